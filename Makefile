@@ -26,7 +26,7 @@ extras: $(READY)
 	$(PIP) -e '.[$(subst +,$(comma),$(subst $(eval ) ,$(comma),$(CI_EXTRAS)))]'
 	touch $(addprefix $(EXTRA),$(CI_EXTRAS))
 
-.PHONY: compile extras reference baseline bench accept demo test test-slow test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers docs figures gui recompile setup clean
+.PHONY: compile extras baseline bench accept demo test test-slow test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers docs figures gui recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -87,15 +87,10 @@ studies: $(READY)
 papers: $(READY)
 	$(BIN)/skysim reproduce all --report --markdown docs/findings/papers.md
 
-# The site, in out/site. Nothing in it is fetched from elsewhere.
+# The site, in out/site, with the reference of commands, keys and responses from the code. Nothing in it is fetched
+# from elsewhere.
 docs: $(READY) $(EXTRA)docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
-
-# The pages of commands, keys and responses, from the code.
-reference: $(READY)
-	$(BIN)/python docs/site/commands.py
-	$(BIN)/python docs/site/keys.py
-	$(BIN)/python docs/site/study_responses.py
 
 figures: $(READY)
 	$(BIN)/python docs/site/figures.py

@@ -11,7 +11,7 @@ import sys
 from typing import Any
 
 from benchmarks import AREAS, accept, chosen, measure, options
-from skysim.core.io.files import to_json
+from skysim.core.files import to_json
 
 HEADS = ("what", "ours", "peer", "peer's", "ratio", "bar", "met")
 

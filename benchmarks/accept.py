@@ -25,8 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import AREAS
-from skysim.core.io.files import to_json
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT, to_json
 from skysim.experiments.study.execution.setups import code_version
 
 OUT = ROOT / "out"
@@ -115,7 +114,7 @@ def benchmark_rows(command: list[str], quick: bool) -> Iterator[tuple[str, Row]]
 def measured(area: str, options: dict[str, int]) -> list[Row] | None:
     """The rows of an area, measured in a process of its own; None if it fails."""
     code = (
-        "import json, sys; from benchmarks import measure; from skysim.core.io.files import to_json\n"
+        "import json, sys; from benchmarks import measure; from skysim.core.files import to_json\n"
         "print(to_json(measure(sys.argv[1], **json.loads(sys.argv[2]))))"
     )
     words = [sys.executable, "-c", code, area, json.dumps(options)]

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.timing import verdict, versus
 from estimator.attitude.solvers import SOLVERS
 from estimator.attitude.wahba import wahba
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 
 # The solver's budget in microseconds, out of one millisecond from image to attitude.
 BUDGET_US = 10.0

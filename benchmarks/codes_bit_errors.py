@@ -29,10 +29,10 @@ from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.lights.dome import LedDome
 from skysim.simulation.timing import exposure_window
+from skysim.sources.dome.codes import LedCodes
 from skysim.sources.dome.led import lit_moments_s
-from skysim.sources.dome.timing.codes import LedCodes
+from skysim.tracking.factory import assumed_settings
 from skysim.tracking.onboard_model import calibration
-from skysim.tracking.settings import assumed_settings
 
 FRAMES = 250
 MAX_OFF = 0.1  # relative difference from theory

@@ -13,8 +13,7 @@ import numpy as np
 
 from benchmarks.codes_attitudes import Bench
 from benchmarks.timing import figure as figure_row
-from skysim.core.io.files import make_folder
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT, make_folder
 
 SEQUENCES = 60
 CODES = {

@@ -16,13 +16,13 @@ from scipy.spatial.transform import Rotation
 from benchmarks.dome_identify import attitude, leds_m
 from benchmarks.timing import figure, verdict
 from estimator.attitude.dome_map import LedMap, Lever, project
-from estimator.core.arrays import Ints
 from estimator.core.camera import Camera
+from estimator.core.checks import Ints
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.dome_tracker import SETTINGS, DomeTracker
 from skysim.scene import loader
 from skysim.simulation.lab import build_lab
-from skysim.sources.dome.shell.surface import Surface, build_surface
+from skysim.sources.dome.surface import Surface, build_surface
 from skysim.tracking.onboard_model import calibration
 
 TRIALS = 1000

@@ -15,14 +15,13 @@ from scipy.spatial.transform import Rotation
 from benchmarks.timing import figure, verdict
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.core.camera import Camera
-from estimator.identification.leds import search
-from estimator.identification.leds.index import DomeIndex, build_dome_index
+from estimator.identification import led_search
+from estimator.identification.led_index import DomeIndex, build_dome_index
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.simulation.lab import build_lab
-from skysim.sources.dome.layouts import placing
-from skysim.sources.dome.placement import optimize
-from skysim.sources.dome.shell.surface import Surface, build_surface
+from skysim.sources.dome.layouts import optimize, placing
+from skysim.sources.dome.surface import Surface, build_surface
 from skysim.tracking.onboard_model import calibration
 
 TRIALS = 2000
@@ -104,7 +103,7 @@ def trial(
     name = np.concatenate([seen, np.full(case.false, -1)])[order]
     sigma = np.full(len(detections_px), case.noise_px / camera.focal_px)
     begin = time.perf_counter()
-    match = search.identify(camera.rays(detections_px), sigma, dome)
+    match = led_search.identify(camera.rays(detections_px), sigma, dome)
     elapsed_s = time.perf_counter() - begin
     if isinstance(match, str):
         return match, elapsed_s, len(seen)

@@ -28,12 +28,12 @@ from scipy.spatial.transform import Rotation
 from benchmarks.dome_identify import attitude, leds_m
 from benchmarks.timing import figure
 from estimator.attitude.dome_map import Lever, project
-from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats, Ints
 from estimator.identification.chance import ACCEPT_DEX, GATE_SIGMA
 from skysim.scene import loader
 from skysim.simulation.lab import build_lab
-from skysim.sources.dome.shell.surface import build_surface
+from skysim.sources.dome.surface import build_surface
 from skysim.tracking.onboard_model import calibration
 from tests.helpers.group_invariants import TRANSFORMS, invariants, predicted
 

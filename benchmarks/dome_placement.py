@@ -17,7 +17,7 @@ from benchmarks.dome_identify import TILT_DEG, Case, trial
 from benchmarks.timing import figure, verdict
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core.camera import Camera
-from estimator.identification.leds.index import build_dome_index
+from estimator.identification.led_index import build_dome_index
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene import loader
@@ -25,9 +25,8 @@ from skysim.scene.sections import layouts
 from skysim.scene.sections import leds as led_schema
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lab import build_lab
-from skysim.sources.dome.layouts import registry
-from skysim.sources.dome.placement import fisher, optimize
-from skysim.sources.dome.shell.surface import Surface, build_surface
+from skysim.sources.dome.layouts import fisher, optimize, registry
+from skysim.sources.dome.surface import Surface, build_surface
 from skysim.sources.photometry import Band
 from skysim.tracking.onboard_model import calibration
 

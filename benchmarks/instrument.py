@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.timing import verdict, versus
-from skysim.camera.detector.detector import Detector, expose
+from skysim.camera.detector import Detector, expose
 from skysim.camera.glow.background import fill
 from skysim.camera.optics import Optics
 from skysim.camera.render import Window, render

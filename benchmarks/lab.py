@@ -32,8 +32,7 @@ import numpy as np
 import psutil
 
 from benchmarks.timing import verdict
-from skysim.apps.gui.memory import QUIET_S
-from skysim.apps.gui.server import RECONNECT_S
+from skysim.apps.gui.server import QUIET_S, RECONNECT_S
 from skysim.core.types import Floats
 
 SCENE = """schema: 1

@@ -22,15 +22,15 @@ from benchmarks import peers
 from benchmarks.timing import figure, verdict
 from estimator.attitude.solvers import quest
 from estimator.catalog import catalog
-from estimator.core.arrays import Ints
 from estimator.core.camera import Camera
+from estimator.core.checks import Ints
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.paths import CATALOGS
+from skysim.core.files import CATALOGS
 from skysim.results.metrics import WRONG_RAD
-from skysim.sources import hipparcos
+from skysim.sources import star_archives
 
 DOUBLES_RAD = 30 * ARCSEC_RAD
 MAGNITUDE_SIGMA = 0.25
@@ -154,7 +154,7 @@ def sky(limit_mag: float) -> catalog.StarCatalog:
     """The stars to a limiting magnitude, without close doubles. Builds the deeper catalog if it does not exist yet."""
     path = CATALOGS / f"{DEEP}.ecsv"
     if not path.is_file():
-        hipparcos.build(7.5, path)
+        star_archives.build_hipparcos(7.5, path)
     stars = catalog.brighter_than(catalog.read(path), limit_mag)
     near = cKDTree(stars.vectors).query_pairs(2 * np.sin(DOUBLES_RAD / 2), output_type="ndarray")
     fainter = near.max(axis=1)  # rows are sorted by magnitude

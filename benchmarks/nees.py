@@ -17,8 +17,8 @@ import scipy.stats
 from benchmarks.lost_in_space import DENSE, SHEFEX, Field, Workload, field
 from benchmarks.rolling import row
 from estimator.catalog import catalog
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.results import metrics

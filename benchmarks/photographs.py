@@ -20,8 +20,8 @@ from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from skysim.apps.plate_solver import picture as plate_picture
 from skysim.apps.plate_solver import solver as plate_solver
-from skysim.core.io.images import Picture
-from skysim.core.paths import CATALOGS
+from skysim.core.files import CATALOGS
+from skysim.core.images import ViewedImage
 from tests.helpers.photographs import CASES, EPOCH, draw, is_same
 
 # pictures of a case; of one with so many pixels
@@ -55,7 +55,7 @@ def measure(count: int = COUNT, seed: int = 25) -> list[dict[str, Any]]:
                 told = plate_solver.make_solver(shot.fov_deg * rng.uniform(0.97, 1.03), None)
                 for how, solver in (("told", told), ("not told", blind)):
                     found = plate_picture.solve_picture(
-                        Picture(image), solver, None
+                        ViewedImage(image), solver, None
                     ).report.attitude.cam_from_ref
                     right = found is not None and not starless and is_same(found, truth)
                     solved[how] += right

@@ -23,13 +23,13 @@ from benchmarks.timing import figure
 from estimator.calibration.star_field import Calibration, StarFrame, calibrate, self_calibrate
 from estimator.catalog import catalog
 from estimator.catalog.refraction import SiteAir, raised, refraction_constants
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.io import images
-from skysim.core.paths import CATALOGS
+from skysim.core import images
+from skysim.core.files import CATALOGS
 
 FOLDER = "SKYSIM_PHOTOGRAPHS"
 DATE = datetime.datetime(2019, 7, 29, 20, 47, 26)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.timing import verdict
-from skysim.experiments.study import loader
+from skysim.experiments.study import study_file
 from skysim.experiments.study.execution import engines, runner, store
 from skysim.experiments.study.execution.engines import Chunk, Chunks, Engine, Job
 from skysim.experiments.study.execution.outcomes import FIELDS, Outcome
@@ -139,7 +139,7 @@ def pace(engine: Engine, workers: int, seconds: float, rounds: int = 4) -> Pace:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "study.yaml"
         path.write_text(STUDY.format(trials=trials))
-        study = loader.load(path)
+        study = study_file.load(path)
         with store.writing(path.with_suffix(".sqlite")) as database:
             runner.prepare_store(study, database, False)
             progress = runner.run(study, database, timed)

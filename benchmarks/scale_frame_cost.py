@@ -17,8 +17,8 @@ import numpy as np
 from benchmarks.scale_rates import CMOS
 from benchmarks.timing import figure
 from skysim.core.types import Floats
-from skysim.experiments.dataset import plan, run
-from skysim.experiments.dataset.storage import Storage
+from skysim.experiments import dataset_run
+from skysim.experiments.dataset_shards import Storage
 
 FRAMES = 32
 REPEATS = 3
@@ -55,20 +55,20 @@ def cost_of(width_px: int, height_px: int, limit_mag: float) -> Cost:
         "camera.height_px": f"{height_px}",
         "light.limit_mag": f"{limit_mag}",
     }
-    made = plan.load(
+    made = dataset_run.load(
         "shefex2", None, FRAMES * (REPEATS + 1), overrides=CMOS | keys, frames_per_shard=FRAMES
     )
     with tempfile.TemporaryDirectory() as folder:
         storage = Storage(f"{folder}/frames")
         spent = []
-        run.prepare(made, storage)
+        dataset_run.prepare(made, storage)
         for shard in range(REPEATS + 1):
             begin = time.process_time()
-            run.make_shard(made, storage, shard)
+            dataset_run.make_shard(made, storage, shard)
             spent.append((time.process_time() - begin) / FRAMES)
         files = [path for path in Path(folder).rglob("*") if path.is_file()]
         size = sum(path.stat().st_size for path in files) / made.frames
-    sources = np.mean([len(one.sources) for _, _, _, one in run.labelled_frames(made, 0)])
+    sources = np.mean([len(one.sources) for _, _, _, one in dataset_run.labelled_frames(made, 0)])
     return Cost(width_px, height_px, limit_mag, float(sources), min(spent[1:]), size)
 
 

@@ -22,11 +22,11 @@ import yaml
 
 from benchmarks import scale_coordination as coordination
 from benchmarks.timing import figure, verdict, versus
-from skysim.camera.detector.added_charge import AddedCharge
+from skysim.camera.detector import AddedCharge
 from skysim.core.errors import InputError
-from skysim.experiments.dataset import plan, run, shards
-from skysim.experiments.dataset.labels import LabelledFrame, label_frame, labeller
-from skysim.experiments.study import loader as study_loader
+from skysim.experiments import dataset_run, dataset_shards
+from skysim.experiments.dataset_labels import LabelledFrame, label_frame, labeller
+from skysim.experiments.study import study_file as study_loader
 from skysim.experiments.study.execution import engines, runner, store, trials
 from skysim.experiments.study.plan import Plan
 from skysim.scene import loader
@@ -85,9 +85,9 @@ def measure() -> list[dict[str, Any]]:
 
 def small_plan(
     count: int = FRAMES, per_shard: int = PER_SHARD, keys: dict[str, str] = CMOS
-) -> plan.DatasetPlan:
+) -> dataset_run.DatasetPlan:
     """Frames of 1024 x 1024 pixels."""
-    return plan.load("shefex2", None, count, overrides=keys, frames_per_shard=per_shard)
+    return dataset_run.load("shefex2", None, count, overrides=keys, frames_per_shard=per_shard)
 
 
 def frames() -> list[dict[str, Any]]:
@@ -117,7 +117,7 @@ def frames_hz(workers: int) -> float:
     """Frames in a second, from the end of the second shard of each worker to that of the last one."""
     arrived: list[tuple[float, int]] = []
     with tempfile.TemporaryDirectory() as folder, closing(engines.Pool(workers)) as pool:
-        run.run(
+        dataset_run.run(
             small_plan(),
             f"{folder}/frames",
             pool,
@@ -142,13 +142,13 @@ def parts() -> list[dict[str, Any]]:
     return rows
 
 
-def parts_of(made: plan.DatasetPlan) -> dict[str, float]:
+def parts_of(made: dataset_run.DatasetPlan) -> dict[str, float]:
     """Milliseconds of CPU of a frame: render; label (detection, masks); encode (COCO, numbers); write (the tar)."""
     spent = dict.fromkeys(("render", "label", "encode", "write"), 0.0)
     with tempfile.TemporaryFile() as file:
-        tar = shards.TarWriter(file)
+        tar = dataset_shards.TarWriter(file)
         by = None
-        for number, levels, setup, one in run.labelled_frames(made, 0):
+        for number, levels, setup, one in dataset_run.labelled_frames(made, 0):
             by = by or labeller(setup.lab.scene)
             seed = made.seed(number)
             with timed(spent, "render"):
@@ -156,12 +156,12 @@ def parts_of(made: plan.DatasetPlan) -> dict[str, float]:
             with timed(spent, "label"):
                 label_frame(setup, seed, by)
             with timed(spent, "encode"):
-                row = shards.frame_labels(
+                row = dataset_shards.frame_labels(
                     one, setup.lab.scene, {"frame": number, "shard": 0, "seed": seed}
                 )
-                shards.coco_annotations(one, number)
+                dataset_shards.coco_annotations(one, number)
             with timed(spent, "write"):
-                shards.add_frame(tar, number, one, row | {"levels": levels})
+                dataset_shards.add_frame(tar, number, one, row | {"levels": levels})
     spent["label"] -= spent["render"]
     return {name: 1e3 * seconds / PARTS for name, seconds in spent.items()}
 
@@ -176,7 +176,7 @@ def timed(spent: dict[str, float], name: str) -> Iterator[None]:
 
 def writing() -> dict[str, Any]:
     """The tar of a shard, beside Python's tarfile and numpy.save with the same members."""
-    _, _, _, one = next(run.labelled_frames(small_plan(PER_SHARD), 0))
+    _, _, _, one = next(dataset_run.labelled_frames(small_plan(PER_SHARD), 0))
     kept = [(number, one) for number in range(PER_SHARD)]
     return versus(
         "write 16 frames as a tar",
@@ -189,9 +189,9 @@ def writing() -> dict[str, Any]:
 
 def ours(kept: list[tuple[int, LabelledFrame]]) -> None:
     """Write the frames as skysim does, to memory."""
-    tar = shards.TarWriter(io.BytesIO())
+    tar = dataset_shards.TarWriter(io.BytesIO())
     for number, one in kept:
-        shards.add_frame(tar, number, one, {})
+        dataset_shards.add_frame(tar, number, one, {})
     tar.close()
 
 

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.timing import verdict
-from skysim.core.io.files import make_folder
-from skysim.experiments.study import loader
+from skysim.core.files import make_folder
+from skysim.experiments.study import study_file
 from skysim.experiments.study.execution import runner, store
 from skysim.results.files import row_parts
 
@@ -57,7 +57,7 @@ def build(folder: Path, rows: int, points: int) -> None:
             levels=np.linspace(5.0, 6.5, points).round(4).tolist(), replicates=rows // points
         )
     )
-    study = loader.load(path)
+    study = study_file.load(path)
     with store.writing(folder / store.STORE) as database:
         runner.prepare_store(study, database, False)
         each = study.study.replicates

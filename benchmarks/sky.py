@@ -24,7 +24,7 @@ from skysim.experiments.study.execution.trials import visible_rows
 from skysim.scene.loader import load
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab
-from skysim.sources import gaia
+from skysim.sources import star_archives
 
 DEEP = Path("out/catalogs/gaia_v10.0.ecsv")
 FIELDS_DEG = 2, 3, 5
@@ -58,7 +58,7 @@ def measure() -> list[dict[str, Any]]:
     """All rows of the area."""
     if not DEEP.is_file():
         DEEP.parent.mkdir(parents=True, exist_ok=True)
-        gaia.build(10.0, DEEP)
+        star_archives.build_gaia(10.0, DEEP)
     return [*bodies(), *(row for fov_deg in FIELDS_DEG for row in narrow(fov_deg)), frame_time()]
 
 

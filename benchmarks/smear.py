@@ -16,11 +16,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.timing import figure
-from estimator.catalog import catalog, shefex
-from estimator.core.errors import ImageError
+from estimator.catalog import catalog, published_catalogs
+from estimator.core.checks import ImageError
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.paths import CATALOGS
+from skysim.core.files import CATALOGS
 from skysim.core.types import Frame, Trajectory
 from skysim.results.metrics import WRONG_RAD
 from skysim.scene.loader import load
@@ -90,7 +90,7 @@ def build_trackers(lab: Lab) -> dict[str, StarTracker]:
     scene = lab.scene
     stars = catalog.read(CATALOGS / "hipparcos_hp6.5.ecsv")
     observer = catalog.on_earth(scene.start_time)
-    paper_stars = shefex.chosen(stars)
+    paper_stars = published_catalogs.chosen(stars)
     stars_default = catalog.brighter_than(stars, scene.tracker.limit_mag)
     gain = scene.camera.detector.gain_e_dn
     paper = Settings(

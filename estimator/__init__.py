@@ -3,20 +3,38 @@
 Numpy arrays and floats go in, dataclasses come out. The package imports neither skysim nor MuJoCo.
 """
 
-from estimator.core.lazy import attach
+import importlib
+from typing import Any
 
-# Loaded on first use, so that `import estimator` is quick.
-__getattr__, __dir__, __all__ = attach(
-    __name__,
-    {
-        "catalog.catalog": ["StarCatalog"],
-        "core.camera": ["Camera"],
-        "core.errors": ["ImageError"],
-        "core.types": ["Attitude", "Centroids", "ra_dec_roll_rad"],
-        "filter.mekf": ["AttitudeFilter", "GyroModel"],
-        "trackers.dome_tracker": ["DomeTracker"],
-        "trackers.pipeline": ["Report", "Settings"],
-        "trackers.star_tracker": ["StarTracker"],
-        "trackers.tracking_mode": ["Health", "TrackingMode"],
-    },
-)
+MODULE_OF = {
+    "Attitude": "core.types",
+    "AttitudeFilter": "filter.mekf",
+    "Camera": "core.camera",
+    "Centroids": "core.types",
+    "DomeTracker": "trackers.dome_tracker",
+    "GyroModel": "filter.mekf",
+    "Health": "trackers.tracking_mode",
+    "ImageError": "core.checks",
+    "Report": "trackers.pipeline",
+    "Settings": "trackers.pipeline",
+    "StarCatalog": "catalog.catalog",
+    "StarTracker": "trackers.star_tracker",
+    "TrackingMode": "trackers.tracking_mode",
+    "ra_dec_roll_rad": "core.types",
+}
+__all__ = sorted(MODULE_OF)
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, loaded on first use (PEP 562), so that `import estimator` is quick."""
+    if name not in MODULE_OF:
+        raise AttributeError(
+            f"module estimator has no attribute {name}; public: {', '.join(__all__)}"
+        )
+    value = getattr(importlib.import_module(f"estimator.{MODULE_OF[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import project
 from skysim.camera.glow.display_glow import black_glow
-from skysim.core.paths import SCENES
+from skysim.core.files import SCENES
 from skysim.dynamics import multibody
-from skysim.experiments.configs import with_config
-from skysim.experiments.study.execution.setups import Setup
+from skysim.experiments.study.execution.setups import TrialSetup
 from skysim.experiments.study.execution.trials import run_frame_trial
 from skysim.experiments.study.plan import FrameTrial
+from skysim.experiments.tracker_comparison import with_config
 from skysim.results import metrics
 from skysim.results.simulate import render
 from skysim.scene import loader
@@ -254,7 +254,7 @@ def test_its_claimed_error_is_the_one_it_makes(name: str) -> None:
             lab = build_lab(scene)
         if survey == 0 or not isinstance(scene.light, StarsConfig):
             tracker = build_tracker(lab.with_scene(scene).camera)
-        setup = Setup(lab.with_scene(scene), tracker, trial, "")
+        setup = TrialSetup(lab.with_scene(scene), tracker, trial, "")
         outcomes += [run_frame_trial(setup, survey * FRAMES + frame) for frame in range(FRAMES)]
     nees = np.array([one.nees for one in outcomes if one.solved])
     assert sum(one.wrong for one in outcomes) == 0

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 
 
 def module_of(path: Path) -> str:
@@ -67,7 +67,7 @@ def test_no_module_imports_itself_by_way_of_others() -> None:
 
 @pytest.mark.parametrize("package", ["skysim", "estimator"])
 def test_no_folder_holds_more_than_a_reader_takes_in(package: str) -> None:
-    """About a dozen; a folder needs a sentence of its own, so that many small ones read no better."""
+    """A dozen or a little more; a folder needs a sentence of its own, so that many small ones read no better."""
     for folder in {path.parent for path in FILES.values() if path.is_relative_to(ROOT / package)}:
         entries = {path.name for path in folder.iterdir()} - {
             "__init__.py",
@@ -75,4 +75,4 @@ def test_no_folder_holds_more_than_a_reader_takes_in(package: str) -> None:
             "__main__.py",
             "README.md",
         }
-        assert len(entries) <= 14, sorted(entries)
+        assert len(entries) <= 18, sorted(entries)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from skysim.apps import plate_solver
-from skysim.core.io import images
-from skysim.core.paths import ROOT
+from skysim.core import images
+from skysim.core.files import ROOT
 from skysim.sources.stars import cam_from_icrs
 
 FOLDER = Path(os.environ.get("SKYSIM_REAL_SKY", ROOT.parent / "shared" / "real_sky"))
@@ -114,7 +114,7 @@ def test_a_photograph_in_a_mirror_is_refused(row, blind):
     """No turn of the sky is its mirror image, so whatever were answered would be wrong; the mirror is named."""
     image = images.monochrome(images.read_image(FOLDER / row["file"]))
     outcome = plate_solver.solve_picture(
-        images.Picture(np.ascontiguousarray(image[:, ::-1])), blind, None
+        images.ViewedImage(np.ascontiguousarray(image[:, ::-1])), blind, None
     )
     assert not outcome.report.attitude.solved
     assert len(outcome.report.centroids) >= 10

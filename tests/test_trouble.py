@@ -21,9 +21,9 @@ from astropy.io import fits
 from typer.testing import CliRunner
 
 from skysim.apps.cli import main
+from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.io import files
-from skysim.results.files import export, frames, recording
+from skysim.results.files import recording, run_export
 from skysim.scene import loader
 from skysim.simulation.flight import open_flight
 
@@ -83,7 +83,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> recording.Recording:
     folder = tmp_path_factory.mktemp("flown")
     scene = loader.load("shefex2", {"exposure.frames": "3", "light.limit_mag": "5"})
     for shot in open_flight(scene).shots(solves=False):
-        frames.write_frame(folder, shot.frame, shot.truth, scene)
+        recording.write_frame(folder, shot.frame, shot.truth, scene)
     return recording.open_recording(folder)
 
 
@@ -120,7 +120,7 @@ def test_an_export_without_room_names_file_and_reason_and_leaves_nothing(
         yield from items
 
     with no_room(500), pytest.raises(OSError, match="File too large") as told:
-        export.export(flown, [name], tmp_path, quiet)
+        run_export.export(flown, [name], tmp_path, quiet)
     assert told.value.filename == str(tmp_path / file)
     assert list(tmp_path.iterdir()) == []
     assert capfd.readouterr().err == ""
@@ -145,11 +145,11 @@ def test_a_film_that_lost_frames_is_refused(
                 self.film.write(image)
 
     monkeypatch.setattr(
-        "skysim.results.files.export.cv2.VideoWriter",
+        "skysim.results.files.run_export.cv2.VideoWriter",
         type("F", (Forgetful,), {"fourcc": film.fourcc}),
     )
     with pytest.raises(InputError, match=r"frames\.mp4: OpenCV wrote 2 of 3 frames"):
-        export.export(flown, ["video"], tmp_path, lambda items, *_: iter(items))
+        run_export.export(flown, ["video"], tmp_path, lambda items, *_: iter(items))
     assert list(tmp_path.iterdir()) == []
 
 

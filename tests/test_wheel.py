@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from skysim.apps.cli import main
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 
 
 def test_versions_are_told_for_a_report() -> None:

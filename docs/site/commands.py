@@ -1,4 +1,4 @@
-"""Write the reference page of the command line from the commands: `make reference`; a test compares the two."""
+"""The command line as Markdown: a section for each command. `reference.py` puts them into the reference."""
 
 from __future__ import annotations
 
@@ -9,20 +9,6 @@ import typer
 
 from skysim.apps.cli.examples import EXAMPLES
 from skysim.apps.cli.main import app
-from skysim.core.paths import ROOT
-
-PAGE = ROOT / "docs" / "reference" / "commands.md"
-HEAD = """# Commands
-
-Every command with its arguments and options, as printed by `skysim COMMAND --help`. Exit code 0 means success, 2
-invalid input (with a one-line message on standard error), and 130 an interruption by Ctrl-C. Output is written to
-`out/NAME` unless `--out` names another folder. This page is written by `make reference`.
-"""
-
-
-def page() -> str:
-    """The text of the page."""
-    return f"{HEAD}\n{commands_markdown()}\n"
 
 
 def commands_markdown() -> str:
@@ -80,7 +66,3 @@ def row(parameter: Any, context: Any) -> str:
 def escape_cell(text: str) -> str:
     """Escape a text for a cell of a Markdown table."""
     return " ".join(text.split()).replace("|", "\\|").replace("*", "\\*")
-
-
-if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")

@@ -1,38 +1,44 @@
-"""Convert this project's docstrings (indented equations, lines `name : meaning`) to Markdown."""
+"""Convert docstrings in NumPy style to Markdown: equations are indented, sections have underlined heads."""
 
 from __future__ import annotations
 
 import re
 
-TERM = re.compile(r"^([a-zA-Z]\w*(?:, \w+)* +|[a-z]\w*(?:, \w+)*): +(?=\S)")
+HEAD = re.compile(r"^([A-Z]\w+)\n-+\n")
 MARKS = re.compile(r"([*_\[\]])")
 CODE = re.compile(r"(`[^`]*`)")
 
 
 def to_markdown(text: str) -> str:
-    """Convert lines `name : meaning` to lists and escape marks; indented blocks stay code."""
+    """Convert sections to lists and escape marks; indented blocks stay code."""
     return "\n\n".join(paragraph_to_markdown(paragraph) for paragraph in re.split(r"\n\s*\n", text))
 
 
 def paragraph_to_markdown(paragraph: str) -> str:
-    """Convert one paragraph."""
+    """Convert one paragraph, or one section."""
+    if head := HEAD.match(paragraph):
+        items = [f"- `{names}`: {escape(text)}" for names, text in terms(paragraph).items()]
+        return "\n".join(items if head[1] == "Attributes" else [f"**{head[1]}**", "", *items])
     lines = paragraph.split("\n")
     if all(line.startswith("    ") for line in lines):
         return paragraph
-    lines_out: list[str] = []
-    in_list = False
-    for line in lines:
-        term = TERM.match(line)
-        if term:
-            separator = [""] if lines_out and not in_list else []
-            lines_out += [*separator, f"- `{term[1].strip()}`: {escape(line[term.end() :])}"]
-            in_list = True
-        elif in_list and line.startswith(" "):
-            lines_out.append(f"    {escape(line.strip())}")
-        else:
-            lines_out += ["", escape(line.strip())] if in_list else [escape(line.strip())]
-            in_list = False
-    return "\n".join(lines_out)
+    return "\n".join(escape(line.strip()) for line in lines)
+
+
+def terms(docstring: str) -> dict[str, str]:
+    """What a docstring's sections say of each name, or of several names on one line."""
+    found: dict[str, str] = {}
+    for section in re.split(r"\n\s*\n", docstring):
+        if not HEAD.match(section):
+            continue
+        names = ""
+        for line in section.splitlines()[2:]:
+            if line.startswith(" "):
+                found[names] = f"{found[names]} {line.strip()}".strip()
+            else:
+                names = line.strip()
+                found[names] = ""
+    return found
 
 
 def escape(text: str) -> str:

@@ -19,19 +19,18 @@ from skysim.core.types import Floats, Mount, Sources, Trajectory
 from skysim.dynamics import multibody
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.orbit import ExclusionConfig
+from skysim.scene.sections.surroundings import ExclusionConfig
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.flight import simulate_motion
 from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.lights.lens import stray_e_s
 from skysim.simulation.lights.light import Exposure, beam_of
+from skysim.sources import air as scintillation
+from skysim.sources import air as starlight
 from skysim.sources import stars as star_sources
-from skysim.sources.air import scintillation, starlight
-from skysim.sources.air.refraction import Refraction, Weather
 from skysim.sources.catalog import read
-from skysim.sources.dome.shell import surface
-from skysim.sources.false_lights import GHOST, MIRRORED
-from skysim.sources.orbit.availability import Pointing, sample
+from skysim.sources.dome import surface
+from skysim.sources.orbit_availability import Pointing, sample
 from skysim.sources.photometry import (
     Band,
     black_body_v0,
@@ -41,6 +40,8 @@ from skysim.sources.photometry import (
     star_chromatic,
     temperature_k,
 )
+from skysim.sources.refraction import Refraction, Weather
+from skysim.sources.satellites import GHOST, MIRRORED
 
 mpl.rcParams.update(
     {"svg.fonttype": "none", "svg.hashsalt": "skysim", "font.family": "sans-serif", "font.size": 11}

@@ -1,4 +1,4 @@
-"""MkDocs hook: equations as MathML, and pages for files outside of docs/ that pages link to.
+"""MkDocs hook: equations as MathML, the generated reference, pages for files outside of docs/ that pages link to.
 
 Pages are written so that a code host shows them too: equations in ```math fences or $`x`$, links relative to the file.
 """
@@ -8,11 +8,15 @@ from __future__ import annotations
 import html
 import os
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File
+
+sys.path.insert(0, str(Path(__file__).parent))
+import reference
 
 ROOT = Path(__file__).resolve().parents[2]
 LINK = re.compile(r"\]\(([^)#\s:]+)(#[^)\s]*)?\)")
@@ -50,7 +54,8 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Rewrite links within the repository as links within the site."""
+    """Insert the generated parts, and rewrite links within the repository as links within the site."""
+    markdown = reference.insert_parts(markdown)
     page_path = repository_paths.get(page.file.src_uri)
     if page_path is None:
         return markdown

@@ -1,6 +1,6 @@
-"""Write the reference pages of the keys of scene and study files from the models that check them.
+"""The keys of scene and study files as Markdown, from the models that check them: a section for each model.
 
-`make reference` writes docs/reference/scene_keys.md and study_keys.md; a test compares them with the models.
+`reference.py` puts them into the reference.
 """
 
 from __future__ import annotations
@@ -23,12 +23,10 @@ from estimator.centroiding.centroid import CENTROIDERS
 from estimator.detection.detect import DETECTORS
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
 from estimator.trackers.dome_tracker import IDENTIFIERS as DOME_IDENTIFIERS
-from skysim.apps.gui.shared.forms import file_value, yaml_line
-from skysim.core.paths import ROOT
+from skysim.apps.gui.views.forms import file_value, yaml_line
 from skysim.core.tolerance import ErrorSchema
 from skysim.core.units import ConfigModel, si_unit
 from skysim.experiments.study.plan import Study
-from skysim.scene.loader import PRESETS
 from skysim.scene.scene import NAME_ALIAS, Scene
 from skysim.scene.sections.camera import CURVE_FOLDER
 
@@ -49,19 +47,6 @@ WORDS = {
     "boolean": "true or false",
 }
 WORDS |= {"null": "null", "object": "a section", "array": "list"}
-
-HEAD = """# Keys of a {what}
-
-Every key with its allowed values and its default, written by `make reference` from the models that check the files. A
-quantity has its unit (`"35 mm"`); the key of a bare number ends in the unit. `skysim validate --schema {what}` prints
-the same as JSON Schema, for editors.{more}
-"""
-MORE = """
-
-Three keys are applied before the others: `base`, the name or file of a scene whose keys this one overrides;
-`camera.preset`, a camera whose keys the section overrides: {presets}, or a file
-([`skysim camera new`](../howto/camera.md#from-a-data-sheet) writes one); and `camera.calibration`, a file of OpenCV
-with size, focal length, principal point and distortion."""
 
 
 def names(options: Iterable[str]) -> str:
@@ -118,7 +103,7 @@ TEXTS = {
     "optimize.objectives.response": "a response, or `cost`",
     "optimize.constraints.response": "a response, or `cost`",
     "set": "a section: dotted keys of the scene and their values",
-    "responses": "a list of [responses](responses.md)",
+    "responses": "a list of [responses](response_names.md)",
 }
 
 
@@ -244,10 +229,10 @@ def bounds(node: dict[str, Any], unit: str) -> Iterator[str]:
             yield f"{symbol} {node[keyword]:g}{suffix}"
 
 
-def page(root: type[BaseModel], what: str, more: str = "") -> str:
-    """The page of a kind of file: one heading per model."""
+def model_sections(root: type[BaseModel]) -> str:
+    """The sections of a kind of file: one heading per model."""
     found = sections(root)
-    parts = [HEAD.format(what=what, more=more)]
+    parts = []
     for name, (model, paths) in found.items():
         kind = model.model_fields.get("kind")
         kinds = names(typing.get_args(kind.annotation)) if kind else ""
@@ -256,19 +241,14 @@ def page(root: type[BaseModel], what: str, more: str = "") -> str:
         )
         parts += [f"## {name}", where, to_markdown(inspect.cleandoc(model.__doc__ or ""))]
         parts.append(table(model, paths, found))
-    return "\n\n".join(part.strip() for part in parts if part.strip()) + "\n"
+    return "\n\n".join(part.strip() for part in parts if part.strip())
 
 
-def pages() -> dict[Path, str]:
-    """The text of every generated page by its path."""
-    folder = ROOT / "docs" / "reference"
-    presets = stems(PRESETS, "yaml")
-    return {
-        folder / "scene_keys.md": page(Scene, "scene", MORE.format(presets=presets)),
-        folder / "study_keys.md": page(Study, "study"),
-    }
+def scene_keys() -> str:
+    """Every key of a scene."""
+    return model_sections(Scene)
 
 
-if __name__ == "__main__":
-    for path, text in pages().items():
-        path.write_text(text, encoding="utf-8")
+def study_keys() -> str:
+    """Every key of a study."""
+    return model_sections(Study)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import cv2
 
-from skysim.core.io import files
-from skysim.dynamics.multibody.view.picture import picture
-from skysim.results import annotate, telemetry_report
+from skysim.core import files
+from skysim.dynamics.multibody.scene_picture import picture
+from skysim.results import plots, telemetry_report
 from skysim.scene import loader
 from skysim.simulation.flight import simulate_motion
 
@@ -48,7 +48,7 @@ def main() -> None:
         f"{rate} deg/s, {truth.sources.streak_px.max():.1f} px"
         for rate, (_, truth) in zip(RATES_DEG_S, exposures, strict=True)
     ]
-    sheet = annotate.contact_sheet(
+    sheet = plots.contact_sheet(
         [image.image_dn[WINDOW] for image, _ in exposures], captions, scale=3
     )
     files.write_image(IMAGES / "smear.png", sheet)

@@ -11,12 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from skysim.core.paths import STUDIES
+from skysim.core.files import STUDIES
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis import search
+from skysim.experiments.study import search
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.execution.store import STORE, Store
-from skysim.experiments.study.loader import load
 from skysim.experiments.study.plan import Plan
 from skysim.experiments.study.report.study_report import (
     POINTS,
@@ -25,7 +24,9 @@ from skysim.experiments.study.report.study_report import (
     commands,
     compose,
 )
-from skysim.results.report import Report, Section, Text
+from skysim.experiments.study.study_file import load
+from skysim.results.report import Report
+from skysim.results.report_blocks import Section, Text
 
 PAGES = Path(__file__).parents[1] / "findings" / "studies"
 BESIDE = {

@@ -1,25 +1,21 @@
-"""Write the reference page of a study's responses from the code that computes them.
+"""Tables of a study's responses as Markdown, from the code that computes them.
 
-`make reference` writes docs/reference/responses.md; a test compares it with the code.
+`reference.py` puts them into the reference.
 """
 
 from __future__ import annotations
 
 import inspect
-import re
 import sys
 from collections.abc import Iterable
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
-from docstring_text import escape
+from docstring_text import escape, terms
 
-from skysim.core.paths import ROOT
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.results import metrics
 
-PAGE = ROOT / "docs" / "reference" / "responses.md"
-TERM = re.compile(r"^(\w+(?:, \w+)*) *: (.*)$")
 # Quantities whose names are not those of a column, or that need more words than a column has.
 QUANTITIES = {
     "cross_arcsec": "error across the boresight, the hypotenuse of both axes",
@@ -35,50 +31,6 @@ EXTREMUM = "none: it is that of these trials"
 INTERVALS = {"mean": BOOTSTRAP, "rms": BOOTSTRAP, "worst": EXTREMUM, "least": EXTREMUM}
 QUANTILES = {"median": 0.5, "p90": 0.9, "p95": 0.95, "p99": 0.99}
 
-HEAD = """# Responses of a study
-
-The names that `responses`, `figures`, `thresholds`, `objectives` and `constraints` of a [study](../howto/study.md)
-take, written by `make reference` from the code that computes them ([`skysim.results.metrics`](running.md)). Intervals
-are of 95 %.
-
-## Proportions
-
-Of the frames, except where it says otherwise; [Conventions](../explanation/conventions.md) define *wrong*. The interval
-is Wilson's; of none, and of all, it is the exact one-sided bound. The frames of a flight are not independent, so its
-interval is that of as many frames as there are flights.
-
-"""
-MIDDLE = """
-
-## Quantities
-
-A quantity with the ending of a statistic is a response: `cross_arcsec_p95`. Errors are those of all solutions, wrong
-ones included, and quantities of a flight those of its frames together.
-
-"""
-TAIL = """
-
-## Statistics
-
-| ending | interval |
-|---|---|
-"""
-
-
-def terms(docstring: str | None) -> dict[str, str]:
-    """The meanings of a docstring's lines `name, name : meaning`, by their names; meanings may go on, indented."""
-    found: dict[str, str] = {}
-    last = ""
-    for line in inspect.cleandoc(docstring or "").splitlines():
-        if term := TERM.match(line):
-            last = term[1]
-            found[last] = term[2].strip()
-        elif last and line.startswith("  ") and line.strip():
-            found[last] += f" {line.strip()}"
-        else:
-            last = ""
-    return found
-
 
 def meaning(name: str, found: dict[str, str]) -> str:
     """The meaning of a name among terms. Raises StopIteration if there is none."""
@@ -87,39 +39,46 @@ def meaning(name: str, found: dict[str, str]) -> str:
 
 def table(head: str, rows: Iterable[tuple[str, str]]) -> str:
     return "\n".join(
-        [f"| {head} | meaning |", "|---|---|", *(f"| {name} | {text} |" for name, text in rows)]
+        [
+            f"| {head} | meaning |",
+            "|---|---|",
+            *(f"| {name} | {text[:1].upper() + text[1:]} |" for name, text in rows),
+        ]
     )
 
 
-def page() -> str:
-    """The text of the page."""
-    shares = terms(metrics.response.__doc__)
-    proportions = [
+def proportions() -> str:
+    """Table of the proportions."""
+    shares = terms(inspect.cleandoc(metrics.response.__doc__ or ""))
+    rows = [
         (", ".join(f"`{name}`" for name in names.split(", ")), escape(text))
         for names, text in shares.items()
         if any(metrics.is_proportion(name) or name == "coverage_N" for name in names.split(", "))
     ]
-    columns = terms(Outcome.__doc__)
+    return table("name", rows)
+
+
+def quantities() -> str:
+    """Table of the quantities, those of one meaning in one row."""
+    columns = terms(inspect.cleandoc(Outcome.__doc__ or ""))
     of_meaning: dict[str, list[str]] = {}
     for name in metrics.QUANTITIES:
         of_meaning.setdefault(QUANTITIES.get(name) or meaning(name, columns), []).append(
             f"`{name}`"
         )
-    quantities = [(", ".join(same), escape(text)) for text, same in of_meaning.items()]
-    short = [
-        (f"`{name}`", f"`{name}_{statistic}`")
-        for name, statistic in metrics.DEFAULT_STATISTICS.items()
-    ]
+    return table("quantity", [(", ".join(same), escape(text)) for text, same in of_meaning.items()])
+
+
+def statistics() -> str:
+    """Table of the statistics with their intervals, and the statistic of a quantity without an ending."""
     intervals = INTERVALS | {
         name: f"two order statistics, whatever the distribution; from {metrics.values_for_quantile(share)} values on"
         for name, share in QUANTILES.items()
     }
-    statistics = "\n".join(f"| `_{name}` | {intervals[name]} |" for name in metrics.STATISTICS)
-    return (
-        f"{HEAD}{table('name', proportions)}{MIDDLE}{table('quantity', quantities)}{TAIL}{statistics}\n\n"
-        f"Without an ending: {'; '.join(f'{name} is {full}' for name, full in short)}.\n"
-    )
-
-
-if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    rows = [f"| `_{name}` | {intervals[name]} |" for name in metrics.STATISTICS]
+    short = [
+        f"`{name}` is `{name}_{statistic}`"
+        for name, statistic in metrics.DEFAULT_STATISTICS.items()
+    ]
+    head = ["| ending | interval |", "|---|---|"]
+    return "\n".join([*head, *rows, "", f"Without an ending: {'; '.join(short)}."])

@@ -13,25 +13,38 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.core import checks
-from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError, Ints
 
 
 @dataclass(frozen=True, slots=True)
 class LedMap:
     """The believed dome: LED positions and inner surface, in the lab frame.
 
-    id         : (N,)
-    position_m : (N, 3)
-    center_m, semi_axes_m : (3,) the ellipsoid |(x - center) / semi_axes| = 1 that the LEDs are on
-    board      : (N,) label of the patch board of each LED, as all boards have the same pattern; None without boards
-    sigma_m    : standard deviation of an LED's position along each axis; the rms of all, if covariance_m2 says more
-    covariance_m2 : (N, 3, 3) of each LED's own error; None if it is the same for all, along all axes
-    common_m   : (M, N, 3) displacement of each LED by one standard deviation of each error that all LEDs share: of the
-        surface, of the instrument's place and orientation; None without any
-    flux_s     : (N,) flux of each LED's light, in the frame's numbers per second of exposure; None if all are alike
-    flux_sigma : standard deviation of the natural logarithm of a measured flux over that
+    Attributes
+    ----------
+    id
+        (N,)
+    position_m
+        (N, 3)
+    center_m, semi_axes_m
+        (3,) the ellipsoid |(x - center) / semi_axes| = 1 that the LEDs are on
+    board
+        (N,) label of the patch board of each LED, as all boards have the same pattern; None
+        without boards
+    sigma_m
+        Standard deviation of an LED's position along each axis; the rms of all, if
+        covariance_m2 says more
+    covariance_m2
+        (N, 3, 3) of each LED's own error; None if it is the same for all, along all axes
+    common_m
+        (M, N, 3) displacement of each LED by one standard deviation of each error that all LEDs
+        share: of the surface, of the instrument's place and orientation; None without any
+    flux_s
+        (N,) flux of each LED's light, in the frame's numbers per second of exposure; None if
+        all are alike
+    flux_sigma
+        Standard deviation of the natural logarithm of a measured flux over that
     """
 
     id: Ints
@@ -50,8 +63,14 @@ class LedMap:
 class Lever:
     """The believed position and orientation of the camera on the vehicle.
 
-    camera_body_m : (3,) entrance pupil in the body frame;  cam_from_body : rotation
-    sigma_m       : standard deviation of the pupil's position along each axis
+    Attributes
+    ----------
+    camera_body_m
+        (3,) entrance pupil in the body frame
+    cam_from_body
+        rotation
+    sigma_m
+        Standard deviation of the pupil's position along each axis
     """
 
     camera_body_m: Floats
@@ -62,9 +81,13 @@ class Lever:
 def on_sphere(rays_body: Floats, camera_body_m: Floats, radius_m: Floats | float) -> Floats:
     """Return (N, 3) intersections of rays from the camera with a sphere about the bearing center, in the body frame.
 
-    radius_m : of one sphere, or (N,) of one for each ray
     |c + s u| = R gives s = -c.u + sqrt((c.u)^2 - c.c + R^2). No attitude is needed: the sphere is the same in every
     attitude. Raises ValueError if the camera is outside the sphere.
+
+    Parameters
+    ----------
+    radius_m
+        Of one sphere, or (N,) of one for each ray
     """
     along = rays_body @ camera_body_m
     discriminant = along**2 - camera_body_m @ camera_body_m + radius_m**2

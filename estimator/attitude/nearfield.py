@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, on_sphere, on_surface, project
 from estimator.attitude.solvers import quest
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.least_squares import cholesky_solve, normal_equations
 from estimator.core.least_squares import step as least_squares_step
@@ -130,9 +130,13 @@ def _fitted_rotation(
 ) -> tuple[float, float, Floats]:
     """The focal ratio, the length of the last step, and the covariance of rotation and logarithm of the ratio.
 
-    R : (3, 3) cam_from_lab, updated in place
     The step's length is NaN if the rays do not determine the unknowns: the LEDs lie in one direction from the bearing,
     about which any rotation fits.
+
+    Parameters
+    ----------
+    R
+        (3, 3) cam_from_lab, updated in place
     """
     unknowns = 4 if with_focal else 3
     normal = np.empty((unknowns + 1, unknowns + 1))
@@ -212,9 +216,13 @@ def _wahba(
 ) -> Rotation:
     """Solve body_from_lab from points in body axes and in the lab, by their directions from the bearing center.
 
-    distance_m : (N,) distance of each point from the camera
     A ray error of sigma at the camera displaces the point by sigma * distance, and its direction from the center by
     sigma * distance / radius, which sets the weights.
+
+    Parameters
+    ----------
+    distance_m
+        (N,) distance of each point from the camera
     """
     radius = np.linalg.norm(point_body_m, axis=1)
     target = position_m / np.linalg.norm(position_m, axis=1, keepdims=True)
@@ -233,13 +241,17 @@ def _with_covariance(
 ) -> tuple[Rotation, Floats]:
     """Return a solution of _wahba with its (3, 3) covariance in body axes, from the noise of the rays.
 
-    by_ray_m      : (N, 3, 3) dp/du, the derivative of a point p with respect to its ray u
-    by_rotation_m : (N, 3) derivative of the point's distance along u with respect to the attitude; 0 where the method
-        does not use the attitude to place the point
-
     At the minimum of Wahba's loss the gradient vanishes, sum(k a x d) = 0 with a = A P / |P|, d = p / |p| and weight k.
     To first order, ray noise du causes a rotation w that keeps it zero:
     sum(k [(a.d) I - a d']) w = sum(k a x (I - d d') dp / |p|), dp = by_ray du + u (by_rotation . w). Derived here.
+
+    Parameters
+    ----------
+    by_ray_m
+        (N, 3, 3) dp/du, the derivative of a point p with respect to its ray u
+    by_rotation_m
+        (N, 3) derivative of the point's distance along u with respect to the attitude; 0 where
+        the method does not use the attitude to place the point
     """
     radius = np.linalg.norm(point_body_m, axis=1)
     d = point_body_m / radius[:, None]
@@ -286,8 +298,13 @@ def thesis_points(
 
     R is the height of the believed surface above the bearing, M the camera's distance from the bearing along the
     boresight.
-    sine    : correct the error in eq. 43, (x, y) = (R - M) sin a: the point is then on its ray, R - M from the camera
     Raises ValueError if eq. 44 has no root.
+
+    Parameters
+    ----------
+    sine
+        Correct the error in eq. 43, (x, y) = (R - M) sin a: the point is then on its ray, R - M
+        from the camera
     """
     boresight_body = lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])
     height_m = on_surface(np.array([[0.0, 0.0, 1.0]]), np.zeros(3), leds)[0, 2]
@@ -510,9 +527,13 @@ TANGENT_SOLVERS = ("rotation_only", "pnp")
 def fitted_sigma_rad(solver: str, rays_cam: Floats, pixel_rad: Floats) -> Floats:
     """Return the (N,) error per axis of the quantity that a solver fits: tangents or unit vectors.
 
-    pixel_rad : (N,) centroid error over the focal length
     At an angle a off the boresight a change of the tangent rotates the ray by cos^2 a of it in the radial direction
     and by cos a of it in the tangential one. The ray's error is the rms of both.
+
+    Parameters
+    ----------
+    pixel_rad
+        (N,) centroid error over the focal length
     """
     if solver in TANGENT_SOLVERS:
         return pixel_rad

@@ -15,11 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.motion import covariance_of, error_gain, streak_factor
 from estimator.attitude.nearfield import tangent_jacobian
-from estimator.attitude.rate import aligned, chords, inliers, inverses
-from estimator.core.arrays import Floats
+from estimator.attitude.rate import (
+    aligned,
+    chords,
+    covariance_of,
+    error_gain,
+    inliers,
+    inverses,
+    streak_factor,
+)
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.core.types import Centroids, RateEstimate
 
 MAX_STEPS = 25
@@ -53,10 +60,19 @@ def fit(
 ) -> Fit:
     """Fit attitude and rate to K centroids and the places (K, 3) of their lights, from a start of both.
 
-    place_ref   : unit vectors of stars, or LEDs from the bearing, m
-    lever_cam_m : (3,) the camera's arm, in camera axes; zeros for stars
-    exposure_s  : None: the streaks are not used
-    Raises ValueError if the lights do not determine the attitude, or if the fit does not converge.
+    Parameters
+    ----------
+    place_ref
+        Unit vectors of stars, or LEDs from the bearing, m
+    lever_cam_m
+        (3,) the camera's arm, in camera axes; zeros for stars
+    exposure_s
+        None: the streaks are not used
+
+    Raises
+    ------
+    ValueError
+        If the lights do not determine the attitude, or if the fit does not converge.
     """
     cam_from_ref, rate = start
     delay_s = camera.row_delays_s(centroids.xy_px)
@@ -133,8 +149,14 @@ def rate_covariance_rad2(
 ) -> Floats:
     """(3, 3) covariance of an attitude by the error of the rate with which its K lights were put at the middle row.
 
-    centroids : as they are found, with total errors;  jacobian : (K, 2, 3) of the tangents by a small rotation
     An error of the rate moves the tangents by t_i J_i times it, which weighted least squares takes for a rotation.
+
+    Parameters
+    ----------
+    centroids
+        As they are found, with total errors
+    jacobian
+        (K, 2, 3) of the tangents by a small rotation
     """
     information = camera.focal_px**2 * np.linalg.inv(covariance_of(centroids))
     weighted = np.swapaxes(jacobian, 1, 2) @ information

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude import wahba as kernel
 from estimator.core import checks
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.vectors import quaternion_xyzw
 
 Solver = Callable[..., Rotation]

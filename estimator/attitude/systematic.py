@@ -12,16 +12,23 @@ from typing import NamedTuple
 import numpy as np
 
 from estimator.attitude.nearfield import tangent_gradients, tangent_jacobian
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 
 
 class Geometry(NamedTuple):
     """K rays as a solution sees them, in camera axes.
 
-    jacobian : (K, 2, 3) derivative of the tangents (x / z, y / z) by a small rotation; (K, 2, 4) `with_focal`
-    gradient : (K, 2, 3) derivative of the tangents by a displacement of the LED, 1/m; of a star's direction
-    tangent  : (K, 2) x / z and y / z
+    Attributes
+    ----------
+    jacobian
+        (K, 2, 3) derivative of the tangents (x / z, y / z) by a small rotation; (K, 2, 4)
+        `with_focal`
+    gradient
+        (K, 2, 3) derivative of the tangents by a displacement of the LED, 1/m; of a star's
+        direction
+    tangent
+        (K, 2) x / z and y / z
     """
 
     jacobian: Floats
@@ -54,7 +61,10 @@ def from_independent(view: Geometry, sigma_rad: Floats, covariance_rad2: Floats)
 def from_common(view: Geometry, sigma_rad: Floats, error_rad: Floats) -> Floats:
     """(P, P) covariance of a least-squares rotation from M errors that all rays share.
 
-    error_rad : (M, K, 2) change of the tangents by one standard deviation of each
+    Parameters
+    ----------
+    error_rad
+        (M, K, 2) change of the tangents by one standard deviation of each
     """
     rotation = np.einsum("kai,mki->ma", response(view, sigma_rad), error_rad)
     return np.asarray(rotation.T @ rotation)
@@ -99,13 +109,22 @@ def with_survey(
 ) -> tuple[Floats, Floats]:
     """The (3, 3) covariance of an attitude with its errors as they are, and the part that successive frames share.
 
-    covariance_rad2 : of the solver, for independent errors of sigma_rad (K,), equal in all directions
-    noise_rad2      : (K, 2, 2) of the tangents in one frame;  own_rad2 : of each light's survey
-    common_rad      : (M, K, 2) change of the tangents by one standard deviation of each error that all lights share
-    fits_focal      : whether the focal length was fitted with the attitude, from the same lights
-
     The errors are propagated through the least-squares solution of the tangents, whose covariance is S = L L'. A solver
     with the covariance L_0 L_0' is taken to respond as that solution does after the rotation L_0 L^-1.
+
+    Parameters
+    ----------
+    covariance_rad2
+        Of the solver, for independent errors of sigma_rad (K,), equal in all directions
+    noise_rad2
+        (K, 2, 2) of the tangents in one frame
+    own_rad2
+        Of each light's survey
+    common_rad
+        (M, K, 2) change of the tangents by one standard deviation of each error that all lights
+        share
+    fits_focal
+        Whether the focal length was fitted with the attitude, from the same lights
     """
     solver = np.linalg.cholesky(covariance_rad2)
     least_squares = np.linalg.cholesky(from_independent(view, sigma_rad, isotropic(sigma_rad)))
@@ -128,10 +147,16 @@ def with_focal_error(
 ) -> tuple[Floats, Floats | None]:
     """The (3, 3) covariance of an attitude with the error of the focal length as it is, and that part alone.
 
-    covariance_rad2 : with that error, `focal_error_px`, as independent from star to star
-    xy_px, seen_cam : (K, 2) centroids and (K, 3) unit vectors of their stars in camera axes
-    sigma_rad       : (K,) on which the covariance is based
     None in place of the part if the focal length is known exactly.
+
+    Parameters
+    ----------
+    covariance_rad2
+        With that error, `focal_error_px`, as independent from star to star
+    xy_px, seen_cam
+        (K, 2) centroids and (K, 3) unit vectors of their stars in camera axes
+    sigma_rad
+        (K,) on which the covariance is based
     """
     if not camera.focal_sigma:
         return covariance_rad2, None

@@ -20,7 +20,7 @@ from math import isfinite, sqrt
 import numpy as np
 
 from estimator.core import least_squares
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.vectors import rotate_in_place
 
@@ -60,7 +60,10 @@ def weights(sigma_rad: Floats) -> Floats:
 def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
     """Return the attitude profile (3, 3) B = sum(w cam ref^T) / sum(w).
 
-    Raises ValueError for directions that are not unit vectors or do not determine a rotation.
+    Raises
+    ------
+    ValueError
+        For directions that are not unit vectors or do not determine a rotation.
     """
     if len(cam) < 2:
         raise ValueError(

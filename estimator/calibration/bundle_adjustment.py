@@ -25,7 +25,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import bsr_array, csr_array
 from scipy.spatial.transform import Rotation
 
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import Floats, Ints
 
 # Newton decrement g'N^-1 g at convergence: the squared step in standard deviations. Small enough for a relative
 # accuracy of 1e-9 in lengths.
@@ -56,7 +56,10 @@ class Sightings:
 class Assumed(NamedTuple):
     """Lever and focal length as they are known without the frames; they enter the adjustment as measurements.
 
-    camera_body_m, lever_sigma_m : (3,) m, and the standard deviation of each axis;  focal_px, focal_sigma_px
+    Attributes
+    ----------
+    camera_body_m, lever_sigma_m
+        (3,) m, and the standard deviation of each axis;  focal_px, focal_sigma_px
     """
 
     camera_body_m: Floats
@@ -82,14 +85,25 @@ class Assumed(NamedTuple):
 class Bundle:
     """Parameters of the model: everything that the pixels depend on, and what is known of them without the pixels.
 
-    position_m       : (N, 3) lights in the lab frame
-    R_body_from_lab  : (F, 3, 3)
-    camera_body_m    : (3,) entrance pupil in the body frame
-    R_cam_from_body  : (3, 3), fixed: its rotation is equivalent to one of every body_from_lab and of the lever
-    lens             : (8,) focal_px, center x and y in px, k1, k2, p1, p2, k3
-    free_lens        : the first free_lens elements of `lens` are unknowns
-    map_m, map_sigma_m : (N, 3) prior positions of the lights, and their standard deviation per axis; inf for no prior
-    assumed          : prior lever and focal length; None for no prior
+    Attributes
+    ----------
+    position_m
+        (N, 3) lights in the lab frame
+    R_body_from_lab
+        (F, 3, 3)
+    camera_body_m
+        (3,) entrance pupil in the body frame
+    R_cam_from_body
+        (3, 3), fixed: its rotation is equivalent to one of every body_from_lab and of the lever
+    lens
+        (8,) focal_px, center x and y in px, k1, k2, p1, p2, k3
+    free_lens
+        The first free_lens elements of `lens` are unknowns
+    map_m, map_sigma_m
+        (N, 3) prior positions of the lights, and their standard deviation per axis; inf for no
+        prior
+    assumed
+        Prior lever and focal length; None for no prior
     """
 
     position_m: Floats
@@ -113,8 +127,13 @@ class Bundle:
     def apply_step(self, led: Floats, rest: Floats) -> Bundle:
         """The bundle after a step.
 
-        led  : (3 N,) changes of the positions, m
-        rest : 3 F small rotations in body axes (rad), 3 changes of the lever (m), changes of the free lens elements
+        Parameters
+        ----------
+        led
+            (3 N,) changes of the positions, m
+        rest
+            3 F small rotations in body axes (rad), 3 changes of the lever (m), changes of the
+            free lens elements
         """
         rotation_size = 3 * len(self.R_body_from_lab)
         lens = self.lens.copy()
@@ -135,8 +154,14 @@ class Bundle:
 class Linearization(NamedTuple):
     """Weighted residuals and Jacobian: both divided by sigma_px.
 
-    residual : (M, 2);  by_led, by_rotation : (M, 2, 3) derivatives of the pixel with respect to position and rotation
-    by_shared : (M, 2, 3 + free_lens) with respect to the lever and the free lens elements
+    Attributes
+    ----------
+    residual
+        (M, 2)
+    by_led, by_rotation
+        (M, 2, 3) derivatives of the pixel with respect to position and rotation
+    by_shared
+        (M, 2, 3 + free_lens) with respect to the lever and the free lens elements
     """
 
     residual: Floats
@@ -243,7 +268,16 @@ def _by_coefficients(tangent: Floats) -> Floats:
 class NormalEquations(NamedTuple):
     """The normal equations, with lights and the R other unknowns (rotations, lever, lens) in separate blocks.
 
-    by_led : (N, 3, 3);  coupling : (R, 3 N) sparse;  rest : (R, R);  rhs_led, rhs_rest : right-hand sides
+    Attributes
+    ----------
+    by_led
+        (N, 3, 3)
+    coupling
+        (R, 3 N) sparse
+    rest
+        (R, R)
+    rhs_led, rhs_rest
+        right-hand sides
     """
 
     by_led: Floats
@@ -331,8 +365,16 @@ def _free_gauge(bundle: Bundle) -> Floats:
 class ReducedSystem(NamedTuple):
     """The reduced system after elimination of the lights.
 
-    inverse_led : inverse blocks of the lights;  elimination : (3 N, R) their product with the transposed coupling
-    factor      : Cholesky factor of the scaled (R, R) Schur complement;  scale : (R,) its scaling to a unit diagonal
+    Attributes
+    ----------
+    inverse_led
+        Inverse blocks of the lights
+    elimination
+        (3 N, R) their product with the transposed coupling
+    factor
+        Cholesky factor of the scaled (R, R) Schur complement
+    scale
+        (R,) its scaling to a unit diagonal
     """
 
     inverse_led: bsr_array
@@ -344,9 +386,16 @@ class ReducedSystem(NamedTuple):
 def eliminate_lights(terms: NormalEquations, gauge: Floats, damping: float) -> ReducedSystem:
     """Eliminate the lights (Schur complement), with Marquardt's damping and the gauge freedoms held.
 
-    gauge : (R, 4 or 0) gauge freedoms without a constraint. Their outer product is added as a penalty, which makes the
-        matrix regular and changes no other move
-    Raises LinAlgError if the lever or the lens is undetermined as well.
+    Parameters
+    ----------
+    gauge
+        (R, 4 or 0) gauge freedoms without a constraint. Their outer product is added as a
+        penalty, which makes the matrix regular and changes no other move
+
+    Raises
+    ------
+    LinAlgError
+        If the lever or the lens is undetermined as well.
     """
     blocks = terms.by_led * np.where(np.eye(3, dtype=bool), 1 + damping, 1.0)
     lights = len(blocks)
@@ -386,9 +435,17 @@ def adjust(
 ) -> tuple[Bundle, bool]:
     """Minimize the loss over all unknowns by Levenberg-Marquardt; returns the bundle and whether it converged.
 
-    width     : of Cauchy's loss in sigmas; inf for least squares
-    decrement : Newton decrement at which the iteration ends
-    Raises LinAlgError if an unknown is undetermined.
+    Parameters
+    ----------
+    width
+        Of Cauchy's loss in sigmas; inf for least squares
+    decrement
+        Newton decrement at which the iteration ends
+
+    Raises
+    ------
+    LinAlgError
+        If an unknown is undetermined.
     """
     damping = 1e-4
     cost, weight = bundle.cost(sightings, width)
@@ -469,10 +526,14 @@ def covariance_in_gauge(
 ) -> Covariances:
     """The covariance in a given gauge, without the error of the gauge itself.
 
-    fixed_led, fixed_rest : (3 N, 4), (R, 4) the matrix H of the four linear gauge constraints H'd = 0
     With Z the gauge freedoms, any generalized inverse Q of the normal matrix becomes T Q T', T = I - Z (H'Z)^-1 H'
     (Baarda's S-transformation). Only the diagonal blocks are computed. Raises LinAlgError if an unknown is
     undetermined.
+
+    Parameters
+    ----------
+    fixed_led, fixed_rest
+        (3 N, 4), (R, 4) the matrix H of the four linear gauge constraints H'd = 0
     """
     led_free, rest_free = gauge_freedoms(bundle)
     reduced, rest = _inverse(terms, bundle)

@@ -40,8 +40,8 @@ from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Covariances, Sightings
 from estimator.calibration.gauge import Gauge, Subset
 from estimator.core import checks
-from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats, Ints
 
 # Cauchy's width for 95 % efficiency under Gaussian noise (Holland & Welsch 1977), in sigmas.
 CAUCHY = 2.385
@@ -74,8 +74,17 @@ class Unconnected(ValueError):
 class DomeFrame:
     """One frame of a survey: identified LEDs and their centroids.
 
-    led      : (K,) rows of the LED map;  xy_px : (K, 2);  sigma_px : (K,) of each coordinate
-    body_from_lab : start value, accurate to a few degrees: from an IMU, or nearfield.rotation_only with the old map
+    Attributes
+    ----------
+    led
+        (K,) rows of the LED map
+    xy_px
+        (K, 2)
+    sigma_px
+        (K,) of each coordinate
+    body_from_lab
+        Start value, accurate to a few degrees: from an IMU, or nearfield.rotation_only with the
+        old map
     """
 
     led: Ints
@@ -91,18 +100,32 @@ class DomeSurvey:
     The covariances are of errors against the truth if the start map is used as a measurement. Otherwise, or with a
     known length or a reference frame, they are relative to the gauge and do not include its error.
 
-    status         : "converged", or "stopped ..." if the iteration did not converge
-    leds           : the map with surveyed positions; lights that are not `surveyed` keep their start positions
-    surveyed       : (N,) lights seen in two or more tied frames, from different directions
-    lever, camera  : fitted; cam_from_body is the start value
-    body_from_lab  : (F,) attitudes; the start value for a frame that is not `tied`
-    tied           : (F,) frames that see two or more surveyed lights
-    outliers       : (K, 2) frame, and row in it, of the sightings rejected as wrong identifications
     led_covariance_m2 (N, 3, 3), attitude_covariance_rad2 (F, 3, 3) in body axes: NaN if not surveyed or tied
     lever_covariance_m2 (3, 3), lens_covariance: of the fitted elements of focal_px, center x and y, k1, k2, p1, p2
-    rms_px         : of the residual coordinates
-    misfit         : sqrt(chi-square / redundancy), near 1 if sigma_px is correct
-    noise_scale    : factor by which sigma_px was multiplied; 1 unless the noise is fitted
+
+    Attributes
+    ----------
+    status
+        "converged", or "stopped ..." if the iteration did not converge
+    leds
+        The map with surveyed positions; lights that are not `surveyed` keep their start
+        positions
+    surveyed
+        (N,) lights seen in two or more tied frames, from different directions
+    lever, camera
+        Fitted; cam_from_body is the start value
+    body_from_lab
+        (F,) attitudes; the start value for a frame that is not `tied`
+    tied
+        (F,) frames that see two or more surveyed lights
+    outliers
+        (K, 2) frame, and row in it, of the sightings rejected as wrong identifications
+    rms_px
+        Of the residual coordinates
+    misfit
+        sqrt(chi-square / redundancy), near 1 if sigma_px is correct
+    noise_scale
+        Factor by which sigma_px was multiplied; 1 unless the noise is fitted
     """
 
     status: str
@@ -149,23 +172,37 @@ def survey(
 ) -> DomeSurvey:
     """Survey the dome: least squares over all lights and attitudes, the lever and the lens.
 
-    known_length    : rows of two lights and the distance between them in m; fixes the scale
-    fit_distortion  : also fit k1, k2, p1, p2; k3 has no visible effect in a narrow field
-    loss            : "linear", or "cauchy", which tolerates wrong identifications: iteratively reweighted, for a noise
-        that shrinks with the median residual; then residuals beyond 5 sigma are rejected and the rest is fitted by
-        least squares, so that the covariance is that of a least-squares fit. Errors of a light seen only twice are hard
-        to detect
-    reference_frame : row of the frame whose start attitude fixes the lab frame, instead of the start map
-    leds_sigma_m    : standard deviation of the start map per axis; the map is then used as a measurement, which the
-        weakly determined moves need. inf: the map is only a start value
-    fit_noise       : multiply sigma_px by the misfit and fit again until the misfit is 1 (estimation of a variance
-        component: Koch 1999, Parameter Estimation and Hypothesis Testing in Linear Models, section 3.6). The weights of
-        pixels and map are then right even if the noise is known only up to a factor
-    assumed         : lever and focal length with standard deviations, used as measurements beside the map. Many frames
-        determine both better. Few frames hardly determine them: a wrong lens could then fit misidentified lights
+    Parameters
+    ----------
+    known_length
+        Rows of two lights and the distance between them in m; fixes the scale
+    fit_distortion
+        Also fit k1, k2, p1, p2; k3 has no visible effect in a narrow field
+    loss
+        "linear", or "cauchy", which tolerates wrong identifications: iteratively reweighted,
+        for a noise that shrinks with the median residual; then residuals beyond 5 sigma are
+        rejected and the rest is fitted by least squares, so that the covariance is that of a
+        least-squares fit. Errors of a light seen only twice are hard to detect
+    reference_frame
+        Row of the frame whose start attitude fixes the lab frame, instead of the start map
+    leds_sigma_m
+        Standard deviation of the start map per axis; the map is then used as a measurement,
+        which the weakly determined moves need. inf: the map is only a start value
+    fit_noise
+        Multiply sigma_px by the misfit and fit again until the misfit is 1 (estimation of a
+        variance component: Koch 1999, Parameter Estimation and Hypothesis Testing in Linear
+        Models, section 3.6). The weights of pixels and map are then right even if the noise is
+        known only up to a factor
+    assumed
+        Lever and focal length with standard deviations, used as measurements beside the map.
+        Many frames determine both better. Few frames hardly determine them: a wrong lens could
+        then fit misidentified lights
 
-    Raises ValueError in one line if the frames are malformed or do not determine the unknowns, Unconnected if they form
-    several groups.
+    Raises
+    ------
+    ValueError
+        In one line if the frames are malformed or do not determine the unknowns, Unconnected if
+        they form several groups.
     """
     if loss not in LOSSES:
         raise ValueError(f"survey: unknown loss {loss!r}; allowed: {', '.join(LOSSES)}")
@@ -207,7 +244,10 @@ class _Fit(NamedTuple):
 def _fit(start: Bundle, sightings: Sightings, gauge: Gauge, width: float, fit_noise: bool) -> _Fit:
     """Fit the connected subset of the observations in the given gauge.
 
-    Raises ValueError if the lever or the lens is undetermined.
+    Raises
+    ------
+    ValueError
+        If the lever or the lens is undetermined.
     """
     covariances = None
     scale = 1.0
@@ -418,9 +458,16 @@ def connected_subset(full: Bundle, sightings: Sightings, keep: np.ndarray) -> Su
 def ray_angles(position_m: np.ndarray, camera_m: np.ndarray, frame: Ints, led: Ints) -> np.ndarray:
     """(N,) rms angle of the rays to each light from their main direction, by which they determine its distance.
 
-    position_m : (N, 3) lights;  camera_m : (F, 3) camera positions;  frame, led : (K,) rows of the sightings
-
     1 minus the largest eigenvalue of the mean of u u' is the mean sin^2 of these angles. Without a sighting it is 0.
+
+    Parameters
+    ----------
+    position_m
+        (N, 3) lights
+    camera_m
+        (F, 3) camera positions
+    frame, led
+        (K,) rows of the sightings
     """
     ray = position_m[led] - camera_m[frame]
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)

@@ -14,14 +14,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration.bundle_adjustment import Bundle, Sightings
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import Floats, Ints
 
 
 @dataclass(frozen=True, slots=True)
 class Subset:
     """The connected subset of lights, frames and sightings, renumbered from 0.
 
-    led, frame, index : their rows in the full set of lights, frames and sightings
+    Attributes
+    ----------
+    led, frame, index
+        Their rows in the full set of lights, frames and sightings
     """
 
     bundle: Bundle
@@ -43,11 +46,19 @@ class Subset:
 class Gauge:
     """The constraints that fix the rotation and the scale of the lab frame.
 
-    length : rows of two lights and the distance between them in m; None: the start map's mean size
-    frame  : row of the reference frame; None: the start map's mean orientation
-    map_m, R_body_from_lab : (N, 3), (F, 3, 3) start values
+    Attributes
+    ----------
+    length
+        Rows of two lights and the distance between them in m; None: the start map's mean size
+    frame
+        Row of the reference frame; None: the start map's mean orientation
+    map_m, R_body_from_lab
+        (N, 3), (F, 3, 3) start values
 
-    Raises ValueError for rows outside of the map or the frames.
+    Raises
+    ------
+    ValueError
+        For rows outside of the map or the frames.
     """
 
     length: tuple[int, int, float] | None

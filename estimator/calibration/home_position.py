@@ -20,18 +20,27 @@ from estimator.attitude.dome_map import LedMap, Lever, on_surface
 from estimator.attitude.nearfield import thesis_points
 from estimator.catalog.catalog import unit
 from estimator.core import checks
-from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError, Ints
 
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
     """One frame with identified lights.
 
-    stop          : number of the vehicle's stop; the stop of the first sighting is home
-    body_from_lab : attitude from the IMU, which is zeroed at home: there the body axes are those of the lab frame
-    led           : (K,) ids, each once;  xy_px : (K, 2) centroids;  brightness : (K,) see `instrument_brightness`
+    Attributes
+    ----------
+    stop
+        Number of the vehicle's stop; the stop of the first sighting is home
+    body_from_lab
+        Attitude from the IMU, which is zeroed at home: there the body axes are those of the lab
+        frame
+    led
+        (K,) ids, each once
+    xy_px
+        (K, 2) centroids
+    brightness
+        (K,) see `instrument_brightness`
     """
 
     stop: int
@@ -45,13 +54,22 @@ class Sighting:
 class HomeCatalog:
     """LED catalog about the bearing, in the lab frame, brightest first (section 3.6.4).
 
-    id, brightness : (N,)
-    vectors        : (N, 3) unit, from the bearing
-    position_m     : (N, 3) positions by eqs 43-44: near the dome, not on it
-    covariance_m2  : (N, 3, 3) of one frame's position about its mean, over all frames; NaN for a single frame
-    samples        : (N,) number of frames averaged for position and brightness
-    epsilon_mag, epsilon_pos_m, epsilon_sep_rad : standard deviations of a brightness, of a coordinate of a position
-        and of the angle between two lights: the greatest over all lights, coordinates and pairs
+    Attributes
+    ----------
+    id, brightness
+        (N,)
+    vectors
+        (N, 3) unit, from the bearing
+    position_m
+        (N, 3) positions by eqs 43-44: near the dome, not on it
+    covariance_m2
+        (N, 3, 3) of one frame's position about its mean, over all frames; NaN for a single
+        frame
+    samples
+        (N,) number of frames averaged for position and brightness
+    epsilon_mag, epsilon_pos_m, epsilon_sep_rad
+        Standard deviations of a brightness, of a coordinate of a position and of the angle
+        between two lights: the greatest over all lights, coordinates and pairs
     """
 
     id: Ints
@@ -139,12 +157,23 @@ def calibrate(
 ) -> HomeCatalog:
     """The catalog and its epsilons by AFIT's procedure (Padro 2012, sections 3.6.3-3.6.4 and 4.4.1).
 
-    surface   : dome model, which gives R; its LEDs are not used
-    sine      : correct eq. 44, which has tan instead of sin (reference 1.2, item 11)
-    statistic : a name in DEVIATIONS: the standard deviation whose maximum is an epsilon
-    home_only : take the catalog from the frames at home, as in the thesis, with every epsilon from all frames; else
-        from the mean over all frames (the black marks of his Fig. 79), which keeps the IMU's errors at the stops
-    Raises ImageError for inconsistent sightings, or if a standard deviation is undetermined.
+    Parameters
+    ----------
+    surface
+        Dome model, which gives R; its LEDs are not used
+    sine
+        Correct eq. 44, which has tan instead of sin (reference 1.2, item 11)
+    statistic
+        A name in DEVIATIONS: the standard deviation whose maximum is an epsilon
+    home_only
+        Take the catalog from the frames at home, as in the thesis, with every epsilon from all
+        frames; else from the mean over all frames (the black marks of his Fig. 79), which keeps
+        the IMU's errors at the stops
+
+    Raises
+    ------
+    ImageError
+        For inconsistent sightings, or if a standard deviation is undetermined.
     """
     checks.each_of_type("sightings", sightings, Sighting)
     checks.of_type("camera", camera, Camera)
@@ -267,7 +296,11 @@ def _covariance(lab_m: Floats, led: Ints) -> Floats:
 def led_map(catalog: HomeCatalog, surface: LedMap) -> LedMap:
     """LED map for a tracker: the intersections of the catalog's directions from the bearing with the dome surface.
 
-    surface : provides the ellipsoid; its LEDs are not used. Raises ImageError if a direction misses it.
+    Parameters
+    ----------
+    surface
+        Provides the ellipsoid; its LEDs are not used. Raises ImageError if a direction misses
+        it.
     """
     position_m = on_surface(catalog.vectors, np.zeros(3), surface)
     outside = catalog.id[np.isnan(position_m).any(axis=1)]

@@ -26,13 +26,60 @@ from estimator.attitude.solvers import rotation
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration.bundle_adjustment import Bundle, Sightings
 from estimator.calibration.dome_survey import CAUCHY, GATE
-from estimator.calibration.magnitude_zero import MagnitudeZero, magnitude_zero
 from estimator.catalog.catalog import StarCatalog
 from estimator.core import checks
-from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError, Ints
+from estimator.core.constants import SIGMA_PER_MAD
 from estimator.core.types import Attitude, Centroids
+
+# Photometric zero point: the offset between instrumental magnitudes and catalog magnitudes.
+
+
+@dataclass(frozen=True, slots=True)
+class MagnitudeZero:
+    """Zero point: median over the stars of V minus the instrumental magnitude -2.5 log10(flux / exposure).
+
+    Attributes
+    ----------
+    sigma_mag
+        Standard deviation of the offset
+    scatter_mag
+        Of one star about the offset, mainly by its color
+    stars
+        Number of different stars
+    """
+
+    offset_mag: float
+    sigma_mag: float
+    scatter_mag: float
+    stars: int
+
+
+def magnitude_zero(instrumental_mag: Floats, v_mag: Floats, vectors_ref: Floats) -> MagnitudeZero:
+    """Zero point as the median over different stars of each star's median difference.
+
+    Colors are unknown and shift a star by some tenths of a magnitude, equally in every frame; therefore the sample is
+    the stars, not the sightings. The scatter is 1.4826 times the median absolute deviation, and the standard deviation
+    of the median is sqrt(pi / 2) times the scatter over the square root of the number of stars. Leave out stars near
+    the detection limit: only those with positive errors are detected, which biases the median.
+    """
+    checks.unit_rows("vectors_ref", vectors_ref, None)
+    if not len(vectors_ref):
+        raise ImageError("magnitude_zero: no stars; allowed: one or more")
+    for name, values in (("instrumental_mag", instrumental_mag), ("v_mag", v_mag)):
+        if not np.isfinite(checks.floats(name, values, (len(vectors_ref),))).all():
+            raise ImageError(f"{name} has a NaN or infinity; allowed: finite")
+    _, star = np.unique(vectors_ref, axis=0, return_inverse=True)
+    star = np.ravel(star)
+    difference = v_mag - instrumental_mag
+    each = np.array([np.median(difference[star == k]) for k in range(star.max() + 1)])
+    offset = float(np.median(each))
+    scatter = float(SIGMA_PER_MAD * np.median(np.abs(each - offset)))
+    return MagnitudeZero(
+        offset, float(np.sqrt(np.pi / 2 / len(each))) * scatter, scatter, len(each)
+    )
+
 
 LENS = 8  # focal_px, center x and y, k1, k2, p1, p2, k3
 LEAST_STARS = 3  # in a frame: two determine its attitude and leave only one coordinate for the lens
@@ -46,9 +93,19 @@ MIN_STAR_FRACTION = (
 class StarFrame:
     """Identified stars of one frame.
 
-    xy_px : (K, 2);  sigma_px : (K,) of each coordinate;  vectors_ref : (K, 3) unit vectors of the identified stars
-    flux, v_mag : (K,) brightness in the image and catalog magnitude, for the magnitude zero point; None without it
-    exposure_s  : of the frame
+    Attributes
+    ----------
+    xy_px
+        (K, 2)
+    sigma_px
+        (K,) of each coordinate
+    vectors_ref
+        (K, 3) unit vectors of the identified stars
+    flux, v_mag
+        (K,) brightness in the image and catalog magnitude, for the magnitude zero point; None
+        without it
+    exposure_s
+        Of the frame
     """
 
     xy_px: Floats
@@ -63,9 +120,13 @@ class StarFrame:
 class LensPrior:
     """Prior standard deviations of the lens parameters about the start camera.
 
-    center : of the principal point, as a fraction of the chip's width
-    radial, tangential : displacement by each coefficient alone in the farthest corner, as a fraction of the corner's
-        distance from the center
+    Attributes
+    ----------
+    center
+        Of the principal point, as a fraction of the chip's width
+    radial, tangential
+        Displacement by each coefficient alone in the farthest corner, as a fraction of the
+        corner's distance from the center
     """
 
     center: float = 0.05
@@ -85,15 +146,26 @@ class LensPrior:
 class FieldReport:
     """Diagnostics of a calibration.
 
-    status       : "converged", or "stopped ..." if the iteration did not converge
-    cam_from_ref : (F,) attitudes; identity for a frame that is not `tied`
-    attitude_covariance_rad2 : (F, 3, 3) in camera axes, including the lens's errors; NaN if not tied
-    tied         : (F,) frames with three or more stars
-    outliers     : (K, 2) frame, and row in it, of the stars rejected as wrong identifications
-    stars        : number of sightings used
-    rms_px       : of the residual coordinates
-    misfit       : sqrt(chi-square / degrees of freedom), near 1 if sigma_px is correct
-    magnitude    : zero point; None if the frames have no brightness
+    Attributes
+    ----------
+    status
+        "converged", or "stopped ..." if the iteration did not converge
+    cam_from_ref
+        (F,) attitudes; identity for a frame that is not `tied`
+    attitude_covariance_rad2
+        (F, 3, 3) in camera axes, including the lens's errors; NaN if not tied
+    tied
+        (F,) frames with three or more stars
+    outliers
+        (K, 2) frame, and row in it, of the stars rejected as wrong identifications
+    stars
+        Number of sightings used
+    rms_px
+        Of the residual coordinates
+    misfit
+        sqrt(chi-square / degrees of freedom), near 1 if sigma_px is correct
+    magnitude
+        Zero point; None if the frames have no brightness
     """
 
     status: str
@@ -160,7 +232,7 @@ def calibrate(
     )
 
 
-class Tracker(Protocol):
+class IdentifyingTracker(Protocol):
     """Interface of the identifying tracker: a star list and a solution for centroids. StarTracker has it."""
 
     stars: StarCatalog
@@ -170,7 +242,7 @@ class Tracker(Protocol):
 
 def self_calibrate(
     frames: Sequence[Centroids],
-    tracker: Callable[[Camera, float], Tracker],
+    tracker: Callable[[Camera, float], IdentifyingTracker],
     camera: Camera,
     focal_uncertainty: float = 0.05,
     exposure_s: float = 1.0,
@@ -178,11 +250,16 @@ def self_calibrate(
 ) -> Calibration:
     """Calibrate a camera from centroids alone: alternately identify the stars and calibrate with them.
 
-    tracker : makes a tracker from a camera and the relative uncertainty of its focal length, 0 after a calibration
-    camera  : prior knowledge: the chip, and the focal length to `focal_uncertainty`
-
     Stops when a round identifies the same stars as the one before (an equal number is not enough), or has lost too
     many (MIN_STAR_FRACTION). Raises ValueError if no frame is identified.
+
+    Parameters
+    ----------
+    tracker
+        Makes a tracker from a camera and the relative uncertainty of its focal length, 0 after
+        a calibration
+    camera
+        Prior knowledge: the chip, and the focal length to `focal_uncertainty`
     """
     checks.each_of_type("self_calibrate: frames", frames, Centroids)
     checks.of_type("self_calibrate: camera", camera, Camera)
@@ -379,8 +456,15 @@ def _eliminate_attitudes(terms: _NormalEquations, damping: float) -> tuple[Float
 def _minimize(problem: _Problem, sightings: Sightings, width: float) -> tuple[_Problem, bool]:
     """Minimize over lens and attitudes by Levenberg-Marquardt; returns the problem and whether it converged.
 
-    width : of Cauchy's loss in sigmas; inf for least squares
-    Raises ValueError if the lens is undetermined.
+    Parameters
+    ----------
+    width
+        Of Cauchy's loss in sigmas; inf for least squares
+
+    Raises
+    ------
+    ValueError
+        If the lens is undetermined.
     """
     damping = 1e-4
     cost, weight = problem.cost(sightings, width)
@@ -474,7 +558,7 @@ def _magnitude(frames: Sequence[StarFrame], keep: np.ndarray) -> MagnitudeZero |
 
 
 def _identified(
-    frames: Sequence[Centroids], tracker: Tracker, exposure_s: float
+    frames: Sequence[Centroids], tracker: IdentifyingTracker, exposure_s: float
 ) -> list[StarFrame]:
     """The frames that the tracker solves, with their identified stars."""
     identified = []

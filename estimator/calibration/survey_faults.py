@@ -21,8 +21,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import gammainccinv
 
 from estimator.attitude.dome_map import LedMap, Lever, on_surface, project
-from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats, Ints
 from estimator.core.constants import SIGMA_PER_MAD
 
 Mask = NDArray[np.bool_]
@@ -51,7 +51,12 @@ class HeldFrames:
     def shown(self, margin_px: float | Floats, apart_px: float) -> Mask:
         """(F, N) LEDs that a frame must show if they shine: not nearer to the edge than a margin, or to another LED.
 
-        margin_px : one, or (N,) of each LED;  apart_px : least distance from other LEDs, whose images may merge
+        Parameters
+        ----------
+        margin_px
+            One, or (N,) of each LED
+        apart_px
+            Least distance from other LEDs, whose images may merge
         """
         out = np.zeros((len(self.body_from_lab), len(self.leds.id)), dtype=bool)
         size_px = np.array([self.camera.width_px, self.camera.height_px])
@@ -88,8 +93,12 @@ class StrayLight:
 def dark(shown: Mask, seen: Mask) -> Ints:
     """Rows of the LEDs that never shine: seen in none of the n frames that must show them.
 
-    shown, seen : (F, N) LEDs that each frame must show, and those identified in it
     By the share p of the other LEDs' images that are detected, chance leaves one of N LEDs so in N (1 - p)^n surveys.
+
+    Parameters
+    ----------
+    shown, seen
+        (F, N) LEDs that each frame must show, and those identified in it
     """
     count = shown.sum(axis=0)
     ever = seen.any(axis=0)
@@ -103,10 +112,14 @@ def dark(shown: Mask, seen: Mask) -> Ints:
 def displaced(list_m: Floats, found_m: Floats, covariance_m2: Floats) -> tuple[Ints, float]:
     """Rows of measured LEDs that are too far from their place in the list, and the list's error about each axis, m.
 
-    covariance_m2 : (N, 3, 3) of the places found; NaN for LEDs that are not measured
     An LED at the distance d has the test value d' (s^2 I + C)^-1 d, a chi-square of three degrees of freedom, C its
     covariance. The list's error s is the one for which the median of all measured LEDs is that of the chi-square,
     2.366. An LED is displaced if its value exceeds the quantile at FALSE_ALARMS / N.
+
+    Parameters
+    ----------
+    covariance_m2
+        (N, 3, 3) of the places found; NaN for LEDs that are not measured
     """
     rows = np.flatnonzero(np.isfinite(covariance_m2).all(axis=(1, 2)))
     if not len(rows):
@@ -137,10 +150,16 @@ def stray_lights(
 ) -> list[StrayLight]:
     """Lights at rest among those that are no known LED: (M,) frames and (M, 2) pixels.
 
-    sigma_px : of a centroid;  reach_m : distance on the assumed surface within which lights may be the same
     Each ray meets the assumed surface; points within `reach_m` of one another form a group. Its light is where the
     rays of at least MIN_FRAMES frames meet, each within GATE standard deviations; other rays, of reflections and faults
     of the chip, which are not at rest in the lab, are left out.
+
+    Parameters
+    ----------
+    sigma_px
+        Of a centroid
+    reach_m
+        Distance on the assumed surface within which lights may be the same
     """
     if len(frame) < MIN_FRAMES:
         return []
@@ -217,9 +236,15 @@ def name_strays(
 class LightTable:
     """What the frames of a survey show of its LEDs.
 
-    light    : (F, N) light of each LED at unit distance, NaN if it is not identified in the frame
-    shown    : (F, N) LEDs that the frame must show if they are on
-    expected : (F, N) light that each LED is expected to give, relative, 0 if its code has it off in the frame
+    Attributes
+    ----------
+    light
+        (F, N) light of each LED at unit distance, NaN if it is not identified in the frame
+    shown
+        (F, N) LEDs that the frame must show if they are on
+    expected
+        (F, N) light that each LED is expected to give, relative, 0 if its code has it off in
+        the frame
     """
 
     light: Floats

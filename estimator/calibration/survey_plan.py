@@ -20,8 +20,8 @@ from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, p
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
 from estimator.calibration.dome_survey import CONNECTING_RAD, check_redundancy, connected_subset
-from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats, Ints
 
 Mask = NDArray[np.bool_]
 MIN_SHARED = 8  # LEDs that an attitude shares with those before it
@@ -36,9 +36,14 @@ ATTITUDE_SIGMA_RAD = 0.05  # of an attitude before its frame is adjusted: next t
 class SurveyModel:
     """What is assumed before a survey, or known from one so far.
 
-    sigma_px     : standard deviation of a centroid's coordinates
-    leds_sigma_m : standard deviation of the LEDs' assumed places about each axis
-    lever_sigma_m, focal_sigma_px : of the lever about each axis and of the focal length; inf if nothing is known
+    Attributes
+    ----------
+    sigma_px
+        Standard deviation of a centroid's coordinates
+    leds_sigma_m
+        Standard deviation of the LEDs' assumed places about each axis
+    lever_sigma_m, focal_sigma_px
+        Of the lever about each axis and of the focal length; inf if nothing is known
     """
 
     camera: Camera
@@ -75,9 +80,16 @@ class SurveyModel:
 class SurveyAccuracy:
     """Standard deviations that a survey leaves, or will leave.
 
-    measured       : (N,) LEDs that are surveyed
-    led_sigma_m    : (N,) rms of the three axes; the map's for LEDs that are not measured
-    lever_sigma_m  : (3,);  lens_sigma : of focal_px, center x and y, and of k1, k2, p1, p2 if they are fitted
+    Attributes
+    ----------
+    measured
+        (N,) LEDs that are surveyed
+    led_sigma_m
+        (N,) rms of the three axes; the map's for LEDs that are not measured
+    lever_sigma_m
+        (3,)
+    lens_sigma
+        Of focal_px, center x and y, and of k1, k2, p1, p2 if they are fitted
     """
 
     measured: Mask
@@ -96,8 +108,15 @@ def predict(
 ) -> SurveyAccuracy:
     """The errors that a survey will leave, from the Fisher information of the LEDs seen (F, N) at F attitudes.
 
-    free_lens : number of lens elements that it fits: 3, or 7 with the distortion
-    Raises ValueError if the attitudes do not determine the unknowns.
+    Parameters
+    ----------
+    free_lens
+        Number of lens elements that it fits: 3, or 7 with the distortion
+
+    Raises
+    ------
+    ValueError
+        If the attitudes do not determine the unknowns.
     """
     bundle, sightings = _bundle(model, body_from_lab, seen, free_lens)
     subset = connected_subset(bundle, sightings, np.ones(len(sightings.led), dtype=bool))
@@ -155,9 +174,6 @@ def choose(
 ) -> list[int]:
     """Rows of up to `count` candidate attitudes to hold next, the most useful first.
 
-    candidates, shown : C attitudes body_from_lab, and the (C, N) LEDs that each shows
-    held, seen        : F attitudes of frames taken before, and the (F, N) LEDs identified in them
-
     Greedy: each attitude is the one that most reduces the sum of the variances of all LEDs, the unseen ones included
     (A-optimality: Pukelsheim 2006, Optimal Design of Experiments, chapter 6). With P_i the covariance of LED i, B_i its
     2 x 3 rows of the Jacobian and A those of the attitude, the reduction is the sum over i of tr(P_i B_i' W_ii B_i
@@ -167,6 +183,13 @@ def choose(
     by the rms angle PLANNED_RAD or more, if any attitude has LEAST_CROSSING of these, else any LEDs. The reductions
     hardly grow from choice to choice, so that a candidate is evaluated again only while its last value is above the
     best (lazy greedy: Minoux 1978).
+
+    Parameters
+    ----------
+    candidates, shown
+        C attitudes body_from_lab, and the (C, N) LEDs that each shows
+    held, seen
+        F attitudes of frames taken before, and the (F, N) LEDs identified in them
     """
     if np.shape(shown) != (len(candidates), len(model.leds.id)):
         raise ValueError(

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from estimator.core import checks
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import Floats, ImageError, Ints
 from estimator.core.constants import (
     DAY_S,
     J2000,
@@ -31,7 +31,6 @@ from estimator.core.constants import (
     SUN_DEFLECTION_RAD,
     TT_MINUS_UTC_S,
 )
-from estimator.core.errors import ImageError
 
 EPOCHS_YR = 1800.0, 2200.0  # allowed: linear proper motions are good for a century or two
 
@@ -40,8 +39,13 @@ EPOCHS_YR = 1800.0, 2200.0  # allowed: linear proper motions are good for a cent
 class StarCatalog:
     """Stars as given in the file, at its epoch in the ICRS, brightest first.
 
-    id : (N,); vectors : (N, 3) unit; drift_rad_yr : (N, 3) proper motion, in the tangent plane; parallax_rad : (N,);
-    v_mag : (N,); epoch_yr : the Julian year of the vectors
+    Attributes
+    ----------
+    id
+        (N,); vectors : (N, 3) unit; drift_rad_yr : (N, 3) proper motion, in the tangent plane;
+        parallax_rad : (N,);
+    v_mag
+        (N,); epoch_yr : the Julian year of the vectors
     """
 
     id: Ints
@@ -74,11 +78,15 @@ class StarCatalog:
     ) -> StarCatalog:
         """A catalog from arrays of any source, (N,) each: ICRS places at a Julian year, and magnitudes.
 
-        pm_ra_mas_yr : proper motion in right ascension times cos(dec), as Hipparcos and Gaia give it
-        id           : (N,) whole numbers; None: 1 to N in the order given
-
         The stars are sorted by brightness. Raises ImageError for arrays of other lengths, places out of range, and
         what looks like radians.
+
+        Parameters
+        ----------
+        pm_ra_mas_yr
+            Proper motion in right ascension times cos(dec), as Hipparcos and Gaia give it
+        id
+            (N,) whole numbers; None: 1 to N in the order given
         """
         count = checks.native("catalog: v_mag", v_mag, np.float64).size
         ra, dec, magnitude = (
@@ -201,7 +209,10 @@ def utc(date: object) -> datetime.datetime:
 def on_earth(time_utc: datetime.datetime) -> Observer:
     """Return the observer at the Earth's center at a UTC time (naive means UTC), from the IAU ephemeris `epv00`.
 
-    Raises ImageError without the package pyerfa, which nothing else of the estimator needs.
+    Raises
+    ------
+    ImageError
+        Without the package pyerfa, which nothing else of the estimator needs.
     """
     try:
         import erfa
@@ -264,7 +275,11 @@ def columns(
 ) -> tuple[Floats, float]:
     """Read columns of a catalog file as (len(names) + len(optional), N) numbers in the file's order, and its epoch.
 
-    optional: columns in which empty fields are allowed and become NaN. Raises ImageError if the file cannot be read.
+    Parameters
+    ----------
+    optional
+        Columns in which empty fields are allowed and become NaN. Raises ImageError if the file
+        cannot be read.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()

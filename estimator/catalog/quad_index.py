@@ -21,10 +21,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.sky_index import SkyIndex
-from estimator.catalog.spatial_grid import cell_of
+from estimator.catalog.sky_index import SkyIndex, cell_of
 from estimator.core import vectors
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 
 PER_CIRCLE = 10  # stars of quads in a circle as high as the field
@@ -41,8 +40,14 @@ ACROSS = 0.87
 class QuadIndex(NamedTuple):
     """Quads by the cell of their code. A named tuple, so that compiled code accepts it.
 
-    star : (Q, 4) rows of the sky index: A, B, C, D;  code : (Q, 4)
-    first : (SIDE^4 + 1,) quads first[k] to first[k + 1] are in cell k
+    Attributes
+    ----------
+    star
+        (Q, 4) rows of the sky index: A, B, C, D
+    code
+        (Q, 4)
+    first
+        (SIDE^4 + 1,) quads first[k] to first[k + 1] are in cell k
     """
 
     star: NDArray[np.int32]

@@ -13,7 +13,7 @@ import numpy as np
 
 from estimator.catalog.catalog import utc
 from estimator.core import checks
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.constants import (
     ARCSEC_RAD,
     DAY_S,
@@ -34,12 +34,21 @@ RAISING_STEPS = 6
 class SiteAir:
     """The air over a site, as a tracker there knows it.
 
-    latitude_deg, longitude_deg : geodetic, east positive
-    epoch        : UTC of t = 0, naive or aware
-    pressure_hpa, temperature_c : at the site
-    wavelength_m : of the refracted light
+    Attributes
+    ----------
+    latitude_deg, longitude_deg
+        Geodetic, east positive
+    epoch
+        UTC of t = 0, naive or aware
+    pressure_hpa, temperature_c
+        At the site
+    wavelength_m
+        Of the refracted light
 
-    Raises ImageError for a number out of range or a date that cannot be read.
+    Raises
+    ------
+    ImageError
+        For a number out of range or a date that cannot be read.
     """
 
     latitude_deg: float

@@ -12,17 +12,133 @@ only the cells of one face; stars near an edge are therefore stored on more than
 
 from __future__ import annotations
 
-from math import sqrt
+from math import pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog import spatial_grid
-from estimator.catalog.spatial_grid import cell_of
-from estimator.core.arrays import Floats
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.jit import jit
+
+# Spatial grid for searches by direction: the cube [-1, 1]^3 about the unit sphere, divided into
+# cells.
+
+
+MAX_SIDE = 64  # 64^3 cells: a table of a megabyte
+
+
+class Cells(NamedTuple):
+    """Stars by the cell of the cube [-1, 1]^3 that holds their direction. A named tuple, for compiled code.
+
+    Attributes
+    ----------
+    side
+        Cells along an edge
+    first
+        (side^3 + 1,) first entry of each cell in `row`
+    row
+        (N,) rows of the vectors, cell after cell
+    """
+
+    side: int
+    first: NDArray[np.int32]
+    row: NDArray[np.int32]
+
+
+def build_grid(vectors: Floats) -> Cells:
+    """Build the cells of (N, 3) unit vectors, with about one star in each cell that the sphere intersects.
+
+    The sphere intersects about 4 pi / (2 / side)^2 = pi side^2 cells.
+    """
+    side = min(max(int(sqrt(len(vectors) / pi)), 2), MAX_SIDE)
+    return Cells(side, *_sorted(vectors, side))
+
+
+@jit
+def _sorted(vectors: Floats, side: int) -> tuple[NDArray, NDArray]:
+    """Sort the stars by cell (counting sort); returns the fields `first` and `row` of Cells."""
+    first = np.zeros(side**3 + 1, np.int32)
+    row = np.empty(len(vectors), np.int32)
+    cell = np.empty(len(vectors), np.int64)
+    for n in range(len(vectors)):
+        x, y, z = vectors[n]
+        cell[n] = (edge_cell(x, side) * side + edge_cell(y, side)) * side + edge_cell(z, side)
+        first[cell[n] + 1] += 1
+    for c in range(side**3):
+        first[c + 1] += first[c]
+    next_free = first[:-1].copy()
+    for n in range(len(vectors)):
+        row[next_free[cell[n]]] = n
+        next_free[cell[n]] += 1
+    return first, row
+
+
+@jit
+def cell_of(position: float, last: int) -> int:
+    """Return the cell, 0 to last, of a coordinate in units of cells, clamped to the range; 0 for NaN.
+
+    The clamp comes before the cast: casting NaN or a number too large for an integer is undefined.
+    """
+    if not position > 0:
+        return 0
+    return int(position) if position < last else last
+
+
+@jit
+def edge_cell(x: float, side: int) -> int:
+    """Return the cell along an edge that holds a coordinate in [-1, 1]."""
+    return cell_of((x + 1) / 2 * side, side - 1)
+
+
+@jit
+def within(
+    cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float, out: NDArray
+) -> int:
+    """Count the stars within a straight-line distance `chord` of (x, y, z); writes the first len(out) rows to `out`."""
+    count = 0
+    side = cells.side
+    for i in range(edge_cell(x - chord, side), edge_cell(x + chord, side) + 1):
+        for j in range(edge_cell(y - chord, side), edge_cell(y + chord, side) + 1):
+            low = (i * side + j) * side
+            begin = cells.first[low + edge_cell(z - chord, side)]
+            end = cells.first[low + edge_cell(z + chord, side) + 1]
+            for entry in range(begin, end):
+                s = cells.row[entry]
+                dx = vectors[s, 0] - x
+                dy = vectors[s, 1] - y
+                dz = vectors[s, 2] - z
+                if dx * dx + dy * dy + dz * dz <= chord * chord:
+                    if count < len(out):
+                        out[count] = s
+                    count += 1
+    return count
+
+
+@jit
+def nearest_in_grid(
+    cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float
+) -> int:
+    """Return the row of the star nearest to (x, y, z) within a straight-line distance `chord`; -1 if there is none."""
+    best = -1
+    least2 = chord * chord
+    side = cells.side
+    for i in range(edge_cell(x - chord, side), edge_cell(x + chord, side) + 1):
+        for j in range(edge_cell(y - chord, side), edge_cell(y + chord, side) + 1):
+            low = (i * side + j) * side
+            begin = cells.first[low + edge_cell(z - chord, side)]
+            end = cells.first[low + edge_cell(z + chord, side) + 1]
+            for entry in range(begin, end):
+                s = cells.row[entry]
+                dx = vectors[s, 0] - x
+                dy = vectors[s, 1] - y
+                dz = vectors[s, 2] - z
+                distance2 = dx * dx + dy * dy + dz * dz
+                if distance2 < least2:
+                    best = s
+                    least2 = distance2
+    return best
+
 
 PAIRS_PER_BIN = 8
 STARS_PER_CELL = 0.5
@@ -35,13 +151,23 @@ FACE_HALF_WIDTH = 1.2
 class SkyIndex(NamedTuple):
     """Stars, and pairs of the brightest, in bins. A named tuple, so that compiled code accepts it.
 
-    vectors : (N, 3) unit vectors, brightest star first
-    pair    : (P, 2) rows of stars, in bins of the angle between them
-    first   : (B + 1,) pairs first[k] to first[k + 1] are separated by k to k + 1 times bin_rad
-    mag     : (N,) magnitudes, increasing;  share : their density per magnitude, from mag[0] in steps of MAG_STEP
-    cell_first, cell_star : the stars of cell c are cell_star[cell_first[c] : cell_first[c + 1]]; each face of the
+    Attributes
+    ----------
+    vectors
+        (N, 3) unit vectors, brightest star first
+    pair
+        (P, 2) rows of stars, in bins of the angle between them
+    first
+        (B + 1,) pairs first[k] to first[k + 1] are separated by k to k + 1 times bin_rad
+    mag
+        (N,) magnitudes, increasing
+    share
+        Their density per magnitude, from mag[0] in steps of MAG_STEP
+    cell_first, cell_star
+        The stars of cell c are cell_star[cell_first[c] : cell_first[c + 1]]; each face of the
         cube has side x side cells
-    cells   : the stars in the cells of `spatial_grid`, for wide searches
+    cells
+        The stars in the cells of `spatial_grid`, for wide searches
     """
 
     vectors: Floats
@@ -53,7 +179,7 @@ class SkyIndex(NamedTuple):
     cell_first: NDArray[np.int32]
     cell_star: NDArray[np.int32]
     side: int
-    cells: spatial_grid.Cells
+    cells: Cells
 
     @property
     def bytes(self) -> int:
@@ -66,7 +192,11 @@ def build(
 ) -> SkyIndex:
     """Build the index of (N, 3) unit vectors, brightest first, with all pairs up to an angle.
 
-    paired : number of brightest stars that form pairs; None: all. Raises ImageError for fewer than 3 pairs.
+    Parameters
+    ----------
+    paired
+        Number of brightest stars that form pairs; None: all. Raises ImageError for fewer than 3
+        pairs.
     """
     sky = build_without_pairs(vectors, mag)
     vectors = sky.vectors[:paired]
@@ -104,7 +234,7 @@ def build_without_pairs(vectors: Floats, mag: Floats) -> SkyIndex:
     side = max(int(np.sqrt(len(vectors) / STARS_PER_CELL / 6)), 1)
     empty_pairs = np.empty((0, 2), np.int32), np.zeros(2, np.int32), np.pi
     faces = _cells(vectors, side)
-    cells = spatial_grid.build(vectors)
+    cells = build_grid(vectors)
     return SkyIndex(vectors, *empty_pairs, mag, _magnitude_density(mag), *faces, side, cells)
 
 
@@ -201,8 +331,12 @@ def nearest(
 ) -> tuple[int, float]:
     """Return the star nearest to a unit vector and its squared chord; (-1, gate^2) if none is within the gate.
 
-    gate : radians, at most 0.05
     The first four arguments are fields of a SkyIndex: passing the whole tuple would cost more than the search.
+
+    Parameters
+    ----------
+    gate
+        Radians, at most 0.05
     """
     # The largest component selects the face; the two others over it are the gnomonic coordinates.
     ax = abs(x)

@@ -1,11 +1,1 @@
 """Blobs to centroids: moments and fits of Gaussians, streaks and disks."""
-
-from estimator.core.lazy import attach
-
-# Loaded on first use: importing one module of the package does not import the others.
-__getattr__, __dir__, __all__ = attach(
-    __name__,
-    {
-        "centroid": ["CENTROIDERS"],
-    },
-)

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from estimator.centroiding import disk_fit, moments, streak_fit
 from estimator.centroiding import gaussian_fit as gaussian
 from estimator.core import checks
-from estimator.core.arrays import Floats
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.types import NO_PRIORS, Blobs, Centroids, FramePriors
 from estimator.detection.classify import streaks_px
 from estimator.detection.detect import check_pixel_type, to_native
@@ -160,7 +159,11 @@ def disk(
 def prepare(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors) -> NDArray:
     """Check a centroider's arguments, and convert the image to a type that compiled code accepts.
 
-    Raises ImageError for another type, a gain that is not above 0, or blobs beyond the image: the loops do not look.
+    Raises
+    ------
+    ImageError
+        For another type, a gain that is not above 0, or blobs beyond the image: the loops do
+        not look.
     """
     check_pixel_type(image)
     checks.of_type("blobs", blobs, Blobs)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from estimator.centroiding.moments import belongs_to_neighbor, neighbors
 from estimator.core import least_squares
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, interpolate
 
@@ -105,8 +105,12 @@ def _fit(
 ) -> None:
     """Fit one disk by Gauss-Newton, starting from `p`; leaves `out` NaN if it does not converge near its start.
 
-    pixels : (3, K) x, y and value of the pixels used
     An LED is not a perfect disk: where the residuals exceed the noise, the covariance is inflated.
+
+    Parameters
+    ----------
+    pixels
+        (3, K) x, y and value of the pixels used
     """
     count = pixels.shape[1]
     start_x = p[X]

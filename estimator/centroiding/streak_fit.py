@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from estimator.centroiding.moments import belongs_to_neighbor, neighbors
 from estimator.core import least_squares
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, interpolate
 
@@ -150,9 +150,13 @@ def _fit(
 ) -> bool:
     """Fit one streak by Gauss-Newton, starting from `p`; return False if it does not converge near its start.
 
-    pixels : (3, K) x, y and value of the pixels used
     The start is the frame's streak; it is also the mean of the priors on length, direction and width. Where the model
     does not fit (two crossing streaks) the covariance is inflated by the residuals.
+
+    Parameters
+    ----------
+    pixels
+        (3, K) x, y and value of the pixels used
     """
     count = pixels.shape[1]
     start_x = p[X]

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimator.core import checks
-from estimator.core.arrays import Floats
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.jit import jit
 
 Distortion = tuple[float, float, float, float, float]
@@ -37,14 +36,25 @@ _FIELDS = f"fov_deg from {NARROWEST_DEG} to {math.degrees(WIDEST_RAD):.0f}, or f
 class Camera:
     """A pinhole with Brown-Conrady distortion, in camera axes +x right, +y down, +z boresight.
 
-    focal_px : focal length divided by the pixel pitch
-    center_px: principal point (x, y); the center of pixel (0, 0) is (0, 0)
-    distortion: k1, k2, p1, p2, k3 in OpenCV's order
-    focal_sigma: relative standard deviation of the focal length: the error of a calibration, the same in every frame
-    row_time_s : rolling shutter: each row is exposed this long after the one above it, negative if the lower one is
-        first; 0 for a global shutter
+    Attributes
+    ----------
+    focal_px
+        Focal length divided by the pixel pitch
+    center_px
+        Principal point (x, y); the center of pixel (0, 0) is (0, 0)
+    distortion
+        k1, k2, p1, p2, k3 in OpenCV's order
+    focal_sigma
+        Relative standard deviation of the focal length: the error of a calibration, the same in
+        every frame
+    row_time_s
+        Rolling shutter: each row is exposed this long after the one above it, negative if the
+        lower one is first; 0 for a global shutter
 
-    Raises ImageError for numbers that no camera has.
+    Raises
+    ------
+    ImageError
+        For numbers that no camera has.
     """
 
     width_px: int

@@ -17,8 +17,24 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.core.arrays import Floats
-from estimator.core.errors import ImageError
+# Errors of the estimator.
+
+
+class ImageError(ValueError):
+    """The image or the calibration cannot be used. The one printable line names the fault and what is allowed."""
+
+    def __init__(self, message: object) -> None:
+        line = " ".join(str(message).split())  # it may quote a file, and a file may hold anything
+        super().__init__(
+            "".join(character if character.isprintable() else "?" for character in line)
+        )
+
+
+# Array types.
+
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 
 def known(what: str, name: object, allowed: Iterable[str]) -> None:

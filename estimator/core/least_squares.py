@@ -12,7 +12,7 @@ from math import sqrt
 
 import numpy as np
 
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 
 # A fit has converged once a step is below a hundredth of a standard deviation (its square is the fall of chi-square),
@@ -39,8 +39,11 @@ FACTORS = np.geomspace(1.0, MAX_VARIANCE_FACTOR, 60)
 def normal_equations(rows: Floats, weight: Floats, count: int, normal: Floats) -> None:
     """Fill the lower triangle of `normal` with sum(w r_i r_j) over `count` pixels.
 
-    rows : (P + 1, K) the model's derivatives with respect to its P parameters, then the residual. The last row of
-        `normal` is therefore the gradient, and its last element is chi-square
+    Parameters
+    ----------
+    rows
+        (P + 1, K) the model's derivatives with respect to its P parameters, then the residual.
+        The last row of `normal` is therefore the gradient, and its last element is chi-square
     """
     for i in range(len(rows)):
         for j in range(i + 1):
@@ -84,7 +87,10 @@ def step(normal: Floats, out: Floats) -> float:
 def cholesky(normal: Floats, min_pivot: float = 1e-12) -> bool:
     """Replace the lower triangle of N = L L^T by its Cholesky factor L; return False if N is numerically singular.
 
-    min_pivot : smallest accepted ratio of a squared pivot to the diagonal element of N
+    Parameters
+    ----------
+    min_pivot
+        Smallest accepted ratio of a squared pivot to the diagonal element of N
     """
     for i in range(len(normal)):
         diagonal = normal[i, i]
@@ -174,8 +180,12 @@ def fit_soft_l1(
     It grows as |r| beyond 1, so that a few gross errors have little effect. Levenberg-Marquardt on the weights
     1 / sqrt(1 + r^2) of iteratively reweighted least squares; slopes by differences of SLOPE_STEP times the scale.
 
-    scale : (P,) change of each parameter that changes the residuals by about as much as any other's
-    converged_fall : the fit ends at a step that lowers the loss by no more than this fraction
+    Parameters
+    ----------
+    scale
+        (P,) change of each parameter that changes the residuals by about as much as any other's
+    converged_fall
+        The fit ends at a step that lowers the loss by no more than this fraction
     """
     point = np.asarray(start, dtype=float)
     r = residual(start)

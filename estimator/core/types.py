@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.core import checks
-from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError, Ints
 from estimator.core.jit import jit
 
 
@@ -20,12 +19,21 @@ from estimator.core.jit import jit
 class FramePriors:
     """Prior information about a frame, known before it is processed.
 
-    streak_px  : (dx, dy) by which stars move over the sensor during the exposure, from the gyro; None if unknown.
-        The sign does not matter: a streak looks the same in either direction
-    saturation : smallest value of a saturated pixel
-    turn_rad   : by which stars turn about the frame's center meanwhile, of the sign of streak_px; as in Blobs
+    Attributes
+    ----------
+    streak_px
+        (dx, dy) by which stars move over the sensor during the exposure, from the gyro; None if
+        unknown. The sign does not matter: a streak looks the same in either direction
+    saturation
+        Smallest value of a saturated pixel
+    turn_rad
+        By which stars turn about the frame's center meanwhile, of the sign of streak_px; as in
+        Blobs
 
-    Raises ImageError for what are no such numbers.
+    Raises
+    ------
+    ImageError
+        For what are no such numbers.
     """
 
     streak_px: tuple[float, float] | None = None
@@ -49,9 +57,15 @@ NO_PRIORS = FramePriors()
 class RateEstimate:
     """Angular rate of the camera, with its error.
 
-    rate_rad_s : (3,) in camera axes: cam_from_ref changes by exp(-[rate] t) in the time t
-    covariance_rad2_s2 : (3, 3)
-    sign_known : False if the frame cannot tell the rate from its negative, as one frame of a global shutter
+    Attributes
+    ----------
+    rate_rad_s
+        (3,) in camera axes: cam_from_ref changes by exp(-[rate] t) in the time t
+    covariance_rad2_s2
+        (3, 3)
+    sign_known
+        False if the frame cannot tell the rate from its negative, as one frame of a global
+        shutter
     """
 
     rate_rad_s: Floats
@@ -80,8 +94,12 @@ SIGN_CHI2 = 16.0  # by which the chi-squares of both signs of a rate differ if t
 class Background:
     """Sky level and noise of an image, on a coarse grid of tile centers.
 
-    level, noise : (rows, columns) in the image's units, interpolated bilinearly between the centers
-    tile_px      : side of a tile
+    Attributes
+    ----------
+    level, noise
+        (rows, columns) in the image's units, interpolated bilinearly between the centers
+    tile_px
+        Side of a tile
     """
 
     level: Floats
@@ -93,16 +111,28 @@ class Background:
 class Blobs:
     """Connected pixels above the threshold, brightest first.
 
-    box_px    : (N, 4) x0, y0, x1, y1, both ends included
-    xy_px     : (N, 2) flux-weighted mean position of the pixels above the threshold
-    flux      : (N,) sum above the background over those pixels
-    peak      : (N,) maximum of the image in the blob
-    area_px   : (N,) number of pixels
-    background: the level and noise used for the detection
-    flag      : (N,) bits of `estimator.detection.classify.Flag`, 0 for a normal star
-    streak_px : (dx, dy) by which the frame's stars are smeared, sign arbitrary; None if they are round or too few
-    turn_rad  : rotation of the stars about the frame's center c meanwhile, from the pixels' x to y: a star at (x, y)
-        is smeared by streak_px + turn_rad (c_y - y, x - c_x)
+    Attributes
+    ----------
+    box_px
+        (N, 4) x0, y0, x1, y1, both ends included
+    xy_px
+        (N, 2) flux-weighted mean position of the pixels above the threshold
+    flux
+        (N,) sum above the background over those pixels
+    peak
+        (N,) maximum of the image in the blob
+    area_px
+        (N,) number of pixels
+    background
+        The level and noise used for the detection
+    flag
+        (N,) bits of `estimator.detection.classify.Flag`, 0 for a normal star
+    streak_px
+        (dx, dy) by which the frame's stars are smeared, sign arbitrary; None if they are round
+        or too few
+    turn_rad
+        Rotation of the stars about the frame's center c meanwhile, from the pixels' x to y: a
+        star at (x, y) is smeared by streak_px + turn_rad (c_y - y, x - c_x)
     """
 
     box_px: Ints
@@ -136,16 +166,28 @@ OPTIONAL_SHAPES = {
 class Centroids:
     """Measured positions of the blobs, brightest first: the search begins with the first ones.
 
-    xy_px    : (N, 2) x to the right and y down; the center of the first pixel is (0, 0)
-    sigma_px : (N,) standard deviation per coordinate; the root of the mean variance where x and y differ
-    flux     : (N,) above the background, in any unit
-    covariance_px2 : (N, 2, 2) from a centroider that models x and y separately (streaks), else None
-    streak_px      : (N, 2) vector of each light's streak, sign arbitrary, NaN where it is not measured; None if none is
-    streak_covariance_px2 : (N, 2, 2) of streak_px
-    moments_px2    : (N, 3) second moments xx - yy, 2 xy, xx + yy of lights that are disks; None if not measured
-
     Any array of numbers is taken; it is kept as C-contiguous float64. Raises ImageError for other shapes, or for arrays
     of different lengths; the trackers check the numbers (`check_values`).
+
+    Attributes
+    ----------
+    xy_px
+        (N, 2) x to the right and y down; the center of the first pixel is (0, 0)
+    sigma_px
+        (N,) standard deviation per coordinate; the root of the mean variance where x and y
+        differ
+    flux
+        (N,) above the background, in any unit
+    covariance_px2
+        (N, 2, 2) from a centroider that models x and y separately (streaks), else None
+    streak_px
+        (N, 2) vector of each light's streak, sign arbitrary, NaN where it is not measured; None
+        if none is
+    streak_covariance_px2
+        (N, 2, 2) of streak_px
+    moments_px2
+        (N, 3) second moments xx - yy, 2 xy, xx + yy of lights that are disks; None if not
+        measured
     """
 
     xy_px: Floats
@@ -241,10 +283,16 @@ def _first_fault(
 class StarMatch:
     """Correspondence between centroids and catalog stars.
 
-    observed : (K,) row of each centroid
-    star     : (K,) row of its catalog star
-    cam_from_ref : the attitude with which the matches were verified
-    log10_chance : log10 of the expected number of equally good chance matches over the whole search
+    Attributes
+    ----------
+    observed
+        (K,) row of each centroid
+    star
+        (K,) row of its catalog star
+    cam_from_ref
+        The attitude with which the matches were verified
+    log10_chance
+        log10 of the expected number of equally good chance matches over the whole search
     """
 
     observed: Ints
@@ -257,15 +305,26 @@ class StarMatch:
 class Attitude:
     """The tracker's solution, or the reason why there is none.
 
-    status          : "solved", or the reason why there is no attitude
-    cam_from_ref    : reference (ICRS for stars, lab for the dome) to camera, at mid-exposure (of the middle row with a
-        rolling shutter); None unless solved
-    covariance_rad2 : (3, 3) of the small rotation in camera axes; None unless solved
-    match           : the stars used; None unless solved
-    rms_px          : RMS residual of the matched centroids; NaN unless solved
-    camera          : the calibration used, fitted where it was uncertain; None unless solved
-    systematic_rad2 : (3, 3) the part of covariance_rad2 that is common to successive frames; None if there is none
-    rate            : of the camera at the attitude's time; None where neither streaks nor rows tell it
+    Attributes
+    ----------
+    status
+        "solved", or the reason why there is no attitude
+    cam_from_ref
+        Reference (ICRS for stars, lab for the dome) to camera, at mid-exposure (of the middle
+        row with a rolling shutter); None unless solved
+    covariance_rad2
+        (3, 3) of the small rotation in camera axes; None unless solved
+    match
+        The stars used; None unless solved
+    rms_px
+        RMS residual of the matched centroids; NaN unless solved
+    camera
+        The calibration used, fitted where it was uncertain; None unless solved
+    systematic_rad2
+        (3, 3) the part of covariance_rad2 that is common to successive frames; None if there is
+        none
+    rate
+        Of the camera at the attitude's time; None where neither streaks nor rows tell it
     """
 
     status: str
@@ -294,13 +353,20 @@ class Attitude:
 class FilterState:
     """State estimate of the attitude filter at one time.
 
-    body_from_ref : reference (ICRS, or lab under the dome) to body
-    bias_rad_s    : (3,) of the gyro, in body axes
-    covariance    : (N, N) of the small rotation in body axes (rad^2), of the bias (rad^2/s^2), then of `others` in
-        order; N is 6 without others
-    others        : estimates of the filter's other states by name: "scale" (3,) of the gyro's axes, "misalignment"
-        (6,) of its matrix off the diagonal, row by row (rad), "mounting" (3,) of the tracker in body axes (rad), of
-        further star cameras relative to the first "mounting_1" and so on
+    Attributes
+    ----------
+    body_from_ref
+        Reference (ICRS, or lab under the dome) to body
+    bias_rad_s
+        (3,) of the gyro, in body axes
+    covariance
+        (N, N) of the small rotation in body axes (rad^2), of the bias (rad^2/s^2), then of
+        `others` in order; N is 6 without others
+    others
+        Estimates of the filter's other states by name: "scale" (3,) of the gyro's axes,
+        "misalignment" (6,) of its matrix off the diagonal, row by row (rad), "mounting" (3,) of
+        the tracker in body axes (rad), of further star cameras relative to the first
+        "mounting_1" and so on
     """
 
     t_s: float

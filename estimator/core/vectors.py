@@ -6,7 +6,7 @@ from math import sqrt
 
 import numpy as np
 
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 
 Vector = tuple[float, float, float]

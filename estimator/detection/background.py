@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.constants import SIGMA_PER_MAD
 from estimator.core.jit import jit
 from estimator.core.types import Background
@@ -51,8 +51,11 @@ def estimate_background(image: NDArray, tile_px: int = TILE_PX) -> Background:
 def accumulator_type(pixel: np.dtype, greatest: float = np.inf) -> type:
     """Return the narrowest type that holds 16 times a pixel: narrow types process more pixels per vector instruction.
 
-    greatest : largest pixel value, if known: 12-bit pixels stored in 16 bits fit a narrower type than their own dtype
-        suggests
+    Parameters
+    ----------
+    greatest
+        Largest pixel value, if known: 12-bit pixels stored in 16 bits fit a narrower type than
+        their own dtype suggests
     """
     if pixel.kind not in "iu" or pixel.itemsize > 2:
         return np.float64
@@ -120,7 +123,10 @@ def _tiles(
 ) -> tuple[Floats, Floats]:
     """Compute level and noise of every tile from SAMPLE_ROWS of its rows.
 
-    smooth, samples : buffers; their dtypes select the types of the computation
+    Parameters
+    ----------
+    smooth, samples
+        Buffers; their dtypes select the types of the computation
     """
     height, width = image.shape
     rows = max(height // tile_px, 1)

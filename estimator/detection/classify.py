@@ -17,11 +17,91 @@ from math import atan2, cos, hypot, sin, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 from estimator.core.types import Blobs, FramePriors
 from estimator.detection.background import FILTERED_NOISE, filtered, interpolate, median
-from estimator.detection.captions import find_captions
+
+# Text burned into a picture: dates, names of cameras, exposure times.
+
+
+MIN_HEIGHT_PX = 7  # of letters; smaller ones are not read
+MIN_LETTERS = 5
+# greatest difference of their tops and base lines over the height; of brightness
+SAME_HEIGHT = 0.2
+SAME_PEAK = 0.15
+GAP = 1.5  # greatest gap of neighbors over the height: a space between words
+UNEQUAL_WIDTH = 1.25  # least ratio of the widest to the narrowest letter
+MARGIN = 0.5  # of the height: around a line of text
+
+
+@jit
+def find_captions(boxes: Ints, peak: Floats) -> NDArray[np.bool_]:
+    """Return (N,) whether a blob belongs to a line of text, from the blobs' boxes (x0, y0, x1, y1) and peaks."""
+    out = np.zeros(len(boxes), np.bool_)
+    letter = np.zeros(len(boxes), np.bool_)
+    line = np.empty(4, np.int64)
+    for n in range(len(boxes)):
+        height = boxes[n, 3] - boxes[n, 1] + 1
+        if out[n] or height < MIN_HEIGHT_PX:
+            continue
+        letter[:] = False
+        letter[n] = True
+        for side in range(4):
+            line[side] = boxes[n, side]
+        count, narrow, wide = _grow(boxes, peak, n, letter, line)
+        if count < MIN_LETTERS or wide < UNEQUAL_WIDTH * narrow:
+            continue
+        margin = MARGIN * height
+        for k in range(len(boxes)):
+            x = (boxes[k, 0] + boxes[k, 2]) / 2
+            y = (boxes[k, 1] + boxes[k, 3]) / 2
+            beside = (
+                line[0] - margin < x < line[2] + margin and line[1] - margin < y < line[3] + margin
+            )
+            out[k] |= letter[k] or (beside and boxes[k, 3] - boxes[k, 1] < 2 * height)
+    return out
+
+
+@jit
+def _grow(
+    boxes: Ints, peak: Floats, first: int, letter: NDArray, line: Ints
+) -> tuple[int, int, int]:
+    """Extend a line from its first letter, in place; return the number of letters and their extreme widths.
+
+    Parameters
+    ----------
+    letter
+        (N,) whether a blob is a letter of it
+    line
+        (4,) its box
+    """
+    top = boxes[first, 1]
+    base = boxes[first, 3]
+    height = base - top + 1
+    count = 1
+    narrow = wide = boxes[first, 2] - boxes[first, 0] + 1
+    near_px = max(SAME_HEIGHT * height, 1.5)
+    found = True
+    while found:
+        found = False
+        for m in range(len(boxes)):
+            if letter[m] or abs(boxes[m, 1] - top) > near_px or abs(boxes[m, 3] - base) > near_px:
+                continue
+            if max(boxes[m, 0] - line[2], line[0] - boxes[m, 2]) > GAP * height:
+                continue
+            if abs(peak[m] - peak[first]) > SAME_PEAK * abs(peak[first]):
+                continue
+            letter[m] = True
+            found = True
+            count += 1
+            line[0], line[1] = min(line[0], boxes[m, 0]), min(line[1], boxes[m, 1])
+            line[2], line[3] = max(line[2], boxes[m, 2]), max(line[3], boxes[m, 3])
+            width = boxes[m, 2] - boxes[m, 0] + 1
+            narrow = min(narrow, width)
+            wide = max(wide, width)
+    return count, narrow, wide
+
 
 # Sum of the four neighbors over the central pixel: about .5 for a centered Gaussian of sigma 0.4 px, 0 for a spike.
 MIN_NEIGHBOR_RATIO = 0.25
@@ -55,12 +135,20 @@ MAX_PIECES = 200
 class Flag(IntFlag):
     """Anomalies of a blob.
 
-    SATURATED : a pixel is saturated: still a star, with a less accurate position
-    HOT       : a single pixel, sharper than the optics allow: a defect or a particle hit
-    TRACK     : a line that the other blobs do not share: a particle or a satellite
-    HUGE      : too large for a star: the Moon, a lamp, the horizon
-    TEXTURE   : in a part of the frame much noisier than the rest: trees, clouds
-    TEXT      : of a line of text that is burned into the picture
+    Attributes
+    ----------
+    SATURATED
+        A pixel is saturated: still a star, with a less accurate position
+    HOT
+        A single pixel, sharper than the optics allow: a defect or a particle hit
+    TRACK
+        A line that the other blobs do not share: a particle or a satellite
+    HUGE
+        Too large for a star: the Moon, a lamp, the horizon
+    TEXTURE
+        In a part of the frame much noisier than the rest: trees, clouds
+    TEXT
+        Of a line of text that is burned into the picture
     """
 
     SATURATED = 1
@@ -145,8 +233,14 @@ def _flags(
 ) -> Ints:
     """Return the (N,) flags of each blob, from its row of `_shapes` and the streaks shared by the blobs.
 
-    field  : shared streak (dx, dy) at the center, and turn;  smeared : whether the frame has streaks
-    step   : floor of the noise, from quantization
+    Parameters
+    ----------
+    field
+        Shared streak (dx, dy) at the center, and turn
+    smeared
+        Whether the frame has streaks
+    step
+        Floor of the noise, from quantization
     """
     height, width = size
     typical_noise = max(median(noise), step)

@@ -17,7 +17,7 @@ from math import floor, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 from estimator.detection.background import accumulator_type, filtered, filtered_row, interpolate
 
@@ -35,8 +35,13 @@ ONE_TAP = np.zeros((1, 2), np.int64)
 def runs_above(image: NDArray, threshold: Floats, taps: Ints | None = None) -> Ints32:
     """Return (N, 3) y, first x and last x of the runs whose filtered value is above the threshold grid.
 
-    threshold : (rows, columns) on tile centers, interpolated bilinearly
-    taps : (K, 2) x, y offsets over which the filtered image is averaged, for streaks; None for round stars
+    Parameters
+    ----------
+    threshold
+        (rows, columns) on tile centers, interpolated bilinearly
+    taps
+        (K, 2) x, y offsets over which the filtered image is averaged, for streaks; None for
+        round stars
     """
     sum_type = accumulator_type(image.dtype, image.max() if image.dtype == np.uint16 else np.inf)
     if taps is None:
@@ -63,7 +68,11 @@ def _scan(
 ) -> int:
     """Fill `runs` and return the number of runs, which may exceed its capacity.
 
-    ring : circular buffer of filtered rows, (2 reach + 1) of them, so that each row is filtered only once
+    Parameters
+    ----------
+    ring
+        Circular buffer of filtered rows, (2 reach + 1) of them, so that each row is filtered
+        only once
     """
     height, width = image.shape
     reach = len(ring) // 2

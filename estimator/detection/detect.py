@@ -12,9 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.arrays import Floats, Ints
-from estimator.core.checks import native, number, of_type
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError, Ints, native, number, of_type
 from estimator.core.types import NO_PRIORS, Background, Blobs, FramePriors
 from estimator.detection import classify
 from estimator.detection.background import FILTERED_NOISE, estimate_background, median
@@ -25,7 +23,7 @@ from estimator.detection.components import (
     label_runs,
     runs_above,
 )
-from estimator.detection.shefex import maximum_scan, sequential_scan
+from estimator.detection.shefex_detection import maximum_scan, sequential_scan
 
 MAX_BLOBS = 20_000
 GROW_SIGMA = 3.5
@@ -507,7 +505,10 @@ def _to_blobs(
 ) -> Blobs:
     """Return the brightest accepted blobs (see `brightest_blobs`) as Blobs, without flags.
 
-    Raises ImageError for more than MAX_BLOBS accepted blobs.
+    Raises
+    ------
+    ImageError
+        For more than MAX_BLOBS accepted blobs.
     """
     box, xy, flux, peak, area, count = brightest_blobs(
         boxes, sums, min_area_px, min_total_px, min_flux_per_root_px, max_blobs

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 from estimator.core.types import NO_PRIORS, Blobs, FramePriors
 from estimator.detection.background import estimate_background, filtered, interpolate
@@ -28,9 +28,15 @@ def in_windows(
 ) -> Blobs:
     """Detect the brightest blob of each window with a peak `threshold_sigma` above the local sky; brightest first.
 
-    image : (H, W) real;  center_px : (N, 2) centers of square windows of half-width `half_px`
     A blob is the set of eight-connected pixels above 3 sigma of the 3x3-filtered image around its peak; it may extend
     beyond its window. A blob found in two windows is returned once. Raises ImageError for an image that cannot be used.
+
+    Parameters
+    ----------
+    image
+        (H, W) real
+    center_px
+        (N, 2) centers of square windows of half-width `half_px`
     """
     image = prepare_image(image)
     # The background is a sparse sample of the frame; only the windows are read in full.

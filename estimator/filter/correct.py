@@ -7,17 +7,21 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.core.arrays import Floats
-from estimator.filter.propagate import rotate_quaternion, transition
-from estimator.filter.states import Layout, State, of_head
+from estimator.core.checks import Floats
+from estimator.filter.states import Layout, MekfState, of_head, rotate_quaternion, transition
 
 
-class Solution(NamedTuple):
+class AttitudeFix(NamedTuple):
     """A star tracker's solution, at the time of a State.
 
-    noise_rad2      : (3, 3) covariance of its small rotation error in body axes, without what solutions share
-    systematic_rad2 : (3, 3) covariance of the slow error that it shares with others of its head
-    head            : number of the star camera
+    Attributes
+    ----------
+    noise_rad2
+        (3, 3) covariance of its small rotation error in body axes, without what solutions share
+    systematic_rad2
+        (3, 3) covariance of the slow error that it shares with others of its head
+    head
+        Number of the star camera
     """
 
     body_from_ref: Rotation
@@ -29,10 +33,16 @@ class Solution(NamedTuple):
 class Innovation(NamedTuple):
     """Residual of a solution, linearized: residual = H error + noise.
 
-    residual_rad : (3,) rotation vector in body axes from the filter's attitude to the solution's
-    H            : (3, N)
-    noise_rad2   : (3, 3) covariance of the noise
-    distance2    : squared Mahalanobis distance of the residual
+    Attributes
+    ----------
+    residual_rad
+        (3,) rotation vector in body axes from the filter's attitude to the solution's
+    H
+        (3, N)
+    noise_rad2
+        (3, 3) covariance of the noise
+    distance2
+        Squared Mahalanobis distance of the residual
     """
 
     residual_rad: Floats
@@ -46,7 +56,7 @@ def wxyz_of(body_from_ref: Rotation) -> Floats:
     return body_from_ref.inv().as_quat(scalar_first=True).copy()
 
 
-def innovation(prior: State, solution: Solution, layout: Layout) -> Innovation:
+def innovation(prior: MekfState, solution: AttitudeFix, layout: Layout) -> Innovation:
     """Residual of a solution against the state before it.
 
     The solution is truth exp(o + v) with the noise v and the offset o = mounting + L slow, where L L^T is the
@@ -75,7 +85,7 @@ def innovation(prior: State, solution: Solution, layout: Layout) -> Innovation:
     return Innovation(residual, H, noise, float(residual @ np.linalg.solve(spread, residual)))
 
 
-def correct(prior: State, found: Innovation, layout: Layout) -> State:
+def correct(prior: MekfState, found: Innovation, layout: Layout) -> MekfState:
     """Schmidt's update (1966) in Joseph form; the attitude error is then multiplied into the quaternion.
 
     The gain is Kalman's with the rows of the considered states set to 0: their values and their covariance stay, and
@@ -110,8 +120,8 @@ def correct(prior: State, found: Innovation, layout: Layout) -> State:
 
 
 def adopt(
-    prior: State, solution: Solution, layout: Layout, bias_variance: Floats, support: int
-) -> State:
+    prior: MekfState, solution: AttitudeFix, layout: Layout, bias_variance: Floats, support: int
+) -> MekfState:
     """The state that a solution alone gives: its attitude and covariance, and the filter's other states.
 
     The error is then -(do + v), correlated with the offset's. The variance of the bias is increased, as a wrong bias
@@ -134,7 +144,7 @@ def adopt(
     )
 
 
-def offset_rows(solution: Solution, layout: Layout) -> Floats:
+def offset_rows(solution: AttitudeFix, layout: Layout) -> Floats:
     """(3, N) the offset of a solution from the states: its mounting, and L times the normalized slow error."""
     offsets = np.zeros((3, layout.size))
     offsets[:, layout.slices[of_head("systematic", solution.head)]] = root(solution.systematic_rad2)

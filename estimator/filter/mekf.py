@@ -27,14 +27,31 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc, chdtri
 
 from estimator.core import checks
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.types import FilterState
-from estimator.filter.checks import checked_covariances, checked_samples, not_negative
-from estimator.filter.correct import Solution, adopt, correct, innovation, wxyz_of
-from estimator.filter.jumps import CONFIRMATIONS, ENOUGH, Jump, log_odds, shock_rad
-from estimator.filter.models import CONSIDERED, GyroModel, JumpModel, TrackerModel
-from estimator.filter.propagate import inverse_response
-from estimator.filter.states import State, build_layout, decorrelate, propagate_state, start_state
+from estimator.filter.consistency import (
+    CONFIRMATIONS,
+    ENOUGH,
+    Jump,
+    checked_covariances,
+    checked_samples,
+    log_odds,
+    not_negative,
+    shock_rad,
+)
+from estimator.filter.correct import AttitudeFix, adopt, correct, innovation, wxyz_of
+from estimator.filter.states import (
+    CONSIDERED,
+    GyroModel,
+    JumpModel,
+    MekfState,
+    TrackerModel,
+    build_layout,
+    decorrelate,
+    inverse_response,
+    propagate_state,
+    start_state,
+)
 
 __all__ = ["AttitudeFilter", "GyroModel", "JumpModel", "TrackerModel", "Update"]
 
@@ -54,13 +71,22 @@ ROUNDING_S = 1e-9
 class Update:
     """Result of an update with a star tracker's solution.
 
-    status       : "used", "reset" (the filter was lost and adopted the solution), or "refused: why"
-    residual_rad : (3,) rotation vector in body axes from the filter's attitude to the solution's
-    distance     : Mahalanobis distance of the residual, the root of a chi-square with 3 degrees of freedom, or less
-        with a systematic error
-    agreeing     : number of solutions outside the gate in a row that agree with this one, itself included; 0 if used
-    log_odds     : natural-log odds that the filter is wrong and not these solutions (`jumps`); NaN if used
     Residual and distance are NaN for a solution that is too old.
+
+    Attributes
+    ----------
+    status
+        "used", "reset" (the filter was lost and adopted the solution), or "refused: why"
+    residual_rad
+        (3,) rotation vector in body axes from the filter's attitude to the solution's
+    distance
+        Mahalanobis distance of the residual, the root of a chi-square with 3 degrees of
+        freedom, or less with a systematic error
+    agreeing
+        Number of solutions outside the gate in a row that agree with this one, itself included;
+        0 if used
+    log_odds
+        natural-log odds that the filter is wrong and not these solutions (`jumps`); NaN if used
     """
 
     status: str
@@ -76,9 +102,9 @@ class _Segment(NamedTuple):
     The solution of the oldest segment is not applied again, and is None if it begins between two solutions.
     """
 
-    state: State
+    state: MekfState
     samples: Floats
-    solution: Solution | None
+    solution: AttitudeFix | None
 
 
 class AttitudeFilter:
@@ -93,16 +119,6 @@ class AttitudeFilter:
     and Farrenkopf's process noise with v = arw, u^2 = 2 bias^2 / bias_time: v^2 T + u^2 T^3 / 3 in the angle,
     -u^2 T^2 / 2 in the cross-covariance, u^2 T in the bias. Each sample is propagated separately (1 us each,
     compiled), so the result does not depend on how the samples are divided among calls.
-
-    gyro               : error model of the gyro
-    t_s, body_from_ref : initial time and attitude; the initial bias is 0
-    sigma_attitude_rad, sigma_bias_rad_s : standard deviations at the start, one number or (3,) in body axes
-    floor_rad          : added in quadrature to every solution's noise, for what its stars share and no other solution
-    gate_sigma         : a solution is refused if its distance is less probable than so many sigma of a scalar Gaussian
-    tracker, jumps     : errors that solutions share; wrong solutions and missed motions
-    considered         : names of the states that are considered and not estimated, of "bias", "scale", "misalignment",
-        "mounting", "systematic"
-    heads              : number of star cameras on the body, each with its own mounting and slow error
 
     Considered states (Schmidt 1966). Their uncertainty is in the covariance and in the gain; their value stays 0 and
     their variance as it was. So a state that the data hardly shows cannot take up other errors.
@@ -137,6 +153,28 @@ class AttitudeFilter:
     variance is increased by the initial variance, as a wrong bias may have been the cause. After a saturation, an
     outage or a shock, or for a start that no solution has confirmed, three are enough. Against a filter that many
     solutions confirmed and a gyro that missed nothing, it takes dozens; meanwhile the status is DISPUTED.
+
+    Attributes
+    ----------
+    gyro
+        Error model of the gyro
+    t_s, body_from_ref
+        Initial time and attitude; the initial bias is 0
+    sigma_attitude_rad, sigma_bias_rad_s
+        Standard deviations at the start, one number or (3,) in body axes
+    floor_rad
+        Added in quadrature to every solution's noise, for what its stars share and no other
+        solution
+    gate_sigma
+        A solution is refused if its distance is less probable than so many sigma of a scalar
+        Gaussian
+    tracker, jumps
+        Errors that solutions share; wrong solutions and missed motions
+    considered
+        Names of the states that are considered and not estimated, of "bias", "scale",
+        "misalignment", "mounting", "systematic"
+    heads
+        Number of star cameras on the body, each with its own mounting and slow error
     """
 
     def __init__(
@@ -179,7 +217,7 @@ class AttitudeFilter:
             _Segment(self._current, np.empty((0, 5)), None)
         ]  # rows of checked_samples
         self._refused: list[
-            tuple[State, Solution]
+            tuple[MekfState, AttitudeFix]
         ] = []  # in a row, each agrees with the one before
         self._measured_rad_s = np.zeros(3)
 
@@ -226,13 +264,23 @@ class AttitudeFilter:
     ) -> None:
         """Propagate the state by gyro samples.
 
-        t_s       : (N,) ends of the sample intervals; the first interval begins at the filter's time
-        angle_rad : (N, 3) rotation angle in each interval, about the body axes
-        saturated : (N,) whether the gyro was at its rate limit
-        missing   : (N,) whether there is no sample (an outage) and its angle is a guess, NaN for 0; None: never
+        Parameters
+        ----------
+        t_s
+            (N,) ends of the sample intervals; the first interval begins at the filter's time
+        angle_rad
+            (N, 3) rotation angle in each interval, about the body axes
+        saturated
+            (N,) whether the gyro was at its rate limit
+        missing
+            (N,) whether there is no sample (an outage) and its angle is a guess, NaN for 0;
+            None: never
 
-        Raises ValueError for other shapes, non-finite numbers, times that do not increase, or intervals that are too
-        long.
+        Raises
+        ------
+        ValueError
+            For other shapes, non-finite numbers, times that do not increase, or intervals that
+            are too long.
         """
         start_s = self._current.t_s
         samples = checked_samples(start_s, t_s, angle_rad, saturated, missing, self._gyro)
@@ -252,12 +300,20 @@ class AttitudeFilter:
     ) -> Update:
         """Apply a star tracker's solution for the current or a past time, then repropagate from there to the present.
 
-        covariance_rad2 : (3, 3) of the small rotation error of the solution, in body axes
-        systematic_rad2 : (3, 3) the part of it that is common to successive solutions; None for 0
-        head            : number of the star camera, from 0
+        Parameters
+        ----------
+        covariance_rad2
+            (3, 3) of the small rotation error of the solution, in body axes
+        systematic_rad2
+            (3, 3) the part of it that is common to successive solutions; None for 0
+        head
+            Number of the star camera, from 0
 
-        Raises ValueError for a covariance that is not symmetric and positive definite, a systematic part that is not
-        less, a head that there is not, or a time after the last sample.
+        Raises
+        ------
+        ValueError
+            For a covariance that is not symmetric and positive definite, a systematic part that
+            is not less, a head that there is not, or a time after the last sample.
         """
         checks.one_rotation("update: body_from_ref_measured", body_from_ref_measured)
         t_s = checks.number("update: t_s", t_s, -math.inf, math.inf, "a time in seconds")
@@ -309,14 +365,14 @@ class AttitudeFilter:
         total_rad2: ArrayLike,
         systematic_rad2: ArrayLike | None,
         head: int,
-    ) -> Solution:
+    ) -> AttitudeFix:
         """The solution with the filter's floor and systematic error added to its covariances, after checks."""
         noise, systematic = checked_covariances(total_rad2, systematic_rad2)
         unit = np.eye(3)
         common = systematic + self._tracker.systematic_rad**2 * unit
-        return Solution(body_from_ref, noise + self._floor_rad2 * unit, common, head)
+        return AttitudeFix(body_from_ref, noise + self._floor_rad2 * unit, common, head)
 
-    def _weigh(self, prior: State, solution: Solution, update: Update) -> Update:
+    def _weigh(self, prior: MekfState, solution: AttitudeFix, update: Update) -> Update:
         """The update by a solution outside the gate: refused, or a reset if the filter is probably wrong."""
         if self._refused and not self._agrees(prior, solution):
             self._refused = []
@@ -337,7 +393,7 @@ class AttitudeFilter:
             status = RESET if odds >= ENOUGH else DISPUTED
         return Update(status, update.residual_rad, update.distance, agreeing, odds)
 
-    def _agrees(self, prior: State, solution: Solution) -> bool:
+    def _agrees(self, prior: MekfState, solution: AttitudeFix) -> bool:
         """Whether a refused solution agrees with the one before, by the gyro alone: none was used in between."""
         state, earlier = self._refused[-1]
         later_from_earlier = prior.body_from_ref * state.body_from_ref.inv()
@@ -375,10 +431,10 @@ class AttitudeFilter:
             state = self._propagate_state(first.state, first.samples[:half])
             self._segments[0] = _Segment(state, first.samples[half:], None)
 
-    def _propagate_state(self, state: State, samples: Floats) -> State:
+    def _propagate_state(self, state: MekfState, samples: Floats) -> MekfState:
         return propagate_state(state, samples, self._gyro, self._tracker, self._layout)
 
-    def _prior(self, state: State, samples: Floats) -> State:
+    def _prior(self, state: MekfState, samples: Floats) -> MekfState:
         """The state at a solution, before it: propagated by the samples from the last solution that was used."""
         return decorrelate(self._propagate_state(state, samples), self._tracker, self._layout)
 

@@ -3,15 +3,357 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from estimator.core.arrays import Floats, Ints
-from estimator.filter.models import STATES, GyroModel, TrackerModel
-from estimator.filter.propagate import advance, inverse_response
+from estimator.core import checks
+from estimator.core.checks import Floats, Ints
+from estimator.core.jit import jit
+
+# Compiled propagation of the filter: gyro samples advance attitude, other states and covariance
+# between solutions.
+
+
+# The last column of a sample.
+MEASURED = 0
+SATURATED = 1
+MISSING = 2
+
+
+@jit
+def advance(
+    state: tuple[float, Floats, Floats, Floats, float, float],
+    samples: Floats,
+    noise: tuple[float, float, float, float, float],
+    columns: Ints,
+    inverse: Floats,
+    slow: tuple[int, int],
+) -> tuple[Floats, Floats, Floats, float, float]:
+    """Return attitude, values, covariance, saturation_rad and lost_rad after the samples; equations: AttitudeFilter.
+
+    Parameters
+    ----------
+    state
+        t_s, ref_from_body_wxyz, values (N,), covariance (N, N), saturation_rad, lost_rad
+    samples
+        (M, 5) rows of t_s, the rotation in the interval that ends there (3), and MEASURED,
+        SATURATED or MISSING
+    noise
+        arw^2, bias^2, 1 / bias_time, 1 / systematic_time, outage_rad_s
+    columns
+        (9,) state of each element of the gyro's matrix M, row by row; -1 if it is none
+    inverse
+        (3, 3) `inverse_response` of the values, of which no element of M changes here
+    slow
+        First and last + 1 of the normalized systematic states
+    """
+    t_s, wxyz, values, covariance, saturation_rad, lost_rad = state
+    arw2, bias2, decay_per_s, slow_per_s, outage_rad_s = noise
+    wxyz = wxyz.copy()
+    values = values.copy()
+    covariance = covariance.copy()
+    size = len(values)
+    rotation = np.empty(3)
+    rows = np.zeros((3, size))
+    buffer = np.empty((3, size))
+    exponential = np.empty((3, 6))
+    decay = np.ones(size)
+    for n in range(len(samples)):
+        step_s = samples[n, 0] - t_s
+        t_s = samples[n, 0]
+        # Integral of the decaying bias over the interval, divided by the bias.
+        effective_s = step_s * (1 - step_s * decay_per_s / 2)
+        remove_errors(samples[n, 1:4], effective_s, values, inverse, rotation)
+        rotate_quaternion(wxyz, rotation)
+        transition(rotation, 1.0, exponential)
+        fill_rows(exponential, inverse, rotation, effective_s, columns, rows)
+        decay[3:6] = math.exp(-step_s * decay_per_s)
+        decay[slow[0] : slow[1]] = math.exp(-step_s * slow_per_s)
+        for i in range(3, size):
+            values[i] *= decay[i]
+        propagate_covariance(rows, decay, covariance, buffer)
+        # While the rate is unknown the standard deviation grows linearly: the variance by a difference of squares.
+        previous_rad = saturation_rad
+        grown_rad = unknown_rad(samples[n], outage_rad_s * step_s)
+        saturation_rad = previous_rad + grown_rad if grown_rad > 0 else 0.0
+        lost_rad += grown_rad
+        # The variance gained by the bias in the interval, u^2 T to first order.
+        bias_variance = -bias2 * math.expm1(-2 * step_s * decay_per_s)
+        missed_variance = saturation_rad**2 - min(previous_rad, saturation_rad) ** 2
+        add_noise(covariance, arw2 * step_s + missed_variance, bias_variance, step_s)
+        for i in range(slow[0], slow[1]):
+            covariance[i, i] -= math.expm1(-2 * step_s * slow_per_s)
+    return wxyz, values, covariance, saturation_rad, lost_rad
+
+
+@jit
+def remove_errors(
+    angle: Floats, effective_s: float, values: Floats, inverse: Floats, out: Floats
+) -> None:
+    """Fill the rotation (3,) A (a - T b) of a measured angle a."""
+    for i in range(3):
+        out[i] = 0.0
+        for j in range(3):
+            out[i] += inverse[i, j] * (angle[j] - effective_s * values[3 + j])
+
+
+@jit
+def unknown_rad(sample: Floats, outage_rad: float) -> float:
+    """Standard deviation of the rotation that a sample leaves unknown: 0, or while saturated as much as is measured."""
+    if sample[4] == MISSING:
+        return outage_rad
+    return max(abs(sample[1]), abs(sample[2]), abs(sample[3])) if sample[4] == SATURATED else 0.0
+
+
+@jit
+def add_noise(
+    covariance: Floats, angle_variance: float, bias_variance: float, step_s: float
+) -> None:
+    """Add Farrenkopf's process noise of an interval to attitude and bias; `angle_variance` without the bias's part."""
+    for i in range(3):
+        covariance[i, i] += angle_variance + bias_variance * step_s**2 / 3
+        covariance[i, i + 3] -= bias_variance * step_s / 2
+        covariance[i + 3, i] -= bias_variance * step_s / 2
+        covariance[i + 3, i + 3] += bias_variance
+
+
+def inverse_response(values: Floats, columns: Ints) -> Floats:
+    """(3, 3) inverse of I + M, with the elements of M among the values."""
+    used = columns >= 0
+    if not used.any():
+        return np.eye(3)
+    response = np.eye(3).ravel()
+    response[used] += values[columns[used]]
+    return np.asarray(np.linalg.inv(response.reshape(3, 3)), dtype=float)
+
+
+@jit
+def fill_rows(
+    exponential: Floats, inverse: Floats, p: Floats, effective_s: float, columns: Ints, rows: Floats
+) -> None:
+    """Fill the attitude rows (3, N) of the transition matrix: exp(-[p]), -T J A, and -(J A)_i p_j for M_ij.
+
+    Parameters
+    ----------
+    exponential
+        (3, 6) of `transition` with an effective time of 1
+    inverse
+        A = (I + M)^-1
+    """
+    for i in range(3):
+        for j in range(3):
+            rows[i, j] = exponential[i, j]
+            total = 0.0
+            for k in range(3):
+                total += exponential[i, 3 + k] * inverse[k, j]
+            rows[i, 3 + j] = effective_s * total
+            for k in range(3):
+                if columns[3 * j + k] >= 0:
+                    rows[i, columns[3 * j + k]] = total * p[k]
+
+
+@jit
+def propagate_covariance(rows: Floats, decay: Floats, covariance: Floats, buffer: Floats) -> None:
+    """covariance <- F covariance F^T, exactly symmetric; F has these three rows, and below them `decay` as diagonal."""
+    size = len(decay)
+    for i in range(3):
+        for j in range(size):
+            total = 0.0
+            for k in range(size):
+                total += rows[i, k] * covariance[k, j]
+            buffer[i, j] = total
+    for i in range(3):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(size):
+                total += buffer[i, k] * rows[j, k]
+            covariance[i, j] = covariance[j, i] = total
+        for j in range(3, size):
+            covariance[i, j] = covariance[j, i] = buffer[i, j] * decay[j]
+    for i in range(3, size):
+        for j in range(3, i + 1):
+            covariance[i, j] = covariance[j, i] = covariance[i, j] * decay[i] * decay[j]
+
+
+@jit
+def transition(p: Floats, effective_s: float, out: Floats) -> None:
+    """Fill the attitude rows of the transition matrix: out[:3] = [exp(-[p]), -effective_s J(p)], with [p] v = p x v."""
+    square = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
+    if (
+        square < 1e-6
+    ):  # series, whose error in `out` is below 1e-16; the quotients would lose digits
+        sine = 1 - square / 6
+        cosine = 0.5 - square / 24
+        cubic = 1 / 6 - square / 120
+    else:
+        angle = math.sqrt(square)
+        sine = math.sin(angle) / angle
+        cosine = (1 - math.cos(angle)) / square
+        cubic = (1 - sine) / square
+    for i in range(3):
+        for j in range(3):
+            # Element (i, j) of [p] is the third axis' component with the sign of the permutation; [p]^2 = p p^T -
+            # |p|^2 I.
+            cross = 0.0 if i == j else p[3 - i - j] * (1.0 if (j - i) % 3 == 2 else -1.0)
+            identity = 1.0 if i == j else 0.0
+            cross_squared = p[i] * p[j] - square * identity
+            out[i, j] = identity - sine * cross + cosine * cross_squared
+            out[i, j + 3] = -effective_s * (identity - cosine * cross + cubic * cross_squared)
+
+
+@jit
+def rotate_quaternion(ref_from_body_wxyz: Floats, rotation_rad: Floats) -> None:
+    """Multiply the unit quaternion by that of a rotation vector in body axes (Hamilton product), in place."""
+    q = ref_from_body_wxyz
+    (x, y, z) = rotation_rad
+    half = math.sqrt(x * x + y * y + z * z) / 2
+    scale = math.sin(half) / (2 * half) if half > 1e-9 else 0.5
+    w = math.cos(half)
+    x = scale * x
+    y = scale * y
+    z = scale * z
+    a, b, c, d = q
+    q[0] = a * w - b * x - c * y - d * z
+    q[1] = a * x + b * w + c * z - d * y
+    q[2] = a * y - b * z + c * w + d * x
+    q[3] = a * z + b * y - c * x + d * w
+    norm = math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    for i in range(4):
+        q[i] /= norm
+
+
+# Error models of the attitude filter: of the gyro, of the star tracker, and of jumps.
+
+
+STATES = ("bias", "scale", "misalignment", "mounting", "systematic")
+CONSIDERED = ("mounting", "systematic")
+
+
+@dataclass(frozen=True, slots=True)
+class GyroModel:
+    """Error model of a gyro, the same for each axis: measured rate = (I + M) rate + bias + white noise.
+
+    M (Crassidis & Junkins, Optimal Estimation of Dynamic Systems, 7.2; Markley & Crassidis, Fundamentals of Spacecraft
+    Attitude Determination and Control, 4.7) has the scale factors in its diagonal and the misalignments of the three
+    sense axes elsewhere, all constant. A common rotation of the axes is among the misalignments.
+
+    Farrenkopf's random walk of the bias with density u (rad / s^1.5) is the limit of a long time t with
+    bias_rad_s = u sqrt(t / 2). Raises ValueError for negative or unusable numbers.
+
+    Attributes
+    ----------
+    arw_rad_sqrt_s
+        Angle random walk, rad / sqrt(s)
+    bias_rad_s
+        Standard deviation of the bias, a first-order Gauss-Markov process (ignored if its time
+        is inf)
+    bias_time_s
+        Its correlation time, long compared with a sample interval; inf for a constant bias
+    scale, misalignment_rad
+        Standard deviations of M's elements on the diagonal and off it
+    limit_rad_s
+        The largest rate about an axis that is measured; inf if saturation is flagged with the
+        samples
+    outage_rad_s
+        Standard deviation of the rate about each axis while the gyro gives no samples
+        (`assumed`)
+    """
+
+    arw_rad_sqrt_s: float
+    bias_rad_s: float
+    bias_time_s: float
+    scale: float = 0.0
+    misalignment_rad: float = 0.0
+    limit_rad_s: float = math.inf
+    outage_rad_s: float = 0.1
+
+    def __post_init__(self) -> None:
+        _check(self, "gyro", above_0=("bias_time_s", "limit_rad_s"))
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerModel:
+    """Errors that successive solutions of a star tracker share: they do not average out.
+
+    The slow error is a first-order Gauss-Markov process with the correlation exp(-T / time - rotation / angle). The
+    covariance that a solution names (`Attitude.systematic_rad2`) is part of the same process, and is added to
+    systematic_rad^2. The times and angles are `assumed`. Raises ValueError for negative or unusable numbers.
+
+    Attributes
+    ----------
+    systematic_rad
+        Standard deviation about each axis of the slow error: distortion across the field, a
+        survey
+    systematic_time_s
+        Its correlation time; inf for a constant
+    systematic_angle_rad
+        Rotation after which it is another one, because other stars are in the field
+    mounting_rad
+        Standard deviation about each axis of the rotation from assumed to true mount
+    mounting_drift_rad_sqrt_s
+        Its random walk about each axis, rad / sqrt(s); 0 for a constant one
+    """
+
+    systematic_rad: float = 0.0
+    systematic_time_s: float = 3600.0
+    systematic_angle_rad: float = 0.2
+    mounting_rad: float = 0.0
+    mounting_drift_rad_sqrt_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check(self, "tracker", above_0=("systematic_time_s", "systematic_angle_rad"))
+        if self.mounting_drift_rad_sqrt_s and not self.mounting_rad:
+            raise ValueError("tracker: mounting_drift_rad_sqrt_s needs mounting_rad above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class JumpModel:
+    """What is assumed of wrong solutions and of motions that a gyro misses; all `assumed`. See `jumps.log_odds`.
+
+    Attributes
+    ----------
+    missed_per_s
+        Rate at which a gyro that flags nothing misses a motion, 1e-4 an hour
+    wrong_share
+        Probability that a wrong solution begins at any given one
+    wrong_repeat
+        Probability that a wrong solution is followed by one that agrees with it
+    wrong_start
+        Probability that the initial attitude is wrong beyond its standard deviation
+
+    Raises
+    ------
+    ValueError
+        Unless all are above 0 and below 1.
+    """
+
+    missed_per_s: float = 1e-4 / 3600
+    wrong_share: float = 1e-4
+    wrong_repeat: float = 0.75
+    wrong_start: float = 0.01
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if not 0 < getattr(self, field.name) < 1:
+                raise ValueError(
+                    f"jumps: {field.name} is {getattr(self, field.name)}; allowed: above 0, below 1"
+                )
+
+
+def _check(model: GyroModel | TrackerModel, what: str, above_0: tuple[str, ...]) -> None:
+    """Raise ValueError unless the named fields are above 0 (inf too) and the others finite and 0 or more."""
+    for field in fields(model):
+        value = getattr(model, field.name)
+        checks.of_type(f"{what}: {field.name}", value, float, int, np.floating, np.integer)
+        if field.name in above_0 and not value > 0:
+            raise ValueError(f"{what}: {field.name} is {value}; allowed: above 0, also inf")
+        if field.name not in above_0 and not 0 <= value < math.inf:
+            raise ValueError(f"{what}: {field.name} is {value}; allowed: finite, 0 or more")
+
 
 DIAGONAL = np.arange(0, 9, 4)
 OFF_DIAGONAL = np.array([1, 2, 3, 5, 6, 7])
@@ -24,12 +366,20 @@ class Layout(NamedTuple):
     Heads are the star cameras on the body. The states of head n above 0 have its number in their name: "mounting_1",
     which is relative to the mounting of the first head.
 
-    size      : N
-    slices    : of each state by name, "attitude" and "systematic" included
-    slow      : that of the slow errors of all heads
-    mountings : (M,) index of each state of a mounting
-    columns   : (9,) state of each element of the gyro's matrix M, row by row; -1 if it is none
-    estimated : (N,) whether its value is estimated; False if it is only considered
+    Attributes
+    ----------
+    size
+        N
+    slices
+        Of each state by name, "attitude" and "systematic" included
+    slow
+        That of the slow errors of all heads
+    mountings
+        (M,) index of each state of a mounting
+    columns
+        (9,) state of each element of the gyro's matrix M, row by row; -1 if it is none
+    estimated
+        (N,) whether its value is estimated; False if it is only considered
     """
 
     size: int
@@ -47,15 +397,23 @@ class Layout(NamedTuple):
         }
 
 
-class State(NamedTuple):
+class MekfState(NamedTuple):
     """State of the filter at one time.
 
-    values         : (N,) estimates in the order of Layout; those of the attitude are 0
-    covariance     : (N, N) of the errors
-    saturation_rad : standard deviation of the attitude from the saturation or outage that now lasts, else 0
-    lost_rad       : rotation that the gyro may have missed since the last solution that was used
-    used_s, used_wxyz : time and attitude of the last solution that was used, or of the start
-    support        : number of solutions used in agreement, see Jump
+    Attributes
+    ----------
+    values
+        (N,) estimates in the order of Layout; those of the attitude are 0
+    covariance
+        (N, N) of the errors
+    saturation_rad
+        Standard deviation of the attitude from the saturation or outage that now lasts, else 0
+    lost_rad
+        Rotation that the gyro may have missed since the last solution that was used
+    used_s, used_wxyz
+        Time and attitude of the last solution that was used, or of the start
+    support
+        Number of solutions used in agreement, see Jump
     """
 
     t_s: float
@@ -117,17 +475,19 @@ def build_layout(
     return Layout(size, slices, slow, np.array(mountings, dtype=int), columns, np.array(estimated))
 
 
-def start_state(t_s: float, wxyz: Floats, sigmas: dict[str, ArrayLike], layout: Layout) -> State:
+def start_state(
+    t_s: float, wxyz: Floats, sigmas: dict[str, ArrayLike], layout: Layout
+) -> MekfState:
     """The state at the start: all values 0, all states independent with these standard deviations."""
     sigma = np.empty(layout.size)
     for name, rows in layout.slices.items():
         sigma[rows] = sigmas[name.partition("_")[0]]
-    return State(t_s, wxyz, np.zeros(layout.size), np.diag(sigma**2), 0.0, 0.0, t_s, wxyz, 0)
+    return MekfState(t_s, wxyz, np.zeros(layout.size), np.diag(sigma**2), 0.0, 0.0, t_s, wxyz, 0)
 
 
 def propagate_state(
-    state: State, samples: Floats, gyro: GyroModel, tracker: TrackerModel, layout: Layout
-) -> State:
+    state: MekfState, samples: Floats, gyro: GyroModel, tracker: TrackerModel, layout: Layout
+) -> MekfState:
     """Propagate a state through gyro samples, rows as of `advance`."""
     if not len(samples):
         return state
@@ -156,7 +516,7 @@ def propagate_state(
     )
 
 
-def decorrelate(state: State, tracker: TrackerModel, layout: Layout) -> State:
+def decorrelate(state: MekfState, tracker: TrackerModel, layout: Layout) -> MekfState:
     """Let the slow errors change by the rotation since the last solution that was used."""
     rows = layout.slow
     # The angle between two quaternions; the scalar product may exceed 1 by rounding.

@@ -10,7 +10,7 @@ from math import lgamma, log, log10, pi, sqrt
 
 import numpy as np
 
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 
 ACCEPT_LOG10_CHANCE = (

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from estimator.attitude.solvers import rotation
 from estimator.attitude.wahba import wahba
 from estimator.catalog.pair_index import PairIndex
-from estimator.catalog.spatial_grid import nearest
-from estimator.core.arrays import Floats
+from estimator.catalog.sky_index import nearest_in_grid
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
@@ -26,8 +26,14 @@ from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, lo
 class DirectMatch(NamedTuple):
     """A match of the whole field. A named tuple, because numba can compile functions that return one.
 
-    observed, star : (K,) rows of the observed stars and of the catalog;  R_cam_from_ref : (3, 3)
-    log10_chance   : log10 of the expected number of equally good chance matches
+    Attributes
+    ----------
+    observed, star
+        (K,) rows of the observed stars and of the catalog
+    R_cam_from_ref
+        (3, 3)
+    log10_chance
+        log10 of the expected number of equally good chance matches
     """
 
     observed: NDArray[np.int64]
@@ -55,8 +61,12 @@ def match_field(
 ) -> DirectMatch:
     """The direct match: match all observed stars at the attitude of a few, refine it once, and test against chance.
 
-    corners, stars : rows of the observed and of the catalog stars of the hypothesis, two or more
-    hypotheses     : number of hypotheses so far, which multiplies the probability
+    Parameters
+    ----------
+    corners, stars
+        Rows of the observed and of the catalog stars of the hypothesis, two or more
+    hypotheses
+        Number of hypotheses so far, which multiplies the probability
     """
     R_cam_from_ref = fit_rotation(rays[corners], index.vectors[stars])
     # The attitude of a few stars is less accurate than a star's direction: the first match has twice the tolerance.
@@ -113,9 +123,13 @@ def match_nearest(
 ) -> tuple[NDArray, NDArray, float]:
     """Match each observed star to the nearest catalog star within its tolerance; each catalog star is used once.
 
-    center : row of a catalog star in the field; its neighbors give the local density of the catalog
     Returns the rows of the observed stars, the rows of the catalog, and the probability that a random direction has a
     catalog star within the mean tolerance.
+
+    Parameters
+    ----------
+    center
+        Row of a catalog star in the field; its neighbors give the local density of the catalog
     """
     observed = np.empty(len(rays), np.int64)
     star = np.empty(len(rays), np.int64)
@@ -130,7 +144,7 @@ def match_nearest(
         z = R_cam_from_ref[0, 2] * u + R_cam_from_ref[1, 2] * v + R_cam_from_ref[2, 2] * w
         radius = tolerance + (stretch * np.arccos(min(max(w, -1.0), 1.0)) if stretch > 0 else 0.0)
         covered_sr += density * pi * radius**2
-        best = nearest(index.cells, index.vectors, x, y, z, 2 * np.sin(min(radius, pi) / 2))
+        best = nearest_in_grid(index.cells, index.vectors, x, y, z, 2 * np.sin(min(radius, pi) / 2))
         is_used = False
         for m in range(count):
             is_used = is_used or star[m] == best
@@ -145,11 +159,16 @@ def match_nearest(
 def log10_chance(groups: NDArray, count: int, p: float) -> float:
     """log10 of the probability that a false attitude gives this match; three independent matches define the attitude.
 
-    groups : (K,) groups of the matched stars;  count : number of observed stars
-
     The first match of each group (patch board) has probability p. All boards have the same pattern, so that further
     matches of a group are not independent: the second counts 1/10 (it fixes the orientation of the lattice), each
     further one 1/2 (lit or not). If every star is its own group, this is the binomial tail.
+
+    Parameters
+    ----------
+    groups
+        (K,) groups of the matched stars
+    count
+        Number of observed stars
     """
     independent = 0
     second = 0

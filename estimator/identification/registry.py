@@ -52,7 +52,13 @@ def candidates(
 
     If the focal length is uncertain, its interval is searched in steps of STEP, first with little effort at all steps,
     then with more.
-    sigma_px : least centroid error;  base_stars : of the search (`options.Options`)
+
+    Parameters
+    ----------
+    sigma_px
+        Least centroid error
+    base_stars
+        Of the search (`options.Options`)
     """
     identify = IDENTIFIERS[identifier]
     steps = int(np.ceil(focal_uncertainty / STEP - 0.5))

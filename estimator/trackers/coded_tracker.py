@@ -17,13 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core import checks
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
-from estimator.identification.leds import codes, naming
-from estimator.identification.leds.codes import LedCode
-from estimator.identification.leds.tracks import LightTracks
+from estimator.identification import led_codes, led_naming
+from estimator.identification.led_codes import LedCode, LightTracks
 from estimator.trackers.dome_tracker import MIN_ERROR_PX, DomeTracker
 from estimator.trackers.pipeline import Clock, Report, Settings, direction_sigma_rad, process_frame
 from estimator.trackers.star_tracker import NO_STARS
@@ -43,11 +41,20 @@ PHASE_REACH = (
 class DecoderSettings:
     """Settings of the decoder.
 
-    flux_sigma : relative error of a light's brightness beside its photon noise: pulses, the chip, detection
-    gate_px    : greatest motion of a light between two frames that is not predicted
-    frames     : whose brightness is used, the last ones; None: as many as the code has bits
+    Attributes
+    ----------
+    flux_sigma
+        Relative error of a light's brightness beside its photon noise: pulses, the chip,
+        detection
+    gate_px
+        Greatest motion of a light between two frames that is not predicted
+    frames
+        Whose brightness is used, the last ones; None: as many as the code has bits
 
-    Raises ImageError for a number that cannot be used.
+    Raises
+    ------
+    ImageError
+        For a number that cannot be used.
     """
 
     flux_sigma: float = 0.03
@@ -67,8 +74,12 @@ class CodedTracker(DomeTracker):
     """Tracker under a dome of coded LEDs. Stateful: it takes the frames in order, with their times and numbers.
 
     A frame that is not later than the last one begins anew; so does one without a time, whose lights have no names.
-    code : the words of the LEDs of the map
     Raises ImageError as DomeTracker does, for a code of other LEDs, and for a rolling shutter with free-running bits.
+
+    Attributes
+    ----------
+    code
+        The words of the LEDs of the map
     """
 
     def __init__(
@@ -95,7 +106,9 @@ class CodedTracker(DomeTracker):
         radius_m = np.linalg.norm(leds.position_m, axis=1)
         pupil_m = lever.cam_from_body.apply(lever.camera_body_m)
         position_m = np.asarray(leds.position_m, dtype=float)
-        self.sphere = naming.Sphere(position_m, radius_m, position_m / radius_m[:, None], pupil_m)
+        self.sphere = led_naming.Sphere(
+            position_m, radius_m, position_m / radius_m[:, None], pupil_m
+        )
         goes_dark = bool(code.levels.min() == 0)
         self.tracks = LightTracks(
             camera,
@@ -112,7 +125,7 @@ class CodedTracker(DomeTracker):
             len(code.phases), bool
         )  # those of the code's clock that the lights have not excluded
         self.last_s: float | None = None
-        codes.misfits(*np.ones((4, 1, 1)))  # compiles it, or loads it, before the frames
+        led_codes.misfits(*np.ones((4, 1, 1)))  # compiles it, or loads it, before the frames
 
     def solve(
         self,
@@ -125,7 +138,10 @@ class CodedTracker(DomeTracker):
     ) -> Report:
         """Solve the frame of number `frame`, exposed about t_s. Raises ImageError for bad input.
 
-        streak_px, rate, exposure_s : as for `DomeTracker.solve`; the rate also predicts the lights' motion
+        Parameters
+        ----------
+        streak_px, rate, exposure_s
+            As for `DomeTracker.solve`; the rate also predicts the lights' motion
         """
         solve = partial(
             self.solve_centroids, rate=rate, exposure_s=exposure_s, t_s=t_s, frame=frame
@@ -190,20 +206,20 @@ class CodedTracker(DomeTracker):
         sigma = np.where(np.isfinite(tracks.light[usable]), greatest, 1.0)
         misfit = self._misfit(tracks.light[usable], sigma)
         lights = len(usable)
-        plausible = misfit.min(axis=(0, 2)) <= codes.expected_misfit(measured[usable])
+        plausible = misfit.min(axis=(0, 2)) <= led_codes.expected_misfit(measured[usable])
         usable = usable[plausible]
         misfit = misfit[:, plausible]
         if len(usable) < 2:
             self.phases[:] = True
             return COLLECTING
-        misfit = misfit / codes.excess_noise(misfit.min(axis=(0, 2)), measured[usable])
+        misfit = misfit / led_codes.excess_noise(misfit.min(axis=(0, 2)), measured[usable])
         row = tracks.row[usable]
-        named = naming.NamedLights(*self._tangents(centroids.take(row)), misfit.min(axis=0))
-        match = naming.identify(named, self.sphere)
+        named = led_naming.NamedLights(*self._tangents(centroids.take(row)), misfit.min(axis=0))
+        match = led_naming.identify(named, self.sphere)
         if isinstance(match, str):
             return match
-        if not naming.is_supported(match, misfit, lights):
-            return naming.CONTRADICTED
+        if not led_naming.is_supported(match, misfit, lights):
+            return led_naming.CONTRADICTED
         return replace(match, observed=row[match.observed])
 
     def _misfit(self, light: Floats, sigma: Floats) -> Floats:
@@ -218,10 +234,10 @@ class CodedTracker(DomeTracker):
         )
         flat = np.full((len(light), len(templates)), np.inf)
         for one, row, error in zip(flat, light, sigma, strict=True):
-            likely = codes.likely(row, templates) if len(tried) > 1 else np.arange(leds)
-            one[likely] = codes.misfits(row[None], error[None], templates[likely], spread[likely])[
-                0
-            ]
+            likely = led_codes.likely(row, templates) if len(tried) > 1 else np.arange(leds)
+            one[likely] = led_codes.misfits(
+                row[None], error[None], templates[likely], spread[likely]
+            )[0]
         each = flat.reshape(-1, len(tried), leds)
         common = each.min(axis=2).sum(axis=0)
         allowed = common <= common.min() + PHASE_REACH

@@ -20,13 +20,13 @@ from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, o
 from estimator.attitude.nearfield import SOLVERS, fit_focal_ratio, fitted_sigma_rad
 from estimator.catalog import pair_index
 from estimator.core import checks
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
+from estimator.identification import led_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
-from estimator.identification.leds import search
-from estimator.identification.leds.index import build_dome_index, corner_rays, inner_field
-from estimator.identification.leds.search import NO_MATCH
+from estimator.identification.led_index import build_dome_index, corner_rays, inner_field
+from estimator.identification.led_search import NO_MATCH
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
 from estimator.trackers import warm_up
 from estimator.trackers.pipeline import (
@@ -38,7 +38,7 @@ from estimator.trackers.pipeline import (
     direction_sigma_rad,
     process_frame,
 )
-from estimator.trackers.residuals.refinement import mutual_nearest
+from estimator.trackers.refinement import mutual_nearest
 from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
 from estimator.trackers.star_tracker import NO_STARS
 
@@ -57,7 +57,7 @@ def led_pairs(camera: Camera, leds: LedMap, lever: Lever, settings: Settings) ->
     """The default LED identifier: pair hypotheses and evidence; see `identification.leds.search.identify`."""
     sight = build_dome_index(leds, lever, camera)
     least_rad = MIN_ERROR_PX / camera.focal_px
-    return lambda rays_cam, sigma_rad, flux_s: search.identify(
+    return lambda rays_cam, sigma_rad, flux_s: led_search.identify(
         rays_cam, np.hypot(sigma_rad, least_rad), sight, flux_s=flux_s
     )
 
@@ -73,7 +73,7 @@ def non_dimensional(camera: Camera, leds: LedMap, lever: Lever, settings: Settin
     sight = build_dome_index(leds, lever, camera.zoomed(1 - uncertainty))
     sight = sight._replace(field_tan=nominal.field_tan, field_area=nominal.field_area)
     least_rad = MIN_ERROR_PX / camera.focal_px
-    return lambda rays_cam, sigma_rad, flux_s: search.identify(
+    return lambda rays_cam, sigma_rad, flux_s: led_search.identify(
         rays_cam, np.hypot(sigma_rad, least_rad), sight, FOCAL_CHECKS, flux_s, uncertainty
     )
 
@@ -180,9 +180,16 @@ class DomeTracker:
     ) -> Report:
         """Solve one frame. Raises ImageError for bad input; any other failure is reported in the status.
 
-        streak_px : (dx, dy) that lights move during the exposure, from the gyro; None: unknown, or from `rate`
-        rate      : of the camera, from the gyro; None: with a rolling shutter it is estimated from the frame
-        exposure_s: to estimate the rate from streaks; None if unknown
+        Parameters
+        ----------
+        streak_px
+            (dx, dy) that lights move during the exposure, from the gyro; None: unknown, or from
+            `rate`
+        rate
+            Of the camera, from the gyro; None: with a rolling shutter it is estimated from the
+            frame
+        exposure_s
+            To estimate the rate from streaks; None if unknown
         """
         solve = partial(self.solve_centroids, rate=rate, exposure_s=exposure_s)
         return process_frame(image, self.camera, self.settings, solve, streak_px, rate, exposure_s)
@@ -191,7 +198,11 @@ class DomeTracker:
         """Compile all that `solve` and `solve_centroids` use: call it before the experiment.
 
         It takes up to a minute once, and a second where numba finds its code on disk.
-        dtype : of the frames' pixels
+
+        Parameters
+        ----------
+        dtype
+            Of the frames' pixels
         """
         fields = []
         for toward_m in self.leds.position_m[:: max(len(self.leds.position_m) // 40, 1)]:
@@ -390,9 +401,15 @@ class DomeTracker:
     ) -> tuple[Floats, Floats]:
         """The covariance of K matches with the survey's errors as they are, and the part that successive frames share.
 
-        covariance : (3, 3) in camera axes, with each LED's error independent of the others' and equal in all directions
-        misfit     : factor of `_reject_blends` on all but the common errors
-        sigma_rad  : (K,) errors on which it is based, (K, 3) rays and (K,) LEDs
+        Parameters
+        ----------
+        covariance
+            (3, 3) in camera axes, with each LED's error independent of the others' and equal in
+            all directions
+        misfit
+            Factor of `_reject_blends` on all but the common errors
+        sigma_rad
+            (K,) errors on which it is based, (K, 3) rays and (K,) LEDs
         """
         led_rad = self.led_sigma_rad[star]
         focal_rad = self._focal_rad(rays)

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.core import checks
-from estimator.core.arrays import Ints
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError, Ints
 from estimator.core.jit import jit
 from estimator.detection.detect import check_pixel_type, to_native
 
@@ -35,13 +34,22 @@ INCREMENT_S = 1e-6
 class Control:
     """Parameters of the control. The defaults are the paper's; it does not state mean_dn.
 
-    mean_dn     : reference mean; a frame with a greater mean is saturated
-    longest_s   : 50 ms is the paper's on-board limit, for a smear of 4.5 px at 2 deg/s
-    min_stars : with fewer objects the flag no_stars is set
-    overexposed_objects, saturated_px : a frame is saturated if at least overexposed_objects objects have more than
-        saturated_px saturated pixels each
+    Attributes
+    ----------
+    mean_dn
+        Reference mean; a frame with a greater mean is saturated
+    longest_s
+        50 ms is the paper's on-board limit, for a smear of 4.5 px at 2 deg/s
+    min_stars
+        With fewer objects the flag no_stars is set
+    overexposed_objects, saturated_px
+        A frame is saturated if at least overexposed_objects objects have more than saturated_px
+        saturated pixels each
 
-    Raises ValueError for limits outside of the camera's range or for invalid numbers.
+    Raises
+    ------
+    ValueError
+        For limits outside of the camera's range or for invalid numbers.
     """
 
     mean_dn: float
@@ -78,9 +86,14 @@ class Control:
 class Observation:
     """Measurements of one frame for the exposure control.
 
-    mean_dn     : of all pixels
-    stars       : number of objects from centroiding
-    overexposed : number of objects with more than `Control.saturated_px` saturated pixels
+    Attributes
+    ----------
+    mean_dn
+        Of all pixels
+    stars
+        Number of objects from centroiding
+    overexposed
+        Number of objects with more than `Control.saturated_px` saturated pixels
     """
 
     mean_dn: float
@@ -89,7 +102,7 @@ class Observation:
 
 
 @dataclass(frozen=True, slots=True)
-class Exposure:
+class NextExposure:
     """The next exposure time, and the flags of the frame that it is based on."""
 
     time_s: float
@@ -97,7 +110,7 @@ class Exposure:
     no_stars: bool = False
 
 
-def step(state: Exposure, observation: Observation, control: Control) -> Exposure:
+def step(state: NextExposure, observation: Observation, control: Control) -> NextExposure:
     """The next exposure from one frame's measurements, within the limits and in whole microseconds."""
     saturated = (
         observation.mean_dn > control.mean_dn
@@ -107,16 +120,23 @@ def step(state: Exposure, observation: Observation, control: Control) -> Exposur
     direction = -1 if saturated else int(no_stars)
     target_s = INCREMENT_S * round((state.time_s + direction * control.step_s) / INCREMENT_S)
     time_s = min(max(target_s, control.shortest_s), control.longest_s)
-    return Exposure(time_s, saturated, no_stars)
+    return NextExposure(time_s, saturated, no_stars)
 
 
 def observe(image: NDArray, box_px: Ints, saturation_dn: float, control: Control) -> Observation:
     """Measure a frame for the exposure control.
 
-    image  : (H, W); box_px : (N, 4) x0, y0, x1, y1 of the objects, both ends included, as in Blobs
-    saturation_dn : least value of a saturated pixel
+    Parameters
+    ----------
+    image
+        (H, W); box_px : (N, 4) x0, y0, x1, y1 of the objects, both ends included, as in Blobs
+    saturation_dn
+        Least value of a saturated pixel
 
-    Raises ImageError for boxes outside of the image.
+    Raises
+    ------
+    ImageError
+        For boxes outside of the image.
     """
     checks.of_type("exposure: control", control, Control)
     check_pixel_type(image)

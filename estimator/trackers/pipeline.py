@@ -17,12 +17,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.attitude.motion import center_streak_px
+from estimator.attitude.rate import center_streak_px
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import checks
-from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera, check_frame
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError, Ints
 from estimator.core.types import Attitude, Blobs, Centroids, FramePriors, RateEstimate
 from estimator.detection import classify
 from estimator.detection.classify import NO_STAR, Flag
@@ -73,19 +72,34 @@ ALLOWED = {
 class Settings:
     """Algorithm of each stage, and its parameters.
 
-    centroid_sigma_px : floor of a centroid's error, for errors beyond its own noise
-    base_stars        : number of brightest blobs from which the published identifiers form patterns
-    searched_stars    : number of brightest blobs that the default identifier uses to find an attitude
-    field_stars       : mean number of catalog stars per field in the pattern index
-    merge_px          : catalog stars closer than this are merged into one
-    zero_point_mag    : magnitude of a source of flux 1; None if unknown: magnitudes are then not used
-    magnitude_sigma   : standard deviation of a star's magnitude, including the effect of its color
-    missed_dex        : see `identification.options.Options`
-    reject            : flags of `detection.classify.Flag` that exclude a blob
-    bad_px            : (K, 2) x and y of the sensor's bad pixels; None without a map
+    Attributes
+    ----------
+    centroid_sigma_px
+        Floor of a centroid's error, for errors beyond its own noise
+    base_stars
+        Number of brightest blobs from which the published identifiers form patterns
+    searched_stars
+        Number of brightest blobs that the default identifier uses to find an attitude
+    field_stars
+        Mean number of catalog stars per field in the pattern index
+    merge_px
+        Catalog stars closer than this are merged into one
+    zero_point_mag
+        Magnitude of a source of flux 1; None if unknown: magnitudes are then not used
+    magnitude_sigma
+        Standard deviation of a star's magnitude, including the effect of its color
+    missed_dex
+        See `identification.options.Options`
+    reject
+        Flags of `detection.classify.Flag` that exclude a blob
+    bad_px
+        (K, 2) x and y of the sensor's bad pixels; None without a map
 
-    Raises ImageError for a number that cannot be used, and for an unknown keyword. The algorithms' names are checked by
-    the tracker (`check_algorithms`): a dome has others than the sky.
+    Raises
+    ------
+    ImageError
+        For a number that cannot be used, and for an unknown keyword. The algorithms' names are
+        checked by the tracker (`check_algorithms`): a dome has others than the sky.
     """
 
     detector: str = "default"
@@ -180,8 +194,15 @@ def detect_and_centroid(
 ) -> Centroids:
     """Detect blobs and compute their centroids, without those that cannot be stars or are too inaccurate.
 
-    streak_px, turn_rad : of FramePriors, from the gyro; None if unknown
-    Raises ImageError for a frame of another shape than the camera's, or a saturated one.
+    Parameters
+    ----------
+    streak_px, turn_rad
+        Of FramePriors, from the gyro; None if unknown
+
+    Raises
+    ------
+    ImageError
+        For a frame of another shape than the camera's, or a saturated one.
     """
     check_frame(image, camera)
     image = in_row_order(image)

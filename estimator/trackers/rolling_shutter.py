@@ -16,12 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.attitude import rolling
-from estimator.attitude.disk_rate import from_moments
-from estimator.attitude.motion import STARS, Sight, at_middle_row
 from estimator.attitude.nearfield import tangent_jacobian
-from estimator.attitude.rate import MAX_RATE_RAD_S, from_streaks
-from estimator.core.arrays import Floats
+from estimator.attitude.rate import (
+    MAX_RATE_RAD_S,
+    STARS,
+    Sight,
+    at_middle_row,
+    from_moments,
+    from_streaks,
+)
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids, RateEstimate
 
 SHORT_STREAK_PX = 1.5  # standard deviation of a streak that is too short to be seen
@@ -37,9 +42,14 @@ ROUNDS = 5  # of the fit: the lights change with the rate
 class Lights(NamedTuple):
     """The lights of a tracker.
 
-    place_ref   : (N, 3) unit vectors of stars, or LEDs from the bearing, m
-    lever_cam_m : (3,) the camera from the bearing, in camera axes; zeros for stars
-    with_errors : returns K centroids of given lights (K,) with their total errors
+    Attributes
+    ----------
+    place_ref
+        (N, 3) unit vectors of stars, or LEDs from the bearing, m
+    lever_cam_m
+        (3,) the camera from the bearing, in camera axes; zeros for stars
+    with_errors
+        Returns K centroids of given lights (K,) with their total errors
     """
 
     place_ref: Floats
@@ -64,9 +74,15 @@ def solve_rolling(
 
     Where streaks leave the sign of the rate open, some stars may match with the wrong one as well: both signs are
     tried, and the one with more evidence is kept.
-    solve_global : solves centroids of one time
-    rate         : from a gyro; None: from the frame
-    exposure_s   : None: streaks tell nothing of the rate
+
+    Parameters
+    ----------
+    solve_global
+        Solves centroids of one time
+    rate
+        From a gyro; None: from the frame
+    exposure_s
+        None: streaks tell nothing of the rate
     """
     best: Attitude | None = None
     for candidate, prior in candidates(camera, lights.sight, centroids, rate, exposure_s):

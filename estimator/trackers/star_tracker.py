@@ -20,28 +20,29 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.motion import covariance_of
+from estimator.attitude.rate import covariance_of
 from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.attitude.systematic import with_focal_error
 from estimator.catalog import catalog, pair_index, quad_index, sky_index
 from estimator.catalog.refraction import SiteAir
 from estimator.core import checks
-from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats, Ints
 from estimator.core.least_squares import variance_factor
 from estimator.core.types import NO_SPREAD, Attitude, Centroids, RateEstimate, StarMatch
+from estimator.identification import star_quads, star_search
 from estimator.identification.chance import (
     MIN_EVIDENCE_MATCHES,
 )
-from estimator.identification.stars import quads, search
-from estimator.identification.stars.detections import (
+from estimator.identification.star_detections import (
     Detections,
     FlatCentroids,
     Sensor,
     detections_of,
 )
-from estimator.identification.stars.evidence import Solution
-from estimator.trackers import warm_up
+from estimator.identification.star_evidence import Solution
+from estimator.trackers import misfit, warm_up
+from estimator.trackers.misfit import Refit
 from estimator.trackers.pipeline import (
     Clock,
     Report,
@@ -50,9 +51,7 @@ from estimator.trackers.pipeline import (
     check_algorithms,
     process_frame,
 )
-from estimator.trackers.residuals import companions, misfit
-from estimator.trackers.residuals.misfit import Refit
-from estimator.trackers.residuals.refinement import NO_MATCH, FieldMatcher
+from estimator.trackers.refinement import NO_MATCH, FieldMatcher
 from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
 
 NO_STARS = "too few stars detected"
@@ -64,11 +63,18 @@ MIN_ERROR_PX = 0.005  # least centroid error of a star: a calibrated lens, a cat
 class SearchModel(NamedTuple):
     """Error model and effort of one search.
 
-    min_error_px   : least centroid error
-    relative_error : additional error, as a fraction of the distance from the principal point
-    max_checks     : greatest number of star look-ups; 400,000 take about 0.02 s
-    by_quads       : whether quads are searched in place of pairs
-    focal_uncertainty : relative, if it is greater than that of the tracker
+    Attributes
+    ----------
+    min_error_px
+        Least centroid error
+    relative_error
+        Additional error, as a fraction of the distance from the principal point
+    max_checks
+        Greatest number of star look-ups; 400,000 take about 0.02 s
+    by_quads
+        Whether quads are searched in place of pairs
+    focal_uncertainty
+        Relative, if it is greater than that of the tracker
     """
 
     min_error_px: float
@@ -78,7 +84,7 @@ class SearchModel(NamedTuple):
     focal_uncertainty: float = 0.0
 
 
-WRONG_FOCAL_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 200_000, True, search.WRONG_FOCAL)
+WRONG_FOCAL_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 200_000, True, star_search.WRONG_FOCAL)
 CALIBRATED_SEARCHES = (
     SearchModel(MIN_ERROR_PX, 0.0, 25_000),
     WRONG_FOCAL_SEARCH,
@@ -104,15 +110,28 @@ SETTINGS = Settings()
 class StarTracker:
     """Lost-in-space star tracker for the real sky.
 
-    camera  : on-board calibration
-    stars   : on-board star list
-    vectors : (N, 3) apparent directions of `stars` at the time of the frames
-    focal_uncertainty : relative; 0 for a calibrated camera, 0.05 if the field of view is only known to 5 %.
-        Unless it is 0, the focal length and, with enough stars, the radial distortion are fitted in each frame.
-    searches : of the default identifier; empty for those that suit the focal uncertainty
-    air      : over the tracker's site, whose refraction is undone; None in space
+    Attributes
+    ----------
+    camera
+        on-board calibration
+    stars
+        on-board star list
+    vectors
+        (N, 3) apparent directions of `stars` at the time of the frames
+    focal_uncertainty
+        Relative; 0 for a calibrated camera, 0.05 if the field of view is only known to 5 %.
+        Unless it is 0, the focal length and, with enough stars, the radial distortion are
+        fitted in each frame.
+    searches
+        Of the default identifier; empty for those that suit the focal uncertainty
+    air
+        Over the tracker's site, whose refraction is undone; None in space
 
-    Raises ImageError for anything that is not as described here, an unknown algorithm of the settings included.
+    Raises
+    ------
+    ImageError
+        For anything that is not as described here, an unknown algorithm of the settings
+        included.
     """
 
     def __init__(
@@ -199,11 +218,21 @@ class StarTracker:
     ) -> StarTracker:
         """A tracker for the sky as seen from the Earth at a date.
 
-        limit_mag : faintest V magnitude of the on-board catalog; None: 6 without `stars`, else all of them
-        date      : UTC, ISO 8601 or datetime: fixes proper motion, parallax and aberration
-        stars     : another catalog than the Hipparcos subset that comes with the package, which ends at Hp 6.5
+        Parameters
+        ----------
+        limit_mag
+            Faintest V magnitude of the on-board catalog; None: 6 without `stars`, else all of
+            them
+        date
+            UTC, ISO 8601 or datetime: fixes proper motion, parallax and aberration
+        stars
+            Another catalog than the Hipparcos subset that comes with the package, which ends at
+            Hp 6.5
 
-        Raises ImageError for a date that cannot be read, or a catalog without a star as bright as limit_mag.
+        Raises
+        ------
+        ImageError
+            For a date that cannot be read, or a catalog without a star as bright as limit_mag.
         """
         if limit_mag is not None or stars is None:
             limit_mag = checks.number(
@@ -225,10 +254,18 @@ class StarTracker:
     ) -> Report:
         """Solve one frame. Raises ImageError for bad input; any other failure is reported in the status.
 
-        streak_px : (dx, dy) that stars move during the exposure, from the gyro; None: unknown, or from `rate`
-        rate      : of the camera, from the gyro; None: with a rolling shutter it is estimated from the frame
-        exposure_s: to estimate the rate from streaks; None if unknown
-        t_s       : time of the frame since the air's epoch
+        Parameters
+        ----------
+        streak_px
+            (dx, dy) that stars move during the exposure, from the gyro; None: unknown, or from
+            `rate`
+        rate
+            Of the camera, from the gyro; None: with a rolling shutter it is estimated from the
+            frame
+        exposure_s
+            To estimate the rate from streaks; None if unknown
+        t_s
+            Time of the frame since the air's epoch
         """
         solve = functools.partial(self.solve_centroids, rate=rate, exposure_s=exposure_s)
         if self.air is not None:
@@ -240,7 +277,11 @@ class StarTracker:
 
         It takes up to a minute once, and a second where numba finds its code on disk. Without it the first frames
         take that time.
-        dtype : of the frames' pixels
+
+        Parameters
+        ----------
+        dtype
+            Of the frames' pixels
         """
         cam_from_ref, xy_px, light = self.rich_field()
         warm_up.run(self.camera, xy_px, light, dtype, self.solve)
@@ -278,8 +319,12 @@ class StarTracker:
     ) -> Attitude:
         """Identify and solve centroids from any source (the truth included).
 
-        effort : run only this one of the `efforts` searches, from 0; None: all of them in turn
-        rate, exposure_s : as in `solve`
+        Parameters
+        ----------
+        effort
+            Run only this one of the `efforts` searches, from 0; None: all of them in turn
+        rate, exposure_s
+            As in `solve`
         """
         checks.of_type("centroids", centroids, Centroids)
         centroids.check_values()
@@ -361,8 +406,12 @@ class StarTracker:
     def solve_matches(self, centroids: Centroids, observed: Ints, star: Ints) -> Attitude:
         """Solve the attitude for given matches from any source (the truth included), without identification.
 
-        observed, star : (K,) rows of the centroids and of `self.stars`, K >= 2
         The match is not tested against chance: its log10_chance is NaN. Raises ImageError for rows that there are not.
+
+        Parameters
+        ----------
+        observed, star
+            (K,) rows of the centroids and of `self.stars`, K >= 2
         """
         checks.of_type("centroids", centroids, Centroids)
         centroids.check_values()
@@ -410,7 +459,12 @@ class StarTracker:
     ) -> Detections:
         """The centroids as input of the search, with magnitudes if the zero point is known.
 
-        sigma_px : (N,) total errors;  focal_uncertainty : relative, if it is greater than that of the tracker
+        Parameters
+        ----------
+        sigma_px
+            (N,) total errors
+        focal_uncertainty
+            Relative, if it is greater than that of the tracker
         """
         return detections_of(
             _lights(centroids, sigma_px),
@@ -437,7 +491,9 @@ class StarTracker:
             if calibrated and not variance and misfit.residuals_too_great(solution):
                 # Of a camera with a wrong focal length a part of the stars may match, at a wrong attitude.
                 other, _ = self._search(centroids, sigma_px, WRONG_FOCAL_SEARCH)
-                solution = other if other.dex > solution.dex + search.WRONG_FOCAL_DEX else solution
+                solution = (
+                    other if other.dex > solution.dex + star_search.WRONG_FOCAL_DEX else solution
+                )
             clock.lap("identify")
             if not len(solution.star):
                 continue
@@ -469,21 +525,26 @@ class StarTracker:
         """One search of the default identifier, and the factor of the variances if it is known, else 0."""
         most = self.settings.searched_stars
         at_once = not (model.by_quads or self.focal_uncertainty or self.camera.row_time_s)
-        if at_once and companions.are_small(sigma_px / self.camera.focal_px):
+        if at_once and misfit.are_small(sigma_px / self.camera.focal_px):
             lights = _lights(centroids, sigma_px)
             return misfit.identify(lights, self.sensor, self.sky, most, model.max_checks)
         detections = self.detections(centroids, sigma_px, model.focal_uncertainty)
         if not model.by_quads:
-            return search.lost_in_space(detections, self.sky, most, model.max_checks), 0.0
+            return star_search.lost_in_space(detections, self.sky, most, model.max_checks), 0.0
         known = not self.focal_uncertainty
-        return quads.identify(detections, self.quads, self.sky, most, model.max_checks, known), 0.0
+        return star_quads.identify(
+            detections, self.quads, self.sky, most, model.max_checks, known
+        ), 0.0
 
     def refit(
         self, centroids: Centroids, solution: Solution, sigma_px: Floats, variance: float = 0.0
     ) -> Refit:
         """A solution with the errors and, of a calibrated global shutter, the lens that its residuals tell.
 
-        variance : factor of the variances if the solution has been matched anew already; else 0
+        Parameters
+        ----------
+        variance
+            Factor of the variances if the solution has been matched anew already; else 0
         """
         camera = (
             self.camera if solution.focal_ratio == 1 else self.camera.zoomed(solution.focal_ratio)
@@ -491,10 +552,10 @@ class StarTracker:
         if not len(solution.star) or 0 < variance < misfit.TELLING:
             return Refit(solution, camera, variance or 1.0)
         detections = self.detections(
-            centroids, sigma_px, 0.0 if solution.focal_ratio == 1 else search.WRONG_FOCAL
+            centroids, sigma_px, 0.0 if solution.focal_ratio == 1 else star_search.WRONG_FOCAL
         )
         if not variance:
-            solution, detections = companions.with_companions(solution, detections, self.sky)
+            solution, detections = misfit.with_companions(solution, detections, self.sky)
             # A few stars may fit by luck within gates that are too narrow for the others.
             if len(solution.star) == len(centroids) and solution.chi2 < misfit.DOUBTFUL:
                 return Refit(solution, camera, 1.0)

@@ -18,15 +18,14 @@ from scipy.spatial.transform import Rotation
 
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import checks
-from estimator.core.arrays import Floats
 from estimator.core.camera import check_frame
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.types import Attitude, Centroids, FramePriors, RateEstimate, StarMatch
 from estimator.detection.classify import Flag
 from estimator.detection.detect import in_row_order
 from estimator.detection.windows import in_windows
+from estimator.identification import star_evidence
 from estimator.identification.chance import ACCEPT_DEX, MIN_EVIDENCE_MATCHES
-from estimator.identification.stars import evidence
 from estimator.trackers import warm_up
 from estimator.trackers.pipeline import Clock, Report, detect_and_centroid, inflate_uncertainty
 from estimator.trackers.rolling_shutter import with_streak_rate
@@ -60,10 +59,16 @@ class Health(IntFlag):
 class TrackedReport(Report):
     """A frame's report with the quality of its solution.
 
-    health       : flags
-    log10_odds   : log10 of the odds of the attitude over chance; -inf without an attitude
-    chi2_per_dof : reduced chi-square of the residuals; NaN without an attitude
-    expected     : number of stars searched for in windows; 0 if solved lost in space
+    Attributes
+    ----------
+    health
+        flags
+    log10_odds
+        log10 of the odds of the attitude over chance; -inf without an attitude
+    chi2_per_dof
+        Reduced chi-square of the residuals; NaN without an attitude
+    expected
+        Number of stars searched for in windows; 0 if solved lost in space
     """
 
     health: Health = Health.LOST
@@ -84,12 +89,21 @@ class LastSolution:
 class TrackingMode:
     """Star tracker with memory: tracks the predicted stars, and solves lost in space if that fails.
 
-    tracker  : lost-in-space tracker with a calibrated camera and the default identifier
-    reach_px : half the side of a window: greatest error of the prediction
-    max_windows : greatest number of windows, for the brightest stars
-    max_age_s   : greatest age of the last attitude for a prediction
+    Attributes
+    ----------
+    tracker
+        lost-in-space tracker with a calibrated camera and the default identifier
+    reach_px
+        Half the side of a window: greatest error of the prediction
+    max_windows
+        Greatest number of windows, for the brightest stars
+    max_age_s
+        Greatest age of the last attitude for a prediction
 
-    Raises ImageError for another tracker or for unusable numbers.
+    Raises
+    ------
+    ImageError
+        For another tracker or for unusable numbers.
     """
 
     def __init__(
@@ -130,9 +144,15 @@ class TrackingMode:
         A rate by streaks gets its sign from the last attitude. The frames of a rolling shutter are solved lost in
         space, with that rate.
 
-        now_from_then : cam(t_s) from cam at the last solved frame, from the gyros; None: the last rate is extrapolated
-        streak_px     : (dx, dy) that stars move during the exposure, from the gyros
-        exposure_s    : to estimate the rate from streaks
+        Parameters
+        ----------
+        now_from_then
+            cam(t_s) from cam at the last solved frame, from the gyros; None: the last rate is
+            extrapolated
+        streak_px
+            (dx, dy) that stars move during the exposure, from the gyros
+        exposure_s
+            To estimate the rate from streaks
         """
         check_frame(image, self.tracker.camera)
         image = in_row_order(image)
@@ -152,7 +172,10 @@ class TrackingMode:
     def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
         """Compile all that `solve` uses, in windows and in whole frames: `StarTracker.warm_up`; the memory is kept.
 
-        dtype : of the frames' pixels
+        Parameters
+        ----------
+        dtype
+            Of the frames' pixels
         """
         self.tracker.warm_up(dtype)
         cam_from_ref, xy_px, light = self.tracker.rich_field()
@@ -228,7 +251,7 @@ class TrackingMode:
         detections = tracker.detections(centroids, sigma_px)
         reach_rad = self.reach_px / tracker.camera.focal_px
         gates = np.full(len(centroids), 1.5 * reach_rad)  # covers a window's corner
-        hypothesis = evidence.evaluate(
+        hypothesis = star_evidence.evaluate(
             detections, tracker.sky, predicted.as_matrix(), 1.0, gates, -np.inf
         )
         # The prior volume of attitudes is not 8 pi^2 but that of the prediction: the boresight in a square of side
@@ -239,7 +262,7 @@ class TrackingMode:
         )
         if hypothesis.dex + prior_gain_dex < ACCEPT_DEX:
             return None
-        solution = evidence.build_solution(detections, tracker.sky, hypothesis)
+        solution = star_evidence.build_solution(detections, tracker.sky, hypothesis)
         refitted = tracker.refit(centroids, solution, sigma_px)
         if refitted.sheared or len(refitted.solution.star) < LEAST_SHARE * len(window_centers_px):
             return None

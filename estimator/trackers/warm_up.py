@@ -12,9 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.detection.detect import to_native
 
 SKY = 100.0

@@ -34,11 +34,18 @@ VIGNETTING: dict[str, Callable[[Any, Floats], Floats]] = {"two_stops": two_stops
 class Optics:
     """Lens and image geometry of a camera, in camera axes +x right, +y down, +z boresight.
 
-    camera        : focal length, principal point, distortion, point-spread function
-    collecting_m2 : entrance pupil's area times transmission, where that is one number
-    fold_r        : tangent of the field angle at which strong barrel distortion folds back: no image beyond
-    field_rad     : greatest field angle (from the boresight) on the chip
-    blur_px       : standard deviation of a Gaussian blur before the lens (seeing)
+    Attributes
+    ----------
+    camera
+        Focal length, principal point, distortion, point-spread function
+    collecting_m2
+        Entrance pupil's area times transmission, where that is one number
+    fold_r
+        Tangent of the field angle at which strong barrel distortion folds back: no image beyond
+    field_rad
+        Greatest field angle (from the boresight) on the chip
+    blur_px
+        Standard deviation of a Gaussian blur before the lens (seeing)
     """
 
     camera: CameraConfig

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from skysim.camera.optics import Optics
 from skysim.camera.psf.ellipse import EllipseDisk, add_ellipse, ellipse_table, sharpest_px
+from skysim.camera.psf.kernel import DiskImages, disk_images
 from skysim.camera.psf.kernel_cache import ELLIPSE, GAUSS, ROUND, Kernels, source_kernels
-from skysim.camera.psf.led_disk import DiskImages, disk_images
 from skysim.camera.psf.splat import Singles, add_gaussian, add_grid, add_round
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
@@ -70,8 +70,12 @@ class Window(NamedTuple):
 class Poses(NamedTuple):
     """The camera's pose at K times.
 
-    cam_from_lab : (K, 3, 3) matrices
-    camera_m     : (K, 3) entrance pupil in the lab
+    Attributes
+    ----------
+    cam_from_lab
+        (K, 3, 3) matrices
+    camera_m
+        (K, 3) entrance pupil in the lab
     """
 
     cam_from_lab: Floats
@@ -81,10 +85,16 @@ class Poses(NamedTuple):
 class Tracks(NamedTuple):
     """Image position and rate of every source at K even times of the exposure, as arrays for numba.
 
-    first_s, step_s : the times
-    xy_px  : (K, N, 2) position of the image, NaN where it has none
-    rate_e_s : (K, N) photo-electrons a second while lit
-    pulse_s  : (N, 3) period, start and duration of its pulses
+    Attributes
+    ----------
+    first_s, step_s
+        The times
+    xy_px
+        (K, N, 2) position of the image, NaN where it has none
+    rate_e_s
+        (K, N) photo-electrons a second while lit
+    pulse_s
+        (N, 3) period, start and duration of its pulses
     """
 
     first_s: float
@@ -181,7 +191,10 @@ def _displacement(tracks: Tracks, begin_s: Floats, end_s: Floats) -> Floats:
 def sample_times(open_s: float, close_s: float, trajectory: Trajectory) -> Floats:
     """K even times over the exposure, as dense as the attitude's samples; K is odd, so that one is in the middle.
 
-    Raises InputError for more samples than memory should hold: dropping samples could drop the jitter.
+    Raises
+    ------
+    InputError
+        For more samples than memory should hold: dropping samples could drop the jitter.
     """
     first, last = np.searchsorted(trajectory.t_s, (open_s, close_s))
     count = max(int(last - first) + 1, MIN_POSES) | 1
@@ -257,7 +270,10 @@ def project_each(
 ) -> tuple[Floats, ...]:
     """As `project` at mid-exposure, of sources in groups, each at a pose of its own: the results are (N, 2) and (N,).
 
-    ends : (K + 1,) 0, and the number of sources up to the end of each group
+    Parameters
+    ----------
+    ends
+        (K + 1,) 0, and the number of sources up to the end of each group
     """
     direction_cam, distance, cos_out = _directions_each(
         sources.place, NO_MOTION, NOW, sources.normal, *poses, ends
@@ -285,7 +301,12 @@ def _directions(
 ) -> tuple[Floats, Floats, Floats]:
     """(K, N, 3) unit directions in camera axes, (K, N) distances in m and cosines at the emitters.
 
-    motion : as of `Sources`, or of length 0 where nothing moves;  after_s : (K,), or (1,) for all poses
+    Parameters
+    ----------
+    motion
+        As of `Sources`, or of length 0 where nothing moves
+    after_s
+        (K,), or (1,) for all poses
     """
     poses = len(cam_from_lab)
     count = len(place)
@@ -436,11 +457,15 @@ def draw(
 ) -> Floats:
     """Draw every source on a patch of its own and add the patches to the image, as many at a time as memory allows.
 
-    step_px : (N,) largest motion of each image in one piece of the exposure; of an ellipse in units of `sharpest_px`
-
     Returns (N, 8): electrons on the chip, those of the brightest pixel, flux-weighted mean x and y, sum of the
     squared pixels, path length in pixels, and the brightest pixel's x and y. The mean is that of the whole image,
     but in a rolling shutter of the part on the chip, since there each row has its own time.
+
+    Parameters
+    ----------
+    step_px
+        (N,) largest motion of each image in one piece of the exposure; of an ellipse in units
+        of `sharpest_px`
     """
     boxes = patches(tracks.xy_px, kernels.reach_px, image.shape)
     areas = (boxes[:, 1] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 2])

@@ -27,9 +27,14 @@ Coefficients = dict[tuple[int, int], float]
 class Sip:
     """Distortion as polynomials about the principal point (Shupe et al. 2005), coefficients by powers (p, q).
 
-    a, b   : from distorted pixel offsets u, v to what is added to get the undistorted offsets
-    ap, bp : the inverse, which is Brown's law (1971) itself, a polynomial of at most seventh order
-    worst_px : the greatest error of a and b on the chip
+    Attributes
+    ----------
+    a, b
+        From distorted pixel offsets u, v to what is added to get the undistorted offsets
+    ap, bp
+        The inverse, which is Brown's law (1971) itself, a polynomial of at most seventh order
+    worst_px
+        The greatest error of a and b on the chip
     """
 
     a: Coefficients

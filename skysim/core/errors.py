@@ -31,8 +31,12 @@ def unknown_name(kind: str, name: object, allowed: Iterable[object]) -> tuple[st
 class Where(NamedTuple):
     """A place in a file; `str` gives `scenes/x.yaml, line 31`.
 
-    line : None if the place is the file as a whole
-    unit : what `line` counts: lines, or rows of a table
+    Attributes
+    ----------
+    line
+        None if the place is the file as a whole
+    unit
+        What `line` counts: lines, or rows of a table
     """
 
     file: str | Path
@@ -51,13 +55,19 @@ OVERRIDES = Where("overrides")  # of a value that the caller gave in place of th
 class InputError(ValueError):
     """The user's input is wrong; `str` says where, what, and what is allowed, in one printable line.
 
-    key     : the input at fault: a dotted key, a parameter or a file; empty if it has no name
-    problem : what is wrong with it; may be empty if `allowed` says all
-    allowed : what it may be; may be empty if `problem` says all
-    where   : place of the key in a file; for the file that is the key itself, the place in it
-
     No code reads the text of an error: the command line and the page word it from these parts. A caller that knows more
     raises a changed copy: `under`, `within`, `at`.
+
+    Attributes
+    ----------
+    key
+        The input at fault: a dotted key, a parameter or a file; empty if it has no name
+    problem
+        What is wrong with it; may be empty if `allowed` says all
+    allowed
+        What it may be; may be empty if `problem` says all
+    where
+        Place of the key in a file; for the file that is the key itself, the place in it
     """
 
     key: str

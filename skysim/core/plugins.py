@@ -48,10 +48,16 @@ Respond = Callable[
 class PluginKind(NamedTuple):
     """A kind of plug-in.
 
-    kind  : what it is, for messages
-    group : group of the entry points
-    key   : key of the scene that names one
-    own   : names of skysim's own, which no plug-in may take
+    Attributes
+    ----------
+    kind
+        What it is, for messages
+    group
+        Group of the entry points
+    key
+        Key of the scene that names one
+    own
+        Names of skysim's own, which no plug-in may take
     """
 
     kind: str
@@ -156,12 +162,23 @@ class RunningProcess:
 class Program:
     """A program that answers messages.
 
-    key, name      : key of the scene that names it, and its name, for error messages
-    arguments      : the command; `{folder}` in it becomes a temporary folder
-    setup          : JSON object that is sent first
-    limit_s        : time limit per answer
-    environment    : in place of this process's
-    Raises InputError where it cannot be started or refuses the set-up.
+    Attributes
+    ----------
+    key, name
+        Key of the scene that names it, and its name, for error messages
+    arguments
+        The command; `{folder}` in it becomes a temporary folder
+    setup
+        JSON object that is sent first
+    limit_s
+        Time limit per answer
+    environment
+        In place of this process's
+
+    Raises
+    ------
+    InputError
+        Where it cannot be started or refuses the set-up.
     """
 
     def __init__(

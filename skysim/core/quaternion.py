@@ -146,8 +146,13 @@ def interpolate(
 ) -> Floats:
     """(M, 4) attitudes between knots (N, 4): cubic Hermite in the rotation vector from the previous knot.
 
-    hermite_rad : (N - 1, 3, 3) rotation vector to the next knot, and its derivatives at both ends times the step
-    knot, fraction : (M,) index of the knot before each time, and the elapsed fraction of the step
+    Parameters
+    ----------
+    hermite_rad
+        (N - 1, 3, 3) rotation vector to the next knot, and its derivatives at both ends times
+        the step
+    knot, fraction
+        (M,) index of the knot before each time, and the elapsed fraction of the step
     """
     out = np.empty((len(knot), 4))
     for m in range(len(knot)):

@@ -33,13 +33,17 @@ SIGMAS_OF_TOLERANCE = (
 class Tolerance(float):
     """The standard deviation of an error within +-half_width, and the distribution that it has there.
 
-    half_width   : the tolerance, above 0
-    parent_sigma : standard deviation of the normal distribution before it is truncated at the tolerance; None: the
-        error is uniform
-
     Uniform (GUM 4.3.7, JCGM 100:2008): half_width / sqrt(3). Truncated normal: with k = half_width / parent_sigma and
     the standard normal density phi, parent_sigma sqrt(1 - 2 k phi(k) / erf(k / sqrt 2)) (Johnson, Kotz & Balakrishnan
     1994, Continuous Univariate Distributions 1, ch. 13.10.1).
+
+    Attributes
+    ----------
+    half_width
+        The tolerance, above 0
+    parent_sigma
+        Standard deviation of the normal distribution before it is truncated at the tolerance;
+        None: the error is uniform
     """
 
     half_width: float
@@ -91,10 +95,16 @@ def scaled_errors(sigma: float, normal: Floats) -> Floats:
 class ToleranceConfig(ConfigModel):
     """Base of a tolerance's section; `tolerance` and `sigma` are quantities of the key's own kind.
 
-    tolerance    : greatest error, plus and minus, as a data sheet states it: "±0.5 mm", or without the sign
-    distribution : uniform (the usual reading of a data sheet, and the default), or a normal distribution truncated at
-        the tolerance; normal has no tolerance
-    sigma        : of the normal distribution before it is truncated; a third of the tolerance if left out
+    Attributes
+    ----------
+    tolerance
+        Greatest error, plus and minus, as a data sheet states it: "±0.5 mm", or without the
+        sign
+    distribution
+        Uniform (the usual reading of a data sheet, and the default), or a normal distribution
+        truncated at the tolerance; normal has no tolerance
+    sigma
+        Of the normal distribution before it is truncated; a third of the tolerance if left out
     """
 
     distribution: Literal["uniform", "truncated_normal", "normal"] | None = None

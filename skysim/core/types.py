@@ -23,8 +23,12 @@ ROUNDING = 1e-12  # more than the rounding errors of a cosine
 class Mount:
     """Position and orientation of the camera on the vehicle.
 
-    camera_body_m : (3,) entrance pupil in the body frame, whose origin is the bearing center
-    cam_from_body : rotation of the body frame into the camera frame (+x right, +y down, +z boresight)
+    Attributes
+    ----------
+    camera_body_m
+        (3,) entrance pupil in the body frame, whose origin is the bearing center
+    cam_from_body
+        Rotation of the body frame into the camera frame (+x right, +y down, +z boresight)
     """
 
     camera_body_m: Floats
@@ -35,9 +39,14 @@ class Mount:
 class Trajectory:
     """The vehicle's attitude history, sampled finely enough for interpolation.
 
-    t_s             : (N,) strictly increasing
-    lab_from_body   : N rotations
-    rate_body_rad_s : (N, 3) angular velocity of body in lab, in body axes
+    Attributes
+    ----------
+    t_s
+        (N,) strictly increasing
+    lab_from_body
+        N rotations
+    rate_body_rad_s
+        (N, 3) angular velocity of body in lab, in body axes
     """
 
     t_s: Floats
@@ -122,23 +131,40 @@ class Mounting(NamedTuple):
 class Telemetry:
     """True and estimated states of the vehicle at K ticks of its computer; None for what it does not have.
 
-    t_s             : (K,); period_s between them
-    lab_from_body   : K, the truth, without the added jitter; rate_body_rad_s (K, 3) likewise
-    lab_from_ref    : K, the commanded attitude
-    torque_nm       : (K, 3) torque demanded by the controller, in body axes
-    disturbance_nm  : (K, 3) disturbance torque, without gravity, drag, spring and actuators
-    momentum_nms    : (K, 3) stored in wheels and CMGs, in body axes
-    wheel_rad_s, gimbal_rad : (K, n)
-    joints          : (K, nq) MuJoCo's positions of all joints, for rendering
-    manipulability  : (K,) of the CMGs: 1 far from a singularity, 0 at one
-    lab_from_imu    : K, the navigator's attitude
-    saturated       : (K,) whether the gyros were at their limit in the previous tick
-    bias_rad_s      : (K, 3) rate error of the gyros: bias, scale, misalignment, and the Earth rate if not compensated
-    lab_from_filter : K, the filter's attitude; sigma_attitude_rad (K, 3) its standard deviation about the body's
-                      axes; assumed_bias_rad_s (K, 3) its bias estimate, sigma_bias_rad_s (K, 3) the bias's standard
-                      deviation
-    mountings       : by name of the camera, where the filter has these states: "main" relative to the gyro's axes,
-                      the others relative to "main"
+    Attributes
+    ----------
+    t_s
+        (K,); period_s between them
+    lab_from_body
+        K, the truth, without the added jitter; rate_body_rad_s (K, 3) likewise
+    lab_from_ref
+        K, the commanded attitude
+    torque_nm
+        (K, 3) torque demanded by the controller, in body axes
+    disturbance_nm
+        (K, 3) disturbance torque, without gravity, drag, spring and actuators
+    momentum_nms
+        (K, 3) stored in wheels and CMGs, in body axes
+    wheel_rad_s, gimbal_rad
+        (K, n)
+    joints
+        (K, nq) MuJoCo's positions of all joints, for rendering
+    manipulability
+        (K,) of the CMGs: 1 far from a singularity, 0 at one
+    lab_from_imu
+        K, the navigator's attitude
+    saturated
+        (K,) whether the gyros were at their limit in the previous tick
+    bias_rad_s
+        (K, 3) rate error of the gyros: bias, scale, misalignment, and the Earth rate if not
+        compensated
+    lab_from_filter
+        K, the filter's attitude; sigma_attitude_rad (K, 3) its standard deviation about the
+        body's axes; assumed_bias_rad_s (K, 3) its bias estimate, sigma_bias_rad_s (K, 3) the
+        bias's standard deviation
+    mountings
+        By name of the camera, where the filter has these states: "main" relative to the gyro's
+        axes, the others relative to "main"
     """
 
     t_s: Floats
@@ -167,19 +193,33 @@ class Telemetry:
 class Sources:
     """All light sources, stars and LEDs alike, in lab axes.
 
-    id         : (N,) number of the star in its catalog (Hipparcos'), or LED number
-    place      : (N, 4) homogeneous: (direction, 0) for a star at infinity, (x, y, z in m, 1) for an LED
-    normal     : (N, 3) unit normal of the emitting disk; zeros for a star
-    radius_m   : (N,) radius of the emitting disk; 0 for a star
-    strength   : (N,) in photo-electrons, that is photons weighted with the chip's quantum efficiency at each
-                 wavelength: star: e- s^-1 m^-2 at the aperture; LED: e- s^-1 sr^-1 along its normal. Its decrease
-                 with angle and distance is given by `led.Emitter`
-    period_s, start_s, on_s : (N,) pulse train: lit from start_s for on_s in every period_s, by its controller's clock
-    clock      : (N,) number of that clock, from 0; LEDs of one controller share it; 0 for a star
-    magnitude  : (N,) V magnitude of a star; NaN for an LED
-    motion     : (N, 2, 3) velocity s^-1 and acceleration s^-2 of `place` at mid-exposure; None where nothing moves
-    chromatic  : (N, 4) mean and standard deviation, over the light's photo-electrons, of the lens's shift of focus in m
-                 and of its shift at the chip's corner in px; None for a lens without chromatic aberration
+    Attributes
+    ----------
+    id
+        (N,) number of the star in its catalog (Hipparcos'), or LED number
+    place
+        (N, 4) homogeneous: (direction, 0) for a star at infinity, (x, y, z in m, 1) for an LED
+    normal
+        (N, 3) unit normal of the emitting disk; zeros for a star
+    radius_m
+        (N,) radius of the emitting disk; 0 for a star
+    strength
+        (N,) in photo-electrons, that is photons weighted with the chip's quantum efficiency at
+        each wavelength: star: e- s^-1 m^-2 at the aperture; LED: e- s^-1 sr^-1 along its
+        normal. Its decrease with angle and distance is given by `led.Emitter`
+    period_s, start_s, on_s
+        (N,) pulse train: lit from start_s for on_s in every period_s, by its controller's clock
+    clock
+        (N,) number of that clock, from 0; LEDs of one controller share it; 0 for a star
+    magnitude
+        (N,) V magnitude of a star; NaN for an LED
+    motion
+        (N, 2, 3) velocity s^-1 and acceleration s^-2 of `place` at mid-exposure; None where
+        nothing moves
+    chromatic
+        (N, 4) mean and standard deviation, over the light's photo-electrons, of the lens's
+        shift of focus in m and of its shift at the chip's corner in px; None for a lens without
+        chromatic aberration
     """
 
     id: NDArray[np.int64]
@@ -261,18 +301,31 @@ def with_sources(parts: Sequence[Sources]) -> Sources:
 class SourceTruth:
     """The true image of every source that contributed light to the frame.
 
-    id           : (N,)
-    xy_px        : (N, 2) pixel at mid-exposure; with a rolling shutter that of the middle row
-    flux_xy_px   : (N, 2) flux-weighted mean pixel over the exposure
-    electrons    : (N,) mean photo-electrons on the chip
-    peak_e       : (N,) mean electrons in the source's brightest pixel
-    streak_px    : (N,) path length over the exposure; with a rolling shutter that of the first row
-    area_px      : (N,) noise-equivalent area (sum s)^2 / sum s^2 of its image
-    peak_xy      : (N, 2) the brightest pixel
-    saturated    : (N,) whether that pixel is expected to be full
-    snr          : (N,) signal-to-noise ratio of its electrons over that area, without saturation
-    streak_xy_px : (N, 2) displacement of the image from the begin to the end of the exposure of the row that it is on;
-                   NaN where it has no image at one of them
+    Attributes
+    ----------
+    id
+        (N,)
+    xy_px
+        (N, 2) pixel at mid-exposure; with a rolling shutter that of the middle row
+    flux_xy_px
+        (N, 2) flux-weighted mean pixel over the exposure
+    electrons
+        (N,) mean photo-electrons on the chip
+    peak_e
+        (N,) mean electrons in the source's brightest pixel
+    streak_px
+        (N,) path length over the exposure; with a rolling shutter that of the first row
+    area_px
+        (N,) noise-equivalent area (sum s)^2 / sum s^2 of its image
+    peak_xy
+        (N, 2) the brightest pixel
+    saturated
+        (N,) whether that pixel is expected to be full
+    snr
+        (N,) signal-to-noise ratio of its electrons over that area, without saturation
+    streak_xy_px
+        (N, 2) displacement of the image from the begin to the end of the exposure of the row
+        that it is on; NaN where it has no image at one of them
     """
 
     id: NDArray[np.int64]
@@ -292,8 +345,12 @@ class SourceTruth:
 class BodyTruth:
     """Sun, Moon or a planet in a frame, none of which is in a star catalog; `id` is its number in the sources' truth.
 
-    ra_deg, dec_deg : apparent place of the disc's center in ICRS axes
-    phase_deg       : angle at the body between the Sun and the observer
+    Attributes
+    ----------
+    ra_deg, dec_deg
+        Apparent place of the disc's center in ICRS axes
+    phase_deg
+        Angle at the body between the Sun and the observer
     """
 
     id: int
@@ -309,11 +366,20 @@ class BodyTruth:
 class SatelliteTruth:
     """An artificial satellite in a frame, at mid-exposure; `id` is its number in the sources' truth.
 
-    v_mag           : as it is lit;  sunlit : part of the Sun's disc that the satellite sees
-    ra_deg, dec_deg : apparent place in ICRS axes
-    rate_deg_s      : against the stars
-    range_km        : from the camera;  phase_deg : angle at the satellite between the Sun and the camera; NaN for a
-                      random one
+    Attributes
+    ----------
+    v_mag
+        As it is lit
+    sunlit
+        Part of the Sun's disc that the satellite sees
+    ra_deg, dec_deg
+        Apparent place in ICRS axes
+    rate_deg_s
+        Against the stars
+    range_km
+        From the camera
+    phase_deg
+        Angle at the satellite between the Sun and the camera; NaN for a random one
     """
 
     id: int
@@ -331,14 +397,25 @@ class SatelliteTruth:
 class Truth:
     """The true state behind a frame.
 
-    t_s           : mid-exposure, seconds from the scene's start
-    lab_from_body : attitude at mid-exposure
-    cam_from_lab  : the camera's attitude at mid-exposure
-    rate_cam_rad_s: (3,) angular velocity in camera axes
-    sources       : the sources on the frame
-    hidden        : (M,) ids of sources that are occluded and would otherwise be on the frame at mid-exposure
-    bodies        : Sun, Moon and planets on the frame
-    satellites    : artificial satellites on the frame
+    Attributes
+    ----------
+    t_s
+        mid-exposure, seconds from the scene's start
+    lab_from_body
+        Attitude at mid-exposure
+    cam_from_lab
+        The camera's attitude at mid-exposure
+    rate_cam_rad_s
+        (3,) angular velocity in camera axes
+    sources
+        The sources on the frame
+    hidden
+        (M,) ids of sources that are occluded and would otherwise be on the frame at
+        mid-exposure
+    bodies
+        Sun, Moon and planets on the frame
+    satellites
+        Artificial satellites on the frame
     """
 
     t_s: float
@@ -366,14 +443,25 @@ class Frame:
 class FrameRow:
     """One frame of a run for the report: angles in degrees, errors in arcseconds, times in ms.
 
-    truth_deg, estimate_deg : (RA, Dec, roll) of the camera under the stars, (roll, pitch, yaw) of the vehicle
-        under the dome
-    wrong : solved, but off by more than ten arcminutes and by more than the tracker claims (`metrics.is_wrong`)
-    cross_sigma_arcsec, roll_sigma_arcsec : standard deviations that the tracker claims;  log10_chance : of its
-        matches
-    rate_error_deg_s : angular rate of the camera by the tracker minus the truth, length of the vector; of the two signs
-        the nearer one if the tracker does not know the sign;  rate_sigma_deg_s : that it claims
-    filter : verdict of the attitude filter on the solution; empty without a filter
+    Attributes
+    ----------
+    truth_deg, estimate_deg
+        (RA, Dec, roll) of the camera under the stars, (roll, pitch, yaw) of the vehicle under
+        the dome
+    wrong
+        Solved, but off by more than ten arcminutes and by more than the tracker claims
+        (`metrics.is_wrong`)
+    cross_sigma_arcsec, roll_sigma_arcsec
+        Standard deviations that the tracker claims
+    log10_chance
+        Of its matches
+    rate_error_deg_s
+        Angular rate of the camera by the tracker minus the truth, length of the vector; of the
+        two signs the nearer one if the tracker does not know the sign
+    rate_sigma_deg_s
+        That it claims
+    filter
+        Verdict of the attitude filter on the solution; empty without a filter
     """
 
     frame: int

@@ -161,7 +161,14 @@ def quantities_within(
 ) -> list[float]:
     """Quantities in SI units. Raises InputError for an invalid or out-of-range value.
 
-    section : of the keys in errors;  ranges : by the name of the quantity;  texts : one each, in that order
+    Parameters
+    ----------
+    section
+        Of the keys in errors
+    ranges
+        By the name of the quantity
+    texts
+        One each, in that order
     """
     values = []
     for text, (name, (unit, what, example, low, high)) in zip(texts, ranges.items(), strict=True):

@@ -134,11 +134,16 @@ def build_controller(
 ) -> Pid:
     """A controller with its poles placed: the error obeys (s^2 + 2 z b s + b^2)(s + p) = 0 on each axis.
 
-    inertia_kg_m2 : (3,) principal moments or (3, 3) tensor about the bearing, in body axes
-    authority_nm  : torque available in every direction; rate_limit_rad_s : greatest return rate
     Bandwidth b and damping z are those of the attitude loop; p, integral_rad_s, is the pole that removes the steady
     error of a constant torque, such as an unbalanced bearing's; law pd is p = 0, and leaves torque / (J b^2). The
     defaults settle in some 5 s, slow enough for a control period of 10 ms (b x period = 0.03).
+
+    Parameters
+    ----------
+    inertia_kg_m2
+        (3,) principal moments or (3, 3) tensor about the bearing, in body axes
+    authority_nm
+        Torque available in every direction; rate_limit_rad_s : greatest return rate
     """
     config = config or ControlConfig()
     inertia = np.asarray(inertia_kg_m2, dtype=float)

@@ -53,7 +53,10 @@ def lab_and_earth_torque(
     """(3,) body torque of a torque constant in the lab plus the Earth's rotation; compiled, called every control
     period.
 
-    present : lab_from_body_wxyz (4,), the body's rate (3,) and the rotors' momentum (3,)
+    Returns
+    -------
+    present
+        lab_from_body_wxyz (4,), the body's rate (3,) and the rotors' momentum (3,)
     """
     lab_from_body, rate, momentum = state
     body_from_lab = inverse(lab_from_body)
@@ -88,10 +91,16 @@ class AirCurrent:
 class DisturbanceModel:
     """The disturbances of a vehicle, period by period. Stateful: one motion each.
 
-    turbine_lab_nm   : (3,) constant
-    earth_lab_rad_s  : (3,) the Earth's rate, zeros where it is off
-    air_current      : None if it is off
-    inertia_kg_m2    : (3, 3) about the bearing, in body axes
+    Attributes
+    ----------
+    turbine_lab_nm
+        (3,) constant
+    earth_lab_rad_s
+        (3,) the Earth's rate, zeros where it is off
+    air_current
+        None if it is off
+    inertia_kg_m2
+        (3, 3) about the bearing, in body axes
     """
 
     turbine_lab_nm: Floats

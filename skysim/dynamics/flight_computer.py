@@ -14,18 +14,18 @@ import numpy as np
 
 from skysim.core.types import Floats
 from skysim.dynamics.attitude_control import Pid, build_controller
-from skysim.dynamics.controllers.adapter import (
+from skysim.dynamics.controllers import (
     NO_SOURCE,
+    ControllerSetup,
     ControllerSource,
     ExternalLaw,
     external_law,
 )
-from skysim.dynamics.controllers.interface import ControllerSetup
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import VehicleModel
-from skysim.dynamics.multibody.actuators.fans import Desaturator, MomentumDump
-from skysim.dynamics.multibody.actuators.kind import Actuators, ControlInput
-from skysim.dynamics.multibody.actuators.registry import IdealTorque, build_actuators
+from skysim.dynamics.multibody.actuator_kind import Actuators, ControlInput
+from skysim.dynamics.multibody.actuators import IdealTorque, build_actuators
+from skysim.dynamics.multibody.fans import Desaturator, MomentumDump
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import BUILT_IN_LAWS, ControlConfig
 
@@ -61,9 +61,14 @@ def controlling_actuator(
 class FlightComputer:
     """Attitude control with one set of actuators, and momentum dumping with the fans. Stateful: one motion each.
 
-    source            : of external controllers
-    actuator_sets     : all actuators that are switched on, by their key in `vehicle`
-    control_torque_nm : (3,) control torque of the last period, zeros without a controller
+    Attributes
+    ----------
+    source
+        Of external controllers
+    actuator_sets
+        All actuators that are switched on, by their key in `vehicle`
+    control_torque_nm
+        (3,) control torque of the last period, zeros without a controller
     """
 
     def __init__(
@@ -137,7 +142,10 @@ class FlightComputer:
     ) -> Floats:
         """(nu,) controls for this period from the measured attitude (4,) and the stored momentum (3,).
 
-        torque_nm : (3,) in body axes, in place of the control law's
+        Parameters
+        ----------
+        torque_nm
+            (3,) in body axes, in place of the control law's
         """
         control = np.zeros(self.nu)
         if self.config is None and torque_nm is None:

@@ -22,16 +22,17 @@ from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from skysim.dynamics.profiles.angle import (
+from skysim.dynamics.reference_curves import (
     AngleProfile,
+    AttitudeSpline,
+    integrate_knots,
     linear_sweep,
     log_sweep,
+    rate_change_state,
     rest_to_rest,
     steady,
     still,
 )
-from skysim.dynamics.profiles.rate_change import integrate_knots, rate_change_state
-from skysim.dynamics.profiles.spline import AttitudeSpline
 from skysim.scene.sections.motion import (
     AttitudeConfig,
     BumpConfig,
@@ -124,8 +125,13 @@ class FixedAxisLeg:
 class RateChangeLeg:
     """A smooth change of the rate: rate_rad_s + change_rad_s (3x^2 - 2x^3), x = t / duration.
 
-    lab_from_knot_wxyz : (K, 4) attitudes at K even steps. The error of Magnus' expansion in n steps of a change that
     rotates by a goes as a^3 / n^4: below 2e-10 rad for the knots that `spin_up` takes.
+
+    Attributes
+    ----------
+    lab_from_knot_wxyz
+        (K, 4) attitudes at K even steps. The error of Magnus' expansion in n steps of a change
+        that
     """
 
     lab_from_knot_wxyz: Floats
@@ -220,7 +226,10 @@ def rate(element: RateConfig, start: LegStart) -> Leg:
 def spin_up(element: SpinUpConfig, start: LegStart) -> Leg:
     """Change the present rate to another, each component along a smoothstep; the axis may move.
 
-    Raises InputError (one line) where more than five million knots would be needed.
+    Raises
+    ------
+    InputError
+        (one line) where more than five million knots would be needed.
     """
     duration_s = element.duration_s
     start_rate = start.rate_rad_s
@@ -282,7 +291,10 @@ def profile(element: ProfileConfig, start: LegStart) -> Leg:
     """The attitudes of a file or table. Between its first sample and the maneuver's beginning the first cubic is
     continued, by one step at most.
 
-    Raises InputError (one line) for samples at other times, and where attitude or rate would jump.
+    Raises
+    ------
+    InputError
+        (one line) for samples at other times, and where attitude or rate would jump.
     """
     spline = start.spline
     assert spline is not None
@@ -329,7 +341,10 @@ LEGS: dict[str, Callable[[Any, LegStart], Leg]] = {
 class Reference:
     """The commanded attitude over time: leg after leg, the last of which continues without end.
 
-    start_s : when each leg starts, ascending from 0
+    Attributes
+    ----------
+    start_s
+        When each leg starts, ascending from 0
     """
 
     legs: tuple[Leg, ...]
@@ -363,7 +378,6 @@ def plan(
 ) -> Reference:
     """The reference of the list of maneuvers; each begins where the previous one ended.
 
-    profiles : of the maneuvers of kind profile, in their order (`profiles.load.load_profiles`)
     lab_from_start defaults to motion.start, or to the identity where that is a pointing among the stars. The Euler
     angles of steps and slews are those of the body in the lab; where the start is a pointing they are relative to
     the attitude at the start, whatever axes lab_from_start is in. A spin_up begins at the rate at which the
@@ -373,6 +387,11 @@ def plan(
     After its end the reference continues as it ended: at rest, or at the rate of a last rate, spin_up or profile.
     Between maneuvers only a step lets the attitude jump. The rate jumps at the start of a rate, and where anything but
     a spin_up or profile follows a rate, spin_up or profile.
+
+    Parameters
+    ----------
+    profiles
+        Of the maneuvers of kind profile, in their order (`profiles.load.load_profiles`)
     """
     first = lab_from_start if lab_from_start is not None else start_attitude(motion, profiles)
     home = first if isinstance(motion.start, PointingConfig) else Rotation.identity()

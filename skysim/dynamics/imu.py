@@ -47,12 +47,21 @@ NO_RATE = np.zeros(3)
 class Increments:
     """Integrals of angular rate and of specific force over sample intervals, in body axes.
 
-    t_s          : (N,) ends of the intervals
-    step_s       : length of each
-    angle_rad    : (N, 3) integral of the rate about each body axis; a rotation vector only if the axis is constant
-    velocity_m_s : (N, 3) integral of the specific force, which is +g along the vertical for a unit at rest
-    saturated    : (N,) a gyro was at its limit; False if ideal
-    overloaded   : (N,) an accelerometer was at its limit; False if ideal
+    Attributes
+    ----------
+    t_s
+        (N,) ends of the intervals
+    step_s
+        Length of each
+    angle_rad
+        (N, 3) integral of the rate about each body axis; a rotation vector only if the axis is
+        constant
+    velocity_m_s
+        (N, 3) integral of the specific force, which is +g along the vertical for a unit at rest
+    saturated
+        (N,) a gyro was at its limit; False if ideal
+    overloaded
+        (N,) an accelerometer was at its limit; False if ideal
     """
 
     t_s: Floats
@@ -96,16 +105,24 @@ def ideal_increments(
     -gravity) in the lab, which includes the Earth's centrifugal part at the origin. int dw/dt x r is the difference
     of w between both ends, crossed with r.
 
-    t_s                : (K,) knots of the motion, ascending, K >= 2, in any spacing
-    lab_from_body_wxyz : (K, 4) attitudes there
-    rate_body_rad_s    : (K, 3) rates of the body in the lab, in body axes
-    ends_s, step_s     : (N,) ends of the sample intervals and their length; they need not coincide with knots
-    position_body_m    : (3,) r, the unit's position on the body
-    earth_rate_lab_rad_s : (3,) zeros for a unit that does not sense the Earth rate
-
     Between knots every component is the cubic through the four nearest, integrated exactly: fourth order in the
     spacing h. If the acceleration jumps by dalpha at a knot, the angle has an error of dalpha h^2 / 12, once.
     Raises InputError for fewer than two knots or an interval outside them.
+
+    Parameters
+    ----------
+    t_s
+        (K,) knots of the motion, ascending, K >= 2, in any spacing
+    lab_from_body_wxyz
+        (K, 4) attitudes there
+    rate_body_rad_s
+        (K, 3) rates of the body in the lab, in body axes
+    ends_s, step_s
+        (N,) ends of the sample intervals and their length; they need not coincide with knots
+    position_body_m
+        (3,) r, the unit's position on the body
+    earth_rate_lab_rad_s
+        (3,) zeros for a unit that does not sense the Earth rate
     """
     if len(t_s) < 2:
         raise InputError("imu", f"{len(t_s)} samples of the motion", "two or more")
@@ -213,15 +230,25 @@ def add_cubic(t_s: Floats, knots: Floats, k: int, at_s: float, factor: float, ou
 class Triad:
     """Three orthogonal sensors of one kind and their errors; SI units, x is rad or m/s.
 
-    matrix    : (3, 3) response of each sensor to motion along each body axis: 1 + scale error on the diagonal, the
-                misalignment of sensor i towards axis j off it
-    turn_on_bias : (3,) constant bias, x/s
-    markov_bias  : (3,) Gauss-Markov bias (bias instability), x/s: a state
-    markov_sd, markov_time_s : its standard deviation and correlation time
-    white     : random walk of the integral, x/sqrt(s)
-    limit     : x/s at which the output saturates
-    quantum   : x of one count; 0 for none
-    remainder : (3,) x not yet counted: a state
+    Attributes
+    ----------
+    matrix
+        (3, 3) response of each sensor to motion along each body axis: 1 + scale error on the
+        diagonal, the misalignment of sensor i towards axis j off it
+    turn_on_bias
+        (3,) constant bias, x/s
+    markov_bias
+        (3,) Gauss-Markov bias (bias instability), x/s: a state
+    markov_sd, markov_time_s
+        Its standard deviation and correlation time
+    white
+        Random walk of the integral, x/sqrt(s)
+    limit
+        x/s at which the output saturates
+    quantum
+        X of one count; 0 for none
+    remainder
+        (3,) x not yet counted: a state
     """
 
     matrix: Floats
@@ -375,8 +402,12 @@ class Imu:
 class Navigator:
     """Attitude by integration of the gyro increments from the attitude at which the vehicle was zeroed.
 
-    lab_from_body_wxyz   : (4,) estimate; at the start that of the home position
-    earth_rate_lab_rad_s : (3,) Earth rate to compensate; with zeros the Earth's rotation appears as the vehicle's
+    Attributes
+    ----------
+    lab_from_body_wxyz
+        (4,) estimate; at the start that of the home position
+    earth_rate_lab_rad_s
+        (3,) Earth rate to compensate; with zeros the Earth's rotation appears as the vehicle's
     """
 
     lab_from_body_wxyz: Floats

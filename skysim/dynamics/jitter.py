@@ -21,7 +21,7 @@ from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats, Trajectory
 from skysim.dynamics.guidance import Reference, plan, vibration_intervals
-from skysim.dynamics.profiles.angle import envelope
+from skysim.dynamics.reference_curves import envelope
 from skysim.scene.sections.motion import (
     JitterBandConfig,
     JitterLineConfig,
@@ -41,8 +41,12 @@ MAX_RISE_S = 1.0  # ... at most
 class Sines:
     """phi(t) = sum over K of sine sin(omega t) + cosine cos(omega t), a rotation vector in body axes.
 
-    omega_rad_s : (K,)
-    sine_rad, cosine_rad : (K, 3)
+    Attributes
+    ----------
+    omega_rad_s
+        (K,)
+    sine_rad, cosine_rad
+        (K, 3)
     """
 
     omega_rad_s: Floats
@@ -103,7 +107,10 @@ class VibrationComponent:
     The envelope is 1 except for a rise and a fall of a tenth of the interval each, a second at most, along
     10x^3 - 15x^4 + 6x^5: phi, its rate and its acceleration are continuous. Without an interval it is 1.
 
-    name : where in the scene it is declared
+    Attributes
+    ----------
+    name
+        Where in the scene it is declared
     """
 
     sines: Sines
@@ -153,7 +160,10 @@ class Vibration:
     ) -> Vibration:
         """The vibration of `motion.jitter`, always on, and of each jitter maneuver during its interval.
 
-        reference : that of the maneuvers; by default planned here, which a profile does not allow
+        Parameters
+        ----------
+        reference
+            That of the maneuvers; by default planned here, which a profile does not allow
         """
         components = [draw_component(motion.jitter, rng, "motion.jitter")]
         for begin_s, end_s, configs in vibration_intervals(motion, reference or plan(motion)):
@@ -201,8 +211,11 @@ class Vibration:
     def subdivisions(self, t_s: Floats) -> NDArray[np.int64]:
         """(N - 1,) number of pieces of each step, so that every period has PER_PERIOD samples.
 
-        Raises InputError if there are too many samples. Before applying vibration piece by piece, call this
-        with all times.
+        Raises
+        ------
+        InputError
+            If there are too many samples. Before applying vibration piece by piece, call this
+            with all times.
         """
         highest_hz = np.zeros(len(t_s) - 1)
         for component in self.components:

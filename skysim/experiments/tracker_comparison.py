@@ -6,31 +6,55 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.io import files
 from skysim.core.types import Frame, FrameRow, Truth
-from skysim.experiments.configs import with_config
+from skysim.core.units import ConfigModel
 from skysim.results import metrics, scoring
 from skysim.scene.scene import Scene
 from skysim.simulation.flight import Flight, Progress
 from skysim.simulation.lab import Lab, build_tracker
 from skysim.tracking import factory
-from skysim.tracking.external.interface import FAILED, SOLVED
+from skysim.tracking.tracker_interface import FAILED, SOLVED
+
+# Copies of scenes with some keys replaced.
+
+
+Config = TypeVar("Config", bound=ConfigModel)
+
+
+def with_config(config: Config, section: str, **values: Any) -> Config:
+    """Copy a scene with values of a section replaced, without validation; `section` may be nested, as `light.led`."""
+    head, _, rest = section.partition(".")
+    inner = getattr(config, head)
+    changed = with_config(inner, rest, **values) if rest else inner.model_copy(update=values)
+    return config.model_copy(update={head: changed})
 
 
 @dataclass(frozen=True, slots=True)
 class TrackerScore:
     """Statistics of one tracker.
 
-    right    : fraction of all frames solved and not wrong (`metrics.is_wrong`), with its 95% interval
-    wrong    : solutions farther off;  refused : no solution;  failed : exception, timeout, crash or invalid output
-    refusals : count of each status other than solved, most frequent first
-    errors   : arcseconds, over correct solutions only; wrong ones are counted instead
-    time_ms  : time from image to solution, over the frames on which the tracker did not fail
+    Attributes
+    ----------
+    right
+        Fraction of all frames solved and not wrong (`metrics.is_wrong`), with its 95% interval
+    wrong
+        Solutions farther off
+    refused
+        No solution
+    failed
+        Exception, timeout, crash or invalid output
+    refusals
+        Count of each status other than solved, most frequent first
+    errors
+        Arcseconds, over correct solutions only; wrong ones are counted instead
+    time_ms
+        Time from image to solution, over the frames on which the tracker did not fail
     """
 
     tracker: str

@@ -47,11 +47,15 @@ def cross_and_roll_rad(
 def is_wrong(error_rad: float, nees: float = np.inf) -> bool:
     """Whether an attitude is worse than none: off by more than ten arcminutes, and by more than the tracker claims.
 
-    error_rad : the rotation angle between estimate and truth
-    nees      : `normalized_error_squared` of the estimate; infinite without a covariance
-
     A few LEDs of an imperfect survey give a roll that is uncertain by many arcminutes. If the covariance allows the
     error (chi-square with three degrees of freedom, probability 1e-8), the limit is one degree.
+
+    Parameters
+    ----------
+    error_rad
+        The rotation angle between estimate and truth
+    nees
+        `normalized_error_squared` of the estimate; infinite without a covariance
     """
     return bool(error_rad > (WRONG_RAD if nees > OVERCONFIDENT_NEES else WRONG_AS_CLAIMED_RAD))
 
@@ -83,7 +87,12 @@ RANK_SIGMAS = 12  # ranks farther from their mean have a probability below 1e-30
 class Summary(NamedTuple):
     """A statistic and its confidence interval at CONFIDENCE, NaN if it has none.
 
-    trials : number of values;  needs : how many more values an interval requires, 0 if more would not give one
+    Attributes
+    ----------
+    trials
+        Number of values
+    needs
+        How many more values an interval requires, 0 if more would not give one
     """
 
     value: float
@@ -428,18 +437,33 @@ COVERAGE = re.compile(r"coverage(?:_(\d+))?$")
 def response(name: str, where: str = "response") -> Response:
     """The function that computes the named statistic from the columns of trials. Raises InputError for other names.
 
-    identified, wrong, refused : proportions of the frames: solved and not wrong (`is_wrong`), wrong, without a solution
-    ambiguous     : proportion of the frames refused because another attitude fits the lights as well (LEDs only)
-    misidentified : proportion of the frames solved with a light that is matched with a wrong star or LED
-    misled        : proportion of the frames that are misidentified and have an error that the covariance does not allow
-    mismatched    : proportion of the matches that are wrong, of all frames; without an interval
-    roll_noise    : proportion of the frames solved with the right lights and a roll error beyond ten arcminutes that
-                    the tracker's covariance allows
-    overconfident : proportion of the solutions with an error far outside their covariance
-    failed        : proportion of the trials that raised an exception
-    coverage_N    : proportion of the trials with at least N sources in the field of view; N is 5 if omitted
     otherwise a quantity and a statistic: stars_least, cross_arcsec_p95 (over all solutions, wrong ones included)
-    nees, centroid_px, streak_px : nees_mean, centroid_px_rms, streak_px_median
+
+    Returns
+    -------
+    identified, wrong, refused
+        Proportions of the frames: solved and not wrong (`is_wrong`), wrong, without a solution
+    ambiguous
+        Proportion of the frames refused because another attitude fits the lights as well (LEDs
+        only)
+    misidentified
+        Proportion of the frames solved with a light that is matched with a wrong star or LED
+    misled
+        Proportion of the frames that are misidentified and have an error that the covariance
+        does not allow
+    mismatched
+        Proportion of the matches that are wrong, of all frames; without an interval
+    roll_noise
+        Proportion of the frames solved with the right lights and a roll error beyond ten
+        arcminutes that the tracker's covariance allows
+    overconfident
+        Proportion of the solutions with an error far outside their covariance
+    failed
+        Proportion of the trials that raised an exception
+    coverage_N
+        Proportion of the trials with at least N sources in the field of view; N is 5 if omitted
+    nees, centroid_px, streak_px
+        nees_mean, centroid_px_rms, streak_px_median
     """
     if name in PROPORTIONS:
         return PROPORTIONS[name]

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import io as std_io
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.constants import SIGMA_PER_MAD
+from skysim.core.types import Floats, SourceTruth
+from skysim.sources.satellites import light_name
 
 DPI = 120
 # Palette for color-blind readers (Okabe & Ito 2008), plus two colors.
@@ -77,3 +86,225 @@ def stacked_axes(heights_in: Sequence[float]) -> tuple[Any, list[Any]]:
         axes.grid(alpha=0.3)
     stack[-1].set_xlabel("time [s]")
     return fig, stack
+
+
+# Draw markers and captions on frames: truth, detections and identified sources.
+
+
+# Convert frames to 8-bit images for display, and encode them as JPEG.
+
+
+CURVES: dict[str, Any] = {
+    "square root": np.sqrt,
+    "linear": lambda fraction: fraction,
+    "logarithm": lambda fraction: np.log1p(200 * fraction) / np.log1p(200),
+}
+SAMPLE_STRIDE = 8  # stride in rows and columns of the sample for the sky statistics
+
+
+@dataclass(frozen=True, slots=True)
+class FrameStatistics:
+    """Statistics of a frame: sky median, sky standard deviation and peak, all in DN; number of saturated pixels."""
+
+    sky_dn: float
+    scatter_dn: float
+    peak_dn: float
+    saturated: int
+
+
+def display_levels(image: NDArray) -> tuple[float, float]:
+    """Black and white levels in DN: the sky (30th percentile), and the 99.9th percentile or, if that is higher,
+    a quarter of the way from the sky to the brightest pixel."""
+    low, high = np.percentile(image[::SAMPLE_STRIDE, ::SAMPLE_STRIDE], (30, 99.9))
+    return float(low), max(float(high), float(low + 0.25 * (image.max() - low)))
+
+
+def to_8bit(
+    image: NDArray, curve: str, levels_dn: tuple[float, float] | None = None
+) -> NDArray[np.uint8]:
+    """(H, W) uint8 image, stretched from the black level to the white level by one of CURVES.
+
+    A uint16 frame is mapped through a lookup table, which is faster than evaluating the curve at each pixel.
+
+    Parameters
+    ----------
+    levels_dn
+        Black and white levels, for example of another frame; by default those of
+        `display_levels`
+    """
+    low, high = levels_dn or display_levels(image)
+    top = low + max(high - low, 1.0)  # at least 1 DN, to avoid division by zero in a flat frame
+    if image.dtype != np.uint16:
+        return (255 * CURVES[curve](np.clip((image - low) / (top - low), 0, 1))).astype(np.uint8)
+    levels = np.arange(int(image.max()) + 1)
+    return (255 * CURVES[curve](np.clip((levels - low) / (top - low), 0, 1))).astype(np.uint8)[
+        image
+    ]
+
+
+def frame_statistics(image: NDArray, saturation_dn: float) -> FrameStatistics:
+    """Sky median and standard deviation from a sample of the pixels; peak and saturation count from all of them.
+
+    Stars are excluded from the standard deviation by a clip at five sigma, with sigma = 1.4826 x the median absolute
+    deviation (exact for a Gaussian). The limit is at least 3 DN, because in digitized frames the median and the
+    deviation are integers and the deviation can be 0.
+    """
+    sample = image[:: 2 * SAMPLE_STRIDE, ::SAMPLE_STRIDE].astype(float)
+    sky = float(np.median(sample))
+    deviation = np.abs(sample - sky)
+    background = sample[deviation <= max(5 * SIGMA_PER_MAD * float(np.median(deviation)), 3.0)]
+    peak = float(image.max())
+    saturated = int(np.count_nonzero(image >= saturation_dn)) if peak >= saturation_dn else 0
+    return FrameStatistics(sky, float(background.std()), peak, saturated)
+
+
+def reduce_width(image: NDArray[np.uint8], max_width_px: int) -> NDArray[np.uint8]:
+    """The image reduced to at most `max_width_px` columns; area averaging, so that no star is skipped."""
+    height, width = image.shape[:2]
+    if width <= max_width_px:
+        return image
+    size = max_width_px, max(round(height * max_width_px / width), 1)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def jpeg(gray: NDArray[np.uint8]) -> bytes:
+    """The image as JPEG bytes for the browser."""
+    return bytes(cv2.imencode(".jpg", gray, [cv2.IMWRITE_JPEG_QUALITY, 88])[1])
+
+
+LEGEND_PX = 20  # height of the legend
+MIN_SNR = 3.0  # of the true sources that are marked: no one sees fainter ones
+TRUTH_BGR = (200, 160, 60)
+DETECTED_BGR = (80, 80, 235)
+MATCHED_BGR = (110, 220, 90)
+
+
+def frame_levels(image: NDArray) -> tuple[float, float]:
+    """Black and white levels in DN: the 30th percentile (the sky), and the 99.95th percentile or a quarter of the peak.
+
+    The higher of the two, so that a few bright sources do not leave a large part of the image white.
+    """
+    low, high = np.percentile(image, (30, 99.95))
+    return float(low), max(float(high), float(low) + 1.0, float(image.max()) * 0.25)
+
+
+def enlarged(image: NDArray) -> tuple[NDArray[np.uint8], int, int]:
+    """The stretched frame in BGR, its scale (2 if smaller than 1000 pixels), and the size of markers in pixels."""
+    scale = 2 if max(image.shape) < 1000 else 1
+    picture = cv2.cvtColor(
+        to_8bit(image, "square root", levels_dn=frame_levels(image)), cv2.COLOR_GRAY2BGR
+    )
+    picture = np.asarray(
+        cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST), np.uint8
+    )
+    return picture, scale, max(8, min(picture.shape[:2]) // 70)
+
+
+def visible(sources: SourceTruth) -> NDArray[np.bool_]:
+    """(N,) whether a true source has a signal-to-noise ratio above MIN_SNR, or none is known."""
+    return ~(sources.snr <= MIN_SNR)
+
+
+def annotate(
+    image: NDArray,
+    detected_px: Floats,
+    matched_px: Floats,
+    labels: list[str] | None = None,
+    truth_px: Floats | None = None,
+) -> NDArray[np.uint8]:
+    """The stretched frame in BGR with blue ticks (truth), red squares (detections), green circles (matched stars).
+
+    All markers leave their center open. A frame smaller than 1000 pixels is enlarged twice, so that the markers do
+    not cover its stars. `labels` are written beside the matched stars. With a truth there is a legend below.
+    """
+    picture, scale, size = enlarged(image)
+    for x, y in pixel_positions(truth_px, scale):
+        draw_ticks(picture, x, y, size, TRUTH_BGR)
+    for x, y in pixel_positions(detected_px, scale):
+        cv2.rectangle(picture, (x - size, y - size), (x + size, y + size), DETECTED_BGR, 1)
+    for n, (x, y) in enumerate(pixel_positions(matched_px, scale)):
+        cv2.circle(picture, (x, y), size + 4, MATCHED_BGR, 1, cv2.LINE_AA)
+        if labels:
+            draw_label(picture, labels[n], x + size + 6, y + 4, MATCHED_BGR)
+    if truth_px is None:
+        return picture
+    meanings = {
+        f"true, SNR > {MIN_SNR:g}": TRUTH_BGR,
+        "detected": DETECTED_BGR,
+        "matched": MATCHED_BGR,
+    }
+    return with_legend(picture, meanings)
+
+
+def annotate_truth(image: NDArray, sources: SourceTruth) -> NDArray[np.uint8]:
+    """The stretched frame in BGR with ticks at the flux centroid of each visible source and the 40 brightest labeled.
+
+    Blue marks unsaturated sources, red those expected to saturate. A frame smaller than 1000 pixels is enlarged twice.
+    """
+    picture, scale, size = enlarged(image)
+    labeled = set(np.argsort(-sources.electrons)[:40].tolist())
+    seen = visible(sources)
+    for n, (x, y) in enumerate(pixel_positions(sources.flux_xy_px, scale)):
+        if not seen[n]:
+            continue
+        color = DETECTED_BGR if sources.saturated[n] else TRUTH_BGR
+        draw_ticks(picture, x, y, size, color)
+        if n in labeled:
+            draw_label(picture, light_name(int(sources.id[n])), x + size + 2, y - size, color)
+    return with_legend(picture, {f"true, SNR > {MIN_SNR:g}": TRUTH_BGR, "saturated": DETECTED_BGR})
+
+
+def with_legend(
+    picture: NDArray[np.uint8], meanings: dict[str, tuple[int, int, int]]
+) -> NDArray[np.uint8]:
+    """The picture with a strip below it that names the colors of its markers; pixels keep their places."""
+    strip = cv2.copyMakeBorder(picture, 0, LEGEND_PX, 0, 0, cv2.BORDER_CONSTANT, value=(0, 0, 0))
+    x = 6
+    for text, color in meanings.items():
+        draw_label(strip, text, x, len(strip) - 6, color)
+        x += 14 + 8 * len(text)
+    return np.asarray(strip, np.uint8)
+
+
+def draw_ticks(
+    picture: NDArray[np.uint8], x: int, y: int, size: int, color: tuple[int, int, int]
+) -> None:
+    """Draw four strokes around (x, y), with an open center."""
+    for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        begin = size - 4
+        end = size + 6
+        cv2.line(picture, (x + begin * dx, y + begin * dy), (x + end * dx, y + end * dy), color, 1)
+
+
+def draw_label(
+    picture: NDArray[np.uint8], text: str, x: int, y: int, color: tuple[int, int, int]
+) -> None:
+    """Draw a small label with its lower left corner at (x, y)."""
+    cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, 1, cv2.LINE_AA)
+
+
+def contact_sheet(images: list[NDArray], captions: list[str], scale: int) -> NDArray[np.uint8]:
+    """Frames of one size side by side, enlarged `scale` times and captioned.
+
+    All use the black and white levels of the first frame, so that their brightnesses can be compared.
+    """
+    low = np.percentile(images[0], 30)
+    high = float(np.percentile(images[0], 99.95))
+    tiles = []
+    for image, caption in zip(images, captions, strict=True):
+        gray = to_8bit(image, "square root", levels_dn=(low, high))
+        large = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
+        picture = cv2.copyMakeBorder(large, 24, 2, 2, 2, cv2.BORDER_CONSTANT, value=40)
+        draw_label(picture, caption, 6, 16, (255, 255, 255))
+        tiles.append(picture)
+    return np.hstack(tiles)
+
+
+def pixel_positions(xy_px: Floats | None, scale: int) -> list[tuple[int, int]]:
+    """Integer pixel positions in an image enlarged `scale` times; empty for None.
+
+    Pixel centers are at integers, so the center of pixel x moves to x * scale + (scale - 1) / 2.
+    """
+    if xy_px is None:
+        return []
+    return [(round(x), round(y)) for x, y in xy_px * scale + (scale - 1) / 2]

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from skysim.core.types import FrameRow
 from skysim.results.plots import figure_png, stacked_axes
-from skysim.results.report import (
+from skysim.results.report import Report
+from skysim.results.report_blocks import (
     Cell,
     Column,
     Facts,
     Figure,
     Items,
-    Report,
     Section,
     Table,
     Text,
@@ -55,13 +55,24 @@ def run_report(
 ) -> Report:
     """The report of a run.
 
-    angles    : names of the three angles of a row;  stages_ms : median time by stage
-    annotated : the last solved frame with its markers, BGR
-    motion    : statistics of the telemetry;  motion_figure : its plot, PNG, or empty
-    views     : image files of the laboratory in 3-D
-    facts, findings : names and lines of the scene's table, and the check's warnings
-
     A single frame has no plot against time.
+
+    Parameters
+    ----------
+    angles
+        Names of the three angles of a row
+    stages_ms
+        Median time by stage
+    annotated
+        The last solved frame with its markers, BGR
+    motion
+        Statistics of the telemetry
+    motion_figure
+        Its plot, PNG, or empty
+    views
+        Image files of the laboratory in 3-D
+    facts, findings
+        Names and lines of the scene's table, and the check's warnings
     """
     frame = Figure(cv2.imencode(".png", annotated)[1].tobytes(), FRAME_CAPTION)
     laboratory = [

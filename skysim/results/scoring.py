@@ -15,9 +15,10 @@ from estimator.core.types import Attitude, RateEstimate, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Frame, FrameRow, Mount, Truth
-from skysim.results import metrics, stretch
-from skysim.results.annotate import annotate, visible
-from skysim.results.report.as_html import embed
+from skysim.results import metrics
+from skysim.results import plots as stretch
+from skysim.results.plots import annotate, visible
+from skysim.results.report import embed
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.flight import Shot
@@ -152,7 +153,11 @@ def annotated(frame: Frame, truth: Truth, report: Report | None) -> NDArray[np.u
 class Score:
     """A shot with the error of its solution.
 
-    row : the shot as numbers: angles in degrees, errors and the tracker's standard deviations in arcseconds
+    Attributes
+    ----------
+    row
+        The shot as numbers: angles in degrees, errors and the tracker's standard deviations in
+        arcseconds
     """
 
     shot: Shot

@@ -33,18 +33,27 @@ def simulate(
 ) -> Run:
     """Simulate a scene's motion, render every frame, solve it and score the solution against the truth.
 
-    controller : in place of the scene's: its name, or a callable that takes a `ControllerSetup` and returns the law, a
-        callable that takes a `ControllerInput` and returns the torque (3,) in N m (docs/howto/controller.md)
-    tracker  : in place of the scene's: its name, a `StarTracker` or `DomeTracker` of the estimator, or a function that
-        takes an image (H, W) and returns the attitude cam_from_ref as a Rotation, a unit quaternion (4,) scalar last or
-        an `Answer`, or None for no attitude. The reference is the ICRS under the stars, else the lab
-    profile  : in place of the scene's start and maneuvers: an attitude file, or an astropy Table, pandas DataFrame or
-        mapping of columns (docs/howto/profile.md). The scene's controller follows it; without one the vehicle moves
-        exactly along it
-    programs : commands of external trackers and controllers by name
-    progress : called as progress(t_s, duration_s) during the flight
-
     All frames are kept in memory; `skysim run` writes them one by one. Raises InputError.
+
+    Parameters
+    ----------
+    controller
+        In place of the scene's: its name, or a callable that takes a `ControllerSetup` and
+        returns the law, a callable that takes a `ControllerInput` and returns the torque (3,)
+        in N m (docs/howto/controller.md)
+    tracker
+        In place of the scene's: its name, a `StarTracker` or `DomeTracker` of the estimator, or
+        a function that takes an image (H, W) and returns the attitude cam_from_ref as a
+        Rotation, a unit quaternion (4,) scalar last or an `Answer`, or None for no attitude.
+        The reference is the ICRS under the stars, else the lab
+    profile
+        In place of the scene's start and maneuvers: an attitude file, or an astropy Table,
+        pandas DataFrame or mapping of columns (docs/howto/profile.md). The scene's controller
+        follows it; without one the vehicle moves exactly along it
+    programs
+        Commands of external trackers and controllers by name
+    progress
+        Called as progress(t_s, duration_s) during the flight
     """
     with open_flight(
         scene, controller=controller, tracker=tracker, profile=profile, programs=programs
@@ -86,11 +95,22 @@ def render_at(
 ) -> tuple[Frame, Truth]:
     """One frame for a plant outside of skysim: the vehicle's attitude and rate are the caller's.
 
-    scene : or a lab of `skysim.build_lab`, which is then not built for every frame
-    lab_from_body, rate_body_rad_s : attitude at mid-exposure, and rate (3,) in body axes, constant in the exposure
-    t_s   : time of mid-exposure since the scene's start
-    index : number of the frame. It selects the noise, which is independent between frames of different numbers
-    Raises InputError for a negative number, and for a camera that the lab does not have.
+    Parameters
+    ----------
+    scene
+        Or a lab of `skysim.build_lab`, which is then not built for every frame
+    lab_from_body, rate_body_rad_s
+        Attitude at mid-exposure, and rate (3,) in body axes, constant in the exposure
+    t_s
+        Time of mid-exposure since the scene's start
+    index
+        Number of the frame. It selects the noise, which is independent between frames of
+        different numbers
+
+    Raises
+    ------
+    InputError
+        For a negative number, and for a camera that the lab does not have.
     """
     lab = build_lab(scene) if isinstance(scene, Scene) else scene
     if index < 0:

@@ -18,9 +18,11 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
+from skysim.core import yaml_reader
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.io import yaml_reader
-from skysim.core.io.yaml_reader import (
+from skysim.core.files import DATA, SCENES
+from skysim.core.units import ConfigModel, quantity
+from skysim.core.yaml_reader import (
     Files,
     check_version,
     explain,
@@ -29,8 +31,6 @@ from skysim.core.io.yaml_reader import (
     set_key,
     where_of,
 )
-from skysim.core.paths import DATA, SCENES
-from skysim.core.units import ConfigModel, quantity
 from skysim.scene import unused
 from skysim.scene.opencv_calibration import read as read_calibration
 from skysim.scene.scene import HEAD_SECTIONS, NAME_ALIAS, Scene
@@ -165,7 +165,11 @@ def over_base(
     """The keys of a scene over those of its base. A camera preset in `own` also replaces the base's keys, and
     `motion.start: profile` the base's rate, which the profile gives.
 
-    camera_of : the camera section of a preset. An unknown preset replaces nothing; `with_preset` reports it.
+    Parameters
+    ----------
+    camera_of
+        The camera section of a preset. An unknown preset replaces nothing; `with_preset`
+        reports it.
     """
     camera = own.get("camera")
     below = base.get("camera")
@@ -221,8 +225,15 @@ def load(
 ) -> Scene:
     """Read, override (`path.to.key` -> YAML value) and validate a scene.
 
-    refuses_unused : whether an option that has no effect is an error (scene/unused.py)
-    Raises InputError with one line: the key, what is wrong with it, what is allowed, the file and line.
+    Parameters
+    ----------
+    refuses_unused
+        Whether an option that has no effect is an error (scene/unused.py)
+
+    Raises
+    ------
+    InputError
+        With one line: the key, what is wrong with it, what is allowed, the file and line.
     """
     path = find(str(name))
     overrides = overrides or {}
@@ -292,7 +303,10 @@ class Layer(NamedTuple):
 def read_layers(path: Path, derived: tuple[Path, ...] = ()) -> list[Layer]:
     """A scene's file, its `base` scene, the base of that, and so on. Raises InputError.
 
-    derived : scenes that have this one as their base, to detect a cycle
+    Parameters
+    ----------
+    derived
+        Scenes that have this one as their base, to detect a cycle
     """
     tree, text = read_yaml(path)
     if derived or tree.keys() != {"camera"}:  # a file with a camera only has no schema version
@@ -407,7 +421,10 @@ def load_camera(
 ) -> CameraConfig:
     """The `camera` section of a scene, or of a file with a camera only. Raises InputError with one line.
 
-    lens : values for keys that a preset leaves to its scene; keys of the file override them
+    Parameters
+    ----------
+    lens
+        Values for keys that a preset leaves to its scene; keys of the file override them
     """
     tree, files = read(path)
     tree = with_overrides(tree, overrides or {})

@@ -11,7 +11,7 @@ import yaml
 
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.io.yaml_reader import StrictLoader, excerpt, parse_yaml
+from skysim.core.yaml_reader import StrictLoader, excerpt, parse_yaml
 
 MAX_BYTES = 1 << 20  # enough for a calibration with the points of all its views
 # Allowed relative difference of fx and fy, the calibration's own error: a chip's pixels are square.
@@ -21,12 +21,17 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
+class OpencvCalibration:
     """A pinhole with square pixels and the distortion of Brown (1971); camera axes +x right, +y down, +z boresight.
 
-    focal_px   : focal length (strictly, the image distance) over the pixel pitch
-    center_px  : principal point (x, y); the center of pixel (0, 0) is (0, 0), as in OpenCV
-    distortion : k1, k2, p1, p2, k3 in OpenCV's order
+    Attributes
+    ----------
+    focal_px
+        Focal length (strictly, the image distance) over the pixel pitch
+    center_px
+        Principal point (x, y); the center of pixel (0, 0) is (0, 0), as in OpenCV
+    distortion
+        k1, k2, p1, p2, k3 in OpenCV's order
     """
 
     width_px: int
@@ -86,7 +91,7 @@ def looks_like_calibration(path: Path) -> bool:
     )
 
 
-def read(path: Path) -> Calibration:
+def read(path: Path) -> OpencvCalibration:
     """Read a file of OpenCV's calibration samples (or of ROS, whose keys are the same).
 
     Keys: image_width, image_height, camera_matrix, distortion_coefficients; others are ignored. Raises InputError
@@ -119,7 +124,7 @@ def read(path: Path) -> Calibration:
             path, f"distortion_coefficients: {len(coefficients)} terms", ", ".join(COEFFICIENTS)
         )
     k1, k2, p1, p2, k3 = [*coefficients, 0.0][:5]
-    return Calibration(width, height, math.sqrt(fx * fy), (cx, cy), (k1, k2, p1, p2, k3))
+    return OpencvCalibration(width, height, math.sqrt(fx * fy), (cx, cy), (k1, k2, p1, p2, k3))
 
 
 def parse_file(path: Path) -> dict[str, Any]:
@@ -182,7 +187,7 @@ def is_number(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) < 1e12
 
 
-def text(calibration: Calibration) -> str:
+def text(calibration: OpencvCalibration) -> str:
     """The calibration as YAML that `read` and OpenCV's FileStorage (4 and 5) read."""
     fx = calibration.focal_px
     (cx, cy) = calibration.center_px

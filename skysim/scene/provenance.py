@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from skysim.core.io.yaml_reader import parse_yaml, read_yaml
 from skysim.core.units import ConfigModel, si_unit
+from skysim.core.yaml_reader import parse_yaml, read_yaml
 from skysim.scene import loader, unused
 from skysim.scene.loader import CALIBRATED_KEYS, Layer, merge
 from skysim.scene.scene import NAME_ALIAS
@@ -43,7 +43,10 @@ OVERRIDE = Origin("--set")
 class Entry(NamedTuple):
     """One key of the effective scene: its path, its value as YAML has it, and where it comes from.
 
-    no_effect : why the key does nothing in this scene; empty if it does something
+    Attributes
+    ----------
+    no_effect
+        Why the key does nothing in this scene; empty if it does something
     """
 
     path: tuple[str, ...]
@@ -183,7 +186,10 @@ def sections(value: Any) -> bool:
 def plain(value: Any, name: str) -> Any:
     """A value of the schema as YAML has it: quantities with their unit, sections of a list as mappings.
 
-    name : of its field, whose suffix gives the unit
+    Parameters
+    ----------
+    name
+        Of its field, whose suffix gives the unit
     """
     if isinstance(value, ConfigModel):
         return {

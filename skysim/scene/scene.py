@@ -15,18 +15,16 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from skysim.core.constants import DAY_S
 from skysim.core.errors import InputError
-from skysim.core.io.yaml_reader import fault_of
 from skysim.core.random_streams import HEAD_SEED, derived_seed
 from skysim.core.time import check_year
 from skysim.core.tolerance import TimeError
 from skysim.core.units import ConfigModel, Length, Number, Spin, Time
+from skysim.core.yaml_reader import fault_of
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
-from skysim.scene.sections.light import DomeConfig, Glow, Light, StarsConfig
-from skysim.scene.sections.lights import FurtherLight
+from skysim.scene.sections.light import DomeConfig, FurtherLight, Glow, Light, StarsConfig
 from skysim.scene.sections.motion import MotionConfig, PointingConfig
-from skysim.scene.sections.orbit import Orbit
-from skysim.scene.sections.thermal import Coefficient, ThermalConfig
+from skysim.scene.sections.surroundings import Coefficient, Orbit, ThermalConfig
 from skysim.scene.sections.tracker import FilterConfig, SurveyErrorsConfig, TrackerConfig
 from skysim.scene.sections.vehicle import SiteConfig, VehicleConfig
 
@@ -42,9 +40,14 @@ MAX_DURATION_S = DAY_S
 class ExposureConfig(ConfigModel):
     """Exposure time, frame rate, number of frames, the time of the first, and the camera's timing errors.
 
-    trigger_jitter  : an exposure begins up to so much late, uniformly distributed
-    time_tag_offset : the time given to a frame minus the true time of mid-exposure, on average
-    time_tag_jitter : its standard deviation from frame to frame, or a tolerance
+    Attributes
+    ----------
+    trigger_jitter
+        An exposure begins up to so much late, uniformly distributed
+    time_tag_offset
+        The time given to a frame minus the true time of mid-exposure, on average
+    time_tag_jitter
+        Its standard deviation from frame to frame, or a tolerance
     """
 
     time_s: Annotated[Time, Field(ge=1e-6)]
@@ -78,14 +81,23 @@ class ExposureConfig(ConfigModel):
 class HeadConfig(ConfigModel):
     """A further star camera on the vehicle, beside that of the sections `camera` and `tracker`, the main one.
 
-    name         : of its folder in the results, and in messages
-    position     : of its entrance pupil on the body
-    rotation_deg : its axes are those of the main camera turned by this rotation vector, about the main camera's axes
-        (+x right, +y down, +z boresight): [0, 90, 0] looks to the right of the main camera's image
-    mount_error_arcsec : rotation of the real camera from the assumed mount, about its own axes; its tracker does not
-        know of it
-    mount_arcsec_k : the same for each kelvin of `thermal`
-    camera, tracker, exposure : keys that differ from those of the main camera. Its camera is another unit: its
+    Attributes
+    ----------
+    name
+        Of its folder in the results, and in messages
+    position
+        Of its entrance pupil on the body
+    rotation_deg
+        Its axes are those of the main camera turned by this rotation vector, about the main
+        camera's axes (+x right, +y down, +z boresight): [0, 90, 0] looks to the right of the
+        main camera's image
+    mount_error_arcsec
+        Rotation of the real camera from the assumed mount, about its own axes; its tracker does
+        not know of it
+    mount_arcsec_k
+        The same for each kelvin of `thermal`
+    camera, tracker, exposure
+        Keys that differ from those of the main camera. Its camera is another unit: its
         hardware_seed is the next one unless it is given
     """
 

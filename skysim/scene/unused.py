@@ -16,10 +16,9 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from skysim.core.errors import OVERRIDES, InputError
-from skysim.core.io.yaml_reader import Files, parse_yaml, where_of
 from skysim.core.units import ConfigModel
+from skysim.core.yaml_reader import Files, parse_yaml, where_of
 from skysim.scene.scene import HEAD_SECTIONS, Scene
-from skysim.scene.sections.air import NEGLIGIBLE_PX
 from skysim.scene.sections.camera import DetectorConfig
 from skysim.scene.sections.layouts import (
     CelestialConfig,
@@ -32,6 +31,7 @@ from skysim.scene.sections.layouts import (
 )
 from skysim.scene.sections.leds import DirectConfig, PwmConfig
 from skysim.scene.sections.light import DomeConfig
+from skysim.scene.sections.surroundings import NEGLIGIBLE_PX
 
 SURFACE_SOLVERS = ("thesis", "ray_on_surface")  # the solvers that use the surveyed surface
 FIXED_DETECTORS = ("thesis",)  # the detectors with thresholds of their own
@@ -41,8 +41,12 @@ OWN = "own"  # skysim's tracker
 class Rule(NamedTuple):
     """Keys that have no effect where `applies` is true, why, and what is allowed.
 
-    keys    : dotted keys; that of a section stands for all keys in it
-    applies : takes the scene (in the rules of studies, the scene and the trial)
+    Attributes
+    ----------
+    keys
+        Dotted keys; that of a section stands for all keys in it
+    applies
+        Takes the scene (in the rules of studies, the scene and the trial)
     """
 
     keys: tuple[str, ...]
@@ -497,8 +501,16 @@ def check(
 ) -> None:
     """Raise InputError for the first key that has no effect, of the overrides or of the scene's own file.
 
-    scene : with the overrides;  own : keys of its own file, not of its base;  files : for the location
-    without_overrides : makes the scene of the file alone
+    Parameters
+    ----------
+    scene
+        With the overrides
+    own
+        Keys of its own file, not of its base
+    files
+        For the location
+    without_overrides
+        Makes the scene of the file alone
     """
     check_overrides([scene], overrides)
     for key in set_keys(own):
@@ -548,7 +560,10 @@ def find(
 ) -> tuple[str, Rule] | None:
     """The first of the dotted keys whose value in the model is not the default and has no effect, and its rule.
 
-    subject : arguments of the rules; the model if left out
+    Parameters
+    ----------
+    subject
+        Arguments of the rules; the model if left out
     """
     for key in keys:
         for rule in rules:

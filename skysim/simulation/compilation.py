@@ -17,11 +17,11 @@ import numpy as np
 from numba.core import event
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.detector.detector import saturation_dn
+from skysim.camera.detector import saturation_dn
 from skysim.core.errors import InputError
-from skysim.core.io.yaml_reader import parse_overrides
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Frame
+from skysim.core.yaml_reader import parse_overrides
 from skysim.scene import loader
 from skysim.simulation.lab import StarCamera, build_lab, build_tracker
 from skysim.simulation.timing import exposure_window
@@ -75,7 +75,10 @@ def on_two_processes(scene: str, overrides: Mapping[str, str]) -> Iterator[None]
 def compile_tracker(scene: str, overrides: Sequence[str] = ()) -> None:
     """Build a scene's tracker and solve a synthetic frame with it; external trackers are skipped.
 
-    overrides : `KEY=VALUE` as on the command line
+    Parameters
+    ----------
+    overrides
+        `KEY=VALUE` as on the command line
     """
     lab = build_lab(loader.load(scene, parse_overrides(list(overrides))))
     warm_up(lab.camera, lab.start, build_tracker(lab.camera))

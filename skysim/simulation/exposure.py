@@ -16,13 +16,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Clock
-from skysim.camera import thermal
-from skysim.camera.detector.added_charge import AddedCharge
-from skysim.camera.detector.detector import add_snr_and_saturation, expose, saturation_dn, smear
-from skysim.camera.discs.bodies import concatenated, render_bodies
-from skysim.camera.glow import background
+from skysim.camera import thermal_motion
+from skysim.camera.detector import AddedCharge, add_snr_and_saturation, expose, saturation_dn, smear
+from skysim.camera.discs import concatenated, render_bodies
+from skysim.camera.glow import background, stray
 from skysim.camera.render import Window, in_view, project, render
-from skysim.camera.stray import ghosts, glare
 from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Floats, Frame, SourceTruth, Trajectory, Truth
 from skysim.simulation.lab import StarCamera
@@ -49,7 +47,11 @@ def render_frame(
     """Render one frame and its truth, both for mid-exposure of the middle row.
 
     They depend only on the camera, its motion, the index and the window (the scene's if left out), not on other frames.
-    added : gets the masks of smear and particles
+
+    Parameters
+    ----------
+    added
+        Gets the masks of smear and particles
     """
     clock = clock or Clock()
     scene = camera.scene
@@ -88,7 +90,10 @@ def exposure_of(
 ) -> Exposure:
     """An exposure of a camera, whose mount and lens are as error and temperature have them at mid-exposure.
 
-    seeds : None for the expectation, see `Exposure`
+    Parameters
+    ----------
+    seeds
+        None for the expectation, see `Exposure`
     """
     mount = camera.mount
     optics = camera.optics
@@ -97,7 +102,7 @@ def exposure_of(
     if camera.mount_error is not None:
         mount = replace(mount, cam_from_body=camera.mount_error * mount.cam_from_body)
     if scene.thermal is not None:
-        mount, optics = thermal.camera_at(scene.thermal, mount, optics, middle_s)
+        mount, optics = thermal_motion.camera_at(scene.thermal, mount, optics, middle_s)
     lab_from_body = trajectory.attitude_at(middle_s)
     return Exposure(
         index,
@@ -117,7 +122,10 @@ def expected_exposure(
 ) -> Exposure:
     """An exposure at an attitude and a constant rate, (3,) in body axes, in which nothing is drawn at random.
 
-    t_s : middle of the first row's exposure; NaN for that of the first frame
+    Parameters
+    ----------
+    t_s
+        Middle of the first row's exposure; NaN for that of the first frame
     """
     config = camera.scene.exposure
     middle_s = config.first_s + config.time_s / 2 if math.isnan(t_s) else t_s
@@ -149,14 +157,14 @@ def draw_lights(image: NDArray[Any], beam: Beam, exposure: Exposure) -> SourceTr
         for lit in beam.lits:
             if lit.points is not None:
                 drawn = render(image, lit.points, *exposed, lit.emitter, any_of(beam.before(lit)))
-                truths.append(ghosts.as_ghosts(drawn, path.number))
+                truths.append(stray.as_ghosts(drawn, path.number))
             if lit.discs:
                 bodies = render_bodies(image, lit.discs, exposed, lit.occlusion)
-                truths += [ghosts.as_ghosts(body, path.number) for body in bodies]
+                truths += [stray.as_ghosts(body, path.number) for body in bodies]
     sources = concatenated(truths)
     for config in beam.glares:
-        glare.add_glare(image, config)
-        sources = glare.without_glare(sources, config)
+        stray.add_glare(image, config)
+        sources = stray.without_glare(sources, config)
     return sources
 
 

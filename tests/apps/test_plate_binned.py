@@ -14,10 +14,10 @@ from estimator.catalog import catalog
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report, Settings
 from skysim.apps import plate_solver
-from skysim.apps.plate_solver import binned
 from skysim.apps.plate_solver import picture as plate_picture
-from skysim.core.io import images
-from skysim.core.paths import CATALOGS
+from skysim.apps.plate_solver import retries
+from skysim.core import images
+from skysim.core.files import CATALOGS
 from tests.helpers import photographs
 
 SHOT = photographs.Shot(1600, 1200, 25.0, 5.6, radius_px=14.0)
@@ -43,7 +43,7 @@ def test_a_picture_out_of_focus_is_solved_binned_and_says_so(
     solver = plate_solver.make_solver(SHOT.fov_deg, None)
     alone, _ = plate_solver.solve_array(blurred, solver, None)
     assert not alone.attitude.solved
-    outcome = plate_solver.solve_picture(images.Picture(blurred), solver, None)
+    outcome = plate_solver.solve_picture(images.ViewedImage(blurred), solver, None)
     found = plate_solver.outcome_fields(outcome, None)
     assert found["status"] == "solved"
     assert math.degrees((outcome.report.attitude.cam_from_ref * truth.inv()).magnitude()) < 0.1
@@ -59,7 +59,7 @@ def test_places_are_those_of_the_picture() -> None:
     for x, y in places:
         cv2.circle(image, (int(x), int(y)), 20, 60, -1)
     noisy = np.clip(image + rng.normal(60, 4, image.shape), 0, 255).astype(np.uint8)
-    tried = dict(binned.large_lights(noisy, Settings()))
+    tried = dict(retries.large_lights(noisy, Settings()))
     assert list(tried) == [8, 4, 2]
     for factor, centroids in tried.items():
         off_px = np.linalg.norm(centroids.xy_px[:, None] - places, axis=2).min(axis=1)
@@ -73,10 +73,10 @@ def test_sharp_pictures_and_small_ones_are_not_binned(blurred: NDArray) -> None:
     light = np.zeros((1000, 1300))
     light[rng.integers(0, 1000, 60), rng.integers(0, 1300, 60)] = rng.uniform(1000, 30_000, 60)
     sharp = 300 + 20 * rng.standard_normal(light.shape) + cv2.GaussianBlur(light, (0, 0), 1.2)
-    assert list(binned.large_lights(sharp.astype(np.uint16), Settings())) == []
-    assert [factor for factor, _ in binned.large_lights(blurred[:850, :850], Settings())] == [4, 2]
-    assert list(binned.large_lights(blurred[:390, :390], Settings())) == []
-    assert list(binned.large_lights(np.full((900, 900), 7, np.uint8), Settings())) == []
+    assert list(retries.large_lights(sharp.astype(np.uint16), Settings())) == []
+    assert [factor for factor, _ in retries.large_lights(blurred[:850, :850], Settings())] == [4, 2]
+    assert list(retries.large_lights(blurred[:390, :390], Settings())) == []
+    assert list(retries.large_lights(np.full((900, 900), 7, np.uint8), Settings())) == []
 
 
 def test_a_binned_picture_needs_more_evidence(
@@ -91,12 +91,12 @@ def test_a_binned_picture_needs_more_evidence(
 
     monkeypatch.setattr(plate_picture, "solve_array", never)
     plate_solver.solve_picture(
-        images.Picture(blurred), plate_solver.make_solver(SHOT.fov_deg, None), None
+        images.ViewedImage(blurred), plate_solver.make_solver(SHOT.fov_deg, None), None
     )
     assert tries[0] == 1
     assert set(tries[1:]) == {1000}
     tries.clear()
-    fits = images.Picture(blurred, row_order_known=False)
+    fits = images.ViewedImage(blurred, row_order_known=False)
     plate_solver.solve_picture(fits, plate_solver.make_solver(None, None), None)
     assert tries[:2] == [2, 2]
     assert set(tries[2:]) == {2000}
@@ -105,7 +105,7 @@ def test_a_binned_picture_needs_more_evidence(
 def test_bins_are_means() -> None:
     image = np.random.default_rng(3).integers(0, 256, (33, 47)).astype(np.uint8)
     means = image[:32, :44].reshape(8, 4, 11, 4).mean(axis=(1, 3))
-    small = binned.bin_pixels(image, 4).astype(float)
+    small = retries.bin_pixels(image, 4).astype(float)
     scale = (means.max() - means.min()) / 65535
     np.testing.assert_allclose(small * scale + means.min(), means, atol=scale)
     assert math.isclose(small.max(), 65535)

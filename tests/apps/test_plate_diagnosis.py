@@ -20,8 +20,8 @@ from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.apps import plate_solver
 from skysim.apps.cli import terminal
 from skysim.apps.plate_solver import diagnosis
-from skysim.core.io import images
-from skysim.core.paths import CATALOGS
+from skysim.core import images
+from skysim.core.files import CATALOGS
 from skysim.scene import loader
 from skysim.simulation.flight import simulate_motion
 from skysim.sources import stars
@@ -103,7 +103,7 @@ make_solver = cache(plate_solver.make_solver)  # it keeps its trackers
 
 def hint(image: NDArray, fov_deg: float | None, catalog_name: str | None = None) -> str:
     """What the refusal of a picture says; "" for a solution."""
-    picture = images.Picture(image)
+    picture = images.ViewedImage(image)
     outcome = plate_solver.solve_picture(
         picture, make_solver(fov_deg, None, catalog=catalog_name), None
     )

@@ -22,11 +22,11 @@ from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.trackers.pipeline import Clock
 from skysim.apps import plate_solver
 from skysim.apps.plate_solver import picture as plate_picture
-from skysim.apps.plate_solver import solution, solver
+from skysim.apps.plate_solver import solver
+from skysim.core import images
 from skysim.core.errors import InputError
-from skysim.core.io import images
 from skysim.core.types import Frame, Truth
-from skysim.results.files import frames
+from skysim.results.files import recording
 from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.simulation.flight import simulate_motion
@@ -164,7 +164,9 @@ def test_both_ways_to_convert_a_focal_length_are_within_its_uncertainty(
     gray: NDArray, focal_35mm: int, orientation: int
 ) -> None:
     """By the longer side (36 mm over 6.52 mm) it is 138 mm. Turned, the field is that of the shorter side."""
-    seen = images.Picture(np.ascontiguousarray(STORED[orientation](gray)), focal_35mm=focal_35mm)
+    seen = images.ViewedImage(
+        np.ascontiguousarray(STORED[orientation](gray)), focal_35mm=focal_35mm
+    )
     unknown = plate_solver.make_solver(None, None)
     outcome = plate_solver.solve_picture(seen, unknown, None)
     assert outcome.report.attitude.solved
@@ -201,7 +203,7 @@ def test_a_wrong_focal_length_is_given_up(
     check_right(answer(with_exif(tmp_path / "x.jpg", gray, 1, 50), None), sky[2])
     for absurd in (1, 65_000):
         unknown = plate_solver.make_solver(None, None)
-        (only,) = plate_picture.hypotheses(images.Picture(gray, focal_35mm=absurd), unknown)
+        (only,) = plate_picture.hypotheses(images.ViewedImage(gray, focal_35mm=absurd), unknown)
         assert (only.solver.fov_deg, only.solver.hypotheses) == (None, 1)
 
 
@@ -278,7 +280,7 @@ def test_our_own_frames_say_their_row_order_and_read_as_written(
     sky: tuple[Scene, Frame, Truth], tmp_path: Path
 ) -> None:
     scene, frame, truth = sky
-    frames.write_frame(tmp_path, frame, truth, scene)
+    recording.write_frame(tmp_path, frame, truth, scene)
     seen = images.read_picture(tmp_path / "frame_0000.fits")
     np.testing.assert_array_equal(seen.pixels, frame.image_dn)
     assert seen.row_order_known
@@ -324,7 +326,7 @@ def test_annotated_pictures_have_the_pictures_names() -> None:
 
 
 def test_stars_are_named_by_their_catalog() -> None:
-    assert [solution.star_name(n) for n in (71683, 1_048_915, 2_345_678)] == [
+    assert [solver.star_name(n) for n in (71683, 1_048_915, 2_345_678)] == [
         "HIP 71683",
         "HD 48915",
         "Gaia 345678",

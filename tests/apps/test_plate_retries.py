@@ -14,8 +14,8 @@ from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Settings
 from skysim.apps import plate_solver
 from skysim.apps.plate_solver import retries
-from skysim.core.io import images
-from skysim.core.paths import CATALOGS
+from skysim.core import images
+from skysim.core.files import CATALOGS
 from tests.helpers import photographs
 
 SHOT = photographs.Shot(1280, 960, 22.0, 6.3)
@@ -38,7 +38,7 @@ def test_a_picture_with_a_town_below_is_solved_by_its_upper_half() -> None:
     image, truth = drawn(replace(SHOT, limit_mag=5.4, spoil=town), 3)
     solver = plate_solver.make_solver(SHOT.fov_deg, None)
     assert not plate_solver.solve_array(image, solver, None)[0].attitude.solved
-    outcome = plate_solver.solve_picture(images.Picture(image), solver, None)
+    outcome = plate_solver.solve_picture(images.ViewedImage(image), solver, None)
     assert photographs.is_same(outcome.report.attitude.cam_from_ref, truth)
     assert (
         plate_solver.outcome_fields(outcome, None)["hint"]
@@ -110,7 +110,7 @@ def test_faint_trails_are_detected_along_the_streak_of_binned_pixels(number: int
     first = right(report.centroids)
     most = max(map(right, retries.trails(image, Settings())))
     assert most > 2 * first
-    outcome = plate_solver.solve_picture(images.Picture(image), solver, None)
+    outcome = plate_solver.solve_picture(images.ViewedImage(image), solver, None)
     assert photographs.is_same(outcome.report.attitude.cam_from_ref, truth)
 
 
@@ -157,5 +157,5 @@ def test_lights_at_random_are_refused_in_every_part() -> None:
     for seed in range(10):
         image, _ = drawn(replace(SHOT, starless=True, spoil=photographs.trees), seed)
         assert not plate_solver.solve_picture(
-            images.Picture(image), blind, None
+            images.ViewedImage(image), blind, None
         ).report.attitude.solved

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.trackers.pipeline import Clock
-from estimator.trackers.residuals.refinement import NO_MATCH
+from estimator.trackers.refinement import NO_MATCH
 from estimator.trackers.star_tracker import NO_STARS
 from skysim.apps import plate_solver
 from skysim.apps.plate_solver import solver as searching
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.paths import SCENES
+from skysim.core.files import SCENES
 from skysim.core.types import Frame, Truth
 from skysim.scene import loader
 from skysim.simulation.flight import simulate_motion

@@ -13,9 +13,9 @@ from skysim.scene.loader import load
 from skysim.scene.sections.light import SkyGlowConfig
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.lights.air import AirGlow, Atmosphere
+from skysim.simulation.lights.atmosphere import AirEffects, AirGlow
 from skysim.simulation.lights.light import find_light
-from skysim.sources.air.air import Sky
+from skysim.sources.air import Sky
 
 SITE = "{latitude_deg: 53.1, longitude_deg: 8.8, height: 10 m}"
 
@@ -96,7 +96,7 @@ def test_the_moon_lights_the_sky_only_above_the_horizon() -> None:
 
 def sky_of(lab: Lab) -> Sky:
     """The air at the scene's start."""
-    atmosphere = find_light(lab.camera.lights, Atmosphere)
+    atmosphere = find_light(lab.camera.lights, AirEffects)
     assert atmosphere is not None
     return atmosphere.air.at(lab.scene.start_time)
 

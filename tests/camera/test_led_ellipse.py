@@ -14,7 +14,7 @@ from scipy.special import ndtr
 
 from skysim.camera.optics import Optics
 from skysim.camera.psf import kernel_cache
-from skysim.camera.psf.led_disk import DiskImages, disk_images
+from skysim.camera.psf.kernel import DiskImages, disk_images
 from skysim.camera.render import Window, render
 from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory
 from skysim.scene.sections.camera import CameraConfig

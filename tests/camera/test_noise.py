@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from skysim.camera.detector import noise
+from skysim.camera import noise
 
 ROWS = 1000
 COLUMNS = 1000

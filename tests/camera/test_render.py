@@ -13,7 +13,7 @@ from scipy.special import erf
 from scipy.stats import ncx2
 
 from skysim.camera import render as rendering
-from skysim.camera.detector.detector import Detector, expose
+from skysim.camera.detector import Detector, expose
 from skysim.camera.optics import Optics
 from skysim.camera.render import Window, render
 from skysim.core.errors import InputError

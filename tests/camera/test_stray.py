@@ -9,9 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.glow.background import nodes_px
+from skysim.camera.glow.stray import add_glare, block_px, wall_glow
 from skysim.camera.optics import Optics
-from skysim.camera.stray.glare import add_glare, block_px
-from skysim.camera.stray.wall import wall_glow
 from skysim.core.types import Frame, Sources, Truth
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig, GlareConfig
@@ -19,11 +18,10 @@ from skysim.scene.sections.leds import CosineLobeConfig
 from skysim.scene.sections.light import ReflectionConfig
 from skysim.simulation.flight import simulate_motion
 from skysim.simulation.lab import build_lab
-from skysim.sources.dome.reflection.dome import ReflectingDome
-from skysim.sources.dome.reflection.interreflection import diffuse_light, spiral
-from skysim.sources.dome.shell.surface import Ellipsoid
-from skysim.sources.false_lights import GHOST, MIRRORED
+from skysim.sources.dome.interreflection import ReflectingDome, diffuse_light, spiral
+from skysim.sources.dome.surface import Ellipsoid
 from skysim.sources.photometry import Band
+from skysim.sources.satellites import GHOST, MIRRORED
 
 CAMERA = {
     "width_px": 400,

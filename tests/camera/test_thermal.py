@@ -10,11 +10,11 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import Optics
-from skysim.camera.thermal import camera_at, leds_at, temperature_c
+from skysim.camera.thermal_motion import camera_at, leds_at, temperature_c
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Mount, Sources
 from skysim.scene import loader
-from skysim.scene.sections.thermal import ThermalConfig
+from skysim.scene.sections.surroundings import ThermalConfig
 from skysim.simulation.flight import simulate_motion
 
 MOUNT = {"mount_arcsec_k": [3.0, -2.0, 1.0]}

@@ -20,11 +20,11 @@ from astropy.table import Table
 from astropy.wcs import WCS
 from scipy.spatial.transform import Rotation
 
+from skysim.core import files, images, yaml_reader
 from skysim.core.errors import InputError
-from skysim.core.io import files, images, yaml_reader
-from skysim.core.io.files import HOST, TEMPORARY_NAME
+from skysim.core.files import HOST, TEMPORARY_NAME
 from skysim.core.types import BodyTruth, Frame, Truth
-from skysim.results.files import ccsds_aem, frames
+from skysim.results.files import recording, run_export
 from skysim.scene import loader, scene
 from skysim.simulation.flight import simulate_motion
 
@@ -50,7 +50,7 @@ def dome() -> Shot:
 @pytest.fixture(scope="module")
 def written(sky: Shot, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("frames")
-    frames.write_frame(folder, sky[1], sky[2], sky[0])
+    recording.write_frame(folder, sky[1], sky[2], sky[0])
     return folder
 
 
@@ -85,7 +85,7 @@ def test_a_frame_comes_back_bit_for_bit(sky: Shot, written: Path, suffix: str) -
 def test_every_16_bit_value_survives_png_and_fits(tmp_path: Path, sky: Shot) -> None:
     image = np.arange(65536, dtype=np.uint16).reshape(256, 256)
     files.write_png16(tmp_path / "all.png", image)
-    frames.write_fits(tmp_path / "all.fits", Frame(0, image, 0.1, 0.04, 65535.0), sky[2], sky[0])
+    recording.write_fits(tmp_path / "all.fits", Frame(0, image, 0.1, 0.04, 65535.0), sky[2], sky[0])
     np.testing.assert_array_equal(images.read_image(tmp_path / "all.png"), image)
     np.testing.assert_array_equal(images.read_image(tmp_path / "all.fits"), image)
 
@@ -95,7 +95,7 @@ def test_a_noise_free_frame_stays_a_float_in_fits_and_is_rounded_in_png(
     tmp_path: Path, dome: Shot
 ) -> None:
     loaded, frame, truth = dome
-    frames.write_frame(tmp_path, frame, truth, loaded)
+    recording.write_frame(tmp_path, frame, truth, loaded)
     np.testing.assert_array_equal(images.read_image(tmp_path / "frame_0000.fits"), frame.image_dn)
     rounded = images.read_image(tmp_path / "frame_0000.png").astype(float)
     assert np.abs(rounded - frame.image_dn).max() <= 0.5
@@ -121,9 +121,9 @@ def test_a_scene_s_time_with_a_zone_is_told_as_utc(sky: Shot, start: str) -> Non
     """DATE-OBS takes no zone, and an attitude message would have been two hours off."""
     loaded, frame, _ = sky
     zoned = loader.load("shefex2", {"start_time": start})
-    assert frames.utc_text(zoned, frame.t_mid_s) == frames.utc_text(loaded, frame.t_mid_s)
+    assert recording.utc_text(zoned, frame.t_mid_s) == recording.utc_text(loaded, frame.t_mid_s)
     local = datetime.datetime.fromisoformat(start)
-    assert ccsds_aem.epoch(local) == "2012-06-22T21:00:00.000000"
+    assert run_export.epoch(local) == "2012-06-22T21:00:00.000000"
 
 
 def test_a_png_has_no_date(written: Path) -> None:
@@ -176,7 +176,7 @@ def test_bodies_come_back_by_name(sky: Shot, tmp_path: Path) -> None:
     loaded, frame, truth = sky
     moon = BodyTruth(9_000_301, "moon", -8.84, 154.86, 4.84, 1868.9, 118.4)
     for bodies in ((), (moon,)):
-        frames.write_truth(tmp_path / "truth.ecsv", frame, replace(truth, bodies=bodies), loaded)
+        recording.write_truth(tmp_path / "truth.ecsv", frame, replace(truth, bodies=bodies), loaded)
         meta = Table.read(tmp_path / "truth.ecsv", format="ascii.ecsv").meta
         assert meta.get("bodies", []) == [asdict(body) for body in bodies]
 
@@ -185,16 +185,16 @@ def test_which_sources_are_saturated_comes_back(sky: Shot, tmp_path: Path) -> No
     loaded, frame, truth = sky
     every_third = np.arange(len(truth.sources.id)) % 3 == 0
     truth = replace(truth, sources=replace(truth.sources, saturated=every_third))
-    frames.write_truth(tmp_path / "truth.ecsv", frame, truth, loaded)
+    recording.write_truth(tmp_path / "truth.ecsv", frame, truth, loaded)
     table = Table.read(tmp_path / "truth.ecsv", format="ascii.ecsv")
     np.testing.assert_array_equal(table["saturated"], every_third)
 
 
 def test_a_shorter_run_leaves_no_frames_of_a_longer_one(tmp_path: Path, sky: Shot) -> None:
-    frames.write_frame(tmp_path, sky[1], sky[2], sky[0])
+    recording.write_frame(tmp_path, sky[1], sky[2], sky[0])
     mine = tmp_path / "frame_of_mine.png"
     mine.write_bytes(b"")
-    frames.remove_results(tmp_path)
+    recording.remove_results(tmp_path)
     assert list(tmp_path.iterdir()) == [mine]
 
 
@@ -221,7 +221,7 @@ def test_astropy_puts_the_true_stars_on_their_true_pixels(
     loaded = loader.load("shefex2", {k.replace("__", "."): v for k, v in pointing.items()})
     flight = simulate_motion(loaded)
     frame, truth = flight.render(0)
-    frames.write_fits(tmp_path / "f.fits", frame, truth, loaded)
+    recording.write_fits(tmp_path / "f.fits", frame, truth, loaded)
     sources = flight.lab.camera.sources
     rows = {hip: n for n, hip in enumerate(sources.id)}
     direction = sources.place[[rows[hip] for hip in truth.sources.id], :3]
@@ -233,7 +233,7 @@ def test_astropy_puts_the_true_stars_on_their_true_pixels(
 
 @pytest.mark.slow
 def test_under_the_dome_there_is_no_wcs(tmp_path: Path, dome: Shot) -> None:
-    frames.write_fits(tmp_path / "f.fits", dome[1], dome[2], dome[0])
+    recording.write_fits(tmp_path / "f.fits", dome[1], dome[2], dome[0])
     assert not [
         key for key in fits.getheader(tmp_path / "f.fits") if key.startswith(("CTYPE", "CRVAL"))
     ]
@@ -294,7 +294,7 @@ def test_an_interrupt_leaves_the_old_folder_or_the_new(
 KILLED = """
 import os, sys
 from pathlib import Path
-from skysim.core.io import files as io
+from skysim.core import files as io
 out = Path(sys.argv[1])
 with io.atomic_file(out / "solutions.ecsv") as file, io.atomic_folder(out / "frames.zarr") as folder:
     file.write_text("half")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+from skysim.core import guarded, images
 from skysim.core.errors import InputError
-from skysim.core.io import guarded, images
 
 PIXELS = np.random.default_rng(1).integers(0, 500, (60, 80)).astype(np.int16)
 

@@ -17,9 +17,9 @@ from astropy.io import fits
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
+from skysim.core import encoded, images
+from skysim.core import images as fits_images
 from skysim.core.errors import InputError
-from skysim.core.io import decoding, encoded, images, tiff
-from skysim.core.io import fits as fits_images
 
 RNG = np.random.default_rng(4)
 GRAY = np.kron(
@@ -120,29 +120,29 @@ def exif_block(order: str, *entries: tuple[int, int, int, int], first: int = 8) 
 @pytest.mark.parametrize(
     ("block", "expected"),
     [
-        (b"", tiff.Exif()),
-        (b"rubbish", tiff.Exif()),
-        (b"II*\0", tiff.Exif()),
-        (exif_block("<", (ORIENTATION, 3, 1, 6)), tiff.Exif(6)),
-        (exif_block(">", (ORIENTATION, 3, 1, 8 << 16)), tiff.Exif(8)),
-        (exif_block("<", (ORIENTATION, 3, 1, 0)), tiff.Exif()),
-        (exif_block("<", (ORIENTATION, 3, 1, 99)), tiff.Exif()),
-        (exif_block("<", (ORIENTATION, 2, 1, 6)), tiff.Exif()),  # text
+        (b"", encoded.Exif()),
+        (b"rubbish", encoded.Exif()),
+        (b"II*\0", encoded.Exif()),
+        (exif_block("<", (ORIENTATION, 3, 1, 6)), encoded.Exif(6)),
+        (exif_block(">", (ORIENTATION, 3, 1, 8 << 16)), encoded.Exif(8)),
+        (exif_block("<", (ORIENTATION, 3, 1, 0)), encoded.Exif()),
+        (exif_block("<", (ORIENTATION, 3, 1, 99)), encoded.Exif()),
+        (exif_block("<", (ORIENTATION, 2, 1, 6)), encoded.Exif()),  # text
         (
             exif_block("<", (ORIENTATION, 3, 1, 6), (EXIF, 4, 1, 8)),
-            tiff.Exif(6),
+            encoded.Exif(6),
         ),  # the directory contains itself
         (
             exif_block("<", (ORIENTATION, 3, 1, 6), (EXIF, 4, 1, 2**32 - 1)),
-            tiff.Exif(6),
+            encoded.Exif(6),
         ),  # beyond the end
-        (exif_block("<", first=2**32 - 1), tiff.Exif()),
+        (exif_block("<", first=2**32 - 1), encoded.Exif()),
     ],
 )
-def test_a_damaged_exif_block_tells_nothing(block: bytes, expected: tiff.Exif) -> None:
-    assert tiff.read_exif(block) == expected
+def test_a_damaged_exif_block_tells_nothing(block: bytes, expected: encoded.Exif) -> None:
+    assert encoded.read_exif_block(block) == expected
     for end in range(len(block)):
-        tiff.read_exif(block[:end])
+        encoded.read_exif_block(block[:end])
 
 
 def test_an_exif_block_that_lies_leaves_the_picture(tmp_path: Path) -> None:
@@ -257,7 +257,7 @@ def test_a_gzipped_file_is_unpacked_up_to_a_limit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A gigabyte of zeros is a megabyte; what is beyond the limit is not unpacked."""
-    monkeypatch.setattr(decoding, "MAX_BYTES", 100_000)
+    monkeypatch.setattr(encoded, "MAX_BYTES", 100_000)
     monkeypatch.setattr(fits_images, "GZIP_BLOCK", 10_000)
     whole = fits_file(tmp_path / "x.fits", FRAME).read_bytes()
     path = tmp_path / "x.fits.gz"

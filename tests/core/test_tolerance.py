@@ -18,8 +18,8 @@ from skysim.dynamics import imu
 from skysim.scene import loader
 from skysim.scene.sections import vehicle
 from skysim.sources import dome
-from skysim.sources.dome.survey import survey_errors
-from skysim.sources.dome.timing.clocks import Clocks
+from skysim.sources.dome import survey_errors
+from skysim.sources.dome.codes import Clocks
 from skysim.sources.photometry import Band
 
 COUNT = 200_000

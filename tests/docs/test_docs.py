@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks import AREAS
-from skysim.core.paths import ROOT
-from skysim.experiments.study import loader, plan
+from skysim.core.files import ROOT
+from skysim.experiments.study import plan, study_file
 
 DOME = (ROOT / "docs/findings/dome.md").read_text(encoding="utf-8")
 ESTIMATOR = (ROOT / "estimator/README.md").read_text(encoding="utf-8")
@@ -121,7 +121,7 @@ def test_every_study_that_comes_along_has_its_page_and_its_command() -> None:
     )
     assert {name for name, page, _, command in told if name == page == command} == shipped
     for name, _, verb, _ in told:
-        assert (verb == "optimize") == (loader.load(name).study.optimize is not None)
+        assert (verb == "optimize") == (study_file.load(name).study.optimize is not None)
 
 
 @pytest.mark.slow
@@ -130,7 +130,7 @@ def test_every_study_that_comes_along_has_its_page_and_its_command() -> None:
 )
 def test_a_study_s_page_is_of_its_study_and_shows_what_is_there(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
-    told = loader.load(path.stem)
+    told = study_file.load(path.stem)
     assert text.startswith(f"# {told.study.title}\n")
     assert f"seed {told.study.seed}." in text
     counted = re.search(r"(\d+) trials, (\d+) failed", text)

@@ -1,4 +1,4 @@
-"""What the site writes by itself: the pages of the commands and of the keys; and what pages tell to make."""
+"""What the site makes from the code: the reference of commands, keys and responses; and what pages say to make."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from skysim.apps.cli import main
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 from skysim.results import metrics
 from skysim.scene.scene import ExposureConfig
 from skysim.scene.sections.tracker import SurveyErrorsConfig
@@ -30,11 +30,15 @@ def of_the_site(name: str) -> ModuleType:
     return module
 
 
-commands, keys, responses = (of_the_site(name) for name in ("commands", "keys", "study_responses"))
-COMMANDS_MARKDOWN = commands.commands_markdown()
+keys, reference = of_the_site("keys"), of_the_site("reference")
+GENERATED = {name: part() for name, part in reference.PARTS.items()}
+PAGES = {
+    path: path.read_text(encoding="utf-8")
+    for path in sorted((ROOT / "docs" / "reference").glob("*.md"))
+}
 SECTIONS = dict(
     re.findall(
-        r"^##+ `skysim ?([^`]*)`\n(.*?)(?=^##|\Z)", COMMANDS_MARKDOWN, re.DOTALL | re.MULTILINE
+        r"^##+ `skysim ?([^`]*)`\n(.*?)(?=^##|\Z)", GENERATED["commands"], re.DOTALL | re.MULTILINE
     )
 )
 
@@ -82,19 +86,33 @@ def test_a_key_s_row_says_what_it_takes_and_what_stands_for_it() -> None:
     assert "| `surface_seed` | whole number, ≥ 0 or null | `null` |" in survey
 
 
-KEYS = keys.pages()
-GENERATED = KEYS | {commands.PAGE: commands.page(), responses.PAGE: responses.page()}
+def test_every_generated_part_has_its_place_on_one_page() -> None:
+    """And no page asks for another."""
+    marked = [name for text in PAGES.values() for name in reference.MARKER.findall(text)]
+    assert sorted(marked) == sorted(GENERATED)
 
 
-@pytest.mark.parametrize("path", GENERATED, ids=lambda path: path.stem)
-def test_a_committed_reference_page_is_that_of_the_code(path: Path) -> None:
-    """`make reference` writes these pages anew."""
-    assert path.read_text(encoding="utf-8") == GENERATED[path]
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_a_page_is_complete_once_its_parts_are_inserted(path: Path) -> None:
+    names = reference.MARKER.findall(PAGES[path])
+    complete = reference.insert_parts(PAGES[path])
+    assert "<!--" not in complete
+    assert [name for name in names if GENERATED[name] not in complete] == []
 
 
-@pytest.mark.parametrize("path", KEYS, ids=lambda path: path.stem)
-def test_a_page_of_keys_links_to_its_sections_and_names_what_a_text_may_be(path: Path) -> None:
-    page = GENERATED[path]
+def test_links_of_generated_parts_lead_to_pages_and_headings() -> None:
+    """The site's build would fail, but not before `make docs`."""
+    for text in GENERATED.values():
+        for page, anchor in re.findall(r"\]\(([\w/.]+\.md)(?:#([\w-]+))?\)", text):
+            linked = (ROOT / "docs" / "reference" / page).read_text(encoding="utf-8")
+            headings = re.findall(r"^#+ (.*)$", linked, re.MULTILINE)
+            slugs = {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in headings}
+            assert not anchor or anchor in slugs
+
+
+@pytest.mark.parametrize("name", ["scene_keys", "study_keys"])
+def test_the_keys_link_to_their_sections_and_name_what_a_text_may_be(name: str) -> None:
+    page = GENERATED[name]
     linked = set(re.findall(r"\]\(#(\w+)\)", page))
     headings = set(re.findall(r"^## (\w+)$", page, re.MULTILINE))
     assert len(linked) > 10
@@ -107,7 +125,7 @@ def test_a_page_of_keys_links_to_its_sections_and_names_what_a_text_may_be(path:
 
 def test_every_response_has_a_row_with_its_meaning() -> None:
     """Proportions, quantities and statistics that the code has, and no others; meanings of several lines are whole."""
-    page = GENERATED[responses.PAGE]
+    page = "\n".join(GENERATED[name] for name in ("proportions", "quantities", "statistics"))
     rows = [
         (set(re.findall(r"`(\w+)`", names)), text)
         for names, text in re.findall(r"^\| (`.*`) \| (.*) \|$", page, re.M)
@@ -125,13 +143,7 @@ def test_every_response_has_a_row_with_its_meaning() -> None:
 
 
 def test_names_that_a_key_allows_are_on_its_row() -> None:
-    rows = dict(
-        re.findall(
-            r"^\| `(\w+)` \| (.*) \|.*\|$",
-            GENERATED[commands.PAGE.with_name("scene_keys.md")],
-            re.MULTILINE,
-        )
-    )
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|.*\|$", GENERATED["scene_keys"], re.MULTILINE))
     assert {"`sequential`", "`local`"} <= set(rows["detector"].split(", "))
     assert "`default`" in rows["identifier"]
     assert "`led_pairs`" in rows["identifier"]

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from skysim.apps.cli import main
-from skysim.core.paths import ROOT
-from skysim.results.files import frames
-from skysim.results.files.export import EXPORTS
+from skysim.core.files import ROOT
+from skysim.results.files import recording
+from skysim.results.files.run_export import EXPORTS
 
 PAGE = (ROOT / "docs/howto/export.md").read_text(encoding="utf-8")
 COMMANDS = [
@@ -36,7 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.long
 def test_the_commands_leave_what_the_table_says(folder: Path) -> None:
     left = {path.name for path in (folder / "out" / "shefex2").iterdir()}
-    told = set(frames.EXPORT_FILES) - {"imu.parquet"} | {frames.ZARR}
+    told = set(recording.EXPORT_FILES) - {"imu.parquet"} | {recording.ZARR}
     assert told <= left
     assert {f"frame_000{n}.tif" for n in range(3)} <= left
     assert not [name for name in left if name.startswith(".")]
@@ -68,8 +68,8 @@ def test_the_photograph_as_tiff_is_solved_by_the_calibration(folder: Path) -> No
 def test_a_new_run_takes_the_exports_of_the_old_one_away(tmp_path: Path) -> None:
     """They would speak of other frames."""
     mine = tmp_path / "notes.aem"
-    for name in (*frames.EXPORT_FILES, "frame_0003.tif", mine.name):
+    for name in (*recording.EXPORT_FILES, "frame_0003.tif", mine.name):
         (tmp_path / name).write_bytes(b"")
-    (tmp_path / frames.ZARR).mkdir()
-    frames.remove_results(tmp_path)
+    (tmp_path / recording.ZARR).mkdir()
+    recording.remove_results(tmp_path)
     assert list(tmp_path.iterdir()) == [mine]

@@ -13,13 +13,13 @@ import yaml
 from skysim.camera.optics import VIGNETTING
 from skysim.camera.psf.otf import PSFS
 from skysim.core.errors import InputError
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections import camera, motion, vehicle
 from skysim.sources.dome import led
 from skysim.sources.dome.layouts.registry import LAYOUTS
-from skysim.sources.dome.shell.surface import SURFACES
+from skysim.sources.dome.surface import SURFACES
 from tests.helpers import doc_pages as pages
 
 PAGE = "docs/howto/scene.md"

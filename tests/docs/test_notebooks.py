@@ -5,7 +5,7 @@ import json
 import matplotlib
 import pytest
 
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 
 NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
 

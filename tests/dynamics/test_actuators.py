@@ -12,9 +12,9 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.dynamics.multibody.actuators.cmgs import STEERING, CmgSet
-from skysim.dynamics.multibody.actuators.fans import Desaturator, FanSet
-from skysim.dynamics.multibody.actuators.wheels import WheelSet
+from skysim.dynamics.multibody.cmgs import STEERING, CmgSet
+from skysim.dynamics.multibody.fans import Desaturator, FanSet
+from skysim.dynamics.multibody.wheels import WheelSet
 from skysim.scene.sections.motion import DesaturationConfig
 from tests.helpers.interpreted import interpreted
 
@@ -304,7 +304,7 @@ def test_away_from_singularities_both_ways_of_steering_agree():
 
 def test_the_robust_inverse_is_wie_s_at_any_time():
     """A^T (A A^T + lambda E)^-1: E is 1 on the diagonal, e_i = 0.01 sin(pi t / 2 + phase_i) off it."""
-    plain = interpreted("skysim.dynamics.multibody.actuators.cmgs")
+    plain = interpreted("skysim.dynamics.multibody.cmgs")
     rng = np.random.default_rng(4)
     for t_s in (0.0, 0.3, 1.1, 2.6):
         jacobian = 0.3 * rng.normal(size=(3, 4))

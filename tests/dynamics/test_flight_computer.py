@@ -16,7 +16,7 @@ from skysim.core.types import Floats, Telemetry
 from skysim.dynamics import multibody
 from skysim.dynamics.flight_computer import FlightComputer
 from skysim.dynamics.guidance import plan
-from skysim.dynamics.multibody.actuators.kind import ControlInput
+from skysim.dynamics.multibody.actuator_kind import ControlInput
 from skysim.scene import loader
 from skysim.simulation.flight import simulate_motion
 

@@ -21,7 +21,7 @@ from skysim.dynamics.guidance import (
     plan,
     vibration_intervals,
 )
-from skysim.dynamics.profiles.angle import envelope
+from skysim.dynamics.reference_curves import envelope
 from skysim.scene.sections.motion import AttitudeConfig, MotionConfig, SlewConfig, StepConfig
 
 HOLD = {"kind": "hold", "duration": "2 s"}

@@ -15,14 +15,14 @@ from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
 from skysim.core.types import Sources
 from skysim.dynamics import multibody
+from skysim.dynamics.multibody import mjcf_export, scene_picture
 from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.mjcf import mujoco_warnings
-from skysim.dynamics.multibody.view import mjcf_export, picture
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
-from skysim.sources.dome.shell import surface
+from skysim.sources.dome import surface
 from skysim.sources.photometry import Band
 
 EVERYTHING = {
@@ -336,8 +336,8 @@ def states(*attitudes: Rotation) -> np.ndarray:
 def opengl() -> None:
     """Skips where not even an empty room can be drawn, with the reason."""
     try:
-        picture.picture(NOTHING, np.zeros(0), (64, 48))
-    except picture.NoPicture as reason:
+        scene_picture.picture(NOTHING, np.zeros(0), (64, 48))
+    except scene_picture.NoPicture as reason:
         pytest.skip(str(reason))
 
 
@@ -347,13 +347,13 @@ def drawn(opengl: None) -> Drawn:
     scene, vehicle, sources = dome_lab()
     text = mjcf_export.mjcf(vehicle, scene, sources, LEVEL)
     dark = mjcf_export.mjcf(vehicle, scene, sources.take(np.zeros(len(sources), bool)), LEVEL)
-    lit = np.array(list(picture.film(text, states(LEVEL, TILTED), SIZE_PX)), float)
+    lit = np.array(list(scene_picture.film(text, states(LEVEL, TILTED), SIZE_PX)), float)
     return (
         sources,
         vehicle,
         *loaded(text),
         lit,
-        picture.picture(dark, states(LEVEL), SIZE_PX).astype(float),
+        scene_picture.picture(dark, states(LEVEL), SIZE_PX).astype(float),
     )
 
 
@@ -409,7 +409,7 @@ def test_stars_are_drawn_around_a_free_vehicle(opengl: None) -> None:
     """The room is black: whatever is white and small is a star, and half of the sphere or less is in the field."""
     scene, vehicle, sources, lab_from_body = star_lab()
     text = mjcf_export.mjcf(vehicle, scene, sources, lab_from_body)
-    drawn = picture.picture(text, states(lab_from_body), SIZE_PX)
+    drawn = scene_picture.picture(text, states(lab_from_body), SIZE_PX)
     count, _, boxes, _ = cv2.connectedComponentsWithStats((drawn.min(axis=2) > 90).astype(np.uint8))
     small = boxes[1:, cv2.CC_STAT_AREA] < 100
     assert 20 < small.sum() < mjcf_export.MAX_STARS
@@ -422,17 +422,17 @@ def test_without_opengl_one_line_says_what_to_do(
     opengl_name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MUJOCO_GL", opengl_name)
-    with pytest.raises(picture.NoPicture, match="apt-get install libegl1") as refused:
-        picture.picture(NOTHING, np.zeros(0), (64, 48))
+    with pytest.raises(scene_picture.NoPicture, match="apt-get install libegl1") as refused:
+        scene_picture.picture(NOTHING, np.zeros(0), (64, 48))
     assert "\n" not in str(refused.value)
     assert "MUJOCO_GL=osmesa" in str(refused.value)
 
 
 def test_a_driver_that_takes_the_painter_with_it_is_named(tmp_path: Path) -> None:
     with (tmp_path / "stderr").open("w+b") as complaints:
-        assert "SIGSEGV" in picture.failure_reason(-11, complaints)
+        assert "SIGSEGV" in scene_picture.failure_reason(-11, complaints)
         complaints.write(b"warning\nImportError: no libEGL\n")
-        assert picture.failure_reason(1, complaints) == "ImportError: no libEGL"
+        assert scene_picture.failure_reason(1, complaints) == "ImportError: no libEGL"
 
 
 # Films
@@ -440,10 +440,10 @@ def test_a_driver_that_takes_the_painter_with_it_is_named(tmp_path: Path) -> Non
 RED_TO_GREEN = [np.full((48, 64, 3), (250 - 20 * k, 20 * k, 0), np.uint8) for k in range(10)]
 
 
-@pytest.mark.parametrize("suffix", picture.ANIMATED)
+@pytest.mark.parametrize("suffix", scene_picture.ANIMATED)
 def test_a_film_comes_back_in_its_colors_and_its_time(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"film{suffix}"
-    picture.write_film(iter(RED_TO_GREEN), path, fps=10.0)
+    scene_picture.write_film(iter(RED_TO_GREEN), path, fps=10.0)
     assert os.listdir(tmp_path) == [path.name]
     done, film = cv2.imreadanimation(str(path))
     assert done
@@ -457,20 +457,20 @@ def test_a_film_comes_back_in_its_colors_and_its_time(suffix: str, tmp_path: Pat
 def test_a_film_of_ten_seconds_fits_into_a_page(drawn: Drawn, tmp_path: Path) -> None:
     """One hundred frames of the lab at the film's size, the vehicle in two poses by turns."""
     lit = [
-        cv2.resize(one.astype(np.uint8), picture.FILM_PX, interpolation=cv2.INTER_AREA)
+        cv2.resize(one.astype(np.uint8), scene_picture.FILM_PX, interpolation=cv2.INTER_AREA)
         for one in drawn[4]
     ]
-    picture.write_film((lit[k % 2] for k in range(100)), tmp_path / "film.gif", fps=10.0)
+    scene_picture.write_film((lit[k % 2] for k in range(100)), tmp_path / "film.gif", fps=10.0)
     assert (tmp_path / "film.gif").stat().st_size < 2.5e6
 
 
 def test_a_film_that_cannot_be_written_says_so(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="nowhere"):
-        picture.write_film(RED_TO_GREEN, tmp_path / "nowhere" / "film.gif", fps=10.0)
+        scene_picture.write_film(RED_TO_GREEN, tmp_path / "nowhere" / "film.gif", fps=10.0)
     with pytest.raises(
         InputError, match=r"film\.avi: unknown animation format '\.avi'; allowed: \.gif, \.webp"
     ):
-        picture.write_film(RED_TO_GREEN, tmp_path / "film.avi", fps=10.0)
+        scene_picture.write_film(RED_TO_GREEN, tmp_path / "film.avi", fps=10.0)
     assert not list(tmp_path.iterdir())
 
 

@@ -10,9 +10,9 @@ import mujoco
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.core.paths import SCENES
-from skysim.dynamics.multibody import mjcf, mjcf_sandbox
-from skysim.dynamics.multibody.mjcf_sandbox import xml_root
+from skysim.core.files import SCENES
+from skysim.dynamics.multibody import mjcf
+from skysim.dynamics.multibody.mjcf import xml_root
 
 BUS = '<body name="bus"><camera name="star_camera"/><geom size=".1"/></body>'
 SECRET = '<body name="secret"><geom size=".1"/></body>'
@@ -156,7 +156,7 @@ def test_a_file_that_includes_itself_in_many_ways_is_read_once(
         read.append(path)
         return xml_root(path)
 
-    monkeypatch.setattr(mjcf_sandbox, "xml_root", noted)
+    monkeypatch.setattr(mjcf, "xml_root", noted)
     (tmp_path / "sub").mkdir()
     (tmp_path / "v.xml").write_text(
         whole("".join(f'<include file="{"sub/../" * n}v.xml"/>' for n in (1, 2, 3)))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from skysim.core.paths import SCENES
+from skysim.core.files import SCENES
 from skysim.core.types import Floats, Sources
 from skysim.dynamics import multibody
 from skysim.dynamics.multibody.integrator import Simulation
@@ -18,10 +18,10 @@ from skysim.scene import loader
 from skysim.scene.sections import light
 from skysim.simulation.exposure import expected_exposure, render_at_rest
 from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.lights.lab_room import DomeWall, Vehicle, behind_wall
 from skysim.simulation.lights.light import Obstacle, find_light
-from skysim.simulation.lights.obstacles import DomeWall, Vehicle, behind_wall
-from skysim.sources.dome.shell import surface
-from skysim.sources.dome.shell.surface import Surface
+from skysim.sources.dome import surface
+from skysim.sources.dome.surface import Surface
 
 SIMSAT = (SCENES / "vehicles" / "simsat.xml").read_text(encoding="utf-8")
 QUIET = {

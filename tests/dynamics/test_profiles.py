@@ -10,14 +10,14 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from skysim.core import text
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.io import text
 from skysim.dynamics.guidance import plan, profile_start
-from skysim.dynamics.profiles.load import read_profile
-from skysim.dynamics.profiles.samples import MAX_SAMPLES, Samples, check_samples
-from skysim.dynamics.profiles.spline import fit_spline
-from skysim.results.files import ccsds_aem
+from skysim.dynamics.profile_samples import MAX_SAMPLES, Samples, check_samples
+from skysim.dynamics.profiles import read_profile
+from skysim.dynamics.reference_curves import fit_spline
+from skysim.results.files import run_export
 from skysim.scene.sections.motion import MotionConfig, ProfileConfig
 from skysim.sources.stars import cam_from_icrs
 
@@ -406,7 +406,7 @@ def read_text(content: str, tmp_path: Path, name: str = "p.aem") -> Samples:
 @pytest.mark.parametrize("frames", [("ICRF", "STARTRACKER_1"), ("LAB", "SC_BODY_1")])
 def test_what_we_write_is_read_as_it_was(frames: tuple[str, str], tmp_path: Path) -> None:
     utc = [START + datetime.timedelta(seconds=float(t)) for t in TIMES + 1.5]
-    read = read_text(ccsds_aem.message("x", ["COMMENT"], frames, utc, MOTION), tmp_path)
+    read = read_text(run_export.message("x", ["COMMENT"], frames, utc, MOTION), tmp_path)
     assert read.direction == {"ICRF": "icrs_from_cam", "LAB": "lab_from_body"}[frames[0]]
     assert read.absolute
     np.testing.assert_allclose(read.t_s, TIMES + 1.5, rtol=0, atol=1e-9)

@@ -11,21 +11,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from estimator.calibration.mass_properties.record import BearingRecord, MassEstimate, Prior
+from estimator.calibration.mass_dynamics import BearingRecord, MassEstimate, Prior
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody
-from skysim.experiments.balance import assumptions, balance_report, flight, observability, procedure
-from skysim.experiments.balance.procedure import Plan
-from skysim.experiments.configs import with_config
+from skysim.experiments import balance_flight, balance_procedure, balance_report
+from skysim.experiments.balance_procedure import BalancePlan
+from skysim.experiments.tracker_comparison import with_config
 from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.simulation.flight import Flight, Progress
 
 SIGMA_RAD = 5e-5
-UNCERTAINTY = assumptions.parse_uncertainty("10%", "500 um", "0.1%", "0.03 deg", 1.0)
-BALANCE = Plan("wheels", 8.0, 5e-5, 4, True)
+UNCERTAINTY = balance_flight.parse_uncertainty("10%", "500 um", "0.1%", "0.03 deg", 1.0)
+BALANCE = BalancePlan("wheels", 8.0, 5e-5, 4, True)
 
 
 def noisy_truth(
@@ -53,9 +53,9 @@ def test_table_is_balanced_below_the_published_torque(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """5e-5 N m (Bahu & Modenini 2020): MuJoCo's mass, center and inertia are the truth."""
-    monkeypatch.setattr(flight, "measured_attitudes", noisy_truth)
+    monkeypatch.setattr(balance_flight, "measured_attitudes", noisy_truth)
     scene = scene_of("cubesat_table")
-    last = list(procedure.balance(scene, BALANCE, UNCERTAINTY))[-1]
+    last = list(balance_procedure.balance(scene, BALANCE, UNCERTAINTY))[-1]
     assert last.true_torque_nm < 5e-5
     assert last.torque_bound_nm <= 5e-5
     result = balance_report.statistics(scene.name, BALANCE, [last])
@@ -78,10 +78,10 @@ def test_table_is_balanced_below_the_published_torque(
 @pytest.mark.slow
 def test_simsat_is_weighed_to_a_percent_and_a_micrometer(monkeypatch: pytest.MonkeyPatch) -> None:
     """In-plane offset, without trim masses; NEES of the nine as their covariance says."""
-    monkeypatch.setattr(flight, "measured_attitudes", noisy_truth)
+    monkeypatch.setattr(balance_flight, "measured_attitudes", noisy_truth)
     scene = scene_of("simsat_slew")
     plan = replace(BALANCE, moves=False)
-    (one,) = procedure.balance(scene, plan, UNCERTAINTY)
+    (one,) = balance_procedure.balance(scene, plan, UNCERTAINTY)
     rows = balance_report.statistics(scene.name, plan, [one])
     for row in rows["estimates"][:3]:
         assert row["estimate"] == pytest.approx(row["truth"], rel=0.01)
@@ -95,7 +95,7 @@ def test_simsat_is_weighed_to_a_percent_and_a_micrometer(monkeypatch: pytest.Mon
 def test_maneuver_stays_within_what_wheels_and_stop_allow(name: str) -> None:
     scene = scene_of(name)
     vehicle = multibody.build(scene.vehicle)
-    moved = flight.excited_by_wheels(scene, vehicle, 8.0)
+    moved = balance_flight.excited_by_wheels(scene, vehicle, 8.0)
     reference = guidance.plan(moved.motion)
     wheels = scene.vehicle.wheels
     assert wheels is not None
@@ -119,7 +119,7 @@ def test_masses_go_where_the_moment_vanishes() -> None:
     )
     vehicle = multibody.build(scene.vehicle)
     moment = vehicle.mass.mass_kg * vehicle.mass.center_m
-    position_m = procedure.balanced_position_m(vehicle, moment, scene)
+    position_m = balance_procedure.balanced_position_m(vehicle, moment, scene)
     moved = multibody.build(
         with_config(scene, "vehicle.trim", position_m=tuple(position_m)).vehicle
     )
@@ -129,7 +129,7 @@ def test_masses_go_where_the_moment_vanishes() -> None:
         InputError,
         match=r"trim_. would have to go to .* mm; allowed: vehicle.trim.travel 20 mm: first",
     ):
-        procedure.balanced_position_m(vehicle, 10 * np.ones(3) * 1e-3, scene)
+        balance_procedure.balanced_position_m(vehicle, 10 * np.ones(3) * 1e-3, scene)
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def test_what_cannot_be_balanced_is_refused(
     name: str, overrides: dict[str, str], message: str
 ) -> None:
     with pytest.raises(InputError) as refused:
-        next(procedure.balance(loader.load(name, overrides), BALANCE, UNCERTAINTY))
+        next(balance_procedure.balance(loader.load(name, overrides), BALANCE, UNCERTAINTY))
     assert str(refused.value).startswith(message)
     assert "\n" not in str(refused.value)
 
@@ -173,7 +173,7 @@ def test_what_a_flight_has_not_shown_is_named_with_what_would_do() -> None:
     def refusal(sigmas: Floats) -> str:
         estimate = MassEstimate(prior.values, np.diag(sigmas**2), 1.0)
         with pytest.raises(InputError) as refused:
-            observability.check_observed(estimate, prior, [record_of(2.0)], 0.01, np.full(3, 1e-5))
+            balance_flight.check_observed(estimate, prior, [record_of(2.0)], 0.01, np.full(3, 1e-5))
         return str(refused.value)
 
     gained = 0.04**-2 - 0.1**-2
@@ -197,7 +197,7 @@ def test_what_a_flight_has_not_shown_is_named_with_what_would_do() -> None:
     )
     known[8] = 1e-6
     estimate = MassEstimate(prior.values, np.diag(known**2), 1.0)
-    observability.check_observed(estimate, prior, [record_of(2.0)], 0.01, np.full(3, 1e-5))
+    balance_flight.check_observed(estimate, prior, [record_of(2.0)], 0.01, np.full(3, 1e-5))
 
 
 @pytest.mark.parametrize(
@@ -222,7 +222,7 @@ def test_wrong_uncertainties_are_refused(
     texts: tuple[str, str, str, str, float], message: str
 ) -> None:
     with pytest.raises(InputError) as refused:
-        assumptions.parse_uncertainty(*texts)
+        balance_flight.parse_uncertainty(*texts)
     assert str(refused.value).startswith(message)
 
 
@@ -233,15 +233,15 @@ def test_wrong_bars_are_refused() -> None:
         ("1e-5 N m", "1 s", "balance.offset_bar: '1 s' is not a length"),
     ):
         with pytest.raises(InputError) as refused:
-            procedure.parse_bars(torque, 1.0, offset)
+            balance_procedure.parse_bars(torque, 1.0, offset)
         assert str(refused.value).startswith(message)
     vehicle = multibody.build(scene_of("cubesat_table").vehicle)
     weight = vehicle.mass.mass_kg * vehicle.gravity_m_s2
     np.testing.assert_allclose(
-        procedure.parse_bars("4e-5 N m", 1.0, None).moment_kg_m(vehicle),
+        balance_procedure.parse_bars("4e-5 N m", 1.0, None).moment_kg_m(vehicle),
         2e-5 / weight * vehicle.mass.mass_kg,
     )
     np.testing.assert_allclose(
-        procedure.parse_bars("4e-5 N m", 1.0, "1 um").moment_kg_m(vehicle),
+        balance_procedure.parse_bars("4e-5 N m", 1.0, "1 um").moment_kg_m(vehicle),
         1e-6 * vehicle.mass.mass_kg,
     )

@@ -14,40 +14,37 @@ from pathlib import Path
 
 import numpy as np
 
-from estimator.catalog import catalog, ptase
-from estimator.core.errors import ImageError
+from estimator.catalog import catalog, published_catalogs
+from estimator.core.checks import ImageError
 from skysim.apps.cli.commands import validate
-from skysim.apps.stream import packet
+from skysim.apps.stream import sinks
 from skysim.camera.psf import otf
-from skysim.core import units
+from skysim.core import images, units, yaml_reader
 from skysim.core.errors import InputError
-from skysim.core.io import images, yaml_reader
-from skysim.dynamics.controllers.interface import torque_of_reply
+from skysim.dynamics.controllers import torque_of_reply
 from skysim.dynamics.multibody import mjcf
-from skysim.dynamics.profiles.load import read_profile
-from skysim.dynamics.profiles.samples import check_samples
-from skysim.dynamics.profiles.spline import fit_spline
-from skysim.experiments.characterize.frames import read_settings
-from skysim.experiments.dome_survey.folder import images as survey_images
-from skysim.experiments.study import loader as study_loader
+from skysim.dynamics.profile_samples import check_samples
+from skysim.dynamics.profiles import read_profile
+from skysim.dynamics.reference_curves import fit_spline
+from skysim.experiments.characterize.frame_files import read_settings
+from skysim.experiments.dome_survey import survey_images
+from skysim.experiments.study import study_file as study_loader
 from skysim.experiments.study.execution import store
 from skysim.results.files import recording
-from skysim.results.files.builder.prices import read_prices
-from skysim.results.report.as_text import print_table
-from skysim.results.report.blocks import Column, Table
+from skysim.results.files.parts import read_prices
+from skysim.results.report import print_table
+from skysim.results.report_blocks import Column, Table
 from skysim.scene import loader, opencv_calibration
 from skysim.sources import catalog as star_catalog
 from skysim.sources import photometry
+from skysim.sources.dome import point_cloud
 from skysim.sources.dome.layouts import listed
-from skysim.sources.dome.shell import point_cloud
-from skysim.sources.orbit.elements import gcrs_states, read_elements
-from skysim.sources.orbit.oem import read_oem
-from skysim.tracking import dome_map_file
-from skysim.tracking.external import interface
+from skysim.sources.orbit_elements import gcrs_states, read_elements, read_oem
+from skysim.tracking import dome_map_file, tracker_interface
 
 START = datetime.datetime(2016, 12, 31)
 GZIP_MAGIC = b"\x1f\x8b"
-COLOR = ptase.Color(0.1, 0.2, 0.0)
+COLOR = published_catalogs.Color(0.1, 0.2, 0.0)
 
 
 @cache
@@ -107,7 +104,7 @@ def catalogs(data: bytes) -> None:
     path = write_file(data, "stars.ecsv")
     rejects(lambda: star_catalog.read(path), InputError)
     rejects(lambda: catalog.read(path), ImageError)
-    rejects(lambda: ptase.read_cat(path, 5.0, 2010.0, COLOR), ImageError)
+    rejects(lambda: published_catalogs.read_cat(path, 5.0, 2010.0, COLOR), ImageError)
     rejects(lambda: validate.describe_file(path), InputError)
 
 
@@ -181,7 +178,9 @@ def answers(data: bytes) -> None:
         return
     statuses: list[str] = []
     if rejects(
-        lambda: statuses.append(interface.check_answer(interface.Answer.of_tree(tree)).status),
+        lambda: statuses.append(
+            tracker_interface.check_answer(tracker_interface.Answer.of_tree(tree)).status
+        ),
         ValueError,
     ):
         return
@@ -225,7 +224,7 @@ def torques(data: bytes) -> None:
 
 
 def packets(data: bytes) -> None:
-    rejects(lambda: packet.unpack(BytesIO(data)), InputError)
+    rejects(lambda: sinks.unpack(BytesIO(data)), InputError)
 
 
 def quantities(data: bytes) -> None:

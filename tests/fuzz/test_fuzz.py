@@ -21,12 +21,12 @@ from hypothesis import strategies as some
 from PIL import Image
 
 from skysim.camera.psf.otf import read_cells
+from skysim.core import encoded, images, yaml_reader
 from skysim.core.errors import InputError
-from skysim.core.io import decoding, encoded, images, yaml_reader
 from skysim.scene import loader
 from skysim.sources import photometry
+from skysim.sources.dome import point_cloud
 from skysim.sources.dome.layouts import listed
-from skysim.sources.dome.shell import point_cloud
 from tests.fuzz.__main__ import NAMES, TOKENS, mutate, seeds
 from tests.fuzz.targets import TARGETS, rejects
 from tests.helpers.hostile_files import promise
@@ -214,7 +214,7 @@ def test_every_sample_of_a_tiff_s_pixels_counts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Four doubles a pixel are sixteen times what two bytes are."""
-    monkeypatch.setattr(decoding, "MAX_PIXELS", 30 * 41)
+    monkeypatch.setattr(encoded, "MAX_PIXELS", 30 * 41)
     path = tmp_path / "x.tiff"
     gray = np.arange(30 * 41.0).reshape(30, 41)
     cv2.imwrite(str(path), gray)

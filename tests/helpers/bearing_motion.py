@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.calibration.mass_properties.record import BearingRecord, Lab, Prior, inertia_six
-from estimator.core.arrays import Floats
+from estimator.calibration.mass_dynamics import BearingRecord, LabConstants, Prior, inertia_six
+from estimator.core.checks import Floats
 
 GRAVITY_M_S2 = 9.80665
 WHEEL_KG_M2 = 2e-5
@@ -44,8 +44,10 @@ class Vehicle:
         )
 
     @property
-    def lab(self) -> Lab:
-        return Lab(GRAVITY_M_S2, np.eye(3), np.full(3, self.torque_rms_nm), self.correlation_s)
+    def lab(self) -> LabConstants:
+        return LabConstants(
+            GRAVITY_M_S2, np.eye(3), np.full(3, self.torque_rms_nm), self.correlation_s
+        )
 
 
 INERTIA = np.array([[0.11, 0.004, -0.002], [0.004, 0.13, 0.003], [-0.002, 0.003, 0.09]])

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import psutil  # type: ignore[import-untyped]
 import pytest
 
-from skysim.core.paths import ROOT
-from skysim.experiments.study import loader, plan
+from skysim.core.files import ROOT
+from skysim.experiments.study import plan, study_file
 from skysim.experiments.study.execution import workers
 
 STUDY = """
@@ -37,7 +37,7 @@ ENVIRONMENT = os.environ | dict.fromkeys(workers.ONE_THREAD, "1") | {"PYTHONPATH
 def study(folder: Path, text: str = STUDY) -> plan.Plan:
     path = folder / "strays.yaml"
     path.write_text(text)
-    return loader.load(path)
+    return study_file.load(path)
 
 
 class Cluster(NamedTuple):

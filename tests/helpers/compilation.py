@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 
 Step = Sequence[str]  # words after `python -m`; {folder} is a temporary folder
 TRACKER = "skysim.simulation.compilation"
@@ -49,7 +49,7 @@ def compile_algorithms() -> None:
     from estimator import Camera, StarTracker
     from estimator.attitude.solvers import SOLVERS
     from estimator.centroiding.centroid import CENTROIDERS
-    from estimator.core.errors import ImageError
+    from estimator.core.checks import ImageError
     from estimator.detection.detect import DETECTORS
     from estimator.identification.registry import IDENTIFIERS
     from estimator.trackers.pipeline import Settings

@@ -26,9 +26,9 @@ from estimator.core.types import Attitude
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps import plate_solver
-from skysim.core.io import images
-from skysim.core.paths import CATALOGS
-from skysim.results.files import frames
+from skysim.core import images
+from skysim.core.files import CATALOGS
+from skysim.results.files import recording
 from skysim.results.metrics import normalized_error_squared
 from tests.helpers.oracles import Agreement, aberrated, lattice, unit_vectors
 
@@ -227,7 +227,7 @@ def calibrated_way(setup: CameraSetup) -> Ours:
         centroid_sigma_px=0.03,
     )
     seen = catalog.apparent(
-        listed, catalog.on_earth(frames.datetime.datetime.fromisoformat(setup.utc))
+        listed, catalog.on_earth(recording.datetime.datetime.fromisoformat(setup.utc))
     )
     tracker = StarTracker(setup.camera, listed, seen, settings)
     return lambda image, path: tracker.solve(image).attitude

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 
 
 class Transform(NamedTuple):

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 import estimator
 from estimator.catalog import catalog
 from estimator.catalog.catalog import StarCatalog
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 
 EXAMPLES = int(os.environ.get("LAW_EXAMPLES", "8"))
 ANY = some.floats(width=64)

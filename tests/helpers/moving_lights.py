@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.motion import STARS, Sight
-from estimator.core.arrays import Floats
+from estimator.attitude.rate import STARS, Sight
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.core.types import Centroids
 
 CAMERA = Camera(

@@ -31,17 +31,16 @@ from scipy.spatial.transform import Rotation
 from estimator.core.camera import Camera
 from skysim.core.constants import SPEED_OF_LIGHT_KM_S
 from skysim.core.types import Frame, Truth
-from skysim.results.files import frames as frame_files
+from skysim.results.files import recording as frame_files
 from skysim.results.metrics import WRONG_RAD
 from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import build_lab
-from skysim.tracking import onboard_model
-from skysim.tracking import settings as tracker_settings
-from skysim.tracking.external import adapter
-from skysim.tracking.external import tetra3rs as tetra3rs_tracker
-from skysim.tracking.external.interface import Stars
+from skysim.tracking import external_tracker, onboard_model
+from skysim.tracking import factory as tracker_settings
+from skysim.tracking import tetra3rs as tetra3rs_tracker
+from skysim.tracking.tracker_interface import Stars
 
 # Epochs of the catalogs: Tycho-2 in the index files, and Gaia; both are used without proper motions.
 EPOCHS = {"astrometry.net": "2000-01-01T12:00:00", "tetra3rs": "2016-01-01T12:00:00"}
@@ -344,7 +343,9 @@ def tetra3rs(name: str) -> Solve | None:
     settings = tracker_settings.assumed_settings(scene)
     nothing = np.zeros(0)
     tracker = tetra3rs_tracker.Tetra3rs(
-        adapter.build_setup(scene, camera, settings, Stars(nothing.astype(int), nothing, nothing))
+        external_tracker.build_setup(
+            scene, camera, settings, Stars(nothing.astype(int), nothing, nothing)
+        )
     )
     pixels = lattice(camera.width_px, camera.height_px) - tracker.image_center_px
 

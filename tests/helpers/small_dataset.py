@@ -6,7 +6,7 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-from skysim.experiments.dataset import plan
+from skysim.experiments import dataset_run
 
 WIDTH = 240
 HEIGHT = 180
@@ -28,10 +28,15 @@ hardware: [camera.detector.hardware_seed]
 """
 
 
-def small(vary: Path | None = None, frames: int = 5, **more: Any) -> plan.DatasetPlan:
+def small(vary: Path | None = None, frames: int = 5, **more: Any) -> dataset_run.DatasetPlan:
     """A dataset of small frames in shards of two."""
-    more = {"seed": 3, "frames_per_shard": 2, "formats": plan.FORMATS, "overrides": SMALL} | more
-    return plan.load("shefex2", vary, frames, **more)
+    more = {
+        "seed": 3,
+        "frames_per_shard": 2,
+        "formats": dataset_run.FORMATS,
+        "overrides": SMALL,
+    } | more
+    return dataset_run.load("shefex2", vary, frames, **more)
 
 
 def contents(folder: Path) -> dict[str, str]:

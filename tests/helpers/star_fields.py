@@ -4,8 +4,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.catalog import sky_index
-from estimator.identification.stars import evidence
-from estimator.identification.stars.evidence import Solution
+from estimator.identification import star_evidence
+from estimator.identification.star_evidence import Solution
 
 WIDE_RAD = np.radians(12.0)
 FIELD = np.tan(np.radians([-5.0, 5.0, -4.0, 4.0]))
@@ -40,10 +40,10 @@ def observe(truth: Rotation, rng, sigma=SIGMA, zoom=1.0, vectors=VECTORS, mag=MA
     return noisy[order], shown[order], row[order]
 
 
-def detections_of(tangent, mag, sigma=SIGMA, zoom=0.0) -> evidence.Detections:
+def detections_of(tangent, mag, sigma=SIGMA, zoom=0.0) -> star_evidence.Detections:
     sigmas = np.full(len(tangent), sigma)
     weight = np.stack([sigmas**-2, sigmas**-2, 0 * sigmas], axis=1)
-    return evidence.Detections(
+    return star_evidence.Detections(
         np.ascontiguousarray(tangent), sigmas, weight, np.array(mag), 0.25, FIELD, zoom, np.nan
     )
 

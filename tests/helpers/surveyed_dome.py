@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, on_surface, project
 from estimator.calibration.survey_plan import SurveyModel
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 
 CAMERA = Camera(640, 480, 900.0, (319.5, 239.5))
 AXES_M = np.array([0.99, 0.99, 0.73])

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.io import files
-from skysim.core.paths import ROOT
-from skysim.dynamics.profiles.load import read_profile
-from skysim.results.files import ccsds_aem
+from skysim.core.files import ROOT
+from skysim.dynamics.profiles import read_profile
+from skysim.results.files import run_export
 
 ndm = pytest.importorskip("ccsds_ndm", reason="the package ccsds-ndm-py is not installed")
 
@@ -26,7 +26,7 @@ def utc(count: int) -> list[datetime.datetime]:
 
 
 @pytest.mark.parametrize(
-    "frames", [(ccsds_aem.ICRF, ccsds_aem.CAMERA), (ccsds_aem.LAB, ccsds_aem.BODY)]
+    "frames", [(run_export.ICRF, run_export.CAMERA), (run_export.LAB, run_export.BODY)]
 )
 @pytest.mark.parametrize("count", [1, 2, 200])
 def test_it_is_valid_and_says_what_was_meant(
@@ -36,7 +36,7 @@ def test_it_is_valid_and_says_what_was_meant(
     meant = Rotation.random(count, rng=np.random.default_rng(count))
     path = tmp_path / "truth.aem"
     files.write_text(
-        path, ccsds_aem.message("afit_simsat", ["LED dome, 3″ off"], frames, utc(count), meant)
+        path, run_export.message("afit_simsat", ["LED dome, 3″ off"], frames, utc(count), meant)
     )
     read = ndm.Aem.from_file(str(path), format="kvn")
     assert read.validate(strict=False) is None
@@ -55,8 +55,8 @@ def test_it_is_valid_and_says_what_was_meant(
         ]
         assert epochs == utc(count)
         assert (told.start_time, told.stop_time) == (
-            ccsds_aem.epoch(epochs[0]),
-            ccsds_aem.epoch(epochs[-1]),
+            run_export.epoch(epochs[0]),
+            run_export.epoch(epochs[-1]),
         )
         off = (Rotation.from_quat(segment.data.attitude_states_numpy) * meant.inv()).magnitude()
         assert off.max() < 1e-14
@@ -64,7 +64,9 @@ def test_it_is_valid_and_says_what_was_meant(
 
 def test_their_reader_refuses_what_ours_never_writes() -> None:
     """So that the tests above can fail."""
-    good = ccsds_aem.message("x", [], (ccsds_aem.LAB, ccsds_aem.BODY), utc(2), Rotation.identity(2))
+    good = run_export.message(
+        "x", [], (run_export.LAB, run_export.BODY), utc(2), Rotation.identity(2)
+    )
     for old, new in (
         ("REF_FRAME_A = LAB\n", ""),
         ("= QUATERNION", "= QUATRNION"),
@@ -74,15 +76,15 @@ def test_their_reader_refuses_what_ours_never_writes() -> None:
         with pytest.raises(ValueError, match=r"REF_FRAME_A|QUATRNION|7\.0"):
             ndm.Aem.from_str(good.replace(old, new), "kvn")
     with pytest.raises(InputError):
-        ccsds_aem.message(
-            "x", [], (ccsds_aem.LAB, ccsds_aem.BODY), utc(2)[::-1], Rotation.identity(2)
+        run_export.message(
+            "x", [], (run_export.LAB, run_export.BODY), utc(2)[::-1], Rotation.identity(2)
         )
 
 
 def test_what_they_write_is_read_by_our_reader(tmp_path: Path) -> None:
     """Both readers take the same numbers for the same epochs. Theirs does not know the keywords of version 1.0."""
     meant = Rotation.from_rotvec(np.outer(np.arange(9.0), [0.01, -0.02, 0.005]))
-    text = ccsds_aem.message("x", ["of ours"], (ccsds_aem.ICRF, ccsds_aem.BODY), utc(9), meant)
+    text = run_export.message("x", ["of ours"], (run_export.ICRF, run_export.BODY), utc(9), meant)
     theirs = ndm.Aem.from_str(text, "kvn")
     path = tmp_path / "theirs.aem"
     path.write_text(theirs.to_str("kvn"))
@@ -108,10 +110,10 @@ def test_the_page_s_code_reads_it(
     meant = Rotation.from_euler(
         "y", [[90]], degrees=True
     )  # the camera's boresight along the ICRF's x
-    text = ccsds_aem.message("shefex2", [], (ccsds_aem.ICRF, ccsds_aem.CAMERA), utc(1), meant)
+    text = run_export.message("shefex2", [], (run_export.ICRF, run_export.CAMERA), utc(1), meant)
     files.write_text(tmp_path / "out/shefex2/truth.aem", text)
     monkeypatch.chdir(tmp_path)
     exec(compile(block, "docs/howto/export.md", "exec"), {})
     frame, epoch, *sight = capsys.readouterr().out.replace("[", " ").replace("]", " ").split()
-    assert (frame, epoch) == ("ICRF", ccsds_aem.epoch(START))
+    assert (frame, epoch) == ("ICRF", run_export.epoch(START))
     np.testing.assert_allclose(np.array(sight, dtype=float), [1, 0, 0], rtol=0, atol=1e-8)

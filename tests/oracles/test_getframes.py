@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skysim.camera.detector import detector
-from skysim.camera.detector.detector import Detector
+from skysim.camera import detector
+from skysim.camera.detector import Detector
 from skysim.scene.sections.camera import CameraConfig
 
 gf = pytest.importorskip("getframes")

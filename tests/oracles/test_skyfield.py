@@ -17,8 +17,7 @@ import pytest
 
 from skysim.core.time import tt_jd
 from skysim.scene.sections.vehicle import SiteConfig
-from skysim.sources.orbit import earth, elements, satellites
-from skysim.sources.solar_system import magnitudes, observer, places
+from skysim.sources import body_discs, camera_orbit, ephemeris, orbit_elements, satellites
 
 LIMIT_ARCSEC = 0.1
 LIMIT_MAG = 0.001
@@ -48,7 +47,9 @@ def skyfield() -> Skyfield:
     return Skyfield(load("de421.bsp"), load.timescale(builtin=True), api.wgs84.latlon)
 
 
-def observers(skyfield: Skyfield, on_ground: bool) -> Iterator[tuple[observer.Observer, Any, Any]]:
+def observers(
+    skyfield: Skyfield, on_ground: bool
+) -> Iterator[tuple[ephemeris.ObserverPlace, Any, Any]]:
     """Random times, and sites if on the ground: our observer, Skyfield's and its time."""
     rng = np.random.default_rng(26)
     for _ in range(COUNT):
@@ -63,7 +64,7 @@ def observers(skyfield: Skyfield, on_ground: bool) -> Iterator[tuple[observer.Ob
             )
             theirs = theirs + skyfield.at_site(latitude_deg, longitude_deg, 2000.0)
         their_time = skyfield.time.from_datetime(time.replace(tzinfo=datetime.UTC))
-        yield observer.observe_from(time, site), theirs.at(their_time), their_time
+        yield ephemeris.observe_from(time, site), theirs.at(their_time), their_time
 
 
 def named(skyfield: Skyfield, name: str) -> Any:
@@ -76,7 +77,7 @@ def test_places_are_skyfield_s(skyfield: Skyfield, on_ground: bool) -> None:
     for ours, theirs, _ in observers(skyfield, on_ground):
         for name in NAMES:
             wanted = theirs.observe(named(skyfield, name)).apparent().xyz.au
-            direction = places.place(name, ours).direction
+            direction = ephemeris.place(name, ours).direction
             off = np.arctan2(np.linalg.norm(np.cross(wanted, direction)), wanted @ direction)
             worst[name] = max(worst[name], np.degrees(off) * 3600)
     assert max(worst.values()) < LIMIT_ARCSEC, worst
@@ -93,19 +94,19 @@ def test_satellites_are_skyfield_s(skyfield: Skyfield, tmp_path: Path) -> None:
     path = tmp_path / "orbits.tle"
     lines = [line for n in range(1, 41) for line in circular_tle(n, rng)]
     path.write_text("\n".join(lines), encoding="utf-8")
-    ours = elements.read_elements(str(path))
+    ours = orbit_elements.read_elements(str(path))
     site = SiteConfig(latitude_deg=40, longitude_deg=10, height="500 m")
     theirs = skyfield.at_site(40, 10, 500.0)
     for hours in (0.0, 5.2, 19.0):
         time = datetime.datetime(2024, 4, 10, 3) + datetime.timedelta(hours=hours)
         their_time = skyfield.time.from_datetime(time.replace(tzinfo=datetime.UTC))
         seen = (skyfield.bodies["earth"] + theirs).at(their_time)
-        place_m = elements.gcrs_states(ours, time, np.zeros(1))[0][:, 0]
-        lit = earth.sunlit_fraction(place_m, earth.sun_m(tt_jd(time)))
+        place_m = orbit_elements.gcrs_states(ours, time, np.zeros(1))[0][:, 0]
+        lit = camera_orbit.sunlit_fraction(place_m, camera_orbit.sun_m(tt_jd(time)))
 
-        def site_at(after_s: float, time: datetime.datetime = time) -> observer.GcrsState:
+        def site_at(after_s: float, time: datetime.datetime = time) -> ephemeris.GcrsState:
             then = time + datetime.timedelta(seconds=after_s)
-            return observer.site_in_gcrs(then, tt_jd(then), site)
+            return ephemeris.site_in_gcrs(then, tt_jd(then), site)
 
         for n in range(len(ours.numbers)):
             satellite = EarthSatellite(lines[2 * n], lines[2 * n + 1], ts=skyfield.time)
@@ -125,7 +126,7 @@ def circular_tle(number: int, rng: np.random.Generator) -> list[str]:
         f"1 {number:05d}U 20001A   24100.50000000  .00001000  00000-0  50000-4 0  999",
         f"2 {number:05d} {inclination:8.4f} {node:8.4f} 0010000   0.0000 {along:8.4f} {rate:11.8f}    1",
     )
-    return [line + elements.checksum(line) for line in lines]
+    return [line + orbit_elements.checksum(line) for line in lines]
 
 
 def test_magnitudes_are_skyfield_s(skyfield: Skyfield) -> None:
@@ -149,6 +150,6 @@ def test_magnitudes_are_skyfield_s(skyfield: Skyfield) -> None:
                 args.append(time.J)
             wanted = float(getattr(library, f"_{name}_magnitude")(*args))
             if np.isfinite(wanted):  # before 2000 it knows Neptune at small phase angles only
-                ours_mag = magnitudes.magnitude(name, places.place(name, ours), ours.tt_jd)
+                ours_mag = body_discs.magnitude(name, ephemeris.place(name, ours), ours.tt_jd)
                 worst[name] = max(worst[name], abs(wanted - ours_mag))
     assert max(worst.values()) < LIMIT_MAG, worst

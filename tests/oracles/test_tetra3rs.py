@@ -14,14 +14,14 @@ import pytest
 
 from estimator.core.camera import Camera
 from skysim.core.errors import InputError
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 from skysim.results import scoring
 from skysim.scene import loader
 from skysim.simulation.flight import open_flight
 from skysim.simulation.lab import build_lab, build_tracker
-from skysim.tracking.external import interface
-from skysim.tracking.external import tetra3rs as tetra3rs_tracker
-from skysim.tracking.external.interface import Setup
+from skysim.tracking import tetra3rs as tetra3rs_tracker
+from skysim.tracking import tracker_interface
+from skysim.tracking.tracker_interface import Setup
 
 tetra3rs = pytest.importorskip("tetra3rs")
 
@@ -90,4 +90,4 @@ def test_the_page_s_commands_do_what_it_says(command: str, tmp_path: Path) -> No
 
 
 def test_it_is_an_entry_point_of_skysim() -> None:
-    assert interface.TRACKERS.entry_points()["tetra3rs"].load() is tetra3rs_tracker.Tetra3rs
+    assert tracker_interface.TRACKERS.entry_points()["tetra3rs"].load() is tetra3rs_tracker.Tetra3rs

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from skysim.core.types import SourceTruth
-from skysim.results import annotate
+from skysim.results import plots
 
 
 def seen(xy_px: list[tuple[float, float]], saturated: list[bool]) -> SourceTruth:
@@ -27,21 +27,21 @@ def colored(picture: np.ndarray, bgr: tuple[int, int, int]) -> np.ndarray:
 
 def test_ticks_stand_around_the_true_places_and_leave_them_open() -> None:
     image = np.random.default_rng(1).normal(100, 5, (1000, 1200))
-    picture = annotate.annotate_truth(image, seen([(300.2, 400.7), (900.0, 650.0)], [False, True]))[
+    picture = plots.annotate_truth(image, seen([(300.2, 400.7), (900.0, 650.0)], [False, True]))[
         :1000
     ]
-    for place, bgr in (((300, 401), annotate.TRUTH_BGR), ((900, 650), annotate.DETECTED_BGR)):
+    for place, bgr in (((300, 401), plots.TRUTH_BGR), ((900, 650), plots.DETECTED_BGR)):
         away = np.abs(colored(picture, bgr) - place).max(axis=1)
         assert away.min() >= 8
         assert np.sort(away)[:40].max() < 40
 
 
 def test_a_small_frame_is_doubled_and_its_marks_with_it() -> None:
-    picture = annotate.annotate_truth(
+    picture = plots.annotate_truth(
         np.random.default_rng(1).normal(100, 5, (200, 300)), seen([(100.0, 50.0)], [False])
     )
-    assert picture.shape == (400 + annotate.LEGEND_PX, 600, 3)
-    ticks = colored(picture[:400], annotate.TRUTH_BGR)
+    assert picture.shape == (400 + plots.LEGEND_PX, 600, 3)
+    ticks = colored(picture[:400], plots.TRUTH_BGR)
     assert (
         np.abs(ticks.min(axis=0) + ticks.max(axis=0) - [401, 201]).max() < 80
     )  # the label leans to one side
@@ -55,12 +55,12 @@ def test_what_nobody_can_see_is_not_marked_and_a_legend_names_the_colors() -> No
         (np.array([9.0, 2.0]), [True, False]),
         (np.array([9.0, np.nan]), [True, True]),
     ):
-        picture = annotate.annotate_truth(image, replace(sources, snr=snr))
-        ticks = colored(picture, annotate.TRUTH_BGR)
+        picture = plots.annotate_truth(image, replace(sources, snr=snr))
+        ticks = colored(picture, plots.TRUTH_BGR)
         near = [(np.hypot(*(ticks - place).T) < 60).any() for place in ((300, 400), (700, 800))]
         assert near == shown
         assert (ticks[:, 1] >= 1200).any()  # the legend, below the frame
-        assert len(picture) == 1200 + annotate.LEGEND_PX
+        assert len(picture) == 1200 + plots.LEGEND_PX
 
 
 def test_a_contact_sheet_stretches_all_frames_alike() -> None:
@@ -68,7 +68,7 @@ def test_a_contact_sheet_stretches_all_frames_alike() -> None:
     bright, dim = (rng.normal(100, 1, (40, 50)) for _ in range(2))
     bright[18:23, 23:28] = 1000
     dim[18:23, 23:28] = 300
-    sheet = annotate.contact_sheet([bright, dim], ["a", "b"], scale=2)
+    sheet = plots.contact_sheet([bright, dim], ["a", "b"], scale=2)
     left, right = np.array_split(sheet, 2, axis=1)
     assert left.shape == right.shape == (80 + 26, 100 + 4)
     peaks = [part[24 + 41, 2 + 51] for part in (left, right)]

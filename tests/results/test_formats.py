@@ -21,11 +21,11 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera import wcs
 from skysim.camera.optics import Optics
+from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.io import files
 from skysim.core.types import Floats
-from skysim.results import scoring, stretch
-from skysim.results.files import ccsds_aem, export, frames, recording
+from skysim.results import plots, scoring
+from skysim.results.files import recording, run_export
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.checks import check
@@ -51,7 +51,7 @@ def sky_flight(folder: Path) -> Flight:
     scene = flight.lab.scene
     rows = []
     for shot in flight.shots():
-        frames.write_frame(folder, shot.frame, shot.truth, scene)
+        recording.write_frame(folder, shot.frame, shot.truth, scene)
         rows.append(scoring.score(shot).row)
     files.write_table(folder / "solutions.ecsv", scoring.table(rows, scoring.angle_names(scene)))
     return flight
@@ -67,7 +67,7 @@ def dome_flight(folder: Path) -> Flight:
     small = {"camera.width_px": "800", "camera.height_px": "600", "camera.detector.noise": "false"}
     flight = open_flight(loader.load("afit_simsat", told | small))
     for shot in flight.shots(solves=False):
-        frames.write_frame(folder, shot.frame, shot.truth, flight.lab.scene)
+        recording.write_frame(folder, shot.frame, shot.truth, flight.lab.scene)
     return flight
 
 
@@ -114,8 +114,8 @@ def matrix_b_from_a(q: Floats) -> Floats:
 def test_the_standard_s_own_examples() -> None:
     """Annex F2.2: B is A turned by 90 deg about Z. F5.4: by 90, 10 and 45 deg about Z, X and Z, one after the other."""
     turns = Rotation.from_euler("ZXZ", [[90, 0, 0], [90, 10, 45]], degrees=True)
-    text = ccsds_aem.message(
-        "x", [], (ccsds_aem.ICRF, ccsds_aem.BODY), [START, START + SECOND], turns
+    text = run_export.message(
+        "x", [], (run_export.ICRF, run_export.BODY), [START, START + SECOND], turns
     )
     rows = [[float(word) for word in line.split()[1:]] for line in text.splitlines()[-3:-1]]
     np.testing.assert_allclose(rows[0], [0, 0, 0.7071, 0.7071], rtol=0, atol=5e-5)
@@ -132,7 +132,7 @@ def test_under_the_stars_the_message_puts_every_star_on_its_pixel(
     """Star directions by the annex's matrix into the camera, by the lens onto the chip, where the truth has them."""
     flight, run = stars
     camera = flight.lab.camera
-    export.export(run, ["aem"], tmp_path, quiet)
+    run_export.export(run, ["aem"], tmp_path, quiet)
     told, epochs, quaternions = read_aem(tmp_path / "truth.aem")
     assert (told["REF_FRAME_A"], told["REF_FRAME_B"], told["TIME_SYSTEM"]) == (
         "ICRF",
@@ -160,7 +160,7 @@ def test_in_the_laboratory_the_message_puts_every_led_on_its_pixel(
     """LEDs in lab coordinates by the annex's matrix into the body, by the mount into the camera."""
     flight, run = dome
     camera = flight.lab.camera
-    export.export(run, ["aem"], tmp_path, quiet)
+    run_export.export(run, ["aem"], tmp_path, quiet)
     told, _, quaternions = read_aem(tmp_path / "truth.aem")
     assert (told["REF_FRAME_A"], told["REF_FRAME_B"]) == ("LAB", "SC_BODY_1")
     place = dict(zip(camera.sources.id.tolist(), camera.sources.place[:, :3], strict=True))
@@ -193,7 +193,7 @@ def test_a_message_is_what_the_notation_allows() -> None:
     """Printable ASCII, 254 characters a line, times that ascend, quaternions that do not jump."""
     spin = Rotation.from_euler("z", np.arange(0, 800, 40)[:, None], degrees=True)
     utc = [START + n * SECOND for n in range(len(spin))]
-    text = ccsds_aem.message("ünïcode", ["″" * 400], (ccsds_aem.LAB, ccsds_aem.BODY), utc, spin)
+    text = run_export.message("ünïcode", ["″" * 400], (run_export.LAB, run_export.BODY), utc, spin)
     assert all(
         line.isascii() and line.isprintable() and len(line) <= 254 for line in text.splitlines()
     )
@@ -203,7 +203,9 @@ def test_a_message_is_what_the_notation_allows() -> None:
     assert (np.sum(rows[1:] * rows[:-1], axis=1) > 0.9).all()
     for epochs in ([], [START, START]):
         with pytest.raises(InputError):
-            ccsds_aem.message("x", [], (ccsds_aem.LAB, ccsds_aem.BODY), epochs, spin[: len(epochs)])
+            run_export.message(
+                "x", [], (run_export.LAB, run_export.BODY), epochs, spin[: len(epochs)]
+            )
 
 
 # Tables
@@ -211,7 +213,7 @@ def test_a_message_is_what_the_notation_allows() -> None:
 
 def test_parquet_is_the_ecsv_with_units(stars: Flown, tmp_path: Path) -> None:
     run = stars[1]
-    export.export(run, ["parquet", "ecsv"], tmp_path, quiet)
+    run_export.export(run, ["parquet", "ecsv"], tmp_path, quiet)
     answers = pyarrow.parquet.read_table(tmp_path / "solutions.parquet")
     kept = Table.read(run.folder / "solutions.ecsv")
     assert answers.column_names == kept.colnames
@@ -261,27 +263,27 @@ def test_every_value_of_16_bits_is_in_a_tiff(tmp_path: Path) -> None:
 def test_a_noise_free_frame_keeps_every_digit(dome: Flown, tmp_path: Path) -> None:
     """As TIFF and as Zarr, 64-bit floats."""
     run = dome[1]
-    written = export.export(run, ["tiff", "zarr"], tmp_path, quiet)
+    written = run_export.export(run, ["tiff", "zarr"], tmp_path, quiet)
     image = fits.getdata(f"{run.stems[1]}.fits")
     assert image.dtype.itemsize == 8
     np.testing.assert_array_equal(cv2.imread(str(written[1]), cv2.IMREAD_UNCHANGED), image)
     np.testing.assert_array_equal(skimage.io.imread(written[1]), image)
     np.testing.assert_array_equal(
-        zarr.open_group(tmp_path / frames.ZARR, mode="r")["frames"][1], image
+        zarr.open_group(tmp_path / recording.ZARR, mode="r")["frames"][1], image
     )
 
 
 @pytest.mark.slow
 def test_a_sequence_is_chunked_by_frame_and_dated(stars: Flown, tmp_path: Path) -> None:
     flight, run = stars
-    export.export(run, ["zarr"], tmp_path, quiet)
-    group = zarr.open_group(tmp_path / frames.ZARR, mode="r")
+    run_export.export(run, ["zarr"], tmp_path, quiet)
+    group = zarr.open_group(tmp_path / recording.ZARR, mode="r")
     assert group.metadata.zarr_format == 3
     assert group["frames"].chunks == (1, 493, 659)
     images = [fits.getdata(f"{stem}.fits") for stem in run.stems]
     assert group["frames"].dtype == np.uint16
     np.testing.assert_array_equal(group["frames"][:], images)
-    opened = xarray.open_zarr(tmp_path / frames.ZARR, consolidated=False)
+    opened = xarray.open_zarr(tmp_path / recording.ZARR, consolidated=False)
     assert opened["frames"].dims == ("frame", "y", "x")
     assert opened["mid_utc"].values[0] == np.datetime64("2012-06-22T21:00:00.120000")
     lab_from_body = flight.trajectory().attitude_at(opened["t_mid_s"].values)
@@ -292,13 +294,13 @@ def test_a_sequence_is_chunked_by_frame_and_dated(stars: Flown, tmp_path: Path) 
 
 def test_a_film_shows_the_frames_at_their_pace(stars: Flown, tmp_path: Path) -> None:
     run = stars[1]
-    (path,) = export.export(run, ["video"], tmp_path, quiet)
+    (path,) = run_export.export(run, ["video"], tmp_path, quiet)
     film = cv2.VideoCapture(str(path))
     assert film.get(cv2.CAP_PROP_FPS) == pytest.approx(10.0, rel=1e-3)
     for stem in run.stems:
         there, picture = film.read()
         assert there
-        meant = stretch.to_8bit(fits.getdata(f"{stem}.fits").astype(np.uint16), "square root")[
+        meant = plots.to_8bit(fits.getdata(f"{stem}.fits").astype(np.uint16), "square root")[
             :492, :658
         ]
         assert np.corrcoef(picture[:, :, 0].ravel(), meant.ravel())[0, 1] > 0.8
@@ -407,7 +409,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(stars: Flown, tmp_path: Path) 
     with pytest.raises(
         InputError, match="unknown format 'jpeg'; allowed: aem, ecsv, parquet, tiff, zarr, video"
     ):
-        export.export(stars[1], ["aem", "jpeg"], tmp_path / "out", quiet)
+        run_export.export(stars[1], ["aem", "jpeg"], tmp_path / "out", quiet)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -424,7 +426,7 @@ def test_a_damaged_frame_leaves_no_half_of_a_sequence(
     last = folder / "frame_0002.fits"
     last.write_bytes(last.read_bytes()[:100_000])
     with pytest.raises(InputError, match=r"frame_0002\.fits: not a complete FITS file"):
-        export.export(recording.open_recording(folder), [name], out, quiet)
+        run_export.export(recording.open_recording(folder), [name], out, quiet)
     assert list(out.iterdir()) == []
 
 

@@ -10,8 +10,16 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.results.files.builder.parts import COLUMNS, PartsList, build_design, parts_list, to_csv
-from skysim.results.files.builder.prices import UNITS, find_prices, read_prices
+from skysim.results.files.parts import (
+    COLUMNS,
+    UNITS,
+    PartsList,
+    build_design,
+    find_prices,
+    parts_list,
+    read_prices,
+    to_csv,
+)
 from skysim.scene import loader
 from skysim.scene.sections.layouts import StringConfig
 from skysim.sources.dome.layouts.string import wind

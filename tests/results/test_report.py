@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.results.report import (
+from skysim.results import report
+from skysim.results.report import Report
+from skysim.results.report_blocks import (
     Block,
     Cell,
     Code,
@@ -20,12 +22,10 @@ from skysim.results.report import (
     Facts,
     Figure,
     Items,
-    Report,
     Section,
     Table,
     Text,
     Verdict,
-    as_text,
 )
 
 HOSTILE = "<script>alert(1)</script> & \"quotes\" 'and' </td></table> <!-- -->"
@@ -218,10 +218,10 @@ def test_the_terminal_ends_with_the_answer_and_shows_what_is_for_it(
 def test_a_long_table_is_cut_on_the_terminal_and_says_so(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    as_text.print_table(Table([Column("n")], [[n] for n in range(100)]))
+    report.print_table(Table([Column("n")], [[n] for n in range(100)]))
     *_, last, more = capsys.readouterr().out.splitlines()
-    assert int(last) == as_text.MAX_ROWS - 1
-    assert more == f"and {100 - as_text.MAX_ROWS} more rows in the report"
+    assert int(last) == report.MAX_ROWS - 1
+    assert more == f"and {100 - report.MAX_ROWS} more rows in the report"
 
 
 @pytest.mark.parametrize(
@@ -231,11 +231,11 @@ def test_a_narrow_terminal_leaves_out_optional_columns_alone(
     width: int, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Columns of 5, 4, 11, 16, 16 and 11 characters, two between each: 24 without optional ones, 42, 60, 73 in all."""
-    monkeypatch.setattr(as_text, "terminal_width", lambda: width)
+    monkeypatch.setattr(report, "terminal_width", lambda: width)
     heads = ["point", "leds", "placement", "identified", "coverage", "stars_least"]
     rows = [
         ["0", "200", "poisson", "0.5 (0.45..0.55)", "0.9 (0.85..0.95)", "3"],
         ["1", "2800", "a long name", "1", "1", "4"],
     ]
     table = Table([Column(head) for head in heads], rows, [(5,), (4,), (3,)])
-    assert as_text.fitting_columns(table, table.cells()) == list(range(count))
+    assert report.fitting_columns(table, table.cells()) == list(range(count))

@@ -12,11 +12,11 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.results.files.builder import templates
-from skysim.results.files.builder.drawing import Drawing, Text, to_dxf
+from skysim.results.files import templates
+from skysim.results.files.templates import Drawing, SheetText, to_dxf
 from skysim.scene import loader
 from skysim.simulation.lab import Lab, build_lab
-from skysim.sources.dome.shell.surface import Ellipsoid, Plane
+from skysim.sources.dome.surface import Ellipsoid, Plane
 
 RADIUS_M = 1.2
 SPHERE = Ellipsoid(np.zeros(3), np.full(3, RADIUS_M))
@@ -142,7 +142,7 @@ def test_the_pattern_to_cut_is_that_to_print(lab: Lab, tmp_path: Path) -> None:
 
 
 def test_words_of_a_cutting_pattern_are_ascii() -> None:
-    text = to_dxf(Drawing(10, 10, [Text(1, 2, 3, "Kuppel größer\u2033")]))
+    text = to_dxf(Drawing(10, 10, [SheetText(1, 2, 3, "Kuppel größer\u2033")]))
     assert text.isascii()
     assert "gr\\U+00F6\\U+00DFer\\U+2033" in text
 

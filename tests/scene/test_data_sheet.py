@@ -10,8 +10,7 @@ import yaml
 
 from skysim.core.errors import InputError
 from skysim.scene import loader
-from skysim.scene.data_sheet.questions import QUESTIONS, REQUIRED
-from skysim.scene.data_sheet.sheet import PLACEHOLDERS, fill, outstanding, text
+from skysim.scene.camera_sheet import PLACEHOLDERS, QUESTIONS, REQUIRED, fill, outstanding, text
 
 STATED = {
     "pixels": "1936 x 1216",

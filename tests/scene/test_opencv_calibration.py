@@ -13,14 +13,16 @@ from hypothesis import strategies as st
 
 from skysim.apps import plate_solver
 from skysim.camera.optics import Optics
+from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.io import files
-from skysim.results.files import frames
+from skysim.results.files import recording
 from skysim.scene import loader, opencv_calibration
-from skysim.scene.opencv_calibration import Calibration
+from skysim.scene.opencv_calibration import OpencvCalibration
 from skysim.simulation.flight import simulate_motion
 
-TOLD = Calibration(1600, 1200, 4545.123456789, (790.25, 611.5), (-0.1, 1e-7, 1e-05, -3.2e-9, 0.25))
+TOLD = OpencvCalibration(
+    1600, 1200, 4545.123456789, (790.25, 611.5), (-0.1, 1e-7, 1e-05, -3.2e-9, 0.25)
+)
 
 
 def by_opencv(path: Path, **more: Any) -> Path:
@@ -51,7 +53,7 @@ numbers = st.floats(-1e3, 1e3, allow_subnormal=False)
 )
 @given(
     st.builds(
-        Calibration,
+        OpencvCalibration,
         st.integers(1, 20000),
         st.integers(1, 20000),
         st.floats(1e-3, 1e8),
@@ -59,7 +61,9 @@ numbers = st.floats(-1e3, 1e3, allow_subnormal=False)
         st.tuples(*[numbers] * 5),
     )
 )
-def test_every_digit_comes_back_by_opencv_and_by_us(tmp_path: Path, told: Calibration) -> None:
+def test_every_digit_comes_back_by_opencv_and_by_us(
+    tmp_path: Path, told: OpencvCalibration
+) -> None:
     path = tmp_path / "camera.yml"
     files.write_text(path, opencv_calibration.text(told))
     assert opencv_calibration.looks_like_calibration(path)
@@ -159,7 +163,7 @@ def test_a_hostile_file_is_refused_in_one_line(tmp_path: Path, data: bytes) -> N
 @pytest.fixture
 def lens(tmp_path: Path) -> Path:
     """A calibration of a camera like shefex2's, its lens a little other than the scene has it."""
-    told = Calibration(659, 493, 2540.5, (331.25, 244.5), (-0.12, 0.04, 6e-4, -4e-4, 0.0))
+    told = OpencvCalibration(659, 493, 2540.5, (331.25, 244.5), (-0.12, 0.04, 6e-4, -4e-4, 0.0))
     files.write_text(tmp_path / "lens.yml", opencv_calibration.text(told))
     return tmp_path / "lens.yml"
 
@@ -220,10 +224,10 @@ def test_a_frame_is_solved_by_its_camera_s_calibration(lens: Path) -> None:
     )
     loaded = loader.load(own)
     frame, truth = simulate_motion(loaded).render(0)
-    frames.write_frame(lens.parent, frame, truth, loaded)
+    recording.write_frame(lens.parent, frame, truth, loaded)
     told = opencv_calibration.read(lens)
     off = opencv_calibration.text(
-        Calibration(
+        OpencvCalibration(
             told.width_px, told.height_px, told.focal_px * 1.001, told.center_px, told.distortion
         )
     )
@@ -238,7 +242,7 @@ def test_a_frame_is_solved_by_its_camera_s_calibration(lens: Path) -> None:
     assert refused["status"].endswith("other.png: 640x480 pixels; this camera's are 659x493")
 
 
-def scene_pointing(truth: Any, told: Calibration) -> list[float]:
+def scene_pointing(truth: Any, told: OpencvCalibration) -> list[float]:
     """RA and Dec, deg, of the image's middle by OpenCV's way back through the lens."""
     focal = told.focal_px
     (x, y) = told.center_px

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from skysim.core.paths import DATA, SCENES
+from skysim.core.files import DATA, SCENES
 from skysim.scene import loader, opencv_calibration, provenance
-from skysim.scene.opencv_calibration import Calibration
+from skysim.scene.opencv_calibration import OpencvCalibration
 from skysim.scene.provenance import Entry, Origin
 
 
@@ -90,7 +90,7 @@ def test_overrides_are_named_and_replace_what_was_there() -> None:
 
 
 def test_a_calibration_is_named(tmp_path: Path) -> None:
-    lens = Calibration(1600, 1200, 9000.0, (800.0, 600.0), (0.1, 0.0, 0.0, 0.0, 0.0))
+    lens = OpencvCalibration(1600, 1200, 9000.0, (800.0, 600.0), (0.1, 0.0, 0.0, 0.0, 0.0))
     (tmp_path / "lens.yml").write_text(opencv_calibration.text(lens))
     path = tmp_path / "mine.yaml"
     path.write_text(

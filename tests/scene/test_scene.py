@@ -16,12 +16,12 @@ from skysim.camera.glow.background import BACKGROUNDS
 from skysim.camera.optics import VIGNETTING
 from skysim.camera.psf.otf import PSFS
 from skysim.core.errors import InputError
-from skysim.core.paths import SCENES
+from skysim.core.files import SCENES
 from skysim.core.tolerance import ErrorSchema, ToleranceConfig
 from skysim.core.units import SI_SUFFIX, ConfigModel
 from skysim.dynamics.guidance import LEGS
 from skysim.dynamics.jitter import SPECTRA
-from skysim.dynamics.multibody.actuators.cmgs import STEERING
+from skysim.dynamics.multibody.cmgs import STEERING
 from skysim.scene import loader, scene
 from skysim.scene.sections import camera, leds, light, motion, vehicle
 from skysim.scene.sections.layouts import Layout
@@ -29,7 +29,7 @@ from skysim.scene.sections.leds import Lobe
 from skysim.scene.sections.tracker import FilterConfig
 from skysim.sources.dome.layouts.registry import LAYOUTS
 from skysim.sources.dome.led import DRIVES, LOBES
-from skysim.sources.dome.shell.surface import SURFACES
+from skysim.sources.dome.surface import SURFACES
 
 AFIT = SCENES / "afit_simsat.yaml"
 SHEFEX = SCENES / "shefex2.yaml"

@@ -13,12 +13,13 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from skysim.apps.cli import json_schema, main
+from skysim.apps.cli import main
+from skysim.apps.cli.commands import validate
 from skysim.apps.cli.commands.validate import check_file
+from skysim.core import yaml_reader
 from skysim.core.errors import InputError
-from skysim.core.io import yaml_reader
-from skysim.core.paths import DATA, ROOT, SCENES
-from skysim.experiments.study import loader
+from skysim.core.files import DATA, ROOT, SCENES
+from skysim.experiments.study import study_file
 from skysim.scene import opencv_calibration
 from skysim.scene.loader import load, load_camera
 
@@ -40,7 +41,7 @@ Plain.yaml_implicit_resolvers = {
 
 def faults(kind: str, tree: Any) -> list[str]:
     """What an independent validator has against it."""
-    validator = jsonschema.Draft202012Validator(json_schema.json_schema(kind))
+    validator = jsonschema.Draft202012Validator(validate.json_schema(kind))
     return [error.message for error in validator.iter_errors(tree)]
 
 
@@ -48,7 +49,7 @@ def faults(kind: str, tree: Any) -> list[str]:
 @pytest.mark.parametrize("kind", SHIPPED)
 def test_the_published_schema_is_the_newest_and_takes_every_file_that_ships(kind: str) -> None:
     published = json.loads((DATA / "schema" / f"{kind}.json").read_text())
-    assert published == json_schema.json_schema(kind), (
+    assert published == validate.json_schema(kind), (
         f"skysim validate --schema {kind} > data/schema/{kind}.json"
     )
     jsonschema.Draft202012Validator.check_schema(published)
@@ -95,7 +96,7 @@ def test_another_version_is_refused_by_name_wherever_it_stands(tmp_path: Path) -
         InputError,
         match=r"^schema: version 0 is no longer supported; allowed: 1 \(.*study\.yaml, line 2\)$",
     ):
-        loader.load(study)
+        study_file.load(study)
 
 
 def test_a_scene_or_study_without_a_version_is_told_the_line_to_add(tmp_path: Path) -> None:
@@ -109,7 +110,7 @@ def test_a_scene_or_study_without_a_version_is_told_the_line_to_add(tmp_path: Pa
             read()
     path.write_text("title: T\nscene: shefex2\n")
     with pytest.raises(InputError, match=f"^{re.escape(says)}$"):
-        loader.load(path)
+        study_file.load(path)
     for kind in SHIPPED:
         assert faults(kind, {"title": "T"}) == ["'schema' is a required property"]
     path.write_text("camera: {preset: ec655, focal_length: 16 mm, f_number: 1.4}\n")  # no scene

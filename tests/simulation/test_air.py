@@ -11,9 +11,9 @@ from skysim.core.types import Frame, Truth
 from skysim.scene.loader import load
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab, build_tracker
-from skysim.simulation.lights.air import Atmosphere, Skyline
+from skysim.simulation.lights.atmosphere import AirEffects, Skyline
 from skysim.simulation.lights.light import find_light
-from skysim.sources.air import scintillation
+from skysim.sources import air
 from skysim.tracking.factory import solve_frame
 
 TIME = "2012-06-24T23:00:00"
@@ -35,7 +35,7 @@ def lab_of(**keys: str) -> Lab:
 
 def level(lab: Lab, altitude_deg: float) -> Rotation:
     """cam_from_icrs of a camera toward the south at an altitude, the zenith up in its image."""
-    atmosphere = find_light(lab.camera.lights, Atmosphere)
+    atmosphere = find_light(lab.camera.lights, AirEffects)
     assert atmosphere is not None
     north, _, up = atmosphere.air.at(lab.scene.start_time).axes
     h = np.radians(altitude_deg)
@@ -59,7 +59,7 @@ def test_stars_are_raised_and_dimmed_in_the_frame() -> None:
     lab = lab_of()
     through = truth_at(lab, 30.0).sources
     airless = tuple(
-        light for light in lab.camera.lights if not isinstance(light, Atmosphere | Skyline)
+        light for light in lab.camera.lights if not isinstance(light, AirEffects | Skyline)
     )
     without = render_toward(lab.with_camera(lights=airless), level(lab, 30.0))[1].sources
     both, ours, bare = np.intersect1d(through.id, without.id, return_indices=True)
@@ -111,9 +111,7 @@ def test_stars_twinkle_by_frame_and_star() -> None:
     camera = lab.scene.camera
     exposure_s = lab.scene.exposure.time_s
     mass = np.array([1 / np.sin(np.radians(60))])
-    variance = scintillation.variance(
-        mass, camera.pupil_m, exposure_s, lab.scene.site.height_m, 660e-9
-    )[0]
+    variance = air.variance(mass, camera.pupil_m, exposure_s, lab.scene.site.height_m, 660e-9)[0]
     assert ratio.mean() == pytest.approx(1, abs=4 * np.sqrt(variance / len(ratio)))
     assert ratio.var() == pytest.approx(variance, rel=0.25)
 
@@ -149,7 +147,7 @@ def test_air_needs_a_site() -> None:
 
 def errors_arcsec(lab: Lab, altitude_deg: float, index: int = 0) -> tuple[float, float]:
     """Error across the boresight and rms residual in px of a frame."""
-    has_air = find_light(lab.camera.lights, Atmosphere) is not None
+    has_air = find_light(lab.camera.lights, AirEffects) is not None
     cam_from_lab = level(lab if has_air else lab_of(), altitude_deg)
     frame, truth = render_toward(lab, cam_from_lab, index)
     attitude = solve_frame(build_tracker(lab.camera), frame).attitude

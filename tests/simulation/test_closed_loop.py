@@ -12,7 +12,7 @@ import pytest
 
 from estimator.trackers.pipeline import Report
 from skysim.core.types import Floats, Frame, Telemetry
-from skysim.experiments.study import loader as loader_of_studies
+from skysim.experiments.study import study_file as loader_of_studies
 from skysim.experiments.study.plan import resolve_point
 from skysim.scene import loader
 from skysim.scene.scene import Scene

@@ -16,22 +16,21 @@ from scipy.spatial.transform import Rotation
 import skysim
 from skysim.core.errors import InputError
 from skysim.core.types import Telemetry
-from skysim.dynamics.controllers.interface import (
+from skysim.dynamics.controllers import (
     ControllerInput,
     ControllerSetup,
     check_torque,
     torque_of_reply,
 )
 from skysim.dynamics.guidance import plan
-from skysim.experiments.study import loader as study_loader
+from skysim.experiments.study import study_file as study_loader
 from skysim.experiments.study.execution import runner, setups, store
 from skysim.experiments.study.execution.engines import Serial
 from skysim.scene import loader
 from skysim.simulation.checks import check
 from skysim.simulation.flight import open_flight
-from skysim.simulation.lab import build_lab
-from skysim.simulation.user_parts import UserParts
-from skysim.tracking.external import process
+from skysim.simulation.lab import UserParts, build_lab
+from skysim.tracking import tracker_interface
 
 PD = '''
 import numpy as np
@@ -67,7 +66,7 @@ def crashing(setup):
 PROGRAM = """
 import json, sys
 from mypd import pd
-from skysim.dynamics.controllers.interface import ControllerInput, ControllerSetup
+from skysim.dynamics.controllers import ControllerInput, ControllerSetup
 
 law = pd(ControllerSetup.of_tree(json.loads(sys.stdin.readline())))
 print(json.dumps({"ready": True}), flush=True)
@@ -382,7 +381,7 @@ def test_an_unknown_law_is_told_before_the_motion() -> None:
 @pytest.mark.parametrize("name", ["pid", "pd", "prescribed", "mine"])
 def test_a_program_takes_no_name_that_is_taken(name: str, installed: Path) -> None:
     with pytest.raises(InputError, match=f"programs.{name}: name already in use"):
-        process.program_commands([f"{name}=x"])
+        tracker_interface.program_commands([f"{name}=x"])
 
 
 @pytest.mark.parametrize(

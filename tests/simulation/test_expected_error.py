@@ -13,7 +13,7 @@ from skysim.results import metrics
 from skysim.results.simulate import render_at
 from skysim.scene import loader
 from skysim.simulation.checks import attitudes, beliefs, detection, expected_error, sampling
-from skysim.simulation.checks.attitudes import Attitudes
+from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, fit_loss, timing_sigma_s
 from skysim.simulation.checks.expected_error import Common, Independent, covariance, gains
 from skysim.simulation.checks.views import VISIBLE, View, image_gradient, peak_share, view
@@ -393,7 +393,7 @@ def normalized_errors(
     return np.array(errors), np.array(wanted), failed
 
 
-def random_attitude(lab: Lab, frames: Attitudes, rng: np.random.Generator) -> Rotation:
+def random_attitude(lab: Lab, frames: CheckedAttitudes, rng: np.random.Generator) -> Rotation:
     if lab.scene.light.kind == "stars":
         return Rotation.random(rng=rng)
     cosine = np.cos(attitudes.greatest_tilt_rad(lab.scene, frames))
@@ -404,7 +404,7 @@ def random_attitude(lab: Lab, frames: Attitudes, rng: np.random.Generator) -> Ro
 def expected_at(
     context: Context, lab_from_body: Rotation, rate_rad_s: Floats
 ) -> tuple[float, float]:
-    at = Attitudes(Rotation.concatenate([lab_from_body]), rate_rad_s[None], np.zeros(1))
+    at = CheckedAttitudes(Rotation.concatenate([lab_from_body]), rate_rad_s[None], np.zeros(1))
     return tuple(value * ARCSEC_RAD for value in sampling.sampled(at, context).error.rms_arcsec())  # type: ignore[return-value]
 
 
@@ -456,7 +456,7 @@ def test_an_angular_acceleration_shifts_images_by_the_mean_of_its_parabola() -> 
     shift_px = (truth.sources.flux_xy_px - truth.sources.xy_px)[rendered]
     assert len(shift_px) > 20
     assert np.abs(shift_px - seen.bend_px[predicted]).max() < 0.02 * np.abs(shift_px).max()
-    at = Attitudes(
+    at = CheckedAttitudes(
         Rotation.concatenate([lab_from_body]), np.zeros((1, 3)), np.zeros(1), about_body[None]
     )
     sampled = sampling.sampled(at, context).error.cross_rad2["angular acceleration"]

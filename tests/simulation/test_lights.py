@@ -15,19 +15,18 @@ import pytest
 from pydantic import Field
 
 from skysim.core.errors import InputError
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 from skysim.core.types import Sources
 from skysim.core.units import Intensity, Length, Time
 from skysim.scene import loader
-from skysim.scene.sections import lights as schema
-from skysim.scene.sections.lights import LightConfig
+from skysim.scene.sections import light as schema
+from skysim.scene.sections.light import LightConfig
 from skysim.simulation.checks import check
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.flight import open_flight
 from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.lights import registry
-from skysim.simulation.lights.light import Exposure, Light, Lit, Obstacle, Occluder
-from skysim.simulation.lights.plan import Plan
+from skysim.simulation.lights.light import Exposure, Light, LightPlan, Lit, Obstacle, Occluder
 from skysim.simulation.lights.registry import register
 from skysim.sources.photometry import led_strength_e_s_sr
 
@@ -61,7 +60,7 @@ class Lighthouse(Light):
         return Lit("lighthouse", points=self.lamp if is_lit else None)
 
 
-def build_lighthouse(config: LighthouseConfig, plan: Plan) -> Lighthouse:
+def build_lighthouse(config: LighthouseConfig, plan: LightPlan) -> Lighthouse:
     one = np.ones(1)
     zero = np.zeros(1)
     strength = np.atleast_1d(led_strength_e_s_sr(config.intensity_cd, "white", plan.band))

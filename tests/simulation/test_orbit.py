@@ -13,8 +13,8 @@ from skysim.scene import loader
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.sources import catalog, stars
-from skysim.sources.orbit.camera_orbit import state_at
-from skysim.sources.orbit.satellites import ID_BASE
+from skysim.sources.camera_orbit import state_at
+from skysim.sources.satellites import ID_BASE
 from skysim.tracking.factory import solve_frame
 
 HALF_S = 2838.0  # half a revolution at 500 km: the velocity is reversed

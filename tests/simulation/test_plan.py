@@ -16,10 +16,10 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.dynamics import multibody
 from skysim.scene import loader
-from skysim.simulation.checks import attitudes, check, detection, facts, plan, sampling
+from skysim.simulation.checks import attitudes, check, detection, facts, sampling, sky_warnings
+from skysim.simulation.checks import check as plan
 from skysim.simulation.checks.facts import Fact
-from skysim.simulation.checks.sampling import Samples
-from skysim.simulation.checks.sky import claims, depth
+from skysim.simulation.checks.sampling import CheckedSamples
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.flight import Flight, simulate_motion
 from skysim.simulation.lab import Lab, build_lab, build_tracker
@@ -54,11 +54,13 @@ def afit() -> plan.Check:
     return check(lab_of("afit_simsat"))
 
 
-def samples_of(lab: Lab) -> tuple[detection.Context, Samples]:
+def samples_of(lab: Lab) -> tuple[detection.Context, CheckedSamples]:
     context = detection.context_of(lab)
     frames = attitudes.of_frames(lab)
     reach = attitudes.within_reach(lab.scene, lab.camera.mount, frames)
-    return context, Samples(sampling.sampled(frames, context), sampling.sampled(reach, context))
+    return context, CheckedSamples(
+        sampling.sampled(frames, context), sampling.sampled(reach, context)
+    )
 
 
 # Attitudes
@@ -148,7 +150,7 @@ def test_the_least_lights_are_where_it_says() -> None:
     roll, pitch, yaw = (
         float(re.search(rf"{name} (\S+)°", text)[1]) for name in ("roll", "pitch", "yaw")
     )  # type: ignore[index]
-    there = attitudes.Attitudes(
+    there = attitudes.CheckedAttitudes(
         Rotation.from_euler("ZYX", [[yaw, pitch, roll]], degrees=True),
         np.zeros((1, 3)),
         np.full(1, np.nan),
@@ -635,7 +637,7 @@ def test_fields_whose_leds_have_names_are_not_alike() -> None:
 def test_half_of_the_stars_at_the_limit_are_detected() -> None:
     """The limit that `light.catalog` is compared with, on rendered frames: most brighter by half a magnitude are."""
     lab = lab_of("shefex2", exposure__frames="1", motion__rate_deg_s="[0, 0, 0]")
-    limit = depth.detection_limit_mag(*samples_of(lab))
+    limit = sky_warnings.detection_limit_mag(*samples_of(lab))
     tracker = build_tracker(lab.camera)
     rng = np.random.default_rng(3)
     found = []
@@ -674,7 +676,7 @@ def test_a_floor_that_the_check_proposes_makes_the_claims_true() -> None:
     """Of a chip whose pixels differ by 10 %, NEES is 5.4 as expected and 5.7 (median of 40 frames) as measured."""
     floor_px = 0.02
     nees = [
-        claims.claimed(
+        sky_warnings.claimed(
             *samples_of(
                 lab_of("shefex2", camera__detector__prnu="0.1", tracker__centroid_sigma_px=str(px))
             )

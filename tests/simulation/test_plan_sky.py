@@ -10,15 +10,13 @@ import pytest
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene import loader
-from skysim.simulation.checks import attitudes, findings
+from skysim.simulation.checks import attitudes, dome_warnings, findings, sky_warnings
+from skysim.simulation.checks.check import check
 from skysim.simulation.checks.detection import Context, context_of
-from skysim.simulation.checks.dome import reflections
-from skysim.simulation.checks.plan import check
-from skysim.simulation.checks.sampling import Samples, sampled
-from skysim.simulation.checks.sky import air, depth, stray
+from skysim.simulation.checks.sampling import CheckedSamples, sampled
 from skysim.simulation.flight import Flight
 from skysim.simulation.lab import build_lab, build_tracker
-from skysim.sources.false_lights import MIRRORED
+from skysim.sources.satellites import MIRRORED
 from skysim.tracking.factory import solve_frame
 
 BAFFLE = "{angle_deg: [20, 50, 90, 120], pst: [1e-3, 1e-7, 1e-9, 1e-12]}"
@@ -42,12 +40,12 @@ SHINY = {
 DOES_NOT_KNOW = {"tracker__orbit_velocity": "false"}
 
 
-def plan_of(scene: str, **keys: str) -> tuple[Context, Samples]:
+def plan_of(scene: str, **keys: str) -> tuple[Context, CheckedSamples]:
     overrides = {key.replace("__", "."): value for key, value in keys.items()}
     lab = build_lab(loader.load(scene, (SPACE if scene == "shefex2" else {}) | overrides))
     context = context_of(lab)
     frames = sampled(attitudes.of_frames(lab), context)
-    return context, Samples(frames, frames)
+    return context, CheckedSamples(frames, frames)
 
 
 def pointing(ra_deg: float, dec_deg: float) -> str:
@@ -58,9 +56,9 @@ def pointing(ra_deg: float, dec_deg: float) -> str:
 def test_stray_light_that_costs_stars_is_warned_of() -> None:
     """The loss is that of the limit with and without the baffle; the cure leaves half a magnitude."""
     keys = {"motion__start": pointing(90.0, -18.0), "light__bodies": "{}"}
-    plain = depth.snr_limit_mag(*plan_of("shefex2", **keys))
+    plain = sky_warnings.snr_limit_mag(*plan_of("shefex2", **keys))
     lit = plan_of("shefex2", **keys, camera__baffle=BAFFLE)
-    (line,) = stray.stray_light(*lit)
+    (line,) = sky_warnings.stray_light(*lit)
     lost = re.match(
         r"camera.baffle.pst: stray light of ([\d.]+) electrons in a pixel, most of it of the Sun, .* the faintest"
         r" star is ([\d.]+) mag brighter; change it to ([\d.]+) times as much",
@@ -68,17 +66,17 @@ def test_stray_light_that_costs_stars_is_warned_of() -> None:
     )
     assert lost
     assert float(lost[1]) == pytest.approx(lit[0].camera.stray_e, rel=1e-2)
-    assert float(lost[2]) == pytest.approx(plain - depth.snr_limit_mag(*lit), abs=0.15)
+    assert float(lost[2]) == pytest.approx(plain - sky_warnings.snr_limit_mag(*lit), abs=0.15)
     better = f"{{angle_deg: [20, 50, 90, 120], pst: {[float(lost[3]) * one for one in (1e-3, 1e-7, 1e-9, 1e-12)]}}}"
     cured = plan_of("shefex2", **keys, camera__baffle=better)
-    assert 0.4 < plain - depth.snr_limit_mag(*cured) < 0.55
-    assert len(list(stray.stray_light(*plan_of("shefex2", **keys)))) == 0
+    assert 0.4 < plain - sky_warnings.snr_limit_mag(*cured) < 0.55
+    assert len(list(sky_warnings.stray_light(*plan_of("shefex2", **keys)))) == 0
 
 
 @pytest.mark.slow
 def test_bodies_within_the_exclusion_angles_are_warned_of() -> None:
     """23 degrees south of the summer's Sun; the camera is over the equator at RA 0, so RA 180 is nadir."""
-    sun, *others = stray.exclusion(
+    sun, *others = sky_warnings.exclusion(
         *plan_of("shefex2", motion__start=pointing(93.9, 0.0), orbit=ORBIT)
     )
     assert re.match(
@@ -86,7 +84,7 @@ def test_bodies_within_the_exclusion_angles_are_warned_of() -> None:
         sun,
     )
     assert others == [line for line in others if "earth_deg" in line]
-    (limb,) = stray.exclusion(
+    (limb,) = sky_warnings.exclusion(
         *plan_of("shefex2", motion__start=pointing(180.0, -60.0), orbit=ORBIT)
     )
     dip_deg = np.degrees(np.arccos(6378.137 / 6878.137))
@@ -98,7 +96,11 @@ def test_bodies_within_the_exclusion_angles_are_warned_of() -> None:
         dip_deg - 30, abs=0.15
     )  # the pole's radius is 21 km less
     assert (
-        list(stray.exclusion(*plan_of("shefex2", motion__start=pointing(0.0, -60.0), orbit=ORBIT)))
+        list(
+            sky_warnings.exclusion(
+                *plan_of("shefex2", motion__start=pointing(0.0, -60.0), orbit=ORBIT)
+            )
+        )
         == []
     )
 
@@ -137,7 +139,7 @@ def test_refraction_that_the_tracker_does_not_know_is_warned_of() -> None:
     found = re.match(
         r"tracker.refraction: the air raises stars by ([\d.]+)″ at RA 222.0° .*, ([\d.]+)° above the horizon, and"
         r" shortens the field by ([\d.]+)″, .*; change it to true",
-        air.refraction(context, samples),
+        sky_warnings.refraction(context, samples),
     )
     assert found
     raised, altitude_deg, shortened = map(float, found.groups())
@@ -146,10 +148,10 @@ def test_refraction_that_the_tracker_does_not_know_is_warned_of() -> None:
     middle, low, high = bent_arcsec(np.array([0.0, -half_deg, half_deg]) + altitude_deg)
     assert raised == pytest.approx(middle, rel=0.02)
     assert shortened == pytest.approx(low - high, rel=0.05)
-    assert not air.refraction(
+    assert not sky_warnings.refraction(
         *plan_of("shefex2", **low_in_the_south, **NIGHT, tracker__refraction="true")
     )
-    assert not air.refraction(*plan_of("shefex2", **low_in_the_south))
+    assert not sky_warnings.refraction(*plan_of("shefex2", **low_in_the_south))
 
 
 def bent_arcsec(altitude_deg: Floats) -> Floats:
@@ -161,7 +163,7 @@ def bent_arcsec(altitude_deg: Floats) -> Floats:
 def test_images_in_the_wall_that_are_detected_are_warned_of() -> None:
     """As many as the tracker detects in a frame near a mirrored LED of its truth; none in a wall as dull as advised."""
     context, samples = plan_of("apl_dome", **SHINY)
-    line = reflections.mirror_images(context, samples)
+    line = dome_warnings.mirror_images(context, samples)
     found = re.match(
         r"light.reflection.specular: the tracker detects up to (\d+) images .* change it to ([\d.]+)$",
         line,
@@ -174,7 +176,7 @@ def test_images_in_the_wall_that_are_detected_are_warned_of() -> None:
     assert near > 0
     assert abs(int(found[1]) - near) <= max(1, 0.2 * near)
     dull = SHINY | {"light__reflection": f"{{specular: {found[2]}}}"}
-    assert not reflections.mirror_images(*plan_of("apl_dome", **dull))
+    assert not dome_warnings.mirror_images(*plan_of("apl_dome", **dull))
 
 
 @pytest.mark.slow

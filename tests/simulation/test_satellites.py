@@ -11,11 +11,11 @@ from scipy.spatial import cKDTree
 
 from skysim.core.errors import InputError
 from skysim.core.types import SourceTruth
-from skysim.results.files.frames import write_frame
+from skysim.results.files.recording import write_frame
 from skysim.scene import loader
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab, build_tracker
-from skysim.sources.orbit.satellites import ID_BASE
+from skysim.sources.satellites import ID_BASE
 from skysim.tracking.factory import solve_frame
 
 FRAMES = 6

@@ -16,13 +16,13 @@ import skysim
 from skysim.core.errors import InputError
 from skysim.core.types import Telemetry
 from skysim.dynamics.guidance import plan
-from skysim.results.files import export, recording
+from skysim.results.files import recording, run_export
 from skysim.results.run import Run
 from skysim.scene import loader
-from skysim.simulation.checks.plan import broken_assumptions
+from skysim.simulation.checks.check import broken_assumptions
 from skysim.simulation.flight import Flight, open_flight, simulate_motion
 from skysim.simulation.lab import build_lab
-from skysim.tracking.external.interface import Answer
+from skysim.tracking.tracker_interface import Answer
 
 ONE = {"exposure": {"time": "10 ms", "rate_hz": 1, "frames": 1, "first": "2 s"}}
 PRESCRIBED = {"motion.control": "prescribed", **ONE}
@@ -305,7 +305,7 @@ def test_a_run_exported_and_flown_again_has_the_same_centroids(
     scene = skysim.load_scene(name, {"exposure.frames": 4} | changes)
     flown = skysim.simulate(scene)
     folder = flown.save(tmp_path)
-    export.export(
+    run_export.export(
         recording.open_recording(folder), ["aem"], folder, lambda items, count, label: iter(items)
     )
     profile = [{"kind": "profile", "file": str(folder / file)}]

@@ -14,15 +14,15 @@ from astropy.time import Time
 from astropy.utils import iers
 
 from skysim.core.types import Floats
-from skysim.scene.sections.air import AirConfig, HorizonConfig
+from skysim.scene.sections.surroundings import AirConfig, HorizonConfig
 from skysim.scene.sections.vehicle import SiteConfig
+from skysim.sources import air as starlight
 from skysim.sources import catalog, stars
-from skysim.sources.air import starlight
-from skysim.sources.air.air import Air, horizon_rad, mean_wavelength_m
-from skysim.sources.air.refraction import Atmosphere, Refraction, Weather, refraction_rad
+from skysim.sources.air import Air, horizon_rad, mean_wavelength_m
+from skysim.sources.bodies import BODIES, bodies_from
+from skysim.sources.ephemeris import observe_from
 from skysim.sources.photometry import Band
-from skysim.sources.solar_system.bodies import BODIES, bodies_from
-from skysim.sources.solar_system.observer import observe_from
+from skysim.sources.refraction import Atmosphere, Refraction, Weather, refraction_rad
 
 BAND = Band.from_efficiency(0.5)
 ARCSEC = 1 / 206264.806

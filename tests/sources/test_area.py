@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from skysim.scene.sections.light import SurfaceConfig
-from skysim.sources.dome.shell.area import cap_area_m2
-from skysim.sources.dome.shell.surface import Surface, build_surface
+from skysim.sources.dome.surface import Surface, build_surface, cap_area_m2
 
 
 def surface(**config: object) -> Surface:

@@ -9,11 +9,11 @@ import pytest
 
 from skysim.core.constants import EARTH_RADIUS_M
 from skysim.core.time import tt_jd
-from skysim.scene.sections.orbit import CircularOrbitConfig, ExclusionConfig
-from skysim.sources.orbit import camera_orbit, earth
-from skysim.sources.orbit.availability import Pointing, place_spline, sample
-from skysim.sources.orbit.camera_orbit import CircularOrbit
-from skysim.sources.solar_system.ephemeris import load_ephemeris
+from skysim.scene.sections.surroundings import CircularOrbitConfig, ExclusionConfig
+from skysim.sources import camera_orbit
+from skysim.sources.camera_orbit import CircularOrbit
+from skysim.sources.ephemeris import load_ephemeris
+from skysim.sources.orbit_availability import Pointing, place_spline, sample
 
 START = datetime.datetime(2024, 3, 20, 3)
 POLE = np.array([[0.0, 0.0, 1.0]])
@@ -23,7 +23,7 @@ POLE = np.array([[0.0, 0.0, 1.0]])
 def sphere(monkeypatch: pytest.MonkeyPatch) -> CircularOrbit:
     """An equatorial orbit of 700 km about a round Earth without J2."""
     monkeypatch.setattr(camera_orbit, "EARTH_J2", 0.0)
-    monkeypatch.setattr(earth, "TO_SPHERE", np.full(3, 1 / EARTH_RADIUS_M))
+    monkeypatch.setattr(camera_orbit, "TO_SPHERE", np.full(3, 1 / EARTH_RADIUS_M))
     return CircularOrbit(
         CircularOrbitConfig(kind="circular", altitude="700 km", inclination_deg=0.0)
     )

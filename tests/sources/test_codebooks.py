@@ -7,8 +7,8 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.scene.sections.leds import BchCodeConfig, Code, CyclicCodeConfig, PlainCodeConfig
-from skysim.sources.dome.timing import codebooks
-from skysim.sources.dome.timing.codebooks import Words, codebook
+from skysim.sources.dome import codebooks
+from skysim.sources.dome.codebooks import Words, codebook
 
 
 def distances(words: Words, others: Words) -> np.ndarray:

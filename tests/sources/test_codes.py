@@ -11,9 +11,8 @@ from skysim.scene.sections.leds import CyclicCodeConfig, PlainCodeConfig
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import build_lab
 from skysim.simulation.lights.dome import LedDome
-from skysim.sources.dome.timing.clocks import Clocks
-from skysim.sources.dome.timing.codebooks import codebook, light_levels
-from skysim.sources.dome.timing.codes import LedCodes
+from skysim.sources.dome.codebooks import codebook, light_levels
+from skysim.sources.dome.codes import Clocks, LedCodes
 
 SCENE = "coded_spiral"
 

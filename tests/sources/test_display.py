@@ -21,9 +21,8 @@ from skysim.simulation.lights.dome import LedDome
 from skysim.simulation.timing import exposure_window
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
-from skysim.sources.dome.displays import display
+from skysim.sources.dome import display, surface
 from skysim.sources.dome.led import lit_moments_s
-from skysim.sources.dome.shell import surface
 from skysim.sources.photometry import SUN, Band, led_strength_e_s_sr, star_flux_e_s_m2
 
 FOOT_M = 0.3048

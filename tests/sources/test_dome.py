@@ -14,8 +14,8 @@ from skysim.scene import loader
 from skysim.scene.sections import light
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources import dome
-from skysim.sources.dome.shell import surface as dome_surface
-from skysim.sources.dome.shell.surface import SURFACES, Ellipsoid, Plane
+from skysim.sources.dome import surface as dome_surface
+from skysim.sources.dome.surface import SURFACES, Ellipsoid, Plane
 from skysim.sources.photometry import Band, led_strength_e_s_sr
 
 INCH_M = 0.0254

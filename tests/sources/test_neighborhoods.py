@@ -7,8 +7,8 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.scene import loader
+from skysim.sources.dome.layouts.ambiguity import unique_levels
 from skysim.sources.dome.layouts.placing import cap
-from skysim.sources.dome.placement.neighborhoods import unique_levels
 
 SCENE = "coded_spiral"
 

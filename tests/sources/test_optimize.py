@@ -17,9 +17,8 @@ from skysim.scene import loader
 from skysim.scene.sections import layouts
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources import catalog, dome
-from skysim.sources.dome.layouts import spreads
-from skysim.sources.dome.placement import fisher, optimize
-from skysim.sources.dome.placement.ambiguity import field_ambiguity
+from skysim.sources.dome.layouts import fisher, optimize, spreads
+from skysim.sources.dome.layouts.ambiguity import field_ambiguity
 from skysim.sources.photometry import Band, star_flux_e_s_m2
 
 MEASURED = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38.88 in", "38.88 in", "28.60 in"]}

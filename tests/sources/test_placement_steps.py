@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from tests.helpers.interpreted import interpreted
 
 OPTIMIZE, AMBIGUITY = (
-    interpreted(f"skysim.sources.dome.placement.{name}") for name in ("optimize", "ambiguity")
+    interpreted(f"skysim.sources.dome.layouts.{name}") for name in ("optimize", "ambiguity")
 )
 
 

@@ -15,9 +15,8 @@ from skysim.scene.sections.layouts import ProjectorConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lab import build_lab
 from skysim.sources import dome
-from skysim.sources.dome.displays import projector
+from skysim.sources.dome import display, surface
 from skysim.sources.dome.led import full_strength_e_s_sr
-from skysim.sources.dome.shell import surface
 from skysim.sources.photometry import Band
 
 BAND = Band.from_efficiency(0.5)
@@ -108,7 +107,7 @@ def test_a_spot_is_as_wide_as_that_of_traced_rays(focus_m: float, block: int) ->
     made = shown(**more)
     shell = surface.build_surface(config().surface)
     rng = np.random.default_rng(1)
-    R = projector.own_from_lab(lens(**more)).as_matrix()
+    R = display.own_from_lab(lens(**more)).as_matrix()
     for place_m, radius_m in zip(made.place[:, :3], made.radius_m, strict=True):
         own = R @ (place_m - PLACE_M)
         chip_m = 8e-3 * own[:2] / own[2] + rng.uniform(-0.5, 0.5, (500, 2)) * block * 8e-6
@@ -157,22 +156,22 @@ def test_white_pixels_light_the_wall_as_the_square_of_distance_and_the_incidence
     one = lens(falloff=2)
     half_m = np.array([1920, 1200]) * 8e-6 / 2
     chip_m = rng.uniform(-1, 1, (2000, 2)) * half_m
-    ray = projector.rays(one, chip_m)
+    ray = display.rays(one, chip_m)
     distance_m = shell.exit_m(PLACE_M, ray)
     place_m = PLACE_M + distance_m[:, None] * ray
     normal = shell.inward(place_m)
-    per_m2 = projector.white_wall_per_m2(one, place_m, normal)
+    per_m2 = display.white_wall_per_m2(one, place_m, normal)
     # The area of one pixel by differences of four traced corners' rays.
     ends = [
-        projector.rays(one, chip_m + 4e-6 * np.array(side))
+        display.rays(one, chip_m + 4e-6 * np.array(side))
         for side in ([1, 0], [-1, 0], [0, 1], [0, -1])
     ]
     hits = [shell.exit_m(PLACE_M, end)[:, None] * end for end in ends]
     area_m2 = np.linalg.norm(np.cross(hits[0] - hits[1], hits[2] - hits[3]), axis=1)
-    cosine = ray @ projector.own_from_lab(one).as_matrix()[2]
+    cosine = ray @ display.own_from_lab(one).as_matrix()[2]
     np.testing.assert_allclose(per_m2, cosine**2 / area_m2, rtol=1e-4)
     outside = PLACE_M + np.array([[0.9, 0.0, 0.1]])
-    assert projector.white_wall_per_m2(one, outside, np.array([[-1.0, 0.0, 0.0]]))[0] == 0
+    assert display.white_wall_per_m2(one, outside, np.array([[-1.0, 0.0, 0.0]]))[0] == 0
 
 
 @pytest.mark.slow
@@ -198,7 +197,7 @@ def test_black_glows_as_all_pixels_by_the_contrast() -> None:
     shell = surface.build_surface(scene.light.surface)
     axis = cam_from_lab.inv().apply([0.0, 0.0, 1.0])
     place_m = shell.meet(camera_m, axis[None])
-    per_m2 = projector.white_wall_per_m2(scene.light.layout, place_m, shell.inward(place_m))[0]
+    per_m2 = display.white_wall_per_m2(scene.light.layout, place_m, shell.inward(place_m))[0]
     radiance = full_strength_e_s_sr(scene.light.led, camera.band) * per_m2 / 500
     etendue = (
         camera.optics.collecting_m2

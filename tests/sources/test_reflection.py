@@ -10,10 +10,10 @@ import pytest
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.leds import CosineLobeConfig, LobeTableConfig
 from skysim.scene.sections.light import ReflectionConfig
-from skysim.sources.dome.reflection.interreflection import DiffuseLight, diffuse_light, spiral
-from skysim.sources.dome.reflection.mirror import mirrored, reflectance
-from skysim.sources.dome.shell.surface import Cylinder, Ellipsoid, Plane, Rim, Surface
-from skysim.sources.false_lights import MIRRORED, light_name
+from skysim.sources.dome.interreflection import DiffuseLight, diffuse_light, spiral
+from skysim.sources.dome.mirror import mirrored, reflectance
+from skysim.sources.dome.surface import Cylinder, Ellipsoid, Plane, Rim, Surface
+from skysim.sources.satellites import MIRRORED, light_name
 
 LAMBERT = CosineLobeConfig()
 # of a sphere, and of its center above the bearing

@@ -14,8 +14,8 @@ from skysim.scene import loader
 from skysim.scene.sections import light
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources import dome
-from skysim.sources.dome.layouts.geodesic import geodesic_vertices
-from skysim.sources.dome.shell import surface
+from skysim.sources.dome import surface
+from skysim.sources.dome.layouts.spreads import geodesic_vertices
 from skysim.sources.photometry import Band
 
 SPHERE = {"kind": "sphere", "apex": "1.2 m", "radius": "1.2 m"}

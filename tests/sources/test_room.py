@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader as study_loader
-from skysim.experiments.study.analysis import search
+from skysim.experiments.study import search
+from skysim.experiments.study import study_file as study_loader
 from skysim.experiments.study.execution import engines, runner, store
 from skysim.scene import loader
 from skysim.scene.sections import light
@@ -18,8 +18,8 @@ from skysim.scene.sections.light import DomeConfig, RoomConfig
 from skysim.simulation import checks
 from skysim.simulation.lab import build_lab
 from skysim.sources import dome
-from skysim.sources.dome.shell import room as rooms
-from skysim.sources.dome.shell import surface
+from skysim.sources.dome import room as rooms
+from skysim.sources.dome import surface
 from skysim.sources.photometry import Band
 
 RADIUS_M = 1.5

@@ -14,11 +14,11 @@ import pytest
 from skysim.core.constants import EARTH_FLATTENING, EARTH_RADIUS_M
 from skysim.core.errors import InputError
 from skysim.core.time import tt_jd
-from skysim.scene.sections.orbit import RandomSatellitesConfig
+from skysim.scene.sections.surroundings import RandomSatellitesConfig
 from skysim.scene.sections.vehicle import SiteConfig
-from skysim.sources.orbit import earth, elements, satellites
-from skysim.sources.orbit.satellites import View
-from skysim.sources.solar_system.observer import GcrsState, site_in_gcrs
+from skysim.sources import camera_orbit, orbit_elements, satellites
+from skysim.sources.ephemeris import GcrsState, site_in_gcrs
+from skysim.sources.satellites import ExposureView
 
 # Satellite 00005 of Vallado et al. 2006 (AIAA 2006-6753), and its TEME states of tcppver.out, km and km/s.
 VANGUARD = (
@@ -70,18 +70,18 @@ def tle(
         f"2 {number:05d} {inclination_deg:8.4f} {node_deg:8.4f} 0001000   0.0000 {along_deg:8.4f}"
         f" {revolutions_day:11.8f}    1",
     )
-    return "".join(f"{line}{elements.checksum(line)}\n" for line in lines)
+    return "".join(f"{line}{orbit_elements.checksum(line)}\n" for line in lines)
 
 
 @pytest.fixture
-def low_orbits(tmp_path: Path) -> elements.Elements:
+def low_orbits(tmp_path: Path) -> orbit_elements.MeanElements:
     rng = np.random.default_rng(4)
     orbits = (tle(n, *rng.uniform((0, 0, 0, 13), (100, 360, 360, 15.5))) for n in range(1, 41))
-    return elements.read_elements(written(tmp_path, "".join(orbits)))
+    return orbit_elements.read_elements(written(tmp_path, "".join(orbits)))
 
 
 def test_sgp4_gives_the_published_states(tmp_path: Path) -> None:
-    record = elements.read_elements(written(tmp_path, f"VANGUARD 1\n{VANGUARD}")).records[0]
+    record = orbit_elements.read_elements(written(tmp_path, f"VANGUARD 1\n{VANGUARD}")).records[0]
     for minutes, state in PUBLISHED.items():
         error, place, velocity = record.sgp4_tsince(minutes)
         assert error == 0
@@ -92,7 +92,7 @@ def test_sgp4_gives_the_published_states(tmp_path: Path) -> None:
 def test_gcrs_of_teme_is_the_published_one() -> None:
     """Vallado et al. 2006, appendix C: 6 April 2004, 07:51:28.386 UTC; their EOP and polar motion differ by a meter."""
     date = datetime.datetime(2004, 4, 6, 7, 51, 28, 386009)
-    place_km = elements.gcrs_from_teme(date) @ [5094.18016210, 6127.64465950, 6380.34453270]
+    place_km = orbit_elements.gcrs_from_teme(date) @ [5094.18016210, 6127.64465950, 6380.34453270]
     assert place_km == pytest.approx([5102.508958, 6123.011401, 6378.136928], abs=3e-3)
 
 
@@ -104,14 +104,14 @@ def test_omm_and_tle_are_the_same_satellite(kind: str, tmp_path: Path) -> None:
     writer.writerow(OMM)
     leaves = "".join(f"<{key}>{value}</{key}>" for key, value in OMM.items())
     xml = f"<ndm><omm><body><segment><metadata/><data>{leaves}</data></segment></body></omm></ndm>"
-    omm = elements.read_elements(
+    omm = orbit_elements.read_elements(
         written(
             tmp_path, {"csv": text.getvalue(), "json": json.dumps([OMM]), "xml": xml}[kind], "omm"
         )
     )
-    line = elements.read_elements(written(tmp_path, VANGUARD))
+    line = orbit_elements.read_elements(written(tmp_path, VANGUARD))
     time = datetime.datetime(2000, 6, 28)
-    places_m = [elements.gcrs_states(one, time, np.zeros(1))[0] for one in (omm, line)]
+    places_m = [orbit_elements.gcrs_states(one, time, np.zeros(1))[0] for one in (omm, line)]
     assert omm.names == ("VANGUARD 1",)
     assert omm.numbers == line.numbers == (5,)
     assert np.abs(places_m[0] - places_m[1]).max() < 0.01
@@ -132,7 +132,7 @@ def test_omm_and_tle_are_the_same_satellite(kind: str, tmp_path: Path) -> None:
 )
 def test_bad_elements_are_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError) as refused:
-        elements.read_elements(written(tmp_path, text))
+        orbit_elements.read_elements(written(tmp_path, text))
     assert message in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -161,12 +161,12 @@ def test_the_shadow_is_a_cone_behind_the_earth() -> None:
     """On a circle about the Earth's axis the umbra ends where the limb hides all of the Sun."""
     sun_m = np.array([1.496e11, 0.0, 0.0])
     radius_m = 7e6
-    sun_rad = np.arcsin(earth.SUN_RADIUS_M / 1.496e11)
+    sun_rad = np.arcsin(camera_orbit.SUN_RADIUS_M / 1.496e11)
     limb_rad = np.arccos(EARTH_RADIUS_M / radius_m)  # beyond 90 degrees from the Sun
 
     def lit(angle_rad: float) -> float:
         place = radius_m * np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0])
-        return float(earth.sunlit_fraction(place, sun_m))
+        return float(camera_orbit.sunlit_fraction(place, sun_m))
 
     parallax_rad = radius_m / 1.496e11
     edge = np.pi / 2 + limb_rad - parallax_rad
@@ -187,16 +187,16 @@ def test_the_earth_hides_what_is_behind_its_ellipsoid() -> None:
     limb_rad = np.arcsin(pole_m / 7e6)
     for off, hidden in ((-0.02, True), (0.02, False)):  # from the nadir to the limb
         direction = np.array([np.sin(limb_rad + off), 0.0, -np.cos(limb_rad + off)])
-        assert earth.hidden_by_earth(high, direction) == hidden
+        assert camera_orbit.hidden_by_earth(high, direction) == hidden
     down = np.array([0.0, 0.0, -1.0])
-    assert not earth.hidden_by_earth(high, down, 7e6 - pole_m - 1)
-    assert earth.hidden_by_earth(high, down, 7e6 - pole_m + 1)
+    assert not camera_orbit.hidden_by_earth(high, down, 7e6 - pole_m - 1)
+    assert camera_orbit.hidden_by_earth(high, down, 7e6 - pole_m + 1)
     ground = np.array([EARTH_RADIUS_M, 0.0, 0.0])
     horizon = np.array([[0.001, 1.0, 0.0], [-0.001, 1.0, 0.0]])
-    assert earth.hidden_by_earth(ground, horizon).tolist() == [False, True]
+    assert camera_orbit.hidden_by_earth(ground, horizon).tolist() == [False, True]
 
 
-def test_a_path_is_that_of_places_at_its_times(low_orbits: elements.Elements) -> None:
+def test_a_path_is_that_of_places_at_its_times(low_orbits: orbit_elements.MeanElements) -> None:
     """Place and motion at mid-exposure give the apparent place at another time of a long exposure."""
 
     def observer_at(after_s: float) -> GcrsState:
@@ -214,15 +214,17 @@ def test_a_path_is_that_of_places_at_its_times(low_orbits: elements.Elements) ->
             assert np.degrees(off) * 3600 < 0.1
 
 
-def test_satellites_of_the_field_are_those_that_cross_it(low_orbits: elements.Elements) -> None:
+def test_satellites_of_the_field_are_those_that_cross_it(
+    low_orbits: orbit_elements.MeanElements,
+) -> None:
     """From a place beside each sunlit satellite, looking at it: found, with its range, and nothing where it is dark."""
-    place_m, velocity_m_s, _ = elements.gcrs_states(low_orbits, DATE, np.zeros(1))
-    lit = earth.sunlit_fraction(place_m[:, 0], earth.sun_m(tt_jd(DATE)))
+    place_m, velocity_m_s, _ = orbit_elements.gcrs_states(low_orbits, DATE, np.zeros(1))
+    lit = camera_orbit.sunlit_fraction(place_m[:, 0], camera_orbit.sun_m(tt_jd(DATE)))
     assert 5 < np.count_nonzero(lit == 1) < 40
     for n in range(len(lit)):
         up = place_m[n, 0] / np.linalg.norm(place_m[n, 0])
         here = GcrsState(place_m[n, 0] - 50e3 * up, velocity_m_s[n, 0])
-        view = View(up, 0.05, 0.0, 0.1)
+        view = ExposureView(up, 0.05, 0.0, 0.1)
         found = list(
             satellites.known_satellites(low_orbits, 6.0, view, DATE, lambda t, at=here: at)
         )
@@ -233,7 +235,7 @@ def test_satellites_of_the_field_are_those_that_cross_it(low_orbits: elements.El
 
 def test_random_satellites_have_their_density_rates_and_magnitudes() -> None:
     config = RandomSatellitesConfig(per_field=30.0, rate_deg_s=(0.1, 2.0), v_mag=(3.0, 5.0), seed=8)
-    view = View(np.array([0.6, 0.0, 0.8]), 0.1, 0.0, 1.0)
+    view = ExposureView(np.array([0.6, 0.0, 0.8]), 0.1, 0.0, 1.0)
     drawn = [list(satellites.random_satellites(config, view, 1, index)) for index in range(60)]
     lights = [light for frame in drawn for light in frame]
     inside = sum(light.place @ view.boresight > np.cos(view.field_rad) for light in lights)

@@ -7,16 +7,14 @@ import pytest
 from scipy import fft, special
 
 from skysim.core.types import Floats
-from skysim.sources.air import scintillation
+from skysim.sources import air
 
 RED_M = 650e-9
 ZENITH = np.ones(1)
 
 
 def one(air_mass: float, aperture_m: float, exposure_s: float, height_m: float = 0.0) -> float:
-    return float(
-        scintillation.variance(np.array([air_mass]), aperture_m, exposure_s, height_m, RED_M)[0]
-    )
+    return float(air.variance(np.array([air_mass]), aperture_m, exposure_s, height_m, RED_M)[0])
 
 
 def profile() -> tuple[Floats, Floats, Floats]:
@@ -111,12 +109,8 @@ def test_waves_through_a_screen_scintillate_by_the_spectrum() -> None:
     rytov = 19.12 * RED_M ** (-7 / 6) * layer * distance_m ** (5 / 6)
     assert np.mean(point) == pytest.approx(rytov, rel=0.06)
     s = np.geomspace(0.1, 500, 2000)
-    spectrum = scintillation.SPECTRUM * RED_M**-2 * layer * 2 * np.pi * s ** (-5 / 3)
-    law = (
-        spectrum
-        * np.sin(np.pi * RED_M * distance_m * s**2) ** 2
-        * scintillation.airy(0.06 * s) ** 2
-    )
+    spectrum = air.SPECTRUM * RED_M**-2 * layer * 2 * np.pi * s ** (-5 / 3)
+    law = spectrum * np.sin(np.pi * RED_M * distance_m * s**2) ** 2 * air.airy(0.06 * s) ** 2
     assert np.mean(averaged) == pytest.approx(np.sum(law) * np.log(s[1] / s[0]), rel=0.06)
 
 
@@ -138,7 +132,7 @@ def test_a_millimeter_s_lens_twinkles_less_than_young_s_law_says() -> None:
 
 def test_factors_have_their_variance() -> None:
     for variance in (1e-4, 0.3):
-        factor = scintillation.factors(np.full(200_000, variance), np.random.default_rng(5))
+        factor = air.factors(np.full(200_000, variance), np.random.default_rng(5))
         assert factor.mean() == pytest.approx(1, abs=5 * np.sqrt(variance / 200_000))
         assert factor.var() == pytest.approx(variance, rel=0.05)
         assert factor.min() > 0

@@ -15,9 +15,9 @@ from astropy.utils import iers
 from skysim.core.time import J2000_JD, TT_MINUS_TAI_S, tai_minus_utc_s, tt_jd
 from skysim.scene.sections.light import BodiesConfig
 from skysim.scene.sections.vehicle import SiteConfig
+from skysim.sources import bodies, body_discs, ephemeris
+from skysim.sources.bodies import BODIES, bodies_from
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
-from skysim.sources.solar_system import colors, discs, ephemeris, magnitudes, observer, places
-from skysim.sources.solar_system.bodies import BODIES, bodies_from
 
 GEOCENTER = SiteConfig()
 ARCSEC_RAD = erfa.DAS2R
@@ -48,16 +48,16 @@ SKYFIELD = {
 @pytest.mark.parametrize("name", SKYFIELD)
 def test_places_are_those_of_skyfield(name: str) -> None:
     date, (ra_deg, dec_deg) = SKYFIELD[name]
-    seen = observer.observe_from(dynamical(date), GEOCENTER)
-    ra, dec = of_date(places.place(name, seen).direction, seen.tt_jd)
+    seen = ephemeris.observe_from(dynamical(date), GEOCENTER)
+    ra, dec = of_date(ephemeris.place(name, seen).direction, seen.tt_jd)
     assert abs(ra - ra_deg) * np.cos(np.radians(dec)) * 3600 < 0.01
     assert abs(dec - dec_deg) * 3600 < 0.01
 
 
 def test_the_moon_of_skyfield_is_as_far_and_as_lit() -> None:
     """Skyfield 1.55 with DE421: 368,405.543 km, phase angle 69.0819 degrees, bright limb at 285.044 degrees."""
-    seen = observer.observe_from(dynamical("1992-04-12"), GEOCENTER)
-    moon = places.place("moon", seen)
+    seen = ephemeris.observe_from(dynamical("1992-04-12"), GEOCENTER)
+    moon = ephemeris.place("moon", seen)
     geometric_km = ephemeris.load_ephemeris().position_km("moon", seen.tt_jd)
     assert np.linalg.norm(geometric_km) == pytest.approx(368405.543, abs=0.01)
     assert np.degrees(moon.phase_rad) == pytest.approx(
@@ -81,10 +81,10 @@ def test_the_earth_moves_as_fast_as_erfa_says() -> None:
         )
         heliocentric, barycentric = erfa.epv00(jd, 0.0)
         km_s = (one - other) / (0.1 * 86400)
-        assert np.linalg.norm(km_s - barycentric["v"] * places.AU_KM / 86400) < 1e-4
+        assert np.linalg.norm(km_s - barycentric["v"] * ephemeris.AU_KM / 86400) < 1e-4
         sun_km = ephemeris.load_ephemeris().position_km("sun", jd)
         from_sun_km = ephemeris.load_ephemeris().position_km("earth", jd) - sun_km
-        assert np.linalg.norm(from_sun_km - heliocentric["p"] * places.AU_KM) < 100
+        assert np.linalg.norm(from_sun_km - heliocentric["p"] * ephemeris.AU_KM) < 100
 
 
 @pytest.mark.parametrize("name", sorted(set(ephemeris.load_ephemeris().series)))
@@ -105,7 +105,7 @@ def test_a_site_is_where_astropy_has_it() -> None:
     for date in (datetime.datetime(1987, 3, 1, 7), datetime.datetime(2012, 6, 22, 21)):
         with iers.conf.set_temp("auto_download", False):
             position, velocity = where.get_gcrs_posvel(Time(date, scale="utc"))
-        position_m, velocity_m_s = observer.site_in_gcrs(date, tt_jd(date), site)
+        position_m, velocity_m_s = ephemeris.site_in_gcrs(date, tt_jd(date), site)
         assert np.linalg.norm(position_m - position.xyz.to_value(u.m)) < 15
         assert np.linalg.norm(velocity_m_s - velocity.xyz.to_value(u.m / u.s)) < 2e-3
 
@@ -113,13 +113,13 @@ def test_a_site_is_where_astropy_has_it() -> None:
 def test_the_moon_is_displaced_by_its_parallax() -> None:
     """From a site where it is on the horizon it is lower by asin(r / d), up to a degree; from below it, not at all."""
     date = datetime.datetime(2012, 6, 24, 21)
-    moon = places.place("moon", observer.observe_from(date, GEOCENTER))
+    moon = ephemeris.place("moon", ephemeris.observe_from(date, GEOCENTER))
     furthest = 0.0
     for longitude_deg in range(0, 360, 5):
         site = SiteConfig(latitude_deg=0.0, longitude_deg=longitude_deg)
-        seen = observer.observe_from(date, site)
-        position_m, _ = observer.site_in_gcrs(date, seen.tt_jd, site)
-        from_site = places.place("moon", seen)
+        seen = ephemeris.observe_from(date, site)
+        position_m, _ = ephemeris.site_in_gcrs(date, seen.tt_jd, site)
+        from_site = ephemeris.place("moon", seen)
         up = position_m / np.linalg.norm(position_m)
         turned = np.arctan2(
             np.linalg.norm(np.cross(from_site.direction, moon.direction)),
@@ -147,11 +147,11 @@ PUBLISHED = [
 
 def lit(
     name: str, sun_au: float, observer_au: float, phase_deg: float, latitude_deg: float = 0.0
-) -> places.Place:
+) -> ephemeris.Place:
     """A body seen at a phase angle, Sun and observer at a latitude above its equator."""
     pole = np.array([0.0, 0.0, 1.0])
-    if name in magnitudes.POLES_DEG:
-        ra, dec = np.radians(magnitudes.POLES_DEG[name])
+    if name in body_discs.POLES_DEG:
+        ra, dec = np.radians(body_discs.POLES_DEG[name])
         pole = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
     east = np.cross(pole, [1.0, 0.0, 0.0])
     east /= np.linalg.norm(east)
@@ -162,9 +162,9 @@ def lit(
     to_sun, to_observer = (
         np.cos(half) * outward + sign * np.sin(half) * across for sign in (1, -1)
     )
-    from_sun_km = -to_sun * sun_au * places.AU_KM
-    to_body_km = -to_observer * observer_au * places.AU_KM
-    return places.lit_place(-to_observer, from_sun_km, to_body_km)
+    from_sun_km = -to_sun * sun_au * ephemeris.AU_KM
+    to_body_km = -to_observer * observer_au * ephemeris.AU_KM
+    return ephemeris.lit_place(-to_observer, from_sun_km, to_body_km)
 
 
 @pytest.mark.parametrize(("name", "sun_au", "observer_au", "phase_deg", "v_mag"), PUBLISHED)
@@ -173,7 +173,7 @@ def test_magnitudes_are_the_authors_own(
 ) -> None:
     at = lit(name, sun_au, observer_au, phase_deg)
     assert np.degrees(at.phase_rad) == pytest.approx(phase_deg, abs=1e-9)
-    assert magnitudes.magnitude(name, at, J2000_JD) == pytest.approx(v_mag, abs=6e-4)
+    assert body_discs.magnitude(name, at, J2000_JD) == pytest.approx(v_mag, abs=6e-4)
 
 
 def test_uranus_and_neptune_are_the_authors_own() -> None:
@@ -183,16 +183,16 @@ def test_uranus_and_neptune_are_the_authors_own() -> None:
         (20.285, 18.321003215845, 17.3229728525108, 5.381),
         (0.995, 20.096361095266, 21.0888470145276, 6.025),
     ):
-        flattened = (1 - magnitudes.URANUS_FLATTENING) ** 2
+        flattened = (1 - body_discs.URANUS_FLATTENING) ** 2
         planetocentric = np.degrees(np.arctan(np.tan(np.radians(latitude_deg)) * flattened))
         at = lit("uranus", sun_au, observer_au, 0.05, planetocentric)
-        assert magnitudes.magnitude("uranus", at, J2000_JD) == pytest.approx(v_mag, abs=1e-3)
+        assert body_discs.magnitude("uranus", at, J2000_JD) == pytest.approx(v_mag, abs=1e-3)
     for years, sun_au, observer_au, phase_deg, v_mag in (
         (-29.1, 30.322109867761, 31.3091610098214, 0.0549, 7.997),
         (-9.68, 30.207767693725, 29.8172370857530, 1.7741, 7.827),
     ):
         at = lit("neptune", sun_au, observer_au, phase_deg)
-        assert magnitudes.magnitude("neptune", at, J2000_JD + years * year) == pytest.approx(
+        assert body_discs.magnitude("neptune", at, J2000_JD + years * year) == pytest.approx(
             v_mag, abs=1e-3
         )
 
@@ -200,30 +200,30 @@ def test_uranus_and_neptune_are_the_authors_own() -> None:
 def test_open_rings_make_saturn_brighter() -> None:
     """Edge on -8.914, at 26.7 degrees -8.914 - (1.825 + 0.378) sin 26.7 at opposition; unlit rings give none."""
     unit = [
-        magnitudes.magnitude("saturn", lit("saturn", 1.0, 1.0, 0.0, b), J2000_JD)
+        body_discs.magnitude("saturn", lit("saturn", 1.0, 1.0, 0.0, b), J2000_JD)
         for b in (0.0, 26.7)
     ]
     assert unit == pytest.approx([-8.914, -8.914 - 2.203 * np.sin(np.radians(26.7))], abs=1e-6)
     at = lit("saturn", 1.0, 1.0, 0.0, 5.0)
-    from_below = places.lit_place(-at.direction, at.from_sun_km, -at.to_body_km)
-    assert magnitudes.saturn(0.0, from_below, J2000_JD) == pytest.approx(-8.914)
+    from_below = ephemeris.lit_place(-at.direction, at.from_sun_km, -at.to_body_km)
+    assert body_discs.saturn(0.0, from_below, J2000_JD) == pytest.approx(-8.914)
 
 
 def test_moon_and_sun_at_their_mean_distances() -> None:
-    assert magnitudes.moon_magnitude(384400.0, 1.0, 0.0) == pytest.approx(-12.73)
-    assert magnitudes.moon_magnitude(384400.0, 1.0, 90.0) == pytest.approx(-10.13, abs=0.01)
+    assert body_discs.moon_magnitude(384400.0, 1.0, 0.0) == pytest.approx(-12.73)
+    assert body_discs.moon_magnitude(384400.0, 1.0, 90.0) == pytest.approx(-10.13, abs=0.01)
     sun = lit("sun", 1.0, 1.0, 0.0)
-    assert magnitudes.magnitude("sun", sun, J2000_JD) == pytest.approx(-26.74)
+    assert body_discs.magnitude("sun", sun, J2000_JD) == pytest.approx(-26.74)
 
 
 def test_earthshine_is_as_dim_as_is_measured() -> None:
     """The earthlit disc of a thin crescent is some 10 mag fainter than the full Moon; that of a full one is dark."""
-    thin = lit("moon", 1.0, magnitudes.MOON_KM / places.AU_KM, 150.0)
-    sunlit = magnitudes.magnitude("moon", thin, J2000_JD)
-    earthlit = sunlit - 2.5 * np.log10(magnitudes.earthshine_fraction(thin))
+    thin = lit("moon", 1.0, body_discs.MOON_KM / ephemeris.AU_KM, 150.0)
+    sunlit = body_discs.magnitude("moon", thin, J2000_JD)
+    earthlit = sunlit - 2.5 * np.log10(body_discs.earthshine_fraction(thin))
     assert -3.5 < earthlit < -1.5
-    full = lit("moon", 1.0, magnitudes.MOON_KM / places.AU_KM, 0.0)
-    assert magnitudes.earthshine_fraction(full) < 1e-5  # the Earth is new
+    full = lit("moon", 1.0, body_discs.MOON_KM / ephemeris.AU_KM, 0.0)
+    assert body_discs.earthshine_fraction(full) < 1e-5  # the Earth is new
 
 
 @pytest.mark.parametrize("phase_deg", [0.0, 40.0, 90.0, 140.0])
@@ -237,30 +237,34 @@ def test_a_lambert_sphere_has_lambert_s_phase_and_center(phase_deg: float) -> No
     assert light.sum() / full.sum() == pytest.approx(
         (np.sin(a) + (np.pi - a) * np.cos(a)) / np.pi, abs=1e-3
     )
-    xy, share = discs.disc_elements(discs.Surface(discs.LAMBERT, a))
+    xy, share = body_discs.disc_elements(body_discs.DiscSurface(body_discs.LAMBERT, a))
     assert share.sum() == pytest.approx(1.0)
     assert share @ xy == pytest.approx([(light * x).sum() / light.sum(), 0.0], abs=2e-3)
 
 
-def lattice(surface: discs.Surface, across: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def lattice(
+    surface: body_discs.DiscSurface, across: int = 200
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     axis = (np.arange(across) + 0.5) * (2 / across) - 1
     x, y = np.meshgrid(axis, axis)
-    return x, y, discs.light_map(surface, axis)
+    return x, y, body_discs.light_map(surface, axis)
 
 
 def test_the_full_moon_is_uniform_and_the_half_moon_ends_at_the_terminator() -> None:
-    x, y, share = lattice(discs.Surface(discs.LOMMEL_SEELIGER, 0.0))
+    x, y, share = lattice(body_discs.DiscSurface(body_discs.LOMMEL_SEELIGER, 0.0))
     inside = np.hypot(x, y) < 0.98
     assert np.ptp(share[inside]) < 1e-9 * share.max()
     for phase_deg in (60.0, 90.0, 120.0):
-        x, y, share = lattice(discs.Surface(discs.LOMMEL_SEELIGER, np.radians(phase_deg)))
+        x, y, share = lattice(
+            body_discs.DiscSurface(body_discs.LOMMEL_SEELIGER, np.radians(phase_deg))
+        )
         terminator = -np.cos(np.radians(phase_deg)) * np.sqrt(np.maximum(1 - y**2, 0))
         assert (share[x < terminator - 0.01] == 0).all()
         assert (share[(x > terminator + 0.01) & (np.hypot(x, y) < 0.99)] > 0).all()
 
 
 def test_earthshine_lights_the_whole_disc() -> None:
-    x, y, share = lattice(discs.Surface(discs.LOMMEL_SEELIGER, np.pi / 2, 0.01))
+    x, y, share = lattice(body_discs.DiscSurface(body_discs.LOMMEL_SEELIGER, np.pi / 2, 0.01))
     dark = (x < -0.02) & (np.hypot(x, y) < 0.98)
     assert np.ptp(share[dark]) < 1e-9 * share[dark].max()
     assert share[dark].sum() == pytest.approx(
@@ -270,7 +274,7 @@ def test_earthshine_lights_the_whole_disc() -> None:
 
 def test_the_sun_s_limb_is_dark() -> None:
     """Its mean brightness is 0.30 + 2/3 0.93 - 1/2 0.23 of the center's."""
-    _, _, share = lattice(discs.Surface(discs.LIMB_DARKENED, 0.0))
+    _, _, share = lattice(body_discs.DiscSurface(body_discs.LIMB_DARKENED, 0.0))
     mean = share.sum() / (np.pi / 4 * 200**2)
     assert mean / share[100, 100] == pytest.approx(0.30 + 0.62 - 0.115, rel=1e-3)
 
@@ -291,25 +295,25 @@ def test_the_sun_s_limb_is_dark() -> None:
 )
 def test_albedos_have_the_measured_colors(name: str, b_v: float) -> None:
     """B-V is the Sun's and 2.5 log10 of the albedo in V over that in B."""
-    blue, visual, *_ = colors.ALBEDO[name]
+    blue, visual, *_ = bodies.ALBEDO[name]
     assert SUN[0] + 2.5 * np.log10(visual / blue) == pytest.approx(b_v, abs=0.013)
 
 
 def test_reflected_light_follows_the_albedo() -> None:
     """A gray body has a G2 star's electrons; at one wavelength a body has that times p / p(V), 0.18 for Uranus in I."""
-    gray = colors.reflected_flux_e_s_m2(3.0, (0.2, 0.2, 0.2, 0.2), BAND)
+    gray = bodies.reflected_flux_e_s_m2(3.0, (0.2, 0.2, 0.2, 0.2), BAND)
     assert gray == pytest.approx(float(star_flux_e_s_m2(3.0, *SUN, BAND)), rel=1e-4)
-    for wavelength_m, albedo in zip(colors.BANDS_M, colors.ALBEDO["uranus"], strict=True):
+    for wavelength_m, albedo in zip(bodies.BANDS_M, bodies.ALBEDO["uranus"], strict=True):
         line = Band(wavelength_m + np.array([-1e-9, 0.0, 1e-9]), np.array([0.0, 1.0, 0.0]))
-        ratio = colors.reflected_flux_e_s_m2(0.0, colors.ALBEDO["uranus"], line) / float(
-            colors.reflected_flux_e_s_m2(0.0, colors.WHITE, line)
+        ratio = bodies.reflected_flux_e_s_m2(0.0, bodies.ALBEDO["uranus"], line) / float(
+            bodies.reflected_flux_e_s_m2(0.0, bodies.WHITE, line)
         )
-        assert ratio == pytest.approx(albedo / colors.ALBEDO["uranus"][1], rel=0.01)
+        assert ratio == pytest.approx(albedo / bodies.ALBEDO["uranus"][1], rel=0.01)
 
 
 def test_the_light_of_all_bodies_is_their_magnitudes() -> None:
     lights = bodies_from(
-        BodiesConfig(), observer.observe_from(datetime.datetime(2012, 6, 24, 21), GEOCENTER), BAND
+        BodiesConfig(), ephemeris.observe_from(datetime.datetime(2012, 6, 24, 21), GEOCENTER), BAND
     )
     assert {light.name for light in lights} == set(BODIES)
     distances = [light.place.distance_km for light in lights]

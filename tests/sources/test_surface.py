@@ -11,11 +11,11 @@ import pytest
 from scipy.special import eval_jacobi
 
 from skysim.core.errors import InputError
-from skysim.dynamics.multibody.view import mjcf_export
+from skysim.dynamics.multibody import mjcf_export
 from skysim.scene import loader
 from skysim.scene.sections import light
-from skysim.sources.dome.shell import point_cloud
-from skysim.sources.dome.shell.surface import SURFACES, Radial, Surface, build_surface
+from skysim.sources.dome import point_cloud
+from skysim.sources.dome.surface import SURFACES, Radial, Surface, build_surface
 
 INCH_M = 0.0254
 UP = np.array([[0.0, 0.0, 1.0]])
@@ -204,7 +204,7 @@ def test_newton_settles_in_few_steps_from_anywhere_inside(
     cloud: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Eight are allowed here of the 200 by which bisection alone would end."""
-    monkeypatch.setattr("skysim.sources.dome.shell.surface.MAX_STEPS", 8)
+    monkeypatch.setattr("skysim.sources.dome.surface.MAX_STEPS", 8)
     rng = np.random.default_rng(2)
     for part in (cloud, DESIGN):
         shape = made(part)
@@ -219,7 +219,7 @@ def test_a_ray_that_does_not_settle_is_an_error_not_a_point(
     cloud: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shape = made(cloud)
-    monkeypatch.setattr("skysim.sources.dome.shell.surface.MAX_STEPS", 1)
+    monkeypatch.setattr("skysim.sources.dome.surface.MAX_STEPS", 1)
     with pytest.raises(
         ArithmeticError, match=r"no convergence on the surface for \d+ rays in 1 steps"
     ):

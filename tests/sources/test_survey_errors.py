@@ -17,9 +17,8 @@ from skysim.scene.sections import light
 from skysim.scene.sections.tracker import SurveyErrorsConfig
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab, build_tracker
-from skysim.sources.dome.shell import surface
-from skysim.sources.dome.shell.surface import Surface
-from skysim.sources.dome.survey import survey_errors
+from skysim.sources.dome import surface, survey_errors
+from skysim.sources.dome.surface import Surface
 from skysim.tracking import factory
 
 RARE = 1e-6  # of a sum of squares that is outside: the seeds are fixed, so it fails for a wrong law alone

@@ -10,15 +10,14 @@ import yaml
 from scipy.stats import chi2
 
 from estimator.identification.chance import GATE_SIGMA
-from estimator.identification.leds.index import build_dome_index
+from estimator.identification.led_index import build_dome_index
 from estimator.trackers.dome_tracker import DomeTracker
 from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.scene.sections import light
 from skysim.scene.sections.tracker import SurveyErrorsConfig, TotalStationConfig
 from skysim.simulation.lab import build_lab, build_tracker
-from skysim.sources.dome.shell import surface
-from skysim.sources.dome.survey import survey_errors, total_station
+from skysim.sources.dome import surface, survey_errors
 
 ARCSEC = np.pi / 180 / 3600
 STATION = {
@@ -48,12 +47,12 @@ def draws(config: TotalStationConfig, own: bool, setup: bool) -> np.ndarray:
     shape = (len(PLACES_M), 3)
     return np.array(
         [
-            total_station.surveyed_m(
+            survey_errors.surveyed_m(
                 config,
                 PLACES_M,
                 own * rng.standard_normal(shape),
-                total_station.draw_setup(
-                    config, setup * rng.standard_normal(total_station.SETUP_ERRORS)
+                survey_errors.draw_setup(
+                    config, setup * rng.standard_normal(survey_errors.SETUP_ERRORS)
                 ),
             )
             - PLACES_M
@@ -67,7 +66,7 @@ def draws(config: TotalStationConfig, own: bool, setup: bool) -> np.ndarray:
 
 def test_a_survey_without_errors_is_the_truth() -> None:
     """Polar coordinates and back, to the rounding of a meter."""
-    found = total_station.surveyed_m(station(), PLACES_M, np.zeros(PLACES_M.shape), np.zeros(8))
+    found = survey_errors.surveyed_m(station(), PLACES_M, np.zeros(PLACES_M.shape), np.zeros(8))
     np.testing.assert_allclose(found, PLACES_M, rtol=0, atol=1e-15)
 
 
@@ -76,7 +75,7 @@ def test_the_own_errors_have_the_covariance_that_is_claimed() -> None:
     """Monte Carlo of angles and distances through the polar coordinates, each LED, each element."""
     config = station()
     error_m = draws(config, own=True, setup=False)
-    claimed = total_station.covariance_m2(config, PLACES_M)
+    claimed = survey_errors.station_covariance_m2(config, PLACES_M)
     found = np.einsum("dni,dnj->nij", error_m, error_m) / DRAWS
     # A sample covariance errs by sqrt((C_ii C_jj + C_ij^2) / D).
     variance = np.einsum("nii->ni", claimed)
@@ -92,8 +91,8 @@ def test_the_common_errors_have_the_covariance_that_is_claimed() -> None:
     """Between any two LEDs too: sum over the errors of the outer products of their displacements."""
     config = station()
     error_m = draws(config, own=False, setup=True).reshape(DRAWS, -1)
-    fields = total_station.common_displacements_m(config, PLACES_M)
-    assert len(fields) == total_station.SETUP_ERRORS
+    fields = survey_errors.station_displacements_m(config, PLACES_M)
+    assert len(fields) == survey_errors.SETUP_ERRORS
     flat = fields.reshape(len(fields), -1)
     claimed = flat.T @ flat
     variance = np.diag(claimed)
@@ -110,7 +109,7 @@ def test_no_leds_and_no_errors_of_the_set_up_are_empty() -> None:
         "distance_sigma": "1 mm",
     }
     for config, errors in ((TotalStationConfig.model_validate(perfect), 0), (station(), 8)):
-        assert total_station.common_displacements_m(config, np.zeros((0, 3))).shape == (
+        assert survey_errors.station_displacements_m(config, np.zeros((0, 3))).shape == (
             errors,
             0,
             3,
@@ -121,13 +120,13 @@ def test_range_and_angle_errors_are_along_and_across_the_sight() -> None:
     """A data sheet's 1 mm along the sight; 1" at 100 m is half a millimeter across (Leica MS60 manual)."""
     place_m = np.array([[100.0, 0.0, 0.0]])
     config = station(position=["0 m", "0 m", "0 m"], angle_sigma_arcsec=1, distance_sigma="1 mm")
-    covariance = total_station.covariance_m2(config, place_m)[0]
+    covariance = survey_errors.station_covariance_m2(config, place_m)[0]
     np.testing.assert_allclose(
         np.sqrt(np.diag(covariance)), [1e-3, 100 * ARCSEC, 100 * ARCSEC], rtol=1e-12
     )
     assert 100 * ARCSEC == pytest.approx(0.5e-3, rel=0.05)  # noqa: SIM300
     # Toward the zenith the horizontal direction matters less, by the sine of the zenith angle.
-    steep = total_station.covariance_m2(config, np.array([[10.0, 0.0, 10 * np.sqrt(3)]]))[0]
+    steep = survey_errors.station_covariance_m2(config, np.array([[10.0, 0.0, 10 * np.sqrt(3)]]))[0]
     assert np.sqrt(steep[1, 1]) == pytest.approx(20 * ARCSEC * 0.5, rel=1e-12)
 
 
@@ -148,8 +147,8 @@ def test_distances_err_by_a_plus_b_ppm() -> None:
         },
     )
     places = np.array([[1000.0, 0, 0], [0, 10.0, 0]])
-    own = total_station.covariance_m2(config, places)
-    (scale,) = total_station.common_displacements_m(config, places)
+    own = survey_errors.station_covariance_m2(config, places)
+    (scale,) = survey_errors.station_displacements_m(config, places)
     variance = np.array([own[0, 0, 0], own[1, 1, 1]]) + np.sum(scale**2, axis=1)
     np.testing.assert_allclose(variance, [1e-6 + 1.5e-3**2, 1e-6 + 1.5e-5**2], rtol=1e-12)
 
@@ -158,11 +157,11 @@ def test_tolerances_bound_every_part() -> None:
     config = station(angle_sigma_arcsec={"tolerance": 60}, centering={"tolerance": "0.5 mm"})
     rng = np.random.default_rng(2)
     setup = np.array(
-        [total_station.draw_setup(config, rng.standard_normal(8)) for _ in range(2000)]
+        [survey_errors.draw_setup(config, rng.standard_normal(8)) for _ in range(2000)]
     )
     assert np.abs(setup[:, :3]).max() <= 5e-4
     assert setup[:, :3].std() == pytest.approx(5e-4 / np.sqrt(3), rel=0.03)
-    claimed = total_station.covariance_m2(config, np.array([[0.8, 9.7, -0.2]]))[0]
+    claimed = survey_errors.station_covariance_m2(config, np.array([[0.8, 9.7, -0.2]]))[0]
     assert claimed[0, 0] == pytest.approx((10 * 60 * ARCSEC) ** 2 / 3, rel=1e-12)
 
 
@@ -208,7 +207,7 @@ def test_the_tracker_believes_what_the_station_measured() -> None:
 
 
 def test_the_error_across_the_line_from_the_bearing_is_that_of_drawn_errors() -> None:
-    own_m2 = total_station.covariance_m2(station(), PLACES_M)
+    own_m2 = survey_errors.station_covariance_m2(station(), PLACES_M)
     normal = np.random.default_rng(2).standard_normal((DRAWS, len(PLACES_M), 3))
     error_m = np.einsum("nij,dnj->dni", np.linalg.cholesky(own_m2), normal)
     along = PLACES_M / np.linalg.norm(PLACES_M, axis=1, keepdims=True)
@@ -307,7 +306,7 @@ def test_a_sky_has_a_focal_length_to_survey_and_no_leds() -> None:
 
 def test_a_station_at_an_led_is_refused() -> None:
     with pytest.raises(InputError, match=r"^tracker.survey.instrument.position: an LED is there"):
-        total_station.covariance_m2(station(position=["0 m", "0 m", "1.2 m"]), PLACES_M)
+        survey_errors.station_covariance_m2(station(position=["0 m", "0 m", "1.2 m"]), PLACES_M)
 
 
 def test_over_the_seeds_the_focal_length_errs_as_its_survey_says() -> None:

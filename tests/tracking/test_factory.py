@@ -17,12 +17,11 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats, Frame, Telemetry
 from skysim.dynamics import imu, multibody
 from skysim.scene import loader
-from skysim.simulation.checks import check
-from skysim.simulation.checks.dome import assumptions
+from skysim.simulation.checks import check, dome_warnings
 from skysim.simulation.flight import Flight, simulate_motion
 from skysim.simulation.lab import build_lab, build_tracker
-from skysim.tracking import exposure_control
-from skysim.tracking.exposure_control import ExposureController
+from skysim.tracking import factory
+from skysim.tracking.factory import ExposureController
 from skysim.tracking.navigation import Navigation, build_filter
 
 PERFECT = (
@@ -393,7 +392,7 @@ def test_under_the_stars_there_is_no_surface_to_doubt() -> None:
 def test_what_no_tracker_copes_with_is_doubted(changes: dict[str, str], told: str) -> None:
     """By hand: 8 mm at 33 in, 36.5 mm before pixels of 4 um, is 87 px; focused at 20 in 4.4 mm of pupil blur by 32."""
     lab = build_lab(loader.load("afit_simsat", changes))
-    lines = assumptions.warnings(lab.scene, lab.camera.sources, lab.camera.mount)
+    lines = dome_warnings.warnings(lab.scene, lab.camera.sources, lab.camera.mount)
     assert len(lines) == 1
     assert lines[0].startswith(told)
     assert lines[0] in check(lab).findings
@@ -418,16 +417,16 @@ def test_a_doubt_is_one_line_before_the_run_which_goes_on(
 
 def test_the_exposure_control_is_the_chart_s_unless_the_scene_says_otherwise() -> None:
     """The schema repeats the estimator's constants, as it may not ask it for them."""
-    plain = exposure_control.control_settings(
+    plain = factory.control_settings(
         loader.load("shefex2", {"tracker.exposure_control": "{mean_dn: 150}"})
     )
     assert plain == Control(mean_dn=150.0)
     part = "{mean_dn: 99, shortest: 1 ms, longest: 90 ms, step: 3 ms, min_stars: 5, overexposed_objects: 6,"
-    told = exposure_control.control_settings(
+    told = factory.control_settings(
         loader.load("shefex2", {"tracker.exposure_control": part + " saturated_px: 7}"})
     )
     assert told == Control(99.0, 1e-3, 90e-3, 3e-3, 5, 6, 7)
-    assert exposure_control.control_settings(loader.load("shefex2")) is None
+    assert factory.control_settings(loader.load("shefex2")) is None
 
 
 def test_without_control_every_frame_is_exposed_for_as_long() -> None:

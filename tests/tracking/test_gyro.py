@@ -11,7 +11,7 @@ from skysim.core.errors import InputError
 from skysim.scene.loader import load
 from skysim.simulation.flight import open_flight, simulate_motion
 from skysim.simulation.timing import exposure_window
-from skysim.tracking.gyro import latest, rate_of_frame, sigma_rad_s
+from skysim.tracking.navigation import latest, rate_of_frame, sigma_rad_s
 
 FLIGHT = {
     "vehicle.imu": "{}",

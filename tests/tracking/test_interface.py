@@ -23,10 +23,10 @@ from typer.testing import CliRunner
 from skysim.apps.cli import main
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 from skysim.core.plugins import ProgramError
 from skysim.experiments import tracker_comparison
-from skysim.experiments.study import loader as study_loader
+from skysim.experiments.study import study_file as study_loader
 from skysim.experiments.study.execution import runner, setups, store
 from skysim.experiments.study.execution.engines import Serial
 from skysim.results import metrics
@@ -34,8 +34,8 @@ from skysim.scene import loader
 from skysim.simulation.flight import Flight, open_flight
 from skysim.simulation.lab import build_lab
 from skysim.sources import stars
-from skysim.tracking.external import interface, process
-from skysim.tracking.external.interface import Answer, Leds, Picture, Setup, Stars, check_answer
+from skysim.tracking import tracker_interface
+from skysim.tracking.tracker_interface import Answer, Leds, Picture, Setup, Stars, check_answer
 
 PAGE = (ROOT / "docs/howto/external_tracker.md").read_text(encoding="utf-8")
 SETUP = Setup("icrs", "2012-06-22T21:00:00", 8, 6, 100.0, (3.5, 2.5), (0.0,) * 5, 1.0, 4095.0, 1)
@@ -105,9 +105,11 @@ READY = "import json, sys, os, time; g = sys.stdin.buffer; g.readline(); print('
 FRAMES = READY + "for line in g:\n    h = json.loads(line); p = g.read(h['bytes'])\n    "
 
 
-def program(text: str, limit_s: float = 5.0, kind: str | None = None) -> process.TrackerProgram:
+def program(
+    text: str, limit_s: float = 5.0, kind: str | None = None
+) -> tracker_interface.TrackerProgram:
     parts = [sys.executable, "-c", text, "{folder}"]
-    return process.TrackerProgram("mine", parts, kind, SETUP, limit_s)
+    return tracker_interface.TrackerProgram("mine", parts, kind, SETUP, limit_s)
 
 
 def test_a_program_sees_the_pixels_and_its_answer_is_ours() -> None:
@@ -258,7 +260,7 @@ def test_a_program_that_will_not_begin_says_why(text: str, told: str) -> None:
 )
 def test_a_program_s_name_and_command_are_checked(told: str) -> None:
     with pytest.raises(InputError, match=r"^programs"):
-        process.program_commands([told])
+        tracker_interface.program_commands([told])
 
 
 # --- runs ---------------------------------------------------------------------------------------------------
@@ -266,7 +268,7 @@ def test_a_program_s_name_and_command_are_checked(told: str) -> None:
 OFFSET = """
 import numpy as np
 from scipy.spatial.transform import Rotation
-from skysim.tracking.external.interface import Answer
+from skysim.tracking.tracker_interface import Answer
 
 class Offset:
     '''Told each frame's truth by hand, it answers with an error that is known.'''
@@ -303,11 +305,11 @@ def test_a_trial_of_another_release_of_a_tracker_is_another(
 ) -> None:
     told = loader.load("shefex2", {"tracker.name": "offset"})
     before = setups.scene_hash(told)
-    assert interface.TRACKERS.release("offset") == "offset 1.0"
+    assert tracker_interface.TRACKERS.release("offset") == "offset 1.0"
     (tmp_path / "offset-1.0.dist-info" / "METADATA").write_text(
         "Metadata-Version: 2.1\nName: offset\nVersion: 1.1\n"
     )
-    assert interface.TRACKERS.release("offset") == "offset 1.1"
+    assert tracker_interface.TRACKERS.release("offset") == "offset 1.1"
     assert setups.scene_hash(told) != before
 
 
@@ -352,7 +354,7 @@ def test_a_package_s_tracker_is_scored_by_the_error_that_it_makes(installed: Non
 
 def test_the_list_tells_what_an_entry_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     for there, needs in ((None, "skysim[oracle]"), (object(), "")):
-        monkeypatch.setattr(interface, "find_spec", lambda name, there=there: there)
+        monkeypatch.setattr(tracker_interface, "find_spec", lambda name, there=there: there)
         listed = json.loads(CliRunner().invoke(main.app, ["trackers", "--json"]).stdout)
         assert {one["name"]: one["needs"] for one in listed}["tetra3rs"] == needs
         assert {one["name"]: one["needs"] for one in listed}["own"] == ""
@@ -390,7 +392,7 @@ def test_a_study_s_factor_is_a_tracker(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(
         FRAMES + 'print(\'{"frame": 0, "status": "cloudy"}\', flush=True)'
     )
-    commands = process.program_commands(
+    commands = tracker_interface.program_commands(
         [f"mine={shlex.join([sys.executable, str(tmp_path / 'mine.py')])}"]
     )
     with pytest.raises(InputError, match="needs frames; allowed: own"):
@@ -521,7 +523,9 @@ def test_the_page_s_adapter_reads_lost_s_axes_and_quaternion(tmp_path: Path) -> 
         (lost / str(n)).write_text("".join(rows))
     (lost / str(len(POINTED))).write_text("attitude_known 0\n")
     words = [sys.executable, str(adapter), str(lost), "{folder}"]
-    runs = process.TrackerProgram("lost", words, "png", replace(SETUP, saturation_dn=255.0), 20.0)
+    runs = tracker_interface.TrackerProgram(
+        "lost", words, "png", replace(SETUP, saturation_dn=255.0), 20.0
+    )
     answers = [
         check_answer(runs.solve(replace(PICTURE, frame=n, image_dn=np.full((6, 8), n, np.uint16))))
         for n in range(len(POINTED) + 1)

@@ -28,8 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.catalog.pair_index import PairIndex, first_neighbor, magnitude_range
-from estimator.core.arrays import Floats
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
@@ -41,7 +40,7 @@ from estimator.identification.direct_match import (
     to_star_match,
     triple,
 )
-from estimator.identification.options import Options
+from estimator.identification.solver_options import Options
 
 MAG_GATE_SIGMA = (
     3.0  # of a magnitude: three stars pass with 0.9973^3 = 99.2 %, the paper's 99.12 +- 0.25 %
@@ -65,15 +64,24 @@ class MagnitudeMatch(StarMatch):
     variance_mag2: float = float("nan")
 
 
-class SearchOptions(NamedTuple):
+class FialhoOptions(NamedTuple):
     """Search parameters. A named tuple, because numba can compile functions that take one.
 
-    tolerance_rad, stretch : tolerance of a direction; that of an angle is sqrt(2) times it plus stretch times the angle
-    gate_mag     : tolerance of a magnitude
-    triangles, checks, base : as in `Options`: limits of observed triangles and of angles compared, number of stars
-    min_fraction : fraction of the observed stars that must match
-    optimized    : assemble the lists from neighbors
-    x, y, z, chord2 : prior boresight, and the greatest squared chord of a candidate from it
+    Attributes
+    ----------
+    tolerance_rad, stretch
+        Tolerance of a direction; that of an angle is sqrt(2) times it plus stretch times the
+        angle
+    gate_mag
+        Tolerance of a magnitude
+    triangles, checks, base
+        As in `Options`: limits of observed triangles and of angles compared, number of stars
+    min_fraction
+        Fraction of the observed stars that must match
+    optimized
+        Assemble the lists from neighbors
+    x, y, z, chord2
+        Prior boresight, and the greatest squared chord of a candidate from it
     """
 
     tolerance_rad: float
@@ -92,10 +100,13 @@ class SearchOptions(NamedTuple):
 
 def search_options(
     tolerance_rad: float, settings: Options, min_fraction: float, optimized: bool, retries: bool
-) -> SearchOptions:
+) -> FialhoOptions:
     """Search parameters from options. Raises ImageError unless the tolerance and the magnitude error are positive.
 
-    retries : try other observed triangles if the first fails
+    Parameters
+    ----------
+    retries
+        Try other observed triangles if the first fails
     """
     if not min(tolerance_rad, settings.epsilon_mag) > 0:
         raise ImageError(
@@ -108,7 +119,7 @@ def search_options(
     if settings.boresight_ref is not None:
         x, y, z = settings.boresight_ref
         chord2 = 4 * np.sin(min(settings.within_rad, np.pi) / 2) ** 2
-    return SearchOptions(
+    return FialhoOptions(
         tolerance_rad,
         settings.stretch,
         MAG_GATE_SIGMA * settings.epsilon_mag,
@@ -156,12 +167,19 @@ def fialho_4(
 ) -> MagnitudeMatch | None:
     """Fialho's triangle method, latest version: as the third, and returns the errors of the magnitudes.
 
-    vectors_cam   : (N, 3) observed unit vectors, brightest first
-    tolerance_rad : of a direction; that of an angle is sqrt(2) times it, plus `stretch` times the angle
-    options       : those of `Options`: `magnitude`, if the index has magnitudes too, shortens the lists;
-        `boresight_ref` and `within_rad` are the prior boresight: candidates are within that angle of it, which must
-        therefore include half the field's diagonal beside the error of the prior
     Returns None if too few stars match, or if the match is not significant (1e-5 expected by chance).
+
+    Parameters
+    ----------
+    vectors_cam
+        (N, 3) observed unit vectors, brightest first
+    tolerance_rad
+        Of a direction; that of an angle is sqrt(2) times it, plus `stretch` times the angle
+    options
+        Those of `Options`: `magnitude`, if the index has magnitudes too, shortens the lists;
+        `boresight_ref` and `within_rad` are the prior boresight: candidates are within that
+        angle of it, which must therefore include half the field's diagonal beside the error of
+        the prior
     """
     match = fialho_3(vectors_cam, index, tolerance_rad, **options)
     if match is None:
@@ -206,13 +224,17 @@ def _identify(
 
 @jit
 def search(
-    rays: Floats, magnitudes: Floats, index: PairIndex, options: SearchOptions
+    rays: Floats, magnitudes: Floats, index: PairIndex, options: FialhoOptions
 ) -> DirectMatch:
     """Compiled search over observed triangles: the brightest first, then others, with all stars changing soon.
 
-    rays, magnitudes : (N, 3) unit vectors, brightest first, and their (N,) magnitudes, NaN if unknown
     Returns the rows of the observed stars and of the catalog, R_cam_from_ref, and log10 of the expected number of
     chance matches; it is a solution only if that is at most ACCEPT_LOG10_CHANCE.
+
+    Parameters
+    ----------
+    rays, magnitudes
+        (N, 3) unit vectors, brightest first, and their (N,) magnitudes, NaN if unknown
     """
     tried = np.zeros(2, np.int64)  # triplets, angles compared
     min_side_rad = MIN_SIDE_FRACTION * index.max_angle_rad
@@ -268,7 +290,7 @@ def triplets(
     magnitudes: Floats,
     index: PairIndex,
     corners: NDArray,
-    options: SearchOptions,
+    options: FialhoOptions,
     tried: NDArray,
 ) -> DirectMatch:
     """Test every triplet of candidates that fits an observed triangle by direct match, until one is accepted."""
@@ -288,7 +310,7 @@ def _direct_match(
     index: PairIndex,
     corners: NDArray,
     stars: NDArray,
-    options: SearchOptions,
+    options: FialhoOptions,
     tried: int,
 ) -> DirectMatch:
     """The second step: the direct match of one triplet; empty if too few stars match or it is not significant."""
@@ -302,7 +324,7 @@ def _direct_match(
 
 
 @jit
-def _candidate(index: PairIndex, star: int, magnitude: float, options: SearchOptions) -> bool:
+def _candidate(index: PairIndex, star: int, magnitude: float, options: FialhoOptions) -> bool:
     """Whether a star is within the magnitude gate and near enough to the prior boresight."""
     if (
         abs(index.magnitude[star] - magnitude) > options.gate_mag
@@ -320,7 +342,7 @@ def _test_neighbors(
     corners: NDArray,
     sides: Floats,
     tolerance: Floats,
-    options: SearchOptions,
+    options: FialhoOptions,
     tried: NDArray,
 ) -> DirectMatch:
     """The optimized assembly: the first list is a range of the sorted catalog, the others its stars' neighbors."""
@@ -365,7 +387,7 @@ def _test_neighbors(
 
 
 @jit
-def _all_candidates(index: PairIndex, magnitude: float, options: SearchOptions) -> NDArray:
+def _all_candidates(index: PairIndex, magnitude: float, options: FialhoOptions) -> NDArray:
     """Candidates for one star, from the whole catalog."""
     out = np.empty(len(index.vectors), np.int64)
     count = 0
@@ -384,7 +406,7 @@ def _test_lists(
     corners: NDArray,
     sides: Floats,
     tolerance: Floats,
-    options: SearchOptions,
+    options: FialhoOptions,
     tried: NDArray,
 ) -> DirectMatch:
     """The basic assembly: three lists, each from the whole catalog, and every triplet of them."""

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.catalog.pair_index import PairIndex, first_neighbor, magnitude_range
-from estimator.core.arrays import Floats
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
@@ -28,10 +27,10 @@ from estimator.identification.direct_match import (
     no_match,
     to_star_match,
 )
-from estimator.identification.options import Options
+from estimator.identification.solver_options import Options
 
 
-class SearchOptions(NamedTuple):
+class MasterStarOptions(NamedTuple):
     """Search parameters: tolerances as in `Options`, magnitude gate, number of masters, limit of angles compared."""
 
     tolerance_rad: float
@@ -46,13 +45,22 @@ def master_star(
 ) -> StarMatch | None:
     """NPS's master-star method: find the catalog star that has most of the brightest star's angles to the others.
 
-    vectors_cam   : (N, 3) observed unit vectors, brightest first;  tolerance_rad : of a direction
-    masters       : number of brightest stars to try as master. NPS's single master fails if it is false or not in the
-        catalog, or if another star is as bright (the thesis's criticism)
-    options       : those of `Options`; with magnitudes, candidates are within the magnitude gate of the master
     The candidates are ranked by how many of the observed angles they have. Each candidate with as many as the best, or
     one less, is tested by direct match: its angle to a second star determines an attitude. Returns None if the match
     is not significant, or if a contradicting match is nearly as good, as on a lattice.
+
+    Parameters
+    ----------
+    vectors_cam
+        (N, 3) observed unit vectors, brightest first
+    tolerance_rad
+        Of a direction
+    masters
+        Number of brightest stars to try as master. NPS's single master fails if it is false or
+        not in the catalog, or if another star is as bright (the thesis's criticism)
+    options
+        Those of `Options`; with magnitudes, candidates are within the magnitude gate of the
+        master
     """
     settings = Options(**options)
     settings.require_known_focal("master_star")
@@ -61,7 +69,7 @@ def master_star(
     count = len(vectors_cam)
     if count < MIN_MATCHES:
         return None
-    parameters = SearchOptions(
+    parameters = MasterStarOptions(
         tolerance_rad,
         settings.stretch,
         3 * settings.epsilon_mag,
@@ -74,7 +82,7 @@ def master_star(
 
 @jit
 def search(
-    rays: Floats, magnitudes: Floats, index: PairIndex, options: SearchOptions
+    rays: Floats, magnitudes: Floats, index: PairIndex, options: MasterStarOptions
 ) -> DirectMatch:
     """Compiled search: rows of the observed stars and of the catalog, R_cam_from_ref, log10 of the chance."""
     tried = np.zeros(2, np.int64)  # assumed pairs, angles compared
@@ -116,7 +124,7 @@ def _count_angles(
     index: PairIndex,
     master: int,
     candidate: int,
-    options: SearchOptions,
+    options: MasterStarOptions,
     tried: NDArray,
 ) -> int:
     """Number of the master's angles that the candidate has to any of its neighbors."""
@@ -140,7 +148,7 @@ def _best_match(
     index: PairIndex,
     master: int,
     candidate: int,
-    options: SearchOptions,
+    options: MasterStarOptions,
     tried: NDArray,
     best: DirectMatch,
     rival: Floats,

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.catalog.pair_index import PairIndex, first_neighbor, pair_range
-from estimator.core.arrays import Floats
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
@@ -27,14 +26,18 @@ from estimator.identification.direct_match import (
     to_star_match,
     triple,
 )
-from estimator.identification.options import Options
+from estimator.identification.solver_options import Options
 
 
-class SearchOptions(NamedTuple):
+class PyramidOptions(NamedTuple):
     """Search parameters. A named tuple, because numba can compile functions that take one.
 
-    tolerance, stretch, focal_unknown, triangles, checks, base, missed_dex : as in `Options`
-    left, right, top, bottom : tangents of the sensor's edges from the boresight
+    Attributes
+    ----------
+    tolerance, stretch, focal_unknown, triangles, checks, base, missed_dex
+        As in `Options`
+    left, right, top, bottom
+        Tangents of the sensor's edges from the boresight
     """
 
     tolerance: float
@@ -55,20 +58,26 @@ def pyramid(
 ) -> StarMatch | None:
     """Pyramid (Mortari, Samaan & Junkins 2001): a triangle, a fourth star, then the whole field.
 
-    vectors_cam   : (N, 3) observed unit vectors, brightest first
-    tolerance_rad : of a direction; that of an angle is sqrt(2) times it, plus `stretch` times the angle
-    options       : those of `Options`; magnitudes are not used
     The three catalog stars are from different groups of the index (patch boards). Observed triangles are tried in the
     paper's `smart` order, which changes all three stars soon, so that one false star costs little. A pyramid is only a
     hypothesis: its attitude must match so many observed stars that, over all hypotheses tried, less than 1e-5 matches
     this good are expected by chance. Otherwise returns None. Raises ImageError unless the tolerance is positive.
+
+    Parameters
+    ----------
+    vectors_cam
+        (N, 3) observed unit vectors, brightest first
+    tolerance_rad
+        Of a direction; that of an angle is sqrt(2) times it, plus `stretch` times the angle
+    options
+        Those of `Options`; magnitudes are not used
     """
     settings = Options(**options)
     if not tolerance_rad > 0:
         raise ImageError(f"pyramid: tolerance {tolerance_rad} rad; allowed: more than 0")
     if len(vectors_cam) < MIN_MATCHES:
         return None
-    parameters = SearchOptions(
+    parameters = PyramidOptions(
         tolerance_rad,
         settings.stretch,
         settings.focal_unknown,
@@ -82,7 +91,7 @@ def pyramid(
 
 
 @jit
-def _search(rays: Floats, index: PairIndex, options: SearchOptions) -> DirectMatch:
+def _search(rays: Floats, index: PairIndex, options: PyramidOptions) -> DirectMatch:
     """Try the triangles (i, i + dj, i + dj + dk) in the smart order; return the first significant match."""
     tried = np.zeros(3, np.int64)  # observed triangles, hypotheses, checks
     for dj in range(1, options.base - 1):
@@ -100,7 +109,7 @@ def _search(rays: Floats, index: PairIndex, options: SearchOptions) -> DirectMat
 
 @jit
 def _triangle(
-    rays: Floats, index: PairIndex, corners: NDArray, options: SearchOptions, tried: NDArray
+    rays: Floats, index: PairIndex, corners: NDArray, options: PyramidOptions, tried: NDArray
 ) -> DirectMatch:
     """Test every catalog triangle that fits an observed one in its sides and its handedness; needs a fourth star."""
     i, j, k = corners
@@ -164,7 +173,7 @@ def _pyramid(
     index: PairIndex,
     corners: NDArray,
     stars: NDArray,
-    options: SearchOptions,
+    options: PyramidOptions,
     stretch: float,
     tried: NDArray,
 ) -> DirectMatch:
@@ -213,7 +222,7 @@ def _match_with_penalty(
     index: PairIndex,
     corners: NDArray,
     stars: NDArray,
-    options: SearchOptions,
+    options: PyramidOptions,
     stretch: float,
     hypotheses: int,
 ) -> DirectMatch:
@@ -230,7 +239,7 @@ def _match_with_penalty(
 
 @jit
 def _count_in_field(
-    index: PairIndex, center: int, R_cam_from_ref: Floats, options: SearchOptions
+    index: PairIndex, center: int, R_cam_from_ref: Floats, options: PyramidOptions
 ) -> int:
     """Number of catalog stars in the field at an attitude; `center` is a star whose neighbors are tested."""
     count = 0

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.catalog.pair_index import PairIndex, first_neighbor, pair_range
-from estimator.core.arrays import Floats
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
@@ -25,17 +24,21 @@ from estimator.identification.direct_match import (
     to_star_match,
     triple,
 )
-from estimator.identification.options import Options
+from estimator.identification.solver_options import Options
 
 FOURTH_STAR = 1e300  # the paper's own rule: "it is already certain that a success will occur"
 # Least angle between base stars, and from them, in tolerances: smaller angles carry little information.
 MIN_SIDE_TOLERANCES = 6.0
 
 
-class SearchOptions(NamedTuple):
+class ShefexOptions(NamedTuple):
     """Search parameters: cosError, a direction's tolerance, and the limits of the effort (see `Options`).
 
-    accept : log10 of the chance at which a match is accepted; FOURTH_STAR accepts any match with a fourth star
+    Attributes
+    ----------
+    accept
+        log10 of the chance at which a match is accepted; FOURTH_STAR accepts any match with a
+        fourth star
     """
 
     cos_error: float
@@ -67,12 +70,19 @@ def shefex(
 ) -> StarMatch | None:
     """SHEFEX-2's pyramid, brightest first, with cosError by eq. 3 from the tolerance and the index's greatest angle.
 
-    vectors_cam   : (N, 3) observed unit vectors, brightest first; the paper has 15 at most
-    tolerance_rad : of a direction;  options : those of `Options`; magnitudes are not used
     All triangles are tried in the order of brightness: the base triangle's stars are found with the k-vector, a fourth
     star and then every other star by its three angles to them. Three tests are added to the paper's: the handedness of
     the triangle, the positions at the attitude found, and significance. The paper accepts any fourth star; here a
     match this good must be expected less than 1e-5 times by chance over all triangles tried. Otherwise returns None.
+
+    Parameters
+    ----------
+    vectors_cam
+        (N, 3) observed unit vectors, brightest first; the paper has 15 at most
+    tolerance_rad
+        Of a direction
+    options
+        Those of `Options`; magnitudes are not used
     """
     settings = Options(**options)
     settings.require_known_focal("shefex")
@@ -83,7 +93,7 @@ def shefex(
     tolerance_rad += settings.stretch * index.max_angle_rad
     error = cos_error(index.max_angle_rad, tolerance_rad)
     base = min(settings.base_stars, len(vectors_cam))
-    parameters = SearchOptions(
+    parameters = ShefexOptions(
         error, tolerance_rad, settings.max_triangles, settings.max_checks, base
     )
     tried = np.zeros(3, np.int64)
@@ -91,7 +101,7 @@ def shefex(
 
 
 @jit
-def search(rays: Floats, index: PairIndex, options: SearchOptions, tried: NDArray) -> DirectMatch:
+def search(rays: Floats, index: PairIndex, options: ShefexOptions, tried: NDArray) -> DirectMatch:
     """Compiled search. Adds its effort to (3,) tried: base triangles found, angles compared, observed triangles."""
     for i in range(options.base - 2):
         for j in range(i + 1, options.base - 1):
@@ -107,7 +117,7 @@ def search(rays: Floats, index: PairIndex, options: SearchOptions, tried: NDArra
 
 @jit
 def _triangle(
-    rays: Floats, index: PairIndex, corners: NDArray, options: SearchOptions, tried: NDArray
+    rays: Floats, index: PairIndex, corners: NDArray, options: ShefexOptions, tried: NDArray
 ) -> DirectMatch:
     """Test every catalog triangle that fits an observed one; other stars are identified by their angles to it."""
     i, j, k = corners
@@ -153,7 +163,7 @@ def _triangle(
 
 
 @jit
-def _angle_gates(rays: Floats, corners: NDArray, options: SearchOptions) -> Floats:
+def _angle_gates(rays: Floats, corners: NDArray, options: ShefexOptions) -> Floats:
     """(N, 10) gates of each observed star's three angles to the base: lower ends, upper ends, cosines, and the area.
 
     The area inside the gates is 0 for base stars and for stars too close to one; these are not identified.
@@ -177,7 +187,7 @@ def _match_others(
     corners: NDArray,
     stars: NDArray,
     gates: Floats,
-    options: SearchOptions,
+    options: ShefexOptions,
     tried: NDArray,
 ) -> DirectMatch:
     """Identify the other stars by their angles to the base triangle, then keep those near their predicted positions.

@@ -1,4 +1,4 @@
-"""Examples of every command, at the end of its `--help` and in docs/reference/commands.md."""
+"""Examples of every command, at the end of its `--help` and in docs/reference/command_line.md."""
 
 from __future__ import annotations
 

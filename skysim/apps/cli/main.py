@@ -9,24 +9,22 @@ from typing import Annotated
 
 import typer
 
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from skysim.apps.cli.commands.availability import availability
 from skysim.apps.cli.commands.camera import app as cameras
-from skysim.apps.cli.commands.files import catalog_app, export, scenes_app
-from skysim.apps.cli.commands.gui import gui
-from skysim.apps.cli.commands.measure.balance import balance
-from skysim.apps.cli.commands.measure.characterize import characterize
-from skysim.apps.cli.commands.measure.dataset import dataset
-from skysim.apps.cli.commands.measure.datasheet import datasheet
-from skysim.apps.cli.commands.measure.survey import survey
+from skysim.apps.cli.commands.dataset import dataset
+from skysim.apps.cli.commands.datasheet import datasheet
+from skysim.apps.cli.commands.measure import balance, characterize
 from skysim.apps.cli.commands.reproduce import reproduce
+from skysim.apps.cli.commands.resources import catalog_app, export, scenes_app
 from skysim.apps.cli.commands.run import compare, render, run, trackers
+from skysim.apps.cli.commands.serve import gui, stream
 from skysim.apps.cli.commands.solve import solve
-from skysim.apps.cli.commands.stream import stream
 from skysim.apps.cli.commands.study import app as studies
+from skysim.apps.cli.commands.survey import survey
 from skysim.apps.cli.commands.validate import check, validate
 from skysim.apps.cli.examples import add_examples
-from skysim.apps.cli.option_names import as_typed
+from skysim.apps.cli.options import as_typed
 from skysim.apps.cli.terminal import print_error
 from skysim.core import __version__, errors
 from skysim.core.errors import InputError

@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skysim.core.errors import InputError
+from skysim.core.errors import OVERRIDES, InputError, Where
+from skysim.scene.camera_sheet import QUESTIONS
 
 if TYPE_CHECKING:
     from skysim.experiments.study.plan import Plan
     from skysim.scene.scene import Scene
+
 
 # Loaded scenes: name and command-line overrides, for the locations in error messages.
 Loaded = tuple[str, dict[str, str]]
@@ -24,14 +26,14 @@ TYPED: dict[str, str] = {}  # keys of the scene that options of their own have s
 
 def complete_scene(incomplete: str) -> list[str]:
     """Names of shipped scenes, and YAML files and folders, that begin with what was typed."""
-    from skysim.core.paths import SCENES
+    from skysim.core.files import SCENES
 
     return complete_yaml(SCENES, incomplete)
 
 
 def complete_study(incomplete: str) -> list[str]:
     """Names of shipped studies, and YAML files and folders, that begin with what was typed."""
-    from skysim.core.paths import STUDIES
+    from skysim.core.files import STUDIES
 
     return complete_yaml(STUDIES, incomplete)
 
@@ -92,10 +94,13 @@ def load(
 ) -> Scene:
     """Load the scene with the command line's overrides. Raises InputError.
 
-    trackers : names of all trackers that will solve its frames, the scene's own first; an override must have an effect
-        for one of them
+    Parameters
+    ----------
+    trackers
+        Names of all trackers that will solve its frames, the scene's own first; an override
+        must have an effect for one of them
     """
-    from skysim.core.io.yaml_reader import parse_overrides
+    from skysim.core.yaml_reader import parse_overrides
     from skysim.scene import unused
     from skysim.scene.loader import load as load_scene
 
@@ -122,9 +127,9 @@ def load(
 
 def used_programs(options: list[str] | None, names: Iterable[str | None]) -> dict[str, str]:
     """The commands of --program by name. Raises InputError for a name that is not among those used."""
-    from skysim.tracking.external import process
+    from skysim.tracking import tracker_interface
 
-    programs = process.program_commands(options)
+    programs = tracker_interface.program_commands(options)
     used = set(names)
     for name in programs:
         if name not in used:
@@ -179,3 +184,86 @@ def datetime_from_iso(text: str | None) -> datetime.datetime | None:
         return datetime.datetime.fromisoformat(text)
     except ValueError:
         raise InputError(f"--time {text}", "", "ISO 8601, e.g. 2012-06-22T21:00:00") from None
+
+
+# What errors name by key, as a user of the command line typed it: options, and `--set`.
+
+
+OPTIONS = {  # by the key of a function's parameter
+    "overrides": "--set",
+    "programs": "--program",
+    "trackers": "--tracker",
+    "engine": "--engine",
+    "scheduler": "--scheduler",
+    "workers": "--workers",
+    "where": "--where",
+    "response": "--response",
+    "export.formats": "--to",
+    "dataset.formats": "--to",
+    "dataset.frames": "--frames",
+    "dataset.frames_per_shard": "--shard-frames",
+    "datasheet.fields": "--fields",
+    "datasheet.fmu": "--fmu",
+    "survey.tilt_deg": "--tilt",
+    "survey.imu_sigma": "--imu-sigma",
+    "survey.led_sigma": "--led-sigma",
+    "survey.lever_sigma": "--lever-sigma",
+    "survey.focal_error": "--focal-error",
+    "balance.torque": "--torque",
+    "balance.offset_bar": "--offset-bar",
+    "balance.inertia_sigma": "--inertia-sigma",
+    "balance.offset_sigma": "--offset-sigma",
+    "balance.wheel_sigma": "--wheel-sigma",
+    "balance.mount_sigma": "--mount-sigma",
+    "balance.tacho_sigma": "--tacho-sigma",
+    "characterize.darks": "--darks",
+    "characterize.flats": "--flats",
+    "characterize.night": "--night",
+    "solve.fov_deg": "--fov",
+    "solve.time_utc": "--time",
+    "solve.catalog": "--catalog",
+    "solve.detector": "--detector",
+    "solve.centroider": "--centroider",
+    "solve.identifier": "--identifier",
+    "solve.solver": "--solver",
+} | {f"answers.{name}": f"--{name.replace('_', '-')}" for name in QUESTIONS}
+
+
+def as_typed(error: InputError, loaded: Loaded | None = None) -> InputError:
+    """The error with the option at fault in place of its key, and the place of a key that was checked after loading.
+
+    Parameters
+    ----------
+    loaded
+        Name and overrides of the scene, by default those of the last one
+    """
+    error = with_place(error, loaded or (LOADED[-1] if LOADED else None))
+    if error.where == OVERRIDES:
+        typed = TYPED.get(error.key)
+        if typed:
+            return InputError(typed, error.problem, error.allowed)
+        return error.at(Where("--set"))
+    return InputError(option_of(error.key), error.problem, error.allowed, error.where)
+
+
+def with_place(error: InputError, loaded: Loaded | None) -> InputError:
+    """The error with file and line, if it is about a key of the loaded scene and has none."""
+    if loaded is None:
+        return error
+    from skysim.scene.loader import located
+
+    return located(error, *loaded)
+
+
+def option_of(key: str) -> str:
+    """The option that gives a parameter, with the name of an item in it: `programs.mine` is `--program mine`."""
+    if key in OPTIONS:
+        return OPTIONS[key]
+    parameter, _, item = key.partition(".")
+    return f"{OPTIONS[parameter]} {item}" if item and parameter in OPTIONS else key
+
+
+def with_location(finding: str, loaded: Loaded | None = None) -> str:
+    """A finding, `key: text`, with file and line of the key in a loaded scene, by default the last one."""
+    key, _, text = finding.partition(": ")
+    return str(as_typed(InputError(key, text), loaded)) if text else finding

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from skysim.core.errors import printable
-from skysim.results.report.as_text import print_blocks, print_table, print_wrapped
-from skysim.results.report.blocks import Cell, Column, Facts, Items, Table, Text
+from skysim.results.report import print_blocks, print_table, print_wrapped
+from skysim.results.report_blocks import Cell, Column, Facts, Items, Table, Text
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
@@ -22,6 +22,11 @@ if TYPE_CHECKING:
     from skysim.experiments.tracker_comparison import TrackerScore
     from skysim.simulation.checks.facts import Fact
     from skysim.simulation.lab import Lab
+if TYPE_CHECKING:
+    from skysim.experiments.study.execution.store import Store
+    from skysim.experiments.study.plan import Plan
+    from skysim.experiments.study.worst import WorstTrial
+
 
 T = TypeVar("T")
 ANIMATION_FRAMES = 60
@@ -179,7 +184,7 @@ def print_remarks(solution: dict[str, Any]) -> None:
 
 
 def print_json(data: Any) -> None:
-    from skysim.core.io.files import to_json
+    from skysim.core.files import to_json
 
     print(to_json(data))
 
@@ -210,7 +215,7 @@ def print_catalog(catalog: dict[str, Any], json: bool) -> None:
 
 def print_titles(folder: Path, json: bool) -> None:
     """Print names and titles of the YAML files in a folder."""
-    from skysim.core.paths import title_of
+    from skysim.core.files import title_of
 
     listed = [
         {"name": path.stem, "title": title_of(path), "file": str(path)}
@@ -230,8 +235,8 @@ def write_3d_views(lab: Lab, log: Telemetry, folder: Path) -> list[Path]:
 
     Without OpenGL print a message and return an empty list, so that the run continues.
     """
-    from skysim.core.io import files
-    from skysim.dynamics.multibody.view import picture
+    from skysim.core import files
+    from skysim.dynamics.multibody import scene_picture
 
     mjcf = lab.export_mjcf()
     joints = log.joints
@@ -240,10 +245,152 @@ def write_3d_views(lab: Lab, log: Telemetry, folder: Path) -> list[Path]:
     steps = max(len(joints) // ANIMATION_FRAMES, 1)
     states = joints[::steps]
     try:
-        files.write_image(image_path, picture.picture(mjcf, joints[len(joints) // 2])[:, :, ::-1])
-        shown = progress(picture.film(mjcf, states), len(states), "rendering the animation")
-        picture.write_film(shown, animation_path, len(states) / float(log.t_s[-1] + 1e-9))
-    except picture.NoPicture as error:
+        files.write_image(
+            image_path, scene_picture.picture(mjcf, joints[len(joints) // 2])[:, :, ::-1]
+        )
+        shown = progress(scene_picture.film(mjcf, states), len(states), "rendering the animation")
+        scene_picture.write_film(shown, animation_path, len(states) / float(log.t_s[-1] + 1e-9))
+    except scene_picture.NoPicture as error:
         print_error(str(error))
         return []
     return [image_path, animation_path]
+
+
+# Terminal output of `skysim study` but for its report: progress and provenance, worst and replayed
+# trials.
+
+
+REPLAYED = (
+    "trial",
+    "point",
+    "replicate",
+    "seed",
+    "status",
+    "x_arcsec",
+    "y_arcsec",
+    "roll_arcsec",
+    "stars",
+    "matched",
+)
+
+
+def study_status(plan: Plan, store: Store) -> dict[str, Any]:
+    """Progress and provenance of a study: trial counts, code version, run time and store."""
+    return {
+        "study": plan.name,
+        "title": plan.study.title,
+        "trials": plan.study.trial_count(len(plan.points)),
+        **store.counts(),
+        "code": store.meta("code"),
+        "seconds": sum(run["seconds"] for run in store.runs()),
+        "store": str(store.path),
+    }
+
+
+def print_study_status(status: dict[str, Any]) -> None:
+    rate = status["done"] / status["seconds"] if status["seconds"] else 0.0
+    print_wrapped(
+        f"{status['title']}: {status['done']} of {status['trials']} trials, {status['failed']} failed,"
+        f" {status['wrong']} wrong attitudes; {status['seconds']:.1f} s, {rate:.0f} trials/s"
+    )
+    print(f"store: {status['store']} (code {status['code']})")
+
+
+def print_worst(
+    response: str,
+    found: Sequence[WorstTrial],
+    levels: Sequence[Mapping[str, Any]],
+    repeat: str,
+    instead: str,
+) -> None:
+    """Print the worst attitudes by a response, the settings that start there, and the commands that repeat them.
+
+    Parameters
+    ----------
+    levels
+        Of each trial's point
+    instead
+        The command to give if no trial counts for the response
+    """
+    if not found:
+        print(f"no trial counts for {response}; rank them by an error: {instead}")
+    for rank, (one, level) in enumerate(zip(found, levels, strict=True), 1):
+        at = ", ".join(f"{name} = {value}" for name, value in level.items())
+        print(
+            f"{rank}. {one.direction}, {one.lights:.0f} lights: {printable(one.event)} ({printable(at)})"
+        )
+        if one.start:
+            print(f"   {one.start}")
+        print(f"   {repeat} {one.trial}")
+
+
+def print_replay(replay: dict[str, Any]) -> None:
+    """Print the outcome of a repeated trial, and whether it differs from the stored one."""
+    for name in REPLAYED:
+        print(f"{name:12s} {replay[name]}")
+    if replay["changed"]:
+        print_error(
+            f"differs from the store in {', '.join(replay['changed'])}: another code version"
+        )
+    if replay["error"]:
+        print(replay["error"])
+    for path in replay["pictures"][:10]:
+        print(path)
+
+
+# Terminal output of `skysim survey --plan` and `--repeat`: the attitudes to hold, predicted and
+# simulated errors.
+
+
+SHOWN_STOPS = 12  # attitudes of a plan that are printed; the file has all
+
+
+def print_plan(plan: dict[str, Any]) -> None:
+    from skysim.experiments.dome_survey.survey_report import stop_table
+
+    print_table(stop_table(plan["attitudes"][:SHOWN_STOPS]))
+    if len(plan["attitudes"]) > SHOWN_STOPS:
+        print(f"... {len(plan['attitudes'])} attitudes in all, in {plan['plan']}")
+    print()
+    heads = ("LED place mm", "lever mm", "focal length px")
+    columns = [
+        Column("frames"),
+        Column("LEDs measured"),
+        *(Column(head, format=".3g") for head in heads),
+    ]
+    keys = ("frames", "measured", "led_mm", "lever_mm", "focal_px")
+    table = Table(columns, [[row[key] for key in keys] for row in plan["predicted"]])
+    print_table(
+        table,
+        f"predicted errors (1σ) of {plan['leds']} LEDs, centroids to {plan['noise_px']:.2g} px",
+    )
+
+
+def print_comparison(result: dict[str, Any]) -> None:
+    columns = [
+        Column("what", kind="text"),
+        Column("predicted", format=".3g"),
+        Column("simulated", format=".3g"),
+    ]
+    rows = [
+        [
+            row["what"],
+            row["predicted"],
+            row["simulated"],
+            None if row["ratio"] is None else f"{row['ratio']:.2f} ± {row['ratio_sigma']:.2f}",
+        ]
+        for row in result["rows"]
+    ]
+    print_table(Table([*columns, Column("ratio")], rows))
+    print_wrapped(
+        f"{len(result['measured'])} surveys of {result['frames']} frames, {min(result['measured'])} to"
+        f" {max(result['measured'])} LEDs measured; {result['false_alarms']} faults reported, of none"
+    )
+    for failure in result["failures"]:
+        print_wrapped(f"one more survey failed: {failure}")
+
+
+PRINTERS: dict[str, Callable[[dict[str, Any]], None]] = {
+    "plan": print_plan,
+    "repeat": print_comparison,
+}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from skysim.core.types import Floats
 from skysim.dynamics.multibody import Shape
-from skysim.results import stretch
+from skysim.results import plots
 
 Triple = tuple[float, float, float]
 NAN = float("nan")
@@ -26,14 +26,21 @@ LIMITS = (
 class Display(NamedTuple):
     """How the browser draws frames.
 
-    screen_px : width and height of its screen that a whole frame fills; (0, 0): all pixels are needed
-    limits : black and white, by one of LIMITS or in DN;  curve : between them, one of `stretch.CURVES`
-    near_px : column and row of the upper left pixel in the loupe, if it shows any
+    Attributes
+    ----------
+    screen_px
+        Width and height of its screen that a whole frame fills; (0, 0): all pixels are needed
+    limits
+        Black and white, by one of LIMITS or in DN
+    curve
+        Between them, one of `stretch.CURVES`
+    near_px
+        Column and row of the upper left pixel in the loupe, if it shows any
     """
 
     screen_px: tuple[int, int] = (0, 0)
     limits: str | tuple[float, float] = LIMITS[0]
-    curve: str = next(iter(stretch.CURVES))
+    curve: str = next(iter(plots.CURVES))
     near_px: tuple[int, int] | None = None
 
 
@@ -44,8 +51,16 @@ ALL_PIXELS = Display()
 class Pixels:
     """A frame's pixels for the browser, see `worker.pixels.pixels_for`.
 
-    data : the encoded pixels;  fields : what the browser draws beside them: limits, histogram, the loupe's pixels
-    display : that they are made for;  number : of the image in its worker
+    Attributes
+    ----------
+    data
+        The encoded pixels
+    fields
+        What the browser draws beside them: limits, histogram, the loupe's pixels
+    display
+        That they are made for
+    number
+        Of the image in its worker
     """
 
     data: bytes
@@ -58,7 +73,7 @@ NO_PIXELS = Pixels(b"", {}, ALL_PIXELS, 0)
 
 
 @dataclass(frozen=True, slots=True)
-class Light:
+class LightRow:
     """A true light on the frame: HIP or LED number, pixel, electrons, V magnitude (NaN of an LED)."""
 
     id: int
@@ -69,10 +84,13 @@ class Light:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lights(Sequence[Light]):
+class LightColumns(Sequence[LightRow]):
     """The true lights of a frame as columns, since objects for hundreds of stars take longer to send than the pixels.
 
-    id, electrons, magnitude : (N,) and xy_px : (N, 2), see `Light`
+    Attributes
+    ----------
+    id, electrons, magnitude
+        (N,) and xy_px : (N, 2), see `Light`
     """
 
     id: NDArray[np.int64]
@@ -84,17 +102,17 @@ class Lights(Sequence[Light]):
         return len(self.id)
 
     @overload
-    def __getitem__(self, n: int) -> Light: ...
+    def __getitem__(self, n: int) -> LightRow: ...
     @overload
-    def __getitem__(self, n: slice) -> Lights: ...
-    def __getitem__(self, n: int | slice) -> Light | Lights:
+    def __getitem__(self, n: slice) -> LightColumns: ...
+    def __getitem__(self, n: int | slice) -> LightRow | LightColumns:
         if isinstance(n, slice):
-            return Lights(self.id[n], self.xy_px[n], self.electrons[n], self.magnitude[n])
+            return LightColumns(self.id[n], self.xy_px[n], self.electrons[n], self.magnitude[n])
         x, y = self.xy_px[n].tolist()
-        return Light(int(self.id[n]), x, y, float(self.electrons[n]), float(self.magnitude[n]))
+        return LightRow(int(self.id[n]), x, y, float(self.electrons[n]), float(self.magnitude[n]))
 
 
-NO_LIGHTS = Lights(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0), np.empty(0))
+NO_LIGHTS = LightColumns(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0), np.empty(0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,9 +131,16 @@ class Detection:
 class TrackerResult:
     """The tracker's solution of a frame, and its error if the truth is known.
 
-    status : "solved", or the reason why not;  angles_deg : in the order of the scene's angle names
-    sigma_arcsec : estimated standard errors, cross-boresight and roll
-    windows_px : (x, y) at which the tracker's map predicts lights
+    Attributes
+    ----------
+    status
+        "solved", or the reason why not
+    angles_deg
+        In the order of the scene's angle names
+    sigma_arcsec
+        Estimated standard errors, cross-boresight and roll
+    windows_px
+        (x, y) at which the tracker's map predicts lights
     """
 
     status: str
@@ -151,8 +176,11 @@ class Lens:
 class Pose:
     """Attitude of a frame's camera: reference_from_cam by rows, the reference being ICRS or the lab.
 
-    place_m, depth_m : under a dome the camera's place, lab frame, and for each point of the lens's tables the depth
-        along the boresight at which its ray meets the surface; None if it does not
+    Attributes
+    ----------
+    place_m, depth_m
+        Under a dome the camera's place, lab frame, and for each point of the lens's tables the
+        depth along the boresight at which its ray meets the surface; None if it does not
     """
 
     rotation: tuple[float, ...]
@@ -164,10 +192,20 @@ class Pose:
 class FrameView:
     """One rendered frame: image, true attitude, true lights, and the tracker's solution if the frame was solved.
 
-    pose : where its pixels point, with the scene's lens;  saturation_dn : from which a pixel is saturated
-    body_wxyz : lab_from_body;  t_s : time in the motion that is played, else 0
-    filter_arcsec : error of the filter during the motion
-    innovation_arcsec : angle between the star tracker's attitude and the filter's
+    Attributes
+    ----------
+    pose
+        Where its pixels point, with the scene's lens
+    saturation_dn
+        From which a pixel is saturated
+    body_wxyz
+        lab_from_body
+    t_s
+        Time in the motion that is played, else 0
+    filter_arcsec
+        Error of the filter during the motion
+    innovation_arcsec
+        Angle between the star tracker's attitude and the filter's
     """
 
     pose: Pose
@@ -176,8 +214,8 @@ class FrameView:
     angles_deg: Triple
     body_wxyz: tuple[float, ...]
     exposure_s: float
-    statistics: stretch.FrameStatistics
-    lights: Lights
+    statistics: plots.FrameStatistics
+    lights: LightColumns
     result: TrackerResult | None
     ms: float
     t_s: float = 0.0
@@ -198,11 +236,24 @@ class PushedView(NamedTuple):
 class SceneInfo:
     """Facts about a loaded scene that the page displays.
 
-    names : of its three angles;  prefix : of its lights' numbers (HIP or LED)
-    field_deg : horizontal field of view;  pixel_arcsec : angle of a pixel in the frame's middle
-    stages : the tracker's algorithm by stage
-    duration_s : of its motion;  noise : whether the camera has noise, else a frame is the expected value
-    surveyed : whether a survey of its dome has begun
+    Attributes
+    ----------
+    names
+        Of its three angles
+    prefix
+        Of its lights' numbers (HIP or LED)
+    field_deg
+        Horizontal field of view
+    pixel_arcsec
+        Angle of a pixel in the frame's middle
+    stages
+        The tracker's algorithm by stage
+    duration_s
+        Of its motion
+    noise
+        Whether the camera has noise, else a frame is the expected value
+    surveyed
+        Whether a survey of its dome has begun
     """
 
     scene: str
@@ -223,7 +274,10 @@ class SceneInfo:
 class LookFrom(NamedTuple):
     """A place to look from and what to look at, m, in the lab frame, or in body axes if it is on the vehicle.
 
-    fov_deg : vertical field of view
+    Attributes
+    ----------
+    fov_deg
+        Vertical field of view
     """
 
     eye_m: Triple
@@ -237,10 +291,15 @@ class LookFrom(NamedTuple):
 class LabGeometry:
     """3-D geometry of the laboratory; meters in the lab frame unless stated otherwise.
 
-    shapes  : those of the MJCF file that `skysim scenes export` writes, without the lights
-    ids, lights_m, radius_m, lit : (N,) the lights, (N, 3) their positions, (N,) drawn radii, (N,) whether they shine;
+    Attributes
+    ----------
+    shapes
+        Those of the MJCF file that `skysim scenes export` writes, without the lights
+    ids, lights_m, radius_m, lit
+        (N,) the lights, (N, 3) their positions, (N,) drawn radii, (N,) whether they shine;
         stars are on a sphere
-    views   : places to look from, by name
+    views
+        Places to look from, by name
     """
 
     shapes: tuple[Shape, ...]
@@ -259,12 +318,19 @@ class MotionLog:
     curves: dict[str, tuple[float, ...]] = field(default_factory=dict)
 
 
-class FrameRow(NamedTuple):
+class FlightRow(NamedTuple):
     """One frame of a flight in numbers; NaN where it was not solved, or the scene has no filter.
 
-    t_s : begin of its exposure;  cross, roll : the tracker's error and standard error, arcsec
-    lights, identified : in the field, and identified
-    filter_arcsec, innovation_arcsec : see `FrameView`
+    Attributes
+    ----------
+    t_s
+        Begin of its exposure
+    cross, roll
+        The tracker's error and standard error, arcsec
+    lights, identified
+        In the field, and identified
+    filter_arcsec, innovation_arcsec
+        See `FrameView`
     """
 
     t_s: float
@@ -282,15 +348,22 @@ class FrameRow(NamedTuple):
 class FlightStep:
     """Progress of a flight that is being computed.
 
-    t_s, duration_s : how far it is, and how long it lasts
-    rows : of the frames since the last step;  log : of the motion so far, where there are new frames
-    residuals : of the lights identified in these frames: time, number, and residual in pixels
+    Attributes
+    ----------
+    t_s, duration_s
+        How far it is, and how long it lasts
+    rows
+        Of the frames since the last step
+    log
+        Of the motion so far, where there are new frames
+    residuals
+        Of the lights identified in these frames: time, number, and residual in pixels
     """
 
     is_done: bool
     t_s: float
     duration_s: float
-    rows: tuple[FrameRow, ...] = ()
+    rows: tuple[FlightRow, ...] = ()
     log: MotionLog | None = None
     residuals: tuple[tuple[float, int, float], ...] = ()
 
@@ -305,8 +378,14 @@ class PlanCheck(NamedTuple):
 class AmbiguityMap(NamedTuple):
     """The most similar other field of the field about each LED.
 
-    ids, others : (N,) LEDs at the centers of the fields;  fraction : (N,) of the LEDs that coincide, at least `least`
-    coincidence_mm : two LEDs coincide if they are nearer than this
+    Attributes
+    ----------
+    ids, others
+        (N,) LEDs at the centers of the fields
+    fraction
+        (N,) of the LEDs that coincide, at least `least`
+    coincidence_mm
+        Two LEDs coincide if they are nearer than this
     """
 
     ids: NDArray[np.int64]
@@ -319,8 +398,17 @@ class AmbiguityMap(NamedTuple):
 class SurveyPlan(NamedTuple):
     """Attitudes to hold for a survey of the dome.
 
-    angles_deg : roll, pitch and yaw of each;  shown : LEDs that each shows;  leds : on the dome
-    steps      : predicted after a number of frames: LEDs measured, and their rms error, mm; None if not determined
+    Attributes
+    ----------
+    angles_deg
+        Roll, pitch and yaw of each
+    shown
+        LEDs that each shows
+    leds
+        On the dome
+    steps
+        Predicted after a number of frames: LEDs measured, and their rms error, mm; None if not
+        determined
     """
 
     angles_deg: tuple[tuple[float, ...], ...]
@@ -332,13 +420,25 @@ class SurveyPlan(NamedTuple):
 class SurveyFound(NamedTuple):
     """What the frames of a survey have measured, and the attitudes to hold next.
 
-    frames, connected : so far, and those that share enough LEDs with others
-    missed : attitudes of the last flight without a frame at which the vehicle rested
-    measured, seen_once, unseen : LEDs, of those in connected frames;  renamed : measured ones with another's number
-    sigma_mm : estimated rms error of the measured LEDs about each axis;  before_mm, error_mm : the true one before the
-        survey and now. None, with the reason in `refusal`, if the frames do not determine them
-    faults : of the dome, a line each
-    ids, known : (N,) the LEDs, and by how much the survey has reduced the uncertainty of each, 0 to 1;
+    Attributes
+    ----------
+    frames, connected
+        So far, and those that share enough LEDs with others
+    missed
+        Attitudes of the last flight without a frame at which the vehicle rested
+    measured, seen_once, unseen
+        LEDs, of those in connected frames
+    renamed
+        Measured ones with another's number
+    sigma_mm
+        Estimated rms error of the measured LEDs about each axis
+    before_mm, error_mm
+        The true one before the survey and now. None, with the reason in `refusal`, if the
+        frames do not determine them
+    faults
+        Of the dome, a line each
+    ids, known
+        (N,) the LEDs, and by how much the survey has reduced the uncertainty of each, 0 to 1;
         `known` is empty after a refusal
     """
 

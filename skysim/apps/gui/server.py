@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
+import ctypes
+import gc
 import hmac
 import re
 import secrets
 import signal
+import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -27,14 +31,69 @@ from starlette.responses import (
 )
 from starlette.routing import Route, Router
 
-from skysim.apps.gui import memory
+from skysim.apps.gui.page.photo_panel import LIMIT_BYTES
 from skysim.apps.gui.page.tab import Tab
-from skysim.apps.gui.panels.photo import LIMIT_BYTES
-from skysim.apps.gui.views.served import FRAMES, display_of
+from skysim.apps.gui.views.overlay import FRAMES, display_of
 from skysim.apps.gui.worker.session import Workers
 from skysim.apps.gui.worker.study_process import StudyProcess, is_shown
 from skysim.core.constants import DAY_S
 from skysim.scene.loader import find
+
+# Garbage collection of the server, while no page gets a frame.
+
+
+THRESHOLDS = (
+    2_000,
+    10,
+    1_000,
+)  # new objects until a collection, and collections until one of older objects
+QUIET_S = 1.0  # after a page was closed, and without a new frame on any page, before closed pages are collected
+PATIENCE_S = 60.0  # after which they are collected although frames follow one another
+
+
+def freeze() -> None:
+    """Take what was imported out of the garbage collector's sight, and let it look at new objects alone.
+
+    A collection of all pages takes half a second with 20 of them, in which no key is answered. Only `ClosedPages`
+    makes one.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(*THRESHOLDS)
+
+
+def release_memory() -> None:
+    """Collect closed pages, and return their memory to the system; glibc's allocator would keep it."""
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim:
+        trim(0)
+
+
+class ClosedPages:
+    """Collects closed pages, many at once if many were closed, while no page gets a frame, or PATIENCE_S later."""
+
+    def __init__(self) -> None:
+        self.waiting: asyncio.Task[None] | None = None
+
+    def collect_soon(self) -> None:
+        """Collect when the pages are quiet."""
+        if self.waiting is None:
+            self.waiting = asyncio.create_task(self.collect())
+
+    async def collect(self) -> None:
+        end_s = time.monotonic() + PATIENCE_S
+        await asyncio.sleep(QUIET_S)
+        while (now_s := time.monotonic()) < end_s and now_s - last_frame_s() < QUIET_S:
+            await asyncio.sleep(QUIET_S)
+        self.waiting = None  # a page that is closed from now on needs another collection
+        await asyncio.to_thread(release_memory)
+
+
+def last_frame_s() -> float:
+    """When a page got a frame last, by `time.monotonic`; minus infinity before the first."""
+    return max((frames.added_s for frames in FRAMES.values()), default=-float("inf"))
+
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
 # Only this server's own code runs in the page, and no other site may frame it. NiceGUI needs inline code and `eval`.
@@ -144,10 +203,16 @@ def is_plain_file(scope: Any) -> bool:
 class Guard:
     """ASGI middleware that refuses unknown host names, requests of other sites or without token, and large requests.
 
-    hosts : allowed Host headers ("*": any). This stops DNS rebinding: another site's name that resolves to this
-        server comes with its own Host header.
-    token : required; `/?token=...` stores it in a cookie
-    port : of the server. Browsers send a host's cookies to all its ports, so the cookie's name has the port
+    Attributes
+    ----------
+    hosts
+        Allowed Host headers ("*": any). This stops DNS rebinding: another site's name that
+        resolves to this server comes with its own Host header.
+    token
+        Required; `/?token=...` stores it in a cookie
+    port
+        Of the server. Browsers send a host's cookies to all its ports, so the cookie's name has
+        the port
     """
 
     def __init__(self, app: Any, hosts: tuple[str, ...], token: str, port: int) -> None:
@@ -262,7 +327,7 @@ def stop_studies() -> None:
         process.stop(signal.SIGTERM)
 
 
-async def close(tab: Tab, closed_pages: memory.ClosedPages) -> None:
+async def close(tab: Tab, closed_pages: ClosedPages) -> None:
     """Release all that a tab held."""
     await tab.close()
     closed_pages.collect_soon()
@@ -271,9 +336,9 @@ async def close(tab: Tab, closed_pages: memory.ClosedPages) -> None:
 def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers: int) -> None:
     """Register all routes, and prepare the workers of tabs."""
     pool = Workers(workers)
-    closed_pages = memory.ClosedPages()
+    closed_pages = ClosedPages()
     app.on_startup(be_patient)
-    app.on_startup(memory.freeze)
+    app.on_startup(freeze)
     app.on_startup(partial(pool.prepare, str(find(scene).resolve())))
     app.on_shutdown(stop_studies)
 
@@ -319,10 +384,15 @@ def serve(
 ) -> None:
     """Serve until Ctrl-C.
 
-    token : required of browsers, also of this machine, where other users and other sites' pages are; a random one if
-        empty
-    cameras : live cameras that the page may watch, see `skysim.core.io.images`
-    workers : greatest number of worker processes; further pages wait for one
+    Parameters
+    ----------
+    token
+        Required of browsers, also of this machine, where other users and other sites' pages
+        are; a random one if empty
+    cameras
+        Live cameras that the page may watch, see `skysim.core.images`
+    workers
+        Greatest number of worker processes; further pages wait for one
     """
     hosts = LOOPBACK if host in LOOPBACK else ("*",)
     token = token or secrets.token_urlsafe(16)

@@ -52,7 +52,10 @@ EFFORTS = 3  # searches of the mirrored picture: its diagnosis should not take a
 class Refusal:
     """A monochrome image that was refused: its centroids, and the solvers that were tried.
 
-    row_order_known : False if both row orders were tried, and with them the mirrored sky
+    Attributes
+    ----------
+    row_order_known
+        False if both row orders were tried, and with them the mirrored sky
     """
 
     image: NDArray

@@ -13,23 +13,25 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.core.types import Centroids
 from estimator.detection.detect import check_size
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.plate_solver import retries
-from skysim.apps.plate_solver.solution import PlateSolution, annotated_image, solution_fields
 from skysim.apps.plate_solver.solver import (
     FOV_LIMITS_DEG,
+    PlateSolution,
     Solver,
+    annotated_image,
     kept_solver,
     make_solver,
+    solution_fields,
     solve_array,
     validated_date,
 )
+from skysim.core import files, images
 from skysim.core.errors import InputError, printable
-from skysim.core.io import files, images
 
 ANNOTATED = ".annotated.png"
 # The focal length of the 35 mm camera (36 x 24 mm) with the same diagonal field: CIPA DCG-001, to which Exif's
@@ -40,7 +42,7 @@ FOCAL_35MM_UNCERTAINTY = 0.10
 TOP_DOWN = "no ROWORDER in the header: its first row is the highest here, not the lowest as the standard recommends"
 
 
-class Hypothesis(NamedTuple):
+class Reading(NamedTuple):
     """One reading of a picture: the pixels as they would be viewed, the solver for its field, and what it assumes."""
 
     pixels: NDArray
@@ -48,13 +50,13 @@ class Hypothesis(NamedTuple):
     assumption: str = ""
 
 
-class Outcome(NamedTuple):
+class SolvedReading(NamedTuple):
     """The hypothesis that was solved, or else the first one, with its report and tracker; all hypotheses."""
 
-    hypothesis: Hypothesis
+    hypothesis: Reading
     report: Report
     tracker: StarTracker
-    tried: list[Hypothesis]
+    tried: list[Reading]
 
 
 def solve(
@@ -67,13 +69,22 @@ def solve(
 ) -> PlateSolution:
     """Solve the attitude of an image file of the sky, lost in space. Public as `skysim.solve`.
 
-    fov_deg  : horizontal field of view to 5 %; if neither it nor `camera` is given, the field that EXIF tells, and 2 to
-        100 degrees
-    camera   : a scene, a camera file or an OpenCV calibration in place of fov_deg
-    time_utc : when the image was taken; the FITS header's date if left out
-    catalog  : name or file of a deeper star catalog, for fields of a few degrees
+    Parameters
+    ----------
+    fov_deg
+        Horizontal field of view to 5 %; if neither it nor `camera` is given, the field that
+        EXIF tells, and 2 to 100 degrees
+    camera
+        A scene, a camera file or an OpenCV calibration in place of fov_deg
+    time_utc
+        When the image was taken; the FITS header's date if left out
+    catalog
+        Name or file of a deeper star catalog, for fields of a few degrees
 
-    Raises InputError with one line for an image that cannot be read.
+    Raises
+    ------
+    InputError
+        With one line for an image that cannot be read.
     """
     if camera or catalog:
         solver = make_solver(
@@ -91,7 +102,10 @@ def solve(
 def pictures_in(paths: Iterable[Path]) -> list[Path]:
     """The files, with every folder replaced by its image files, sorted; without annotated images of an earlier call.
 
-    Raises InputError for a folder without an image.
+    Raises
+    ------
+    InputError
+        For a folder without an image.
     """
     found: list[Path] = []
     for path in paths:
@@ -171,7 +185,7 @@ def read_and_solve(path: Path, solver: Solver, annotated: Path | None) -> dict[s
     return result
 
 
-def load_picture(path: Path, solver: Solver) -> images.Picture:
+def load_picture(path: Path, solver: Solver) -> images.ViewedImage:
     """The picture as it is viewed, in monochrome. Raises InputError or ImageError if it cannot be solved."""
     picture = images.read_picture(path)
     check_image(path, picture.pixels, solver)
@@ -183,7 +197,10 @@ def load_picture(path: Path, solver: Solver) -> images.Picture:
 def check_image(path: Path, image: NDArray, solver: Solver) -> None:
     """Check the image's size against the known camera, and for a scene's camera also its channels and bit depth.
 
-    Raises InputError if the image cannot come from this camera.
+    Raises
+    ------
+    InputError
+        If the image cannot come from this camera.
     """
     camera = solver.camera
     if camera and image.ndim != 2:
@@ -204,8 +221,8 @@ def check_image(path: Path, image: NDArray, solver: Solver) -> None:
 
 
 def solve_picture(
-    picture: images.Picture, solver: Solver, date_utc: datetime.datetime | None
-) -> Outcome:
+    picture: images.ViewedImage, solver: Solver, date_utc: datetime.datetime | None
+) -> SolvedReading:
     """Solve the hypotheses about a monochrome picture in turn, up to the first that is solved."""
     tried = hypotheses(picture, solver)
     # those of a reading serve all fields of view
@@ -214,14 +231,16 @@ def solve_picture(
     for hypothesis in tried:
         reading = id(hypothesis.pixels)
         solved = solve_array(hypothesis.pixels, hypothesis.solver, date_utc, centroids.get(reading))
-        outcomes.append(Outcome(hypothesis, *solved, tried))
+        outcomes.append(SolvedReading(hypothesis, *solved, tried))
         centroids[reading] = outcomes[-1].report.centroids
         if outcomes[-1].report.attitude.solved:
             return outcomes[-1]
     return solve_again(outcomes, date_utc) or outcomes[0]
 
 
-def solve_again(refused: list[Outcome], date_utc: datetime.datetime | None) -> Outcome | None:
+def solve_again(
+    refused: list[SolvedReading], date_utc: datetime.datetime | None
+) -> SolvedReading | None:
     """The first hypothesis that is solved by other centroids of its picture (`retries`), if any."""
     if refused[0].hypothesis.solver.camera:
         return None  # a frame of a camera that is known, with its own saturation
@@ -237,13 +256,13 @@ def solve_again(refused: list[Outcome], date_utc: datetime.datetime | None) -> O
                 )
                 if report.attitude.solved:
                     notes = [one.assumption] * bool(one.assumption) + [retry.note]
-                    return Outcome(
+                    return SolvedReading(
                         one._replace(assumption="; ".join(notes)), report, tracker, refused[0].tried
                     )
     return None
 
 
-def hypotheses(picture: images.Picture, solver: Solver) -> list[Hypothesis]:
+def hypotheses(picture: images.ViewedImage, solver: Solver) -> list[Reading]:
     """What a picture may show, the likeliest first: its field by EXIF, or an unknown one; both row orders, if unknown.
 
     A field or a camera of the user's takes precedence over EXIF.
@@ -262,13 +281,13 @@ def hypotheses(picture: images.Picture, solver: Solver) -> list[Hypothesis]:
         readings.append((np.ascontiguousarray(picture.pixels[::-1]), TOP_DOWN))
     count = len(solvers) * len(readings)
     return [
-        Hypothesis(pixels, replace(one, hypotheses=count), text)
+        Reading(pixels, replace(one, hypotheses=count), text)
         for one in solvers
         for pixels, text in readings
     ]
 
 
-def outcome_fields(outcome: Outcome, date_utc: datetime.datetime | None) -> dict[str, Any]:
+def outcome_fields(outcome: SolvedReading, date_utc: datetime.datetime | None) -> dict[str, Any]:
     """The fields of PlateSolution: what was seen and tried, the solution, or the likely cause of a refusal."""
     report = outcome.report
     (pixels, solver, assumption) = outcome.hypothesis

@@ -18,12 +18,76 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.errors import ImageError
+from estimator.attitude.rate import covariance_of
+from estimator.core.camera import Camera
+from estimator.core.checks import ImageError
 from estimator.core.types import Centroids
 from estimator.detection.background import estimate_background
+from estimator.detection.classify import NO_STAR
 from estimator.detection.detect import DETECTORS, to_native
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
-from skysim.apps.plate_solver import binned
+
+# Centroids of a picture whose stars are large: out of focus, or blurred by motion.
+
+
+FACTORS = (8, 4, 2)  # sides of the squares: the most reduced picture is the fastest
+MIN_SIDE_PX = 200  # of a binned picture
+# of so many lights of the binned picture the median area; a sharp star has 10
+BRIGHTEST = 12
+MIN_AREA_PX = 30
+MAX_SIGMA_PX = 20.0  # that `Centroids.check_values` allows
+
+
+def large_lights(image: NDArray, settings: Settings) -> Iterator[tuple[int, Centroids]]:
+    """The sides of the squares for which a picture's lights are large, and the centroids in pixels of the picture."""
+    for factor in FACTORS:
+        if min(image.shape) < factor * MIN_SIDE_PX:
+            continue
+        small = bin_pixels(image, factor)
+        try:
+            found = DETECTORS[settings.detector](
+                small, settings.threshold_sigma, settings.min_area_px
+            )
+            area_px = found.area_px[found.flag & NO_STAR == 0][:BRIGHTEST]
+            if not len(area_px) or np.median(area_px) < MIN_AREA_PX:
+                continue
+            camera = camera_of(small)
+            yield (
+                factor,
+                enlarged(detect_and_centroid(small, camera, settings, Clock()), factor, settings),
+            )
+        except ImageError:  # nothing is left, or there are thousands of lights
+            continue
+
+
+def bin_pixels(image: NDArray, factor: int) -> NDArray[np.uint16]:
+    """The means of squares of pixels, spread over 16 bits; what is left over at the right and below is cut off."""
+    height, width = (side // factor for side in image.shape)
+    light = image[: height * factor, : width * factor].astype(np.float32)
+    small = cv2.resize(light, (width, height), interpolation=cv2.INTER_AREA)
+    low = float(small.min())
+    high = float(small.max())
+    return np.rint((small - low) * (65535 / max(high - low, 1e-30))).astype(np.uint16)
+
+
+def enlarged(centroids: Centroids, factor: int, settings: Settings) -> Centroids:
+    """Centroids of a binned picture in pixels of the picture itself; the floor of their errors is in binned pixels."""
+    floor_px2 = settings.centroid_sigma_px**2 * np.eye(2)
+    out = replace(
+        centroids,
+        xy_px=factor * centroids.xy_px + (factor - 1) / 2,
+        sigma_px=factor * np.hypot(centroids.sigma_px, settings.centroid_sigma_px),
+        covariance_px2=factor**2 * (covariance_of(centroids) + floor_px2),
+        streak_px=None,
+        streak_covariance_px2=None,
+    )
+    return out.take(out.sigma_px < MAX_SIGMA_PX)
+
+
+def camera_of(pixels: NDArray) -> Camera:
+    """A camera for the detection, which uses only its size."""
+    return Camera.from_fov(pixels.shape[1], pixels.shape[0], 1.0)
+
 
 EXTRA_TRIES = 1000
 MIN_LIGHTS = 10  # in a half: fewer were searched in all combinations with the others
@@ -64,7 +128,7 @@ def retries(pixels: NDArray, centroids: Centroids, settings: Settings) -> Iterat
         yield from halves(pixels, flat, f"{FLAT}, ")
     for trailed in trails(pixels, settings):
         yield Retry(TRAILED, MORE_EFFORTS, trailed)
-    for factor, large in binned.large_lights(pixels, settings):
+    for factor, large in large_lights(pixels, settings):
         yield Retry(BINNED.format(factor), MORE_EFFORTS, large)
 
 
@@ -88,11 +152,11 @@ def trails(pixels: NDArray, settings: Settings) -> Iterator[Centroids]:
     The mean of n^2 pixels has n times the signal-to-noise ratio, and the trail is one piece there. With its streak the
     detector adds up the light along each trail in the pixels themselves.
     """
-    camera = binned.camera_of(pixels)
+    camera = camera_of(pixels)
     for factor in TRAIL_FACTORS:
         try:
             blobs = DETECTORS[settings.detector](
-                binned.bin_pixels(pixels, factor), settings.threshold_sigma
+                bin_pixels(pixels, factor), settings.threshold_sigma
             )
             x, y = factor * np.array(blobs.streak_px or ROUND)
             if hypot(x, y) >= MIN_TRAIL_PX:
@@ -106,12 +170,12 @@ def without_clouds(pixels: NDArray, settings: Settings) -> Centroids:
     noise = estimate_background(to_native(pixels)).noise
     if np.quantile(noise, 0.9) < UNEVEN * np.quantile(noise, 0.1):
         return Centroids.empty()
-    light = cv2.GaussianBlur(binned.bin_pixels(pixels, 1), (0, 0), 0.5)
+    light = cv2.GaussianBlur(bin_pixels(pixels, 1), (0, 0), 0.5)
     flat = cv2.morphologyEx(light, cv2.MORPH_TOPHAT, np.ones((TOPHAT_PX, TOPHAT_PX), np.uint8))
     try:
         # The edges of trees leave as many lights as there are stars.
         more = replace(settings, max_blobs=2 * settings.max_blobs)
-        found = detect_and_centroid(flat, binned.camera_of(pixels), more, Clock(), ROUND)
+        found = detect_and_centroid(flat, camera_of(pixels), more, Clock(), ROUND)
         return replace(found, sigma_px=np.hypot(found.sigma_px, FLAT_SIGMA_PX))
     except ImageError:
         return Centroids.empty()

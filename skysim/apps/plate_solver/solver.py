@@ -2,7 +2,7 @@
 
 If the field of view is known (a camera file, an OpenCV calibration or `--fov`), one `StarTracker` solves the image.
 Otherwise 2 to 100 degrees are split into N overlapping ranges of focal length, each searched by quads of stars
-(`estimator.identification.stars.quads`) with a tracker that fits the focal length within its range. The image's stars
+(`estimator.identification.star_quads`) with a tracker that fits the focal length within its range. The image's stars
 are detected once; all trackers are tried with little effort before any is tried with more. A tracker has the brightest
 stars of the catalog, as many as its narrowest field needs.
 
@@ -24,24 +24,26 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from estimator.catalog import catalog as star_catalog
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
-from estimator.core.types import Attitude, Centroids
+from estimator.core.checks import Floats, ImageError
+from estimator.core.types import Attitude, Centroids, ra_dec_roll_rad
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_centroid
-from estimator.trackers.residuals.refinement import NO_MATCH
+from estimator.trackers.refinement import NO_MATCH
 from estimator.trackers.star_tracker import QUAD_SEARCHES, StarTracker
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.paths import CATALOGS
+from skysim.core.files import CATALOGS
 from skysim.core.time import check_year
 
 if TYPE_CHECKING:
-    from skysim.scene.opencv_calibration import Calibration
+    from skysim.scene.opencv_calibration import OpencvCalibration
     from skysim.scene.sections.camera import CameraConfig
+
 
 # Relative uncertainty of the focal length. An OpenCV chessboard calibration gives it to about 0.1 %.
 CALIBRATED_UNCERTAINTY = 0.003
@@ -60,16 +62,28 @@ class FieldSearch:
     the angle a from the boresight by up to 2 u sin^2 a (`quads._code_gate`). In narrow fields that is nothing, and the
     lengths of an index's quads, in units of the field's height, limit the range.
 
-    widest_deg, narrowest_deg : limits of the fields of view
-    typical_deg : field that is tried first
-    max_uncertainty : greatest relative half-width of a range of focal lengths
-    max_warp   : greatest u sin^2 a, a of the corner
-    overlap    : of neighboring ranges, as a fraction of the focal length
-    stars      : mean number of catalog stars in the narrowest field of a tracker
-    least_stars : mean number in the middle of a range below which the catalog is too shallow for it
-    decisive_log10_chance : a solution below this ends the search without trying other fields of view
-    margin_dex : by which a solution must beat those with another attitude
-    same_attitude_rad : solutions that differ by less than this are the same
+    Attributes
+    ----------
+    widest_deg, narrowest_deg
+        Limits of the fields of view
+    typical_deg
+        Field that is tried first
+    max_uncertainty
+        Greatest relative half-width of a range of focal lengths
+    max_warp
+        Greatest u sin^2 a, a of the corner
+    overlap
+        Of neighboring ranges, as a fraction of the focal length
+    stars
+        Mean number of catalog stars in the narrowest field of a tracker
+    least_stars
+        Mean number in the middle of a range below which the catalog is too shallow for it
+    decisive_log10_chance
+        A solution below this ends the search without trying other fields of view
+    margin_dex
+        By which a solution must beat those with another attitude
+    same_attitude_rad
+        Solutions that differ by less than this are the same
     """
 
     widest_deg: float = 100.0
@@ -111,13 +125,21 @@ class Solver:
     """Settings of the plate solver: a field of view known to 5 %, or a camera known exactly or by calibration; with
     neither, `search` says which fields are tried.
 
-    time_utc : when the images were taken; None takes the date of each FITS header. Without any date the epoch is
-        2020, and stellar aberration (20") is left out because its direction depends on the season.
-    fov_uncertainty : relative, of the focal length that follows from fov_deg
-    hypotheses : number of alternative readings of one picture that are solved in turn
-    upper_half : whether the centroids are of the upper half alone: the trackers' field then is that half, with quads
-        of its height, and no star counts as missing in the lower half
-    tracker_cache : the trackers for the last image size and date, by camera and uncertainty
+    Attributes
+    ----------
+    time_utc
+        When the images were taken; None takes the date of each FITS header. Without any date
+        the epoch is 2020, and stellar aberration (20") is left out because its direction
+        depends on the season.
+    fov_uncertainty
+        Relative, of the focal length that follows from fov_deg
+    hypotheses
+        Number of alternative readings of one picture that are solved in turn
+    upper_half
+        Whether the centroids are of the upper half alone: the trackers' field then is that
+        half, with quads of its height, and no star counts as missing in the lower half
+    tracker_cache
+        The trackers for the last image size and date, by camera and uncertainty
     """
 
     fov_deg: float | None
@@ -125,7 +147,7 @@ class Solver:
     stars: star_catalog.StarCatalog
     settings: Settings
     time_utc: datetime.datetime | None = None
-    opencv_calibration: Calibration | None = None
+    opencv_calibration: OpencvCalibration | None = None
     fov_uncertainty: float = FOV_UNCERTAINTY
     search: FieldSearch = FIELD_SEARCH
     hypotheses: int = 1
@@ -229,8 +251,12 @@ def make_solver(
 ) -> Solver:
     """Build a Solver from user input. Raises InputError with one line.
 
-    stages  : names of algorithms by stage (`check_stages`); the tracker's defaults for the others
-    catalog : name or file of a star catalog; the shipped one to V 6.5 if left out
+    Parameters
+    ----------
+    stages
+        Names of algorithms by stage (`check_stages`); the tracker's defaults for the others
+    catalog
+        Name or file of a star catalog; the shipped one to V 6.5 if left out
     """
     low, high = FOV_LIMITS_DEG
     if fov_deg is not None and camera_file is not None:
@@ -260,26 +286,33 @@ def kept_solver(
     """The solver of `make_solver` with the shipped catalog, kept with its trackers for the next picture.
 
     To index the fields of view from 2 to 100 degrees takes longer than to solve a picture.
-    stages : pairs of stage and algorithm
+
+    Parameters
+    ----------
+    stages
+        Pairs of stage and algorithm
     """
     return make_solver(fov_deg, None, time_utc, dict(stages))
 
 
 def check_stages(stages: Mapping[str, str]) -> None:
     """Raise InputError for the name of an unknown algorithm; stages are detector, centroider, identifier, solver."""
-    from skysim.tracking.settings import STAR_ALGORITHMS
+    from skysim.tracking.factory import STAR_ALGORITHMS
 
     for stage, name in stages.items():
         if name not in STAR_ALGORITHMS[stage]:
             raise InputError(f"solve.{stage}", *unknown_name(stage, name, STAR_ALGORITHMS[stage]))
 
 
-def read_camera(path: Path) -> tuple[CameraConfig | None, Calibration | None, Settings]:
+def read_camera(path: Path) -> tuple[CameraConfig | None, OpencvCalibration | None, Settings]:
     """The camera of a scene (its file, or its name) or of a camera file, or else an OpenCV calibration; the settings.
 
-    Raises InputError with one line.
+    Raises
+    ------
+    InputError
+        With one line.
     """
-    from skysim.camera.detector.detector import saturation_dn
+    from skysim.camera.detector import saturation_dn
     from skysim.scene import loader
     from skysim.scene import opencv_calibration as opencv
 
@@ -323,7 +356,14 @@ def solve_array(
 ) -> tuple[Report, StarTracker]:
     """Solve one monochrome image and return the report and the tracker that made it.
 
-    date_utc : None if unknown;  centroids : of this image, if they are known;  efforts : see `solve_centroids`
+    Parameters
+    ----------
+    date_utc
+        None if unknown
+    centroids
+        Of this image, if they are known
+    efforts
+        See `solve_centroids`
     """
     height_px, width_px = image.shape
     first = next(solver.trackers(width_px, height_px, date_utc))
@@ -350,7 +390,10 @@ def solve_centroids(
 ) -> tuple[Attitude, StarTracker]:
     """Solve the centroids of an image of (width, height) with every tracker of the solver, as `solve_array`.
 
-    efforts : number of searches that are made, of growing effort; None: all of them
+    Parameters
+    ----------
+    efforts
+        Number of searches that are made, of growing effort; None: all of them
     """
     first = next(solver.trackers(*size_px, date_utc))
     made = range(first.efforts)[:efforts]
@@ -434,3 +477,99 @@ def same_attitude(first: Attitude, second: Attitude) -> bool:
         (first.cam_from_ref * second.cam_from_ref.inv()).magnitude()
         < FIELD_SEARCH.same_attitude_rad
     )
+
+
+# The solution of a plate: its fields for Python and JSON, and the annotated image.
+
+
+@dataclass(frozen=True, slots=True)
+class PlateSolution:
+    """Pointing of a picture as it is viewed; the angles are None unless `status` is solved.
+
+    Attributes
+    ----------
+    ra_deg, dec_deg
+        Of the image center, ICRS
+    roll_deg
+        Position angle of the image's up, north through east
+    fov_deg
+        Fitted horizontal field of view
+    matches
+        Number of identified stars
+    rms_arcsec
+        Rms of their residuals
+    lights
+        Number of detections that may be stars
+    brightest_dn, background_dn
+        Maximum and median of the pixels
+    tried_fov_deg
+        Narrowest and widest horizontal field of each range that was tried, the likeliest first
+    catalog_limit_mag
+        V magnitude of the faintest stars of the catalog
+    hint
+        Of a refusal, the likely cause and what to do; of a solution, an assumption about the
+        file
+    """
+
+    status: str = ""
+    ra_deg: float | None = None
+    dec_deg: float | None = None
+    roll_deg: float | None = None
+    fov_deg: float | None = None
+    matches: int = 0
+    rms_arcsec: float | None = None
+    lights: int = 0
+    brightest_dn: float | None = None
+    background_dn: float | None = None
+    tried_fov_deg: tuple[tuple[float, float], ...] = ()
+    catalog_limit_mag: float | None = None
+    hint: str = ""
+
+
+def solution_fields(report: Report) -> dict[str, Any]:
+    """Fields of a solved image for the JSON output; the angles are those of the image center."""
+    attitude = report.attitude
+    assert attitude.cam_from_ref is not None
+    assert attitude.match is not None
+    camera = attitude.camera
+    assert camera is not None
+    ra, dec, roll = np.degrees(ra_dec_roll_rad(center_from_cam(camera) * attitude.cam_from_ref))
+    return {
+        "ra_deg": float(ra),
+        "dec_deg": float(dec),
+        "roll_deg": float(roll),
+        "fov_deg": float(np.degrees(camera.fov_rad)),
+        "matches": len(attitude.match.observed),
+        "rms_arcsec": float(np.degrees(attitude.rms_px / camera.focal_px) * 3600),
+    }
+
+
+def center_from_cam(camera: Camera) -> Rotation:
+    """Rotation from the camera frame into a frame with z along the ray of the image center and y along image down.
+
+    The principal point need not be the image center, so the camera's own boresight is not used. The down direction
+    comes from the ray of the pixel one row below, made orthogonal to z.
+    """
+    center = np.array([(camera.width_px - 1) / 2, (camera.height_px - 1) / 2])
+    z, below = camera.rays(np.array([center, [center[0], center[1] + 1]]))
+    x = np.cross(below - z, z)
+    x /= np.linalg.norm(x)
+    return Rotation.from_matrix(np.array([x, np.cross(z, x), z]))
+
+
+def annotated_image(image: NDArray, report: Report, tracker: StarTracker) -> NDArray[np.uint8]:
+    """The image annotated with detections, matched stars and their numbers."""
+    from skysim.results.plots import annotate
+
+    match = report.attitude.match
+    detected_px = report.centroids.xy_px
+    if match is None:
+        return annotate(image, detected_px, np.empty((0, 2)))
+    names = [star_name(int(tracker.stars.id[star])) for star in match.star]
+    return annotate(image, detected_px, detected_px[match.observed], names)
+
+
+def star_name(number: int) -> str:
+    """Name of a star by its number in a catalog of skysim (see `skysim.sources.catalog.Catalog`)."""
+    millions, rest = divmod(number, 1_000_000)
+    return f"{('HIP', 'HD', 'Gaia')[min(millions, 2)]} {rest}"

@@ -15,11 +15,10 @@ from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from skysim.apps.stream.packet import Packet
-from skysim.apps.stream.sinks import encode_png
+from skysim.apps.stream.sinks import Packet, encode_png
+from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.io import files
-from skysim.results.stretch import jpeg, to_8bit
+from skysim.results.plots import jpeg, to_8bit
 
 BOUNDARY = "frame"
 SOCKET_TIMEOUT_S = 10.0  # for a client that stops reading
@@ -41,9 +40,14 @@ class Client:
 class FrameHub:
     """The newest packet, shared between the simulation thread and the clients' threads.
 
-    sender_status : returns the sender's counters
-    clients : connected clients, and the last KEPT_DISCONNECTED that have disconnected
-    earlier : number of clients that disconnected before those, and the sums of their counters
+    Attributes
+    ----------
+    sender_status
+        Returns the sender's counters
+    clients
+        Connected clients, and the last KEPT_DISCONNECTED that have disconnected
+    earlier
+        Number of clients that disconnected before those, and the sums of their counters
     """
 
     def __init__(self, sender_status: Callable[[], dict[str, Any]]) -> None:

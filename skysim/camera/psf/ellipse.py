@@ -46,10 +46,17 @@ COARSE_HALF_PX = (
 class EllipseBox(NamedTuple):
     """Shared tables for images that reach `half` pixels: sizes, and one array of singles for compiled code.
 
-    waves   : F frequencies k / N of the N x N box along each axis, 0 <= k < F
-    samples : S a pixel
-    table   : the frequencies, (F,); lens and pixel at (fx, fy) and (-fx, fy), real, then imaginary parts, (4, F, F);
-              cosine and sine of the waves at x = t + p / S, in the order of p, then t, (2, F, S (half + 1))
+    Attributes
+    ----------
+    waves
+        F frequencies k / N of the N x N box along each axis, 0 <= k < F
+    samples
+        S a pixel
+    table
+        The frequencies, (F,); lens and pixel at (fx, fy) and (-fx, fy), real, then imaginary
+        parts, (4, F, F);
+        cosine and sine of the waves at x = t + p / S, in the order of p, then t, (2, F, S (half
+        + 1))
     """
 
     waves: int
@@ -115,15 +122,26 @@ def jinc(table: Singles, w: float) -> Any:
 class EllipseDisk(NamedTuple):
     """One disk for compiled code, all in pixels.
 
-    center_x, _y   : of the drawn image, from the image of the disk's center
-    mean_x, _y     : of its center of gravity, from there
-    xx, xy, yy     : A A^T
-    slope_x, _y    : of the light behind the blur, over the light at the center, a pixel
-    gradient_x, _y : A q, an odd part of the spectrum
-    blur           : radius of the defocus disk
-    sigma          : of a Gaussian blur beside the lens's
-    fade           : reach of wings, where they are faded to zero; 0 for a lens without wings
-    odd            : 1 if the spectrum has an odd part, else 0
+    Attributes
+    ----------
+    center_x, _y
+        Of the drawn image, from the image of the disk's center
+    mean_x, _y
+        Of its center of gravity, from there
+    xx, xy, yy
+        A A^T
+    slope_x, _y
+        Of the light behind the blur, over the light at the center, a pixel
+    gradient_x, _y
+        A q, an odd part of the spectrum
+    blur
+        Radius of the defocus disk
+    sigma
+        Of a Gaussian blur beside the lens's
+    fade
+        Reach of wings, where they are faded to zero; 0 for a lens without wings
+    odd
+        1 if the spectrum has an odd part, else 0
     """
 
     center_x: float

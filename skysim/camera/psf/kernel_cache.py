@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.camera.psf import ellipse
-from skysim.camera.psf.kernel import QUANTUM_PX, Kernel, build_kernel
-from skysim.camera.psf.led_disk import DiskImages
+from skysim.camera.psf.kernel import QUANTUM_PX, DiskImages, Kernel, build_kernel
 from skysim.camera.psf.otf import (
     NOT_ROUND,
     WINGED,
@@ -37,14 +36,25 @@ PACKING = np.array(
 class Kernels(NamedTuple):
     """The pixel-integrated images of N sources.
 
-    kind     : (N,) GAUSS, ROUND, GRID or ELLIPSE
-    sigma_px : (N,) of a Gaussian
-    reach_px : (N,) no light beyond it in x or in y
-    sharp_px : (N,) size of the sharpest feature, see `sharpness_px`; 1 for an ellipse, whose table is built later
-    table    : (N, 4) begin and end of the source's table in `tables`, and two sizes of its shape
-    tables   : all tables that are needed, end to end
-    disk     : (N, 15) the fields of `ellipse.EllipseDisk`; zeros for other kinds
-    bessel   : the table for `ellipse.jinc`
+    Attributes
+    ----------
+    kind
+        (N,) GAUSS, ROUND, GRID or ELLIPSE
+    sigma_px
+        (N,) of a Gaussian
+    reach_px
+        (N,) no light beyond it in x or in y
+    sharp_px
+        (N,) size of the sharpest feature, see `sharpness_px`; 1 for an ellipse, whose table is
+        built later
+    table
+        (N, 4) begin and end of the source's table in `tables`, and two sizes of its shape
+    tables
+        All tables that are needed, end to end
+    disk
+        (N, 15) the fields of `ellipse.EllipseDisk`; zeros for other kinds
+    bessel
+        The table for `ellipse.jinc`
     """
 
     kind: NDArray[np.int64]
@@ -89,15 +99,29 @@ def source_kernels(
 ) -> Kernels:
     """The kernels of N sources.
 
-    xy_px      : (N, 2) image positions, for the blur that grows with the field; NaN is taken as the principal point
-    radius_m   : (N,) of the emitting disk, 0 for a star; drawn as a round disk of angular radius radius / distance
-                 where that differs from its image in `disks` by less than MAX_ROUND_ERROR
-    is_led     : (N,) LEDs, which may be out of focus by their own distance_m; stars are at infinity
-    cos_field  : (N,) of the angle from the boresight
-    disks      : their geometric images, NaN for stars; None draws all disks round
-    blur_px    : standard deviation of a blur of all of them
-    chromatic  : (N, 4) as in `Sources`
-    Raises InputError for a source too far out of focus.
+    Parameters
+    ----------
+    xy_px
+        (N, 2) image positions, for the blur that grows with the field; NaN is taken as the
+        principal point
+    radius_m
+        (N,) of the emitting disk, 0 for a star; drawn as a round disk of angular radius radius
+        / distance where that differs from its image in `disks` by less than MAX_ROUND_ERROR
+    is_led
+        (N,) LEDs, which may be out of focus by their own distance_m; stars are at infinity
+    cos_field
+        (N,) of the angle from the boresight
+    disks
+        Their geometric images, NaN for stars; None draws all disks round
+    blur_px
+        Standard deviation of a blur of all of them
+    chromatic
+        (N, 4) as in `Sources`
+
+    Raises
+    ------
+    InputError
+        For a source too far out of focus.
     """
     position = np.where(np.isnan(xy_px), camera.center_px, xy_px)
     extra = field_sigma_px(camera.psf, camera, position)
@@ -193,12 +217,16 @@ def ellipse_disks(
 ) -> tuple[Floats, NDArray[np.int64]]:
     """(M, 15) `ellipse.EllipseDisk` of M disks, and (M, 3) the keys of their boxes.
 
-    axes_px      : (M, 2) their semi-axes, the larger one first
-    variance_px2 : s^2 of the blur behind which they are seen
-
     Blurred by a Gaussian, a light of I (1 + g x) is (1 + g x) I + s^2 g dI/dx: the blurred I, shifted by -s^2 g, times
     (1 + g x). A disk smaller than its blur is only shifted by its gradient. For a lens with wings or one that is not
     round the gradient is in the spectrum.
+
+    Parameters
+    ----------
+    axes_px
+        (M, 2) their semi-axes, the larger one first
+    variance_px2
+        s^2 of the blur behind which they are seen
     """
     matrix, center, gradient = disks
     square = matrix @ matrix.transpose(0, 2, 1)

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy import special
 
 from skysim.core.errors import InputError
-from skysim.core.io.yaml_reader import is_file
 from skysim.core.types import Floats
+from skysim.core.yaml_reader import is_file
 from skysim.scene.sections.camera import (
     AiryPsfConfig,
     CameraConfig,
@@ -41,8 +41,13 @@ def blur_radius_px(camera: CameraConfig, distance_m: Any, focus_shift_m: Any = 0
 
     The cone from a pupil A to the image at v(u) meets the chip at v0 in a disk of diameter A |v - v0| / v =
     A v0 |1/u - 1/u0|, u0 the distance in focus. This form has no pole and holds for stars (u infinite) as well.
-    distance_m    : scalar or array of axial distances, infinity allowed
-    focus_shift_m : of the focal length d for the light's color, which adds d / f^2 to 1/u - 1/u0
+
+    Parameters
+    ----------
+    distance_m
+        Scalar or array of axial distances, infinity allowed
+    focus_shift_m
+        Of the focal length d for the light's color, which adds d / f^2 to 1/u - 1/u0
     """
     distance = np.asarray(distance_m, dtype=float)
     color = focus_shift_m / camera.focal_length_m**2
@@ -157,9 +162,12 @@ def cell_positions_px(psf: MeasuredPsfConfig) -> tuple[Floats, Floats]:
 def read_cells(file: str) -> Floats:
     """(n, n) numbers of a measured PSF from CSV or an image (FITS, PNG, TIFF), scaled to a sum of 1.
 
-    Raises InputError with one line, `camera.psf.file: ...`, for an unreadable file or an unusable table.
+    Raises
+    ------
+    InputError
+        With one line, `camera.psf.file: ...`, for an unreadable file or an unusable table.
     """
-    from skysim.core.io.images import monochrome, read_image
+    from skysim.core.images import monochrome, read_image
 
     path = Path(file)
     if not is_file(path):

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Trajectory
-from skysim.dynamics.multibody.actuators.registry import set_start
+from skysim.dynamics.multibody.actuators import set_start
 from skysim.dynamics.multibody.mjcf import mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel
 
@@ -33,9 +33,15 @@ class Simulation:
     The present is the last state; angles, rates and speeds are views of it, without a copy. A row of `states` is
     MuJoCo's full physics state: time, qpos (its first four lab_from_body), qvel, actuator states.
 
-    lab_from_body : at the start; rate_body_rad_s : (3,) likewise
-    duration_s    : the longest that this motion can last, which sets the memory. With history_s it may be inf
-    history_s     : keep only states of this age or younger; memory is for twice as many
+    Attributes
+    ----------
+    lab_from_body
+        At the start; rate_body_rad_s : (3,) likewise
+    duration_s
+        The longest that this motion can last, which sets the memory. With history_s it may be
+        inf
+    history_s
+        Keep only states of this age or younger; memory is for twice as many
     """
 
     def __init__(
@@ -178,7 +184,10 @@ class Simulation:
 class PrescribedMotion(Simulation):
     """A motion along given attitudes, without dynamics; wheels and gimbals stay as they are at the start.
 
-    state_at : time in s to lab_from_body_wxyz (4,) and rate (3,) in body axes
+    Attributes
+    ----------
+    state_at
+        Time in s to lab_from_body_wxyz (4,) and rate (3,) in body axes
     """
 
     def __init__(
@@ -217,7 +226,12 @@ def simulate(
 
     controller(t_s, lab_from_body, rate_body_rad_s) -> (3,) torque in N m about the body axes. It is called at
     the start and every control period (whole steps); its torque, clipped to the limit, is held in between.
-    rate_body_rad_s : (3,) at the start. Raises InputError for a start beyond the tilt stop, and if MuJoCo warned.
+
+    Parameters
+    ----------
+    rate_body_rad_s
+        (3,) at the start. Raises InputError for a start beyond the tilt stop, and if MuJoCo
+        warned.
     """
     simulation = Simulation(vehicle, lab_from_body_start, rate_body_rad_s, duration_s)
     steps = (

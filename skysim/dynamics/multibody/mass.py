@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuators.elements import joints
-from skysim.dynamics.multibody.actuators.registry import TRIM
+from skysim.dynamics.multibody.actuator_kind import joints
+from skysim.dynamics.multibody.actuators import TRIM
 from skysim.scene.sections.vehicle import TrimConfig, VehicleConfig, WheelsConfig
 
 CAMERA = "star_camera"
@@ -145,7 +145,10 @@ def set_inertial(
 ) -> None:
     """Set mass, center and inertia (3, 3) about it in a body of a spec. Raises InputError for impossible inertia.
 
-    subject : the key at fault, and whose moments they are
+    Parameters
+    ----------
+    subject
+        The key at fault, and whose moments they are
     """
     key, whose = subject
     moments, axes = np.linalg.eigh(inertia_kg_m2)
@@ -170,8 +173,16 @@ def set_inertial(
 class Trims:
     """Trim masses, in the order of their joints' names.
 
-    axes       : (3, n) directions in body axes;  centers_m : (3, n) centers of mass at position zero
-    mass_kg    : (n,);  position_m : (n,) where they are held
+    Attributes
+    ----------
+    axes
+        (3, n) directions in body axes
+    centers_m
+        (3, n) centers of mass at position zero
+    mass_kg
+        (n,)
+    position_m
+        (n,) where they are held
     """
 
     names: tuple[str, ...]

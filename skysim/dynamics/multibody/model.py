@@ -20,19 +20,18 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
-from skysim.core.paths import SCENES
+from skysim.core.files import SCENES
 from skysim.core.types import Floats, Mount
-from skysim.dynamics.multibody.actuators.cmgs import GIMBAL, ROTOR
-from skysim.dynamics.multibody.actuators.elements import Hinges, joints
-from skysim.dynamics.multibody.actuators.fans import Fans
-from skysim.dynamics.multibody.actuators.registry import (
+from skysim.dynamics.multibody.actuator_kind import Hinges, joints
+from skysim.dynamics.multibody.actuators import (
     KINDS,
     TORQUES,
     add_actuators,
     lock_unused,
     locked_joint_hint,
 )
-from skysim.dynamics.multibody.actuators.wheels import WHEEL
+from skysim.dynamics.multibody.cmgs import GIMBAL, ROTOR
+from skysim.dynamics.multibody.fans import Fans
 from skysim.dynamics.multibody.mass import (
     CAMERA,
     MassProperties,
@@ -43,6 +42,7 @@ from skysim.dynamics.multibody.mass import (
     unbalance,
 )
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings, one_line
+from skysim.dynamics.multibody.wheels import WHEEL
 from skysim.scene.sections.vehicle import VehicleConfig
 
 STEP_S = 1e-3
@@ -62,11 +62,19 @@ STOP_BODY_M = 0.5
 class VehicleModel:
     """A vehicle on its bearing, ready to simulate. Simulation does not change the model.
 
-    spec    : mujoco.MjSpec that the model was made from
-    model   : mujoco.MjModel, whose first four qpos and three qvel are the bearing's
-    mass    : mass properties of the whole vehicle, with balanced wheels and the trim masses in their places
-    torques : (3,) actuator numbers of the ideal torques about body x, y, z
-    wheels, gimbals, rotors, fans, trims : the actuators, empty where they are not switched on
+    Attributes
+    ----------
+    spec
+        mujoco.MjSpec that the model was made from
+    model
+        mujoco.MjModel, whose first four qpos and three qvel are the bearing's
+    mass
+        Mass properties of the whole vehicle, with balanced wheels and the trim masses in their
+        places
+    torques
+        (3,) actuator numbers of the ideal torques about body x, y, z
+    wheels, gimbals, rotors, fans, trims
+        The actuators, empty where they are not switched on
     """
 
     spec: Any

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core import quaternion
+from skysim.core.files import SCENES
 from skysim.core.jit import jit
-from skysim.core.paths import SCENES
 from skysim.core.types import Floats, Mount
-from skysim.dynamics.multibody.actuators.registry import lock_unused, set_start
+from skysim.dynamics.multibody.actuators import lock_unused, set_start
 from skysim.dynamics.multibody.mass import CAMERA
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel, camera_mount, place_camera, put_at_origin
@@ -34,8 +34,13 @@ GROUPS = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)  # rays are tested against
 class Obstacles:
     """Everything that can hide a source; the vehicle's attitude can be set.
 
-    model, data   : MuJoCo model and data of their own, not the simulated ones; body bus is set as a mocap body
-    camera_body_m : (3,) the pupil, where all rays end
+    Attributes
+    ----------
+    model, data
+        MuJoCo model and data of their own, not the simulated ones; body bus is set as a mocap
+        body
+    camera_body_m
+        (3,) the pupil, where all rays end
     """
 
     model: Any
@@ -87,7 +92,10 @@ def camera_housing(
 def occluded(obstacles: Obstacles, lab_from_body: Rotation, place: Floats) -> NDArray[np.bool_]:
     """(N,) whether a part of the vehicle or the lab is on the line from the pupil to each LED or star at that attitude.
 
-    place : (N, 4), as in `Sources`
+    Parameters
+    ----------
+    place
+        (N, 4), as in `Sources`
     """
     lab_from_body_wxyz = quaternion.from_rotation(lab_from_body)
     camera_m = quaternion.apply(lab_from_body_wxyz, obstacles.camera_body_m)

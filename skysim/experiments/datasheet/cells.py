@@ -7,17 +7,25 @@ thermal state, attitude and noise by number, so that terms can be separated and 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
+from numpy.typing import NDArray
 
-from skysim.camera import thermal
+from skysim.camera import thermal_motion
 from skysim.core.constants import DAY_S, HOUR_S
 from skysim.core.errors import InputError
-from skysim.experiments.study.factors import Settings
-from skysim.experiments.study.loader import has_survey_errors
+from skysim.core.files import make_folder, write_text
+from skysim.core.types import Floats
+from skysim.core.yaml_reader import parse_yaml
+from skysim.experiments.study.execution import runner, store
+from skysim.experiments.study.factors import Point, Settings
+from skysim.experiments.study.plan import Plan, Study, TrialSpec, make_plan
+from skysim.experiments.study.study_file import has_survey_errors
 from skysim.experiments.study.unused_options import tracks
 from skysim.scene.scene import BODIES_YEARS, Scene
 from skysim.scene.sections.layouts import OnPoints
@@ -48,8 +56,15 @@ MISSED_PX = (
 class Size:
     """Numbers of fields, of units, of thermal states, of attitudes and frames in a field, and of other cells.
 
-    draws : frames in each field with attitudes and noise of their own, in which units and thermal states take turns
-    sky   : frames in new fields, of other units;  pairs : frames with and without a cause to compare
+    Attributes
+    ----------
+    draws
+        Frames in each field with attitudes and noise of their own, in which units and thermal
+        states take turns
+    sky
+        Frames in new fields, of other units
+    pairs
+        Frames with and without a cause to compare
     """
 
     fields: int
@@ -66,7 +81,7 @@ QUICK = Size(fields=40, units=4, states=3, attitudes=2, frames=2, draws=8, sky=1
 FULL = Size(fields=300, units=8, states=4, attitudes=2, frames=2, draws=32, sky=4, pairs=2)
 
 
-class Cell(NamedTuple):
+class DatasheetCell(NamedTuple):
     """One cell: its experiment, its levels there, and its settings."""
 
     experiment: str
@@ -136,7 +151,7 @@ def states_c(scene: Scene, count: int) -> list[float]:
         hours = np.linspace(history.hours[0], history.hours[-1], count)
     if history.kind == "steady":
         hours = hours[:1]
-    return [float(thermal.TEMPERATURES[history.kind](history, hour)) for hour in hours]
+    return [float(thermal_motion.TEMPERATURES[history.kind](history, hour)) for hour in hours]
 
 
 class Designer:
@@ -178,7 +193,7 @@ class Designer:
         """
         return Draw(number % self.units, number // self.units % self.states, 10 + number)
 
-    def cells(self) -> Iterator[Cell]:
+    def cells(self) -> Iterator[DatasheetCell]:
         """All cells, in the order in which they are run."""
         yield from self.terms()
         combinations = self.units * self.states
@@ -187,7 +202,7 @@ class Designer:
             settings = self.settings(Draw(100 + number, number)) | {
                 "trial.attitude_seed": 1 + number
             }
-            yield Cell("sky", {"draw": number}, settings)
+            yield DatasheetCell("sky", {"draw": number}, settings)
         yield from self.rates()
         yield from self.sequences()
         yield from self.accelerations()
@@ -198,7 +213,7 @@ class Designer:
         for name, change in self.disturbances().items():
             yield from self.draws("disturbance", 1, change, disturbance=name)
 
-    def terms(self) -> Iterator[Cell]:
+    def terms(self) -> Iterator[DatasheetCell]:
         """The crossed and nested design of `components`."""
         for unit in range(self.units):
             for state in range(self.states):
@@ -210,55 +225,57 @@ class Designer:
                             "attitude": attitude,
                             "frame": frame,
                         }
-                        yield Cell("terms", levels, self.settings(Draw(unit, state, attitude)))
+                        yield DatasheetCell(
+                            "terms", levels, self.settings(Draw(unit, state, attitude))
+                        )
 
     def draws(
         self, experiment: str, count: int, change: Settings | None = None, **levels: str
-    ) -> Iterator[Cell]:
+    ) -> Iterator[DatasheetCell]:
         """Frames of other attitudes; with a change the same as without it, noise included, for a comparison."""
         for number in range(count):
             settings = self.settings(self.in_turn(number)) | {"trial.noise_seed": 10_000 + number}
             settings |= change or {}
             if settings.get("trial.kind") == "centroids":
                 del settings["trial.turn_deg"]
-            yield Cell(experiment, {**levels, "draw": number}, settings)
+            yield DatasheetCell(experiment, {**levels, "draw": number}, settings)
 
     def rates_deg_s(self, streaks_px: Sequence[float]) -> list[float]:
         """Rates with streaks of these lengths, to two digits."""
         per_px = self.pixel_deg / self.scene.exposure.time_s
         return [float(f"{streak * per_px:.2g}") for streak in streaks_px]
 
-    def rates(self) -> Iterator[Cell]:
+    def rates(self) -> Iterator[DatasheetCell]:
         """At each rate two frames of each attitude that differ in their noise alone."""
         for rate in self.rates_deg_s(STREAKS_PX):
             for frame in range(2):
-                yield Cell(
+                yield DatasheetCell(
                     "rate",
                     {"rate_deg_s": rate, "frame": frame},
                     self.settings(Draw()) | {"trial.rate_deg_s": rate},
                 )
 
-    def sequences(self) -> Iterator[Cell]:
+    def sequences(self) -> Iterator[DatasheetCell]:
         """Frames of one unit at the scene's frame rate, at rest and at constant rates."""
         for rate in (0.0, *self.rates_deg_s(STREAKS_PX[:SEQUENCE_RATES])):
             for step in SEQUENCE:
                 settings = self.settings(Draw(), rate * step / self.scene.exposure.rate_hz)
-                yield Cell(
+                yield DatasheetCell(
                     "sequence",
                     {"rate_deg_s": rate, "step": step},
                     settings | {"trial.rate_deg_s": rate},
                 )
 
-    def accelerations(self) -> Iterator[Cell]:
+    def accelerations(self) -> Iterator[DatasheetCell]:
         """Two frames of each attitude at accelerations with no rate at mid-exposure."""
         for bend in BENDS_PX:
             acceleration = float(f"{bend * self.pixel_deg / self.scene.exposure.time_s**2:.2g}")
             change = {"trial.acceleration_deg_s2": acceleration}
             for frame in range(2):
                 levels = {"acceleration_deg_s2": acceleration, "frame": frame}
-                yield Cell("acceleration", levels, self.settings(Draw()) | change)
+                yield DatasheetCell("acceleration", levels, self.settings(Draw()) | change)
 
-    def tracked(self) -> Iterator[Cell]:
+    def tracked(self) -> Iterator[DatasheetCell]:
         """Two frames of each attitude in tracking mode, at constant rates and at accelerations; none without the mode.
 
         The prediction extrapolates the mean rate between the last two frames, so under an acceleration a it misses the
@@ -273,11 +290,11 @@ class Designer:
         for key, value in motions:
             for frame in range(2):
                 change = {f"trial.{key}": value, "trial.tracked": TRACKED}
-                yield Cell(
+                yield DatasheetCell(
                     f"tracked {key}", {key: value, "frame": frame}, self.settings(Draw()) | change
                 )
 
-    def magnitudes(self) -> Iterator[Cell]:
+    def magnitudes(self) -> Iterator[DatasheetCell]:
         """Pairs of frames with other limits of the tracker's catalog, under the stars."""
         if not self.under_stars:
             return
@@ -285,7 +302,7 @@ class Designer:
             limit = self.scene.tracker.limit_mag + step
             for frame in range(2):
                 settings = self.settings(Draw()) | {"tracker.limit_mag": limit}
-                yield Cell("magnitude", {"limit_mag": limit, "frame": frame}, settings)
+                yield DatasheetCell("magnitude", {"limit_mag": limit, "frame": frame}, settings)
 
     def causes(self) -> dict[str, Settings]:
         """What would lower the error, as changes of the scene; those that it has no use for are left out."""
@@ -368,3 +385,149 @@ class Designer:
         """Half of the field's smaller side."""
         side_px = min(self.scene.camera.width_px, self.scene.camera.height_px)
         return math.degrees(math.atan(side_px / 2 / self.scene.camera.focal_px))
+
+
+# Run the experiments of a datasheet: write them as a study, run its missing trials, and read them
+# as arrays.
+
+
+STUDY = "datasheet.yaml"
+AXES = ("x_arcsec", "y_arcsec", "roll_arcsec")
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredFrames:
+    """The measured frames of a datasheet.
+
+    Attributes
+    ----------
+    columns
+        Of the trials, (cells, fields) each
+    scene_name
+        As it was given
+    overrides
+        Of the command line
+    spec
+        What a trial needs to be run again
+    """
+
+    scene: Scene
+    scene_name: str
+    overrides: Mapping[str, str]
+    size: Size
+    designer: Designer
+    cells: list[DatasheetCell]
+    columns: dict[str, NDArray[Any]]
+    spec: TrialSpec
+
+    def rows(self, experiment: str, **levels: Any) -> list[int]:
+        """Rows of the cells of an experiment that have these levels."""
+        return [
+            row
+            for row, cell in enumerate(self.cells)
+            if cell.experiment == experiment and levels.items() <= cell.levels.items()
+        ]
+
+    def levels(self, experiment: str, name: str) -> list[Any]:
+        """The levels of an experiment, in order."""
+        return list(
+            dict.fromkeys(cell.levels[name] for cell in self.cells if cell.experiment == experiment)
+        )
+
+    def column(self, name: str, rows: list[int]) -> NDArray[Any]:
+        """(cells, fields) of some cells."""
+        return self.columns[name][rows]
+
+    def right(self, rows: list[int]) -> NDArray[np.bool_]:
+        """(cells, fields) whether a frame was solved and is not false."""
+        return (self.columns["solved"][rows] > 0) & ~self.false(rows)
+
+    def false(self, rows: list[int]) -> NDArray[np.bool_]:
+        """(cells, fields) whether a frame has a false attitude."""
+        return self.columns["wrong"][rows] > 0
+
+    def errors(self, rows: list[int]) -> Floats:
+        """(3, cells, fields) errors about the camera's axes, arcseconds; NaN for refused and false ones."""
+        errors = np.stack([self.columns[name][rows] for name in AXES])
+        return np.where(self.right(rows), errors, np.nan)
+
+
+def study_tree(
+    scene_name: str,
+    scene: Scene,
+    overrides: Mapping[str, str],
+    size: Size,
+    cells: list[DatasheetCell],
+) -> dict[str, Any]:
+    """The study file of the cells."""
+    settings = {key: parse_yaml(text)[1] for key, text in overrides.items() if key != "seed"}
+    return {
+        "schema": 1,
+        "title": f"Datasheet of {scene.title}",
+        "scene": scene_name,
+        "seed": scene.seed,
+        **({"set": settings} if settings else {}),
+        "trial": {"kind": "frames", **attitudes(scene)},
+        "factors": {"cell": {"levels": {cell.name: cell.settings for cell in cells}}},
+        "replicates": size.fields,
+        "responses": ["identified", "wrong", "refused", "cross_arcsec_rms", "roll_arcsec_rms"],
+    }
+
+
+def attitudes(scene: Scene) -> dict[str, Any]:
+    """Keys of the trial that bound the attitudes: under a dome the tilt of the vehicle's stop."""
+    if scene.light.kind != "dome":
+        return {}
+    greatest = scene.vehicle.tilt_stop_deg if scene.vehicle.mount == "air_bearing" else 30.0
+    return {"tilt_deg": [0.0, min(float(greatest), 30.0)]}
+
+
+def measure(
+    scene_name: str,
+    scene: Scene,
+    overrides: Mapping[str, str],
+    folder: Path,
+    *,
+    quick: bool = False,
+    fields: int | None = None,
+    workers: int | None = None,
+    watch: Callable[[int], runner.Watch] | None = None,
+) -> MeasuredFrames:
+    """Run the missing trials of a scene's datasheet in a folder, and return all of them.
+
+    watch(trials) : returns the function that is called after every batch
+    Raises InputError for a scene without attitudes of single frames, and for a cell whose trials fail.
+
+    Parameters
+    ----------
+    quick, fields
+        Smaller experiments, and another number of fields
+    """
+    check_scene(scene)
+    size = QUICK if quick else FULL
+    size = replace(size, fields=fields or size.fields)
+    designer = Designer(scene, size)
+    cells = list(designer.cells())
+    tree = study_tree(scene_name, scene, overrides, size, cells)
+    path = make_folder(folder) / STUDY
+    write_text(path, yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=120))
+    plan = make_plan(path, Study.model_validate(tree), tree["trial"], {})
+    engine = runner.ENGINES["serial" if workers == 1 else "pool"](workers, "")
+    try:
+        with store.writing(folder / store.STORE) as kept:
+            runner.prepare_store(plan, kept, resume=kept.counts()["done"] > 0)
+            runner.run(plan, kept, engine, watch(plan.trials) if watch else None)
+            return MeasuredFrames(
+                scene, scene_name, overrides, size, designer, cells, read(plan, kept), plan.spec
+            )
+    finally:
+        engine.close()
+
+
+def read(plan: Plan, kept: store.Store) -> dict[str, NDArray[Any]]:
+    """The columns of all trials, (cells, fields). Raises InputError for a failed trial."""
+    if failures := kept.failures():
+        trial, error = failures[0]
+        point: Point = plan.points[trial // plan.study.replicates]
+        raise InputError(point.levels["cell"], error.strip().splitlines()[-1])
+    return {name: values.reshape(len(plan.points), -1) for name, values in kept.columns().items()}

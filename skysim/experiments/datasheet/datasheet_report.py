@@ -2,17 +2,167 @@
 
 from __future__ import annotations
 
+import math
 import shlex
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from skysim.core.io.files import make_folder, to_json, write_bytes, write_text
+import numpy as np
+
+from skysim.core.files import make_folder, to_json, write_bytes, write_text
 from skysim.experiments.datasheet import statement as statements
-from skysim.experiments.datasheet.figures import FIGURES
-from skysim.experiments.datasheet.run import Sheet
-from skysim.experiments.datasheet.statement import Statement
-from skysim.results.plots import png
-from skysim.results.report import Block, Column, Figure, Report, Section, Table, Text, Verdict
-from skysim.results.report.blocks import figure_files
+from skysim.experiments.datasheet.cells import MeasuredFrames
+from skysim.experiments.datasheet.statement import NAMES, Statement
+from skysim.experiments.datasheet.variance_components import GROUPS, Components
+from skysim.results.plots import INK, png
+from skysim.results.report import Report
+from skysim.results.report_blocks import (
+    Block,
+    Column,
+    Figure,
+    Section,
+    Table,
+    Text,
+    Verdict,
+    figure_files,
+)
+
+# Figures of a datasheet.
+
+
+class DatasheetFigure(NamedTuple):
+    """A figure: its function, size in inches and caption."""
+
+    draw: Callable[[Any, Statement], None]
+    size_in: tuple[float, float]
+    caption: str
+
+
+def draw_terms(fig: Any, statement: Statement) -> None:
+    """Terms as bars with their intervals, across and about the boresight."""
+    shown = [
+        name
+        for name in Components._fields
+        if name != "thermal" or statement.sheet.designer.states > 1
+    ]
+    for axes, (group, table) in zip(fig.subplots(1, 2), statement.terms.items(), strict=True):
+        for n, name in enumerate(shown):
+            low, value, high = (
+                math.sqrt(max(x, 0)) for x in np.array(table.squares[name])[[1, 0, 2]]
+            )
+            axes.barh(n, value, color=INK[n], height=0.6)
+            axes.plot([low, high], [n, n], color="#222222")
+        axes.set_yticks(range(len(shown)), [NAMES[name] for name in shown])
+        axes.invert_yaxis()
+        axes.set_xlabel(f"{group} the boresight, 1 σ of one axis [″]")
+
+
+def draw_causes(fig: Any, statement: Statement) -> None:
+    """What each change leaves of the mean square."""
+    axes = fig.subplots()
+    for n, group in enumerate(GROUPS):
+        for k, one in enumerate(statement.causes):
+            value, low, high = (100 * part for part in one[group])
+            axes.plot([low, high], [k + 0.2 * n] * 2, color=INK[n])
+            axes.plot(
+                value,
+                k + 0.2 * n,
+                "o",
+                color=INK[n],
+                label=f"{group} the boresight" if k == 0 else None,
+            )
+    axes.axvline(100, color="#888888")
+    axes.set_yticks(range(len(statement.causes)), [one["cause"] for one in statement.causes])
+    axes.invert_yaxis()
+    axes.set_xlabel("what is left of the mean square [%]")
+    axes.legend()
+
+
+def draw_sky(fig: Any, statement: Statement) -> None:
+    """Where frames are solved: boresights on the sky, or tilts of the vehicle."""
+    sheet = statement.sheet
+    rows = sheet.rows("sky")
+    if sheet.designer.under_stars:
+        axes = fig.add_subplot(projection="mollweide")
+        longitude = np.radians((sheet.column("boresight_ra_deg", rows) + 180) % 360 - 180)
+        place = -longitude, np.radians(sheet.column("boresight_dec_deg", rows))
+    else:
+        axes = fig.add_subplot(projection="polar")
+        place = (
+            np.radians(sheet.column("body_azimuth_deg", rows)),
+            sheet.column("body_tilt_deg", rows),
+        )
+    right = sheet.right(rows)
+    false = sheet.false(rows)
+    kinds = {"right": right, "refused": ~right & ~false, "false": false}
+    for n, (name, chosen) in enumerate(kinds.items()):
+        if chosen.any() or name == "right":
+            x, y = (part[chosen] for part in place)
+            axes.plot(x, y, ".", color=INK[n], markersize=2 if name == "right" else 5, label=name)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.15, 0))
+
+
+def draw_by(fig: Any, rows: list[dict[str, Any]], key: str, label: str) -> None:
+    """Noise-equivalent angle, error and share of right attitudes against a quantity."""
+    errors, share = fig.subplots(1, 2)
+    x = [row[key] for row in rows]
+    for n, group in enumerate(GROUPS):
+        errors.plot(
+            x, [row[f"nea_{group}"] for row in rows], "o-", color=INK[n], label=f"NEA {group}"
+        )
+        errors.plot(
+            x, [row[f"rms_{group}"] for row in rows], "s--", color=INK[n], label=f"rms {group}"
+        )
+    errors.set_yscale("log")
+    errors.yaxis.set_major_formatter("{x:g}")
+    errors.set_ylabel("one axis [″]")
+    errors.legend()
+    found = [row["counts"].share("right") for row in rows]
+    values = np.array([one.value for one in found])
+    ends = np.array([[one.value - one.low, one.high - one.value] for one in found]).T
+    share.errorbar(x, 100 * values, 100 * ends, fmt="o-", color=INK[2])
+    share.set_ylabel("right attitudes [%]")
+    for axes in (errors, share):
+        axes.set_xlabel(label)
+
+
+def draw_rates(fig: Any, statement: Statement) -> None:
+    """By rate."""
+    draw_by(fig, statement.rates, "rate_deg_s", "rate [°/s]")
+
+
+def draw_magnitudes(fig: Any, statement: Statement) -> None:
+    """By the catalog's limit."""
+    draw_by(fig, statement.magnitudes, "limit_mag", "faintest star of the catalog [V]")
+
+
+FIGURES = {
+    "terms": DatasheetFigure(
+        draw_terms,
+        (9, 2.6),
+        "The terms of the error, with 95 % intervals over the fields (ensemble).",
+    ),
+    "causes": DatasheetFigure(
+        draw_causes,
+        (9, 3.4),
+        "What each change of the scene leaves of the error's mean square (ensemble).",
+    ),
+    "sky": DatasheetFigure(
+        draw_sky, (7, 3.6), "Where the frames are solved lost in space, at rest (ensemble)."
+    ),
+    "rates": DatasheetFigure(
+        draw_rates,
+        (9, 3),
+        "By rate: NEA (temporal), rms (ensemble), and right attitudes with exact bounds.",
+    ),
+    "magnitudes": DatasheetFigure(
+        draw_magnitudes,
+        (9, 3),
+        "By magnitude limit: NEA (temporal), rms (ensemble), and right attitudes.",
+    ),
+}
+
 
 STANDARD = (
     "Terms in the sense of ECSS-E-ST-60-20C (star sensors: terminology and performance specification). The numbers"
@@ -21,7 +171,7 @@ STANDARD = (
 PRINTED = 3  # sections on a terminal: the terms, their causes and the probabilities
 
 
-def command(sheet: Sheet, quick: bool) -> str:
+def command(sheet: MeasuredFrames, quick: bool) -> str:
     """The shell command that repeats the datasheet."""
     options = ["--quick"] * quick
     for key, value in sheet.overrides.items():
@@ -58,7 +208,7 @@ def verdict(statement: Statement) -> Verdict:
     )
 
 
-def section_blocks(section: statements.Section, statement: Statement) -> list[Block]:
+def section_blocks(section: statements.StatementSection, statement: Statement) -> list[Block]:
     """A section's texts, figures and table."""
     texts = [Text(text) for text in section.texts]
     figures = [

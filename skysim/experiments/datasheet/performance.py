@@ -10,9 +10,13 @@ import numpy as np
 from scipy.special import chdtri
 
 from skysim.core.types import Floats
-from skysim.experiments.datasheet.components import mean_known, mean_square_ratio
-from skysim.experiments.datasheet.run import Sheet
-from skysim.experiments.datasheet.terms import GROUPS, rms
+from skysim.experiments.datasheet.cells import MeasuredFrames
+from skysim.experiments.datasheet.variance_components import (
+    GROUPS,
+    mean_known,
+    mean_square_ratio,
+    rms,
+)
 from skysim.experiments.study.execution import setups, trials
 from skysim.results import metrics
 from skysim.results.metrics import Summary
@@ -41,14 +45,14 @@ class Counts(NamedTuple):
         return Summary(hits / self.frames, *metrics.exact_bounds(hits, self.frames), self.frames)
 
 
-def counts(sheet: Sheet, rows: list[int]) -> Counts:
+def counts(sheet: MeasuredFrames, rows: list[int]) -> Counts:
     """The outcomes of some cells."""
     right = sheet.right(rows)
     false = sheet.false(rows)
     return Counts(right.size, int(right.sum()), int((~right & ~false).sum()), int(false.sum()))
 
 
-def counts_of_fields(sheet: Sheet, rows: list[int]) -> Counts:
+def counts_of_fields(sheet: MeasuredFrames, rows: list[int]) -> Counts:
     """The outcomes of fields with a frame in each of some cells, which succeed and fail together."""
     false = sheet.false(rows).any(axis=0)
     right = sheet.right(rows).all(axis=0)
@@ -94,7 +98,7 @@ def claims(found: Counts) -> list[dict[str, Any]]:
     ]
 
 
-def quantiles(sheet: Sheet) -> list[dict[str, Any]]:
+def quantiles(sheet: MeasuredFrames) -> list[dict[str, Any]]:
     """Quantiles of the errors' magnitude over independent frames, with intervals between order statistics."""
     errors = sheet.errors(sheet.rows("sky")).reshape(3, -1)
     errors = errors[:, np.isfinite(errors).all(axis=0)]
@@ -108,7 +112,7 @@ def quantiles(sheet: Sheet) -> list[dict[str, Any]]:
     ]
 
 
-def consistency(sheet: Sheet) -> dict[str, Any]:
+def consistency(sheet: MeasuredFrames) -> dict[str, Any]:
     """How well the tracker's covariance P and the assumption of equal axes fit the errors e of independent frames.
 
     The normalized error squared e^T P^-1 e has the chi-square distribution of three degrees of freedom where P is
@@ -134,7 +138,7 @@ def noise_equivalent_angle(first: Floats, second: Floats) -> float:
     return float(np.sqrt(mean_known((first - second) ** 2) / 2))
 
 
-def pair_row(sheet: Sheet, rows: list[int]) -> dict[str, Any]:
+def pair_row(sheet: MeasuredFrames, rows: list[int]) -> dict[str, Any]:
     """Outcomes, temporal noise and rms error about one axis of a pair of cells, arcseconds."""
     first, second = (sheet.errors([row]) for row in rows[:2])
     return {
@@ -147,7 +151,7 @@ def pair_row(sheet: Sheet, rows: list[int]) -> dict[str, Any]:
     }
 
 
-def by_rate(sheet: Sheet) -> list[dict[str, Any]]:
+def by_rate(sheet: MeasuredFrames) -> list[dict[str, Any]]:
     """Noise-equivalent angle, error and outcomes by rate; that at rest is of the terms' first attitude."""
     rest = sheet.rows("terms", unit=0, state=0, attitude=0)
     rates = sheet.levels("rate", "rate_deg_s")
@@ -159,7 +163,7 @@ def by_rate(sheet: Sheet) -> list[dict[str, Any]]:
     return found
 
 
-def by_level(sheet: Sheet, experiment: str, key: str) -> list[dict[str, Any]]:
+def by_level(sheet: MeasuredFrames, experiment: str, key: str) -> list[dict[str, Any]]:
     """The same by the levels of a key, in rising order; empty for a scene without the experiment."""
     return [
         {key: level, **pair_row(sheet, sheet.rows(experiment, **{key: level}))}
@@ -167,7 +171,7 @@ def by_level(sheet: Sheet, experiment: str, key: str) -> list[dict[str, Any]]:
     ]
 
 
-def by_acceleration(sheet: Sheet) -> list[dict[str, Any]]:
+def by_acceleration(sheet: MeasuredFrames) -> list[dict[str, Any]]:
     """Error and outcomes by acceleration, beside the error that the streaks' asymmetry predicts.
 
     From no rate at mid-exposure all lights move by a t^2 / 2, to one side. Their mean is a T^2 / 24 away from where
@@ -194,10 +198,16 @@ def by_acceleration(sheet: Sheet) -> list[dict[str, Any]]:
 class Limit(NamedTuple):
     """Between which levels the probability of a right attitude falls below `share`, each shown at 95 % confidence.
 
-    share : the highest of LIMITS that the frames of a level can show
-    above : the highest level up to which all are shown to be above it, NaN if none is
-    below : the lowest from which all are shown to be below it, infinite if none is
-    fields : fewest fields at a level
+    Attributes
+    ----------
+    share
+        The highest of LIMITS that the frames of a level can show
+    above
+        The highest level up to which all are shown to be above it, NaN if none is
+    below
+        The lowest from which all are shown to be below it, infinite if none is
+    fields
+        Fewest fields at a level
     """
 
     share: float
@@ -223,7 +233,7 @@ def bracket(rows: list[dict[str, Any]], key: str) -> Limit:
     return Limit(share, above, below, fewest)
 
 
-def solution_times_s(sheet: Sheet) -> Floats:
+def solution_times_s(sheet: MeasuredFrames) -> Floats:
     """(TIMED,) seconds that the tracker took for frames lost in space, from pixels to attitude, on this machine.
 
     All are solved twice and the second time counts: the first one compiles or loads what the solutions need.
@@ -239,7 +249,7 @@ def solution_times_s(sheet: Sheet) -> Floats:
     return np.array(found[TIMED:])
 
 
-def disturbances(sheet: Sheet) -> list[dict[str, Any]]:
+def disturbances(sheet: MeasuredFrames) -> list[dict[str, Any]]:
     """Outcomes and errors under each disturbance, the undisturbed frames first."""
     undisturbed = [row for row in sheet.rows("total") if sheet.cells[row].levels["draw"] == 0]
     cases = {"none": undisturbed}

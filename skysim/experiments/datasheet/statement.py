@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skysim.experiments.datasheet import performance, terms
-from skysim.experiments.datasheet.cells import TRACKED
-from skysim.experiments.datasheet.components import Bounded, Components
+from skysim.experiments.datasheet import performance, variance_components
+from skysim.experiments.datasheet.cells import TRACKED, MeasuredFrames
 from skysim.experiments.datasheet.performance import Counts, Limit, runs_needed
-from skysim.experiments.datasheet.run import Sheet
+from skysim.experiments.datasheet.variance_components import Bounded, Components
 from skysim.results.metrics import Summary
 
 NAMES = {
@@ -27,7 +26,7 @@ ENSEMBLE = "ensemble: over fields, units and noise, each frame on its own"
 TEMPORAL = "temporal: over frames of one attitude that differ in their noise"
 
 
-class Section(NamedTuple):
+class StatementSection(NamedTuple):
     """A section of the statement: what the numbers are, their table, and names of figures (see `figures`)."""
 
     title: str
@@ -40,8 +39,8 @@ class Section(NamedTuple):
 class Statement(NamedTuple):
     """All numbers of a datasheet, and the sheet they are from."""
 
-    sheet: Sheet
-    terms: dict[str, terms.TermTable]
+    sheet: MeasuredFrames
+    terms: dict[str, variance_components.TermTable]
     fields: int
     bias: list[Bounded]
     causes: list[dict[str, Any]]
@@ -58,16 +57,16 @@ class Statement(NamedTuple):
     times_s: list[float]
 
 
-def state(sheet: Sheet) -> Statement:
+def state(sheet: MeasuredFrames) -> Statement:
     """The statement of a measured sheet, with times of this machine. Raises InputError where too few are solved."""
-    _, solved = terms.term_errors(sheet)
+    _, solved = variance_components.term_errors(sheet)
     found = performance.counts(sheet, sheet.rows("sky"))
     return Statement(
         sheet,
-        terms.term_tables(sheet),
+        variance_components.term_tables(sheet),
         int(solved.sum()),
-        terms.mean_errors(sheet),
-        terms.causes(sheet),
+        variance_components.mean_errors(sheet),
+        variance_components.causes(sheet),
         found,
         performance.claims(found),
         performance.quantiles(sheet),
@@ -163,7 +162,7 @@ def arcsec(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.3g}"
 
 
-def sections(statement: Statement) -> list[Section]:
+def sections(statement: Statement) -> list[StatementSection]:
     """All sections, in order."""
     made = [
         term_section(statement),
@@ -178,7 +177,7 @@ def sections(statement: Statement) -> list[Section]:
     return [*made, disturbance_section(statement)]
 
 
-def term_section(statement: Statement) -> Section:
+def term_section(statement: Statement) -> StatementSection:
     """The terms, and their sum beside the total measured at once."""
     sheet = statement.sheet
     tables = statement.terms
@@ -200,7 +199,7 @@ def term_section(statement: Statement) -> Section:
         for table in tables.values():
             share = table.squares[name].value / table.squares["total"].value
             row += [size(table.squares[name]), f"{100 * share:.1f}"]
-        rows.append([*row, terms.TERMS.get(name, "of the terms of this scene")])
+        rows.append([*row, variance_components.TERMS.get(name, "of the terms of this scene")])
     ratios = ", ".join(f"{bounded(table.ratio)} {name}" for name, table in tables.items())
     x, y, roll = (bounded(one, 2) for one in statement.bias)
     texts = [
@@ -216,7 +215,7 @@ def term_section(statement: Statement) -> Section:
     ]
     if sheet.designer.units > 1:
         texts.insert(2, unit_text(sheet.designer.units))
-    return Section(
+    return StatementSection(
         "Error terms",
         texts,
         ["term", "across ″", "%", "about ″", "%", "what it is"],
@@ -238,7 +237,7 @@ def unit_text(units: int) -> str:
     )
 
 
-def lowering_section(statement: Statement) -> Section:
+def lowering_section(statement: Statement) -> StatementSection:
     """Which term dominates, and what is left of the mean square after each change of the scene."""
     texts = [
         f"{name.capitalize()} the boresight {NAMES[table.dominant]} dominates:"
@@ -252,11 +251,14 @@ def lowering_section(statement: Statement) -> Section:
     rows = [
         [
             one["cause"],
-            *(bounded(Bounded(*(100 * part for part in one[name]))) for name in terms.GROUPS),
+            *(
+                bounded(Bounded(*(100 * part for part in one[name])))
+                for name in variance_components.GROUPS
+            ),
         ]
         for one in statement.causes
     ]
-    return Section(
+    return StatementSection(
         "What dominates, and what would lower it",
         texts,
         ["change", "across %", "about %"],
@@ -265,7 +267,7 @@ def lowering_section(statement: Statement) -> Section:
     )
 
 
-def probability_section(statement: Statement) -> Section:
+def probability_section(statement: Statement) -> StatementSection:
     """Probabilities of right, refused and false attitudes, and what may be claimed."""
     counts = statement.counts
     where = "the whole sky" if statement.sheet.designer.under_stars else "the tilts of the vehicle"
@@ -309,10 +311,10 @@ def probability_section(statement: Statement) -> Section:
         "runs needed without failure",
         "more runs, if none fails",
     ]
-    return Section("Right, refused and false attitudes", texts, headers, rows, ["sky"])
+    return StatementSection("Right, refused and false attitudes", texts, headers, rows, ["sky"])
 
 
-def quantile_section(statement: Statement) -> Section:
+def quantile_section(statement: Statement) -> StatementSection:
     """Quantiles of the errors."""
     texts = [
         "Errors that a frame stays below with the probability at the left, over independent frames"
@@ -320,10 +322,13 @@ def quantile_section(statement: Statement) -> Section:
         consistency_text(statement.consistency),
     ]
     rows = [
-        [f"{100 * one['level']:g} %", *(quantile_text(one[name]) for name in terms.GROUPS)]
+        [
+            f"{100 * one['level']:g} %",
+            *(quantile_text(one[name]) for name in variance_components.GROUPS),
+        ]
         for one in statement.quantiles
     ]
-    return Section(
+    return StatementSection(
         "Performance at a confidence", texts, ["probability", "boresight angle ″", "about ″"], rows
     )
 
@@ -357,7 +362,11 @@ def outcome_cells(row: dict[str, Any]) -> list[str]:
 
 def pair_cells(row: dict[str, Any]) -> list[str]:
     """Cells of a pair of frames: noise-equivalent angle and error."""
-    return [arcsec(row[f"{kind}_{name}"]) for name in terms.GROUPS for kind in ("nea", "rms")]
+    return [
+        arcsec(row[f"{kind}_{name}"])
+        for name in variance_components.GROUPS
+        for kind in ("nea", "rms")
+    ]
 
 
 PAIR_HEADERS = ["NEA across ″", "rms across ″", "NEA about ″", "rms about ″"]
@@ -375,7 +384,7 @@ def bracket_text(what: str, limit: Limit, unit: str) -> str:
     return f"Limit of {what}: {share} of right attitudes are shown {above}; fewer than {share} are shown {below}."
 
 
-def rate_section(statement: Statement) -> Section:
+def rate_section(statement: Statement) -> StatementSection:
     """Noise-equivalent angle, error and acquisition by rate."""
     texts = [
         "Two frames of each attitude that differ in their noise, at a constant rate across the boresight, each lost in"
@@ -390,10 +399,10 @@ def rate_section(statement: Statement) -> Section:
         for row in statement.rates
     ]
     headers = ["rate °/s", "streak px", *PAIR_HEADERS, *FIELD_HEADERS]
-    return Section("By rate", texts, headers, rows, ["rates"])
+    return StatementSection("By rate", texts, headers, rows, ["rates"])
 
 
-def precision_text(sheet: Sheet) -> str:
+def precision_text(sheet: MeasuredFrames) -> str:
     """How well rms and NEA of F fields are known: 1 / sqrt(2 F) about two axes, 1 / sqrt(F) about one.
 
     For two Gaussian values a field and axis, with a scatter of the fields' variances that doubles the error's square.
@@ -402,7 +411,7 @@ def precision_text(sheet: Sheet) -> str:
     return f"NEA and rms are known to about {across:.0f} % across and {about:.0f} % about the boresight (1 σ)."
 
 
-def acceleration_section(statement: Statement) -> Section:
+def acceleration_section(statement: Statement) -> StatementSection:
     """Error and acquisition by acceleration."""
     texts = [
         "Two frames of each attitude, with no rate at mid-exposure and a constant acceleration across the boresight"
@@ -425,10 +434,10 @@ def acceleration_section(statement: Statement) -> Section:
         for row in statement.accelerations
     ]
     headers = ["acceleration °/s²", "rms across ″", "predicted ″", "rms about ″", *FIELD_HEADERS]
-    return Section("By acceleration", texts, headers, rows)
+    return StatementSection("By acceleration", texts, headers, rows)
 
 
-def tracking_section(statement: Statement) -> Section:
+def tracking_section(statement: Statement) -> StatementSection:
     """Error and outcomes in tracking mode."""
     rates = statement.tracked_rates
     accelerations = statement.tracked_accelerations
@@ -449,7 +458,7 @@ def tracking_section(statement: Statement) -> Section:
         ["", f"{row['acceleration_deg_s2']:g}", *pair_cells(row), *outcome_cells(row)]
         for row in accelerations
     ]
-    return Section(
+    return StatementSection(
         "In tracking mode",
         texts,
         ["rate °/s", "acceleration °/s²", *PAIR_HEADERS, *FIELD_HEADERS],
@@ -457,7 +466,7 @@ def tracking_section(statement: Statement) -> Section:
     )
 
 
-def magnitude_section(statement: Statement) -> Section:
+def magnitude_section(statement: Statement) -> StatementSection:
     """Noise-equivalent angle by the limit of the catalog."""
     texts = [
         "The faintest stars of the tracker's catalog, at rest: two frames of each attitude that differ in their noise"
@@ -472,7 +481,7 @@ def magnitude_section(statement: Statement) -> Section:
         ]
         for row in statement.magnitudes
     ]
-    return Section(
+    return StatementSection(
         "By magnitude limit",
         texts,
         ["limit V", *PAIR_HEADERS, *FIELD_HEADERS],
@@ -481,7 +490,7 @@ def magnitude_section(statement: Statement) -> Section:
     )
 
 
-def disturbance_section(statement: Statement) -> Section:
+def disturbance_section(statement: Statement) -> StatementSection:
     """Outcomes and errors under disturbances."""
     texts = [
         f"One frame in each field with a disturbance beyond what the scene has ({ENSEMBLE}); the Moon's frames have"
@@ -497,7 +506,7 @@ def disturbance_section(statement: Statement) -> Section:
         ]
         for row in statement.disturbances
     ]
-    return Section(
+    return StatementSection(
         "Under disturbances",
         texts,
         ["disturbance", *OUTCOME_HEADERS, "rms of the right: across ″", "about ″"],

@@ -23,16 +23,20 @@ from estimator.calibration.bundle_adjustment import Assumed
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, Unconnected
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.dome_survey.frames import SurveyFrame
-from skysim.experiments.dome_survey.matching import Correspondences, match_by_imu, match_by_survey
-from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncertainty, assumed
-from skysim.experiments.dome_survey.survey_run import (
+from skysim.experiments.dome_survey.survey_findings import (
     SurveyRun,
     identified,
     led_sigma_m,
     light_table,
     stray_lights,
 )
+from skysim.experiments.dome_survey.survey_frames import (
+    Correspondences,
+    SurveyFrame,
+    match_by_imu,
+    match_by_survey,
+)
+from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty, assumed
 from skysim.tracking.dome_map_file import DomeMap
 
 MIN_SHARED_LEDS = 3  # that a frame must share with others: two determine its attitude
@@ -62,10 +66,15 @@ def run_survey(
 ) -> SurveyRun:
     """Survey LEDs, lever arm, lens and attitudes from all frames, starting from `prior` with errors of `uncertainty`.
 
-    fit_distortion : fit k1, k2, p1, p2 as well. A narrow field hardly determines them, and they correlate with the
-        focal length: on the AFIT dome its sigma grows from 10 to 80 px, while the attitude does not change
     watch(rounds done, rounds) is called after each round of identification and adjustment
     Raises InputError if the frames do not determine the unknowns, or the result contradicts the prior.
+
+    Parameters
+    ----------
+    fit_distortion
+        Fit k1, k2, p1, p2 as well. A narrow field hardly determines them, and they correlate
+        with the focal length: on the AFIT dome its sigma grows from 10 to 80 px, while the
+        attitude does not change
     """
 
     def adjusted(
@@ -316,11 +325,15 @@ def led_visibility(
 def largest_connected_group(visible: NDArray[np.bool_], min_shared: int) -> list[int]:
     """Indices of the largest group of frames connected by shared LEDs.
 
-    visible : (F, N) mask of the LEDs in each frame
-    min_shared : minimum number of LEDs that a frame shares with the rest of the group
-
     Frames outside the group have an undetermined position relative to it, which `dome_survey.survey` rejects. A group
     grows from the frame with the most LEDs, adding connected frames until none is left.
+
+    Parameters
+    ----------
+    visible
+        (F, N) mask of the LEDs in each frame
+    min_shared
+        Minimum number of LEDs that a frame shares with the rest of the group
     """
     n_frames = len(visible)
     remaining = np.ones(n_frames, dtype=bool)

@@ -8,12 +8,18 @@ fault of the paper's laboratory); else `disagrees`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
-from skysim.experiments.papers.published import Experiment, Row
-from skysim.results.metrics import Summary
+import numpy as np
+from scipy.special import stdtrit
+
+from skysim.core.random_streams import random_stream
+from skysim.core.types import Floats
+from skysim.experiments.papers.published import Experiment, PublishedRow
+from skysim.results import metrics
+from skysim.results.metrics import CONFIDENCE, RESAMPLES, Summary
 
 Verdict = Literal["agrees", "explained", "disagrees"]
 VERDICTS: tuple[Verdict, ...] = ("agrees", "explained", "disagrees")
@@ -23,8 +29,14 @@ VERDICTS: tuple[Verdict, ...] = ("agrees", "explained", "disagrees")
 class ExperimentOptions:
     """Options of an experiment.
 
-    quick: fewer trials, wider intervals;  seed: of all its random streams
-    watch: progress callback, called with (completed, total)
+    Attributes
+    ----------
+    quick
+        Fewer trials, wider intervals
+    seed
+        Of all its random streams
+    watch
+        Progress callback, called with (completed, total)
     """
 
     quick: bool = False
@@ -58,7 +70,7 @@ def with_cause(
     return RowResult(statistic(ours), note, Cause(cause, statistic(theirs)))
 
 
-class Drawing(NamedTuple):
+class FigureDrawing(NamedTuple):
     """A figure of our data: draw(figure) draws into an empty matplotlib figure of that size."""
 
     caption: str
@@ -71,14 +83,14 @@ class ExperimentResult:
     """Results of an experiment: one for every published row, by key, and figures."""
 
     results: Mapping[str, RowResult]
-    drawings: tuple[Drawing, ...] = ()
+    drawings: tuple[FigureDrawing, ...] = ()
 
 
 class Comparison(NamedTuple):
     """One row of the table: published number, ours and the verdict."""
 
     id: str
-    row: Row
+    row: PublishedRow
     result: RowResult
     verdict: Verdict
 
@@ -127,7 +139,7 @@ class Reproduction:
     id: str
     published: Experiment
     comparisons: tuple[Comparison, ...]
-    drawings: tuple[Drawing, ...]
+    drawings: tuple[FigureDrawing, ...]
     seconds: float = field(compare=False)
 
     @property
@@ -147,7 +159,10 @@ def compare(
 ) -> Reproduction:
     """Compare every published row with our result.
 
-    Raises ValueError if the experiment has no result for a row, or a result for a row that is not published.
+    Raises
+    ------
+    ValueError
+        If the experiment has no result for a row, or a result for a row that is not published.
     """
     if unmatched := published.rows.keys() ^ experiment.results.keys():
         raise ValueError(
@@ -160,7 +175,7 @@ def compare(
     return Reproduction(id, published, comparisons, experiment.drawings, seconds)
 
 
-def verdict(row: Row, result: RowResult) -> Verdict:
+def verdict(row: PublishedRow, result: RowResult) -> Verdict:
     """agrees: our interval overlaps the published number's band; explained: it does so only with the cause."""
     if intervals_overlap(row, result.ours):
         return "agrees"
@@ -169,14 +184,14 @@ def verdict(row: Row, result: RowResult) -> Verdict:
     )
 
 
-def intervals_overlap(row: Row, ours: Summary) -> bool:
+def intervals_overlap(row: PublishedRow, ours: Summary) -> bool:
     """Return True if our interval (the number itself if it has none) and the row's band overlap."""
     low, high = row.band
     our_low, our_high = (ours.value if math.isnan(end) else end for end in (ours.low, ours.high))
     return our_low <= high and our_high >= low
 
 
-def format_with_source(row: Row) -> str:
+def format_with_source(row: PublishedRow) -> str:
     """Format the published number with its source; `derived` if the paper does not print it."""
     source = "; ".join(part for part in ("derived" if row.derived else "", row.source) if part)
     return f"{format_published(row)} ({source})" if source else format_published(row)
@@ -189,7 +204,7 @@ def format_summary(summary: Summary) -> str:
     return f"{summary.value:.4g} ({summary.low:.4g}..{summary.high:.4g})"
 
 
-def format_published(row: Row) -> str:
+def format_published(row: PublishedRow) -> str:
     """Format the published number or its bounds, with the tolerance."""
     if row.published is not None:
         text = f"{row.published:.6g}"
@@ -202,3 +217,95 @@ def format_published(row: Row) -> str:
             else f"{row.at_least:.6g}..{row.at_most:.6g}"
         )
     return f"{text} ± {row.tolerance:.3g}" if row.tolerance else text
+
+
+# 95 % intervals: confidence interval of a mean, prediction interval of one draw, bootstrap of
+# functions of means.
+
+
+def confidence_interval(values: Sequence[float] | Floats) -> Summary:
+    """The mean with Student's confidence interval: mean +- t s / sqrt(n)."""
+    return prediction_interval(values, own_variance=0.0)
+
+
+def prediction_interval(
+    values: Sequence[float] | Floats, count: int = 0, own_variance: float = 1.0
+) -> Summary:
+    """The mean with Student's prediction interval: mean +- t s sqrt(1 + 1 / n), t for n - 1 degrees of freedom.
+
+    For a published number that is itself a single draw.
+
+    Parameters
+    ----------
+    count
+        Number of independent draws, if fewer than the values
+    own_variance
+        Of the predicted draw in units of s^2, in place of 1
+    """
+    draws = np.asarray(values, float)
+    count = count or len(draws)
+    mean = float(np.mean(draws))
+    half = float(
+        stdtrit(count - 1, 0.975) * np.std(draws, ddof=1) * np.sqrt(own_variance + 1 / count)
+    )
+    return symmetric_interval(mean, half, count)
+
+
+def symmetric_interval(value: float, half: float, trials: int) -> Summary:
+    """value +- half."""
+    return Summary(value, value - half, value + half, trials)
+
+
+def percent(summary: Summary) -> Summary:
+    """A fraction with its interval in percent."""
+    return Summary(100 * summary.value, 100 * summary.low, 100 * summary.high, summary.trials)
+
+
+def sample_std(values: Floats, axis: int = -1) -> Any:
+    """Standard deviation with divisor n - 1."""
+    return np.std(values, axis=axis, ddof=1)
+
+
+def bootstrap_interval(values: Floats, statistic: Callable[..., Any]) -> Summary:
+    """A statistic with its bootstrap percentile interval, widened for small samples (see `widen_interval`)."""
+    return widen_interval(metrics.resampled(values, statistic))
+
+
+def widen_interval(summary: Summary) -> Summary:
+    """Widen a bootstrap interval about its value by (t / 1.96) sqrt(n / (n - 1)), t for n - 1 degrees of freedom.
+
+    The percentile bootstrap of n values uses the standard deviation with divisor n and the normal quantile, so it is
+    too narrow by this factor for small n.
+    """
+    if summary.trials < 2:
+        return summary
+    factor = (
+        stdtrit(summary.trials - 1, 0.975) / 1.96 * np.sqrt(summary.trials / (summary.trials - 1))
+    )
+    low, high = (
+        summary.value + factor * (end - summary.value) for end in (summary.low, summary.high)
+    )
+    return summary._replace(low=float(low), high=float(high))
+
+
+def bootstrap_of_means(columns: Floats, statistic: Callable[[Floats], Any]) -> Summary:
+    """A function of K column means, with its bootstrap percentile interval over the N rows; NaNs are left out.
+
+    Parameters
+    ----------
+    columns
+        (N, K)
+    statistic
+        Of (..., K) means, shape (...)
+    """
+    finite = np.isfinite(columns)
+    filled = np.where(finite, columns, 0.0)
+    rows = len(columns)
+    # A resample only needs how often it draws each row, so the means of all resamples are one matrix product.
+    weight = random_stream(1).multinomial(rows, np.full(rows, 1 / rows), RESAMPLES)
+    with np.errstate(invalid="ignore"):
+        resampled = statistic((weight @ filled) / (weight @ finite))
+    value = float(statistic(filled.sum(axis=0) / finite.sum(axis=0)))
+    tail = 50 * (1 - CONFIDENCE)
+    low, high = np.nanpercentile(resampled, [tail, 100 - tail])
+    return widen_interval(Summary(value, min(float(low), value), max(float(high), value), rows))

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from skysim.experiments.papers import compare
 from skysim.experiments.papers.compare import VERDICTS, Comparison, Reproduction
 from skysim.results.plots import png
-from skysim.results.report import (
+from skysim.results.report import Report
+from skysim.results.report_blocks import (
     Cell,
     Column,
     Figure,
     Items,
-    Report,
     Section,
     Table,
     Text,

@@ -10,23 +10,33 @@ import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from skysim.core.errors import InputError
-from skysim.core.io.yaml_reader import explain, read_yaml
-from skysim.core.paths import DATA
+from skysim.core.files import DATA
 from skysim.core.types import Floats
 from skysim.core.units import ConfigModel, NotNegative, Number
+from skysim.core.yaml_reader import explain, read_yaml
 
 FOLDER = DATA / "published"
 
 
-class Row(ConfigModel):
+class PublishedRow(ConfigModel):
     """One published number.
 
-    quantity : its description, with the unit in parentheses
-    published: the number; at_least and at_most, one or both, replace it if the paper states only a bound
-    tolerance: allowed difference of ours, in the same unit
-    source   : the table, figure or page, if it differs from its experiment's
-    derived  : not printed, but follows from printed numbers by arithmetic or by generally accepted theory
-    note     : remark for the reader, such as a misprint or the reason for the tolerance
+    Attributes
+    ----------
+    quantity
+        Its description, with the unit in parentheses
+    published
+        The number; at_least and at_most, one or both, replace it if the paper states only a
+        bound
+    tolerance
+        Allowed difference of ours, in the same unit
+    source
+        The table, figure or page, if it differs from its experiment's
+    derived
+        Not printed, but follows from printed numbers by arithmetic or by generally accepted
+        theory
+    note
+        Remark for the reader, such as a misprint or the reason for the tolerance
     """
 
     quantity: str
@@ -57,10 +67,18 @@ class Row(ConfigModel):
 class Experiment(ConfigModel):
     """Published data of one experiment.
 
-    source : table, figure or section;  wrong: errors of the paper, with the corrected values
-    assumed: our assumptions where the paper gives no value
-    fitted : parameters chosen so that a number is reproduced; all such parameters are listed here
-    data   : published tables that are inputs of the experiment, row by row
+    Attributes
+    ----------
+    source
+        Table, figure or section
+    wrong
+        Errors of the paper, with the corrected values
+    assumed
+        Our assumptions where the paper gives no value
+    fitted
+        Parameters chosen so that a number is reproduced; all such parameters are listed here
+    data
+        Published tables that are inputs of the experiment, row by row
     """
 
     title: str
@@ -69,7 +87,7 @@ class Experiment(ConfigModel):
     assumed: tuple[str, ...] = ()
     fitted: tuple[str, ...] = ()
     data: dict[str, tuple[tuple[Number, ...], ...]] = Field(default_factory=dict)
-    rows: Annotated[dict[str, Row], Field(min_length=1)]
+    rows: Annotated[dict[str, PublishedRow], Field(min_length=1)]
     paper: str = ""
 
 

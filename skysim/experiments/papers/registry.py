@@ -6,38 +6,52 @@ import time
 from collections.abc import Callable
 
 from skysim.core.errors import InputError
-from skysim.experiments.papers.afit import attitude, bump, led_tests, surface, test1, test2, test3
+from skysim.experiments.papers import (
+    nps,
+    other_domes,
+    ptase_ground,
+    ptase_monte_carlo,
+    shefex_camera,
+    shefex_identification,
+    shefex_nights,
+    shefex_setup,
+)
+from skysim.experiments.papers.afit import (
+    afit_surface,
+    led_tests,
+    test1,
+    test2,
+    test3,
+    test3_attitude,
+)
 from skysim.experiments.papers.compare import (
     ExperimentOptions,
     ExperimentResult,
     Reproduction,
     compare,
 )
-from skysim.experiments.papers.other_domes import apl, nps, oled
-from skysim.experiments.papers.ptase import ground, monte_carlo
 from skysim.experiments.papers.published import experiments
-from skysim.experiments.papers.shefex import camera, catalog, identification, nights
 
 ExperimentFunction = Callable[[ExperimentOptions], ExperimentResult]
 
 EXPERIMENTS: dict[str, ExperimentFunction] = {
-    "afit-table-1": surface.table_1,
+    "afit-table-1": afit_surface.table_1,
     "afit-figs-30-46": led_tests.led_tests,
     "afit-table-2": test1.table_2,
     "afit-table-3-5": test2.tables_3_to_5,
     "afit-table-6-9": test3.tables_6_to_9,
-    "afit-table-10-15": attitude.tables_10_to_15,
-    "afit-bump": bump.bump,
+    "afit-table-10-15": test3_attitude.tables_10_to_15,
+    "afit-bump": test3_attitude.bump,
     "nps": nps.initial_error_trials,
-    "apl": apl.discrepancies_and_counts,
-    "oled": oled.noise_and_absolute_error,
-    "ptase-table-1": monte_carlo.table_1,
-    "ptase-table-2": ground.table_2,
-    "shefex-fig-2": camera.exposure_control,
-    "shefex-fig-3": camera.scan_times,
-    "shefex-figs-4-5": catalog.catalog_statistics,
-    "shefex-figs-7-10": identification.figs_7_to_10,
-    "shefex-nights": nights.night_results,
+    "apl": other_domes.discrepancies_and_counts,
+    "oled": other_domes.noise_and_absolute_error,
+    "ptase-table-1": ptase_monte_carlo.table_1,
+    "ptase-table-2": ptase_ground.table_2,
+    "shefex-fig-2": shefex_camera.exposure_control,
+    "shefex-fig-3": shefex_camera.scan_times,
+    "shefex-figs-4-5": shefex_setup.catalog_statistics,
+    "shefex-figs-7-10": shefex_identification.figs_7_to_10,
+    "shefex-nights": shefex_nights.night_results,
 }
 
 

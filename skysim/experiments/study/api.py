@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from skysim.core.io.yaml_reader import override_texts
-from skysim.experiments.study import loader
-from skysim.experiments.study.analysis import table as tables
+from skysim.core.yaml_reader import override_texts
+from skysim.experiments.study import study_file
+from skysim.experiments.study import table as tables
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.plan import Plan
 from skysim.experiments.study.report.study_report import study_report
@@ -61,15 +61,21 @@ def run_study(
 ) -> StudyResult:
     """Run the missing trials of a study and keep them in a store.
 
-    name      : path of a study file, or name of a study in scenes/studies
-    overrides : keys of the study and their values, such as {"replicates": 20}
-    out       : folder of the store, by default out/NAME. A store of the same study is continued
-    workers   : number of processes, by default the number of cores; 1 runs the trials in this process
-
     A script that uses several processes needs the usual `if __name__ == "__main__":`. Raises InputError.
+
+    Parameters
+    ----------
+    name
+        Path of a study file, or name of a study in scenes/studies
+    overrides
+        Keys of the study and their values, such as {"replicates": 20}
+    out
+        Folder of the store, by default out/NAME. A store of the same study is continued
+    workers
+        Number of processes, by default the number of cores; 1 runs the trials in this process
     """
     texts = override_texts(overrides)
-    plan = loader.load(str(name), texts)
+    plan = study_file.load(str(name), texts)
     folder = Path(out) if out is not None else Path("out") / Path(name).stem
     engine = runner.ENGINES["serial" if workers == 1 else "pool"](workers, "")
     path = folder / store.STORE

@@ -21,14 +21,13 @@ from pydantic import (
     model_validator,
 )
 
+from skysim.core import yaml_reader
 from skysim.core.errors import InputError
-from skysim.core.io import yaml_reader
-from skysim.core.io.yaml_reader import explain, is_file, set_key
-from skysim.core.paths import STUDIES
+from skysim.core.files import STUDIES
 from skysim.core.units import ConfigModel, Fraction, NotNegative, Number, Time, Triple
-from skysim.experiments.study.designs import Design, Point, points
-from skysim.experiments.study.factors import Factor, Settings, Value
-from skysim.results.files.builder.prices import Prices, find_prices, read_prices
+from skysim.core.yaml_reader import explain, is_file, set_key
+from skysim.experiments.study.factors import Design, Factor, Point, Settings, Value, points
+from skysim.results.files.parts import Prices, find_prices, read_prices
 from skysim.scene.loader import find as find_scene
 from skysim.scene.loader import load as load_scene
 from skysim.scene.scene import Scene
@@ -54,7 +53,11 @@ def check_rising(ends: tuple[float, float]) -> tuple[float, float]:
 class NearBody(ConfigModel):
     """Directions within two angles of the Sun, the Moon, a planet or the zenith of `site`, at the scene's start.
 
-    body : also where the scene's light has no bodies, so that frames with and without it can be compared
+    Attributes
+    ----------
+    body
+        Also where the scene's light has no bodies, so that frames with and without it can be
+        compared
     """
 
     body: BodyName
@@ -64,9 +67,16 @@ class NearBody(ConfigModel):
 class AttitudeRange(ConfigModel):
     """A random attitude in every trial, roll or yaw uniform.
 
-    tilt_deg : under a dome, tilt of the body from vertical: one angle, or uniform in solid angle between two
-    dec_deg  : under the stars, the boresight is uniform over the sphere between two declinations
-    near     : under the stars, the boresight is uniform in solid angle between two angles from a body instead
+    Attributes
+    ----------
+    tilt_deg
+        Under a dome, tilt of the body from vertical: one angle, or uniform in solid angle
+        between two
+    dec_deg
+        Under the stars, the boresight is uniform over the sphere between two declinations
+    near
+        Under the stars, the boresight is uniform in solid angle between two angles from a body
+        instead
     """
 
     tilt_deg: Tilt | tuple[Tilt, Tilt] = (0.0, 30.0)
@@ -77,8 +87,14 @@ class AttitudeRange(ConfigModel):
 class RandomAttitude(AttitudeRange):
     """A random attitude in every trial, and its noise.
 
-    noise_seed : selects the noise at unchanged attitudes; as a factor it makes noise an input, as Sobol indices need
-    attitude_seed : selects the attitudes; at points of a paired study that have the same one they are the same
+    Attributes
+    ----------
+    noise_seed
+        Selects the noise at unchanged attitudes; as a factor it makes noise an input, as Sobol
+        indices need
+    attitude_seed
+        Selects the attitudes; at points of a paired study that have the same one they are the
+        same
     """
 
     noise_seed: Annotated[int, Field(ge=0)] = 0
@@ -117,10 +133,20 @@ class CentroidTrial(RandomAttitude):
     With `tracker.decoder` they are those of successive frames at rest, to the first with an attitude, as many as the
     code has bits at most.
 
-    noise_px : standard deviation of a centroid, each axis;  magnitude_sigma : of its brightness, magnitudes
-    lights   : maximum number of true sources, the brightest;  missing : fraction of the true sources not detected
-    false_lights : number of false detections, uniform over the image
-    false_share  : fraction of all detections that are false; their number is rounded
+    Attributes
+    ----------
+    noise_px
+        Standard deviation of a centroid, each axis
+    magnitude_sigma
+        Of its brightness, magnitudes
+    lights
+        Maximum number of true sources, the brightest
+    missing
+        Fraction of the true sources not detected
+    false_lights
+        Number of false detections, uniform over the image
+    false_share
+        Fraction of all detections that are false; their number is rounded
     """
 
     kind: Literal["centroids"]
@@ -135,14 +161,24 @@ class CentroidTrial(RandomAttitude):
 class FrameTrial(RandomAttitude):
     """One frame, rendered with all camera noise, then solved.
 
-    rate_deg_s : rate about rate_axis
-    acceleration_deg_s2 : about the same axis, in the direction of the rate
-    turn_deg   : rotation about the same axis from the random attitude to that of the frame, such as rate times time in
-        a sequence of frames, or a fraction of a pixel
-    rate_axis  : perpendicular: a random axis perpendicular to the boresight; boresight; or an axis of body or camera
-    gyro : whether the tracker receives the streak vector of the stars
-    tracked : number of frames before it, at the scene's frame rate in the same motion, that the tracker has followed in
-        its tracking mode; the frame is then solved in windows around the predicted stars, or not at all
+    Attributes
+    ----------
+    rate_deg_s
+        Rate about rate_axis
+    acceleration_deg_s2
+        About the same axis, in the direction of the rate
+    turn_deg
+        Rotation about the same axis from the random attitude to that of the frame, such as rate
+        times time in a sequence of frames, or a fraction of a pixel
+    rate_axis
+        Perpendicular: a random axis perpendicular to the boresight; boresight; or an axis of
+        body or camera
+    gyro
+        Whether the tracker receives the streak vector of the stars
+    tracked
+        Number of frames before it, at the scene's frame rate in the same motion, that the
+        tracker has followed in its tracking mode; the frame is then solved in windows around
+        the predicted stars, or not at all
     """
 
     kind: Literal["frames"]
@@ -164,8 +200,13 @@ def expand_start(value: Any) -> Any:
 class FlightTrial(ConfigModel):
     """The complete scene: motion simulated, frames rendered and solved, with the attitude filter if it has one.
 
-    settle : frames before this time are not counted
-    start  : `scene`: that of the scene; `random`, or a section: a random attitude in every trial, at the scene's rate
+    Attributes
+    ----------
+    settle
+        Frames before this time are not counted
+    start
+        `scene`: that of the scene; `random`, or a section: a random attitude in every trial, at
+        the scene's rate
     """
 
     kind: Literal["flight"]
@@ -261,8 +302,14 @@ Figure = Annotated[Curve | Heat | Map, Field(discriminator="kind")]
 class Threshold(ConfigModel):
     """Where along a factor a proportion crosses a limit, such as the rate at which 95 % of the frames are identified.
 
-    response : a proportion (`identified`, `coverage_4`, ...), rising or falling along the factor
-    along    : a factor with numeric levels;  by : one threshold for each level of this factor
+    Attributes
+    ----------
+    response
+        A proportion (`identified`, `coverage_4`, ...), rising or falling along the factor
+    along
+        A factor with numeric levels
+    by
+        One threshold for each level of this factor
     """
 
     response: str
@@ -280,8 +327,11 @@ class Threshold(ConfigModel):
 class Cost(ConfigModel):
     """Cost of a point: base + sum of `per` times the factor's value + the prices of its named levels + its parts.
 
-    parts : table of prices of the scene's parts (`skysim scenes parts`), whose total is added: `assumed`, or a CSV file
-        beside the study; none if left out
+    Attributes
+    ----------
+    parts
+        Table of prices of the scene's parts (`skysim scenes parts`), whose total is added:
+        `assumed`, or a CSV file beside the study; none if left out
     """
 
     parts: str | None = None
@@ -308,7 +358,10 @@ class Constraint(ConfigModel):
 class Search(ConfigModel):
     """The optimization of `skysim study optimize`: one objective, or the Pareto front of two.
 
-    candidates : number of points evaluated, each with all replicates
+    Attributes
+    ----------
+    candidates
+        Number of points evaluated, each with all replicates
     """
 
     objectives: Annotated[tuple[Objective, ...], Field(min_length=1, max_length=2)]
@@ -328,11 +381,20 @@ class Search(ConfigModel):
 class Study(ConfigModel):
     """A study file: scene, trial, factors, design and responses.
 
-    scene      : name, or path relative to the study file's folder; `set` overrides keys of it at all points
-    paired     : use the same random attitudes and noise at every point for each replicate (common random numbers)
-    hardware   : keys of seeds, such as `light.layout.hardware_seed` and `tracker.survey.seed`, that are drawn anew in
-        every replicate: results then hold for all LED domes or surveys of the kind, not for one of them
-    responses  : names that `metrics.response` accepts
+    Attributes
+    ----------
+    scene
+        Name, or path relative to the study file's folder; `set` overrides keys of it at all
+        points
+    paired
+        Use the same random attitudes and noise at every point for each replicate (common random
+        numbers)
+    hardware
+        Keys of seeds, such as `light.layout.hardware_seed` and `tracker.survey.seed`, that are
+        drawn anew in every replicate: results then hold for all LED domes or surveys of the
+        kind, not for one of them
+    responses
+        Names that `metrics.response` accepts
     """
 
     schema_version: Annotated[Literal[1], Field(alias="schema")]
@@ -363,9 +425,15 @@ class Study(ConfigModel):
 class TrialSpec:
     """The part of a study that a worker needs to run any of its trials.
 
-    folder : folder of the study file, to which scene paths are relative
-    hardware : keys of the seeds that every replicate draws anew
-    programs : commands of external trackers by name, from the command line; not part of the study's digest
+    Attributes
+    ----------
+    folder
+        Folder of the study file, to which scene paths are relative
+    hardware
+        Keys of the seeds that every replicate draws anew
+    programs
+        Commands of external trackers by name, from the command line; not part of the study's
+        digest
     """
 
     scene: str
@@ -394,7 +462,10 @@ class TrialSpec:
 class Plan:
     """A study with its design points. Trial number = point * replicates + replicate.
 
-    prices : of `optimize.cost.parts`
+    Attributes
+    ----------
+    prices
+        Of `optimize.cost.parts`
     """
 
     path: Path

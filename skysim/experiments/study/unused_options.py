@@ -10,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
-from skysim.experiments.study.designs import make_point
-from skysim.experiments.study.factors import Settings, Value
+from skysim.experiments.study.factors import Settings, Value, make_point
 from skysim.experiments.study.plan import (
     TRIAL,
     CentroidTrial,
@@ -27,7 +26,7 @@ from skysim.scene.sections.camera import RollingShutterConfig
 from skysim.scene.sections.layouts import CelestialConfig, OnPoints
 from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.scene.unused import Rule
-from skysim.tracking import settings
+from skysim.tracking import factory
 
 STREAK_ALGORITHMS = (
     "default",
@@ -88,7 +87,7 @@ DETECTOR = tuple(
 
 def ignores_streak(scene: Scene, trial: Trial) -> bool:
     """Whether neither the detector nor the centroider of skysim's tracker uses a measured streak."""
-    chosen = settings.assumed_settings(scene)
+    chosen = factory.assumed_settings(scene)
     used = {chosen.detector, chosen.centroider} & set(STREAK_ALGORITHMS)
     return isinstance(trial, FrameTrial) and not unused.external(scene) and not used
 
@@ -223,8 +222,12 @@ RULES = (
 class CheckedPoint(NamedTuple):
     """A point of a study at which options are checked: one factor at a level, the others at their middle.
 
-    own      : settings of that factor alone
-    settings : of all factors
+    Attributes
+    ----------
+    own
+        Settings of that factor alone
+    settings
+        Of all factors
     """
 
     factor: str
@@ -249,8 +252,12 @@ Resolve = Callable[[Settings], tuple[Scene, Trial]]
 def check(plan: Plan, points: Iterable[CheckedPoint], resolve: Resolve) -> None:
     """Raise InputError, which begins with a key of the study, for an option that has no effect.
 
-    points  : every level of every factor, the other factors at their middle
-    resolve : makes the scene and the trial from the settings of all factors
+    Parameters
+    ----------
+    points
+        Every level of every factor, the other factors at their middle
+    resolve
+        Makes the scene and the trial from the settings of all factors
     """
     written = [*plan.spec.base, *(f"{TRIAL}{key}" for key in plan.spec.trial if key != "kind")]
     faults: dict[
@@ -275,7 +282,10 @@ def check(plan: Plan, points: Iterable[CheckedPoint], resolve: Resolve) -> None:
 def unused_overrides(overrides: Mapping[str, str], scene: Scene, trial: Trial) -> set[str]:
     """The overrides of a scene that have no effect on a trial.
 
-    scene : with the overrides
+    Parameters
+    ----------
+    scene
+        With the overrides
     """
     keys = {key: unused.override_keys({key: text}) for key, text in overrides.items()}
     return {

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.io.files import atomic_file
+from skysim.core.files import atomic_file
 
 EXTRA = "needs optional packages: pip install 'skysim[export]'"
 KEPT_BYTES = (
@@ -31,9 +31,16 @@ Source = Callable[[str], Array]  # the column of some rows by its name
 class Rows(Mapping[str, Array]):
     """Columns of some rows by name; a column is read when it is asked for.
 
-    names   : of the columns, in order
-    sources : of the rows, one after another;  counts : of the rows of each
-    order   : (N,) places of the rows in those of the sources; None for their own order
+    Attributes
+    ----------
+    names
+        Of the columns, in order
+    sources
+        Of the rows, one after another
+    counts
+        Of the rows of each
+    order
+        (N,) places of the rows in those of the sources; None for their own order
     """
 
     def __init__(

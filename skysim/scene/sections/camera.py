@@ -17,7 +17,7 @@ from pydantic import (
 )
 
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.paths import DATA
+from skysim.core.files import DATA
 from skysim.core.units import (
     Ascending,
     ConfigModel,
@@ -29,7 +29,7 @@ from skysim.core.units import (
     check_table,
     quantity,
 )
-from skysim.scene.opencv_calibration import Calibration
+from skysim.scene.opencv_calibration import OpencvCalibration
 
 FocusText = Annotated[
     str, Field(description='a length such as "33 in", or infinity')
@@ -52,8 +52,11 @@ def focus_distance(value: Any) -> float:
 class PsfConfig(ConfigModel):
     """Base of all point-spread functions: a Gaussian blur that grows toward the corner of the field.
 
-    corner_sigma_px : standard deviation at the farthest corner of the chip, proportional to the field radius, added
-                      in quadrature (field curvature and coma, to first order)
+    Attributes
+    ----------
+    corner_sigma_px
+        Standard deviation at the farthest corner of the chip, proportional to the field radius,
+        added in quadrature (field curvature and coma, to first order)
     """
 
     corner_sigma_px: Annotated[Number, Field(ge=0, le=20)] = 0.0
@@ -127,9 +130,14 @@ class VignettingTableConfig(ConfigModel):
 class ChromaticConfig(ConfigModel):
     """Chromatic aberration: where light of other wavelengths is imaged, linear between them, constant beyond them.
 
-    focus     : axial color: the image distance minus that of the lens's focal length, for a light at infinity
-    corner_px : lateral color: shift away from the principal point at the farthest corner of the chip, proportional to
-        the distance from it
+    Attributes
+    ----------
+    focus
+        Axial color: the image distance minus that of the lens's focal length, for a light at
+        infinity
+    corner_px
+        Lateral color: shift away from the principal point at the farthest corner of the chip,
+        proportional to the distance from it
     """
 
     wavelength_m: Annotated[
@@ -159,9 +167,15 @@ class ChromaticConfig(ConfigModel):
 class GhostConfig(ConfigModel):
     """A ghost of every light: light that a pair of the lens's surfaces reflects back to the chip.
 
-    magnification : its distance from the principal point over the image's, on the other side of it; below 0 on the same
-    share         : its light over the image's: the product of the two reflectances
-    radius_px     : of the disk over which it is spread, out of focus
+    Attributes
+    ----------
+    magnification
+        Its distance from the principal point over the image's, on the other side of it; below 0
+        on the same
+    share
+        Its light over the image's: the product of the two reflectances
+    radius_px
+        Of the disk over which it is spread, out of focus
     """
 
     magnification: Annotated[Number, Field(ge=-20, le=20)]
@@ -181,7 +195,12 @@ class GhostConfig(ConfigModel):
 class GlareConfig(ConfigModel):
     """Veiling glare: light scattered over the chip, (1 + (r / core_px)^2)^(-exponent / 2) at the distance r.
 
-    share    : of all light;  core_px : where the law of the power begins
+    Attributes
+    ----------
+    share
+        Of all light
+    core_px
+        Where the law of the power begins
     """
 
     share: Annotated[Fraction, Field(gt=0, lt=1)]
@@ -192,8 +211,12 @@ class GlareConfig(ConfigModel):
 class BaffleConfig(ConfigModel):
     """Point source transmittance (PST) of baffle and lens, by which bodies outside the field light the chip.
 
-    angle_deg, pst : irradiance on the chip over irradiance before the lens, against the angle from the boresight. Its
-        logarithm is linear between the rows; beyond them it is constant. A curve of `transmission` counts in addition
+    Attributes
+    ----------
+    angle_deg, pst
+        Irradiance on the chip over irradiance before the lens, against the angle from the
+        boresight. Its logarithm is linear between the rows; beyond them it is constant. A curve
+        of `transmission` counts in addition
     """
 
     angle_deg: Ascending
@@ -244,11 +267,18 @@ Shutter = Annotated[
 class ParticlesConfig(ConfigModel):
     """Ionizing particles that leave straight tracks: cosmic rays, trapped protons.
 
-    per_cm2_s     : crossings per square centimeter of the chip and second, from all sides: half of the
-                    omnidirectional flux
-    depth_m       : thickness of the sensitive layer
-    electrons_um  : most probable charge per micrometer of track (about 80 for a fast singly charged particle)
-    diffusion_px  : standard deviation of the charge cloud
+    Attributes
+    ----------
+    per_cm2_s
+        Crossings per square centimeter of the chip and second, from all sides: half of the
+        omnidirectional flux
+    depth_m
+        Thickness of the sensitive layer
+    electrons_um
+        Most probable charge per micrometer of track (about 80 for a fast singly charged
+        particle)
+    diffusion_px
+        Standard deviation of the charge cloud
     """
 
     per_cm2_s: Annotated[Number, Field(ge=0, le=1e12)]
@@ -260,7 +290,12 @@ class ParticlesConfig(ConfigModel):
 class EfficiencyConfig(ConfigModel):
     """A curve of quantum efficiency, scaled to the peak that a data sheet states.
 
-    curve : in data/qe, or a file;  peak : electrons per photon at its highest point
+    Attributes
+    ----------
+    curve
+        In data/qe, or a file
+    peak
+        Electrons per photon at its highest point
     """
 
     curve: str
@@ -311,20 +346,36 @@ Transmission = Annotated[
 class DetectorConfig(ConfigModel):
     """The chip and its electronics, in the order of the signal path. Each effect's parameter can switch it off.
 
-    quantum_efficiency : one number for 400-1000 nm, the name of a curve in data/qe (or a file), or a curve with its
-                         peak: {curve: cmos, peak: 0.6}
-    hardware_seed      : this chip's fixed pattern: PRNU, DSNU, hot pixels, column offsets
-    prnu               : standard deviation of the pixels' relative sensitivity
-    dark_e_s           : mean dark current at dark_temperature_c; it doubles every dark_doubling_c
-    dsnu               : standard deviation of the pixels' relative dark current
-    hot_pixels         : fraction of hot pixels, whose dark current is exponentially distributed with mean hot_e_s
-    blooming           : column: charge beyond a full well flows along its column; anti_blooming: the drained fraction
-    cti_parallel, cti_serial : fraction of the charge left behind in each transfer
-    read_noise_e, reset_noise_e : Gaussian, every pixel, every frame
-    column_offset_e    : standard deviation of the columns' fixed offsets
-    nonlinearity       : fraction of the signal missing at full well: e (1 - nonlinearity e / full_well)
-    noise              : false gives the expected value, not rounded: with fixed pattern and transfer loss, but
-                         without particles, full-well limit, nonlinearity and converter range
+    Attributes
+    ----------
+    quantum_efficiency
+        One number for 400-1000 nm, the name of a curve in data/qe (or a file), or a curve with
+        its peak: {curve: cmos, peak: 0.6}
+    hardware_seed
+        This chip's fixed pattern: PRNU, DSNU, hot pixels, column offsets
+    prnu
+        Standard deviation of the pixels' relative sensitivity
+    dark_e_s
+        Mean dark current at dark_temperature_c; it doubles every dark_doubling_c
+    dsnu
+        Standard deviation of the pixels' relative dark current
+    hot_pixels
+        Fraction of hot pixels, whose dark current is exponentially distributed with mean
+        hot_e_s
+    blooming
+        Column: charge beyond a full well flows along its column; anti_blooming: the drained
+        fraction
+    cti_parallel, cti_serial
+        Fraction of the charge left behind in each transfer
+    read_noise_e, reset_noise_e
+        Gaussian, every pixel, every frame
+    column_offset_e
+        Standard deviation of the columns' fixed offsets
+    nonlinearity
+        Fraction of the signal missing at full well: e (1 - nonlinearity e / full_well)
+    noise
+        False gives the expected value, not rounded: with fixed pattern and transfer loss, but
+        without particles, full-well limit, nonlinearity and converter range
     """
 
     quantum_efficiency: Efficiency
@@ -391,10 +442,15 @@ class DetectorConfig(ConfigModel):
 class CameraConfig(ConfigModel):
     """Lens and chip as the hardware is. What the tracker assumes about them is in `tracker`.
 
-    transmission  : of the lens: one number for all wavelengths, or a CSV file of wavelength_nm and transmission, 0
-        beyond its ends
-    ghosts, glare : stray light of what is in the field
-    baffle        : stray light of the bodies and of the Earth, where they are at the time; none if left out
+    Attributes
+    ----------
+    transmission
+        Of the lens: one number for all wavelengths, or a CSV file of wavelength_nm and
+        transmission, 0 beyond its ends
+    ghosts, glare
+        Stray light of what is in the field
+    baffle
+        Stray light of the bodies and of the Earth, where they are at the time; none if left out
     """
 
     width_px: Annotated[int, Field(ge=16, le=20000)]
@@ -453,9 +509,9 @@ class CameraConfig(ConfigModel):
         """The principal point; the chip's center by default."""
         return self.principal_point_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
 
-    def calibration(self) -> Calibration:
+    def calibration(self) -> OpencvCalibration:
         """The result of a perfect calibration of this camera."""
-        return Calibration(
+        return OpencvCalibration(
             self.width_px, self.height_px, self.focal_px, self.center_px, self.distortion
         )
 

@@ -33,9 +33,16 @@ def relative_levels(magnitudes: Sequence[float]) -> tuple[float, ...]:
 class BoardConfig(ConfigModel):
     """One patch board, glued with its center in this direction from the bearing's center.
 
-    azimuth_deg, tilt_deg : from the lab's +x toward +y, and from the zenith
-    rotation_deg : rotation of its columns about its normal
-    leds     : the holes that hold an LED, 0 to 8, row by row;  levels : one per LED, full brightness if left out
+    Attributes
+    ----------
+    azimuth_deg, tilt_deg
+        From the lab's +x toward +y, and from the zenith
+    rotation_deg
+        Rotation of its columns about its normal
+    leds
+        The holes that hold an LED, 0 to 8, row by row
+    levels
+        One per LED, full brightness if left out
     """
 
     azimuth_deg: Number
@@ -56,12 +63,22 @@ class BoardConfig(ConfigModel):
 class PatchBoardsConfig(ConfigModel):
     """3x3 LED boards on a cap of the surface: spread evenly or on a grid with random patterns, or listed.
 
-    cap_deg : angle from the zenith, seen from the bearing, to which the dome carries LEDs; so for every layout
-    spacing, lit, pwm_levels : of boards that are spread; `boards` replaces them
-    spread  : spiral: as evenly as possible; grid: rows and columns along the lab's x and y, seen from above. The
-        number of boards on a spiral is that of a dome with the apex's height in all directions
-    glue_scatter  : standard deviation of an LED's place along each axis of its board, or its tolerance
-    glue_tilt_deg : greatest angle between a board's normal and the surface's; normals are uniform over that cap
+    Attributes
+    ----------
+    cap_deg
+        Angle from the zenith, seen from the bearing, to which the dome carries LEDs; so for
+        every layout
+    spacing, lit, pwm_levels
+        Of boards that are spread; `boards` replaces them
+    spread
+        Spiral: as evenly as possible; grid: rows and columns along the lab's x and y, seen from
+        above. The number of boards on a spiral is that of a dome with the apex's height in all
+        directions
+    glue_scatter
+        Standard deviation of an LED's place along each axis of its board, or its tolerance
+    glue_tilt_deg
+        Greatest angle between a board's normal and the surface's; normals are uniform over that
+        cap
     """
 
     kind: Literal["patch_boards"]
@@ -103,8 +120,11 @@ class DimmedConfig(ConfigModel):
     Each LED's brightness is drawn from the list (in `listed`, the list has one value per LED). The smallest magnitude
     is full brightness.
 
-    unique_neighbors : the levels are drawn so that each LED with so many nearest ones looks different from all others,
-        however the field is turned
+    Attributes
+    ----------
+    unique_neighbors
+        The levels are drawn so that each LED with so many nearest ones looks different from all
+        others, however the field is turned
     """
 
     cap_deg: Cap
@@ -172,10 +192,16 @@ class LitConfig(DimmedConfig):
 class GeodesicConfig(LitConfig):
     """LEDs at the vertices of a geodesic sphere about the bearing, with one vertex at the zenith.
 
-    frequency    : parts into which an edge of the icosahedron is divided (class I), or twice the parts into which half
-        of a face's height is divided (class II: even)
-    class        : I: lines of the division parallel to the icosahedron's edges; II: perpendicular to them
-    rotation_deg : about the zenith; at 0 one of the five edges from the zenith's vertex runs along the lab's x
+    Attributes
+    ----------
+    frequency
+        Parts into which an edge of the icosahedron is divided (class I), or twice the parts
+        into which half of a face's height is divided (class II: even)
+    class
+        I: lines of the division parallel to the icosahedron's edges; II: perpendicular to them
+    rotation_deg
+        About the zenith; at 0 one of the five edges from the zenith's vertex runs along the
+        lab's x
     """
 
     kind: Literal["geodesic"]
@@ -193,13 +219,22 @@ class GeodesicConfig(LitConfig):
 class StringConfig(LitConfig):
     """LED tape wound on the surface about the vertical through the bearing, numbered along the tape.
 
-    winding : latitude: circles at equal angles from the zenith, each cut where it closes, the first half a spacing from
-        the apex; spiral: one tape from the apex to the rim; meridian: straight strips down to the rim, each from where
-        it has half a spacing to its neighbors
-    pitch   : from one LED of the tape to the next, along the surface
-    spacing : between two circles or turns, along the surface, in the mean of all azimuths; greatest one of two strips
-    pitch_error  : relative standard deviation of a tape's pitch, or its tolerance
-    glue_scatter : standard deviation of a tape's place sideways, or its tolerance; it wanders over GLUE_M of tape
+    Attributes
+    ----------
+    winding
+        Latitude: circles at equal angles from the zenith, each cut where it closes, the first
+        half a spacing from the apex; spiral: one tape from the apex to the rim; meridian:
+        straight strips down to the rim, each from where it has half a spacing to its neighbors
+    pitch
+        From one LED of the tape to the next, along the surface
+    spacing
+        Between two circles or turns, along the surface, in the mean of all azimuths; greatest
+        one of two strips
+    pitch_error
+        Relative standard deviation of a tape's pitch, or its tolerance
+    glue_scatter
+        Standard deviation of a tape's place sideways, or its tolerance; it wanders over GLUE_M
+        of tape
     """
 
     kind: Literal["string"]
@@ -213,13 +248,22 @@ class StringConfig(LitConfig):
 class OptimizedConfig(DimmedConfig):
     """`count` LEDs placed for one camera's best accuracy at its worst attitudes: tilts to tilt_deg, any yaw.
 
-    field_deg : the camera's field of view along body x and y; the scene's camera's if left out, its rows along x
-    camera    : its entrance pupil on the body, `vehicle.camera` if left out; it looks along body z
-    spacing   : least distance between two LEDs
-    coincidence : LEDs of two fields coincide if they are closer than this when one field is laid on the other: a few
-        times the survey's error
-    min_leds  : LEDs that every field should hold; fewer are penalized
-    rounds    : how often each LED is offered another position
+    Attributes
+    ----------
+    field_deg
+        The camera's field of view along body x and y; the scene's camera's if left out, its
+        rows along x
+    camera
+        Its entrance pupil on the body, `vehicle.camera` if left out; it looks along body z
+    spacing
+        Least distance between two LEDs
+    coincidence
+        LEDs of two fields coincide if they are closer than this when one field is laid on the
+        other: a few times the survey's error
+    min_leds
+        LEDs that every field should hold; fewer are penalized
+    rounds
+        How often each LED is offered another position
     """
 
     kind: Literal["optimized"]
@@ -237,12 +281,22 @@ class CelestialConfig(ConfigModel):
     """The real sky: an LED for each of the brightest stars, where the camera at its nominal position sees it.
 
     count or limit_mag : number of LEDs for the brightest stars on the dome, or all stars to this V
-    camera : the entrance pupil in the lab when the vehicle is level
-    zenith_ra_deg, zenith_dec_deg, roll_deg : the direction at the zenith, and the position angle there of the lab's
-        -y (a level camera's up), as `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
-    epoch  : time of the apparent places, UTC
-    brightness : band: each LED is as bright as the chip measures its star, whose color the LED lacks; v: as its V
-    brightest_mag : no star is shown brighter than this, which is full brightness; the brightest star's if left out
+
+    Attributes
+    ----------
+    camera
+        The entrance pupil in the lab when the vehicle is level
+    zenith_ra_deg, zenith_dec_deg, roll_deg
+        The direction at the zenith, and the position angle there of the lab's -y (a level
+        camera's up), as `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
+    epoch
+        Time of the apparent places, UTC
+    brightness
+        Band: each LED is as bright as the chip measures its star, whose color the LED lacks; v:
+        as its V
+    brightest_mag
+        No star is shown brighter than this, which is full brightness; the brightest star's if
+        left out
     """
 
     kind: Literal["celestial"]
@@ -271,9 +325,14 @@ class CelestialConfig(ConfigModel):
 class ListedConfig(DimmedConfig):
     """LEDs by list: places in the lab, or directions from the bearing onto the surface, or a CSV file of either.
 
-    directions_deg : azimuth from +x toward +y, and tilt from the zenith
-    file : columns x_m, y_m, z_m or azimuth_deg, tilt_deg; optionally level or magnitude, and id, the LEDs' numbers.
-        `skysim scenes export --out leds.csv` and `skysim survey` write such files
+    Attributes
+    ----------
+    directions_deg
+        Azimuth from +x toward +y, and tilt from the zenith
+    file
+        Columns x_m, y_m, z_m or azimuth_deg, tilt_deg; optionally level or magnitude, and id,
+        the LEDs' numbers. `skysim scenes export --out leds.csv` and `skysim survey` write such
+        files
     """
 
     kind: Literal["listed"]
@@ -316,10 +375,16 @@ Points = Annotated[
 class AimingConfig(ConfigModel):
     """A laser on a two-axis mount that marks each place on the shell, where a hole is drilled (JHU/APL's dome).
 
-    laser : where its axes meet, in the lab
-    pointing_sigma_arcsec    : of its line about two axes across it, or its tolerance; of each hole
-    orientation_sigma_arcsec : of the mount about each axis of the lab, or its tolerance; common to all holes
-    drill_sigma : of a hole off its mark, along two axes in the surface, or its tolerance; of each hole
+    Attributes
+    ----------
+    laser
+        Where its axes meet, in the lab
+    pointing_sigma_arcsec
+        Of its line about two axes across it, or its tolerance; of each hole
+    orientation_sigma_arcsec
+        Of the mount about each axis of the lab, or its tolerance; common to all holes
+    drill_sigma
+        Of a hole off its mark, along two axes in the surface, or its tolerance; of each hole
     """
 
     laser_m: tuple[Length, Length, Length]
@@ -331,10 +396,15 @@ class AimingConfig(ConfigModel):
 class FibersConfig(ConfigModel):
     """Ends of optical fibers through the shell (JHU/APL's dome), at the points of any layout of single LEDs.
 
-    radius_variation : greatest error of the dome's radius at a fiber, as a fraction of the distance from the bearing,
-        uniformly distributed: the end is displaced along the surface's normal, inward or outward
-    aiming : a laser that marked the places, with its errors; the shell's error is then along its line. The places are
-        as designed, but for the shell's error, if left out
+    Attributes
+    ----------
+    radius_variation
+        Greatest error of the dome's radius at a fiber, as a fraction of the distance from the
+        bearing, uniformly distributed: the end is displaced along the surface's normal, inward
+        or outward
+    aiming
+        A laser that marked the places, with its errors; the shell's error is then along its
+        line. The places are as designed, but for the shell's error, if left out
     """
 
     kind: Literal["fibers"]
@@ -364,10 +434,18 @@ class FibersConfig(ConfigModel):
 class PixelsConfig(ConfigModel):
     """A display's grid and gray levels, common to an LCD panel, a projector and a collimated micro-display.
 
-    pixels : columns and rows;  pitch : from one pixel to the next, along both
-    block  : a star is drawn as a square of this many pixels a side, all of one gray
-    gray_levels, gamma : gray g = 0, 1, ... transmits (g / (gray_levels - 1))^gamma of white
-    contrast : white over black, which glows all over the display; none: black is dark
+    Attributes
+    ----------
+    pixels
+        Columns and rows
+    pitch
+        From one pixel to the next, along both
+    block
+        A star is drawn as a square of this many pixels a side, all of one gray
+    gray_levels, gamma
+        Gray g = 0, 1, ... transmits (g / (gray_levels - 1))^gamma of white
+    contrast
+        White over black, which glows all over the display; none: black is dark
     """
 
     pixels: tuple[Annotated[int, Field(ge=1, le=20_000)], Annotated[int, Field(ge=1, le=20_000)]]
@@ -412,13 +490,23 @@ class ProjectorConfig(PixelsConfig):
     (share / pi of the pixel's lumens, in candela), lobe of the wall; disk_diameter is the blur of lens and paint. The
     beam is not hidden by the vehicle.
 
-    position, aim : the lens's entrance pupil, and the point of the lab on its axis
-    rotation_deg  : of the picture about the axis; at 0 its rows run along the lab's +x as far as the axis lets them
-    pitch, focal_length, f_number : of the chip's pixels and of the lens
-    focus      : distance along the axis at which it is sharp; that of `aim` if left out
-    distortion : k of the lens: a direction at the tangent t from the axis is at f t (1 + k t^2) on the chip. The
-        picture is drawn for it
-    falloff    : a pixel's light falls as cos^falloff of its angle from the axis; 4 is a lens's natural vignetting
+    Attributes
+    ----------
+    position, aim
+        The lens's entrance pupil, and the point of the lab on its axis
+    rotation_deg
+        Of the picture about the axis; at 0 its rows run along the lab's +x as far as the axis
+        lets them
+    pitch, focal_length, f_number
+        Of the chip's pixels and of the lens
+    focus
+        Distance along the axis at which it is sharp; that of `aim` if left out
+    distortion
+        K of the lens: a direction at the tangent t from the axis is at f t (1 + k t^2) on the
+        chip. The picture is drawn for it
+    falloff
+        A pixel's light falls as cos^falloff of its angle from the axis; 4 is a lens's natural
+        vignetting
     """
 
     kind: Literal["projector"]

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
 
 from skysim.core.errors import InputError
-from skysim.core.paths import DATA
+from skysim.core.files import DATA
 from skysim.core.tolerance import LengthError, NumberError, Tolerance
 from skysim.core.units import (
     Ascending,
@@ -58,8 +58,13 @@ class DirectConfig(ConfigModel):
 class LowPassConfig(ConfigModel):
     """An RC low-pass filter for each LED, whose light follows the filter's voltage.
 
-    time_constant : R C
-    error         : relative standard deviation of R C from LED to LED, or its tolerance (both parts' together)
+    Attributes
+    ----------
+    time_constant
+        R C
+    error
+        Relative standard deviation of R C from LED to LED, or its tolerance (both parts'
+        together)
     """
 
     time_constant_s: Annotated[Time, Field(gt=0)]
@@ -69,7 +74,10 @@ class LowPassConfig(ConfigModel):
 class PwmConfig(ConfigModel):
     """Hardware PWM: lit for its level of every led.pwm_period, each LED with a random phase.
 
-    filter : turns the pulses into nearly steady light; none if left out
+    Attributes
+    ----------
+    filter
+        Turns the pulses into nearly steady light; none if left out
     """
 
     kind: Literal["pwm"] = "pwm"
@@ -79,7 +87,11 @@ class PwmConfig(ConfigModel):
 class SequentialConfig(ConfigModel):
     """An Arduino's software PWM: its LEDs in sequence, each lit for its level of its slot.
 
-    controller : `board`: one per patch board; `dome`: one for all; or how many LEDs, by number, share one
+    Attributes
+    ----------
+    controller
+        `board`: one per patch board; `dome`: one for all; or how many LEDs, by number, share
+        one
     """
 
     kind: Literal["sequential"]
@@ -104,8 +116,13 @@ Drive = Annotated[
 class ClockConfig(ConfigModel):
     """Oscillators of the controllers: a crystal of tens of ppm, in a room whose temperature changes (assumed).
 
-    offset_ppm  : standard deviation of their frequency offsets, or their tolerance, from the layout's hardware_seed
-    drift_ppm_h : standard deviation of the drift of the frequency per hour, from the scene's seed
+    Attributes
+    ----------
+    offset_ppm
+        Standard deviation of their frequency offsets, or their tolerance, from the layout's
+        hardware_seed
+    drift_ppm_h
+        Standard deviation of the drift of the frequency per hour, from the scene's seed
     """
 
     offset_ppm: Annotated[NumberError, Field(le=10_000)] = 50.0
@@ -117,10 +134,16 @@ class CodeConfig(ConfigModel):
 
     The words are given by LED number, in order. A failed bit shows another level.
 
-    depth    : part of its light that an LED lacks at its lowest level; 1 is on and off
-    bit_time : of one bit, by a clock of the dome's own (`clock`) that runs freely; `frame`: the camera's trigger
-        advances the code, one bit a frame
-    dropout  : probability that an LED's bit fails, independent of all others; drawn from the scene's seed
+    Attributes
+    ----------
+    depth
+        Part of its light that an LED lacks at its lowest level; 1 is on and off
+    bit_time
+        Of one bit, by a clock of the dome's own (`clock`) that runs freely; `frame`: the
+        camera's trigger advances the code, one bit a frame
+    dropout
+        Probability that an LED's bit fails, independent of all others; drawn from the scene's
+        seed
     """
 
     depth: Annotated[Number, Field(gt=0, le=1)] = 0.5
@@ -131,7 +154,10 @@ class CodeConfig(ConfigModel):
 class TriggeredCodeConfig(CodeConfig):
     """Codes that need the camera's trigger, and may have more than two levels of light.
 
-    levels : of light, equally spaced in magnitude; 4 show two bits a frame and 8 show three
+    Attributes
+    ----------
+    levels
+        Of light, equally spaced in magnitude; 4 show two bits a frame and 8 show three
     """
 
     levels: Literal[2, 4, 8] = 2
@@ -150,9 +176,13 @@ class TriggeredCodeConfig(CodeConfig):
 class PlainCodeConfig(TriggeredCodeConfig):
     """Codes of all kinds without a parameter.
 
-    kind : gray: numbers, distance 1; hamming: extended and shortened, distance 4; gold: all sequences and shifts,
-        distance 12 of 31 bits; de_bruijn: one sequence that moves along the LEDs, in which any few successive LEDs and
-        any few successive frames of an LED are unique: the data of a shift register
+    Attributes
+    ----------
+    kind
+        Gray: numbers, distance 1; hamming: extended and shortened, distance 4; gold: all
+        sequences and shifts, distance 12 of 31 bits; de_bruijn: one sequence that moves along
+        the LEDs, in which any few successive LEDs and any few successive frames of an LED are
+        unique: the data of a shift register
     """
 
     kind: Literal["gray", "hamming", "gold", "de_bruijn"]
@@ -179,10 +209,15 @@ class AgingConfig(ConfigModel):
     """Light lost over the hours of operation: each LED has exp(-a hours) of its light left, a = ln(1 / 0.7) / life
     (IES TM-21).
 
-    hours      : of operation so far
-    life_hours : L70 of the data sheet, after which 70 % of the light is left
-    scatter    : of a from LED to LED: standard deviation of its logarithm, or its tolerance as a fraction; from the
-        layout's hardware_seed
+    Attributes
+    ----------
+    hours
+        Of operation so far
+    life_hours
+        L70 of the data sheet, after which 70 % of the light is left
+    scatter
+        Of a from LED to LED: standard deviation of its logarithm, or its tolerance as a
+        fraction; from the layout's hardware_seed
     """
 
     hours: Annotated[Number, Field(gt=0, le=1e6)]
@@ -202,7 +237,12 @@ class WarmUpConfig(ConfigModel):
 
     steady + (1 - steady) exp(-t / time) is left of the light of cold LEDs, which is that of a pulsed data sheet.
 
-    steady : share that is left when they are warm;  time : in which 63 % of the loss are reached
+    Attributes
+    ----------
+    steady
+        Share that is left when they are warm
+    time
+        In which 63 % of the loss are reached
     """
 
     steady: Annotated[Number, Field(gt=0, lt=1)]
@@ -250,17 +290,29 @@ LedSpectrum = Annotated[
 class LedConfig(ConfigModel):
     """The one LED type of the dome: intensity along its normal, in candela or in watts per steradian.
 
-    spectrum : white (data/led/white.csv) or a CSV file of wavelength_nm and relative power, or the peak wavelength of a
-        colored LED
-    fwhm     : width of a colored LED's spectrum at half maximum, a Gaussian in power; a narrow line if left out
-    color_scatter : of the peak wavelength from LED to LED, at the same intensity: standard deviation or tolerance (a
-        bin); from the layout's hardware_seed
-    scatter : of the intensity from LED to LED: standard deviation of its logarithm, or its tolerance as a fraction
-        (a bin of ±10 %: {tolerance: 0.1})
-    aging, warm_up : how much light is left of it
-    drive : how its level is made; pwm_period belongs to the kind pwm
-    clock : the oscillators that time the pulses; every run starts with phases of its own
-    code : of the light over frames, by which the tracker knows an LED (`tracker.decoder`); steady if left out
+    Attributes
+    ----------
+    spectrum
+        White (data/led/white.csv) or a CSV file of wavelength_nm and relative power, or the
+        peak wavelength of a colored LED
+    fwhm
+        Width of a colored LED's spectrum at half maximum, a Gaussian in power; a narrow line if
+        left out
+    color_scatter
+        Of the peak wavelength from LED to LED, at the same intensity: standard deviation or
+        tolerance (a bin); from the layout's hardware_seed
+    scatter
+        Of the intensity from LED to LED: standard deviation of its logarithm, or its tolerance
+        as a fraction (a bin of ±10 %: {tolerance: 0.1})
+    aging, warm_up
+        How much light is left of it
+    drive
+        How its level is made; pwm_period belongs to the kind pwm
+    clock
+        The oscillators that time the pulses; every run starts with phases of its own
+    code
+        Of the light over frames, by which the tracker knows an LED (`tracker.decoder`); steady
+        if left out
     """
 
     intensity_cd: Annotated[Intensity, Field(gt=0)] | None = None

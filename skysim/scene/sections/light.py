@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
+    ConfigDict,
     Field,
     ModelWrapValidatorHandler,
+    SerializeAsAny,
     field_validator,
     model_validator,
 )
 
 from skysim.core.constants import SUN_V_MAG
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, unknown_name
+from skysim.core.plugins import PluginKind
 from skysim.core.tolerance import LengthError
 from skysim.core.units import (
     Ascending,
@@ -26,10 +30,9 @@ from skysim.core.units import (
     SemiAxis,
     check_table,
 )
-from skysim.scene.sections.air import AirConfig
 from skysim.scene.sections.layouts import Layout, PixelsConfig
 from skysim.scene.sections.leds import LedConfig
-from skysim.scene.sections.orbit import SatellitesConfig
+from skysim.scene.sections.surroundings import AirConfig, SatellitesConfig
 
 SKY = "gaia_v8.0"  # as faint as any camera of a shipped scene detects
 Tilt = Annotated[Number, Field(ge=-45, le=45)]
@@ -40,10 +43,17 @@ class SurfaceConfig(ConfigModel):
 
     Sizes, apex and rim are the dome's before it is displaced, its axis upright through the bearing's center.
 
-    offset   : the whole dome's displacement
-    tilt_deg : about the lab's x, then about its y, through the surface's own center (the origin of surveyed points)
-    error    : standard deviation of the lab's survey of it, along the normal, or a tolerance: one draw for the whole
-               surface, because errors of single points average out; drawn by `tracker.survey.seed`
+    Attributes
+    ----------
+    offset
+        The whole dome's displacement
+    tilt_deg
+        About the lab's x, then about its y, through the surface's own center (the origin of
+        surveyed points)
+    error
+        Standard deviation of the lab's survey of it, along the normal, or a tolerance: one draw
+        for the whole surface, because errors of single points average out; drawn by
+        `tracker.survey.seed`
     """
 
     kind: Literal["sphere", "ellipsoid", "flat", "cylinder", "surveyed"]
@@ -85,8 +95,12 @@ class RimmedConfig(SurfaceConfig):
 class WallConfig(ConfigModel):
     """A formed sheet, thinnest at the apex: its thickness is linear in the angle about the sphere's center.
 
-    base_deg  : the angle of thickness_base, beyond which the thickness is constant
-    radius_of : the face that is a sphere: the outside, or the middle of the wall
+    Attributes
+    ----------
+    base_deg
+        The angle of thickness_base, beyond which the thickness is constant
+    radius_of
+        The face that is a sphere: the outside, or the middle of the wall
     """
 
     thickness_apex_m: Annotated[Length, Field(gt=0)]
@@ -154,8 +168,12 @@ class CylinderSurfaceConfig(SurfaceConfig):
 class SurveyedSurfaceConfig(RimmedConfig):
     """A smooth surface fitted to points of a measuring arm on the inside: Zernike polynomials to a degree.
 
-    file      : comments (#), a line of names, then lines of x, y, z in `unit`, z up
-    rms_limit : of the points' distances from the smooth surface
+    Attributes
+    ----------
+    file
+        Comments (#), a line of names, then lines of x, y, z in `unit`, z up
+    rms_limit
+        Of the points' distances from the smooth surface
     """
 
     kind: Literal["surveyed"]
@@ -205,13 +223,21 @@ class RoomConfig(ConfigModel):
     The shell is the surface within its rim or its width and height, else up to the layout's cap_deg, and as thick as
     `thickness` outside of it.
 
-    height         : of the ceiling above the floor; the shell's top must be below
-    bearing_height : of the bearing's center above the floor, where the shell must end
-    width, length  : of the floor along the lab's x and y; the shell must fit between the walls
-    door           : width and height of the narrowest opening on the way in. Every part of the shell must go through:
-        two sides of a box around it, turned as fits best, must be within the door's
-    segments       : equal parts, cut along planes through the vertical, in which the shell is carried in
-    thickness      : of the shell with its ribs
+    Attributes
+    ----------
+    height
+        Of the ceiling above the floor; the shell's top must be below
+    bearing_height
+        Of the bearing's center above the floor, where the shell must end
+    width, length
+        Of the floor along the lab's x and y; the shell must fit between the walls
+    door
+        Width and height of the narrowest opening on the way in. Every part of the shell must go
+        through: two sides of a box around it, turned as fits best, must be within the door's
+    segments
+        Equal parts, cut along planes through the vertical, in which the shell is carried in
+    thickness
+        Of the shell with its ribs
     """
 
     height_m: Annotated[Length, Field(gt=0)] | None = None
@@ -236,9 +262,14 @@ class RoomConfig(ConfigModel):
 class FloorConfig(ConfigModel):
     """A level disc below the bearing's center that scatters light by Lambert's law: floor, table and vehicle.
 
-    share  : of the light that it scatters
-    depth  : below the bearing's center
-    radius : the wall should not be between it and the LEDs: up to that of the rim
+    Attributes
+    ----------
+    share
+        Of the light that it scatters
+    depth
+        Below the bearing's center
+    radius
+        The wall should not be between it and the LEDs: up to that of the rim
     """
 
     share: Annotated[Fraction, Field(gt=0, lt=1)]
@@ -249,11 +280,17 @@ class FloorConfig(ConfigModel):
 class ReflectionConfig(ConfigModel):
     """Light that the dome's inside and the floor reflect.
 
-    diffuse          : share of the light on the wall that it scatters by Lambert's law: a glow
-    specular         : share that it mirrors, at any angle: images of the LEDs
-    refractive_index : of a polished wall, which mirrors by Fresnel's equations for unpolarized light; in place of
-        specular. Acrylic has 1.49
-    floor            : black if left out
+    Attributes
+    ----------
+    diffuse
+        Share of the light on the wall that it scatters by Lambert's law: a glow
+    specular
+        Share that it mirrors, at any angle: images of the LEDs
+    refractive_index
+        Of a polished wall, which mirrors by Fresnel's equations for unpolarized light; in place
+        of specular. Acrylic has 1.49
+    floor
+        Black if left out
     """
 
     diffuse: Annotated[Fraction, Field(lt=1)] = 0.0
@@ -288,9 +325,14 @@ class ReflectionConfig(ConfigModel):
 class DomeConfig(ConfigModel):
     """An LED dome as the light source.
 
-    occlusion  : whether the vehicle's parts and the dome's own wall hide LEDs
-    reflection : of wall and floor; black if left out
-    room       : limits of the room in which it is to be built; unlimited if left out
+    Attributes
+    ----------
+    occlusion
+        Whether the vehicle's parts and the dome's own wall hide LEDs
+    reflection
+        Of wall and floor; black if left out
+    room
+        Limits of the room in which it is to be built; unlimited if left out
     """
 
     kind: Literal["dome"]
@@ -339,7 +381,10 @@ class BodiesConfig(ConfigModel):
     """Bodies of the solar system at the scene's time, seen from `site` if it has a longitude, else from the Earth's
     center.
 
-    planets : Mercury, Venus, Mars, Jupiter, Saturn, Uranus, Neptune
+    Attributes
+    ----------
+    planets
+        Mercury, Venus, Mars, Jupiter, Saturn, Uranus, Neptune
     """
 
     sun: bool = True
@@ -356,14 +401,23 @@ class BodiesConfig(ConfigModel):
 class StarsConfig(ConfigModel):
     """The real sky as the light source.
 
-    catalog   : a name in data/catalogs, or a file of `skysim catalog build`; the tracker has its own
-    limit_mag : faintest V; all stars of the catalog if left out
-    variability_seed : of the magnitudes of variable stars at the scene's time, which scatter as Hipparcos saw them;
-        means if left out
-    bodies    : Sun, Moon and planets; none if left out
-    satellites : artificial satellites; none if left out
-    air       : the atmosphere over `site`, which needs a longitude; none if left out
-    occlusion : whether the vehicle's parts hide stars
+    Attributes
+    ----------
+    catalog
+        A name in data/catalogs, or a file of `skysim catalog build`; the tracker has its own
+    limit_mag
+        Faintest V; all stars of the catalog if left out
+    variability_seed
+        Of the magnitudes of variable stars at the scene's time, which scatter as Hipparcos saw
+        them; means if left out
+    bodies
+        Sun, Moon and planets; none if left out
+    satellites
+        Artificial satellites; none if left out
+    air
+        The atmosphere over `site`, which needs a longitude; none if left out
+    occlusion
+        Whether the vehicle's parts hide stars
     """
 
     kind: Literal["stars"]
@@ -383,12 +437,20 @@ class CollimatedDisplayConfig(PixelsConfig):
     covers the lens wherever it moves. The collimator's color and image errors and the display's refresh are
     neglected.
 
-    focal_length : of the collimator
-    catalog, limit_mag : the stars shown, to this V (all if left out), at the scene's start_time
-    axis_ra_deg, axis_dec_deg, roll_deg : the direction at the display's center, and the position angle there of the
-        lab's -y (a level camera's up), as `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
-    brightest_mag : V of a white block for the camera, in the Sun's color; brighter stars are limited to it
-    conjugate : distance of the stars from the bearing's center, from an error of collimation; none: infinite
+    Attributes
+    ----------
+    focal_length
+        Of the collimator
+    catalog, limit_mag
+        The stars shown, to this V (all if left out), at the scene's start_time
+    axis_ra_deg, axis_dec_deg, roll_deg
+        The direction at the display's center, and the position angle there of the lab's -y (a
+        level camera's up), as `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
+    brightest_mag
+        V of a white block for the camera, in the Sun's color; brighter stars are limited to it
+    conjugate
+        Distance of the stars from the bearing's center, from an error of collimation; none:
+        infinite
     """
 
     kind: Literal["collimated_display"]
@@ -420,9 +482,14 @@ class SkyGlowConfig(ConfigModel):
 class MoonGlowConfig(ConfigModel):
     """Moonlight scattered by the atmosphere (Krisciunas & Schaefer 1991), the Moon at ra_deg, dec_deg.
 
-    phase_angle_deg : 0 at full moon, 90 at the quarters
-    extinction_mag  : of the atmosphere at the zenith, in V
-    moon_zenith_deg, field_zenith_deg : zenith distances of the Moon and of the boresight
+    Attributes
+    ----------
+    phase_angle_deg
+        0 at full moon, 90 at the quarters
+    extinction_mag
+        Of the atmosphere at the zenith, in V
+    moon_zenith_deg, field_zenith_deg
+        Zenith distances of the Moon and of the boresight
     """
 
     kind: Literal["moon"]
@@ -437,9 +504,15 @@ class MoonGlowConfig(ConfigModel):
 class StrayLightConfig(ConfigModel):
     """Stray light of a bright body outside the field, by the point source transmittance of baffle and lens.
 
-    ra_deg, dec_deg : its direction, in the lab's axes (under the stars those of the ICRS)
-    v_mag           : its V magnitude; the Sun's -26.74 if left out
-    angle_deg, pst  : irradiance on the chip over irradiance before the lens, against the angle from the boresight
+    Attributes
+    ----------
+    ra_deg, dec_deg
+        Its direction, in the lab's axes (under the stars those of the ICRS)
+    v_mag
+        Its V magnitude; the Sun's -26.74 if left out
+    angle_deg, pst
+        Irradiance on the chip over irradiance before the lens, against the angle from the
+        boresight
     """
 
     kind: Literal["stray"]
@@ -458,7 +531,10 @@ class StrayLightConfig(ConfigModel):
 class FaintStarsGlowConfig(ConfigModel):
     """Light of all stars fainter than a V magnitude, by galactic latitude, for skies of kind stars.
 
-    fainter_than_mag : where the catalog, or its limit_mag, ends
+    Attributes
+    ----------
+    fainter_than_mag
+        Where the catalog, or its limit_mag, ends
     """
 
     kind: Literal["faint_stars"]
@@ -472,3 +548,49 @@ Glow = Annotated[
 
 
 Light = DomeConfig | StarsConfig | CollimatedDisplayConfig
+
+
+# Schema of the scene section `lights`: further lights, of kinds that modules or installed packages
+# add.
+
+
+PLUGINS = PluginKind("light", "skysim.lights", "lights.kind", ())
+CONFIGS: dict[str, type[LightConfig]] = {}  # of the kinds that were added
+
+
+def check_kind(kind: str) -> str:
+    """The name of a kind. Raises InputError for an unknown one, with the known ones."""
+    if kind not in CONFIGS:
+        raise InputError(
+            "", *unknown_name("light", kind, sorted({*CONFIGS, *PLUGINS.entry_points()}))
+        )
+    return kind
+
+
+class LightConfig(ConfigModel):
+    """A further light; each kind has a class derived from this one."""
+
+    model_config = ConfigDict(json_schema_extra={"additionalProperties": True})
+
+    kind: Annotated[str, AfterValidator(check_kind)]
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def validate_by_kind(
+        cls, value: Any, handler: ModelWrapValidatorHandler[LightConfig]
+    ) -> LightConfig:
+        """Validate a section with the class of its `kind` when called on the base class."""
+        kind = value.get("kind") if cls is LightConfig and isinstance(value, dict) else None
+        if kind not in CONFIGS and kind in PLUGINS.entry_points():
+            PLUGINS.entry_points()[kind].load()  # it registers the kind
+        return CONFIGS[kind].model_validate(value) if kind in CONFIGS else handler(value)
+
+
+def add_kind(config: type[LightConfig]) -> str:
+    """Add a kind of light to the schema; returns its name, the literal of its `kind`."""
+    (kind,) = get_args(config.model_fields["kind"].annotation)
+    CONFIGS[kind] = config
+    return str(kind)
+
+
+FurtherLight = SerializeAsAny[LightConfig]

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from skysim.core.errors import InputError
-from skysim.core.io.yaml_reader import existing_file
 from skysim.core.units import ConfigModel, Momentum, NotNegative, Number, Positive, Spin, Time
+from skysim.core.yaml_reader import existing_file
 from skysim.scene.sections.vehicle import ActuatorsName
 
 Duration = Annotated[Time, Field(gt=0)]
@@ -129,8 +129,13 @@ class SineConfig(ConfigModel):
 class ChirpConfig(ConfigModel):
     """Oscillate about the attitude with a frequency that sweeps from from_hz to to_hz.
 
-    amplitude_deg : about body x, y, z, in phase; constant but for a smooth beginning and end of one period each
-    sweep         : linear: the frequency changes evenly with time; log: by equal factors in equal times
+    Attributes
+    ----------
+    amplitude_deg
+        About body x, y, z, in phase; constant but for a smooth beginning and end of one period
+        each
+    sweep
+        Linear: the frequency changes evenly with time; log: by equal factors in equal times
     """
 
     kind: Literal["chirp"]
@@ -158,10 +163,17 @@ class ChirpConfig(ConfigModel):
 class ProfileConfig(ConfigModel):
     """Follow the attitudes of a file, interpolated by a spline with continuous rate and acceleration.
 
-    file     : CSV or ECSV table, CCSDS AEM, or STK attitude file; its content tells which
-    begin    : the maneuver's beginning in the file: `zero`: t_s = 0; epochs apply as they are, with the scene's
+    Attributes
+    ----------
+    file
+        CSV or ECSV table, CCSDS AEM, or STK attitude file; its content tells which
+    begin
+        The maneuver's beginning in the file: `zero`: t_s = 0; epochs apply as they are, with
+        the scene's
         start_time at its t = 0. `first_sample`: the first sample, whatever its time
-    rotation : which rotation columns q_x, q_y, q_z, q_w are; columns such as lab_from_body_qx name it themselves
+    rotation
+        Which rotation columns q_x, q_y, q_z, q_w are; columns such as lab_from_body_qx name it
+        themselves
     """
 
     kind: Literal["profile"]
@@ -191,9 +203,14 @@ class ShakeConfig(ConfigModel):
 class BumpConfig(ConfigModel):
     """An external torque impulse hits the vehicle while it is commanded to hold.
 
-    rate_deg_s : change of the rate about body x, y, z that the impulse alone would cause
-    duration   : of the impulse, a half-sine of torque
-    caught_after : time from its beginning to an equal and opposite impulse; none if left out
+    Attributes
+    ----------
+    rate_deg_s
+        Change of the rate about body x, y, z that the impulse alone would cause
+    duration
+        Of the impulse, a half-sine of torque
+    caught_after
+        Time from its beginning to an equal and opposite impulse; none if left out
     """
 
     kind: Literal["bump"]
@@ -228,7 +245,10 @@ Maneuver = Annotated[
 class DesaturationConfig(ConfigModel):
     """The fans unload momentum from wheels or CMGs: from above start until below stop.
 
-    time : the fans' torque is the stored momentum over this time, within their limits
+    Attributes
+    ----------
+    time
+        The fans' torque is the stored momentum over this time, within their limits
     """
 
     start_nms: Annotated[Momentum, Field(gt=0)]
@@ -247,14 +267,24 @@ class DesaturationConfig(ConfigModel):
 class ControlConfig(ConfigModel):
     """The attitude controller on the vehicle's computer.
 
-    law       : pid, or pd, which leaves the offset caused by a constant torque; or your own: an entry point of the
-        group skysim.controllers, or a program given on the command line (`--program`). `prescribed` is no controller:
-        the vehicle moves exactly along the maneuver, without dynamics
-    options, time_limit : options of an external controller, and its time limit per control period
-    actuators : ideal torques about the body's axes, or one of the sets that `vehicle` switches on
-    feedback  : source of the attitude: truth, imu (the navigator), filter (star tracker and gyro)
-    bandwidth_rad_s, damping : of the attitude loop;  integral_rad_s : the pole of the integral. Keep the bandwidth
-        times the delay (a period of rate_hz, and the fans' time constant with fans) well below 1: 0.3 is fine
+    Attributes
+    ----------
+    law
+        Pid, or pd, which leaves the offset caused by a constant torque; or your own: an entry
+        point of the group skysim.controllers, or a program given on the command line
+        (`--program`). `prescribed` is no controller: the vehicle moves exactly along the
+        maneuver, without dynamics
+    options, time_limit
+        Options of an external controller, and its time limit per control period
+    actuators
+        Ideal torques about the body's axes, or one of the sets that `vehicle` switches on
+    feedback
+        Source of the attitude: truth, imu (the navigator), filter (star tracker and gyro)
+    bandwidth_rad_s, damping
+        Of the attitude loop
+    integral_rad_s
+        The pole of the integral. Keep the bandwidth times the delay (a period of rate_hz, and
+        the fans' time constant with fans) well below 1: 0.3 is fine
     """
 
     law: LawName = "pid"
@@ -303,7 +333,11 @@ def expand_control(value: Any) -> Any:
 class MotionConfig(ConfigModel):
     """The vehicle's start, its maneuver, its controller and its jitter.
 
-    start : an attitude, or under the stars a pointing; `profile`: attitude and rate of the first maneuver, a profile
+    Attributes
+    ----------
+    start
+        An attitude, or under the stars a pointing; `profile`: attitude and rate of the first
+        maneuver, a profile
     """
 
     start: Start = AttitudeConfig()

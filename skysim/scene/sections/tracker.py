@@ -7,25 +7,36 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from skysim.core.errors import InputError
-from skysim.core.io.yaml_reader import existing_file
 from skysim.core.tolerance import LengthError, NumberError
 from skysim.core.units import ConfigModel, Length, NotNegative, Number, Positive, Spin, Time
+from skysim.core.yaml_reader import existing_file
 
 
 class TotalStationConfig(ConfigModel):
     """A total station that measures every LED by a horizontal direction, a zenith angle and a distance from one place.
 
     Errors of the sight are drawn for each LED; those of the set-up once, and are common to all LEDs. See
-    `skysim.sources.dome.survey.total_station`. Sizes are standard deviations or tolerances.
+    `skysim.sources.dome.survey_errors`. Sizes are standard deviations or tolerances.
 
-    position           : of its center, where its axes meet, in the lab
-    angle_sigma_arcsec : of a direction and of a zenith angle, measured in both faces (ISO 17123-3); of each LED
-    distance_sigma     : a of the data sheet's a + b ppm (ISO 17123-4), without reflector if LEDs have none; of each LED
-    distance_ppm       : b, an error of the distances' scale; common
-    zero_sigma         : of the distance meter's zero point on these targets (additive constant); common
-    centering          : of its place along each axis of the lab; common
-    orientation_sigma_arcsec : of its horizontal circle's zero (the backsight), about the vertical; common
-    leveling_sigma_arcsec    : of its vertical axis, about each horizontal axis (the compensator); common
+    Attributes
+    ----------
+    position
+        Of its center, where its axes meet, in the lab
+    angle_sigma_arcsec
+        Of a direction and of a zenith angle, measured in both faces (ISO 17123-3); of each LED
+    distance_sigma
+        A of the data sheet's a + b ppm (ISO 17123-4), without reflector if LEDs have none; of
+        each LED
+    distance_ppm
+        B, an error of the distances' scale; common
+    zero_sigma
+        Of the distance meter's zero point on these targets (additive constant); common
+    centering
+        Of its place along each axis of the lab; common
+    orientation_sigma_arcsec
+        Of its horizontal circle's zero (the backsight), about the vertical; common
+    leveling_sigma_arcsec
+        Of its vertical axis, about each horizontal axis (the compensator); common
     """
 
     kind: Literal["total_station"]
@@ -42,14 +53,22 @@ class TotalStationConfig(ConfigModel):
 class SurveyErrorsConfig(ConfigModel):
     """Errors of the survey of LEDs and camera, drawn once from their own seed; also draws `light.surface.error`.
 
-    instrument   : that measured the LEDs, with its own errors; none if left out
-    led_sigma    : standard deviation of every LED's surveyed place, along each axis of the lab, or its tolerance; of
-        the target (where in its window the LED is), if there is an instrument
-    lever_sigma  : of the camera's surveyed place, along each axis of the body
-    focal_length_sigma : of the focal length that the tracker assumes, about the true one
-    rotation_deg     : rotation vector of the survey's axes relative to the lab's: the error of the level or IMU that it
-        was referenced to. All surveyed LEDs are rotated by it
-    surface_seed : draws `light.surface.error`; `seed` if left out
+    Attributes
+    ----------
+    instrument
+        That measured the LEDs, with its own errors; none if left out
+    led_sigma
+        Standard deviation of every LED's surveyed place, along each axis of the lab, or its
+        tolerance; of the target (where in its window the LED is), if there is an instrument
+    lever_sigma
+        Of the camera's surveyed place, along each axis of the body
+    focal_length_sigma
+        Of the focal length that the tracker assumes, about the true one
+    rotation_deg
+        Rotation vector of the survey's axes relative to the lab's: the error of the level or
+        IMU that it was referenced to. All surveyed LEDs are rotated by it
+    surface_seed
+        Draws `light.surface.error`; `seed` if left out
     """
 
     rotation_deg: tuple[Spin, Spin, Spin] = (0.0, 0.0, 0.0)
@@ -68,9 +87,14 @@ class ExposureControlConfig(ConfigModel):
     otherwise, if it has too few stars, one step longer. Each exposure time depends on earlier frames, so with
     exposure control a frame cannot be rendered on its own. See `estimator.trackers.exposure_control`.
 
-    mean_dn             : mean of a frame above which it is overexposed: twice its bias and sky, for example
-    min_stars         : fewer cannot be identified
-    overexposed_objects : number of objects with more than saturated_px full pixels each that is too many
+    Attributes
+    ----------
+    mean_dn
+        Mean of a frame above which it is overexposed: twice its bias and sky, for example
+    min_stars
+        Fewer cannot be identified
+    overexposed_objects
+        Number of objects with more than saturated_px full pixels each that is too many
     """
 
     mean_dn: Positive
@@ -93,9 +117,16 @@ class ExposureControlConfig(ConfigModel):
 class DecoderConfig(ConfigModel):
     """Reading the codes of a dome's LEDs (`light.led.code`) over the frames.
 
-    flux_sigma : relative error of a light's brightness that the decoder assumes beside its photon noise
-    gate_px    : greatest motion of a light between two frames beyond what `tracker.gyro` or the last motion predicts
-    frames     : number of frames whose brightness is used, the last ones; as many as the code has bits if left out
+    Attributes
+    ----------
+    flux_sigma
+        Relative error of a light's brightness that the decoder assumes beside its photon noise
+    gate_px
+        Greatest motion of a light between two frames beyond what `tracker.gyro` or the last
+        motion predicts
+    frames
+        Number of frames whose brightness is used, the last ones; as many as the code has bits
+        if left out
     """
 
     flux_sigma: Annotated[Number, Field(ge=1e-6, le=1)] = 0.03
@@ -106,24 +137,46 @@ class DecoderConfig(ConfigModel):
 class TrackerConfig(ConfigModel):
     """Settings of the star tracker and its assumed values of the hardware; `null` for an assumed value is the true one.
 
-    name : own, or an external tracker: an entry point, or a program given on the command line (`--program`)
-    options, time_limit : options of an external tracker, and its time limit per frame
-    catalog : its stars under the sky, not the simulator's: a name in data/catalogs, or a file of `skysim catalog build`
-    map : a file that `skysim survey` wrote: LEDs, lever, focal length and distortion as measured
-    detector, centroider, identifier, solver : if left out, under a dome local, cog, led_pairs and rotation_only, and
-        under the stars all of them `default`. The dome's identifier `non_dimensional` takes an assumed focal length
-        that is wrong by up to 12 %, and the tracker then fits it with the attitude
-    assumed_distortion : k1, k2, p1, p2, k3 of the lens; as it is if left out
-    assumed_row_time : of a rolling shutter; 0 for a tracker that takes all rows as exposed at once
-    gyro : whether the tracker gets the mean rate that `vehicle.imu` measures during each exposure, unless saturated,
-        for smear and a rolling shutter. Without it, as in the published labs, both follow from the frame alone
-    orbit_velocity : whether the tracker gets the velocity of the scene's `orbit`, and corrects for its aberration (5")
-    brightest : only this many of the brightest detections of a frame are used
-    refraction : whether the tracker knows `site`, weather and the time, and undoes the refraction of `light.air`
-    exposure_control : every frame is exposed for `exposure.time` if left out
-    decoder : identifies LEDs by their codes over the frames, in order; without it frame by frame, by their places
-    brightness_sigma : LEDs are identified by their brightness too, whose logarithm has this standard deviation over the
-        data sheet's: scatter, aging, angle, flicker; by their places alone if left out
+    Attributes
+    ----------
+    name
+        Own, or an external tracker: an entry point, or a program given on the command line
+        (`--program`)
+    options, time_limit
+        Options of an external tracker, and its time limit per frame
+    catalog
+        Its stars under the sky, not the simulator's: a name in data/catalogs, or a file of
+        `skysim catalog build`
+    map
+        A file that `skysim survey` wrote: LEDs, lever, focal length and distortion as measured
+    detector, centroider, identifier, solver
+        If left out, under a dome local, cog, led_pairs and rotation_only, and under the stars
+        all of them `default`. The dome's identifier `non_dimensional` takes an assumed focal
+        length that is wrong by up to 12 %, and the tracker then fits it with the attitude
+    assumed_distortion
+        k1, k2, p1, p2, k3 of the lens; as it is if left out
+    assumed_row_time
+        Of a rolling shutter; 0 for a tracker that takes all rows as exposed at once
+    gyro
+        Whether the tracker gets the mean rate that `vehicle.imu` measures during each exposure,
+        unless saturated, for smear and a rolling shutter. Without it, as in the published labs,
+        both follow from the frame alone
+    orbit_velocity
+        Whether the tracker gets the velocity of the scene's `orbit`, and corrects for its
+        aberration (5")
+    brightest
+        Only this many of the brightest detections of a frame are used
+    refraction
+        Whether the tracker knows `site`, weather and the time, and undoes the refraction of
+        `light.air`
+    exposure_control
+        Every frame is exposed for `exposure.time` if left out
+    decoder
+        Identifies LEDs by their codes over the frames, in order; without it frame by frame, by
+        their places
+    brightness_sigma
+        LEDs are identified by their brightness too, whose logarithm has this standard deviation
+        over the data sheet's: scatter, aging, angle, flicker; by their places alone if left out
     """
 
     name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")] = "own"
@@ -192,24 +245,43 @@ class FilterConfig(ConfigModel):
     scale factors and misalignments, the tracker's slow error and its mount are states too, if their standard deviation
     is not 0; one that is `considered` counts in the covariance, but its value is not estimated.
 
-    arw_deg_sqrt_h, bias_deg_h, bias_time : of the gyro; the bias a Gauss-Markov process
-    scale_ppm, misalignment_arcsec        : standard deviation of the gyro's scale factors and of its axes' directions
-    rate_limit_deg_s : largest rate that the gyro measures; from nine tenths of it a rate counts as saturated, also
-        where the IMU does not say so
-    start_deg, start_bias_deg_h : standard deviation of attitude and bias about each axis at the start
-    systematic_arcsec : standard deviation about each axis of the tracker's slow error, which does not average out;
-        added to what a dome tracker knows of its survey
-    systematic_time, systematic_angle_deg : time and rotation after which the slow error is another one
-    mounting_arcsec : standard deviation of the tracker's mount about each axis, and of those of `heads` relative to it,
-        which are estimated
-    mounting_drift_arcsec_sqrt_h : random walk of each mount about each axis
-    floor_arcsec : error that all lights of one frame share, another one in every frame, added to the covariance
-    considered   : states that are considered
-    gate_sigma   : a solution with a larger innovation is rejected
-    missed_per_h : how often the gyro misses a motion in silence
-    wrong_share, wrong_repeat : probability that a wrong solution begins at a frame, and that the next agrees with it
-    latency      : from the end of an exposure to its solution
-    time_tag_sigma : standard deviation of a frame's time, which adds sigma^2 w w^T to the covariance at the rate w
+    Attributes
+    ----------
+    arw_deg_sqrt_h, bias_deg_h, bias_time
+        Of the gyro; the bias a Gauss-Markov process
+    scale_ppm, misalignment_arcsec
+        Standard deviation of the gyro's scale factors and of its axes' directions
+    rate_limit_deg_s
+        Largest rate that the gyro measures; from nine tenths of it a rate counts as saturated,
+        also where the IMU does not say so
+    start_deg, start_bias_deg_h
+        Standard deviation of attitude and bias about each axis at the start
+    systematic_arcsec
+        Standard deviation about each axis of the tracker's slow error, which does not average
+        out; added to what a dome tracker knows of its survey
+    systematic_time, systematic_angle_deg
+        Time and rotation after which the slow error is another one
+    mounting_arcsec
+        Standard deviation of the tracker's mount about each axis, and of those of `heads`
+        relative to it, which are estimated
+    mounting_drift_arcsec_sqrt_h
+        Random walk of each mount about each axis
+    floor_arcsec
+        Error that all lights of one frame share, another one in every frame, added to the
+        covariance
+    considered
+        States that are considered
+    gate_sigma
+        A solution with a larger innovation is rejected
+    missed_per_h
+        How often the gyro misses a motion in silence
+    wrong_share, wrong_repeat
+        Probability that a wrong solution begins at a frame, and that the next agrees with it
+    latency
+        From the end of an exposure to its solution
+    time_tag_sigma
+        Standard deviation of a frame's time, which adds sigma^2 w w^T to the covariance at the
+        rate w
     """
 
     arw_deg_sqrt_h: NotNegative = 0.07

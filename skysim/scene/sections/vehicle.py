@@ -43,10 +43,17 @@ class ActuatorsConfig(ConfigModel):
 class WheelsConfig(ActuatorsConfig):
     """Reaction wheels: every hinge joint `wheel_*` of the model.
 
-    coulomb, viscous   : bearing friction, T = coulomb sign(speed) + viscous speed
-    static_imbalance   : mass times offset of the rotor's center from its axle; disturbs with the speed squared
-    dynamic_imbalance  : product of inertia between the axle and a line across it; disturbs with the speed squared
-    start_rpm          : speed of each at the start; at rest if left out
+    Attributes
+    ----------
+    coulomb, viscous
+        Bearing friction, T = coulomb sign(speed) + viscous speed
+    static_imbalance
+        Mass times offset of the rotor's center from its axle; disturbs with the speed squared
+    dynamic_imbalance
+        Product of inertia between the axle and a line across it; disturbs with the speed
+        squared
+    start_rpm
+        Speed of each at the start; at rest if left out
     """
 
     stores_momentum: ClassVar[bool] = True
@@ -68,7 +75,10 @@ class WheelsConfig(ActuatorsConfig):
 class FansConfig(ActuatorsConfig):
     """Fans: every site `fan_*` of the model exerts a thrust along its own z, in both directions.
 
-    time_constant : of the first-order lag between command and thrust
+    Attributes
+    ----------
+    time_constant
+        Of the first-order lag between command and thrust
     """
 
     thrust_limit_n: Annotated[Force, Field(gt=0)] = 0.5
@@ -78,9 +88,14 @@ class FansConfig(ActuatorsConfig):
 class CmgsConfig(ActuatorsConfig):
     """Control moment gyroscopes: hinge joints `gimbal_*`, each with the joint `rotor_*` of the same suffix.
 
-    steering           : method that computes gimbal rates; a key of STEERING
-    start_deg          : gimbal angles at the start; those of the model if left out
-    rotor_torque_limit : None keeps the rotor speeds constant; a torque makes them variable-speed CMGs
+    Attributes
+    ----------
+    steering
+        Method that computes gimbal rates; a key of STEERING
+    start_deg
+        Gimbal angles at the start; those of the model if left out
+    rotor_torque_limit
+        None keeps the rotor speeds constant; a torque makes them variable-speed CMGs
     """
 
     stores_momentum: ClassVar[bool] = True
@@ -95,9 +110,15 @@ class CmgsConfig(ActuatorsConfig):
 class TrimConfig(ConfigModel):
     """Motorized trim masses: every slide joint `trim_*` of the model, held in its place during a run.
 
-    position : of each along its joint's axis, from its place in the model; `skysim balance` finds the balanced ones
-    travel   : largest position, either way
-    step     : of the motors: a mass is held at a multiple of it
+    Attributes
+    ----------
+    position
+        Of each along its joint's axis, from its place in the model; `skysim balance` finds the
+        balanced ones
+    travel
+        Largest position, either way
+    step
+        Of the motors: a mass is held at a multiple of it
     """
 
     position_m: tuple[Length, ...] = ()
@@ -134,8 +155,13 @@ class AirCurrentConfig(ConfigModel):
 class DisturbancesConfig(ConfigModel):
     """Disturbance torques; each is off if it is left out.
 
-    turbine        : turbine torque of the bearing's air jets, constant about the lab's axes
-    earth_rotation : the lab rotates with the Earth (`site` gives its latitude), the vehicle's momentum does not
+    Attributes
+    ----------
+    turbine
+        Turbine torque of the bearing's air jets, constant about the lab's axes
+    earth_rotation
+        The lab rotates with the Earth (`site` gives its latitude), the vehicle's momentum does
+        not
     """
 
     turbine_nm: tuple[Torque, Torque, Torque] = (0.0, 0.0, 0.0)
@@ -147,12 +173,20 @@ class DisturbancesConfig(ConfigModel):
 class GyroConfig(ConfigModel):
     """Three fiber-optic gyroscopes. The defaults are an LN-200's, of which only the first two have a source.
 
-    arw_deg_sqrt_h     : angle random walk
-    bias_deg_h         : bias instability: standard deviation of a Gauss-Markov process with bias_time
-    turn_on_bias_deg_h : constant part of the bias, standard deviation over units, or a tolerance
-    scale_ppm, misalignment_arcsec : of each axis, standard deviations over units, or tolerances
-    quantum_arcsec     : step of the angle counter
-    rate_limit_deg_s   : the output saturates at this rate
+    Attributes
+    ----------
+    arw_deg_sqrt_h
+        Angle random walk
+    bias_deg_h
+        Bias instability: standard deviation of a Gauss-Markov process with bias_time
+    turn_on_bias_deg_h
+        Constant part of the bias, standard deviation over units, or a tolerance
+    scale_ppm, misalignment_arcsec
+        Of each axis, standard deviations over units, or tolerances
+    quantum_arcsec
+        Step of the angle counter
+    rate_limit_deg_s
+        The output saturates at this rate
     """
 
     arw_deg_sqrt_h: NotNegative = 0.07
@@ -181,10 +215,15 @@ class AccelerometerConfig(ConfigModel):
 class ImuConfig(ConfigModel):
     """An inertial measurement unit and the navigator that integrates it to 3-2-1 Euler angles.
 
-    earth_rate    : none: the gyros do not measure the Earth's rotation; uncompensated: they do, and the navigator
-                    takes it for the vehicle's; compensated: the navigator subtracts it
-    home_error_deg: roll, pitch, yaw error of the vehicle's attitude when the navigator was zeroed
-    hardware_seed : selects one unit of the production: its turn-on bias, scale factors and misalignments
+    Attributes
+    ----------
+    earth_rate
+        None: the gyros do not measure the Earth's rotation; uncompensated: they do, and the
+        navigator takes it for the vehicle's; compensated: the navigator subtracts it
+    home_error_deg
+        Roll, pitch, yaw error of the vehicle's attitude when the navigator was zeroed
+    hardware_seed
+        Selects one unit of the production: its turn-on bias, scale factors and misalignments
     """
 
     rate_hz: Annotated[Number, Field(ge=10, le=1000)] = 400.0
@@ -198,10 +237,16 @@ class ImuConfig(ConfigModel):
 class VehicleConfig(ConfigModel):
     """The moving body: an MJCF file, and values of the scene that replace the file's.
 
-    camera       : entrance pupil on the body, the housing moves with it; the MJCF's if left out
-    torque_limit : of each of the ideal torques about body x, y, z
-    wheels, fans, cmgs : the actuators that are switched on; joints of the others are locked
-    trim         : the trim masses' places; center_of_mass and inertia are those with all of them at zero
+    Attributes
+    ----------
+    camera
+        Entrance pupil on the body, the housing moves with it; the MJCF's if left out
+    torque_limit
+        Of each of the ideal torques about body x, y, z
+    wheels, fans, cmgs
+        The actuators that are switched on; joints of the others are locked
+    trim
+        The trim masses' places; center_of_mass and inertia are those with all of them at zero
     """
 
     model: str
@@ -247,8 +292,12 @@ class VehicleConfig(ConfigModel):
 class SiteConfig(ConfigModel):
     """Where on the Earth the lab is, and the azimuth of its x axis from north through east.
 
-    longitude_deg : east; `light.bodies` are seen from there, without it from the Earth's center
-    height        : above the ellipsoid
+    Attributes
+    ----------
+    longitude_deg
+        East; `light.bodies` are seen from there, without it from the Earth's center
+    height
+        Above the ellipsoid
     """
 
     latitude_deg: Annotated[Number, Field(ge=-90, le=90)] = 39.8

@@ -4,7 +4,7 @@
 `views` projects the lights, `detection` and `expected_error` predict the tracker, `facts` and `findings` say it.
 """
 
-from skysim.simulation.checks.plan import LEAST_ALIKE as LEAST_ALIKE
-from skysim.simulation.checks.plan import Check as Check
-from skysim.simulation.checks.plan import ambiguity_map as ambiguity_map
-from skysim.simulation.checks.plan import check as check
+from skysim.simulation.checks.check import LEAST_ALIKE as LEAST_ALIKE
+from skysim.simulation.checks.check import Check as Check
+from skysim.simulation.checks.check import ambiguity_map as ambiguity_map
+from skysim.simulation.checks.check import check as check

@@ -28,13 +28,19 @@ DIRECTIONS = 48  # attitudes that the motion could reach
 GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
 
 
-class Attitudes(NamedTuple):
+class CheckedAttitudes(NamedTuple):
     """N attitudes.
 
-    lab_from_body   : N rotations
-    rate_body_rad_s : (N, 3) in body axes; zeros where only the direction is of interest
-    t_s             : (N,) time of the frame; NaN where it is none
-    acceleration_body_rad_s2 : (N, 3) in body axes; None for zeros
+    Attributes
+    ----------
+    lab_from_body
+        N rotations
+    rate_body_rad_s
+        (N, 3) in body axes; zeros where only the direction is of interest
+    t_s
+        (N,) time of the frame; NaN where it is none
+    acceleration_body_rad_s2
+        (N, 3) in body axes; None for zeros
     """
 
     lab_from_body: Rotation
@@ -48,7 +54,7 @@ class Attitudes(NamedTuple):
         return np.zeros_like(self.rate_body_rad_s) if given is None else given
 
 
-def of_frames(lab: Lab) -> Attitudes:
+def of_frames(lab: Lab) -> CheckedAttitudes:
     """Attitudes at mid-exposure of some frames: evenly spaced ones, the fastest and the most tilted."""
     scene = lab.scene
     count = lab.scene.exposure.frames
@@ -66,7 +72,7 @@ def of_frames(lab: Lab) -> Attitudes:
     if scene.vehicle.mount == "air_bearing":
         check_stop(scene, t_s[rows], np.degrees(tilt_rad))
         rows = rows[tilt_rad <= math.radians(scene.vehicle.tilt_stop_deg)]
-    return Attitudes(
+    return CheckedAttitudes(
         every.lab_from_body[rows],
         every.rate_body_rad_s[rows],
         t_s[rows],
@@ -92,13 +98,13 @@ def check_stop(scene: Scene, t_s: Floats, tilt_deg: Floats) -> None:
         )
 
 
-def attitudes_at(lab: Lab, t_s: Floats) -> Attitudes:
+def attitudes_at(lab: Lab, t_s: Floats) -> CheckedAttitudes:
     """The commanded attitudes at (N,) times; without a controller those of the initial rate, kept constant."""
     scene = lab.scene
     lab_from_start = lab.start
     if scene.motion.control is None:
         rate = np.radians(scene.motion.rate_deg_s)
-        return Attitudes(
+        return CheckedAttitudes(
             lab_from_start * Rotation.from_rotvec(np.outer(t_s, rate)),
             np.tile(rate, (len(t_s), 1)),
             t_s,
@@ -107,15 +113,15 @@ def attitudes_at(lab: Lab, t_s: Floats) -> Attitudes:
     states = [reference.state_at(float(t)) for t in t_s]
     lab_from_body = Rotation.from_quat(np.array([state[0] for state in states]), scalar_first=True)
     rates, accelerations = (np.array([state[k] for state in states]) for k in (1, 2))
-    return Attitudes(lab_from_body, rates, t_s, accelerations)
+    return CheckedAttitudes(lab_from_body, rates, t_s, accelerations)
 
 
-def tilts_rad(attitudes: Attitudes) -> Floats:
+def tilts_rad(attitudes: CheckedAttitudes) -> Floats:
     """(N,) angles between the body's z and the lab's."""
     return np.radians(multibody.tilt_deg(attitudes.lab_from_body))
 
 
-def greatest_tilt_rad(scene: Scene, frames: Attitudes) -> float:
+def greatest_tilt_rad(scene: Scene, frames: CheckedAttitudes) -> float:
     """The greatest tilt of the maneuver; without a controller on a bearing, the tilt stop."""
     if scene.motion.control is None and scene.vehicle.mount == "air_bearing":
         return math.radians(scene.vehicle.tilt_stop_deg)
@@ -123,13 +129,16 @@ def greatest_tilt_rad(scene: Scene, frames: Attitudes) -> float:
 
 
 def within_reach(
-    scene: Scene, mount: Mount, frames: Attitudes, tilt_deg: float | None = None
-) -> Attitudes:
+    scene: Scene, mount: Mount, frames: CheckedAttitudes, tilt_deg: float | None = None
+) -> CheckedAttitudes:
     """Attitudes that a motion could reach: under the stars all, else any azimuth and yaw up to the greatest tilt.
 
-    tilt_deg : the greatest tilt, of a study's trials for example; that of `greatest_tilt_rad` if None
-
     Directions are even on a Fibonacci spiral; the angles about them are even too.
+
+    Parameters
+    ----------
+    tilt_deg
+        The greatest tilt, of a study's trials for example; that of `greatest_tilt_rad` if None
     """
     n = np.arange(DIRECTIONS)
     turn_rad = 2 * np.pi * np.mod(n / GOLDEN_RATIO, 1.0)
@@ -151,10 +160,10 @@ def within_reach(
         # With a yaw of minus the azimuth, the tilt is about a horizontal axis.
         angles = np.column_stack([azimuth_rad, tilt_rad, turn_rad - azimuth_rad])
         lab_from_body = Rotation.from_euler("ZYZ", angles)
-    return Attitudes(lab_from_body, np.zeros((DIRECTIONS, 3)), np.full(DIRECTIONS, np.nan))
+    return CheckedAttitudes(lab_from_body, np.zeros((DIRECTIONS, 3)), np.full(DIRECTIONS, np.nan))
 
 
-def describe(attitudes: Attitudes, n: int, scene: Scene, mount: Mount) -> str:
+def describe(attitudes: CheckedAttitudes, n: int, scene: Scene, mount: Mount) -> str:
     """An attitude in words: RA and Dec of the boresight, or the vehicle's roll, pitch, yaw and tilt; and the time."""
     lab_from_body = attitudes.lab_from_body[n]
     t_s = attitudes.t_s[n]

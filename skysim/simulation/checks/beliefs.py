@@ -27,12 +27,16 @@ from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.simulation.checks.views import CameraModel
 from skysim.simulation.lab import Lab
-from skysim.sources.dome.displays import display
-from skysim.sources.dome.survey.survey_errors import led_covariance_m2
+from skysim.sources.dome import display
+from skysim.sources.dome.survey_errors import led_covariance_m2
 from skysim.tracking import dome_map_file
-from skysim.tracking.onboard_model import assumed_camera, onboard_catalog
-from skysim.tracking.orbit_velocity import assumed_observer, assumed_orbit
-from skysim.tracking.settings import assumed_settings
+from skysim.tracking.factory import assumed_settings
+from skysim.tracking.onboard_model import (
+    assumed_camera,
+    assumed_observer,
+    assumed_orbit,
+    onboard_catalog,
+)
 
 REACH_PX = 7.0  # of neighbors
 WINDOW_PX = 3  # half the side of the fit's window
@@ -42,17 +46,29 @@ WINDOW_PX = 3  # half the side of the fit's window
 class Beliefs:
     """What the tracker believes. Standard deviations are of a survey that is still to be drawn.
 
-    lights         : the sources that it knows, N of them
-    direction_error : (N, 3) measured minus believed direction of each star, from the catalog's error and from
+    Attributes
+    ----------
+    lights
+        The sources that it knows, N of them
+    direction_error
+        (N, 3) measured minus believed direction of each star, from the catalog's error and from
         neighbors, in lab axes; zeros for LEDs
-    led_sigma_m, lever_sigma_m : of the surveyed places, about each axis (rms of LEDs measured by an instrument)
-    surface_sigma_m : of the surveyed surface, along its normal, common to all LEDs
-    rotation_rad   : (3,) rotation of the survey's axes, in lab axes
-    lever_error_m  : (3,) believed minus true place of the camera, in body axes
-    focal_error, focal_sigma : relative error of the focal length, and its standard deviation
-    camera         : the camera with the believed distortion
-    faintest_mag   : of the stars that it knows; infinite under a dome
-    epoch_jyear    : of its star catalog; NaN under a dome
+    led_sigma_m, lever_sigma_m
+        Of the surveyed places, about each axis (rms of LEDs measured by an instrument)
+    surface_sigma_m
+        Of the surveyed surface, along its normal, common to all LEDs
+    rotation_rad
+        (3,) rotation of the survey's axes, in lab axes
+    lever_error_m
+        (3,) believed minus true place of the camera, in body axes
+    focal_error, focal_sigma
+        Relative error of the focal length, and its standard deviation
+    camera
+        The camera with the believed distortion
+    faintest_mag
+        Of the stars that it knows; infinite under a dome
+    epoch_jyear
+        Of its star catalog; NaN under a dome
     """
 
     lights: Sources
@@ -159,8 +175,14 @@ def neighbor_shift(
 ) -> Floats:
     """(N, 3) displacement of the directions of some stars by the images of their neighbors.
 
-    place : (M, 3) unit vectors of all sources;  rate_e_s : (M,) photo-electrons per second
-    row   : (N,) the stars
+    Parameters
+    ----------
+    place
+        (M, 3) unit vectors of all sources
+    rate_e_s
+        (M,) photo-electrons per second
+    row
+        (N,) the stars
     """
     focal_px = camera.optics.camera.focal_px
     reach = cKDTree(place[row]).sparse_distance_matrix(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from estimator.trackers.pipeline import SATURATED_SIGMA_PX, Settings
-from skysim.camera.detector.detector import saturation_dn
+from skysim.camera.detector import saturation_dn
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import DetectorConfig
 from skysim.scene.sections.light import DomeConfig
@@ -17,8 +17,8 @@ from skysim.simulation.checks import beliefs
 from skysim.simulation.checks.beliefs import Beliefs
 from skysim.simulation.checks.views import CameraModel, View, peak_share
 from skysim.simulation.lab import Lab
-from skysim.sources.dome.shell.surface import Surface, build_surface
-from skysim.tracking.settings import assumed_settings
+from skysim.sources.dome.surface import Surface, build_surface
+from skysim.tracking.factory import assumed_settings
 
 BINOMIAL_VARIANCE_PX2 = 0.5  # that the detectors' filter [1 2 1] / 4 adds to an image, each axis
 FILTERED_NOISE = 0.375  # factor of that filter on the noise of a pixel
@@ -31,8 +31,14 @@ MAX_PULSES = 500  # in an exposure; with more the mean time of the light does no
 class Context(NamedTuple):
     """What all checks share: the lab, the tracker's settings and beliefs, the camera, and the dome's surface.
 
-    known_id, known_row : (N,) ascending numbers of the lights that the tracker knows, and their rows in its beliefs
-    timing_s : (N,) standard deviation of the mean time of each light that the tracker knows within an exposure
+    Attributes
+    ----------
+    known_id, known_row
+        (N,) ascending numbers of the lights that the tracker knows, and their rows in its
+        beliefs
+    timing_s
+        (N,) standard deviation of the mean time of each light that the tracker knows within an
+        exposure
     """
 
     lab: Lab

@@ -40,17 +40,17 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.nearfield import SOLVERS
 from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES
-from estimator.identification.stars.search import WRONG_FOCAL
+from estimator.identification.star_search import WRONG_FOCAL
 from estimator.trackers.dome_tracker import FITS_FOCAL, FOCAL_UNCERTAINTY
 from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import RollingShutterConfig
 from skysim.scene.sections.light import StarsConfig
-from skysim.simulation.checks.attitudes import Attitudes
+from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.views import View
-from skysim.sources.dome.survey import survey_errors, total_station
+from skysim.sources.dome import survey_errors
 
 
 class Independent(NamedTuple):
@@ -115,7 +115,7 @@ def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Common
     instrument = context.lab.scene.tracker.survey.instrument
     if instrument is None:
         return None
-    shifts_m = total_station.common_displacements_m(
+    shifts_m = survey_errors.station_displacements_m(
         instrument, context.beliefs.lights.place[view.row, :3]
     )
     parts = [displacement(view, shift_m, lab_from_cam).displacement_px for shift_m in shifts_m]
@@ -231,8 +231,15 @@ EXACT_SOLVERS = ("rotation_only", "pnp")  # without an error of their own
 def gains(view: View, sigma_px: Floats, fitted: Floats | None = None) -> Floats:
     """(n, 3, 2) K_i: the rotation by a unit error of each image position, for weights 1 / sigma^2.
 
-    fitted : (n, 2, k) derivatives of the image positions by what is fitted beside the rotation
-    Raises LinAlgError if the lights do not determine the rotation.
+    Parameters
+    ----------
+    fitted
+        (n, 2, k) derivatives of the image positions by what is fitted beside the rotation
+
+    Raises
+    ------
+    LinAlgError
+        If the lights do not determine the rotation.
     """
     jacobian = view.jacobian if fitted is None else np.concatenate([view.jacobian, fitted], axis=2)
     weighted = jacobian / sigma_px[:, None, None] ** 2
@@ -271,9 +278,14 @@ def believed_sigma_px(view: View, noise: Independent, context: Context) -> Float
 class Mismatch(NamedTuple):
     """How far images are from where the tracker expects them, after the best attitude for that.
 
-    residual_px : (n,) of all errors together, of those drawn once 1 sigma;  gate_px : (n,) at which the tracker takes a
-        light for another
-    by_cause    : rms of the residual of each cause
+    Attributes
+    ----------
+    residual_px
+        (n,) of all errors together, of those drawn once 1 sigma
+    gate_px
+        (n,) at which the tracker takes a light for another
+    by_cause
+        Rms of the residual of each cause
     """
 
     residual_px: Floats
@@ -363,7 +375,7 @@ def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats
     )
 
 
-def expected(views: list[View], attitudes: Attitudes, context: Context) -> Expected:
+def expected(views: list[View], attitudes: CheckedAttitudes, context: Context) -> Expected:
     """The expected errors at some attitudes with the lights that the tracker uses there."""
     cross, roll = (
         {name: np.zeros(len(views)) for name in (CENTROIDS, *CAUSES, SOLVER)} for _ in range(2)

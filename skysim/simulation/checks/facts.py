@@ -17,9 +17,9 @@ from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes, beliefs
 from skysim.simulation.checks.detection import Context, full_scale_e
 from skysim.simulation.checks.expected_error import mean_root
-from skysim.simulation.checks.sampling import Sampled, Samples
+from skysim.simulation.checks.sampling import CheckedSamples, Sampled
 from skysim.sources.dome.layouts.led_list import max_tilt_deg
-from skysim.sources.dome.shell.room import fit
+from skysim.sources.dome.room import fit
 
 GAUSSIAN_WIDTH = 4.0  # width of an image over its rms radius: D4sigma (ISO 11146), the diameter of a uniform disk
 SIDES = 12  # to which the greatest tilt is tried, and rays around the field
@@ -41,7 +41,7 @@ class Fact(NamedTuple):
     values: dict[str, Any]
 
 
-def field_of_view(context: Context, samples: Samples) -> Fact:
+def field_of_view(context: Context, samples: CheckedSamples) -> Fact:
     """Angles between the centers of opposite edges and corners of the chip, without distortion."""
     lens = context.camera.optics.camera.calibration()
     return Fact(
@@ -51,7 +51,7 @@ def field_of_view(context: Context, samples: Samples) -> Fact:
     )
 
 
-def lights_in_field(context: Context, samples: Samples) -> Fact:
+def lights_in_field(context: Context, samples: CheckedSamples) -> Fact:
     """How many lights the tracker knows and detects in the field: mean and least, and where the least are."""
     scene = context.lab.scene
     mount = context.lab.camera.mount
@@ -90,7 +90,7 @@ def lights_in_field(context: Context, samples: Samples) -> Fact:
     return Fact("lights in the field", lines, values)
 
 
-def other_lights(context: Context, samples: Samples) -> Fact | None:
+def other_lights(context: Context, samples: CheckedSamples) -> Fact | None:
     """Lights at the frames that the tracker detects and does not know, by their names; None if there are none."""
     others = samples.frames.others
     most = {
@@ -110,13 +110,13 @@ def other_lights(context: Context, samples: Samples) -> Fact | None:
     return Fact("other lights", lines, values)
 
 
-def reached(context: Context, samples: Samples) -> str:
+def reached(context: Context, samples: CheckedSamples) -> str:
     """What directions the motion could reach, in words."""
     tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
     return f"any azimuth and yaw to {tilt_deg:.1f}° of tilt"
 
 
-def spot(context: Context, samples: Samples) -> Fact:
+def spot(context: Context, samples: CheckedSamples) -> Fact:
     """Width of the median image without motion, and what it is made of."""
     sampled = samples.frames if sum(map(len, samples.frames.seen)) else samples.reach
     sigma, disk, defocus = (sampled.joined(name) for name in ("sigma_px", "disk_px", "defocus_px"))
@@ -134,12 +134,12 @@ def spot(context: Context, samples: Samples) -> Fact:
     return Fact("image size", [text], values)
 
 
-def fill(context: Context, samples: Samples) -> Floats:
+def fill(context: Context, samples: CheckedSamples) -> Floats:
     """Peaks of all lights at the frames over the full well, or over the converter's range if that is less."""
     return samples.frames.joined("peak_e") / full_scale_e(context.lab.scene.camera.detector)
 
 
-def peak(context: Context, samples: Samples) -> Fact:
+def peak(context: Context, samples: CheckedSamples) -> Fact:
     """Mean electrons in the brightest pixel of a centered image over the full well."""
     ratio = fill(context, samples)
     full_e = full_scale_e(context.lab.scene.camera.detector)
@@ -157,7 +157,7 @@ def peak(context: Context, samples: Samples) -> Fact:
     return Fact("peak", [text + full_text], values)
 
 
-def smear(context: Context, samples: Samples) -> Fact:
+def smear(context: Context, samples: CheckedSamples) -> Fact:
     """Path of the images during an exposure at the rates of the frames."""
     frames = samples.frames
     rate_deg_s = np.degrees(np.linalg.norm(frames.attitudes.rate_body_rad_s, axis=1))
@@ -186,9 +186,16 @@ def smear(context: Context, samples: Samples) -> Fact:
 class CapMargin(NamedTuple):
     """The cap of a dome's LEDs, a tilt, and what the field needs there; degrees from the zenith.
 
-    cap_deg : where the LEDs end; of a `listed` layout, the farthest one
-    needed_deg : for the middle of the field's longer side;  corner_deg : for its corner
-    limit_deg : the layout's `cap_deg`, to which shell and wires reach
+    Attributes
+    ----------
+    cap_deg
+        Where the LEDs end; of a `listed` layout, the farthest one
+    needed_deg
+        For the middle of the field's longer side
+    corner_deg
+        For its corner
+    limit_deg
+        The layout's `cap_deg`, to which shell and wires reach
     """
 
     cap_deg: float
@@ -208,14 +215,18 @@ class CapMargin(NamedTuple):
 
 
 def cap_margin(
-    context: Context, samples: Samples, tilt_deg: float | None = None
+    context: Context, samples: CheckedSamples, tilt_deg: float | None = None
 ) -> CapMargin | None:
     """How far the LEDs reach beyond the field at a tilt; None without a layout that fills a cap.
 
-    tilt_deg : the greatest of the attitudes in reach if None
     Any side or corner of the field may point outward. Rays at these angles from the boresight are traced to the surface
     from the pupil, at the tilt to all sides; their angle from the zenith, as seen from the bearing, is what
     `light.layout.cap_deg` is compared with.
+
+    Parameters
+    ----------
+    tilt_deg
+        The greatest of the attitudes in reach if None
     """
     light = context.lab.scene.light
     camera = context.camera.optics.camera
@@ -261,7 +272,7 @@ def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> floa
     return needed_deg
 
 
-def cap(context: Context, samples: Samples) -> Fact | None:
+def cap(context: Context, samples: CheckedSamples) -> Fact | None:
     """Margin of the LED cap over the tilt plus half the field, at the greatest tilt in reach and at the tilt stop."""
     found = cap_margin(context, samples)
     vehicle = context.lab.scene.vehicle
@@ -284,7 +295,7 @@ def cap(context: Context, samples: Samples) -> Fact | None:
     return Fact("LED cap", lines, values)
 
 
-def room(context: Context, samples: Samples) -> Fact | None:
+def room(context: Context, samples: CheckedSamples) -> Fact | None:
     """How the dome fits into the room where it is to be built, which a scene that does not fit refuses."""
     light = context.lab.scene.light
     surface = context.surface
@@ -311,7 +322,7 @@ def room(context: Context, samples: Samples) -> Fact | None:
     return Fact("room", [text], values)
 
 
-def depth_of_focus(context: Context, samples: Samples) -> Fact:
+def depth_of_focus(context: Context, samples: CheckedSamples) -> Fact:
     """Distances at which the defocus disk is one pixel wide: 1 / u = 1 / focus ± pixel / (pupil image_distance)."""
     camera = context.camera.optics.camera
     spread = camera.pixel_m / (camera.pupil_m * camera.image_distance_m)
@@ -334,7 +345,7 @@ def depth_of_focus(context: Context, samples: Samples) -> Fact:
     return Fact("depth of focus", [text], values)
 
 
-def tracker_beliefs(context: Context, samples: Samples) -> Fact:
+def tracker_beliefs(context: Context, samples: CheckedSamples) -> Fact:
     """What the tracker believes, and what of it is uncertain or wrong."""
     believed = context.beliefs
     values = {
@@ -351,7 +362,7 @@ def tracker_beliefs(context: Context, samples: Samples) -> Fact:
     return Fact(TRACKER_KNOWS, beliefs.describe(believed, context.lab.scene), values)
 
 
-def expected_error(context: Context, samples: Samples) -> Fact:
+def expected_error(context: Context, samples: CheckedSamples) -> Fact:
     """Expected cross and roll error, 1 sigma, and the causes in the order of their share."""
     scene = context.lab.scene
     mount = context.lab.camera.mount
@@ -420,7 +431,7 @@ def cause_text(sampled: Sampled, angle: str) -> str:
     return ", ".join(parts)
 
 
-FACTS: tuple[Callable[[Context, Samples], Fact | None], ...] = (
+FACTS: tuple[Callable[[Context, CheckedSamples], Fact | None], ...] = (
     field_of_view,
     lights_in_field,
     other_lights,

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.camera import thermal
+from skysim.camera import thermal_motion
 from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Mount, Sources
@@ -26,9 +26,9 @@ from skysim.simulation.checks.detection import (
 )
 from skysim.simulation.checks.expected_error import Independent, believed_sigma_px, gains, mismatch
 from skysim.simulation.checks.facts import GAUSSIAN_WIDTH, cap_margin, fill, short
-from skysim.simulation.checks.sampling import Samples
+from skysim.simulation.checks.sampling import CheckedSamples
 from skysim.simulation.checks.views import View
-from skysim.simulation.lights.background import BACKGROUND
+from skysim.simulation.lights.starlight import BACKGROUND
 
 MAX_SATURATED = (
     0.25  # fraction of saturated lights that gives no warning: a bright star or LED now and then
@@ -58,7 +58,7 @@ MAX_TAG_RATIO = 1.3
 MAX_TAG_ARCSEC = 1.0
 
 
-def saturation(context: Context, samples: Samples) -> str:
+def saturation(context: Context, samples: CheckedSamples) -> str:
     """Warn where many lights are saturated."""
     ratio = fill(context, samples)
     scene = context.lab.scene
@@ -102,7 +102,7 @@ def dimmer(context: Context, factor: float) -> dict[str, str]:
     return cures
 
 
-def bright_background(context: Context, samples: Samples) -> str:
+def bright_background(context: Context, samples: CheckedSamples) -> str:
     """Warn where extended light alone fills the pixels."""
     scene = context.lab.scene
     camera = context.camera
@@ -118,7 +118,7 @@ def bright_background(context: Context, samples: Samples) -> str:
     )
 
 
-def dark_corners(context: Context, samples: Samples) -> str:
+def dark_corners(context: Context, samples: CheckedSamples) -> str:
     """Warn where the lens passes no light to a part of the chip."""
     camera = context.camera.optics.camera
     stops = context.camera.optics.camera.vignetting
@@ -131,7 +131,7 @@ def dark_corners(context: Context, samples: Samples) -> str:
     )
 
 
-def few_lights(context: Context, samples: Samples) -> str:
+def few_lights(context: Context, samples: CheckedSamples) -> str:
     """Warn where the tracker has too few lights: at the frames, or in reach."""
     scene = context.lab.scene
     mount = context.lab.camera.mount
@@ -166,7 +166,7 @@ def few_lights(context: Context, samples: Samples) -> str:
     return f"tracker.limit_mag: {text}; change it to {fainter:g}, or take a shorter camera.focal_length"
 
 
-def hidden_lights(context: Context, samples: Samples) -> str:
+def hidden_lights(context: Context, samples: CheckedSamples) -> str:
     """Warn where something hides so many lights that the tracker has too few: at the frames."""
     frames = samples.frames
     scene = context.lab.scene
@@ -218,7 +218,7 @@ def denser(layout: Layout, mean: float) -> str:
     return f"add LEDs: {factor:.1f} times as many"
 
 
-def undetected(context: Context, samples: Samples) -> str:
+def undetected(context: Context, samples: CheckedSamples) -> str:
     """Warn where most of the lights on the chip are too faint or too small for the detector."""
     scene = context.lab.scene
     settings = context.settings
@@ -260,7 +260,7 @@ def brighter(scene: Scene, factor: float, text: str) -> str:
     return f"light.led.radiant_intensity: {text}; change it to {short(radiant_uw_sr, 2)} uW / sr"
 
 
-def not_where_expected(context: Context, samples: Samples) -> str:
+def not_where_expected(context: Context, samples: CheckedSamples) -> str:
     """Warn where errors that the tracker does not know of displace images beyond its matching radius."""
     frames = samples.frames
     scene = context.lab.scene
@@ -330,7 +330,7 @@ CHANGES: dict[str, Callable[[Scene, float], str]] = {
 }
 
 
-def cap_too_small(context: Context, samples: Samples) -> str:
+def cap_too_small(context: Context, samples: CheckedSamples) -> str:
     """Warn where the field reaches beyond the LEDs at the greatest tilt."""
     found = cap_margin(context, samples)
     light = context.lab.scene.light
@@ -353,7 +353,7 @@ def cap_too_small(context: Context, samples: Samples) -> str:
     )
 
 
-def out_of_focus(context: Context, samples: Samples) -> str:
+def out_of_focus(context: Context, samples: CheckedSamples) -> str:
     """Warn where the defocus disk is wide beside the image in focus."""
     sampled = samples.frames
     defocus, sigma, distance_m = (
@@ -371,7 +371,7 @@ def out_of_focus(context: Context, samples: Samples) -> str:
     return f"camera.focus: {text}; change it to {best}"
 
 
-def long_smear(context: Context, samples: Samples) -> str:
+def long_smear(context: Context, samples: CheckedSamples) -> str:
     """Warn where images move by more than some pixels and than their own width."""
     frames = samples.frames
     scene = context.lab.scene
@@ -391,7 +391,7 @@ def long_smear(context: Context, samples: Samples) -> str:
     )
 
 
-def unknown_tag_error(context: Context, samples: Samples) -> str:
+def unknown_tag_error(context: Context, samples: CheckedSamples) -> str:
     """Warn where frames' times err by more than the filter assumes, and the vehicle turns in that time."""
     scene = context.lab.scene
     sigma_s = float(scene.exposure.time_tag_jitter_s)
@@ -408,7 +408,7 @@ def unknown_tag_error(context: Context, samples: Samples) -> str:
     )
 
 
-def thermal_drift(context: Context, samples: Samples) -> str:
+def thermal_drift(context: Context, samples: CheckedSamples) -> str:
     """Warn where dome, mount and lens drift so far that solutions err by more than expected."""
     thermal_config = context.lab.scene.thermal
     frames = samples.frames
@@ -424,7 +424,7 @@ def thermal_drift(context: Context, samples: Samples) -> str:
     if not (cross_rad > expected_rad).any():
         return ""
     n = int(np.nanargmax(cross_rad))
-    warm_c = thermal.temperature_c(thermal_config, float(at.t_s[n]))
+    warm_c = thermal_motion.temperature_c(thermal_config, float(at.t_s[n]))
     return (
         f"thermal.reference_c: dome, mount and lens turn the solution by {short(cross_rad[n] / ARCSEC_RAD)}″ (cross) at"
         f" {warm_c:.1f} °C, t = {at.t_s[n]:.1f} s, beside an expected error of"
@@ -445,8 +445,8 @@ def drift_rad(view: View, lab_from_body: Rotation, t_s: float, context: Context)
     mount = context.lab.camera.mount
     optics = context.camera.optics
     surveyed_px = image_px(lights, mount, optics, lab_from_body)
-    moved = thermal.camera_at(config, mount, optics, t_s)
-    drifted_px = image_px(thermal.leds_at(config, lights, t_s), *moved, lab_from_body)
+    moved = thermal_motion.camera_at(config, mount, optics, t_s)
+    drifted_px = image_px(thermal_motion.leds_at(config, lights, t_s), *moved, lab_from_body)
     return np.asarray(np.einsum("nij,nj->i", gains(view, sigma_px), drifted_px - surveyed_px))
 
 
@@ -457,7 +457,7 @@ def image_px(lights: Sources, mount: Mount, optics: Optics, lab_from_body: Rotat
     return optics.project((mount.cam_from_body * lab_from_body.inv()).apply(offset_m))
 
 
-FINDINGS: tuple[Callable[[Context, Samples], str], ...] = (
+FINDINGS: tuple[Callable[[Context, CheckedSamples], str], ...] = (
     bright_background,
     saturation,
     dark_corners,

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skysim.core.types import Floats
-from skysim.simulation.checks.attitudes import Attitudes
+from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, usable
 from skysim.simulation.checks.expected_error import Expected, expected
 from skysim.simulation.checks.views import VISIBLE, View, view
@@ -24,13 +24,21 @@ from skysim.simulation.lights.light import Beam, Exposure, beam_of
 class Sampled(NamedTuple):
     """Some attitudes, what the camera sees there, and the expected errors.
 
-    known  : the lights on the chip that the tracker knows, also hidden ones
-    seen   : of them those that nothing hides;  used : those that it also detects
-    hidden : how many of them are hidden, by the name of what hides them
-    others : the lights that it detects and does not know, by their names
+    Attributes
+    ----------
+    known
+        The lights on the chip that the tracker knows, also hidden ones
+    seen
+        Of them those that nothing hides
+    used
+        Those that it also detects
+    hidden
+        How many of them are hidden, by the name of what hides them
+    others
+        The lights that it detects and does not know, by their names
     """
 
-    attitudes: Attitudes
+    attitudes: CheckedAttitudes
     exposures: list[Exposure]
     beams: list[Beam]
     known: list[View]
@@ -53,14 +61,14 @@ class Sampled(NamedTuple):
         return np.concatenate([getattr(view, name) for view in self.seen])
 
 
-class Samples(NamedTuple):
+class CheckedSamples(NamedTuple):
     """The two sets of attitudes: those of the frames, and all that the motion could reach."""
 
     frames: Sampled
     reach: Sampled
 
 
-def sampled(at: Attitudes, context: Context) -> Sampled:
+def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
     """What the camera sees at some attitudes, and the expected errors there."""
     camera = context.lab.camera
     rows = zip(at.lab_from_body, at.rate_body_rad_s, at.t_s.tolist(), strict=True)

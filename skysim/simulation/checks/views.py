@@ -43,18 +43,32 @@ VISIBLE = -1
 class View(NamedTuple):
     """The lights on the chip at one attitude, (n,) each.
 
-    row         : row of the sources
-    xy_px       : (n, 2)
-    offset_m    : (n, 3) from the pupil to the light in camera axes; a unit vector for a star
-    arm_m       : (n, 3) from the bearing to the light in camera axes; the same as offset_m for a star
-    gradient    : (n, 2, 3) derivative of xy_px by offset_m
-    distance_m  : along the boresight; infinite for a star
-    electrons   : mean photo-electrons of an exposure
-    disk_px, defocus_px, sigma_px : radii of the LED's and of the defocus disk, rms radius per axis without motion
-    streak_px   : (n, 2) path during the exposure
-    peak_e      : mean electrons in the brightest pixel, background included
-    bend_px     : (n, 2) mean of the path minus its middle, by the angular acceleration
-    behind      : number of the occluder that hides the light; VISIBLE for none
+    Attributes
+    ----------
+    row
+        Row of the sources
+    xy_px
+        (n, 2)
+    offset_m
+        (n, 3) from the pupil to the light in camera axes; a unit vector for a star
+    arm_m
+        (n, 3) from the bearing to the light in camera axes; the same as offset_m for a star
+    gradient
+        (n, 2, 3) derivative of xy_px by offset_m
+    distance_m
+        Along the boresight; infinite for a star
+    electrons
+        Mean photo-electrons of an exposure
+    disk_px, defocus_px, sigma_px
+        Radii of the LED's and of the defocus disk, rms radius per axis without motion
+    streak_px
+        (n, 2) path during the exposure
+    peak_e
+        Mean electrons in the brightest pixel, background included
+    bend_px
+        (n, 2) mean of the path minus its middle, by the angular acceleration
+    behind
+        Number of the occluder that hides the light; VISIBLE for none
     """
 
     row: NDArray[np.int64]
@@ -101,13 +115,21 @@ class View(NamedTuple):
 class CameraModel(NamedTuple):
     """What all views share.
 
-    optics       : lens and chip geometry
-    lens_px      : standard deviation of the Gaussian that has the peak of the lens's image, pixel included
-    background_e : mean electrons in a pixel, of extended light and dark current
-    glow_e       : of them those of each light, by name; of light with edges its median over the chip
-    noise_e      : standard deviation of a pixel without light: of that charge, of the read-out, of the converter, and
-                   of the fixed pattern (without hot pixels)
-    exposure_s   : exposure time
+    Attributes
+    ----------
+    optics
+        Lens and chip geometry
+    lens_px
+        Standard deviation of the Gaussian that has the peak of the lens's image, pixel included
+    background_e
+        Mean electrons in a pixel, of extended light and dark current
+    glow_e
+        Of them those of each light, by name; of light with edges its median over the chip
+    noise_e
+        Standard deviation of a pixel without light: of that charge, of the read-out, of the
+        converter, and of the fixed pattern (without hot pixels)
+    exposure_s
+        Exposure time
     """
 
     optics: Optics

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from skysim.camera.glow.display_glow import black_glow
 from skysim.camera.render import Window
-from skysim.camera.thermal import leds_at
+from skysim.camera.thermal_motion import leds_at
 from skysim.core.types import Sources
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
-from skysim.scene.sections.thermal import ThermalConfig
-from skysim.simulation.lights.light import EdgedGlow, Exposure, KnownLight, Lit
-from skysim.sources.dome.led import warm_up_factor
-from skysim.sources.dome.timing.clocks import Clocks, build_clocks
-from skysim.sources.dome.timing.codes import LedCodes, build_codes
+from skysim.scene.sections.surroundings import ThermalConfig
+from skysim.simulation.lights.light import EdgedGlow, Exposure, KnownLight, LightPlan, Lit
+from skysim.simulation.lights.starlight import stars_of
+from skysim.sources import dome
+from skysim.sources.dome import display
+from skysim.sources.dome.codes import Clocks, LedCodes, build_clocks, build_codes
+from skysim.sources.dome.led import Emitter, warm_up_factor
 
 MAX_RUNS = 4  # whose timing is kept
 
@@ -22,8 +25,12 @@ MAX_RUNS = 4  # whose timing is kept
 class LedTiming(NamedTuple):
     """The LEDs' timing in one run.
 
-    clocks : the controllers' oscillators; None where all light is steady
-    codes  : the LEDs' words and the clock of their bits; None without light.led.code
+    Attributes
+    ----------
+    clocks
+        The controllers' oscillators; None where all light is steady
+    codes
+        The LEDs' words and the clock of their bits; None without light.led.code
     """
 
     clocks: Clocks | None
@@ -34,7 +41,10 @@ class LedTiming(NamedTuple):
 class LedDome(KnownLight):
     """A dome's LEDs: warmed up, moved by the temperature, and lit by their controllers' pulses and codes.
 
-    thermal : what has moved since the survey; None for nothing
+    Attributes
+    ----------
+    thermal
+        What has moved since the survey; None for nothing
     """
 
     config: DomeConfig
@@ -100,3 +110,34 @@ def black_pixels(
     return EdgedGlow(
         lambda: black_glow(config, optics, cam_from_lab, camera_m, exposure.band), share
     )
+
+
+# The scene's own light, which a tracker can know: stars, LEDs of a dome, or stars on a collimated
+# display.
+
+
+def of_dome(config: DomeConfig, plan: LightPlan) -> KnownLight:
+    """The LEDs of a dome. Raises InputError for LEDs off the surface, and for a dome that does not fit its room."""
+    return LedDome(
+        dome.sources(config, plan.band), Emitter.from_config(config.led), config, plan.scene.thermal
+    )
+
+
+def of_display(config: CollimatedDisplayConfig, plan: LightPlan) -> KnownLight:
+    """The stars on a display at the scene's start."""
+    assert plan.catalog is not None
+    shown = display.display_sources(config, plan.catalog, plan.scene.start_time, plan.band)
+    return CollimatedDisplay(shown, Emitter(), config)
+
+
+# By the kind of the section `light`.
+KNOWN: dict[str, Callable[[Any, LightPlan], KnownLight]] = {
+    "dome": of_dome,
+    "stars": stars_of,
+    "collimated_display": of_display,
+}
+
+
+def known_light(plan: LightPlan) -> KnownLight:
+    """The light of the section `light`; that of the plan, if it has been made."""
+    return plan.known or KNOWN[plan.scene.light.kind](plan.scene.light, plan)

@@ -9,13 +9,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from skysim.camera.discs.bodies import centers_of
-from skysim.camera.glow.baffle import stray_around_e_s_m2, stray_of_bodies_e_s_m2
-from skysim.camera.stray.ghosts import ghost_optics
+from skysim.camera.discs import centers_of
+from skysim.camera.glow.earth_glow import stray_around_e_s_m2, stray_of_bodies_e_s_m2
+from skysim.camera.glow.stray import ghost_optics
 from skysim.scene.sections.camera import BaffleConfig, GhostConfig, GlareConfig
-from skysim.simulation.lights.light import Beam, Exposure, Light, Lit, Path, beam_of
-from skysim.simulation.lights.plan import Plan
-from skysim.sources.solar_system.bodies import BodyLight
+from skysim.simulation.lights.light import Beam, Exposure, Light, LightPath, LightPlan, Lit, beam_of
+from skysim.sources.bodies import BodyLight
 
 STRAY_LIGHT = "stray light"
 
@@ -69,7 +68,8 @@ class Ghosts(Light):
 
     def through(self, beam: Beam, exposure: Exposure) -> Beam:
         paths = (
-            Path(n, ghost_optics(exposure.optics, ghost)) for n, ghost in enumerate(self.ghosts, 1)
+            LightPath(n, ghost_optics(exposure.optics, ghost))
+            for n, ghost in enumerate(self.ghosts, 1)
         )
         return beam._replace(paths=(*beam.paths, *paths))
 
@@ -85,13 +85,13 @@ class Glare(Light):
         return beam._replace(glares=(*beam.glares, self.config))
 
 
-def build_baffle(plan: Plan) -> Iterator[Light]:
+def build_baffle(plan: LightPlan) -> Iterator[Light]:
     baffle = plan.scene.camera.baffle
     if baffle:
         yield Baffle(baffle)
 
 
-def build(plan: Plan) -> Iterator[Light]:
+def build(plan: LightPlan) -> Iterator[Light]:
     camera = plan.scene.camera
     if camera.ghosts:
         yield Ghosts(camera.ghosts)

@@ -19,18 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.discs.bodies import FEW, centers_of
-from skysim.camera.discs.disc_image import Exposed
+from skysim.camera.discs import FEW, Exposed, centers_of
 from skysim.camera.optics import Optics
 from skysim.camera.render import OcclusionTest, Poses, Window, poses
 from skysim.core.types import Floats, Mount, SatelliteTruth, Sources, Trajectory
+from skysim.dynamics.multibody.model import VehicleModel
+from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import GlareConfig
+from skysim.sources.bodies import BodyLight
+from skysim.sources.camera_orbit import Viewpoint
+from skysim.sources.catalog import Catalog
 from skysim.sources.dome.led import Emitter
-from skysim.sources.orbit.satellites import View
-from skysim.sources.orbit.viewpoint import Viewpoint
+from skysim.sources.ephemeris import ObserverPlace
 from skysim.sources.photometry import Band
-from skysim.sources.solar_system.bodies import BodyLight
-from skysim.sources.solar_system.observer import Observer
+from skysim.sources.satellites import ExposureView
 
 
 class Seeds(NamedTuple):
@@ -44,14 +46,24 @@ class Seeds(NamedTuple):
 class Exposure:
     """One exposure of one camera, as its lights see it.
 
-    index      : of the frame
-    window     : when it is exposed
-    trajectory : of the vehicle
-    lab_from_body : its attitude at mid-exposure
-    mount, optics : at mid-exposure, as temperature and errors of the mount have them
-    band       : of the chip
-    viewpoint  : the camera's place on the Earth or in its orbit
-    seeds      : of the run; None for the expectation, in which nothing is drawn at random
+    Attributes
+    ----------
+    index
+        Of the frame
+    window
+        When it is exposed
+    trajectory
+        Of the vehicle
+    lab_from_body
+        Its attitude at mid-exposure
+    mount, optics
+        At mid-exposure, as temperature and errors of the mount have them
+    band
+        Of the chip
+    viewpoint
+        The camera's place on the Earth or in its orbit
+    seeds
+        Of the run; None for the expectation, in which nothing is drawn at random
     """
 
     index: int
@@ -75,7 +87,7 @@ class Exposure:
         return self.viewpoint.time_at(self.t_s)
 
     @cached_property
-    def observer(self) -> Observer:
+    def observer(self) -> ObserverPlace:
         """The camera among the bodies of the solar system at mid-exposure."""
         return self.viewpoint.observer_at(self.t_s)
 
@@ -95,11 +107,11 @@ class Exposure:
         return self.cam_from_lab.inv().apply([0.0, 0.0, 1.0])
 
     @cached_property
-    def view(self) -> View:
+    def view(self) -> ExposureView:
         """What the camera can see from the first row's opening to the last row's end."""
         duration_s = self.window.close_s(self.optics.camera.height_px) - self.window.open_s
         turn_rad = float(np.linalg.norm(self.trajectory.rate_at(self.t_s))) * duration_s
-        return View(self.boresight, self.optics.field_rad, turn_rad, duration_s)
+        return ExposureView(self.boresight, self.optics.field_rad, turn_rad, duration_s)
 
     @cached_property
     def few_poses(self) -> Poses:
@@ -120,9 +132,14 @@ class Exposure:
 class Occluder(NamedTuple):
     """What hides lights.
 
-    name  : for messages, such as "the Earth"
-    hides : which of N places, as in `Sources`, are behind it
-    whole : whether it hides a disc as a whole, by its center
+    Attributes
+    ----------
+    name
+        For messages, such as "the Earth"
+    hides
+        Which of N places, as in `Sources`, are behind it
+    whole
+        Whether it hides a disc as a whole, by its center
     """
 
     name: str
@@ -142,9 +159,13 @@ def any_of(occluders: Sequence[Occluder]) -> OcclusionTest | None:
 class EdgedGlow(NamedTuple):
     """Extended light with edges.
 
-    e_s   : gives (h, w) electrons s^-1 px^-1 at even nodes from the first pixel's center to the last one's, or of all
-        pixels; None if none of it is in the field
-    share : of that light that is left
+    Attributes
+    ----------
+    e_s
+        Gives (h, w) electrons s^-1 px^-1 at even nodes from the first pixel's center to the
+        last one's, or of all pixels; None if none of it is in the field
+    share
+        Of that light that is left
     """
 
     e_s: Callable[[], Floats | None]
@@ -154,18 +175,32 @@ class EdgedGlow(NamedTuple):
 class Lit(NamedTuple):
     """What one light gives to an exposure. Extended light, which takes longest, is computed when it is asked for.
 
-    name    : what it is, for messages
-    known   : whether a tracker can find itself by it
-    points  : whose images are drawn along their paths
-    emitter : how points in the laboratory shine
-    discs   : resolved bodies, the farthest first
-    glow    : gives its smooth extended light, electrons s^-1 px^-1: a number, or (h, w) at `background.node_directions`
-    edged   : its extended light with edges
-    around  : gives (M, 3) directions and (M,) irradiances, photo-electrons s^-1 m^-2, of extended light also beside the
-        field, which a baffle may let through
-    hides   : what it hides of the lights before it
-    hidden_by : what may hide this light
-    satellites : the truth of those of the points that are satellites
+    Attributes
+    ----------
+    name
+        What it is, for messages
+    known
+        Whether a tracker can find itself by it
+    points
+        Whose images are drawn along their paths
+    emitter
+        How points in the laboratory shine
+    discs
+        Resolved bodies, the farthest first
+    glow
+        Gives its smooth extended light, electrons s^-1 px^-1: a number, or (h, w) at
+        `background.node_directions`
+    edged
+        Its extended light with edges
+    around
+        Gives (M, 3) directions and (M,) irradiances, photo-electrons s^-1 m^-2, of extended
+        light also beside the field, which a baffle may let through
+    hides
+        What it hides of the lights before it
+    hidden_by
+        What may hide this light
+    satellites
+        The truth of those of the points that are satellites
     """
 
     name: str
@@ -193,7 +228,7 @@ class Lit(NamedTuple):
         return any_of(self.hidden_by)
 
 
-class Path(NamedTuple):
+class LightPath(NamedTuple):
     """One way of the light through the lens: 0 is the image, and the others, from 1, are ghosts."""
 
     number: int
@@ -204,7 +239,7 @@ class Beam(NamedTuple):
     """All light of an exposure on its way to the chip: of each light so far, the ways through the lens, its glare."""
 
     lits: tuple[Lit, ...]
-    paths: tuple[Path, ...]
+    paths: tuple[LightPath, ...]
     glares: tuple[GlareConfig, ...] = ()
 
     def plus(self, lit: Lit) -> Beam:
@@ -250,7 +285,10 @@ class Light:
     A light that shines or hides overrides `during`; one that changes what others give overrides `through`. What is
     drawn at random is drawn from the exposure's seeds, so that the same lights serve any run.
 
-    only_adds : whether it neither hides nor changes others, and no tracker knows it
+    Attributes
+    ----------
+    only_adds
+        Whether it neither hides nor changes others, and no tracker knows it
     """
 
     only_adds: ClassVar[bool] = False
@@ -268,8 +306,12 @@ class Light:
 class KnownLight(Light):
     """The light of a scene by which a tracker can find itself: stars or LEDs.
 
-    sources : all of them, at the scene's start
-    emitter : how those in the laboratory shine
+    Attributes
+    ----------
+    sources
+        All of them, at the scene's start
+    emitter
+        How those in the laboratory shine
     """
 
     sources: Sources
@@ -291,7 +333,41 @@ def find_light(lights: Iterable[Light], kind: type[AnyLight]) -> AnyLight | None
 
 def beam_of(lights: Iterable[Light], exposure: Exposure) -> Beam:
     """The light of all lights in an exposure."""
-    beam = Beam((), (Path(0, exposure.optics),))
+    beam = Beam((), (LightPath(0, exposure.optics),))
     for light in lights:
         beam = light.through(beam, exposure)
     return beam
+
+
+# What a camera's lights are built from.
+
+
+@dataclass(frozen=True, slots=True)
+class LightPlan:
+    """The scene and the hardware around a camera.
+
+    Attributes
+    ----------
+    scene
+        As the camera sees it, see `Scene.of_head`
+    band
+        Of its chip
+    vehicle
+        That carries it
+    viewpoint
+        Its place on the Earth or in its orbit
+    catalog
+        The stars of the scene's light; None under a dome
+    known
+        The scene's light in this band, where another camera has it already
+    mount
+        Of a further camera; None for the main one
+    """
+
+    scene: Scene
+    band: Band
+    vehicle: VehicleModel
+    viewpoint: Viewpoint
+    catalog: Catalog | None
+    known: KnownLight | None = None
+    mount: Mount | None = None

@@ -12,55 +12,49 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
-from skysim.scene.sections.lights import LightConfig, add_kind
-from skysim.simulation.lights import (
-    air,
-    background,
-    earth,
-    lens,
-    obstacles,
-    satellites,
-    solar_system,
-    wall,
-)
-from skysim.simulation.lights.known import known_light
-from skysim.simulation.lights.light import Light
-from skysim.simulation.lights.plan import Plan
+from skysim.scene.sections.light import LightConfig, add_kind
+from skysim.simulation.lights import atmosphere, lab_room, lens, sky_bodies, starlight
+from skysim.simulation.lights.dome import known_light
+from skysim.simulation.lights.light import Light, LightPlan
 
-KINDS: dict[str, Callable[[Any, Plan], Light]] = {}
+KINDS: dict[str, Callable[[Any, LightPlan], Light]] = {}
 
 
-def register(config: type[LightConfig], build: Callable[[Any, Plan], Light]) -> None:
+def register(config: type[LightConfig], build: Callable[[Any, LightPlan], Light]) -> None:
     """Add a kind of light to those of the scene's list `lights`.
 
-    config : the schema of its section, with a literal `kind`
-    build  : makes the light of such a section
+    Parameters
+    ----------
+    config
+        The schema of its section, with a literal `kind`
+    build
+        Makes the light of such a section
     """
     KINDS[add_kind(config)] = build
 
 
-def further_lights(plan: Plan) -> Iterator[Light]:
+def further_lights(plan: LightPlan) -> Iterator[Light]:
     """The lights of the scene's list `lights`."""
     for config in plan.scene.lights:
         yield KINDS[config.kind](config, plan)
 
 
-LIGHTS: dict[str, Callable[[Plan], Iterable[Light]]] = {
-    "background": background.build,
+LIGHTS: dict[str, Callable[[LightPlan], Iterable[Light]]] = {
+    "background": starlight.build,
     "stars, LEDs or a display": lambda plan: [known_light(plan)],
-    "Sun, Moon and planets": solar_system.build,
-    "Earth": earth.build,
-    "satellites": satellites.build,
-    "air": air.build,
+    "Sun, Moon and planets": sky_bodies.build_solar_system,
+    "Earth": sky_bodies.build_earth,
+    "satellites": sky_bodies.build_satellites,
+    "air": atmosphere.build,
     "further lights": further_lights,
-    "wall": wall.build,
+    "wall": lab_room.build_wall,
     "baffle": lens.build_baffle,
-    "vehicle and dome": obstacles.build,
+    "vehicle and dome": lab_room.build_obstacles,
     "lens": lens.build,
 }
 
 
-def build_lights(plan: Plan) -> tuple[Light, ...]:
+def build_lights(plan: LightPlan) -> tuple[Light, ...]:
     """All lights of a camera. Raises InputError for files that cannot be read and for a dome that does not fit."""
     plan = replace(plan, known=known_light(plan))
     return tuple(light for build in LIGHTS.values() for light in build(plan))

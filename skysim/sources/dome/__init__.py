@@ -9,19 +9,22 @@ from skysim.sources.dome.layouts.boards import patch_boards as patch_boards
 from skysim.sources.dome.layouts.placing import cap as cap
 from skysim.sources.dome.layouts.registry import LAYOUTS as LAYOUTS
 from skysim.sources.dome.layouts.registry import board_of as board_of
-from skysim.sources.dome.shell.room import check_room
-from skysim.sources.dome.shell.surface import SURFACES as SURFACES
-from skysim.sources.dome.shell.surface import Ellipsoid as Ellipsoid
-from skysim.sources.dome.shell.surface import Plane as Plane
-from skysim.sources.dome.shell.surface import Surface as Surface
-from skysim.sources.dome.shell.surface import build_surface
+from skysim.sources.dome.room import check_room
+from skysim.sources.dome.surface import SURFACES as SURFACES
+from skysim.sources.dome.surface import Ellipsoid as Ellipsoid
+from skysim.sources.dome.surface import Plane as Plane
+from skysim.sources.dome.surface import Surface as Surface
+from skysim.sources.dome.surface import build_surface
 from skysim.sources.photometry import Band
 
 
 def sources(config: light.DomeConfig, band: Band) -> Sources:
     """All LEDs of the dome; strength is in photo-electrons s^-1 sr^-1 in the chip's band.
 
-    Raises InputError for LEDs off the surface, and for a dome that does not fit into its room.
+    Raises
+    ------
+    InputError
+        For LEDs off the surface, and for a dome that does not fit into its room.
     """
     surface = build_surface(config.surface)
     if config.room is not None:

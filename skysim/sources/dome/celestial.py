@@ -19,14 +19,17 @@ from skysim.scene.sections import layouts, leds
 from skysim.sources import catalog
 from skysim.sources import stars as star_sources
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
-from skysim.sources.dome.shell.surface import Surface
+from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band, synthetic_mag
 
 
 class ProjectedStars(NamedTuple):
     """Stars on the dome, brightest first: hip, v_mag, shown_mag (N,), place_m (N, 3) in the lab.
 
-    shown_mag : magnitude that the LED has to show: V, or the instrumental magnitude in the chip's band
+    Attributes
+    ----------
+    shown_mag
+        Magnitude that the LED has to show: V, or the instrumental magnitude in the chip's band
     """
 
     hip: NDArray[np.int64]
@@ -84,7 +87,10 @@ def project_stars(
 def merge_targets(place_m: Floats, separation_m: float) -> NDArray[np.int64]:
     """(N,) index of the star with which each star is merged: itself, unless a brighter target is within separation_m.
 
-    place_m : (N, 3), brightest first, so that a star's target does not depend on fainter stars.
+    Parameters
+    ----------
+    place_m
+        (N, 3), brightest first, so that a star's target does not depend on fainter stars.
     """
     target = np.arange(len(place_m))
     # Sorted pairs: when a pair is reached, it is decided whether its brighter star is a target.

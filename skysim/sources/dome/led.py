@@ -69,8 +69,12 @@ LOBES: dict[str, Callable[[Any, Floats], Floats]] = {"cosine": cosine_lobe, "tab
 class Emitter:
     """Emission of a dome's LEDs: falloff with distance and lobe over angle. The default is a Lambertian disk.
 
-    falloff : a key of FALLOFF
-    lobe    : its kind is a key of LOBES
+    Attributes
+    ----------
+    falloff
+        A key of FALLOFF
+    lobe
+        Its kind is a key of LOBES
     """
 
     falloff: str = "inverse_square"
@@ -91,11 +95,18 @@ def irradiance_e_s_m2(
 ) -> Floats:
     """Irradiance at the aperture: E = I_0 L(theta) cos(phi) f(d), zero where either surface faces away.
 
-    strength_e_s_sr : photo-electrons s^-1 sr^-1 along the LED's normal
-    cos_emission    : of theta, at the LED from its normal; L is the emitter's lobe
-    cos_incidence   : of phi, at the aperture from the boresight
-    distance_m      : f is the emitter's falloff
     The arrays broadcast. Returns photo-electrons s^-1 m^-2.
+
+    Parameters
+    ----------
+    strength_e_s_sr
+        photo-electrons s^-1 sr^-1 along the LED's normal
+    cos_emission
+        Of theta, at the LED from its normal; L is the emitter's lobe
+    cos_incidence
+        Of phi, at the aperture from the boresight
+    distance_m
+        F is the emitter's falloff
     """
     facing = (np.asarray(cos_emission) > 0) & (np.asarray(cos_incidence) > 0)
     emitted = LOBES[emitter.lobe.kind](emitter.lobe, cos_emission)
@@ -180,9 +191,14 @@ def warm_up_factor(warm_up: WarmUpConfig | None, t_s: float) -> float:
 class DriveInput(NamedTuple):
     """Input of a drive, (N,) each.
 
-    level : fraction of full brightness
-    board : number of the board that carries the LED
-    row   : of a pixel on its panel, from 0 at the top to below 1; 0 for LEDs
+    Attributes
+    ----------
+    level
+        Fraction of full brightness
+    board
+        Number of the board that carries the LED
+    row
+        Of a pixel on its panel, from 0 at the top to below 1; 0 for LEDs
     """
 
     level: Floats

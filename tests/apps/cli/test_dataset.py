@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from skysim.experiments.dataset import run
-from skysim.experiments.dataset.run import ShardResult
+from skysim.experiments import dataset_run
+from skysim.experiments.dataset_run import ShardResult
 from skysim.experiments.study.execution import engines
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
@@ -50,10 +50,10 @@ def test_it_writes_the_frames_and_says_where(command: Command, tmp_path: Path) -
 def test_frames_that_are_missing_end_it_with_an_error(
     command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def dead(self: run.DatasetJob, chunk: engines.Chunk) -> list[ShardResult]:
+    def dead(self: dataset_run.DatasetJob, chunk: engines.Chunk) -> list[ShardResult]:
         return [self.failed(segment, engines.DIED) for segment in chunk]
 
-    monkeypatch.setattr(run.DatasetJob, "run", dead)
+    monkeypatch.setattr(dataset_run.DatasetJob, "run", dead)
     done = command(*WORDS)
     assert done.returncode == 2
     assert done.stdout == "0 of 3 frames in 2 shards: frames\n"

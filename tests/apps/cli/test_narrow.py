@@ -9,8 +9,9 @@ import pytest
 from skysim.apps.cli import terminal
 from skysim.core.types import FrameRow
 from skysim.experiments.tracker_comparison import TrackerScore
+from skysim.results import report as as_text
 from skysim.results.metrics import Summary
-from skysim.results.report import Report, as_text
+from skysim.results.report import Report
 from skysim.results.run_report import frame_table, run_report
 
 TRIPLE = ("roll", "pitch", "yaw")

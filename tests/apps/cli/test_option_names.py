@@ -11,8 +11,7 @@ import typer
 
 from skysim.apps.cli import options
 from skysim.apps.cli.main import app
-from skysim.apps.cli.option_names import OPTIONS, as_typed
-from skysim.apps.cli.options import load
+from skysim.apps.cli.options import OPTIONS, as_typed, load
 from skysim.core.errors import OVERRIDES, InputError, Where
 from skysim.experiments.study.plan import Study
 from skysim.scene.scene import Scene

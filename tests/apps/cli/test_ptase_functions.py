@@ -17,16 +17,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.solvers import SOLVERS
-from estimator.catalog import ptase
-from estimator.core.arrays import Ints
+from estimator.catalog import published_catalogs
+from estimator.core.checks import Ints
 from estimator.core.types import ra_dec_roll_rad
 from estimator.identification.published.fialho import VERSIONS, MagnitudeMatch, fialho_2, fialho_4
 from estimator.identification.registry import IDENTIFIERS
+from skysim.core import files, images
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.io import files, images
-from skysim.core.paths import CATALOGS, ROOT
+from skysim.core.files import CATALOGS, ROOT
 from skysim.core.types import Floats
-from skysim.experiments.papers.ptase.monte_carlo import (
+from skysim.experiments.papers.ptase_monte_carlo import (
     SIGMA_MAG,
     TOLERANCE_RAD,
     catalog,
@@ -34,8 +34,7 @@ from skysim.experiments.papers.ptase.monte_carlo import (
     run_version,
     version,
 )
-from skysim.results.plots import png
-from skysim.results.stretch import to_8bit
+from skysim.results.plots import png, to_8bit
 
 SCENE = ("shefex2", "--frames", "1", "--set", "motion.rate_deg_s=[0,0,0]")
 STUDY = """schema: 1
@@ -267,8 +266,8 @@ def stopped(folder: Path) -> bool:
 def readcat(folder: Path) -> bool:
     """A limit, the mission's epoch, and instrumental magnitudes; the order is the file's."""
     path = CATALOGS / "hipparcos_hp6.5.ecsv"
-    plain = ptase.read_cat(path, 5.0)
-    later = ptase.read_cat(path, 5.0, 2010.0, ptase.Color(0.1, 0.2, 0.0))
+    plain = published_catalogs.read_cat(path, 5.0)
+    later = published_catalogs.read_cat(path, 5.0, 2010.0, published_catalogs.Color(0.1, 0.2, 0.0))
     shift = np.linalg.norm(later.vectors - plain.vectors, axis=1) / ARCSEC_RAD
     return bool(
         plain.magnitude.max() <= 5.0
@@ -281,9 +280,9 @@ def readcat(folder: Path) -> bool:
 
 def proc_cat(folder: Path) -> bool:
     """Doubles merged, growing magnitude, the log with its histogram and every star."""
-    plain = ptase.read_cat(CATALOGS / "hipparcos_hp6.5.ecsv", 5.0)
-    done = ptase.proc_cat(plain, 60 * ARCSEC_RAD)
-    told = ptase.log(done)
+    plain = published_catalogs.read_cat(CATALOGS / "hipparcos_hp6.5.ecsv", 5.0)
+    done = published_catalogs.proc_cat(plain, 60 * ARCSEC_RAD)
+    told = published_catalogs.log(done)
     return bool(
         len(done) < len(plain)
         and done.components.sum() == len(plain)

@@ -19,11 +19,11 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 import httpx
 from astropy.io import fits
 
-from skysim.apps.gui.messages import ALL_PIXELS, LIMITS, Display, Lights, Pixels
+from skysim.apps.gui.messages import ALL_PIXELS, LIMITS, Display, LightColumns, Pixels
 from skysim.apps.gui.server import Guard
-from skysim.apps.gui.shared.live import Contents
-from skysim.apps.gui.views import served as served_module
-from skysim.apps.gui.views.served import FRAMES, KEPT_FRAMES, ServedFrame, TabFrames, display_of
+from skysim.apps.gui.views import overlay as served_module
+from skysim.apps.gui.views.live import Contents
+from skysim.apps.gui.views.overlay import FRAMES, KEPT_FRAMES, ServedFrame, TabFrames, display_of
 from skysim.apps.gui.worker.pixels import (
     BINS,
     HEADER_BYTES,
@@ -36,7 +36,7 @@ from skysim.apps.gui.worker.pixels import (
 )
 from skysim.apps.gui.worker.session import WorkerLost
 from skysim.apps.gui.worker.tasks import Worker
-from skysim.results import stretch
+from skysim.results import plots
 
 SCREEN = (77, 200)  # narrower than the frames
 
@@ -151,12 +151,12 @@ def overlaps(length: int, count: int) -> np.ndarray:
     return np.clip(shared, 0, None) * count / length
 
 
-@pytest.mark.parametrize("curve", stretch.CURVES)
+@pytest.mark.parametrize("curve", plots.CURVES)
 def test_shades_follow_the_curve_between_the_limits(curve: str) -> None:
     image = np.repeat(np.arange(0, 500, dtype=np.uint16)[None], 2, axis=0).repeat(2, axis=1)
     found = shades(image, 500, (100.0, 400.0), np.inf, curve)[0]
     fraction = np.clip((np.arange(500) - 100) / 300, 0, 1)
-    np.testing.assert_array_equal(found, np.rint((SHADES - 1) * stretch.CURVES[curve](fraction)))
+    np.testing.assert_array_equal(found, np.rint((SHADES - 1) * plots.CURVES[curve](fraction)))
 
 
 def test_a_single_saturated_pixel_is_seen_in_the_reduced_frame() -> None:
@@ -197,7 +197,7 @@ def test_zscale_is_astropy_s_and_the_others_are_those_of_pictures(seed: int) -> 
     np.testing.assert_allclose(
         limits_of(levels, "zscale"), ZScaleInterval().get_limits(image), rtol=1e-12
     )
-    assert limits_of(levels, "automatic") == stretch.display_levels(image)
+    assert limits_of(levels, "automatic") == plots.display_levels(image)
     assert limits_of(levels, "min to max") == (image.min(), image.max())
     assert limits_of(levels._replace(offset=-50.0, step=0.5), (100.0, 120.0)) == (300.0, 340.0)
 
@@ -371,7 +371,7 @@ def test_a_worker_keeps_the_pixels_of_its_newest_images() -> None:
 def test_lights_are_a_sequence_that_is_sent_as_columns() -> None:
     count = 500
     random = np.random.default_rng(7)
-    lights = Lights(
+    lights = LightColumns(
         np.arange(count),
         random.uniform(0, 1000, (count, 2)),
         random.random(count),

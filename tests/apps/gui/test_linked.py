@@ -29,10 +29,9 @@ from tests.helpers.labpage import (
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.messages import Detection, Lights, MotionLog, TrackerResult
-from skysim.apps.gui.panels import lights, strips
-from skysim.apps.gui.worker import playback
-from skysim.apps.gui.worker.scene import geometry
+from skysim.apps.gui.messages import Detection, LightColumns, MotionLog, TrackerResult
+from skysim.apps.gui.page import readouts, strips
+from skysim.apps.gui.worker import geometry, playback
 from skysim.scene import loader
 from skysim.simulation.lab import build_lab
 
@@ -42,7 +41,7 @@ in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed"
 
 def test_the_table_has_every_light_with_its_detection_then_the_false_ones() -> None:
     places_px = np.array([[10.0, 20], [40, 50], [70, 80]])
-    true = Lights(
+    true = LightColumns(
         np.array([3, 4, 5]), places_px, np.array([5000.0, 900, 100]), np.array([1.5, np.nan, 4])
     )
     found = [
@@ -50,7 +49,7 @@ def test_the_table_has_every_light_with_its_detection_then_the_false_ones() -> N
         Detection(10.3, 20.4, 0.05, 700, 3, 0.02),
         Detection(40.0, 50.0, 0.1, 90, 9, 0.5),
     ]
-    table = list(lights.rows(true, found, "LED {}".format))
+    table = list(readouts.rows(true, found, "LED {}".format))
     assert [row["id"] for row in table] == [3, 4, 5, -1]
     assert [row["state"] for row in table] == ["good", "warn", "quiet", "warn"]
     assert table[0]["cells"] == ["LED 3", "1.50", "5000", "10.00", "20.00", "0.500", "LED 3"]

@@ -23,9 +23,9 @@ from tests.helpers.labpage import (
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.page import log
-from skysim.apps.gui.shared import forms
-from skysim.apps.gui.shared.texts import csv_table
+from skysim.apps.gui.page import log_panel
+from skysim.apps.gui.views import forms
+from skysim.apps.gui.views.live import csv_table
 from skysim.apps.gui.worker.tasks import Worker
 from skysim.core.errors import InputError
 from skysim.scene import loader
@@ -38,9 +38,9 @@ def test_the_log_has_attitude_and_error_and_the_noise_keeps_the_attitude() -> No
     worker = Worker()
     info, view = worker.open("shefex2", {}, True, (40.0, 10.0, 5.0))
     assert view.result is not None
-    assert "identify with noise: solved" in log.line(view, info)
-    assert f"error {view.result.cross_arcsec:.2f}″ across" in log.line(view, info)
-    one = dict(zip(log.COLUMNS, log.row(view, info), strict=True))
+    assert "identify with noise: solved" in log_panel.line(view, info)
+    assert f"error {view.result.cross_arcsec:.2f}″ across" in log_panel.line(view, info)
+    one = dict(zip(log_panel.COLUMNS, log_panel.row(view, info), strict=True))
     np.testing.assert_allclose(
         [float(one[f"true_{n}_deg"]) for n in (1, 2, 3)], (40, 10, 5), rtol=0, atol=1e-6
     )
@@ -48,7 +48,7 @@ def test_the_log_has_attitude_and_error_and_the_noise_keeps_the_attitude() -> No
     info, view = worker.open("shefex2", {"camera.detector.noise": "false"}, True)
     np.testing.assert_allclose(view.angles_deg, (40, 10, 5), rtol=0, atol=1e-9)
     assert not info.noise
-    assert "without noise" in log.line(view, info)
+    assert "without noise" in log_panel.line(view, info)
     assert worker.workbench.frame is not None
     first = worker.workbench.frame.image_dn
     worker.render(False)

@@ -20,26 +20,32 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.apps.gui import memory
-from skysim.apps.gui.messages import Detection, Lights, TrackerResult
+from skysim.apps.gui import server
+from skysim.apps.gui.messages import Detection, LightColumns, TrackerResult
 from skysim.apps.gui.server import FILES, Guard, KeptFiles, host_of, report_path, user_of
-from skysim.apps.gui.shared import forms, keys
-from skysim.apps.gui.views import overlay
-from skysim.apps.gui.views.sensor import Sensor
-from skysim.apps.gui.views.served import FRAMES, TabFrames
-from skysim.apps.gui.views.star_names import NAMES
-from skysim.apps.gui.worker import export, photo, pixels, playback, study_process, tasks, workbench
+from skysim.apps.gui.views import forms, keys, overlay
+from skysim.apps.gui.views.overlay import FRAMES, NAMES, TabFrames
+from skysim.apps.gui.views.sensor import SensorView
+from skysim.apps.gui.worker import (
+    geometry,
+    image_export,
+    photo,
+    pixels,
+    playback,
+    study_process,
+    tasks,
+    workbench,
+)
+from skysim.apps.gui.worker import geometry as lenses
 from skysim.apps.gui.worker.photo import SUFFIXES
-from skysim.apps.gui.worker.scene import lens as lenses
-from skysim.apps.gui.worker.scene import pointing
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
-from skysim.core.io.images import IMAGE_SUFFIXES
-from skysim.core.paths import ROOT, SCENES
+from skysim.core.files import ROOT, SCENES
+from skysim.core.images import IMAGE_SUFFIXES
 from skysim.core.types import Mount
 from skysim.dynamics import multibody
-from skysim.experiments.study import loader as study_loader
-from skysim.results import scoring, stretch
+from skysim.experiments.study import study_file as study_loader
+from skysim.results import plots, scoring
 from skysim.scene import loader
 from skysim.simulation.flight import open_flight, simulate_motion
 from skysim.sources import catalog, stars
@@ -48,7 +54,7 @@ from skysim.sources import catalog, stars
 def test_a_body_has_its_name_and_magnitude() -> None:
     """In the sensor's labels and in what the page says of a true light."""
     sensor = SimpleNamespace(prefix="HIP")
-    assert [Sensor.name(sensor, id) for id in (9_000_599, 32349, 20)] == [
+    assert [SensorView.name(sensor, id) for id in (9_000_599, 32349, 20)] == [
         "Jupiter",
         "Sirius",
         "HIP 20",
@@ -74,7 +80,7 @@ def boresight(mount: Mount, lab_from_body: Rotation) -> np.ndarray:
 
 def test_typed_angles_are_the_camera_s_under_the_stars() -> None:
     mount = multibody.camera_mount(multibody.build(STARS.vehicle))
-    lab_from_body = pointing.from_angles(STARS, mount, (83.0, -5.0, 30.0))
+    lab_from_body = geometry.from_angles(STARS, mount, (83.0, -5.0, 30.0))
     ra, dec = np.radians([83.0, -5.0])
     towards = [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]
     np.testing.assert_allclose(boresight(mount, lab_from_body), towards, rtol=0, atol=1e-12)
@@ -86,27 +92,27 @@ def test_an_arrow_moves_stars_the_other_way_by_its_share_of_the_field_even_at_th
 ) -> None:
     """A star in the image's middle stands, after a key to the right, a fiftieth of the field to the left of it."""
     mount = multibody.camera_mount(multibody.build(STARS.vehicle))
-    before = pointing.from_angles(STARS, mount, (83.0, dec_deg, 20.0))
-    after = pointing.moved(STARS, mount, before, pointing.FINE, 0.0, 0.0)
+    before = geometry.from_angles(STARS, mount, (83.0, dec_deg, 20.0))
+    after = geometry.moved(STARS, mount, before, geometry.FINE, 0.0, 0.0)
     star = boresight(mount, before)
     x, y, z = (mount.cam_from_body * after.inv()).apply(star)
     across = 2 * np.arctan(STARS.camera.width_px / 2 / STARS.camera.focal_px)
-    np.testing.assert_allclose(np.arctan2(x, z), -pointing.FINE * across, rtol=1e-9)
+    np.testing.assert_allclose(np.arctan2(x, z), -geometry.FINE * across, rtol=1e-9)
     np.testing.assert_allclose(y, 0.0, atol=1e-12)
     _, y, z = (
-        mount.cam_from_body * pointing.moved(STARS, mount, before, 0.0, pointing.FINE, 0.0).inv()
+        mount.cam_from_body * geometry.moved(STARS, mount, before, 0.0, geometry.FINE, 0.0).inv()
     ).apply(star)
     np.testing.assert_allclose(
-        np.arctan2(y, z), pointing.FINE * across, rtol=1e-9
+        np.arctan2(y, z), geometry.FINE * across, rtol=1e-9
     )  # down: y is down
 
 
 def test_r_rolls_the_camera_clockwise_so_that_stars_turn_the_other_way() -> None:
     """PTASE's sign: positive when the sensor moves clockwise, stars appear counter-clockwise."""
     mount = multibody.camera_mount(multibody.build(STARS.vehicle))
-    before = pointing.from_angles(STARS, mount, (83.0, 2.0, 0.0))
+    before = geometry.from_angles(STARS, mount, (83.0, 2.0, 0.0))
     above = stars.cam_from_icrs(83.0, 2.0, 0.0).inv().apply([0.0, -0.1, 1.0])
-    x, y, _ = (mount.cam_from_body * pointing.moved(STARS, mount, before, 0, 0, 10.0).inv()).apply(
+    x, y, _ = (mount.cam_from_body * geometry.moved(STARS, mount, before, 0, 0, 10.0).inv()).apply(
         above
     )
     np.testing.assert_allclose(np.degrees(np.arctan2(-x, -y)), 10.0, rtol=1e-9)  # to the left of up
@@ -114,10 +120,10 @@ def test_r_rolls_the_camera_clockwise_so_that_stars_turn_the_other_way() -> None
 
 def test_a_tilt_beyond_the_stop_is_refused_and_angles_out_of_range_too() -> None:
     with pytest.raises(InputError, match=r"tilt of 40\.0 deg: the bearing stops at 30 deg"):
-        pointing.from_angles(DOME, UPRIGHT, (40.0, 0.0, 0.0))
+        geometry.from_angles(DOME, UPRIGHT, (40.0, 0.0, 0.0))
     for angles in ((400.0, 0.0, 0.0), (10.0, 95.0, 0.0), (float("nan"), 0.0, 0.0)):
         with pytest.raises(InputError, match="allowed"):
-            pointing.from_angles(STARS, UPRIGHT, angles)
+            geometry.from_angles(STARS, UPRIGHT, angles)
 
 
 def test_every_key_of_the_2005_program_is_on_the_map() -> None:
@@ -271,7 +277,7 @@ def test_a_scene_is_saved_as_what_differs_and_nothing_is_overwritten(tmp_path: P
 
 # Marks.
 
-LIGHTS = Lights(
+LIGHTS = LightColumns(
     np.array([1, 2]), np.array([[10.0, 20], [50, 60]]), np.array([1e4, 1e3]), np.array([2.0, 4.0])
 )
 SPOTS = (Detection(10.1, 20.0, 0.01, 5.0, 1, 0.1), Detection(80.0, 80.0, 0.1, 1.0))
@@ -530,12 +536,12 @@ def test_closed_pages_are_collected_once_and_while_no_page_gets_a_frame(
     """A collection of all pages takes as long as many frames, and a page's frames need not wait for it."""
     collected = list[float]()
     frames = TabFrames(lambda _: None)
-    monkeypatch.setattr(memory, "release_memory", lambda: collected.append(time.monotonic()))
-    monkeypatch.setattr(memory, "QUIET_S", 0.2)
+    monkeypatch.setattr(server, "release_memory", lambda: collected.append(time.monotonic()))
+    monkeypatch.setattr(server, "QUIET_S", 0.2)
     monkeypatch.setitem(FRAMES, "busy", frames)
 
     async def close_while_another_plays() -> None:
-        closed = memory.ClosedPages()
+        closed = server.ClosedPages()
         for number in range(8):
             frames.add(number, SimpleNamespace(), alone=False)
             closed.collect_soon()
@@ -558,13 +564,13 @@ def test_closed_pages_are_collected_in_the_end_though_frames_go_on(
 ) -> None:
     collected = list[bool]()
     frames = TabFrames(lambda _: None)
-    monkeypatch.setattr(memory, "release_memory", lambda: collected.append(True))
-    monkeypatch.setattr(memory, "QUIET_S", 0.05)
-    monkeypatch.setattr(memory, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(server, "release_memory", lambda: collected.append(True))
+    monkeypatch.setattr(server, "QUIET_S", 0.05)
+    monkeypatch.setattr(server, "PATIENCE_S", 0.2)
     monkeypatch.setitem(FRAMES, "busy", frames)
 
     async def close_while_another_plays() -> None:
-        memory.ClosedPages().collect_soon()
+        server.ClosedPages().collect_soon()
         for number in range(20):
             frames.add(number, SimpleNamespace(), alone=False)
             await asyncio.sleep(0.02)
@@ -702,7 +708,7 @@ def test_a_session_answers_refuses_and_ends_with_its_tab() -> None:
             there = await session.run("point", (10.0, 45.0, 0.0), False)
             np.testing.assert_allclose(there.angles_deg[:2], (10.0, 45.0), rtol=0, atol=1e-9)
             files = await session.run("export")
-            assert set(export.FILE_BY_ITEM.values()) - {"", "solution.json"} == set(files)
+            assert set(image_export.FILE_BY_ITEM.values()) - {"", "solution.json"} == set(files)
             with pytest.raises(InputError, match=r"x\.exe: allowed"):
                 await session.run("solve_file", "x.exe", b"MZ", None)
             with pytest.raises(InputError, match="no camera found"):
@@ -817,7 +823,9 @@ def test_a_histogram_counts_every_trial_once() -> None:
 
 
 def test_a_saved_scene_names_its_base_first() -> None:
-    text = export.scene_yaml("shefex2", {"camera.f_number": "2", "tracker.limit_mag": "5"}, "T")
+    text = image_export.scene_yaml(
+        "shefex2", {"camera.f_number": "2", "tracker.limit_mag": "5"}, "T"
+    )
     assert re.match(
         r"schema: 1\nbase: shefex2\ntitle: T\ncamera:\n  f_number: 2\ntracker:\n  limit_mag: 5\n",
         text,
@@ -831,7 +839,7 @@ def test_a_frame_s_numbers_are_its_sky_s_for_all_its_stars() -> None:
         image = np.rint(random.normal(200, sigma_dn, (800, 800)))
         image[random.random(image.shape) < 0.02] += 40 * sigma_dn + 100
         image[:2, :3] = 4095
-        values = stretch.frame_statistics(image.astype(np.uint16), 4095.0)
+        values = plots.frame_statistics(image.astype(np.uint16), 4095.0)
         np.testing.assert_allclose(values.sky_dn, 200, rtol=0, atol=0.06 * sigma_dn + 0.01)
         np.testing.assert_allclose(
             values.scatter_dn, np.hypot(sigma_dn, 12**-0.5), rtol=0.06, atol=0
@@ -854,7 +862,7 @@ def test_a_pedestal_under_a_frame_changes_nothing_for_the_eye() -> None:
     """Black and white are measured from the sky."""
     image = np.random.default_rng(2).poisson(20, (200, 200)).astype(np.uint16)
     image[50, 60] = 900
-    shown = [stretch.to_8bit((image + up).astype(np.uint16), "square root") for up in (0, 1000)]
+    shown = [plots.to_8bit((image + up).astype(np.uint16), "square root") for up in (0, 1000)]
     np.testing.assert_array_equal(*shown)
 
 

@@ -13,20 +13,21 @@ import pytest
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
 from skysim.apps.gui.messages import AmbiguityMap, SurveyFound, SurveyPlan
-from skysim.apps.gui.panels.plan import (
+from skysim.apps.gui.page.plan_panel import (
     ambiguity_text,
     greatest_tilt_deg,
     prediction_text,
     survey_flight,
     survey_lines,
 )
-from skysim.apps.gui.shared.style import color_scale
-from skysim.apps.gui.worker.scene import planning, survey
+from skysim.apps.gui.views.style import color_scale
+from skysim.apps.gui.worker import survey_flight as survey
+from skysim.apps.gui.worker import workbench
 from skysim.apps.gui.worker.tasks import Worker
 from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.dynamics import guidance
-from skysim.experiments.dome_survey import stops
+from skysim.experiments.dome_survey import survey_frames
 from skysim.scene import loader
 from skysim.simulation import checks
 from skysim.simulation.lab import build_lab
@@ -39,7 +40,7 @@ ANGLES = ((5.0, -3.0, 20.0), (-4.0, 2.0, 140.0))
 
 def test_a_check_is_that_of_the_command() -> None:
     lab = build_lab(loader.load("afit_simsat", {"exposure.time": "50 ms"}))
-    found = planning.check(lab)
+    found = workbench.check(lab)
     expected = checks.check(lab)
     assert [name for name, _ in found.facts] == [fact.name for fact in expected.facts]
     assert list(found.findings) == expected.findings
@@ -53,7 +54,7 @@ def test_a_regular_dome_is_ambiguous_and_a_random_one_is_not() -> None:
     for kind, size in (("geodesic", "frequency: 32"), ("poisson_disk", "count: 800")):
         settings = {"light.layout": f"{{kind: {kind}, {size}, cap_deg: 40}}"}
         lab = build_lab(loader.load("afit_simsat_ideal", settings))
-        found = planning.ambiguity(lab)
+        found = workbench.ambiguity(lab)
         assert set(found.ids) <= set(lab.camera.sources.id)
         assert np.all((found.fraction >= found.least) & (found.fraction <= 1))
         shares[kind] = np.mean(found.fraction > 0.9)
@@ -63,7 +64,7 @@ def test_a_regular_dome_is_ambiguous_and_a_random_one_is_not() -> None:
 
 def test_stars_have_no_ambiguity_map() -> None:
     with pytest.raises(InputError, match=r"light\.kind: stars: .*; allowed: dome"):
-        planning.ambiguity(build_lab(loader.load("shefex2")))
+        workbench.ambiguity(build_lab(loader.load("shefex2")))
 
 
 def test_the_most_similar_fields_are_named() -> None:
@@ -92,14 +93,14 @@ def test_a_survey_is_flown_through_its_attitudes_with_a_frame_at_each(
     for leg, wanted in zip(holds, angles, strict=True):
         start_s = reference.start_s[leg]
         end_s = reference.start_s[leg + 1]
-        wxyz = stops.from_angles(np.array([wanted])).as_quat(scalar_first=True)[0]
+        wxyz = survey_frames.from_angles(np.array([wanted])).as_quat(scalar_first=True)[0]
         assert abs(reference.state_at(start_s)[0] @ wxyz) == pytest.approx(1, abs=1e-9)
         assert np.any((begin_s >= start_s) & (begin_s + shown.time_s <= end_s))
 
 
 def test_a_survey_does_not_tilt_the_vehicle_beyond_its_stop_between_attitudes() -> None:
     """The rotation about one axis from one tilted attitude to the opposite one may tilt it by more than both."""
-    first, last = (stops.from_angles(np.array([angles]))[0] for angles in TILTED[:2])
+    first, last = (survey_frames.from_angles(np.array([angles]))[0] for angles in TILTED[:2])
     assert greatest_tilt_deg(first, last) == pytest.approx(32.2, abs=0.1)
     assert max(greatest_tilt_deg(one, one) for one in (first, last)) < 24.1
     overrides = {
@@ -168,7 +169,7 @@ def test_a_survey_goes_on_with_the_frames_flown() -> None:
         rows, holds = survey.frames_at_rest(worker.flight.flight, views)
         assert holds == len(rows) == 8
         wxyz = np.array([views[row].body_wxyz for row in rows])
-        wanted = stops.from_angles(np.array(plan.angles_deg)).as_quat(scalar_first=True)
+        wanted = survey_frames.from_angles(np.array(plan.angles_deg)).as_quat(scalar_first=True)
         np.testing.assert_allclose(np.abs(np.sum(wxyz * wanted, axis=1)), 1, rtol=0, atol=1e-9)
         found = worker.adjust_survey(8)
         assert (found.frames, found.refusal) == (count, "")

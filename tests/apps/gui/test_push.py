@@ -13,7 +13,7 @@ from tests.helpers.labpage import CHROMIUM, angles, changed, chosen, come, sourc
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.worker.scene.push import PULL_RAD_S, Grip, Push, pull_torque_nm
+from skysim.apps.gui.worker.geometry import PULL_RAD_S, Grip, Push, pull_torque_nm
 from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.simulation.lab import Lab, build_lab

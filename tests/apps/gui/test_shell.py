@@ -24,12 +24,11 @@ from tests.helpers.labpage import (
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.cli.option_names import OPTIONS
+from skysim.apps.cli.options import OPTIONS
 from skysim.apps.gui.page.actions import Command, matching
 from skysim.apps.gui.page.tab import PANELS
-from skysim.apps.gui.shared import style
-from skysim.apps.gui.shared.texts import LABELS, for_page
-from skysim.apps.gui.views import overlay
+from skysim.apps.gui.views import overlay, style
+from skysim.apps.gui.views.live import LABELS, for_page
 from skysim.apps.gui.worker.study_process import MAX_STUDIES, StudyProcess
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core.errors import OVERRIDES, InputError, Where

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from skysim.apps.gui.page import history
-from skysim.apps.gui.shared.state import View
+from skysim.apps.gui.views.state import PageView
 from skysim.core.errors import InputError
 from tests.helpers.labpage import (
     CHROMIUM,
@@ -34,21 +34,21 @@ pytest_plugins = ["tests.helpers.labpage"]
 in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
 SCENES = ("shefex2", "/a b/ä&=.yaml")
 VIEWS = (
-    View("shefex2"),
-    View(
+    PageView("shefex2"),
+    PageView(
         "/a b/ä&=.yaml",
         {"camera.focal_length": "35 mm", "light.bodies": "{}", "title": "a=b&set=c#"},
         angles_deg=(1.5, -2.25, 359.0),
     ),
-    View("shefex2", kind="flight", t_s=12.3456, angles_deg=(0.0, 0.0, 0.0)),
-    View("shefex2", kind="replay", study="monte_carlo_ab_1", trial=17),
-    View("shefex2", kind="photo", photo="my sky?.jpg"),
+    PageView("shefex2", kind="flight", t_s=12.3456, angles_deg=(0.0, 0.0, 0.0)),
+    PageView("shefex2", kind="replay", study="monte_carlo_ab_1", trial=17),
+    PageView("shefex2", kind="photo", photo="my sky?.jpg"),
 )
 
 
 @pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.kind)
-def test_a_view_comes_back_from_its_address(view: View) -> None:
-    assert View.from_query(view.query(), SCENES) == view
+def test_a_view_comes_back_from_its_address(view: PageView) -> None:
+    assert PageView.from_query(view.query(), SCENES) == view
     assert re.fullmatch(r"\?[\w%.+&=-]+", view.query())
 
 
@@ -64,12 +64,12 @@ def test_a_view_comes_back_from_its_address(view: View) -> None:
 )
 def test_an_address_of_elsewhere_is_refused_in_one_line(query: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        View.from_query(query, SCENES)
+        PageView.from_query(query, SCENES)
 
 
 def test_an_address_without_a_scene_names_no_view() -> None:
-    assert View.from_query("", SCENES) is None
-    assert View.from_query("?token=x", SCENES) is None
+    assert PageView.from_query("", SCENES) is None
+    assert PageView.from_query("?token=x", SCENES) is None
 
 
 def test_steps_are_told_from_continuous_changes() -> None:

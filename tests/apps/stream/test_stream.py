@@ -26,8 +26,8 @@ from typer.testing import CliRunner
 
 from skysim.apps.cli import main
 from skysim.apps.stream import http, sender, sinks
-from skysim.apps.stream.pacing import Pace
-from skysim.apps.stream.packet import Packet, unpack
+from skysim.apps.stream.sender import Pace
+from skysim.apps.stream.sinks import Packet, unpack
 from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.simulation.flight import Flight, open_flight
@@ -110,7 +110,7 @@ def test_a_frame_is_sent_when_due_and_dropped_one_period_later(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clock = FakeClock()
-    monkeypatch.setattr("skysim.apps.stream.pacing.time", clock)
+    monkeypatch.setattr("skysim.apps.stream.sender.time", clock)
     pace = Pace(2.0, 10.0)  # a period is 50 ms on the wall
     assert pace.is_on_time(0, 123.0)  # the clock has not started yet
     pace.start(0.3)

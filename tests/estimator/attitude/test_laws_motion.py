@@ -10,11 +10,10 @@ from hypothesis import given
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude import disk_rate, motion, nearfield, rate, rolling
-from estimator.attitude.motion import STARS, Sight
-from estimator.core.arrays import Floats
+from estimator.attitude import nearfield, rate, rolling
+from estimator.attitude.rate import STARS, Sight
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.types import Centroids, RateEstimate
 from estimator.detection import classify
 from estimator.detection.detect import local
@@ -40,10 +39,10 @@ def exact(rate_rad_s: Floats) -> RateEstimate:
 
 
 @law(
-    motion.tangent_motion,
-    motion.places_cam,
-    motion.center_streak_px,
-    motion.Sight.take,
+    rate.tangent_motion,
+    rate.places_cam,
+    rate.center_streak_px,
+    rate.Sight.take,
     Camera.row_delays_s,
 )
 @given(rng=SEEDS)
@@ -55,25 +54,25 @@ def test_images_move_as_the_rate_says(rng: np.random.Generator) -> None:
         moved = [GLOBAL.tangents(seen.pixels(np.full(30, t_s))) for t_s in (-step_s, step_s)]
         expected = (moved[1] - moved[0]) / 2 / step_s
         assert_allclose(
-            motion.tangent_motion(rays, sight) @ seen.rate_rad_s, expected, rtol=0, atol=1e-6
+            rate.tangent_motion(rays, sight) @ seen.rate_rad_s, expected, rtol=0, atol=1e-6
         )
         assert_allclose(
             seen.cam_from_ref.apply(seen.place_ref),
-            motion.places_cam(rays, sight),
+            rate.places_cam(rays, sight),
             rtol=0,
             atol=1e-12,
         )
-        some = motion.places_cam(rays[[3, 1]], sight.take(np.array([3, 1])))
-        assert_allclose(some, motion.places_cam(rays, sight)[[3, 1]], rtol=0, atol=0)
+        some = rate.places_cam(rays[[3, 1]], sight.take(np.array([3, 1])))
+        assert_allclose(some, rate.places_cam(rays, sight)[[3, 1]], rtol=0, atol=0)
     middle_px = np.array(
         [[5.0, (CAMERA.height_px - 1) / 2], [5.0, (CAMERA.height_px - 1) / 2 + 10]]
     )
     assert_allclose(CAMERA.row_delays_s(middle_px), [0, 10 * CAMERA.row_time_s], rtol=0, atol=1e-18)
-    dx, dy = motion.center_streak_px(CAMERA, exact(np.array([0.1, 0.2, 5.0])), 0.5)
+    dx, dy = rate.center_streak_px(CAMERA, exact(np.array([0.1, 0.2, 5.0])), 0.5)
     assert (dx, dy) == pytest.approx((-0.2 * 0.5 * 3000, 0.1 * 0.5 * 3000))
 
 
-@law(motion.at_middle_row, motion.error_gain, motion.covariance_of)
+@law(rate.at_middle_row, rate.error_gain, rate.covariance_of)
 @given(rng=SEEDS)
 def test_lights_of_a_rolling_shutter_are_put_where_a_global_one_sees_them(
     rng: np.random.Generator,
@@ -81,43 +80,41 @@ def test_lights_of_a_rolling_shutter_are_put_where_a_global_one_sees_them(
     for sight in STARS, DOME:
         seen = moving(rng, any_rate(rng, 10.0), sight=sight)
         found = seen.centroids()
-        still = motion.at_middle_row(CAMERA, found, exact(seen.rate_rad_s), sight)
+        still = rate.at_middle_row(CAMERA, found, exact(seen.rate_rad_s), sight)
         assert_allclose(still.xy_px, seen.still_px, rtol=0, atol=1e-9)
         assert np.abs(found.xy_px - seen.still_px).max() > 1
         # An error of a centroid moves its place at the middle row by the gain.
         error_px = rng.normal(0, 1e-4, found.xy_px.shape)
-        off = motion.at_middle_row(
+        off = rate.at_middle_row(
             CAMERA, replace(found, xy_px=found.xy_px + error_px), exact(seen.rate_rad_s), sight
         )
-        gain = motion.error_gain(
-            CAMERA, motion.tangent_motion(CAMERA.rays(found.xy_px), sight) @ seen.rate_rad_s
+        gain = rate.error_gain(
+            CAMERA, rate.tangent_motion(CAMERA.rays(found.xy_px), sight) @ seen.rate_rad_s
         )
         assert_allclose(
             off.xy_px - still.xy_px, np.einsum("nij,nj->ni", gain, error_px), rtol=0, atol=2e-6
         )
         assert still.covariance_px2 is not None
-        expected = gain @ motion.covariance_of(found) @ np.swapaxes(gain, 1, 2)
+        expected = gain @ rate.covariance_of(found) @ np.swapaxes(gain, 1, 2)
         assert_allclose(still.covariance_px2, expected, rtol=0, atol=1e-12)
         # An error of the rate moves it too.
         other = seen.rate_rad_s + rng.normal(0, 1e-6, 3)
-        moved = motion.at_middle_row(CAMERA, found, exact(other), sight).xy_px - still.xy_px
+        moved = rate.at_middle_row(CAMERA, found, exact(other), sight).xy_px - still.xy_px
         sure = RateEstimate(
             seen.rate_rad_s, np.outer(other - seen.rate_rad_s, other - seen.rate_rad_s)
         )
-        spread = motion.at_middle_row(
+        spread = rate.at_middle_row(
             CAMERA, replace(found, sigma_px=0 * found.sigma_px), sure, sight
         )
         assert spread.covariance_px2 is not None
         assert_allclose(
             np.sqrt(spread.covariance_px2[:, [0, 1], [0, 1]]), np.abs(moved), rtol=0.02, atol=1e-5
         )
-    assert motion.at_middle_row(GLOBAL, found, exact(seen.rate_rad_s)) is found
+    assert rate.at_middle_row(GLOBAL, found, exact(seen.rate_rad_s)) is found
 
 
 @pytest.mark.slow
-@law(
-    rate.from_streaks, rate.chords, rate.aligned, rate.inliers, rate.inverses, motion.streak_factor
-)
+@law(rate.from_streaks, rate.chords, rate.aligned, rate.inliers, rate.inverses, rate.streak_factor)
 @given(rng=SEEDS)
 def test_exact_streaks_give_the_rate_in_one_of_two_signs(rng: np.random.Generator) -> None:
     for camera in CAMERA, GLOBAL:
@@ -218,7 +215,7 @@ def test_an_error_of_the_rate_turns_the_attitude(rng: np.random.Generator) -> No
     seen = moving(rng, any_rate(rng))
     error = rng.normal(0, 1e-5, 3)
     found = seen.centroids()
-    wrong = motion.at_middle_row(CAMERA, found, exact(seen.rate_rad_s + error))
+    wrong = rate.at_middle_row(CAMERA, found, exact(seen.rate_rad_s + error))
     place = seen.cam_from_ref.apply(seen.place_ref)
     jacobian = nearfield.tangent_jacobian(place, place).reshape(-1, 2, 3)
     residual = GLOBAL.tangents(wrong.xy_px) - GLOBAL.tangents(seen.still_px)
@@ -256,7 +253,7 @@ def moments_of(seen: Moving, variance_px2: float) -> Floats:
     """(N, 3) second moments of round images of a rolling shutter: a D D' and the streak's."""
     velocity = (
         seen.camera.focal_px
-        * motion.tangent_motion(GLOBAL.rays(seen.still_px), seen.sight)
+        * rate.tangent_motion(GLOBAL.rays(seen.still_px), seen.sight)
         @ seen.rate_rad_s
     )
     u, w = CAMERA.row_time_s * velocity.T
@@ -272,20 +269,20 @@ def moments_of(seen: Moving, variance_px2: float) -> Floats:
     )
 
 
-@law(disk_rate.from_moments)
+@law(rate.from_moments)
 @given(rng=SEEDS)
 def test_disks_of_a_rolling_shutter_tell_the_rate(rng: np.random.Generator) -> None:
     seen = moving(rng, any_rate(rng, 8.0), sight=DOME)
     disks = replace(
         seen.centroids(), xy_px=seen.still_px, streak_px=None, moments_px2=moments_of(seen, 30.0)
     )
-    rates = disk_rate.from_moments(CAMERA, disks, EXPOSURE_S, DOME)
+    rates = rate.from_moments(CAMERA, disks, EXPOSURE_S, DOME)
     assert len(rates) == 2
     assert min(np.linalg.norm(one.rate_rad_s - seen.rate_rad_s) for one in rates) < np.radians(0.05)
     assert_covariance(rates[0].covariance_rad2_s2)
-    assert disk_rate.from_moments(GLOBAL, disks, EXPOSURE_S, DOME) == []
+    assert rate.from_moments(GLOBAL, disks, EXPOSURE_S, DOME) == []
     points = replace(disks, moments_px2=moments_of(seen, 0.1) * 0.01)
-    assert disk_rate.from_moments(CAMERA, points, EXPOSURE_S, DOME) == []
+    assert rate.from_moments(CAMERA, points, EXPOSURE_S, DOME) == []
 
 
 @law(classify.moments)

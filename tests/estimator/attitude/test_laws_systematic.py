@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude import nearfield, systematic
 from estimator.attitude.dome_map import LedMap, Lever
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.trackers import dome_tracker
 from tests.helpers.laws import SEEDS, assert_covariance, law, turn, units
 

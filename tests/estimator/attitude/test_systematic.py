@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude import systematic
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.nearfield import rotation_only
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.core.types import Centroids
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Settings

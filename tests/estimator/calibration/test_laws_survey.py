@@ -22,8 +22,8 @@ from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, survey
 from estimator.calibration.gauge import Gauge, Subset, align_attitudes
 from estimator.calibration.star_field import LensPrior, StarFrame
 from estimator.catalog.catalog import StarCatalog
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids, StarMatch
 from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units
 

@@ -10,12 +10,15 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ellipj, ellipkinc
 from scipy.stats import chi2
 
-from estimator.calibration.mass_properties.batch import estimate_mass, estimate_with_noise
-from estimator.calibration.mass_properties.dynamics import Motion, States
-from estimator.calibration.mass_properties.record import BearingRecord, Lab, MassEstimate
-from estimator.calibration.mass_properties.recursive import filter_mass
-from estimator.core.arrays import Floats
-from estimator.core.errors import ImageError
+from estimator.calibration.mass_dynamics import (
+    BearingRecord,
+    EquationsOfMotion,
+    LabConstants,
+    MassEstimate,
+    States,
+)
+from estimator.calibration.mass_properties import estimate_mass, estimate_with_noise, filter_mass
+from estimator.core.checks import Floats, ImageError
 from tests.helpers.bearing_motion import GRAVITY_M_S2, INERTIA, SMALL, Vehicle, prior, record
 
 NINE = slice(0, 9)
@@ -26,7 +29,9 @@ def flown(vehicle: Vehicle, rate_rad_s: Floats, t_s: Floats) -> tuple[States, Fl
     still = replace(
         record(SMALL, np.random.default_rng(0), 4.0), wheel_momentum_nms=np.zeros((41, 3))
     )
-    equations = Motion(still, vehicle.lab, np.tile(vehicle.truth[:, None], len(t_s)), vehicle.truth)
+    equations = EquationsOfMotion(
+        still, vehicle.lab, np.tile(vehicle.truth[:, None], len(t_s)), vehicle.truth
+    )
     count = len(t_s)
     momentum = np.tile((vehicle.inertia_kg_m2 @ rate_rad_s)[:, None], count)
     start = States(np.tile([[0.0], [0], [0], [1]], count), momentum, np.zeros((3, count)))
@@ -80,7 +85,7 @@ def nees(estimate: MassEstimate, vehicle: Vehicle) -> float:
     return float(error @ np.linalg.solve(estimate.covariance[NINE, NINE], error))
 
 
-def draws(count: int, seed: int) -> list[tuple[BearingRecord, Lab, float, MassEstimate]]:
+def draws(count: int, seed: int) -> list[tuple[BearingRecord, LabConstants, float, MassEstimate]]:
     """Records of draws of noise, random torque and assumptions: each with the NEES of the batch."""
     rows = []
     for child in np.random.SeedSequence(seed).spawn(count):

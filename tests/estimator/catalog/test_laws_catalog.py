@@ -12,20 +12,11 @@ from hypothesis import strategies as some
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from estimator.catalog import (
-    catalog,
-    pair_buckets,
-    pair_index,
-    ptase,
-    quad_index,
-    shefex,
-    sky_index,
-    spatial_grid,
-)
+from estimator.catalog import catalog, pair_index, published_catalogs, quad_index, sky_index
 from estimator.catalog.catalog import StarCatalog
 from estimator.catalog.sky_index import SkyIndex
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, drawn, law, units
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
@@ -78,7 +69,12 @@ def test_the_earth_is_an_au_from_the_sun_and_goes_30_km_a_second(utc: datetime.d
     np.testing.assert_allclose(same.position_au, there.position_au, rtol=0, atol=1e-15)
 
 
-@law(StarCatalog.take, catalog.brighter_than, catalog.limit_for_density, shefex.asymmetric)
+@law(
+    StarCatalog.take,
+    catalog.brighter_than,
+    catalog.limit_for_density,
+    published_catalogs.asymmetric,
+)
 @given(rng=SEEDS, limit=some.floats(-2, 7), wanted=some.floats(0, 1e3))
 def test_a_catalog_s_subset_is_what_was_asked_for(
     rng: np.random.Generator, limit: float, wanted: float
@@ -88,7 +84,7 @@ def test_a_catalog_s_subset_is_what_was_asked_for(
     assert bright.id.tolist() == [
         n for n, mag in zip(stars.id, stars.v_mag, strict=True) if mag <= limit
     ]
-    south = shefex.asymmetric(stars, limit, limit + 1)
+    south = published_catalogs.asymmetric(stars, limit, limit + 1)
     assert set(bright.id) <= set(south.id) <= set(catalog.brighter_than(stars, limit + 1).id)
     density = catalog.limit_for_density(stars, 1.0, wanted)
     assert len(catalog.brighter_than(stars, density)) == np.clip(
@@ -96,28 +92,28 @@ def test_a_catalog_s_subset_is_what_was_asked_for(
     )
 
 
-@law(shefex.thin, shefex.uniform)
+@law(published_catalogs.thin, published_catalogs.uniform)
 @given(rng=SEEDS, apart_rad=some.floats(0.01, 1), count=some.integers(-1, 70))
 def test_spread_stars_are_apart_and_none_is_left_out_for_nothing(
     rng: np.random.Generator, apart_rad: float, count: int
 ) -> None:
     stars = drawn(rng)
-    kept = shefex.thin(stars, apart_rad)
+    kept = published_catalogs.thin(stars, apart_rad)
     between = apart(kept.vectors, kept.vectors)[np.triu_indices(len(kept), 1)]
     assert (between > apart_rad - 1e-9).all()
     assert (apart(stars.vectors, kept.vectors).min(axis=1) <= apart_rad + 1e-9).all()
-    few = answered(lambda: shefex.uniform(stars, count), ImageError)
+    few = answered(lambda: published_catalogs.uniform(stars, count), ImageError)
     assert (few is not None) == (1 <= count <= 60)
     assert few is None or (set(few.id) <= set(stars.id) and abs(len(few) - count) <= 2)
 
 
-@law(shefex.chosen, slow=True)
+@law(published_catalogs.chosen, slow=True)
 @given(rng=SEEDS)
 def test_the_flown_catalog_has_its_number_or_is_refused(rng: np.random.Generator) -> None:
     many = replace(drawn(rng, 2600), v_mag=np.linspace(4, 5.2, 2600))
-    assert abs(len(shefex.chosen(many)) - shefex.COUNT) <= 3
+    assert abs(len(published_catalogs.chosen(many)) - published_catalogs.COUNT) <= 3
     with pytest.raises(ImageError, match="2023 of"):
-        shefex.chosen(drawn(rng))
+        published_catalogs.chosen(drawn(rng))
 
 
 @law(catalog.light_centers, catalog.close_groups, catalog.merge_doubles)
@@ -140,7 +136,7 @@ def test_merged_stars_keep_their_light(rng: np.random.Generator, near_rad: float
 
 
 @pytest.mark.long
-@law(catalog.read, catalog.columns, ptase.read_cat)
+@law(catalog.read, catalog.columns, published_catalogs.read_cat)
 @given(
     rows=some.lists(
         some.lists(some.floats() | some.text(max_size=5), min_size=5, max_size=8), max_size=3
@@ -154,30 +150,32 @@ def test_any_table_is_a_catalog_or_is_none(
     head = "# epoch_jyear: 2016.0\n" + ",".join(catalog.COLUMNS)
     path.write_text("\n".join([head, *(",".join(map(str, row)) for row in rows)]), encoding="utf-8")
     answered(lambda: catalog.read(path), ImageError)
-    answered(lambda: ptase.read_cat(path, 5.0), ImageError)
+    answered(lambda: published_catalogs.read_cat(path, 5.0), ImageError)
     table = rng.uniform(1, 50, (4, 7))
     path.write_text("\n".join([head, *(",".join(map(repr, row)) for row in table.tolist())]))
     numbers, epoch_yr = catalog.columns(path, catalog.COLUMNS)
     np.testing.assert_array_equal(numbers, table.T)
     assert epoch_yr == 2016.0
     assert catalog.read(path).v_mag.tolist() == sorted(table[:, 6])
-    assert len(ptase.read_cat(path, 60.0)) == 4
+    assert len(published_catalogs.read_cat(path, 60.0)) == 4
 
 
-@law(ptase.proc_cat, ptase.histogram, ptase.log)
+@law(published_catalogs.proc_cat, published_catalogs.histogram, published_catalogs.log)
 @given(rng=SEEDS, near_rad=some.floats(0, 1), step_mag=some.floats(0.1, 2))
 def test_a_prepared_catalog_counts_every_star(
     rng: np.random.Generator, near_rad: float, step_mag: float
 ) -> None:
     stars = drawn(rng)
-    raw = ptase.OnBoard(stars.id, stars.vectors, stars.v_mag, np.ones(len(stars), np.int64), 2000.0)
-    told = ptase.proc_cat(raw, near_rad)
+    raw = published_catalogs.OnBoard(
+        stars.id, stars.vectors, stars.v_mag, np.ones(len(stars), np.int64), 2000.0
+    )
+    told = published_catalogs.proc_cat(raw, near_rad)
     assert told.components.sum() == len(stars)
     assert (np.diff(told.magnitude) >= 0).all()
-    edges, count = ptase.histogram(told.magnitude, step_mag)
+    edges, count = published_catalogs.histogram(told.magnitude, step_mag)
     assert count.sum() == len(told)
     assert edges[0] <= told.magnitude[0] + 1e-6 and told.magnitude[-1] < edges[-1] + step_mag  # noqa: PT018
-    assert len(ptase.log(told, step_mag).splitlines()) == 6 + len(count) + len(told)
+    assert len(published_catalogs.log(told, step_mag).splitlines()) == 6 + len(count) + len(told)
 
 
 # Indexes
@@ -186,8 +184,8 @@ def test_a_prepared_catalog_counts_every_star(
 @law(
     pair_index.build,
     pair_index.k_vector,
-    spatial_grid.build,
-    pair_buckets.build_pair_catalog,
+    sky_index.build_grid,
+    pair_index.build_pair_catalog,
     sky_index.build,
     sky_index.build_without_pairs,
     SkyIndex.bytes,
@@ -208,9 +206,9 @@ def test_three_indexes_hold_the_pairs_that_there_are(
         in_bin = np.repeat(np.arange(len(made.first) - 1), np.diff(made.first))
         assert np.abs(angle / made.bin_rad - in_bin - 0.5).max() < 0.5 + 1e-6
         assert len({tuple(sorted(pair)) for pair in made.pair.tolist()}) == pairs
-    known = pair_buckets.build_pair_catalog(vectors, mag, 0.01, (0.0, most_rad)) if pairs else None
+    known = pair_index.build_pair_catalog(vectors, mag, 0.01, (0.0, most_rad)) if pairs else None
     assert known is None or known.table[-1] == len(known.pair) == pairs
-    assert sorted(spatial_grid.build(vectors).row.tolist()) == list(range(count))
+    assert sorted(sky_index.build_grid(vectors).row.tolist()) == list(range(count))
     kvector, slope, offset = pair_index.k_vector(np.sort(every))
     z = slope * np.arange(len(kvector)) + offset
     assert all(np.count_nonzero(every <= at) == n for at, n in zip(z, kvector, strict=True))
@@ -251,4 +249,4 @@ def test_the_shipped_catalog_is_brightest_first() -> None:
 def test_a_place_s_cell_is_the_nearest_there_is(place: float, last: int) -> None:
     """Whatever the number: casts of NaN and of 1e300 once led beyond a table's end."""
     expected = 0 if np.isnan(place) else min(max(place, 0), last)
-    assert spatial_grid.cell_of(float(place), last) == int(expected)
+    assert sky_index.cell_of(float(place), last) == int(expected)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from estimator.catalog.pair_buckets import ARCSEC_RAD, PairCatalog
-from estimator.core.arrays import Floats
+from estimator.catalog.pair_index import ARCSEC_RAD, PairCatalog
+from estimator.core.checks import Floats
 from tests.helpers.interpreted import interpreted
 
-PLAIN = interpreted("estimator.catalog.pair_buckets")
+PLAIN = interpreted("estimator.catalog.pair_index")
 bucket_of = PLAIN.bucket_of
 candidates = PLAIN.candidates
 build_pair_catalog = PLAIN.build_pair_catalog

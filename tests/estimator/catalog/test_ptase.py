@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from estimator.catalog.ptase import (
+from estimator.catalog.published_catalogs import (
     BYTES_PER_ENTRY,
     Color,
     OnBoard,
@@ -16,7 +16,7 @@ from estimator.catalog.ptase import (
     proc_cat,
     read_cat,
 )
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 
 FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 ARCSEC_RAD = np.pi / 648_000

@@ -8,8 +8,16 @@ from scipy.spatial import cKDTree
 
 from estimator.catalog import catalog, pair_index
 from estimator.catalog.catalog import StarCatalog
-from estimator.catalog.shefex import BRIGHT_MAG, CATALOGS, COUNT, asymmetric, chosen, thin, uniform
-from estimator.core.errors import ImageError
+from estimator.catalog.published_catalogs import (
+    BRIGHT_MAG,
+    CATALOGS,
+    COUNT,
+    asymmetric,
+    chosen,
+    thin,
+    uniform,
+)
+from estimator.core.checks import ImageError
 
 FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from estimator.catalog import spatial_grid
-from estimator.core.arrays import Floats
+from estimator.catalog import sky_index
+from estimator.core.checks import Floats
 
 
 def directions(rng: np.random.Generator, count: int) -> Floats:
@@ -22,20 +22,20 @@ def patch(rng: np.random.Generator, count: int) -> Floats:
 def test_the_stars_within_a_distance_are_brute_force_s(make, chord: float) -> None:
     rng = np.random.default_rng(1)
     vectors = make(rng, 700)
-    known = spatial_grid.build(vectors)
+    known = sky_index.build_grid(vectors)
     out = np.empty(700, np.int64)
     # Some of the stars themselves, the poles of the axes, and anywhere.
     for place in np.vstack([vectors[:40], np.eye(3), -np.eye(3), directions(rng, 100)]):
-        count = spatial_grid.within(known, vectors, *place, chord, out)
+        count = sky_index.within(known, vectors, *place, chord, out)
         off = np.linalg.norm(vectors - place, axis=1)
         assert sorted(out[:count]) == np.flatnonzero(off <= chord).tolist()
-        near = spatial_grid.nearest(known, vectors, *place, chord)
+        near = sky_index.nearest_in_grid(known, vectors, *place, chord)
         assert near == (off.argmin() if off.min() < chord else -1)
 
 
 def test_every_star_is_in_one_cell() -> None:
     vectors = directions(np.random.default_rng(2), 5000)
-    known = spatial_grid.build(vectors)
+    known = sky_index.build_grid(vectors)
     assert sorted(known.row) == list(range(5000))
     assert known.first[-1] == 5000
     assert np.all(np.diff(known.first) >= 0)
@@ -44,5 +44,5 @@ def test_every_star_is_in_one_cell() -> None:
 def test_a_short_list_keeps_the_count() -> None:
     vectors = patch(np.random.default_rng(3), 50)
     out = np.full(10, -1)
-    assert spatial_grid.within(spatial_grid.build(vectors), vectors, 0.0, 0.0, 1.0, 0.5, out) == 50
+    assert sky_index.within(sky_index.build_grid(vectors), vectors, 0.0, 0.0, 1.0, 0.5, out) == 50
     assert len(set(out)) == 10

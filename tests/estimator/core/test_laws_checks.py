@@ -18,8 +18,8 @@ from estimator.attitude import dome_map
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import catalog
 from estimator.catalog.catalog import StarCatalog
-from estimator.core import checks, lazy
-from estimator.core.errors import ImageError
+from estimator.core import checks
+from estimator.core.checks import ImageError
 from estimator.core.types import Centroids
 from estimator.detection import detect
 from estimator.trackers import pipeline
@@ -167,17 +167,6 @@ def test_rows_are_of_their_length_finite_and_there(rng: np.random.Generator, thi
     with pytest.raises(ImageError, match="2 of a, 1 of b; allowed: equal numbers"):
         checks.row_pairs(("a", [0, 1], 2), ("b", [0], 1))
     assert checks.angle_guess("fov", 14.9) == "fov 14.9 rad is 854°; degrees?"
-
-
-@law(lazy.attach)
-@given(name=WORDS)
-def test_a_lazy_name_is_its_module_s_or_told(name: str) -> None:
-    get, listed, every = lazy.attach("estimator.core", {"types": ["Centroids"]})
-    assert get("Centroids") is Centroids
-    assert every == listed() == ["Centroids"]
-    if name != "Centroids":
-        with pytest.raises(AttributeError, match="public: Centroids"):
-            get(name)
 
 
 def lights(rng: np.random.Generator, count: int) -> dict[str, NDArray]:

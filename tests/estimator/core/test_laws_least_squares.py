@@ -9,7 +9,7 @@ import scipy.integrate
 from hypothesis import given
 from hypothesis import strategies as some
 
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.core.least_squares import MAX_VARIANCE_FACTOR, fit_soft_l1, soft_l1, variance_factor
 from tests.helpers.laws import SEEDS, law
 

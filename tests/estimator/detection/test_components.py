@@ -5,12 +5,12 @@ import pytest
 from scipy import ndimage
 from scipy.special import erf
 
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.core.types import FramePriors
 from estimator.detection import detect
 from estimator.detection.background import interpolate
 from estimator.detection.components import FIRST_RUNS, label_runs, runs_above
-from estimator.detection.shefex import maximum_scan, sequential_scan
+from estimator.detection.shefex_detection import maximum_scan, sequential_scan
 from tests.helpers.interpreted import interpreted
 
 BINOMIAL = np.outer([1, 2, 1], [1, 2, 1]) / 16

@@ -18,14 +18,13 @@ from estimator.attitude.solvers import SOLVERS
 from estimator.centroiding import centroid
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import camera
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.types import NO_SPREAD, Attitude, Blobs, Centroids, FramePriors, ra_dec_roll_rad
-from estimator.detection import background, captions, classify, components, detect, windows
+from estimator.detection import background, classify, components, detect, windows
 from estimator.detection.classify import Flag
 from estimator.detection.detect import DETECTORS
-from estimator.identification.stars.detections import FlatCentroids, Sensor, detections_of
+from estimator.identification.star_detections import FlatCentroids, Sensor, detections_of
 from estimator.trackers import pipeline
 from estimator.trackers.pipeline import Clock, Settings
 from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units
@@ -231,7 +230,7 @@ def test_letters_are_text_wherever_they_are(
     boxes = (np.concatenate([line, lights]) + rng.integers(0, 1000, 2)[[0, 1, 0, 1]])[order].astype(
         np.int64
     )
-    text = captions.find_captions(boxes, np.where(order < letters, 255.0, 200.0))
+    text = classify.find_captions(boxes, np.where(order < letters, 255.0, 200.0))
     assert text.tolist() == ((order < letters) & (not even)).tolist()
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from estimator.filter.jumps import CONFIRMATIONS, ENOUGH, Jump, log_odds, shock_rad
+from estimator.filter.consistency import CONFIRMATIONS, ENOUGH, Jump, log_odds, shock_rad
 from estimator.filter.mekf import (
     DISPUTED,
     OUTSIDE_GATE,

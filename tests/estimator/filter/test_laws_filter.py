@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.types import FilterState
 from estimator.filter.mekf import USED, AttitudeFilter, GyroModel
-from estimator.filter.propagate import inverse_response
+from estimator.filter.states import inverse_response
 from estimator.trackers import exposure_control
-from estimator.trackers.exposure_control import Control, Exposure, Observation
+from estimator.trackers.exposure_control import Control, NextExposure, Observation
 from tests.helpers import laws
 from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn
 
@@ -149,7 +149,7 @@ def test_an_exposure_stays_within_the_camera_s(
     time_s: float, mean_dn: float, stars: int, overexposed: int, control: Control
 ) -> None:
     asked = exposure_control.step(
-        Exposure(time_s), Observation(mean_dn, stars, overexposed), control
+        NextExposure(time_s), Observation(mean_dn, stars, overexposed), control
     )
     assert control.shortest_s <= asked.time_s <= control.longest_s
     assert asked.no_stars == (stars < control.min_stars)

@@ -15,9 +15,9 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import FilterState
-from estimator.filter import checks, correct, jumps, states
+from estimator.filter import consistency, correct, states
 from estimator.filter.mekf import AttitudeFilter
-from estimator.filter.models import STATES, GyroModel, JumpModel, TrackerModel
+from estimator.filter.states import STATES, GyroModel, JumpModel, TrackerModel
 from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
@@ -31,7 +31,7 @@ def covariance(rng: np.random.Generator, size: int, scale: float = 1e-3) -> NDAr
     return root @ root.T + 1e-3 * scale**2 * np.eye(size)
 
 
-def state_of(rng: np.random.Generator, layout: states.Layout) -> states.State:
+def state_of(rng: np.random.Generator, layout: states.Layout) -> states.MekfState:
     """A state with some attitude, values, correlations and history."""
     values = rng.normal(0, 1e-3, layout.size)
     values[:3] = 0.0
@@ -45,10 +45,10 @@ def state_of(rng: np.random.Generator, layout: states.Layout) -> states.State:
 
 
 def solution_near(
-    rng: np.random.Generator, state: states.State, off_rad: float
-) -> correct.Solution:
+    rng: np.random.Generator, state: states.MekfState, off_rad: float
+) -> correct.AttitudeFix:
     near = Rotation.from_rotvec(rng.normal(0, off_rad, 3)) * state.body_from_ref
-    return correct.Solution(near, covariance(rng, 3), covariance(rng, 3))
+    return correct.AttitudeFix(near, covariance(rng, 3), covariance(rng, 3))
 
 
 # States of several heads
@@ -83,16 +83,16 @@ def test_every_head_has_a_mounting_and_a_slow_error_of_its_own(
 # What is accepted
 
 
-@law(checks.not_negative)
+@law(consistency.not_negative)
 @given(value=ANY | NUMBERS)
 def test_standard_deviations_are_kept_or_refused(value: float | NDArray) -> None:
-    told = answered(lambda: checks.not_negative("sigma", value))
+    told = answered(lambda: consistency.not_negative("sigma", value))
     good = np.shape(value) in ((), (3,)) and bool((np.asarray(value) >= 0).all())
     assert (told is not None) == good
     np.testing.assert_array_equal(told if good else value, value)
 
 
-@law(checks.checked_samples)
+@law(consistency.checked_samples)
 @given(rng=SEEDS, angle=arrays("f8", (5, 3), elements=some.floats(-1, 1)), lost=arrays(bool, 5))
 def test_samples_keep_what_was_measured_and_say_how(
     rng: np.random.Generator, angle: NDArray, lost: NDArray
@@ -101,32 +101,33 @@ def test_samples_keep_what_was_measured_and_say_how(
     saturated = rng.random(5) < 0.5
     gyro = replace(GYRO, limit_rad_s=3.0)
     holes = np.where(lost[:, None], np.nan, angle)
-    samples = checks.checked_samples(0.0, t_s, holes, saturated, lost, gyro)
+    samples = consistency.checked_samples(0.0, t_s, holes, saturated, lost, gyro)
     np.testing.assert_array_equal(samples[:, 0], t_s)
     np.testing.assert_array_equal(samples[:, 1:4], np.where(lost[:, None], 0.0, angle))
     rate_rad_s = np.abs(angle).max(axis=1) / np.diff(t_s, prepend=0.0)
-    limited = saturated | (rate_rad_s >= checks.NEAR_LIMIT * 3.0)
+    limited = saturated | (rate_rad_s >= consistency.NEAR_LIMIT * 3.0)
     np.testing.assert_array_equal(samples[:, 4], np.where(lost, 2, limited))
     np.testing.assert_array_equal(
-        checks.checked_samples(0.0, t_s, angle, saturated, None, gyro)[:, 4], limited.astype(float)
+        consistency.checked_samples(0.0, t_s, angle, saturated, None, gyro)[:, 4],
+        limited.astype(float),
     )
 
 
-@law(checks.checked_covariances, checks.is_covariance)
+@law(consistency.checked_covariances, consistency.is_covariance)
 @given(rng=SEEDS, any_matrix=NUMBERS | arrays("f8", (3, 3), elements=ANY))
 def test_a_solution_s_covariance_is_its_noise_and_what_it_shares(
     rng: np.random.Generator, any_matrix: NDArray
 ) -> None:
     noise = covariance(rng, 3)
     common = covariance(rng, 3)
-    told = checks.checked_covariances(noise + common, common)
+    told = consistency.checked_covariances(noise + common, common)
     np.testing.assert_allclose(told[0], noise, rtol=0, atol=1e-12 * np.trace(noise + common))
     np.testing.assert_array_equal(told[1], told[1].T)
-    assert checks.is_covariance(noise)
-    assert not checks.is_covariance(noise - 2 * np.trace(noise) * np.eye(3))
-    assert checks.is_covariance(np.outer(noise[0], noise[0]), singular=True)
-    found = answered(lambda: checks.checked_covariances(any_matrix, None))
-    assert (found is not None) == checks.is_covariance(any_matrix)
+    assert consistency.is_covariance(noise)
+    assert not consistency.is_covariance(noise - 2 * np.trace(noise) * np.eye(3))
+    assert consistency.is_covariance(np.outer(noise[0], noise[0]), singular=True)
+    found = answered(lambda: consistency.checked_covariances(any_matrix, None))
+    assert (found is not None) == consistency.is_covariance(any_matrix)
 
 
 # States
@@ -155,7 +156,7 @@ def test_the_states_fill_the_covariance_without_gap_or_overlap(
     assert len(set(inside)) == len(inside) == 3 * ("scale" in used) + 6 * ("misalignment" in used)
 
 
-@law(states.propagate_state, states.State.body_from_ref)
+@law(states.propagate_state, states.MekfState.body_from_ref)
 @given(rng=SEEDS, considered=CHOICES)
 def test_a_gyro_sample_moves_the_errors_as_it_moves_the_truth(
     rng: np.random.Generator, considered: tuple[str, ...]
@@ -328,7 +329,7 @@ def test_rotations_and_roots_are_what_they_are_of(rng: np.random.Generator, leng
 # Jumps
 
 
-@law(jumps.log_odds)
+@law(consistency.log_odds)
 @given(
     angle=some.floats(1e-6, np.pi),
     distance=some.floats(5, 1e5),
@@ -341,10 +342,10 @@ def test_odds_rise_with_what_speaks_against_the_filter(
     angle: float, distance: float, agreeing: int, since_s: float, lost: float, support: int
 ) -> None:
     model = JumpModel()
-    one = jumps.Jump(angle, distance, agreeing, since_s, lost, support)
-    odds = jumps.log_odds(one, model)
+    one = consistency.Jump(angle, distance, agreeing, since_s, lost, support)
+    odds = consistency.log_odds(one, model)
     assert math.isfinite(odds)
-    assert jumps.log_odds(one._replace(agreeing=agreeing + 1), model) > odds
+    assert consistency.log_odds(one._replace(agreeing=agreeing + 1), model) > odds
     rising = {
         "since_s": since_s + 1,
         "lost_rad": lost + 0.1,
@@ -352,13 +353,13 @@ def test_odds_rise_with_what_speaks_against_the_filter(
         "distance": distance / 2,
     }
     for name, value in rising.items():
-        assert jumps.log_odds(one._replace(**{name: value}), model) >= odds  # type: ignore[arg-type]
-    assert jumps.log_odds(one._replace(support=support + 1), model) <= odds
+        assert consistency.log_odds(one._replace(**{name: value}), model) >= odds  # type: ignore[arg-type]
+    assert consistency.log_odds(one._replace(support=support + 1), model) <= odds
     # A tracker that is wrong more often is believed less.
-    assert jumps.log_odds(one, replace(model, wrong_share=1e-2)) <= odds + 1e-9
+    assert consistency.log_odds(one, replace(model, wrong_share=1e-2)) <= odds + 1e-9
 
 
-@law(jumps.shock_rad)
+@law(consistency.shock_rad)
 @given(rng=SEEDS, step=some.floats(1e-3, 1.0), slope=some.floats(-10, 10))
 def test_a_step_of_the_rate_is_a_shock_and_a_slope_is_none(
     rng: np.random.Generator, step: float, slope: float
@@ -367,10 +368,12 @@ def test_a_step_of_the_rate_is_a_shock_and_a_slope_is_none(
     t_s = 5.0 + np.arange(1, 21) * 0.01
     rate = slope * (t_s - 5.0)[:, None] * turn(rng).apply([1.0, 0, 0])
     samples = np.column_stack([t_s, 0.01 * rate, np.zeros(20)])
-    assert jumps.shock_rad(5.0, samples, 1e-9) < 1e-6
+    assert consistency.shock_rad(5.0, samples, 1e-9) < 1e-6
     samples[at:, 1:4] += 0.01 * step * turn(rng).apply([1.0, 0, 0])
-    np.testing.assert_allclose(jumps.shock_rad(5.0, samples, 1e-9), 0.01 * step, rtol=1e-3, atol=0)
-    assert jumps.shock_rad(5.0, samples, 1.0) == 0.0
+    np.testing.assert_allclose(
+        consistency.shock_rad(5.0, samples, 1e-9), 0.01 * step, rtol=1e-3, atol=0
+    )
+    assert consistency.shock_rad(5.0, samples, 1.0) == 0.0
 
 
 @law(FilterState.sigma, AttitudeFilter.state)

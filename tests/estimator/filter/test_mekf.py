@@ -20,7 +20,7 @@ from estimator.filter.mekf import (
     GyroModel,
     Update,
 )
-from estimator.filter.propagate import transition
+from estimator.filter.states import transition
 from tests.helpers.tumble import tumble_angle_rad, tumble_body_from_ref
 
 ARCSEC_RAD = np.pi / 180 / 3600

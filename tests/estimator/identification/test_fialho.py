@@ -5,9 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from estimator.catalog import catalog, pair_index
-from estimator.core.arrays import Floats
-from estimator.core.errors import ImageError
-from estimator.identification.options import Options
+from estimator.core.checks import Floats, ImageError
 from estimator.identification.published.fialho import (
     MAG_GATE_SIGMA,
     MIN_SIDE_FRACTION,
@@ -18,6 +16,7 @@ from estimator.identification.published.fialho import (
     search_options,
     triplets,
 )
+from estimator.identification.solver_options import Options
 
 pytestmark = pytest.mark.slow  # much is compiled
 

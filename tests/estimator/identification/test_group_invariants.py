@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from tests.helpers import group_invariants
 
 AFFINE = np.array([[1.1, 0.2, 0.3], [-0.1, 0.9, -0.2], [0.0, 0.0, 1.0]])

@@ -11,13 +11,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from estimator.attitude.dome_map import Lever, project
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.types import Centroids, StarMatch
-from estimator.identification.leds import codes, naming
-from estimator.identification.leds.codes import GROSS, LedCode
-from estimator.identification.leds.tracks import LightTracks
+from estimator.identification import led_codes, led_naming
+from estimator.identification.led_codes import GROSS, LedCode, LightTracks
 from tests.helpers.laws import SEEDS, answered, law, turn, units
 
 CAMERA = Camera(640, 480, 900.0, (319.5, 239.5))
@@ -44,7 +42,7 @@ def test_a_template_is_the_mean_level_of_an_exposure(
 
 
 @pytest.mark.slow
-@law(codes.misfits, codes.expected_misfit, codes.likely)
+@law(led_codes.misfits, led_codes.expected_misfit, led_codes.likely)
 @given(rng=SEEDS, gross=some.integers(0, 2))
 def test_a_misfit_is_the_least_over_the_brightness(rng: np.random.Generator, gross: int) -> None:
     """Of the true template it is that of a fine search of brightnesses; of others at least as much as theirs."""
@@ -53,7 +51,7 @@ def test_a_misfit_is_the_least_over_the_brightness(rng: np.random.Generator, gro
     light[0, :gross] = rng.uniform(0.3, 1.2, gross) * 1e4
     light[0, 5] = np.nan
     sigma = np.full((1, 20), 200.0)
-    found = codes.misfits(light, sigma, template, np.zeros_like(template))
+    found = led_codes.misfits(light, sigma, template, np.zeros_like(template))
 
     def misfit(brightness: float, row: Floats) -> float:
         each = ((light[0] - brightness * row) / sigma[0]) ** 2 / 2
@@ -67,18 +65,18 @@ def test_a_misfit_is_the_least_over_the_brightness(rng: np.random.Generator, gro
         assert found[0, n] >= best - 1e-6
         if n == 0:
             assert found[0, n] == pytest.approx(best, abs=0.02)
-    assert 0 in codes.likely(light[0], template)
-    assert found[0, 0] <= codes.expected_misfit(np.array([19]))[0] + GROSS * gross
+    assert 0 in led_codes.likely(light[0], template)
+    assert found[0, 0] <= led_codes.expected_misfit(np.array([19]))[0] + GROSS * gross
 
 
 def test_a_true_word_is_seldom_suspicious() -> None:
     """Half of a chi-square exceeds the limit without its allowance for gross errors in 1 of 50 cases or fewer."""
     for measured in (3, 9, 19, 31):
-        limit = codes.expected_misfit(np.array([measured]))[0] - GROSS * max(1, measured / 6)
+        limit = led_codes.expected_misfit(np.array([measured]))[0] - GROSS * max(1, measured / 6)
         assert chi2.sf(2 * limit, measured) < 0.02
 
 
-@law(codes.excess_noise)
+@law(led_codes.excess_noise)
 @given(rng=SEEDS, factor=some.floats(0.3, 4.0))
 def test_noise_beyond_the_declared_is_found_from_the_misfits(
     rng: np.random.Generator, factor: float
@@ -87,11 +85,11 @@ def test_noise_beyond_the_declared_is_found_from_the_misfits(
     measured = np.full(90, 24)
     least = factor**2 * rng.chisquare(measured) / 2
     least[::9] = 1e4
-    found = codes.excess_noise(least, measured)
+    found = led_codes.excess_noise(least, measured)
     assert found == 1 if factor < 0.85 else found == pytest.approx(max(1.0, factor**2), rel=0.25)
 
 
-@law(naming.is_supported)
+@law(led_naming.is_supported)
 @given(lights=some.integers(2, 6), rival=some.floats(0.0, 30.0))
 def test_names_hold_only_at_a_common_time_and_against_the_other_lights(
     lights: int, rival: float
@@ -101,28 +99,28 @@ def test_names_hold_only_at_a_common_time_and_against_the_other_lights(
     misfit[0, 0, 1] = misfit[1, 1, 2] = 0.0
     misfit[1, 0, 1] = misfit[0, 1, 2] = rival
     match = StarMatch(np.array([0, 1]), np.array([1, 2]), Rotation.identity(), 0.0)
-    assert naming.is_supported(match, misfit, lights) == (
-        lights == 2 and rival <= naming.TRUSTED * np.sqrt(2)
+    assert led_naming.is_supported(match, misfit, lights) == (
+        lights == 2 and rival <= led_naming.TRUSTED * np.sqrt(2)
     )
 
 
-def dome(count: int) -> naming.Sphere:
+def dome(count: int) -> led_naming.Sphere:
     """LEDs on a golden spiral of radius 1.2 m, where every field looks like its neighbors."""
     z = 1 - (np.arange(count) + 0.5) / count * 0.4
     azimuth = np.arange(count) * np.pi * (3 - np.sqrt(5))
     ring = np.sqrt(1 - z**2)
     along = np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
-    return naming.Sphere(1.2 * along, np.full(count, 1.2), along, LEVER.camera_body_m)
+    return led_naming.Sphere(1.2 * along, np.full(count, 1.2), along, LEVER.camera_body_m)
 
 
-def field(sphere: naming.Sphere, body_from_lab: Rotation) -> tuple[Floats, Floats]:
+def field(sphere: led_naming.Sphere, body_from_lab: Rotation) -> tuple[Floats, Floats]:
     """The LEDs in the field and their pixels."""
     xy_px = np.nan_to_num(project(body_from_lab, sphere.position_m, LEVER, CAMERA), nan=-1e9)
     seen = np.flatnonzero(CAMERA.contains(xy_px, 3))
     return seen, xy_px[seen]
 
 
-@law(naming.identify)
+@law(led_naming.identify)
 @given(rng=SEEDS, known=some.floats(0, 40), lied=some.integers(0, 1))
 def test_names_are_right_or_refused(rng: np.random.Generator, known: float, lied: int) -> None:
     """Codes that know each LED by `known`, and in some cases one that claims another: then no attitude is wrong."""
@@ -133,7 +131,9 @@ def test_names_are_right_or_refused(rng: np.random.Generator, known: float, lied
     if lied:
         misfit[0] = 40.0 * (np.arange(100) != rng.integers(100))
     rays = CAMERA.rays(xy_px + rng.normal(0, 0.1, xy_px.shape))
-    found = naming.identify(naming.NamedLights(rays, np.full(len(seen), 3e-4), misfit), sphere)
+    found = led_naming.identify(
+        led_naming.NamedLights(rays, np.full(len(seen), 3e-4), misfit), sphere
+    )
     if isinstance(found, str):
         assert known < 25 or lied
         return
@@ -184,12 +184,12 @@ def test_two_lights_have_names_if_no_other_pair_is_a_hundred_thousandth_as_likel
     """Of eight LEDs on a circle all neighbors are as far apart; ln(10^5) is 11.5."""
     azimuth = np.arange(8) * np.pi / 4
     ring = np.column_stack([0.1 * np.cos(azimuth), 0.1 * np.sin(azimuth), np.full(8, 0.99499)])
-    sphere = naming.Sphere(1.2 * ring, np.full(8, 1.2), ring, LEVER.camera_body_m)
+    sphere = led_naming.Sphere(1.2 * ring, np.full(8, 1.2), ring, LEVER.camera_body_m)
     _, xy_px = field(sphere, Rotation.identity())
     misfit = np.full((2, 8), 100.0)
     misfit[[0, 1], [0, 1]] = 3.0
     misfit[[0, 1], [4, 5]] = 3.0 + excess / 2
-    found = naming.identify(
-        naming.NamedLights(CAMERA.rays(xy_px[:2]), np.full(2, 3e-4), misfit), sphere
+    found = led_naming.identify(
+        led_naming.NamedLights(CAMERA.rays(xy_px[:2]), np.full(2, 3e-4), misfit), sphere
     )
-    assert (found == naming.UNDECIDED) if not decided else found.star.tolist() == [0, 1]
+    assert (found == led_naming.UNDECIDED) if not decided else found.star.tolist() == [0, 1]

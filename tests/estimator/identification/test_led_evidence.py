@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 from scipy.special import betaln
 
 from estimator.attitude.dome_map import LedMap, Lever, project
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
-from estimator.identification.leds import evidence, search
-from estimator.identification.leds.evidence import LedDetections
-from estimator.identification.leds.index import DomeIndex, build_dome_index
+from estimator.core.checks import Floats
+from estimator.identification import led_evidence, led_search
+from estimator.identification.led_evidence import LedDetections
+from estimator.identification.led_index import DomeIndex, build_dome_index
 from tests.helpers.interpreted import interpreted
 
 CAMERA = Camera(1600, 1200, 8698.0, (799.5, 599.5))
@@ -43,12 +43,14 @@ def test_matches_on_one_board_count_little(boards: list[int], second: int, furth
     dome = build_dome_index(leds, LEVER, CAMERA)
     sigma = 0.2 / CAMERA.focal_px
     rays = CAMERA.rays(project(Rotation.identity(), place_m, LEVER, CAMERA))
-    detections = search.build_detections(rays, np.full(6, sigma), dome)._replace(
+    detections = led_search.build_detections(rays, np.full(6, sigma), dome)._replace(
         sigma=np.full(6, sigma)
     )
     boarded = dome._replace(pairs=dome.pairs._replace(group=np.array(boards)))
     apart = dome._replace(pairs=dome.pairs._replace(group=np.arange(6)))
-    found = [evidence.evaluate(detections, index, np.eye(3), 0, 0, 3) for index in (apart, boarded)]
+    found = [
+        led_evidence.evaluate(detections, index, np.eye(3), 0, 0, 3) for index in (apart, boarded)
+    ]
     assert [len(hypothesis.star) for hypothesis in found] == [6, 6]
     area = CAMERA.width_px * CAMERA.height_px / CAMERA.focal_px**2
     in_full = np.log10(area / 6 / (2 * np.pi * sigma**2))
@@ -68,7 +70,11 @@ def wide_field(level_from_lab: Rotation) -> tuple[DomeIndex, LedDetections, Floa
     rays = WIDE.rays(project(level_from_lab, place_m, ASIDE, WIDE))
     sigma = np.full(6, 0.01)
     R_cam_from_lab = (ASIDE.cam_from_body * level_from_lab).as_matrix()
-    return dome, search.build_detections(rays, sigma, dome)._replace(sigma=sigma), R_cam_from_lab
+    return (
+        dome,
+        led_search.build_detections(rays, sigma, dome)._replace(sigma=sigma),
+        R_cam_from_lab,
+    )
 
 
 @pytest.mark.slow
@@ -79,7 +85,7 @@ def test_two_fits_of_the_attitude_come_to_the_truth(axis: tuple[float, float, fl
         Rotation.from_euler("xyz", [5, -8, 30], degrees=True)
     )
     off = Rotation.from_rotvec(np.radians(0.5) * np.array(axis)).as_matrix() @ R_cam_from_lab
-    hypothesis = evidence.evaluate(detections, dome, off, 0, 0, 3)
+    hypothesis = led_evidence.evaluate(detections, dome, off, 0, 0, 3)
     assert len(hypothesis.star) == 6
     error = Rotation.from_matrix(hypothesis.R_cam_from_lab @ R_cam_from_lab.T).magnitude()
     assert error < 1e-6
@@ -107,7 +113,7 @@ def test_the_information_is_that_of_the_projection_s_slopes(uncertainty: float) 
     unknowns = np.eye(4)[: 4 if uncertainty else 3]
     slopes = np.array([(tangents(step * e) - tangents(-step * e)) / (2 * step) for e in unknowns])
     detections = detections._replace(focal_uncertainty=uncertainty)
-    info, _ = evidence._fit(detections, dome, R_cam_from_lab.copy(), 1.07, rows, rows)
+    info, _ = led_evidence._fit(detections, dome, R_cam_from_lab.copy(), 1.07, rows, rows)
     np.testing.assert_allclose(
         info, slopes @ slopes.T / 0.01**2, rtol=0, atol=1e-7 * np.abs(info).max()
     )
@@ -121,11 +127,11 @@ def test_two_fits_of_attitude_and_focal_length_come_to_the_truth() -> None:
     )
     zoomed = detections._replace(tangent=1.08 * detections.tangent, focal_uncertainty=0.1)
     off = Rotation.from_rotvec(np.radians([0.2, -0.1, 0.2])).as_matrix() @ R_cam_from_lab
-    hypothesis = evidence.evaluate(zoomed, dome, off, 0, 0, 3, 1.07)
+    hypothesis = led_evidence.evaluate(zoomed, dome, off, 0, 0, 3, 1.07)
     assert len(hypothesis.star) == 6
     assert Rotation.from_matrix(hypothesis.R_cam_from_lab @ R_cam_from_lab.T).magnitude() < 1e-5
     beyond = zoomed._replace(focal_uncertainty=0.05)  # to 6 % at most
-    assert evidence.evaluate(beyond, dome, off.copy(), 0, 0, 3, 1.07).dex == -np.inf
+    assert led_evidence.evaluate(beyond, dome, off.copy(), 0, 0, 3, 1.07).dex == -np.inf
 
 
 @pytest.mark.slow
@@ -146,12 +152,12 @@ def test_leds_are_matched_within_the_error_of_their_pair_s_direction(
     dome = build_dome_index(leds, LEVER, CAMERA)
     sigma = 0.2 / CAMERA.focal_px
     rays = CAMERA.rays(project(Rotation.identity(), place_m, LEVER, CAMERA))
-    detections = search.build_detections(rays, np.full(6, sigma), dome)._replace(
+    detections = led_search.build_detections(rays, np.full(6, sigma), dome)._replace(
         sigma=np.full(6, sigma)
     )
     apart = 0.03 / (1.2192 - 0.381)
     rolled = Rotation.from_euler("z", sigmas * np.sqrt(2) * sigma / apart).as_matrix()
-    hypothesis = evidence.evaluate(detections, dome, rolled, 0, 0, 1)
+    hypothesis = led_evidence.evaluate(detections, dome, rolled, 0, 0, 1)
     assert len(hypothesis.star) == matched
     assert np.isfinite(hypothesis.dex) == (matched > 0)
 
@@ -159,7 +165,7 @@ def test_leds_are_matched_within_the_error_of_their_pair_s_direction(
 @pytest.mark.parametrize("dead", [[], [1], [1, 4], [0, 2, 5]])
 def test_dead_leds_cost_the_beta_function_of_the_counts(dead: list[int]) -> None:
     """Against the same frame on a dome without these LEDs, by the interpreter; the rest are matched all the same."""
-    plain = interpreted("estimator.identification.leds.evidence")
+    plain = interpreted("estimator.identification.led_evidence")
     place_m = np.column_stack(
         [np.vstack([PLACES_M, [[0.02, 0.045], [0.06, 0.02]]]), np.full(8, 1.2192)]
     )
@@ -171,7 +177,7 @@ def test_dead_leds_cost_the_beta_function_of_the_counts(dead: list[int]) -> None
         dome = build_dome_index(LedMap(rows, place_m[rows], *surface), LEVER, CAMERA)
         dome = dome._replace(prior_volume=1.0)
         sigma = np.full(len(kept), 0.2 / CAMERA.focal_px)
-        detections = search.build_detections(rays, sigma, dome)._replace(sigma=sigma)
+        detections = led_search.build_detections(rays, sigma, dome)._replace(sigma=sigma)
         center = int(np.flatnonzero(rows == 3)[0])
         hypothesis = plain.evaluate(detections, dome, np.eye(3), center, 0, len(kept) - 1)
         assert sorted(hypothesis.observed) == list(range(len(kept)))

@@ -12,11 +12,11 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, on_sphere, on_surface, project
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.core.types import Centroids, StarMatch
-from estimator.identification.leds import search
-from estimator.identification.leds.index import DomeIndex, build_dome_index
+from estimator.identification import led_search
+from estimator.identification.led_index import DomeIndex, build_dome_index
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Settings
 from tests.helpers.interpreted import interpreted
@@ -88,7 +88,7 @@ def lights(
 
 def identified(pixels: Floats, dome: DomeIndex) -> StarMatch | str:
     sigma = np.full(len(pixels), NOISE_PX / CAMERA.focal_px)
-    return search.identify(CAMERA.rays(pixels), sigma, dome)
+    return led_search.identify(CAMERA.rays(pixels), sigma, dome)
 
 
 def names_right(match: StarMatch, names: Floats) -> bool:
@@ -120,7 +120,7 @@ def test_equal_leds_are_told_apart_and_never_wrongly(surface, dead, false, least
         if not isinstance(match, str):
             found += 1
             assert names_right(match, names)
-            assert match.log10_chance <= -search.ACCEPT_DEX
+            assert match.log10_chance <= -led_search.ACCEPT_DEX
     assert found >= least * 80
 
 
@@ -146,12 +146,12 @@ def test_lights_that_fell_anywhere_are_no_attitude():
     dex = []
     for _ in range(200):
         rays = CAMERA.rays(rng.uniform(0, [1599, 1199], (8, 2)))
-        fallen = search.build_detections(rays, np.full(8, NOISE_PX / CAMERA.focal_px), dome)
-        best, _ = search._search(fallen, dome, 10**7)
+        fallen = led_search.build_detections(rays, np.full(8, NOISE_PX / CAMERA.focal_px), dome)
+        best, _ = led_search._search(fallen, dome, 10**7)
         dex.append(best.dex)
     # At most .1 of them, and three deviations of a binomial count.
     assert np.mean(np.array(dex) > 1) <= 0.1 + 3 * np.sqrt(0.09 / 200)
-    assert max(dex) < search.ACCEPT_DEX
+    assert max(dex) < led_search.ACCEPT_DEX
 
 
 @pytest.mark.parametrize("surface", [OVAL, FLAT], ids=["ellipsoid", "flat"])
@@ -212,7 +212,7 @@ def seen_by_tracker(leds: LedMap, yaw_deg: float) -> tuple[str, float]:
     "turns", [(0.0, 180.0), (0.0, 120.0, 240.0)], ids=["two boards", "three boards"]
 )
 def test_a_pattern_that_is_its_own_twin_is_called_ambiguous(turns):
-    assert seen_by_tracker(boards(turns, extra=False), 33.0)[0] == search.AMBIGUOUS
+    assert seen_by_tracker(boards(turns, extra=False), 33.0)[0] == led_search.AMBIGUOUS
 
 
 def test_one_light_that_breaks_the_symmetry_is_enough():
@@ -227,7 +227,7 @@ def test_too_few_lights_are_no_attitude():
     dome = build_dome_index(leds, LEVER, CAMERA)
     for count in range(3):
         pixels = np.random.default_rng(13).uniform(0, [1599, 1199], (count, 2))
-        assert identified(pixels.reshape(-1, 2), dome) == search.NO_MATCH
+        assert identified(pixels.reshape(-1, 2), dome) == led_search.NO_MATCH
 
 
 @pytest.mark.long
@@ -314,7 +314,7 @@ def test_the_index_knows_the_errors_and_the_field_as_angles() -> None:
 
 # ---- steps of the search, by the interpreter
 
-PLAIN = interpreted("estimator.identification.leds.search")
+PLAIN = interpreted("estimator.identification.led_search")
 
 
 def test_an_led_near_a_direction_is_found_as_by_brute_force() -> None:
@@ -352,7 +352,7 @@ def test_a_pair_s_gates_are_the_error_of_where_it_puts_a_detection() -> None:
     b = 2
     places = np.array([[0.05, 0.02], [0.0, 0.03], [-0.04, 0.01], [0.07, -0.05]])
     rays = np.column_stack([places, np.ones(4)])
-    detections = search.build_detections(
+    detections = led_search.build_detections(
         rays / np.linalg.norm(rays, axis=1, keepdims=True), np.full(4, sigma), dome
     )
     seen = places[:, 0] + 1j * places[:, 1]
@@ -391,7 +391,7 @@ def test_the_quick_check_counts_until_it_knows(dead: list[int], required: int, f
     kept = np.setdiff1d(np.arange(5), dead)
     dome = build_dome_index(LedMap(kept, position_m[kept], *FLAT), lever, camera) if dead else whole
     rays = camera.rays(project(Rotation.identity(), position_m, lever, camera))
-    detections = search.build_detections(rays, np.full(5, 1e-5), dome)
+    detections = led_search.build_detections(rays, np.full(5, 1e-5), dome)
     gates = np.full(5, 1e-4)
     R_grid_from_cam = dome.grid.R_grid_from_lab
     median_m = dome.median_radius_m
@@ -399,7 +399,7 @@ def test_the_quick_check_counts_until_it_knows(dead: list[int], required: int, f
         PLAIN._quick_check(detections, dome, R_grid_from_cam, 1.0, median_m, 0, 1, gates, required)
         == found
     )
-    zoomed = search.build_detections(
+    zoomed = led_search.build_detections(
         camera.zoomed(1 / 1.08).rays(camera.pixels(rays)),
         np.full(5, 1e-5),
         dome,
@@ -426,7 +426,7 @@ def test_a_pair_tells_the_focal_length_at_which_it_is_two_leds(ratio: float) -> 
         for one in ((rays[0], dome, 1.1), (rays[1], dome, 1.3))
     ]
     pixels = CAMERA.pixels(rays)
-    seen = search.build_detections(
+    seen = led_search.build_detections(
         CAMERA.zoomed(1 / ratio).rays(pixels), np.full(2, 1e-5), dome, focal_uncertainty=0.12
     )
     chord = float(np.linalg.norm(ends[0] - ends[1]))
@@ -455,7 +455,7 @@ def test_a_pair_s_attitude_is_worth_its_volume_among_all_attitudes() -> None:
     dome = build_dome_index(spread(60, OVAL, seed=1), LEVER, CAMERA)
     rays = np.array([[0.05, 0.02, 1.0], [-0.04, 0.01, 1.0]])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    detections = search.build_detections(rays, np.array([1e-5, 2e-5]), dome)
+    detections = led_search.build_detections(rays, np.array([1e-5, 2e-5]), dome)
     across = detections.sigma.min() / np.sqrt(2)
     apart = np.hypot(0.09, 0.01)
     covariance = np.diag([across, across, np.sqrt(2) * detections.sigma.min() / apart]) ** 2
@@ -556,10 +556,10 @@ def test_lights_that_fell_anywhere_have_no_attitude_at_any_focal_length() -> Non
     dex = []
     for _ in range(200):
         rays = CAMERA.rays(rng.uniform(0, [1599, 1199], (8, 2)))
-        fallen = search.build_detections(
+        fallen = led_search.build_detections(
             rays, np.full(8, NOISE_PX / CAMERA.focal_px), dome, focal_uncertainty=0.12
         )
-        best, _ = search._search(fallen, dome, 10**7)
+        best, _ = led_search._search(fallen, dome, 10**7)
         dex.append(best.dex)
     assert np.mean(np.array(dex) > 1) <= 0.1 + 3 * np.sqrt(0.09 / 200)
-    assert max(dex) < search.ACCEPT_DEX
+    assert max(dex) < led_search.ACCEPT_DEX

@@ -15,28 +15,22 @@ from scipy.spatial.transform import Rotation
 
 from estimator.catalog import pair_index
 from estimator.catalog.catalog import unit
-from estimator.core.arrays import Floats
-from estimator.identification.options import Options
+from estimator.core.checks import Floats
 from estimator.identification.published import pyramid
-from estimator.identification.published.saa_search import (
-    UNMATCHED_COST,
-    Gates,
-    Primary,
-    SearchInput,
-)
-from estimator.identification.published.shefex import FOURTH_STAR, SearchOptions
+from estimator.identification.published.saa import UNMATCHED_COST, Gates, Primary, SearchInput
+from estimator.identification.published.shefex import FOURTH_STAR, ShefexOptions
 from estimator.identification.registry import IDENTIFIERS
+from estimator.identification.solver_options import Options
 from tests.helpers.interpreted import interpreted
 
 PLAIN = interpreted("estimator.identification.registry").IDENTIFIERS
-PYRAMID, SHEFEX, FIALHO, SAA, SEARCH, DIRECT = (
+PYRAMID, SHEFEX, FIALHO, SAA, DIRECT = (
     interpreted(f"estimator.identification.{name}")
     for name in (
         "published.pyramid",
         "published.shefex",
         "published.fialho",
         "published.saa",
-        "published.saa_search",
         "direct_match",
     )
 )
@@ -195,7 +189,7 @@ def test_a_triangle_s_sides_must_agree_on_one_focal_length(
     """The stretch of 0.015 is one factor of all sides if the focal length is unknown, and else each side's own."""
     sides = np.array([0.1, 0.12, 0.14])
     index = pair_index.build(triangle(sides * scale), 0.2)
-    options = pyramid.SearchOptions(1e-5, 0.015, unknown, 10, 1000, 3, 0.0, -1.0, 1.0, -1.0, 1.0)
+    options = pyramid.PyramidOptions(1e-5, 0.015, unknown, 10, 1000, 3, 0.0, -1.0, 1.0, -1.0, 1.0)
     tried = np.zeros(3, np.int64)
     PYRAMID._triangle(triangle(sides), index, np.arange(3), options, tried)
     assert tried[1] == hypotheses
@@ -217,7 +211,7 @@ def test_a_side_may_be_off_by_both_directions_errors_and_its_stretch(
     own_stretch = (stretch / 3 if unknown else stretch) * sides[side]
     longer = sides + np.eye(3)[side] * (share * np.sqrt(2) * tolerance + own_stretch) / part
     index = pair_index.build(triangle(longer), 0.2)
-    options = pyramid.SearchOptions(tolerance, stretch, unknown, 10, 1000, 3, 0.0, *EDGES)
+    options = pyramid.PyramidOptions(tolerance, stretch, unknown, 10, 1000, 3, 0.0, *EDGES)
     tried = np.zeros(3, np.int64)
     PYRAMID._triangle(triangle(sides), index, np.arange(3), options, tried)
     assert tried[1] == hypotheses
@@ -229,7 +223,7 @@ def test_a_fourth_star_has_its_angles_to_all_three_corners() -> None:
     tolerance = 1e-4
     taken = 0
     corners = unit(np.array([[0.1, 0.02, 1], [-0.06, 0.08, 1], [-0.03, -0.09, 1]]))
-    options = pyramid.SearchOptions(tolerance, 0.0, False, 10, 1000, 4, 0.0, *EDGES)
+    options = pyramid.PyramidOptions(tolerance, 0.0, False, 10, 1000, 4, 0.0, *EDGES)
     for _ in range(100):
         fourth = unit(np.array([[0.03, 0.05, 1]]))
         moved = unit(fourth + rng.normal(0, 1.5 * tolerance, 3))
@@ -271,7 +265,7 @@ def test_as_many_triangles_are_tried_as_allowed(name: str) -> None:
 
 def test_a_pyramid_s_chance_counts_the_hypotheses_tried() -> None:
     rays, _, rows, index, _ = field(4)
-    options = pyramid.SearchOptions(TOLERANCE_RAD, 0.0, False, 10, 10**6, 12, 0.0, *EDGES)
+    options = pyramid.PyramidOptions(TOLERANCE_RAD, 0.0, False, 10, 10**6, 12, 0.0, *EDGES)
     tried = np.array([0, 40, 0])
     match = PYRAMID._triangle(rays, index, np.arange(3), options, tried)
     np.testing.assert_array_equal(match.star, rows[match.observed])
@@ -306,7 +300,7 @@ def test_shefex_s_gates_have_the_least_area_of_their_crossing_rings() -> None:
             [[0.1, 0.02, 1], [-0.06, 0.08, 1], [-0.03, -0.09, 1], [0.02, 0.03, 1], [0.06, -0.08, 1]]
         )
     )
-    options = SearchOptions(1e-5, 1e-6, 100, 10**6, 5)
+    options = ShefexOptions(1e-5, 1e-6, 100, 10**6, 5)
     gates = SHEFEX._angle_gates(rays, np.arange(3), options)
     assert (gates[:3, 9] == 0).all()
     for n in (3, 4):
@@ -322,7 +316,7 @@ def test_shefex_s_gates_have_the_least_area_of_their_crossing_rings() -> None:
 
 def test_shefex_counts_the_other_stars_in_the_gates_by_the_binomial_law() -> None:
     rays, _, rows, index, _ = field(2)
-    options = SearchOptions(2e-5, TOLERANCE_RAD, 100, 10**6, 12)
+    options = ShefexOptions(2e-5, TOLERANCE_RAD, 100, 10**6, 12)
     tried = np.zeros(3, np.int64)
     match = SHEFEX.search(rays, index, options, tried)
     np.testing.assert_array_equal(match.star, rows[match.observed])
@@ -358,7 +352,7 @@ def test_shefex_takes_the_star_whose_three_angles_fit_best() -> None:
         rays = cap(rng, 4, 0.15)
         strays = cap(rng, 300, 0.17)
         index = pair_index.build(np.vstack([rays[:3], strays]), 0.4)
-        gates = SHEFEX._angle_gates(rays, np.arange(3), SearchOptions(1e-3, 1e-6, 1, 1, 4))
+        gates = SHEFEX._angle_gates(rays, np.arange(3), ShefexOptions(1e-3, 1e-6, 1, 1, 4))
         cosines = rays[:3] @ index.vectors.T
         tried = np.zeros(3, np.int64)
         angles = np.arccos(np.clip(cosines, -1, 1))
@@ -381,7 +375,7 @@ def test_shefex_takes_the_star_whose_three_angles_fit_best() -> None:
 def test_four_stars_are_the_least_of_shefex_s_match() -> None:
     """The paper's own rule takes any fourth star."""
     rays, _, rows, index, _ = field(2)
-    options = SearchOptions(2e-6, TOLERANCE_RAD, 10, 10**6, 12, accept=FOURTH_STAR)
+    options = ShefexOptions(2e-6, TOLERANCE_RAD, 10, 10**6, 12, accept=FOURTH_STAR)
     match = SHEFEX.search(rays[:4], index, options._replace(base=4), np.zeros(3, np.int64))
     np.testing.assert_array_equal(match.star, rows[:4])
     strays = np.vstack([rays[:3], unit(np.array([[0.012, 0.034, 1.0]]))])
@@ -518,7 +512,7 @@ def test_saa_s_partner_meets_the_four_conditions_at_the_least_cost() -> None:
         nearby = np.empty(302, np.int64)
         partner = np.empty(3, np.int64)
         cost = np.empty(3)
-        SEARCH._partners(stars, primary, 0, 1, nearby, partner, cost)
+        SAA._partners(stars, primary, 0, 1, nearby, partner, cost)
         for k, n in enumerate((1, 3, 4)):
             distance = np.linalg.norm(
                 index.vectors - seen[n], axis=1
@@ -542,7 +536,7 @@ def test_two_stars_of_one_partner_leave_it_to_the_cheaper() -> None:
     for costs, kept in (([1.0, 2.0], 0), ([2.0, 1.0], 2)):
         partner = np.array([7, 3, 7, -1])
         cost = np.array([costs[0], 5.0, costs[1], UNMATCHED_COST])
-        assert SEARCH._remove_duplicates(partner, cost) == 2
+        assert SAA._remove_duplicates(partner, cost) == 2
         assert partner.tolist() == [7 if kept == 0 else -1, 3, 7 if kept == 2 else -1, -1]
         assert cost[2 - kept] == UNMATCHED_COST
         assert cost[kept] == 1

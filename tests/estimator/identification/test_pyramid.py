@@ -8,8 +8,8 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from estimator.catalog import catalog, pair_index
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identification.published.pyramid import _scale_tangents, pyramid

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from estimator.catalog import quad_index, sky_index
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids
-from estimator.identification.stars import quads, search
+from estimator.identification import star_quads, star_search
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from tests.helpers.star_fields import (
@@ -96,7 +96,7 @@ def test_a_code_is_the_same_in_every_order_and_at_every_scale() -> None:
         for ratio in (0.9, 1.0, 1.1):
             detections = detections_of(ratio * tangent[list(order)], np.full(4, 5.0))
             quad = np.arange(4)
-            quads._longest_first(detections.tangent, quad)
+            star_quads._longest_first(detections.tangent, quad)
             code, _ = code_of(rays_of(detections.tangent[quad]))
             np.testing.assert_allclose(code, expected, atol=0.2 * 0.03**2)
             assert {order[quad[0]], order[quad[1]]} == {0, 1}
@@ -108,7 +108,7 @@ def rays_of(tangent):
 
 
 def identify(detections, calibrated=False):
-    return quads.identify(detections, all_quads(), SKY, SEARCHED, CHECKS, calibrated)
+    return star_quads.identify(detections, all_quads(), SKY, SEARCHED, CHECKS, calibrated)
 
 
 @pytest.mark.parametrize("ratio", [0.955, 1.0, 1.045])
@@ -167,7 +167,7 @@ def test_the_effort_is_bounded() -> None:
     tangent = rng.uniform(FIELD[[0, 2]], FIELD[[1, 3]], (40, 2))
     tangent = np.concatenate([tangent, observe(Rotation.identity(), rng)[0]])
     loose = detections_of(tangent, np.full(len(tangent), np.nan), sigma=3e-4, zoom=0.05)
-    assert not len(quads.identify(loose, all_quads(), SKY, SEARCHED, 0, False).star)
+    assert not len(star_quads.identify(loose, all_quads(), SKY, SEARCHED, 0, False).star)
 
 
 def test_a_right_focal_length_is_kept() -> None:
@@ -204,4 +204,4 @@ def test_a_calibrated_tracker_finds_that_its_focal_length_is_wrong() -> None:
                 == camera.focal_px
             )
     assert np.mean(solved) > 0.9
-    assert search.DECISIVE_DEX == 10.0
+    assert star_search.DECISIVE_DEX == 10.0

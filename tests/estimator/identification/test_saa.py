@@ -11,10 +11,9 @@ from estimator.attitude.nearfield import thesis_points
 from estimator.calibration.home_position import Sighting, calibrate
 from estimator.catalog import pair_index
 from estimator.catalog.catalog import unit
-from estimator.catalog.pair_buckets import ARCSEC_RAD, PairCatalog, build_pair_catalog
-from estimator.core.arrays import Floats
+from estimator.catalog.pair_index import ARCSEC_RAD, PairCatalog, build_pair_catalog
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.types import StarMatch
 from estimator.identification.published.saa import saa
 

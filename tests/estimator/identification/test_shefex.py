@@ -5,10 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from estimator.catalog import catalog, pair_index
-from estimator.core.arrays import Floats
+from estimator.core.checks import Floats
 from estimator.identification.published.master_star import master_star
 from estimator.identification.published.shefex import (
-    SearchOptions,
+    ShefexOptions,
     angle_interval,
     cos_error,
     search,
@@ -62,7 +62,7 @@ def test_no_triangle_is_begun_once_the_effort_is_used_up(
     seen = catalog.unit(screen(np.random.default_rng(5))[:6])
     index = pair_index.build(SCREEN_CORNERS, 0.5)
     tried = np.zeros(3, np.int64)
-    search(seen, index, SearchOptions(1e-9, 1e-7, triangles, checks, base=6), tried)
+    search(seen, index, ShefexOptions(1e-9, 1e-7, triangles, checks, base=6), tried)
     assert tried[2] == begun
 
 

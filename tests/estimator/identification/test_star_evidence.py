@@ -9,7 +9,7 @@ from scipy.special import betaln
 from scipy.stats import norm
 
 from estimator.catalog import sky_index
-from estimator.identification.stars import evidence
+from estimator.identification import star_evidence
 from tests.helpers.interpreted import interpreted
 
 FIELD = np.tan(np.radians([-5.0, 5.0, -4.0, 4.0]))
@@ -34,19 +34,19 @@ RAYS /= np.linalg.norm(RAYS, axis=1, keepdims=True)
 SKY = sky_index.build_without_pairs(TRUTH.inv().apply(RAYS), np.arange(1.0, 9.0))
 
 
-def seen(tangent: np.ndarray) -> evidence.Detections:
+def seen(tangent: np.ndarray) -> star_evidence.Detections:
     """Detections without magnitudes, as accurate along as across."""
     sigma = np.full(len(tangent), SIGMA)
     weight = np.column_stack([sigma**-2, sigma**-2, 0 * sigma])
-    return evidence.Detections(
+    return star_evidence.Detections(
         tangent.copy(), sigma, weight, np.full(len(tangent), np.nan), 0.25, FIELD, 0.0, np.nan
     )
 
 
-def evaluated(tangent: np.ndarray) -> evidence.Hypothesis:
+def evaluated(tangent: np.ndarray) -> star_evidence.Hypothesis:
     """The hypothesis of the true attitude; its evidence is not limited."""
     gates = np.full(len(tangent), 0.01)
-    return evidence.evaluate(seen(tangent), SKY, TRUTH.as_matrix(), 1.0, gates, -np.inf)
+    return star_evidence.evaluate(seen(tangent), SKY, TRUTH.as_matrix(), 1.0, gates, -np.inf)
 
 
 def test_evidence_is_the_integral_over_all_attitudes() -> None:
@@ -83,10 +83,10 @@ def test_missing_stars_cost_the_beta_function_of_the_counts(missing: int) -> Non
     kept = np.setdiff1d(np.arange(len(TANGENT)), gone)
     fewer = sky_index.build_without_pairs(SKY.vectors[kept], SKY.mag[kept])
     gates = np.full(4, 0.01)
-    here = evidence.evaluate(seen(tangent), fewer, TRUTH.as_matrix(), 1.0, gates, -np.inf)
+    here = star_evidence.evaluate(seen(tangent), fewer, TRUTH.as_matrix(), 1.0, gates, -np.inf)
     none = np.setdiff1d(np.arange(len(TANGENT)), [3, 4, 5])
     bare = sky_index.build_without_pairs(SKY.vectors[none], SKY.mag[none])
-    whole = evidence.evaluate(seen(tangent), bare, TRUTH.as_matrix(), 1.0, gates, -np.inf)
+    whole = star_evidence.evaluate(seen(tangent), bare, TRUTH.as_matrix(), 1.0, gates, -np.inf)
     toll = (betaln(5, missing + 1) - betaln(5, 1)) / np.log(10)
     assert here.dex - whole.dex == pytest.approx(toll, abs=1e-9)
 
@@ -98,7 +98,7 @@ def test_stars_to_the_limiting_magnitude_are_missed(limit_mag: float, missing: i
     gates = np.full(4, 0.01)
     dex = []
     for limit in 4.4, limit_mag:
-        found = evidence.evaluate(
+        found = star_evidence.evaluate(
             lights._replace(limit_mag=limit), SKY, TRUTH.as_matrix(), 1.0, gates, -np.inf
         )
         assert found.star.tolist() == [0, 1, 2, 3]
@@ -111,7 +111,7 @@ def test_stars_outside_of_the_field_are_not_missed() -> None:
     """The faintest match is fainter than all; the eighth star is out of the field, one more is behind the camera."""
     behind = np.vstack([-SKY.vectors[:1], SKY.vectors[:7]])
     sky = sky_index.build_without_pairs(behind, np.arange(1.0, 9.0))
-    hypothesis = evidence.evaluate(
+    hypothesis = star_evidence.evaluate(
         seen(TANGENT[:7]), sky, TRUTH.as_matrix(), 1.0, np.full(7, 0.01), -np.inf
     )
     assert hypothesis.dex == pytest.approx(evaluated(TANGENT[:7]).dex, abs=1e-9)
@@ -133,7 +133,7 @@ def test_bright_strays_cost_half_a_power_of_ten_each_beyond_the_matches() -> Non
 def test_the_focal_length_is_measured_within_its_uncertainty(ratio: float) -> None:
     """All tangents are `ratio` times those of the assumed focal length, known to 0.01; twice that is no solution."""
     detections = seen(ratio * TANGENT[:7])._replace(focal_uncertainty=0.01)
-    hypothesis = evidence.evaluate(
+    hypothesis = star_evidence.evaluate(
         detections, SKY, TRUTH.as_matrix(), 1.0, np.full(7, 0.01), -np.inf
     )
     solved = abs(ratio - 1) < 0.01
@@ -152,7 +152,7 @@ def test_a_match_is_within_three_and_a_half_standard_deviations(
     detections = seen(TANGENT[:7])
     detections.tangent[6] += sigmas * wide * np.array([0.6, 0.8])
     detections.sigma[6], detections.weight[6, :2] = wide, wide**-2
-    hypothesis = evidence.evaluate(
+    hypothesis = star_evidence.evaluate(
         detections, SKY, TRUTH.as_matrix(), 1.0, np.full(7, 0.01), -np.inf
     )
     assert len(hypothesis.star) == matched
@@ -167,11 +167,15 @@ def test_the_magnitudes_density_is_that_of_the_smoothed_catalog() -> None:
     sky = sky_index.build_without_pairs(vectors, mag)
     for value in (3.0, 4.0, 5.0, 5.5):
         wanted = np.mean(norm.pdf(value, mag, sky_index.MAG_SMOOTHING))
-        assert evidence.magnitude_density(sky, value) == pytest.approx(
+        assert star_evidence.magnitude_density(sky, value) == pytest.approx(
             wanted, rel=0.1
         )  # of bins of MAG_STEP
-    assert evidence.magnitude_density(sky, -9.0) == evidence.magnitude_density(sky, mag[0])
-    assert evidence.magnitude_density(sky, 30.0) == evidence.magnitude_density(sky, mag[-1] + 2)
+    assert star_evidence.magnitude_density(sky, -9.0) == star_evidence.magnitude_density(
+        sky, mag[0]
+    )
+    assert star_evidence.magnitude_density(sky, 30.0) == star_evidence.magnitude_density(
+        sky, mag[-1] + 2
+    )
 
 
 @pytest.mark.parametrize("star", [0, 20, 59])
@@ -183,8 +187,10 @@ def test_a_magnitude_s_likelihoods_of_one_star_add_up_to_one(star: int) -> None:
     mag = np.arange(-2, 10, 1e-3)
     share = 0.8
     detections = seen(np.zeros((len(mag), 2)))._replace(mag=mag)
-    ratio = [evidence._magnitude_ratio(detections, sky, n, star, share) for n in range(len(mag))]
-    density = [evidence.magnitude_density(sky, value) / share for value in mag]
+    ratio = [
+        star_evidence._magnitude_ratio(detections, sky, n, star, share) for n in range(len(mag))
+    ]
+    density = [star_evidence.magnitude_density(sky, value) / share for value in mag]
     # Of 5 stars in 100, variable ones and the like, the magnitude is any of those seen.
     assert np.dot(ratio, density) * 1e-3 == pytest.approx(
         0.95 + 0.05 * np.sum(density) * 1e-3, rel=2e-3
@@ -194,7 +200,7 @@ def test_a_magnitude_s_likelihoods_of_one_star_add_up_to_one(star: int) -> None:
 @pytest.mark.parametrize("uncertain", [0.0, 0.01])
 def test_the_information_is_that_of_the_projection_s_slopes(uncertain: float) -> None:
     """J' W J of the tangents' derivatives by rotation and log focal length, by differences; in the interpreter."""
-    plain = interpreted("estimator.identification.stars.evidence")
+    plain = interpreted("estimator.identification.star_evidence")
     detections = seen(1.01 * TANGENT[:7])
     rows = np.arange(7)
     R = TRUTH.as_matrix()

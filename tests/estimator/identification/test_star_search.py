@@ -8,13 +8,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.catalog import sky_index
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.core.types import NO_SPREAD
 from estimator.core.vectors import quaternion_xyzw
-from estimator.identification.stars import detections as detections_module
-from estimator.identification.stars import evidence, search
-from estimator.identification.stars.detections import FlatCentroids, Sensor, changed, gates_of
-from estimator.identification.stars.evidence import Solution
+from estimator.identification import star_detections as detections_module
+from estimator.identification import star_evidence, star_search
+from estimator.identification.star_detections import FlatCentroids, Sensor, changed, gates_of
+from estimator.identification.star_evidence import Solution
 from tests.helpers.interpreted import interpreted
 from tests.helpers.star_fields import (
     CHECKS,
@@ -32,8 +32,8 @@ from tests.helpers.star_fields import (
 )
 
 
-def solve(detections: evidence.Detections, sky: sky_index.SkyIndex = SKY) -> Solution:
-    return search.lost_in_space(detections, sky, SEARCHED, CHECKS)
+def solve(detections: star_evidence.Detections, sky: sky_index.SkyIndex = SKY) -> Solution:
+    return star_search.lost_in_space(detections, sky, SEARCHED, CHECKS)
 
 
 @pytest.mark.slow
@@ -222,7 +222,7 @@ def test_a_sky_that_repeats_is_ambiguous() -> None:
     once = sky_index.build(sparse, sparse_mag, WIDE_RAD)
     loose = 5e-4
     dex = np.inf
-    while not search.ACCEPT_DEX < dex < search.DECISIVE_DEX:
+    while not star_search.ACCEPT_DEX < dex < star_search.DECISIVE_DEX:
         truth = Rotation.random(rng=rng)
         tangent, mag, row = observe(truth, rng, sigma=loose, vectors=sparse, mag=sparse_mag)
         dex = solve(detections_of(tangent, mag, sigma=loose), once).dex if len(row) > 3 else np.inf
@@ -255,7 +255,7 @@ def test_the_normal_equations_are_solved(seed: int) -> None:
     matrix = half @ half.T + 0.1 * np.eye(4)
     right = rng.normal(size=4)
     np.testing.assert_allclose(
-        matrix @ evidence.cholesky_solve(matrix.copy(), right), right, rtol=0, atol=1e-10
+        matrix @ star_evidence.cholesky_solve(matrix.copy(), right), right, rtol=0, atol=1e-10
     )
 
 
@@ -275,14 +275,14 @@ def test_a_matrix_is_its_quaternion(seed: int, axis) -> None:
 
 # ---- steps of the search, by the interpreter
 
-PLAIN = interpreted("estimator.identification.stars.search")
+PLAIN = interpreted("estimator.identification.star_search")
 PLACES = np.array(
     [[0.01, 0.02], [-0.05, 0.03], [0.06, -0.04], [-0.02, -0.06], [0.03, 0.0], [0.012, 0.018]]
 )
 UNEQUAL = np.array([1, 2, 3, 1.5, 1, 1]) * SIGMA
 
 
-def unequal(zoom: float = 0.0) -> evidence.Detections:
+def unequal(zoom: float = 0.0) -> star_evidence.Detections:
     """Six detections of magnitudes 3, 4, ..., the last one's unknown, of unequal errors."""
     mag = np.array([3.0, 4.0, 5.0, 5.5, 6.0, np.nan])
     return detections_of(PLACES, mag, zoom=zoom)._replace(sigma=UNEQUAL)
@@ -388,7 +388,7 @@ def test_a_pair_s_attitude_counts_as_laplace_s_integral(zoom: float) -> None:
     )
     info = np.zeros((4, 4))
     both = np.arange(2)
-    evidence._fit(detections, sky, np.eye(3), 1.0, both, both, info)
+    star_evidence._fit(detections, sky, np.eye(3), 1.0, both, both, info)
     count = 4 if zoom else 3
     volume = 8 * np.pi**2 * (2 * zoom if zoom else 1)
     wanted = np.log10(
@@ -439,10 +439,12 @@ def test_all_lights_must_confirm_what_the_brightest_tell(limit_mag: float, match
         np.concatenate([tangent[:4], false]), np.append(mag[:4], np.full(100, 6.0))
     )
     few = changed(lights, 4, 1.0, 0.0)
-    candidate = evidence.evaluate(few, SKY, truth.as_matrix(), 1.0, gates_of(few, 1.5), -np.inf)
-    assert candidate.dex > search.ACCEPT_DEX
-    found = search.fit_to_all(
-        lights._replace(limit_mag=limit_mag), SKY, candidate, search.ACCEPT_DEX, True, False
+    candidate = star_evidence.evaluate(
+        few, SKY, truth.as_matrix(), 1.0, gates_of(few, 1.5), -np.inf
+    )
+    assert candidate.dex > star_search.ACCEPT_DEX
+    found = star_search.fit_to_all(
+        lights._replace(limit_mag=limit_mag), SKY, candidate, star_search.ACCEPT_DEX, True, False
     )
     assert len(found.star) == matches
 

@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.detection.detect import DETECTORS
-from estimator.trackers.exposure_control import Control, Exposure, Observation, observe, step
-from skysim.camera.detector.detector import saturation_dn
+from estimator.trackers.exposure_control import Control, NextExposure, Observation, observe, step
+from skysim.camera.detector import saturation_dn
 from skysim.scene import loader
 from skysim.scene.sections.light import UniformGlowConfig
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.lights.background import Background
+from skysim.simulation.lights.starlight import BackgroundLight
 
 CONTROL = Control(mean_dn=100.0)
 GOOD = Observation(mean_dn=40.0, stars=12, overexposed=0)
@@ -40,14 +40,14 @@ GOOD = Observation(mean_dn=40.0, stars=12, overexposed=0)
 def test_each_branch_of_the_chart(
     seen: Observation, change_s: float, saturated: bool, no_stars: bool
 ) -> None:
-    after = step(Exposure(0.03), seen, CONTROL)
+    after = step(NextExposure(0.03), seen, CONTROL)
     # Microseconds are whole; their sum is not, in binary.
     assert after.time_s == pytest.approx(0.03 + change_s, abs=1e-12)
     assert (after.saturated, after.no_stars) == (saturated, no_stars)
 
 
 def run(start_s: float, seen: Observation, count: int, control: Control) -> list[float]:
-    states = [Exposure(start_s)]
+    states = [NextExposure(start_s)]
     for _ in range(count):
         states.append(step(states[-1], seen, control))
     return [state.time_s for state in states]
@@ -129,7 +129,7 @@ def lab() -> Lab:
 def lit(lab: Lab, glare_e_s: float) -> Lab:
     """The lab with light from a body at the baffle's edge on the whole chip."""
     glow = (UniformGlowConfig(kind="uniform", e_s=glare_e_s),) if glare_e_s else ()
-    return lab.with_light(Background(glow))
+    return lab.with_light(BackgroundLight(glow))
 
 
 def exposed(lab: Lab, time_s: float) -> Lab:
@@ -139,9 +139,9 @@ def exposed(lab: Lab, time_s: float) -> Lab:
 
 def flown(
     lab: Lab, glare_e_s: list[float], start_s: float, control: Control
-) -> tuple[list[Exposure], list[Observation]]:
+) -> tuple[list[NextExposure], list[Observation]]:
     """Frame after frame: taken with the exposure that the chart asked for, under the glare of its moment."""
-    state = Exposure(start_s)
+    state = NextExposure(start_s)
     states = []
     seen = []
     saturation = saturation_dn(lab.scene.camera.detector)

@@ -16,13 +16,13 @@ from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.catalog import catalog
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.core.types import Centroids, FramePriors
 from estimator.detection.detect import DETECTORS
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import TrackingMode
-from skysim.core.paths import CATALOGS
+from skysim.core.files import CATALOGS
 from skysim.results import metrics
 from tests.helpers import hostile
 

@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids
-from estimator.identification.stars.detections import information_of
+from estimator.identification.star_detections import information_of
+from estimator.trackers import misfit
+from estimator.trackers.misfit import ARCSEC_RAD, ERROR_RAD, SHARE
 from estimator.trackers.pipeline import Settings
-from estimator.trackers.residuals import companions
-from estimator.trackers.residuals.companions import ARCSEC_RAD, ERROR_RAD, SHARE
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.paths import CATALOGS
+from skysim.core.files import CATALOGS
 from tests.helpers.laws import law
 
 CAMERA = Camera.from_fov(4056, 3040, np.radians(22))  # 20 arcseconds a pixel
@@ -56,7 +56,7 @@ def test_a_bright_double_does_not_pull_the_attitude(tracker: StarTracker) -> Non
     assert np.mean(nees) < 18
 
 
-@law(companions.with_companions, companions.are_small)
+@law(misfit.with_companions, misfit.are_small)
 @given(seed=some.integers(0, 10**6))
 def test_coarse_centroids_know_nothing_of_companions(tracker: StarTracker, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -69,9 +69,9 @@ def test_coarse_centroids_know_nothing_of_companions(tracker: StarTracker, seed:
     centroids = Centroids(noisy_px, np.full(len(star), noise_px), np.ones(len(star)))
     detections = tracker.detections(centroids, tracker.sigma_px(centroids))
     solution, _ = tracker._search(centroids, tracker.sigma_px(centroids), tracker.searches[0])
-    after, errors = companions.with_companions(solution, detections, tracker.sky)
-    assert companions.are_small(detections.sigma)
-    assert not companions.are_small(detections.sigma / 3)
+    after, errors = misfit.with_companions(solution, detections, tracker.sky)
+    assert misfit.are_small(detections.sigma)
+    assert not misfit.are_small(detections.sigma / 3)
     assert after is solution
     assert errors is detections
 
@@ -84,7 +84,7 @@ def test_the_information_holds_each_weight_at_its_axes(seed: int) -> None:
         assert matrix.tolist() == [[row[0], row[2]], [row[2], row[1]]]
 
 
-@law(companions.prediction_by_others)
+@law(misfit.prediction_by_others)
 @given(seed=some.integers(0, 10**6), count=some.integers(4, 12))
 def test_the_prediction_is_that_of_a_fit_without_the_star(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
@@ -102,7 +102,7 @@ def test_the_prediction_is_that_of_a_fit_without_the_star(seed: int, count: int)
 
     every = np.arange(count)
     at_best = residual - jacobian @ fit(every)[0]
-    alone, spread = companions.prediction_by_others(at_best, jacobian, information)
+    alone, spread = misfit.prediction_by_others(at_best, jacobian, information)
     for k in range(count):
         step, covariance = fit(np.delete(every, k))
         assert alone[k] == pytest.approx(residual[k] - jacobian[k] @ step, rel=1e-3, abs=1e-3)
@@ -111,7 +111,7 @@ def test_the_prediction_is_that_of_a_fit_without_the_star(seed: int, count: int)
         )
 
 
-@law(companions.mean_information)
+@law(misfit.mean_information)
 @given(sigma=some.floats(0.02, 2.0), off=some.floats(0.0, 20.0), spread=some.floats(0.0, 2.0))
 def test_a_star_loses_information_only_by_what_companions_explain(
     sigma: float, off: float, spread: float
@@ -119,9 +119,7 @@ def test_a_star_loses_information_only_by_what_companions_explain(
     """In arcseconds: between that of its centroid and that of a star with the greatest error."""
     own = np.eye(2)[None] / (sigma * ARCSEC_RAD) ** 2
     residual = np.array([[off, 0.0]]) * ARCSEC_RAD
-    mean = companions.mean_information(own, residual, (spread * ARCSEC_RAD) ** 2 * np.eye(2)[None])[
-        0
-    ]
+    mean = misfit.mean_information(own, residual, (spread * ARCSEC_RAD) ** 2 * np.eye(2)[None])[0]
     least = 1 / (sigma**2 + (ERROR_RAD.max() / ARCSEC_RAD) ** 2)
     share = np.diag(mean) * (sigma * ARCSEC_RAD) ** 2
     assert (share <= 1 + 1e-9).all()

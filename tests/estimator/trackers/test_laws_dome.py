@@ -19,11 +19,10 @@ from estimator.attitude.nearfield import SOLVERS
 from estimator.calibration import home_position
 from estimator.calibration.home_position import HomeCatalog, Sighting
 from estimator.catalog import pair_index
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.types import Centroids
-from estimator.identification.leds import index, search
+from estimator.identification import led_index, led_search
 from estimator.trackers import dome_tracker
 from estimator.trackers.dome_tracker import DomeTracker
 from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units
@@ -195,7 +194,12 @@ def eye() -> DomeTracker:
     return DomeTracker(CAMERA, even(150), Lever(np.array([0.01, 0.0, 0.3]), Rotation.identity()))
 
 
-@law(DomeTracker.solve_centroids, search.identify, search.build_detections, dome_tracker.led_pairs)
+@law(
+    DomeTracker.solve_centroids,
+    led_search.identify,
+    led_search.build_detections,
+    dome_tracker.led_pairs,
+)
 @given(rng=SEEDS, false=some.integers(0, 4))
 def test_lights_are_named_as_they_are_or_not_at_all(
     eye: DomeTracker, rng: np.random.Generator, false: int
@@ -216,10 +220,10 @@ def test_lights_are_named_as_they_are_or_not_at_all(
     )
     rays = CAMERA.rays(xy)
     sigma = np.full(len(xy), 1e-4)
-    dome = index.build_dome_index(eye.leds, eye.lever, CAMERA)
-    lights = search.build_detections(rays, sigma, dome)
+    dome = led_index.build_dome_index(eye.leds, eye.lever, CAMERA)
+    lights = led_search.build_detections(rays, sigma, dome)
     np.testing.assert_allclose(np.linalg.norm(lights.direction, axis=1), 1, rtol=0, atol=1e-9)
-    for match in (search.identify(rays, sigma, dome), eye.identify(rays, sigma, None)):
+    for match in (led_search.identify(rays, sigma, dome), eye.identify(rays, sigma, None)):
         named = [] if isinstance(match, str) else match.observed.tolist()
         assert len(set(named)) == len(named)
 
@@ -283,31 +287,36 @@ def test_a_warm_up_changes_no_answer_under_a_dome(
     assert eye.solve(frame).attitude.status == before
 
 
-@law(index.build_dome_index, index.build_grid, index.scale_pair_angles)
+@law(led_index.build_dome_index, led_index.build_grid, led_index.scale_pair_angles)
 @given(rng=SEEDS, count=some.integers(20, 60))
 def test_a_dome_is_laid_out_whole(rng: np.random.Generator, count: int) -> None:
     leds = even(count)
-    dome = index.build_dome_index(leds, lever(rng), CAMERA)
-    grid = index.build_grid(leds.position_m / 1.2)
+    dome = led_index.build_dome_index(leds, lever(rng), CAMERA)
+    grid = led_index.build_grid(leds.position_m / 1.2)
     assert grid.first[-1] == len(grid.direction) == count
     np.testing.assert_allclose(np.sort(dome.radius_m), 1.2, rtol=1e-12, atol=0)
     assert (np.diff(dome.pairs.angle_rad) >= 0).all()
     known = pair_index.build(units(rng, count), 1.0)
-    scaled = index.scale_pair_angles(known, np.full(count, 1.5))
+    scaled = led_index.scale_pair_angles(known, np.full(count, 1.5))
     np.testing.assert_allclose(scaled.angle_rad, 1.5 * known.angle_rad, rtol=1e-12, atol=0)
 
 
-@law(index.corner_rays, index.inner_field, index.cap_height)
+@law(led_index.corner_rays, led_index.inner_field, led_index.cap_height)
 @given(rng=SEEDS, factor=some.floats(0.3, 5), margin_rad=some.floats(0, 3))
 def test_a_field_holds_its_inner_one(
     rng: np.random.Generator, factor: float, margin_rad: float
 ) -> None:
-    corners = index.corner_rays(CAMERA.zoomed(factor))
-    (left, right, top, bottom), half = index.inner_field(corners)
+    corners = led_index.corner_rays(CAMERA.zoomed(factor))
+    (left, right, top, bottom), half = led_index.inner_field(corners)
     assert 0 < right - left < 2 * half[0]
     assert 0 < bottom - top < 2 * half[1]
     directions = units(rng, 5)
-    assert 0 <= index.cap_height(directions, 0.0) <= index.cap_height(directions, margin_rad) <= 2
+    assert (
+        0
+        <= led_index.cap_height(directions, 0.0)
+        <= led_index.cap_height(directions, margin_rad)
+        <= 2
+    )
 
 
 # The claimed error

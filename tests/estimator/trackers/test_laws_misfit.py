@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.solvers import covariance
 from estimator.catalog import catalog
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
+from estimator.core.checks import Floats
 from estimator.core.types import Centroids
-from estimator.identification.stars import evidence, search
-from estimator.identification.stars.detections import changed
+from estimator.identification import star_evidence, star_search
+from estimator.identification.star_detections import changed
+from estimator.trackers import misfit
 from estimator.trackers.pipeline import Settings
-from estimator.trackers.residuals import misfit
 from estimator.trackers.star_tracker import StarTracker
 from tests.helpers.laws import law
 
@@ -103,20 +103,22 @@ def test_wider_errors_without_new_matches_need_no_match(
     _, centroids = field(tracker, 5, CAMERA, claimed)
     detections = tracker.detections(centroids, tracker.sigma_px(centroids))
     wide = changed(detections, len(centroids), 25.0, 0.0)
-    found = search.lost_in_space(wide, tracker.sky, 80, 100_000)
+    found = star_search.lost_in_space(wide, tracker.sky, 80, 100_000)
     R_cam_from_ref = Rotation.from_quat(found.cam_from_ref_xyzw).as_matrix()
     gates = np.full(len(centroids), 0.01)
-    hypothesis = evidence.evaluate(detections, tracker.sky, R_cam_from_ref, 1.0, gates, -np.inf)
+    hypothesis = star_evidence.evaluate(
+        detections, tracker.sky, R_cam_from_ref, 1.0, gates, -np.inf
+    )
     kept = centroids.take(hypothesis.observed)
     detections = tracker.detections(kept, tracker.sigma_px(kept))
-    hypothesis = evidence.evaluate(
+    hypothesis = star_evidence.evaluate(
         detections, tracker.sky, hypothesis.R_cam_from_ref, 1.0, gates[: len(kept)], -np.inf
     )
-    matched = evidence.build_solution(detections, tracker.sky, hypothesis)
+    matched = star_evidence.build_solution(detections, tracker.sky, hypothesis)
     quick, quick_factor = misfit.widened(
         matched, hypothesis.R_cam_from_ref, detections, tracker.sky
     )
-    monkeypatch.setattr(evidence, "count_near", lambda *_: 1)
+    monkeypatch.setattr(star_evidence, "count_near", lambda *_: 1)
     slow, slow_factor = misfit.widened.py_func(
         matched, hypothesis.R_cam_from_ref, detections, tracker.sky
     )

@@ -14,24 +14,25 @@ from scipy import stats
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from estimator.calibration.magnitude_zero import magnitude_zero
+from estimator.calibration.star_field import magnitude_zero
 from estimator.catalog import catalog, pair_index
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.identification.direct_match import to_star_match
-from estimator.identification.options import Options
-from estimator.identification.published import saa_search, shefex
+from estimator.identification.published import saa as saa_search
+from estimator.identification.published import shefex
 from estimator.identification.published.fialho import fialho_1, fialho_2, fialho_3, fialho_4
 from estimator.identification.published.fialho import search_options as fialho_options
 from estimator.identification.published.master_star import master_star
 from estimator.identification.published.pyramid import pyramid
 from estimator.identification.published.saa import AssumptionPool, saa
 from estimator.identification.registry import IDENTIFIERS, STEP, candidates
-from estimator.identification.stars.evidence import Solution
+from estimator.identification.solver_options import Options
+from estimator.identification.star_evidence import Solution
+from estimator.trackers import refinement
 from estimator.trackers.pipeline import Settings
-from estimator.trackers.residuals import refinement
-from estimator.trackers.residuals.refinement import FieldMatcher
+from estimator.trackers.refinement import FieldMatcher
 from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import TrackingMode
 from tests.helpers.laws import (

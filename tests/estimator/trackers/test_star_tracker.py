@@ -11,13 +11,12 @@ from scipy.special import erf
 from estimator.attitude import dome_map
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import catalog
-from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.dome_tracker import SETTINGS, DomeTracker
 from estimator.trackers.pipeline import SATURATED, Clock, Settings, detect_and_centroid
-from estimator.trackers.residuals.refinement import NO_MATCH, mutual_nearest
+from estimator.trackers.refinement import NO_MATCH, mutual_nearest
 from estimator.trackers.star_tracker import NO_STARS, StarTracker
 
 FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"

@@ -16,8 +16,8 @@ from astropy.io import fits
 
 from skysim.apps.cli import main
 from skysim.core.errors import InputError
-from skysim.experiments.characterize import checks, procedure
-from skysim.experiments.characterize.frames import Setting, read_frames, read_stack
+from skysim.experiments.characterize import characterize_camera, frame_files
+from skysim.experiments.characterize.frame_files import Setting, read_frames, read_stack
 
 SIDE = 64
 SHAPE = (SIDE, SIDE)
@@ -119,8 +119,8 @@ def test_numbers_in_the_upper_bits_are_shifted_back(tmp_path: Path, good: Path) 
 
 
 def test_frames_of_an_independent_camera_come_back(good: Path) -> None:
-    config, raw = procedure.read_camera(str(good / "camera.yaml"))
-    found = procedure.measure_sensor(config, good / "darks", good / "flats").estimates
+    config, raw = characterize_camera.read_camera(str(good / "camera.yaml"))
+    found = characterize_camera.measure_sensor(config, good / "darks", good / "flats").estimates
     for key, truth in (
         ("gain_e_dn", GAIN),
         ("read_noise_e", READ),
@@ -298,9 +298,9 @@ def test_frames_that_do_not_tell_are_refused_in_one_line(
     lab(tmp_path)
     spoil(tmp_path)
     (tmp_path / "camera.yaml").write_text(yaml.safe_dump({"camera": CAMERA}), encoding="utf-8")
-    config, _ = procedure.read_camera(str(tmp_path / "camera.yaml"))
+    config, _ = characterize_camera.read_camera(str(tmp_path / "camera.yaml"))
     with pytest.raises(InputError) as refused:
-        procedure.measure_sensor(config, tmp_path / "darks", tmp_path / "flats")
+        characterize_camera.measure_sensor(config, tmp_path / "darks", tmp_path / "flats")
     assert message in str(refused.value)
     assert len(str(refused.value).splitlines()) == 1
 
@@ -338,7 +338,7 @@ def test_hot_pixels_are_no_stars(tmp_path: Path) -> None:
         for n in range(2):
             image = frame(rng, hot * exposure_s / 100, exposure_s)
             write(tmp_path / f"dark_{exposure_s:g}s_{n}.png", image)
-    checks.check_darks(read_stack(tmp_path, SHAPE, BITS))
+    frame_files.check_darks(read_stack(tmp_path, SHAPE, BITS))
 
 
 # The command

@@ -13,15 +13,13 @@ from scipy import special
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration.star_field import disagreement_px
+from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.io import files
 from skysim.core.types import Floats, Frame, Truth
-from skysim.experiments.characterize import preset
-from skysim.experiments.characterize.night import lens, star_images
-from skysim.experiments.characterize.night.lens import NightFrame
-from skysim.experiments.characterize.night.star_images import StarImages
-from skysim.experiments.characterize.sensor.photon_transfer import Transfer
-from skysim.experiments.dome_survey.frames import render_stops
+from skysim.experiments.characterize import characterize_camera, night_sky
+from skysim.experiments.characterize.night_sky import NightFrame, StarImages
+from skysim.experiments.characterize.photon_transfer import Transfer
+from skysim.experiments.dome_survey.survey_frames import render_stops
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.lab import build_lab
@@ -66,7 +64,7 @@ def drawn(
 def fitted(rng: np.random.Generator, *law: float) -> tuple[StarImages, Floats]:
     image, places = drawn(rng, *law)
     start = places + rng.normal(0, 0.1, places.shape)
-    return star_images.fit_images(image, start, GAIN_DN_E, READ_DN**2), places
+    return night_sky.fit_images(image, start, GAIN_DN_E, READ_DN**2), places
 
 
 @pytest.mark.slow
@@ -76,7 +74,7 @@ def test_sizes_over_the_field_are_those_drawn_within_their_errors() -> None:
         stars, places = fitted(np.random.default_rng(seed), 0.7, 0.5)
         assert np.mean(stars.chi2) == pytest.approx(1, abs=0.03)
         assert np.std((stars.xy_px - places)[stars.flux_dn > 1500]) < 0.03
-        size = star_images.image_size(stars, CENTER_PX, CORNER_PX)
+        size = night_sky.image_size(stars, CENTER_PX, CORNER_PX)
         assert size is not None
         assert size.left_out < 5
         pairs = ((size.sigma_px, 0.7), (size.corner_sigma_px, 0.5))
@@ -93,8 +91,8 @@ def test_double_stars_are_left_out() -> None:
     image += np.roll(
         np.where(np.arange(SIDE_PX) < 120, image, 0.0), (1, 2), axis=(0, 1)
     )  # companions at the left
-    stars = star_images.fit_images(image, places, GAIN_DN_E, READ_DN**2)
-    size = star_images.image_size(stars, CENTER_PX, CORNER_PX)
+    stars = night_sky.fit_images(image, places, GAIN_DN_E, READ_DN**2)
+    size = night_sky.image_size(stars, CENTER_PX, CORNER_PX)
     assert size is not None
     assert size.left_out >= 0.9 * np.sum(places[:, 0] < 105)
     assert size.sigma_px.value == pytest.approx(0.8, rel=0.01)
@@ -112,23 +110,21 @@ def test_trails_are_measured_and_refused() -> None:
         InputError,
         match=r"night_1.fits: stars trail by 1\.[5-8] px at -?[01]° from the rows; allowed",
     ):
-        lens.check_trails([frame])
+        night_sky.check_trails([frame])
     still, _ = fitted(np.random.default_rng(4), 0.8, 0.0)
-    lens.check_trails([frame._replace(stars=still)])
+    night_sky.check_trails([frame._replace(stars=still)])
     # What the trail adds to the mean variance is taken off.
-    assert np.median(lens.without_trail(stars).variance_px2) == pytest.approx(0.64, rel=0.03)
-    assert np.median(lens.without_trail(still).variance_px2) == pytest.approx(0.64, rel=0.01)
+    assert np.median(night_sky.without_trail(stars).variance_px2) == pytest.approx(0.64, rel=0.03)
+    assert np.median(night_sky.without_trail(still).variance_px2) == pytest.approx(0.64, rel=0.01)
 
 
 def test_slopes_of_the_image_are_differences() -> None:
     p = np.array([[7.2, 6.7, 900.0, 12.0, np.log(0.8), np.log(1.1)]])
-    _, slopes = star_images.model(p)
+    _, slopes = night_sky.model(p)
     for n in range(6):
         step = np.zeros(6)
         step[n] = 1e-5 * max(abs(p[0, n]), 1)
-        difference = (star_images.model(p + step)[0] - star_images.model(p - step)[0]) / (
-            2 * step[n]
-        )
+        difference = (night_sky.model(p + step)[0] - night_sky.model(p - step)[0]) / (2 * step[n])
         np.testing.assert_allclose(
             slopes[:, :, n], difference, rtol=1e-6, atol=1e-7 * np.abs(slopes[:, :, n]).max()
         )
@@ -136,12 +132,12 @@ def test_slopes_of_the_image_are_differences() -> None:
 
 def test_a_tilt_is_seen() -> None:
     """An image with the covariance c: drawn as many small Gaussians along the diagonal."""
-    span = np.arange(2 * star_images.HALF_PX + 1.0)
+    span = np.arange(2 * night_sky.HALF_PX + 1.0)
     light = np.zeros((len(span), len(span)))
     for t in np.linspace(-1, 1, 21):
         light += 200 * np.outer(gaussian(span, 7 + 0.7 * t, 1.0), gaussian(span, 7 + 0.7 * t, 1.0))
     image = np.pad(light, 10)
-    stars = star_images.fit_images(image, np.array([[17.0, 17.0]]), 1.0, 0.01)
+    stars = night_sky.fit_images(image, np.array([[17.0, 17.0]]), 1.0, 0.01)
     covariance = float(np.mean(np.linspace(-1, 1, 21) ** 2) * 0.7**2)
     assert stars.stretch_px2[0, 1] == pytest.approx(2 * covariance, rel=0.25)
     assert abs(stars.stretch_px2[0, 0]) < 1e-3
@@ -218,19 +214,19 @@ def test_lens_and_star_images_come_back_and_frames_with_them_are_indistinguishab
     for n, (frame, _) in enumerate(truth):
         files.write_png16(files.make_folder(tmp_path / "night") / f"night_{n}.png", frame.image_dn)
     config = CameraConfig.model_validate(SHEET)
-    night = lens.measure_night(config, tmp_path / "night", transfer(), SATURATION_DN)
+    night = night_sky.measure_night(config, tmp_path / "night", transfer(), SATURATION_DN)
     assert night.identified == FRAMES
     assert night.size.sigma_px.value == pytest.approx(0.8, rel=0.02)
     assert night.size.corner_sigma_px.value == pytest.approx(0.6, rel=0.05)
     assert night.lens is not None
-    found = lens.lens_estimates(config, night.lens)
+    found = night_sky.lens_estimates(config, night.lens)
     assert found["focal_length_mm"].value == pytest.approx(16.0, rel=1e-3)
     assert disagreement_px(night.lens.camera, calibration(CameraConfig.model_validate(TRUE))) < 0.1
     psf = {"kind": "gaussian", "sigma_px": night.size.sigma_px.value}
     psf["corner_sigma_px"] = night.size.corner_sigma_px.value
     measured = {
         key: value
-        for key, (value, _) in preset.measured_lens(config, night).items()
+        for key, (value, _) in characterize_camera.measured_lens(config, night).items()
         if "." not in key
     }
     ours = rendered(

@@ -8,16 +8,20 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from skysim.camera.detector import detector
-from skysim.camera.detector.detector import Detector
+from skysim.camera import detector
+from skysim.camera.detector import Detector
 from skysim.core.types import Floats
-from skysim.experiments.characterize import rendered
-from skysim.experiments.characterize.sensor import dark_current, photon_transfer, sensor, uniformity
-from skysim.experiments.characterize.sensor.dark_current import RateNoise
-from skysim.experiments.characterize.sensor.estimate import Estimate, propagate
-from skysim.experiments.characterize.sensor.levels import Level, Moments, level
-from skysim.experiments.characterize.sensor.photon_transfer import Point
-from skysim.experiments.characterize.sensor.sensor import Sensor
+from skysim.experiments.characterize import fixed_pattern, frame_files, photon_transfer, sensor_fit
+from skysim.experiments.characterize.fixed_pattern import RateNoise
+from skysim.experiments.characterize.photon_transfer import (
+    Estimate,
+    Level,
+    Moments,
+    TransferPoint,
+    level,
+    propagate,
+)
+from skysim.experiments.characterize.sensor_fit import MeasuredSensor
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig
 from tests.helpers.two_samples import histogram_p
 
@@ -55,7 +59,7 @@ def camera(side_px: int, seed: int = 0, **changes: Any) -> CameraConfig:
     )
 
 
-def measured(side_px: int, seed: int, darks: int = 8, **changes: Any) -> Sensor:
+def measured(side_px: int, seed: int, darks: int = 8, **changes: Any) -> MeasuredSensor:
     """Darks of three exposures at two temperatures, and flats in pairs, of one simulated chip."""
     rng = np.random.default_rng(1000 + seed)
 
@@ -71,7 +75,7 @@ def measured(side_px: int, seed: int, darks: int = 8, **changes: Any) -> Sensor:
     dark_levels = [
         frames(at_c, 0.0, t_s, darks) for at_c in (20.0, 30.0) for t_s in (0.1, 5.0, 20.0)
     ]
-    return sensor.characterize(dark_levels, [frames(20.0, rate_e_s, t_s, 2) for t_s in FLAT_S])
+    return sensor_fit.characterize(dark_levels, [frames(20.0, rate_e_s, t_s, 2) for t_s in FLAT_S])
 
 
 def test_half_the_variance_of_a_pair_s_difference_is_the_noise_without_pattern_and_flicker() -> (
@@ -106,7 +110,7 @@ def test_an_odd_last_frame_is_left_out() -> None:
 
 def exact_points(
     gain_dn_e: float, curvature: float, read_dn: float, black_dn: float
-) -> list[Point]:
+) -> list[TransferPoint]:
     """Points of the law, from 10^7 numbers drawn for none: by the moments of a Poisson variable up to the fourth."""
     points = []
     for lit, rate_e_s, times in (
@@ -125,7 +129,9 @@ def exact_points(
             mean = float((w * y).sum())
             variance = float((w * (y - mean) ** 2).sum()) + 1 / 12
             points.append(
-                Point(t_s, lit, 0, Moments(black_dn + mean, 1e-3, variance, 1e-3 * variance))
+                TransferPoint(
+                    t_s, lit, 0, Moments(black_dn + mean, 1e-3, variance, 1e-3 * variance)
+                )
             )
     return points
 
@@ -159,7 +165,7 @@ def test_the_lamp_s_flicker_is_what_noise_does_not_explain() -> None:
     points = []
     changes = []
     for mean in np.linspace(500, 3000, 400):
-        points.append(Point(1.0, 1, 0, Moments(100 + mean, 0.0, mean, 0.0)))
+        points.append(TransferPoint(1.0, 1, 0, Moments(100 + mean, 0.0, mean, 0.0)))
         change = rng.normal(0, np.sqrt(2 * (flicker * mean) ** 2 + 2 * mean / pixels))
         changes.append(change**2)
     assert photon_transfer.lamp_flicker(points, changes, 100.0, pixels) == pytest.approx(
@@ -186,7 +192,7 @@ def test_the_law_of_the_dark_current_is_that_of_drawn_pixels(reading: float) -> 
     rates = drawn_rates(rng, 400_000, noise)
     theta = np.array([np.log(2.0), np.log(0.4), np.log(0.004 / 0.996), np.log(30.0)])
     edges = np.quantile(rates, np.linspace(0.002, 0.998, 60))
-    expected = len(rates) * dark_current.probabilities(theta, edges, noise)
+    expected = len(rates) * fixed_pattern.probabilities(theta, edges, noise)
     counts = np.bincount(np.searchsorted(edges, rates), minlength=len(edges) + 1)
     assert expected.sum() == pytest.approx(len(rates))
     chi2 = np.sum((counts - expected) ** 2 / expected)
@@ -199,7 +205,7 @@ def test_dark_current_of_drawn_pixels_is_found_within_its_interval() -> None:
     pulls = []
     for seed in range(20):
         noise = RateNoise(0.3, 0.01)
-        found = dark_current.fit(
+        found = fixed_pattern.fit(
             drawn_rates(np.random.default_rng(seed), 60_000, noise), noise, np.inf
         )
         assert found.hot is not None
@@ -215,7 +221,7 @@ def test_few_hot_pixels_are_counted() -> None:
     noise = RateNoise(0.3, 0.01)
     rates = drawn_rates(np.random.default_rng(7), 60_000, noise, hot=0.0)
     rates[[5, 900, 40_000]] = 80.0
-    found = dark_current.fit(rates, noise, np.inf)
+    found = fixed_pattern.fit(rates, noise, np.inf)
     assert found.hot is None
     assert found.hot_pixels.value == pytest.approx(3 / 60_000)
     exact = stats.binomtest(3, 60_000).proportion_ci()
@@ -227,15 +233,15 @@ def test_few_hot_pixels_are_counted() -> None:
 def test_a_dark_current_below_the_noise_is_not_resolved() -> None:
     rng = np.random.default_rng(8)
     noise = RateNoise(4.0, 0.01)
-    assert not dark_current.is_resolved(rng.normal(0.3, 2.0, 50_000), noise)
-    assert dark_current.is_resolved(drawn_rates(rng, 50_000, noise), noise)
+    assert not fixed_pattern.is_resolved(rng.normal(0.3, 2.0, 50_000), noise)
+    assert fixed_pattern.is_resolved(drawn_rates(rng, 50_000, noise), noise)
 
 
 def test_the_light_s_distribution_is_no_prnu() -> None:
     """A slope of 20 % over the flat, of which the polynomial leaves nothing."""
     y, x = np.mgrid[0:96, 0:128]
     image = 500 * (1 + 0.1 * (x - 64) / 64 - 0.06 * ((y - 48) / 48) ** 2)
-    trend = uniformity.smooth(image, np.ones(image.shape, bool))
+    trend = fixed_pattern.smooth(image, np.ones(image.shape, bool))
     np.testing.assert_allclose(trend, image, rtol=3e-4)  # means of a block are not its center's
 
 
@@ -324,10 +330,10 @@ def test_frames_of_the_measured_camera_are_indistinguishable_and_those_of_a_wron
         found["gain_e_dn"].value / CHIP["gain_e_dn"]
     )  # the lamp as the flats measured it, not as it is
 
-    def numbers(config: DetectorConfig, shot: rendered.Shot, seed: int) -> Floats:
+    def numbers(config: DetectorConfig, shot: frame_files.PlannedFrame, seed: int) -> Floats:
         one = camera(side).model_copy(update={"detector": config})
         return np.concatenate(
-            [frame.ravel() for frame in rendered.frames_of(one, shot, seed)]
+            [frame.ravel() for frame in frame_files.frames_of(one, shot, seed)]
         ).astype(float)
 
     true = DetectorConfig.model_validate(CHIP | changes | {"hardware_seed": 21})
@@ -338,7 +344,7 @@ def test_frames_of_the_measured_camera_are_indistinguishable_and_those_of_a_wron
         ("darks", 5.0, 32.0, 0.0),
         ("flats", 0.5, 20.0, 8000.0),
     ):
-        shot = rendered.Shot(kind, exposure_s, at_c, rate_e_s, 1)
+        shot = frame_files.PlannedFrame(kind, exposure_s, at_c, rate_e_s, 1)
         measured_shot = shot._replace(light_e_s=rate_e_s * light)
         same, other = (numbers(config, measured_shot, 5) for config in (ours, wrong))
         assert histogram_p(numbers(true, shot, 4), same) > 0.01, (kind, at_c)
@@ -356,7 +362,7 @@ def test_tracks_of_particles_are_neither_noise_nor_hot_pixels() -> None:
     for x, y in rng.integers(0, 90, (12, 2)):
         frames[3][y, x : x + 6] += 400
     hit = level(10.0, None, frames)
-    usable = sensor.usable_pixels([hit])
+    usable = sensor_fit.usable_pixels([hit])
     assert 70 <= (~usable).sum() <= 76
     assert hit.moments(usable).variance_dn2 == pytest.approx(9 + 20 + 1 / 12, rel=0.04)
     assert hit.moments(np.ones(shape, bool)).variance_dn2 > 2 * 29

@@ -10,7 +10,7 @@ import pytest
 import scipy
 
 from skysim.core.errors import InputError
-from skysim.experiments.dataset import plan
+from skysim.experiments import dataset_run
 from tests.helpers.small_dataset import VARY, small
 
 
@@ -128,4 +128,4 @@ def test_what_is_wrong_in_the_options_is_told() -> None:
         with pytest.raises(InputError, match=message):
             small(**more)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="nothing"):
-        plan.load("nothing", None, 1)
+        dataset_run.load("nothing", None, 1)

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.core.paths import ROOT
-from skysim.experiments.dataset import plan, run, shards, storage
+from skysim.core.files import ROOT
+from skysim.experiments import dataset_run, dataset_shards
 from skysim.experiments.study.execution import engines, workers
 from tests.helpers.small_dataset import HEIGHT, VARY, WIDTH, contents, small
 
@@ -37,7 +37,7 @@ def vary(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def whole(vary: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of five frames that one process made undisturbed."""
     folder = tmp_path_factory.mktemp("whole") / "frames"
-    progress = run.run(small(vary), str(folder), engines.Serial())
+    progress = dataset_run.run(small(vary), str(folder), engines.Serial())
     assert (progress.done, progress.failed) == (5, 0)
     return folder
 
@@ -69,9 +69,9 @@ def test_every_format_has_the_same_frames(whole: Path) -> None:
     images = zarr.open_group(whole / "images.zarr", mode="r")["images"]
     assert images.metadata.zarr_format == 3
     assert [row["frame"] for row in rows] == list(range(5))
-    assert sorted(made) == [shards.key_of(n) for n in range(5)]
+    assert sorted(made) == [dataset_shards.key_of(n) for n in range(5)]
     for row in rows:
-        one = made[shards.key_of(row["frame"])]
+        one = made[dataset_shards.key_of(row["frame"])]
         image = one["image.npy"]
         assert image.shape == (row["height"], row["width"])
         np.testing.assert_array_equal(images[row["frame"]], image)
@@ -123,10 +123,12 @@ def test_boxes_hold_the_light_of_their_sources(whole: Path) -> None:
         ]
         names = {one["id"]: one["file_name"] for one in coco["images"]}
         for one in coco["annotations"]:
-            assert names[one["image_id"]].endswith(f"{shards.key_of(one['image_id'])}.image.npy")
+            assert names[one["image_id"]].endswith(
+                f"{dataset_shards.key_of(one['image_id'])}.image.npy"
+            )
             if one["category_id"] != 1:
                 continue
-            sample = made[shards.key_of(one["image_id"])]
+            sample = made[dataset_shards.key_of(one["image_id"])]
             image = sample["image.npy"].astype(float)
             rows = sample["sources.npy"]
             row = rows[rows["id"] == one["source"]][0]
@@ -160,27 +162,27 @@ def test_numbers_with_two_decimals_are_written_as_json_writes_them() -> None:
     rng = np.random.default_rng(3)
     numbers = np.round(rng.standard_normal((500, 4)) * 10.0 ** rng.integers(-3, 6, (500, 4)), 2)
     numbers[0] = [0.0, -0.0, 100.0, -0.05]
-    assert [f"[{row}]" for row in shards.hundredths(numbers)] == [
+    assert [f"[{row}]" for row in dataset_shards.hundredths(numbers)] == [
         json.dumps(row) for row in numbers.tolist()
     ]
-    assert shards.hundredths(np.empty((0, 4))) == []
+    assert dataset_shards.hundredths(np.empty((0, 4))) == []
 
 
 def test_the_box_of_a_mask_is_about_its_pixels() -> None:
-    from skysim.experiments.dataset.labels import run_lengths
+    from skysim.experiments.dataset_labels import run_lengths
 
     rng = np.random.default_rng(1)
     for share in (0.02, 0.3):
         mask = rng.random((20, 30)) < share
         y, x = np.nonzero(mask)
         box = [x.min(), y.min(), np.ptp(x) + 1, np.ptp(y) + 1]
-        assert shards.mask_box(run_lengths(mask), 20) == box
+        assert dataset_shards.mask_box(run_lengths(mask), 20) == box
     mask[:, :] = False
     # one run from column 7 to column 8
     mask[3:5, 2] = True
     mask[18:, 7] = True
     mask[:2, 8] = True
-    assert shards.mask_box(run_lengths(mask), 20) == [2, 0, 7, 20]
+    assert dataset_shards.mask_box(run_lengths(mask), 20) == [2, 0, 7, 20]
 
 
 class Stopped(Exception):
@@ -192,10 +194,10 @@ def test_killed_at_any_file_and_resumed_it_has_the_same_bytes(
     whole: Path, vary: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before and after each file; a temporary file that was half written stays behind."""
-    original = storage.Storage.write
+    original = dataset_shards.Storage.write
     left = 0
 
-    def stopping(self: storage.Storage, name: str, data: bytes) -> None:
+    def stopping(self: dataset_shards.Storage, name: str, data: bytes) -> None:
         nonlocal left
         left -= 1
         if left == 0:
@@ -208,14 +210,14 @@ def test_killed_at_any_file_and_resumed_it_has_the_same_bytes(
         if left == 1:
             raise Stopped
 
-    monkeypatch.setattr(storage.Storage, "write", stopping)
+    monkeypatch.setattr(dataset_shards.Storage, "write", stopping)
     stops = 0
     for first in range(1, 11):
         folder = tmp_path / f"{first}"
         left = first
         for _ in range(30):
             try:
-                run.run(small(vary), str(folder), engines.Serial())
+                dataset_run.run(small(vary), str(folder), engines.Serial())
                 break
             except Stopped:
                 stops = stops + 1
@@ -225,7 +227,7 @@ def test_killed_at_any_file_and_resumed_it_has_the_same_bytes(
 
 
 def storage_host() -> str:
-    from skysim.core.io.files import HOST
+    from skysim.core.files import HOST
 
     return HOST
 
@@ -234,11 +236,11 @@ DRIVER = """
 import sys
 from pathlib import Path
 from tests.helpers.small_dataset import small
-from skysim.experiments.dataset import run
+from skysim.experiments import dataset_run
 from skysim.experiments.study.execution import engines
 if __name__ == "__main__":
     told = small(Path(sys.argv[1]), 40)
-    run.run(told, sys.argv[2], engines.Pool(2), lambda progress: print(progress.done, flush=True))
+    dataset_run.run(told, sys.argv[2], engines.Pool(2), lambda progress: print(progress.done, flush=True))
 """
 
 
@@ -247,7 +249,7 @@ def test_killed_with_its_workers_and_resumed_it_has_the_same_bytes(
     vary: Path, tmp_path: Path
 ) -> None:
     """Twice by kill -9 in the middle of a shard, on two workers; then one process makes the rest."""
-    run.run(small(vary, 40), str(tmp_path / "whole"), engines.Serial())
+    dataset_run.run(small(vary, 40), str(tmp_path / "whole"), engines.Serial())
     driver = tmp_path / "driver.py"
     folder = tmp_path / "killed"
     driver.write_text(DRIVER)
@@ -264,14 +266,14 @@ def test_killed_with_its_workers_and_resumed_it_has_the_same_bytes(
                 pass
             os.killpg(made.pid, signal.SIGKILL)
         time.sleep(1)
-    assert run.run(small(vary, 40), str(folder), engines.Serial()).done == 40
+    assert dataset_run.run(small(vary, 40), str(folder), engines.Serial()).done == 40
     assert contents(folder) == contents(tmp_path / "whole")
 
 
 @pytest.mark.slow
 def test_two_workers_make_the_same_bytes(whole: Path, vary: Path, tmp_path: Path) -> None:
     engine = engines.Pool(2)
-    assert run.run(small(vary), str(tmp_path / "two"), engine).done == 5
+    assert dataset_run.run(small(vary), str(tmp_path / "two"), engine).done == 5
     engine.close()
     assert contents(tmp_path / "two") == contents(whole)
 
@@ -285,7 +287,7 @@ def test_dask_makes_the_same_bytes(whole: Path, vary: Path, tmp_path: Path) -> N
         n_workers=2, threads_per_worker=1, dashboard_address=None
     ) as cluster:
         engine = ENGINES["dask"](None, cluster.scheduler_address)
-        assert run.run(small(vary), str(tmp_path / "dask"), engine).done == 5
+        assert dataset_run.run(small(vary), str(tmp_path / "dask"), engine).done == 5
         engine.close()
     assert contents(tmp_path / "dask") == contents(whole)
 
@@ -307,7 +309,7 @@ def test_an_object_store_holds_the_same_bytes(
         client = boto3.client("s3", endpoint_url=endpoint)
         client.create_bucket(Bucket="frames")
         url = "s3://frames/night"
-        assert run.run(small(vary), url, engines.Serial()).done == 5
+        assert dataset_run.run(small(vary), url, engines.Serial()).done == 5
         listed = client.list_objects_v2(Bucket="frames")["Contents"]
         made = {
             one["Key"]: client.get_object(Bucket="frames", Key=one["Key"])["Body"].read()
@@ -317,24 +319,24 @@ def test_an_object_store_holds_the_same_bytes(
         for name, data in made.items():
             assert data == (whole / name.removeprefix("night/")).read_bytes(), name
         client.delete_object(Bucket="frames", Key="night/index/000001.parquet")
-        assert run.run(small(vary), url, engines.Serial()).now == 2
+        assert dataset_run.run(small(vary), url, engines.Serial()).now == 2
         again = client.get_object(Bucket="frames", Key="night/index/000001.parquet")["Body"].read()
         assert again == made["night/index/000001.parquet"]
         with pytest.raises(InputError, match=r"^s3://nowhere/x: .*can be written"):
-            run.run(small(vary), "s3://nowhere/x", engines.Serial())
+            dataset_run.run(small(vary), "s3://nowhere/x", engines.Serial())
     finally:
         server.stop()
 
 
 def test_a_complete_dataset_is_left_as_it_is(whole: Path, vary: Path) -> None:
     before = contents(whole)
-    assert run.run(small(vary), str(whole), engines.Serial()).now == 0
+    assert dataset_run.run(small(vary), str(whole), engines.Serial()).now == 0
     assert contents(whole) == before
 
 
 def changed(key: str, value: Any) -> Callable[[Path], object]:
     def change(folder: Path) -> None:
-        path = folder / run.MANIFEST
+        path = folder / dataset_run.MANIFEST
         path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
 
     return change
@@ -353,13 +355,19 @@ def changed(key: str, value: Any) -> Callable[[Path], object]:
         ),
         (changed("format", 7), "a dataset of format 7; allowed: 1"),
         (
-            lambda folder: (folder / run.MANIFEST).write_text("[" * 10_000),
+            lambda folder: (folder / dataset_run.MANIFEST).write_text("[" * 10_000),
             "is not that of a dataset",
         ),
-        (lambda folder: (folder / run.MANIFEST).write_text("[]"), "is not that of a dataset"),
-        (lambda folder: (folder / run.MANIFEST).write_text("{}"), "is not that of a dataset"),
         (
-            lambda folder: (folder / run.MANIFEST).rename(folder / "mine.txt"),
+            lambda folder: (folder / dataset_run.MANIFEST).write_text("[]"),
+            "is not that of a dataset",
+        ),
+        (
+            lambda folder: (folder / dataset_run.MANIFEST).write_text("{}"),
+            "is not that of a dataset",
+        ),
+        (
+            lambda folder: (folder / dataset_run.MANIFEST).rename(folder / "mine.txt"),
             r"contains \w+; allowed: an empty folder",
         ),
     ],
@@ -367,25 +375,25 @@ def changed(key: str, value: Any) -> Callable[[Path], object]:
 def test_another_dataset_is_not_written_over(
     vary: Path, tmp_path: Path, change: Callable[[Path], object], message: str
 ) -> None:
-    made = storage.Storage(str(tmp_path / "frames"))
-    run.prepare(small(vary, formats=("webdataset",)), made)
+    made = dataset_shards.Storage(str(tmp_path / "frames"))
+    dataset_run.prepare(small(vary, formats=("webdataset",)), made)
     change(tmp_path / "frames")
     before = contents(tmp_path)
     with pytest.raises(InputError, match=message):
-        run.run(small(vary, formats=("webdataset",)), made.url, engines.Serial())
+        dataset_run.run(small(vary, formats=("webdataset",)), made.url, engines.Serial())
     assert contents(tmp_path) == before
 
 
 @pytest.mark.parametrize("url", ["nowhere://x/y", "s4://bucket"])
 def test_an_unknown_url_is_told(url: str) -> None:
     with pytest.raises(InputError, match=rf"^{url}: .*allowed"):
-        storage.Storage(url)
+        dataset_shards.Storage(url)
 
 
 def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fsspec.core", None)
     with pytest.raises(InputError, match=r"pip install 'skysim\[dataset\]'"):
-        storage.Storage("out/frames")
+        dataset_shards.Storage("out/frames")
 
 
 def test_frames_of_several_sizes_fit_no_zarr_array(tmp_path: Path) -> None:
@@ -399,12 +407,12 @@ def test_frames_of_several_sizes_fit_no_zarr_array(tmp_path: Path) -> None:
         InputError,
         match=r"dataset.formats: zarr: frame \d+ of shard \d+ is \d+x180 uint16, the first one \d+x180",
     ):
-        run.run(made, str(tmp_path / "frames"), engines.Serial())
+        dataset_run.run(made, str(tmp_path / "frames"), engines.Serial())
 
 
 def test_a_shard_that_kills_its_workers_is_told_and_left_out() -> None:
     made = small(formats=("coco",))
-    (chunk,) = run.ShardQueue([2]).next()
-    failed = run.DatasetJob(made, "x").failed(chunk, engines.DIED)
+    (chunk,) = dataset_run.ShardQueue([2]).next()
+    failed = dataset_run.DatasetJob(made, "x").failed(chunk, engines.DIED)
     assert (failed.shard, failed.frames, failed.error) == (2, 0, engines.DIED)
-    assert plan.FORMATS
+    assert dataset_run.FORMATS

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from skysim.experiments.datasheet.components import (
+from skysim.experiments.datasheet.variance_components import (
     Components,
     components,
     mean_square_ratio,

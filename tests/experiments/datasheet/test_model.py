@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skysim.experiments.datasheet.cells import QUICK, Designer
-from skysim.experiments.datasheet.model import check, export, fit
-from skysim.experiments.datasheet.model.errors import ErrorModel, State, correlated
-from skysim.experiments.datasheet.run import AXES, Sheet
+from skysim.experiments.datasheet import model_fit
+from skysim.experiments.datasheet.cells import AXES, QUICK, Designer, MeasuredFrames
+from skysim.experiments.datasheet.error_model import ErrorModel, State, correlated
 from skysim.scene.loader import load
 
 CONSTANTS: dict[str, Any] = {
@@ -145,7 +144,7 @@ def test_more_than_a_hundred_thousand_errors_a_second(model):
 
 def test_the_module_stands_alone(tmp_path: Path) -> None:
     """Copied away it needs NumPy and its constants, and nothing of skysim."""
-    export.write_model(tmp_path, CONSTANTS)
+    model_fit.write_model(tmp_path, CONSTANTS)
     code = (
         "import sys, numpy; from tracker_error import ErrorModel; m = ErrorModel.read('tracker_error.json');"
         " print(m.draw(numpy.full(5, 1.0), 0.1, numpy.random.default_rng(1)).shape,"
@@ -169,8 +168,8 @@ def test_the_unit_runs_in_another_tool_with_the_same_errors(
     """fmpy runs it at 1.5 degrees per second: the errors are those of the model's own steps with that seed."""
     fmpy = pytest.importorskip("fmpy")
     pytest.importorskip("pythonfmu3")
-    export.write_model(tmp_path, CONSTANTS)
-    path = export.write_fmu(tmp_path)
+    model_fit.write_model(tmp_path, CONSTANTS)
+    path = model_fit.write_fmu(tmp_path)
     assert fmpy.read_model_description(str(path)).fmiVersion == "3.0"
     outputs = ["x_arcsec", "y_arcsec", "roll_arcsec"]
     result = fmpy.simulate_fmu(
@@ -196,12 +195,12 @@ def test_the_scatter_of_the_fields_comes_from_two_estimates_of_each():
     rng = np.random.default_rng(9)
     variance = np.exp(0.7 * rng.standard_normal(60_000))
     first, second = (variance * rng.chisquare(7, 60_000) / 7 for _ in range(2))
-    assert fit.log_scale(first, second) == pytest.approx(0.7, rel=0.05)
-    assert fit.log_scale(first, first) > 0.8
-    assert fit.log_scale(np.ones(9), np.ones(9)) == 0
+    assert model_fit.log_scale(first, second) == pytest.approx(0.7, rel=0.05)
+    assert model_fit.log_scale(first, first) > 0.8
+    assert model_fit.log_scale(np.ones(9), np.ones(9)) == 0
 
 
-def drawn_sheet(model: ErrorModel, fields: int) -> Sheet:
+def drawn_sheet(model: ErrorModel, fields: int) -> MeasuredFrames:
     """A datasheet of shefex2 whose errors are drawn from a model: every cell of a field at its turn and rate."""
     scene = load("shefex2", {})
     size = replace(QUICK, fields=fields)
@@ -230,7 +229,7 @@ def drawn_sheet(model: ErrorModel, fields: int) -> Sheet:
         "wrong": 0 * ones,
         "axis_rad": axis_rad * ones,
     }
-    return Sheet(scene, "shefex2", {}, size, designer, cells, columns, None)
+    return MeasuredFrames(scene, "shefex2", {}, size, designer, cells, columns, None)
 
 
 def turned(model: ErrorModel, state: State, step_deg: float, rng: np.random.Generator) -> State:
@@ -254,18 +253,18 @@ def test_a_model_agrees_with_other_fields_of_its_own_errors_and_not_with_others(
     rates = {"rates_deg_s": [0.0, 0.28, 0.57, 1.1, 2.3], "along": [0.0, 0.5, 1.0, 2.0, 4.0]}
     truth = ErrorModel(CONSTANTS | rates | {"noise": [[1.0, 1.0, 10.0]] * 5})
     sheet = drawn_sheet(truth, 300)
-    monkeypatch.setattr(fit, "axes_rad", lambda sheet, rate: sheet.columns["axis_rad"][0])
-    found = check.agreements(sheet)
+    monkeypatch.setattr(model_fit, "axes_rad", lambda sheet, rate: sheet.columns["axis_rad"][0])
+    found = model_fit.agreements(sheet)
     assert [one.fitted for one in found] == ["even"] * 5 + ["odd"] * 5
     assert np.mean([p > 0.05 for one in found for p in one.p_values]) >= 0.7
     assert [one.correlation for one in found] == pytest.approx(
         [one.expected_correlation for one in found], abs=0.06
     )
-    constants = fit.constants(sheet)
+    constants = model_fit.constants(sheet)
     assert constants["along"][:5] == pytest.approx(truth.along, abs=0.4)
     noisy = truth.constants | {"noise": [[2.0, 2.0, 20.0]] * 5}
-    assert max(check.agreement(ErrorModel(noisy), sheet, 0.0, "even").p_values) < 0.01
-    fleeting = check.agreement(
+    assert max(model_fit.agreement(ErrorModel(noisy), sheet, 0.0, "even").p_values) < 0.01
+    fleeting = model_fit.agreement(
         ErrorModel(truth.constants | {"field_deg": 0.02}), sheet, 0.57, "even"
     )
     assert fleeting.correlation - fleeting.expected_correlation > 0.1

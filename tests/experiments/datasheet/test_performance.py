@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import scipy
 
-from skysim.experiments.datasheet import performance, run
-from skysim.experiments.datasheet.cells import Cell
+from skysim.experiments.datasheet import cells as datasheet_run
+from skysim.experiments.datasheet import performance
+from skysim.experiments.datasheet.cells import DatasheetCell
 from skysim.experiments.datasheet.performance import (
     Counts,
     bracket,
@@ -90,17 +91,19 @@ def test_frames_of_one_field_count_once():
     assert performance.counts_of_fields(sheet, [0, 1]) == Counts(4, 1, 1, 2)
 
 
-def sky_sheet(errors_over_sigma: tuple[float, float, float]) -> run.Sheet:
+def sky_sheet(errors_over_sigma: tuple[float, float, float]) -> datasheet_run.MeasuredFrames:
     """A sheet of 4,000 frames with these errors about x, y and roll, whose covariance says 1."""
     rng = np.random.default_rng(3)
     errors = np.asarray(errors_over_sigma)[:, None, None] * rng.standard_normal((3, 10, 400))
-    columns = dict(zip(run.AXES, errors, strict=True)) | {"nees": np.sum(errors**2, axis=0)}
+    columns = dict(zip(datasheet_run.AXES, errors, strict=True)) | {
+        "nees": np.sum(errors**2, axis=0)
+    }
     columns |= {"solved": np.ones((10, 400)), "wrong": np.zeros((10, 400))}
     columns["solved"][0, :5] = 0
     columns["nees"][0, :5] = np.nan
-    cells = [Cell("sky", {"draw": number}, {}) for number in range(10)]
+    cells = [DatasheetCell("sky", {"draw": number}, {}) for number in range(10)]
     unused: Any = None
-    return run.Sheet(unused, "", {}, unused, unused, cells, columns, unused)
+    return datasheet_run.MeasuredFrames(unused, "", {}, unused, unused, cells, columns, unused)
 
 
 def test_an_honest_covariance_is_found_honest():

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.datasheet import cells, datasheet_report, performance, run
+from skysim.experiments.datasheet import cells, datasheet_report, performance
 from skysim.experiments.datasheet.cells import Designer, Size
-from skysim.experiments.datasheet.components import components
 from skysim.experiments.datasheet.statement import Statement, numbers, sections, state
+from skysim.experiments.datasheet.variance_components import components
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.plan import TrialSpec
 from skysim.scene.loader import load
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few levels of every experiment."""
-    monkeypatch.setattr(run, "QUICK", SMALL)
+    monkeypatch.setattr(cells, "QUICK", SMALL)
     monkeypatch.setattr(cells, "STREAKS_PX", (1.0,))
     monkeypatch.setattr(cells, "SEQUENCE", (0, 1))
     monkeypatch.setattr(cells, "BENDS_PX", (4.0,))
@@ -38,9 +38,9 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def measured(
     folder: Path, watch: Callable[[int], Any] | None = None, fields: int | None = None
-) -> run.Sheet:
+) -> cells.MeasuredFrames:
     scene = load("shefex2", {})
-    return run.measure(
+    return cells.measure(
         "shefex2", scene, {}, folder, quick=True, fields=fields, workers=1, watch=watch
     )
 
@@ -80,7 +80,7 @@ def test_a_stopped_datasheet_goes_on_and_is_the_same(small: None, tmp_path: Path
     assert report.markdown().count("\n## ") == len(sections(whole))
     assert len(list((tmp_path / "whole").glob("*.png"))) == 5
     with pytest.raises(InputError, match="contains another study"):
-        run.measure(
+        cells.measure(
             "shefex2",
             load("shefex2", {}),
             {"camera.f_number": "2"},

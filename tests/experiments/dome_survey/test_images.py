@@ -21,8 +21,12 @@ from scipy.spatial.transform import Rotation
 from skysim.apps.cli import main
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.dome_survey import prior, procedure, stops
-from skysim.experiments.dome_survey.folder import images, watch
+from skysim.experiments.dome_survey import (
+    survey_frames,
+    survey_images,
+    survey_prior,
+    survey_procedure,
+)
 from skysim.scene import loader
 from skysim.simulation.lab import Lab, build_lab
 
@@ -109,14 +113,14 @@ def built(folder: Path) -> Lab:
 @pytest.fixture(scope="module")
 def frames(folder: Path, built: Lab) -> Path:
     """The images of a survey of the built dome, and the attitudes of its IMU."""
-    uncertainty = prior.survey_uncertainty("0.3 deg", "1 mm", "3 mm", "1%")
-    lab = build_lab(prior.as_listed(loader.load(folder / "design.yaml")))
-    assumed = prior.prior_of(
-        lab, prior.calibration_prior(lab).camera, prior.calibration_prior(lab).leds
+    uncertainty = survey_prior.survey_uncertainty("0.3 deg", "1 mm", "3 mm", "1%")
+    lab = build_lab(survey_prior.as_listed(loader.load(folder / "design.yaml")))
+    assumed = survey_prior.prior_of(
+        lab, survey_prior.calibration_prior(lab).camera, survey_prior.calibration_prior(lab).leds
     )
-    model = prior.survey_model(assumed, uncertainty, 0.02)
-    held = stops.planned_stops(built.scene, model, 8.0, STOPS, TILT_DEG)
-    for _ in procedure.simulated_frames(built, uncertainty, held, folder / "frames"):
+    model = survey_prior.survey_model(assumed, uncertainty, 0.02)
+    held = survey_frames.planned_stops(built.scene, model, 8.0, STOPS, TILT_DEG)
+    for _ in survey_procedure.simulated_frames(built, uncertainty, held, folder / "frames"):
         pass
     return folder / "frames"
 
@@ -224,7 +228,7 @@ def test_without_an_imu_the_tracker_identifies_the_images(
     """LEDs that differ in place alone, to a millimeter: nearly all images, and the same dome."""
     alone = folder / "alone"
     shutil.copytree(frames, alone)
-    (alone / images.ATTITUDES).unlink()
+    (alone / survey_images.ATTITUDES).unlink()
     found = surveyed(folder, alone, "lost")
     assert found["tied"] > 0.8 * STOPS
     assert found["surveyed"] > 0.8 * result["surveyed"]
@@ -251,7 +255,7 @@ def test_a_watch_ends_with_the_survey_of_what_is_there(
     arriving.mkdir()
 
     def drop() -> None:
-        shutil.copy(frames / images.ATTITUDES, arriving)
+        shutil.copy(frames / survey_images.ATTITUDES, arriving)
         (arriving / "noise.png").write_bytes(b"no image")
         for path in sorted(frames.glob("*.fits")):
             shutil.copy(path, arriving / f".{path.name}")
@@ -265,7 +269,7 @@ def test_a_watch_ends_with_the_survey_of_what_is_there(
             raise KeyboardInterrupt
 
     rested: list[bool] = []
-    monkeypatch.setattr(watch.time, "sleep", wait)
+    monkeypatch.setattr(survey_images.time, "sleep", wait)
     dropping.start()
     words = [
         "survey",
@@ -369,9 +373,9 @@ HEAD = "file,roll_deg,pitch_deg,yaw_deg\n"
 
 
 def test_attitudes_are_read_as_they_were_written(tmp_path: Path) -> None:
-    held = stops.from_angles(np.array([[1.0, -20.0, 170.0], [0.5, 3.0, -90.0]]))
-    images.write_attitudes(tmp_path / "a.csv", ["b.fits", "a.fits"], held, np.array([3, 4]))
-    read = images.read_attitudes(tmp_path / "a.csv")
+    held = survey_frames.from_angles(np.array([[1.0, -20.0, 170.0], [0.5, 3.0, -90.0]]))
+    survey_images.write_attitudes(tmp_path / "a.csv", ["b.fits", "a.fits"], held, np.array([3, 4]))
+    read = survey_images.read_attitudes(tmp_path / "a.csv")
     assert list(read) == ["b.fits", "a.fits"]
     assert (
         Rotation.concatenate(list(read.values())) * held.inv()
@@ -393,7 +397,7 @@ def test_attitudes_are_read_as_they_were_written(tmp_path: Path) -> None:
 def test_attitudes_with_a_slip_are_one_line(tmp_path: Path, text: str, says: str) -> None:
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(InputError) as refused:
-        images.read_attitudes(tmp_path / "a.csv")
+        survey_images.read_attitudes(tmp_path / "a.csv")
     assert says in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -401,4 +405,8 @@ def test_attitudes_with_a_slip_are_one_line(tmp_path: Path, text: str, says: str
 def test_of_two_formats_of_one_image_one_is_read(tmp_path: Path) -> None:
     for name in ("b.png", "a.png", "a.fits", "c.jpg", "notes.txt", ".d.png"):
         (tmp_path / name).touch()
-    assert [path.name for path in images.image_files(tmp_path)] == ["a.fits", "b.png", "c.jpg"]
+    assert [path.name for path in survey_images.image_files(tmp_path)] == [
+        "a.fits",
+        "b.png",
+        "c.jpg",
+    ]

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from skysim.apps.cli.main import app
 from skysim.core.errors import InputError
-from skysim.experiments.dome_survey import adjust, prior, procedure
-from skysim.experiments.dome_survey.procedure import Errors
+from skysim.experiments.dome_survey import adjust, survey_prior, survey_procedure
+from skysim.experiments.dome_survey.survey_procedure import SimulatedErrors
 
 
 def test_a_survey_that_fails_does_not_lose_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -21,20 +21,20 @@ def test_a_survey_that_fails_does_not_lose_the_others(monkeypatch: pytest.Monkey
     found = iter(
         [
             InputError("survey", "too few"),
-            Errors(1e-8, 4e-8, 1.0, 90, 0),
-            Errors(3e-8, 4e-8, 9.0, 92, 1),
+            SimulatedErrors(1e-8, 4e-8, 1.0, 90, 0),
+            SimulatedErrors(3e-8, 4e-8, 9.0, 92, 1),
         ]
     )
 
-    def run_survey(*_: object) -> Errors:
+    def run_survey(*_: object) -> SimulatedErrors:
         one = next(found)
         if isinstance(one, InputError):
             raise one
         return one
 
-    monkeypatch.setattr(procedure, "run_survey", run_survey)
-    monkeypatch.setattr(procedure, "survey_errors", lambda run, *_: run)
-    monkeypatch.setattr(procedure, "simulated_frames", lambda *_: [])
+    monkeypatch.setattr(survey_procedure, "run_survey", run_survey)
+    monkeypatch.setattr(survey_procedure, "survey_errors", lambda run, *_: run)
+    monkeypatch.setattr(survey_procedure, "simulated_frames", lambda *_: [])
     command = ["survey", "afit_simsat", "--frames", "4", "--repeat", "3", "--json"]
     done = CliRunner().invoke(app, command)
     result = json.loads(done.stdout)
@@ -51,7 +51,7 @@ def test_a_survey_that_contradicts_what_was_assumed_is_refused(
 ) -> None:
     """The frames alone give a value of sigma s, before that one of sigma p was assumed: they differ by hypot(s, p), and
     the weighted mean of both moves from the assumed one by p^2 / (s^2 + p^2) of this."""
-    assumed = prior.survey_uncertainty()
+    assumed = survey_prior.survey_uncertainty()
     focal_px = 9222.6
     share = adjust.PLAUSIBLE * (1.01 if refused else 0.99)
 
@@ -75,6 +75,6 @@ def test_a_survey_that_contradicts_what_was_assumed_is_refused(
     run = SimpleNamespace(survey=found, accuracy=accuracy)
     if refused:
         with pytest.raises(InputError, match=f"survey: {parameter} .* contradicts the assumed"):
-            adjust.check_plausible(run, prior.assumed(before, assumed))  # type: ignore[arg-type]
+            adjust.check_plausible(run, survey_prior.assumed(before, assumed))  # type: ignore[arg-type]
     else:
-        adjust.check_plausible(run, prior.assumed(before, assumed))  # type: ignore[arg-type]
+        adjust.check_plausible(run, survey_prior.assumed(before, assumed))  # type: ignore[arg-type]

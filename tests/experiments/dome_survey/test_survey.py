@@ -23,11 +23,9 @@ from estimator.core.types import Centroids
 from estimator.trackers.dome_tracker import DomeTracker
 from skysim.apps.cli import main
 from skysim.core.errors import InputError
-from skysim.experiments.dome_survey import adjust, matching, procedure
-from skysim.experiments.dome_survey import frames as survey_frames
-from skysim.experiments.dome_survey import prior as survey_prior
-from skysim.experiments.dome_survey import stops as survey_stops
-from skysim.experiments.dome_survey.frames import SurveyFrame
+from skysim.experiments.dome_survey import adjust, survey_frames, survey_prior, survey_procedure
+from skysim.experiments.dome_survey import survey_frames as survey_stops
+from skysim.experiments.dome_survey.survey_frames import SurveyFrame
 from skysim.scene import loader
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.tracking import dome_map_file, factory
@@ -251,7 +249,7 @@ def test_an_imu_error_shifts_a_frame_by_what_is_predicted(lab: Lab) -> None:
     """The camera is off the center of rotation, so that it moves too: the LEDs shift by half as much again."""
     prior = survey_prior.calibration_prior(lab)
     sigmas = replace(UNCERTAINTY, lever_sigma_m=0.0)
-    predicted_px, _ = matching.prediction_sigmas_px(prior, sigmas)
+    predicted_px, _ = survey_frames.prediction_sigmas_px(prior, sigmas)
     errors_rad = sigmas.imu_sigma_rad * np.random.default_rng(7).standard_normal((2000, 3))
     center = np.argsort(
         np.linalg.norm(prior.pixels(Rotation.identity()) - prior.camera.center_px, axis=1)
@@ -267,10 +265,10 @@ def test_lights_get_their_true_names_by_the_imu(lab: Lab) -> None:
     """Of ten stops' lights, 25 px aside each and 60 px all together where LEDs are some 75 px apart: 19 in 20."""
     prior = survey_prior.calibration_prior(lab)
     stops = survey_stops.stop_attitudes(lab.scene, "attitudes", 10, 18.0)
-    taken = procedure.simulated_frames(lab, UNCERTAINTY, stops)
+    taken = survey_procedure.simulated_frames(lab, UNCERTAINTY, stops)
     named = right = lights = 0
     for survey_frame, (_, truth) in zip(taken, survey_frames.render_stops(lab, stops), strict=True):
-        names = matching.match_by_imu(survey_frame, prior, UNCERTAINTY)
+        names = survey_frames.match_by_imu(survey_frame, prior, UNCERTAINTY)
         apart_px, nearest = cKDTree(truth.sources.flux_xy_px).query(
             survey_frame.lights.xy_px[names.light]
         )
@@ -290,7 +288,7 @@ def test_a_common_shift_is_found_though_neighbors_are_nearer_than_it(seed: int) 
     shift = rng.normal(0, 100, 2)
     seen = predicted[10:45] + shift + rng.normal(0, 5, (35, 2))
     seen = np.vstack([seen, rng.uniform(0, 1000, (5, 2))])  # reflections
-    found = matching.common_shift_px(seen, predicted, 100.0, np.full(60, 5.0), (500.0, 500.0))
+    found = survey_frames.common_shift_px(seen, predicted, 100.0, np.full(60, 5.0), (500.0, 500.0))
     # The mean of 35 lights, 5 px each, and of strangers that stand within the gate.
     assert np.linalg.norm(found - shift) < 5 * 5 / np.sqrt(35)
 
@@ -309,7 +307,7 @@ def test_leds_of_an_unknown_place_do_not_attract_a_shift() -> None:
         shift = rng.normal(0, 90, 2)
         seen = predicted + shift + sigma_px[:, None] * rng.normal(size=(625, 2))
         seen = seen[((seen > 0) & (seen < 700)).all(axis=1)]
-        found = matching.common_shift_px(seen, predicted, 90.0, sigma_px, (350.0, 350.0))
+        found = survey_frames.common_shift_px(seen, predicted, 90.0, sigma_px, (350.0, 350.0))
         missed += np.linalg.norm(found - shift) > 30
     assert missed <= 2
 
@@ -361,7 +359,7 @@ def test_pairs_are_the_cheapest_of_all_that_there_are() -> None:
         assert (
             list(
                 zip(
-                    *(rows.tolist() for rows in matching.assign_lights(seen, predicted, gate)),
+                    *(rows.tolist() for rows in survey_frames.assign_lights(seen, predicted, gate)),
                     strict=True,
                 )
             )

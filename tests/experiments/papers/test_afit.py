@@ -7,9 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import INCH_M
-from skysim.experiments.configs import with_config
-from skysim.experiments.papers.afit import led_tests, surface, test1, test2
-from skysim.experiments.papers.afit.test2 import PAIR_M, Place, geometric_angle_arcsec
+from skysim.experiments.papers.afit import afit_surface, led_tests, test1, test2
+from skysim.experiments.papers.afit.test2 import PAIR_M, BoardPlace, geometric_angle_arcsec
 from skysim.experiments.papers.afit.test_stand import (
     build_test_stand,
     gray_levels,
@@ -17,7 +16,8 @@ from skysim.experiments.papers.afit.test_stand import (
     render_at_attitude,
     separations_arcsec,
 )
-from skysim.experiments.papers.intervals import confidence_interval
+from skysim.experiments.papers.compare import confidence_interval
+from skysim.experiments.tracker_comparison import with_config
 from skysim.scene.loader import load
 from skysim.simulation.lab import Lab
 
@@ -34,18 +34,18 @@ def test_the_angle_of_a_pair_at_the_apex_is_eq_45s_own(pair: Lab) -> None:
     """y is half the pair, x the root of (R - M)^2 - y^2; the camera's M is added: an angle about the bearing."""
     y = PAIR_M / 2
     angle = 2 * np.arctan(y / (np.sqrt((R_M - M_M) ** 2 - y**2) + M_M))
-    assert geometric_angle_arcsec(pair, Place(0.0)) == pytest.approx(
+    assert geometric_angle_arcsec(pair, BoardPlace(0.0)) == pytest.approx(
         np.degrees(angle) * 3600, abs=1e-3
     )
 
 
 def test_a_board_that_leans_shows_the_cosine_of_its_angle(pair: Lab) -> None:
     """One LED comes nearer and the other farther, which cancels but for the square of half the pair's angle."""
-    share = geometric_angle_arcsec(pair, Place(28.0, 5.0)) / geometric_angle_arcsec(
-        pair, Place(28.0)
+    share = geometric_angle_arcsec(pair, BoardPlace(28.0, 5.0)) / geometric_angle_arcsec(
+        pair, BoardPlace(28.0)
     )
     # The dome's own normal leans there by a little, so that five degrees are added to it.
-    normal = test2.place_pair(pair, Place(28.0)).camera.sources.normal[0]
+    normal = test2.place_pair(pair, BoardPlace(28.0)).camera.sources.normal[0]
     crop_board = np.array([-np.sin(np.radians(28)), 0, -np.cos(np.radians(28))])
     own = np.arctan2(np.cross(crop_board, normal)[1], crop_board @ normal)
     assert share == pytest.approx(np.cos(own + np.radians(5)) / np.cos(own), abs=2e-5)
@@ -53,7 +53,7 @@ def test_a_board_that_leans_shows_the_cosine_of_its_angle(pair: Lab) -> None:
 
 def test_a_dome_that_is_moved_away_shows_less_by_the_longer_way(pair: Lab) -> None:
     """The range from the camera grows; the pair in the image plane at R - M shrinks by as much."""
-    places = [Place(28.0), Place(28.0, 0.0, 0.125)]
+    places = [BoardPlace(28.0), BoardPlace(28.0, 0.0, 0.125)]
     camera_m = M_M * np.array([np.sin(np.radians(28)), 0, np.cos(np.radians(28))])
     pairs_m = [test2.place_pair(pair, place).camera.sources.place[:, :3] for place in places]
     range_m = [np.linalg.norm(pair_m.mean(axis=0) - camera_m) for pair_m in pairs_m]
@@ -63,17 +63,19 @@ def test_a_dome_that_is_moved_away_shows_less_by_the_longer_way(pair: Lab) -> No
 
 
 def test_images_have_the_angle_of_the_geometry(pair: Lab) -> None:
-    board = test2.place_pair(pair, Place(28.0))
-    frame, truth = render_at_attitude(board, test2.point_at(Place(28.0)), np.random.default_rng(1))
+    board = test2.place_pair(pair, BoardPlace(28.0))
+    frame, truth = render_at_attitude(
+        board, test2.point_at(BoardPlace(28.0)), np.random.default_rng(1)
+    )
     lights = measure_lights(gray_levels(frame, board))
     assert separations_arcsec(lights.xy_px, board)[0] == pytest.approx(
-        geometric_angle_arcsec(pair, Place(28.0)), abs=1.0
+        geometric_angle_arcsec(pair, BoardPlace(28.0)), abs=1.0
     )
     assert len(truth.sources.id) == 2
 
 
 def test_the_rim_of_the_measured_dome_is_its_ellipse_where_it_is_62_in_wide() -> None:
-    found = surface.contour(test2.measured_dome(load("afit_test2_ideal")))
+    found = afit_surface.contour(test2.measured_dome(load("afit_test2_ideal")))
     rim = 48 - 28.60 + 28.60 * np.sqrt(1 - (31 / 38.88) ** 2)
     assert found["rim_z"].ours.value == pytest.approx(rim, abs=1e-9)
     assert found["rim_rho"].ours.value == pytest.approx(np.hypot(31, rim), abs=1e-9)

@@ -7,15 +7,15 @@ import pytest
 from scipy import stats
 
 from estimator.calibration.home_position import Sighting, calibrate
-from skysim.experiments.papers.afit import attitude, bump, test3
-from skysim.experiments.papers.afit.test3_images import (
+from skysim.experiments.papers.afit import test3, test3_attitude
+from skysim.experiments.papers.afit.test3 import (
     IMU_DEG,
     build_test3,
     lab_from_body,
     measure,
     photograph,
 )
-from skysim.experiments.papers.intervals import prediction_interval
+from skysim.experiments.papers.compare import prediction_interval
 from skysim.experiments.papers.published import experiments
 from skysim.simulation.lab import Lab
 from skysim.tracking import onboard_model
@@ -99,7 +99,7 @@ def test_another_draw_is_in_its_interval_as_often_as_it_says() -> None:
 @pytest.mark.long
 def test_an_image_against_the_catalog_of_itself_is_not_turned_at_all(lab: Lab) -> None:
     """Reference 1.2, item 14: the thesis has .0335 deg there."""
-    found = attitude.algorithm_errors(lab, 1, 2, np.random.default_rng(72))
+    found = test3_attitude.algorithm_errors(lab, 1, 2, np.random.default_rng(72))
     assert np.abs(found.error_deg[:, 0]).max() < 1e-9
     assert found.named == (5, 5)
     assert np.abs(found.error_deg[:, 1:, :2]).max() < 0.02  # the slip of eq. 44
@@ -109,7 +109,7 @@ def test_an_image_against_the_catalog_of_itself_is_not_turned_at_all(lab: Lab) -
 def test_an_imu_drifts_by_the_earth_s_rate() -> None:
     """15.04 deg/h: north by the cosine of 39.8 deg of latitude along x, up by its sine along z; t from home."""
     units = 40
-    off = attitude.imu_drift(1.0, units, np.random.default_rng(73))
+    off = test3_attitude.imu_drift(1.0, units, np.random.default_rng(73))
     latitude = np.radians(39.8)
     hours = np.arange(1, 5) / 60
     expected = 15.041 * np.outer(hours, [np.cos(latitude), 0, np.sin(latitude)])
@@ -124,8 +124,8 @@ def test_an_imu_drifts_by_the_earth_s_rate() -> None:
 
 @pytest.mark.long
 def test_gyros_miss_what_is_beyond_their_limit_and_nothing_else() -> None:
-    calm = bump.simulate_bump(None, 74)
-    knocked = bump.simulate_bump(bump.FITTED_BUMP, 74)
+    calm = test3_attitude.simulate_bump(None, 74)
+    knocked = test3_attitude.simulate_bump(test3_attitude.FITTED_BUMP, 74)
     assert calm.saturated_s == 0
     assert 0.15 < knocked.saturated_s < 0.25  # caught after 0.2 s
     lost = np.abs(knocked.imu_deg[-1] - calm.imu_deg[-1])
@@ -133,7 +133,7 @@ def test_gyros_miss_what_is_beyond_their_limit_and_nothing_else() -> None:
     # No more than the excess of (12.1, 15) deg/s over 10 for as long as it stood at the limit.
     assert lost[1] < 2.1 * knocked.saturated_s
     assert lost[2] < 5.0 * knocked.saturated_s
-    assert bump.filter_errors_after(knocked).max() < 0.01
+    assert test3_attitude.filter_errors_after(knocked).max() < 0.01
 
 
 def test_the_vehicle_stands_where_the_tables_say() -> None:

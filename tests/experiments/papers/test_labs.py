@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import ARCSEC_RAD
-from skysim.experiments.papers.other_domes import apl, nps, oled
+from skysim.experiments.papers import nps, other_domes
 from skysim.simulation.lab import build_lab
 
 pytestmark = pytest.mark.slow  # much is compiled
@@ -39,11 +39,11 @@ def test_an_update_leaves_a_small_share_of_the_error(level: nps.OnboardModel) ->
 
 def test_a_camera_in_the_center_sees_no_shell() -> None:
     """(r / R)(dR / R) is nothing for r = 0, and proportional to r."""
-    scene = apl.shell_scene(0.004, 5)
+    scene = other_domes.shell_scene(0.004, 5)
     lab = build_lab(scene)
-    poses = apl.random_attitudes(8, np.random.default_rng(1))
+    poses = other_domes.random_attitudes(8, np.random.default_rng(1))
     worst = [
-        apl.largest_discrepancies_arcsec(scene, lab, offset_m, True, poses).max()
+        other_domes.largest_discrepancies_arcsec(scene, lab, offset_m, True, poses).max()
         for offset_m in (0.0, 0.001, 0.01)
     ]
     assert worst[0] < 1e-6
@@ -52,9 +52,9 @@ def test_a_camera_in_the_center_sees_no_shell() -> None:
 
 def test_a_circle_about_the_zenith_holds_its_share_of_evenly_spread_stars() -> None:
     """n (1 - cos(d / 2)) of n on a hemisphere."""
-    lab = build_lab(apl.shell_scene(0.0, 1))
+    lab = build_lab(other_domes.shell_scene(0.0, 1))
     rng = np.random.default_rng(2)
-    mean = apl.count_fibers(lab, 10.0, apl.random_boresights(50_000, rng)).mean()
+    mean = other_domes.count_fibers(lab, 10.0, other_domes.random_boresights(50_000, rng)).mean()
     assert mean == pytest.approx(100 * (1 - np.cos(np.radians(5))), rel=0.05)
 
 
@@ -62,7 +62,8 @@ def test_a_circle_about_the_zenith_holds_its_share_of_evenly_spread_stars() -> N
 def test_noise_falls_with_the_root_of_the_lights() -> None:
     """Twice the lights, 1 / sqrt(2) of the noise, to four sigmas of 150 trials."""
     few, many = (
-        oled.solve_random_attitudes(oled.build_setup(lights), range(150)) for lights in (20, 40)
+        other_domes.solve_random_attitudes(other_domes.build_setup(lights), range(150))
+        for lights in (20, 40)
     )
     ratio = few.error_arcsec.std(axis=0) / many.error_arcsec.std(axis=0)
     assert np.abs(ratio / np.sqrt(2) - 1).max() < 4 / np.sqrt(150)

@@ -13,25 +13,25 @@ from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from skysim.apps.cli.main import app
+from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.io import files
-from skysim.core.paths import ROOT
-from skysim.experiments.papers import compare, intervals, papers_report, published
+from skysim.core.files import ROOT
+from skysim.experiments.papers import compare, papers_report, published
 from skysim.experiments.papers.compare import (
     Cause,
-    Drawing,
     ExperimentOptions,
     ExperimentResult,
+    FigureDrawing,
     RowResult,
 )
-from skysim.experiments.papers.published import Experiment, Row
+from skysim.experiments.papers.published import Experiment, PublishedRow
 from skysim.experiments.papers.registry import EXPERIMENTS, check_ids, reproduce
 from skysim.results import metrics, plots
 from skysim.results.metrics import Summary, exact, proportion
 
 # The law of the verdict.
 
-TEN = Row(quantity="ten", published=10.0, tolerance=0.5)
+TEN = PublishedRow(quantity="ten", published=10.0, tolerance=0.5)
 
 
 def interval(low: float, high: float) -> Summary:
@@ -74,15 +74,15 @@ def test_a_cause_explains_only_what_disagrees_and_only_where_it_brings_ours_ther
 @pytest.mark.parametrize(
     ("row", "ours", "agrees"),
     [
-        (Row(quantity="x", at_least=0.9), 0.95, True),
-        (Row(quantity="x", at_least=0.9), 0.85, False),
-        (Row(quantity="x", at_least=0.9, tolerance=0.1), 0.85, True),
-        (Row(quantity="x", at_most=0.5), 0.2, True),
-        (Row(quantity="x", at_most=0.5), 0.6, False),
-        (Row(quantity="x", at_least=0.9, at_most=0.97), 0.99, False),
+        (PublishedRow(quantity="x", at_least=0.9), 0.95, True),
+        (PublishedRow(quantity="x", at_least=0.9), 0.85, False),
+        (PublishedRow(quantity="x", at_least=0.9, tolerance=0.1), 0.85, True),
+        (PublishedRow(quantity="x", at_most=0.5), 0.2, True),
+        (PublishedRow(quantity="x", at_most=0.5), 0.6, False),
+        (PublishedRow(quantity="x", at_least=0.9, at_most=0.97), 0.99, False),
     ],
 )
-def test_a_bound_is_held_on_its_side(row: Row, ours: float, agrees: bool) -> None:
+def test_a_bound_is_held_on_its_side(row: PublishedRow, ours: float, agrees: bool) -> None:
     assert (compare.verdict(row, RowResult(exact(ours))) == "agrees") == agrees
 
 
@@ -93,7 +93,7 @@ def test_an_interval_wider_than_the_tolerance_is_told() -> None:
 
 
 def test_machines_get_the_keys_that_were_promised() -> None:
-    bound = Row(quantity="share", at_least=0.9, note="of frames")
+    bound = PublishedRow(quantity="share", at_least=0.9, note="of frames")
     line = compare.Comparison("x", bound, RowResult(proportion(95, 100)), "agrees")
     told = line.as_dict()
     assert list(told) == [
@@ -137,9 +137,9 @@ TRIED = 1500
 
 def test_intervals_of_four_hold_what_they_promise() -> None:
     """95 % by t's law; 1500 tries are good to 1.1 % (2 sigma)."""
-    assert abs(covered(intervals.confidence_interval, lambda rng: 3.0) - 0.95) < 0.018
+    assert abs(covered(compare.confidence_interval, lambda rng: 3.0) - 0.95) < 0.018
     assert (
-        abs(covered(intervals.prediction_interval, lambda rng: rng.normal(3.0, 2.0)) - 0.95) < 0.018
+        abs(covered(compare.prediction_interval, lambda rng: rng.normal(3.0, 2.0)) - 0.95) < 0.018
     )
 
 
@@ -154,7 +154,7 @@ def test_a_bootstrap_of_four_is_widened_to_what_it_promises() -> None:
 
 
 def both(values: np.ndarray) -> tuple[Summary, Summary]:
-    return metrics.resampled(values, np.mean), intervals.bootstrap_interval(values, np.mean)
+    return metrics.resampled(values, np.mean), compare.bootstrap_interval(values, np.mean)
 
 
 # What was published.
@@ -167,7 +167,7 @@ def test_a_row_says_a_number_or_bounds() -> None:
         {"published": 1},
     ):
         with pytest.raises(ValidationError):
-            Row.model_validate(wrong)
+            PublishedRow.model_validate(wrong)
 
 
 def test_a_wrong_file_is_told_in_one_line(tmp_path: Path) -> None:
@@ -229,7 +229,7 @@ def test_what_disagrees_is_red_in_the_report_and_bold_in_the_page() -> None:
     one = Experiment(title="t", source="s", rows={"ten": TEN, "a | b": TEN})
     found = ExperimentResult(
         {"ten": RowResult(exact(12)), "a | b": RowResult(exact(10))},
-        (Drawing("<empty>", lambda fig: None),),
+        (FigureDrawing("<empty>", lambda fig: None),),
     )
     report = papers_report.papers_report([compare.compare("x", one, found, 0.0)], ("x",), True, 3)
     html = report.html()
@@ -280,7 +280,7 @@ def eased(ours: Summary, share: float) -> Summary:
     return ours._replace(low=ours.low - by, high=ours.high + by)
 
 
-def rows() -> list[tuple[str, Row, list[str]]]:
+def rows() -> list[tuple[str, PublishedRow, list[str]]]:
     """Every published row with the page's cells."""
     page_ = parts()
     return [

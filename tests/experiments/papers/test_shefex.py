@@ -9,13 +9,17 @@ from scipy.special import erf
 
 from estimator.identification.published.shefex import FOURTH_STAR
 from skysim.core.types import Frame
-from skysim.experiments.papers.compare import ExperimentOptions
-from skysim.experiments.papers.intervals import bootstrap_of_means
-from skysim.experiments.papers.shefex import camera, catalog, identification, optics
-from skysim.experiments.papers.shefex.setup import Field, pairs, random_fields, shefex_lab
+from skysim.experiments.papers import (
+    shefex_camera,
+    shefex_identification,
+    shefex_nights,
+    shefex_setup,
+)
+from skysim.experiments.papers.compare import ExperimentOptions, bootstrap_of_means
+from skysim.experiments.papers.shefex_setup import StarField, pairs, random_fields, shefex_lab
 from skysim.scene.loader import load
 from skysim.tracking import onboard_model
-from skysim.tracking.exposure_control import ExposureController
+from skysim.tracking.factory import ExposureController
 
 pytestmark = pytest.mark.long  # compiles the paper's algorithms for ten seconds
 
@@ -49,51 +53,60 @@ def test_a_field_s_stars_are_the_catalog_s_where_the_attitude_puts_them() -> Non
 @pytest.mark.long
 def test_without_noise_a_field_is_named_and_its_attitude_found() -> None:
     field = next(one for one in random_fields(20, 4) if len(one.xy_px) >= 6)
-    told = identification.identify(field, 1e-6, 1e-5, 0, FOURTH_STAR, np.random.default_rng(1))
+    told = shefex_identification.identify(
+        field, 1e-6, 1e-5, 0, FOURTH_STAR, np.random.default_rng(1)
+    )
     assert (told.right, told.wrong) == (1.0, 0.0)
     assert np.abs(told.error_deg).max() < 1e-3
 
 
 def test_three_stars_are_no_success() -> None:
-    field = Field(np.array([[100.0, 100.0], [300.0, 80.0], [200.0, 400.0]]), Rotation.identity())
-    told = identification.identify(field, 0.1, 1e-4, 0, FOURTH_STAR, np.random.default_rng(1))
+    field = StarField(
+        np.array([[100.0, 100.0], [300.0, 80.0], [200.0, 400.0]]), Rotation.identity()
+    )
+    told = shefex_identification.identify(
+        field, 0.1, 1e-4, 0, FOURTH_STAR, np.random.default_rng(1)
+    )
     assert (told.right, told.wrong) == (0.0, 0.0)
 
 
 def test_the_triangles_of_fifteen_are_the_binomial_coefficient() -> None:
-    assert identification.count_triangles(np.random.default_rng(2)) == 15 * 14 * 13 // 6
+    assert shefex_identification.count_triangles(np.random.default_rng(2)) == 15 * 14 * 13 // 6
 
 
 def test_equation_5_fails_as_printed_and_holds_when_mended() -> None:
-    assert identification.eq5_failures(np.random.default_rng(3), 500) == (500, 0)
+    assert shefex_identification.eq5_failures(np.random.default_rng(3), 500) == (500, 0)
 
 
 def test_where_a_line_passes_the_limit() -> None:
     """0.2 deg a pixel passes 0.1 deg at half a pixel; one that stays below ends at the last."""
-    yaw_deg = 0.2 * identification.ERRORS_PX
-    assert identification.error_at_limit(1.0, yaw_deg**2) == pytest.approx(0.5, abs=0.01)
-    assert identification.error_at_limit(2.0, yaw_deg**2) == pytest.approx(0.25, abs=0.01)
-    assert identification.error_at_limit(1.0, 1e-4 * yaw_deg**2) == identification.ERRORS_PX[-1]
+    yaw_deg = 0.2 * shefex_identification.ERRORS_PX
+    assert shefex_identification.error_at_limit(1.0, yaw_deg**2) == pytest.approx(0.5, abs=0.01)
+    assert shefex_identification.error_at_limit(2.0, yaw_deg**2) == pytest.approx(0.25, abs=0.01)
+    assert (
+        shefex_identification.error_at_limit(1.0, 1e-4 * yaw_deg**2)
+        == shefex_identification.ERRORS_PX[-1]
+    )
 
 
 @pytest.mark.parametrize("rate_deg_s", [2.0, 4.0])
 def test_smear_is_rate_times_time_and_the_peak_falls_as_a_line_s(rate_deg_s: float) -> None:
     """A line of L pixels over one centered star's pixel: (1 / L) of erf(1 / (2 sqrt 2 sigma)), ends far away."""
     length_px = np.radians(rate_deg_s) * 0.05 * shefex_lab().scene.camera.focal_px
-    assert optics.smear_px(rate_deg_s) == pytest.approx(length_px, rel=2e-3)
+    assert shefex_nights.smear_px(rate_deg_s) == pytest.approx(length_px, rel=2e-3)
     alone = erf(0.5 / (0.7 * np.sqrt(2)))
     loss_mag = 2.5 * np.log10(alone * length_px)
     # The pixel's own ends are rounded by the blur: a few thousandths.
-    assert optics.peak_loss(rate_deg_s, 1, 1).ours.value == pytest.approx(loss_mag, abs=0.02)
+    assert shefex_nights.peak_loss(rate_deg_s, 1, 1).ours.value == pytest.approx(loss_mag, abs=0.02)
 
 
 def test_the_blur_disk_is_the_defocus_over_the_f_number() -> None:
-    assert optics.blur_px() == pytest.approx(1e-4 / 1.4 / 9.9e-6, rel=0.01)
+    assert shefex_nights.blur_px() == pytest.approx(1e-4 / 1.4 / 9.9e-6, rel=0.01)
 
 
 def test_the_chip_s_fields_are_those_of_its_half_sizes() -> None:
     half = np.array([659, 493, np.hypot(659, 493)]) / 2 * 9.9e-6 / 25e-3
-    told = optics.field_deg(onboard_model.calibration(shefex_lab().scene.camera))
+    told = shefex_nights.field_deg(onboard_model.calibration(shefex_lab().scene.camera))
     np.testing.assert_allclose(told, np.degrees(2 * np.arctan(half)), rtol=1e-9)
 
 
@@ -103,7 +116,7 @@ def test_a_poisson_sky_is_as_uneven_as_another_and_an_even_one_less() -> None:
     even = np.full(20_000, 8.0) + rng.integers(-1, 2, 20_000)
     for counts, expected in ((poisson, 1.0), (np.column_stack([poisson[:, 0], even]), (2 / 3) / 8)):
         columns = np.hstack([counts, counts**2.0])
-        assert catalog.relative_dispersion(columns.mean(axis=0)) == pytest.approx(
+        assert shefex_setup.relative_dispersion(columns.mean(axis=0)) == pytest.approx(
             expected, rel=0.05
         )
 
@@ -113,7 +126,7 @@ def test_the_two_scans_have_the_same_objects() -> None:
     image = rng.normal(100, 3, (200, 300))
     for x, y in rng.uniform(20, 180, (10, 2)):
         image[int(y) : int(y) + 3, int(x) : int(x) + 3] += 200
-    count, share = camera.count_common(np.rint(image).astype(np.uint16), 100)
+    count, share = shefex_camera.count_common(np.rint(image).astype(np.uint16), 100)
     assert count >= 8
     assert share == 1.0
 
@@ -126,24 +139,27 @@ def test_an_empty_frame_of_a_coarse_converter_lengthens_the_exposure() -> None:
 
 
 def test_a_planet_s_light_is_pogson_s() -> None:
-    loop = camera.ExposureLoop({}, camera.random_attitudes(1, 1)[0], 40)
+    loop = shefex_camera.ExposureLoop({}, shefex_camera.random_attitudes(1, 1)[0], 40)
     before = loop.lab.camera.sources
-    after = camera.with_planets(loop.lab.camera, loop.rest, 3)
+    after = shefex_camera.with_planets(loop.lab.camera, loop.rest, 3)
     changed = after.strength != before.strength
     assert changed.sum() == 3
     gained_mag = 2.5 * np.log10(after.strength[changed] / before.strength[changed])
-    np.testing.assert_allclose(gained_mag, before.magnitude[changed] - camera.PLANET_MAG, rtol=1e-9)
+    np.testing.assert_allclose(
+        gained_mag, before.magnitude[changed] - shefex_camera.PLANET_MAG, rtol=1e-9
+    )
 
 
 @pytest.mark.long
 def test_the_same_seed_gives_the_same_numbers() -> None:
     first, again = (
-        camera.exposure_control(ExperimentOptions(quick=True, seed=2)).results for _ in range(2)
+        shefex_camera.exposure_control(ExperimentOptions(quick=True, seed=2)).results
+        for _ in range(2)
     )
     assert first == again
 
 
 def test_a_lab_under_the_air_gathers_thirty_per_cent_less() -> None:
     """What the shutter lets in for 50 ms there, it lets in for 35 here."""
-    on_ground = optics.star_image(optics.ground_lab(), 0.05).sum()
-    assert on_ground == pytest.approx(optics.star_image(shefex_lab(), 0.035).sum(), rel=1e-6)
+    on_ground = shefex_nights.star_image(shefex_nights.ground_lab(), 0.05).sum()
+    assert on_ground == pytest.approx(shefex_nights.star_image(shefex_lab(), 0.035).sum(), rel=1e-6)

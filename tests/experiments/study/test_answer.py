@@ -9,12 +9,11 @@ from typing import Any
 import pytest
 import yaml
 
-from skysim.experiments.study import loader
-from skysim.experiments.study.analysis import answer
-from skysim.experiments.study.analysis.table import PointRow, format_summary
+from skysim.experiments.study import answer, study_file
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.plan import Study, resolve_point
 from skysim.experiments.study.report import overview, study_report
+from skysim.experiments.study.table import PointRow, format_summary
 from skysim.results import metrics
 from skysim.results.metrics import Summary
 from skysim.simulation import checks
@@ -224,7 +223,7 @@ def test_a_point_whose_trials_all_failed_is_left_out() -> None:
 def loaded(folder: Path, **keys: Any) -> Any:
     path = folder / "study.yaml"
     path.write_text(yaml.safe_dump(STUDY | {"replicates": 2} | keys, sort_keys=False))
-    return loader.load(path)
+    return study_file.load(path)
 
 
 @pytest.mark.slow

@@ -10,12 +10,11 @@ from scipy.stats import qmc
 
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
-from skysim.core.paths import SCENES
-from skysim.experiments.study import loader
-from skysim.experiments.study.analysis import sensitivity, table
-from skysim.experiments.study.execution import engines, replay, runner, store
+from skysim.core.files import SCENES
+from skysim.experiments.study import study_file, table
+from skysim.experiments.study.execution import engines, runner, store
 from skysim.experiments.study.execution.outcomes import FIELDS
-from skysim.experiments.study.report import export
+from skysim.experiments.study.report import study_export
 from skysim.results import metrics
 
 STUDY = """schema: 1
@@ -115,7 +114,7 @@ def test_sobol_indices_of_two_outputs_are_those_worked_out_by_hand():
         return np.stack([2 * u[:, 0] + u[:, 1], 3 * u[:, 2] + u[:, 0] * u[:, 1]])
 
     mixed = np.stack([f(np.where(np.arange(3) == n, b, a)) for n in range(3)])
-    first, total = sensitivity.generalized(f(a), f(b), mixed)
+    first, total = table.generalized(f(a), f(b), mixed)
     assert first == pytest.approx(np.array([51, 15, 108]) / 175, abs=5e-3)
     assert total == pytest.approx(np.array([52, 16, 108]) / 175, abs=5e-3)
 
@@ -146,7 +145,7 @@ def test_the_error_budget_blames_whom_it_should(tmp_path):
     33 in of the camera's sight is 0.2 / 838 rad of a point's direction, of which the bearing's turn takes 1 - 15/48."""
     told, kept = done(tmp_path, ERRORS)
     with kept as rows:
-        found = {(one.response, one.factor): one for one in sensitivity.indices(told, rows)}
+        found = {(one.response, one.factor): one for one in table.indices(told, rows)}
     assert found["roll_arcsec", "turn_z"].total.value > 0.9
     assert found["cross_arcsec", "turn_z"].total.value < 0.05
     assert found["roll_arcsec", "turn_x"].total.value < 0.1
@@ -161,10 +160,10 @@ def test_the_error_budget_blames_whom_it_should(tmp_path):
 def test_a_budget_that_is_not_known_yet_is_no_fault(tmp_path):
     path = tmp_path / "question.yaml"
     path.write_text(ERRORS)
-    told = loader.load(path)
+    told = study_file.load(path)
     with store.writing(tmp_path / "study.sqlite") as rows:
         runner.prepare_store(told, rows, resume=False)
-        found = sensitivity.indices(told, rows)
+        found = table.indices(told, rows)
     assert len(found) == 6
     assert all(math.isnan(one.total.value) for one in found)
 
@@ -173,7 +172,7 @@ def done(folder, text):
     """A study's plan, and its finished store to be opened."""
     path = folder / "question.yaml"
     path.write_text(text)
-    told = loader.load(path) if "-1 mm" not in text else loaded_with_a_fault(path)
+    told = study_file.load(path) if "-1 mm" not in text else loaded_with_a_fault(path)
     with store.writing(folder / "study.sqlite") as kept:
         runner.prepare_store(told, kept, resume=False)
         runner.run(told, kept, engines.Serial())
@@ -184,7 +183,7 @@ def loaded_with_a_fault(path):
     """A plan with a level that makes no scene, which `load` would refuse before the first trial."""
     good = path.with_name("good.yaml")
     good.write_text(path.read_text().replace("-1 mm", "30 mm"))
-    told = loader.load(good)
+    told = study_file.load(good)
     bad = [
         point._replace(
             settings={
@@ -205,13 +204,13 @@ def test_exports_say_what_the_store_says(tmp_path):
     told, kept = done(tmp_path, STUDY)
     with kept as rows:
         for suffix in ("csv", "parquet", "zarr"):
-            export.export(rows, told.study.responses, tmp_path / f"trials.{suffix}")
+            study_export.export(rows, told.study.responses, tmp_path / f"trials.{suffix}")
         columns = rows.columns()
         lines = table.table(rows, told.study.responses)
         with pytest.raises(
             InputError, match=r"unknown file format '.xlsx'; allowed: .csv, .parquet, .zarr"
         ):
-            export.export(rows, told.study.responses, tmp_path / "trials.xlsx")
+            study_export.export(rows, told.study.responses, tmp_path / "trials.xlsx")
     with (tmp_path / "trials.csv").open() as file:
         written = list(csv.DictReader(file))
     assert len(written) == told.trials == 16
@@ -235,7 +234,7 @@ def test_a_csv_leaves_out_what_no_trial_has(tmp_path):
     """A study of centroids has no pointing error and no streak; the columns that are left are the store's, in order."""
     told, kept = done(tmp_path, STUDY)
     with kept as rows:
-        export.export(rows, told.study.responses, tmp_path / "trials.csv")
+        study_export.export(rows, told.study.responses, tmp_path / "trials.csv")
         columns = table.trial_columns(rows)
     written = (tmp_path / "trials.csv").read_text().splitlines()[0].split(",")
     empty = {"pointing_arcsec", "filter_arcsec", "streak_px", "body_tilt_deg"}
@@ -249,16 +248,16 @@ def test_a_csv_leaves_out_what_no_trial_has(tmp_path):
 def test_a_trial_is_replayed_with_its_frames(tmp_path):
     told, kept = done(tmp_path, STUDY)
     with kept as rows:
-        again = replay.replay(told, rows, 9, tmp_path / "trial_9")
+        again = runner.replay(told, rows, 9, tmp_path / "trial_9")
         assert again.changed == []
         assert again.row.seed == rows.trial(9)["seed"]
         assert [path.name for path in again.files] == ["frame_0000.fits"]
         assert all(path.is_file() for path in again.files + again.pictures)
-        failed = replay.replay(told, rows, 5, tmp_path / "trial_5")
+        failed = runner.replay(told, rows, 5, tmp_path / "trial_5")
         assert "camera.focal_length" in failed.row.error
         assert failed.files == []
         with pytest.raises(InputError, match="trial 16: not in the study; allowed: 0 to 15"):
-            replay.replay(told, rows, 16, tmp_path)
+            runner.replay(told, rows, 16, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -283,7 +282,7 @@ def test_a_trial_that_raises_in_its_tracker_is_replayed_with_its_frame(tmp_path,
 
     monkeypatch.setattr(StarTracker, "solve_centroids", broken)
     with kept as rows:
-        again = replay.replay(told, rows, 9, tmp_path / "trial_9")
+        again = runner.replay(told, rows, 9, tmp_path / "trial_9")
     assert "in the tracker" in again.row.error
     assert str(SCENES.parent) not in again.row.error
     assert [path.name for path in again.files] == ["frame_0000.fits"]

@@ -8,8 +8,7 @@ from pydantic import TypeAdapter, ValidationError
 from scipy import stats
 
 from skysim.core.errors import InputError
-from skysim.experiments.study.designs import Design, points
-from skysim.experiments.study.factors import Factor, join_quantity, split_quantity
+from skysim.experiments.study.factors import Design, Factor, join_quantity, points, split_quantity
 
 READ = TypeAdapter(Factor).validate_python
 

@@ -10,9 +10,8 @@ import pytest
 import yaml
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, plan
-from skysim.experiments.study.analysis import table
-from skysim.experiments.study.execution import replay, runner, setups, store
+from skysim.experiments.study import plan, study_file, table
+from skysim.experiments.study.execution import runner, setups, store
 from tests.helpers.study_stores import done
 
 STUDY: dict[str, Any] = {
@@ -35,7 +34,7 @@ STUDY: dict[str, Any] = {
 def loaded(folder: Path, **keys: Any) -> plan.Plan:
     path = folder / "study.yaml"
     path.write_text(yaml.safe_dump(STUDY | keys, sort_keys=False))
-    return loader.load(path)
+    return study_file.load(path)
 
 
 def test_every_replicate_has_hardware_of_its_own_and_the_same_at_every_point(
@@ -64,7 +63,7 @@ def test_the_trials_are_of_different_domes_and_pooled(tmp_path: Path) -> None:
         assert np.ptp(columns["stars"]) > 0
         assert [line.levels for line in lines] == [{"noise": 0.1}, {"noise": 0.2}]
         assert lines[0].responses["stars_mean"].trials == 6
-        again = replay.replay(told, kept, 8, tmp_path / "trial_8")
+        again = runner.replay(told, kept, 8, tmp_path / "trial_8")
     assert again.changed == []
     with store.writing(tmp_path / "study.sqlite") as kept:
         runner.prepare_store(

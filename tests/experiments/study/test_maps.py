@@ -15,13 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.dynamics import guidance
-from skysim.experiments.study import loader
-from skysim.experiments.study.analysis import worst
-from skysim.experiments.study.analysis.table import PointRow
+from skysim.experiments.study import study_file, worst
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.plan import Map, Study
 from skysim.experiments.study.report import maps
+from skysim.experiments.study.table import PointRow
 from skysim.results.metrics import Columns
 from skysim.scene.sections.motion import AttitudeConfig
 
@@ -147,7 +146,7 @@ def test_a_cell_of_too_few_values_is_hatched() -> None:
 def test_the_sky_keeps_its_areas() -> None:
     """Hammer's projection: the whole sky is an ellipse of area 4 pi; every cell has the area of its solid angle."""
     for low, high, left, right in maps.partition(-90, 90, 2000, True):
-        polygon = maps.outline(maps.Cell(low, high, left, right, 0.0, 9), True)
+        polygon = maps.outline(maps.MapCell(low, high, left, right, 0.0, 9), True)
         x, y = polygon.T
         area = abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
         solid = (math.sin(math.radians(high)) - math.sin(math.radians(low))) * math.radians(
@@ -209,7 +208,7 @@ def test_the_colors_of_a_proportion_are_the_same_whatever_its_values() -> None:
 
     table = columns(2000)
     table = {**table, "wrong": (np.arange(2000) % 10 < 3).astype(float)}
-    cell = maps.Cell(0.0, 30.0, 0.0, 360.0, 0.3, 2000)
+    cell = maps.MapCell(0.0, 30.0, 0.0, 360.0, 0.3, 2000)
     panel = maps.DirectionMap("", False, [cell], [])
     image = maps.map_png([panel], Map(kind="map", value="wrong"))
     picture = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
@@ -262,7 +261,7 @@ def test_a_map_that_cannot_be_is_refused(
         yaml.safe_dump(STUDY | {"figures": [{"kind": "map", "value": "wrong"}]} | change)
     )
     with pytest.raises(InputError, match=complaint):
-        loader.load(path)
+        study_file.load(path)
 
 
 def test_a_cell_of_too_few_values_for_its_quantile_is_hatched() -> None:
@@ -357,7 +356,7 @@ def test_the_worst_can_be_pasted_as_a_start() -> None:
 @pytest.mark.slow
 def test_the_worst_of_real_trials_are_found_again_by_their_number() -> None:
     """A trial is replayed from the number in the list, with the same attitude and error."""
-    plan = loader.load("led_count", {"replicates": "40"})
+    plan = study_file.load("led_count", {"replicates": "40"})
     point = next(
         n
         for n, one in enumerate(plan.points)

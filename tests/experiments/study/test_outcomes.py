@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import StarMatch, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
 from skysim.core.types import Floats
-from skysim.experiments.study import loader
+from skysim.experiments.study import study_file
 from skysim.experiments.study.execution import outcomes, setups, trials
 from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX, Outcome, TrueLights
-from skysim.experiments.study.execution.setups import Setup
+from skysim.experiments.study.execution.setups import TrialSetup
 from skysim.experiments.study.plan import TrialSpec
 from skysim.simulation.flight import Flight
 from skysim.simulation.timing import exposure_window
@@ -25,7 +25,7 @@ DOME = TrialSpec("afit_simsat", ".", 1, {}, {"kind": "centroids"}, True)
 ARCMIN_RAD = math.radians(1 / 60)
 
 
-def solved(spec: TrialSpec, seed: int = 3) -> tuple[Setup, Report, TrueLights]:
+def solved(spec: TrialSpec, seed: int = 3) -> tuple[TrialSetup, Report, TrueLights]:
     """A centroid trial's report and true lights."""
     setup = setups.prepared_setup(spec, {})
     ((lights, report),) = trials.solved_centroids(setup, [seed])
@@ -33,7 +33,7 @@ def solved(spec: TrialSpec, seed: int = 3) -> tuple[Setup, Report, TrueLights]:
     return setup, report, lights
 
 
-def scored(setup: Setup, report: Report, lights: TrueLights) -> Outcome:
+def scored(setup: TrialSetup, report: Report, lights: TrueLights) -> Outcome:
     return outcomes.score(setup.lab, setup.estimator, report, lights)
 
 
@@ -137,7 +137,7 @@ def test_honest_roll_noise_is_beyond_ten_arcminutes_and_within_the_covariance(
 
 
 def test_a_regular_spiral_is_refused_as_ambiguous() -> None:
-    plan = loader.load("led_count")
+    plan = study_file.load("led_count")
     point = next(one for one in plan.points if one.levels == {"leds": 1000, "placement": "spiral"})
     rows = trials.run_segments(plan.spec, (trials.Segment(0, point.settings, 0, range(20)),))
     ambiguous = [row.outcome for row in rows if row.outcome.ambiguous]

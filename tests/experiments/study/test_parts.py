@@ -18,13 +18,12 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, plan
-from skysim.experiments.study.analysis import table, worst
-from skysim.experiments.study.designs import Point
+from skysim.experiments.study import plan, study_file, table, worst
 from skysim.experiments.study.execution import engines, runner, store, workers
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.trials import Row
-from skysim.experiments.study.report import export
+from skysim.experiments.study.factors import Point
+from skysim.experiments.study.report import study_export
 from skysim.results.files import row_parts
 from tests.helpers.study_stores import STRAYS, done
 
@@ -200,7 +199,7 @@ def same(columns: Any, others: Any) -> None:
 def test_exports_have_the_same_bytes(both: tuple[Path, Path], tmp_path: Path, suffix: str) -> None:
     for path in both:
         with store.open_store(path) as kept:
-            export.export(kept, ("identified",), tmp_path / f"{path.stem}.{suffix}")
+            study_export.export(kept, ("identified",), tmp_path / f"{path.stem}.{suffix}")
     one, parts = ((tmp_path / f"{path.stem}.{suffix}").read_bytes() for path in both)
     assert one == parts
     assert len(one) > 4000
@@ -211,8 +210,8 @@ def test_an_export_reads_some_trials_at_a_time(both: tuple[Path, Path], tmp_path
     with store.open_store(both[1]) as kept, pytest.MonkeyPatch.context() as patch:
         patch.delattr(store.Store, "columns")
         assert [len(block["trial"]) for block in kept.blocks()] == [30, 30, 30, 30]
-        export.export(kept, ("identified",), tmp_path / "rows.parquet")
-        export.export(kept, ("identified",), tmp_path / "rows.csv")
+        study_export.export(kept, ("identified",), tmp_path / "rows.parquet")
+        study_export.export(kept, ("identified",), tmp_path / "rows.csv")
     assert pyarrow.ParquetFile(tmp_path / "rows.parquet").num_row_groups == 4
     found = pyarrow.read_table(tmp_path / "rows.parquet").to_pydict()
     assert {name: found[name] for name in store.COLUMNS} == whole(both[1])
@@ -337,7 +336,7 @@ def test_killed_at_any_instant_a_study_ends_with_the_same_rows(
 ) -> None:
     """Six kills of the process that stores, while it moves rows every few milliseconds."""
     (tmp_path / "strays.yaml").write_text(STRAYS)
-    told = loader.load(tmp_path / "strays.yaml")
+    told = study_file.load(tmp_path / "strays.yaml")
     draw = random.Random(2)
     done(told, tmp_path / "whole.sqlite")
     often = tmp_path / "often.sqlite"

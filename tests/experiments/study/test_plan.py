@@ -3,7 +3,7 @@
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, plan
+from skysim.experiments.study import plan, study_file
 
 STUDY = """schema: 1
 title: a question
@@ -26,7 +26,7 @@ def written(folder, text):
 
 
 def test_a_plan_has_every_trial_of_every_point(tmp_path):
-    told = loader.load(written(tmp_path, STUDY))
+    told = study_file.load(written(tmp_path, STUDY))
     assert (told.name, len(told.points), told.trials) == ("question", 6, 24)
     scene, trial = plan.resolve_point(told.spec, told.points[4].settings)
     assert trial.false_lights == 5
@@ -36,8 +36,8 @@ def test_a_plan_has_every_trial_of_every_point(tmp_path):
 
 
 def test_the_digest_is_of_what_decides_on_trials_and_of_nothing_else(tmp_path):
-    told = loader.load(written(tmp_path, STUDY))
-    same = loader.load(
+    told = study_file.load(written(tmp_path, STUDY))
+    same = study_file.load(
         written(tmp_path, STUDY.replace("a question", "another").replace(", cross_arcsec_p95", ""))
     )
     assert same.digest == told.digest
@@ -46,11 +46,11 @@ def test_the_digest_is_of_what_decides_on_trials_and_of_nothing_else(tmp_path):
         ("noise_px: 0.1", "noise_px: 0.2"),
         ("replicates: 4", "replicates: 5"),
     ):
-        assert loader.load(written(tmp_path, STUDY.replace(*change))).digest != told.digest
+        assert study_file.load(written(tmp_path, STUDY.replace(*change))).digest != told.digest
 
 
 def test_an_override_changes_the_study(tmp_path):
-    told = loader.load(
+    told = study_file.load(
         written(tmp_path, STUDY), {"replicates": "7", "factors.strays.values": "[1, 2, 3]"}
     )
     assert told.trials == 3 * 3 * 7
@@ -122,14 +122,14 @@ def test_an_override_changes_the_study(tmp_path):
 )
 def test_a_slip_is_told_in_one_line_with_its_place(tmp_path, change, complaint):
     with pytest.raises(InputError, match=complaint) as told:
-        loader.load(written(tmp_path, STUDY.replace(*change)))
+        study_file.load(written(tmp_path, STUDY.replace(*change)))
     assert "\n" not in str(told.value)
     assert "question.yaml" in str(told.value)
 
 
 def test_a_scene_beside_the_study_is_found_from_anywhere(tmp_path):
     (tmp_path / "mine.yaml").write_text("schema: 1\nbase: shefex2\ntitle: mine\n")
-    told = loader.load(written(tmp_path, STUDY.replace("scene: shefex2", "scene: mine.yaml")))
+    told = study_file.load(written(tmp_path, STUDY.replace("scene: shefex2", "scene: mine.yaml")))
     assert plan.resolve_point(told.spec, {})[0].title == "mine"
 
 
@@ -137,14 +137,14 @@ def test_there_is_no_such_study():
     with pytest.raises(
         InputError, match=r"which: no such study; allowed: a .yaml file or one of dome_"
     ):
-        loader.load("which")
+        study_file.load("which")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(plan.STUDIES.glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_study_that_comes_along_can_be_asked(path):
     """Every level of every factor makes a scene; `load` has tried them all."""
-    told = loader.load(path)
+    told = study_file.load(path)
     assert told.study.title
     assert told.trials or told.study.optimize
 
@@ -163,7 +163,9 @@ responses: [identified]
 def test_codes_of_leds_need_a_flight(tmp_path):
     """One frame shows one bit."""
     assert (
-        loader.load(written(tmp_path, FLIGHT.format(scene="coded_spiral", start="scene"))).trials
+        study_file.load(
+            written(tmp_path, FLIGHT.format(scene="coded_spiral", start="scene"))
+        ).trials
         == 2
     )
     single = FLIGHT.format(scene="coded_spiral", start="scene").replace(
@@ -173,7 +175,7 @@ def test_codes_of_leds_need_a_flight(tmp_path):
         InputError,
         match=r"frames with tracker\.decoder, which needs many; allowed: centroids, flight",
     ):
-        loader.load(written(tmp_path, single))
+        study_file.load(written(tmp_path, single))
 
 
 @pytest.mark.parametrize(
@@ -215,10 +217,10 @@ def test_codes_of_leds_need_a_flight(tmp_path):
 def test_a_random_start_is_one_that_the_scene_can_have(scene, start, complaint, tmp_path):
     path = written(tmp_path, FLIGHT.format(scene=scene, start=start))
     if complaint is None:
-        assert loader.load(path).trials == 2
+        assert study_file.load(path).trials == 2
     else:
         with pytest.raises(InputError, match=complaint):
-            loader.load(path)
+            study_file.load(path)
 
 
 @pytest.mark.parametrize(
@@ -239,4 +241,4 @@ def test_an_axis_is_a_name_or_one_vector(axis, complaint, tmp_path):
         "trial.false_lights", "seed"
     )
     with pytest.raises(InputError, match=complaint):
-        loader.load(written(tmp_path, text))
+        study_file.load(written(tmp_path, text))

@@ -14,17 +14,14 @@ import pytest
 import yaml
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, plan
-from skysim.experiments.study.analysis import cost, search
-from skysim.experiments.study.designs import Point
+from skysim.experiments.study import plan, search, study_file
 from skysim.experiments.study.execution import engines, runner, store
 from skysim.experiments.study.execution.outcomes import FAILED, Outcome
 from skysim.experiments.study.execution.setups import code_version, seed_of
 from skysim.experiments.study.execution.trials import REFUSED, Row, TrialJob
-from skysim.experiments.study.factors import Settings
+from skysim.experiments.study.factors import Point, Settings
 from skysim.experiments.study.report.study_report import front_table
-from skysim.results.files.builder.parts import parts_list
-from skysim.results.files.builder.prices import find_prices, read_prices
+from skysim.results.files.parts import find_prices, parts_list, read_prices
 from skysim.results.metrics import Summary
 from skysim.results.report import Report
 from skysim.scene import loader as scene_loader
@@ -105,7 +102,7 @@ def any_scene(monkeypatch: pytest.MonkeyPatch) -> None:
 def loaded(folder: Path, told: dict[str, Any]) -> plan.Plan:
     path = folder / "study.yaml"
     path.write_text(yaml.safe_dump(told))
-    made = loader.load(path)
+    made = study_file.load(path)
     search.check(made.study)
     return made
 
@@ -374,7 +371,7 @@ def test_cost_is_in_si_units(tmp_path: Path) -> None:
             },
         }
     )
-    price = cost.factors_cost(wanted.cost, {"size": "48 in", "leds": 300, "dome": "precise"})
+    price = search.factors_cost(wanted.cost, {"size": "48 in", "leds": 300, "dome": "precise"})
     assert price == pytest.approx(1 + 2 * 1.2192 + 3 + 5, rel=1e-12)
 
 
@@ -402,9 +399,9 @@ def test_cost_is_the_total_of_the_parts(tmp_path: Path) -> None:
     settings: Settings = {"light.layout.count": 200, "tracker.survey.led_sigma": "1 mm"}
     scene = scene_loader.load("coded_spiral", {key: str(value) for key, value in settings.items()})
     total = parts_list(scene, read_prices(find_prices("assumed"))).total
-    found, why = cost.cost(made, Point({"leds": 200, "survey": "1 mm"}, settings))
+    found, why = search.cost(made, Point({"leds": 200, "survey": "1 mm"}, settings))
     assert (found, why) == (pytest.approx(7 + total, abs=1e-9), "")
-    refused, why = cost.cost(made, Point({}, settings | {"tracker.survey.led_sigma": "1 um"}))
+    refused, why = search.cost(made, Point({}, settings | {"tracker.survey.led_sigma": "1 um"}))
     assert math.isnan(refused)
     assert "no survey reaches 0.001 mm" in why
 
@@ -418,7 +415,7 @@ def test_other_prices_are_another_search(tmp_path: Path) -> None:
     again = priced(tmp_path, "mine.csv")
     assert again.digest != first.digest
     settings: Settings = {"light.layout.count": 200}
-    prices = [cost.cost(one, Point({}, settings))[0] for one in (first, again)]
+    prices = [search.cost(one, Point({}, settings))[0] for one in (first, again)]
     assert prices[1] - prices[0] == pytest.approx(200 * 0.1, abs=0.01)
 
 
@@ -536,7 +533,7 @@ def test_a_factor_sets_several_keys_alike(factor: dict[str, Any]) -> None:
     study = plan.Study.model_validate(STUDY | {"factors": {"size": factor | {"keys": keys}}})
     value, settings = study.factors["size"].value_at(0.75)
     assert settings == dict.fromkeys(keys, value)
-    assert 1 < cost.si(value) <= 2
+    assert 1 < search.si(value) <= 2
     for wrong in ({}, {"key": "a", "keys": ["b"]}):
         with pytest.raises(ValueError, match="needs either key or keys"):
             plan.Study.model_validate(STUDY | {"factors": {"size": factor | wrong}})
@@ -544,7 +541,7 @@ def test_a_factor_sets_several_keys_alike(factor: dict[str, Any]) -> None:
 
 @pytest.mark.slow
 def test_the_shipped_study_is_what_it_says(tmp_path: Path) -> None:
-    made = loader.load("dome_for_the_money")
+    made = study_file.load("dome_for_the_money")
     search.check(made.study)
     first = {name: factor.value_at(0.5) for name, factor in made.study.factors.items()}
     settings: Settings = {}
@@ -552,5 +549,5 @@ def test_the_shipped_study_is_what_it_says(tmp_path: Path) -> None:
         settings |= sets
     scene, _ = plan.resolve_point(made.spec, settings)
     surface: Any = scene.light.surface  # type: ignore[union-attr]
-    assert surface.apex_m == surface.radius_m == cost.si(first["radius"][0])
-    assert scene.vehicle.camera_m == (0.0, 0.0, cost.si(first["lever"][0]))
+    assert surface.apex_m == surface.radius_m == search.si(first["radius"][0])
+    assert scene.vehicle.camera_m == (0.0, 0.0, search.si(first["lever"][0]))

@@ -19,12 +19,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, plan
-from skysim.experiments.study.designs import Point
+from skysim.experiments.study import plan, study_file
 from skysim.experiments.study.execution import runner, setups, store, trials
 from skysim.experiments.study.execution.outcomes import Outcome
-from skysim.experiments.study.execution.setups import Setup
+from skysim.experiments.study.execution.setups import TrialSetup
 from skysim.experiments.study.execution.trials import Row
+from skysim.experiments.study.factors import Point
 from tests.helpers.study_stores import STRAYS, contents, done
 
 
@@ -32,7 +32,7 @@ from tests.helpers.study_stores import STRAYS, contents, done
 def told(tmp_path_factory: pytest.TempPathFactory) -> plan.Plan:
     path = tmp_path_factory.mktemp("study") / "strays.yaml"
     path.write_text(STRAYS)
-    return loader.load(path)
+    return study_file.load(path)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def whole(told: plan.Plan) -> str:
 
 
 def other(told: plan.Plan, **overrides: str) -> plan.Plan:
-    return loader.load(told.path, overrides)
+    return study_file.load(told.path, overrides)
 
 
 def child(does: Callable[[], object]) -> int:
@@ -274,7 +274,7 @@ def test_out_of_time_it_stops_and_resumes(told: plan.Plan, whole: str, tmp_path:
 def test_trials_that_raise_are_rows_until_they_are_too_many(
     told: plan.Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fragile(ready: Setup, seed: int) -> Outcome:
+    def fragile(ready: TrialSetup, seed: int) -> Outcome:
         if seed % 4 == 0:
             raise ZeroDivisionError(f"of {seed}")
         return Outcome("solved", 1, 1)

@@ -14,19 +14,19 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import designs
-from skysim.experiments.study.analysis import axes, search
-from skysim.experiments.study.analysis.sensitivity import Index
-from skysim.experiments.study.analysis.table import PointRow, cells, has_few_values, table
-from skysim.experiments.study.designs import Point
+from skysim.experiments.study import factors as designs
+from skysim.experiments.study import search
+from skysim.experiments.study import table as axes
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.trials import Row
+from skysim.experiments.study.factors import Point
 from skysim.experiments.study.plan import Curve, Heat, Study
 from skysim.experiments.study.report import figures, layout, study_report
+from skysim.experiments.study.report.figures import color_scale
 from skysim.experiments.study.report.overview import Overview
-from skysim.experiments.study.report.scales import color_scale
 from skysim.experiments.study.report.study_report import POINTS, Analysis
+from skysim.experiments.study.table import Index, PointRow, cells, has_few_values, table
 from skysim.results.metrics import Summary
 from skysim.results.plots import INK
 

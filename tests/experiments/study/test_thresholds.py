@@ -12,11 +12,10 @@ import yaml
 from scipy import stats
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader
-from skysim.experiments.study.analysis import thresholds
-from skysim.experiments.study.analysis.table import PointRow
-from skysim.experiments.study.analysis.thresholds import Crossing, crossing
+from skysim.experiments.study import study_file, thresholds
 from skysim.experiments.study.plan import Study, Threshold
+from skysim.experiments.study.table import PointRow
+from skysim.experiments.study.thresholds import Crossing, crossing
 from skysim.results import metrics
 
 LEVELS = np.array([0.0, 1, 2, 3, 4, 6, 8, 10])
@@ -204,7 +203,7 @@ def test_a_threshold_that_cannot_be_is_refused(
     path = tmp_path / "study.yaml"
     path.write_text(yaml.safe_dump(tree, sort_keys=False))
     with pytest.raises(InputError, match=complaint):
-        loader.load(path)
+        study_file.load(path)
 
 
 @pytest.mark.parametrize(

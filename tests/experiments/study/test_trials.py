@@ -13,13 +13,12 @@ from astropy.utils import iers
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from skysim.core.paths import SCENES
+from skysim.core.files import SCENES
 from skysim.experiments.study import plan
 from skysim.experiments.study.execution import detections, setups, trials
 from skysim.experiments.study.plan import CentroidTrial, FrameTrial, TrialSpec
 from skysim.simulation.exposure import render_at_rest
-from skysim.sources.solar_system.observer import observe_from
-from skysim.sources.solar_system.places import place
+from skysim.sources.ephemeris import observe_from, place
 
 SKY = TrialSpec("shefex2", ".", 1, {}, {"kind": "centroids"}, True)
 DOME = TrialSpec("afit_simsat", ".", 1, {}, {"kind": "centroids"}, True)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, unused_options
+from skysim.experiments.study import study_file, unused_options
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.setups import build_setup
 from skysim.experiments.study.plan import CentroidTrial, FrameTrial
@@ -149,7 +149,7 @@ def test_an_option_without_effect_is_refused(
     scene: str, trial: str, factors: str, settings: str, told: str, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match=told) as refused:
-        loader.load(study(tmp_path, scene, trial, factors, settings))
+        study_file.load(study(tmp_path, scene, trial, factors, settings))
     assert str(refused.value).count("\n") == 0
     assert "allowed: " in str(refused.value)
 
@@ -183,7 +183,7 @@ def test_an_option_without_effect_is_refused(
 def test_an_option_with_an_effect_is_allowed(
     scene: str, trial: str, factors: str, settings: str, tmp_path: Path
 ) -> None:
-    assert loader.load(study(tmp_path, scene, trial, factors, settings)).trials >= 2
+    assert study_file.load(study(tmp_path, scene, trial, factors, settings)).trials >= 2
 
 
 @pytest.mark.parametrize("order", ["[local, default]", "[default, local]"])
@@ -192,7 +192,7 @@ def test_an_option_that_has_an_effect_at_another_factor_s_level_is_allowed(
 ) -> None:
     """Whichever level of the detector is the middle: with one of them the gyro is used."""
     factors = f"detector: {{key: tracker.detector, values: {order}}}, gyro: {{key: trial.gyro, values: [false, true]}}"
-    assert loader.load(study(tmp_path, "afit_simsat", DOME, factors)).trials == 8
+    assert study_file.load(study(tmp_path, "afit_simsat", DOME, factors)).trials == 8
 
 
 @pytest.mark.slow
@@ -241,7 +241,7 @@ def test_an_option_that_has_an_effect_at_another_factor_s_level_is_allowed(
 def test_what_is_refused_changes_no_outcome(
     scene: str, trial: str, settings: dict[str, object], change: dict[str, object], tmp_path: Path
 ) -> None:
-    plan = loader.load(study(tmp_path, scene, trial, NOISE, "{}"))
+    plan = study_file.load(study(tmp_path, scene, trial, NOISE, "{}"))
     outcomes = []
     for chosen in (settings, settings | change):
         setup = build_setup(plan.spec, chosen)

@@ -12,12 +12,12 @@ from skysim.apps.cli.options import Json, Overrides, SceneArg, load
 from skysim.apps.cli.terminal import print_json, progress_callback
 from skysim.core.constants import DAY_S, HOUR_S, JULIAN_YEAR_DAY
 from skysim.core.errors import InputError
-from skysim.results.report.as_text import print_table
-from skysim.results.report.blocks import Column, Table
+from skysim.results.report import print_table
+from skysim.results.report_blocks import Column, Table
 
 if TYPE_CHECKING:
     from skysim.scene.scene import Scene
-    from skysim.sources.orbit.availability import Pointing, Samples
+    from skysim.sources.orbit_availability import Pointing, SkySamples
 
 SPANS_S = {"orbit": None, "day": DAY_S, "year": JULIAN_YEAR_DAY * DAY_S}
 LAWS = ("inertial", "zenith")
@@ -87,7 +87,7 @@ def pointing_of(scene: Scene, law: str, off_deg: float, around_deg: float) -> Po
 
     from skysim.camera.glow.background import direction
     from skysim.scene.sections.motion import PointingConfig
-    from skysim.sources.orbit.availability import Pointing
+    from skysim.sources.orbit_availability import Pointing
 
     start = scene.motion.start
     if law == "zenith":
@@ -99,14 +99,14 @@ def pointing_of(scene: Scene, law: str, off_deg: float, around_deg: float) -> Po
 
 def computed(
     scene: Scene, pointing: Pointing, span_s: float | None, samples: int, watch: Any
-) -> Samples:
+) -> SkySamples:
     """The angles over the span, or over one revolution."""
     import numpy as np
 
     from skysim.core.constants import EARTH_MU_M3_S2
     from skysim.sources import catalog, stars
-    from skysim.sources.orbit.availability import sample
-    from skysim.sources.orbit.camera_orbit import build_orbit
+    from skysim.sources.camera_orbit import build_orbit
+    from skysim.sources.orbit_availability import sample
 
     orbit = build_orbit(scene.orbit, scene.start_time)
     assert orbit is not None
@@ -136,7 +136,7 @@ def computed(
     )
 
 
-def fractions_of(found: Samples, scene: Scene) -> dict[str, float]:
+def fractions_of(found: SkySamples, scene: Scene) -> dict[str, float]:
     """The fraction of the times at which each condition holds, and at which all do."""
     import numpy as np
 
@@ -147,11 +147,11 @@ def fractions_of(found: Samples, scene: Scene) -> dict[str, float]:
     return {**each, "all": float(np.mean(np.all(list(outside.values()), axis=0)))}
 
 
-def write_picture(path: Path, found: Samples, scene: Scene) -> None:
+def write_picture(path: Path, found: SkySamples, scene: Scene) -> None:
     """The angles over time with their limits, and the times at which the tracker is available."""
     import numpy as np
 
-    from skysim.core.io.files import atomic_file
+    from skysim.core.files import atomic_file
     from skysim.results.plots import INK, png
 
     assert scene.orbit is not None

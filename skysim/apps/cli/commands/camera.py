@@ -9,22 +9,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from skysim.apps.cli.option_names import OPTIONS, as_typed
-from skysim.apps.cli.options import Json, Overrides, complete_scene
+from skysim.apps.cli.options import OPTIONS, Json, Overrides, as_typed, complete_scene
 from skysim.apps.cli.terminal import print_error, print_json, print_list
 from skysim.core.errors import InputError, printable, unknown_name
-from skysim.results.report.as_text import terminal_width
-from skysim.scene.data_sheet.questions import QUESTIONS
-from skysim.scene.data_sheet.sheet import PLACEHOLDER_LENS
+from skysim.results.report import terminal_width
+from skysim.scene.camera_sheet import PLACEHOLDER_LENS, QUESTIONS
 
 if TYPE_CHECKING:
-    from skysim.scene.data_sheet.sheet import Sheet
-    from skysim.scene.opencv_calibration import Calibration
+    from skysim.scene.camera_sheet import Sheet
+    from skysim.scene.opencv_calibration import OpencvCalibration
 
 
 def complete_camera(incomplete: str) -> list[str]:
     """Names of camera presets, scenes and YAML files that begin with what was typed."""
-    from skysim.core.paths import DATA
+    from skysim.core.files import DATA
 
     names = {
         path.stem for path in (DATA / "cameras").glob("*.yaml") if path.stem.startswith(incomplete)
@@ -78,7 +76,7 @@ def cameras(context: typer.Context, json: Json = False) -> None:
 
 def preset_entry(path: Path) -> dict[str, str]:
     """Name, size, pitch, shutter and the first words of the description of a preset."""
-    from skysim.core.io.yaml_reader import read_yaml
+    from skysim.core.yaml_reader import read_yaml
 
     tree, text = read_yaml(path)
     camera = tree["camera"]
@@ -116,7 +114,7 @@ def camera_show(
     """
     import dataclasses
 
-    from skysim.core.io import files
+    from skysim.core import files
     from skysim.scene import opencv_calibration
 
     lens, body = read_camera(file, set_)
@@ -149,9 +147,9 @@ def camera_show(
 
 def read_camera(
     name: str, overrides: list[str] | None
-) -> tuple[Calibration | None, dict[str, int]]:
+) -> tuple[OpencvCalibration | None, dict[str, int]]:
     """The calibration, None without a lens, and the chip's size: of a scene, a camera, a preset or an OpenCV file."""
-    from skysim.core.io.yaml_reader import parse_overrides
+    from skysim.core.yaml_reader import parse_overrides
     from skysim.scene import loader, opencv_calibration
 
     if opencv_calibration.looks_like_calibration(Path(name)):
@@ -225,8 +223,8 @@ def camera_new(
 
     Numbers that the data sheet does not state are assumed; the file and the output name them.
     """
-    from skysim.core.io import files
-    from skysim.scene.data_sheet import sheet
+    from skysim.core import files
+    from skysim.scene import camera_sheet
 
     if out.suffix not in (".yaml", ".yml") or out.exists():
         raise InputError(
@@ -235,9 +233,9 @@ def camera_new(
     answers = {key: context.params[key] for key in QUESTIONS if context.params[key] is not None}
     if not answers:
         answers = ask_all()
-    filled = sheet.fill(answers)
+    filled = camera_sheet.fill(answers)
     files.make_folder(out.parent)
-    files.write_text(out, sheet.text(filled, name or out.stem))
+    files.write_text(out, camera_sheet.text(filled, name or out.stem))
     if json:
         print_json({"file": str(out), "missing": [one._asdict() for one in filled.missing]})
     else:
@@ -246,17 +244,17 @@ def camera_new(
 
 def ask_all() -> dict[str, str]:
     """Ask for each number of the data sheet; a wrong answer is asked again, an empty one is not stated."""
-    from skysim.scene.data_sheet import sheet
+    from skysim.scene import camera_sheet
 
     print(
         "Numbers of the data sheets of camera and lens, with their units. Press Enter for what is not stated."
     )
     answers: dict[str, str] = {}
     for name, question in QUESTIONS.items():
-        required = name in sheet.PLACEHOLDERS
-        if not required and name not in sheet.outstanding(answers):
+        required = name in camera_sheet.PLACEHOLDERS
+        if not required and name not in camera_sheet.outstanding(answers):
             continue  # of a lens or a shutter that this camera does not have
-        assumed = "" if required else sheet.outstanding(answers)[name].assumed or "left out"
+        assumed = "" if required else camera_sheet.outstanding(answers)[name].assumed or "left out"
         print(
             f"\n{question.ask}\n  where: {question.where}"
             + (f"\n  not stated: {assumed}" if assumed else "")
@@ -267,7 +265,7 @@ def ask_all() -> dict[str, str]:
             ).strip()
             try:
                 if text:
-                    sheet.outstanding(answers | {name: text})
+                    camera_sheet.outstanding(answers | {name: text})
                     answers[name] = text
                 elif required:
                     raise InputError(name.replace("_", "-"), "required")

@@ -10,7 +10,7 @@ import typer
 from skysim.apps.cli.options import Json, OpenReport
 from skysim.apps.cli.terminal import print_json, print_list, progress_callback
 from skysim.core.errors import InputError
-from skysim.results.report.as_text import print_blocks
+from skysim.results.report import print_blocks
 
 
 def reproduce(

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skysim.apps.cli import terminal
-from skysim.apps.cli.option_names import with_location
 from skysim.apps.cli.options import (
     LOADED,
     TRACKER_HELP,
@@ -31,6 +30,7 @@ from skysim.apps.cli.options import (
     scene_names,
     selected_stages,
     used_programs,
+    with_location,
 )
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def run(
     json: Json = False,
 ) -> None:
     """Simulate a scene: motion, frames, attitude solutions and their scores."""
-    from skysim.results.report import Facts
+    from skysim.results.report_blocks import Facts
     from skysim.results.run import FlightRecorder
     from skysim.simulation.checks import check
     from skysim.simulation.checks.facts import TRACKER_KNOWS
@@ -117,14 +117,14 @@ def render(
 ) -> None:
     """Simulate a scene and write its frames with their truth, without solving them."""
     from skysim.results.run import FlightRecorder
-    from skysim.simulation.checks.dome import assumptions
+    from skysim.simulation.checks import dome_warnings
     from skysim.simulation.flight import open_flight
 
     loaded = load(scene, frames, seed, set_)
     folder = output_folder(out, loaded.name)
     paths = list[str]()
     with open_flight(loaded) as flight:
-        if warning := assumptions.camera_outside_warning(
+        if warning := dome_warnings.camera_outside_warning(
             loaded, flight.lab.camera.mount, flight.lab.start
         ):
             terminal.print_error(warning)
@@ -152,10 +152,9 @@ def compare(
 ) -> None:
     """Let trackers solve the same frames and compare their scores. With a filter, the first one closes the loop."""
     from skysim.experiments import tracker_comparison
-    from skysim.results.recorder import Recorder
+    from skysim.results.run import Recorder
     from skysim.simulation.flight import Flight
-    from skysim.simulation.lab import build_lab
-    from skysim.simulation.user_parts import UserParts
+    from skysim.simulation.lab import UserParts, build_lab
 
     loaded = load(scene, frames, seed, set_, tracker)
     programs = used_programs(program, [*tracker, *scene_names(loaded)])
@@ -186,12 +185,12 @@ def compare(
 
 def trackers(json: Json = False) -> None:
     """List the available trackers, and what each still needs to be installed."""
-    from skysim.tracking.external import interface
+    from skysim.tracking import tracker_interface
 
-    entries = [{"name": interface.OWN, "from": "skysim", "needs": ""}]
+    entries = [{"name": tracker_interface.OWN, "from": "skysim", "needs": ""}]
     entries += [
-        {"name": name, "from": point.value, "needs": interface.missing_extra(point)}
-        for name, point in interface.TRACKERS.entry_points().items()
+        {"name": name, "from": point.value, "needs": tracker_interface.missing_extra(point)}
+        for name, point in tracker_interface.TRACKERS.entry_points().items()
     ]
 
     def line(entry: dict[str, str]) -> str:

@@ -68,8 +68,8 @@ def solve(
     """
     import skysim.core.jit  # noqa: F401  # says so if numba has to compile
     from skysim.apps import plate_solver
-    from skysim.core.io import files
-    from skysim.core.io.images import grab_frame
+    from skysim.core import files
+    from skysim.core.images import grab_frame
 
     stages = selected_stages(
         detector=detector, centroider=centroider, identifier=identifier, solver=solver

@@ -20,13 +20,16 @@ from skysim.apps.cli.options import (
     study_names,
     used_programs,
 )
-from skysim.apps.cli.study_summary import (
+from skysim.apps.cli.terminal import (
+    print_error,
+    print_json,
     print_replay,
     print_study_status,
+    print_titles,
     print_worst,
     study_status,
+    trial_progress,
 )
-from skysim.apps.cli.terminal import print_error, print_json, print_titles, trial_progress
 from skysim.core.errors import InputError, printable, unknown_name
 
 if TYPE_CHECKING:
@@ -61,7 +64,7 @@ def studies(context: typer.Context, json: Json = False) -> None:
     """List the studies that come with skysim."""
     if context.invoked_subcommand:
         return
-    from skysim.core.paths import STUDIES
+    from skysim.core.files import STUDIES
 
     print_titles(STUDIES, json)
 
@@ -83,12 +86,12 @@ def run(
 ) -> None:
     """Run a study, or a search if called as `optimize`, that has no store yet."""
     start_workers(engine)
-    from skysim.core.io.yaml_reader import parse_overrides
-    from skysim.experiments.study import loader
-    from skysim.tracking.external import process
+    from skysim.core.yaml_reader import parse_overrides
+    from skysim.experiments.study import study_file
+    from skysim.tracking import tracker_interface
 
     overrides = parse_overrides(set_)
-    plan = loader.load(study, overrides, process.program_commands(program))
+    plan = study_file.load(study, overrides, tracker_interface.program_commands(program))
     used_programs(program, study_names(plan) if program else ())
     search = context.info_name == "optimize"
     if search and plan.study.optimize is None:
@@ -163,7 +166,7 @@ def export(
     out: Out = None,
 ) -> None:
     """Write a study's results for other tools."""
-    from skysim.experiments.study.report import export as study_export
+    from skysim.experiments.study.report import study_export
 
     study, out = located(study, out)
     plan, _ = load_stored_plan(study, out)
@@ -188,7 +191,7 @@ def replay(
     json: Json = False,
 ) -> None:
     """Repeat one trial and write its frames."""
-    from skysim.experiments.study.execution import replay as execution
+    from skysim.experiments.study.execution import runner as execution
 
     study, out = located(study, out)
     plan, _ = load_stored_plan(study, out, program or [])
@@ -234,7 +237,7 @@ def worst(
     json: Json = False,
 ) -> None:
     """Name the attitudes of the worst trials, and the commands that repeat them."""
-    from skysim.experiments.study.analysis import worst as analysis
+    from skysim.experiments.study import worst as analysis
     from skysim.results import metrics
 
     study, out = located(study, out)
@@ -258,7 +261,7 @@ def worst(
 
 def chosen_levels(words: list[str]) -> dict[str, Any]:
     """Levels by factor from FACTOR=LEVEL. Raises InputError."""
-    from skysim.core.io.yaml_reader import parse_overrides, parse_yaml
+    from skysim.core.yaml_reader import parse_overrides, parse_yaml
 
     return {
         key: parse_yaml(text)[1]
@@ -287,10 +290,14 @@ def run_and_report(
 ) -> None:
     """Run the missing trials of a study or a search with a progress bar, then report.
 
-    resumed       : the store may hold trials already
-    repeat_failed : repeat the failed trials too
+    Parameters
+    ----------
+    resumed
+        The store may hold trials already
+    repeat_failed
+        Repeat the failed trials too
     """
-    from skysim.experiments.study.analysis import search
+    from skysim.experiments.study import search
     from skysim.experiments.study.execution import runner, store
 
     path = folder_of(study, out) / store.STORE
@@ -328,7 +335,7 @@ def interruptible(resume_command: str, stored: Store) -> Iterator[None]:
 
 def write_report(plan: Plan, study: str, out: Path | None, json: bool, open_: bool) -> None:
     """Write the HTML report, print it, and open it in the browser if `open_`."""
-    from skysim.experiments.study.analysis import search, table
+    from skysim.experiments.study import search, table
     from skysim.experiments.study.report import study_report
 
     path = folder_of(study, out) / "report.html"
@@ -379,21 +386,31 @@ def load_stored_plan(
 ) -> tuple[Plan, dict[str, str]]:
     """Load the study with the overrides saved in its store; return the plan and the overrides.
 
-    program : external trackers of the command line; None if no trial will be run
-    set_    : more overrides
-    grows   : whether the study may have more replicates than its store
+    Parameters
+    ----------
+    program
+        External trackers of the command line; None if no trial will be run
+    set_
+        More overrides
+    grows
+        Whether the study may have more replicates than its store
 
-    Raises InputError if the store holds another study, or this one before it was changed.
+    Raises
+    ------
+    InputError
+        If the store holds another study, or this one before it was changed.
     """
-    from skysim.core.io.yaml_reader import parse_overrides
-    from skysim.experiments.study import loader
+    from skysim.core.yaml_reader import parse_overrides
+    from skysim.experiments.study import study_file
     from skysim.experiments.study.execution import runner
-    from skysim.tracking.external import process
+    from skysim.tracking import tracker_interface
 
     with open_store(study, out) as stored:
         overrides = stored.overrides() | parse_overrides(set_)
-        plan = loader.load(
-            study, overrides, None if program is None else process.program_commands(program)
+        plan = study_file.load(
+            study,
+            overrides,
+            None if program is None else tracker_interface.program_commands(program),
         )
         kept = runner.stored_replicates(plan, stored)
         path = stored.path

@@ -10,11 +10,11 @@ import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import typer
+from pydantic import BaseModel
 
-from skysim.apps.cli.option_names import with_location
 from skysim.apps.cli.options import (
     Json,
     Overrides,
@@ -24,15 +24,96 @@ from skysim.apps.cli.options import (
     scene_names,
     study_names,
     used_programs,
+    with_location,
 )
 from skysim.apps.cli.terminal import print_check, print_error, print_json
 from skysim.core.errors import InputError
-from skysim.scene.data_sheet.sheet import PLACEHOLDER_LENS
+from skysim.experiments.study.plan import Study
+from skysim.scene.camera_sheet import PLACEHOLDER_LENS
+from skysim.scene.scene import NAME_ALIAS, Scene
+from skysim.scene.sections.camera import CameraConfig
+
+# JSON Schema of scene and study files, for editors.
+
+
+SCHEMA_KINDS: Mapping[str, type[BaseModel]] = {"scene": Scene, "study": Study}
+EXTRA_KEYS: Mapping[str, dict[str, Any]] = {  # keys that the loader resolves before validation
+    Scene.__name__: {
+        "base": {
+            "type": "string",
+            "description": "another scene: its name, or a file beside this one",
+        }
+    },
+    CameraConfig.__name__: {
+        "preset": {
+            "type": "string",
+            "description": "a file of data/cameras that supplies the missing keys",
+        },
+        "calibration": {
+            "type": "string",
+            "description": "an OpenCV calibration file: focal length, center, distortion",
+        },
+    },
+}
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+DROPPED_KEYWORDS = ("required", "discriminator", "default")
+BOUND_KEYWORDS = {
+    "ge": "minimum",
+    "gt": "exclusiveMinimum",
+    "le": "maximum",
+    "lt": "exclusiveMaximum",
+}
+
+
+def json_schema(kind: str) -> dict[str, Any]:
+    """The JSON Schema (draft 2020-12) of a kind of file."""
+    model = SCHEMA_KINDS[kind]
+    schema = relaxed(model.model_json_schema(by_alias=True), model.__name__)
+    return {"$schema": DIALECT, "title": f"A {kind} of skysim", "required": ["schema"]} | {
+        key: value for key, value in schema.items() if key != "title"
+    }
+
+
+def relaxed(node: Any, name: str = "") -> Any:
+    """Return the schema without required keys, defaults and discriminators; `oneOf` becomes `anyOf`.
+
+    Parameters
+    ----------
+    name
+        Of the definition that `node` is, for which EXTRA_KEYS may add keys
+    """
+    if isinstance(node, list):
+        return [relaxed(item) for item in node]
+    if not isinstance(node, dict):
+        return node
+    relaxed_node: dict[str, Any] = {}
+    for key, value in node.items():
+        if key == "properties":
+            properties = {
+                key_name: relaxed(child)
+                for key_name, child in value.items()
+                if key_name != NAME_ALIAS
+            }
+            relaxed_node[key] = properties | EXTRA_KEYS.get(name, {})
+        elif key == "$defs":
+            relaxed_node[key] = {
+                key_name: relaxed(child, key_name) for key_name, child in value.items()
+            }
+        elif (
+            key in BOUND_KEYWORDS
+        ):  # pydantic's keyword remains where a validator precedes the bound
+            relaxed_node |= (
+                {BOUND_KEYWORDS[key]: value} if node.get("type") in ("number", "integer") else {}
+            )
+        elif key not in DROPPED_KEYWORDS and (key != "title" or name):
+            relaxed_node["anyOf" if key == "oneOf" else key] = relaxed(value)
+    return relaxed_node
+
 
 KINDS = ("scene", "study")
 
 
-class Verdict(NamedTuple):
+class FileVerdict(NamedTuple):
     """Result for one file: a description and warnings, or `fault`, the error in one line."""
 
     file: str
@@ -58,19 +139,17 @@ def validate(
 ) -> None:
     """Check files: keys, units, consistency, and whether a scene can be set up. Exit code 2 if one is invalid."""
     if schema is not None:
-        from skysim.apps.cli import json_schema
-
         if schema not in KINDS:
             raise InputError(f"--schema {schema}", "", ", ".join(KINDS))
-        print_json(json_schema.json_schema(schema))
+        print_json(json_schema(schema))
         return
     if not files:
         raise InputError("", "no files", "files, or --schema scene")
     programs = {}
     if program:
-        from skysim.tracking.external import process
+        from skysim.tracking import tracker_interface
 
-        programs = process.program_commands(program)
+        programs = tracker_interface.program_commands(program)
     verdicts = [check_file(path, programs) for path in files]
     if program and not any(verdict.fault for verdict in verdicts):
         used_programs(program, {name for path in files for name in names_in_file(path)})
@@ -93,8 +172,7 @@ def check(
     Nothing is simulated or rendered; everything is computed at sampled attitudes.
     """
     from skysim.simulation.checks import check as check_plan
-    from skysim.simulation.lab import build_lab
-    from skysim.simulation.user_parts import UserParts
+    from skysim.simulation.lab import UserParts, build_lab
 
     loaded = load(scene, None, None, set_)
     result = check_plan(build_lab(loaded, UserParts(used_programs(program, scene_names(loaded)))))
@@ -105,19 +183,19 @@ def check(
         print_check(result.facts, findings)
 
 
-def check_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})) -> Verdict:
+def check_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})) -> FileVerdict:
     """Check one file; errors become the verdict's `fault`. programs : of trackers and controllers, by name"""
     try:
-        return Verdict(str(path), *describe_file(path, programs))
+        return FileVerdict(str(path), *describe_file(path, programs))
     except (InputError, OSError) as error:
-        return Verdict(str(path), fault=str(error))
+        return FileVerdict(str(path), fault=str(error))
 
 
 def describe_file(
     path: Path, programs: Mapping[str, str] = MappingProxyType({})
 ) -> tuple[str, tuple[str, ...]]:
     """Return a description of the file and warnings. Raises InputError with one line."""
-    from skysim.core.io.yaml_reader import is_file, read_yaml
+    from skysim.core.yaml_reader import is_file, read_yaml
     from skysim.scene import opencv_calibration
 
     path = path if path.suffix else find_shipped(path)
@@ -138,9 +216,9 @@ def describe_file(
         return f"a calibration of {lens.width_px} x {lens.height_px} pixels", ()
     keys = read_yaml(path)[0].keys()
     if keys & {"factors", "trial", "responses"}:
-        from skysim.experiments.study import loader
+        from skysim.experiments.study import study_file
 
-        plan = loader.load(path)
+        plan = study_file.load(path)
         return f"a study of {plan.trials} trials" if plan.trials else "a search", ()
     if "camera" in keys and keys <= {"camera", "schema"}:
         from skysim.scene.loader import load_camera
@@ -152,7 +230,7 @@ def describe_file(
 
 def names_in_file(path: Path) -> set[str | None]:
     """The names of trackers and controllers in a scene or a study; empty for other files."""
-    from skysim.experiments.study import loader as studies
+    from skysim.experiments.study import study_file as studies
     from skysim.scene import loader
 
     path = path if path.suffix else find_shipped(path)
@@ -165,8 +243,8 @@ def names_in_file(path: Path) -> set[str | None]:
 
 def find_shipped(path: Path) -> Path:
     """Path of the shipped scene, study or camera of this name. Raises InputError with the names of the scenes."""
-    from skysim.core.io.yaml_reader import find_file
-    from skysim.core.paths import DATA, SCENES, STUDIES
+    from skysim.core.files import DATA, SCENES, STUDIES
+    from skysim.core.yaml_reader import find_file
 
     names = (folder / f"{path}.yaml" for folder in (STUDIES, DATA / "cameras"))
     return next((file for file in names if file.is_file()), None) or find_file(
@@ -178,8 +256,7 @@ def check_scene(path: Path, programs: Mapping[str, str]) -> tuple[str, tuple[str
     """Set up a scene without simulating its motion: vehicle, lights, tracker. Returns a description and warnings."""
     from skysim.scene import loader
     from skysim.simulation.checks import check as check_plan
-    from skysim.simulation.lab import build_lab, build_tracker
-    from skysim.simulation.user_parts import UserParts
+    from skysim.simulation.lab import UserParts, build_lab, build_tracker
 
     scene = loader.load(path)
     try:

@@ -10,10 +10,10 @@ import numpy as np
 from nicegui import ui
 from nicegui.events import KeyEventArguments
 
-from skysim.apps.gui.shared import keys
-from skysim.apps.gui.shared.context import PageContext
-from skysim.apps.gui.views.sensor import Sensor
-from skysim.apps.gui.worker.scene import pointing
+from skysim.apps.gui.views import keys
+from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views.sensor import SensorView
+from skysim.apps.gui.worker import geometry
 
 Action = Callable[[], Awaitable[None] | None]
 
@@ -51,7 +51,12 @@ def matching(commands: list[Command], text: str) -> list[Command]:
 class Palette:
     """The dialog. Arrows choose, Enter or a click does.
 
-    found : commands that match;  chosen : index of the one that Enter does
+    Attributes
+    ----------
+    found
+        Commands that match
+    chosen
+        Index of the one that Enter does
     """
 
     def __init__(self, commands: Callable[[], list[Command]]) -> None:
@@ -113,17 +118,24 @@ class Palette:
 class Actions:
     """What keys and commands do on a page.
 
-    step : shows the next or the previous frame of the flight (1 or -1)
-    performers : by the action of a key, of those that are also commands
-    others : commands that are not in `keys.KEYS`
-    steps : (3,) right, up, roll: movements requested by keys that no frame shows yet
-    moving : whether such a frame is being rendered
+    Attributes
+    ----------
+    step
+        Shows the next or the previous frame of the flight (1 or -1)
+    performers
+        By the action of a key, of those that are also commands
+    others
+        Commands that are not in `keys.KEYS`
+    steps
+        (3,) right, up, roll: movements requested by keys that no frame shows yet
+    moving
+        Whether such a frame is being rendered
     """
 
     def __init__(
         self,
         page: PageContext,
-        sensor: Sensor,
+        sensor: SensorView,
         step: Callable[[int], Awaitable[None]],
         performers: Mapping[str, Action],
         others: Sequence[Command],
@@ -161,8 +173,8 @@ class Actions:
             return
         if action == "move":
             right, up, roll_sign = keys.MOVES[name]
-            step = pointing.COARSE if event.modifiers.shift else pointing.FINE
-            roll = pointing.ROLL_COARSE_DEG if event.modifiers.shift else pointing.ROLL_FINE_DEG
+            step = geometry.COARSE if event.modifiers.shift else geometry.FINE
+            roll = geometry.ROLL_COARSE_DEG if event.modifiers.shift else geometry.ROLL_FINE_DEG
             await self.move(right * step, up * step, roll_sign * roll)
         elif action == "step":
             await self.step(1 if name == "." else -1)

@@ -7,18 +7,23 @@ from pathlib import Path
 from nicegui import ui
 
 from skysim.apps.gui.messages import SceneInfo
-from skysim.apps.gui.shared import forms, keys
-from skysim.apps.gui.shared.context import PageContext
-from skysim.apps.gui.shared.live import Contents, LiveText
-from skysim.apps.gui.shared.state import View
-from skysim.apps.gui.worker import export
-from skysim.core.paths import SCENES
+from skysim.apps.gui.views import forms, keys
+from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views.live import Contents, LiveText
+from skysim.apps.gui.views.state import PageView
+from skysim.apps.gui.worker import image_export
+from skysim.core.files import SCENES
 
 
 class Head:
     """The elements of the head, and what they do.
 
-    folder : where scenes are saved;  message_text : the message
+    Attributes
+    ----------
+    folder
+        Where scenes are saved
+    message_text
+        The message
     """
 
     def __init__(self, page: PageContext, contents: Contents, folder: Path) -> None:
@@ -49,7 +54,7 @@ class Head:
             )
             self.identify = ui.switch("identify", value=True).props("dense size=xs")
             with ui.button("Export").props("dense flat size=sm").mark("export"), ui.menu():
-                for name in export.FILE_BY_ITEM:
+                for name in image_export.FILE_BY_ITEM:
                     item = ui.menu_item(name, on_click=lambda name=name: self.export(name))
                     item.props("dense").style("white-space: nowrap")
 
@@ -80,7 +85,7 @@ class Head:
         self.title.set_text(info.title)
         self.noise.set_value(info.noise)
 
-    def set_state(self, state: View) -> None:
+    def set_state(self, state: PageView) -> None:
         """Say in the banner what the page shows."""
         self.banner.set_text(state.banner, state.kind)
         self.live_button.set_visibility(state.kind != "live")
@@ -116,9 +121,9 @@ class Head:
         files = await self.page.run_task("export")
         if not files:
             return
-        name = export.FILE_BY_ITEM[item]
+        name = image_export.FILE_BY_ITEM[item]
         if not name:
-            ui.download(export.zip_archive(files), f"{Path(self.page.state.scene).stem}.zip")
+            ui.download(image_export.zip_archive(files), f"{Path(self.page.state.scene).stem}.zip")
         elif name in files:
             ui.download(files[name], name)
         else:
@@ -128,3 +133,119 @@ class Head:
                 else "not known of an image from elsewhere"
             )
             self.page.show_message(f"{item}: {reason}")
+
+
+# How a user arranges the page: the sizes of its panes and its theme, remembered by the browser.
+
+
+# The splitters work in the browser alone. Each sets the size of a pane in pixels, as a variable of CSS; without it the
+# page has its own. Below CLOSED the pane of the 3-D view is closed. An arrow key on a splitter is not the camera's.
+SPLITTER_JS = """
+window.skysimSplitter = (() => {
+  const STEP = 24, CLOSED = 60, root = document.documentElement;
+  const KINDS = {
+    side: { pane: ".lab-side", grows: "ArrowLeft", shrinks: "ArrowRight", size: box => box.width,
+      to: (event, box) => box.right - event.clientX, fit: px => Math.min(Math.max(px, 360), 0.7 * innerWidth) },
+    space: { pane: ".lab-space-pane", grows: "ArrowDown", shrinks: "ArrowUp", size: box => box.height,
+      to: (event, box) => event.clientY - box.top,
+      fit: px => px < CLOSED ? 0 : Math.min(px, document.querySelector(".lab-panes").clientHeight - 60) },
+  };
+  const store = (kind, px) => {
+    try {
+      if (px === null) localStorage.removeItem("skysim." + kind);
+      else localStorage.setItem("skysim." + kind, px);
+    } catch { /* storage is off */ }
+  };
+  const box = kind => document.querySelector(KINDS[kind].pane).getBoundingClientRect();
+  const set = (kind, px) => {
+    const size = Math.round(KINDS[kind].fit(px));
+    root.style.setProperty("--lab-" + kind, size + "px");
+    store(kind, size);
+  };
+  const reset = kind => {
+    root.style.removeProperty("--lab-" + kind);
+    store(kind, null);
+  };
+  const at = event => event.target.dataset?.split;
+  for (const kind in KINDS) {
+    try {
+      const kept = localStorage.getItem("skysim." + kind);
+      if (kept !== null) root.style.setProperty("--lab-" + kind, Number(kept) + "px");
+    } catch { /* storage is off */ }
+  }
+  document.addEventListener("pointerdown", event => {
+    const kind = at(event), line = event.target;
+    if (!kind) return;
+    event.preventDefault();
+    line.setPointerCapture(event.pointerId);
+    line.onpointermove = moved => set(kind, KINDS[kind].to(moved, box(kind)));
+    line.onpointerup = line.onpointercancel = () => { line.onpointermove = null; };
+  });
+  document.addEventListener("dblclick", event => at(event) && reset(at(event)));
+  document.addEventListener("keydown", event => {
+    const kind = at(event), { grows, shrinks, size } = KINDS[kind] ?? {};
+    if (!kind || ![grows, shrinks, "Enter"].includes(event.key)) return;
+    event.preventDefault();
+    event.stopImmediatePropagation();
+    if (event.key === "Enter") reset(kind);
+    else {
+      const now = size(box(kind)), step = event.key === grows ? STEP : -STEP;
+      set(kind, step > 0 ? Math.max(now + step, kind === "space" ? CLOSED : 0) : now + step);
+    }
+  }, true);
+  return { reset: () => Object.keys(KINDS).forEach(reset) };
+})();
+"""
+
+
+class Arrangement:
+    """The splitters between the frame, the 3-D view and the panels, and the theme.
+
+    Attributes
+    ----------
+    charts
+        That are drawn again in another theme
+    """
+
+    def __init__(self, charts: list[ui.echart]) -> None:
+        self.charts = charts
+        self.dark = ui.dark_mode(True)
+        ui.add_body_html(f"<script>{SPLITTER_JS}</script>")
+
+    @staticmethod
+    def splitter(kind: str, orientation: str, label: str) -> None:
+        """A line that is dragged or moved by arrow keys; a double click or Enter gives the pane its first size.
+
+        Parameters
+        ----------
+        kind
+            Side (the column of panels) or space (the 3-D view)
+        """
+        line = (
+            ui.element("div")
+            .classes(f"lab-split {orientation}")
+            .props(f'role="separator" data-split="{kind}"')
+        )
+        line.props(f'aria-orientation="{orientation}" tabindex="0" aria-label="{label}"')
+        line.props(f'title="{label}: drag, or arrow keys; double-click: as at first"')
+
+    async def restore(self) -> None:
+        """Take the theme that the browser remembers."""
+        if await ui.run_javascript('localStorage.getItem("skysim.theme")', timeout=10) == "light":
+            self.set_dark(False)
+
+    def reset(self) -> None:
+        """Give all panes their first sizes."""
+        ui.run_javascript("skysimSplitter.reset()")
+
+    def toggle(self) -> None:
+        self.set_dark(not self.dark.value)
+        ui.run_javascript(
+            f'localStorage.setItem("skysim.theme", "{"dark" if self.dark.value else "light"}")'
+        )
+
+    def set_dark(self, dark: bool) -> None:
+        """Change the theme; charts take their colors from it when they are drawn."""
+        self.dark.set_value(dark)
+        for chart in self.charts:
+            chart.update()

@@ -12,8 +12,8 @@ from typing import Any
 
 from nicegui import ui
 
-from skysim.apps.gui.shared.context import Shown
-from skysim.apps.gui.shared.state import View
+from skysim.apps.gui.views.context import Shown
+from skysim.apps.gui.views.state import PageView
 
 SETTLED = 3  # times of the timer without a change after which the next one is a new step
 WRITE_S = 0.4  # browsers refuse more than about 200 entries in 30 s
@@ -50,10 +50,22 @@ document.addEventListener("keydown", event => {
 class History:
     """Writes a page's view to the browser, and shows the view of an address.
 
-    home : the server's scene; a stored view is that of a server for the same one
-    show_query : shows the view of an address;  is_settling : whether the page does not show its view yet
-    written : the view in the address;  pending : the newest query that is asked for while another is being shown
-    moving : whether the last change was of attitude or time alone;  unchanged : times of the timer since then
+    Attributes
+    ----------
+    home
+        The server's scene; a stored view is that of a server for the same one
+    show_query
+        Shows the view of an address
+    is_settling
+        Whether the page does not show its view yet
+    written
+        The view in the address
+    pending
+        The newest query that is asked for while another is being shown
+    moving
+        Whether the last change was of attitude or time alone
+    unchanged
+        Times of the timer since then
     """
 
     def __init__(
@@ -67,7 +79,7 @@ class History:
         self.home = home
         self.show_query = show_query
         self.is_settling = is_settling
-        self.written: View | None = None
+        self.written: PageView | None = None
         self.showing = False
         self.moving = False
         self.unchanged = 0

@@ -14,27 +14,24 @@ from typing import Any
 from nicegui import run, ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
+from skysim.apps.gui.page import monte_carlo_panel, readouts
 from skysim.apps.gui.page.actions import Action, Actions, Command
-from skysim.apps.gui.page.arrangement import Arrangement
-from skysim.apps.gui.page.head import Head
+from skysim.apps.gui.page.head import Arrangement, Head
 from skysim.apps.gui.page.history import History
-from skysim.apps.gui.page.log import LogPanel
-from skysim.apps.gui.panels import lights, monte_carlo
-from skysim.apps.gui.panels.attitude import AttitudeCard
-from skysim.apps.gui.panels.lights import LightsPanel
-from skysim.apps.gui.panels.monte_carlo import MonteCarloPanel
-from skysim.apps.gui.panels.photo import PhotoPanel
-from skysim.apps.gui.panels.plan import PlanPanel
-from skysim.apps.gui.panels.run import RunPanel
-from skysim.apps.gui.panels.settings import ScenePanel, TrackerPanel
-from skysim.apps.gui.shared import forms, keys, style
-from skysim.apps.gui.shared.live import Contents
-from skysim.apps.gui.shared.state import View
-from skysim.apps.gui.shared.texts import for_page
-from skysim.apps.gui.views.sensor import Sensor
-from skysim.apps.gui.views.served import FRAMES
+from skysim.apps.gui.page.log_panel import LogPanel
+from skysim.apps.gui.page.monte_carlo_panel import MonteCarloPanel
+from skysim.apps.gui.page.photo_panel import PhotoPanel
+from skysim.apps.gui.page.plan_panel import PlanPanel
+from skysim.apps.gui.page.readouts import AttitudeCard, LightsPanel
+from skysim.apps.gui.page.run_panel import RunPanel
+from skysim.apps.gui.page.settings_panel import ScenePanel, TrackerPanel
+from skysim.apps.gui.views import forms, keys, style
+from skysim.apps.gui.views.live import Contents, for_page
+from skysim.apps.gui.views.overlay import FRAMES
+from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.views.space import Scene3D
-from skysim.apps.gui.worker import export
+from skysim.apps.gui.views.state import PageView
+from skysim.apps.gui.worker import image_export
 from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
@@ -47,13 +44,26 @@ PANELS = ("Run", "Lights", "Scene", "Tracker", "Plan", "Monte Carlo", "Image", "
 class Tab:
     """One tab: its worker, its scene, and its page elements. It is the `PageContext` of its parts.
 
-    session : its worker, set when it has got one
-    new_session : gives another worker, None if there are too many
-    folder : where scenes are saved;  out : where studies are;  cameras : live ones that it may watch
-    user : its browser, see `server.user_of`
-    state, scene_info, view, is_open : see `Shown`
-    contents : of the fields that change with every frame
-    editing, filling : held while the scene is changed, or a form of its keys is filled
+    Attributes
+    ----------
+    session
+        Its worker, set when it has got one
+    new_session
+        Gives another worker, None if there are too many
+    folder
+        Where scenes are saved
+    out
+        Where studies are
+    cameras
+        Live ones that it may watch
+    user
+        Its browser, see `server.user_of`
+    state, scene_info, view, is_open
+        See `Shown`
+    contents
+        Of the fields that change with every frame
+    editing, filling
+        Held while the scene is changed, or a form of its keys is filled
     """
 
     session: Session
@@ -67,7 +77,7 @@ class Tab:
         self.folder = folder
         self.out = out
         self.cameras = cameras
-        self.state = View(scene)
+        self.state = PageView(scene)
         self.scene_info: SceneInfo | None = None
         self.view: FrameView | None = None
         self.is_open = True
@@ -119,7 +129,7 @@ class Tab:
         )
         with ui.element("div").classes("lab"):
             self.head = Head(self, self.contents, self.folder)
-            self.sensor = Sensor(self.id, self.contents)
+            self.sensor = SensorView(self.id, self.contents)
             self.sensor.show_setting_up(self.state.scene)
             await asyncio.sleep(PAUSE_S)
             with ui.element("div").classes("lab-side"):
@@ -139,8 +149,8 @@ class Tab:
             self, self.sensor, self.run_panel.step, self.performers(), self.commands()
         )
         # A timer waits for the browser, whereupon NiceGUI sends the page as it is: so timers come after all pauses.
-        ui.timer(lights.UPDATE_S, self.update_lights)
-        ui.timer(monte_carlo.POLL_S, self.study_panel.poll)
+        ui.timer(readouts.UPDATE_S, self.update_lights)
+        ui.timer(monte_carlo_panel.POLL_S, self.study_panel.poll)
 
     async def build_panels(self) -> None:
         with ui.element("div").classes("lab-panes"):
@@ -213,7 +223,7 @@ class Tab:
             *(Command(f"panel: {name}", "", partial(self.show_panel, name)) for name in PANELS),
             *(
                 Command(f"export: {name}", "", partial(self.head.export, name))
-                for name in export.FILE_BY_ITEM
+                for name in image_export.FILE_BY_ITEM
             ),
         ]
 
@@ -253,7 +263,7 @@ class Tab:
     async def show_query(self, query: str) -> None:
         """Show the view of an address; refuse one that is not of this server."""
         try:
-            wanted = View.from_query(query, self.head.scenes())
+            wanted = PageView.from_query(query, self.head.scenes())
             if wanted:
                 await asyncio.to_thread(forms.validated_scene, wanted.scene, wanted.overrides)
         except InputError as error:
@@ -262,7 +272,7 @@ class Tab:
         if wanted:
             await self.restore(wanted)
 
-    async def restore(self, wanted: View) -> None:
+    async def restore(self, wanted: PageView) -> None:
         """Show a view again: open its scene if it is another, point there, then fly or replay."""
         now = self.state
         is_shown = self.view is not None and (now.scene, now.overrides) == (
@@ -396,7 +406,10 @@ class Tab:
     def show_photo(self, photo: Photo, /, **state: Any) -> None:
         """Show an image that is not of the scene as it is now: a photograph, or a trial again.
 
-        state : see `show_frame`
+        Parameters
+        ----------
+        state
+            See `show_frame`
         """
         self.set_state(**state)
         self.attitude.show_photo(photo)

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+import asyncio
+import math
+import struct
+import time
+from collections.abc import AsyncIterator, Callable, Collection, Mapping
+from dataclasses import dataclass, field
 from itertools import compress
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+from nicegui import json
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import Lights, TrackerResult
+from skysim.apps.gui.messages import LIMITS, Display, LightColumns, Pixels, TrackerResult
+from skysim.apps.gui.worker.session import WorkerLost
+from skysim.core.errors import InputError
 from skysim.core.types import Floats
+from skysim.results.plots import CURVES
 
 COLORS = {
     "truth": "#7a8cff",
@@ -31,7 +40,10 @@ Points = list[list[float]]  # to a tenth of a pixel, for a short message
 
 
 def marks(
-    lights: Lights, result: TrackerResult | None, shown: Collection[str], name: Callable[[int], str]
+    lights: LightColumns,
+    result: TrackerResult | None,
+    shown: Collection[str],
+    name: Callable[[int], str],
 ) -> dict[str, Any]:
     """What frame.js draws: marks by kind (ticks for true lights, dots for those fainter than any identified one,
     squares for detections, circles for identified ones, crosses for false ones, dashed squares for predicted windows),
@@ -74,11 +86,17 @@ def marks(
     }
 
 
-def bright_count(lights: Lights, identified: Collection[int], near: NDArray[np.bool_]) -> int:
+def bright_count(lights: LightColumns, identified: Collection[int], near: NDArray[np.bool_]) -> int:
     """How many lights, the brightest first, are as bright as the faintest identified one, or else detected one.
 
     In a field of hundreds of faint stars some detection of noise is beside one of them.
-    identified : number of the light of each detection, or -1;  near : (lights, detections) whether they are near
+
+    Parameters
+    ----------
+    identified
+        Number of the light of each detection, or -1
+    near
+        (lights, detections) whether they are near
     """
     if not len(identified) or not len(lights):
         return UNSOLVED_TICKS
@@ -89,3 +107,266 @@ def bright_count(lights: Lights, identified: Collection[int], near: NDArray[np.b
 
 def rounded(xy_px: Floats) -> Points:
     return np.round(xy_px, 1).tolist()
+
+
+# Proper names of bright stars (IAU Working Group on Star Names) by Hipparcos number.
+
+
+NAMES = {
+    677: "Alpheratz",
+    746: "Caph",
+    2081: "Ankaa",
+    3179: "Schedar",
+    3419: "Diphda",
+    5447: "Mirach",
+    7588: "Achernar",
+    8903: "Sheratan",
+    9640: "Almach",
+    9884: "Hamal",
+    11767: "Polaris",
+    14576: "Algol",
+    15863: "Mirfak",
+    17702: "Alcyone",
+    21421: "Aldebaran",
+    24436: "Rigel",
+    24608: "Capella",
+    25336: "Bellatrix",
+    25428: "Elnath",
+    25930: "Mintaka",
+    25985: "Arneb",
+    26311: "Alnilam",
+    26727: "Alnitak",
+    27366: "Saiph",
+    27989: "Betelgeuse",
+    28360: "Menkalinan",
+    30324: "Mirzam",
+    30438: "Canopus",
+    31681: "Alhena",
+    32349: "Sirius",
+    33579: "Adhara",
+    34444: "Wezen",
+    35904: "Aludra",
+    36850: "Castor",
+    37279: "Procyon",
+    37826: "Pollux",
+    39429: "Naos",
+    41037: "Avior",
+    44816: "Suhail",
+    45238: "Miaplacidus",
+    45556: "Aspidiske",
+    46390: "Alphard",
+    49669: "Regulus",
+    53910: "Merak",
+    54061: "Dubhe",
+    57632: "Denebola",
+    58001: "Phecda",
+    59774: "Megrez",
+    59803: "Gienah",
+    60718: "Acrux",
+    61084: "Gacrux",
+    62434: "Mimosa",
+    62956: "Alioth",
+    63608: "Vindemiatrix",
+    65378: "Mizar",
+    65474: "Spica",
+    67301: "Alkaid",
+    68702: "Hadar",
+    68933: "Menkent",
+    69673: "Arcturus",
+    71683: "Rigil Kentaurus",
+    72105: "Izar",
+    72607: "Kochab",
+    72622: "Zubenelgenubi",
+    74785: "Zubeneschamali",
+    76267: "Alphecca",
+    77070: "Unukalhai",
+    78401: "Dschubba",
+    80763: "Antares",
+    82273: "Atria",
+    84012: "Sabik",
+    85927: "Shaula",
+    86032: "Rasalhague",
+    86228: "Sargas",
+    87833: "Eltanin",
+    90185: "Kaus Australis",
+    91262: "Vega",
+    92855: "Nunki",
+    97278: "Tarazed",
+    97649: "Altair",
+    100453: "Sadr",
+    100751: "Peacock",
+    102098: "Deneb",
+    105199: "Alderamin",
+    107315: "Enif",
+    109268: "Alnair",
+    112122: "Tiaki",
+    113368: "Fomalhaut",
+    113881: "Scheat",
+    113963: "Markab",
+}
+
+
+# A frame as the browser gets it: its pixels, then marks and texts that are drawn with them.
+
+
+MAX_SCREEN_PX = 10**5
+KEPT_FRAMES = 5
+FRAMES: dict[str, TabFrames] = {}  # by tab
+IDLE_S = 2.0  # without a frame, after which a stream ends: a browser has six connections for all of its tabs
+
+
+class Source(Protocol):
+    """The session of the tab: the worker has all pixels of its newest images."""
+
+    display: Display | None
+
+    async def run(self, task: str, *arguments: Any) -> Any:
+        """Run a task of the worker."""
+
+
+@dataclass(frozen=True)
+class ServedFrame:
+    """A frame of a tab.
+
+    Attributes
+    ----------
+    fields
+        What frame.js needs beside the pixels: pointing, marks, contents of live fields
+    """
+
+    pixels: Pixels
+    fields: Mapping[str, Any]
+    source: Source
+
+    async def response(self, display: Display, whole: bool) -> bytes | None:
+        """Header, pixels, fields as JSON, and the length of these as an unsigned integer of 32 bits. So a frame comes
+        with its marks, and little goes over the websocket, whose messages are compiled as code.
+
+        None if pixels are missing, and the worker has newer images.
+
+        Parameters
+        ----------
+        display
+            For which the worker makes the next frames
+        whole
+            Whether all pixels of this one are needed
+        """
+        self.source.display = display
+        pixels = self.pixels
+        needs_all = whole or not all(display.screen_px)
+        if needs_all if pixels.fields["shaded"] else pixels.display.limits != display.limits:
+            try:
+                pixels = await self.source.run("all_pixels", pixels.number, display)
+            except (WorkerLost, InputError):
+                return None
+            if pixels is None:
+                return None
+        text = json.dumps({**self.fields, **pixels.fields}).encode()
+        return b"".join((pixels.data, text, len(text).to_bytes(4, "little")))
+
+
+@dataclass
+class TabFrames:
+    """The newest frames of a tab, and the stream over which its browser gets them while they follow one another.
+
+    A stream is one response for many frames: a request for each would take a fifth of the time that a frame may take.
+
+    Attributes
+    ----------
+    announce
+        Sends the number of a frame to the browser, which then requests it
+    newest
+        By number
+    waiting
+        Numbers of those to be sent over the stream; None: no stream is open
+    drawn
+        Number of the last frame that the browser has drawn
+    alone
+        Of the last one that did not go over the stream, which later ones must not overtake
+    added_s
+        When the newest one was added, by `time.monotonic`
+    """
+
+    announce: Callable[[int], Any]
+    newest: dict[int, ServedFrame] = field(default_factory=dict)
+    waiting: asyncio.Queue[int] | None = None
+    drawn: int = 0
+    alone: int = 0
+    added_s: float = -math.inf
+
+    def add(self, number: int, frame: ServedFrame, alone: bool) -> None:
+        """Keep a frame and send it, or its number. alone : not over the stream, because messages belong to it"""
+        self.newest[number] = frame
+        self.added_s = time.monotonic()
+        self.newest.pop(min(self.newest) if len(self.newest) > KEPT_FRAMES else -1, None)
+        self.alone = number if alone else self.alone
+        if self.waiting is None or self.drawn < self.alone:
+            self.announce(number)
+        else:
+            self.waiting.put_nowait(number)
+
+    async def stream(self, display: Display) -> AsyncIterator[bytes]:
+        """Frames as they come, until there is none for a while: length and number as unsigned integers of 32 bits, then
+        the frame's response. Of several streams the newest gets the frames.
+        """
+        waiting = self.waiting = asyncio.Queue[int]()
+        try:
+            while True:
+                number = await asyncio.wait_for(waiting.get(), IDLE_S)
+                frame = self.newest.get(number)
+                data = (
+                    await frame.response(frame.source.display or display, whole=False)
+                    if frame
+                    else None
+                )
+                if data is not None:
+                    yield struct.pack("<II", len(data), number) + data
+        except TimeoutError:
+            return
+        finally:
+            if self.waiting is waiting:
+                self.waiting = None
+                if self.drawn < max(
+                    self.newest, default=0
+                ):  # the connection was lost before the browser got it
+                    self.announce(max(self.newest))
+
+
+def display_of(query: Mapping[str, str]) -> Display | None:
+    """The display that a browser asks for; None if the query has a value that is not allowed.
+
+    Returns
+    -------
+    screen
+        Width and height
+    near
+        Column and row
+    limits
+        A name or two values in DN
+    curve
+        A name
+    """
+    try:
+        screen_px = pair(query.get("screen", "0,0"))
+        near_px = pair(query["near"]) if query.get("near") else None
+        limits = limits_from(query.get("limits", LIMITS[0]))
+        curve = query.get("curve", next(iter(CURVES)))
+    except ValueError:
+        return None
+    return Display(screen_px, limits, curve, near_px) if limits and curve in CURVES else None
+
+
+def pair(text: str) -> tuple[int, int]:
+    """Two numbers of pixels. Raises ValueError."""
+    first, second = (int(word) for word in text.split(","))
+    if not (0 <= first <= MAX_SCREEN_PX and 0 <= second <= MAX_SCREEN_PX):
+        raise ValueError
+    return first, second
+
+
+def limits_from(text: str) -> str | tuple[float, float] | None:
+    """Limits by name, or two increasing values; None if they are neither. Raises ValueError."""
+    if text in LIMITS:
+        return text
+    low, high = (float(word) for word in text.split(","))
+    return (low, high) if math.isfinite(low) and math.isfinite(high) and low < high else None

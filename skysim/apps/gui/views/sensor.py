@@ -22,26 +22,24 @@ from skysim.apps.gui.messages import (
     Detection,
     FrameView,
     Lens,
-    Light,
-    Lights,
+    LightColumns,
+    LightRow,
     Pixels,
     Pose,
     SceneInfo,
     TrackerResult,
 )
-from skysim.apps.gui.shared import keys
-from skysim.apps.gui.shared.live import Contents, LiveText
-from skysim.apps.gui.views import overlay
-from skysim.apps.gui.views.served import FRAMES, ServedFrame, Source, TabFrames, display_of
-from skysim.apps.gui.views.star_names import NAMES
+from skysim.apps.gui.views import keys, overlay
+from skysim.apps.gui.views.live import Contents, LiveText
+from skysim.apps.gui.views.overlay import FRAMES, NAMES, ServedFrame, Source, TabFrames, display_of
 from skysim.apps.gui.worker.photo import Photo
 from skysim.core.types import Floats
-from skysim.results import stretch
-from skysim.sources.solar_system.bodies import NAMES as BODIES
+from skysim.results import plots
+from skysim.sources.bodies import NAMES as BODIES
 
 FIRST_START = "The first frame on a machine takes up to a minute, because the code is compiled."
 LABELS = NAMES | BODIES  # by number
-STRETCHES = list(stretch.CURVES)
+STRETCHES = list(plots.CURVES)
 COLOR_MAPS = {
     "gray": None,
     "gray, inverted": None,
@@ -58,12 +56,21 @@ class Canvas(ui.element, component="js/frame.js", esm={"skysim-views": "js"}):  
     """The frame with its loupe and plot, implemented in frame.js."""
 
 
-class Sensor:
+class SensorView:
     """The view and its controls. It shows a frame of the scene, or another image such as a user's.
 
-    id, contents : of the tab, and its live fields;  source : of pixels, set when the tab has got a worker
-    hover_px : place of the light under the mouse, or None
-    sent_number : of the last frame sent to the browser;  frames : the newest ones
+    Attributes
+    ----------
+    id, contents
+        Of the tab, and its live fields
+    source
+        Of pixels, set when the tab has got a worker
+    hover_px
+        Place of the light under the mouse, or None
+    sent_number
+        Of the last frame sent to the browser
+    frames
+        The newest ones
     """
 
     source: Source
@@ -72,7 +79,7 @@ class Sensor:
         self.id = id
         self.contents = contents
         self.shown = {"truth", "identified", "false"}
-        self.lights: Lights = NO_LIGHTS
+        self.lights: LightColumns = NO_LIGHTS
         self.result: TrackerResult | None = None
         self.size_px = (4, 3)
         self.prefix = "HIP"
@@ -243,7 +250,7 @@ class Sensor:
         self.hover_px = (event.args["x"], event.args["y"]) if event.args["id"] is not None else None
         self.update_text()
 
-    def nearest(self, x: float, y: float) -> tuple[Detection | None, Light | None]:
+    def nearest(self, x: float, y: float) -> tuple[Detection | None, LightRow | None]:
         """The nearest detection and the nearest true light within a few marks' width, or None."""
         radius_px = max(8.0, self.size_px[0] / 60)
 
@@ -258,7 +265,7 @@ class Sensor:
             light
         ]
 
-    def light_text(self, detection: Detection | None, light: Light | None) -> str:
+    def light_text(self, detection: Detection | None, light: LightRow | None) -> str:
         """Text on a light: where it truly is, the detection and its error."""
         lines = []
         if light:
@@ -302,7 +309,7 @@ def color_table(name: str) -> str:
 
 def statistics_text(
     size_px: tuple[int, int],
-    statistics: stretch.FrameStatistics,
+    statistics: plots.FrameStatistics,
     result: TrackerResult | None,
     view: FrameView | None = None,
     scene_info: SceneInfo | None = None,

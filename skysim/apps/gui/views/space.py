@@ -16,10 +16,10 @@ from nicegui import ui
 from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import FrameView, LabGeometry, SceneInfo, Triple
-from skysim.apps.gui.shared.context import PageContext
-from skysim.apps.gui.shared.style import DARK, color_scale
-from skysim.apps.gui.views.sensor import Sensor
-from skysim.apps.gui.worker.scene.push import Grip
+from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views.sensor import SensorView
+from skysim.apps.gui.views.style import DARK, color_scale
+from skysim.apps.gui.worker.geometry import Grip
 from skysim.core.types import Floats
 from skysim.dynamics.multibody import Shape
 
@@ -43,10 +43,15 @@ class Space(ui.element, component="js/space.js", esm={"skysim-views": "js"}):  #
 class Scene3D:
     """The view and its buttons; `set_scene` builds it, `show` sets the attitude, which is sent a little later.
 
-    newest_view : that is not sent yet;  waits : whether `send_newest` will be called
+    Attributes
+    ----------
+    newest_view
+        That is not sent yet
+    waits
+        Whether `send_newest` will be called
     """
 
-    def __init__(self, page: PageContext, sensor: Sensor) -> None:
+    def __init__(self, page: PageContext, sensor: SensorView) -> None:
         self.page = page
         self.sensor = sensor
         self.newest_view: FrameView | None = None
@@ -114,13 +119,22 @@ class Scene3D:
 class PushControl:
     """The drag, and the label and the button that are shown while the vehicle moves.
 
-    moved  : called after each frame of the motion
-    grip   : the newest one; None while the vehicle is not held;  held_s : when there was one last
-    before : attitude before the push, deg;  motion : of which frames are being computed; None if there is none
+    Attributes
+    ----------
+    moved
+        Called after each frame of the motion
+    grip
+        The newest one; None while the vehicle is not held
+    held_s
+        When there was one last
+    before
+        Attitude before the push, deg
+    motion
+        Of which frames are being computed; None if there is none
     """
 
     def __init__(
-        self, page: PageContext, sensor: Sensor, canvas: ui.element, moved: Callable[[], None]
+        self, page: PageContext, sensor: SensorView, canvas: ui.element, moved: Callable[[], None]
     ) -> None:
         self.page = page
         self.sensor = sensor

@@ -19,13 +19,13 @@ from skysim.apps.gui.messages import (
     NO_LIGHTS,
     NO_PIXELS,
     Lens,
-    Lights,
+    LightColumns,
     Pixels,
     Pose,
     TrackerResult,
     Triple,
 )
-from skysim.apps.gui.worker.scene import lens as lenses
+from skysim.apps.gui.worker import geometry as lenses
 from skysim.apps.gui.worker.workbench import (
     detection_views,
     id_prefix,
@@ -34,37 +34,45 @@ from skysim.apps.gui.worker.workbench import (
     tracker_result,
     true_lights,
 )
+from skysim.core import images
 from skysim.core.errors import InputError
-from skysim.core.io import images
-from skysim.experiments.study import loader
-from skysim.experiments.study.execution import replay, store
+from skysim.experiments.study import study_file
+from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.execution.setups import prepared_setup
 from skysim.experiments.study.execution.store import STORE
 from skysim.experiments.study.execution.trials import run_trial
-from skysim.results import scoring, stretch
+from skysim.results import plots, scoring
 
 
 @dataclass(frozen=True, slots=True)
 class Photo:
     """An image that is not of the current scene, and its solution.
 
-    pixels, saturation_dn, pose : see `FrameView`;  lens : of the pose; both are None if the image was not solved
-    names, true_deg : of its three angles, and their true values if known
-    lights, prefix : true lights of a study's trial, and the catalog of the lights' numbers (HIP or LED)
-    hint : of a refused file the likely cause, of a solved one what was assumed
+    Attributes
+    ----------
+    pixels, saturation_dn, pose
+        See `FrameView`
+    lens
+        Of the pose; both are None if the image was not solved
+    names, true_deg
+        Of its three angles, and their true values if known
+    lights, prefix
+        True lights of a study's trial, and the catalog of the lights' numbers (HIP or LED)
+    hint
+        Of a refused file the likely cause, of a solved one what was assumed
     """
 
     size_px: tuple[int, int]
     result: TrackerResult
     solution: dict[str, Any]
-    statistics: stretch.FrameStatistics
+    statistics: plots.FrameStatistics
     pixels: Pixels = NO_PIXELS
     saturation_dn: float = math.inf
     lens: Lens | None = None
     pose: Pose | None = None
     names: tuple[str, str, str] = ("RA", "Dec", "roll")
     true_deg: Triple | None = None
-    lights: Lights = NO_LIGHTS
+    lights: LightColumns = NO_LIGHTS
     prefix: str = "HIP"
     hint: str = ""
 
@@ -101,12 +109,12 @@ def photo_from_file(
 
 def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     """Repeat a study's trial: its first frame with the tracker's solution."""
-    plan = loader.load(study)
+    plan = study_file.load(study)
     with store.open_store(folder / STORE) as stored:
-        segment = replay.segment_of(plan, stored, trial)
+        segment = runner.segment_of(plan, stored, trial)
     row = run_trial(plan.spec, segment, trial, segment.replicates[0])
     setup = prepared_setup(plan.spec, segment.settings)
-    frame, truth, report = next(replay.replayed_frames(setup, row.seed))
+    frame, truth, report = next(runner.replayed_frames(setup, row.seed))
     result = tracker_result(setup.lab, setup.estimator, frame, truth, report)
     if row.error:
         result = TrackerResult(row.error.strip().splitlines()[-1], result.detections, result.ms)
@@ -116,7 +124,7 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
         (width, height),
         result,
         {},
-        stretch.frame_statistics(frame.image_dn, frame.saturation_dn),
+        plots.frame_statistics(frame.image_dn, frame.saturation_dn),
         names=scoring.angle_names(scene),
         true_deg=scoring.angles_deg(truth.cam_from_lab, scene, setup.lab.camera.mount),
         lights=true_lights(truth, magnitude_by_id(setup.lab)),
@@ -148,7 +156,7 @@ def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoP
     result = TrackerResult(attitude.status, detections, 1e3 * sum(report.seconds.values()), angles)
     height, width = image.shape
     saturation_dn = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf
-    statistics = stretch.frame_statistics(image, saturation_dn)
+    statistics = plots.frame_statistics(image, saturation_dn)
     photo = Photo((width, height), result, solution, statistics)
     if attitude.solved:
         camera = attitude.camera or tracker.camera

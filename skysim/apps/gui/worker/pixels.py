@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from skysim.apps.gui.messages import Display, Pixels
 from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.jit import jit
-from skysim.results import stretch
+from skysim.results import plots
 
 LEVELS = 2**16 - 1
 HEADER_BYTES = 16
@@ -33,10 +33,13 @@ ZSCALE_SAMPLES = 1000  # pixels, as in IRAF
 LOUPE_PX = 11  # most rows and columns in the loupe
 
 
-class Levels(NamedTuple):
+class PixelLevels(NamedTuple):
     """An image as unsigned integers n: pixel = offset + step n.
 
-    integers : (H, W), of 8 or 16 bits
+    Attributes
+    ----------
+    integers
+        (H, W), of 8 or 16 bits
     """
 
     integers: NDArray
@@ -48,35 +51,42 @@ class Levels(NamedTuple):
         return header(self) + self.integers.tobytes()
 
 
-def levels_of(image: NDArray) -> Levels:
+def levels_of(image: NDArray) -> PixelLevels:
     """The levels of an image: exact for integers of 8 and 16 bits; other numbers are rounded to 65,535 steps between
     the least and the greatest value."""
     if image.dtype in (np.uint8, np.uint16):
-        return Levels(image)
+        return PixelLevels(image)
     low = float(image.min())
     high = float(image.max())
     step = (high - low) / LEVELS or 1.0
-    return Levels(np.rint((image - low) / step).astype(np.uint16), low, step)
+    return PixelLevels(np.rint((image - low) / step).astype(np.uint16), low, step)
 
 
-def header(levels: Levels) -> bytes:
+def header(levels: PixelLevels) -> bytes:
     return np.array([levels.offset, levels.step]).tobytes()
 
 
-def levels_from(data: bytes, size_px: tuple[int, int]) -> Levels:
+def levels_from(data: bytes, size_px: tuple[int, int]) -> PixelLevels:
     """The levels that `Levels.data` has encoded. size_px : width and height"""
     offset, step = np.frombuffer(data, float, 2).tolist()
     kind = np.uint8 if len(data) - HEADER_BYTES == math.prod(size_px) else np.uint16
-    return Levels(
+    return PixelLevels(
         np.frombuffer(data, kind, offset=HEADER_BYTES).reshape(size_px[::-1]), offset, step
     )
 
 
-def pixels_for(display: Display, levels: Levels, saturation_dn: float, number: int = 0) -> Pixels:
+def pixels_for(
+    display: Display, levels: PixelLevels, saturation_dn: float, number: int = 0
+) -> Pixels:
     """What the browser gets of an image: offset and step of its levels, then these, or shades if its screen has fewer
     columns than the image.
 
-    saturation_dn : from which a pixel is saturated;  number : of the image in its worker
+    Parameters
+    ----------
+    saturation_dn
+        From which a pixel is saturated
+    number
+        Of the image in its worker
     """
     integers = levels.integers
     (height, width) = levels.integers.shape
@@ -117,7 +127,7 @@ def shades(
     rows = max(round(height * columns / width), 1)
     low, high = limits
     fraction = np.clip((np.arange(int(integers.max()) + 1) - low) / max(high - low, 1e-9), 0, 1)
-    table = np.rint((SHADES - 1) * stretch.CURVES[curve](fraction)).astype(np.uint8)
+    table = np.rint((SHADES - 1) * plots.CURVES[curve](fraction)).astype(np.uint8)
     shaded = np.empty((rows, columns), np.uint8)
     _shade(integers, table, shaded)
     if len(table) - 1 >= saturation:
@@ -191,7 +201,7 @@ def _mark(integers: Any, saturation: Any, shaded: Any) -> None:
                 shaded[top : bottom + 1, left : right + 1] = SATURATED
 
 
-def limits_of(levels: Levels, limits: str | tuple[float, float]) -> tuple[float, float]:
+def limits_of(levels: PixelLevels, limits: str | tuple[float, float]) -> tuple[float, float]:
     """Black and white level by name, or from values in DN."""
     integers = levels.integers
     if not isinstance(limits, str):
@@ -203,16 +213,21 @@ def limits_of(levels: Levels, limits: str | tuple[float, float]) -> tuple[float,
         return float(low), float(high)
     if limits == "min to max":
         return float(integers.min()), float(integers.max())
-    return stretch.display_levels(integers)
+    return plots.display_levels(integers)
 
 
 def histogram(integers: NDArray) -> dict[str, Any]:
     """Counts of a sample of the pixels, in BINS of an axis that is an inverse hyperbolic sine about the sky, in units
     of its scatter: linear there, logarithmic for stars.
 
-    sky, scatter : of the axis;  range : least and greatest value of all pixels, over which it reaches
+    Returns
+    -------
+    sky, scatter
+        Of the axis
+    range
+        Least and greatest value of all pixels, over which it reaches
     """
-    sample = integers[:: 2 * stretch.SAMPLE_STRIDE, :: stretch.SAMPLE_STRIDE].astype(float)
+    sample = integers[:: 2 * plots.SAMPLE_STRIDE, :: plots.SAMPLE_STRIDE].astype(float)
     low = float(integers.min())
     high = float(integers.max())
     below, sky = np.percentile(sample, (25, 50))

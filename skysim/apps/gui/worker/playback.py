@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimator.trackers.pipeline import Report
-from skysim.apps.gui.messages import NAN, FlightStep, FrameRow, FrameView, MotionLog
+from skysim.apps.gui.messages import NAN, FlightRow, FlightStep, FrameView, MotionLog
 from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker.workbench import Workbench, tracker_result
 from skysim.core import quaternion
@@ -32,7 +32,11 @@ KEPT_BYTES = (
 class KeptFrame:
     """A frame of a flight without its pixels.
 
-    place : of these in the file, and their number of bytes; None: they are rendered again, bit for bit
+    Attributes
+    ----------
+    place
+        Of these in the file, and their number of bytes; None: they are rendered again, bit for
+        bit
     """
 
     view: FrameView
@@ -45,8 +49,14 @@ class Playback:
 
     Its computation is a series of short steps, so that the worker does other tasks between them.
 
-    file  : pixels of the first frames, so that playing them costs no rendering;  shown : number of the shown frame
-    reported : number of frames reported by `advance`
+    Attributes
+    ----------
+    file
+        Pixels of the first frames, so that playing them costs no rendering
+    shown
+        Number of the shown frame
+    reported
+        Number of frames reported by `advance`
     """
 
     def __init__(self, bench: Workbench) -> None:
@@ -105,7 +115,7 @@ class Playback:
         self.file.write(data)
         return begin, len(data)
 
-    def show(self, index: int) -> tuple[FrameView, pixels.Levels]:
+    def show(self, index: int) -> tuple[FrameView, pixels.PixelLevels]:
         """The view of a kept frame and its pixels; the scene is seen from there from now on."""
         kept = self.frames[index]
         bench = self.bench
@@ -129,11 +139,11 @@ class Playback:
         bench.report = kept.report
 
 
-def frame_row(view: FrameView) -> FrameRow:
+def frame_row(view: FrameView) -> FlightRow:
     """A frame of a flight in numbers."""
     result = view.result
     if result is None:
-        return FrameRow(
+        return FlightRow(
             view.t_s,
             NAN,
             NAN,
@@ -147,7 +157,7 @@ def frame_row(view: FrameView) -> FrameRow:
     cross_sigma, roll_sigma = result.sigma_arcsec
     errors = result.cross_arcsec, cross_sigma, result.roll_arcsec, roll_sigma
     counts = len(view.lights), result.identified
-    return FrameRow(view.t_s, *errors, *counts, view.filter_arcsec, view.innovation_arcsec)
+    return FlightRow(view.t_s, *errors, *counts, view.filter_arcsec, view.innovation_arcsec)
 
 
 def light_residuals(view: FrameView) -> Iterator[tuple[float, int, float]]:

@@ -13,7 +13,7 @@ from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:  # the template sets the environment of numba before it is imported
@@ -58,8 +58,12 @@ def serve(pipe: Connection) -> None:
 class Session:
     """One tab's worker process. Calls are queued and run one at a time.
 
-    display : of the browser, for which the worker makes frames; None: not known yet
-    alive : all that are not closed
+    Attributes
+    ----------
+    display
+        Of the browser, for which the worker makes frames; None: not known yet
+    alive
+        All that are not closed
     """
 
     display: Display | None = None
@@ -114,7 +118,12 @@ class Session:
 class Workers:
     """The workers of all tabs.
 
-    limit : of workers at once;  queue : of the tabs that wait for one, the first first
+    Attributes
+    ----------
+    limit
+        Of workers at once
+    queue
+        Of the tabs that wait for one, the first first
     """
 
     def __init__(self, limit: int) -> None:

@@ -39,8 +39,15 @@ MAX_FAILED = 20  # maximum number of failed trials in the results
 class StudyResults(NamedTuple):
     """Results of a study so far.
 
-    statistics: (value, low, high) by response;  bins, counts : histogram of the error angle, arcsec
-    failed  : (number, reason) of trials that raised, then of wrong ones, then of unsolved ones; the first MAX_FAILED
+    Attributes
+    ----------
+    statistics
+        (value, low, high) by response
+    bins, counts
+        Histogram of the error angle, arcsec
+    failed
+        (number, reason) of trials that raised, then of wrong ones, then of unsolved ones; the
+        first MAX_FAILED
     """
 
     done: int
@@ -72,7 +79,10 @@ def monte_carlo(
 class StudyProcess:
     """One study's process, which ends with its tab.
 
-    begun : processes of all tabs; those that have ended are taken out before another begins
+    Attributes
+    ----------
+    begun
+        Processes of all tabs; those that have ended are taken out before another begins
     """
 
     begun: ClassVar[set[StudyProcess]] = set()

@@ -24,12 +24,12 @@ from skysim.apps.gui.messages import (
     SurveyPlan,
     Triple,
 )
-from skysim.apps.gui.worker import export, photo, pixels, playback
-from skysim.apps.gui.worker.scene import planning, pointing, survey
-from skysim.apps.gui.worker.scene.push import Grip, Push
+from skysim.apps.gui.worker import geometry, image_export, photo, pixels, playback, survey_flight
+from skysim.apps.gui.worker import workbench as planning
+from skysim.apps.gui.worker.geometry import Grip, Push
 from skysim.apps.gui.worker.workbench import Workbench
+from skysim.core import images
 from skysim.core.errors import InputError
-from skysim.core.io import images
 
 KEPT_IMAGES = 3  # the page may still show one before the newest
 
@@ -38,20 +38,31 @@ KEPT_IMAGES = 3  # the page may still show one before the newest
 class Worker:
     """State between tasks: the workbench, its flight, and the other image if the page shows one.
 
-    display : of the browser, for which frames are made, as far as it is known
-    shown : the newest images for the page by number, and from where each is saturated;  number : of the last one
-    pushed : the motion of the pushed vehicle, as long as the workbench has its attitude
-    surveyed : the survey of the scene's dome, if one was planned
-    other, image : an image that is not of the scene, and its (H, W) pixels;  camera : an open live camera
+    Attributes
+    ----------
+    display
+        Of the browser, for which frames are made, as far as it is known
+    shown
+        The newest images for the page by number, and from where each is saturated
+    number
+        Of the last one
+    pushed
+        The motion of the pushed vehicle, as long as the workbench has its attitude
+    surveyed
+        The survey of the scene's dome, if one was planned
+    other, image
+        An image that is not of the scene, and its (H, W) pixels
+    camera
+        An open live camera
     """
 
     current: Workbench | None = None
     display: Display | None = None
-    shown: dict[int, tuple[pixels.Levels, float]] = field(default_factory=dict)
+    shown: dict[int, tuple[pixels.PixelLevels, float]] = field(default_factory=dict)
     number: int = 0
     flight: playback.Playback | None = None
     pushed: Push | None = None
-    surveyed: survey.Survey | None = None
+    surveyed: survey_flight.Survey | None = None
     other: photo.Photo | None = None
     image: NDArray | None = None
     scene: str = ""
@@ -65,7 +76,7 @@ class Worker:
             raise InputError("", "no scene is set up")
         return self.current
 
-    def show_frame(self, view: FrameView, levels: pixels.Levels) -> FrameView:
+    def show_frame(self, view: FrameView, levels: pixels.PixelLevels) -> FrameView:
         """Return the view with its pixels, and forget the other image, because the page now shows the scene."""
         self.other = self.image = None
         return replace(view, pixels=self.show(levels, view.saturation_dn))
@@ -77,7 +88,7 @@ class Worker:
             self.other, pixels=self.show(pixels.levels_of(self.image), self.other.saturation_dn)
         )
 
-    def show(self, levels: pixels.Levels, saturation_dn: float) -> Pixels:
+    def show(self, levels: pixels.PixelLevels, saturation_dn: float) -> Pixels:
         """Keep an image for the page, and return its pixels for the browser's display."""
         self.number += 1
         self.shown[self.number] = levels, saturation_dn
@@ -85,14 +96,14 @@ class Worker:
         return pixels.pixels_for(self.display or ALL_PIXELS, levels, saturation_dn, self.number)
 
     @property
-    def survey_of_scene(self) -> survey.Survey:
+    def survey_of_scene(self) -> survey_flight.Survey:
         """The survey of the current scene. Raises InputError if none was planned."""
         if self.surveyed is None or not self.surveyed.is_of(self.workbench.scene):
             raise InputError("", "no survey of this scene: plan one")
         return self.surveyed
 
     @property
-    def levels(self) -> pixels.Levels:
+    def levels(self) -> pixels.PixelLevels:
         """The newest frame of the workbench. Raises InputError if there is none."""
         if self.workbench.frame is None:
             raise InputError("", "no frame has been rendered")
@@ -122,7 +133,7 @@ class Worker:
         """Set up a scene and render a first frame; angles_deg : of another attitude than the kept one or the start."""
         bench = Workbench.open(scene, overrides, self.current)
         if angles_deg is not None:
-            bench.lab_from_body = pointing.from_angles(
+            bench.lab_from_body = geometry.from_angles(
                 bench.scene, bench.lab.camera.mount, angles_deg
             )
         self.current = bench
@@ -139,12 +150,12 @@ class Worker:
 
     def point(self, angles_deg: Triple, solve: bool) -> FrameView:
         bench = self.workbench
-        bench.lab_from_body = pointing.from_angles(bench.scene, bench.lab.camera.mount, angles_deg)
+        bench.lab_from_body = geometry.from_angles(bench.scene, bench.lab.camera.mount, angles_deg)
         return self.render(solve)
 
     def move(self, right: float, up: float, roll_deg: float, solve: bool) -> FrameView:
         bench = self.workbench
-        bench.lab_from_body = pointing.moved(
+        bench.lab_from_body = geometry.moved(
             bench.scene, bench.lab.camera.mount, bench.lab_from_body, right, up, roll_deg
         )
         return self.render(solve)
@@ -174,7 +185,7 @@ class Worker:
 
     def plan_survey(self, frames: int) -> SurveyPlan:
         """Begin a survey of the scene's dome."""
-        self.surveyed, plan = survey.begin(self.workbench.scene, frames)
+        self.surveyed, plan = survey_flight.begin(self.workbench.scene, frames)
         return plan
 
     def adjust_survey(self, frames: int) -> SurveyFound:
@@ -212,10 +223,10 @@ class Worker:
     def export(self) -> dict[str, bytes]:
         """The files of the image on the page."""
         if self.other is not None and self.image is not None:
-            return export.photo_files(self.other, self.image)
+            return image_export.photo_files(self.other, self.image)
         if self.flight:
             self.flight.render()
-        return export.frame_files(self.workbench, self.scene, dict(self.overrides or {}))
+        return image_export.frame_files(self.workbench, self.scene, dict(self.overrides or {}))
 
     def solve_file(
         self, name: str, data: bytes, fov_deg: float | None, stages: photo.Stages = ()

@@ -16,28 +16,32 @@ from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.gui.messages import (
+    AmbiguityMap,
     Detection,
     FrameView,
     LabGeometry,
     Lens,
-    Lights,
+    LightColumns,
+    PlanCheck,
     SceneInfo,
     TrackerResult,
 )
-from skysim.apps.gui.worker.scene import geometry, lens
+from skysim.apps.gui.worker import geometry
+from skysim.apps.gui.worker import geometry as lens
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Trajectory, Truth
-from skysim.results import scoring, stretch
+from skysim.experiments.dome_survey import survey_prior
+from skysim.results import plots, scoring
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
-from skysim.simulation import exposure
+from skysim.simulation import checks, exposure
 from skysim.simulation.compilation import warm_up
 from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
 from skysim.simulation.timing import frame_end_s
-from skysim.tracking import factory
-from skysim.tracking import settings as tracker_settings
+from skysim.tracking import factory, onboard_model
+from skysim.tracking import factory as tracker_settings
 
 STAGES = ("detector", "centroider", "identifier", "solver")
 
@@ -46,9 +50,16 @@ STAGES = ("detector", "centroider", "identifier", "solver")
 class Workbench:
     """A scene that is set up, with the current attitude and the newest frame.
 
-    lens : where its camera's pixels point;  geometry : of the laboratory
-    rendered_count : number of frames rendered; it changes the seed, so that each frame has independent noise
-    magnitude : V magnitude by a light's number
+    Attributes
+    ----------
+    lens
+        Where its camera's pixels point
+    geometry
+        Of the laboratory
+    rendered_count
+        Number of frames rendered; it changes the seed, so that each frame has independent noise
+    magnitude
+        V magnitude by a light's number
     """
 
     scene: Scene
@@ -70,7 +81,9 @@ class Workbench:
         """Set up a scene, or keep `before` if it is the same. If only the tracker differs from `before`, its lab is
         kept; if tracker or camera, its attitude.
 
-        Raises InputError.
+        Raises
+        ------
+        InputError
         """
         scene = load(name, overrides)
         if before and before.scene == scene:
@@ -155,7 +168,7 @@ class Workbench:
             scoring.angles_deg(truth.cam_from_lab, self.scene, self.lab.camera.mount),
             tuple(quaternion.from_rotation(truth.lab_from_body).tolist()),
             frame.exposure_s,
-            stretch.frame_statistics(frame.image_dn, frame.saturation_dn),
+            plots.frame_statistics(frame.image_dn, frame.saturation_dn),
             true_lights(truth, self.magnitude),
             result,
             1e3 * seconds,
@@ -174,7 +187,7 @@ def id_prefix(lab: Lab) -> str:
     return "LED" if np.isnan(lab.camera.sources.magnitude).all() else "HIP"
 
 
-def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> Lights:
+def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> LightColumns:
     """The true lights of a frame, the brightest first. magnitude : V by number, of stars and LEDs"""
     sources = truth.sources
     of_bodies = {body.id: body.v_mag for body in truth.bodies}
@@ -182,7 +195,7 @@ def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> Lights:
     rows = np.argsort(-sources.electrons)
     ids = sources.id[rows]
     magnitudes = [of_bodies.get(id, magnitude.get(id, math.nan)) for id in ids.tolist()]
-    return Lights(
+    return LightColumns(
         ids, sources.flux_xy_px[rows], sources.electrons[rows], np.array(magnitudes, float)
     )
 
@@ -270,3 +283,28 @@ def search_windows_px(
     _, xy_px = predicted_lights(estimator, attitude)
     inside = estimator.camera.contains(np.nan_to_num(xy_px, nan=-1e9))
     return tuple((float(x), float(y)) for x, y in xy_px[inside][:200])
+
+
+# What a lab wants to know before it runs a scene: its check and its ambiguous fields.
+
+
+def check(lab: Lab) -> PlanCheck:
+    """The facts of a scene and its warnings, as `skysim check` prints them."""
+    found = checks.check(lab)
+    return PlanCheck(
+        tuple((fact.name, tuple(fact.lines)) for fact in found.facts), tuple(found.findings)
+    )
+
+
+def ambiguity(lab: Lab) -> AmbiguityMap:
+    """How much of the field about each LED another field shows too. Raises InputError for a scene without such fields.
+
+    See `skysim.sources.dome.layouts.ambiguity`.
+    """
+    found, coincidence_m = checks.ambiguity_map(lab)
+    ids = onboard_model.assumed_dome(
+        lab.scene, survey_prior.require_dome(lab.scene), lab.camera.sources
+    ).id
+    return AmbiguityMap(
+        ids[found.led], ids[found.other], found.fraction, checks.LEAST_ALIKE, 1e3 * coincidence_m
+    )

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from skysim.core.constants import INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.configs import with_config
 from skysim.experiments.papers.afit.test2 import INTENSITY_CD, NOISE_E, ON_FRACTION
 from skysim.experiments.papers.afit.test_stand import (
     E_PER_GRAY,
@@ -26,14 +25,15 @@ from skysim.experiments.papers.afit.test_stand import (
     render_at_attitude,
 )
 from skysim.experiments.papers.compare import (
-    Drawing,
     ExperimentOptions,
     ExperimentResult,
+    FigureDrawing,
     RowResult,
+    confidence_interval,
     with_cause,
 )
-from skysim.experiments.papers.intervals import confidence_interval
 from skysim.experiments.papers.published import published_values
+from skysim.experiments.tracker_comparison import with_config
 from skysim.results.metrics import Summary, exact, proportion
 from skysim.results.plots import INK
 from skysim.scene.loader import load
@@ -125,7 +125,10 @@ def color_board(lens: LensSettings = DEFAULT_LENS, **led_values: Any) -> Lab:
 def white_board(pulses_us: Sequence[float], saturation_fraction: float = 1.0) -> Lab:
     """The last board under the dome: white LEDs lit one after another, each for its pulse within its slot.
 
-    saturation_fraction : a pixel saturates at this fraction of the converter's range
+    Parameters
+    ----------
+    saturation_fraction
+        A pixel saturates at this fraction of the converter's range
     """
     levels = [pulse * 1e-6 / SLOT_S for pulse in pulses_us]
     scene = board_scene(levels, DOME_IN, LensSettings(8.0, DOME_IN), intensity_cd=WHITE_CD)
@@ -197,17 +200,17 @@ def led_tests(options: ExperimentOptions) -> ExperimentResult:
         take_image(color_board(LensSettings(noise_e=one)), rng_drawn)[0] for one in (None, NOISE_E)
     ]
     drawings = (
-        Drawing(
+        FigureDrawing(
             "Fig. 36: our board, focused and wide, less focused and narrow, balanced.",
             lambda fig: draw_apertures(fig, aperture_images),
             (7.4, 2.8),
         ),
-        Drawing(
+        FigureDrawing(
             "Figs 37 and 40: pixels above four thresholds, with the camera's own noise (top) and with that of Test 2.",
             lambda fig: draw_thresholds(fig, noise_images),
             (7.4, 4.0),
         ),
-        Drawing(
+        FigureDrawing(
             "Pulses of five LEDs against their measured magnitude, beside Table 7's.",
             lambda fig: draw_pulses(fig, magnitude),
         ),

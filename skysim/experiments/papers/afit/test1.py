@@ -14,7 +14,6 @@ from skysim.core.constants import INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
-from skysim.experiments.configs import with_config
 from skysim.experiments.papers.afit.test_stand import (
     build_test_stand,
     gray_levels,
@@ -24,22 +23,23 @@ from skysim.experiments.papers.afit.test_stand import (
     separations_arcsec,
 )
 from skysim.experiments.papers.compare import (
-    Drawing,
     ExperimentOptions,
     ExperimentResult,
+    FigureDrawing,
     RowResult,
+    confidence_interval,
     with_cause,
 )
-from skysim.experiments.papers.intervals import confidence_interval
 from skysim.experiments.papers.published import published_values
+from skysim.experiments.tracker_comparison import with_config
 from skysim.results.metrics import exact
 from skysim.results.plots import INK
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import SlewConfig
 from skysim.simulation.lab import Lab
-from skysim.simulation.lights.known import known_light
-from skysim.simulation.lights.plan import Plan
+from skysim.simulation.lights.dome import known_light
+from skysim.simulation.lights.light import LightPlan
 from skysim.tracking import onboard_model
 
 LEDS = 9
@@ -91,21 +91,21 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
         for stage, lab in enumerate(stands):
             # The same board with nine other LEDs, by another hardware seed.
             scene = with_config(lab.scene, "light.layout", hardware_seed=hardware_seed)
-            plan = Plan(scene, lab.camera.band, lab.vehicle, lab.camera.viewpoint, None)
+            plan = LightPlan(scene, lab.camera.band, lab.vehicle, lab.camera.viewpoint, None)
             other_leds = lab.with_scene(scene).with_light(known_light(plan))
             rng = random_stream(options.seed, stage, n)
             runs[stage].append(take_board(other_leds, images, rng))
     found_arcsec = lattice_angles(stands[0], options.trials(20, 2), random_stream(options.seed, 2))
     drawings = (
-        Drawing(
+        FigureDrawing(
             "Table 2: magnitude by rank; a bar is a rank's standard deviation over the images of a board.",
             lambda fig: draw_ranks(fig, *runs),
         ),
-        Drawing(
+        FigureDrawing(
             "Figs 64 and 65: magnitudes of one of our boards by rank, at an exposure of 100 ms.",
             lambda fig: draw_board(fig, runs[1][0]),
         ),
-        Drawing(
+        FigureDrawing(
             "Fig. 66: angles of all 36 pairs; dashed, a perfect lattice of 8 mm at 48 in.",
             lambda fig: draw_angles(fig, found_arcsec),
         ),

@@ -18,8 +18,7 @@ from estimator.attitude.dome_map import project
 from skysim.core.constants import INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.configs import with_config
-from skysim.experiments.papers.afit.surface import contour
+from skysim.experiments.papers.afit.afit_surface import contour
 from skysim.experiments.papers.afit.test_stand import (
     E_PER_GRAY,
     build_test_stand,
@@ -27,19 +26,18 @@ from skysim.experiments.papers.afit.test_stand import (
     separations_arcsec,
 )
 from skysim.experiments.papers.compare import (
-    Drawing,
     ExperimentOptions,
     ExperimentResult,
+    FigureDrawing,
     RowResult,
-    with_cause,
-)
-from skysim.experiments.papers.intervals import (
     bootstrap_interval,
     confidence_interval,
     sample_std,
     symmetric_interval,
+    with_cause,
 )
 from skysim.experiments.papers.published import experiments
+from skysim.experiments.tracker_comparison import with_config
 from skysim.results.metrics import Summary, exact
 from skysim.results.plots import INK, MARKS
 from skysim.scene.loader import load
@@ -47,7 +45,7 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import MoffatPsfConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lab import Lab
-from skysim.sources.dome.shell.surface import Surface, build_surface
+from skysim.sources.dome.surface import Surface, build_surface
 from skysim.tracking import onboard_model
 
 PLACES_DEG = (
@@ -69,7 +67,7 @@ DIM = 1
 CAUSE_NOISE = f"noise of {NOISE_E / E_PER_GRAY:.1f} gray levels"
 
 
-class Place(NamedTuple):
+class BoardPlace(NamedTuple):
     """Place of the board: tilt from the vertical at the bearing, tilt off the tangent plane, dome offset in x."""
 
     tilt_deg: float
@@ -77,7 +75,7 @@ class Place(NamedTuple):
     decenter_in: float = 0.0
 
 
-class Series(NamedTuple):
+class PlaceSeries(NamedTuple):
     """Measurements of n images of a place: (n, 2) magnitudes of the bright and the dim LED, (n,) their angle."""
 
     magnitude: Floats
@@ -87,8 +85,8 @@ class Series(NamedTuple):
 class NoiseRuns(NamedTuple):
     """Series of all places, with the camera's own noise and with more noise as the cause."""
 
-    own: list[Series]
-    more: list[Series]
+    own: list[PlaceSeries]
+    more: list[PlaceSeries]
 
 
 def scene(dim_fraction: float) -> Scene:
@@ -106,7 +104,7 @@ def measured_dome(scene: Scene, decenter_in: float = 0.0) -> Surface:
     )
 
 
-def place_pair(lab: Lab, place: Place) -> Lab:
+def place_pair(lab: Lab, place: BoardPlace) -> Lab:
     """The pair on a board tangent to the dome, or tilted from it, with its LEDs along the meridian."""
     dome = measured_dome(lab.scene, place.decenter_in)
     tilt = np.radians(place.tilt_deg)
@@ -122,12 +120,12 @@ def place_pair(lab: Lab, place: Place) -> Lab:
     return lab.with_sources(replace(pair, place=homogeneous, normal=np.tile(normal, (2, 1))))
 
 
-def point_at(place: Place) -> Rotation:
+def point_at(place: BoardPlace) -> Rotation:
     """lab_from_body that points the boresight at the board."""
     return Rotation.from_euler("y", place.tilt_deg, degrees=True)
 
 
-def series(lab: Lab, place: Place, images: int, rng: np.random.Generator) -> Series:
+def series(lab: Lab, place: BoardPlace, images: int, rng: np.random.Generator) -> PlaceSeries:
     """Measure images of a place; those that do not show two lights are left out."""
     lab_at_place = place_pair(lab, place)
     attitude = point_at(place)
@@ -138,7 +136,7 @@ def series(lab: Lab, place: Place, images: int, rng: np.random.Generator) -> Ser
         if len(lights.magnitude) == 2:
             magnitudes.append(lights.magnitude)
             angles.append(separations_arcsec(lights.xy_px, lab_at_place)[0])
-    return Series(np.array(magnitudes), np.array(angles))
+    return PlaceSeries(np.array(magnitudes), np.array(angles))
 
 
 def tables_3_to_5(options: ExperimentOptions) -> ExperimentResult:
@@ -153,19 +151,19 @@ def tables_3_to_5(options: ExperimentOptions) -> ExperimentResult:
     runs = NoiseRuns([], [])
     for n, tilt_deg in enumerate(PLACES_DEG):
         options.watch(n, 4)
-        runs.own.append(series(quiet_stand, Place(tilt_deg), images, rng[0]))
-        runs.more.append(series(noisy_stand, Place(tilt_deg), images, rng[1]))
+        runs.own.append(series(quiet_stand, BoardPlace(tilt_deg), images, rng[0]))
+        runs.more.append(series(noisy_stand, BoardPlace(tilt_deg), images, rng[1]))
     results = magnitudes(runs, images) | standard_deviations(runs)
     options.watch(3, 4)
     results |= angles(quiet_stand, runs, options.trials(12, 2), rng[2])
     results |= contour(measured_dome(load("afit_test2_ideal")))
     drawings = (
-        Drawing(
+        FigureDrawing(
             f"Figs 69 and 70: magnitudes of the two LEDs at three positions, ours with {CAUSE_NOISE}; published as"
             " mean and standard deviation.",
             lambda fig: draw_magnitudes(fig, runs.more),
         ),
-        Drawing(
+        FigureDrawing(
             "Fig. 71 and Table 5: the pair's angle over the tilt of its board; the published bars are standard"
             " deviations, their tilts 0 deg, as fitted and as assumed.",
             lambda fig: draw_angles(fig, quiet_stand, runs.own),
@@ -233,11 +231,11 @@ def angles(
     halfway, decentered, tilted, tilted_decentered, more_tilted_decentered = (
         series(lab, place, images, rng).angle_arcsec
         for place in (
-            Place(HALFWAY_DEG),
-            Place(edge, 0.0, DECENTER_IN),
-            Place(edge, BOARD_TILT_DEG),
-            Place(edge, SMALLER_BOARD_TILT_DEG, DECENTER_IN),
-            Place(edge, BOARD_TILT_DEG, DECENTER_IN),
+            BoardPlace(HALFWAY_DEG),
+            BoardPlace(edge, 0.0, DECENTER_IN),
+            BoardPlace(edge, BOARD_TILT_DEG),
+            BoardPlace(edge, SMALLER_BOARD_TILT_DEG, DECENTER_IN),
+            BoardPlace(edge, BOARD_TILT_DEG, DECENTER_IN),
         )
     )
     glare_arcsec = glare_bias_arcsec(lab, images, rng)
@@ -255,7 +253,7 @@ def angles(
     )
     cause = f"a board tilted by {BOARD_TILT_DEG:g} deg"
     smallest = min(
-        geometric_angle_arcsec(lab, Place(float(tilt))) for tilt in np.linspace(20, 34, 29)
+        geometric_angle_arcsec(lab, BoardPlace(float(tilt))) for tilt in np.linspace(20, 34, 29)
     )
     return {
         "angle_1": RowResult(confidence_interval(at_apex)),
@@ -284,8 +282,8 @@ def glare_bias_arcsec(lab: Lab, images: int, rng: np.random.Generator) -> float:
     """
     psf = MoffatPsfConfig(kind="moffat", fwhm_px=2.5, beta=1.5)
     stand = build_test_stand(with_config(scene(2 * ON_FRACTION), "camera", psf=psf))
-    edge = Place(PLACES_DEG[2])
-    apex = Place(0.0)
+    edge = BoardPlace(PLACES_DEG[2])
+    apex = BoardPlace(0.0)
     at_edge, at_apex = (
         series(stand, place, images, rng).angle_arcsec.mean() for place in (edge, apex)
     )
@@ -293,7 +291,7 @@ def glare_bias_arcsec(lab: Lab, images: int, rng: np.random.Generator) -> float:
     return float(at_edge - at_apex - expected_edge + expected_apex)
 
 
-def geometric_angle_arcsec(lab: Lab, place: Place) -> float:
+def geometric_angle_arcsec(lab: Lab, place: BoardPlace) -> float:
     """The pair's angle by eqs 43-45 from its LEDs' projected positions, without rendering."""
     lever = onboard_model.assumed_lever(lab.scene, lab.camera.mount)
     camera = onboard_model.assumed_camera(lab.scene)
@@ -303,7 +301,7 @@ def geometric_angle_arcsec(lab: Lab, place: Place) -> float:
     return float(separations_arcsec(xy_px, lab)[0])
 
 
-def draw_magnitudes(fig: Any, places: Sequence[Series]) -> None:
+def draw_magnitudes(fig: Any, places: Sequence[PlaceSeries]) -> None:
     rows = experiments()["afit-table-3-5"].rows
     panels = fig.subplots(1, 2)
     for column, name, axes in zip((DIM, BRIGHT), ("dim", "bright"), panels, strict=True):
@@ -325,14 +323,14 @@ def draw_magnitudes(fig: Any, places: Sequence[Series]) -> None:
     )
 
 
-def draw_angles(fig: Any, lab: Lab, places: Sequence[Series]) -> None:
+def draw_angles(fig: Any, lab: Lab, places: Sequence[PlaceSeries]) -> None:
     rows = experiments()["afit-table-3-5"].rows
     axes = fig.subplots()
     tilt_deg = np.linspace(0, 32, 33)
     curves = (
-        ("measured dome", Place(0)),
-        (f"{DECENTER_IN} in off center", Place(0, 0, DECENTER_IN)),
-        (f"leaning {BOARD_TILT_DEG:g} deg", Place(0, BOARD_TILT_DEG)),
+        ("measured dome", BoardPlace(0)),
+        (f"{DECENTER_IN} in off center", BoardPlace(0, 0, DECENTER_IN)),
+        (f"leaning {BOARD_TILT_DEG:g} deg", BoardPlace(0, BOARD_TILT_DEG)),
     )
     for ink, style, (name, place) in zip(
         (INK[0], INK[2], INK[4]), ("-", "--", "-."), curves, strict=True

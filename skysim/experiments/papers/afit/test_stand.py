@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude import nearfield
 from estimator.calibration.home_position import instrument_brightness
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.core.types import FramePriors
 from estimator.detection import detect
 from skysim.camera.optics import Optics
@@ -24,7 +24,7 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.lights.plan import Plan
+from skysim.simulation.lights.light import LightPlan
 from skysim.simulation.lights.registry import build_lights
 from skysim.tracking import onboard_model
 
@@ -51,7 +51,7 @@ def build_test_stand(scene: Scene) -> Lab:
     """Lab of a scene with other lights, lens or electronics; the detector's fixed pattern is computed only once."""
     lab = base_lab()
     assert isinstance(scene.light, DomeConfig)
-    plan = Plan(scene, lab.camera.band, lab.vehicle, lab.camera.viewpoint, None)
+    plan = LightPlan(scene, lab.camera.band, lab.vehicle, lab.camera.viewpoint, None)
     return lab.with_scene(scene).with_camera(
         lights=build_lights(plan),
         optics=Optics.from_camera(scene.camera),
@@ -94,7 +94,10 @@ def measure_frame(lab: Lab, lab_from_body: Rotation, rng: np.random.Generator) -
 def light_positions_m(lab: Lab, xy_px: Floats, camera: Camera | None = None) -> Floats:
     """(N, 3) positions of lights in body axes, by eqs 43-44 and the camera's lever arm.
 
-    camera : camera model to use; the tracker's own if left out
+    Parameters
+    ----------
+    camera
+        Camera model to use; the tracker's own if left out
     """
     assert isinstance(lab.scene.light, DomeConfig)
     leds = onboard_model.assumed_dome(lab.scene, lab.scene.light, lab.camera.sources)

@@ -219,9 +219,15 @@ def run_encoded(name: str, text: str) -> tuple[list[Any], float]:
 class Dask:
     """Engine that uses an existing Dask cluster. A task that loses its worker is run by another.
 
-    scheduler : its address, such as tcp://10.0.0.1:8786
+    Attributes
+    ----------
+    scheduler
+        Its address, such as tcp://10.0.0.1:8786
 
-    Raises InputError if the scheduler does not respond or a worker has another code version.
+    Raises
+    ------
+    InputError
+        If the scheduler does not respond or a worker has another code version.
     """
 
     name = "dask"

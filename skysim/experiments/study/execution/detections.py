@@ -24,7 +24,7 @@ from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import exposure_of
 from skysim.simulation.lab import Lab, StarCamera
-from skysim.simulation.lights.air import Atmosphere
+from skysim.simulation.lights.atmosphere import AirEffects
 from skysim.simulation.lights.dome import LedDome
 from skysim.simulation.lights.light import Exposure, Obstacle, any_of, find_light
 from skysim.simulation.timing import MARGIN_S, exposure_window
@@ -36,10 +36,17 @@ FLUX_NOISE = (
 )
 
 
-class View(NamedTuple):
+class VisibleSources(NamedTuple):
     """The visible sources whose center is on the detector at one attitude, without occluded ones.
 
-    rows : (N,) in `lab.camera.sources`;  xy_px : (N, 2);  electrons : (N,) photo-electrons of an exposure
+    Attributes
+    ----------
+    rows
+        (N,) in `lab.camera.sources`
+    xy_px
+        (N, 2)
+    electrons
+        (N,) photo-electrons of an exposure
     """
 
     rows: NDArray[np.int64]
@@ -53,7 +60,7 @@ def visible_sources(lab: Lab, lab_from_body: Rotation) -> tuple[Floats, Floats]:
     return view.xy_px, view.electrons
 
 
-def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[View]:
+def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[VisibleSources]:
     """The view at each of B attitudes, all at the scene's start. The sources near all fields are projected at once."""
     R_cam_from_body = lab.camera.mount.cam_from_body.as_matrix()
     camera_body_m = lab.camera.mount.camera_body_m
@@ -66,7 +73,7 @@ def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[View]:
     rows = [in_view(lab.camera.sources, lab.camera.optics, pose, reach=0.0) for pose in each_pose]
     ends = np.cumsum([0, *map(len, rows)])
     near = lab.camera.sources.take(np.concatenate(rows))
-    atmosphere = find_light(lab.camera.lights, Atmosphere)
+    atmosphere = find_light(lab.camera.lights, AirEffects)
     if atmosphere:
         near = atmosphere.air.at(lab.scene.start_time).points_seen(near)
     xy_px, distance_m, cos_out, cos_in = project_each(near, lab.camera.optics, poses, ends)
@@ -85,7 +92,7 @@ def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[View]:
         chosen = begin + np.flatnonzero(visible[begin:end])
         if occludes := occlusion(lab.camera, replace(start, lab_from_body=lab_from_body[n])):
             chosen = chosen[~occludes(near.place[chosen])]
-        views.append(View(rows[n][chosen - begin], xy_px[chosen], electrons[chosen]))
+        views.append(VisibleSources(rows[n][chosen - begin], xy_px[chosen], electrons[chosen]))
     return views
 
 

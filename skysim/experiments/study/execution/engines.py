@@ -146,7 +146,10 @@ class Pool:
         Rows of chunks that are complete at the same time come together, so that the store takes one transaction for
         them: the more workers wait for it, the fewer transactions.
 
-        Raises BrokenProcessPool if a worker dies; `in_flight` then holds the chunks that were lost.
+        Raises
+        ------
+        BrokenProcessPool
+            If a worker dies; `in_flight` then holds the chunks that were lost.
         """
         while True:
             # A retried trial runs with nothing else in flight, so that a worker's death can be attributed to it.

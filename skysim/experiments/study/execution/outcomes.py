@@ -34,31 +34,58 @@ AMBIGUOUS = "ambiguous"  # beginning of the status of such a refusal
 class Outcome:
     """Result of a trial. For a flight trial, errors are RMS over the solved frames and counts are sums unless noted.
 
-    status   : "solved", the reason why there is no attitude, or "failed" if the trial raised an exception
-    frames, solved, wrong : number of frames, of solved frames, and of wrong solutions (`metrics.is_wrong`)
-    x_arcsec, y_arcsec, roll_arcsec : error in camera axes, signed (RMS for a flight); NaN without a solution
-    nees     : e^T P^-1 e with three degrees of freedom and the tracker's covariance P; mean for a flight
-    stars    : true sources on the detector, minimum for a flight
-    detected, matched : numbers of detections and of lights matched with a star or LED, means for a flight
-    availability : fraction of a flight's ticks with a filter error below ten arcminutes; without a filter, fraction
-               of its frames solved correctly
-    filter_arcsec, filter_worst_arcsec : angular error of a flight's filter, RMS and worst
-    drift_arcsec : filter_arcsec of the last quarter of a flight minus that of the first quarter
-    pointing_arcsec, pointing_worst_arcsec : angle between a flight's attitude and the commanded one, RMS and worst;
-               NaN without a maneuver
-    ambiguous : number of frames refused because another attitude fits the lights as well
-    misidentified : number of frames solved with a light that is matched with a wrong star or LED, more than
-               SAME_LIGHT_PX from the true image of that star or LED; NaN if the tracker does not name its lights
-    roll_noise : number of frames solved with the right lights and a roll error beyond ten arcminutes that the
-               covariance allows; NaN likewise
-    misled   : number of misidentified frames whose error the covariance does not allow: the wrong lights moved the
-               attitude beyond what the tracker claims; NaN likewise
-    wrong_matches : number of lights that are matched with a wrong star or LED; NaN likewise
-    centroid_px : RMS error of the centroids about each axis, of those within SAME_LIGHT_PX of a true image
-    streak_px : length of the images of the lights, median of a frame and mean for a flight; NaN for centroid trials
-    lab_from_body_w, _x, _y, _z : true attitude at mid-exposure; of the worst frame for a flight (`worst_frame`)
-    body_tilt_deg, body_azimuth_deg : under a dome, of the body's z axis: from vertical, and from the lab's x toward y
-    boresight_ra_deg, boresight_dec_deg : under the stars, of the camera
+    Attributes
+    ----------
+    status
+        "solved", the reason why there is no attitude, or "failed" if the trial raised an
+        exception
+    frames, solved, wrong
+        Number of frames, of solved frames, and of wrong solutions (`metrics.is_wrong`)
+    x_arcsec, y_arcsec, roll_arcsec
+        Error in camera axes, signed (RMS for a flight); NaN without a solution
+    nees
+        e^T P^-1 e with three degrees of freedom and the tracker's covariance P; mean for a
+        flight
+    stars
+        True sources on the detector, minimum for a flight
+    detected, matched
+        Numbers of detections and of lights matched with a star or LED, means for a flight
+    availability
+        Fraction of a flight's ticks with a filter error below ten arcminutes; without a filter,
+        fraction of its frames solved correctly
+    filter_arcsec, filter_worst_arcsec
+        Angular error of a flight's filter, RMS and worst
+    drift_arcsec
+        filter_arcsec of the last quarter of a flight minus that of the first quarter
+    pointing_arcsec, pointing_worst_arcsec
+        Angle between a flight's attitude and the commanded one, RMS and worst; NaN without a
+        maneuver
+    ambiguous
+        Number of frames refused because another attitude fits the lights as well
+    misidentified
+        Number of frames solved with a light that is matched with a wrong star or LED, more than
+        SAME_LIGHT_PX from the true image of that star or LED; NaN if the tracker does not name
+        its lights
+    roll_noise
+        Number of frames solved with the right lights and a roll error beyond ten arcminutes
+        that the covariance allows; NaN likewise
+    misled
+        Number of misidentified frames whose error the covariance does not allow: the wrong
+        lights moved the attitude beyond what the tracker claims; NaN likewise
+    wrong_matches
+        Number of lights that are matched with a wrong star or LED; NaN likewise
+    centroid_px
+        RMS error of the centroids about each axis, of those within SAME_LIGHT_PX of a true
+        image
+    streak_px
+        Length of the images of the lights, median of a frame and mean for a flight; NaN for
+        centroid trials
+    lab_from_body_w, _x, _y, _z
+        True attitude at mid-exposure; of the worst frame for a flight (`worst_frame`)
+    body_tilt_deg, body_azimuth_deg
+        Under a dome, of the body's z axis: from vertical, and from the lab's x toward y
+    boresight_ra_deg, boresight_dec_deg
+        Under the stars, of the camera
     """
 
     status: str
@@ -109,9 +136,14 @@ DIRECTION = FIELDS[-8:]  # attitude and direction
 class TrueLights(NamedTuple):
     """True state of a frame: attitude at mid-exposure, and N lights on the detector.
 
-    xy_px     : (N, 2) image at mid-exposure
-    flux_xy_px: (N, 2) flux-weighted mean of the image over the exposure, where a perfect centroid is
-    streak_px : (N,) length of its path over the exposure; None if there is no exposure
+    Attributes
+    ----------
+    xy_px
+        (N, 2) image at mid-exposure
+    flux_xy_px
+        (N, 2) flux-weighted mean of the image over the exposure, where a perfect centroid is
+    streak_px
+        (N,) length of its path over the exposure; None if there is no exposure
     """
 
     lab_from_body: Rotation
@@ -210,9 +242,15 @@ def count_wrong_matches(
 ) -> int:
     """How many of K lights are matched with a star or LED whose true image is farther than reach_px from them.
 
-    observed_px : (K, 2) centroids;  claimed_px : (K, 2) true images at mid-exposure of the matched stars or LEDs
     The image of a pulsed LED, or under a rolling shutter, is displaced over the exposure: that of the light nearest to
     the claimed image is added.
+
+    Parameters
+    ----------
+    observed_px
+        (K, 2) centroids
+    claimed_px
+        (K, 2) true images at mid-exposure of the matched stars or LEDs
     """
     if not len(lights.xy_px):
         return len(observed_px)

@@ -12,22 +12,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.paths import DATA, ROOT
-from skysim.dynamics.controllers.interface import CONTROLLERS
+from skysim.core.files import DATA, ROOT
+from skysim.dynamics.controllers import CONTROLLERS
 from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.plan import Trial, TrialSpec, digest, resolve_point
 from skysim.scene.loader import file_names
 from skysim.scene.scene import Scene
-from skysim.scene.sections.lights import PLUGINS
-from skysim.simulation.lab import Lab, build_lab, build_tracker
-from skysim.simulation.user_parts import UserParts
+from skysim.scene.sections.light import PLUGINS
+from skysim.simulation.lab import Lab, UserParts, build_lab, build_tracker
 from skysim.tracking import factory
-from skysim.tracking.external.interface import TRACKERS
+from skysim.tracking.tracker_interface import TRACKERS
 
 CACHE_SIZE = 4  # setups that a worker caches
 
 
-class Setup(NamedTuple):
+class TrialSetup(NamedTuple):
     """A scene prepared for trials: lab, tracker with its index, trial, scene hash, commands of external programs."""
 
     lab: Lab
@@ -41,7 +40,7 @@ class SetupCache(threading.local):
     """Least-recently-used cache of setups. One per thread, because a lab's canvas serves one trial at a time."""
 
     def __init__(self) -> None:
-        self.setups: OrderedDict[str, Setup] = OrderedDict()
+        self.setups: OrderedDict[str, TrialSetup] = OrderedDict()
 
 
 CACHE = SetupCache()
@@ -52,10 +51,14 @@ def setup_key(spec: TrialSpec, settings: Settings) -> str:
     return digest([spec.scene, spec.folder, spec.base, spec.trial, spec.programs, settings])
 
 
-def prepared_setup(spec: TrialSpec, settings: Settings, key: str = "") -> Setup:
+def prepared_setup(spec: TrialSpec, settings: Settings, key: str = "") -> TrialSetup:
     """The setup of a design point, from the cache if it is there. Raises InputError.
 
-    key : its `setup_key`, if it is known: a trial of centroids takes fifteen times as long as the key
+    Parameters
+    ----------
+    key
+        Its `setup_key`, if it is known: a trial of centroids takes fifteen times as long as the
+        key
     """
     key = key or setup_key(spec, settings)
     cached = CACHE.setups
@@ -67,7 +70,7 @@ def prepared_setup(spec: TrialSpec, settings: Settings, key: str = "") -> Setup:
     return cached[key]
 
 
-def build_setup(spec: TrialSpec, settings: Settings) -> Setup:
+def build_setup(spec: TrialSpec, settings: Settings) -> TrialSetup:
     """Build hardware and tracker of a point, or reuse those of a cached setup that differs only in its trial."""
     scene, trial = resolve_point(spec, settings)
     hash_ = scene_hash(scene)
@@ -81,7 +84,7 @@ def build_setup(spec: TrialSpec, settings: Settings) -> Setup:
     )
     lab = next(same, None) or build_lab(scene, UserParts(spec.programs))
     lab = lab.with_scene(scene)
-    return Setup(lab, build_tracker(lab.camera, spec.programs), trial, hash_, spec.programs)
+    return TrialSetup(lab, build_tracker(lab.camera, spec.programs), trial, hash_, spec.programs)
 
 
 def scene_hash(scene: Scene) -> str:

@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.io.files import make_folder, remove
-from skysim.experiments.study.designs import Point
+from skysim.core.files import make_folder, remove
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.execution.trials import Row
+from skysim.experiments.study.factors import Point
 from skysim.results.files import row_parts
 from skysim.results.files.row_parts import Part, Rows, Source
 
@@ -114,8 +114,11 @@ class Store:
     ) -> None:
         """Set the study's points and metadata in one transaction.
 
-        grown : replicates of the stored trials and of the study, if it has more: trials are numbered
-                point * replicates + replicate, and get their new numbers
+        Parameters
+        ----------
+        grown
+            Replicates of the stored trials and of the study, if it has more: trials are
+            numbered point * replicates + replicate, and get their new numbers
         """
         with self.db:
             if grown:
@@ -329,7 +332,10 @@ class Store:
     def columns(self, failed: bool = True) -> Rows:
         """Every column of `trials`, and `timings.time_ms`, as arrays in trial order; NaN for missing values.
 
-        failed : whether failed trials are among them
+        Parameters
+        ----------
+        failed
+            Whether failed trials are among them
         """
         return self._rows([EVERY], "1" if failed else "error IS NULL")
 
@@ -367,7 +373,10 @@ class Store:
     def _rows(self, ranges: Sequence[tuple[int, int]], where: str = "1") -> Rows:
         """The columns of the trials in some ranges of numbers, in their order.
 
-        where : what else holds of those in SQLite
+        Parameters
+        ----------
+        where
+            What else holds of those in SQLite
         """
         sources = list[Source]()
         numbers = list[NDArray[np.int64]]()
@@ -448,8 +457,15 @@ def to_sql(value: Any) -> Any:
 def to_array(name: str, column: Sequence[Any], texts: dict[Any, Any]) -> NDArray[Any]:
     """A column as an array: objects for text, int64 for integers, otherwise floats with NaN for null.
 
-    texts : texts so far, each of which is kept once
-    Raises TypeError for other values in a column of numbers; NumPy would read digits in bytes.
+    Parameters
+    ----------
+    texts
+        Texts so far, each of which is kept once
+
+    Raises
+    ------
+    TypeError
+        For other values in a column of numbers; NumPy would read digits in bytes.
     """
     if name in TEXT_FIELDS or name in ("scene", "code", "error"):
         return np.array([texts.setdefault(text, text) for text in column], dtype=object)

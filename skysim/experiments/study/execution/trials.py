@@ -15,17 +15,17 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.core.errors import ImageError
+from estimator.core.checks import ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate
 from estimator.trackers.coded_tracker import CodedTracker
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import Health, TrackedReport, TrackingMode
-from skysim.camera.detector.added_charge import AddedCharge
+from skysim.camera.detector import AddedCharge
 from skysim.core import quaternion
 from skysim.core.errors import InputError
-from skysim.core.paths import ROOT
+from skysim.core.files import ROOT
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Frame, Mount, Trajectory, Truth
 from skysim.experiments.study.execution.detections import (
@@ -42,7 +42,7 @@ from skysim.experiments.study.execution.outcomes import (
     true_lights,
 )
 from skysim.experiments.study.execution.setups import (
-    Setup,
+    TrialSetup,
     code_version,
     prepared_setup,
     seed_of,
@@ -60,12 +60,10 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.flight import Flight
-from skysim.simulation.lab import StarCamera
+from skysim.simulation.lab import StarCamera, UserParts
 from skysim.simulation.timing import MARGIN_S, exposure_window
-from skysim.simulation.user_parts import UserParts
-from skysim.sources.air.air import topocentric_axes
-from skysim.sources.solar_system.observer import observe_from
-from skysim.sources.solar_system.places import place
+from skysim.sources.air import topocentric_axes
+from skysim.sources.ephemeris import observe_from, place
 from skysim.tracking import factory
 
 GYRO_RAD_S = 1e-5  # standard deviation that a frame trial's gyro claims, 2 arcseconds a second
@@ -77,8 +75,13 @@ REFUSED = "refused"  # in place of the hash of a scene that cannot be built
 class Row(NamedTuple):
     """One trial as stored.
 
-    scene : its hash; REFUSED, with why in `error`, for a scene that is invalid; empty if its worker died
-    error : an InputError's line, or the traceback of another exception
+    Attributes
+    ----------
+    scene
+        Its hash; REFUSED, with why in `error`, for a scene that is invalid; empty if its worker
+        died
+    error
+        An InputError's line, or the traceback of another exception
     """
 
     trial: int
@@ -155,7 +158,11 @@ def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
     """Run the trials of a segment together.
 
     If one of them raises an exception, each runs by itself, and the row of that one stores it.
-    key : `setup_key` of the segment, if it is known
+
+    Parameters
+    ----------
+    key
+        `setup_key` of the segment, if it is known
     """
     numbers = list(enumerate(segment.replicates, segment.first))
     seeds = [seed_of(spec, segment.point, replicate) for _, replicate in numbers]
@@ -192,7 +199,7 @@ def run_trial(spec: TrialSpec, segment: Segment, trial: int, replicate: int) -> 
     )[0]
 
 
-def run_centroid_trials(setup: Setup, seeds: Sequence[int]) -> list[Outcome]:
+def run_centroid_trials(setup: TrialSetup, seeds: Sequence[int]) -> list[Outcome]:
     """Centroid trials: random attitude, noisy true detections and false ones; identified and solved.
 
     Every step is made for all of the trials before the next one, so that its code is in the processor's cache.
@@ -201,7 +208,7 @@ def run_centroid_trials(setup: Setup, seeds: Sequence[int]) -> list[Outcome]:
     return [score(setup.lab, setup.estimator, report, lights) for lights, report in solved]
 
 
-def solved_centroids(setup: Setup, seeds: Sequence[int]) -> list[tuple[TrueLights, Report]]:
+def solved_centroids(setup: TrialSetup, seeds: Sequence[int]) -> list[tuple[TrueLights, Report]]:
     """The lights of centroid trials, and the report on the detections; of coded light on those of the last frame."""
     lab = setup.lab
     trial = setup.trial
@@ -234,7 +241,7 @@ def solved_centroids(setup: Setup, seeds: Sequence[int]) -> list[tuple[TrueLight
     return list(zip(lights, reports, strict=True))
 
 
-def streams(setup: Setup, seed: int) -> tuple[np.random.Generator, np.random.Generator]:
+def streams(setup: TrialSetup, seed: int) -> tuple[np.random.Generator, np.random.Generator]:
     """Random generators of a trial's attitude and of its noise; `noise_seed` changes the noise only."""
     trial = setup.trial
     assert isinstance(trial, CentroidTrial | FrameTrial)
@@ -242,7 +249,7 @@ def streams(setup: Setup, seed: int) -> tuple[np.random.Generator, np.random.Gen
     return random_stream(seed, *attitude), random_stream(seed, 1, trial.noise_seed)
 
 
-def run_frame_trial(setup: Setup, seed: int) -> Outcome:
+def run_frame_trial(setup: TrialSetup, seed: int) -> Outcome:
     """Frame trial: random attitude, one rendered frame, solved lost in space or in tracking mode."""
     moving = moving_camera(setup, seed)
     frame, truth = moving.render(tracked_frames(setup))
@@ -255,7 +262,7 @@ def run_frame_trial(setup: Setup, seed: int) -> Outcome:
     return score(setup.lab, setup.estimator, report, true_lights(truth))
 
 
-def run_flight_trial(setup: Setup, seed: int) -> Outcome:
+def run_flight_trial(setup: TrialSetup, seed: int) -> Outcome:
     """Flight trial: the complete scene with another seed, and with a random start if the trial has one."""
     trial = setup.trial
     assert isinstance(trial, FlightTrial)
@@ -266,7 +273,7 @@ def run_flight_trial(setup: Setup, seed: int) -> Outcome:
         return summarize_flight(flight.telemetry(), outcomes, trial.settle_s)
 
 
-def trial_flight(setup: Setup, seed: int) -> Flight:
+def trial_flight(setup: TrialSetup, seed: int) -> Flight:
     """The flight of a trial at its start."""
     trial = setup.trial
     lab = setup.lab.in_run(seed)
@@ -286,13 +293,13 @@ def flight_outcomes(
 
 
 def one_by_one(
-    run: Callable[[Setup, int], Outcome],
-) -> Callable[[Setup, Sequence[int]], list[Outcome]]:
+    run: Callable[[TrialSetup, int], Outcome],
+) -> Callable[[TrialSetup, Sequence[int]], list[Outcome]]:
     """Trials of which each is run by itself."""
     return lambda setup, seeds: [run(setup, seed) for seed in seeds]
 
 
-TRIALS: dict[str, Callable[[Setup, Sequence[int]], list[Outcome]]] = {
+TRIALS: dict[str, Callable[[TrialSetup, Sequence[int]], list[Outcome]]] = {
     "centroids": run_centroid_trials,
     "frames": one_by_one(run_frame_trial),
     "flight": one_by_one(run_flight_trial),
@@ -302,12 +309,12 @@ TRIALS: dict[str, Callable[[Setup, Sequence[int]], list[Outcome]]] = {
 # Parts of trials.
 
 
-def random_attitude(setup: Setup, rng: np.random.Generator) -> Rotation:
+def random_attitude(setup: TrialSetup, rng: np.random.Generator) -> Rotation:
     """Random lab_from_body, see `random_attitudes`."""
     return random_attitudes(setup, [rng])[0]
 
 
-def random_attitudes(setup: Setup, rngs: Sequence[np.random.Generator]) -> Rotation:
+def random_attitudes(setup: TrialSetup, rngs: Sequence[np.random.Generator]) -> Rotation:
     """Random lab_from_body, N of them, each drawn by a generator of its own.
 
     Under a dome: tilt uniform in solid angle within `tilt_deg`, tilt direction and yaw uniform. Otherwise: boresight
@@ -369,11 +376,14 @@ def zyz(first_rad: float, second_rad: float, third_rad: float) -> Floats:
 
 
 def render_trial_frame(
-    setup: Setup, seed: int, added: AddedCharge | None = None
+    setup: TrialSetup, seed: int, added: AddedCharge | None = None
 ) -> tuple[Frame, Truth, tuple[float, float] | None]:
     """Frame of a frame trial, its truth and, with a gyro, the streak vector (dx, dy) in pixels at the image center.
 
-    added : gets the masks of smear and particles
+    Parameters
+    ----------
+    added
+        Gets the masks of smear and particles
     """
     moving = moving_camera(setup, seed)
     return *moving.render(tracked_frames(setup), added), moving.streak_px
@@ -391,13 +401,13 @@ class MovingCamera(NamedTuple):
         return render_frame(self.camera, self.trajectory, index, added=added)
 
 
-def tracked_frames(setup: Setup) -> int:
+def tracked_frames(setup: TrialSetup) -> int:
     """How many frames of a frame trial are followed before its own; this is also the index of its own."""
     assert isinstance(setup.trial, FrameTrial)
     return setup.trial.tracked
 
 
-def moving_camera(setup: Setup, seed: int) -> MovingCamera:
+def moving_camera(setup: TrialSetup, seed: int) -> MovingCamera:
     """The camera in the motion of a frame trial and, with a gyro, the streak vector of its frame."""
     trial = setup.trial
     (attitude_rng, noise) = streams(setup, seed)
@@ -420,7 +430,7 @@ def moving_camera(setup: Setup, seed: int) -> MovingCamera:
     return MovingCamera(camera, trajectory, streak)
 
 
-def attitude_and_axis(setup: Setup, rng: np.random.Generator) -> tuple[Rotation, Floats]:
+def attitude_and_axis(setup: TrialSetup, rng: np.random.Generator) -> tuple[Rotation, Floats]:
     """Random lab_from_body of a frame trial, and the (3,) axis of its rate in camera axes."""
     assert isinstance(setup.trial, FrameTrial)
     lab_from_body = random_attitude(setup, rng)
@@ -429,7 +439,7 @@ def attitude_and_axis(setup: Setup, rng: np.random.Generator) -> tuple[Rotation,
     )
 
 
-def tracked_report(setup: Setup, moving: MovingCamera, frame: Frame) -> Report:
+def tracked_report(setup: TrialSetup, moving: MovingCamera, frame: Frame) -> Report:
     """The report on a frame trial's last frame by a tracker in its tracking mode, which has solved those before.
 
     Without an attitude if the prediction failed and the frame had to be solved lost in space. A gyro's prediction is
@@ -464,7 +474,7 @@ def rotation_between(moving: MovingCamera, then_s: float, now_s: float) -> Rotat
     return now * then.inv()
 
 
-def gyro_rate(setup: Setup, truth: Truth) -> RateEstimate | None:
+def gyro_rate(setup: TrialSetup, truth: Truth) -> RateEstimate | None:
     """The rate in camera axes that the trial's gyro measures, without an error; None without a gyro."""
     assert isinstance(setup.trial, FrameTrial)
     return (

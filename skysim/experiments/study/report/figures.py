@@ -10,24 +10,91 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.axes import (
+from skysim.experiments.study.plan import Curve, Heat, Map, Study
+from skysim.experiments.study.report import layout
+from skysim.experiments.study.report.layout import MAX_POINTS_WITH_BARS, Grid, Panel, Series
+from skysim.experiments.study.table import (
     Axis,
+    PointRow,
     axis,
     is_sampled,
     is_share,
     label,
     shown_points,
 )
-from skysim.experiments.study.analysis.table import PointRow
-from skysim.experiments.study.analysis.thresholds import crossings, thresholds_of
-from skysim.experiments.study.plan import Curve, Heat, Study
-from skysim.experiments.study.report import layout
-from skysim.experiments.study.report.layout import MAX_POINTS_WITH_BARS, Grid, Panel, Series
-from skysim.experiments.study.report.scales import HATCHED, add_color_bar, color_scale, halo, ticks
+from skysim.experiments.study.thresholds import crossings, thresholds_of
+from skysim.results.metrics import MORE_IS_BETTER, split_name
 from skysim.results.plots import INK, MARKS, png
 
 if TYPE_CHECKING:
-    from skysim.experiments.study.analysis.sensitivity import Index
+    from skysim.experiments.study.table import Index
+
+
+# Color scales of a study's figures, outlines of texts, and ticks of logarithmic axes.
+
+
+SHARE_COLORS = "cividis"  # color map of all proportions
+COLORS = "YlOrRd"  # of other responses, dark where they are bad: reversed where more is better
+HATCHED: Any = {
+    "facecolor": "#eeeeee",
+    "edgecolor": "#b8b8b8",
+    "hatch": "////",
+    "linewidth": 0,
+}  # a cell without value
+
+
+def add_color_bar(fig: Any, image: Any, figure: Heat | Map, **where: Any) -> None:
+    """Add the color bar, labeled with the response."""
+    locator, formatter = ticks(image.norm.vmin, image.norm.vmax) if figure.log else (None, None)
+    fig.colorbar(
+        image, label=label(figure.response), ticks=locator, format=formatter, **where
+    ).minorticks_off()
+
+
+def color_scale(values: Floats, figure: Heat | Map) -> dict[str, Any]:
+    """Color map and normalization of a response: every proportion has the same, from 0 to 1."""
+    from matplotlib.colors import Normalize
+
+    if is_share(figure.response) and not figure.log:
+        return {"cmap": SHARE_COLORS, "norm": Normalize(0, 1)}
+    colors = SHARE_COLORS if is_share(figure.response) else COLORS
+    if split_name(figure.response)[0] in MORE_IS_BETTER:
+        colors += "_r"
+    return {"cmap": colors, "norm": color_norm(values, figure.log)}
+
+
+def color_norm(values: Floats, log: bool) -> Any:
+    """Color normalization over the finite values; a valid default range if all are equal or there are none."""
+    from matplotlib.colors import LogNorm, Normalize
+
+    finite = values[np.isfinite(values) & ((values > 0) | (not log))]
+    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.5, 1.0)
+    high = high if high > low else low + (abs(low) or 1.0)
+    return LogNorm(low, high, clip=True) if log else Normalize(low, high)
+
+
+def ticks(low: float, high: float) -> tuple[Any, Any]:
+    """Tick locator and formatter of a logarithmic axis.
+
+    Ticks are at each decade over three decades or more, at 1, 2 and 5 of each decade over less, and at round numbers
+    if the range is a factor of 8 or less.
+    """
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
+
+    where = (
+        LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,))
+        if high > 8 * low
+        else MaxNLocator(5)
+    )
+    return where, FuncFormatter(lambda value, _: f"{value:.6g}")
+
+
+def halo() -> Any:
+    """A white outline that keeps text and marks readable on any color."""
+    from matplotlib.patheffects import withStroke
+
+    return withStroke(linewidth=2.2, foreground="white")
+
 
 MAX_TICKS = 16  # maximum number of levels with a tick each
 MAX_WRAPPED_LABELS = (
@@ -404,7 +471,10 @@ def pareto_png(
 ) -> bytes:
     """Candidates in the plane of the two objectives; Pareto-optimal ones are joined and, if few, labeled.
 
-    also : fronts of other searches with the same objectives, (K, 2) by label
+    Parameters
+    ----------
+    also
+        Fronts of other searches with the same objectives, (K, 2) by label
     """
     from matplotlib.patheffects import withStroke
 

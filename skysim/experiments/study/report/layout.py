@@ -13,19 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.axes import (
+from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study
+from skysim.experiments.study.table import (
     Axis,
+    PointRow,
     axis,
     distinct,
     fixed_levels,
+    format_level,
     group_points,
+    has_few_values,
     is_sampled,
     label,
     shown_points,
 )
-from skysim.experiments.study.analysis.table import PointRow, format_level, has_few_values
-from skysim.experiments.study.analysis.thresholds import thresholds_of
-from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study
+from skysim.experiments.study.thresholds import thresholds_of
 from skysim.results import metrics
 from skysim.results.metrics import Summary
 
@@ -48,7 +50,12 @@ FAR_RATIO = (
 class Series(NamedTuple):
     """A line of a curve: its label and (N,) x, values and interval bounds, ascending in x.
 
-    values : number of trials with a value;  few : whether they are few of the point's trials (`has_few_values`)
+    Attributes
+    ----------
+    values
+        Number of trials with a value
+    few
+        Whether they are few of the point's trials (`has_few_values`)
     """
 
     label: str
@@ -63,7 +70,12 @@ class Series(NamedTuple):
 class Grid(NamedTuple):
     """A heat map: its axes and (Y, X) values, NaN where there is no value.
 
-    values : (Y, X) number of trials with a value;  few : whether they are few of the point's trials (`has_few_values`)
+    Attributes
+    ----------
+    values
+        (Y, X) number of trials with a value
+    few
+        Whether they are few of the point's trials (`has_few_values`)
     """
 
     x: Axis

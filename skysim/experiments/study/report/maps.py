@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.axes import axis, group_points, shown_points
-from skysim.experiments.study.analysis.table import PointRow
-from skysim.experiments.study.analysis.worst import ColumnsOf, WorstTrial, worst_trials
 from skysim.experiments.study.plan import Map, Study
+from skysim.experiments.study.report.figures import HATCHED, add_color_bar, color_scale, halo
 from skysim.experiments.study.report.layout import caption_title, fixed_text
-from skysim.experiments.study.report.scales import HATCHED, add_color_bar, color_scale, halo
+from skysim.experiments.study.table import PointRow, axis, group_points, shown_points
+from skysim.experiments.study.worst import ColumnsOf, WorstTrial, worst_trials
 from skysim.results import metrics
 from skysim.results.files.row_parts import subset
 from skysim.results.metrics import Columns
@@ -36,10 +35,15 @@ RING_LABEL_DEG = 67.5  # azimuth of the labels of the rings
 LABEL: Any = {"ha": "center", "va": "center", "fontsize": 7, "color": "#444444"}
 
 
-class Cell(NamedTuple):
+class MapCell(NamedTuple):
     """A cell: its range from the center (tilt, or declination) and around it (azimuth, or RA), in degrees.
 
-    value : the response, NaN without values;  values : number of trials with a value
+    Attributes
+    ----------
+    value
+        The response, NaN without values
+    values
+        Number of trials with a value
     """
 
     low_deg: float
@@ -60,7 +64,7 @@ class DirectionMap(NamedTuple):
 
     label: str
     sky: bool
-    cells: list[Cell]
+    cells: list[MapCell]
     worst: list[WorstTrial]
 
 
@@ -112,7 +116,7 @@ def direction_map(label: str, columns: Columns, response: str) -> DirectionMap:
     for one, (first, end) in zip(ranges, itertools.pairwise(ends.tolist()), strict=True):
         summary = summarize(subset(columns, order[first:end]))
         value = summary.value if summary.trials >= least else math.nan
-        cells.append(Cell(*one, value, summary.trials))
+        cells.append(MapCell(*one, value, summary.trials))
     return DirectionMap(label, sky, cells, worst_trials(columns, response))
 
 
@@ -213,7 +217,10 @@ def place(radial_deg: Floats | float, around_deg: Floats | float, sky: bool) -> 
 
         x = 2 sqrt(2) cos(dec) sin(l / 2) / d,    y = sqrt(2) sin(dec) / d,    d = sqrt(1 + cos(dec) cos(l / 2)).
 
-    around_deg : azimuth, or RA from 180 to 540
+    Parameters
+    ----------
+    around_deg
+        Azimuth, or RA from 180 to 540
     """
     around = np.radians(360.0 - np.asarray(around_deg)) if sky else np.radians(around_deg)
     if not sky:
@@ -253,7 +260,7 @@ def draw_cells(axes: Any, panel: DirectionMap, colors: Any) -> None:
         )
 
 
-def outline(cell: Cell, sky: bool) -> Floats:
+def outline(cell: MapCell, sky: bool) -> Floats:
     """(K, 2) outline of a cell in the drawing."""
     left = cell.left_deg
     right = cell.right_deg

@@ -12,19 +12,17 @@ import numpy as np
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis.table import format_level
-from skysim.experiments.study.designs import Point, make_point
 from skysim.experiments.study.execution.trials import rate_axis
-from skysim.experiments.study.factors import Distribution, Factor, Range
-from skysim.experiments.study.loader import fixed_seeds, may_report_ambiguity
+from skysim.experiments.study.factors import Distribution, Factor, Point, Range, make_point
 from skysim.experiments.study.plan import FlightTrial, FrameTrial, Plan, Trial, resolve_point
+from skysim.experiments.study.study_file import fixed_seeds, may_report_ambiguity
+from skysim.experiments.study.table import format_level
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation import checks
 from skysim.simulation.checks.facts import TRACKER_KNOWS, Fact
-from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.user_parts import UserParts
+from skysim.simulation.lab import Lab, UserParts, build_lab
 
 NUMBER = re.compile(r"\d[\d.]*")
 RATE = "trial.rate_deg_s"
@@ -34,10 +32,17 @@ MAX_CHECKED = 8  # scenes that are checked: building one takes up to a second
 class Overview(NamedTuple):
     """What a report begins with.
 
-    rows     : names and texts of the scene table, for the first level of every factor
-    findings : of the checks, each with the levels at which it was found; at the rates of the study's trials
-    may_be_ambiguous : whether the tracker can refuse a frame as ambiguous
-    fixed    : seeds of hardware that all trials share, see `loader.fixed_seeds`
+    Attributes
+    ----------
+    rows
+        Names and texts of the scene table, for the first level of every factor
+    findings
+        Of the checks, each with the levels at which it was found; at the rates of the study's
+        trials
+    may_be_ambiguous
+        Whether the tracker can refuse a frame as ambiguous
+    fixed
+        Seeds of hardware that all trials share, see `loader.fixed_seeds`
     """
 
     rows: list[tuple[str, str]]
@@ -93,7 +98,10 @@ def greatest_tilt_deg(scene: Scene, trial: Trial) -> float | None:
 def with_leds(levels: str, leds: Mapping[str, int]) -> str:
     """The name of a checked point, with its number of LEDs where a study's points differ in it.
 
-    leds : of each checked point under a dome
+    Parameters
+    ----------
+    leds
+        Of each checked point under a dome
     """
     return f"{levels}, {leds[levels]} LEDs" if len(set(leds.values())) > 1 else levels
 

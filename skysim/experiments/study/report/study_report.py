@@ -9,21 +9,30 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from skysim.core.paths import STUDIES
+from skysim.core.files import STUDIES
 from skysim.core.types import Floats
-from skysim.experiments.study.analysis import answer, search, sensitivity
-from skysim.experiments.study.analysis import table as tables
-from skysim.experiments.study.analysis.axes import axis, is_sampled, same, shown_points
-from skysim.experiments.study.analysis.search import SearchResult
-from skysim.experiments.study.analysis.sensitivity import Index
-from skysim.experiments.study.analysis.table import PointRow, format_response, format_summary
-from skysim.experiments.study.analysis.worst import ColumnsOf
+from skysim.experiments.study import answer, search
+from skysim.experiments.study import table as sensitivity
+from skysim.experiments.study import table as tables
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
 from skysim.experiments.study.report import figures, layout, maps
 from skysim.experiments.study.report.maps import DirectionMap
 from skysim.experiments.study.report.overview import Overview, overview
-from skysim.results.report import (
+from skysim.experiments.study.search import SearchResult
+from skysim.experiments.study.table import (
+    Index,
+    PointRow,
+    axis,
+    format_response,
+    format_summary,
+    is_sampled,
+    same,
+    shown_points,
+)
+from skysim.experiments.study.worst import ColumnsOf
+from skysim.results.report import Report
+from skysim.results.report_blocks import (
     Block,
     Cell,
     Code,
@@ -31,19 +40,19 @@ from skysim.results.report import (
     Facts,
     Figure,
     Items,
-    Report,
+    Kind,
     Section,
     Table,
     Text,
+    Tone,
     Verdict,
 )
-from skysim.results.report.blocks import Kind, Tone
 
 POINTS = "Points"  # titles of sections
 STUDY_FILE = "The study file"
 LISTED = 10  # maximum number of failures listed
 ROWS = 5000  # maximum number of rows in the table of points
-OPEN_ROWS = 72  # rows above which that table is folded
+OPEN_ROWS = 20  # rows above which that table is folded
 SOBOL = (
     "Sobol indices of {}: the share of its variance that would go were a factor known, and that would stay were all"
     " others known; intervals of 95 %."
@@ -53,10 +62,20 @@ SOBOL = (
 class Analysis(NamedTuple):
     """What is known of a study's trials.
 
-    lines    : of all points, with the responses of `responses` and those of the answers
-    about    : scene table and findings of its checks
-    headline : answers in words;  ranges : of each response, in words
-    indices  : Sobol indices, of design saltelli;  result : candidates and front, of a search
+    Attributes
+    ----------
+    lines
+        Of all points, with the responses of `responses` and those of the answers
+    about
+        Scene table and findings of its checks
+    headline
+        Answers in words
+    ranges
+        Of each response, in words
+    indices
+        Sobol indices, of design saltelli
+    result
+        Candidates and front, of a search
     """
 
     lines: Sequence[PointRow]
@@ -75,7 +94,10 @@ class Analysis(NamedTuple):
 def study_report(plan: Plan, store: Store, study: str = "", out: Path | None = None) -> Report:
     """The report of a study. study, out : as `commands` takes them
 
-    Raises InputError if `where` of a figure names an unknown factor or level.
+    Raises
+    ------
+    InputError
+        If `where` of a figure names an unknown factor or level.
     """
     command = commands(plan, store, study, out)
     return compose(plan.study, store, analyze(plan, store, command), command)
@@ -86,7 +108,10 @@ def commands(
 ) -> Callable[[str], str]:
     """The function from a verb to the shell command that applies it to a study, with its overrides if it runs it.
 
-    study, out : what the command names; by default the study's name or path, and the store's folder
+    Parameters
+    ----------
+    study, out
+        What the command names; by default the study's name or path, and the store's folder
     """
     if not study:
         study = plan.name if plan.path.parent == STUDIES else str(plan.path)
@@ -144,6 +169,7 @@ def compose(
 ) -> Report:
     """The report of an analyzed study. command : see `commands`;  also : see `figures.pareto_png`"""
     lines = tables.select_responses(found.lines, responses(study))
+    answered = answer.verdict(study, found.lines)
     costs = {one.number: one.cost for one in found.result.candidates} if found.result else None
     front = [one.number for one in found.result.front] if found.result else []
     drawn = [
@@ -154,26 +180,41 @@ def compose(
     shown = {one.response for one in layout.figures(study, lines)}
     left = ", ".join(name for name in study.responses if name not in shown)
     scene = [(name, [text]) for name, text in found.about.rows]
+    first, others = drawn[:1], drawn[1:]
     warnings = Items(found.about.findings, tone="warning")
     blocks = [
         Text(question(store.meta("study")), on_terminal=False),
-        verdict(study, store),
+        *([Verdict(answered, tone(store))] if answered else []),
+        progress(study, store, answered),
         failures(store, command("replay")),
-        Items(found.headline, "Answer"),
+        *first,
+        Section("All answers", [Items(found.headline)], folded=True),
         Section(
-            "Figures", [*drawn, Text(left and f"In the table alone: {left}.")], on_terminal=False
+            "Further figures",
+            [*others, Text(left and f"In the table alone: {left}.")],
+            folded=True,
+            on_terminal=False,
         ),
         Section(
-            "Scene", [Facts([*scene, ("code version", [store.meta("code")])])], on_terminal=False
+            "Ranges of the responses",
+            [range_table(study, found.lines)],
+            folded=True,
+            on_terminal=False,
         ),
-        Section(
-            "Checks of the scene",
-            [warnings if found.about.findings else Text("Nothing to warn of.")],
-        ),
-        Section("Ranges of the responses", [Items(found.ranges)], on_terminal=False),
         Section("Sobol indices", [index_table(found.indices)]),
         Section("Front", front_table(study, found.result)),
         points_section(lines, study, front, costs),
+        Section(
+            "Checks of the scene",
+            [warnings if found.about.findings else Text("Nothing to warn of.")],
+            folded=True,
+        ),
+        Section(
+            "Scene",
+            [Facts([*scene, ("code version", [store.meta("code")])])],
+            folded=True,
+            on_terminal=False,
+        ),
         runs_section(store),
         Section(STUDY_FILE, [Code(store.meta("study"), "yaml")], folded=True, on_terminal=False),
     ]
@@ -189,17 +230,22 @@ def question(text: str) -> str:
     return " ".join(line.removeprefix("#").strip() for line in lines)
 
 
-def verdict(study: Study, store: Store) -> Verdict:
-    """How many trials are done, failed, and ended in a wrong attitude."""
+def tone(store: Store) -> Tone:
+    """Bad if trials failed."""
+    return "bad" if store.counts()["failed"] else "good"
+
+
+def progress(study: Study, store: Store, answered: str) -> Verdict | Text:
+    """How many trials are done, failed, and ended in a wrong attitude; the verdict of a study without an answer."""
     counts = store.counts()
     trials = study.trial_count(len(store.points()))
     finished = 0 < trials <= counts["done"]
-    tone: Tone = "good" if finished else "warning"
     text = "{done} of {} trials, {failed} failed, {wrong} wrong attitudes (over 10′).".format(
         trials, **counts
     )
     text += "" if finished else " Not finished: what follows is of the trials that are in."
-    return Verdict(text, "bad" if counts["failed"] else tone)
+    shown: Tone = "bad" if counts["failed"] else "good" if finished else "warning"
+    return Text(text, shown) if answered else Verdict(text, shown)
 
 
 def failures(store: Store, replay: str) -> Items:
@@ -244,6 +290,12 @@ def points_section(
     note = "In brackets intervals of 95 %." + (" Tinted: the front." if front else "")
     table = Table(columns, rows, from_the_last(len(axes) + 1, len(columns)))
     return Section(POINTS, [table, Text(f"{note} {more}")], folded=len(lines) > OPEN_ROWS)
+
+
+def range_table(study: Study, lines: Sequence[PointRow]) -> Table:
+    """The least and the largest value of each response, and where they are."""
+    heads = ("response", "least", "at", "largest", "at")
+    return Table([Column(head, kind="text") for head in heads], answer.range_rows(study, lines))
 
 
 def index_table(indices: Sequence[Index]) -> Table:
@@ -297,7 +349,7 @@ def runs_section(store: Store) -> Section:
         row.append(row[2] / row[3] if row[3] else None)
     untimed = store.counts()["done"] - sum(run["trials"] for run in store.runs())
     note = f"{untimed} trials are of runs that were killed." if untimed > 0 else ""
-    return Section("Runs", [Table(columns, rows), Text(note)])
+    return Section("Runs", [Table(columns, rows), Text(note)], folded=True)
 
 
 # Figures.

@@ -23,7 +23,7 @@ from skysim.sources.dome.layouts.placing import (
     led_sources,
     project_from_bearing,
 )
-from skysim.sources.dome.shell.surface import Surface
+from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band
 
 GLUE_STREAM = 1  # spawn key of the glue's own random stream, so that glue errors leave a board's pattern unchanged

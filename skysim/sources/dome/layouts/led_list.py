@@ -9,11 +9,11 @@ import numpy as np
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import StringConfig
 from skysim.scene.sections.light import DomeConfig
-from skysim.sources.dome.displays.display import ideal_led
+from skysim.sources.dome.display import ideal_led
 from skysim.sources.dome.layouts.registry import LAYOUTS
 from skysim.sources.dome.layouts.string import wind
 from skysim.sources.dome.led import full_strength_e_s_sr
-from skysim.sources.dome.shell.surface import Surface, build_surface
+from skysim.sources.dome.surface import Surface, build_surface
 from skysim.sources.photometry import Band
 
 BUILT = {

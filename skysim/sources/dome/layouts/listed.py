@@ -21,7 +21,7 @@ from skysim.sources.dome.layouts.placing import (
     on_surface,
     project_from_bearing,
 )
-from skysim.sources.dome.shell.surface import Surface
+from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band
 
 MAX_SURFACE_OFFSET_M = 0.05  # of a listed LED; more is an error in a unit or an axis

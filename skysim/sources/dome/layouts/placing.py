@@ -14,6 +14,7 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import HOLES, DimmedConfig, LitConfig
 from skysim.scene.sections.leds import LedConfig
+from skysim.sources.dome.layouts.ambiguity import unique_levels
 from skysim.sources.dome.led import (
     DRIVES,
     DriveInput,
@@ -23,8 +24,7 @@ from skysim.sources.dome.led import (
     full_strength_e_s_sr,
     strength_factors,
 )
-from skysim.sources.dome.placement.neighborhoods import unique_levels
-from skysim.sources.dome.shell.surface import Surface
+from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band
 
 Ints = NDArray[np.int64]
@@ -34,10 +34,18 @@ Ints = NDArray[np.int64]
 class PlacedLeds:
     """LED positions before drive and brightness are assigned.
 
-    id        : (N,) LED numbers
-    place_m   : (N, 3) in the lab;  normal : (N, 3) unit
-    level     : (N,) fraction of full brightness, 0 < level <= 1
-    magnitude : (N,) of the star that the LED represents; NaN if it represents none
+    Attributes
+    ----------
+    id
+        (N,) LED numbers
+    place_m
+        (N, 3) in the lab
+    normal
+        (N, 3) unit
+    level
+        (N,) fraction of full brightness, 0 < level <= 1
+    magnitude
+        (N,) of the star that the LED represents; NaN if it represents none
     """
 
     id: Ints

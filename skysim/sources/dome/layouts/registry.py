@@ -24,16 +24,20 @@ from skysim.scene.sections.layouts import (
 )
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome import celestial as celestial_dome
-from skysim.sources.dome.displays import display
-from skysim.sources.dome.displays.projector import projector_sources
+from skysim.sources.dome import display
+from skysim.sources.dome.display import projector_sources
 from skysim.sources.dome.layouts.boards import patch_boards
-from skysim.sources.dome.layouts.fibers import displace_ends
-from skysim.sources.dome.layouts.geodesic import geodesic
 from skysim.sources.dome.layouts.listed import listed
 from skysim.sources.dome.layouts.placing import Ints, PlacedLeds, led_sources
-from skysim.sources.dome.layouts.spreads import fibonacci, optimized, poisson_disk, random_places
-from skysim.sources.dome.layouts.string import string
-from skysim.sources.dome.shell.surface import Surface
+from skysim.sources.dome.layouts.spreads import (
+    fibonacci,
+    geodesic,
+    optimized,
+    poisson_disk,
+    random_places,
+)
+from skysim.sources.dome.layouts.string import displace_ends, string
+from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band
 
 

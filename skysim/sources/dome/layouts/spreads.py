@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -13,19 +13,21 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import (
     FibonacciConfig,
+    GeodesicConfig,
     OptimizedConfig,
     PoissonDiskConfig,
     RandomPlacesConfig,
 )
 from skysim.scene.sections.leds import LedConfig
+from skysim.sources.dome.layouts import optimize
 from skysim.sources.dome.layouts.placing import (
     cap,
     dimmed_sources,
+    lit_sources,
     project_from_bearing,
     scattered_cap,
 )
-from skysim.sources.dome.placement import optimize
-from skysim.sources.dome.shell.surface import Surface
+from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band
 
 DARTS_PER_SPACING2 = (
@@ -132,7 +134,10 @@ def optimized_places(
 ) -> tuple[Floats, Mapping[str, Any]]:
     """(N, 3) read-only places of `optimized`, m, and the state of the hardware's random stream after the search.
 
-    sites, spirals : (K, 3) points, m, as bytes, because arrays have no hash
+    Parameters
+    ----------
+    sites, spirals
+        (K, 3) points, m, as bytes, because arrays have no hash
     """
     rng = random_stream(config.hardware_seed)
     points = [np.frombuffer(text).reshape(-1, 3) for text in (sites, *spirals)]
@@ -140,3 +145,74 @@ def optimized_places(
     place_m = optimize.optimize_places(config, points[0], points[1:], rng, optimize.OPTIONS)
     place_m.flags.writeable = False
     return place_m, rng.bit_generator.state
+
+
+# LEDs at the vertices of a geodesic sphere: an icosahedron with divided faces, projected on the
+# surface.
+
+
+CAP_SLACK = 1e-12  # relative rounding of a vertex on the rim of the cap
+
+
+def geodesic(config: GeodesicConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+    """LEDs at the geodesic vertices within the cap, numbered from the zenith, then by azimuth."""
+    vertices = geodesic_vertices(config.frequency, config.class_)
+    tilt_rad = np.arctan2(np.hypot(vertices[:, 0], vertices[:, 1]), vertices[:, 2])
+    azimuth_rad = np.arctan2(vertices[:, 1], vertices[:, 0])
+    order = np.lexsort((np.round(azimuth_rad, 9), np.round(tilt_rad, 9)))
+    order = order[tilt_rad[order] <= np.radians(config.cap_deg) * (1 + CAP_SLACK)]
+    turned = azimuth_rad[order] + np.radians(config.rotation_deg)
+    ring = np.sin(tilt_rad[order])
+    z = np.cos(tilt_rad[order])
+    directions = np.column_stack([ring * np.cos(turned), ring * np.sin(turned), z])
+    return lit_sources(config, surface, project_from_bearing(surface, directions), led, band)
+
+
+def geodesic_vertices(frequency: int, class_: str) -> Floats:
+    """(10 T + 2, 3) unit vectors of all vertices; see the module's docstring. frequency is even in class II."""
+    corners = icosahedron()
+    weights: set[tuple[tuple[int, int], ...]] = (
+        set()
+    )  # corners with their weights: the same from every face
+    for face in icosahedron_faces():
+        for lattice in lattice_points(frequency, class_):
+            weights.add(
+                tuple(sorted((corner, n) for corner, n in zip(face, lattice, strict=True) if n))
+            )
+    points = np.array([sum(n * corners[corner] for corner, n in each) for each in sorted(weights)])
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def lattice_points(frequency: int, class_: str) -> Iterator[tuple[int, int, int]]:
+    """Whole barycentric coordinates of a face's lattice points, its edges and corners included."""
+    total = frequency if class_ == "I" else 3 * frequency // 2
+    for i in range(total + 1):
+        for j in range(total + 1 - i):
+            k = total - i - j
+            if class_ == "I" or i % 3 == j % 3 == k % 3:
+                yield i, j, k
+
+
+def icosahedron() -> Floats:
+    """(12, 3) unit vectors: the zenith, five at z = 1 / sqrt 5, five at -1 / sqrt 5 between them, the nadir."""
+    z = 1 / np.sqrt(5)
+    ring = 2 / np.sqrt(5)
+    azimuth = np.arange(5) * (2 * np.pi / 5)
+    upper = np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), np.full(5, z)])
+    between = azimuth + np.pi / 5
+    lower = np.column_stack([ring * np.cos(between), ring * np.sin(between), np.full(5, -z)])
+    return np.vstack([[0.0, 0.0, 1.0], upper, lower, [0.0, 0.0, -1.0]])
+
+
+def icosahedron_faces() -> list[tuple[int, int, int]]:
+    """The corners of its 20 faces, as rows of `icosahedron`."""
+    faces = []
+    for n in range(5):
+        following = (n + 1) % 5
+        upper = 1 + n
+        next_upper = 1 + following
+        lower = 6 + n
+        next_lower = 6 + following
+        faces += [(0, upper, next_upper), (upper, lower, next_upper)]
+        faces += [(lower, next_lower, next_upper), (11, lower, next_lower)]
+    return faces

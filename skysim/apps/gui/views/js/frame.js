@@ -1,6 +1,6 @@
 // The frame: its pixels come as numbers, so zoom, limits, colors, values under the cursor, loupe and cut are made here,
 // without the server. Marks are drawn together with their frame, so that they never appear on another one.
-import { setContents } from "skysim-live/live.js";
+import { setContents } from "skysim-views/live.js";
 import { colorTable, decode, palette, profile, reader, shadeTable } from "skysim-views/pixels.js";
 import { drawGrid, drawHighlight, drawLoupe, drawMarks, drawNames } from "skysim-views/marks.js";
 import { drawHistogram, drawProfile, levelAt, nearestLevel } from "skysim-views/plots.js";

@@ -1,0 +1,360 @@
+"""Mass properties from whole records: the most probable motion and parameters (multiple shooting).
+
+A rate found by differencing attitudes has errors that bias a regression on it. Here the motion itself is fitted: the
+unknowns are the states at every attitude (`dynamics.States`) and the parameters, and the residuals are
+
+    attitudes measured minus fitted,                         weighted by the tracker's covariance,
+    states integrated from the last attitude minus fitted,   weighted by the covariance of the random torque,
+    parameters assumed minus fitted,                         weighted by the prior.
+
+Their weighted sum of squares is minimized by the Gauss-Newton method, which for a motion with random forces is the
+iterated Kalman smoother (Bell, SIAM J. Optimization 4, 1994, 626; Bock's multiple shooting, 1983). The states of a
+record form a banded matrix and are eliminated, so that records of different trim add their information on the
+parameters, whose covariance is the inverse of the sum.
+
+Errors that attitudes share, of a map of LEDs or a lens, are not fitted, but considered (Schmidt 1966): the weights are
+those of the noise alone, and the covariance of the parameters has what the shared errors add to it (`considered`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import LinAlgError, solveh_banded
+from scipy.spatial.transform import Rotation
+
+from estimator.calibration.mass_dynamics import (
+    BIAS,
+    MIN_ATTITUDES,
+    STATE,
+    BearingRecord,
+    EquationsOfMotion,
+    LabConstants,
+    MassEstimate,
+    Prior,
+    States,
+    inertia_matrix,
+    inverse_inertia,
+    momentum_scale,
+    transition,
+    turn,
+)
+from estimator.core.checks import Floats, ImageError
+from estimator.filter.states import TrackerModel
+
+MAX_ITERATIONS = 30
+CONVERGED_SIGMA = 0.01  # largest step of a parameter, in its standard deviations
+# of the logarithm of the misfit; fits to reach it
+MISFIT_TOLERANCE = 0.1
+MAX_FACTORS = 8
+# above 1: the random torque's share of the misfit stays
+FACTOR_POWER = 1.5
+FACTOR_LIMITS = (1e-3, 1e3)
+MOMENTUM = slice(3, 6)  # of a state
+BANDS = 2 * STATE  # of the normal matrix: a state and its neighbor
+
+
+class Reduced(NamedTuple):
+    """A record's normal equations on the parameters after its states are eliminated.
+
+    normal (P, P), gradient (P,) : of the parameters;  states_step (9 N,), states_by_parameter (9 N, P) : the states'
+    step is the first minus the second times the parameters' step;  chi2 : of the residuals before the step
+    """
+
+    normal: Floats
+    gradient: Floats
+    states_step: Floats
+    states_by_parameter: Floats
+    chi2: float
+
+
+def estimate_mass(
+    records: Sequence[BearingRecord], lab: LabConstants, prior: Prior
+) -> MassEstimate:
+    """The mass properties from one or several records. Raises ImageError if the fit does not converge."""
+    values = prior.values.copy()
+    motions = [first_states(record, lab, values) for record in records]
+    information = np.diag(prior.sigma**-2)
+    attitudes = sum(len(record.t_s) for record in records)
+    for iteration in range(1, MAX_ITERATIONS + 1):
+        parts = [reduced(*one, lab, values, prior) for one in zip(records, motions, strict=True)]
+        normal = information + sum(part.normal for part in parts)
+        gradient = information @ (prior.values - values) + sum(part.gradient for part in parts)
+        covariance: Floats = np.asarray(np.linalg.inv(normal))
+        step = covariance @ gradient
+        motions = [
+            states.moved((part.states_step - part.states_by_parameter @ step).reshape(-1, STATE).T)
+            for states, part in zip(motions, parts, strict=True)
+        ]
+        values = values + step
+        if np.all(np.abs(step) < CONVERGED_SIGMA * np.sqrt(np.diag(covariance))):
+            covariance = covariance + considered(records, parts, covariance)
+            chi2 = sum(part.chi2 for part in parts) + np.sum(
+                ((prior.values - values) / prior.sigma) ** 2
+            )
+            return MassEstimate(
+                values, covariance, float(chi2 / (3 * attitudes - 6 * len(records))), iteration
+            )
+        if not np.all(np.isfinite(values)):
+            break
+    raise ImageError(
+        "mass properties: the fit does not converge; allowed: a motion that the assumed values describe"
+    )
+
+
+def estimate_with_noise(
+    records: Sequence[BearingRecord], lab: LabConstants, prior: Prior
+) -> MassEstimate:
+    """The mass properties, with the attitudes' noise scaled by a factor at which the misfit is 1.
+
+    A tracker's own covariance is too small where an error is unknown to it, and too large where it is cautious. The
+    level of the random torque is taken as known. Raises ImageError as `estimate_mass`.
+    """
+    factor = 1.0
+    for _ in range(MAX_FACTORS):
+        estimate = estimate_mass([one.with_noise(factor) for one in records], lab, prior)
+        if abs(np.log(estimate.misfit)) < MISFIT_TOLERANCE:
+            break
+        factor = float(np.clip(factor * estimate.misfit**FACTOR_POWER, *FACTOR_LIMITS))
+    return replace(estimate, attitude_factor=factor)
+
+
+def considered(
+    records: Sequence[BearingRecord], parts: Sequence[Reduced], covariance: Floats
+) -> Floats:
+    """(P, P) what errors that attitudes share add to the covariance of the parameters.
+
+    An attitude's error e_n changes the parameters by K_n e_n = C (B - X_n)^T W_n e_n: C their covariance by the noise,
+    W_n the weight, B the derivatives of a measured attitude by the parameters (those of the bias) and X_n those of the
+    fitted one. Errors of covariance S_n = L_n L_n^T whose correlation r falls with the rotation between two attitudes
+    add sum K_m L_m r_mn L_n^T K_n^T. The process is that of `filter.models.TrackerModel`, without its time.
+    """
+    size = len(covariance)
+    effects = []
+    attitudes = []
+    by_bias = np.zeros((3, size))
+    by_bias[:, BIAS] = np.eye(3)
+    for record, part in zip(records, parts, strict=True):
+        if record.systematic_rad2 is None:
+            continue
+        fitted = part.states_by_parameter.reshape(-1, STATE, size)[:, :3]
+        gain = covariance @ (by_bias - fitted).transpose(0, 2, 1) @ np.linalg.inv(record.noise_rad2)
+        values, axes = np.linalg.eigh(record.systematic_rad2)
+        effects.append(
+            gain @ (axes * np.sqrt(np.maximum(values, 0))[:, None]) @ axes.transpose(0, 2, 1)
+        )
+        attitudes.append(record.lab_from_body)
+    if not effects:
+        return np.zeros((size, size))
+    effect = np.concatenate(effects)
+    quaternion = Rotation.concatenate(attitudes).as_quat()
+    angle_rad = 2 * np.arccos(np.minimum(np.abs(quaternion @ quaternion.T), 1))
+    shared = np.exp(-angle_rad / TrackerModel().systematic_angle_rad)
+    return np.asarray(np.einsum("mpk,mn,nqk->pq", effect, shared, effect, optimize=True))
+
+
+def first_states(record: BearingRecord, lab: LabConstants, values: Floats) -> States:
+    """States to begin with: the measured attitudes, the momentum of their differences, no random torque."""
+    motion = EquationsOfMotion(record, lab, values[:, None], values)
+    turned = (record.lab_from_body[:-1].inv() * record.lab_from_body[1:]).as_rotvec() / np.diff(
+        record.t_s
+    )[:, None]
+    middle_s = (record.t_s[1:] + record.t_s[:-1]) / 2
+    rate = np.array([np.interp(record.t_s, middle_s, one) for one in turned.T])
+    inertia = inertia_matrix(values[:6]) + record.added_inertia_kg_m2
+    quaternion = record.lab_from_body.as_quat().T
+    own = inertia @ rate + motion.stored(record.t_s)
+    return States(quaternion, turn(quaternion, own), np.zeros_like(rate))
+
+
+def reduced(
+    record: BearingRecord, states: States, lab: LabConstants, values: Floats, prior: Prior
+) -> Reduced:
+    """Linearize a record's residuals and eliminate its states."""
+    count = len(record.t_s)
+    size = len(values)
+    rows = whitened_links(record, states, lab, values, prior)
+    products = rows.transpose(0, 2, 1) @ rows
+    before = slice(0, STATE)
+    after = slice(STATE, 2 * STATE)
+    rest = slice(2 * STATE, None)
+    diagonal = np.zeros((count, STATE, STATE))
+    border = np.zeros((count, STATE, size + 1))
+    for block, to in ((before, slice(None, -1)), (after, slice(1, None))):
+        diagonal[to] += products[:, block, block]
+        border[to] += products[:, block, rest]
+    corner = products[:, rest, rest].sum(axis=0)
+    chi2 = float(np.sum(rows[:, :, -1] ** 2)) + add_measured(
+        record, states, lab, values, (diagonal, border, corner)
+    )
+    flat = border.reshape(-1, size + 1)
+    try:
+        solved = solveh_banded(lower_band(diagonal, products[:, before, after]), flat, lower=True)
+    except LinAlgError as error:
+        raise ImageError(f"mass properties: {error}") from error
+    corner -= flat.T @ solved
+    return Reduced(corner[:-1, :-1], -corner[:-1, -1], -solved[:, -1], solved[:, :-1], chi2)
+
+
+def whitened_links(
+    record: BearingRecord, states: States, lab: LabConstants, values: Floats, prior: Prior
+) -> Floats:
+    """(N - 1, 9, 18 + P + 1) slopes of the transitions' residuals by state before, state after and parameters, and the
+    residuals, in standard deviations.
+
+    Residuals of momentum m are those of the assumed inertia, R J0 J^-1 R^T m, whose noise does not depend on J; their
+    slopes by the elements of J are those of m and -R J0 J^-1 (dJ) J^-1 R^T m.
+    """
+    before = states.take(slice(None, -1))
+    link = transition(record, lab, 0, before, values, prior)
+    misfit = link.after.minus(states.take(slice(1, None))).T[:, :, None]
+    by_after = np.broadcast_to(-np.eye(STATE), link.by_state.shape)
+    rows = np.concatenate([link.by_state, by_after, link.by_parameter, misfit], axis=2)
+    scale = np.tile(np.eye(STATE), (len(misfit), 1, 1))
+    scale[:, MOMENTUM, MOMENTUM] = momentum_scale(record, before, values, prior.values)
+    R_lab_from_body = before.rotation.as_matrix()
+    in_body = R_lab_from_body.transpose(0, 2, 1) @ misfit[:, MOMENTUM]
+    turned = np.einsum(
+        "ijp,kjl->kip", inertia_matrix(np.eye(6)), inverse_inertia(record, values) @ in_body
+    )
+    rows[:, MOMENTUM, 2 * STATE : 2 * STATE + 6] -= R_lab_from_body @ turned
+    noise = scale @ link.noise @ scale.transpose(0, 2, 1)
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(noise)) @ scale @ rows)
+
+
+def add_measured(
+    record: BearingRecord,
+    states: States,
+    lab: LabConstants,
+    values: Floats,
+    to: tuple[Floats, Floats, Floats],
+) -> float:
+    """Add the attitudes (N), and what is known of the first random torque; return their chi-square.
+
+    A measured attitude is R exp(bias) exp(noise). `to` are the blocks that are added to: diagonal (N, 9, 9), border
+    (N, 9, P + 1) and corner (P + 1, P + 1); the last column is the gradient.
+    """
+    diagonal, border, corner = to
+    weight = np.linalg.inv(record.noise_rad2)
+    torque_weight = lab.torque_rms_nm**-2.0
+    off = measured_minus(record.lab_from_body, states.rotation, values[BIAS])
+    pull = np.einsum("nij,nj->ni", weight, off)
+    diagonal[:, :3, :3] += weight
+    border[:, :3, BIAS] += weight
+    border[:, :3, -1] -= pull
+    corner[BIAS, BIAS] += weight.sum(axis=0)
+    corner[BIAS, -1] -= pull.sum(axis=0)
+    corner[-1, BIAS] -= pull.sum(axis=0)
+    diagonal[0, 6:, 6:] += np.diag(torque_weight)
+    border[0, 6:, -1] += torque_weight * states.torque[:, 0]
+    return float(np.sum(off * pull) + torque_weight @ states.torque[:, 0] ** 2)
+
+
+def measured_minus(measured: Rotation, lab_from_body: Rotation, bias_rad: Floats) -> Floats:
+    """(N, 3) rotation vectors of attitudes measured minus those of the states with the tracker's bias."""
+    return np.asarray(
+        ((lab_from_body * Rotation.from_rotvec(bias_rad)).inv() * measured).as_rotvec()
+    )
+
+
+def lower_band(diagonal: Floats, beside: Floats) -> Floats:
+    """(18, 9 N) lower band of a normal matrix from its diagonal blocks (N, 9, 9) and those right of them."""
+    band = np.zeros((BANDS, STATE * len(diagonal)))
+    for i in range(STATE):
+        for j in range(STATE):
+            if i >= j:
+                band[i - j, j::STATE] = diagonal[:, i, j]
+            band[STATE + i - j, j:-STATE:STATE] = beside[:, j, i]
+    return band
+
+
+# Mass properties in flight: an extended Kalman filter of state and parameters, one attitude after
+# another.
+
+
+START = 20  # attitudes for the batch that begins the filter
+RATE_SIGMA_RAD_S = 0.01  # of the rate by the difference of the attitudes before and after
+
+
+def filter_mass(record: BearingRecord, lab: LabConstants, prior: Prior) -> Iterator[MassEstimate]:
+    """Yield the estimate after each attitude from number START + 2 on; its misfit is that of the innovations so far.
+
+    The parameters begin with the batch estimate from the first START attitudes, the state with the next three alone.
+    """
+    least = START + MIN_ATTITUDES
+    if len(record.t_s) < least:
+        raise ImageError(
+            f"mass properties: {len(record.t_s)} attitudes; allowed for a filter: {least} or more"
+        )
+    begun = estimate_mass([cut(record, slice(0, START))], lab, prior)
+    rest = cut(record, slice(START, None))
+    yield from filter_from(begun, rest, lab, prior)
+
+
+def cut(record: BearingRecord, which: slice) -> BearingRecord:
+    """Some of the attitudes."""
+    return replace(
+        record,
+        t_s=record.t_s[which],
+        lab_from_body=record.lab_from_body[which],
+        covariance_rad2=record.covariance_rad2[which],
+        systematic_rad2=None if record.systematic_rad2 is None else record.systematic_rad2[which],
+    )
+
+
+def filter_from(
+    begun: MassEstimate, record: BearingRecord, lab: LabConstants, prior: Prior
+) -> Iterator[MassEstimate]:
+    """Yield the estimate after each attitude but the first two, from earlier parameters and their covariance."""
+    size = len(begun.values)
+    values = begun.values
+    states = first_states(record, lab, values).take(slice(1, 2))
+    covariance = first_covariance(begun, record, lab)
+    at_bias = slice(STATE + BIAS.start, STATE + BIAS.stop)
+    chi2 = 0.0
+    for n in range(2, len(record.t_s)):
+        link = transition(record, lab, n - 1, states, values, prior)
+        F = np.eye(STATE + size)
+        F[:STATE] = np.hstack([link.by_state[0], link.by_parameter[0]])
+        covariance = F @ covariance @ F.T
+        covariance[:STATE, :STATE] += link.noise[0]
+        off = measured_minus(record.lab_from_body[n], link.after.rotation, values[BIAS])[0]
+        seen = covariance[:3] + covariance[at_bias]
+        innovation = seen[:, :3] + seen[:, at_bias] + record.covariance_rad2[n]
+        gain = np.linalg.solve(innovation, seen).T
+        chi2 += float(off @ np.linalg.solve(innovation, off))
+        change = gain @ off
+        covariance = joseph(covariance, gain, record.covariance_rad2[n])
+        states = link.after.moved(change[:STATE, None])
+        values = values + change[STATE:]
+        yield MassEstimate(values, covariance[STATE:, STATE:], chi2 / (3 * (n - 1)))
+
+
+def first_covariance(begun: MassEstimate, record: BearingRecord, lab: LabConstants) -> Floats:
+    """(9 + P, 9 + P) at the second attitude. H = R (J w + A (1 + e) h): its errors are those of rate and parameters."""
+    values = begun.values
+    P = begun.covariance
+    one = cut(record, slice(0, MIN_ATTITUDES))
+    step = begun.sigma
+    momenta = [
+        first_states(one, lab, each).momentum[:, 1] for each in (values, *(values + np.diag(step)))
+    ]
+    slope = np.zeros((STATE, len(values)))
+    slope[3:6] = ((np.array(momenta[1:]) - momenta[0]) / step[:, None]).T
+    own = np.zeros((STATE, STATE))
+    own[:3, :3] = record.covariance_rad2[1]
+    R_inertia = record.lab_from_body[1].as_matrix() @ begun.inertia_kg_m2
+    own[3:6, 3:6] = RATE_SIGMA_RAD_S**2 * R_inertia @ R_inertia.T
+    own[6:, 6:] = np.diag(lab.torque_rms_nm**2)
+    return np.block([[own + slope @ P @ slope.T, slope @ P], [P @ slope.T, P]])
+
+
+def joseph(covariance: Floats, gain: Floats, noise: Floats) -> Floats:
+    """The covariance after an attitude, (I - K H) P (I - K H)^T + K S K^T, which stays positive."""
+    kept = np.eye(len(covariance))
+    kept[:, :3] -= gain
+    kept[:, STATE + BIAS.start : STATE + BIAS.stop] -= gain
+    return np.asarray(kept @ covariance @ kept.T + gain @ noise @ gain.T)

@@ -1,1 +1,0 @@
-"""Mass properties of a vehicle on an air bearing from star-tracker attitudes: inertia tensor and center of mass."""

@@ -1,0 +1,329 @@
+"""Bayes factor of a candidate attitude under an LED dome, from matched and missing LEDs.
+
+`evaluate` projects the LEDs at a candidate attitude, matches them to the detections, refines the attitude, and returns
+log10 of the Bayes factor ("dex") of this attitude over detections at random positions; see `_evidence` for its terms.
+Unlike stars, LEDs are near: the projection includes the lever from the bearing to the camera's entrance pupil. If the
+focal length is uncertain, it is refined with the attitude: `focal_ratio` is the true one over the assumed one.
+"""
+
+from __future__ import annotations
+
+from math import exp, log, log10, pi, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.core import least_squares, vectors
+from estimator.core.checks import Floats
+from estimator.core.jit import jit
+from estimator.core.vectors import Vector
+from estimator.identification.chance import (
+    GATE_SIGMA,
+    MIN_EVIDENCE_MATCHES,
+    counts_dex,
+    middle,
+    separation,
+)
+from estimator.identification.led_index import DomeIndex
+
+# part of the lights of any brightness: blends, reflections; per unit of logarithm
+STRAY = 0.01
+STRAY_DENSITY = 0.1
+
+
+class LedDetections(NamedTuple):
+    """The detections of one frame, in camera axes.
+
+    Attributes
+    ----------
+    ray
+        (N, 3) unit
+    tangent
+        (N, 2) x / z and y / z
+    sigma
+        (N,) total standard deviation of each tangent
+    direction
+        (N, 3) unit vector from the bearing to the point where the ray meets the sphere of the
+        median LED radius
+    direction_per_m
+        (N, 3) derivative of `direction` with respect to that radius, 1 / m
+    log_flux
+        (N,) logarithm of the flux per second of exposure; of length 0 where brightness is not
+        used
+    light_density
+        (N,) density of that brightness, per unit of the logarithm, if the light may be any LED
+        or none
+    focal_uncertainty
+        Greatest relative error of the focal length; 0 for a calibrated camera
+    """
+
+    ray: Floats
+    tangent: Floats
+    sigma: Floats
+    direction: Floats
+    direction_per_m: Floats
+    log_flux: Floats
+    light_density: Floats
+    focal_uncertainty: float = 0.0
+
+
+class LedHypothesis(NamedTuple):
+    """A hypothesis: matched rows of detections and LEDs (K,), R_cam_from_lab (3, 3), log10 of the Bayes factor."""
+
+    observed: NDArray[np.int64]
+    star: NDArray[np.int64]
+    R_cam_from_lab: Floats
+    dex: float
+
+
+@jit
+def light_dex(detections: LedDetections, dome: DomeIndex, n: int, star: int) -> float:
+    """log10 of the ratio of a light's brightness density as that LED to its density as any LED; 0 if it is not used."""
+    if len(detections.log_flux) == 0 or len(dome.log_flux) == 0:
+        return 0.0
+    z = (detections.log_flux[n] - dome.log_flux[star]) / dome.flux_sigma
+    as_led = exp(-z * z / 2) / (sqrt(2 * pi) * dome.flux_sigma)
+    return log10(((1 - STRAY) * as_led + STRAY * STRAY_DENSITY) / detections.light_density[n])
+
+
+@jit
+def same_identification(first: LedHypothesis, second: LedHypothesis) -> bool:
+    """Whether two hypotheses agree: more than half of the matches of the smaller one are also in the other."""
+    common = 0
+    for n in range(len(first.observed)):
+        for m in range(len(second.observed)):
+            common += first.observed[n] == second.observed[m] and first.star[n] == second.star[m]
+    return 2 * common > min(len(first.observed), len(second.observed))
+
+
+@jit
+def evaluate(
+    detections: LedDetections,
+    dome: DomeIndex,
+    R_cam_from_lab: Floats,
+    center: int,
+    a: int,
+    b: int,
+    focal_ratio: float = 1.0,
+) -> LedHypothesis:
+    """Evaluate the attitude of a pair of detections a, b: match, fit and match again (twice), compute the evidence.
+
+    R_cam_from_lab is changed in place by the fit. The evidence is -inf if fewer than MIN_EVIDENCE_MATCHES LEDs match,
+    or if the focal length is out of its range.
+
+    Parameters
+    ----------
+    center
+        Row of the LED whose neighborhood is matched
+    focal_ratio
+        Of the pair, if it is uncertain
+    """
+    # Error of the pair's attitude, in units of a detection's variance: 1/2 from its midpoint (beside the detection's
+    # own 1), and 2 / separation^2 per squared distance from the midpoint from its direction; a focal length from the
+    # pair adds the same along that distance.
+    midpoint = middle(detections.tangent, a, b)
+    direction_variance = 2 / separation(detections.tangent, a, b) ** 2
+    observed, star, missing = _match(
+        detections, dome, R_cam_from_lab, focal_ratio, center, midpoint, 1.5, direction_variance
+    )
+    dex = -np.inf
+    for _ in range(2):
+        if len(observed) < MIN_EVIDENCE_MATCHES:
+            return LedHypothesis(observed, star, R_cam_from_lab, -np.inf)
+        info, focal_ratio = _fit(detections, dome, R_cam_from_lab, focal_ratio, observed, star)
+        if abs(focal_ratio - 1) > 1.2 * detections.focal_uncertainty + 1e-12:
+            return LedHypothesis(observed, star, R_cam_from_lab, -np.inf)
+        observed, star, missing = _match(
+            detections, dome, R_cam_from_lab, focal_ratio, center, midpoint, 1.0, 0.0
+        )
+        dex = _evidence(
+            detections, dome, R_cam_from_lab, focal_ratio, observed, star, missing, info
+        )
+    return LedHypothesis(
+        observed, star, R_cam_from_lab, dex if len(observed) >= MIN_EVIDENCE_MATCHES else -np.inf
+    )
+
+
+@jit
+def _vector_from_pupil(dome: DomeIndex, R_cam_from_lab: Floats, star: int) -> Vector:
+    """Vector from the camera's entrance pupil to an LED, in camera axes, m."""
+    x, y, z = vectors.rotate(R_cam_from_lab, vectors.row(dome.position_m, star))
+    return x - dome.pupil_m[0], y - dome.pupil_m[1], z - dome.pupil_m[2]
+
+
+@jit
+def _match(
+    detections: LedDetections,
+    dome: DomeIndex,
+    R_cam_from_lab: Floats,
+    focal_ratio: float,
+    center: int,
+    midpoint: tuple[float, float],
+    base_variance: float,
+    direction_variance: float,
+) -> tuple[NDArray, NDArray, int]:
+    """Match each LED near `center` to its nearest detection within the gate, one LED for each detection.
+
+    The gate is GATE_SIGMA; its variance is base_variance + direction_variance * (distance from `midpoint`)^2, times
+    the detection's. Returns rows of detections, rows of LEDs, and the number of missing LEDs: predicted well inside
+    the field, or rivals for a detection that a nearer LED keeps.
+    """
+    left, right, top, bottom = dome.field_tan
+    first = dome.pairs.first
+    count = 0
+    missing = 0
+    total = len(detections.ray)
+    observed = np.empty(total, np.int64)
+    star = np.empty(total, np.int64)
+    distances2 = np.empty(total)
+    # The LED `center` itself, then its neighbors in the pair index: all LEDs that can share a field with it.
+    for entry in range(first[center] - 1, first[center + 1]):
+        s = center if entry < first[center] else dome.pairs.neighbor[entry]
+        qx, qy, qz = _vector_from_pupil(dome, R_cam_from_lab, s)
+        qx = focal_ratio * qx
+        qy = focal_ratio * qy
+        if not (
+            qz > 0
+            and 1.1 * left * qz < qx < 1.1 * right * qz
+            and 1.1 * top * qz < qy < 1.1 * bottom * qz
+        ):
+            continue
+        x = qx / qz
+        y = qy / qz
+        variance = base_variance + direction_variance * (
+            (x - midpoint[0]) ** 2 + (y - midpoint[1]) ** 2
+        )
+        # in units of the detection's variance
+        best = -1
+        distance2 = GATE_SIGMA**2 * variance
+        for n in range(total):
+            residual2 = (detections.tangent[n, 0] - x) ** 2 + (detections.tangent[n, 1] - y) ** 2
+            if residual2 < distance2 * detections.sigma[n] ** 2:
+                best = n
+                distance2 = residual2 / detections.sigma[n] ** 2
+        if best < 0:
+            missing += left < x < right and top < y < bottom
+            continue
+        slot = 0
+        while slot < count and observed[slot] != best:
+            slot += 1
+        if slot == count:
+            observed[count] = best
+            star[count] = s
+            distances2[count] = distance2
+            count += 1
+            continue
+        missing += 1  # two LEDs match one detection: the farther one is missing
+        if distance2 < distances2[slot]:
+            star[slot] = s
+            distances2[slot] = distance2
+    return observed[:count], star[:count], missing
+
+
+@jit
+def _fit(
+    detections: LedDetections,
+    dome: DomeIndex,
+    R_cam_from_lab: Floats,
+    focal_ratio: float,
+    observed: NDArray,
+    star: NDArray,
+) -> tuple[Floats, float]:
+    """One Gauss-Newton step of R_cam_from_lab about the bearing, in place, with exact near-field projection.
+
+    With b = R P, q = b - r (r the pupil) and R <- exp([w]) R, a tangent changes by d . (w x b) = w . (b x d), d its
+    gradient with respect to q. An uncertain focal length multiplies all tangents: its logarithm is the fourth unknown.
+    Returns the Fisher information of w, in camera axes, and of that logarithm, (3, 3) or (4, 4), and the focal ratio.
+    """
+    count = 4 if detections.focal_uncertainty > 0 else 3
+    info = np.zeros((count, count))
+    factor = np.empty((count, count))
+    step = np.zeros(count)
+    slopes = np.empty(4)
+    for k in range(len(observed)):
+        q = _vector_from_pupil(dome, R_cam_from_lab, star[k])
+        bx = q[0] + dome.pupil_m[0]
+        by = q[1] + dome.pupil_m[1]
+        bz = q[2] + dome.pupil_m[2]
+        weight = 1 / detections.sigma[observed[k]] ** 2
+        for axis in range(2):
+            by_component = focal_ratio / q[2]
+            by_depth = -focal_ratio * q[axis] / q[2] ** 2
+            slopes[0] = by * by_depth - axis * bz * by_component
+            slopes[1] = (1 - axis) * bz * by_component - bx * by_depth
+            slopes[2] = axis * bx * by_component - (1 - axis) * by * by_component
+            slopes[3] = focal_ratio * q[axis] / q[2]
+            residual = detections.tangent[observed[k], axis] - slopes[3]
+            for i in range(count):
+                step[i] += weight * slopes[i] * residual
+                for j in range(count):
+                    info[i, j] += weight * slopes[i] * slopes[j]
+    _factorize(info, factor)
+    least_squares.cholesky_solve(factor, step)
+    vectors.rotate_in_place(step, R_cam_from_lab)
+    return info, focal_ratio * exp(step[3]) if count == 4 else focal_ratio
+
+
+@jit
+def _factorize(info: Floats, factor: Floats) -> float:
+    """Cholesky factor of a square matrix, in the lower triangle of `factor`; returns the root of its determinant.
+
+    The root is 0 for a singular matrix.
+    """
+    for i in range(len(info)):
+        for j in range(i + 1):
+            factor[i, j] = info[i, j]
+    if not least_squares.cholesky(factor):
+        return 0.0
+    root = 1.0
+    for i in range(len(info)):
+        root *= factor[i, i]
+    return root
+
+
+@jit
+def _evidence(
+    detections: LedDetections,
+    dome: DomeIndex,
+    R_cam_from_lab: Floats,
+    focal_ratio: float,
+    observed: NDArray,
+    star: NDArray,
+    missing: int,
+    info: Floats,
+) -> float:
+    """log10 of the Bayes factor of this attitude over detections at random positions.
+
+    Each match contributes N(residual) / rho, rho the density of detections on the sensor, and the evidence of its
+    brightness (`light_dex`). The counts of matched (m)
+    and missing (k) LEDs contribute B(m + 1, k + 1), a uniform prior on the fraction of dead LEDs. The attitude
+    contributes (2 pi)^1.5 / sqrt(det info) over the prior volume (Laplace's approximation), an uncertain focal length
+    the root of another 2 pi over the width of its range. By Markov's inequality, random detections reach 10^x for any
+    attitude in at most one of 10^x frames.
+
+    All patch boards have the same pattern, so that further matches on one board are not independent: the second LED of
+    a board counts at most a factor of 10 (it fixes the orientation of the lattice), each further one at most a factor
+    of 2 (it is lit or not).
+    """
+    density = len(detections.ray) / dome.field_area
+    group = dome.pairs.group
+    root_det = _factorize(info, np.empty_like(info))
+    total = len(info) / 2 * log10(2 * pi) - log10(max(root_det, 1e-150)) - log10(dome.prior_volume)
+    if detections.focal_uncertainty > 0:
+        total -= log10(2 * detections.focal_uncertainty)
+    for k in range(len(observed)):
+        qx, qy, qz = _vector_from_pupil(dome, R_cam_from_lab, star[k])
+        variance = detections.sigma[observed[k]] ** 2
+        x = detections.tangent[observed[k], 0]
+        y = detections.tangent[observed[k], 1]
+        residual2 = (x - focal_ratio * qx / qz) ** 2 + (y - focal_ratio * qy / qz) ** 2
+        match_dex = -residual2 / variance / 2 / log(10.0) - log10(2 * pi * variance * density)
+        match_dex += light_dex(detections, dome, observed[k], star[k])
+        same_board = 0
+        for m in range(k):
+            same_board += group[star[m]] == group[star[k]]
+        if same_board > 0:
+            match_dex = min(match_dex, 1.0 if same_board == 1 else 0.3)
+        total += match_dex
+    return total + counts_dex(len(observed), missing)

@@ -1,0 +1,198 @@
+"""Index of a dome's LEDs for identification: pairs by the angle between them, and LEDs by direction.
+
+Angles are measured about the bearing center, from which they do not change with the attitude, and are scaled to those
+that LEDs at the median radius would have; the search allows for the error of that scaling. Pairs are sorted by angle,
+with a k-vector to find a range of angles. Directions are binned in a square grid around the dome's middle, so that the
+question "is an LED near this direction" reads a few cells.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.dome_map import LedMap, Lever
+from estimator.catalog.pair_index import PairIndex, build, k_vector
+from estimator.core.camera import Camera
+from estimator.core.checks import Floats
+
+# Fraction of the field in which an unmatched source counts as missing; the border may cut it off.
+INNER_FRACTION = 0.95
+
+
+class DirectionGrid(NamedTuple):
+    """LED directions in a square grid of side * side cells over their x and y components.
+
+    Attributes
+    ----------
+    R_grid_from_lab
+        (3, 3) rotates the mean direction of the LEDs to +z
+    cell, side
+        Width of a cell, and number of cells along a side
+    first
+        LEDs first[c] to first[c + 1] are in cell c
+    direction
+        (N, 3) unit vectors of the LEDs in that order, in grid axes
+    """
+
+    R_grid_from_lab: Floats
+    cell: float
+    side: int
+    first: NDArray[np.int64]
+    direction: Floats
+
+
+class DomeIndex(NamedTuple):
+    """The dome map prepared for the search. A named tuple, because numba can compile functions that take one.
+
+    Attributes
+    ----------
+    pairs
+        LED pairs by their angle about the bearing, scaled to the median radius
+        (`scale_pair_angles`)
+    grid
+        The LEDs by direction
+    position_m
+        (L, 3) LEDs in the lab frame
+    radius_m
+        (L,) from the bearing
+    median_radius_m
+        Their median
+    pupil_m
+        (3,) camera's entrance pupil from the bearing, in camera axes
+    scaling_error_rad
+        Greatest error of a pair angle that results from the scaling to the median radius
+    field_tan
+        (4,) tangents left, right, top, bottom inside which an LED is fully visible
+    field_area
+        Of the sensor, in tangents squared
+    prior_volume
+        Of attitudes that see the dome: steradians of boresight times 2 pi of roll
+    led_sigma, lever_sigma
+        Standard deviations of LED positions and of the pupil, over their least distance
+    log_flux
+        (L,) logarithm of each LED's flux per second; of length 0 if all are alike
+    flux_sigma
+        Standard deviation of the logarithm of a measured flux
+    """
+
+    pairs: PairIndex
+    grid: DirectionGrid
+    position_m: Floats
+    radius_m: Floats
+    median_radius_m: float
+    pupil_m: Floats
+    scaling_error_rad: float
+    field_tan: Floats
+    field_area: float
+    prior_volume: float
+    led_sigma: float
+    lever_sigma: float
+    log_flux: Floats
+    flux_sigma: float
+
+
+def build_dome_index(leds: LedMap, lever: Lever, camera: Camera) -> DomeIndex:
+    """Index of a dome: every pair of LEDs that one field of view can hold.
+
+    A ray at angle alpha from the boresight meets radius R at an angle theta about the bearing, with
+    R sin(alpha - theta) = M sin(alpha), M the length of the lever. For small angles a pair angle at radius R therefore
+    scales to the median radius R0 by the factor ((R0 - M) / R0) / ((R - M) / R). `scaling_error_rad` bounds the
+    neglected terms: d(theta)/dR = M alpha / R^2 times the difference of the two radii, a relative term alpha^2 in wide
+    fields, and a second-order term. Raises ImageError if there are no pairs.
+    """
+    radius = np.linalg.norm(leds.position_m, axis=1)
+    median_m = float(np.median(radius))
+    lever_m = float(np.linalg.norm(lever.camera_body_m))
+    rays = corner_rays(camera)
+    inner, half_size = inner_field(rays)
+    alpha = float(np.arccos(rays[:, 2].min()))
+    # At a given angle from the boresight, the LED of the greatest radius has the greatest angle about the bearing.
+    theta = alpha - np.arcsin(min(lever_m / radius.max() * np.sin(alpha), 1.0))
+    index = build(leds.position_m / radius[:, None], min(2.1 * theta, np.pi), leds.board)
+    scale = (median_m - lever_m) / median_m * radius / (radius - lever_m)
+    first, second = index.pair.T
+    max_offset_m = np.abs(radius - median_m).max()
+    difference_m = np.abs(radius[first] - radius[second]).max()
+    max_difference_m = difference_m + alpha**2 * max_offset_m + max_offset_m**2 / median_m
+    scaling_error = 1.5 * max_difference_m * lever_m * alpha / radius.min() ** 2
+    return DomeIndex(
+        scale_pair_angles(index, scale),
+        build_grid(index.vectors),
+        np.ascontiguousarray(leds.position_m, dtype=float),
+        radius,
+        median_m,
+        lever.cam_from_body.apply(lever.camera_body_m),
+        float(scaling_error),
+        inner,
+        float(4 * half_size[0] * half_size[1]),
+        (2 * np.pi) ** 2 * cap_height(leds.position_m / radius[:, None], theta),
+        float(leds.sigma_m / (radius.min() - lever_m)),
+        float(lever.sigma_m / (radius.min() - lever_m)),
+        np.zeros(0) if leds.flux_s is None else np.log(leds.flux_s),
+        float(leds.flux_sigma),
+    )
+
+
+def corner_rays(camera: Camera) -> Floats:
+    """(4, 3) unit rays of the sensor's corners, in camera axes."""
+    return camera.rays(
+        np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * [camera.width_px, camera.height_px] - 0.5
+    )
+
+
+def inner_field(corners: Floats) -> tuple[Floats, Floats]:
+    """The inner field of a sensor with (4, 3) corner rays.
+
+    Returns its (4,) tangents left, right, top, bottom, INNER_FRACTION times the full field, and (2,) the half-size of
+    the full field.
+    """
+    tangent = corners[:, :2] / corners[:, 2:]
+    mean = (tangent.max(axis=0) + tangent.min(axis=0)) / 2
+    half_size = np.ptp(tangent, axis=0) / 2
+    return np.array(
+        [mean - INNER_FRACTION * half_size, mean + INNER_FRACTION * half_size]
+    ).T.ravel(), half_size
+
+
+def build_grid(directions: Floats) -> DirectionGrid:
+    """Grid of (N, 3) unit vectors with one vector per cell on average."""
+    mean = directions.mean(axis=0)
+    R_grid_from_lab = Rotation.align_vectors([[0.0, 0.0, 1.0]], [mean])[0].as_matrix()
+    in_grid = directions @ R_grid_from_lab.T
+    flat = in_grid[:, :2]
+    half_size = np.abs(flat).max() * 1.001
+    side = max(int(np.sqrt(len(flat))), 1)
+    cell = 2 * half_size / side
+    column, row = ((flat + half_size) / cell).astype(np.int64).T
+    number = row * side + column
+    order = np.argsort(number, kind="stable")
+    first = np.searchsorted(number[order], np.arange(side * side + 1))
+    return DirectionGrid(
+        R_grid_from_lab, float(cell), side, first, np.ascontiguousarray(in_grid[order])
+    )
+
+
+def scale_pair_angles(index: PairIndex, scale: Floats) -> PairIndex:
+    """The index with each pair angle multiplied by the mean scale (N,) of its LEDs, sorted again by angle."""
+    first, second = index.pair.T
+    angle = index.angle_rad * (scale[first] + scale[second]) / 2
+    order = np.argsort(angle, kind="stable")
+    kvector, slope, offset = k_vector(angle[order])
+    return index._replace(
+        pair=np.ascontiguousarray(index.pair[order]),
+        angle_rad=angle[order],
+        kvector=kvector,
+        slope_rad=slope,
+        offset_rad=offset,
+    )
+
+
+def cap_height(directions: Floats, margin_rad: float) -> float:
+    """1 - cos(half-angle) of the cap about the mean of (N, 3) directions that holds all of them, plus a margin."""
+    mean = directions.mean(axis=0)
+    nearest = (directions @ mean).min() / max(np.linalg.norm(mean), 1e-9)
+    return float(1 - np.cos(min(np.arccos(np.clip(nearest, -1, 1)) + margin_rad, np.pi)))

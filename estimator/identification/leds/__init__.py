@@ -1,1 +1,0 @@
-"""Identification of LEDs under a dome: index of pairs, search, and evidence."""

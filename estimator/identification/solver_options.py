@@ -1,0 +1,77 @@
+"""Optional parameters common to all identification methods.
+
+The published methods differ in what they need: a magnitude, a prior direction, a tolerance. All are called with the
+same keywords, of which each method uses its own, so that one can be put in the place of another.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimator.core.checks import Floats, ImageError
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """Keyword arguments of an identifier. A method ignores those that it does not use.
+
+    Attributes
+    ----------
+    stretch
+        Relative tolerance of an angle: stretch * angle is added to its tolerance
+    focal_unknown
+        The stretch is one unknown focal length, which each pattern measures; see
+        `require_known_focal`
+    max_triangles, max_checks
+        Observed patterns tried, and angles compared, before giving up; the latter bounds the
+        time, at a few to tens of nanoseconds each
+    base_stars
+        Number of brightest stars from which patterns are formed
+    missed_dex
+        Penalty for each catalog star that is predicted in the field and not observed, in powers
+        of ten; 0 if the detection limit is unknown, greater if all sources are known to be on
+    field_tan
+        (left, right, top, bottom) tangents of the field's edges, for missed_dex
+    magnitude
+        (N,) of the observed stars, on the index's scale; None if unknown
+    epsilon_mag
+        Standard deviation of a magnitude
+    epsilon_sep_rad
+        Standard deviation of an angle between two stars, for methods that use it
+    boresight_ref
+        (3,) unit vector, prior direction of the optical axis
+    within_rad
+        Its greatest error
+    """
+
+    stretch: float = 0.0
+    focal_unknown: bool = False
+    max_triangles: int = 3000
+    max_checks: int = 20_000_000
+    base_stars: int = 20
+    missed_dex: float = 0.0
+    field_tan: tuple[float, float, float, float] = (-1.0, 1.0, -1.0, 1.0)
+    magnitude: Floats | None = None
+    epsilon_mag: float = np.inf
+    epsilon_sep_rad: float | None = None
+    boresight_ref: Floats | None = None
+    within_rad: float = np.pi
+
+    def require_known_focal(self, name: str) -> None:
+        """Raise ImageError if the focal length is uncertain: method `name` needs calibrated angles."""
+        if self.focal_unknown:
+            raise ImageError(
+                f"{name}: the focal length is uncertain; allowed: a calibrated camera, or pyramid"
+            )
+
+    def magnitudes(self, count: int) -> Floats:
+        """(N,) magnitudes of the observed stars, NaN if unknown. Raises ImageError for an array of another shape."""
+        if self.magnitude is None:
+            return np.full(count, np.nan)
+        if np.shape(self.magnitude) != (count,):
+            raise ImageError(
+                f"magnitudes {np.shape(self.magnitude)} of {count} observed stars; allowed: one for each"
+            )
+        return np.ascontiguousarray(self.magnitude, dtype=float)

@@ -1,0 +1,195 @@
+"""Lost-in-space star identification by quads of detections: for a camera whose focal length is uncertain.
+
+The code of four detections (`catalog.quad_index`) hardly depends on the focal length, so that the few catalog quads
+with the same code are the only candidates, however uncertain it is. The two detections farthest apart and their stars
+determine the attitude and the focal length. A quick check and the Bayes factor then decide as in `search`. Quads are
+tried in the order of brightness: first those of the four brightest detections, then all with the fifth, and so on.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimator.catalog import quad_index
+from estimator.catalog.quad_index import SIDE, QuadIndex
+from estimator.catalog.sky_index import SkyIndex
+from estimator.core import vectors
+from estimator.core.checks import Floats, Ints
+from estimator.core.jit import jit
+from estimator.identification import star_search
+from estimator.identification.chance import GATE_SIGMA
+from estimator.identification.star_detections import Detections, changed, ray
+from estimator.identification.star_evidence import Hypothesis, Solution, evaluate, no_hypothesis
+
+COMBINED = 24  # number of brightest detections that are combined to quads
+
+
+@jit
+def identify(
+    detections: Detections,
+    quads: QuadIndex,
+    stars: SkyIndex,
+    max_detections: int,
+    max_checks: int,
+    calibrated: bool,
+) -> Solution:
+    """Identify the detections and solve attitude and focal length; an empty solution below DECISIVE_DEX.
+
+    The candidates are tested on the `max_detections` brightest; the attitude is then fitted to all detections.
+
+    Parameters
+    ----------
+    max_checks
+        Bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
+    calibrated
+        Whether the focal length should be right (`search.fit_to_all`)
+    """
+    count = min(max_detections, len(detections.sigma))
+    searched = changed(detections, count, 1.0, detections.focal_uncertainty)
+    best = _search(searched, quads, stars, max_checks)
+    # The last argument matters for a calibrated camera only. A literal False would be compiled as another type.
+    return star_search.fit_to_all(
+        detections, stars, best, star_search.DECISIVE_DEX, calibrated, not calibrated
+    )
+
+
+@jit
+def _search(detections: Detections, quads: QuadIndex, sky: SkyIndex, max_checks: int) -> Hypothesis:
+    """The first hypothesis of the quads with DECISIVE_DEX, else the empty one."""
+    quad = np.empty(4, np.int64)
+    checks = np.zeros(1, np.int64)
+    for d in range(3, min(len(detections.sigma), COMBINED)):
+        for c in range(2, d):
+            for b in range(1, c):
+                for a in range(b):
+                    quad[0] = a
+                    quad[1] = b
+                    quad[2] = c
+                    quad[3] = d
+                    candidate = _test_quad(detections, quads, sky, quad, checks)
+                    if candidate.dex >= star_search.DECISIVE_DEX:
+                        return candidate
+                    if checks[0] > max_checks:
+                        return no_hypothesis()
+    return no_hypothesis()
+
+
+@jit
+def _test_quad(
+    detections: Detections, quads: QuadIndex, sky: SkyIndex, quad: Ints, checks: Ints
+) -> Hypothesis:
+    """Test four detections against every catalog quad of the same code; the first with DECISIVE_DEX.
+
+    Parameters
+    ----------
+    checks
+        (1,) effort so far, increased in place
+    """
+    _longest_first(detections.tangent, quad)
+    a = quad[0]
+    b = quad[1]
+    ray_a = ray(detections.tangent, a, 1.0)
+    ray_b = ray(detections.tangent, b, 1.0)
+    length = vectors.chord(ray_a, ray_b)
+    code = np.empty(4)
+    frame = np.empty((3, 3))
+    vectors.pair_frame(ray_a, ray_b, frame)
+    code[0], code[1] = quad_index.in_frame(frame, ray(detections.tangent, quad[2], 1.0), length)
+    code[2], code[3] = quad_index.in_frame(frame, ray(detections.tangent, quad[3], 1.0), length)
+    quad_index.arrange(code, quad)
+    gate = _code_gate(detections, quad, length)
+    low = np.empty(4, np.int64)
+    high = np.empty(4, np.int64)
+    for axis in range(4):
+        low[axis] = quad_index.code_cell(code[axis] - gate, axis)
+        high[axis] = quad_index.code_cell(code[axis] + gate, axis)
+    for i in range(low[0], high[0] + 1):
+        for j in range(low[1], high[1] + 1):
+            for k in range(low[2], high[2] + 1):
+                # The cells along the last axis are contiguous: one loop covers them.
+                row = ((i * SIDE + j) * SIDE + k) * SIDE
+                for q in range(quads.first[row + low[3]], quads.first[row + high[3] + 1]):
+                    checks[0] += 1
+                    if not _alike(quads.code, q, code, gate):
+                        continue
+                    candidate = _test_match(detections, sky, quad, quads.star[q], length, checks)
+                    if candidate.dex >= star_search.DECISIVE_DEX:
+                        return candidate
+    return no_hypothesis()
+
+
+@jit
+def _alike(codes: Floats, q: int, code: Floats, gate: float) -> bool:
+    """Whether no coordinate of the code in row q differs by more than the gate."""
+    alike = True
+    for axis in range(4):  # without a temporary array, which would cost more than the comparison
+        alike = alike and abs(codes[q, axis] - code[axis]) <= gate
+    return alike
+
+
+@jit
+def _longest_first(tangent: Floats, quad: Ints) -> None:
+    """Reorder four detections in place, so that the first two are the ones farthest apart."""
+    longest = -1.0
+    first = 0
+    second = 1
+    for m in range(4):
+        for k in range(m):
+            length = vectors.chord(ray(tangent, quad[k], 1.0), ray(tangent, quad[m], 1.0))
+            if length > longest:
+                longest = length
+                first = k
+                second = m
+    quad[0], quad[first] = quad[first], quad[0]
+    second = first if second == 0 else second
+    quad[1], quad[second] = quad[second], quad[1]
+
+
+@jit
+def _code_gate(detections: Detections, quad: Ints, length: float) -> float:
+    """Greatest difference of the codes of a quad and of its image.
+
+    The errors of C or D and of the two ends are each sigma / L. At the angle a from the boresight a focal length that
+    is wrong by the fraction u changes small angles by (1 - u) (1 + 2 u sin^2 a) along the radius and by
+    (1 - u) (1 + u sin^2 a) across it: ratios differ by up to 2 u sin^2 a of the outermost star.
+    """
+    sigma = 0.0
+    r2 = 0.0
+    for n in quad:
+        sigma = max(sigma, detections.sigma[n])
+        r2 = max(r2, detections.tangent[n, 0] ** 2 + detections.tangent[n, 1] ** 2)
+    # Coordinates are at most one half along and across, so that half of this difference reaches them.
+    return GATE_SIGMA * sigma / length + detections.focal_uncertainty * r2 / (1 + r2)
+
+
+@jit
+def _test_match(
+    detections: Detections, sky: SkyIndex, quad: Ints, star: Ints, length: float, checks: Ints
+) -> Hypothesis:
+    """The hypothesis that four detections are four stars, if a quick check and the evidence confirm it."""
+    tangent = detections.tangent
+    a = quad[0]
+    b = quad[1]
+    star_a = vectors.row(sky.vectors, star[0])
+    star_b = vectors.row(sky.vectors, star[1])
+    ratio = star_search.fit_focal_ratio(tangent, a, b, length, vectors.chord(star_a, star_b))
+    if abs(ratio - 1) > detections.focal_uncertainty:
+        return no_hypothesis()
+    in_cam = np.empty((3, 3))
+    in_ref = np.empty((3, 3))
+    R_ref_from_cam = np.empty((3, 3))
+    vectors.pair_frame(ray(tangent, a, ratio), ray(tangent, b, ratio), in_cam)
+    vectors.pair_frame(star_a, star_b, in_ref)
+    vectors.multiply_transposed(in_ref, in_cam, R_ref_from_cam)
+    gates, order, required = star_search.trial(detections, a, b, 0, star_search.DECISIVE_DEX)
+    grid = sky.cell_first, sky.cell_star, sky.side
+    lookups, fits = star_search.quick_check(
+        tangent, sky.vectors, *grid, R_ref_from_cam, ratio, gates, order, required, len(gates)
+    )
+    checks[0] += 1 + lookups
+    if not fits:
+        return no_hypothesis()
+    checks[0] += star_search.EVALUATION_COST
+    return evaluate(
+        detections, sky, R_ref_from_cam.T.copy(), ratio, gates, star_search.DECISIVE_DEX
+    )

@@ -1,1 +1,0 @@
-"""Identification of stars: search for candidate attitudes and their Bayes factor."""

@@ -1,0 +1,83 @@
+"""Command `skysim dataset`."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from skysim.apps.cli.commands.study import (
+    EngineName,
+    Scheduler,
+    Workers,
+    create_engine,
+    start_workers,
+)
+from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed
+from skysim.apps.cli.terminal import print_error, print_json, trial_progress
+
+
+def dataset(
+    scene: SceneArg,
+    frames: Annotated[int, typer.Option(help="Number of frames.")],
+    out: Annotated[
+        str, typer.Option(metavar="URL", help="Output folder, or a URL such as s3://bucket/folder.")
+    ],
+    vary: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Variations: YAML with the study's keys set, trial, factors, hardware.",
+        ),
+    ] = None,
+    to: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--to", help="Format: webdataset, zarr, coco; repeatable. Default: webdataset and coco."
+        ),
+    ] = None,
+    shard_frames: Annotated[int, typer.Option(help="Frames of a shard.")] = 64,
+    seed: Seed = None,
+    set_: Overrides = None,
+    workers: Workers = None,
+    engine: EngineName = "pool",
+    scheduler: Scheduler = "",
+    json: Json = False,
+) -> None:
+    """Write labelled frames at random attitudes, for those who train and test detectors.
+
+    Stopped or killed, it goes on where it was when it is called again.
+    """
+    start_workers(engine)
+    from skysim.core.yaml_reader import parse_overrides
+    from skysim.experiments import dataset_run
+    from skysim.experiments.dataset_shards import Storage
+
+    Storage(out)  # refuses a wrong URL before the scene is read
+    formats = tuple(to or ("webdataset", "coco"))
+    made = dataset_run.load(
+        scene,
+        vary,
+        frames,
+        seed=seed,
+        overrides=parse_overrides(set_),
+        frames_per_shard=shard_frames,
+        formats=formats,
+    )
+    with (
+        closing(create_engine(engine, workers, scheduler)) as chosen,
+        trial_progress(f"dataset of {scene}", frames, "frames") as update,
+    ):
+        progress = dataset_run.run(made, out, chosen, update)
+    result = {"out": out, "frames": progress.done, "shards": made.shards, "failed": progress.failed}
+    if json:
+        print_json(result | {"rate_hz": progress.rate})
+    else:
+        print(f"{progress.done} of {frames} frames in {made.shards} shards: {out}")
+    if progress.failed:
+        print_error(
+            f"{progress.failed} frames are missing: their workers died; the same command tries them again"
+        )
+        raise typer.Exit(2)

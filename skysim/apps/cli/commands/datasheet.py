@@ -1,0 +1,142 @@
+"""Command `skysim datasheet`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from skysim.apps.cli.options import Json, OpenReport, Overrides, SceneArg, Seed, load
+from skysim.apps.cli.terminal import print_json, trial_progress
+from skysim.core.errors import InputError
+from skysim.results.report import print_table, print_wrapped
+from skysim.results.report_blocks import Column, Table
+
+if TYPE_CHECKING:
+    from skysim.experiments.datasheet.model_fit import Agreement
+
+
+def datasheet(
+    scene: SceneArg,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Smaller experiments; the intervals are wider.")
+    ] = False,
+    fields: Annotated[
+        int | None,
+        typer.Option(
+            min=2,
+            help="Number of fields (attitudes) of each experiment; more narrow the intervals.",
+        ),
+    ] = None,
+    seed: Seed = None,
+    set_: Overrides = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Number of processes; default: number of cores.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Output folder; default: out/NAME_datasheet.")
+    ] = None,
+    markdown: Annotated[
+        Path | None,
+        typer.Option(help="Also write a Markdown page, as docs/findings/datasheets/shefex2.md."),
+    ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            help="Also write a fast model of the errors to a folder: a module for NumPy, its constants in JSON."
+        ),
+    ] = None,
+    fmu: Annotated[
+        bool,
+        typer.Option(
+            "--fmu", help="With --model: also as a co-simulation unit of FMI 3 (needs pythonfmu3)."
+        ),
+    ] = False,
+    open_: OpenReport = False,
+    json: Json = False,
+) -> None:
+    """State the performance of a scene's star tracker: error terms, probabilities, limits, robustness.
+
+    Stopped or killed, it goes on where it was when it is called again.
+    """
+    from skysim.core import files
+    from skysim.core.yaml_reader import parse_overrides
+    from skysim.experiments.datasheet import cells, datasheet_report, model_fit
+    from skysim.experiments.datasheet.statement import numbers, state
+
+    if fmu and model is None:
+        raise InputError("--fmu", "has no effect without --model", "--model FOLDER --fmu")
+    if fmu:
+        model_fit.require_fmu_builder()
+    loaded = load(scene, None, seed, set_)
+    overrides = parse_overrides(set_) | ({} if seed is None else {"seed": str(seed)})
+    folder = out or Path("out") / f"{loaded.name}_datasheet"
+    with ExitStack() as stack:
+
+        def watch(trials: int) -> Callable[[Any], Any]:
+            return stack.enter_context(trial_progress(f"datasheet of {loaded.name}", trials))
+
+        sheet = cells.measure(
+            scene,
+            loaded,
+            overrides,
+            folder,
+            quick=quick,
+            fields=fields,
+            workers=workers,
+            watch=watch,
+        )
+    statement = state(sheet)
+    report = datasheet_report.datasheet_report(statement, quick)
+    paths = datasheet_report.write_all(folder, statement, report)
+    if markdown:
+        files.make_folder(markdown.parent)
+        files.write_text(markdown, report.markdown())
+    if model:
+        agreements = model_fit.agreements(sheet)
+        constants = model_fit.constants(sheet) | {
+            "agreement": [one._asdict() for one in agreements]
+        }
+        written = model_fit.write_model(model, constants) + (
+            [model_fit.write_fmu(model)] if fmu else []
+        )
+    if json:
+        print_json(numbers(statement))
+    else:
+        report.print()
+        print(f"report: {paths['report']}")
+        if model:
+            print_agreements(agreements)
+            for path in written:
+                print(path)
+    if open_:
+        typer.launch(str(paths["report"]))
+
+
+def print_agreements(agreements: list[Agreement]) -> None:
+    """Print how well the model, fitted to each half of the fields, agrees with the other half."""
+    rows = [
+        [
+            one.fitted,
+            f"{one.rate_deg_s:g}",
+            str(one.frames),
+            *(f"{p:.2g}" for p in one.p_values),
+            f"{one.correlation:.3f}",
+            f"{one.expected_correlation:.3f}",
+        ]
+        for one in agreements
+    ]
+    heads = ["rate °/s", "frames", "p of x", "p of y", "p of roll", "correlation", "of the model"]
+    table = Table([Column("fitted to", kind="text"), *map(Column, heads)], rows)
+    print_table(
+        table,
+        "The model, fitted to half of the fields (even or odd numbers), beside the other half",
+    )
+    print_wrapped(
+        "p: Kolmogorov-Smirnov; of a right model one in twenty is below 0.05. correlation: mean over the axes and the"
+        " pairs of frames of the sequences."
+    )
+    print()

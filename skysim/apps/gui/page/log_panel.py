@@ -1,0 +1,109 @@
+"""Log panel: what has happened in this session, and a table of the identifications, as CSV."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from nicegui import ui
+
+from skysim.apps.gui.messages import FrameView, SceneInfo
+from skysim.apps.gui.views.context import Shown
+from skysim.apps.gui.views.live import csv_table
+
+MAX_LINES = 500
+MAX_ROWS = 10_000
+COLUMNS = (
+    "time",
+    "scene",
+    "noise",
+    "detector",
+    "identifier",
+    "status",
+    "detected",
+    "identified",
+    "true_1_deg",
+    "true_2_deg",
+    "true_3_deg",
+    "found_1_deg",
+    "found_2_deg",
+    "found_3_deg",
+    "cross_arcsec",
+    "roll_arcsec",
+    "cross_sigma_arcsec",
+    "roll_sigma_arcsec",
+    "wrong",
+)
+
+
+class LogPanel:
+    """The log, the newest line first. rows : of the identifications, with the cells of COLUMNS"""
+
+    def __init__(self, page: Shown) -> None:
+        self.page = page
+        self.lines: list[str] = []
+        self.rows: list[tuple[Any, ...]] = []
+        self.button = ui.button("CSV of the identifications", on_click=self.download).props(
+            "dense flat size=sm"
+        )
+        self.button.mark("log-csv").set_enabled(False)
+        self.label = ui.label("Nothing yet.").classes("mono lab-log").mark("log")
+
+    def add(self, text: str) -> None:
+        self.lines = [f"{time.strftime('%H:%M:%S')}  {text}", *self.lines[: MAX_LINES - 1]]
+        self.label.set_text("\n".join(self.lines))
+
+    def identified(self, view: FrameView, info: SceneInfo) -> None:
+        """Log an identification with its attitude and error."""
+        self.add(line(view, info))
+        self.rows = [*self.rows[1 - MAX_ROWS :], row(view, info)]
+        self.button.set_enabled(True)
+
+    def download(self) -> None:
+        ui.download(csv_table(COLUMNS, self.rows), f"{Path(self.page.state.scene).stem}_log.csv")
+
+
+def line(view: FrameView, info: SceneInfo) -> str:
+    """An identification in a line."""
+    noise = "with" if info.noise else "without"
+    result = view.result
+    if result is None or result.angles_deg is None:
+        return f"identify {noise} noise: {result.status if result else 'no result'}"
+    counts = f"{result.identified} of {len(result.detections)}"
+    angles = "  ".join(
+        f"{name} {angle:.4f}°" for name, angle in zip(info.names, result.angles_deg, strict=True)
+    )
+    errors = (
+        f"error {result.cross_arcsec:.2f}″ across, {result.roll_arcsec:+.1f}″ about the boresight"
+    )
+    return f"identify {noise} noise: {result.status}, {counts}; {angles}; {errors}"
+
+
+def row(view: FrameView, info: SceneInfo) -> tuple[Any, ...]:
+    """An identification as values of COLUMNS; None where there is no solution."""
+    result = view.result
+    assert result is not None
+    found = result.angles_deg or (None,) * 3
+    errors = (
+        (result.cross_arcsec, result.roll_arcsec, *result.sigma_arcsec)
+        if result.solved
+        else (None,) * 4
+    )
+    counts = len(result.detections), result.identified
+    names = (
+        info.scene,
+        info.noise,
+        info.stages["detector"],
+        info.stages["identifier"],
+        result.status,
+    )
+    return (
+        time.strftime("%H:%M:%S"),
+        *names,
+        *counts,
+        *view.angles_deg,
+        *found,
+        *errors,
+        result.wrong,
+    )

@@ -1,0 +1,443 @@
+"""Monte Carlo panel: start and stop studies, show statistics and histogram while they run, replay failed trials."""
+
+from __future__ import annotations
+
+import math
+import signal
+import time
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from nicegui import run, ui
+from pydantic import ValidationError
+
+from skysim.apps.gui.views import forms, keys
+from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views.live import for_page, format_number
+from skysim.apps.gui.views.style import CURVE_COLORS, TOOLTIP, chart_color
+from skysim.apps.gui.worker.study_process import (
+    PAGE_STUDY,
+    RESPONSES,
+    StudyProcess,
+    StudyResults,
+    finished,
+    is_shown,
+    monte_carlo,
+)
+from skysim.core import files
+from skysim.core.errors import InputError
+from skysim.core.files import STUDIES, title_of
+from skysim.experiments.study import study_file as loader
+from skysim.experiments.study import unused_options
+from skysim.experiments.study.execution.store import STORE
+from skysim.experiments.study.plan import Plan, TrialSection
+from skysim.scene.loader import load
+
+POLL_S = 0.5
+TRIAL_KINDS = {"centroids": "centroids", "frames": "rendered frames"}
+
+
+class MonteCarloPanel:
+    """Panel that runs one study at a time.
+
+    Attributes
+    ----------
+    out
+        Folder of the studies
+    user, tab
+        The browser and its tab, which are in the names of their folders
+    process
+        The study
+    run_number
+        Of the tab's last Monte Carlo study
+    failed
+        Trials that the page lists, see `StudyResults`
+    stopped
+        Whether the study was stopped and can be continued
+    starting
+        Whether its process is being started
+    """
+
+    def __init__(self, page: PageContext, out: Path, user: str, tab: str) -> None:
+        self.page = page
+        self.out = out
+        self.user = user
+        self.tab = tab
+        self.process = StudyProcess(Path())
+        self.run_number = 0
+        self.failed: tuple[tuple[int, str], ...] = ()
+        self.stopped = False
+        self.starting = False
+        with ui.row().classes("w-full no-wrap items-center gap-2"):
+            self.study_select = ui.select({}, value=None).props(
+                'dense outlined options-dense aria-label="Study"'
+            )
+            self.study_select.classes("flex-grow").mark("study").on_value_change(self.study_chosen)
+            self.study_select.on("popup-hide", js_handler=keys.BLUR_JS)
+            self.button = ui.button("Start", on_click=self.start_or_stop).props(
+                "dense outline size=sm"
+            )
+            self.button.mark("monte-carlo")
+        with ui.element("div").classes("lab-trial") as self.fields:
+            self.count = ui.number("runs, F8", value=200, min=1, max=100_000, precision=0).props(
+                "dense outlined"
+            )
+            self.count.mark("runs")
+            self.kind = ui.select(TRIAL_KINDS, value="centroids", label="of").props(
+                "dense outlined options-dense"
+            )
+            self.kind.on("popup-hide", js_handler=keys.BLUR_JS)
+            self.noise = ui.number("noise, px", value=0.1, min=0, max=10, step=0.05).props(
+                "dense outlined"
+            )
+            self.noise.on_value_change(self.show_noise)
+            self.magnitude = ui.number("noise, mag", value=0.25, min=0, max=5, step=0.05).props(
+                "dense outlined"
+            )
+            self.false_lights = ui.number("false", value=0, min=0, max=100, precision=0).props(
+                "dense outlined"
+            )
+            self.field = ui.number("field, °", min=1, max=90).props("dense outlined").mark("field")
+            self.field.on("keydown.enter", self.set_field_of_view)
+        with ui.row().classes("w-full no-wrap items-center gap-3") as self.model:
+            self.with_noise = (
+                ui.checkbox("with noise", value=True).props("dense size=xs").mark("with-noise")
+            )
+            self.noise_text = ui.label().classes("quiet").mark("noise-text")
+        self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
+        self.note = (
+            ui.label("No study has been run yet: press 2.")
+            .classes("quiet")
+            .style("margin-top: 6px")
+        )
+        self.note.mark("trials-note")
+        self.chart = ui.echart(options()).classes("w-full").style("height: 190px").mark("histogram")
+        self.table = ui.element("div").classes("mono w-full").mark("figures")
+        self.failures = ui.column().classes("w-full gap-1")
+        ui.separator().style("margin: 8px 0")
+        ui.label("Finished studies").classes("quiet")
+        self.reports = ui.column().classes("w-full gap-0")
+        self.list_reports()
+
+    def set_scene(self) -> None:
+        options = {"": f"Monte Carlo of {Path(self.page.state.scene).stem}"}
+        options |= {
+            path.stem: f"{path.stem}: {title_of(path)}" for path in sorted(STUDIES.glob("*.yaml"))
+        }
+        self.study_select.set_options(options, value=self.study_select.value or "")
+        info = self.page.scene_info
+        if info:
+            self.field.set_value(round(info.field_deg, 3))
+        self.show_noise()
+
+    def show_noise(self) -> None:
+        """Say what the centroids' noise is as an angle, in the middle of the frame."""
+        info = self.page.scene_info
+        angle = f"{float(self.noise.value or 0) * info.pixel_arcsec:.3g}″" if info else ""
+        self.noise_text.set_text(f"noise of a centroid: {angle} an axis")
+
+    def study_chosen(self) -> None:
+        """Hide the Monte Carlo fields when a study file is chosen."""
+        for item in (self.fields, self.model):
+            item.set_visibility(not self.study_select.value)
+
+    async def set_field_of_view(self) -> None:
+        """Change the scene's field of view by the focal length."""
+        state = self.page.state
+        field_deg = float(self.field.value or 0)
+        try:
+            change = await run.io_bound(
+                forms.field_override, state.scene, state.overrides, field_deg
+            )
+        except InputError as error:
+            self.page.show_message(for_page(error))
+            return
+        await self.page.apply_overrides(change)
+
+    def focus(self) -> None:
+        """Give the number of runs the keyboard focus."""
+        keys.focus(self.count)
+
+    def close(self) -> None:
+        """End the study with the page; its trials so far are kept."""
+        self.process.stop(signal.SIGTERM)
+
+    async def start_or_stop(self) -> None:
+        if not self.process.running:
+            await self.start()
+            return
+        self.process.stop()
+        self.stopped = True
+        self.note.set_text("stopping …")
+
+    async def start(self) -> None:
+        """Start the chosen study and wait for its end; resume it if its store exists. Only one runs at a time."""
+        if self.starting or self.process.running:
+            return
+        self.starting = True
+        try:
+            started = await self.start_process()
+        finally:
+            self.starting = False
+        if started:
+            fault = await self.process.wait()
+            if self.page.is_open:
+                self.show_end("" if self.stopped else fault)
+
+    async def start_process(self) -> bool:
+        """Start the process of the chosen study; return whether it could be."""
+        self.page.show_message("")
+        try:
+            StudyProcess.check_count()
+            path = await run.io_bound(self.study_file)
+            study = await run.io_bound(loader.load, path)
+            if study.study.optimize is not None:
+                raise InputError(path.stem, "has the key optimize", "studies with a design")
+        except InputError as error:
+            self.page.show_message(for_page(error))
+            return False
+        self.process = StudyProcess(
+            path.parent if not self.study_select.value else self.out / path.stem
+        )
+        self.process.total = study.trials
+        self.bar.set_value(0)
+        self.button.set_text("Stop")
+        self.stopped = False
+        self.note.set_text("starting …")
+        self.page.log(f"study {path.stem}: {study.trials} trials")
+        unused = (
+            []
+            if self.study_select.value
+            else sorted(self.page.state.overrides.keys() - study.spec.base.keys())
+        )
+        if unused:
+            self.page.show_message(
+                f"trials of {self.kind.value} do not use {', '.join(unused)}", "quiet"
+            )
+        self.page.set_state(study=self.process.folder.name)
+        await self.process.start(path)
+        if not self.page.is_open:  # closed meanwhile, when there was no process to end
+            self.process.stop(signal.SIGTERM)
+        return True
+
+    def study_file(self) -> Path:
+        """Path of the study file: the chosen one, or a new Monte Carlo study; a stopped one if it is unchanged.
+
+        Raises
+        ------
+        InputError
+            For a wrong number of runs.
+        """
+        if self.study_select.value:
+            return STUDIES / f"{self.study_select.value}.yaml"
+        trial: dict[str, Any] = {"kind": self.kind.value}
+        if self.kind.value == "centroids":
+            noise = {"noise_px": self.noise, "magnitude_sigma": self.magnitude}
+            trial |= {
+                name: float(field.value or 0) * bool(self.with_noise.value)
+                for name, field in noise.items()
+            }
+            trial |= {"false_lights": int(self.false_lights.value or 0)}
+        if not (self.count.value and 1 <= self.count.value <= 100_000):
+            raise InputError("runs", "", "1 to 100000")
+        scene = forms.absolute_path(self.page.state.scene)
+        settings = scene, self.effective_overrides(scene, trial), trial, int(self.count.value)
+        # A stopped run with unchanged settings is resumed from its own file.
+        before = self.process.folder / "monte_carlo.yaml"
+        if (
+            self.stopped
+            and before.is_file()
+            and before.read_text() == monte_carlo(*settings, self.run_number)
+        ):
+            return before
+        self.run_number += 1
+        text = monte_carlo(*settings, self.run_number)
+        folder = files.make_folder(
+            self.out / f"{PAGE_STUDY}{self.user}_{self.tab}_{self.run_number}"
+        )
+        files.write_text(folder / "monte_carlo.yaml", text)
+        return folder / "monte_carlo.yaml"
+
+    def effective_overrides(self, scene: str, trial: dict[str, Any]) -> dict[str, str]:
+        """The changes of the scene that have an effect on a trial; a study with others would be refused."""
+        overrides = dict(self.page.state.overrides)
+        try:
+            section = TrialSection.model_validate({"trial": trial})
+        except ValidationError:  # the study's loader says in one line what is wrong
+            return overrides
+        unused = unused_options.unused_overrides(overrides, load(scene, overrides), section.trial)
+        return {key: text for key, text in overrides.items() if key not in unused}
+
+    def show_end(self, fault: str) -> None:
+        self.button.set_text("Start")
+        results = self.process.results()
+        if results:
+            self.show(results)
+        done = results.done if results else 0
+        if fault:
+            self.page.show_message(fault)
+        self.show_count(done)
+        self.page.log(f"study ended: {done} of {self.process.total} trials")
+        self.list_reports()
+
+    async def show_study(self, name: str) -> None:
+        """Show the results of a study of the page's folder, as after a reload; a stopped one can be continued."""
+        if self.process.running or self.starting:
+            return
+        folder = self.out / name
+        is_here = name and folder.parent == self.out and is_shown(name, self.user)
+        found = await run.io_bound(stored_study, folder) if is_here else None
+        if found is None:
+            self.page.set_state(study="")
+            return
+        self.process = StudyProcess(folder)
+        self.process.total = found.trials
+        self.stopped = True
+        self.study_select.set_value(name if (STUDIES / f"{name}.yaml").is_file() else "")
+        if not self.study_select.value:
+            self.set_fields(name, found)
+        results = await run.io_bound(self.process.results)
+        self.page.set_state(study=name)
+        if results:
+            self.show(results)
+            self.show_count(results.done)
+
+    def set_fields(self, name: str, study: Plan) -> None:
+        """Fill in the fields with the settings of a Monte Carlo study of this page, so that Start continues it."""
+        number = name.rpartition("_")[2]
+        trial = study.spec.trial
+        self.run_number = int(number) if number.isdigit() else 0
+        self.count.set_value(study.trials)
+        self.kind.set_value(trial["kind"])
+        noise_px = trial.get("noise_px")
+        magnitude_sigma = trial.get("magnitude_sigma")
+        self.with_noise.set_value(noise_px != 0 or magnitude_sigma != 0)
+        if self.with_noise.value and noise_px is not None:
+            self.noise.set_value(noise_px)
+            self.magnitude.set_value(magnitude_sigma)
+        self.false_lights.set_value(trial.get("false_lights", self.false_lights.value))
+
+    def show_count(self, done: int) -> None:
+        """Say how many trials are done, and how to go on."""
+        rest = "" if done >= self.process.total else "; stopped, Start continues"
+        self.note.set_text(f"{done} of {self.process.total} trials{rest}")
+
+    async def poll(self) -> None:
+        """Timer, every POLL_S: read the store of a running study and display its results so far."""
+        if self.process.running:
+            results = await run.io_bound(self.process.results)
+            if results and self.process.running:
+                self.show(results)
+                self.note.set_text(f"{results.done} of {self.process.total} trials")
+
+    def show(self, results: StudyResults) -> None:
+        self.bar.set_value(results.done / max(self.process.total, 1))
+        self.chart.options["xAxis"]["data"] = [format_number(center) for center in results.bins]
+        self.chart.options["series"][0]["data"] = list(results.counts)
+        self.chart.options["title"]["text"] = "" if results.counts else "no trial solved"
+        self.chart.update()
+        self.table.clear()
+        with self.table:
+            ui.label(f"{'':16s}{'value':>8s}   95 % interval").classes("mono quiet")
+            lines = [
+                f"{RESPONSES[name]:16s}{format_interval(*value)}"
+                for name, value in results.statistics.items()
+            ]
+            ui.label("\n".join(lines)).classes("mono")
+        if results.failed == self.failed:
+            return
+        self.failed = results.failed
+        self.failures.clear()
+        with self.failures:
+            if results.failed:
+                ui.label("Failed trials, the first of them").classes("quiet").style(
+                    "margin-top: 8px"
+                )
+            for number, reason in results.failed:
+                with ui.row().classes("items-center gap-2 no-wrap"):
+                    ui.label(f"trial {number}: {reason}").classes("mono warn ellipsis")
+                    ui.button("replay", on_click=lambda number=number: self.replay(number)).props(
+                        "dense flat size=sm"
+                    )
+
+    async def replay(self, number: int) -> None:
+        """Repeat a failed trial and show its frame in the sensor view."""
+        study = next(
+            iter(self.process.folder.glob("*.yaml")), STUDIES / f"{self.study_select.value}.yaml"
+        )
+        self.page.stop_playback()
+        photo = await self.page.run_task(
+            "replay",
+            str(study),
+            str(self.process.folder),
+            number,
+            activity=f"replaying trial {number} …",
+        )
+        if photo:
+            self.page.show_photo(photo, kind="replay", study=self.process.folder.name, trial=number)
+            self.page.log(f"replayed trial {number}: {photo.result.status}")
+
+    def list_reports(self) -> None:
+        self.reports.clear()
+        with self.reports:
+            folders = finished(self.out, self.user)
+            for folder in folders[:12]:
+                done = time.strftime(
+                    "%d %b %H:%M", time.localtime((folder / "report.html").stat().st_mtime)
+                )
+                with ui.row().classes("w-full no-wrap gap-3"):
+                    ui.label(done).classes("mono quiet flex-none")
+                    link = ui.link(
+                        report_title(folder), f"/report/{quote(folder.name)}", new_tab=True
+                    )
+                    link.classes("ellipsis").props["title"] = folder.name
+            if not folders:
+                ui.label("none yet").classes("quiet")
+
+
+def stored_study(folder: Path) -> Plan | None:
+    """The plan of a study with a store in the folder; None if there is none."""
+    try:
+        file = next(iter(sorted(folder.glob("*.yaml"))), STUDIES / f"{folder.name}.yaml")
+        return loader.load(file) if (folder / STORE).is_file() else None
+    except (InputError, ValueError, OSError):  # a name with a null byte, or too long
+        return None
+
+
+def report_title(folder: Path) -> str:
+    """The study's title if its file is in the report's folder, else the folder's name."""
+    file = next(iter(sorted(folder.glob("*.yaml"))), None)
+    return (title_of(file) if file else "") or folder.name
+
+
+def format_interval(value: float, low: float, high: float) -> str:
+    if math.isnan(value):
+        return "       –"
+    text = f"{value:8.4g}"
+    return text if math.isnan(low) or low == high else f"{text}   {low:.4g} .. {high:.4g}"
+
+
+def options() -> dict[str, Any]:
+    """ECharts options of the histogram of the error angle."""
+    text = {":color": chart_color("quiet"), "fontSize": 10}
+    rule = {"lineStyle": {":color": chart_color("line")}}
+    title = {"text": "no trials yet", "left": "center", "top": "middle"}
+    axis = {"axisLabel": text, "nameTextStyle": text}
+    x_name = {"name": "error angle, ″", "nameLocation": "middle", "nameGap": 24}
+    return {
+        "animation": False,
+        "title": title | {"textStyle": text | {"fontWeight": "normal", "fontSize": 11}},
+        "grid": {"left": 42, "right": 10, "top": 22, "bottom": 36},
+        "xAxis": axis | x_name | {"type": "category", "data": []},
+        "yAxis": axis | {"name": "trials", "type": "value", "splitLine": rule},
+        "tooltip": TOOLTIP,
+        "series": [
+            {
+                "type": "bar",
+                "data": [],
+                "barCategoryGap": "8%",
+                "itemStyle": {"color": CURVE_COLORS[0]},
+            }
+        ],
+    }

@@ -1,0 +1,160 @@
+"""Image panel: solves an uploaded image or frames of a live camera; shows the solution or the reason for none."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from nicegui import ui
+
+from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.worker.photo import SUFFIXES, Photo, Stages
+
+LIMIT_BYTES = 64 * 2**20
+
+
+def weak_handler(method: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """A handler that does not keep its panel alive: FastAPI keeps the route of an upload area in a cache for ever."""
+    reference = weakref.WeakMethod(method)
+
+    def handler(event: Any) -> Any:
+        alive = reference()
+        return alive(event) if alive else None
+
+    return handler
+
+
+class PhotoPanel:
+    """Panel with upload area, live camera and result text.
+
+    Attributes
+    ----------
+    cameras
+        That it may watch
+    live
+        Whether it watches one
+    logged
+        The status that was logged last
+    """
+
+    def __init__(self, page: PageContext, cameras: Sequence[str]) -> None:
+        self.page = page
+        self.cameras = cameras
+        self.live = False
+        self.logged = ""
+        self.fov = ui.number("field of view, deg (empty: 2 to 100 are tried)", min=1, max=120)
+        self.fov.props("dense outlined clearable").classes("w-full").mark("fov")
+        self.upload = ui.upload(
+            label="Drop a FITS, PNG, JPEG, TIFF or BMP here",
+            auto_upload=True,
+            max_file_size=LIMIT_BYTES,
+            on_upload=weak_handler(self.uploaded),
+            on_rejected=weak_handler(self.rejected),
+        )
+        self.upload.props(f'flat bordered accept="{",".join(SUFFIXES)}"').classes("w-full").style(
+            "margin: 10px 0"
+        )
+        self.upload.mark("upload")
+        with ui.row().classes("w-full no-wrap items-center gap-2"):
+            self.source = ui.select(
+                list(cameras), label="live camera", value=next(iter(cameras), None)
+            )
+            self.source.props("dense outlined options-dense").classes("flex-grow")
+            self.button = (
+                ui.button("Watch", on_click=self.watch)
+                .props("dense outline size=sm")
+                .mark("camera")
+            )
+            if not cameras:
+                self.source.set_visibility(False)
+                self.button.set_visibility(False)
+                ui.label(
+                    "No live camera is offered here. Cameras are named when the lab is started."
+                ).classes("quiet")
+        self.result_text = ui.label(
+            "No image yet. Images are solved lost in space; uncertain matches are rejected."
+        )
+        self.result_text.classes("mono quiet").style(
+            "margin-top: 10px; white-space: pre-wrap"
+        ).mark("facts")
+
+    def rejected(self, _: Any) -> None:
+        self.page.show_message(f"refused; allowed: {', '.join(SUFFIXES)}, at most 64 MB")
+
+    async def uploaded(self, event: Any) -> None:
+        data = await event.file.read()
+        name = str(event.file.name)
+        self.upload.reset()
+        if len(data) > LIMIT_BYTES:
+            self.page.show_message(f"{name}: larger than 64 MB")
+            return
+        self.page.stop_playback()
+        self.show_text(f"solving {name} …", "quiet")
+        photo = await self.page.run_task(
+            "solve_file", name, data, self.fov.value, self.stages, activity=f"solving {name} …"
+        )
+        self.show(name, photo)
+
+    @property
+    def stages(self) -> Stages:
+        """The algorithms that the user has chosen for stars; a dome's do not solve photographs."""
+        info = self.page.scene_info
+        chosen = info.stages if info and info.under_stars else {}
+        return tuple((stage, name) for stage, name in chosen.items() if name != "default")
+
+    def stop(self) -> None:
+        """Stop the live camera after the current frame."""
+        if self.live:
+            self.live = False
+            self.button.disable()
+
+    async def watch(self) -> None:
+        """Solve frames of a live camera until the button is pressed again or a frame fails."""
+        if self.live:
+            self.stop()
+            return
+        # The value comes from the browser, which may send any: only what the command line named is opened.
+        if self.source.value not in self.cameras:
+            self.page.show_message("live camera: allowed: one of those in the list")
+            return
+        self.page.stop_playback()
+        self.live = True
+        solved_count = 0
+        source = str(self.source.value)
+        self.button.set_text("Stop")
+        while self.live:
+            photo = await self.page.run_task("solve_camera", source, self.fov.value, self.stages)
+            if not self.page.is_open:
+                return
+            if photo or not solved_count:  # a camera that ends keeps its last result on the page
+                self.show("camera", photo)
+            solved_count += 1
+            self.live = self.live and photo is not None
+        self.button.disable()
+        await self.page.ask("release")
+        self.button.set_text("Watch")
+        self.button.enable()
+
+    def show(self, name: str, photo: Photo | None) -> None:
+        if photo is None:
+            self.show_text(self.page.message_text, "warn")
+            return
+        self.page.show_photo(photo, kind="photo", photo=name)
+        stages = "".join(f"; {stage} {algorithm}" for stage, algorithm in self.stages)
+        status_text = f"{name}: {photo.result.status}{stages}"
+        if status_text != self.logged:  # log the repeated status of a live camera once
+            self.logged = status_text
+            self.page.log(status_text)
+        solution = photo.solution
+        if not solution:
+            hint = photo.hint or "Rejected: the match is not significant."
+            self.show_text(f"{status_text}\n{hint}", "warn")
+            return
+        pointing = f"RA {solution['ra_deg']:.4f}°  Dec {solution['dec_deg']:+.4f}°  roll {solution['roll_deg']:.3f}°"
+        quality = f"field {solution['fov_deg']:.3f}°  {solution['matches']} stars  rms {solution['rms_arcsec']:.1f}″"
+        self.show_text(f"{status_text}\n{pointing}\n{quality}", "good")
+
+    def show_text(self, text: str, color: str) -> None:
+        self.result_text.set_text(text)
+        self.result_text.classes(remove="quiet good warn", add=color)

@@ -1,0 +1,387 @@
+"""Plan panel: the scene's check, ambiguous fields on the dome, and attitudes of a survey, which can be flown."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nicegui import run, ui
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from skysim.apps.gui.messages import AmbiguityMap, PlanCheck, SurveyFound, SurveyPlan
+from skysim.apps.gui.page.run_panel import RunPanel
+from skysim.apps.gui.views import forms
+from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views.live import for_page
+from skysim.apps.gui.views.space import Scene3D
+from skysim.apps.gui.views.style import color_scale
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.dynamics import guidance, multibody
+from skysim.experiments.dome_survey import survey_frames
+from skysim.scene.sections.motion import PRESCRIBED
+
+# Of a survey that is flown: few frames while the vehicle slews, and a whole exposure in each hold.
+SURVEY_RATE_HZ = 0.5
+HOLD_PERIODS = 2.0
+TILT_MARGIN_DEG = 0.5  # to the vehicle's stop
+TILT_STEPS = 61  # points of a slew at which its tilt is looked at
+FRAMES = 20  # of a survey, at first
+ALIKE = 0.9  # of the LEDs that coincide: a tracker without a prior refuses the field as ambiguous
+UNCHECKED = "Check computes what this scene will show and how accurate its tracker will be. Nothing is rendered."
+UNMAPPED = "Map compares the fields of the dome with one another: a field that looks like another one is ambiguous."
+COLORED = "In the 3-D view the LEDs are the brighter the better they are measured."
+UNPLANNED = (
+    "Plan begins a survey: it chooses the attitudes from which the dome's LEDs are measured best. Fly takes frames at"
+    " them. Adjust adds these to the survey's frames, measures the LEDs by all of them, and plans the next attitudes."
+)
+
+
+class PlanPanel:
+    """Panel with three parts, each computed at a button's press and cleared when the scene changes.
+
+    Attributes
+    ----------
+    scene_3d
+        In which it colors LEDs
+    run_panel
+        Which flies the survey
+    taken
+        Frames of the survey, once they are adjusted
+    colored
+        Its LEDs and how well it knows each
+    legends
+        What the colors of the LEDs in the 3-D view mean, by what has colored them; the last one
+        is shown
+    """
+
+    def __init__(self, page: PageContext, scene_3d: Scene3D, run_panel: RunPanel) -> None:
+        self.page = page
+        self.scene_3d = scene_3d
+        self.run_panel = run_panel
+        self.plan: SurveyPlan | None = None
+        self.taken = 0
+        self.colored: tuple[NDArray[np.int64], Floats] | None = None
+        self.legends = dict[str, ui.element]()
+        with self.part():
+            ui.button("Check", on_click=self.check).props("dense outline size=sm").mark("check")
+        self.facts = ui.column().classes("w-full gap-1").mark("check-result")
+        with self.part():
+            ui.button("Map", on_click=self.map).props("dense outline size=sm").mark("map")
+        self.fields = ui.column().classes("w-full gap-1").mark("map-result")
+        with self.part():
+            self.begin = self.survey_button("Plan", self.plan_survey, "begin a new survey")
+            self.frames = (
+                ui.number(value=FRAMES, min=2, step=1, label="frames")
+                .props("dense outlined")
+                .classes("w-24")
+            )
+            self.fly = self.survey_button(
+                "Fly", self.fly_plan, "fly the vehicle to these attitudes"
+            )
+            self.adjust_button = self.survey_button(
+                "Adjust",
+                self.adjust,
+                "adjust LEDs, lever and lens to the frames of the last flight and those before",
+            )
+            self.save_map = self.survey_button(
+                "Map file", self.download_map, "save the LEDs for tracker.map"
+            )
+        self.stops = ui.column().classes("w-full gap-1").mark("survey-result")
+        self.set_scene()
+
+    def part(self) -> ui.row:
+        return ui.row().classes("w-full no-wrap items-center gap-2").style("margin-top: 8px")
+
+    def survey_button(self, label: str, action: Callable[[], Any], title: str) -> ui.button:
+        button = ui.button(label, on_click=action).props(f'dense outline size=sm title="{title}"')
+        return button.classes("flex-none")
+
+    def set_scene(self) -> None:
+        """Say what each part does, because nothing is known of a new scene; its survey goes on if there is one."""
+        self.legends.pop("map", None)
+        for column, text in ((self.facts, UNCHECKED), (self.fields, UNMAPPED)):
+            column.clear()
+            with column:
+                ui.label(text).classes("quiet")
+        info = self.page.scene_info
+        if not (info and info.surveyed):
+            self.clear_survey()
+        elif self.colored:
+            self.color("survey", *self.colored)
+
+    def color(self, by: str, ids: NDArray[np.int64], values: Floats) -> None:
+        """Color LEDs of the 3-D view, and show what that means."""
+        self.scene_3d.color_lights(ids, values)
+        for name, legend in self.legends.items():
+            legend.set_visibility(name == by)
+
+    def clear_survey(self) -> None:
+        """Forget the survey, and say what it does."""
+        self.plan = self.colored = None
+        self.taken = 0
+        self.legends.pop("survey", None)
+        self.enable()
+        self.save_map.set_enabled(False)
+        self.stops.clear()
+        with self.stops:
+            ui.label(UNPLANNED).classes("quiet")
+
+    def enable(self) -> None:
+        """Let the buttons of a planned survey act."""
+        self.begin.set_enabled(True)
+        for button in (self.fly, self.adjust_button):
+            button.set_enabled(self.plan is not None)
+
+    @contextmanager
+    def working(self) -> Iterator[None]:
+        """Within this context no second step of the survey begins."""
+        for button in (self.begin, self.fly, self.adjust_button):
+            button.set_enabled(False)
+        try:
+            yield
+        finally:
+            if self.page.is_open:
+                self.enable()
+
+    # The check.
+
+    async def check(self) -> None:
+        found: PlanCheck | None = await self.page.run_task("check", activity="checking the scene …")
+        if found is None:
+            return
+        self.facts.clear()
+        with self.facts:
+            for finding in found.findings:
+                ui.label(finding).classes("warn").style("overflow-wrap: anywhere")
+            if not found.findings:
+                ui.label("No warnings.").classes("good")
+            with ui.element("div").classes("lab-facts"):
+                for name, lines in found.facts:
+                    ui.label(name).classes("quiet")
+                    ui.label("\n".join(lines)).style(
+                        "white-space: pre-line; overflow-wrap: anywhere"
+                    )
+
+    # The ambiguity map.
+
+    async def map(self) -> None:
+        found: AmbiguityMap | None = await self.page.run_task(
+            "ambiguity", activity="comparing the fields …"
+        )
+        if found is None:
+            return
+        self.fields.clear()
+        with self.fields:
+            ui.label(ambiguity_text(found))
+            with ui.row().classes("no-wrap items-center gap-2") as self.legends["map"]:
+                ui.label(f"{100 * found.least:.0f} % or less").classes("quiet")
+                colors = ", ".join(
+                    f"rgb({r:.0f} {g:.0f} {b:.0f})"
+                    for r, g, b in 255 * color_scale(np.linspace(0, 1, 8))
+                )
+                ui.element("div").style(
+                    f"width: 120px; height: 10px; background: linear-gradient(90deg, {colors})"
+                )
+                ui.label("100 % of the LEDs coincide; drawn in the 3-D view").classes("quiet")
+        self.color("map", found.ids, (found.fraction - found.least) / (1 - found.least))
+
+    # The survey.
+
+    async def plan_survey(self) -> None:
+        """Begin a new survey: plan its first attitudes."""
+        with self.working():
+            question = f"A new survey forgets the {self.taken} frames of this one."
+            if self.taken and not await confirmed(question, "Begin anew"):
+                return
+            found: SurveyPlan | None = await self.page.run_task(
+                "plan_survey", int(self.frames.value or 0), activity="planning the survey …"
+            )
+            if found is not None:
+                self.clear_survey()
+                self.show_survey([prediction_text(found)], found)
+
+    async def adjust(self) -> None:
+        """Adjust the dome to the frames flown, and show what they measure and the attitudes to hold next."""
+        with self.working():
+            found: SurveyFound | None = await self.page.run_task(
+                "adjust_survey", int(self.frames.value or 0), activity="adjusting the survey …"
+            )
+            if found is None:
+                return
+            self.taken = found.frames
+            lines = survey_lines(found)
+            self.show_survey([*lines, prediction_text(found.plan)], found.plan)
+            self.page.log(f"survey of {Path(self.page.state.scene).name}: {lines[0]}")
+            if not found.refusal:
+                self.save_map.set_enabled(True)
+                self.colored = found.ids, found.known
+            if self.colored:
+                self.color("survey", *self.colored)
+
+    def show_survey(self, lines: Sequence[str], plan: SurveyPlan) -> None:
+        """Show what a survey has found and its next attitudes, which can then be flown."""
+        self.plan = plan
+        self.stops.clear()
+        with self.stops:
+            for line in lines:
+                ui.label(line).style("overflow-wrap: anywhere")
+            self.legends["survey"] = ui.label(COLORED)
+            self.legends["survey"].set_visibility(False)
+            with ui.element("div").classes("lab-stops mono"):
+                for head in ("", "roll °", "pitch °", "yaw °", "LEDs"):
+                    ui.label(head).classes("quiet num")
+                for number, (angles, leds) in enumerate(
+                    zip(plan.angles_deg, plan.shown, strict=True), 1
+                ):
+                    button = ui.button(str(number), on_click=partial(self.point, number - 1)).props(
+                        "dense flat size=sm"
+                    )
+                    button.props(f'aria-label="Point to attitude {number}"')
+                    for text in (*(f"{angle:.2f}" for angle in angles), str(leds)):
+                        ui.label(text).classes("num")
+
+    async def point(self, number: int) -> None:
+        """Show the frame at an attitude of the plan."""
+        assert self.plan is not None
+        self.page.stop_playback()
+        await self.page.show_live("point", self.plan.angles_deg[number], self.page.solving)
+
+    async def fly_plan(self) -> None:
+        """Change the scene's maneuver to the plan's attitudes, in order, and compute this flight."""
+        assert self.plan is not None
+        scene = self.page.state.scene
+        with self.working():
+            try:
+                overrides = await run.io_bound(
+                    survey_flight, scene, self.page.state.overrides, self.plan.angles_deg
+                )
+            except InputError as error:
+                self.page.show_message(for_page(error))
+                return
+            if self.page.is_open and await self.page.open(scene, overrides):
+                self.page.show_panel("Run")
+                await self.run_panel.simulate()
+
+    async def download_map(self) -> None:
+        data: bytes | None = await self.page.run_task("survey_map")
+        if data is not None:
+            ui.download(data, f"{Path(self.page.state.scene).stem}_leds.ecsv")
+
+
+async def confirmed(question: str, action: str) -> bool:
+    """Ask before something is lost. action : the label of the button that does it"""
+    with ui.dialog() as dialog, ui.card():
+        ui.label(question)
+        with ui.row():
+            ui.button(action, on_click=lambda: dialog.submit(True)).props("dense outline size=sm")
+            ui.button("Cancel", on_click=lambda: dialog.submit(False)).props("dense flat size=sm")
+    answer = await dialog
+    if not dialog.is_deleted:
+        dialog.delete()
+    return bool(answer)
+
+
+def ambiguity_text(found: AmbiguityMap) -> str:
+    """How many fields look like another one, and which the most alike are."""
+    count = int(np.sum(found.fraction >= ALIKE))
+    most = int(np.argmax(found.fraction))
+    return (
+        f"{count} of {len(found.ids)} fields look like another one: {100 * ALIKE:.0f} % of the LEDs or more coincide"
+        f" within {found.coincidence_mm:.2g} mm. Most alike: the fields about LED {found.ids[most]} and"
+        f" {found.others[most]}, {100 * found.fraction[most]:.0f} %"
+        + (" or less." if found.fraction[most] <= found.least else ".")
+    )
+
+
+def prediction_text(plan: SurveyPlan) -> str:
+    """What a survey is predicted to reach with the attitudes of its plan."""
+    steps = [
+        f"after {frames} frames {measured} LEDs to {mm:.2g} mm rms"
+        for frames, measured, mm in plan.steps
+        if mm
+    ]
+    return f"Predicted of the {plan.leds} LEDs: {'; '.join(steps) or 'none measured, the frames are too few'}."
+
+
+def survey_lines(found: SurveyFound) -> list[str]:
+    """What the frames of a survey have measured, and the faults of the dome."""
+    missed = (
+        [f"{found.missed} attitudes have no frame: the vehicle did not rest there."]
+        if found.missed
+        else []
+    )
+    unmeasured = f"{found.seen_once} seen once, {found.unseen} not seen"
+    if found.refusal:
+        return [
+            f"{found.frames} frames: no LED measured; {unmeasured}.",
+            *missed,
+            f"Not determined yet: {found.refusal}.",
+        ]
+    renamed = f"; {found.renamed} have the number of another one" if found.renamed else ""
+    return [
+        f"{found.frames} frames, {found.connected} of them connected: {found.measured} of {len(found.ids)} LEDs"
+        f" measured to {found.sigma_mm:.2g} mm rms about each axis (1σ), {unmeasured} in the connected ones. Their true"
+        f" error is {found.error_mm:.2g} mm, {found.before_mm:.2g} mm before{renamed}.",
+        *missed,
+        *found.faults,
+    ]
+
+
+def survey_flight(
+    scene: str, overrides: Mapping[str, str], angles_deg: tuple[tuple[float, ...], ...]
+) -> dict[str, str]:
+    """Overrides with which the vehicle slews to each attitude and holds it, with frames over the whole time.
+
+    An exposure is no longer than the frame period, so one lies wholly in a hold of two periods. Between two tilted
+    attitudes the vehicle may tilt more than at either: where that is too much, it is leveled in between. Raises
+    InputError.
+    """
+    before = forms.validated_scene(scene, overrides)
+    rate_hz = min(SURVEY_RATE_HZ, before.exposure.rate_hz)
+    legs: list[dict[str, object]] = []
+    at = guidance.start_attitude(before.motion)
+    for angles in angles_deg:
+        attitude = survey_frames.from_angles(np.array([angles]))[0]
+        if greatest_tilt_deg(at, attitude) > before.vehicle.tilt_stop_deg - TILT_MARGIN_DEG:
+            legs += [
+                slew((0.0, 0.0, yaw_deg))
+                for yaw_deg in (float(at.as_euler("ZYX", degrees=True)[0]), angles[2])
+            ]
+        legs += [slew(angles), {"kind": "hold", "duration": f"{HOLD_PERIODS / rate_hz:g} s"}]
+        at = attitude
+    flown = {
+        **overrides,
+        "motion.maneuver": forms.yaml_line(legs),
+        "exposure.rate_hz": f"{rate_hz:g}",
+    }
+    flown["exposure.first"] = "0 s"
+    if before.motion.control is None:
+        flown["motion.control"] = PRESCRIBED
+    duration_s = guidance.plan(forms.validated_scene(scene, flown).motion).duration_s
+    return {**flown, "exposure.frames": str(max(math.floor(duration_s * rate_hz), 1))}
+
+
+def slew(angles_deg: Sequence[float]) -> dict[str, object]:
+    """A slew to roll, pitch and yaw, as a maneuver of a scene."""
+    names = "roll_deg", "pitch_deg", "yaw_deg"
+    return {
+        "kind": "slew",
+        **{name: round(angle, 3) for name, angle in zip(names, angles_deg, strict=True)},
+    }
+
+
+def greatest_tilt_deg(first: Rotation, last: Rotation) -> float:
+    """Greatest tilt of the vehicle between two attitudes lab_from_body, along the rotation about one axis."""
+    share = np.linspace(0, 1, TILT_STEPS)[:, None]
+    return float(
+        multibody.tilt_deg(
+            first * Rotation.from_rotvec(share * (first.inv() * last).as_rotvec())
+        ).max()
+    )

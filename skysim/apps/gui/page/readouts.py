@@ -1,0 +1,236 @@
+"""What the tracker made of the frame: the card of its attitude, and the table of its lights."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterator
+from typing import Any
+
+import numpy as np
+from nicegui import ui
+
+from skysim.apps.gui.messages import Detection, FrameView, LightRow, SceneInfo, TrackerResult
+from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views.live import Contents, LiveInput, LiveText, format_number
+from skysim.apps.gui.views.overlay import MAX_TRUTH_MARKS, NEAR_PX
+from skysim.apps.gui.views.sensor import SensorView
+from skysim.apps.gui.worker.photo import Photo
+
+ANGLES_JS = "() => emit([...document.querySelectorAll('.lab-angle')].map(field => field.value))"
+
+
+class AttitudeCard:
+    """True and estimated angles with the error, and the algorithms of the tracker's four stages.
+
+    Attributes
+    ----------
+    contents
+        Of the tab's live fields
+    shows_photo
+        Whether the card shows an image that is not of the current scene
+    """
+
+    def __init__(self, page: PageContext, contents: Contents) -> None:
+        self.page = page
+        self.contents = contents
+        self.shows_photo = False
+        with ui.element("div").classes("lab-card"):
+            with ui.element("div").classes("lab-grid"):
+                ui.label("attitude").classes("quiet")
+                self.heads = [ui.label().classes("quiet num") for _ in range(3)]
+                ui.label("true (F5)").classes("quiet")
+                self.inputs = [self.angle_input(n) for n in range(3)]
+                ui.label("tracker").classes("quiet")
+                self.estimates = [LiveText(contents, "–").classes("mono num") for _ in range(3)]
+                ui.label("error").classes("quiet")
+                self.errors = [LiveText(contents, "–").classes("mono num") for _ in range(3)]
+            self.status = LiveText(contents).classes("mono ellipsis lab-status").mark("status")
+            self.stages = ui.label(" ").classes("quiet ellipsis").mark("stages")
+
+    def angle_input(self, n: int) -> LiveInput:
+        field = LiveInput(self.contents, "text").props(f'aria-label="angle {n + 1}"')
+        return (
+            field.classes("mono lab-angle")
+            .mark(f"angle-{n}")
+            .on("keydown.enter", self.point, js_handler=ANGLES_JS)
+        )
+
+    def set_scene(self, scene_info: SceneInfo) -> None:
+        """Take over a new scene: angle names and algorithms."""
+        self.set_headers(scene_info.names)
+        self.stages.set_text("stages (F6, F7): " + " · ".join(scene_info.stages.values()))
+        self.stages.props["title"] = ", ".join(
+            f"{stage} {name}" for stage, name in scene_info.stages.items()
+        )
+
+    def set_headers(self, names: tuple[str, str, str]) -> None:
+        for head, name in zip(self.heads, names, strict=True):
+            head.set_text(f"{name}, deg")
+
+    async def point(self, event: Any) -> None:
+        """Point the camera at the typed angles."""
+        self.page.stop_playback()
+        self.page.show_message("")
+        try:
+            angles = tuple(float(text) for text in event.args)
+        except (TypeError, ValueError):
+            self.page.show_message("an angle is not a number; allowed: degrees, e.g. 83.6")
+            return
+        if await self.page.show_live("point", angles, self.page.solving):
+            for field in self.inputs:
+                field.run_method("blur")  # so that the arrow keys move the camera again
+
+    def focus(self) -> None:
+        """Give the first angle the keyboard focus."""
+        self.inputs[0].run_method("focus")
+
+    def show(self, view: FrameView) -> None:
+        info = self.page.scene_info
+        if self.shows_photo and info:
+            self.shows_photo = False
+            self.set_headers(info.names)
+            self.set_placeholder("")
+        for field, angle in zip(self.inputs, view.angles_deg, strict=True):
+            field.set_value(format_angle(angle))
+        self.show_result(view.result)
+
+    def show_photo(self, photo: Photo) -> None:
+        """Display the attitudes of an image that is not of the current scene; a user's image has no true attitude."""
+        self.shows_photo = True
+        self.set_headers(photo.names)
+        self.set_placeholder("unknown")
+        texts = (
+            [format_angle(angle) for angle in photo.true_deg] if photo.true_deg else ["", "", ""]
+        )
+        for field, text in zip(self.inputs, texts, strict=True):
+            field.set_value(text)
+        self.show_result(photo.result)
+
+    def set_placeholder(self, text: str) -> None:
+        for field in self.inputs:
+            field.props["placeholder"] = text
+            field.update()
+
+    def show_result(self, result: TrackerResult | None) -> None:
+        """Display the tracker's angles, errors and status; dashes without a solution."""
+        if result is None or result.angles_deg is None:
+            for label in (*self.estimates, *self.errors):
+                label.set_text("–")
+        else:
+            for label, angle in zip(self.estimates, result.angles_deg, strict=True):
+                label.set_text(format_angle(angle))
+            cross, roll = result.sigma_arcsec
+            self.errors[0].set_text(
+                "–" if math.isnan(result.cross_arcsec) else f"cross {result.cross_arcsec:.2f}″"
+            )
+            self.errors[1].set_text(
+                "–" if math.isnan(result.roll_arcsec) else f"roll {result.roll_arcsec:+.1f}″"
+            )
+            self.errors[2].set_text(
+                "–" if math.isnan(cross) else f"σ {format_number(cross)}″ {format_number(roll)}″"
+            )
+        color, text = status_line(result)
+        self.status.set_text(text, color)
+
+
+def format_angle(angle: float) -> str:
+    """Format with four decimals; adding 0.0 turns minus zero into zero."""
+    return f"{round(angle, 4) + 0.0:.4f}"
+
+
+def status_line(result: TrackerResult | None) -> tuple[str, str]:
+    """Style class and status line: solved, refused, wrong, or not solved."""
+    if result is None:
+        return "quiet", "not solved: press 1 to identify"
+    if not result.solved:
+        return "warn", f"{result.status}; {len(result.detections)} lights detected"
+    time_text = f", {result.ms:.1f} ms" if result.ms else ""  # a replayed trial has no time
+    counts = f"{result.identified} of {len(result.detections)} lights identified{time_text}"
+    if result.wrong:
+        return "bad", f"WRONG by more than 10′ and than claimed; {counts}"
+    return "good", f"solved; {counts}"
+
+
+# Lights panel: a table of the true lights of the frame and of what the tracker made of each.
+
+
+HEADS = ("light", "V", "e⁻", "x, px", "y, px", "error, px", "taken for")
+UPDATE_S = 0.5
+
+
+class LightsTable(ui.element, component="js/lights.js"):  # type: ignore[call-arg]
+    """The table, implemented in lights.js."""
+
+
+class LightsPanel:
+    """Panel with the table. sent : number of the frame in it"""
+
+    def __init__(self, sensor: SensorView) -> None:
+        self.sensor = sensor
+        self.sent = 0
+        self.table = LightsTable().mark("lights")
+
+    def update(self) -> None:
+        """Send the table of the sensor's frame if it is another one; every UPDATE_S while the panel is open."""
+        sensor = self.sensor
+        if self.sent == sensor.sent_number:
+            return
+        self.sent = sensor.sent_number
+        detections = sensor.result.detections if sensor.result else ()
+        self.table.run_method(
+            "show", HEADS, list(rows(sensor.lights[:MAX_TRUTH_MARKS], detections, sensor.name))
+        )
+
+
+def rows(
+    lights: Collection[LightRow], detections: Collection[Detection], name: Callable[[int], str]
+) -> Iterator[dict[str, Any]]:
+    """Rows of the table: every true light with its detection, the brightest first, then detections of no light.
+
+    Returns
+    -------
+    state
+        Good if the light was identified, warn if a detection is false or taken for another
+        light, else quiet
+    """
+    found = list(detections)
+    found_px = np.array([(one.x, one.y) for one in found]).reshape(-1, 2)
+    left = set(range(len(found)))
+    for light in lights:
+        distance_px = np.hypot(*(found_px - (light.x, light.y)).T)
+        n = int(distance_px.argmin()) if len(found) else -1
+        near = n in left and distance_px[n] < NEAR_PX
+        spot = found[n] if near else None
+        left -= {n} if near else set()
+        yield {
+            "key": f"light {light.id}",
+            "id": light.id,
+            "state": state(light, spot),
+            "cells": cells(light, spot, name),
+        }
+    for n in sorted(left):
+        spot = found[n]
+        taken = name(spot.id) if spot.id >= 0 else ""
+        texts = ["no light", "", f"{spot.flux:.4g}", f"{spot.x:.2f}", f"{spot.y:.2f}", "", taken]
+        yield {"key": f"detection {n}", "id": -1, "state": "warn", "cells": texts}
+
+
+def cells(light: LightRow, spot: Detection | None, name: Callable[[int], str]) -> list[str]:
+    magnitude = "" if math.isnan(light.magnitude) else f"{light.magnitude:.2f}"
+    texts = [
+        name(light.id),
+        magnitude,
+        f"{light.electrons:.4g}",
+        f"{light.x:.2f}",
+        f"{light.y:.2f}",
+    ]
+    if spot is None:
+        return [*texts, "", ""]
+    error_px = math.hypot(spot.x - light.x, spot.y - light.y)
+    return [*texts, f"{error_px:.3f}", name(spot.id) if spot.id >= 0 else "–"]
+
+
+def state(light: LightRow, spot: Detection | None) -> str:
+    if spot is None or spot.id < 0:
+        return "quiet"
+    return "good" if spot.id == light.id else "warn"

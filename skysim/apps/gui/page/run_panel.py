@@ -1,0 +1,392 @@
+"""Run panel: computes the scene's flight in the worker, and plays its frames: scrub, step, any speed."""
+
+from __future__ import annotations
+
+import asyncio
+import bisect
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from nicegui import ui
+
+from skysim.apps.gui.messages import FlightRow, FlightStep, MotionLog
+from skysim.apps.gui.page.strips import StripChart, rms_line, strips
+from skysim.apps.gui.views import keys
+from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views.forms import FEEDBACKS, loop_overrides
+from skysim.apps.gui.views.live import Contents, LiveInput, LiveText, csv_table
+from skysim.apps.gui.views.sensor import SensorView
+
+SPEEDS = {"real time": 1.0, "½": 0.5, "¼": 0.25, "1/10": 0.1, "2×": 2.0, "5×": 5.0}
+CONTROL_KEYS = ("motion.control", "motion.maneuver")
+BUDGET_S = 0.04  # of a piece of the flight; a key waits for one at most
+LOOK_S = 0.05  # between two looks whether the flight still plays
+DRAW_S = 0.7  # between two drawings of the strips while frames come
+
+
+class RunPanel:
+    """Panel that computes the flight, plays, pauses, steps and seeks.
+
+    Attributes
+    ----------
+    sensor
+        Which shows its frames
+    contents
+        Of the tab's live fields
+    feedback
+        Of the scene's controller; None without a controller
+    rows, log
+        Of the computed frames and of the motion
+    residuals
+        Of the identified lights, see `FlightStep`
+    computing, stopping
+        Whether the flight is being computed, and whether it shall end
+    playing, showing
+        Whether it plays, and whether `play_on` shows its frames
+    slot
+        Of the panel in the page
+    wanted_s
+        Time to be shown once the flight is computed; None: play it from its start
+    when_shown
+        Called then
+    sought
+        Place of the slider while its frame is not shown yet
+    index
+        Of the frame on the page
+    started_s, from_s
+        Time of the last start of playback, and in the flight there
+    closed_scene, closed_overrides
+        Last scene with a closed loop and its overrides, with which an opened loop is closed
+        again
+    """
+
+    def __init__(self, page: PageContext, contents: Contents, sensor: SensorView) -> None:
+        self.page = page
+        self.contents = contents
+        self.sensor = sensor
+        self.feedback: str | None = None
+        self.rows: list[FlightRow] = []
+        self.log = MotionLog(())
+        self.times_s: list[float] = []
+        self.residuals: list[tuple[float, int, float]] = []
+        self.computing = self.stopping = self.playing = self.showing = False
+        self.wanted_s: float | None = None
+        self.when_shown: Callable[[], None] | None = None
+        self.sought: int | None = None
+        self.plays_when_done = False
+        self.index = 0
+        self.factor = SPEEDS["real time"]
+        self.started_s = 0.0
+        self.from_s = 0.0
+        self.drawn_s = 0.0
+        self.closed_scene = ""
+        self.closed_overrides: dict[str, str] = {}
+        self.slot = ui.context.slot
+        self.build()
+        ui.on("moment", self.clicked)
+
+    def build(self) -> None:
+        with ui.row().classes("w-full no-wrap items-center gap-1"):
+            self.simulate_button = ui.button("Simulate", on_click=self.simulate).props(
+                "dense outline size=sm"
+            )
+            self.simulate_button.mark("fly")
+            self.back = self.player_button(
+                "skip_previous", "Previous frame", partial(self.step, -1)
+            )
+            self.play = self.player_button("play_arrow", "Play", self.toggle)
+            self.forward = self.player_button("skip_next", "Next frame", partial(self.step, 1))
+            self.speed = ui.select(list(SPEEDS), value="real time").props(
+                'dense borderless aria-label="Speed"'
+            )
+            self.speed.classes("w-24").on("popup-hide", js_handler=keys.BLUR_JS).on_value_change(
+                self.resync
+            )
+            self.loop = ui.select({}, on_change=self.close_loop).props(
+                "dense borderless options-dense"
+            )
+            self.loop.props('aria-label="Feedback"').mark("feedback").on(
+                "popup-hide", js_handler=keys.BLUR_JS
+            )
+        self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
+        with ui.row().classes("w-full no-wrap items-center gap-3"):
+            self.seek = LiveInput(self.contents, "range").props(
+                'min=0 step=1 aria-label="Frame of the flight"'
+            )
+            self.seek.classes("lab-seek").on(
+                "input", self.slid, js_handler="event => emit(event.target.value)"
+            )
+            self.clock = LiveText(self.contents).classes("mono flex-none").mark("clock")
+        with ui.row().classes("w-full no-wrap items-center gap-3"):
+            self.summary = ui.label().classes("quiet flex-grow").mark("flight")
+            self.csv_button = (
+                ui.button("CSV", on_click=self.download).props("dense flat size=sm").mark("csv")
+            )
+        self.strips = StripChart(self.contents)
+        self.enable()
+
+    def player_button(self, icon: str, label: str, action: Any) -> ui.button:
+        button = ui.button(icon=icon, on_click=action).props(f'dense flat aria-label="{label}"')
+        return button.mark(label.lower())
+
+    def enable(self) -> None:
+        """Let the controls work that have frames to work on, and say what to do without."""
+        for item in (self.back, self.play, self.forward, self.csv_button):
+            item.set_enabled(bool(self.rows) and not self.computing)
+        self.seek.props(f"max={max(len(self.rows) - 1, 1)}")
+        self.seek.props["disabled"] = not self.rows or self.computing
+        if self.rows or self.computing:
+            return
+        info = self.page.scene_info
+        self.clock.set_text("")
+        self.summary.set_text(
+            f"No flight yet. Simulate computes the motion of {info.duration_s:.4g} s and every frame of it."
+            if info
+            else ""
+        )
+
+    def set_scene(self, feedback: str | None) -> None:
+        """Take over a new scene, which has no flight yet. feedback : of its controller; None without one"""
+        self.pause()
+        self.clear()
+        self.feedback = feedback
+        state = self.page.state
+        if feedback:
+            self.closed_scene = state.scene
+            self.closed_overrides = dict(state.overrides)
+        offered = FEEDBACKS if self.closed_scene == state.scene else {"": FEEDBACKS[""]}
+        self.loop.set_options(offered, value=feedback or "")
+
+    def clear(self) -> None:
+        self.rows = []
+        self.log = MotionLog(())
+        self.times_s = []
+        self.residuals = []
+        self.index = 0
+        self.from_s = 0.0
+        self.seek.set_value(0)
+        self.bar.set_value(0)
+        self.strips.draw([], 1.0, str)
+        self.enable()
+
+    async def close_loop(self) -> None:
+        """Reopen the scene with another feedback. An opened loop can be closed again with its old controller."""
+        state = self.page.state
+        feedback = str(self.loop.value or "")
+        if self.closed_scene != state.scene or feedback == (self.feedback or ""):
+            return
+        others = {
+            key: value for key, value in state.overrides.items() if not key.startswith(CONTROL_KEYS)
+        }
+        controls = {
+            key: value
+            for key, value in self.closed_overrides.items()
+            if key.startswith(CONTROL_KEYS)
+        }
+        maneuver = {
+            key: value
+            for key, value in controls.items()
+            if feedback and key.startswith("motion.maneuver")
+        }
+        control = loop_overrides(state.scene, others | controls, feedback)
+        self.loop.disable()  # no second change while this one runs
+        await self.page.open(state.scene, others | maneuver | control)
+        if self.page.is_open:
+            self.loop.set_value(
+                self.feedback or ""
+            )  # the old value, if the scene refused the change
+            self.loop.enable()
+
+    # Computing.
+
+    def stop_computing(self) -> None:
+        """Ask the computation of the flight to end after its current piece; the frames so far are kept."""
+        self.stopping = self.computing
+
+    async def simulate(self) -> None:
+        """Compute the flight, then play it; if it is being computed, stop that and keep the frames so far."""
+        self.stop_computing()
+        if self.computing:
+            return
+        self.pause()
+        self.computing = self.plays_when_done = True
+        self.clear()
+        self.simulate_button.set_text("Stop")
+        self.page.show_message("")
+        done = await self.compute()
+        if not self.page.is_open:
+            return
+        self.computing = False
+        self.simulate_button.set_text("Simulate")
+        self.bar.set_value(0)
+        self.draw()
+        self.enable()
+        if self.rows:
+            flown = f"flight of {Path(self.page.state.scene).name}: {rms_line(self.rows)}"
+            self.page.log(flown if done else f"{flown}; stopped")
+        if self.wanted_s is not None:
+            await self.show_moment(self.wanted_s)
+            self.wanted_s = None
+            if self.when_shown:
+                self.when_shown()
+        elif self.rows and self.plays_when_done and done:
+            self.start()
+
+    async def compute(self) -> bool:
+        """Compute piece by piece, so that keys and other requests get their turn; return whether it was all."""
+        step = await self.page.ask("begin_flight")
+        while step is not None and not step.is_done and not self.stopping:
+            self.take(step)
+            step = await self.page.ask("advance_flight", BUDGET_S)
+        if step is not None:
+            self.take(step)
+        self.stopping = False
+        return step is not None and step.is_done
+
+    def take(self, step: FlightStep) -> None:
+        """Take over what is new of the flight."""
+        self.rows += step.rows
+        self.residuals += step.residuals
+        self.times_s += [row.t_s for row in step.rows]
+        self.log = step.log or self.log
+        self.bar.set_value(step.t_s / max(step.duration_s, 1e-9))
+        self.summary.set_text(f"{step.t_s:.2f} of {step.duration_s:.2f} s, {len(self.rows)} frames")
+        if time.monotonic() > self.drawn_s + DRAW_S and (step.rows or step.log):
+            self.draw()
+
+    def draw(self) -> None:
+        """Draw the strips with the frames so far."""
+        self.drawn_s = time.monotonic()
+        ends = [*self.log.t_s[-1:], *self.times_s[-1:]]
+        lights = () if self.computing else self.residuals  # which are many, and sent once
+        self.strips.draw(
+            strips(self.rows, self.log, lights), max(ends, default=1.0), self.sensor.name
+        )
+        if self.rows:
+            self.summary.set_text(rms_line(self.rows))
+
+    async def restore(self, t_s: float, when_shown: Callable[[], None]) -> None:
+        """Show a moment of the flight again; compute the flight first if it is not kept.
+
+        Parameters
+        ----------
+        when_shown
+            Called after this computation
+        """
+        if self.rows and not self.computing:
+            await self.show_moment(t_s)
+            return
+        self.wanted_s = t_s
+        self.when_shown = when_shown
+        if not self.computing:
+            self.page.show_panel("Run")
+            ui.timer(0, self.simulate, once=True)
+
+    # Playing.
+
+    def start(self) -> None:
+        self.page.stop_playback()
+        self.playing = True
+        self.started_s = time.monotonic()
+        self.play.props("icon=pause")
+        with self.slot:  # not in that of a palette's row, which ends with the palette
+            ui.timer(0, self.play_on, once=True)
+
+    def toggle(self) -> None:
+        """Play or pause; at the end, play again from the start."""
+        if self.playing:
+            self.pause()
+        elif self.rows and not self.computing:
+            self.from_s = 0.0 if self.index >= len(self.rows) - 1 else self.times_s[self.index]
+            self.start()
+
+    def pause(self) -> None:
+        self.from_s = self.now_s
+        self.playing = False
+        self.plays_when_done = False
+        self.play.props("icon=play_arrow")
+
+    @property
+    def now_s(self) -> float:
+        """Current playback time."""
+        elapsed = (time.monotonic() - self.started_s) * self.factor if self.playing else 0.0
+        return self.from_s + elapsed
+
+    def resync(self) -> None:
+        """Continue from the current time at another speed."""
+        self.from_s = self.now_s
+        self.started_s = time.monotonic()
+        self.factor = SPEEDS[str(self.speed.value)]
+
+    async def step(self, frames: int) -> None:
+        """Show the next or the previous frame."""
+        if self.rows and not self.computing:
+            self.pause()
+            await self.show_index(min(max(self.index + frames, 0), len(self.rows) - 1))
+
+    async def clicked(self, event: Any) -> None:
+        """A strip was clicked at a time."""
+        await self.show_moment(float(event.args))
+
+    async def show_moment(self, t_s: float) -> None:
+        """Show the frame nearest to a time of the flight."""
+        if self.rows and not self.computing:
+            self.pause()
+            await self.show_index(
+                min(range(len(self.times_s)), key=lambda n: abs(self.times_s[n] - t_s))
+            )
+
+    async def slid(self, event: Any) -> None:
+        """The slider is dragged: show the frame at its place, of several the newest."""
+        is_showing = self.sought is not None
+        self.sought = int(event.args)
+        while not is_showing and self.sought is not None:
+            index = self.sought
+            if 0 <= index < len(self.rows):
+                self.from_s = self.times_s[index]
+                self.started_s = time.monotonic()
+                await self.show_index(index)
+            if self.sought == index:
+                self.sought = None
+
+    async def play_on(self) -> None:
+        """While the flight plays, show the frame whose turn it is; pause at the last."""
+        if self.showing:  # it was paused and started again meanwhile
+            return
+        self.showing = True
+        try:
+            while self.playing and self.rows and self.page.is_open:
+                index = max(bisect.bisect_right(self.times_s, self.now_s) - 1, 0)
+                if index != self.index or self.page.state.kind != "flight":
+                    await self.show_index(index)
+                if self.index >= len(self.rows) - 1:
+                    self.pause()
+                elif self.playing:
+                    wait_s = (self.times_s[self.index + 1] - self.now_s) / self.factor
+                    await asyncio.sleep(min(max(wait_s, 0.001), LOOK_S))
+        except Exception:
+            self.pause()
+            raise
+        finally:
+            self.showing = False
+
+    async def show_index(self, index: int) -> None:
+        """Show a frame of the flight."""
+        self.index = index
+        view = await self.page.ask("flight_frame", index)
+        if view is None or index >= len(self.rows):
+            return
+        self.seek.set_value(index)
+        self.clock.set_text(f"{view.t_s:.2f} s  {index + 1}/{len(self.rows)}")
+        self.strips.set_moment(view.t_s)
+        self.page.show_frame(view, kind="flight", t_s=view.t_s)
+        await self.sensor.wait_drawn()
+
+    def download(self) -> None:
+        ui.download(
+            csv_table(FlightRow._fields, self.rows),
+            f"{Path(self.page.state.scene).stem}_flight.csv",
+        )

@@ -1,0 +1,349 @@
+"""Scene and Tracker panels: the keys of the scene as forms, all of them, and those of image processing and tracker."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+from nicegui import run, ui
+
+from skysim.apps.gui.page.monte_carlo_panel import MonteCarloPanel
+from skysim.apps.gui.views import forms, keys
+from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views.live import for_page
+from skysim.core.errors import InputError
+
+SENSOR = "sensor, F6"
+IDENTIFIER = "identifier, F7"
+NAMES = {  # by group and key
+    SENSOR: {
+        "tracker.detector": "detector",
+        "tracker.centroider": "centroider",
+        "tracker.threshold_sigma": "threshold, σ",
+        "tracker.min_area_px": "least area",
+        "camera.detector.noise": "camera's noise, N",
+        "camera.detector.read_noise_e": "read noise",
+        "light.limit_mag": "faintest star, V",
+    },
+    IDENTIFIER: {
+        "tracker.identifier": "identifier",
+        "tracker.solver": "solver",
+        "tracker.limit_mag": "limiting magnitude",
+        "tracker.catalog": "catalog",
+        "tracker.centroid_sigma_px": "least error",
+        "tracker.brightest": "brightest lights",
+        "tracker.brightness_sigma": "brightness, σ",
+        "tracker.decoder.gate_px": "decoder's gate",
+        "tracker.decoder.frames": "decoder's frames",
+    },
+}
+FOCUS_S = 0.2  # until a part that opens is drawn
+MODEL = "Sensor model: the Monte Carlo simulation of centroids takes stars of the catalog with random errors."
+
+
+class KeyForm:
+    """Form with one expandable part per group of keys; values that differ from the file are marked.
+
+    Attributes
+    ----------
+    label
+        Of a field, from its key
+    opens
+        The group that is open at first
+    scene, fields
+        The scene whose fields are shown, and these by key
+    last_typed
+        By key the last typed value, accepted or refused
+    rows, labels, inputs
+        By key its elements
+    expansions
+        By group
+    """
+
+    def __init__(
+        self, page: PageContext, label: Callable[[forms.FormField], str], opens: str = ""
+    ) -> None:
+        self.page = page
+        self.label = label
+        self.opens = opens
+        self.parts = ui.column().classes("lab-sections w-full gap-0")
+        self.rows: dict[str, ui.element] = {}
+        self.expansions: dict[str, ui.expansion] = {}
+        self.inputs: dict[str, ui.input | ui.select] = {}
+        self.scene = ""
+        self.fields: dict[str, forms.FormField] = {}
+        self.last_typed: dict[str, str] = {}
+        self.labels: dict[str, ui.label] = {}
+
+    def show(self, groups: Mapping[str, Sequence[forms.FormField]]) -> None:
+        """Show the fields of the current scene. Open groups stay open, and text being typed is kept."""
+        by_key = {field.key: field for fields in groups.values() for field in fields}
+        same = [(key, field.allowed_values) for key, field in by_key.items()] == [
+            (key, field.allowed_values) for key, field in self.fields.items()
+        ]
+        scene = self.page.state.scene
+        if self.scene == scene and same:
+            for key, field in by_key.items():
+                self.update_field(field, self.fields[key])
+        else:
+            self.build(groups)
+        self.scene = scene
+        self.fields = by_key
+
+    def build(self, groups: Mapping[str, Sequence[forms.FormField]]) -> None:
+        open_now = {name for name, expansion in self.expansions.items() if expansion.value}
+        open_now = open_now if self.expansions else {self.opens}
+        self.parts.clear()
+        for elements in (self.expansions, self.last_typed, self.rows, self.labels, self.inputs):
+            elements.clear()
+        with self.parts:
+            for name, fields in groups.items():
+                box = ui.expansion(name, group=f"keys-{id(self)}", value=name in open_now)
+                self.expansions[name] = box.classes("w-full").props("dense dense-toggle")
+                with box:
+                    for field in fields:
+                        self.row(field)
+
+    def row(self, field: forms.FormField) -> None:
+        with ui.row().classes("w-full no-wrap items-start gap-2") as box:
+            head = (
+                ui.label(self.label(field))
+                .classes("mono w-48 flex-none ellipsis")
+                .style("padding-top: 6px")
+            )
+            head.tooltip(field.key).classes(self.style_class(field))
+            if field.allowed_values:
+                selected = field.shown if field.shown in field.allowed_values else None
+                entry: ui.input | ui.select = ui.select(list(field.allowed_values), value=selected)
+                entry.props("dense outlined options-dense").on_value_change(
+                    partial(self.edit, field.key)
+                )
+                entry.on("popup-hide", js_handler=keys.BLUR_JS)
+                if len(field.allowed_values) == 1:
+                    entry.props("readonly hide-dropdown-icon")
+            else:
+                entry = ui.input(value=field.shown).props(f'dense outlined suffix="{field.unit}"')
+                leave = partial(self.edit, field.key)
+                entry.on("keydown.enter", leave).on("blur", leave)
+            entry.classes("flex-grow").style("width: 0; margin-bottom: 3px").mark(
+                f"key-{field.key}"
+            )
+            entry.props(f'hide-bottom-space aria-label="{field.key}"')
+        self.rows[field.key] = box
+        self.inputs[field.key] = entry
+        self.labels[field.key] = head
+
+    def style_class(self, field: forms.FormField) -> str:
+        """Style class of a key: changed by the user, set in a file, or default."""
+        changed = any(
+            field.key == key or field.key.startswith(f"{key}.") for key in self.page.state.overrides
+        )
+        return "warn" if changed else "given" if field.is_set else "quiet"
+
+    def update_field(self, field: forms.FormField, before: forms.FormField) -> None:
+        """Update a field after the scene has changed; text typed since then is kept."""
+        self.labels[field.key].classes(remove="warn given quiet", add=self.style_class(field))
+        if field.shown != before.shown and (
+            not field.allowed_values or field.shown in field.allowed_values
+        ):
+            self.last_typed[field.key] = field.shown
+            self.inputs[field.key].set_value(field.shown)
+            self.show_error(field.key, "")
+
+    async def edit(self, key: str, *_: object) -> None:
+        """Apply a typed value, or show at the field why it is refused."""
+        value = str(self.inputs[key].value)
+        current = self.fields[key].shown
+        if value == self.last_typed.get(key, current):
+            return  # leaving a field after Enter reports the same value again
+        self.last_typed[key] = value
+        self.show_error(key, "")
+        if value == current:
+            return
+        before = self.page.state.overrides
+        try:
+            after = await run.io_bound(forms.with_value, self.page.state.scene, before, key, value)
+        except InputError as error:
+            self.show_error(key, error.fault if error.key == key else for_page(error))
+            return
+        changed = {one: text for one, text in after.items() if before.get(one) != text}
+        await self.page.apply_overrides(changed, before.keys() - after.keys())
+        now = self.page.state.overrides
+        if any(now.get(one) != text for one, text in after.items()):  # it could not be set up
+            self.show_error(key, self.page.message_text)
+
+    def show_error(self, key: str, message: str) -> None:
+        """Show an error message at a field, if it is still there; an empty one removes it."""
+        entry = self.inputs.get(key)
+        if entry is None:
+            return
+        if message:
+            entry.props("error").props["error-message"] = message
+        else:
+            entry.props(remove="error error-message")
+        entry.update()
+
+
+class ScenePanel:
+    """The form, one part per section of the scene, a field that finds keys, and a button that saves a new scene file.
+
+    Attributes
+    ----------
+    folder
+        Of the saved scenes
+    saved
+        Called when one is there
+    shown
+        Scene and overrides in the form
+    """
+
+    def __init__(self, page: PageContext, folder: Path, saved: Callable[[], None]) -> None:
+        self.page = page
+        self.folder = folder
+        self.saved = saved
+        self.shown: tuple[str, Mapping[str, str]] | None = None
+        with ui.row().classes("w-full no-wrap items-center gap-2").style("margin-bottom: 8px"):
+            self.find = ui.input(placeholder="find a key", on_change=lambda: self.search())
+            self.find.props("dense outlined clearable").classes("flex-grow").mark("find-key")
+            self.name = ui.input(placeholder="new-name").props(
+                'dense outlined aria-label="Name of the new scene"'
+            )
+            self.name.classes("w-36").mark("save-name")
+            ui.button("Save as", on_click=self.save).props("dense outline no-wrap size=sm").mark(
+                "save"
+            )
+            self.undo = (
+                ui.button("Undo all", on_click=self.revert)
+                .props("dense flat no-wrap size=sm")
+                .mark("revert")
+            )
+        self.no_match = ui.label("No key contains this text.").classes("w-full empty")
+        self.no_match.set_visibility(False)
+        self.form = KeyForm(page, lambda field: field.key.removeprefix(f"{field.section}."))
+
+    def set_scene(self, fields: Sequence[forms.FormField]) -> None:
+        """Show the fields of the current scene."""
+        sections = dict.fromkeys(field.section for field in fields)
+        self.form.show(
+            {name: [field for field in fields if field.section == name] for name in sections}
+        )
+        self.undo.set_visibility(bool(self.page.state.overrides))
+        self.filter()
+
+    def filter(self) -> None:
+        """Show only keys that contain the search text, and sections with such keys."""
+        text = (self.find.value or "").lower()
+        for key, box in self.form.rows.items():
+            box.set_visibility(text in key.lower())
+        visible = {field.section for key, field in self.form.fields.items() if text in key.lower()}
+        for section, expansion in self.form.expansions.items():
+            expansion.set_visibility(section in visible)
+        self.no_match.set_visibility(not visible)
+
+    def search(self) -> None:
+        """Filter, and open the first section with a matching key if none is open."""
+        self.filter()
+        expansions = self.form.expansions.values()
+        first = next((item for item in expansions if item.visible), None)
+        if (
+            self.find.value
+            and first
+            and not any(item.value and item.visible for item in expansions)
+        ):
+            first.open()
+
+    async def save(self) -> None:
+        name = (self.name.value or "").strip()
+        info = self.page.scene_info
+        title_before = info.title.removesuffix(", changed") if info else ""
+        title = f"{title_before}, changed" if title_before else name
+        state = self.page.state
+        try:
+            path = await run.io_bound(
+                forms.save, self.folder, name, state.scene, state.overrides, title
+            )
+        except InputError as error:
+            self.page.show_message(for_page(error))
+            return
+        self.page.log(f"saved {path}")
+        self.saved()
+        self.name.set_value("")
+        self.page.show_message(f"saved as {path.name}", "good")
+
+    async def revert(self) -> None:
+        """Reopen the scene without overrides."""
+        self.form.scene = ""  # forces a rebuild, which removes refused values too
+        await self.page.open(self.page.state.scene)
+
+
+class TrackerPanel:
+    """What F6 and F7 of PTASE set up: image processing with the sensor's noise, and identification.
+
+    A form of two parts, without keys that have no effect, and the noise of the Monte Carlo simulation's lights.
+
+    Attributes
+    ----------
+    study
+        The panel of that simulation
+    shown
+        Scene and overrides in the form
+    """
+
+    def __init__(self, page: PageContext, study: MonteCarloPanel) -> None:
+        self.page = page
+        self.study = study
+        self.shown: tuple[str, Mapping[str, str]] | None = None
+        names = {key: name for group in NAMES.values() for key, name in group.items()}
+        self.form = KeyForm(page, lambda field: names[field.key], opens=SENSOR)
+        ui.label(MODEL).classes("quiet").style("margin: 10px 0 4px")
+        with ui.row().classes("w-full no-wrap items-center gap-2"):
+            self.arcsec = (
+                ui.number("noise, ″ an axis", min=0, step=1)
+                .props("dense outlined")
+                .mark("noise-arcsec")
+            )
+            self.arcsec.on("blur", self.typed).on("keydown.enter", self.typed)
+            magnitude = ui.number("noise, magnitudes", min=0, max=5, step=0.05).props(
+                "dense outlined"
+            )
+            magnitude.classes("w-36 flex-none").bind_value(study.magnitude)
+            ui.checkbox("with noise").props("dense size=xs").bind_value(study.with_noise).mark(
+                "model-noise"
+            )
+        study.noise.on_value_change(self.show_noise)
+
+    def set_scene(self, fields: Sequence[forms.FormField]) -> None:
+        """Show the fields of the current scene."""
+        offered = {field.key: field for field in fields if not field.no_effect}
+        self.form.show(
+            {group: [offered[key] for key in NAMES[group] if key in offered] for group in NAMES}
+        )
+        self.show_noise()
+
+    def show_noise(self) -> None:
+        """Show the noise of a centroid, which is in pixels, as an angle in the middle of the frame."""
+        info = self.page.scene_info
+        if info:
+            self.arcsec.set_value(
+                float(f"{float(self.study.noise.value or 0) * info.pixel_arcsec:.4g}")
+            )
+
+    def typed(self) -> None:
+        """Take over a typed angle."""
+        info = self.page.scene_info
+        noise = self.study.noise
+        shown = float(f"{float(noise.value or 0) * info.pixel_arcsec:.4g}") if info else 0.0
+        if info and self.arcsec.value != shown:
+            noise.set_value(float(f"{float(self.arcsec.value or 0) / info.pixel_arcsec:.4g}"))
+
+    def open(self, action: str) -> None:
+        """Show the part of an action, sensor or identifier, with the keyboard on its first field."""
+        group = SENSOR if action == "sensor" else IDENTIFIER
+        if group in self.form.expansions:
+            self.form.expansions[group].open()
+            entry = self.form.inputs.get(
+                f"tracker.{'detector' if group == SENSOR else 'identifier'}"
+            )
+            if entry:
+                ui.timer(FOCUS_S, partial(keys.focus, entry), once=True)

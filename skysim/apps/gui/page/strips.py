@@ -1,0 +1,324 @@
+"""Strip charts of a flight: curves against a common time axis, one chart above the other, with a shared cursor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from nicegui import ui
+
+from skysim.apps.gui.messages import FlightRow, MotionLog
+from skysim.apps.gui.views.live import Contents
+from skysim.apps.gui.views.style import CURVE_COLORS, TOOLTIP, chart_color
+
+BAND_COLOR = "#8b95a5"
+STRIP_PX = 118  # height of a strip
+HEAD_PX = 22  # of its title and legend
+AXIS_PX = 24  # of the time axis
+INNER_PX = STRIP_PX - HEAD_PX - 8  # height of a strip between its axes
+MAX_DOTS = 20_000  # of lights; of more, some frames are left out
+Points = list[list[float]]
+LEFT_PX = 52  # from a strip to the left edge of the chart
+RIGHT_PX = 12
+# A click on a strip, and the line of the shown moment over all strips. The line is an element of its own, because the
+# chart would draw all curves again for it.
+CHART_JS = """() => {
+  const chart = getElement(%d).chart;
+  if (skysimMoment.chart !== chart) {
+    const line = document.createElement("div");
+    line.className = "lab-moment";
+    chart.getDom().append(line);
+    Object.assign(skysimMoment, { chart, line });
+    chart.getZr().on("click", event => {
+      const at = [event.offsetX, event.offsetY];
+      chart.getOption().grid.forEach((_, gridIndex) => {
+        if (!chart.containPixel({ gridIndex }, at)) return;
+        emitEvent("moment", chart.convertFromPixel({ gridIndex }, at)[0]);
+      });
+    });
+  }
+  skysimMoment(skysimMoment.t_s ?? 0);
+  getElement(%d)?.attach(chart);
+}"""
+MOMENT_JS = f"""
+window.skysimMoment = (t_s) => {{
+  const {{ chart, line }} = skysimMoment;
+  skysimMoment.t_s = t_s;
+  if (!chart) return;
+  const x = chart.convertToPixel({{ xAxisIndex: 0 }}, t_s);
+  line.hidden = !(x >= {LEFT_PX} && x <= chart.getWidth() - {RIGHT_PX});
+  line.style.transform = `translateX(${{x}}px)`;
+}};
+"""
+
+
+@dataclass(frozen=True)
+class StripCurve:
+    """One curve of a strip. kind : line, dots (a value per frame), or band (an area of 3 standard errors)."""
+
+    name: str
+    points: Points
+    kind: str = "line"
+
+
+@dataclass(frozen=True)
+class Strip:
+    """One chart with its unit in the title.
+
+    Attributes
+    ----------
+    dots
+        Of lights, drawn by strips.js: time, value, and the light's number
+    """
+
+    title: str
+    curves: tuple[StripCurve, ...] = ()
+    logarithmic: bool = False
+    dots: Points = field(default_factory=list)
+
+    @property
+    def drawn(self) -> tuple[StripCurve, ...]:
+        return tuple(curve for curve in self.curves if curve.points)
+
+
+class Dots(ui.element, component="js/strips.js"):  # type: ignore[call-arg]
+    """Dots over a strip, implemented in strips.js."""
+
+
+def strips(
+    rows: Sequence[FlightRow], log: MotionLog, residuals: Sequence[tuple[float, int, float]] = ()
+) -> list[Strip]:
+    """The strips of a flight that have something to show. residuals : see `FlightStep`"""
+
+    def of_frames(value: Callable[[FlightRow], float]) -> Points:
+        pairs = ((row.t_s, value(row)) for row in rows)
+        return [[round(t, 4), float(f"{y:.5g}")] for t, y in pairs if not math.isnan(y)]
+
+    def of_motion(name: str) -> StripCurve:
+        values = log.curves.get(name, ())
+        return StripCurve(
+            name, [[round(t, 4), float(f"{y:.5g}")] for t, y in zip(log.t_s, values, strict=False)]
+        )
+
+    found = [
+        Strip(
+            "cross-boresight error, ″",
+            (
+                StripCurve("tracker", of_frames(lambda row: max(row.cross_arcsec, 1e-3)), "dots"),
+                StripCurve("3σ", of_frames(lambda row: 3 * row.cross_sigma_arcsec), "band"),
+            ),
+            logarithmic=True,
+        ),
+        Strip(
+            "roll error, ″",
+            (
+                StripCurve("tracker", of_frames(lambda row: row.roll_arcsec), "dots"),
+                StripCurve("−3σ", of_frames(lambda row: -3 * row.roll_sigma_arcsec), "band"),
+                StripCurve("+3σ", of_frames(lambda row: 3 * row.roll_sigma_arcsec), "band"),
+            ),
+        ),
+        Strip(
+            "attitude error, ″",
+            (
+                *map(of_motion, ("pointing", "IMU alone", "filter")),
+                StripCurve("innovation", of_frames(lambda row: row.innovation_arcsec), "dots"),
+            ),
+            logarithmic=True,
+        ),
+        Strip(
+            "lights",
+            (
+                StripCurve("in the field", of_frames(lambda row: row.lights)),
+                StripCurve("identified", of_frames(lambda row: row.identified)),
+            ),
+        ),
+        Strip("residual of each light, px", dots=thinned(residuals)),
+        Strip("rate, °/s", (of_motion("rate"),)),
+        Strip("momentum, N m s", (of_motion("momentum"),)),
+    ]
+    return [strip for strip in found if strip.drawn or strip.dots]
+
+
+def thinned(residuals: Sequence[tuple[float, int, float]]) -> Points:
+    """The residuals as dots, of every frame or, if they are many, of every so many-th one."""
+    times_s = sorted({t_s for t_s, _, _ in residuals})
+    kept = set(times_s[:: max(math.ceil(len(residuals) / MAX_DOTS), 1)])
+    return [[round(t_s, 4), float(f"{px:.3g}"), id] for t_s, id, px in residuals if t_s in kept]
+
+
+class StripChart:
+    """The chart; a click on a strip emits the page's event `moment` with the time there.
+
+    Attributes
+    ----------
+    contents
+        Of the tab's live fields
+    strips
+        That are drawn
+    """
+
+    def __init__(self, contents: Contents) -> None:
+        self.contents = contents
+        self.strips: list[Strip] = []
+        with ui.element("div").classes("w-full relative-position"):
+            self.chart = ui.echart({"series": []}).classes("w-full").mark("strips")
+            self.dots = Dots().mark("dots")
+        ui.add_body_html(f"<script>{MOMENT_JS}</script>")
+        self.chart.on("chart:finished", js_handler=CHART_JS % (self.chart.id, self.dots.id))
+        self.chart.set_visibility(False)
+
+    def draw(self, drawn: list[Strip], end_s: float, name: Callable[[int], str]) -> None:
+        """Draw strips up to a time. name : of a light"""
+        if any(strip.dots for strip in (*self.strips, *drawn)):
+            self.dots.run_method("show", dot_fields(drawn, name))
+        self.strips = drawn
+        self.chart.set_visibility(bool(drawn))
+        self.chart.style(f"height: {len(drawn) * STRIP_PX + AXIS_PX}px")
+        self.chart.options.clear()
+        self.chart.options.update(options(drawn, end_s) if drawn else {"series": []})
+        self.chart.update()
+
+    def set_moment(self, t_s: float) -> None:
+        """Move the line of the shown moment, when the next frame is drawn."""
+        if self.strips:
+            self.contents.set(self.chart.id, {"moment": f"{t_s:.4f}"})
+
+
+def dot_fields(drawn: list[Strip], name: Callable[[int], str]) -> dict[str, Any]:
+    """What strips.js draws: dots, names of their lights, and the place of their strip."""
+    n = next((n for n, strip in enumerate(drawn) if strip.dots), 0)
+    dots = drawn[n].dots if drawn else []
+    names = {int(id): name(int(id)) for _, _, id in dots}
+    place = {"left": LEFT_PX, "right": RIGHT_PX, "top": n * STRIP_PX + HEAD_PX, "height": INNER_PX}
+    return {"dots": dots, "names": names, "grid": n, "place": place, "color": CURVE_COLORS[0]}
+
+
+def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
+    """ECharts options of stacked strips; each has a title with its unit and a legend."""
+    text = {":color": chart_color("quiet"), "fontSize": 11}
+    rule = {"lineStyle": {":color": chart_color("line")}}
+    title_text = {":color": chart_color("text"), "fontWeight": "normal", "fontSize": 12}
+    title = {"padding": 0, "left": 0, "textStyle": title_text}
+    legend = {
+        "textStyle": text,
+        "itemWidth": 14,
+        "itemHeight": 7,
+        "itemGap": 10,
+        "right": 10,
+        "padding": 0,
+    }
+    tops = [n * STRIP_PX for n in range(len(drawn))]
+    grid = {"left": LEFT_PX, "right": RIGHT_PX, "height": INNER_PX}
+    x_axis = {"type": "value", "min": 0, "max": round(end_s, 3), "splitLine": {"show": False}}
+    last = len(drawn) - 1
+    return {
+        "animation": False,
+        "title": [
+            title | {"text": one.title, "top": top + 3}
+            for one, top in zip(drawn, tops, strict=True)
+        ],
+        "legend": [
+            legend | {"top": top + 3, "data": [curve.name for curve in one.drawn]}
+            for one, top in zip(drawn, tops, strict=True)
+        ],
+        "tooltip": TOOLTIP,
+        "axisPointer": {
+            "link": [{"xAxisIndex": "all"}],
+            "lineStyle": {":color": chart_color("text")},
+        },
+        "dataZoom": [
+            {
+                "type": "inside",
+                "xAxisIndex": "all",
+                "zoomOnMouseWheel": "ctrl",
+                "moveOnMouseMove": "shift",
+            }
+            | {"moveOnMouseWheel": False, "filterMode": "none"}
+        ],
+        "grid": [grid | {"top": top + HEAD_PX} for top in tops],
+        "xAxis": [
+            x_axis
+            | {
+                "gridIndex": n,
+                "axisLabel": text | {"show": n == last, "formatter": "{value} s"},
+                "axisTick": rule,
+            }
+            for n in range(len(drawn))
+        ],
+        "yAxis": [
+            y_axis(one, n) | {"axisLabel": text, "splitLine": rule} for n, one in enumerate(drawn)
+        ],
+        "series": [
+            *(
+                series(curve, n, k)
+                for n, one in enumerate(drawn)
+                for k, curve in enumerate(one.drawn)
+            ),
+        ],
+    }
+
+
+def y_axis(strip: Strip, n: int) -> dict[str, Any]:
+    axis = {"gridIndex": n, "splitNumber": 3, "type": "log" if strip.logarithmic else "value"}
+    if strip.dots:
+        return axis | {"min": 0, "max": round_up(max(dot[1] for dot in strip.dots))}
+    return axis | (
+        decades([y for curve in strip.drawn for _, y in curve.points]) if strip.logarithmic else {}
+    )
+
+
+def round_up(value: float) -> float:
+    """The next greater of 1, 2, 5, 10, ... times a power of ten."""
+    decade = 10.0 ** math.floor(math.log10(max(value, 1e-6)))
+    return float(f"{next(step * decade for step in (1, 2, 5, 10) if step * decade >= value):.6g}")
+
+
+def decades(values: list[float]) -> dict[str, float]:
+    """Axis limits: whole decades that contain the values, the uppermost four at most."""
+    positive = [value for value in values if value > 0] or [1.0]
+    low = math.floor(math.log10(min(positive)))
+    high = math.ceil(math.log10(max(positive)))
+    return {"min": 10.0 ** max(low, high - 4), "max": 10.0 ** max(high, low + 1)}
+
+
+def series(curve: StripCurve, n: int, k: int) -> dict[str, Any]:
+    """ECharts series of a curve in strip n. A band's area reaches to the axis, so that two make one around zero."""
+    color = CURVE_COLORS[k % len(CURVE_COLORS)]
+    look: dict[str, Any] = {
+        "itemStyle": {"color": color},
+        "symbolSize": 5,
+        "showSymbol": curve.kind == "dots",
+    }
+    if curve.kind == "band":
+        color = BAND_COLOR
+        look = {
+            "areaStyle": {"color": color, "opacity": 0.22},
+            "showSymbol": False,
+            "itemStyle": {"color": color},
+        }
+    line = {"lineStyle": {"width": 0.8 if curve.kind == "band" else 1.5, "color": color}}
+    kind = "scatter" if curve.kind == "dots" else "line"
+    return (
+        {"name": curve.name, "type": kind, "data": curve.points, "animation": False}
+        | look
+        | line
+        | in_strip(n)
+    )
+
+
+def in_strip(n: int) -> dict[str, int]:
+    return {"xAxisIndex": n, "yAxisIndex": n}
+
+
+def rms_line(rows: Sequence[FlightRow]) -> str:
+    """Root mean squares over the flight's solved frames, and how many were solved."""
+    solved = [row for row in rows if not math.isnan(row.cross_arcsec)]
+    if not solved:
+        return f"{len(rows)} frames, none solved" if rows else ""
+    cross, roll = (
+        math.sqrt(sum(value**2 for value in values) / len(solved))
+        for values in ([row.cross_arcsec for row in solved], [row.roll_arcsec for row in solved])
+    )
+    return f"{len(solved)} of {len(rows)} frames solved; rms: cross {cross:.3g}″, roll {roll:.3g}″"

@@ -1,0 +1,98 @@
+"""What a part of the page may ask of the page. The page implements it, and no part imports the page."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any, Protocol
+
+from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
+from skysim.apps.gui.views.state import PageView
+from skysim.apps.gui.worker.photo import Photo
+
+
+class Shown(Protocol):
+    """What the page shows.
+
+    Attributes
+    ----------
+    state
+        As an address holds it
+    scene_info
+        Of the open scene, None before the first is open
+    view
+        Newest frame of the scene, None before the first
+    message_text
+        Message in the head
+    solving
+        Whether every frame is solved
+    is_open
+        Whether the browser still has the page
+    """
+
+    @property
+    def state(self) -> PageView: ...
+    @property
+    def scene_info(self) -> SceneInfo | None: ...
+    @property
+    def view(self) -> FrameView | None: ...
+    @property
+    def message_text(self) -> str: ...
+    @property
+    def solving(self) -> bool: ...
+    @property
+    def is_open(self) -> bool: ...
+
+
+class Asked(Protocol):
+    """What the page asks of its worker for a part. An error is shown in the head, and the answer is None or False."""
+
+    async def ask(self, task: str, *arguments: Any) -> Any:
+        """Return the result of a task."""
+
+    async def run_task(self, task: str, *arguments: Any, activity: str = "") -> Any:
+        """`ask`, with the mark of a busy page. activity : message until the task ends; it replaces an older one"""
+
+    async def show_live(self, task: str, *arguments: Any) -> FrameView | None:
+        """Show the frame of the live scene that a task renders."""
+
+    async def open(
+        self,
+        scene: str,
+        overrides: Mapping[str, str] | None = None,
+        angles_deg: Triple | None = None,
+    ) -> bool:
+        """Set up a scene and show a first frame, at its start or at other angles; keep the old scene if that fails."""
+
+    async def apply_overrides(
+        self, overrides: Mapping[str, str], dropped: Collection[str] = ()
+    ) -> None:
+        """Reopen the scene with further overrides and without some."""
+
+
+class Notified(Protocol):
+    """How a part notifies the page."""
+
+    def show_message(self, text: str, color: str = "warn") -> None:
+        """Show a message in the head until the next action."""
+
+    def log(self, text: str) -> None:
+        """Add a line to the log."""
+
+    def set_state(self, **changes: Any) -> None:
+        """Change fields of `Shown.state`."""
+
+    def show_frame(self, view: FrameView, **state: Any) -> None:
+        """Show a frame of the scene in all views. state : changes of `Shown.state` that belong to it"""
+
+    def show_photo(self, image: Photo, /, **state: Any) -> None:
+        """Show an image that is not of the scene as it is now: a photograph, or a trial again. state : see above"""
+
+    def stop_playback(self) -> None:
+        """Stop playback, a pushed vehicle and the live camera, because something else is to be shown."""
+
+    def show_panel(self, name: str) -> None:
+        """Open a panel by its name."""
+
+
+class PageContext(Shown, Asked, Notified, Protocol):
+    """The page for its parts: what it shows, what it asks of its worker, and how it is notified."""

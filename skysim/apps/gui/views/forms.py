@@ -1,0 +1,404 @@
+"""A scene's keys as form fields, derived from the schema: value, unit and allowed values of each."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from functools import cache
+from math import isfinite, radians, tan
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from skysim.core.errors import InputError
+from skysim.core.files import SCENES
+from skysim.core.units import SI_SUFFIX, si_unit
+from skysim.core.yaml_reader import read_yaml, set_key
+from skysim.scene import unused
+from skysim.scene.loader import file_names, find, load, read, with_overrides
+from skysim.scene.scene import NAME_ALIAS, Scene
+from skysim.scene.sections.motion import expand_control
+from skysim.tracking import factory as tracker_settings
+
+# Units of bare numbers by suffix of a key.
+DISPLAY_UNITS = {
+    "deg": "deg",
+    "arcsec": "arcsec",
+    "px": "px",
+    "hz": "Hz",
+    "e": "e-",
+    "e_s": "e-/s",
+    "dn": "DN",
+    "mag": "mag",
+    "deg_s": "deg/s",
+    "deg_s2": "deg/s²",
+    "rpm": "rpm",
+    "c": "°C",
+    "e_dn": "e-/DN",
+    "deg_h": "deg/h",
+    "px_s": "px/s",
+}
+UNIT_SUFFIX = re.compile(rf"_({'|'.join(sorted(DISPLAY_UNITS, key=len, reverse=True))})$")
+SECTIONS = (
+    "vehicle",
+    "motion",
+    "site",
+    "light",
+    "background",
+    "camera",
+    "exposure",
+    "filter",
+    "tracker",
+)
+NO_SECTION = "none"  # the kind of a section that is left out
+# Values of the keys that a kind of section requires, when it is chosen. A kind without them, as of a file, is not
+# offered; nor is another kind of light, which requires another start of the motion.
+FIRST_VALUES: dict[str, Any] = {
+    "row_time": "10 us",
+    "fwhm_px": 2,
+    "radius_px": 3,
+    "cutoff_deg": 40,
+    "transmission": [1, 0.8],
+    "angle_deg": [0, 40],
+    "intensity": [1, 0.5],
+    "apex": "1.5 m",
+    "radius": "1.5 m",
+    "semi_axes": ["1.5 m", "1.5 m", "1.3 m"],
+    "axis": "x",
+    "count": 800,
+    "frequency": 16,
+    "spacing": "40 mm",
+    "pitch": "20 mm",
+    "cap_deg": 60,
+    "temperature_c": 20,
+    "start_c": 20,
+    "rate_c_h": 1,
+    "mean_c": 20,
+    "amplitude_c": 2,
+    "period": "1 h",
+    "altitude": "500 km",
+    "inclination_deg": 51.6,
+}
+ONE_KIND = ("light",)
+
+
+class FormField(NamedTuple):
+    """One key of a scene.
+
+    Attributes
+    ----------
+    key
+        dotted
+    text
+        Its value as YAML, from the file, or else the default
+    unit
+        Of a bare number
+    allowed_values
+        Those of an enumeration
+    is_set
+        Whether a file or an override sets it
+    meaning
+        What `null` stands for, if that is one of the allowed values
+    no_effect
+        Why the key does nothing in this scene; empty if it does something
+    """
+
+    key: str
+    text: str
+    unit: str
+    allowed_values: tuple[str, ...]
+    is_set: bool
+    meaning: str = ""
+    no_effect: str = ""
+
+    @property
+    def section(self) -> str:
+        first = self.key.partition(".")[0]
+        return first if first in SECTIONS else "scene"
+
+    @property
+    def shown(self) -> str:
+        """The text in the field."""
+        return self.meaning if self.meaning and self.text == "null" else self.text
+
+
+def fields(name: str, overrides: Mapping[str, str]) -> list[FormField]:
+    """All keys that a scene has or could have, sections in the order of the README. Raises InputError."""
+    scene = load(name, overrides)
+    tree = with_overrides(read(find(name))[0], overrides)
+    stages = tracker_settings.assumed_settings(scene)
+    names = tracker_settings.algorithm_names(scene)
+    meanings = {f"tracker.{stage}": getattr(stages, stage) for stage in names}
+    choices = {f"tracker.{stage}": algorithms for stage, algorithms in names.items()}
+    form_fields = [
+        item._replace(
+            text=overrides.get(item.key, item.text),
+            allowed_values=choices.get(item.key, item.allowed_values),
+            meaning=meanings.get(item.key, item.meaning),
+            no_effect=unused.reason(item.key, scene),
+        )
+        for item in section_fields(scene, tree, "")
+        if item.key not in (NAME_ALIAS, "schema")
+    ]
+    order = ("scene", *SECTIONS)
+    return sorted(form_fields, key=lambda item: order.index(item.section))
+
+
+def section_fields(
+    model: BaseModel, tree: Any, prefix: str, kinds: tuple[str, ...] = ()
+) -> Iterator[FormField]:
+    """Yield the fields of a section. A list of sections is one field, as is one given by a word (`control: pid`).
+
+    Parameters
+    ----------
+    kinds
+        That the section could have instead of its own
+    """
+    for name, info in type(model).model_fields.items():
+        file_key = info.alias or SI_SUFFIX.sub("", name)
+        key = f"{prefix}{file_key}"
+        value = getattr(model, name)
+        is_set = isinstance(tree, dict) and file_key in tree
+        subtree = tree[file_key] if is_set else None
+        annotation: Any = info.annotation
+        others = () if key in ONE_KIND else offered_kinds(annotation)
+        if isinstance(value, BaseModel) and (subtree is None or isinstance(subtree, dict)):
+            yield from section_fields(value, subtree, f"{key}.", others)
+        elif value is None and len(others) == len(models(annotation)) + 1:
+            yield FormField(f"{key}.kind", "null", "", others, is_set, NO_SECTION)
+        elif file_key == "kind" and kinds:
+            yield FormField(key, value, "", tuple(dict.fromkeys((*kinds, value))), is_set)
+        else:
+            subtree = short_path(subtree)
+            text = yaml_line(subtree) if is_set else yaml_line(file_value(value, si_unit(name)))
+            yield FormField(key, text, display_unit(file_key), allowed_values(annotation), is_set)
+
+
+def short_path(value: Any) -> Any:
+    """Shorten the path of a shipped file to its name in scenes/."""
+    return (
+        str(Path(value).relative_to(SCENES))
+        if isinstance(value, str) and value.startswith(str(SCENES))
+        else value
+    )
+
+
+def display_unit(file_key: str) -> str:
+    """The unit of a bare number, from the suffix of its key."""
+    match = UNIT_SUFFIX.search(file_key)
+    return DISPLAY_UNITS[match[1]] if match else ""
+
+
+def allowed_values(annotation: Any) -> tuple[str, ...]:
+    """The allowed values of a Boolean or an enumeration; () for others."""
+    if annotation is bool:
+        return ("true", "false")
+    if get_origin(annotation) is Literal:
+        return tuple(str(item) for item in get_args(annotation))
+    parts = [item for item in get_args(annotation) if item is not type(None)]
+    return (
+        allowed_values(parts[0]) if len(parts) == 1 and get_origin(annotation) is not tuple else ()
+    )
+
+
+def models(annotation: Any) -> dict[str, type[BaseModel]]:
+    """The models of a section that has several kinds, by kind."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        kind = annotation.model_fields.get("kind")
+        return dict.fromkeys(allowed_values(kind.annotation), annotation) if kind else {}
+    found: dict[str, type[BaseModel]] = {}
+    for part in (
+        get_args(annotation) if get_origin(annotation) in (Union, UnionType, Annotated) else ()
+    ):
+        found |= models(part)
+    return found
+
+
+@cache
+def offered_kinds(annotation: Any) -> tuple[str, ...]:
+    """The kinds that a section may be given by a choice, with NO_SECTION if it may be left out; () if there is none."""
+    found = tuple(
+        kind for kind, model in models(annotation).items() if first_section(model, kind) is not None
+    )
+    return (NO_SECTION, *found) if found and NoneType in get_args(annotation) else found
+
+
+def first_section(
+    model: type[BaseModel], kind: str, kept: Mapping[str, Any] | None = None
+) -> dict[str, Any] | None:
+    """A section of a kind with the keys that it requires and others that are kept; None if their values are unknown."""
+    required = [
+        info.alias or name for name, info in model.model_fields.items() if info.is_required()
+    ]
+    section = (
+        {"kind": kind}
+        | {key: FIRST_VALUES[key] for key in required if key in FIRST_VALUES}
+        | dict(kept or {})
+    )
+    try:
+        model.model_validate(section)
+    except ValidationError:
+        return None
+    return section
+
+
+def with_value(name: str, overrides: Mapping[str, str], key: str, text: str) -> dict[str, str]:
+    """Overrides after a key has got a value, without those that lose their effect thereby. Raises InputError.
+
+    The kind of a section replaces the section.
+    """
+    section = key.removesuffix(".kind")
+    changed = (
+        with_kind(name, overrides, section, text) if section != key else {**overrides, key: text}
+    )
+    scene = load(name, changed, refuses_unused=False)
+    kept = {
+        one: value for one, value in changed.items() if one == key or not unused.reason(one, scene)
+    }
+    validated_scene(name, kept)
+    return kept
+
+
+def with_kind(name: str, overrides: Mapping[str, str], section: str, kind: str) -> dict[str, str]:
+    """Overrides by which a section gets another kind: that of the file, or with the keys that this kind requires.
+
+    Keys that both kinds have keep their values.
+    """
+    rest = {
+        key: text
+        for key, text in overrides.items()
+        if key != section and not key.startswith(f"{section}.")
+    }
+    info, in_file = section_at(load(name, rest, refuses_unused=False), section)
+    if kind == getattr(in_file, "kind", NO_SECTION):
+        return rest
+    if kind == NO_SECTION:
+        return rest | {section: "null"}
+    model = models(info.annotation)[kind]
+    now = section_at(load(name, overrides), section)[1]
+    kept = {
+        info.alias or field: file_value(getattr(now, field), si_unit(field))
+        for field, info in (type(now).model_fields.items() if isinstance(now, BaseModel) else ())
+        if field != "kind"
+        and field in now.model_fields_set
+        and same_field(model, field, info.annotation)
+    }
+    found = first_section(model, kind, kept) or first_section(model, kind)
+    return rest | {section: yaml_line(found)}
+
+
+def same_field(model: type[BaseModel], name: str, annotation: Any) -> bool:
+    """Whether a model has a field of a name with the same type, and no section."""
+    field = model.model_fields.get(name)
+    return field is not None and field.annotation == annotation and not models(annotation)
+
+
+def section_at(scene: Scene, key: str) -> tuple[Any, Any]:
+    """The field of a dotted key in the schema, and its value in a scene."""
+    info: Any = None
+    value: Any = scene
+    for part in key.split("."):
+        model: type[BaseModel] = type(value)
+        name = unused.field_names(model)[part]
+        info = model.model_fields[name]
+        value = getattr(value, name)
+    return info, value
+
+
+def file_value(value: Any, unit: str) -> Any:
+    """Convert a validated value to what a file would contain: plain types, with the unit."""
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json", by_alias=True)
+    if isinstance(value, tuple | list):
+        return [file_value(item, unit) for item in value]
+    if unit and isinstance(value, float):
+        return f"{value:.6g} {unit}" if isfinite(value) else "infinity"
+    return value
+
+
+def yaml_line(value: Any) -> str:
+    """Format a value as one line of YAML; strings are returned unchanged."""
+    if isinstance(value, str):
+        return value
+    text = yaml.safe_dump(
+        value, default_flow_style=True, width=10_000, allow_unicode=True, sort_keys=False
+    )
+    return text.strip().removesuffix("...").strip()
+
+
+def absolute_path(scene: str) -> str:
+    """Absolute path of a scene's file, by which a file in any folder can name it."""
+    return str(find(scene).resolve())
+
+
+def validated_scene(name: str, overrides: Mapping[str, str]) -> Scene:
+    """Load the scene with the overrides. Raises InputError if it is invalid or names a file outside its folder."""
+    scene = load(name, overrides)
+    tree = scene.model_dump(mode="json", by_alias=True)
+    folder = find(name).resolve().parent
+    for key, name in file_names(tree):
+        if not any((at / name).resolve().is_relative_to(at) for at in (folder, SCENES)):
+            raise InputError(key, f"{name!r}", "a file in the scene's own folder")
+    return scene
+
+
+def is_scene(path: Path) -> bool:
+    """Return True if a YAML file looks like a scene: no study, with a camera or a base scene."""
+    try:
+        tree, _ = read_yaml(path)
+    except InputError:
+        return False
+    return "factors" not in tree and not {"base", "camera"}.isdisjoint(tree)
+
+
+FEEDBACKS = {
+    "truth": "closed by the truth",
+    "imu": "closed by the IMU",
+    "filter": "closed by the filter",
+    "": "open loop",
+}
+
+
+def field_override(name: str, overrides: Mapping[str, str], field_deg: float) -> dict[str, str]:
+    """Override by which a scene's horizontal field of view becomes another: f = width / (2 tan(field / 2)).
+
+    Raises
+    ------
+    InputError
+    """
+    if not 0.5 <= field_deg <= 120:
+        raise InputError("field", "", "0.5 to 120 deg")
+    camera = load(name, overrides).camera
+    focal_m = (
+        camera.focal_length_m / camera.focal_px * camera.width_px / 2 / tan(radians(field_deg / 2))
+    )
+    return {"camera.focal_length": f"{1e3 * focal_m:.5g} mm"}
+
+
+def loop_overrides(name: str, overrides: Mapping[str, str], feedback: str) -> dict[str, str]:
+    """Overrides that close the loop with another feedback (a key of FEEDBACKS); "" removes controller and maneuver."""
+    tree = read(find(name))[0]
+    for key, value in overrides.items():
+        set_key(tree, key, value)
+    control = expand_control(tree.get("motion", {}).get("control"))
+    if not feedback or control is None:
+        return {"motion.control": "null", "motion.maneuver": "[]"}
+    return {"motion.control": yaml_line(control | {"feedback": feedback})}
+
+
+def save(folder: Path, name: str, base: str, overrides: Mapping[str, str], title: str) -> Path:
+    """Save a new scene file that consists of a base and overrides. Raises InputError, also if the file exists."""
+    from skysim.apps.gui.worker.image_export import base_reference, scene_yaml
+    from skysim.core import files
+
+    if not re.fullmatch(r"[A-Za-z0-9][\w-]{0,60}", name):
+        raise InputError(f"{name!r}", "", "letters, digits, _ and -")
+    path = folder / f"{name}.yaml"
+    if path.exists():
+        raise InputError(path.name, "file exists", "another name")
+    validated_scene(base, overrides)
+    files.write_text(path, scene_yaml(base_reference(base, folder), dict(overrides), title))
+    return path

@@ -1,0 +1,119 @@
+"""Texts and fields that change with every frame.
+
+NiceGUI's page renders all of its elements again when one of them is updated, which takes a browser as long as a frame.
+So these contents travel with the frame's pixels, and the browser sets them when it draws the frame; without a new frame
+a message brings them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import csv
+import io
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+from nicegui import ui
+
+from skysim.core.errors import OVERRIDES, InputError
+
+
+class Contents:
+    """The contents of a tab's live fields. send : called with all of them when some have changed without a frame"""
+
+    def __init__(self) -> None:
+        self.all = dict[int, dict[str, str]]()
+        self.send: Callable[[dict[int, dict[str, str]]], Any] = lambda _: None
+        self.waits = False
+
+    def set(self, number: int, content: dict[str, str]) -> None:
+        """Change the content of a field: its text and state, or its value; of the strips the moment that is shown."""
+        if self.all.get(number) == content:
+            return
+        self.all[number] = content
+        if not self.waits and asyncio._get_running_loop() is not None:
+            self.waits = True
+            asyncio.get_running_loop().call_soon(self.flush)
+
+    def take(self) -> dict[int, dict[str, str]]:
+        """All contents, for a frame."""
+        self.waits = False
+        return dict(self.all)
+
+    def flush(self) -> None:
+        """Send the contents, unless a frame has taken them."""
+        if self.waits:
+            self.send(self.take())
+
+
+class LiveField(ui.element, component="js/live_field.js", esm={"skysim-views": "js"}):  # type: ignore[call-arg]
+    """An element whose content travels with the frames."""
+
+    def __init__(self, contents: Contents, tag: str, type: str = "") -> None:
+        super().__init__()
+        self.contents = contents
+        self.props["tag"] = tag
+        self.props["type"] = type
+        self.props["number"] = self.id
+
+
+class LiveText(LiveField):
+    """A text. state : its style class, such as good or warn"""
+
+    def __init__(self, contents: Contents, text: str = "") -> None:
+        super().__init__(contents, "div")
+        self.set_text(text)
+
+    def set_text(self, text: str, state: str = "") -> None:
+        self.contents.set(self.id, {"text": text, "state": state})
+
+
+class LiveInput(LiveField):
+    """A field to type into, or a slider. type : as in HTML"""
+
+    def __init__(self, contents: Contents, type: str) -> None:
+        super().__init__(contents, "input", type)
+
+    def set_value(self, value: object) -> None:
+        self.contents.set(self.id, {"value": str(value)})
+
+
+# Texts of the page: errors in its words, numbers, and tables as CSV files.
+
+
+LABELS = {  # of the fields, by the parameter's key; a key of a scene is the label of its field
+    "solve.fov_deg": "the field of view",
+    "solve.time_utc": "the date",
+    "solve.catalog": "the star catalog",
+    "solve.detector": "the detector",
+    "solve.centroider": "the centroider",
+    "solve.identifier": "the identifier",
+    "solve.solver": "the solver",
+    "survey.tilt_deg": "the tilt",
+}
+
+
+def for_page(error: InputError) -> str:
+    """An error with the label of the field at fault; without a place if the value was typed in the page."""
+    where = None if error.where == OVERRIDES else error.where
+    return str(InputError(LABELS.get(error.key, error.key), error.problem, error.allowed, where))
+
+
+def format_number(value: float) -> str:
+    """Format with three significant digits, from 100 up as an integer."""
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def csv_table(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:
+    """A table with its heads; numbers with nine digits, unknown values (NaN, None) as empty cells."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(heads)
+    writer.writerows([cell(value) for value in row] for row in rows)
+    return text.getvalue().encode()
+
+
+def cell(value: Any) -> str:
+    if value is None or value != value:
+        return ""
+    return f"{value:.9g}" if isinstance(value, float) else str(value)

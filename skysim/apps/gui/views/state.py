@@ -1,0 +1,121 @@
+"""The state of a page: what it shows, as one value that an address can hold.
+
+Reload, back, a shared link, undo and redo all read a `View` from the page's address and show it again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+from urllib.parse import parse_qsl, urlencode
+
+from skysim.apps.gui.messages import Triple
+from skysim.core.errors import InputError
+
+Kind = Literal["live", "flight", "replay", "photo"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+
+@dataclass(frozen=True, slots=True)
+class PageView:
+    """What a page shows.
+
+    Attributes
+    ----------
+    scene, overrides
+        The scene and the keys that differ from its file
+    kind
+        Live scene at rest, a moment of its flight, a study's trial again, or an image from
+        elsewhere
+    angles_deg
+        Attitude of the live scene; None: the scene's own start
+    t_s
+        Begin of the shown frame of a flight
+    study, trial
+        Folder of the study in the Monte Carlo panel, and the trial that is replayed
+    photo
+        Name of the image from elsewhere
+    """
+
+    scene: str
+    overrides: Mapping[str, str] = field(default_factory=dict)
+    kind: Kind = "live"
+    angles_deg: Triple | None = None
+    t_s: float = 0.0
+    study: str = ""
+    trial: int = -1
+    photo: str = ""
+
+    def query(self) -> str:
+        """The view as the query of an address, without what has its default."""
+        pairs = [
+            ("scene", self.scene),
+            *(("set", f"{key}={value}") for key, value in self.overrides.items()),
+        ]
+        optional = (
+            ("view", self.kind if self.kind != "live" else ""),
+            (
+                "at",
+                ",".join(f"{angle:.6f}" for angle in self.angles_deg) if self.angles_deg else "",
+            ),
+            ("t", f"{self.t_s:.4f}" if self.kind == "flight" else ""),
+            ("study", self.study),
+            ("trial", str(self.trial) if self.kind == "replay" else ""),
+            ("photo", self.photo if self.kind == "photo" else ""),
+        )
+        return "?" + urlencode(pairs + [pair for pair in optional if pair[1]])
+
+    @classmethod
+    def from_query(cls, query: str, scenes: Collection[str]) -> PageView | None:
+        """The view that an address names; None if it names none.
+
+        Parameters
+        ----------
+        scenes
+            Those that the page offers. An address from elsewhere opens no other file. Raises
+            InputError.
+        """
+        pairs = parse_qsl(query.removeprefix("?"))
+        one: dict[str, Any] = dict(pairs)
+        if "scene" not in one:
+            return None
+        if one["scene"] not in scenes:
+            raise InputError(
+                "link", f"scene {one['scene']!r} is not offered here; choose one from the list"
+            )
+        kind = one.get("view", "live")
+        if kind not in KINDS:
+            raise InputError("link", f"view {kind!r}", ", ".join(KINDS))
+        try:
+            angles = tuple(float(angle) for angle in one["at"].split(",")) if "at" in one else None
+            t_s = float(one.get("t", 0))
+            trial = int(one.get("trial", -1))
+        except ValueError:
+            raise InputError("link", "at, t, trial", "numbers") from None
+        if not all(map(math.isfinite, (*(angles or ()), t_s))) or (angles and len(angles) != 3):
+            raise InputError("link", "at", "three angles in degrees; t: seconds")
+        overrides = dict(value.partition("=")[::2] for key, value in pairs if key == "set")
+        study = one.get("study", "")
+        photo = one.get("photo", "")
+        return cls(one["scene"], overrides, kind, angles, t_s, study, trial, photo)  # type: ignore[arg-type]
+
+    def same_step(self, other: PageView) -> bool:
+        """Whether only attitude or time differ, which change continuously."""
+        return self.coarse == other.coarse
+
+    @property
+    def coarse(self) -> tuple[Any, ...]:
+        """What changes in steps that a user undoes one by one."""
+        return self.scene, dict(self.overrides), self.kind, self.study, self.trial, self.photo
+
+    @property
+    def banner(self) -> str:
+        """The view in words."""
+        return {
+            "live": "live",
+            "flight": f"flight at {self.t_s:.2f} s",
+            "replay": f"trial {self.trial} of {self.study}",
+            "photo": f"image {self.photo}",
+        }[self.kind]

@@ -1,0 +1,294 @@
+"""3-D geometry of the laboratory, as numbers for the browser to draw."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.core.camera import Camera
+from estimator.core.types import Attitude
+from skysim.apps.gui.messages import LabGeometry, Lens, LookFrom, Pose
+from skysim.core.errors import InputError
+from skysim.core.types import Floats, Mount, Sources, Trajectory, Truth
+from skysim.dynamics import guidance, multibody
+from skysim.dynamics.multibody.mjcf_export import FOVY_DEG, LED_RADIUS_M, SKY_RADIUS_M
+from skysim.results import scoring
+from skysim.scene.scene import Scene
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
+from skysim.scene.sections.motion import AttitudeConfig
+from skysim.simulation.lab import Lab
+from skysim.simulation.timing import MARGIN_S, exposure_window
+from skysim.sources import stars
+from skysim.sources.dome import surface
+from skysim.tracking.onboard_model import calibration
+
+MAX_STARS = 600
+MAX_LEDS = 4000
+WIDE_DEG = 100.0  # of the view from the bearing
+
+
+def lab_geometry(lab: Lab) -> LabGeometry:
+    """Geometry of a lab: that of its MJCF file, its lights, and the places to look from."""
+    model = multibody.laboratory(lab.export_mjcf())
+    return LabGeometry(model.shapes, *lights(lab.camera.sources), views(lab, model))
+
+
+def lights(sources: Sources) -> tuple[NDArray[np.int64], Floats, Floats, NDArray[np.bool_]]:
+    """Ids, (N, 3) positions, (N,) drawn radii in m of the brightest lights, the brightest first, and which are lit.
+
+    An LED's radius grows with the time-averaged power to the power of 0.3, so that faint ones remain visible; a star's
+    with its square root, as in the MJCF file.
+    """
+    power = sources.strength * np.minimum(sources.on_s / sources.period_s, 1.0)
+    stars = bool((sources.place[:, 3] == 0).any())
+    rows = np.argsort(-power, kind="stable")[: MAX_STARS if stars else MAX_LEDS]
+    fraction = power[rows] / power.max(initial=1e-300)
+    position_m = sources.place[rows, :3] * (SKY_RADIUS_M if stars else 1.0)
+    radius_m = (
+        0.006 + 0.04 * np.sqrt(fraction)
+        if stars
+        else LED_RADIUS_M * np.clip(fraction**0.3, 0.3, 1.0)
+    )
+    return sources.id[rows], position_m, radius_m, power[rows] > 0
+
+
+def views(lab: Lab, model: multibody.Laboratory) -> dict[str, LookFrom]:
+    """The places to look from: outside, from the camera along its boresight, from the bearing up, and from above."""
+    camera = lab.scene.camera
+    mount = lab.camera.mount
+    body_from_cam = mount.cam_from_body.inv()
+    pupil_m = mount.camera_body_m
+    height_m = np.linalg.norm(model.eye_m - model.target_m)
+    field_deg = 2 * math.degrees(math.atan(camera.height_px / 2 / camera.focal_px))
+    up = np.array([0.0, 0.0, 1.0])
+    north = np.array([0.0, 1.0, 0.0])
+    ahead, above = body_from_cam.apply([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    return {
+        "outside": look_from(model.eye_m, model.target_m, up, FOVY_DEG),
+        "camera": look_from(pupil_m, pupil_m + ahead, above, field_deg, on_vehicle=True),
+        "bearing": look_from(np.zeros(3), up, north, WIDE_DEG),
+        "top": look_from(model.target_m + height_m * up, model.target_m, north, FOVY_DEG),
+    }
+
+
+def look_from(
+    eye_m: Floats, target_m: Floats, up: Floats, fov_deg: float, on_vehicle: bool = False
+) -> LookFrom:
+    eye, target, upwards = ((float(x), float(y), float(z)) for x, y, z in (eye_m, target_m, up))
+    return LookFrom(eye, target, upwards, fov_deg, on_vehicle)
+
+
+# Where a frame's pixels point, for the browser.
+
+
+NODES = 13  # along each side of a frame, of the tables between which the browser interpolates
+
+
+def lens_of(camera: Camera) -> Lens:
+    """Tables of the tangents x / z and y / z of a camera's pixels, from the frame's upper left to its lower right
+    corner."""
+    x = np.linspace(-0.5, camera.width_px - 0.5, NODES)
+    y = np.linspace(-0.5, camera.height_px - 0.5, NODES)
+    tangents = camera.tangents(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    return Lens(NODES, *(tuple(column.tolist()) for column in tangents.T))
+
+
+def scene_lens(lab: Lab) -> Lens:
+    """The tables of a scene's true camera."""
+    return lens_of(calibration(lab.scene.camera))
+
+
+def scene_pose(lab: Lab, lens: Lens, truth: Truth) -> Pose:
+    """The true attitude of a frame's camera; under a dome also where its rays meet the surface."""
+    lab_from_cam = truth.cam_from_lab.inv()
+    rotation = tuple(lab_from_cam.as_matrix().ravel().tolist())
+    if not isinstance(lab.scene.light, DomeConfig):
+        return Pose(rotation)
+    place_m = truth.lab_from_body.apply(lab.camera.mount.camera_body_m)
+    rays_cam = np.column_stack([lens.x, lens.y, np.ones(len(lens.x))])
+    length = np.linalg.norm(rays_cam, axis=1)
+    dome = surface.build_surface(lab.scene.light.surface)
+    points_m = dome.meet(place_m, lab_from_cam.apply(rays_cam / length[:, None]))
+    depth_m = (
+        np.linalg.norm(points_m - place_m, axis=1) / length
+    )  # along the boresight; NaN where a ray meets nothing
+    return Pose(rotation, tuple(place_m.tolist()), tuple(rounded(depth_m)))
+
+
+def rounded(depth_m: Floats) -> list[float | None]:
+    """Depths to 0.01 mm; None for a ray that meets nothing."""
+    return [None if np.isnan(value) else round(float(value), 5) for value in depth_m]
+
+
+def solved_pose(attitude: Attitude) -> Pose | None:
+    """The tracker's attitude of an image from elsewhere; None if it was not solved."""
+    if attitude.cam_from_ref is None:
+        return None
+    return Pose(tuple(attitude.cam_from_ref.inv().as_matrix().ravel().tolist()))
+
+
+# Camera pointing: from typed angles, or by rotations about the camera's own axes, which have no
+# singularity.
+
+
+# step of an arrow key without and with shift, in fields of view
+FINE = 0.02
+COARSE = 0.2
+ROLL_FINE_DEG = 1.0
+ROLL_COARSE_DEG = 10.0
+RANGES = {  # degrees
+    "RA": (0.0, 360.0),
+    "Dec": (-90.0, 90.0),
+    "roll": (-360.0, 360.0),
+    "pitch": (-90.0, 90.0),
+    "yaw": (-360.0, 360.0),
+}
+
+
+def from_angles(scene: Scene, mount: Mount, angles_deg: tuple[float, float, float]) -> Rotation:
+    """lab_from_body from RA, Dec, roll of the camera under stars, else from roll, pitch, yaw of the vehicle; degrees.
+
+    Raises
+    ------
+    InputError
+        For an angle out of range, or a tilt beyond the vehicle's stop.
+    """
+    for name, angle in zip(scoring.angle_names(scene), angles_deg, strict=True):
+        low, high = RANGES[name]
+        if not (math.isfinite(angle) and low <= angle <= high):
+            raise InputError(name, f"{angle:g} deg is not allowed", f"{low:g} to {high:g}")
+    if isinstance(scene.light, StarsConfig):
+        return stars.cam_from_icrs(*angles_deg).inv() * mount.cam_from_body
+    roll, pitch, yaw = angles_deg
+    start = AttitudeConfig.model_validate({"roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw})
+    return within_stop(scene, guidance.attitude(start))
+
+
+def moved(
+    scene: Scene, mount: Mount, lab_from_body: Rotation, right: float, up: float, roll_deg: float
+) -> Rotation:
+    """lab_from_body after moving the boresight right and up (in fields of view) and rolling the camera clockwise.
+
+    The three form one rotation vector about the camera's axes (x right, y down, z boresight). Raises InputError
+    beyond the tilt stop.
+    """
+    camera = scene.camera
+    field_rad = 2 * math.atan(camera.width_px / 2 / camera.focal_px)
+    rotation_vector = np.array([up * field_rad, right * field_rad, math.radians(roll_deg)])
+    new_from_cam = Rotation.from_rotvec(rotation_vector).inv()
+    cam_from_lab = new_from_cam * mount.cam_from_body * lab_from_body.inv()
+    return within_stop(scene, cam_from_lab.inv() * mount.cam_from_body)
+
+
+def within_stop(scene: Scene, lab_from_body: Rotation) -> Rotation:
+    """Return the attitude. Raises InputError if its tilt is beyond the air bearing's stop."""
+    vehicle = scene.vehicle
+    tilt_deg = float(multibody.tilt_deg(lab_from_body))
+    if vehicle.mount == "air_bearing" and tilt_deg > vehicle.tilt_stop_deg:
+        raise InputError(
+            "", f"tilt of {tilt_deg:.1f} deg: the bearing stops at {vehicle.tilt_stop_deg:g} deg"
+        )
+    return lab_from_body
+
+
+# Pushing the vehicle: a user pulls at a point of it, and its multibody dynamics are integrated in
+# real time.
+
+
+PULL_RAD_S = 1.5  # a held vehicle without gravity would swing at this angular frequency about where it is pulled to
+PERIOD_S = 0.01  # for which a torque is held in body axes
+MAX_ADVANCE_S = 0.25  # in one call; on a slow machine the motion is slower than real time
+
+
+class Grip(NamedTuple):
+    """Where the vehicle is held, in body axes, and where that point is pulled to, in the lab frame; m."""
+
+    held_body_m: tuple[float, float, float]
+    wanted_m: tuple[float, float, float]
+
+
+class Push:
+    """The motion of a lab's vehicle from rest at an attitude, as long as the user lets it go on.
+
+    Attributes
+    ----------
+    simulation
+        With gravity, drag, cable, tilt stop and the rotors' momentum; without disturbances and
+        controller
+    lab_from_body
+        The present attitude
+    torque_nm
+        (3,) of the grip in the last period, body axes
+    """
+
+    def __init__(self, lab: Lab, lab_from_body: Rotation) -> None:
+        require_vehicle(lab.scene)
+        self.lab = lab
+        kept_s = self.exposure_s + MAX_ADVANCE_S
+        self.simulation = multibody.Simulation(
+            lab.vehicle, lab_from_body, np.zeros(3), math.inf, kept_s
+        )
+        self.lab_from_body = lab_from_body
+        self.torque_nm = np.zeros(3)
+
+    @property
+    def exposure_s(self) -> float:
+        """How much of the motion a frame sees."""
+        window = exposure_window(self.lab.scene, 0)
+        return window.close_s(self.lab.scene.camera.height_px) - window.open_s + 2 * MARGIN_S
+
+    def advance(self, grip: Grip | None, elapsed_s: float) -> None:
+        """Integrate for a time with a torque that follows the vehicle; without a grip there is none."""
+        simulation = self.simulation
+        period = round(PERIOD_S / simulation.step_s)
+        steps = round(min(elapsed_s, MAX_ADVANCE_S) / simulation.step_s)
+        for begin in range(0, steps, period):
+            lab_from_body = Rotation.from_quat(simulation.lab_from_body_wxyz, scalar_first=True)
+            self.torque_nm = pull_torque_nm(grip, lab_from_body, self.lab.vehicle.inertia_kg_m2)
+            control = np.zeros((min(period, steps - begin), simulation.model.nu))
+            control[:, simulation.vehicle.torques] = self.torque_nm
+            simulation.advance(control)
+        self.lab_from_body = Rotation.from_quat(simulation.lab_from_body_wxyz, scalar_first=True)
+
+    def seen(self) -> Trajectory:
+        """A motion of which frame 0 sees what happened until now; before it the vehicle was at rest."""
+        window = exposure_window(self.lab.scene, 0)
+        end_s = window.close_s(self.lab.scene.camera.height_px) + MARGIN_S
+        begin = self.simulation.step - math.ceil(self.exposure_s / self.simulation.step_s)
+        motion = self.simulation.trajectory(max(begin, self.simulation.first_step))
+        t_s = motion.t_s + end_s - self.simulation.now_s
+        attitudes = motion.lab_from_body
+        rates = motion.rate_body_rad_s
+        start_s = window.open_s - MARGIN_S
+        if t_s[0] > start_s:
+            t_s = np.append(start_s, t_s)
+            rates = np.concatenate([np.zeros((1, 3)), rates])
+            attitudes = Rotation.concatenate([attitudes[:1], attitudes])
+        return Trajectory(t_s, attitudes, rates)
+
+
+def pull_torque_nm(grip: Grip | None, lab_from_body: Rotation, inertia_kg_m2: Floats) -> Floats:
+    """(3,) torque about the bearing, in body axes, of a force towards the wanted point.
+
+    With the held point r and the way d from it to the wanted one, T = J w^2 (r x d) / max(r^2, |r x d|): that of a
+    force in proportion to d, scaled so that vehicles of every size follow alike, and not above J w^2. J is the mean
+    moment of inertia, w is PULL_RAD_S. The force itself is the bearing's to bear.
+    """
+    if grip is None:
+        return np.zeros(3)
+    held = np.array(grip.held_body_m)
+    moment = np.cross(held, lab_from_body.inv().apply(grip.wanted_m) - held)
+    stiffness = np.trace(inertia_kg_m2) / 3 * PULL_RAD_S**2
+    return np.asarray(stiffness * moment / max(held @ held, float(np.linalg.norm(moment)), 1e-9))
+
+
+def require_vehicle(scene: Scene) -> None:
+    """Raise InputError for a scene whose vehicle does not move by dynamics."""
+    if isinstance(scene.light, CollimatedDisplayConfig):
+        raise InputError("", "the camera of this scene is on a bench: there is no vehicle to push")
+    if scene.motion.is_prescribed:
+        raise InputError("", "the motion of this scene is prescribed: its vehicle cannot be pushed")

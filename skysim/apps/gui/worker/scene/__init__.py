@@ -1,1 +1,0 @@
-"""The scene of a worker: its geometry for the 3-D view, where the camera points, and the plan of its use."""

@@ -1,0 +1,263 @@
+"""A survey of the dome in the page: attitudes to hold, the frames flown at them, and what these measure."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator.calibration.survey_plan import Mask, SurveyAccuracy
+from estimator.core.types import Centroids
+from skysim.apps.gui.messages import FrameView, SurveyFound, SurveyPlan
+from skysim.core import quaternion
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.dynamics import guidance
+from skysim.experiments.dome_survey import (
+    adjust,
+    survey_findings,
+    survey_prior,
+    survey_procedure,
+    survey_report,
+)
+from skysim.experiments.dome_survey import survey_frames as stops
+from skysim.experiments.dome_survey.survey_findings import Coverage, SurveyRun
+from skysim.experiments.dome_survey.survey_frames import SurveyFrame, detect_lights, imu_attitudes
+from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
+from skysim.scene.scene import Scene
+from skysim.scene.sections.motion import HoldConfig, SlewConfig
+from skysim.simulation.flight import Flight
+from skysim.simulation.lab import Lab
+from skysim.tracking import dome_map_file, onboard_model
+from skysim.tracking import factory as tracker_settings
+
+SURVEY_TILT_DEG = 25.0  # greatest tilt of a survey, if the vehicle's stop allows it
+MAX_STOPS = 200
+REST_PX = 1.0  # motion of the image at rest, during an exposure
+UNCERTAINTY = survey_prior.survey_uncertainty()  # that `skysim survey` assumes
+
+
+@dataclass
+class Survey:
+    """A survey of a scene's dome, with the uncertainties that `skysim survey` assumes.
+
+    Attributes
+    ----------
+    lab, before
+        With the errors of the onboard model before the survey, and this model
+    noise_px
+        Standard deviation of a centroid's coordinates, by which attitudes are chosen
+    taken
+        The frames that were flown
+    run
+        The newest adjustment that succeeded
+    """
+
+    scene: Scene
+    lab: Lab
+    before: CalibrationPrior
+    noise_px: float
+    taken: list[TakenFrame] = field(default_factory=list)
+    run: SurveyRun | None = None
+
+    def is_of(self, scene: Scene) -> bool:
+        """Whether a scene is the surveyed one, but for its sections `motion` and `exposure`."""
+        return (
+            self.scene.model_copy(update={"motion": scene.motion, "exposure": scene.exposure})
+            == scene
+        )
+
+    def adjust(self, flight: Flight, views: Sequence[FrameView], count: int) -> SurveyFound:
+        """Adjust the dome to all frames so far and those of a flight, and plan `count` further attitudes.
+
+        Parameters
+        ----------
+        views
+            The frames of the flight so far, in order
+
+        Raises
+        ------
+        InputError
+            If the flight has no further frames; the survey is then as before.
+        """
+        allow(count)
+        new, missed = self.new_frames(flight, views)
+        taken = [*self.taken, *new]
+        frames = self.survey_frames(taken)
+        try:
+            run = adjust.run_survey(frames, self.before, UNCERTAINTY)
+            refusal = ""
+            so_far = survey_findings.coverage(run)
+        except InputError as error:
+            run = None
+            refusal = str(error)
+            so_far = survey_findings.coverage_before(
+                frames, self.before, UNCERTAINTY, self.noise_px
+            )
+        counts = survey_findings.coverage_statistics(so_far)
+        truth = survey_report.truth_statistics(run, self.before, self.lab) if run else {}
+        found = SurveyFound(
+            frames=len(taken),
+            connected=int(run.survey.tied.sum()) if run else 0,
+            missed=missed,
+            measured=counts["measured"] if run else 0,
+            seen_once=counts["seen_once"],
+            unseen=counts["unseen"],
+            renamed=truth.get("renamed", 0),
+            sigma_mm=1e3 * run.accuracy.led_rms_m if run else None,
+            before_mm=truth.get("led_mm_before"),
+            error_mm=truth.get("led_mm_after"),
+            faults=tuple(survey_findings.fault_lines(asdict(survey_findings.find_faults(run))))
+            if run
+            else (),
+            refusal=refusal,
+            ids=so_far.model.leds.id,
+            known=known_share(run),
+            plan=self.next_plan(so_far, len(taken), count),
+        )
+        self.taken = taken
+        self.run = run or self.run
+        return found
+
+    def new_frames(
+        self, flight: Flight, views: Sequence[FrameView]
+    ) -> tuple[list[TakenFrame], int]:
+        """The frames of a flight at which the vehicle rests, one of each hold, and the number of holds without one.
+
+        Raises
+        ------
+        InputError
+            If there are none, or the survey has them already.
+        """
+        rows, holds = frames_at_rest(flight, views)
+        if not rows:
+            raise InputError(
+                "survey",
+                f"the vehicle rests at none of the flight's {holds} holds",
+                "a flight of the survey's attitudes with a vehicle that holds them, such as motion.control: prescribed",
+            )
+        known = {frame.row for frame in self.taken if frame.flown == flight.lab.scene}
+        if known >= set(rows):
+            raise InputError(
+                "survey", "it has the frames of this flight", "a flight of the next attitudes"
+            )
+        settings = tracker_settings.assumed_settings(self.lab.scene)
+        camera = onboard_model.assumed_camera(self.lab.scene)
+        new = []
+        for row in (row for row in rows if row not in known):
+            frame, _ = flight.render(row)
+            lab_from_body = quaternion.to_rotation(np.array(views[row].body_wxyz))
+            lights = detect_lights(settings, camera, frame.image_dn)
+            new.append(TakenFrame(flight.lab.scene, row, lab_from_body, lights))
+        return new, holds - len(rows)
+
+    def survey_frames(self, taken: Sequence[TakenFrame]) -> list[SurveyFrame]:
+        """Frames with the IMU's attitudes."""
+        lab_from_body = Rotation.concatenate([frame.lab_from_body for frame in taken])
+        measured = imu_attitudes(self.scene, lab_from_body, UNCERTAINTY.imu_sigma_rad)
+        return [
+            SurveyFrame(frame.lights, at, frame.row)
+            for frame, at in zip(taken, measured, strict=True)
+        ]
+
+    def next_plan(self, so_far: Coverage, taken: int, count: int) -> SurveyPlan:
+        """Attitudes to hold after the frames taken so far."""
+        margin_px = survey_prior.image_sizes(self.before).margin_px
+        further = survey_findings.next_stops(
+            self.scene, so_far, margin_px, count, tilt_deg(self.scene)
+        )
+        shown = so_far.model.visible(further.lab_from_body.inv(), margin_px)
+        return survey_plan(
+            further.lab_from_body, shown, (plan_step(taken + len(shown), further.accuracy),)
+        )
+
+    def map_file(self) -> bytes:
+        """The measured LEDs, lever arm and lens as the file for `tracker.map`. Raises InputError if there are none."""
+        if self.run is None:
+            raise InputError(
+                "", "the survey has measured no LED yet: fly its attitudes, then adjust"
+            )
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "leds.ecsv"
+            dome_map_file.write_dome_map(path, adjust.dome_map(self.run.survey, UNCERTAINTY))
+            return path.read_bytes()
+
+
+@dataclass(frozen=True, slots=True)
+class TakenFrame:
+    """A frame of a survey: the scene that was flown, its number there, the true attitude, and its detections."""
+
+    flown: Scene
+    row: int
+    lab_from_body: Rotation
+    lights: Centroids
+
+
+def begin(scene: Scene, frames: int) -> tuple[Survey, SurveyPlan]:
+    """A new survey of a scene's dome and its first attitudes. Raises InputError."""
+    allow(frames)
+    lab, before, plan = survey_procedure.plan_survey(scene, UNCERTAINTY, frames, tilt_deg(scene))
+    steps = tuple(plan_step(*step) for step in plan.steps())
+    survey = Survey(scene, lab, before, plan.model.sigma_px)
+    return survey, survey_plan(plan.lab_from_body, plan.shown, steps)
+
+
+def allow(frames: int) -> None:
+    """Raise InputError for a number of frames that is not allowed."""
+    if not 2 <= frames <= MAX_STOPS:
+        raise InputError("frames", frames, f"2 to {MAX_STOPS}")
+
+
+def tilt_deg(scene: Scene) -> float:
+    """Greatest tilt of a survey's attitudes."""
+    return min(SURVEY_TILT_DEG, scene.vehicle.tilt_stop_deg)
+
+
+def survey_plan(
+    lab_from_body: Rotation, shown: Mask, steps: tuple[tuple[int, int, float | None], ...]
+) -> SurveyPlan:
+    """A plan as the page has it. shown : (F, N) LEDs that each attitude shows"""
+    angles = tuple(tuple(row) for row in stops.angles_deg(lab_from_body).tolist())
+    return SurveyPlan(angles, tuple(shown.sum(axis=1).tolist()), shown.shape[1], steps)
+
+
+def plan_step(count: int, accuracy: SurveyAccuracy | None) -> tuple[int, int, float | None]:
+    """Number of frames, and what is predicted after them: LEDs measured, and their rms error in mm."""
+    statistics = survey_findings.accuracy_statistics(accuracy)
+    return count, int(statistics["measured"] or 0), statistics["led_mm"]
+
+
+def known_share(run: SurveyRun | None) -> Floats:
+    """(N,) by how much a survey has reduced the uncertainty of each LED: 0, not measured, to 1; (0,) without one."""
+    if run is None:
+        return np.zeros(0)
+    share = 1 - run.accuracy.led_sigma_m / UNCERTAINTY.led_sigma_m
+    return np.where(run.accuracy.measured, np.clip(share, 0.0, 1.0), 0.0)
+
+
+def frames_at_rest(flight: Flight, views: Sequence[FrameView]) -> tuple[list[int], int]:
+    """Rows of a flight's frames at which the vehicle rests, of each hold the last one, and the number of holds.
+
+    It rests if its image moves by less than REST_PX during the exposure, as its true rate says: a controller may not
+    reach the attitude, or not hold it.
+    """
+    scene = flight.lab.scene
+    motion = scene.motion
+    if not flight.is_over or not all(
+        isinstance(one, SlewConfig | HoldConfig) for one in motion.maneuver
+    ):
+        return [], 0
+    reference = guidance.plan(motion)
+    by_hold: dict[int, int] = {}
+    holds = {leg for leg, one in enumerate(motion.maneuver) if isinstance(one, HoldConfig)}
+    for row, view in enumerate(views):
+        leg = int(np.searchsorted(reference.start_s, view.t_s, side="right")) - 1
+        if leg in holds and view.t_s + view.exposure_s <= reference.start_s[leg + 1]:
+            rate_rad_s = np.linalg.norm(flight.trajectory().rate_at(view.t_s + view.exposure_s / 2))
+            if rate_rad_s * view.exposure_s * scene.camera.focal_px < REST_PX:
+                by_hold[leg] = row
+    return list(by_hold.values()), len(holds)

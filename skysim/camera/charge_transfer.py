@@ -1,0 +1,228 @@
+"""Charge transport in the chip: blooming, transfer loss and smear, in place on a frame.
+
+A frame is (H, W) electrons, float32 or float64. It is read out towards row 0 and then towards column 0: the packet
+of pixel (x, y) makes y + 1 parallel and x + 1 serial transfers.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.jit import jit
+from skysim.core.types import Floats
+
+BLOCK = 256  # columns processed together: a kilobyte or two of each row, which the processor reads ahead
+TAIL = 1e-6  # fraction of a packet that the table of delays does not resolve
+
+
+def bloom(electrons: NDArray[Any], full_well_e: float, anti_blooming: float = 0.0) -> None:
+    """Spread charge above the full well along its column: half of each excess to either neighbor, until all fits.
+
+    The final state does not depend on the order of the halvings, and it conserves the charge's sum and first moment
+    (the divisible sandpile in one dimension: Levine & Peres 2009, Potential Anal. 30, 1; `assumed`). These two
+    conserved numbers give the ends of the streak directly, see `_settle`. Columns without excess are skipped.
+
+    Parameters
+    ----------
+    anti_blooming
+        Fraction of every pixel's excess that a drain removes first; the rest is conserved,
+        except for what leaves the ends of the column, which is lost.
+    """
+    columns = np.flatnonzero(electrons.max(axis=0) > full_well_e)
+    if len(columns):
+        _bloom(electrons, columns, float(full_well_e), float(anti_blooming))
+
+
+@jit(parallel=True)
+def _bloom(
+    electrons: NDArray[Any], columns: NDArray[np.int64], full_well_e: float, anti_blooming: float
+) -> None:
+    height = electrons.shape[0]
+    for k in numba.prange(len(columns)):
+        x = columns[k]
+        headroom = np.empty(height)  # remaining capacity; negative: excess
+        first = height
+        last = -1
+        for y in range(height):
+            headroom[y] = full_well_e - electrons[y, x]
+            if headroom[y] < 0:
+                # The drain takes its fraction of the excess before the rest spreads.
+                headroom[y] *= 1 - anti_blooming
+                first = min(first, y)
+                last = max(last, y)
+        for y in range(height):
+            if headroom[y] < 0:
+                a, b = _settle(headroom, y)
+                first = min(first, a)
+                last = max(last, b)
+        for y in range(max(first, 0), min(last, height - 1) + 1):
+            # Back from remaining capacity to charge, only where something changed.
+            electrons[y, x] = full_well_e - headroom[y]
+
+
+@jit
+def _settle(headroom: Floats, y: int) -> tuple[int, int]:
+    """Spread the excess of pixel y until it fits; return the two ends of the streak, which are filled partly.
+
+    All pixels between the ends a and b are full. The charge that is left over, `excess` with its first moment `moment`
+    about y, is split between a and b so that sum and first moment are conserved (the lever rule). An end pixel that
+    cannot hold its part is filled and the end moves on; if that pixel has excess itself (negative room), its excess
+    joins the charge to spread. Beyond the column's ends any amount fits, and is lost.
+    """
+    height = len(headroom)
+    # moment about y
+    excess = -headroom[y]
+    moment = 0.0
+    headroom[y] = 0.0
+    a = y - 1
+    b = y + 1
+    while True:
+        # Lever rule: the charge left over is split so that its sum and its moment about y are conserved.
+        to_b = (moment + excess * (y - a)) / (b - a)
+        to_a = excess - to_b
+        if a >= 0 and to_a > headroom[a]:
+            excess = excess - headroom[a]
+            moment = moment - headroom[a] * (a - y)
+            headroom[a] = 0.0
+            a -= 1
+        elif b < height and to_b > headroom[b]:
+            excess = excess - headroom[b]
+            moment = moment - headroom[b] * (b - y)
+            headroom[b] = 0.0
+            b += 1
+        else:
+            break
+    if a >= 0:
+        headroom[a] -= to_a
+    if b < height:
+        headroom[b] -= to_b
+    return a, b
+
+
+def transfer_loss(electrons: NDArray[Any], cti_parallel: float, cti_serial: float) -> None:
+    """Charge-transfer inefficiency: every transfer leaves a fraction behind, which joins the next packet:
+    trailing tails.
+
+    Of a packet that makes n transfers, C(n + k - 1, k) cti^k (1 - cti)^n arrives k pixels late: it takes k
+    failures before the n-th success, the negative binomial law. What arrives later than the frame's last row or
+    column is in the overscan and not in the frame; nothing else is lost.
+
+    Parameters
+    ----------
+    cti_parallel, cti_serial
+        That fraction, the same for every charge (linear, no traps that fill).
+    """
+    height, width = electrons.shape
+    if cti_parallel > 0:
+        _delay_rows(electrons, delayed_fractions(height, cti_parallel))
+    if cti_serial > 0:
+        _delay_columns(electrons, delayed_fractions(width, cti_serial).astype(electrons.dtype))
+
+
+@functools.lru_cache(maxsize=8)
+def delayed_fractions(transfers: int, cti: float) -> Floats:
+    """(K + 1, transfers) fraction of the packet of n + 1 transfers that arrives k pixels late; columns add up to 1.
+
+    The terms follow from one another: C(n + k - 1, k) = C(n + k - 2, k - 1) (n + k - 1) / k. K is where less than 1e-6
+    of the charge with the most transfers is later still; that is counted as K pixels late.
+    """
+    n = np.arange(1, transfers + 1)
+    fractions = [(1 - cti) ** n]
+    while (later := 1 - np.sum(fractions, axis=0))[-1] > TAIL:
+        k = len(fractions)
+        fractions.append(fractions[-1] * cti * (n + k - 1) / k)
+    fractions[-1] = np.maximum(fractions[-1] + later, 0)  # `later` may be minus a rounding error
+    table = np.array(fractions)
+    table.flags.writeable = False
+    return table
+
+
+@jit(parallel=True)
+def _delay_rows(electrons: NDArray[Any], fraction: Floats) -> None:
+    """Apply the parallel loss from the last row to the first: each row gathers from rows that are not yet changed."""
+    height, width = electrons.shape
+    for block in numba.prange((width + BLOCK - 1) // BLOCK):
+        first = block * BLOCK
+        last = min((block + 1) * BLOCK, width)
+        gathered = np.empty(last - first, electrons.dtype)
+        # Backwards, so that the rows that row y gathers from still hold the charge before transfer.
+        for y in range(height - 1, -1, -1):
+            gathered[:] = 0
+            for k in range(min(len(fraction), y + 1)):
+                weight = electrons.dtype.type(fraction[k, y - k])
+                packets = electrons[y - k, first:last]
+                for x in range(len(gathered)):
+                    gathered[x] += weight * packets[x]
+            electrons[y, first:last] = gathered
+
+
+@jit(parallel=True)
+def _delay_columns(electrons: NDArray[Any], fraction: NDArray[Any]) -> None:
+    """Apply the serial loss. fraction : of the electrons' type"""
+    height, width = electrons.shape
+    for y in numba.prange(height):
+        row = electrons[y]
+        gathered = np.zeros(width, electrons.dtype)
+        for k in range(min(len(fraction), width)):
+            weight = fraction[k]
+            late = gathered[k:]
+            for x in range(len(late)):
+                late[x] += weight[x] * row[x]
+        row[:] = gathered
+
+
+def frame_transfer_smear(light_e: NDArray[Any], exposure_s: float, row_time_s: float) -> None:
+    """Smear of a frame-transfer chip: rows shifted under light collect row_time / exposure of the light of every
+    row passed.
+
+    The chip is shifted into its store row by row before the exposure as after it. A pixel that ends at row y was
+    shifted in, empty, over the rows above y (greater y) and is shifted out over those below, for row_time in each.
+    So it passes every other row of its column once, with the same brightness as in the exposure.
+
+    Parameters
+    ----------
+    light_e
+        Light of the exposure; the smear is added in place. Dark current is the same in every
+        row, so it is not affected.
+    """
+    _smear(light_e, row_time_s / exposure_s)
+
+
+def interline_smear(
+    light_e: NDArray[Any], exposure_s: float, row_time_s: float, leak: float
+) -> None:
+    """Smear of an interline chip: the covered register collects `leak` of the light of every row passed.
+
+    Parameters
+    ----------
+    light_e
+        Light of the exposure; the smear is added in place. The register is clocked all the
+        time, so the register cell that takes over a pixel's charge has passed the rows above it
+        and will pass those below.
+    """
+    _smear(light_e, leak * row_time_s / exposure_s)
+
+
+@jit(parallel=True)
+def _smear(light_e: NDArray[Any], fraction: float) -> None:
+    """Add to every pixel a fraction of the sum of the other pixels in its column."""
+    height, width = light_e.shape
+    for block in numba.prange((width + BLOCK - 1) // BLOCK):
+        first = block * BLOCK
+        last = min((block + 1) * BLOCK, width)
+        total = np.zeros(last - first)
+        for y in range(height):
+            total += light_e[y, first:last]
+        smear = (fraction * total).astype(light_e.dtype)
+        own = light_e.dtype.type(1 - fraction)
+        for y in range(height):
+            row = light_e[
+                y, first:last
+            ]  # contiguous for the compiler, which rows of a block of columns are not
+            for x in range(len(row)):
+                row[x] = own * row[x] + smear[x]

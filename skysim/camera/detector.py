@@ -1,0 +1,375 @@
+"""The detector model: mean photo-electrons to digital numbers, one function per step, in the order of the signal.
+
+Light and shutter smear, PRNU and dark current, Poisson counting, particles, full well or blooming, transfer loss,
+read noise, nonlinearity and the converter. Each step is switched off by its parameter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from math import hypot
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numba import float32, int32
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from skysim.camera import charge_transfer, cosmic_rays, noise
+from skysim.core.jit import jit
+from skysim.core.random_streams import random_stream
+from skysim.core.types import SourceTruth
+from skysim.scene.sections.camera import (
+    CameraConfig,
+    DetectorConfig,
+    FrameTransferConfig,
+    InterlineConfig,
+    Shutter,
+)
+from skysim.sources.photometry import snr
+
+# Pixels to which something other than light adds charge: smear of the shutter and particles, for
+# labelled frames.
+
+
+SMEAR = "smear"
+PARTICLES = "cosmic_ray"
+
+
+class AddedCharge:
+    """Masks of the pixels that gain more than threshold_e electrons while they are watched, by what adds them.
+
+    A frame is watched only where its masks are wanted, since that takes a copy of it.
+    """
+
+    def __init__(self, threshold_e: float) -> None:
+        self.threshold_e = threshold_e
+        self.masks = dict[str, NDArray[np.bool_]]()
+
+    @contextmanager
+    def watch(self, name: str, electrons: NDArray[Any]) -> Iterator[None]:
+        """Compare a frame of electrons before and after the body of this context, which changes it in place."""
+        before = electrons.copy()
+        yield
+        np.subtract(electrons, before, out=before)
+        self.masks[name] = before > self.threshold_e
+
+
+ROWS = 16  # that share memory for their random numbers
+
+
+@dataclass(frozen=True, slots=True)
+class Detector:
+    """One chip: its parameters and its fixed pattern, drawn from its hardware seed.
+
+    Attributes
+    ----------
+    sensitivity
+        (H, W) relative, mean 1: PRNU
+    dark_e_s
+        (H, W) dark current at the chip's temperature, with DSNU and hot pixels
+    column_offset_e
+        (W,) offsets of the column amplifiers
+    """
+
+    config: DetectorConfig
+    shutter: Shutter
+    pixel_m: float
+    sensitivity: NDArray[np.float32]
+    dark_e_s: NDArray[np.float32]
+    column_offset_e: NDArray[np.float32]
+
+    @classmethod
+    def from_camera(cls, camera: CameraConfig) -> Detector:
+        """Draw the fixed pattern."""
+        config = camera.detector
+        shape = (camera.height_px, camera.width_px)
+        prnu, dark, column = (random_stream(config.hardware_seed, key) for key in range(3))
+        return cls(
+            config,
+            camera.shutter,
+            camera.pixel_m,
+            sensitivity(config, shape, prnu),
+            dark_current_e_s(config, shape, dark),
+            (config.column_offset_e * column.standard_normal(shape[1])).astype(np.float32),
+        )
+
+
+def sensitivity(
+    config: DetectorConfig, shape: tuple[int, int], rng: Generator
+) -> NDArray[np.float32]:
+    """Photo-response non-uniformity (PRNU): Gaussian about 1, independent in each pixel, not below 0."""
+    if config.prnu == 0:
+        return np.ones(shape, np.float32)
+    prnu = rng.standard_normal(shape, np.float32)
+    prnu *= config.prnu
+    prnu += 1
+    return np.maximum(prnu, 0, out=prnu)
+
+
+def dark_current_e_s(
+    config: DetectorConfig, shape: tuple[int, int], rng: Generator
+) -> NDArray[np.float32]:
+    """Dark current of every pixel: D = D_ref 2^((T - T_ref) / T_double), D_ref lognormal over the pixels.
+
+    A lognormal of mean 1 and standard deviation dsnu has s^2 = ln(1 + dsnu^2) and median exp(-s^2 / 2). Hot pixels
+    add an exponential of mean hot_e_s. Generation in the depletion region doubles every 6 to 8 K near room
+    temperature (Janesick 2001, Scientific Charge-Coupled Devices, ch. 7).
+    """
+    dark = np.full(shape, config.dark_e_s, np.float32)
+    if config.dsnu > 0 and config.dark_e_s > 0:
+        s2 = np.log1p(config.dsnu**2)
+        normal = rng.standard_normal(shape, np.float32)
+        dark *= np.exp(np.float32(np.sqrt(s2)) * normal - np.float32(s2 / 2))
+    hot = rng.choice(dark.size, rng.binomial(dark.size, config.hot_pixels), replace=False)
+    dark.reshape(-1)[hot] += rng.exponential(config.hot_e_s, len(hot)).astype(np.float32)
+    dark *= np.float32(2.0**config.doublings)
+    return dark
+
+
+def expose(
+    light_e: NDArray[Any],
+    exposure_s: float,
+    detector: Detector,
+    rng: Generator,
+    added: AddedCharge | None = None,
+) -> NDArray[Any]:
+    """Convert a frame's light to digital numbers. Returns (H, W) uint16.
+
+    With noise off the frame is the expected value in digital numbers, of light_e's own type, neither rounded nor
+    clipped, for tests of the steps that follow.
+
+    Parameters
+    ----------
+    light_e
+        (H, W) float32 mean photo-electrons of a perfect pixel, including the shutter's `smear`;
+        overwritten
+    added
+        Gets the mask of the particles' pixels
+    """
+    config = detector.config
+    if not config.noise:
+        return expectation(light_e, exposure_s, detector)
+    count_seeds = noise.seeds(rng, len(light_e))
+    read_seeds = noise.seeds(rng, len(light_e))
+    constants = readout_constants(config, exposure_s)
+    guide = noise.guide()
+    pattern = (detector.sensitivity, detector.dark_e_s)
+    frame = np.empty(light_e.shape, np.uint16)
+    # With no step between counting and read-out, one fused loop does both, with the same numbers.
+    if not (
+        config.particles or config.blooming == "column" or config.cti_parallel or config.cti_serial
+    ):
+        _count_and_read(
+            light_e,
+            *pattern,
+            detector.column_offset_e,
+            constants,
+            count_seeds,
+            read_seeds,
+            guide,
+            frame,
+        )
+        return frame
+    _count(light_e, *pattern, constants, count_seeds, guide)
+    if config.particles:
+        with added.watch(PARTICLES, light_e) if added else nullcontext():
+            cosmic_rays.add_particles(light_e, exposure_s, detector.pixel_m, config.particles, rng)
+    if config.blooming == "column":
+        charge_transfer.bloom(light_e, config.full_well_e, config.anti_blooming)
+    else:
+        np.minimum(light_e, config.full_well_e, out=light_e)
+    if config.cti_parallel or config.cti_serial:
+        charge_transfer.transfer_loss(light_e, config.cti_parallel, config.cti_serial)
+    _read_out(light_e, detector.column_offset_e, constants, read_seeds, frame)
+    return frame
+
+
+def expectation(light_e: NDArray[Any], exposure_s: float, detector: Detector) -> NDArray[Any]:
+    """Expected digital numbers without full well, nonlinearity and particles."""
+    config = detector.config
+    mean_e = light_e * detector.sensitivity + detector.dark_e_s * exposure_s
+    charge_transfer.transfer_loss(mean_e, config.cti_parallel, config.cti_serial)
+    return (mean_e + detector.column_offset_e) / config.gain_e_dn + config.offset_dn
+
+
+def smear(
+    light_e: NDArray[Any], exposure_s: float, shutter: Shutter, added: AddedCharge | None = None
+) -> None:
+    """Add the smear of a frame-transfer or interline shutter to the light (in place). Other shutters add none.
+
+    Rolling shutters are part of the time integral in render.py. added : gets the mask of the pixels
+    """
+    if not isinstance(shutter, FrameTransferConfig | InterlineConfig):
+        return
+    with added.watch(SMEAR, light_e) if added else nullcontext():
+        if isinstance(shutter, FrameTransferConfig):
+            charge_transfer.frame_transfer_smear(light_e, exposure_s, shutter.row_time_s)
+        else:
+            charge_transfer.interline_smear(light_e, exposure_s, shutter.row_time_s, shutter.leak)
+
+
+class ReadoutConstants(NamedTuple):
+    """Detector parameters for the compiled loops."""
+
+    exposure_s: np.float32
+    well_e: np.float32
+    noise_e: np.float32
+    nonlinearity_per_e: np.float32
+    dn_per_e: np.float32
+    offset_dn: np.float32
+    top_dn: np.float32
+
+
+def readout_constants(config: DetectorConfig, exposure_s: float) -> ReadoutConstants:
+    """The parameters that `_count_row` and `_read_row` need, in single precision."""
+    values = (
+        exposure_s,
+        np.inf if config.blooming == "column" else config.full_well_e,
+        hypot(config.read_noise_e, config.reset_noise_e),
+        config.nonlinearity / config.full_well_e,
+        1 / config.gain_e_dn,
+        config.offset_dn + 0.5,  # truncation after adding 0.5 rounds
+        2**config.bits - 1,
+    )
+    return ReadoutConstants(*map(np.float32, values))
+
+
+@jit
+def _count_row(
+    row: Any,
+    sensitivity: Any,
+    dark_e_s: Any,
+    constants: ReadoutConstants,
+    seed: Any,
+    guide: Any,
+    memory: noise.Scratch,
+) -> None:
+    """Count electrons, light and dark together: Poisson, variance equal to the mean. One row, in place.
+
+    PRNU is a pixel's relative quantum efficiency, so it scales the mean and the sum stays a Poisson variable.
+    """
+    for x in range(row.size):
+        # Interpolated images may be slightly negative (about 1e-6).
+        row[x] = max(row[x], float32(0)) * sensitivity[x] + dark_e_s[x] * constants.exposure_s
+    noise.count(row, seed, guide, memory)
+
+
+@jit
+def _read_row(
+    row: Any,
+    offset_e: Any,
+    constants: ReadoutConstants,
+    seed: Any,
+    memory: noise.Scratch,
+    dn_row: Any,
+) -> None:
+    """Convert charge to numbers: full well, column offset and read noise, nonlinearity, gain, rounding, clipping.
+
+    Without blooming a well holds at most its capacity. The amplifier gives e (1 - nonlinearity e / full_well);
+    DN = round(that / gain + offset), clipped to the converter's bits.
+    """
+    noise_row = memory.normals
+    noise.normal(noise_row, seed, memory)
+    for x in range(row.size):
+        e = min(row[x], constants.well_e) + offset_e[x] + constants.noise_e * noise_row[x]
+        dn = (
+            e * (float32(1) - constants.nonlinearity_per_e * e) * constants.dn_per_e
+            + constants.offset_dn
+        )
+        dn_row[x] = np.uint16(int32(min(max(dn, float32(0)), constants.top_dn)))
+
+
+@jit(parallel=True)
+def _count(
+    light_e: Any,
+    sensitivity: Any,
+    dark_e_s: Any,
+    constants: ReadoutConstants,
+    seeds: Any,
+    guide: Any,
+) -> None:
+    """Light to electrons, in place; see `_count_row`."""
+    height, width = light_e.shape
+    for block in numba.prange((height + ROWS - 1) // ROWS):
+        memory = noise.scratch(width)
+        for y in range(block * ROWS, min((block + 1) * ROWS, height)):
+            _count_row(light_e[y], sensitivity[y], dark_e_s[y], constants, seeds[y], guide, memory)
+
+
+@jit(parallel=True)
+def _read_out(
+    electrons: Any, offset_e: Any, constants: ReadoutConstants, seeds: Any, frame: Any
+) -> None:
+    """Electrons to digital numbers; see `_read_row`."""
+    height, width = electrons.shape
+    for block in numba.prange((height + ROWS - 1) // ROWS):
+        memory = noise.scratch(width)
+        for y in range(block * ROWS, min((block + 1) * ROWS, height)):
+            _read_row(electrons[y], offset_e, constants, seeds[y], memory, frame[y])
+
+
+@jit(parallel=True)
+def _count_and_read(
+    light_e: Any,
+    sensitivity: Any,
+    dark_e_s: Any,
+    offset_e: Any,
+    constants: ReadoutConstants,
+    count_seeds: Any,
+    read_seeds: Any,
+    guide: Any,
+    frame: Any,
+) -> None:
+    """`_count` and `_read_out` fused row by row: the same numbers, faster. Only if no charge leaves its row between."""
+    height, width = light_e.shape
+    for block in numba.prange((height + ROWS - 1) // ROWS):
+        memory = noise.scratch(width)
+        for y in range(block * ROWS, min((block + 1) * ROWS, height)):
+            _count_row(
+                light_e[y], sensitivity[y], dark_e_s[y], constants, count_seeds[y], guide, memory
+            )
+            _read_row(light_e[y], offset_e, constants, read_seeds[y], memory, frame[y])
+
+
+def saturation_dn(config: DetectorConfig) -> float:
+    """The digital number from which a pixel counts as saturated: full well less three sigma of the read-out noise,
+    or the converter's maximum.
+    """
+    well_e = config.full_well_e - 3 * hypot(config.read_noise_e, config.reset_noise_e)
+    well_dn = (
+        well_e * (1 - config.nonlinearity * well_e / config.full_well_e) / config.gain_e_dn
+        + config.offset_dn
+    )
+    return float(min(max(well_dn, 0.0), 2**config.bits - 1))
+
+
+def add_snr_and_saturation(
+    sources: SourceTruth, light_e: NDArray[Any], exposure_s: float, detector: Detector
+) -> SourceTruth:
+    """Which sources are expected to saturate, and the signal-to-noise ratio of each.
+
+    Both use the incident light: losses by full well or nonlinearity are not subtracted. A source is saturated if the
+    expected value in its brightest pixel reaches `saturation_dn`. The SNR is that of the CCD equation over the
+    noise-equivalent area of its image, with all other charge in its brightest pixel as background, and with the
+    converter's rounding added to the read noise.
+
+    Parameters
+    ----------
+    light_e
+        (H, W) mean photo-electrons of the whole frame, smear included, before `expose`
+        overwrites it
+    """
+    config = detector.config
+    x, y = sources.peak_xy.T
+    own_e = sources.peak_e * detector.sensitivity[y, x]
+    mean_e = light_e[y, x] * detector.sensitivity[y, x] + detector.dark_e_s[y, x] * exposure_s
+    read_e = mean_e * (1 - config.nonlinearity * np.minimum(mean_e / config.full_well_e, 1))
+    # The relative nonlinearity is held at its value at full well, since beyond it the parabola turns down.
+    is_saturated = read_e / config.gain_e_dn + config.offset_dn >= saturation_dn(config)
+    noise_e = np.sqrt(config.read_noise_e**2 + config.reset_noise_e**2 + config.gain_e_dn**2 / 12)
+    sources_snr = snr(sources.electrons, sources.area_px, np.maximum(mean_e - own_e, 0), noise_e)
+    return replace(sources, saturated=is_saturated, snr=sources_snr)

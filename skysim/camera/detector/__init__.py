@@ -1,1 +1,0 @@
-"""The detector: fixed pattern, noise, charge transfer and cosmic rays, one function per step."""

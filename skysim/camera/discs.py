@@ -1,0 +1,551 @@
+"""Draw the Sun, the Moon and the planets: points, small discs of a few points, and large discs by convolution."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from skysim.camera.optics import Optics
+from skysim.camera.psf.kernel_cache import Kernels, source_kernels
+from skysim.camera.render import (
+    STEP,
+    OcclusionTest,
+    Window,
+    draw,
+    image_tracks,
+    in_view,
+    poses,
+    project,
+    render,
+    sample_times,
+)
+from skysim.core.jit import jit
+from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory
+from skysim.sources.bodies import BodyLight
+from skysim.sources.body_discs import DiscSurface, cell_light, disc_elements, inner_radius2
+from skysim.sources.dome.led import Emitter
+from skysim.sources.stars import steady_points
+
+# The light of a disc on a lattice of sub-pixels, sampled several times a point where that is
+# needed.
+
+
+REACH = 3  # points to either side among which a sample's light is shared
+
+
+def lattice_light(
+    surface: DiscSurface,
+    count: int,
+    subsamples: int,
+    axis_px: Floats,
+    radius_from_px: Floats,
+    shown: Any,
+) -> Floats:
+    """(count, count) shares of the disc's light at the points of a lattice, [y, x], which zeros must surround.
+
+    Parameters
+    ----------
+    axis_px
+        (count * subsamples,) even coordinates of the samples in both directions
+    shown
+        (len(axis_px), len(axis_px)) the part of each sample that nothing hides; (0, 0) where
+        all are seen
+    """
+    fine = len(axis_px)
+    weights = sharing_weights(subsamples)
+    step = float(axis_px[1] - axis_px[0]) * math.sqrt(abs(float(np.linalg.det(radius_from_px))))
+    matrix = np.ascontiguousarray(radius_from_px)
+    has_earthshine = surface.earthshine > 0
+    sunlit = np.empty((fine, count))
+    earthlit = np.empty((fine, count) if has_earthshine else (0, 0))
+    totals = np.empty((fine, 2))
+    _light_rows(
+        sunlit,
+        earthlit,
+        totals,
+        surface.law,
+        surface.phase_rad,
+        axis_px,
+        matrix,
+        step,
+        weights,
+        shown,
+    )
+    of_sun, of_earth = totals.sum(axis=0)
+    light = np.empty((count, count))
+    of_all = 1 + surface.earthshine
+    _light_columns(light, sunlit, weights, 1 / (of_all * max(of_sun, 1e-300)), False)
+    if has_earthshine:
+        _light_columns(light, earthlit, weights, surface.earthshine / (of_all * of_earth), True)
+    return light
+
+
+def sharing_weights(subsamples: int) -> Floats:
+    """(subsamples, 2 REACH + 1) weights of a sample's light at the points -REACH to REACH from its own.
+
+    Light between two points is shared between them by linear weights: a triangular filter, whose spectrum sinc^2
+    suppresses the frequencies that the lattice folds back. Below them it is undone by the second differences
+    D = -delta^2: 1 / sinc^2 = 1 + D / 12 + D^2 / 90 + ...
+    """
+    offset = (np.arange(subsamples) + 0.5) / subsamples - 0.5
+    linear = np.stack([np.maximum(-offset, 0), 1 - np.abs(offset), np.maximum(offset, 0)], axis=1)
+    second = np.array([-1.0, 2.0, -1.0])
+    undone = np.convolve(second, second) / 90
+    undone[1:4] += second / 12
+    undone[2] += 1
+    return np.stack([np.convolve(row, undone) for row in linear])
+
+
+@jit(parallel=True)
+def _light_rows(
+    sunlit: Any,
+    earthlit: Any,
+    totals: Any,
+    law: int,
+    phase_rad: float,
+    axis_px: Floats,
+    matrix: Floats,
+    step: float,
+    weights: Floats,
+    shown: Any,
+) -> None:
+    """Light of each row of samples, shared among the lattice's columns, from the Sun and from the observer's side.
+
+    Parameters
+    ----------
+    totals
+        (fine, 2) sums of the rows with what is hidden
+    """
+    count = sunlit.shape[1]
+    subsamples = len(weights)
+    sine = math.sin(phase_rad)
+    cosine = math.cos(phase_rad)
+    inner = inner_radius2(step)
+    with_earth = len(earthlit) > 0
+    masked = len(shown) > 0
+    for j in numba.prange(len(axis_px)):
+        own = np.zeros(
+            (2, subsamples, count + 2 * REACH)
+        )  # with a margin, so that no point has an edge
+        of_sun = of_earth = 0.0
+        for k in range(count):
+            for m in range(subsamples):
+                i = k * subsamples + m
+                x = matrix[0, 0] * axis_px[i] + matrix[0, 1] * axis_px[j]
+                y = matrix[1, 0] * axis_px[i] + matrix[1, 1] * axis_px[j]
+                from_sun, from_earth = cell_light(law, sine, cosine, x, y, step, inner)
+                of_sun += from_sun
+                of_earth += from_earth
+                part = shown[j, i] if masked else 1.0
+                own[0, m, k + REACH] = part * from_sun
+                own[1, m, k + REACH] = part * from_earth
+        totals[j, 0] = of_sun
+        totals[j, 1] = of_earth
+        _share(sunlit[j], own[0], weights)
+        if with_earth:
+            _share(earthlit[j], own[1], weights)
+
+
+@jit
+def _share(points: Any, samples: Floats, weights: Floats) -> None:
+    """Light of (subsamples, count + 2 REACH) samples shared among (count,) points, in place."""
+    for k in range(len(points)):
+        points[k] = 0.0
+    for d in range(2 * REACH + 1):
+        for m in range(len(weights)):
+            weight = weights[m, d]
+            for k in range(len(points)):
+                points[k] += weight * samples[m, k + 2 * REACH - d]
+
+
+@jit(parallel=True)
+def _light_columns(light: Any, rows: Floats, weights: Floats, scale: float, add: bool) -> None:
+    """Rows of samples shared among the lattice's rows, scaled, in place of `light` or in addition to it."""
+    count = light.shape[1]
+    subsamples = len(weights)
+    for k in numba.prange(count):
+        if not add:
+            for i in range(count):
+                light[k, i] = 0.0
+        for d in range(max(k + REACH - count + 1, 0), min(2 * REACH, k + REACH) + 1):
+            for m in range(subsamples):
+                weight = scale * weights[m, d]
+                j = (k + REACH - d) * subsamples + m
+                for i in range(count):
+                    light[k, i] += weight * rows[j, i]
+
+
+# The image of a disc as a convolution of a star's image with a map of the disc's light.
+
+
+LATTICE = (
+    0.7  # largest spacing of the lattice, in units of the star image's sharpest feature (sigma)
+)
+SUBSAMPLES = 2  # least number of samples across a point of the lattice
+# across a disc
+MIN_SAMPLES = 160
+MAX_SAMPLES = 480
+CRESCENT_SAMPLES = 4  # wanted across a crescent
+ON_DISC = 1.2  # square of the radius within which a sample can have light
+SMALL = 1e-3  # of the radius: the step by which the disc's scale on the chip is found
+
+
+class Exposed(NamedTuple):
+    """A camera during an exposure."""
+
+    optics: Optics
+    trajectory: Trajectory
+    mount: Mount
+    window: Window
+
+
+class DiscOnChip(NamedTuple):
+    """Where a disc lies on the chip at mid-exposure.
+
+    Attributes
+    ----------
+    center_px
+        (2,)
+    px_from_radius
+        (2, 2) pixels (x, y) from coordinates on the disc in units of its radius
+    """
+
+    center_px: Floats
+    px_from_radius: Floats
+
+
+Hidden = Callable[[Floats], NDArray[np.bool_]]  # which of (M, 2) points of a disc are hidden
+
+
+def disc_on_chip(body: BodyLight, exposed: Exposed) -> DiscOnChip:
+    """Project the disc's center and two points near it. Center and scale are NaN behind the camera."""
+    window = exposed.window
+    rows = exposed.optics.camera.height_px
+    xy = SMALL * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    middle = poses(exposed.trajectory, exposed.mount, np.array([window.middle_s(rows)]))
+    center, x, y = project(points_of(body, xy), exposed.optics, middle)[0][0]
+    return DiscOnChip(center, np.column_stack([x - center, y - center]) / SMALL)
+
+
+def points_of(body: BodyLight, xy: Floats, share: Floats | None = None) -> Any:
+    """Points (M, 2) of a body's disc as Sources with (M,) shares of its light, all of it each if left out."""
+    share = np.ones(len(xy)) if share is None else share
+    ids = np.full(len(xy), body.id, np.int64)
+    magnitude = np.full(len(xy), body.magnitude)
+    colors = None if body.chromatic is None else np.tile(body.chromatic, (len(xy), 1))
+    return steady_points(ids, body.directions(xy), share * body.flux_e_s_m2, magnitude, colors)
+
+
+class DisplacedImages(NamedTuple):
+    """A point of the disc's full light at its center and displaced by sub-pixel phases.
+
+    Attributes
+    ----------
+    patches
+        (s, s, h, w) electrons, at phases (q / s, p / s) pixels down and right
+    corner_px
+        (2,) chip's pixel (x, y) of a patch's first one
+    speed_px_s
+        (2,) velocity of the image at mid-exposure
+    streak_px
+        Path length
+    """
+
+    patches: Floats
+    corner_px: NDArray[np.int64]
+    speed_px_s: Floats
+    streak_px: float
+
+
+def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> DisplacedImages:
+    """Draw a point with all of the body's light at the disc's center and at s^2 sub-pixel phases from it."""
+    optics = exposed.optics
+    camera = exposed.optics.camera
+    t_s = sample_times(
+        exposed.window.open_s, exposed.window.close_s(camera.height_px), exposed.trajectory
+    )
+    all_poses = poses(exposed.trajectory, exposed.mount, t_s)
+    star = star_kernel(optics, disc.center_px, body.chromatic)
+    steps = math.ceil(1 / (LATTICE * float(star.sharp_px[0])))
+    phase_px = np.stack(np.meshgrid(*2 * (np.arange(steps) / steps,)), axis=-1).reshape(
+        -1, 2
+    )  # x fastest
+    points = points_of(body, phase_px @ np.linalg.inv(disc.px_from_radius).T)
+    tracks, distance_m, cos_in = image_tracks(points, optics, all_poses, t_s, Emitter())
+    xy_px = tracks.xy_px
+    middle = len(t_s) // 2
+    is_led = np.zeros(len(points), bool)
+    blur_px = optics.blur_px
+    kernels = source_kernels(
+        camera,
+        xy_px[middle],
+        points.radius_m,
+        is_led,
+        distance_m,
+        cos_in,
+        None,
+        blur_px,
+        points.chromatic,
+    )
+    reach_px = kernels.reach_px.max() + 2
+    low = np.floor(np.nanmin(xy_px, axis=(0, 1)) - reach_px).astype(np.int64)
+    width, height = (
+        np.ceil(np.nanmax(xy_px, axis=(0, 1)) + reach_px).astype(np.int64) - low + 1
+    ).tolist()
+    # Side by side in one strip, each in a patch of its own.
+    strip = np.zeros((height, len(points) * width))
+    moved = xy_px - low + width * np.column_stack([np.arange(len(points)), np.zeros(len(points))])
+    window = exposed.window._replace(
+        open_s=exposed.window.open_s + low[1] * exposed.window.row_time_s
+    )
+    drawn = draw(strip, tracks._replace(xy_px=moved), kernels, STEP * kernels.sharp_px, window)
+    patches = strip.reshape(height, steps, steps, width).transpose(1, 2, 0, 3)
+    speed = (xy_px[middle + 1, 0] - xy_px[middle - 1, 0]) / (2 * tracks.step_s)
+    return DisplacedImages(patches, low, speed, float(drawn[0, 5]))
+
+
+def star_kernel(optics: Optics, xy_px: Floats, chromatic: Floats | None) -> Kernels:
+    """The kernel of a point at a place on the chip; chromatic: (4,) of its light."""
+    one = np.ones(1)
+    is_led = np.zeros(1, bool)
+    colors = None if chromatic is None else chromatic[None]
+    return source_kernels(
+        optics.camera, xy_px[None], 0 * one, is_led, one, one, None, optics.blur_px, colors
+    )
+
+
+class DiscImage(NamedTuple):
+    """(h, w) electrons, the chip's pixel (x, y) of the first one, the path length, and the (2,) displacement at the
+    speed of mid-exposure.
+    """
+
+    electrons: Floats
+    corner_px: NDArray[np.int64]
+    streak_px: float
+    streak_xy_px: Floats
+
+
+def disc_image(
+    body: BodyLight, disc: DiscOnChip, exposed: Exposed, hidden: Hidden | None
+) -> DiscImage:
+    """The mean photo-electrons of a disc, also those beyond the chip.
+
+    In a rolling shutter a point d below the center is exposed d rows later, and the image has moved by v row_time d
+    more: the map is sheared by the inverse of I - v row_time e_y^T. The rotation of the disc about its center during
+    the exposure is neglected.
+    """
+    star = star_images(body, disc, exposed)
+    steps = len(star.patches)
+    sheared = np.eye(2) - np.outer(star.speed_px_s * exposed.window.row_time_s, [0.0, 1.0])
+    radius_from_px = np.asarray(np.linalg.inv(disc.px_from_radius) @ sheared, float)
+    reach_px = math.ceil(float(np.linalg.norm(np.linalg.inv(radius_from_px), 2))) + 4
+    light = light_on_lattice(body, radius_from_px, reach_px, steps, hidden)
+    corner_px = star.corner_px - reach_px
+    streak_xy_px = star.speed_px_s * exposed.window.exposure_s
+    return DiscImage(convolved(light, star.patches), corner_px, star.streak_px, streak_xy_px)
+
+
+def convolved(light: Floats, patches: Floats) -> Floats:
+    """The sum over phases (q, p) of the convolutions of light[q::s, p::s] with patches[q, p], in full.
+
+    The transforms round where there is no light; what falls below zero is cut, as a disc's edge alone may be on the
+    chip, whose light would be negative.
+    """
+    steps, _, height, width = patches.shape
+    full = (len(light) // steps + height - 1, len(light) // steps + width - 1)
+    shape = [fft.next_fast_len(size, real=True) for size in full]
+    by_phase = light.reshape(len(light) // steps, steps, -1, steps).transpose(1, 3, 0, 2)
+    spectrum = (fft.rfft2(by_phase, shape) * fft.rfft2(patches, shape)).sum(axis=(0, 1))
+    return np.maximum(fft.irfft2(spectrum, shape)[: full[0], : full[1]], 0.0)
+
+
+def light_on_lattice(
+    body: BodyLight, radius_from_px: Floats, reach_px: int, steps: int, hidden: Hidden | None
+) -> Floats:
+    """Shares of the light of the lattice's points, (n, n) from -reach_px to reach_px in both directions."""
+    count = (2 * reach_px + 1) * steps
+    radius_px = 1 / float(np.linalg.norm(radius_from_px, 2))
+    crescent = 1 + math.cos(body.place.phase_rad)  # its width in units of the radius
+    samples = min(max(MIN_SAMPLES, 2 * CRESCENT_SAMPLES / max(crescent, 1e-9)), MAX_SAMPLES)
+    subsamples = max(SUBSAMPLES, math.ceil(samples / (2 * radius_px * steps)))
+    fine = count * subsamples
+    # The cells of points 0, 1/s, ... are centered on them.
+    axis_px = (np.arange(fine) + 0.5) / (steps * subsamples) - 0.5 / steps - reach_px
+    shown = np.ones((fine, fine)) if hidden else np.ones((0, 0))
+    if hidden:
+        xy = np.stack(np.meshgrid(axis_px, axis_px), axis=-1) @ radius_from_px.T
+        on_disc = np.sum(xy**2, axis=2) < ON_DISC
+        shown[on_disc] = ~hidden(xy[on_disc])
+    return lattice_light(body.surface, count, subsamples, axis_px, radius_from_px, shown)
+
+
+POINT_PX = 0.3  # a disc of a smaller diameter is a point: its image is wider by 0.006 px^2, or half a percent
+SMALL_PX = 4.0  # one of a smaller diameter is a few points
+COARSE = 16  # places across a disc at which the vehicle is tested for hiding it
+FEW = 9  # poses in an exposure at which a body is looked for in the field
+
+
+def render_bodies(
+    image: NDArray[Any],
+    bodies: Sequence[BodyLight],
+    exposed: Exposed,
+    occluded: OcclusionTest | None = None,
+) -> list[SourceTruth]:
+    """Add the light of the bodies, farthest first, to the (H, W) image, in place; return the truth of each in view.
+
+    Lens, motion and shutter act on a disc as on a star (see disc_image.py). What is behind a nearer body is left out.
+    """
+    window = exposed.window
+    few_poses = poses(
+        exposed.trajectory,
+        exposed.mount,
+        np.linspace(window.open_s, window.close_s(len(image)), FEW),
+    )
+    truths = []
+    for n in in_view(centers_of(bodies), exposed.optics, few_poses).tolist():
+        body = bodies[n]
+        disc = disc_on_chip(body, exposed)
+        diameter_px = (
+            2 * float(np.linalg.norm(disc.px_from_radius, 2))
+            if np.isfinite(disc.center_px).all()
+            else 0.0
+        )
+        nearer = bodies[n + 1 :]
+        if diameter_px > SMALL_PX:
+            drawn = disc_image(body, disc, exposed, hidden_points(body, nearer, occluded))
+            truths += add_disc(image, drawn, body, disc.center_px)
+        else:
+            hidden = behind(nearer, occluded)
+            truths += render_points(
+                image, body, diameter_px > POINT_PX, exposed, hidden, disc.center_px
+            )
+    return truths
+
+
+def centers_of(bodies: Sequence[BodyLight]) -> Sources:
+    """The centers of bodies as points with all of their light."""
+    number = [(body.id, body.flux_e_s_m2, body.magnitude) for body in bodies]
+    ids, flux_e_s_m2, magnitude = np.array(number, float).reshape(-1, 3).T
+    directions = np.array([body.place.direction for body in bodies]).reshape(-1, 3)
+    return steady_points(ids.astype(np.int64), directions, flux_e_s_m2, magnitude)
+
+
+def render_points(
+    image: NDArray[Any],
+    body: BodyLight,
+    resolved: bool,
+    exposed: Exposed,
+    hidden: OcclusionTest | None,
+    center_px: Floats,
+) -> list[SourceTruth]:
+    """Draw a small disc as points, one at the center of its light if it is not resolved."""
+    elements = disc_elements(body.surface)
+    if not resolved:
+        elements = elements.merged()
+    own = np.zeros_like(image) if resolved else image
+    truth = render(own, points_of(body, *elements), *exposed, None, hidden)
+    if not resolved or not len(truth.id):
+        return [truth] if len(truth.id) else []
+    image += own
+    streak = (float(truth.streak_px.mean()), truth.streak_xy_px.mean(axis=0))
+    return [whole(own, np.zeros(2, np.int64), body, center_px, *streak)]
+
+
+def add_disc(
+    image: NDArray[Any], disc: DiscImage, body: BodyLight, center_px: Floats
+) -> list[SourceTruth]:
+    """Add a disc's image to the chip's; return its truth, none if it misses the chip."""
+    size = np.array(disc.electrons.shape[::-1])
+    limit = np.array(image.shape[::-1])
+    low = np.clip(disc.corner_px, 0, limit)
+    high = np.clip(disc.corner_px + size, 0, limit)
+    (x0, y0), (x1, y1) = low - disc.corner_px, high - disc.corner_px
+    own = disc.electrons[y0:y1, x0:x1]
+    if not own.size or own.max() <= 0:
+        return []
+    image[low[1] : high[1], low[0] : high[0]] += own
+    return [whole(own, low, body, center_px, disc.streak_px, disc.streak_xy_px)]
+
+
+def whole(
+    own_e: NDArray[Any],
+    corner_px: NDArray[np.int64],
+    body: BodyLight,
+    center_px: Floats,
+    streak_px: float,
+    streak_xy_px: Floats,
+) -> SourceTruth:
+    """The truth of one body, a row, from its own light in a part of the image that begins at a corner (x, y)."""
+    electrons = own_e.sum(dtype=float)
+    y, x = np.unravel_index(np.argmax(own_e), own_e.shape)
+    columns = own_e.sum(axis=0, dtype=float)
+    rows = own_e.sum(axis=1, dtype=float)
+    center = np.array([columns @ np.arange(len(columns)), rows @ np.arange(len(rows))]) / electrons
+    return SourceTruth(
+        id=np.array([body.id]),
+        xy_px=center_px[None],
+        flux_xy_px=(corner_px + center)[None],
+        electrons=np.array([electrons]),
+        peak_e=np.array([own_e[y, x]], float),
+        streak_px=np.array([streak_px]),
+        area_px=np.array([electrons**2 / np.sum(np.square(own_e, dtype=float))]),
+        peak_xy=corner_px[None] + np.array([[x, y]]),
+        saturated=np.zeros(1, bool),  # set by the detector
+        snr=np.full(1, np.nan),
+        streak_xy_px=streak_xy_px[None],
+    )
+
+
+def behind(bodies: Sequence[BodyLight], occluded: OcclusionTest | None) -> OcclusionTest | None:
+    """The test for sources that the discs of these bodies or anything else hide; None if nothing can."""
+
+    def hidden(place: Floats) -> NDArray[np.bool_]:
+        by_discs = [body.hides(place[:, :3]) for body in bodies]
+        return np.any([*by_discs, *([occluded(place)] if occluded else [])], axis=0)
+
+    return hidden if bodies else occluded
+
+
+def hidden_points(
+    body: BodyLight, nearer: Sequence[BodyLight], occluded: OcclusionTest | None
+) -> Hidden | None:
+    """The test for points (M, 2) of a disc that nearer bodies or the vehicle hide; None if nothing does.
+
+    The vehicle is tested at COARSE places across the disc.
+    """
+    overlapping = [other for other in nearer if body.overlaps(other)]
+    axis = (np.arange(COARSE) + 0.5) * (2 / COARSE) - 1
+    coarse = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    by_vehicle = (
+        occluded(points_of(body, coarse).place) if occluded else np.zeros(len(coarse), bool)
+    )
+
+    def hidden(xy: Floats) -> NDArray[np.bool_]:
+        column, row = np.clip(((xy + 1) * (COARSE / 2)).astype(int), 0, COARSE - 1).T
+        directions = body.directions(xy)
+        return np.any(
+            [
+                by_vehicle[row * COARSE + column],
+                *(other.hides(directions) for other in overlapping),
+            ],
+            axis=0,
+        )
+
+    return hidden if overlapping or by_vehicle.any() else None
+
+
+def concatenated(truths: Sequence[SourceTruth]) -> SourceTruth:
+    """The rows of several truths, in their order."""
+    if len(truths) == 1:
+        return truths[0]
+    names = [field.name for field in fields(SourceTruth)]
+    return SourceTruth(
+        **{name: np.concatenate([getattr(truth, name) for truth in truths]) for name in names}
+    )

@@ -1,1 +1,0 @@
-"""Images of bodies that are larger than a pixel: Sun, Moon and planets."""

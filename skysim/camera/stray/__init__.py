@@ -1,1 +1,0 @@
-"""Stray light: the dome's reflections as the camera sees them, ghosts of the lens, and its veiling glare."""

@@ -1,0 +1,261 @@
+"""Atomic writes of files and folders, tables, images and JSON."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import platform
+import re
+import shutil
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError
+
+HOST = f"{zlib.crc32(platform.node().encode()):08x}"  # distinguishes machines that share a folder
+
+TEMPORARY_NAME = re.compile(rf"\..+\.skysim-{HOST}-(\d{{1,9}})(\.\w+)?")
+
+ACTIVE_PATHS: set[Path] = set()  # temporary paths in use by this process
+
+
+@contextlib.contextmanager
+def temporary_path(path: Path) -> Iterator[Path]:
+    """Yield a hidden name beside `path` with host and process id, for a file or a folder; removed at the end."""
+    temporary = path.with_name(f".{path.stem}.skysim-{HOST}-{os.getpid()}{path.suffix}")
+    ACTIVE_PATHS.add(temporary.absolute())
+    try:
+        yield temporary
+    finally:
+        remove(temporary)
+        ACTIVE_PATHS.discard(temporary.absolute())
+
+
+def remove_stale_temporaries(folder: Path) -> None:
+    """Remove temporary files that processes of this machine left in the folder and that no longer run."""
+    for path in folder.glob(".*.skysim-*"):
+        match = TEMPORARY_NAME.fullmatch(path.name)
+        if match and not writer_is_running(int(match[1]), path):
+            with contextlib.suppress(OSError):  # a permission error will surface at the next write
+                remove(path)
+
+
+def writer_is_running(pid: int, path: Path) -> bool:
+    """Whether the process that was writing a file still runs. Our own process number may be a reused one."""
+    if pid == os.getpid():
+        return path.absolute() in ACTIVE_PATHS
+    if os.name != "posix":  # signal 0 is not available
+        return True
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # it runs as another user
+        return True
+    return True
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a folder if it exists."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+@contextmanager
+def name_in_errors(path: Path) -> Iterator[None]:
+    """Re-raise an OSError with `path` and the system's own message.
+
+    Some libraries do not name the file, or do not report a full disk by its error number.
+    """
+    try:
+        yield
+    except OSError as error:
+        # Some libraries report a full disk in the text only.
+        full = error.errno in (None, errno.ENOSPC, errno.EDQUOT) and "space" in str(error).lower()
+        number = errno.ENOSPC if full else error.errno
+        if number is None:
+            raise
+        raise OSError(number, os.strerror(number), str(path)) from error
+
+
+@contextmanager
+def atomic_file(path: Path) -> Iterator[Path]:
+    """Write a file atomically: yields a temporary name beside `path`, which replaces `path` at the end.
+
+    If the body raises an exception, the temporary file is removed and `path` is unchanged.
+    """
+    with temporary_path(path) as temporary, name_in_errors(path):
+        yield temporary
+        os.replace(temporary, path)
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """As `atomic_file`, for a folder: yields a temporary one that replaces `path` and any previous content."""
+    backup = path.with_name(f"{path.stem}.old{path.suffix}")
+    with temporary_path(path) as temporary, temporary_path(backup) as old, name_in_errors(path):
+        yield temporary
+        # Two renames are fast; the old folder is removed afterward. So an interruption leaves one of the two complete.
+        if path.exists():
+            path.rename(old)
+        temporary.rename(path)
+
+
+def make_folder(path: Path) -> Path:
+    """The folder, created if it does not exist, without temporary files of our processes that were killed.
+
+    Raises
+    ------
+    InputError
+        If it cannot be created.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(path, f"cannot be created as a folder: {error.strerror}") from error
+    remove_stale_temporaries(path)
+    return path
+
+
+def write_png16(path: Path, image_dn: NDArray) -> None:
+    """16-bit PNG of the digital numbers; a noise-free frame is rounded."""
+    numbers = np.clip(np.rint(image_dn), 0, 65535).astype(np.uint16)
+    write_image(path, numbers)
+
+
+UNCOMPRESSED_TIFF = (
+    cv2.IMWRITE_TIFF_COMPRESSION,
+    cv2.IMWRITE_TIFF_COMPRESSION_NONE,
+)  # some readers support no other
+
+
+def write_image(path: Path, image: NDArray) -> None:
+    """Write an image in the format of the name's suffix.
+
+    Raises
+    ------
+    InputError
+        If it cannot be encoded
+    OSError
+        If it cannot be written. OpenCV encodes in memory, because it would not report why a
+        file cannot be written.
+    """
+    try:
+        encoded, data = cv2.imencode(
+            path.suffix, image, UNCOMPRESSED_TIFF if path.suffix == ".tif" else ()
+        )
+    except cv2.error:
+        encoded = False
+    if not encoded:
+        raise InputError(
+            path,
+            f"an image of {image.dtype} and shape {image.shape} cannot be encoded in this format",
+        )
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(data.data)
+
+
+def write_table(path: Path, table: Any) -> None:
+    """An astropy table as ECSV."""
+    with atomic_file(path) as temporary:
+        table.write(temporary, format="ascii.ecsv", overwrite=True)
+
+
+def read_table(path: Path) -> Any:
+    """Read an ECSV file as an astropy table. Raises InputError (one line) if the file is not valid ECSV."""
+    from astropy.table import Table
+
+    try:
+        return Table.read(path, format="ascii.ecsv")
+    except (
+        Exception
+    ) as error:  # astropy's parsers raise many types of exception for a file that is not ECSV
+        raise InputError(path, f"not an ECSV table: {' '.join(str(error).split())[:120]}") from None
+
+
+def header_numbers(path: Path, meta: dict[str, Any], key: str, count: int) -> list[float]:
+    """`count` finite numbers under a key of an ECSV header, positive for a size or focal length. Raises InputError."""
+    try:
+        numbers = np.atleast_1d(np.array(meta.get(key), dtype=float))
+    except (TypeError, ValueError):
+        numbers = np.array([np.nan])
+    positive = key in ("size_px", "focal_px")
+    if (
+        numbers.shape != (count,)
+        or not np.isfinite(numbers).all()
+        or (positive and numbers.min() <= 0)
+    ):
+        what = f"{count} finite number{'s' if count > 1 else ''}{' above 0' if positive else ''}"
+        raise InputError(path, f"{key} in the header is {meta.get(key)!r}", what)
+    return [float(number) for number in numbers]
+
+
+def write_text(path: Path, text: str) -> None:
+    with atomic_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def to_json(data: Any) -> str:
+    """JSON with null for NaN and infinity."""
+
+    def without_nan(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: without_nan(item) for key, item in value.items()}
+        if isinstance(value, list | tuple):
+            return [without_nan(item) for item in value]
+        if isinstance(value, np.generic):
+            value = value.item()
+        return None if isinstance(value, float) and not np.isfinite(value) else value
+
+    return json.dumps(without_nan(data), indent=1, allow_nan=False)
+
+
+# Folders of the scenes and the data that are shipped with skysim, and the titles of scene and study
+# files.
+
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# In a checkout scenes/ and data/ are beside the package; an installed package contains them.
+SHIPPED = ROOT if (ROOT / "pyproject.toml").is_file() else ROOT / "skysim"
+DATA = SHIPPED / "data"
+SCENES = SHIPPED / "scenes"
+STUDIES = SCENES / "studies"
+CATALOGS = DATA / "catalogs"
+
+
+def title_of(path: Path) -> str:
+    """Title of a scene or study file, or of the base of a scene without one; "" if there is none that can be read.
+
+    Only its line is parsed: a list of all scenes would otherwise take a second.
+    """
+    lines = dict(
+        re.findall(
+            r"^(title|base):(.*)", path.read_text(encoding="utf-8", errors="replace"), re.MULTILINE
+        )
+    )
+    try:
+        values = {key: str(yaml.safe_load(text) or "") for key, text in lines.items()}
+    except yaml.YAMLError:
+        return ""
+    if "title" in values:
+        return values["title"]
+    base = path.with_name(f"{values.get('base', '').removesuffix('.yaml')}.yaml")
+    return title_of(base) if "base" in values and base.is_file() and base != path else ""

@@ -1,0 +1,80 @@
+"""Run a script on an untrusted file in a child process with limits: libraries in C may crash, hang or fill memory.
+
+The child is `python -m skysim.core.guarded CPU_S MEMORY_BYTES SCRIPT ARGUMENTS`. It imports this module, then
+the script as a file, without the packages that contain it.
+"""
+
+from __future__ import annotations
+
+import os
+import runpy
+import signal
+import subprocess
+import sys
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+
+WALL_S = 15.0  # for a child that waits, or on a loaded machine
+MESSAGE_BYTES = 1000  # of a child's last words
+# One thread: the stacks and arenas of a pool for many cores would exceed the limit of memory.
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+
+
+def run_guarded(script: Path, *arguments: str, cpu_s: int, memory_bytes: int) -> str:
+    """Run a script to its end; return "" on success, else why it failed, in one line.
+
+    Parameters
+    ----------
+    cpu_s
+        Processor time, with start-up; memory_bytes : address space, with the libraries
+    """
+    command = [
+        sys.executable,
+        "-m",
+        __name__,
+        str(cpu_s),
+        str(memory_bytes),
+        str(script),
+        *arguments,
+    ]
+    with tempfile.TemporaryFile() as errors:
+        try:
+            code = subprocess.run(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=errors,
+                env=dict(os.environ) | ONE_THREAD,
+                timeout=WALL_S,
+            ).returncode
+        except subprocess.TimeoutExpired:
+            return f"it takes longer than {WALL_S:g} s"
+        errors.seek(max(errors.tell() - MESSAGE_BYTES, 0))
+        lines = errors.read().decode(errors="replace").strip().splitlines()
+    if code in (-signal.SIGXCPU, -signal.SIGKILL):
+        return f"it takes more than {cpu_s} s"
+    if code < 0:
+        return f"it crashes its reader ({signal.Signals(-code).name})"
+    return (lines[-1] if lines else f"its reader exits with code {code}") if code else ""
+
+
+def main() -> None:
+    """The child: set the limits, then run the script with its arguments."""
+    import resource  # not on every system, and the parent does without
+
+    cpu_s, memory_bytes, script, *arguments = sys.argv[1:]
+    with suppress(ValueError, OSError):  # a system without this limit, or with a lower one
+        resource.setrlimit(resource.RLIMIT_AS, (int(memory_bytes),) * 2)
+    with suppress(ValueError, OSError):
+        resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_s),) * 2)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    sys.argv = [script, *arguments]
+    try:
+        runpy.run_path(script, run_name="__main__")
+    except MemoryError:
+        sys.exit(f"it needs more than {int(memory_bytes) >> 20} MiB of memory")
+
+
+if __name__ == "__main__":
+    main()

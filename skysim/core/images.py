@@ -1,0 +1,407 @@
+"""Image files (FITS, PNG, TIFF, JPEG, BMP) and frames of a live camera, read with limits on their size.
+
+A few bytes of a damaged or hostile file can declare an image that exceeds the memory. The declared size is therefore
+read from the header, and checked, before astropy (`fits`) or OpenCV (`encoded`) decodes the file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import gzip
+import math
+import re
+import tempfile
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import IO, Any, BinaryIO, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core import encoded
+from skysim.core.encoded import check_bytes, check_pixels, silent_opencv
+from skysim.core.errors import InputError
+from skysim.core.guarded import run_guarded
+
+# FITS images: plain, gzipped (.gz) or compressed in tiles (.fz), monochrome or color, with their
+# row order and date.
+
+
+SUFFIXES = tuple(
+    f"{suffix}{packed}" for packed in ("", ".gz", ".fz") for suffix in (".fits", ".fit", ".fts")
+)
+MAGIC = (
+    b"SIMPLE  ="  # start of every FITS file; a compressed one differs, which astropy would unpack
+)
+GZIP_BLOCK = 1 << 20  # bytes unpacked at a time
+MAX_HDUS = 1000  # that are searched for an image
+# a line of a header, and their greatest number
+CARD_BYTES = 80
+MAX_CARDS = 100_000
+# FITS standard 4.0, section 4.4.1.1
+AXES = re.compile(rb"NAXIS *= *(\d+)")
+MAX_AXES = 999
+MAX_COLUMNS = 999  # of a table (FITS standard 4.0, section 7.3.1)
+# for a compressed image
+TILES_CPU_S = 10
+TILES_BYTES = 1 << 31
+EXPOSURE_KEYS = ("EXPTIME", "EXPOSURE")  # seconds
+TEMPERATURE_KEYS = (
+    "CCD-TEMP",
+    "DET-TEMP",
+)  # of the chip, degrees Celsius: conventions of imaging programs
+TOP_DOWN = {
+    "TOP-DOWN": True,
+    "BOTTOM-UP": False,
+}  # values of ROWORDER, which is a convention of imaging programs
+
+
+class FitsImage(NamedTuple):
+    """The first image of a file.
+
+    Attributes
+    ----------
+    pixels
+        (H, W), or (H, W, 3) in OpenCV's order blue, green, red; rows as stored
+    top_down
+        Whether the first row is the highest, by ROWORDER; None without one: the lowest is, by
+        the standard, but programs that do not follow it leave the keyword out too
+    date_utc
+        DATE-OBS; None without a valid one
+    exposure_s, temperature_c
+        EXPTIME or EXPOSURE, CCD-TEMP or DET-TEMP; None without a number
+    """
+
+    pixels: NDArray
+    top_down: bool | None
+    date_utc: datetime.datetime | None
+    exposure_s: float | None
+    temperature_c: float | None
+
+
+def read_fits(path: Path) -> NDArray:
+    """The pixels of the first image, rows as stored. Raises InputError with one line."""
+    return read_fits_image(path).pixels
+
+
+def read_fits_image(path: Path) -> FitsImage:
+    """The first image, in the machine's byte order. Raises InputError with one line."""
+    from astropy.io import fits
+
+    try:
+        with (
+            open_fits(path) as file,
+            fits.open(file, memmap=False, disable_image_compression=True) as hdus,
+        ):
+            for number, hdu in enumerate(islice(hdus, MAX_HDUS)):
+                check_hdu(path, hdu)
+                if hdu.header.get("ZIMAGE"):
+                    pixels = decode_tiles(path, file, number)
+                elif getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0) > 0:
+                    pixels = np.ascontiguousarray(hdu.data.astype(hdu.data.dtype.newbyteorder("=")))
+                else:
+                    place = hdu.fileinfo()
+                    check_header(
+                        path, file, place["datLoc"] + place["datSpan"]
+                    )  # the next one, before it is opened
+                    continue
+                return FitsImage(
+                    channels_last(path, pixels), *header_values(hdu.header, hdus[0].header)
+                )
+    except InputError:
+        raise
+    except (
+        Exception
+    ) as error:  # a damaged header makes astropy raise exceptions of many types, KeyError too
+        raise InputError(path, f"not a complete FITS file: {error}") from None
+    raise InputError(path, "a FITS file without an image")
+
+
+@contextmanager
+def open_fits(path: Path) -> Iterator[BinaryIO]:
+    """The file for astropy, with its warnings as errors: past a warning it may read a damaged file endlessly.
+
+    A .gz file is unpacked to a temporary file first.
+    """
+    from astropy.utils.exceptions import AstropyWarning
+
+    packed = path.suffix.lower() == ".gz"
+    with contextlib.ExitStack() as stack:
+        plain = path
+        if packed:
+            temporary = stack.enter_context(tempfile.NamedTemporaryFile(prefix="skysim-"))
+            unpack(path, temporary)
+            plain = Path(temporary.name)
+        file = stack.enter_context(plain.open("rb"))
+        stack.enter_context(warnings.catch_warnings())
+        warnings.simplefilter("error", AstropyWarning)  # "file may have been truncated" is one
+        if file.read(len(MAGIC)) != MAGIC:
+            allowed = "one that begins with SIMPLE" + ("" if packed else ", not compressed")
+            raise InputError(path, "not a complete FITS file", allowed)
+        file.seek(0)
+        check_header(path, file)
+        yield file
+
+
+def unpack(path: Path, file: IO[bytes]) -> None:
+    """Unpack a gzipped file, up to MAX_BYTES. Raises InputError for more, and for a damaged file."""
+    size = 0
+    try:
+        with gzip.open(path) as packed:
+            while block := packed.read(GZIP_BLOCK):
+                size += len(block)
+                if size > encoded.MAX_BYTES:
+                    raise InputError(
+                        path, f"more than {encoded.MAX_BYTES} bytes when unpacked", "no more"
+                    )
+                file.write(block)
+    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+        raise InputError(path, f"not a complete gzip file: {error}") from None
+    file.flush()
+
+
+def check_header(path: Path, file: BinaryIO, start: int = 0) -> None:
+    """Refuse the header that begins at `start` if it is longer than any real one, or has too many axes.
+
+    astropy makes a list of as many entries as NAXIS says when it opens a header, and joins all blocks up to END.
+    Raises InputError; the file is left where it was.
+    """
+    before = file.tell()
+    file.seek(start)
+    for _ in range(MAX_CARDS):
+        card = file.read(CARD_BYTES)
+        if not card or card.rstrip() == b"END":
+            break
+        if (hit := AXES.match(card)) and int(hit[1]) > MAX_AXES:
+            raise InputError(path, f"NAXIS {int(hit[1])}", f"up to {MAX_AXES} axes")
+    else:
+        raise InputError(path, f"a header of more than {MAX_CARDS} lines", f"up to {MAX_CARDS}")
+    file.seek(before)
+
+
+def check_hdu(path: Path, hdu: Any) -> None:
+    """Raise InputError for too large a size by the header, before the data is read or skipped."""
+    if (columns := hdu.header.get("TFIELDS", 0)) > MAX_COLUMNS:
+        raise InputError(path, f"TFIELDS {columns}", f"up to {MAX_COLUMNS} columns")
+    if hdu.header.get("ZIMAGE"):
+        sides = (int(hdu.header[f"ZNAXIS{n}"]) for n in range(hdu.header["ZNAXIS"], 0, -1))
+        check_pixels(path, *sides, each_bytes=abs(int(hdu.header.get("ZBITPIX", 8))) // 8)
+        return
+    item_bytes = abs(int(hdu.header.get("BITPIX", 8))) // 8
+    check_pixels(path, *map(int, getattr(hdu, "shape", ()) or ()), each_bytes=item_bytes)
+    check_pixels(path, int(hdu.size) // 8)
+
+
+def decode_tiles(path: Path, file: BinaryIO, number: int) -> NDArray:
+    """The pixels of a compressed image, the HDU of this number. Raises InputError with one line."""
+    with tempfile.TemporaryDirectory(prefix="skysim-") as folder:
+        out = Path(folder) / "pixels.npy"
+        script = Path(__file__).with_name("fits_tiles.py")
+        arguments = file.name, str(number), str(out)
+        if fault := run_guarded(script, *arguments, cpu_s=TILES_CPU_S, memory_bytes=TILES_BYTES):
+            raise InputError(path, f"not a complete FITS file: {fault}")
+        return np.asarray(np.load(out))
+
+
+def channels_last(path: Path, pixels: NDArray) -> NDArray:
+    """A color cube, (3, H, W) or (H, W, 3), red first, as (H, W, 3), blue first; a monochrome image as (H, W).
+
+    Raises
+    ------
+    InputError
+        For any other shape.
+    """
+    shape = pixels.shape
+    while pixels.ndim > 2 and pixels.shape[0] == 1:
+        pixels = pixels[0]
+    if pixels.ndim == 3 and pixels.shape[0] == 3:
+        pixels = np.moveaxis(pixels, 0, 2)
+    if pixels.ndim == 3 and pixels.shape[2] == 3:
+        return np.ascontiguousarray(pixels[:, :, ::-1])
+    if pixels.ndim != 2:
+        raise InputError(
+            path, f"a FITS image of shape {shape}", "(H, W), color (3, H, W) and (H, W, 3)"
+        )
+    return pixels
+
+
+def header_values(
+    *headers: Any,
+) -> tuple[bool | None, datetime.datetime | None, float | None, float | None]:
+    """FitsImage's fields beside the pixels, by the first header that has them: the image's, then the file's."""
+    found: dict[str, str] = {}
+    for header in reversed(headers):
+        for key in ("ROWORDER", "DATE-OBS", *EXPOSURE_KEYS, *TEMPERATURE_KEYS):
+            with contextlib.suppress(Exception):  # of many types, for a damaged card
+                found[key] = str(header[key]).strip()
+    date_utc = None
+    with contextlib.suppress(ValueError):
+        date_utc = datetime.datetime.fromisoformat(found.get("DATE-OBS", ""))
+    exposure_s = first_number(found, EXPOSURE_KEYS)
+    temperature_c = first_number(found, TEMPERATURE_KEYS)
+    return TOP_DOWN.get(found.get("ROWORDER", "").upper()), date_utc, exposure_s, temperature_c
+
+
+def first_number(found: dict[str, str], keys: tuple[str, ...]) -> float | None:
+    """The first finite number under these keys."""
+    for key in keys:
+        with contextlib.suppress(ValueError):
+            if math.isfinite(number := float(found.get(key, ""))):
+                return number
+    return None
+
+
+IMAGE_SUFFIXES = (*SUFFIXES, *encoded.SUFFIXES)
+LUMINANCE = {"blue": 0.114, "green": 0.587, "red": 0.299}  # ITU-R BT.601, in OpenCV's order
+
+
+@dataclass(frozen=True, slots=True)
+class ViewedImage:
+    """An image as a person sees it: turned as EXIF says, the highest row first.
+
+    Attributes
+    ----------
+    pixels
+        (H, W) or (H, W, channels), blue first
+    date_utc
+        DATE-OBS of a FITS file; None if unknown
+    focal_35mm
+        Focal length of the 35 mm camera with the same diagonal field, mm; None if unknown
+    row_order_known
+        False for a FITS file without ROWORDER, whose last row is then taken for the highest, as
+        the standard recommends
+    exposure_s, temperature_c
+        Of a FITS header; None if unknown
+    """
+
+    pixels: NDArray
+    date_utc: datetime.datetime | None = None
+    focal_35mm: float | None = None
+    row_order_known: bool = True
+    exposure_s: float | None = None
+    temperature_c: float | None = None
+
+
+def read_picture(path: Path) -> ViewedImage:
+    """The image as a person sees it. Raises InputError as `read_image` does."""
+    check_name(path)
+    if not is_fits(path):
+        data = path.read_bytes()
+        pixels = encoded.decode_image(path, data)
+        exif = encoded.read_exif(data)
+        return ViewedImage(
+            check_numbers(path, encoded.upright(pixels, exif.orientation)),
+            focal_35mm=exif.focal_35mm,
+        )
+    image = read_fits_image(path)
+    pixels = image.pixels if image.top_down else np.ascontiguousarray(image.pixels[::-1])
+    return ViewedImage(
+        check_numbers(path, pixels),
+        image.date_utc,
+        row_order_known=image.top_down is not None,
+        exposure_s=image.exposure_s,
+        temperature_c=image.temperature_c,
+    )
+
+
+def read_image(path: Path) -> NDArray:
+    """The pixels of a FITS, PNG, TIFF, JPEG or BMP file as stored: (H, W) or (H, W, channels), blue first.
+
+    Raises
+    ------
+    InputError
+        With one line for a file that is missing, truncated, not an image, or has too many
+        pixels.
+    """
+    check_name(path)
+    return check_numbers(
+        path,
+        read_fits(path) if is_fits(path) else encoded.decode_image(path, path.read_bytes()),
+    )
+
+
+def image_suffix(name: str) -> str:
+    """The suffix of an image file's name, in small letters: the longest known one; empty if there is none."""
+    return max(
+        (suffix for suffix in IMAGE_SUFFIXES if name.lower().endswith(suffix)), key=len, default=""
+    )
+
+
+def check_name(path: Path) -> None:
+    """Raise InputError for a missing or too large file, and for one with the suffix of no known format."""
+    if not path.is_file():
+        raise InputError(path, "no such file")
+    if not image_suffix(path.name):
+        raise InputError(path, "unknown image suffix", ", ".join(IMAGE_SUFFIXES))
+    check_bytes(path)
+
+
+def check_numbers(path: Path, pixels: NDArray) -> NDArray:
+    """The pixels. Raises InputError unless they are real numbers."""
+    if pixels.dtype.kind not in "uif":
+        raise InputError(path, f"pixels of type {pixels.dtype}", "integers and floats")
+    return pixels
+
+
+def is_fits(path: Path) -> bool:
+    """Whether this is the name of a FITS file."""
+    return path.name.lower().endswith(SUFFIXES)
+
+
+def monochrome(image: NDArray) -> NDArray:
+    """Luminance of a color image (alpha is ignored); a monochrome one unchanged. Raises InputError."""
+    if image.ndim == 2:
+        return image
+    if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
+        raise InputError(
+            "", f"an image of shape {image.shape}", "(height, width) and color with 3 or 4 channels"
+        )
+    if image.shape[2] == 1:
+        return np.ascontiguousarray(image[:, :, 0])
+    if image.dtype in (np.uint8, np.uint16, np.float32):
+        return cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)
+    gray = np.zeros(image.shape[:2])
+    for n, weight in enumerate(LUMINANCE.values()):
+        gray += weight * image[:, :, n]
+    return gray
+
+
+class LiveCamera:
+    """An open camera or video stream, read frame by frame."""
+
+    def __init__(self, source: str) -> None:
+        self.source = source
+        self.frame_count = 0
+        with silent_opencv():
+            self.capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
+            self.capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest frame, not a buffered one
+
+    def frame(self) -> NDArray:
+        """The next frame, (H, W) or (H, W, 3). Raises InputError if there is none."""
+        with silent_opencv():
+            ok, frame = self.capture.read()
+        if not ok or frame is None:
+            if self.frame_count:
+                raise InputError(self.source, f"ends after {self.frame_count} frames")
+            raise InputError(
+                self.source, "no camera found", "an index such as 0, a video file, a URL"
+            )
+        self.frame_count += 1
+        return np.asarray(frame)
+
+    def close(self) -> None:
+        """Release the camera."""
+        self.capture.release()
+
+
+def grab_frame(source: str) -> NDArray:
+    """One frame of a camera, (H, W) or (H, W, 3). Raises InputError if there is none."""
+    with contextlib.closing(LiveCamera(source)) as camera:
+        return camera.frame()

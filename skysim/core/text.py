@@ -1,0 +1,214 @@
+"""Text files of samples over time: numbers and epochs with the line of what is wrong, and CCSDS's keyword = value
+notation: segments of metadata and data lines.
+"""
+
+from __future__ import annotations
+
+import datetime
+import re
+import warnings
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from skysim.core.errors import InputError, Where, printable
+from skysim.core.time import GPS_MINUS_TAI_S, SCALES
+from skysim.core.types import Floats
+
+MAX_BYTES = 200_000_000  # of a file: a million lines of 200 characters
+MAX_EXCERPT = 40  # characters of a value in a message
+EPOCH = re.compile(r"(?:19|20|21)\d\d-(\d\d-\d\d|\d{3})[T ]\d\d:\d\d:\d\d(\.\d{0,15})?Z?", re.ASCII)
+
+Line = tuple[int, str]  # number from 1, and content
+
+
+def read_lines(path: Path) -> list[Line]:
+    """The numbered lines of a text file, without blank ones. Raises InputError for one too large or not UTF-8 text."""
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise InputError(path, f"{size} bytes", f"up to {MAX_BYTES}")
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            path, f"cannot be read: {getattr(error, 'strerror', None) or error}"
+        ) from None
+    return [(n, line.strip()) for n, line in enumerate(text.split("\n"), 1) if line.strip()]
+
+
+def excerpt(text: object) -> str:
+    """A value for a message, on one line and truncated."""
+    shown = printable(text)
+    return repr(shown if len(shown) <= MAX_EXCERPT else f"{shown[:MAX_EXCERPT]}…")
+
+
+def to_numbers(
+    source: str, places: Sequence[int], rows: Sequence[Sequence[str]], width: int
+) -> Floats:
+    """(N, width) finite numbers of the words of each line. Raises InputError for the first line that has others."""
+    for line, words in zip(places, rows, strict=True):
+        if len(words) != width:
+            raise InputError(source, f"{len(words)} numbers", width, where=Where(source, line))
+    try:
+        numbers = np.array(rows, dtype=np.float64).reshape(-1, width)
+    except ValueError:
+        numbers = np.full((1, width), np.nan)
+    if not np.isfinite(numbers).all():
+        for line, words in zip(places, rows, strict=True):
+            check_numbers(Where(source, line), words)
+    return numbers
+
+
+def check_numbers(where: Where, words: Sequence[str]) -> None:
+    """Raise InputError for the first word that is not a finite number."""
+    for word in words:
+        try:
+            number = float(word)
+        except ValueError:
+            raise InputError(where.file, f"{excerpt(word)} is not a number", where=where) from None
+        if not np.isfinite(number):
+            raise InputError(where.file, f"{excerpt(word)} is not a finite number", where=where)
+
+
+def seconds_since(
+    source: str,
+    places: Sequence[int],
+    epochs: Sequence[str],
+    start: datetime.datetime,
+    system: str,
+    unit: str = "line",
+) -> Floats:
+    """(N,) seconds from a start in UTC to epochs (ISO 8601, calendar or day of year) of a time system of SCALES.
+
+    UTC is taken as uniform, like the scene's own times: a leap second between the two is not counted. Raises
+    InputError for the first epoch that is not one.
+    """
+    from astropy.time import Time
+
+    bad = [n for n, epoch in enumerate(epochs) if not EPOCH.fullmatch(epoch)]
+    bad += [
+        n for n, epoch in enumerate(epochs) if len(epoch.split("-")) != len(epochs[0].split("-"))
+    ]
+    if bad:
+        raise InputError(
+            source,
+            f"{excerpt(epochs[min(bad)])} is not an epoch",
+            "2012-06-22T21:00:00.5, or all of the form 2012-174T21:00:00.5",
+            where=Where(source, places[min(bad)], unit),
+        )
+    texts = [epoch.rstrip("Z").replace(" ", "T") for epoch in epochs]
+    ordinal = bool(texts) and texts[0].count("-") == 1
+    kind = "yday" if ordinal else "isot"
+    scale = SCALES[system]
+    if ordinal:
+        texts = [text.replace("-", ":", 1).replace("T", ":", 1) for text in texts]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # "dubious year": leap seconds of the future are unknown
+        try:
+            times = Time(texts, format=kind, scale=scale).utc
+        except ValueError:
+            n = next(n for n, text in enumerate(texts) if not is_time(text, kind, scale))
+            raise InputError(
+                source,
+                f"{excerpt(epochs[n])} is not a date and time",
+                where=Where(source, places[n], unit),
+            ) from None
+        times.precision = 9
+    try:
+        nanoseconds = np.array(times.isot, dtype="datetime64[ns]") - np.datetime64(start, "ns")
+    except ValueError:
+        raise InputError(source, "an epoch within a leap second", "other times") from None
+    return nanoseconds.astype(np.int64) / 1e9 - (GPS_MINUS_TAI_S if system == "GPS" else 0.0)
+
+
+def is_time(text: str, kind: str, scale: str) -> bool:
+    """Whether astropy takes the text for a time."""
+    from astropy.time import Time
+
+    try:
+        Time(text, format=kind, scale=scale)
+    except ValueError:
+        return False
+    return True
+
+
+def read_named_rows(
+    path: Path, name: str, needed: Sequence[str], refusal: InputError, also: Sequence[str] = ()
+) -> tuple[list[str], Floats]:
+    """Names and numbers of a CSV file whose first line names its columns; # begins a comment.
+
+    Parameters
+    ----------
+    name, needed
+        Columns that it must have, of the rows' names, each once, and of numbers
+    also
+        Columns of numbers that it may have, after `needed` in the result;  others are not used
+    refusal
+        Of a file without these columns or rows
+
+    Raises
+    ------
+    InputError
+        With one line.
+    """
+    lines = [(n, line) for n, line in read_lines(path) if not line.startswith("#")]
+    columns = [cell.strip() for cell in lines[0][1].split(",")] if lines else []
+    if len(lines) < 2 or len({*columns}) < len(columns) or not {name, *needed} <= {*columns}:
+        raise refusal
+    rows = [[cell.strip() for cell in line.split(",")] for _, line in lines[1:]]
+    places = [n for n, _ in lines[1:]]
+    for place, row in zip(places, rows, strict=True):
+        if len(row) != len(columns):
+            raise InputError(
+                path,
+                f"{len(row)} values",
+                f"{len(columns)}, as the first line has",
+                where=Where(path, place),
+            )
+    used = [columns.index(one) for one in (*needed, *also) if one in columns]
+    numbers = to_numbers(str(path), places, [[row[k] for k in used] for row in rows], len(used))
+    names = [row[columns.index(name)] for row in rows]
+    repeated = next((one for n, one in enumerate(names) if one in names[:n]), None)
+    if repeated is not None:
+        raise InputError(path, f"{excerpt(repeated)} occurs twice", "once")
+    return names, numbers
+
+
+class TextSegment(NamedTuple):
+    """A segment: its metadata with their lines, and its data lines split into words."""
+
+    metadata: dict[str, Line]
+    data: list[tuple[int, list[str]]]
+
+    def require(self, path: str | Path, keys: Sequence[str]) -> None:
+        """Raise InputError for the first keyword that the metadata lack."""
+        for key in keys:
+            if key not in self.metadata:
+                raise InputError(path, f"{key} is missing in the metadata of a segment")
+
+
+def keyword_value(path: str | Path, n: int, line: str) -> tuple[str, str]:
+    """The keyword and the value of a line. Raises InputError for another line."""
+    key, equals, value = (part.strip() for part in line.partition("="))
+    if not equals:
+        raise InputError(path, f"{excerpt(line)} is not KEYWORD = value", where=Where(path, n))
+    return key, value
+
+
+def check_version(path: str | Path, keyword: str, version: str, allowed: Sequence[str]) -> None:
+    """Raise InputError for a version of the message that is not read."""
+    if version not in allowed:
+        raise InputError(path, f"{keyword} is {excerpt(version)}", ", ".join(allowed))
+
+
+def one_of(path: str | Path, metadata: dict[str, Line], key: str, allowed: Iterable[str]) -> str:
+    """A keyword's value, in capitals, if it is allowed. Raises InputError."""
+    line, value = metadata[key]
+    names = list(allowed)
+    if value.upper() not in names:
+        raise InputError(
+            path, f"{key} = {excerpt(value)}", ", ".join(names), where=Where(path, line)
+        )
+    return value.upper()

@@ -1,0 +1,313 @@
+"""An external controller as a control law of the flight computer: in this process, or in one of its own."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
+
+import numpy as np
+
+from skysim.core.errors import InputError, printable
+from skysim.core.plugins import (
+    MAX_STATUS_CHARS,
+    PluginKind,
+    Program,
+    ProgramError,
+    describe_error,
+    finite_array,
+    host_command,
+    to_lists,
+)
+from skysim.core.types import Floats
+from skysim.dynamics.guidance import Reference
+from skysim.scene.sections.motion import BUILT_IN_LAWS, PRESCRIBED, ControlConfig
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+
+# The interface for external attitude controllers: set-up, input, torque, and discovery by entry
+# points.
+
+
+CONTROLLERS = PluginKind(
+    "law", "skysim.controllers", "motion.control.law", (*BUILT_IN_LAWS, PRESCRIBED)
+)
+PROTOCOL = 1  # version, the first key of the set-up
+MAX_AUTHORITIES = (
+    1000.0  # largest torque over the actuators' authority: larger ones are errors of unit or sign
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ControllerSetup:
+    """What a controller gets before the first control period.
+
+    Attributes
+    ----------
+    period_s
+        Control period: time between two calls
+    inertia_kg_m2
+        (3, 3) about the bearing, in body axes
+    authority_nm
+        Torque that the actuators can give in every direction; a larger one is limited by them
+    rate_limit_rad_s
+        Rate above which the gyros saturate, with a margin; None if the controller does not use
+        them
+    actuators, feedback, bandwidth_rad_s, damping, integral_rad_s, options
+        Of the scene's `motion.control`
+    seed
+        For a controller that draws random numbers
+    """
+
+    period_s: float
+    inertia_kg_m2: Floats
+    authority_nm: float
+    rate_limit_rad_s: float | None
+    actuators: str
+    feedback: str
+    bandwidth_rad_s: float
+    damping: float
+    integral_rad_s: float
+    seed: int
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def as_tree(self) -> dict[str, Any]:
+        """As a JSON object; arrays become lists."""
+        tree: dict[str, Any] = to_lists(asdict(self))
+        return {"skysim_controller": PROTOCOL, **tree}
+
+    @classmethod
+    def of_tree(cls, tree: Mapping[str, Any]) -> Self:
+        """The inverse of `as_tree`."""
+        values = {name: value for name, value in tree.items() if name != "skysim_controller"}
+        return cls(**values | {"inertia_kg_m2": np.array(values["inertia_kg_m2"])})
+
+
+@dataclass(frozen=True, slots=True)
+class ControllerInput:
+    """What a controller gets at the start of a control period. Quaternions are unit, scalar last: v_lab = q v q*.
+
+    Attributes
+    ----------
+    tick
+        Number of the period, from 0
+    t_s
+        Seconds since the scene's start
+    lab_from_body_xyzw
+        (4,) measured attitude
+    rate_body_rad_s
+        (3,) measured rate in body axes. The source of both is `motion.control.feedback`
+    lab_from_ref_xyzw
+        (4,) commanded attitude
+    rate_ref_rad_s, acceleration_ref_rad_s2
+        (3,) each, commanded, in the commanded attitude's own axes
+    momentum_nms
+        (3,) stored in wheels and CMGs, in body axes
+    achieved_nm
+        (3,) torque that the actuators gave for the last command; zeros at the first
+    """
+
+    tick: int
+    t_s: float
+    lab_from_body_xyzw: Floats
+    rate_body_rad_s: Floats
+    lab_from_ref_xyzw: Floats
+    rate_ref_rad_s: Floats
+    acceleration_ref_rad_s2: Floats
+    momentum_nms: Floats
+    achieved_nm: Floats
+
+    @property
+    def lab_from_body(self) -> Rotation:
+        """The measured attitude."""
+        return _rotation(self.lab_from_body_xyzw)
+
+    @property
+    def lab_from_ref(self) -> Rotation:
+        """The commanded attitude."""
+        return _rotation(self.lab_from_ref_xyzw)
+
+    def as_tree(self) -> dict[str, Any]:
+        """As a JSON object; arrays become lists."""
+        return {item.name: to_lists(getattr(self, item.name)) for item in fields(self)}
+
+    @classmethod
+    def of_tree(cls, tree: Mapping[str, Any]) -> Self:
+        """The inverse of `as_tree`."""
+        values: dict[str, Any] = {
+            name: np.array(value) if isinstance(value, list) else value
+            for name, value in tree.items()
+        }
+        return cls(**values)
+
+
+Law = Callable[[ControllerInput], Any]
+Factory = Callable[[ControllerSetup], Law]
+
+
+def build_law(factory: Any, setup: ControllerSetup) -> Law:
+    """The law that a factory makes of a set-up. Raises TypeError if it is not callable."""
+    law = factory(setup)
+    if not callable(law):
+        raise TypeError(
+            f"it returned {type(law).__name__} for the set-up; allowed: a callable that takes a ControllerInput"
+        )
+    return law
+
+
+def check_torque(torque_nm: Any, authority_nm: float) -> Floats:
+    """(3,) torque, finite and at most MAX_AUTHORITIES times the authority. Raises ValueError."""
+    torque = finite_array(torque_nm, "torque_nm", (3,))
+    if np.linalg.norm(torque) > MAX_AUTHORITIES * authority_nm:
+        raise ValueError(
+            f"torque_nm is {np.linalg.norm(torque):.3g} N m; allowed: up to {MAX_AUTHORITIES:g} times the actuators'"
+            f" {authority_nm:.3g} N m"
+        )
+    return torque
+
+
+def torque_of_reply(reply: Any, tick: int, authority_nm: float) -> Floats:
+    """The torque in a program's answer to a tick, a parsed JSON value. Raises ValueError."""
+    if not isinstance(reply, dict) or reply.get("tick") != tick:
+        raise ValueError(f"no answer to tick {tick}, but {printable(reply)[:80]!r}")
+    if "status" in reply:
+        raise ValueError(printable(reply["status"])[:MAX_STATUS_CHARS] or "a status without a text")
+    unknown = [printable(name) for name in reply if name not in ("tick", "torque_nm")]
+    if unknown:
+        raise ValueError(f"unknown key {unknown[0][:80]!r}; allowed: tick, torque_nm, status")
+    return check_torque(reply.get("torque_nm"), authority_nm)
+
+
+def _rotation(a_from_b_xyzw: Floats) -> Rotation:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(a_from_b_xyzw)
+
+
+class ControllerSource(NamedTuple):
+    """Where external controllers come from, beside entry points.
+
+    Attributes
+    ----------
+    programs
+        Commands by name, from the user's command line
+    factory
+        The controller given to `skysim.simulate`, in place of the one that the scene names
+    """
+
+    programs: Mapping[str, str] = {}
+    factory: Factory | None = None
+
+    def check_name(self, law: str) -> None:
+        """Raise InputError for an unknown name of a law."""
+        if self.factory is None:
+            CONTROLLERS.check_name(law, self.programs)
+
+
+NO_SOURCE = ControllerSource()
+
+
+class ExternalLaw:
+    """An external controller with the methods of `attitude_control.Pid`. Stateful: one motion each.
+
+    Attributes
+    ----------
+    answer
+        Returns the checked torque for an input, or raises an exception
+    program
+        The running program, None for a callable in this process
+    """
+
+    def __init__(
+        self,
+        reference: Reference,
+        name: str,
+        answer: Callable[[ControllerInput], Floats],
+        program: Program | None = None,
+    ) -> None:
+        self.reference = reference
+        self.name = name
+        self.answer = answer
+        self.program = program
+        self.tick = 0
+        self.commanded_nm = self.achieved_nm = np.zeros(3)
+
+    def torque_nm(
+        self, t_s: float, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats, momentum_nms: Floats
+    ) -> Floats:
+        """(3,) the commanded torque at t_s. Raises InputError that names the controller if it gives none."""
+        lab_from_ref_wxyz, rate_ref, acceleration_ref = self.reference.state_at(t_s)
+        inputs = ControllerInput(
+            self.tick,
+            t_s,
+            scalar_last(lab_from_body_wxyz),
+            rate_body_rad_s.copy(),
+            scalar_last(lab_from_ref_wxyz),
+            np.array(rate_ref),
+            np.array(acceleration_ref),
+            momentum_nms.copy(),
+            self.achieved_nm,
+        )
+        try:
+            self.commanded_nm = self.answer(inputs)
+        except Exception as error:
+            reason = (
+                str(error)
+                if isinstance(error, ProgramError | ValueError)
+                else describe_error(error)
+            )
+            self.close()
+            text = printable(reason)[:MAX_STATUS_CHARS]
+            raise InputError(CONTROLLERS.key, f"{self.name}: {text}, at {t_s:g} s") from error
+        self.tick += 1
+        return self.commanded_nm
+
+    def integrate(self, commanded_nm: Floats, achieved_nm: Floats, period_s: float) -> None:
+        """Keep the torque that the actuators gave: the controller gets it in its next input."""
+        self.achieved_nm = self.commanded_nm - (commanded_nm - achieved_nm)
+
+    def close(self) -> None:
+        """End the program, if there is one."""
+        if self.program:
+            self.program.close()
+
+
+def external_law(
+    reference: Reference, setup: ControllerSetup, config: ControlConfig, source: ControllerSource
+) -> ExternalLaw:
+    """Start the controller that the scene names. Raises InputError if it is unknown or refuses the set-up."""
+    name = config.law
+    source.check_name(name)
+    if source.factory is not None:
+        try:
+            law = build_law(source.factory, setup)
+        except Exception as error:
+            raise InputError(CONTROLLERS.key, f"{name}: {describe_error(error)}") from error
+        return ExternalLaw(
+            reference, name, lambda inputs: check_torque(law(inputs), setup.authority_nm)
+        )
+    environment = None
+    if name in source.programs:
+        arguments = shlex.split(source.programs[name])
+    else:
+        arguments, environment = host_command("skysim.dynamics.controller_host", name)
+    program = Program(
+        CONTROLLERS.key, name, arguments, setup.as_tree(), config.time_limit_s, environment
+    )
+
+    def answer(inputs: ControllerInput) -> Floats:
+        message = (json.dumps(inputs.as_tree()) + "\n").encode()
+        return torque_of_reply(
+            program.exchange([message], config.time_limit_s), inputs.tick, setup.authority_nm
+        )
+
+    return ExternalLaw(reference, name, answer, program)
+
+
+def scalar_last(a_from_b_wxyz: Floats) -> Floats:
+    """(4,) xyzw of a quaternion wxyz."""
+    return a_from_b_wxyz[[1, 2, 3, 0]]

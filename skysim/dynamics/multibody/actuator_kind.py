@@ -1,0 +1,209 @@
+"""What the flight computer and the model ask of a kind of actuator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError
+from skysim.core.jit import jit
+from skysim.core.types import Floats
+
+RANK_TOLERANCE = (
+    1e-6  # directions with a smaller fraction of the largest singular value get no torque
+)
+
+
+class ControlInput(NamedTuple):
+    """The controller's inputs at the start of a control period: measured body rate (3,), all of qpos and qvel.
+
+    Of the latter only angles and speeds of wheels and gimbals are used, as encoders without errors.
+    """
+
+    t_s: float
+    period_s: float
+    rate_body_rad_s: Floats
+    angles_rad: Floats
+    speeds_rad_s: Floats
+
+
+class Actuators(Protocol):
+    """An actuator set: converts a torque (3,) on the body to entries of the controls (nu,)."""
+
+    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
+        """Write the commands; return (3,) the torque that they will give."""
+        ...
+
+    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
+        """(3,) stored angular momentum, in body axes."""
+        ...
+
+    def command_map(self) -> tuple[Floats, float]:
+        """(n, 3) commands per torque on the body with every gimbal at zero, and the limit of each command."""
+        ...
+
+
+def nothing(*_: Any) -> None:
+    """Default of the functions that a kind does not need."""
+
+
+@dataclass(frozen=True, slots=True)
+class ActuatorKind:
+    """A kind of actuator.
+
+    Attributes
+    ----------
+    key
+        Of its section in the scene's `vehicle`, which switches it on
+    joints, sites
+        Beginnings of the names of its joints and sites in the vehicle's file
+    add
+        Adds its motors to a spec; (spec, the compiled spec, config)
+    control
+        Makes the set that the flight computer commands; (compiled model, config)
+    start
+        Sets the joints' angles and speeds in the data of a model; (model, data, config)
+    check
+        Raises InputError for joints that do not fit together; (spec, path of the file)
+    """
+
+    key: str
+    add: Callable[[Any, Any, Any], None]
+    control: Callable[[Any, Any], Actuators]
+    joints: tuple[str, ...] = ()
+    sites: tuple[str, ...] = ()
+    start: Callable[[Any, Any, Any], None] = nothing
+    check: Callable[[Any, Path], None] = nothing
+
+
+@jit
+def scale_to_limit(command: Floats, limit: float) -> Floats:
+    """Scale all elements of a command by one factor, so that none exceeds the limit and the direction is kept."""
+    peak = np.abs(command).max()
+    return command * (limit / peak if peak > limit else 1.0)
+
+
+def unit_columns(axes: Floats, name: str) -> Floats:
+    """(3, n) floats; raises InputError unless they are unit vectors."""
+    columns = np.ascontiguousarray(axes, dtype=float)  # one layout, or numba compiles for each
+    if columns.ndim != 2 or len(columns) != 3 or not columns.size:
+        raise InputError(name, f"shape {columns.shape}", "(3, n), one column each")
+    norm = np.linalg.norm(columns, axis=0)
+    if not np.all(np.abs(norm - 1) < 1e-6):
+        raise InputError(name, f"lengths {np.round(norm, 6).tolist()}", "unit vectors")
+    return columns
+
+
+def positive_values(value: Floats, n: int, name: str) -> Floats:
+    """(n,) positive floats; raises InputError otherwise."""
+    values = np.asarray(value, dtype=float)
+    if values.shape != (n,) or not np.all(values > 0):
+        raise InputError(name, values.tolist(), f"{n} positive numbers")
+    return values
+
+
+# Joints, sites and motors of actuators in the MuJoCo model.
+
+
+UNIT_GEAR = (1, 0, 0, 0, 0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Hinges:
+    """Hinge joints of one kind, in the order of their names.
+
+    Attributes
+    ----------
+    names
+        (n)
+    axes
+        (3, n) unit axes in body axes, with all joints at zero
+    inertia_kg_m2
+        (n,) about each axis, of all that rotates with it
+    qpos, dof
+        (n,) indices of angle and speed in qpos and qvel
+    motor
+        (n,) actuator numbers, -1 without one
+    """
+
+    names: tuple[str, ...]
+    axes: Floats
+    inertia_kg_m2: Floats
+    qpos: NDArray[np.int64]
+    dof: NDArray[np.int64]
+    motor: NDArray[np.int64]
+
+    @classmethod
+    def from_model(cls, model: Any, prefix: str) -> Hinges:
+        """All joints whose name begins with prefix."""
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        full = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, full)
+        names = sorted(
+            name for name in all_names(model.joint, model.njnt) if name.startswith(prefix)
+        )
+        ids = np.array([model.joint(name).id for name in names], dtype=np.int64)
+        dof = model.jnt_dofadr[ids].astype(np.int64)
+        actuators = all_names(model.actuator, model.nu)
+        motor = [actuators.index(name) if name in actuators else -1 for name in names]
+        return cls(
+            tuple(names),
+            data.xaxis[ids].T.copy(),
+            full[dof, dof],
+            model.jnt_qposadr[ids].astype(np.int64),
+            dof,
+            np.array(motor, dtype=np.int64),
+        )
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def all_names(element: Any, count: int) -> list[str]:
+    """Names of a compiled model's elements of one kind; `element` is its accessor by number."""
+    return [element(k).name for k in range(count)]
+
+
+def joints(spec: Any, prefix: str) -> list[Any]:
+    """The joints of a spec whose name begins with prefix, in the order of their names."""
+    return sorted(
+        (j for j in spec.joints if j.name.startswith(prefix)), key=lambda joint: joint.name
+    )
+
+
+def sites(spec: Any, prefix: str) -> list[Any]:
+    """The sites of a spec whose name begins with prefix, in the order of their names."""
+    return sorted(
+        (site for site in spec.sites if site.name.startswith(prefix)), key=lambda site: site.name
+    )
+
+
+def add_motor(
+    spec: Any,
+    name: str,
+    kind: Any,
+    target: str,
+    limit: float | None = None,
+    gear: Sequence[float] = UNIT_GEAR,
+) -> Any:
+    """Add a motor: force = control, which is limited to +-limit if one is given."""
+    motor = spec.add_actuator(name=name, trntype=kind, target=target, gear=gear)
+    motor.set_to_motor()
+    if limit is not None:
+        motor.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        motor.ctrlrange = [-limit, limit]
+    return motor
+
+
+def member_values(values: tuple[float, ...], count: int, key: str) -> Floats:
+    """One value for each of `count` members; zeros if none are given. Raises InputError for another count."""
+    if values and len(values) != count:
+        raise InputError(key, f"{len(values)} values", f"{count}, one for each, or none")
+    return np.array(values or (0.0,) * count)

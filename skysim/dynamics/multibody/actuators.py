@@ -1,0 +1,160 @@
+"""All kinds of actuators, and what the model does with those that a scene switches on.
+
+A new kind is a file beside this one, an entry in `KINDS`, and its section in scene/sections/vehicle.py. A vehicle's
+MJCF places the actuators by the names of joints and sites; the scene sets their limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.dynamics.multibody.actuator_kind import (
+    ActuatorKind,
+    Actuators,
+    ControlInput,
+    add_motor,
+    joints,
+    sites,
+)
+from skysim.dynamics.multibody.cmgs import CMGS
+from skysim.dynamics.multibody.fans import FANS
+from skysim.dynamics.multibody.wheels import WHEELS
+from skysim.scene.sections.vehicle import VehicleConfig
+
+KINDS: tuple[ActuatorKind, ...] = (WHEELS, CMGS, FANS)
+
+TORQUES = ("torque_x", "torque_y", "torque_z")
+TRIM = "trim_"  # slide joints of trim masses, see mass.py
+PREFIXES = (*(prefix for kind in KINDS for prefix in (*kind.joints, *kind.sites)), TRIM)
+
+
+def kinds_on(vehicle: VehicleConfig) -> list[ActuatorKind]:
+    """The kinds that a scene switches on."""
+    return [kind for kind in KINDS if getattr(vehicle, kind.key) is not None]
+
+
+def build_actuators(vehicle: VehicleConfig, model: Any) -> dict[str, Actuators]:
+    """All actuators that are switched on, by their key in `vehicle`."""
+    return {kind.key: kind.control(model, getattr(vehicle, kind.key)) for kind in kinds_on(vehicle)}
+
+
+def set_start(vehicle: VehicleConfig, model: Any, data: Any) -> None:
+    """Set angles and speeds of the actuators' joints in the data of a model to those of the scene's start."""
+    for kind in kinds_on(vehicle):
+        kind.start(model, data, getattr(vehicle, kind.key))
+
+
+def add_actuators(spec: Any, model: Any, vehicle: VehicleConfig) -> None:
+    """Add the motors of all actuators that are on, and three ideal torques; model is the compiled spec."""
+    for name, axis in zip(TORQUES, np.eye(3), strict=True):
+        # A ball joint's motor acts about a body axis.
+        add_motor(spec, name, mujoco.mjtTrn.mjTRN_JOINT, "bearing", gear=[*axis, 0, 0, 0])
+    for kind in kinds_on(vehicle):
+        kind.add(spec, model, getattr(vehicle, kind.key))
+
+
+class IdealTorque:
+    """Ideal actuator: body-axis torques clipped to a limit."""
+
+    def __init__(self, motor: NDArray[np.int64], limit_nm: float) -> None:
+        self.motor = motor
+        self.limit_nm = limit_nm
+
+    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
+        control[self.motor] = achieved_nm = np.clip(torque_nm, -self.limit_nm, self.limit_nm)
+        return achieved_nm
+
+    def command_map(self) -> tuple[Floats, float]:
+        return np.eye(3), self.limit_nm
+
+    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
+        return np.zeros(3)
+
+
+def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]:
+    """Delete the joints of actuators that are off. Raises InputError if an actuator that is on has no joint.
+
+    Returns the names of the deleted joints, each with the scene's key that would have kept it.
+    """
+    locked: dict[str, str] = {}
+    check_names(spec, path)
+    prefixes_by_key = {kind.key: kind.joints for kind in KINDS} | {"trim": (TRIM,)}
+    for key, prefixes in prefixes_by_key.items():
+        for prefix in prefixes:
+            found = joints(spec, prefix)
+            if getattr(vehicle, key) is None:
+                locked |= dict.fromkeys((joint.name for joint in found), f"vehicle.{key}")
+                for joint in found:
+                    spec.delete(joint)
+            else:
+                check_joints(found, prefix, key, path)
+    for kind in kinds_on(vehicle):
+        kind.check(spec, path)
+        for prefix in kind.sites:
+            if not sites(spec, prefix):
+                raise InputError(path, f"no site {prefix}*, which vehicle.{kind.key} needs")
+    for actuator in spec.actuators:
+        if actuator.name in TORQUES or actuator.name.startswith(PREFIXES):
+            problem = f"actuator {actuator.name}: an actuator of this name is added; remove it from the file"
+            raise InputError(path, problem)
+    return locked
+
+
+def check_joints(found: Sequence[Any], prefix: str, key: str, path: Path) -> None:
+    """Raise InputError for missing joints of an actuator, and for joints of another type or with properties."""
+    wanted = mujoco.mjtJoint.mjJNT_SLIDE if prefix == TRIM else mujoco.mjtJoint.mjJNT_HINGE
+    if not found:
+        raise InputError(path, f"no joint {prefix}*, which vehicle.{key} needs")
+    if any(joint.type != wanted for joint in found):
+        raise InputError(
+            path, f"joints {prefix}* must be {'slides' if prefix == TRIM else 'hinges'}"
+        )
+    for joint in found:
+        check_bare(joint, path)
+
+
+def locked_joint_hint(spec: Any, locked: dict[str, str]) -> str:
+    """An addition to the problem of a model that does not compile, if it refers to a joint that was deleted."""
+    named = {sensor.objname for sensor in spec.sensors} | {
+        actuator.target for actuator in spec.actuators
+    }
+    named |= {name for equality in spec.equalities for name in (equality.name1, equality.name2)}
+    names = [name for name in locked if name in named]
+    return f"; {locked[names[0]]} is off, which locks joint {names[0]}" if names else ""
+
+
+def check_names(spec: Any, path: Path) -> None:
+    """Raise InputError for a joint or site whose name nearly matches an actuator's: it would silently not be one."""
+    for element in (*spec.joints, *spec.sites):
+        prefix = next((p for p in PREFIXES if element.name.startswith(p[:-1])), None)
+        if prefix and not element.name.startswith(prefix):
+            raise InputError(
+                path, element.name, f"{prefix}{element.name[len(prefix) - 1 :]}, or another word"
+            )
+
+
+def check_bare(joint: Any, path: Path) -> None:
+    """Raise InputError for limits, springs, damping or drives of an actuator's joint in the file: the
+    scene sets them.
+    """
+    attributes = {
+        "range": joint.range,
+        "stiffness": joint.stiffness,
+        "damping": joint.damping,
+        "frictionloss": joint.frictionloss,
+        "armature": joint.armature,
+        "actuatorfrcrange": joint.actfrcrange,
+    }
+    for name, value in attributes.items():
+        if np.any(value):
+            raise InputError(
+                path, f"joint {joint.name}: {name} is set by the scene; remove it from the file"
+            )

@@ -1,0 +1,318 @@
+"""Control moment gyroscopes: hinge joints `gimbal_*`, each carrying a hinge joint `rotor_*` with the same suffix."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from skysim.core.constants import RPM_RAD_S
+from skysim.core.errors import InputError, unknown_name
+from skysim.core.jit import jit
+from skysim.core.types import Floats
+from skysim.dynamics.multibody.actuator_kind import (
+    RANK_TOLERANCE,
+    ActuatorKind,
+    ControlInput,
+    Hinges,
+    add_motor,
+    joints,
+    member_values,
+    positive_values,
+    scale_to_limit,
+    unit_columns,
+)
+from skysim.scene.sections.vehicle import CmgsConfig
+
+GIMBAL = "gimbal_"
+ROTOR = "rotor_"
+
+# Generalized singularity-robust inverse and the weights of variable-speed CMGs: the sizes are `assumed`.
+DAMPING = 0.01  # lambda at a singularity, in units of the rotors' momentum squared
+DITHER = 0.01  # off-diagonal part of the damping
+DITHER_RAD_S = math.pi / 2
+DAMPING_DECAY = 10.0  # of both away from a singularity: exp(-DAMPING_DECAY det A A^T)
+
+
+@jit
+def solve_gram(gram: Floats, rhs: Floats) -> Floats:
+    """x of gram x = rhs for a symmetric positive semidefinite (3, 3); singular directions get zero."""
+    value, vector = np.linalg.eigh(gram)
+    x = np.zeros(3)
+    for k in range(3):
+        if value[k] > RANK_TOLERANCE**2 * value[2]:
+            x += vector[:, k] * ((vector[:, k] * rhs).sum() / value[k])
+    return x
+
+
+@jit
+def gram_determinant(m: Floats) -> float:
+    """Determinant of A A^T (3, 3), clipped at zero against rounding; np.linalg.det takes several times as long."""
+    minor_0 = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
+    minor_1 = m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0]
+    minor_2 = m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0]
+    return max(m[0, 0] * minor_0 - m[0, 1] * minor_1 + m[0, 2] * minor_2, 0.0)
+
+
+@jit
+def pseudo_inverse(jacobian_unit: Floats, momentum_rate: Floats, t_s: float) -> Floats:
+    """The smallest gimbal rates that give a momentum rate, A^T (A A^T)^-1 dh/dt; no singularity avoidance.
+
+    The rates grow without bound near a singularity, and this law tends to steer into one.
+    """
+    return jacobian_unit.T @ solve_gram(jacobian_unit @ jacobian_unit.T, momentum_rate)
+
+
+@jit
+def singularity_robust(jacobian_unit: Floats, momentum_rate: Floats, t_s: float) -> Floats:
+    """Gimbal rates by the generalized singularity-robust inverse: A^T (A A^T + lambda E)^-1 dh/dt.
+
+    Near a singularity lambda = 0.01 exp(-10 det A A^T) keeps the rates bounded, at the price of an error in the
+    torque. The off-diagonal elements e_i = 0.01 sin(pi t / 2 + phase_i) of the matrix E, of unit diagonal, move the
+    gimbals sideways for a torque along the singular direction, and so out of the singularity. Wie, Bailey & Heiberg
+    2001, J. Guidance, Control, and Dynamics 24 (5), 865; the numbers are `assumed`.
+    """
+    gram = jacobian_unit @ jacobian_unit.T
+    damping = DAMPING * math.exp(-DAMPING_DECAY * gram_determinant(gram))
+    for row, column, phase in ((1, 2, 0.0), (0, 2, math.pi / 2), (0, 1, math.pi)):
+        dither = damping * DITHER * math.sin(DITHER_RAD_S * t_s + phase)
+        gram[row, column] += dither
+        gram[column, row] += dither
+        gram[row, row] += damping / 2  # each row is visited twice
+        gram[column, column] += damping / 2
+    return jacobian_unit.T @ solve_gram(gram, momentum_rate)
+
+
+# (jacobian (3, n) of unit rotor momentum, dh/dt (3,) in the same unit, time in s) -> gimbal rates (n,) in rad/s.
+STEERING: dict[str, Callable[[Floats, Floats, float], Floats]] = {
+    "pseudo_inverse": pseudo_inverse,
+    "singularity_robust": singularity_robust,
+}
+
+
+@jit
+def rotor_axles(spin_axes: Floats, cross_axes: Floats, angle_rad: Floats) -> tuple[Floats, Floats]:
+    """Rotor axles (3, n) at the gimbal angles, s cos + t sin, and their derivative (3, n) by the gimbal angles."""
+    cosine = np.cos(angle_rad)
+    sine = np.sin(angle_rad)
+    return spin_axes * cosine + cross_axes * sine, cross_axes * cosine - spin_axes * sine
+
+
+@jit
+def vscmg_commands(
+    axle: Floats,
+    jacobian: Floats,
+    unit_nms: float,
+    momentum_rate_nm: Floats,
+    rate_limit: float,
+    torque_limit: float,
+) -> tuple[Floats, Floats]:
+    """Variable-speed CMGs: gimbals and rotors share dh/dt (3,), with the rotors active near gimbal singularities.
+
+    The exact solution that is smallest in a weighted norm: gimbal rates in units of their limit, rotor torques in
+    units of theirs times exp(-5 det A A^T) (A of unit rotor momentum), which keeps the rotors idle away from
+    singularities. Beyond a limit all are scaled together. Schaub, Vadali & Junkins 1998, J. Astronautical Sciences
+    46 (3); weighting by the limits is our own choice, the number is `assumed`.
+    """
+    gram = jacobian @ jacobian.T
+    determinant = gram_determinant(gram) / unit_nms**6 if unit_nms > 0 else 0.0
+    gimbal_weight = rate_limit**2
+    rotor_weight = torque_limit**2 * math.exp(-DAMPING_DECAY * determinant)
+    # Weighted minimum norm: x = W B^T (B W B^T)^-1 dh/dt with B = [jacobian, axle] and W = diag(limits^2).
+    multiplier = solve_gram(gimbal_weight * gram + rotor_weight * (axle @ axle.T), momentum_rate_nm)
+    rate = gimbal_weight * (jacobian.T @ multiplier)
+    torque = rotor_weight * (axle.T @ multiplier)
+    scale = 1 / max(1.0, np.abs(rate).max() / rate_limit, np.abs(torque).max() / torque_limit)
+    return rate * scale, torque * scale
+
+
+@dataclass(frozen=True, slots=True)
+class CmgSet:
+    """Control moment gyroscopes: rotating a spinning rotor's axle gives the torque d(angle)/dt x h.
+
+    A rotor's axle points along s cos(angle) + g x s sin(angle), g the gimbal's and s the spin axis. The torque of
+    accelerating a gimbal about its own axis is left out. Raises InputError (one line) for axes that are not unit
+    vectors or not at right angles, and for an unknown steering law.
+
+    Attributes
+    ----------
+    gimbal_axes, spin_axes
+        (3, n) unit vectors at right angles; the rotor's axle at gimbal angle zero
+    rotor_inertia_kg_m2
+        (n,) of each rotor about its axle
+    rotor_torque_limit_nm
+        None leaves the rotors to spin; a torque makes them variable-speed CMGs
+    steering
+        A key of STEERING, which variable-speed CMGs do not use
+    """
+
+    gimbal_axes: Floats
+    spin_axes: Floats
+    rotor_inertia_kg_m2: Floats
+    gimbal_rate_limit_rad_s: float
+    rotor_torque_limit_nm: float | None = None
+    steering: str = "singularity_robust"
+    cross_axes: Floats = field(init=False, repr=False)  # (3, n) g x s
+
+    def __post_init__(self) -> None:
+        gimbal = unit_columns(self.gimbal_axes, "gimbal axes")
+        spin = unit_columns(self.spin_axes, "rotor axes")
+        inertia = positive_values(self.rotor_inertia_kg_m2, gimbal.shape[1], "rotor_inertia_kg_m2")
+        if spin.shape != gimbal.shape or np.abs((gimbal * spin).sum(axis=0)).max() > 1e-6:
+            raise InputError("rotor axes", "", "one for each gimbal, at right angles to its axis")
+        if self.steering not in STEERING:
+            raise InputError(
+                "cmgs.steering", *unknown_name("steering law", self.steering, STEERING)
+            )
+        arrays = {"gimbal_axes": gimbal, "spin_axes": spin, "rotor_inertia_kg_m2": inertia}
+        for name, value in arrays.items():
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "cross_axes", np.ascontiguousarray(np.cross(gimbal, spin, axis=0)))
+
+    def momentum(self, angle_rad: Floats, rotor_rad_s: Floats) -> Floats:
+        """Angular momentum (3,) of the rotors relative to the body: sum of inertia speed axle."""
+        axle, _ = rotor_axles(self.spin_axes, self.cross_axes, angle_rad)
+        return axle @ (self.rotor_inertia_kg_m2 * rotor_rad_s)
+
+    def jacobian(self, angle_rad: Floats, rotor_rad_s: Floats) -> Floats:
+        """A (3, n), derivative of the momentum by the gimbal angles; columns g x h."""
+        _, derivative = rotor_axles(self.spin_axes, self.cross_axes, angle_rad)
+        return derivative * (self.rotor_inertia_kg_m2 * rotor_rad_s)
+
+    def manipulability(self, angle_rad: Floats, rotor_rad_s: Floats) -> Floats:
+        """Distance from singularity: 1 if torque is equally easy in every direction, 0 if a direction has none.
+
+        sqrt(det A A^T) over its greatest value for the same trace, (sum h^2 / 3)^1.5, which is independent of the
+        rotors' size and number. 0 with the rotors at rest. (..., n) -> (...).
+        """
+        angle = np.asarray(angle_rad)[..., None, :]
+        spin = np.asarray(rotor_rad_s)[..., None, :]
+        cross = self.cross_axes * np.cos(angle) - self.spin_axes * np.sin(angle)
+        jacobian = cross * (self.rotor_inertia_kg_m2 * spin)
+        gram = jacobian @ jacobian.swapaxes(-1, -2)
+        largest = (np.trace(gram, axis1=-2, axis2=-1) / 3) ** 3
+        return np.sqrt(np.maximum(np.linalg.det(gram), 0.0) / np.where(largest > 0, largest, 1.0))
+
+    def drive(
+        self,
+        torque_nm: Floats,
+        rate_body_rad_s: Floats,
+        angle_rad: Floats,
+        rotor_rad_s: Floats,
+        t_s: float,
+    ) -> tuple[Floats, Floats]:
+        """Gimbal rates (n,) and motor torques (n,) on the rotors that give torque_nm (3,) on the body.
+
+        torque on the body = -A d(angle)/dt - sum axle u, with A from the rotors' inertial spin, which is their
+        speed plus the body's rate along the axle. The body also feels -rate x h: the controller's feed-forward has
+        to include +rate x h in torque_nm, it is not added here.
+
+        Without a rotor torque limit the rotors get no torque. Beyond a limit everything is scaled together, which
+        keeps the torque's direction.
+        """
+        axle, derivative = rotor_axles(self.spin_axes, self.cross_axes, angle_rad)
+        # A gimbal rotates the rotor's inertial angular momentum, which includes the body's rate along the axle.
+        spin_nms = self.rotor_inertia_kg_m2 * (rotor_rad_s + rate_body_rad_s @ axle)
+        jacobian = derivative * spin_nms
+        unit_nms = float(np.abs(spin_nms).mean())
+        if self.rotor_torque_limit_nm is not None:
+            limits = self.gimbal_rate_limit_rad_s, self.rotor_torque_limit_nm
+            return vscmg_commands(axle, jacobian, unit_nms, -torque_nm, *limits)
+        if unit_nms == 0:  # rotors at rest give no gyroscopic torque
+            return np.zeros_like(spin_nms), np.zeros_like(spin_nms)
+        rate = STEERING[self.steering](jacobian / unit_nms, torque_nm / -unit_nms, t_s)
+        return scale_to_limit(rate, self.gimbal_rate_limit_rad_s), np.zeros_like(rate)
+
+
+class CmgActuator:
+    """Control moment gyroscopes as the flight computer commands them, see `CmgSet`."""
+
+    def __init__(self, model: Any, config: CmgsConfig) -> None:
+        self.gimbals = Hinges.from_model(model, GIMBAL)
+        self.rotors = Hinges.from_model(model, ROTOR)
+        self.rotor_rad_s = config.rotor_rpm * RPM_RAD_S
+        self.model = CmgSet(
+            self.gimbals.axes,
+            self.rotors.axes,
+            self.rotors.inertia_kg_m2,
+            math.radians(config.gimbal_rate_limit_deg_s),
+            config.rotor_torque_limit_nm,
+            config.steering,
+        )
+
+    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
+        angle = inputs.angles_rad[self.gimbals.qpos]
+        spin = inputs.speeds_rad_s[self.rotors.dof]
+        rate, torque = self.model.drive(torque_nm, inputs.rate_body_rad_s, angle, spin, inputs.t_s)
+        control[self.gimbals.motor] = rate
+        achieved_nm = -self.model.jacobian(angle, spin) @ rate
+        if self.model.rotor_torque_limit_nm is not None:
+            control[self.rotors.motor] = torque
+            achieved_nm -= self.model.momentum(angle, torque / self.model.rotor_inertia_kg_m2)
+        return achieved_nm
+
+    def command_map(self) -> tuple[Floats, float]:
+        jacobian = self.model.jacobian(
+            np.zeros(len(self.gimbals)), np.full(len(self.rotors), self.rotor_rad_s)
+        )
+        return np.asarray(
+            np.linalg.pinv(jacobian), dtype=np.float64
+        ), self.model.gimbal_rate_limit_rad_s
+
+    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
+        return self.model.momentum(angles_rad[self.gimbals.qpos], speeds_rad_s[self.rotors.dof])
+
+
+def check_rotor_pairs(spec: Any, path: Path) -> None:
+    """Check that each rotor is on the gimbal with the same suffix. Raises InputError."""
+    for gimbal in joints(spec, GIMBAL):
+        suffix = gimbal.name.removeprefix(GIMBAL)
+        rotor = spec.joint(ROTOR + suffix)
+        if rotor is None or rotor.parent.parent != gimbal.parent:
+            raise InputError(
+                path, f"joint {gimbal.name} has no joint {ROTOR}{suffix} on a child body of its own"
+            )
+    if len(joints(spec, ROTOR)) != len(joints(spec, GIMBAL)):
+        raise InputError(path, f"a joint {ROTOR}* has no joint {GIMBAL}* of the same suffix")
+
+
+def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
+    """A rate servo at each gimbal, and a motor at each variable-speed rotor; other rotors keep their momentum.
+
+    The servo's set-point is the integral of the commanded rate. A critically damped spring pulls the gimbal to it
+    with the scene's time constant, so that the rate is held against gyroscopic torque from the vehicle's rotation;
+    a damper alone would not hold it.
+    """
+    tau_s = cmgs.gimbal_time_constant_s
+    for joint, inertia in zip(
+        joints(spec, GIMBAL), Hinges.from_model(model, GIMBAL).inertia_kg_m2, strict=True
+    ):
+        servo = spec.add_actuator(
+            name=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint.name
+        )
+        servo.set_to_intvelocity(kp=inertia / tau_s**2, kv=2 * inertia / tau_s)
+    for joint in joints(spec, ROTOR):
+        if cmgs.rotor_torque_limit_nm:
+            add_motor(
+                spec, joint.name, mujoco.mjtTrn.mjTRN_JOINT, joint.name, cmgs.rotor_torque_limit_nm
+            )
+
+
+def start_cmgs(model: Any, data: Any, config: CmgsConfig) -> None:
+    """Set the gimbals' angles at the start, and the rotors' speed."""
+    gimbals = Hinges.from_model(model, GIMBAL)
+    angles = np.radians(member_values(config.start_deg, len(gimbals), "vehicle.cmgs.start_deg"))
+    data.qpos[gimbals.qpos] = angles
+    driven = gimbals.motor >= 0
+    data.act[model.actuator_actadr[gimbals.motor[driven]]] = angles[driven]  # servo set-points
+    data.qvel[Hinges.from_model(model, ROTOR).dof] = config.rotor_rpm * RPM_RAD_S
+
+
+CMGS = ActuatorKind(
+    "cmgs", add_cmgs, CmgActuator, joints=(GIMBAL, ROTOR), start=start_cmgs, check=check_rotor_pairs
+)

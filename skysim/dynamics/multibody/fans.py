@@ -1,0 +1,176 @@
+"""Fans: sites `fan_*`, which push along their own z, with a first-order lag."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.dynamics.multibody.actuator_kind import (
+    RANK_TOLERANCE,
+    ActuatorKind,
+    Actuators,
+    ControlInput,
+    add_motor,
+    all_names,
+    scale_to_limit,
+    sites,
+    unit_columns,
+)
+from skysim.scene.sections.motion import DesaturationConfig
+from skysim.scene.sections.vehicle import FansConfig
+
+FAN = "fan_"
+
+
+@dataclass(frozen=True, slots=True)
+class Fans:
+    """Fans, in the order of their names: (3, n) thrust directions and positions, and actuator numbers."""
+
+    names: tuple[str, ...]
+    axes: Floats
+    positions_m: Floats
+    motor: NDArray[np.int64]
+
+    @classmethod
+    def from_model(cls, model: Any) -> Fans:
+        """The fans that have an actuator."""
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        names = sorted(name for name in all_names(model.actuator, model.nu) if name.startswith(FAN))
+        sites = [model.site(name).id for name in names]
+        axes = data.site_xmat[sites].reshape(-1, 3, 3)[:, :, 2]
+        motor = np.array([model.actuator(name).id for name in names], dtype=np.int64)
+        return cls(tuple(names), axes.T.copy(), data.site_xpos[sites].T.copy(), motor)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+@dataclass(frozen=True, slots=True)
+class FanSet:
+    """Fans: thrust with a lever arm about the bearing's center rotates the vehicle, T = sum position x axis thrust.
+
+    Attributes
+    ----------
+    force_axes
+        (3, n) unit vectors along which a positive thrust pushes the body
+    positions_m
+        (3, n) from the center of rotation
+
+    Raises
+    ------
+    InputError
+        (one line) for axes that are not unit vectors and positions of another shape.
+    """
+
+    force_axes: Floats
+    positions_m: Floats
+    thrust_limit_n: float
+    torque_per_thrust_m: Floats = field(init=False, repr=False)  # (3, n) lever arms, N m per N
+    thrust_from_torque: Floats = field(init=False, repr=False)  # (n, 3)
+
+    def __post_init__(self) -> None:
+        axes = unit_columns(self.force_axes, "fan axes")
+        positions = np.asarray(self.positions_m, dtype=float)
+        if positions.shape != axes.shape:
+            raise InputError(
+                "fan positions_m", f"shape {positions.shape}", f"{axes.shape}, as the axes"
+            )
+        arms = np.cross(positions, axes, axis=0)
+        object.__setattr__(self, "torque_per_thrust_m", arms)
+        object.__setattr__(self, "thrust_from_torque", np.linalg.pinv(arms, rcond=RANK_TOLERANCE))
+
+    def torque(self, thrust_n: Floats) -> Floats:
+        """Torque (3,) on the body of thrusts (n,)."""
+        return self.torque_per_thrust_m @ thrust_n
+
+    def drive(self, torque_nm: Floats) -> Floats:
+        """Thrusts (n,), the smallest that give the torque (3,), or the nearest to it in least squares.
+
+        Beyond the limit all are scaled together, which keeps the direction. Each fan can blow either way. The
+        bearing takes the net force.
+        """
+        return scale_to_limit(self.thrust_from_torque @ torque_nm, self.thrust_limit_n)
+
+
+class FanActuator:
+    """Fans, commanded as if they had no lag; see `FanSet`."""
+
+    def __init__(self, model: Any, config: FansConfig) -> None:
+        fans = Fans.from_model(model)
+        self.motor = fans.motor
+        self.lag_s = config.time_constant_s
+        self.model = FanSet(fans.axes, fans.positions_m, config.thrust_limit_n)
+
+    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
+        thrust = self.model.drive(torque_nm)
+        control[self.motor] = thrust
+        return self.model.torque(thrust)
+
+    def command_map(self) -> tuple[Floats, float]:
+        return self.model.thrust_from_torque, self.model.thrust_limit_n
+
+    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
+        return np.zeros(3)
+
+
+@dataclass(slots=True)
+class Desaturator:
+    """Momentum dumping by fans: torque -h / time on the body, once the stored momentum h exceeds a threshold.
+
+    The controller holds the body still against this torque, so that the wheels or CMGs absorb it and h decays as
+    exp(-t / time). Stateful: one motion each.
+    """
+
+    config: DesaturationConfig
+    running: bool = False
+
+    def torque(self, momentum_nms: Floats) -> Floats:
+        """Torque (3,) that the fans should give on the body: zero until |h| > start, then -h / time down to stop."""
+        magnitude = math.sqrt(float(momentum_nms @ momentum_nms))
+        self.running = (
+            magnitude >= self.config.stop_nms if self.running else magnitude > self.config.start_nms
+        )
+        return momentum_nms * (-1.0 / self.config.time_s) if self.running else np.zeros(3)
+
+
+class MomentumDump:
+    """Momentum dumping by fans, with a model of their lag."""
+
+    def __init__(self, fans: Actuators, desaturator: Desaturator) -> None:
+        assert isinstance(fans, FanActuator)
+        self.fans = fans
+        self.desaturator = desaturator
+        self.fan_torque_nm = np.zeros(3)
+
+    def allocate(self, control: Floats, momentum_nms: Floats, inputs: ControlInput) -> Floats:
+        """Command the fans; return (3,) the torque that they give now according to the lag model."""
+        present_nm = self.fan_torque_nm
+        commanded_nm = self.fans.allocate(control, self.desaturator.torque(momentum_nms), inputs)
+        # First-order lag of the fans over one period; the torque at its start is the one that acts now.
+        self.fan_torque_nm = present_nm + (commanded_nm - present_nm) * -math.expm1(
+            -inputs.period_s / self.fans.lag_s
+        )
+        return present_nm
+
+
+def add_fans(spec: Any, _: Any, config: FansConfig) -> None:
+    """A force at each fan, along its site's z, which follows the command with a first-order lag."""
+    for site in sites(spec, FAN):
+        limit = config.thrust_limit_n
+        fan = add_motor(
+            spec, site.name, mujoco.mjtTrn.mjTRN_SITE, site.name, limit, [0, 0, 1, 0, 0, 0]
+        )
+        # Not FILTEREXACT, which is exact for Euler steps only: with Runge-Kutta it adds half a step of lag.
+        fan.dyntype = mujoco.mjtDyn.mjDYN_FILTER
+        fan.dynprm[0] = config.time_constant_s
+
+
+FANS = ActuatorKind("fans", add_fans, FanActuator, sites=(FAN,))

@@ -1,0 +1,589 @@
+"""Export the laboratory as one MJCF file, for MuJoCo's viewer and for `picture`.
+
+What is added to the vehicle is for display only: no mass, no contacts, no constraints. Groups of the viewer:
+0 vehicle, floor and pedestal, 1 dome and LEDs or stars, 2 the star camera's field of view; 4, hidden, the tilt stop.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from skysim.core.errors import InputError
+from skysim.core.files import SCENES
+from skysim.core.types import Floats, Mount, Sources
+from skysim.dynamics.multibody.integrator import Simulation
+from skysim.dynamics.multibody.mjcf import compile_spec, mujoco_warnings
+from skysim.dynamics.multibody.model import VehicleModel, camera_mount
+from skysim.dynamics.multibody.scene_picture import LAB_CAMERA
+from skysim.scene.scene import Scene
+from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.light import DomeConfig
+from skysim.sources.dome import surface
+from skysim.sources.dome.surface import Ellipsoid, Plane, Surface
+
+GROUP_LIGHTS = 1
+GROUP_FIELD = 2
+GROUP_HIDDEN = 4
+MAX_PX = (1920, 1440)  # width, height of the largest picture
+FOVY_DEG = 38.0
+
+SKY_RADIUS_M = 5.0
+SKY = Ellipsoid(np.zeros(3), np.full(3, SKY_RADIUS_M))
+MAX_STARS = 300
+LED_RADIUS_M = 5e-3  # larger than the true disk, which would be less than a pixel
+# steps of brightness, and the darkest over the brightest
+LEVELS = 12
+DIM = 0.15
+RIM_M = 0.03
+# of the dome's mesh
+SECTORS = 72
+RINGS = 24
+FLOOR_BELOW_M = 0.95
+VEHICLE_BELOW_M = 0.6
+LIT_RGB = np.array([1.0, 0.93, 0.78])
+FIELD_RGB = np.array([0.25, 0.75, 1.0])
+
+
+def mjcf(vehicle: VehicleModel, scene: Scene, sources: Sources, lab_from_body: Rotation) -> str:
+    """The laboratory as the text of one MJCF file, which MuJoCo's own viewer can open and simulate.
+
+    The simulated model is not changed. Raises InputError for a start beyond the tilt stop, and for a vehicle that
+    has a camera named `lab`.
+
+    Parameters
+    ----------
+    sources
+        LEDs in lab coordinates (m), or stars, of which the brightest are put on a sphere
+    lab_from_body
+        Attitude in the keyframe `start`, which also has the speeds and gimbal angles of the
+        scene
+    """
+    spec = vehicle.spec.copy()
+    mount = camera_mount(vehicle)
+    if spec.camera(LAB_CAMERA):
+        raise InputError(
+            scene.vehicle.model,
+            f"camera name {LAB_CAMERA!r} is reserved for the view of the laboratory; rename it",
+        )
+    on_earth = vehicle.config.mount == "air_bearing"
+    inside = (
+        surface.build_surface(scene.light.surface) if isinstance(scene.light, DomeConfig) else SKY
+    )
+    hide_tilt_stop(spec)
+    inline_meshes(spec, vehicle.model)
+    add_backdrop(spec, on_earth)
+    if on_earth:
+        add_room(spec)
+    if isinstance(scene.light, DomeConfig):
+        rings_m = shell_m(inside, np.radians(scene.light.layout.cap_deg))
+        add_dome(spec, rings_m)
+        look_at(spec, *dome_view(rings_m))
+    else:
+        boresight = lab_from_body.apply(mount.cam_from_body.inv().apply([0.0, 0.0, 1.0]))
+        look_at(spec, *sky_view(vehicle, boresight))
+    add_lights(spec, sources)
+    add_field(spec, mount, field_corners(scene.camera, mount, lab_from_body, inside))
+    add_start_keyframe(spec, vehicle, scene, lab_from_body)
+    with mujoco_warnings(), full_precision():
+        compile_spec(spec, SCENES / scene.vehicle.model)
+        return shorten_colors(spec.to_xml())
+
+
+def hide_tilt_stop(spec: Any) -> None:
+    """Put the tilt stop's tendon and its ends, which are not hardware, into the hidden group."""
+    for element in (*spec.tendons, *spec.sites):
+        if element.name.startswith("tilt_stop"):
+            element.group = GROUP_HIDDEN
+
+
+def inline_meshes(spec: Any, model: Any) -> None:
+    """Copy the vertices of the vehicle's mesh files into the model, so that it needs no other file.
+
+    A compiled mesh is rotated to its principal axes; mesh_pos and mesh_quat undo this.
+    """
+    for mesh in spec.meshes:
+        if not mesh.file:
+            continue
+        compiled_mesh = model.mesh(mesh.name or Path(mesh.file).stem)
+        first = int(compiled_mesh.vertadr[0])
+        count = int(compiled_mesh.vertnum[0])
+        begin = int(compiled_mesh.faceadr[0])
+        faces = int(compiled_mesh.facenum[0])
+        file_from_compiled = Rotation.from_quat(
+            model.mesh_quat[compiled_mesh.id], scalar_first=True
+        )
+        mesh.name = compiled_mesh.name
+        mesh.file = ""
+        mesh.scale = [1.0, 1.0, 1.0]
+        mesh.refpos = [0.0, 0.0, 0.0]
+        mesh.refquat = [1.0, 0.0, 0.0, 0.0]
+        mesh.uservert = (
+            file_from_compiled.apply(model.mesh_vert[first : first + count])
+            + model.mesh_pos[compiled_mesh.id]
+        ).ravel()
+        mesh.userface = model.mesh_face[begin : begin + faces].ravel()
+
+
+def add_backdrop(spec: Any, on_earth: bool) -> None:
+    """A dim room or black space as background, and a lamp."""
+    top, bottom = (
+        ([0.16, 0.19, 0.24], [0.03, 0.035, 0.05]) if on_earth else ([0.0, 0.0, 0.01], [0.0] * 3)
+    )
+    spec.add_texture(
+        name="stage_backdrop",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=top,
+        rgb2=bottom,
+        width=256,
+        height=1536,
+    )
+    spec.visual.headlight.ambient = [0.22] * 3
+    spec.visual.headlight.diffuse = [0.35] * 3
+    spec.visual.headlight.specular = [0.1] * 3
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = MAX_PX
+    spec.visual.quality.shadowsize = 2048
+    spec.worldbody.add_light(
+        name="stage_lamp",
+        pos=[2.0, -2.5, 0.9],
+        dir=[-2.0, 2.5, -1.0],
+        diffuse=[0.6] * 3,
+        specular=[0.3] * 3,
+        castshadow=on_earth,
+    )
+
+
+def add_room(spec: Any) -> None:
+    """A tiled floor, and the pedestal whose cup holds the bearing's ball."""
+    spec.add_texture(
+        name="stage_tiles",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.34, 0.36, 0.40],
+        rgb2=[0.46, 0.48, 0.52],
+        width=256,
+        height=256,
+    )
+    tiles = spec.add_material(
+        name="stage_tiles", texrepeat=[2.0, 2.0], texuniform=True, reflectance=0.08
+    )
+    tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "stage_tiles"
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    cylinder = mujoco.mjtGeom.mjGEOM_CYLINDER
+    bottom = -FLOOR_BELOW_M
+    add_visual_geom(
+        spec.worldbody,
+        "stage_floor",
+        plane,
+        size=[6, 6, 0.1],
+        pos=[0, 0, bottom],
+        material="stage_tiles",
+    )
+    for name, radius, low, high in (
+        ("foot", 0.30, bottom, bottom + 0.04),
+        ("column", 0.10, bottom, -0.35),
+        ("neck", 0.05, -0.35, -0.06),
+    ):
+        fromto = [0.0, 0.0, low, 0.0, 0.0, high]
+        add_visual_geom(
+            spec.worldbody,
+            f"stage_{name}",
+            cylinder,
+            size=[radius, 0, 0],
+            fromto=fromto,
+            rgba=[0.36, 0.39, 0.44, 1],
+        )
+
+
+def add_visual_geom(body: Any, name: str, kind: Any, **more: Any) -> Any:
+    """A geom for display only: no mass, no contact."""
+    return body.add_geom(name=name, type=kind, mass=0.0, contype=0, conaffinity=0, **more)
+
+
+def add_dome(spec: Any, rings_m: Floats) -> None:
+    """The dome, opaque from inside and transparent from outside, with a rim."""
+    add_sheet(spec, "stage_dome", rings_m, [0.16, 0.19, 0.27, 1.0], [0.60, 0.72, 0.90, 0.10])
+    rim_m = np.stack([rings_m[-1], rings_m[-1] - [0.0, 0.0, RIM_M]])
+    add_sheet(spec, "stage_rim", rim_m, [0.45, 0.50, 0.58, 1.0], [0.45, 0.50, 0.58, 0.6])
+
+
+def shell_m(inside: Surface, cap_rad: float) -> Floats:
+    """(RINGS, SECTORS, 3) points of the dome, ring under ring from its top down, each counterclockwise from above.
+
+    A panel ends slightly beyond its LEDs; an upright ellipsoid without a rim ends where it is widest, or above the
+    vehicle if that is higher; every other surface ends where it does as seen from the bearing.
+    """
+    azimuth = np.arange(SECTORS) * (2 * np.pi / SECTORS)
+    around = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(SECTORS)], axis=1)
+    up = np.array([0.0, 0.0, 1.0])
+    if isinstance(inside, Plane):
+        radius = np.linspace(1e-3, inside.height_m * np.tan(min(cap_rad + 0.1, 1.3)), RINGS)[
+            :, None, None
+        ]
+        half_m = np.append(inside.half_m, np.inf)
+        return np.asarray(
+            inside.center_m
+            + np.clip(radius * around, -half_m, half_m) @ inside.lab_from_own.as_matrix().T
+        )
+    upright = inside.lab_from_own.magnitude() == 0
+    if not (isinstance(inside, Ellipsoid) and upright and inside.rim.unbounded):
+        return visible_shell_m(inside, around)
+    middle = inside.center_m[2]
+    half = inside.semi_axes_m[2]
+    lowest = max(middle, 0.35 * (middle + half))
+    polar = np.linspace(1e-3, np.arccos((lowest - middle) / half), RINGS)[:, None, None]
+    return np.asarray(
+        inside.center_m + inside.semi_axes_m * (np.sin(polar) * around + np.cos(polar) * up)
+    )
+
+
+def visible_shell_m(inside: Surface, around: Floats) -> Floats:
+    """(RINGS, SECTORS, 3) points where rays from the bearing meet a surface, from its upper edge to its rim.
+
+    Parameters
+    ----------
+    around
+        (SECTORS, 3) horizontal unit vectors. Edge and rim are found to a fifth of a degree,
+        between 0 and 80 deg from the zenith and above a third of the surface's height
+    """
+    up = np.array([0.0, 0.0, 1.0])
+
+    def points_at(polar: Floats) -> Floats:
+        rays = np.sin(polar)[..., None] * around + np.cos(polar)[..., None] * up
+        return inside.meet(np.zeros(3), rays.reshape(-1, 3)).reshape(rays.shape)
+
+    polar = np.broadcast_to(np.linspace(1e-3, np.radians(80), 400)[:, None], (400, len(around)))
+    height_m = np.nan_to_num(points_at(polar)[..., 2], nan=-np.inf)
+    on_surface = height_m > 0.35 * height_m.max()
+    first = on_surface.argmax(axis=0)
+    last = 399 - on_surface[::-1].argmax(axis=0)
+    fraction = np.linspace(0, 1, RINGS)[:, None]
+    return points_at(polar[first, 0] * (1 - fraction) + polar[last, 0] * fraction)
+
+
+def add_sheet(
+    spec: Any, name: str, rings_m: Floats, inside_rgba: list[float], outside_rgba: list[float]
+) -> None:
+    """A surface with a color for each side; OpenGL does not draw the back of a triangle, so it is two meshes.
+
+    Parameters
+    ----------
+    rings_m
+        (K, n, 3) each counterclockwise seen from above, every one beneath or around the
+        previous one
+    """
+    index = np.arange(rings_m.shape[0] * rings_m.shape[1]).reshape(rings_m.shape[:2])
+    a = index[:-1].ravel()
+    d = index[1:].ravel()
+    b = np.roll(index, -1, axis=1)[:-1].ravel()
+    c = np.roll(index, -1, axis=1)[1:].ravel()
+    inwards = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    for side, faces, rgba in (
+        ("inside", inwards, inside_rgba),
+        ("outside", inwards[:, ::-1], outside_rgba),
+    ):
+        add_mesh(
+            spec,
+            spec.worldbody,
+            f"{name}_{side}",
+            rings_m.reshape(-1, 3),
+            faces,
+            rgba,
+            GROUP_LIGHTS,
+        )
+
+
+def add_mesh(
+    spec: Any,
+    body: Any,
+    name: str,
+    vertices_m: Floats,
+    faces: NDArray[np.int64],
+    rgba: Any,
+    group: int,
+    **more: Any,
+) -> None:
+    """A mesh, open or closed, and its geom; its inertia is that of a shell, which needs no volume."""
+    mesh = spec.add_mesh(
+        name=name, uservert=np.round(vertices_m, 6).ravel(), userface=faces.astype(np.int32).ravel()
+    )
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    add_visual_geom(
+        body, name, mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=rgba, group=group, **more
+    )
+
+
+def add_lights(spec: Any, sources: Sources) -> None:
+    """A glowing octahedron for each LED, and for each of the brightest stars; brightness from its mean strength.
+
+    An LED's color shows its strength; a star's size does, by the square root. Markers of similar color share
+    one mesh: as many sites would make a step eight times as slow, and a picture take seconds.
+    """
+    glow = spec.add_material(name="stage_glow", emission=0.8, specular=0.0)
+    mean = sources.strength * sources.on_s / sources.period_s
+    stars = bool((sources.place[:, 3] == 0).any())
+    shown = np.argsort(-mean, kind="stable")[: MAX_STARS if stars else len(mean)]
+    fraction = mean[shown] / mean.max(initial=1e-300)
+    position_m = sources.place[shown, :3] * (SKY_RADIUS_M if stars else 1.0)
+    radius_m = 0.006 + 0.04 * np.sqrt(fraction) if stars else np.full(len(shown), LED_RADIUS_M)
+    level = np.full(len(shown), LEVELS) if stars else np.ceil(fraction * LEVELS).astype(int)
+    for step in np.unique(level):
+        vertices, faces = octahedra(position_m[level == step], radius_m[level == step])
+        rgba = [*(LIT_RGB * (DIM + (1 - DIM) * step / LEVELS)), 1.0]
+        name = f"stage_{'stars' if stars else 'leds'}_{step}"
+        add_mesh(
+            spec, spec.worldbody, name, vertices, faces, rgba, GROUP_LIGHTS, material=glow.name
+        )
+
+
+def octahedra(position_m: Floats, radius_m: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """(6 N, 3) vertices and (8 N, 3) faces of N octahedra: corners on the axes, a face in every octant."""
+    corners = np.concatenate([np.eye(3), -np.eye(3)])
+    signs = np.array([[x, y, z] for x in (0, 3) for y in (0, 3) for z in (0, 3)])
+    faces = signs + np.arange(3)
+    odd = (signs > 0).sum(axis=1) % 2 == 1  # mirrored: reverse the order, to face outwards
+    faces[odd] = faces[odd][:, ::-1]
+    vertices = position_m[:, None, :] + radius_m[:, None, None] * corners
+    return vertices.reshape(-1, 3), (6 * np.arange(len(position_m))[:, None, None] + faces).reshape(
+        -1, 3
+    )
+
+
+def field_corners(
+    camera: CameraConfig, mount: Mount, lab_from_body: Rotation, inside: Surface
+) -> Floats:
+    """(4, 3) in body axes: where a pinhole's rays of the chip's corners meet dome or sky, at a given attitude.
+
+    A ray that misses a flat panel, or meets it far away, ends at the distance of the sky.
+    """
+    x = np.array([-0.5, camera.width_px - 0.5, camera.width_px - 0.5, -0.5]) - camera.center_px[0]
+    y = np.array([-0.5, -0.5, camera.height_px - 0.5, camera.height_px - 0.5]) - camera.center_px[1]
+    rays_cam = np.column_stack([x, y, np.full(4, camera.focal_px)])
+    lab_from_cam = lab_from_body * mount.cam_from_body.inv()
+    rays = lab_from_cam.apply(rays_cam / np.linalg.norm(rays_cam, axis=1, keepdims=True))
+    tip_m = lab_from_body.apply(mount.camera_body_m)
+    length_m = np.linalg.norm(inside.meet(tip_m, rays) - tip_m, axis=1)
+    return lab_from_body.inv().apply(tip_m + np.fmin(length_m, SKY_RADIUS_M)[:, None] * rays)
+
+
+def add_field(spec: Any, mount: Mount, corners_m: Floats) -> None:
+    """The star camera's field of view as a translucent pyramid on the vehicle, with its edges."""
+    bus = spec.body("bus")
+    tip = mount.camera_body_m
+    sides = np.array(
+        [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]]
+    )  # open, so that it does not block the camera's own view
+    glow = spec.add_material(name="stage_field", emission=0.6, specular=0.0)
+    more = {"material": glow.name, "group": GROUP_FIELD}
+    vertices = np.vstack([tip, corners_m])
+    add_mesh(spec, bus, "stage_field", vertices, sides, [*FIELD_RGB, 0.4], **more)
+    length_m = np.linalg.norm(corners_m - tip, axis=1).min()
+    for k, corner in enumerate(corners_m):
+        for kind, end in (("ray", tip), ("edge", corners_m[k - 1])):
+            add_visual_geom(
+                bus,
+                f"stage_{kind}_{k}",
+                mujoco.mjtGeom.mjGEOM_CAPSULE,
+                size=[0.003 * length_m, 0, 0],
+                fromto=[*end, *corner],
+                rgba=[*FIELD_RGB, 0.9],
+                **more,
+            )
+
+
+def dome_view(rings_m: Floats) -> tuple[Floats, Floats, Floats, float]:
+    """(eye, target, up, size), m: from the side, so that one sees under the dome's rim and through it.
+
+    The eye's distance makes dome and vehicle fill a picture of 4:3; the rim's near side is the widest.
+    """
+    wide = np.hypot(*rings_m[-1, :, :2].T).max()
+    top = rings_m[..., 2].max()
+    size = (top + VEHICLE_BELOW_M) / 2
+    tangent = np.tan(np.radians(FOVY_DEG / 2))
+    distance = max(1.25 * size / tangent, wide * (1.05 / (4 / 3 * tangent) + 0.35))
+    middle = np.array([0.0, 0.0, top - size])
+    return (
+        middle + distance * direction(-62.0, 8.0),
+        middle,
+        np.array([0.0, 0.0, 1.0]),
+        0.55 * distance,
+    )
+
+
+def sky_view(vehicle: VehicleModel, boresight: Floats) -> tuple[Floats, Floats, Floats, float]:
+    """As `dome_view`, from beside and behind the vehicle, with the camera's field along the picture's diagonal."""
+    size = float(vehicle.model.stat.extent) / 2 + SKY_RADIUS_M / 2
+    beside = np.cross(boresight, np.eye(3)[np.argmin(np.abs(boresight))])
+    back = beside / np.linalg.norm(beside) - 0.5 * boresight
+    up = Rotation.from_rotvec(np.radians(-40.0) * back / np.linalg.norm(back)).apply(boresight)
+    return size * (2.0 * back + 0.5 * boresight), 0.5 * size * boresight, up, 1.2 * size
+
+
+def direction(azimuth_deg: float, elevation_deg: float) -> Floats:
+    azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
+    ring = np.cos(elevation)
+    return np.array([ring * np.cos(azimuth), ring * np.sin(azimuth), np.sin(elevation)])
+
+
+def look_at(spec: Any, eye_m: Floats, middle_m: Floats, up: Floats, size_m: float) -> None:
+    """Add the camera `lab` and set the viewer's initial view: MuJoCo's cameras look along -z, y is up."""
+    back = (eye_m - middle_m) / np.linalg.norm(eye_m - middle_m)
+    right = np.cross(up, back) / np.linalg.norm(np.cross(up, back))
+    lab_from_view = Rotation.from_matrix(np.column_stack([right, np.cross(back, right), back]))
+    spec.worldbody.add_camera(
+        name=LAB_CAMERA, pos=eye_m, quat=lab_from_view.as_quat(scalar_first=True), fovy=FOVY_DEG
+    )
+    spec.stat.center = middle_m
+    spec.stat.extent = size_m
+    spec.visual.map.znear = 0.01
+    spec.visual.map.zfar = 50.0
+    spec.visual.global_.azimuth = float(np.degrees(np.arctan2(-back[1], -back[0])))
+    spec.visual.global_.elevation = float(-np.degrees(np.arcsin(back[2])))
+
+
+def add_start_keyframe(
+    spec: Any, vehicle: VehicleModel, scene: Scene, lab_from_body: Rotation
+) -> None:
+    """The keyframe `start`: attitude and rate, wheel and rotor speeds, gimbal angles and servo set-points."""
+    simulation = Simulation(vehicle, lab_from_body, np.radians(scene.motion.rate_deg_s), 0.0)
+    data = simulation.data
+    spec.add_key(name="start", qpos=data.qpos, qvel=data.qvel, act=data.act, ctrl=data.ctrl)
+
+
+@contextmanager
+def full_precision() -> Iterator[None]:
+    """Write MJCF with fifteen digits; MuJoCo's six would shift a balanced vehicle's center of mass.
+
+    MuJoCo's switch for it is private; if a version lacks it, six digits are written.
+    """
+    library = ctypes.CDLL(mujoco._functions.__file__)
+    switch = getattr(library, "_mjPRIVATE__set_xml_precision", lambda digits: None)
+    switch(15)
+    try:
+        yield
+    finally:
+        switch(6)
+
+
+def shorten_colors(text: str) -> str:
+    """Write colors with four digits: they are single precision, so fifteen digits make 0.1 into 0.100000001490116."""
+    return re.sub(
+        r'(rgba|rgb1|rgb2)="([^"]*)"',
+        lambda m: f'{m[1]}="{" ".join(f"{float(x):.4g}" for x in m[2].split())}"',
+        text,
+    )
+
+
+# The geometry of an MJCF file as plain shapes, for other drawing programs than MuJoCo's.
+
+
+KINDS = {
+    mujoco.mjtGeom.mjGEOM_PLANE: "plane",
+    mujoco.mjtGeom.mjGEOM_BOX: "box",
+    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
+    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
+    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
+}
+LIGHTS = ("stage_leds", "stage_stars")  # begin of the names of the lights' geoms
+
+
+class Shape(NamedTuple):
+    """A shape in the lab, or on the vehicle in body axes with every joint at zero.
+
+    Attributes
+    ----------
+    name
+        Of the geom; empty if it has none
+    kind
+        Of KINDS
+    size_m
+        As MuJoCo has it: half edges, radius and half length along z, semi-axes
+    on_vehicle
+        Whether it turns with the vehicle
+    vertices_m, faces
+        (N, 3) and (M, 3) of a mesh, in the shape's axes; empty of other kinds
+    """
+
+    name: str
+    kind: str
+    size_m: tuple[float, ...]
+    position_m: tuple[float, ...]
+    parent_from_shape_wxyz: tuple[float, ...]
+    rgba: tuple[float, ...]
+    on_vehicle: bool
+    vertices_m: Floats
+    faces: NDArray[np.int32]
+
+
+class Laboratory(NamedTuple):
+    """All visible shapes of a laboratory without its lights, and the camera `lab`: (3,) eye and what it looks at, m."""
+
+    shapes: tuple[Shape, ...]
+    eye_m: Floats
+    target_m: Floats
+
+
+def laboratory(mjcf: str) -> Laboratory:
+    """The laboratory of an MJCF text, see `mjcf_export.mjcf`."""
+    with mujoco_warnings():
+        model = mujoco.MjModel.from_xml_string(mjcf)
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+    shown = [n for n in range(model.ngeom) if is_shown(model, n)]
+    shapes = tuple(shape(model, data, n) for n in shown)
+    return Laboratory(shapes, model.camera(LAB_CAMERA).pos.copy(), model.stat.center.copy())
+
+
+def is_shown(model: mujoco.MjModel, n: int) -> bool:
+    kind = mujoco.mjtGeom(model.geom_type[n])
+    name = model.geom(n).name
+    return kind in KINDS and model.geom_group[n] != GROUP_HIDDEN and not name.startswith(LIGHTS)
+
+
+def shape(model: mujoco.MjModel, data: mujoco.MjData, n: int) -> Shape:
+    """The geom with index n, in the pose of data."""
+    wxyz = np.empty(4)
+    mujoco.mju_mat2Quat(wxyz, data.geom_xmat[n])
+    vertices_m, faces = mesh(model, n)
+    return Shape(
+        model.geom(n).name,
+        KINDS[mujoco.mjtGeom(model.geom_type[n])],
+        tuple(model.geom_size[n].tolist()),
+        tuple(data.geom_xpos[n].tolist()),
+        tuple(wxyz.tolist()),
+        tuple(color(model, n).tolist()),
+        bool(model.geom_bodyid[n] != 0),
+        vertices_m,
+        faces,
+    )
+
+
+def color(model: mujoco.MjModel, n: int) -> Floats:
+    """(4,) of a geom: its own, or its material's if it has none of its own."""
+    material = model.geom_matid[n]
+    unset = (model.geom_rgba[n] == (0.5, 0.5, 0.5, 1.0)).all()
+    return np.asarray(
+        model.mat_rgba[material] if material >= 0 and unset else model.geom_rgba[n], float
+    )
+
+
+def mesh(model: mujoco.MjModel, n: int) -> tuple[Floats, NDArray[np.int32]]:
+    """Vertices and faces of a geom's mesh; empty if it is none."""
+    if model.geom_type[n] != mujoco.mjtGeom.mjGEOM_MESH:
+        return np.empty((0, 3)), np.empty((0, 3), np.int32)
+    k = model.geom_dataid[n]
+    vertices = slice(model.mesh_vertadr[k], model.mesh_vertadr[k] + model.mesh_vertnum[k])
+    faces = slice(model.mesh_faceadr[k], model.mesh_faceadr[k] + model.mesh_facenum[k])
+    return model.mesh_vert[vertices].astype(float), model.mesh_face[faces].copy()

@@ -1,0 +1,140 @@
+"""Render pictures of the laboratory by MuJoCo without a screen, and animations of them."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import IO
+
+import cv2
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError, unknown_name
+from skysim.core.files import atomic_file
+from skysim.core.types import Floats
+from skysim.dynamics.multibody.mjcf import mujoco_warnings, one_line
+
+Picture = NDArray[np.uint8]
+
+LAB_CAMERA = "lab"  # the MJCF's camera that sees everything
+# width, height
+PICTURE_PX = (960, 720)
+FILM_PX = (480, 360)
+NO_OPENGL = (
+    "no picture of the lab: {why}; MuJoCo draws with OpenGL by EGL: apt-get install libegl1 libgl1-mesa-dri"
+    " (or libosmesa6, and MUJOCO_GL=osmesa)"
+)
+ANIMATED = {  # browser formats, with encoder options for less than 20 kB per frame of FILM_PX
+    ".gif": [cv2.IMWRITE_GIF_DITHER, 3],
+    ".webp": [cv2.IMWRITE_WEBP_QUALITY, 75],
+}
+
+
+class NoPicture(RuntimeError):
+    """Rendering is not possible here; the message is one line and says what to install."""
+
+
+def picture(mjcf: str, qpos: Floats, size_px: tuple[int, int] = PICTURE_PX) -> Picture:
+    """(H, W, 3) RGB: the laboratory from its camera `lab`, in the state qpos (nq,). Raises NoPicture.
+
+    Parameters
+    ----------
+    mjcf
+        From `mjcf_export.mjcf`
+    size_px
+        Width and height, at most `mjcf_export.MAX_PX`
+    """
+    return next(film(mjcf, np.atleast_2d(qpos), size_px))
+
+
+def film(mjcf: str, qpos: Floats, size_px: tuple[int, int] = FILM_PX) -> Iterator[Picture]:
+    """As `picture`, for each row of qpos (N, nq), yielded as they are rendered.
+
+    Rendering runs in its own process: MuJoCo chooses its OpenGL when first imported, by MUJOCO_GL (here EGL by
+    default), and a graphics driver may crash the whole process.
+    """
+    width, height = size_px
+    with tempfile.TemporaryFile() as task, tempfile.TemporaryFile() as errors:
+        np.savez(task, mjcf=np.array(mjcf), qpos=qpos, size_px=np.array(size_px))
+        task.seek(0)
+        with subprocess.Popen(
+            [sys.executable, "-m", "skysim.dynamics.multibody.scene_picture"],
+            stdin=task,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            env={"MUJOCO_GL": "egl"} | dict(os.environ),
+        ) as renderer:
+            try:
+                for _ in range(len(qpos)):
+                    raw = renderer.stdout.read(height * width * 3) if renderer.stdout else b""
+                    if len(raw) < height * width * 3:
+                        raise NoPicture(
+                            NO_OPENGL.format(why=failure_reason(renderer.wait(), errors))
+                        )
+                    yield np.frombuffer(raw, np.uint8).reshape(height, width, 3)
+            finally:
+                renderer.kill()  # a caller may stop before the last picture
+
+
+def write_film(pictures: Iterable[Picture], path: Path, fps: float) -> None:
+    """Write RGB pictures as .gif, or as .webp, which is a quarter as large. Raises InputError for other types;
+    OSError.
+
+    Parameters
+    ----------
+    fps
+        Pictures a second; a GIF counts in hundredths of a second, and browsers show 50 at most
+    """
+    if path.suffix not in ANIMATED:
+        raise InputError(path, *unknown_name("animation format", path.suffix, ANIMATED))
+    animation = cv2.Animation()
+    animation.frames = [cv2.cvtColor(picture, cv2.COLOR_RGB2BGR) for picture in pictures]
+    animation.durations = [round(1000 / fps)] * len(animation.frames)
+    done, coded = cv2.imencodeanimation(path.suffix, animation, ANIMATED[path.suffix])
+    if not done:
+        raise OSError(errno.EIO, "OpenCV could not encode the film", str(path))
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(coded.tobytes())
+
+
+def failure_reason(code: int, errors: IO[bytes]) -> str:
+    """The last line that the rendering process wrote to standard error, or how it ended."""
+    errors.seek(0)
+    lines = errors.read().decode(errors="replace").strip().splitlines()
+    if code < 0:
+        return f"the renderer was ended by {signal.Signals(-code).name}"
+    return one_line(RuntimeError(lines[-1])) if lines else f"the renderer exited with code {code}"
+
+
+def render_task() -> None:
+    """The rendering process: task as npz on stdin, raw pictures on stdout, errors on stderr."""
+    with os.fdopen(os.dup(1), "wb") as out:
+        os.dup2(2, 1)  # a driver's output must not reach the pictures
+        with np.load(io.BytesIO(sys.stdin.buffer.read())) as task, mujoco_warnings():
+            text = str(task["mjcf"])
+            states = task["qpos"]
+            (width, height) = task["size_px"].tolist()
+            model = mujoco.MjModel.from_xml_string(text)
+            data = mujoco.MjData(model)
+            with mujoco.Renderer(model, height, width) as renderer:
+                for qpos in states:
+                    data.qpos[:] = qpos
+                    mujoco.mj_forward(model, data)
+                    renderer.update_scene(data, camera=LAB_CAMERA)
+                    out.write(np.ascontiguousarray(renderer.render()).tobytes())
+
+
+if __name__ == "__main__":
+    try:
+        render_task()
+    except Exception as error:
+        sys.exit(f"{type(error).__name__}: {one_line(error)}")

@@ -1,1 +1,0 @@
-"""Pictures of the laboratory: shapes, MJCF for MuJoCo's viewer, and rendered views."""

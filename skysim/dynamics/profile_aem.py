@@ -1,0 +1,220 @@
+"""Attitude samples from a CCSDS Attitude Ephemeris Message (AEM) in keyword = value notation, versions 1.0 and 2.0.
+
+CCSDS 504.0-B-1 and 504.0-B-2. The quaternion "from A to B" turns the axes of A into those of B (annex F2 of the
+latter), which is the quaternion of the rotation a_from_b of coordinates. Version 1.0 also names the direction
+(ATTITUDE_DIR: A2B or B2A) and whether the scalar is FIRST or LAST (QUATERNION_TYPE); from version 2.0 on it is A to B,
+scalar last. A file of version 2.0 that has these keywords nevertheless is read by them. Rates and derivatives after the
+quaternion, and the interpolation that the file recommends, are not used.
+"""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.core.errors import InputError, Where
+from skysim.core.text import (
+    Line,
+    TextSegment,
+    check_version,
+    excerpt,
+    keyword_value,
+    one_of,
+    seconds_since,
+    to_numbers,
+)
+from skysim.core.time import SCALES
+from skysim.core.types import Floats
+from skysim.dynamics.profile_samples import (
+    REFERENCES,
+    Samples,
+    frame_of,
+    from_quaternions,
+    icrs_from,
+)
+
+VERSION = "CCSDS_AEM_VERS"
+VERSIONS = ("1.0", "2.0")
+# Numbers after the epoch; the first four are the quaternion.
+TYPES = {"QUATERNION": 4, "QUATERNION/DERIVATIVE": 8, "QUATERNION/RATE": 7, "QUATERNION/ANGVEL": 7}
+DIRECTIONS = ("A2B", "B2A")
+ORDERS = ("FIRST", "LAST")
+REQUIRED = ("REF_FRAME_A", "REF_FRAME_B", "TIME_SYSTEM", "ATTITUDE_TYPE")
+SAME_ATTITUDE_RAD = 1e-6  # of a sample that both of two adjoining segments have
+
+
+def read_aem(path: Path, lines: list[Line], start: datetime.datetime) -> Samples:
+    """The samples of all segments. Raises InputError for a file that is not an AEM of quaternions."""
+    version, segments = split_segments(path, lines)
+    if not segments:
+        raise InputError(path, "no segment", "META_START ... META_STOP, DATA_START ... DATA_STOP")
+    parts = [segment_samples(path, version, segment, start) for segment in segments]
+    joined = parts[0]
+    for part in parts[1:]:
+        joined = join(joined, part)
+    return joined
+
+
+def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[TextSegment]]:
+    """The version, and the segments of the message. Raises InputError for a line out of place."""
+    version = ""
+    segments = list[TextSegment]()
+    section = ""
+    for n, line in lines:
+        if line.split(maxsplit=1)[0] == "COMMENT":
+            continue
+        if line in ("META_START", "META_STOP", "DATA_START", "DATA_STOP"):
+            section = next_section(Where(path, n), section, line)
+            if line == "META_START":
+                segments.append(TextSegment({}, []))
+        elif section == "DATA_START":
+            segments[-1].data.append((n, line.split()))
+        elif section in ("", "META_START"):
+            key, value = keyword_value(path, n, line)
+            if section:
+                segments[-1].metadata[key] = (n, value)
+            elif key == VERSION:
+                version = value
+        else:
+            raise InputError(
+                path,
+                f"{excerpt(line)} after {section}",
+                "DATA_START or META_START",
+                where=Where(path, n),
+            )
+    check_version(path, VERSION, version, VERSIONS)
+    if section not in ("", "DATA_STOP"):
+        raise InputError(path, f"ends within a segment, after {section}: the file is cut off")
+    return version, segments
+
+
+def next_section(where: Where, section: str, keyword: str) -> str:
+    """The section that a keyword begins or ends. Raises InputError if it is out of order."""
+    after = {"META_START": ("", "DATA_STOP"), "META_STOP": ("META_START",)}
+    after |= {"DATA_START": ("META_STOP",), "DATA_STOP": ("DATA_START",)}
+    if section not in after[keyword]:
+        raise InputError(where.file, f"{keyword} after {section or 'the header'}", where=where)
+    return keyword
+
+
+def segment_samples(
+    path: Path, version: str, segment: TextSegment, start: datetime.datetime
+) -> Samples:
+    """The samples of one segment within its useable span. Raises InputError."""
+    metadata = segment.metadata
+    source = str(path)
+    segment.require(
+        path, (*REQUIRED, *(("ATTITUDE_DIR", "QUATERNION_TYPE") if version == "1.0" else ()))
+    )
+    system = one_of(path, metadata, "TIME_SYSTEM", SCALES)
+    width = TYPES[one_of(path, metadata, "ATTITUDE_TYPE", TYPES)]
+    frames = [frame_of(Where(path, metadata[key][0]), metadata[key][1]) for key in REQUIRED[:2]]
+    names = [metadata[key][1] for key in REQUIRED[:2]]
+    if sum(name.upper() in REFERENCES for name in names) != 1:
+        raise InputError(
+            path,
+            f"the attitude of {names[1]} in {names[0]}",
+            "one of the two an inertial or laboratory frame, the other of the vehicle",
+            where=Where(path, metadata["REF_FRAME_B"][0]),
+        )
+    for n, words in segment.data:
+        if len(words) != width + 1:
+            raise InputError(
+                path, f"{len(words)} values", f"an epoch and {width} numbers", where=Where(path, n)
+            )
+    lines = [n for n, _ in segment.data]
+    numbers = to_numbers(source, lines, [words[1:] for _, words in segment.data], width)
+    t_s = seconds_since(source, lines, [words[0] for _, words in segment.data], start, system)
+    last = (
+        one_of(path, metadata, "QUATERNION_TYPE", ORDERS) == "LAST"
+        if "QUATERNION_TYPE" in metadata
+        else True
+    )
+    reverse = (
+        one_of(path, metadata, "ATTITUDE_DIR", DIRECTIONS) == "B2A"
+        if "ATTITUDE_DIR" in metadata
+        else False
+    )
+    xyzw: Floats = numbers[:, [0, 1, 2, 3] if last else [1, 2, 3, 0]]
+    a, b = frames[::-1] if reverse else frames
+    samples = from_quaternions(source, "line", lines, t_s, (a, b), xyzw, absolute=True)
+    useable = within_span(path, metadata, t_s, start, system)
+    return take(to_icrs(samples, names), useable)
+
+
+def within_span(
+    path: Path, metadata: dict[str, Line], t_s: Floats, start: datetime.datetime, system: str
+) -> slice:
+    """The samples from USEABLE_START_TIME to USEABLE_STOP_TIME; all where a keyword is missing."""
+    ends_s = [-np.inf, np.inf]
+    for side, key in enumerate(("USEABLE_START_TIME", "USEABLE_STOP_TIME")):
+        if key in metadata:
+            line, epoch = metadata[key]
+            ends_s[side] = float(seconds_since(str(path), [line], [epoch], start, system)[0])
+    inside = np.flatnonzero((t_s >= ends_s[0] - 1e-9) & (t_s <= ends_s[1] + 1e-9))
+    return slice(int(inside[0]), int(inside[-1]) + 1) if len(inside) else slice(0, 0)
+
+
+def take(samples: Samples, which: slice) -> Samples:
+    """A range of the samples."""
+    return replace(
+        samples,
+        places=samples.places[which],
+        t_s=samples.t_s[which],
+        a_from_b=samples.a_from_b[which],
+    )
+
+
+def to_icrs(samples: Samples, names: list[str]) -> Samples:
+    """The samples with the bias between EME2000 and the ICRS applied, if one of the two frames is EME2000."""
+    bias = Rotation.identity()
+    for name in names:
+        bias = icrs_from(name) * bias
+    a_from_b = bias * samples.a_from_b if samples.a == "icrs" else samples.a_from_b * bias.inv()
+    return replace(samples, a_from_b=a_from_b)
+
+
+def join(first: Samples, second: Samples) -> Samples:
+    """Two adjoining segments as one. A sample that both have at the seam is taken once.
+
+    Raises
+    ------
+    InputError
+        For segments of different frames, that overlap or that leave a gap.
+    """
+    if not len(first.t_s) or not len(second.t_s):
+        return first if len(first.t_s) else second
+    direction = second.direction
+    if direction != first.direction:
+        second = second.inverted()
+    if second.direction != first.direction:
+        raise second.error(
+            0, f"a segment of {direction} after one of {first.direction}", "the same frames"
+        )
+    gap_s = second.t_s[0] - first.t_s[-1]
+    if (
+        gap_s == 0
+        and (first.a_from_b[-1].inv() * second.a_from_b[0]).magnitude() < SAME_ATTITUDE_RAD
+    ):
+        second = take(second, slice(1, None))
+    elif gap_s <= 0:
+        raise second.error(
+            0, f"a segment that begins {-gap_s:.6g} s before the end of the one before it"
+        )
+    longest_s = max(float(np.diff(part.t_s).max(initial=0.0)) for part in (first, second))
+    if gap_s > 1.5 * longest_s:
+        raise second.error(
+            0,
+            f"a gap of {gap_s:.6g} s between two segments",
+            f"up to 1.5 steps, {1.5 * longest_s:.6g}",
+        )
+    return replace(
+        first,
+        places=np.concatenate([first.places, second.places]),
+        t_s=np.concatenate([first.t_s, second.t_s]),
+        a_from_b=Rotation.concatenate([first.a_from_b, second.a_from_b]),
+    )

@@ -1,0 +1,219 @@
+"""Attitude samples from named columns: a CSV or ECSV file, or an astropy Table or pandas DataFrame.
+
+The columns' names say what they hold, so that nothing is guessed:
+
+time     : `t_s`, or `utc` (ISO 8601)
+attitude : a quaternion `A_from_B_qw`, `_qx`, `_qy`, `_qz` of one of the rotations in QUATERNIONS, or the components
+           `q_w`, `q_x`, `q_y`, `q_z` where the scene's maneuver names the rotation; in a laboratory `roll_deg`,
+           `pitch_deg`, `yaw_deg`, 3-2-1 angles of the body; under the stars `ra_deg`, `dec_deg`, `roll_deg` of the
+           camera
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.core import files
+from skysim.core.errors import InputError, Where, printable
+from skysim.core.text import Line, excerpt, seconds_since, to_numbers
+from skysim.core.types import Floats
+from skysim.dynamics.profile_samples import Samples, from_quaternions
+from skysim.sources.stars import cam_from_icrs
+
+QUATERNIONS = (
+    "lab_from_body",
+    "body_from_lab",
+    "icrs_from_body",
+    "body_from_icrs",
+    "icrs_from_cam",
+    "cam_from_icrs",
+)
+BARE = ("q_x", "q_y", "q_z", "q_w")
+BODY_ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
+CAMERA_ANGLES = ("ra_deg", "dec_deg", "roll_deg")
+TIMES = ("t_s", "utc")
+UNITS = {"t_s": "s", **dict.fromkeys(BODY_ANGLES + CAMERA_ANGLES, "deg")}
+COLUMNS = (
+    "t_s or utc, with A_from_B_qx, _qy, _qz, _qw (A_from_B: "
+    + ", ".join(QUATERNIONS)
+    + "), or q_x, q_y, q_z, q_w and"
+    " the maneuver's key rotation, or roll_deg, pitch_deg, yaw_deg, or ra_deg, dec_deg, roll_deg"
+)
+
+
+def read_csv(
+    path: Path, lines: list[Line], start: datetime.datetime, rotation: str | None
+) -> Samples:
+    """Samples of a CSV file: a line of column names, then a line each; lines that begin with # are comments."""
+    rows = [
+        (n, [cell.strip() for cell in line.split(",")])
+        for n, line in lines
+        if not line.startswith("#")
+    ]
+    if not rows:
+        raise InputError(path, "empty", "a line of column names, then a line for each attitude")
+    body = rows[1:]
+    (head, names) = rows[0]
+    check_names(Where(path, head), names, rotation)
+    for n, cells in body:
+        if len(cells) != len(names):
+            raise InputError(
+                path,
+                f"{len(cells)} values",
+                f"{len(names)}, one for each column",
+                where=Where(path, n),
+            )
+    places = [n for n, _ in body]
+    columns = dict[str, Any]()
+    if "utc" in names:
+        date = names.index("utc")
+        columns["utc"] = [cells.pop(date) for _, cells in body]
+        names = names[:date] + names[date + 1 :]
+    numbers = to_numbers(str(path), places, [cells for _, cells in body], len(names))
+    columns |= dict(zip(names, numbers.T, strict=True))
+    return to_samples(str(path), "line", places, columns, start, rotation)
+
+
+def read_ecsv(path: Path, start: datetime.datetime, rotation: str | None) -> Samples:
+    """Samples of an ECSV file; units of its columns are checked."""
+    return from_table(files.read_table(path), str(path), start, rotation)
+
+
+def from_table(
+    table: Any, source: str, start: datetime.datetime, rotation: str | None = None
+) -> Samples:
+    """Samples of an astropy Table, a pandas DataFrame or a mapping of columns. Raises InputError."""
+    try:
+        names = [
+            str(name) for name in (table.colnames if hasattr(table, "colnames") else table.keys())
+        ]
+        columns = {name: table[name] for name in names}
+    except (AttributeError, TypeError, KeyError):
+        raise InputError(
+            source,
+            type(table).__name__,
+            "an astropy Table, a pandas DataFrame or a mapping of columns",
+        ) from None
+    check_names(Where(source), names, rotation)
+    values: dict[str, Any] = {}
+    for name, column in columns.items():
+        unit = getattr(column, "unit", None)
+        if unit is not None and str(unit) != UNITS.get(name, ""):
+            raise InputError(source, f"column {name} is in {unit}", UNITS.get(name) or "no unit")
+        values[name] = to_epochs(column) if name == "utc" else to_column(source, name, column)
+    count = len(next(iter(values.values())))
+    for name, column in values.items():
+        if len(column) != count:
+            raise InputError(
+                source, f"column {name} has {len(column)} values", f"{count}, as the first"
+            )
+    return to_samples(source, "row", range(1, count + 1), values, start, rotation)
+
+
+def to_column(source: str, name: str, column: Any) -> Floats:
+    """A column as (N,) finite numbers. Raises InputError that names the first row with another value."""
+    try:
+        numbers = np.ma.filled(np.ma.asarray(column).astype(np.float64), np.nan)
+    except (TypeError, ValueError):
+        raise InputError(source, f"column {name} has values that are no numbers") from None
+    if numbers.ndim != 1:
+        raise InputError(
+            source, f"column {name} has shape {numbers.shape}", "one number in each row"
+        )
+    if len(bad := np.flatnonzero(~np.isfinite(numbers))):
+        raise InputError(
+            source, f"{name} is not a finite number", where=Where(source, int(bad[0]) + 1, "row")
+        )
+    return np.asarray(numbers, dtype=np.float64)
+
+
+def to_epochs(column: Any) -> list[str]:
+    """A column of texts, datetimes, numpy or pandas dates, or an astropy Time, as ISO 8601."""
+    if hasattr(column, "utc") and hasattr(column, "isot"):  # an astropy Time
+        exact = column.utc.replicate()
+        exact.precision = 9
+        return [str(text) for text in np.atleast_1d(exact.isot)]
+    values = np.asarray(column)
+    if values.dtype.kind == "M":
+        return [str(text) for text in np.datetime_as_string(values.astype("datetime64[ns]"))]
+    return [
+        value.isoformat() if isinstance(value, datetime.datetime) else str(value)
+        for value in values.tolist()
+    ]
+
+
+def check_names(where: Where, names: Sequence[str], rotation: str | None) -> None:
+    """Raise InputError unless the columns are one time and one attitude, and no others."""
+    repeated = [name for n, name in enumerate(names) if name in names[:n]]
+    if repeated:
+        raise InputError(where.file, f"two columns {excerpt(repeated[0])}", "one", where)
+    attitudes = [tuple(f"{name}_q{end}" for end in "xyzw") for name in QUATERNIONS]
+    attitudes += [BARE, BODY_ANGLES, CAMERA_ANGLES]
+    known = {*TIMES, *(name for columns in attitudes for name in columns)}
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise InputError(where.file, f"unknown column {excerpt(unknown[0])}", COLUMNS, where)
+    found = {name for name in names if name not in TIMES}
+    if len(found) + 1 != len(names) or not any(set(columns) == found for columns in attitudes):
+        given = ", ".join(printable(name) for name in names)
+        raise InputError(
+            where.file, f"columns {given} are not one time and one attitude", COLUMNS, where
+        )
+    if found == set(BARE) and rotation is None:
+        raise InputError(
+            where.file,
+            "q_x, q_y, q_z, q_w do not say which rotation they are",
+            f"rotation: {QUATERNIONS[0]} in the maneuver, or columns {QUATERNIONS[0]}_qx, ...",
+            where,
+        )
+    if found != set(BARE) and rotation is not None:
+        raise InputError(
+            where.file, "the columns name the rotation", "no key rotation in the maneuver", where
+        )
+
+
+def to_samples(
+    source: str,
+    unit: str,
+    places: Sequence[int],
+    columns: Mapping[str, Any],
+    start: datetime.datetime,
+    rotation: str | None,
+) -> Samples:
+    """Samples of checked columns."""
+    absolute = "utc" in columns
+    t_s = (
+        seconds_since(source, places, columns["utc"], start, "UTC", unit)
+        if absolute
+        else np.asarray(columns["t_s"], dtype=np.float64)
+    )
+    ends = np.array(places, np.int64)
+    if "yaw_deg" in columns:
+        body = Rotation.from_euler("ZYX", stack(columns, BODY_ANGLES[::-1]), degrees=True)
+        return Samples(source, unit, ends, t_s, "lab", "body", body, absolute)
+    if "ra_deg" in columns:
+        if len(bad := np.flatnonzero(np.abs(columns["dec_deg"]) > 90)):
+            raise InputError(
+                source,
+                "dec_deg is beyond a pole",
+                "-90 to 90",
+                where=Where(source, places[bad[0]], unit),
+            )
+        camera = cam_from_icrs(*stack(columns, CAMERA_ANGLES).T)
+        return Samples(source, unit, ends, t_s, "cam", "icrs", camera, absolute)
+    first = next(name for name in columns if name.endswith(("_qw", "q_w")))
+    prefix = first.removesuffix("w")
+    a, _, b = (rotation or first.removesuffix("_qw")).partition("_from_")
+    xyzw = stack(columns, [f"{prefix}{end}" for end in "xyzw"])
+    return from_quaternions(source, unit, ends, t_s, (a, b), xyzw, absolute)
+
+
+def stack(columns: Mapping[str, Any], names: Sequence[str]) -> Floats:
+    """(N, K) numbers of some columns."""
+    return np.column_stack([columns[name] for name in names])

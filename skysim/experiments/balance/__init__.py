@@ -1,1 +1,0 @@
-"""`skysim balance`: measure inertia and center of mass with the star tracker, and move trim masses to balance."""

@@ -1,0 +1,435 @@
+"""One flight of a vehicle to be balanced: excitation, frames, and what the lab measures of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator.calibration.mass_dynamics import (
+    BearingRecord,
+    LabConstants,
+    MassEstimate,
+    Prior,
+    inertia_six,
+)
+from skysim.core.constants import RPM_RAD_S
+from skysim.core.errors import InputError
+from skysim.core.random_streams import BALANCE, random_stream
+from skysim.core.types import Floats
+from skysim.core.units import quantities_within
+from skysim.dynamics import guidance, imu, multibody
+from skysim.dynamics.multibody import VehicleModel
+from skysim.experiments.tracker_comparison import with_config
+from skysim.scene.scene import Scene
+from skysim.scene.sections.light import StarsConfig
+from skysim.scene.sections.motion import MotionConfig
+from skysim.simulation.flight import Flight, open_flight
+
+# What is assumed of a vehicle before it is balanced, and how uncertain it is.
+
+
+PARAMETERS = 17  # beside the wheels' relative errors
+LAB_TORQUE_SHARE = (
+    0.05  # standard deviation of the constant lab torque, relative to the offset's torque
+)
+DRAG_RATE_RAD_S = 0.1  # at which the drag's standard deviation is as large as that torque
+LEAST_TORQUE_NM = 1e-7  # rms of the random torque that is always assumed
+DEFAULT_CORRELATION_S = 2.0
+MAX_TACHO_RPM = 1000.0
+
+# Unit, quantity, example, minimum and maximum.
+RANGES = {
+    "inertia_sigma": ("", "share", '"10%"', 1e-3, 0.5),
+    "offset_sigma": ("m", "length", '"300 um"', 1e-7, 0.01),
+    "wheel_sigma": ("", "share", '"0.1%"', 1e-6, 0.1),
+    "mount_sigma": ("rad", "plane angle", '"0.03 deg"', 1e-8, 0.1),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Uncertainty:
+    """Standard deviations of what is assumed, all Gaussian.
+
+    Attributes
+    ----------
+    inertia_sigma
+        Of each moment of inertia, relative to their mean; products have half of it
+    offset_sigma_m
+        Of the center of mass along each axis, assumed at the bearing's center
+    wheel_sigma
+        Of each wheel's axial inertia, relative
+    mount_sigma_rad
+        Of the tracker's axes in the body, about each axis, assumed as known
+    tacho_sigma_rad_s
+        Of every reading of a wheel's speed
+    """
+
+    inertia_sigma: float
+    offset_sigma_m: float
+    wheel_sigma: float
+    mount_sigma_rad: float
+    tacho_sigma_rad_s: float
+
+
+def parse_uncertainty(
+    inertia_sigma: str,
+    offset_sigma: str,
+    wheel_sigma: str,
+    mount_sigma: str,
+    tacho_sigma_rpm: float,
+) -> Uncertainty:
+    """Parse quantities with units. Raises InputError for an invalid or out-of-range value."""
+    texts = inertia_sigma, offset_sigma, wheel_sigma, mount_sigma
+    inertia, offset_m, wheel, mount_rad = quantities_within("balance", RANGES, texts)
+    if not 0 <= tacho_sigma_rpm <= MAX_TACHO_RPM:
+        raise InputError(
+            "balance.tacho_sigma", f"{tacho_sigma_rpm:g}", f"0 to {MAX_TACHO_RPM:g} rpm"
+        )
+    return Uncertainty(inertia, offset_m, wheel, mount_rad, tacho_sigma_rpm * RPM_RAD_S)
+
+
+@dataclass(frozen=True, slots=True)
+class Assumptions:
+    """What the lab assumes of a vehicle with its trim masses at zero.
+
+    Attributes
+    ----------
+    prior
+        Of the parameters (`estimator.calibration.mass_properties`)
+    lab
+        Gravity, the Earth's rate, wheel axes, level of the random torque
+    wheel_inertia_kg_m2
+        (n,) assumed axial inertias
+    """
+
+    prior: Prior
+    lab: LabConstants
+    wheel_inertia_kg_m2: Floats
+
+
+def draw_assumptions(scene: Scene, at_zero: VehicleModel, uncertainty: Uncertainty) -> Assumptions:
+    """Draw the errors of inertia and wheels from the scene's seed; offset, lab torque and drag are assumed as zero.
+
+    The level of air currents is assumed as in the scene, or LEAST_TORQUE_NM.
+    """
+    rng = random_stream(scene.seed, BALANCE, 0)
+    count = len(at_zero.wheels)
+    true_kg_m2 = at_zero.inertia_kg_m2
+    inertia_sigma = uncertainty.inertia_sigma * np.trace(true_kg_m2) / 3 * np.repeat([1.0, 0.5], 3)
+    moment_kg_m = at_zero.mass.mass_kg * uncertainty.offset_sigma_m
+    torque_nm = LAB_TORQUE_SHARE * moment_kg_m * at_zero.gravity_m_s2
+    drag = torque_nm / DRAG_RATE_RAD_S ** np.array([1, 2])
+    sigma = np.concatenate(
+        [
+            inertia_sigma,
+            np.full(3, moment_kg_m),
+            np.full(3, torque_nm),
+            drag,
+            np.full(3, uncertainty.mount_sigma_rad),
+            np.full(count, uncertainty.wheel_sigma),
+        ]
+    )
+    values = np.zeros(PARAMETERS + count)
+    values[:6] = inertia_six(true_kg_m2) + inertia_sigma * rng.standard_normal(6)
+    wheels = at_zero.wheels.inertia_kg_m2
+    assumed_wheels = wheels / (1 + uncertainty.wheel_sigma * rng.standard_normal(count))
+    return Assumptions(Prior(values, sigma), known_lab(scene, at_zero, uncertainty), assumed_wheels)
+
+
+def known_lab(scene: Scene, vehicle: VehicleModel, uncertainty: Uncertainty) -> LabConstants:
+    """The lab as the estimator assumes it."""
+    disturbances = scene.vehicle.disturbances
+    air = disturbances.air_current
+    earth = imu.earth_rate_lab_rad_s(scene.site)
+    return LabConstants(
+        vehicle.gravity_m_s2,
+        vehicle.wheels.axes,
+        np.maximum(air.rms_nm if air else 0.0, LEAST_TORQUE_NM) * np.ones(3),
+        air.correlation_s if air else DEFAULT_CORRELATION_S,
+        earth * disturbances.earth_rotation,
+        float(np.max(vehicle.wheels.inertia_kg_m2, initial=0.0)) * uncertainty.tacho_sigma_rad_s,
+    )
+
+
+# Which mass properties a flight has not shown well enough, what was missing, and how much more
+# would do.
+
+
+LEAST_RATE_DEG_S = 0.05  # below which there is no turn to speak of
+LEAST_INFORMATION = 1e-3  # of what is needed: below it, more of the same does not help
+AXES = "xyz"
+
+
+def check_observed(
+    estimate: MassEstimate,
+    prior: Prior,
+    records: Sequence[BearingRecord],
+    inertia_bar: float,
+    moment_bar_kg_m: Floats,
+) -> None:
+    """Raise InputError, in one line, if moments of inertia or the moment are less certain than asked.
+
+    of the components of the moment
+
+    Parameters
+    ----------
+    inertia_bar
+        Standard deviation of a moment of inertia over its value
+    moment_bar_kg_m
+        (3,) standard deviations
+    """
+    values = estimate.values
+    sigma = estimate.sigma
+    rate_deg_s = largest_rates_deg_s(records)
+    tilt_deg = largest_tilt_deg(records)
+    faults = []
+    for axis in range(3):
+        bar = inertia_bar * abs(values[axis])
+        if sigma[axis] > bar:
+            known = f"inertia about {AXES[axis]} is known to {100 * sigma[axis] / abs(values[axis]):.3g} %"
+            shown = f"after turns of {rate_deg_s[axis]:.2g} deg/s"
+            if rate_deg_s[axis] < LEAST_RATE_DEG_S:
+                shown = "after no turn about it"
+            needed = remedy("turn", sigma[axis], prior.sigma[axis], bar)
+            faults.append(f"{known}, not {100 * inertia_bar:.3g} %, {shown}: {needed}")
+    for axis in range(3):
+        if sigma[6 + axis] > moment_bar_kg_m[axis]:
+            known = f"moment along {AXES[axis]} is known to {1e6 * sigma[6 + axis]:.4g} g mm"
+            needed = remedy("tilt", sigma[6 + axis], prior.sigma[6 + axis], moment_bar_kg_m[axis])
+            faults.append(
+                f"{known}, not {1e6 * moment_bar_kg_m[axis]:.3g}, after tilts of {tilt_deg:.1f} deg: {needed}"
+            )
+    if faults:
+        raise InputError(
+            "balance", f"{faults[0]}{f' ({len(faults) - 1} more)' if len(faults) > 1 else ''}"
+        )
+
+
+def remedy(motion: str, sigma: float, prior_sigma: float, bar: float) -> str:
+    """What would do: the information is that beyond the assumed, which grows with the square of the motion and time."""
+    needed = bar**-2 - prior_sigma**-2
+    gained = max(sigma**-2 - prior_sigma**-2, 0.0)
+    if gained < LEAST_INFORMATION * needed:
+        return f"a {motion} is needed that the wheels' known momentum or a known trim weighs"
+    factor = needed / gained
+    return f"{motion} {np.sqrt(factor):.1f} times as far, or fly {factor:.1f} times as long"
+
+
+def largest_rates_deg_s(records: Sequence[BearingRecord]) -> Floats:
+    """(3,) largest rate about each body axis between two attitudes."""
+    rates = [
+        np.abs(
+            (one.lab_from_body[:-1].inv() * one.lab_from_body[1:]).as_rotvec()
+            / np.diff(one.t_s)[:, None]
+        )
+        for one in records
+    ]
+    return np.degrees(np.concatenate(rates).max(axis=0))
+
+
+def largest_tilt_deg(records: Sequence[BearingRecord]) -> float:
+    """Largest angle between body z and lab z."""
+    cosines = np.concatenate([one.lab_from_body.as_matrix()[:, 2, 2] for one in records])
+    return float(np.degrees(np.arccos(np.clip(cosines, -1, 1))).max())
+
+
+YAWS_DEG = (0.0, 120.0, 240.0)
+AXES_DEG = (0.0, 90.0, 45.0)  # of the tilting at each of these, from body x
+PERIODS = 2  # of tilting at each yaw
+# of what the wheels can do that the maneuver takes
+TORQUE_SHARE = 0.3
+MOMENTUM_SHARE = 0.3
+STOP_MARGIN_DEG = 1.0
+LEAST_ATTITUDES = 20
+MAX_HZ = 0.1
+YAW_DEG_S = 5.0
+YAW_DEG_S2 = 1.0
+SWING_S = 150.0
+ProgressCallback = Callable[[float, float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class BalanceFlight:
+    """A flight's record, the true vehicle, and how many frames had no attitude or came after a contact.
+
+    Attributes
+    ----------
+    frames, solved, after_contact
+        Numbers of frames
+    """
+
+    record: BearingRecord
+    vehicle: VehicleModel
+    frames: int
+    solved: int
+    after_contact: int
+
+
+def check_scene(scene: Scene) -> None:
+    """Refuse a scene whose vehicle cannot be weighed so."""
+    vehicle = scene.vehicle
+    if vehicle.mount != "air_bearing":
+        raise InputError(
+            "vehicle.mount", "a free vehicle has no bearing to be balanced on", "air_bearing"
+        )
+    if isinstance(scene.light, StarsConfig):
+        raise InputError(
+            "light.kind", "stars: balancing needs attitudes relative to the lab", "dome"
+        )
+    if vehicle.disturbances.cable:
+        raise InputError(
+            "vehicle.disturbances.cable", "its spring acts like a low center of mass", "no cable"
+        )
+    if vehicle.cmgs:
+        raise InputError("vehicle.cmgs", "the stored momentum must be that of wheels", "no cmgs")
+
+
+def excited_by_wheels(scene: Scene, vehicle: VehicleModel, tilt_deg: float) -> Scene:
+    """The scene with its wheels at rest at first and a maneuver that tilts the vehicle at three yaw angles.
+
+    The yaw separates an offset of the center of mass from a horizontal torque that is constant in the lab, the tilt
+    shows the offset's height, and the wheels' momentum, about all three axes, the moments of inertia.
+    """
+    wheels = scene.vehicle.wheels
+    if wheels is None:
+        raise InputError(
+            "vehicle.wheels", "none, and the inertia's scale is that of the wheels", "excite swing"
+        )
+    largest = float(np.linalg.eigvalsh(vehicle.inertia_kg_m2)[2])
+    torque = TORQUE_SHARE * wheels.torque_limit_nm / (largest * math.radians(tilt_deg))
+    limit_rad_s = wheels.speed_limit_rpm * RPM_RAD_S
+    momentum = MOMENTUM_SHARE * float(vehicle.wheels.inertia_kg_m2.min()) * limit_rad_s / largest
+    rate_hz = min(
+        MAX_HZ, math.sqrt(torque) / (2 * math.pi), momentum / math.radians(tilt_deg) / (2 * math.pi)
+    )
+    acceleration = math.degrees(TORQUE_SHARE * wheels.torque_limit_nm / largest)
+    legs = []
+    for yaw_deg, axis_deg in zip(YAWS_DEG, AXES_DEG, strict=True):
+        legs.append(
+            {
+                "kind": "slew",
+                "yaw_deg": yaw_deg,
+                "rate_deg_s": min(YAW_DEG_S, math.degrees(momentum)),
+                "acceleration_deg_s2": min(YAW_DEG_S2, acceleration),
+            }
+        )
+        direction = [math.cos(math.radians(axis_deg)), math.sin(math.radians(axis_deg)), 0.0]
+        legs.append(
+            {
+                "kind": "sine",
+                "amplitude_deg": [tilt_deg * one for one in direction],
+                "frequency_hz": rate_hz,
+                "duration": f"{PERIODS / rate_hz} s",
+            }
+        )
+    control = scene.motion.control
+    law = {"law": "pid", "actuators": "wheels"}
+    if control and control.law in ("pid", "pd"):
+        law |= {
+            key: getattr(control, key)
+            for key in ("bandwidth_rad_s", "damping", "integral_rad_s", "rate_hz")
+        }
+    motion = MotionConfig.model_validate({"control": law, "maneuver": legs[1:]})
+    return with_config(scene, "vehicle.wheels", start_rpm=()).model_copy(update={"motion": motion})
+
+
+def excited_by_swing(scene: Scene, tilt_deg: float, number: int) -> Scene:
+    """The scene with the vehicle let go at rest, tilted and at another yaw in every flight, without control."""
+    start = {
+        "roll_deg": tilt_deg,
+        "pitch_deg": tilt_deg / 2,
+        "yaw_deg": YAWS_DEG[number % len(YAWS_DEG)],
+    }
+    motion = MotionConfig.model_validate({"start": start})
+    return scene.model_copy(update={"motion": motion})
+
+
+def with_frames(scene: Scene, duration_s: float) -> Scene:
+    """The scene with frames at its rate over this time."""
+    frames = max(int((duration_s - scene.exposure.first_s) * scene.exposure.rate_hz), 2)
+    return with_config(scene, "exposure", frames=frames)
+
+
+def maneuver_s(scene: Scene) -> float:
+    """Duration of a scene's maneuver."""
+    return guidance.plan(scene.motion).duration_s
+
+
+def fly(
+    scene: Scene, assumptions: Assumptions, uncertainty: Uncertainty, watch: ProgressCallback | None
+) -> BalanceFlight:
+    """Simulate a flight, render and solve its frames, and return what was measured.
+
+    The frames from the first one near the tilt stop on are left out, because the torque of a contact is unknown.
+    """
+    with open_flight(scene) as flight:
+        rows = measured_attitudes(flight, watch)
+        log = flight.telemetry()
+    vehicle = flight.lab.vehicle
+    tilts_deg = np.array([multibody.tilt_deg(attitude) for _, attitude, *_ in rows])
+    contact = np.flatnonzero(tilts_deg > scene.vehicle.tilt_stop_deg - STOP_MARGIN_DEG)
+    kept = rows[: contact[0]] if len(contact) else rows
+    if len(kept) < LEAST_ATTITUDES:
+        cause = (
+            "before the vehicle touched its tilt stop: balance it by hand first"
+            if len(contact)
+            else "were solved"
+        )
+        raise InputError("balance", f"{len(kept)} attitudes {cause}", f"{LEAST_ATTITUDES} or more")
+    t_s, attitudes, covariances, shared = zip(*kept, strict=True)
+    speeds = log.wheel_rad_s + uncertainty.tacho_sigma_rad_s * random_stream(
+        scene.seed, BALANCE, 1
+    ).standard_normal(log.wheel_rad_s.shape)
+    lab_from_body = Rotation.concatenate(attitudes)
+    record = BearingRecord(
+        np.array(t_s),
+        lab_from_body,
+        np.array(covariances)
+        + timing_covariance(np.array(t_s), lab_from_body, scene.exposure.time_tag_jitter_s),
+        log.t_s,
+        speeds * assumptions.wheel_inertia_kg_m2,
+        *vehicle.trims.added(vehicle.trims.position_m),
+        np.array(shared),
+    )
+    return BalanceFlight(record, vehicle, scene.exposure.frames, len(rows), len(rows) - len(kept))
+
+
+def measured_attitudes(
+    flight: Flight, watch: ProgressCallback | None
+) -> list[tuple[float, Rotation, Floats, Floats]]:
+    """Of every frame that the tracker solved: time, attitude, (3, 3) covariance in body axes, and its shared part."""
+    camera = flight.lab.camera
+    body_from_cam = camera.mount.cam_from_body.inv()
+    R_body_from_cam = body_from_cam.as_matrix()
+    rows = []
+    for shot in flight.shots(cameras=[0], progress=watch):
+        assert shot.report is not None
+        attitude = shot.report.attitude
+        if attitude.cam_from_ref is not None and attitude.covariance_rad2 is not None:
+            systematic = (
+                np.zeros((3, 3)) if attitude.systematic_rad2 is None else attitude.systematic_rad2
+            )
+            covariance, shared = (
+                R_body_from_cam @ one @ R_body_from_cam.T
+                for one in (attitude.covariance_rad2, systematic)
+            )
+            rows.append(
+                (
+                    shot.frame.t_mid_s,
+                    (body_from_cam * attitude.cam_from_ref).inv(),
+                    covariance,
+                    shared,
+                )
+            )
+    return rows
+
+
+def timing_covariance(t_s: Floats, lab_from_body: Rotation, jitter_s: float) -> Floats:
+    """(N, 3, 3) s^2 w w^T of attitudes whose times have the error s, with the rate w of their differences."""
+    turned = (lab_from_body[:-1].inv() * lab_from_body[1:]).as_rotvec() / np.diff(t_s)[:, None]
+    rate = np.vstack([turned[:1], (turned[1:] + turned[:-1]) / 2, turned[-1:]])
+    return np.asarray(jitter_s**2 * rate[:, :, None] * rate[:, None, :])

@@ -1,0 +1,243 @@
+"""The procedure of `skysim balance`: fly, estimate, move the trim masses, and fly again until the torque is small.
+
+Every estimate takes all flights so far: the trim masses' places, and so their share of inertia and moment, are known.
+The masses move by -(m r) / m_i along their axes, which would bring the center of mass to the bearing's center. The
+gravity torque that remains is at most g |m r|; it is below the bar if the estimate plus two standard deviations is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimator.calibration.mass_dynamics import MOMENT, BearingRecord, MassEstimate
+from estimator.calibration.mass_properties import estimate_with_noise, filter_mass
+from estimator.core.checks import ImageError
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.core.units import quantity
+from skysim.dynamics import multibody
+from skysim.dynamics.multibody import VehicleModel
+from skysim.experiments import balance_flight
+from skysim.experiments.balance_flight import (
+    Assumptions,
+    BalanceFlight,
+    Uncertainty,
+    draw_assumptions,
+)
+from skysim.experiments.tracker_comparison import with_config
+from skysim.scene.scene import Scene
+
+CONFIDENCE = 2.0  # standard deviations that the estimated torque must stay below the bar
+MAX_SHRINK = 1e-6  # smallest eigenvalue of the trim axes' Gram matrix
+
+
+@dataclass(frozen=True, slots=True)
+class BalancePlan:
+    """How a vehicle is balanced.
+
+    Attributes
+    ----------
+    excite
+        Wheels or swing
+    tilt_deg
+        Of the excitation
+    torque_bar_nm
+        Residual gravity torque
+    max_flights
+        To try
+    moves
+        False: estimate from one flight only
+    """
+
+    excite: str
+    tilt_deg: float
+    torque_bar_nm: float
+    max_flights: int
+    moves: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Bars:
+    """What must be reached: residual torque, and standard deviations of inertia (relative) and offset.
+
+    Attributes
+    ----------
+    offset_m
+        None: half of the residual torque over the vehicle's weight
+    """
+
+    torque_nm: float
+    inertia: float
+    offset_m: float | None
+
+    def moment_kg_m(self, vehicle: VehicleModel) -> Floats:
+        """(3,) standard deviations of mass times center of mass."""
+        if self.offset_m is None:
+            return np.full(3, self.torque_nm / (CONFIDENCE * vehicle.gravity_m_s2))
+        return np.full(3, vehicle.mass.mass_kg * self.offset_m)
+
+
+def parse_bars(torque: str, inertia_percent: float, offset: str | None) -> Bars:
+    """Parse the bars. Raises InputError for what is no torque or length, or not above 0."""
+    values: list[float | None] = []
+    for name, text, unit, what in (
+        ("torque", torque, "N m", "torque"),
+        ("offset_bar", offset, "m", "length"),
+    ):
+        try:
+            value = (
+                None
+                if text is None
+                else quantity(unit, what, '"1 um"' if unit == "m" else '"5e-5 N m"')(text)
+            )
+        except InputError as error:
+            raise error.under(f"balance.{name}") from None
+        if value is not None and not value > 0:
+            raise InputError(f"balance.{name}", text, "above 0")
+        values.append(value)
+    torque_nm, offset_m = values
+    assert torque_nm is not None
+    return Bars(torque_nm, inertia_percent / 100, offset_m)
+
+
+@dataclass(frozen=True, slots=True)
+class Iteration:
+    """One flight and the estimate from all flights so far.
+
+    Attributes
+    ----------
+    estimate
+        Of the vehicle with its trim masses at zero
+    next_m
+        (n,) where the trim masses go next; where they are if they stay
+    """
+
+    flight: BalanceFlight
+    estimate: MassEstimate
+    gravity_m_s2: float
+    next_m: Floats
+
+    @property
+    def moment_kg_m(self) -> Floats:
+        """(3,) estimated mass times center of mass, as flown."""
+        return self.estimate.moment_kg_m + self.flight.record.added_moment_kg_m
+
+    @property
+    def torque_nm(self) -> float:
+        """Estimate of the largest gravity torque at any attitude, g |m r|."""
+        return float(self.gravity_m_s2 * np.linalg.norm(self.moment_kg_m))
+
+    @property
+    def torque_bound_nm(self) -> float:
+        """The same with CONFIDENCE standard deviations in the worst direction."""
+        worst = float(np.linalg.eigvalsh(self.estimate.covariance[MOMENT, MOMENT])[2])
+        return self.torque_nm + CONFIDENCE * self.gravity_m_s2 * float(np.sqrt(worst))
+
+    @property
+    def true_torque_nm(self) -> float:
+        """The simulated vehicle's."""
+        mass = self.flight.vehicle.mass
+        return float(self.gravity_m_s2 * mass.mass_kg * np.linalg.norm(mass.center_m))
+
+
+Watch = Callable[[float, float], None]
+
+
+def balance(
+    scene: Scene, plan: BalancePlan, uncertainty: Uncertainty, watch: Watch | None = None
+) -> Iterator[Iteration]:
+    """Yield each flight's iteration until the torque is below the bar, or max_flights are flown.
+
+    Raises
+    ------
+    InputError
+        For a vehicle that cannot be balanced so.
+    """
+    balance_flight.check_scene(scene)
+    vehicle = multibody.build(scene.vehicle)
+    if plan.moves and not len(vehicle.trims):
+        raise InputError(
+            "vehicle.trim",
+            "none, so nothing can be moved",
+            "joints trim_* in the vehicle's file and vehicle.trim, or an estimate only",
+        )
+    assumptions = assumed(scene, uncertainty)
+    records = list[BearingRecord]()
+    position_m = vehicle.trims.position_m
+    for number in range(plan.max_flights if plan.moves else 1):
+        flown = balance_flight.fly(
+            in_flight(scene, plan, number, position_m), assumptions, uncertainty, watch
+        )
+        records.append(flown.record)
+        estimate = estimated(records, assumptions)
+        iteration = Iteration(flown, estimate, vehicle.gravity_m_s2, position_m)
+        if plan.moves and iteration.torque_bound_nm > plan.torque_bar_nm:
+            position_m = balanced_position_m(flown.vehicle, iteration.moment_kg_m, scene)
+            iteration = Iteration(flown, estimate, vehicle.gravity_m_s2, position_m)
+        yield iteration
+        if iteration.torque_bound_nm <= plan.torque_bar_nm:
+            return
+
+
+def assumed(scene: Scene, uncertainty: Uncertainty) -> Assumptions:
+    """What is assumed of the vehicle with its trim masses at zero."""
+    at_zero = with_config(scene, "vehicle", trim=None) if scene.vehicle.trim else scene
+    return draw_assumptions(scene, multibody.build(at_zero.vehicle), uncertainty)
+
+
+def in_flight(scene: Scene, plan: BalancePlan, number: int, position_m: Floats) -> Scene:
+    """The scene of one flight: trim masses in their places, excitation, frames over all of it, noise of its own."""
+    scene = scene.model_copy(update={"seed": scene.seed + number})
+    if scene.vehicle.trim:
+        scene = with_config(scene, "vehicle.trim", position_m=tuple(map(float, position_m)))
+    if plan.excite == "swing":
+        return balance_flight.with_frames(
+            balance_flight.excited_by_swing(scene, plan.tilt_deg, number), balance_flight.SWING_S
+        )
+    scene = balance_flight.excited_by_wheels(scene, multibody.build(scene.vehicle), plan.tilt_deg)
+    return balance_flight.with_frames(scene, balance_flight.maneuver_s(scene))
+
+
+def estimated(records: list[BearingRecord], assumptions: Assumptions) -> MassEstimate:
+    """The batch estimate. Raises InputError if it does not converge."""
+    try:
+        return estimate_with_noise(records, assumptions.lab, assumptions.prior)
+    except ImageError as error:
+        raise InputError("balance", error) from error
+
+
+def filtered(record: BearingRecord, assumptions: Assumptions) -> MassEstimate:
+    """The last estimate of the filter in flight. Raises InputError for too few attitudes."""
+    try:
+        *_, last = filter_mass(record, assumptions.lab, assumptions.prior)
+    except ImageError as error:
+        raise InputError("balance", error) from error
+    return last
+
+
+def balanced_position_m(vehicle: VehicleModel, moment_kg_m: Floats, scene: Scene) -> Floats:
+    """(n,) places of the trim masses that cancel a moment (3,) as flown. Raises InputError beyond their travel."""
+    trims = vehicle.trims
+    config = scene.vehicle.trim
+    assert config is not None
+    lever = trims.axes * trims.mass_kg
+    if np.linalg.matrix_rank(lever, tol=MAX_SHRINK) < 3:
+        raise InputError(
+            "vehicle.trim",
+            f"{', '.join(trims.names)} do not move the center of mass along all axes",
+            "three slides in independent directions",
+        )
+    position_m = trims.position_m - np.linalg.pinv(lever) @ moment_kg_m
+    worst = int(np.argmax(np.abs(position_m)))
+    if abs(position_m[worst]) > config.travel_m:
+        excess_kg_m = trims.mass_kg[worst] * (abs(position_m[worst]) - config.travel_m)
+        raise InputError(
+            "balance",
+            f"{trims.names[worst]} would have to go to {1e3 * position_m[worst]:.1f} mm",
+            f"vehicle.trim.travel {1e3 * config.travel_m:g} mm: first move ballast along its axis, by"
+            f" {1e6 * excess_kg_m:.3g} g mm",
+        )
+    return np.asarray(position_m)

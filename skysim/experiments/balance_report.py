@@ -1,0 +1,235 @@
+"""Statistics, picture and report of a balance: the estimates by flight, and beside them the simulated vehicle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.calibration.mass_dynamics import INERTIA, MOMENT, MassEstimate, inertia_six
+from skysim.core import files
+from skysim.core.types import Floats
+from skysim.experiments.balance_flight import Assumptions, BalanceFlight, largest_tilt_deg
+from skysim.experiments.balance_procedure import BalancePlan, Iteration, filtered
+from skysim.results.report import Report
+from skysim.results.report_blocks import (
+    Block,
+    Cell,
+    Column,
+    Facts,
+    Figure,
+    Section,
+    Table,
+    Text,
+    Verdict,
+)
+
+INERTIA_NAMES = ("Jxx", "Jyy", "Jzz", "Jxy", "Jxz", "Jyz")
+MOMENT_NAMES = ("x", "y", "z")
+
+
+def statistics(scene: str, plan: BalancePlan, iterations: Sequence[Iteration]) -> dict[str, Any]:
+    """All numbers of a balance, SI except where a unit is in the name."""
+    last = iterations[-1]
+    return {
+        "scene": scene,
+        "excite": plan.excite,
+        "torque_bar_nm": plan.torque_bar_nm,
+        "balanced": last.torque_bound_nm <= plan.torque_bar_nm,
+        "flights": [flight_row(n, one) for n, one in enumerate(iterations, 1)],
+        "estimates": estimate_rows(last.flight, last.estimate),
+        "misfit": last.estimate.misfit,
+        "nees": nees(last.flight, last.estimate),
+    }
+
+
+def flight_row(number: int, one: Iteration) -> dict[str, Any]:
+    """Numbers of one flight; those that begin with true are of the simulated vehicle."""
+    trims = one.flight.vehicle.trims
+    mass = one.flight.vehicle.mass
+    per_um = 1e6 / mass.mass_kg
+    return {
+        "flight": number,
+        "duration_s": float(one.flight.record.t_s[-1]),
+        "frames": one.flight.frames,
+        "solved": one.flight.solved,
+        "after_contact": one.flight.after_contact,
+        "tilt_deg": largest_tilt_deg([one.flight.record]),
+        "trim_mm": (1e3 * trims.position_m).tolist(),
+        "next_trim_mm": (1e3 * one.next_m).tolist(),
+        "offset_um": (per_um * one.moment_kg_m).tolist(),
+        "offset_sigma_um": (per_um * one.estimate.sigma[MOMENT]).tolist(),
+        "true_offset_um": (1e6 * mass.center_m).tolist(),
+        "torque_nm": one.torque_nm,
+        "torque_bound_nm": one.torque_bound_nm,
+        "true_torque_nm": one.true_torque_nm,
+        "misfit": one.estimate.misfit,
+    }
+
+
+def true_values(flight: BalanceFlight) -> Floats:
+    """(9,) inertia and moment of the simulated vehicle with its trim masses at zero."""
+    vehicle = flight.vehicle
+    record = flight.record
+    inertia = vehicle.inertia_kg_m2 - record.added_inertia_kg_m2
+    moment = vehicle.mass.mass_kg * vehicle.mass.center_m - record.added_moment_kg_m
+    return np.concatenate([inertia_six(inertia), moment])
+
+
+def estimate_rows(flight: BalanceFlight, estimate: MassEstimate) -> list[dict[str, Any]]:
+    """One row per mass property, of the vehicle with its trim masses at zero: offsets in micrometers."""
+    scale = np.repeat([1.0, 1e6 / flight.vehicle.mass.mass_kg], [6, 3])
+    names = (*INERTIA_NAMES, *(f"offset {axis} um" for axis in MOMENT_NAMES))
+    columns = (scale * estimate.values[:9], scale * estimate.sigma[:9], scale * true_values(flight))
+    return [
+        {"what": name, "estimate": value, "sigma": sigma, "truth": truth}
+        for name, value, sigma, truth in zip(
+            names, *(column.tolist() for column in columns), strict=True
+        )
+    ]
+
+
+def nees(flight: BalanceFlight, estimate: MassEstimate) -> float:
+    """Squared error of the nine mass properties in units of their covariance: chi-square of 9 if that is honest."""
+    nine = slice(INERTIA.start, MOMENT.stop)
+    error = estimate.values[nine] - true_values(flight)
+    return float(error @ np.linalg.solve(estimate.covariance[nine, nine], error))
+
+
+def balance_figure(iterations: Sequence[Iteration], torque_bar_nm: float) -> NDArray[np.uint8]:
+    """BGR image: gravity torque and offset of the center of mass flight by flight, and the last flight's attitude."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=(15, 4.5), layout="constrained")
+    canvas = FigureCanvasAgg(fig)
+    torque, offset, motion = fig.subplots(1, 3)
+    numbers = np.arange(1, len(iterations) + 1)
+    torque.semilogy(numbers, [one.torque_nm for one in iterations], "o-", label="estimate")
+    torque.semilogy(numbers, [one.torque_bound_nm for one in iterations], "v--", label="bound")
+    torque.semilogy(
+        numbers, [one.true_torque_nm for one in iterations], "kx", label="simulated vehicle"
+    )
+    torque.axhline(torque_bar_nm, color="0.5", linestyle=":")
+    torque.set(xlabel="flight", ylabel="largest gravity torque [N m]", xticks=numbers)
+    rows = [flight_row(n, one) for n, one in enumerate(iterations, 1)]
+    for axis, name in enumerate(MOMENT_NAMES):
+        values, sigma = (
+            [row[key][axis] for row in rows] for key in ("offset_um", "offset_sigma_um")
+        )
+        offset.errorbar(numbers, values, sigma, marker="o", capsize=3, label=name)
+    offset.set(
+        xlabel="flight",
+        ylabel="center of mass from the bearing's center [um]",
+        xticks=numbers,
+        yscale="symlog",
+    )
+    record = iterations[-1].flight.record
+    angles_deg = record.lab_from_body.as_euler("ZYX", degrees=True)[:, ::-1]
+    for name, angle in zip(("roll", "pitch", "yaw"), angles_deg.T, strict=True):
+        motion.plot(record.t_s, angle, ".-", label=name)
+    motion.set(xlabel="t [s]", ylabel="measured attitude [deg]", title=f"flight {len(iterations)}")
+    for axes in (torque, offset, motion):
+        axes.legend(fontsize="small")
+    canvas.draw()
+    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[:, :, 2::-1])
+
+
+def filter_rows(one: Iteration, assumptions: Assumptions) -> list[dict[str, Any]]:
+    """As `estimate_rows`, of the filter in flight over an iteration's flight alone."""
+    return estimate_rows(one.flight, filtered(one.flight.record, assumptions))
+
+
+def balance_report(statistics: dict[str, Any], picture: bytes, command: str) -> Report:
+    """The report of a balance. picture : see `balance_figure`, PNG"""
+    blocks = [
+        verdict(statistics),
+        Facts(
+            [("every number of this page", [Cell("balance.json", link="balance.json")])],
+            on_terminal=False,
+        ),
+        Section("Balance", [Figure(picture, CAPTION)]),
+        Section("Flights", [Text(FLIGHTS), flight_table(statistics["flights"])], on_terminal=False),
+        Section(
+            "With the trim masses at zero, from all flights", mass_blocks(statistics["estimates"])
+        ),
+        Section(
+            "By the filter in flight, from the last flight",
+            mass_blocks(statistics.get("in_flight", [])),
+        ),
+    ]
+    return Report(f"Balance of {statistics['scene']}", blocks, command)
+
+
+CAPTION = "Gravity torque and offset flight by flight, and the attitude in the last flight."
+FLIGHTS = (
+    "The center of mass is measured from the bearing's center, with the trim masses where they were in the flight; ± is"
+    " 1σ."
+)
+
+
+def verdict(statistics: dict[str, Any]) -> Verdict:
+    """Whether the vehicle is balanced, and how well that is known."""
+    flights = statistics["flights"]
+    last = flights[-1]
+    frames = sum(one["frames"] for one in flights)
+    return Verdict(
+        f"{'balanced' if statistics['balanced'] else 'not balanced'}: gravity torque at most (estimate and 2σ)"
+        f" {last['torque_bound_nm']:.2g} N m, bar {statistics['torque_bar_nm']:.2g} N m; the simulated vehicle's is"
+        f" {last['true_torque_nm']:.2g} N m; {len(flights)} flights, {frames} frames; misfit {statistics['misfit']:.2f}"
+        " (rms residual over its standard error)",
+        "good" if statistics["balanced"] else "bad",
+    )
+
+
+def flight_table(flights: Sequence[dict[str, Any]]) -> Table:
+    """One row per flight."""
+    columns = [Column("flight"), Column("frames solved"), Column("greatest tilt", "°", ".1f")]
+    columns += [
+        Column("trim masses", "mm"),
+        Column("center of mass", "µm"),
+        Column("of the simulated vehicle", "µm"),
+    ]
+    columns += [Column("gravity torque", "N m", ".2g"), Column("at most", "N m", ".2g")]
+    rows = []
+    for one in flights:
+        trims = ", ".join(f"{place:.3f}" for place in one["trim_mm"])
+        truth = ", ".join(f"{value:.3g}" for value in one["true_offset_um"])
+        flown = [one["flight"], f"{one['solved']} / {one['frames']}", one["tilt_deg"]]
+        rows.append(
+            [*flown, trims, offset_text(one), truth, one["torque_nm"], one["torque_bound_nm"]]
+        )
+    return Table(columns, rows)
+
+
+def offset_text(flight: dict[str, Any]) -> str:
+    """The center of mass with its standard deviations."""
+    found = zip(flight["offset_um"], flight["offset_sigma_um"], strict=True)
+    return ", ".join(f"{value:.3g} ± {sigma:.2g}" for value, sigma in found)
+
+
+def mass_blocks(rows: Sequence[dict[str, Any]]) -> list[Block]:
+    """Estimates of the mass properties beside the simulated vehicle's."""
+    heads = ("estimate", "1σ", "simulated vehicle")
+    columns = [Column("what", kind="text"), *(Column(head, format=".5g") for head in heads)]
+    values = [[row[key] for key in ("what", "estimate", "sigma", "truth")] for row in rows]
+    for row in values:
+        row.append((row[1] - row[3]) / row[2])
+    table = Table([*columns, Column("error over 1σ", format=".1f")], values)
+    return [table, Text("J in kg m², of the vehicle with its trim masses at zero.")] if rows else []
+
+
+def write_all(
+    folder: Path, statistics: dict[str, Any], iterations: Sequence[Iteration], command: str
+) -> Report:
+    """Write picture, JSON and report; their paths are added to the statistics. Returns the report."""
+    picture = files.make_folder(folder) / "balance.png"
+    files.write_image(picture, balance_figure(iterations, statistics["torque_bar_nm"]))
+    statistics |= {"picture": str(picture), "report": str(folder / "report.html")}
+    files.write_text(folder / "balance.json", files.to_json(statistics))
+    report = balance_report(statistics, picture.read_bytes(), command)
+    report.save(folder / "report.html")
+    return report

@@ -1,0 +1,448 @@
+"""From folders of frames to a camera: read, check, estimate, write."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skysim.core import files
+from skysim.core.errors import InputError, printable
+from skysim.experiments.characterize import frame_files, night_sky, sensor_fit
+from skysim.experiments.characterize.fixed_pattern import DarkCurrent
+from skysim.experiments.characterize.frame_files import read_stack
+from skysim.experiments.characterize.night_sky import LENS, ImageSize, Night, lens_estimates
+from skysim.experiments.characterize.photon_transfer import (
+    BLACK,
+    CURVATURE,
+    FIRST_DARK,
+    GAIN,
+    LIGHT,
+    Estimate,
+    model,
+)
+from skysim.experiments.characterize.sensor_fit import MeasuredSensor
+from skysim.results.plots import INK, png
+from skysim.results.report import Report
+from skysim.results.report_blocks import Column, Facts, Figure, Items, Section, Table, Verdict
+from skysim.scene import loader
+from skysim.scene.camera_sheet import PLACEHOLDER_LENS, SheetLine, yaml_lines
+from skysim.scene.sections.camera import CameraConfig, GaussianPsfConfig
+
+# The report of a characterized camera: its values, and figures of what they were fitted to.
+
+
+def characterize_report(
+    statistics: dict[str, Any], config: CameraConfig, found: MeasuredSensor, night: Night | None
+) -> Report:
+    """The report of a characterized camera. statistics : as in `characterize.json`"""
+    figures = [
+        Figure(png(lambda fig: draw_transfer(fig.subplots(1, 2), found), SIZE_IN), TRANSFER_TEXT)
+    ]
+    if dark := found.dark:
+        figures.append(Figure(png(lambda fig: draw_dark(fig.subplots(), dark), SIZE_IN), DARK_TEXT))
+    if night:
+        figures.append(
+            Figure(png(lambda fig: draw_size(fig.subplots(), config, night), SIZE_IN), SIZE_TEXT)
+        )
+    values = value_table(statistics)
+    blocks = [
+        verdict(statistics, len(values.rows)),
+        Items([f"unknown: {remark}" for remark in statistics["remarks"]], tone="bad"),
+        Section("Figures", figures),
+        Section("Values", [values, facts(statistics)]),
+    ]
+    return Report(f"{statistics['camera']}, measured", blocks)
+
+
+def verdict(statistics: dict[str, Any], values: int) -> Verdict:
+    """How many values are known, and how well the law of photon transfer holds."""
+    unknown = len(statistics["remarks"])
+    misfit = statistics["misfit"]
+    text = (
+        f"{values} values measured, {unknown} unknown; misfit of the photon transfer {misfit:.2f}"
+    )
+    return Verdict(f"{text} (1 if the law holds).", "warning" if unknown else "good")
+
+
+def facts(statistics: dict[str, Any]) -> Facts:
+    """The preset, and the conditions of the values."""
+    celsius = statistics["temperature_c"]
+    night = statistics["night"]
+    rows = [
+        ("for camera.preset", [statistics["preset"]]),
+        ("dark current at", ["an unknown temperature" if celsius is None else f"{celsius:g} °C"]),
+        (
+            "linearity error",
+            [f"{100 * statistics['linearity_error']:.2g} %, of 5 to 95 % of the saturation"],
+        ),
+        ("flicker of the lamp", [f"{100 * statistics['flicker']:.2g} %"]),
+    ]
+    if night:
+        residuals = "" if night["rms_px"] is None else f", residuals {night['rms_px']:.2g} px rms"
+        stars = f"{night['stars']} star images in {night['frames']} frames"
+        rows.append(
+            ("night", [f"{stars}, of which {night['identified']} were identified{residuals}"])
+        )
+    return Facts(rows)
+
+
+def value_table(statistics: dict[str, Any]) -> Table:
+    """The values with their intervals, and those of the camera's file."""
+    columns = [Column("what", kind="text"), Column("measured", format=".5g"), Column("95 %")]
+    columns += [Column("file", format=".5g"), Column("unit", kind="text")]
+    values = statistics["values"] + (statistics["night"]["values"] if statistics["night"] else [])
+    interval = "{low:.5g} to {high:.5g}"
+    rows = [
+        [row["what"], row["value"], interval.format(**row), row["file"], row["unit"]]
+        for row in values
+    ]
+    return Table(columns, rows)
+
+
+SIZE_IN = (10, 4)  # of a figure
+TRANSFER_TEXT = (
+    "Photon transfer: temporal variance against the mean signal, of darks and flats. Line: the fit; open: beyond it."
+    " Right: the signal over that of a linear sensor with the same lamp, less 1; line: the fitted amplifier."
+)
+DARK_TEXT = (
+    "Dark current of the pixels at the darks' temperature: bars measured, line expected "
+    "(lognormal, hot pixels, noise)."
+)
+SIZE_TEXT = (
+    "Size of the star images over the field, line: the fit; the principal point is at 0, "
+    "the farthest corner at 1."
+)
+
+
+def draw_transfer(axes: Any, found: MeasuredSensor) -> None:
+    """Variance against mean, and the linearity."""
+    transfer = found.transfer
+    (curve, line) = axes
+    black = transfer.values[BLACK]
+    curvature = transfer.values[CURVATURE]
+    fitted = transfer.points
+    beyond = [one for one in found.flats if one not in fitted]
+    groups = (
+        ("darks", [one for one in fitted if not one.lit], {"color": INK[1]}),
+        ("flats", [one for one in fitted if one.lit], {"color": INK[0]}),
+        ("flats beyond the fit", beyond, {"facecolor": "none", "edgecolor": INK[0]}),
+    )
+    for name, points, colors in groups:
+        mean, variance = (
+            np.array([getattr(one.moments, key) for one in points])
+            for key in ("mean_dn", "variance_dn2")
+        )
+        curve.scatter(
+            np.maximum(mean - black, 0.1), np.maximum(variance, 0.05), 18, label=name, **colors
+        )
+    expected_mean, expected_variance = model(fitted, transfer.values)
+    order = np.argsort(expected_mean)
+    curve.plot(
+        np.maximum(expected_mean - black, 0.1)[order],
+        expected_variance[order],
+        color="0.4",
+        zorder=0,
+    )
+    curve.set(xscale="log", yscale="log", xlabel="signal [DN]", ylabel="temporal variance [DN²]")
+    curve.legend()
+    plain_labels(curve.xaxis, curve.yaxis)
+    flats = [one for one in fitted if one.lit] + beyond
+    time_s = np.array([one.exposure_s for one in flats])
+    signal = np.array([one.moments.mean_dn for one in flats]) - black
+    linear = (transfer.values[LIGHT] + transfer.values[FIRST_DARK + flats[0].dark]) * time_s
+    inside = signal < 0.98 * signal.max()
+    line.scatter(linear[inside], 100 * (signal / linear - 1)[inside], 18, color=INK[0])
+    x = np.linspace(0, linear[inside].max(), 50)
+    line.plot(x, -100 * curvature * x, color="0.4", zorder=0)
+    line.set(
+        xlabel="signal of a linear sensor [DN]",
+        ylabel="deviation [%]",
+        title=f"{1 / transfer.values[GAIN]:.4g} e-/DN",
+    )
+
+
+def plain_labels(*axis: Any) -> None:
+    """Label powers of ten as numbers: the style has no mathematical text."""
+    from matplotlib.ticker import NullFormatter
+
+    for one in axis:
+        one.set_major_formatter("{x:g}")
+        one.set_minor_formatter(NullFormatter())
+
+
+def draw_dark(axes: Any, dark: DarkCurrent) -> None:
+    """Density of the pixels' rates, hot ones too, measured and expected."""
+    width = np.diff(dark.edges)
+    measured = dark.counts[1:-1] / width
+    expected = dark.expected[1:-1] / width
+    axes.stairs(measured, dark.edges, color=INK[0], fill=True, alpha=0.4, label="measured")
+    axes.plot((dark.edges[1:] + dark.edges[:-1]) / 2, expected, color=INK[1], label="expected")
+    axes.set_xscale("symlog", linthresh=dark.mean.value)
+    axes.set(yscale="log", xlabel="dark current [DN/s]", ylabel="pixels per DN/s")
+    axes.legend()
+    plain_labels(axes.xaxis, axes.yaxis)
+
+
+def draw_size(axes: Any, config: CameraConfig, night: Night) -> None:
+    """Standard deviation of the images against the distance from the principal point."""
+    size: ImageSize = night.size
+    center_px = night.lens.camera.center_px if night.lens else config.center_px
+    rho = np.linalg.norm(size.used.xy_px - np.array(center_px), axis=1) / config.corner_px
+    sigma_px = np.sqrt(size.used.variance_px2)
+    axes.errorbar(
+        rho,
+        sigma_px,
+        size.used.variance_sigma_px2 / (2 * sigma_px),
+        fmt=".",
+        color=INK[0],
+        elinewidth=0.6,
+    )
+    x = np.linspace(0, 1, 60)
+    axes.plot(x, np.hypot(size.sigma_px.value, size.corner_sigma_px.value * x), color=INK[1])
+    axes.set(
+        xlabel="distance from the principal point, of the corner's",
+        ylabel="standard deviation [px]",
+    )
+
+
+# A camera preset with the measured values in place of those of the camera that the frames were
+# taken with.
+
+
+DIGITS = 6
+AT_LEAST_ZERO = ("nonlinearity", "hot_pixels")  # an estimate below 0 is 0
+
+
+def preset_text(
+    camera: Mapping[str, Any],
+    config: CameraConfig,
+    sensor: MeasuredSensor,
+    night: Night | None,
+    name: str,
+) -> str:
+    """The file: YAML with the source of each value. camera : raw section of the camera that was measured"""
+    head = [
+        f"# {printable(name)}, measured. Written by `skysim characterize`.",
+        "# [M] measured, with its 95 % interval. Other values are those of the camera's file.",
+    ]
+    found = measured(sensor) | (measured_lens(config, night) if night else {})
+    return "\n".join([*head, *yaml_lines(list(lines(camera, found)))]) + "\n"
+
+
+def measured(sensor: MeasuredSensor) -> dict[str, tuple[Any, str]]:
+    """Value and comment by key of the section camera."""
+    found: dict[str, tuple[Any, str]] = {}
+    for key, one in sensor.estimates.items():
+        value = max(one.value, 0.0) if key in AT_LEAST_ZERO or one.value < 0 else one.value
+        found[f"detector.{key}"] = (rounded(value), comment(one))
+    if sensor.dark_temperature_c is not None:
+        found["detector.dark_temperature_c"] = (
+            rounded(sensor.dark_temperature_c),
+            "[M] of the darks",
+        )
+    else:
+        found["detector.temperature_c"] = (
+            None,
+            "the darks' temperature is unknown: dark_e_s is at it",
+        )
+    found["detector.reset_noise_e"] = (0.0, "[M] contained in read_noise_e")
+    return found
+
+
+def measured_lens(config: CameraConfig, night: Night) -> dict[str, tuple[Any, str]]:
+    """Value and comment by key, of the lens."""
+    size = night.size
+    found: dict[str, tuple[Any, str]] = {
+        "psf.kind": ("gaussian", "[M]"),
+        "psf.sigma_px": (rounded(size.sigma_px.value), comment(size.sigma_px)),
+        "psf.corner_sigma_px": (rounded(size.corner_sigma_px.value), comment(size.corner_sigma_px)),
+    }
+    if night.lens is None:
+        return found
+    lens = lens_estimates(config, night.lens)
+    focal = lens["focal_length_mm"]
+    x, y, *distortion = (lens[name] for name in LENS[1:])
+    points = f"{comment(x)}, {y.low:.5g} to {y.high:.5g}"
+    return found | {
+        "focal_length": (f"{focal.value:.7g} mm", f"[M] {focal.low:.7g} to {focal.high:.7g} mm"),
+        "principal_point_px": ([rounded(x.value), rounded(y.value)], points),
+        "distortion": ([rounded(one.value) for one in distortion], f"k1 {comment(distortion[0])}"),
+    }
+
+
+def comment(one: Estimate) -> str:
+    return f"[M] {one.low:.5g} to {one.high:.5g}"
+
+
+def rounded(value: float) -> float:
+    """With DIGITS significant digits."""
+    return float(f"{value:.{DIGITS}g}")
+
+
+def lines(camera: Mapping[str, Any], found: Mapping[str, tuple[Any, str]]) -> Iterator[SheetLine]:
+    """The lines of the section with the values that were found in place of the camera's own, sections last."""
+    tree = copy.deepcopy(dict(camera))
+    if "psf.kind" in found:
+        tree["psf"] = {}  # keys of another kind
+    for key, (value, _) in found.items():
+        section, _, last = key.rpartition(".")
+        (tree.setdefault(section, {}) if section else tree)[last] = value
+    yield from section_lines(tree, "", {key: source for key, (_, source) in found.items()})
+
+
+def section_lines(
+    section: Mapping[str, Any], prefix: str, sources: Mapping[str, str]
+) -> Iterator[SheetLine]:
+    """The lines of a section and, after its values, of the sections in it."""
+    for key, value in section.items():
+        if not isinstance(value, dict):
+            yield SheetLine(prefix + key, value, sources.get(prefix + key, "of the camera's file"))
+    for key, value in section.items():
+        if isinstance(value, dict):
+            yield from section_lines(value, f"{prefix}{key}.", sources)
+
+
+def write(path: Path, contents: str) -> None:
+    """Write the file and read it as a scene would. Raises InputError if it is no camera."""
+    from skysim.core.files import make_folder, write_text
+    from skysim.scene.camera_sheet import PLACEHOLDER_LENS
+    from skysim.scene.loader import load_camera
+
+    make_folder(path.parent)
+    write_text(path, contents)
+    load_camera(path, PLACEHOLDER_LENS)
+
+
+UNITS = {
+    "gain_e_dn": "e-/DN",
+    "offset_dn": "DN",
+    "read_noise_e": "e-",
+    "full_well_e": "e-",
+    "dark_e_s": "e-/s",
+    "dark_doubling_c": "K",
+    "hot_e_s": "e-/s",
+    "column_offset_e": "e-",
+    "sigma_px": "px",
+    "corner_sigma_px": "px",
+    "focal_length_mm": "mm",
+    "center_x_px": "px",
+    "center_y_px": "px",
+}
+
+
+def read_camera(name: str) -> tuple[CameraConfig, dict[str, Any]]:
+    """The camera of a preset, a camera file or a scene, and its raw section. Raises InputError."""
+    path = loader.preset_path(name) if name in loader.list_cameras() else loader.find(name)
+    camera = loader.load_camera(path, PLACEHOLDER_LENS)
+    tree, files = loader.read(path)
+    return camera, loader.camera_tree(path, tree, files, {})["camera"]
+
+
+def measure_sensor(camera: CameraConfig, darks_folder: Path, flats_folder: Path) -> MeasuredSensor:
+    """The sensor from folders of darks and flats. Raises InputError for frames that do not tell."""
+    shape = (camera.height_px, camera.width_px)
+    bits = camera.detector.bits
+    darks = read_stack(darks_folder, shape, bits)
+    frame_files.check_darks(darks)
+    flats = read_stack(flats_folder, shape, bits)
+    usable = sensor_fit.usable_pixels(darks.levels)
+    shortest = min(darks.levels, key=lambda one: one.exposure_s)
+    frame_files.check_flats(flats, usable, float(np.median(shortest.mean_dn)))
+    return sensor_fit.characterize(darks.levels, flats.levels)
+
+
+def measure_night(
+    config: CameraConfig, raw: dict[str, Any], folder: Path, found: MeasuredSensor
+) -> Night:
+    """The lens from a folder of night frames. Raises InputError for a camera without a lens, and as `lens` does."""
+    if "focal_length" not in raw:
+        raise InputError(
+            "characterize.night",
+            "the camera's file has no lens",
+            "a camera file with focal_length, to 5 %, and f_number",
+        )
+    return night_sky.measure_night(config, folder, found.transfer, found.saturation_dn)
+
+
+def write_results(
+    folder: Path,
+    config: CameraConfig,
+    raw: dict[str, Any],
+    found: MeasuredSensor,
+    night: Night | None,
+    name: str,
+) -> tuple[dict[str, Any], Report]:
+    """Write preset and report; returns the statistics, which `characterize.json` holds too, and the report."""
+    path = folder / "camera.yaml"
+    write(path, preset_text(raw, config, found, night, name))
+    statistics = {
+        "camera": name,
+        "preset": str(path),
+        "report": str(folder / "report.html"),
+        "temperature_c": found.dark_temperature_c,
+        "values": [row(key, one, raw["detector"].get(key)) for key, one in found.estimates.items()],
+        "linearity_error": found.linearity_error,
+        "flicker": found.transfer.flicker,
+        "misfit": found.transfer.misfit,
+        "night": night_statistics(config, night) if night else None,
+        "remarks": found.remarks + (night.remarks if night else []),
+    }
+    files.write_text(folder / "characterize.json", files.to_json(statistics))
+    report = characterize_report(statistics, config, found, night)
+    report.save(folder / "report.html")
+    return statistics, report
+
+
+def night_statistics(config: CameraConfig, night: Night) -> dict[str, Any]:
+    """Rows of the lens, and the frames and stars from which they are."""
+    psf = config.psf if isinstance(config.psf, GaussianPsfConfig) else None
+    rows = [
+        row("sigma_px", night.size.sigma_px, psf and psf.sigma_px),
+        row("corner_sigma_px", night.size.corner_sigma_px, psf and psf.corner_sigma_px),
+    ]
+    if night.lens:
+        before = [1e3 * config.focal_length_m, *config.center_px, *config.distortion]
+        found = night_sky.lens_estimates(config, night.lens)
+        rows += [
+            row(name, one, value) for (name, one), value in zip(found.items(), before, strict=True)
+        ]
+    return {
+        "values": rows,
+        "frames": night.frames,
+        "identified": night.identified,
+        "stars": len(night.size.used.chi2),
+        "rms_px": night.lens.report.rms_px if night.lens else None,
+    }
+
+
+def row(key: str, one: Estimate, before: object) -> dict[str, Any]:
+    """A row of the table: name, value, interval, unit, and the value of the camera's file."""
+    return {
+        "what": key,
+        "value": one.value,
+        "low": one.low,
+        "high": one.high,
+        "unit": UNITS.get(key, ""),
+        "file": before if isinstance(before, int | float) else None,
+    }
+
+
+def check_folders(darks: Path | None, flats: Path | None) -> tuple[Path, Path]:
+    """Both folders. Raises InputError if one is missing."""
+    for name, folder, why in (
+        ("darks", darks, "dark current and black level"),
+        ("flats", flats, "gain and full well"),
+    ):
+        if folder is None:
+            raise InputError(
+                f"characterize.{name}",
+                f"missing: without them {why} are unknown",
+                f"a folder of {name}",
+            )
+    assert darks is not None
+    assert flats is not None
+    return darks, flats

@@ -1,0 +1,330 @@
+"""Dark current, its scatter over the pixels, and hot pixels, from the rate of every pixel.
+
+A pixel's dark current is lognormal over the chip, with the mean m and the relative standard deviation DSNU; hot pixels,
+the fraction h, have an exponential of mean H beside it. A rate measured from darks of several exposures has Gaussian
+noise of a variance v + w u at the rate u: of reading, and of counting. So the probability that it is below d is
+
+    P(d) = (1 - h) E[Phi(z)] + h E[Phi(z) - exp(s^2 / 2 H^2 - (d - u) / H) Phi(z - s / H)],  z = (d - u) / s,
+
+with s^2 = v + w u and the expectation over the lognormal u: the second term is an exponentially modified Gaussian. The
+counts of pixels in bins are multinomial; Fisher's scoring maximizes their likelihood and gives the covariance, which
+has the scatter of a chip's pixels in it (Rao 1973, Linear Statistical Inference, 5g). Frames have too few hot
+pixels for H if they have fewer than LEAST_HOT: h is then their count, with the interval of Clopper & Pearson (1934).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special, stats
+
+from skysim.core.constants import MAD_PER_SIGMA
+from skysim.core.types import Floats
+from skysim.experiments.characterize.photon_transfer import BLACK, Estimate, Level, Mask, Transfer
+
+LEAST_HOT = 10  # hot pixels for a fit of their scatter
+# quantiles; the tail is the upper hundredth
+CORE_BINS = 160
+TAIL_BINS = 60
+TAIL = 0.01
+# of the lognormal's normal variable
+NODES = 301
+SPAN = 6.0
+# scoring steps, and a step in standard deviations
+STEPS = 60
+CONVERGED = 1e-3
+DIFFERENCE = 1e-4
+# sigmas; standard error of a variance from medians over that from squares
+RESOLVED = 5.0
+MEDIAN_COST = 1.65
+HOT_SIGMAS = 8.0  # above the core's width: where hot pixels begin, for the start of the fit
+
+
+class RateNoise(NamedTuple):
+    """Variance of a measured rate in (DN/s)^2: `reading`, and `counting` more for each DN/s of the rate."""
+
+    reading: float
+    counting: float
+
+
+class DarkCurrent(NamedTuple):
+    """Mean and DSNU over the pixels, fraction of hot pixels, and their mean excess if they are enough. Rates in DN/s.
+
+    Attributes
+    ----------
+    edges, counts, expected
+        Histogram of the rates, and what the law expects
+    """
+
+    mean: Estimate
+    dsnu: Estimate
+    hot_pixels: Estimate
+    hot: Estimate | None
+    edges: Floats
+    counts: Floats
+    expected: Floats
+
+
+def own_variance(rates: Floats, noise: RateNoise) -> tuple[float, float]:
+    """Variance of the rates over the pixels beyond their noise, and its standard error, from medians."""
+    median, spread = median_and_spread(rates)
+    expected = noise.reading + noise.counting * max(median, 0.0)
+    return spread**2 - expected, MEDIAN_COST * expected * math.sqrt(2 / rates.size)
+
+
+def is_resolved(rates: Floats, noise: RateNoise) -> bool:
+    """Whether there is dark current, and it scatters over the pixels by more than the noise, by RESOLVED sigmas."""
+    variance, sigma = own_variance(rates, noise)
+    return float(np.median(rates)) > 0 and variance > RESOLVED * sigma
+
+
+def fit(rates: Floats, noise: RateNoise, greatest: float) -> DarkCurrent:
+    """Fit the rates of all pixels, in DN/s. greatest : rate beyond which a pixel saturates in the longest dark"""
+    start, hot = start_values(rates, noise)
+    enough = hot >= LEAST_HOT
+    kept = rates if enough else np.sort(rates)[: rates.size - hot]
+    edges = bin_edges(kept, greatest)
+    counts = np.bincount(np.searchsorted(edges, kept), minlength=len(edges) + 1).astype(np.float64)
+    theta, covariance = maximize(start if enough else start[:2], edges, counts, noise)
+    sigma = np.sqrt(np.diag(covariance))
+    values = [
+        Estimate.lognormal(math.exp(one), math.exp(one) * error)
+        for one, error in zip(theta, sigma, strict=True)
+    ]
+    if enough:
+        fraction = Estimate.logistic(theta[2], sigma[2])
+    else:
+        low, high = stats.beta.ppf(
+            [0.025, 0.975], [max(hot, 1e-9), hot + 1], [rates.size - hot + 1, rates.size - hot]
+        )
+        fraction = Estimate(
+            hot / rates.size, math.sqrt(max(hot, 1)) / rates.size, float(low), float(high)
+        )
+    expected = counts.sum() * probabilities(theta, edges, noise)
+    return DarkCurrent(
+        values[0], values[1], fraction, values[3] if enough else None, edges, counts, expected
+    )
+
+
+def median_and_spread(values: Floats) -> tuple[float, float]:
+    """Median and robust standard deviation."""
+    median = float(np.median(values))
+    return median, float(np.median(np.abs(values - median))) / MAD_PER_SIGMA
+
+
+def bin_edges(rates: Floats, greatest: float) -> Floats:
+    """Edges at quantiles, denser in the tail, each midway between two measured values, which may be discrete."""
+    pixels = rates.size
+    tail = TAIL * np.geomspace(1.0, min(5 / (TAIL * pixels), 1.0), TAIL_BINS)
+    at = np.concatenate([np.linspace(5 / pixels, 1 - TAIL, CORE_BINS), 1 - tail[1:]])
+    ordered = np.sort(rates)
+    index = np.unique(np.clip((at * pixels).astype(int), 1, pixels - 1))
+    above = np.searchsorted(ordered, ordered[index], side="left")
+    above = above[above > 0]
+    edges = np.unique((ordered[above] + ordered[above - 1]) / 2)
+    return edges[edges < greatest]
+
+
+def probabilities(theta: Floats, edges: Floats, noise: RateNoise) -> Floats:
+    """Probability of each bin, those below the first and above the last edge included."""
+    mean = math.exp(theta[0])
+    dsnu = math.exp(theta[1])
+    width = math.sqrt(math.log1p(dsnu**2))
+    z = np.linspace(-SPAN, SPAN, NODES)
+    weight = np.exp(-(z**2) / 2)
+    weight /= weight.sum()
+    u = mean * np.exp(width * z - width**2 / 2)
+    s = np.sqrt(noise.reading + noise.counting * u)
+    normal = (edges[:, None] - u) / s
+    below = special.ndtr(normal)
+    if len(theta) == 4:
+        share = special.expit(theta[2])
+        excess = math.exp(theta[3])
+        tail = np.exp(
+            s**2 / (2 * excess**2)
+            - (edges[:, None] - u) / excess
+            + special.log_ndtr(normal - s / excess)
+        )
+        below -= share * tail
+    cumulative = np.concatenate([[0.0], below @ weight, [1.0]])
+    return np.maximum(np.diff(cumulative), 1e-15)
+
+
+def maximize(
+    start: Floats, edges: Floats, counts: Floats, noise: RateNoise
+) -> tuple[Floats, Floats]:
+    """The parameters of the greatest likelihood and their covariance, by Fisher's scoring with halved steps."""
+    theta = start
+    total = counts.sum()
+    p = probabilities(theta, edges, noise)
+    for _ in range(STEPS):
+        slope = np.empty((len(theta), p.size))
+        for n in range(len(theta)):
+            moved = np.zeros(len(theta))
+            moved[n] = DIFFERENCE
+            slope[n] = (
+                probabilities(theta + moved, edges, noise)
+                - probabilities(theta - moved, edges, noise)
+            ) / (2 * DIFFERENCE)
+        information = total * (slope / p) @ slope.T
+        score = slope @ (counts / p)
+        step = np.linalg.solve(information, score)
+        likelihood = counts @ np.log(p)
+        for halving in 0.5 ** np.arange(12):
+            trial = theta + halving * np.clip(step, -1.0, 1.0)
+            trial_p = probabilities(trial, edges, noise)
+            if counts @ np.log(trial_p) >= likelihood - 1e-9 * abs(likelihood):
+                break
+        theta = trial
+        p = trial_p
+        if step @ information @ step < CONVERGED**2:
+            break
+    return theta, np.linalg.inv(information)
+
+
+def start_values(rates: Floats, noise: RateNoise) -> tuple[Floats, int]:
+    """Parameters from moments of the core, and the number of pixels far above it."""
+    median, spread = median_and_spread(rates)
+    core = max(median, 1e-3 * spread, 1e-12)
+    own = max(spread**2 - noise.reading - noise.counting * core, (0.02 * spread) ** 2)
+    dsnu = min(math.sqrt(own) / core, 2.0)
+    width = math.sqrt(math.log1p(dsnu**2))
+    limit = max(core * math.exp(HOT_SIGMAS / 1.6 * width), core + HOT_SIGMAS * spread)
+    hot = rates[rates > limit]
+    excess = max(float(hot.mean()) - limit, spread) if hot.size else spread
+    share = max(hot.size, 1) / rates.size * math.exp(min((limit - core) / excess, 3.0))
+    return np.array(
+        [math.log(core), math.log(dsnu), special.logit(min(share, 0.5)), math.log(excess)]
+    ), hot.size
+
+
+# Fixed pattern: of the black level by columns, and of the sensitivity (PRNU).
+
+
+ORDER = 4  # of the polynomial that is the light's distribution
+SAMPLE = 8  # rows and columns of a block, for the fit of the polynomial
+
+Planes = tuple[
+    Floats, Floats, Floats
+]  # (H, W) at exposure 0 in DN, (H, W) rate in DN/s, (L,) weights of the rate
+
+
+def dark_planes(darks: Sequence[Level], transfer: Transfer, half: str) -> Planes:
+    """Line of every pixel against the exposure, by weighted least squares over the darks of one temperature.
+
+    Parameters
+    ----------
+    half
+        first_dn or second_dn
+    """
+    times = np.array([one.exposure_s for one in darks])
+    weight = np.array(
+        [one.count / one.moments(np.ones(one.first_dn.shape, bool)).variance_dn2 for one in darks]
+    )
+    weight /= weight.sum()
+    middle = weight @ times
+    spread = weight @ (times - middle) ** 2
+    slopes = weight * (times - middle) / spread
+    at_zero = weight - slopes * middle
+    base = np.zeros(darks[0].first_dn.shape)
+    rate = np.zeros(darks[0].first_dn.shape)
+    for one, by_slope, by_zero in zip(darks, slopes, at_zero, strict=True):
+        frame = transfer.linear_dn(getattr(one, half) - transfer.values[BLACK])
+        base += by_zero * frame
+        rate += by_slope * frame
+    return base, rate, slopes
+
+
+def column_offset(first: Floats, second: Floats, usable: Mask, gain_e_dn: float) -> Estimate:
+    """Standard deviation of the columns' black levels, in electrons, from the two dark frames at exposure 0."""
+    means = [
+        np.where(usable, one, 0.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
+        for one in (first, second)
+    ]
+    a, b = (one - one.mean() for one in means)
+    columns = len(a)
+    product = a * b * columns / (columns - 1)
+    variance = gain_e_dn**2 * product.mean()
+    sigma = gain_e_dn**2 * product.std() / np.sqrt(columns)
+    if variance > 3 * sigma:
+        return Estimate.lognormal(float(np.sqrt(variance)), float(sigma / (2 * np.sqrt(variance))))
+    return Estimate.root(float(variance), float(sigma))
+
+
+def prnu(
+    flats: Sequence[Level],
+    transfer: Transfer,
+    first: Planes,
+    second: Planes,
+    dark_ratio: float,
+    usable: Mask,
+) -> Estimate:
+    """Relative standard deviation of the sensitivity, from the rate of every pixel in the light.
+
+    Parameters
+    ----------
+    dark_ratio
+        Dark current at the flats' temperature over that of the darks
+    """
+    rates = [
+        light_rate(flats, transfer, half, planes, dark_ratio)
+        for half, planes in (("first_dn", first), ("second_dn", second))
+    ]
+    trend = smooth((rates[0] + rates[1]) / 2, usable)
+    a, b = (one[usable] / trend[usable] - 1 for one in rates)
+    product = (a - a.mean()) * (b - b.mean())
+    return Estimate.root(float(product.mean()), float(product.std() / np.sqrt(product.size)))
+
+
+def light_rate(
+    flats: Sequence[Level], transfer: Transfer, half: str, dark: Planes, dark_ratio: float
+) -> Floats:
+    """Rate of every pixel in the light, DN/s, by weighted least squares through 0, without black level and dark."""
+    base, rate, _ = dark
+    times = np.array([one.exposure_s for one in flats])
+    weight = np.array([one.count / one.variance_dn2.mean(dtype=np.float64) for one in flats])
+    weight = weight * times / np.sum(weight * times**2)
+    total = np.zeros(base.shape)
+    for one, by in zip(flats, weight, strict=True):
+        signal = transfer.linear_dn(getattr(one, half) - transfer.values[BLACK] - base)
+        total += by * (signal - dark_ratio * one.exposure_s * rate)
+    return total
+
+
+def smooth(image: Floats, usable: Mask) -> Floats:
+    """The polynomial in x and y of total order ORDER, fitted to means of blocks of usable pixels."""
+    height, width = image.shape
+    rows = height // SAMPLE * SAMPLE
+    columns = width // SAMPLE * SAMPLE
+    weight = usable[:rows, :columns].astype(np.float64)
+
+    def blocks(plane: Floats) -> Floats:
+        return (
+            plane.reshape(rows // SAMPLE, SAMPLE, columns // SAMPLE, SAMPLE)
+            .sum(axis=(1, 3))
+            .ravel()
+        )
+
+    count = blocks(weight)
+    y, x = np.mgrid[0:rows:SAMPLE, 0:columns:SAMPLE] + (SAMPLE - 1) / 2
+    mean = blocks(weight * image[:rows, :columns]) / np.maximum(count, 1)
+    terms = [(p, q) for p in range(ORDER + 1) for q in range(ORDER + 1 - p)]
+
+    def powers(at: NDArray[Any], size: int) -> Floats:
+        return np.stack([((2.0 * at - size) / size) ** p for p in range(ORDER + 1)])
+
+    by_x = powers(x.ravel(), width)
+    by_y = powers(y.ravel(), height)
+    root = np.sqrt(count)
+    design = np.column_stack([by_x[p] * by_y[q] for p, q in terms])
+    found = np.linalg.lstsq(design * root[:, None], mean * root, rcond=None)[0]
+    matrix = np.zeros((ORDER + 1, ORDER + 1))
+    for (p, q), value in zip(terms, found, strict=True):
+        matrix[p, q] = value
+    by_row = powers(np.arange(height), height)
+    by_column = powers(np.arange(width), width)
+    return np.asarray(by_row.T @ matrix.T @ by_column, dtype=np.float64)

@@ -1,0 +1,479 @@
+"""Frames of a camera from image files, grouped by exposure time and temperature.
+
+A frame's exposure time and temperature are those of its folder's `frames.csv` (columns file, exposure_s and, if known,
+temperature_c), else of its FITS header (EXPTIME, CCD-TEMP), else of its name or that of a folder above it: `100ms`,
+`2s`, `-5C` between other words, as in `dark_100ms_-5C_03.tif`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from skysim.camera import detector
+from skysim.camera.detector import Detector
+from skysim.core import images
+from skysim.core.constants import MAD_PER_SIGMA
+from skysim.core.errors import InputError
+from skysim.core.files import atomic_file, make_folder
+from skysim.core.random_streams import random_stream
+from skysim.core.text import read_named_rows
+from skysim.core.types import Floats
+from skysim.experiments.characterize.photon_transfer import FIT_RANGE, Level, LevelBuilder, Mask
+from skysim.scene.sections.camera import CameraConfig, DetectorConfig
+
+TABLE = "frames.csv"
+UNITS_S = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
+EXPOSURE = re.compile(r"(?:^|[_\- ])(\d+(?:\.\d+)?)(us|ms|s)(?=$|[_\- ])")
+TEMPERATURE = re.compile(r"(?:^|[_\- ])([-+]?\d+(?:\.\d+)?)C(?=$|[_\- ])")
+TEMPERATURE_STEP_C = (
+    0.5  # temperatures are rounded to it: a cooled chip is held to a tenth of a degree
+)
+
+
+class Setting(NamedTuple):
+    """Exposure time, and temperature of the chip if known."""
+
+    exposure_s: float
+    temperature_c: float | None
+
+
+@dataclass
+class Stack:
+    """Levels of a folder's frames, and the median of each frame."""
+
+    folder: Path
+    levels: list[Level] = field(default_factory=list)
+    medians: dict[Setting, list[tuple[float, Path]]] = field(default_factory=dict)
+    shape: tuple[int, ...] = ()
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The images of a folder and its subfolders, by name; of several formats of one name FITS. Raises InputError."""
+    if not folder.is_dir():
+        raise InputError(folder, "no such folder", "a folder of images")
+    best: dict[Path, Path] = {}
+    for path in sorted(folder.rglob("*")):
+        if (suffix := images.image_suffix(path.name)) and path.name[0] != ".":
+            stem = path.with_name(path.name[: -len(suffix)])
+            best[stem] = min(best.get(stem, path), path, key=lambda one: not images.is_fits(one))
+    found = list(best.values())
+    if not found:
+        raise InputError(folder, "no images", ", ".join(images.IMAGE_SUFFIXES))
+    return found
+
+
+def read_frames(folder: Path) -> Iterator[tuple[Path, Setting, NDArray[np.uint16]]]:
+    """The frames of a folder. Raises InputError for a frame that cannot be used."""
+    tables: dict[Path, dict[str, Setting]] = {}
+    for path in image_files(folder):
+        parent = path.parent
+        if parent not in tables:
+            tables[parent] = read_settings(parent / TABLE) if (parent / TABLE).exists() else {}
+        picture = images.read_picture(path)
+        yield (
+            path,
+            setting_of(path, folder, picture, tables[parent]),
+            raw_numbers(path, picture.pixels),
+        )
+
+
+def raw_numbers(path: Path, pixels: NDArray) -> NDArray[np.uint16]:
+    """The digital numbers of a frame. Raises InputError unless they are a raw monochrome frame's."""
+    if pixels.ndim != 2:
+        raise InputError(path, "a color image", "monochrome frames, raw, of 8 to 16 bits a pixel")
+    if images.image_suffix(path.name) in (".jpg", ".jpeg"):
+        raise InputError(path, "JPEG changes the noise", "raw frames in FITS, PNG or TIFF")
+    if pixels.dtype.kind == "f" and not np.all(pixels == np.rint(pixels)):
+        raise InputError(path, "numbers that are not whole, as of an average", "raw frames")
+    if pixels.min() < 0 or pixels.max() > 65535:
+        raise InputError(path, f"{pixels.min()} to {pixels.max()} DN", "0 to 65535")
+    return pixels.astype(np.uint16)
+
+
+def setting_of(
+    path: Path, root: Path, picture: images.ViewedImage, table: dict[str, Setting]
+) -> Setting:
+    """Exposure and temperature of a frame. Raises InputError without an exposure."""
+    if path.name in table:
+        return table[path.name]
+    names = [
+        path.name[: -len(images.image_suffix(path.name))],
+        *path.relative_to(root).parts[-2::-1],
+    ]
+    exposure_s = picture.exposure_s
+    temperature_c = picture.temperature_c
+    if exposure_s is None:
+        exposure_s = next(
+            (float(hit[1]) * UNITS_S[hit[2]] for name in names if (hit := EXPOSURE.search(name))),
+            None,
+        )
+    if temperature_c is None:
+        temperature_c = next(
+            (float(hit[1]) for name in names if (hit := TEMPERATURE.search(name))), None
+        )
+    if exposure_s is None or exposure_s < 0:
+        raise InputError(
+            path,
+            "no exposure time",
+            f"EXPTIME in a FITS header, a row of {TABLE} beside it (file, exposure_s, temperature_c), or a name such"
+            " as dark_100ms_20C_01.png",
+        )
+    if temperature_c is not None:
+        temperature_c = round(temperature_c / TEMPERATURE_STEP_C) * TEMPERATURE_STEP_C
+    return Setting(float(f"{exposure_s:.6g}"), temperature_c)
+
+
+def read_settings(path: Path) -> dict[str, Setting]:
+    """Exposure and temperature by the file's name, from a CSV file. Raises InputError with one line."""
+    refusal = InputError(
+        path, "no exposures", "columns file, exposure_s and, if known, temperature_c"
+    )
+    files, numbers = read_named_rows(path, "file", ["exposure_s"], refusal, ["temperature_c"])
+    if (numbers[:, 0] < 0).any():
+        raise InputError(path, "an exposure below 0", "seconds, 0 or more")
+    return {
+        name: Setting(float(row[0]), float(row[1]) if len(row) == 2 else None)
+        for name, row in zip(files, numbers, strict=True)
+    }
+
+
+def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
+    """The levels of a folder's frames, by exposure. Raises InputError with one line.
+
+    Numbers that a camera or program has shifted to the upper bits of 16 are shifted back, if all are multiples.
+
+    Parameters
+    ----------
+    shape
+        (height, width) of the camera's frames
+    """
+    builders: dict[Setting, LevelBuilder] = {}
+    stack = Stack(folder)
+    shift = None
+    for path, setting, frame in read_frames(folder):
+        if frame.shape != shape:
+            size = f"{frame.shape[1]} x {frame.shape[0]} pixels"
+            raise InputError(path, size, f"{shape[1]} x {shape[0]}, as the camera has them")
+        shift = padding_bits(frame, bits) if shift is None else shift
+        numbers = np.right_shift(frame, np.uint16(shift))
+        if numbers.max() >= 2**bits:
+            raise InputError(
+                path, f"{numbers.max()} DN", f"up to {2**bits - 1}, the {bits} bits of the camera"
+            )
+        builders.setdefault(setting, LevelBuilder()).add(numbers)
+        stack.medians.setdefault(setting, []).append((float(np.median(numbers)), path))
+    check_settings(stack, builders)
+    for setting in sorted(builders, key=lambda one: (one.exposure_s, one.temperature_c or 0.0)):
+        stack.levels.append(builders[setting].level(*setting))
+    return stack
+
+
+def padding_bits(frame: NDArray[np.uint16], bits: int) -> int:
+    """By how many bits the numbers are shifted to the left, if they are beyond the camera's range; otherwise 0."""
+    if frame.max() < 2**bits:
+        return 0
+    union = int(np.bitwise_or.reduce(frame, axis=None))
+    zeros = (union & -union).bit_length() - 1
+    return min(zeros, 16 - bits)
+
+
+def check_settings(stack: Stack, builders: dict[Setting, LevelBuilder]) -> None:
+    """Raise InputError for a single frame of an exposure, and if the temperature of some frames only is known."""
+    for setting, builder in builders.items():
+        if builder.frames < 2:
+            path = stack.medians[setting][0][1]
+            raise InputError(path, f"the only frame of {describe(setting)}", "2 or more, alike")
+    unknown = [setting for setting in builders if setting.temperature_c is None]
+    if unknown and len(unknown) < len(builders):
+        path = stack.medians[unknown[0]][0][1]
+        raise InputError(
+            path, "no temperature, which other frames have", "of all frames, or of none"
+        )
+
+
+def describe(setting: Setting) -> str:
+    """An exposure and temperature for a message."""
+    at = "" if setting.temperature_c is None else f" at {setting.temperature_c:g} °C"
+    return f"{setting.exposure_s:g} s{at}"
+
+
+# Darks and flats as a camera of a scene would take them, written as files: to try the command, and
+# to test it.
+
+
+# frames of a dark's exposure, and of a flat's
+DARKS = 16
+PAIR = 2
+DARK_PARTS = (0.01, 0.3, 1.0)  # exposures of the darks, of the longest
+# dark current of the longest dark: squared read noises, electrons
+DARK_NOISES = 8.0
+LEAST_DARK_E = 200.0
+WARMER_C = 10.0
+FLAT_S = 0.1  # exposure that saturates a flat
+FLAT_PARTS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.66, 0.8, 0.9, 1.3, 1.5)
+
+
+class PlannedFrame(NamedTuple):
+    """Frames to take: their kind, exposure, temperature, light in electrons a second, and number of frames."""
+
+    kind: str
+    exposure_s: float
+    temperature_c: float
+    light_e_s: float
+    frames: int
+
+
+def shots(config: DetectorConfig) -> Iterator[PlannedFrame]:
+    """Darks at three exposures and two temperatures, flats in pairs from 2 to 150 % of the full well."""
+    own_c = config.dark_temperature_c if config.temperature_c is None else config.temperature_c
+    own_e_s = config.dark_e_s * 2.0**config.doublings
+    wanted_e = min(max(DARK_NOISES * config.read_noise_e**2, LEAST_DARK_E), capacity_e(config) / 16)
+    longest_s = float(f"{wanted_e / own_e_s:.2g}") if own_e_s > 0 else 10.0
+    for temperature_c in (own_c, own_c + WARMER_C):
+        for part in DARK_PARTS:
+            yield PlannedFrame("darks", float(f"{part * longest_s:.3g}"), temperature_c, 0.0, DARKS)
+    for part in FLAT_PARTS:
+        yield PlannedFrame(
+            "flats", float(f"{part * FLAT_S:.3g}"), own_c, capacity_e(config) / FLAT_S, PAIR
+        )
+
+
+def capacity_e(config: DetectorConfig) -> float:
+    """Electrons at which a pixel or the converter is full."""
+    return min(config.full_well_e, (2**config.bits - 1 - config.offset_dn) * config.gain_e_dn)
+
+
+def frames_of(camera: CameraConfig, shot: PlannedFrame, seed: int) -> Iterator[NDArray[np.uint16]]:
+    """The frames of a shot by the simulated detector, uniform light."""
+    at_it = camera.detector.model_copy(update={"temperature_c": shot.temperature_c})
+    made = Detector.from_camera(camera.model_copy(update={"detector": at_it}))
+    key = (
+        shot.kind == "flats",
+        round(1e6 * shot.exposure_s),
+        round(10 * (shot.temperature_c + 300)),
+    )
+    for n in range(shot.frames):
+        light_e = np.full(
+            (camera.height_px, camera.width_px), shot.light_e_s * shot.exposure_s, np.float32
+        )
+        detector.smear(light_e, max(shot.exposure_s, 1e-9), camera.shutter)
+        yield detector.expose(
+            light_e, shot.exposure_s, made, random_stream(seed, *map(int, key), n)
+        )
+
+
+def write_frames(camera: CameraConfig, folder: Path, seed: int) -> Iterator[Path]:
+    """Write the frames of all shots to folder/darks and folder/flats, with exposure and temperature in the headers."""
+    from astropy.io import fits
+
+    for shot in shots(camera.detector):
+        parent = make_folder(folder / shot.kind)
+        name = f"{shot.kind[:-1]}_{shot.exposure_s:g}s_{shot.temperature_c:g}C".replace("/", "")
+        for n, frame in enumerate(frames_of(camera, shot, seed)):
+            header = fits.Header()
+            header["EXPTIME"] = (shot.exposure_s, "exposure [s]")
+            header["CCD-TEMP"] = (shot.temperature_c, "temperature of the chip [C]")
+            path = parent / f"{name}_{n:03d}.fits"
+            with atomic_file(path) as temporary:
+                fits.PrimaryHDU(frame, header).writeto(temporary, overwrite=True)
+            yield path
+
+
+def frame_count(config: DetectorConfig) -> int:
+    """Number of files of `write_frames`."""
+    return sum(shot.frames for shot in shots(config))
+
+
+# Frames that cannot be what they are taken for: darks with light, flats that are not flat, too few
+# of either.
+
+
+LEAST_LEVELS = (
+    4  # of flats that are not saturated: three rates and a curvature, with one to test them
+)
+MEDIAN_SIGMAS = (
+    0.5  # greatest difference of a dark's median from the others, in standard deviations of a pixel
+)
+MAX_ZEROS = 1e-3  # of a dark's pixels
+BLOCK = 32  # pixels: side of the blocks whose medians show structure
+MAX_DARK_RANGE = 2.0  # of the blocks' medians, in standard deviations of a pixel
+MAX_FLAT_RANGE = 0.3  # of the light over the frame, relative to its mean
+BRIGHT = 0.2  # signal over the brightest, from which on a flat must be flat
+MAX_PAIR_CHANGE = 0.03  # of the light from frame to frame, relative
+# of a bright pixel, of a spot, and spots beyond those by chance
+SPOT_SIGMAS = 12.0
+SPOT_PIXELS = 4
+MAX_SPOTS = 3
+POLYPLETS = 110  # figures of four squares that touch by sides or corners, fixed (OEIS A006770)
+
+
+class BrightSpots(NamedTuple):
+    """Where a frame is brightest and darkest, in words."""
+
+    brightest: str
+    darkest: str
+
+
+def check_darks(darks: Stack) -> None:
+    """Raise InputError unless these are darks of two exposures or more: equal medians, no structure, no stars."""
+    for setting, medians in darks.medians.items():
+        level = level_of(darks, setting)
+        noise_dn = math.sqrt(float(np.median(level.variance_dn2)) + 1)
+        middle = float(np.median([median for median, _ in medians]))
+        worst, path = max(medians)
+        if worst - middle > max(MEDIAN_SIGMAS * noise_dn, 1.0):
+            raise InputError(
+                path,
+                f"not dark: median {worst:g} DN, the other frames of {describe(setting)} {middle:g} DN",
+                "darks with the lens capped",
+            )
+    for level in darks.levels:
+        check_dark(darks, level)
+    times = {one.exposure_s for one in darks.levels}
+    if len(times) < 2:
+        only = times.pop()
+        raise InputError(
+            darks.folder,
+            f"darks of {only:g} s only",
+            f"two exposures or more: add 4 of the shortest and 4 of {max(10 * only, 10):g} s",
+        )
+
+
+def level_of(stack: Stack, setting: Setting) -> Level:
+    """The level of a setting."""
+    return next(
+        one for one in stack.levels if Setting(one.exposure_s, one.temperature_c) == setting
+    )
+
+
+def check_dark(darks: Stack, level: Level) -> None:
+    """Raise InputError for a level of darks that is cut off at 0, equal frame by frame, or has structure or stars."""
+    folder = darks.folder
+    which = f"the darks of {describe(Setting(level.exposure_s, level.temperature_c))}"
+    mean = level.mean_dn
+    noise_dn = math.sqrt(float(np.median(level.variance_dn2)))
+    zeros = float(np.mean(mean < 1))
+    if zeros > MAX_ZEROS:
+        raise InputError(
+            folder,
+            f"{which} have {100 * zeros:.2g} % of the pixels at 0 DN",
+            "a higher black level",
+        )
+    if not level.variance_dn2.any():
+        raise InputError(
+            folder, f"{which} are equal in every pixel", "frames of their own, no copies"
+        )
+    noise_dn = max(noise_dn, 0.3)
+    medians = block_medians(mean)
+    if (extent := float(np.ptp(medians))) > MAX_DARK_RANGE * noise_dn:
+        place = extremes(medians)
+        raise InputError(
+            folder,
+            f"{which} are not dark: {extent:.3g} DN brighter at the {place.brightest} than at the {place.darkest}",
+            f"{MAX_DARK_RANGE * noise_dn:.2g} DN: cap the lens, cover the window",
+        )
+    # Hot pixels are single, but for those that touch by chance; images of stars cover several pixels. A track of a
+    # particle is in one half of the frames.
+    both = np.minimum(level.first_dn, level.second_dn)
+    bright = both > np.median(mean) + SPOT_SIGMAS * max(
+        spread(mean), noise_dn / math.sqrt(level.count)
+    )
+    labels, _ = ndimage.label(bright, np.ones((3, 3)))
+    sizes = np.bincount(labels.ravel())[1:]
+    by_chance = POLYPLETS * bright.mean() ** SPOT_PIXELS * bright.size
+    if (touching := int((sizes >= SPOT_PIXELS).sum())) > MAX_SPOTS + by_chance:
+        y, x = ndimage.center_of_mass(bright, labels, int(np.argmax(sizes)) + 1)
+        raise InputError(
+            folder,
+            f"{which} are not dark: {touching} spots of {SPOT_PIXELS} pixels or more, the largest at x {x:.0f},"
+            f" y {y:.0f}",
+            "darks with the lens capped",
+        )
+
+
+def check_flats(flats: Stack, usable: Mask, black_dn: float) -> None:
+    """Raise InputError unless these are flats of LEAST_LEVELS levels or more below saturation, flat and steady."""
+    signals = np.array([float(one.mean_dn[usable].mean()) - black_dn for one in flats.levels])
+    times = np.array([one.exposure_s for one in flats.levels])
+    top = signals.max()
+    below = (signals < FIT_RANGE * top) & (signals > 0.01 * top)
+    if signals.min() > 0.95 * top and times.max() > 1.2 * times.min():
+        raise InputError(
+            flats.folder,
+            f"all saturated, at {top + black_dn:.0f} DN",
+            f"{LEAST_LEVELS} levels or more below: exposures shorter than {times.min():.3g} s",
+        )
+    if below.sum() < LEAST_LEVELS:
+        lacking = LEAST_LEVELS - int(below.sum())
+        longest = float(times[signals >= top].min())
+        raise InputError(
+            flats.folder,
+            f"{int(below.sum())} levels from 1 to {100 * FIT_RANGE:.0f} % of the brightest",
+            f"{LEAST_LEVELS} or more: add pairs at {lacking} exposures from {0.05 * longest:.2g} to"
+            f" {0.6 * longest:.2g} s",
+        )
+    for one, signal in zip(flats.levels, signals, strict=True):
+        which = f"the flats of {describe(Setting(one.exposure_s, one.temperature_c))}"
+        if not one.variance_dn2.any() and signal < 0.95 * top:
+            raise InputError(
+                flats.folder, f"{which} are equal in every pixel", "frames of their own, no copies"
+            )
+        change = math.sqrt(one.difference_dn2) / signal if signal > 0.02 * top else 0.0
+        if change > MAX_PAIR_CHANGE:
+            raise InputError(
+                flats.folder,
+                f"{which} differ by {100 * change:.2g} % from frame to frame",
+                f"{100 * MAX_PAIR_CHANGE:g} %: a steady lamp, warmed up, on direct current",
+            )
+        if BRIGHT * top < signal < FIT_RANGE * top:
+            check_flat(flats.folder, which, block_medians(one.mean_dn) - black_dn)
+
+
+def check_flat(folder: Path, which: str, medians: Floats) -> None:
+    """Raise InputError for a flat whose blocks' medians differ too much."""
+    extent = float(np.ptp(medians) / medians.mean())
+    if extent > MAX_FLAT_RANGE:
+        place = extremes(medians)
+        raise InputError(
+            folder,
+            f"{which} are not flat: {100 * extent:.0f} % brighter at the {place.brightest} than at the {place.darkest}",
+            f"{100 * MAX_FLAT_RANGE:.0f} %: an integrating sphere or a diffuser, no lens",
+        )
+
+
+def spread(image: Floats) -> float:
+    """Robust standard deviation of the pixels."""
+    return float(np.median(np.abs(image - np.median(image)))) / MAD_PER_SIGMA
+
+
+def block_medians(image: Floats) -> Floats:
+    """Medians of square blocks, BLOCK pixels wide or smaller, so that there are nine at least."""
+    side = max(min(BLOCK, *(size // 3 for size in image.shape)), 1)
+    rows, columns = (size // side for size in image.shape)
+    blocks = image[: rows * side, : columns * side].reshape(rows, side, columns, side)
+    return np.asarray(np.median(blocks, axis=(1, 3)))
+
+
+def extremes(medians: Floats) -> BrightSpots:
+    """Words for the places of the greatest and of the least block."""
+
+    def word(index: int) -> str:
+        row, column = np.unravel_index(index, medians.shape)
+        vertical = ("top", "middle", "bottom")[int(3 * row / medians.shape[0])]
+        horizontal = ("left", "center", "right")[int(3 * column / medians.shape[1])]
+        return (
+            "center"
+            if (vertical, horizontal) == ("middle", "center")
+            else f"{vertical} {horizontal}"
+        )
+
+    return BrightSpots(word(int(np.argmax(medians))), word(int(np.argmin(medians))))

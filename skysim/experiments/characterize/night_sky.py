@@ -1,0 +1,450 @@
+"""Frames of the night sky: detection, identification and calibration by the estimator, and the size of star images."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+from scipy.spatial import cKDTree
+
+from estimator.calibration.star_field import Calibration, self_calibrate
+from estimator.catalog import catalog
+from estimator.core.camera import Camera
+from estimator.core.checks import ImageError
+from estimator.core.types import Centroids
+from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
+from estimator.trackers.star_tracker import StarTracker
+from skysim.core import images
+from skysim.core.constants import MAD_PER_SIGMA
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.experiments.characterize.frame_files import image_files, padding_bits, raw_numbers
+from skysim.experiments.characterize.photon_transfer import (
+    BLACK,
+    GAIN,
+    READ,
+    ROUNDING_DN2,
+    Estimate,
+    Transfer,
+)
+from skysim.scene.sections.camera import CameraConfig
+from skysim.tracking.onboard_model import calibration, onboard_catalog
+
+# Size of star images over the field, from Gaussian fits of single stars.
+
+
+HALF_PX = 7  # half of a star's window
+X, Y, FLUX, SKY, LN_SX, LN_SY = range(6)
+# of the fit; a step in standard deviations
+STEPS = 30
+CONVERGED = 1e-3
+START_SIGMA_PX = 1.0
+MAX_STEP = 0.5  # pixels, and of the logarithms
+OUTLIER_SIGMAS = 4.0  # of a chi-square, and of a size
+# of leaving out outliers, and the change of the errors at their end
+ROUNDS = 12
+SETTLED = 1e-4
+LEAST_VARIANCE_PX2 = 1e-3
+
+
+class StarImages(NamedTuple):
+    """Fitted images of N stars.
+
+    Attributes
+    ----------
+    xy_px
+        (N, 2)
+    flux_dn
+        (N,)
+    variance_px2, variance_sigma_px2
+        (N,) mean of s_x^2 and s_y^2, and its error
+    stretch_px2
+        (N, 2) s_x^2 - s_y^2, and twice the covariance of x and y: of a trail
+    chi2
+        (N,) reduced
+    """
+
+    xy_px: Floats
+    flux_dn: Floats
+    variance_px2: Floats
+    variance_sigma_px2: Floats
+    stretch_px2: Floats
+    chi2: Floats
+
+    def take(self, rows: Floats) -> StarImages:
+        return StarImages(*(one[rows] for one in self))
+
+
+class ImageSize(NamedTuple):
+    """sigma_px and corner_sigma_px of the key psf; the stars used, and how many were left out."""
+
+    sigma_px: Estimate
+    corner_sigma_px: Estimate
+    used: StarImages
+    left_out: int
+
+
+def windows(image_dn: Floats, xy_px: Floats) -> tuple[Floats, Floats]:
+    """(N, M) pixels of each star's window, and (N, 2) their upper left corners; stars are HALF_PX from the border."""
+    corner = np.rint(xy_px).astype(int) - HALF_PX
+    span = np.arange(2 * HALF_PX + 1)
+    rows = corner[:, 1, None, None] + span[:, None]
+    columns = corner[:, 0, None, None] + span[None, :]
+    return np.asarray(
+        image_dn[rows, columns].reshape(len(xy_px), -1), dtype=np.float64
+    ), corner.astype(np.float64)
+
+
+def integrals(center: Floats, ln_sigma: Floats) -> tuple[Floats, Floats, Floats]:
+    """(N, S) integrals of a Gaussian over the pixels of a window, and their slopes to center and logarithm of sigma."""
+    sigma = np.exp(ln_sigma)[:, None]
+    z = (np.arange(2 * HALF_PX + 2) - 0.5 - center[:, None]) / sigma
+    density = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi)
+    return np.diff(special.ndtr(z)), -np.diff(density) / sigma, -np.diff(z * density)
+
+
+def model(p: Floats) -> tuple[Floats, Floats]:
+    """(N, M) pixels, and (N, M, 6) their slopes, of images with the parameters p (N, 6)."""
+    (gx, dx, wx), (gy, dy, wy) = integrals(p[:, X], p[:, LN_SX]), integrals(p[:, Y], p[:, LN_SY])
+
+    def plane(by_y: Floats, by_x: Floats) -> Floats:
+        return np.asarray((by_y[:, :, None] * by_x[:, None, :]).reshape(len(p), -1))
+
+    flux = p[:, FLUX, None]
+    image = plane(gy, gx)
+    slopes = [flux * plane(gy, dx), flux * plane(dy, gx), image, np.ones_like(image)]
+    slopes += [flux * plane(gy, wx), flux * plane(wy, gx)]
+    return p[:, SKY, None] + flux * image, np.stack(slopes, axis=2)
+
+
+def fit_images(image_dn: Floats, xy_px: Floats, gain_dn_e: float, read_dn2: float) -> StarImages:
+    """Fit the stars at these pixels of a frame without black level, its signal linear; gain in DN per electron."""
+    pixels, corner = windows(image_dn, xy_px)
+    sky = np.median(pixels, axis=1)
+    flux = np.maximum((pixels - sky[:, None]).sum(axis=1), 1.0)
+    start = np.full(len(xy_px), np.log(START_SIGMA_PX))
+    p = np.column_stack([xy_px - corner, flux, sky, start, start])
+    damping = np.full(len(p), 1e-3)
+    expected, slopes = model(p)
+    chi2 = np.full(len(p), np.inf)
+    for _ in range(STEPS):
+        weight = 1 / (gain_dn_e * np.maximum(expected, 0.0) + read_dn2 + ROUNDING_DN2)
+        residual = pixels - expected
+        chi2 = np.sum(weight * residual**2, axis=1)
+        normal = np.einsum("nmi,nm,nmj->nij", slopes, weight, slopes, optimize=True)
+        gradient = np.einsum("nmi,nm->ni", slopes, weight * residual)
+        damped = (
+            normal
+            + np.eye(6)
+            * (damping[:, None] * np.diagonal(normal, axis1=1, axis2=2) + 1e-12)[:, None, :]
+        )
+        step = np.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
+        limited = np.clip(step[:, [X, Y, LN_SX, LN_SY]], -MAX_STEP, MAX_STEP)
+        step[:, [X, Y, LN_SX, LN_SY]] = limited
+        trial = p + step
+        trial_expected, trial_slopes = model(trial)
+        better = np.sum(weight * (pixels - trial_expected) ** 2, axis=1) <= chi2 * (1 + 1e-12)
+        p = np.where(better[:, None], trial, p)
+        expected = np.where(better[:, None], trial_expected, expected)
+        slopes = np.where(better[:, None, None], trial_slopes, slopes)
+        damping = np.where(better, damping / 10, damping * 10)
+        if np.all(np.einsum("ni,nij,nj->n", step, normal, step) < CONVERGED**2):
+            break
+    return summary(p, corner, pixels - expected, normal, chi2)
+
+
+def summary(
+    p: Floats, corner: Floats, residual: Floats, normal: Floats, chi2: Floats
+) -> StarImages:
+    """What is used of the fits."""
+    covariance = np.linalg.inv(normal)
+    sx2 = np.exp(2 * p[:, LN_SX])
+    sy2 = np.exp(2 * p[:, LN_SY])
+    slope = np.zeros((len(p), 6))
+    # of (s_x^2 + s_y^2) / 2
+    slope[:, LN_SX] = sx2
+    slope[:, LN_SY] = sy2
+    error = np.sqrt(np.einsum("ni,nij,nj->n", slope, covariance, slope))
+    # A tilt leaves residuals F c g (x - x0)(y - y0) / (s_x^2 s_y^2), c the covariance, to first order.
+    span = np.arange(2 * HALF_PX + 1)
+    u = (span - p[:, X, None]) / sx2[:, None]
+    v = (span - p[:, Y, None]) / sy2[:, None]
+    gx = integrals(p[:, X], p[:, LN_SX])[0]
+    gy = integrals(p[:, Y], p[:, LN_SY])[0]
+    tilt = p[:, FLUX, None] * ((v * gy)[:, :, None] * (u * gx)[:, None, :]).reshape(len(p), -1)
+    covariance_px2 = np.sum(tilt * residual, axis=1) / np.maximum(np.sum(tilt**2, axis=1), 1e-300)
+    stretch = np.column_stack([sx2 - sy2, 2 * covariance_px2])
+    freedom = residual.shape[1] - 6
+    return StarImages(
+        corner + p[:, [X, Y]], p[:, FLUX], (sx2 + sy2) / 2, error, stretch, chi2 / freedom
+    )
+
+
+def image_size(
+    stars: StarImages, center_px: tuple[float, float], corner_px: float
+) -> ImageSize | None:
+    """The law of the size over the field; None for fewer than three stars that are Gaussians."""
+    freedom = (2 * HALF_PX + 1) ** 2 - 6
+    sound = np.isfinite(stars.variance_sigma_px2) & (
+        stars.chi2 < 1 + OUTLIER_SIGMAS * np.sqrt(2 / freedom) + 0.2
+    )
+    rho2 = np.sum((stars.xy_px - np.array(center_px)) ** 2, axis=1) / corner_px**2
+    design = np.column_stack([np.ones(len(rho2)), rho2])
+    # A star's relative error, times the law's size: its own error would give images that came out small more weight.
+    kept = sound
+    relative = stars.variance_sigma_px2 / stars.variance_px2
+    expected = stars.variance_px2
+    for _ in range(ROUNDS):
+        if kept.sum() < 3:
+            return None
+        error = relative * expected
+        weight = np.where(kept, 1 / error**2, 0.0)
+        normal = np.linalg.inv((design.T * weight) @ design)
+        found = normal @ ((design.T * weight) @ stars.variance_px2)
+        expected = np.maximum(design @ found, LEAST_VARIANCE_PX2)
+        pull = (stars.variance_px2 - expected) / (relative * expected)
+        again = sound & (
+            np.abs(pull)
+            < OUTLIER_SIGMAS * max(1.0, float(np.median(np.abs(pull[kept]))) / MAD_PER_SIGMA)
+        )
+        is_settled = np.array_equal(again, kept) and np.allclose(
+            error, relative * expected, rtol=SETTLED
+        )
+        kept = again
+        if is_settled:
+            break
+    scatter = max(1.0, float(np.sum(pull[kept] ** 2)) / max(int(kept.sum()) - 2, 1))
+    sigma2, corner2 = np.sqrt(np.diag(normal) * scatter)
+    used = stars.take(kept)
+    return ImageSize(
+        Estimate.root(float(found[0]), float(sigma2)),
+        Estimate.root(float(found[1]), float(corner2)),
+        used,
+        len(rho2) - int(kept.sum()),
+    )
+
+
+CATALOG = "gaia_v8.0"
+DEFAULT_EPOCH_YR = 2020.0
+STARS_A_FIELD = 300.0  # of the catalog, on average
+FOCAL_UNCERTAINTY = 0.05  # of the focal length in the camera's file
+# of a star whose image is measured; its peak over saturation
+LEAST_SNR = 40.0
+MAX_PEAK = 0.8
+LEAST_STARS = 20
+LEAST_FRAMES = 3
+LEAST_TRAILED = 3
+MEDIAN_COST = 1.25  # standard error of a median over that of a mean
+MAX_STRETCH = 0.25  # of the images, over their variance
+LENS = ("focal_px", "center_x_px", "center_y_px", "k1", "k2", "p1", "p2", "k3")
+
+
+class Night(NamedTuple):
+    """Image size, and the lens with its covariance if the sky was identified; remarks on what is unknown."""
+
+    size: ImageSize
+    lens: Calibration | None
+    frames: int
+    identified: int
+    remarks: list[str]
+
+
+class NightFrame(NamedTuple):
+    """A frame of the night: its stars' centroids and images."""
+
+    path: Path
+    centroids: Centroids
+    stars: StarImages
+    date_utc: datetime.datetime | None
+
+
+def measure_night(
+    config: CameraConfig, folder: Path, transfer: Transfer, saturation_dn: float
+) -> Night:
+    """The lens from frames of the sky. Raises InputError for frames that do not tell."""
+    frames = [read_frame(path, config, transfer, saturation_dn) for path in image_files(folder)]
+    still = [without_trail(one.stars) for one in frames]
+    stars = StarImages(*(np.concatenate(part) for part in zip(*still, strict=True)))
+    if len(stars.chi2) < LEAST_STARS:
+        raise InputError(
+            folder,
+            f"{len(stars.chi2)} single stars of a signal to noise of {LEAST_SNR:g}, not saturated, in"
+            f" {len(frames)} frames",
+            f"{LEAST_STARS} or more: more frames, or longer exposures",
+        )
+    check_trails(frames)
+    lens, remarks = find_lens(config, frames, transfer, saturation_dn)
+    center_px = lens.camera.center_px if lens else config.center_px
+    size = image_size(stars, center_px, config.corner_px)
+    if size is None:
+        raise InputError(folder, "no star's image is a Gaussian", "stars in focus, not trailed")
+    if size.left_out > 0.5 * len(stars.chi2):
+        remarks.append(
+            f"psf: {size.left_out} of {len(stars.chi2)} star images are no Gaussians, and were left out"
+        )
+    identified = int(lens.report.tied.sum()) if lens else 0
+    return Night(size, lens, len(frames), identified, remarks)
+
+
+def read_frame(
+    path: Path, config: CameraConfig, transfer: Transfer, saturation_dn: float
+) -> NightFrame:
+    """Detect and fit the stars of a frame. Raises InputError for one of another camera."""
+    picture = images.read_picture(path)
+    numbers = raw_numbers(path, picture.pixels)
+    if numbers.shape != (config.height_px, config.width_px):
+        size = f"{numbers.shape[1]} x {numbers.shape[0]} pixels"
+        raise InputError(
+            path, size, f"{config.width_px} x {config.height_px}, as the camera has them"
+        )
+    numbers = np.right_shift(numbers, np.uint16(padding_bits(numbers, config.detector.bits)))
+    try:
+        centroids = detect_and_centroid(
+            numbers, calibration(config), settings_of(transfer, saturation_dn), Clock()
+        )
+    except ImageError as error:
+        raise InputError(path, error) from None
+    signal = transfer.linear_dn(numbers - transfer.values[BLACK])
+    chosen = measurable(numbers, centroids, transfer, saturation_dn)
+    gain = float(transfer.values[GAIN])
+    read = float(transfer.values[READ])
+    return NightFrame(path, centroids, fit_images(signal, chosen, gain, read), picture.date_utc)
+
+
+def settings_of(transfer: Transfer, saturation_dn: float) -> Settings:
+    """Settings of the tracker for this camera."""
+    return Settings(
+        gain_e_dn=float(1 / transfer.values[GAIN]), saturation=saturation_dn, centroid_sigma_px=0.02
+    )
+
+
+def measurable(
+    numbers: NDArray[Any], centroids: Centroids, transfer: Transfer, saturation_dn: float
+) -> Floats:
+    """(N, 2) pixels of stars that are bright, not saturated, away from the border and from other stars."""
+    xy = centroids.xy_px
+    if not len(xy):
+        return np.zeros((0, 2))
+    height, width = numbers.shape
+    inside = np.all((xy >= HALF_PX) & (xy <= np.array([width, height]) - 1 - HALF_PX), axis=1)
+    near = cKDTree(xy).query(xy, k=2)[0][:, 1] if len(xy) > 1 else np.array([np.inf])
+    x, y = np.rint(xy).astype(int).T
+    background = float(np.median(numbers))
+    peak = numbers[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
+    dark_e2 = (background - transfer.values[BLACK]) / transfer.values[GAIN] + transfer.values[
+        READ
+    ] / transfer.values[GAIN] ** 2
+    flux_e = centroids.flux / transfer.values[GAIN]
+    snr = flux_e / np.sqrt(np.maximum(flux_e + 12 * max(dark_e2, 0.0), 1.0))
+    kept = (
+        inside
+        & (near > HALF_PX * math.sqrt(2))
+        & (peak < MAX_PEAK * saturation_dn)
+        & (snr > LEAST_SNR)
+    )
+    return np.asarray(xy[kept])
+
+
+def trail_px2(stars: StarImages) -> tuple[float, float]:
+    """Median difference of the variances along the rows and along the columns, and twice the median covariance."""
+    if len(stars.chi2) < LEAST_TRAILED:
+        return 0.0, 0.0
+    along, across = np.median(stars.stretch_px2, axis=0)
+    return float(along), float(across)
+
+
+def without_trail(stars: StarImages) -> StarImages:
+    """The images without what a common trail adds to their mean variance: half of the stretch, less its own error."""
+    count = max(len(stars.chi2), 1)
+    noise2 = (
+        float(np.sum(np.var(stars.stretch_px2, axis=0))) * MEDIAN_COST**2 / count
+        if count > 1
+        else 0.0
+    )
+    added = math.sqrt(max(math.hypot(*trail_px2(stars)) ** 2 - noise2, 0.0)) / 2
+    return stars._replace(variance_px2=stars.variance_px2 - added)
+
+
+def check_trails(frames: list[NightFrame]) -> None:
+    """Raise InputError for a frame whose stars trail: their images are longer in one direction."""
+    for one in frames:
+        if not len(one.stars.chi2):
+            continue
+        along, across = trail_px2(one.stars)
+        stretch = math.hypot(along, across)
+        variance = float(np.median(one.stars.variance_px2))
+        if stretch > MAX_STRETCH * variance:
+            trail_px = math.sqrt(
+                12 * stretch
+            )  # a uniform streak of length L has the variance L^2 / 12
+            angle_deg = math.degrees(math.atan2(across, along)) / 2
+            raise InputError(
+                one.path,
+                f"stars trail by {trail_px:.2g} px at {angle_deg:.0f}° from the rows",
+                f"{math.sqrt(12 * MAX_STRETCH * variance):.2g} px: a shorter exposure, or a mount that follows the sky",
+            )
+
+
+def find_lens(
+    config: CameraConfig, frames: list[NightFrame], transfer: Transfer, saturation_dn: float
+) -> tuple[Calibration | None, list[str]]:
+    """The lens by stars that are identified, from the focal length in the camera's file; or why it is unknown."""
+    if len(frames) < LEAST_FRAMES:
+        lacking = LEAST_FRAMES - len(frames)
+        return None, [
+            f"focal length, distortion: {len(frames)} frames of the night; allowed: {lacking} more elsewhere"
+        ]
+    camera = calibration(config)
+    settings = settings_of(transfer, saturation_dn)
+    stars = onboard_catalog("characterize.night", CATALOG)
+    narrow_sr = (
+        config.width_px * config.height_px / (camera.focal_px * (1 + FOCAL_UNCERTAINTY)) ** 2
+    )
+    stars = stars.take(stars.v_mag <= catalog.limit_for_density(stars, narrow_sr, STARS_A_FIELD))
+    dates = [one.date_utc for one in frames if one.date_utc is not None]
+    vectors = (
+        catalog.apparent(stars, catalog.on_earth(dates[0]))
+        if dates
+        else catalog.at_epoch(stars, DEFAULT_EPOCH_YR)
+    )
+
+    def tracker(model: Camera, uncertainty: float) -> StarTracker:
+        return StarTracker(model, stars, vectors, settings, uncertainty)
+
+    try:
+        found = self_calibrate(
+            [one.centroids for one in frames], tracker, camera, FOCAL_UNCERTAINTY
+        )
+    except ValueError as error:
+        return None, [
+            f"focal length, distortion: {error}; the camera's file states {camera.focal_px:.5g} px, to 5 %"
+        ]
+    return found, [] if dates else [
+        "date: no frame has one; allowed: DATE-OBS in a FITS header, for aberration to 20″"
+    ]
+
+
+def lens_estimates(config: CameraConfig, found: Calibration) -> dict[str, Estimate]:
+    """Focal length in millimeters, principal point in pixels, and coefficients of distortion.
+
+    The calibration measures the distance of the image in pixels; by the thin lens the focal length is
+    1 / (1 / v + 1 / u).
+    """
+    errors = np.sqrt(np.diag(found.covariance))
+    camera = found.camera
+    image_m = camera.focal_px * config.pixel_m
+    focal_m = 1 / (1 / image_m + 1 / config.focus_m)
+    focal = Estimate.normal(
+        1e3 * focal_m, 1e3 * float(errors[0]) * config.pixel_m * (focal_m / image_m) ** 2
+    )
+    values = [*camera.center_px, *camera.distortion]
+    rest = {
+        name: Estimate.normal(value, error)
+        for name, value, error in zip(LENS[1:], values, errors[1:], strict=True)
+    }
+    return {"focal_length_mm": focal, **rest}

@@ -1,0 +1,374 @@
+"""The photon transfer fit: gain, read noise, nonlinearity, black level, and rates of light and dark current.
+
+Light of a steady lamp and dark current give a pixel, in the time t, N = (R + D) t electrons on average, with the
+variance N. With the conversion K (DN per electron) its mean signal is x = K N; an amplifier whose gain falls with the
+signal makes x (1 - c x) of it. A level's mean and its temporal variance over the pixels are then
+
+    mean = o + x - c x^2,    variance = (1 - 2 c x)^2 (K x + r^2) + 1/12,
+
+with the black level o, the read noise r in DN, and 1/12 DN^2 of the converter's rounding (Janesick 2007, Photon
+Transfer, ch. 5; EMVA 1288, release 4.0 Linear, has the law without c). Darks, R = 0, and flats follow one law and
+are fitted at once by weighted least squares, with a rate D for each temperature. What is left of the differences
+between two frames' means beyond their noise is the lamp's flicker; it is part of a mean's error.
+
+Only levels up to FIT_RANGE of the saturation are fitted, as EMVA 1288 has it for the photon transfer curve. In a
+saturated level the variance collapses: it grows up to the turnover and falls to the read noise beyond it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+from scipy.optimize import least_squares
+
+from skysim.core.types import Floats
+
+# A measured number with its interval.
+
+
+SIGMAS_95 = 1.959964  # half of a normal 95 % interval in standard deviations
+STEP = 1e-4  # of a slope's difference, in standard deviations
+
+
+class Estimate(NamedTuple):
+    """A value, its standard error, and its 95 % interval."""
+
+    value: float
+    sigma: float
+    low: float
+    high: float
+
+    @classmethod
+    def normal(cls, value: float, sigma: float) -> Estimate:
+        """A normal estimate: value ± 1.96 sigma."""
+        half = SIGMAS_95 * sigma
+        return cls(float(value), float(sigma), float(value - half), float(value + half))
+
+    @classmethod
+    def lognormal(cls, value: float, sigma: float) -> Estimate:
+        """An estimate of a positive number whose logarithm is normal, such as a standard deviation."""
+        factor = math.exp(min(SIGMAS_95 * sigma / value, 50.0)) if value > 0 else 1.0
+        return cls(float(value), float(sigma), float(value / factor), float(value * factor))
+
+    @classmethod
+    def logistic(cls, logit: float, sigma: float) -> Estimate:
+        """An estimate of a fraction whose logit is normal."""
+        low, value, high = (
+            float(special.expit(logit + sign * SIGMAS_95 * sigma)) for sign in (-1, 0, 1)
+        )
+        return cls(value, value * (1 - value) * float(sigma), low, high)
+
+    @classmethod
+    def root(cls, variance: float, sigma: float) -> Estimate:
+        """The square root of a variance, with the standard error of that; an interval from 0 if it is not above 0."""
+        value = math.sqrt(max(variance, 0.0))
+        low, high = (math.sqrt(max(variance + sign * SIGMAS_95 * sigma, 0.0)) for sign in (-1, 1))
+        return cls(value, sigma / (2 * value) if value else high / SIGMAS_95, low, high)
+
+
+def propagate(
+    function: Callable[[Floats], float], at: Floats, covariance: Floats
+) -> tuple[float, float]:
+    """Value and standard error of a function of parameters, by central differences of a fraction of their errors."""
+    step = STEP * np.sqrt(np.diag(covariance))
+    slope = np.zeros(len(at))
+    for n in np.flatnonzero(step > 0):
+        moved = np.zeros(len(at))
+        moved[n] = step[n]
+        slope[n] = (function(at + moved) - function(at - moved)) / (2 * step[n])
+    return float(function(at)), math.sqrt(max(float(slope @ covariance @ slope), 0.0))
+
+
+# Frames of one exposure, reduced to two mean frames and to the mean and temporal variance of their
+# pixels.
+
+
+Mask = NDArray[np.bool_]
+# interquartile ranges, and pixels from which these are taken
+TRIM = 5.0
+SAMPLES = 100_000
+
+
+class Moments(NamedTuple):
+    """Mean and temporal variance over the pixels of a level, in DN, with their standard errors."""
+
+    mean_dn: float
+    mean_sigma_dn: float
+    variance_dn2: float
+    variance_sigma_dn2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """Frames of one exposure time and temperature.
+
+    Attributes
+    ----------
+    count
+        Frames, an even number
+    greatest_dn, least_dn
+        Of all pixels
+    first_dn, second_dn
+        (H, W) means of the first and of the second frames of the pairs
+    variance_dn2
+        (H, W) temporal variance of every pixel, from count / 2 pairs
+    difference_dn2
+        Mean square of the difference of the frames of a pair, averaged over the frame
+    """
+
+    exposure_s: float
+    temperature_c: float | None
+    count: int
+    first_dn: NDArray[np.float32]
+    second_dn: NDArray[np.float32]
+    variance_dn2: NDArray[np.float32]
+    difference_dn2: float
+    least_dn: int
+    greatest_dn: int
+
+    @property
+    def mean_dn(self) -> Floats:
+        """(H, W) mean of all frames."""
+        return (self.first_dn.astype(np.float64) + self.second_dn) / 2
+
+    def moments(self, used: Mask) -> Moments:
+        """Mean and variance over the used pixels. Standard errors are empirical, from the scatter of the pixels'
+        variances, since hot pixels have more noise."""
+        variance = self.variance_dn2[used].astype(np.float64)
+        mean = (
+            self.first_dn[used].mean(dtype=np.float64) + self.second_dn[used].mean(dtype=np.float64)
+        ) / 2
+        return Moments(
+            float(mean),
+            float(np.sqrt(variance.mean() / self.count / variance.size)),
+            float(variance.mean()),
+            float(variance.std() / np.sqrt(variance.size)),
+        )
+
+
+class LevelBuilder:
+    """Adds frames of one size to a level, one after the other, so that no more than one is in memory."""
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self.first: NDArray | None = None
+        self.sums: list[NDArray[np.float32]] = []
+        self.difference_dn2 = 0.0
+        self.least_dn = np.iinfo(np.int64).max
+        self.greatest_dn = 0
+
+    def add(self, frame: NDArray) -> None:
+        """Add a frame of digital numbers; every second one completes a pair."""
+        self.frames += 1
+        if self.first is None:
+            self.first = frame
+            return
+        difference = self.first.astype(np.float32) - frame
+        offset_dn = trimmed_mean(difference)
+        difference -= np.float32(offset_dn)
+        np.square(difference, out=difference)
+        self.sums = self.sums or [np.zeros(frame.shape, np.float32) for _ in range(3)]
+        for total, one in zip(self.sums, (self.first, frame, difference), strict=True):
+            total += one
+        self.least_dn = min(self.least_dn, int(self.first.min()), int(frame.min()))
+        self.greatest_dn = max(self.greatest_dn, int(self.first.max()), int(frame.max()))
+        self.difference_dn2 += offset_dn**2
+        self.first = None
+
+    def level(self, exposure_s: float, temperature_c: float | None) -> Level:
+        """The level of the pairs so far, of which there must be one; an odd last frame is left out."""
+        pairs = self.frames // 2
+        first, second, squares = (
+            total / np.float32(divisor)
+            for total, divisor in zip(self.sums, (pairs, pairs, 2 * pairs), strict=True)
+        )
+        drift_dn2 = self.difference_dn2 / pairs
+        return Level(
+            *(exposure_s, temperature_c, 2 * pairs),
+            *(first, second, squares),
+            *(drift_dn2, self.least_dn, self.greatest_dn),
+        )
+
+
+def trimmed_mean(difference: NDArray[np.float32]) -> float:
+    """Mean of the pixels within TRIM interquartile ranges of the median: without those that a particle hit."""
+    low, middle, high = np.quantile(
+        difference.ravel()[:: max(difference.size // SAMPLES, 1)], (0.25, 0.5, 0.75)
+    )
+    inside = np.abs(difference - np.float32(middle)) <= TRIM * (high - low) + 1
+    return float(difference[inside].mean(dtype=np.float64))
+
+
+def level(exposure_s: float, temperature_c: float | None, frames: Iterable[NDArray]) -> Level:
+    """The level of some frames, two at least."""
+    builder = LevelBuilder()
+    for frame in frames:
+        builder.add(frame)
+    return builder.level(exposure_s, temperature_c)
+
+
+ROUNDING_DN2 = 1 / 12  # variance of a rounding error, uniform over one number
+FIT_RANGE = 0.7
+SIGNIFICANT = 2.0  # standard errors from which on a flicker is one
+COLLAPSED = 0.5  # a level beyond the turnover whose variance is below this fraction of the greatest is saturated
+GAIN, CURVATURE, READ, BLACK, LIGHT, FIRST_DARK = range(6)  # places of the parameters
+
+
+class TransferPoint(NamedTuple):
+    """A level as the fit sees it. dark : index of its temperature;  lit : 1 for a flat, 0 for a dark."""
+
+    exposure_s: float
+    lit: int
+    dark: int
+    moments: Moments
+
+
+class Transfer(NamedTuple):
+    """The fit.
+
+    Attributes
+    ----------
+    values
+        K in DN/e-, c in 1/DN, r^2 in DN^2, o in DN, K R in DN/s, and K D in DN/s for each
+        temperature
+    covariance
+        Of these
+    flicker
+        Relative standard deviation of the light from frame to frame
+    misfit
+        chi-square over its degrees of freedom
+    points
+        Those fitted
+    """
+
+    values: Floats
+    covariance: Floats
+    flicker: float
+    misfit: float
+    points: list[TransferPoint]
+
+    @property
+    def gain_e_dn(self) -> Estimate:
+        return Estimate.normal(*propagate(lambda p: 1 / p[GAIN], self.values, self.covariance))
+
+    @property
+    def read_noise_e(self) -> Estimate:
+        """Of the sensor alone, without rounding."""
+        variance, sigma = propagate(lambda p: p[READ] / p[GAIN] ** 2, self.values, self.covariance)
+        return Estimate.root(variance, sigma)
+
+    @property
+    def offset_dn(self) -> Estimate:
+        return Estimate.normal(self.values[BLACK], float(np.sqrt(self.covariance[BLACK, BLACK])))
+
+    @property
+    def light_e_s(self) -> Estimate:
+        """Electrons that the lamp gives a pixel in a second."""
+        return Estimate.normal(
+            *propagate(lambda p: p[LIGHT] / p[GAIN], self.values, self.covariance)
+        )
+
+    def linear_dn(self, signal_dn: Floats) -> Floats:
+        """The signal x that a linear amplifier would give, from the measured x (1 - c x)."""
+        return linear_dn(signal_dn, float(self.values[CURVATURE]))
+
+
+def linear_dn(signal_dn: Floats, curvature: float) -> Floats:
+    """The lower root x of s = x - c x^2, in a form that is exact for c = 0; the top of the parabola beyond it."""
+    root = np.sqrt(np.maximum(1 - 4 * curvature * signal_dn, 0.0))
+    return np.asarray(2 * signal_dn / (1 + root))
+
+
+def model(points: Sequence[TransferPoint], values: Floats) -> tuple[Floats, Floats]:
+    """Means and variances of the levels."""
+    t_s = np.array([one.exposure_s for one in points])
+    lit = np.array([one.lit for one in points])
+    rate = lit * values[LIGHT] + values[FIRST_DARK + np.array([one.dark for one in points])]
+    x = rate * t_s
+    slope = 1 - 2 * values[CURVATURE] * rate * t_s
+    mean = values[BLACK] + x - values[CURVATURE] * x**2
+    return mean, slope**2 * (values[GAIN] * x + values[READ]) + ROUNDING_DN2
+
+
+def fit(points: Sequence[TransferPoint], flicker: float) -> Transfer:
+    """Fit levels of darks and flats. flicker : relative, from `lamp_flicker`"""
+    kept = list(points)
+    mean, mean_sigma, variance, variance_sigma = np.array([one.moments for one in kept]).T
+    black = min(mean)
+    lit = np.array([one.lit for one in kept])
+    mean_sigma = np.hypot(
+        mean_sigma, lit * flicker * (mean - black) / np.sqrt(2)
+    )  # of a pair at least
+    start = start_values(kept)
+
+    def residuals(values: Floats) -> Floats:
+        expected_mean, expected_variance = model(kept, values)
+        return np.concatenate(
+            [(mean - expected_mean) / mean_sigma, (variance - expected_variance) / variance_sigma]
+        )
+
+    scale = np.maximum(np.abs(start), 1e-9)
+    scale[CURVATURE] = 0.01 / max(mean.max() - black, 1.0)
+    found = least_squares(
+        lambda p: residuals(p * scale), start / scale, x_scale="jac", method="lm", xtol=1e-12
+    )
+    covariance = np.linalg.inv(found.jac.T @ found.jac) * np.outer(scale, scale)
+    misfit = 2 * found.cost / max(2 * len(kept) - len(start), 1)
+    return Transfer(found.x * scale, covariance, flicker, misfit, kept)
+
+
+def start_values(points: Sequence[TransferPoint]) -> Floats:
+    """Slope of the variance against the mean over all levels, and rates from the longest exposures."""
+    mean, variance = (
+        np.array([getattr(one.moments, name) for one in points])
+        for name in ("mean_dn", "variance_dn2")
+    )
+    darkest = int(np.argmin(mean))
+    brightest = int(np.argmax(mean))
+    gain = (variance[brightest] - variance[darkest]) / max(mean[brightest] - mean[darkest], 1e-9)
+    black = mean[darkest]
+    temperatures = 1 + max(one.dark for one in points)
+    rates = [0.0] * temperatures
+    for one in points:
+        if not one.lit:
+            rates[one.dark] = max(rates[one.dark], (one.moments.mean_dn - black) / one.exposure_s)
+    light = (mean[brightest] - black) / points[brightest].exposure_s
+    return np.array([gain, 0.0, max(variance[darkest] - ROUNDING_DN2, 0.01), black, light, *rates])
+
+
+def unsaturated(points: Sequence[TransferPoint], black_dn: float) -> list[bool]:
+    """Which flats are up to FIT_RANGE of the greatest signal."""
+    top = max(one.moments.mean_dn for one in points) - black_dn
+    return [one.moments.mean_dn - black_dn <= FIT_RANGE * top for one in points]
+
+
+def saturated(points: Sequence[TransferPoint]) -> list[bool]:
+    """Which flats are beyond the turnover of the variance, with a variance that has collapsed."""
+    variance = np.array([one.moments.variance_dn2 for one in points])
+    brighter = (
+        np.array([one.exposure_s for one in points]) > points[int(np.argmax(variance))].exposure_s
+    )
+    return [bool(one) for one in brighter & (variance < COLLAPSED * variance.max())]
+
+
+def lamp_flicker(
+    points: Sequence[TransferPoint], difference_dn2: Sequence[float], black_dn: float, pixels: int
+) -> float:
+    """Relative flicker from frame to frame: of the means' differences in pairs, what their noise does not explain.
+
+    The frames of a pair are independent, so the mean square difference is 2 (flicker signal)^2 + 2 variance / pixels.
+    What is not above its own error, by SIGNIFICANT sigmas, is taken for 0: a flicker would else be found in half of all
+    steady lamps.
+    """
+    signal = np.array([one.moments.mean_dn for one in points]) - black_dn
+    noise = 2 * np.array([one.moments.variance_dn2 for one in points]) / pixels
+    excess = (np.array(difference_dn2) - noise) / (2 * signal**2)
+    chance = math.sqrt(2 / len(points)) * float(np.sqrt(np.mean((noise / (2 * signal**2)) ** 2)))
+    mean = float(np.mean(excess))
+    return math.sqrt(mean) if mean > SIGNIFICANT * chance else 0.0

@@ -1,1 +1,0 @@
-"""A sensor from darks and flats, by the photon transfer method. Nothing here imports the simulated detector."""

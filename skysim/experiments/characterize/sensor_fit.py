@@ -1,0 +1,332 @@
+"""A sensor from its levels of darks and flats: every parameter of the detector with its interval."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from skysim.core.constants import MAD_PER_SIGMA
+from skysim.core.types import Floats
+from skysim.experiments.characterize import fixed_pattern, photon_transfer
+from skysim.experiments.characterize.fixed_pattern import DarkCurrent, Planes, RateNoise
+from skysim.experiments.characterize.photon_transfer import (
+    BLACK,
+    CURVATURE,
+    FIRST_DARK,
+    GAIN,
+    READ,
+    ROUNDING_DN2,
+    Estimate,
+    Level,
+    Mask,
+    Transfer,
+    TransferPoint,
+    propagate,
+)
+
+HOT_SIGMAS = 20.0  # above the median dark: pixels left out of the photon transfer
+HIT_SIGMAS = 8.0  # by which the halves of a pixel's frames differ, where a particle hit it
+
+
+class MeasuredSensor(NamedTuple):
+    """What the frames tell.
+
+    Attributes
+    ----------
+    estimates
+        By key of `camera.detector`, in its units
+    remarks
+        What they do not tell, one line each
+    dark
+        Distribution of the dark current, None if it is below the noise
+    flats
+        All levels, those too that are beyond the fit
+    saturation_dn
+        Digital number of a saturated pixel, or of the brightest flat
+    """
+
+    estimates: dict[str, Estimate]
+    remarks: list[str]
+    transfer: Transfer
+    dark: DarkCurrent | None
+    dark_temperature_c: float | None
+    flats: list[TransferPoint]
+    linearity_error: float
+    saturation_dn: float
+
+
+def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSensor:
+    """Every parameter from levels of darks and flats, which `checks` has found to be usable.
+
+    The dark current is stated at the darks' temperature that is nearest to that of the flats.
+    """
+    usable = usable_pixels(darks)
+    temperatures = sorted(
+        {one.temperature_c for one in darks}, key=lambda one: -math.inf if one is None else one
+    )
+    own = nearest_index(temperatures, flats[0].temperature_c)
+    dark_points = [
+        TransferPoint(one.exposure_s, 0, temperatures.index(one.temperature_c), one.moments(usable))
+        for one in darks
+    ]
+    flat_points = [TransferPoint(one.exposure_s, 1, own, one.moments(usable)) for one in flats]
+    black_dn = min(point.moments.mean_dn for point in dark_points)
+    below = photon_transfer.unsaturated(flat_points, black_dn)
+    fitted = [one for one, is_below in zip(flats, below, strict=True) if is_below]
+    lit = [one for one, is_below in zip(flat_points, below, strict=True) if is_below]
+    changes = [one.difference_dn2 for one in fitted]
+    transfer = photon_transfer.fit(
+        [*dark_points, *lit],
+        photon_transfer.lamp_flicker(lit, changes, black_dn, int(usable.sum())),
+    )
+    estimates: dict[str, Estimate] = {
+        "gain_e_dn": transfer.gain_e_dn,
+        "read_noise_e": transfer.read_noise_e,
+    }
+    remarks: list[str] = []
+    full_well(estimates, remarks, transfer, flat_points)
+    chosen = best_temperature(temperatures, darks, transfer)
+    at_it = [one for one in darks if one.temperature_c == temperatures[chosen]]
+    first, second = (
+        fixed_pattern.dark_planes(at_it, transfer, half) for half in ("first_dn", "second_dn")
+    )
+    ratio = rate_ratio(transfer, own, chosen)
+    dark = dark_parameters(estimates, remarks, at_it, transfer, first, second, own, ratio)
+    doubling(estimates, remarks, transfer, temperatures)
+    estimates["prnu"] = fixed_pattern.prnu(fitted, transfer, first, second, ratio, usable)
+    columns = fixed_pattern.column_offset(first[0], second[0], usable, 1 / transfer.values[GAIN])
+    estimates["column_offset_e"] = columns
+    # The columns' levels are those of this chip: the mean of as many others differs by their scatter.
+    scatter_dn = columns.value * transfer.values[GAIN] / math.sqrt(usable.shape[1])
+    black = transfer.offset_dn
+    estimates["offset_dn"] = Estimate.normal(black.value, math.hypot(black.sigma, scatter_dn))
+    error = linearity_error(flat_points, transfer)
+    saturation_dn = max(one.moments.mean_dn for one in flat_points)
+    return MeasuredSensor(
+        estimates, remarks, transfer, dark, temperatures[own], flat_points, error, saturation_dn
+    )
+
+
+def rate_ratio(transfer: Transfer, own: int, chosen: int) -> float:
+    """Dark current at one temperature over that at another, of the same pixels."""
+    rates = transfer.values[FIRST_DARK:]
+    return 1.0 if own == chosen else float(max(rates[own], 0.0) / max(rates[chosen], 1e-12))
+
+
+def usable_pixels(darks: Sequence[Level]) -> Mask:
+    """Pixels that no particle has hit and that are not hot in any dark: no further above the median than HOT_SIGMAS
+    robust standard deviations."""
+    usable = np.ones(darks[0].first_dn.shape, bool)
+    for one in darks:
+        mean = one.mean_dn
+        median = np.median(mean)
+        spread = max(np.median(np.abs(mean - median)) / MAD_PER_SIGMA, 0.5)
+        usable &= (mean < median + HOT_SIGMAS * spread) & steady_pixels(
+            one, float(np.median(one.variance_dn2))
+        )
+    return usable
+
+
+def steady_pixels(one: Level, variance_dn2: float | Floats) -> Mask:
+    """Pixels whose two halves of the frames agree within HIT_SIGMAS: no track of a particle is in one of them.
+
+    Each half is the mean of count / 2 frames, so that their difference has four times the variance over count.
+    """
+    return np.asarray(
+        np.abs(one.first_dn - one.second_dn)
+        <= HIT_SIGMAS * np.sqrt(4 * np.maximum(variance_dn2, 0.2) / one.count)
+    )
+
+
+def nearest_index(temperatures: Sequence[float | None], temperature_c: float | None) -> int:
+    """Index of the darks' temperature that is nearest; 0 if it is unknown."""
+    if temperature_c is None or temperatures[0] is None:
+        return 0
+    return int(np.argmin([abs(one - temperature_c) for one in temperatures if one is not None]))
+
+
+def best_temperature(
+    temperatures: Sequence[float | None], darks: Sequence[Level], transfer: Transfer
+) -> int:
+    """The temperature whose darks of two exposures or more have the most dark current."""
+
+    def signal(index: int) -> float:
+        times = [one.exposure_s for one in darks if one.temperature_c == temperatures[index]]
+        return float(transfer.values[FIRST_DARK + index]) * (max(times) - min(times))
+
+    return max(range(len(temperatures)), key=signal)
+
+
+def full_well(
+    estimates: dict[str, Estimate],
+    remarks: list[str],
+    transfer: Transfer,
+    flats: Sequence[TransferPoint],
+) -> None:
+    """Full well and nonlinearity: electrons where the signal stays though the exposure grows, and what is missing
+    there; c x of the fit."""
+    full = [
+        one for one, is_full in zip(flats, photon_transfer.saturated(flats), strict=True) if is_full
+    ]
+    brightest = max(flats, key=lambda one: one.moments.mean_dn)
+    if full:
+        level_dn = float(np.mean([one.moments.mean_dn for one in full]))
+        sigma_dn = math.sqrt(np.mean([one.moments.mean_sigma_dn**2 for one in full]))
+    else:
+        level_dn = brightest.moments.mean_dn
+        sigma_dn = brightest.moments.mean_sigma_dn
+        remarks.append(
+            f"full well: the flats end at {level_dn:.0f} DN, before the variance turns; allowed: flats to twice the"
+            f" longest exposure, {brightest.exposure_s:.3g} s"
+        )
+    values = np.append(transfer.values, level_dn)
+    covariance = np.zeros((len(values), len(values)))
+    covariance[:-1, :-1] = transfer.covariance
+    covariance[-1, -1] = sigma_dn**2
+
+    def signal(p: Floats) -> float:
+        return float(photon_transfer.linear_dn(np.array(p[-1] - p[BLACK]), p[CURVATURE]))
+
+    estimates["full_well_e"] = Estimate.normal(
+        *propagate(lambda p: signal(p) / p[GAIN], values, covariance)
+    )
+    estimates["nonlinearity"] = Estimate.normal(
+        *propagate(lambda p: p[CURVATURE] * signal(p), values, covariance)
+    )
+
+
+def dark_parameters(
+    estimates: dict[str, Estimate],
+    remarks: list[str],
+    darks: Sequence[Level],
+    transfer: Transfer,
+    first: Planes,
+    second: Planes,
+    own: int,
+    ratio: float,
+) -> DarkCurrent | None:
+    """Dark current, DSNU and hot pixels from the rates of the pixels at the temperature of these darks.
+
+    Parameters
+    ----------
+    own
+        Index of the temperature for which they are stated
+    ratio
+        Dark current at it over that of these darks
+    """
+    weights = first[2]
+    gain = transfer.values[GAIN]
+    read = transfer.values[READ] + ROUNDING_DN2
+    steady = np.ones(first[0].shape, bool)
+    for one in darks:
+        steady &= steady_pixels(
+            one, read + gain * np.maximum(one.mean_dn - transfer.values[BLACK], 0.0)
+        )
+    rates = ((first[1] + second[1]) / 2)[steady]
+    counts = np.array([one.count for one in darks])
+    times = np.array([one.exposure_s for one in darks])
+    noise = RateNoise(
+        float(np.sum(weights**2 * read / counts)), float(np.sum(weights**2 * gain * times / counts))
+    )
+    if not fixed_pattern.is_resolved(rates, noise):
+        unresolved(estimates, remarks, transfer, own, rates, noise, float(times.max()))
+        return None
+    top_dn = max(one.greatest_dn for one in darks)
+    greatest = (0.98 * top_dn - transfer.values[BLACK]) / times.max()
+    dark = fixed_pattern.fit(rates, noise, float(greatest))
+    relative = math.sqrt(transfer.covariance[GAIN, GAIN]) / gain
+
+    def in_electrons(one: Estimate) -> Estimate:
+        value = ratio * one.value / gain
+        return Estimate.lognormal(value, value * math.hypot(one.sigma / one.value, relative))
+
+    estimates["dark_e_s"] = in_electrons(dark.mean)
+    estimates["dsnu"] = dark.dsnu
+    estimates["hot_pixels"] = dark.hot_pixels
+    if dark.hot is not None:
+        estimates["hot_e_s"] = in_electrons(dark.hot)
+    return dark
+
+
+def unresolved(
+    estimates: dict[str, Estimate],
+    remarks: list[str],
+    transfer: Transfer,
+    own: int,
+    rates: Floats,
+    noise: RateNoise,
+    longest_s: float,
+) -> None:
+    """Mean dark current alone, where its scatter over the pixels is below the noise; with the exposure to take."""
+    value, sigma = propagate(
+        lambda p: p[FIRST_DARK + own] / p[GAIN], transfer.values, transfer.covariance
+    )
+    estimates["dark_e_s"] = Estimate.normal(value, sigma)
+    mean = float(np.median(rates))
+    if mean > 0 and mean**2 > noise.reading:
+        variance, error = fixed_pattern.own_variance(rates, noise)
+        estimates["dsnu"] = Estimate.root(variance / mean**2, error / mean**2)
+        remarks.append("hot pixels: all pixels have the same dark current within its noise")
+        return
+    noise_e_s = math.sqrt(noise.reading) / transfer.values[GAIN]
+    needed = (
+        f"{longest_s * noise_e_s / value:.2g} s or more"
+        if value > 3 * sigma
+        else "much longer exposures"
+    )
+    remarks.append(
+        f"DSNU and hot pixels: the scatter of the dark current, {value:.2g} e-/s, is below the noise of"
+        f" {longest_s:g} s; allowed: darks of {needed}"
+    )
+
+
+def doubling(
+    estimates: dict[str, Estimate],
+    remarks: list[str],
+    transfer: Transfer,
+    temperatures: Sequence[float | None],
+) -> None:
+    """Temperature that doubles the dark current: ln 2 over the slope of ln D, a weighted line through all temperatures.
+
+    The same pixels are compared, so that their scatter does not count.
+    """
+    known = [one for one in temperatures if one is not None]
+    if len(known) < 2:
+        remarks.append(
+            "doubling temperature: darks at one temperature; allowed: two, 5 K apart or more"
+        )
+        return
+    rates = transfer.values[FIRST_DARK:]
+    covariance = transfer.covariance[FIRST_DARK:, FIRST_DARK:]
+    if np.any(rates <= 0):
+        remarks.append(
+            "doubling temperature: no dark current at one of the temperatures; allowed: longer darks"
+        )
+        return
+    weight = np.linalg.inv(covariance / np.outer(rates, rates))
+    design = np.column_stack([np.ones(len(known)), np.array(known) - known[0]])
+    normal = np.linalg.inv(design.T @ weight @ design)
+    _, slope = normal @ design.T @ weight @ np.log(rates)
+    value = math.log(2) / slope
+    estimates["dark_doubling_c"] = Estimate.normal(value, value / slope * math.sqrt(normal[1, 1]))
+
+
+def linearity_error(flats: Sequence[TransferPoint], transfer: Transfer) -> float:
+    """Mean relative deviation of the signal from a line through the levels at 5 to 95 % of the saturation.
+
+    The line is fitted with relative weights (EMVA 1288, release 4.0 Linear: the linearity error LE).
+    """
+    black = transfer.values[BLACK]
+    signal = np.array([one.moments.mean_dn for one in flats]) - black
+    time_s = np.array([one.exposure_s for one in flats])
+    inside = (signal > 0.05 * signal.max()) & (signal < 0.95 * signal.max())
+    if inside.sum() < 3:
+        return math.nan
+    x = time_s[inside]
+    y = signal[inside]
+    slope, intercept = np.polyfit(x, y, 1, w=1 / y)
+    line = intercept + slope * x
+    return float(np.mean(np.abs(y - line) / line))

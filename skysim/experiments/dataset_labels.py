@@ -1,0 +1,258 @@
+"""Render one frame of a dataset with its labels: sources, detections, masks of saturation, particles and smear."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.core.camera import Camera
+from estimator.core.checks import ImageError
+from estimator.core.types import Centroids
+from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
+from skysim.camera.detector import PARTICLES, SMEAR, AddedCharge
+from skysim.camera.render import Window
+from skysim.core.jit import jit
+from skysim.core.types import BodyTruth, Floats, Frame, SourceTruth, Truth
+from skysim.experiments.study.execution import trials
+from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX
+from skysim.experiments.study.execution.setups import TrialSetup
+from skysim.scene.scene import Scene
+from skysim.simulation.timing import exposure_window
+from skysim.tracking.factory import assumed_settings
+from skysim.tracking.onboard_model import assumed_camera
+
+SATURATED = "saturated"
+MASKS = (SATURATED, PARTICLES, SMEAR)
+REACH_SIGMA = (
+    3.0  # half-width of a source's rectangle, in standard deviations of its image across the streak
+)
+DISC_PX = 2.0  # sources of a larger radius are discs with edges
+EDGE_PX = 3.0  # reach of the blur about the edge of a disc
+STILL_PX = 1e-6  # a shorter streak has no direction
+SOURCE = np.dtype(
+    [
+        ("id", "<i8"),
+        *((name, "<f8") for name in ("x_px", "y_px", "flux_x_px", "flux_y_px")),
+        *(
+            (name, "<f4")
+            for name in ("streak_x_px", "streak_y_px", "streak_px", "electrons", "peak_e", "snr")
+        ),
+        *((name, "<f4") for name in ("sigma_px", "radius_px")),
+        ("saturated", "?"),
+        ("detected", "?"),
+        *((name, "<f4") for name in ("detected_x_px", "detected_y_px")),
+    ]
+)
+
+
+class Extents(NamedTuple):
+    """The rectangle about each source's image, along its streak.
+
+    Attributes
+    ----------
+    center_px
+        (N, 2)
+    along
+        (N, 2) unit vector of the streak
+    half_px
+        (N, 2) half-length and half-width
+    """
+
+    center_px: Floats
+    along: Floats
+    half_px: Floats
+
+    def of(self, which: NDArray[np.bool_]) -> Extents:
+        """Those of some sources."""
+        return Extents(*(part[which] for part in self))
+
+
+class LabelledFrame(NamedTuple):
+    """A frame with its labels.
+
+    Attributes
+    ----------
+    sources
+        (N,) of dtype SOURCE, brightest first
+    extents
+        The rectangle about each image
+    unmatched_px
+        (M, 2) detections that are no source of the frame: noise, particles, hot pixels
+    masks
+        By name of MASKS, run lengths of `run_lengths`; a mask that the scene cannot have is
+        left out
+    """
+
+    frame: Frame
+    truth: Truth
+    sources: NDArray[Any]
+    extents: Extents
+    unmatched_px: Floats
+    masks: dict[str, list[int]]
+
+
+class Labeller(NamedTuple):
+    """What the labels of all frames of one scene take.
+
+    Attributes
+    ----------
+    camera, settings
+        What its tracker assumes
+    threshold_e
+        Least charge that something else than light adds to a pixel of a mask
+    """
+
+    camera: Camera
+    settings: Settings
+    threshold_e: float
+
+
+def labeller(scene: Scene) -> Labeller:
+    """The labeller of a scene, made once for its frames: it takes as long as a tenth of them."""
+    config = scene.camera.detector
+    threshold_e = max(math.hypot(config.read_noise_e, config.reset_noise_e), 1.0)
+    return Labeller(assumed_camera(scene), assumed_settings(scene), threshold_e)
+
+
+def label_frame(setup: TrialSetup, seed: int, by: Labeller | None = None) -> LabelledFrame:
+    """Render a frame trial's frame and its labels. They depend on the setup and the seed alone.
+
+    Parameters
+    ----------
+    by
+        Of the setup's scene, if there is one already
+    """
+    scene = setup.lab.scene
+    by = by or labeller(scene)
+    added = AddedCharge(by.threshold_e)
+    frame, truth, streak_px = trials.render_trial_frame(setup, seed, added)
+    try:
+        found = detect_and_centroid(frame.image_dn, by.camera, by.settings, Clock(), streak_px)
+    except ImageError:  # a saturated frame
+        found = Centroids.empty()
+    sources, unmatched = source_rows(truth.sources, found.xy_px)
+    add_radii(sources, truth.bodies, scene.camera.focal_px)
+    extents = image_extents(sources, exposure_window(scene, frame.index), scene.camera.height_px)
+    runs = {SATURATED: run_lengths(frame.image_dn, least_value(frame))}
+    runs |= {name: run_lengths(added.masks[name]) for name in MASKS if name in added.masks}
+    return LabelledFrame(frame, truth, sources, extents, unmatched, runs)
+
+
+def least_value(frame: Frame) -> float:
+    """The least value of a saturated pixel, an integer if pixels are, which compares faster."""
+    return (
+        math.ceil(frame.saturation_dn) if frame.image_dn.dtype.kind == "u" else frame.saturation_dn
+    )
+
+
+def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Floats]:
+    """(N,) labels of the sources, brightest first, and the (M, 2) detections that are none of them.
+
+    A detection is that of the brightest source within SAME_LIGHT_PX of it, and half of the streak.
+    """
+    order = np.argsort(-truth.electrons, kind="stable")
+    rows = np.zeros(len(order), SOURCE)
+    rows["x_px"], rows["y_px"] = truth.xy_px[order].T
+    rows["flux_x_px"], rows["flux_y_px"] = truth.flux_xy_px[order].T
+    rows["streak_x_px"], rows["streak_y_px"] = truth.streak_xy_px[order].T
+    for name in ("id", "streak_px", "electrons", "peak_e", "snr", "saturated"):
+        rows[name] = getattr(truth, name)[order]
+    rows["sigma_px"] = across_sigma_px(truth.area_px, truth.streak_px)[order]
+    rows["detected_x_px"] = rows["detected_y_px"] = np.nan
+    chosen = brightest_near(
+        found_px, truth.flux_xy_px[order], SAME_LIGHT_PX + truth.streak_px[order] / 2
+    )
+    own = chosen[chosen >= 0]
+    rows["detected"][own] = True
+    rows["detected_x_px"][own], rows["detected_y_px"][own] = found_px[chosen >= 0].T
+    return rows, found_px[chosen < 0]
+
+
+@jit
+def brightest_near(found_px: Floats, source_px: Floats, reach_px: Floats) -> NDArray[np.int64]:
+    """(M,) number of the first source that is within its reach of each detection and has none yet; -1 without one."""
+    chosen = np.full(len(found_px), -1)
+    is_free = np.ones(len(source_px), np.bool_)
+    for m in range(len(found_px)):
+        for n in range(len(source_px)):
+            dx = source_px[n, 0] - found_px[m, 0]
+            dy = source_px[n, 1] - found_px[m, 1]
+            if is_free[n] and dx * dx + dy * dy <= reach_px[n] * reach_px[n]:
+                chosen[m] = n
+                is_free[n] = False
+                break
+    return chosen
+
+
+def add_radii(rows: NDArray[Any], bodies: Sequence[BodyTruth], focal_px: float) -> None:
+    """Set the radius of Sun, Moon and planets among the sources, in place, without the lens's distortion."""
+    for body in bodies:
+        rows["radius_px"][rows["id"] == body.id] = (
+            math.radians(body.diameter_arcsec / 7200) * focal_px
+        )
+
+
+def image_extents(rows: NDArray[Any], window: Window, height_px: int) -> Extents:
+    """The rectangle about each source's streak.
+
+    It is wider on each side by REACH_SIGMA standard deviations of the blur, or by the radius of a disc and its blurred
+    edge. A rolling shutter exposes the row of a disc's center later than the middle one, and shears the disc.
+    """
+    streak = np.nan_to_num(
+        np.column_stack([rows["streak_x_px"], rows["streak_y_px"]]).astype(float)
+    )
+    length = np.linalg.norm(streak, axis=1)
+    along = np.where(
+        length[:, None] > STILL_PX, streak / np.maximum(length, STILL_PX)[:, None], [1.0, 0.0]
+    )
+    # Of a source at the row y at mid-exposure: delay = row_time (y + v_y delay - middle row), in exposures.
+    rolling = window.row_time_s / window.exposure_s
+    rolling = rolling / np.maximum(1 - rolling * streak[:, 1], 0.1)
+    radius = rows["radius_px"].astype(float)
+    disc = radius > DISC_PX
+    delay = rolling * (rows["y_px"] - (height_px - 1) / 2)
+    middle = np.column_stack([rows["x_px"], rows["y_px"]]) + delay[:, None] * streak
+    center = np.where(
+        disc[:, None], middle, np.column_stack([rows["flux_x_px"], rows["flux_y_px"]])
+    )
+    reach = np.where(disc, radius + EDGE_PX, REACH_SIGMA * rows["sigma_px"])
+    shear = np.where(disc, rolling * radius, 0.0) * length
+    return Extents(center, along, np.column_stack([length / 2 + reach + shear, reach]))
+
+
+def across_sigma_px(area_px: Floats, streak_px: Floats) -> Floats:
+    """(N,) standard deviation across the streak of a Gaussian image with this noise-equivalent area.
+
+    A Gaussian of sigma s at rest has 4 pi s^2; one along a path L much longer than s has 2 sqrt(pi) s L. The root of
+    (4 pi s^2)^2 + (2 sqrt(pi) s L)^2 = area^2 has both limits, and an error of 6 % at most between them.
+    """
+    square = streak_px**2
+    return np.asarray(np.sqrt((np.sqrt(square**2 + 4 * area_px**2) - square) / (8 * math.pi)))
+
+
+def run_lengths(mask: NDArray[Any], least: float = True) -> list[int]:
+    """Lengths of the runs of a (H, W) mask, column by column, the first of pixels that are not set: COCO's code.
+
+    Parameters
+    ----------
+    least
+        Of an image, the least value of a pixel that is set
+    """
+    rows = np.flatnonzero(mask.max(axis=1) >= least)  # most have no pixel that is set
+    y, x = np.nonzero(mask[rows] >= least)
+    flat = np.sort(
+        x * len(mask) + rows[y]
+    )  # a copy of the transposed mask would take ten times longer
+    if not len(flat):
+        return [mask.size]
+    breaks = np.flatnonzero(np.diff(flat) != 1)
+    first = np.concatenate([flat[:1], flat[breaks + 1]])
+    after = np.concatenate([flat[breaks], flat[-1:]]) + 1
+    ends = np.column_stack([first, after]).ravel()
+    lengths = np.diff(ends, prepend=0)
+    rest = mask.size - int(ends[-1])
+    return [*lengths.tolist(), *([rest] if rest else [])]

@@ -1,0 +1,406 @@
+"""Make the missing shards of a dataset on an engine of the studies, and keep what was made.
+
+A shard is complete when its index, the last of its files, is there. The workers write the files; this process writes
+`dataset.json` first, which says what the dataset is, and nothing later. So it can be killed at any time, and the same
+command continues: frames that are made again have the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from skysim.core import __version__
+from skysim.core.errors import OVERRIDES, InputError, unknown_name
+from skysim.core.random_streams import random_stream
+from skysim.core.yaml_reader import check_version, parse_yaml, read_yaml
+from skysim.experiments import dataset_shards
+from skysim.experiments.dataset_labels import LabelledFrame, label_frame, labeller
+from skysim.experiments.dataset_shards import Storage, TarWriter, shard_name
+from skysim.experiments.study import study_file
+from skysim.experiments.study.execution.engines import Chunk, Engine
+from skysim.experiments.study.execution.runner import Progress
+from skysim.experiments.study.execution.setups import (
+    TrialSetup,
+    code_version,
+    prepared_setup,
+    scene_hash,
+    seed_of,
+)
+from skysim.experiments.study.execution.trials import Segment
+from skysim.experiments.study.factors import Factor, Settings, Value
+from skysim.experiments.study.plan import (
+    TRIAL,
+    Plan,
+    TrialSpec,
+    digest,
+    resolve_point,
+    resolve_trial,
+)
+
+# What a dataset is: a scene, the random values of each frame, and how frames are divided into
+# shards.
+
+
+KEYS = ("schema", "set", "trial", "factors", "hardware")  # of a file of variations
+AS_IT_IS: dict[str, Any] = {
+    "variation": {"levels": {"none": {}}}
+}  # factors of a scene without variations
+TRACKED = f"{TRIAL}tracked"
+DRAW = (
+    2  # first of the four numbers of a draw's key; seeds of trials and of hardware have up to three
+)
+FORMATS = ("webdataset", "zarr", "coco")
+
+
+@dataclass(frozen=True)
+class DatasetPlan:
+    """A dataset that can be made on any worker.
+
+    Attributes
+    ----------
+    spec
+        Scene, seed, settings and trial of all frames
+    """
+
+    spec: TrialSpec
+    factors: dict[str, Factor]
+    frames: int
+    frames_per_shard: int
+    formats: tuple[str, ...]
+
+    @property
+    def shards(self) -> int:
+        """Number of shards; the last may have fewer frames."""
+        return -(-self.frames // self.frames_per_shard)
+
+    def frames_of(self, shard: int) -> range:
+        """The numbers of a shard's frames."""
+        first = shard * self.frames_per_shard
+        return range(first, min(first + self.frames_per_shard, self.frames))
+
+    def draw(self, shard: int, frame: int) -> tuple[dict[str, Value], Settings]:
+        """The level of each factor in a frame, and the settings that they make together."""
+        levels = {}
+        settings = Settings()
+        for n, (name, factor) in enumerate(self.factors.items()):
+            number = (0, frame) if is_of_frame(factor) else (1, shard)
+            u = float(random_stream(self.spec.seed, DRAW, *number, n).random())
+            levels[name], own = factor.value_at(u)
+            settings |= own
+        return levels, self.spec.trial_settings(settings, shard)
+
+    def seed(self, frame: int) -> int:
+        """The seed of a frame's attitude and noise."""
+        return seed_of(self.spec, 0, frame)
+
+    def manifest(self) -> dict[str, Any]:
+        """What makes the frames, for `dataset.json`."""
+        spec = self.spec
+        return {
+            "scene": spec.scene,
+            "scene_hash": scene_hash(resolve_point(spec, self.draw(0, 0)[1])[0]),
+            "seed": spec.seed,
+            "set": spec.base,
+            "trial": spec.trial,
+            "factors": {
+                name: factor.model_dump(mode="json", by_alias=True)
+                for name, factor in self.factors.items()
+            },
+            "hardware": list(spec.hardware),
+            "frames": self.frames,
+            "frames_per_shard": self.frames_per_shard,
+            "formats": list(self.formats),
+        }
+
+    @property
+    def digest(self) -> str:
+        """Hash of everything that the bytes of the dataset depend on, except the code."""
+        return digest(self.manifest())
+
+
+def keys_of(factor: Factor) -> set[str]:
+    """The keys that a factor sets."""
+    options = [settings for _, settings in factor.options()] or [factor.value_at(0.5)[1]]
+    return {key for settings in options for key in settings}
+
+
+def is_of_frame(factor: Factor) -> bool:
+    """Whether a factor sets keys of the trial alone, and is drawn in every frame."""
+    return all(key.startswith(TRIAL) for key in keys_of(factor))
+
+
+def load(
+    scene: str,
+    vary: Path | None,
+    frames: int,
+    *,
+    seed: int | None = None,
+    overrides: Mapping[str, str] | None = None,
+    frames_per_shard: int = 64,
+    formats: tuple[str, ...] = ("webdataset", "coco"),
+) -> DatasetPlan:
+    """The plan of a dataset. Raises InputError with one line.
+
+    Parameters
+    ----------
+    scene
+        Name or path
+    vary
+        File with the sections `set`, `trial`, `factors` and `hardware` of a study, or None
+    """
+    for name, count in (("frames", frames), ("frames_per_shard", frames_per_shard)):
+        if count < 1:
+            raise InputError(f"dataset.{name}", count, "1 or more")
+    for name in formats:
+        if name not in FORMATS:
+            raise InputError("dataset.formats", *unknown_name("format", name, FORMATS))
+    plan = study_plan(scene, vary, seed, overrides or {})
+    check_trial(plan, vary)
+    return DatasetPlan(
+        plan.spec, dict(plan.study.factors), frames, frames_per_shard, tuple(dict.fromkeys(formats))
+    )
+
+
+def check_trial(plan: Plan, vary: Path | None) -> None:
+    """Refuse the key of the trial that is for solving alone. Raises InputError."""
+    keys = {*(TRIAL + key for key in plan.spec.trial)}.union(
+        *map(keys_of, plan.study.factors.values())
+    )
+    if TRACKED in keys:
+        raise InputError(vary, f"{TRACKED}: no effect on single frames", "studies")
+
+
+def study_plan(
+    scene: str, vary: Path | None, seed: int | None, overrides: Mapping[str, str]
+) -> Plan:
+    """The plan of a study with this scene and these variations, validated as a study is. Raises InputError."""
+    tree, text = read_yaml(vary) if vary else ({"schema": 1}, "")
+    if vary:
+        check_version(tree, vary, text)
+    for key in tree:
+        if key not in KEYS:
+            raise InputError(vary, *unknown_name("key", key, KEYS))
+    trial = tree.get("trial") or {"kind": "frames"}
+    if not isinstance(trial, dict) or trial.get("kind", "frames") != "frames":
+        raise InputError(vary, "trial.kind: a dataset has frames", "frames")
+    settings = tree.get("set") or {}
+    if not isinstance(settings, dict):
+        raise InputError(vary, f"set: {settings!r}", "keys of the scene with their values")
+    settings = settings | {key: parse_yaml(value)[1] for key, value in overrides.items()}
+    tree = {
+        "title": "dataset",
+        "factors": AS_IT_IS,
+        "design": {"kind": "lhs", "points": 2},
+        "responses": ["identified"],
+        **tree,
+        "scene": scene,
+        "seed": 0 if seed is None else seed,
+        "trial": {**trial, "kind": "frames"},
+        "set": settings,
+    }
+    # Scenes are found from the folder of the command, not from that of the variations.
+    return study_file.plan_of(tree, text, vary or Path(OVERRIDES.file), Path.cwd() / "dataset")
+
+
+MANIFEST = "dataset.json"
+FORMAT = 1
+INDEX = "index"
+SOURCES = "sources"
+SHARDS = "shards"
+COCO = "coco"
+FOLDERS = {"webdataset": SHARDS, "coco": COCO}  # of the formats that have one
+
+
+class ShardResult(NamedTuple):
+    """A shard that was made, or why it was not."""
+
+    shard: int
+    frames: int
+    error: str | None = None
+
+
+@dataclass(frozen=True)
+class DatasetJob:
+    """The shards of a dataset as a job of the engines; an item is a shard."""
+
+    plan: DatasetPlan
+    url: str
+
+    def run(self, chunk: Chunk) -> list[ShardResult]:
+        """Make the shards of a chunk."""
+        return [make_shard(self.plan, Storage(self.url), segment.point) for segment in chunk]
+
+    def failed(self, segment: Segment, error: str) -> ShardResult:
+        """The result of a shard that repeatedly killed its worker."""
+        return ShardResult(segment.point, 0, error)
+
+
+class ShardQueue:
+    """The missing shards, one a chunk."""
+
+    def __init__(self, missing: list[int]) -> None:
+        self.missing = list(reversed(missing))
+
+    def next(self) -> Chunk:
+        """The next shard as a chunk; empty if nothing is left."""
+        if not self.missing:
+            return ()
+        shard = self.missing.pop()
+        return (Segment(shard, {}, shard, range(shard, shard + 1)),)
+
+    def report_time(self, chunk: Chunk, seconds: float) -> None:
+        """The size of a shard is that of the plan."""
+
+
+# On the workers.
+
+
+def labelled_frames(
+    plan: DatasetPlan, shard: int
+) -> Iterator[tuple[int, dict[str, Any], TrialSetup, LabelledFrame]]:
+    """The frames of a shard: number, level of each factor, lab, frame with labels."""
+    known = None  # settings of the frame before
+    for frame in plan.frames_of(shard):
+        levels, settings = plan.draw(shard, frame)
+        if known is None:
+            setup = prepared_setup(plan.spec, settings)
+            by = labeller(setup.lab.scene)
+        if settings != known:
+            setup = setup._replace(trial=resolve_trial(plan.spec, settings))
+            known = settings
+        yield frame, levels, setup, label_frame(setup, plan.seed(frame), by)
+
+
+def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
+    """Render a shard's frames and write all of its files, the index last."""
+    frames = plan.frames_of(shard)
+    rows = list[dict[str, Any]]()
+    sources = []
+    images = []
+    coco = []
+    name = shard_name(SHARDS, shard, "tar")
+    with storage.writer(name) if "webdataset" in plan.formats else nullcontext() as file:
+        tar = TarWriter(file) if file else None
+        for frame, levels, setup, one in labelled_frames(plan, shard):
+            numbers = {"frame": frame, "shard": shard, "seed": plan.seed(frame)}
+            row = dataset_shards.frame_labels(one, setup.lab.scene, numbers)
+            row |= {"pixel_type": one.frame.image_dn.dtype.str, "file": name if tar else ""}
+            row["position"] = (
+                dataset_shards.add_frame(tar, frame, one, row | {"levels": levels}) if tar else -1
+            )
+            rows.append(row | {"levels": json.dumps(levels, default=str)})
+            sources.append(one.sources)
+            if "zarr" in plan.formats:
+                images.append(one.frame.image_dn)
+            if "coco" in plan.formats:
+                coco.append(dataset_shards.coco_annotations(one, frame))
+        if tar:
+            tar.close()
+    if images:
+        dataset_shards.write_zarr(storage, frames.start, images, shard)
+    if "coco" in plan.formats:
+        storage.write(
+            shard_name(COCO, shard, "json"),
+            dataset_shards.coco_file(list(map(dataset_shards.coco_image, rows)), coco),
+        )
+    storage.write(
+        shard_name(SOURCES, shard, "parquet"), dataset_shards.sources_table(list(frames), sources)
+    )
+    storage.write(shard_name(INDEX, shard, "parquet"), dataset_shards.index_table(rows))
+    return ShardResult(shard, len(rows))
+
+
+# In the process of the command.
+
+
+def prepare(plan: DatasetPlan, storage: Storage) -> None:
+    """Write the manifest of a new dataset, or check that the one that is there is the plan's. Raises InputError."""
+    described = {
+        "made_by": "skysim",
+        "format": FORMAT,
+        "skysim": __version__,
+        "code": code_version(),
+    }
+    there = storage.names()
+    if MANIFEST in there:
+        check_manifest(storage, described | {"digest": plan.digest})
+    elif there:
+        raise InputError(storage.url, f"contains {min(there)}", "an empty folder, or this dataset")
+    else:
+        storage.prepare(())
+        text = json.dumps(
+            described | {"digest": plan.digest} | plan.manifest(), indent=1, default=str
+        )
+        storage.write(MANIFEST, text.encode())
+    storage.prepare(folders_of(plan))
+    if "zarr" in plan.formats and not dataset_shards.zarr_is_there(storage):
+        image = next(labelled_frames(plan, 0))[3].frame.image_dn
+        dataset_shards.create_zarr(storage, plan.frames, plan.frames_per_shard, image)
+
+
+def folders_of(plan: DatasetPlan) -> tuple[str, ...]:
+    """The folders of a dataset's files, without Zarr's."""
+    return (INDEX, SOURCES, *(folder for name, folder in FOLDERS.items() if name in plan.formats))
+
+
+def check_manifest(storage: Storage, own: dict[str, Any]) -> None:
+    """Raise InputError if a dataset is another one, or of another version."""
+    try:
+        stored = json.loads(storage.read_text(MANIFEST))
+        kept = {key: stored[key] for key in own}
+    except (LookupError, TypeError, ValueError, RecursionError):
+        raise InputError(
+            storage.url, f"{MANIFEST} is not that of a dataset", "an empty folder"
+        ) from None
+    if kept["format"] != FORMAT:
+        raise InputError(
+            storage.url, f"a dataset of format {kept['format']}", f"{FORMAT}, or another folder"
+        )
+    if kept["digest"] != own["digest"]:
+        raise InputError(
+            storage.url,
+            "contains another dataset or an earlier version of this one",
+            "another folder",
+        )
+    if kept["code"] != own["code"]:
+        raise InputError(
+            storage.url,
+            f"made by skysim {kept['skysim']}, code {kept['code']}",
+            f"{own['code']}, the version here, or another folder",
+        )
+
+
+def missing_shards(plan: DatasetPlan, storage: Storage) -> list[int]:
+    """The shards whose index is not there."""
+    there = storage.names(INDEX)
+    return [
+        shard for shard in range(plan.shards) if shard_name("", shard, "parquet")[1:] not in there
+    ]
+
+
+def run(
+    plan: DatasetPlan, url: str, engine: Engine, watch: Callable[[Progress], Any] | None = None
+) -> Progress:
+    """Make the missing shards. Progress counts frames, and as failed those of shards that killed their workers."""
+    storage = Storage(url)
+    prepare(plan, storage)
+    missing = missing_shards(plan, storage)
+    left = sum(len(plan.frames_of(shard)) for shard in missing)
+    progress = Progress(plan.frames, plan.frames - left, began=time.perf_counter())
+    for results in engine.run(DatasetJob(plan, url), ShardQueue(missing)) if missing else ():
+        for result in results:
+            progress.done += result.frames
+            progress.now += result.frames
+            progress.failed += len(plan.frames_of(result.shard)) if result.error else 0
+        if watch:
+            watch(progress)
+    storage.prepare(
+        folders_of(plan)
+    )  # workers of a killed run may have been writing when this one began
+    return progress

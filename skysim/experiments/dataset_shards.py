@@ -1,0 +1,431 @@
+"""The files of one shard: a tar of frames and labels (WebDataset), COCO JSON, part of a Zarr array, Parquet tables."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+import tarfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.core.types import ra_dec_roll_rad
+from skysim.core.errors import InputError
+from skysim.core.files import atomic_file, make_folder
+from skysim.core.jit import jit
+from skysim.core.types import Floats
+from skysim.experiments.dataset_labels import MASKS, Extents, LabelledFrame
+from skysim.scene.scene import Scene
+from skysim.scene.sections.light import StarsConfig
+
+# The folder of a dataset: any URL that fsspec knows. A local file appears whole or not at all, as
+# an object does.
+
+
+EXTRA = "needs optional packages: pip install 'skysim[dataset]'"
+URLS = "a folder, or a URL such as s3://bucket/folder"
+
+
+class Storage:
+    """Files of a dataset by name. Raises InputError for a URL that cannot be opened."""
+
+    def __init__(self, url: str) -> None:
+        try:
+            from fsspec.core import url_to_fs
+        except ImportError:
+            raise InputError(url, f"a dataset {EXTRA}") from None
+        try:
+            self.files, self.root = url_to_fs(url)
+        except ImportError as error:
+            raise InputError(url, f"{error}; {EXTRA}") from None
+        except (OSError, ValueError) as error:
+            raise InputError(url, error, URLS) from None
+        self.url = url
+        self.is_local = "file" in (self.files.protocol, *self.files.protocol)
+
+    def path(self, name: str) -> str:
+        """The path of a file in the file system."""
+        return f"{self.root.rstrip('/')}/{name}"
+
+    def names(self, folder: str = "") -> set[str]:
+        """Names of the files of a folder; empty if there is none. Raises InputError if it cannot be read."""
+        with self.errors():
+            self.files.invalidate_cache()
+            try:
+                found = self.files.ls(self.path(folder), detail=False)
+            except FileNotFoundError:
+                return set()
+        names = {str(path).rstrip("/").rsplit("/", 1)[-1] for path in found}
+        return {name for name in names if name and not name.startswith(".")}
+
+    def read_text(self, name: str) -> str:
+        """A text file. Raises InputError if it cannot be read."""
+        with self.errors():
+            return str(self.files.cat_file(self.path(name)).decode("utf-8", "replace"))
+
+    def prepare(self, folders: tuple[str, ...]) -> None:
+        """Create the folders, without temporary files of writers that were killed."""
+        if self.is_local:
+            for folder in ("", *folders):
+                make_folder(Path(self.path(folder)))
+
+    @contextmanager
+    def writer(self, name: str) -> Iterator[IO[bytes]]:
+        """A file that is written from its begin to its end."""
+        if self.is_local:
+            with atomic_file(Path(self.path(name))) as temporary, temporary.open("wb") as file:
+                yield file
+            return
+        with self.errors(), self.files.open(self.path(name), "wb") as file:
+            yield file
+
+    def write(self, name: str, data: bytes) -> None:
+        """Write a whole file."""
+        with self.writer(name) as file:
+            file.write(data)
+
+    def zarr_store(self, name: str) -> Any:
+        """The store of a Zarr group."""
+        from zarr.storage import FsspecStore, LocalStore
+
+        return (
+            LocalStore(self.path(name))
+            if self.is_local
+            else FsspecStore.from_url(f"{self.url.rstrip('/')}/{name}")
+        )
+
+    @contextmanager
+    def errors(self) -> Iterator[None]:
+        """Raise InputError for what a server refuses or a network loses; errors of local files name their file."""
+        try:
+            yield
+        except InputError:
+            raise
+        except Exception as error:
+            if self.is_local:
+                raise
+            raise InputError(self.url, error, f"{URLS} that can be written") from None
+
+
+ZARR = "images.zarr"
+ZARR_ARRAY = "images"
+BLOCK = 512  # bytes of a block of a tar file
+COCO_SNR = 3.0  # sources below are no annotations; they are in the other labels
+CATEGORIES = ("source", *MASKS)
+COMMA, SPACE, MINUS, POINT, ZERO = b", -.0"
+SOURCE_JSON = (
+    '{"id": %d, "image_id": %d, "category_id": 1, "bbox": [%s], "area": %r, '
+    '"segmentation": [[%s]], "iscrowd": 0, "source": %d, "electrons": %r, "detected": %s}'
+)
+
+
+def to_npy(array: NDArray[Any]) -> bytes:
+    """The header of an array in NumPy's format, version 1."""
+    file = io.BytesIO()
+    description = np.lib.format.header_data_from_array_1_0(array)
+    np.lib.format.write_array_header_1_0(file, description)
+    return file.getvalue()
+
+
+class TarWriter:
+    """A tar file in the POSIX ustar format, without times and owners, so that the same frames give the same bytes."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self.file = file
+        self.position = 0
+
+    def add(self, name: str, *parts: bytes | memoryview) -> int:
+        """Append a file that is made of some parts; return the position of the last part in the tar."""
+        header = tarfile.TarInfo(name)
+        header.size = sum(len(part) for part in parts)
+        self._write(header.tobuf(tarfile.USTAR_FORMAT))
+        for part in parts:
+            last = self.position
+            self._write(part)
+        self._write(bytes(-self.position % BLOCK))
+        return last
+
+    def close(self) -> None:
+        """Write the two empty blocks at the end."""
+        self._write(bytes(2 * BLOCK))
+
+    def _write(self, data: bytes | memoryview) -> None:
+        self.file.write(data)
+        self.position += len(data)
+
+
+def key_of(frame: int) -> str:
+    """The key of a frame's files in a shard."""
+    return f"{frame:09d}"
+
+
+def shard_name(folder: str, shard: int, suffix: str) -> str:
+    """Name of a shard's file in the dataset."""
+    return f"{folder}/{shard:06d}.{suffix}"
+
+
+def add_frame(tar: TarWriter, number: int, one: LabelledFrame, labels: dict[str, Any]) -> int:
+    """Append a frame with its labels; return the position of its first pixel."""
+    key = key_of(number)
+    image = np.ascontiguousarray(one.frame.image_dn)
+    position = tar.add(f"{key}.image.npy", to_npy(image), image.data.cast("B"))
+    tar.add(f"{key}.sources.npy", to_npy(one.sources), one.sources.tobytes())
+    masks = {
+        name: {"size": list(image.shape), "counts": counts} for name, counts in one.masks.items()
+    }
+    more = {
+        "masks": masks,
+        "unmatched_px": one.unmatched_px.tolist(),
+        "hidden": one.truth.hidden.tolist(),
+    }
+    tar.add(f"{key}.frame.json", json.dumps(labels | more).encode())
+    return position
+
+
+def frame_labels(one: LabelledFrame, scene: Scene, numbers: dict[str, Any]) -> dict[str, Any]:
+    """The labels of a frame that are one number each, by column of the index; `numbers` come first."""
+    truth = one.truth
+    frame = one.frame
+    labels = {**numbers, "height": frame.image_dn.shape[0], "width": frame.image_dn.shape[1]}
+    labels |= {"exposure_s": frame.exposure_s, "saturation_dn": frame.saturation_dn}
+    for name in ("lab_from_body", "cam_from_lab"):
+        rotation: Rotation = getattr(truth, name)
+        labels |= {
+            f"{name}_q{end}": float(q) for end, q in zip("xyzw", rotation.as_quat(), strict=True)
+        }
+    labels |= {
+        f"rate_cam_{end}_rad_s": float(rate)
+        for end, rate in zip("xyz", truth.rate_cam_rad_s, strict=True)
+    }
+    if isinstance(scene.light, StarsConfig):
+        angles = np.degrees(ra_dec_roll_rad(truth.cam_from_lab))
+        labels |= dict(zip(("ra_deg", "dec_deg", "roll_deg"), map(float, angles), strict=True))
+    labels |= {"sources": len(one.sources), "detected": int(one.sources["detected"].sum())}
+    labels["unmatched"] = len(one.unmatched_px)
+    return labels | {f"{name}_pixels": sum(one.masks.get(name, [])[1::2]) for name in MASKS}
+
+
+# COCO.
+
+
+def coco_image(labels: dict[str, Any]) -> dict[str, Any]:
+    """The entry of an image; its file is that in the tar of the shard."""
+    name = f"{shard_name('shards', labels['shard'], 'tar')}/{key_of(labels['frame'])}.image.npy"
+    return {
+        "id": labels["frame"],
+        "file_name": name,
+        "height": labels["height"],
+        "width": labels["width"],
+    }
+
+
+def coco_annotations(one: LabelledFrame, number: int) -> bytes:
+    """JSON objects, joined by commas: outlines of the sources, and masks of the rest as crowds.
+
+    Ids are unique in the dataset. A source is written as `json.dumps` would write it, ten times as fast.
+    """
+    seen = one.sources["snr"] >= COCO_SNR
+    rows = one.sources[seen]
+    first = number * 100_000 + 1
+    boxes, corners = outlines(one.extents.of(seen))
+    ids = rows["id"].tolist()
+    detected = (("false", "true")[one] for one in rows["detected"].tolist())
+    areas = (boxes[:, 2] * boxes[:, 3]).tolist()
+    columns = (
+        hundredths(boxes),
+        areas,
+        hundredths(corners),
+        ids,
+        rows["electrons"].tolist(),
+        detected,
+    )
+    found = [
+        SOURCE_JSON % (first + n, number, *each)
+        for n, each in enumerate(zip(*columns, strict=True))
+    ]
+    height, width = one.frame.image_dn.shape
+    for name, counts in one.masks.items():
+        if len(counts) > 1:
+            code = {"size": [height, width], "counts": counts}
+            mask = {
+                "bbox": mask_box(counts, height),
+                "area": sum(counts[1::2]),
+                "segmentation": code,
+                "iscrowd": 1,
+            }
+            numbers = {
+                "id": first + len(found),
+                "image_id": number,
+                "category_id": 1 + CATEGORIES.index(name),
+            }
+            found.append(json.dumps(numbers | mask))
+    return ", ".join(found).encode()
+
+
+def outlines(extents: Extents) -> tuple[Floats, Floats]:
+    """(N, 4) boxes (x, y, width, height) and (N, 8) outlines (x, y of four corners).
+
+    COCO's origin is the corner of the first pixel, half a pixel from its center.
+    """
+    across = extents.along[:, ::-1] * [-1, 1]
+    a = extents.along * extents.half_px[:, :1]
+    b = across * extents.half_px[:, 1:]
+    corners = np.round(
+        extents.center_px[:, None] + 0.5 + np.stack([-a - b, a - b, a + b, b - a], axis=1), 2
+    )
+    low = corners.min(axis=1)
+    high = corners.max(axis=1)
+    return np.round(np.column_stack([low, high - low]), 2), corners.reshape(-1, 8)
+
+
+def hundredths(numbers: Floats) -> list[str]:
+    """The rows of (N, K) finite numbers with two decimals, as `json.dumps` writes a list without its brackets."""
+    steps = np.rint(100 * np.abs(numbers)).astype(np.int64)
+    text, ends = _hundredths(steps, np.signbit(numbers))
+    whole = text[: ends[-1]].tobytes().decode("ascii")
+    return [whole[begin:end] for begin, end in itertools.pairwise(ends.tolist())]
+
+
+@jit
+def _hundredths(
+    steps: NDArray[np.int64], negative: NDArray[np.bool_]
+) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """The ASCII of numbers of hundredths with their signs, and where each row ends in it, after a first 0."""
+    digits = np.empty(20, np.uint8)
+    ends = np.zeros(len(steps) + 1, np.int64)
+    text = np.empty(steps.size * 25, np.uint8)
+    at = 0
+    for n in range(len(steps)):
+        for k in range(steps.shape[1]):
+            if k:
+                text[at] = COMMA
+                text[at + 1] = SPACE
+                at += 2
+            if negative[n, k]:
+                text[at] = MINUS
+                at += 1
+            left = steps[n, k] // 100
+            count = 0
+            while left or count == 0:
+                digits[count] = ZERO + left % 10
+                left //= 10
+                count += 1
+            for i in range(count):
+                text[at + i] = digits[count - 1 - i]
+            at += count
+            text[at] = POINT
+            text[at + 1] = ZERO + steps[n, k] // 10 % 10
+            at += 2
+            if steps[n, k] % 10:
+                text[at] = ZERO + steps[n, k] % 10
+                at += 1
+        ends[n + 1] = at
+    return text, ends
+
+
+def mask_box(counts: list[int], height: int) -> list[float]:
+    """The box about the pixels of a mask."""
+    ends = np.cumsum(counts)
+    first = ends[:-1:2]
+    last = ends[1::2] - 1
+    x0 = int(first[0] // height)
+    x1 = int(last[-1] // height)
+    whole = (
+        first // height != last // height
+    )  # a run over the end of a column has its first and its last row
+    y0 = 0 if whole.any() else int((first % height).min())
+    y1 = height - 1 if whole.any() else int((last % height).max())
+    return [float(x0), float(y0), float(x1 - x0 + 1), float(y1 - y0 + 1)]
+
+
+def coco_file(images: list[dict[str, Any]], annotations: list[bytes]) -> bytes:
+    """A COCO file of one shard, from the annotations of each frame."""
+    categories = json.dumps(
+        [{"id": n, "name": name} for n, name in enumerate(CATEGORIES, 1)]
+    ).encode()
+    parts = (json.dumps(images).encode(), b", ".join(filter(None, annotations)), categories)
+    return b'{"images": %b, "annotations": [%b], "categories": %b}' % parts
+
+
+# Tables.
+
+
+def parquet(columns: dict[str, Any]) -> bytes:
+    """A Parquet file of some columns, the same bytes for the same columns. Raises InputError without pyarrow."""
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise InputError("", f"a dataset {EXTRA}") from None
+    sink = pyarrow.BufferOutputStream()
+    pyarrow.parquet.write_table(pyarrow.table(columns), sink, compression="zstd")
+    return bytes(sink.getvalue())
+
+
+def index_table(rows: list[dict[str, Any]]) -> bytes:
+    """The index of a shard: a row for each frame."""
+    return parquet({name: [row[name] for row in rows] for name in rows[0]})
+
+
+def sources_table(frames: list[int], sources: list[NDArray[Any]]) -> bytes:
+    """The sources of a shard: a row for each source of each frame."""
+    rows = np.concatenate(sources)
+    number = np.repeat(frames, [len(one) for one in sources])
+    return parquet(
+        {
+            "frame": number,
+            **{name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names or ()},
+        }
+    )
+
+
+# Zarr.
+
+
+def require_zarr() -> Any:
+    """The package zarr. Raises InputError."""
+    try:
+        import zarr
+    except ImportError:
+        raise InputError("dataset.formats", f"zarr {EXTRA}") from None
+    return zarr
+
+
+def zarr_is_there(storage: Storage) -> bool:
+    """Whether the array was created: its description is written last."""
+    return "zarr.json" in storage.names(f"{ZARR}/{ZARR_ARRAY}")
+
+
+def create_zarr(storage: Storage, frames: int, per_shard: int, image: NDArray[Any]) -> None:
+    """Create the array of all images, of the size and the type of this one; its shards are the dataset's."""
+    shape = image.shape
+    group = require_zarr().create_group(storage.zarr_store(ZARR), zarr_format=3, overwrite=True)
+    group.create_array(
+        ZARR_ARRAY,
+        shape=(frames, *shape),
+        chunks=(1, *shape),
+        shards=(per_shard, *shape),
+        dtype=image.dtype,
+        dimension_names=("frame", "y", "x"),
+        attributes={"units": "DN"},
+    )
+
+
+def write_zarr(storage: Storage, first: int, images: list[NDArray[Any]], shard: int) -> None:
+    """Write the images of one shard, which is one object. Raises InputError for an image of another size."""
+    array = require_zarr().open_group(storage.zarr_store(ZARR), mode="r+")[ZARR_ARRAY]
+    for n, image in enumerate(images):
+        if image.shape != array.shape[1:] or image.dtype != array.dtype:
+            raise InputError(
+                "dataset.formats",
+                f"zarr: frame {first + n} of shard {shard} is {image.shape[1]}x{image.shape[0]} {image.dtype}, the"
+                f" first one {array.shape[2]}x{array.shape[1]} {array.dtype}",
+                "one size, or webdataset",
+            )
+    array[first : first + len(images)] = np.stack(images)

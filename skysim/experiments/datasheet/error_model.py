@@ -1,0 +1,196 @@
+"""Attitude errors of a star tracker from the constants of its datasheet, without frames. Needs NumPy alone.
+
+The errors about the camera's axes x, y (across the boresight) and z (about it) at the time k are
+
+    e_k = bias + s_k (field f_k + pixel p_k + noise(rate) n_k + along(rate) m_k u),      s_k^2 of mean 1,
+
+n and m white, u the axis of the rate across the boresight (a streak's centroid errs more along the streak, and so the
+attitude about the axis of the motion), f and p Gauss-Markov processes of the angle that the boresight has turned, with
+a correlation angle each, and s the scale of the field: a lognormal process of that angle, since a field with few stars
+errs more. At rest f, p and s are constant. bias is the mean and the draw of the unit. All are independent; the scale is
+common to the axes.
+
+    model = ErrorModel.read("tracker_error.json")
+    errors_arcsec = model.draw(rate_deg_s, step_s, np.random.default_rng(1))     # (N, 3)
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+AXES = ("x", "y", "roll")
+
+
+class State(NamedTuple):
+    """What is kept from one time to the next: standard normal numbers, the unit's bias and the axis of the rate.
+
+    Attributes
+    ----------
+    field, pixel
+        (3,)
+    scale
+        A number
+    bias
+        (3,) arcseconds
+    axis_rad
+        Angle of the axis from x toward y
+    """
+
+    field: Any
+    pixel: Any
+    scale: float
+    bias: Any
+    axis_rad: float
+
+
+class ErrorModel:
+    """Constants of one tracker.
+
+    Attributes
+    ----------
+    constants
+        Mean, unit, field, pixel (x, y, roll: arcseconds, 1 sigma), scale (x, y, roll: standard
+        deviation of the logarithm of the variance), field_deg, pixel_deg, scale_deg
+        (correlation angles), rates_deg_s, noise (for each rate x, y, roll in arcseconds) and
+        along (for each rate what is added about its axis, arcseconds); both are linear between
+        the rates and constant beyond the last
+    """
+
+    def __init__(self, constants: dict[str, Any]) -> None:
+        self.constants = constants
+        self.mean, self.unit, self.field, self.pixel, self.scale = (
+            np.array(constants[name], dtype=float)
+            for name in ("mean", "unit", "field", "pixel", "scale")
+        )
+        self.rates_deg_s = np.array(constants["rates_deg_s"], dtype=float)
+        self.noise = np.array(constants["noise"], dtype=float)
+        self.along = np.array(constants["along"], dtype=float)
+
+    @classmethod
+    def read(cls, path: Any) -> ErrorModel:
+        """The model of a JSON file."""
+        with open(path, encoding="utf-8") as file:
+            return cls(json.load(file))
+
+    def start(self, rng: Any, unit: bool = True) -> State:
+        """The state of a new unit in a random field, turning about a random axis across the boresight.
+
+        Parameters
+        ----------
+        unit
+            Whether its bias is drawn, or the mean of all units
+        """
+        bias = self.mean + (self.unit * rng.standard_normal(3) if unit else 0.0)
+        axis_rad = float(rng.uniform(0, 2 * math.pi))
+        return State(
+            rng.standard_normal(3),
+            rng.standard_normal(3),
+            float(rng.standard_normal()),
+            bias,
+            axis_rad,
+        )
+
+    def noise_arcsec(self, rate_deg_s: Any) -> Any:
+        """(N, 3) standard deviation of the noise at (N,) rates, without what is added about the rate's axis."""
+        return np.stack(
+            [np.interp(rate_deg_s, self.rates_deg_s, column) for column in self.noise.T], axis=-1
+        )
+
+    def along_arcsec(self, rate_deg_s: Any) -> Any:
+        """(N,) standard deviation of what is added about the rate's axis."""
+        return np.interp(rate_deg_s, self.rates_deg_s, self.along)
+
+    def drawn_noise(self, rate_deg_s: Any, axis_rad: Any, rng: Any) -> Any:
+        """(N, 3) temporal noise at (N,) rates about an axis, or one for each."""
+        noise = self.noise_arcsec(rate_deg_s) * rng.standard_normal((len(rate_deg_s), 3))
+        along = self.along_arcsec(rate_deg_s) * rng.standard_normal(len(rate_deg_s))
+        noise[:, 0] += along * np.cos(axis_rad)
+        noise[:, 1] += along * np.sin(axis_rad)
+        return noise
+
+    def draw(
+        self,
+        rate_deg_s: Any,
+        step_s: float,
+        rng: Any,
+        state: State | None = None,
+        axis_rad: Any | None = None,
+    ) -> Any:
+        """(N, 3) errors in arcseconds, at times step_s apart.
+
+        Parameters
+        ----------
+        rate_deg_s
+            (N,) rate of the boresight; from one time to the next it turns by rate times step
+        state
+            At the first time; that of a new unit in a random field if left out
+        axis_rad
+            Angle of the rate's axis from the camera's x toward y, or (N,); that of the state if
+            left out
+        """
+        rate = np.abs(np.asarray(rate_deg_s, dtype=float))
+        first = self.start(rng) if state is None else state
+        turned = rate * step_s
+        field, pixel, scale = (
+            correlated(turned / self.constants[f"{name}_deg"], getattr(first, name), rng)
+            for name in ("field", "pixel", "scale")
+        )
+        slow = self.field * field + self.pixel * pixel
+        noise = self.drawn_noise(rate, first.axis_rad if axis_rad is None else axis_rad, rng)
+        return first.bias + self.scales(scale) * (slow + noise)
+
+    def step(self, state: State, rate_deg_s: float, step_s: float, rng: Any) -> tuple[State, Any]:
+        """The state one step later, and its (3,) errors in arcseconds."""
+        turned = abs(rate_deg_s) * step_s
+        new = []
+        for name in ("field", "pixel", "scale"):
+            left = math.exp(-turned / self.constants[f"{name}_deg"])
+            old = getattr(state, name)
+            new.append(left * old + math.sqrt(1 - left * left) * rng.standard_normal(np.shape(old)))
+        later = state._replace(field=new[0], pixel=new[1], scale=float(new[2]))
+        noise = self.drawn_noise(np.array([abs(rate_deg_s)]), state.axis_rad, rng)[0]
+        slow = self.field * later.field + self.pixel * later.pixel
+        return later, later.bias + self.scales(np.array([later.scale]))[0] * (slow + noise)
+
+    def correlation(self, angle_deg: float, rate_deg_s: float) -> Any:
+        """(3,) correlation of two errors of one unit at a rate, between which the boresight turns by an angle.
+
+        The mean over all axes of the rate, about which x and y have half of what is added along each.
+
+        E[s_k s_l] = exp(-v^2 (1 - r) / 4) for lognormal scales whose normal numbers have the correlation r.
+        """
+        field, pixel, scale = (
+            math.exp(-abs(angle_deg) / self.constants[f"{name}_deg"])
+            for name in ("field", "pixel", "scale")
+        )
+        noise = self.noise_arcsec(np.array([abs(rate_deg_s)]))[0]
+        shared = self.field**2 * field + self.pixel**2 * pixel
+        along = self.along_arcsec(abs(rate_deg_s)) ** 2 / 2 * np.array([1.0, 1.0, 0.0])
+        total = self.field**2 + self.pixel**2 + noise**2 + along
+        return np.exp(-(self.scale**2) * (1 - scale) / 4) * shared / total
+
+    def scales(self, normal: Any) -> Any:
+        """(N, 3) scales of standard normal numbers: s^2 = exp(v q - v^2 / 2) has the mean 1."""
+        return np.exp(0.5 * (np.multiply.outer(normal, self.scale) - self.scale**2 / 2))
+
+
+def correlated(steps: Any, first: Any, rng: Any) -> Any:
+    """(N, ...) Gauss-Markov process x_k = c_k x_(k-1) + sqrt(1 - c_k^2) n_k from x_0 = first, c_k = exp(-steps_k).
+
+    The recursion is composed in log2 N passes over the array (Hillis & Steele 1986), without a loop over the times.
+    """
+    shape = (len(steps), *np.shape(first))
+    left = np.exp(-np.asarray(steps)).reshape(-1, *[1] * np.ndim(first))
+    values = np.sqrt(1 - left**2) * rng.standard_normal(shape)
+    values[0] = first
+    left[0] = 0.0
+    shift = 1
+    while shift < len(values) and left.any():
+        values[shift:] += left[shift:] * values[:-shift]
+        left[shift:] *= left[:-shift].copy()
+        shift *= 2
+    return values

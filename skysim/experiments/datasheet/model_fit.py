@@ -1,0 +1,327 @@
+"""Fit the constants of a measurement model to the frames of a datasheet."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from skysim.core.errors import InputError
+from skysim.core.files import make_folder, to_json, write_text
+from skysim.core.random_streams import random_stream
+from skysim.core.types import Floats
+from skysim.experiments.datasheet.cells import MeasuredFrames
+from skysim.experiments.datasheet.error_model import AXES, ErrorModel
+from skysim.experiments.datasheet.variance_components import (
+    GROUPS,
+    components,
+    effects,
+    mean_known,
+    term_errors,
+)
+from skysim.experiments.study.execution import setups, trials
+
+GRID = 60  # correlation angles that are tried
+LEAST_NOISE = (
+    0.05  # of the mean square at a rate: noise below it cannot be separated from the slow terms
+)
+
+
+def constants(sheet: MeasuredFrames) -> dict[str, Any]:
+    """The constants of `errors.ErrorModel` for the scene of a datasheet."""
+    errors, _ = term_errors(sheet)
+    found = [components(one) for one in errors]
+    field, pixel = (
+        np.sqrt(np.maximum([getattr(one, name) for one in found], 0)) for name in ("field", "pixel")
+    )
+    bias = [bias_terms(one) for one in errors]
+    across, about = (log_scale(*field_variances(sheet, axes)) for axes in GROUPS.values())
+    mean = [one[0] for one in bias]
+    by_rate = errors_by_rate(sheet)
+    squares = np.array([mean_known(one**2, (1, 2)) for one in by_rate.values()])
+    along = np.array([along_square(sheet, rate, mean, found) for rate, found in by_rate.items()])
+    slow = np.square(mean) + field**2 + pixel**2 + np.outer(along / 2, [1.0, 1.0, 0.0])
+    noise = np.sqrt(np.maximum(squares - slow, LEAST_NOISE * squares))
+    rest = np.sqrt([one.temporal for one in found])
+    return {
+        "scene": sheet.scene.name,
+        "axes": list(AXES),
+        "mean": mean,
+        "unit": [one[1] for one in bias],
+        "field": field.tolist(),
+        "pixel": pixel.tolist(),
+        "scale": [across, across, about],
+        "field_deg": field_angle_deg(sheet, field, pixel, mean),
+        "pixel_deg": sheet.designer.pixel_deg,
+        "scale_deg": sheet.designer.half_field_deg,
+        "rates_deg_s": list(by_rate),
+        "noise": [rest.tolist(), *noise[1:].tolist()],
+        "along": np.sqrt(along).tolist(),
+    }
+
+
+def bias_terms(errors: Floats) -> tuple[float, float]:
+    """Mean and standard deviation among units of the (fields, units, states, attitudes, frames) errors of one axis."""
+    means = errors.mean(axis=(3, 4))
+    present = [axis for axis in range(3) if means.shape[axis] > 1]
+    scatter = effects(means, present).get((1,), 0.0)
+    return float(errors.mean()), math.sqrt(max(scatter, 0.0))
+
+
+def log_scale(first: Floats, second: Floats) -> float:
+    """Standard deviation of the logarithm of a field's noise variance, from two estimates of it in each of (F,) fields.
+
+    A lognormal variance has E[v^2] / E[v]^2 = exp(scale^2). The estimates are of other frames, so their errors are
+    independent and the mean of their product is E[v^2].
+    """
+    ratio = float(np.mean(first * second) / (first.mean() * second.mean()))
+    return math.sqrt(math.log(max(ratio, 1.0)))
+
+
+def field_variances(sheet: MeasuredFrames, axes: slice) -> tuple[Floats, Floats]:
+    """Two estimates of the noise variance in each field: of the terms' frames, and of the sequence at rest."""
+    errors, solved = term_errors(sheet)
+    terms = np.var(errors[axes], axis=-1, ddof=1).mean(axis=(0, 2, 3, 4))
+    rest = sequences(sheet, 0.0)[1][axes][:, :, solved]
+    known = np.isfinite(rest).all(axis=(0, 1))
+    return terms[known], np.var(rest[:, :, known], axis=1, ddof=1).mean(axis=0)
+
+
+def sequences(sheet: MeasuredFrames, rate_deg_s: float) -> tuple[list[int], Floats]:
+    """Steps and (3, steps, fields) errors of the sequences at one rate."""
+    rows = sheet.rows("sequence", rate_deg_s=rate_deg_s)
+    return [sheet.cells[row].levels["step"] for row in rows], sheet.errors(rows)
+
+
+def errors_by_rate(sheet: MeasuredFrames) -> dict[float, Floats]:
+    """(3, frames, fields) errors by rate, from rest on: of the sequences, and of the faster pairs of frames."""
+    sequenced = sheet.levels("sequence", "rate_deg_s")
+    faster = [rate for rate in sheet.levels("rate", "rate_deg_s") if rate > max(sequenced)]
+    found = {rate: sequences(sheet, rate)[1] for rate in sequenced}
+    return found | {rate: sheet.errors(sheet.rows("rate", rate_deg_s=rate)) for rate in faster}
+
+
+def along_square(
+    sheet: MeasuredFrames, rate_deg_s: float, mean: list[float], errors: Floats
+) -> float:
+    """Mean square of the errors about the rate's axis beyond that about the other axis across the boresight.
+
+    Parameters
+    ----------
+    errors
+        (3, frames, fields), whose means are taken off;  0 at rest, and where the difference is
+        negative
+    """
+    if not rate_deg_s:
+        return 0.0
+    angle_rad = axes_rad(sheet, rate_deg_s)
+    x, y = errors[:2] - np.array(mean)[:2, None, None]
+    about = x * np.cos(angle_rad) + y * np.sin(angle_rad)
+    other = y * np.cos(angle_rad) - x * np.sin(angle_rad)
+    return max(float(mean_known(about**2) - mean_known(other**2)), 0.0)
+
+
+def axes_rad(sheet: MeasuredFrames, rate_deg_s: float) -> Floats:
+    """(fields,) angle of the axis of a rate from the camera's x toward y, as the trials at this rate draw it again."""
+    rows = sheet.rows("sequence", rate_deg_s=rate_deg_s) or sheet.rows(
+        "rate", rate_deg_s=rate_deg_s
+    )
+    setup = setups.prepared_setup(sheet.spec, sheet.cells[rows[0]].settings)
+    seeds = sheet.column("seed", rows[:1])[0].tolist()
+    axes = np.array(
+        [trials.attitude_and_axis(setup, trials.streams(setup, seed)[0])[1] for seed in seeds]
+    )
+    return np.asarray(np.arctan2(axes[:, 1], axes[:, 0]))
+
+
+def lagged(sheet: MeasuredFrames, mean: list[float]) -> tuple[Floats, Floats, Floats]:
+    """Angles in degrees between frames of the sequences, the products of their errors, and the mean square at the rate.
+
+    (M,) each, the mean over the fields and the axes across the boresight, without the mean error; arcsec^2
+    """
+    angles = []
+    products = []
+    squares = []
+    for rate in sheet.levels("sequence", "rate_deg_s"):
+        steps, errors = sequences(sheet, rate)
+        errors = errors[:2] - np.array(mean)[:2, None, None]
+        square = mean_known(errors**2)
+        for first in range(len(steps)):
+            for second in range(first + 1, len(steps)):
+                apart = steps[second] - steps[first]
+                angles.append(rate * apart / sheet.scene.exposure.rate_hz)
+                products.append(mean_known(errors[:, first] * errors[:, second]))
+                squares.append(square)
+    return np.array(angles), np.array(products), np.array(squares)
+
+
+def field_angle_deg(
+    sheet: MeasuredFrames, field: Floats, pixel: Floats, mean: list[float]
+) -> float:
+    """The correlation angle of the field term: that with the least squares of the lagged products.
+
+    They are fitted by a exp(-angle / field_deg) + b exp(-angle / pixel_deg) with a : b as the terms at rest, each in
+    units of the mean square at its rate, to which its error is proportional; between a pixel and four fields.
+    """
+    angles, products, squares = lagged(sheet, mean)
+    pixel_deg = sheet.designer.pixel_deg
+    weight = float(np.sum(field[:2] ** 2))
+    total = weight + float(np.sum(pixel[:2] ** 2))
+    trials_deg = np.geomspace(pixel_deg, 8 * sheet.designer.half_field_deg, GRID)
+    if not total:
+        return float(trials_deg[-1])
+    found = products / squares
+    left = []
+    for angle in trials_deg:
+        shape = (
+            (weight * np.exp(-angles / angle) + (total - weight) * np.exp(-angles / pixel_deg))
+            / total
+            / squares
+        )
+        left.append(float(np.sum((found - shape * (shape @ found) / (shape @ shape)) ** 2)))
+    return float(trials_deg[int(np.argmin(left))])
+
+
+# Compare a measurement model with frames that it was not fitted to: distribution by rate, and
+# correlation.
+
+
+DRAWN = 200_000  # errors of the model for its distribution
+APART_STEP_S = 1e9  # between draws, which then are of other fields
+
+
+class Agreement(NamedTuple):
+    """How well the model agrees with other fields at one rate.
+
+    Attributes
+    ----------
+    fitted
+        The fields of the fit, even or odd
+    frames
+        One of each other field
+    p_values
+        (3,) of x, y, roll, of the Kolmogorov-Smirnov tests
+    correlation
+        Mean over the axes and over all pairs of frames of a sequence, and that of the model
+    """
+
+    fitted: str
+    rate_deg_s: float
+    frames: int
+    p_values: list[float]
+    correlation: float
+    expected_correlation: float
+
+
+def some_fields(sheet: MeasuredFrames, fields: slice) -> MeasuredFrames:
+    """The sheet of some of its fields."""
+    columns = {name: values[:, fields] for name, values in sheet.columns.items()}
+    count = len(range(sheet.size.fields)[fields])
+    return replace(sheet, columns=columns, size=replace(sheet.size, fields=count))
+
+
+def agreements(sheet: MeasuredFrames) -> list[Agreement]:
+    """The agreement of each half of the fields with the other, at the rates of the sequences, from rest on."""
+    even = some_fields(sheet, slice(0, None, 2))
+    odd = some_fields(sheet, slice(1, None, 2))
+    rates = sheet.levels("sequence", "rate_deg_s")
+    return [
+        agreement(of_one_unit(fitted), other, rate, name)
+        for name, fitted, other in (("even", even, odd), ("odd", odd, even))
+        for rate in rates
+    ]
+
+
+def of_one_unit(sheet: MeasuredFrames) -> ErrorModel:
+    """The model of a sheet for the first of its units."""
+    unit_mean = term_errors(sheet)[0][:, :, 0].mean(axis=(1, 2, 3, 4))
+    return ErrorModel(constants(sheet) | {"mean": unit_mean.tolist(), "unit": [0.0, 0.0, 0.0]})
+
+
+def agreement(
+    model: ErrorModel, sheet: MeasuredFrames, rate_deg_s: float, fitted: str
+) -> Agreement:
+    """The agreement with the sequences at one rate."""
+    steps, errors = sequences(sheet, rate_deg_s)
+    first = errors[:, 0][:, np.isfinite(errors[:, 0]).all(axis=0)]
+    drawn = turning(model, rate_deg_s) if rate_deg_s else at_rest(model)
+    p_values = [float(stats.ks_2samp(*pair).pvalue) for pair in zip(first, drawn.T, strict=True)]
+    centered = errors - model.mean[:, None, None]
+    found = []
+    expected = []
+    for one in range(len(steps)):
+        for two in range(one + 1, len(steps)):
+            angle_deg = rate_deg_s * (steps[two] - steps[one]) / sheet.scene.exposure.rate_hz
+            found.append(
+                mean_known(centered[:, one] * centered[:, two], 1) / mean_known(centered**2, (1, 2))
+            )
+            expected.append(model.correlation(angle_deg, rate_deg_s))
+    return Agreement(
+        fitted,
+        rate_deg_s,
+        first.shape[1],
+        p_values,
+        float(np.mean(found)),
+        float(np.mean(expected)),
+    )
+
+
+def turning(model: ErrorModel, rate_deg_s: float) -> Floats:
+    """(DRAWN, 3) errors at a rate, each in another field and about another axis."""
+    rng = random_stream(1)
+    axis_rad = rng.uniform(0, 2 * np.pi, DRAWN)
+    return np.asarray(model.draw(np.full(DRAWN, rate_deg_s), APART_STEP_S, rng, axis_rad=axis_rad))
+
+
+def at_rest(model: ErrorModel) -> Floats:
+    """(DRAWN, 3) errors at rest, each in another field."""
+    rates = len(model.noise)
+    rest = {"noise": [model.noise[0].tolist()] * rates, "along": [model.along[0]] * rates}
+    return turning(ErrorModel(model.constants | rest), 1.0)
+
+
+# Write a measurement model: a Python module that needs NumPy alone, its constants as JSON, a co-
+# simulation unit.
+
+
+MODULE = "tracker_error.py"
+CONSTANTS = "tracker_error.json"
+HERE = Path(__file__).parent
+
+
+def write_model(folder: Path, constants: dict[str, Any]) -> list[Path]:
+    """Write the module and its constants to a folder; return their paths."""
+    paths = [make_folder(folder) / MODULE, folder / CONSTANTS]
+    write_text(paths[0], (HERE / "error_model.py").read_text(encoding="utf-8"))
+    write_text(paths[1], to_json(constants))
+    return paths
+
+
+def require_fmu_builder() -> None:
+    """Raise InputError if the package that builds the units is not installed."""
+    if find_spec("pythonfmu3") is None:
+        raise InputError(
+            "datasheet.fmu", "pythonfmu3 is not installed", "after pip install 'skysim[fmu]'"
+        )
+
+
+def write_fmu(folder: Path) -> Path:
+    """Build the co-simulation unit (FMI 3) from a folder of `write_model`; return its path.
+
+    It runs in a Python with NumPy on the machine of the importer.
+    """
+    require_fmu_builder()
+    from pythonfmu3.builder import FmuBuilder
+
+    script = folder / "fmu_slave.py"
+    write_text(script, (HERE / "fmu_slave.py").read_text(encoding="utf-8"))
+    return Path(
+        FmuBuilder.build_FMU(
+            script, dest=folder, project_files=[folder / MODULE, folder / CONSTANTS]
+        )
+    )

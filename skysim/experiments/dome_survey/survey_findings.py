@@ -1,0 +1,417 @@
+"""What a survey has found: which LEDs are measured and how well, the attitudes to hold next, and faults of the dome."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.dome_map import LedMap, project
+from estimator.calibration import survey_faults, survey_plan
+from estimator.calibration.dome_survey import DomeSurvey
+from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
+from estimator.calibration.survey_plan import Mask, SurveyAccuracy, SurveyModel
+from skysim.core.types import Floats
+from skysim.experiments.dome_survey import survey_frames
+from skysim.experiments.dome_survey.survey_frames import (
+    GATE_SIGMAS,
+    Correspondences,
+    Ints,
+    SurveyFrame,
+    match_by_imu,
+)
+from skysim.experiments.dome_survey.survey_prior import (
+    CalibrationPrior,
+    SurveyUncertainty,
+    image_sizes,
+    survey_model,
+)
+from skysim.scene.scene import Scene
+
+# A survey of a dome as its last round has it: frames, correspondences, what they show of each LED,
+# stray lights.
+
+
+STRAY_SIGMA_PX = 0.3  # of a ray to a stray light, for the errors of the attitude and of blends
+STRAY_REACH_M = 0.005  # on the dome, within which stray lights of two frames may be one
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyRun:
+    """A survey with the frames and correspondences of its last round.
+
+    Attributes
+    ----------
+    taken
+        All frames, with the IMU's attitudes
+    rows
+        Those of `taken` that are in the survey
+    listed
+        The LEDs before the survey
+    prior
+        The model before the last round; its LEDs are the listed ones, those moved at the places
+        found
+    """
+
+    survey: DomeSurvey
+    taken: Sequence[SurveyFrame]
+    rows: list[int]
+    matches: list[Correspondences]
+    listed: LedMap
+    prior: CalibrationPrior
+    uncertainty: SurveyUncertainty
+
+    @property
+    def frames(self) -> list[SurveyFrame]:
+        """The frames of the survey, with their adjusted attitudes."""
+        pairs = zip(self.rows, self.survey.body_from_lab, strict=True)
+        return [replace(self.taken[row], body_from_lab=attitude) for row, attitude in pairs]
+
+    @property
+    def held(self) -> HeldFrames:
+        """The frames with their adjusted attitudes and the model found."""
+        survey = self.survey
+        return HeldFrames(survey.camera, survey.leds, survey.lever, survey.body_from_lab)
+
+    @property
+    def inliers(self) -> list[Correspondences]:
+        """The correspondences without those that the adjustment rejected."""
+        keep = [np.ones(len(match.led), dtype=bool) for match in self.matches]
+        for frame, row in self.survey.outliers.tolist():
+            keep[frame][row] = False
+        return [
+            Correspondences(m.light[k], m.led[k]) for m, k in zip(self.matches, keep, strict=True)
+        ]
+
+    @property
+    def seen(self) -> Mask:
+        """(F, N) LEDs identified in each frame."""
+        return identified(self.inliers, len(self.listed.id))
+
+    @property
+    def noise_px(self) -> float:
+        """Standard deviation of a centroid's coordinates, as the residuals have it; of the mean information."""
+        pairs = zip(self.frames, self.inliers, strict=True)
+        sigma_px = np.concatenate([frame.lights.sigma_px[match.light] for frame, match in pairs])
+        return self.survey.noise_scale / float(np.sqrt(np.mean(sigma_px**-2.0)))
+
+    @property
+    def accuracy(self) -> SurveyAccuracy:
+        """The standard deviations of the survey."""
+        survey = self.survey
+        return SurveyAccuracy(
+            survey.surveyed,
+            led_sigma_m(survey, self.uncertainty),
+            np.sqrt(np.diag(survey.lever_covariance_m2)),
+            np.sqrt(np.diag(survey.lens_covariance)),
+        )
+
+    @property
+    def uncertainty_after(self) -> SurveyUncertainty:
+        """The uncertainty of the IMU and of LEDs that are not measured, and that of the lever and the lens found."""
+        accuracy = self.accuracy
+        before = self.uncertainty
+        lever_m = float(np.sqrt(np.mean(accuracy.lever_sigma_m**2)))
+        focal = float(accuracy.lens_sigma[0] / self.survey.camera.focal_px)
+        return replace(before, lever_sigma_m=lever_m, focal_error=focal)
+
+
+def identified(matches: Sequence[Correspondences], leds: int) -> Mask:
+    """(F, N) LEDs that the correspondences of each frame have."""
+    out = np.zeros((len(matches), leds), dtype=bool)
+    for row, match in zip(out, matches, strict=True):
+        row[match.led] = True
+    return out
+
+
+def led_sigma_m(survey: DomeSurvey, uncertainty: SurveyUncertainty) -> Floats:
+    """(N,) standard deviation of each LED's position, RMS of three axes; that before the survey if not surveyed."""
+    variance_m2 = np.einsum("nii->n", survey.led_covariance_m2) / 3
+    return np.sqrt(np.where(survey.surveyed, variance_m2, uncertainty.led_sigma_m**2))
+
+
+def stray_lights(run: SurveyRun) -> list[StrayLight]:
+    """Lights at rest in the lab that are no known LED."""
+    frame = [np.zeros(0, np.int64)]
+    xy_px = [np.zeros((0, 2))]
+    for k, match in enumerate(run.inliers):
+        if run.survey.tied[k]:
+            lights = run.frames[k].lights.xy_px
+            xy_px.append(np.delete(lights, match.light, axis=0))
+            frame.append(np.full(len(xy_px[-1]), k))
+    return survey_faults.stray_lights(
+        run.held, np.concatenate(frame), np.concatenate(xy_px), STRAY_SIGMA_PX, STRAY_REACH_M
+    )
+
+
+def residuals_px(run: SurveyRun) -> tuple[Floats, Floats]:
+    """(M, 2) pixels of all correspondences without outliers, and their residuals: found minus predicted."""
+    survey = run.survey
+    found = [np.zeros((0, 2))]
+    residual = [np.zeros((0, 2))]
+    for frame, match, tied in zip(run.frames, run.inliers, survey.tied, strict=True):
+        used = survey.surveyed[match.led] & tied
+        xy_px = frame.lights.xy_px[match.light[used]]
+        place_m = survey.leds.position_m[match.led[used]]
+        found.append(xy_px)
+        residual.append(xy_px - project(frame.body_from_lab, place_m, survey.lever, survey.camera))
+    return np.concatenate(found), np.concatenate(residual)
+
+
+def light_table(run: SurveyRun) -> LightTable:
+    """What the frames show of each LED, and what each must show."""
+    index = np.array([frame.index for frame in run.frames])
+    return LightTable(
+        light_at_unit_distance(run), run.held.shown(*margins(run)), run.prior.expected_light(index)
+    )
+
+
+def margins(run: SurveyRun) -> tuple[Floats, float]:
+    """Margin of the chip for each LED, and distance between LEDs, by the errors of the places as well."""
+    sizes = image_sizes(run.prior)
+    place_px = run.accuracy.led_sigma_m * run.prior.px_per_m
+    return sizes.margin_px + GATE_SIGMAS * place_px, sizes.apart_px
+
+
+def light_at_unit_distance(run: SurveyRun) -> Floats:
+    """(F, N) light of each LED in each frame, multiplied with its squared distance; NaN if it is not identified."""
+    out = np.full(run.seen.shape, np.nan)
+    survey = run.survey
+    camera_m = survey.body_from_lab.inv().apply(np.tile(survey.lever.camera_body_m, (len(out), 1)))
+    for k, (frame, match) in enumerate(zip(run.frames, run.inliers, strict=True)):
+        squared_m2 = np.sum((survey.leds.position_m[match.led] - camera_m[k]) ** 2, axis=1)
+        out[k, match.led] = np.maximum(frame.lights.flux[match.light], 1e-9) * squared_m2
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """The frames held so far, and which LEDs they measure.
+
+    Attributes
+    ----------
+    model
+        By which further attitudes are chosen
+    held, seen
+        body_from_lab of F frames, and (F, N) LEDs in them
+    accuracy
+        That of the survey, or predicted before it; None if the frames are too few
+    """
+
+    model: SurveyModel
+    held: Rotation
+    seen: Mask
+    accuracy: SurveyAccuracy | None
+
+    @property
+    def measured(self) -> Mask:
+        """(N,) LEDs that are surveyed."""
+        return (
+            np.zeros(len(self.model.leds.id), dtype=bool)
+            if self.accuracy is None
+            else self.accuracy.measured
+        )
+
+
+def coverage(run: SurveyRun) -> Coverage:
+    """The coverage of a survey."""
+    survey = run.survey
+    model = survey_model(survey, run.uncertainty, run.noise_px)
+    return Coverage(model, survey.body_from_lab, run.seen, run.accuracy)
+
+
+def coverage_before(
+    frames: Sequence[SurveyFrame],
+    prior: CalibrationPrior,
+    uncertainty: SurveyUncertainty,
+    noise_px: float,
+) -> Coverage:
+    """The coverage of frames before their survey: LEDs named by the IMU's attitudes, and the accuracy predicted."""
+    matches = [match_by_imu(frame, prior, uncertainty) for frame in frames]
+    held = Rotation.concatenate([frame.body_from_lab for frame in frames])
+    model = survey_model(prior, uncertainty, noise_px)
+    seen = identified(matches, len(prior.leds.id))
+    return Coverage(model, held, seen, predicted(model, held, seen))
+
+
+@dataclass(frozen=True, slots=True)
+class NextStops:
+    """Attitudes to hold next, and what the survey with them will reach (None if that does not determine it)."""
+
+    lab_from_body: Rotation
+    accuracy: SurveyAccuracy | None
+
+
+def next_stops(
+    scene: Scene, so_far: Coverage, margin_px: float, count: int, tilt_deg: float
+) -> NextStops:
+    """Up to `count` attitudes after those held so far."""
+    model = so_far.model
+    further = survey_frames.planned_stops(
+        scene, model, margin_px, count, tilt_deg, so_far.held, so_far.seen
+    )
+    attitudes = Rotation.concatenate([so_far.held, further.inv()])
+    seen = np.vstack([so_far.seen, model.visible(further.inv(), margin_px)])
+    return NextStops(further, predicted(model, attitudes, seen))
+
+
+def predicted(model: SurveyModel, body_from_lab: Rotation, seen: Mask) -> SurveyAccuracy | None:
+    """The accuracy predicted; None if the frames do not determine the unknowns."""
+    try:
+        return survey_plan.predict(model, body_from_lab, seen)
+    except ValueError:
+        return None
+
+
+# --- faults -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class DomeFaults:
+    """Faults of the dome by LED number.
+
+    Attributes
+    ----------
+    dark
+        LEDs that no frame shows though it must
+    displaced
+        LED and its distance from the list's place, m
+    list_sigma_m
+        Error of the other places about each axis
+    exchanged
+        LED at whose place another one shines, that other one, and others that would do as well
+    found_m
+        Places, m, at which displaced LEDs and lights of exchanged ones were found
+    unlisted
+        Places, m, of lights at rest that are no LED of the list
+    exchange_share
+        Share of the pairs of LEDs whose exchange would be found; 0 if all are alike, None if
+        none are compared: too few are in enough frames, or the time of their code is unknown
+    """
+
+    dark: list[int]
+    displaced: dict[int, float]
+    list_sigma_m: float
+    exchanged: list[tuple[int, int, list[int]]]
+    found_m: dict[int, list[float]]
+    unlisted: list[list[float]]
+    exchange_share: float | None
+
+    @property
+    def count(self) -> int:
+        """Number of faults."""
+        return len(self.dark) + len(self.displaced) + len(self.exchanged) + len(self.unlisted)
+
+
+def find_faults(run: SurveyRun) -> DomeFaults:
+    """The faults that a survey shows."""
+    survey = run.survey
+    leds = run.listed
+    table = light_table(run)
+    rows, sigma_m = survey_faults.displaced(
+        leds.position_m, survey.leds.position_m, survey.led_covariance_m2
+    )
+    off_m = np.linalg.norm(survey.leds.position_m - leds.position_m, axis=1)
+    # The time of a code that runs freely is unknown, and with it what each LED shows.
+    code = run.prior.code
+    is_free = code is not None and code.bit_time_s is not None
+    exchanges, share = ([], None) if is_free else survey_faults.exchanged(table)
+    return DomeFaults(
+        leds.id[survey_faults.dark(table.shown & (table.expected > 0), run.seen)].tolist(),
+        {int(leds.id[row]): float(off_m[row]) for row in rows},
+        sigma_m,
+        [
+            (int(leds.id[x.led]), int(leds.id[x.shows]), leds.id[list(x.or_any_of)].tolist())
+            for x in exchanges
+        ],
+        {
+            int(leds.id[row]): survey.leds.position_m[row].tolist()
+            for row in (*rows, *(x.led for x in exchanges))
+        },
+        [stray.position_m.tolist() for stray in stray_lights(run)],
+        share,
+    )
+
+
+def fault_lines(faults: Mapping[str, Any]) -> Iterator[str]:
+    """Faults as lines of text, by LED number, and a summary. faults : the fields of a `DomeFaults`"""
+    for led in faults["dark"]:
+        yield f"LED {led} is dark"
+    for led, distance_m in faults["displaced"].items():
+        yield f"LED {led} is {1e3 * distance_m:.1f} mm from its place in the list"
+    for led, shows, others in faults["exchanged"]:
+        alike = f" (or {', '.join(map(str, others))})" if others else ""
+        yield f"LED {shows}{alike} shines at the place of LED {led}: wires or numbers exchanged"
+    for place_m in faults["unlisted"]:
+        yield f"a light that is not in the list shines at {', '.join(f'{one:.3f}' for one in place_m)} m"
+    share = faults["exchange_share"]
+    observable = "exchanged LEDs cannot be found: all shine alike; codes or brightness levels would tell them apart"
+    if share is None:
+        observable = (
+            f"exchanged LEDs are not searched for: too few are in {survey_faults.MIN_FRAMES} frames, or their code runs"
+            " freely"
+        )
+    elif share > 0:
+        observable = f"{100 * share:.0f} % of exchanges would be found"
+    yield (
+        f"{len(faults['dark'])} dark, {len(faults['displaced'])} displaced, {len(faults['exchanged'])} exchanged; the"
+        f" other places of the list err by {1e3 * faults['list_sigma_m']:.2g} mm about each axis; {observable}"
+    )
+
+
+# --- as numbers ---------------------------------------------------------------------------------------------
+
+
+def coverage_statistics(so_far: Coverage) -> dict[str, Any]:
+    """Counts and errors of a coverage, one row for each LED."""
+    frames = so_far.seen.sum(axis=0)
+    measured = so_far.measured
+    sigma_m = (
+        so_far.accuracy.led_sigma_m
+        if so_far.accuracy
+        else np.full(len(measured), so_far.model.leds_sigma_m)
+    )
+    sigma_mm = (1e3 * sigma_m).tolist()
+    columns = so_far.model.leds.id.tolist(), frames.tolist(), measured.tolist(), sigma_mm
+    keys = ("led", "frames", "measured", "sigma_mm")
+    return {
+        "leds": len(frames),
+        "measured": int(measured.sum()),
+        "seen_once": int(np.sum(frames == 1)),
+        "unseen": int(np.sum(frames == 0)),
+        "by_led": [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)],
+    }
+
+
+def accuracy_statistics(accuracy: SurveyAccuracy | None) -> dict[str, float | int | None]:
+    """Measured LEDs, their rms error in mm, that of the lever, and of the focal length in px; None if undetermined."""
+    if accuracy is None:
+        return {"measured": 0, "led_mm": None, "lever_mm": None, "focal_px": None}
+    return {
+        "measured": int(accuracy.measured.sum()),
+        "led_mm": 1e3 * accuracy.led_rms_m,
+        "lever_mm": 1e3 * float(np.sqrt(np.mean(accuracy.lever_sigma_m**2))),
+        "focal_px": float(accuracy.lens_sigma[0]),
+    }
+
+
+def stop_rows(lab_from_body: Rotation, shown: Mask) -> list[dict[str, float | int]]:
+    """Attitudes as rows: roll, pitch, yaw and tilt in degrees, and the number of LEDs that each shows."""
+    up = lab_from_body.apply([0.0, 0.0, 1.0])
+    tilt_deg = np.degrees(np.arctan2(np.hypot(up[:, 0], up[:, 1]), up[:, 2]))
+    columns = (
+        *survey_frames.angles_deg(lab_from_body).T.tolist(),
+        tilt_deg.tolist(),
+        shown.sum(axis=1).tolist(),
+    )
+    keys = ("roll_deg", "pitch_deg", "yaw_deg", "tilt_deg", "leds")
+    return [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
+
+
+def rows_of(numbers: Sequence[int], ids: Ints) -> Ints:
+    """Rows of LEDs by their numbers."""
+    order = np.argsort(ids)
+    return np.asarray(order[np.searchsorted(ids[order], np.array(numbers, dtype=np.int64))])

@@ -1,0 +1,255 @@
+"""Frames of a survey from images on disk.
+
+A folder has one image for each attitude, in the order of their names, and may have `attitudes.csv` with the IMU's
+attitudes: columns file, roll_deg, pitch_deg, yaw_deg (`motion` of a scene has the same angles). Images that it does not
+name are identified by the tracker with the list of LEDs, or with the survey of the other images.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.dome_map import LedMap, Lever
+from estimator.core.camera import Camera
+from estimator.core.checks import ImageError
+from estimator.core.types import Centroids
+from estimator.trackers.dome_tracker import DomeTracker
+from estimator.trackers.pipeline import Settings
+from skysim.core import images
+from skysim.core.errors import InputError
+from skysim.core.files import atomic_file
+from skysim.core.text import excerpt, read_named_rows
+from skysim.experiments.dome_survey import survey_frames
+from skysim.experiments.dome_survey.survey_frames import SurveyFrame, detect_lights
+from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
+
+ATTITUDES = "attitudes.csv"
+FRAME = "frame_{:04d}.fits"
+COLUMNS = ("file", "roll_deg", "pitch_deg", "yaw_deg")
+MIN_IMAGES = 3
+FORMATS = (
+    ".fits",
+    ".fit",
+    ".fits.gz",
+    ".tif",
+    ".tiff",
+    ".png",
+)  # of several images of one name the first is read
+
+
+class SurveyImage(NamedTuple):
+    """An image of a survey: its name, its detections, and the IMU's lab_from_body, None if there is none."""
+
+    name: str
+    lights: Centroids
+    lab_from_body: Rotation | None
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The images of a folder by name, one of each stem. Raises InputError for too few, or no folder."""
+    paths = best_images(folder)
+    if len(paths) < MIN_IMAGES:
+        raise InputError(folder, f"{len(paths)} images", f"{MIN_IMAGES} or more, typically tens")
+    return paths
+
+
+def best_images(folder: Path) -> list[Path]:
+    """The images of a folder by name, of those of one stem the first of FORMATS. Raises InputError for no folder."""
+    if not folder.is_dir():
+        raise InputError(folder, "no such folder", "a folder of images")
+    best: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        suffix = images.image_suffix(path.name)
+        if suffix and not path.name.startswith("."):
+            stem = path.name[: -len(suffix)]
+            if stem not in best or rank(suffix) < rank(images.image_suffix(best[stem].name)):
+                best[stem] = path
+    return [best[stem] for stem in sorted(best)]
+
+
+def rank(suffix: str) -> int:
+    """Place of an image format in the order in which images of one name are preferred."""
+    return FORMATS.index(suffix) if suffix in FORMATS else len(FORMATS)
+
+
+def read_images(folder: Path, camera: Camera, settings: Settings) -> Iterator[SurveyImage]:
+    """The images of a folder with their detections. Raises InputError for an image that cannot be used."""
+    paths = image_files(folder)
+    attitudes = read_attitudes(folder / ATTITUDES) if (folder / ATTITUDES).exists() else {}
+    names = {path.name for path in paths}
+    for name in attitudes:
+        if name not in names:
+            raise InputError(folder / ATTITUDES, f"{excerpt(name)} is no image of the folder")
+    for path in paths:
+        yield SurveyImage(path.name, lights_of(path, camera, settings), attitudes.get(path.name))
+
+
+def lights_of(path: Path, camera: Camera, settings: Settings) -> Centroids:
+    """The detections of an image. Raises InputError for one that cannot be used."""
+    return detect_lights(settings, camera, pixels_of(path, camera))
+
+
+def pixels_of(path: Path, camera: Camera) -> NDArray:
+    """The pixels of an image of the camera, the highest row first. Raises InputError for another size."""
+    pixels = images.monochrome(images.read_picture(path).pixels)
+    if pixels.shape != (camera.height_px, camera.width_px):
+        raise InputError(
+            path,
+            f"{pixels.shape[1]} x {pixels.shape[0]} pixels",
+            f"{camera.width_px} x {camera.height_px}, as the camera has them",
+        )
+    return pixels
+
+
+def read_attitudes(path: Path) -> dict[str, Rotation]:
+    """lab_from_body of each image by its name, from a CSV file. Raises InputError with one line."""
+    refusal = InputError(
+        path, "no attitudes", f"columns {', '.join(COLUMNS)}, and others, which are not used"
+    )
+    files, numbers = read_named_rows(path, COLUMNS[0], COLUMNS[1:], refusal)
+    return dict(zip(files, survey_frames.from_angles(numbers), strict=True))
+
+
+def write_attitudes(
+    path: Path, names: Sequence[str], lab_from_body: Rotation, leds: NDArray[np.int64] | None = None
+) -> None:
+    """Write attitudes as `read_attitudes` reads them; leds : number of LEDs in view, for a plan."""
+    lines = [",".join((*COLUMNS, "leds") if leds is not None else COLUMNS)]
+    for n, (name, angles) in enumerate(
+        zip(names, survey_frames.angles_deg(lab_from_body), strict=True)
+    ):
+        cells = [name, *(f"{angle:.4f}" for angle in angles)] + (
+            [f"{leds[n]}"] if leds is not None else []
+        )
+        lines.append(",".join(cells))
+    with atomic_file(path) as temporary:
+        temporary.write_text("\n".join([*lines, ""]), encoding="utf-8")
+
+
+def frames_with_attitude(
+    pictures: Sequence[SurveyImage],
+    model: CalibrationPrior,
+    uncertainty: SurveyUncertainty,
+    settings: Settings,
+) -> list[SurveyFrame]:
+    """The images whose attitude is known or is found by the tracker, lost in space, with this model."""
+    tracker: DomeTracker | None = None
+    out = []
+    for index, picture in enumerate(pictures):
+        attitude = picture.lab_from_body
+        if attitude is None:
+            tracker = tracker or lost_in_space(model, uncertainty, settings)
+            cam_from_lab = tracker.solve_centroids(picture.lights).cam_from_ref
+            if cam_from_lab is None:
+                continue
+            attitude = cam_from_lab.inv() * model.lever.cam_from_body
+        out.append(SurveyFrame(picture.lights, attitude.inv(), index))
+    return out
+
+
+def lost_in_space(
+    model: CalibrationPrior, uncertainty: SurveyUncertainty, settings: Settings
+) -> DomeTracker:
+    """A tracker that knows how uncertain the model is. Raises InputError for LEDs that it cannot use."""
+    camera = replace(model.camera, focal_sigma=abs(uncertainty.focal_error))
+    leds: LedMap = replace(
+        model.leds, sigma_m=uncertainty.led_sigma_m, covariance_m2=None, common_m=None
+    )
+    lever = Lever(model.lever.camera_body_m, model.lever.cam_from_body, uncertainty.lever_sigma_m)
+    try:
+        return DomeTracker(camera, leds, lever, settings)
+    except ImageError as error:
+        raise InputError("light", f"the star tracker cannot use this dome: {error}") from None
+
+
+# A folder of images that is followed while they are taken.
+
+
+POLL_S = 0.5  # between two looks at the folder
+
+Stamp = tuple[int, int]  # size in bytes, time of the last change in ns
+
+
+class News(NamedTuple):
+    """What a look found: names of the files that were read, and an error for each that cannot be used."""
+
+    read: list[str]
+    complaints: list[InputError]
+
+
+@dataclass
+class WatchedFolder:
+    """The images of a folder so far; `pictures` has their names, detections and attitudes, by name."""
+
+    folder: Path
+    camera: Camera
+    settings: Settings
+    _lights: dict[str, Centroids] = field(default_factory=dict)
+    _attitudes: dict[str, Rotation] = field(default_factory=dict)
+    _seen: dict[str, Stamp] = field(default_factory=dict)
+    _done: dict[str, Stamp] = field(default_factory=dict)
+
+    @property
+    def pictures(self) -> list[SurveyImage]:
+        """The images that were read."""
+        return [
+            SurveyImage(name, self._lights[name], self._attitudes.get(name))
+            for name in sorted(self._lights)
+        ]
+
+    def arrivals(self, count: int, poll_s: float = POLL_S) -> Iterator[News]:
+        """Yield after every look that finds something new, until `count` images are read."""
+        while True:
+            news = self.look()
+            if news.read or news.complaints:
+                yield news
+            if len(self._lights) >= count:
+                return
+            time.sleep(poll_s)
+
+    def look(self) -> News:
+        """Read the files that are complete and new. Raises InputError if there is no such folder."""
+        news = News([], [])
+        paths = best_images(self.folder)
+        names = {path.name for path in paths}
+        self._lights = {name: lights for name, lights in self._lights.items() if name in names}
+        for path in [*paths, self.folder / ATTITUDES]:
+            stamp = stamp_of(path)
+            before = self._seen.get(path.name)
+            if stamp is None:
+                continue
+            self._seen[path.name] = stamp
+            if stamp != before or stamp == self._done.get(path.name):
+                continue
+            try:
+                self._read(path)
+            except InputError as error:
+                news.complaints.append(error)
+            else:
+                news.read.append(path.name)
+            self._done[path.name] = stamp
+        return news
+
+    def _read(self, path: Path) -> None:
+        if path.name == ATTITUDES:
+            self._attitudes = read_attitudes(path)
+        else:
+            self._lights.pop(path.name, None)
+            self._lights[path.name] = lights_of(path, self.camera, self.settings)
+
+
+def stamp_of(path: Path) -> Stamp | None:
+    """Size and time of the last change of a file; None if there is none."""
+    try:
+        about = path.stat()
+    except OSError:
+        return None
+    return about.st_size, about.st_mtime_ns

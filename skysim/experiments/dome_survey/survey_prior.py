@@ -1,0 +1,241 @@
+"""What is assumed before a survey of the dome, and how uncertain it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.dome_map import LedMap, Lever
+from estimator.calibration.bundle_adjustment import Assumed
+from estimator.calibration.dome_survey import DomeSurvey
+from estimator.calibration.survey_plan import SurveyModel
+from estimator.core.camera import Camera
+from estimator.identification.led_codes import LedCode
+from skysim.core.errors import InputError
+from skysim.core.types import Floats, Sources
+from skysim.core.units import quantities_within
+from skysim.experiments.tracker_comparison import with_config
+from skysim.scene.scene import Scene
+from skysim.scene.sections.light import DomeConfig
+from skysim.scene.sections.tracker import SurveyErrorsConfig
+from skysim.simulation.lab import Lab
+from skysim.sources.dome import surface
+from skysim.sources.dome.layouts import led_list, registry
+from skysim.tracking import onboard_model
+
+Ints = NDArray[np.int64]
+BLUR_PX = 3.0  # of an image's edge
+
+# Options: unit, quantity, example, minimum and maximum. The LED error must be > 0, because it weights the map.
+UNCERTAINTY_RANGES = {
+    "imu_sigma": ("rad", "plane angle", '"0.5 deg"', 0.0, 0.1),
+    "led_sigma": ("m", "length", '"2 mm"', 1e-6, 0.1),
+    "lever_sigma": ("m", "length", '"5 mm"', 0.0, 0.1),
+    "focal_error": ("", "share", '"1%" or "0.01"', -0.1, 0.1),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyUncertainty:
+    """Uncertainty before the survey: standard deviations per axis, and a focal length error.
+
+    Attributes
+    ----------
+    imu_sigma_rad
+        Attitude from the IMU at each frame
+    led_sigma_m
+        Position of each LED
+    lever_sigma_m
+        Position of the camera in the body
+    focal_error
+        Relative error of the assumed focal length
+    """
+
+    imu_sigma_rad: float
+    led_sigma_m: float
+    lever_sigma_m: float
+    focal_error: float
+
+    def focal_sigma_px(self, camera: Camera) -> float:
+        """Standard deviation of the assumed focal length of a camera."""
+        return abs(self.focal_error) * camera.focal_px
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationPrior:
+    """Assumed model of dome and camera, before a survey or from it.
+
+    Attributes
+    ----------
+    floor_px
+        Least standard deviation of a prediction's residuals, by which lights are matched
+    disk_m
+        Diameter of an LED's luminous disk
+    levels
+        (N,) nominal brightness of the LEDs, relative; code : what each shows in a frame, None
+        if all are steady
+    """
+
+    camera: Camera
+    leds: LedMap
+    lever: Lever
+    floor_px: float
+    disk_m: float
+    levels: Floats
+    code: LedCode | None = None
+
+    def expected_light(self, index: Ints) -> Floats:
+        """(F, N) relative light that each LED gives in frames of these numbers, 0 if its code has it off."""
+        if self.code is None or self.code.bit_time_s is not None:
+            return np.tile(self.levels, (len(index), 1))
+        return np.asarray(self.levels * self.code.levels[:, index % self.code.bits].T)
+
+    @property
+    def nearest_m(self) -> float:
+        """Least distance of an LED from the center of rotation."""
+        return float(np.linalg.norm(self.leds.position_m, axis=1).min())
+
+    @property
+    def px_per_m(self) -> float:
+        """Image scale in pixels per meter perpendicular to the line of sight, at the least distance of an LED."""
+        return float(
+            self.camera.focal_px / (self.nearest_m - np.linalg.norm(self.lever.camera_body_m))
+        )
+
+    def pixels(self, body_from_lab: Rotation) -> Floats:
+        """(N, 2) pixel positions of the LEDs; a value far outside the image for LEDs behind the camera."""
+        in_body = body_from_lab.apply(self.leds.position_m) - self.lever.camera_body_m
+        xy_px = self.camera.pixels(self.lever.cam_from_body.apply(in_body))
+        return np.nan_to_num(xy_px, nan=-1e9)
+
+
+def survey_uncertainty(
+    imu_sigma: str = "0.5 deg",
+    led_sigma: str = "2 mm",
+    lever_sigma: str = "5 mm",
+    focal_error: str = "1%",
+) -> SurveyUncertainty:
+    """Parse quantities with units. Raises InputError for an invalid or out-of-range value."""
+    texts = imu_sigma, led_sigma, lever_sigma, focal_error
+    return SurveyUncertainty(*quantities_within("survey", UNCERTAINTY_RANGES, texts))
+
+
+def calibration_prior(lab: Lab) -> CalibrationPrior:
+    """The onboard model of the tracker of a lab. Raises InputError for a scene without a dome."""
+    light = require_dome(lab.scene)
+    leds = onboard_model.assumed_dome(lab.scene, light, lab.camera.sources)
+    return prior_of(lab, onboard_model.assumed_camera(lab.scene), leds)
+
+
+def listed_prior(lab: Lab, camera: Camera) -> CalibrationPrior:
+    """The model of a dome as its list has it, without the errors of the scene's simulation, and this camera."""
+    light = require_dome(lab.scene)
+    inside = surface.build_surface(light.surface)
+    design = design_of(lab)
+    board = registry.board_of(light.layout, design.id)
+    leds = LedMap(design.id, design.place[:, :3], *inside.as_ellipsoid(), board)
+    return prior_of(lab, camera, leds)
+
+
+def prior_of(lab: Lab, camera: Camera, leds: LedMap) -> CalibrationPrior:
+    """The prior with these LEDs, their nominal brightness and code, and the lever that the tracker assumes."""
+    scene = lab.scene
+    design = design_of(lab)
+    order = np.argsort(design.id)
+    levels = design.strength[order][np.searchsorted(design.id[order], leds.id)]
+    lever = onboard_model.assumed_lever(scene, lab.camera.mount)
+    light = require_dome(scene)
+    code = onboard_model.assumed_code(light, lab.camera.sources, leds) if light.led.code else None
+    floor_px = scene.tracker.centroid_sigma_px
+    disk_m = light.led.disk_diameter_m
+    return CalibrationPrior(camera, leds, lever, floor_px, disk_m, levels / levels.max(), code)
+
+
+def design_of(lab: Lab) -> Sources:
+    """The LEDs of the dome as designed."""
+    light = require_dome(lab.scene)
+    return led_list.design_leds(light, surface.build_surface(light.surface), lab.camera.band)
+
+
+def require_dome(scene: Scene) -> DomeConfig:
+    """The dome of a scene. Raises InputError if its light is another."""
+    if not isinstance(scene.light, DomeConfig):
+        raise InputError("light.kind", f"a survey needs LEDs, not {scene.light.kind}", "dome")
+    return scene.light
+
+
+def survey_model(
+    known: CalibrationPrior | DomeSurvey, uncertainty: SurveyUncertainty, noise_px: float
+) -> SurveyModel:
+    """The model by which the estimator plans and predicts. known : before a survey, or from it"""
+    sigmas = (
+        uncertainty.led_sigma_m,
+        uncertainty.lever_sigma_m,
+        uncertainty.focal_sigma_px(known.camera),
+    )
+    return SurveyModel(known.camera, known.leds, known.lever, noise_px, *sigmas)
+
+
+def assumed(prior: CalibrationPrior, uncertainty: SurveyUncertainty) -> Assumed:
+    """Lever and focal length before a survey, which enter its adjustment as measurements."""
+    camera = prior.camera
+    arm_m = prior.lever.camera_body_m
+    return Assumed(
+        arm_m, uncertainty.lever_sigma_m, camera.focal_px, uncertainty.focal_sigma_px(camera)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class ImageSizes:
+    """Sizes of an LED's image: margin_px from the edge for a complete image; apart_px at which two do not merge."""
+
+    margin_px: float
+    apart_px: float
+
+
+def image_sizes(prior: CalibrationPrior) -> ImageSizes:
+    """The sizes of an LED's image at the least distance, with BLUR_PX of blur on every side."""
+    radius_px = prior.disk_m / 2 * prior.px_per_m
+    return ImageSizes(radius_px + BLUR_PX, 2 * (radius_px + BLUR_PX))
+
+
+def with_survey_errors(scene: Scene, uncertainty: SurveyUncertainty) -> Scene:
+    """The scene with the onboard model before a survey: errors of this size, drawn with `tracker.survey.seed`."""
+    focal_length_m = scene.camera.focal_length_m * (1 + uncertainty.focal_error)
+    return with_onboard_model(
+        scene, uncertainty.led_sigma_m, uncertainty.lever_sigma_m, focal_length_m, None
+    )
+
+
+def as_listed(scene: Scene) -> Scene:
+    """The scene whose tracker assumes the LEDs of the list and the vehicle's lever, without errors of a simulation."""
+    tracker = scene.tracker.model_copy(update={"survey": SurveyErrorsConfig(), "map": None})
+    return scene.model_copy(update={"tracker": tracker})
+
+
+def with_map(scene: Scene, path: str) -> Scene:
+    """The scene whose tracker uses the map file of a surveyed dome, and no other onboard errors."""
+    return with_onboard_model(scene, 0.0, 0.0, None, path)
+
+
+def with_onboard_model(
+    scene: Scene,
+    led_sigma_m: float,
+    lever_sigma_m: float,
+    focal_length_m: float | None,
+    path: str | None,
+) -> Scene:
+    """The scene whose tracker has survey errors of this size, and assumes this focal length or map file."""
+    scene = with_config(
+        scene, "tracker.survey", led_sigma_m=led_sigma_m, lever_sigma_m=lever_sigma_m
+    )
+    return with_config(
+        scene,
+        "tracker",
+        assumed_focal_length_m=focal_length_m,
+        assumed_camera_body_m=None,
+        map=path,
+    )

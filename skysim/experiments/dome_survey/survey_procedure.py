@@ -1,0 +1,254 @@
+"""The survey from beginning to end: its plan and predicted errors, its simulation, and both side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator.calibration.survey_plan import Mask, SurveyAccuracy, SurveyModel
+from estimator.trackers.pipeline import Settings
+from skysim.core import files
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.experiments.dome_survey import survey_frames
+from skysim.experiments.dome_survey.adjust import run_survey
+from skysim.experiments.dome_survey.survey_findings import (
+    SurveyRun,
+    accuracy_statistics,
+    find_faults,
+    predicted,
+)
+from skysim.experiments.dome_survey.survey_frames import (
+    SurveyFrame,
+    centroid_noise_px,
+    imu_attitudes,
+    take_frames,
+)
+from skysim.experiments.dome_survey.survey_images import (
+    ATTITUDES,
+    FRAME,
+    SurveyImage,
+    frames_with_attitude,
+    write_attitudes,
+)
+from skysim.experiments.dome_survey.survey_prior import (
+    CalibrationPrior,
+    SurveyUncertainty,
+    calibration_prior,
+    image_sizes,
+    survey_model,
+    with_survey_errors,
+)
+from skysim.experiments.dome_survey.survey_report import led_errors
+from skysim.experiments.tracker_comparison import with_config
+from skysim.results.files import recording as frame_files
+from skysim.scene.scene import Scene
+from skysim.simulation.lab import Lab, build_lab
+
+PLANNED = "plan"
+RANDOM = "random"
+
+
+@dataclass(frozen=True, slots=True)
+class HeldAttitudes:
+    """Attitudes to hold, one frame at each.
+
+    Attributes
+    ----------
+    shown
+        (F, N) LEDs that each shows
+    margin_px
+        From the edge, where an image would be incomplete
+    """
+
+    lab_from_body: Rotation
+    shown: Mask
+    model: SurveyModel
+    margin_px: float
+
+    def first(self, count: int) -> SurveyAccuracy | None:
+        """The accuracy predicted after the first `count` frames; None if they do not determine the unknowns."""
+        return predicted(self.model, self.lab_from_body[:count].inv(), self.shown[:count])
+
+    def steps(self) -> list[tuple[int, SurveyAccuracy | None]]:
+        """The accuracy predicted after a quarter, a half, three quarters and all of the frames."""
+        total = len(self.lab_from_body)
+        counts = sorted({max(round(total * part / 4), 2) for part in range(1, 5)})
+        return [(count, self.first(count)) for count in counts]
+
+
+def plan_survey(
+    scene: Scene, uncertainty: SurveyUncertainty, count: int, tilt_deg: float, kind: str = PLANNED
+) -> tuple[Lab, CalibrationPrior, HeldAttitudes]:
+    """The lab with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
+    lab = build_lab(with_survey_errors(scene, uncertainty))
+    before = calibration_prior(lab)
+    return lab, before, make_plan(lab, before, uncertainty, count, tilt_deg, kind)
+
+
+def make_plan(
+    lab: Lab,
+    prior: CalibrationPrior,
+    uncertainty: SurveyUncertainty,
+    count: int,
+    tilt_deg: float,
+    kind: str,
+) -> HeldAttitudes:
+    """The attitudes of a survey: by the plan, or random. Raises InputError for a tilt beyond the vehicle's stop."""
+    random = survey_frames.stop_attitudes(lab.scene, "attitudes", count, tilt_deg)
+    model = survey_model(prior, uncertainty, centroid_noise_px(lab, tilt_deg))
+    margin_px = image_sizes(prior).margin_px
+    held = (
+        random
+        if kind == RANDOM
+        else survey_frames.planned_stops(lab.scene, model, margin_px, count, tilt_deg)
+    )
+    return HeldAttitudes(held, model.visible(held.inv(), margin_px), model, margin_px)
+
+
+def write_plan(path: Path, plan: HeldAttitudes) -> None:
+    """Write the attitudes as CSV, with the names of the images to take, so that it serves as their attitudes too."""
+    names = [FRAME.format(n) for n in range(len(plan.shown))]
+    write_attitudes(path, names, plan.lab_from_body, plan.shown.sum(axis=1))
+
+
+def simulated_frames(
+    lab: Lab, uncertainty: SurveyUncertainty, lab_from_body: Rotation, folder: Path | None = None
+) -> Iterator[SurveyFrame]:
+    """The frames of a simulated survey. A folder gets each as FITS, and the IMU's attitudes, for `images`."""
+    measured = imu_attitudes(lab.scene, lab_from_body, uncertainty.imu_sigma_rad)
+    if folder is not None:
+        names = [FRAME.format(n) for n in range(len(lab_from_body))]
+        write_attitudes(files.make_folder(folder) / ATTITUDES, names, measured.inv())
+    for (frame, truth, lights), body_from_lab in zip(
+        take_frames(lab, lab_from_body), measured, strict=True
+    ):
+        if folder is not None:
+            frame_files.write_fits(folder / FRAME.format(frame.index), frame, truth, lab.scene)
+        yield SurveyFrame(lights, body_from_lab, frame.index)
+
+
+def survey_images(
+    pictures: Sequence[SurveyImage],
+    frames: list[SurveyFrame],
+    prior: CalibrationPrior,
+    uncertainty: SurveyUncertainty,
+    settings: Settings,
+    fit_distortion: bool = False,
+    watch: Callable[[float, float], None] | None = None,
+) -> SurveyRun:
+    """Survey from images, of which `frames` have an attitude; the others are identified with the LEDs surveyed so far.
+
+    Raises
+    ------
+    InputError
+        If too few images have an attitude, or they do not determine the unknowns.
+    """
+    if len(frames) < 2:
+        raise InputError(
+            "survey",
+            f"{len(frames)} of {len(pictures)} images identified",
+            f"2 or more: give their attitudes in {ATTITUDES}",
+        )
+    run = run_survey(frames, prior, uncertainty, fit_distortion, watch)
+    while len(frames) < len(pictures):
+        found = run.survey
+        model = replace(prior, camera=found.camera, leds=found.surveyed_leds, lever=found.lever)
+        known = {frame.index: frame.body_from_lab.inv() for frame in frames}
+        named = [picture._replace(lab_from_body=known.get(n)) for n, picture in enumerate(pictures)]
+        more = frames_with_attitude(
+            named,
+            model,
+            replace(run.uncertainty_after, led_sigma_m=run.accuracy.led_rms_m),
+            settings,
+        )
+        if len(more) == len(frames):
+            break
+        frames = more
+        run = run_survey(frames, prior, uncertainty, fit_distortion, watch)
+    return run
+
+
+# --- the prediction against simulated surveys ---------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedErrors:
+    """Errors of one simulated survey: mean squares of LED coordinates (m2) and of the lever's (m2), of the focal length
+    (px2); LEDs measured, and faults reported although the dome has none."""
+
+    led_m2: float
+    lever_m2: float
+    focal_px2: float
+    measured: int
+    false_alarms: int
+
+
+def repeat_survey(
+    lab: Lab, uncertainty: SurveyUncertainty, plan: HeldAttitudes, repeats: int
+) -> Iterator[SimulatedErrors | InputError]:
+    """The errors of simulated surveys at the attitudes of a plan, each with its own noise, IMU errors and list.
+
+    Of a survey that does not determine the dome, why.
+    """
+    for n in range(repeats):
+        again = in_survey(lab, n)
+        prior = calibration_prior(again)
+        frames = list(simulated_frames(again, uncertainty, plan.lab_from_body))
+        try:
+            yield survey_errors(run_survey(frames, prior, uncertainty), prior, again)
+        except InputError as error:
+            yield error
+
+
+def in_survey(lab: Lab, n: int) -> Lab:
+    """The lab in another survey: other noise, and other errors of the list, the lever and the IMU."""
+    scene = lab.scene
+    again = lab.in_run(scene.seed + n)
+    return replace(
+        again, scene=with_config(again.scene, "tracker.survey", seed=scene.tracker.survey.seed + n)
+    )
+
+
+def survey_errors(run: SurveyRun, prior: CalibrationPrior, lab: Lab) -> SimulatedErrors:
+    """The errors of one survey against the truth."""
+    survey = run.survey
+    lever_m = survey.lever.camera_body_m - lab.camera.mount.camera_body_m
+    return SimulatedErrors(
+        float(np.mean(led_errors(survey, prior, lab).after_m ** 2)),
+        float(np.mean(lever_m**2)),
+        (survey.camera.focal_px - lab.scene.camera.focal_px) ** 2,
+        int(survey.surveyed.sum()),
+        find_faults(run).count,
+    )
+
+
+def comparison(plan: HeldAttitudes, errors: list[SimulatedErrors]) -> list[dict[str, Any]]:
+    """Rows of the errors predicted, those simulated (rms over all surveys), their ratio and its standard error."""
+    accuracy = accuracy_statistics(plan.first(len(plan.lab_from_body)))
+    rows = (
+        ("LED place mm", accuracy["led_mm"], 1e6 * np.array([one.led_m2 for one in errors])),
+        ("lever mm", accuracy["lever_mm"], 1e6 * np.array([one.lever_m2 for one in errors])),
+        ("focal length px", accuracy["focal_px"], np.array([one.focal_px2 for one in errors])),
+    )
+    return [compared(*row) for row in rows]
+
+
+def compared(what: str, sigma: float | None, squares: Floats) -> dict[str, Any]:
+    """One row: the root of the mean square has the relative error std(square) / (2 mean sqrt(n))."""
+    mean = float(squares.mean())
+    simulated = float(np.sqrt(mean))
+    relative = float(squares.std() / (2 * mean * np.sqrt(len(squares))))
+    ratio = simulated / sigma if sigma else None
+    return {
+        "what": what,
+        "predicted": sigma,
+        "simulated": simulated,
+        "ratio": ratio,
+        "ratio_sigma": ratio and ratio * relative,
+    }

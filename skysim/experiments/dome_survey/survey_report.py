@@ -1,0 +1,515 @@
+"""The report of a survey: the dome from above, what was found and how well, faults, and what to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.dome_map import Lever, on_surface
+from estimator.calibration.dome_survey import DomeSurvey
+from estimator.core.camera import Camera
+from skysim.core.constants import ARCSEC_RAD
+from skysim.core.types import Floats, Frame, Mount, Truth
+from skysim.experiments.dome_survey.adjust import lens_sigma
+from skysim.experiments.dome_survey.survey_findings import (
+    Coverage,
+    DomeFaults,
+    SurveyRun,
+    accuracy_statistics,
+    fault_lines,
+    residuals_px,
+    rows_of,
+)
+from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
+from skysim.results import metrics
+from skysim.results.plots import INK, png
+from skysim.results.report import Report
+from skysim.results.report_blocks import (
+    Block,
+    Cell,
+    Column,
+    Facts,
+    Figure,
+    Section,
+    Table,
+    Text,
+    Verdict,
+)
+from skysim.scene.sections.camera import CameraConfig
+from skysim.simulation.lab import Lab
+from skysim.tracking import factory
+
+CELLS = 8  # across the chip, over which residuals are averaged
+BINS = 60
+TAIL = 0.005  # share of the residuals beyond each end of the histogram
+REACHED = {"led_mm": "LED place, mm", "lever_mm": "lever, mm", "focal_px": "focal length, px"}
+FIT = (
+    "{status}: {outliers} outliers, {rms_px:.2g} px rms residual; 1σ of an LED's place: median"
+    " {led_sigma_mm_median:.2g} mm, worst {led_sigma_mm_worst:.2g} mm."
+)
+FILES = (("map, for tracker.map", "leds.ecsv"), ("every number of this page", "survey.json"))
+
+
+def survey_report(statistics: dict[str, Any], run: SurveyRun, command: str) -> Report:
+    """The report of a survey. statistics : as in `survey.json`"""
+    reached = accuracy_statistics(run.accuracy)
+    dome = Figure(
+        Path(statistics["picture"]).read_bytes(),
+        "The dome from above: LED errors, faults, next attitudes.",
+    )
+    residuals = Figure(
+        residual_figure(run), "Residuals: their distribution, and their means over the chip."
+    )
+    blocks = [
+        verdict(statistics, 1e3 * run.accuracy.led_rms_m),
+        Text(FIT.format(**statistics)),
+        Facts([(name, [Cell(file, link=file)]) for name, file in FILES], on_terminal=False),
+        Section("The dome", [dome]),
+        Section("Residuals", [residuals]),
+        Section("Camera and lever", [value_table(statistics)]),
+        Section("Truth and survey", truth_blocks(statistics)),
+        Section("Predicted and reached", [accuracy_table(statistics, reached)]),
+        Section("Coverage and next attitudes", coverage_blocks(statistics)),
+        Section("Faults", fault_blocks(statistics["faults"])),
+    ]
+    return Report(f"Survey of {statistics['scene']}", blocks, command)
+
+
+def verdict(statistics: Mapping[str, Any], led_mm: float) -> Verdict:
+    """How many LEDs were measured, how well, and the number of faults."""
+    faults = len(fault_rows(statistics["faults"]))
+    text = "{surveyed} of {leds} LEDs measured in {tied} of {frames} frames".format(**statistics)
+    text += f", to {led_mm:.2g} mm rms about each axis (1σ); {faults} faults."
+    return Verdict(text, "warning" if faults else "good")
+
+
+def value_table(statistics: dict[str, Any]) -> Table:
+    """Lens and lever before and after the survey, and in truth if it was simulated."""
+    truth = statistics.get("truth")
+    rows = []
+    for row in statistics["values"]:
+        what = row["what"]
+        numbers = [row["believed"], row["found"], *([truth[what]] if truth else [])]
+        before, found, *known = (
+            f"{one:.5g}" if what[0] in "kp" else f"{one:.3f}" for one in numbers
+        )
+        rows += [[what, before, found, f"{row['sigma']:.2g}", *known]] if row["sigma"] else []
+    return Table(
+        [
+            Column("", kind="text"),
+            *map(Column, ["before", "found", "1σ", *["truth"] * bool(truth)]),
+        ],
+        rows,
+    )
+
+
+def truth_blocks(statistics: dict[str, Any]) -> list[Block]:
+    """The true errors of a simulated survey, and the tracker before and after it."""
+    if not statistics.get("truth"):
+        return []
+    predicted = Column("", format=".2g").cell(statistics["predicted"]["led_mm"]).text
+    text = (
+        f"True error of the LEDs: {statistics['led_mm_before']:.2g} mm rms before, {statistics['led_mm_after']:.2g} mm"
+        f" after (predicted {predicted} mm); {statistics['renamed']} with another identity."
+    )
+    errors = (
+        "cross_arcsec_median",
+        "cross_arcsec_worst",
+        "roll_arcsec_median",
+        "roll_arcsec_worst",
+    )
+    trackers = [(when, statistics[when]) for when in ("before", "after")]
+    rows = [
+        [when, f"{one['solved']} / {one['stops']}", *(one[key] for key in errors)]
+        for when, one in trackers
+    ]
+    heads = ("cross, median", "worst", "roll, median", "worst")
+    columns = [
+        Column("the tracker", kind="text"),
+        Column("solved"),
+        *(Column(head, "″", ".3g") for head in heads),
+    ]
+    return [Text(text), Table(columns, rows)]
+
+
+def accuracy_table(statistics: dict[str, Any], reached: Mapping[str, Any]) -> Table:
+    """Errors by the plan, by this survey's covariance, in truth, and with the next attitudes."""
+    predicted = statistics.get("predicted")
+    after = statistics.get("led_mm_after")
+    columns = {"by the plan": predicted} if predicted else {}
+    columns["by this survey's covariance"] = reached
+    columns |= {"true error, rms": {"led_mm": after}} if after is not None else {}
+    columns["with the next attitudes"] = statistics["next_reaches"]
+    rows = [[what, *(one.get(key) for one in columns.values())] for key, what in REACHED.items()]
+    return Table(
+        [Column("1σ", kind="text"), *(Column(head, format=".3g") for head in columns)], rows
+    )
+
+
+def coverage_blocks(statistics: dict[str, Any]) -> list[Block]:
+    """Which LEDs are measured, the attitudes to hold next, and what those will reach."""
+    counts = statistics["coverage"]
+    reaches = statistics["next_reaches"]
+    stops = statistics["next"]
+    seen = (
+        f"{counts['measured']} of {counts['leds']} LEDs measured, {counts['seen_once']} seen once, {counts['unseen']}"
+        f" not seen; hold these {len(stops)} attitudes next:"
+    )
+    with_them = f"With them: {reaches['measured']} measured"
+    if reaches["led_mm"] is not None:
+        with_them += f", to {reaches['led_mm']:.2g} mm rms about each axis"
+    return [Text(seen), stop_table(stops), Text(f"{with_them}.")]
+
+
+def stop_table(stops: list[dict[str, Any]]) -> Table:
+    """Attitudes as roll, pitch and yaw, with tilt and number of LEDs."""
+    names = ("roll", "pitch", "yaw", "tilt")
+    rows = [
+        [n, *(one[f"{name}_deg"] for name in names), one["leds"]] for n, one in enumerate(stops, 1)
+    ]
+    return Table([Column(""), *(Column(name, "°", ".1f") for name in names), Column("LEDs")], rows)
+
+
+def fault_blocks(faults: dict[str, Any]) -> list[Block]:
+    """The faults as a table; their numbers, the error of the list's other places, and which exchanges can be found."""
+    columns = [Column("LED"), Column("fault", kind="text"), Column("details", kind="text")]
+    *_, counts = fault_lines(faults)
+    return [Table(columns, fault_rows(faults)), Text(counts)]
+
+
+def fault_rows(faults: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """LED, fault and details, one row a fault."""
+    rows = [(str(led), "dark", "no frame shows it") for led in faults["dark"]]
+    for led, off_m in faults["displaced"].items():
+        rows.append(
+            (
+                str(led),
+                "displaced",
+                f"{1e3 * off_m:.1f} mm from its place in the list, {place(faults, led)}",
+            )
+        )
+    for led, shows, others in faults["exchanged"]:
+        alike = f" (or {', '.join(map(str, others))})" if others else ""
+        rows.append(
+            (str(led), "exchanged", f"LED {shows}{alike} shines at its place, {place(faults, led)}")
+        )
+    rows += [("", "not in the list", f"a light at {coordinates(at)}") for at in faults["unlisted"]]
+    return rows
+
+
+def place(faults: dict[str, Any], led: int) -> str:
+    """Where an LED with a fault was found."""
+    return f"at {coordinates(faults['found_m'][led])}"
+
+
+def coordinates(place_m: list[float]) -> str:
+    """A place in millimeters."""
+    return f"({', '.join(f'{1e3 * one:.1f}' for one in place_m)}) mm"
+
+
+def residual_figure(run: SurveyRun) -> bytes:
+    """PNG of the residuals: their distribution against the Gaussian of their noise, and their means over the chip."""
+    xy_px, residual_px = residuals_px(run)
+
+    def draw(fig: Any) -> None:
+        left, right = fig.subplots(1, 2)
+        draw_histogram(left, residual_px.ravel(), run.noise_px)
+        draw_means(
+            right, xy_px, residual_px, (run.survey.camera.width_px, run.survey.camera.height_px)
+        )
+
+    return png(draw, (10, 4))
+
+
+def draw_histogram(axes: Any, residual_px: Floats, noise_px: float) -> None:
+    """Residual coordinates as a density, with the Gaussian of the noise: wider, as a fit takes up part of the noise."""
+    end_px = float(np.quantile(np.abs(residual_px), 1 - TAIL))
+    x_px = np.linspace(-end_px, end_px, 200)
+    inside = residual_px[np.abs(residual_px) <= end_px]
+    axes.hist(
+        inside,
+        BINS,
+        weights=np.full(len(inside), BINS / (2 * end_px * len(residual_px))),
+        color=INK[5],
+    )
+    density = np.exp(-((x_px / noise_px) ** 2) / 2) / (noise_px * np.sqrt(2 * np.pi))
+    axes.plot(x_px, density, color=INK[1], label=f"Gaussian of the noise, {noise_px:.2g} px")
+    axes.set(xlabel="residual coordinate [px]", ylabel="density [1/px]", title="residuals")
+    axes.locator_params(axis="x", nbins=5)
+    axes.legend()
+
+
+def draw_means(axes: Any, xy_px: Floats, residual_px: Floats, size_px: tuple[int, int]) -> None:
+    """Mean residuals in cells of the chip: a pattern is a distortion that the lens model lacks."""
+    width_px = size_px[0] / CELLS
+    cell = (xy_px // width_px).astype(np.int64)
+    _, inverse, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    inverse = inverse.ravel()
+    centers, means = (
+        np.column_stack([np.bincount(inverse, one, len(count)) / count for one in values.T])
+        for values in (xy_px, residual_px)
+    )
+    enough = count >= 5
+    centers = centers[enough]
+    means = means[enough]
+    largest_px = float(np.linalg.norm(means, axis=1).max(initial=0)) or 1.0
+    arrows = axes.quiver(
+        *centers.T, *means.T, angles="xy", scale_units="xy", scale=2 * largest_px / width_px
+    )
+    axes.quiverkey(arrows, 0.85, 1.04, largest_px, f"{largest_px:.2g} px", labelpos="E")
+    axes.set(
+        xlim=(0, size_px[0]), ylim=(size_px[1], 0), aspect="equal", xlabel="x [px]", ylabel="y [px]"
+    )
+    axes.set_title("mean residuals over the chip", loc="left")
+
+
+# Report of a dome survey: statistics, pictures of the dome, and the comparison of a simulated one
+# with the truth.
+
+
+LENS = ("focal length px", "center x px", "center y px", "k1", "k2", "p1", "p2")
+PARAMETERS = (*LENS, *(f"lever {axis} mm" for axis in "xyz"))
+VALUE_KEYS = ("what", "believed", "found", "sigma")
+
+
+def error_statistics(
+    stops: int, errors_rad: list[tuple[float, float]]
+) -> dict[str, float | int | None]:
+    """Median and worst cross-boresight and roll errors of a tracker in arcseconds; None if nothing was solved."""
+    statistics: dict[str, float | int | None] = {"stops": stops, "solved": len(errors_rad)}
+    errors_arcsec = np.abs(errors_rad).reshape(-1, 2) / ARCSEC_RAD
+    for name, error_arcsec in zip(("cross", "roll"), errors_arcsec.T, strict=True):
+        statistics[f"{name}_arcsec_median"] = (
+            float(np.median(error_arcsec)) if len(error_arcsec) else None
+        )
+        statistics[f"{name}_arcsec_worst"] = (
+            float(error_arcsec.max()) if len(error_arcsec) else None
+        )
+    return statistics
+
+
+def compare_trackers(
+    trackers: Mapping[str, factory.Estimator], frames: Iterable[tuple[Frame, Truth]]
+) -> dict[str, dict[str, float | int | None]]:
+    """Statistics of each tracker on the same frames, by name."""
+    errors: dict[str, list[tuple[float, float]]] = {name: [] for name in trackers}
+    stops = 0
+    for frame, truth in frames:
+        stops += 1
+        for name, tracker in trackers.items():
+            cam_from_ref = factory.solve_frame(tracker, frame).attitude.cam_from_ref
+            if cam_from_ref is not None:
+                errors[name].append(metrics.cross_and_roll_rad(cam_from_ref, truth.cam_from_lab))
+    return {name: error_statistics(stops, errors_rad) for name, errors_rad in errors.items()}
+
+
+class LedErrors(NamedTuple):
+    """The S surveyed LEDs: true positions (S, 3), position errors before and after the survey (S, 3), renamed (S,).
+
+    If the map before the survey has two LEDs each closer to the other's true position, the survey may exchange their
+    numbers. This does not affect an attitude, which depends on positions only. `after_m` is therefore the error from
+    the nearest true LED, and `renamed` marks LEDs whose nearest true LED has another number.
+    """
+
+    true_m: Floats
+    before_m: Floats
+    after_m: Floats
+    renamed: NDArray[np.bool_]
+
+
+def led_errors(survey: DomeSurvey, prior: CalibrationPrior, lab: Lab) -> LedErrors:
+    """LED position errors before and after the survey."""
+    true_m = lab.camera.sources.place[:, :3]
+    row = np.flatnonzero(survey.surveyed)
+    position_m = survey.leds.position_m[row]
+    _, nearest = cKDTree(true_m).query(position_m)
+    before_m = prior.leds.position_m[row] - true_m[row]
+    return LedErrors(true_m[row], before_m, position_m - true_m[nearest], nearest != row)
+
+
+def survey_statistics(run: SurveyRun, before: CalibrationPrior) -> dict[str, Any]:
+    """Statistics of a survey without the truth. `values` holds one row per lens and lever parameter that is fitted."""
+    survey = run.survey
+    sigma_mm = 1e3 * run.accuracy.led_sigma_m[survey.surveyed]
+    columns = [
+        parameters(lens, lever)
+        for lens, lever in ((before.camera, before.lever), (survey.camera, survey.lever))
+    ]
+    lever_sigma_mm = 1e3 * np.sqrt(np.diag(survey.lever_covariance_m2))
+    sigma = [*lens_sigma(survey)[:7].tolist(), *lever_sigma_mm.tolist()]
+    return {
+        "status": survey.status,
+        "tied": int(survey.tied.sum()),
+        "leds": len(survey.surveyed),
+        "surveyed": int(survey.surveyed.sum()),
+        "outliers": len(survey.outliers),
+        "rms_px": survey.rms_px,
+        "noise_px": run.noise_px,
+        "misfit": survey.misfit,
+        "led_sigma_mm_median": float(np.median(sigma_mm)),
+        "led_sigma_mm_worst": float(sigma_mm.max()),
+        "values": [
+            dict(zip(VALUE_KEYS, row, strict=True))
+            for row in zip(PARAMETERS, *columns, sigma, strict=True)
+        ],
+    }
+
+
+def truth_statistics(run: SurveyRun, before: CalibrationPrior, lab: Lab) -> dict[str, Any]:
+    """The errors of a simulated survey: of the LEDs before and after it, and the true parameters."""
+    errors = led_errors(run.survey, before, lab)
+    truth = parameters(lab.scene.camera, lab.camera.mount)
+    return {
+        "renamed": int(errors.renamed.sum()),
+        "led_mm_before": float(1e3 * np.sqrt(np.mean(errors.before_m**2))),
+        "led_mm_after": float(1e3 * np.sqrt(np.mean(errors.after_m**2))),
+        "truth": dict(zip(PARAMETERS, truth, strict=True)),
+    }
+
+
+def parameters(lens: Camera | CameraConfig, lever: Lever | Mount) -> list[float]:
+    """The lens and the lever in the order of PARAMETERS."""
+    lever_mm = (1e3 * np.asarray(lever.camera_body_m)).tolist()
+    return [float(lens.focal_px), *lens.center_px, *lens.distortion[:4], *lever_mm]
+
+
+def coverage_figure(
+    so_far: Coverage, faults: DomeFaults | None, further: Rotation | None
+) -> NDArray[np.uint8]:
+    """BGR image of the dome from above: how well each LED is measured, faults, and where to point the camera next."""
+    fig, canvas = new_figure((8, 7))
+    draw_coverage(fig.subplots(), so_far, faults, further)
+    return picture_of(canvas)
+
+
+def survey_figure(
+    so_far: Coverage,
+    faults: DomeFaults,
+    further: Rotation | None,
+    errors: LedErrors | None,
+    shifts: LedErrors,
+) -> NDArray[np.uint8]:
+    """BGR image: the coverage, and the LED errors before and after the survey, or else their shifts from the list."""
+    panels = [("found minus list", shifts.true_m, -shifts.before_m)]
+    if errors is not None:
+        panels = [
+            ("error before the survey", errors.true_m, errors.before_m),
+            ("after", errors.true_m, errors.after_m),
+        ]
+    fig, canvas = new_figure((7 * (1 + len(panels)), 6.5))
+    first, *rest = fig.subplots(1, 1 + len(panels))
+    draw_coverage(first, so_far, faults, further)
+    for axes, (title, place_m, error_m) in zip(rest, panels, strict=True):
+        draw_errors(axes, title, place_m, error_m)
+    return picture_of(canvas)
+
+
+def new_figure(size_in: tuple[float, float]) -> tuple[Any, Any]:
+    """A figure and its canvas."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=size_in, layout="constrained")
+    return fig, FigureCanvasAgg(fig)
+
+
+def picture_of(canvas: Any) -> NDArray[np.uint8]:
+    """BGR image of a canvas."""
+    canvas.draw()
+    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[:, :, 2::-1])
+
+
+def draw_coverage(
+    axes: Any, so_far: Coverage, faults: DomeFaults | None, further: Rotation | None
+) -> None:
+    """LEDs by their standard deviation, gray if not measured; faults; the numbers of the next attitudes."""
+    from matplotlib.colors import LogNorm
+
+    leds = so_far.model.leds
+    measured = so_far.measured
+    x_m, y_m, _ = leds.position_m.T
+    once = so_far.seen.any(axis=0) & ~measured
+    unseen = ~measured & ~once
+    axes.scatter(
+        x_m[unseen],
+        y_m[unseen],
+        s=14,
+        facecolor="none",
+        edgecolor="0.6",
+        label=f"not seen: {unseen.sum()}",
+    )
+    axes.scatter(
+        x_m[once], y_m[once], s=14, color="0.75", label=f"seen, not measured: {once.sum()}"
+    )
+    if so_far.accuracy is not None:
+        sigma_mm = 1e3 * so_far.accuracy.led_sigma_m[measured]
+        label = f"measured: {measured.sum()}"
+        points = axes.scatter(
+            x_m[measured], y_m[measured], s=14, c=sigma_mm, norm=LogNorm(), label=label
+        )
+        axes.figure.colorbar(
+            points, ax=axes, label="standard deviation about each axis [mm]", shrink=0.8
+        )
+    if faults is not None:
+        marks = {
+            "dark": (faults.dark, "x", "black"),
+            "displaced": (list(faults.displaced), "D", "magenta"),
+            "exchanged": ([led for led, _, _ in faults.exchanged], "s", "red"),
+        }
+        for name, (numbers, marker, color) in marks.items():
+            rows = rows_of(numbers, leds.id)
+            colors = (
+                {"color": color} if marker == "x" else {"facecolor": "none", "edgecolor": color}
+            )
+            if len(rows):
+                axes.scatter(x_m[rows], y_m[rows], 70, marker=marker, label=name, **colors)
+            for row in rows:
+                axes.annotate(
+                    str(leds.id[row]),
+                    (x_m[row], y_m[row]),
+                    (6, 6),
+                    textcoords="offset points",
+                    color=color,
+                )
+    if further is not None:
+        lever = so_far.model.lever
+        toward = further.apply(lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])).reshape(-1, 3)
+        for n, (u, attitude) in enumerate(zip(toward, further, strict=True)):
+            at = on_surface(u[None], attitude.apply(lever.camera_body_m), leds)[0]
+            axes.annotate(str(n + 1), at[:2], color="tab:blue", ha="center", weight="bold")
+    axes.legend(loc="upper left", fontsize="small")
+    axes.set(
+        xlabel="x [m]",
+        ylabel="y [m]",
+        aspect="equal",
+        title="coverage; blue: the attitudes to hold next",
+    )
+
+
+def draw_errors(axes: Any, title: str, place_m: Floats, error_m: Floats) -> None:
+    """Arrows of LED errors; the scale is in the key, and color is the vertical error."""
+    rms_mm = 1e3 * float(np.sqrt(np.mean(error_m**2)))
+    scale_mm = 1e3 * float(np.quantile(np.linalg.norm(error_m, axis=1), 0.95)) or 1.0
+    x_m, y_m, _ = place_m.T
+    arrows = axes.quiver(
+        x_m, y_m, *(1e3 * error_m.T), angles="xy", scale=25 * scale_mm, cmap="coolwarm"
+    )
+    arrows.set_clim(-scale_mm, scale_mm)
+    axes.quiverkey(arrows, 0.9, 1.03, scale_mm, f"{scale_mm:.2g} mm", labelpos="E")
+    axes.set_title(f"{title}: {rms_mm:.2g} mm rms an axis", loc="left")
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    axes.figure.colorbar(arrows, ax=axes, label="z error [mm]", shrink=0.8)
+
+
+def list_shifts(run: SurveyRun) -> LedErrors:
+    """The measured LEDs as found, and the list's errors against that."""
+    row = np.flatnonzero(run.survey.surveyed)
+    found_m = run.survey.leds.position_m[row]
+    none = np.zeros(len(row), dtype=bool)
+    return LedErrors(found_m, run.listed.position_m[row] - found_m, np.zeros_like(found_m), none)

@@ -1,1 +1,0 @@
-"""Experiments of PTASE (Fialho & Saotome 2005)."""

@@ -1,1 +1,0 @@
-"""Experiments of SHEFEX-2 (Samaan & Theil 2011)."""

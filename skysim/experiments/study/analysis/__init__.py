@@ -1,1 +1,0 @@
-"""Analysis of a study's trials: tables, sensitivity (error budget) and design optimization."""

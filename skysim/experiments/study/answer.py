@@ -1,0 +1,345 @@
+"""The answers of a study in words: range of each response, thresholds, and how often the tracker answers wrongly.
+
+Misidentification (a light matched with a wrong star or LED) is kept apart from honest roll noise (the right lights, and
+an error that the covariance allows). An event that was never seen has an upper bound instead of an interval.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from skysim.experiments.study import thresholds
+from skysim.experiments.study.factors import Value
+from skysim.experiments.study.plan import Study
+from skysim.experiments.study.table import (
+    Place,
+    PointRow,
+    axis,
+    distinct,
+    format_level,
+    format_summary,
+    has_few_values,
+    unit_of,
+)
+from skysim.results import metrics
+from skysim.results.metrics import Summary
+
+# What a study's numbers allow to claim, in words: whether the tracker's claimed errors are true,
+# and rare events.
+
+
+TRUE_NEES = (2.5, 3.5)  # mean NEES of claimed errors that are true to a tenth
+
+
+def claimed_errors(lines: Sequence[PointRow], place: Place) -> list[str]:
+    """Whether the claimed errors are true at all points, by the intervals of the mean NEES; none without any NEES."""
+    found = [(known(line.responses.get("nees", metrics.NO_VALUE)), line) for line in lines]
+    found = [(one, line) for one, line in found if np.isfinite(one.low)]
+    if not found:
+        return []
+    low, high = TRUE_NEES
+    question = "Are the claimed errors true?"
+    false = [(one, line) for one, line in found if one.low > high or one.high < low]
+    if not false:
+        if all(one.low >= low and one.high <= high for one, _ in found):
+            return [f"{question} Yes: NEES is {low:g} to {high:g}{everywhere(len(found))}."]
+        widest, line = max(found, key=lambda pair: pair[0].high - pair[0].low)
+        at = f" at {place(line)}" if len(found) > 1 else ""
+        between = f"{widest.low:.3g} to {widest.high:.3g}"
+        return [
+            f"{question} Nothing says otherwise, but NEES is known to {between} only{at}; more trials decide it."
+        ]
+    worst, line = max(false, key=lambda pair: abs(math.log(max(pair[0].value, 1e-9) / 3)))
+    factor = math.sqrt(worst.value / 3)
+    size = "small"
+    if factor < 1:
+        factor = 1 / factor
+        size = "large"
+    at = f" at {place(line)}" if len(found) > 1 else ""
+    count = f", at {len(false)} of {len(found)} points" if len(found) > 1 else ""
+    wrong = line.responses.get("wrong", metrics.NO_VALUE).value
+    cause = ", wrong attitudes included" if wrong > 0 else ""
+    interval = f"{worst.low:.3g} to {worst.high:.3g}"
+    return [
+        f"{question} No: too {size} by a factor of {factor:.2g}{at} (NEES {worst.value:.3g}, {interval}{cause}; 3 if"
+        f" true){count}."
+    ]
+
+
+def known(nees: Summary) -> Summary:
+    """A mean NEES, also of a single solution if no true covariance has it (probability 1e-8)."""
+    if np.isnan(nees.low) and nees.value > metrics.OVERCONFIDENT_NEES:
+        return nees._replace(low=nees.value, high=nees.value)
+    return nees
+
+
+def effect_of_wrong_matches(lines: Sequence[PointRow], place: Place) -> list[str]:
+    """How many matches are wrong, and whether the attitude errs more than claimed because of them; none if none are."""
+    shares = [
+        one
+        for line in lines
+        if (one := line.responses.get("mismatched", metrics.NO_VALUE)).value > 0
+    ]
+    if not shares:
+        return []
+    matches = sum(one.trials for one in shares)
+    count = round(sum(one.value * one.trials for one in shares))
+    text = f"There {count:,} of {matches:,} matches {'is' if count == 1 else 'are'} wrong"
+    misled = [(one, line) for line in lines if (one := line.responses["misled"]).value > 0]
+    if not misled:
+        return [f"{text}; the attitude is unaffected: all errors are as claimed."]
+    most, line = max(misled, key=lambda pair: pair[0].value)
+    at = (
+        f" at {len(misled)} of {len(lines)} points, most at {place(line)}:"
+        if len(lines) > 1
+        else " in"
+    )
+    share = (
+        f"{100 * most.value:.3g} % of the frames ({100 * most.low:.3g} to {100 * most.high:.3g} %)"
+    )
+    return [f"{text}; the attitude errs more than claimed{at} {share}."]
+
+
+def everywhere(points: int) -> str:
+    """ " at all 5 points"; empty for one."""
+    return f" at all {points} points" if points > 1 else ""
+
+
+def runs_needed(lines: Sequence[PointRow], events: Sequence[str]) -> list[str]:
+    """How many trials the next smaller claim about an event that was never seen needs; none if all were seen.
+
+    The next smaller claim is the next power of ten below the bound of the point with the fewest trials.
+    """
+    shares = [line.responses[name] for line in lines for name in events]
+    never = [share.trials for share in shares if share.value == 0]
+    if not never:
+        return []
+    fewest = min(never)
+    bound = metrics.exact_bounds(0, fewest)[1]
+    claim = 10.0 ** (math.ceil(math.log10(bound) - 1e-9) - 1)
+    needed = metrics.trials_for_bound(claim)
+    each = " at each point" if len(lines) > 1 else ""
+    return [
+        f"None in {fewest:,} is less than {100 * bound:.2g} % at {100 * metrics.CONFIDENCE:g} % confidence; a claim of"
+        f" less than {100 * claim:.6g} % needs {needed:,} in all{each} without any."
+    ]
+
+
+EVENTS = {
+    "misidentified": "Misidentified (at least one light matched with a wrong star or LED)",
+    "roll_noise": "Roll noise (the right lights, but a roll error beyond 10′ that the covariance allows)",
+    "wrong": "Wrong attitudes (an error beyond 10′ that the covariance does not allow, or beyond 1°)",
+}
+SHARES = (*EVENTS, "ambiguous", "misled", "refused")
+RESPONSES = (
+    *SHARES,
+    "mismatched",
+    "nees",
+)  # responses that the answers need besides those of the study
+
+
+def headline(
+    study: Study,
+    lines: Sequence[PointRow],
+    may_be_ambiguous: bool,
+    worst: str = "skysim study worst STUDY",
+) -> list[str]:
+    """Thresholds, refusals, ambiguity and wrong answers, one sentence or two each; none if all trials failed.
+
+    Parameters
+    ----------
+    lines
+        Of all points, with the responses of the study and RESPONSES
+    may_be_ambiguous
+        Whether the tracker can refuse a frame as ambiguous
+    worst
+        The command that lists the worst trials
+    """
+    done = [line for line in lines if line.trials and np.isfinite(line.responses["wrong"].value)]
+    if not done:
+        return []
+    place = placer(study, done)
+    found = list[str]()
+    for threshold in study.thresholds:
+        found += thresholds.sentences(threshold, study, done)
+    found.append(solved_everywhere(study, done, place, worst))
+    if may_be_ambiguous:
+        found.append(ambiguity(study, done, place))
+    for name, text in EVENTS.items():
+        found.append(event(text, [line.responses[name] for line in done], done, place))
+        found += effect_of_wrong_matches(done, place) if name == "misidentified" else []
+    return [*found, *runs_needed(done, list(EVENTS)), *claimed_errors(done, place)]
+
+
+def verdict(study: Study, lines: Sequence[PointRow]) -> str:
+    """What the study answers, in three or four short sentences; "" if no trial has an answer.
+
+    1. Its thresholds. 2. How many frames are refused. 3. How many attitudes are wrong.
+    """
+    done = [line for line in lines if line.trials and np.isfinite(line.responses["wrong"].value)]
+    if not done:
+        return ""
+    place = placer(study, done)
+    frame = "attitude" if study.trial.kind == "centroids" else "frame"
+    sentences = [thresholds.brief(threshold, study, done) for threshold in study.thresholds]
+    sentences += [
+        worst_share(
+            "refused", f"Every {frame} is solved", f"of the {frame}s are refused", done, place
+        ),
+        worst_share(
+            "wrong", "No attitude is wrong", f"of the {frame}s give a wrong attitude", done, place
+        ),
+    ]
+    return " ".join(sentence[:1].upper() + sentence[1:] for sentence in sentences if sentence)
+
+
+def worst_share(name: str, never: str, text: str, lines: Sequence[PointRow], place: Place) -> str:
+    """ "No attitude is wrong (in 12,000).", or the share at the point where it is largest."""
+    worst = max(lines, key=lambda line: np.nan_to_num(line.responses[name].value))
+    share = worst.responses[name]
+    if not share.value > 0:
+        return f"{never} (in {sum(line.responses[name].trials for line in lines):,})."
+    if len(lines) == 1:
+        return f"{percent(share.value)} {text} ({interval(share)})."
+    return f"Up to {percent(share.value)} {text}, most at {place(worst)}."
+
+
+def ranges(study: Study, lines: Sequence[PointRow]) -> list[str]:
+    """Smallest and largest value of each response over the points, but of those that the headline is about."""
+    done = [line for line in lines if line.trials]
+    place = placer(study, done)
+    return (
+        [response_range(name, done, place) for name in study.responses if name not in SHARES]
+        if done
+        else []
+    )
+
+
+def placer(study: Study, lines: Sequence[PointRow]) -> Place:
+    """The function that names a point by the levels that vary: "leds = 900, rate = 8 deg/s"."""
+    varied = [
+        name for name in study.factors if len(distinct(line.levels[name] for line in lines)) > 1
+    ]
+    units = {name: unit_of(axis(study, lines, name)) for name in varied}
+
+    def named(name: str, level: Value) -> str:
+        return f"{name} = {format_level(level)}" + ("" if isinstance(level, str) else units[name])
+
+    return lambda line: ", ".join(named(name, line.levels[name]) for name in varied)
+
+
+def extremes(name: str, lines: Sequence[PointRow]) -> tuple[PointRow, PointRow] | None:
+    """The points with the least and the largest value of a response; those of few values only without others."""
+    known = [line for line in lines if np.isfinite(line.responses[name].value)]
+    known = [line for line in known if not has_few_values(line, name)] or known
+    if not known:
+        return None
+
+    def value(line: PointRow) -> float:
+        return line.responses[name].value
+
+    return min(known, key=value), max(known, key=value)
+
+
+def response_range(name: str, lines: Sequence[PointRow], place: Place) -> str:
+    """Smallest and largest value of a response over the points, as a sentence."""
+    found = extremes(name, lines)
+    if found is None:
+        return f"{name}: no trial has a value."
+    least, most = found
+    low, high = (format_summary(line.responses[name]) for line in found)
+    if least.responses[name].value == most.responses[name].value:
+        equal = sum(np.isfinite(line.responses[name].value) for line in lines)
+        return f"{name}: {low}" + (f" at all {equal} points." if equal > 1 else ".")
+    return f"{name}: {low} at {place(least)}, to {high} at {place(most)}."
+
+
+def range_rows(study: Study, lines: Sequence[PointRow]) -> list[list[str]]:
+    """Of each response its name, least value, the point that has it, largest value, and the point that has that."""
+    done = [line for line in lines if line.trials]
+    place = placer(study, done)
+    rows = []
+    for name in study.responses:
+        if found := extremes(name, done):
+            low, high = (format_summary(line.responses[name]) for line in found)
+            rows.append([name, low, place(found[0]), high, place(found[1])])
+    return rows
+
+
+def event(text: str, shares: Sequence[Summary], lines: Sequence[PointRow], place: Place) -> str:
+    """How often an event happens: the point where it is most frequent, and an upper bound where it was never seen."""
+    known = [
+        (share, line) for share, line in zip(shares, lines, strict=True) if np.isfinite(share.value)
+    ]
+    if not known:
+        return f"{text}: unknown, as the tracker does not name its lights."
+    never = [share for share, _ in known if share.value == 0]
+    if len(never) == len(known):
+        return f"{text}: {none_of(never)}."
+    most, line = max(known, key=lambda pair: pair[0].value)
+    where = (
+        f" at {len(known) - len(never)} of {len(known)} points, most at {place(line)}:"
+        if len(known) > 1
+        else ""
+    )
+    found = f"{text}:{where} {percent(most.value)} of the frames ({interval(most)})"
+    return f"{found}; {none_of(never)} at the other points." if never else f"{found}."
+
+
+def ambiguity(study: Study, lines: Sequence[PointRow], place: Place) -> str:
+    """Whether the lights of some attitude fit another one as well: refused as ambiguous, or misled."""
+    shares = []
+    for line in lines:
+        refused = line.responses["ambiguous"]
+        wrong = line.responses["misled"]
+        either = refused.value + np.nan_to_num(wrong.value)
+        share = metrics.proportion(round(either * refused.trials), refused.trials)
+        shares.append(share._replace(value=either))
+    unit = ", each with hardware of its own" if study.hardware else ""
+    text = event("Ambiguous or misled", shares, lines, place)
+    never = all(share.value == 0 for share in shares)
+    return f"Is it ambiguous anywhere{unit}? {'No' if never else 'Yes'}. {text}"
+
+
+def solved_everywhere(study: Study, lines: Sequence[PointRow], place: Place, worst: str) -> str:
+    """Whether every attitude is solved, and how often and where the tracker refuses one for any reason."""
+    shares = [line.responses["refused"] for line in lines]
+    text = event("Refused (no attitude is returned)", shares, lines, place)
+    what = "attitude" if study.trial.kind == "centroids" else "frame"
+    if all(share.value == 0 for share in shares):
+        return f"Is every {what} solved? Yes. {text}"
+    return f"Is every {what} solved? No. {text} `{worst} --response refused` names the worst."
+
+
+def one_unit(fixed: Sequence[str]) -> list[str]:
+    """That the intervals are of one unit of hardware, and how to cover others; nothing without a seed drawn once."""
+    if not fixed:
+        return []
+    units = " and ".join(
+        "one survey" if seed.startswith("tracker.") else "one draw of the LEDs" for seed in fixed
+    )
+    return [
+        f"Intervals cover other attitudes, with {units}: `hardware: [{', '.join(fixed)}]` in the study draws"
+        " the hardware anew in every replicate, and they cover it too."
+    ]
+
+
+def none_of(shares: Sequence[Summary]) -> str:
+    """That an event was never seen, and the exact upper bound of its frequency (Clopper & Pearson 1934)."""
+    fewest = min(share.trials for share in shares)
+    each = " a point" if len(shares) > 1 else ""
+    bound = metrics.exact_bounds(0, fewest)[1] if fewest else 1.0
+    return f"none in {fewest:,}{each} (less than {100 * bound:.2g} % at {100 * metrics.CONFIDENCE:g} % confidence)"
+
+
+def interval(share: Summary) -> str:
+    """The interval of a share in percent."""
+    return f"{100 * share.low:.3g} to {percent(share.high)}"
+
+
+def percent(share: float) -> str:
+    """A share in percent, to three digits."""
+    return f"{100 * share:.3g} %"

@@ -1,0 +1,135 @@
+"""Export a study's results for other tools: CSV, Parquet and Zarr, and as an xarray dataset."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core import files
+from skysim.core.errors import InputError, unknown_name
+from skysim.experiments.study.execution.store import COLUMNS, Store
+from skysim.experiments.study.table import level_columns, table, to_columns, with_levels
+from skysim.results.files.row_parts import EXTRA, encoding, to_arrow
+
+
+def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
+    """Write one line per trial, missing values empty; numbers in Python's shortest form, which reads back exactly.
+
+    Columns without any value are left out: of a study of frames, for example, those of flights.
+    """
+    levels = level_columns(store)
+    names = names_with_values(store)
+    with (
+        files.atomic_file(path) as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as file,
+    ):
+        writer = csv.writer(file)
+        writer.writerow(names)
+        for block in store.blocks():
+            columns = with_levels(block, levels)
+            writer.writerows(zip(*(texts(columns[name]) for name in names), strict=True))
+
+
+def names_with_values(store: Store) -> list[str]:
+    """Names of the columns of `trial_columns` that are not empty; all of a store without trials."""
+    every = [*COLUMNS, *level_columns(store)]
+    empty = set(COLUMNS)
+    some = False
+    for block in store.blocks():
+        some |= bool(len(block["trial"]))
+        empty -= {name for name in empty if has_values(block[name])}
+    return [name for name in every if name not in empty] if some else every
+
+
+def has_values(column: NDArray[Any]) -> bool:
+    """Whether any value is neither None nor NaN."""
+    return (
+        any(value is not None for value in column)
+        if column.dtype == object
+        else bool(np.any(column == column))
+    )
+
+
+def texts(column: NDArray[Any]) -> list[Any]:
+    """Values for CSV: an empty string for None and NaN."""
+    values = column.tolist()
+    return [value if value is not None and value == value else "" for value in values]
+
+
+def to_parquet(store: Store, responses: tuple[str, ...], path: Path) -> None:
+    """Write one row per trial, missing values null; title, code version and study file are in the file's metadata.
+
+    Raises
+    ------
+    InputError
+        If pyarrow is not installed.
+    """
+    try:
+        import pyarrow.parquet
+    except ImportError:
+        raise InputError(path, f"Parquet {EXTRA}") from None
+    levels = level_columns(store)
+    meta = {key: store.meta(key) for key in ("title", "code", "study")}
+    tables = (
+        to_arrow(with_levels(block, levels)).replace_schema_metadata(meta)
+        for block in store.blocks()
+    )
+    first = next(tables)
+    with (
+        files.atomic_file(path) as temporary,
+        pyarrow.parquet.ParquetWriter(temporary, first.schema, **encoding(first.schema)) as writer,
+    ):
+        for rows in itertools.chain([first], tables):
+            writer.write_table(rows)
+
+
+def dataset(store: Store, responses: tuple[str, ...], path: Path) -> Any:
+    """An xarray.Dataset of every response with its interval and count.
+
+    The dimensions are the factors if the design is a full factorial, otherwise the points. Raises InputError if
+    xarray or pandas is not installed.
+    """
+    try:
+        import pandas
+        import xarray
+    except ImportError:
+        raise InputError(path, f"xarray {EXTRA}") from None
+    lines = table(store, responses)
+    frame = pandas.DataFrame(to_columns(lines))
+    factors = list(lines[0].levels) if lines else []
+    for name in factors:
+        if frame[name].map(type).isin([list, dict]).any():
+            frame[name] = frame[name].map(str)
+    sizes = [frame[name].nunique() for name in factors]
+    full = factors and int(np.prod(sizes)) == len(frame) and not frame.duplicated(factors).any()
+    meta = {key: store.meta(key) for key in ("title", "code", "study")}
+    indexed = frame.set_index(factors if full else ["point"])
+    return xarray.Dataset.from_dataframe(indexed).assign_attrs(meta)
+
+
+def to_zarr(store: Store, responses: tuple[str, ...], path: Path) -> None:
+    """Write `dataset` as a Zarr folder."""
+    tables = dataset(store, responses, path)
+    with files.atomic_folder(path) as temporary:
+        tables.to_zarr(temporary, mode="w", consolidated=False)
+
+
+EXPORTS: dict[str, Callable[[Store, tuple[str, ...], Path], None]] = {
+    ".csv": to_csv,
+    ".parquet": to_parquet,
+    ".zarr": to_zarr,
+}
+
+
+def export(store: Store, responses: tuple[str, ...], path: Path) -> None:
+    """Write a study's results in the format given by the path's suffix. Raises InputError for an unknown suffix."""
+    if path.suffix not in EXPORTS:
+        raise InputError(path, *unknown_name("file format", path.suffix, EXPORTS))
+    files.make_folder(path.parent)
+    EXPORTS[path.suffix](store, responses, path)

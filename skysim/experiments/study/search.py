@@ -1,0 +1,487 @@
+"""Design optimization: a sampler proposes candidate points one after another, each evaluated by all its replicates.
+
+The sampler is optuna's tree-structured Parzen estimator with constraints. It is seeded by the study and learns only
+from rows in the store, so a resumed search proposes the same candidates again, finds their rows and continues after
+them. The result is the feasible candidate with the best objective or, with two objectives, the Pareto front.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from skysim.core.errors import InputError, unknown_name
+from skysim.core.units import in_si
+from skysim.experiments.study.execution.engines import Engine
+from skysim.experiments.study.execution.outcomes import FAILED
+from skysim.experiments.study.execution.runner import Progress, Watch, run_points
+from skysim.experiments.study.execution.setups import code_version, seed_of
+from skysim.experiments.study.execution.store import Store
+from skysim.experiments.study.execution.trials import REFUSED, Row
+from skysim.experiments.study.factors import (
+    Distribution,
+    Factor,
+    Levels,
+    Point,
+    Range,
+    Value,
+    make_point,
+    split_quantity,
+)
+from skysim.experiments.study.plan import Constraint, Cost, Plan, Search, Study, resolve_point
+from skysim.experiments.study.table import format_level, format_summary
+from skysim.results import metrics
+from skysim.results.files.parts import parts_list
+from skysim.results.metrics import Columns, Summary
+from skysim.scene.scene import Scene
+from skysim.scene.sections.light import DomeConfig
+
+# Cost of a candidate of a search: prices of its factors, and the parts list of its scene's dome.
+
+
+COST = "cost"
+
+
+def check_cost(factors: Mapping[str, Factor], config: Cost) -> None:
+    """Raise InputError for prices of unknown factors or levels, and for prices per unit of a factor without numbers."""
+    for name in config.per:
+        where = f"optimize.cost.per.{name}"
+        factor = require_factor(name, factors, where)
+        values = [value for value, _ in factor.options()]
+        try:
+            for value in values if not isinstance(factor, Levels) else [values[0]]:
+                si(value)
+        except InputError as error:
+            allowed = (
+                "numbers, or quantities with units; prices of named levels: optimize.cost.levels"
+            )
+            raise InputError(where, error.problem, allowed) from None
+    for name, prices in config.levels.items():
+        where = f"optimize.cost.levels.{name}"
+        factor = require_factor(name, factors, where)
+        named = (
+            [str(level) for level, _ in factor.options()] if not isinstance(factor, Range) else []
+        )
+        if sorted(named) != sorted(prices):
+            allowed = (
+                f"a price of each of {', '.join(named)}"
+                if named
+                else "optimize.cost.per, as it is a range"
+            )
+            raise InputError(where, f"prices {', '.join(prices) or 'nothing'}", allowed)
+
+
+def check_parts(config: Cost, scene: Scene) -> None:
+    """Raise InputError if a scene whose parts are to be priced has no dome."""
+    if config.parts and not isinstance(scene.light, DomeConfig):
+        raise InputError(
+            "optimize.cost.parts", f"light of kind {scene.light.kind} has no parts", "dome"
+        )
+
+
+def require_factor(name: str, factors: Mapping[str, Factor], where: str) -> Factor:
+    """The factor with a name. Raises InputError if there is none."""
+    if name not in factors:
+        raise InputError(where, *unknown_name("factor", name, factors))
+    return factors[name]
+
+
+def si(value: Value) -> float:
+    """A plain number unchanged, or a quantity in SI units: "48 in" is 1.2192. Raises InputError."""
+    number, unit = split_quantity(value)
+    return in_si(value) if unit else number
+
+
+def cost(plan: Plan, point: Point) -> tuple[float, str]:
+    """Cost of a point, and why it has none (NaN): base, `per` and `levels` of the factors, and the parts' total."""
+    assert plan.study.optimize is not None
+    config = plan.study.optimize.cost
+    total = factors_cost(config, point.levels)
+    if plan.prices is None:
+        return total, ""
+    try:
+        scene, _ = resolve_point(plan.spec, point.settings)
+        return total + parts_list(scene, plan.prices).total, ""
+    except InputError as error:
+        return math.nan, str(error)
+
+
+def factors_cost(config: Cost, levels: Mapping[str, Value]) -> float:
+    """base + sum of per[factor] * value + prices of the named levels, with values in SI units."""
+    linear = sum(price * si(levels[name]) for name, price in config.per.items())
+    return (
+        config.base
+        + linear
+        + sum(price[str(levels[name])] for name, price in config.levels.items())
+    )
+
+
+STARTUP_CANDIDATES = 10  # random candidates before the sampler uses earlier results
+MAX_REPEATS = 50  # repeated proposals in succession after which all points count as evaluated
+MISSING_VIOLATION = (
+    1e3  # violation of a candidate without a value; larger than usual relative violations
+)
+MIN_SCALE = 1e-9  # scale of the relative violation of a bound of zero
+
+
+class Candidate(NamedTuple):
+    """One evaluated point.
+
+    Attributes
+    ----------
+    figures
+        Statistic of each response that is an objective or a constraint
+    feasible
+        All constraints hold for the values (intervals are ignored), and no value is missing
+    refused
+        Its scene is invalid
+    why
+        The violated constraints, or the error message of the scene; empty if feasible
+    """
+
+    number: int
+    levels: dict[str, Value]
+    objectives: tuple[float, ...]
+    figures: dict[str, Summary]
+    cost: float
+    feasible: bool
+    refused: bool
+    why: str
+
+
+class SearchResult(NamedTuple):
+    """Result of a search.
+
+    Attributes
+    ----------
+    front
+        The Pareto-optimal feasible candidates, best in the first objective first; with one
+        objective, the best
+    finished
+        Whether all candidates, or all existing points, were evaluated
+    """
+
+    candidates: list[Candidate]
+    front: list[Candidate]
+    finished: bool
+
+
+class InvalidScene(Exception):
+    """Raised when a candidate's scene is invalid, so that none of its trials can run."""
+
+
+# Validation before the first trial.
+
+
+def check(study: Study) -> None:
+    """Validate section `optimize` of a study. Raises InputError with the key at fault."""
+    config = study.optimize
+    if config is None:
+        return
+    for n, objective in enumerate(config.objectives):
+        check_response(objective.response, f"optimize.objectives.{n}.response")
+    first, *others = (one.response for one in config.objectives)
+    if first in others:
+        raise InputError("optimize.objectives", f"{first} occurs twice", "different responses")
+    for n, limit in enumerate(config.constraints):
+        check_response(limit.response, f"optimize.constraints.{n}.response")
+        if limit.at_least is None and limit.at_most is None:
+            raise InputError(f"optimize.constraints.{n}", "no bound", "at_least, at_most or both")
+    for name, factor in study.factors.items():
+        if isinstance(factor, Distribution):
+            raise InputError(
+                f"factors.{name}",
+                "a distribution cannot be optimized",
+                "levels, values, from and to",
+            )
+    check_cost(study.factors, config.cost)
+    trials = config.candidates * study.replicates
+    budget = study.budget.trials
+    if budget is not None and trials > budget:
+        raise InputError("budget.trials", budget, f"at least {trials}, the trials of the search")
+
+
+def check_response(response: str, where: str) -> None:
+    """Raise InputError for an unknown response and for one that is not reproducible (time_ms)."""
+    if response == COST:
+        return
+    try:
+        metrics.response(response, where)
+    except InputError as error:
+        raise InputError(where, error.problem, f"{error.allowed}, or {COST}") from None
+    if response.startswith("time_ms"):
+        allowed = "responses that a resumed search reproduces"
+        raise InputError(where, f"{response} is not reproducible", allowed)
+
+
+# Evaluation of a candidate.
+
+
+def evaluate_candidate(plan: Plan, number: int, point: Point, columns: Columns) -> Candidate:
+    """The candidate computed from the columns of all its trials, and its cost."""
+    config = plan.study.optimize
+    assert config is not None
+    figures = {name: metrics.response(name)(columns) for name in config.responses if name != COST}
+    price, unpriced = cost(plan, point)
+    values = {name: figure.value for name, figure in figures.items()} | {COST: price}
+    objectives = tuple(values[one.response] for one in config.objectives)
+    violated = [
+        one.response for one in config.constraints if violation(one, values[one.response]) > 0
+    ]
+    violated += [
+        f"no {one.response}" for one in config.objectives if math.isnan(values[one.response])
+    ]
+    refused = scene_error(columns)
+    why = refused or unpriced or ", ".join(violated)
+    return Candidate(number, point.levels, objectives, figures, price, not why, bool(refused), why)
+
+
+def violation(limit: Constraint, value: float) -> float:
+    """Relative violation of a constraint, (value - bound) / |bound|; <= 0 if it holds, MISSING_VIOLATION for NaN."""
+    if math.isnan(value):
+        return MISSING_VIOLATION
+    over = (
+        []
+        if limit.at_most is None
+        else [(value - limit.at_most) / max(abs(limit.at_most), MIN_SCALE)]
+    )
+    under = (
+        []
+        if limit.at_least is None
+        else [(limit.at_least - value) / max(abs(limit.at_least), MIN_SCALE)]
+    )
+    return max(over + under)
+
+
+def scene_error(columns: Columns) -> str:
+    """Why a candidate's scene was rejected; empty if the scene is valid."""
+    errors = zip(columns["scene"], columns["error"], strict=True)
+    return next((str(error) for scene, error in errors if scene == REFUSED), "")
+
+
+def front(config: Search, candidates: Sequence[Candidate]) -> list[Candidate]:
+    """The Pareto front: feasible candidates that no other dominates.
+
+    One candidate dominates another if it is at least as good in every objective and better in one.
+    """
+    feasible = [one for one in candidates if one.feasible]
+    sign = np.array([1.0 if one.better == "less" else -1.0 for one in config.objectives])
+    values = np.array([one.objectives for one in feasible]).reshape(-1, len(sign)) * sign
+    dominated = [
+        np.any(np.all(values <= one, axis=1) & np.any(values < one, axis=1)) for one in values
+    ]
+    best = [n for n in range(len(feasible)) if not dominated[n]]
+    return [feasible[n] for n in sorted(best, key=lambda n: tuple(values[n]))]
+
+
+def front_cells(study: Study, result: SearchResult) -> tuple[list[str], list[list[str]]]:
+    """Column heads and cell texts of the front: candidate, levels, objectives and what the constraints bound."""
+    assert study.optimize is not None
+    named = [one.response for one in study.optimize.objectives]
+    shown = named + [name for name in study.optimize.responses if name not in (*named, COST)]
+    rows = [
+        [
+            str(one.number),
+            *map(format_level, one.levels.values()),
+            *(
+                f"{one.cost:.4g}" if name == COST else format_summary(one.figures[name])
+                for name in shown
+            ),
+        ]
+        for one in result.front
+    ]
+    return ["candidate", *study.factors, *shown], rows
+
+
+def front_columns(result: SearchResult) -> dict[str, Any]:
+    """The candidates of the front, and of all candidates the cost; None for one without."""
+    costs = [None if math.isnan(one.cost) else one.cost for one in result.candidates]
+    return {"front": [one.number for one in result.front], "costs": costs}
+
+
+def collect_result(plan: Plan, store: Store) -> SearchResult:
+    """The candidates in a store whose trials are complete, and their front; the search may be unfinished."""
+    study = plan.study
+    replicates = plan.study.replicates
+    assert study.optimize is not None
+    evaluated = [
+        evaluate_candidate(plan, n, point, columns)
+        for n, point in enumerate(store.points())
+        if len((columns := store.point_columns(n))["trial"]) == replicates
+    ]
+    return SearchResult(
+        evaluated, front(study.optimize, evaluated), len(evaluated) == study.optimize.candidates
+    )
+
+
+# The search.
+
+
+def search(plan: Plan, store: Store, engine: Engine, watch: Watch | None = None) -> SearchResult:
+    """Evaluate candidates until `candidates` of them are complete, all points are evaluated, or the budget is spent.
+
+    Raises InputError, also if optuna is not installed or proposes other candidates than those in the store.
+    """
+    study = plan.study
+    config = plan.study.optimize
+    assert config is not None
+    sampler = create_sampler(study)
+    stored = store.points()
+    total = Progress(config.candidates * study.replicates, **store.counts())
+    evaluated: dict[str, Candidate] = {}
+    for n in range(config.candidates):
+        proposal, point = propose(sampler, study, evaluated)
+        if point is None:
+            return collect_result(plan, store)._replace(finished=True)
+        if n >= len(stored):
+            store.set_points([point], first=n)
+        elif key_of(stored[n]) != key_of(point):
+            raise InputError(
+                store.path,
+                f"candidate {n} is {stored[n].levels}, the sampler now proposes {point.levels}",
+                "the version of optuna that started the search, or another store",
+            )
+        refused = study.replicates * sum(one.refused for one in evaluated.values())
+        if not run_candidate(plan, store, engine, n, point, total, refused, watch):
+            return collect_result(plan, store)
+        evaluated[key_of(point)] = evaluate_candidate(plan, n, point, store.point_columns(n))
+        report_to_sampler(sampler, proposal, config, evaluated[key_of(point)])
+    return collect_result(plan, store)
+
+
+def create_sampler(study: Study) -> Any:
+    """An optuna study with the tree-structured Parzen estimator (TPE), which handles one or two objectives.
+
+    The first candidate is the middle of all factors. TPE learns after START candidates; NSGA-II would need a
+    population of fifty.
+    """
+    try:
+        import optuna
+    except ImportError:
+        raise InputError(
+            "optimize", "optuna is not installed", "after pip install 'skysim[optuna]'"
+        ) from None
+    assert study.optimize is not None
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    seed = int(np.random.SeedSequence(study.seed).generate_state(1)[0])
+    sampler = optuna.samplers.TPESampler(seed=seed, n_startup_trials=STARTUP_CANDIDATES)
+    directions = [
+        "minimize" if one.better == "less" else "maximize" for one in study.optimize.objectives
+    ]
+    optuna_study = optuna.create_study(sampler=sampler, directions=directions)
+    factors = study.factors.items()
+    middle = {
+        name: 0.5 if isinstance(factor, Range) else len(factor.options()) // 2
+        for name, factor in factors
+    }
+    optuna_study.enqueue_trial(middle)
+    return optuna_study
+
+
+def propose(
+    sampler: Any, study: Study, evaluated: dict[str, Candidate]
+) -> tuple[Any, Point | None]:
+    """The sampler's next proposal that was not evaluated yet: optuna trial and point; (None, None) if there is none.
+
+    A repeated proposal gets the known result, so that the sampler moves on.
+    """
+    assert study.optimize is not None
+    for _ in range(MAX_REPEATS):
+        # A number in [0, 1] for a range, an index for levels or values.
+        proposal = sampler.ask()
+        chosen = {}
+        for name, factor in study.factors.items():
+            if isinstance(factor, Range):
+                chosen[name] = factor.value_at(proposal.suggest_float(name, 0.0, 1.0))
+            else:
+                options = factor.options()
+                chosen[name] = options[proposal.suggest_categorical(name, range(len(options)))]
+        point = make_point(chosen)
+        if key_of(point) not in evaluated:
+            return proposal, point
+        report_to_sampler(sampler, proposal, study.optimize, evaluated[key_of(point)])
+    return None, None
+
+
+def key_of(point: Point) -> str:
+    """Identity of a point: its settings as text."""
+    return json.dumps(point.settings, sort_keys=True)
+
+
+def report_to_sampler(sampler: Any, proposal: Any, config: Search, candidate: Candidate) -> None:
+    """Report a candidate's objectives and constraint violations to the sampler.
+
+    A candidate without values gets infinitely bad objectives and an extra violated constraint.
+    """
+    values = {name: figure.value for name, figure in candidate.figures.items()} | {
+        COST: candidate.cost
+    }
+    for n, limit in enumerate(config.constraints):
+        proposal.set_constraint(str(n), violation(limit, values[limit.response]))
+    valid = not candidate.refused and not any(math.isnan(one) for one in candidate.objectives)
+    proposal.set_constraint("answered", 0.0 if valid else MISSING_VIOLATION)
+    worst = [math.inf if one.better == "less" else -math.inf for one in config.objectives]
+    sampler.tell(proposal, list(candidate.objectives) if valid else worst)
+
+
+def run_candidate(
+    plan: Plan, store: Store, engine: Engine, number: int, point: Point, total: Progress, refused: int,
+    watch: Watch | None,
+) -> bool:  # fmt: skip
+    """Run the missing replicates of a candidate. Returns False if the budget is spent before all are in the store.
+
+    Parameters
+    ----------
+    total
+        Progress of the whole search, passed to `watch`
+    refused
+        Number of failed trials of invalid scenes, which the budget does not count
+    """
+    # Budgets are for the whole search: subtract the time spent, and the failures of earlier candidates.
+    before = replace(total)
+    budget = plan.study.budget
+    left_s = None if budget.time_s is None else budget.time_s - (time.perf_counter() - total.began)
+    if left_s is not None and left_s <= 0:
+        return False
+    failures = budget.failures and budget.failures + refused - before.failed
+    budget = budget.model_copy(update={"time_s": left_s, "failures": failures})
+    limited = replace(plan, study=plan.study.model_copy(update={"budget": budget}))
+
+    def watch_candidate(progress: Progress) -> None:
+        total.done = before.done + progress.now
+        total.now = before.now + progress.now
+        total.failed = progress.failed
+        total.wrong = before.wrong + progress.wrong
+        if watch:
+            watch(total)
+        if progress.failed > refused and scene_error(store.point_columns(number)):
+            raise InvalidScene
+
+    try:
+        progress = run_points(limited, store, engine, [point], number, watch_candidate)
+    except InvalidScene:
+        rows = failed_rows(plan, store, number)
+        store.add(rows)
+        total.add(rows)
+        return True
+    return progress.done == progress.trials
+
+
+def failed_rows(plan: Plan, store: Store, number: int) -> list[Row]:
+    """Rows for the remaining trials of a candidate with an invalid scene: failed, with the error of the first one."""
+    columns = store.point_columns(number)
+    replicates = plan.study.replicates
+    missing = np.setdiff1d(np.arange(replicates), columns["replicate"]).tolist()
+    failed = Row(0, number, 0, 0, REFUSED, code_version(), FAILED, scene_error(columns), 0.0)
+    return [
+        failed._replace(
+            trial=number * replicates + k, replicate=k, seed=seed_of(plan.spec, number, k)
+        )
+        for k in missing
+    ]

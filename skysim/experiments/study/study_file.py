@@ -1,0 +1,363 @@
+"""Load a study file, validate it and make its plan."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from skysim.core.errors import OVERRIDES, InputError, unknown_name
+from skysim.core.yaml_reader import check_version, explain, read_yaml, set_key, where_of
+from skysim.dynamics.controllers import CONTROLLERS
+from skysim.experiments.study import unused_options
+from skysim.experiments.study.factors import (
+    Distribution,
+    Factor,
+    Levels,
+    Settings,
+    Value,
+    make_point,
+)
+from skysim.experiments.study.plan import (
+    TRIAL,
+    AttitudeRange,
+    CentroidTrial,
+    Figure,
+    FlightTrial,
+    FrameTrial,
+    Map,
+    Plan,
+    Study,
+    Threshold,
+    Trial,
+    find,
+    make_plan,
+    resolve_point,
+)
+from skysim.results import metrics
+from skysim.scene.scene import BODIES_YEARS, Scene
+from skysim.scene.sections.layouts import OnPoints
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
+from skysim.tracking.tracker_interface import OWN, TRACKERS
+
+SURVEY_SEED = "tracker.survey.seed"
+HARDWARE_SEED = re.compile(r"(hardware_seed|survey\.(surface_)?seed)$")
+FLIGHT_QUANTITIES = (
+    "availability",
+    "filter_arcsec",
+    "filter_worst_arcsec",
+    "drift_arcsec",
+    "pointing_arcsec",
+    "pointing_worst_arcsec",
+)
+# Kinds of trial that measure a quantity; quantities that are not listed are measured by all.
+MEASURED_BY: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(FLIGHT_QUANTITIES, ("flight",)),
+    "streak_px": ("frames", "flight"),
+}
+
+
+def load(
+    name: str | Path,
+    overrides: Mapping[str, str] | None = None,
+    programs: Mapping[str, str] | None = None,
+) -> Plan:
+    """Read, override (`path.to.key` -> YAML value) and validate a study and every level of its factors.
+
+    Parameters
+    ----------
+    programs
+        Commands of external trackers and controllers by name; None if the study will not be
+        run, and its trackers and controllers need not be installed
+
+    Raises
+    ------
+    InputError
+        With one line: the key, the fault, what is allowed, the file and line.
+    """
+    path = find(str(name))
+    tree, text = read_yaml(path)
+    check_version(tree, path, text)
+    for key, value in (overrides or {}).items():
+        set_key(tree, key, value)
+    return plan_of(tree, text, path, overrides=overrides, programs=programs)
+
+
+def plan_of(
+    tree: dict[str, Any],
+    text: str,
+    path: Path,
+    base: Path | None = None,
+    *,
+    overrides: Mapping[str, str] | None = None,
+    programs: Mapping[str, str] | None = None,
+) -> Plan:
+    """The validated plan of a study's tree, read from a text.
+
+    Parameters
+    ----------
+    path
+        Of the text, for messages
+    base
+        A file beside which scenes are, `path` if left out
+
+    Raises
+    ------
+    InputError
+        With one line.
+    """
+    try:
+        study = Study.model_validate(tree)
+    except ValidationError as error:
+        raise explain(error, Study, tree, [(path, text)], overrides or {}) from None
+    try:
+        plan = make_plan(base or path, study, tree["trial"], programs or {})
+        check(plan, to_run=programs is not None)
+    except InputError as error:  # about a key of the study: add file and line
+        if error.where in (None, OVERRIDES):
+            error = error.at(where_of(error.key.split("."), [(path, text)], {}))
+        raise error from None
+    return plan
+
+
+def check(plan: Plan, to_run: bool) -> None:
+    """Validate responses, figures, budget and each level of each factor before the first trial. Raises InputError.
+
+    Parameters
+    ----------
+    to_run
+        Whether the trackers and controllers must be installed
+    """
+    from skysim.experiments.study import search
+    from skysim.experiments.study.execution.store import COLUMNS
+
+    study = plan.study
+    for n, name in enumerate(study.responses):
+        metrics.response(name, f"responses.{n}")
+    check_figures(plan)
+    if study.optimize:
+        search.check(study)
+    if study.budget.trials is not None and plan.trials > study.budget.trials:
+        raise InputError(
+            "budget.trials", study.budget.trials, f"at least {plan.trials}, the trials of the study"
+        )
+    for name in study.factors:
+        if name in COLUMNS or name in study.responses:
+            raise InputError(
+                f"factors.{name}", "the name is that of a column of the trials", "another name"
+            )
+    check_hardware(study)
+    points = []
+    for name, level, own, settings in each_level(study.factors):
+        try:
+            scene, trial = resolve_point(plan.spec, plan.spec.trial_settings(settings, 0))
+            check_trial(plan, scene, trial, to_run)
+            if study.optimize:
+                search.check_parts(study.optimize.cost, scene)
+        except InputError as error:
+            raise at_factor(study, name, level, error) from None
+        points.append(unused_options.CheckedPoint(name, level, own, settings, scene, trial))
+    check_measured(study, {point.trial.kind for point in points}, [point.scene for point in points])
+    unused_options.check(plan, points, partial(resolve_point, plan.spec))
+
+
+def check_figures(plan: Plan) -> None:
+    """Raise InputError for a figure or threshold of an unknown factor, level or response."""
+    from skysim.experiments.study import table, thresholds
+    from skysim.experiments.study.table import PointRow
+
+    study = plan.study
+    rows = [PointRow(k, point.levels, {}) for k, point in enumerate(plan.points)]
+    for where, one in named_sections(study):
+        for key, factor in one.axes.items():
+            if factor is not None and factor not in study.factors:
+                raise InputError(f"{where}.{key}", *unknown_name("factor", factor, study.factors))
+        metrics.response(one.response, where)
+        if isinstance(one, Map) and study.trial.kind == "flight":
+            raise InputError(
+                f"{where}.kind", "a map of flights, which have no single attitude", "curve, heat"
+            )
+        if isinstance(one, Threshold):
+            thresholds.check(one, where, study, rows)
+        if plan.points:
+            try:
+                table.fixed_levels(one, study, rows)
+            except InputError as error:
+                raise error.under(where) from None
+
+
+def named_sections(study: Study) -> Iterator[tuple[str, Figure | Threshold]]:
+    """Every figure and threshold with its key in the study file."""
+    for n, figure in enumerate(study.figures):
+        yield f"figures.{n}", figure
+    for n, threshold in enumerate(study.thresholds):
+        yield f"thresholds.{n}", threshold
+
+
+def check_hardware(study: Study) -> None:
+    """Raise InputError where draws of the hardware are levels of a factor, or keys that the factors set too."""
+    for n, key in enumerate(study.hardware):
+        if key.startswith(TRIAL):
+            raise InputError(
+                f"hardware.{n}", f"{key} is no hardware", "seeds of the scene's hardware"
+            )
+        for name, factor in study.factors.items():
+            if key in dict(factor.value_at(0.5)[1]):
+                raise InputError(
+                    f"hardware.{n}", f"{key} is set by factors.{name} too", "one of the two"
+                )
+    for name, factor in study.factors.items():
+        keys = [] if isinstance(factor, Levels | Distribution) else list(factor.value_at(0.5)[1])
+        if keys and all(HARDWARE_SEED.search(key) for key in keys):
+            raise InputError(
+                f"factors.{name}",
+                f"{keys[0]} numbers draws of the hardware",
+                f"hardware: [{', '.join(keys)}], which draws them anew in every replicate, or levels with a name for"
+                " each unit",
+            )
+
+
+def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
+    """Raise InputError where the trial does not fit the scene of a level."""
+    if isinstance(scene.light, CollimatedDisplayConfig) and not isinstance(trial, FlightTrial):
+        raise InputError("trial.kind", f"{trial.kind} with a collimated display", "flight")
+    if scene.tracker.decoder and isinstance(trial, FrameTrial):
+        raise InputError(
+            "trial.kind", "frames with tracker.decoder, which needs many", "centroids, flight"
+        )
+    if SURVEY_SEED in plan.spec.hardware and not has_survey_errors(scene):
+        raise InputError(
+            "hardware",
+            "tracker.survey.seed has no effect without errors of the survey",
+            "with tracker.survey.led_sigma, lever_sigma or light.surface.error",
+        )
+    if isinstance(trial, FlightTrial) and trial.start:
+        check_random_start(scene, trial.start)
+    near = getattr(trial.start if isinstance(trial, FlightTrial) else trial, "near", None)
+    if near and near.body == "zenith" and scene.site.longitude_deg is None:
+        raise InputError("trial.near.body", "zenith requires site.longitude_deg in the scene")
+    if near and not BODIES_YEARS[0] <= scene.start_time.year <= BODIES_YEARS[1]:
+        first, last = BODIES_YEARS
+        raise InputError(
+            "trial.near", f"start_time {scene.start_time} is outside {first} to {last}", "none"
+        )
+    if to_run:
+        tracker = scene.tracker.name
+        TRACKERS.check_name(tracker, plan.spec.programs)
+        if scene.motion.control:
+            CONTROLLERS.check_name(scene.motion.control.law, plan.spec.programs)
+        if tracker != OWN and isinstance(trial, CentroidTrial):  # an external tracker takes images
+            raise InputError(
+                "tracker.name", f"{tracker} needs frames", f"{OWN}, or another trial.kind"
+            )
+
+
+def has_survey_errors(scene: Scene) -> bool:
+    """Whether the survey of a scene has errors that `tracker.survey.seed` draws."""
+    survey = scene.tracker.survey
+    dome = scene.light if isinstance(scene.light, DomeConfig) else None
+    error_m = dome.surface.error_m if dome else 0.0
+    return any(
+        (
+            survey.led_sigma_m,
+            survey.lever_sigma_m,
+            survey.focal_length_sigma_m,
+            survey.instrument,
+            error_m,
+        )
+    )
+
+
+def fixed_seeds(study: Study, scene: Scene) -> list[str]:
+    """Seeds of the survey and of the LEDs that a scene draws once, and the study neither draws anew nor varies."""
+    layout = scene.light.layout if isinstance(scene.light, DomeConfig) else None
+    points, prefix = (layout.points, ".points") if isinstance(layout, OnPoints) else (layout, "")
+    seeds = [SURVEY_SEED] if has_survey_errors(scene) else []
+    seeds += [f"light.layout{prefix}.hardware_seed"] if hasattr(points, "hardware_seed") else []
+    varied = {*study.hardware, *study.set}.union(
+        *(factor.value_at(0.5)[1] for factor in study.factors.values())
+    )
+    return [seed for seed in seeds if seed not in varied]
+
+
+def at_factor(study: Study, name: str, level: Value, error: InputError) -> InputError:
+    """A level's error with the factor that sets the key at fault, and its value; one of `hardware` unchanged."""
+    if error.key == "hardware":
+        return error
+    owners = [
+        other
+        for other, factor in study.factors.items()
+        if error.key in dict(factor.value_at(0.5)[1])
+    ]
+    owner = name if name in owners or not owners else owners[0]
+    value = level if owner == name else study.factors[owner].value_at(0.5)[0]
+    return error.within(f"{value!r}").within(f"factors.{owner}")
+
+
+def check_measured(study: Study, kinds: set[str], scenes: Sequence[Scene]) -> None:
+    """Raise InputError for a response that no trial of the study measures."""
+    where = {name: f"responses.{n}" for n, name in enumerate(study.responses)}
+    where |= {one.response: key for key, one in named_sections(study)}
+    for name, key in where.items():
+        measured = MEASURED_BY.get(metrics.split_name(name)[0], kinds)
+        if not kinds & set(measured):
+            raise InputError(
+                key, f"{name} in trials of kind {', '.join(kinds)}", f"of {', '.join(measured)}"
+            )
+        if name == "ambiguous" and not any(map(may_report_ambiguity, scenes)):
+            raise InputError(
+                key,
+                "no tracker of this study reports ambiguity",
+                "under a dome, with the default identifier",
+            )
+
+
+def may_report_ambiguity(scene: Scene) -> bool:
+    """Whether the tracker of a scene can refuse a frame as ambiguous."""
+    from estimator.trackers.dome_tracker import SETTINGS
+
+    own = isinstance(scene.light, DomeConfig) and scene.tracker.identifier in (
+        None,
+        SETTINGS.identifier,
+    )
+    return own or scene.tracker.name != OWN
+
+
+def check_random_start(scene: Scene, start: AttitudeRange) -> None:
+    """Raise InputError for a random start that the scene cannot have, or whose keys have no effect in it."""
+    if isinstance(scene.light, CollimatedDisplayConfig) or scene.motion.start == "profile":
+        where = (
+            "a collimated display" if scene.motion.start != "profile" else "motion.start: profile"
+        )
+        raise InputError("trial.start", f"random with {where}", "scene")
+    dome = isinstance(scene.light, DomeConfig)
+    for unused in ("dec_deg", "near") if dome else ("tilt_deg",):
+        if unused in start.model_fields_set:
+            raise InputError(
+                f"trial.start.{unused}",
+                f"has no effect with light of kind {scene.light.kind}",
+                "none",
+            )
+    greatest_deg = max(start.tilt_deg) if isinstance(start.tilt_deg, tuple) else start.tilt_deg
+    vehicle = scene.vehicle
+    if dome and vehicle.mount == "air_bearing" and greatest_deg > vehicle.tilt_stop_deg:
+        raise InputError(
+            "trial.start.tilt_deg",
+            f"{greatest_deg:g}",
+            f"up to vehicle.tilt_stop_deg {vehicle.tilt_stop_deg:g}",
+        )
+
+
+def each_level(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Settings, Settings]]:
+    """Every level of every factor with the other factors at their middle: factor, level, its settings, all settings."""
+    middle = {name: factor.value_at(0.5) for name, factor in factors.items()}
+    for name, factor in factors.items():
+        others = make_point(
+            {other: chosen for other, chosen in middle.items() if other != name}
+        ).settings
+        for level, settings in factor.options() or [middle[name]]:
+            yield name, level, settings, others | settings

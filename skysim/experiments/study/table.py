@@ -1,0 +1,446 @@
+"""Result tables of a study: one line per point with every response and its interval, and one row per trial."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError, unknown_name
+from skysim.core.random_streams import random_stream
+from skysim.core.types import Floats
+from skysim.experiments.study.execution.store import Store
+from skysim.experiments.study.factors import Distribution, Levels, Range, Value, split_quantity
+from skysim.experiments.study.plan import Figure, Plan, Study, Threshold
+from skysim.results import metrics
+from skysim.results.files.row_parts import Rows
+from skysim.results.metrics import CONFIDENCE, NO_VALUE, Summary
+
+LONG_QUANTITY = re.compile(r"(-?\d*\.\d{4,}(?:e[-+]?\d+)?)(\s\S.*)$")
+
+
+ROUNDING = 1e-9  # a smaller response is the rounding error of 0
+MIN_VALUES = 5  # fewer values of more trials are few
+
+
+class PointRow(NamedTuple):
+    """One point: its number, factor levels, the responses computed from its trials, and the number of these."""
+
+    point: int
+    levels: dict[str, Any]
+    responses: dict[str, Summary]
+    trials: int = 0
+
+
+Place = Callable[[PointRow], str]  # names a point in words
+
+
+def table(store: Store, responses: Sequence[str]) -> list[PointRow]:
+    """One row for every point of a store; responses of points without trials are NaN."""
+    functions = {name: metrics.response(name) for name in responses}
+    rows = []
+    for number, point in enumerate(store.points()):
+        columns = store.point_columns(number)
+        responses_ = {name: response(columns) for name, response in functions.items()}
+        rows.append(PointRow(number, point.levels, responses_, len(columns["trial"])))
+    return rows
+
+
+def has_few_values(row: PointRow, response: str) -> bool:
+    """Whether few of a point's trials have a value of a response: less than half of them, or less than MIN_VALUES.
+
+    The error of a solution, for example, is that of the solved trials alone, which are the easy ones where few are.
+    """
+    values = row.responses[response].trials
+    return 0 < values < max(row.trials / 2, min(MIN_VALUES, row.trials))
+
+
+def select_responses(rows: Sequence[PointRow], responses: Sequence[str]) -> list[PointRow]:
+    """The rows with only these responses."""
+    return [
+        one._replace(responses={name: one.responses[name] for name in responses}) for one in rows
+    ]
+
+
+def cells(rows: Sequence[PointRow]) -> tuple[list[str], list[list[str]]]:
+    """Column heads and cell texts of a table, such as `0.97 (0.95..0.98)`."""
+    if not rows:
+        return [], []
+    texts = [
+        [
+            str(one.point),
+            *map(format_level, one.levels.values()),
+            *(format_response(one, name) for name in one.responses),
+        ]
+        for one in rows
+    ]
+    return ["point", *rows[0].levels, *rows[0].responses], texts
+
+
+def format_level(value: Any) -> str:
+    """Text of a factor's level, numbers rounded to four digits."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, str) and (
+        match := LONG_QUANTITY.match(value)
+    ):  # a sampled quantity with a unit
+        return f"{float(match[1]):.4g}{match[2]}"
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def format_summary(summary: Summary) -> str:
+    """Text of a statistic with its interval, or how many values more it needs to have one."""
+    if np.isnan(summary.value):
+        return "-"
+    value, low, high = (0.0 if abs(one) < ROUNDING else one for one in summary[:3])
+    if summary.needs:
+        return f"{value:.3g} (needs {summary.needs} more values)"
+    if np.isnan(low) or low == high:
+        return f"{value:.3g}"
+    return f"{value:.3g} ({low:.3g}..{high:.3g})"
+
+
+def format_response(row: PointRow, name: str) -> str:
+    """Text of a response, with the number of values where few of the point's trials have one."""
+    text = format_summary(row.responses[name])
+    return f"{text} n={row.responses[name].trials}" if has_few_values(row, name) else text
+
+
+def to_columns(rows: Sequence[PointRow]) -> dict[str, list[Any]]:
+    """The rows as columns: point, factors, and value, low, high and trial count of each response."""
+    columns: dict[str, list[Any]] = {"point": [one.point for one in rows]}
+    for name in rows[0].levels if rows else ():
+        columns[name] = [one.levels[name] for one in rows]
+    for name in rows[0].responses if rows else ():
+        for field in Summary._fields:
+            key = name if field == "value" else f"{name}_{field}"
+            columns[key] = [getattr(one.responses[name], field) for one in rows]
+    return columns
+
+
+def trial_columns(store: Store) -> Rows:
+    """All trials: the columns of the store, and a column for the levels of each factor."""
+    return with_levels(store.columns(), level_columns(store))
+
+
+def level_columns(store: Store) -> dict[str, NDArray[Any]]:
+    """(P,) levels of each factor by point: numbers, or texts."""
+    points = store.points()
+    return {
+        name: to_array([one.levels[name] for one in points])
+        for name in (points[0].levels if points else ())
+    }
+
+
+def to_array(levels: Sequence[Any]) -> NDArray[Any]:
+    """Levels of a factor as an array; those that numpy has no type for as texts."""
+    array = np.array([format_level(one) if isinstance(one, list) else one for one in levels])
+    return (
+        array
+        if array.dtype != object
+        else np.array([one if one is None else str(one) for one in levels], object)
+    )
+
+
+def with_levels(rows: Rows, levels: dict[str, NDArray[Any]]) -> Rows:
+    """Rows of trials, and the levels of their points."""
+
+    def column(name: str) -> NDArray[Any]:
+        return levels[name][rows["point"]] if name in levels else rows[name]
+
+    return Rows((*rows, *levels), [column], [rows.starts[-1]])
+
+
+# Error budget: Sobol indices of the attitude error for each factor (Sobol 1993).
+
+
+AXES = {"cross_arcsec": ("x_arcsec", "y_arcsec"), "roll_arcsec": ("roll_arcsec",)}
+RESAMPLES = 200
+
+
+class Index(NamedTuple):
+    """Contribution of a factor to one error: its indices, and rms_arcsec, the error due to this factor alone.
+
+    rms_arcsec is the standard deviation of the error times the square root of the first-order index.
+    """
+
+    factor: str
+    response: str
+    first: Summary
+    total: Summary
+    rms_arcsec: float
+
+
+def indices(plan: Plan, store: Store) -> list[Index]:
+    """Indices of every factor for the cross-boresight and roll errors. Raises InputError for another design."""
+    kind = plan.study.design.kind
+    if kind != "saltelli" or plan.study.optimize:
+        raise InputError("design.kind", kind, "saltelli, without optimize, for Sobol indices")
+    return [index for response in AXES for index in response_indices(plan, store, response)]
+
+
+def response_indices(plan: Plan, store: Store, response: str) -> list[Index]:
+    """Indices of every factor for one error; NaN if no replicate is complete."""
+    a, b, ab = sample_outputs(plan, store, AXES[response])
+    names = list(plan.study.factors)
+    count = a.shape[1]
+    if not len(a):
+        return [Index(name, response, NO_VALUE, NO_VALUE, np.nan) for name in names]
+    estimate = generalized(a, b, ab)
+    rng = random_stream(1)
+    # Resample rows of A, B and AB together, so that each resample is a valid Saltelli sample.
+    selections = rng.integers(count, size=(RESAMPLES, count))
+    resampled = np.array(
+        [generalized(a[:, rows], b[:, rows], ab[:, :, rows]) for rows in selections]
+    )
+    low, high = np.quantile(resampled, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], axis=0)
+    first, total = (
+        [Summary(float(v), float(lo), float(hi), count) for v, lo, hi in zip(*index, strict=True)]
+        for index in zip(estimate, low, high, strict=True)
+    )
+    # The variance of the cross-boresight error is the sum of the variances about its two axes.
+    sigma_arcsec = float(
+        np.sqrt(np.var(np.concatenate([a, b], axis=1), axis=1).mean() * len(AXES[response]))
+    )
+    rms_arcsec = [sigma_arcsec * float(np.sqrt(max(one.value, 0.0))) for one in first]
+    columns = zip(names, first, total, rms_arcsec, strict=True)
+    return [Index(name, response, one, other, rms) for name, one, other, rms in columns]
+
+
+def sample_outputs(
+    plan: Plan, store: Store, axes: tuple[str, ...]
+) -> tuple[Floats, Floats, Floats]:
+    """(S, N), (S, N) and (D, S, N) errors at A, at B, and at A with one column of B.
+
+    There are N sample rows, D factors and S outputs, one per axis and replicate. A replicate is left out if any of its
+    trials has no solution or is not done yet.
+    """
+    width = len(plan.study.factors)
+    each = plan.study.replicates
+    columns = store.columns()
+    # Trial number = point * replicates + replicate, and points are in the order A, B, AB_1 .. AB_D.
+    values = np.full((len(axes), plan.trials), np.nan)
+    values[:, columns["trial"]] = [columns[name] for name in axes]
+    grid = values.reshape(len(axes), -1, each).transpose(0, 2, 1).reshape(len(axes) * each, -1)
+    complete = np.isfinite(grid).all(axis=1)
+    blocks = grid[complete].reshape(int(complete.sum()), width + 2, len(plan.points) // (width + 2))
+    return blocks[:, 0], blocks[:, 1], blocks[:, 2:].transpose(1, 0, 2)
+
+
+def generalized(a: Floats, b: Floats, ab: Floats) -> NDArray[np.float64]:
+    """(2, D) first-order and total indices, averaged over the outputs with their variances as weights.
+
+    The estimators are those of Saltelli et al. (2010), from SciPy. Outputs without variance have weight zero.
+    """
+    estimate = scipy.stats.sobol_indices(func={"f_A": a, "f_B": b, "f_AB": ab}, n=a.shape[1])
+    weight = np.var(np.concatenate([a, b], axis=1), axis=1)
+    if weight.sum() == 0:
+        return np.zeros((2, len(ab)))
+    varying = weight > 0
+    both = (estimate.first_order, estimate.total_order)
+    return np.stack([weight[varying] @ index[varying] / weight.sum() for index in both])
+
+
+# Factors of a study as axes, and which of its points a figure or a threshold is about.
+
+
+SAMPLED_DESIGNS = ("lhs", "sobol", "saltelli")  # sampled designs: no two points share a level
+GROUPS = 4  # number of groups into which a sampled factor `by` is divided
+LOG_FACTOR_RATIO = 10  # minimum ratio of last to first level for a logarithmic factor axis
+UNITS = {
+    "_deg_s": "deg/s",
+    "_arcsec": "arcsec",
+    "_deg": "deg",
+    "_mag": "mag",
+    "_px": "px",
+    "_um": "um",
+}
+UNITS |= {"_mm": "mm", "_ms": "ms", "_hz": "Hz", "_m": "m", "_s": "s"}
+Shown = Figure | Threshold
+
+
+class Axis(NamedTuple):
+    """A factor as an axis: label and levels, ascending if they are numbers of one unit, else in the study's order."""
+
+    label: str
+    levels: list[Value]
+    numeric: bool
+    log: bool
+
+    def coordinate(self, one: Value) -> float:
+        """Coordinate of a level on the axis: its numeric value, or its index if levels are not numeric."""
+        if self.numeric:
+            return split_quantity(one)[0]
+        return float(next(n for n, other in enumerate(self.levels) if same(one, other)))
+
+    def tick_label(self, one: Value) -> str:
+        """Tick text of a level; a number is written without its unit, which is in the axis label."""
+        if not self.numeric:
+            return format_level(one)
+        number = self.coordinate(one)
+        return f"{number:.6g}" if number == int(number) else f"{number:.3g}"
+
+
+# Names and axes.
+
+
+def is_sampled(study: Study) -> bool:
+    """Whether the points are sampled, so that no two share a level: a design in SAMPLED_DESIGNS, or an optimization."""
+    return study.optimize is not None or study.design.kind in SAMPLED_DESIGNS
+
+
+def same(one: Value, other: Value) -> bool:
+    """Whether two levels are equal, as numbers where possible: 5 equals 5.0, and "5 m" equals "5.0 m"."""
+    try:
+        return split_quantity(one) == split_quantity(other)
+    except ValueError:
+        return bool(one == other)
+
+
+def distinct(levels: Iterable[Value]) -> list[Value]:
+    """The levels without duplicates, in order of first appearance."""
+    return list({repr(one): one for one in levels}.values())
+
+
+def label(name: str, unit: str = "") -> str:
+    """Readable name with its unit in brackets: `cross_arcsec_p95` becomes "cross p95 [arcsec]"."""
+    figure, _, statistic = name.rpartition("_")
+    stem, tail = (figure, f" {statistic}") if statistic in metrics.STATISTICS else (name, "")
+    ending = next((ending for ending in UNITS if stem.endswith(ending)), "")
+    unit = unit or UNITS.get(ending, "")
+    text = stem.removesuffix(ending).replace("_", " ") + tail
+    return text + (f" [{unit}]" if unit else " [share]" if is_share(name) else "")
+
+
+def is_share(name: str) -> bool:
+    """Whether a response is a proportion between 0 and 1."""
+    return metrics.is_proportion(name)
+
+
+def axis(study: Study, lines: Sequence[PointRow], name: str) -> Axis:
+    """The axis of a factor, with the levels at which there are points."""
+    factor = study.factors[name]
+    levels = distinct(line.levels[name] for line in lines)
+    key = "" if isinstance(factor, Levels) else factor.key or ""
+    unit = next((unit for ending, unit in UNITS.items() if key.endswith(ending)), "")
+    numbers, own_unit = as_numbers(levels)
+    if numbers is not None:
+        levels = [levels[n] for n in np.argsort(numbers)]
+        # A range or distribution declares its own scale; explicit values are judged by their spacing.
+        if isinstance(factor, Range):
+            log = factor.scale == "log"
+        elif isinstance(factor, Distribution):
+            log = factor.distribution == "lognormal"
+        else:
+            log = suits_log_scale(np.sort(numbers))
+        return Axis(label(name, own_unit or unit), levels, True, log)
+    order = [one for one, _ in factor.options()]
+    levels.sort(
+        key=lambda one: next((n for n, other in enumerate(order) if same(one, other)), len(order))
+    )
+    has_text = any(isinstance(one, str | bool) for one in levels)
+    return Axis(label(name, "" if has_text else unit), levels, False, False)
+
+
+def unit_of(axis: Axis) -> str:
+    """The unit of an axis after a space; empty if it has none."""
+    unit = axis.label.partition(" [")[2].rstrip("]")
+    return f" {unit}" if unit else ""
+
+
+def as_numbers(levels: Sequence[Value]) -> tuple[Floats | None, str]:
+    """(N,) levels as numbers, and their unit. None unless all are numbers of the same unit and distinct."""
+    try:
+        parts = [split_quantity(one) for one in levels]
+    except ValueError:
+        return None, ""
+    numbers = np.array([number for number, _ in parts])
+    units = {unit for _, unit in parts}
+    if len(units) != 1 or len(np.unique(numbers)) < len(numbers):
+        return None, ""
+    return numbers, units.pop()
+
+
+def suits_log_scale(numbers: Floats) -> bool:
+    """Whether ascending numbers suit a logarithmic axis.
+
+    True if they are positive, extend over a ratio of at least LOG_FACTOR_RATIO, and their steps vary less as ratios
+    than as differences (compared by the coefficient of variation).
+    """
+    if len(numbers) < 4 or numbers[0] <= 0 or numbers[-1] < LOG_FACTOR_RATIO * numbers[0]:
+        return False
+    variation = [
+        np.std(steps) / np.mean(steps) for steps in (np.diff(np.log(numbers)), np.diff(numbers))
+    ]
+    return bool(variation[0] < variation[1])
+
+
+# Selection of points.
+
+
+def fixed_levels(shown: Shown, study: Study, lines: Sequence[PointRow]) -> dict[str, Value]:
+    """The levels at which a figure or threshold keeps factors fixed: those of its `where`, and the first level of
+    other factors that it does not show.
+
+    Sampled points share no levels, so only `where` applies to them. Raises InputError if `where` names an unknown
+    factor or level.
+    """
+    check_levels(shown.where, study, lines)
+    if is_sampled(study):
+        return dict(shown.where)
+    axes = set(shown.axes.values())
+    return {
+        name: shown.where.get(name, factor.options()[0][0])
+        for name, factor in study.factors.items()
+        if name not in axes or name in shown.where
+    }
+
+
+def shown_points(lines: Sequence[PointRow], shown: Shown, study: Study) -> list[PointRow]:
+    """The table lines (points) that a figure or threshold is about."""
+    return points_at(lines, study, fixed_levels(shown, study, lines))
+
+
+def check_levels(levels: Mapping[str, Value], study: Study, lines: Sequence[PointRow]) -> None:
+    """Raise InputError for an unknown factor, or a level at which there is no point."""
+    for name, level in levels.items():
+        if name not in study.factors:
+            raise InputError("where", *unknown_name("factor", name, study.factors))
+        available = distinct(line.levels[name] for line in lines)
+        if not any(same(level, one) for one in available):
+            allowed = ", ".join(map(format_level, available[:20]))
+            raise InputError(f"where.{name}", f"unknown level {level!r}", allowed)
+
+
+def points_at(
+    lines: Sequence[PointRow], study: Study, levels: Mapping[str, Value]
+) -> list[PointRow]:
+    """The table lines (points) at these levels. Raises InputError for an unknown factor or level."""
+    check_levels(levels, study, lines)
+    return [
+        line for line in lines if all(same(line.levels[name], one) for name, one in levels.items())
+    ]
+
+
+def group_points(
+    lines: Sequence[PointRow], group_axis: Axis, name: str, study: Study
+) -> dict[str, list[PointRow]]:
+    """Table lines grouped by the level of factor `name`, in the order of its axis `group_axis`."""
+    # A sampled factor has about as many levels as points: divide the sorted points into GROUPS groups of equal size.
+    if is_sampled(study) and group_axis.numeric and len(group_axis.levels) > 2 * GROUPS:
+        ordered = sorted(lines, key=lambda line: group_axis.coordinate(line.levels[name]))
+        bounds = [round(n * len(ordered) / GROUPS) for n in range(GROUPS + 1)]
+        parts = [ordered[a:b] for a, b in itertools.pairwise(bounds) if b > a]
+        spans = [[group_axis.coordinate(part[n].levels[name]) for n in (0, -1)] for part in parts]
+        return {
+            f"{low:.3g} to {high:.3g}": part for (low, high), part in zip(spans, parts, strict=True)
+        }
+    return {
+        group_axis.tick_label(one): [line for line in lines if same(line.levels[name], one)]
+        for one in group_axis.levels
+    }

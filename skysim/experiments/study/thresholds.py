@@ -1,0 +1,324 @@
+"""Thresholds of a study: where along a factor a proportion crosses a limit, with an interval.
+
+The proportion is assumed to rise or to fall along the factor, and nothing else about its curve. The estimate is the
+place where its isotonic fit crosses the limit, linear between the levels. The interval has levels as its ends: it goes
+from the last level of which it is certain that it is on one side of the limit to the first that is certainly on the
+other, so more levels between the two make it shorter.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.experiments.study import table
+from skysim.experiments.study.plan import Curve, Study, Threshold
+from skysim.experiments.study.table import Axis, PointRow
+from skysim.results import metrics
+
+TAIL = (1 - metrics.CONFIDENCE) / 2
+MOST_TRIALS = 1_000_000  # more trials than that are no advice
+MISFIT_PROBABILITY = 1e-3  # of a monotonic curve that differs from its isotonic fit by more than the accepted deviance
+
+
+class Crossing(NamedTuple):
+    """Where a proportion crosses a limit along a factor.
+
+    Attributes
+    ----------
+    value
+        The estimate; -inf or inf if it is beyond the levels, NaN if the proportion neither
+        rises nor falls
+    low, high
+        Interval at CONFIDENCE; -inf or inf where no level is certain
+    rising
+        Whether the proportion rises along the factor
+    between
+        The two levels between which it crosses, where trials are so few that the estimate is no
+        more than that (`too_few`); None otherwise
+    needs
+        Of each open end that more trials would close, a level, and about how many trials it
+        takes in all
+    """
+
+    value: float
+    low: float
+    high: float
+    rising: bool
+    between: tuple[float, float] | None = None
+    needs: tuple[tuple[float, int], ...] = ()
+
+
+# Estimation.
+
+
+def crossing(x: Floats, hits: Floats, trials: Floats, limit: float, log: bool = False) -> Crossing:
+    """Where a monotonic proportion crosses a limit, from (L,) hits of (L,) trials at (L,) ascending levels.
+
+    The isotonic fit is the maximum-likelihood estimate of a monotonic curve (Ayer et al. 1955). The interval's ends
+    are found by fixed-sequence tests (Maurer, Hothorn & Lehmacher 1995): from the side where the proportion is above
+    the limit, level after level as long as its exact lower bound (Clopper & Pearson 1934) is; from the other side
+    likewise with upper bounds. A wrong end requires a wrong test at the first level beyond the true crossing, so each
+    end is wrong with a probability of at most 2.5 %, for any monotonic curve.
+
+    Parameters
+    ----------
+    log
+        Interpolate between the levels in the logarithm of x
+    """
+    fits = {rising: isotonic(hits / trials, trials, rising) for rising in (False, True)}
+    rising = log_likelihood(hits, trials, fits[True]) > log_likelihood(hits, trials, fits[False])
+    deviance = 2 * (
+        log_likelihood(hits, trials, hits / trials) - log_likelihood(hits, trials, fits[rising])
+    )
+    if deviance > scipy.stats.chi2.isf(MISFIT_PROBABILITY, max(len(x) - 1, 1)):
+        return Crossing(math.nan, -math.inf, math.inf, rising)
+    # In the order in which the proportion falls, `above` and `below` are certain levels.
+    order = slice(None, None, -1) if rising else slice(None)
+    sign = -1.0 if rising else 1.0
+    places = (np.log(x) if log else x)[order]
+    fit = fits[rising][order]
+    value = sign * math.inf
+    between = None
+    below = np.flatnonzero(fit < limit)
+    if len(below):
+        n = int(below[0])
+        share = (fit[n - 1] - limit) / (fit[n - 1] - fit[n]) if n else 0.0
+        value = (
+            float(places[n - 1] + share * (places[n] - places[n - 1])) if n else -sign * math.inf
+        )
+        value = math.exp(value) if log and n else value
+        if n and too_few(trials, limit):
+            first, second = sorted(x[order][n - 1 : n + 1].tolist())
+            between = first, second
+    above, beneath = certain_levels(x[order], hits[order], trials[order], limit)
+    ends = (
+        -sign * math.inf if above is None else above,
+        sign * math.inf if beneath is None else beneath,
+    )
+    open_ends = [end for end, level in ((0, above), (-1, beneath)) if level is None]
+    needs = [
+        (float(x[order][end]), trials_needed(float(fit[end]), limit, above=end == 0))
+        for end in open_ends
+    ]
+    return Crossing(
+        value, min(ends), max(ends), rising, between, tuple((at, n) for at, n in needs if n)
+    )
+
+
+def too_few(trials: Floats, limit: float) -> bool:
+    """Whether one trial is more than what separates the limit from 0 or 1: a proportion then has no value near it."""
+    return bool(trials.min() < 1 / min(limit, 1 - limit))
+
+
+def trials_needed(share: float, limit: float, above: bool) -> int:
+    """About how many trials make a level of this proportion certainly above (or below) the limit; 0 if none would.
+
+    The fewest n whose exact bound for n share hits is beyond the limit, a guess as good as the share is known.
+    """
+    side, sign = (0, 1.0) if above else (1, -1.0)
+
+    def certain(count: int) -> bool:
+        return sign * (metrics.exact_bounds(share * count, count, 1 - TAIL)[side] - limit) >= 0
+
+    if not certain(MOST_TRIALS):
+        return 0
+    return bisect.bisect_left(range(MOST_TRIALS), True, lo=1, key=certain)
+
+
+def isotonic(proportion: Floats, weight: Floats, rising: bool) -> Floats:
+    """(L,) isotonic fit of proportions, by pooling adjacent violators."""
+    return np.asarray(
+        scipy.optimize.isotonic_regression(proportion, weights=weight, increasing=rising).x
+    )
+
+
+def log_likelihood(hits: Floats, trials: Floats, proportion: Floats) -> float:
+    """Binomial log-likelihood of proportions, without the term that does not depend on them."""
+    return float(
+        np.sum(
+            scipy.special.xlogy(hits, proportion)
+            + scipy.special.xlogy(trials - hits, 1 - proportion)
+        )
+    )
+
+
+def certain_levels(
+    x: Floats, hits: Floats, trials: Floats, limit: float
+) -> tuple[float | None, float | None]:
+    """The last level that is certainly above the limit and the first that is certainly below it, by fixed sequences.
+
+    Parameters
+    ----------
+    x
+        (L,) levels in the order in which the proportion falls
+    """
+    counts = list(
+        zip(x.tolist(), hits.astype(int).tolist(), trials.astype(int).tolist(), strict=True)
+    )
+    above = beneath = None
+    for place, count, total in counts:
+        if metrics.exact_bounds(count, total, 1 - TAIL)[0] < limit:
+            break
+        above = place
+    for place, count, total in reversed(counts):
+        if metrics.exact_bounds(count, total, 1 - TAIL)[1] >= limit:
+            break
+        beneath = place
+    return above, beneath
+
+
+# Thresholds of a study.
+
+
+def check(threshold: Threshold, where: str, study: Study, rows: Sequence[PointRow]) -> None:
+    """Raise InputError for a threshold of no proportion, or along a factor without numeric levels."""
+    name = threshold.response
+    if not metrics.is_proportion(name):
+        raise InputError(
+            f"{where}.response", f"{name} is no proportion", "identified, coverage_4, ..."
+        )
+    if table.is_sampled(study):
+        raise InputError(
+            where, "points are sampled, without levels", "design factorial or one_at_a_time"
+        )
+    axis = table.axis(study, rows, threshold.along)
+    if not axis.numeric or len(axis.levels) < 2:
+        raise InputError(
+            f"{where}.along",
+            f"{threshold.along} has no two numeric levels",
+            "a factor with numbers",
+        )
+
+
+def thresholds_of(curve: Curve, study: Study, lines: Sequence[PointRow]) -> list[Threshold]:
+    """The study's thresholds of a curve's response, along its x, at its levels."""
+    levels = table.fixed_levels(curve, study, lines)
+    shown = (curve.y, curve.x, curve.by)
+    return [
+        one
+        for one in study.thresholds
+        if (one.response, one.along, one.by) == shown
+        and table.fixed_levels(one, study, lines) == levels
+    ]
+
+
+def crossings(
+    threshold: Threshold, study: Study, lines: Sequence[PointRow]
+) -> dict[str, Crossing | None]:
+    """The crossing for each level of `by`, by its label, or by "" without `by`; None without trials at two levels."""
+    axis = table.axis(study, lines, threshold.along)
+    chosen = table.shown_points(lines, threshold, study)
+    groups = {"": chosen}
+    if threshold.by is not None:
+        groups = table.group_points(
+            chosen, table.axis(study, lines, threshold.by), threshold.by, study
+        )
+    return {label: group_crossing(threshold, group, axis) for label, group in groups.items()}
+
+
+def group_crossing(threshold: Threshold, lines: Sequence[PointRow], axis: Axis) -> Crossing | None:
+    """The crossing along one series of points; None without trials at two levels."""
+    summaries = [
+        (axis.coordinate(line.levels[threshold.along]), line.responses[threshold.response])
+        for line in lines
+    ]
+    rows = [(x, round(one.value * one.trials), one.trials) for x, one in summaries if one.trials]
+    if len(rows) < 2:
+        return None
+    x, hits, trials = np.array(sorted(rows), dtype=float).T
+    return crossing(x, hits, trials, threshold.limit, axis.log)
+
+
+def sentences(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> list[str]:
+    """The threshold in words, one sentence for each level of `by`."""
+    axis = table.axis(study, lines, threshold.along)
+    unit = table.unit_of(table.axis(study, lines, threshold.by)) if threshold.by is not None else ""
+    return [
+        (f"{threshold.by} = {label}{unit}: " if label else "") + describe(one, threshold, axis)
+        for label, one in crossings(threshold, study, lines).items()
+    ]
+
+
+def describe(found: Crossing | None, threshold: Threshold, axis: Axis) -> str:
+    """A crossing in words, such as "identified falls below 95 % at rate = 6.2 deg/s (95 %: 4 to 8)"."""
+    response = threshold.response
+    limit = f"{100 * threshold.limit:g} %"
+    name = threshold.along
+    if found is None:
+        return f"{response} has no trials at two levels of {name} yet."
+    unit = table.unit_of(axis)
+    if math.isnan(found.value):
+        return f"{response} neither rises nor falls along {name}, so no level of it is a threshold."
+    first, last = (axis.coordinate(one) for one in (axis.levels[0], axis.levels[-1]))
+    crosses = f"{response} {'reaches' if found.rising else 'falls below'} {limit}"
+    if math.isinf(found.value):
+        everywhere = (found.value > 0) != found.rising
+        text = f"{response} is {'at least' if everywhere else 'below'} {limit} at all levels of {name}, "
+        text += f"{first:.4g} to {last:.4g}{unit}"
+    elif found.between:
+        text = f"{crosses} between {name} = {found.between[0]:.4g} and {found.between[1]:.4g}{unit}"
+    else:
+        text = f"{crosses} at {name} = {found.value:.4g}{unit}"
+    return f"{text} ({interval_text(found, name, unit)})."
+
+
+def interval_text(found: Crossing, name: str, unit: str) -> str:
+    """The interval of a crossing in words, and how many trials it takes in all where an end is open."""
+    counts = " and ".join(
+        f"about {trials:,} trials at {name} = {level:.4g}{unit}" for level, trials in found.needs
+    )
+    needs = f"; needs {counts}" if counts else ""
+    low, high = (f"{end:.4g}" for end in (found.low, found.high))
+    if math.isinf(found.low) and math.isinf(found.high):
+        return f"{100 * metrics.CONFIDENCE:g} %: no level is certain{needs}"
+    if math.isinf(found.low):
+        return f"{100 * metrics.CONFIDENCE:g} %: below {high}{needs}"
+    if math.isinf(found.high):
+        return f"{100 * metrics.CONFIDENCE:g} %: above {low}{needs}"
+    return f"{100 * metrics.CONFIDENCE:g} %: {low} to {high}"
+
+
+def brief(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> str:
+    """The threshold in one sentence without its intervals, all levels of `by` together; "" without trials."""
+    axis = table.axis(study, lines, threshold.along)
+    unit = table.unit_of(axis)
+    found = [
+        (f" ({label})" if label else "", one)
+        for label, one in crossings(threshold, study, lines).items()
+        if one is not None
+    ]
+    if not found:
+        return ""
+    limit = f"{100 * threshold.limit:g} %"
+    at = [
+        f"{one.between[0]:.4g} to {one.between[1]:.4g}{unit}{label}"
+        if one.between
+        else f"{one.value:.4g}{unit}{label}"
+        for label, one in found
+        if math.isfinite(one.value)
+    ]
+    always = [
+        label for label, one in found if math.isinf(one.value) and (one.value > 0) != one.rising
+    ]
+    never = [
+        label for label, one in found if math.isinf(one.value) and (one.value > 0) == one.rising
+    ]
+    parts = []
+    if at:
+        crosses = "reaches" if any(one.rising for _, one in found) else "falls below"
+        parts.append(
+            f"{threshold.response} {crosses} {limit} at {threshold.along} = {', '.join(at)}"
+        )
+    for labels, text in ((always, f"at least {limit}"), (never, f"below {limit}")):
+        if labels:
+            subject = "" if parts else f"{threshold.response} is "
+            parts.append(f"{subject}{text} at all levels{','.join(labels)}")
+    return "; ".join(parts) + "." if parts else ""

@@ -1,0 +1,195 @@
+"""The worst trials of a study by a response: where in the sky or in the dome they are, and which trials repeat them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from skysim.core.types import Floats
+from skysim.experiments.study.execution.store import Store
+from skysim.experiments.study.plan import Study
+from skysim.experiments.study.table import PointRow, points_at
+from skysim.results import metrics
+from skysim.results.files.row_parts import row_of, subset
+from skysim.results.metrics import Columns
+
+COUNT = 3  # number of worst trials that a report lists
+DIRECTION = ("body_tilt_deg", "body_azimuth_deg", "boresight_ra_deg", "boresight_dec_deg", "stars")
+FIRST = 1000  # worst trials that are sorted at first
+APART_DEG = 5.0  # least angle between the directions of two of them; nearer ones are one place
+NEAR = math.cos(math.radians(APART_DEG))
+# Column by which a trial counts for a proportion; for `identified` those that do not.
+FLAGS: dict[str, Callable[[Columns], NDArray[Any]]] = {
+    "identified": lambda c: c["frames"] - c["solved"] + c["wrong"],
+    "refused": lambda c: c["frames"] - c["solved"],
+    "overconfident": lambda c: np.nan_to_num(c["nees"]) > metrics.OVERCONFIDENT_NEES,
+    "failed": lambda c: c["frames"] == 0,
+}
+ColumnsOf = Callable[..., Columns]  # the columns of the trials of some points
+
+
+class WorstTrial(NamedTuple):
+    """One of the worst trials: its number, point and attitude, and what happened in it.
+
+    Attributes
+    ----------
+    status
+        "misidentified" where it is solved with wrong lights
+    tilt_deg, azimuth_deg
+        Of the body's z axis under a dome
+    ra_deg, dec_deg
+        Of the boresight under the stars
+    yaw_deg, pitch_deg, roll_deg
+        The body's 3-2-1 angles under a dome, as of `motion.start`;  NaN under the stars
+    lights
+        In the field
+    cross_arcsec, roll_arcsec
+        Its errors, NaN without a solution
+    """
+
+    trial: int
+    point: int
+    status: str
+    cross_arcsec: float
+    roll_arcsec: float
+    tilt_deg: float
+    azimuth_deg: float
+    ra_deg: float
+    dec_deg: float
+    lights: float
+    yaw_deg: float = math.nan
+    pitch_deg: float = math.nan
+    roll_deg: float = math.nan
+
+    @property
+    def direction(self) -> str:
+        """Its direction in words."""
+        if math.isfinite(self.tilt_deg):
+            return f"tilt {self.tilt_deg:.1f}°, azimuth {self.azimuth_deg:.0f}°"
+        return f"RA {self.ra_deg:.1f}°, Dec {self.dec_deg:+.1f}°"
+
+    @property
+    def start(self) -> str:
+        """The setting that starts a scene at the attitude; empty under the stars, where the direction does."""
+        if math.isnan(self.yaw_deg):
+            return ""
+        angles = ", ".join(
+            f"{name}: {getattr(self, name):.3f}" for name in ("roll_deg", "pitch_deg", "yaw_deg")
+        )
+        return f"motion.start: {{{angles}}}"
+
+    @property
+    def event(self) -> str:
+        """What happened, in words."""
+        if math.isnan(self.cross_arcsec):
+            return self.status
+        status = "" if self.status == "solved" else f"{self.status}, "
+        return f"{status}cross {self.cross_arcsec:.3g}″, roll {self.roll_arcsec:.4g}″"
+
+
+def worst_trials(columns: Columns, response: str, count: int = COUNT) -> list[WorstTrial]:
+    """The worst trials by a response or a quantity, worst first, of directions at least APART_DEG apart.
+
+    For a proportion they are trials that count for it (for `identified`, that do not), those without a solution before
+    those with one, then by error and by the number of lights; none if there is no such trial.
+    """
+    if not columns:
+        return []
+    keys, counted = ranking(columns, response)
+    axis = np.empty((0, 3))
+    chosen = list[WorstTrial]()
+    for rows in worst_first(keys, np.flatnonzero(counted)):
+        directions = unit_directions(subset(columns, rows))
+        left = np.all(directions @ axis.T <= NEAR, axis=1)
+        while len(chosen) < count and left.any():
+            nearest = int(np.argmax(left))
+            chosen.append(worst_trial(row_of(columns, int(rows[nearest]))))
+            left &= directions @ directions[nearest] <= NEAR
+            axis = np.concatenate([axis, directions[nearest : nearest + 1]])
+        if len(chosen) == count:
+            break
+    return chosen
+
+
+def worst_first(keys: Sequence[Floats], rows: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    """Rows in the order of their keys, some at a time: about FIRST, then ten times as many, since few are needed."""
+    most = FIRST
+    while len(rows) and keys:
+        first = keys[0][rows]
+        limit = np.partition(first, most - 1)[most - 1] if most < len(rows) else first.max()
+        below = rows[first < limit]
+        yield below[np.lexsort([key[below] for key in reversed(keys)])]
+        yield from worst_first(keys[1:], rows[first == limit])
+        rows = rows[first > limit]
+        most = 10 * most
+    if len(rows):
+        yield rows
+
+
+def worst_trial(columns: Columns) -> WorstTrial:
+    """The only one of some trials."""
+    return WorstTrial(
+        int(columns["trial"][0]),
+        int(columns["point"][0]),
+        "misidentified" if columns["misidentified"][0] > 0 else str(columns["status"][0]),
+        *(float(metrics.QUANTITIES[name](columns)[0]) for name in ("cross_arcsec", "roll_arcsec")),
+        *(float(columns[name][0]) for name in DIRECTION),
+        *body_angles_deg(columns, 0),
+    )
+
+
+def body_angles_deg(columns: Columns, row: int) -> list[float]:
+    """Yaw, pitch and roll of a trial's body under a dome; none under the stars, where the lab is the sky."""
+    wxyz = [float(columns[f"lab_from_body_{part}"][row]) for part in "wxyz"]
+    if not (np.isfinite(columns["body_tilt_deg"][row]) and np.isfinite(wxyz).all()):
+        return []
+    return [
+        float(angle)
+        for angle in Rotation.from_quat(wxyz, scalar_first=True).as_euler("ZYX", degrees=True)
+    ]
+
+
+def unit_directions(columns: Columns) -> Floats:
+    """(N, 3) direction of each trial's attitude: the body's z axis in the lab, or the boresight on the sky."""
+    in_dome = np.isfinite(columns["body_tilt_deg"])
+    zenith = np.radians(
+        np.where(in_dome, columns["body_tilt_deg"], 90 - columns["boresight_dec_deg"])
+    )
+    azimuth = np.radians(
+        np.where(in_dome, columns["body_azimuth_deg"], columns["boresight_ra_deg"])
+    )
+    return np.stack(
+        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=1
+    )
+
+
+def ranking(columns: Columns, response: str) -> tuple[list[Floats], NDArray[np.bool_]]:
+    """Sort keys, (N,) each, the first the most important and smaller the worse; and (N,) whether a trial qualifies."""
+    angle = metrics.QUANTITIES["angle_arcsec"](columns)
+    unsolved_first = np.where(np.isnan(angle), -np.inf, -angle)
+    fewest_first = np.nan_to_num(columns["stars"], nan=0.0)
+    quantity = response if response in metrics.QUANTITIES else metrics.split_name(response)[0]
+    if metrics.COVERAGE.match(response):
+        return [fewest_first], columns["frames"] > 0
+    if quantity in metrics.QUANTITIES:
+        values = metrics.QUANTITIES[quantity](columns)
+        key = values if quantity in metrics.MORE_IS_BETTER else -values
+        return [key, fewest_first], np.isfinite(values)
+    flagged = np.nan_to_num(
+        np.asarray(FLAGS.get(response, lambda c: c[response])(columns), dtype=float)
+    )
+    return [-flagged, unsolved_first, fewest_first], flagged > 0
+
+
+def worst_of_levels(
+    study: Study, store: Store, response: str, levels: Mapping[str, Any], count: int = COUNT
+) -> list[WorstTrial]:
+    """The worst trials of the points at some levels. Raises InputError for an unknown factor or level."""
+    rows = [PointRow(n, point.levels, {}) for n, point in enumerate(store.points())]
+    chosen = points_at(rows, study, levels)
+    return worst_trials(store.point_columns(*(row.point for row in chosen)), response, count)

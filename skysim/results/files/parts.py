@@ -1,0 +1,393 @@
+"""The list of a dome's parts with their prices: quantities follow from the scene, prices from a table.
+
+The rim at the end of the LED cap has the controllers. A pair of wires runs from there along the surface to every LED,
+board or tape, as far as its place is from the rim on the surface's mean meridian; tape is joined at its LED next to the
+rim. An LED with a drive of its own (`pwm`, or any with a code) takes a channel of a driver board; LEDs that a
+controller lights one after another, or all the time, have a series resistor instead. On tape a code, levels or PWM take
+tape with a driver chip at each LED.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from skysim.core.errors import InputError, Where
+from skysim.core.files import DATA
+from skysim.core.text import excerpt, read_lines
+from skysim.core.types import Floats, Sources
+from skysim.core.yaml_reader import suggestion
+from skysim.scene.scene import Scene
+from skysim.scene.sections.layouts import HOLES, LcdConfig, StringConfig
+from skysim.scene.sections.leds import LedConfig, PwmConfig, SequentialConfig
+from skysim.scene.sections.light import DomeConfig
+from skysim.sources.dome.layouts.led_list import design_leds, max_tilt_deg
+from skysim.sources.dome.layouts.placing import Ints
+from skysim.sources.dome.layouts.string import mean_meridian, wind
+from skysim.sources.dome.surface import Surface, build_surface, cap_area_m2
+from skysim.sources.photometry import Band
+
+# Prices of a dome's parts: a CSV table that the user edits; the shipped one, `assumed`, is a guess
+# throughout.
+
+
+ASSUMED = "assumed"
+SURVEY = "survey"  # a line whose part begins so is a way to survey the LEDs
+UNITS = {
+    **dict.fromkeys(("shell", "shell_bent", "shell_flat"), "m2"),
+    **dict.fromkeys(
+        ("led", "board", "panel", "mounting_led", "mounting_board", "resistor", "filter"), "each"
+    ),
+    **dict.fromkeys(
+        ("driver", "microcontroller", "sequencer", "tape_controller", "trigger", "power_supply"),
+        "each",
+    ),
+    **dict.fromkeys(("tape", "tape_addressable", "fiber", "mounting_tape", "wire"), "m"),
+}
+NEEDED = ("part", "unit", "price")
+FURTHER = ("fixed", "serves", "sigma_mm", "what")
+LARGEST = 1e9
+
+
+class Price(NamedTuple):
+    """A line of the table.
+
+    Attributes
+    ----------
+    price
+        Of a unit
+    fixed
+        once
+    serves
+        How many LEDs or channels one part serves
+    sigma_m
+        Error of an LED's place along each axis that a survey reaches; nan for other parts
+    """
+
+    unit: str
+    price: float
+    fixed: float
+    serves: int
+    sigma_m: float
+    what: str
+
+
+class Prices(NamedTuple):
+    """A table of prices by part, and its name for messages."""
+
+    name: str
+    parts: dict[str, Price]
+
+    def of(self, part: str) -> Price:
+        """The price of a part. Raises InputError if the table lacks it."""
+        if part not in self.parts:
+            raise InputError(self.name, f"no price of {part}", "a line that begins with it")
+        return self.parts[part]
+
+    def survey(self, sigma_m: float, leds: int) -> str:
+        """The cheapest survey of so many LEDs that reaches an error. Raises InputError if none does."""
+        able = {
+            name: one.fixed + leds * one.price
+            for name, one in self.parts.items()
+            if name.startswith(SURVEY) and one.sigma_m <= sigma_m * (1 + 1e-9)
+        }
+        if not able:
+            raise InputError(
+                self.name,
+                f"no {SURVEY} reaches {1e3 * sigma_m:.3g} mm",
+                f"a line {SURVEY}_NAME with a sigma_mm of at most that",
+            )
+        return min(able, key=lambda name: able[name])
+
+
+def find_prices(name: str, folder: Path | None = None) -> Path:
+    """The file of a table: `assumed`, the one that comes along, or a path, relative to a folder if it is given."""
+    shipped = DATA / "prices" / f"{ASSUMED}.csv"
+    return shipped if name == ASSUMED else (folder or Path()) / name
+
+
+def read_prices(path: Path) -> Prices:
+    """Read a table: comments begin with #, then the columns' names and one line a part. Raises InputError, one line."""
+    lines = [(n, line) for n, line in read_lines(path) if not line.startswith("#")]
+    names = [cell.strip() for cell in lines[0][1].split(",")] if lines else []
+    if (
+        {*NEEDED} - {*names}
+        or {*names} - {*NEEDED, *FURTHER}
+        or len({*names}) < len(names)
+        or len(lines) < 2
+    ):
+        raise InputError(
+            path,
+            "not a table of prices",
+            f"columns {', '.join(NEEDED)}, optionally {', '.join(FURTHER)}; one part per line",
+        )
+    parts = dict[str, Price]()
+    for number, line in lines[1:]:
+        try:
+            part, price = parse_line(line, names)
+            if part in parts:
+                raise InputError("", f"{part} occurs twice", "once")
+        except InputError as error:
+            raise error.within(path).at(Where(path, number)) from None
+        parts[part] = price
+    return Prices(str(path), parts)
+
+
+def parse_line(line: str, names: list[str]) -> tuple[str, Price]:
+    """A part and its price. Raises InputError."""
+    try:
+        cells = next(csv.reader([line], strict=True))
+    except csv.Error as error:
+        raise InputError("", f"{line[:80]!r} is no line of CSV ({error})") from None
+    if len(cells) != len(names):
+        raise InputError("", f"{len(cells)} cells", f"{len(names)}, one a column")
+    cell = dict(zip(names, (one.strip() for one in cells), strict=True))
+    part = cell["part"]
+    unit = cell["unit"]
+    survey = part.startswith(SURVEY)
+    if part not in UNITS and not survey:
+        known = [*UNITS, f"{SURVEY}_NAME"]
+        raise InputError(
+            "", f"unknown part {excerpt(part)}{suggestion(part, known)}", ", ".join(known)
+        )
+    if unit != UNITS.get(part, "each"):
+        raise InputError(f"unit of {part}", f"{unit!r}", UNITS.get(part, "each"))
+    if survey != bool(cell.get("sigma_mm")):
+        raise InputError(
+            f"sigma_mm of {part}", cell.get("sigma_mm") or "none", f"of a {SURVEY}, which needs it"
+        )
+    price, fixed = (number(cell, key, 0.0) for key in ("price", "fixed"))
+    serves = number(cell, "serves", 1.0)
+    if serves < 1 or serves % 1:
+        raise InputError("serves", cell["serves"], "a whole number from 1")
+    sigma_m = 1e-3 * number(cell, "sigma_mm", math.nan)
+    return part, Price(unit, price, fixed, int(serves), sigma_m, cell.get("what", ""))
+
+
+def number(cell: dict[str, str], key: str, default: float) -> float:
+    """The number in a cell, `default` if an optional one is empty. Raises InputError."""
+    text = cell.get(key, "")
+    if not text and key != "price":
+        return default
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value <= LARGEST:
+        raise InputError(key, f"{text!r}", f"a number from 0 to {LARGEST:g}")
+    return value
+
+
+SHELLS = {"cylinder": "shell_bent", "flat": "shell_flat"}  # all others are doubly curved
+COLUMNS = ("part", "quantity", "unit", "price", "fixed", "sum", "what")
+
+Quantities = dict[str, float]
+
+
+class PartLine(NamedTuple):
+    """A part that is bought: quantity in units, price of a unit, what is paid once, and both together."""
+
+    part: str
+    quantity: float
+    unit: str
+    price: float
+    fixed: float
+    sum: float
+    what: str
+
+
+class PartsList(NamedTuple):
+    """The parts of a dome; the total is the sum of the lines, each rounded to a hundredth."""
+
+    lines: list[PartLine]
+
+    @property
+    def total(self) -> float:
+        """Sum of all lines."""
+        return round(sum(line.sum for line in self.lines), 2)
+
+
+class DomeDesign(NamedTuple):
+    """A dome as designed: what the functions of this module count."""
+
+    light: DomeConfig
+    surface: Surface
+    leds: Sources
+    cap_deg: float
+
+    def to_rim_m(self, place_m: Floats) -> Floats:
+        """(N,) lengths along the surface from places to the cap's rim, on the mean meridian."""
+        meridian = mean_meridian(self.surface, math.radians(self.cap_deg))
+        tilt_rad = np.arctan2(np.hypot(place_m[:, 0], place_m[:, 1]), place_m[:, 2])
+        return np.asarray(
+            meridian.arc_m[-1] - np.interp(tilt_rad, meridian.tilt_rad, meridian.arc_m)
+        )
+
+
+def parts_list(scene: Scene, prices: Prices) -> PartsList:
+    """The parts of a scene's dome. Raises InputError without a dome and for a part without a price."""
+    lines = []
+    for part, quantity in quantities(scene, prices).items():
+        one = prices.of(part)
+        bought = quantity if one.unit != "each" else float(math.ceil(quantity / one.serves))
+        lines.append(
+            PartLine(
+                part,
+                bought,
+                one.unit,
+                one.price,
+                one.fixed,
+                round(one.fixed + bought * one.price, 2),
+                one.what,
+            )
+        )
+    return PartsList(lines)
+
+
+def quantities(scene: Scene, prices: Prices) -> Quantities:
+    """How much of each part the scene's dome needs, in its unit; of electronics the LEDs or channels to be served."""
+    design = build_design(scene)
+    layout = design.light.layout
+    leds = len(design.leds)
+    shell = SHELLS.get(design.light.surface.kind, "shell")
+    found: Quantities = (
+        {}
+        if isinstance(layout, LcdConfig)
+        else {shell: cap_area_m2(design.surface, design.cap_deg)}
+    )
+    found |= MOUNTED.get(layout.kind, single_leds)(design)
+    if not isinstance(layout, LcdConfig):
+        found |= electronics(design) | {"power_supply": leds}
+    if design.light.led.code and design.light.led.code.bit_time_s == "frame":
+        found["trigger"] = 1
+    survey = scene.tracker.survey
+    if survey.instrument:
+        found[f"{SURVEY}_{survey.instrument.kind}"] = leds
+    elif survey.led_sigma_m:
+        found[prices.survey(survey.led_sigma_m, leds)] = leds
+    return found
+
+
+def build_design(scene: Scene) -> DomeDesign:
+    """The scene's dome as designed. Raises InputError without a dome."""
+    light = scene.light
+    if not isinstance(light, DomeConfig):
+        raise InputError("light.kind", f"{light.kind} has no parts", "dome")
+    surface = build_surface(light.surface)
+    leds = design_leds(light, surface, Band.from_camera(scene.camera))
+    return DomeDesign(
+        light, surface, leds, max(light.layout.cap_deg, max_tilt_deg(leds.place[:, :3]))
+    )
+
+
+def single_leds(design: DomeDesign) -> Quantities:
+    """LEDs one by one, each in its hole."""
+    count = len(design.leds)
+    return {
+        "led": count,
+        "mounting_led": count,
+        "wire": float(design.to_rim_m(design.leds.place[:, :3]).sum()),
+    }
+
+
+def boards(design: DomeDesign) -> Quantities:
+    """Patch boards; a board's wire goes to its LED next to the rim."""
+    length_m = nearest_m(design.to_rim_m(design.leds.place[:, :3]), design.leds.id // HOLES)
+    count = len(length_m)
+    return {
+        "board": count,
+        "led": len(design.leds),
+        "mounting_board": count,
+        "wire": float(length_m.sum()),
+    }
+
+
+def tape(design: DomeDesign) -> Quantities:
+    """LED tape, cut between LEDs: a pitch of it for each, also for those that are covered."""
+    layout = design.light.layout
+    assert isinstance(layout, StringConfig)
+    wound = wind(
+        layout.model_copy(update={"pitch_error": 0.0, "glue_scatter_m": 0.0}), design.surface
+    )
+    length_m = layout.pitch_m * len(wound.place_m)
+    kind = "tape_addressable" if is_addressable(design) else "tape"
+    wire_m = nearest_m(design.to_rim_m(wound.place_m), wound.tape).sum()
+    return {kind: length_m, "mounting_tape": length_m, "wire": float(wire_m)}
+
+
+def fibers(design: DomeDesign) -> Quantities:
+    """LEDs at the rim, each with a fiber to its hole."""
+    count = len(design.leds)
+    return {
+        "led": count,
+        "fiber": float(design.to_rim_m(design.leds.place[:, :3]).sum()),
+        "mounting_led": count,
+    }
+
+
+def panel(design: DomeDesign) -> Quantities:
+    """An LCD panel, with all that drives it."""
+    return {"panel": 1}
+
+
+MOUNTED: dict[str, Callable[[DomeDesign], Quantities]] = {
+    "patch_boards": boards,
+    "string": tape,
+    "fibers": fibers,
+    "lcd": panel,
+}
+
+
+def nearest_m(length_m: Floats, group: Ints) -> Floats:
+    """The least length of each group, that of a negative one 0."""
+    return np.array([length_m[group == one].min() for one in np.unique(group)]).clip(0)
+
+
+def is_addressable(design: DomeDesign) -> bool:
+    """Whether the LEDs of a tape need a driver each: they differ in brightness, or in time."""
+    layout = design.light.layout
+    led = design.light.led
+    assert isinstance(layout, StringConfig)
+    return led.code is not None or led.drive.kind != "direct" or len(set(layout.dimming)) > 1
+
+
+def electronics(design: DomeDesign) -> Quantities:
+    """What drives the LEDs: by the drive, the code and the layout."""
+    led = design.light.led
+    count = float(len(design.leds))
+    if isinstance(design.light.layout, StringConfig):
+        return {"tape_controller": count} if is_addressable(design) else {}
+    if isinstance(led.drive, SequentialConfig):
+        return {"resistor": count, "sequencer": len(np.unique(design.leds.clock))}
+    if led.drive.kind == "direct" and led.code is None:
+        return {"resistor": count}
+    channels: Quantities = {"driver": count, "microcontroller": count}
+    return channels | {"filter": count} if has_filter(led) else channels
+
+
+def has_filter(led: LedConfig) -> bool:
+    return isinstance(led.drive, PwmConfig) and led.drive.filter is not None
+
+
+def to_csv(parts: PartsList, name: str) -> str:
+    """The list as CSV, with the total in its last line."""
+    text = io.StringIO()
+    text.write(f"# Parts of {name}; the prices are those of the table that was given\n")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows(cells(line) for line in parts.lines)
+    writer.writerow(["total", "", "", "", "", f"{parts.total:.2f}", ""])
+    return text.getvalue()
+
+
+def cells(line: PartLine) -> list[str]:
+    """The cells of a line, by COLUMNS."""
+    quantity = f"{line.quantity:.0f}" if line.unit == "each" else f"{line.quantity:.2f}"
+    money = [f"{line.price:.2f}", f"{line.fixed:.2f}", f"{line.sum:.2f}"]
+    return [line.part, quantity, line.unit, *money, line.what]

@@ -1,0 +1,495 @@
+"""Export a finished run to the formats of other tools: CCSDS AEM, ECSV, Parquet, TIFF, Zarr, video."""
+
+from __future__ import annotations
+
+import datetime
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.core import files, images
+from skysim.core.encoded import silent_stderr
+from skysim.core.errors import InputError, unknown_name
+from skysim.core.time import in_utc
+from skysim.core.types import Floats
+from skysim.dynamics.profile_samples import BODY, CAMERA, ICRF, LAB
+from skysim.results import plots
+from skysim.results.files import recording as frame_files
+from skysim.results.files.recording import FrameTruth, Recording
+from skysim.results.files.row_parts import EXTRA
+
+# Write attitudes as a CCSDS Attitude Ephemeris Message, version 2.0, in keyword = value notation
+# (CCSDS 504.0-B-2).
+
+
+MOST_CHARACTERS = 254  # limit of a line, section 6.3 of the standard
+ORIGINATOR = (
+    "SKYSIM"  # not in the SANA registry; the standard leaves that to those who exchange the files
+)
+MEANING = {
+    ICRF: "axes of the ICRS",
+    LAB: "the laboratory: origin in the bearing's center, z up; known to this file's users only",
+    CAMERA: "the camera: +x right and +y down in the image, +z along the boresight",
+    BODY: "the vehicle's body as its MJCF has it",
+}
+
+
+def message(
+    name: str,
+    notes: Sequence[str],
+    frames: tuple[str, str],
+    utc: Sequence[datetime.datetime],
+    a_from_b: Rotation,
+) -> str:
+    """The text of an AEM file with one segment of type QUATERNION.
+
+    The standard's quaternion "from A to B" rotates the basis vectors of A into those of B (annex F2). That is the
+    quaternion of a_from_b, whose matrix has the axes of B in coordinates of A as columns; coordinates transform by
+    X_B = a_from_b^-1 X_A. Scalar last. Raises InputError if there is no epoch or the epochs do not ascend.
+
+    Parameters
+    ----------
+    name
+        Object name
+    notes
+        comments
+    frames
+        (A, B), keys of MEANING
+    utc
+        K epochs, ascending
+    a_from_b
+        K rotations
+    """
+    if not utc:
+        raise InputError(name, "no attitude to write")
+    late = [n for n in range(1, len(utc)) if utc[n] <= utc[n - 1]]
+    if late:
+        raise InputError(
+            name, f"epoch {epoch(utc[late[0]])} is not after {epoch(utc[late[0] - 1])}"
+        )
+    head = {
+        "CCSDS_AEM_VERS": "2.0",
+        "CREATION_DATE": epoch(datetime.datetime.now(datetime.UTC)),
+        "ORIGINATOR": ORIGINATOR,
+    }
+    meta = {
+        "OBJECT_NAME": name.upper(),
+        "OBJECT_ID": "UNKNOWN",
+        "REF_FRAME_A": frames[0],
+        "REF_FRAME_B": frames[1],
+        "TIME_SYSTEM": "UTC",
+        "START_TIME": epoch(utc[0]),
+        "STOP_TIME": epoch(utc[-1]),
+        "ATTITUDE_TYPE": "QUATERNION",
+    }
+    comments = [*notes, *(f"{frame} = {MEANING[frame]}" for frame in frames)]
+    rows = zip(utc, continuous_quaternions(a_from_b.as_quat()), strict=True)
+    lines = [
+        *(f"{key} = {value}" for key, value in head.items()),
+        "META_START",
+        *(f"COMMENT {text}" for text in comments),
+        *(f"{key} = {value}" for key, value in meta.items()),
+        "META_STOP",
+        "DATA_START",
+        *(
+            f"{epoch(when)} " + " ".join(f"{component:.15f}" for component in xyzw)
+            for when, xyzw in rows
+        ),
+        "DATA_STOP",
+    ]
+    return "".join(f"{ascii_line(line)}\n" for line in lines)
+
+
+def continuous_quaternions(xyzw: Floats) -> Floats:
+    """(K, 4) the same attitudes as a continuous sequence of quaternions; the first has a scalar part >= 0.
+
+    q and -q are the same attitude. Each quaternion takes the sign that makes its dot product with the previous one
+    positive, so that other tools can interpolate between them.
+    """
+    dot = np.sum(xyzw[1:] * xyzw[:-1], axis=1)
+    first = -1.0 if xyzw[0, 3] < 0 else 1.0
+    sign = first * np.concatenate([[1.0], np.cumprod(np.where(dot < 0, -1.0, 1.0))])
+    return np.asarray(xyzw * sign[:, None] + 0.0)  # + 0.0 turns -0.0 into 0.0
+
+
+def epoch(utc: datetime.datetime) -> str:
+    """Time string of section 6.8.9 of the standard, in UTC: 2012-06-22T21:00:00.120000."""
+    return in_utc(utc).isoformat(timespec="microseconds")
+
+
+def ascii_line(line: str) -> str:
+    """The line cut to the allowed length, with characters outside printable ASCII replaced by "?"."""
+    printable = "".join(character if " " <= character <= "~" else "?" for character in line)
+    return printable[:MOST_CHARACTERS]
+
+
+BATCH_ROWS = 1 << 16  # rows buffered before a Parquet row group is written
+SAMPLED_FRAMES = 9  # about this many frames determine the black and white levels of a video
+FOURCC = "mp4v"  # MPEG-4 part 2, which every wheel of OpenCV can write
+PROBE_BYTES = 1 << 20
+
+Bar = Callable[
+    [Iterable[Any], int, str], Iterator[Any]
+]  # progress bar over items: items, count, label
+
+# Unit by the ending of a column's name; the longest matching ending applies.
+UNITS = {
+    "_deg_s": "deg/s",
+    "_deg_h": "deg/h",
+    "_deg": "deg",
+    "_rad_s": "rad/s",
+    "_rad": "rad",
+    "_arcsec": "arcsec",
+    "_px": "px",
+    "_ms": "ms",
+    "_m_s": "m/s",
+    "_s": "s",
+    "_rpm": "rpm",
+    "_nms": "N m s",
+    "_nm": "N m",
+    "_e": "electron",
+    "electrons": "electron",
+}
+
+
+def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
+    """Write truth.aem, solutions.aem if frames were solved, and motion.aem of a simulated motion. Returns the paths.
+
+    At mid-exposure, attitudes are those of the camera in the ICRF under the stars, and of the body in the laboratory
+    under a dome. The motion is that of the body at every tick of the vehicle's computer. Raises InputError if a
+    solution has no truth.
+    """
+    stars = run.is_celestial
+    frames = (ICRF, CAMERA) if stars else (LAB, BODY)
+    true = [
+        (truth.frame, truth.mid_utc, truth.t_mid_s, attitude(truth, stars))
+        for truth in truths(run, bar)
+    ]
+    name = str(run.meta["scene"])
+    seed = run.meta["seed"]
+    epochs = {frame: utc for frame, utc, _, _ in true}
+
+    def write(
+        stem: str,
+        content: str,
+        utc: list[datetime.datetime],
+        a_from_b: Rotation,
+        between: tuple[str, str] = frames,
+    ) -> Path:
+        comments = [f"{content} of skysim, scene {name}, seed {seed}"]
+        path = out / f"{stem}.aem"
+        files.write_text(path, message(name, comments, between, utc, a_from_b))
+        return path
+
+    a_from_b = Rotation.concatenate([rotation for *_, rotation in true])
+    written = [write("truth", "True attitude at mid-exposure", list(epochs.values()), a_from_b)]
+    solved = run.solved()
+    if solved is not None:
+        unknown = [frame for frame in solved[0].tolist() if frame not in epochs]
+        if unknown:
+            raise InputError(
+                run.folder / "solutions.ecsv", f"unknown frame {unknown[0]}", "frames with truth"
+            )
+        utc = [epochs[frame] for frame in solved[0].tolist()]
+        written.append(
+            write(
+                "solutions", "Attitude found by the star tracker, at mid-exposure", utc, solved[1]
+            )
+        )
+    motion = run.motion()
+    if motion is not None:
+        start = true[0][1] - datetime.timedelta(seconds=true[0][2])
+        utc = [start + datetime.timedelta(seconds=t_s) for t_s in motion[0].tolist()]
+        between = (ICRF if stars else LAB, BODY)
+        content = "True motion of the vehicle, without jitter,"
+        written.append(write("motion", content, utc, motion[1], between))
+    return written
+
+
+def attitude(truth: FrameTruth, stars: bool) -> Rotation:
+    """lab_from_cam under the stars, lab_from_body in a laboratory; the same convention as `Recording.solved`."""
+    if stars:
+        return Rotation.from_quat(truth.cam_from_lab_xyzw).inv()
+    return Rotation.from_quat(truth.lab_from_body_xyzw)
+
+
+def truths(run: Recording, bar: Bar) -> Iterator[FrameTruth]:
+    return bar(run.truths(), len(run.stems), "reading truths")
+
+
+def truth_table(run: Recording, bar: Bar) -> Any:
+    """The truth as an astropy table, one row per frame."""
+    from astropy.table import Table
+
+    rows = [truth_row(truth) for truth in truths(run, bar)]
+    return Table({name: [row[name] for row in rows] for name in rows[0]}, meta=run.meta)
+
+
+def truth_row(truth: FrameTruth) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "frame": truth.frame,
+        "mid_utc": truth.mid_utc.isoformat(timespec="microseconds"),
+    }
+    row |= {"t_mid_s": truth.t_mid_s, "exposure_s": truth.exposure_s}
+    for name in ("lab_from_body", "cam_from_lab"):
+        quaternion = getattr(truth, f"{name}_xyzw")
+        row |= {
+            f"{name}_q{end}": float(component)
+            for end, component in zip("xyzw", quaternion, strict=True)
+        }
+    return row | {
+        f"rate_cam_{end}_rad_s": float(rate)
+        for end, rate in zip("xyz", truth.rate_cam_rad_s, strict=True)
+    }
+
+
+def to_ecsv(run: Recording, out: Path, bar: Bar) -> list[Path]:
+    """Write truth.ecsv, one row per frame; the run has already written solutions.ecsv."""
+    files.write_table(out / "truth.ecsv", truth_table(run, bar))
+    return [out / "truth.ecsv"]
+
+
+def to_parquet(run: Recording, out: Path, bar: Bar) -> list[Path]:
+    """Write truth (one row per frame), sources (one row per source and frame) and the run's own tables as Parquet.
+
+    Units are in the field metadata. Raises InputError if pyarrow is not installed.
+    """
+    try:
+        import pyarrow.parquet
+    except ImportError:
+        raise InputError("export.formats", f"parquet {EXTRA}") from None
+    tables = {"truth": truth_table(run, bar)}
+    tables |= {
+        name: table
+        for name in ("solutions", "telemetry", "imu")
+        if (table := run.table(name)) is not None
+    }
+    written = []
+    for name, table in tables.items():
+        path = out / f"{name}.parquet"
+        with files.atomic_file(path) as temporary:
+            pyarrow.parquet.write_table(to_arrow(table, run), temporary)
+        written.append(path)
+    return [*written, sources_parquet(run, out / "sources.parquet", bar)]
+
+
+def sources_parquet(run: Recording, path: Path, bar: Bar) -> Path:
+    """Write every source of every frame from the truth files, in batches of about BATCH_ROWS rows to limit memory."""
+    import pyarrow
+    import pyarrow.parquet
+
+    def frame_table(truth: FrameTruth) -> Any:
+        truth.sources.add_column(np.full(len(truth.sources), truth.frame), name="frame", index=0)
+        return to_arrow(truth.sources, run)
+
+    tables = map(frame_table, truths(run, bar))
+    batch = [next(tables)]
+    with (
+        files.atomic_file(path) as temporary,
+        pyarrow.parquet.ParquetWriter(temporary, batch[0].schema) as writer,
+    ):
+        for table in tables:
+            if sum(len(part) for part in batch) >= BATCH_ROWS:
+                writer.write_table(pyarrow.concat_tables(batch))
+                batch = []
+            batch.append(table)
+        writer.write_table(pyarrow.concat_tables(batch))
+    return path
+
+
+def to_arrow(table: Any, run: Recording) -> Any:
+    """Convert an astropy table to an Arrow table; masked values become null. Units and run metadata are kept."""
+    import pyarrow
+
+    fields = []
+    columns = []
+    for name in table.colnames:
+        values = pyarrow.array(
+            table[name].tolist(),
+            type=pyarrow.from_numpy_dtype(table[name].dtype)
+            if table[name].dtype.kind in "biuf"
+            else pyarrow.string(),
+        )
+        unit = unit_of(name)
+        fields.append(pyarrow.field(name, values.type, metadata={"unit": unit} if unit else None))
+        columns.append(values)
+    metadata = {f"skysim.{key}": str(value) for key, value in run.meta.items()}
+    return pyarrow.table(columns, schema=pyarrow.schema(fields, metadata=metadata))
+
+
+def unit_of(name: str) -> str:
+    """Unit of a column from the ending of its name; empty if it has none."""
+    ending = max((suffix for suffix in UNITS if name.endswith(suffix)), key=len, default="")
+    return UNITS.get(ending, "")
+
+
+def to_tiff(run: Recording, out: Path, bar: Bar) -> list[Path]:
+    """Write frame_NNNN.tif with unchanged digital numbers: 16 bits (64-bit floats for a noise-free camera)."""
+    written = []
+    for stem in bar(run.stems, len(run.stems), "TIFF"):
+        written.append(out / f"{stem.name}.tif")
+        files.write_image(written[-1], run.image(stem))
+    return written
+
+
+def to_zarr(run: Recording, out: Path, bar: Bar) -> list[Path]:
+    """Write frames.zarr (Zarr 3): frames in chunks of one, with times, exposures, attitudes and rates.
+
+    Raises
+    ------
+    InputError
+        If zarr is not installed or the frames differ in size or type.
+    """
+    try:
+        import zarr
+    except ImportError:
+        raise InputError("export.formats", f"zarr {EXTRA}") from None
+    path = out / frame_files.ZARR
+    count = len(run.stems)
+    frame_truths = [replace(truth, sources=None) for truth in truths(run, bar)]
+    first = run.image(run.stems[0])
+    with files.atomic_folder(path) as temporary:
+        group = zarr.create_group(
+            temporary, zarr_format=3, attributes=run.meta | {"made_by": "skysim"}
+        )
+        frames = group.create_array(
+            "frames",
+            shape=(count, *first.shape),
+            chunks=(1, *first.shape),
+            dtype=first.dtype,
+            dimension_names=("frame", "y", "x"),
+            attributes={"units": "DN"},
+        )
+        for n, stem in enumerate(bar(run.stems, count, "Zarr")):
+            frames[n] = check_same_format(run.image(stem), first, stem)
+        for name, values, axis, unit in frame_arrays(frame_truths):
+            dimensions = ("frame", axis) if axis else ("frame",)
+            group.create_array(
+                name,
+                data=values,
+                dimension_names=dimensions,
+                attributes={"units": unit} if unit else {},
+            )
+    return [path]
+
+
+def frame_arrays(frame_truths: list[FrameTruth]) -> Iterator[tuple[str, Any, str, str]]:
+    """Arrays stored with the frames of a sequence: name, array, name of its second axis, unit."""
+    utc = [truth.mid_utc.isoformat(timespec="microseconds") for truth in frame_truths]
+    yield "frame", np.array([truth.frame for truth in frame_truths]), "", ""
+    yield (
+        "mid_utc",
+        np.array(utc, dtype="datetime64[us]").astype(np.int64),
+        "",
+        "microseconds since 1970-01-01",
+    )
+    for name, axis in (
+        ("t_mid_s", ""),
+        ("exposure_s", ""),
+        ("rate_cam_rad_s", "xyz"),
+        ("lab_from_body_xyzw", "xyzw"),
+        ("cam_from_lab_xyzw", "xyzw"),
+    ):
+        yield name, np.array([getattr(truth, name) for truth in frame_truths]), axis, unit_of(name)
+
+
+def check_same_format(image: Any, first: Any, stem: Path) -> Any:
+    """The image itself. Raises InputError if its size or type differs from the first one's."""
+    if image.shape != first.shape or image.dtype != first.dtype:
+        raise InputError(
+            f"{stem}.fits",
+            f"{image.shape[1]}x{image.shape[0]} {image.dtype}; the first frame is"
+            f" {first.shape[1]}x{first.shape[0]} {first.dtype}",
+        )
+    return image
+
+
+def to_video(run: Recording, out: Path, bar: Bar) -> list[Path]:
+    """Write frames.mp4 for display: 8 bits, square-root stretch, at the scene's frame rate.
+
+    All frames share the same black and white levels. A side with an odd number of pixels is cropped by one pixel.
+    Raises InputError if OpenCV cannot write the video, and OSError if the disk is full.
+    """
+    path = out / "frames.mp4"
+    first = run.image(run.stems[0])
+    seconds = [truth.t_mid_s for truth in truths(run, bar)]
+    rate_hz = 1 / float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
+    sampled = run.stems[:: max(len(run.stems) // SAMPLED_FRAMES, 1)]
+    low, high = np.median([plots.display_levels(run.image(stem)) for stem in sampled], axis=0)
+    height, width = (side // 2 * 2 for side in first.shape)  # color subsampling needs even sides
+    with files.atomic_file(path) as temporary:
+        film = cv2.VideoWriter(
+            str(temporary), cv2.VideoWriter.fourcc(*FOURCC), rate_hz, (width, height), False
+        )
+        try:
+            if not film.isOpened():
+                check_disk_space(temporary)
+                raise InputError(
+                    path,
+                    f"this OpenCV cannot write {FOURCC} video of {width}x{height} at {rate_hz:g} Hz",
+                )
+            for stem in bar(run.stems, len(run.stems), "video"):
+                image = check_same_format(run.image(stem), first, stem)
+                gray = plots.to_8bit(image, "square root", levels_dn=(float(low), float(high)))
+                with silent_stderr():
+                    film.write(np.ascontiguousarray(gray[:height, :width]))
+        finally:
+            film.release()
+        readable = count_frames(temporary)
+        count = len(run.stems)
+        # OpenCV reports no write errors, so count the frames that can be read back.
+        if readable != count:
+            check_disk_space(temporary)
+            raise InputError(
+                path, f"OpenCV wrote {readable} of {count} frames, without an error message"
+            )
+    return [path]
+
+
+def count_frames(film: Path) -> int:
+    """Number of readable frames in a video file."""
+    with silent_stderr(), closing(images.LiveCamera(str(film))) as reader:
+        return sum(1 for _ in iter(reader.capture.grab, False))
+
+
+def check_disk_space(path: Path) -> None:
+    """Append PROBE_BYTES to a file, more than a video index needs, to raise the OSError that OpenCV did not report.
+
+    A full disk then raises "no space left on device" rather than an unexplained failure of OpenCV.
+    """
+    with path.open("ab") as file:
+        file.write(bytes(PROBE_BYTES))
+        os.fsync(file.fileno())
+
+
+EXPORTS: dict[str, Callable[[Recording, Path, Bar], list[Path]]] = {
+    "aem": to_aem,
+    "ecsv": to_ecsv,
+    "parquet": to_parquet,
+    "tiff": to_tiff,
+    "zarr": to_zarr,
+    "video": to_video,
+}
+
+
+def export(run: Recording, formats: Iterable[str], out: Path, bar: Bar) -> list[Path]:
+    """Write a run in each of the formats and return the paths.
+
+    Raises
+    ------
+    InputError
+        For an unknown format before anything is written.
+    """
+    names = list(dict.fromkeys(formats))
+    for name in names:
+        if name not in EXPORTS:
+            raise InputError("export.formats", *unknown_name("format", name, EXPORTS))
+    files.make_folder(out)
+    return [path for name in names for path in EXPORTS[name](run, out, bar)]

@@ -1,0 +1,354 @@
+"""Templates for the builder of a dome: gores at full scale (SVG, DXF), and the shell with its LEDs (OBJ, mm).
+
+A gore is a strip of the surface along a meridian. Paper bends along the meridian but does not stretch, so a point of
+the surface is drawn by its Cassini coordinates: y is the length of the gore's central meridian from the apex to the
+foot of the perpendicular through the point, and x the length of that perpendicular. On a sphere of radius R, at the
+angle t from the zenith and a from the meridian,
+
+    sin(x / R) = sin t sin a,   tan(y / R) = tan t cos a
+
+(Snyder 1987, USGS Professional Paper 1395, section 13). On any other surface the lengths are those of the surface,
+along the directions that these equations give as seen from the bearing. At the distance x from the meridian the paper
+is longer than the surface by the factor 1 / cos(x / R), which `MAX_WIDTH_M` limits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from html import escape
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.scene.sections.light import DomeConfig
+from skysim.simulation.lab import Lab
+from skysim.sources.dome.layouts.led_list import design_leds, max_tilt_deg
+from skysim.sources.dome.layouts.placing import project_from_bearing
+from skysim.sources.dome.layouts.string import directions
+from skysim.sources.dome.surface import Surface, build_surface, perpendicular
+
+# A flat drawing in millimeters, as SVG to print and as DXF for a cutter.
+
+
+class Polyline(NamedTuple):
+    """A polyline through (K, 2) points."""
+
+    xy_mm: Floats
+    closed: bool = False
+    dashed: bool = False
+    layer: str = "OUTLINE"
+
+
+class Circle(NamedTuple):
+    """A circle about a point."""
+
+    x_mm: float
+    y_mm: float
+    radius_mm: float
+    layer: str = "LEDS"
+
+
+class SheetText(NamedTuple):
+    """Words to the right of a point on their base line."""
+
+    x_mm: float
+    y_mm: float
+    size_mm: float
+    words: str
+    layer: str = "TEXT"
+
+
+Shape = Polyline | Circle | SheetText
+
+
+class Drawing(NamedTuple):
+    """Shapes on a sheet whose origin is its upper left corner, y downward; all in mm."""
+
+    width_mm: float
+    height_mm: float
+    shapes: list[Shape]
+
+
+def to_svg(drawing: Drawing) -> str:
+    """The drawing at full scale: 1 user unit = 1 mm."""
+    width = f"{drawing.width_mm:.3f}"
+    height = f"{drawing.height_mm:.3f}"
+    size = f'width="{width}mm" height="{height}mm" viewBox="0 0 {width} {height}"'
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" {size} fill="none" stroke="black" stroke-width="0.2">'
+    return "\n".join([head, *map(svg_element, drawing.shapes), "</svg>\n"])
+
+
+def svg_element(shape: Shape) -> str:
+    match shape:
+        case Polyline():
+            points = " ".join(f"{x:.3f},{y:.3f}" for x, y in shape.xy_mm)
+            dashes = ' stroke-dasharray="4 2"' if shape.dashed else ""
+            return f'<{"polygon" if shape.closed else "polyline"} points="{points}"{dashes}/>'
+        case Circle():
+            return (
+                f'<circle cx="{shape.x_mm:.3f}" cy="{shape.y_mm:.3f}" r="{shape.radius_mm:.3f}"/>'
+            )
+        case SheetText():
+            return (
+                f'<text x="{shape.x_mm:.3f}" y="{shape.y_mm:.3f}" font-size="{shape.size_mm:g}"'
+                f' font-family="sans-serif" fill="black" stroke="none">{escape(shape.words)}</text>'
+            )
+
+
+def to_dxf(drawing: Drawing) -> str:
+    """The drawing with 1 drawing unit = 1 mm, the origin at its lower left corner, and a layer for each use."""
+    groups: list[tuple[int, object]] = [
+        (0, "SECTION"),
+        (2, "HEADER"),
+        (9, "$ACADVER"),
+        (1, "AC1009"),
+    ]
+    groups += [
+        (9, "$INSUNITS"),
+        (70, 4),
+        (0, "ENDSEC"),
+        (0, "SECTION"),
+        (2, "ENTITIES"),
+    ]  # 4: millimeters
+    for shape in drawing.shapes:
+        groups += dxf_groups(shape, drawing.height_mm)
+    groups += [(0, "ENDSEC"), (0, "EOF")]
+    return "".join(
+        f"{code}\n{f'{value:.4f}' if isinstance(value, float) else value}\n"
+        for code, value in groups
+    )
+
+
+def dxf_groups(shape: Shape, height_mm: float) -> Iterator[tuple[int, object]]:
+    """The group codes and values of a shape; a dashed line is on a layer of its own."""
+    kind = "CIRCLE" if isinstance(shape, Circle) else "TEXT"
+    layer = (8, shape.layer)
+    if isinstance(shape, Polyline):
+        layer = (8, "HELP" if shape.dashed else shape.layer)
+        yield from ((0, "POLYLINE"), layer, (66, 1), (70, int(shape.closed)))
+        for x, y in shape.xy_mm.tolist():
+            yield from ((0, "VERTEX"), layer, (10, x), (20, height_mm - y), (30, 0.0))
+        yield from ((0, "SEQEND"), layer)
+        return
+    yield from (
+        (0, kind),
+        layer,
+        (10, float(shape.x_mm)),
+        (20, float(height_mm - shape.y_mm)),
+        (30, 0.0),
+    )
+    if isinstance(shape, Circle):
+        yield 40, float(shape.radius_mm)
+    else:
+        words = "".join(one if one.isascii() else f"\\U+{ord(one):04X}" for one in shape.words)
+        yield from ((40, float(shape.size_mm)), (1, words))
+
+
+MAX_WIDTH_M = 0.25  # of a gore: at its edge the paper is 0.5 % too long under a dome of 1.2 m
+LEAST_GORES = 6
+STEPS = 64  # of a polyline whose length is measured
+EDGE_DEG = 0.5  # spacing of an edge's points
+FROM_INSIDE = np.array([-1.0, 1.0])  # seen from inside with the apex up, azimuths grow to the left
+MARGIN_MM = 10.0
+GAP_MM = 5.0
+CAPTION_MM = 12.0
+RULE_MM = 100.0  # of the scale that is to be measured after printing
+# of the shell's mesh
+RINGS = 60
+SECTORS = 180
+MARK_M = 4e-3  # size of an LED's mark on the mesh
+
+
+class Dome(NamedTuple):
+    """What the builder makes: the surface to the cap's rim, and LEDs by number (N,) at (N, 3) places.
+
+    Attributes
+    ----------
+    name
+        Of the scene
+    led_radius_m
+        Of an LED's disk
+    """
+
+    name: str
+    surface: Surface
+    cap_deg: float
+    led: NDArray[np.int64]
+    led_m: Floats
+    led_radius_m: float
+
+
+def template(lab: Lab, ending: str) -> str:
+    """The text of a template for a scene's dome, by its file's ending. Raises InputError without a dome."""
+    light = lab.scene.light
+    if not isinstance(light, DomeConfig):
+        raise InputError("light.kind", f"{light.kind} has no {ending}", "dome")
+    surface = build_surface(light.surface)
+    leds = design_leds(light, surface, lab.camera.band)
+    cap_deg = max(
+        float(getattr(light.layout, "cap_deg", 0.0)), max_tilt_deg(leds.place[:, :3])
+    )  # boards stand out
+    dome = Dome(
+        lab.scene.name, surface, cap_deg, leds.id, leds.place[:, :3], light.led.disk_diameter_m / 2
+    )
+    return TEMPLATES[ending](dome)
+
+
+def at(surface: Surface, rays: Floats) -> Floats:
+    """(..., 3) points of the surface in these directions from the bearing. Raises InputError where it has ended."""
+    return project_from_bearing(surface, rays.reshape(-1, 3)).reshape(rays.shape)
+
+
+def length_m(points_m: Floats) -> Floats:
+    """(...) lengths of polylines (..., K, 3)."""
+    return np.asarray(np.linalg.norm(np.diff(points_m, axis=-2), axis=-1).sum(axis=-1))
+
+
+def on_paper_m(surface: Surface, rays: Floats, meridian_rad: float) -> Floats:
+    """(N, 2) x and y on the gore of a meridian of points in these directions (N, 3) from the bearing."""
+    azimuth_rad = np.arctan2(rays[:, 1], rays[:, 0]) - meridian_rad
+    tilt_rad = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+    aside_rad = np.arcsin(np.clip(np.sin(tilt_rad) * np.sin(azimuth_rad), -1, 1))
+    foot_rad = np.arctan2(np.sin(tilt_rad) * np.cos(azimuth_rad), np.cos(tilt_rad))
+    steps = np.linspace(0, 1, STEPS + 1)
+    along = at(
+        surface,
+        directions(foot_rad[:, None] * steps, np.full((len(rays), STEPS + 1), meridian_rad)),
+    )
+    foot = directions(foot_rad, np.full(len(rays), meridian_rad))
+    across = np.array([-math.sin(meridian_rad), math.cos(meridian_rad), 0.0])
+    turn = aside_rad[:, None] * steps
+    perpendicular = at(
+        surface, np.cos(turn)[..., None] * foot[:, None] + np.sin(turn)[..., None] * across
+    )
+    x_m = np.sign(aside_rad) * length_m(perpendicular)
+    y_m = np.sign(foot_rad) * length_m(along)
+    return np.column_stack([x_m, y_m])
+
+
+def gore_count(surface: Surface, cap_deg: float) -> int:
+    """The least number of gores of which none is wider than MAX_WIDTH_M."""
+    tilt_rad = np.radians(np.arange(1, cap_deg + 1))
+    azimuth_rad = np.radians(np.arange(0, 360, 10.0))
+    around_m = at(surface, directions(*np.meshgrid(tilt_rad, azimuth_rad, indexing="ij")))
+    ring_m = float(np.hypot(around_m[..., 0], around_m[..., 1]).max())
+    return max(LEAST_GORES, math.ceil(2 * math.pi * ring_m / MAX_WIDTH_M))
+
+
+def gores(dome: Dome) -> Drawing:
+    """The gores of a dome side by side at full scale, apex up, seen from inside the dome.
+
+    Every LED is a circle of its diameter with its number; a line of RULE_MM tells whether the print is to scale.
+    """
+    count = gore_count(dome.surface, dome.cap_deg)
+    rays = dome.led_m / np.linalg.norm(dome.led_m, axis=1, keepdims=True)
+    nearest = np.rint(np.arctan2(rays[:, 1], rays[:, 0]) * count / (2 * np.pi)).astype(int) % count
+    shapes = list[Shape]()
+    left_mm = MARGIN_MM
+    bottom_mm = 0.0
+    for gore in range(count):
+        own = nearest == gore
+        meridian_rad = 2 * math.pi / count * gore
+        outline_mm, leds_mm = (
+            1e3 * on_paper_m(dome.surface, some, meridian_rad)
+            for some in (outline(meridian_rad, math.pi / count, dome.cap_deg), rays[own])
+        )
+        shift_mm = np.array([left_mm + outline_mm[:, 0].max(), MARGIN_MM + CAPTION_MM])
+        outline_mm = shift_mm + FROM_INSIDE * outline_mm
+        leds_mm = shift_mm + FROM_INSIDE * leds_mm
+        shapes += gore_shapes(outline_mm, f"{gore + 1}: {math.degrees(meridian_rad):.4g} deg")
+        shapes += marks(dome.led[own], leds_mm, 1e3 * dome.led_radius_m)
+        left_mm += float(np.ptp(outline_mm[:, 0])) + GAP_MM
+        bottom_mm = max(bottom_mm, float(outline_mm[:, 1].max()))
+    rule_mm = bottom_mm + CAPTION_MM
+    caption = f"{dome.name}: {count} gores, seen from inside, azimuth on top. To scale if this line is {RULE_MM:g} mm."
+    shapes += [
+        Polyline(np.array([[MARGIN_MM, rule_mm], [MARGIN_MM + RULE_MM, rule_mm]])),
+        SheetText(MARGIN_MM, rule_mm + 6, 5.0, caption),
+    ]
+    return Drawing(left_mm - GAP_MM + MARGIN_MM, rule_mm + CAPTION_MM + MARGIN_MM, shapes)
+
+
+def outline(meridian_rad: float, half_rad: float, cap_deg: float) -> Floats:
+    """(K, 3) directions around a gore: from the apex down one edge, along the rim, up the other."""
+    down = np.radians(np.linspace(0, cap_deg, math.ceil(cap_deg / EDGE_DEG) + 1))
+    along = np.linspace(1, -1, STEPS) * half_rad
+    tilt_rad = np.concatenate([down, np.full(STEPS, down[-1]), down[::-1]])
+    aside_rad = np.concatenate([np.full(len(down), half_rad), along, np.full(len(down), -half_rad)])
+    return directions(tilt_rad, meridian_rad + aside_rad)
+
+
+def gore_shapes(outline_mm: Floats, title: str) -> Iterator[Shape]:
+    """The outline of a gore, its central meridian and its title at the apex."""
+    apex = outline_mm[0]
+    yield Polyline(outline_mm, closed=True)
+    yield Polyline(np.array([apex, [apex[0], outline_mm[:, 1].max()]]), dashed=True)
+    yield SheetText(apex[0] - 12, apex[1] - 2, 4.0, title)
+
+
+def marks(numbers: NDArray[np.int64], xy_mm: Floats, radius_mm: float) -> Iterator[Shape]:
+    """A circle with a cross for each LED, and its number."""
+    for number, (x, y) in zip(numbers, xy_mm, strict=True):
+        yield Circle(x, y, radius_mm)
+        yield Polyline(np.array([[x - 1, y], [x + 1, y]]), layer="CENTERS")
+        yield Polyline(np.array([[x, y - 1], [x, y + 1]]), layer="CENTERS")
+        yield SheetText(x + radius_mm + 0.5, y - 0.5, 2.0, f"{number}")
+
+
+def shell_obj(dome: Dome) -> str:
+    """The inner surface to the cap's rim as a mesh in mm, and for each LED an object `led_NUMBER`, a small pyramid
+    whose base is on the surface and whose tip points outward.
+    """
+    tilt_rad = np.radians(np.linspace(0, dome.cap_deg, RINGS + 1))[1:]
+    azimuth_rad = np.arange(SECTORS) * (2 * np.pi / SECTORS)
+    rings_m = at(
+        dome.surface, directions(*np.meshgrid(tilt_rad, azimuth_rad, indexing="ij"))
+    ).reshape(-1, 3)
+    vertices_m = np.concatenate([at(dome.surface, np.array([[0.0, 0.0, 1.0]])), rings_m])
+    lines = [
+        f"# {dome.name}: inner surface and LEDs, mm from the bearing's center, z up",
+        "o shell",
+    ]
+    lines += vertex_lines(vertices_m)
+    around = np.arange(SECTORS)
+    onward = (around + 1) % SECTORS
+    lines += [f"f 1 {b} {a}" for a, b in zip(around + 2, onward + 2, strict=True)]
+    for ring in range(RINGS - 1):
+        low = 2 + ring * SECTORS
+        high = 2 + (ring + 1) * SECTORS
+        corners = zip(around + low, onward + low, onward + high, around + high, strict=True)
+        lines += [f"f {a} {b} {c} {d}" for a, b, c, d in corners]
+    used = len(vertices_m)
+    for number, place_m, inward in zip(
+        dome.led, dome.led_m, dome.surface.inward(dome.led_m), strict=True
+    ):
+        lines += [f"o led_{number}", *vertex_lines(pyramid_m(place_m, inward))]
+        lines += [
+            f"f {used + a} {used + b} {used + c}"
+            for a, b, c in ((1, 2, 3), (1, 4, 2), (2, 4, 3), (3, 4, 1))
+        ]
+        used += 4
+    return "\n".join([*lines, ""])
+
+
+def pyramid_m(place_m: Floats, inward: Floats) -> Floats:
+    """(4, 3) three corners about a place on the surface, and a tip outside."""
+    first = perpendicular(inward[None])[0]
+    angle = 2 * np.pi / 3 * np.arange(3)
+    base = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), np.cross(inward, first))
+    return place_m + MARK_M * np.concatenate([base / 2, -inward[None]])
+
+
+def vertex_lines(points_m: Floats) -> list[str]:
+    return [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in 1e3 * points_m]
+
+
+TEMPLATES: dict[str, Callable[[Dome], str]] = {
+    ".svg": lambda dome: to_svg(gores(dome)),
+    ".dxf": lambda dome: to_dxf(gores(dome)),
+    ".obj": shell_obj,
+}

@@ -1,0 +1,401 @@
+"""A report: its title, the command that repeats it, and its blocks.
+
+It prints as a self-contained HTML page, as Markdown with its figures beside it, and as text on a terminal.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+import textwrap
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from skysim.core import __version__
+from skysim.core.errors import InputError, printable, unknown_name
+from skysim.results.report_blocks import (
+    Block,
+    Cell,
+    Code,
+    Column,
+    Facts,
+    Figure,
+    Items,
+    Section,
+    Table,
+    Text,
+    Verdict,
+    figure_files,
+    filled,
+)
+
+# A report as a Markdown page. Its figures are files beside it.
+
+
+TAG = re.compile(r"<(?=[A-Za-z/!?])")
+FENCE = re.compile(r"^`{3,}", re.MULTILINE)
+
+
+def markdown_page(title: str, command: str, blocks: Sequence[Block], pictures: str = "") -> str:
+    """The page. pictures : what the paths of the figures begin with; they are left out without it"""
+    begin = [Code(command, "sh")] if command else []
+    names = iter([pictures + name for name, _ in figure_files(blocks)] if pictures else [])
+    return "\n\n".join(paragraphs(Section(title, [*begin, *blocks]), 1, names)) + "\n"
+
+
+def paragraphs(block: Block, level: int, names: Iterator[str]) -> Iterator[str]:
+    """A block's paragraphs. level : of a section's heading;  names : of the figures from this one on"""
+    match block:
+        case Section(title=title, folded=folded):
+            opened = (
+                '<details markdown="1"><summary>{}</summary>' if folded else "#" * level + " {}"
+            )
+            yield opened.format(inline(title))
+            for one in block.blocks:
+                yield from paragraphs(one, level + 1, names)
+            yield from ["</details>"] if folded else []
+        case Figure(caption=caption):
+            if name := next(names, ""):
+                yield f"![{inline(caption).replace('[', '(').replace(']', ')')}]({name})"
+                yield f"*{inline(caption)}*"
+        case Verdict(text=text):
+            yield f"**{inline(text)}**"
+        case Text(text=text):
+            yield inline(text)
+        case Items(lines=lines, title=title):
+            yield from [f"**{inline(title)}**"] if title else []
+            yield "\n".join(f"- {inline(line)}" for line in lines)
+        case Facts(rows=rows):
+            yield table(
+                ["", ""],
+                [[cell(Cell(name)), "<br>".join(map(cell, lines))] for name, lines in rows],
+            )
+        case Table():
+            yield table(
+                [inline(one.head) for one in block.columns],
+                [list(map(cell, row)) for row in block.cells()],
+            )
+        case Code(text=text, language=language):
+            fence = max(["```", *(found + "`" for found in FENCE.findall(text))], key=len)
+            yield f"{fence}{language}\n{text}\n{fence}"
+
+
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table of cells that are escaped already."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def cell(one: Cell | str) -> str:
+    """A cell, what is bad in bold."""
+    found = Cell(one) if isinstance(one, str) else one
+    text = inline(found.text).replace("|", "\\|")
+    text = f"**{text}**" if found.tone == "bad" else text
+    return f"[{text}]({found.link})" if found.link else text
+
+
+def inline(text: str) -> str:
+    """A text on one line that opens no HTML element."""
+    return TAG.sub("&lt;", " ".join(text.split()))
+
+
+# A report as one self-contained HTML page: images embedded, texts escaped, nothing loaded from
+# elsewhere.
+
+
+def html_page(title: str, command: str, version: str, blocks: Sequence[Block]) -> str:
+    """The page of a report (`page.html`)."""
+    from jinja2 import Environment, PackageLoader
+
+    loader = PackageLoader("skysim", "results")
+    environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.filters |= {"parts": parts, "embed": embed, "sort_key": sort_key}
+    environment.tests["cell"] = lambda one: isinstance(one, Cell)
+    environment.globals["kind"] = lambda block: type(block).__name__
+    return environment.get_template("page.html").render(
+        title=title, command=command, version=version, blocks=blocks
+    )
+
+
+def parts(text: str) -> Iterator[tuple[bool, str]]:
+    """The parts of a text, and whether each is in backticks; a last backtick without a partner is a letter."""
+    pieces = text.split("`")
+    if len(pieces) % 2 == 0:
+        pieces[-2:] = ["`".join(pieces[-2:])]
+    return ((n % 2 == 1, piece) for n, piece in enumerate(pieces) if piece)
+
+
+def embed(image: bytes, kind: str = "png") -> str:
+    """An image as the address of an <img> element."""
+    return f"data:image/{kind};base64," + base64.b64encode(image).decode()
+
+
+def sort_key(cell: Cell) -> str:
+    """What a column is sorted by, for the page's script: a number, or nothing for NaN."""
+    return "" if cell.key is None or math.isnan(cell.key) else str(cell.key)
+
+
+# Blocks of a report on the terminal: tables that fit into it, wrapped sentences, no figures.
+
+
+WIDE = 240  # characters in a line of a file
+NARROW = 40  # characters, below which no text is wrapped
+MAX_ROWS = 60  # printed rows of a table; the page has all
+FACT_COLUMN = 21  # characters before the text of a fact
+FACT_WIDTH = 80  # of the lines of facts and warnings
+COLORS = {"good": "green", "warning": "yellow", "bad": "bold red"}
+
+
+def print_blocks(blocks: Sequence[Block]) -> None:
+    """Print blocks one below the other; those without a terminal's form, such as figures, are skipped."""
+    for one in blocks:
+        if one.on_terminal and type(one) in PRINTERS:
+            PRINTERS[type(one)](one)
+
+
+def print_section(section: Section) -> None:
+    """Print a section under its title; nothing if it has nothing to print."""
+    if not any(one.on_terminal and type(one) in PRINTERS for one in section.blocks):
+        return
+    console().print(styled(Cell(section.title), "bold"))
+    print_blocks(section.blocks)
+    print()
+
+
+def print_items(items: Items) -> None:
+    """Print one wrapped sentence after the other; warnings are named, and as narrow as facts."""
+    if items.title:
+        print_wrapped(items.title)
+    for line in items.lines:
+        if items.tone == "warning":
+            print_wrapped(f"warning: {line}", width=FACT_WIDTH)
+        else:
+            print_wrapped(line)
+
+
+def print_facts(facts: Facts) -> None:
+    """Print facts, names at the left."""
+    for name, lines in facts.rows:
+        texts = [one.text if isinstance(one, Cell) else one for one in lines]
+        wrapped = [
+            part
+            for text in texts
+            for part in textwrap.wrap(printable(text), FACT_WIDTH - FACT_COLUMN)
+        ]
+        for head, line in zip([name, *[""] * (len(wrapped) - 1)], wrapped, strict=True):
+            print(f"{head:{FACT_COLUMN}}{line}")
+
+
+def print_table(table: Table, title: str = "") -> None:
+    """Print a table's first MAX_ROWS rows; optional columns are left out if it is too wide. Asides follow below it."""
+    from rich.table import Table as Grid
+
+    rows = table.cells()
+    shown = fitting_columns(table, rows[:MAX_ROWS])
+    grid = Grid(
+        box=None,
+        header_style="bold",
+        pad_edge=False,
+        title=styled(Cell(title), "") if title else None,
+    )
+    grid.title_justify = "left"
+    for n in shown:
+        column = table.columns[n]
+        justify: Any = "right" if column.kind == "number" else "left"
+        grid.add_column(styled(Cell(column.head), ""), justify=justify, no_wrap=True)
+    for row in rows[:MAX_ROWS]:
+        grid.add_row(*(styled(row[n], COLORS.get(row[n].tone, "")) for n in shown))
+    console().print(grid)
+    for row in rows[:MAX_ROWS]:
+        for column, one in zip(table.columns, row, strict=True):
+            if column.kind == "aside" and one.text:
+                name = "" if one.text.startswith(row[0].text) else f"{row[0].text}: "
+                print_wrapped(name + one.text, first="  ", others="    ")
+    if left_out := [
+        column.head
+        for n, column in enumerate(table.columns)
+        if n not in shown and column.kind != "aside"
+    ]:
+        print_wrapped(f"in the report, or in a wider terminal: {', '.join(left_out)}")
+    if len(rows) > MAX_ROWS:
+        print(f"and {len(rows) - MAX_ROWS} more rows in the report")
+
+
+def fitting_columns(table: Table, rows: Sequence[Sequence[Cell]]) -> list[int]:
+    """The columns that fit into the terminal, asides left out; all that are not optional."""
+    shown = [n for n, column in enumerate(table.columns) if column.kind != "aside"]
+    texts = [
+        [column.head for column in table.columns],
+        *([one.text for one in row] for row in rows),
+    ]
+    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
+    for group in table.optional:
+        if sum(widths[n] for n in shown) + 2 * (len(shown) - 1) > terminal_width():
+            shown = [n for n in shown if n not in group]
+    return shown
+
+
+def styled(cell: Cell, style: str) -> Any:
+    """A cell's text literally: rich's markup in it has no effect."""
+    from rich.text import Text as RichText
+
+    return RichText(printable(cell.text), style)
+
+
+def print_wrapped(text: str, first: str = "", others: str = "  ", width: int | None = None) -> None:
+    """Print a text in lines of a width, by default the terminal's.
+
+    Parameters
+    ----------
+    first, others
+        What the first line and the others begin with
+    """
+    width = width or max(terminal_width(), NARROW)
+    print(
+        textwrap.fill(
+            printable(text),
+            width,
+            initial_indent=first,
+            subsequent_indent=others,
+            break_on_hyphens=False,
+        )
+    )
+
+
+def console() -> Any:
+    """The terminal, or a file of WIDE characters a line."""
+    from rich.console import Console
+
+    return Console(width=terminal_width())
+
+
+def terminal_width() -> int:
+    """Characters in a line: of the terminal, or WIDE if the output goes to a file."""
+    from rich.console import Console
+
+    shown = Console()
+    return shown.width if shown.is_terminal else max(shown.width, WIDE)
+
+
+PRINTERS: dict[type[Block], Callable[[Any], None]] = {
+    Code: lambda one: print(one.text),
+    Facts: print_facts,
+    Items: print_items,
+    Section: print_section,
+    Table: print_table,
+    Text: lambda one: print_wrapped(one.text),
+    Verdict: lambda one: print_wrapped(one.text),
+}
+
+
+SUFFIXES = (".html", ".md", ".json")
+LOOKS = (
+    "folded",
+    "id",
+    "image",
+    "kind",
+    "name",
+    "on_terminal",
+    "optional",
+)  # fields that JSON leaves out
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a run, a study or a measurement says to people.
+
+    Attributes
+    ----------
+    blocks
+        The answer and what must be known with it, then sections; those that hold nothing are
+        left out
+    command
+        The command that repeats it
+    """
+
+    title: str
+    blocks: Sequence[Block]
+    command: str = ""
+    version: str = __version__
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "blocks", filled(self.blocks))
+
+    @property
+    def verdict(self) -> str:
+        """The sentence that answers; empty without one."""
+        return next((one.text for one in self.blocks if isinstance(one, Verdict)), "")
+
+    def html(self) -> str:
+        """One self-contained page, its images embedded."""
+        return html_page(self.title, self.command, self.version, self.blocks)
+
+    def markdown(self, pictures: str = "") -> str:
+        """A Markdown page. pictures : what the paths of its figures begin with; without it they are left out"""
+        return markdown_page(self.title, self.command, self.blocks, pictures)
+
+    def json(self) -> dict[str, Any]:
+        """Title, command, version and blocks as values for JSON; figures by their captions."""
+        return {
+            "title": self.title,
+            "command": self.command,
+            "version": self.version,
+            "blocks": plain(self.blocks),
+        }
+
+    def print(self) -> None:
+        """Print it on the terminal, without figures; the answer comes last, above the prompt."""
+        opening = [one for one in self.blocks if not isinstance(one, Section)]
+        print_blocks([*(one for one in self.blocks if isinstance(one, Section)), *opening])
+
+    def save(self, path: str | Path, pictures: str = "") -> Path:
+        """Write a page in the format of the suffix: .html, .md or .json. Returns the path.
+
+        Parameters
+        ----------
+        pictures
+            What the paths of a Markdown page's figures begin with; by default a folder of the
+            page's name
+
+        Raises
+        ------
+        InputError
+            For another suffix.
+        """
+        from skysim.core import files
+
+        path = Path(path)
+        if path.suffix not in SUFFIXES:
+            raise InputError(path, *unknown_name("file format", path.suffix, SUFFIXES))
+        files.make_folder(path.parent)
+        if path.suffix == ".html":
+            files.write_text(path, self.html())
+        elif path.suffix == ".json":
+            files.write_text(path, files.to_json(self.json()))
+        else:
+            pictures = pictures or f"{path.stem}/"
+            for name, figure in figure_files(self.blocks):
+                file = path.parent / f"{pictures}{name}"
+                files.make_folder(file.parent)
+                files.write_bytes(file, figure.image)
+            files.write_text(path, self.markdown(pictures))
+        return path
+
+
+def plain(value: Any) -> Any:
+    """Blocks and what they hold as values for JSON."""
+    if isinstance(value, Block):
+        held = {
+            one.name: plain(getattr(value, one.name))
+            for one in fields(value)
+            if one.name not in LOOKS
+        }
+        return {"kind": type(value).__name__.lower()} | held
+    if isinstance(value, Cell):
+        return value.text
+    if isinstance(value, Column):
+        return {"title": value.title, "unit": value.unit}
+    return [plain(one) for one in value] if isinstance(value, list | tuple) else value

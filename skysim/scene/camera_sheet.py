@@ -1,0 +1,517 @@
+"""A camera file from the numbers of a data sheet: what to ask, and what is assumed where the sheet is silent.
+
+Answers are texts as a user types them. The file is a preset (`camera.preset`); each value has a comment: [S1] if the
+data sheet states it, otherwise `assumed` with the reason.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import yaml
+
+from skysim.core.errors import InputError, printable
+
+# Parsers of the answers, from a typed text to a value of the file. Each raises InputError with what
+# is allowed.
+
+
+def pixels(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{1,6})\s*(?:px)?\s*[x×*,]\s*(\d{1,6})\s*(?:px)?", text.strip())
+    if not match:
+        raise InputError("", "", "width x height, such as 1936x1216")
+    return int(match[1]), int(match[2])
+
+
+def quantity_text(si_unit: str, what: str, example: str) -> Callable[[str], str]:
+    """A parser that checks a quantity and returns its text."""
+
+    def parse(text: str) -> str:
+        from skysim.core.units import quantity
+
+        try:
+            quantity(si_unit, what, example)(text)
+        except ValueError:
+            raise InputError("", "", f"a {what} with its unit, such as {example}") from None
+        return " ".join(text.split())
+
+    return parse
+
+
+def finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise InputError("", "not finite")
+    return value
+
+
+def plain(value: float) -> float:
+    """The number, without a decimal point if it is whole."""
+    return int(value) if value.is_integer() and abs(value) < 1e15 else value
+
+
+def number(units: str, example: str) -> Callable[[str], float]:
+    """A parser of a number without or with its unit. units : a pattern"""
+
+    def parse(text: str) -> float:
+        match = re.fullmatch(rf"([-+.\de]*?\d\.?)\s*(?:{units})?", text.strip(), re.IGNORECASE)
+        try:
+            value = finite(float(match[1] if match else ""))
+        except ValueError:
+            raise InputError("", "", f"a number such as {example}") from None
+        return plain(value)
+
+    return parse
+
+
+def share(text: str) -> float:
+    """A fraction, or a percentage with its sign."""
+    digits, percent, _ = text.partition("%")
+    value = number("", '0.65, or "65 %"')(digits)
+    return rounded(value / 100, 12) if percent else value
+
+
+def bits(text: str) -> int:
+    value = number("bits?", "12")(text)
+    if value not in range(1, 17):
+        raise InputError("", "", "1 to 16")
+    return int(value)
+
+
+def f_number(text: str) -> float:
+    return number("", "1.4")(re.sub(r"^\s*f\s*/?\s*", "", text, flags=re.IGNORECASE))
+
+
+def gain(text: str) -> float:
+    """Electrons a digital number; EMVA 1288 states the inverse, in DN/e-."""
+    inverse = re.fullmatch(r"(.*?)\s*(?:DN|ADU)\s*/\s*e-?", text.strip(), re.IGNORECASE)
+    value = number(r"e-?\s*/\s*(?:DN|ADU)", '2.64, "2.64 e-/DN" or "0.379 DN/e-"')(
+        inverse[1] if inverse else text
+    )
+    return rounded(1 / value, 6) if inverse and value else value
+
+
+def shutter(text: str) -> str:
+    kinds = ("global", "rolling", "frame_transfer", "interline")
+    kind = text.strip().lower().replace(" ", "_").replace("-", "_").removesuffix("_shutter")
+    if kind not in kinds:
+        raise InputError("", "", ", ".join(kinds))
+    return kind
+
+
+def rounded(value: float, digits: int = 4) -> float:
+    return plain(float(f"{value:.{digits}g}"))
+
+
+# The numbers of a data sheet: how they are asked, where they are stated, and what is assumed if
+# they are not.
+
+
+Values = Mapping[str, Any]  # parsed answers, by the name of the question
+
+WELL_E_UM2 = 900.0  # full well of a square micrometer: the least of the cameras in data/cameras, that of the IMX264
+TRANSFER = "1 us"  # time of a row of a charge-coupled device
+
+
+class AssumedValue(NamedTuple):
+    """A value that the data sheet does not state, and the reason for it."""
+
+    value: Any
+    why: str
+
+
+class Question(NamedTuple):
+    """One number of a data sheet.
+
+    Attributes
+    ----------
+    keys
+        Of the section `camera` that the answer gives
+    where
+        Where a data sheet states it
+    parse
+        From the typed text to the value of the file, several for several keys; raises
+        InputError
+    assume
+        From the values known so far to the assumption; None if the key is then left out
+    consequence
+        Of not knowing it; empty if it must be given
+    skipped
+        Why it is not asked, by the values known so far; empty if it is
+    """
+
+    keys: tuple[str, ...]
+    ask: str
+    where: str
+    parse: Callable[[str], Any]
+    assume: Callable[[Values], AssumedValue | None] = lambda values: None
+    consequence: str = ""
+    skipped: Callable[[Values], str] = lambda values: ""
+
+
+def assumed(value: Any, why: str) -> Callable[[Values], AssumedValue]:
+    return lambda values: AssumedValue(value, why)
+
+
+def without_lens(values: Values) -> str:
+    return "" if "focal_length" in values else "without focal_length"
+
+
+def not_by_rows(values: Values) -> str:
+    return "with a global shutter" if values.get("shutter", "global") == "global" else ""
+
+
+def row_time(values: Values) -> AssumedValue:
+    """Time from row to row of a shutter that is not global."""
+    if values["shutter"] != "rolling":
+        return AssumedValue(TRANSFER, "a fast transfer")
+    return AssumedValue(f"{rounded(1e6 / 30 / values['pixels'][1])} us", "30 frames a second")
+
+
+def full_well(values: Values) -> AssumedValue:
+    """Electrons, from the range of the converter if the gain is known, otherwise from the area of a pixel."""
+    if "gain" in values:
+        return AssumedValue(
+            rounded(values["gain"] * range_dn(values)), "where the converter's range ends"
+        )
+    from skysim.core.units import in_si
+
+    area_um2 = (1e6 * in_si(values["pitch"], "m")) ** 2
+    return AssumedValue(
+        rounded(WELL_E_UM2 * area_um2), f"{WELL_E_UM2:g} e- a square micrometer, as in the IMX264"
+    )
+
+
+def gain_of_well(values: Values) -> AssumedValue:
+    """Electrons a digital number that map the full well to the end of the range, rounded up."""
+    exact = max(values["full_well"], 1e-3) / range_dn(values)
+    step = 10.0 ** (math.floor(math.log10(exact)) - 3)
+    return AssumedValue(rounded(step * math.ceil(exact / step)), "the range ends at the full well")
+
+
+def range_dn(values: Values) -> float:
+    """Digital numbers from the black level to the end of the converter."""
+    return max(2 ** values["bits"] - 1 - values["black_level"], 1)
+
+
+QUESTIONS: dict[str, Question] = {
+    "pixels": Question(
+        ("width_px", "height_px"),
+        "Pixels, width x height",
+        "resolution or effective pixels, on the first page",
+        pixels,
+    ),
+    "pitch": Question(
+        ("pixel",),
+        'Pixel pitch, such as "5.86 um"',
+        "pixel size or unit cell size, on the first page",
+        quantity_text("m", "length", '"5.86 um"'),
+    ),
+    "focal_length": Question(
+        ("focal_length",),
+        'Focal length of the lens, such as "25 mm"',
+        "engraved on the lens",
+        quantity_text("m", "length", '"25 mm"'),
+        consequence="the file has no lens: a scene must give camera.focal_length and camera.f_number",
+    ),
+    "f_number": Question(
+        ("f_number",),
+        "F-number at which the lens is used",
+        "the aperture ring; the data sheet of the lens states the smallest",
+        f_number,
+        consequence="a scene must give camera.f_number",
+        skipped=without_lens,
+    ),
+    "transmission": Question(
+        ("transmission",),
+        "Transmission of the lens, a fraction or %",
+        "data sheet of the lens, or (f-number / T-number)²; seldom stated",
+        share,
+        assumed(0.9, "a coated lens"),
+        "the brightness of every light is uncertain by a tenth",
+        without_lens,
+    ),
+    "blur": Question(
+        ("psf.sigma_px",),
+        "Blur of the lens, standard deviation in pixels",
+        "spot diagram or MTF of the lens; seldom stated",
+        number("px", "0.7"),
+        assumed(0.7, "a sharp lens"),
+        "image size and centroid noise are uncertain: measure a point source",
+        without_lens,
+    ),
+    "shutter": Question(
+        ("shutter.kind",),
+        "Shutter: global, rolling, frame_transfer or interline",
+        "shutter type; a CCD is frame_transfer or interline",
+        shutter,
+        assumed("global", "as machine-vision cameras have"),
+        "a rolling shutter would shear the frames of a turning vehicle",
+    ),
+    "row_time": Question(
+        ("shutter.row_time",),
+        'Time from one row to the next, such as "15 us"',
+        "line time or horizontal period; or 1 / (frame rate x rows)",
+        quantity_text("s", "time", '"15 us"'),
+        row_time,
+        "how much a turning vehicle shears or streaks the frames is uncertain",
+        not_by_rows,
+    ),
+    "quantum_efficiency": Question(
+        ("detector.quantum_efficiency.peak",),
+        "Peak quantum efficiency, a fraction or %",
+        "EMVA 1288 or spectral response, at the highest point",
+        share,
+        assumed(0.6, "a monochrome CMOS sensor"),
+        "the electrons of every light are uncertain by a third",
+    ),
+    "bits": Question(
+        ("detector.bits",),
+        "Bits of a pixel in the frames",
+        "A/D converter, or pixel format (Mono12: 12)",
+        bits,
+        assumed(12, "the usual converter"),
+        "rounding, and the brightest digital number, are uncertain",
+    ),
+    "black_level": Question(
+        ("detector.offset_dn",),
+        "Black level, digital numbers",
+        "offset or black level; or the mean of a dark frame",
+        number("DN|ADU", "32"),
+        lambda values: AssumedValue(2 ** max(values["bits"] - 7, 0), "1/128 of the range"),
+        "digital numbers do not compare with those of a real frame",
+    ),
+    "full_well": Question(
+        ("detector.full_well_e",),
+        "Full well, electrons",
+        "EMVA 1288: saturation capacity",
+        number("e-?|electrons", "10700"),
+        full_well,
+        "it is unknown which lights saturate: the peak of `skysim check` is a guess",
+    ),
+    "gain": Question(
+        ("detector.gain_e_dn",),
+        "Gain, electrons a digital number",
+        'EMVA 1288: 1/K; or its inverse with the unit, "0.379 DN/e-"',
+        gain,
+        gain_of_well,
+        "digital numbers do not compare with those of a real frame",
+    ),
+    "read_noise": Question(
+        ("detector.read_noise_e",),
+        "Read noise, electrons rms",
+        "EMVA 1288: temporal dark noise",
+        number("e-?|electrons", "3"),
+        assumed(3, "a CMOS sensor of today"),
+        "the faintest light that is detected is uncertain",
+    ),
+    "dark_current": Question(
+        ("detector.dark_e_s",),
+        "Dark current, electrons a pixel and second",
+        "EMVA 1288: dark current",
+        number(r"e-?\s*/\s*(?:px\s*/\s*)?s", "5"),
+        assumed(5, "a CMOS sensor at room temperature"),
+        "it matters for exposures of a second and more",
+    ),
+    "prnu": Question(
+        ("detector.prnu",),
+        "Photo-response non-uniformity, a fraction or %",
+        "EMVA 1288: PRNU",
+        share,
+        assumed(0.01, "1 %, the usual size"),
+        "centroid noise of bright lights is uncertain",
+    ),
+}
+REQUIRED = tuple(name for name, question in QUESTIONS.items() if question.consequence == "")
+
+
+CURVES = {
+    "interline": "interline",
+    "frame_transfer": "thick_ccd",
+}  # shapes of the quantum efficiency by shutter
+PLACEHOLDERS = {
+    "pixels": "1000x1000",
+    "pitch": "5 um",
+}  # to check an answer before these two are given
+PLACEHOLDER_LENS = {"focal_length": "1 m", "f_number": 1.0}  # to validate a camera without a lens
+SI = {
+    "pixel": " m",
+    "focal_length": " m",
+    "shutter.row_time": " s",
+}  # units of the limits in messages
+COMMENT_COLUMN = 34
+
+
+class SheetLine(NamedTuple):
+    """One value of the file with its comment."""
+
+    key: str
+    value: Any
+    comment: str
+
+
+class Missing(NamedTuple):
+    """A number that is not stated: what is assumed (empty: the key is left out), and the consequence."""
+
+    name: str
+    assumed: str
+    consequence: str
+
+
+class Sheet(NamedTuple):
+    """The values of a camera file, and what the data sheet does not state."""
+
+    lines: list[SheetLine]
+    missing: list[Missing]
+
+
+def fill(answers: Mapping[str, str]) -> Sheet:
+    """The camera of some answers, with assumptions for the rest. Raises InputError; its key is `answers.NAME`."""
+    values = {name: parsed(name, text) for name, text in answers.items()}
+    missing = []
+    comments = dict.fromkeys(values, "[S1]")
+    for name, question in QUESTIONS.items():
+        skipped = question.skipped(values)
+        if skipped and name in values:
+            raise InputError(f"answers.{name}", f"has no effect {skipped}")
+        if skipped or name in values:
+            continue
+        if name in REQUIRED:
+            raise InputError(f"answers.{name}", f"missing; {question.ask}: {question.where}")
+        guess = question.assume(values)
+        if guess is not None:
+            values[name] = guess.value
+            comments[name] = f"assumed: {guess.why}"
+        text = f"{guess.value} ({guess.why})" if guess else ""
+        missing.append(Missing(name, text, question.consequence))
+    sheet = Sheet(list(lines_of(values, comments)), missing)
+    check(sheet, answers)
+    return sheet
+
+
+def outstanding(answers: Mapping[str, str]) -> dict[str, Missing]:
+    """What some answers leave open, by name; pixels and pitch may still be missing. Raises InputError as `fill`."""
+    return {one.name: one for one in fill(PLACEHOLDERS | dict(answers)).missing}
+
+
+def parsed(name: str, text: str) -> Any:
+    """The value of an answer. Raises InputError."""
+    try:
+        return QUESTIONS[name].parse(text)
+    except InputError as error:
+        raise InputError(f"answers.{name}", quoted(text), error.allowed) from None
+
+
+def quoted(text: str) -> str:
+    """The begin of an answer, for messages."""
+    return repr(printable(text)[:40])
+
+
+def lines_of(values: Values, comments: Mapping[str, str]) -> Iterator[SheetLine]:
+    """The lines of the file in the order of the questions, with what is needed and not asked."""
+    for name, question in QUESTIONS.items():
+        if name not in values:
+            continue
+        if name == "blur":
+            yield SheetLine("psf.kind", "gaussian", "assumed")
+        if name == "quantum_efficiency":
+            curve = CURVES.get(values["shutter"], "cmos")
+            yield SheetLine("detector.quantum_efficiency.curve", curve, "assumed: the shape")
+        several = values[name] if len(question.keys) > 1 else (values[name],)
+        yield from (
+            SheetLine(key, value, comments[name])
+            for key, value in zip(question.keys, several, strict=True)
+        )
+        if name == "dark_current":
+            yield SheetLine("detector.dark_temperature_c", 25, "assumed: room temperature")
+
+
+def tree_of(lines: list[SheetLine]) -> dict[str, Any]:
+    """The section `camera` as nested mappings."""
+    tree: dict[str, Any] = {}
+    for line in lines:
+        *parents, last = line.key.split(".")
+        section = tree
+        for parent in parents:
+            section = section.setdefault(parent, {})
+        section[last] = line.value
+    return tree
+
+
+def check(sheet: Sheet, answers: Mapping[str, str]) -> None:
+    """Validate the camera. Raises InputError of the first wrong answer."""
+    from pydantic import ValidationError
+
+    from skysim.core.yaml_reader import fault_of, yaml_keys
+    from skysim.scene.sections.camera import CameraConfig
+
+    tree = tree_of(sheet.lines)
+    try:
+        CameraConfig.model_validate(PLACEHOLDER_LENS | tree)
+    except ValidationError as error:
+        faults: list[InputError] = []
+        for one in error.errors():
+            fault = fault_of(one, CameraConfig)
+            section = ".".join(map(str, yaml_keys(one["loc"], tree, False)))
+            faults.append(fault.under(section) if section else fault)
+        raise blame(faults, answers) from None
+
+
+def blame(faults: list[InputError], answers: Mapping[str, str]) -> InputError:
+    """The first fault that is of an answer, as an error of that answer; otherwise the first."""
+    for name, text in answers.items():
+        for fault in faults:
+            if fault.key in QUESTIONS[name].keys:
+                if fault.allowed:
+                    return InputError(
+                        f"answers.{name}", quoted(text), fault.allowed + SI.get(fault.key, "")
+                    )
+                return InputError(f"answers.{name}", f"{quoted(text)}: {fault.problem}")
+    return faults[0].under("camera")
+
+
+def text(sheet: Sheet, name: str) -> str:
+    """The file: YAML with a comment at each value."""
+    lines = [
+        f"# {printable(name)}. Written by `skysim camera new`.",
+        "# [S1] the data sheets of camera and lens. A value marked `assumed` is not stated there.",
+        *(
+            f"# Not stated: {one.name}; {one.consequence}."
+            for one in sheet.missing
+            if not one.assumed
+        ),
+        *yaml_lines(sheet.lines),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def yaml_value(value: Any) -> str:
+    """A value in one line of YAML; a text with spaces is quoted."""
+    if isinstance(value, str):
+        return f'"{value}"' if " " in value else value
+    return (
+        yaml.safe_dump(value, default_flow_style=True, width=math.inf)
+        .removesuffix("\n")
+        .removesuffix("\n...")
+    )
+
+
+def yaml_lines(camera: list[SheetLine]) -> list[str]:
+    """A section `camera` in YAML, with the comment of each value."""
+    lines = ["camera:"]
+    open_ = list[str]()
+    for line in camera:
+        *parents, last = line.key.split(".")
+        depth = next(
+            (n for n, pair in enumerate(zip(open_, parents, strict=False)) if pair[0] != pair[1]),
+            len(open_),
+        )
+        lines += [
+            f"{'  ' * (n + 1)}{parents[n]}:" for n in range(min(depth, len(parents)), len(parents))
+        ]
+        open_ = parents
+        written = f"{'  ' * (len(parents) + 1)}{last}: {yaml_value(line.value)}"
+        lines.append(f"{written.ljust(COMMENT_COLUMN)} # {line.comment}")
+    return lines

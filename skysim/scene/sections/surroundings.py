@@ -1,0 +1,347 @@
+"""Schema of what surrounds camera and laboratory: `light.air`, `thermal`, `orbit`, and satellites."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+
+from skysim.core.constants import FWHM_PER_SIGMA
+from skysim.core.errors import InputError
+from skysim.core.units import Ascending, ConfigModel, Fraction, Length, Number, Time, check_table
+from skysim.core.yaml_reader import existing_file
+
+NEGLIGIBLE_PX = 0.02  # a blur of this sigma makes an image of 0.7 px wider by 0.0003 px
+Altitude = Annotated[Number, Field(ge=0, lt=90)]
+
+
+class HorizonConfig(ConfigModel):
+    """A skyline: apparent altitudes below which nothing is seen, linear between the azimuths (from north through east).
+
+    The table continues around the circle from its last row to its first.
+    """
+
+    azimuth_deg: Ascending
+    altitude_deg: Annotated[tuple[Altitude, ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def check_columns(self) -> Self:
+        check_table(self.azimuth_deg, self.altitude_deg, "altitude_deg")
+        if not 0 <= self.azimuth_deg[0] <= self.azimuth_deg[-1] < 360:
+            raise InputError("azimuth_deg", "outside the circle", "0 to below 360")
+        return self
+
+
+class AirGlowConfig(ConfigModel):
+    """The sky's glow, which follows from time and place.
+
+    Attributes
+    ----------
+    dark_mag_arcsec2
+        V surface brightness of the moonless night sky at the zenith
+    moonlight, twilight
+        Scattered light of the Moon and of the Sun
+    """
+
+    dark_mag_arcsec2: Annotated[Number, Field(ge=10, le=30)] = 21.7
+    moonlight: bool = True
+    twilight: bool = True
+
+
+class AirConfig(ConfigModel):
+    """The atmosphere over `site`. Of the standard atmosphere at the site's height what is left out.
+
+    Attributes
+    ----------
+    pressure_hpa, temperature_c
+        At the site
+    humidity
+        Relative, 0 to 1
+    wavelength
+        Of refraction; the mean of a G2 star's photo-electrons if left out
+    extinction_mag
+        k' at the zenith in the camera's band
+    color_extinction_mag
+        k''. A star loses (k' + k'' (B-V)) mag for each air mass
+    scintillation
+        Whether stars twinkle
+    seeing_arcsec
+        Full width of a star's image at the zenith, half maximum, at a long exposure
+    horizon
+        The skyline; altitude 0 all around if left out
+    glow
+        Sky, twilight and moonlight; none if left out
+    """
+
+    pressure_hpa: Annotated[Number, Field(ge=0, le=1100)] | None = None
+    temperature_c: Annotated[Number, Field(ge=-80, le=50)] | None = None
+    humidity: Fraction = 0.5
+    wavelength_m: Annotated[Length, Field(ge=300e-9, le=2e-6)] | None = None
+    extinction_mag: Annotated[Number, Field(ge=0, le=5)] = 0.172
+    color_extinction_mag: Annotated[Number, Field(ge=-1, le=1)] = 0.0
+    scintillation: bool = True
+    seeing_arcsec: Annotated[Number, Field(ge=0, le=20)] = 0.0
+    horizon: HorizonConfig | None = None
+    glow: AirGlowConfig | None = None
+
+    def seeing_px(self, focal_px: float) -> float:
+        """Standard deviation of a star's image at the zenith by the seeing; 0 where it is too small to matter."""
+        sigma_px = math.radians(self.seeing_arcsec / 3600) * (1 / FWHM_PER_SIGMA) * focal_px
+        return sigma_px if sigma_px > NEGLIGIBLE_PX else 0.0
+
+
+# Schema of the scene section `thermal`: the temperature of the laboratory, and what moves with it.
+
+
+Temperature = Annotated[Number, Field(ge=-150, le=150)]
+Coefficient = Annotated[Number, Field(ge=-10_000, le=10_000)]
+
+
+class SteadyTemperatureConfig(ConfigModel):
+    """The same temperature all along."""
+
+    kind: Literal["steady"]
+    temperature_c: Temperature
+
+
+class LinearTemperatureConfig(ConfigModel):
+    """A temperature that rises or falls evenly from start_c."""
+
+    kind: Literal["linear"]
+    start_c: Temperature
+    rate_c_h: Annotated[Number, Field(ge=-100, le=100)]
+
+
+class SineTemperatureConfig(ConfigModel):
+    """A temperature that goes up and down: mean + amplitude sin(2 pi t / period + phase)."""
+
+    kind: Literal["sine"]
+    mean_c: Temperature
+    amplitude_c: Annotated[Number, Field(gt=0, le=100)]
+    period_s: Annotated[Time, Field(gt=0)]
+    phase_deg: Annotated[Number, Field(ge=-360, le=360)] = 0.0
+
+
+class TemperatureTableConfig(ConfigModel):
+    """A measured history, linear between its times and constant beyond them."""
+
+    kind: Literal["table"]
+    hours: Ascending
+    temperature_c: Annotated[tuple[Temperature, ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def check_columns(self) -> TemperatureTableConfig:
+        check_table(self.hours, self.temperature_c, "temperature_c", "hours")
+        return self
+
+
+Temperatures = Annotated[
+    SteadyTemperatureConfig
+    | LinearTemperatureConfig
+    | SineTemperatureConfig
+    | TemperatureTableConfig,
+    Field(discriminator="kind"),
+]
+
+
+class ThermalConfig(ConfigModel):
+    """What has moved since survey and calibration, which were at reference_c. The tracker does not know of it.
+
+    Attributes
+    ----------
+    temperature
+        Of dome, mount and lens alike, against the time since the scene's start
+    speed
+        The temperature's history runs so many times as fast as the clock, so that a short run
+        has hours
+    dome_ppm_k
+        Linear expansion of the dome with its LEDs, from the level anchor_height above the
+        bearing's center on its axis; acrylic has 70, steel 12
+    creep
+        Displacement of the dome since its survey
+    mount_arcsec_k
+        Rotation of the camera on the vehicle about the camera's axes
+    lens_ppm_k
+        Relative change of the focal length
+    """
+
+    temperature: Temperatures
+    reference_c: Temperature = 20.0
+    speed: Annotated[Number, Field(ge=1, le=1e5)] = 1.0
+    dome_ppm_k: Coefficient = 0.0
+    anchor_height_m: Length = 0.0
+    creep_m: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
+    mount_arcsec_k: tuple[Coefficient, Coefficient, Coefficient] = (0.0, 0.0, 0.0)
+    lens_ppm_k: Coefficient = 0.0
+
+    @property
+    def has_effect(self) -> bool:
+        """Whether anything depends on the temperature."""
+        return bool(self.dome_ppm_k or any(self.mount_arcsec_k) or self.lens_ppm_k)
+
+    @model_validator(mode="after")
+    def check_effect(self) -> ThermalConfig:
+        if not self.has_effect:
+            raise InputError(
+                "",
+                "nothing depends on the temperature",
+                "dome_ppm_k, mount_arcsec_k or lens_ppm_k, or no thermal",
+            )
+        return self
+
+
+# Schema of the scene section `orbit`, of the satellites in a sky scene, and of what the Earth does
+# to the camera.
+
+
+ElementsFile = Annotated[str, AfterValidator(existing_file)]
+Magnitude = Annotated[Number, Field(ge=-30, le=30)]
+Rate = Annotated[Number, Field(gt=0, le=30)]
+
+
+class RandomSatellitesConfig(ConfigModel):
+    """Sunlit satellites on random paths, drawn anew for each frame: anywhere in the field, in any direction.
+
+    Attributes
+    ----------
+    per_field
+        Mean number in the camera's field (the circle around its chip) at any moment
+    rate_deg_s
+        Least and greatest angular rate against the stars; its logarithm is uniformly
+        distributed
+    v_mag
+        Least and greatest V magnitude, uniformly distributed
+    seed
+        Of all these draws, together with the scene's
+    """
+
+    per_field: Annotated[Number, Field(gt=0, le=1000)]
+    rate_deg_s: tuple[Rate, Rate] = (0.05, 1.5)
+    v_mag: tuple[Magnitude, Magnitude] = (2.0, 8.0)
+    seed: Annotated[int, Field(ge=0)]
+
+    @model_validator(mode="after")
+    def check_ranges(self) -> Self:
+        for name in ("rate_deg_s", "v_mag"):
+            low, high = getattr(self, name)
+            if low > high:
+                raise InputError(name, f"{low:g} is above {high:g}", "the least, then the greatest")
+        return self
+
+
+class SatellitesConfig(ConfigModel):
+    """Artificial satellites, seen from the scene's `orbit`, or else from `site` with its longitude.
+
+    Attributes
+    ----------
+    file
+        Mean elements: TLE, or OMM as CSV, XML or JSON
+    standard_mag
+        V at a range of 1000 km and a phase angle of 90 degrees, of all satellites of the file
+    random
+        Further satellites on random paths
+    """
+
+    file: ElementsFile | None = None
+    standard_mag: Magnitude = 6.0
+    random: RandomSatellitesConfig | None = None
+
+    @model_validator(mode="after")
+    def check_any(self) -> Self:
+        if self.file is None and self.random is None:
+            raise InputError("", "no satellite is left", "file or random, or no satellites")
+        return self
+
+
+class ExclusionConfig(ConfigModel):
+    """When the tracker can be used in its orbit, for `skysim availability`.
+
+    Attributes
+    ----------
+    sun_deg, moon_deg
+        Least angle of the boresight from their centers
+    earth_deg
+        From the Earth's limb
+    stars
+        Least number of stars to `tracker.limit_mag` in a round field of the chip's area
+    """
+
+    sun_deg: Annotated[Number, Field(ge=0, lt=180)] = 0.0
+    earth_deg: Annotated[Number, Field(ge=0, lt=180)] = 0.0
+    moon_deg: Annotated[Number, Field(ge=0, lt=180)] = 0.0
+    stars: Annotated[int, Field(ge=0)] = 4
+
+
+class EarthConfig(ConfigModel):
+    """The Earth's light in the field: lit ground, the air above its limb, and the airglow.
+
+    Attributes
+    ----------
+    albedo
+        Of the ground with its clouds
+    airglow
+        V surface brightness of the layer seen from straight above
+    """
+
+    albedo: Fraction = 0.3
+    airglow_mag_arcsec2: Annotated[Number, Field(ge=10, le=30)] = 22.0
+
+
+class OrbitConfig(ConfigModel):
+    """The camera's orbit about the Earth: keys common to all kinds.
+
+    Attributes
+    ----------
+    earth
+        The Earth's light; if left out it is dark, but hides stars
+    exclusion
+        Limits of the tracker's use; none if left out
+    """
+
+    earth: EarthConfig | None = None
+    exclusion: ExclusionConfig | None = None
+
+
+class CircularOrbitConfig(OrbitConfig):
+    """A circular orbit at the scene's start, in GCRS axes, turned by the Earth's flattening (J2).
+
+    Attributes
+    ----------
+    altitude
+        Above the Earth's equatorial radius, 6378.137 km
+    argument_deg
+        From the ascending node to the camera at start_time
+    """
+
+    kind: Literal["circular"]
+    altitude_m: Annotated[Length, Field(ge=100e3, le=1e9)]
+    inclination_deg: Annotated[Number, Field(ge=0, le=180)]
+    raan_deg: Annotated[Number, Field(ge=-360, le=360)] = 0.0
+    argument_deg: Annotated[Number, Field(ge=-360, le=360)] = 0.0
+
+
+class TleOrbitConfig(OrbitConfig):
+    """An orbit of mean elements (SGP4): a TLE, or an OMM as CSV, XML or JSON.
+
+    Attributes
+    ----------
+    number
+        The satellite's catalog number, for a file of several
+    """
+
+    kind: Literal["tle"]
+    file: ElementsFile
+    number: Annotated[int, Field(ge=0, le=999_999_999)] | None = None
+
+
+class OemOrbitConfig(OrbitConfig):
+    """An orbit of a CCSDS Orbit Ephemeris Message (OEM) in keyword = value notation."""
+
+    kind: Literal["oem"]
+    file: ElementsFile
+
+
+Orbit = Annotated[
+    CircularOrbitConfig | TleOrbitConfig | OemOrbitConfig, Field(discriminator="kind")
+]

@@ -1,1 +1,0 @@
-"""Checks of a dome: assumptions that it breaks, and fields that look alike."""

@@ -1,0 +1,409 @@
+"""What the air does to a scene's frames that the tracker does not know."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from skysim.camera.glow.background import angular_separation_deg
+from skysim.core.constants import ARCSEC_RAD
+from skysim.core.types import Floats
+from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.light import StarsConfig
+from skysim.simulation.checks import attitudes
+from skysim.simulation.checks.detection import (
+    BINOMIAL_VARIANCE_PX2,
+    Context,
+    centroid_variance,
+    full_scale_e,
+    threshold_e,
+)
+from skysim.simulation.checks.expected_error import Independent, covariance, gains, star_places
+from skysim.simulation.checks.facts import Fact, short
+from skysim.simulation.checks.findings import few_lights
+from skysim.simulation.checks.sampling import CheckedSamples, Sampled
+from skysim.simulation.checks.views import peak_share
+from skysim.simulation.lights.atmosphere import AirEffects
+from skysim.simulation.lights.lens import stray_e_s
+from skysim.simulation.lights.light import find_light
+from skysim.sources.bodies import NAMES, BodyLight
+from skysim.sources.camera_orbit import limb_elevation_rad
+from skysim.sources.ephemeris import place
+from skysim.sources.photometry import SUN, star_flux_e_s_m2
+from skysim.tracking.tracker_interface import OWN
+
+MIN_RAISED_ARCSEC = 1.0  # of a refraction that matters
+
+
+def refraction(context: Context, samples: CheckedSamples) -> str:
+    """Warn where stars are raised by more than the expected error and the tracker does not undo it: the lowest frame.
+
+    The attitude errs by the refraction at the boresight, and the field's height is shortened by the difference of the
+    refractions at its two ends.
+    """
+    lab = context.lab
+    at = samples.frames.attitudes
+    atmosphere = find_light(lab.camera.lights, AirEffects)
+    if atmosphere is None or lab.scene.tracker.refraction:
+        return ""
+    boresight = (at.lab_from_body * lab.camera.mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
+    zenith = np.array(
+        [atmosphere.air.at(exposure.time).zenith for exposure in samples.frames.exposures]
+    )
+    altitude_rad = np.arcsin(np.sum(boresight * zenith, axis=1))
+    n = int(altitude_rad.argmin())
+    zenith_rad = math.pi / 2 - altitude_rad[n]
+    half_rad = context.camera.optics.field_rad
+    around_rad = zenith_rad + np.array([0.0, half_rad, -half_rad])
+    middle, low, high = (
+        atmosphere.air.refraction.bending_rad(np.abs(around_rad)) * np.sign(around_rad) / ARCSEC_RAD
+    )
+    expected_arcsec = samples.frames.error.rms_arcsec()[0]
+    if not middle > max(MIN_RAISED_ARCSEC, 0.0 if math.isnan(expected_arcsec) else expected_arcsec):
+        return ""
+    where = attitudes.describe(at, n, lab.scene, lab.camera.mount)
+    text = (
+        f"the air raises stars by {short(middle)}″ at {where}, {math.degrees(altitude_rad[n]):.1f}° above the horizon,"
+        f" and shortens the field by {short(low - high, 2)}″, which the tracker does not know"
+    )
+    if lab.scene.tracker.name == OWN:
+        return f"tracker.refraction: {text}; change it to true"
+    return f"tracker.name: {text}; change it to own, with tracker.refraction: true, or point higher"
+
+
+# Whether the Sun, the Moon or a planet is in the field of a scene's frames, and whether Sun or Moon
+# is near it.
+
+
+NEAR_DEG = {"sun": 60.0, "moon": 30.0}  # from the boresight, where their stray light would matter
+
+
+def bodies_near(context: Context, samples: CheckedSamples) -> Iterator[str]:
+    """A line for each body: the frame at which it is nearest to the boresight, if it is in the field or near it."""
+    lab = context.lab
+    at = samples.frames.attitudes
+    cam_from_lab = lab.camera.mount.cam_from_body * at.lab_from_body.inv()
+    closest: dict[str, tuple[float, int, BodyLight]] = {}
+    for n, beam in enumerate(samples.frames.beams):
+        for body in beam.discs:
+            z = float(cam_from_lab[n].apply(body.place.direction)[2])
+            off = math.acos(max(min(z, 1.0), -1.0)), n, body
+            closest[body.name] = min(closest.get(body.name, off), off, key=lambda found: found[0])
+    for name, (off_rad, n, body) in closest.items():
+        seen = body.truth()
+        where = attitudes.describe(at, n, lab.scene, lab.camera.mount)
+        what = f"light.bodies: {NAMES[body.id]} (V {seen.v_mag:.1f}, {short(seen.diameter_arcsec, 2)}″ wide)"
+        far = f"{math.degrees(off_rad):.1f}° from the boresight at {where}"
+        if in_field(cam_from_lab[n].apply(body.place.direction), body.radius_rad, lab.scene.camera):
+            yield f"{what} is in the field, {far}: {short(peak_fill(context, body), 2)} times saturation"
+        elif lab.scene.camera.baffle is None and off_rad < math.radians(NEAR_DEG.get(name, 0.0)):
+            yield f"{what} is {far}; its stray light is not drawn: add camera.baffle, or a background of kind stray"
+
+
+def in_field(direction_cam: Floats, radius_rad: float, camera: CameraConfig) -> bool:
+    """Whether a disc about a direction (3,) overlaps the chip of a lens without distortion."""
+    if direction_cam[2] <= 0:
+        return False
+    xy_px = camera.focal_px * np.abs(direction_cam[:2]) / direction_cam[2]
+    half_px = np.array([camera.width_px, camera.height_px]) / 2 + camera.focal_px * math.tan(
+        radius_rad
+    )
+    return bool((xy_px < half_px).all())
+
+
+def peak_fill(context: Context, body: BodyLight) -> float:
+    """Electrons in the brightest pixel of a body at rest over saturation; a phase is a disk of its bright area."""
+    camera = context.camera
+    scene = context.lab.scene
+    lit = (1 + math.cos(body.place.phase_rad)) / 2
+    radius_px = scene.camera.focal_px * math.tan(body.radius_rad) * math.sqrt(lit)
+    lens2_px2 = np.array([camera.lens_px**2])
+    radius = np.array([radius_px])
+    none = np.zeros(1)
+    electrons = body.flux_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s
+    return (
+        electrons
+        * float(peak_share(lens2_px2, radius, none, none)[0])
+        / full_scale_e(scene.camera.detector)
+    )
+
+
+# Whether the errors that the tracker will claim are true: the mean NEES that the checks expect
+# under the stars.
+
+
+MAX_FACTOR = 1.3  # by which claimed errors may be too small
+TRUE_NEES = 3.0
+LARGEST_FLOOR_PX = 1.0
+
+
+def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
+    """Median of the expected NEES over some attitudes, with a least error of the centroids; NaN without lights."""
+    found = []
+    cam_from_body = context.lab.camera.mount.cam_from_body
+    for view, lab_from_body in zip(sampled.used, sampled.attitudes.lab_from_body, strict=True):
+        own = centroid_variance(view, context, prnu=0.0)
+        sigma_px = np.sqrt(np.trace(own, axis1=1, axis2=2) / 2 + floor_px**2)
+        try:
+            gain = gains(view, sigma_px) if len(view) > 2 else None
+        except np.linalg.LinAlgError:
+            gain = None
+        if gain is None:
+            continue
+        places = star_places(view, lab_from_body * cam_from_body.inv(), context)
+        errors = covariance(gain, Independent(centroid_variance(view, context)))
+        errors = errors if places is None else errors + covariance(gain, places)
+        information = np.einsum("nij,nik,n->jk", view.jacobian, view.jacobian, 1 / sigma_px**2)
+        found.append(float(np.trace(information @ errors)))
+    return float(np.median(found)) if found else math.nan
+
+
+def claimed(context: Context, samples: CheckedSamples) -> float:
+    """The expected NEES over the whole sky with the tracker's floor; NaN under other lights."""
+    if not isinstance(context.lab.scene.light, StarsConfig):
+        return math.nan
+    return expected_nees(samples.reach, context, context.settings.centroid_sigma_px)
+
+
+def fact(context: Context, samples: CheckedSamples) -> Fact | None:
+    """The expected NEES in words."""
+    nees = claimed(context, samples)
+    if math.isnan(nees):
+        return None
+    floor_px = context.settings.centroid_sigma_px
+    text = f"NEES {nees:.2g} over the sky (3 if true), with a least centroid error of {short(floor_px)} px"
+    return Fact("claimed errors", [text], {"nees": nees, "centroid_sigma_px": floor_px})
+
+
+def floor_too_small(context: Context, samples: CheckedSamples) -> str:
+    """Warn where the tracker will claim errors that are too small, because its floor of the centroids' error is."""
+    nees = claimed(context, samples)
+    factor = math.sqrt(nees / TRUE_NEES) if nees > 0 else 0.0
+    if factor <= MAX_FACTOR:
+        return ""
+    low = context.settings.centroid_sigma_px
+    high = LARGEST_FLOOR_PX
+    while high / low > 1.02:
+        middle = math.sqrt(low * high)
+        low, high = (
+            (middle, high)
+            if expected_nees(samples.reach, context, middle) > TRUE_NEES
+            else (low, middle)
+        )
+    return (
+        f"tracker.centroid_sigma_px: the tracker will claim errors that are {factor:.2g} times too small (NEES"
+        f" {nees:.2g}; 3 if true); change it to {short(high, 2)}"
+    )
+
+
+# Whether stray light past the baffle costs stars, and whether a body is within the tracker's
+# exclusion angles.
+
+
+MAX_LOSS_MAG = 0.5  # of the faintest star
+STRAY_NAMES = {"sun": "the Sun", "moon": "the Moon", "earth": "the Earth"}
+
+
+def stray_light(context: Context, samples: CheckedSamples) -> Iterator[str]:
+    """Warn where stray light makes the noise of a pixel so large that fainter stars are lost.
+
+    With n0 the noise without it and s electrons of it the noise is sqrt(n0^2 + s), and the faintest star brighter by
+    1.25 log10(1 + s / n0^2) magnitudes.
+    """
+    lab = context.lab
+    at = samples.frames.attitudes
+    if lab.scene.camera.baffle is None:
+        return
+    by_frame = [stray_e_s(lab.camera.lights, exposure) for exposure in samples.frames.exposures]
+    stray_e = context.camera.exposure_s * np.array([sum(one.values()) for one in by_frame])
+    n = int(stray_e.argmax())
+    own_e2 = context.camera.noise_e**2 - context.camera.stray_e
+    loss_mag = 1.25 * math.log10(1 + stray_e[n] / own_e2)
+    if loss_mag <= MAX_LOSS_MAG:
+        return
+    allowed_e = own_e2 * (10 ** (MAX_LOSS_MAG / 1.25) - 1)
+    source = max(by_frame[n], key=lambda name: by_frame[n][name])
+    full_e = full_scale_e(lab.scene.camera.detector)
+    yield (
+        f"camera.baffle.pst: stray light of {short(stray_e[n])} electrons in a pixel, most of it of"
+        f" {source}, of {full_e:.0f} at saturation,"
+        f" at {attitudes.describe(at, n, lab.scene, lab.camera.mount)}; the faintest star is {loss_mag:.1f} mag"
+        f" brighter; change it to {short(allowed_e / stray_e[n], 2)} times as much, or point farther away"
+    )
+
+
+def exclusion(context: Context, samples: CheckedSamples) -> Iterator[str]:
+    """Warn where a frame's boresight is within an exclusion angle of the orbit's tracker: the frame nearest to it."""
+    lab = context.lab
+    at = samples.frames.attitudes
+    limits = lab.scene.orbit.exclusion if lab.scene.orbit else None
+    if limits is None:
+        return
+    boresight = (at.lab_from_body * lab.camera.mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
+    angles_deg = np.array(
+        [beside_deg(context, t, axis) for t, axis in zip(at.t_s.tolist(), boresight, strict=True)]
+    )
+    for column, (name, limit_deg) in enumerate(
+        (("sun", limits.sun_deg), ("earth", limits.earth_deg), ("moon", limits.moon_deg))
+    ):
+        n = int(angles_deg[:, column].argmin())
+        if angles_deg[n, column] < limit_deg:
+            what = f"{STRAY_NAMES[name]}'s limb" if name == "earth" else STRAY_NAMES[name]
+            yield (
+                f"orbit.exclusion.{name}_deg: {what} is {angles_deg[n, column]:.1f}° from the boresight at"
+                f" {attitudes.describe(at, n, lab.scene, lab.camera.mount)}, within {limit_deg:g}°; point farther away"
+            )
+
+
+def beside_deg(context: Context, t_s: float, boresight: Floats) -> Floats:
+    """(3,) angles of a boresight from the Sun's center, the Earth's limb and the Moon's center at a time."""
+    here = context.lab.camera.viewpoint.observer_at(t_s)
+    sun, moon = (
+        float(angular_separation_deg(boresight, place(name, here).direction))
+        for name in ("sun", "moon")
+    )
+    limb_deg = math.degrees(float(limb_elevation_rad(here.from_earth.position_m, boresight)))
+    return np.array([sun, limb_deg, moon])
+
+
+# How deep the camera sees, and whether the simulated sky and the tracker's catalog are as deep.
+
+
+# by which the camera may see fainter stars than a catalog, a limit
+CATALOG_MARGIN_MAG = 0.3
+LIMIT_MARGIN_MAG = 0.5
+MIN_KNOWN = (
+    0.2  # share of the stars detected that the tracker should know: among more others it needs luck
+)
+DEEPEST_V = 10.0  # of a sky that `skysim catalog build` makes
+SNR = 5.0
+
+
+def faintest_star(context: Context, samples: CheckedSamples) -> Fact | None:
+    """V of the faintest star that the tracker detects, and of that with a signal-to-noise ratio of 5."""
+    scene = context.lab.scene
+    believed = context.beliefs
+    if not isinstance(scene.light, StarsConfig):
+        return None
+    rate_deg_s = float(
+        np.degrees(np.linalg.norm(samples.frames.attitudes.rate_body_rad_s, axis=1)).min()
+    )
+    limit_mag = detection_limit_mag(context, samples)
+    snr_mag = snr_limit_mag(context, samples)
+    sky = context.lab.camera.sources.magnitude
+    known = known_share(context, limit_mag)
+    lines = [
+        f"the tracker detects V {limit_mag:.1f} (like the Sun) in {1e3 * scene.exposure.time_s:.4g} ms at"
+        f" {rate_deg_s:.3g} deg/s; signal to noise {SNR:g} at V {snr_mag:.1f}",
+        f"the sky ends at V {np.nanmax(sky, initial=-math.inf):.1f}; the tracker knows stars to V"
+        f" {believed.faintest_mag:.1f}, {100 * known:.0f} % of those that it detects",
+    ]
+    values = {
+        "detected_v_mag": limit_mag,
+        "snr_5_v_mag": snr_mag,
+        "known": known,
+        "rate_deg_s": rate_deg_s,
+    }
+    return Fact("faintest star", lines, values)
+
+
+def known_share(context: Context, limit_mag: float) -> float:
+    """Share of the sky's stars brighter than a limit that are also brighter than the tracker's faintest one."""
+    sky = context.lab.camera.sources.magnitude
+    seen = sky < limit_mag
+    return float((sky[seen] <= context.beliefs.faintest_mag).mean()) if seen.any() else 1.0
+
+
+def sky_too_shallow(context: Context, samples: CheckedSamples) -> str:
+    """Warn where the camera detects fainter stars than the simulated sky holds."""
+    light = context.lab.scene.light
+    sky = context.lab.camera.sources.magnitude
+    if not isinstance(light, StarsConfig) or not len(sky):
+        return ""
+    limit_mag = detection_limit_mag(context, samples)
+    faintest_mag = float(np.nanmax(sky))
+    text = f"the camera detects stars to V {limit_mag:.1f}, but the sky ends at V {faintest_mag:.1f}; change it to"
+    if light.limit_mag is not None:
+        said = few_lights(context, samples).startswith(
+            "light.limit_mag"
+        )  # which asks for a deeper one already
+        deeper = limit_mag > light.limit_mag + LIMIT_MARGIN_MAG and not said
+        return (
+            f"light.limit_mag: {text} {math.ceil(2 * limit_mag) / 2:g}, or leave it out"
+            if deeper
+            else ""
+        )
+    if limit_mag <= min(faintest_mag + CATALOG_MARGIN_MAG, DEEPEST_V):
+        return ""
+    wanted = min(math.ceil(2 * limit_mag) / 2, DEEPEST_V)
+    return (
+        f"light.catalog: {text} a file of `skysim catalog build --source gaia --limit {wanted:g}`"
+    )
+
+
+def tracker_too_shallow(context: Context, samples: CheckedSamples) -> str:
+    """Warn where most of the stars that the tracker detects are fainter than those that it knows."""
+    if not isinstance(context.lab.scene.light, StarsConfig):
+        return ""
+    limit_mag = detection_limit_mag(context, samples)
+    faintest_mag = context.beliefs.faintest_mag
+    known = known_share(context, limit_mag)
+    if known >= MIN_KNOWN or limit_mag <= faintest_mag + LIMIT_MARGIN_MAG:
+        return ""
+    return (
+        f"tracker.limit_mag: the camera detects stars to V {limit_mag:.1f}, but the tracker knows them to V"
+        f" {faintest_mag:.1f} only, {100 * known:.0f} % of them; change it to {math.floor(2 * limit_mag) / 2:g}, with a"
+        f" tracker.catalog of `skysim catalog build --limit {math.floor(2 * limit_mag) / 2:g}`"
+    )
+
+
+def detection_limit_mag(context: Context, samples: CheckedSamples) -> float:
+    """V of the faintest star like the Sun that is detected at the slowest frame, about half of such stars being so.
+
+    A Gaussian of variance s^2 has the least area A above the threshold T if its peak is T exp(A / (2 pi s^2)), see
+    `detection.detected_area_px`.
+    """
+    camera = context.camera
+    blur2_px2 = camera.lens_px**2 + BINOMIAL_VARIANCE_PX2
+    peak_e = threshold_e(context) * math.exp(
+        context.settings.min_area_px / (2 * math.pi * blur2_px2)
+    )
+    none = np.zeros(1)
+    share = peak_share(np.array([blur2_px2]), none, none, np.array([least_streak_px(samples)]))[0]
+    reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
+    return 2.5 * math.log10(
+        reference_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s * share / peak_e
+    )
+
+
+def snr_limit_mag(context: Context, samples: CheckedSamples) -> float:
+    """V of a star like the Sun with a signal-to-noise ratio of 5 over the noise-equivalent area, at the slowest frame.
+
+    S / sqrt(S + A n^2) = 5, n the noise of a pixel, gives S = (25 + sqrt(25^2 + 100 A n^2)) / 2. A Gaussian of
+    deviation s has the area A = 4 pi s^2, moved by L much more than s it has 2 sqrt(pi) s L; between them the
+    hypotenuse.
+    """
+    camera = context.camera
+    area_px = (
+        2
+        * math.sqrt(math.pi)
+        * camera.lens_px
+        * math.hypot(2 * math.sqrt(math.pi) * camera.lens_px, least_streak_px(samples))
+    )
+    signal_e = (SNR**2 + math.sqrt(SNR**4 + 4 * SNR**2 * area_px * camera.noise_e**2)) / 2
+    reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
+    return 2.5 * math.log10(
+        reference_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s / signal_e
+    )
+
+
+def least_streak_px(samples: CheckedSamples) -> float:
+    """Path of the images at the slowest frame."""
+    return float(
+        min(
+            (np.median(view.streak_length_px) for view in samples.frames.known if len(view)),
+            default=0.0,
+        )
+    )

@@ -1,0 +1,94 @@
+"""The air over the site: it raises, dims and blurs what is above it, and glows; the skyline hides what is low.
+
+It is the air of mid-exposure: the site turns by 15" in a second, which changes a refraction by less than 0.02" at 15
+degrees of altitude.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+from skysim.camera.glow.air_glow import air_glow
+from skysim.camera.glow.background import node_directions, viewing_geometry
+from skysim.camera.render import in_view
+from skysim.core.random_streams import SCINTILLATION, random_stream
+from skysim.core.types import Floats, Sources
+from skysim.scene.sections.light import StarsConfig
+from skysim.scene.sections.surroundings import AirGlowConfig
+from skysim.simulation.lights.light import Beam, Exposure, Light, LightPlan, Lit, Obstacle, Occluder
+from skysim.sources.air import Air, Sky
+
+
+@dataclass(frozen=True)
+class AirEffects(Light):
+    """Refraction, extinction, scintillation and seeing, for all lights before it."""
+
+    air: Air
+
+    def through(self, beam: Beam, exposure: Exposure) -> Beam:
+        sky = self.air.at(exposure.time)
+        blur_px = sky.seeing_px(exposure.boresight, exposure.optics.camera.focal_px)
+        return beam.changed(lambda lit: seen_through(sky, lit, exposure)).blurred(blur_px)
+
+
+@dataclass(frozen=True)
+class Skyline(Obstacle):
+    """The horizon, or the hills of `light.air.horizon`."""
+
+    air: Air
+
+    def during(self, exposure: Exposure) -> Lit:
+        sky = self.air.at(exposure.time)
+        return Lit(
+            "the skyline",
+            hides=Occluder("the skyline", lambda place: sky.below_horizon(place[:, :3])),
+        )
+
+
+@dataclass(frozen=True)
+class AirGlow(Light):
+    """Airglow, moonlight and twilight."""
+
+    only_adds: ClassVar[bool] = True
+    air: Air
+    config: AirGlowConfig
+
+    def during(self, exposure: Exposure) -> Lit:
+        return Lit("the air", glow=lambda: self.glow(exposure))
+
+    def glow(self, exposure: Exposure) -> Floats:
+        """(h, w) electrons s^-1 px^-1 at the nodes of the background."""
+        toward, pixel_sr, shape = node_directions(exposure.optics)
+        view = viewing_geometry(
+            toward, pixel_sr, exposure.optics, exposure.cam_from_lab, exposure.band
+        )
+        return air_glow(self.config, self.air.at(exposure.time), view).reshape(shape)
+
+
+def seen_through(sky: Sky, lit: Lit, exposure: Exposure) -> Lit:
+    """A light raised and dimmed by the air."""
+    points = None if lit.points is None else seen_points(sky, lit.points, exposure)
+    return lit._replace(points=points, discs=tuple(sky.body_seen(disc) for disc in lit.discs))
+
+
+def seen_points(sky: Sky, points: Sources, exposure: Exposure) -> Sources:
+    """Points raised and dimmed: of those at rest the ones near the field, which twinkle."""
+    if points.motion is not None:
+        return sky.points_seen(points)
+    seen = sky.points_seen(points.take(in_view(points, exposure.optics, exposure.few_poses)))
+    if not sky.air.config.scintillation or exposure.seeds is None:
+        return seen
+    rng = random_stream(exposure.seeds.camera, SCINTILLATION, exposure.index)
+    return sky.twinkling(seen, exposure.optics.camera.pupil_m, exposure.window.exposure_s, rng)
+
+
+def build(plan: LightPlan) -> Iterator[Light]:
+    light = plan.scene.light
+    if isinstance(light, StarsConfig) and light.air and plan.catalog is not None:
+        air = Air.from_config(light.air, plan.scene.site, plan.catalog, plan.band)
+        yield AirEffects(air)
+        yield Skyline(air)
+        if light.air.glow:
+            yield AirGlow(air, light.air.glow)

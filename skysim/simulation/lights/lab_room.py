@@ -1,0 +1,144 @@
+"""The laboratory around the lights: a wall that sends light on, and what stands between a light and the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.camera.glow.stray import images_in_wall, wall_glow
+from skysim.core.types import Floats
+from skysim.dynamics import multibody
+from skysim.scene.sections.leds import WarmUpConfig
+from skysim.scene.sections.light import DomeConfig
+from skysim.simulation.lights.dome import known_light
+from skysim.simulation.lights.light import Beam, Exposure, Light, LightPlan, Lit, Obstacle, Occluder
+from skysim.sources.dome.interreflection import ReflectingDome, reflecting_dome
+from skysim.sources.dome.led import warm_up_factor
+from skysim.sources.dome.surface import Surface, build_surface
+
+
+def images_of(name: str) -> str:
+    """The name of the images of lights in the wall."""
+    return f"images of {name} in the wall"
+
+
+IMAGES = images_of("LEDs")
+
+
+@dataclass(frozen=True)
+class WallGlow(Light):
+    """The glow of wall and floor, which wanes with the LEDs as they warm up."""
+
+    only_adds: ClassVar[bool] = True
+    dome: ReflectingDome
+    warm_up: WarmUpConfig | None
+
+    def during(self, exposure: Exposure) -> Lit:
+        return Lit("the dome's wall", glow=lambda: self.glow(exposure))
+
+    def glow(self, exposure: Exposure) -> Floats:
+        """(h, w) electrons s^-1 px^-1 at the nodes of the background."""
+        full = wall_glow(
+            self.dome, exposure.optics, exposure.cam_from_lab, exposure.camera_m, exposure.band
+        )
+        return warm_up_factor(self.warm_up, exposure.t_s) * full
+
+
+@dataclass(frozen=True)
+class Mirror(Light):
+    """The images of the LEDs, and of other lights in the laboratory, in the wall."""
+
+    only_adds: ClassVar[bool] = True
+    dome: ReflectingDome
+
+    def through(self, beam: Beam, exposure: Exposure) -> Beam:
+        for lit in beam.lits:
+            if lit.points is not None and len(lit.points):
+                beam = beam.plus(self.image(lit, exposure))
+        return beam
+
+    def image(self, lit: Lit, exposure: Exposure) -> Lit:
+        """The images of one light, which the same things hide."""
+        assert lit.points is not None
+        images = images_in_wall(
+            self.dome, lit.points, exposure.optics, exposure.cam_from_lab, exposure.camera_m
+        )
+        return Lit(images_of(lit.name), False, images, lit.emitter, hidden_by=lit.hidden_by)
+
+
+def build_wall(plan: LightPlan) -> Iterator[Light]:
+    """What a wall or a floor reflects: a glow if it scatters, images if it mirrors."""
+    light = plan.scene.light
+    dome = reflecting_dome(light, known_light(plan).sources)
+    if isinstance(light, DomeConfig) and dome is not None:
+        if dome.diffuse is not None:
+            yield WallGlow(dome, light.led.warm_up)
+        if dome.config.mirrors:
+            yield Mirror(dome)
+
+
+# What stands in the laboratory between a light and the camera: the vehicle's parts, and the dome's
+# wall.
+
+
+INWARD_FRACTION = (
+    1e-6  # an LED is moved off its wall by this fraction of its distance from the bearing
+)
+
+
+@dataclass(frozen=True)
+class Vehicle(Obstacle):
+    """Parts of the vehicle that are in the way at mid-exposure."""
+
+    obstacles: multibody.Obstacles
+
+    def during(self, exposure: Exposure) -> Lit:
+        hides = partial(multibody.occluded, self.obstacles, exposure.lab_from_body)
+        return Lit("the vehicle", hides=Occluder("the vehicle", hides))
+
+
+@dataclass(frozen=True)
+class DomeWall(Obstacle):
+    """The dome's wall before its own LEDs, for a camera that is outside of it."""
+
+    wall: Surface
+
+    def during(self, exposure: Exposure) -> Lit:
+        def hides(place: Floats) -> NDArray[np.bool_]:
+            hidden = place[:, 3] > 0
+            hidden[hidden] = behind_wall(self.wall, exposure.camera_m, place[hidden, :3])
+            return hidden
+
+        return Lit("the dome's wall", hides=Occluder("the dome's wall", hides))
+
+
+def behind_wall(wall: Surface, camera_m: Floats, position_m: Floats) -> NDArray[np.bool_]:
+    """(N,) whether the line from LEDs at (N, 3) to the camera passes through the dome's wall (not beneath its rim).
+
+    A camera inside sees no LED through the wall, as convex surfaces cannot hide their inside; all surfaces here are
+    convex, except for the millimeters of a surveyed one.
+    """
+    behind = np.zeros(len(position_m), dtype=bool)
+    if wall.inside(camera_m):
+        return behind
+    for n, led_m in enumerate(position_m * (1 - INWARD_FRACTION)):
+        ray = (camera_m - led_m)[None]
+        wall_m = wall.meet(led_m, ray)[0]
+        behind[n] = np.linalg.norm(wall_m - led_m) < np.linalg.norm(
+            ray
+        )  # NaN, beneath the rim, is not
+    return behind
+
+
+def build_obstacles(plan: LightPlan) -> Iterator[Light]:
+    """What `light.occlusion` lets hide a light; a collimated display has nothing in its beam."""
+    light = plan.scene.light
+    if getattr(light, "occlusion", False):
+        yield Vehicle(multibody.build_obstacles(plan.vehicle, plan.mount))
+        if isinstance(light, DomeConfig):
+            yield DomeWall(build_surface(light.surface))

@@ -1,0 +1,103 @@
+"""Stars of a catalog: as seen from the ground, or from an orbit with the aberration of each frame's velocity."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.camera.glow.background import glow_map
+from skysim.core.errors import InputError
+from skysim.core.types import Floats, StarSources
+from skysim.scene.sections.light import Glow, StarsConfig
+from skysim.simulation.lights.light import Exposure, KnownLight, Light, LightPlan, Lit
+from skysim.sources import stars
+from skysim.sources.dome.led import Emitter
+
+
+@dataclass(frozen=True)
+class FixedStars(KnownLight):
+    """Stars whose places hold for the whole scene."""
+
+    def during(self, exposure: Exposure) -> Lit:
+        return Lit("stars", True, self.sources, self.emitter)
+
+
+@dataclass(frozen=True)
+class StarsInOrbit(KnownLight):
+    """Stars displaced by the velocity of an orbit, which turns by a degree in 15 s when it is low.
+
+    Attributes
+    ----------
+    velocity_m_s
+        (3,) barycentric velocity for which `sources` are
+    """
+
+    velocity_m_s: Floats
+
+    def during(self, exposure: Exposure) -> Lit:
+        """The stars near the field at the velocity of mid-exposure: in a second a star moves by 0.006"."""
+        view = exposure.view
+        reach_rad = 1.25 * view.field_rad + 0.02 + view.turn_rad
+        assert isinstance(self.sources, StarSources)
+        near = self.sources.take(self.sources.within(view.boresight, reach_rad))
+        now_m_s = 1e3 * exposure.observer.velocity_km_s
+        direction = stars.seen_at_velocity(near.place[:, :3], self.velocity_m_s, now_m_s)
+        return Lit(
+            "stars",
+            True,
+            replace(near, place=np.column_stack([direction, np.zeros(len(near))])),
+            self.emitter,
+        )
+
+
+def stars_of(config: StarsConfig, plan: LightPlan) -> KnownLight:
+    """The stars of a scene at its start, in the lab's axes, which are the ICRS. Raises InputError."""
+    catalog = plan.catalog
+    scene = plan.scene
+    viewpoint = plan.viewpoint
+    assert catalog is not None
+    if config.variability_seed is not None:
+        if not catalog.scatter_mag.any():
+            raise InputError(
+                "light.variability_seed", f"{config.catalog} has no variable stars", "gaia_v8.0"
+            )
+        catalog = stars.varied(catalog, config.variability_seed)
+    velocity_m_s: Floats | tuple[float, ...] = stars.AT_REST
+    if config.bodies or config.satellites or config.air or viewpoint.orbit:
+        velocity_m_s = viewpoint.state_at(0.0).velocity_m_s
+    shown = stars.sources(
+        catalog, scene.start_time, config.limit_mag, Rotation.identity(), plan.band, velocity_m_s
+    )
+    if viewpoint.orbit is None:
+        return FixedStars(shown, Emitter())
+    return StarsInOrbit(shown, Emitter(), 1e3 * viewpoint.observer_at(0.0).velocity_km_s)
+
+
+# The scene's section `background`: light leaks and the glow of the sky.
+
+
+BACKGROUND = "background"
+
+
+@dataclass(frozen=True)
+class BackgroundLight(Light):
+    """Extended light that does not change from frame to frame."""
+
+    only_adds: ClassVar[bool] = True
+    glows: tuple[Glow, ...]
+
+    def during(self, exposure: Exposure) -> Lit:
+        return Lit(
+            BACKGROUND,
+            glow=lambda: glow_map(
+                self.glows, exposure.optics, exposure.cam_from_lab, exposure.band
+            ),
+        )
+
+
+def build(plan: LightPlan) -> Iterator[Light]:
+    yield BackgroundLight(plan.scene.background)

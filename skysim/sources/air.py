@@ -1,0 +1,304 @@
+"""The air over a site at a time: what it does to the directions and the light of stars and bodies."""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import erfa
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+from scipy.interpolate import RectBivariateSpline
+
+from skysim.core.time import tt_jd, ut1_jd
+from skysim.core.types import Floats, Sources
+from skysim.scene.sections.surroundings import AirConfig, HorizonConfig
+from skysim.scene.sections.vehicle import SiteConfig
+from skysim.sources.bodies import ALBEDO, BodyLight
+from skysim.sources.catalog import Catalog
+from skysim.sources.photometry import SUN, Band, black_body_v0, complete_colors, temperature_k
+from skysim.sources.refraction import (
+    Refraction,
+    Weather,
+    standard_pressure_hpa,
+    standard_temperature_c,
+)
+
+# How much stars twinkle, for any aperture and exposure, in weak turbulence.
+
+
+SPECTRUM = 1.534  # 4 x 0.3834
+YOUNG = 10.66
+YOUNG_M_S = 10e-6  # of the variance at D = 1 m, t = 1 s, m^(4/3) s
+C_Y = 1.56  # median of the sites in Osborn et al. (2015)
+SCALE_HEIGHT_M = 8000.0  # of the turbulence in Young's law
+TOP_M = 25_000.0
+# within 0.3 % of finer ones
+LAYERS = 20
+FREQUENCIES = 300
+FREQUENCY_1_M = 1e-2, 3e3  # lowest and highest
+AIR_MASSES = np.geomspace(1.0, 40.0, 12)
+EXPOSURES_S = np.geomspace(1e-5, 1e2, 22)
+
+
+def variance(
+    air_masses: Floats, aperture_m: float, exposure_s: float, height_m: float, wavelength_m: float
+) -> Floats:
+    """(N,) relative variances of stars' light at these air masses, from a site at a height."""
+    spline = variance_table(aperture_m, height_m, wavelength_m)
+    within_s = min(max(exposure_s, EXPOSURES_S[0]), EXPOSURES_S[-1])
+    at_masses = spline.ev(np.log(np.clip(air_masses, 1.0, AIR_MASSES[-1])), np.log(within_s))
+    return np.asarray(np.exp(at_masses) * min(within_s / exposure_s, 1.0))
+
+
+@lru_cache(maxsize=8)
+def variance_table(aperture_m: float, height_m: float, wavelength_m: float) -> RectBivariateSpline:
+    """The logarithm of the variance against those of air mass and exposure.
+
+    The turbulence is scaled so that the limit of wide apertures and long exposures is Young's law, 10^-5 C_Y^2 D^(-4/3)
+    t^-1 X^3 exp(-2 h / 8 km) (Young 1967, AJ 72, 747; Osborn et al. 2015, MNRAS 452, 1707, equation 7).
+    """
+    above_m, strength = layers(height_m)
+    wind_m_s = wind(height_m + above_m)
+    scale = YOUNG_M_S * C_Y**2 * np.exp(-2 * height_m / SCALE_HEIGHT_M)
+    scale /= YOUNG * float(np.sum(strength * above_m**2 / wind_m_s))
+    f = np.geomspace(*FREQUENCY_1_M, FREQUENCIES)
+    # The integral of S(f) 2 pi f df in even steps of ln f.
+    density = (
+        SPECTRUM
+        * wavelength_m**-2
+        * f ** (-5 / 3)
+        * 2
+        * np.pi
+        * np.log(f[1] / f[0])
+        * airy(aperture_m * f) ** 2
+    )
+    distance_m = AIR_MASSES[:, None] * above_m
+    fresnel = np.sin(np.pi * wavelength_m * distance_m[..., None] * f**2) ** 2
+    spectra = AIR_MASSES[:, None, None] * (scale * strength)[:, None] * fresnel * density
+    moved = exposure_filter(EXPOSURES_S[:, None, None] * wind_m_s[:, None] * f)
+    found = spectra.reshape(len(AIR_MASSES), -1) @ moved.reshape(len(EXPOSURES_S), -1).T
+    return RectBivariateSpline(np.log(AIR_MASSES), np.log(EXPOSURES_S), np.log(found))
+
+
+def layers(height_m: float) -> tuple[Floats, Floats]:
+    """(L,) heights above a site, and Cn^2 dh of the layers there: a Gauss-Legendre rule in the root of the height."""
+    x, weight = np.polynomial.legendre.leggauss(LAYERS)
+    root = (1 + x) / 2
+    above_m = TOP_M * root**2
+    return above_m, hufnagel_valley(height_m + above_m, above_m) * TOP_M * root * weight
+
+
+def hufnagel_valley(sea_m: Floats, above_m: Floats) -> Floats:
+    """Cn^2 in m^(-2/3) of the model Hufnagel-Valley 5/7 at heights above the sea and above the ground.
+
+    Source: Andrews & Phillips 2005, Laser Beam Propagation through Random Media, section 12.2.
+    """
+    high = 0.00594 * (21 / 27) ** 2 * (1e-5 * sea_m) ** 10 * np.exp(-sea_m / 1000)
+    return np.asarray(high + 2.7e-16 * np.exp(-sea_m / 1500) + 1.7e-14 * np.exp(-above_m / 100))
+
+
+def wind(sea_m: Floats) -> Floats:
+    """Bufton's wind in m/s at heights above the sea, 5 on the ground (Andrews & Phillips 2005, section 12.2)."""
+    return np.asarray(5 + 30 * np.exp(-(((sea_m - 9400) / 4800) ** 2)))
+
+
+def airy(x: Floats) -> Floats:
+    """2 J1(pi x) / (pi x)."""
+    u = np.pi * np.maximum(x, 1e-9)
+    return np.asarray(2 * special.j1(u) / u)
+
+
+def exposure_filter(turns: Floats) -> Floats:
+    """Mean of sinc^2(turns cos phi) over phi: 2 (∫ J0 - J1) / x, x = 2 pi turns."""
+    x = 2 * np.pi * np.maximum(turns, 1e-4)
+    return np.asarray(2 * (special.itj0y0(x)[0] - special.j1(x)) / x)
+
+
+def factors(variances: Floats, rng: np.random.Generator) -> Floats:
+    """(N,) factors of stars' light with mean 1 and these variances, log-normal (Dravins et al. 1997, PASP 109, 173)."""
+    log_variance = np.log1p(variances)
+    return np.asarray(
+        np.exp(np.sqrt(log_variance) * rng.standard_normal(len(variances)) - log_variance / 2)
+    )
+
+
+# What the air takes from starlight: extinction.
+
+
+def air_mass(altitude_rad: Floats) -> Floats:
+    """Air masses along the line of sight over that at the zenith: X = 1 / sin(h + 244 / (165 + 47 h^1.1)).
+
+    h is the apparent altitude in degrees; 38.75 on the horizon, which holds below it.
+    Source: Pickering (2002), DIO 12, 20.
+    """
+    h_deg = np.degrees(np.maximum(altitude_rad, 0.0))
+    return np.asarray(1 / np.sin(np.radians(h_deg + 244 / (165 + 47 * h_deg**1.1))))
+
+
+def transmission(air_masses: Floats, extinction_mag: float | Floats) -> Floats:
+    """Bouguer's law: 10^(-0.4 k X) of the light passes X air masses."""
+    return np.asarray(10 ** (-0.4 * extinction_mag * air_masses))
+
+
+@dataclass(frozen=True, slots=True)
+class Air:
+    """The air of a scene.
+
+    Attributes
+    ----------
+    site
+        With a longitude
+    refraction
+        For its weather and the camera's band
+    star_id, b_v
+        (N,) ascending numbers of the catalog's stars, and their colors
+    wavelength_m
+        Of scintillation: the mean of a G2 star's photo-electrons
+    """
+
+    config: AirConfig
+    site: SiteConfig
+    refraction: Refraction
+    star_id: NDArray[np.int64]
+    b_v: Floats
+    wavelength_m: float
+
+    @classmethod
+    def from_config(cls, config: AirConfig, site: SiteConfig, stars: Catalog, band: Band) -> Air:
+        """The air over a site for a catalog's stars and a chip's band."""
+        order = np.argsort(stars.hip)
+        b_v = complete_colors(stars.b_v, stars.v_i)[0][order]
+        refraction = Refraction(weather_of(config, site, band))
+        return cls(config, site, refraction, stars.hip[order], b_v, mean_wavelength_m(band))
+
+    def at(self, time: datetime.datetime) -> Sky:
+        """The sky at a time."""
+        return Sky(self, time, topocentric_axes(time, self.site))
+
+    def b_v_of(self, ids: NDArray[np.int64]) -> Floats:
+        """(M,) B-V of lights by their numbers: of the catalog's stars, and for all others the Sun's."""
+        row = np.minimum(np.searchsorted(self.star_id, ids), len(self.star_id) - 1)
+        return np.where(self.star_id[row] == ids, self.b_v[row], SUN[0])
+
+    def extinction_mag(self, b_v: float | Floats) -> float | Floats:
+        """k' + k'' (B-V): magnitudes for each air mass."""
+        return self.config.extinction_mag + self.config.color_extinction_mag * b_v
+
+
+@dataclass(frozen=True, slots=True)
+class Sky:
+    """The air at a time. axes: (3, 3) rows north, east and zenith of the site in ICRS axes."""
+
+    air: Air
+    time: datetime.datetime
+    axes: Floats
+
+    @property
+    def zenith(self) -> Floats:
+        return self.axes[2]
+
+    def altitude_rad(self, directions: Floats) -> Floats:
+        """(N,) apparent altitudes of apparent directions (N, 3)."""
+        return np.asarray(np.arcsin(np.clip(directions @ self.zenith, -1, 1)))
+
+    def air_mass(self, directions: Floats) -> Floats:
+        """(N,) air masses in apparent directions (N, 3)."""
+        return air_mass(self.altitude_rad(directions))
+
+    def below_horizon(self, directions: Floats) -> NDArray[np.bool_]:
+        """(N,) whether apparent directions (N, 3) are below the skyline."""
+        north, east, up = self.axes @ directions.T
+        limit_rad = horizon_rad(self.air.config.horizon, np.arctan2(east, north))
+        return np.asarray(up < np.sin(limit_rad))
+
+    def points_seen(self, lights: Sources) -> Sources:
+        """Lights at infinity raised and dimmed, in their order; their motion is as without air."""
+        b_v = self.air.b_v_of(lights.id)
+        directions = self.air.refraction.apparent(lights.place[:, :3], self.zenith)
+        passed = transmission(self.air_mass(directions), self.air.extinction_mag(b_v))
+        place = np.column_stack([directions, lights.place[:, 3]])
+        return replace(lights, place=place, strength=lights.strength * passed)
+
+    def twinkling(
+        self, seen: Sources, aperture_m: float, exposure_s: float, rng: np.random.Generator
+    ) -> Sources:
+        """The stars of `points_seen` with the scintillation of one exposure through an aperture of this diameter."""
+        air_masses = self.air_mass(seen.place[:, :3])
+        optics = aperture_m, exposure_s, self.air.site.height_m, self.air.wavelength_m
+        variances = variance(air_masses, *optics)
+        return replace(seen, strength=seen.strength * factors(variances, rng))
+
+    def body_seen(self, body: BodyLight) -> BodyLight:
+        """A body raised and dimmed; its disc stays round, and does not twinkle."""
+        direction = self.air.refraction.apparent(body.place.direction[None], self.zenith)[0]
+        along = body.place.toward_sun - (body.place.toward_sun @ direction) * direction
+        place = body.place._replace(direction=direction, toward_sun=along / np.linalg.norm(along))
+        blue, visual = ALBEDO[body.name][:2]
+        b_v = SUN[0] - 2.5 * np.log10(blue / visual)
+        passed = transmission(self.air_mass(direction[None]), self.air.extinction_mag(b_v))
+        return replace(body, place=place, flux_e_s_m2=body.flux_e_s_m2 * float(passed[0]))
+
+    def seeing_px(self, boresight: Floats, focal_px: float) -> float:
+        """Standard deviation of the seeing at the boresight: that at the zenith times X^0.6 (Fried 1966)."""
+        at_zenith_px = self.air.config.seeing_px(focal_px)
+        return at_zenith_px and at_zenith_px * float(self.air_mass(boresight[None])[0] ** 0.6)
+
+
+@lru_cache(maxsize=8)  # a frame asks several times
+def topocentric_axes(time: datetime.datetime, site: SiteConfig) -> Floats:
+    """(3, 3) rows north, east and the ellipsoid's zenith at a site, in ICRS axes at a time.
+
+    Earth rotation angle of UT1, precession and nutation of IAU 2006/2000A, as in `observer.site_in_gcrs`. Polar motion
+    (0.3") and the deflection of the vertical (some arcseconds) are neglected: they move the zenith, and so change a
+    refraction by less than 0.01".
+    """
+    assert site.longitude_deg is not None  # checked in scene.py
+    longitude, latitude = np.radians([site.longitude_deg, site.latitude_deg])
+    sidereal = longitude + erfa.era00(ut1_jd(time), 0.0)
+    sin_l = np.sin(sidereal)
+    cos_l = np.cos(sidereal)
+    sin_b = np.sin(latitude)
+    cos_b = np.cos(latitude)
+    in_cirs = [
+        [-sin_b * cos_l, -sin_b * sin_l, cos_b],
+        [-sin_l, cos_l, 0.0],
+        [cos_b * cos_l, cos_b * sin_l, sin_b],
+    ]
+    return np.asarray(np.array(in_cirs) @ erfa.c2i06a(tt_jd(time), 0.0))
+
+
+def horizon_rad(config: HorizonConfig | None, azimuth_rad: Floats) -> Floats:
+    """(N,) altitude of the skyline at azimuths, linear between the rows of its table and across north."""
+    if config is None:
+        return np.zeros(len(azimuth_rad))
+    table_rad = np.radians(config.azimuth_deg)
+    return np.asarray(
+        np.interp(azimuth_rad, table_rad, np.radians(config.altitude_deg), period=2 * np.pi)
+    )
+
+
+def weather_of(config: AirConfig, site: SiteConfig, band: Band) -> Weather:
+    """The weather at a site: what the section says, else the standard atmosphere."""
+    pressure_hpa = config.pressure_hpa
+    temperature_c = config.temperature_c
+    return Weather(
+        site.height_m,
+        float(np.radians(site.latitude_deg)),
+        standard_pressure_hpa(site.height_m) if pressure_hpa is None else pressure_hpa,
+        standard_temperature_c(site.height_m) if temperature_c is None else temperature_c,
+        config.humidity,
+        mean_wavelength_m(band) if config.wavelength_m is None else config.wavelength_m,
+    )
+
+
+def mean_wavelength_m(band: Band) -> float:
+    """Mean wavelength of a G2 star's photo-electrons."""
+    sun_k = temperature_k(*SUN)
+    total = band.integral(lambda wavelength_m: black_body_v0(wavelength_m, sun_k))
+    return float(
+        band.integral(lambda wavelength_m: wavelength_m * black_body_v0(wavelength_m, sun_k))
+        / total
+    )

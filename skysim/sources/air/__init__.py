@@ -1,1 +1,0 @@
-"""The air over a site: refraction, extinction, scintillation and the horizon."""

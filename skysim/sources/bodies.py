@@ -1,0 +1,203 @@
+"""The bodies of a scene at a time, as light sources: points, or discs of many points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.types import BodyTruth, Floats
+from skysim.scene.sections.light import BodiesConfig
+from skysim.sources.body_discs import (
+    LAMBERT,
+    LIMB_DARKENED,
+    LOMMEL_SEELIGER,
+    DiscSurface,
+    earthshine_fraction,
+    magnitude,
+)
+from skysim.sources.ephemeris import ObserverPlace, Place, place
+from skysim.sources.photometry import SUN, Band, black_body_v0, chromatic_moments, temperature_k
+
+# Photo-electrons of reflected sunlight, by the albedo of a body at four wavelengths.
+
+
+Albedo = tuple[float, float, float, float]
+
+BANDS_M = (
+    438e-9,
+    545e-9,
+    641e-9,
+    798e-9,
+)  # effective wavelengths of B, V, Cousins' R and I (Bessell 2005, ARA&A 43, 293)
+WHITE: Albedo = (1.0, 1.0, 1.0, 1.0)
+# Planets: geometric albedos of Mallama, Krobusek & Pavlov 2017, Icarus 282, 19 (arXiv:1609.05048), table 7. The Moon,
+# relative to V: Kieffer & Stone 2005, AJ 129, 2887, equation 10 and table 4 at a phase angle of 45 degrees without
+# libration, smoothed by a parabola in the logarithms; it reddens by 0.1 mag in V-I from full to quarter.
+ALBEDO: dict[str, Albedo] = {
+    "sun": WHITE,
+    "moon": (0.786, 1.0, 1.169, 1.402),
+    "mercury": (0.105, 0.142, 0.158, 0.180),
+    "venus": (0.658, 0.689, 0.658, 0.640),
+    "mars": (0.088, 0.170, 0.250, 0.285),
+    "jupiter": (0.443, 0.538, 0.513, 0.389),
+    "saturn": (0.339, 0.499, 0.646, 0.543),
+    "uranus": (0.561, 0.488, 0.264, 0.089),
+    "neptune": (0.562, 0.442, 0.226, 0.072),
+}
+
+
+def reflected_flux_e_s_m2(v_mag: float, albedo: Albedo, band: Band) -> float:
+    """Photo-electrons s^-1 m^-2 of a body of this V magnitude: 10^(-0.4 V) ∫ n(λ) p(λ) / p(V) QE(λ) dλ.
+
+    n is the photon flux of a star like the Sun of V = 0, p the albedo, linear between the four bands and constant
+    beyond them.
+    """
+    return float(_flux_v0_e_s_m2(albedo, band) * 10 ** (-0.4 * v_mag))
+
+
+@lru_cache(maxsize=64)
+def _flux_v0_e_s_m2(albedo: Albedo, band: Band) -> float:
+    return float(band.integral(lambda wavelength_m: reflected_v0(wavelength_m, albedo)))
+
+
+def reflected_v0(wavelength_m: Floats, albedo: Albedo) -> Floats:
+    """Spectral photon flux of a body of V = 0, as `black_body_v0`."""
+    relative = np.array(albedo) / albedo[1]
+    return np.asarray(
+        black_body_v0(wavelength_m, temperature_k(*SUN))
+        * np.interp(wavelength_m, BANDS_M, relative)
+    )
+
+
+@lru_cache(maxsize=64)
+def reflected_chromatic(albedo: Albedo, band: Band) -> Floats | None:
+    """(4,) `chromatic_moments` of a body; None for a lens without chromatic aberration."""
+    if band.chromatic is None:
+        return None
+    return chromatic_moments(band, lambda wavelength_m: reflected_v0(wavelength_m, albedo))
+
+
+ID_BASE = 9_000_000  # a body's number is this + NAIF's
+
+
+class Body(NamedTuple):
+    """Properties of a body: NAIF's number, mean radius, and how its surface scatters.
+
+    Radii: IAU WGCCRE 2015 (Archinal et al. 2018, Celest. Mech. 130, 22), the Sun's IAU 2015 B3.
+    """
+
+    naif: int
+    radius_km: float
+    law: int
+
+    @property
+    def id(self) -> int:
+        return ID_BASE + self.naif
+
+
+BODIES = {
+    "sun": Body(10, 695_700.0, LIMB_DARKENED),
+    "moon": Body(301, 1737.4, LOMMEL_SEELIGER),
+    "mercury": Body(199, 2439.4, LOMMEL_SEELIGER),
+    "venus": Body(299, 6051.8, LAMBERT),
+    "mars": Body(499, 3389.5, LOMMEL_SEELIGER),
+    "jupiter": Body(599, 69_911.0, LAMBERT),
+    "saturn": Body(699, 58_232.0, LAMBERT),
+    "uranus": Body(799, 25_362.0, LAMBERT),
+    "neptune": Body(899, 24_622.0, LAMBERT),
+}
+NAMES = {body.id: name.capitalize() for name, body in BODIES.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class BodyLight:
+    """One body in the sky, in the lab's axes (the ICRS).
+
+    Attributes
+    ----------
+    radius_rad
+        Of its disc
+    flux_e_s_m2
+        photo-electrons at the aperture
+    earthshine
+        See `Surface`
+    chromatic
+        (4,) a row of `Sources.chromatic`
+    """
+
+    name: str
+    place: Place
+    magnitude: float
+    radius_rad: float
+    flux_e_s_m2: float
+    earthshine: float = 0.0
+    chromatic: Floats | None = None
+
+    @property
+    def id(self) -> int:
+        return BODIES[self.name].id
+
+    @property
+    def title(self) -> str:
+        """Its name in a sentence."""
+        return {"sun": "the Sun", "moon": "the Moon"}.get(self.name, self.name.capitalize())
+
+    @property
+    def surface(self) -> DiscSurface:
+        return DiscSurface(BODIES[self.name].law, self.place.phase_rad, self.earthshine)
+
+    def truth(self) -> BodyTruth:
+        """What a frame's truth says of the body."""
+        x, y, z = self.place.direction
+        ra_deg = np.degrees(np.arctan2(y, x)) % 360
+        dec_deg = np.degrees(np.arcsin(z))
+        diameter_arcsec = np.degrees(2 * self.radius_rad) * 3600
+        phase_deg = np.degrees(self.place.phase_rad)
+        numbers = map(float, (self.magnitude, ra_deg, dec_deg, diameter_arcsec, phase_deg))
+        return BodyTruth(self.id, self.name, *numbers)
+
+    def directions(self, xy: Floats) -> Floats:
+        """(M, 3) unit vectors toward points (M, 2) of the disc, in units of its radius."""
+        x_axis = self.place.toward_sun
+        center = self.place.direction
+        offset = xy @ np.stack([x_axis, np.cross(center, x_axis)])
+        vectors = center + np.tan(self.radius_rad) * offset
+        return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+    def overlaps(self, other: BodyLight) -> bool:
+        """Whether two discs overlap."""
+        cosine = float(self.place.direction @ other.place.direction)
+        return cosine > np.cos(self.radius_rad + other.radius_rad)
+
+    def hides(self, directions: Floats) -> NDArray[np.bool_]:
+        """(M,) which of these unit vectors (M, 3) lie behind the disc."""
+        return directions @ self.place.direction > np.cos(self.radius_rad)
+
+
+def bodies_from(config: BodiesConfig, observer: ObserverPlace, band: Band) -> list[BodyLight]:
+    """The chosen bodies as an observer sees them, the farthest first."""
+    lights = [
+        body_light(name, place(name, observer), observer.tt_jd, band) for name in chosen(config)
+    ]
+    return sorted(lights, key=lambda light: -light.place.distance_km)
+
+
+def chosen(config: BodiesConfig) -> list[str]:
+    """The names of the bodies that the section switches on."""
+    planets = [name for name in BODIES if name not in ("sun", "moon")]
+    return ["sun"] * config.sun + ["moon"] * config.moon + planets * config.planets
+
+
+def body_light(name: str, at: Place, tt_jd: float, band: Band) -> BodyLight:
+    """The light of a body at its place."""
+    body = BODIES[name]
+    v_mag = magnitude(name, at, tt_jd)
+    earthshine = earthshine_fraction(at) if name == "moon" else 0.0
+    flux = reflected_flux_e_s_m2(v_mag, ALBEDO[name], band)
+    radius_rad = float(np.arcsin(body.radius_km / at.distance_km))
+    colors = reflected_chromatic(ALBEDO[name], band)
+    return BodyLight(name, at, v_mag, radius_rad, flux * (1 + earthshine), earthshine, colors)

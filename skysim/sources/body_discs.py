@@ -1,0 +1,299 @@
+"""Sunlight from the Moon and the planets: V magnitudes by phase, and how a disc's brightness is distributed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from math import cos, sin, sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from skysim.core.constants import AU_KM, JULIAN_YEAR_DAY, SUN_V_MAG
+from skysim.core.jit import jit
+from skysim.core.time import J2000_JD
+from skysim.core.types import Floats
+from skysim.sources.ephemeris import Place
+
+# laws of `brightness`
+LIMB_DARKENED = 0
+LOMMEL_SEELIGER = 1
+LAMBERT = 2
+ACROSS = 12  # elements on the diameter of a small disc
+SAMPLES = 16  # points across an element at which the brightness is sampled
+RIM = 20  # cells within the rim in which the mean over a cell matters
+PHASE_STEP_DEG = (
+    0.05  # phases of small discs are rounded to this, so that frames share their elements
+)
+
+
+@jit
+def brightness(law: int, mu: float, mu0: float) -> float:
+    """Relative brightness of a surface.
+
+    Returns
+    -------
+    LIMB_DARKENED
+        The Sun at 550 nm: 0.30 + 0.93 mu - 0.23 mu^2 (Cox 2000, Allen's Astrophysical
+        Quantities)
+    LOMMEL_SEELIGER
+        A dark rough surface, in which light is scattered once: mu0 / (mu0 + mu) (Hapke 1981,
+        JGR 86, 3039). The full disc is uniform, as the full Moon's is; the maria are left out.
+    LAMBERT
+        A bright cloud deck, in which light is scattered many times: mu0
+    """
+    if law == LIMB_DARKENED:
+        return 0.30 + 0.93 * mu - 0.23 * mu**2
+    if mu0 <= 0:
+        return 0.0
+    return mu0 / (mu0 + mu) if law == LOMMEL_SEELIGER else mu0
+
+
+class DiscSurface(NamedTuple):
+    """How a disc shines.
+
+    Attributes
+    ----------
+    law
+        Of `brightness`
+    earthshine
+        Light of the disc as lit from the observer's side, over that of the sunlit one
+    """
+
+    law: int
+    phase_rad: float
+    earthshine: float = 0.0
+
+
+def light_map(surface: DiscSurface, axis: Floats) -> Floats:
+    """Shares of the disc's light at the points of a square lattice that covers it; they add up to 1.
+
+    Returns (n, n), [y, x].
+
+    Parameters
+    ----------
+    axis
+        (n,) the lattice's even coordinates in both directions, in units of the disc's radius
+    """
+    sunlit, earthlit = np.zeros((2, len(axis), len(axis)))
+    _fill(sunlit, earthlit, surface.law, surface.phase_rad, axis)
+    light = sunlit / max(float(sunlit.sum()), 1e-300)
+    if surface.earthshine:
+        light += earthlit * (surface.earthshine / float(earthlit.sum()))
+        light /= 1 + surface.earthshine
+    return np.asarray(light)
+
+
+@jit
+def _fill(sunlit: Any, earthlit: Any, law: int, phase_rad: float, axis: Floats) -> None:
+    """Light of each point's cell, lit from the Sun and from the observer."""
+    sine = sin(phase_rad)
+    cosine = cos(phase_rad)
+    step = axis[1] - axis[0]
+    inner = inner_radius2(step)
+    for j in range(len(axis)):
+        for i in range(len(axis)):
+            sunlit[j, i], earthlit[j, i] = cell_light(
+                law, sine, cosine, axis[i], axis[j], step, inner
+            )
+
+
+@jit
+def inner_radius2(step: float) -> float:
+    """Square of the radius within which the brightness at a cell's center is its mean."""
+    return max(1 - RIM * step, 0.0) ** 2
+
+
+@jit
+def cell_light(
+    law: int, sine: float, cosine: float, x: float, y: float, step: float, inner: float
+) -> tuple[float, float]:
+    """Brightness at (x, y) times the part of a cell of width `step` that is on the disc, lit from the Sun and from the
+    observer, at a phase angle with this sine and cosine.
+
+    Near the rim mu varies as a square root: the mean of mu over the cell's radial extent on the disc, from m1 inside
+    to m2, is 2/3 (m1^2 + m1 m2 + m2^2) / (m1 + m2), as mu^2 is linear in the radius there.
+    """
+    rho2 = x * x + y * y
+    if rho2 > (1 + step / 2) ** 2:
+        return 0.0, 0.0
+    covered = 1.0
+    inward = 1.0
+    mu = 0.0
+    if rho2 < inner:
+        mu = sqrt(1 - rho2)
+    else:
+        rho = sqrt(rho2)
+        covered = min(max(0.5 + (1 - rho) / step, 0.0), 1.0)
+        m1 = sqrt(max(1 - max(rho - step / 2, 0.0) ** 2, 0.0))
+        m2 = sqrt(max(1 - (rho + step / 2) ** 2, 0.0))
+        mu = 2 / 3 * (m1 * m1 + m1 * m2 + m2 * m2) / (m1 + m2) if m1 > 0 else 0.0
+        inward = 1.0 if covered == 1 else (1 + rho - step / 2) / (2 * rho)
+    return covered * brightness(law, mu, inward * x * sine + mu * cosine), covered * brightness(
+        law, mu, mu
+    )
+
+
+class DiscElements(NamedTuple):
+    """M elements of a disc: (M, 2) centers of light in units of its radius, (M,) shares of the light."""
+
+    xy: Floats
+    share: Floats
+
+    def merged(self) -> DiscElements:
+        """All light at its center."""
+        return DiscElements((self.share @ self.xy)[None], np.array([self.share.sum()]))
+
+
+def disc_elements(surface: DiscSurface) -> DiscElements:
+    """A small disc as elements on a square lattice, ACROSS on its diameter; dark ones are left out.
+
+    An element has the light of its cell and lies at the center of that light.
+    """
+    phase_steps = round(np.degrees(surface.phase_rad) / PHASE_STEP_DEG)
+    return _elements(surface.law, phase_steps, float(f"{surface.earthshine:.2g}"))
+
+
+@lru_cache(maxsize=32)
+def _elements(law: int, phase_steps: int, earthshine: float) -> DiscElements:
+    fine = ACROSS * SAMPLES
+    axis = np.asarray((np.arange(fine) + 0.5) * (2 / fine) - 1, float)
+    light = light_map(
+        DiscSurface(law, float(np.radians(phase_steps * PHASE_STEP_DEG)), earthshine), axis
+    )
+    cells = (ACROSS, SAMPLES, ACROSS, SAMPLES)
+    weighted = (light, light * axis, light * axis[:, None])
+    share, share_x, share_y = (one.reshape(cells).sum(axis=(1, 3)).ravel() for one in weighted)
+    lit = share > 0
+    return DiscElements(
+        np.column_stack([share_x[lit], share_y[lit]]) / share[lit, None], share[lit]
+    )
+
+
+# V magnitudes of the Sun, the Moon and the planets by distance and phase.
+
+
+MOON_KM = 384400.0  # mean distance
+FULL_MOON_MAG = -12.73  # at this distance, the Sun at 1 au
+EARTH = (-3.99, -1.060e-3, 2.054e-4)
+POLES_DEG = {
+    "saturn": (40.589, 83.537),
+    "uranus": (257.311, -15.175),
+}  # right ascension, declination (IAU WGCCRE 2015)
+URANUS_FLATTENING = 0.0022927
+
+
+def magnitude(name: str, place: Place, tt_jd: float) -> float:
+    """V of a body above the atmosphere. Phase angles that the Earth never sees are extrapolated."""
+    if name == "sun":
+        return float(SUN_V_MAG + 5 * np.log10(place.distance_km / AU_KM))
+    sun_au = place.sun_distance_km / AU_KM
+    phase_deg = float(np.degrees(place.phase_rad))
+    if name == "moon":
+        return moon_magnitude(place.distance_km, sun_au, phase_deg)
+    return float(
+        5 * np.log10(sun_au * place.distance_km / AU_KM) + PLANETS[name](phase_deg, place, tt_jd)
+    )
+
+
+def moon_magnitude(distance_km: float, sun_au: float, phase_deg: float) -> float:
+    """V = -12.73 + 0.026 a + 4e-9 a^4 at the mean distance.
+
+    Source: Allen 1976, as in Krisciunas & Schaefer 1991, PASP 103, 1033. Within 7 degrees of full the Moon is up to
+    35 % brighter than this (its opposition surge); beyond 150 degrees the law is extrapolated. An eclipse is not
+    computed.
+    """
+    law = FULL_MOON_MAG + 0.026 * phase_deg + 4e-9 * phase_deg**4
+    return float(law + 5 * np.log10(distance_km / MOON_KM * sun_au))
+
+
+def earthshine_fraction(moon: Place) -> float:
+    """Light of the earthlit Moon over that of the sunlit Moon.
+
+    The Earth, as bright from the Moon as its phase polynomial says at a phase angle of 180 degrees less the Moon's,
+    shines on the Moon from the observer's direction. So the earthlit Moon is a full Moon (phase angle 0) fainter by
+    the magnitude of the Earth less that of the Sun, both as seen from the Moon.
+    """
+    sun_au = moon.sun_distance_km / AU_KM
+    moon_au = moon.distance_km / AU_KM
+    phase_deg = float(np.degrees(moon.phase_rad))
+    earth_mag = polynomial(180 - phase_deg, EARTH) + 5 * np.log10(moon_au * sun_au)
+    fainter = earth_mag - (SUN_V_MAG + 5 * np.log10(sun_au))
+    full, sunlit = (
+        moon_magnitude(moon.distance_km, sun_au, angle_deg) for angle_deg in (0.0, phase_deg)
+    )
+    return float(10 ** (-0.4 * (full + fainter - sunlit)))
+
+
+def polynomial(phase_deg: float, coefficients: tuple[float, ...]) -> float:
+    """The sum of c_k a^k."""
+    return float(sum(c * phase_deg**k for k, c in enumerate(coefficients)))
+
+
+def mercury(phase_deg: float, _place: Place, _tt_jd: float) -> float:
+    return polynomial(
+        phase_deg, (-0.613, 6.3280e-2, -1.6336e-3, 3.3644e-5, -3.4265e-7, 1.6893e-9, -3.0334e-12)
+    )
+
+
+def venus(phase_deg: float, _place: Place, _tt_jd: float) -> float:
+    """Two polynomials: near inferior conjunction sunlight is scattered forward."""
+    far = (-4.384, -1.044e-3, 3.687e-4, -2.814e-6, 8.938e-9)
+    return polynomial(phase_deg, far if phase_deg < 163.7 else (236.05828, -2.81914, 8.39034e-3))
+
+
+def mars(phase_deg: float, _place: Place, _tt_jd: float) -> float:
+    return polynomial(
+        phase_deg,
+        (-1.601, 2.267e-2, -1.302e-4) if phase_deg <= 50 else (-0.367, -2.573e-2, 3.445e-4),
+    )
+
+
+def jupiter(phase_deg: float, _place: Place, _tt_jd: float) -> float:
+    return polynomial(phase_deg, (-9.395, -3.7e-4, 6.16e-4))
+
+
+def saturn(phase_deg: float, place: Place, _tt_jd: float) -> float:
+    """Globe and rings; b is the geometric mean of the latitudes of Sun and observer, 0 if the rings are seen unlit."""
+    to_sun, to_observer = latitudes_rad("saturn", place)
+    tilt = math.sin(math.sqrt(max(to_sun * to_observer, 0.0)))
+    return -8.914 - 1.825 * tilt + 0.026 * phase_deg - 0.378 * tilt * math.exp(-2.25 * phase_deg)
+
+
+def uranus(phase_deg: float, place: Place, _tt_jd: float) -> float:
+    """Fainter toward the equator; the latitudes are planetographic."""
+    latitudes_deg = np.degrees(
+        np.arctan(np.tan(latitudes_rad("uranus", place)) / (1 - URANUS_FLATTENING) ** 2)
+    )
+    by_phase = polynomial(phase_deg, (0.0, 6.587e-3, 1.045e-4)) if phase_deg > 3.1 else 0.0
+    return -7.110 + by_phase - 8.4e-4 * float(np.abs(latitudes_deg).mean())
+
+
+def neptune(phase_deg: float, _place: Place, tt_jd: float) -> float:
+    """It brightened from 1980 to 2000."""
+    year = 2000 + (tt_jd - J2000_JD) / JULIAN_YEAR_DAY
+    at_full = min(max(-6.89 - 0.0054 * (year - 1980), -7.0), -6.89)
+    return at_full + (polynomial(phase_deg, (0.0, 7.944e-3, 9.617e-5)) if phase_deg > 1.9 else 0.0)
+
+
+PLANETS: dict[str, Callable[[float, Place, float], float]] = {
+    "mercury": mercury,
+    "venus": venus,
+    "mars": mars,
+    "jupiter": jupiter,
+    "saturn": saturn,
+    "uranus": uranus,
+    "neptune": neptune,
+}
+
+
+def latitudes_rad(name: str, place: Place) -> Floats:
+    """(2,) planetocentric latitudes of the Sun and of the observer above the planet's equator."""
+    ra, dec = np.radians(POLES_DEG[name])
+    pole = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    sines = [
+        -(vector @ pole) / np.linalg.norm(vector)
+        for vector in (place.from_sun_km, place.to_body_km)
+    ]
+    return np.arcsin(sines)

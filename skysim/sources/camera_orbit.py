@@ -1,0 +1,257 @@
+"""The camera's own orbit: its position and velocity in GCRS axes at any time of a run."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import erfa
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.constants import DAY_S, EARTH_FLATTENING, EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M
+from skysim.core.errors import InputError
+from skysim.core.time import tt_jd
+from skysim.core.types import Floats
+from skysim.scene.sections.surroundings import CircularOrbitConfig, OemOrbitConfig, TleOrbitConfig
+from skysim.scene.sections.vehicle import SiteConfig
+from skysim.sources.bodies import BODIES
+from skysim.sources.ephemeris import (
+    GcrsState,
+    ObserverPlace,
+    load_ephemeris,
+    observe_at,
+    site_in_gcrs,
+)
+from skysim.sources.orbit_elements import (
+    MeanElements,
+    OrbitEphemeris,
+    gcrs_states,
+    read_elements,
+    read_oem,
+)
+
+
+class CameraOrbit(Protocol):
+    """Position and velocity of the camera."""
+
+    def states(self, after_s: Floats) -> GcrsState:
+        """(K, 3) positions and velocities at K times since the scene's start. Raises InputError beyond its data."""
+        ...
+
+
+def state_at(orbit: CameraOrbit, after_s: float) -> GcrsState:
+    """(3,) position and velocity at a time since the scene's start."""
+    return GcrsState(*(column[0] for column in orbit.states(np.array([after_s]))))
+
+
+@dataclass(frozen=True, slots=True)
+class CircularOrbit:
+    """A circular orbit under gravity and J2, averaged over a revolution.
+
+    With the mean motion n = sqrt(mu / a^3) and k = 1.5 J2 (R / a)^2, the node moves by -k n cos i and the argument of
+    latitude by n (1 + k (3 - 4 sin^2 i)). The short-period terms (some km in a low orbit) are left out, and the
+    equator is that of the GCRS. Source: Vallado 2013, Fundamentals of Astrodynamics, section 9.6.
+    """
+
+    config: CircularOrbitConfig
+
+    @property
+    def rates_rad_s(self) -> tuple[float, float]:
+        """Of the argument of latitude and of the node."""
+        radius_m = EARTH_RADIUS_M + self.config.altitude_m
+        inclination = np.radians(self.config.inclination_deg)
+        n = np.sqrt(EARTH_MU_M3_S2 / radius_m**3)
+        k = 1.5 * EARTH_J2 * (EARTH_RADIUS_M / radius_m) ** 2
+        return float(n * (1 + k * (3 - 4 * np.sin(inclination) ** 2))), float(
+            -k * n * np.cos(inclination)
+        )
+
+    def states(self, after_s: Floats) -> GcrsState:
+        config = self.config
+        (rate, node_rate) = self.rates_rad_s
+        inclination = np.radians(config.inclination_deg)
+        along = np.radians(config.argument_deg) + rate * after_s
+        node = np.radians(config.raan_deg) + node_rate * after_s
+        toward_node = np.stack([np.cos(node), np.sin(node), np.zeros_like(node)], axis=-1)
+        ahead = np.stack(
+            [-np.sin(node) * np.cos(inclination), np.cos(node) * np.cos(inclination)], axis=-1
+        )
+        ahead = np.column_stack([ahead, np.full(len(node), np.sin(inclination))])
+        radius_m = EARTH_RADIUS_M + config.altitude_m
+        cosine = np.cos(along)[:, None]
+        sine = np.sin(along)[:, None]
+        position_m = radius_m * (cosine * toward_node + sine * ahead)
+        velocity_m_s = radius_m * rate * (cosine * ahead - sine * toward_node)
+        return GcrsState(position_m, velocity_m_s + np.cross([0.0, 0.0, node_rate], position_m))
+
+
+@dataclass(frozen=True, slots=True)
+class TleOrbit:
+    """An orbit by SGP4."""
+
+    elements: MeanElements
+    start: datetime.datetime
+
+    def states(self, after_s: Floats) -> GcrsState:
+        position_m, velocity_m_s = np.empty((2, len(after_s), 3))
+        day = np.round(after_s / DAY_S)
+        for one in np.unique(day):  # the equinox moves by 0.1" a day
+            rows = np.flatnonzero(day == one)
+            middle_s = float(after_s[rows].mean())
+            time = self.start + datetime.timedelta(seconds=middle_s)
+            place, velocity, errors = gcrs_states(self.elements, time, after_s[rows] - middle_s)
+            if errors.any():
+                raise InputError(
+                    "orbit.file", f"SGP4 has no place of this satellite at {time}", "newer elements"
+                )
+            position_m[rows] = place[0]
+            velocity_m_s[rows] = velocity[0]
+        return GcrsState(position_m, velocity_m_s)
+
+
+@dataclass(frozen=True, slots=True)
+class OemOrbit:
+    """An orbit of samples."""
+
+    ephemeris: OrbitEphemeris
+
+    def states(self, after_s: Floats) -> GcrsState:
+        return GcrsState(*self.ephemeris.at(after_s))
+
+
+def circular(config: CircularOrbitConfig, start: datetime.datetime) -> CircularOrbit:
+    return CircularOrbit(config)
+
+
+def tle(config: TleOrbitConfig, start: datetime.datetime) -> TleOrbit:
+    """The orbit of one satellite of a file. Raises InputError for a file without it, or of several without a number."""
+    elements = read_elements(config.file)
+    rows = [n for n, number in enumerate(elements.numbers) if config.number in (None, number)]
+    if len(rows) != 1:
+        listed = ", ".join(map(str, elements.numbers[:5])) + ", ..." * (len(elements.numbers) > 5)
+        raise InputError(
+            "orbit.number",
+            f"{config.number}: {len(rows)} satellites of {config.file}",
+            f"one of {listed}",
+        )
+    return TleOrbit(elements.take(rows), start)
+
+
+def oem(config: OemOrbitConfig, start: datetime.datetime) -> OemOrbit:
+    return OemOrbit(read_oem(config.file, start))
+
+
+ORBITS: dict[str, Callable[[Any, datetime.datetime], CameraOrbit]] = {
+    "circular": circular,
+    "tle": tle,
+    "oem": oem,
+}
+
+
+def build_orbit(config: Any, start: datetime.datetime) -> CameraOrbit | None:
+    """The camera's orbit of a scene; None without the section `orbit`. Raises InputError for an unreadable file."""
+    return ORBITS[config.kind](config, start) if config else None
+
+
+# Where a scene's camera is, on the turning Earth or in its orbit, at any time.
+
+
+@dataclass(frozen=True, slots=True)
+class Viewpoint:
+    """The camera's place from the scene's start on.
+
+    Attributes
+    ----------
+    start
+        UTC at t = 0
+    site
+        On the ground; a site without a longitude is the Earth's center
+    orbit
+        None on the ground
+    """
+
+    start: datetime.datetime
+    site: SiteConfig
+    orbit: CameraOrbit | None = None
+
+    def time_at(self, t_s: float) -> datetime.datetime:
+        """UTC at a time since the start."""
+        return self.start + datetime.timedelta(seconds=t_s)
+
+    def state_at(self, t_s: float) -> GcrsState:
+        """The state from the Earth's center at a time since the start: in the orbit, else at the site."""
+        if self.orbit:
+            return state_at(self.orbit, t_s)
+        time = self.time_at(t_s)
+        return site_in_gcrs(time, tt_jd(time), self.site)
+
+    def observer_at(self, t_s: float) -> ObserverPlace:
+        """The state among the bodies of the solar system at a time since the start."""
+        return observe_at(self.time_at(t_s), self.state_at(t_s))
+
+
+# The Earth as an ellipsoid: what it hides, and how much of the Sun it leaves to a satellite.
+
+
+SUN_RADIUS_M = 1e3 * BODIES["sun"].radius_km
+TO_SPHERE = np.array([1.0, 1.0, 1 / (1 - EARTH_FLATTENING)]) / EARTH_RADIUS_M  # per meter
+
+
+def sun_m(tt_jd: float) -> Floats:
+    """(3,) the Sun from the Earth's center, GCRS axes, geometric."""
+    ephemeris = load_ephemeris()
+    return 1e3 * (ephemeris.position_km("sun", tt_jd) - ephemeris.position_km("earth", tt_jd))
+
+
+def hidden_by_earth(
+    observer_m: Floats, direction: Floats, distance_m: Floats | float = np.inf
+) -> NDArray[np.bool_]:
+    """Whether the Earth is between an observer and points in unit directions (..., 3) at these distances.
+
+    The line p + s d comes nearest to the center at s = -p.d, where its distance is sqrt(p^2 - (p.d)^2). An observer on
+    or below the ellipsoid sees what is above the plane that touches it there.
+    """
+    place = observer_m * TO_SPHERE
+    along = direction * TO_SPHERE
+    length = np.linalg.norm(along, axis=-1)
+    inward = -(along @ place if place.ndim == 1 else np.sum(along * place, axis=-1)) / length
+    square = np.sum(place * place, axis=-1)
+    below = square - inward**2 < np.minimum(1.0, square * (1 - 1e-12))
+    entry = inward - np.sqrt(np.maximum(1 - square + inward**2, 0.0))
+    return np.asarray((inward > 0) & below & (np.maximum(entry, 0.0) < distance_m * length))
+
+
+def sunlit_fraction(place_m: Floats, sun_m: Floats) -> Floats:
+    """(...,) part of the Sun's disc that the Earth leaves to places (..., 3): 1 in the light, 0 in the umbra.
+
+    The limb crosses the Sun's disc as a straight line, at h solar radii from its center toward the Earth:
+    f = 1/2 + (h sqrt(1 - h^2) + arcsin h) / pi, for |h| < 1. The Sun's elevation above the limb is that on the
+    stretched sphere (within 0.4 % of it). Refraction and the limb's curvature across the Sun (0.7 % of the light in a
+    low orbit) are left out. Source: Montenbruck & Gill 2000, Satellite Orbits, section 3.4.2.
+    """
+    to_sun = sun_m - place_m
+    h_rad = limb_elevation_rad(place_m, to_sun)
+    h = np.clip(h_rad * np.linalg.norm(to_sun, axis=-1) / SUN_RADIUS_M, -1, 1)
+    return np.asarray(0.5 + (h * np.sqrt(1 - h**2) + np.arcsin(h)) / np.pi)
+
+
+def limb_elevation_rad(place_m: Floats, direction: Floats) -> Floats:
+    """(...,) angles of directions (..., 3) above the Earth's limb, seen from places (..., 3); below it negative.
+
+    With the nadir angle of the direction and the angular radius of the Earth, arcsin(1/r), it is their difference.
+    """
+    place = place_m * TO_SPHERE
+    toward = direction * TO_SPHERE
+    radius = np.linalg.norm(place, axis=-1)
+    length = np.linalg.norm(toward, axis=-1)
+    above_horizon = np.arcsin(np.clip(np.sum(place * toward, axis=-1) / (radius * length), -1, 1))
+    return np.asarray(above_horizon + np.arccos(1 / np.maximum(radius, 1.0)))
+
+
+def to_astronomical(direction: Floats) -> tuple[float, float]:
+    """Right ascension and declination of a vector, degrees."""
+    ra, dec = erfa.c2s(direction)
+    return float(np.degrees(ra)) % 360, float(np.degrees(dec))

@@ -1,0 +1,450 @@
+"""Stars shown by displays instead of LEDs: an LCD panel, a collimated micro-display.
+
+A display rounds places to its pixels and levels to its gray levels (`draw_blocks`). On an LCD panel each star is a
+block of pixels at a finite distance; behind a collimator it is a parallel beam, a source at infinity.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from skysim.core.errors import InputError
+from skysim.core.random_streams import random_stream
+from skysim.core.types import Floats, Sources
+from skysim.scene.sections import layouts, leds, light
+from skysim.scene.sections.layouts import ProjectorConfig
+from skysim.scene.sections.leds import LedConfig
+from skysim.sources import stars as star_sources
+from skysim.sources.catalog import Catalog
+from skysim.sources.dome.led import (
+    DRIVES,
+    DriveInput,
+    aging_factors,
+    chromatic_of,
+    full_strength_e_s_sr,
+    strength_factors,
+)
+from skysim.sources.dome.surface import Plane, Surface
+from skysim.sources.photometry import SUN, Band, star_chromatic, star_flux_e_s_m2
+
+Ints = NDArray[np.int64]
+PanelConfig = layouts.LcdConfig | layouts.ProjectorConfig
+
+
+class PixelBlocks(NamedTuple):
+    """Stars on a display, one for each of M lit blocks.
+
+    Attributes
+    ----------
+    star
+        (M,) index of the star; where several fall on one block, of the brightest
+    corner_px
+        (M, 2) column and row of the block's first pixel
+    center_px
+        (M, 2) column and row of its center, from the display's center
+    level
+        (M,) transmitted light above that of black, as a fraction of a white block's
+    """
+
+    star: Ints
+    corner_px: Ints
+    center_px: Floats
+    level: Floats
+
+
+def draw_blocks(config: layouts.PixelsConfig, position_m: Floats, level: Floats) -> PixelBlocks:
+    """Draw stars as blocks of pixels: places rounded to the nearest block that fits, levels to the nearest gray.
+
+    Rounding to a pitch p is an error uniform over p, p / sqrt(12) rms along each axis. A returned level of 0 is a
+    star too faint for the gray levels.
+
+    Parameters
+    ----------
+    position_m
+        (N, 2) places on the display along its columns' and its rows' direction, from its center
+    level
+        (N,) fraction of white; stars on one block add up, to white at most
+    """
+    pixels = np.array(config.pixels)
+    exact_px = position_m / config.pitch_m + (pixels - 1) / 2 - (config.block - 1) / 2
+    corner = np.clip(np.rint(exact_px), 0, pixels - config.block).astype(np.int64)
+    # Brightest first, so that `first` is the brightest star of each block.
+    order = np.argsort(-level, kind="stable")
+    _, first, block = np.unique(
+        corner[order] @ [1, pixels[0]], return_index=True, return_inverse=True
+    )
+    total = np.minimum(np.bincount(block, level[order], len(first)), 1.0)
+    star = order[first]
+    center_px = corner[star] + (config.block - 1) / 2 - (pixels - 1) / 2
+    return PixelBlocks(
+        star,
+        corner[star],
+        center_px,
+        gray_transmission(config, total) * (1 - black_transmission(config)),
+    )
+
+
+def black_transmission(config: layouts.PixelsConfig) -> float:
+    """Transmission of a black pixel, as a fraction of white."""
+    return 1 / config.contrast if config.contrast else 0.0
+
+
+def gray_transmission(config: layouts.PixelsConfig, level: Floats) -> Floats:
+    """(N,) transmission of the nearest gray level: (g / (G - 1))^gamma, g rounded from (G - 1) level^(1 / gamma).
+
+    Rounding is in g, as in a program that writes a picture, so steps are fine for faint stars.
+    """
+    top = config.gray_levels - 1
+    return np.asarray((np.rint(top * level ** (1 / config.gamma)) / top) ** config.gamma)
+
+
+def min_level(config: layouts.PixelsConfig) -> float:
+    """Level below which a star is black: half a step of gray."""
+    return float((0.5 / (config.gray_levels - 1)) ** config.gamma)
+
+
+def panel_surface(config: layouts.LcdConfig, surface: Any) -> Plane:
+    """The panel as a surface: the flat surface, cut to the extent of the pixels.
+
+    Raises
+    ------
+    InputError
+        If the pixels do not fit into the surface's width and height.
+    """
+    assert isinstance(surface, Plane)  # DomeConfig admits no other surface
+    half_m = np.array(config.pixels) * config.pitch_m / 2
+    if np.any(half_m > surface.half_m * (1 + 1e-9)):
+        raise InputError(
+            "light.layout.pixels",
+            f"need {2 * half_m[0]:.4g} m by {2 * half_m[1]:.4g} m",
+            f"the surface's {2 * surface.half_m[0]:.4g} m by {2 * surface.half_m[1]:.4g} m",
+        )
+    return dataclasses.replace(surface, half_m=half_m)
+
+
+def ideal_led(led: leds.LedConfig) -> leds.LedConfig:
+    """The LED as new, on direct current, without scatter: its strength is the level that a layout assigns to a star."""
+    ideal = {
+        "drive": leds.DirectConfig(kind="direct"),
+        "scatter": 0.0,
+        "color_scatter_m": 0.0,
+        "aging": None,
+    }
+    return led.model_copy(update=ideal)
+
+
+def panel_strength_e_s_sr(led: leds.LedConfig, band: Band) -> float:
+    """Strength of a white pixel of a panel, whose backlight ages as one."""
+    return full_strength_e_s_sr(led, band) * float(aging_factors(led.aging, np.zeros(1))[0])
+
+
+def panel_sources(
+    config: layouts.LcdConfig, panel: Plane, led: leds.LedConfig, band: Band, stars: Sources
+) -> Sources:
+    """Stars on an LCD panel, each a block of n x n equal pixels: n^2 times a pixel's light from n times its width.
+
+    Places and gray levels as in `draw_blocks`. A block is represented by a disk of its area; numbers are those of the
+    stars. Raises InputError for a star nearer to black than to the first gray level.
+
+    Parameters
+    ----------
+    stars
+        As LEDs that are always lit, on the panel or near it; they are projected onto it
+    """
+    own_m = panel.lab_from_own.inv().apply(stars.place[:, :3] - panel.center_m)
+    blocks = visible_blocks(config, own_m[:, :2], stars.strength / full_strength_e_s_sr(led, band))
+    flat_m = np.column_stack([blocks.center_px * config.pitch_m, np.zeros(len(blocks.star))])
+    place_m = panel.center_m + panel.lab_from_own.apply(flat_m)
+    patches = LitBlocks(place_m, panel.inward(place_m), config.block * led.disk_diameter_m / 2, 1.0)
+    row = blocks.corner_px[:, 1] / config.pixels[1]
+    return block_sources(config, led, band, stars, blocks, patches, row)
+
+
+def visible_blocks(config: PanelConfig, position_m: Floats, level: Floats) -> PixelBlocks:
+    """`draw_blocks`; raises InputError for a star that is nearer to black than to the first gray level."""
+    blocks = draw_blocks(config, position_m, level)
+    if not np.all(blocks.level > 0):
+        raise InputError(
+            "light.layout.points",
+            f"a star of level {level.min():.2g} is black on {config.gray_levels} gray levels",
+            f"{min_level(config):.2g} or more",
+        )
+    return blocks
+
+
+class LitBlocks(NamedTuple):
+    """M blocks of pixels as they are lit: place and inward normal (M, 3), radius of the disk, and the light of one of
+    their pixels over that of the white pixel `led`."""
+
+    place_m: Floats
+    normal: Floats
+    radius_m: Floats | float
+    gain: Floats | float
+
+
+def block_sources(
+    config: PanelConfig,
+    led: leds.LedConfig,
+    band: Band,
+    stars: Sources,
+    blocks: PixelBlocks,
+    patches: LitBlocks,
+    row: Floats | float,
+) -> Sources:
+    """The blocks as sources, n^2 times the light of a pixel each; row : of `DriveInput`."""
+    rng = random_stream(config.points.hardware_seed)
+    count = len(blocks.star)
+    # Pixels scatter independently: the mean of n^2 of them scatters by 1 / n as much, and is nearly Gaussian.
+    scatter = strength_factors(
+        led.scatter if config.block == 1 else led.scatter / config.block, rng.standard_normal(count)
+    )
+    pulses = DRIVES[led.drive.kind](
+        led, DriveInput(blocks.level, np.zeros(count, dtype=np.int64), row), rng
+    )
+    return Sources(
+        id=stars.id[blocks.star],
+        place=np.column_stack([patches.place_m, np.ones(count)]),
+        normal=patches.normal,
+        radius_m=np.broadcast_to(patches.radius_m, (count,)).copy(),
+        strength=panel_strength_e_s_sr(led, band)
+        * config.block**2
+        * scatter
+        * pulses.strength
+        * patches.gain,
+        period_s=pulses.period_s,
+        start_s=pulses.start_s,
+        on_s=pulses.on_s,
+        clock=pulses.clock,
+        magnitude=stars.magnitude[blocks.star],
+        chromatic=chromatic_of(led, band, np.zeros(count)),
+    )
+
+
+def lab_from_icrs(config: light.CollimatedDisplayConfig) -> Rotation:
+    """Rotation from ICRS to lab axes: the collimator's axis is lab +z, and roll is the position angle of lab -y."""
+    return star_sources.cam_from_icrs(config.axis_ra_deg, config.axis_dec_deg, config.roll_deg)
+
+
+def display_sources(
+    config: light.CollimatedDisplayConfig, stars: Catalog, time: datetime.datetime, band: Band
+) -> Sources:
+    """Stars on a collimated display: a pixel (x, y) off the axis is a parallel beam along (x, y, focal length).
+
+    Returns Sources in lab axes: points at infinity, or, with config.conjugate_m = D, at D from the bearing's center, so
+    that a camera off it by r sees them shifted by r / D. Strength is that of a star of config.brightest_mag and the
+    Sun's color, times the gray level; magnitude is the catalog's. Pixels are not resolved.
+    Raises InputError if no star is in the field, and for a star nearer to black than to the first gray level.
+
+    Parameters
+    ----------
+    time
+        UTC, of the apparent places shown
+    """
+    stars = stars.to_limit(config.limit_mag)
+    direction = (
+        lab_from_icrs(config).apply(star_sources.apparent(stars, time))
+        if len(stars)
+        else np.zeros((0, 3))
+    )
+    in_front = direction[:, 2] > 0
+    stars = stars.take(in_front)
+    direction = direction[in_front]
+    on_display_m = direction[:, :2] / direction[:, 2:] * config.focal_length_m
+    half_m = np.array(config.pixels) * config.pitch_m / 2
+    within = np.all(np.abs(on_display_m) <= half_m, axis=1)
+    stars = stars.take(within)
+    on_display_m = on_display_m[within]
+    if not len(stars):
+        raise InputError(
+            "light.limit_mag",
+            "no star of the catalog is on the display to this limit",
+            "a fainter one",
+        )
+    level = np.minimum(10 ** (-0.4 * (stars.v_mag - config.brightest_mag)), 1.0)
+    blocks = draw_blocks(config, on_display_m, level)
+    if not np.all(blocks.level > 0):
+        darkest_mag = config.brightest_mag - 2.5 * np.log10(min_level(config))
+        raise InputError(
+            "light.limit_mag",
+            f"stars of V {stars.v_mag.max():.3g} are black on {config.gray_levels} gray levels",
+            f"to {darkest_mag:.3g}",
+        )
+    beam = np.column_stack(
+        [blocks.center_px * config.pitch_m, np.full(len(blocks.star), config.focal_length_m)]
+    )
+    white_e_s_m2 = float(star_flux_e_s_m2(config.brightest_mag, *SUN, band))
+    beams = beam_sources(config, beam, white_e_s_m2 * blocks.level, stars.take(blocks.star))
+    b_v, v_i = (np.full(len(beam), color) for color in SUN)
+    return dataclasses.replace(beams, chromatic=star_chromatic(b_v, v_i, band))
+
+
+def beam_sources(
+    config: light.CollimatedDisplayConfig, beam: Floats, flux_e_s_m2: Floats, stars: Catalog
+) -> Sources:
+    """Beams along (N, 3) as steady sources at infinity or, for an imperfect collimator, at config.conjugate_m."""
+    direction = beam / np.linalg.norm(beam, axis=1, keepdims=True)
+    zeros = np.zeros(len(beam))
+    ones = np.ones(len(beam))
+    place = np.column_stack([direction, zeros])
+    normal = 0 * direction
+    strength = flux_e_s_m2
+    if config.conjugate_m is not None:
+        place = np.column_stack([direction * config.conjugate_m, ones])
+        normal = -direction
+        strength = flux_e_s_m2 * config.conjugate_m**2
+    return Sources(
+        id=stars.hip,
+        place=place,
+        normal=normal,
+        radius_m=zeros,
+        strength=strength,
+        period_s=ones,
+        start_s=zeros,
+        on_s=ones,
+        clock=np.zeros(len(beam), dtype=np.int64),
+        magnitude=stars.v_mag,
+    )
+
+
+# A projector in the dome: a grid of pixels through a lens onto the matt wall, from a place off the
+# center.
+
+
+NEWTON_STEPS = 12
+
+
+def own_from_lab(config: ProjectorConfig) -> Rotation:
+    """Rotation from the lab's axes to the projector's: x along its rows, y along its columns, z along its axis."""
+    axis = np.array(config.aim_m) - config.position_m
+    axis /= np.linalg.norm(axis)
+    right = np.array([1.0, 0.0, 0.0]) - axis[0] * axis
+    right = Rotation.from_rotvec(np.radians(config.rotation_deg) * axis).apply(
+        right / np.linalg.norm(right)
+    )
+    return Rotation.from_matrix(np.array([right, np.cross(axis, right), axis]))
+
+
+def on_chip_m(config: ProjectorConfig, own: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """(N, 2) places on the chip of directions (N, 3) in the projector's axes, and whether they are on its pixels."""
+    in_front = own[:, 2] > 0
+    tangent = own[:, :2] / np.where(in_front, own[:, 2], np.nan)[:, None]
+    tangent2 = np.sum(tangent**2, axis=1, keepdims=True)
+    chip_m = config.focal_length_m * tangent * (1 + config.distortion * tangent2)
+    half_m = np.array(config.pixels) * config.pitch_m / 2
+    unfolded = 1 + 3 * config.distortion * tangent2[:, 0] > 0
+    return chip_m, np.asarray(in_front & unfolded & np.all(np.abs(chip_m) <= half_m, axis=1))
+
+
+def rays(config: ProjectorConfig, chip_m: Floats) -> Floats:
+    """(N, 3) unit rays in the lab of places (N, 2) on the chip; Newton's method inverts the distortion."""
+    radius = np.linalg.norm(chip_m, axis=1) / config.focal_length_m
+    tangent = radius
+    for _ in range(NEWTON_STEPS if config.distortion else 0):
+        excess = tangent * (1 + config.distortion * tangent**2) - radius
+        tangent = tangent - excess / (1 + 3 * config.distortion * tangent**2)
+    stretch = np.divide(tangent, radius, out=np.ones_like(radius), where=radius > 0)
+    own = np.column_stack([chip_m / config.focal_length_m * stretch[:, None], np.ones(len(chip_m))])
+    return np.asarray(
+        own_from_lab(config).inv().apply(own / np.linalg.norm(own, axis=1, keepdims=True))
+    )
+
+
+def pixel_sr(config: ProjectorConfig, cos_axis: Floats) -> Floats:
+    """(N,) solid angle of a pixel at these cosines from the axis."""
+    tangent2 = 1 / cos_axis**2 - 1
+    stretch = (1 + config.distortion * tangent2) * (1 + 3 * config.distortion * tangent2)
+    return np.asarray((config.pitch_m / config.focal_length_m) ** 2 * cos_axis**3 / stretch)
+
+
+def spot_radius_m(
+    config: ProjectorConfig, surface: Surface, chip_m: Floats, place_m: Floats, normal: Floats
+) -> Floats:
+    """(N,) radius of a uniform disk with the mean square radius of each block's image on the wall.
+
+    A parallelogram with the edges a, b has the mean square distance (a^2 + b^2) / 12 from its center, a disk r^2 / 2.
+    The edges are traced. The defocus disk is projected along the ray onto the wall: v to v - (n . v) / (n . u) u.
+    """
+    position_m = np.array(config.position_m)
+    R_own_from_lab = own_from_lab(config).as_matrix()
+    ray = rays(config, chip_m)
+    square_m2 = np.zeros(len(chip_m))
+    half_m = config.block * config.pitch_m / 2
+    for axis in np.eye(2):
+        ends = [rays(config, chip_m + side * half_m * axis) for side in (1, -1)]
+        first_m, last_m = (surface.exit_m(position_m, end)[:, None] * end for end in ends)
+        square_m2 += np.sum((first_m - last_m) ** 2, axis=1) / 6
+    depth_m = (place_m - position_m) @ R_own_from_lab[2]
+    focus_m = config.focus_m or float(np.linalg.norm(np.array(config.aim_m) - position_m))
+    blur_m = config.focal_length_m / config.f_number / 2 * np.abs(depth_m / focus_m - 1)
+    for axis in R_own_from_lab[:2]:
+        on_wall = axis - (normal @ axis / np.sum(normal * ray, axis=1))[:, None] * ray
+        square_m2 += blur_m**2 / 2 * np.sum(on_wall**2, axis=1)
+    return np.asarray(np.sqrt(square_m2))
+
+
+def projector_sources(
+    config: ProjectorConfig, surface: Surface, led: LedConfig, band: Band, stars: Sources
+) -> Sources:
+    """Stars drawn on the nearest blocks of pixels, as disks on the wall where the projector's rays meet it.
+
+    Parameters
+    ----------
+    stars
+        As LEDs that are always lit, on the surface. Numbers are theirs; the picture is drawn
+        for the lens's distortion, so that a star is off by the rounding to pixels alone
+
+    Raises
+    ------
+    InputError
+        For a projector outside the dome, for stars outside its picture or nearer to black than
+        to the first gray level, and for a pixel that passes below the rim.
+    """
+    position_m = np.array(config.position_m)
+    if not surface.inside(position_m):
+        raise InputError(
+            "light.layout.position", f"{config.position_m} m is outside of the dome", "inside"
+        )
+    chip_m, shown = on_chip_m(config, own_from_lab(config).apply(stars.place[:, :3] - position_m))
+    if not shown.all():
+        raise InputError(
+            "light.layout.points",
+            f"{np.sum(~shown)} of {len(shown)} stars are outside of the projector's picture",
+            "a smaller cap_deg, a shorter focal_length, or another position",
+        )
+    blocks = visible_blocks(config, chip_m, stars.strength / full_strength_e_s_sr(led, band))
+    drawn_m = blocks.center_px * config.pitch_m
+    ray = rays(config, drawn_m)
+    place_m = surface.meet(position_m, ray)
+    if np.isnan(place_m).any():
+        raise InputError(
+            "light.layout.points", "a star's pixel is below the dome's rim", "a smaller cap_deg"
+        )
+    normal = surface.inward(place_m)
+    lens_disk_m = spot_radius_m(config, surface, drawn_m, place_m, normal)
+    cos_axis = ray @ own_from_lab(config).as_matrix()[2]
+    patches = LitBlocks(
+        place_m, normal, np.hypot(lens_disk_m, led.disk_diameter_m / 2), cos_axis**config.falloff
+    )
+    return block_sources(config, led, band, stars, blocks, patches, 0.0)
+
+
+def white_wall_per_m2(config: ProjectorConfig, place_m: Floats, normal: Floats) -> Floats:
+    """(N,) light of white pixels per area of the wall at places (N, 3), over that of one pixel on the axis, 1/m^2.
+
+    E = I cos(i) / D^2 in units of a pixel's: cos^n(theta) over the area w D^2 / cos(i) that it lights; 0 outside of the
+    picture, and for NaN.
+    """
+    sight_m = place_m - np.array(config.position_m)
+    own = own_from_lab(config).apply(sight_m)
+    _, shown = on_chip_m(config, own)
+    distance_m = np.linalg.norm(sight_m, axis=1)
+    cos_axis = np.where(shown, own[:, 2] / distance_m, 1.0)
+    cos_incidence = -np.sum(normal * sight_m, axis=1) / distance_m
+    area_m2 = pixel_sr(config, cos_axis) * distance_m**2 / np.maximum(cos_incidence, 0)
+    return np.where(shown & (cos_incidence > 0), cos_axis**config.falloff / area_m2, 0.0)

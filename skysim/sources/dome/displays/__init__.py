@@ -1,1 +1,0 @@
-"""Stars shown by displays: an LCD panel, a projector, a collimated micro-display."""

@@ -1,0 +1,572 @@
+"""Optimized LED placement: move LEDs between candidate sites to lower the variance of the worst attitudes.
+
+What a camera on its lever arm can learn about the attitude a from the LEDs in its field is the Fisher information of
+the rotation-only solution, M_a = sum_i J_i'J_i (`fisher`). It does not depend on any estimator. The search minimizes
+    sum_a (MISSING_LED_FACTOR^missing_a tr(M_a^-1))^HARDNESS,
+a smooth substitute for the worst case over all attitudes to the greatest tilt, in which missing_a is the number of
+LEDs that the field lacks of `min_leds`. It is a local search: each LED in turn is tried at a random site nearby, and
+the move is kept if it lowers the sum and respects the least spacing. Because no finite set of attitudes contains the
+worst one, the hardest attitudes of a fresh random sample join the set between generations (`hardest_attitudes`).
+
+The search starts from even layouts: Fibonacci spirals and a Poisson-disk sample of the sites, the best of them also
+contracted toward the zenith. A final stage moves LEDs whose fields of view are too similar to another field
+(`reduce_ambiguity`). Layouts are compared by the mean variance of the worst 1 % of independent attitudes
+(`PlacementScore`). By this measure the result is never worse than the even layouts; at a single attitude it can be.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from skysim.core.errors import InputError
+from skysim.core.jit import jit
+from skysim.core.types import Floats
+from skysim.scene.sections import layouts
+from skysim.sources.dome.layouts.ambiguity import Ambiguity, field_ambiguity
+from skysim.sources.dome.layouts.fisher import (
+    Visibility,
+    add_led,
+    costs,
+    sum_information,
+    total_information,
+    update_costs,
+    variances,
+    visible_from,
+)
+from skysim.sources.dome.surface import Surface
+
+Ints = NDArray[np.int64]
+
+GOLDEN = 1.2207440846057596  # g^4 = g + 1: base of the R3 low-discrepancy sequence (Roberts 2018; assumed)
+
+
+@dataclass(frozen=True, slots=True)
+class PlacementOptions:
+    """Settings of the placement search; `OPTIONS` holds the defaults.
+
+    Sites and starting layouts
+
+    Local search
+
+    Hardest attitudes
+
+    Comparison of layouts
+
+    Ambiguity
+
+    Attributes
+    ----------
+    sites_per_led
+        Candidate sites per LED; their spacing is then a twentieth of the LEDs' own
+    even_sites_per_led
+        Sites per LED that suffice for an even layout
+    bisections
+        Steps that find its spacing, between the least spacing and the sites' extent
+    contractions
+        Fractions of the solid angle to which the best even layout is contracted
+    sparse_below
+        Mean number of LEDs in a field below which the sparse settings apply, else the dense
+        ones. With few LEDs in a field evenness matters most and steps must be small; with many,
+        larger steps gain more.
+    sparse_steps, dense_steps
+        (least, greatest) step in units of the LEDs' spacing
+    sparse_field, dense_field
+        Fraction of the field that the search uses. The margin is for attitudes between the
+        sampled ones, which lose LEDs at the edge.
+    views_per_site
+        Sampled attitudes that see a site; a field's border passes it in steps of a twentieth of
+        the field
+    min_attitudes, max_attitudes
+        Limits of the number of sampled attitudes
+    generations
+        Rounds are divided into so many; after each the hardest of fresh attitudes join the
+        sample
+    keep_every
+        Generations from one candidate layout to the next
+    fresh_attitudes, hardest_attitudes
+        Size of a fresh sample, and how many of it are kept
+    perturbations, perturbation_size
+        Random rotations tried for each of these, and their size in half fields
+    score_attitudes
+        Number of independent attitudes
+    tail_fraction
+        Fraction of them, the worst, whose mean variance is compared
+    inner_field
+        Part of the field in which fewer than two LEDs count as too few
+    max_overlap
+        Fraction of a field's LEDs that may coincide with another field's
+    ambiguity_trials
+        Tries to move one LED of an ambiguous field
+    central_leds
+        LEDs nearest to the field's center, one of which is moved
+    nearby_sites
+        Nearest sites that it may take; they reach a fifth of the LEDs' own spacing
+    variance_slack
+        Relative rise of the worst variances that the moves may cost in total
+    """
+
+    sites_per_led: int = 500
+    even_sites_per_led: int = 10
+    bisections: int = 12
+    contractions: tuple[float, ...] = (0.98, 0.96, 0.94, 0.92, 0.9, 0.88, 0.86, 0.84)
+
+    sparse_below: float = 8.0
+    sparse_steps: tuple[float, float] = (0.02, 0.06)
+    sparse_field: float = 0.93
+    dense_steps: tuple[float, float] = (0.01, 0.3)
+    dense_field: float = 0.97
+    views_per_site: int = 400
+    min_attitudes: int = 2000
+    max_attitudes: int = 20_000
+    generations: int = 15
+    keep_every: int = 3
+
+    fresh_attitudes: int = 20_000
+    hardest_attitudes: int = 600
+    perturbations: int = 6
+    perturbation_size: float = 0.1
+
+    score_attitudes: int = 40_000
+    tail_fraction: float = 0.01
+    inner_field: float = 0.95
+
+    max_overlap: float = 0.5
+    ambiguity_trials: int = 100
+    central_leds: int = 4
+    nearby_sites: int = 60
+    variance_slack: float = 0.02
+
+
+OPTIONS = PlacementOptions()
+
+
+class PlacementScore(NamedTuple):
+    """Comparison of layouts on (A, 3, 3) attitudes that no search uses.
+
+    Attributes
+    ----------
+    reference
+        Tail variance of the best even layout, the unit of `tail_variance`
+    """
+
+    config: layouts.OptimizedConfig
+    options: PlacementOptions
+    R_body_from_lab: Floats
+    reference: float = 1.0
+
+    def tail_variance(self, place_m: Floats) -> float:
+        """Mean variance of the worst attitudes over the reference: 1 or less is as good as any even layout.
+
+        The single worst attitude is unstable: it depends on one LED at the field's edge and on the sampling.
+        """
+        variance = np.sort(
+            variances(
+                total_information(place_m, self.R_body_from_lab, *camera_geometry(self.config))
+            )
+        )
+        tail = math.ceil(self.options.tail_fraction * len(variance))
+        return float(variance[-tail:].mean()) / self.reference
+
+    def under_two(self, place_m: Floats) -> int:
+        """Number of attitudes with fewer than two LEDs in the inner part of the field; two fix an attitude."""
+        geometry = camera_geometry(self.config, self.options.inner_field)
+        return int(np.sum(total_information(place_m, self.R_body_from_lab, *geometry)[:, 6] < 2))
+
+    def score(self, place_m: Floats, rng: np.random.Generator) -> tuple[bool, bool, float]:
+        """Sort key of layouts, less is better.
+
+        In this order: whether an even layout is better in the worst attitudes; whether an attitude was found that
+        sees fewer than two LEDs; the tail variance, times 1 + the fraction of ambiguous fields.
+        """
+        tail = self.tail_variance(place_m)
+        ambiguity = layout_ambiguity(self.config, place_m)
+        hardest = hardest_attitudes(self.config, self.options, place_m, 1.0, rng)
+        fewest = total_information(place_m, hardest, *camera_geometry(self.config))[:, 6].min()
+        ambiguous = float(np.mean(ambiguity.fraction > self.options.max_overlap))
+        return tail > 1, bool(fewest < 2), tail * (1 + ambiguous)
+
+
+def optimize_places(
+    config: layouts.OptimizedConfig,
+    sites_m: Floats,
+    starts_m: Sequence[Floats],
+    rng: np.random.Generator,
+    options: PlacementOptions,
+) -> Floats:
+    """(N, 3) sites, m, at which config.count LEDs make the worst attitudes within the tilt as good as possible.
+
+    1. The best even layout by `PlacementScore.tail_variance` sets the reference. It is also contracted toward the
+       zenith.
+    2. From the best of these `descend` lowers sum_a c_a^HARDNESS, c_a = MISSING_LED_FACTOR^missing
+       tr((sum_i J_i'J_i)^-1), over attitudes a to the tilt. The Jacobian J_i of LED i is with respect to a rotation
+       about the bearing. Steps are small, because evenness once lost is not regained, but they suffice to make one
+       field differ from others.
+    3. The best by `PlacementScore.score` of all layouts reached is kept, so no even layout is better in the worst
+       attitudes.
+    4. `reduce_ambiguity` changes ambiguous fields; its result is kept if `score` prefers it.
+    Raises InputError if not all LEDs find room at the spacing.
+
+    Parameters
+    ----------
+    sites_m
+        (K, 3) allowed places in the lab, on the surface within its rim and cap;
+        options.sites_per_led times the count
+    starts_m
+        (N, 3) each, layouts to start from; a Poisson-disk sample of the sites, as even as
+        possible, is added
+    """
+    few_sites_m = sites_m[: options.even_sites_per_led * config.count]
+    even = [start_m for start_m in starts_m if spacing_ok(start_m, config.spacing_m)]
+    chosen = spread(few_sites_m, config.spacing_m, config.count, options.bisections)
+    if len(chosen) == config.count:
+        even.append(sites_m[chosen])
+    if not even:
+        raise InputError(
+            "light.layout.spacing",
+            f"{len(chosen)} of {config.count} LEDs fit {config.spacing_m:.3g} m apart where the field reaches at a"
+            f" tilt of {config.tilt_deg:g} deg",
+            "fewer LEDs, less spacing, or a greater cap_deg",
+        )
+    visible = visible_fraction(config, few_sites_m, rng)
+    scorer = PlacementScore(config, options, sample_attitudes(config, options.score_attitudes, rng))
+    even_m = min(even, key=scorer.tail_variance)
+    scorer = scorer._replace(reference=scorer.tail_variance(even_m))
+    contracted = [contract(even_m, sites_m, fraction) for fraction in options.contractions]
+    start_m = min(
+        [even_m, *(layout_m for layout_m in contracted if spacing_ok(layout_m, config.spacing_m))],
+        key=scorer.tail_variance,
+    )
+
+    def best(layouts_m: Sequence[Floats]) -> Floats:
+        return min(layouts_m, key=lambda layout_m: scorer.score(layout_m, rng))
+
+    best_m = best([even_m, start_m])
+    steps, field_fraction = (
+        (options.sparse_steps, options.sparse_field)
+        if visible * config.count < options.sparse_below
+        else (options.dense_steps, options.dense_field)
+    )
+    search = LocalSearch(config, options, sites_m, cKDTree(sites_m), steps, field_fraction)
+    count = np.clip(
+        options.views_per_site / max(visible, 1e-9), options.min_attitudes, options.max_attitudes
+    )
+    best_m = best([best_m, *descend(search, start_m, int(count), rng)])
+    return best([reduce_ambiguity(scorer, best_m, sites_m, rng), best_m])
+
+
+def spacing_ok(place_m: Floats, spacing_m: float) -> bool:
+    """Whether no two LEDs are nearer to each other than the spacing."""
+    return bool(cKDTree(place_m).query(place_m, k=2)[0][:, 1].min() >= spacing_m)
+
+
+def contract(place_m: Floats, sites_m: Floats, fraction: float) -> Floats:
+    """(N, 3) sites nearest to a layout that is contracted to this fraction of its solid angle about the zenith.
+
+    Few attitudes see the rim, so its LEDs help more where more fields overlap. With z = cos(zenith angle) the
+    contraction is 1 - z' = fraction (1 - z), which scales every solid angle alike.
+    """
+    direction = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
+    z = 1 - fraction * (1 - direction[:, 2])
+    xy = (
+        direction[:, :2]
+        * np.sqrt((1 - z**2) / np.maximum(1 - direction[:, 2] ** 2, 1e-12))[:, None]
+    )
+    site_direction = sites_m / np.linalg.norm(sites_m, axis=1, keepdims=True)
+    return sites_m[cKDTree(site_direction).query(np.column_stack([xy, z]))[1]]
+
+
+class LocalSearch(NamedTuple):
+    """Local search: (K, 3) candidate sites, m, a k-d tree of them, the step sizes and the part of the field used."""
+
+    config: layouts.OptimizedConfig
+    options: PlacementOptions
+    sites_m: Floats
+    tree: cKDTree
+    steps: tuple[float, float]
+    field_fraction: float
+
+    def propose(self, place_m: Floats, rng: np.random.Generator) -> Floats:
+        """(N, 3) one site per LED, a random step away; step lengths are log-uniform between the limits in `steps`."""
+        spacing_m = np.median(cKDTree(place_m).query(place_m, k=2)[0][:, 1])
+        low, high = np.log(self.steps)
+        step_m = spacing_m * np.exp(rng.uniform(low, high, (len(place_m), 1)))
+        return self.sites_m[
+            self.tree.query(place_m + step_m * rng.standard_normal(place_m.shape))[1]
+        ]
+
+
+def descend(
+    search: LocalSearch, place_m: Floats, attitude_count: int, rng: np.random.Generator
+) -> list[Floats]:
+    """Layouts, (N, 3) sites each, reached by descent from place_m: one per `keep_every` generations, and the last.
+
+    Parameters
+    ----------
+    attitude_count
+        Number of attitudes in the first generation's cost
+    """
+    config = search.config
+    options = search.options
+    field_fraction = search.field_fraction
+    candidates = []
+    R_body_from_lab = sample_attitudes(config, attitude_count, rng)
+    last_rounds = np.linspace(0, config.rounds, options.generations + 1).round().astype(int)[1:-1]
+    for n in range(config.rounds):
+        if n in last_rounds[options.keep_every - 1 :: options.keep_every]:
+            candidates.append(place_m)
+        # The descent improves the sampled attitudes at the expense of those between them. Adding the worst of a fresh
+        # sample closes these gaps.
+        if n in last_rounds:
+            hardest = hardest_attitudes(config, options, place_m, field_fraction, rng)
+            R_body_from_lab = np.concatenate([R_body_from_lab, hardest])
+        # Sites 0 to count - 1 are the present places, site count + n is the one proposed to LED n.
+        both_m = np.concatenate([place_m, search.propose(place_m, rng)])
+        visibility = Visibility(
+            *visible_from(both_m, R_body_from_lab, *camera_geometry(config, field_fraction))
+        )
+        chosen = np.arange(config.count)
+        order = rng.permutation(config.count)
+        try_moves(
+            chosen,
+            both_m,
+            visibility,
+            len(R_body_from_lab),
+            config.min_leds,
+            config.spacing_m,
+            order,
+            order + config.count,
+        )
+        place_m = both_m[chosen]
+    return [*candidates, place_m]
+
+
+def visible_fraction(
+    config: layouts.OptimizedConfig, sites_m: Floats, rng: np.random.Generator
+) -> float:
+    """Mean fraction of the sites that an attitude sees; times the number of LEDs it is the mean number in a field."""
+    total = total_information(sites_m, sample_attitudes(config, 200, rng), *camera_geometry(config))
+    return float(total[:, 6].mean()) / len(sites_m)
+
+
+def hardest_attitudes(
+    config: layouts.OptimizedConfig,
+    options: PlacementOptions,
+    place_m: Floats,
+    field_fraction: float,
+    rng: np.random.Generator,
+) -> Floats:
+    """(H, 3, 3) R_body_from_lab with the highest cost for these LEDs: the worst of a fresh sample, then perturbed.
+
+    Each perturbation is kept if the cost rises. Rotations about the boresight are larger, because they move an LED
+    less than rotations across it do: by the tangent of its field angle, at most that of the field's corner.
+    """
+
+    def attitude_costs(R_body_from_lab: Floats) -> Floats:
+        geometry = camera_geometry(config, field_fraction)
+        return costs(total_information(place_m, R_body_from_lab, *geometry), config.min_leds)
+
+    sample = sample_attitudes(config, options.fresh_attitudes, rng)
+    sample_cost = attitude_costs(sample)
+    worst = np.argsort(sample_cost)[-options.hardest_attitudes :]
+    hardest = sample[worst]
+    cost = sample_cost[worst]
+    half = tan_half(config)
+    step_rad = options.perturbation_size * half.min() * np.array([1, 1, 1 / math.hypot(*half)])
+    for _ in range(options.perturbations):
+        perturbation = Rotation.from_rotvec(step_rad * rng.standard_normal((len(hardest), 3)))
+        perturbed = perturbation.as_matrix() @ hardest
+        new_cost = attitude_costs(perturbed)
+        harder = (new_cost > cost) & (perturbed[:, 2, 2] >= math.cos(math.radians(config.tilt_deg)))
+        hardest[harder] = perturbed[harder]
+        cost[harder] = new_cost[harder]
+    return hardest
+
+
+def sample_attitudes(
+    config: layouts.OptimizedConfig, count: int, rng: np.random.Generator
+) -> Floats:
+    """(A, 3, 3) R_body_from_lab: boresights uniform over the cap of the tilt, yaw uniform; a shifted R3 lattice."""
+    # R3 sequence: the multiples of 1/g, 1/g^2 and 1/g^3 modulo 1 fill the unit cube evenly.
+    unit = (rng.random(3) + np.arange(count)[:, None] / GOLDEN ** np.arange(1, 4)) % 1
+    tilt = np.arccos(1 - unit[:, 0] * (1 - math.cos(math.radians(config.tilt_deg))))
+    angles = np.column_stack([2 * math.pi * unit[:, 1], tilt, 2 * math.pi * unit[:, 2]])
+    return Rotation.from_euler("ZYZ", angles).inv().as_matrix()
+
+
+def camera_geometry(
+    config: layouts.OptimizedConfig, field_fraction: float = 1.0
+) -> tuple[Floats, Floats]:
+    """(3,) entrance pupil on the body, m, and (2,) tangents of half the field, scaled by `field_fraction`."""
+    return np.array(config.camera_m), field_fraction * tan_half(config)
+
+
+def tan_half(config: layouts.OptimizedConfig) -> Floats:
+    """(2,) tangents of half the field's width and height."""
+    assert config.field_deg is not None, "completed by the scene"
+    return np.tan(np.radians(config.field_deg) / 2)
+
+
+def field_reach_rad(config: layouts.OptimizedConfig, surface: Surface) -> float:
+    """Greatest angle from the zenith, at the bearing, that the field of any attitude reaches; at most the cap.
+
+    Rays around the cone that encloses the field are intersected with the surface, for boresights at the greatest tilt
+    in all azimuths and at every yaw.
+    """
+    half_diagonal = np.hypot(*tan_half(config))
+    azimuth = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    cone = np.column_stack(
+        [half_diagonal * np.cos(azimuth), half_diagonal * np.sin(azimuth), np.ones(24)]
+    )
+    angles = [(a, math.radians(config.tilt_deg), yaw) for a in azimuth for yaw in azimuth[::2]]
+    reach = 0.0
+    for lab_from_body in Rotation.from_euler("ZYZ", angles):
+        met_m = surface.meet(
+            lab_from_body.apply(np.array(config.camera_m)), lab_from_body.apply(cone)
+        )
+        met_m = met_m[np.isfinite(met_m[:, 0])]
+        reach = max(reach, *np.arctan2(np.hypot(*met_m.T[:2]), met_m[:, 2]), 0.0)
+    return min(reach, math.radians(config.cap_deg)) or math.radians(config.cap_deg)
+
+
+@jit
+def has_room(site: int, without: int, chosen: Ints, sites_m: Floats, spacing_m: float) -> bool:
+    """Whether a site keeps the spacing to every LED except `without`."""
+    for n in range(len(chosen)):
+        distance2 = 0.0
+        for i in range(3):
+            distance2 += (sites_m[chosen[n], i] - sites_m[site, i]) ** 2
+        if n != without and distance2 < spacing_m**2:
+            return False
+    return True
+
+
+@jit
+def try_moves(
+    chosen: Ints,
+    sites_m: Floats,
+    visibility: Visibility,
+    attitude_count: int,
+    min_leds: int,
+    spacing_m: float,
+    moved: Ints,
+    target: Ints,
+) -> None:
+    """One trial per LED: moved[n] goes to site target[n] if there is room and the cost falls. In place in `chosen`."""
+    total = sum_information(chosen, visibility, attitude_count)
+    attitude_cost = costs(total, min_leds)
+    for n in range(len(moved)):
+        old = chosen[moved[n]]
+        new = target[n]
+        if old == new or not has_room(new, moved[n], chosen, sites_m, spacing_m):
+            continue
+        # Only attitudes that see the old or the new site change. The cost is a sum over attitudes, so the changes at
+        # the two sites add up: the second call finds attitudes that see both already up to date.
+        add_led(old, -1, visibility, total)
+        add_led(new, 1, visibility, total)
+        change_old = update_costs(old, visibility, total, attitude_cost, min_leds)
+        if change_old + update_costs(new, visibility, total, attitude_cost, min_leds) < 0:
+            chosen[moved[n]] = new
+        else:  # undo the move
+            add_led(new, -1, visibility, total)
+            add_led(old, 1, visibility, total)
+            update_costs(old, visibility, total, attitude_cost, min_leds)
+            update_costs(new, visibility, total, attitude_cost, min_leds)
+
+
+def spread(sites_m: Floats, spacing_m: float, count: int, bisections: int) -> Ints:
+    """Indices of `count` sites at the widest spacing at which `thin` finds that many, by bisection.
+
+    Fewer than `count` if even spacing_m does not leave room for them.
+    """
+    chosen = thin(sites_m, spacing_m, count)
+    low_m = spacing_m
+    high_m = float(np.ptp(sites_m, axis=0).max())
+    for _ in range(bisections):
+        middle_m = (low_m + high_m) / 2
+        wider = thin(sites_m, middle_m, count)
+        if len(wider) < count:
+            high_m = middle_m
+        else:
+            low_m = middle_m
+            chosen = wider
+    return chosen
+
+
+def thin(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
+    """Indices of sites taken in order, each if none taken before is within the spacing, to `count`.
+
+    This is random sequential adsorption where the sites are in random order.
+    """
+    tree = cKDTree(sites_m)
+    free = np.ones(len(sites_m), dtype=bool)
+    taken: list[int] = []
+    for site in range(len(sites_m)):
+        if free[site] and (count is None or len(taken) < count):
+            taken.append(site)
+            free[tree.query_ball_point(sites_m[site], spacing_m)] = False
+    return np.array(taken, dtype=np.int64)
+
+
+# Reduce the ambiguity between fields of view.
+
+
+def layout_ambiguity(config: layouts.OptimizedConfig, place_m: Floats) -> Ambiguity:
+    """Ambiguity of the layout (`ambiguity`), for a round field of the same area as the camera's."""
+    radius_rad = math.atan(math.sqrt(4 * float(np.prod(tan_half(config))) / math.pi))
+    assert config.camera_m is not None, "completed by the scene"
+    return field_ambiguity(
+        place_m, config.camera_m[2], math.radians(config.tilt_deg), radius_rad, config.coincidence_m
+    )
+
+
+def reduce_ambiguity(
+    scorer: PlacementScore, place_m: Floats, sites_m: Floats, rng: np.random.Generator
+) -> Floats:
+    """The layout after LEDs in ambiguous fields are moved to free sites nearby, where that reduces `excess_overlap`.
+
+    A field is ambiguous if more than `max_overlap` of its LEDs coincide with another field's. The worst variances may
+    rise by `variance_slack` in total, but not beyond those of the best even layout. Ambiguity that remains after
+    `ambiguity_trials` is accepted: with three LEDs in a field, two of them have a similar pair almost anywhere.
+    """
+    config = scorer.config
+    options = scorer.options
+    tree = cKDTree(sites_m)
+    ambiguity = layout_ambiguity(config, place_m)
+    tail = scorer.tail_variance(place_m)
+    under_two = scorer.under_two(place_m)
+    max_tail = max(tail, min(1.0, tail * (1 + options.variance_slack)))
+    for _ in range(options.ambiguity_trials):
+        ambiguous = np.flatnonzero(ambiguity.fraction > options.max_overlap)
+        if not len(ambiguous):
+            break
+        center_m = place_m[ambiguity.led[rng.choice(ambiguous)]]
+        central = cKDTree(place_m).query(center_m, k=min(options.central_leds, config.count))[1]
+        moved = rng.choice(central)
+        nearby = tree.query(place_m[moved], k=min(options.nearby_sites, len(sites_m)))[1]
+        trial_m = place_m.copy()
+        trial_m[moved] = sites_m[rng.choice(nearby)]
+        distance_m = np.linalg.norm(place_m - trial_m[moved], axis=1)
+        if np.delete(distance_m, moved).min() < config.spacing_m:
+            continue
+        # The move must reduce the ambiguity and must not leave more attitudes with fewer than two LEDs.
+        trial_ambiguity = layout_ambiguity(config, trial_m)
+        less_excess = excess_overlap(trial_ambiguity, options) < excess_overlap(ambiguity, options)
+        if not less_excess or scorer.under_two(trial_m) > under_two:
+            continue
+        if scorer.tail_variance(trial_m) <= max_tail:
+            place_m = trial_m
+            ambiguity = trial_ambiguity
+    return place_m
+
+
+def excess_overlap(ambiguity: Ambiguity, options: PlacementOptions) -> float:
+    """Sum over the fields of the overlap in excess of `max_overlap`."""
+    return float(np.maximum(ambiguity.fraction - options.max_overlap, 0).sum())

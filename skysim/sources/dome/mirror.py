@@ -1,0 +1,252 @@
+"""Mirror images of LEDs in the dome's wall, as lights at virtual places.
+
+A ray from the camera in the direction u meets the wall at Q, with the inward normal N, and goes on along
+
+    r = u - 2 (u . N) N .
+
+An LED at P is seen in the wall where P lies on that ray (the law of reflection, by which the path's length is
+stationary, as Fermat says: Alhazen's problem on a sphere). The LED's offset F = P - Q - ((P - Q) . r) r from the ray is
+brought to zero by Newton's method for the two angles of u, from all directions of a grid where the LED is nearest to
+the ray.
+
+A bundle of rays of the solid angle dOmega from the camera has the cross-section dA = |det dF / du| dOmega at the LED.
+By reciprocity a bundle from the LED spreads as much on its way to the camera. So the LED's image is as bright and, in
+area, as large as an LED at the distance
+
+    d = sqrt(dA / dOmega),
+
+seen under the angle at which the light leaves the LED: |Q - C| + |P - Q| for a flat wall. A curved wall stretches the
+image along one of two directions, at equal area; that is neglected.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.jit import jit
+from skysim.core.types import Floats, Sources
+from skysim.scene.sections.light import ReflectionConfig
+from skysim.sources.dome.surface import Surface, perpendicular
+from skysim.sources.satellites import MIRRORED
+
+STEP_RAD = 1e-5  # of the differences: error 1e-10
+STEPS = 12  # of Newton's method
+REACH = 12.0  # largest angle from an LED to a ray of the grid to start from, in the grid's spacing
+TOUCHING = 1e-4  # an image as near to the LED itself, in the camera's distance, is no reflection
+SAME_RAD = 1e-7  # images of an LED nearer to each other are one
+CLOSE = 1e-9  # of the distance: the largest offset from the ray of a solution
+
+
+class Rays(NamedTuple):
+    """N rays from the camera after their reflection: places on the wall, directions, cosines of the incidence."""
+
+    wall_m: Floats
+    along: Floats
+    cosine: Floats
+
+
+class Image(NamedTuple):
+    """K images: rows of their LEDs, directions from the camera, virtual distances, and cosines of the incidence.
+
+    Attributes
+    ----------
+    wall_m
+        (K, 3) where they are mirrored
+    along
+        (K, 3) from there toward the LED
+    """
+
+    led: NDArray[np.int64]
+    toward: Floats
+    distance_m: Floats
+    cosine: Floats
+    wall_m: Floats
+    along: Floats
+
+
+def mirrored(
+    config: ReflectionConfig, wall: Surface, leds: Sources, camera_m: Floats, grid: Floats
+) -> Sources:
+    """The images of the LEDs that the camera sees in the wall; their numbers are in `false_lights.MIRRORED`.
+
+    Images closer together than the grid's directions, near a caustic, can be missed. None for a camera outside.
+
+    Parameters
+    ----------
+    camera_m
+        (3,) the entrance pupil
+    grid
+        (h, w, 3) unit vectors that cover the field
+    """
+    if not wall.inside(camera_m):
+        return leds.take(np.zeros(0, np.int64))
+    images = find_images(wall, leds.place[:, :3], camera_m, grid)
+    sources = leds.take(images.led)
+    normal = wall.inward(images.wall_m) if len(images.led) else np.zeros((0, 3))
+    across = np.sum(sources.normal * normal, axis=1, keepdims=True)
+    place = np.column_stack(
+        [camera_m + images.toward * images.distance_m[:, None], np.ones(len(sources))]
+    )
+    return replace(
+        sources,
+        id=sources.id + MIRRORED * numbered(images.led),
+        place=place,
+        normal=sources.normal - 2 * across * normal,
+        strength=sources.strength * reflectance(config, images.cosine),
+    )
+
+
+def numbered(led: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(K,) the number of each image among those of its LED, from 1; the images of an LED follow each other."""
+    return np.arange(len(led)) - np.searchsorted(led, led) + 1
+
+
+def reflectance(config: ReflectionConfig, cosine: Floats) -> Floats:
+    """Share of the light that the wall mirrors at these cosines of the incidence: constant, or Fresnel's.
+
+    R = (r_s^2 + r_p^2) / 2, r_s = (cos i - n cos t) / (cos i + n cos t), r_p = (n cos i - cos t) / (n cos i + cos t).
+    """
+    n = config.refractive_index
+    if n is None:
+        return np.full(len(cosine), config.specular)
+    refracted = np.sqrt(1 - (1 - cosine**2) / n**2)
+    r_s = (cosine - n * refracted) / (cosine + n * refracted)
+    r_p = (n * cosine - refracted) / (n * cosine + refracted)
+    return np.asarray((r_s**2 + r_p**2) / 2)
+
+
+def find_images(wall: Surface, led_m: Floats, camera_m: Floats, grid: Floats) -> Image:
+    """All images of LEDs at (N, 3) in the directions of a grid (h, w, 3), in the LEDs' order."""
+    led, start = nearest_rays(wall, led_m, camera_m, grid)
+    toward = grid.reshape(-1, 3)[start]
+    for _ in range(STEPS):
+        offset, jacobian, axes = linearized(wall, led_m[led], camera_m, toward)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            step = -np.einsum("kij,kj->ki", inverse(jacobian), offset)
+        toward = toward + np.einsum("ki,kij->kj", np.clip(step, -0.1, 0.1), axes)
+        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    offset, jacobian, _ = linearized(wall, led_m[led], camera_m, toward)
+    rays = reflect(wall, camera_m, toward)
+    to_led = led_m[led] - rays.wall_m
+    far_m = np.linalg.norm(to_led, axis=1)
+    path_m = np.linalg.norm(rays.wall_m - camera_m, axis=1)
+    solved = (np.linalg.norm(offset, axis=1) < CLOSE * far_m) & (far_m > TOUCHING * path_m)
+    solved &= np.isfinite(wall.meet(camera_m, toward)[:, 0]) & (
+        np.sum(to_led * rays.along, axis=1) > 0
+    )
+    solved &= cosines_to_grid(toward, grid) > 0
+    distance_m = np.sqrt(np.abs(np.linalg.det(np.nan_to_num(jacobian))))
+    found = distinct(led, toward, solved & (distance_m > 0))
+    wall_m, along, cosine = (part[found] for part in rays)
+    return Image(led[found], toward[found], distance_m[found], cosine, wall_m, along)
+
+
+def distinct(
+    led: NDArray[np.int64], toward: Floats, solved: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    """Rows of the solutions, each once, sorted by LED and direction."""
+    rows = np.flatnonzero(solved)
+    rows = rows[np.lexsort([*np.round(toward[rows] / SAME_RAD).T, led[rows]])]
+    same = (np.diff(led[rows]) == 0) & (
+        np.linalg.norm(np.diff(toward[rows], axis=0), axis=1) < 3 * SAME_RAD
+    )
+    return rows[~np.concatenate([[False], same])] if len(rows) else rows
+
+
+def reflect(wall: Surface, camera_m: Floats, toward: Floats) -> Rays:
+    """Reflect rays from the camera at the wall, its rim ignored; NaN where they miss it."""
+    wall_m = camera_m + wall.exit_m(camera_m, toward)[:, None] * toward
+    normal = wall.inward(wall_m)
+    cosine = -np.sum(toward * normal, axis=1)
+    return Rays(wall_m, toward + 2 * cosine[:, None] * normal, cosine)
+
+
+def nearest_rays(
+    wall: Surface, led_m: Floats, camera_m: Floats, grid: Floats
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """LEDs (K,) and rays of the grid (K,), flat, at which the LED's angle from the reflected ray has a minimum."""
+    rays = reflect(wall, camera_m, grid.reshape(-1, 3))
+    spacing_rad = float(np.arccos(np.clip(np.sum(grid[1:] * grid[:-1], axis=2), -1, 1)).max())
+    limit = np.cos(min(REACH * spacing_rad, np.pi))
+    shape = (*grid.shape[:2], 3)
+    found = _minima(
+        np.ascontiguousarray(led_m), rays.wall_m.reshape(shape), rays.along.reshape(shape), limit
+    )
+    return found[:, 0], found[:, 1]
+
+
+@jit
+def _minima(led_m: Floats, wall_m: Floats, along: Floats, limit: float) -> Any:
+    """(K, 2) LED and ray of each largest cosine among a ray and its neighbors, above a limit."""
+    rows, columns = wall_m.shape[:2]
+    cosine = np.empty((rows, columns))
+    found = []
+    for n in range(len(led_m)):
+        for i in range(rows):
+            for j in range(columns):
+                square = 0.0
+                dot = 0.0
+                for k in range(3):
+                    offset = led_m[n, k] - wall_m[i, j, k]
+                    square += offset * offset
+                    dot += offset * along[i, j, k]
+                # NaN, a ray without a wall, is no maximum.
+                cosine[i, j] = dot / np.sqrt(square) if square > 0 and dot == dot else -1.0
+        for i in range(rows):
+            for j in range(columns):
+                if cosine[i, j] < limit:
+                    continue
+                largest = True
+                for y in range(max(i - 1, 0), min(i + 2, rows)):
+                    for x in range(max(j - 1, 0), min(j + 2, columns)):
+                        largest = largest and cosine[y, x] <= cosine[i, j]
+                if largest:
+                    found.append((n, i * columns + j))
+    out = np.empty((len(found), 2), np.int64)
+    for k in range(len(found)):
+        out[k, 0], out[k, 1] = found[k]
+    return out
+
+
+def linearized(
+    wall: Surface, led_m: Floats, camera_m: Floats, toward: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """(K, 2) offsets of LEDs (K, 3) from the reflected rays, across them, (K, 2, 2) their derivatives with respect to
+    two angles of the direction, and (K, 2, 3) the axes of these angles.
+    """
+    axes = axes_across(toward)
+    first, second = STEP_RAD * np.moveaxis(axes, 1, 0)
+    shifted = toward + np.stack([0 * toward, first, -first, second, -second])
+    shifted /= np.linalg.norm(shifted, axis=2, keepdims=True)
+    rays = reflect(wall, camera_m, shifted.reshape(-1, 3))
+    wall_m = rays.wall_m.reshape(shifted.shape)
+    along = rays.along.reshape(shifted.shape)
+    # The LEDs' offsets from the nearest points of the rays.
+    to_led = led_m - wall_m
+    offset = to_led - np.sum(to_led * along, axis=2, keepdims=True) * along
+    center, *ends = np.einsum("kij,skj->ski", axes_across(along[0]), offset)
+    columns = [(ends[0] - ends[1]) / (2 * STEP_RAD), (ends[2] - ends[3]) / (2 * STEP_RAD)]
+    return center, np.stack(columns, axis=2), axes
+
+
+def axes_across(unit: Floats) -> Floats:
+    """(K, 2, 3) two unit vectors perpendicular to each of these and to each other."""
+    first = perpendicular(unit)
+    return np.stack([first, np.cross(unit, first)], axis=1)
+
+
+def inverse(matrix: Floats) -> Floats:
+    """(K, 2, 2) inverses; infinite where there is none."""
+    (a, b), (c, d) = np.moveaxis(matrix, 0, 2)
+    return np.moveaxis(np.array([[d, -b], [-c, a]]) / (a * d - b * c), 2, 0)
+
+
+def cosines_to_grid(toward: Floats, grid: Floats) -> Floats:
+    """(K,) positive for directions within the cone about the grid's middle that holds all of it."""
+    middle = grid.reshape(-1, 3).mean(axis=0)
+    middle /= np.linalg.norm(middle)
+    return np.asarray(toward @ middle - (grid @ middle).min() * (1 - 1e-12))

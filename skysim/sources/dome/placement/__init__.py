@@ -1,1 +1,0 @@
-"""LED placement: Fisher information of the attitude, ambiguity between fields, and the search for the best layout."""

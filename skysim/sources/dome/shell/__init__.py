@@ -1,1 +1,0 @@
-"""The shell of the dome: its inner surface, measured or ideal, and the room that it must fit into."""

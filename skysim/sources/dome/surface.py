@@ -1,0 +1,521 @@
+"""The inside of the dome as a surface in the lab frame: ray intersection, normals, rim.
+
+Every surface is a level set f(x) = 0 in its own frame, f < 0 inside. The frame's origin is the surface's center; its
+axes are the lab's unless the surface is tilted. A ray from the inside meets the surface where f first becomes zero:
+in closed form for planes and quadrics (`exit_distance`), by safeguarded Newton steps for a radius over
+direction (`Radial`).
+SURFACES maps the scene's `light.surface.kind` to the function that builds the surface.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.scene.sections import light
+from skysim.sources.dome import point_cloud
+from skysim.sources.dome.point_cloud import FittedEllipsoid, fit_ellipsoid
+
+FLAT_RADIUS_M = 1e6  # of a sphere that is flat to a micrometer within a meter
+# of the samples to which an ellipsoid is fitted
+RINGS = 60
+SECTORS = 72
+MAX_STEPS = 200  # of the ray intersection
+SLACK_M = 1e-12  # rounding tolerance that keeps points on the rim within it
+
+
+@dataclass(frozen=True, slots=True)
+class Rim:
+    """Where a surface ends, in its own frame.
+
+    Attributes
+    ----------
+    bearing_m
+        (3,) the bearing's center before the surface was displaced
+    lowest_m
+        Height of the lowest point
+    half_rad
+        Greatest angle from the upright axis, seen from the bearing
+    """
+
+    bearing_m: Floats = field(default_factory=lambda: np.zeros(3))
+    lowest_m: float = -math.inf
+    half_rad: float = math.pi
+
+    @property
+    def unbounded(self) -> bool:
+        """Whether the surface has no end."""
+        return self.lowest_m == -math.inf and self.half_rad == math.pi
+
+    def contains(self, own_m: Floats) -> NDArray[np.bool_]:
+        """(N,) whether (N, 3) points in the surface's own frame are within the rim; False for NaN."""
+        from_bearing_m = own_m - self.bearing_m
+        slack = SLACK_M - np.cos(self.half_rad) * np.linalg.norm(from_bearing_m, axis=1)
+        return np.asarray(
+            (own_m[:, 2] >= self.lowest_m - SLACK_M) & (from_bearing_m[:, 2] + slack >= 0)
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Surface(ABC):
+    """A surface seen from inside: a level set, negative inside, in its own displaced and tilted frame.
+
+    Attributes
+    ----------
+    center_m
+        (3,) origin of its own frame, in the lab
+    rim
+        Where it ends
+    lab_from_own
+        Its tilt
+    survey_sigma_m
+        Standard deviation, along the normal, of the lab's survey of it
+    """
+
+    center_m: Floats
+    rim: Rim = field(default_factory=Rim, kw_only=True)
+    lab_from_own: Rotation = field(default_factory=Rotation.identity, kw_only=True)
+    survey_sigma_m: float = field(default=0.0, kw_only=True)
+
+    @abstractmethod
+    def level(self, own_m: Floats) -> Floats:
+        """(N,) level at (N, 3) points in its own frame: negative inside, zero on the surface."""
+
+    @abstractmethod
+    def gradient(self, own_m: Floats) -> Floats:
+        """(N, 3) gradient of the level at points of the surface, or a positive multiple of it."""
+
+    @abstractmethod
+    def distance(self, start_m: Floats, along: Floats) -> Floats:
+        """(N,) distance at which a ray from the inside leaves, in lengths of `along` (N, 3); NaN if it never does."""
+
+    def within(self, own_m: Floats) -> NDArray[np.bool_]:
+        """(N,) whether points of the level set belong to the surface."""
+        return self.rim.contains(own_m)
+
+    def meet(self, origin_m: Floats, rays: Floats) -> Floats:
+        """(N, 3) points where rays (N, 3) of any length leave the inside; NaN where they miss or pass below the rim."""
+        R_lab_from_own = self.lab_from_own.as_matrix()
+        # A rotation keeps lengths, so the distance along the ray is the same in both frames.
+        start = (origin_m - self.center_m) @ R_lab_from_own
+        along = rays @ R_lab_from_own
+        distance = self.distance(start, along)
+        within = self.within(start + distance[:, None] * along)
+        return np.asarray(origin_m + np.where(within, distance, np.nan)[:, None] * rays)
+
+    def exit_m(self, origin_m: Floats, rays: Floats) -> Floats:
+        """(N,) `distance` of rays in the lab's axes, to the surface or to where it would be beyond its rim."""
+        R_lab_from_own = self.lab_from_own.as_matrix()
+        return self.distance((origin_m - self.center_m) @ R_lab_from_own, rays @ R_lab_from_own)
+
+    def inward(self, points_m: Floats) -> Floats:
+        """(N, 3) unit normals toward the inside, at points of the surface: minus the level's gradient."""
+        R_lab_from_own = self.lab_from_own.as_matrix()
+        gradient = self.gradient((points_m - self.center_m) @ R_lab_from_own) @ R_lab_from_own.T
+        return np.asarray(-gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
+
+    def inside(self, point_m: Floats) -> bool:
+        """Whether a point of the lab, (3,), is inside; the rim is ignored."""
+        own = (point_m - self.center_m) @ self.lab_from_own.as_matrix()
+        return bool(self.level(own[None])[0] < 0)
+
+    def samples_m(self) -> Floats:
+        """(N, 3) points of the surface within its rim, on rings of equal solid angle as seen from the bearing."""
+        min_z = np.cos(min(self.rim.half_rad, np.pi / 2))
+        ring_z = 1 - (np.arange(RINGS) + 0.5) / RINGS * (1 - min_z)
+        sectors = np.arange(SECTORS) * (2 * np.pi / SECTORS)
+        z, azimuth = (grid.ravel() for grid in np.meshgrid(ring_z, sectors, indexing="ij"))
+        ring = np.sqrt(1 - z**2)
+        rays = self.lab_from_own.apply(
+            np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
+        )
+        met = self.meet(np.zeros(3), rays)
+        return met[np.isfinite(met[:, 0])]
+
+    def nearest_ellipsoid(self) -> FittedEllipsoid:
+        """The nearest ellipsoid: a least-squares fit to `samples_m`."""
+        return fit_ellipsoid(self.samples_m())
+
+    def as_ellipsoid(self) -> tuple[Floats, Floats]:
+        """Center and semi-axes, (3,) each, m, of the ellipsoid that estimators use, see `nearest_ellipsoid`."""
+        nearest = self.nearest_ellipsoid()
+        return nearest.center_m, nearest.semi_axes_m
+
+
+def perpendicular(unit: Floats) -> Floats:
+    """(N, 3) a unit vector perpendicular to each of these unit vectors, along the surface if they are normals."""
+    across = np.cross(unit, np.eye(3)[np.abs(unit).argmin(axis=1)])
+    return np.asarray(across / np.linalg.norm(across, axis=1, keepdims=True))
+
+
+def exit_distance(start: Floats, along: Floats) -> Floats:
+    """(N,) the greater root s > 0 of |start + s along| = 1; NaN where there is none.
+
+    With q = |b| + sqrt(b^2 - a c) the greater root is -c / q for b > 0 and q / a otherwise, free of cancellation.
+    """
+    # a s^2 + 2 b s + c = 0
+    a = np.sum(along**2, axis=1)
+    b = along @ start
+    c = start @ start - 1
+    discriminant = b**2 - a * c
+    q = np.abs(b) + np.sqrt(np.where((discriminant >= 0) & (a > 0), discriminant, np.nan))
+    q = np.where(q > 0, q, np.nan)
+    root = np.where(b > 0, -c / q, q / np.where(a > 0, a, np.nan))
+    return np.where(root > 0, root, np.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class Ellipsoid(Surface):
+    """sum((x / semi_axes)^2) = 1 in its own frame. A sphere has equal semi-axes."""
+
+    semi_axes_m: Floats
+
+    def level(self, own_m: Floats) -> Floats:
+        return np.asarray(np.sum((own_m / self.semi_axes_m) ** 2, axis=1) - 1)
+
+    def gradient(self, own_m: Floats) -> Floats:
+        return np.asarray(own_m / self.semi_axes_m**2)
+
+    def distance(self, start_m: Floats, along: Floats) -> Floats:
+        return exit_distance(start_m / self.semi_axes_m, along / self.semi_axes_m)
+
+    def nearest_ellipsoid(self) -> FittedEllipsoid:
+        """The ellipsoid itself; a fit if it is tilted and not a sphere."""
+        if self.lab_from_own.magnitude() > 0 and np.ptp(self.semi_axes_m) > 0:
+            return fit_ellipsoid(self.samples_m())
+        return FittedEllipsoid(self.center_m, self.semi_axes_m, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Plane(Surface):
+    """A panel at z = 0 in its own frame, seen from below.
+
+    Attributes
+    ----------
+    half_m
+        (2,) half its extent along its own x and y
+    """
+
+    half_m: Floats = field(default_factory=lambda: np.full(2, np.inf))
+
+    @property
+    def height_m(self) -> float:
+        """Height of its center above the bearing."""
+        return float(self.center_m[2])
+
+    def level(self, own_m: Floats) -> Floats:
+        return own_m[:, 2]
+
+    def gradient(self, own_m: Floats) -> Floats:
+        return np.tile([0.0, 0.0, 1.0], (len(own_m), 1))
+
+    def distance(self, start_m: Floats, along: Floats) -> Floats:
+        """As `Surface.distance`; NaN for rays that point down."""
+        distance = -start_m[2] / np.where(along[:, 2] > 0, along[:, 2], np.nan)
+        return np.where(distance > 0, distance, np.nan)
+
+    def within(self, own_m: Floats) -> NDArray[np.bool_]:
+        return np.asarray(np.all(np.abs(own_m[:, :2]) <= self.half_m + SLACK_M, axis=1))
+
+    def nearest_ellipsoid(self) -> FittedEllipsoid:
+        """A sphere so large that it is flat to a micrometer within a meter."""
+        up = self.lab_from_own.apply([0.0, 0.0, 1.0])
+        return FittedEllipsoid(self.center_m - FLAT_RADIUS_M * up, np.full(3, FLAT_RADIUS_M), 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Cylinder(Surface):
+    """sum((x_i / radius)^2) = 1 over the two axes i across, in its own frame.
+
+    Attributes
+    ----------
+    axis
+        0, 1, 2 for its own x, y, z
+    half_length_m
+        Half its extent along the axis
+    """
+
+    radius_m: float
+    axis: int
+    half_length_m: float = math.inf
+
+    def semi_axes_m(self, along_m: float = math.inf) -> Floats:
+        return np.where(np.arange(3) == self.axis, along_m, self.radius_m)
+
+    def level(self, own_m: Floats) -> Floats:
+        return np.asarray(np.sum((own_m / self.semi_axes_m()) ** 2, axis=1) - 1)
+
+    def gradient(self, own_m: Floats) -> Floats:
+        return np.asarray(own_m / self.semi_axes_m() ** 2)
+
+    def distance(self, start_m: Floats, along: Floats) -> Floats:
+        return exit_distance(start_m / self.semi_axes_m(), along / self.semi_axes_m())
+
+    def within(self, own_m: Floats) -> NDArray[np.bool_]:
+        inside_ends = np.abs(own_m[:, self.axis]) <= self.half_length_m + SLACK_M
+        return np.asarray(self.rim.contains(own_m) & inside_ends)
+
+    def nearest_ellipsoid(self) -> FittedEllipsoid:
+        """An ellipsoid so long that it is straight; a fit if the cylinder is tilted."""
+        if self.lab_from_own.magnitude() > 0:
+            return fit_ellipsoid(self.samples_m())
+        return FittedEllipsoid(self.center_m, self.semi_axes_m(FLAT_RADIUS_M), 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Shell:
+    """Inner radius of a formed wall: r = R - f t(angle), t linear from apex to base and constant beyond.
+
+    AFIT's design contour, 48.033 in at the apex and 48.010 in at 40 deg (Padro 2012, sec. 3.7), follows from its
+    0.2036 in and 0.25 in of acrylic about R = 48.135 in as the mid-wall radius. With R as the outer radius it does
+    not.
+
+    Attributes
+    ----------
+    max_m
+        R, the upper bound of the radius
+    cover_rad
+        Angle from the axis to which the radius is defined
+    inner_fraction
+        F, the part of the wall's thickness inside R: 1 if R is the outer radius, 1/2 if the
+        mid-wall's
+    """
+
+    max_m: float
+    inner_fraction: float
+    thickness_m: tuple[float, float]
+    base_rad: float
+    cover_rad: float = math.pi
+
+    def evaluate(self, unit: Floats) -> tuple[Floats, Floats]:
+        ring = np.hypot(unit[:, 0], unit[:, 1])
+        angle = np.arctan2(ring, unit[:, 2])
+        slope = -self.inner_fraction * (self.thickness_m[1] - self.thickness_m[0]) / self.base_rad
+        radius = (
+            self.max_m
+            - self.inner_fraction * self.thickness_m[0]
+            + slope * np.minimum(angle, self.base_rad)
+        )
+        # Unit vector toward greater angles; zero at the apex, where the law has no tangent.
+        tangent = np.column_stack(
+            [unit[:, :2] * (unit[:, 2] / np.where(ring > 0, ring, np.inf))[:, None], -ring]
+        )
+        return radius, np.where(angle < self.base_rad, slope, 0.0)[:, None] * tangent
+
+
+@dataclass(frozen=True, slots=True)
+class Radial(Surface):
+    """|x| = r(x / |x|) in its own frame: one radius in every direction from its center.
+
+    Attributes
+    ----------
+    fit
+        The measured points that it was fitted to, if any
+    """
+
+    radius: Shell | point_cloud.Zernike
+    fit: point_cloud.SurfaceFit | None = None
+
+    def level(self, own_m: Floats) -> Floats:
+        return self.level_and_gradient(own_m)[0]
+
+    def gradient(self, own_m: Floats) -> Floats:
+        return self.level_and_gradient(own_m)[1]
+
+    def level_and_gradient(self, own_m: Floats) -> tuple[Floats, Floats]:
+        """(N,) level |x| - r and (N, 3) its gradient x/|x| - (grad r - its part along x) / |x|."""
+        distance_m = np.linalg.norm(own_m, axis=1, keepdims=True)
+        distance_m = np.where(
+            distance_m > 0, distance_m, np.finfo(float).tiny
+        )  # avoids 0 / 0 at the center
+        unit = own_m / distance_m
+        radius, slope = self.radius.evaluate(unit)
+        across = slope - np.sum(slope * unit, axis=1, keepdims=True) * unit
+        return distance_m[:, 0] - radius, unit - across / distance_m
+
+    def within(self, own_m: Floats) -> NDArray[np.bool_]:
+        cosine = own_m[:, 2] - np.cos(self.radius.cover_rad) * np.linalg.norm(own_m, axis=1)
+        return np.asarray(self.rim.contains(own_m) & (cosine >= -SLACK_M))
+
+    def distance(self, start_m: Floats, along: Floats) -> Floats:
+        """Newton's method within a bracket: the level is negative at its low end and not negative at its high end.
+
+        The bracket ends on the sphere of the greatest radius. A step is a bisection if Newton's step would leave the
+        bracket or if the last step did not halve the level; so the iteration converges. Raises ArithmeticError if a
+        level larger than a few roundings remains. A ray leaves a convex inside only once; otherwise one of several
+        crossings is found.
+        """
+        low = np.zeros(len(along))
+        high = exit_distance(start_m / self.radius.max_m, along / self.radius.max_m)
+        if self.level(start_m[None])[0] >= 0:
+            return np.full(len(along), np.nan)
+        distance = high.copy()
+        before = np.full(len(along), np.inf)
+        for _ in range(MAX_STEPS):
+            level, gradient = self.level_and_gradient(start_m + distance[:, None] * along)
+            # Rays that have not converged; those that have keep their distance.
+            unconverged = np.abs(level) > 16 * np.finfo(float).eps * self.radius.max_m
+            if not unconverged.any():
+                return distance
+            low = np.where(level < 0, distance, low)
+            high = np.where(level > 0, distance, high)
+            slope = np.sum(gradient * along, axis=1)
+            step = distance - level / np.where(slope > 0, slope, np.nan)
+            newton = (step > low) & (step < high) & (np.abs(level) <= before / 2)
+            before = np.abs(level)
+            distance = np.where(unconverged, np.where(newton, step, (low + high) / 2), distance)
+        raise ArithmeticError(
+            f"no convergence on the surface for {unconverged.sum()} rays in {MAX_STEPS} steps"
+        )
+
+
+def pose_and_rim(config: light.SurfaceConfig, center_m: float) -> dict[str, Any]:
+    """Arguments common to all surfaces: center, rim, tilt, survey error. center_m is the height above the bearing."""
+    height_m = getattr(config, "rim_height_m", None)
+    half_deg = getattr(config, "rim_deg", None)
+    lowest_m = -math.inf if height_m is None else height_m - center_m
+    half_rad = math.pi if half_deg is None else math.radians(half_deg)
+    return {
+        "center_m": np.array([0.0, 0.0, center_m]) + config.offset_m,
+        "rim": Rim(np.array([0.0, 0.0, -center_m]), lowest_m, half_rad),
+        "lab_from_own": Rotation.from_euler("xy", config.tilt_deg, degrees=True),
+        "survey_sigma_m": config.error_m,
+    }
+
+
+def sphere(config: light.SphereSurfaceConfig) -> Surface:
+    """A sphere with its top at part.apex_m above the bearing, or the inner face of a formed wall."""
+    if config.wall is None:
+        return Ellipsoid(
+            semi_axes_m=np.full(3, config.radius_m),
+            **pose_and_rim(config, config.apex_m - config.radius_m),
+        )
+    thickness_m = (config.wall.thickness_apex_m, config.wall.thickness_base_m)
+    inner_fraction = {"outside": 1.0, "mid_wall": 0.5}[config.wall.radius_of]
+    shell = Shell(config.radius_m, inner_fraction, thickness_m, math.radians(config.wall.base_deg))
+    return Radial(
+        radius=shell,
+        **pose_and_rim(config, config.apex_m - config.radius_m + inner_fraction * thickness_m[0]),
+    )
+
+
+def ellipsoid(config: light.EllipsoidSurfaceConfig) -> Surface:
+    """An ellipsoid with its top at part.apex_m above the bearing."""
+    axes_m = np.array(config.semi_axes_m)
+    return Ellipsoid(semi_axes_m=axes_m, **pose_and_rim(config, config.apex_m - axes_m[2]))
+
+
+def flat(config: light.FlatSurfaceConfig) -> Surface:
+    """A panel with its center at part.apex_m above the bearing."""
+    size_m = [
+        math.inf if side_m is None else side_m for side_m in (config.width_m, config.height_m)
+    ]
+    return Plane(half_m=np.array(size_m) / 2, **pose_and_rim(config, config.apex_m))
+
+
+def cylinder(config: light.CylinderSurfaceConfig) -> Surface:
+    """A vault with its top line, or a drum with its upper edge, at part.apex_m above the bearing."""
+    half_m = math.inf if config.length_m is None else config.length_m / 2
+    below_m = half_m if config.axis == "z" else config.radius_m
+    pose = pose_and_rim(config, config.apex_m - below_m)
+    return Cylinder(
+        radius_m=config.radius_m, axis="xyz".index(config.axis), half_length_m=half_m, **pose
+    )
+
+
+def surveyed(config: light.SurveyedSurfaceConfig) -> Surface:
+    """A smooth surface fitted to measured points; tilted about the origin of the points. Raises InputError."""
+    fit = point_cloud.fit(point_cloud.read(config.file, config.unit), config.degree, config.file)
+    if fit.rms_m > config.rms_limit_m:
+        raise InputError(
+            "light.surface.file",
+            f"{config.file}: the points are {fit.rms_m:.3g} m rms off a smooth surface (worst {fit.max_residual_m:.3g}"
+            " m)",
+            f"rms_limit {config.rms_limit_m:g} m, a higher degree, another unit",
+        )
+    pose = pose_and_rim(config, 0.0)
+    # The surface's frame has its origin at the best sphere's center; the scene's tilt and rim refer to the points'.
+    pose["center_m"] = config.offset_m + pose["lab_from_own"].apply(fit.center_m)
+    pose["rim"] = Rim(-fit.center_m, pose["rim"].lowest_m - fit.center_m[2], pose["rim"].half_rad)
+    has_rim = config.rim_height_m is not None or config.rim_deg is not None
+    if has_rim and pose["rim"].contains(fit.edge_m()).any():
+        raise InputError(
+            "light.surface",
+            f"the points of {config.file} do not reach the rim",
+            f"a rim within {np.degrees(fit.radius.cover_rad):.2f} deg about their best sphere's center",
+        )
+    return Radial(radius=fit.radius, fit=fit, **pose)
+
+
+SURFACES: dict[str, Callable[[Any], Surface]] = {
+    "sphere": sphere,
+    "ellipsoid": ellipsoid,
+    "flat": flat,
+    "cylinder": cylinder,
+    "surveyed": surveyed,
+}
+
+
+def build_surface(config: light.SurfaceConfig) -> Surface:
+    """The surface that a scene describes.
+
+    Raises
+    ------
+    InputError
+        Unless the bearing's center is inside the surface and sees a part of it.
+    """
+    surface = SURFACES[config.kind](config)
+    if not surface.inside(np.zeros(3)):
+        check = "file, unit, offset" if config.kind == "surveyed" else "apex, sizes and offset"
+        place = "not below the panel" if isinstance(surface, Plane) else "outside of the dome"
+        raise InputError("light.surface", f"the bearing's center is {place}; check {check}")
+    if not len(surface.samples_m()):
+        raise InputError(
+            "light.surface", "no part of it is above the bearing; check rim, width, height, length"
+        )
+    return surface
+
+
+# Area of a dome's surface over a cap of directions from the bearing.
+
+
+AREA_RINGS = 200
+AREA_SECTORS = 180
+
+
+def cap_area_m2(surface: Surface, cap_deg: float) -> float:
+    """Area of a surface within an angle from the zenith, seen from the bearing, m^2; of a panel with sides all of it.
+
+    A cone of directions of solid angle dW about the unit vector u meets the surface at the distance r, where its inward
+    normal is n, in the area
+
+        dA = r^2 dW / -(u . n),
+
+    integrated over the cosine of the zenith angle by Gauss and Legendre's rule, and over the azimuth in equal steps,
+    which is exact to rounding for a smooth surface. Beyond a rim there is none, to one part in RINGS.
+    """
+    if isinstance(surface, Plane) and np.isfinite(surface.half_m).all():
+        return float(np.prod(2 * surface.half_m))
+    node, weight = np.polynomial.legendre.leggauss(AREA_RINGS)
+    least = np.cos(np.radians(cap_deg))
+    cosine = (1 + least) / 2 + (1 - least) / 2 * node
+    azimuth = np.arange(AREA_SECTORS) * (2 * np.pi / AREA_SECTORS)
+    z, angle = (grid.ravel() for grid in np.meshgrid(cosine, azimuth, indexing="ij"))
+    ring = np.sqrt(1 - z**2)
+    rays = np.column_stack([ring * np.cos(angle), ring * np.sin(angle), z])
+    place_m = surface.meet(np.zeros(3), rays)
+    met = np.isfinite(place_m[:, 0])
+    place_m = place_m[met]
+    rays = rays[met]
+    element_m2 = np.sum(place_m**2, axis=1) / -np.sum(rays * surface.inward(place_m), axis=1)
+    solid = np.repeat(weight, AREA_SECTORS)[met] * (1 - least) / 2 * (2 * np.pi / AREA_SECTORS)
+    return float(element_m2 @ solid)

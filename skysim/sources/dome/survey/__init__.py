@@ -1,1 +1,0 @@
-"""Survey of the dome: the positions that the tracker assumes, with the errors of the instrument."""

@@ -1,0 +1,255 @@
+"""Surveyed positions of LEDs, surface and camera, which the tracker assumes: the truth plus survey errors.
+
+The errors are drawn once, from their own seed (`tracker.survey.seed`), because a survey is a property of the hardware
+and not noise of a frame. Each kind of error has its own random stream, so adding one leaves the others unchanged.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.core.constants import ARCSEC_RAD, PPM
+from skysim.core.errors import InputError
+from skysim.core.random_streams import random_stream
+from skysim.core.tolerance import scaled_errors
+from skysim.core.types import Floats
+from skysim.scene.sections.tracker import SurveyErrorsConfig, TotalStationConfig
+from skysim.sources.dome.surface import Surface
+
+# Errors of a survey of LEDs by a total station: a horizontal direction, a zenith angle and a
+# distance to each.
+
+
+SETUP_ERRORS = 8  # centering 3, leveling 2, orientation, scale, zero point
+
+
+def polar(config: TotalStationConfig, place_m: Floats) -> tuple[Floats, Floats, Floats]:
+    """Horizontal direction from the lab's x toward its y and zenith angle, rad, and distance, m, (N,) each.
+
+    Raises
+    ------
+    InputError
+        For an LED at the station.
+    """
+    sight_m = place_m - np.array(config.position_m)
+    level_m = np.hypot(sight_m[:, 0], sight_m[:, 1])
+    distance_m = np.hypot(level_m, sight_m[:, 2])
+    if not np.all(distance_m > 0):
+        raise InputError(
+            "tracker.survey.instrument.position", "an LED is there", "a place away from the LEDs"
+        )
+    return np.arctan2(sight_m[:, 1], sight_m[:, 0]), np.arctan2(level_m, sight_m[:, 2]), distance_m
+
+
+def axes(direction_rad: Floats, zenith_rad: Floats) -> tuple[Floats, Floats, Floats]:
+    """Unit vectors u along the sight, v toward greater zenith angles, h toward greater directions, (N, 3) each."""
+    cos_h = np.cos(direction_rad)
+    sin_h = np.sin(direction_rad)
+    zero = np.zeros(len(direction_rad))
+    cos_v = np.cos(zenith_rad)
+    sin_v = np.sin(zenith_rad)
+    return (
+        np.column_stack([sin_v * cos_h, sin_v * sin_h, cos_v]),
+        np.column_stack([cos_v * cos_h, cos_v * sin_h, -sin_v]),
+        np.column_stack([-sin_h, cos_h, zero]),
+    )
+
+
+def setup_sigmas(config: TotalStationConfig) -> list[float]:
+    """Sizes of the common errors in SI units: place x, y, z; rotation about x, y, z; scale; zero point."""
+    level = config.leveling_sigma_arcsec
+    orientation = config.orientation_sigma_arcsec
+    return [
+        *3 * [config.centering_m],
+        level,
+        level,
+        orientation,
+        config.distance_ppm,
+        config.zero_sigma_m,
+    ]
+
+
+SETUP_UNITS = np.array([1, 1, 1, ARCSEC_RAD, ARCSEC_RAD, ARCSEC_RAD, PPM, 1])  # of setup_sigmas
+
+
+def draw_setup(config: TotalStationConfig, normal: Floats) -> Floats:
+    """(8,) errors of the set-up, SI units, from standard normal numbers (8,)."""
+    drawn = [
+        float(scaled_errors(sigma, one))
+        for sigma, one in zip(setup_sigmas(config), normal, strict=True)
+    ]
+    return np.array(drawn) * SETUP_UNITS
+
+
+def moved_m(config: TotalStationConfig, place_m: Floats, setup: Floats) -> Floats:
+    """(..., 3) places moved as a rigid body by the set-up's errors: station's place, leveling and orientation."""
+    station_m = np.array(config.position_m)
+    return np.asarray(
+        station_m + setup[:3] + Rotation.from_rotvec(setup[3:6]).apply(place_m - station_m)
+    )
+
+
+def surveyed_m(config: TotalStationConfig, place_m: Floats, own: Floats, setup: Floats) -> Floats:
+    """(N, 3) places in the lab that the survey yields for LEDs at place_m.
+
+    Parameters
+    ----------
+    own
+        (N, 3) standard normal numbers of each LED's direction, zenith angle and distance
+    setup
+        (8,) of `draw_setup`
+    """
+    direction_rad, zenith_rad, distance_m = polar(config, place_m)
+    angles_rad = ARCSEC_RAD * scaled_errors(config.angle_sigma_arcsec, own[:, :2])
+    distance_m = (
+        distance_m * (1 + setup[6]) + setup[7] + scaled_errors(config.distance_sigma_m, own[:, 2])
+    )
+    along, _, _ = axes(direction_rad + angles_rad[:, 0], zenith_rad + angles_rad[:, 1])
+    return moved_m(config, np.array(config.position_m) + distance_m[:, None] * along, setup)
+
+
+def station_covariance_m2(config: TotalStationConfig, place_m: Floats) -> Floats:
+    """(N, 3, 3) covariance of each LED's own error, in the lab."""
+    direction_rad, zenith_rad, distance_m = polar(config, place_m)
+    along, down, across = axes(direction_rad, zenith_rad)
+    angle_rad = ARCSEC_RAD * float(config.angle_sigma_arcsec)
+    scaled = np.stack(
+        [
+            float(config.distance_sigma_m) * along,
+            (distance_m * angle_rad)[:, None] * down,
+            (distance_m * np.sin(zenith_rad) * angle_rad)[:, None] * across,
+        ]
+    )
+    return np.einsum("kni,knj->nij", scaled, scaled)
+
+
+def station_displacements_m(config: TotalStationConfig, place_m: Floats) -> Floats:
+    """(M, N, 3) displacement of each LED by one standard deviation of each error of the set-up, without those of 0."""
+    sight_m = place_m - np.array(config.position_m)
+    unit = np.eye(3)
+    fields = [np.broadcast_to(axis, sight_m.shape) for axis in unit]
+    fields += [np.cross(axis, sight_m) for axis in unit]
+    fields += [sight_m, sight_m / np.linalg.norm(sight_m, axis=1, keepdims=True)]
+    sizes = np.array([float(sigma) for sigma in setup_sigmas(config)]) * SETUP_UNITS
+    chosen = [size * field for size, field in zip(sizes, fields, strict=True) if size]
+    return np.array(chosen).reshape(len(chosen), *place_m.shape)
+
+
+STREAM = {"leds": 1, "lever": 2, "surface": 3, "sights": 4, "setup": 5, "focal": 6}
+
+
+def standard_normals(seed: int, kind: str, shape: tuple[int, ...]) -> Floats:
+    """Standard normal numbers of that shape; they depend on the seed and the kind of error only."""
+    return random_stream(seed, STREAM[kind]).standard_normal(shape)
+
+
+def assumed_m(place_m: Floats, sigma_m: float, seed: int, kind: str) -> Floats:
+    """Surveyed places: the true ones (..., 3) plus an error of this size along each axis; unchanged for 0."""
+    return (
+        place_m + scaled_errors(sigma_m, standard_normals(seed, kind, place_m.shape))
+        if sigma_m
+        else place_m
+    )
+
+
+def surface_seed(config: SurveyErrorsConfig) -> int:
+    """Seed of the surface's survey error."""
+    return config.seed if config.surface_seed is None else config.surface_seed
+
+
+def rotate_survey(places_m: Floats, config: SurveyErrorsConfig) -> Floats:
+    """Surveyed places (..., 3) rotated by the orientation error of the survey's axes in the lab."""
+    if not any(config.rotation_deg):
+        return places_m
+    return Rotation.from_rotvec(config.rotation_deg, degrees=True).apply(places_m)
+
+
+def surface_offset_m(surface: Surface, seed: int) -> float:
+    """Offset of the surveyed surface, outward along the normal of the true one, of the size light.surface.error.
+
+    One draw for the whole surface (the arm's zero, its probe's radius). Independent errors of a thousand points
+    average out in a fitted ellipsoid.
+    """
+    return float(scaled_errors(surface.survey_sigma_m, standard_normals(seed, "surface", (1,)))[0])
+
+
+def assumed_leds_m(surface: Surface, place_m: Floats, config: SurveyErrorsConfig) -> Floats:
+    """(N, 3) surveyed LED places: independent errors, the surface's common offset and the rotation of the axes.
+
+    An instrument adds the errors of its sights and of its set-up.
+    """
+    offset_m = surface_offset_m(surface, surface_seed(config))
+    displaced_m = place_m - offset_m * surface.inward(place_m) if offset_m else place_m
+    if config.instrument is not None:
+        sights = standard_normals(config.seed, "sights", place_m.shape)
+        displaced_m = surveyed_m(config.instrument, displaced_m, sights, setup_errors(config))
+    return rotate_survey(assumed_m(displaced_m, config.led_sigma_m, config.seed, "leds"), config)
+
+
+def setup_errors(config: SurveyErrorsConfig) -> Floats:
+    """(8,) errors of the instrument's set-up, drawn."""
+    assert config.instrument is not None
+    drawn = standard_normals(config.seed, "setup", (SETUP_ERRORS,))
+    return draw_setup(config.instrument, drawn)
+
+
+def led_covariance_m2(place_m: Floats, config: SurveyErrorsConfig) -> Floats | None:
+    """(N, 3, 3) covariance of each LED's own error; None if it is that of led_sigma alone."""
+    if config.instrument is None:
+        return None
+    return station_covariance_m2(config.instrument, place_m) + config.led_sigma_m**2 * np.eye(3)
+
+
+def across_sigma_m(place_m: Floats, covariance_m2: Floats) -> Floats:
+    """(N,) standard deviation of LEDs across the line from the bearing, per axis, from their (N, 3, 3) covariances.
+
+    sigma^2 = (trace C - u' C u) / 2, u the direction from the bearing. The error along u hardly moves an image.
+    """
+    along = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
+    along_m2 = np.einsum("ni,nij,nj->n", along, covariance_m2, along)
+    return np.asarray(np.sqrt((np.trace(covariance_m2, axis1=1, axis2=2) - along_m2) / 2))
+
+
+def common_displacements_m(
+    surface: Surface, place_m: Floats, config: SurveyErrorsConfig
+) -> Floats | None:
+    """(M, N, 3) displacement of each LED by one standard deviation of each error that all share; None without any.
+
+    The survey error of the surface, along its normals, and the errors of the instrument's set-up.
+    """
+    fields = []
+    if surface.survey_sigma_m:
+        fields.append(-surface.survey_sigma_m * surface.inward(place_m)[None])
+    if config.instrument is not None:
+        fields.append(station_displacements_m(config.instrument, place_m))
+    joined = np.concatenate(fields) if fields else np.zeros((0, *place_m.shape))
+    return joined if len(joined) else None
+
+
+def assumed_ellipsoid(surface: Surface, config: SurveyErrorsConfig) -> tuple[Floats, Floats]:
+    """Center and semi-axes, (3,) each, m, of the surveyed ellipsoid: the nearest one, longer by `surface_offset_m`.
+
+    That displaces an ellipsoid by sum(a_i n_i^2) / sqrt(sum(a_i^2 n_i^2)) of the offset where the normal is n: by all
+    of it on the axes and on a sphere, and never by less than 2 sqrt(a b) / (a + b), a and b its longest and shortest
+    semi-axis. An instrument's set-up moves it as a rigid body. Raises InputError if a semi-axis is not positive.
+    """
+    center_m, semi_axes_m = surface.as_ellipsoid()
+    assumed_axes_m = semi_axes_m + surface_offset_m(surface, surface_seed(config))
+    if assumed_axes_m.min() <= 0:
+        raise InputError(
+            "light.surface.error",
+            f"{surface.survey_sigma_m:g} m makes an ellipsoid of {assumed_axes_m.min():.3g} m",
+            "far less than the dome",
+        )
+    if config.instrument is not None:
+        center_m = moved_m(config.instrument, center_m, setup_errors(config))
+    return rotate_survey(center_m, config), assumed_axes_m
+
+
+def assumed_focal_length_m(focal_length_m: float, config: SurveyErrorsConfig) -> float:
+    """The focal length that the tracker assumes: the true one plus its survey error."""
+    if not config.focal_length_sigma_m:
+        return focal_length_m
+    drawn = standard_normals(config.seed, "focal", (1,))
+    return focal_length_m + float(scaled_errors(config.focal_length_sigma_m, drawn)[0])

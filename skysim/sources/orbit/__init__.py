@@ -1,1 +1,0 @@
-"""Orbits around the Earth: that of the camera, satellites and their light, and the Earth in the way."""

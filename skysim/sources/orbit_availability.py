@@ -1,0 +1,138 @@
+"""How much of the time a star tracker in orbit can work: exclusion angles of Sun, Earth and Moon, and stars in view."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import erfa
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
+
+from skysim.core.constants import DAY_S, HOUR_S
+from skysim.core.time import tt_jd
+from skysim.core.types import Floats
+from skysim.scene.sections.surroundings import ExclusionConfig
+from skysim.sources.camera_orbit import CameraOrbit, limb_elevation_rad
+from skysim.sources.ephemeris import GcrsState, load_ephemeris
+
+CHUNK = 20_000  # times that are computed at once
+NODE_S = (
+    HOUR_S  # of the Sun's and the Moon's places, between which a cubic spline is right to 0.01"
+)
+
+Law = Literal["inertial", "zenith"]
+
+
+class Pointing(NamedTuple):
+    """The attitude law of the boresight.
+
+    Attributes
+    ----------
+    inertial
+        Toward `direction` (3,), ICRS axes
+    zenith
+        off_rad from the zenith, toward the azimuth around_rad from the flight direction, left
+        of it positive
+    """
+
+    law: Law
+    direction: Floats
+    off_rad: float = 0.0
+    around_rad: float = 0.0
+
+    def boresights(self, states: GcrsState) -> Floats:
+        """(K, 3) boresights in these states of the camera."""
+        if self.law == "inertial":
+            return np.broadcast_to(self.direction, states.position_m.shape)
+        up = unit(states.position_m)
+        left = unit(np.cross(states.position_m, states.velocity_m_s))
+        ahead = np.cross(left, up)
+        level = np.cos(self.around_rad) * ahead + np.sin(self.around_rad) * left
+        return np.asarray(np.cos(self.off_rad) * up + np.sin(self.off_rad) * level)
+
+
+class SkySamples(NamedTuple):
+    """What the tracker has about its boresight at K times.
+
+    Attributes
+    ----------
+    sun_deg, moon_deg
+        Angles from their centers
+    earth_deg
+        From the Earth's limb, negative on its disc
+    stars
+        Number of stars in the field that the Earth does not hide
+    """
+
+    t_s: Floats
+    sun_deg: Floats
+    earth_deg: Floats
+    moon_deg: Floats
+    stars: NDArray[np.int64]
+
+    def outside(self, exclusion: ExclusionConfig) -> dict[str, NDArray[np.bool_]]:
+        """(K,) whether the boresight is outside each body's exclusion angle, and whether there are enough stars."""
+        return {
+            "Sun": self.sun_deg > exclusion.sun_deg,
+            "Earth": self.earth_deg > exclusion.earth_deg,
+            "Moon": self.moon_deg > exclusion.moon_deg,
+            "stars": self.stars >= exclusion.stars,
+        }
+
+
+def sample(
+    orbit: CameraOrbit,
+    start: datetime.datetime,
+    t_s: Floats,
+    pointing: Pointing,
+    stars: Floats,
+    field_rad: float,
+    watch: Callable[[float, float], None] = lambda done, total: None,
+) -> SkySamples:
+    """Angles and stars at K times since the start.
+
+    Parameters
+    ----------
+    stars
+        (N, 3) directions of the stars that the tracker detects
+    field_rad
+        half-angle of a round field
+    """
+    tree = cKDTree(stars)
+    parts = list[SkySamples]()
+    places_m = {name: place_spline(name, start, float(t_s[-1])) for name in ("sun", "moon")}
+    for first in range(0, len(t_s), CHUNK):
+        times = t_s[first : first + CHUNK]
+        states = orbit.states(times)
+        boresight = pointing.boresights(states)
+        angles = {
+            name: erfa.sepp(place(times) - states.position_m, boresight)
+            for name, place in places_m.items()
+        }
+        limb = limb_elevation_rad(states.position_m, boresight)
+        seen = tree.query_ball_point(boresight, 2 * np.sin(field_rad / 2), return_length=True)
+        seen = np.where(limb > field_rad, seen, 0)
+        sun_deg, limb_deg, moon_deg = np.degrees([angles["sun"], limb, angles["moon"]])
+        parts.append(SkySamples(times, sun_deg, limb_deg, moon_deg, np.asarray(seen, np.int64)))
+        watch(first + len(times), len(t_s))
+    return SkySamples(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def place_spline(name: str, start: datetime.datetime, last_s: float) -> CubicSpline:
+    """A body's place (3,) from the Earth's center in m, by seconds since the start."""
+    ephemeris = load_ephemeris()
+    first_jd = tt_jd(start)
+    nodes_s = np.arange(-NODE_S, last_s + 2 * NODE_S, NODE_S)
+    dates = first_jd + nodes_s / DAY_S
+    earth_km = [ephemeris.position_km("earth", jd) for jd in dates]
+    body_km = [ephemeris.barycentric_km(name, jd) for jd in dates]
+    return CubicSpline(nodes_s, 1e3 * (np.array(body_km) - np.array(earth_km)))
+
+
+def unit(vectors: Floats) -> Floats:
+    """Normalized (K, 3) vectors."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

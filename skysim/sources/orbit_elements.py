@@ -1,0 +1,348 @@
+"""Mean elements of satellites from TLE and OMM files, and their places by SGP4.
+
+SGP4's theory and its constants (WGS 72) belong to the elements, which were fitted with it. Source: Hoots & Roehrich
+1980, Spacetrack Report No. 3; Vallado, Crawford, Hujsak & Kelso 2006, Revisiting Spacetrack Report #3 (AIAA 2006-6753),
+whose code the package `sgp4` compiles. Formats: CCSDS 502.0-B-3 (OMM).
+"""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import io
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import erfa
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BPoly
+
+from skysim.core.constants import DAY_S, EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M
+from skysim.core.errors import InputError, Where
+from skysim.core.text import (
+    TextSegment,
+    check_version,
+    excerpt,
+    keyword_value,
+    one_of,
+    read_lines,
+    seconds_since,
+    to_numbers,
+)
+from skysim.core.time import J2000_JD, SCALES, tt_jd, ut1_jd, utc_days
+from skysim.core.types import Floats
+
+MAX_SATELLITES = 100_000  # of a file
+REQUIRED = (
+    "NORAD_CAT_ID",
+    "EPOCH",
+    "MEAN_MOTION",
+    "ECCENTRICITY",
+    "INCLINATION",
+    "RA_OF_ASC_NODE",
+    "ARG_OF_PERICENTER",
+    "MEAN_ANOMALY",
+    "BSTAR",
+)
+# What SGP4 does not use: a message may lack it.
+OPTIONAL = {
+    "CLASSIFICATION_TYPE": "U",
+    "OBJECT_ID": "",
+    "EPHEMERIS_TYPE": "0",
+    "ELEMENT_SET_NO": "0",
+    "REV_AT_EPOCH": "0",
+    "MEAN_MOTION_DOT": "0",
+    "MEAN_MOTION_DDOT": "0",
+    "OBJECT_NAME": "",
+}
+EPOCH = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,6})?", re.ASCII)
+TLE_LENGTHS = 68, 69  # without and with the checksum
+
+
+class MeanElements(NamedTuple):
+    """N satellites: their catalog numbers, names, and SGP4's records."""
+
+    numbers: tuple[int, ...]
+    names: tuple[str, ...]
+    records: tuple[Any, ...]
+
+    def take(self, which: Iterable[int]) -> MeanElements:
+        """The chosen satellites."""
+        rows = list(which)
+        return MeanElements(*(tuple(column[n] for n in rows) for column in self))  # type: ignore[arg-type]
+
+
+def read_elements(path: str) -> MeanElements:
+    """The satellites of a file, told by its content: TLE, or OMM as CSV, XML or JSON. Raises InputError."""
+    lines = read_lines(Path(path))
+    if not lines:
+        raise InputError(path, "empty", "a TLE or an OMM")
+    text = "\n".join(line for _, line in lines)
+    if text[0] in "<[{" or "NORAD_CAT_ID" in lines[0][1]:
+        satellites = [
+            satellite(path, n, fields) for n, fields in enumerate(messages(path, text), 1)
+        ]
+    else:
+        satellites = list(read_tle(path, lines))
+    if not 0 < len(satellites) <= MAX_SATELLITES:
+        raise InputError(path, f"{len(satellites)} satellites", f"1 to {MAX_SATELLITES}")
+    return MeanElements(*map(tuple, zip(*satellites, strict=True)))
+
+
+def read_tle(path: str, lines: list[tuple[int, str]]) -> Iterator[tuple[int, str, Any]]:
+    """Number, name and record of each pair of lines, before which its name may be. Raises InputError."""
+    from sgp4.api import Satrec
+
+    rest = iter(lines)
+    for n, line in rest:
+        name = ""
+        if not line.startswith("1 ") or len(line) < TLE_LENGTHS[0]:
+            name = line.removeprefix("0 ").strip()
+            n, line = next(rest, (n, ""))
+        second = next(rest, (n, ""))[1]
+        pair = line[: TLE_LENGTHS[1]], second[: TLE_LENGTHS[1]]
+        for begin, one in zip("12", pair, strict=True):
+            if not one.startswith(f"{begin} ") or len(one) not in TLE_LENGTHS:
+                raise InputError(
+                    path, f"{excerpt(one)} is not line {begin} of a TLE", where=Where(path, n)
+                )
+            if len(one) == TLE_LENGTHS[1] and checksum(one) != one[-1]:
+                raise InputError(
+                    path,
+                    f"the checksum of line {begin} is {one[-1]}; it should be {checksum(one)}",
+                    where=Where(path, n),
+                )
+        try:
+            record = Satrec.twoline2rv(*pair)
+        except (ValueError, IndexError) as error:
+            raise InputError(path, f"not a TLE: {excerpt(error)}", where=Where(path, n)) from None
+        yield usable(path, n, name, record)
+
+
+def checksum(line: str) -> str:
+    """The last character of a line of a TLE: the sum of its digits, a minus counting 1, modulo 10."""
+    return str(sum(int(c) if c.isdigit() and c.isascii() else c == "-" for c in line[:68]) % 10)
+
+
+def messages(path: str, text: str) -> Iterator[Mapping[str, Any]]:
+    """The keywords of each message of OMMs. Raises InputError."""
+    from xml.etree import ElementTree
+
+    try:
+        if text[0] == "<":
+            for segment in ElementTree.fromstring(text).iter("segment"):
+                yield {leaf.tag: leaf.text for leaf in segment.iter() if not len(leaf)}
+        elif text[0] in "[{":
+            tree = json.loads(text)
+            for fields in tree if isinstance(tree, list) else [tree]:
+                yield fields if isinstance(fields, dict) else {}
+        else:
+            yield from csv.DictReader(io.StringIO(text))
+    except (ElementTree.ParseError, ValueError, csv.Error, RecursionError) as error:
+        raise InputError(path, f"not an OMM: {excerpt(error)}") from None
+
+
+def satellite(path: str, n: int, fields: Mapping[str, Any]) -> tuple[int, str, Any]:
+    """Number, name and record of the n-th message. Raises InputError."""
+    from sgp4 import omm
+    from sgp4.api import Satrec
+
+    record = Satrec()
+    texts = {key: str(value) for key, value in fields.items() if value not in (None, "")}
+    missing = [key for key in REQUIRED if key not in texts]
+    if missing:
+        raise InputError(path, f"{missing[0]} is missing", where=Where(path, n, "message"))
+    epoch = texts["EPOCH"].rstrip("Z")
+    if not EPOCH.fullmatch(epoch):
+        raise InputError(
+            path,
+            f"EPOCH {excerpt(epoch)}",
+            "2012-06-22T21:00:00.123456",
+            where=Where(path, n, "message"),
+        )
+    try:
+        omm.initialize(
+            record, {**OPTIONAL, **texts, "EPOCH": epoch if "." in epoch else f"{epoch}.0"}
+        )
+    except (ValueError, OverflowError) as error:
+        raise InputError(path, excerpt(error), where=Where(path, n, "message")) from None
+    return usable(path, n, texts.get("OBJECT_NAME", ""), record)
+
+
+def usable(path: str, n: int, name: str, record: Any) -> tuple[int, str, Any]:
+    """Number, name and record. Raises InputError for elements that SGP4 refuses at their own epoch."""
+    from sgp4.api import SGP4_ERRORS
+
+    error, place_km, _ = record.sgp4(record.jdsatepoch, record.jdsatepochF)
+    if error or not np.isfinite(place_km).all():
+        what = SGP4_ERRORS.get(error, "elements that are not numbers")
+        raise InputError(
+            path, f"SGP4 refuses these elements: {what}", where=Where(path, n, "satellite")
+        )
+    return int(record.satnum), name or str(record.satnum), record
+
+
+def age_days(elements: MeanElements, time: datetime.datetime) -> Floats:
+    """(N,) days from the elements' epochs to a time; SGP4's error grows by 1 to 3 km a day in low orbits."""
+    epochs = [record.jdsatepoch - J2000_JD + record.jdsatepochF for record in elements.records]
+    return utc_days(time) - np.array(epochs)
+
+
+def gcrs_states(
+    elements: MeanElements, time: datetime.datetime, after_s: Floats
+) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    """Positions (N, K, 3) in m and velocities in m/s in GCRS axes at K times after a time, and SGP4's errors (N, K)."""
+    from sgp4.api import SatrecArray
+
+    # In one number with the Julian date a satellite would be off by 0.3 m.
+    days = utc_days(time) + np.asarray(after_s, float) / DAY_S
+    errors, place_km, velocity_km_s = SatrecArray(list(elements.records)).sgp4(
+        np.full(len(days), J2000_JD), days
+    )
+    matrix = gcrs_from_teme(time)
+    return 1e3 * place_km @ matrix.T, 1e3 * velocity_km_s @ matrix.T, errors.astype(np.int64)
+
+
+@lru_cache(maxsize=64)
+def gcrs_from_teme(time: datetime.datetime) -> Floats:
+    """(3, 3) matrix to GCRS axes from SGP4's true equator and mean equinox.
+
+    TEME and the axes that turn with the Earth differ by Greenwich mean sidereal time of 1982 about the pole, and those
+    differ from the celestial intermediate system by the Earth rotation angle; the latter follows by precession and
+    nutation of IAU 2006/2000A. Source: Vallado et al. 2006, appendix C; IERS Conventions 2010, chapter 5.
+    """
+    ut1 = ut1_jd(time)
+    angle = erfa.gmst82(ut1, 0.0) - erfa.era00(ut1, 0.0)
+    return np.asarray(erfa.c2i06a(tt_jd(time), 0.0).T @ erfa.rz(angle, np.eye(3)))
+
+
+# Positions and velocities from a CCSDS Orbit Ephemeris Message (OEM) in keyword = value notation.
+
+
+VERSION = "CCSDS_OEM_VERS"
+VERSIONS = ("1.0", "2.0", "3.0")
+FRAMES = ("ICRF", "GCRF", "EME2000", "J2000")
+OEM_REQUIRED = ("CENTER_NAME", "REF_FRAME", "TIME_SYSTEM")
+SAME_M = 1.0  # of a sample that both of two adjoining segments have
+KEYWORDS = ("META_START", "META_STOP", "COVARIANCE_START", "COVARIANCE_STOP")
+
+
+class OrbitEphemeris(NamedTuple):
+    """Samples of an orbit in GCRS axes.
+
+    Attributes
+    ----------
+    t_s
+        (N,) since the scene's start, strictly increasing
+    path
+        A polynomial of the fifth degree between two samples, of their positions, velocities and
+        accelerations
+    """
+
+    source: str
+    t_s: Floats
+    path: BPoly
+
+    def at(self, after_s: Floats) -> tuple[Floats, Floats]:
+        """Positions (K, 3) in m and velocities in m/s. Raises InputError outside the samples."""
+        first, last = self.t_s[[0, -1]]
+        if after_s.min() < first or after_s.max() > last:
+            worst = after_s.min() if after_s.min() < first else after_s.max()
+            raise InputError(
+                "orbit.file",
+                f"{self.source} is from {first:.6g} to {last:.6g} s after start_time, not at {worst:.6g} s",
+            )
+        return self.path(after_s), self.path.derivative()(after_s)
+
+
+def read_oem(path: str, start: datetime.datetime) -> OrbitEphemeris:
+    """The orbit of an OEM. Raises InputError.
+
+    Without accelerations in the file, those of gravity with J2 are taken. The error between two samples of a low orbit
+    is 1 mm at a step of 2 min and 0.2 m at 5 min.
+    """
+    segments = split_segments(path)
+    if not segments:
+        raise InputError(
+            path, "no segment", "META_START ... META_STOP, then lines of an epoch and numbers"
+        )
+    parts = [segment_samples(path, segment, start) for segment in segments]
+    t_s, samples = parts[0]
+    for t, more in parts[1:]:
+        if t[0] == t_s[-1] and np.linalg.norm(more[0, :3] - samples[-1, :3]) < SAME_M:
+            t = t[1:]
+            more = more[1:]
+        t_s = np.concatenate([t_s, t])
+        samples = np.concatenate([samples, more])
+    if len(t_s) < 2 or (np.diff(t_s) <= 0).any():
+        raise InputError(path, f"the epochs of {len(t_s)} samples", "two or more, in order of time")
+    missing = np.isnan(samples[:, 6])
+    samples[missing, 6:] = gravity_m_s2(samples[missing, :3])
+    return OrbitEphemeris(path, t_s, BPoly.from_derivatives(t_s, samples.reshape(-1, 3, 3)))
+
+
+def gravity_m_s2(position_m: Floats) -> Floats:
+    """(N, 3) acceleration by the Earth's mass and J2 at (N, 3). Source: Vallado 2013, section 8.7.1."""
+    r = np.linalg.norm(position_m, axis=1, keepdims=True)
+    flattened = 1.5 * EARTH_J2 * (EARTH_RADIUS_M / r) ** 2
+    polar = 5 * (position_m[:, 2:] / r) ** 2
+    factors = 1 + flattened * (np.array([1.0, 1.0, 3.0]) - polar)
+    return np.asarray(-EARTH_MU_M3_S2 / r**3 * position_m * factors)
+
+
+def split_segments(path: str) -> list[TextSegment]:
+    """The segments of a message. Raises InputError for a line out of place."""
+    version = ""
+    segments = list[TextSegment]()
+    section = ""
+    for n, line in read_lines(Path(path)):
+        word = line.split(maxsplit=1)[0]
+        if word == "COMMENT":
+            continue
+        if word in KEYWORDS:
+            section = word
+            if word == "META_START":
+                segments.append(TextSegment({}, []))
+            elif not segments:
+                raise InputError(path, f"{word} before META_START", where=Where(path, n))
+        elif section in ("", "META_START"):
+            key, value = keyword_value(path, n, line)
+            if section:
+                segments[-1].metadata[key] = (n, value)
+            elif key == VERSION:
+                version = value
+        elif section == "META_STOP":
+            segments[-1].data.append((n, line.split()))
+    check_version(path, VERSION, version, VERSIONS)
+    return segments
+
+
+def segment_samples(
+    path: str, segment: TextSegment, start: datetime.datetime
+) -> tuple[Floats, Floats]:
+    """Times (N,) and positions, velocities, accelerations (N, 9) of a segment, SI, GCRS axes. Raises InputError."""
+    metadata = segment.metadata
+    segment.require(path, OEM_REQUIRED)
+    frame = one_of(path, metadata, "REF_FRAME", FRAMES)
+    one_of(path, metadata, "CENTER_NAME", ("EARTH",))
+    system = one_of(path, metadata, "TIME_SYSTEM", SCALES)
+    if not segment.data:
+        raise InputError(
+            path, "a segment without data", "lines of an epoch, a position and a velocity"
+        )
+    lines = [n for n, _ in segment.data]
+    rows = [words[1:] for _, words in segment.data]
+    width = 9 if len(rows[0]) == 9 else 6
+    numbers = 1e3 * to_numbers(path, lines, rows, width)
+    t_s = seconds_since(path, lines, [words[0] for _, words in segment.data], start, system)
+    if width == 6:
+        numbers = np.column_stack([numbers, np.full((len(numbers), 3), np.nan)])
+    if frame in ("EME2000", "J2000"):
+        bias, _, _ = erfa.bp06(J2000_JD, 0.0)
+        numbers = (numbers.reshape(-1, 3) @ bias).reshape(-1, 9)
+    return t_s, numbers

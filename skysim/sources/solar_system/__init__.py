@@ -1,1 +1,0 @@
-"""Sun, Moon and planets: places, magnitudes and discs."""

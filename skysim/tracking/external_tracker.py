@@ -1,0 +1,174 @@
+"""Adapter for an external star tracker in its own process; it gets the same set-up and frames as skysim's own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.dome_map import LedMap, Lever
+from estimator.catalog.catalog import StarCatalog
+from estimator.core.camera import Camera
+from estimator.core.types import Attitude, Centroids
+from estimator.trackers.pipeline import Report, Settings
+from skysim.core.errors import InputError
+from skysim.core.plugins import ProgramError, describe_error, host_command
+from skysim.core.types import Floats, Frame
+from skysim.scene import scene as scenes
+from skysim.scene.sections.light import StarsConfig
+from skysim.tracking import tracker_interface
+from skysim.tracking.tracker_interface import (
+    FAILED,
+    OWN,
+    SOLVED,
+    TRACKERS,
+    Answer,
+    Leds,
+    Picture,
+    Setup,
+    Stars,
+    check_answer,
+)
+
+
+class ExternalTracker:
+    """A tracker in its own process. Every failure there becomes the status of a frame."""
+
+    def __init__(self, program: tracker_interface.TrackerProgram) -> None:
+        self.program = program
+
+    @classmethod
+    def start(
+        cls,
+        scene: scenes.Scene,
+        camera: Camera,
+        settings: Settings,
+        lights: Stars | Leds,
+        commands: Mapping[str, str],
+    ) -> ExternalTracker:
+        """Start the tracker that the scene names. Raises InputError if it is unknown or refuses the set-up."""
+        config = scene.tracker
+        name = scene.tracker.name
+        TRACKERS.check_name(name, commands)
+        setup = build_setup(scene, camera, settings, lights)
+        if name in commands:
+            arguments, image_format = tracker_interface.split_command(name, commands[name])
+            return cls(
+                tracker_interface.TrackerProgram(
+                    name, arguments, image_format, setup, config.time_limit_s
+                )
+            )
+        host, environment = host_command("skysim.tracking.tracker_host", name)
+        return cls(
+            tracker_interface.TrackerProgram(
+                name, host, None, setup, config.time_limit_s, environment
+            )
+        )
+
+    def solve_frame(self, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
+        """Send a frame; return the tracker's report."""
+        picture = Picture(frame.image_dn, frame.index, frame.t_mid_s, frame.exposure_s, streak_px)
+        try:
+            return to_report(self.program.solve(picture))
+        except ProgramError as error:
+            return Report(Attitude(f"{FAILED}{error}"), Centroids.empty())
+
+    def solve_centroids(self, centroids: Centroids) -> Attitude:
+        """Not supported by external trackers. Raises InputError."""
+        raise InputError("tracker.name", f"{self.program.name} solves frames, not centroids", OWN)
+
+
+def build_setup(
+    scene: scenes.Scene, camera: Camera, settings: Settings, lights: Stars | Leds
+) -> Setup:
+    """The set-up sent to the tracker: the same assumed hardware as skysim's own tracker gets."""
+    return Setup(
+        "icrs" if isinstance(scene.light, StarsConfig) else "lab",
+        scene.start_time.isoformat(),
+        camera.width_px,
+        camera.height_px,
+        camera.focal_px,
+        camera.center_px,
+        camera.distortion,
+        settings.gain_e_dn,
+        settings.saturation,
+        scene.seed,
+        lights if isinstance(lights, Stars) else None,
+        lights if isinstance(lights, Leds) else None,
+        dict(scene.tracker.options),
+    )
+
+
+def star_map(catalog: StarCatalog, direction: Floats) -> Stars:
+    """The on-board catalog."""
+    return Stars(catalog.id, direction, catalog.v_mag)
+
+
+def led_map(leds: LedMap, lever: Lever) -> Leds:
+    """The dome map and the camera's mounting."""
+    return Leds(leds.id, leds.position_m, lever.camera_body_m, lever.cam_from_body.as_quat())
+
+
+def to_report(answer: Answer) -> Report:
+    """Convert a checked answer to a Report. External trackers do not say which star is which."""
+    xy_px = answer.centroids_px
+    unmeasured = np.full(len(xy_px), np.nan)
+    seconds = {} if answer.seconds is None else {"solve": answer.seconds}
+    quaternion = answer.cam_from_ref_xyzw
+    attitude = Attitude(
+        answer.status,
+        None if quaternion is None else Rotation.from_quat(quaternion),
+        answer.covariance_rad2,
+    )
+    return Report(attitude, Centroids(xy_px, unmeasured, unmeasured), seconds)
+
+
+# A Python function as a star tracker: in this process, from a frame's image to an attitude.
+
+
+NO_ATTITUDE = "no attitude"  # status where the function returned None
+
+
+class FunctionTracker:
+    """A tracker that is a function. Every failure there becomes the status of a frame.
+
+    Attributes
+    ----------
+    function
+        Takes the image (H, W) and returns an Answer, the attitude cam_from_ref as a Rotation or
+        as a unit quaternion (4,) scalar last, or None for no attitude
+    """
+
+    def __init__(self, name: str, function: Callable[[NDArray[Any]], Any]) -> None:
+        self.name = name
+        self.function = function
+
+    def solve_frame(self, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
+        """The tracker's report on a frame; the function gets a copy of its image."""
+        begin_s = time.perf_counter()
+        try:
+            answer = check_answer(to_answer(self.function(np.array(frame.image_dn))))
+        except Exception as error:
+            return Report(Attitude(f"{FAILED}{describe_error(error)}"), Centroids.empty())
+        report = to_report(answer)
+        report.seconds.setdefault("solve", time.perf_counter() - begin_s)
+        return report
+
+    def solve_centroids(self, centroids: Centroids) -> Attitude:
+        """Not supported: a function takes an image. Raises InputError."""
+        raise InputError("tracker.name", f"{self.name} solves frames, not centroids", OWN)
+
+
+def to_answer(value: Any) -> Any:
+    """What a function may return, as an Answer; other values unchanged, for `check_answer` to refuse."""
+    if value is None:
+        return Answer(NO_ATTITUDE)
+    if isinstance(value, Rotation):
+        return Answer(SOLVED, value.as_quat())
+    if isinstance(value, np.ndarray | list | tuple):
+        return Answer(SOLVED, value)
+    return value

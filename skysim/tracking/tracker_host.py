@@ -1,0 +1,72 @@
+"""The process in which an entry point's tracker runs: `python -m skysim.tracking.tracker_host NAME`.
+
+It speaks the protocol of docs/howto/external_tracker.md.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import replace
+from functools import partial
+from typing import IO, Any
+
+import numpy as np
+
+from skysim.core.plugins import Respond, describe_error, serve
+from skysim.tracking.tracker_interface import (
+    FAILED,
+    TRACKERS,
+    Answer,
+    Picture,
+    Setup,
+    Tracker,
+    check_answer,
+)
+
+
+def receive_picture(header: dict[str, Any], frames: IO[bytes]) -> Picture:
+    """Read the pixels of a frame whose header has been read."""
+    count = header["bytes"]
+    image = np.frombuffer(frames.read(count), header["dtype"]).reshape(
+        header["height_px"], header["width_px"]
+    )
+    streak = header["streak_px"]
+    fields = (header["frame"], header["t_s"], header["exposure_s"])
+    return Picture(image, *fields, None if streak is None else tuple(streak))
+
+
+def solve_picture(tracker: Tracker, picture: Picture) -> Answer:
+    """The tracker's answer; an exception or an invalid answer becomes an answer with status "failed: ..."."""
+    begin_s = time.perf_counter()
+    try:
+        answer = tracker.solve(picture)
+        spent_s = time.perf_counter() - begin_s
+        return replace(check_answer(answer), seconds=spent_s)
+    except Exception as error:
+        return Answer(check_answer(Answer(FAILED + describe_error(error))).status)
+
+
+def create_tracker(name: str, setup: Setup) -> Tracker:
+    """Load an entry point and build its tracker."""
+    tracker = TRACKERS.entry_points()[name].load()(setup)
+    if not callable(getattr(tracker, "solve", None)):
+        raise TypeError(f"{type(tracker).__name__} has no method solve")
+    return tracker
+
+
+def create(name: str, setup: dict[str, Any]) -> Respond:
+    """The function that answers frames, for `serve`."""
+    tracker = create_tracker(name, Setup.of_tree(setup))
+
+    def respond(header: dict[str, Any], frames: IO[bytes]) -> dict[str, Any]:
+        return {
+            "frame": header["frame"],
+            **solve_picture(tracker, receive_picture(header, frames)).as_tree(),
+        }
+
+    return respond
+
+
+if __name__ == "__main__":
+    serve(partial(create, sys.argv[1]))

@@ -1,0 +1,448 @@
+"""The interface for external star trackers: set-up, frame, answer, and discovery by entry points `skysim.trackers`.
+
+An entry point names a callable that makes a `Tracker` from a `Setup`. It runs in its own process, so that a hang or
+a crash there becomes a failed answer and does not end the run; docs/howto/external_tracker.md has examples.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError, printable
+from skysim.core.plugins import (
+    FOLDER,
+    MAX_STATUS_CHARS,
+    PluginKind,
+    Program,
+    ProgramError,
+    finite_array,
+    to_lists,
+)
+from skysim.dynamics.controllers import CONTROLLERS
+
+OWN = "own"  # the name of skysim's own estimator
+TRACKERS = PluginKind("tracker", "skysim.trackers", "tracker.name", (OWN,))
+SOLVED = "solved"
+FAILED = "failed: "  # start of the status after an exception, hang, crash or invalid answer
+PROTOCOL = 1  # version, the first key of the set-up
+UNIT_TOLERANCE = 1e-3  # of a quaternion's norm: single precision passes and is normalized
+MAX_RAD2 = (2 * np.pi) ** 2  # largest eigenvalue of a covariance: no information
+EXTRAS = {
+    "skysim.tracking.tetra3rs:Tetra3rs": ("tetra3rs", "oracle")
+}  # module and extra of the trackers in our own package
+MIN_RAD2 = 1e-24  # smallest eigenvalue: (0.2 micro-arcseconds)^2
+MAX_CENTROIDS = 100_000
+MAX_CENTROID_PX = 1e6  # distance from the first pixel along x and y
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Stars:
+    """The star catalog given to the tracker, brightest first.
+
+    (proper motion, parallax, aberration); magnitude : (N,) V
+
+    Attributes
+    ----------
+    id
+        (N,) Hipparcos numbers; direction : (N, 3) apparent unit vectors in the reference frame
+        at the scene's date
+    """
+
+    id: NDArray[np.int64]
+    direction: Floats
+    magnitude: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Leds:
+    """The surveyed dome. The vehicle rotates about the lab's origin; the camera is offset from it.
+
+    Attributes
+    ----------
+    id
+        (N,); position_m : (N, 3) in the lab
+    camera_body_m
+        (3,) entrance pupil in body axes; cam_from_body_xyzw : (4,) body axes to camera axes
+    """
+
+    id: NDArray[np.int64]
+    position_m: Floats
+    camera_body_m: Floats
+    cam_from_body_xyzw: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What a tracker gets before the first frame: the hardware as the scene's tracker assumes it.
+
+    Attributes
+    ----------
+    reference
+        Frame of the attitudes: "icrs" under the stars, "lab" under a dome or on a bench
+    time_utc
+        ISO 8601, when t_s is 0
+    width_px, height_px, focal_px, center_px
+        A pinhole in camera axes, +x right, +y down, +z boresight; the center of the first pixel
+        is (0, 0)
+    distortion
+        k1, k2, p1, p2, k3 of Brown and Conrady, in OpenCV's order
+    stars, leds
+        The map; one of them is None
+    seed
+        For a tracker that draws random numbers
+    options
+        The scene's `tracker.options`
+    """
+
+    reference: Literal["icrs", "lab"]
+    time_utc: str
+    width_px: int
+    height_px: int
+    focal_px: float
+    center_px: tuple[float, float]
+    distortion: tuple[float, float, float, float, float]
+    gain_e_dn: float
+    saturation_dn: float
+    seed: int
+    stars: Stars | None = None
+    leds: Leds | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def as_tree(self) -> dict[str, Any]:
+        """As a JSON object; arrays become lists."""
+        tree: dict[str, Any] = to_lists(asdict(self))
+        return {"skysim_tracker": PROTOCOL, **tree}
+
+    @classmethod
+    def of_tree(cls, tree: Mapping[str, Any]) -> Self:
+        """The inverse of `as_tree`."""
+        values = {name: value for name, value in tree.items() if name != "skysim_tracker"}
+        for name, map_type in (("stars", Stars), ("leds", Leds)):
+            if values[name] is not None:
+                values[name] = map_type(
+                    **{key: np.array(value) for key, value in values[name].items()}
+                )
+        values["center_px"], values["distortion"] = (
+            tuple(values["center_px"]),
+            tuple(values["distortion"]),
+        )
+        return cls(**values)
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """One frame as a tracker gets it.
+
+    Attributes
+    ----------
+    image_dn
+        (height_px, width_px), uint16; float64 from a camera without noise
+    frame
+        Its number; t_s : mid-exposure since the scene's start; exposure_s
+    streak_px
+        (dx, dy) that lights move in the exposure, if a gyro measures it; else None
+    """
+
+    image_dn: NDArray[Any]
+    frame: int
+    t_s: float
+    exposure_s: float
+    streak_px: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A tracker's solution of a frame.
+
+    Attributes
+    ----------
+    status
+        "solved", or why there is no attitude
+    cam_from_ref_xyzw
+        (4,) unit quaternion, scalar last: v_cam = q v_ref q*, reference to camera; only if
+        solved
+    covariance_rad2
+        (3, 3) of the small rotation in camera axes, optional; an attitude filter needs it
+    centroids_px
+        (N, 2) x and y of the lights found, optional
+    seconds
+        Processing time; if None, the time from sending the frame to its answer
+    """
+
+    status: str
+    cam_from_ref_xyzw: Any = None
+    covariance_rad2: Any = None
+    centroids_px: Any = None
+    seconds: float | None = None
+
+    def as_tree(self) -> dict[str, Any]:
+        """As a JSON object; entries that are None are left out."""
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        return {name: to_lists(value) for name, value in values.items() if value is not None}
+
+    @classmethod
+    def of_tree(cls, tree: Any) -> Self:
+        """The inverse of `as_tree`. Raises ValueError for unknown keys or a missing status."""
+        if not isinstance(tree, dict) or "status" not in tree:
+            raise ValueError("status: missing; allowed: a JSON object with a status")
+        names = [item.name for item in fields(cls)]
+        unknown = [name for name in tree if name not in names]
+        if unknown:
+            raise ValueError(f"unknown key {unknown[0]!r}; allowed: {', '.join(names)}")
+        return cls(**tree)
+
+
+class Tracker(Protocol):
+    """What an entry point's callable makes of a `Setup`; the callable raises for a set-up that it cannot use."""
+
+    def solve(self, picture: Picture) -> Answer:
+        """The attitude at mid-exposure, or why there is none."""
+        ...
+
+
+def check_answer(answer: Any) -> Answer:
+    """Check an answer (shapes of arrays, quaternion, covariance) and normalize its quaternion. Raises ValueError."""
+    if not isinstance(answer, Answer):
+        raise ValueError(f"the tracker returned {type(answer).__name__}; allowed: Answer")
+    status = printable(answer.status)[:MAX_STATUS_CHARS] if isinstance(answer.status, str) else ""
+    if not status:
+        raise ValueError(f"status {answer.status!r}; allowed: text")
+    quaternion = None
+    if answer.cam_from_ref_xyzw is not None:
+        quaternion = normalize_quaternion(
+            finite_array(answer.cam_from_ref_xyzw, "cam_from_ref_xyzw", (4,))
+        )
+    if (status == SOLVED) != (quaternion is not None):
+        raise ValueError(
+            f"status {status!r} {'without' if quaternion is None else 'with'} cam_from_ref_xyzw"
+        )
+    covariance = answer.covariance_rad2
+    if covariance is not None:
+        covariance = check_covariance(finite_array(covariance, "covariance_rad2", (3, 3)))
+    seconds = None if answer.seconds is None else float(finite_array(answer.seconds, "seconds", ()))
+    if seconds is not None and seconds < 0:
+        raise ValueError(f"seconds {seconds:g}; allowed: 0 or more")
+    return Answer(status, quaternion, covariance, check_centroids(answer.centroids_px), seconds)
+
+
+def normalize_quaternion(quaternion: Floats) -> Floats:
+    """Normalize a quaternion whose norm is within UNIT_TOLERANCE of 1. Raises ValueError for others."""
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1) > UNIT_TOLERANCE:
+        raise ValueError(f"cam_from_ref_xyzw has norm {norm:.6g}; allowed: 1")
+    return quaternion / norm
+
+
+def check_covariance(covariance: Floats) -> Floats:
+    """Check that a covariance is symmetric and positive definite within plausible limits. Raises ValueError."""
+    if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=0):
+        raise ValueError("covariance_rad2 is not symmetric")
+    eigenvalues = np.linalg.eigvalsh(covariance)
+    if eigenvalues[0] < MIN_RAD2 or eigenvalues[-1] > MAX_RAD2:
+        raise ValueError(
+            f"covariance_rad2 has eigenvalues {eigenvalues[0]:.3g} to {eigenvalues[-1]:.3g};"
+            f" allowed: {MIN_RAD2:g} to {MAX_RAD2:.3g}"
+        )
+    return (covariance + covariance.T) / 2
+
+
+def check_centroids(centroids: Any) -> Floats:
+    """(N, 2) centroids as finite numbers, not far out of the frame; empty for None. Raises ValueError."""
+    count = 0 if centroids is None else np.shape(centroids)[0] if np.ndim(centroids) else -1
+    if count > MAX_CENTROIDS:
+        raise ValueError(f"centroids_px has {count} rows; allowed: up to {MAX_CENTROIDS}")
+    xy_px = finite_array(centroids, "centroids_px", (count, 2)) if count else np.empty((0, 2))
+    if (farthest := np.abs(xy_px).max(initial=0.0)) > MAX_CENTROID_PX:
+        raise ValueError(
+            f"centroids_px has {farthest:g}; allowed: up to {MAX_CENTROID_PX:g} px from the first pixel"
+        )
+    return xy_px
+
+
+def missing_extra(point: metadata.EntryPoint) -> str:
+    """The extra to install for one of skysim's own plug-ins, if it is missing; else empty. Imports nothing."""
+    plugin = EXTRAS.get(point.value)
+    return f"skysim[{plugin[1]}]" if plugin and find_spec(plugin[0]) is None else ""
+
+
+# Programs, and the one that is an external tracker: it answers each frame with a line of JSON.
+
+
+MAX_FAILURES = 3  # consecutive failures after which a program is not restarted
+NAME = re.compile(r"[a-z][a-z0-9_-]*")
+
+
+def program_commands(options: Sequence[str] | None) -> dict[str, str]:
+    """Parse texts `NAME=COMMAND` (trackers, controllers) to commands by name. Raises InputError."""
+    programs: dict[str, str] = {}
+    for option in options or ():
+        name, equals, command = option.partition("=")
+        if not equals or not NAME.fullmatch(name) or not command.strip():
+            raise InputError(
+                "programs", option, "NAME=COMMAND, NAME of lower-case letters, digits, _ and -"
+            )
+        taken = {
+            *programs,
+            *(
+                known
+                for kind in (TRACKERS, CONTROLLERS)
+                for known in (*kind.own, *kind.entry_points())
+            ),
+        }
+        if name in taken:
+            raise InputError(f"programs.{name}", "name already in use", "another one")
+        split_command(name, command)
+        programs[name] = command
+    return programs
+
+
+def split_command(name: str, command: str) -> tuple[list[str], str | None]:
+    """Split a command into its arguments; also return the file format of `{folder}`, None without one."""
+    try:
+        arguments = shlex.split(command)
+    except ValueError as error:
+        raise InputError(f"programs.{name}", error) from None
+    formats = {image_format or "png" for image_format in FOLDER.findall(command)}
+    if formats - set(WRITERS) or len(formats) > 1:
+        raise InputError(
+            f"programs.{name}",
+            "",
+            f"{{folder}}, or one of {{folder:{'}, {folder:'.join(WRITERS)}}}",
+        )
+    return arguments, formats.pop() if formats else None
+
+
+def write_png(path: Path, picture: Picture) -> None:
+    """Write the frame as a 16-bit PNG."""
+    from skysim.core import files
+
+    files.write_png16(path, picture.image_dn)
+
+
+def write_fits(path: Path, picture: Picture) -> None:
+    """Write the frame as FITS with times in the header, without the truth that a run's own frames carry."""
+    from astropy.io import fits
+
+    from skysim.core import files
+
+    header = fits.Header(
+        {"EXPTIME": picture.exposure_s, "TMID": picture.t_s, "FRAME": picture.frame}
+    )
+    with files.atomic_file(path) as temporary:
+        fits.PrimaryHDU(picture.image_dn, header).writeto(temporary, overwrite=True)
+
+
+WRITERS: dict[str, Callable[[Path, Picture], None]] = {"png": write_png, "fits": write_fits}
+
+
+class TrackerProgram(Program):
+    """An external tracker program. After a failure it is restarted for the next frame, up to MAX_FAILURES in a row.
+
+    Attributes
+    ----------
+    arguments, image_format
+        Of `split_command`
+    limit_s
+        Time limit per frame
+    environment
+        In place of this process's
+
+    Raises
+    ------
+    InputError
+        Where it cannot be started or refuses the set-up.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        arguments: Sequence[str],
+        image_format: str | None,
+        setup: Setup,
+        limit_s: float,
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
+        self.image_format = image_format
+        self.failures = 0
+        self.last_failure = ""
+        super().__init__(TRACKERS.key, name, arguments, setup.as_tree(), limit_s, environment)
+
+    def solve(self, picture: Picture) -> Answer:
+        """The program's answer to a frame, with the seconds it took. Raises ProgramError."""
+        if self.failures >= MAX_FAILURES:
+            raise ProgramError(
+                f"given up after {MAX_FAILURES} failures in a row, the last: {self.last_failure}"
+            )
+        try:
+            if self.running is None:
+                self.start()
+            begin_s = time.perf_counter()
+            reply = self.exchange(self.frame_message(picture), self.limit_s)
+            spent_s = time.perf_counter() - begin_s
+            answer = self.to_answer(reply, picture.frame)
+        except ProgramError as error:
+            if self.running is None:
+                self.failures = self.failures + 1
+                self.last_failure = str(error)
+            raise
+        self.failures = 0
+        own_s = spent_s if answer.seconds is None else min(answer.seconds, spent_s)
+        return replace(answer, seconds=own_s)
+
+    def to_answer(self, reply: Any, frame: int) -> Answer:
+        """Convert JSON to an Answer. Raises ProgramError; an answer to another frame ends the program."""
+        if not isinstance(reply, dict) or reply.get("frame") != frame:
+            raise self.fail(f"no answer to frame {frame}, but {str(reply)[:80]!r}")
+        try:
+            return check_answer(
+                Answer.of_tree({key: reply[key] for key in reply if key != "frame"})
+            )
+        except ValueError as error:
+            raise ProgramError(str(error)) from None
+
+    def frame_message(self, picture: Picture) -> list[bytes]:
+        """A frame's header and, unless it is written to the folder, its pixels, row by row, little-endian.
+
+        Raises
+        ------
+        ProgramError
+            Where the program has made its folder unusable.
+        """
+        header: dict[str, Any] = {
+            "frame": picture.frame,
+            "t_s": picture.t_s,
+            "exposure_s": picture.exposure_s,
+            "streak_px": picture.streak_px,
+        }
+        if self.image_format:
+            assert self.running is not None
+            assert self.running.folder is not None
+            path = self.running.folder / f"frame_{picture.frame:04d}.{self.image_format}"
+            try:
+                for previous in self.running.folder.glob("frame_*"):
+                    previous.unlink(missing_ok=True)
+                WRITERS[self.image_format](path, picture)
+            except OSError as error:
+                raise self.fail(
+                    f"the program's folder takes no frame: {error.strerror or error}", 0.0
+                ) from None
+            return [(json.dumps(header | {"file": str(path)}) + "\n").encode()]
+        dtype = "<u2" if picture.image_dn.dtype == np.uint16 else "<f8"
+        pixels = np.ascontiguousarray(picture.image_dn, dtype=dtype).tobytes()
+        height, width = picture.image_dn.shape
+        header |= {"width_px": width, "height_px": height, "dtype": dtype, "bytes": len(pixels)}
+        return [(json.dumps(header) + "\n").encode(), pixels]
