@@ -67,7 +67,7 @@ def test_the_airglow_is_brightest_at_the_bottom_of_its_layer(sphere: None) -> No
     assert light[1] == pytest.approx(72, rel=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_the_limb_is_where_its_dip_says() -> None:
     """From 500 km above the equator, looking 2 degrees above the horizon ahead: the ground's edge is so far off."""
     dip_deg = np.degrees(np.arccos(EARTH_RADIUS_M / (EARTH_RADIUS_M + 500e3)))

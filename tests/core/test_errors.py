@@ -105,7 +105,6 @@ def refuse() -> None:
     raise COUNT
 
 
-@pytest.mark.slow
 def test_it_crosses_a_pool_of_processes_with_its_parts() -> None:
     with ProcessPoolExecutor(1) as pool, pytest.raises(InputError) as raised:
         pool.submit(refuse).result()

@@ -99,7 +99,6 @@ def test_gusts_begin_as_they_go_on() -> None:
     )
 
 
-@pytest.mark.slow
 def test_a_steady_wind_and_the_turbine_blow_along_the_lab_s_axes() -> None:
     """Turned by 90 deg of yaw, what twists about lab x twists about body -y."""
     config = DisturbancesConfig.model_validate({"turbine": ["1 mN m", "0 N m", "2 mN m"]})

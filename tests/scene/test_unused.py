@@ -262,7 +262,6 @@ CASES = [
 KEYS = [case.key for case in CASES]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=KEYS)
 def test_a_key_without_effect_is_refused(case: Case) -> None:
     """In one line: the key, why, what is allowed, where; and not where it has an effect."""

@@ -475,7 +475,6 @@ def test_the_glow_is_on_the_frame_and_nothing_glows_without_a_contrast() -> None
 # Slips
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "says"),
     [

@@ -91,7 +91,7 @@ def test_errors_of_two_mountings_are_what_the_covariance_says(
     assert abs(every - states) < 4 * np.sqrt(2 * states / 150)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_a_constant_model_does_not_claim_a_walk() -> None:
     """The same flights as above with mountings that walk: the filter without the walk is wrong about them."""
     rng = np.random.default_rng(3)
