@@ -26,7 +26,7 @@ extras: $(READY)
 	$(PIP) -e '.[$(subst +,$(comma),$(subst $(eval ) ,$(comma),$(CI_EXTRAS)))]'
 	touch $(addprefix $(EXTRA),$(CI_EXTRAS))
 
-.PHONY: compile extras baseline bench accept demo test test-slow test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers docs figures gui recompile setup clean
+.PHONY: compile extras baseline bench accept demo test test-slow test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers stale docs figures gui recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -85,7 +85,13 @@ studies: $(READY)
 	$(BIN)/python docs/site/studies.py
 
 papers: $(READY)
-	$(BIN)/skysim reproduce all --report --markdown docs/findings/papers.md
+	mkdir -p out
+	$(BIN)/skysim reproduce all --report --json > out/papers.json
+	$(BIN)/python docs/site/papers.py out/papers.json
+
+# The findings pages whose code has changed since they were made, and the commands that make them again.
+stale: $(READY)
+	$(BIN)/python docs/site/stale.py
 
 # The site, in out/site, with the reference of commands, keys and responses from the code. Nothing in it is fetched
 # from elsewhere.

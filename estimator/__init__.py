@@ -14,7 +14,7 @@ MODULE_OF = {
     "DomeTracker": "trackers.dome_tracker",
     "GyroModel": "filter.mekf",
     "Health": "trackers.tracking_mode",
-    "ImageError": "core.checks",
+    "ImageError": "core.errors",
     "Report": "trackers.pipeline",
     "Settings": "trackers.pipeline",
     "StarCatalog": "catalog.catalog",

@@ -36,6 +36,14 @@ def test_an_import_loads_no_library(package: str) -> None:
     assert done.stdout.strip() == "set()"
 
 
+def test_the_command_line_loads_no_library_until_a_command_runs() -> None:
+    script = "import sys, skysim.apps.cli.main; print({'numpy', 'scipy', 'numba', 'mujoco', 'cv2'} & set(sys.modules))"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "set()"
+
+
 def test_a_run_is_a_sequence_of_scored_frames(run) -> None:
     assert len(run) == 3
     assert [frame.row.frame for frame in run] == [0, 1, 2]

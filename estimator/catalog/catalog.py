@@ -1,8 +1,7 @@
 """On-board star catalog: read a star list and compute apparent unit vectors, independently of the simulator.
 
-`read` parses an ECSV file, `StarCatalog.from_radec` takes arrays; `apparent` applies proper motion, parallax, light
-deflection and aberration for an `Observer`, and `merge_doubles` replaces unresolved stars by one at their center of
-light.
+`read` parses an ECSV file, and `StarCatalog.from_radec` takes arrays. `apparent` applies proper motion, parallax, light
+deflection and aberration for an `Observer`. `merge_doubles` replaces unresolved stars by one at their center of light.
 """
 
 from __future__ import annotations
@@ -42,10 +41,17 @@ class StarCatalog:
     Attributes
     ----------
     id
-        (N,); vectors : (N, 3) unit; drift_rad_yr : (N, 3) proper motion, in the tangent plane;
-        parallax_rad : (N,);
+        (N,) identifiers
+    vectors
+        (N, 3) unit vectors
+    drift_rad_yr
+        (N, 3) proper motion in the tangent plane, rad per Julian year
+    parallax_rad
+        (N,) parallaxes
     v_mag
-        (N,); epoch_yr : the Julian year of the vectors
+        (N,) visual magnitudes
+    epoch_yr
+        Julian year of the vectors
     """
 
     id: Ints
@@ -76,17 +82,29 @@ class StarCatalog:
         epoch_yr: float = 2000.0,
         id: ArrayLike | None = None,
     ) -> StarCatalog:
-        """A catalog from arrays of any source, (N,) each: ICRS places at a Julian year, and magnitudes.
+        """Build a catalog from arrays of any source: ICRS places at a Julian year, and magnitudes, (N,) each.
 
-        The stars are sorted by brightness. Raises ImageError for arrays of other lengths, places out of range, and
-        what looks like radians.
+        The stars are sorted by brightness.
 
         Parameters
         ----------
-        pm_ra_mas_yr
-            Proper motion in right ascension times cos(dec), as Hipparcos and Gaia give it
+        ra_deg, dec_deg
+            Right ascension and declination
+        v_mag
+            Visual magnitudes
+        pm_ra_mas_yr, pm_dec_mas_yr
+            Proper motions; that in right ascension is times cos(dec), as Hipparcos and Gaia give it
+        parallax_mas
+            Parallaxes
+        epoch_yr
+            Julian year of the places
         id
             (N,) whole numbers; None: 1 to N in the order given
+
+        Raises
+        ------
+        ImageError
+            For arrays of other lengths, places out of range, and values that look like radians.
         """
         count = checks.native("catalog: v_mag", v_mag, np.float64).size
         ra, dec, magnitude = (
@@ -121,15 +139,21 @@ class StarCatalog:
 
     def take(self, which: NDArray[Any]) -> StarCatalog:
         """Select stars by mask or index."""
-        return replace(
-            self,
-            **{name: getattr(self, name)[which] for name in self.__slots__ if name != "epoch_yr"},
-        )
+        columns = [name for name in self.__slots__ if name != "epoch_yr"]
+        return replace(self, **{name: getattr(self, name)[which] for name in columns})
 
 
 @dataclass(frozen=True, slots=True)
 class Observer:
-    """State of the observer: barycentric position_au and velocity_m_s, (3,) in ICRS axes, and the Julian year."""
+    """State of the observer, barycentric, in ICRS axes.
+
+    Attributes
+    ----------
+    epoch_yr
+        Julian year
+    position_au, velocity_m_s
+        (3,) position and velocity
+    """
 
     epoch_yr: float
     position_au: Floats
@@ -161,6 +185,7 @@ def _check_places(ra_deg: Floats, dec_deg: Floats) -> None:
             raise ImageError(
                 f"catalog: {name} is {value:g} in a row; allowed: {low:g} to {high:g} degrees"
             )
+    # Many stars that cover the sky in radians, and only a corner of it in degrees.
     turn = 2 * np.pi + 1e-6
     pole = np.pi / 2 + 1e-6
     if (
@@ -175,7 +200,7 @@ def _check_places(ra_deg: Floats, dec_deg: Floats) -> None:
 
 
 def checked(stars: object) -> StarCatalog:
-    """The catalog, if its columns are of one length, finite, and its vectors of unit length. Raises ImageError."""
+    """The catalog, if its columns are of one length and finite and its vectors of unit length; else ImageError."""
     checks.of_type("stars", stars, StarCatalog)
     assert isinstance(stars, StarCatalog)
     count = len(stars)
@@ -207,12 +232,12 @@ def utc(date: object) -> datetime.datetime:
 
 
 def on_earth(time_utc: datetime.datetime) -> Observer:
-    """Return the observer at the Earth's center at a UTC time (naive means UTC), from the IAU ephemeris `epv00`.
+    """The observer at the Earth's center at a UTC time (naive means UTC), from the IAU ephemeris `epv00`.
 
     Raises
     ------
     ImageError
-        Without the package pyerfa, which nothing else of the estimator needs.
+        Without the package pyerfa, which nothing else in the estimator needs.
     """
     try:
         import erfa
@@ -233,22 +258,28 @@ def on_earth(time_utc: datetime.datetime) -> Observer:
 def read(path: str | Path) -> StarCatalog:
     """Read a catalog file: ECSV with hip, ra_deg, dec_deg, pm_ra_mas_yr, pm_dec_mas_yr, parallax_mas, v_mag.
 
-    The header gives the epoch, `epoch_jyear`. Raises ImageError with one line if the file cannot be read.
+    The header gives the epoch, `epoch_jyear`. A file that has not changed is read once.
+
+    Raises
+    ------
+    ImageError
+        If the file cannot be read.
     """
     try:
         state = Path(path).stat()
     except (OSError, TypeError, ValueError):
-        return _read(path)  # refuses it
+        return _read(path)  # raises the error
     return _kept(path, state.st_dev, state.st_ino, state.st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=4)
 def _kept(path: str | Path, *_state: int) -> StarCatalog:
-    """The catalog of a file in this state. The last four are kept: it takes 0.1 s to read one."""
+    """The catalog of a file in this state. The last four are kept, because reading one takes 0.1 s."""
     return _read(path)
 
 
 def _read(path: str | Path) -> StarCatalog:
+    """Read a catalog file, and sort the stars by brightness."""
     (hip, ra_deg, dec_deg, pm_ra, pm_dec, parallax, v_mag), epoch_yr = columns(path, COLUMNS)
     radec_rad = np.radians(ra_deg), np.radians(dec_deg)
     stars = from_columns(hip.astype(np.int64), *radec_rad, pm_ra, pm_dec, parallax, v_mag, epoch_yr)
@@ -262,7 +293,12 @@ def hipparcos() -> StarCatalog:
     """The Hipparcos-2 subset to Hp 6.5 that comes with the package.
 
     It is in data/catalogs beside the package in a checkout, in skysim/data/catalogs where skysim is installed, and in
-    estimator/data/catalogs where the estimator is installed alone. Raises ImageError where none of them has it.
+    estimator/data/catalogs where the estimator is installed alone.
+
+    Raises
+    ------
+    ImageError
+        If none of them has it.
     """
     root = Path(__file__).resolve().parents[2]
     name = "data/catalogs/hipparcos_hp6.5.ecsv"
@@ -273,13 +309,26 @@ def hipparcos() -> StarCatalog:
 def columns(
     path: str | Path, names: Sequence[str], optional: Sequence[str] = ()
 ) -> tuple[Floats, float]:
-    """Read columns of a catalog file as (len(names) + len(optional), N) numbers in the file's order, and its epoch.
+    """Read columns of a catalog file, in the file's order.
 
     Parameters
     ----------
+    names
+        Columns in which every field is a number
     optional
-        Columns in which empty fields are allowed and become NaN. Raises ImageError if the file
-        cannot be read.
+        Columns in which empty fields are allowed and become NaN
+
+    Returns
+    -------
+    numbers
+        (len(names) + len(optional), N)
+    epoch_yr
+        Julian year of the file
+
+    Raises
+    ------
+    ImageError
+        If the file cannot be read.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
@@ -306,20 +355,17 @@ def columns(
 
 
 def _epoch_yr(lines: Sequence[str]) -> float:
-    """The Julian year in the header's line `# epoch_jyear: 1991.25`. Raises ValueError."""
-    comments = (line for line in lines if line.startswith("#"))
-    found = [
-        match
-        for line in comments
-        if (match := re.fullmatch(r"#\s*epoch_jyear:\s*(\d+\.?\d*)\s*", line))
-    ]
-    epoch_yr = float(found[0][1]) if found else np.nan
+    """The Julian year in the header's line `# epoch_jyear: 1991.25`. Raises ValueError if there is none."""
+    matches = (re.fullmatch(r"#\s*epoch_jyear:\s*(\d+\.?\d*)\s*", line) for line in lines)
+    found = next(filter(None, matches), None)
+    epoch_yr = float(found[1]) if found else np.nan
     if not EPOCHS_YR[0] <= epoch_yr <= EPOCHS_YR[1]:
         raise ValueError("its header has no epoch_jyear of {:g} to {:g}".format(*EPOCHS_YR))
     return epoch_yr
 
 
 def _number_or_nan(text: str) -> float:
+    """A field as a number; NaN if it is empty."""
     return float(text) if text.strip('" ') else np.nan
 
 
@@ -333,7 +379,11 @@ def from_columns(
     v_mag: Floats,
     epoch_yr: float,
 ) -> StarCatalog:
-    """Convert spherical coordinates and proper motions to vectors; pm_ra includes the factor cos(dec)."""
+    """Convert spherical coordinates and proper motions to vectors; pm_ra includes the factor cos(dec).
+
+    The tangent plane has the axes east = (-sin a, cos a, 0) and north = (-sin d cos a, -sin d sin a, cos d), with
+    the right ascension a and the declination d. The proper motion is pm_ra east + pm_dec north.
+    """
     sa = np.sin(ra_rad)
     ca = np.cos(ra_rad)
     sd = np.sin(dec_rad)
@@ -346,32 +396,37 @@ def from_columns(
 
 
 def at_epoch(stars: StarCatalog, epoch_yr: float) -> Floats:
-    """Return (N, 3) barycentric unit vectors at a Julian year: R + (t - t0) dR/dt, normalized."""
+    """(N, 3) barycentric unit vectors at a Julian year: R + (t - t0) dR/dt, normalized."""
     return unit(stars.vectors + (epoch_yr - stars.epoch_yr) * stars.drift_rad_yr)
 
 
 def apparent(stars: StarCatalog, observer: Observer) -> Floats:
-    """Return (N, 3) apparent unit vectors for an observer.
+    """(N, 3) apparent unit vectors for an observer.
 
-    Applies in this order: proper motion; parallax, R - pi r; deflection of light by the Sun, 2 G M / (c^2 r)
-    cot(psi / 2) away from the Sun; aberration by PTASE's eq. 4, (R + v/c) / |R + v/c|, the classical law, which is
-    within 0.5 mas of the relativistic one. The Sun is assumed at the barycenter; for stars more than 10 degrees from
-    the Sun the error is below 0.1 mas.
+    1. Proper motion, R + (t - t0) dR/dt.
+    2. Parallax, R - pi r.
+    3. Deflection of light by the Sun, 2 G M / (c^2 r) cot(psi / 2) away from the Sun, psi the angle from the Sun.
+    4. Aberration by PTASE's eq. 4, (R + v/c) / |R + v/c|: the classical law, within 0.5 mas of the relativistic one.
+
+    The Sun is assumed at the barycenter; for stars more than 10 degrees from the Sun the error is below 0.1 mas.
     """
+    # 1. and 2. Proper motion and parallax.
     vectors = at_epoch(stars, observer.epoch_yr)
     vectors = unit(vectors - stars.parallax_rad[:, None] * observer.position_au)
     distance_au = np.linalg.norm(observer.position_au)
     from_sun = observer.position_au / distance_au
     along = vectors @ from_sun
+    # 3. Deflection.
     # The vector (e - (u.e) u) / (1 + u.e) has length cot(psi / 2). The floor keeps it finite behind the Sun's disk,
     # where no star is visible.
     deflection = (from_sun - along[:, None] * vectors) / np.maximum(1 + along, 1e-5)[:, None]
     vectors = unit(vectors + SUN_DEFLECTION_RAD / distance_au * deflection)
+    # 4. Aberration.
     return unit(vectors + observer.velocity_m_s / SPEED_OF_LIGHT_M_S)
 
 
 def unit(vectors: Floats) -> Floats:
-    """Normalize (N, 3) vectors."""
+    """(N, 3) vectors, normalized."""
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
@@ -389,7 +444,24 @@ def merge_doubles(stars: StarCatalog, closer_than_rad: float) -> StarCatalog:
 
 
 def light_centers(values: Floats, magnitude: Floats, group: Ints) -> tuple[Floats, Floats]:
-    """Return (G, K) flux-weighted means of (N, K) values, and the (G,) magnitudes of the total flux of each group."""
+    """Centers of light of groups: means weighted by the flux 10^(-0.4 m).
+
+    Parameters
+    ----------
+    values
+        (N, K) values of the stars
+    magnitude
+        (N,) their magnitudes
+    group
+        (N,) their groups, 0 to G - 1
+
+    Returns
+    -------
+    means
+        (G, K)
+    magnitude
+        (G,) magnitudes of the total flux of each group
+    """
     flux = 10 ** (-0.4 * magnitude)
     total = np.bincount(group, flux)
     means = np.column_stack([np.bincount(group, flux * column) / total for column in values.T])
@@ -399,12 +471,11 @@ def light_centers(values: Floats, magnitude: Floats, group: Ints) -> tuple[Float
 def close_groups(vectors: Floats, closer_than_rad: float) -> Ints:
     """Label each star with its group: the connected components of the graph of pairs closer than an angle.
 
-    Each star takes the least row among itself and its neighbors until none changes; scipy.sparse.csgraph does the same,
-    but takes longer to import than this to run.
+    Each star takes the least label among itself and its neighbors until none changes. scipy.sparse.csgraph does the
+    same, but takes longer to import than this to run.
     """
-    one, other = (
-        cKDTree(vectors).query_pairs(2 * np.sin(closer_than_rad / 2), output_type="ndarray").T
-    )
+    chord = 2 * np.sin(closer_than_rad / 2)
+    one, other = cKDTree(vectors).query_pairs(chord, output_type="ndarray").T
     label = np.arange(len(vectors))
     before = np.empty(0, int)
     while not np.array_equal(label, before):
@@ -420,6 +491,6 @@ def brighter_than(stars: StarCatalog, limit_mag: float) -> StarCatalog:
 
 
 def limit_for_density(stars: StarCatalog, field_sr: float, mean_count: float) -> float:
-    """Return the limiting magnitude at which a field of `field_sr` steradians holds `mean_count` stars on average."""
+    """The limiting magnitude at which a field of `field_sr` steradians holds `mean_count` stars on average."""
     count = int(np.clip(mean_count * 4 * np.pi / field_sr, 1, len(stars)))
     return float(np.sort(stars.v_mag)[count - 1])

@@ -1,13 +1,22 @@
-"""Pair index of the on-board catalog: star pairs sorted by separation with a k-vector, and neighbor lists.
+"""Pair indexes of the on-board catalog: a k-vector with neighbor lists, and Boeing's buckets.
 
-The k-vector (Mortari 1997) finds all pairs with a separation in [low, high] without a search. A straight line
-z(k) = slope k + offset spans the sorted separations from just below the smallest to just above the largest; kvector[k]
-counts the pairs with a separation of at most z(k). Inverting the line at `low` and `high` gives two indices k, and the
-counts at these are the ends of the range. The separations are nearly enough linear in their rank that the range holds
-only a few pairs too many.
+`PairIndex` sorts star pairs by separation. The k-vector (Mortari 1997) finds all pairs with a separation in [low, high]
+without a search:
 
-The neighbor lists serve the other question, which stars are at a given separation from one star: for each star they
-hold the other stars of its pairs, sorted by separation, and are searched by bisection.
+1. A straight line z(k) = slope k + offset spans the sorted separations, from just below the smallest to just above the
+   largest; kvector[k] is the number of pairs with a separation of at most z(k) (`k_vector`).
+2. Inverting the line at `low` and `high` gives two values of k. The counts there are the ends of the range
+   (`pair_range`).
+
+The separations are nearly enough linear in their rank that the range holds only a few pairs too many. The neighbor
+lists give the stars at a given separation from one star: for each star they hold the other stars of its pairs,
+sorted by separation, and are searched by bisection (`first_neighbor`).
+
+`PairCatalog` groups the pairs into buckets of equal width in angle (Needelman, Li & Wu 2005, as described by Padro
+2012, section 2.4.6). Pairs within a bucket are unsorted, and a table gives the first pair of each bucket. A look-up
+computes the bucket numbers of the two ends of the range, without a search. Leaving out the separations halves the
+memory. The price: the range is rounded outward to whole buckets, so that the caller has to check a few pairs too
+many.
 """
 
 from __future__ import annotations
@@ -35,24 +44,26 @@ class PairIndex(NamedTuple):
     pair
         (P, 2) star rows, by increasing angle
     angle_rad
-        (P,)
+        (P,) angles of the pairs
     kvector
         (P + 2,) kvector[k] = number of pairs with angle <= slope k + offset (Mortari 1997)
     slope_rad, offset_rad
-        The line of the k-vector
+        Slope and offset of the line of the k-vector
     first
         (N + 1,) first entry of each star in `neighbor`
     neighbor
-        Rows of the neighbors, by increasing angle
+        (M,) rows of the neighbors, star after star, by increasing angle
     separation_rad
-        Their angles
+        (M,) angles of the neighbors from their star
     group
-        (N,) label of each star's group (patch board); pairs within a group are left out of
-        `pair`, as the pattern of a board repeats on every other board
+        (N,) label of each star's group (patch board); pairs within a group are left out of `pair`, as the pattern of a
+        board repeats on every other board
+    max_angle_rad
+        Greatest angle of a pair
     magnitude
-        (N,) increasing, in the camera's own scale; NaN if unknown
+        (N,) increasing magnitudes in the camera's own scale; NaN if unknown
     cells
-        The stars by direction
+        Spatial grid of the stars' directions
     """
 
     vectors: Floats
@@ -81,15 +92,14 @@ def build(
     Parameters
     ----------
     group
-        (N,) labels of stars not placed independently (LEDs of one patch board); if omitted,
-        each star is its own group
+        (N,) labels of stars not placed independently (LEDs of one patch board); if omitted, each star is its own group
     magnitude
-        (N,) non-decreasing; unknown if omitted
+        (N,) non-decreasing magnitudes; unknown if omitted
 
     Raises
     ------
     ImageError
-        For fewer than 3 pairs and for magnitudes that decrease or are not one for each star.
+        For fewer than 3 pairs, and for magnitudes that decrease or are not one for each star.
     """
     group = np.arange(len(vectors)) if group is None else np.asarray(group, np.int64)
     vectors = np.ascontiguousarray(vectors, dtype=float)
@@ -100,10 +110,8 @@ def build(
         raise ImageError(
             f"magnitudes {magnitudes.shape} of {len(vectors)} stars; allowed: one for each, the brightest first"
         )
-    chord = 2 * np.sin(min(max_angle_rad, np.pi) / 2)
-    pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
-    # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
-    angle = 2 * np.arcsin(np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2)
+    # All pairs, sorted by angle.
+    pair, angle = _pairs_within(vectors, 2 * np.sin(min(max_angle_rad, np.pi) / 2))
     order = np.argsort(angle, kind="stable")
     pair = np.ascontiguousarray(pair[order])
     angle = angle[order]
@@ -141,11 +149,26 @@ def build(
     )
 
 
+def _pairs_within(vectors: Floats, chord: float) -> tuple[NDArray[np.int32], Floats]:
+    """(P, 2) rows of all pairs of (N, 3) unit vectors up to a chord, and their (P,) angles, rad."""
+    pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
+    # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
+    half_chord = np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2
+    return pair, 2 * np.arcsin(half_chord)
+
+
 def k_vector(angle_rad: Floats) -> tuple[NDArray[np.int64], float, float]:
-    """Return the k-vector of sorted angles, with the slope and the offset of its line.
+    """The k-vector of sorted angles, with the slope and the offset of its line.
 
     The line runs from just below the smallest to just above the largest angle: z(k) = slope k + offset with
-    k = 0 .. P + 1, and count[k] = #{angle <= z(k)}.
+    k = 0 .. P + 1, and kvector[k] = #{angle <= z(k)}.
+
+    Returns
+    -------
+    kvector
+        (P + 2,) counts
+    slope, offset
+        Of the line, rad
     """
     count = len(angle_rad)
     margin = max(1e-12, 1e-12 * angle_rad[-1])
@@ -158,11 +181,12 @@ def k_vector(angle_rad: Floats) -> tuple[NDArray[np.int64], float, float]:
 
 @jit
 def pair_range(index: PairIndex, low_rad: float, high_rad: float) -> tuple[int, int]:
-    """Return the half-open range of pairs that holds every angle in [low, high].
+    """The half-open range of pairs that holds every angle in [low, high].
 
-    Mortari's formula, j_b = floor((low - q) / m) and j_t = ceil((high - q) / m), may include one or two pairs
-    outside the range at either end (SHEFEX's eq. 5 has the signs of the error and of q wrong). The range is widened by
-    a thousandth of a step on each side, so that rounding cannot exclude an angle on a node of the line.
+    Mortari's formula, j_b = floor((low - q) / m) and j_t = ceil((high - q) / m) with the slope m and the offset q, may
+    include one or two pairs outside the range at either end (SHEFEX's eq. 5 has the signs of the error and of q
+    wrong). The range is widened by a thousandth of a step on each side, so that rounding cannot exclude an angle on
+    a node of the line.
     """
     last = len(index.kvector) - 1
     k_low = int(np.floor((low_rad - index.offset_rad) / index.slope_rad - 1e-3))
@@ -176,7 +200,7 @@ def pair_range(index: PairIndex, low_rad: float, high_rad: float) -> tuple[int, 
 
 @jit
 def magnitude_range(index: PairIndex, magnitude: float, gate: float) -> tuple[int, int]:
-    """Return the half-open range of rows within `gate` of a magnitude; all rows if magnitude or gate is unknown."""
+    """The half-open range of rows within `gate` of a magnitude; all rows if magnitude or gate is unknown."""
     if not np.isfinite(gate) or np.isnan(magnitude) or np.isnan(index.magnitude[0]):
         return 0, len(index.magnitude)
     begin = int(np.searchsorted(index.magnitude, magnitude - gate))
@@ -185,13 +209,23 @@ def magnitude_range(index: PairIndex, magnitude: float, gate: float) -> tuple[in
 
 @jit
 def first_neighbor(index: PairIndex, star: int, low_rad: float) -> int:
-    """Return the position in `neighbor` of a star's first neighbor at `low_rad` or farther, by bisection."""
+    """The position in `neighbor` of a star's first neighbor at `low_rad` or farther, by bisection."""
     return first_from(index.separation_rad, index.first[star], index.first[star + 1], low_rad)
 
 
 @jit
+def neighbor_range(index: PairIndex, star: int, low_rad: float, high_rad: float) -> tuple[int, int]:
+    """The half-open range in `neighbor` of a star's neighbors at the angles [low, high]."""
+    begin = first_neighbor(index, star, low_rad)
+    end = begin
+    while end < index.first[star + 1] and index.separation_rad[end] <= high_rad:
+        end += 1
+    return begin, end
+
+
+@jit
 def first_from(values: Floats, begin: int, end: int, least: float) -> int:
-    """Return the first row in [begin, end) whose value is at least `least`, by bisection of sorted values; else end."""
+    """The first row in [begin, end) of sorted values that is at least `least`, by bisection; `end` if there is none."""
     while begin < end:
         middle = (begin + end) // 2
         if values[middle] < least:
@@ -201,9 +235,7 @@ def first_from(values: Floats, begin: int, end: int, least: float) -> int:
     return begin
 
 
-# Boeing's pair catalog: star pairs grouped into buckets of separation, without storing the
-# separations.
-
+# Boeing's pair catalog: star pairs grouped into buckets of separation, without storing the separations.
 
 BUCKET_WIDTH_RAD = 100 * ARCSEC_RAD  # from the thesis (Padro 2012, section 3.7.3)
 
@@ -214,18 +246,19 @@ class PairCatalog(NamedTuple):
     Attributes
     ----------
     vectors
-        (N, 3) unit
+        (N, 3) unit vectors
     magnitude
-        (N,) any scale
+        (N,) magnitudes, on any scale
     pair
         (P, 2) star rows, bucket after bucket, unsorted within a bucket
     table
         (M + 1,) first pair of each bucket; the last entry is P
     max_rad
-        Upper end of the last bucket; bucket i of 0 .. M - 1 begins at max_rad - (M - i)
-        width_rad
+        Upper end of the last bucket; bucket i of 0 .. M - 1 begins at max_rad - (M - i) width_rad
+    width_rad
+        Width of a bucket
     cells
-        The stars by direction; Boeing sorts them by declination instead
+        Spatial grid of the stars' directions; Boeing sorts the stars by declination instead
     """
 
     vectors: Floats
@@ -244,23 +277,32 @@ def build_pair_catalog(
     range_rad: tuple[float, float] | None = None,
     magnitudes: tuple[float, float] = (-np.inf, np.inf),
 ) -> PairCatalog:
-    """Build the catalog of pairs of (N, 3) unit vectors whose angle and magnitudes (N,) are in range (section 2.4.6).
+    """Build the catalog of the pairs of (N, 3) unit vectors whose angle and magnitudes are in range (section 2.4.6).
 
-    Buckets are counted back from the largest angle. Raises ImageError where there is no pair.
+    Buckets are counted back from the largest angle.
 
     Parameters
     ----------
+    magnitude
+        (N,) magnitudes
+    width_rad
+        Width of a bucket
     range_rad
         Range of angles, both ends included; if omitted, that of the pairs found
+    magnitudes
+        Range of magnitudes, both ends included
+
+    Raises
+    ------
+    ImageError
+        If there is no pair.
     """
     vectors = np.ascontiguousarray(vectors, dtype=float)
     if not width_rad > 0:
         raise ImageError(f"bucket width {width_rad} rad; allowed: more than 0")
     low, high = range_rad or (0.0, np.pi)
     # Search slightly beyond the range, then select by the exact angles.
-    chord = 2 * np.sin(min(high, np.pi) / 2) + 1e-12
-    pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
-    angle = 2 * np.arcsin(np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2)
+    pair, angle = _pairs_within(vectors, 2 * np.sin(min(high, np.pi) / 2) + 1e-12)
     in_magnitude_range = (magnitude >= magnitudes[0]) & (magnitude <= magnitudes[1])
     selected = (angle >= low) & (angle <= high) & in_magnitude_range[pair].all(axis=1)
     pair = pair[selected]
@@ -285,7 +327,9 @@ def build_pair_catalog(
 
 @jit
 def bucket_of(angle_rad: Floats, max_rad: float, width_rad: float, buckets: int) -> Ints:
-    """Return the bucket, 0 .. buckets - 1, of each angle; angles outside go to the first or the last bucket.
+    """The bucket, 0 .. buckets - 1, of each angle; angles outside go to the first or the last bucket.
+
+        bucket = floor(buckets - (max - angle) / width)
 
     Each operation is monotonic in the angle, in floating point too. An angle between two limits is therefore always in
     a bucket between those of the limits, whatever the rounding.
@@ -296,7 +340,7 @@ def bucket_of(angle_rad: Floats, max_rad: float, width_rad: float, buckets: int)
 
 @jit
 def candidates(catalog: PairCatalog, low_rad: float, high_rad: float) -> tuple[int, int]:
-    """Return the half-open range of pairs that holds every angle in [low, high], rounded out to whole buckets.
+    """The half-open range of pairs that holds every angle in [low, high], rounded outward to whole buckets.
 
     It begins at the last bucket whose lower end is below `low` and ends before the first one above `high` (eq. 12).
     """

@@ -1,17 +1,20 @@
 """Index of star quads by a code that does not depend on the scale: for a camera whose focal length is uncertain.
 
 A quad is four stars. A and B are the two farthest apart; m is the bisector of their directions, n the normal A x B and
-w the third axis, which points from B to A. The code of the quad is where C and D lie on these axes, in units of the
+w the third axis, which points from B to A. The code of the quad is the place of C and D on these axes, in units of the
 chord L between A and B (after Lang et al. 2010, Astron. J. 139, 1782, who use the circle over A and B):
 
     (C.w / L, C.n / L, D.w / L, D.n / L)
 
-A wrong focal length multiplies all small angles by the same factor, and leaves the code. The quad is turned by half a
-turn where the sum of the first and the third number would be negative, and C is the one with the smaller first number,
-so that the same four stars always have the same code.
+A wrong focal length multiplies all small angles by the same factor, and leaves the code unchanged. The same four stars
+must always have the same code (`arrange`): A and B are exchanged if the sum of the first and the third number would be
+negative, and C is the one with the smaller first number.
 
-The quads are of stars that are bright for their surroundings, PER_CIRCLE in a circle as high as the field, so that the
-brightest detections of a frame are among them everywhere in the sky. Codes are binned on a grid of four dimensions.
+1. Choose stars that are bright for their surroundings, PER_CIRCLE in a circle as high as the field, so that the
+   brightest detections of a frame are among them everywhere in the sky (`_locally_bright`).
+2. List the chosen neighbors of each chosen star (`_neighbors`).
+3. Form all quads of neighbors, and their codes (`_quads`).
+4. Sort them into the cells of a grid of four dimensions (`_grid_cells`).
 """
 
 from __future__ import annotations
@@ -21,18 +24,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.sky_index import SkyIndex, cell_of
+from estimator.catalog.sky_index import SkyIndex, cell_of, counting_sort
 from estimator.core import vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
 
 PER_CIRCLE = 10  # stars of quads in a circle as high as the field
-# distance of A and B, in units of the field's height
+# Greatest and least distance of A and B, in units of the field's height.
 LONGEST = 0.75
 SHORTEST = 0.15
 NEIGHBORS = 60  # greatest number of stars near one star that are combined with it
 SIDE = 20  # cells along each of the four axes
-# bounds of the coordinates along B to A and across, since C is nearer to A than B is
+# Bounds of the coordinates along B to A and across: C and D are nearer to A and to B than these are to each other.
 ALONG = 0.5
 ACROSS = 0.87
 
@@ -45,7 +48,7 @@ class QuadIndex(NamedTuple):
     star
         (Q, 4) rows of the sky index: A, B, C, D
     code
-        (Q, 4)
+        (Q, 4) codes
     first
         (SIDE^4 + 1,) quads first[k] to first[k + 1] are in cell k
     """
@@ -56,26 +59,31 @@ class QuadIndex(NamedTuple):
 
 
 def build(sky: SkyIndex, height_rad: float) -> QuadIndex:
-    """Build the index of the stars and pairs of `sky` for fields of the given height."""
+    """Build the index of the stars and pairs of `sky` for fields of the given height: the module's steps."""
+    # 1. and 2. Chosen stars and their neighbors.
     chosen = _locally_bright(sky.pair, sky.first, sky.bin_rad, height_rad / 2, len(sky.vectors))
     neighbor, first = _neighbors(sky.pair, sky.first, sky.bin_rad, LONGEST * height_rad, chosen)
     total = 1
     found = np.empty((0, 4), np.int32)
     code = np.empty((0, 4))
+    # 3. Quads: the first pass only counts them.
     while total > len(found):
         found = np.empty((total, 4), np.int32)
         code = np.empty((total, 4))
         total = _quads(sky.vectors, neighbor, first, SHORTEST * height_rad, found, code)
-    return QuadIndex(*_sort_into_cells(found[:total], code[:total]))
+    # 4. Cells.
+    cells, order = counting_sort(_grid_cells(code[:total]), SIDE**4)
+    return QuadIndex(found[order], code[order], cells)
 
 
 @jit
 def _locally_bright(
     pair: NDArray, first: NDArray, bin_rad: float, radius_rad: float, count: int
 ) -> NDArray[np.bool_]:
-    """(count,) stars with fewer than PER_CIRCLE brighter ones within the radius. Stars are sorted by brightness."""
+    """Step 1: (count,) whether each star, sorted by brightness, has fewer than PER_CIRCLE brighter ones around it."""
     brighter = np.zeros(count, np.int64)
     for p in range(first[cell_of(radius_rad / bin_rad, len(first) - 1)]):
+        # The greater row is the fainter star.
         brighter[max(pair[p, 0], pair[p, 1])] += 1
     return brighter < PER_CIRCLE
 
@@ -84,9 +92,16 @@ def _locally_bright(
 def _neighbors(
     pair: NDArray, first: NDArray, bin_rad: float, reach_rad: float, chosen: NDArray
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Of every chosen star the chosen ones within reach: those of star s are neighbor[start[s] : start[s + 1]]."""
+    """Step 2: the chosen stars within reach of each chosen star.
+
+    Returns
+    -------
+    neighbor, start
+        The neighbors of star s are neighbor[start[s] : start[s + 1]], by increasing angle up to the width of a bin
+    """
     end = first[cell_of(reach_rad / bin_rad, len(first) - 1)]
     start = np.zeros(len(chosen) + 1, np.int64)
+    # Count the neighbors of each star, add the counts up, and fill the lists.
     for p in range(end):
         if chosen[pair[p, 0]] and chosen[pair[p, 1]]:
             start[pair[p, 0] + 1] += 1
@@ -115,12 +130,28 @@ def _quads(
     found: NDArray,
     code: Floats,
 ) -> int:
-    """Find all quads of neighbors, and their codes; return their number. No more than the arrays hold are stored."""
+    """Step 3: find all quads of neighbors, and their codes.
+
+    Parameters
+    ----------
+    xyz
+        (N, 3) unit vectors of the stars
+    shortest_rad
+        Least distance of A and B
+    found, code
+        (Q, 4) rows and codes of the quads, written in place; no more than the arrays hold
+
+    Returns
+    -------
+    int
+        Number of quads
+    """
     total = 0
     frame = np.empty((3, 3))
     near = np.empty(NEIGHBORS, np.int64)
     place = np.empty((NEIGHBORS, 2))
     for a in range(len(start) - 1):
+        # A and B.
         for entry in range(start[a], start[a + 1]):
             b = neighbor[entry]
             star_a = vectors.row(xyz, a)
@@ -129,6 +160,7 @@ def _quads(
             if b < a or length < shortest_rad:
                 continue
             vectors.pair_frame(star_a, star_b, frame)
+            # Stars nearer to A and to B than these are to each other.
             count = 0
             for other in range(start[a], min(start[a + 1], start[a] + NEIGHBORS)):
                 c = neighbor[other]
@@ -140,6 +172,7 @@ def _quads(
                     near[count] = c
                     place[count, 0], place[count, 1] = in_frame(frame, star_c, length)
                     count += 1
+            # Pairs C, D of these.
             for k in range(count):
                 for m in range(k):
                     if (
@@ -163,7 +196,7 @@ def _quads(
 
 @jit
 def in_frame(frame: Floats, star: vectors.Vector, length: float) -> tuple[float, float]:
-    """A star's coordinates along B to A and across, in units of their chord; `frame` is that of `pair_frame`."""
+    """A star's coordinates along B to A and across, in chords of A and B; `frame` is that of `vectors.pair_frame`."""
     along = frame[0, 2] * star[0] + frame[1, 2] * star[1] + frame[2, 2] * star[2]
     across = frame[0, 1] * star[0] + frame[1, 1] * star[1] + frame[2, 1] * star[2]
     return along / length, across / length
@@ -171,11 +204,13 @@ def in_frame(frame: Floats, star: vectors.Vector, length: float) -> tuple[float,
 
 @jit
 def arrange(code: Floats, star: NDArray) -> None:
-    """Bring a quad's code (4,) and its stars A, B, C, D (4,) into the order that the module names, in place."""
+    """Bring a quad's code (4,) and its stars A, B, C, D (4,) into the module's order, in place."""
+    # Exchange A and B: half a turn.
     if code[0] + code[2] < 0:
         for k in range(4):
             code[k] = -code[k]
         star[0], star[1] = star[1], star[0]
+    # Exchange C and D.
     if code[0] > code[2]:
         code[0], code[2] = code[2], code[0]
         code[1], code[3] = code[3], code[1]
@@ -190,26 +225,10 @@ def code_cell(value: float, axis: int) -> int:
 
 
 @jit
-def _sort_into_cells(
-    star: NDArray, code: Floats
-) -> tuple[NDArray[np.int32], Floats, NDArray[np.int32]]:
-    """Counting sort of quads by the cell of their code."""
-    cell = np.empty(len(code), np.int64)
-    first = np.zeros(SIDE**4 + 1, np.int32)
+def _grid_cells(code: Floats) -> NDArray[np.int64]:
+    """(Q,) number of the cell of each code (Q, 4) in the grid of SIDE^4 cells."""
+    cell = np.zeros(len(code), np.int64)
     for n in range(len(code)):
-        k = 0
         for axis in range(4):
-            k = k * SIDE + code_cell(code[n, axis], axis)
-        cell[n] = k
-        first[k + 1] += 1
-    for k in range(SIDE**4):
-        first[k + 1] += first[k]
-    sorted_star = np.empty_like(star)
-    sorted_code = np.empty_like(code)
-    free = first.copy()
-    for n in range(len(code)):
-        slot = free[cell[n]]
-        sorted_star[slot] = star[n]
-        sorted_code[slot] = code[n]
-        free[cell[n]] += 1
-    return sorted_star, sorted_code, first
+            cell[n] = cell[n] * SIDE + code_cell(code[n, axis], axis)
+    return cell

@@ -1,7 +1,10 @@
-"""Refraction as a tracker on the ground undoes it: where the zenith is at a time, and where stars are without air.
+"""Refraction as a tracker on the ground corrects it: the zenith at a time, and directions without air.
 
-Independent of the simulator: a two-term formula with the refractivity of Edlen, and low-precision sidereal time and
-precession, against its integral along the ray and its nutation.
+The refraction is R = A tan z + B tan^3 z (`refraction_constants`). The zenith in ICRS axes follows from sidereal time
+and precession (`zenith_icrs`).
+
+This code is independent of the simulator's. It uses a two-term formula with the refractivity of Edlen, and
+low-precision sidereal time and precession; the simulator integrates the refraction along the ray, and has nutation.
 """
 
 from __future__ import annotations
@@ -24,10 +27,9 @@ from estimator.core.constants import (
     ZERO_CELSIUS_K,
 )
 
-LOWEST_RAD = np.radians(
-    85.0
-)  # of the apparent zenith distance; the formula fails nearer to the horizon
-RAISING_STEPS = 6
+# Greatest apparent zenith distance: the formula fails nearer to the horizon.
+LOWEST_RAD = np.radians(85.0)
+RAISING_STEPS = 6  # iterations of `raised`
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,13 +39,13 @@ class SiteAir:
     Attributes
     ----------
     latitude_deg, longitude_deg
-        Geodetic, east positive
+        Geodetic coordinates of the site, east positive
     epoch
         UTC of t = 0, naive or aware
     pressure_hpa, temperature_c
-        At the site
+        Pressure and temperature at the site
     wavelength_m
-        Of the refracted light
+        Wavelength of the refracted light
 
     Raises
     ------
@@ -67,7 +69,7 @@ class SiteAir:
         utc(self.epoch)
 
     def zenith(self, t_s: float) -> Floats:
-        """(3,) zenith in ICRS axes t_s seconds after the epoch."""
+        """The (3,) zenith in ICRS axes t_s seconds after the epoch."""
         epoch = utc(self.epoch)
         if epoch.tzinfo is not None:
             epoch = epoch.astimezone(datetime.UTC).replace(tzinfo=None)
@@ -75,11 +77,11 @@ class SiteAir:
         return zenith_icrs(days, np.radians(self.latitude_deg), np.radians(self.longitude_deg))
 
     def seen(self, directions: Floats, t_s: float) -> Floats:
-        """(N, 3) unit vectors of stars as they are seen, from those without air (N, 3), in ICRS axes."""
+        """The (N, 3) unit vectors of stars as they are seen, from those without air (N, 3), in ICRS axes."""
         return raised(directions, self.zenith(t_s), *self._constants)
 
     def without_air(self, directions: Floats, t_s: float) -> Floats:
-        """(N, 3) unit vectors of stars without air, from those seen (N, 3), in ICRS axes."""
+        """The (N, 3) unit vectors of stars without air, from those seen (N, 3), in ICRS axes."""
         return lowered(directions, self.zenith(t_s), *self._constants)
 
     @property
@@ -88,12 +90,21 @@ class SiteAir:
 
 
 def zenith_icrs(days: float, latitude_rad: float, longitude_rad: float) -> Floats:
-    """(3,) zenith of a site in ICRS axes, days after J2000.0 in UTC: within 20" (nutation, UT1 - UTC).
+    """The (3,) zenith of a site in ICRS axes, within 20" (nutation, UT1 - UTC are neglected).
 
-    Greenwich mean sidereal time is 280.46061837 + 360.98564736629 d + 0.000387933 T^2 degrees; precession turns the
-    mean equator of date by the angles of IAU 1976 (Lieske et al. 1977, A&A 58, 1). Source: Meeus (1998), ch. 12, 21.
+    Greenwich mean sidereal time is 280.46061837 + 360.98564736629 d + 0.000387933 T^2 degrees, with d days and T Julian
+    centuries after J2000.0. Precession turns the mean equator of date by the angles of IAU 1976 (Lieske et al. 1977,
+    A&A 58, 1). Source: Meeus (1998), ch. 12, 21.
+
+    Parameters
+    ----------
+    days
+        Days after J2000.0 in UTC
+    latitude_rad, longitude_rad
+        Geodetic coordinates of the site, east positive
     """
     centuries = days / JULIAN_CENTURY_DAY
+    # Zenith in the mean equator of date.
     sidereal_deg = 280.46061837 + 360.98564736629 * days + 0.000387933 * centuries**2
     hour = np.radians(sidereal_deg % 360) + longitude_rad
     of_date = np.array(
@@ -103,6 +114,7 @@ def zenith_icrs(days: float, latitude_rad: float, longitude_rad: float) -> Float
             np.sin(latitude_rad),
         ]
     )
+    # Precession from the equator of date to that of J2000.0.
     zeta, z, theta = ARCSEC_RAD * np.array(
         [
             2306.2181 * centuries + 0.30188 * centuries**2,
@@ -114,14 +126,14 @@ def zenith_icrs(days: float, latitude_rad: float, longitude_rad: float) -> Float
 
 
 def _about_z(angle: float) -> Floats:
-    """(3, 3) components in axes turned by the angle about z."""
+    """(3, 3) matrix of components in axes turned by the angle about z."""
     c = np.cos(angle)
     s = np.sin(angle)
     return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
 
 
 def _about_y(angle: float) -> Floats:
-    """(3, 3) components in axes turned by the angle about y."""
+    """(3, 3) matrix of components in axes turned by the angle about y."""
     c = np.cos(angle)
     s = np.sin(angle)
     return np.array([[c, 0, -s], [0, 1.0, 0], [s, 0, c]])
@@ -130,11 +142,13 @@ def _about_y(angle: float) -> Floats:
 def refraction_constants(
     pressure_hpa: float, temperature_c: float, wavelength_m: float
 ) -> tuple[float, float]:
-    """A and B in radians of R = A tan z + B tan^3 z, z the apparent zenith distance.
+    """A and B, in radians, of the refraction R = A tan z + B tan^3 z at the apparent zenith distance z.
 
-    A = g (1 - beta), B = -g (beta - g / 2), with the refractivity g of dry air (Edlen 1953, as in Stone 1996, PASP 108,
-    1051) and beta = 0.001254 T / 273.15 K, the scale height of the air over the Earth's radius. Within 0.2" of
-    ray tracing above 15 degrees of altitude.
+        A = g (1 - beta),   B = -g (beta - g / 2)
+
+    g is the refractivity of dry air (Edlen 1953, as in Stone 1996, PASP 108, 1051), which is proportional to the
+    pressure over the temperature. beta = 0.001254 T / 273.15 K is the scale height of the air over the Earth's
+    radius. The formula is within 0.2" of ray tracing above 15 degrees of altitude.
     """
     per_um2 = (1e-6 / wavelength_m) ** 2
     t_k = temperature_c + ZERO_CELSIUS_K
@@ -145,23 +159,34 @@ def refraction_constants(
 
 
 def lowered(directions: Floats, zenith: Floats, a_rad: float, b_rad: float) -> Floats:
-    """(N, 3) unit vectors turned away from the zenith (3,) by the refraction of constants A and B."""
+    """The (N, 3) unit vectors turned away from the zenith (3,) by the refraction of the constants A and B."""
     directions, zenith_rad, up = _vertical(directions, zenith)
     bending = _bending(zenith_rad, a_rad, b_rad)
     return np.cos(bending)[:, None] * directions - np.sin(bending)[:, None] * up
 
 
 def raised(directions: Floats, zenith: Floats, a_rad: float, b_rad: float) -> Floats:
-    """(N, 3) unit vectors turned toward the zenith (3,): the inverse of `lowered`, by iteration to 1e-9 rad."""
+    """The (N, 3) unit vectors turned toward the zenith (3,): the inverse of `lowered`, by iteration to 1e-9 rad."""
     directions, zenith_rad, up = _vertical(directions, zenith)
     bending = np.zeros(len(directions))
+    # The refraction depends on the apparent zenith distance: iterate from the true one.
     for _ in range(RAISING_STEPS):
         bending = _bending(np.maximum(zenith_rad - bending, 0.0), a_rad, b_rad)
     return np.cos(bending)[:, None] * directions + np.sin(bending)[:, None] * up
 
 
 def _vertical(directions: Floats, zenith: Floats) -> tuple[Floats, Floats, Floats]:
-    """The checked directions, their zenith distances (N,), and (N, 3) unit vectors across them toward the zenith."""
+    """The vertical plane of each direction.
+
+    Returns
+    -------
+    directions
+        (N, 3) unit vectors, checked
+    zenith_rad
+        (N,) zenith distances
+    up
+        (N, 3) unit vectors across the directions, toward the zenith
+    """
     directions = checks.floats("directions", directions, (None, 3))
     cosine = directions @ zenith
     across = zenith - cosine[:, None] * directions
@@ -170,6 +195,6 @@ def _vertical(directions: Floats, zenith: Floats) -> tuple[Floats, Floats, Float
 
 
 def _bending(zenith_rad: Floats, a_rad: float, b_rad: float) -> Floats:
-    """(N,) A tan z + B tan^3 z, constant beyond LOWEST_RAD."""
+    """(N,) refraction A tan z + B tan^3 z, constant beyond LOWEST_RAD."""
     tangent = np.tan(np.minimum(zenith_rad, LOWEST_RAD))
     return a_rad * tangent + b_rad * tangent**3

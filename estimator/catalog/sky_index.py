@@ -1,13 +1,24 @@
 """Sky index for star identification: star pairs binned by separation, and stars binned by direction.
 
-Pairs are sorted into bins of equal width in angle (a counting sort), so the candidates for a measured angle are the
-pairs of a few adjacent bins. They are found by a sweep along z: with the stars sorted by z, only stars with |dz| up to
-the maximum chord can form a pair.
+Pairs (`build`) are sorted into bins of equal width in angle, so that the candidates for a measured angle are the pairs
+of a few adjacent bins:
 
-Directions are binned on the six faces of a cube about the observer. A star is projected onto a face by the gnomonic
-projection (u, v) = the two other components over the face's component, and each face is a grid of side x side cells.
-The grid extends beyond the face's edges (|u|, |v| = 1) to FACE_HALF_WIDTH, so that a search around any direction needs
-only the cells of one face; stars near an edge are therefore stored on more than one face.
+1. Find all pairs by a sweep along z: with the stars sorted by z, only stars with |dz| up to the greatest chord can form
+   a pair (`_sweep`).
+2. Sort them into bins (`counting_sort`).
+
+Directions are binned twice, for two kinds of search:
+
+`SkyIndex.cell_first`, `cell_star`: on the six faces of a cube about the observer, for the nearest star within a small
+gate (`nearest`). A star is projected onto a face by the gnomonic projection (u, v), the two other components over the
+face's component, and each face is a grid of side x side cells. The grid extends beyond the face's edges (|u|, |v| = 1)
+to FACE_HALF_WIDTH, so that a search around any direction needs only the cells of one face. Stars near an edge are
+therefore stored on more than one face.
+
+`Cells`: in the cells of the cube [-1, 1]^3 about the unit sphere, for searches within any angle (`within`,
+`nearest_in_grid`). The stars are listed cell after cell. A search within a chord visits the cells that meet
+the box of that half-width about the direction. Cells adjacent in z are adjacent in the list, so that each (x, y) column
+is one loop.
 """
 
 from __future__ import annotations
@@ -21,9 +32,7 @@ from numpy.typing import NDArray
 from estimator.core.checks import Floats, ImageError
 from estimator.core.jit import jit
 
-# Spatial grid for searches by direction: the cube [-1, 1]^3 about the unit sphere, divided into
-# cells.
-
+# Spatial grid for searches by direction: the cube [-1, 1]^3 about the unit sphere, divided into cells.
 
 MAX_SIDE = 64  # 64^3 cells: a table of a megabyte
 
@@ -34,7 +43,7 @@ class Cells(NamedTuple):
     Attributes
     ----------
     side
-        Cells along an edge
+        Number of cells along an edge
     first
         (side^3 + 1,) first entry of each cell in `row`
     row
@@ -47,36 +56,57 @@ class Cells(NamedTuple):
 
 
 def build_grid(vectors: Floats) -> Cells:
-    """Build the cells of (N, 3) unit vectors, with about one star in each cell that the sphere intersects.
+    """Build the cells of (N, 3) unit vectors, with about one star in each cell that the sphere meets.
 
-    The sphere intersects about 4 pi / (2 / side)^2 = pi side^2 cells.
+    The sphere meets about 4 pi / (2 / side)^2 = pi side^2 cells.
     """
     side = min(max(int(sqrt(len(vectors) / pi)), 2), MAX_SIDE)
-    return Cells(side, *_sorted(vectors, side))
+    return Cells(side, *counting_sort(_cube_cells(vectors, side), side**3))
 
 
 @jit
-def _sorted(vectors: Floats, side: int) -> tuple[NDArray, NDArray]:
-    """Sort the stars by cell (counting sort); returns the fields `first` and `row` of Cells."""
-    first = np.zeros(side**3 + 1, np.int32)
-    row = np.empty(len(vectors), np.int32)
+def _cube_cells(vectors: Floats, side: int) -> NDArray[np.int64]:
+    """(N,) number of the cell of each unit vector (N, 3); cells adjacent in z have successive numbers."""
     cell = np.empty(len(vectors), np.int64)
     for n in range(len(vectors)):
         x, y, z = vectors[n]
         cell[n] = (edge_cell(x, side) * side + edge_cell(y, side)) * side + edge_cell(z, side)
-        first[cell[n] + 1] += 1
-    for c in range(side**3):
+    return cell
+
+
+@jit
+def counting_sort(cell: NDArray, cells: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Sort N things by their cell, in a time proportional to N; the order within a cell is kept.
+
+    Parameters
+    ----------
+    cell
+        (N,) number of each thing's cell, 0 to cells - 1
+
+    Returns
+    -------
+    first
+        (cells + 1,) the things of cell c are order[first[c] : first[c + 1]]
+    order
+        (N,) rows of the things, cell after cell
+    """
+    first = np.zeros(cells + 1, np.int32)
+    order = np.empty(len(cell), np.int32)
+    # Count the things of each cell, add the counts up, and fill the cells.
+    for c in cell:
+        first[c + 1] += 1
+    for c in range(cells):
         first[c + 1] += first[c]
-    next_free = first[:-1].copy()
-    for n in range(len(vectors)):
-        row[next_free[cell[n]]] = n
-        next_free[cell[n]] += 1
-    return first, row
+    free = first.copy()
+    for n in range(len(cell)):
+        order[free[cell[n]]] = n
+        free[cell[n]] += 1
+    return first, order
 
 
 @jit
 def cell_of(position: float, last: int) -> int:
-    """Return the cell, 0 to last, of a coordinate in units of cells, clamped to the range; 0 for NaN.
+    """The cell, 0 to last, of a coordinate in units of cells, clamped to the range; 0 for NaN.
 
     The clamp comes before the cast: casting NaN or a number too large for an integer is undefined.
     """
@@ -87,7 +117,7 @@ def cell_of(position: float, last: int) -> int:
 
 @jit
 def edge_cell(x: float, side: int) -> int:
-    """Return the cell along an edge that holds a coordinate in [-1, 1]."""
+    """The cell along an edge that holds a coordinate in [-1, 1]."""
     return cell_of((x + 1) / 2 * side, side - 1)
 
 
@@ -95,7 +125,18 @@ def edge_cell(x: float, side: int) -> int:
 def within(
     cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float, out: NDArray
 ) -> int:
-    """Count the stars within a straight-line distance `chord` of (x, y, z); writes the first len(out) rows to `out`."""
+    """Find the stars within a straight-line distance `chord` of (x, y, z).
+
+    Parameters
+    ----------
+    out
+        Rows of the stars, as many as it holds, are written to it
+
+    Returns
+    -------
+    int
+        Number of stars
+    """
     count = 0
     side = cells.side
     for i in range(edge_cell(x - chord, side), edge_cell(x + chord, side) + 1):
@@ -119,7 +160,7 @@ def within(
 def nearest_in_grid(
     cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float
 ) -> int:
-    """Return the row of the star nearest to (x, y, z) within a straight-line distance `chord`; -1 if there is none."""
+    """The row of the star nearest to (x, y, z) within a straight-line distance `chord`; -1 if there is none."""
     best = -1
     least2 = chord * chord
     side = cells.side
@@ -140,6 +181,7 @@ def nearest_in_grid(
     return best
 
 
+# Sky index: star pairs binned by separation, and stars by direction on the faces of a cube.
 PAIRS_PER_BIN = 8
 STARS_PER_CELL = 0.5
 MAG_STEP = 0.1
@@ -159,15 +201,19 @@ class SkyIndex(NamedTuple):
         (P, 2) rows of stars, in bins of the angle between them
     first
         (B + 1,) pairs first[k] to first[k + 1] are separated by k to k + 1 times bin_rad
+    bin_rad
+        Width of a bin
     mag
         (N,) magnitudes, increasing
-    share
-        Their density per magnitude, from mag[0] in steps of MAG_STEP
+    density
+        Density of the magnitudes, 1 / mag, from mag[0] in steps of MAG_STEP
     cell_first, cell_star
-        The stars of cell c are cell_star[cell_first[c] : cell_first[c + 1]]; each face of the
-        cube has side x side cells
+        The stars of cell c are cell_star[cell_first[c] : cell_first[c + 1]]; each face of the cube has side x side
+        cells
+    side
+        Number of cells along the side of a face
     cells
-        The stars in the cells of `spatial_grid`, for wide searches
+        The stars in the spatial grid, for wide searches
     """
 
     vectors: Floats
@@ -194,16 +240,24 @@ def build(
 
     Parameters
     ----------
+    mag
+        (N,) magnitudes, increasing
+    max_angle_rad
+        Greatest angle of a pair
     paired
-        Number of brightest stars that form pairs; None: all. Raises ImageError for fewer than 3
-        pairs.
+        Number of brightest stars that form pairs; None: all
+
+    Raises
+    ------
+    ImageError
+        For fewer than 3 pairs.
     """
     sky = build_without_pairs(vectors, mag)
     vectors = sky.vectors[:paired]
     max_angle_rad = min(max_angle_rad, np.pi)
     by_z = np.argsort(vectors[:, 2])
     sorted_xyz = np.ascontiguousarray(vectors[by_z].T)
-    # A uniform sky's pairs and a fifth more; a second sweep if these are not enough.
+    # 1. Find the pairs. A uniform sky's pairs and a fifth more; a second sweep if these are not enough.
     expected = len(vectors) ** 2 * np.sin(max_angle_rad / 2) ** 2 / 2
     found = np.empty((0, 2), np.int32)
     half_chord = np.empty(0)
@@ -213,13 +267,14 @@ def build(
         half_chord = np.empty(total)
         total = _sweep(*sorted_xyz, 2 * np.sin(max_angle_rad / 2), found, half_chord)
     # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
-    angle_rad = np.minimum(
-        half_chord[:total], 1.0, out=half_chord[:total]
-    )  # in place: there may be millions
+    # In place: there may be millions.
+    angle_rad = np.minimum(half_chord[:total], 1.0, out=half_chord[:total])
     angle_rad = np.multiply(np.arcsin(angle_rad, out=angle_rad), 2, out=angle_rad)
-    pair, first, bin_rad = _sort_into_bins(
-        by_z, found[:total], angle_rad, max_angle_rad * (1 + 1e-9)
-    )
+    # 2. Sort them into bins; the width leaves the greatest angle in the last bin, whatever the rounding.
+    bins = max(total // PAIRS_PER_BIN, 1)
+    bin_rad = max_angle_rad * (1 + 1e-9) / bins
+    first, order = counting_sort((angle_rad / bin_rad).astype(np.int32), bins)
+    pair = by_z.astype(np.int32)[found[order]]
     if len(pair) < 3:
         raise ImageError(
             f"{len(pair)} pairs of stars within {np.degrees(max_angle_rad):.2f} deg are too few; allowed: 3 or more"
@@ -228,7 +283,7 @@ def build(
 
 
 def build_without_pairs(vectors: Floats, mag: Floats) -> SkyIndex:
-    """Build the index of (N, 3) unit vectors, brightest first, without pairs: for lookups by direction only."""
+    """Build the index of (N, 3) unit vectors, brightest first, without pairs: for look-ups by direction only."""
     vectors = np.ascontiguousarray(vectors, dtype=float)
     mag = np.ascontiguousarray(mag, dtype=float)
     side = max(int(np.sqrt(len(vectors) / STARS_PER_CELL / 6)), 1)
@@ -239,7 +294,7 @@ def build_without_pairs(vectors: Floats, mag: Floats) -> SkyIndex:
 
 
 def _magnitude_density(mag: Floats) -> Floats:
-    """Return the density of sorted magnitudes per magnitude: a histogram smoothed by MAG_SMOOTHING."""
+    """Density of sorted magnitudes, 1 / mag: a histogram smoothed by a Gaussian of MAG_SMOOTHING."""
     reach = 4 * MAG_SMOOTHING
     edges = np.arange(mag[0] - reach, mag[-1] + reach + MAG_STEP, MAG_STEP)
     count = np.histogram(mag, edges)[0] / len(mag) / MAG_STEP
@@ -254,9 +309,21 @@ def _magnitude_density(mag: Floats) -> Floats:
 def _sweep(
     x: Floats, y: Floats, z: Floats, reach: float, found: NDArray, half_chord: Floats
 ) -> int:
-    """Find all pairs up to a chord among stars sorted by z, and their half-chords; return their number.
+    """Step 1: find all pairs up to a chord among stars sorted by z.
 
-    No more than the arrays hold are stored: a greater number asks for another sweep.
+    Parameters
+    ----------
+    x, y, z
+        (N,) components of the unit vectors
+    reach
+        Greatest chord
+    found, half_chord
+        (P, 2) rows of the pairs and (P,) half-chords, written in place; no more than the arrays hold
+
+    Returns
+    -------
+    int
+        Number of pairs; one greater than the arrays asks for another sweep
     """
     total = 0
     for i in range(len(z)):
@@ -277,34 +344,19 @@ def _sweep(
     return total
 
 
-@jit
-def _sort_into_bins(
-    row: NDArray, found: NDArray, angle_rad: Floats, end_rad: float
-) -> tuple[NDArray[np.int32], NDArray[np.int32], float]:
-    """Counting sort of pairs of `row`'s elements by angle: pairs, the first of each bin, and the bins' width."""
-    bins = max(len(found) // PAIRS_PER_BIN, 1)
-    bin_rad = end_rad / bins
-    first = np.zeros(bins + 1, np.int32)
-    for n in range(len(found)):
-        first[int(angle_rad[n] / bin_rad) + 1] += 1
-    for k in range(bins):
-        first[k + 1] += first[k]
-    pair = np.empty((len(found), 2), np.int32)
-    next_free = first.copy()
-    for n in range(len(found)):
-        k = int(angle_rad[n] / bin_rad)
-        pair[next_free[k], 0] = row[found[n, 0]]
-        pair[next_free[k], 1] = row[found[n, 1]]
-        next_free[k] += 1
-    return pair, first, bin_rad
-
-
 def _cells(vectors: Floats, side: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Sort the stars by cell; a star near the edge of a face is also on the neighboring face."""
+    """Sort the stars by cell of the faces; a star near the edge of a face is also on the neighboring face.
+
+    Returns
+    -------
+    cell_first, cell_star
+        Fields of SkyIndex
+    """
     cell = []
     star = []
     for axis in range(3):
         for sign in (1, -1):
+            # Gnomonic projection onto this face, of the stars before it.
             along = sign * vectors[:, axis]
             gnomonic = np.roll(vectors, -axis, axis=1)[:, 1:] / np.maximum(along, 1e-9)[:, None]
             on_face = np.flatnonzero((along > 0) & (np.abs(gnomonic).max(axis=1) < FACE_HALF_WIDTH))
@@ -312,10 +364,8 @@ def _cells(vectors: Floats, side: int) -> tuple[NDArray[np.int32], NDArray[np.in
             column, row = cells.astype(np.int64).T
             cell.append(((2 * axis + (sign < 0)) * side + row) * side + column)
             star.append(on_face)
-    number = np.concatenate(cell)
-    order = np.argsort(number, kind="stable")
-    first = np.searchsorted(number[order], np.arange(6 * side * side + 1))
-    return first.astype(np.int32), np.concatenate(star)[order].astype(np.int32)
+    first, order = counting_sort(np.concatenate(cell), 6 * side * side)
+    return first, np.concatenate(star)[order].astype(np.int32)
 
 
 @jit
@@ -329,14 +379,21 @@ def nearest(
     z: float,
     gate: float,
 ) -> tuple[int, float]:
-    """Return the star nearest to a unit vector and its squared chord; (-1, gate^2) if none is within the gate.
+    """The star nearest to a unit vector within a gate.
 
     The first four arguments are fields of a SkyIndex: passing the whole tuple would cost more than the search.
 
     Parameters
     ----------
+    x, y, z
+        Unit vector in the catalog's frame
     gate
-        Radians, at most 0.05
+        Greatest distance, rad, at most 0.05
+
+    Returns
+    -------
+    star, distance2
+        Row of the star and its squared chord; -1 and gate^2 if none is within the gate
     """
     # The largest component selects the face; the two others over it are the gnomonic coordinates.
     ax = abs(x)
@@ -357,6 +414,7 @@ def nearest(
         inverse = 1 / az
         u = x * inverse
         v = y * inverse
+    # The cells that a square of the gate's half-width about (u, v) meets.
     scale = side / (2 * FACE_HALF_WIDTH)
     # A gnomonic coordinate changes by at most (1 + u^2 + v^2) times the angle, to first order; the last factor bounds
     # the higher orders.

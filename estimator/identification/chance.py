@@ -1,7 +1,8 @@
-"""Significance of a match: binomial probability of as many matches by chance, and common terms of Bayes factors.
+"""Significance of a match: the binomial chance of as many matches, and what Bayes factors of stars and LEDs share.
 
 The published identifiers accept a match by the binomial tail (`log10_tail`). The searches for stars and for LEDs
-compute a Bayes factor instead, whose common constants and terms are here; "dex" is its power of ten.
+compute a Bayes factor instead: the probability of the detections at a candidate attitude over that of detections at
+random places. Its common constants and terms are here. "dex" is the base-10 logarithm of a Bayes factor.
 """
 
 from __future__ import annotations
@@ -13,14 +14,12 @@ import numpy as np
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
 
-ACCEPT_LOG10_CHANCE = (
-    -5.0
-)  # log10 of the expected number of chance matches this good, over all hypotheses
-MIN_MATCHES = 4
+# The published identifiers: greatest log10 of the expected number of chance matches, over all hypotheses tried.
+ACCEPT_LOG10_CHANCE = -5.0
+MIN_MATCHES = 4  # matches that they need
 
-# Bayes factors
-# Least log10 Bayes factor of an accepted attitude. By Markov's inequality, random detections reach it in at most one of
-# 10^5 frames. With 4, a mirrored sky was solved in one of 10^5 adversarial images
+# The searches by Bayes factors: least log10 Bayes factor of an accepted attitude. By Markov's inequality, random
+# detections reach it in at most one of 10^5 frames. With 4, a mirrored sky was solved in one of 10^5 adversarial images
 # (docs/findings/robustness.md); 5 loses two in a thousand of the hardest frames (python -m benchmarks.lost_in_space),
 # 6 would lose twelve.
 ACCEPT_DEX = 5.0
@@ -31,19 +30,31 @@ SHORT_PAIR = 0.2  # of the field size: shorter pairs determine the roll poorly a
 
 @jit
 def log10_tail(trials: int, hits: int, p: float) -> float:
-    """log10 of the probability of `hits` or more in `trials` at probability p each."""
+    """log10 of the binomial tail: the probability of `hits` or more in `trials`, each with probability p.
+
+        P = sum over k from hits to trials of  C(trials, k) p^k (1 - p)^(trials - k)
+
+    The binomial coefficients are computed as logarithms, so that many trials do not overflow.
+    """
     if hits <= 0 or p >= 1:
         return 0.0
     total = 0.0
     for k in range(hits, trials + 1):
+        # ln C(trials, k)
         ways = lgamma(trials + 1.0) - lgamma(k + 1.0) - lgamma(trials - k + 1.0)
         total += np.exp(ways + k * log(p) + (trials - k) * log(1 - p))
+    # The floor keeps a hopeless match finite.
     return np.log10(max(total, 1e-300))
 
 
 @jit
 def counts_dex(matched: int, missing: int) -> float:
-    """log10 B(matched + 1, missing + 1): likelihood of the counts under a uniform prior of detection probability."""
+    """log10 B(m + 1, k + 1): likelihood of m matched and k missing sources.
+
+    The detection probability is unknown, with a uniform prior: the integral of p^m (1 - p)^k over p is the Beta
+    function m! k! / (m + k + 1)!.
+    """
+    # ln B = ln m! + ln k! - ln (m + k + 1)!, with n! = gamma(n + 1).
     return (lgamma(matched + 1.0) + lgamma(missing + 1.0) - lgamma(matched + missing + 2.0)) / log(
         10.0
     )
@@ -51,7 +62,7 @@ def counts_dex(matched: int, missing: int) -> float:
 
 @jit
 def least(values: Floats) -> float:
-    """Least of (N,) values."""
+    """Least of (N,) values; infinity without any."""
     found = np.inf
     for value in values:
         found = min(found, value)
@@ -62,14 +73,37 @@ def least(values: Floats) -> float:
 def required_matches(
     sigma: Floats, field_area: float, attitude_dex: float, min_dex: float, light_dex: float = 0.0
 ) -> int:
-    """Least number of matches that can reach min_dex, from an estimate of the greatest evidence.
+    """Least number of matches with which the evidence can reach `min_dex`.
 
-    The estimate has no residuals and no missing sources: each match contributes the density ratio
-    1 / (2 pi sigma^2 rho) of the least sigma of all detections and light_dex by its brightness, the attitude
-    contributes attitude_dex.
+    The evidence is estimated from above, without residuals and without missing sources:
+
+        dex(k) = k match_dex + attitude_dex - log10(k + 1)
+        match_dex = light_dex - log10(2 pi sigma^2 rho)
+
+    sigma is the least one of all detections and rho = N / field_area their density. log10(k + 1) is `counts_dex` of k
+    matches without a missing source.
+
+    Parameters
+    ----------
+    sigma
+        (N,) standard deviations of the detections, tangents
+    field_area
+        Area of the sensor, tangents squared
+    attitude_dex
+        Contribution of the attitude to the evidence
+    min_dex
+        Evidence to reach
+    light_dex
+        Greatest contribution of the brightness of a match
+
+    Returns
+    -------
+    int
+        From MIN_EVIDENCE_MATCHES to N; N if no number of matches suffices
     """
     total = len(sigma)
     match_dex = light_dex - log10(2 * pi * least(sigma) ** 2 * total / field_area)
+    # The least count whose evidence suffices.
     for count in range(MIN_EVIDENCE_MATCHES, total):
         if count * match_dex + attitude_dex - log10(count + 1.0) >= min_dex:
             return count
@@ -78,17 +112,17 @@ def required_matches(
 
 @jit
 def middle(tangent: Floats, a: int, b: int) -> tuple[float, float]:
-    """Midpoint of two detections, tangents."""
+    """Midpoint (x, y) of two detections, tangents."""
     return (tangent[a, 0] + tangent[b, 0]) / 2, (tangent[a, 1] + tangent[b, 1]) / 2
 
 
 @jit
 def squared_separation(tangent: Floats, a: int, b: int) -> float:
-    """Squared distance between two detections, in tangents."""
+    """Squared distance between two detections, tangents squared."""
     return (tangent[a, 0] - tangent[b, 0]) ** 2 + (tangent[a, 1] - tangent[b, 1]) ** 2
 
 
 @jit
 def separation(tangent: Floats, a: int, b: int) -> float:
-    """Distance between two detections, in tangents."""
+    """Distance between two detections, tangents."""
     return sqrt(squared_separation(tangent, a, b))

@@ -1,8 +1,11 @@
-"""Direct match: the attitude of a few identified stars is applied to the whole field, and tested against chance.
+"""Direct match: test the attitude of a few identified stars on the whole field, against chance.
 
-Common to the published identifiers: angles between directions, the least-squares attitude of a hypothesis (Wahba's
-problem), nearest-neighbor matching of all observed stars at that attitude, and the probability of such a match by
-chance.
+Common to the published identifiers, which find a few stars each in their own way:
+
+1. Solve the attitude of these stars by least squares (Wahba's problem, `fit_rotation`).
+2. Match each observed star to the nearest catalog star at that attitude (`match_nearest`).
+3. Solve the attitude of all matches and match again.
+4. Compute the probability of such a match by chance (`log10_chance`), times the number of hypotheses tried.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from estimator.attitude.solvers import rotation
 from estimator.attitude.wahba import wahba
 from estimator.catalog.pair_index import PairIndex
 from estimator.catalog.sky_index import nearest_in_grid
+from estimator.core import vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
@@ -29,9 +33,9 @@ class DirectMatch(NamedTuple):
     Attributes
     ----------
     observed, star
-        (K,) rows of the observed stars and of the catalog
+        (K,) rows of the matched observed stars and of their catalog stars
     R_cam_from_ref
-        (3, 3)
+        (3, 3) rotation from the catalog's frame to camera axes
     log10_chance
         log10 of the expected number of equally good chance matches
     """
@@ -59,39 +63,53 @@ def match_field(
     stretch: float,
     hypotheses: int,
 ) -> DirectMatch:
-    """The direct match: match all observed stars at the attitude of a few, refine it once, and test against chance.
+    """The direct match of all observed stars at the attitude of a few: the module's steps.
 
     Parameters
     ----------
+    rays
+        (N, 3) unit vectors of the observed stars, in camera axes
     corners, stars
         Rows of the observed and of the catalog stars of the hypothesis, two or more
+    tolerance
+        Tolerance of a direction, rad
+    stretch
+        Relative tolerance of the angle from the boresight, added to the tolerance
     hypotheses
         Number of hypotheses so far, which multiplies the probability
+
+    Returns
+    -------
+    DirectMatch
+        Empty with fewer than MIN_MATCHES matches
     """
+    # 1. and 2. The attitude of a few stars, and its matches.
     R_cam_from_ref = fit_rotation(rays[corners], index.vectors[stars])
     # The attitude of a few stars is less accurate than a star's direction: the first match has twice the tolerance.
     observed, star, _ = match_nearest(rays, index, stars[0], R_cam_from_ref, 2 * tolerance, stretch)
     if len(observed) < MIN_MATCHES:
         return no_match()
+    # 3. The attitude of all of them, and its matches.
     R_cam_from_ref = fit_rotation(rays[observed], index.vectors[star])
     observed, star, expected = match_nearest(
         rays, index, stars[0], R_cam_from_ref, tolerance, stretch
     )
     if len(observed) < MIN_MATCHES:
         return no_match()
+    # 4. The probability by chance.
     chance = log10_chance(index.group[star], len(rays), expected) + np.log10(hypotheses)
     return DirectMatch(observed, star, fit_rotation(rays[observed], index.vectors[star]), chance)
 
 
 @jit
 def no_match() -> DirectMatch:
-    """The empty match, with probability 1 by chance."""
+    """The empty match, with the probability 1 by chance."""
     return DirectMatch(np.empty(0, np.int64), np.empty(0, np.int64), np.eye(3), 0.0)
 
 
 @jit
 def angle(u: Floats, v: Floats) -> float:
-    """Angle between unit vectors, from half the chord: accurate for small angles."""
+    """Angle between unit vectors, rad: 2 arcsin(|u - v| / 2), which is accurate for small angles."""
     half = sqrt((u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2) / 2
     return 2 * np.arcsin(min(half, 1.0))
 
@@ -108,7 +126,7 @@ def triple(u: Floats, v: Floats, w: Floats) -> float:
 
 @jit
 def fit_rotation(cam: Floats, ref: Floats) -> Floats:
-    """R_cam_from_ref by Wahba's problem with equal weights."""
+    """R_cam_from_ref of (K, 3) unit vectors in both frames: Wahba's problem with equal weights."""
     return wahba(cam, ref, np.ones(len(cam)))[0]
 
 
@@ -123,28 +141,39 @@ def match_nearest(
 ) -> tuple[NDArray, NDArray, float]:
     """Match each observed star to the nearest catalog star within its tolerance; each catalog star is used once.
 
-    Returns the rows of the observed stars, the rows of the catalog, and the probability that a random direction has a
-    catalog star within the mean tolerance.
+    A random direction has a catalog star within its tolerance r with the probability p = 1 - exp(-density pi r^2).
+    The mean of pi r^2 over the observed stars is used, and the density of the catalog around star `center`.
 
     Parameters
     ----------
     center
-        Row of a catalog star in the field; its neighbors give the local density of the catalog
+        Row of a catalog star in the field; the number of its neighbors gives the local density of the catalog
+
+    Returns
+    -------
+    observed, star
+        (K,) rows of the observed and of the catalog stars
+    p
+        Probability of a chance match
     """
     observed = np.empty(len(rays), np.int64)
     star = np.empty(len(rays), np.int64)
+    # Stars per steradian in the cap of the neighbors.
     cap_sr = 2 * pi * (1 - np.cos(index.max_angle_rad))
     density = (index.first[center + 1] - index.first[center] + 1) / cap_sr
+    R_ref_from_cam = R_cam_from_ref.T.copy()
     count = 0
     covered_sr = 0.0
     for n in range(len(rays)):
-        u, v, w = rays[n]
-        x = R_cam_from_ref[0, 0] * u + R_cam_from_ref[1, 0] * v + R_cam_from_ref[2, 0] * w
-        y = R_cam_from_ref[0, 1] * u + R_cam_from_ref[1, 1] * v + R_cam_from_ref[2, 1] * w
-        z = R_cam_from_ref[0, 2] * u + R_cam_from_ref[1, 2] * v + R_cam_from_ref[2, 2] * w
-        radius = tolerance + (stretch * np.arccos(min(max(w, -1.0), 1.0)) if stretch > 0 else 0.0)
+        ray = vectors.row(rays, n)
+        x, y, z = vectors.rotate(R_ref_from_cam, ray)
+        # The uncertain focal length or distortion adds an error that grows with the angle from the boresight.
+        radius = tolerance + (
+            stretch * np.arccos(min(max(ray[2], -1.0), 1.0)) if stretch > 0 else 0.0
+        )
         covered_sr += density * pi * radius**2
         best = nearest_in_grid(index.cells, index.vectors, x, y, z, 2 * np.sin(min(radius, pi) / 2))
+        # A catalog star that is used already cannot match again.
         is_used = False
         for m in range(count):
             is_used = is_used or star[m] == best
@@ -159,9 +188,9 @@ def match_nearest(
 def log10_chance(groups: NDArray, count: int, p: float) -> float:
     """log10 of the probability that a false attitude gives this match; three independent matches define the attitude.
 
-    The first match of each group (patch board) has probability p. All boards have the same pattern, so that further
+    The first match of each group (patch board) has the probability p. All boards have the same pattern, so that further
     matches of a group are not independent: the second counts 1/10 (it fixes the orientation of the lattice), each
-    further one 1/2 (lit or not). If every star is its own group, this is the binomial tail.
+    further one 1/2 (lit or not). If every star is its own group, this is the binomial tail of the other matches.
 
     Parameters
     ----------
@@ -169,16 +198,21 @@ def log10_chance(groups: NDArray, count: int, p: float) -> float:
         (K,) groups of the matched stars
     count
         Number of observed stars
+    p
+        Probability of one chance match
     """
     independent = 0
     second = 0
     further = 0
     for n in range(len(groups)):
+        # Number of earlier matches of the same group.
         earlier = 0
         for m in range(n):
             earlier += groups[m] == groups[n]
         independent += earlier == 0
         second += earlier == 1
         further += earlier > 1
+    # Three independent matches define the attitude: the others are trials.
     tail = log10_tail(max(count - 3 - second - further, 0), independent - 3, p)
+    # log10 2 = 0.3.
     return tail - second - 0.3 * further

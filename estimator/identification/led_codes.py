@@ -1,13 +1,23 @@
 """Codes of LEDs: which LED a light is, from its brightness over successive frames.
 
-An LED repeats a word of bits. In an exposure its light is a T, with the brightness a, which is unknown, and the
-template T, the mean level of the bits in the exposure by their shares of its time. A word's misfit to a light y in
-frames j is its negative log likelihood, with normal errors sigma of which a few are gross (a bit that failed, a blend):
+Each LED repeats a word of bits. In an exposure its light is a T: the unknown brightness a times the template T, the
+mean level of the bits that the exposure covers, weighted by their shares of its time. The misfit of a word to the light
+y_j of the frames j is its negative log likelihood, with normal errors sigma_j of which a few are gross (a failed bit, a
+blend):
 
     misfit = min over a of sum over j of min((y_j - a T_j)^2 / (2 sigma_j^2), GROSS)
 
-A receiver that does not know the code's time tries all words at some phases of it, and adds the error of a level by
-that of the phase to sigma: an exposure that crosses a bit's edge counts less.
+A receiver that does not know the time of the code tries all words at PHASES_PER_BIT phases in each bit. It adds the
+error of a level by the error of the phase to sigma: an exposure that crosses the edge of a bit counts less.
+
+Codes need the same light in successive frames. `LightTracks` follows the lights. Under a dome the points where rays
+meet a sphere about the bearing turn rigidly with the vehicle, wherever the camera is on its lever:
+
+1. Turn the points of the last frame by the motion since then, from a gyro or else the last motion of the lights.
+2. Project them. A light continues the track whose prediction is nearest to it, and of which it is the nearest.
+3. Measure the motion of the lights for the next frame.
+4. Record the brightness of each track; 0 for an LED that is dark well inside the field.
+5. End the tracks that have lost their light for too long, and begin tracks of new lights.
 """
 
 from __future__ import annotations
@@ -26,23 +36,21 @@ from estimator.core.jit import jit
 from estimator.core.types import Centroids
 
 GROSS = 7.0  # misfit of a gross error: one of a thousand
-# errors at first sight, and the greatest excess of their misfit
-ROUGH = 0.1
-LIKELY = 40.0
+ROUGH = 0.1  # `likely`: error of a light, as a fraction of the brightest frame
+LIKELY = 40.0  # `likely`: greatest misfit in excess of the best word's
 PHASES_PER_BIT = 8  # phases that a free-running receiver tries
 
 
 @dataclass(frozen=True, slots=True)
 class LedCode:
-    """The words of a dome's LEDs as the tracker knows them.
+    """The words of a dome's LEDs, as the tracker knows them.
 
     Attributes
     ----------
     levels
-        (N, B) part of its light that each LED shows in each bit, 0 to 1, in the order of the
-        LED map
+        (N, B) fraction of its light that each LED shows in each bit, 0 to 1, in the order of the LED map
     bit_time_s
-        Of one bit, of a free-running clock of unknown phase; None if frame n shows bit n
+        Duration of a bit, of a free-running clock of unknown phase; None if frame n shows bit n
     """
 
     levels: Floats
@@ -50,11 +58,9 @@ class LedCode:
 
     def __post_init__(self) -> None:
         levels = checks.floats("code: levels", self.levels, (None, None))
-        if (
-            levels.size == 0
-            or not ((levels >= 0) & (levels <= 1)).all()
-            or not (np.ptp(levels, axis=1) > 0).all()
-        ):
+        # An LED with the same level in all bits has no code.
+        in_range = ((levels >= 0) & (levels <= 1)).all()
+        if levels.size == 0 or not in_range or not (np.ptp(levels, axis=1) > 0).all():
             raise ImageError(
                 "code: levels; allowed: 0 to 1, of each LED two different ones or more"
             )
@@ -67,27 +73,46 @@ class LedCode:
 
     @property
     def bits(self) -> int:
+        """Number of bits B of a word."""
         return self.levels.shape[1]
 
     @property
     def phases(self) -> Floats:
-        """(P,) phases to try, in bits: the code's time at t = 0."""
+        """(P,) phases to try: the code's time at t = 0, in bits."""
         if self.bit_time_s is None:
             return np.zeros(1)
         return np.arange(self.bits * PHASES_PER_BIT) / PHASES_PER_BIT
 
     def templates(self, frame: int, begin_s: float, end_s: float) -> tuple[Floats, Floats]:
-        """(P, N) mean level of each LED in the exposure of a frame, at each phase, and its error by the phase.
+        """The mean level of each LED in the exposure of a frame, at each phase.
 
-        The phase is uniform over a step of the phases, and the level about linear in it: the standard deviation is the
-        change over the step divided by sqrt(12).
+        The mean level is the integral of the level over the exposure, divided by its length. The phase is uniform
+        over a step of the phases, and the level about linear in it, so that its standard deviation is the change
+        over a whole step divided by sqrt(12), that over half a step divided by sqrt(3).
+
+        Parameters
+        ----------
+        frame
+            Number of the frame
+        begin_s, end_s
+            Exposure, in the time of the phases
+
+        Returns
+        -------
+        level
+            (P, N) mean levels
+        error
+            (P, N) standard deviation of the level by that of the phase
         """
+        # Synchronized: the frame shows one bit, without an error of the phase.
         if self.bit_time_s is None:
             shown = self.levels[None, :, frame % self.bits]
             return shown, np.zeros_like(shown)
+        # Free-running: begin and length of the exposure, in bits, at each phase.
         begin = begin_s / self.bit_time_s % self.bits + self.phases
         length = max((end_s - begin_s) / self.bit_time_s, 1e-6)
         half = 0.5 / PHASES_PER_BIT
+        # The mean level half a step of the phase before, at, and after each phase.
         before, at, after = (
             (self._shown_until(begin + step + length) - self._shown_until(begin + step)).T / length
             for step in (-half, 0.0, half)
@@ -99,18 +124,28 @@ class LedCode:
         total = np.concatenate(
             [np.zeros((len(self.levels), 1)), np.cumsum(self.levels, axis=1)], axis=1
         )
+        # Whole periods, whole bits, and a part of a bit.
         periods, within = np.divmod(time, self.bits)
         bit = np.minimum(within.astype(np.int64), self.bits - 1)
         return total[:, -1:] * periods + total[:, bit] + (within - bit) * self.levels[:, bit]
 
 
 def misfits(light: Floats, sigma: Floats, templates: Floats, spread: Floats) -> Floats:
-    """(T, W) misfit of W templates (W, J) to each of T lights (T, J) with errors sigma; a NaN is no measurement.
+    """Misfit of W words to each of T lights (see the module's equation).
 
     Parameters
     ----------
+    light, sigma
+        (T, J) brightness of the lights in J frames and its errors; a NaN is no measurement
+    templates
+        (W, J) templates of the words
     spread
         (W, J) error of a template by the unknown phase
+
+    Returns
+    -------
+    Floats
+        (T, W)
     """
     arrays = (np.ascontiguousarray(one, dtype=float) for one in (light, sigma, templates, spread))
     out = np.empty((len(light), len(templates)))
@@ -120,18 +155,25 @@ def misfits(light: Floats, sigma: Floats, templates: Floats, spread: Floats) -> 
 
 @jit
 def _misfits(light: Floats, sigma: Floats, templates: Floats, spread: Floats, out: Floats) -> None:
-    """Write the misfits. The brightness is fitted twice: from all frames, and from the brightest one."""
+    """Write the misfits to `out`.
+
+    The brightness is fitted twice, as gross errors make the least-squares fit depend on its start: from the fit to all
+    frames, and from the brightest frame. The better fit counts.
+    """
     weight = np.empty(light.shape[1])
     for t in range(len(light)):
         top = 0.0
         for j in range(light.shape[1]):
             if light[t, j] > top:
                 top = light[t, j]
+        # The error by the phase is proportional to the brightness, for which the brightest frame is taken.
         for w in range(len(templates)):
             for j in range(len(weight)):
+                # Without a measurement the weight is 0.
                 weight[j] = 0.0
                 if abs(light[t, j]) < np.inf:
                     weight[j] = 1 / (sigma[t, j] ** 2 + (top * spread[w, j]) ** 2)
+            # The brightness from two starts; the better fit counts.
             least = np.inf
             for start in (_brightness(light[t], weight, templates[w], 0.0, False), top):
                 fitted = _brightness(light[t], weight, templates[w], start, True)
@@ -143,10 +185,21 @@ def _misfits(light: Floats, sigma: Floats, templates: Floats, spread: Floats, ou
 def _brightness(
     light: Floats, weight: Floats, template: Floats, start: float, selects: bool
 ) -> float:
-    """Least-squares brightness; with `selects` of the frames without a gross error at a first brightness."""
+    """Least-squares brightness a = sum(w y T) / sum(w T^2).
+
+    Parameters
+    ----------
+    weight
+        (J,) inverse variances; 0 without a measurement
+    start
+        First brightness, returned if no frame has light
+    selects
+        Whether to leave out the frames that have a gross error at the first brightness
+    """
     product = 0.0
     square = 0.0
     for j in range(len(light)):
+        # Leave out what is not measured, and gross errors.
         if weight[j] == 0 or (
             selects and (light[j] - start * template[j]) ** 2 * weight[j] > 2 * GROSS
         ):
@@ -158,6 +211,7 @@ def _brightness(
 
 @jit
 def _misfit(light: Floats, weight: Floats, template: Floats, brightness: float) -> float:
+    """The misfit at a brightness: sum of min(w (y - a T)^2 / 2, GROSS) over the frames measured."""
     total = 0.0
     for j in range(len(light)):
         if weight[j] > 0:
@@ -166,11 +220,20 @@ def _misfit(light: Floats, weight: Floats, template: Floats, brightness: float) 
 
 
 def likely(light: Floats, templates: Floats) -> Ints:
-    """Rows of the (W, J) templates that a light (J,) does not exclude at first sight; a NaN is no measurement.
+    """Rows of the templates that a light does not exclude at first sight.
 
-    By least squares with errors of ROUGH of the brightest frame, which make little of an edge or a failed bit.
+    By least squares with errors of ROUGH of the brightest frame, which tolerate an edge or a failed bit. With the best
+    brightness a = (y . T) / (T . T) the misfit is (y . y - (y . T)^2 / (T . T)) / 2.
+
+    Parameters
+    ----------
+    light
+        (J,) brightness in J frames; a NaN is no measurement
+    templates
+        (W, J) templates of the words
     """
     seen = np.isfinite(light)
+    # In units of the standard deviation.
     y = light[seen] / light[seen].max() / ROUGH
     shown = templates[:, seen]
     square = np.maximum(np.einsum("wj,wj->w", shown, shown), 1e-300)
@@ -179,10 +242,17 @@ def likely(light: Floats, templates: Floats) -> Ints:
 
 
 def excess_noise(least: Floats, measured: Floats | Ints) -> float:
-    """The factor by which squared errors exceed the assumed ones, 1 or more, from the least misfit of each light (T,).
+    """Factor by which squared errors exceed the assumed ones, 1 or more.
 
-    Half a chi-square of n measurements has the mean n / 2 (Birge 1932, Phys. Rev. 40, 207: errors are enlarged until
-    the residuals are as large as expected). The median over the lights leaves out one that is no LED.
+    Half a chi-square of n measurements has the mean n / 2 (Birge 1932, Phys. Rev. 40, 207: errors are enlarged
+    until the residuals are as large as expected). The median over the lights leaves out one that is no LED.
+
+    Parameters
+    ----------
+    least
+        (T,) least misfit of each light
+    measured
+        (T,) number of its measurements
     """
     return max(1.0, float(np.median(least / (np.asarray(measured) / 2))))
 
@@ -190,57 +260,61 @@ def excess_noise(least: Floats, measured: Floats | Ints) -> float:
 def expected_misfit(measured: Floats | Ints) -> Floats:
     """(T,) greatest misfit of the true word to so many measurements that is not suspicious.
 
-    Half a chi-square has the mean n / 2 and the variance n / 2; beside it one gross error, and one in six.
+    Half a chi-square has the mean n / 2 and the variance n / 2. Three standard deviations are allowed, and gross
+    errors: one, or one in six measurements.
     """
     return measured / 2 + 3 * np.sqrt(measured / 2) + GROSS * np.maximum(1.0, measured / 6)
 
 
-# Lights followed from frame to frame, with the brightness of each in the last frames.
+# Tracks: lights followed from frame to frame, with the brightness of each in the last frames.
 
 
 BORDER_PX = 30.0  # an LED nearer to the border of the sensor may be undetected
 
 
+@dataclass(eq=False)
 class LightTracks:
-    """The tracks of a field's lights; T of them, with the last J frames.
+    """Tracks of the lights of a field, with the brightness of each in the last frames (see the module's steps).
 
     Attributes
     ----------
+    camera
+        The camera
     pupil_m
-        (3,) of the camera from the bearing, in camera axes
+        (3,) camera's entrance pupil from the bearing, in camera axes
     radius_m
-        Of the sphere about the bearing
+        Radius of the sphere about the bearing
     frames
-        J
+        Number J of frames that are kept
     gate_px
-        Greatest distance of a light from its prediction
+        Greatest distance of a light from its prediction, pixels
     patience
-        Successive frames without its light after which a track ends
+        Number of successive frames without its light after which a track ends
     goes_dark
-        Whether an LED without light says that its level is 0; it is unknown otherwise
+        Whether an LED without light has the level 0; its level is unknown otherwise
+    point_m
+        (T, 3) points on the sphere, in camera axes
     light, sigma
-        (T, J) and their errors, NaN without a measurement; frame n is in column n modulo J
+        (T, J) brightness and its errors, NaN without a measurement; frame n is in column n modulo J
     row
-        (T,) row of each in the last frame's centroids, -1 without a light
+        (T,) row of each track's light in the last frame's centroids, -1 without a light
+    missed
+        (T,) number of frames since its last light
+    rate_rad_s
+        (3,) last rate of the lights, in camera axes
+    column
+        Column of the last frame
     """
 
-    def __init__(
-        self,
-        camera: Camera,
-        pupil_m: Floats,
-        radius_m: float,
-        frames: int,
-        gate_px: float,
-        patience: int,
-        goes_dark: bool,
-    ) -> None:
-        self.camera = camera
-        self.pupil_m = pupil_m
-        self.radius_m = radius_m
-        self.frames = frames
-        self.gate_px = gate_px
-        self.patience = patience
-        self.goes_dark = goes_dark
+    camera: Camera
+    pupil_m: Floats
+    radius_m: float
+    frames: int
+    gate_px: float
+    patience: int
+    goes_dark: bool
+
+    def __post_init__(self) -> None:
         self.clear()
 
     def clear(self) -> None:
@@ -260,52 +334,71 @@ class LightTracks:
         elapsed_s: float,
         now_from_then: Rotation | None = None,
     ) -> None:
-        """Continue the tracks with a frame's lights, and begin new ones.
+        """Continue the tracks with the lights of a frame, and begin new ones.
 
         Parameters
         ----------
+        centroids
+            The lights of the frame
         sigma
             (N,) errors of the lights' brightness
+        elapsed_s
+            Time since the last frame
         now_from_then
-            cam(now) from cam(last frame), from a gyro
+            cam(now) from cam(last frame), from a gyro; None: from the last motion of the lights
         """
         self.column = (self.column + 1) % self.frames
+        # 1. Turn the points by the motion.
         turn = now_from_then or Rotation.from_rotvec(self.rate_rad_s * elapsed_s)
         predicted_m = turn.apply(self.point_m)
+        # 2. Project them, and find their lights.
         xy_px = self.camera.pixels(predicted_m - self.pupil_m)
         seen_m = on_sphere(self.camera.rays(centroids.xy_px), self.pupil_m, self.radius_m)
         self.row = _mutual_nearest(xy_px, centroids.xy_px, self.gate_px)
+        # 3. Measure the motion.
         self._measure_motion(seen_m, elapsed_s)
         found = self.row >= 0
-        self.point_m = np.where(
-            found[:, None], seen_m[self.row] if len(seen_m) else predicted_m, predicted_m
-        )
-        self._record(
-            centroids, sigma, self.camera.contains(np.nan_to_num(xy_px, nan=-1e9), BORDER_PX)
-        )
+        self.point_m = predicted_m
+        self.point_m[found] = seen_m[self.row[found]]
+        # 4. Record the brightness. A point behind the camera has no pixel: it is outside of the sensor.
+        xy_px = np.nan_to_num(xy_px, nan=-1e9)
+        self._record(centroids, sigma, self.camera.contains(xy_px, BORDER_PX))
+        # 5. End tracks and begin new ones.
         self.missed = np.where(found, 0, self.missed + 1)
-        self._keep(
-            found
-            | (
-                (self.missed <= self.patience)
-                & self.camera.contains(np.nan_to_num(xy_px, nan=-1e9))
-            )
-        )
+        waits = (self.missed <= self.patience) & self.camera.contains(xy_px)
+        self._keep(found | waits)
         self._begin(centroids, sigma, seen_m)
 
     def _measure_motion(self, seen_m: Floats, elapsed_s: float) -> None:
-        """The rate of the lights between the last two frames, in camera axes; unchanged unless two are seen in both."""
+        """Step 3: measure the rate of the lights between the last two frames, in camera axes.
+
+        The rate is unchanged unless two lights are seen in both frames.
+
+        Parameters
+        ----------
+        seen_m
+            (N, 3) points of the frame's lights on the sphere, in camera axes
+        """
         found = self.row >= 0
         if found.sum() >= 2 and elapsed_s > 0:
+            # Wahba's problem: the rotation of the points from the last frame to this one.
             turn, _ = Rotation.align_vectors(seen_m[self.row[found]], self.point_m[found])
             self.rate_rad_s = turn.as_rotvec() / elapsed_s
 
     def _record(self, centroids: Centroids, sigma: Floats, inside: NDArray[np.bool_]) -> None:
-        """Store the brightness of each track; 0 for an LED that is dark well inside the field."""
+        """Step 4: store the brightness of each track; 0 for an LED that is dark well inside the field.
+
+        Parameters
+        ----------
+        inside
+            (T,) whether the prediction is well inside the sensor
+        """
         found = self.row >= 0
         dark = ~found & inside & self.goes_dark
+        # Dark tracks have a measurement of 0; those without one have NaN.
         self.light[:, self.column] = np.where(dark, 0.0, np.nan)
         self.sigma[:, self.column] = np.nan
+        # The light found, with its error.
         self.light[found, self.column] = centroids.flux[self.row[found]]
         self.sigma[found, self.column] = sigma[self.row[found]]
         # A dark frame is as uncertain as the others, whose errors are those of the light itself.
@@ -314,31 +407,49 @@ class LightTracks:
         self.sigma[dark, self.column] = greatest[dark]
 
     def _keep(self, kept: NDArray[np.bool_]) -> None:
+        """Keep the tracks of a (T,) mask."""
         for name in ("point_m", "light", "sigma", "row", "missed"):
             setattr(self, name, getattr(self, name)[kept])
 
     def _begin(self, centroids: Centroids, sigma: Floats, seen_m: Floats) -> None:
-        """New tracks for the lights that continue none."""
+        """Begin tracks for the lights that continue none."""
         new = np.setdiff1d(np.arange(len(centroids)), self.row)
         nothing = np.full((len(new), self.frames), np.nan)
         self.point_m = np.vstack([self.point_m, seen_m[new]])
-        self.light, self.sigma = np.vstack([self.light, nothing]), np.vstack([self.sigma, nothing])
+        self.light = np.vstack([self.light, nothing])
+        self.sigma = np.vstack([self.sigma, nothing])
         self.row = np.concatenate([self.row, new])
         self.missed = np.concatenate([self.missed, np.zeros(len(new), np.int64)])
+        # Their only measurement is that of this frame.
         first = len(self.row) - len(new)
         self.light[first:, self.column] = centroids.flux[new]
         self.sigma[first:, self.column] = sigma[new]
 
 
 def _mutual_nearest(predicted_px: Floats, seen_px: Floats, gate_px: float) -> Ints:
-    """(T,) row of the light nearest to each prediction, if both are each other's nearest within the gate, else -1."""
+    """Row of the light nearest to each prediction, if both are each other's nearest within the gate.
+
+    Parameters
+    ----------
+    predicted_px, seen_px
+        (T, 2) predictions and (N, 2) lights, pixels
+    gate_px
+        Greatest distance
+
+    Returns
+    -------
+    Ints
+        (T,) rows of the lights, -1 without one
+    """
     row = np.full(len(predicted_px), -1)
     if not len(predicted_px) or not len(seen_px):
         return row
     distance = np.linalg.norm(predicted_px[:, None] - seen_px, axis=2)
+    # A prediction behind the camera has no pixel.
     distance = np.where(np.isfinite(distance), distance, np.inf)
     nearest = distance.argmin(axis=1)
     track = np.arange(len(row))
+    # Nearest in both directions, and within the gate.
     good = (distance.argmin(axis=0)[nearest] == track) & (distance[track, nearest] <= gate_px)
     row[good] = nearest[good]
     return row

@@ -1,9 +1,25 @@
 """Bayes factor of a candidate attitude under an LED dome, from matched and missing LEDs.
 
 `evaluate` projects the LEDs at a candidate attitude, matches them to the detections, refines the attitude, and returns
-log10 of the Bayes factor ("dex") of this attitude over detections at random positions; see `_evidence` for its terms.
+log10 of the Bayes factor ("dex"): the probability of the detections if the attitude is true, over that if they are
+distributed at random over the sensor.
+
+    dex = sum_k log10( N(residual_k) / rho ) + sum_k light_dex_k       positions and brightness of the matches
+        + log10( (2 pi)^(n/2) / sqrt(det info) / V )                   attitude and focal length
+        + log10 B(matched + 1, missing + 1)                            counts of matched and missing LEDs
+
+N is the Gaussian of a residual, rho the density of detections, info the n x n Fisher information of the fit, and V the
+prior volume of attitudes that see the dome, times the width of the range of an uncertain focal length.
+
 Unlike stars, LEDs are near: the projection includes the lever from the bearing to the camera's entrance pupil. If the
 focal length is uncertain, it is refined with the attitude: `focal_ratio` is the true one over the assumed one.
+
+The steps of `evaluate`; the same numbers return as comments in the code:
+
+1. Match the LEDs around to the detections, within the error of the pair's attitude (`_match`).
+2. Fit attitude and focal ratio to the matches by one Gauss-Newton step (`_fit`).
+3. Match again, within the errors of the detections alone, and count the missing LEDs.
+4. Compute the evidence (`_evidence`). Steps 2 to 4 are done twice.
 """
 
 from __future__ import annotations
@@ -27,9 +43,8 @@ from estimator.identification.chance import (
 )
 from estimator.identification.led_index import DomeIndex
 
-# part of the lights of any brightness: blends, reflections; per unit of logarithm
-STRAY = 0.01
-STRAY_DENSITY = 0.1
+STRAY = 0.01  # fraction of the lights that may have any brightness: blends, reflections
+STRAY_DENSITY = 0.1  # density of their brightness, per unit of the logarithm
 
 
 class LedDetections(NamedTuple):
@@ -38,22 +53,19 @@ class LedDetections(NamedTuple):
     Attributes
     ----------
     ray
-        (N, 3) unit
+        (N, 3) unit vectors
     tangent
         (N, 2) x / z and y / z
     sigma
         (N,) total standard deviation of each tangent
     direction
-        (N, 3) unit vector from the bearing to the point where the ray meets the sphere of the
-        median LED radius
+        (N, 3) unit vectors from the bearing to the point where the ray meets the sphere of the median LED radius
     direction_per_m
         (N, 3) derivative of `direction` with respect to that radius, 1 / m
     log_flux
-        (N,) logarithm of the flux per second of exposure; of length 0 where brightness is not
-        used
+        (N,) logarithm of the flux per second of exposure; of length 0 if brightness is not used
     light_density
-        (N,) density of that brightness, per unit of the logarithm, if the light may be any LED
-        or none
+        (N,) density of that brightness, per unit of the logarithm, if the light may be any LED or none
     focal_uncertainty
         Greatest relative error of the focal length; 0 for a calibrated camera
     """
@@ -69,7 +81,17 @@ class LedDetections(NamedTuple):
 
 
 class LedHypothesis(NamedTuple):
-    """A hypothesis: matched rows of detections and LEDs (K,), R_cam_from_lab (3, 3), log10 of the Bayes factor."""
+    """A candidate attitude with its matches and its evidence.
+
+    Attributes
+    ----------
+    observed, star
+        (K,) rows of the matched detections and of their LEDs
+    R_cam_from_lab
+        (3, 3) rotation from the lab frame to camera axes
+    dex
+        log10 of the Bayes factor
+    """
 
     observed: NDArray[np.int64]
     star: NDArray[np.int64]
@@ -79,9 +101,16 @@ class LedHypothesis(NamedTuple):
 
 @jit
 def light_dex(detections: LedDetections, dome: DomeIndex, n: int, star: int) -> float:
-    """log10 of the ratio of a light's brightness density as that LED to its density as any LED; 0 if it is not used."""
+    """Evidence of the brightness of light n for being LED `star`; 0 if brightness is not used.
+
+        log10( ((1 - e) N(log flux - log flux of the LED) + e STRAY_DENSITY) / p )
+
+    e = STRAY is the fraction of lights of any brightness, and p the density of this brightness if the light may be
+    any LED or none.
+    """
     if len(detections.log_flux) == 0 or len(dome.log_flux) == 0:
         return 0.0
+    # Difference of the logarithms in standard deviations.
     z = (detections.log_flux[n] - dome.log_flux[star]) / dome.flux_sigma
     as_led = exp(-z * z / 2) / (sqrt(2 * pi) * dome.flux_sigma)
     return log10(((1 - STRAY) * as_led + STRAY * STRAY_DENSITY) / detections.light_density[n])
@@ -107,18 +136,25 @@ def evaluate(
     b: int,
     focal_ratio: float = 1.0,
 ) -> LedHypothesis:
-    """Evaluate the attitude of a pair of detections a, b: match, fit and match again (twice), compute the evidence.
-
-    R_cam_from_lab is changed in place by the fit. The evidence is -inf if fewer than MIN_EVIDENCE_MATCHES LEDs match,
-    or if the focal length is out of its range.
+    """Match, fit and score the attitude of a pair of detections: the module's steps 1 to 4.
 
     Parameters
     ----------
+    R_cam_from_lab
+        (3, 3) candidate attitude, changed in place by the fit
     center
         Row of the LED whose neighborhood is matched
+    a, b
+        Rows of the pair's detections
     focal_ratio
-        Of the pair, if it is uncertain
+        Focal ratio of the pair, if it is uncertain
+
+    Returns
+    -------
+    LedHypothesis
+        Its evidence is -inf if fewer than MIN_EVIDENCE_MATCHES LEDs match, or if the focal length is out of its range
     """
+    # 1. Match.
     # Error of the pair's attitude, in units of a detection's variance: 1/2 from its midpoint (beside the detection's
     # own 1), and 2 / separation^2 per squared distance from the midpoint from its direction; a focal length from the
     # pair adds the same along that distance.
@@ -127,22 +163,26 @@ def evaluate(
     observed, star, missing = _match(
         detections, dome, R_cam_from_lab, focal_ratio, center, midpoint, 1.5, direction_variance
     )
-    dex = -np.inf
     for _ in range(2):
+        dex = -np.inf
+        # Too few matches determine no attitude.
         if len(observed) < MIN_EVIDENCE_MATCHES:
-            return LedHypothesis(observed, star, R_cam_from_lab, -np.inf)
+            break
+        # 2. Fit; the range of the focal ratio has a margin, as the fit is noisy.
         info, focal_ratio = _fit(detections, dome, R_cam_from_lab, focal_ratio, observed, star)
         if abs(focal_ratio - 1) > 1.2 * detections.focal_uncertainty + 1e-12:
-            return LedHypothesis(observed, star, R_cam_from_lab, -np.inf)
+            break
+        # 3. Match again.
         observed, star, missing = _match(
             detections, dome, R_cam_from_lab, focal_ratio, center, midpoint, 1.0, 0.0
         )
+        # 4. The evidence.
         dex = _evidence(
             detections, dome, R_cam_from_lab, focal_ratio, observed, star, missing, info
         )
-    return LedHypothesis(
-        observed, star, R_cam_from_lab, dex if len(observed) >= MIN_EVIDENCE_MATCHES else -np.inf
-    )
+    if len(observed) < MIN_EVIDENCE_MATCHES:
+        dex = -np.inf
+    return LedHypothesis(observed, star, R_cam_from_lab, dex)
 
 
 @jit
@@ -163,11 +203,26 @@ def _match(
     base_variance: float,
     direction_variance: float,
 ) -> tuple[NDArray, NDArray, int]:
-    """Match each LED near `center` to its nearest detection within the gate, one LED for each detection.
+    """Match each LED near `center` to its nearest detection within the gate, one LED for each detection: steps 1 and 3.
 
-    The gate is GATE_SIGMA; its variance is base_variance + direction_variance * (distance from `midpoint`)^2, times
-    the detection's. Returns rows of detections, rows of LEDs, and the number of missing LEDs: predicted well inside
-    the field, or rivals for a detection that a nearer LED keeps.
+    The squared gate is GATE_SIGMA^2 (base_variance + direction_variance d^2) times the detection's variance, d the
+    distance from `midpoint`.
+
+    Parameters
+    ----------
+    center
+        Row of an LED; itself and its neighbors in the pair index are matched
+    midpoint
+        (x, y) of the pair, tangents
+    base_variance, direction_variance
+        Error of the attitude and of the detection, in units of the detection's variance
+
+    Returns
+    -------
+    observed, star
+        (K,) rows of the detections and of the LEDs
+    missing
+        Number of missing LEDs: predicted well inside the field, or rivals for a detection that a nearer LED keeps
     """
     left, right, top, bottom = dome.field_tan
     first = dome.pairs.first
@@ -180,6 +235,7 @@ def _match(
     # The LED `center` itself, then its neighbors in the pair index: all LEDs that can share a field with it.
     for entry in range(first[center] - 1, first[center + 1]):
         s = center if entry < first[center] else dome.pairs.neighbor[entry]
+        # Predict the LED's place; leave it out if it is behind the camera or outside a field widened by a tenth.
         qx, qy, qz = _vector_from_pupil(dome, R_cam_from_lab, s)
         qx = focal_ratio * qx
         qy = focal_ratio * qy
@@ -191,10 +247,11 @@ def _match(
             continue
         x = qx / qz
         y = qy / qz
+        # The gate of an LED: the errors of the attitude at its place and of a detection.
         variance = base_variance + direction_variance * (
             (x - midpoint[0]) ** 2 + (y - midpoint[1]) ** 2
         )
-        # in units of the detection's variance
+        # The nearest detection: squared distances are in units of the detection's variance.
         best = -1
         distance2 = GATE_SIGMA**2 * variance
         for n in range(total):
@@ -203,8 +260,10 @@ def _match(
                 best = n
                 distance2 = residual2 / detections.sigma[n] ** 2
         if best < 0:
+            # A missing LED counts only well inside the field.
             missing += left < x < right and top < y < bottom
             continue
+        # The slot of an earlier match of the same detection, or a new one at the end.
         slot = 0
         while slot < count and observed[slot] != best:
             slot += 1
@@ -230,11 +289,26 @@ def _fit(
     observed: NDArray,
     star: NDArray,
 ) -> tuple[Floats, float]:
-    """One Gauss-Newton step of R_cam_from_lab about the bearing, in place, with exact near-field projection.
+    """One Gauss-Newton step of R_cam_from_lab about the bearing, in place, with exact near-field projection: step 2.
 
-    With b = R P, q = b - r (r the pupil) and R <- exp([w]) R, a tangent changes by d . (w x b) = w . (b x d), d its
-    gradient with respect to q. An uncertain focal length multiplies all tangents: its logarithm is the fourth unknown.
-    Returns the Fisher information of w, in camera axes, and of that logarithm, (3, 3) or (4, 4), and the focal ratio.
+    With b = R P and q = b - r (r the pupil), an LED's tangent is t = f q_xy / q_z. For R <- exp([w]) R it changes by
+    d . (w x b) = w . (b x d), d its gradient with respect to q:
+
+        d of t_x = f (1 / q_z, 0, -q_x / q_z^2),   d of t_y = f (0, 1 / q_z, -q_y / q_z^2)
+
+    An uncertain focal length multiplies all tangents: its logarithm is the fourth unknown, with the derivative t.
+
+    Parameters
+    ----------
+    observed, star
+        (K,) rows of the matched detections and of their LEDs
+
+    Returns
+    -------
+    info
+        (3, 3) or (4, 4) Fisher information of w, in camera axes, and of log focal_ratio
+    focal_ratio
+        The new focal ratio
     """
     count = 4 if detections.focal_uncertainty > 0 else 3
     info = np.zeros((count, count))
@@ -248,17 +322,20 @@ def _fit(
         bz = q[2] + dome.pupil_m[2]
         weight = 1 / detections.sigma[observed[k]] ** 2
         for axis in range(2):
+            # Components of d, then of b x d.
             by_component = focal_ratio / q[2]
             by_depth = -focal_ratio * q[axis] / q[2] ** 2
             slopes[0] = by * by_depth - axis * bz * by_component
             slopes[1] = (1 - axis) * bz * by_component - bx * by_depth
             slopes[2] = axis * bx * by_component - (1 - axis) * by * by_component
             slopes[3] = focal_ratio * q[axis] / q[2]
+            # The residual, and its contribution to the gradient and to the information.
             residual = detections.tangent[observed[k], axis] - slopes[3]
             for i in range(count):
                 step[i] += weight * slopes[i] * residual
                 for j in range(count):
                     info[i, j] += weight * slopes[i] * slopes[j]
+    # Solve for the step and apply it.
     _factorize(info, factor)
     least_squares.cholesky_solve(factor, step)
     vectors.rotate_in_place(step, R_cam_from_lab)
@@ -267,15 +344,17 @@ def _fit(
 
 @jit
 def _factorize(info: Floats, factor: Floats) -> float:
-    """Cholesky factor of a square matrix, in the lower triangle of `factor`; returns the root of its determinant.
+    """Cholesky factor of a square matrix, in the lower triangle of `factor`; returns the root of the determinant.
 
     The root is 0 for a singular matrix.
     """
+    # Copy the lower triangle, then factorize the copy.
     for i in range(len(info)):
         for j in range(i + 1):
             factor[i, j] = info[i, j]
     if not least_squares.cholesky(factor):
         return 0.0
+    # det info = (product of the factor's diagonal)^2
     root = 1.0
     for i in range(len(info)):
         root *= factor[i, i]
@@ -293,21 +372,27 @@ def _evidence(
     missing: int,
     info: Floats,
 ) -> float:
-    """log10 of the Bayes factor of this attitude over detections at random positions.
+    """log10 of the Bayes factor of an attitude over detections at random positions (see the module's equation): step 4.
 
-    Each match contributes N(residual) / rho, rho the density of detections on the sensor, and the evidence of its
-    brightness (`light_dex`). The counts of matched (m)
-    and missing (k) LEDs contribute B(m + 1, k + 1), a uniform prior on the fraction of dead LEDs. The attitude
-    contributes (2 pi)^1.5 / sqrt(det info) over the prior volume (Laplace's approximation), an uncertain focal length
-    the root of another 2 pi over the width of its range. By Markov's inequality, random detections reach 10^x for any
-    attitude in at most one of 10^x frames.
+    The counts have a uniform prior on the fraction of dead LEDs. By Markov's inequality, random detections reach x
+    dex at any attitude in at most one of 10^x frames.
 
-    All patch boards have the same pattern, so that further matches on one board are not independent: the second LED of
-    a board counts at most a factor of 10 (it fixes the orientation of the lattice), each further one at most a factor
-    of 2 (it is lit or not).
+    All patch boards have the same pattern, so that further matches on one board are not independent: the second LED
+    of a board counts at most a factor of 10 (it fixes the orientation of the lattice), each further one at most a
+    factor of 2 (it is lit or not).
+
+    Parameters
+    ----------
+    observed, star
+        (K,) rows of the matched detections and of their LEDs
+    missing
+        Number of missing LEDs
+    info
+        Fisher information of the fit
     """
     density = len(detections.ray) / dome.field_area
     group = dome.pairs.group
+    # Attitude and focal length.
     root_det = _factorize(info, np.empty_like(info))
     total = len(info) / 2 * log10(2 * pi) - log10(max(root_det, 1e-150)) - log10(dome.prior_volume)
     if detections.focal_uncertainty > 0:
@@ -318,8 +403,10 @@ def _evidence(
         x = detections.tangent[observed[k], 0]
         y = detections.tangent[observed[k], 1]
         residual2 = (x - focal_ratio * qx / qz) ** 2 + (y - focal_ratio * qy / qz) ** 2
+        # Position and brightness of a match.
         match_dex = -residual2 / variance / 2 / log(10.0) - log10(2 * pi * variance * density)
         match_dex += light_dex(detections, dome, observed[k], star[k])
+        # A further match on one board counts less; log10 2 = 0.3.
         same_board = 0
         for m in range(k):
             same_board += group[star[m]] == group[star[k]]

@@ -1,9 +1,9 @@
 """Index of a dome's LEDs for identification: pairs by the angle between them, and LEDs by direction.
 
-Angles are measured about the bearing center, from which they do not change with the attitude, and are scaled to those
+Angles are measured about the bearing center, from which they do not change with the attitude. They are scaled to those
 that LEDs at the median radius would have; the search allows for the error of that scaling. Pairs are sorted by angle,
-with a k-vector to find a range of angles. Directions are binned in a square grid around the dome's middle, so that the
-question "is an LED near this direction" reads a few cells.
+with a k-vector to find a range of angles. Directions are sorted into a square grid around the middle of the dome, so
+that the question "is an LED near this direction" reads a few cells.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from estimator.catalog.pair_index import PairIndex, build, k_vector
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 
-# Fraction of the field in which an unmatched source counts as missing; the border may cut it off.
+# Fraction of the field in which an unmatched LED counts as missing; nearer to the border it may be cut off.
 INNER_FRACTION = 0.95
 
 
@@ -29,13 +29,13 @@ class DirectionGrid(NamedTuple):
     Attributes
     ----------
     R_grid_from_lab
-        (3, 3) rotates the mean direction of the LEDs to +z
+        (3, 3) rotation of the mean direction of the LEDs to +z
     cell, side
         Width of a cell, and number of cells along a side
     first
-        LEDs first[c] to first[c + 1] are in cell c
+        (side^2 + 1,) LEDs first[c] to first[c + 1] are in cell c
     direction
-        (N, 3) unit vectors of the LEDs in that order, in grid axes
+        (L, 3) unit vectors of the LEDs in that order, in grid axes
     """
 
     R_grid_from_lab: Floats
@@ -51,16 +51,15 @@ class DomeIndex(NamedTuple):
     Attributes
     ----------
     pairs
-        LED pairs by their angle about the bearing, scaled to the median radius
-        (`scale_pair_angles`)
+        LED pairs by their angle about the bearing, scaled to the median radius (`scale_pair_angles`)
     grid
         The LEDs by direction
     position_m
-        (L, 3) LEDs in the lab frame
+        (L, 3) positions of the LEDs in the lab frame
     radius_m
-        (L,) from the bearing
+        (L,) distances of the LEDs from the bearing
     median_radius_m
-        Their median
+        Median of these distances
     pupil_m
         (3,) camera's entrance pupil from the bearing, in camera axes
     scaling_error_rad
@@ -68,9 +67,9 @@ class DomeIndex(NamedTuple):
     field_tan
         (4,) tangents left, right, top, bottom inside which an LED is fully visible
     field_area
-        Of the sensor, in tangents squared
+        Area of the sensor, tangents squared
     prior_volume
-        Of attitudes that see the dome: steradians of boresight times 2 pi of roll
+        Volume of the attitudes that see the dome: steradians of boresight times 2 pi of roll
     led_sigma, lever_sigma
         Standard deviations of LED positions and of the pupil, over their least distance
     log_flux
@@ -98,21 +97,29 @@ class DomeIndex(NamedTuple):
 def build_dome_index(leds: LedMap, lever: Lever, camera: Camera) -> DomeIndex:
     """Index of a dome: every pair of LEDs that one field of view can hold.
 
-    A ray at angle alpha from the boresight meets radius R at an angle theta about the bearing, with
-    R sin(alpha - theta) = M sin(alpha), M the length of the lever. For small angles a pair angle at radius R therefore
-    scales to the median radius R0 by the factor ((R0 - M) / R0) / ((R - M) / R). `scaling_error_rad` bounds the
-    neglected terms: d(theta)/dR = M alpha / R^2 times the difference of the two radii, a relative term alpha^2 in wide
-    fields, and a second-order term. Raises ImageError if there are no pairs.
+    A ray at the angle alpha from the boresight meets the sphere of radius R at an angle theta about the bearing, with
+    R sin(alpha - theta) = M sin(alpha), M the length of the lever. For small angles, theta = alpha (R - M) / R. A
+    pair angle at radius R therefore scales to the median radius R0 by the factor ((R0 - M) / R0) / ((R - M) / R).
+
+    `scaling_error_rad` bounds the neglected terms: d(theta)/dR = M alpha / R^2 times the difference of the two radii, a
+    relative term alpha^2 in wide fields, and a second-order term.
+
+    Raises
+    ------
+    ImageError
+        If there are no pairs.
     """
     radius = np.linalg.norm(leds.position_m, axis=1)
     median_m = float(np.median(radius))
     lever_m = float(np.linalg.norm(lever.camera_body_m))
+    # The greatest angle between two LEDs in one field.
     rays = corner_rays(camera)
     inner, half_size = inner_field(rays)
     alpha = float(np.arccos(rays[:, 2].min()))
     # At a given angle from the boresight, the LED of the greatest radius has the greatest angle about the bearing.
     theta = alpha - np.arcsin(min(lever_m / radius.max() * np.sin(alpha), 1.0))
     index = build(leds.position_m / radius[:, None], min(2.1 * theta, np.pi), leds.board)
+    # Scale the angles to the median radius, and bound the error of that.
     scale = (median_m - lever_m) / median_m * radius / (radius - lever_m)
     first, second = index.pair.T
     max_offset_m = np.abs(radius - median_m).max()
@@ -145,10 +152,19 @@ def corner_rays(camera: Camera) -> Floats:
 
 
 def inner_field(corners: Floats) -> tuple[Floats, Floats]:
-    """The inner field of a sensor with (4, 3) corner rays.
+    """The inner field of a sensor, in which a missing LED counts.
 
-    Returns its (4,) tangents left, right, top, bottom, INNER_FRACTION times the full field, and (2,) the half-size of
-    the full field.
+    Parameters
+    ----------
+    corners
+        (4, 3) rays of the sensor's corners
+
+    Returns
+    -------
+    inner
+        (4,) tangents left, right, top, bottom of INNER_FRACTION times the full field
+    half_size
+        (2,) half-size of the full field, tangents
     """
     tangent = corners[:, :2] / corners[:, 2:]
     mean = (tangent.max(axis=0) + tangent.min(axis=0)) / 2
@@ -159,14 +175,17 @@ def inner_field(corners: Floats) -> tuple[Floats, Floats]:
 
 
 def build_grid(directions: Floats) -> DirectionGrid:
-    """Grid of (N, 3) unit vectors with one vector per cell on average."""
+    """Grid of (L, 3) unit vectors, with one vector in a cell on average."""
+    # Turn the mean direction to +z, so that x and y tell the LEDs apart.
     mean = directions.mean(axis=0)
     R_grid_from_lab = Rotation.align_vectors([[0.0, 0.0, 1.0]], [mean])[0].as_matrix()
     in_grid = directions @ R_grid_from_lab.T
     flat = in_grid[:, :2]
+    # A square that holds all LEDs, with one cell for each LED.
     half_size = np.abs(flat).max() * 1.001
     side = max(int(np.sqrt(len(flat))), 1)
     cell = 2 * half_size / side
+    # Sort the LEDs by cell.
     column, row = ((flat + half_size) / cell).astype(np.int64).T
     number = row * side + column
     order = np.argsort(number, kind="stable")
@@ -177,8 +196,15 @@ def build_grid(directions: Floats) -> DirectionGrid:
 
 
 def scale_pair_angles(index: PairIndex, scale: Floats) -> PairIndex:
-    """The index with each pair angle multiplied by the mean scale (N,) of its LEDs, sorted again by angle."""
+    """The index with each pair angle multiplied by the mean scale of its LEDs, sorted again by angle.
+
+    Parameters
+    ----------
+    scale
+        (L,) factor of each LED
+    """
     first, second = index.pair.T
+    # The order of the pairs changes with the angles, and with it the k-vector.
     angle = index.angle_rad * (scale[first] + scale[second]) / 2
     order = np.argsort(angle, kind="stable")
     kvector, slope, offset = k_vector(angle[order])
@@ -192,7 +218,11 @@ def scale_pair_angles(index: PairIndex, scale: Floats) -> PairIndex:
 
 
 def cap_height(directions: Floats, margin_rad: float) -> float:
-    """1 - cos(half-angle) of the cap about the mean of (N, 3) directions that holds all of them, plus a margin."""
+    """1 - cos(half-angle) of the cap about the mean of (L, 3) directions that holds all of them, plus a margin.
+
+    The solid angle of the cap is 2 pi times this.
+    """
     mean = directions.mean(axis=0)
+    # Cosine of the angle of the LED farthest from the mean.
     nearest = (directions @ mean).min() / max(np.linalg.norm(mean), 1e-9)
     return float(1 - np.cos(min(np.arccos(np.clip(nearest, -1, 1)) + margin_rad, np.pi)))

@@ -1,10 +1,17 @@
-"""Attitude from lights that may each be several LEDs: the names by their codes and the places together.
+"""Attitude from lights that may each be one of several LEDs: names from their codes and places together.
 
-Two lights are taken to be all pairs of LEDs that their codes allow and that are as far apart, seen from the bearing.
-Each pair of names gives an attitude, which predicts where the others are: the misfit of the hypothesis is that of the
-two codes, and of each other light the least sum, over the LEDs, of the code's misfit and the squared distance, at most
-STRANGER. The best hypothesis counts if every other one is worse by the factor 10^MARGIN_DEX in likelihood, if it takes
-the codes at their word, and if most of the lights agree: one wrong name leads to a refusal, not to a wrong attitude.
+A name is the LED that a light is taken for. Codes alone leave several names for a light; the places decide.
+
+1. Choose two lights with few names that are far apart (`_best_pair`).
+2. List the pairs of their names with the same angle about the bearing, likeliest codes first (`_pair_names`).
+3. Each pair of names gives an attitude (`_attitudes`).
+4. The attitude predicts the places of all LEDs, and each other light takes its best name (`_evaluate`). The misfit of
+   the hypothesis is that of the two codes plus, for each other light, the least sum of a code's misfit and half the
+   squared distance; at most STRANGER.
+5. Accept the best hypothesis if every other one is worse by the factor 10^MARGIN_DEX in likelihood, if its names hardly
+   contradict the codes, and if most of the lights have a name (`identify`).
+
+One wrong name thus leads to a refusal, not to a wrong attitude.
 """
 
 from __future__ import annotations
@@ -21,10 +28,10 @@ from estimator.core.types import StarMatch
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.led_search import MARGIN_DEX
 
-REACH = 30.0  # names with a misfit that exceeds the best one's by more are left out
+REACH = 30.0  # greatest misfit of a name in excess of the best name's
 STRANGER = 14.0  # misfit of a light that fits no LED: a reflection, or a track that changed its LED
-TRUSTED = 5.0  # by which the misfit of two codes may exceed that of their best names
-MAX_HYPOTHESES = 150  # more of them are not decided yet
+TRUSTED = 5.0  # greatest excess misfit of the names, times the square root of their number
+MAX_HYPOTHESES = 150  # with so many or more, the lights are undecided
 UNDECIDED = "codes: more than one attitude fits the lights"
 CONTRADICTED = "codes: the names of the lights contradict their places"
 
@@ -35,11 +42,11 @@ class NamedLights(NamedTuple):
     Attributes
     ----------
     ray
-        (T, 3) unit, in camera axes
+        (T, 3) unit vectors in camera axes
     sigma
-        (T,) standard deviation of its tangents
+        (T,) standard deviation of their tangents
     misfit
-        (T, N) of each LED's code
+        (T, N) misfit of each LED's code
     """
 
     ray: Floats
@@ -53,13 +60,13 @@ class Sphere(NamedTuple):
     Attributes
     ----------
     position_m
-        (N, 3) in the lab
+        (N, 3) positions of the LEDs in the lab frame
     radius_m
-        (N,) from the bearing
+        (N,) their distances from the bearing
     direction
         (N, 3) position / radius
     pupil_m
-        (3,) in camera axes
+        (3,) camera's entrance pupil from the bearing, in camera axes
     """
 
     position_m: Floats
@@ -69,16 +76,26 @@ class Sphere(NamedTuple):
 
 
 def identify(lights: NamedLights, sphere: Sphere) -> StarMatch | str:
-    """The lights' LEDs with the attitude, or the reason for a refusal; rows of `lights` in the match."""
+    """Name the lights and solve the attitude: the module's steps.
+
+    Returns
+    -------
+    StarMatch | str
+        The lights' rows, their LEDs and the attitude, or the reason for a refusal
+    """
     excess = lights.misfit - lights.misfit.min(axis=1, keepdims=True)
+    # 1. Two lights.
     first, second = _best_pair(lights.ray, excess)
+    # 2. Their names.
     names = _pair_names(lights, sphere, excess, first, second)
     if not len(names):
         return CONTRADICTED
     if len(names) >= MAX_HYPOTHESES:
         return UNDECIDED
+    # 3. and 4. Attitudes, and the names of the other lights.
     R_cam_from_lab = _attitudes(lights, sphere, first, second, names)
     total, star = _evaluate(lights, sphere, excess, R_cam_from_lab, (first, second), names)
+    # 5. Refuse unless one hypothesis is clearly the best, and agrees with the codes and with most of the lights.
     order = np.argsort(total)
     best = order[0]
     if len(order) > 1 and total[order[1]] - total[best] < MARGIN_DEX * np.log(10):
@@ -96,31 +113,41 @@ def identify(lights: NamedLights, sphere: Sphere) -> StarMatch | str:
 
 
 def is_supported(match: StarMatch, misfit: Floats, lights: int) -> bool:
-    """Whether the names hold at one time of the codes' clock, and no other light of the frame speaks against them.
+    """Whether the names hold at one time of the codes' clock, and no other light of the frame contradicts them.
 
     `identify` takes each light at its own best phase; the names together must be nearly as good at a common one. Two
-    names that nothing else confirms count only where there is no other light; else half of the lights must have one.
+    names that nothing else confirms count only if there is no other light. Otherwise half of the lights must have a
+    name.
 
     Parameters
     ----------
     misfit
-        (P, T, N) of each LED's code at P phases of the clock, of the rows of `match.observed`
-        among others
+        (P, T, N) misfit of each LED's code at P phases of the clock, for lights that include those of `match.observed`
     lights
-        Number of lights with enough bits, also those that fit no code
+        Number of lights with enough bits, including those that fit no code
     """
     count = len(match.observed)
     if count < lights / 2 or (count == 2 and lights > 2):
         return False
+    # Best misfit at one common phase, and at a phase of its own for each light.
     together = misfit[:, match.observed, match.star].sum(axis=1).min()
     apart = misfit.min(axis=(0, 2))[match.observed].sum()
     return bool(together - apart <= TRUSTED * np.sqrt(count))
 
 
 def _best_pair(ray: Floats, excess: Floats) -> tuple[int, int]:
-    """The two lights with the fewest pairs of names, of those that are at least half as far apart as any."""
+    """Step 1: the two lights with the fewest pairs of names, among those at least half as far apart as any.
+
+    Parameters
+    ----------
+    ray
+        (T, 3) unit vectors
+    excess
+        (T, N) misfit of each name in excess of the best one's
+    """
     apart = np.linalg.norm(ray[:, None] - ray, axis=2)
     names = (excess <= REACH).sum(axis=1).astype(float)
+    # The number of pairs of names; infinite for lights that are too close together.
     cost = np.where(apart >= apart.max() / 2, names[:, None] * names, np.inf)
     np.fill_diagonal(cost, np.inf)
     first, second = np.unravel_index(int(cost.argmin()), cost.shape)
@@ -130,17 +157,30 @@ def _best_pair(ray: Floats, excess: Floats) -> tuple[int, int]:
 def _pair_names(
     lights: NamedLights, sphere: Sphere, excess: Floats, first: int, second: int
 ) -> Ints:
-    """(M, 2) names of two lights, the likeliest ones, whose angle about the bearing is that of the lights."""
-    rows = [np.flatnonzero(excess[light] <= REACH) for light in (first, second)]
-    seen = [
-        _seen_directions(lights.ray[light], sphere, row)
-        for light, row in zip((first, second), rows, strict=True)
-    ]
-    known = [sphere.direction[row] for row in rows]
+    """Step 2: names of two lights whose angle about the bearing is that of the lights, the likeliest ones.
+
+    Returns
+    -------
+    Ints
+        (M, 2) rows of LEDs, at most MAX_HYPOTHESES
+    """
+    first_rows = np.flatnonzero(excess[first] <= REACH)
+    second_rows = np.flatnonzero(excess[second] <= REACH)
+    seen_first = _seen_directions(lights.ray[first], sphere, first_rows)
+    seen_second = _seen_directions(lights.ray[second], sphere, second_rows)
+    directions = (
+        seen_first,
+        seen_second,
+        sphere.direction[first_rows],
+        sphere.direction[second_rows],
+    )
     gate = float(GATE_SIGMA * np.hypot(lights.sigma[first], lights.sigma[second]))
-    pairs = np.empty((_alike(*seen, *known, gate, np.empty((0, 2), np.int64)), 2), np.int64)
-    _alike(*seen, *known, gate, pairs)
-    names = np.column_stack([rows[0][pairs[:, 0]], rows[1][pairs[:, 1]]])
+    # Count the pairs, then store them.
+    count = _alike(*directions, gate, np.empty((0, 2), np.int64))
+    pairs = np.empty((count, 2), np.int64)
+    _alike(*directions, gate, pairs)
+    names = np.column_stack([first_rows[pairs[:, 0]], second_rows[pairs[:, 1]]])
+    # One LED cannot be both lights.
     names = names[names[:, 0] != names[:, 1]]
     cost = excess[first, names[:, 0]] + excess[second, names[:, 1]]
     order = np.argsort(cost, kind="stable")
@@ -149,19 +189,26 @@ def _pair_names(
 
 @jit
 def _alike(u: Floats, v: Floats, known_u: Floats, known_v: Floats, gate: float, pairs: Ints) -> int:
-    """How many pairs of u (K, 3) and v (L, 3) are as far apart as their known directions; the first fill `pairs`.
+    """Find the pairs of directions u (K, 3) and v (L, 3) that are as far apart as their known directions.
 
-    The difference of two angles that are much greater than it is that of their cosines over the sine.
+    The cosines of two angles differ by the difference of the angles times the sine, if that difference is small.
+
+    Returns
+    -------
+    int
+        Number of pairs; the first len(pairs) of them are written to `pairs`
     """
     found = 0
     for a in range(len(u)):
         for b in range(len(v)):
+            # Cosine of the angle that is seen, and of the angle that is known.
             cosine = u[a, 0] * v[b, 0] + u[a, 1] * v[b, 1] + u[a, 2] * v[b, 2]
             known = (
                 known_u[a, 0] * known_v[b, 0]
                 + known_u[a, 1] * known_v[b, 1]
                 + known_u[a, 2] * known_v[b, 2]
             )
+            # (difference of the cosines / sine)^2 < gate^2; the sine has a floor for coincident lights.
             if (cosine - known) ** 2 < gate**2 * max(1 - cosine**2, gate**2):
                 if found < len(pairs):
                     pairs[found, 0] = a
@@ -171,7 +218,7 @@ def _alike(u: Floats, v: Floats, known_u: Floats, known_v: Floats, gate: float, 
 
 
 def _seen_directions(ray: Floats, sphere: Sphere, rows: Ints) -> Floats:
-    """(K, 3) direction from the bearing to the point where a ray meets the sphere of each of these LEDs' radii."""
+    """(K, 3) directions from the bearing to the points where a ray meets the spheres of these LEDs' radii."""
     radius = sphere.radius_m[rows]
     along = float(ray @ sphere.pupil_m)
     reach = -along + np.sqrt(np.maximum(along**2 - sphere.pupil_m @ sphere.pupil_m + radius**2, 0))
@@ -179,17 +226,19 @@ def _seen_directions(ray: Floats, sphere: Sphere, rows: Ints) -> Floats:
 
 
 def _attitudes(lights: NamedLights, sphere: Sphere, first: int, second: int, names: Ints) -> Floats:
-    """(M, 3, 3) R_cam_from_lab of each pair of names."""
-    seen = [
-        _seen_directions(lights.ray[light], sphere, names[:, k])
-        for k, light in enumerate((first, second))
-    ]
-    known = [sphere.direction[names[:, k]] for k in range(2)]
-    return np.einsum("mia,mib->mab", _frames(*seen), _frames(*known))
+    """Step 3: (M, 3, 3) R_cam_from_lab of each pair of names."""
+    seen_first = _seen_directions(lights.ray[first], sphere, names[:, 0])
+    seen_second = _seen_directions(lights.ray[second], sphere, names[:, 1])
+    known_first = sphere.direction[names[:, 0]]
+    known_second = sphere.direction[names[:, 1]]
+    # R = sum over the axes of (axis in camera axes) (axis in the lab frame)^T.
+    seen = _frames(seen_first, seen_second)
+    known = _frames(known_first, known_second)
+    return np.einsum("mia,mib->mab", seen, known)
 
 
 def _frames(u: Floats, v: Floats) -> Floats:
-    """(M, 3, 3) orthonormal axes, in rows, of pairs of unit vectors: their middle, the third, and their normal."""
+    """(M, 3, 3) axes, in rows, of pairs of unit vectors: their bisector, the third axis, and their normal."""
     middle = u + v
     normal = np.cross(u, v)
     middle = middle / np.linalg.norm(middle, axis=1, keepdims=True)
@@ -205,22 +254,41 @@ def _evaluate(
     pair: tuple[int, int],
     names: Ints,
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """(M,) misfit of each hypothesis and (M, T) its names of the lights, -1 for none."""
+    """Step 4: the misfit of each hypothesis, and the names that it gives to the lights.
+
+    Parameters
+    ----------
+    R_cam_from_lab
+        (M, 3, 3) attitudes of the hypotheses
+    pair
+        Rows of the two lights
+    names
+        (M, 2) names of the two lights
+
+    Returns
+    -------
+    total
+        (M,) misfits
+    star
+        (M, T) names of the lights, -1 for none
+    """
+    # Predicted tangents of all LEDs at each attitude; infinite behind the camera.
     offset = (R_cam_from_lab.reshape(-1, 3) @ sphere.position_m.T).reshape(
         -1, 3, len(sphere.position_m)
     )
     offset = offset - sphere.pupil_m[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         tangent = np.where(offset[:, 2:] > 0, offset[:, :2] / offset[:, 2:], np.inf)
+    # Geometry of the pair, for the error of its attitude.
     seen = lights.ray[:, :2] / lights.ray[:, 2:]
     middle = seen[list(pair)].mean(axis=0)
     length2 = np.sum((seen[pair[0]] - seen[pair[1]]) ** 2)
+    # Misfit of the pair's two codes.
     total = excess[pair[0], names[:, 0]] + excess[pair[1], names[:, 1]]
     star = np.full((len(names), len(seen)), -1)
     star[:, pair] = names
-    cost = np.full(
-        (len(names), len(sphere.position_m) + 1), STRANGER
-    )  # of each LED, and at last (-1) of none of them
+    # Cost of each name of a light; the last column is that of no name.
+    cost = np.full((len(names), len(sphere.position_m) + 1), STRANGER)
     named = list(pair)
     for light in set(range(len(seen))) - set(pair):
         # The pair's attitude adds half of a light's variance, and more with the distance from the pair's middle.
@@ -230,6 +298,7 @@ def _evaluate(
         cost[:, :-1] = np.where(squared < GATE_SIGMA**2, squared / 2 + excess[light], np.inf)
         np.put_along_axis(cost, star[:, named], np.inf, axis=1)  # an LED is one light at most
         cost[:, -1] = STRANGER
+        # The best name of this light, or none.
         star[:, light] = cost.argmin(axis=1)
         total = total + cost.min(axis=1)
         star[star[:, light] == len(sphere.position_m), light] = -1

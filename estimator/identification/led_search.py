@@ -2,17 +2,27 @@
 
 The angles between near LEDs, seen from the camera, change with the attitude. But the camera only rotates about the
 bearing center, from which every LED has a fixed distance. A measured ray is intersected with the sphere of the
-hypothetical LED's own radius about the bearing, which gives the direction from the bearing to the LED in body axes
+hypothetical LED's own radius about the bearing. This gives the direction from the bearing to the LED in camera axes,
 without knowledge of the attitude. A pair of detections and a pair of LEDs must then agree in one angle about the
-bearing, and determine an attitude. A quick check counts the other detections that have an LED at the predicted
-direction; if enough do, the candidate is fitted to the whole field and its Bayes factor is computed
-(`evidence.evaluate`).
+bearing, and they determine an attitude, which the other detections must confirm.
+
+The steps; the same numbers return as comments in the code:
+
+1. Convert rays to directions from the bearing, with their total errors (`build_detections`).
+2. Sort the pairs of detections by the number of LED pairs of the same angle (`_ordered_pairs`).
+3. Take the next pair, and all LED pairs of its angle, in both orders (`_test_pair`).
+4. Compute the focal ratio and the exact directions with the LEDs' own radii; compare the angle; compute the attitude.
+5. Quick check: look for an LED at the direction of each other detection (`_quick_check`).
+6. Match the LEDs around, fit the attitude and compute its Bayes factor (`led_evidence.evaluate`).
+7. Once an attitude reaches ACCEPT_DEX, search for rivals (`_search`): the same pair again with a lower bound, then one
+   pair that shares no detection with it. A rival that explains almost as much must contain one of the two pairs.
+8. Refuse an attitude that a rival approaches within MARGIN_DEX, or that is not beyond chance (`identify`).
 
 If the focal length is uncertain, an angle alone says little. Angles of triangles in the focal plane hardly depend on
 it (Samaan, Mortari & Junkins 2003, AAS 03-131: non-dimensional star identification; Leake, Arnas & Mortari 2020,
-arXiv:2003.13736). A pair of detections is then compared with all LED pairs of any length in its range. Each gives an
-attitude and a focal length, that is, the frame of a similarity in which the places of the other detections are
-invariants: with each of them the pair makes a triangle, whose angles the quick check compares with the LEDs'.
+arXiv:2003.13736). A pair of detections is then compared with all LED pairs of any angle in its range. Each LED pair
+gives an attitude and a focal length, that is, the frame of a similarity in which the places of the other detections
+are invariants: the pair makes a triangle with each of them, whose angles the quick check compares with the LEDs'.
 """
 
 from __future__ import annotations
@@ -52,9 +62,7 @@ from estimator.identification.led_evidence import (
 from estimator.identification.led_index import DirectionGrid, DomeIndex
 
 MARGIN_DEX = 5.0  # by which the best attitude must beat every other one
-AMBIGUOUS_DEX = (
-    2.0  # least evidence of the best attitude for a near rival to be reported as an ambiguity
-)
+AMBIGUOUS_DEX = 2.0  # least evidence of the best attitude for a near rival to be reported
 MIN_SEPARATION = 1e-9  # of a pair, in tangents: closer detections have no direction between them
 AMBIGUOUS = "ambiguous: another attitude fits the lights as well"
 NO_MATCH = "no identification beyond chance"
@@ -68,30 +76,36 @@ def identify(
     flux_s: Floats | None = None,
     focal_uncertainty: float = 0.0,
 ) -> StarMatch | str:
-    """Identify the LEDs of (N, 3) rays in camera axes: the matches and the attitude, or the reason for a refusal.
-
-    Detection pairs are tested against all LED pairs of the same angle (`_test_pair`), the pairs with the fewest first.
-    After an attitude reaches ACCEPT_DEX, rivals are searched for with a second, disjoint pair of its detections: a
-    rival that explains almost as much must contain one of the two pairs. If a rival comes within MARGIN_DEX, the
-    pattern is ambiguous and no attitude is returned. Brightness counts only if the map's LEDs differ in it.
+    """Identify the LEDs of (N, 3) rays in camera axes: the whole search (see the module's steps).
 
     Parameters
     ----------
+    rays_cam
+        (N, 3) unit vectors in camera axes
     sigma_rad
         (N,) standard deviation of a ray about each axis; `dome` holds the survey's own errors
+    dome
+        Index of the LEDs
     max_checks
-        LED pairs tested, plus detections times LEDs compared, before giving up
+        Bound on the effort: LED pairs tested, plus a quarter of the detections times the LEDs compared with them
     flux_s
-        (N,) flux of the lights per second of exposure, for LEDs that differ in brightness;
-        None: unknown
+        (N,) flux of the lights per second of exposure; None: unknown. It counts only if the map's LEDs differ in
+        brightness
     focal_uncertainty
-        Greatest relative error of the focal length; `dome` must hold the pairs of the widest
-        field
+        Greatest relative error of the focal length; `dome` must hold the pairs of the widest field
+
+    Returns
+    -------
+    StarMatch | str
+        The matches and the attitude, or the reason for a refusal
     """
     if len(rays_cam) < MIN_EVIDENCE_MATCHES:
         return NO_MATCH
+    # 1. Directions from the bearing.
     detections = build_detections(rays_cam, sigma_rad, dome, flux_s, focal_uncertainty)
+    # 2. to 7. The best attitude, and the evidence of its best rival.
     hypothesis, rival_dex = _search(detections, dome, max_checks)
+    # 8. Refuse an ambiguous or insignificant one.
     if hypothesis.dex > AMBIGUOUS_DEX and hypothesis.dex - rival_dex < MARGIN_DEX:
         return AMBIGUOUS
     if hypothesis.dex < ACCEPT_DEX:
@@ -108,16 +122,29 @@ def build_detections(
     flux_s: Floats | None = None,
     focal_uncertainty: float = 0.0,
 ) -> LedDetections:
-    """Detections for the search: rays with their total errors, which include those of the LED map and of the lever.
+    """Step 1: rays with their total errors, which include those of the LED map and of the lever.
 
-    A lateral error of the pupil shifts all LEDs alike and is absorbed by the attitude; an axial one scales the
-    image and adds an error proportional to the distance from the boresight.
+    A lateral error of the pupil shifts all LEDs alike and is absorbed by the attitude. An axial error scales the image,
+    and adds an error proportional to the distance from the boresight.
 
-    With p = r + s u on the sphere |p| = R, ds/dR = R / (u . p), so that d(p / R)/dR = u / (u . p) - p / R^2.
+    A ray u from the pupil r meets the sphere of radius R at p = r + s u with |p| = R. Then ds/dR = R / (u . p), so
+    that the direction p / R changes by d(p / R)/dR = u / (u . p) - p / R^2.
+
+    Parameters
+    ----------
+    rays_cam, sigma_rad, dome, flux_s, focal_uncertainty
+        See `identify`
+
+    Returns
+    -------
+    LedDetections
+        The tangents' errors are those of the rays divided by z^2 = cos^2 of the angle from the boresight
     """
+    # Total standard deviations of the tangents.
     tangent = np.ascontiguousarray(rays_cam[:, :2] / rays_cam[:, 2:])
     pupil_sigma = dome.lever_sigma * np.linalg.norm(tangent, axis=1)
     ray_sigma = np.hypot(sigma_rad, dome.led_sigma) / rays_cam[:, 2] ** 2
+    # Directions from the bearing, and their change with the radius.
     point_m = on_sphere(rays_cam, dome.pupil_m, dome.median_radius_m)
     along_m = np.sum(rays_cam * point_m, axis=1)[:, None]
     return LedDetections(
@@ -132,7 +159,17 @@ def build_detections(
 
 
 def _brightness(flux_s: Floats | None, dome: DomeIndex) -> tuple[Floats, Floats]:
-    """(N,) logarithms of lights' fluxes, and (N,) density of each if it may be any LED or none; empty if unused."""
+    """The brightness of lights, for `led_evidence.light_dex`.
+
+    Returns
+    -------
+    log_flux
+        (N,) logarithms of the fluxes
+    light_density
+        (N,) density of each, if the light may be any LED or none
+
+    Both are empty if brightness is not used.
+    """
     if flux_s is None or not len(dome.log_flux):
         return np.zeros(0), np.zeros(0)
     log_flux = np.log(np.maximum(flux_s, 1e-300))
@@ -145,25 +182,34 @@ def _brightness(flux_s: Floats | None, dome: DomeIndex) -> tuple[Floats, Floats]
 def _search(
     detections: LedDetections, dome: DomeIndex, max_checks: int
 ) -> tuple[LedHypothesis, float]:
-    """The best hypothesis, and the evidence of the best one with another attitude."""
-    R_cam_from_lab = np.zeros((3, 3))
-    for axis in range(3):
-        R_cam_from_lab[axis, axis] = 1.0
-    best = LedHypothesis(np.empty(0, np.int64), np.empty(0, np.int64), R_cam_from_lab, -np.inf)
+    """Steps 2 to 7: search for the best attitude and for its rivals.
+
+    Returns
+    -------
+    best
+        The best hypothesis
+    rival_dex
+        Evidence of the best hypothesis with another attitude, log10
+    """
+    none = np.empty(0, np.int64)
+    best = LedHypothesis(none, none, np.eye(3), -np.inf)
     rival_dex = -np.inf
     checks = np.zeros(1, np.int64)
+    # 2. The order of the pairs.
     order = _ordered_pairs(detections, dome)
     for rank in range(len(order)):
+        # 3. to 6. Test the next pair.
         a, b = order[rank]
         best, rival_dex = _test_pair(detections, dome, a, b, ACCEPT_DEX, best, rival_dex, checks)
         if best.dex >= ACCEPT_DEX:
-            # A rival below this floor cannot matter. If the floor is below ACCEPT_DEX, `_test_pair` has skipped such
-            # rivals so far, and the same pair is tested again; then a second pair is tested.
+            # 7. Search for rivals. One below `min_rival_dex` cannot matter. If that is below ACCEPT_DEX, `_test_pair`
+            # has skipped such rivals so far, and the same pair is tested again.
             min_rival_dex = best.dex - MARGIN_DEX
             if min_rival_dex < ACCEPT_DEX:
                 best, rival_dex = _test_pair(
                     detections, dome, a, b, min_rival_dex, best, rival_dex, checks
                 )
+            # A second pair, because detections a and b may not be in the rival.
             a, b = order[_disjoint_pair(order, rank, best)]
             return _test_pair(detections, dome, a, b, min_rival_dex, best, rival_dex, checks)
         if checks[0] > max_checks:
@@ -173,10 +219,15 @@ def _search(
 
 @jit
 def _ordered_pairs(detections: LedDetections, dome: DomeIndex) -> NDArray[np.int64]:
-    """(P, 2) pairs of detections, sorted by the number of LED pairs they may be; short pairs come last.
+    """Step 2: pairs of detections, sorted by the number of LED pairs that they may be; short pairs come last.
 
     Short pairs also match few LED pairs, but determine the roll about the boresight poorly. Coincident detections are
     left out.
+
+    Returns
+    -------
+    NDArray
+        (P, 2) rows of the detections
     """
     total = len(detections.ray)
     min_length = SHORT_PAIR * sqrt(dome.field_area)
@@ -186,9 +237,11 @@ def _ordered_pairs(detections: LedDetections, dome: DomeIndex) -> NDArray[np.int
     for a in range(total):
         for b in range(a + 1, total):
             length = separation(detections.tangent, a, b)
+            # Coincident detections have no direction between them.
             if not length > MIN_SEPARATION:
                 continue
             begin, end, _ = _pair_range(detections, dome, a, b)
+            # The cost: number of LED pairs, or one beyond all of these for a short pair.
             pair[count, 0] = a
             pair[count, 1] = b
             cost[count] = end - begin if length >= min_length else 1e9 - length
@@ -200,7 +253,18 @@ def _ordered_pairs(detections: LedDetections, dome: DomeIndex) -> NDArray[np.int
 def _pair_range(
     detections: LedDetections, dome: DomeIndex, a: int, b: int
 ) -> tuple[int, int, float]:
-    """Half-open range of index pairs that two detections may be, and the gate of their angle about the bearing, rad."""
+    """Step 3: the LED pairs that two detections may be.
+
+    The gate is GATE_SIGMA standard deviations of the angle, converted to an angle about the bearing. The range is
+    wider by the error of the index's angles, and by the uncertain focal length.
+
+    Returns
+    -------
+    begin, end
+        Half-open range of pairs in the index
+    gate
+        Greatest difference of the angles about the bearing, rad
+    """
     gate = (
         GATE_SIGMA
         * sqrt(detections.sigma[a] ** 2 + detections.sigma[b] ** 2)
@@ -208,9 +272,12 @@ def _pair_range(
     )
     direction_a = vectors.row(detections.direction, a)
     direction_b = vectors.row(detections.direction, b)
+    # The angle about the bearing, for LEDs at the median radius.
     angle = 2 * np.arcsin(min(vectors.chord(direction_a, direction_b) / 2, 1.0))
+    # The index holds angles that are scaled to the median radius, with an error.
     slack = gate + dome.scaling_error_rad
     uncertainty = detections.focal_uncertainty
+    # An uncertain focal length widens the range in proportion.
     begin, end = pair_range(
         dome.pairs, angle / (1 + uncertainty) - slack, angle / (1 - uncertainty) + slack
     )
@@ -219,7 +286,7 @@ def _pair_range(
 
 @jit
 def _bearing_angle_ratio(dome: DomeIndex) -> float:
-    """Ratio of an angle about the bearing to the angle seen by the camera: (R - M) / R."""
+    """Ratio of a small angle about the bearing to that seen by the camera: (R - M) / R, M the length of the lever."""
     return (
         1
         - sqrt(dome.pupil_m[0] ** 2 + dome.pupil_m[1] ** 2 + dome.pupil_m[2] ** 2)
@@ -229,16 +296,25 @@ def _bearing_angle_ratio(dome: DomeIndex) -> float:
 
 @jit
 def _disjoint_pair(pairs: NDArray, rank: int, best: LedHypothesis) -> int:
-    """Rank of the first pair of two matched detections that shares none with pair `rank`, or as few as possible."""
+    """Rank of the first pair of two matched detections that shares none with pair `rank`, or else as few as possible.
+
+    Parameters
+    ----------
+    pairs
+        (P, 2) rows of the detections
+    best
+        The hypothesis that matches them
+    """
     best_rank = rank
     cost = 9
     for other in range(len(pairs)):
         penalty = 0
         for end in range(2):
+            # Each end costs 3 if it is not matched, and 1 if it is shared.
             is_matched = False
             for n in best.observed:
                 is_matched = is_matched or n == pairs[other, end]
-            penalty += 3 * (not is_matched)  # an unmatched detection is worse than two shared ones
+            penalty += 3 * (not is_matched)
             penalty += pairs[other, end] == pairs[rank, 0] or pairs[other, end] == pairs[rank, 1]
         if penalty < cost:
             best_rank = other
@@ -257,18 +333,27 @@ def _test_pair(
     rival_dex: float,
     checks: NDArray,
 ) -> tuple[LedHypothesis, float]:
-    """Test two detections against every LED pair of the same angle, in both orders.
-
-    Candidates that cannot reach min_dex are skipped. Returns the updated best hypothesis and the evidence of its best
-    rival.
+    """Steps 3 to 6: test two detections against every LED pair of the same angle, in both orders.
 
     Parameters
     ----------
+    a, b
+        Rows of the two detections
+    min_dex
+        Candidates that cannot reach this evidence are skipped
+    best, rival_dex
+        Best hypothesis so far, and the evidence of its best rival
     checks
         (1,) effort so far, increased in place
+
+    Returns
+    -------
+    best, rival_dex
+        Updated
     """
     index = dome.pairs
     radius = dome.radius_m
+    # 3. LED pairs of the same angle, and what the quick check needs.
     begin, end, gate = _pair_range(detections, dome, a, b)
     attitude_dex = _attitude_dex(detections, dome, a, b)
     most_light_dex = _most_light_dex(detections, dome)
@@ -287,6 +372,7 @@ def _test_pair(
             j = index.pair[p, 1 - flip]
             led_i = vectors.row(index.vectors, i)
             led_j = vectors.row(index.vectors, j)
+            # 4a. The focal ratio at which the chord is that of the LEDs.
             focal_ratio = _fit_focal_ratio(
                 detections, dome, a, b, radius[i], radius[j], vectors.chord(led_i, led_j)
             )
@@ -294,20 +380,25 @@ def _test_pair(
                 continue
             direction_a = _direction_from_bearing(_ray(detections, a, focal_ratio), dome, radius[i])
             direction_b = _direction_from_bearing(_ray(detections, b, focal_ratio), dome, radius[j])
-            # The index holds angles scaled to the median radius; here each ray meets the LED's own radius.
+            # 4b. Compare the angle. The index holds angles scaled to the median radius; here each ray meets the
+            # LED's own radius.
             if abs(vectors.chord(direction_a, direction_b) - vectors.chord(led_i, led_j)) > gate:
                 continue
+            # 4c. The attitude turns the axes of the LEDs into those of the detections.
             vectors.pair_frame(direction_a, direction_b, in_cam)
             vectors.pair_frame(led_i, led_j, in_lab)
             vectors.multiply_transposed(in_cam, in_lab, R_cam_from_lab)
             vectors.multiply_transposed(dome.grid.R_grid_from_lab, R_cam_from_lab, R_grid_from_cam)
+            # 5. Quick check.
             counted = _quick_check(
                 detections, dome, R_grid_from_cam, focal_ratio, radius[i], a, b, gates, required
             )
             if counted < required:
                 continue
+            # 6. Evidence.
             checks[0] += len(detections.ray) * (index.first[i + 1] - index.first[i]) // 4
             hypothesis = evaluate(detections, dome, R_cam_from_lab.copy(), i, a, b, focal_ratio)
+            # Keep the best hypothesis and the best one with another identification.
             same = same_identification(hypothesis, best)
             if hypothesis.dex > best.dex:
                 rival_dex = rival_dex if same else max(rival_dex, best.dex)
@@ -319,7 +410,7 @@ def _test_pair(
 
 @jit
 def _ray(detections: LedDetections, n: int, focal_ratio: float) -> Vector:
-    """Unit ray of a detection in camera axes, if the focal length is `focal_ratio` times the assumed one."""
+    """Unit ray of detection n in camera axes, if the focal length is `focal_ratio` times the assumed one."""
     if focal_ratio == 1:
         return vectors.row(detections.ray, n)
     x = detections.tangent[n, 0] / focal_ratio
@@ -338,12 +429,20 @@ def _fit_focal_ratio(
     radius_b_m: float,
     chord: float,
 ) -> float:
-    """The focal ratio at which two detections are two LEDs with this chord of directions from the bearing.
+    """Step 4a: the focal ratio at which two detections are two LEDs with this chord of directions from the bearing.
 
-    By fixed-point iteration: a chord is nearly proportional to 1 / focal length. 1 for a calibrated camera.
+    By fixed-point iteration, as a chord is nearly proportional to 1 / focal length; 1 for a calibrated camera.
+
+    Parameters
+    ----------
+    radius_a_m, radius_b_m
+        Distances of the two LEDs from the bearing
+    chord
+        Chord between the directions of the two LEDs
     """
     focal_ratio = 1.0
     if detections.focal_uncertainty > 0:
+        # f <- f chord(f) / chord of the LEDs
         for _ in range(3):
             direction_a = _direction_from_bearing(
                 _ray(detections, a, focal_ratio), dome, radius_a_m
@@ -357,8 +456,24 @@ def _fit_focal_ratio(
 
 @jit
 def _direction_from_bearing(ray: Vector, dome: DomeIndex, radius_m: float) -> Vector:
-    """Unit vector from the bearing to the point where a camera ray meets the sphere of radius_m, in camera axes."""
+    """Direction from the bearing to the point where a camera ray meets a sphere, in camera axes.
+
+    The point is p = r + s u, s = -u . r + sqrt((u . r)^2 - r . r + R^2), with the pupil r, the ray u and the radius R.
+
+    Parameters
+    ----------
+    ray
+        Unit ray in camera axes
+    radius_m
+        Radius of the sphere about the bearing
+
+    Returns
+    -------
+    Vector
+        Unit vector p / R
+    """
     px, py, pz = dome.pupil_m
+    # u . r, then the distance s along the ray.
     along = ray[0] * px + ray[1] * py + ray[2] * pz
     distance = -along + sqrt(
         max(along * along - px * px - py * py - pz * pz + radius_m * radius_m, 0.0)
@@ -373,9 +488,10 @@ def _direction_from_bearing(ray: Vector, dome: DomeIndex, radius_m: float) -> Ve
 
 @jit
 def _most_light_dex(detections: LedDetections, dome: DomeIndex) -> float:
-    """Greatest evidence that the brightness of any light can give."""
+    """Greatest evidence that the brightness of any light can give, for `required_matches`."""
     if len(detections.light_density) == 0:
         return 0.0
+    # The peak of the LED's density over the least density of a light.
     return -log10(least(detections.light_density) * sqrt(2 * pi) * dome.flux_sigma)
 
 
@@ -383,14 +499,19 @@ def _most_light_dex(detections: LedDetections, dome: DomeIndex) -> float:
 def _attitude_dex(detections: LedDetections, dome: DomeIndex, a: int, b: int) -> float:
     """Contribution of a pair's attitude alone to the evidence, for `required_matches`.
 
-    The uncertainty is sqrt(2) sigma / separation about the boresight, sigma / sqrt(2) across it; that of the focal
-    length, if the pair has to tell it too, is sqrt(2) sigma / separation.
+        log10( (2 pi)^(3/2) (s / sqrt(2))^2 (sqrt(2) s / D) / V )
+
+    The pair determines the two axes across the boresight to s / sqrt(2), and the roll to sqrt(2) s / D, D the
+    separation and s the least sigma of all detections. V is the prior volume. An uncertain focal length, known to
+    sqrt(2) s / D from the pair, contributes sqrt(2 pi) sqrt(2) s / D over the width of its range.
     """
+    # Attitude.
     sigma = least(detections.sigma)
     length = separation(detections.tangent, a, b)
     attitude_dex = (
         1.5 * log10(2 * pi) - log10(dome.prior_volume) + log10(sigma**3 / sqrt(2.0) / length)
     )
+    # Focal length: its posterior width over the width of its range.
     if detections.focal_uncertainty > 0:
         attitude_dex += log10(
             sqrt(2 * pi) * sqrt(2.0) * sigma / length / (2 * detections.focal_uncertainty)
@@ -400,15 +521,24 @@ def _attitude_dex(detections: LedDetections, dome: DomeIndex, a: int, b: int) ->
 
 @jit
 def _pair_gates(detections: LedDetections, dome: DomeIndex, a: int, b: int) -> Floats:
-    """(N,) matching radius of each detection at a pair's attitude, as an angle about the bearing, rad.
+    """Matching radius of each detection at a pair's attitude, as an angle about the bearing.
 
-    The pair's own error adds a shift with half of a detection's variance and a rotation with 2 sigma^2 / separation^2.
+        gate_n = GATE_SIGMA s_n sqrt(1 + 1/2 + 2 d_n^2 / D^2)
+
+    The pair's own error adds a shift with half of a detection's variance, and a rotation with 2 s^2 / D^2 times the
+    squared distance d_n from the midpoint; D is the separation.
+
+    Returns
+    -------
+    Floats
+        (N,) rad
     """
     x, y = middle(detections.tangent, a, b)
     direction_variance = 2 / separation(detections.tangent, a, b) ** 2
     out = np.empty(len(detections.ray))
     for n in range(len(out)):
         distance2 = (detections.tangent[n, 0] - x) ** 2 + (detections.tangent[n, 1] - y) ** 2
+        # As seen by the camera, then about the bearing.
         gate = GATE_SIGMA * detections.sigma[n] * sqrt(1.5 + direction_variance * distance2)
         out[n] = gate * _bearing_angle_ratio(dome) + dome.scaling_error_rad
     return out
@@ -426,19 +556,39 @@ def _quick_check(
     gates: Floats,
     required: int,
 ) -> int:
-    """Quick check: number of detections with an LED at the predicted direction, the pair included.
+    """Step 5: count the detections with an LED at their predicted direction.
 
-    Stops as soon as `required` is reached or out of reach. Every ray is taken to the radius of the hypothetical LED
-    (radius_m) by a first-order step from the median radius, or exactly if the focal length is another one.
+    Every ray is taken to the radius of the hypothetical LED: by a first-order step from the median radius, or
+    exactly if the focal length is not the assumed one.
+
+    Parameters
+    ----------
+    R_grid_from_cam
+        (3, 3) rotation from camera axes to those of the grid of LEDs
+    radius_m
+        Distance of the hypothetical LED from the bearing
+    a, b
+        Rows of the pair's detections, which count as matched
+    gates
+        (N,) rad, matching radius of each detection
+    required
+        The count stops as soon as it reaches this number, or cannot
+
+    Returns
+    -------
+    int
+        Number of detections counted, the pair included
     """
     count = 2
     total = len(detections.ray)
     radius_offset_m = radius_m - dome.median_radius_m
     for n in range(total):
+        # Reached or out of reach.
         if count >= required or count + total - n < required:
             break
         if n in (a, b):
             continue
+        # The direction from the bearing, then the LEDs near it.
         if focal_ratio != 1:
             x, y, z = _direction_from_bearing(_ray(detections, n, focal_ratio), dome, radius_m)
         else:
@@ -451,12 +601,22 @@ def _quick_check(
 
 @jit
 def _has_led_near(grid: DirectionGrid, direction: Vector, gate: float) -> bool:
-    """Whether any LED is within `gate` (rad) of a direction in grid axes."""
+    """Whether any LED is near a direction.
+
+    Parameters
+    ----------
+    direction
+        Unit vector in grid axes
+    gate
+        Greatest distance, rad
+    """
     inverse = 1 / grid.cell
     half = grid.side / 2
     reach = gate / grid.cell
+    # Place in units of cells.
     x = direction[0] * inverse + half
     y = direction[1] * inverse + half
+    # The cells that a square of this half-width about the direction meets; those of a line are contiguous.
     for line in range(cell_of(y - reach, grid.side), cell_of(y + reach, grid.side - 1) + 1):
         left = line * grid.side + cell_of(x - reach, grid.side)
         right = line * grid.side + cell_of(x + reach, grid.side - 1)

@@ -1,7 +1,7 @@
 """Star identification algorithms by name.
 
-Each is a function of rays, a pair index and a tolerance that returns the match or None; `options.Options` has its
-keywords. The tracker verifies what a method answers with the whole field (`trackers.residuals.refinement`).
+Each algorithm is a function of rays, a pair index, a tolerance and the keywords of `solver_options.Options`. It returns
+the match or None. The tracker verifies a match with the whole field (`trackers.refinement`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from estimator.identification.published.shefex import shefex
 
 Identifier = Callable[..., StarMatch | None]
 
-# StarTracker does not look up `default`: it uses identification/stars/search.py. The entry is for direct callers.
+# StarTracker does not look up `default`: it uses `star_search`. The entry is for direct callers.
 IDENTIFIERS: dict[str, Identifier] = {
     "default": pyramid,
     "pyramid": pyramid,
@@ -32,11 +32,11 @@ IDENTIFIERS: dict[str, Identifier] = {
     **VERSIONS,
 }
 
-STEP = 0.02  # of the focal length
-# relative errors of the focal length: calibrated, half a step and what is over
-CALIBRATED = 5e-4
-STRETCH = 0.011
-EFFORTS = (60, 1_500_000), (600, 3_000_000), (3000, 4_000_000)  # triangles and checks, at most
+STEP = 0.02  # relative step of the focal length
+CALIBRATED = 5e-4  # relative error of a calibrated focal length
+STRETCH = 0.011  # relative error of an uncertain one: half a step and a margin
+# Greatest numbers of triangles and of checks, round after round.
+EFFORTS = (60, 1_500_000), (600, 3_000_000), (3000, 4_000_000)
 
 
 def candidates(
@@ -48,25 +48,38 @@ def candidates(
     sigma_px: float,
     base_stars: int,
 ) -> Iterator[tuple[Camera, Rotation]]:
-    """Candidate cameras and attitudes, cam_from_ref, of the brightest centroids.
+    """Candidate cameras and attitudes from the brightest centroids, by a published method.
 
-    If the focal length is uncertain, its interval is searched in steps of STEP, first with little effort at all steps,
-    then with more.
+    If the focal length is uncertain, its interval is searched in steps of STEP from the middle outward: first with
+    little effort at every step, then with more.
 
     Parameters
     ----------
+    identifier
+        Name of the method, a key of IDENTIFIERS
+    index
+        Catalog of the method
+    focal_uncertainty
+        Greatest relative error of the camera's focal length; 0 if it is calibrated
     sigma_px
-        Least centroid error
+        Least centroid error, pixels
     base_stars
-        Of the search (`options.Options`)
+        See `solver_options.Options`
+
+    Yields
+    ------
+    tuple[Camera, Rotation]
+        The camera with the focal length of the step, and cam_from_ref
     """
     identify = IDENTIFIERS[identifier]
+    # Steps on either side of the assumed focal length, the nearest first.
     steps = int(np.ceil(focal_uncertainty / STEP - 0.5))
     stretch = STRETCH if focal_uncertainty else CALIBRATED
     zooms = sorted((n * STEP for n in range(-steps, steps + 1)), key=abs)
     for triangles, most_checks in EFFORTS:
         for zoom in zooms:
             zoomed = camera.zoomed(1 + zoom)
+            # The tolerance is four standard deviations, but at least a pixel, for errors of the calibration.
             match = identify(
                 zoomed.rays(centroids.xy_px),
                 index,

@@ -1,7 +1,7 @@
 """Optional parameters common to all identification methods.
 
-The published methods differ in what they need: a magnitude, a prior direction, a tolerance. All are called with the
-same keywords, of which each method uses its own, so that one can be put in the place of another.
+The published methods need different things: a magnitude, a prior direction, a tolerance. All are called with the same
+keywords, of which each method uses some, so that one method can replace another.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ class Options:
     stretch
         Relative tolerance of an angle: stretch * angle is added to its tolerance
     focal_unknown
-        The stretch is one unknown focal length, which each pattern measures; see
-        `require_known_focal`
-    max_triangles, max_checks
-        Observed patterns tried, and angles compared, before giving up; the latter bounds the
-        time, at a few to tens of nanoseconds each
+        Whether the stretch is one unknown focal length, which each pattern measures; see `require_known_focal`
+    max_triangles
+        Greatest number of observed patterns tried
+    max_checks
+        Greatest number of angles compared. It bounds the time: a comparison takes nanoseconds to tens of nanoseconds
     base_stars
         Number of brightest stars from which patterns are formed
     missed_dex
-        Penalty for each catalog star that is predicted in the field and not observed, in powers
-        of ten; 0 if the detection limit is unknown, greater if all sources are known to be on
+        Penalty for each catalog star that is predicted in the field and not observed, in powers of ten; 0 if the
+        detection limit is unknown, greater if all sources are known to be on
     field_tan
         (left, right, top, bottom) tangents of the field's edges, for missed_dex
     magnitude
-        (N,) of the observed stars, on the index's scale; None if unknown
+        (N,) magnitudes of the observed stars, on the index's scale; None if unknown
     epsilon_mag
         Standard deviation of a magnitude
     epsilon_sep_rad
-        Standard deviation of an angle between two stars, for methods that use it
+        Standard deviation of an angle between two stars, for methods that use it; None: from the tolerance
     boresight_ref
-        (3,) unit vector, prior direction of the optical axis
+        (3,) unit vector, prior direction of the optical axis in the catalog's frame
     within_rad
-        Its greatest error
+        Greatest error of that direction
     """
 
     stretch: float = 0.0
@@ -59,15 +59,21 @@ class Options:
     boresight_ref: Floats | None = None
     within_rad: float = np.pi
 
+    @staticmethod
+    def require_tolerance(name: str, tolerance_rad: float) -> None:
+        """Raise ImageError unless the tolerance of method `name` is positive."""
+        if not tolerance_rad > 0:
+            raise ImageError(f"{name}: tolerance {tolerance_rad} rad; allowed: more than 0")
+
     def require_known_focal(self, name: str) -> None:
-        """Raise ImageError if the focal length is uncertain: method `name` needs calibrated angles."""
+        """Raise ImageError if the focal length is uncertain, as method `name` needs calibrated angles."""
         if self.focal_unknown:
             raise ImageError(
                 f"{name}: the focal length is uncertain; allowed: a calibrated camera, or pyramid"
             )
 
     def magnitudes(self, count: int) -> Floats:
-        """(N,) magnitudes of the observed stars, NaN if unknown. Raises ImageError for an array of another shape."""
+        """Return (N,) magnitudes of the observed stars, NaN if unknown. Raises ImageError for another shape."""
         if self.magnitude is None:
             return np.full(count, np.nan)
         if np.shape(self.magnitude) != (count,):

@@ -1,4 +1,8 @@
-"""The detections of one frame as the search for stars takes them: tangents, errors, magnitudes."""
+"""The detections of one frame as the star search uses them: tangents, errors, magnitudes.
+
+A centroid in pixels becomes a tangent (x / z, y / z) in camera axes, with the inverse covariance that weights it in
+the fit and the error of its worst axis, which sets its matching radius.
+"""
 
 from __future__ import annotations
 
@@ -28,15 +32,14 @@ class Detections(NamedTuple):
     mag
         (N,) magnitudes on the catalog's scale, NaN if unknown
     mag_sigma
-        Their standard deviation
+        Standard deviation of a magnitude
     field
         (4,) tangents left, right, top, bottom of the sensor's edges
     focal_uncertainty
         Relative uncertainty of the focal length; 0 for a calibrated camera
     limit_mag
-        To which every star should be seen: that of the median detection, as what shows faint
-        false lights shows the stars of their magnitude; NaN if unknown, and of a part of the
-        detections
+        Magnitude down to which every star should be detected: that of the median detection, because an image that shows
+        faint false lights also shows the stars of their magnitude. NaN if unknown, and for a part of the detections
     """
 
     tangent: Floats
@@ -50,14 +53,20 @@ class Detections(NamedTuple):
 
 
 class Sensor(NamedTuple):
-    """What turns centroids into detections: the camera's calibration, and the light's scale.
+    """The camera's calibration and the scale of its magnitudes, which turn centroids into detections.
 
     Attributes
     ----------
-    zero_point_mag, magnitude_sigma
-        As in `trackers.pipeline.Settings`; NaN if the zero point is unknown
+    focal_px
+        Focal length, pixels
+    center_px
+        (x, y) principal point, pixels
+    distortion
+        Coefficients of the lens distortion
     field
         See `Detections`
+    zero_point_mag, magnitude_sigma
+        See `trackers.pipeline.Settings`; the zero point is NaN if unknown
     """
 
     focal_px: float
@@ -73,10 +82,14 @@ class FlatCentroids(NamedTuple):
 
     Attributes
     ----------
+    xy_px
+        (N, 2) positions, pixels
     own_px, sigma_px
-        (N,) standard deviation of their own noise, and in total
+        (N,) standard deviations of a position: of its own noise, and in total
+    flux
+        (N,) flux of each light
     spread_px2
-        (N, 2, 2) covariance of the noise; (0, 2, 2) where it is the same in all directions
+        (N, 2, 2) covariance of the noise; (0, 2, 2) if it is the same in all directions
     """
 
     xy_px: Floats
@@ -88,7 +101,11 @@ class FlatCentroids(NamedTuple):
 
 @jit
 def detections_of(lights: FlatCentroids, sensor: Sensor, focal_uncertainty: float) -> Detections:
-    """The detections of centroids. What the total error has above the noise is the same in all directions."""
+    """The detections of centroids.
+
+    The covariance of a position is that of its noise plus an isotropic excess, sigma_px^2 - own_px^2. Divided by the
+    squared focal length it is the covariance of the tangents, to first order.
+    """
     count = len(lights.flux)
     focal_px = sensor.focal_px
     (center_x, center_y) = sensor.center_px
@@ -103,14 +120,16 @@ def detections_of(lights: FlatCentroids, sensor: Sensor, focal_uncertainty: floa
             xx = lights.spread_px2[n, 0, 0] + excess
             yy = lights.spread_px2[n, 1, 1] + excess
             xy = lights.spread_px2[n, 0, 1]
-        # The greater eigenvalue of the covariance is the variance along the axis of the greatest error.
+        # The variance along the major axis is the greater eigenvalue, (xx + yy) / 2 + hypot((xx - yy) / 2, xy).
         sigma[n] = sqrt((xx + yy) / 2 + hypot((xx - yy) / 2, xy)) / focal_px
+        # The inverse of [xx xy; xy yy] is [yy -xy; -xy xx] / (xx yy - xy^2).
         scale = focal_px**2 / (xx * yy - xy * xy)
         weight[n, 0] = yy * scale
         weight[n, 1] = xx * scale
         weight[n, 2] = -xy * scale
         mag[n] = sensor.zero_point_mag - 2.5 * log10(lights.flux[n])
     tangent = undistorted(lights.xy_px, focal_px, center_x, center_y, sensor.distortion)
+    # Detections are sorted by brightness: the middle one is the median.
     limit_mag = mag[count // 2] if count else np.nan
     return Detections(
         tangent,
@@ -128,14 +147,16 @@ def detections_of(lights: FlatCentroids, sensor: Sensor, focal_uncertainty: floa
 def changed(
     detections: Detections, count: int, variance: float, focal_uncertainty: float
 ) -> Detections:
-    """The first `count` detections with their variances multiplied by a factor, and another focal uncertainty."""
+    """The first `count` detections, with their variances multiplied by a factor and another focal uncertainty."""
     sigma = np.empty(count)
     weight = np.empty((count, 3))
     factor = sqrt(variance)
+    # The inverse covariance falls as the variance grows.
     for n in range(count):
         sigma[n] = detections.sigma[n] * factor
         for k in range(3):
             weight[n, k] = detections.weight[n, k] / variance
+    # A part of the detections has no limiting magnitude.
     return Detections(
         detections.tangent[:count],
         sigma,
@@ -150,7 +171,7 @@ def changed(
 
 @jit
 def gates_of(detections: Detections, factor: float) -> Floats:
-    """(N,) matching radii, tangents: a factor times GATE_SIGMA standard deviations."""
+    """(N,) matching radii in tangents: `factor` times GATE_SIGMA standard deviations."""
     gates = np.empty(len(detections.sigma))
     for n in range(len(gates)):
         gates[n] = factor * GATE_SIGMA * detections.sigma[n]
@@ -158,7 +179,7 @@ def gates_of(detections: Detections, factor: float) -> Floats:
 
 
 def information_of(weight: Floats) -> Floats:
-    """(N, 2, 2) inverse covariances of the tangents, from rows of `Detections.weight`."""
+    """(N, 2, 2) inverse covariances of the tangents, from (N, 3) rows of `Detections.weight`."""
     return np.asarray(weight[:, [0, 2, 2, 1]].reshape(-1, 2, 2))
 
 
@@ -173,4 +194,5 @@ def ray(tangent: Floats, n: int, focal_ratio: float) -> vectors.Vector:
 
 @jit
 def field_area(detections: Detections) -> float:
+    """Area of the sensor, tangents squared."""
     return (detections.field[1] - detections.field[0]) * (detections.field[3] - detections.field[2])

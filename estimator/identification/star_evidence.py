@@ -1,15 +1,28 @@
 """Bayes factor of a candidate attitude from matched and missing stars.
 
-`evaluate` matches the detections to the catalog stars that the candidate attitude projects next to them, fits the
-attitude (and the focal length, if it is uncertain) to the matches, and returns log10 of the Bayes factor ("dex") of the
-hypothesis "this attitude" over the hypothesis "the detections are distributed at random over the sensor":
+`evaluate` matches the detections to the catalog stars that a candidate attitude projects next to them, fits the
+attitude to the matches, and returns log10 of the Bayes factor ("dex"): the probability of the detections if the
+attitude is true, over that if they are distributed at random over the sensor.
 
-    dex = sum_k log10( N(residual_k) / rho ) + sum_k log10( p(magnitude_k | star) / p(magnitude_k) )
-          + log10( (2 pi)^(n/2) / sqrt(det info) / V ) + log10 B(matched + 1, missing + 1) - penalty
+    dex = sum_k log10( N(residual_k) / rho )               positions of the matched detections
+        + sum_k log10( p(mag_k | star) / p(mag_k) )        their magnitudes
+        + log10( (2 pi)^(n/2) / sqrt(det info) / V )       attitude and focal length
+        + log10 B(matched + 1, missing + 1)                counts of matched and missing stars
+        - UNMATCHED_PENALTY_DEX * excess                   unmatched detections in excess of the matches
 
-rho is the density of detections on the sensor and info the n x n Fisher information of the fit. V is the prior volume
-of attitudes (8 pi^2) and focal lengths; the term with V is Laplace's approximation of the integral over them. By
-Markov's inequality, random detections reach x dex for any attitude in at most one of 10^x frames.
+N is the Gaussian of a residual, rho the density of detections on the sensor, and info the n x n Fisher information of
+the fit (n = 3, or 4 with an uncertain focal length). V is the prior volume of attitudes (8 pi^2) and focal lengths; the
+term with V is Laplace's approximation of the integral over them. By Markov's inequality, random detections reach x dex
+at any attitude in at most one of 10^x frames.
+
+The steps of `evaluate`; the same numbers return as comments in the code:
+
+1. Match each detection to its nearest star (`_match`).
+2. Fit attitude and focal ratio to the matches by one Gauss-Newton step (`_fit`).
+3. Match again, with the gates of the detections alone, and reject the candidate if an upper bound of its evidence is
+   too low (`_evidence` without residuals).
+4. Fit and match once more, unless the fit has converged.
+5. Compute the evidence (`_evidence`), and count the missing stars (`_count_missing`).
 """
 
 from __future__ import annotations
@@ -26,8 +39,8 @@ from estimator.catalog.sky_index import (
     MAG_STEP,
     SkyIndex,
     cell_of,
-    edge_cell,
     nearest,
+    within,
 )
 from estimator.core import least_squares, vectors
 from estimator.core.checks import Floats
@@ -38,25 +51,25 @@ from estimator.identification.star_detections import Detections, field_area, gat
 
 # Fraction of stars whose magnitude disagrees with the catalog: variable stars, doubles, an unusual passband.
 MAG_OUTLIER_FRACTION = 0.05
-# Penalty for unmatched detections brighter than the faintest match, for each one in excess of the number of matches.
+# Penalty for each detection brighter than the faintest match that is unmatched, in excess of the number of matches.
 UNMATCHED_PENALTY_DEX = 0.5
-# Fraction of the field in which an unmatched source counts as missing; the border may cut it off.
+# Fraction of the field in which an unmatched star counts as missing; nearer to the border it may be cut off.
 INNER_FRACTION = 0.97
 
 
 class Hypothesis(NamedTuple):
-    """A hypothesis: candidate attitude, matches and evidence.
+    """A candidate attitude with its matches and its evidence.
 
     Attributes
     ----------
     observed, star
-        (K,) rows of detections and of stars
+        (K,) rows of the matched detections and of their stars
     R_cam_from_ref
-        (3, 3)
+        (3, 3) rotation from the catalog's frame to camera axes
     focal_ratio
         Ratio of the true to the assumed focal length
     info
-        (4, 4) Fisher information of the small rotation in camera axes and of log focal_ratio
+        (4, 4) Fisher information of a small rotation in camera axes and of log focal_ratio
     dex
         log10 of the Bayes factor
     """
@@ -75,17 +88,17 @@ class Solution(NamedTuple):
     Attributes
     ----------
     observed, star
-        (K,) rows of detections and of stars; empty if there is no solution
+        (K,) rows of the matched detections and of their stars; empty if there is no solution
     cam_from_ref_xyzw
-        (4,)
+        (4,) quaternion from the catalog's frame to camera axes
     covariance_rad2
-        (3, 3) of the small rotation in camera axes
+        (3, 3) covariance of the small rotation in camera axes, rad^2
     focal_ratio
         Ratio of the true to the assumed focal length
     rms
-        Of the residuals, tangents
+        Root mean square of the residuals along one axis, tangents
     chi2
-        Squared Mahalanobis distances of the matches per degree of freedom
+        Sum of the squared Mahalanobis distances of the matches per degree of freedom
     dex
         log10 of the Bayes factor
     """
@@ -103,15 +116,8 @@ class Solution(NamedTuple):
 @jit
 def no_hypothesis() -> Hypothesis:
     """The empty hypothesis, with evidence -inf."""
-    R_cam_from_ref = np.zeros((3, 3))
-    info = np.zeros((4, 4))
-    for n in range(4):
-        info[n, n] = 1.0
-        if n < 3:
-            R_cam_from_ref[n, n] = 1.0
-    return Hypothesis(
-        np.empty(0, np.int64), np.empty(0, np.int64), R_cam_from_ref, 1.0, info, -np.inf
-    )
+    none = np.empty(0, np.int64)
+    return Hypothesis(none, none, np.eye(3), 1.0, np.eye(4), -np.inf)
 
 
 @jit
@@ -122,7 +128,7 @@ def magnitude_density(sky: SkyIndex, mag: float) -> float:
 
 @jit
 def prior_volume_dex(detections: Detections) -> float:
-    """log10 of the prior volume: 8 pi^2 of attitudes times the width of the interval of log focal_ratio."""
+    """log10 of the prior volume: 8 pi^2 of attitudes, times the width of the interval of log focal_ratio."""
     width = 2 * detections.focal_uncertainty
     return log10(8 * pi * pi) + (log10(width) if width > 0 else 0.0)
 
@@ -136,19 +142,24 @@ def evaluate(
     gates: Floats,
     min_dex: float,
 ) -> Hypothesis:
-    """Evaluate a candidate: match detections to stars, fit attitude and focal ratio (twice), compute the evidence.
-
-    R_cam_from_ref is changed in place by the fit. Returns the empty hypothesis if fewer than
-    MIN_EVIDENCE_MATCHES stars match, the focal ratio leaves its interval, or the evidence is below min_dex. The last
-    test is made early with an upper bound of the evidence (exact matches, no missing star), which rejects most false
-    candidates before the full evaluation. A fit that has converged is not
-    repeated, nor are its matches.
+    """Match, fit and score a candidate attitude: the module's steps 1 to 5.
 
     Parameters
     ----------
+    R_cam_from_ref
+        (3, 3) candidate attitude, changed in place by the fit
+    focal_ratio
+        Candidate ratio of the true to the assumed focal length
     gates
-        (N,) rad, matching radius of each detection in the first round; later rounds use
-        GATE_SIGMA
+        (N,) rad, matching radius of each detection in the first round; later rounds use GATE_SIGMA
+    min_dex
+        Least evidence of interest; -inf for none
+
+    Returns
+    -------
+    Hypothesis
+        Empty if fewer than MIN_EVIDENCE_MATCHES stars match, if the focal ratio leaves its interval, or if the evidence
+        is below `min_dex`
     """
     R = R_cam_from_ref
     info = np.zeros((4, 4))
@@ -157,44 +168,41 @@ def evaluate(
     observed = np.empty(0, np.int64)
     star = np.empty(0, np.int64)
     for iteration in range(3):
+        # 1. Match. The first round allows for the error of the candidate attitude, later ones only for the detections'.
         before = observed, star
         observed, star = _match(detections, sky, R, focal_ratio, gates, max_sigma)
         gates = gates_of(detections, 1.0)
         max_sigma = GATE_SIGMA
         if len(observed) < MIN_EVIDENCE_MATCHES:
             return no_hypothesis()
+        # 3. Reject most false candidates before the full evaluation, by an upper bound: exact matches, no missing star.
         if iteration == 1 and min_dex > -np.inf:
-            # `info` is that of the first fit; without the residuals the evidence is an upper bound.
+            # `info` is that of the first fit.
             upper_bound_dex = _evidence(
                 detections, sky, R, focal_ratio, observed, star, info, iteration > 1
             )
             if upper_bound_dex + counts_dex(len(observed), 0) < min_dex:
                 return no_hypothesis()
-        if fall < CONVERGED_CHI2 and _equal(observed, before[0]) and _equal(star, before[1]):
+        # A fit that has converged on the same matches need not be repeated.
+        same = np.array_equal(observed, before[0]) and np.array_equal(star, before[1])
+        if same and fall < CONVERGED_CHI2:
             break
+        # 2. and 4. Fit; the interval of the focal ratio has a margin, as the fit is noisy.
         if iteration < 2:
             focal_ratio, fall = _fit(detections, sky, R, focal_ratio, observed, star, info)
             if abs(focal_ratio - 1) > 1.2 * detections.focal_uncertainty + 1e-12:
                 return no_hypothesis()
             if iteration == 1 and fall < CONVERGED_CHI2:
                 break
-    # a literal True would be compiled as another type
+    # 5. The evidence. A literal True in place of `with_residuals` would be compiled as another type.
     matched = len(observed)
-    with_residuals = len(observed) > 0
+    with_residuals = matched > 0
     dex = _evidence(detections, sky, R, focal_ratio, observed, star, info, with_residuals)
+    # Missing stars only reduce the evidence: count them if it suffices without any.
     if dex + counts_dex(matched, 0) < min_dex:
         return no_hypothesis()
     dex += counts_dex(matched, _count_missing(detections, sky, R, focal_ratio, star))
     return Hypothesis(observed, star, R, focal_ratio, info, dex)
-
-
-@jit
-def _equal(first: NDArray, second: NDArray) -> bool:
-    """Whether two lists of rows are equal."""
-    same = len(first) == len(second)
-    for n in range(min(len(first), len(second))):
-        same = same and first[n] == second[n]
-    return same
 
 
 @jit
@@ -206,10 +214,21 @@ def _match(
     gates: Floats,
     max_sigma: float,
 ) -> tuple[NDArray, NDArray]:
-    """Match each detection to its nearest star, within gates[n] rad and max_sigma standard deviations.
+    """Match each detection to its nearest star: steps 1, 3 and 4.
 
-    If two detections match one star, the one with the smaller Mahalanobis distance keeps it. Returns the rows of the
-    detections and of the stars.
+    If two detections match one star, the one with the smaller Mahalanobis distance keeps it.
+
+    Parameters
+    ----------
+    gates
+        (N,) rad, greatest distance of a star
+    max_sigma
+        Greatest Mahalanobis distance of a star
+
+    Returns
+    -------
+    tuple[NDArray, NDArray]
+        (K,) rows of the detections and of the stars
     """
     total = len(detections.sigma)
     count = 0
@@ -223,14 +242,17 @@ def _match(
     cell_star = sky.cell_star
     side = sky.side
     for n in range(total):
+        # The star nearest to the detection's direction in the catalog's frame.
         x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, n, focal_ratio))
         s, _ = nearest(vectors_ref, cell_first, cell_star, side, x, y, z, gates[n])
         if s < 0:
             continue
+        # The gate is a circle; an elongated error ellipse asks for the Mahalanobis distance.
         distance2 = squared_mahalanobis(detections, sky, R, focal_ratio, n, s)
         if distance2 > max_sigma**2:
             continue
-        slot = 0  # of an earlier match of the same star, or `count`
+        # The slot of an earlier match of the same star, or a new one at the end.
+        slot = 0
         while slot < count and star[slot] != s:
             slot += 1
         if slot == count:
@@ -252,7 +274,15 @@ def count_near(
     observed: NDArray,
     gates: Floats,
 ) -> int:
-    """Number of detections beside those `observed` that have a star within their gate (N,), at most 0.05 rad."""
+    """Number of detections that are not `observed` and have a star nearby.
+
+    Parameters
+    ----------
+    observed
+        (K,) rows of the matched detections, which are left out
+    gates
+        (N,) rad, greatest distance of a star; at most 0.05 is used
+    """
     R_ref_from_cam = R_cam_from_ref.T.copy()
     count = 0
     matched = np.zeros(len(gates), np.bool_)
@@ -261,13 +291,11 @@ def count_near(
     for n in range(len(gates)):
         if matched[n]:
             continue
+        # The star nearest to the detection's direction in the catalog's frame.
         x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, n, focal_ratio))
-        count += (
-            nearest(
-                sky.vectors, sky.cell_first, sky.cell_star, sky.side, x, y, z, min(gates[n], 0.05)
-            )[0]
-            >= 0
-        )
+        gate = min(gates[n], 0.05)
+        s, _ = nearest(sky.vectors, sky.cell_first, sky.cell_star, sky.side, x, y, z, gate)
+        count += s >= 0
     return count
 
 
@@ -275,32 +303,36 @@ def count_near(
 def focal_gain_dex(detections: Detections, sky: SkyIndex, hypothesis: Hypothesis) -> float:
     """log10 of the Bayes factor of a free focal length over that of a hypothesis, with the same matches.
 
-    The fall of chi-square by a step of the fit, and the posterior width of log focal_ratio over its prior width.
+        fall / 2 / ln 10  +  log10( sqrt(2 pi) sigma / (2 u) )
+
+    fall is the decrease of chi-square by one step of the fit, sigma the posterior standard deviation of log
+    focal_ratio, which is the inverse of the last diagonal element of the Cholesky factor of the information, and 2
+    u the width of its prior interval.
     """
     info = np.zeros((4, 4))
     R = hypothesis.R_cam_from_ref.copy()
     _, fall = _fit(
         detections, sky, R, hypothesis.focal_ratio, hypothesis.observed, hypothesis.star, info
     )
+    # `info` becomes its Cholesky factor.
     cholesky_solve(info, np.zeros(4))
-    return fall / 2 / log(10.0) + log10(
-        sqrt(2 * pi) / info[3, 3] / (2 * detections.focal_uncertainty)
-    )
+    width_dex = log10(sqrt(2 * pi) / info[3, 3] / (2 * detections.focal_uncertainty))
+    return fall / 2 / log(10.0) + width_dex
 
 
 @jit
-def project(vectors_ref: Floats, R: Floats, star: int) -> vectors.Vector:
-    """Project a star into camera axes: x / z, y / z, and z."""
+def project(vectors_ref: Floats, R: Floats, star: int) -> tuple[float, float]:
+    """Tangents x / z and y / z of a star in camera axes."""
     x, y, z = vectors.rotate(R, vectors.row(vectors_ref, star))
-    return x / z, y / z, z
+    return x / z, y / z
 
 
 @jit
 def squared_mahalanobis(
     detections: Detections, sky: SkyIndex, R: Floats, focal_ratio: float, detection: int, star: int
 ) -> float:
-    """Squared Mahalanobis distance of a detection from a star's predicted image."""
-    x, y, _ = project(sky.vectors, R, star)
+    """Squared Mahalanobis distance of a detection from a star's predicted image: r^T W r, W the inverse covariance."""
+    x, y = project(sky.vectors, R, star)
     dx = detections.tangent[detection, 0] - focal_ratio * x
     dy = detections.tangent[detection, 1] - focal_ratio * y
     xx, yy, xy = vectors.row(detections.weight, detection)
@@ -317,13 +349,27 @@ def _fit(
     star: NDArray,
     info: Floats,
 ) -> tuple[float, float]:
-    """One weighted Gauss-Newton step of the attitude R (in place) and of the focal ratio f.
+    """One weighted Gauss-Newton step of the attitude R (in place) and of the focal ratio f: steps 2 and 4.
 
-    Returns the new ratio and the fall of chi-square, which is the squared length of the step in standard deviations.
+    The model is t = f (x, y) / z with a star q = (x, y, z) in camera axes. A small rotation w changes q to q + w x
+    q. With (x, y) here for (x / z, y / z), the derivatives of t with respect to w and to log f are
 
-    With t = f (x, y) / z and a small rotation q <- q + w x q, the derivative of t_x with respect to w is
-    f (-x y / z^2, 1 + x^2 / z^2, -y / z), that of t_y is f (-1 - y^2 / z^2, x y / z^2, x / z), and that of t with
-    respect to log f is t itself. The (4, 4) Fisher information is written to `info`.
+        d t_x = f (-x y,      1 + x^2,  -y,  x)
+        d t_y = f (-1 - y^2,  x y,       x,  y)
+
+    The step is info^-1 g, info = sum J^T W J, g = sum J^T W r, r the residuals and W their inverse covariances.
+
+    Parameters
+    ----------
+    observed, star
+        (K,) rows of the matched detections and of their stars
+    info
+        (4, 4), the Fisher information is written to it
+
+    Returns
+    -------
+    tuple[float, float]
+        The new focal ratio, and the fall of chi-square g . step: the squared length of the step in standard deviations
     """
     f = focal_ratio
     count = 4 if detections.focal_uncertainty > 0 else 3
@@ -335,7 +381,8 @@ def _fit(
     weight = detections.weight
     vectors_ref = sky.vectors
     for k in range(len(observed)):
-        x, y, _ = project(vectors_ref, R, star[k])
+        # Derivatives of the predicted tangents.
+        x, y = project(vectors_ref, R, star[k])
         d_x[0] = -f * x * y
         d_x[1] = f * (1 + x * x)
         d_x[2] = -f * y
@@ -344,6 +391,7 @@ def _fit(
         d_y[1] = f * x * y
         d_y[2] = f * x
         d_y[3] = f * y
+        # Their weighted sums; the matrix is symmetric, so that its lower triangle suffices.
         xx, yy, xy = vectors.row(weight, observed[k])
         residual_x = tangent[observed[k], 0] - f * x
         residual_y = tangent[observed[k], 1] - f * y
@@ -353,11 +401,13 @@ def _fit(
             gradient[i] += weighted_x * residual_x + weighted_y * residual_y
             for j in range(i + 1):
                 info[i, j] += weighted_x * d_x[j] + weighted_y * d_y[j]
+    # Solve for the step, and complete the symmetric matrix.
     factor = info[:count, :count].copy()
     step = cholesky_solve(factor, gradient[:count])
     for i in range(4):
         for j in range(i):
             info[j, i] = info[i, j]
+    # Apply the step; its squared length is the predicted fall of chi-square.
     vectors.rotate_in_place(step[:3], R)
     fall = 0.0
     for i in range(count):
@@ -374,6 +424,7 @@ def cholesky_solve(a: Floats, b: Floats) -> Floats:
     x = b.copy()
     for i in range(len(b)):
         for j in range(i + 1):
+            # a_ij - sum over k < j of L_ik L_jk, then the pivot or the quotient.
             for k in range(j):
                 a[i, j] -= a[i, k] * a[j, k]
             a[i, j] = sqrt(max(a[i, i], 1e-300)) if i == j else a[i, j] / a[j, j]
@@ -387,16 +438,23 @@ def _count_missing(
 ) -> int:
     """Number of missing stars: well inside the field, not matched, and bright enough to be detected.
 
-    Bright enough are stars as bright as the faintest matched one, and those to `detections.limit_mag`, if it is known.
+    A star is bright enough if it is as bright as the faintest matched one, or brighter than `detections.limit_mag`,
+    if that is known.
+
+    Parameters
+    ----------
+    star
+        (K,) rows of the matched stars
     """
     field = detections.field * (INNER_FRACTION / focal_ratio)
     left, right, top, bottom = field
+    # Stars are sorted by brightness: the row of the faintest detectable star bounds them all.
     matched = 0
     faintest = np.int64(0)
     if np.isfinite(detections.limit_mag):
         faintest = first_from(sky.mag, 0, len(sky.mag), detections.limit_mag) - 1
     for s in star:
-        x, y, _ = project(sky.vectors, R, s)
+        x, y = project(sky.vectors, R, s)
         matched += left < x < right and top < y < bottom
         faintest = max(faintest, s)
     return _count_inside(sky, R, field, faintest) - matched
@@ -404,27 +462,30 @@ def _count_missing(
 
 @jit
 def _count_inside(sky: SkyIndex, R: Floats, field: Floats, faintest: int) -> int:
-    """Number of stars inside a field (4,), up to a row: the stars are sorted by brightness."""
+    """Number of stars inside a field, down to a row: the stars are sorted by brightness.
+
+    Parameters
+    ----------
+    field
+        (4,) tangents left, right, top, bottom
+    faintest
+        Last row that counts
+    """
     left, right, top, bottom = field
     # Chord of the angle from the boresight to the farthest corner.
     corner2 = max(left * left, right * right) + max(top * top, bottom * bottom)
-    chord = sqrt(2 - 2 / sqrt(1 + corner2))
-    (bx, by, bz) = vectors.row(R, 2)
-    side = sky.cells.side
-    first = sky.cells.first
-    row = sky.cells.row
-    vectors_ref = sky.vectors
+    # A hair longer, so that rounding excludes no star in a corner.
+    chord = sqrt(2 - 2 / sqrt(1 + corner2)) * (1 + 1e-9)
+    bx, by, bz = vectors.row(R, 2)
+    # Stars within the circle around the field, then those in the field.
+    near = np.empty(len(sky.vectors), np.int64)
+    count = within(sky.cells, sky.vectors, bx, by, bz, chord, near)
     inside = 0
-    low = edge_cell(bz - chord, side)
-    high = edge_cell(bz + chord, side) + 1
-    for i in range(edge_cell(bx - chord, side), edge_cell(bx + chord, side) + 1):
-        for j in range(edge_cell(by - chord, side), edge_cell(by + chord, side) + 1):
-            column = (i * side + j) * side
-            for entry in range(first[column + low], first[column + high]):
-                if row[entry] > faintest:
-                    continue
-                x, y, z = vectors.rotate(R, vectors.row(vectors_ref, row[entry]))
-                inside += left * z < x < right * z and top * z < y < bottom * z
+    for s in near[:count]:
+        if s > faintest:
+            continue
+        x, y, z = vectors.rotate(R, vectors.row(sky.vectors, s))
+        inside += left * z < x < right * z and top * z < y < bottom * z
     return inside
 
 
@@ -439,24 +500,31 @@ def _evidence(
     info: Floats,
     with_residuals: bool,
 ) -> float:
-    """log10 of the Bayes factor of this attitude over detections at random positions, without the term `counts_dex`.
-
-    Each match contributes N(residual) / rho, rho the density of detections on the sensor, and the ratio of
-    `_magnitude_ratio`. The attitude and the focal ratio contribute sqrt(2 pi)^n / sqrt(det info) over their prior
-    volume (Laplace's approximation). Unmatched detections cost nothing as long as they are no more than the matches;
-    each one above that, among the detections brighter than the faintest match, costs UNMATCHED_PENALTY_DEX.
+    """log10 of the Bayes factor of an attitude, without the term `counts_dex` (see the module's equation).
 
     Parameters
     ----------
+    observed, star
+        (K,) rows of the matched detections and of their stars
+    info
+        (4, 4) Fisher information of the fit
     with_residuals
-        Include the residuals; without them the result is an upper bound for these matches
+        Whether the residuals count; without them the result is an upper bound for these matches
+
+    Returns
+    -------
+    float
+        dex. Unmatched detections cost nothing as long as they are no more than the matches; each further one among the
+        detections brighter than the faintest match costs UNMATCHED_PENALTY_DEX
     """
+    # Attitude and focal length: (2 pi)^(n/2) / sqrt(det info) over the prior volume.
     count = 4 if detections.focal_uncertainty > 0 else 3
     factor = info[:count, :count].copy()
     cholesky_solve(factor, np.zeros(count))
     total = 0.5 * count * log10(2 * pi) - prior_volume_dex(detections)
     for i in range(count):  # the product of the Cholesky factor's diagonal is sqrt(det info)
         total -= log10(factor[i, i])
+    # Positions and magnitudes of the matched detections.
     fraction_brighter = _fraction_brighter(sky, detections.mag)
     last = np.int64(0)
     for k in range(len(observed)):
@@ -488,15 +556,19 @@ def _fraction_brighter(sky: SkyIndex, mag: Floats) -> float:
 def _magnitude_ratio(
     detections: Detections, sky: SkyIndex, detection: int, star: int, fraction_brighter: float
 ) -> float:
-    """Likelihood ratio of a detection's magnitude: given its star, over a random star as bright as these.
+    """Likelihood ratio of a detection's magnitude: given its star, over a random star as bright as the detections.
 
-    A fraction MAG_OUTLIER_FRACTION of the stars is taken to have any magnitude, so that one outlier costs at most
-    that factor. Returns 1 if the magnitude is unknown.
+        ratio = e + (1 - e) N(mag - star's mag) / p(mag)
+
+    A fraction e = MAG_OUTLIER_FRACTION of the stars is taken to have any magnitude, so that one outlier costs at
+    most that factor. p is the density of the catalog's magnitudes among the stars that are bright enough. Returns 1
+    if the magnitude is unknown.
     """
     difference = detections.mag[detection] - sky.mag[star]
     if not np.isfinite(difference):
         return 1.0
     relative_density = magnitude_density(sky, detections.mag[detection]) / fraction_brighter
+    # The Gaussian density of the difference.
     likelihood = (
         np.exp(-0.5 * (difference / detections.mag_sigma) ** 2)
         / detections.mag_sigma
@@ -507,30 +579,34 @@ def _magnitude_ratio(
 
 @jit
 def build_solution(detections: Detections, stars: SkyIndex, hypothesis: Hypothesis) -> Solution:
-    """The solution of a hypothesis, with attitude covariance and rms residual.
+    """The solution of a hypothesis, with its covariance and its residuals.
 
-    The covariance is marginalized over the focal ratio if the focal length is uncertain.
+    The covariance is the attitude's block of info^-1: if the focal length is uncertain, it is marginalized over the
+    focal ratio.
     """
     covariance = np.zeros((3, 3))
     total = 0.0
     chi2 = 0.0
     count = 4 if detections.focal_uncertainty > 0 else 3
+    # Column by column of the inverse of the Fisher information.
     for axis in range(3):
         unit = np.zeros(count)
         unit[axis] = 1.0
         column = cholesky_solve(hypothesis.info[:count, :count].copy(), unit)
         for k in range(3):
             covariance[axis, k] = column[k]
+    # Residuals: weighted by the inverse covariances for chi-square, and plain for the rms.
     for k in range(len(hypothesis.star)):
         observed = hypothesis.observed[k]
         star = hypothesis.star[k]
         chi2 += squared_mahalanobis(
             detections, stars, hypothesis.R_cam_from_ref, hypothesis.focal_ratio, observed, star
         )
-        x, y, _ = project(stars.vectors, hypothesis.R_cam_from_ref, hypothesis.star[k])
-        tx = detections.tangent[hypothesis.observed[k], 0]
-        ty = detections.tangent[hypothesis.observed[k], 1]
+        x, y = project(stars.vectors, hypothesis.R_cam_from_ref, star)
+        tx = detections.tangent[observed, 0]
+        ty = detections.tangent[observed, 1]
         total += (tx - hypothesis.focal_ratio * x) ** 2 + (ty - hypothesis.focal_ratio * y) ** 2
+    # Two residuals for each match, of which `count` are used up by the fit.
     rms = sqrt(total / max(2 * len(hypothesis.star), 1))
     chi2 /= max(2 * len(hypothesis.star) - count, 1)
     xyzw = vectors.quaternion_xyzw(hypothesis.R_cam_from_ref)

@@ -1,9 +1,18 @@
 """Lost-in-space star identification by quads of detections: for a camera whose focal length is uncertain.
 
-The code of four detections (`catalog.quad_index`) hardly depends on the focal length, so that the few catalog quads
-with the same code are the only candidates, however uncertain it is. The two detections farthest apart and their stars
-determine the attitude and the focal length. A quick check and the Bayes factor then decide as in `search`. Quads are
-tried in the order of brightness: first those of the four brightest detections, then all with the fifth, and so on.
+The code of four detections (`catalog.quad_index`) hardly depends on the focal length. Only the few catalog quads of the
+same code are therefore candidates, however uncertain the focal length is. The two detections farthest apart and their
+stars determine the attitude and the focal length, which the other detections confirm as in `star_search`.
+
+The steps; the same numbers return as comments in the code:
+
+1. Take four detections, by brightness: the four brightest, then all fours with the fifth, and so on (`_search`).
+2. Call the two farthest apart A and B, and compute the code (`_test_quad`).
+3. Look up the catalog quads whose codes differ by no more than the gate (`_code_gate`).
+4. Compute the focal ratio and the attitude from A, B and their stars (`_test_match`).
+5. Quick check of the other detections (`star_search.quick_check`).
+6. Match all detections, fit, and compute the Bayes factor (`star_evidence.evaluate`).
+7. Stop at the first candidate with DECISIVE_DEX, and fit it to all detections (`star_search.fit_to_all`).
 """
 
 from __future__ import annotations
@@ -33,20 +42,30 @@ def identify(
     max_checks: int,
     calibrated: bool,
 ) -> Solution:
-    """Identify the detections and solve attitude and focal length; an empty solution below DECISIVE_DEX.
-
-    The candidates are tested on the `max_detections` brightest; the attitude is then fitted to all detections.
+    """Identify the detections, and solve the attitude and the focal length.
 
     Parameters
     ----------
+    detections
+        All detections of the frame, brightest first
+    quads, stars
+        The catalog's quads and its stars
+    max_detections
+        Number of brightest detections on which the candidates are tested
     max_checks
-        Bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
+        Bound on the effort: quads compared and star look-ups, plus EVALUATION_COST for each candidate evaluated
     calibrated
-        Whether the focal length should be right (`search.fit_to_all`)
+        Whether the focal length should be right (see `star_search.fit_to_all`)
+
+    Returns
+    -------
+    Solution
+        Empty if no candidate reaches DECISIVE_DEX
     """
     count = min(max_detections, len(detections.sigma))
     searched = changed(detections, count, 1.0, detections.focal_uncertainty)
     best = _search(searched, quads, stars, max_checks)
+    # 7. Fit to all detections.
     # The last argument matters for a calibrated camera only. A literal False would be compiled as another type.
     return star_search.fit_to_all(
         detections, stars, best, star_search.DECISIVE_DEX, calibrated, not calibrated
@@ -55,9 +74,10 @@ def identify(
 
 @jit
 def _search(detections: Detections, quads: QuadIndex, sky: SkyIndex, max_checks: int) -> Hypothesis:
-    """The first hypothesis of the quads with DECISIVE_DEX, else the empty one."""
+    """Steps 1 to 6: the first hypothesis of the quads with DECISIVE_DEX, or else the empty one."""
     quad = np.empty(4, np.int64)
     checks = np.zeros(1, np.int64)
+    # 1. Row d is the faintest of the four: every quad of brighter detections comes before any with a fainter one.
     for d in range(3, min(len(detections.sigma), COMBINED)):
         for c in range(2, d):
             for b in range(1, c):
@@ -69,6 +89,7 @@ def _search(detections: Detections, quads: QuadIndex, sky: SkyIndex, max_checks:
                     candidate = _test_quad(detections, quads, sky, quad, checks)
                     if candidate.dex >= star_search.DECISIVE_DEX:
                         return candidate
+                    # Give up when the effort is used up.
                     if checks[0] > max_checks:
                         return no_hypothesis()
     return no_hypothesis()
@@ -78,13 +99,21 @@ def _search(detections: Detections, quads: QuadIndex, sky: SkyIndex, max_checks:
 def _test_quad(
     detections: Detections, quads: QuadIndex, sky: SkyIndex, quad: Ints, checks: Ints
 ) -> Hypothesis:
-    """Test four detections against every catalog quad of the same code; the first with DECISIVE_DEX.
+    """Steps 2 to 6: test four detections against every catalog quad of the same code.
 
     Parameters
     ----------
+    quad
+        (4,) rows of the detections, reordered in place to A, B, C, D
     checks
         (1,) effort so far, increased in place
+
+    Returns
+    -------
+    Hypothesis
+        The first one with DECISIVE_DEX, or else the empty one
     """
+    # 2. The code: C and D in the axes of A and B.
     _longest_first(detections.tangent, quad)
     a = quad[0]
     b = quad[1]
@@ -97,6 +126,7 @@ def _test_quad(
     code[0], code[1] = quad_index.in_frame(frame, ray(detections.tangent, quad[2], 1.0), length)
     code[2], code[3] = quad_index.in_frame(frame, ray(detections.tangent, quad[3], 1.0), length)
     quad_index.arrange(code, quad)
+    # 3. All cells within the gate of the code.
     gate = _code_gate(detections, quad, length)
     low = np.empty(4, np.int64)
     high = np.empty(4, np.int64)
@@ -112,6 +142,7 @@ def _test_quad(
                     checks[0] += 1
                     if not _alike(quads.code, q, code, gate):
                         continue
+                    # 4. to 6. Test the attitude of this quad.
                     candidate = _test_match(detections, sky, quad, quads.star[q], length, checks)
                     if candidate.dex >= star_search.DECISIVE_DEX:
                         return candidate
@@ -120,7 +151,7 @@ def _test_quad(
 
 @jit
 def _alike(codes: Floats, q: int, code: Floats, gate: float) -> bool:
-    """Whether no coordinate of the code in row q differs by more than the gate."""
+    """Whether no coordinate of the code in row q of `codes` differs from `code` (4,) by more than the gate."""
     alike = True
     for axis in range(4):  # without a temporary array, which would cost more than the comparison
         alike = alike and abs(codes[q, axis] - code[axis]) <= gate
@@ -135,30 +166,48 @@ def _longest_first(tangent: Floats, quad: Ints) -> None:
     second = 1
     for m in range(4):
         for k in range(m):
+            # The pair (k, m) farthest apart so far.
             length = vectors.chord(ray(tangent, quad[k], 1.0), ray(tangent, quad[m], 1.0))
             if length > longest:
                 longest = length
                 first = k
                 second = m
     quad[0], quad[first] = quad[first], quad[0]
+    # If the first swap moved the second detection, it is now where `first` was.
     second = first if second == 0 else second
     quad[1], quad[second] = quad[second], quad[1]
 
 
 @jit
 def _code_gate(detections: Detections, quad: Ints, length: float) -> float:
-    """Greatest difference of the codes of a quad and of its image.
+    """Greatest difference of the codes of a quad of stars and of its image.
 
-    The errors of C or D and of the two ends are each sigma / L. At the angle a from the boresight a focal length that
-    is wrong by the fraction u changes small angles by (1 - u) (1 + 2 u sin^2 a) along the radius and by
-    (1 - u) (1 + u sin^2 a) across it: ratios differ by up to 2 u sin^2 a of the outermost star.
+        gate = GATE_SIGMA s / L + u r^2 / (1 + r^2)
+
+    Noise: the errors of C or D and of the two ends are each s / L, L the chord from A to B.
+
+    Focal length: at the angle a from the boresight, a focal length that is wrong by the fraction u changes small
+    angles by (1 - u) (1 + 2 u sin^2 a) along the radius and by (1 - u) (1 + u sin^2 a) across it. Ratios of angles
+    differ by up to 2 u sin^2 a of the outermost star, sin^2 a = r^2 / (1 + r^2) for the tangent r. Coordinates of a
+    code are at most one half along and across, so that half of this difference reaches them.
+
+    Parameters
+    ----------
+    quad
+        (4,) rows of the detections
+    length
+        Chord L
+
+    Returns
+    -------
+    float
+        In units of the code
     """
     sigma = 0.0
     r2 = 0.0
     for n in quad:
         sigma = max(sigma, detections.sigma[n])
         r2 = max(r2, detections.tangent[n, 0] ** 2 + detections.tangent[n, 1] ** 2)
-    # Coordinates are at most one half along and across, so that half of this difference reaches them.
     return GATE_SIGMA * sigma / length + detections.focal_uncertainty * r2 / (1 + r2)
 
 
@@ -166,12 +215,28 @@ def _code_gate(detections: Detections, quad: Ints, length: float) -> float:
 def _test_match(
     detections: Detections, sky: SkyIndex, quad: Ints, star: Ints, length: float, checks: Ints
 ) -> Hypothesis:
-    """The hypothesis that four detections are four stars, if a quick check and the evidence confirm it."""
+    """Steps 4 to 6: the hypothesis that four detections are four stars.
+
+    Parameters
+    ----------
+    quad, star
+        (4,) rows of the detections and of the stars: A, B, C, D
+    length
+        Chord between detections A and B
+    checks
+        (1,) effort so far, increased in place
+
+    Returns
+    -------
+    Hypothesis
+        Empty if the focal length, the quick check or the evidence refutes it
+    """
     tangent = detections.tangent
     a = quad[0]
     b = quad[1]
     star_a = vectors.row(sky.vectors, star[0])
     star_b = vectors.row(sky.vectors, star[1])
+    # 4. The focal ratio and the attitude from A and B.
     ratio = star_search.fit_focal_ratio(tangent, a, b, length, vectors.chord(star_a, star_b))
     if abs(ratio - 1) > detections.focal_uncertainty:
         return no_hypothesis()
@@ -181,6 +246,7 @@ def _test_match(
     vectors.pair_frame(ray(tangent, a, ratio), ray(tangent, b, ratio), in_cam)
     vectors.pair_frame(star_a, star_b, in_ref)
     vectors.multiply_transposed(in_ref, in_cam, R_ref_from_cam)
+    # 5. Quick check of the other detections.
     gates, order, required = star_search.trial(detections, a, b, 0, star_search.DECISIVE_DEX)
     grid = sky.cell_first, sky.cell_star, sky.side
     lookups, fits = star_search.quick_check(
@@ -189,6 +255,7 @@ def _test_match(
     checks[0] += 1 + lookups
     if not fits:
         return no_hypothesis()
+    # 6. Evidence.
     checks[0] += star_search.EVALUATION_COST
     return evaluate(
         detections, sky, R_ref_from_cam.T.copy(), ratio, gates, star_search.DECISIVE_DEX

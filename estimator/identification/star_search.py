@@ -1,13 +1,26 @@
 """Lost-in-space star identification by pair hypotheses and a Bayes factor: the default method.
 
-A pair of detections and a pair of catalog stars with the same angular separation determine a candidate attitude. A
-quick check counts how many of the other detections have a star at the predicted position; if enough do, the candidate
-is fitted to the whole field and its Bayes factor is computed (`evidence.evaluate`). Pairs that few catalog pairs can
-match are tried first. The search ends at DECISIVE_DEX; a weaker candidate must have ACCEPT_DEX and beat every other
-attitude by MARGIN_DEX.
+Two detections and two catalog stars with the same angular separation determine an attitude. If it is the true one, the
+other detections have catalog stars at their predicted directions. A quick check counts these stars. The Bayes factor
+(`star_evidence`) then decides whether chance could have placed them there. If the focal length is uncertain, each pair
+also determines it, from the ratio of the measured to the catalog separation, and the other detections must confirm
+both.
 
-If the focal length is uncertain, each pair hypothesis also determines it, from the ratio of the measured to the catalog
-separation, and the rest of the field must confirm both.
+The steps; the same numbers return as comments in the code:
+
+1. Choose the detections and the effort: the FEW brightest first, then up to `max_detections` (`lost_in_space`).
+2. Take the pair of detections that the fewest catalog pairs are expected to match (`search`).
+3. Look up the catalog pairs of the same separation within GATE_SIGMA (`_pair_range`).
+4. For each catalog pair, in both orders (`_test_pair`):
+   reject it by its magnitudes and its separation, and compute the focal ratio and the attitude.
+5. Quick check: look up the other detections, until enough of them or too few have a star nearby (`quick_check`).
+6. Match all detections, fit the attitude and compute its Bayes factor (`star_evidence.evaluate`).
+7. Stop at DECISIVE_DEX. From ACCEPT_DEX on, continue only to find rivals, with limited effort (`search`).
+8. Accept an attitude that passes ACCEPT_DEX and beats every other one by MARGIN_DEX (`search`).
+9. Fit the attitude to all detections, with the calibrated and with a free focal length (`fit_to_all`).
+
+Steps 2 to 8 are repeated with more detections, or with less strict quick checks, if they find nothing.
+Angles in the image are tangents; `ref` is the frame of the catalog's vectors.
 """
 
 from __future__ import annotations
@@ -46,20 +59,19 @@ from estimator.identification.star_evidence import (
 DECISIVE_DEX = 10.0  # evidence at which the search stops without looking for rivals
 MARGIN_DEX = 3.0  # by which the solution must beat every other attitude
 NO_RIVAL_DEX = ACCEPT_DEX - MARGIN_DEX  # below this an attitude is neither acceptable nor a rival
-# Extra effort for finding rivals of an accepted attitude: multiple of the effort so far, plus a number of look-ups.
+# Effort to find rivals of an accepted attitude: a multiple of the effort so far, plus a number of star look-ups.
 RIVAL_EFFORT = 2
 MIN_RIVAL_EFFORT = 2000
 MAG_GATE_SIGMA = 4.0  # greatest difference of magnitudes in the first round, in standard deviations
-EVALUATION_COST = (
-    6  # of one evaluation in units of one star look-up, so that frames without a solution end
-)
+# Cost of an evaluation in star look-ups. It is part of the effort, so that frames without a solution end in time.
+EVALUATION_COST = 6
 FEW = 20  # number of detections of the first search
-# fractions of the effort: of the first search at first, and of the second
+# Fractions of `max_checks`: for the first search with FEW detections, and for that with many.
 SHORT_EFFORT = 1 / 16
 MANY_EFFORT = 1 / 4
-WRONG_FOCAL = 0.05  # greatest relative error of a calibrated focal length that is found
+WRONG_FOCAL = 0.05  # greatest relative error of a calibrated focal length that step 9 can find
 WRONG_FOCAL_DEX = 2.0  # evidence by which another focal length must beat the calibrated one
-FREE_DEX = 1.0  # gain of a free focal length with the same matches below which the field is not matched with it
+FREE_DEX = 1.0  # least gain by a free focal length, with the same matches, for which it is tried
 MAX_MISSES = 4  # detections without a star after which the first round drops a candidate
 
 
@@ -67,106 +79,72 @@ MAX_MISSES = 4  # detections without a star after which the first round drops a 
 def lost_in_space(
     detections: Detections, stars: SkyIndex, max_detections: int, max_checks: int
 ) -> Solution:
-    """Identify the detections and solve the attitude.
+    """Identify the detections and solve the attitude: the whole search (see the module's steps).
 
-    The search uses the FEW brightest detections and, if it fails, the `max_detections` brightest, with the pairs of
-    `stars`: a few bright stars among many faint false lights are found by the first, stars among brighter false
-    lights by the second. The first is short; it is repeated with the whole effort if the second fails too. Each of the
-    two must have twice the evidence, so that together they accept a chance match as rarely as one. The attitude found
-    is then fitted to all detections. Returns an empty solution if the search finds nothing beyond
-    chance, or if the full field keeps no more than half of its matches.
-
-    Parameters
-    ----------
-    max_checks
-        Bound on the effort (see `search`)
-    """
-    few = min(FEW, max_detections, len(detections.sigma))
-    many = min(max_detections, len(detections.sigma))
-    if many == few:
-        accept_dex = ACCEPT_DEX
-        candidate = search(
-            changed(detections, few, 1.0, detections.focal_uncertainty), stars, max_checks
-        )
-    else:
-        accept_dex = ACCEPT_DEX + log10(2.0)
-        for count, effort in ((few, SHORT_EFFORT), (many, MANY_EFFORT), (few, 1.0)):
-            searched = changed(detections, count, 1.0, detections.focal_uncertainty)
-            candidate = search(searched, stars, int(effort * max_checks))
-            if candidate.dex >= accept_dex:
-                break
-    calibrated = detections.focal_uncertainty == 0
-    free = (
-        changed(detections, len(detections.sigma), 1.0, WRONG_FOCAL) if calibrated else detections
-    )
-    return fit_to_all(free, stars, candidate, accept_dex, calibrated, few == len(detections.sigma))
-
-
-@jit
-def fit_to_all(
-    detections: Detections,
-    stars: SkyIndex,
-    candidate: Hypothesis,
-    accept_dex: float,
-    calibrated: bool,
-    whole: bool,
-) -> Solution:
-    """Fit a candidate of some detections to all of them and all stars.
-
-    Of a calibrated camera it is fitted with the calibrated focal length and with a free one. The calibrated one is kept
-    unless the other has WRONG_FOCAL_DEX more evidence: with a wrong focal length a part of the stars may still match,
-    at a wrong attitude. The solution is empty if the candidate has less than `accept_dex`, if it keeps no more than
-    half of its matches, or if all detections together are not beyond chance.
+    A few bright stars among many faint false lights are found with the FEW brightest detections, stars among brighter
+    false lights with the `max_detections` brightest. Each of the two searches must reach twice the evidence, so that
+    together they accept a chance match as rarely as one would.
 
     Parameters
     ----------
     detections
-        With the focal uncertainty of the free fit
-    whole
-        Whether the candidate is the calibrated fit to all detections already
+        All detections of the frame, brightest first
+    stars
+        The catalog's stars and pairs
+    max_detections
+        Greatest number of detections to search with
+    max_checks
+        Bound on the effort (see `search`)
+
+    Returns
+    -------
+    Solution
+        Empty if the search finds nothing beyond chance, or if all detections together do not confirm what it finds
     """
-    chosen = detections
-    full = no_hypothesis()
-    gates = gates_of(detections, 1.5)
-    R = candidate.R_cam_from_ref
-    ratio = candidate.focal_ratio
-    found = candidate.dex >= accept_dex
-    free = True
-    if found and calibrated:
-        chosen = changed(detections, len(detections.sigma), 1.0, 0.0)
-        full = candidate if whole else evaluate(chosen, stars, R.copy(), 1.0, gates, -np.inf)
-        # If all detections match there is none that another focal length could match.
-        free = len(full.star) < len(gates) or focal_gain_dex(detections, stars, full) >= FREE_DEX
-    if found and free:
-        fitted = evaluate(detections, stars, R.copy(), ratio, gates, -np.inf)
-        if not calibrated or fitted.dex > full.dex + WRONG_FOCAL_DEX:
-            chosen = detections
-            full = fitted
-    if not found or 2 * len(full.observed) <= len(candidate.observed) or full.dex < ACCEPT_DEX:
-        return build_solution(chosen, stars, no_hypothesis())
-    dex = max(full.dex, candidate.dex)
-    best = Hypothesis(
-        full.observed, full.star, full.R_cam_from_ref, full.focal_ratio, full.info, dex
-    )
-    return build_solution(chosen, stars, best)
+    # 1. Choose the detections to search with.
+    total = len(detections.sigma)
+    few = min(FEW, max_detections, total)
+    many = min(max_detections, total)
+    # Two searches must each reach twice the evidence.
+    accept_dex = ACCEPT_DEX if few == many else ACCEPT_DEX + log10(2.0)
+    candidate = no_hypothesis()
+    # A short search with few detections, one with many, then the first one again with the whole effort.
+    for count, effort in ((few, SHORT_EFFORT), (many, MANY_EFFORT), (few, 1.0)):
+        if few == many and effort < 1:
+            continue
+        # 2. to 8. The search.
+        searched = changed(detections, count, 1.0, detections.focal_uncertainty)
+        candidate = search(searched, stars, int(effort * max_checks))
+        if candidate.dex >= accept_dex:
+            break
+    # 9. Fit to all detections. A calibrated camera may be wrong by up to WRONG_FOCAL.
+    calibrated = detections.focal_uncertainty == 0
+    free = changed(detections, total, 1.0, WRONG_FOCAL) if calibrated else detections
+    return fit_to_all(free, stars, candidate, accept_dex, calibrated, few == total)
 
 
 @jit
 def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis:
-    """The first attitude with DECISIVE_DEX of evidence; else the best one, if it passes ACCEPT_DEX and MARGIN_DEX.
+    """Steps 2 to 8: search one set of detections for the attitude.
 
-    Detection pairs are tried in the order of the expected number of matching catalog pairs: short pairs (above
-    SHORT_PAIR) and rare magnitudes first. Each attempt doubles the cost of its two detections, so that a false
-    detection does not hold up the search. The first round drops a candidate after MAX_MISSES detections without a star
-    and skips stars outside of the magnitude gate; the second round has neither limit, and is skipped if there are so
-    few detections that MAX_MISSES covers them. Every attempt checks its candidates at another MAX_MISSES detections
-    first: a fixed order would drop every true candidate of a frame in which these are all false. After an attitude
-    reaches ACCEPT_DEX the search continues for rivals, with RIVAL_EFFORT times the effort so far.
+    Pairs of detections are tried by increasing cost: the expected number of catalog pairs that match them, doubled for
+    each earlier attempt with either detection, so that a false detection does not hold up the search. Pairs shorter
+    than SHORT_PAIR come last, as they determine the roll poorly.
+
+    The first round drops a candidate after MAX_MISSES detections without a star and skips stars outside of the
+    magnitude gate. The second round has neither limit. It is skipped if MAX_MISSES covers all other detections
+    anyway.
 
     Parameters
     ----------
     max_checks
         Bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
+
+    Returns
+    -------
+    Hypothesis
+        The first attitude with DECISIVE_DEX, or else the best one that passes ACCEPT_DEX and MARGIN_DEX, or else the
+        empty hypothesis
     """
     total = len(detections.sigma)
     length = _pair_lengths(detections)
@@ -179,8 +157,11 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
         tried = np.zeros((total, total), np.bool_)
         cost = rarity.copy()
         for attempt in range(total * (total - 1) // 2):
+            # 2. The untried pair of detections of least cost.
             a, b = _next_pair(length, tried, cost)
             tried[a, b] = True
+            # 3. to 6. Every attempt starts its quick checks at another MAX_MISSES detections: a fixed order would
+            # drop every true candidate of a frame in which these are all false.
             candidate = _test_pair(
                 detections, sky, a, b, attempt * MAX_MISSES, max_misses, best, checks
             )
@@ -193,23 +174,30 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
                 best = candidate
             elif not same:
                 rival_dex = max(rival_dex, candidate.dex)
+            # 7. A decisive attitude needs no search for rivals.
             if best.dex >= DECISIVE_DEX:
                 return best
+            # The next attempts prefer other detections: one of these two may be false.
             cost[a] *= 2
             cost[b] *= 2
             if checks[0] > limit:
                 break
         if checks[0] > limit or total - 2 <= MAX_MISSES:
             break
-    return (
-        best if best.dex >= ACCEPT_DEX and best.dex - rival_dex >= MARGIN_DEX else no_hypothesis()
-    )
+    # 8. A weaker attitude must be significant, and clearly better than any other.
+    if best.dex >= ACCEPT_DEX and best.dex - rival_dex >= MARGIN_DEX:
+        return best
+    return no_hypothesis()
 
 
 @jit
 def _same_attitude(first: Hypothesis, second: Hypothesis) -> bool:
-    """Whether two hypotheses are the same attitude within 5.7 degrees (trace > 2.99); False if `second` is empty."""
+    """Whether two hypotheses have the same attitude within 5.7 degrees; False if `second` is empty.
+
+    The trace of R1^T R2 is 1 + 2 cos(angle): 2.99 for 5.7 degrees.
+    """
     trace = 0.0
+    # trace(R1^T R2) = sum of the products of the elements.
     for i in range(3):
         for j in range(3):
             trace += first.R_cam_from_ref[i, j] * second.R_cam_from_ref[i, j]
@@ -218,7 +206,16 @@ def _same_attitude(first: Hypothesis, second: Hypothesis) -> bool:
 
 @jit
 def _pair_lengths(detections: Detections) -> Floats:
-    """(N, N) length in tangents of every pair a < b; pairs too short to determine the roll count as very long."""
+    """Separations of all pairs of detections, for the order of the search.
+
+    The expected number of catalog pairs in a gate grows with sin(separation). A pair shorter than SHORT_PAIR of the
+    field determines the roll poorly: it is given a length beyond all others, the greater the shorter it is.
+
+    Returns
+    -------
+    Floats
+        (N, N) tangents, for a < b; the other elements are not set
+    """
     total = len(detections.sigma)
     field = detections.field
     min_length = SHORT_PAIR * sqrt((field[1] - field[0]) * (field[3] - field[2]))
@@ -226,20 +223,26 @@ def _pair_lengths(detections: Detections) -> Floats:
     for a in range(total):
         for b in range(a + 1, total):
             length = separation(detections.tangent, a, b)
-            out[a, b] = (
-                length
-                if length >= min_length
-                else 1e3 * min_length * min_length / max(length, 1e-9)
-            )
+            # A short pair comes after all others.
+            if length < min_length:
+                length = 1e3 * min_length * min_length / max(length, 1e-9)
+            out[a, b] = length
     return out
 
 
 @jit
 def _rarity(detections: Detections, sky: SkyIndex) -> Floats:
-    """(N,) fraction of the stars inside the magnitude gate of each detection; 1 if its magnitude is unknown."""
+    """Fraction of the catalog's stars that each detection's magnitude allows.
+
+    Returns
+    -------
+    Floats
+        (N,) fraction of the stars inside the magnitude gate; 1 if the magnitude is unknown
+    """
     out = np.ones(len(detections.sigma))
     for n in range(len(out)):
         if np.isfinite(detections.mag[n]):
+            # The gate's full width times the density of magnitudes; the small constant keeps every cost above 0.
             density = magnitude_density(sky, detections.mag[n])
             out[n] = min(2 * MAG_GATE_SIGMA * detections.mag_sigma * density + 1e-3, 1.0)
     return out
@@ -247,12 +250,28 @@ def _rarity(detections: Detections, sky: SkyIndex) -> Floats:
 
 @jit
 def _next_pair(length: Floats, tried: NDArray, weight: Floats) -> tuple[int, int]:
-    """The untried pair a < b of the least cost length[a, b] * weight[a] * weight[b]."""
+    """The untried pair a < b of the least cost length[a, b] * weight[a] * weight[b].
+
+    Parameters
+    ----------
+    length
+        (N, N) lengths of the pairs, see `_pair_lengths`
+    tried
+        (N, N) whether a pair has been tried
+    weight
+        (N,) cost of each detection
+
+    Returns
+    -------
+    tuple[int, int]
+        Rows of the two detections
+    """
     best = np.inf
     best_a = 0
     best_b = 1
     for a in range(len(weight)):
         for b in range(a + 1, len(weight)):
+            # The costs change with every attempt: sorting the pairs once would not do.
             cost = length[a, b] * weight[a] * weight[b]
             if cost < best and not tried[a, b]:
                 best = cost
@@ -272,16 +291,25 @@ def _test_pair(
     previous: Hypothesis,
     checks: NDArray,
 ) -> Hypothesis:
-    """Test two detections against every catalog pair of the same separation, in both orders.
-
-    Returns the first hypothesis with ACCEPT_DEX that is another attitude than `previous`, else the best one.
+    """Steps 3 to 6: test two detections against every catalog pair of the same separation, in both orders.
 
     Parameters
     ----------
+    a, b
+        Rows of the two detections
     start
-        The other detections are looked up from this one on
+        The quick check looks up the other detections from this row on
+    max_misses
+        The quick check drops a candidate after this many detections without a star
+    previous
+        Best hypothesis so far
     checks
         (1,) effort so far, increased in place
+
+    Returns
+    -------
+    Hypothesis
+        The first one with ACCEPT_DEX whose attitude is not that of `previous`, or else the best one
     """
     gates, order, required = trial(detections, a, b, start, ACCEPT_DEX)
     in_cam = np.empty((3, 3))
@@ -289,6 +317,7 @@ def _test_pair(
     R_ref_from_cam = np.empty((3, 3))
     best = no_hypothesis()
     focal_ratio = 1.0
+    # 3. Catalog pairs of the same separation.
     begin, end, chord, gate = _pair_range(detections, sky, a, b)
     # Tuple members are unpacked here: in the loop each access would cost two updates of a reference count.
     tangent = detections.tangent
@@ -301,9 +330,11 @@ def _test_pair(
     mag_a = detections.mag[a]
     mag_b = detections.mag[b]
     mag_gate = MAG_GATE_SIGMA * detections.mag_sigma if max_misses == MAX_MISSES else np.inf
+    # 4. Candidate attitudes.
     for p in range(begin, end):
         i = pair[p, 0]
         j = pair[p, 1]
+        # 4a. Compare magnitudes first: this needs no geometry.
         forward = _alike(mag_a - mag[i], mag_b - mag[j], mag_gate)
         backward = _alike(mag_a - mag[j], mag_b - mag[i], mag_gate)
         if not (forward or backward):
@@ -311,6 +342,7 @@ def _test_pair(
         star_i = vectors.row(star, i)
         star_j = vectors.row(star, j)
         catalog_chord = vectors.chord(star_i, star_j)
+        # 4b. An uncertain focal length follows from the separations; else the separations must agree.
         if focal_uncertainty > 0:
             focal_ratio = fit_focal_ratio(tangent, a, b, chord, catalog_chord)
             if abs(focal_ratio - 1) > focal_uncertainty:
@@ -320,12 +352,16 @@ def _test_pair(
             continue
         vectors.pair_frame(star_i, star_j, in_ref)
         for flip in range(2):
-            if flip:  # the star pair in reverse order: a half turn about its first axis
+            if flip:
+                # The star pair in reverse order: a half turn about its bisector, the first axis.
                 for k in range(3):
-                    in_ref[k, 1], in_ref[k, 2] = -in_ref[k, 1], -in_ref[k, 2]
+                    in_ref[k, 1] = -in_ref[k, 1]
+                    in_ref[k, 2] = -in_ref[k, 2]
             if not (backward if flip else forward):
                 continue
+            # 4c. The attitude turns the axes of the detections into those of the stars.
             vectors.multiply_transposed(in_ref, in_cam, R_ref_from_cam)
+            # 5. Quick check.
             lookups, fits = quick_check(
                 tangent,
                 star,
@@ -339,6 +375,7 @@ def _test_pair(
             )
             checks[0] += 1 + lookups
             if fits:
+                # 6. Evidence. Below NO_RIVAL_DEX the candidate is neither acceptable nor a rival.
                 checks[0] += EVALUATION_COST
                 candidate = evaluate(
                     detections, sky, R_ref_from_cam.T.copy(), focal_ratio, gates, NO_RIVAL_DEX
@@ -353,23 +390,31 @@ def _test_pair(
 def trial(
     detections: Detections, a: int, b: int, start: int, min_dex: float
 ) -> tuple[Floats, NDArray[np.int64], int]:
-    """What a quick check of an attitude by two detections takes: gates, the other detections, and matches required.
+    """What the quick check of an attitude by two detections needs.
 
     Parameters
     ----------
+    a, b
+        Rows of the two detections
     start
-        The other detections are looked up from this one on
+        The other detections are looked up from this row on
     min_dex
-        Least evidence of interest
+        Least evidence of interest, log10
+
+    Returns
+    -------
+    gates
+        (N,) matching radius of each detection, tangents
+    order
+        (N - 2,) rows of the other detections
+    required
+        Number of matches, the pair included, without which the evidence cannot reach `min_dex`
     """
     gates = pair_gates(detections, a, b)
     order = other_detections(len(detections.sigma), a, b, start)
     pair_dex = attitude_dex(detections, a, b)
-    return (
-        gates,
-        order,
-        required_matches(detections.sigma, field_area(detections), pair_dex, min_dex),
-    )
+    required = required_matches(detections.sigma, field_area(detections), pair_dex, min_dex)
+    return gates, order, required
 
 
 @jit
@@ -382,10 +427,24 @@ def _alike(difference_a: float, difference_b: float, gate: float) -> bool:
 def _pair_range(
     detections: Detections, sky: SkyIndex, a: int, b: int
 ) -> tuple[int, int, float, float]:
-    """Half-open range of catalog pairs that two detections may be; their chord, and the gate of their angle, rad."""
+    """Step 3: the catalog pairs whose separation two detections may have.
+
+    The gate is GATE_SIGMA sqrt(sa^2 + sb^2). A focal length that is uncertain by the fraction u widens the range of
+    angles to angle / (1 + u) .. angle / (1 - u).
+
+    Returns
+    -------
+    begin, end
+        Half-open range of rows of `sky.pair`
+    chord
+        Chord between the two rays
+    gate
+        Greatest difference of the separations, rad
+    """
     chord = vectors.chord(ray(detections.tangent, a, 1.0), ray(detections.tangent, b, 1.0))
     gate = GATE_SIGMA * sqrt(detections.sigma[a] ** 2 + detections.sigma[b] ** 2)
     angle = 2 * np.arcsin(min(chord / 2, 1.0))
+    # Cell k of the index holds the angles from k to k + 1 times bin_rad.
     last = len(sky.first) - 2
     low = cell_of((angle / (1 + detections.focal_uncertainty) - gate) / sky.bin_rad, last + 1)
     high = cell_of((angle / (1 - detections.focal_uncertainty) + gate) / sky.bin_rad, last)
@@ -394,10 +453,11 @@ def _pair_range(
 
 @jit
 def other_detections(total: int, a: int, b: int, start: int) -> NDArray[np.int64]:
-    """(N - 2,) all detections but a and b, from number `start` on and around."""
+    """Rows of all N detections but a and b, from row `start` on and around: (N - 2,)."""
     out = np.empty(total, np.int64)
     count = 0
     for step in range(total):
+        # Wrap around at the end.
         n = (start + step) % total
         if n not in (a, b):
             out[count] = n
@@ -407,8 +467,24 @@ def other_detections(total: int, a: int, b: int, start: int) -> NDArray[np.int64
 
 @jit
 def fit_focal_ratio(tangent: Floats, a: int, b: int, chord: float, target: float) -> float:
-    """The focal ratio at which the chord between two detections is `target`, by two fixed-point iterations."""
+    """The focal ratio at which the chord between two detections is `target`.
+
+    A chord is nearly proportional to 1 / focal length: f <- f chord(f) / target converges in two iterations.
+
+    Parameters
+    ----------
+    chord
+        Chord between the two rays at the assumed focal length
+    target
+        Chord between the two stars
+
+    Returns
+    -------
+    float
+        Ratio of the true to the assumed focal length
+    """
     focal_ratio = chord / target
+    # f <- f chord(f) / target
     for _ in range(2):
         focal_ratio *= (
             vectors.chord(ray(tangent, a, focal_ratio), ray(tangent, b, focal_ratio)) / target
@@ -418,10 +494,18 @@ def fit_focal_ratio(tangent: Floats, a: int, b: int, chord: float, target: float
 
 @jit
 def pair_gates(detections: Detections, a: int, b: int) -> Floats:
-    """(N,) matching radius of each detection at a pair's attitude: its own error and that of the attitude.
+    """Matching radius of each detection at the attitude of a pair: its own error and that of the attitude.
 
-    The variance of the pair's midpoint is (sa^2 + sb^2) / 4; that of its direction, and of its relative length, is
-    (sa^2 + sb^2) / separation^2 and grows with the squared distance from the midpoint.
+        gate_n = GATE_SIGMA sqrt(s_n^2 + (sa^2 + sb^2) / 4 + (sa^2 + sb^2) d_n^2 / D^2)
+
+    The second term is the variance of the pair's midpoint. The third is that of its direction, and of its relative
+    length (for an uncertain focal length), which grows with the squared distance d_n from the midpoint; D is the
+    separation.
+
+    Returns
+    -------
+    Floats
+        (N,) tangents
     """
     tangent = detections.tangent
     x, y = middle(tangent, a, b)
@@ -430,6 +514,7 @@ def pair_gates(detections: Detections, a: int, b: int) -> Floats:
     out = np.empty(len(detections.sigma))
     for n in range(len(out)):
         distance2 = (tangent[n, 0] - x) ** 2 + (tangent[n, 1] - y) ** 2
+        # The detection's variance, that of the midpoint, and that of the direction at this distance.
         out[n] = GATE_SIGMA * sqrt(
             detections.sigma[n] ** 2 + pair_variance / 4 + direction_variance * distance2
         )
@@ -440,12 +525,16 @@ def pair_gates(detections: Detections, a: int, b: int) -> Floats:
 def attitude_dex(detections: Detections, a: int, b: int) -> float:
     """Contribution of a pair's attitude alone to the evidence, for `required_matches`.
 
-    The uncertainty is sqrt(2) sigma / separation about the boresight (and of the focal ratio), sigma / sqrt(2) across
-    it, with the least sigma of all detections and isotropic errors.
+        log10( (2 pi)^(3/2) (s / sqrt(2))^2 (sqrt(2) s / D) / V )
+
+    The pair determines the two axes across the boresight to s / sqrt(2), and the roll to sqrt(2) s / D, D the
+    separation. s is the least sigma of all detections, taken as isotropic, which gives a lower bound of the
+    uncertainty. V is the prior volume. An uncertain focal length adds sqrt(2 pi) sqrt(2) s / D.
     """
     sigma = least(detections.sigma)
     direction_sigma = sqrt(2.0) * sigma / separation(detections.tangent, a, b)
     dex = 1.5 * log10(2 * pi) + log10(sigma**2 / 2 * direction_sigma) - prior_volume_dex(detections)
+    # An uncertain focal length is as well known as the roll.
     if detections.focal_uncertainty > 0:
         dex += log10(sqrt(2 * pi) * direction_sigma)
     return dex
@@ -465,20 +554,109 @@ def quick_check(
     required: int,
     max_misses: int,
 ) -> tuple[int, bool]:
-    """Quick check of an attitude: number of detections looked up, and whether `required` of them have a star nearby.
+    """Step 5: look up detections at an attitude, until it is clear whether enough of them have a star nearby.
 
-    The two detections of the pair count as matched. Stops as soon as the count is reached or out of reach, or after
-    `max_misses` detections without any match.
+    Parameters
+    ----------
+    tangent
+        (N, 2) detections, tangents
+    vectors_ref, cell_first, cell_star, side
+        Fields of the sky index (see `nearest`)
+    R_ref_from_cam
+        (3, 3) candidate attitude
+    focal_ratio
+        Ratio of the true to the assumed focal length
+    gates
+        (N,) matching radius of each detection
+    order
+        (N - 2,) rows of the detections other than the pair, in the order of the look-ups
+    required
+        Number of matches wanted, with the pair's two
+    max_misses
+        Number of look-ups without any match after which the candidate is dropped
+
+    Returns
+    -------
+    lookups
+        Number of detections looked up
+    fits
+        Whether `required` is reached
     """
     count = 2
     remaining = len(order)
     for step in range(remaining):
+        # Out of reach, or too many misses at the start.
         if count + remaining - step < required or (step >= max_misses and count == 2):
             return step, False
-        x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, order[step], focal_ratio))
-        count += (
-            nearest(vectors_ref, cell_first, cell_star, side, x, y, z, gates[order[step]])[0] >= 0
-        )
+        # The star nearest to the detection's direction in the catalog's frame.
+        n = order[step]
+        x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, n, focal_ratio))
+        star, _ = nearest(vectors_ref, cell_first, cell_star, side, x, y, z, gates[n])
+        count += star >= 0
         if count >= required:
             return step + 1, True
     return remaining, False
+
+
+@jit
+def fit_to_all(
+    detections: Detections,
+    stars: SkyIndex,
+    candidate: Hypothesis,
+    accept_dex: float,
+    calibrated: bool,
+    whole: bool,
+) -> Solution:
+    """Step 9: fit a candidate attitude of some detections to all detections and all stars.
+
+    With a wrong focal length a part of the stars may still match, at a wrong attitude. The candidate of a calibrated
+    camera is therefore fitted with the calibrated and with a free focal length. The free one is taken if it has
+    WRONG_FOCAL_DEX more evidence.
+
+    Parameters
+    ----------
+    detections
+        All detections, with the focal uncertainty of the free fit
+    candidate
+        Best hypothesis of the search
+    accept_dex
+        Least evidence of the candidate, log10
+    calibrated
+        Whether the focal length is calibrated
+    whole
+        Whether the candidate already is the calibrated fit to all detections
+
+    Returns
+    -------
+    Solution
+        Empty if the candidate has less than `accept_dex`, if the full field keeps no more than half of its matches, or
+        if all detections together are not beyond chance
+    """
+    if not candidate.dex >= accept_dex:
+        return build_solution(detections, stars, no_hypothesis())
+    chosen = detections
+    full = no_hypothesis()
+    # A candidate of some detections is less accurate than the fit to all: the first match has a wider gate.
+    gates = gates_of(detections, 1.5)
+    R = candidate.R_cam_from_ref
+    free = True
+    if calibrated:
+        # 9a. The fit with the calibrated focal length.
+        chosen = changed(detections, len(detections.sigma), 1.0, 0.0)
+        full = candidate if whole else evaluate(chosen, stars, R.copy(), 1.0, gates, -np.inf)
+        # If all detections match there is none that another focal length could match.
+        free = len(full.star) < len(gates) or focal_gain_dex(detections, stars, full) >= FREE_DEX
+    if free:
+        # 9b. The fit with a free focal length.
+        fitted = evaluate(detections, stars, R.copy(), candidate.focal_ratio, gates, -np.inf)
+        if not calibrated or fitted.dex > full.dex + WRONG_FOCAL_DEX:
+            chosen = detections
+            full = fitted
+    # 9c. Refuse what all detections together do not confirm.
+    if 2 * len(full.observed) <= len(candidate.observed) or full.dex < ACCEPT_DEX:
+        return build_solution(chosen, stars, no_hypothesis())
+    dex = max(full.dex, candidate.dex)
+    best = Hypothesis(
+        full.observed, full.star, full.R_cam_from_ref, full.focal_ratio, full.info, dex
+    )
+    return build_solution(chosen, stars, best)

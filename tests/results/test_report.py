@@ -13,8 +13,7 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.results import report
-from skysim.results.report import Report
-from skysim.results.report_blocks import (
+from skysim.results.report import (
     Block,
     Cell,
     Code,
@@ -22,6 +21,7 @@ from skysim.results.report_blocks import (
     Facts,
     Figure,
     Items,
+    Report,
     Section,
     Table,
     Text,

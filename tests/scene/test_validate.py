@@ -13,8 +13,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from skysim.apps.cli import main
-from skysim.apps.cli.commands import validate
+from skysim.apps.cli import json_schema, main
 from skysim.apps.cli.commands.validate import check_file
 from skysim.core import yaml_reader
 from skysim.core.errors import InputError
@@ -41,7 +40,7 @@ Plain.yaml_implicit_resolvers = {
 
 def faults(kind: str, tree: Any) -> list[str]:
     """What an independent validator has against it."""
-    validator = jsonschema.Draft202012Validator(validate.json_schema(kind))
+    validator = jsonschema.Draft202012Validator(json_schema.json_schema(kind))
     return [error.message for error in validator.iter_errors(tree)]
 
 
@@ -49,7 +48,7 @@ def faults(kind: str, tree: Any) -> list[str]:
 @pytest.mark.parametrize("kind", SHIPPED)
 def test_the_published_schema_is_the_newest_and_takes_every_file_that_ships(kind: str) -> None:
     published = json.loads((DATA / "schema" / f"{kind}.json").read_text())
-    assert published == validate.json_schema(kind), (
+    assert published == json_schema.json_schema(kind), (
         f"skysim validate --schema {kind} > data/schema/{kind}.json"
     )
     jsonschema.Draft202012Validator.check_schema(published)

@@ -1,10 +1,19 @@
 """Fialho's triangle method, PTASE's identifier in its four versions: candidate lists, a triplet, the direct match.
 
 Fialho & Saotome 2005, section 3.5: "In the first step it tries to match a triangle of observed stars (the three
-brightest stars above a minimum magnitude and with a minimum angular distance) with a triangle of cataloged stars"
-from a list of candidates for each; then the rest are matched at the attitude that the triplet gives, and it counts if
-"greater than a minimum threshold (e.g, half the number of observed stars)"; else the search goes on. The paper names
-four improvements since alg_ide_mf1_1 of 2003 and says what mf1_2 has; mf1_3 is inferred to lie between 2 and 4:
+brightest stars above a minimum magnitude and with a minimum angular distance) with a triangle of catalogued stars" from
+a list of candidates for each star. In the second step "the remaining stars in the FOV are matched through a direct
+match technique", and the identification is accepted if they are "greater than a minimum threshold (e.g, half the number
+of observed stars)".
+
+1. Take the three brightest observed stars that are far enough apart (`search`).
+2. List the candidates of each star by magnitude and prior boresight (`_candidate`).
+3. Test every triplet of candidates with the triangle's sides and handedness (`_test_neighbors`, `_test_lists`).
+4. Match the whole field at the triplet's attitude; accept it if enough stars match, significantly (`_direct_match`).
+5. If no triplet is accepted, take another triangle of observed stars (versions 3 and 4).
+
+The paper names four improvements since alg_ide_mf1_1 of 2003 and says what mf1_2 has. mf1_3 is inferred to be between
+2 and 4:
 
     mf1_1  the basic algorithm: every list from the whole catalog
     mf1_2  lists "assembled in an optimized way", and a prior direction of the optical axis
@@ -14,7 +23,7 @@ four improvements since alg_ide_mf1_1 of 2003 and says what mf1_2 has; mf1_3 is 
 The paper does not say what "optimized" means. Here the first list is a range of the catalog, which is sorted by
 magnitude, and the other lists are the neighbors of its stars at the observed angles. Two tests are added in all
 versions: the match must be significant against chance, and the triangles must have the same handedness. As in the
-paper, the first triplet that passes is the solution; for a repetitive catalog, such as a lattice of LEDs, use `saa`.
+paper, the first triplet that passes is the solution. For a repetitive catalog, such as a lattice of LEDs, use `saa`.
 """
 
 from __future__ import annotations
@@ -27,7 +36,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.pair_index import PairIndex, first_neighbor, magnitude_range
+from estimator.catalog.pair_index import PairIndex, magnitude_range, neighbor_range
 from estimator.core.checks import Floats, ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
@@ -42,12 +51,10 @@ from estimator.identification.direct_match import (
 )
 from estimator.identification.solver_options import Options
 
-MAG_GATE_SIGMA = (
-    3.0  # of a magnitude: three stars pass with 0.9973^3 = 99.2 %, the paper's 99.12 +- 0.25 %
-)
-MIN_SIDE_FRACTION = (
-    0.1  # of the field's diagonal, between the stars of a triangle; the paper gives no value
-)
+# Gate of a magnitude, in standard deviations: three stars pass with 0.9973^3 = 99.2 %, the paper's 99.12 +- 0.25 %.
+MAG_GATE_SIGMA = 3.0
+# Least angle between the stars of a triangle, as a fraction of the field's diagonal. The paper gives no value.
+MIN_SIDE_FRACTION = 0.1
 # Least fraction of the observed stars that must match: basic, and with false stars.
 MIN_FRACTION_BASIC = 0.5
 MIN_FRACTION_FALSE_STARS = 0.3
@@ -55,9 +62,14 @@ MIN_FRACTION_FALSE_STARS = 0.3
 
 @dataclass(frozen=True, slots=True)
 class MagnitudeMatch(StarMatch):
-    """A match with the mean and the variance of observed minus catalog magnitude; NaN if magnitudes are unknown.
+    """A match with the errors of its magnitudes.
 
-    Fialho, Lopes & Saotome 2005 use these to calibrate a sensor's magnitude offset.
+    Fialho, Lopes & Saotome 2005 use them to calibrate the magnitude offset of a sensor.
+
+    Attributes
+    ----------
+    offset_mag, variance_mag2
+        Mean and variance of observed minus catalog magnitude; NaN if magnitudes are unknown
     """
 
     offset_mag: float = float("nan")
@@ -70,18 +82,17 @@ class FialhoOptions(NamedTuple):
     Attributes
     ----------
     tolerance_rad, stretch
-        Tolerance of a direction; that of an angle is sqrt(2) times it plus stretch times the
-        angle
+        Tolerance of a direction; that of an angle is sqrt(2) times it plus stretch times the angle
     gate_mag
-        Tolerance of a magnitude
+        Greatest difference of magnitudes
     triangles, checks, base
-        As in `Options`: limits of observed triangles and of angles compared, number of stars
+        Limits of observed triangles and of angles compared, and number of stars (see `Options`)
     min_fraction
         Fraction of the observed stars that must match
     optimized
-        Assemble the lists from neighbors
+        Whether the lists are assembled from neighbors
     x, y, z, chord2
-        Prior boresight, and the greatest squared chord of a candidate from it
+        Prior boresight, a unit vector in the catalog's frame, and the greatest squared chord of a candidate from it
     """
 
     tolerance_rad: float
@@ -101,17 +112,27 @@ class FialhoOptions(NamedTuple):
 def search_options(
     tolerance_rad: float, settings: Options, min_fraction: float, optimized: bool, retries: bool
 ) -> FialhoOptions:
-    """Search parameters from options. Raises ImageError unless the tolerance and the magnitude error are positive.
+    """Search parameters of one version.
 
     Parameters
     ----------
+    min_fraction
+        Fraction of the observed stars that must match
+    optimized
+        Whether the lists are assembled from neighbors
     retries
-        Try other observed triangles if the first fails
+        Whether other observed triangles are tried if the first fails
+
+    Raises
+    ------
+    ImageError
+        Unless the tolerance and the magnitude error are positive.
     """
     if not min(tolerance_rad, settings.epsilon_mag) > 0:
         raise ImageError(
             f"fialho: tolerance {tolerance_rad} rad, magnitude error {settings.epsilon_mag}; allowed: more than 0"
         )
+    # No chord on the unit sphere is longer than 2: without a prior boresight every star passes.
     x = 0.0
     y = 0.0
     z = 1.0
@@ -138,7 +159,7 @@ def search_options(
 def fialho_1(
     vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
 ) -> StarMatch | None:
-    """The basic algorithm: one triangle, each list from the whole catalog, no boresight prior. See `fialho_4`."""
+    """The basic algorithm: one triangle, each list from the whole catalog, no prior boresight. See `fialho_4`."""
     settings = replace(Options(**options), boresight_ref=None)
     return _identify(vectors_cam, index, tolerance_rad, settings, MIN_FRACTION_BASIC, False, False)
 
@@ -167,24 +188,29 @@ def fialho_4(
 ) -> MagnitudeMatch | None:
     """Fialho's triangle method, latest version: as the third, and returns the errors of the magnitudes.
 
-    Returns None if too few stars match, or if the match is not significant (1e-5 expected by chance).
-
     Parameters
     ----------
     vectors_cam
         (N, 3) observed unit vectors, brightest first
+    index
+        Catalog of the stars and pairs
     tolerance_rad
-        Of a direction; that of an angle is sqrt(2) times it, plus `stretch` times the angle
+        Tolerance of a direction; that of an angle is sqrt(2) times it, plus `stretch` times the angle
     options
-        Those of `Options`: `magnitude`, if the index has magnitudes too, shortens the lists;
-        `boresight_ref` and `within_rad` are the prior boresight: candidates are within that
-        angle of it, which must therefore include half the field's diagonal beside the error of
-        the prior
+        Keywords of `Options`. `magnitude`, if the index has magnitudes too, shortens the lists. `boresight_ref` and
+        `within_rad` are the prior boresight: candidates are within that angle of it, which must therefore include half
+        the field's diagonal beside the error of the prior
+
+    Returns
+    -------
+    MagnitudeMatch | None
+        None if too few stars match, or if the match is not significant (1e-5 expected by chance)
     """
     match = fialho_3(vectors_cam, index, tolerance_rad, **options)
     if match is None:
         return None
     magnitudes = Options(**options).magnitudes(len(vectors_cam))
+    # Errors of the magnitudes of the identified stars.
     offset_mag = magnitudes[match.observed] - index.magnitude[match.star]
     return MagnitudeMatch(
         match.observed,
@@ -213,6 +239,7 @@ def _identify(
     optimized: bool,
     retries: bool,
 ) -> StarMatch | None:
+    """Identify stars with the parameters of one version."""
     parameters = search_options(tolerance_rad, settings, min_fraction, optimized, retries)
     settings.require_known_focal("fialho")
     count = len(vectors_cam)
@@ -226,25 +253,30 @@ def _identify(
 def search(
     rays: Floats, magnitudes: Floats, index: PairIndex, options: FialhoOptions
 ) -> DirectMatch:
-    """Compiled search over observed triangles: the brightest first, then others, with all stars changing soon.
-
-    Returns the rows of the observed stars and of the catalog, R_cam_from_ref, and log10 of the expected number of
-    chance matches; it is a solution only if that is at most ACCEPT_LOG10_CHANCE.
+    """The compiled search over observed triangles: the brightest first, then others, with all stars changing soon.
 
     Parameters
     ----------
     rays, magnitudes
         (N, 3) unit vectors, brightest first, and their (N,) magnitudes, NaN if unknown
+
+    Returns
+    -------
+    DirectMatch
+        A solution only if its log10_chance is at most ACCEPT_LOG10_CHANCE
     """
     tried = np.zeros(2, np.int64)  # triplets, angles compared
     min_side_rad = MIN_SIDE_FRACTION * index.max_angle_rad
     base = min(options.base, len(rays))
+    # 1. The three brightest stars.
     corners = _brightest(rays, base, min_side_rad)
     if corners[0] < 0:
         return no_match()
+    # 2. to 4. Test its triplets.
     match = triplets(rays, magnitudes, index, corners, options, tried)
     if match.log10_chance <= ACCEPT_LOG10_CHANCE:
         return match
+    # 5. Other triangles: (i, i + dj, i + dj + dk), i running fastest, so that one false star costs little.
     count = 1
     for dj in range(1, base - 1):
         for dk in range(1, base - dj):
@@ -252,6 +284,7 @@ def search(
                 if count >= options.triangles or tried[1] >= options.checks:
                     return no_match()
                 next_corners = np.array([i, i + dj, i + dj + dk])
+                # Not the first triangle again, and none that is too small.
                 if (next_corners == corners).all() or _shortest_side(
                     rays, next_corners
                 ) < min_side_rad:
@@ -277,6 +310,7 @@ def _brightest(rays: Floats, base: int, min_side_rad: float) -> NDArray:
         for j in range(i + 1, base):
             if angle(rays[i], rays[j]) < min_side_rad:
                 continue
+            # The first triangle in the order of brightness whose sides are long enough.
             for k in range(j + 1, base):
                 corners = np.array([i, j, k])
                 if _shortest_side(rays, corners) >= min_side_rad:
@@ -293,9 +327,18 @@ def triplets(
     options: FialhoOptions,
     tried: NDArray,
 ) -> DirectMatch:
-    """Test every triplet of candidates that fits an observed triangle by direct match, until one is accepted."""
+    """Test every triplet of candidates that fits an observed triangle by direct match, until one is accepted.
+
+    Parameters
+    ----------
+    corners
+        (3,) rows of the observed stars
+    tried
+        (2,) triplets tested and angles compared so far, increased in place
+    """
     i, j, k = corners
     sides = np.array([angle(rays[i], rays[j]), angle(rays[i], rays[k]), angle(rays[j], rays[k])])
+    # The index holds no longer pairs.
     if sides.max() > index.max_angle_rad:
         return no_match()
     tolerance = sqrt(2.0) * options.tolerance_rad + options.stretch * sides
@@ -313,8 +356,9 @@ def _direct_match(
     options: FialhoOptions,
     tried: int,
 ) -> DirectMatch:
-    """The second step: the direct match of one triplet; empty if too few stars match or it is not significant."""
+    """Step 4: the direct match of one triplet; empty if too few stars match or it is not significant."""
     match = match_field(rays, index, corners, stars, options.tolerance_rad, options.stretch, tried)
+    # The paper's threshold on the number of matches, and the added one on their significance.
     if (
         len(match.observed) <= options.min_fraction * len(rays)
         or match.log10_chance > ACCEPT_LOG10_CHANCE
@@ -325,10 +369,9 @@ def _direct_match(
 
 @jit
 def _candidate(index: PairIndex, star: int, magnitude: float, options: FialhoOptions) -> bool:
-    """Whether a star is within the magnitude gate and near enough to the prior boresight."""
-    if (
-        abs(index.magnitude[star] - magnitude) > options.gate_mag
-    ):  # False for NaN: an unknown magnitude passes
+    """Step 2: whether a star is within the magnitude gate and near enough to the prior boresight."""
+    # The comparison is False for NaN: an unknown magnitude passes.
+    if abs(index.magnitude[star] - magnitude) > options.gate_mag:
         return False
     x, y, z = index.vectors[star]
     return (x - options.x) ** 2 + (y - options.y) ** 2 + (z - options.z) ** 2 <= options.chord2
@@ -345,9 +388,9 @@ def _test_neighbors(
     options: FialhoOptions,
     tried: NDArray,
 ) -> DirectMatch:
-    """The optimized assembly: the first list is a range of the sorted catalog, the others its stars' neighbors."""
-    # For each candidate a of the first star: collect candidates b of the second at the angle of side 0, then test each
-    # candidate c of the third at the angle of side 1 against all of them.
+    """Steps 2 and 3, optimized: the first list is a range of the sorted catalog, the others are its neighbors."""
+    # 2. and 3. For each candidate a of the first star: collect candidates b of the second at the angle of side 0, then
+    # test each candidate c of the third at the angle of side 1 against all of them.
     handedness = triple(rays[corners[0]], rays[corners[1]], rays[corners[2]])
     second = np.empty(len(index.vectors), np.int64)
     begin, end = magnitude_range(index, magnitudes[corners[0]], options.gate_mag)
@@ -357,28 +400,29 @@ def _test_neighbors(
         tried[1] += 1
         if not _candidate(index, a, magnitudes[corners[0]], options):
             continue
+        # Candidates b at the angle of side 0 from a.
         count = 0
-        place = first_neighbor(index, a, sides[0] - tolerance[0])
-        while place < index.first[a + 1] and index.separation_rad[place] <= sides[0] + tolerance[0]:
-            if _candidate(index, index.neighbor[place], magnitudes[corners[1]], options):
-                second[count] = index.neighbor[place]
+        low, high = neighbor_range(index, a, sides[0] - tolerance[0], sides[0] + tolerance[0])
+        tried[1] += high - low
+        for b in index.neighbor[low:high]:
+            if _candidate(index, b, magnitudes[corners[1]], options):
+                second[count] = b
                 count += 1
-            place += 1
-            tried[1] += 1
+        # Candidates c at the angle of side 1 from a.
         if count == 0:
             continue
-        place = first_neighbor(index, a, sides[1] - tolerance[1])
-        while place < index.first[a + 1] and index.separation_rad[place] <= sides[1] + tolerance[1]:
-            c = index.neighbor[place]
-            place += 1
+        low, high = neighbor_range(index, a, sides[1] - tolerance[1], sides[1] + tolerance[1])
+        for c in index.neighbor[low:high]:
             tried[1] += count
             if not _candidate(index, c, magnitudes[corners[2]], options):
                 continue
+            # Side 2, and the handedness.
             for b in second[:count]:
                 if abs(angle(index.vectors[b], index.vectors[c]) - sides[2]) > tolerance[2]:
                     continue
                 if handedness * triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
                     continue
+                # 4. The direct match.
                 tried[0] += 1
                 match = _direct_match(rays, index, corners, np.array([a, b, c]), options, tried[0])
                 if match.log10_chance <= ACCEPT_LOG10_CHANCE:
@@ -409,12 +453,14 @@ def _test_lists(
     options: FialhoOptions,
     tried: NDArray,
 ) -> DirectMatch:
-    """The basic assembly: three lists, each from the whole catalog, and every triplet of them."""
+    """Steps 2 and 3, basic: three lists, each from the whole catalog, and every triplet of them."""
+    # 2. The three lists.
     first = _all_candidates(index, magnitudes[corners[0]], options)
     second = _all_candidates(index, magnitudes[corners[1]], options)
     third = _all_candidates(index, magnitudes[corners[2]], options)
     handedness = triple(rays[corners[0]], rays[corners[1]], rays[corners[2]])
     vectors = index.vectors
+    # 3. Every triplet with the three sides and the handedness.
     for a in first:
         if tried[1] >= options.checks:
             break
@@ -430,6 +476,7 @@ def _test_lists(
                     continue
                 if handedness * triple(vectors[a], vectors[b], vectors[c]) <= 0:
                     continue
+                # 4. The direct match.
                 tried[0] += 1
                 match = _direct_match(rays, index, corners, np.array([a, b, c]), options, tried[0])
                 if match.log10_chance <= ACCEPT_LOG10_CHANCE:

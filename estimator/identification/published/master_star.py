@@ -1,10 +1,16 @@
-"""NPS TAS-2's identifier: the angles of a master star to all others, and the catalog star with most of them.
+"""NPS TAS-2's identifier: the angles of a master star to all others, and the catalog star that has most of them.
 
 Tappe 2009, cited by Padro 2012, sections 2.7.2 and 3.2: "star separation angles were measured only with respect to the
 brightest star in the image, or the 'master star'", and "star matches were made based solely on the most commonly
 reoccurring angle matches associated with the master stars from the cataloged and tracked images", within 500 arcsec,
 of nine stars. This test alone cannot distinguish a pattern from its mirror image, or a true match from a chance one.
-Here the ambiguities of the angles are resolved with an attitude (direct match), and the match must be significant.
+Steps 3 and 4 are therefore added:
+
+1. Take the brightest star as the master. Candidates are the catalog stars of its brightness (`search`).
+2. Count how many of the master's angles each candidate has (`_count_angles`).
+3. Test the candidates with as many as the best one, or one less: the angle to a second star determines an attitude,
+   at which the whole field is matched (`_best_match`).
+4. Accept the best match if it is significant, and no contradicting match is nearly as good, as on a lattice.
 """
 
 from __future__ import annotations
@@ -15,8 +21,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.pair_index import PairIndex, first_neighbor, magnitude_range
-from estimator.core.checks import Floats, ImageError
+from estimator.catalog.pair_index import PairIndex, magnitude_range, neighbor_range
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
@@ -31,7 +37,19 @@ from estimator.identification.solver_options import Options
 
 
 class MasterStarOptions(NamedTuple):
-    """Search parameters: tolerances as in `Options`, magnitude gate, number of masters, limit of angles compared."""
+    """Search parameters.
+
+    Attributes
+    ----------
+    tolerance_rad, stretch
+        Tolerance of a direction, and relative tolerance of an angle (see `Options`)
+    gate_mag
+        Greatest difference of the magnitudes of the master and a candidate
+    masters
+        Number of brightest stars to try as master
+    checks
+        Greatest number of angles compared
+    """
 
     tolerance_rad: float
     stretch: float
@@ -43,29 +61,35 @@ class MasterStarOptions(NamedTuple):
 def master_star(
     vectors_cam: Floats, index: PairIndex, tolerance_rad: float, masters: int = 1, **options: Any
 ) -> StarMatch | None:
-    """NPS's master-star method: find the catalog star that has most of the brightest star's angles to the others.
-
-    The candidates are ranked by how many of the observed angles they have. Each candidate with as many as the best, or
-    one less, is tested by direct match: its angle to a second star determines an attitude. Returns None if the match
-    is not significant, or if a contradicting match is nearly as good, as on a lattice.
+    """Identify stars by NPS's master-star method (see the module's steps).
 
     Parameters
     ----------
     vectors_cam
         (N, 3) observed unit vectors, brightest first
+    index
+        Catalog of the stars and pairs
     tolerance_rad
-        Of a direction
+        Tolerance of a direction
     masters
-        Number of brightest stars to try as master. NPS's single master fails if it is false or
-        not in the catalog, or if another star is as bright (the thesis's criticism)
+        Number of brightest stars to try as master. NPS's single master fails if it is false or not in the catalog,
+        or if another star is as bright (the thesis's criticism)
     options
-        Those of `Options`; with magnitudes, candidates are within the magnitude gate of the
-        master
+        Keywords of `Options`; with magnitudes, candidates are within the magnitude gate of the master
+
+    Returns
+    -------
+    StarMatch | None
+        None if the match is not significant, or if a contradicting match is nearly as good
+
+    Raises
+    ------
+    ImageError
+        Unless the tolerance is positive.
     """
     settings = Options(**options)
     settings.require_known_focal("master_star")
-    if not tolerance_rad > 0:
-        raise ImageError(f"master_star: tolerance {tolerance_rad} rad; allowed: more than 0")
+    settings.require_tolerance("master_star", tolerance_rad)
     count = len(vectors_cam)
     if count < MIN_MATCHES:
         return None
@@ -84,10 +108,23 @@ def master_star(
 def search(
     rays: Floats, magnitudes: Floats, index: PairIndex, options: MasterStarOptions
 ) -> DirectMatch:
-    """Compiled search: rows of the observed stars and of the catalog, R_cam_from_ref, log10 of the chance."""
+    """The compiled search: steps 1 to 4.
+
+    Parameters
+    ----------
+    rays, magnitudes
+        (N, 3) unit vectors, brightest first, and their (N,) magnitudes, NaN if unknown
+
+    Returns
+    -------
+    DirectMatch
+        Empty if no match is accepted
+    """
     tried = np.zeros(2, np.int64)  # assumed pairs, angles compared
     for master in range(options.masters):
+        # 1. Candidates of the master's brightness.
         begin, end = magnitude_range(index, magnitudes[master], options.gate_mag)
+        # 2. The number of the master's angles that each of them has.
         angle_counts = np.zeros(end - begin, np.int64)
         for candidate in range(begin, end):
             angle_counts[candidate - begin] = _count_angles(
@@ -95,6 +132,7 @@ def search(
             )
         if len(angle_counts) == 0 or angle_counts.max() < MIN_MATCHES - 1:
             continue
+        # 3. Test the best candidates by direct match.
         best = no_match()
         rival = np.zeros(1)
         # One angle less than the best is allowed: a false candidate can have an additional angle by chance.
@@ -103,7 +141,7 @@ def search(
             if tried[1] >= options.checks:
                 break
         if best.log10_chance <= ACCEPT_LOG10_CHANCE:
-            # A repetitive pattern has another match as good. The best must be 1e5 times less likely by chance.
+            # 4. A repetitive pattern has another match as good: the best must be 1e5 times less likely by chance.
             return best if rival[0] > best.log10_chance - ACCEPT_LOG10_CHANCE else no_match()
     return no_match()
 
@@ -134,11 +172,10 @@ def _count_angles(
             continue
         side = angle(rays[master], rays[n])
         tolerance = sqrt(2.0) * options.tolerance_rad + options.stretch * side
-        place = first_neighbor(index, candidate, side - tolerance)
+        # Catalog stars at this angle from the candidate; one is enough.
+        begin, end = neighbor_range(index, candidate, side - tolerance, side + tolerance)
         tried[1] += 1
-        count += (
-            place < index.first[candidate + 1] and index.separation_rad[place] <= side + tolerance
-        )
+        count += end > begin
     return count
 
 
@@ -153,27 +190,37 @@ def _best_match(
     best: DirectMatch,
     rival: Floats,
 ) -> DirectMatch:
-    """The better of `best` and the direct matches at the attitudes from the master and a second star.
+    """The better of `best` and the direct matches at the attitudes from the master and a second star: step 3.
 
-    The second star is the farthest from the master, for its leverage, and each of the next three, in case it is false
-    or not in the catalog. rival : (1,) least chance of a match that contradicts the best, updated in place.
+    The second star is the farthest from the master, for its leverage, and each of the next three, in case it is
+    false or not in the catalog.
+
+    Parameters
+    ----------
+    master, candidate
+        Row of the observed star and of the catalog star
+    tried
+        (2,) assumed pairs and angles compared so far, increased in place
+    best
+        Best match so far
+    rival
+        (1,) least chance of a match that contradicts the best, updated in place
     """
     sides = np.array([angle(rays[master], rays[n]) for n in range(len(rays))])
+    # Stars at the angle of the second star from the candidate.
     for n in np.argsort(-sides)[: min(4, len(rays) - 1)]:
         tolerance = sqrt(2.0) * options.tolerance_rad + options.stretch * sides[n]
-        place = first_neighbor(index, candidate, sides[n] - tolerance)
-        while (
-            place < index.first[candidate + 1]
-            and index.separation_rad[place] <= sides[n] + tolerance
-        ):
-            stars = np.array([candidate, index.neighbor[place]], np.int64)
-            place += 1
+        begin, end = neighbor_range(index, candidate, sides[n] - tolerance, sides[n] + tolerance)
+        for second in index.neighbor[begin:end]:
+            stars = np.array([candidate, second], np.int64)
             tried[0] += 1
             tried[1] += len(rays)
+            # The attitude of the master and the second star, matched to the whole field.
             pair = np.array([master, n])
             match = match_field(
                 rays, index, pair, stars, options.tolerance_rad, options.stretch, tried[0]
             )
+            # The worse of two matches that contradict each other is a rival.
             if len(match.observed) and _contradict(best, match):
                 rival[0] = min(rival[0], max(best.log10_chance, match.log10_chance))
             if match.log10_chance < best.log10_chance:

@@ -1,8 +1,12 @@
 """Pyramid star identification (Mortari, Samaan & Junkins 2001), verified by the direct match of the whole field.
 
-A triangle of observed stars is compared with catalog triangles through the k-vector index. A fourth star whose angles
-to all three corners fit makes a pyramid; the direct match then tests its attitude on all stars. With an uncertain
-focal length each triangle also estimates it, from the ratio of the catalog's to the observed perimeter.
+1. Take a triangle of observed stars, in an order that changes all three stars soon (`_search`).
+2. Find the catalog triangles with the same sides, by the k-vector and the neighbor lists (`_triangle`).
+3. Reject those of the other handedness. With an uncertain focal length, each triangle also estimates it, from the ratio
+   of the catalog's to the observed perimeter; the three sides must agree on it.
+4. Find a fourth star whose angles to all three corners fit: a pyramid (`_pyramid`).
+5. Test the attitude on all stars by the direct match, with a penalty for missing stars (`_match_with_penalty`).
+6. Accept the first match with fewer than 1e-5 chance matches expected over all hypotheses tried.
 """
 
 from __future__ import annotations
@@ -13,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.pair_index import PairIndex, first_neighbor, pair_range
-from estimator.core.checks import Floats, ImageError
+from estimator.catalog.pair_index import PairIndex, neighbor_range, pair_range
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
@@ -34,8 +38,10 @@ class PyramidOptions(NamedTuple):
 
     Attributes
     ----------
-    tolerance, stretch, focal_unknown, triangles, checks, base, missed_dex
-        As in `Options`
+    tolerance
+        Tolerance of a direction, rad
+    stretch, focal_unknown, triangles, checks, base, missed_dex
+        See `Options`
     left, right, top, bottom
         Tangents of the sensor's edges from the boresight
     """
@@ -56,25 +62,34 @@ class PyramidOptions(NamedTuple):
 def pyramid(
     vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
 ) -> StarMatch | None:
-    """Pyramid (Mortari, Samaan & Junkins 2001): a triangle, a fourth star, then the whole field.
+    """Identify stars by pyramids (Mortari, Samaan & Junkins 2001): a triangle, a fourth star, then the whole field.
 
     The three catalog stars are from different groups of the index (patch boards). Observed triangles are tried in the
-    paper's `smart` order, which changes all three stars soon, so that one false star costs little. A pyramid is only a
-    hypothesis: its attitude must match so many observed stars that, over all hypotheses tried, less than 1e-5 matches
-    this good are expected by chance. Otherwise returns None. Raises ImageError unless the tolerance is positive.
+    paper's `smart` order, so that one false star costs little.
 
     Parameters
     ----------
     vectors_cam
         (N, 3) observed unit vectors, brightest first
+    index
+        Catalog of the stars and pairs
     tolerance_rad
-        Of a direction; that of an angle is sqrt(2) times it, plus `stretch` times the angle
+        Tolerance of a direction; that of an angle is sqrt(2) times it, plus `stretch` times the angle
     options
-        Those of `Options`; magnitudes are not used
+        Keywords of `Options`; magnitudes are not used
+
+    Returns
+    -------
+    StarMatch | None
+        None if no match is significant
+
+    Raises
+    ------
+    ImageError
+        Unless the tolerance is positive.
     """
     settings = Options(**options)
-    if not tolerance_rad > 0:
-        raise ImageError(f"pyramid: tolerance {tolerance_rad} rad; allowed: more than 0")
+    settings.require_tolerance("pyramid", tolerance_rad)
     if len(vectors_cam) < MIN_MATCHES:
         return None
     parameters = PyramidOptions(
@@ -92,8 +107,9 @@ def pyramid(
 
 @jit
 def _search(rays: Floats, index: PairIndex, options: PyramidOptions) -> DirectMatch:
-    """Try the triangles (i, i + dj, i + dj + dk) in the smart order; return the first significant match."""
+    """Steps 1 to 6: try triangles (i, i + dj, i + dj + dk) in the smart order; return the first significant match."""
     tried = np.zeros(3, np.int64)  # observed triangles, hypotheses, checks
+    # 1. Close rows first: i runs fastest, so that successive triangles share few stars.
     for dj in range(1, options.base - 1):
         for dk in range(1, options.base - dj):
             for i in range(options.base - dj - dk):
@@ -111,18 +127,32 @@ def _search(rays: Floats, index: PairIndex, options: PyramidOptions) -> DirectMa
 def _triangle(
     rays: Floats, index: PairIndex, corners: NDArray, options: PyramidOptions, tried: NDArray
 ) -> DirectMatch:
-    """Test every catalog triangle that fits an observed one in its sides and its handedness; needs a fourth star."""
+    """Steps 2 to 5: test every catalog triangle that fits an observed one in its sides and its handedness.
+
+    Parameters
+    ----------
+    corners
+        (3,) rows of the observed stars
+    tried
+        (3,) observed triangles, hypotheses and checks so far, increased in place
+
+    Returns
+    -------
+    DirectMatch
+        The first significant one, or else the empty one
+    """
     i, j, k = corners
     ij = angle(rays[i], rays[j])
     ik = angle(rays[i], rays[k])
     jk = angle(rays[j], rays[k])
     t_ij, t_ik, t_jk = sqrt(2.0) * options.tolerance + options.stretch * np.array([ij, ik, jk])
+    # Short sides carry little information, and the index holds no longer pairs.
     if min(ij, ik, jk) < 4 * t_ij or max(ij, ik, jk) > index.max_angle_rad:
         return no_match()
     # If the three sides agree on one focal length, only the lens distortion remains of the stretch.
     residual_stretch = options.stretch / 3 if options.focal_unknown else options.stretch
     handedness = triple(rays[i], rays[j], rays[k])
-    # Catalog pairs (a, b) for side ij, in both orders; then neighbors c of a for side ik; then side jk is tested.
+    # 2. Catalog pairs (a, b) for side ij, in both orders; then neighbors c of a for side ik; then side jk is tested.
     begin, end = pair_range(index, ij - t_ij, ij + t_ij)
     for p in range(begin, end):
         if tried[2] >= options.checks:
@@ -133,17 +163,17 @@ def _triangle(
         for flip in range(2):
             a = index.pair[p, flip]
             b = index.pair[p, 1 - flip]
-            place = first_neighbor(index, a, ik - t_ik)
-            while place < index.first[a + 1] and index.separation_rad[place] <= ik + t_ik:
+            first, last = neighbor_range(index, a, ik - t_ik, ik + t_ik)
+            for place in range(first, last):
                 c = index.neighbor[place]
                 side_ac = index.separation_rad[place]
-                place += 1
                 tried[2] += 1
                 if index.group[c] == index.group[a] or index.group[c] == index.group[b]:
                     continue
                 side_bc = angle(index.vectors[b], index.vectors[c])
                 if abs(side_bc - jk) > t_jk:
                     continue
+                # 3. The mirror image has the same sides.
                 if handedness * triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
                     continue
                 # One factor for all three sides: the assumed over the true focal length.
@@ -157,6 +187,7 @@ def _triangle(
                 )
                 if misfit > sqrt(2.0) * options.tolerance:
                     continue
+                # 4. and 5. Find a fourth star, and test the whole field.
                 tried[1] += 1
                 scaled = _scale_tangents(rays, tangent_scale) if options.focal_unknown else rays
                 match = _pyramid(
@@ -177,19 +208,26 @@ def _pyramid(
     stretch: float,
     tried: NDArray,
 ) -> DirectMatch:
-    """Find a fourth star that fits a triangle; if there is one, return the direct match."""
+    """Steps 4 and 5: find a fourth star that fits a triangle; if there is one, return the direct match.
+
+    Parameters
+    ----------
+    corners, stars
+        (3,) rows of the observed and of the catalog triangle
+    stretch
+        Relative tolerance of an angle that remains
+    """
     for r in range(options.base):
         tried[2] += 1
+        # The fourth star is none of the corners.
         if r == corners[0] or r == corners[1] or r == corners[2]:
             continue
+        # Catalog stars d at the angle of r from the first corner.
         reach = angle(rays[corners[0]], rays[r])
         tolerance = sqrt(2.0) * options.tolerance + stretch * reach
-        place = first_neighbor(index, stars[0], reach - tolerance)
-        while (
-            place < index.first[stars[0] + 1] and index.separation_rad[place] <= reach + tolerance
-        ):
-            d = index.neighbor[place]
-            place += 1
+        begin, end = neighbor_range(index, stars[0], reach - tolerance, reach + tolerance)
+        for d in index.neighbor[begin:end]:
+            # The angles to the two other corners.
             fits = True
             for corner in range(1, 3):
                 side = angle(rays[corners[corner]], rays[r])
@@ -203,9 +241,10 @@ def _pyramid(
 
 @jit
 def _scale_tangents(rays: Floats, factor: float) -> Floats:
-    """The directions with their tangents multiplied by a factor, by which the focal length is then shorter."""
+    """The (N, 3) unit vectors with their tangents multiplied by a factor, as if the focal length were shorter by it."""
     out = np.empty_like(rays)
     for n in range(len(rays)):
+        # Scale the tangents, then normalize.
         z = rays[n, 2]
         x = rays[n, 0] / z * factor
         y = rays[n, 1] / z * factor
@@ -226,10 +265,11 @@ def _match_with_penalty(
     stretch: float,
     hypotheses: int,
 ) -> DirectMatch:
-    """The direct match of the whole field, with a penalty of missed_dex for each catalog star that is missing."""
+    """Step 5: the direct match of the whole field, with a penalty of missed_dex for each missing catalog star."""
     match = match_field(rays, index, corners, stars, options.tolerance, stretch, hypotheses)
     if len(match.observed) == 0 or options.missed_dex <= 0:
         return match
+    # Catalog stars that the attitude puts into the field and that are not matched.
     missing = max(
         _count_in_field(index, stars[0], match.R_cam_from_ref, options) - len(match.observed), 0
     )
@@ -241,11 +281,18 @@ def _match_with_penalty(
 def _count_in_field(
     index: PairIndex, center: int, R_cam_from_ref: Floats, options: PyramidOptions
 ) -> int:
-    """Number of catalog stars in the field at an attitude; `center` is a star whose neighbors are tested."""
+    """Number of catalog stars in the field at an attitude.
+
+    Parameters
+    ----------
+    center
+        Row of a star in the field; itself and its neighbors are tested
+    """
     count = 0
     begin = index.first[center]
     end = index.first[center + 1]
     for place in range(begin - 1, end):
+        # The star itself, then its neighbors.
         s = center if place < begin else index.neighbor[place]
         x, y, z = R_cam_from_ref @ index.vectors[s]
         inside = (

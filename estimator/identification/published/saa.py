@@ -1,9 +1,21 @@
 """Stellar Attitude Acquisition, the angle method of Boeing and of AFIT's thesis: a pair, then a direct match.
 
-Needelman, Li & Wu 2005, cited by Padro 2012, sections 2.4.2 to 2.4.5 and 3.6.4. A primary pair of observed stars is
-assumed to be each catalog pair of the same angle; each assumption gives an attitude, at which all other stars are
-matched, and a cost in squared standard deviations. The assumption of the least cost is accepted if its match is
-significant and no contradicting assumption is nearly as good. `saa_search` has the compiled steps.
+Needelman, Li & Wu 2005, cited by Padro 2012, sections 2.4.2 to 2.4.5 and 3.6.4. An assumption says that the two stars
+of an observed pair are a certain catalog pair, in a certain order. The steps are those of section 2.4.2:
+
+2. Take a primary pair A, B of observed stars, the brightest first (`_primary_pairs`).
+3. Look up the catalog pairs of the same angle: the primary pair candidates (`_test_pairs`).
+4. Assume that A, B are such a pair, if the magnitudes agree (`match_assumptions`).
+5. The assumption determines an attitude (`triad`), which predicts the place of every other observed star.
+6. Direct match (`_partners`): of the catalog stars within the gates of magnitude, place and the two angles to A and B,
+   the one of least squared deviations is the partner of an observed star. The cost of the assumption is the sum of the
+   squared deviations, with UNMATCHED_COST for a star without a partner.
+7. Repeat steps 4 to 6 with the pair in the other order, then with the next catalog pair.
+8. Repeat steps 3 to 7 with the next primary pair.
+
+The thesis stops at the first assumption that passes. Here the assumption of least cost is accepted, if it is
+significant, and 1e5 times as likely as any contradicting assumption of this and of RIVAL_PAIRS more pairs
+(`AssumptionPool`).
 """
 
 from __future__ import annotations
@@ -17,6 +29,7 @@ from numpy.typing import NDArray
 from estimator.attitude.solvers import quest
 from estimator.catalog.pair_index import PairCatalog, PairIndex, candidates, pair_range
 from estimator.catalog.sky_index import Cells, within
+from estimator.core import vectors
 from estimator.core.checks import Floats, ImageError, Ints
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
@@ -24,13 +37,13 @@ from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, lo
 from estimator.identification.direct_match import angle
 from estimator.identification.solver_options import Options
 
-# SAA's steps 3 to 7, compiled: every assumption of a primary pair, and the direct match of each.
-# See `saa`.
-
-
 # Cost of an observed star without a partner, in squared standard deviations; a bad partner costs no more. 16 is four
 # standard deviations: it corresponds to a probability of one in three thousand that a star has no partner.
 UNMATCHED_COST = 16.0
+# Further pairs whose assumptions the best one must beat. If half of the pairs are of true stars, the true assumption is
+# missed by all ten with probability 1e-3.
+RIVAL_PAIRS = 10
+MAX_ASSUMPTIONS = 100_000  # 16 MB of matches at 40 observed stars
 
 
 class Gates(NamedTuple):
@@ -38,8 +51,10 @@ class Gates(NamedTuple):
 
     Attributes
     ----------
+    separation_rad, position_rad, magnitude
+        Standard deviations
     stretch
-        Stretch * angle is added to the gate of an angle
+        Relative tolerance of an angle: stretch * angle is added to its gate
     """
 
     separation_rad: float
@@ -54,11 +69,13 @@ class SearchInput(NamedTuple):
     Attributes
     ----------
     vectors_cam, vectors
-        (N, 3) observed unit vectors, camera axes;  (M, 3) of the catalog, reference axes
+        (N, 3) unit vectors of the observed stars in camera axes, and (M, 3) of the catalog in the reference frame
     magnitude_cam, magnitude
-        (N,), (M,) their magnitudes, NaN if unknown
+        (N,) and (M,) magnitudes, NaN if unknown
     cells
         Spatial grid of the catalog's directions
+    gates
+        Tolerances
     """
 
     vectors_cam: Floats
@@ -74,16 +91,18 @@ class Primary(NamedTuple):
 
     Attributes
     ----------
-    rows, triad
-        (2,) rows of the observed stars;  (3, 3) see `triad`
+    rows
+        (2,) rows of A and B
+    triad
+        (3, 3) axes of A and B in camera axes (see `triad`)
     midpoint
-        (3,) unit vector halfway
+        (3,) unit vector halfway between A and B
     others
-        (X,) rows
+        (X,) rows of the other stars
     corner_rad, gate_rad
-        (2, X) their angles from A and from B, and the gates of these
+        (2, X) their angles from A and from B, and the gates of these angles
     sigma_rad, radius_rad
-        (X,) standard deviation of the predicted position and its gate
+        (X,) standard deviation of the predicted place, and its gate
     area_sr
         (X,) area inside all gates
     reach_rad
@@ -110,15 +129,16 @@ def gate_rad(gates: Gates, angle_rad: float) -> float:
 
 @jit
 def triad(a: Floats, b: Floats) -> Floats:
-    """Rows: unit vectors along a + b, a - b and their cross product.
+    """Axes of two unit vectors, in rows: along a + b, a - b and their cross product.
 
-    The rotation that maps one pair's triad to another's is Wahba's solution for two stars of equal weight."""
+    The rotation that maps one pair's axes to another's is the solution of Wahba's problem for two stars of equal
+    weight.
+    """
     rows = np.empty((3, 3))
     rows[0] = a + b
     rows[1] = a - b
-    rows[2, 0] = b[1] * a[2] - b[2] * a[1]
-    rows[2, 1] = b[2] * a[0] - b[0] * a[2]
-    rows[2, 2] = b[0] * a[1] - b[1] * a[0]
+    rows[2] = np.cross(b, a)
+    # Normalize.
     for n in range(3):
         rows[n] /= np.sqrt(rows[n, 0] ** 2 + rows[n, 1] ** 2 + rows[n, 2] ** 2)
     return rows
@@ -126,11 +146,16 @@ def triad(a: Floats, b: Floats) -> Floats:
 
 @jit
 def build_primary(stars: SearchInput, row_a: int, row_b: int) -> Primary:
-    """The geometry that the direct match needs of an observed pair; it is the same for all its assumptions.
+    """The geometry of an observed pair that the direct match needs; it is the same for all assumptions of the pair.
 
-    The thesis's position gate is 3 epsilon_position everywhere. Needelman's epsilon_position(S) includes the error of
-    the pair's attitude: with noise sigma, a pair of separation b rotates by sqrt(2) sigma / b and shifts by
-    sigma / sqrt(2). At distance d from its middle the variance is sigma^2 (1 + 1/2 + 2 d^2 / b^2), which is used here.
+    The thesis's position gate is 3 epsilon_position everywhere. Needelman's epsilon_position(S) includes the error
+    of the pair's attitude. With the noise s, a pair of separation b rotates by sqrt(2) s / b and shifts by s /
+    sqrt(2). At the distance d from its middle the variance is s^2 (1 + 1/2 + 2 d^2 / b^2), which is used here.
+
+    Parameters
+    ----------
+    row_a, row_b
+        Rows of the observed stars A and B
     """
     gates = stars.gates
     vectors_cam = stars.vectors_cam
@@ -153,11 +178,13 @@ def build_primary(stars: SearchInput, row_a: int, row_b: int) -> Primary:
         reach_rad = max(reach_rad, from_midpoint_rad)
         if n in (row_a, row_b):
             continue
+        # The angles to A and B, and their gates.
         others[k] = n
         corner[0, k] = angle(x, a)
         corner[1, k] = angle(x, b)
         gate[0, k] = gate_rad(gates, corner[0, k])
         gate[1, k] = gate_rad(gates, corner[1, k])
+        # The predicted place, and its gate.
         sigma[k] = gates.position_rad * np.sqrt(1.5 + 2 * (from_midpoint_rad / base_rad) ** 2)
         radius[k] = 3 * sigma[k] + gates.stretch * from_midpoint_rad
         # The rings about A and B, of the gates' widths, cross at X in a rhombus; its angle is that of A and B seen
@@ -176,7 +203,7 @@ def build_primary(stars: SearchInput, row_a: int, row_b: int) -> Primary:
 
 @jit
 def magnitude_cost(stars: SearchInput, observed: int, star: int) -> float:
-    """Squared deviation of a magnitude in standard deviations, inf beyond three; 0 if it is unknown."""
+    """Squared deviation of a magnitude in standard deviations, inf beyond three; 0 if a magnitude is unknown."""
     deviation = (stars.magnitude_cam[observed] - stars.magnitude[star]) / stars.gates.magnitude
     if np.isnan(deviation):
         return 0.0
@@ -187,10 +214,22 @@ def magnitude_cost(stars: SearchInput, observed: int, star: int) -> float:
 def match_assumptions(
     stars: SearchInput, primary: Primary, pairs: NDArray
 ) -> tuple[NDArray, Floats, Ints]:
-    """Steps 3 to 7: every assumption from the catalog's (K, 2) pairs, in both orders.
+    """Steps 4 to 7: every assumption from the catalog's pairs, in both orders.
 
-    Returns for each assumption (N,) catalog rows of the observed stars (-1: none), the cost, and the number of matches
-    beside the pair. Pairs outside the gate, at the ends of a bucket or of a k-vector step, are skipped.
+    Parameters
+    ----------
+    pairs
+        (P, 2) rows of the primary pair candidates; those outside of the gate, at the ends of a bucket or of a k-vector
+        step, are skipped
+
+    Returns
+    -------
+    star
+        (K, N) catalog rows of the observed stars in each assumption, -1 for none
+    cost
+        (K,) costs in squared standard deviations
+    matches
+        (K,) numbers of matches beside the pair
     """
     a, b = primary.rows
     separation_rad = angle(stars.vectors_cam[a], stars.vectors_cam[b])
@@ -203,9 +242,11 @@ def match_assumptions(
     partner = np.empty(len(primary.others), np.int64)
     partner_cost = np.empty(len(primary.others))
     for p in range(len(pairs)):
+        # Skip pairs outside of the gate, which whole buckets include.
         misfit = abs(angle(stars.vectors[pairs[p, 0]], stars.vectors[pairs[p, 1]]) - separation_rad)
         if misfit > gate:
             continue
+        # 4. Assume the pair in this order; 7. then in the other one.
         for flip in range(2):
             first = pairs[p, flip]
             second = pairs[p, 1 - flip]
@@ -216,7 +257,9 @@ def match_assumptions(
             star[count] = -1
             star[count, a] = first
             star[count, b] = second
+            # The cost of the pair: its angle and its two magnitudes.
             total = (misfit / stars.gates.separation_rad) ** 2 + cost_a + cost_b
+            # 5. and 6. The attitude and the direct match; then the cost.
             _partners(stars, primary, first, second, nearby, partner, partner_cost)
             matches[count] = _remove_duplicates(partner, partner_cost)
             for k in range(len(partner)):
@@ -237,25 +280,27 @@ def _partners(
     partner: NDArray,
     partner_cost: Floats,
 ) -> None:
-    """Steps 5 and 6: the pair's attitude, and for each other star its partner (-1: none) and its cost, in place.
+    """Steps 5 and 6: the pair's attitude, and the partner of each other star.
 
-    Section 2.4.5's four conditions: magnitude, position, and the angles to A and to B. The position distinguishes a
-    star from its mirror image about the line A B, which the two angles cannot.
+    Section 2.4.5 has four conditions: magnitude, position, and the angles to A and to B. The position distinguishes
+    a star from its mirror image about the line A B, which the two angles cannot.
+
+    Parameters
+    ----------
+    first, second
+        Catalog rows of A and B
+    nearby
+        (M,) buffer for the rows of nearby stars
+    partner, partner_cost
+        (X,) row of each other star's partner (-1: none) and its cost, written in place
     """
+    # 5. R_ref_from_cam maps the axes of the observed pair to those of the catalog pair.
     triad_ref = triad(stars.vectors[first], stars.vectors[second])
-    R = np.empty((3, 3))  # R_ref_from_cam
-    for i in range(3):
-        for j in range(3):
-            R[i, j] = (
-                triad_ref[0, i] * primary.triad[0, j]
-                + triad_ref[1, i] * primary.triad[1, j]
-                + triad_ref[2, i] * primary.triad[2, j]
-            )
+    R_ref_from_cam = np.empty((3, 3))
+    vectors.multiply_transposed(triad_ref.T, primary.triad.T, R_ref_from_cam)
+    # 6. Catalog stars near the predicted place.
     for k in range(len(primary.others)):
-        u, v, w = stars.vectors_cam[primary.others[k]]
-        x = R[0, 0] * u + R[0, 1] * v + R[0, 2] * w
-        y = R[1, 0] * u + R[1, 1] * v + R[1, 2] * w
-        z = R[2, 0] * u + R[2, 1] * v + R[2, 2] * w
+        x, y, z = vectors.rotate(R_ref_from_cam, vectors.row(stars.vectors_cam, primary.others[k]))
         chord = 2 * np.sin(min(primary.radius_rad[k], np.pi) / 2)
         partner[k] = -1
         partner_cost[k] = UNMATCHED_COST
@@ -264,6 +309,7 @@ def _partners(
             if s in (first, second):
                 continue
             cost = magnitude_cost(stars, primary.others[k], s)
+            # The angles to A and B.
             misfit_a = abs(primary.corner_rad[0, k] - angle(stars.vectors[s], stars.vectors[first]))
             misfit_b = abs(
                 primary.corner_rad[1, k] - angle(stars.vectors[s], stars.vectors[second])
@@ -284,12 +330,13 @@ def _partners(
 
 @jit
 def _remove_duplicates(partner: NDArray, partner_cost: Floats) -> int:
-    """If two observed stars have the same partner, the one of less cost keeps it; returns the number of matches."""
+    """Keep each catalog star for the observed star of least cost; return the number of matches."""
     count = 0
     for k in range(len(partner)):
         if partner[k] < 0:
             continue
         count += 1
+        # An earlier observed star with the same partner: the one of greater cost loses it.
         for m in range(k):
             if partner[m] == partner[k]:
                 loser = k if partner_cost[m] <= partner_cost[k] else m
@@ -304,15 +351,20 @@ def _remove_duplicates(partner: NDArray, partner_cost: Floats) -> int:
 def add_contradictions(
     star: NDArray, cost: Floats, matches: NDArray, best: NDArray, contradictions: Floats
 ) -> None:
-    """Accumulate the assumptions that identify an observed star differently from the best one.
+    """Count the assumptions that identify an observed star differently from the best one.
 
     Parameters
     ----------
+    star, cost, matches
+        Assumptions, as from `match_assumptions`
+    best
+        (N,) catalog rows of the observed stars in the best assumption
     contradictions
         (3,) their number, the sum of their matches and their least cost, updated in place
     """
     for n in range(len(cost)):
         for m in range(len(best)):
+            # One star identified differently is enough.
             if star[n, m] >= 0 and best[m] >= 0 and star[n, m] != best[m]:
                 contradictions[0] += 1
                 contradictions[1] += matches[n]
@@ -320,21 +372,12 @@ def add_contradictions(
                 break
 
 
-# Further pairs whose assumptions the best one must beat. If half of the pairs are of true stars, the true assumption is
-# missed by all ten with probability 1e-3.
-RIVAL_PAIRS = 10
-MAX_ASSUMPTIONS = 100_000  # 16 MB of matches at 40 observed stars
-
-
 def saa(
     vectors_cam: Floats, index: PairIndex | PairCatalog, tolerance_rad: float, **options: Any
 ) -> StarMatch | None:
-    """SAA (Needelman, Li & Wu 2005; Padro 2012, 2.4.2): two bright stars, all pairs like them, all other stars.
+    """Identify stars by SAA (Needelman, Li & Wu 2005; Padro 2012, 2.4.2; see the module's steps).
 
-    Steps 2 to 8 of 2.4.2, except that the search does not stop at the first assumption that passes: with the
-    assumptions of ten more pairs, the best must be significant (1e-5), and 1e5 times as likely as the next one that
-    identifies a star differently. Otherwise returns None. A lattice of LEDs that is not in the catalog is sometimes
-    identified as one that is.
+    A lattice of LEDs that is not in the catalog is sometimes identified as one that is.
 
     Parameters
     ----------
@@ -343,25 +386,34 @@ def saa(
     index
         Pairs in buckets, or a k-vector index
     tolerance_rad
-        Of a direction, 3 epsilon_position
+        Tolerance of a direction, 3 epsilon_position
     options
-        Those of `Options`: magnitudes are used if the index has them too; epsilon_sep_rad is
-        sqrt(2) / 3 of the tolerance if None; max_triangles is the limit of observed pairs
+        Keywords of `Options`: magnitudes are used if the index has them too; epsilon_sep_rad is sqrt(2) / 3 of the
+        tolerance if None; max_triangles is the limit of observed pairs
+
+    Returns
+    -------
+    StarMatch | None
+        None if no assumption is significant and clearly better than those that contradict it
+
+    Raises
+    ------
+    ImageError
+        Unless the tolerances are positive.
     """
     settings = Options(**options)
     settings.require_known_focal("saa")
     count = len(vectors_cam)
     if count < MIN_MATCHES:
         return None
-    sep_rad = (
-        np.sqrt(2) / 3 * tolerance_rad
-        if settings.epsilon_sep_rad is None
-        else settings.epsilon_sep_rad
-    )
+    sep_rad = settings.epsilon_sep_rad
+    if sep_rad is None:
+        sep_rad = np.sqrt(2) / 3 * tolerance_rad
     if not min(sep_rad, tolerance_rad, settings.epsilon_mag) > 0:
         raise ImageError(
             f"saa: tolerance {tolerance_rad}, epsilons {sep_rad} and {settings.epsilon_mag}; allowed: more than 0"
         )
+    # The tolerance of a direction is three standard deviations.
     gates = Gates(float(sep_rad), tolerance_rad / 3, settings.epsilon_mag, settings.stretch)
     stars = SearchInput(
         np.ascontiguousarray(vectors_cam),
@@ -379,8 +431,18 @@ def saa(
 class AssumptionPool:
     """All assumptions tried, in the order of the pairs, and the best of them.
 
-    Each assumption has (N,) the catalog's row for each observed star (-1: none), its cost in squared standard
-    deviations, and the number of stars matched beside the pair.
+    Attributes
+    ----------
+    assumptions
+        The assumptions of each pair, as from `match_assumptions`
+    count
+        Number of assumptions
+    cost, star
+        Cost of the best one, and its (N,) catalog rows of the observed stars, -1 for none
+    p
+        Probability that an observed star finds a partner by chance, at the best attitude
+    missing
+        Number of catalog stars that the best attitude predicts and that are not matched
     """
 
     def __init__(
@@ -423,8 +485,10 @@ class AssumptionPool:
     def log10_chance(self) -> float:
         """log10 of the expected number of chance matches as good as the best one; 0 with too few matches.
 
-        On a lattice false assumptions match often; their match rate is measured on those that contradict the best.
+        On a lattice, false assumptions match often. The match rate of those that contradict the best one is
+        therefore measured, and the greater of it and of p counts.
         """
+        # The pair defines the attitude: the other stars are trials.
         trials = len(self.star) - 2
         hits = int((self.star >= 0).sum()) - 2
         if hits + 2 < MIN_MATCHES:
@@ -437,10 +501,12 @@ class AssumptionPool:
     def best_match(self) -> StarMatch | None:
         """The best assumption, or None if it is not significant or a contradicting one is nearly as likely."""
         chance = self.log10_chance
+        # A cost is -2 ln(likelihood): 1e5 times as likely is a cost smaller by 2 ln 1e5.
         margin = -2 * np.log(10) * ACCEPT_LOG10_CHANCE
         count, _, rival_cost = self._contradictions
         if chance > ACCEPT_LOG10_CHANCE or (count and rival_cost < self.cost + margin):
             return None
+        # The attitude of all matches.
         observed = np.flatnonzero(self.star >= 0)
         star = self.star[observed].astype(np.int64)
         cam_from_ref = quest(
@@ -450,21 +516,24 @@ class AssumptionPool:
 
 
 def _test_pairs(pool: AssumptionPool, index: PairIndex | PairCatalog, settings: Options) -> None:
-    """Add the assumptions of pair after pair, until the pool's best is significant and has beaten RIVAL_PAIRS more.
+    """Steps 2 to 8: add the assumptions of pair after pair to the pool.
 
-    One pair is not enough: if noise moves A or B out of a gate, the truth is not among its assumptions.
+    One pair is not enough: if noise moves A or B out of a gate, the truth is not among its assumptions. The search ends
+    when the best assumption is significant and has competed with RIVAL_PAIRS more pairs.
     """
     stars = pool.stars
     remaining = settings.max_triangles
     budget = min(settings.max_checks // len(stars.vectors_cam), MAX_ASSUMPTIONS)
     max_rad = index.max_rad if isinstance(index, PairCatalog) else index.max_angle_rad
     find_pairs = candidates if isinstance(index, PairCatalog) else pair_range
+    # 2. Primary pairs; 3. their candidates.
     for a, b, angle_rad in _primary_pairs(stars, settings.base_stars, max_rad):
         gate = gate_rad(stars.gates, angle_rad)
         begin, end = find_pairs(index, angle_rad - gate, angle_rad + gate)
         if remaining == 0 or pool.count + end - begin > budget:
             break
         remaining -= 1
+        # 4. to 7. Their assumptions.
         primary = build_primary(stars, a, b)
         pool.add(primary, match_assumptions(stars, primary, index.pair[begin:end]))
         # Once the best is significant, only RIVAL_PAIRS more pairs are tried.
@@ -475,14 +544,13 @@ def _test_pairs(pool: AssumptionPool, index: PairIndex | PairCatalog, settings: 
 def _primary_pairs(
     stars: SearchInput, base_stars: int, max_rad: float
 ) -> Iterator[tuple[int, int, float]]:
-    """Step 2: pairs of observed stars, the brightest first, far enough apart to determine the roll; and their angle."""
+    """Step 2: rows and angle of observed pairs, the brightest first, far enough apart to determine the roll."""
     base = min(base_stars, len(stars.vectors_cam))
     gates = stars.gates
     chord = np.linalg.norm(stars.vectors_cam[:base, None] - stars.vectors_cam[:base], axis=2)
     angles = 2 * np.arcsin(np.minimum(chord / 2, 1.0))
-    for rank_sum in range(
-        1, 2 * base - 2
-    ):  # sum of the two rows: the brightest pairs have the least
+    # The sum of the two rows is least for the brightest pair.
+    for rank_sum in range(1, 2 * base - 2):
         for a in range(max(rank_sum - base + 1, 0), (rank_sum + 1) // 2):
             angle = float(angles[a, rank_sum - a])
             if 4 * 3 * gates.separation_rad < angle <= max_rad + gate_rad(gates, angle):
@@ -494,10 +562,17 @@ def _chance_statistics(
 ) -> tuple[float, float]:
     """Chance statistics of an assumption's attitude.
 
-    Returns the mean probability that an observed star finds a partner by chance, from the number of catalog stars of
-    similar brightness in a field of uniform density and the area of the gates, and the number of catalog stars that
-    are predicted in the field and not matched.
+    In a field of uniform density, n stars of similar brightness in the solid angle Omega give an area A at least
+    one with the probability 1 - exp(-n A / Omega). A is the area of the gates of an observed star.
+
+    Returns
+    -------
+    p
+        Mean probability that an observed star finds a partner by chance
+    missing
+        Number of catalog stars that are predicted in the field and not matched
     """
+    # Catalog stars in the field at the assumption's attitude.
     pair = star[primary.rows]
     R_cam_from_ref = primary.triad.T @ triad(stars.vectors[pair[0]], stars.vectors[pair[1]])
     predicted = stars.vectors @ R_cam_from_ref.T
@@ -507,8 +582,10 @@ def _chance_statistics(
     from_midpoint_rad = 2 * np.arcsin(
         np.minimum(np.linalg.norm(predicted - primary.midpoint, axis=1) / 2, 1.0)
     )
+    # Those that can be partners: within reach of the pair, and not of the pair itself.
     rows = np.flatnonzero(field & (from_midpoint_rad < primary.reach_rad))
     rows = rows[(rows != pair[0]) & (rows != pair[1])]
+    # Of these, the number of similar brightness, for each observed star.
     difference_mag = np.abs(stars.magnitude_cam[primary.others][:, None] - stars.magnitude[rows])
     # NaN > x is False: an unknown magnitude passes.
     similar = len(rows) - (difference_mag > 3 * stars.gates.magnitude).sum(axis=1)

@@ -1,7 +1,14 @@
-"""SHEFEX-2's identifier: a base triangle of the brightest, a fourth star, then the rest, by cosines of angles.
+"""SHEFEX-2's identifier: a base triangle of bright stars, a fourth star, then the rest, by cosines of angles.
 
-Samaan & Theil 2011, section 3.4 and Fig. 6. Two angles agree if their cosines differ by less than cosError, which is a
-wide gate for stars close together: for 5.5e-5 it is 0.090 deg at 2 deg, and 0.010 deg at 18.57 deg.
+Samaan & Theil 2011, section 3.4 and Fig. 6. Two angles agree if their cosines differ by less than cosError. This
+gate is wide for stars close together: for 5.5e-5 it is 0.090 deg at 2 deg, and 0.010 deg at 18.57 deg.
+
+1. Take a base triangle of observed stars, by brightness (`search`).
+2. Find the catalog triangles with the same sides, by the k-vector and the neighbor lists (`_triangle`).
+3. Reject those of the other handedness (not in the paper).
+4. Identify every other star by its three angles to the base, a fourth star first (`_match_others`, `_partner`).
+5. Keep those that are near their predicted place at the attitude found (not in the paper).
+6. Accept a match with fewer than 1e-5 chance matches expected over all triangles. The paper accepts any fourth star.
 """
 
 from __future__ import annotations
@@ -11,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.pair_index import PairIndex, first_neighbor, pair_range
-from estimator.core.checks import Floats, ImageError
+from estimator.catalog.pair_index import PairIndex, neighbor_range, pair_range
+from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
@@ -27,18 +34,23 @@ from estimator.identification.direct_match import (
 from estimator.identification.solver_options import Options
 
 FOURTH_STAR = 1e300  # the paper's own rule: "it is already certain that a success will occur"
-# Least angle between base stars, and from them, in tolerances: smaller angles carry little information.
+# Least angle between base stars, and from them to others, in tolerances: smaller angles carry little information.
 MIN_SIDE_TOLERANCES = 6.0
 
 
 class ShefexOptions(NamedTuple):
-    """Search parameters: cosError, a direction's tolerance, and the limits of the effort (see `Options`).
+    """Search parameters.
 
     Attributes
     ----------
+    cos_error
+        Greatest difference of the cosines of two angles that agree
+    tolerance_rad
+        Tolerance of a direction
+    triangles, checks, base
+        Limits of the effort (see `Options`)
     accept
-        log10 of the chance at which a match is accepted; FOURTH_STAR accepts any match with a
-        fourth star
+        log10 of the chance at which a match is accepted; FOURTH_STAR accepts any match with a fourth star
     """
 
     cos_error: float
@@ -50,15 +62,33 @@ class ShefexOptions(NamedTuple):
 
 
 def cos_error(fov_rad: float, centroid_error_rad: float, factor: float = 1.0) -> float:
-    """Eq. 3: c |cos FOV - cos(FOV - centroidError)|; c from 1.6 to 5 makes the paper's 5.5e-5 of .3 to .1 px."""
+    """cosError by eq. 3: c |cos FOV - cos(FOV - centroidError)|.
+
+    With c from 1.6 to 5, centroid errors from 0.3 to 0.1 pixels give the paper's 5.5e-5.
+
+    Parameters
+    ----------
+    fov_rad
+        Greatest angle of the index
+    centroid_error_rad
+        Error of a direction
+    factor
+        The constant c
+    """
     return factor * abs(float(np.cos(fov_rad) - np.cos(fov_rad - centroid_error_rad)))
 
 
 @jit
 def angle_interval(angle_rad: float, cos_error: float) -> tuple[float, float]:
-    """Interval of angles whose cosines differ by at most cosError from that of an angle: eqs 4, 5 with correct signs.
+    """Interval of angles whose cosines differ by at most cosError from that of an angle: eqs 4 and 5 with correct
+    signs.
 
     Computed with cos a = 1 - 2 sin^2(a / 2), which is accurate for small angles.
+
+    Returns
+    -------
+    tuple[float, float]
+        Lower and upper end, rad
     """
     half = np.sin(angle_rad / 2) ** 2
     low = 2 * np.arcsin(np.sqrt(max(half - cos_error / 2, 0.0)))
@@ -68,28 +98,37 @@ def angle_interval(angle_rad: float, cos_error: float) -> tuple[float, float]:
 def shefex(
     vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
 ) -> StarMatch | None:
-    """SHEFEX-2's pyramid, brightest first, with cosError by eq. 3 from the tolerance and the index's greatest angle.
+    """Identify stars by SHEFEX-2's pyramids, brightest first (see the module's steps).
 
-    All triangles are tried in the order of brightness: the base triangle's stars are found with the k-vector, a fourth
-    star and then every other star by its three angles to them. Three tests are added to the paper's: the handedness of
-    the triangle, the positions at the attitude found, and significance. The paper accepts any fourth star; here a
-    match this good must be expected less than 1e-5 times by chance over all triangles tried. Otherwise returns None.
+    cosError is that of eq. 3 for the tolerance and the greatest angle of the index.
 
     Parameters
     ----------
     vectors_cam
         (N, 3) observed unit vectors, brightest first; the paper has 15 at most
+    index
+        Catalog of the stars and pairs
     tolerance_rad
-        Of a direction
+        Tolerance of a direction
     options
-        Those of `Options`; magnitudes are not used
+        Keywords of `Options`; magnitudes are not used
+
+    Returns
+    -------
+    StarMatch | None
+        None if no match is significant
+
+    Raises
+    ------
+    ImageError
+        Unless the tolerance is positive.
     """
     settings = Options(**options)
     settings.require_known_focal("shefex")
-    if not tolerance_rad > 0:
-        raise ImageError(f"shefex: tolerance {tolerance_rad} rad; allowed: more than 0")
+    settings.require_tolerance("shefex", tolerance_rad)
     if len(vectors_cam) < MIN_MATCHES:
         return None
+    # cosError is one number for all angles: the stretch counts at the greatest angle.
     tolerance_rad += settings.stretch * index.max_angle_rad
     error = cos_error(index.max_angle_rad, tolerance_rad)
     base = min(settings.base_stars, len(vectors_cam))
@@ -102,7 +141,19 @@ def shefex(
 
 @jit
 def search(rays: Floats, index: PairIndex, options: ShefexOptions, tried: NDArray) -> DirectMatch:
-    """Compiled search. Adds its effort to (3,) tried: base triangles found, angles compared, observed triangles."""
+    """The compiled search: steps 1 to 6.
+
+    Parameters
+    ----------
+    tried
+        (3,) base triangles found, angles compared and observed triangles so far, increased in place
+
+    Returns
+    -------
+    DirectMatch
+        The first match that is accepted, or else the empty one
+    """
+    # 1. Triangles of base stars, brightest first.
     for i in range(options.base - 2):
         for j in range(i + 1, options.base - 1):
             for k in range(j + 1, options.base):
@@ -110,6 +161,7 @@ def search(rays: Floats, index: PairIndex, options: ShefexOptions, tried: NDArra
                     return no_match()
                 tried[2] += 1
                 match = _triangle(rays, index, np.array([i, j, k]), options, tried)
+                # 6. Accept.
                 if len(match.observed) and match.log10_chance <= options.accept:
                     return match
     return no_match()
@@ -119,11 +171,18 @@ def search(rays: Floats, index: PairIndex, options: ShefexOptions, tried: NDArra
 def _triangle(
     rays: Floats, index: PairIndex, corners: NDArray, options: ShefexOptions, tried: NDArray
 ) -> DirectMatch:
-    """Test every catalog triangle that fits an observed one; other stars are identified by their angles to it."""
+    """Steps 2 to 5: test every catalog triangle that fits an observed one.
+
+    Parameters
+    ----------
+    corners
+        (3,) rows of the observed stars
+    """
     i, j, k = corners
     ij = angle(rays[i], rays[j])
     ik = angle(rays[i], rays[k])
     jk = angle(rays[j], rays[k])
+    # Short sides carry little information, and the index holds no longer pairs.
     if (
         min(ij, ik, jk) < MIN_SIDE_TOLERANCES * options.tolerance_rad
         or max(ij, ik, jk) > index.max_angle_rad
@@ -133,8 +192,9 @@ def _triangle(
     low, high = angle_interval(ij, options.cos_error)
     low_ik, high_ik = angle_interval(ik, options.cos_error)
     low_jk, high_jk = angle_interval(jk, options.cos_error)
+    # The gates of the other stars are the same for all catalog triangles.
     gates = _angle_gates(rays, corners, options)
-    # Catalog pairs (a, b) for side ij, in both orders; then neighbors c of a for side ik; then side jk is tested.
+    # 2. Catalog pairs (a, b) for side ij, in both orders; then neighbors c of a for side ik; then side jk is tested.
     begin, end = pair_range(index, low, high)
     for p in range(begin, end):
         if tried[1] >= options.checks:
@@ -144,16 +204,16 @@ def _triangle(
         for flip in range(2):
             a = index.pair[p, flip]
             b = index.pair[p, 1 - flip]
-            place = first_neighbor(index, a, low_ik)
-            while place < index.first[a + 1] and index.separation_rad[place] <= high_ik:
-                c = index.neighbor[place]
-                place += 1
+            first, last = neighbor_range(index, a, low_ik, high_ik)
+            for c in index.neighbor[first:last]:
                 tried[1] += 1
                 if not low_jk <= angle(index.vectors[b], index.vectors[c]) <= high_jk:
                     continue
+                # 3. The mirror image has the same sides.
                 if handedness * triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
                     continue
                 tried[0] += 1
+                # 4. and 5. The other stars.
                 match = _match_others(
                     rays, index, corners, np.array([a, b, c], np.int64), gates, options, tried
                 )
@@ -164,17 +224,23 @@ def _triangle(
 
 @jit
 def _angle_gates(rays: Floats, corners: NDArray, options: ShefexOptions) -> Floats:
-    """(N, 10) gates of each observed star's three angles to the base: lower ends, upper ends, cosines, and the area.
+    """Gates of each observed star's three angles to the base.
 
-    The area inside the gates is 0 for base stars and for stars too close to one; these are not identified.
+    Returns
+    -------
+    Floats
+        (N, 10): three lower ends and three upper ends, rad, three cosines, and the area inside the gates, sr. The
+        area is 0 for base stars and for stars too close to one; these are not identified
     """
     gates = np.zeros((len(rays), 10))
     side = np.empty(3)
     for n in range(len(rays)):
+        # Each angle's interval and cosine.
         for m in range(3):
             side[m] = angle(rays[corners[m]], rays[n])
             gates[n, m], gates[n, 3 + m] = angle_interval(side[m], options.cos_error)
             gates[n, 6 + m] = np.cos(side[m])
+        # A star too close to the base keeps the area 0.
         if side.min() >= MIN_SIDE_TOLERANCES * options.tolerance_rad:
             gates[n, 9] = _gate_area(rays, corners, n, side, gates[n, 3:6] - gates[n, :3])
     return gates
@@ -190,15 +256,23 @@ def _match_others(
     options: ShefexOptions,
     tried: NDArray,
 ) -> DirectMatch:
-    """Identify the other stars by their angles to the base triangle, then keep those near their predicted positions.
+    """Steps 4 and 5: identify the other stars by their angles to the base, then keep those near their predicted places.
 
-    The second test rejects mirror images, which a slim base, or stars in line with it, cannot distinguish by angles.
+    Step 5 rejects mirror images, which a slim base, or stars in line with it, cannot distinguish by angles.
+
+    Parameters
+    ----------
+    corners, stars
+        (3,) rows of the observed and of the catalog base
+    gates
+        (N, 10) see `_angle_gates`
     """
     observed = np.empty(len(rays), np.int64)
     star = np.empty(len(rays), np.int64)
     observed[:3] = corners
     star[:3] = stars
     count = 3
+    # 4. Identify by angles; each catalog star is used once.
     for n in range(len(rays)):
         s = _partner(rays, index, corners, stars, n, gates[n], tried) if gates[n, 9] > 0 else -1
         if s >= 0 and not (star[:count] == s).any():
@@ -207,6 +281,7 @@ def _match_others(
             count += 1
     if count < MIN_MATCHES:
         return no_match()
+    # 5. Keep what is near its predicted place.
     observed = observed[:count]
     star = star[:count]
     R_cam_from_ref = fit_rotation(rays[observed], index.vectors[star])
@@ -239,18 +314,24 @@ def _partner(
 ) -> int:
     """The catalog star whose three angles to the base fit those of observed star n, or -1.
 
-    Of several, the one of the least sum of cosine differences. With a slim base three angles do not distinguish a
-    position from its mirror image, so that the side of the base line is tested too.
+    Of several, the one of the least sum of cosine differences. With a slim base three angles do not distinguish a place
+    from its mirror image, so that the side of the base line is tested too.
+
+    Parameters
+    ----------
+    gate
+        (10,) gates of the star, see `_angle_gates`
     """
     best = -1
     least = np.inf
-    place = first_neighbor(index, stars[0], gate[0])
+    begin, end = neighbor_range(index, stars[0], gate[0], gate[3])
     tried[1] += 3
-    while place < index.first[stars[0] + 1] and index.separation_rad[place] <= gate[3]:
+    for place in range(begin, end):
         d = index.neighbor[place]
+        # The angle to the first star of the base.
         difference = abs(np.cos(index.separation_rad[place]) - gate[6])
-        place += 1
         tried[1] += 1
+        # The angles to the second and third star of the base.
         fits = d != stars[1] and d != stars[2]
         for m in range(1, 3):
             if not fits:
@@ -268,13 +349,17 @@ def _partner(
 def _same_side(
     rays: Floats, index: PairIndex, corners: NDArray, stars: NDArray, n: int, d: int
 ) -> bool:
-    """Whether observed star n and catalog star d are on the same side of the base line farthest from the star."""
+    """Whether observed star n and catalog star d are on the same side of the base line farthest from the star.
+
+    The side is the sign of the triple product of the line's two stars and the star.
+    """
     best = 0.0
     product = 1.0
     for m in range(3):
         a = m
         b = (m + 1) % 3
         volume = triple(rays[corners[a]], rays[corners[b]], rays[n])
+        # The line farthest from the star decides: noise cannot move the star across it.
         if abs(volume) > best:
             best = abs(volume)
             product = volume * triple(
@@ -285,16 +370,27 @@ def _same_side(
 
 @jit
 def _gate_area(rays: Floats, corners: NDArray, n: int, side: Floats, width: Floats) -> float:
-    """The least area of the three rhombi in which two rings about base stars cross at a star, in steradians.
+    """Area in which a star can be identified by its angles, sr.
 
-    The rings cross at the angle between the two base stars as seen from the star; its sine is the triple product of the
-    three directions over the sines of the two sides.
+    Two rings about base stars, as wide as their gates, cross at the star in a rhombus of the area w_a w_b /
+    sin(angle). The angle is that between the two base stars as seen from the star; its sine is the triple product
+    of the three directions over the sines of the two sides. The least of the three rhombi counts.
+
+    Parameters
+    ----------
+    n
+        Row of the observed star
+    side
+        (3,) its angles to the base stars, rad
+    width
+        (3,) widths of their gates, rad
     """
     least = np.inf
     for m in range(3):
         a = m
         b = (m + 1) % 3
         volume = abs(triple(rays[corners[a]], rays[corners[b]], rays[n]))
+        # Sine of the angle at which the rings cross.
         sine = max(volume / (np.sin(side[a]) * np.sin(side[b])), 1e-9)
         least = min(least, width[a] * width[b] / sine)
     return least

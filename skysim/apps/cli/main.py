@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from skysim.apps.cli.commands.availability import availability
 from skysim.apps.cli.commands.camera import app as cameras
 from skysim.apps.cli.commands.dataset import dataset

@@ -9,8 +9,7 @@ import pytest
 
 from skysim.apps.cli import terminal
 from skysim.experiments.study.execution.runner import Progress
-from skysim.results.report import print_table
-from skysim.results.report_blocks import Cell, Column, Table
+from skysim.results.report import Cell, Column, Table, print_table
 from skysim.tracking.tracker_interface import Answer, check_answer
 
 HOSTILE = "m[red].png [/b] no match [/tmp/x] :bug: \\"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 from collections.abc import Callable
@@ -249,95 +250,100 @@ def test_what_disagrees_is_red_in_the_report_and_bold_in_the_page() -> None:
     assert "| agrees |" in text
 
 
-# The page that the command wrote.
+# The page in docs/findings/papers.md and its table, which docs/site/papers.py writes.
 
-PAGE = ROOT / "docs/findings/papers.md"
+FINDINGS = ROOT / "docs/findings"
+PAGE = FINDINGS / "papers.md"
 NUMBER = r"(-?[\d.]+(?:e[-+]?\d+)?)"
-SUMMARY_PATTERN = re.compile(rf"{NUMBER}(?: \({NUMBER}\.\.{NUMBER}\))?$")
+CAUSE = re.compile(rf": {NUMBER}(?: \({NUMBER}\.\.{NUMBER}\))?$")
 
 
-def parts() -> dict[str, list[list[str]]]:
-    """The cells of each experiment's table by id."""
-    sections = re.split(r"^### (\S+)$", PAGE.read_text("utf-8"), flags=re.MULTILINE)[1:]
-    found = {}
-    for id, text in zip(sections[::2], sections[1::2], strict=True):
-        rows = [line for line in text.splitlines() if line.startswith("| ")][2:]
-        found[id] = [re.split(r" ?(?<!\\)\| ?", row)[1:-1] for row in rows]
+def parts() -> dict[str, list[dict[str, str]]]:
+    """The rows of each experiment in papers.csv by id."""
+    found: dict[str, list[dict[str, str]]] = {}
+    with (FINDINGS / "papers.csv").open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            found.setdefault(row["experiment"], []).append(row)
     return found
 
 
-def told(text: str) -> Summary:
-    """A number and its interval as the page has them."""
-    found = SUMMARY_PATTERN.search(text)
+def told(cells: dict[str, str]) -> Summary:
+    """Our number with its interval."""
+    value, low, high = (float(cells[name]) for name in ("ours", "low", "high"))
+    return Summary(value, low, high, 1)
+
+
+def told_with_cause(text: str) -> Summary:
+    """The number with a cause, `name: number (low..high)`, of four digits."""
+    found = CAUSE.search(text)
     assert found is not None, text
     value, low, high = (float(one) if one else float(found[1]) for one in found.groups())
     return Summary(value, low, high, 1)
 
 
 def eased(ours: Summary, share: float) -> Summary:
-    """The interval wider by a share of the number, or narrower: the page rounds to four digits."""
+    """The interval wider by a share of the number, or narrower: texts have four digits."""
     by = share * abs(ours.value)
     return ours._replace(low=ours.low - by, high=ours.high + by)
 
 
-def rows() -> list[tuple[str, PublishedRow, list[str]]]:
-    """Every published row with the page's cells."""
-    page_ = parts()
+def rows() -> list[tuple[str, PublishedRow, dict[str, str]]]:
+    """Every published row with its row of the table."""
+    table = parts()
     return [
         (id, row, cells)
         for id, experiment in published.experiments().items()
-        for row, cells in zip(experiment.rows.values(), page_[id], strict=True)
+        for row, cells in zip(experiment.rows.values(), table[id], strict=True)
     ]
 
 
-def test_the_page_has_every_published_row_as_it_is_published() -> None:
+def test_the_table_has_every_published_row_as_it_is_published() -> None:
     assert list(parts()) == list(published.experiments())
     for id, row, cells in rows():
-        assert [one.replace("\\|", "|") for one in cells[:2]] == [
-            row.quantity,
-            compare.format_with_source(row),
-        ], id
-        assert row.note in cells[4].replace("\\|", "|"), id
+        assert cells["quantity"] == row.quantity, id
+        assert cells["published"] == compare.format_with_source(row), id
 
 
-def test_the_page_s_verdicts_follow_from_its_numbers() -> None:
+def test_the_table_s_verdicts_follow_from_its_numbers() -> None:
     slack = 1e-3
     for id, row, cells in rows():
-        ours = told(cells[2])
-        verdict = cells[3].strip("*")
-        where = f"{id}: {row.quantity}"
-        cause = re.match(rf"with .*?: ({NUMBER}(?: \({NUMBER}\.\.{NUMBER}\))?)(?=;|$)", cells[4])
-        explains = bool(cause) and compare.intervals_overlap(row, eased(told(cause[1]), slack))
+        ours = told(cells)
+        explains = bool(cells["cause"]) and compare.intervals_overlap(
+            row, eased(told_with_cause(cells["cause"]), slack)
+        )
         allowed = {
             "agrees": compare.intervals_overlap(row, eased(ours, slack)),
             "explained": explains and not compare.intervals_overlap(row, eased(ours, -slack)),
             "disagrees": not compare.intervals_overlap(row, eased(ours, -slack)),
         }
-        assert allowed[verdict], where
+        assert allowed[cells["verdict"]], f"{id}: {row.quantity}"
 
 
-def test_the_page_s_pictures_are_there() -> None:
-    named = re.findall(r"^!\[.+\]\((papers/.+\.png)\)$", PAGE.read_text("utf-8"), re.MULTILINE)
-    assert len(named) >= len(published.experiments())
-    assert {
-        str(path.relative_to(PAGE.parent)) for path in PAGE.with_suffix("").glob("*.png")
-    } == set(named)
+def test_the_page_counts_the_table_s_verdicts_and_shows_all_that_disagree() -> None:
+    text = PAGE.read_text("utf-8")
+    table = [cells for lines in parts().values() for cells in lines]
+    verdicts = [cells["verdict"] for cells in table]
+    counts = [verdicts.count(name) for name in ("agrees", "explained", "disagrees")]
+    assert (
+        "Of {} published numbers {} agree with ours, {} are explained by a cause that we simulated"
+        " and {} disagree.".format(len(table), *counts)
+    ) in text
+    for cells in table:
+        assert (f"\n| {cells['quantity']} |" in text) == (cells["verdict"] == "disagrees")
+    assert all(f"\n### {id}\n" in text for id in published.experiments())
+    assert (FINDINGS / "papers.png").is_file()
 
 
 @pytest.mark.long
-def test_the_page_is_what_the_command_writes(tmp_path: Path) -> None:
-    """All but the seconds, and what is timed."""
-
-    def still(text: str) -> list[str]:
-        head, tail = text.split("\n## ", 1)
-        timed = re.compile(r"^### shefex-fig-3$.*?(?=^### )", re.MULTILINE | re.DOTALL)
-        return [re.sub(r"\d+ \|$", "|", line) for line in head.splitlines()] + timed.sub(
-            "", tail
-        ).splitlines()
-
-    asked("all", "--markdown", str(tmp_path / "papers.md"))
-    again = (tmp_path / "papers.md").read_text("utf-8")
-    assert still(again) == still(PAGE.read_text("utf-8"))
+def test_the_table_is_what_the_command_prints() -> None:
+    """All but what is timed."""
+    again = json.loads(asked("all", "--json"))
+    table = [cells for lines in parts().values() for cells in lines]
+    for one, cells in zip(again, table, strict=True):
+        if one["id"] not in TIMED:
+            assert one["quantity"] == cells["quantity"]
+            assert f"{one['ours']:.6g}" == cells["ours"], one["quantity"]
+            assert one["verdict"] == cells["verdict"], one["quantity"]
 
 
 # Every experiment, quickly.
@@ -361,7 +367,7 @@ def test_an_experiment_done_quickly_has_honest_numbers(id: str) -> None:
     lines = list(zip(done.comparisons, parts()[id], strict=True))
     for line, cells in lines:
         ours = line.result.ours
-        whole = told(cells[2])
+        whole = told(cells)
         assert not ours.low > ours.value + 1e-12, line.row.quantity
         assert not ours.high < ours.value - 1e-12, line.row.quantity
         assert ours.trials > 0, line.row.quantity
@@ -373,7 +379,7 @@ def test_an_experiment_done_quickly_has_honest_numbers(id: str) -> None:
     turned = [
         line.row.quantity
         for line, cells in lines
-        if cells[3] == "agrees" and line.verdict == "disagrees"
+        if cells["verdict"] == "agrees" and line.verdict == "disagrees"
     ]
     assert turned == [] or id in TIMED
     for drawing in done.drawings:

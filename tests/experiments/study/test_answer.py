@@ -395,19 +395,20 @@ def test_a_rolling_shutter_is_checked_at_the_rates_of_the_trials(tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_a_report_begins_with_scene_findings_and_answers(tmp_path: Path) -> None:
+def test_a_report_begins_with_its_answer_and_one_figure(tmp_path: Path) -> None:
     plan = loaded(tmp_path, figures=[{"kind": "map", "value": "stars_least"}])
     assert done(plan, tmp_path / "study.sqlite").failed == 0
     with store.open_store(tmp_path / "study.sqlite") as kept:
         report = study_report.study_report(plan, kept, "again")
     text = report.save(tmp_path / "r.html").read_text(encoding="utf-8")
     parts = (
+        'class="verdict good"',
         "trials, 0 failed",
-        "<b>Answer</b>",
         "<figure>",
-        "<h2>Scene",
-        "<h2>Checks of the scene",
+        "<summary>All answers",
         "<h2>Points",
+        "<summary>Checks of the scene",
+        "<summary>Scene",
     )
     places = [text.index(part) for part in parts]
     assert places == sorted(places)

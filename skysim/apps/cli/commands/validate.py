@@ -10,10 +10,9 @@ import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import typer
-from pydantic import BaseModel
 
 from skysim.apps.cli.options import (
     Json,
@@ -28,87 +27,6 @@ from skysim.apps.cli.options import (
 )
 from skysim.apps.cli.terminal import print_check, print_error, print_json
 from skysim.core.errors import InputError
-from skysim.experiments.study.plan import Study
-from skysim.scene.camera_sheet import PLACEHOLDER_LENS
-from skysim.scene.scene import NAME_ALIAS, Scene
-from skysim.scene.sections.camera import CameraConfig
-
-# JSON Schema of scene and study files, for editors.
-
-
-SCHEMA_KINDS: Mapping[str, type[BaseModel]] = {"scene": Scene, "study": Study}
-EXTRA_KEYS: Mapping[str, dict[str, Any]] = {  # keys that the loader resolves before validation
-    Scene.__name__: {
-        "base": {
-            "type": "string",
-            "description": "another scene: its name, or a file beside this one",
-        }
-    },
-    CameraConfig.__name__: {
-        "preset": {
-            "type": "string",
-            "description": "a file of data/cameras that supplies the missing keys",
-        },
-        "calibration": {
-            "type": "string",
-            "description": "an OpenCV calibration file: focal length, center, distortion",
-        },
-    },
-}
-DIALECT = "https://json-schema.org/draft/2020-12/schema"
-DROPPED_KEYWORDS = ("required", "discriminator", "default")
-BOUND_KEYWORDS = {
-    "ge": "minimum",
-    "gt": "exclusiveMinimum",
-    "le": "maximum",
-    "lt": "exclusiveMaximum",
-}
-
-
-def json_schema(kind: str) -> dict[str, Any]:
-    """The JSON Schema (draft 2020-12) of a kind of file."""
-    model = SCHEMA_KINDS[kind]
-    schema = relaxed(model.model_json_schema(by_alias=True), model.__name__)
-    return {"$schema": DIALECT, "title": f"A {kind} of skysim", "required": ["schema"]} | {
-        key: value for key, value in schema.items() if key != "title"
-    }
-
-
-def relaxed(node: Any, name: str = "") -> Any:
-    """Return the schema without required keys, defaults and discriminators; `oneOf` becomes `anyOf`.
-
-    Parameters
-    ----------
-    name
-        Of the definition that `node` is, for which EXTRA_KEYS may add keys
-    """
-    if isinstance(node, list):
-        return [relaxed(item) for item in node]
-    if not isinstance(node, dict):
-        return node
-    relaxed_node: dict[str, Any] = {}
-    for key, value in node.items():
-        if key == "properties":
-            properties = {
-                key_name: relaxed(child)
-                for key_name, child in value.items()
-                if key_name != NAME_ALIAS
-            }
-            relaxed_node[key] = properties | EXTRA_KEYS.get(name, {})
-        elif key == "$defs":
-            relaxed_node[key] = {
-                key_name: relaxed(child, key_name) for key_name, child in value.items()
-            }
-        elif (
-            key in BOUND_KEYWORDS
-        ):  # pydantic's keyword remains where a validator precedes the bound
-            relaxed_node |= (
-                {BOUND_KEYWORDS[key]: value} if node.get("type") in ("number", "integer") else {}
-            )
-        elif key not in DROPPED_KEYWORDS and (key != "title" or name):
-            relaxed_node["anyOf" if key == "oneOf" else key] = relaxed(value)
-    return relaxed_node
-
 
 KINDS = ("scene", "study")
 
@@ -141,7 +59,9 @@ def validate(
     if schema is not None:
         if schema not in KINDS:
             raise InputError(f"--schema {schema}", "", ", ".join(KINDS))
-        print_json(json_schema(schema))
+        from skysim.apps.cli import json_schema
+
+        print_json(json_schema.json_schema(schema))
         return
     if not files:
         raise InputError("", "no files", "files, or --schema scene")
@@ -221,6 +141,7 @@ def describe_file(
         plan = study_file.load(path)
         return f"a study of {plan.trials} trials" if plan.trials else "a search", ()
     if "camera" in keys and keys <= {"camera", "schema"}:
+        from skysim.scene.camera_sheet import PLACEHOLDER_LENS
         from skysim.scene.loader import load_camera
 
         camera = load_camera(path, PLACEHOLDER_LENS)

@@ -68,8 +68,10 @@ class Analysis(NamedTuple):
         Of all points, with the responses of `responses` and those of the answers
     about
         Scene table and findings of its checks
+    verdict
+        The answer in a few sentences
     headline
-        Answers in words
+        All answers in words
     ranges
         Of each response, in words
     indices
@@ -80,6 +82,7 @@ class Analysis(NamedTuple):
 
     lines: Sequence[PointRow]
     about: Overview
+    verdict: str = ""
     headline: Sequence[str] = ()
     ranges: Sequence[str] = ()
     indices: Sequence[Index] = ()
@@ -144,7 +147,8 @@ def analyze(plan: Plan, store: Store, command: Callable[[str], str]) -> Analysis
         else []
     )
     result = search.collect_result(plan, store) if study.optimize else None
-    return Analysis(lines, about, headline, answer.ranges(study, lines), indices, result)
+    verdict = answer.verdict(study, lines)
+    return Analysis(lines, about, verdict, headline, answer.ranges(study, lines), indices, result)
 
 
 def responses(study: Study) -> list[str]:
@@ -167,11 +171,18 @@ def compose(
     command: Callable[[str], str],
     also: Mapping[str, Floats] | None = None,
 ) -> Report:
-    """The report of an analyzed study. command : see `commands`;  also : see `figures.pareto_png`"""
+    """The report of an analyzed study: its question, its answer, one figure, and then the details.
+
+    Parameters
+    ----------
+    command
+        See `commands`
+    also
+        See `figures.pareto_png`
+    """
     lines = tables.select_responses(found.lines, responses(study))
-    answered = answer.verdict(study, found.lines)
-    costs = {one.number: one.cost for one in found.result.candidates} if found.result else None
     front = [one.number for one in found.result.front] if found.result else []
+    costs = {one.number: one.cost for one in found.result.candidates} if found.result else None
     drawn = [
         *search_figures(lines, study, front, costs, also),
         *sobol_figures(found.indices),
@@ -179,46 +190,41 @@ def compose(
     ]
     shown = {one.response for one in layout.figures(study, lines)}
     left = ", ".join(name for name in study.responses if name not in shown)
-    scene = [(name, [text]) for name, text in found.about.rows]
-    first, others = drawn[:1], drawn[1:]
-    warnings = Items(found.about.findings, tone="warning")
+    further = [*drawn[1:], Text(left and f"In the table alone: {left}.")]
     blocks = [
         Text(question(store.meta("study")), on_terminal=False),
-        *([Verdict(answered, tone(store))] if answered else []),
-        progress(study, store, answered),
+        *([Verdict(found.verdict, tone(store))] if found.verdict else []),
+        progress(study, store, found.verdict),
         failures(store, command("replay")),
-        *first,
-        Section("All answers", [Items(found.headline)], folded=True),
-        Section(
-            "Further figures",
-            [*others, Text(left and f"In the table alone: {left}.")],
-            folded=True,
-            on_terminal=False,
-        ),
-        Section(
-            "Ranges of the responses",
-            [range_table(study, found.lines)],
-            folded=True,
-            on_terminal=False,
-        ),
+        *drawn[:1],
+        folded("All answers", [Items(found.headline)], on_terminal=True),
+        folded("Further figures", further),
+        folded("Ranges of the responses", [range_table(study, found.lines)]),
         Section("Sobol indices", [index_table(found.indices)]),
         Section("Front", front_table(study, found.result)),
         points_section(lines, study, front, costs),
-        Section(
-            "Checks of the scene",
-            [warnings if found.about.findings else Text("Nothing to warn of.")],
-            folded=True,
-        ),
-        Section(
-            "Scene",
-            [Facts([*scene, ("code version", [store.meta("code")])])],
-            folded=True,
-            on_terminal=False,
-        ),
+        *scene_sections(found.about, store.meta("code")),
         runs_section(store),
-        Section(STUDY_FILE, [Code(store.meta("study"), "yaml")], folded=True, on_terminal=False),
+        folded(STUDY_FILE, [Code(store.meta("study"), "yaml")]),
     ]
     return Report(study.title, blocks, command("optimize" if study.optimize else "run"))
+
+
+def folded(title: str, blocks: Sequence[Block], on_terminal: bool = False) -> Section:
+    """A section that a reader opens; on the page alone unless it is said."""
+    return Section(title, blocks, folded=True, on_terminal=on_terminal)
+
+
+def scene_sections(about: Overview, code: str) -> list[Section]:
+    """The findings of the scene's checks, and the scene as a table with the version of the code."""
+    findings = (
+        Items(about.findings, tone="warning") if about.findings else Text("Nothing to warn of.")
+    )
+    facts = [*((name, [text]) for name, text in about.rows), ("code version", [code])]
+    return [
+        folded("Checks of the scene", [findings], on_terminal=True),
+        folded("Scene", [Facts(facts)]),
+    ]
 
 
 # What it says.
