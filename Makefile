@@ -42,11 +42,11 @@ compile: $(READY)
 PYTEST = PYTHONDONTWRITEBYTECODE= NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
 
 test: $(READY)
-	$(PYTEST) -m "not slow and not long and not browser"
+	$(PYTEST) -m "not slow and not compiles and not long and not browser"
 
 # The tests that CI runs beside those of `make test`.
 test-slow: $(READY) $(EXTRA)s3+query
-	$(PYTEST) -m "slow and not long and not browser"
+	$(PYTEST) -m "(slow or compiles) and not long and not browser"
 
 test-long: $(READY)
 	$(PYTEST) -m long

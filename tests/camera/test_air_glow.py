@@ -116,7 +116,6 @@ def up_pointing(lab: Lab) -> Rotation:
     return Rotation.from_matrix(np.stack([-east, -north, up]))
 
 
-@pytest.mark.slow
 def test_below_the_skyline_there_is_no_glow() -> None:
     lab = lab_of("2012-06-24T23:00:00")
     sky = sky_of(lab)
@@ -129,7 +128,6 @@ def test_below_the_skyline_there_is_no_glow() -> None:
     assert (np.diff(glow[: half - 1].mean(axis=1)) != 0).all()
 
 
-@pytest.mark.slow
 def test_the_dark_glow_is_that_of_the_declared_sky() -> None:
     """At the zenith, moonless and at night: as a background of kind sky of the same magnitude."""
     lab = lab_of("2012-12-13T23:00:00", **{"glow.dark_mag_arcsec2": "21", "extinction_mag": "0"})

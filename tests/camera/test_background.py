@@ -110,7 +110,6 @@ def test_a_uniform_sky_falls_with_the_fourth_power_of_the_cosine() -> None:
     assert cosine.min() ** 4 < 0.8  # the field is wide enough to tell
 
 
-@pytest.mark.slow
 def test_a_pixel_s_sky_light_is_its_solid_angle_times_surface_brightness() -> None:
     lens = optics()
     pixel_arcsec = np.degrees(1 / lens.camera.focal_px) * 3600
@@ -147,7 +146,6 @@ def test_the_pixels_solid_angles_sum_to_the_field(camera: dict[str, object]) -> 
     assert pixels == pytest.approx(2 * halves.sum(), rel=2e-5)
 
 
-@pytest.mark.slow
 def test_vignetting_dims_the_sky_and_not_a_light_leak() -> None:
     table = {"kind": "table", "angle_deg": (0, 10, 30), "transmission": (1, 0.7, 0.1)}
     clear = optics()
@@ -161,7 +159,6 @@ def test_vignetting_dims_the_sky_and_not_a_light_leak() -> None:
     np.testing.assert_array_equal(leak, np.full((601, 801), 3.5, np.float32))
 
 
-@pytest.mark.slow
 def test_the_sky_s_gradient_is_relative_per_degree() -> None:
     lens = optics()
     flat, sloped = (
@@ -210,7 +207,7 @@ def test_scattered_moonlight_decreases_to_90_degrees_and_vanishes_without_air() 
     assert scattering(0.0) == scattering(0.26)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_moonlight_on_the_frame_comes_from_the_moon_s_side() -> None:
     """The Moon 25 degrees to the right of the boresight, just outside of the frame; separations by dot products."""
     lens = optics()
@@ -277,7 +274,7 @@ def test_frames_drawn_between_nodes_are_within_a_thousandth(
     )
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_the_cusp_of_two_stops_is_rounded_off_within_a_node_of_the_axis() -> None:
     lens = optics(vignetting={"kind": "two_stops", "cutoff_deg": 50.0})
     error = np.abs(drawn(glow(**SLOPED), lens)[::3, ::3] / whole_map(glow(**SLOPED), lens) - 1)
@@ -286,7 +283,7 @@ def test_the_cusp_of_two_stops_is_rounded_off_within_a_node_of_the_axis() -> Non
     assert error[np.hypot(3 * x - 400, 3 * y - 300) > 200].max() < 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 @pytest.mark.parametrize(
     ("shape", "nodes"), [((601, 801), (20, 27)), ((97, 33), (2, 3)), ((50, 64), (50, 64))]

@@ -33,7 +33,7 @@ def halve_till_it_fits(column: np.ndarray) -> np.ndarray:
     return charge[1:-1]
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize("seed", range(6))
 def test_blooming_equals_the_limit_of_repeated_halving(seed: int) -> None:
     """Random sky with one to four saturated sources, near each other and near the ends."""
@@ -45,7 +45,7 @@ def test_blooming_equals_the_limit_of_repeated_halving(seed: int) -> None:
     np.testing.assert_allclose(image[:, 1], halve_till_it_fits(column), rtol=0, atol=1e-3 * WELL)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_blooming_keeps_the_charge_and_its_center() -> None:
     rng = np.random.default_rng(2)
     image = rng.uniform(0, 0.5 * WELL, (400, 30)).astype(np.float32)
@@ -61,7 +61,7 @@ def test_blooming_keeps_the_charge_and_its_center() -> None:
     np.testing.assert_allclose(rows @ image.astype(float), rows @ before, rtol=0, atol=10.0)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize("wells", [1, 3, 11, 41])
 def test_a_single_source_fills_as_many_pixels_as_it_has_wells(wells: int) -> None:
     column = np.zeros(101)
@@ -162,7 +162,7 @@ def test_parallel_and_serial_loss_of_a_frame_are_clocked_one_after_the_other() -
     np.testing.assert_allclose(image, wanted, rtol=0, atol=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_deferred_charge_of_a_flat_field_is_transfers_times_inefficiency() -> None:
     """The extended-pixel edge response: what trails a flat field of n rows is n cti of a row (Janesick 2001)."""
     rows = 1000
@@ -198,7 +198,6 @@ def clocked_under_light(rate_e_s: np.ndarray, exposure_s: float, row_time_s: flo
     return np.array(store)
 
 
-@pytest.mark.slow
 def test_smear_equals_that_of_a_column_clocked_under_light() -> None:
     exposure_s = 0.05
     row_time_s = 2e-6
@@ -212,7 +211,6 @@ def test_smear_equals_that_of_a_column_clocked_under_light() -> None:
     np.testing.assert_allclose(single, wanted, rtol=1e-6)
 
 
-@pytest.mark.slow
 def test_a_leaking_register_smears_in_proportion_to_its_leak() -> None:
     rate = np.random.default_rng(8).uniform(0, 1e5, (40, 65))
     open_sky = rate * 0.1

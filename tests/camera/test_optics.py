@@ -47,7 +47,6 @@ def matrix(lens: Optics) -> np.ndarray:
 small = st.floats(-0.3, 0.3, allow_subnormal=False)
 
 
-@pytest.mark.slow
 @settings(max_examples=50, derandomize=True, deadline=None)
 @given(st.tuples(small, small, st.floats(-0.02, 0.02), st.floats(-0.02, 0.02), small))
 def test_distortion_matches_opencv(distortion: tuple[float, ...]) -> None:
@@ -277,7 +276,6 @@ def test_a_table_of_transmission_is_linear_between_its_angles_and_level_beyond()
     np.testing.assert_allclose(throughput, [1, 0.96, 0.9, 0.58, 0.5, 0.5], rtol=0, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_a_star_s_electrons_are_scaled_by_vignetting() -> None:
     """Rendered at 10 deg off axis, the ratio to the axis is the product of cosine and vignetting."""
     lens = optics(vignetting={"kind": "two_stops", "cutoff_deg": 40}, focal_length="15 mm")

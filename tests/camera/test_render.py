@@ -575,7 +575,7 @@ def test_a_rolling_shutter_bands_a_pulsed_led() -> None:
 # Any attitude history
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_jitter_widens_a_star_by_its_own_variance() -> None:
     line = JitterLineConfig(kind="line", frequency_hz=40.0, rms_arcsec=(60.0, 120.0, 0.0))
     shaken = Vibration.draw(MotionConfig(jitter=(line,)), np.random.default_rng(4)).add_to(STILL)

@@ -105,7 +105,6 @@ def refuse() -> None:
     raise COUNT
 
 
-@pytest.mark.slow
 def test_an_error_keeps_its_parts_across_processes() -> None:
     with ProcessPoolExecutor(1) as pool, pytest.raises(InputError) as raised:
         pool.submit(refuse).result()

@@ -231,7 +231,6 @@ def test_astropy_puts_the_true_stars_on_their_true_pixels(
     np.testing.assert_allclose(np.column_stack([x, y]), truth.sources.xy_px, rtol=0, atol=1e-6)
 
 
-@pytest.mark.slow
 def test_under_the_dome_there_is_no_wcs(tmp_path: Path, dome: Shot) -> None:
     recording.write_fits(tmp_path / "f.fits", dome[1], dome[2], dome[0])
     assert not [

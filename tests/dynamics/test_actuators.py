@@ -233,7 +233,6 @@ ANGLES = np.array([0.4, -1.1, 2.0, 0.7])
 SPEEDS = np.array([100.0, 80, -120, 95])
 
 
-@pytest.mark.slow
 def test_the_momentum_is_that_of_the_gimballed_rotors():
     set_ = pyramid_set()
     axles = Rotation.from_rotvec((set_.gimbal_axes * ANGLES).T).apply(set_.spin_axes.T)
@@ -242,7 +241,7 @@ def test_the_momentum_is_that_of_the_gimballed_rotors():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_the_jacobian_is_the_momentums_derivative():
     """By a five-point difference, exact to the fourth order of 1e-3 rad."""
     set_ = pyramid_set()
@@ -291,7 +290,6 @@ def test_a_cmg_s_torque_is_gimbal_rate_times_momentum(rate):
     np.testing.assert_allclose(crossed, asked, rtol=1e-12, atol=0)
 
 
-@pytest.mark.slow
 def test_away_from_singularities_both_steering_laws_agree():
     """lambda is 0.01 exp(-10 det A A^T), 5e-8 at rest with det = 32/27: the rates differ by no more."""
     torque = np.array([0.1, -0.05, 0.2])
@@ -322,7 +320,7 @@ def test_the_robust_inverse_matches_wie_s_formula_at_any_time():
         )
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize("steering", STEERING)
 def test_gimbals_at_their_limit_keep_the_direction(steering):
     torque = np.array([1.0, -0.5, 2.0])
@@ -371,7 +369,6 @@ def test_the_pyramid_saturates_with_every_rotor_at_its_largest_projection():
     assert set_.manipulability(angles, SPEED) < 1e-12
 
 
-@pytest.mark.slow
 def test_in_a_singularity_the_pseudo_inverse_gives_the_other_components():
     set_ = pyramid_set("pseudo_inverse")
     angles = np.radians([-90, 0, 90, 0])
@@ -393,7 +390,6 @@ def pushed_along_x(set_: CmgSet, seconds: float) -> tuple[np.ndarray, np.ndarray
     return np.array(momentum), np.array(rates), np.array(angles)
 
 
-@pytest.mark.slow
 def test_the_pseudo_inverse_is_stuck_at_the_internal_singularity():
     """It keeps rotors 2 and 4 opposed; at (-90, 0, 90, 0) deg the others are spent: h_x = 2 c = 1.155 and no more."""
     momentum, rates, angles = pushed_along_x(pyramid_set("pseudo_inverse"), 60)
@@ -446,7 +442,7 @@ def singular_angles(set_: CmgSet, along: np.ndarray) -> np.ndarray:
     return np.arctan2(along @ across, along @ set_.spin_axes)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_rotors_deliver_what_singular_gimbals_cannot():
     set_ = variable()
     along = np.array([2.0, 1.0, -2.0]) / 3
@@ -469,7 +465,6 @@ def test_rotors_deliver_what_singular_gimbals_cannot():
     assert np.linalg.norm(along @ fixed.jacobian(angles, THREE) * stuck) < 1e-14
 
 
-@pytest.mark.slow
 def test_rotors_keep_their_speed_where_gimbals_suffice():
     """At angle zero A = 1 N m s, det A A^T = 1: the weights leave the rotors 0.25 exp(-10) of the torque."""
     set_ = variable()
@@ -495,7 +490,7 @@ def test_variable_speed_cmgs_give_the_commanded_torque_at_any_angle():
         np.testing.assert_allclose(given, torque, rtol=0, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_variable_speed_gyros_at_their_limits_keep_the_direction():
     set_ = variable(rotor_torque_limit_nm=0.05)
     along = np.array([2.0, 1.0, -2.0]) / 3
@@ -510,7 +505,7 @@ def test_variable_speed_gyros_at_their_limits_keep_the_direction():
         assert given @ torque > 0
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_rotors_at_rest_work_as_wheels():
     set_ = variable()
     torque = np.array([0.1, 0.2, -0.1])

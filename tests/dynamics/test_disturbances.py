@@ -99,7 +99,6 @@ def test_gusts_are_stationary_from_the_start() -> None:
     )
 
 
-@pytest.mark.slow
 def test_steady_wind_and_turbine_torques_are_along_the_lab_s_axes() -> None:
     """Turned by 90 deg of yaw, what twists about lab x twists about body -y."""
     config = DisturbancesConfig.model_validate({"turbine": ["1 mN m", "0 N m", "2 mN m"]})

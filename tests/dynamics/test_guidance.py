@@ -130,7 +130,7 @@ def test_euler_angles_are_yaw_then_pitch_then_roll() -> None:
         np.testing.assert_allclose(attitude(given).as_matrix(), expected, rtol=0, atol=1e-15)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize("name", EVERY)
 def test_rate_and_acceleration_are_the_derivatives_of_the_attitude(name: str) -> None:
     """Five-point differences at random times within the last element: off by 1e-15 / h, that is 1e-11, by rounding.
@@ -219,7 +219,7 @@ CHANGES = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize(("begin", "end", "lasts_s"), CHANGES)
 def test_spin_up_is_the_integral_of_its_rate(begin: tuple, end: tuple, lasts_s: float) -> None:
     """Against scipy's eighth-order integration of q' = q w / 2 with w by hand, to 1e-9 rad."""
@@ -247,7 +247,6 @@ def test_spin_up_is_the_integral_of_its_rate(begin: tuple, end: tuple, lasts_s: 
     )
 
 
-@pytest.mark.slow
 def test_a_spin_up_from_or_to_rest_turns_by_half_of_rate_times_time() -> None:
     """The mean of the smoothstep is 1/2; the axis stands still, so this is exact."""
     up, down = (SPIN | {"rate_deg_s": w, "duration": "10 s"} for w in ([6, 0, -12], [0, 0, 0]))
@@ -258,7 +257,7 @@ def test_a_spin_up_from_or_to_rest_turns_by_half_of_rate_times_time() -> None:
     np.testing.assert_array_equal(ref.state_at(30.0)[1:], np.zeros((2, 3)))
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_first_spin_up_begins_at_the_vehicles_own_rate() -> None:
     ref = reference(SPIN, rate_deg_s=(1.0, 2.0, -3.0))
     np.testing.assert_allclose(np.degrees(ref.state_at(0.0)[1]), [1, 2, -3], rtol=1e-14)
@@ -276,7 +275,7 @@ def test_a_spin_up_of_too_many_knots_is_refused_in_one_line() -> None:
     reference(HOLD, fast | {"duration": "10 h"})  # one axis needs no knots
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_sine_swings_by_its_amplitude_about_the_attitude_it_started_from() -> None:
     """Between the first and the last period phi(t) is amplitude sin(2 pi f t), exactly."""
     ref = reference(HOLD, SINE)

@@ -193,7 +193,7 @@ def test_the_earth_rate_is_along_the_pole(latitude: float, azimuth: float) -> No
 ATTITUDES = [Rotation.identity(), TILTED, Rotation.from_rotvec([1.0, 2.0, -0.5])]
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize("attitude", ATTITUDES)
 def test_uncompensated_earth_rate_rotates_a_still_vehicle_s_navigator(attitude: Rotation) -> None:
     """An hour: 15.04 deg about the Earth's own axis, whatever the vehicle's attitude."""
@@ -205,7 +205,7 @@ def test_uncompensated_earth_rate_rotates_a_still_vehicle_s_navigator(attitude: 
     np.testing.assert_allclose(np.linalg.norm(drift), 15.041, rtol=0, atol=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize("attitude", ATTITUDES)
 def test_compensated_earth_rate_keeps_a_still_vehicle_s_attitude(attitude: Rotation) -> None:
     navigator = Navigator(wxyz(attitude), EARTH)
@@ -214,7 +214,7 @@ def test_compensated_earth_rate_keeps_a_still_vehicle_s_attitude(attitude: Rotat
     assert (believed * attitude.inv()).magnitude() < 1e-11
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_compensation_holds_on_a_turning_vehicle() -> None:
     """20 s at 20 deg/s: what is left is the swing of the Earth rate in the body, Omega (w dt)^2 / 12 for 20 s: 1e-10.
 
@@ -411,7 +411,6 @@ def test_one_knot_is_refused_and_no_samples_give_an_empty_result() -> None:
 # --- the unit's errors
 
 
-@pytest.mark.slow
 def test_without_errors_the_imu_is_exact() -> None:
     """Zero parameters leave every bit."""
     ideal = CONE.felt(np.arange(0, 1.0005, 1e-3), np.arange(1, 401) * STEP, EARTH)
@@ -521,7 +520,6 @@ def test_scale_and_misalignment_change_a_known_rotation_as_declared() -> None:
     np.testing.assert_allclose(backwards.angle_rad.sum(axis=0), -total, rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_the_measured_rate_at_rest_is_the_bias() -> None:
     one = unit({"turn_on_bias_deg_h": 5.0, "bias_deg_h": 2.0})
     count = one.measure(steady([0, 0, 0], 1))

@@ -305,7 +305,6 @@ def test_pair_of_fans_turns_about_its_axis_alone(axis: int) -> None:
 # --- air and cable ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("begin", [0.8, -0.8])
 @pytest.mark.parametrize(("viscous", "quadratic"), [(1.0, 0.0), (0.0, 3.0), (1.0, 3.0)])
 def test_drag_slows_a_spin(begin: float, viscous: float, quadratic: float) -> None:
@@ -335,7 +334,6 @@ def test_drag_is_felt_about_each_axis_by_its_own_rate() -> None:
     np.testing.assert_allclose(data.qfrc_passive, [-0.0012, 0.0028, -0.0048], rtol=0, atol=1e-15)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("axis", "amplitude_deg"), [(0, 6), (1, 6), (2, 6), (2, 120)])
 def test_cable_swings_the_vehicle_like_a_spring(axis: int, amplitude_deg: float) -> None:
     """T = 2 pi sqrt(J / k) about each axis, whatever the amplitude: the torque goes with the angle."""

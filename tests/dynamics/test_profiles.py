@@ -48,7 +48,7 @@ def attitudes(spline, t_s: np.ndarray) -> Rotation:
     return Rotation.from_quat(spline.states_at(t_s)[0], scalar_first=True)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_the_spline_goes_through_its_samples_with_a_unit_quaternion() -> None:
     spline = fit_spline(sampled())
     assert angle(attitudes(spline, TIMES), tumble(TIMES)).max() < 1e-14
@@ -58,7 +58,7 @@ def test_the_spline_goes_through_its_samples_with_a_unit_quaternion() -> None:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_rate_and_acceleration_are_the_derivatives_of_the_attitude() -> None:
     """Central differences within the steps, the continued ends included: off by their own h^2 and by rounding / h."""
     spline = fit_spline(sampled())
@@ -74,7 +74,7 @@ def test_rate_and_acceleration_are_the_derivatives_of_the_attitude() -> None:
     np.testing.assert_allclose((after[1] - before[1]) / (2 * h), acceleration, rtol=0, atol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_rate_and_acceleration_are_continuous_at_every_sample() -> None:
     spline = fit_spline(sampled())
     eps = 1e-9
@@ -88,7 +88,7 @@ def test_rate_and_acceleration_are_continuous_at_every_sample() -> None:
     )  # the next derivative does jump, so the test can fail
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_the_error_is_of_fourth_order_up_to_both_ends() -> None:
     """Half the step, a sixteenth of the error: within and in the first and last step alike."""
     t = np.linspace(0, 6, 4001)

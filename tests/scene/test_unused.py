@@ -262,7 +262,6 @@ CASES = [
 KEYS = [case.key for case in CASES]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=KEYS)
 def test_a_key_without_effect_is_refused(case: Case) -> None:
     """One line has the key, the reason, allowed values and the place; where it has an effect, it is accepted."""

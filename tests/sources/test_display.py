@@ -475,7 +475,6 @@ def test_the_glow_is_on_the_frame_only_with_a_finite_contrast() -> None:
 # Faulty keys
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "says"),
     [

@@ -202,7 +202,6 @@ def on_sphere(tilt_deg: Floats, azimuth_deg: Floats) -> Floats:
     return Rotation.from_euler("ZYZ", angles, degrees=True).apply([0.0, 0.0, 1.0])
 
 
-@pytest.mark.slow
 def test_a_rotated_field_coincides_wholly_and_a_mirrored_one_does_not() -> None:
     """Seven LEDs, and the same rigidly turned by 30 deg: share 1, LED on LED; two left out: 5 of 7."""
     pattern = on_sphere(
@@ -225,7 +224,7 @@ def test_a_rotated_field_coincides_wholly_and_a_mirrored_one_does_not() -> None:
     assert field_ambiguity(np.concatenate([pattern, mirrored]), *seen).fraction[0] < 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_leds_that_are_off_by_more_than_the_tolerance_do_not_coincide() -> None:
     pattern = on_sphere(
         np.array([0, 1.2, 2.1, 2.6, 3.1, 3.5]), np.array([0, 20, 250, 110, 305, 170])

@@ -172,7 +172,6 @@ def survey_of(**more: Any) -> SurveyErrorsConfig:
     return SurveyErrorsConfig.model_validate({"instrument": STATION, "seed": 5} | more)
 
 
-@pytest.mark.slow
 def test_the_tracker_uses_the_station_s_measurements() -> None:
     """Places, covariance and common errors, over surveys: all errors together are chi-square as claimed."""
     inside = surface.build_surface(

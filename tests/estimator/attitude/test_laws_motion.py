@@ -167,7 +167,6 @@ def test_the_rate_from_streaks_has_its_claimed_covariance() -> None:
     assert np.mean(nees) == pytest.approx(3, abs=4 * np.sqrt(6 / 300))
 
 
-@pytest.mark.slow
 @law(rolling.fit)
 @given(rng=SEEDS)
 def test_attitude_and_rate_are_found_together(rng: np.random.Generator) -> None:

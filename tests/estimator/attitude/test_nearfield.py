@@ -164,7 +164,7 @@ def test_the_jacobian_is_the_derivative_of_the_projection(lever: Lever) -> None:
     np.testing.assert_allclose(jacobian, np.transpose(slopes), rtol=0, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize("surface", [SPHERE, MEASURED], ids=["sphere", "ellipsoid"])
 @pytest.mark.parametrize("lever", [LEVER, ASKEW], ids=["axial", "askew"])
 @pytest.mark.parametrize("count", [2, 5, 20])
@@ -245,7 +245,7 @@ def test_five_lights_have_the_reference_s_error() -> None:
     assert 1.0 < cross / np.sqrt(2) / axis < 1.17
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize("lever", [LEVER, ASKEW], ids=["axial", "askew"])
 def test_rays_on_the_surface_find_the_truth_on_a_centered_sphere(lever: Lever) -> None:
     rng = np.random.default_rng(57)

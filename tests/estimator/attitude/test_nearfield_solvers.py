@@ -64,7 +64,6 @@ def compare(method: str, surface: str, tilts: tuple[int, ...], trials: int) -> N
                 assert agrees(squares, published), (tilt, published, rms_and_error(squares))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("method", "surface"), PUBLISHED, ids=" ".join)
 def test_errors_match_rows_of_the_reference_s_table(method: str, surface: str) -> None:
     compare(method, surface, (30,), 60)
@@ -149,7 +148,6 @@ def nees(errors: np.ndarray, claimed: np.ndarray) -> np.ndarray:
     return np.einsum("ni,nij,nj->n", errors, np.linalg.inv(claimed), errors)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("trials", [400, pytest.param(2000, marks=pytest.mark.long)])
 def test_the_exact_solve_s_covariance_holds_within_ten_per_cent(trials: int) -> None:
     errors, claimed = noise_alone("rotation_only", "measured ellipsoid", 15, trials, seed=75)
@@ -161,7 +159,6 @@ def test_the_exact_solve_s_covariance_holds_within_ten_per_cent(trials: int) -> 
     assert 0.0045 < roll_deg < 0.0055 * (1 + 3 / np.sqrt(2 * trials))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("surface", ["flat at 48 in", "NPS flat at 1 m"])
 @pytest.mark.parametrize("method", ["infinity", "thesis", "tappe", "ray_on_surface"])
 def test_every_covariance_matches_the_noise(method: str, surface: str) -> None:

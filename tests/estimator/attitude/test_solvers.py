@@ -44,7 +44,7 @@ def error_rad(a: Rotation, b: Rotation) -> float:
     return (a * b.inv()).magnitude()
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @every_optimal
 @pytest.mark.parametrize("count", [2, 3, 5, 20])
 def test_each_solver_gives_the_svd_s_rotation(count: int, solve: Solver) -> None:
@@ -72,7 +72,7 @@ def test_quest_gives_the_svd_s_rotation_in_a_star_tracker_s_field(count: int) ->
         assert error_rad(quest(cam, ref, np.ones(count)), oracle) < 1e-8
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @every_solver
 @pytest.mark.parametrize("half_rad", [0.1, 0.01, 1e-3, 2e-4])
 def test_close_directions_keep_full_precision(half_rad: float, solve: Solver) -> None:
@@ -88,7 +88,7 @@ def test_close_directions_keep_full_precision(half_rad: float, solve: Solver) ->
         )
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @every_solver
 def test_directions_on_one_great_circle_are_enough(solve: Solver) -> None:
     rng = np.random.default_rng(43)
@@ -113,7 +113,7 @@ AXES = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @every_solver
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("short_of_rad", [0.0, 1e-12, 1e-8, 1e-4])
@@ -269,7 +269,7 @@ def davenport_matrix(B: np.ndarray) -> np.ndarray:
     return np.block([[S - trace * np.eye(3), z[:, None]], [z[None], np.array([[trace]])]])
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize("name", RAW)
 @pytest.mark.parametrize("half_turn", [False, True])
 def test_each_bare_method_solves_davenport_s_equation_itself(name: str, half_turn: bool) -> None:
@@ -302,7 +302,6 @@ def test_each_bare_method_is_exact_at_half_a_turn(name: str, axis: str) -> None:
         assert np.abs(RAW[name](B) - truth.as_matrix()).max() < 1e-13  # rounding over a gap of 0.3
 
 
-@pytest.mark.slow
 def test_no_method_reads_outside_its_arrays() -> None:
     """NumPy refuses an index beyond an array; compiled code would read and write what lies behind it."""
     plain = interpreted("estimator.attitude.wahba")
@@ -454,7 +453,7 @@ def test_fifteen_stars_have_the_reference_s_error() -> None:
     assert predicted == pytest.approx([cross, cross, roll], rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize("name", SOLVERS)
 @pytest.mark.parametrize("count", [2, 3, 5, 30])
 def test_the_covariance_matches_the_scatter(count: int, name: str) -> None:

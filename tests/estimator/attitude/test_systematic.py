@@ -86,7 +86,6 @@ def test_equal_errors_give_the_solver_s_covariance() -> None:
     np.testing.assert_allclose(ours, R @ covariance @ R.T, rtol=1e-8, atol=1e-8 * covariance.max())
 
 
-@pytest.mark.slow
 def test_own_errors_that_differ_by_led_and_direction_have_the_claimed_covariance() -> None:
     """LEDs believed off along one axis of the lab, by 0.1 mm to 1 mm, and solved with equal weights."""
     position_m = leds_in_view(7, 2)

@@ -22,7 +22,6 @@ from tests.helpers.laws import SEEDS, answered, law
 from tests.helpers.surveyed_dome import attitudes, model, pixels
 
 
-@pytest.mark.slow
 @law(
     *(
         survey_plan.predict,

@@ -186,7 +186,7 @@ def test_a_blob_whose_fit_fails_keeps_its_center_of_gravity() -> None:
     np.testing.assert_array_equal(fitted.flux, wanted.flux)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize(
     ("flux_e", "noise_e", "published_px"),
     [(1e4, 15, 0.0097), (1e5, 15, 0.0025), (3e3, 15, 0.022), (1e5, 0.5, 0.0024)],
@@ -205,7 +205,7 @@ def test_the_fit_reaches_the_cramer_rao_bound(
 
 # cog's own variance is photon + pixel noise over its box; its box moves with the noise, hence the wider band.
 # The S-curves of the other two are in their variance as if their profiles were Gaussian.
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize(
     ("name", "band"),
     [
@@ -280,7 +280,7 @@ def test_a_large_saturated_star_is_placed_by_its_wings() -> None:
     assert row[3] == pytest.approx(1e5, rel=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize("name", list(CENTROIDERS))
 @pytest.mark.parametrize("apart_px", [8.0, 11.0])
 def test_stars_side_by_side_do_not_pull_each_other(name: str, apart_px: float) -> None:
@@ -301,7 +301,7 @@ def test_stars_side_by_side_do_not_pull_each_other(name: str, apart_px: float) -
     assert np.all((chi2 > 0.7) & (chi2 < 1.3))
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize("name", list(CENTROIDERS))
 def test_the_flux_is_the_light_above_the_sky(name: str) -> None:
     image = np.random.default_rng(24).normal(300, 2, (128, 128)) + gaussian(
@@ -312,7 +312,7 @@ def test_the_flux_is_the_light_above_the_sky(name: str) -> None:
     assert found.flux[0] == pytest.approx(5e4, abs=225)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize("name", list(CENTROIDERS))
 def test_a_big_endian_frame_gives_the_same_centroids(name: str) -> None:
     image = np.random.default_rng(25).normal(300, 5, (128, 128)) + gaussian(

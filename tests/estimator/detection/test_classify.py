@@ -68,7 +68,7 @@ def test_stars_are_not_flagged(sigma: float) -> None:
     assert np.concatenate(flags).tolist() == [0] * 200
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_hot_pixels_are_flagged_and_left_out() -> None:
     rng = np.random.default_rng(41)
     light, xy = sky_frame(rng, 15, 0.7)
@@ -87,7 +87,7 @@ def off_px(found: Centroids, places: np.ndarray) -> np.ndarray:
     return np.linalg.norm(found.xy_px[None] - places[:, None], axis=2).min(axis=1)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize("angle_deg", [10.0, 45.0, 100.0, 170.0])
 def test_a_track_among_round_stars_is_flagged(angle_deg: float) -> None:
     rng = np.random.default_rng(42)
@@ -402,7 +402,7 @@ def test_rows_of_equal_lights_are_not_flagged_as_text() -> None:
     assert blobs.flag.tolist() == [0] * 21
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 @pytest.mark.parametrize("seed", [2, 50, 84])
 def test_columns_of_readout_smear_are_not_taken_for_streaks(seed: int) -> None:
     """Saturated stars leave columns from border to border: they are parallel, but no star moved along them."""

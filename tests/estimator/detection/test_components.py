@@ -34,7 +34,7 @@ def field(seed: int, sigma: float = 0.8) -> np.ndarray:
     return np.rint(rng.poisson(light) + rng.normal(200, 6, light.shape)).astype(np.uint16)
 
 
-@pytest.mark.slow  # compiles the published scans
+@pytest.mark.compiles
 @pytest.mark.parametrize("seed", range(4))
 def test_both_component_scans_find_the_same_objects(seed: int) -> None:
     image = field(seed)

@@ -43,7 +43,6 @@ def nearest_px(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return np.linalg.norm(found[None] - wanted[:, None], axis=2).min(axis=1)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [4.0, 4.5, 5.0])
 def test_the_false_alarm_rate_on_white_noise_is_the_gaussian_tail(sigma: float) -> None:
     rng = np.random.default_rng(4)

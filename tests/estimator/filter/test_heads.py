@@ -91,7 +91,7 @@ def test_errors_of_two_mountings_match_the_covariance(
     assert abs(every - states) < 4 * np.sqrt(2 * states / 150)
 
 
-@pytest.mark.slow
+@pytest.mark.compiles
 def test_a_constant_model_does_not_claim_a_walk() -> None:
     """The same flights with mountings that drift: a filter without the random walk understates their errors."""
     rng = np.random.default_rng(3)

@@ -50,7 +50,6 @@ def assert_sound(state: FilterState) -> None:
     )
 
 
-@pytest.mark.slow
 @law(
     AttitudeFilter.propagate,
     AttitudeFilter.state,
