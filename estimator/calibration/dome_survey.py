@@ -526,6 +526,7 @@ def _check_one_group(incidence: csr_array, frame_rows: Ints) -> None:
     A group that shares only one light with the rest could rotate about it. The group grows from the frame with the most
     lights.
     """
+    # Frames by lights; the group begins with the frame with the most lights.
     table = incidence[frame_rows].astype(float)
     member = np.zeros(len(frame_rows), dtype=bool)
     member[np.argmax(table.sum(axis=1))] = True
@@ -535,6 +536,7 @@ def _check_one_group(incidence: csr_array, frame_rows: Ints) -> None:
         if (grown == member).all():
             break
         member = grown
+    # The message names one frame of the group and one outside it.
     if not member.all():
         first = frame_rows[member][0]
         second = frame_rows[~member][0]

@@ -37,6 +37,7 @@ class Subset:
 
     def insert_into(self, full: Bundle, fitted: Bundle) -> Bundle:
         """Return the full bundle with the adjusted values of this subset inserted."""
+        # Lights and frames outside of the subset keep their values.
         position = full.position_m.copy()
         rotated = full.R_body_from_lab.copy()
         position[self.led] = fitted.position_m

@@ -312,6 +312,7 @@ def _maximum(deviation: Floats, source: str) -> float:
 def _covariance(lab_m: Floats, led: Ints) -> Floats:
     """Return the (N, 3, 3) sample covariance of each light's positions, m^2; NaN for a single position."""
     count = np.bincount(led)
+    # Deviations from each light's mean position
     mean_m = np.array([np.bincount(led, column) for column in lab_m.T]) / count
     difference_m = lab_m - mean_m.T[led]
     covariance = np.zeros((len(count), 3, 3))

@@ -129,6 +129,7 @@ def streak(
             rows[short] = _fit_gaussians(image, blobs.take(short), gain_e_dn, priors)
         rows = _with_fallback(rows, image, blobs, gain_e_dn)
         covariance[failed] = rows[failed, 2, None, None] ** 2 * np.eye(2)
+    # Covariance of the streaks without their priors
     own = streaks[:, [10, 12, 12, 11]].reshape(-1, 2, 2)
     if blobs.turn_rad:
         # 3. A streak v that a roll w bends is an arc. Its mean is off its middle by a 24th of the acceleration w J v,
@@ -144,6 +145,7 @@ def streak_ends(
     """Return the two ends of each streak, (N, 2) each, in arbitrary order; NaN for a blob that is not a streak."""
     image = prepare(image, blobs, gain_e_dn, priors)
     rows = _fit_streaks(image, blobs, gain_e_dn, priors)
+    # Center minus and plus half the streak
     return rows[:, :2] - rows[:, 3:5] / 2, rows[:, :2] + rows[:, 3:5] / 2
 
 
@@ -187,6 +189,7 @@ def prepare(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors)
     checks.number("gain_e_dn", gain_e_dn, 1e-300, np.inf, "above 0; inf without photon noise")
     if image.ndim != 2:
         raise ImageError(f"an image of shape {image.shape}; allowed: monochrome, (height, width)")
+    # Boxes within the image: x0, y0 of 0 or more, x1, y1 below its size
     edge = np.array([image.shape[1], image.shape[0]] * 2)
     if len(blobs) and not (blobs.box_px.min() >= 0 and (blobs.box_px.max(axis=0) < edge).all()):
         raise ImageError(
@@ -263,6 +266,7 @@ def _median_shift(vectors_px: Floats, expected_px: Floats) -> Floats:
         return np.zeros(2)
     vectors = vectors_px[measured]
     expected = expected_px[measured]
+    # A streak and its reverse are equal: give each the sign of the expected one.
     sign = np.where(np.sum(vectors * expected, axis=1) < 0, -1.0, 1.0)
     return np.asarray(np.median(sign[:, None] * vectors - expected, axis=0))
 

@@ -123,6 +123,7 @@ def _fit(
     start_y = p[Y]
     normal = np.empty((6, 6))
     step = np.empty(5)
+    # Initial flux: the sum of the window above the sky
     p[FLUX] = max(window.sum() - window.size * p[SKY], 1e-9)
     for _ in range(MAX_ITERATIONS):
         # 1. Derivatives

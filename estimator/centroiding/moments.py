@@ -133,7 +133,7 @@ def squared_light(
         neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
         cx = cy = flux = weight = moment_variance = second_moment = 0.0
         sigma2 = 0.0
-        for sweep in range(2):  # first the position, then its variance about it
+        for sweep in range(2):  # first c and the flux, then the sums about c
             for y in range(y0, y1 + 1):
                 for x in range(x0, x1 + 1):
                     if belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
@@ -154,6 +154,7 @@ def squared_light(
             if sweep == 0:
                 if weight == 0:
                     break
+                # c, and n^2 of one pixel there
                 cx = cx / weight
                 cy = cy / weight
                 sigma2 = (interpolate(noise, height, width, cy, cx) / FILTERED_NOISE) ** 2
@@ -228,6 +229,7 @@ def gaussian_windowed(
             scale = min(1.0, 0.7 / max(abs(dx), abs(dy), 1e-300))
             cx = cx + scale * dx
             cy = cy + scale * dy
+            # Too far from the blob: another source
             if abs(cx - xy[n, 0]) > 2 + sqrt(s2) or abs(cy - xy[n, 1]) > 2 + sqrt(s2):
                 break
             if iteration < SIZING_ITERATIONS:

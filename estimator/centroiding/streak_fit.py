@@ -352,6 +352,7 @@ def _rows(
         tail_sum, tail_bell = _gaussian_integral(tail)
         across = exp(-v * v / (2 * w * w)) / (w * sqrt(2 * pi) * length)
         unit = (head_sum - tail_sum) * across
+        # Derivatives of `unit` by u and v
         by_u = (head_bell - tail_bell) / w * across
         by_v = -v / (w * w) * unit
         rows[X, k] = -flux * (along_x * by_u - along_y * by_v)

@@ -271,6 +271,7 @@ def check_image(image: NDArray) -> None:
     if image.ndim != 2:
         raise ImageError(f"an image of shape {image.shape}; allowed: monochrome, (height, width)")
     check_size(image)
+    # A sample of the pixels is quicker than all of them.
     some = image[::97, ::89]
     if image.dtype.kind != "f" and some.min() != some.max():
         return  # integers are finite, and the sample shows that the image is not constant
@@ -351,6 +352,7 @@ def replace_bad_pixels(image: NDArray, bad_px: Ints) -> NDArray:
     if len(x) and not (x.min() >= 0 and x.max() < width and y.min() >= 0 and y.max() < height):
         raise ImageError(f"the bad-pixel map reaches beyond the frame of {width}x{height} pixels")
     bad = set(zip(x.tolist(), y.tolist(), strict=True))
+    # A wider neighborhood only if the near one has no good pixel
     for column, row in bad:
         for reach in (1, 2):
             good = [
@@ -517,6 +519,7 @@ def _scan(
 ) -> Blobs:
     """Run one of SHEFEX's scans and convert its table to Blobs."""
     image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
+    # One level for the frame, and the noise of a raw pixel
     flat = flat_background(estimate_background(image), image.shape)
     level = float(flat.level[0, 0])
     noise = float(flat.noise[0, 0]) / FILTERED_NOISE

@@ -111,6 +111,7 @@ def _flood_fill(
     box[3] = y
     object_sums[:] = 0.0
     object_sums[PEAK] = -np.inf
+    # The stack holds pixels that are assigned but not summed yet.
     stack[0, 0] = y
     stack[0, 1] = x
     assigned[y, x] = 1

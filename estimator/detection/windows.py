@@ -131,6 +131,7 @@ def _grow(
 ) -> None:
     """Sum the pixels connected to a peak into `box` and `total` by flood fill, up to 4096 pixels."""
     height, width = image.shape
+    # Pixels to be summed, and all pixels that have ever been among them
     stack = [(x, y)]
     visited = {(x, y)}
     box[0] = x

@@ -63,6 +63,7 @@ def checked_samples(
     samples[:, 1:4] = np.where(lost[:, None] & np.isnan(angle), 0.0, angle)
     if not (np.isfinite(samples[:, :4]).all() and np.isfinite(np.asarray(saturated, float)).all()):
         raise ValueError("propagate: NaN or infinite times or angles; allowed: finite ones")
+    # Lengths of the intervals
     step_s = np.diff(ends_s, prepend=start_s)
     longest_s = 0.1 * gyro.bias_time_s
     if not (step_s.min() > 0 and step_s.max() <= longest_s):

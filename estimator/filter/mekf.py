@@ -222,6 +222,7 @@ class AttitudeFilter:
         self._gate = float(chdtri(3, chdtrc(1, not_negative("gate_sigma", gate_sigma) ** 2)))
         self._layout = build_layout(gyro, self._tracker, considered, heads)
         self._heads = heads
+        # Standard deviations at the start; the slow error is normalized.
         sigma_bias = not_negative("sigma_bias_rad_s", sigma_bias_rad_s) * np.ones(3)
         sigmas: dict[str, ArrayLike] = {
             "attitude": not_negative("sigma_attitude_rad", sigma_attitude_rad) * np.ones(3),
@@ -244,6 +245,7 @@ class AttitudeFilter:
         state = self._current
         slices = self._layout.reported
         size = max(rows.stop for rows in slices.values())
+        # Attitude and bias are the first six states.
         return FilterState(
             state.t_s,
             state.body_from_ref,
@@ -304,6 +306,7 @@ class AttitudeFilter:
         samples = checked_samples(start_s, t_s, angle_rad, saturated, missing, self._gyro)
         self._current = self._propagate_state(self._current, samples)
         self._measured_rad_s = samples[:, 1:4].sum(axis=0) / (samples[-1, 0] - start_s)
+        # The samples belong to the history since the last solution.
         last = self._segments[-1]
         self._segments[-1] = last._replace(samples=np.concatenate([last.samples, samples]))
         self._trim_history(float(samples[-1, 0]) - HISTORY_S)
@@ -404,6 +407,7 @@ class AttitudeFilter:
         since_s = prior.t_s - prior.used_s
         jump = Jump(angle_rad, update.distance, agreeing, since_s, prior.lost_rad, prior.support)
         odds = log_odds(jump, self._jumps)
+        # Adopt only what is confirmed and probable.
         status = OUTSIDE_GATE
         if agreeing >= CONFIRMATIONS:
             status = RESET if odds >= ENOUGH else DISPUTED
@@ -430,6 +434,7 @@ class AttitudeFilter:
     def _replay(self, k: int) -> None:
         """Apply the solutions after segment k again, from its new state. They have passed the gate already."""
         for j in range(k + 1, len(self._segments)):
+            # State before solution j, from the new state after the one before it
             earlier = self._segments[j - 1]
             segment = self._segments[j]
             assert segment.solution is not None

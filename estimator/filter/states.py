@@ -528,6 +528,7 @@ def build_layout(
     for name, elements in (("scale", DIAGONAL), ("misalignment", OFF_DIAGONAL)):
         if name in slices:
             columns[elements] = np.arange(slices[name].start, slices[name].stop)
+    # The slow errors are the last states; the mountings of all heads are side by side.
     slow = slice(slices["systematic"].start, size)
     mounts = [rows for name, rows in slices.items() if name.startswith("mounting")]
     mountings = [row for rows in mounts for row in range(rows.start, rows.stop)]
@@ -585,6 +586,7 @@ def decorrelate(state: MekfState, tracker: TrackerModel, layout: Layout) -> Mekf
     # The angle between two quaternions; the scalar product may exceed 1 by rounding.
     turned_rad = 2 * math.acos(min(abs(float(state.ref_from_body_wxyz @ state.used_wxyz)), 1.0))
     kept = math.exp(-turned_rad / tracker.systematic_angle_rad)
+    # P <- D P D with D = k for the slow errors and 1 for the others
     factor = np.ones(layout.size)
     factor[rows] = kept
     covariance = state.covariance * np.outer(factor, factor)
