@@ -24,27 +24,26 @@ class LedMap:
     Attributes
     ----------
     id
-        (N,)
+        (N,) number of each LED
     position_m
-        (N, 3)
+        (N, 3) position of each LED
     center_m, semi_axes_m
-        (3,) the ellipsoid |(x - center) / semi_axes| = 1 that the LEDs are on
+        (3,) center and semi-axes of the ellipsoid |(x - center) / semi_axes| = 1 of the LEDs
     board
-        (N,) label of the patch board of each LED, as all boards have the same pattern; None
+        (N,) label of the patch board of each LED, since all boards have the same pattern; None
         without boards
     sigma_m
-        Standard deviation of an LED's position along each axis; the rms of all, if
-        covariance_m2 says more
+        Standard deviation of an LED's position along each axis; the rms over all LEDs if
+        `covariance_m2` is given
     covariance_m2
-        (N, 3, 3) of each LED's own error; None if it is the same for all, along all axes
+        (N, 3, 3) covariance of each LED's own position error; None if all are sigma_m^2 I
     common_m
-        (M, N, 3) displacement of each LED by one standard deviation of each error that all LEDs
-        share: of the surface, of the instrument's place and orientation; None without any
+        (M, N, 3) displacement of each LED by one standard deviation of each of the M errors that
+        all LEDs share (surface, position and orientation of the instrument); None without any
     flux_s
-        (N,) flux of each LED's light, in the frame's numbers per second of exposure; None if
-        all are alike
+        (N,) flux of each LED, in image units per second of exposure; None if all are alike
     flux_sigma
-        Standard deviation of the natural logarithm of a measured flux over that
+        Standard deviation of the natural logarithm of measured over expected flux
     """
 
     id: Ints
@@ -66,9 +65,9 @@ class Lever:
     Attributes
     ----------
     camera_body_m
-        (3,) entrance pupil in the body frame
+        (3,) position of the entrance pupil, from the bearing center, in the body frame
     cam_from_body
-        rotation
+        Rotation from the body frame to camera axes
     sigma_m
         Standard deviation of the pupil's position along each axis
     """
@@ -81,15 +80,24 @@ class Lever:
 def on_sphere(rays_body: Floats, camera_body_m: Floats, radius_m: Floats | float) -> Floats:
     """Return (N, 3) intersections of rays from the camera with a sphere about the bearing center, in the body frame.
 
-    |c + s u| = R gives s = -c.u + sqrt((c.u)^2 - c.c + R^2). No attitude is needed: the sphere is the same in every
-    attitude. Raises ValueError if the camera is outside the sphere.
+    The distance s along the ray u from the camera at c follows from |c + s u| = R:
+    s = -c.u + sqrt((c.u)^2 - c.c + R^2). No attitude is needed: the sphere is the same in every attitude.
 
     Parameters
     ----------
+    rays_body
+        (N, 3) unit vectors in the body frame
+    camera_body_m
+        (3,) position c of the camera in the body frame
     radius_m
-        Of one sphere, or (N,) of one for each ray
+        Radius R of one sphere, or (N,) radius of the sphere of each ray
+
+    Raises
+    ------
+    ValueError
+        If the camera is outside the sphere.
     """
-    along = rays_body @ camera_body_m
+    along = rays_body @ camera_body_m  # c.u
     discriminant = along**2 - camera_body_m @ camera_body_m + radius_m**2
     least_m = np.min(radius_m)
     if least_m <= np.linalg.norm(camera_body_m):
@@ -102,25 +110,29 @@ def on_sphere(rays_body: Floats, camera_body_m: Floats, radius_m: Floats | float
 def on_surface(rays_lab: Floats, origin_lab_m: Floats, leds: LedMap) -> Floats:
     """Return (N, 3) intersections of rays from inside with the believed ellipsoid, in the lab frame; NaN if none.
 
-    In scaled coordinates w = (x - center) / semi_axes the surface is |w| = 1: a quadratic equation for the distance.
+    In the scaled coordinates w = (x - center) / semi_axes the surface is the unit sphere. With w = w0 + s v along a
+    ray, |w| = 1 is the quadratic equation a s^2 + 2 b s + c = 0, a = v.v, b = v.w0, c = w0.w0 - 1. The larger root
+    is the intersection ahead of an origin inside: s = (-b + sqrt(b^2 - a c)) / a.
     """
-    start = (origin_lab_m - leds.center_m) / leds.semi_axes_m
-    along = rays_lab / leds.semi_axes_m
+    start = (origin_lab_m - leds.center_m) / leds.semi_axes_m  # w0
+    along = rays_lab / leds.semi_axes_m  # v
     a = np.sum(along**2, axis=1)
     b = along @ start
     discriminant = b**2 - a * (start @ start - 1)
-    distance = np.where(discriminant >= 0, (-b + np.sqrt(np.maximum(discriminant, 0))) / a, np.nan)
+    root = np.sqrt(np.maximum(discriminant, 0))
+    distance = np.where(discriminant >= 0, (-b + root) / a, np.nan)
     return origin_lab_m + distance[:, None] * rays_lab
 
 
 def project(body_from_lab: Rotation, position_m: Floats, lever: Lever, camera: Camera) -> Floats:
     """Project LEDs at (N, 3) lab positions to (N, 2) pixels; NaN behind the camera."""
+    # q = A P - c: from the camera to the LED, in the body frame
     in_body = body_from_lab.apply(position_m) - lever.camera_body_m
     return camera.pixels(lever.cam_from_body.apply(in_body))
 
 
 def check_map(leds: object) -> None:
-    """Raise ImageError unless a map's arrays belong together and its numbers can be used."""
+    """Raise ImageError unless a map's arrays have matching shapes and usable numbers."""
     checks.of_type("leds", leds, LedMap)
     assert isinstance(leds, LedMap)
     count = len(checks.rows("leds: position_m", leds.position_m, None, 3))
@@ -140,15 +152,14 @@ def check_map(leds: object) -> None:
     if leds.common_m is not None:
         checks.floats("leds: common_m", leds.common_m, (None, count, 3))
     checks.number("leds: flux_sigma", leds.flux_sigma, 1e-3, 10.0, "0.001 to 10")
-    if (
-        leds.flux_s is not None
-        and not (checks.floats("leds: flux_s", leds.flux_s, (count,)) > 0).all()
-    ):
-        raise ImageError("leds: flux_s is 0 or less, or not a number; allowed: above 0")
+    if leds.flux_s is not None:
+        flux_s = checks.floats("leds: flux_s", leds.flux_s, (count,))
+        if not (flux_s > 0).all():  # False for NaN too
+            raise ImageError("leds: flux_s is 0 or less, or not a number; allowed: above 0")
 
 
 def check_lever(leds: LedMap, lever: Lever) -> None:
-    """Raise ImageError unless the lever can be used, and its arm is shorter than the distance of the nearest LED."""
+    """Raise ImageError unless the lever's numbers are usable and its arm is shorter than the nearest LED's distance."""
     checks.of_type("lever", lever, Lever)
     if not np.isfinite(checks.floats("lever: camera_body_m", lever.camera_body_m, (3,))).all():
         raise ImageError("lever: camera_body_m has a NaN or infinity; allowed: finite")

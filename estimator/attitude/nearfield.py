@@ -12,15 +12,15 @@ position in the lab frame and c the camera's position in the body frame. The met
 
 All have the same signature. Each takes
 
-rays_cam      : (N, 3) unit vectors in camera axes
-sigma_rad     : (N,) their standard deviation per axis; for the methods in TANGENT_SOLVERS, that of their tangents
-position_m    : (N, 3) position of each ray's LED in the lab frame
-leds, lever   : the believed surface and the believed position of the camera
-body_from_lab : the initial attitude; not used by infinity and thesis
+- `rays_cam`: (N, 3) unit vectors in camera axes;
+- `sigma_rad`: (N,) standard deviation of each ray per axis; for the methods in TANGENT_SOLVERS, that of its tangents;
+- `position_m`: (N, 3) position of each ray's LED in the lab frame;
+- `leds`, `lever`: the believed surface, and the believed position and orientation of the camera;
+- `body_from_lab`: the initial attitude; `infinity` and `thesis` do not use it;
 
 and returns body_from_lab with its (3, 3) covariance in body axes, rad^2. The covariance includes the noise of the rays
-only: neither errors of the believed positions nor the bias of the method, which noise-free rays reveal. All raise
-ValueError if the rays do not determine an attitude.
+only. It includes neither errors of the believed positions nor the bias of the method, which noise-free rays reveal. All
+raise ValueError if the rays do not determine an attitude.
 """
 
 from __future__ import annotations
@@ -65,13 +65,30 @@ def rotation_only(
     lever: Lever,
     body_from_lab: Rotation,
 ) -> tuple[Rotation, Floats]:
-    """Exact solution: body_from_lab and its (3, 3) covariance in body axes, from N >= 2 rays and their LEDs.
+    """Fit the exact model: body_from_lab and its (3, 3) covariance in body axes, from N >= 2 rays and their LEDs.
 
-    Minimizes the weighted residual of the tangents (q_x / q_z, q_y / q_z) by Gauss-Newton in camera axes, with
-    q = b - r, b = A P and r the lever arm. The update is A <- exp([w]) A, the Jacobian J_i = D(q) (-[b_i]x) with
-    D = [[1/q_z, 0, -q_x/q_z^2], [0, 1/q_z, -q_y/q_z^2]]. Uses the LEDs' positions and the constraint that the camera
-    rotates about the bearing center, but not the surface. Raises ValueError if it does not converge, or if the LEDs do
-    not determine all three angles.
+    The fit minimizes the weighted residuals of the tangents, sum |m_i - y_i|^2 / sigma_i^2, over the rotation A alone.
+    In camera axes, with P the LED's position and r the lever arm,
+
+        b = A P,  q = b - r,  y = (q_x / q_z, q_y / q_z),
+        J = dy/dw = D(q) (-[b]x),  D = [[1/q_z, 0, -q_x/q_z^2], [0, 1/q_z, -q_y/q_z^2]],
+
+    where w is a small rotation, A <- exp([w]) A. Gauss-Newton repeats four steps:
+
+    1. Predict each LED's tangents y, their residuals m - y and their Jacobian J.
+    2. Sum the normal equations N w = g, with N = sum(J^T J / sigma^2) and g = sum(J^T (m - y) / sigma^2), and solve.
+    3. Rotate A by w.
+    4. Stop if |w| is below CONVERGED_STEP_RAD.
+
+    5. The covariance is N^-1.
+
+    The method uses the LEDs' positions and the constraint that the camera rotates about the bearing center, but not
+    the surface. The equations are derived here; the model is that of reference, section 5.
+
+    Raises
+    ------
+    ValueError
+        If the fit does not converge, or if the LEDs do not determine all three angles.
     """
     body_from_lab, _, covariance_cam = _fit_rotation(
         rays_cam, sigma_rad, position_m, lever, body_from_lab, False
@@ -82,10 +99,11 @@ def rotation_only(
 def fit_focal_ratio(
     rays_cam: Floats, sigma_rad: Floats, position_m: Floats, lever: Lever, body_from_lab: Rotation
 ) -> float:
-    """The true focal length over the assumed one, from N >= 2 rays and their LEDs.
+    """Return the ratio of the true focal length to the assumed one, from N >= 2 rays and their LEDs.
 
-    The fit of `rotation_only` with one more unknown, the logarithm of the ratio rho: the tangents are
-    rho (q_x / q_z, q_y / q_z), their derivative by it they themselves. Raises ValueError as that does.
+    This is the fit of `rotation_only` with one more unknown, the logarithm of the ratio rho. The tangents are
+    y = rho (q_x / q_z, q_y / q_z), and their derivative with respect to log rho is y itself. The errors raised are
+    those of `rotation_only`.
     """
     return _fit_rotation(rays_cam, sigma_rad, position_m, lever, body_from_lab, True)[1]
 
@@ -98,8 +116,8 @@ def _fit_rotation(
     body_from_lab: Rotation,
     with_focal: bool,
 ) -> tuple[Rotation, float, Floats]:
-    """body_from_lab, the focal ratio (1 unless it is fitted), and the covariance of both in camera axes."""
-    R_cam_from_lab = (lever.cam_from_body * body_from_lab).as_matrix()
+    """Return body_from_lab, the focal ratio (1 unless `with_focal`), and the covariance of both in camera axes."""
+    R_cam_from_lab = (lever.cam_from_body * body_from_lab).as_matrix()  # updated in place
     lever_cam_m = lever.cam_from_body.apply(lever.camera_body_m)
     ratio, step_rad, covariance_cam = _fitted_rotation(
         rays_cam,
@@ -128,10 +146,11 @@ def _fitted_rotation(
     R: Floats,
     with_focal: bool,
 ) -> tuple[float, float, Floats]:
-    """The focal ratio, the length of the last step, and the covariance of rotation and logarithm of the ratio.
+    """Run the fit of `rotation_only`: the focal ratio, the last step's length, and the covariance in camera axes.
 
-    The step's length is NaN if the rays do not determine the unknowns: the LEDs lie in one direction from the bearing,
-    about which any rotation fits.
+    The step's length is NaN if the rays do not determine the unknowns: all LEDs are in one direction from the bearing,
+    and a rotation about that direction changes nothing. The covariance is (3, 3) of the rotation, rad^2, or (4, 4)
+    with the logarithm of the ratio. The numbered steps are those of `rotation_only`.
 
     Parameters
     ----------
@@ -141,22 +160,27 @@ def _fitted_rotation(
     unknowns = 4 if with_focal else 3
     normal = np.empty((unknowns + 1, unknowns + 1))
     rows = np.empty((unknowns + 1, 2 * len(rays_cam)))
-    weight = np.repeat(1 / sigma_rad**2, 2)
+    weight = np.repeat(1 / sigma_rad**2, 2)  # both tangents of a ray have the same weight
     step = np.empty(unknowns)
     covariance = np.eye(unknowns)
     log_ratio = 0.0
     length = np.nan
     for _ in range(30):
+        # 1. Predicted tangents, residuals, Jacobian.
         _residual_rows(rays_cam, position_m, lever_cam_m, R, np.exp(log_ratio), rows)
+        # 2. Normal equations; the solver leaves their Cholesky factor in `normal`.
         normal_equations(rows, weight, rows.shape[1], normal)
         if np.isnan(least_squares_step(normal, step)):
             return 1.0, np.nan, covariance
+        # 3. Update. A step of the focal length is limited to a factor e.
         rotate_in_place(step[:3], R)
         if with_focal:
             log_ratio += min(max(step[3], -1.0), 1.0)
+        # 4. Convergence
         length = np.sqrt(np.sum(step**2))
         if length < CONVERGED_STEP_RAD:
             break
+    # 5. Covariance N^-1, column by column from the unit vectors.
     factor = normal[:unknowns, :unknowns]
     for i in range(unknowns):
         cholesky_solve(factor, covariance[i])
@@ -167,26 +191,32 @@ def _fitted_rotation(
 def _residual_rows(
     rays_cam: Floats, position_m: Floats, lever_cam_m: Floats, R: Floats, ratio: float, rows: Floats
 ) -> None:
-    """Fill rows (4 or 5, 2 N) with the derivatives of the tangents by rotation (and log ratio), then the residuals."""
+    """Fill `rows` (4 or 5, 2 N): derivatives of the tangents by the rotation (and log ratio), then the residuals.
+
+    The tangent x = rho q_x / q_z has the gradient d = rho (1/q_z, 0, -q_x/q_z^2) with respect to q. A small rotation w
+    moves q by w x b, so that dx = d . (w x b) = w . (b x d): the three derivatives are b x d. The same holds for y.
+    """
     last = len(rows) - 1
     for n in range(len(rays_cam)):
-        bx, by, bz = rotate(R, row(position_m, n))
+        bx, by, bz = rotate(R, row(position_m, n))  # b = A P
         qx = bx - lever_cam_m[0]
         qy = by - lever_cam_m[1]
         qz = bz - lever_cam_m[2]
         x = ratio * qx / qz
         y = ratio * qy / qz
         scale = ratio / qz
-        # The derivative of a tangent by w is b x d, with d its derivative by q.
+        # b x d for the tangents x (even columns) and y (odd columns)
         rows[0, 2 * n] = -by * x / qz
         rows[0, 2 * n + 1] = -by * y / qz - bz * scale
         rows[1, 2 * n] = bz * scale + bx * x / qz
         rows[1, 2 * n + 1] = bx * y / qz
         rows[2, 2 * n] = -by * scale
         rows[2, 2 * n + 1] = bx * scale
+        # The derivative of rho (q_x / q_z) with respect to log rho is the tangent itself.
         if last == 4:
             rows[3, 2 * n] = x
             rows[3, 2 * n + 1] = y
+        # Residuals: measured minus predicted tangents
         rows[last, 2 * n] = rays_cam[n, 0] / rays_cam[n, 2] - x
         rows[last, 2 * n + 1] = rays_cam[n, 1] / rays_cam[n, 2] - y
 
@@ -201,12 +231,13 @@ def tangent_gradients(q: Floats) -> Floats:
 
 
 def tangent_jacobian(b: Floats, q: Floats) -> Floats:
-    """Return the (2 N, 3) derivative of the tangents of q = b - r by a small rotation w of b: dq = w x b."""
-    # d . (w x b) = w . (b x d)
+    """Return the (2 N, 3) derivative of the tangents of q = b - r with respect to a small rotation w: dq = w x b."""
+    # With d the gradient of a tangent: d . (w x b) = w . (b x d).
     return np.cross(b[:, None, :], tangent_gradients(q)).reshape(-1, 3)
 
 
 def _in_body_axes(covariance_cam: np.ndarray, lever: Lever) -> Floats:
+    """Return a (3, 3) covariance of a small rotation in body axes, from one in camera axes: R P R^T."""
     R_body_from_cam = lever.cam_from_body.inv().as_matrix()
     return R_body_from_cam @ covariance_cam @ R_body_from_cam.T
 
@@ -214,19 +245,24 @@ def _in_body_axes(covariance_cam: np.ndarray, lever: Lever) -> Floats:
 def _wahba(
     point_body_m: Floats, distance_m: Floats, sigma_rad: Floats, position_m: Floats
 ) -> Rotation:
-    """Solve body_from_lab from points in body axes and in the lab, by their directions from the bearing center.
+    """Return body_from_lab from points in body axes and in the lab, by their directions from the bearing center.
 
-    A ray error of sigma at the camera displaces the point by sigma * distance, and its direction from the center by
-    sigma * distance / radius, which sets the weights.
+    A ray error of sigma at the camera displaces the point by sigma * distance. Its direction from the center changes
+    by sigma * distance / radius, which sets the weights of Wahba's problem.
 
     Parameters
     ----------
+    point_body_m
+        (N, 3) points from the bearing center, in body axes
     distance_m
         (N,) distance of each point from the camera
+    position_m
+        (N, 3) the same points in the lab frame
     """
     radius = np.linalg.norm(point_body_m, axis=1)
+    observed = point_body_m / radius[:, None]
     target = position_m / np.linalg.norm(position_m, axis=1, keepdims=True)
-    return quest(point_body_m / radius[:, None], target, sigma_rad * distance_m / radius)
+    return quest(observed, target, sigma_rad * distance_m / radius)
 
 
 def _with_covariance(
@@ -239,14 +275,22 @@ def _with_covariance(
     by_ray_m: Floats,
     by_rotation_m: Floats | float = 0.0,
 ) -> tuple[Rotation, Floats]:
-    """Return a solution of _wahba with its (3, 3) covariance in body axes, from the noise of the rays.
+    """Return a solution of `_wahba` with its (3, 3) covariance in body axes, rad^2, from the noise of the rays.
 
-    At the minimum of Wahba's loss the gradient vanishes, sum(k a x d) = 0 with a = A P / |P|, d = p / |p| and weight k.
-    To first order, ray noise du causes a rotation w that keeps it zero:
-    sum(k [(a.d) I - a d']) w = sum(k a x (I - d d') dp / |p|), dp = by_ray du + u (by_rotation . w). Derived here.
+    At the minimum of Wahba's loss its gradient vanishes: sum(k a x d) = 0, with a = A P / |P|, d = p / |p| and the
+    weight k. To first order, ray noise du causes the rotation w that keeps the gradient zero (derived here):
+
+        sum(k [(a.d) I - a d^T]) w = sum(k a x (I - d d^T) dp / |p|),    dp = by_ray du + u (by_rotation . w).
+
+    1. Compute the gradient's derivative G_i by a shift dp_i of each point: the columns of k a x (I - d d^T) / |p|.
+    2. Compute the Hessian H: the bracket on the left, less the part of dp that depends on w.
+    3. Map ray noise of sigma across the ray to the rotation: w_i = H^-1 G_i by_ray (I - u u^T) sigma_i.
+    4. Sum over the independent rays: P = sum(w_i w_i^T).
 
     Parameters
     ----------
+    rays_body
+        (N, 3) unit vectors u in body axes
     by_ray_m
         (N, 3, 3) dp/du, the derivative of a point p with respect to its ray u
     by_rotation_m
@@ -256,16 +300,19 @@ def _with_covariance(
     radius = np.linalg.norm(point_body_m, axis=1)
     d = point_body_m / radius[:, None]
     a = body_from_lab.apply(position_m / np.linalg.norm(position_m, axis=1, keepdims=True))
-    weight = (radius / (sigma_rad * distance_m)) ** 2
+    weight = (radius / (sigma_rad * distance_m)) ** 2  # k
+    # 1. Columns of G: derivative of a point's term k a x d by a shift along each axis.
     across_point = np.eye(3) - np.einsum("ni,nj->nij", d, d)
-    # Columns: derivative of a point's term k a x d, of the loss's gradient, by a shift along each axis.
     gradient = np.cross(a[:, None, :], np.swapaxes(across_point, 1, 2)).swapaxes(1, 2)
     gradient *= (weight / radius)[:, None, None]
+    # 2. Hessian
     gradient_along_ray = np.einsum("nij,nj->ni", gradient, rays_body)
     hessian = np.eye(3) * (weight * np.sum(a * d, axis=1)).sum() - (weight[:, None] * a).T @ d
     hessian -= gradient_along_ray.T @ (by_rotation_m * np.ones_like(gradient_along_ray))
+    # 3. Rotation by a ray's noise; a unit vector has noise only across itself.
     across_ray = np.eye(3) - np.einsum("ni,nj->nij", rays_body, rays_body)
     response = np.linalg.solve(hessian, gradient @ by_ray_m @ across_ray) * sigma_rad[:, None, None]
+    # 4. Covariance
     return body_from_lab, np.einsum("nij,nkj->ik", response, response)
 
 
@@ -277,7 +324,7 @@ def infinity(
     lever: Lever,
     body_from_lab: Rotation,
 ) -> tuple[Rotation, Floats]:
-    """Stars at infinity: Wahba's problem with the rays as directions from the bearing center.
+    """Take the LEDs as infinitely far: solve Wahba's problem with the rays as directions from the bearing center.
 
     This is what a flight tracker does under a dome. The camera is closer to the dome by M, so the pattern appears
     larger by R / (R - M). The solution aligns the center of the pattern, whose own direction is wrong in proportion
@@ -285,7 +332,7 @@ def infinity(
     (reference, section 5).
     """
     rays = lever.cam_from_body.inv().apply(rays_cam)
-    at_infinity = np.ones(len(rays))
+    at_infinity = np.ones(len(rays))  # equal radius and distance: the weights are those of the rays
     body_from_lab = _wahba(rays, at_infinity, sigma_rad, position_m)
     by_ray_m = np.tile(np.eye(3), (len(rays), 1, 1))
     return _with_covariance(body_from_lab, rays, at_infinity, sigma_rad, position_m, rays, by_ray_m)
@@ -297,19 +344,28 @@ def thesis_points(
     """Return AFIT's vectors to the LEDs (Padro 2012, eqs 43-44): (N, 3) points in camera axes, m, and R - M, m.
 
     R is the height of the believed surface above the bearing, M the camera's distance from the bearing along the
-    boresight.
-    Raises ValueError if eq. 44 has no root.
+    boresight. With the angle a of a ray off the boresight,
+
+        (x, y) = (R - M) tan a (eq. 43),    z = sqrt((R - M)^2 - x^2 - y^2) (eq. 44).
 
     Parameters
     ----------
     sine
-        Correct the error in eq. 43, (x, y) = (R - M) sin a: the point is then on its ray, R - M
-        from the camera
+        Correct the error in eq. 43 to (x, y) = (R - M) sin a: the point is then on its ray, at the
+        distance R - M from the camera
+
+    Raises
+    ------
+    ValueError
+        If eq. 44 has no root.
     """
     boresight_body = lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])
-    height_m = on_surface(np.array([[0.0, 0.0, 1.0]]), np.zeros(3), leds)[0, 2]
-    distance_m = float(height_m - lever.camera_body_m @ boresight_body)
-    across_m = distance_m * (rays_cam[:, :2] if sine else rays_cam[:, :2] / rays_cam[:, 2:])
+    height_m = on_surface(np.array([[0.0, 0.0, 1.0]]), np.zeros(3), leds)[0, 2]  # R
+    distance_m = float(height_m - lever.camera_body_m @ boresight_body)  # R - M
+    # Eq. 43: across the boresight
+    across = rays_cam[:, :2] if sine else rays_cam[:, :2] / rays_cam[:, 2:]
+    across_m = distance_m * across
+    # Eq. 44: along the boresight
     along2_m2 = distance_m**2 - np.sum(across_m**2, axis=1)
     if not (distance_m > 0 and np.all(along2_m2 > 0)):
         raise ValueError(
@@ -326,25 +382,28 @@ def thesis(
     lever: Lever,
     body_from_lab: Rotation,
 ) -> tuple[Rotation, Floats]:
-    """AFIT's method: place each LED on a sphere of radius R - M about the camera, solve Wahba about the bearing.
+    """Solve by AFIT's method: place each LED on a sphere of radius R - M about the camera (Padro 2012, eqs 43-45).
 
-    Across the boresight an LED is where its ray meets a plane at R - M, (x, y) = (R - M) tan a, as the image is
-    calibrated; along the boresight z = sqrt((R - M)^2 - x^2 - y^2). The camera's position is added, and directions are
-    taken from the bearing (Padro 2012, eqs 43-45, with his x, y, z for z, x, y here). The use of tan instead of sin is
-    his error (reference 1.2, item 11). It causes the bias: .0036 degrees cross-boresight on AFIT's dome, .07 under a
-    flat ceiling at 30 degrees.
+    1. Place each LED in camera axes by `thesis_points`.
+    2. Add the camera's position, which gives points from the bearing (eq. 45).
+    3. Solve Wahba's problem for their directions.
+
+    The thesis's axes x, y, z are z, x, y here. Its eq. 43 has tan where sin is right (reference 1.2, item 11). That
+    causes the bias: .0036 degrees cross-boresight on AFIT's dome, .07 under a flat ceiling at 30 degrees.
     """
+    # 1. Points in camera axes
     point_cam, distance_m = thesis_points(rays_cam, leds, lever)
-    across_m = point_cam[:, :2]
-    # Chain rule: the point's derivative by the tangents, then the tangents' by the ray.
-    by_tangent = np.zeros((len(rays_cam), 3, 2))
-    by_tangent[:, [0, 1], [0, 1]] = distance_m
-    by_tangent[:, 2, :] = -distance_m * across_m / point_cam[:, 2:]
+    # 2. Points from the bearing, in body axes
     R_body_from_cam = lever.cam_from_body.inv().as_matrix()
-    by_ray_m = R_body_from_cam @ by_tangent @ tangent_gradients(rays_cam) @ R_body_from_cam.T
     point = point_cam @ R_body_from_cam.T + lever.camera_body_m
     distances_m = np.full(len(rays_cam), distance_m)
+    # 3. Wahba's problem
     body_from_lab = _wahba(point, distances_m, sigma_rad, position_m)
+    # dp/du by the chain rule: of the point by the tangents (eqs 43-44), then of the tangents by the ray.
+    by_tangent = np.zeros((len(rays_cam), 3, 2))
+    by_tangent[:, [0, 1], [0, 1]] = distance_m
+    by_tangent[:, 2, :] = -distance_m * point_cam[:, :2] / point_cam[:, 2:]
+    by_ray_m = R_body_from_cam @ by_tangent @ tangent_gradients(rays_cam) @ R_body_from_cam.T
     rays = rays_cam @ R_body_from_cam.T
     return _with_covariance(
         body_from_lab, point, distances_m, sigma_rad, position_m, rays, by_ray_m
@@ -359,22 +418,31 @@ def tappe(
     lever: Lever,
     body_from_lab: Rotation,
 ) -> tuple[Rotation, Floats]:
-    """NPS's method: compute the distance of each LED from the last attitude, solve Wahba, and iterate.
+    """Solve by NPS's method: compute the LEDs' distances at the last attitude, solve Wahba's problem, and iterate.
 
-    R_0 + alpha_i b_i = A beta_i r_i with alpha_i = |A P_i - R_0| (Tappe, cited by Padro 2012, eq. 33). Tappe stopped
-    after one update, or five; here it iterates to convergence. An error of a distance moves the point along its ray,
-    which is almost its direction from the bearing, so an update reduces the error by a factor of about M / R times
-    the square of the field's half-angle. The true attitude is the fixed point: there is no bias.
+    The geometry is R_0 + alpha_i b_i = A beta_i r_i with the camera at R_0, the ray b_i, the LED at beta_i r_i and the
+    distance alpha_i = |A P_i - R_0| (Tappe, cited by Padro 2012, eq. 33). Until the attitude converges:
+
+    1. Compute the distances alpha_i at the last attitude.
+    2. Place each LED on its ray at that distance.
+    3. Solve Wahba's problem for the directions from the bearing.
+
+    Tappe stopped after one update, or five; here the method iterates to convergence. An error of a distance moves the
+    point along its ray, which is almost its direction from the bearing, so an update reduces the error by a factor of
+    about M / R times the square of the field's half-angle. The true attitude is the fixed point: there is no bias.
     """
     rays = lever.cam_from_body.inv().apply(rays_cam)
     for _ in range(MAX_UPDATES):
-        # The distances change little with the attitude, so a few updates converge.
+        # 1. Distances. They change little with the attitude, so a few updates converge.
         distance_m = np.linalg.norm(body_from_lab.apply(position_m) - lever.camera_body_m, axis=1)
+        # 2. Points from the bearing
         point = lever.camera_body_m + distance_m[:, None] * rays
         previous = body_from_lab
+        # 3. Attitude
         body_from_lab = _wahba(point, distance_m, sigma_rad, position_m)
         if (body_from_lab * previous.inv()).magnitude() < CONVERGED_RAD:
             break
+    # p = c + alpha u, alpha = |b - c|: dp/du = alpha I, and a rotation w changes alpha by u.(w x p) = w.(p x u).
     by_ray_m = distance_m[:, None, None] * np.eye(3)
     by_rotation_m = np.cross(point, rays)
     return _with_covariance(
@@ -390,32 +458,38 @@ def ray_on_surface(
     lever: Lever,
     body_from_lab: Rotation,
 ) -> tuple[Rotation, Floats]:
-    """Intersect each ray with the believed ellipsoid at the last attitude, solve Wahba about the center, and iterate.
+    """Solve by placing each LED where its ray meets the believed ellipsoid, and iterate.
+
+    Until the attitude converges:
+
+    1. Intersect each ray with the ellipsoid at the last attitude (`on_surface`).
+    2. Rotate the intersections to body axes: points p from the bearing.
+    3. Solve Wahba's problem for their directions.
 
     A bias comes only from errors of the surface: LEDs off the believed ellipsoid, amplified where rays meet it
     obliquely.
     """
     rays = lever.cam_from_body.inv().apply(rays_cam)
     for _ in range(MAX_UPDATES):
+        # 1. Intersections, in the lab frame
         origin = body_from_lab.inv().apply(lever.camera_body_m)
         intersection_m = on_surface(body_from_lab.inv().apply(rays), origin, leds)
         if np.isnan(intersection_m).any():
             raise ValueError("a ray misses the believed surface")
+        # 2. Points in body axes
         point = body_from_lab.apply(intersection_m)
         distance_m = np.linalg.norm(point - lever.camera_body_m, axis=1)
         previous = body_from_lab
+        # 3. Attitude
         body_from_lab = _wahba(point, distance_m, sigma_rad, position_m)
         if (body_from_lab * previous.inv()).magnitude() < CONVERGED_RAD:
             break
-    normal = previous.apply(
-        (intersection_m - leds.center_m) / leds.semi_axes_m**2
-    )  # not normalized
+    # The gradient of |(x - center) / semi_axes|^2 / 2 is along the surface's normal; n is it over its part along u.
+    normal = previous.apply((intersection_m - leds.center_m) / leds.semi_axes_m**2)
     scaled_normal = normal / np.sum(normal * rays, axis=1, keepdims=True)
-    # With n the scaled normal, p moves on the surface by distance (du - u n.du); rotating the surface by w moves p
-    # along u by n.(w x p).
-    by_ray_m = distance_m[:, None, None] * (
-        np.eye(3) - np.einsum("ni,nj->nij", rays, scaled_normal)
-    )
+    # p moves on the surface by distance (du - u n.du); rotating the surface by w moves p along u by n.(w x p).
+    across_normal = np.eye(3) - np.einsum("ni,nj->nij", rays, scaled_normal)
+    by_ray_m = distance_m[:, None, None] * across_normal
     by_rotation_m = np.cross(point, scaled_normal)
     return _with_covariance(
         body_from_lab, point, distance_m, sigma_rad, position_m, rays, by_ray_m, by_rotation_m
@@ -430,30 +504,41 @@ def pnp(
     lever: Lever,
     body_from_lab: Rotation,
 ) -> tuple[Rotation, Floats]:
-    """Perspective-n-point: attitude and position, six degrees of freedom, from N >= 4 rays; ignores the bearing.
+    """Fit attitude and camera position (perspective-n-point), six unknowns, from N >= 4 rays; ignores the bearing.
 
-    OpenCV's Levenberg-Marquardt starts from the believed position. (A small pattern seen face on fits almost as well
-    when flipped; SQPnP, which needs no start, converged to the flipped solution in 5 % of noise-free trials.)
-    Gauss-Newton with step halving then weights the rays: residual and D as in rotation_only, q = b + t,
-    b = A (P - mean P), unknowns w and t.
+    With the pattern's mean position as origin, q = b + t, b = A (P - mean P). The unknowns are the rotation w and the
+    translation t; residuals and D(q) are those of `rotation_only`, the Jacobian is [D (-[b]x), D].
+
+    1. Start from the believed position of the camera.
+    2. Solve by OpenCV's Levenberg-Marquardt, without weights.
+    3. Refine by Gauss-Newton with step halving, with weights 1 / sigma^2.
+
+    Step 2 has a start because a small pattern seen face on fits almost as well when flipped: SQPnP, which needs no
+    start, converged to the flipped solution in 5 % of noise-free trials.
 
     A translation of a small pattern is hard to distinguish from a rotation: knowing the bearing improves the
     cross-boresight error by a factor of about a thousand (reference, section 5). The covariance is of first order;
     where a pattern is seen face on and the noise makes the flipped solution possible, the errors are not Gaussian.
-    Raises ValueError for LEDs in a line and if it does not converge.
+
+    Raises
+    ------
+    ValueError
+        For LEDs in a line, and if the fit does not converge.
     """
     if len(rays_cam) < 4:
         raise ValueError(
             f"pnp: {len(rays_cam)} rays do not determine the camera's position; 4 are needed"
         )
     measured = rays_cam[:, :2] / rays_cam[:, 2:]
-    # With the pattern's centroid as origin, rotation and translation are nearly uncorrelated.
+    # 1. With the pattern's mean as origin, rotation and translation are nearly uncorrelated.
     centroid_m = position_m.mean(axis=0)
     pattern_m = position_m - centroid_m
     start_shift_m = lever.cam_from_body.apply(body_from_lab.apply(centroid_m) - lever.camera_body_m)
+    # 2. Unweighted solution
     cam_from_lab, shift_m = _opencv_pnp(
         pattern_m, measured, lever.cam_from_body * body_from_lab, start_shift_m
     )
+    # 3. Weighted solution: residuals are divided by their standard deviations.
     weight = np.repeat(1 / sigma_rad, 2)
     cam_from_lab, covariance_cam = _gauss_newton(pattern_m, measured, cam_from_lab, shift_m, weight)
     return lever.cam_from_body.inv() * cam_from_lab, _in_body_axes(covariance_cam, lever)
@@ -462,7 +547,10 @@ def pnp(
 def _gauss_newton(
     pattern_m: Floats, measured: Floats, cam_from_lab: Rotation, shift_m: Floats, weight: Floats
 ) -> tuple[Rotation, np.ndarray]:
-    """Gauss-Newton with step halving on the weighted residual; returns cam_from_lab and its (3, 3) covariance."""
+    """Refine the six unknowns by Gauss-Newton with step halving; return cam_from_lab and its (3, 3) covariance, rad^2.
+
+    The covariance is the rotation's block of (J^T J)^-1, with the weights in J.
+    """
     residual, jacobian = _six_dof_residual(pattern_m, measured, cam_from_lab, shift_m, weight)
     for _ in range(100):
         step, _, rank, _ = np.linalg.lstsq(jacobian, residual, rcond=None)
@@ -470,6 +558,7 @@ def _gauss_newton(
             raise ValueError(
                 "pnp: the LEDs do not determine the camera's position: they are collinear"
             )
+        # Halve the step until the sum of squares does not rise.
         before = residual @ residual
         for _ in range(12):
             updated = Rotation.from_rotvec(step[:3]) * cam_from_lab, shift_m + step[3:]
@@ -488,7 +577,7 @@ def _gauss_newton(
 def _six_dof_residual(
     pattern_m: Floats, measured: Floats, cam_from_lab: Rotation, shift_m: Floats, weight: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the tangents' weighted residual (2 N,) and its Jacobian (2 N, 6) by a small rotation and a shift."""
+    """Return the weighted residuals of the tangents, (2 N,), and their Jacobian (2 N, 6) by rotation and shift."""
     b = cam_from_lab.apply(pattern_m)
     q = b + shift_m
     jacobian = np.hstack([tangent_jacobian(b, q), tangent_gradients(q).reshape(-1, 3)])
@@ -498,7 +587,7 @@ def _six_dof_residual(
 def _opencv_pnp(
     pattern_m: Floats, tangent: Floats, cam_from_lab: Rotation, shift_m: Floats
 ) -> tuple[Rotation, Floats]:
-    """Return cam_from_lab and the shift in camera axes, (3,), by OpenCV's iterative PnP from an initial guess."""
+    """Return cam_from_lab and the (3,) shift in camera axes by OpenCV's iterative PnP from an initial guess."""
     start = cam_from_lab.as_rotvec()[:, None], np.array(shift_m)[:, None]
     try:
         converged, rotvec, shift = cv2.solvePnP(
@@ -520,15 +609,15 @@ SOLVERS: dict[str, NearFieldSolver] = {
     "tappe": tappe,
     "pnp": pnp,
 }
-# These fit tangents (x/z, y/z), in which a pixel has the same size everywhere.
+# Methods that fit tangents (x/z, y/z), in which a pixel has the same size everywhere.
 TANGENT_SOLVERS = ("rotation_only", "pnp")
 
 
 def fitted_sigma_rad(solver: str, rays_cam: Floats, pixel_rad: Floats) -> Floats:
-    """Return the (N,) error per axis of the quantity that a solver fits: tangents or unit vectors.
+    """Return the (N,) standard deviation per axis of the quantity that a solver fits: tangents or unit vectors.
 
-    At an angle a off the boresight a change of the tangent rotates the ray by cos^2 a of it in the radial direction
-    and by cos a of it in the tangential one. The ray's error is the rms of both.
+    At an angle a off the boresight, a change dt of the tangent rotates the ray by cos^2(a) dt in the radial direction
+    and by cos(a) dt across it. The ray's error is the rms of both, dt sqrt((cos^2 a + cos^4 a) / 2).
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
 """Attitude and angular rate together, from matched lights of a rolling shutter, each with the time of its row.
 
-Light i, at P_i in the reference frame, is seen at the delay t_i of its row along q_i = exp(-[w] t_i) A P_i - r: the
-attitude A is that at mid-exposure of the middle row, w the camera's rate and r its lever arm. Gauss-Newton fits both to
-the tangents of all lights but outliers, to the chords of their streaks (`rate`) and to a prior of the rate. A tangent's
-residual has the Jacobian J_i exp(-[w] t_i) by a small rotation of A, and -t_i J_i by the rate; its error is that of
-`motion.at_middle_row`.
+Light i, at P_i in the reference frame, is seen at the delay t_i of its row along q_i = exp(-[w] t_i) A P_i - r. The
+attitude A is that at mid-exposure of the middle row, w is the camera's rate and r its lever arm. Gauss-Newton fits A
+and w to three kinds of data: the tangents of all lights but outliers, the chords of their streaks (`rate`), and a prior
+of the rate. The Jacobian of a tangent is J_i exp(-[w] t_i) by a small rotation of A, and -t_i J_i by the rate. Its
+error is that of `rate.error_gain`.
 """
 
 from __future__ import annotations
@@ -31,18 +31,19 @@ from estimator.core.types import Centroids, RateEstimate
 
 MAX_STEPS = 25
 CONVERGED_RAD = 1e-12
-FREE_STEPS = 15  # after which outliers stay what they are: at its limit a light may turn one with every second step
+# After these steps the outliers are fixed: a light at the limit could otherwise change sides in every second step.
+FREE_STEPS = 15
 
 
 class Fit(NamedTuple):
-    """Solution of `fit`: the attitude at the middle row, and the rate."""
+    """Solution of `fit`: the attitude at mid-exposure of the middle row, and the rate."""
 
     cam_from_ref: Rotation
     rate: RateEstimate
 
 
 class _Rows(NamedTuple):
-    """Residuals (M, 2), their slopes (M, 2, 6) by a small rotation and the rate, their information (M, 2, 2)."""
+    """Residuals (M, 2), their slopes (M, 2, 6) by a small rotation and the rate, and inverse covariances (M, 2, 2)."""
 
     residual: Floats
     slopes: Floats
@@ -58,16 +59,27 @@ def fit(
     prior: RateEstimate,
     exposure_s: float | None = None,
 ) -> Fit:
-    """Fit attitude and rate to K centroids and the places (K, 3) of their lights, from a start of both.
+    """Fit attitude and rate to K centroids and their lights, from initial values of both.
+
+    Each step of Gauss-Newton:
+
+    1. Predict each light at the time of its row; form the residuals of tangents and streaks, and their slopes.
+    2. Reject outliers (`rate.inliers`), in the first FREE_STEPS steps.
+    3. Sum the normal equations of the six unknowns, and add the prior of the rate.
+    4. Solve them; rotate the attitude and add the change of the rate.
 
     Parameters
     ----------
     place_ref
-        Unit vectors of stars, or LEDs from the bearing, m
+        (K, 3) unit vectors of stars, or positions of LEDs from the bearing, m
     lever_cam_m
-        (3,) the camera's arm, in camera axes; zeros for stars
+        (3,) position of the camera from the bearing, in camera axes; zeros for stars
+    start
+        Initial cam_from_ref and (3,) rate in camera axes, rad/s
+    prior
+        Prior of the rate
     exposure_s
-        None: the streaks are not used
+        Exposure time; None: the streaks are not used
 
     Raises
     ------
@@ -79,27 +91,32 @@ def fit(
     prior_information = np.linalg.inv(prior.covariance_rad2_s2)
     keep: list[NDArray[np.bool_]] = []
     for n in range(MAX_STEPS):
-        normal = np.zeros((6, 6))
-        gradient = np.zeros(6)
+        # 1. q = exp(-[w] t) A P - r of each light; residuals and slopes
         turn = Rotation.from_rotvec(-delay_s[:, None] * rate)
         place = turn.apply(cam_from_ref.apply(place_ref))
-        jacobian = tangent_jacobian(place, place - lever_cam_m).reshape(-1, 2, 3)
-        rows = [_place_rows(camera, centroids, place - lever_cam_m, jacobian, turn, rate)]
+        ray = place - lever_cam_m
+        jacobian = tangent_jacobian(place, ray).reshape(-1, 2, 3)
+        rows = [_place_rows(camera, centroids, ray, jacobian, turn, rate)]
         if exposure_s is not None and centroids.streak_px is not None:
             rows.append(_streak_rows(camera, centroids, jacobian, rate, exposure_s))
+        # 2. Outliers
         if n < FREE_STEPS:
             keep = [inliers(residual, information) for residual, _, information in rows]
+        # 3. Normal equations
+        normal = np.zeros((6, 6))
+        gradient = np.zeros(6)
         for (residual, slopes, information), kept in zip(rows, keep, strict=True):
             weighted = np.swapaxes(slopes, 1, 2) @ information * kept[:, None, None]
             normal += np.sum(weighted @ slopes, axis=0)
             gradient += np.einsum("nij,nj->i", weighted, residual)
         normal[3:, 3:] += prior_information
         gradient[3:] += prior_information @ (prior.rate_rad_s - rate)
-        # Columns are scaled: a rate and an angle have different sizes.
+        # 4. Step. The unknowns are scaled by the roots of the diagonal: a rate and an angle have different sizes.
         size = np.sqrt(np.diag(normal))
-        if not np.all(size > 0) or np.linalg.cond(normal / np.outer(size, size)) > 1e12:
+        sizes = np.outer(size, size)
+        if not np.all(size > 0) or np.linalg.cond(normal / sizes) > 1e12:
             raise ValueError(f"{len(centroids)} lights do not determine attitude and rate")
-        step = np.linalg.solve(normal / np.outer(size, size), gradient / size) / size
+        step = np.linalg.solve(normal / sizes, gradient / size) / size
         cam_from_ref = Rotation.from_rotvec(step[:3]) * cam_from_ref
         rate = rate + step[3:]
         if np.linalg.norm(step[:3]) < CONVERGED_RAD:
@@ -119,49 +136,54 @@ def _place_rows(
     turn: Rotation,
     rate: Floats,
 ) -> _Rows:
-    """Residuals of the tangents from those of predicted rays (K, 3), each at the time of its row."""
+    """Return the rows of the tangents: measured minus those of the (K, 3) rays predicted at the times of their rows."""
     delay_s = camera.row_delays_s(centroids.xy_px)
+    # Covariance of the residuals: a centroid's error also shifts the time at which it is predicted.
     gain = error_gain(camera, -jacobian @ rate)
     error_rad2 = gain @ covariance_of(centroids) @ np.swapaxes(gain, 1, 2) / camera.focal_px**2
-    slopes = np.concatenate(
-        [jacobian @ turn.as_matrix(), -delay_s[:, None, None] * jacobian], axis=2
-    )
-    return _Rows(
-        camera.tangents(centroids.xy_px) - ray[:, :2] / ray[:, 2:], slopes, inverses(error_rad2)
-    )
+    # Slopes: J exp(-[w] t) by the rotation, -t J by the rate
+    by_rotation = jacobian @ turn.as_matrix()
+    by_rate = -delay_s[:, None, None] * jacobian
+    residual = camera.tangents(centroids.xy_px) - ray[:, :2] / ray[:, 2:]
+    slopes = np.concatenate([by_rotation, by_rate], axis=2)
+    return _Rows(residual, slopes, inverses(error_rad2))
 
 
 def _streak_rows(
     camera: Camera, centroids: Centroids, jacobian: Floats, rate: Floats, exposure_s: float
 ) -> _Rows:
-    """Residuals of the streaks' chords, each with the sign nearer to the rate."""
+    """Return the rows of the streaks: measured minus predicted chords, the measured with the nearer sign."""
     assert centroids.streak_px is not None
     seen = np.isfinite(centroids.streak_px[:, 0])
     chord, information = chords(camera, centroids.take(seen))
     jacobian = jacobian[seen]
+    # A chord is -T J w times the rolling shutter's factor; the attitude does not change it to first order.
     by_rate = -exposure_s * streak_factor(camera, -jacobian @ rate)[:, None, None] * jacobian
-    residual = aligned(chord, information, by_rate @ rate) - by_rate @ rate
+    predicted = by_rate @ rate
+    residual = aligned(chord, information, predicted) - predicted
     return _Rows(residual, np.concatenate([0 * by_rate, by_rate], axis=2), information)
 
 
 def rate_covariance_rad2(
     camera: Camera, centroids: Centroids, jacobian: Floats, covariance_rad2_s2: Floats
 ) -> Floats:
-    """(3, 3) covariance of an attitude by the error of the rate with which its K lights were put at the middle row.
+    """Return the (3, 3) covariance, rad^2, that the rate's error adds to an attitude from centroids at the middle row.
 
-    An error of the rate moves the tangents by t_i J_i times it, which weighted least squares takes for a rotation.
+    An error dw of the rate, with which K lights were moved to the middle row, moves their tangents by t_i J_i dw.
+    Weighted least squares takes that for the rotation G dw, G = sum(J_i^T W_i J_i)^-1 sum(t_i J_i^T W_i J_i). The
+    covariance is G C G^T, with C that of the rate.
 
     Parameters
     ----------
     centroids
-        As they are found, with total errors
+        Centroids as found, before they are moved, with total errors
     jacobian
-        (K, 2, 3) of the tangents by a small rotation
+        (K, 2, 3) derivative J_i of the tangents by a small rotation
+    covariance_rad2_s2
+        (3, 3) covariance C of the rate
     """
-    information = camera.focal_px**2 * np.linalg.inv(covariance_of(centroids))
-    weighted = np.swapaxes(jacobian, 1, 2) @ information
+    information = camera.focal_px**2 * np.linalg.inv(covariance_of(centroids))  # W
+    products = np.swapaxes(jacobian, 1, 2) @ information @ jacobian  # J^T W J
     delay_s = camera.row_delays_s(centroids.xy_px)[:, None, None]
-    gain = np.linalg.solve(
-        np.sum(weighted @ jacobian, axis=0), np.sum(weighted @ jacobian * delay_s, axis=0)
-    )
+    gain = np.linalg.solve(np.sum(products, axis=0), np.sum(products * delay_s, axis=0))
     return np.asarray(gain @ covariance_rad2_s2 @ gain.T)

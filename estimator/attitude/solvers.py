@@ -1,8 +1,8 @@
 """Solvers of Wahba's problem: the rotation that best maps reference vectors to observed ones, with its covariance.
 
-Six classical methods, each as published, based on the compiled kernels in `estimator.attitude.wahba`. All but TRIAD
-minimize sum(w |cam - A ref|^2), w = 1 / sigma^2, over all stars. Gauss-Newton steps on the vectors (`refine`) refine
-their results, so that they agree to the last digits.
+Six methods, based on the compiled kernels in `estimator.attitude.wahba`, which has the equations. All but TRIAD
+minimize sum(w |cam - A ref|^2), w = 1 / sigma^2, over all stars. Their results are refined by Gauss-Newton on the
+vectors (`wahba.refine`), so that they agree to the last digits.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ Solver = Callable[..., Rotation]
 
 
 def triad(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """TRIAD (Black 1964; optimal for its two stars by Markley 2002): cam_from_ref from the best pair only.
+    """Return cam_from_ref by TRIAD (Black 1964; in the form optimal for two stars, Markley 2002), from the best pair.
 
-    Of more than two stars it uses the pair with the smallest variance about the worst axis: accurate ones, far apart.
-    Its covariance is that of the pair: covariance(..., solver="triad"). Arguments and errors are those of `quest`.
+    Of more than two stars it uses the pair with the smallest variance about the worst axis: two accurate stars that are
+    far apart (`wahba.best_pair`). The covariance is that of the pair: covariance(..., solver="triad"). Arguments and
+    errors are those of `quest`.
     """
     cam, ref, weight = _checked_arrays(vectors_cam, vectors_ref, sigma_rad)
     kernel.profile(cam, ref, weight)  # raises ValueError for unusable or parallel directions
@@ -32,32 +33,42 @@ def triad(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotati
 
 
 def davenport(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """Davenport's q-method: the eigenvector of the largest eigenvalue, refined. Arguments and errors as `quest`."""
+    """Return cam_from_ref by Davenport's q-method, refined. Arguments and errors are those of `quest`."""
     return _solve_profile(kernel.raw_davenport, vectors_cam, vectors_ref, sigma_rad)
 
 
 def quest(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """QUEST (Shuster & Oh 1981): cam_from_ref from (N, 3) unit vectors, N >= 2, with errors (N,) sigma_rad.
+    """Return cam_from_ref by QUEST (Shuster & Oh 1981), refined by Gauss-Newton.
 
-    Refined by Gauss-Newton. Raises ValueError for fewer than two directions and for unusable numbers.
+    Parameters
+    ----------
+    vectors_cam, vectors_ref
+        (N, 3) unit vectors, N >= 2, in camera axes and in the reference frame
+    sigma_rad
+        (N,) standard deviation of each direction per axis
+
+    Raises
+    ------
+    ValueError
+        For fewer than two directions, and for unusable numbers.
     """
     return _solve_profile(kernel.raw_quest, vectors_cam, vectors_ref, sigma_rad)
 
 
 def esoq2(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """ESOQ2 (Mortari 1997): the rotation axis from a singular matrix, refined. Arguments and errors as `quest`."""
+    """Return cam_from_ref by ESOQ2 (Mortari 1997), refined. Arguments and errors are those of `quest`."""
     return _solve_profile(kernel.raw_esoq2, vectors_cam, vectors_ref, sigma_rad)
 
 
 def svd(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """Singular value decomposition (Markley 1988), refined. Arguments and errors as `quest`."""
+    """Return cam_from_ref by singular value decomposition (Markley 1988), refined. Arguments and errors as `quest`."""
     return _solve_profile(kernel.raw_svd, vectors_cam, vectors_ref, sigma_rad)
 
 
 def least_squares(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """Least squares on the vectors: Gauss-Newton from TRIAD's solution. Arguments and errors as `quest`."""
+    """Return cam_from_ref by Gauss-Newton on the vectors from TRIAD's solution. Arguments and errors as `quest`."""
     cam, ref, weight = _checked_arrays(vectors_cam, vectors_ref, sigma_rad)
-    kernel.profile(cam, ref, weight)
+    kernel.profile(cam, ref, weight)  # raises ValueError, as in `triad`
     R_cam_from_ref = kernel.raw_triad(cam, ref, weight)
     kernel.refine(R_cam_from_ref, cam, ref, weight)
     return rotation(R_cam_from_ref)
@@ -87,7 +98,7 @@ def _solve_profile(
 def _checked_arrays(
     vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Prepare the kernels' arguments: two (N, 3) arrays, (N,) weights in rad^-2. Raises ValueError for other shapes."""
+    """Return the kernels' arguments: two (N, 3) arrays and (N,) weights, rad^-2. Raises ValueError for other shapes."""
     cam, ref, sigma = (
         checks.native("directions", one, np.float64)
         for one in (vectors_cam, vectors_ref, sigma_rad)
@@ -103,16 +114,21 @@ def _checked_arrays(
 def rotation(R_a_from_b: Floats) -> Rotation:
     """Convert a matrix that is a rotation to within rounding to a Rotation.
 
-    It goes through the quaternion, as Rotation.from_matrix orthogonalizes any matrix and takes four times as long.
+    The conversion uses the quaternion: Rotation.from_matrix orthogonalizes any matrix and takes four times as long.
     """
     return Rotation.from_quat(quaternion_xyzw(R_a_from_b))
 
 
 def covariance(vectors_cam: Floats, sigma_rad: Floats, solver: str = "quest") -> Floats:
-    """Return the (3, 3) covariance of the small rotation in camera axes: [sum((I - b b^T) / sigma^2)]^-1, rad^2.
+    """Return the (3, 3) covariance of the small rotation in camera axes: P = [sum((I - b b^T) / sigma^2)]^-1, rad^2.
 
-    QUEST's measurement model (Shuster & Oh 1981, eq. 97). It holds for all methods that use all stars; for TRIAD the
-    sum is over its pair. Confirmed by Monte Carlo in the tests. Raises ValueError if the roll is unobservable.
+    This is QUEST's measurement model (Shuster & Oh 1981, eq. 97), confirmed by Monte Carlo in the tests. It holds for
+    all methods that use all stars; for TRIAD the sum is over its pair.
+
+    Raises
+    ------
+    ValueError
+        If the roll is unobservable.
     """
     cam, _, weight = _checked_arrays(vectors_cam, vectors_cam, sigma_rad)
     checks.unit_rows("vectors_cam", cam, None)

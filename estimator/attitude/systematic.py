@@ -1,8 +1,14 @@
 """Covariance of an attitude from errors that the weights of its solution do not describe.
 
-The weights take every ray's error as independent, equal in all directions. Errors of a survey are neither: an LED's
-place errs more along the surveying instrument's sight than across, and errors of the instrument's set-up, of the
-surface or of the focal length are common to all rays.
+The weights assume that each ray's error is independent and equal in all directions. Errors of a survey are neither: an
+LED's position has a larger error along the line of sight of the surveying instrument than across it, and errors of the
+instrument's set-up, of the surface or of the focal length are common to all rays.
+
+The weighted least-squares solution is linear in small errors e_i of the tangents: the rotation is w = sum_i G_i e_i,
+with G_i = S J_i^T / sigma_i^2 and S = [sum_i J_i^T J_i / sigma_i^2]^-1 (`response`). Its covariance is the sum of
+
+- sum_i G_i C_i G_i^T for independent errors with covariances C_i (`from_independent`), and
+- sum_m w_m w_m^T, w_m = sum_i G_i e_mi, for errors m that all rays share (`from_common`).
 """
 
 from __future__ import annotations
@@ -17,18 +23,18 @@ from estimator.core.checks import Floats
 
 
 class Geometry(NamedTuple):
-    """K rays as a solution sees them, in camera axes.
+    """Geometry of the K rays of a solution, in camera axes.
 
     Attributes
     ----------
     jacobian
-        (K, 2, 3) derivative of the tangents (x / z, y / z) by a small rotation; (K, 2, 4)
-        `with_focal`
+        (K, 2, P) derivative of the tangents (x / z, y / z) by the unknowns: a small rotation, P = 3;
+        and the logarithm of the focal length, P = 4, in `with_focal`
     gradient
-        (K, 2, 3) derivative of the tangents by a displacement of the LED, 1/m; of a star's
-        direction
+        (K, 2, 3) derivative of the tangents by a displacement of the LED, 1/m, or by a change of a
+        star's direction
     tangent
-        (K, 2) x / z and y / z
+        (K, 2) tangents x / z and y / z
     """
 
     jacobian: Floats
@@ -37,64 +43,78 @@ class Geometry(NamedTuple):
 
 
 def geometry(place_cam: Floats, ray_cam: Floats) -> Geometry:
-    """Geometry of LEDs at (K, 3) from the bearing and from the pupil, m; of stars both are unit vectors."""
+    """Return the geometry of LEDs from their (K, 3) positions from the bearing and from the pupil, m, in camera axes.
+
+    For stars both are the same unit vectors.
+    """
     jacobian = tangent_jacobian(place_cam, ray_cam).reshape(-1, 2, 3)
     return Geometry(jacobian, tangent_gradients(ray_cam), ray_cam[:, :2] / ray_cam[:, 2:])
 
 
 def with_focal(view: Geometry) -> Geometry:
-    """The geometry of a fit of the rotation and the logarithm of the focal length, by which the tangents change."""
+    """Return the geometry of a fit whose fourth unknown is the logarithm of the focal length."""
+    # The derivative of f (x / z) / f_0 by log f is the tangent itself.
     return view._replace(jacobian=np.concatenate([view.jacobian, view.tangent[:, :, None]], axis=2))
 
 
 def from_independent(view: Geometry, sigma_rad: Floats, covariance_rad2: Floats) -> Floats:
-    """(P, P) covariance of a least-squares rotation from independent errors of the tangents, (K, 2, 2).
+    """Return the (P, P) covariance of a least-squares solution from independent errors of the tangents.
 
-    With weights 1 / sigma^2 and the tangents' errors e_i the rotation errs by w = S sum_i J_i' e_i / sigma_i^2, S the
-    inverse of sum_i J_i' J_i / sigma_i^2. For errors with covariances C_i that is S (sum_i J_i' C_i J_i / sigma_i^4) S;
-    it is S itself if C_i = sigma_i^2 I.
+    It is sum_i G_i C_i G_i^T = S (sum_i J_i^T C_i J_i / sigma_i^4) S, and S itself if C_i = sigma_i^2 I.
+
+    Parameters
+    ----------
+    covariance_rad2
+        (K, 2, 2) covariance C_i of each ray's tangents
     """
     gain = response(view, sigma_rad)
     return np.asarray(np.einsum("kai,kij,kbj->ab", gain, covariance_rad2, gain))
 
 
 def from_common(view: Geometry, sigma_rad: Floats, error_rad: Floats) -> Floats:
-    """(P, P) covariance of a least-squares rotation from M errors that all rays share.
+    """Return the (P, P) covariance of a least-squares solution from M errors that all rays share.
 
     Parameters
     ----------
     error_rad
-        (M, K, 2) change of the tangents by one standard deviation of each
+        (M, K, 2) change of the tangents by one standard deviation of each error
     """
+    # w_m = sum_i G_i e_mi: the solution's change by one standard deviation of each error
     rotation = np.einsum("kai,mki->ma", response(view, sigma_rad), error_rad)
     return np.asarray(rotation.T @ rotation)
 
 
 def response(view: Geometry, sigma_rad: Floats) -> Floats:
-    """(K, P, 2) rotation that an error of each ray's tangents causes in the weighted least-squares solution.
+    """Return G_i = S J_i^T / sigma_i^2, (K, P, 2): the solution's change by an error of each ray's tangents.
 
-    P is 3, or 4 for `with_focal`, where the last number is of the focal length's logarithm.
+    P is 3; it is 4 for `with_focal`, where the last unknown is the logarithm of the focal length.
     """
     weighted = view.jacobian / sigma_rad[:, None, None] ** 2
-    information = np.einsum("kia,kib->ab", weighted, view.jacobian)
+    information = np.einsum("kia,kib->ab", weighted, view.jacobian)  # the inverse of S
     return np.asarray(np.linalg.solve(information, np.moveaxis(weighted, 2, 1)))
 
 
 def residual_products(view: Geometry, sigma_rad: Floats, error_rad: Floats) -> Floats:
-    """(M, M) inner products of the weighted residuals that M common errors (M, K, 2) leave after the solution.
+    """Return Q, (M, M): inner products of the weighted residuals that M common errors leave after the solution.
 
-    With z standard normal and unit noise in every weighted tangent, the sum of squares has the mean 2 K - P + tr Q and
-    the variance 2 (2 K - P) + 4 tr Q + 2 tr Q^2, Q these products, P the number of unknowns.
+    Let the common errors have standard normal amplitudes, and every weighted tangent unit noise. The sum of squared
+    residuals then has the mean 2 K - P + tr Q and the variance 2 (2 K - P) + 4 tr Q + 2 tr Q^2, with P unknowns.
+
+    Parameters
+    ----------
+    error_rad
+        (M, K, 2) change of the tangents by one standard deviation of each error
     """
     weighted = (error_rad / sigma_rad[:, None]).reshape(len(error_rad), 2 * len(sigma_rad))
     jacobian = (view.jacobian / sigma_rad[:, None, None]).reshape(2 * len(sigma_rad), -1)
+    # The solution absorbs the part of an error that looks like a rotation; the rest is left in the residuals.
     absorbed, _, _, _ = np.linalg.lstsq(jacobian, weighted.T, rcond=None)
     left = weighted.T - jacobian @ absorbed
     return np.asarray(left.T @ left)
 
 
 def isotropic(sigma_rad: Floats) -> Floats:
-    """(K, 2, 2) covariances of errors equal in all directions."""
+    """Return the (K, 2, 2) covariances sigma_i^2 I of errors that are equal in all directions."""
     return sigma_rad[:, None, None] ** 2 * np.eye(2)
 
 
@@ -107,61 +127,69 @@ def with_survey(
     common_rad: Floats,
     fits_focal: bool = False,
 ) -> tuple[Floats, Floats]:
-    """The (3, 3) covariance of an attitude with its errors as they are, and the part that successive frames share.
+    """Return the (3, 3) covariance of an attitude with all its errors, and the part that successive frames share.
 
-    The errors are propagated through the least-squares solution of the tangents, whose covariance is S = L L'. A solver
-    with the covariance L_0 L_0' is taken to respond as that solution does after the rotation L_0 L^-1.
+    1. Map the least-squares solution's response to the solver's. With the covariances S = L L^T of the least-squares
+       solution and L_0 L_0^T of the solver, the solver is taken to respond as A = L_0 L^-1 times that solution.
+    2. Propagate the survey's errors, of each light and common ones, through the least-squares solution.
+    3. Propagate the noise of one frame.
 
     Parameters
     ----------
     covariance_rad2
-        Of the solver, for independent errors of sigma_rad (K,), equal in all directions
+        (3, 3) covariance L_0 L_0^T of the solver, for independent errors of sigma_rad in all directions
+    sigma_rad
+        (K,) standard deviations on which the solver's weights are based
     noise_rad2
-        (K, 2, 2) of the tangents in one frame
+        (K, 2, 2) covariance of the tangents' noise in one frame
     own_rad2
-        Of each light's survey
+        (K, 2, 2) covariance of the tangents from the survey of each light
     common_rad
         (M, K, 2) change of the tangents by one standard deviation of each error that all lights
         share
     fits_focal
         Whether the focal length was fitted with the attitude, from the same lights
     """
+    # 1. Solver's response
     solver = np.linalg.cholesky(covariance_rad2)
     least_squares = np.linalg.cholesky(from_independent(view, sigma_rad, isotropic(sigma_rad)))
     adapt = solver @ np.linalg.inv(least_squares)
+    # 2. Errors that successive frames share
     fitted = with_focal(view) if fits_focal else view
-    shared = (
-        from_independent(fitted, sigma_rad, own_rad2) + from_common(fitted, sigma_rad, common_rad)
-    )[:3, :3]
+    own = from_independent(fitted, sigma_rad, own_rad2)
+    shared = (own + from_common(fitted, sigma_rad, common_rad))[:3, :3]
+    # 3. Noise
     noise = from_independent(fitted, sigma_rad, noise_rad2)[:3, :3]
     return adapt @ (noise + shared) @ adapt.T, adapt @ shared @ adapt.T
 
 
 def focal_error_px(camera: Camera, xy_px: Floats) -> Floats:
-    """(N,) standard deviation of a calibrated focal length times the distance from the principal point."""
+    """Return the (N,) position errors from the focal length: its relative sigma times the distance from the center."""
     return np.asarray(camera.focal_sigma * np.linalg.norm(xy_px - camera.center_px, axis=1))
 
 
 def with_focal_error(
     covariance_rad2: Floats, camera: Camera, xy_px: Floats, seen_cam: Floats, sigma_rad: Floats
 ) -> tuple[Floats, Floats | None]:
-    """The (3, 3) covariance of an attitude with the error of the focal length as it is, and that part alone.
+    """Return the (3, 3) covariance of an attitude with the focal length's error as common to all stars, and its part.
 
-    None in place of the part if the focal length is known exactly.
+    The second is None if the focal length is known exactly.
 
     Parameters
     ----------
     covariance_rad2
-        With that error, `focal_error_px`, as independent from star to star
+        (3, 3) covariance in which that error, `focal_error_px`, is independent from star to star
     xy_px, seen_cam
         (K, 2) centroids and (K, 3) unit vectors of their stars in camera axes
     sigma_rad
-        (K,) on which the covariance is based
+        (K,) standard deviations on which the covariance is based
     """
     if not camera.focal_sigma:
         return covariance_rad2, None
     view = geometry(seen_cam, seen_cam)
+    # The noise of the frame alone: sigma without the focal length's part; the limit guards against rounding.
     focal_rad = focal_error_px(camera, xy_px) / camera.focal_px
-    noise = isotropic(np.sqrt(np.maximum(sigma_rad**2 - focal_rad**2, (0.01 * sigma_rad) ** 2)))
+    noise_rad2 = np.maximum(sigma_rad**2 - focal_rad**2, (0.01 * sigma_rad) ** 2)
+    noise = isotropic(np.sqrt(noise_rad2))
     common = camera.focal_sigma * view.tangent[None]
     return with_survey(covariance_rad2, view, sigma_rad, noise, np.zeros_like(noise), common)

@@ -11,6 +11,11 @@ The elements of B lose the small differences between vectors of a narrow field, 
 Gauss-Newton on the vectors themselves. The covariance is the inverse of the Fisher information, sum(w (I - b b^T)).
 
 All kernels take unit vectors as C-ordered (N, 3) arrays; `weight` is (N,), in rad^-2 where a covariance is computed.
+The tracker's own solution (`wahba`) takes three steps:
+
+1. Sum the attitude profile B (`profile`), which also checks the directions.
+2. Solve it by QUEST (`raw_quest`).
+3. Refine the rotation on the vectors, and compute its covariance (`refine`, `attitude_covariance`).
 """
 
 from __future__ import annotations
@@ -26,7 +31,7 @@ from estimator.core.vectors import rotate_in_place
 
 Quaternion = tuple[float, float, float, float]
 
-# Smallest accepted squared sine of the largest angle to the first direction: 13 arcsec.
+# Limit of the squared sine of the largest angle to the first direction: smaller ones are refused. It is 13 arcsec.
 MIN_SINE2 = 4e-9
 LENGTH_TOLERANCE = 1e-2  # largest deviation of a unit vector's squared length from 1
 MAX_STEPS = 30  # of the refinement
@@ -37,10 +42,16 @@ MIN_STEP2_RAD2 = 1e-26  # squared length of a step below double precision
 def wahba(cam: Floats, ref: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """Return R_cam_from_ref (3, 3) that minimizes sum(w |cam - A ref|^2), and its (3, 3) camera-axes covariance, rad^2.
 
-    QUEST and `refine`; a few microseconds for twenty stars. Raises ValueError if the directions do not determine the
-    rotation.
+    It takes a few microseconds for twenty stars.
+
+    Raises
+    ------
+    ValueError
+        If the directions do not determine the rotation.
     """
+    # 1. Profile and 2. QUEST
     R_cam_from_ref = raw_quest(profile(cam, ref, weight))
+    # 3. Refinement and covariance
     refine(R_cam_from_ref, cam, ref, weight)
     return R_cam_from_ref, attitude_covariance(cam, weight)
 
@@ -75,6 +86,7 @@ def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
     length_error = 0.0
     for n in range(len(cam)):
         total += weight[n]
+        # | |v|^2 - 1 | of both vectors
         length_error = max(length_error, abs(cam[n, 0] ** 2 + cam[n, 1] ** 2 + cam[n, 2] ** 2 - 1))
         length_error = max(length_error, abs(ref[n, 0] ** 2 + ref[n, 1] ** 2 + ref[n, 2] ** 2 - 1))
         # The directions must differ from the first one in both frames.
@@ -113,11 +125,11 @@ def largest_eigenvalue(B: Floats) -> float:
     """Return the largest eigenvalue of Davenport's matrix, by Newton's method from 1 downwards.
 
     With normalized weights the eigenvalue is at most 1, and close to 1 for small errors. The characteristic equation
-    is (x^2 - |B|^2)^2 - 8 x det B - 4 |adj B|^2 = 0 (Markley 1993, J. Astronautical
-    Sciences 41, 261), the same polynomial as QUEST's quartic.
+    is (x^2 - |B|^2)^2 - 8 x det B - 4 |adj B|^2 = 0 (Markley 1993, J. Astronautical Sciences 41, 261), the same
+    polynomial as QUEST's quartic.
     """
-    square = 0.0
-    minors = 0.0
+    square = 0.0  # |B|^2
+    minors = 0.0  # |adj B|^2
     det = 0.0
     for i in range(3):
         for j in range(3):
@@ -126,6 +138,7 @@ def largest_eigenvalue(B: Floats) -> float:
             minors += cofactor**2
             if i == 0:
                 det += B[0, j] * cofactor
+    # Newton's method on f(x): x <- x - f / f'
     x = 1.0
     for _ in range(50):
         inner = x * x - square
@@ -141,7 +154,8 @@ def largest_eigenvalue(B: Floats) -> float:
 
 @jit
 def _cofactor(matrix: Floats, i: int, j: int) -> float:
-    # Cyclic indices give the cofactor with its sign.
+    """Return the cofactor of element (i, j) of a (3, 3) matrix."""
+    # Cyclic indices give the minor with the cofactor's sign.
     a = (i + 1) % 3
     b = (i + 2) % 3
     c = (j + 1) % 3
@@ -186,14 +200,14 @@ def _symmetric(B: Floats) -> tuple[Floats, Floats, float]:
 
 @jit
 def raw_quest(B: Floats) -> Floats:
-    """QUEST (Shuster & Oh 1981, J. Guidance & Control 4, 70): the Gibbs vector from the largest eigenvalue.
+    """Solve the profile by QUEST (Shuster & Oh 1981, J. Guidance & Control 4, 70): the Gibbs vector of the eigenvalue.
 
     The Gibbs vector is infinite at a rotation of 180 degrees. It is therefore computed in four reference frames, the
     original one and those rotated by 180 degrees about each axis ("sequential rotations"), and the solution with the
     largest scalar part of the quaternion is returned. The scalar parts are compared before normalization: at 180
     degrees all four components of the quaternion vanish, and their ratios are rounding noise.
     """
-    x = largest_eigenvalue(B)
+    x = largest_eigenvalue(B)  # the same in all four frames
     best = (0.0, 0.0, 0.0, 0.0)
     frame = 3
     for axis in (3, 0, 1, 2):
@@ -206,7 +220,12 @@ def raw_quest(B: Floats) -> Floats:
 
 @jit
 def _quest_once(B: Floats, x: float) -> Quaternion:
-    """Return QUEST's quaternion (x, y, z, w), not normalized, for the eigenvalue x (Shuster & Oh 1981)."""
+    """Return QUEST's quaternion (v, gamma), not normalized, for the eigenvalue x (Shuster & Oh 1981).
+
+    With S, z and the trace t of `_symmetric`, and kappa = tr(adj S):
+
+        alpha = x^2 - t^2 + kappa,  gamma = (x + t) alpha - det S,  v = [alpha I + (x - t) S + S^2] z.
+    """
     S, z, trace = _symmetric(B)
     det = 0.0
     kappa = 0.0
@@ -223,6 +242,7 @@ def _quest_once(B: Floats, x: float) -> Quaternion:
 
 @jit
 def _matrix_vector(matrix: Floats, v: Floats) -> Floats:
+    """Return the product (3,) of a (3, 3) matrix and a vector."""
     out = np.zeros(3)
     for i in range(3):
         for j in range(3):
@@ -232,13 +252,17 @@ def _matrix_vector(matrix: Floats, v: Floats) -> Floats:
 
 @jit
 def raw_esoq2(B: Floats) -> Floats:
-    """ESOQ2 (Mortari 1997; Markley & Mortari 2000, J. Astronautical Sciences 48, 359): the axis e and angle.
+    """Solve the profile by ESOQ2 (Mortari 1997; Markley & Mortari 2000, J. Astronautical Sciences 48, 359).
 
-    From Davenport's equations, M e = 0 with M = (x - tr)((x + tr) - S) - z z^T. The axis e is the longest of the cross
-    products of M's rows, and the quaternion is ((x - tr) e, z . e), normalized. M vanishes for the identity rotation;
-    the reference frame is therefore first rotated by the 180-degree rotation that gives the smallest trace.
+    From Davenport's equations, M e = 0 for the rotation axis e, with M = (x - tr)((x + tr) I - S) - z z^T.
+
+    1. Rotate the reference frame by the 180-degree rotation that gives the smallest trace: M vanishes for the identity
+       rotation.
+    2. Compute M.
+    3. Take the longest of the cross products of M's rows as e.
+    4. The quaternion is ((x - tr) e, z . e), to be normalized.
     """
-    # A rotation by 180 degrees about an axis keeps that diagonal element and negates the two others.
+    # 1. A rotation by 180 degrees about an axis keeps that diagonal element and negates the two others.
     x = largest_eigenvalue(B)
     frame = 3
     least = B[0, 0] + B[1, 1] + B[2, 2]
@@ -247,13 +271,14 @@ def raw_esoq2(B: Floats) -> Floats:
         if trace < least:
             frame = axis
             least = trace
+    # 2. M = (x - tr)((x + tr) I - S) - z z^T
     S, z, trace = _symmetric(_rotated_profile(B, frame))
     M = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
             M[i, j] = -(x - trace) * S[i, j] - z[i] * z[j]
         M[i, i] += (x - trace) * (x + trace)
-    # Row i of the cofactors of M is the cross product of the two other rows.
+    # 3. Row i of the cofactors of M is the cross product of the two other rows.
     e = np.zeros(3)
     length2 = -1.0
     for i in range(3):
@@ -265,6 +290,7 @@ def raw_esoq2(B: Floats) -> Floats:
             e[0] = u
             e[1] = v
             e[2] = w
+    # 4. Quaternion
     scalar = z[0] * e[0] + z[1] * e[1] + z[2] * e[2]
     q = (x - trace) * e[0], (x - trace) * e[1], (x - trace) * e[2], scalar
     return matrix_of(_undo_rotation(q, frame))
@@ -272,7 +298,10 @@ def raw_esoq2(B: Floats) -> Floats:
 
 @jit
 def raw_davenport(B: Floats) -> Floats:
-    """Davenport's q-method (Keat 1977, CSC/TM-77/6034): the eigenvector of K's largest eigenvalue."""
+    """Solve the profile by Davenport's q-method (Keat 1977, CSC/TM-77/6034).
+
+    The quaternion (x, y, z, w) is the eigenvector of the largest eigenvalue of K = [[S - tr I, z], [z^T, tr]].
+    """
     S, z, trace = _symmetric(B)
     K = np.empty((4, 4))
     K[3, 3] = trace
@@ -281,14 +310,18 @@ def raw_davenport(B: Floats) -> Floats:
             K[i, j] = S[i, j]
         K[i, i] -= trace
         K[i, 3] = K[3, i] = z[i]
-    _, vectors = np.linalg.eigh(K)
+    _, vectors = np.linalg.eigh(K)  # in the order of increasing eigenvalues
     return matrix_of((vectors[0, 3], vectors[1, 3], vectors[2, 3], vectors[3, 3]))
 
 
 @jit
 def raw_svd(B: Floats) -> Floats:
-    """SVD method (Markley 1988, J. Astronautical Sciences 36, 245): B = U S V^T, A = U diag(1, 1, det U det V) V^T."""
+    """Solve the profile by singular value decomposition (Markley 1988, J. Astronautical Sciences 36, 245).
+
+    With B = U S V^T the rotation is A = U diag(1, 1, det U det V) V^T.
+    """
     U, _, Vt = np.linalg.svd(B)
+    # The determinants are 1 or -1: their product keeps A a rotation rather than a reflection.
     determinant = np.linalg.det(U) * np.linalg.det(Vt)
     R = np.zeros((3, 3))
     for i in range(3):
@@ -301,8 +334,8 @@ def raw_svd(B: Floats) -> Floats:
 def best_pair(cam: Floats, weight: Floats) -> tuple[int, int]:
     """Return the pair of stars with the smallest variance about the worst axis.
 
-    The smallest eigenvalue of a pair's information matrix is (p + q - sqrt((p + q)^2 - 4 p q sin^2)) / 2, with weights
-    p and q and the sine of their separation; the best pair has the largest.
+    The smallest eigenvalue of a pair's information matrix is (p + q - sqrt((p + q)^2 - 4 p q sin^2 s)) / 2, with the
+    weights p and q and the separation s. The best pair is that with the largest one.
     """
     first = 0
     second = 1
@@ -323,19 +356,25 @@ def best_pair(cam: Floats, weight: Floats) -> tuple[int, int]:
 
 @jit
 def raw_triad(cam: Floats, ref: Floats, weight: Floats) -> Floats:
-    """TRIAD for two stars, in its optimal form (Markley 2002, J. Guidance 25, 411).
+    """Solve for the rotation from two stars by TRIAD in its optimal form (Markley 2002, J. Guidance 25, 411).
 
     With b3, r3 the normals of the planes that the two stars span, w the weights and l a normalization factor,
 
-        A = b3 r3^T + sum over the two of (w / l) [b r^T + (b x b3)(r x r3)^T],
+        A = b3 r3^T + sum over the two of (w / l) [b r^T + (b x b3)(r x r3)^T].
 
-    which is the optimum of Wahba's problem for two stars, and Black's (1964) TRIAD if one weight is zero.
+    This is the optimum of Wahba's problem for two stars, and Black's (1964) TRIAD if one weight is zero.
+
+    1. Select the best pair, and compute the normals b3 and r3.
+    2. Sum the bracket over the two stars.
+    3. Normalize it, and add b3 r3^T.
     """
+    # 1. Pair and normals
     m, n = best_pair(cam, weight)
     b = cam[np.array([m, n])]
     r = ref[np.array([m, n])]
     b3 = _normal(b[0], b[1])
     r3 = _normal(r[0], r[1])
+    # 2. w [b r^T + (b x b3)(r x r3)^T]
     along = np.zeros((3, 3))
     for k in range(2):
         c = np.cross(b[k], b3)
@@ -344,7 +383,7 @@ def raw_triad(cam: Floats, ref: Floats, weight: Floats) -> Floats:
         for i in range(3):
             for j in range(3):
                 along[i, j] += weight_k * (b[k, i] * r[k, j] + c[i] * s[j])
-    # `along` is l times a rotation of the plane: the sum of its squared entries is 2 l^2.
+    # 3. `along` is l times a rotation of the plane: the sum of its squared entries is 2 l^2.
     scale = sqrt(2 / (along**2).sum())
     for i in range(3):
         for j in range(3):
@@ -354,6 +393,7 @@ def raw_triad(cam: Floats, ref: Floats, weight: Floats) -> Floats:
 
 @jit
 def _normal(u: Floats, v: Floats) -> Floats:
+    """Return the unit vector along u x v."""
     w = np.cross(u, v)
     return w / sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
 
@@ -362,10 +402,16 @@ def _normal(u: Floats, v: Floats) -> Floats:
 def refine(R_cam_from_ref: Floats, cam: Floats, ref: Floats, weight: Floats) -> None:
     """Refine `R_cam_from_ref` in place by Gauss-Newton on sum(w |cam - A ref|^2).
 
-    Each step solves sum(w (I - a a^T)) step = sum(w a x cam), a = A ref. If the directions are close together, the two
-    largest eigenvalues of Davenport's matrix are nearly equal, and methods based on the profile lose precision as the
-    inverse square of the directions' spread. Here the small differences a x cam are computed star by star, which keeps
-    the precision. Wahba's problem has no other local minimum, so the iteration cannot converge to a wrong one.
+    With a = A ref, each step:
+
+    1. Sum the gradient sum(w a x cam) and the information sum(w (I - a a^T)).
+    2. Solve for the small rotation: information step = gradient.
+    3. Rotate A by the step; stop if it is below double precision.
+
+    If the directions are close together, the two largest eigenvalues of Davenport's matrix are nearly equal, and
+    methods based on the profile lose precision as the inverse square of the directions' spread. Here the small
+    differences a x cam are computed star by star, which keeps the precision. Wahba's problem has no other local
+    minimum, so the iteration cannot converge to a wrong one.
     """
     R = R_cam_from_ref
     a = np.empty(3)
@@ -373,6 +419,7 @@ def refine(R_cam_from_ref: Floats, cam: Floats, ref: Floats, weight: Floats) -> 
     normal = np.empty((3, 3))
     step = np.empty(3)
     for _ in range(MAX_STEPS):
+        # 1. Gradient and information
         gradient.fill(0.0)
         normal.fill(0.0)
         for n in range(len(cam)):
@@ -383,10 +430,12 @@ def refine(R_cam_from_ref: Floats, cam: Floats, ref: Floats, weight: Floats) -> 
             gradient[1] += w * (a[2] * cam[n, 0] - a[0] * cam[n, 2])
             gradient[2] += w * (a[0] * cam[n, 1] - a[1] * cam[n, 0])
             _add_information(normal, a, w)
+        # 2. Step
         _factorize(normal)
         for i in range(3):
             step[i] = gradient[i]
         least_squares.cholesky_solve(normal, step)
+        # 3. Rotation
         rotate_in_place(step, R)
         if step[0] ** 2 + step[1] ** 2 + step[2] ** 2 < MIN_STEP2_RAD2:
             break
@@ -405,14 +454,16 @@ def _add_information(matrix: Floats, v: Floats, w: float) -> None:
 
 @jit
 def attitude_covariance(cam: Floats, weight: Floats) -> Floats:
-    """Return the (3, 3) covariance: the inverse of sum(w (I - b b^T)). Raises ValueError if that is singular."""
+    """Return the (3, 3) covariance P = [sum(w (I - b b^T))]^-1. Raises ValueError if the sum is singular."""
     factor = np.zeros((3, 3))
     out = np.eye(3)
     for n in range(len(cam)):
         _add_information(factor, cam[n], weight[n])
     _factorize(factor)
+    # Column j of the inverse solves N x = e_j.
     for j in range(3):
         least_squares.cholesky_solve(factor, out[j])
+    # Rounding leaves it slightly asymmetric.
     for i in range(3):
         for j in range(i):
             out[i, j] = out[j, i] = (out[i, j] + out[j, i]) / 2

@@ -1,7 +1,13 @@
 """Self-calibration of an LED dome: LED positions, lever, lens and attitudes from frames at many attitudes.
 
-The method is bundle adjustment (`bundle_adjustment`) from an approximate map and approximate attitudes, after removal
-of wrong identifications and of lights and frames that the observations do not determine.
+The method is bundle adjustment (`bundle_adjustment`) from an approximate map and approximate attitudes:
+
+1. Improve the start attitudes, and reject wrong identifications (`_reject_misidentified`).
+2. Select the connected subset: lights and frames that the sightings determine (`connected_subset`).
+3. Adjust all unknowns by least squares (`bundle_adjustment.adjust`).
+4. Transform the solution to the gauge (`Gauge.transform`).
+5. Compute the covariances, and the misfit sqrt(chi-square / redundancy). If the noise is to be fitted, multiply it by
+   the misfit and repeat from step 3 (`_fit`).
 
 Gauge freedoms, which no pixel can determine, and the constraints that fix them here:
 
@@ -48,22 +54,25 @@ CAUCHY = 2.385
 LOSSES: dict[str, float] = {"linear": np.inf, "cauchy": CAUCHY}
 GATE = 5.0  # residuals above this many robust sigmas are outliers in the final fit
 GROSS_GATE = 6.0  # the same for the first rejection, after only the attitudes are fitted
-MIN_REDUNDANCY = (
-    8  # coordinates more than unknowns, for a survey that estimates its noise from them
-)
-CROSSING_RAD = (
-    0.005  # least rms angle between the rays to one light; below, its distance is undetermined
-)
-CONNECTING_RAD = (
-    2 * CROSSING_RAD
-)  # of lights that connect frames before they are adjusted: the angle is not yet exact
-# of the noise estimated from the residuals; the tolerance is relative
+# Least number of redundant coordinates of a survey that estimates its noise from them.
+MIN_REDUNDANCY = 8
+# Least rms angle of the rays to one light from their main direction; below it, the distance is undetermined.
+CROSSING_RAD = 0.005
+# The same for lights that connect frames before they are adjusted, when the angle is not yet exact.
+CONNECTING_RAD = 2 * CROSSING_RAD
+# Estimation of the noise from the residuals: number of rounds, and the misfit's difference from 1 that ends them.
 NOISE_ROUNDS = 8
 NOISE_TOLERANCE = 0.01
 
 
 class Unconnected(ValueError):
-    """The frames form several groups; `frames` are the rows of those outside the group of the frame with most LEDs."""
+    """Error: the frames form several groups.
+
+    Attributes
+    ----------
+    frames
+        Rows of the frames outside the group of the frame with most LEDs
+    """
 
     def __init__(self, message: str, frames: Ints) -> None:
         super().__init__(message)
@@ -79,12 +88,12 @@ class DomeFrame:
     led
         (K,) rows of the LED map
     xy_px
-        (K, 2)
+        (K, 2) centroids
     sigma_px
-        (K,) of each coordinate
+        (K,) standard deviation of each coordinate
     body_from_lab
-        Start value, accurate to a few degrees: from an IMU, or nearfield.rotation_only with the
-        old map
+        Start value of the attitude, accurate to a few degrees: from an IMU, or from
+        nearfield.rotation_only with the old map
     """
 
     led: Ints
@@ -100,9 +109,6 @@ class DomeSurvey:
     The covariances are of errors against the truth if the start map is used as a measurement. Otherwise, or with a
     known length or a reference frame, they are relative to the gauge and do not include its error.
 
-    led_covariance_m2 (N, 3, 3), attitude_covariance_rad2 (F, 3, 3) in body axes: NaN if not surveyed or tied
-    lever_covariance_m2 (3, 3), lens_covariance: of the fitted elements of focal_px, center x and y, k1, k2, p1, p2
-
     Attributes
     ----------
     status
@@ -111,17 +117,26 @@ class DomeSurvey:
         The map with surveyed positions; lights that are not `surveyed` keep their start
         positions
     surveyed
-        (N,) lights seen in two or more tied frames, from different directions
+        (N,) whether each light is surveyed: seen in two or more tied frames, from different
+        directions
     lever, camera
-        Fitted; cam_from_body is the start value
+        Fitted lever and camera; cam_from_body is the start value
     body_from_lab
         (F,) attitudes; the start value for a frame that is not `tied`
     tied
-        (F,) frames that see two or more surveyed lights
+        (F,) whether each frame is tied: it sees two or more surveyed lights
     outliers
         (K, 2) frame, and row in it, of the sightings rejected as wrong identifications
+    led_covariance_m2
+        (N, 3, 3) covariance of each position in the lab frame; NaN if not surveyed
+    attitude_covariance_rad2
+        (F, 3, 3) covariance of each attitude in body axes; NaN if not tied
+    lever_covariance_m2
+        (3, 3) covariance of the lever in body axes
+    lens_covariance
+        Covariance of the fitted elements of focal_px, center x and y, k1, k2, p1, p2
     rms_px
-        Of the residual coordinates
+        RMS of the residual coordinates
     misfit
         sqrt(chi-square / redundancy), near 1 if sigma_px is correct
     noise_scale
@@ -152,9 +167,10 @@ class DomeSurvey:
     @property
     def surveyed_leds(self) -> LedMap:
         """The map of the surveyed lights only."""
-        board = None if self.leds.board is None else self.leds.board[self.surveyed]
-        selected = self.leds.id[self.surveyed], self.leds.position_m[self.surveyed]
-        return LedMap(*selected, self.leds.center_m, self.leds.semi_axes_m, board)
+        leds = self.leds
+        board = None if leds.board is None else leds.board[self.surveyed]
+        position_m = leds.position_m[self.surveyed]
+        return LedMap(leds.id[self.surveyed], position_m, leds.center_m, leds.semi_axes_m, board)
 
 
 def survey(
@@ -174,15 +190,19 @@ def survey(
 
     Parameters
     ----------
+    frames
+        Identified LEDs, centroids and start attitude of each frame
+    leds_start, lever_start, camera_start
+        Start values of the map, the lever and the camera
     known_length
         Rows of two lights and the distance between them in m; fixes the scale
     fit_distortion
         Also fit k1, k2, p1, p2; k3 has no visible effect in a narrow field
     loss
-        "linear", or "cauchy", which tolerates wrong identifications: iteratively reweighted,
-        for a noise that shrinks with the median residual; then residuals beyond 5 sigma are
-        rejected and the rest is fitted by least squares, so that the covariance is that of a
-        least-squares fit. Errors of a light seen only twice are hard to detect
+        "linear", or "cauchy", which tolerates wrong identifications: they are rejected with a
+        robust loss first (`_reject_misidentified`), and the rest is fitted by least squares, so
+        that the covariance is that of a least-squares fit. Errors of a light seen only twice are
+        hard to detect
     reference_frame
         Row of the frame whose start attitude fixes the lab frame, instead of the start map
     leds_sigma_m
@@ -201,8 +221,9 @@ def survey(
     Raises
     ------
     ValueError
-        In one line if the frames are malformed or do not determine the unknowns, Unconnected if
-        they form several groups.
+        If the frames are malformed or do not determine the unknowns.
+    Unconnected
+        If the frames form several groups.
     """
     if loss not in LOSSES:
         raise ValueError(f"survey: unknown loss {loss!r}; allowed: {', '.join(LOSSES)}")
@@ -219,19 +240,20 @@ def survey(
     check_map(leds_start)
     check_lever(leds_start, lever_start)
     sightings = _collect(frames, len(leds_start.position_m))
-    start = _start_bundle(frames, leds_start, lever_start, camera_start, 7 if fit_distortion else 3)
+    free_lens = 7 if fit_distortion else 3  # focal length, center; k1, k2, p1, p2
+    start = _start_bundle(frames, leds_start, lever_start, camera_start, free_lens)
     start = replace(start, map_sigma_m=leds_sigma_m, assumed=assumed)
     gauge = Gauge(known_length, reference_frame, start.map_m, start.R_body_from_lab)
     fit = _fit(start, sightings, gauge, LOSSES[loss], fit_noise)
-    status = "converged" if fit.converged else f"stopped after {ba.STEPS} steps without convergence"
+    # The frame, and the row in it, of each rejected sighting.
     row = np.concatenate([np.arange(len(frame.led)) for frame in frames])
     outliers = np.column_stack([sightings.frame, row])[~fit.keep]
     full = fit.subset.insert_into(start, fit.subset.bundle)
-    return _report(status, fit, full, outliers, leds_start, camera_start)
+    return _report(fit, full, outliers, leds_start, camera_start)
 
 
 class _Fit(NamedTuple):
-    """A fitted subset, the (M,) mask of sightings kept, and what the report needs besides."""
+    """A fitted subset, the (M,) mask of sightings kept, and the quality of the fit."""
 
     subset: Subset
     keep: np.ndarray
@@ -242,7 +264,7 @@ class _Fit(NamedTuple):
 
 
 def _fit(start: Bundle, sightings: Sightings, gauge: Gauge, width: float, fit_noise: bool) -> _Fit:
-    """Fit the connected subset of the observations in the given gauge.
+    """Fit the connected subset of the observations in the given gauge: the numbered steps of the module.
 
     Raises
     ------
@@ -252,17 +274,20 @@ def _fit(start: Bundle, sightings: Sightings, gauge: Gauge, width: float, fit_no
     covariances = None
     scale = 1.0
     try:
+        # 1. Wrong identifications
         start, keep = _reject_misidentified(start, sightings, width)
+        # 2. Connected subset
         subset = connected_subset(start, sightings, keep)
         gauge.check(subset)
         for _ in range(NOISE_ROUNDS if fit_noise else 1):
+            # 3. Least squares
             scaled = replace(subset.sightings, sigma_px=scale * sightings.sigma_px[subset.index])
             fitted, converged = ba.adjust(subset.bundle, scaled, np.inf)
-            # If priors fix the gauge, the fit's own is the one of least squares.
-            in_gauge = (
-                fitted if _has_prior_gauge(fitted, gauge) else gauge.transform(fitted, subset)
-            )
-            subset = replace(subset, bundle=in_gauge, sightings=scaled)
+            # 4. Gauge. If the map as a measurement fixes it, the fit is in that gauge already.
+            if not _has_prior_gauge(fitted, gauge):
+                fitted = gauge.transform(fitted, subset)
+            subset = replace(subset, bundle=fitted, sightings=scaled)
+            # 5. Covariances, misfit, and noise
             covariances = _covariances(subset, gauge)
             if fit_noise:
                 check_redundancy(subset, covariances)
@@ -280,12 +305,12 @@ def _fit(start: Bundle, sightings: Sightings, gauge: Gauge, width: float, fit_no
 
 
 def _has_prior_gauge(bundle: Bundle, gauge: Gauge) -> bool:
-    """Whether the map, as a measurement, fixes rotation and scale."""
+    """Return whether the map, as a measurement, fixes rotation and scale."""
     return gauge.is_map and bool(np.isfinite(bundle.map_sigma_m))
 
 
 def _covariances(subset: Subset, gauge: Gauge) -> Covariances:
-    """The covariances of a fitted subset: of total errors if its map fixes the gauge, else relative to the gauge."""
+    """Return the covariances of a fitted subset: of total errors if its map fixes the gauge, else relative to it."""
     bundle = subset.bundle
     terms = ba.normal_equations(bundle, subset.sightings, np.ones(len(subset.index)))
     if _has_prior_gauge(bundle, gauge):
@@ -294,19 +319,20 @@ def _covariances(subset: Subset, gauge: Gauge) -> Covariances:
 
 
 def _misfit(subset: Subset, covariances: Covariances) -> float:
-    """Square root of chi-square of the pixels over their redundancy."""
+    """Return the square root of the pixels' chi-square over their redundancy."""
     chi2 = np.sum(ba.residuals(subset.bundle, subset.sightings) ** 2)
     return float(np.sqrt(chi2 / max(redundancy(subset, covariances), 1)))
 
 
 def redundancy(subset: Subset, covariances: Covariances) -> float:
-    """Number of coordinates of the pixels less that of the unknowns that they determine.
+    """Return the number of pixel coordinates less the number of unknowns that they determine.
 
-    With the map as a measurement the pixels determine U - tr(C) / sigma_map^2 of the U unknowns, C the covariance of
-    the lights, and the map the rest; without it U less the four gauge freedoms. An assumed lever and focal length
-    count as the map does.
+    With the map as a measurement, the pixels determine U - tr(C) / sigma_map^2 of the U unknowns, C the covariance of
+    the lights, and the map determines the rest. Without it the pixels determine U less the four gauge freedoms. An
+    assumed lever and focal length are counted in the same way as the map.
     """
     bundle = subset.bundle
+    # Lights, rotations, lever, and lens, less the gauge freedoms
     unknowns = 3.0 * (len(subset.led) + len(subset.frame) + 1) + bundle.free_lens - 4
     if np.isfinite(bundle.map_sigma_m):
         by_prior = float(np.einsum("nii->", covariances.by_led)) / bundle.map_sigma_m**2
@@ -317,9 +343,9 @@ def redundancy(subset: Subset, covariances: Covariances) -> float:
 
 
 def check_redundancy(subset: Subset, covariances: Covariances) -> None:
-    """Raise ValueError if so few coordinates are redundant that a misidentified light would not be seen.
+    """Raise ValueError if so few coordinates are redundant that the residuals would not show a misidentified light.
 
-    Two frames under AFIT's dome have four, and one wrong light of 18 moved the lens center by four standard deviations.
+    Two frames under AFIT's dome have four: one wrong light of 18 moved the lens center by four standard deviations.
     """
     spare = redundancy(subset, covariances)
     if spare < MIN_REDUNDANCY:
@@ -330,7 +356,7 @@ def check_redundancy(subset: Subset, covariances: Covariances) -> None:
 
 
 def _collect(frames: Sequence[DomeFrame], lights: int) -> Sightings:
-    """The sightings of all frames in one table. Raises ValueError for the first malformed frame."""
+    """Return the sightings of all frames in one table. Raises ValueError for the first malformed frame."""
     if not frames:
         raise ValueError("survey: no frames; allowed: 1 or more, typically tens")
     for k, frame in enumerate(frames):
@@ -342,10 +368,8 @@ def _collect(frames: Sequence[DomeFrame], lights: int) -> Sightings:
             )
         if count and not (frame.led.min() >= 0 and frame.led.max() < lights):
             raise ValueError(f"survey: frame {k} has LED rows outside of 0 to {lights - 1}")
-        if not (
-            np.isfinite(frame.xy_px).all()
-            and np.all((frame.sigma_px > 0) & (frame.sigma_px < np.inf))
-        ):
+        usable_sigma = (frame.sigma_px > 0) & (frame.sigma_px < np.inf)
+        if not (np.isfinite(frame.xy_px).all() and usable_sigma.all()):
             raise ValueError(
                 f"survey: frame {k} has a pixel that is not finite or a sigma_px not above 0"
             )
@@ -360,15 +384,14 @@ def _collect(frames: Sequence[DomeFrame], lights: int) -> Sightings:
 def _start_bundle(
     frames: Sequence[DomeFrame], leds: LedMap, lever: Lever, camera: Camera, free_lens: int
 ) -> Bundle:
-    lens = np.array([camera.focal_px, *camera.center_px, *camera.distortion])
-    rotated = Rotation.concatenate([frame.body_from_lab for frame in frames]).as_matrix()
-    R_cam_from_body = lever.cam_from_body.as_matrix()
+    """Return the start values of all parameters, without priors."""
+    attitudes = Rotation.concatenate([frame.body_from_lab for frame in frames])
     return Bundle(
         leds.position_m,
-        rotated,
+        attitudes.as_matrix(),
         np.array(lever.camera_body_m),
-        R_cam_from_body,
-        lens,
+        lever.cam_from_body.as_matrix(),
+        np.array([camera.focal_px, *camera.center_px, *camera.distortion]),
         free_lens,
         leds.position_m,
     )
@@ -377,52 +400,67 @@ def _start_bundle(
 def _reject_misidentified(
     full: Bundle, sightings: Sightings, width: float
 ) -> tuple[Bundle, np.ndarray]:
-    """Improve the start values and reject wrong identifications.
+    """Improve the start values and reject wrong identifications; return the bundle and the (M,) mask of those kept.
 
-    First only the attitudes are fitted. For a finite width, gross outliers are rejected, the whole bundle is fitted
-    with Cauchy's loss for a noise that shrinks with the residuals until it settles, and residuals beyond GATE are
-    rejected. Returns the bundle and the (M,) mask of sightings kept.
+    a. Fit the attitudes only. With an infinite width (least squares) this is all.
+    b. Reject gross outliers: residuals beyond GROSS_GATE robust sigmas.
+    c. Fit the whole bundle with Cauchy's loss, for a noise that shrinks with the residuals until it settles.
+    d. Reject residuals beyond GATE robust sigmas.
 
-    With the true noise at once, a few wrong identifications would move the lever or the lens by ten times what is known
-    of them, and the fit would end in a minimum where the right ones are rejected. So at first what is known counts as
-    much as the pixels (graduated non-convexity: Blake and Zisserman 1987, Visual Reconstruction, chapter 7).
+    With the true noise at once, a few wrong identifications would move the lever or the lens by ten times their prior
+    standard deviations, and the fit would end in a minimum where the right ones are rejected. In step c the priors
+    therefore count at first as much as the pixels (graduated non-convexity: Blake and Zisserman 1987, Visual
+    Reconstruction, chapter 7).
     """
+    # a. Attitudes
     keep = np.ones(len(sightings.led), dtype=bool)
     subset = connected_subset(full, sightings, keep)
     fitted = ba.fit_attitudes(subset.bundle, subset.sightings, 12)
     full = subset.insert_into(full, fitted)
     if np.isinf(width):
         return full, keep
+    # b. Gross outliers
     keep[subset.index] = _inliers(fitted, subset.sightings, GROSS_GATE)
     subset = connected_subset(full, sightings, keep)
+    # c. Whole bundle, as long as the noise shrinks by a tenth or more
     fitted = subset.bundle
     previous = np.inf
     while (scale := ba.robust_scale(fitted, subset.sightings)) < 0.9 * previous:
         noisy = replace(subset.sightings, sigma_px=scale * subset.sightings.sigma_px)
         fitted = ba.adjust(fitted, noisy, width, decrement=0.1)[0]
         previous = scale
+    # d. Outliers
     keep[subset.index] = _inliers(fitted, subset.sightings, GATE)
     return subset.insert_into(full, fitted), keep
 
 
 def _inliers(bundle: Bundle, sightings: Sightings, gate: float) -> np.ndarray:
-    """(M,) whether each residual is below `gate` robust sigmas."""
+    """Return (M,) whether each residual is below `gate` robust sigmas."""
     length = np.linalg.norm(ba.residuals(bundle, sightings), axis=1)
     return length < gate * ba.robust_scale(bundle, sightings)
 
 
 def connected_subset(full: Bundle, sightings: Sightings, keep: np.ndarray) -> Subset:
-    """The subset that the sightings determine.
+    """Return the subset that the sightings determine.
 
-    It holds lights seen in two or more frames with crossing rays, and frames that see two or more such lights. Raises
-    ValueError if too few sightings remain, or if they form groups of frames that are not connected.
+    1. Remove lights seen in fewer than two frames or without crossing rays, and frames that see fewer than two of the
+       remaining lights, until nothing changes.
+    2. Check that the coordinates suffice for the unknowns, and that the frames form one group.
+    3. Renumber lights, frames and sightings from 0.
+
+    Raises
+    ------
+    ValueError
+        If too few sightings remain.
+    Unconnected
+        If they form groups of frames that are not connected.
     """
     in_front = np.isfinite(ba.residuals(full, sightings)).all(axis=1)
     index = np.flatnonzero(keep & in_front)
     lights = len(full.position_m)
     frames = len(full.R_body_from_lab)
-    camera_m = np.einsum("kji,j->ki", full.R_body_from_lab, full.camera_body_m)
-    # Removing a light can leave its frames with too few lights, and the reverse: repeat until nothing changes.
+    camera_m = np.einsum("kji,j->ki", full.R_body_from_lab, full.camera_body_m)  # in the lab
+    # 1. Removing a light can leave its frames with too few lights, and the reverse.
     while True:
         led = sightings.led[index]
         frame = sightings.frame[index]
@@ -434,6 +472,7 @@ def connected_subset(full: Bundle, sightings: Sightings, keep: np.ndarray) -> Su
         if valid.all():
             break
         index = index[valid]
+    # 2. Coordinates and connection
     led_rows = np.unique(led)
     frame_rows = np.unique(frame)
     unknowns = 3 * len(led_rows) + 3 * len(frame_rows) + 3 + full.free_lens - 4
@@ -442,9 +481,11 @@ def connected_subset(full: Bundle, sightings: Sightings, keep: np.ndarray) -> Su
             f"survey: {2 * len(index)} usable coordinates for {unknowns} unknowns; take more frames"
         )
     _check_one_group(incidence, frame_rows)
-    sightings = sightings.take(index)
+    # 3. New numbers
     numbered = replace(
-        sightings, frame=np.searchsorted(frame_rows, frame), led=np.searchsorted(led_rows, led)
+        sightings.take(index),
+        frame=np.searchsorted(frame_rows, frame),
+        led=np.searchsorted(led_rows, led),
     )
     bundle = replace(
         full,
@@ -456,18 +497,18 @@ def connected_subset(full: Bundle, sightings: Sightings, keep: np.ndarray) -> Su
 
 
 def ray_angles(position_m: np.ndarray, camera_m: np.ndarray, frame: Ints, led: Ints) -> np.ndarray:
-    """(N,) rms angle of the rays to each light from their main direction, by which they determine its distance.
+    """Return the (N,) rms angle of the rays to each light from their main direction; the distance depends on it.
 
-    1 minus the largest eigenvalue of the mean of u u' is the mean sin^2 of these angles. Without a sighting it is 0.
+    The mean sin^2 of these angles is 1 minus the largest eigenvalue of the mean of u u^T. Without a sighting it is 0.
 
     Parameters
     ----------
     position_m
-        (N, 3) lights
+        (N, 3) positions of the lights
     camera_m
-        (F, 3) camera positions
+        (F, 3) positions of the camera in each frame
     frame, led
-        (K,) rows of the sightings
+        (K,) rows of each sighting's frame and light
     """
     ray = position_m[led] - camera_m[frame]
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -485,6 +526,7 @@ def _check_one_group(incidence: csr_array, frame_rows: Ints) -> None:
     A group that shares only one light with the rest could rotate about it. The group grows from the frame with the most
     lights.
     """
+    # Frames by lights; the group begins with the frame with the most lights.
     table = incidence[frame_rows].astype(float)
     member = np.zeros(len(frame_rows), dtype=bool)
     member[np.argmax(table.sum(axis=1))] = True
@@ -494,6 +536,7 @@ def _check_one_group(incidence: csr_array, frame_rows: Ints) -> None:
         if (grown == member).all():
             break
         member = grown
+    # The message names one frame of the group and one outside it.
     if not member.all():
         first = frame_rows[member][0]
         second = frame_rows[~member][0]
@@ -505,7 +548,7 @@ def _check_one_group(incidence: csr_array, frame_rows: Ints) -> None:
 
 
 def _determined(fitted: Bundle, shared: Floats) -> bool:
-    """Whether the lever is determined to 10 % of the least LED distance, and the focal length to 10 %."""
+    """Return whether the lever is determined to 10 % of the least LED distance, and the focal length to 10 %."""
     sigma = np.sqrt(np.maximum(np.diag(shared), 0))
     nearest_m = np.linalg.norm(fitted.position_m, axis=1).min()
     return bool(
@@ -515,21 +558,22 @@ def _determined(fitted: Bundle, shared: Floats) -> bool:
     )
 
 
-def _report(
-    status: str, fit: _Fit, full: Bundle, outliers: Ints, leds: LedMap, camera: Camera
-) -> DomeSurvey:
+def _report(fit: _Fit, full: Bundle, outliers: Ints, leds: LedMap, camera: Camera) -> DomeSurvey:
+    """Return the survey's result: the fitted subset in the full set of lights and frames."""
+    status = "converged" if fit.converged else f"stopped after {ba.STEPS} steps without convergence"
     subset = fit.subset
-    sightings = fit.subset.sightings
     lights = len(full.position_m)
     frames = len(full.R_body_from_lab)
     surveyed = np.zeros(lights, dtype=bool)
     tied = np.zeros(frames, dtype=bool)
     surveyed[subset.led] = tied[subset.frame] = True
+    # Covariances of the subset; NaN elsewhere
     by_led = np.full((lights, 3, 3), np.nan)
     by_rotation = np.full((frames, 3, 3), np.nan)
     by_led[subset.led], by_rotation[subset.frame], shared = fit.covariances
-    residual = ba.residuals(subset.bundle, sightings)
-    lens = [float(value) for value in full.lens]
+    residual = ba.residuals(subset.bundle, subset.sightings)
+    residual_px = residual * subset.sightings.sigma_px[:, None]
+    focal_px, center_x, center_y, k1, k2, p1, p2, k3 = (float(value) for value in full.lens)
     return DomeSurvey(
         status,
         replace(leds, position_m=full.position_m),
@@ -537,18 +581,18 @@ def _report(
         Lever(full.camera_body_m, Rotation.from_matrix(full.R_cam_from_body)),
         replace(
             camera,
-            focal_px=lens[0],
-            center_px=(lens[1], lens[2]),
-            distortion=(lens[3], lens[4], lens[5], lens[6], lens[7]),
+            focal_px=focal_px,
+            center_px=(center_x, center_y),
+            distortion=(k1, k2, p1, p2, k3),
         ),
         Rotation.from_matrix(full.R_body_from_lab),
         tied,
         outliers,
         by_led,
         by_rotation,
-        shared[:3, :3],
-        shared[3:, 3:],
-        rms_px=float(np.sqrt(np.mean((residual * sightings.sigma_px[:, None]) ** 2))),
+        lever_covariance_m2=shared[:3, :3],
+        lens_covariance=shared[3:, 3:],
+        rms_px=float(np.sqrt(np.mean(residual_px**2))),
         misfit=fit.misfit,
         noise_scale=fit.noise_scale,
     )

@@ -1,8 +1,8 @@
 """Gauge freedoms of the dome survey (rotation of the lab frame, scale) and the constraints that fix them.
 
 No pixel changes if the lab frame rotates or if all lengths are scaled; see estimator/calibration/dome_survey.py.
-The rotation is fixed by the start map (least squares) or by the attitude of one reference frame, and the scale by one
-known length or by the start map. `Gauge.transform` transforms a solution to the gauge; `Gauge.constraints` linearizes
+The start map (in the least-squares sense) or the attitude of one reference frame fixes the rotation; one known length
+or the start map fixes the scale. `Gauge.transform` transforms a solution to the gauge; `Gauge.constraints` linearizes
 the four constraints for the covariance.
 """
 
@@ -19,12 +19,14 @@ from estimator.core.checks import Floats, Ints
 
 @dataclass(frozen=True, slots=True)
 class Subset:
-    """The connected subset of lights, frames and sightings, renumbered from 0.
+    """Connected subset of lights, frames and sightings, renumbered from 0.
 
     Attributes
     ----------
+    bundle, sightings
+        Parameters and observations of the subset
     led, frame, index
-        Their rows in the full set of lights, frames and sightings
+        Rows of its lights, frames and sightings in the full set
     """
 
     bundle: Bundle
@@ -34,7 +36,8 @@ class Subset:
     index: Ints
 
     def insert_into(self, full: Bundle, fitted: Bundle) -> Bundle:
-        """The full bundle with the adjusted values of this subset inserted."""
+        """Return the full bundle with the adjusted values of this subset inserted."""
+        # Lights and frames outside of the subset keep their values.
         position = full.position_m.copy()
         rotated = full.R_body_from_lab.copy()
         position[self.led] = fitted.position_m
@@ -44,16 +47,18 @@ class Subset:
 
 @dataclass(frozen=True, slots=True)
 class Gauge:
-    """The constraints that fix the rotation and the scale of the lab frame.
+    """Constraints that fix the rotation and the scale of the lab frame.
 
     Attributes
     ----------
     length
-        Rows of two lights and the distance between them in m; None: the start map's mean size
+        Rows of two lights and the distance between them in m, which fixes the scale; None: the
+        start map's mean size fixes it
     frame
-        Row of the reference frame; None: the start map's mean orientation
+        Row of the reference frame, which fixes the rotation; None: the start map's mean
+        orientation fixes it
     map_m, R_body_from_lab
-        (N, 3), (F, 3, 3) start values
+        (N, 3) and (F, 3, 3) start values of positions and attitudes
 
     Raises
     ------
@@ -91,23 +96,28 @@ class Gauge:
             self._reference_row(subset)
 
     def transform(self, fitted: Bundle, subset: Subset) -> Bundle:
-        """The bundle rotated and scaled to satisfy the gauge; its pixels do not change."""
+        """Return the bundle rotated and scaled to satisfy the gauge; its pixels do not change.
+
+        1. Find the rotation G of the lab frame: onto the start map, or to the reference frame's start attitude.
+        2. Find the scale s: from the known length, or from the start map.
+        3. Apply them: x <- s G x, A <- A G^T, r <- s r.
+        """
+        # 1. Rotation
         position_m = fitted.position_m
         start = self.map_m[subset.led]
         if self.frame is None:
             rotation = Rotation.align_vectors(start, position_m)[0].as_matrix()
         else:
-            rotation = (
-                self.R_body_from_lab[self.frame].T
-                @ fitted.R_body_from_lab[self._reference_row(subset)]
-            )
+            fitted_attitude = fitted.R_body_from_lab[self._reference_row(subset)]
+            rotation = self.R_body_from_lab[self.frame].T @ fitted_attitude
+        # 2. Scale. Without a length it makes the survey's projection on the start map equal to the start map's own
+        # sum of squares, sum(x_0 . s G x) = sum(x_0 . x_0): the linear constraint that `constraints` uses.
         if self.length is None:
-            # The scale for which the survey's projection on the start map equals the start map's own sum of squares:
-            # the linear constraint that `constraints` uses.
             scale = np.sum(start**2) / np.sum(start * (position_m @ rotation.T))
         else:
             i, j = self._length_rows(subset)
             scale = self.length[2] / np.linalg.norm(position_m[i] - position_m[j])
+        # 3. Transformed bundle
         return replace(
             fitted,
             position_m=scale * position_m @ rotation.T,
@@ -117,16 +127,18 @@ class Gauge:
         )
 
     def constraints(self, fitted: Bundle, subset: Subset) -> tuple[Floats, Floats]:
-        """The gauge's four constraints, linearized: (3 n, 4) for the positions and (R, 4) for the other unknowns."""
+        """Return the four constraints, linearized: (3 n, 4) for the positions and (R, 4) for the other unknowns."""
         start = self.map_m[subset.led]
         by_led = np.zeros((len(start), 3, 4))
         by_rest = np.zeros((3 * len(subset.frame) + 3 + fitted.free_lens, 4))
+        # Rotation: sum((e x x_0) . dx) = 0 about each axis e, or no rotation of the reference frame.
         if self.frame is None:
             for axis, e in enumerate(np.eye(3)):
                 by_led[:, :, axis] = np.cross(e, start)
         else:
             first = 3 * self._reference_row(subset)
             by_rest[first : first + 3, :3] = np.eye(3)
+        # Scale: sum(x_0 . dx) = 0, or no change of the known length.
         if self.length is None:
             by_led[:, :, 3] = start
         else:
@@ -137,6 +149,7 @@ class Gauge:
         return by_led.reshape(-1, 4), by_rest
 
     def _length_rows(self, subset: Subset) -> tuple[int, int]:
+        """Return the subset's rows of the known length's two lights. Raises ValueError if one is not surveyed."""
         assert self.length is not None
         for row in self.length[:2]:
             if row not in subset.led:
@@ -147,6 +160,7 @@ class Gauge:
         return int(i), int(j)
 
     def _reference_row(self, subset: Subset) -> int:
+        """Return the subset's row of the reference frame. Raises ValueError if it is not surveyed."""
         if self.frame is None or self.frame not in subset.frame:
             raise ValueError(
                 f"survey: reference_frame {self.frame} sees fewer than two surveyed LEDs"
@@ -155,22 +169,30 @@ class Gauge:
 
 
 def align_attitudes(ours: Rotation, theirs: Rotation) -> tuple[Rotation, Rotation]:
-    """The constant rotations of body and lab between two sets of simultaneous attitudes: theirs = left * ours * right.
+    """Return the constant rotations of body and lab between simultaneous attitudes: theirs = left * ours * right.
 
-    left = theirs_body_from_our_body (so cam_from_their_body = cam_from_our_body * left.inv()), right =
-    our_lab_from_their_lab. Least squares by Gauss-Newton on the rotation vectors of the residuals, starting from the
-    mean rotation. If all attitudes rotate about one axis, a rotation can be divided between the two; the minimum-norm
-    step is taken.
+    `left` is their_body_from_our_body (so cam_from_their_body = cam_from_our_body * left.inv()), and `right` is
+    our_lab_from_their_lab. Gauss-Newton minimizes the sum of squares of the residuals, the rotation vectors of
+    theirs (left ours right)^-1:
+
+    1. Start from left = I and the mean of ours^-1 theirs as right.
+    2. Linearize: the residual changes by -w_left - R(left ours) w_right for small rotations of both.
+    3. Solve by least squares. If all attitudes rotate about one axis, a rotation can be divided between the two; the
+       minimum-norm step is taken.
+    4. Rotate both, until the step is negligible.
     """
+    # 1. Start
     left = Rotation.identity()
     right = (ours.inv() * theirs).mean()
     for _ in range(50):
+        # 2. Residuals and Jacobian
         predicted_left = left * ours
         residual = (theirs * (predicted_left * right).inv()).as_rotvec()
-        jacobian = np.concatenate(
-            [np.tile(np.eye(3), (len(residual), 1, 1)), predicted_left.as_matrix()], axis=2
-        )
+        by_left = np.tile(np.eye(3), (len(residual), 1, 1))
+        jacobian = np.concatenate([by_left, predicted_left.as_matrix()], axis=2)
+        # 3. Step, of minimum norm
         step = np.linalg.lstsq(jacobian.reshape(-1, 6), residual.ravel(), rcond=1e-9)[0]
+        # 4. Update
         left = Rotation.from_rotvec(step[:3]) * left
         right = Rotation.from_rotvec(step[3:]) * right
         if np.linalg.norm(step) < 1e-14:

@@ -1,9 +1,13 @@
 """AFIT's laboratory calibration: an LED catalog measured from the home position, and its repeatability.
 
-Padro 2012, sections 3.6.3 and 3.6.4: the vehicle is held at several positions (stops). In every frame the directions
-of the lights are transformed from the camera to the bearing (his eqs 43-44) and from there to the lab frame with the
-IMU's angles. The repeatability of a light's position gives epsilon_position; that of the angles between lights
-(eq. 45), which need no IMU, gives epsilon_separation; that of the brightness gives epsilon_magnitude.
+The source is Padro 2012, sections 3.6.3 and 3.6.4. The vehicle is held at several positions (stops), and `calibrate`
+takes these steps:
+
+1. In every frame, transform the directions of the lights from the camera to the bearing (his eqs 43-44), and from there
+   to the lab frame with the IMU's angles.
+2. Compute the repeatability: of a light's position, epsilon_position; of the angles between lights (eq. 45), which need
+   no IMU, epsilon_separation; of the brightness, epsilon_magnitude.
+3. Average positions and brightness for the catalog.
 """
 
 from __future__ import annotations
@@ -36,11 +40,11 @@ class Sighting:
         Attitude from the IMU, which is zeroed at home: there the body axes are those of the lab
         frame
     led
-        (K,) ids, each once
+        (K,) id of each light, each once
     xy_px
         (K, 2) centroids
     brightness
-        (K,) see `instrument_brightness`
+        (K,) brightness, as of `instrument_brightness`
     """
 
     stop: int
@@ -57,19 +61,19 @@ class HomeCatalog:
     Attributes
     ----------
     id, brightness
-        (N,)
+        (N,) id and mean brightness of each light
     vectors
-        (N, 3) unit, from the bearing
+        (N, 3) unit vectors from the bearing
     position_m
         (N, 3) positions by eqs 43-44: near the dome, not on it
     covariance_m2
-        (N, 3, 3) of one frame's position about its mean, over all frames; NaN for a single
-        frame
+        (N, 3, 3) covariance of one frame's position about its mean, over all frames; NaN for a
+        single frame
     samples
         (N,) number of frames averaged for position and brightness
     epsilon_mag, epsilon_pos_m, epsilon_sep_rad
         Standard deviations of a brightness, of a coordinate of a position and of the angle
-        between two lights: the greatest over all lights, coordinates and pairs
+        between two lights: the largest over all lights, coordinates and pairs
     """
 
     id: Ints
@@ -87,24 +91,29 @@ class HomeCatalog:
 
     @property
     def epsilon_pos_rad(self) -> float:
-        """epsilon_pos_m as an angle about the bearing, at the mean distance of the lights."""
+        """The angle of epsilon_pos_m about the bearing, at the mean distance of the lights."""
         return self.epsilon_pos_m / float(np.linalg.norm(self.position_m, axis=1).mean())
 
 
 def instrument_brightness(mean_dn: Floats, area_px: Floats) -> Floats:
-    """(N,) brightness of each blob of a frame: mean brightness times its area over the frame's median area.
+    """Return the (N,) brightness of a frame's blobs: mean value times area over the frame's median area.
 
-    Section 3.6.2.1 says only that the mean brightness is "normalized against the median LED area"; his dim means of
-    7 are below his own threshold of 10.2, so that the area must be a factor (reference 1.2, item 13: inferred). A
+    Section 3.6.2.1 says only that the mean brightness is "normalized against the median LED area"; the thesis's dim
+    means of 7 are below its own threshold of 10.2, so the area must be a factor (reference 1.2, item 13: inferred). A
     change common to all blobs, such as defocus, changes the result in the same ratio as the mean brightness.
     """
     return mean_dn * area_px / np.median(area_px)
 
 
 def pooled(value: Floats, group: Ints, stop: Ints) -> Floats:
-    """(G,) sample standard deviation (n - 1) of each group's values over all frames; differences between stops count.
+    """Return the (G,) sample standard deviation (n - 1) of each group's values over all frames; NaN for a single value.
 
-    Section 3.6.3: "across the total number of recorded observations". NaN for a single value.
+    Differences between stops count. Section 3.6.3: "across the total number of recorded observations".
+
+    Parameters
+    ----------
+    value, group, stop
+        (S,) samples, the group of each (a light or a pair of lights), and the stop of its frame
     """
     count = np.bincount(group)
     difference = value - (np.bincount(group, value) / np.maximum(count, 1))[group]
@@ -113,30 +122,32 @@ def pooled(value: Floats, group: Ints, stop: Ints) -> Floats:
 
 
 def averaged(value: Floats, group: Ints, stop: Ints) -> Floats:
-    """(G,) mean over the stops of the standard deviation at each stop.
+    """Return the (G,) mean over the stops of the standard deviation at each stop; NaN if no stop has two frames.
 
     Differences between stops, such as errors of the IMU's angles, have no effect. Section 4.4.1: "the averaged
-    multi-positional standard deviation values". NaN if no stop has two frames.
+    multi-positional standard deviation values". The parameters are those of `pooled`.
     """
+    # Standard deviation of each group at each stop: (G, stops)
     _, row = np.unique(stop, return_inverse=True)
     stops = row.max() + 1
     at_stop = np.full((group.max() + 1) * stops, np.nan)
     deviation = pooled(value, group * stops + row, stop)
     at_stop[: len(deviation)] = deviation
     table = at_stop.reshape(-1, stops)
+    # Mean over the stops that have one
     finite = np.isfinite(table)
     total = np.where(finite, table, 0.0).sum(axis=1)
     return np.where(finite.any(axis=1), total / np.maximum(finite.sum(axis=1), 1), np.nan)
 
 
-# The thesis describes both. Table 4 has a pooled value under "Avg"; the position value of Table 9 is too small for a
-# pooled one if the IMU's angles were those of Tables 10-14 (reference 1.2, items 3 and 15).
+# The thesis describes both statistics. Table 4 has a pooled value under "Avg"; the position value of Table 9 is too
+# small for a pooled one if the IMU's angles were those of Tables 10-14 (reference 1.2, items 3 and 15).
 Deviation = Callable[[Floats, Ints, Ints], Floats]
 DEVIATIONS: dict[str, Deviation] = {"pooled": pooled, "averaged": averaged}
 
 
 class _Samples(NamedTuple):
-    """Every light of every frame: row of its id, frame, stop, position in body and in lab axes, brightness."""
+    """Every light of every frame, (S,) each: row of its id, frame, stop, (S, 3) positions in body and in lab axes."""
 
     led: Ints
     frame: Ints
@@ -155,20 +166,26 @@ def calibrate(
     statistic: str = "pooled",
     home_only: bool = True,
 ) -> HomeCatalog:
-    """The catalog and its epsilons by AFIT's procedure (Padro 2012, sections 3.6.3-3.6.4 and 4.4.1).
+    """Return the catalog and its epsilons by AFIT's procedure (Padro 2012, sections 3.6.3-3.6.4 and 4.4.1).
+
+    The numbered steps are those of the module.
 
     Parameters
     ----------
+    sightings
+        Frames with identified lights; the first one is at home
+    camera, lever
+        Calibrated camera, and its position and orientation
     surface
         Dome model, which gives R; its LEDs are not used
     sine
-        Correct eq. 44, which has tan instead of sin (reference 1.2, item 11)
+        Correct eqs 43-44, which have tan instead of sin (reference 1.2, item 11)
     statistic
         A name in DEVIATIONS: the standard deviation whose maximum is an epsilon
     home_only
-        Take the catalog from the frames at home, as in the thesis, with every epsilon from all
-        frames; else from the mean over all frames (the black marks of his Fig. 79), which keeps
-        the IMU's errors at the stops
+        Take the catalog from the frames at home, as in the thesis; otherwise from the mean over
+        all frames (the black marks of the thesis's Fig. 79), which contains the IMU's errors at
+        the stops. The epsilons are from all frames in both cases
 
     Raises
     ------
@@ -180,7 +197,9 @@ def calibrate(
     checks.of_type("surface", surface, LedMap)
     checks.of_type("lever", lever, Lever)
     checks.known("statistic", statistic, DEVIATIONS)
+    # 1. Positions in the lab
     id_, samples = _lab_positions(sightings, camera, surface, lever, sine)
+    # 2. Repeatability
     deviation = DEVIATIONS[statistic]
     coordinates = [deviation(column, samples.led, samples.stop) for column in samples.lab_m.T]
     angle, pair, stop = _separations(samples)
@@ -189,6 +208,7 @@ def calibrate(
         _maximum(np.concatenate(coordinates), "light"),
         _maximum(deviation(angle, pair, stop), "pair of lights"),
     )
+    # 3. Catalog
     selected = samples.stop == sightings[0].stop if home_only else np.ones(len(samples.led), bool)
     order, mean_m, brightness, count = _brightest_first(samples, selected)
     covariance = _covariance(samples.lab_m, samples.led)[order]
@@ -198,14 +218,16 @@ def calibrate(
 def _brightest_first(
     samples: _Samples, selected: NDArray[np.bool_]
 ) -> tuple[Ints, Floats, Floats, Ints]:
-    """Lights seen in the frames used, brightest first: rows, mean positions (N, 3), brightness, numbers of frames."""
+    """Return the lights of the selected samples, brightest first.
+
+    They are given as rows of their ids, mean positions (N, 3), mean brightness, and numbers of frames.
+    """
     led = samples.led[selected]
     count = np.bincount(led)
-    total = [
-        np.bincount(led, column)
-        for column in (*samples.lab_m[selected].T, samples.brightness[selected])
-    ]
+    columns = (*samples.lab_m[selected].T, samples.brightness[selected])
+    total = [np.bincount(led, column) for column in columns]
     mean = np.column_stack(total) / np.maximum(count, 1)[:, None]
+    # Lights that are not among the samples have a count of 0.
     order = np.argsort(-mean[:, 3], kind="stable")
     order = order[count[order] > 0]
     return order, mean[order, :3], mean[order, 3], count[order]
@@ -214,7 +236,7 @@ def _brightest_first(
 def _lab_positions(
     sightings: Sequence[Sighting], camera: Camera, surface: LedMap, lever: Lever, sine: bool
 ) -> tuple[Ints, _Samples]:
-    """The ids seen, and each light of each frame transformed to the lab frame with the IMU's attitude."""
+    """Return the ids seen, and each light of each frame transformed to the lab frame with the IMU's attitude."""
     if not len(sightings):
         raise ImageError("no sightings; allowed: at least two frames")
     for index, sighting in enumerate(sightings):
@@ -222,14 +244,14 @@ def _lab_positions(
     body_m = []
     lab_m = []
     for sighting in sightings:
+        # Eqs 43-44, then from the camera to the bearing, then to the lab
         point_cam, _ = thesis_points(camera.rays(sighting.xy_px), surface, lever, sine)
         point_body = lever.cam_from_body.inv().apply(point_cam) + lever.camera_body_m
         body_m.append(point_body)
         lab_m.append(sighting.body_from_lab.inv().apply(point_body))
     lights = [len(sighting.led) for sighting in sightings]
-    id_, led = np.unique(
-        np.concatenate([sighting.led for sighting in sightings]), return_inverse=True
-    )
+    all_ids = np.concatenate([sighting.led for sighting in sightings])
+    id_, led = np.unique(all_ids, return_inverse=True)
     frame = np.repeat(np.arange(len(sightings)), lights)
     stop = np.repeat([sighting.stop for sighting in sightings], lights)
     brightness = np.concatenate([sighting.brightness for sighting in sightings])
@@ -237,6 +259,7 @@ def _lab_positions(
 
 
 def _check(index: int, sighting: Sighting) -> None:
+    """Raise ImageError unless a sighting's arrays have matching shapes and finite values, and its ids differ."""
     lights = len(sighting.led)
     if not lights or sighting.xy_px.shape != (lights, 2) or sighting.brightness.shape != (lights,):
         raise ImageError(
@@ -250,10 +273,12 @@ def _check(index: int, sighting: Sighting) -> None:
 
 
 def _separations(samples: _Samples) -> tuple[Floats, Ints, Ints]:
-    """Angle about the bearing of every pair in every frame (eq. 45), rad; number of the pair; stop of the frame.
+    """Return the angle about the bearing of every pair in every frame (eq. 45), its pair's number, its frame's stop.
 
-    Computed from half the chord, which is accurate for small angles, unlike the arc cosine of eq. 45.
+    The angle, in rad, is computed from half the chord, 2 asin(|u - v| / 2), which is accurate for small angles, unlike
+    the arc cosine of eq. 45.
     """
+    # All pairs of each frame
     direction = unit(samples.body_m)
     first = []
     second = []
@@ -268,12 +293,14 @@ def _separations(samples: _Samples) -> tuple[Floats, Ints, Ints]:
             "no frame has two lights; allowed: two or more in a frame, for their separation"
         )
     angle = 2 * np.arcsin(np.linalg.norm(direction[a] - direction[b], axis=1) / 2)
+    # One number for each pair of lights, in whichever order they occur
     low, high = np.sort([samples.led[a], samples.led[b]], axis=0)
     _, pair = np.unique(low * (samples.led.max() + 1) + high, return_inverse=True)
     return angle, pair, samples.stop[a]
 
 
 def _maximum(deviation: Floats, source: str) -> float:
+    """Return the largest finite standard deviation. Raises ImageError if there is none."""
     finite = deviation[np.isfinite(deviation)]
     if not len(finite):
         raise ImageError(
@@ -283,8 +310,9 @@ def _maximum(deviation: Floats, source: str) -> float:
 
 
 def _covariance(lab_m: Floats, led: Ints) -> Floats:
-    """(N, 3, 3) sample covariance of each light's positions, m^2."""
+    """Return the (N, 3, 3) sample covariance of each light's positions, m^2; NaN for a single position."""
     count = np.bincount(led)
+    # Deviations from each light's mean position
     mean_m = np.array([np.bincount(led, column) for column in lab_m.T]) / count
     difference_m = lab_m - mean_m.T[led]
     covariance = np.zeros((len(count), 3, 3))
@@ -294,13 +322,17 @@ def _covariance(lab_m: Floats, led: Ints) -> Floats:
 
 
 def led_map(catalog: HomeCatalog, surface: LedMap) -> LedMap:
-    """LED map for a tracker: the intersections of the catalog's directions from the bearing with the dome surface.
+    """Return a tracker's LED map: the intersections of the catalog's directions from the bearing with the surface.
 
     Parameters
     ----------
     surface
-        Provides the ellipsoid; its LEDs are not used. Raises ImageError if a direction misses
-        it.
+        Map with the ellipsoid; its LEDs are not used
+
+    Raises
+    ------
+    ImageError
+        If a direction misses the ellipsoid.
     """
     position_m = on_surface(catalog.vectors, np.zeros(3), surface)
     outside = catalog.id[np.isnan(position_m).any(axis=1)]

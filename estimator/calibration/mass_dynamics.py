@@ -8,17 +8,22 @@ respect to inertial space, and a random torque d about lab axes:
     dH/dt = (R m r) x g - W x H + T + R J J0^-1 R^T d - R (v + q |w|) w
     dd/dt = -d / tau + noise
 
-J0 is the assumed inertia, so that d stands for the random acceleration J0^-1 R^T d. If it were a torque, a fit of J and
-of the motion at once would prefer small inertias, since with them small random torques explain a motion: it has the
-greatest joint probability of J and d, where that of J alone is sought (Box & Tiao, Bayesian Inference in Statistical
-Analysis, 1973, section 1.5).
+J0 is the assumed inertia, so that d represents the random acceleration J0^-1 R^T d. If d were the torque itself, a fit
+of J and of the motion at once would prefer small inertias, since with them small random torques explain a motion: it
+maximizes the joint probability of J and d, where that of J alone is sought (Box & Tiao, Bayesian Inference in
+Statistical Analysis, 1973, section 1.5).
 
 J is the inertia with the wheels locked, A the wheel axes, h the wheels' assumed momenta and e their relative errors,
 m r the mass times the center of mass, g gravity, W the Earth's rate, T a torque constant in the lab, v and q the air's
 viscous and quadratic drag about each body axis (Hughes, Spacecraft Attitude Dynamics, 1986, ch. 3). H changes by
 external torques only, so that friction and motor torques of the wheels do not enter.
 
-Arrays have their components first, (3, B) for B motions.
+Arrays have their components first, (3, B) for B motions. `transition` integrates K intervals at once:
+
+1. Change each state and parameter a little, for the difference quotients.
+2. Integrate all of them by the fourth-order Runge-Kutta method (`EquationsOfMotion.integrate`).
+3. Form the difference quotients: the derivatives of the states after the interval.
+4. Compute the covariance from the random torque and the wheels' noise (`torque_noise`).
 """
 
 from __future__ import annotations
@@ -31,26 +36,23 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.checks import Floats, ImageError, Ints
 
-# What is measured of a motion on an air bearing, what is assumed of it, and what is to be found.
+# Measurements of a motion on an air bearing, assumptions, and the parameters that are estimated.
 
-
+# Elements of the parameters; those of the wheels are the last, from WHEELS on.
 INERTIA = slice(0, 6)
 MOMENT = slice(6, 9)
 LAB_TORQUE = slice(9, 12)
 DRAG = slice(12, 14)
-# the wheels' are the last
 BIAS = slice(14, 17)
 WHEELS = 17
-TRIANGLE = (
-    (0, 1, 2, 0, 0, 1),
-    (0, 1, 2, 1, 2, 2),
-)  # rows and columns of the six numbers of an inertia tensor
+# Rows and columns of the six numbers of an inertia tensor.
+TRIANGLE = ((0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2))
 MIN_ATTITUDES = 4
 
 
 @dataclass(frozen=True, slots=True)
 class BearingRecord:
-    """One motion without contact: attitudes of the star tracker, and momenta of the wheels by their speeds.
+    """One motion without contact: attitudes of the star tracker, and momenta of the wheels from their speeds.
 
     Attributes
     ----------
@@ -59,17 +61,16 @@ class BearingRecord:
     lab_from_body
         N measured attitudes
     covariance_rad2
-        (N, 3, 3) of their errors, rotation vectors in body axes
+        (N, 3, 3) covariance of their errors, rotation vectors in body axes
     wheel_t_s
-        (M,) ascending times of the wheel speeds, over all attitudes' times
+        (M,) ascending times of the wheel speeds, which cover the times of all attitudes
     wheel_momentum_nms
         (M, n) assumed axial inertia times measured speed
     added_inertia_kg_m2, added_moment_kg_m
-        (3, 3) and (3,) that trim masses have added to the vehicle since the configuration whose
-        mass properties are sought
+        (3, 3) inertia and (3,) moment that trim masses have added to the vehicle since the
+        configuration whose mass properties are sought
     systematic_rad2
-        (N, 3, 3) the part of covariance_rad2 that attitudes near one another share; None
-        without one
+        (N, 3, 3) part of covariance_rad2 that attitudes near one another share; None without one
     """
 
     t_s: Floats
@@ -96,33 +97,34 @@ class BearingRecord:
 
     @property
     def noise_rad2(self) -> Floats:
-        """(N, 3, 3) the part of covariance_rad2 that is independent from attitude to attitude."""
-        return (
-            self.covariance_rad2
-            if self.systematic_rad2 is None
-            else self.covariance_rad2 - self.systematic_rad2
-        )
+        """(N, 3, 3) part of covariance_rad2 that is independent from attitude to attitude."""
+        if self.systematic_rad2 is None:
+            return self.covariance_rad2
+        return self.covariance_rad2 - self.systematic_rad2
 
     def with_noise(self, factor: float) -> BearingRecord:
-        """The record with its independent part scaled."""
+        """Return the record with the independent part of its covariance scaled by a factor."""
         added = (factor - 1) * self.noise_rad2
         return replace(self, covariance_rad2=self.covariance_rad2 + added)
 
 
 @dataclass(frozen=True, slots=True)
 class LabConstants:
-    """What is known of the lab and of the wheels.
+    """Known constants of the lab and of the wheels.
 
     Attributes
     ----------
-    gravity_m_s2, earth_lab_rad_s
-        Along lab -z; (3,) the Earth's rate
+    gravity_m_s2
+        Gravity, along lab -z
     wheel_axes
-        (3, n) in body axes
+        (3, n) unit vectors of the wheels' axes in body axes
     torque_rms_nm
         (3,) standard deviation of the random torque (air currents) about each lab axis
     torque_correlation_s
-        Its correlation time; its autocorrelation is rms^2 exp(-|lag| / correlation)
+        Correlation time of the random torque; its autocorrelation is
+        rms^2 exp(-|lag| / correlation)
+    earth_lab_rad_s
+        (3,) rate of the Earth's rotation in lab axes
     wheel_sigma_nms
         Standard deviation of a measured wheel momentum, independent from sample to sample
     """
@@ -137,11 +139,12 @@ class LabConstants:
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """Values assumed before, (P,), and their standard deviations.
+    """Prior values of the parameters, (P,), and their standard deviations.
 
-    In the order: inertia xx, yy, zz, xy, xz, yz about the bearing (kg m2); moment m r, mass times center of mass (3,)
-    (kg m); torque constant in the lab (3,) (N m); viscous and quadratic drag (N m s, N m s2); rotation of the
-    tracker's body axes from the true ones (3,) (rad); relative error of each wheel's assumed axial inertia (n).
+    The parameters are, in this order: inertia xx, yy, zz, xy, xz, yz about the bearing (kg m2); moment m r, mass times
+    center of mass (3,) (kg m); torque constant in the lab (3,) (N m); viscous and quadratic drag (N m s, N m s2);
+    rotation of the tracker's body axes from the true ones (3,) (rad); relative error of each wheel's assumed axial
+    inertia (n,).
     """
 
     values: Floats
@@ -161,13 +164,13 @@ class MassEstimate:
     Attributes
     ----------
     values, covariance
-        (P,) and (P, P), in the order of `Prior`
+        (P,) parameters and their (P, P) covariance, in the order of `Prior`
     misfit
-        chi-square of the residuals over their number; 1 if noise and torques are as assumed
+        Chi-square of the residuals over their number; 1 if noise and torques are as assumed
     iterations
-        0 of a recursive estimate
+        Number of iterations; 0 for a recursive estimate
     attitude_factor
-        By which the attitudes' noise was scaled
+        Factor by which the attitudes' noise was scaled
     """
 
     values: Floats
@@ -178,7 +181,7 @@ class MassEstimate:
 
     @property
     def inertia_kg_m2(self) -> Floats:
-        """(3, 3)"""
+        """(3, 3) inertia about the bearing with the wheels locked, in body axes."""
         return inertia_matrix(self.values[INERTIA])
 
     @property
@@ -188,60 +191,79 @@ class MassEstimate:
 
     @property
     def sigma(self) -> Floats:
-        """(P,)"""
+        """(P,) standard deviations of the parameters."""
         return np.sqrt(np.diag(self.covariance))
 
 
 def inertia_matrix(six: Floats) -> Floats:
-    """(3, 3, ...) symmetric matrix of xx, yy, zz, xy, xz, yz (6, ...)."""
+    """Return the (3, 3, ...) symmetric matrix of xx, yy, zz, xy, xz, yz (6, ...)."""
     xx, yy, zz, xy, xz, yz = six
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def inertia_six(inertia: Floats) -> Floats:
-    """(6,) xx, yy, zz, xy, xz, yz of a symmetric (3, 3) matrix."""
+    """Return xx, yy, zz, xy, xz, yz, (6,), of a symmetric (3, 3) matrix."""
     return inertia[TRIANGLE]
 
 
-MAX_STEP_S = 0.1  # of Runge-Kutta steps: relative error below 1e-7 at 0.5 rad/s
+# States, equations of motion, and their integration.
+
+MAX_STEP_S = 0.1  # largest Runge-Kutta step: relative error below 1e-7 at 0.5 rad/s
 STATE = 9  # attitude error, momentum, torque
 GAUSS_X, GAUSS_W = np.polynomial.legendre.leggauss(8)
-# of the difference quotients
+# Steps of the difference quotients.
 ATTITUDE_STEP_RAD = 1e-5
 RELATIVE_STEP = 1e-5
 
 
 class States(NamedTuple):
-    """B states: lab_from_body as quaternions (4, B) x y z w, momenta (3, B) and random torques (3, B) in the lab."""
+    """B states.
+
+    Attributes
+    ----------
+    quaternion
+        (4, B) lab_from_body as unit quaternions x, y, z, w
+    momentum
+        (3, B) angular momentum H in lab axes
+    torque
+        (3, B) random torque d in lab axes
+    """
 
     quaternion: Floats
     momentum: Floats
     torque: Floats
 
     def take(self, which: slice | Ints) -> States:
-        """Some of them."""
+        """Select states by slice or index."""
         return States(*(part[:, which] for part in self))
 
     @property
     def rotation(self) -> Rotation:
+        """The B rotations lab_from_body."""
         return Rotation.from_quat(self.quaternion.T)
 
     def moved(self, change: Floats) -> States:
-        """The states changed by (9, B): rotation vector in body axes, momentum, torque."""
+        """Return the states after a change (9, B): rotation vector in body axes, momentum, torque."""
         turned = (self.rotation * Rotation.from_rotvec(change[:3].T)).as_quat().T
         return States(turned, self.momentum + change[3:6], self.torque + change[6:])
 
     def minus(self, other: States) -> Floats:
-        """(9, B) the change that leads from another's states to these."""
+        """Return the (9, B) change from other states to these: the inverse of `moved`."""
         turn = (other.rotation.inv() * self.rotation).as_rotvec().T
         return np.vstack([turn, self.momentum - other.momentum, self.torque - other.torque])
 
 
 class Transition(NamedTuple):
-    """States after K intervals, and how they change with those before and with the parameters.
+    """States after K intervals, and their derivatives.
 
-    by_state (K, 9, 9), by_parameter (K, 9, P) : derivatives
-    noise (K, 9, 9) : covariance of the random torque's effect
+    Attributes
+    ----------
+    after
+        K states after the intervals
+    by_state, by_parameter
+        (K, 9, 9) and (K, 9, P) derivatives with respect to the states before and the parameters
+    noise
+        (K, 9, 9) covariance from the random torque and the wheels' noise
     """
 
     after: States
@@ -251,24 +273,28 @@ class Transition(NamedTuple):
 
 
 def cross(a: Floats, b: Floats) -> Floats:
-    """(3, B)"""
+    """Return the (3, B) cross products of (3, B) vectors."""
     return np.array(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )
 
 
 def turn(quaternion: Floats, vector: Floats, inverse: bool = False) -> Floats:
-    """(3, B) R v, or R^T v: v + 2 s u x v + 2 u x (u x v)."""
+    """Return R v, or R^T v, (3, B), of quaternions (u, s): v + 2 s u x v + 2 u x (u x v)."""
     u = -quaternion[:3] if inverse else quaternion[:3]
     twice = 2 * cross(u, vector)
     return vector + quaternion[3] * twice + cross(u, twice)
 
 
 class EquationsOfMotion:
-    """The equations of motion of one record, for given parameters (P, B) of B motions.
+    """Equations of motion of one record, for B motions.
 
-    Attributes
+    Parameters
     ----------
+    record, lab
+        Measured motion and known constants
+    parameters
+        (P, B) parameters of the motions, in the order of `Prior`
     assumed
         (P,) parameters with the inertia J0
     """
@@ -276,10 +302,10 @@ class EquationsOfMotion:
     def __init__(
         self, record: BearingRecord, lab: LabConstants, parameters: Floats, assumed: Floats
     ) -> None:
+        # J, J^-1 and J J0^-1, (3, 3, B), with the trim masses of the record
         inertia = inertia_matrix(parameters[INERTIA]) + record.added_inertia_kg_m2[:, :, None]
-        self.inverse: Floats = np.asarray(
-            np.linalg.inv(inertia.transpose(2, 0, 1)), dtype=np.float64
-        ).transpose(1, 2, 0)
+        inverse = np.asarray(np.linalg.inv(inertia.transpose(2, 0, 1)), dtype=np.float64)
+        self.inverse: Floats = inverse.transpose(1, 2, 0)
         self.torque_scale = np.einsum("ijb,jk->ikb", inertia, inverse_inertia(record, assumed))
         self.moment = parameters[MOMENT] + record.added_moment_kg_m[:, None]
         self.lab_torque = parameters[LAB_TORQUE]
@@ -291,28 +317,30 @@ class EquationsOfMotion:
         self.record = record
 
     def stored(self, t_s: Floats) -> Floats:
-        """(3, B) momentum of the wheels in body axes."""
-        measured = [
-            np.interp(t_s, self.record.wheel_t_s, one) for one in self.record.wheel_momentum_nms.T
-        ]
+        """Return A (1 + e) h, (3, B): the momentum of the wheels at times (B,), in body axes."""
+        wheel_t_s = self.record.wheel_t_s
+        measured = [np.interp(t_s, wheel_t_s, one) for one in self.record.wheel_momentum_nms.T]
         return np.asarray(self.axes @ (self.wheel_scale * np.array(measured)))
 
     def rate(self, states: States, stored: Floats) -> Floats:
-        """(3, B) in the lab, body axes."""
-        own = turn(states.quaternion, states.momentum, inverse=True) - stored
-        turned: Floats = np.einsum("ijb,jb->ib", self.inverse, own)
-        return turned - turn(
-            states.quaternion, np.broadcast_to(self.earth, own.shape), inverse=True
-        )
+        """Return the rate relative to the lab, (3, B) in body axes: w = J^-1 (R^T H - stored) - R^T W."""
+        q = states.quaternion
+        own = turn(q, states.momentum, inverse=True) - stored
+        inertial: Floats = np.einsum("ijb,jb->ib", self.inverse, own)
+        return inertial - turn(q, np.broadcast_to(self.earth, own.shape), inverse=True)
 
     def slope(self, t_s: Floats, states: States) -> States:
-        """Derivatives with respect to time, without the torque's decay."""
+        """Return the derivatives with respect to time: the equations of the module, without the torque's decay."""
         q = states.quaternion
         rate = self.rate(states, self.stored(t_s))
+        # R (v + q |w|) w
         viscous, quadratic = self.drag
         drag = turn(q, (viscous + quadratic * np.abs(rate)) * rate)
+        # (R m r) x g - W x H
         torque = cross(turn(q, self.moment), self.gravity) - cross(self.earth, states.momentum)
+        # J J0^-1 R^T d
         in_body = np.einsum("ijb,jb->ib", self.torque_scale, turn(q, states.torque, inverse=True))
+        # dq/dt = q (w, 0) / 2, a Hamilton product
         vector = q[3] * rate + cross(q[:3], rate)
         spin = np.vstack([vector, -np.sum(q[:3] * rate, axis=0)[None]]) / 2
         return States(spin, torque + self.lab_torque + turn(q, in_body) - drag, np.zeros_like(rate))
@@ -320,7 +348,11 @@ class EquationsOfMotion:
     def integrate(
         self, begin_s: Floats, end_s: Floats, states: States, correlation_s: float
     ) -> States:
-        """States at end_s (B,) by the fourth-order Runge-Kutta method; the torque is its mean in each step."""
+        """Return the states at end_s (B,) by the fourth-order Runge-Kutta method.
+
+        The random torque decays as exp(-t / correlation); in each step h the motion feels its mean,
+        d (correlation / h) (1 - exp(-h / correlation)).
+        """
         steps = max(1, int(np.ceil(np.max(end_s - begin_s) / MAX_STEP_S)))
         h = (end_s - begin_s) / steps
         decay = np.exp(-h / correlation_s)
@@ -333,6 +365,7 @@ class EquationsOfMotion:
             b = self.slope(t_s + h / 2, moved_on(now, a, h / 2))
             c = self.slope(t_s + h / 2, moved_on(now, b, h / 2))
             d = self.slope(t_s + h, moved_on(now, c, h))
+            # y + h / 6 (a + 2 b + 2 c + d); the quaternion is normalized.
             q, momentum = (
                 old + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
                 for old, k1, k2, k3, k4 in zip(now[:2], a[:2], b[:2], c[:2], d[:2], strict=True)
@@ -342,18 +375,19 @@ class EquationsOfMotion:
 
 
 def inverse_inertia(record: BearingRecord, values: Floats) -> Floats:
-    """(3, 3) inverse of the inertia of the vehicle as it was in a record, for parameters (P,)."""
+    """Return the (3, 3) inverse inertia of the vehicle with a record's trim masses, for parameters (P,)."""
     return np.asarray(np.linalg.inv(inertia_matrix(values[INERTIA]) + record.added_inertia_kg_m2))
 
 
 def moved_on(states: States, slope: States, by_s: Floats | float) -> States:
+    """Return the states after the time by_s at a constant slope."""
     return States(*(one + by_s * rate for one, rate in zip(states, slope, strict=True)))
 
 
 def difference_steps(
     values: Floats, sigma: Floats, momentum_nms: float, torque_nm: float
 ) -> tuple[Floats, Floats]:
-    """Steps of the difference quotients: (9,) of the states, (P,) of the parameters."""
+    """Return the steps of the difference quotients: (9,) of the states, (P,) of the parameters."""
     state = np.repeat([ATTITUDE_STEP_RAD, RELATIVE_STEP * momentum_nms, torque_nm], 3)
     return state, np.minimum(1e-3 * sigma, RELATIVE_STEP * np.maximum(np.abs(values), sigma))
 
@@ -366,16 +400,19 @@ def transition(
     values: Floats,
     prior: Prior,
 ) -> Transition:
-    """Integrate K states (from attitude number `first` on) each to the next attitude's time, with derivatives.
-
-    Every interval is integrated once for each element of state and parameters, a little changed, all at once.
+    """Integrate K states, each to the next attitude's time, with derivatives: the numbered steps of the module.
 
     Parameters
     ----------
+    first
+        Number of the attitude of the first state
+    before
+        K states at successive attitudes
     values
         (P,) parameters
     prior
-        Its standard deviations scale the steps of their difference quotients
+        Prior of the parameters, whose standard deviations scale the steps of the difference
+        quotients
     """
     count = before.momentum.shape[1]
     size = len(values)
@@ -383,6 +420,7 @@ def transition(
     state_step, step = difference_steps(
         values, prior.sigma, largest, float(np.max(lab.torque_rms_nm))
     )
+    # 1. Columns of each interval: unchanged, each element of the state changed, each parameter changed
     columns = 1 + STATE + size
     change = np.zeros((STATE, columns))
     change[:, 1 : 1 + STATE] = np.diag(state_step)
@@ -392,16 +430,15 @@ def transition(
     motion = EquationsOfMotion(record, lab, np.tile(parameters, count), prior.values)
     t_s = record.t_s[first : first + count + 1]
     start = before.take(pick).moved(np.tile(change, count))
+    # 2. Integration
     end = motion.integrate(t_s[:-1][pick], t_s[1:][pick], start, lab.torque_correlation_s)
+    # 3. Difference quotients
     after = end.take(slice(None, None, columns))
     slopes = end.minus(after.take(pick)).reshape(STATE, count, columns).transpose(1, 0, 2)
     slopes = slopes[:, :, 1:] / np.concatenate([state_step, step])
-    return Transition(
-        after,
-        slopes[:, :, :STATE],
-        slopes[:, :, STATE:],
-        torque_noise(np.diff(t_s), record, before, values, prior.values, lab),
-    )
+    # 4. Noise
+    noise = torque_noise(np.diff(t_s), record, before, values, prior.values, lab)
+    return Transition(after, slopes[:, :, :STATE], slopes[:, :, STATE:], noise)
 
 
 def torque_noise(
@@ -412,22 +449,31 @@ def torque_noise(
     assumed: Floats,
     lab: LabConstants,
 ) -> Floats:
-    """(K, 9, 9) covariance of the states after K intervals due to the random torque and to the wheels' speed noise.
+    """Return the (K, 9, 9) covariance of the states after K intervals from the random torque and the wheels' noise.
 
     White noise of density 2 rms^2 / tau that acts at s before the end has by then changed torque, momentum and angle by
 
         c = exp(-s / tau),   R J J0^-1 R^T b,  b = tau (1 - c),   a = J0^-1 R^T tau (s - b)
 
-    whose products are integrated over s by Gauss's rule. Noise of a measured momentum, sigma in every sample, moves the
-    angle by J^-1 sigma times the sample's time, a random walk.
+    per unit of noise. Their products are integrated over s by Gauss's rule. Noise of a measured momentum, sigma in
+    every sample, moves the angle by J0^-1 sigma times the sample's time, a random walk.
+
+    Parameters
+    ----------
+    duration_s
+        (K,) lengths of the intervals
+    values, assumed
+        (P,) parameters with the inertia J, and with J0
     """
     tau = lab.torque_correlation_s
     s = duration_s[:, None] * (1 + GAUSS_X) / 2
     c = np.exp(-s / tau)
     b = tau * (1 - c)
-    moments = np.einsum(
-        "iks,jks,ks->kij", *2 * [np.array([tau * (s - b), b, c])], duration_s[:, None] * GAUSS_W / 2
-    )
+    # Integrals of the products of the three time functions
+    factors = np.array([tau * (s - b), b, c])
+    weights = duration_s[:, None] * GAUSS_W / 2
+    moments = np.einsum("iks,jks,ks->kij", factors, factors, weights)
+    # Matrices of the three effects
     density = np.diag(2 * lab.torque_rms_nm**2 / tau)
     spread = np.zeros((len(duration_s), 3, 3, 3))
     R_body_from_lab = before.rotation.inv().as_matrix()
@@ -435,9 +481,9 @@ def torque_noise(
     spread[:, 0] = inverse @ R_body_from_lab
     spread[:, 1] = momentum_scale(record, before, assumed, values)
     spread[:, 2] = np.eye(3)
-    noise = np.einsum("kij,kiab,bc,kjdc->kiajd", moments, spread, density, spread).reshape(
-        -1, STATE, STATE
-    )
+    blocks = np.einsum("kij,kiab,bc,kjdc->kiajd", moments, spread, density, spread)
+    noise = blocks.reshape(-1, STATE, STATE)
+    # Random walk from the wheels' noise
     sample_s = float(np.median(np.diff(record.wheel_t_s)))
     walk = (
         lab.wheel_sigma_nms**2 * sample_s * inverse @ lab.wheel_axes @ lab.wheel_axes.T @ inverse.T
@@ -449,7 +495,7 @@ def torque_noise(
 def momentum_scale(
     record: BearingRecord, states: States, values: Floats, assumed: Floats
 ) -> Floats:
-    """(K, 3, 3) R J0 J^-1 R^T: of a change of momentum it makes that of the assumed inertia at the same rate."""
+    """Return R J0 J^-1 R^T, (K, 3, 3): it converts a momentum to that of the assumed inertia at the same rate."""
     R_lab_from_body = states.rotation.as_matrix()
     scale = np.linalg.solve(inverse_inertia(record, assumed), inverse_inertia(record, values))
     return np.asarray(R_lab_from_body @ scale @ R_lab_from_body.transpose(0, 2, 1))

@@ -1,19 +1,24 @@
 """Mass properties from whole records: the most probable motion and parameters (multiple shooting).
 
-A rate found by differencing attitudes has errors that bias a regression on it. Here the motion itself is fitted: the
-unknowns are the states at every attitude (`dynamics.States`) and the parameters, and the residuals are
+A rate from differences of attitudes has errors that bias a regression on it. Here the motion itself is fitted: the
+unknowns are the states at every attitude (`mass_dynamics.States`) and the parameters, and the residuals are
 
     attitudes measured minus fitted,                         weighted by the tracker's covariance,
     states integrated from the last attitude minus fitted,   weighted by the covariance of the random torque,
     parameters assumed minus fitted,                         weighted by the prior.
 
-Their weighted sum of squares is minimized by the Gauss-Newton method, which for a motion with random forces is the
-iterated Kalman smoother (Bell, SIAM J. Optimization 4, 1994, 626; Bock's multiple shooting, 1983). The states of a
-record form a banded matrix and are eliminated, so that records of different trim add their information on the
-parameters, whose covariance is the inverse of the sum.
+The Gauss-Newton method minimizes their weighted sum of squares; for a motion with random forces it is the iterated
+Kalman smoother (Bell, SIAM J. Optimization 4, 1994, 626; Bock's multiple shooting, 1983). `estimate_mass` repeats:
+
+1. Linearize each record's residuals, and eliminate its states, which form a banded matrix (`reduced`).
+2. Add the records' information on the parameters to that of the prior. Records of different trim add up.
+3. Solve for the parameters; their covariance is the inverse of the sum.
+4. Substitute back for the states.
 
 Errors that attitudes share, of a map of LEDs or a lens, are not fitted, but considered (Schmidt 1966): the weights are
-those of the noise alone, and the covariance of the parameters has what the shared errors add to it (`considered`).
+those of the noise alone, and the shared errors add to the covariance of the parameters (`considered`).
+
+In flight `filter_mass` estimates the same parameters by an extended Kalman filter.
 """
 
 from __future__ import annotations
@@ -46,22 +51,28 @@ from estimator.core.checks import Floats, ImageError
 from estimator.filter.states import TrackerModel
 
 MAX_ITERATIONS = 30
-CONVERGED_SIGMA = 0.01  # largest step of a parameter, in its standard deviations
-# of the logarithm of the misfit; fits to reach it
+CONVERGED_SIGMA = 0.01  # largest step of a parameter at convergence, in its standard deviations
+# Tolerance of the logarithm of the misfit, and the largest number of fits to reach it.
 MISFIT_TOLERANCE = 0.1
 MAX_FACTORS = 8
-# above 1: the random torque's share of the misfit stays
+# Power of the misfit in the next factor. It is above 1, because the random torque's share of the misfit stays.
 FACTOR_POWER = 1.5
 FACTOR_LIMITS = (1e-3, 1e3)
-MOMENTUM = slice(3, 6)  # of a state
-BANDS = 2 * STATE  # of the normal matrix: a state and its neighbor
+MOMENTUM = slice(3, 6)  # elements of a state
+BANDS = 2 * STATE  # width of the normal matrix's band: a state and its neighbor
 
 
 class Reduced(NamedTuple):
     """A record's normal equations on the parameters after its states are eliminated.
 
-    normal (P, P), gradient (P,) : of the parameters;  states_step (9 N,), states_by_parameter (9 N, P) : the states'
-    step is the first minus the second times the parameters' step;  chi2 : of the residuals before the step
+    Attributes
+    ----------
+    normal, gradient
+        (P, P) normal matrix and (P,) gradient of the parameters
+    states_step, states_by_parameter
+        (9 N,) a and (9 N, P) B: the states' step is a - B times the parameters' step
+    chi2
+        Chi-square of the residuals before the step
     """
 
     normal: Floats
@@ -74,30 +85,38 @@ class Reduced(NamedTuple):
 def estimate_mass(
     records: Sequence[BearingRecord], lab: LabConstants, prior: Prior
 ) -> MassEstimate:
-    """The mass properties from one or several records. Raises ImageError if the fit does not converge."""
+    """Return the mass properties from one or several records: the numbered steps of the module.
+
+    Raises
+    ------
+    ImageError
+        If the fit does not converge.
+    """
     values = prior.values.copy()
     motions = [first_states(record, lab, values) for record in records]
     information = np.diag(prior.sigma**-2)
     attitudes = sum(len(record.t_s) for record in records)
     for iteration in range(1, MAX_ITERATIONS + 1):
+        # 1. Linearization and elimination
         parts = [reduced(*one, lab, values, prior) for one in zip(records, motions, strict=True)]
+        # 2. Information
         normal = information + sum(part.normal for part in parts)
         gradient = information @ (prior.values - values) + sum(part.gradient for part in parts)
+        # 3. Parameters
         covariance: Floats = np.asarray(np.linalg.inv(normal))
         step = covariance @ gradient
-        motions = [
-            states.moved((part.states_step - part.states_by_parameter @ step).reshape(-1, STATE).T)
-            for states, part in zip(motions, parts, strict=True)
-        ]
         values = values + step
+        # 4. States
+        for k, part in enumerate(parts):
+            change = part.states_step - part.states_by_parameter @ step
+            motions[k] = motions[k].moved(change.reshape(-1, STATE).T)
         if np.all(np.abs(step) < CONVERGED_SIGMA * np.sqrt(np.diag(covariance))):
             covariance = covariance + considered(records, parts, covariance)
-            chi2 = sum(part.chi2 for part in parts) + np.sum(
-                ((prior.values - values) / prior.sigma) ** 2
-            )
-            return MassEstimate(
-                values, covariance, float(chi2 / (3 * attitudes - 6 * len(records))), iteration
-            )
+            from_prior = np.sum(((prior.values - values) / prior.sigma) ** 2)
+            chi2 = sum(part.chi2 for part in parts) + from_prior
+            # Three numbers an attitude, less attitude and momentum at the start of each record.
+            misfit = float(chi2 / (3 * attitudes - 6 * len(records)))
+            return MassEstimate(values, covariance, misfit, iteration)
         if not np.all(np.isfinite(values)):
             break
     raise ImageError(
@@ -108,10 +127,10 @@ def estimate_mass(
 def estimate_with_noise(
     records: Sequence[BearingRecord], lab: LabConstants, prior: Prior
 ) -> MassEstimate:
-    """The mass properties, with the attitudes' noise scaled by a factor at which the misfit is 1.
+    """Return the mass properties, with the attitudes' noise scaled by a factor at which the misfit is 1.
 
-    A tracker's own covariance is too small where an error is unknown to it, and too large where it is cautious. The
-    level of the random torque is taken as known. Raises ImageError as `estimate_mass`.
+    A tracker's own covariance is too small where it does not model an error, and too large where it is cautious. The
+    level of the random torque is taken as known. The errors raised are those of `estimate_mass`.
     """
     factor = 1.0
     for _ in range(MAX_FACTORS):
@@ -125,12 +144,14 @@ def estimate_with_noise(
 def considered(
     records: Sequence[BearingRecord], parts: Sequence[Reduced], covariance: Floats
 ) -> Floats:
-    """(P, P) what errors that attitudes share add to the covariance of the parameters.
+    """Return the (P, P) covariance of the parameters from errors that attitudes share.
 
-    An attitude's error e_n changes the parameters by K_n e_n = C (B - X_n)^T W_n e_n: C their covariance by the noise,
-    W_n the weight, B the derivatives of a measured attitude by the parameters (those of the bias) and X_n those of the
-    fitted one. Errors of covariance S_n = L_n L_n^T whose correlation r falls with the rotation between two attitudes
-    add sum K_m L_m r_mn L_n^T K_n^T. The process is that of `filter.models.TrackerModel`, without its time.
+    1. An attitude's error e_n changes the parameters by K_n e_n, K_n = C (B - X_n)^T W_n: C is their covariance from
+       the noise, W_n the weight, B the derivative of a measured attitude by the parameters (those of the bias), and X_n
+       that of the fitted one.
+    2. The errors have the covariance S_n = L_n L_n^T, and a correlation r = exp(-rotation / angle) that falls with the
+       rotation between two attitudes: the process of `filter.states.TrackerModel`, without its time.
+    3. They add sum_mn K_m L_m r_mn L_n^T K_n^T.
     """
     size = len(covariance)
     effects = []
@@ -140,15 +161,17 @@ def considered(
     for record, part in zip(records, parts, strict=True):
         if record.systematic_rad2 is None:
             continue
+        # 1. K_n
         fitted = part.states_by_parameter.reshape(-1, STATE, size)[:, :3]
         gain = covariance @ (by_bias - fitted).transpose(0, 2, 1) @ np.linalg.inv(record.noise_rad2)
+        # 2. K_n L_n, with the symmetric root L_n
         values, axes = np.linalg.eigh(record.systematic_rad2)
-        effects.append(
-            gain @ (axes * np.sqrt(np.maximum(values, 0))[:, None]) @ axes.transpose(0, 2, 1)
-        )
+        scaled_axes = axes * np.sqrt(np.maximum(values, 0))[:, None]
+        effects.append(gain @ scaled_axes @ axes.transpose(0, 2, 1))
         attitudes.append(record.lab_from_body)
     if not effects:
         return np.zeros((size, size))
+    # 3. Sum over all pairs of attitudes, of all records
     effect = np.concatenate(effects)
     quaternion = Rotation.concatenate(attitudes).as_quat()
     angle_rad = 2 * np.arccos(np.minimum(np.abs(quaternion @ quaternion.T), 1))
@@ -157,13 +180,14 @@ def considered(
 
 
 def first_states(record: BearingRecord, lab: LabConstants, values: Floats) -> States:
-    """States to begin with: the measured attitudes, the momentum of their differences, no random torque."""
+    """Return the start states: the measured attitudes, the momentum from their differences, no random torque."""
     motion = EquationsOfMotion(record, lab, values[:, None], values)
-    turned = (record.lab_from_body[:-1].inv() * record.lab_from_body[1:]).as_rotvec() / np.diff(
-        record.t_s
-    )[:, None]
+    # Mean rate between two attitudes, interpolated to their times
+    turned = (record.lab_from_body[:-1].inv() * record.lab_from_body[1:]).as_rotvec()
+    mean_rate = turned / np.diff(record.t_s)[:, None]
     middle_s = (record.t_s[1:] + record.t_s[:-1]) / 2
-    rate = np.array([np.interp(record.t_s, middle_s, one) for one in turned.T])
+    rate = np.array([np.interp(record.t_s, middle_s, one) for one in mean_rate.T])
+    # H = R (J w + wheels)
     inertia = inertia_matrix(values[:6]) + record.added_inertia_kg_m2
     quaternion = record.lab_from_body.as_quat().T
     own = inertia @ rate + motion.stored(record.t_s)
@@ -173,10 +197,19 @@ def first_states(record: BearingRecord, lab: LabConstants, values: Floats) -> St
 def reduced(
     record: BearingRecord, states: States, lab: LabConstants, values: Floats, prior: Prior
 ) -> Reduced:
-    """Linearize a record's residuals and eliminate its states."""
+    """Linearize a record's residuals and eliminate its states.
+
+    1. Compute the residuals of the transitions and their slopes, in standard deviations (`whitened_links`).
+    2. Sum the normal equations: the states' blocks on the diagonal, their `border` with the parameters and the
+       residuals, and the `corner` of these.
+    3. Add the measured attitudes (`add_measured`).
+    4. Eliminate the states: corner - border^T A^-1 border, with the states' banded matrix A.
+    """
     count = len(record.t_s)
     size = len(values)
+    # 1. Residuals and slopes
     rows = whitened_links(record, states, lab, values, prior)
+    # 2. Normal equations; columns are the state before, the state after, the parameters and the residual.
     products = rows.transpose(0, 2, 1) @ rows
     before = slice(0, STATE)
     after = slice(STATE, 2 * STATE)
@@ -187,9 +220,10 @@ def reduced(
         diagonal[to] += products[:, block, block]
         border[to] += products[:, block, rest]
     corner = products[:, rest, rest].sum(axis=0)
-    chi2 = float(np.sum(rows[:, :, -1] ** 2)) + add_measured(
-        record, states, lab, values, (diagonal, border, corner)
-    )
+    # 3. Attitudes
+    chi2 = float(np.sum(rows[:, :, -1] ** 2))
+    chi2 += add_measured(record, states, lab, values, (diagonal, border, corner))
+    # 4. Elimination
     flat = border.reshape(-1, size + 1)
     try:
         solved = solveh_banded(lower_band(diagonal, products[:, before, after]), flat, lower=True)
@@ -202,17 +236,20 @@ def reduced(
 def whitened_links(
     record: BearingRecord, states: States, lab: LabConstants, values: Floats, prior: Prior
 ) -> Floats:
-    """(N - 1, 9, 18 + P + 1) slopes of the transitions' residuals by state before, state after and parameters, and the
-    residuals, in standard deviations.
+    """Return the slopes of the transitions' residuals, and the residuals, in standard deviations.
+
+    The array is (N - 1, 9, 18 + P + 1): slopes by the state before, the state after and the parameters; residuals.
 
     Residuals of momentum m are those of the assumed inertia, R J0 J^-1 R^T m, whose noise does not depend on J; their
     slopes by the elements of J are those of m and -R J0 J^-1 (dJ) J^-1 R^T m.
     """
+    # Residuals: integrated minus fitted state
     before = states.take(slice(None, -1))
     link = transition(record, lab, 0, before, values, prior)
     misfit = link.after.minus(states.take(slice(1, None))).T[:, :, None]
     by_after = np.broadcast_to(-np.eye(STATE), link.by_state.shape)
     rows = np.concatenate([link.by_state, by_after, link.by_parameter, misfit], axis=2)
+    # R J0 J^-1 R^T of the momentum's rows, and its derivative by J
     scale = np.tile(np.eye(STATE), (len(misfit), 1, 1))
     scale[:, MOMENTUM, MOMENTUM] = momentum_scale(record, before, values, prior.values)
     R_lab_from_body = before.rotation.as_matrix()
@@ -221,6 +258,7 @@ def whitened_links(
         "ijp,kjl->kip", inertia_matrix(np.eye(6)), inverse_inertia(record, values) @ in_body
     )
     rows[:, MOMENTUM, 2 * STATE : 2 * STATE + 6] -= R_lab_from_body @ turned
+    # Division by the Cholesky factor of the noise
     noise = scale @ link.noise @ scale.transpose(0, 2, 1)
     return np.asarray(np.linalg.inv(np.linalg.cholesky(noise)) @ scale @ rows)
 
@@ -232,12 +270,18 @@ def add_measured(
     values: Floats,
     to: tuple[Floats, Floats, Floats],
 ) -> float:
-    """Add the attitudes (N), and what is known of the first random torque; return their chi-square.
+    """Add the N attitudes, and the prior of the first random torque, to the normal equations; return their chi-square.
 
-    A measured attitude is R exp(bias) exp(noise). `to` are the blocks that are added to: diagonal (N, 9, 9), border
-    (N, 9, P + 1) and corner (P + 1, P + 1); the last column is the gradient.
+    A measured attitude is R exp(bias) exp(noise).
+
+    Parameters
+    ----------
+    to
+        Blocks that are added to in place: diagonal (N, 9, 9), border (N, 9, P + 1) and corner
+        (P + 1, P + 1); the last column is the gradient
     """
     diagonal, border, corner = to
+    # The residual depends on the attitude and on the bias with the same derivative, -I.
     weight = np.linalg.inv(record.noise_rad2)
     torque_weight = lab.torque_rms_nm**-2.0
     off = measured_minus(record.lab_from_body, states.rotation, values[BIAS])
@@ -248,20 +292,23 @@ def add_measured(
     corner[BIAS, BIAS] += weight.sum(axis=0)
     corner[BIAS, -1] -= pull.sum(axis=0)
     corner[-1, BIAS] -= pull.sum(axis=0)
+    # First random torque: mean 0, variance rms^2
     diagonal[0, 6:, 6:] += np.diag(torque_weight)
     border[0, 6:, -1] += torque_weight * states.torque[:, 0]
     return float(np.sum(off * pull) + torque_weight @ states.torque[:, 0] ** 2)
 
 
 def measured_minus(measured: Rotation, lab_from_body: Rotation, bias_rad: Floats) -> Floats:
-    """(N, 3) rotation vectors of attitudes measured minus those of the states with the tracker's bias."""
-    return np.asarray(
-        ((lab_from_body * Rotation.from_rotvec(bias_rad)).inv() * measured).as_rotvec()
-    )
+    """Return the (N, 3) rotation vectors from the states' attitudes, with the tracker's bias, to the measured ones."""
+    predicted = lab_from_body * Rotation.from_rotvec(bias_rad)
+    return np.asarray((predicted.inv() * measured).as_rotvec())
 
 
 def lower_band(diagonal: Floats, beside: Floats) -> Floats:
-    """(18, 9 N) lower band of a normal matrix from its diagonal blocks (N, 9, 9) and those right of them."""
+    """Return the (18, 9 N) lower band of a normal matrix from its diagonal blocks (N, 9, 9) and those right of them.
+
+    Element (i, j) of the matrix is in row i - j and column j of the band, as `solveh_banded` requires.
+    """
     band = np.zeros((BANDS, STATE * len(diagonal)))
     for i in range(STATE):
         for j in range(STATE):
@@ -271,31 +318,45 @@ def lower_band(diagonal: Floats, beside: Floats) -> Floats:
     return band
 
 
-# Mass properties in flight: an extended Kalman filter of state and parameters, one attitude after
-# another.
+# Mass properties in flight: an extended Kalman filter of state and parameters, one attitude after another.
 
-
-START = 20  # attitudes for the batch that begins the filter
-RATE_SIGMA_RAD_S = 0.01  # of the rate by the difference of the attitudes before and after
+START = 20  # number of attitudes of the batch that begins the filter
+RATE_SIGMA_RAD_S = 0.01  # standard deviation of the rate from the attitudes before and after
 
 
 def filter_mass(record: BearingRecord, lab: LabConstants, prior: Prior) -> Iterator[MassEstimate]:
     """Yield the estimate after each attitude from number START + 2 on; its misfit is that of the innovations so far.
 
-    The parameters begin with the batch estimate from the first START attitudes, the state with the next three alone.
+    State and parameters are those of `estimate_mass`; the parameters are constant.
+
+    1. Estimate the parameters by a batch over the first START attitudes, since the filter linearizes only once, at its
+       current estimate. It diverges from assumptions that are far off, since the rate is the ratio of two unknowns,
+       momentum and inertia.
+    2. Start the state from the next three attitudes.
+    3. Integrate to the next attitude; the covariance becomes F P F^T + Q (`transition`).
+    4. Correct state and parameters by K r for an attitude with the residual r and the covariance S:
+       K = P H^T (H P H^T + S)^-1 (Gelb, Applied Optimal Estimation, 1974, ch. 6). H selects the attitude's error plus
+       the tracker's bias. Then repeat from step 3.
+
+    Raises
+    ------
+    ImageError
+        For too few attitudes, and if the batch does not converge.
     """
     least = START + MIN_ATTITUDES
     if len(record.t_s) < least:
         raise ImageError(
             f"mass properties: {len(record.t_s)} attitudes; allowed for a filter: {least} or more"
         )
+    # 1. Batch
     begun = estimate_mass([cut(record, slice(0, START))], lab, prior)
+    # 2. to 4. Filter
     rest = cut(record, slice(START, None))
     yield from filter_from(begun, rest, lab, prior)
 
 
 def cut(record: BearingRecord, which: slice) -> BearingRecord:
-    """Some of the attitudes."""
+    """Return the record with some of its attitudes."""
     return replace(
         record,
         t_s=record.t_s[which],
@@ -308,19 +369,25 @@ def cut(record: BearingRecord, which: slice) -> BearingRecord:
 def filter_from(
     begun: MassEstimate, record: BearingRecord, lab: LabConstants, prior: Prior
 ) -> Iterator[MassEstimate]:
-    """Yield the estimate after each attitude but the first two, from earlier parameters and their covariance."""
+    """Yield the estimate after each attitude but the first two, from earlier parameters and their covariance.
+
+    The numbered steps are those of `filter_mass`.
+    """
     size = len(begun.values)
     values = begun.values
+    # 2. State at the second attitude
     states = first_states(record, lab, values).take(slice(1, 2))
     covariance = first_covariance(begun, record, lab)
     at_bias = slice(STATE + BIAS.start, STATE + BIAS.stop)
     chi2 = 0.0
     for n in range(2, len(record.t_s)):
+        # 3. Integration: P <- F P F^T + Q
         link = transition(record, lab, n - 1, states, values, prior)
         F = np.eye(STATE + size)
         F[:STATE] = np.hstack([link.by_state[0], link.by_parameter[0]])
         covariance = F @ covariance @ F.T
         covariance[:STATE, :STATE] += link.noise[0]
+        # 4. Correction, with P H^T in `seen`
         off = measured_minus(record.lab_from_body[n], link.after.rotation, values[BIAS])[0]
         seen = covariance[:3] + covariance[at_bias]
         innovation = seen[:, :3] + seen[:, at_bias] + record.covariance_rad2[n]
@@ -334,16 +401,21 @@ def filter_from(
 
 
 def first_covariance(begun: MassEstimate, record: BearingRecord, lab: LabConstants) -> Floats:
-    """(9 + P, 9 + P) at the second attitude. H = R (J w + A (1 + e) h): its errors are those of rate and parameters."""
+    """Return the (9 + P, 9 + P) covariance of state and parameters at the second attitude.
+
+    The momentum H = R (J w + A (1 + e) h) has the errors of the rate and of the parameters, so it is correlated with
+    the parameters. Its derivative by them is a difference quotient over one standard deviation.
+    """
     values = begun.values
     P = begun.covariance
+    # Derivative of the momentum by the parameters
     one = cut(record, slice(0, MIN_ATTITUDES))
     step = begun.sigma
-    momenta = [
-        first_states(one, lab, each).momentum[:, 1] for each in (values, *(values + np.diag(step)))
-    ]
+    changed = (values, *(values + np.diag(step)))
+    momenta = [first_states(one, lab, each).momentum[:, 1] for each in changed]
     slope = np.zeros((STATE, len(values)))
     slope[3:6] = ((np.array(momenta[1:]) - momenta[0]) / step[:, None]).T
+    # Errors that are independent of the parameters: attitude, rate and torque
     own = np.zeros((STATE, STATE))
     own[:3, :3] = record.covariance_rad2[1]
     R_inertia = record.lab_from_body[1].as_matrix() @ begun.inertia_kg_m2
@@ -353,7 +425,7 @@ def first_covariance(begun: MassEstimate, record: BearingRecord, lab: LabConstan
 
 
 def joseph(covariance: Floats, gain: Floats, noise: Floats) -> Floats:
-    """The covariance after an attitude, (I - K H) P (I - K H)^T + K S K^T, which stays positive."""
+    """Return the covariance after an attitude, (I - K H) P (I - K H)^T + K S K^T, which stays positive."""
     kept = np.eye(len(covariance))
     kept[:, :3] -= gain
     kept[:, STATE + BIAS.start : STATE + BIAS.stop] -= gain

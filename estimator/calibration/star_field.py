@@ -1,10 +1,19 @@
 """Camera calibration from star fields at unknown attitudes: focal length, principal point, distortion, magnitude zero.
 
-Star directions are known to milliarcseconds, so that the unknowns are the eight lens parameters and three attitude
-angles per frame. The projection and its derivatives are those of `bundle_adjustment`, with the stars as lights at
-distance 1 and no lever. Levenberg-Marquardt minimizes the weighted residuals; the attitudes are eliminated (Schur
-complement), so that each step solves an 8 x 8 system whatever the number of frames. `self_calibrate` alternates
-identification and calibration.
+Star directions are known to milliarcseconds, so the unknowns are the eight lens parameters and three attitude angles
+per frame. The projection and its derivatives are those of `bundle_adjustment`, with the stars as lights at distance 1
+and no lever. `calibrate` takes these steps:
+
+1. Find each frame's start attitude with the start camera, by a robust fit (`_robust_attitude`).
+2. Fit the attitudes alone with Cauchy's loss.
+3. Fit lens and attitudes with Cauchy's loss, whose width shrinks with the median residual.
+4. Reject residuals beyond 5 sigma as wrong identifications.
+5. Fit the rest by least squares (`_minimize`).
+6. Compute the covariance and the diagnostics (`_report`).
+
+The fits minimize the weighted residuals by Levenberg-Marquardt. They eliminate the attitudes (Schur complement), so
+that each step solves an 8 x 8 system whatever the number of frames. `self_calibrate` alternates identification and
+calibration.
 
 Some lens parameters are weakly observable: a shift of the principal point differs from a rotation of the camera only
 by the square of the field angle, and k2 and k3 resemble k1 over a narrow field. A Gaussian prior on ordinary lenses
@@ -34,6 +43,8 @@ from estimator.core.constants import SIGMA_PER_MAD
 from estimator.core.types import Attitude, Centroids
 
 # Photometric zero point: the offset between instrumental magnitudes and catalog magnitudes.
+# The instrumental magnitude of a star is -2.5 log10(flux / exposure). Its difference from the catalog's V is the zero
+# point plus the star's color term, which is unknown but constant.
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,10 +53,12 @@ class MagnitudeZero:
 
     Attributes
     ----------
+    offset_mag
+        Zero point
     sigma_mag
-        Standard deviation of the offset
+        Standard deviation of the zero point
     scatter_mag
-        Of one star about the offset, mainly by its color
+        Standard deviation of one star about the zero point, mainly because of its color
     stars
         Number of different stars
     """
@@ -57,12 +70,19 @@ class MagnitudeZero:
 
 
 def magnitude_zero(instrumental_mag: Floats, v_mag: Floats, vectors_ref: Floats) -> MagnitudeZero:
-    """Zero point as the median over different stars of each star's median difference.
+    """Return the zero point: the median over different stars of each star's median difference.
 
     Colors are unknown and shift a star by some tenths of a magnitude, equally in every frame; therefore the sample is
-    the stars, not the sightings. The scatter is 1.4826 times the median absolute deviation, and the standard deviation
-    of the median is sqrt(pi / 2) times the scatter over the square root of the number of stars. Leave out stars near
-    the detection limit: only those with positive errors are detected, which biases the median.
+    the N different stars, not the sightings. The scatter is s = 1.4826 times the median absolute deviation, and the
+    standard deviation of the median is sqrt(pi / 2) s / sqrt(N). Leave out stars near the detection limit: only those
+    with positive errors are detected, which biases the median.
+
+    Parameters
+    ----------
+    instrumental_mag, v_mag
+        (K,) instrumental and catalog magnitude of each sighting
+    vectors_ref
+        (K, 3) unit vector of each sighting's star, by which stars are told apart
     """
     checks.unit_rows("vectors_ref", vectors_ref, None)
     if not len(vectors_ref):
@@ -70,23 +90,25 @@ def magnitude_zero(instrumental_mag: Floats, v_mag: Floats, vectors_ref: Floats)
     for name, values in (("instrumental_mag", instrumental_mag), ("v_mag", v_mag)):
         if not np.isfinite(checks.floats(name, values, (len(vectors_ref),))).all():
             raise ImageError(f"{name} has a NaN or infinity; allowed: finite")
+    # Median of each star
     _, star = np.unique(vectors_ref, axis=0, return_inverse=True)
     star = np.ravel(star)
     difference = v_mag - instrumental_mag
     each = np.array([np.median(difference[star == k]) for k in range(star.max() + 1)])
+    # Median of the stars
     offset = float(np.median(each))
     scatter = float(SIGMA_PER_MAD * np.median(np.abs(each - offset)))
-    return MagnitudeZero(
-        offset, float(np.sqrt(np.pi / 2 / len(each))) * scatter, scatter, len(each)
-    )
+    sigma = float(np.sqrt(np.pi / 2 / len(each))) * scatter
+    return MagnitudeZero(offset, sigma, scatter, len(each))
 
+
+# Calibration of the lens.
 
 LENS = 8  # focal_px, center x and y, k1, k2, p1, p2, k3
 LEAST_STARS = 3  # in a frame: two determine its attitude and leave only one coordinate for the lens
 START_ROUNDS = 30  # iterations of the robust start attitude
-MIN_STAR_FRACTION = (
-    0.9  # self_calibrate stops at a round with fewer than this fraction of the most stars so far
-)
+# self_calibrate stops at a round with fewer than this fraction of the most stars so far.
+MIN_STAR_FRACTION = 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,16 +118,16 @@ class StarFrame:
     Attributes
     ----------
     xy_px
-        (K, 2)
+        (K, 2) centroids
     sigma_px
-        (K,) of each coordinate
+        (K,) standard deviation of each coordinate
     vectors_ref
         (K, 3) unit vectors of the identified stars
     flux, v_mag
-        (K,) brightness in the image and catalog magnitude, for the magnitude zero point; None
-        without it
+        (K,) flux in the image and catalog magnitude, for the magnitude zero point; None without
+        it
     exposure_s
-        Of the frame
+        Exposure time of the frame
     """
 
     xy_px: Floats
@@ -123,10 +145,10 @@ class LensPrior:
     Attributes
     ----------
     center
-        Of the principal point, as a fraction of the chip's width
+        Standard deviation of the principal point, as a fraction of the chip's width
     radial, tangential
-        Displacement by each coefficient alone in the farthest corner, as a fraction of the
-        corner's distance from the center
+        Standard deviation of the displacement by each coefficient alone in the farthest corner,
+        as a fraction of the corner's distance from the center
     """
 
     center: float = 0.05
@@ -134,7 +156,8 @@ class LensPrior:
     tangential: float = 0.02
 
     def sigma(self, camera: Camera) -> Floats:
-        """(8,) standard deviations of focal_px (inf: no prior), center x and y, k1, k2, p1, p2, k3."""
+        """Return the (8,) standard deviations of focal_px (inf: no prior), center x and y, k1, k2, p1, p2, k3."""
+        # In the corner k1 displaces by k1 r^2 of r, k2 by k2 r^4, k3 by k3 r^6, and p1 or p2 by up to 3 p r.
         r = np.tan(camera.diagonal_rad / 2)
         k1 = self.radial / r**2
         p = self.tangential / (3 * r)
@@ -155,13 +178,13 @@ class FieldReport:
     attitude_covariance_rad2
         (F, 3, 3) in camera axes, including the lens's errors; NaN if not tied
     tied
-        (F,) frames with three or more stars
+        (F,) whether each frame is tied: three or more of its stars are used
     outliers
         (K, 2) frame, and row in it, of the stars rejected as wrong identifications
     stars
         Number of sightings used
     rms_px
-        Of the residual coordinates
+        RMS of the residual coordinates
     misfit
         sqrt(chi-square / degrees of freedom), near 1 if sigma_px is correct
     magnitude
@@ -180,7 +203,7 @@ class FieldReport:
 
 
 class Calibration(NamedTuple):
-    """The camera, the (8, 8) covariance of focal_px, center x, y, k1, k2, p1, p2, k3, and the report."""
+    """Result: the camera, the (8, 8) covariance of focal_px, center x, y, k1, k2, p1, p2, k3, and the report."""
 
     camera: Camera
     covariance: Floats
@@ -195,9 +218,13 @@ def calibrate(
 ) -> Calibration:
     """Fit the lens and every frame's attitude by least squares, from a focal length accurate to a few percent.
 
-    Wrong identifications are tolerated: the fit first uses Cauchy's loss, its width shrinking with the median residual;
-    then residuals beyond 5 sigma are rejected, and the rest is fitted by least squares, whose covariance is returned.
-    Raises ValueError in one line if the frames are malformed or do not determine the lens.
+    The numbered steps are those of the module. Wrong identifications are tolerated: they are rejected before the
+    least-squares fit, whose covariance is returned.
+
+    Raises
+    ------
+    ValueError
+        If the frames are malformed or do not determine the lens.
     """
     checks.each_of_type("calibrate: frames", frames, StarFrame)
     checks.of_type("calibrate: camera_start", camera_start, Camera)
@@ -206,34 +233,35 @@ def calibrate(
     row = np.concatenate([np.arange(len(frame.xy_px)) for frame in frames])
     counts = np.array([len(frame.xy_px) for frame in frames])
     vectors = np.concatenate([frame.vectors_ref for frame in frames])
+    # 1. Start attitudes
     problem = _start_problem(sightings, vectors, camera_start, prior, len(frames))
-    keep = counts[sightings.frame] >= LEAST_STARS
-    _check_enough(sightings.take(keep))
-    problem = problem._replace(bundle=_fit_attitudes(problem.bundle, sightings.take(keep)))
+    # 2. Attitudes alone, in frames with enough stars
+    enough = counts[sightings.frame] >= LEAST_STARS
+    used = sightings.take(enough)
+    _check_enough(used)
+    problem = problem._replace(bundle=_fit_attitudes(problem.bundle, used))
+    # 3. Graduated robust fit: each round shrinks the width with the residuals, until it shrinks by less than 10 %.
     previous = np.inf
-    # Graduated robust fit: each round shrinks the width with the residuals, until it shrinks by less than 10 %.
-    while (
-        current := CAUCHY * ba.robust_scale(problem.bundle, sightings.take(keep))
-    ) < 0.9 * previous:
-        problem, _ = _minimize(problem, sightings.take(keep), current)
+    while (current := CAUCHY * ba.robust_scale(problem.bundle, used)) < 0.9 * previous:
+        problem, _ = _minimize(problem, used, current)
         previous = current
+    # 4. Wrong identifications
     distance = np.linalg.norm(ba.residuals(problem.bundle, sightings), axis=1)
-    keep &= distance < GATE * ba.robust_scale(problem.bundle, sightings.take(keep))
-    outliers = np.column_stack([sightings.frame, row])[
-        ~keep & (counts[sightings.frame] >= LEAST_STARS)
-    ]
+    keep = enough & (distance < GATE * ba.robust_scale(problem.bundle, used))
+    outliers = np.column_stack([sightings.frame, row])[~keep & enough]
     tied = np.bincount(sightings.frame[keep], minlength=len(frames)) >= LEAST_STARS
     keep &= tied[sightings.frame]
-    _check_enough(sightings.take(keep))
-    problem, converged = _minimize(problem, sightings.take(keep), np.inf)
+    # 5. Least squares
+    used = sightings.take(keep)
+    _check_enough(used)
+    problem, converged = _minimize(problem, used, np.inf)
+    # 6. Covariance and diagnostics
     status = "converged" if converged else f"stopped after {ba.STEPS} steps without convergence"
-    return _report(
-        status, problem, sightings.take(keep), tied, outliers, keep, frames, camera_start
-    )
+    return _report(status, problem, used, tied, outliers, keep, frames, camera_start)
 
 
 class IdentifyingTracker(Protocol):
-    """Interface of the identifying tracker: a star list and a solution for centroids. StarTracker has it."""
+    """Interface of a tracker that identifies stars: a star list, and a solution for centroids. StarTracker has it."""
 
     stars: StarCatalog
 
@@ -248,18 +276,31 @@ def self_calibrate(
     exposure_s: float = 1.0,
     rounds: int = 8,
 ) -> Calibration:
-    """Calibrate a camera from centroids alone: alternately identify the stars and calibrate with them.
+    """Calibrate a camera from centroids alone.
 
-    Stops when a round identifies the same stars as the one before (an equal number is not enough), or has lost too
-    many (MIN_STAR_FRACTION). Raises ValueError if no frame is identified.
+    Each round:
+
+    1. Identify the stars with the camera of the last round.
+    2. Stop if they are the same stars as in the round before (an equal number is not enough), or if too many are lost
+       (MIN_STAR_FRACTION).
+    3. Calibrate with them, from the start camera.
 
     Parameters
     ----------
+    frames
+        Centroids of each frame
     tracker
-        Makes a tracker from a camera and the relative uncertainty of its focal length, 0 after
-        a calibration
+        Function that makes a tracker from a camera and the relative uncertainty of its focal
+        length, which is 0 after a calibration
     camera
-        Prior knowledge: the chip, and the focal length to `focal_uncertainty`
+        Start camera: the chip, and the focal length to `focal_uncertainty`
+    exposure_s
+        Exposure time of the frames
+
+    Raises
+    ------
+    ValueError
+        If no frame is identified.
     """
     checks.each_of_type("self_calibrate: frames", frames, Centroids)
     checks.of_type("self_calibrate: camera", camera, Camera)
@@ -273,11 +314,13 @@ def self_calibrate(
     previous_stars = np.empty((0, 3))
     estimate = camera
     for _ in range(rounds):
+        # 1. Identification
         identified = _identified(frames, tracker(estimate, focal_uncertainty), exposure_s)
         stars = np.concatenate([np.empty((0, 3)), *(frame.vectors_ref for frame in identified)])
-        # Each round identifies with the calibrated camera, but calibrates from the start camera, which is the prior.
+        # 2. Convergence
         if np.array_equal(stars, previous_stars) or len(stars) < MIN_STAR_FRACTION * most:
             break
+        # 3. Calibration. The start camera is the prior, so that the rounds do not count it several times.
         best = calibrate(identified, camera)
         most = max(most, len(stars))
         previous_stars = stars
@@ -291,9 +334,14 @@ def self_calibrate(
 
 
 def disagreement_px(camera: Camera, other: Camera, nodes: int = 41) -> float:
-    """Rms distance over the sensor between the projections of two cameras, after the best common rotation, px.
+    """Return the rms distance over the sensor between the projections of two cameras, after the best rotation, px.
 
     The rotation is removed because it is not a property of the lens: every attitude absorbs it.
+
+    Parameters
+    ----------
+    nodes
+        Number of points along each side of the sensor
     """
     x = np.linspace(-0.5, camera.width_px - 0.5, nodes)
     y = np.linspace(-0.5, camera.height_px - 0.5, nodes)
@@ -301,28 +349,26 @@ def disagreement_px(camera: Camera, other: Camera, nodes: int = 41) -> float:
     checks.of_type("other", other, Camera)
     rays = camera.rays(xy)
     R_other_from_camera, _ = kernel.wahba(other.rays(xy), rays, np.ones(len(xy)))
-    return float(
-        np.sqrt(np.mean(np.sum((other.pixels(rays @ R_other_from_camera.T) - xy) ** 2, axis=1)))
-    )
+    shift_px = other.pixels(rays @ R_other_from_camera.T) - xy
+    return float(np.sqrt(np.mean(np.sum(shift_px**2, axis=1))))
 
 
 class _Problem(NamedTuple):
-    """The bundle with the stars as lights at distance 1, and the (8,) prior lens with its standard deviations."""
+    """Bundle with the stars as lights at distance 1, and the (8,) prior lens with its standard deviations."""
 
     bundle: Bundle
     prior_lens: Floats
     sigma: Floats
 
     def cost(self, sightings: Sightings, width: float) -> tuple[float, Floats]:
-        """Total loss of the pixels and the prior, and the (M,) robust weights of the sightings."""
+        """Return the total loss of the pixels and the prior, and the (M,) robust weights of the sightings."""
         loss, weight = ba.cauchy(np.sum(ba.residuals(self.bundle, sightings) ** 2, axis=1), width)
-        return loss + float(
-            np.sum(((self.bundle.lens - self.prior_lens) / self.sigma) ** 2)
-        ), weight
+        from_prior = np.sum(((self.bundle.lens - self.prior_lens) / self.sigma) ** 2)
+        return loss + float(from_prior), weight
 
 
 class _NormalEquations(NamedTuple):
-    """The normal equations: (F, 3, 3) of rotations, (F, 3, 8) coupling, (8, 8) of the lens, right-hand sides."""
+    """Normal equations: (F, 3, 3) of rotations, (F, 3, 8) coupling, (8, 8) of the lens, and right-hand sides."""
 
     rotation_blocks: Floats
     coupling: Floats
@@ -332,7 +378,7 @@ class _NormalEquations(NamedTuple):
 
 
 def _collect(frames: Sequence[StarFrame]) -> Sightings:
-    """The stars of all frames in one table, each sighting with its own light. Raises ValueError if malformed."""
+    """Return the stars of all frames in one table, each sighting as its own light. Raises ValueError if malformed."""
     if not frames:
         raise ValueError("calibrate: no frames; allowed: 1 or more, typically tens")
     for k, frame in enumerate(frames):
@@ -344,8 +390,8 @@ def _collect(frames: Sequence[StarFrame]) -> Sightings:
                 f"calibrate: frame {k} has shapes {shapes}; allowed: (K, 2), (K,), (K, 3)"
             )
         checks.unit_rows(f"calibrate: frame {k}: vectors_ref", arrays[2], count)
-        finite = np.isfinite(arrays[0]).all()
-        if not (finite and np.all((arrays[1] > 0) & (arrays[1] < np.inf))):
+        usable_sigma = (arrays[1] > 0) & (arrays[1] < np.inf)
+        if not (np.isfinite(arrays[0]).all() and usable_sigma.all()):
             raise ValueError(
                 f"calibrate: frame {k} has a pixel or direction that is not finite or a sigma_px not above 0"
             )
@@ -371,7 +417,7 @@ def _check_enough(sightings: Sightings) -> None:
 def _start_problem(
     sightings: Sightings, vectors: Floats, camera: Camera, prior: LensPrior, count: int
 ) -> _Problem:
-    """Start values: the start camera, and each frame's robust attitude with it."""
+    """Return the start values: the start camera, and each frame's robust attitude with it."""
     lens = np.array([camera.focal_px, *camera.center_px, *camera.distortion])
     rays = camera.rays(sightings.xy_px)
     R_cam_from_ref = np.tile(np.eye(3), (count, 1, 1))
@@ -384,10 +430,15 @@ def _start_problem(
 
 
 def _robust_attitude(rays: Floats, vectors: Floats) -> Floats:
-    """(3, 3) rotation of the least sum of distances, by iteratively reweighted Wahba solutions.
+    """Return the (3, 3) rotation of the least sum of distances, by iteratively reweighted Wahba solutions.
 
-    With the sum of distances (not of squares) an outlier has no more influence than any other star. Raises ValueError
-    if all stars coincide.
+    With the sum of distances d (not of squares) an outlier has no more influence than any other star: the weights of
+    the next solution are 1 / d.
+
+    Raises
+    ------
+    ValueError
+        If all stars coincide.
     """
     weight = np.ones(len(rays))
     for _ in range(START_ROUNDS):
@@ -399,7 +450,7 @@ def _robust_attitude(rays: Floats, vectors: Floats) -> Floats:
 
 
 def _fit_attitudes(bundle: Bundle, sightings: Sightings) -> Bundle:
-    """The bundle with every frame's attitude fitted under Cauchy's loss, the lens fixed."""
+    """Return the bundle with every frame's attitude fitted under Cauchy's loss, the lens fixed."""
     frames = np.unique(sightings.frame)
     selected = replace(bundle, R_body_from_lab=bundle.R_body_from_lab[frames])
     numbered = replace(sightings, frame=np.searchsorted(frames, sightings.frame))
@@ -409,39 +460,35 @@ def _fit_attitudes(bundle: Bundle, sightings: Sightings) -> Bundle:
 
 
 def _normal_equations(problem: _Problem, sightings: Sightings, weight: Floats) -> _NormalEquations:
-    """The normal equations J'WJ and J'W residual, with one weight per sighting and the prior on the lens added."""
+    """Return the normal equations J^T W J and J^T W e, with one weight per sighting and the prior on the lens added."""
     terms = ba.linearize(problem.bundle, sightings)
     frames = len(problem.bundle.R_body_from_lab)
     by_rotation = terms.by_rotation
-    by_lens = terms.by_shared[
-        :, :, 3:
-    ]  # the first three columns are the lever, which is fixed at zero
+    by_lens = terms.by_shared[:, :, 3:]  # without the lever, which is fixed at zero
     weighted_rotation = weight[:, None, None] * by_rotation
     weighted_lens = weight[:, None, None] * by_lens
+    # Each frame's attitude, and its coupling with the lens
     rotation_blocks = np.zeros((frames, 3, 3))
     coupling = np.zeros((frames, 3, LENS))
     rhs = np.zeros((frames, 3))
     np.add.at(rotation_blocks, sightings.frame, by_rotation.transpose(0, 2, 1) @ weighted_rotation)
     np.add.at(coupling, sightings.frame, by_rotation.transpose(0, 2, 1) @ weighted_lens)
     np.add.at(rhs, sightings.frame, np.einsum("mai,ma->mi", weighted_rotation, terms.residual))
-    rotation_blocks[np.bincount(sightings.frame, minlength=frames) == 0] = np.eye(
-        3
-    )  # unused frame: zero step
+    # The identity gives an unused frame a step of zero.
+    unused = np.bincount(sightings.frame, minlength=frames) == 0
+    rotation_blocks[unused] = np.eye(3)
+    # The lens, with its prior
     lens = np.einsum("mai,maj->ij", weighted_lens, by_lens) + np.diag(problem.sigma**-2)
     prior_rhs = (problem.prior_lens - problem.bundle.lens) / problem.sigma**2
-    return _NormalEquations(
-        rotation_blocks,
-        coupling,
-        lens,
-        rhs,
-        np.einsum("mai,ma->i", weighted_lens, terms.residual) + prior_rhs,
-    )
+    lens_rhs = np.einsum("mai,ma->i", weighted_lens, terms.residual) + prior_rhs
+    return _NormalEquations(rotation_blocks, coupling, lens, rhs, lens_rhs)
 
 
 def _eliminate_attitudes(terms: _NormalEquations, damping: float) -> tuple[Floats, Floats, Floats]:
-    """Eliminate the attitudes, with Marquardt's damping: (F, 3, 8) A^-1 C, (F, 3) A^-1 pull, (8, 8) Schur complement.
+    """Eliminate the attitudes: (F, 3, 8) A^-1 C, (F, 3) A^-1 a, and the (8, 8) Schur complement D - sum(C^T A^-1 C).
 
-    A are the blocks of the attitudes, C their coupling with the lens.
+    A are the blocks of the attitudes, C their coupling with the lens, D the block of the lens, and a the right-hand
+    sides of the attitudes. Damping multiplies the diagonals of A and D by 1 + damping (Marquardt).
     """
     blocks = terms.rotation_blocks * np.where(np.eye(3, dtype=bool), 1 + damping, 1.0)
     right_sides = np.concatenate([terms.coupling, terms.rhs_rotation[:, :, None]], axis=2)
@@ -454,12 +501,19 @@ def _eliminate_attitudes(terms: _NormalEquations, damping: float) -> tuple[Float
 
 
 def _minimize(problem: _Problem, sightings: Sightings, width: float) -> tuple[_Problem, bool]:
-    """Minimize over lens and attitudes by Levenberg-Marquardt; returns the problem and whether it converged.
+    """Minimize over lens and attitudes by Levenberg-Marquardt; return the problem and whether it converged.
+
+    Each step:
+
+    1. Eliminate the attitudes, and solve for the lens.
+    2. Substitute back for the attitudes.
+    3. Accept the step and reduce the damping if the loss falls; otherwise increase the damping.
+    4. Stop when the Newton decrement is negligible.
 
     Parameters
     ----------
     width
-        Of Cauchy's loss in sigmas; inf for least squares
+        Width of Cauchy's loss in sigmas; inf for least squares
 
     Raises
     ------
@@ -471,20 +525,22 @@ def _minimize(problem: _Problem, sightings: Sightings, width: float) -> tuple[_P
     terms = _normal_equations(problem, sightings, weight)
     no_step = np.zeros(3 * len(problem.bundle.position_m))
     for _ in range(ba.STEPS):
+        # 1. Lens
         through, uncoupled, matrix = _eliminate_attitudes(terms, damping)
-        lens = _solve_scaled(
-            matrix, terms.rhs_lens - np.einsum("fij,fi->j", terms.coupling, uncoupled)
-        )
+        reduced_rhs = terms.rhs_lens - np.einsum("fij,fi->j", terms.coupling, uncoupled)
+        lens = _solve_scaled(matrix, reduced_rhs)
+        # 2. Attitudes
         rotation = uncoupled - through @ lens
         slope = float(np.sum(terms.rhs_rotation * rotation) + terms.rhs_lens @ lens)
         step = np.concatenate([rotation.ravel(), np.zeros(3), lens])
         trial = problem._replace(bundle=problem.bundle.apply_step(no_step, step))
         new_cost, new_weight = trial.cost(sightings, width)
-        # Near the minimum the costs differ only by rounding, so that a step is accepted within that.
+        # 3. Near the minimum the costs differ only by rounding: a step is accepted within that.
         if new_cost <= cost * (1 + 1e-13) + 1e-20:
             problem = trial
             cost = new_cost
             damping = max(damping / 10, 1e-12)
+            # 4. Convergence
             if slope < ba.DECREMENT:
                 return problem, True
             terms = _normal_equations(problem, sightings, new_weight)
@@ -494,7 +550,7 @@ def _minimize(problem: _Problem, sightings: Sightings, width: float) -> tuple[_P
 
 
 def _solve_scaled(matrix: Floats, right: Floats) -> Floats:
-    """matrix^-1 right for a positive definite matrix, scaled to a unit diagonal. Raises ValueError if it is not."""
+    """Return matrix^-1 right, with the matrix scaled to a unit diagonal. Raises ValueError if it is not positive."""
     try:
         scale = 1 / np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
         factor = cho_factor(matrix * scale * scale[:, None], lower=True)
@@ -515,38 +571,41 @@ def _report(
     frames: Sequence[StarFrame],
     camera: Camera,
 ) -> Calibration:
+    """Return the calibration with its covariances and diagnostics.
+
+    The lens has the covariance S^-1 with the Schur complement S, the attitudes A^-1 + A^-1 C S^-1 C^T A^-1.
+    """
+    # Covariances of the lens and of the attitudes
     terms = _normal_equations(problem, sightings, np.ones(len(sightings.frame)))
     through, _, matrix = _eliminate_attitudes(terms, 0.0)
     covariance = _solve_scaled(matrix, np.eye(LENS))
-    attitude_covariance = np.linalg.inv(
-        terms.rotation_blocks
-    ) + through @ covariance @ through.transpose(0, 2, 1)
+    by_lens = through @ covariance @ through.transpose(0, 2, 1)
+    attitude_covariance = np.linalg.inv(terms.rotation_blocks) + by_lens
     attitude_covariance[~tied] = np.nan
+    # Residuals
     residual = ba.residuals(problem.bundle, sightings)
+    residual_px = residual * sightings.sigma_px[:, None]
+    freedom = 2 * len(sightings.frame) - 3 * tied.sum() - LENS
     R = problem.bundle.R_body_from_lab
-    focal, x, y, *rest = (float(value) for value in problem.bundle.lens)
-    k1, k2, p1, p2, k3 = rest
+    attitudes = [rotation(R[k]) if tied[k] else Rotation.identity() for k in range(len(R))]
     report = FieldReport(
         status,
-        Rotation.concatenate(
-            [rotation(R[k]) if tied[k] else Rotation.identity() for k in range(len(R))]
-        ),
+        Rotation.concatenate(attitudes),
         attitude_covariance,
         tied,
         outliers,
         len(sightings.frame),
-        float(np.sqrt(np.mean((residual * sightings.sigma_px[:, None]) ** 2))),
-        float(
-            np.sqrt(np.sum(residual**2) / max(2 * len(sightings.frame) - 3 * tied.sum() - LENS, 1))
-        ),
-        _magnitude(frames, keep),
+        rms_px=float(np.sqrt(np.mean(residual_px**2))),
+        misfit=float(np.sqrt(np.sum(residual**2) / max(freedom, 1))),
+        magnitude=_magnitude(frames, keep),
     )
+    focal, x, y, k1, k2, p1, p2, k3 = (float(value) for value in problem.bundle.lens)
     lens = replace(camera, focal_px=focal, center_px=(x, y), distortion=(k1, k2, p1, p2, k3))
     return Calibration(lens, covariance, report)
 
 
 def _magnitude(frames: Sequence[StarFrame], keep: np.ndarray) -> MagnitudeZero | None:
-    """The magnitude zero point from the stars that were kept; None unless every frame has brightnesses."""
+    """Return the magnitude zero point from the stars that were kept; None unless every frame has flux and magnitude."""
     flux = [frame.flux for frame in frames if frame.flux is not None]
     v_mag = [frame.v_mag for frame in frames if frame.v_mag is not None]
     if not len(flux) == len(v_mag) == len(frames):
@@ -560,17 +619,16 @@ def _magnitude(frames: Sequence[StarFrame], keep: np.ndarray) -> MagnitudeZero |
 def _identified(
     frames: Sequence[Centroids], tracker: IdentifyingTracker, exposure_s: float
 ) -> list[StarFrame]:
-    """The frames that the tracker solves, with their identified stars."""
+    """Return the frames that the tracker solves, with their identified stars."""
     identified = []
     for centroids in frames:
         match = tracker.solve_centroids(centroids).match
-        if match is not None:
-            selected = centroids.take(match.observed)
-            vectors = tracker.stars.vectors[match.star]
-            v_mag = tracker.stars.v_mag[match.star]
-            identified.append(
-                StarFrame(
-                    selected.xy_px, selected.sigma_px, vectors, selected.flux, v_mag, exposure_s
-                )
-            )
+        if match is None:
+            continue
+        seen = centroids.take(match.observed)
+        vectors = tracker.stars.vectors[match.star]
+        v_mag = tracker.stars.v_mag[match.star]
+        identified.append(
+            StarFrame(seen.xy_px, seen.sigma_px, vectors, seen.flux, v_mag, exposure_s)
+        )
     return identified

@@ -1,7 +1,10 @@
 """Faults of a dome found by its survey: LEDs that are dark, far from their place in the list, or exchanged.
 
-`names` first gives each light the name that place and brightness have together, so that what the list's errors explain
-is no fault.
+1. `names` gives each light the name that its place and brightness together determine, so that errors of the list are
+   no faults.
+2. `dark` finds LEDs that never shine, `displaced` LEDs far from their place in the list.
+3. `stray_lights` finds lights at rest where no LED is expected, and `name_strays` assigns them to missing LEDs.
+4. `exchanged` finds LEDs that shine with another LED's light.
 
 A fault is reported only if chance would make it in fewer than FALSE_ALARMS surveys of a dome without one, all LEDs
 together (Bonferroni: each of N LEDs is tested at FALSE_ALARMS / N).
@@ -26,22 +29,21 @@ from estimator.core.checks import Floats, Ints
 from estimator.core.constants import SIGMA_PER_MAD
 
 Mask = NDArray[np.bool_]
-FALSE_ALARMS = 1e-3  # mean number of surveys with a false alarm of one kind
-MIN_FRAMES = 3  # that must show a light, or fail to show it
-CHI2_MEDIAN = 2.366  # of three degrees of freedom
-TINY_M2 = 1e-18  # keeps a variance of 0 from a division
-SURFACE_SIGMA_M = (
-    0.005  # of the assumed surface, for the distance of a light seen from one side only
-)
-GATE = 5.0  # standard deviations of a ray that belongs to a light
-MIN_SCATTER = 0.02  # of the logarithm of an LED's light
-CHANCE = 0.02  # of a light missed although it is on, or seen although it is off, at least
+FALSE_ALARMS = 1e-3  # share of surveys with a false alarm of one kind
+MIN_FRAMES = 3  # least number of frames that show a light, or fail to show it
+CHI2_MEDIAN = 2.366  # median of a chi-square of three degrees of freedom
+TINY_M2 = 1e-18  # added to variances, which could be 0
+# Standard deviation of the assumed surface, which determines the distance of a light seen from one side only.
+SURFACE_SIGMA_M = 0.005
+GATE = 5.0  # largest distance of a ray from its light, in standard deviations
+MIN_SCATTER = 0.02  # least standard deviation of the logarithm of an LED's light
+CHANCE = 0.02  # probability that a light is missed although it is on, or seen although it is off
 FORBIDDEN = 1e7  # cost of a name that is not allowed
 
 
 @dataclass(frozen=True, slots=True)
 class HeldFrames:
-    """The attitudes of a survey's F frames, and the model that it found."""
+    """Attitudes of a survey's F frames, and the model that it found."""
 
     camera: Camera
     leds: LedMap
@@ -49,23 +51,26 @@ class HeldFrames:
     body_from_lab: Rotation
 
     def shown(self, margin_px: float | Floats, apart_px: float) -> Mask:
-        """(F, N) LEDs that a frame must show if they shine: not nearer to the edge than a margin, or to another LED.
+        """Return (F, N) whether a frame must show an LED if that shines.
+
+        It must if the LED is inside the frame by a margin, and far enough from all other LEDs.
 
         Parameters
         ----------
         margin_px
-            One, or (N,) of each LED
+            Least distance from the frame's edge: one number, or (N,)
         apart_px
-            Least distance from other LEDs, whose images may merge
+            Least distance from other LEDs, whose images may merge with it
         """
         out = np.zeros((len(self.body_from_lab), len(self.leds.id)), dtype=bool)
         size_px = np.array([self.camera.width_px, self.camera.height_px])
         margin = np.broadcast_to(margin_px, len(self.leds.id))[:, None]
         for row, attitude in zip(out, self.body_from_lab, strict=True):
-            xy_px = np.nan_to_num(
-                project(attitude, self.leds.position_m, self.lever, self.camera), nan=-1e9
-            )
+            # An LED behind the camera is put far outside.
+            xy_px = project(attitude, self.leds.position_m, self.lever, self.camera)
+            xy_px = np.nan_to_num(xy_px, nan=-1e9)
             inside = ((xy_px >= margin) & (xy_px <= size_px - 1 - margin)).all(axis=1)
+            # Distance to the nearest other LED, one outside the frame included
             near = np.flatnonzero(((xy_px > -apart_px) & (xy_px < size_px + apart_px)).all(axis=1))
             if len(near) > 1:
                 distance_px, _ = cKDTree(xy_px[near]).query(xy_px[near], 2)
@@ -74,53 +79,67 @@ class HeldFrames:
         return out
 
     def rays(self, frame: Ints, xy_px: Floats) -> tuple[Floats, Floats]:
-        """(M, 3) origins and unit directions in the lab of the rays to lights at pixels (M, 2) of these frames."""
+        """Return the (M, 3) origins and unit directions, in the lab, of the rays to pixels (M, 2) of frames (M,)."""
         lab_from_body = self.body_from_lab[frame].inv()
-        directions = lab_from_body.apply(
-            self.lever.cam_from_body.inv().apply(self.camera.rays(xy_px))
-        )
-        return lab_from_body.apply(np.tile(self.lever.camera_body_m, (len(frame), 1))), directions
+        rays_body = self.lever.cam_from_body.inv().apply(self.camera.rays(xy_px))
+        origins = lab_from_body.apply(np.tile(self.lever.camera_body_m, (len(frame), 1)))
+        return origins, lab_from_body.apply(rays_body)
 
 
 @dataclass(frozen=True, slots=True)
 class StrayLight:
-    """A light at rest in the lab where no LED is expected: its place, and the number of frames that show it."""
+    """A light at rest in the lab where no LED is expected.
+
+    Attributes
+    ----------
+    position_m
+        (3,) position in the lab
+    frames
+        Number of frames that show it
+    """
 
     position_m: Floats
     frames: int
 
 
 def dark(shown: Mask, seen: Mask) -> Ints:
-    """Rows of the LEDs that never shine: seen in none of the n frames that must show them.
+    """Return the rows of the LEDs that never shine: seen in none of the n frames that must show them.
 
-    By the share p of the other LEDs' images that are detected, chance leaves one of N LEDs so in N (1 - p)^n surveys.
+    With the share p of the other LEDs' images that are detected, chance leaves one of N LEDs unseen in N (1 - p)^n
+    surveys. The share is estimated with one more detection and one more miss (Laplace's rule).
 
     Parameters
     ----------
     shown, seen
-        (F, N) LEDs that each frame must show, and those identified in it
+        (F, N) whether each frame must show each LED, and whether the LED is identified in it
     """
     count = shown.sum(axis=0)
     ever = seen.any(axis=0)
     trials = shown[:, ever].sum()
     hits = (shown & seen).sum()
-    missed = (trials - hits + 1) / (trials + 2)
+    missed = (trials - hits + 1) / (trials + 2)  # 1 - p
     surveys = len(count) * missed**count
     return np.flatnonzero(~ever & (count >= MIN_FRAMES) & (surveys < FALSE_ALARMS))
 
 
 def displaced(list_m: Floats, found_m: Floats, covariance_m2: Floats) -> tuple[Ints, float]:
-    """Rows of measured LEDs that are too far from their place in the list, and the list's error about each axis, m.
+    """Return the rows of measured LEDs that are too far from their place in the list, and the list's error s, m.
 
-    An LED at the distance d has the test value d' (s^2 I + C)^-1 d, a chi-square of three degrees of freedom, C its
-    covariance. The list's error s is the one for which the median of all measured LEDs is that of the chi-square,
-    2.366. An LED is displaced if its value exceeds the quantile at FALSE_ALARMS / N.
+    An LED at the distance d from its place, with the covariance C, has the test value d^T (s^2 I + C)^-1 d, a
+    chi-square of three degrees of freedom.
+
+    1. Diagonalize the covariances: the test value is then a sum over the axes.
+    2. Find the list's error s along each axis, by bisection: the median of all values is that of the chi-square, 2.366.
+    3. An LED is displaced if its value exceeds the quantile at FALSE_ALARMS / N.
 
     Parameters
     ----------
+    list_m, found_m
+        (N, 3) positions in the list, and as found by the survey
     covariance_m2
-        (N, 3, 3) of the places found; NaN for LEDs that are not measured
+        (N, 3, 3) covariance of the positions found; NaN for LEDs that are not measured
     """
+    # 1. Squared distances along the axes of each covariance
     rows = np.flatnonzero(np.isfinite(covariance_m2).all(axis=(1, 2)))
     if not len(rows):
         return rows, 0.0
@@ -128,69 +147,86 @@ def displaced(list_m: Floats, found_m: Floats, covariance_m2: Floats) -> tuple[I
     squared_m2 = np.einsum("nji,nj->ni", axes, (found_m - list_m)[rows]) ** 2
 
     def value(sigma_m: float) -> Floats:
-        return np.asarray(
-            np.sum(squared_m2 / (np.maximum(eigenvalue, 0) + sigma_m**2 + TINY_M2), axis=1)
-        )
+        variance_m2 = np.maximum(eigenvalue, 0) + sigma_m**2 + TINY_M2
+        return np.asarray(np.sum(squared_m2 / variance_m2, axis=1))
 
+    # 2. Bisection: the median falls with s.
     low = 0.0
     high = float(np.sqrt(squared_m2.max()))
-    for _ in range(60):  # bisection: the median falls with s
+    for _ in range(60):
         middle = (low + high) / 2
-        low, high = (middle, high) if np.median(value(middle)) > CHI2_MEDIAN else (low, middle)
+        if np.median(value(middle)) > CHI2_MEDIAN:
+            low = middle
+        else:
+            high = middle
+    # 3. Displaced LEDs
     return rows[value(high) > _limit(len(rows))], high
 
 
 def _limit(count: int) -> float:
-    """Chi-square of three degrees of freedom that one of `count` LEDs exceeds in FALSE_ALARMS surveys."""
+    """Return the chi-square of three degrees of freedom that one of `count` LEDs exceeds in FALSE_ALARMS surveys."""
     return float(2 * gammainccinv(1.5, FALSE_ALARMS / count))
 
 
 def stray_lights(
     held: HeldFrames, frame: Ints, xy_px: Floats, sigma_px: float, reach_m: float
 ) -> list[StrayLight]:
-    """Lights at rest among those that are no known LED: (M,) frames and (M, 2) pixels.
+    """Return the lights at rest among those that are no known LED.
 
-    Each ray meets the assumed surface; points within `reach_m` of one another form a group. Its light is where the
-    rays of at least MIN_FRAMES frames meet, each within GATE standard deviations; other rays, of reflections and faults
-    of the chip, which are not at rest in the lab, are left out.
+    1. Intersect each ray with the assumed surface.
+    2. Group the points that are within `reach_m` of one another.
+    3. Find the point where the rays of a group meet (`_meeting_point`).
+    4. Keep it if the rays of at least MIN_FRAMES frames pass it within GATE standard deviations. Reflections and faults
+       of the chip are not at rest in the lab, so their rays do not meet.
 
     Parameters
     ----------
+    frame, xy_px
+        (M,) frame and (M, 2) pixel of each light that is no known LED
     sigma_px
-        Of a centroid
+        Standard deviation of a centroid
     reach_m
         Distance on the assumed surface within which lights may be the same
     """
     if len(frame) < MIN_FRAMES:
         return []
+    # 1. Points on the surface; a ray that misses it is put far away.
     origins, directions = held.rays(frame, xy_px)
     points = np.array(
         [on_surface(u[None], o, held.leds)[0] for o, u in zip(origins, directions, strict=True)]
     )
     points = np.nan_to_num(points, nan=1e9)
+    # 2. Groups
     pairs = cKDTree(points).query_pairs(reach_m, output_type="ndarray")
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
     groups, label = connected_components(links, directed=False)
     sigma_rad = sigma_px / held.camera.focal_px
     out = []
     for group in range(groups):
+        # 3. Meeting point
         rows = np.flatnonzero(label == group)
         place_m = _meeting_point(origins[rows], directions[rows], points[rows], sigma_rad)
-        if place_m is not None:
-            near = _off_rad(place_m, origins[rows], directions[rows]) < GATE * sigma_rad
-            count = len(np.unique(frame[rows[near]]))
-            if count >= MIN_FRAMES:
-                out.append(StrayLight(place_m, count))
+        if place_m is None:
+            continue
+        # 4. Number of frames
+        near = _off_rad(place_m, origins[rows], directions[rows]) < GATE * sigma_rad
+        count = len(np.unique(frame[rows[near]]))
+        if count >= MIN_FRAMES:
+            out.append(StrayLight(place_m, count))
     return out
 
 
 def _meeting_point(
     origins: Floats, directions: Floats, points: Floats, sigma_rad: float
 ) -> Floats | None:
-    """The place nearest to most of the rays; None if too few meet.
+    """Return the point x nearest to most of the rays; None if too few meet.
 
-    Least squares of the distances from the rays, |(I - u u') (x - o)|^2, held to the surface by its own error. The rays
-    that are used are first those within GATE of the best single point of the surface, then those within GATE of x.
+    x minimizes the sum of the squared distances from the rays with origins o and directions u,
+    |(I - u u^T) (x - o)|^2, plus a weak term that holds it near its last value, by the surface's own error. It starts
+    from the median of the points on the surface, with all rays; each round:
+
+    1. Select the rays within three times the median angle of the last round from x, or within GATE if that is larger.
+    2. Solve for x.
     """
     if len(points) < MIN_FRAMES:
         return None
@@ -200,20 +236,21 @@ def _meeting_point(
     weak = (sigma_rad * distance_m.mean() / SURFACE_SIGMA_M) ** 2
     limit_rad = np.inf
     for _ in range(10):
+        # 1. Rays
         off_rad = _off_rad(at, origins, directions)
         near = off_rad <= max(limit_rad, GATE * sigma_rad)
         if near.sum() < MIN_FRAMES:
             return None
+        # 2. Least squares
         matrix = across[near].sum(axis=0) + weak * np.eye(3)
-        at = np.linalg.solve(
-            matrix, np.einsum("nij,nj->i", across[near], origins[near]) + weak * at
-        )
+        right = np.einsum("nij,nj->i", across[near], origins[near]) + weak * at
+        at = np.linalg.solve(matrix, right)
         limit_rad = 3 * float(np.median(_off_rad(at, origins, directions)[near]))
     return at
 
 
 def _off_rad(place_m: Floats, origins: Floats, directions: Floats) -> Floats:
-    """(N,) angles between rays and the direction to a place."""
+    """Return the (N,) sines of the angles between rays and the directions from their origins to a place."""
     toward = place_m - origins
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     return np.asarray(np.linalg.norm(np.cross(toward, directions), axis=1))
@@ -222,7 +259,19 @@ def _off_rad(place_m: Floats, origins: Floats, directions: Floats) -> Floats:
 def name_strays(
     strays: list[StrayLight], candidates: Ints, list_m: Floats, limit_m: float
 ) -> list[tuple[int, int]]:
-    """Pairs (LED, stray) of LEDs that are not where the list has them, by the least sum of distances up to a limit."""
+    """Return pairs (LED, stray) of LEDs that are not at their place in the list, and the lights that they may be.
+
+    The pairs minimize the sum of squared distances, each counted up to the limit.
+
+    Parameters
+    ----------
+    candidates
+        Rows of the LEDs that are missing
+    list_m
+        (N, 3) positions in the list
+    limit_m
+        Largest distance of a pair
+    """
     if not strays or not len(candidates):
         return []
     places_m = np.array([stray.position_m for stray in strays])
@@ -234,17 +283,17 @@ def name_strays(
 
 @dataclass(frozen=True, slots=True)
 class LightTable:
-    """What the frames of a survey show of its LEDs.
+    """Light of a survey's LEDs in its frames.
 
     Attributes
     ----------
     light
         (F, N) light of each LED at unit distance, NaN if it is not identified in the frame
     shown
-        (F, N) LEDs that the frame must show if they are on
+        (F, N) whether the frame must show the LED if that is on
     expected
-        (F, N) light that each LED is expected to give, relative, 0 if its code has it off in
-        the frame
+        (F, N) relative light that each LED is expected to give, 0 if its code has it off in the
+        frame
     """
 
     light: Floats
@@ -254,7 +303,17 @@ class LightTable:
 
 @dataclass(frozen=True, slots=True)
 class Exchange:
-    """At the place of LED `led` shines the LED `shows` (rows); the others that would do as well are `or_any_of`."""
+    """An LED that shines at the place of another one.
+
+    Attributes
+    ----------
+    led
+        Row of the LED whose place it is
+    shows
+        Row of the LED that shines there
+    or_any_of
+        Rows of other LEDs that explain the light as well
+    """
 
     led: int
     shows: int
@@ -262,29 +321,34 @@ class Exchange:
 
 
 def exchanged(table: LightTable) -> tuple[list[Exchange], float | None]:
-    """LEDs whose light is another LED's, and the share of pairs of LEDs of which an exchange would be found; None if
-    fewer than two LEDs are in enough frames to be compared.
+    """Return the LEDs that shine with another LED's light, and the share of pairs whose exchange would be found.
 
-    The log likelihood of LED j at the place of i is that of the logarithms of the light in the frames less the expected
-    ones: of their mean, with the robust scatter of all LEDs between them, and of their deviations from it, with that
-    from frame to frame; and of the frames in which it is on but not seen, or seen but off, with CHANCE each. Of the
-    LEDs for which another one is more likely by half of the threshold
-    T = ln(N^2 / 2 / FALSE_ALARMS), the most likely permutation is reported (linear assignment), if it gains T a pair.
+    The share is None if fewer than two LEDs are in enough frames to be compared.
+
+    1. Compute the log likelihood of each LED's light at each place (`_log_likelihood`).
+    2. Suspect the LEDs for which another one is more likely by half of the threshold T = ln(N^2 / 2 / FALSE_ALARMS).
+    3. Find the most likely permutation of the suspects (linear assignment).
+    4. Report those that gain T / 2 each, T a pair.
+
     LEDs that are alike in all frames have equal likelihoods: their exchange has no effect on any frame.
     """
+    # 1. Likelihoods
     likelihood = _log_likelihood(table)
     count = len(likelihood)
     own = np.diag(likelihood)
+    # 2. Suspects
     least = np.log(max(count, 2) ** 2 / 2 / FALSE_ALARMS) / 2
     suspects = np.flatnonzero(likelihood.max(axis=1, initial=-np.inf) - own > least)
     tested = np.isfinite(table.light).sum(axis=0) >= MIN_FRAMES
     observable = _observable(table, likelihood, tested, least)
     if len(suspects) < 2:
         return [], observable
+    # 3. Permutation
     among = likelihood[np.ix_(suspects, suspects)]
     rows, columns = linear_sum_assignment(-among)
     out = []
     for row, column in zip(rows, columns, strict=True):
+        # 4. Report, with the suspects that explain the light as well
         if row != column and among[row, column] - among[row, row] > least:
             alike = np.flatnonzero(among[row] > among[row, column] - least)
             others = tuple(int(suspects[k]) for k in alike if k not in (row, column))
@@ -295,65 +359,96 @@ def exchanged(table: LightTable) -> tuple[list[Exchange], float | None]:
 def names(
     table: LightTable, list_m: Floats, found_m: Floats, covariance_m2: Floats
 ) -> tuple[Ints, Ints]:
-    """The measured LEDs (rows), and the names (rows of the list) that their places and their light have together.
+    """Return the rows of the measured LEDs, and the names (rows of the list) by their places and their light together.
 
-    A light is named by its place, and where two LEDs stand closer than a few errors of the list, the list may have them
+    A survey names a light by its place. Where two LEDs are closer than a few errors of the list, the list may have them
     in the wrong order: each is then found at the other's place. The name j of the light at place x_i costs
-    d' (s^2 I + C_i)^-1 d / 2 - ln L_ij, with d = x_i - list_j, s and C_i as in `displaced`, and L_ij the likelihood of
-    its light (`exchanged`). The names are the assignment of the least sum (maximum a posteriori: Fortmann, Bar-Shalom &
-    Scheffe 1983, IEEE J. Oceanic Eng. 8, 173). A name other than the present one is allowed only where the list could
-    err so much: below the quantile of `displaced`. Exchanged wires of LEDs farther apart therefore keep the names of
-    their places, and `exchanged` finds them; those of closer ones get the names of their light.
+
+        d^T (s^2 I + C_i)^-1 d / 2 - ln L_ij,
+
+    with d = x_i - list_j, s and C_i as in `displaced`, and L_ij the likelihood of its light (`_log_likelihood`). The
+    names are the assignment of the least sum (maximum a posteriori: Fortmann, Bar-Shalom & Scheffe 1983, IEEE J.
+    Oceanic Eng. 8, 173).
+
+    1. Estimate the list's error s.
+    2. Find the names within reach of each light. A name other than the present one is allowed only where the list's
+       error could explain it: below the quantile of `displaced`.
+    3. Compute the costs, and solve the assignment.
+
+    Exchanged wires of LEDs farther apart therefore keep the names of their places, and `exchanged` finds them; those of
+    closer ones get the names of their light.
+
+    Parameters
+    ----------
+    list_m, found_m, covariance_m2
+        (N, 3), (N, 3) and (N, 3, 3) positions in the list, as found, and their covariance, as of
+        `displaced`
     """
     rows = np.flatnonzero(np.isfinite(covariance_m2).all(axis=(1, 2)))
     if not len(rows):
         return rows, rows
+    # 1. Error of the list
     _, sigma_m = displaced(list_m, found_m, covariance_m2)
     limit = _limit(len(rows))
     information = np.linalg.inv(covariance_m2[rows] + (sigma_m**2 + TINY_M2) * np.eye(3))
+    # 2. Names within the longest axis of the limiting ellipsoid, then within the ellipsoid itself
     reach_m = np.sqrt(limit / np.linalg.eigvalsh(information)[:, 0])
     near = cKDTree(list_m).query_ball_point(found_m[rows], reach_m)
     at = np.repeat(np.arange(len(rows)), [len(one) for one in near])
     name = np.concatenate([np.asarray(one, dtype=np.int64) for one in near])
     off_m = found_m[rows[at]] - list_m[name]
     squares = np.einsum("ni,nij,nj->n", off_m, information[at], off_m)
-    likelihood = _log_likelihood(table)
-    cost = np.full((len(rows), len(list_m)), FORBIDDEN)
-    cost[np.arange(len(rows)), rows] = np.minimum(
-        limit / 2 - likelihood[rows, rows], FORBIDDEN / 10
-    )
     inside = squares < limit
     at = at[inside]
     name = name[inside]
+    # 3. Costs. The present name is always allowed, at most at the limit's cost.
+    likelihood = _log_likelihood(table)
+    cost = np.full((len(rows), len(list_m)), FORBIDDEN)
+    present = limit / 2 - likelihood[rows, rows]
+    cost[np.arange(len(rows)), rows] = np.minimum(present, FORBIDDEN / 10)
     cost[at, name] = squares[inside] / 2 - likelihood[rows[at], name]
     return rows, np.asarray(linear_sum_assignment(cost)[1])
 
 
 def _log_likelihood(table: LightTable) -> Floats:
-    """(N, N) log likelihood that the light at the place of LED i (rows) is that of LED j (columns)."""
+    """Return the (N, N) log likelihood that the light at the place of LED i (rows) is that of LED j (columns).
+
+    With x_f the logarithm of the measured light less that of the expected one in frame f, it is
+
+        -[(mean x / s_between)^2 + sum (x_f - mean x)^2 / s_within^2] / 2 + n ln CHANCE.
+
+    1. Remove each frame's zero, the median of x over its LEDs: exposure and gain.
+    2. Compute mean and sum of squares of x for all pairs i, j, by matrix products.
+    3. Estimate the scatters s_between, of the means between LEDs, and s_within, from frame to frame, robustly.
+    4. Count the n frames in which the light is on but not seen, or seen but off.
+
+    LEDs in too few frames have the log likelihood 0.
+    """
     seen = np.isfinite(table.light)
     on = table.expected > 0
     log_light = np.log(np.where(seen, table.light, 1.0))
     log_expected = np.log(np.where(on, table.expected, 1.0))
     both = seen & on
-    # The zero of each frame, by the LEDs in it, removes exposure and gain.
+    # 1. Zero of each frame
     own = np.where(both, log_light - log_expected, np.nan)
     zero = np.array([np.nanmedian(row) if np.isfinite(row).any() else 0.0 for row in own])
     centered = np.where(seen, log_light - zero[:, None], 0.0)
+    # 2. Mean and sum of squares
     indicator = seen.T.astype(float)
     level = np.where(on, log_expected, 0.0)
     counts = np.maximum(indicator @ on, 1)  # (N, N) frames in which i is seen and j on
     mean = (centered.T @ on - indicator @ level) / counts
     squares = (centered**2).T @ on - 2 * centered.T @ level + indicator @ level**2
     within = np.maximum(squares - counts * mean**2, 0)
+    # 3. Scatters, of the LEDs at their own places
     tested = both.sum(axis=0) >= MIN_FRAMES
     between_sigma = within_sigma = MIN_SCATTER
     if tested.any():
-        between_sigma = max(
-            SIGMA_PER_MAD * float(np.median(np.abs(np.diag(mean)[tested]))), MIN_SCATTER
-        )
+        between = SIGMA_PER_MAD * float(np.median(np.abs(np.diag(mean)[tested])))
+        between_sigma = max(between, MIN_SCATTER)
         spread = np.sqrt(np.diag(within) / np.maximum(np.diag(counts) - 1, 1))
         within_sigma = max(float(np.median(spread[tested])), MIN_SCATTER)
+    # 4. Frames that contradict the LED's code
     silent = table.shown & ~seen
     wrong = indicator @ ~on + silent.T.astype(float) @ on
     out = -((mean / between_sigma) ** 2 + within / within_sigma**2) / 2 + wrong * np.log(CHANCE)
@@ -362,7 +457,10 @@ def _log_likelihood(table: LightTable) -> Floats:
 
 
 def _observable(table: LightTable, likelihood: Floats, tested: Mask, least: float) -> float | None:
-    """Share of the pairs of tested LEDs whose exchange would be found, by the likelihoods as they are."""
+    """Return the share of the pairs of tested LEDs whose exchange would be found; None with fewer than two LEDs.
+
+    An exchange would be found if each of the two LEDs explains the other's light worse by `least`.
+    """
     rows = np.flatnonzero(tested)
     if len(rows) < 2:
         return None

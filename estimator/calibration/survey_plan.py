@@ -1,8 +1,8 @@
 """Plan of a dome survey: the errors that a set of attitudes will leave, and the attitudes that leave the smallest.
 
-The errors are those of the inverse normal matrix of the bundle adjustment (`bundle_adjustment`) at the assumed model:
-the Cramer-Rao bound of an unbiased survey with the start map as a measurement. No frame is needed, only which LEDs
-each attitude shows.
+`predict` takes the errors from the inverse normal matrix of the bundle adjustment (`bundle_adjustment`) at the assumed
+model: the Cramer-Rao bound of an unbiased survey with the start map as a measurement. It needs no frame, only the LEDs
+that each attitude shows. `choose` selects attitudes one after another by what each reduces (greedy).
 """
 
 from __future__ import annotations
@@ -24,26 +24,29 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints
 
 Mask = NDArray[np.bool_]
-MIN_SHARED = 8  # LEDs that an attitude shares with those before it
-LEAST_CROSSING = 2  # LEDs that determine an attitude
-PLANNED_RAD = (
-    1.7 * CONNECTING_RAD
-)  # rms angle by which their rays cross; with less, AFIT's LEDs err by a third more
-ATTITUDE_SIGMA_RAD = 0.05  # of an attitude before its frame is adjusted: next to nothing is known
+MIN_SHARED = 8  # least number of LEDs that an attitude shares with those before it
+LEAST_CROSSING = 2  # least number of LEDs that determine an attitude
+# Least rms angle of crossing rays; with a smaller one, the errors of AFIT's LEDs are a third larger.
+PLANNED_RAD = 1.7 * CONNECTING_RAD
+# Standard deviation of an attitude before its frame is adjusted: almost no prior knowledge.
+ATTITUDE_SIGMA_RAD = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class SurveyModel:
-    """What is assumed before a survey, or known from one so far.
+    """Model that is assumed before a survey, or known from the frames taken so far.
 
     Attributes
     ----------
+    camera, leds, lever
+        Assumed camera, map and lever
     sigma_px
         Standard deviation of a centroid's coordinates
     leds_sigma_m
-        Standard deviation of the LEDs' assumed places about each axis
+        Standard deviation of the LEDs' assumed positions along each axis
     lever_sigma_m, focal_sigma_px
-        Of the lever about each axis and of the focal length; inf if nothing is known
+        Standard deviations of the lever along each axis and of the focal length; inf if nothing
+        is known
     """
 
     camera: Camera
@@ -67,13 +70,13 @@ class SurveyModel:
                 raise ValueError(f"survey: {name} is {getattr(self, name)}; allowed: 0 or more")
 
     def visible(self, body_from_lab: Rotation, margin_px: float = 0.0) -> Mask:
-        """(F, N) LEDs on the chip at each of F attitudes, at least `margin_px` from its edge."""
-        rows = [
-            project(one, self.leds.position_m, self.lever, self.camera) for one in body_from_lab
-        ]
-        return np.array(
-            [self.camera.contains(np.nan_to_num(xy_px, nan=-1e9), margin_px) for xy_px in rows]
-        )
+        """Return (F, N) whether each LED is on the chip at each of F attitudes, at least `margin_px` from its edge."""
+        rows = []
+        for attitude in body_from_lab:
+            xy_px = project(attitude, self.leds.position_m, self.lever, self.camera)
+            # An LED behind the camera is put far outside.
+            rows.append(self.camera.contains(np.nan_to_num(xy_px, nan=-1e9), margin_px))
+        return np.array(rows)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,13 +86,14 @@ class SurveyAccuracy:
     Attributes
     ----------
     measured
-        (N,) LEDs that are surveyed
+        (N,) whether each LED is surveyed
     led_sigma_m
-        (N,) rms of the three axes; the map's for LEDs that are not measured
+        (N,) rms over the three axes of each LED's position; the map's for LEDs that are not
+        measured
     lever_sigma_m
-        (3,)
+        (3,) standard deviations of the lever in body axes
     lens_sigma
-        Of focal_px, center x and y, and of k1, k2, p1, p2 if they are fitted
+        Standard deviations of focal_px, center x and y, and of k1, k2, p1, p2 if they are fitted
     """
 
     measured: Mask
@@ -106,12 +110,16 @@ class SurveyAccuracy:
 def predict(
     model: SurveyModel, body_from_lab: Rotation, seen: Mask, free_lens: int = 3
 ) -> SurveyAccuracy:
-    """The errors that a survey will leave, from the Fisher information of the LEDs seen (F, N) at F attitudes.
+    """Return the errors that a survey will leave, from the Fisher information of its sightings.
 
     Parameters
     ----------
+    body_from_lab
+        F attitudes
+    seen
+        (F, N) whether each LED is seen at each attitude
     free_lens
-        Number of lens elements that it fits: 3, or 7 with the distortion
+        Number of lens elements that the survey fits: 3, or 7 with the distortion
 
     Raises
     ------
@@ -139,25 +147,22 @@ def predict(
 def _bundle(
     model: SurveyModel, body_from_lab: Rotation, seen: Mask, free_lens: int
 ) -> tuple[Bundle, Sightings]:
-    """The assumed model as a bundle, with sightings exactly where it predicts them."""
+    """Return the assumed model as a bundle, with sightings exactly where it predicts them."""
     camera = model.camera
-    lever = model.lever
-    position_m = model.leds.position_m
-    lens = np.array([camera.focal_px, *camera.center_px, *camera.distortion])
-    matrices = body_from_lab.as_matrix().reshape(-1, 3, 3), lever.cam_from_body.as_matrix()
-    arm_m = np.array(lever.camera_body_m)
+    arm_m = np.array(model.lever.camera_body_m)
     assumed = Assumed(arm_m, model.lever_sigma_m, camera.focal_px, model.focal_sigma_px)
     bundle = Bundle(
-        position_m,
-        matrices[0],
+        model.leds.position_m,
+        body_from_lab.as_matrix().reshape(-1, 3, 3),
         arm_m,
-        matrices[1],
-        lens,
+        model.lever.cam_from_body.as_matrix(),
+        np.array([camera.focal_px, *camera.center_px, *camera.distortion]),
         free_lens,
-        position_m,
+        model.leds.position_m,
         model.leds_sigma_m,
         assumed,
     )
+    # With pixels of 0 the residuals are the negative predictions over sigma.
     frame, led = np.nonzero(seen)
     sightings = Sightings(frame, led, np.zeros((len(led), 2)), np.full(len(led), model.sigma_px))
     xy_px = -ba.residuals(bundle, sightings) * model.sigma_px
@@ -172,29 +177,38 @@ def choose(
     held: Rotation | None = None,
     seen: Mask | None = None,
 ) -> list[int]:
-    """Rows of up to `count` candidate attitudes to hold next, the most useful first.
+    """Return the rows of up to `count` candidate attitudes to take frames at next, the most useful first.
 
-    Greedy: each attitude is the one that most reduces the sum of the variances of all LEDs, the unseen ones included
+    Each attitude is the one that most reduces the sum of the variances of all LEDs, the unseen ones included
     (A-optimality: Pukelsheim 2006, Optimal Design of Experiments, chapter 6). With P_i the covariance of LED i, B_i its
-    2 x 3 rows of the Jacobian and A those of the attitude, the reduction is the sum over i of tr(P_i B_i' W_ii B_i
-    P_i), W = (B P B' + s^2 A A' + I)^-1. Correlations between LEDs are left out, which is thirty times faster and no
-    worse: 40 attitudes under a dome of 390 LEDs leave 0.66 mm rms, against 0.69 mm with all correlations. An attitude
-    must share MIN_SHARED LEDs with those before it, so that the frames are connected at any time: LEDs whose rays cross
-    by the rms angle PLANNED_RAD or more, if any attitude has LEAST_CROSSING of these, else any LEDs. The reductions
-    hardly grow from choice to choice, so that a candidate is evaluated again only while its last value is above the
-    best (lazy greedy: Minoux 1978).
+    2 x 3 rows of the Jacobian and A those of the attitude, the reduction is
+
+        sum_i tr(P_i B_i^T W_ii B_i P_i),    W = (B P B^T + s^2 A A^T + I)^-1.
+
+    1. Start from the map's covariances, reduced by the frames taken before.
+    2. Restrict the candidates to those connected with the attitudes so far: they share MIN_SHARED LEDs. These are LEDs
+       whose rays cross by the rms angle PLANNED_RAD or more, if any attitude has LEAST_CROSSING of them, else any LEDs.
+    3. Select the candidate of the largest reduction (`_best`). The reductions hardly grow from choice to choice, so a
+       candidate is evaluated again only while its last value is above the best (lazy greedy: Minoux 1978).
+    4. Reduce the covariances by it, and repeat from step 2.
+
+    Correlations between LEDs are left out, which is thirty times faster and no worse: 40 attitudes under a dome of 390
+    LEDs leave 0.66 mm rms, against 0.69 mm with all correlations.
 
     Parameters
     ----------
     candidates, shown
-        C attitudes body_from_lab, and the (C, N) LEDs that each shows
+        C attitudes body_from_lab, and (C, N) whether each shows each LED
+    count
+        Largest number of attitudes
     held, seen
-        F attitudes of frames taken before, and the (F, N) LEDs identified in them
+        F attitudes of frames taken before, and (F, N) whether each LED is identified in them
     """
     if np.shape(shown) != (len(candidates), len(model.leds.id)):
         raise ValueError(
             f"survey: shown has shape {np.shape(shown)}; allowed: {len(candidates), len(model.leds.id)}"
         )
+    # 1. Covariances
     blocks = np.tile(np.eye(3) * model.leds_sigma_m**2, (len(model.leds.id), 1, 1))
     reach = _Reach(model, candidates, shown)
     if held is not None and seen is not None:
@@ -205,9 +219,11 @@ def choose(
     bound = np.array([np.inf if len(row.led) >= MIN_SHARED else 0.0 for row in rows])
     chosen: list[int] = []
     while len(chosen) < count:
+        # 2. and 3. Best of the connected candidates
         best = _best(rows, blocks, bound, reach.connected(bound > 0))
         if best is None:
             break
+        # 4. Reduced covariances
         blocks[rows[best].led] -= _reduction(rows[best], blocks)
         reach.add(candidates[[best]], shown[[best]])
         chosen.append(best)
@@ -215,9 +231,13 @@ def choose(
 
 
 def _best(rows: Sequence[_Row], blocks: Floats, bound: Floats, allowed: Mask) -> int | None:
-    """The allowed candidate of the greatest reduction, None if none has any; updates the bounds of those evaluated."""
+    """Return the allowed candidate of the largest reduction; None if no candidate reduces anything.
+
+    The bounds, (C,) last reductions, of the candidates that are evaluated are updated in place.
+    """
     best = None
     greatest = 0.0
+    # In the order of the last reductions: below the best so far, no other can be better.
     for k in np.argsort(-bound, kind="stable").tolist():
         if bound[k] <= greatest:
             break
@@ -231,32 +251,34 @@ def _best(rows: Sequence[_Row], blocks: Floats, bound: Floats, allowed: Mask) ->
 
 
 class _Reach:
-    """Where each LED has been seen from, and what candidate attitudes share with that.
+    """Camera positions from which each LED has been seen, and the LEDs that candidate attitudes share with them.
 
     The rms angle of an LED's rays is the rms distance of the camera positions from their mean, perpendicular to the
     direction u of the LED, over its mean distance from them. With the camera at the radius r about the center of
     rotation, m the mean of its positions c and a that of (u.c)^2, the mean square distance is
-    r^2 - |m|^2 - (a - (u.m)^2). The LED at the distance R from the center is R - u.m from the camera.
+    r^2 - |m|^2 - (a - (u.m)^2). The distance from the camera of an LED at R from the center is R - u.m.
     """
 
     def __init__(self, model: SurveyModel, candidates: Rotation, shown: Mask) -> None:
         place_m = model.leds.position_m
         self.arm_m = np.array(model.lever.camera_body_m)
         self.distance_m = np.linalg.norm(place_m, axis=1)
-        self.toward = place_m / self.distance_m[:, None]
+        self.toward = place_m / self.distance_m[:, None]  # u
+        # Sums over the positions from which each LED has been seen: 1, (u.c)^2 and c
         self.count, self.along_m2 = np.zeros((2, len(place_m)))
         self.sum_m = np.zeros_like(place_m)
+        # Sightings of the candidates
         self.candidates = candidates
-        (self.row, self.led) = np.nonzero(shown)
+        self.row, self.led = np.nonzero(shown)
         self.camera_m, self.along_m = self.positions(candidates, self.row, self.led)
 
     def positions(self, body_from_lab: Rotation, row: Ints, led: Ints) -> tuple[Floats, Floats]:
-        """(K, 3) camera positions of sightings, and (K,) their components toward the LEDs."""
+        """Return the (K, 3) camera positions of sightings, and their (K,) components toward the LEDs."""
         camera_m = np.atleast_2d(body_from_lab.inv().apply(self.arm_m))[row]
         return camera_m, np.sum(camera_m * self.toward[led], axis=1)
 
     def add(self, body_from_lab: Rotation, seen: Mask) -> None:
-        """Count the (F, N) LEDs seen at F attitudes."""
+        """Add the sightings of the LEDs seen (F, N) at F attitudes to the sums."""
         row, led = np.nonzero(seen)
         camera_m, along_m = self.positions(body_from_lab, row, led)
         np.add.at(self.count, led, 1)
@@ -264,11 +286,13 @@ class _Reach:
         np.add.at(self.along_m2, led, along_m**2)
 
     def connected(self, useful: Mask) -> Mask:
-        """(C,) candidates that share MIN_SHARED LEDs with what has been seen, or as many as any useful one does.
+        """Return (C,) whether a candidate shares enough LEDs with the attitudes so far.
 
-        LEDs count whose rays cross. If no useful candidate has LEAST_CROSSING of them, all shared ones count.
+        These are MIN_SHARED, or as many as any useful candidate shares. Only LEDs with crossing rays count. If no
+        useful candidate has LEAST_CROSSING of them, all shared ones count.
         """
         crossing, shared = self.shared()
+        # At the start every LED counts.
         if not self.count.any():
             shared = self.counted(np.ones(len(self.row), dtype=bool))
         if crossing[useful].max(initial=0) >= LEAST_CROSSING:
@@ -276,20 +300,21 @@ class _Reach:
         return shared >= min(MIN_SHARED, shared[useful].max(initial=0))
 
     def shared(self) -> tuple[Ints, Ints]:
-        """(C,) LEDs of each candidate that have been seen before: from another direction, and from any."""
+        """Return the (C,) numbers of each candidate's LEDs seen before: from another direction, and from any."""
+        # Sums with the candidate's own position
         led = self.led
         count = self.count[self.led] + 1
         mean_m = (self.sum_m[led] + self.camera_m) / count[:, None]
         mean_along_m = np.sum(mean_m * self.toward[led], axis=1)
+        # r^2 - |m|^2 - (a - (u.m)^2)
         across_m2 = self.arm_m @ self.arm_m - np.sum(mean_m**2, axis=1)
         across_m2 -= (self.along_m2[led] + self.along_m**2) / count - mean_along_m**2
-        is_crossing = (count > 1) & (
-            across_m2 > (PLANNED_RAD * (self.distance_m[led] - mean_along_m)) ** 2
-        )
+        least_m = PLANNED_RAD * (self.distance_m[led] - mean_along_m)
+        is_crossing = (count > 1) & (across_m2 > least_m**2)
         return self.counted(is_crossing), self.counted(count > 1)
 
     def counted(self, sightings: Mask) -> Ints:
-        """(C,) number of sightings of each candidate, of those selected."""
+        """Return the (C,) numbers of the selected sightings of each candidate."""
         return np.bincount(self.row[sightings], minlength=len(self.candidates))
 
 
@@ -302,23 +327,22 @@ class _Row(NamedTuple):
 
 
 def _rows(model: SurveyModel, body_from_lab: Rotation, shown: Mask) -> list[_Row]:
+    """Return the derivatives of each attitude's pixels."""
     bundle, sightings = _bundle(model, body_from_lab, shown, 3)
     terms = ba.linearize(bundle, sightings)
+    # The sightings are in the order of the attitudes.
     ends = np.cumsum(np.sum(shown, axis=1))[:-1]
-    return [
-        _Row(*parts)
-        for parts in zip(
-            *(np.split(one, ends) for one in (sightings.led, terms.by_led, terms.by_rotation)),
-            strict=True,
-        )
-    ]
+    columns = (sightings.led, terms.by_led, terms.by_rotation)
+    split = [np.split(column, ends) for column in columns]
+    return [_Row(*parts) for parts in zip(*split, strict=True)]
 
 
 def _reduction(row: _Row, blocks: Floats) -> Floats:
-    """(K, 3, 3) by which the covariances of the LEDs of an attitude shrink."""
+    """Return P_i B_i^T W_ii B_i P_i, (K, 3, 3): the reduction of the LEDs' covariances by an attitude."""
     count = len(row.led)
     gain = row.by_led @ blocks[row.led]  # B P
-    turned = ATTITUDE_SIGMA_RAD * row.by_rotation.reshape(-1, 3)
+    turned = ATTITUDE_SIGMA_RAD * row.by_rotation.reshape(-1, 3)  # s A
+    # B P B^T is block diagonal, as correlations between LEDs are left out.
     matrix = turned @ turned.T + np.eye(2 * count)
     own = np.arange(2 * count).reshape(count, 2)
     matrix[own[:, :, None], own[:, None, :]] += np.einsum("kaj,kbj->kab", gain, row.by_led)

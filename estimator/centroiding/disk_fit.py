@@ -1,8 +1,8 @@
 """Disk fit of one nearby LED: a uniform disk with a blurred edge, by weighted least squares.
 
 The model of a pixel at distance r from the center is sky + A erfc((r - R) / (w sqrt 2)) / 2: a disk of radius R with an
-edge blurred by a Gaussian of width w. Gauss-Newton solves for center, R, w, A and sky. The position is determined by
-the pixels at the edge alone, so saturated pixels inside can be left out.
+edge blurred by a Gaussian of width w. Gauss-Newton solves for center, R, w, A and sky (`_fit`). Only the pixels at the
+edge determine the position, so saturated pixels inside can be left out.
 """
 
 from __future__ import annotations
@@ -18,10 +18,8 @@ from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, interpolate
 
-MARGIN_PX = 4
-MIN_RADIUS_PX = (
-    2.0  # radius of the smallest disk that still has a flat center despite its blurred edge
-)
+MARGIN_PX = 4  # around a blob's box
+MIN_RADIUS_PX = 2.0  # of the smallest disk that has a flat center despite its blurred edge
 MAX_ITERATIONS = 40
 # Model error at a curved edge of square pixels, measured without noise at radii of 5 and 10 px.
 MODEL_PX = 0.004
@@ -56,6 +54,7 @@ def fit_all(
         p[RADIUS] = sqrt(area[n] / pi)
         if p[RADIUS] < MIN_RADIUS_PX:
             continue
+        # The window must be inside the image.
         x0 = boxes[n, 0] - MARGIN_PX
         y0 = boxes[n, 1] - MARGIN_PX
         x1 = boxes[n, 2] + MARGIN_PX
@@ -69,6 +68,7 @@ def fit_all(
         p[EDGE] = 1.0
         p[BRIGHTNESS] = flux[n] / area[n]
         p[SKY] = sky
+        # Pixels that are neither saturated nor of another blob
         count = 0
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
@@ -79,7 +79,7 @@ def fit_all(
                     pixels[1, count] = y
                     pixels[2, count] = image[y, x]
                     count += 1
-        if count >= 12:
+        if count >= 12:  # twice the number of parameters
             _fit(pixels[:, :count], sigma, gain_e_dn, rows, weight, p, out[n])
     return out
 
@@ -103,14 +103,26 @@ def _fit(
     p: Floats,
     out: Floats,
 ) -> None:
-    """Fit one disk by Gauss-Newton, starting from `p`; leaves `out` NaN if it does not converge near its start.
+    """Fit one disk by Gauss-Newton, starting from `p`; leave `out` NaN if it does not converge near its start.
 
-    An LED is not a perfect disk: where the residuals exceed the noise, the covariance is inflated.
+    1. Compute derivatives, residuals and weights at every pixel (`_rows`).
+    2. Solve the normal equations for the step.
+    3. Apply the step, shortened to at most a pixel, and give up far from the start.
+    4. At convergence, read the position's covariance from the inverse normal matrix. An LED is not a perfect disk:
+       where the residuals exceed the noise, the covariance is inflated.
 
     Parameters
     ----------
     pixels
         (3, K) x, y and value of the pixels used
+    noise
+        Standard deviation of a pixel of the sky
+    rows, weight
+        Work arrays for `_rows`
+    p
+        (6,) parameters, updated in place
+    out
+        (5,) x, y, sigma, flux, radius
     """
     count = pixels.shape[1]
     start_x = p[X]
@@ -119,13 +131,15 @@ def _fit(
     normal = np.empty((7, 7))
     step = np.empty(6)
     for _ in range(MAX_ITERATIONS):
+        # 1. Derivatives
         _rows(pixels, noise, gain_e_dn, p, rows, weight)
+        # 2. Step
         least_squares.normal_equations(rows, weight, count, normal)
         fall = least_squares.step(normal, step)
-        if not fall >= 0:
+        if not fall >= 0:  # a singular matrix gives NaN
             return
         largest_step = max(abs(step[X]), abs(step[Y]), abs(step[RADIUS]))
-        # At most one pixel per step, and a quarter of a pixel in the edge's width.
+        # 3. At most one pixel per step, and a quarter of a pixel in the edge's width.
         scale = min(1.0, 1 / max(largest_step, 4 * abs(step[EDGE]), 1e-300))
         for k in range(len(p)):
             p[k] += scale * step[k]
@@ -134,6 +148,7 @@ def _fit(
             return
         if not start_radius / 2 < p[RADIUS] < 2 * start_radius:
             return
+        # 4. Convergence
         if largest_step < least_squares.CONVERGED_PX or fall < least_squares.CONVERGED_CHI2:
             xx, yy, _ = least_squares.position_covariance(normal, step)
             variance = (xx + yy) / 2 * least_squares.misfit_factor(normal[6, 6], count - 6)
@@ -152,8 +167,9 @@ def _rows(
 ) -> None:
     """Fill the model's derivatives by the six parameters, the residual and the weight of every pixel.
 
-    The model A erfc((r - R) / (w sqrt 2)) / 2 is exact for a straight edge blurred by a Gaussian; w^2 is the optics'
-    sigma^2 plus the pixel's 1/12.
+    With d = r - R, the model is A q(d), q = erfc(d / (w sqrt 2)) / 2, and -dq/dd = exp(-d^2 / 2 w^2) / (w sqrt(2 pi)).
+    It is exact for a straight edge blurred by a Gaussian; w^2 is the optics' sigma^2 plus the pixel's 1/12. A pixel's
+    weight is 1 / (noise^2 + A q / gain).
     """
     brightness = p[BRIGHTNESS]
     w = p[EDGE]
@@ -163,6 +179,7 @@ def _rows(
         r = max(hypot(dx, dy), 1e-9)
         d = r - p[RADIUS]
         profile = erfc(d / (w * sqrt(2.0))) / 2
+        # Derivative by the radius; those by the center are its components along the radius.
         slope = brightness * exp(-d * d / (2 * w * w)) / (w * sqrt(2 * pi))
         rows[X, k] = slope * dx / r
         rows[Y, k] = slope * dy / r

@@ -1,9 +1,13 @@
 """Gaussian fit of one star: a Gaussian integrated over each pixel, by weighted least squares.
 
 The model of a pixel is I = sky + F gx gy, where gx and gy are the integrals of a one-dimensional Gaussian over the
-pixel's width and height (differences of erf). Gauss-Newton solves for x, y, F, sigma and sky; the weights are the
-inverse variances of the current model, so they are updated in each iteration. The covariance is the inverse normal
-matrix, inflated by the reduced chi-square where the model does not fit.
+pixel's width and height,
+
+    gx = [erf((x - x0 + 1/2) / (sigma sqrt 2)) - erf((x - x0 - 1/2) / (sigma sqrt 2))] / 2.
+
+Gauss-Newton solves for x0, y0, F, sigma and sky (`_fit`). The weights are the inverse variances of the current model,
+so they are updated in each iteration. The covariance is the inverse normal matrix, inflated by the reduced chi-square
+where the model does not fit.
 """
 
 from __future__ import annotations
@@ -18,10 +22,10 @@ from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, interpolate
 
-# default, and largest for a saturated star
+# Half-width of the window, and its largest value, for a saturated star.
 HALF_WINDOW_PX = 3
 MAX_HALF_WINDOW_PX = 10
-# limits of sigma that a 7x7 window can resolve
+# Limits of sigma that a 7x7 window can resolve.
 MIN_SIGMA_PX = 0.2
 MAX_SIGMA_PX = 3.0
 INITIAL_SIGMA_PX = 0.8  # initial sigma of the first star
@@ -65,6 +69,7 @@ def fit_all(
         side = 2 * half + 1
         if left < 0 or top < 0 or left + side > width or top + side > height:
             continue
+        # Initial values, in coordinates of the window
         window = image[top : top + side, left : left + side]
         sigma = interpolate(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
         p[X] = xy[n, 0] - left
@@ -75,8 +80,9 @@ def fit_all(
             start_sigma_px = p[WIDTH]
             out[n, 0] += left
             out[n, 1] += top
+        # On the plateau of a disk the fit finds a weak star on a bright sky.
         if not out[n, 3] > flux[n] / 2:
-            out[n] = np.nan  # on the plateau of a disk the fit finds a weak star on a bright sky
+            out[n] = np.nan
     return out
 
 
@@ -94,27 +100,48 @@ def _fit(
 ) -> bool:
     """Fit one Gaussian by Gauss-Newton, starting from `p`; return False if it does not converge within its window.
 
-    Where the model does not fit (two stars in one window) the covariance is inflated by the residuals.
+    1. Compute derivatives, residuals and weights at every pixel (`_rows`).
+    2. Solve the normal equations for the step.
+    3. Apply the step, shortened to at most half a pixel, and give up far from the start.
+    4. At convergence, read the position's covariance from the inverse normal matrix. Where the model does not fit (two
+       stars in one window) the residuals inflate it.
+
+    Parameters
+    ----------
+    window
+        (side, side) pixels around the star
+    noise
+        Standard deviation of a pixel of the sky
+    rows, weight, edges
+        Work arrays for `_rows`
+    p
+        (5,) parameters in coordinates of the window, updated in place
+    out
+        (4,) x, y, sigma of the position, flux
     """
     start_x = p[X]
     start_y = p[Y]
     normal = np.empty((6, 6))
     step = np.empty(5)
+    # Initial flux: the sum of the window above the sky
     p[FLUX] = max(window.sum() - window.size * p[SKY], 1e-9)
     for _ in range(MAX_ITERATIONS):
+        # 1. Derivatives
         pixels = _rows(window, noise, gain_e_dn, saturation, p, rows, weight, edges)
+        # 2. Step
         least_squares.normal_equations(rows, weight, window.size, normal)
         fall = least_squares.step(normal, step)
-        if not fall >= 0:
+        if not fall >= 0:  # a singular matrix gives NaN
             return False
         largest_step = max(abs(step[X]), abs(step[Y]), abs(step[WIDTH]))
-        # Steps of more than half a pixel are shortened: the model is too nonlinear for them.
+        # 3. Steps of more than half a pixel are shortened: the model is too nonlinear for them.
         scale = min(1.0, 0.5 / max(largest_step, 1e-300))
         for k in range(len(p)):
             p[k] += scale * step[k]
         if abs(p[X] - start_x) > 2 or abs(p[Y] - start_y) > 2 or p[FLUX] <= 0:
             return False
         p[WIDTH] = min(max(p[WIDTH], MIN_SIGMA_PX), MAX_SIGMA_PX)
+        # 4. Convergence; a width at its limit is no solution.
         if largest_step < least_squares.CONVERGED_PX or fall < least_squares.CONVERGED_CHI2:
             if not MIN_SIGMA_PX < p[WIDTH] < MAX_SIGMA_PX:
                 return False
@@ -139,10 +166,14 @@ def _rows(
     weight: Floats,
     edges: Floats,
 ) -> int:
-    """Fill the model's derivatives, the residuals and the weights at every pixel; return the number of pixels used."""
+    """Fill the model's derivatives, the residuals and the weights at every pixel; return the number of pixels used.
+
+    A pixel's weight is 1 / (noise^2 + F gx gy / gain); it is 0 for a saturated pixel.
+    """
     side = len(window)
     flux = p[FLUX]
     used = window.size
+    # Integrals over the columns and rows, and their derivatives by the center and by sigma
     gx, dgx, sgx, gy, dgy, sgy = edges
     _cells(side, p[X], p[WIDTH], gx, dgx, sgx)
     _cells(side, p[Y], p[WIDTH], gy, dgy, sgy)
@@ -153,6 +184,7 @@ def _rows(
         flux_y = flux * gy[j]
         slope_y = flux * dgy[j]
         widening_y = flux * sgy[j]
+        # The product rule for F gx gy
         for i in range(side):
             model = flux_y * gx[i]
             block[X, i] = flux_y * dgx[i]
@@ -162,6 +194,7 @@ def _rows(
             block[5, i] = pixel_row[i] - p[SKY] - model
             # The 1e-9 keeps the weights finite in the sky of a noise-free image.
             block_weight[i] = 1 / (noise * noise + (model + 1e-9 * flux) / gain_e_dn)
+        # A loop of its own, so that the compiler can vectorize the first one.
         for i in range(side):
             if pixel_row[i] >= saturation:
                 block_weight[i] = 0.0
@@ -175,7 +208,9 @@ def _cells(
 ) -> None:
     """Integrate a 1-D Gaussian over each pixel; also its derivatives with respect to the center and to sigma.
 
-    Adjacent pixels share an edge, so erf and exp are computed once per edge.
+    With t = (edge - center) / sigma and the density b(t), a pixel's fraction is [erf(t / sqrt 2) / 2] from its low to
+    its high edge; its derivative by the center is (b_low - b_high) / sigma, and by sigma
+    (t_low b_low - t_high b_high) / sigma. Adjacent pixels share an edge, so erf and exp are computed once per edge.
     """
     scale = 1 / sigma
     low = (-0.5 - center) * scale

@@ -2,10 +2,12 @@
 
 Each kernel sums the light above the interpolated sky and returns x, y, sigma and flux per blob, or NaN where the
 position is undefined. `center_of_gravity` and `squared_light` use the blob's box and a margin, `gaussian_windowed` the
-window. The variance propagates photon noise (I / gain) and the sky's noise through the estimator's derivative with
-respect to each pixel.
+window. With the light I_i of pixel i, in units of the image, the pixel's variance is s_i^2 = I_i / g + n^2: photon
+noise for a gain of g electrons per unit, and the sky's noise n. The position's variance is
+var(x) = sum((dx/dI_i)^2 s_i^2). `sigma` is the root of the mean of var(x) and var(y).
+
 The two weighted estimators also have a systematic error that depends on the position of the star within its pixel
-(the S-curve), since they see the profile at the pixel centers only; `sampling_variance` gives its mean square.
+(the S-curve), since they sample the profile at the pixel centers only; `sampling_variance` gives its mean square.
 """
 
 from __future__ import annotations
@@ -19,13 +21,13 @@ from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, interpolate
 
-MARGIN_PX = 4
-# limits of the window's sigma
+MARGIN_PX = 4  # around a blob's box
+# Limits of the window's sigma.
 MIN_WINDOW_PX = 0.6
 MAX_WINDOW_PX = 4.0
-# The window's variance over the star's: the error is an eighth above the minimum, see `gaussian_windowed`.
+# Ratio of the window's variance to the star's: the error is an eighth above the minimum, see `gaussian_windowed`.
 WINDOW_VARIANCE_RATIO = 2.0
-# iterations that adapt the window's width, and iterations at most
+# Number of iterations that adapt the window's width, and largest number of all iterations.
 SIZING_ITERATIONS = 4
 MAX_ITERATIONS = 60
 
@@ -34,11 +36,27 @@ MAX_ITERATIONS = 60
 def center_of_gravity(
     image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float
 ) -> Floats:
-    """Compute the center of gravity in each box and a margin: (N, 4) x, y, sigma of the position, flux."""
+    """Compute the center of gravity in each box and a margin: (N, 4) x, y, sigma of the position, flux.
+
+    With the light I_i above the sky at pixel x_i, and F = sum I_i,
+
+        xbar = sum(I_i x_i) / F,    var(xbar) = sum(s_i^2 (x_i - xbar)^2) / F^2,    s_i^2 = max(I_i, 0) / g + n^2,
+
+    as dxbar/dI_i = (x_i - xbar) / F. The same holds for y, and sigma^2 = (var(xbar) + var(ybar)) / 2. In one pass over
+    the pixels, with u = x - x_origin and v = y - y_origin from the window's center:
+
+    1. Sum the light and its first moments, which give xbar and ybar.
+    2. Sum the second moments of the positive light and of the pixels about the origin.
+    3. Move the second moments to xbar and ybar: sum(w (u - c)^2) = sum(w u^2) - 2 c sum(w u) + c^2 sum(w).
+    4. The variance is the light's second moment over g plus the pixels' second moment times n^2.
+
+    Pixels nearer to another blob's box are excluded.
+    """
     height, width = image.shape
     out = np.empty((len(boxes), 4))
     buffer = np.empty(len(boxes), np.int64)
     for n in range(len(boxes)):
+        # The box with its margin, cut at the image's edge
         x0 = max(boxes[n, 0] - MARGIN_PX, 0)
         y0 = max(boxes[n, 1] - MARGIN_PX, 0)
         x1 = min(boxes[n, 2] + MARGIN_PX, width - 1)
@@ -55,10 +73,11 @@ def center_of_gravity(
                 light = image[y, x] - interpolate(level, height, width, y, x)
                 u = x - origin_x
                 v = y - origin_y
+                # 1. F, sum(I u), sum(I v)
                 flux += light
                 sx += light * u
                 sy += light * v
-                # Photon noise needs the light itself, without the negative noise of the sky.
+                # 2. Photon noise is that of the light itself, without the negative noise of the sky.
                 positive = max(light, 0.0)
                 s_light += positive
                 light_x += positive * u
@@ -72,11 +91,13 @@ def center_of_gravity(
             out[n, :3] = np.nan
             out[n, 3] = 0.0
             continue
+        # xbar and ybar, from the origin
         cx = sx / flux
         cy = sy / flux
-        # Sums of (x - cx)^2 + (y - cy)^2 over the pixels, and weighted by their light.
+        # 3. Sums of (x - xbar)^2 + (y - ybar)^2 over the pixels, weighted by their light, and without weights.
         by_light = light_xx - 2 * (cx * light_x + cy * light_y) + (cx * cx + cy * cy) * s_light
         by_pixel = pxx - 2 * (cx * px + cy * py) + (cx * cx + cy * cy) * pixels
+        # 4. n^2 of one pixel, and the mean of both coordinates' variances times F^2
         sigma2 = (
             interpolate(noise, height, width, cy + origin_y, cx + origin_x) / FILTERED_NOISE
         ) ** 2
@@ -92,7 +113,15 @@ def center_of_gravity(
 def squared_light(
     image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float
 ) -> Floats:
-    """Compute the mean position weighted by the squared light: (N, 4) x, y, sigma of the position, flux."""
+    """Compute the mean position weighted by the squared light: (N, 4) x, y, sigma of the position, flux.
+
+    With the positive light I_i above the sky, W = sum I_i^2 and dc/dI_i = 2 I_i (x_i - c) / W,
+
+        c = sum(I_i^2 x_i) / W,    var(c) = sum(4 I_i^2 (x_i - c)^2 (I_i / g + n^2)) / W^2 + sampling_variance.
+
+    The sampling variance is that of the squared profile, whose variance is sum(I_i^2 (x_i - c)^2) / W. The first sweep
+    over the pixels gives c, the second one the sums about it.
+    """
     height, width = image.shape
     out = np.empty((len(boxes), 4))
     buffer = np.empty(len(boxes), np.int64)
@@ -104,7 +133,7 @@ def squared_light(
         neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
         cx = cy = flux = weight = moment_variance = second_moment = 0.0
         sigma2 = 0.0
-        for sweep in range(2):  # first the position, then its variance about it
+        for sweep in range(2):  # first c and the flux, then the sums about c
             for y in range(y0, y1 + 1):
                 for x in range(x0, x1 + 1):
                     if belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
@@ -117,6 +146,7 @@ def squared_light(
                         cx += light * light * x
                         cy += light * light * y
                         continue
+                    # Mean of both coordinates' squared distances
                     light = max(light, 0.0)
                     distance2 = ((x - cx) ** 2 + (y - cy) ** 2) / 2
                     second_moment += light * light * distance2
@@ -124,6 +154,7 @@ def squared_light(
             if sweep == 0:
                 if weight == 0:
                     break
+                # c, and n^2 of one pixel there
                 cx = cx / weight
                 cy = cy / weight
                 sigma2 = (interpolate(noise, height, width, cy, cx) / FILTERED_NOISE) ** 2
@@ -144,9 +175,15 @@ def gaussian_windowed(
 ) -> Floats:
     """Compute the centroid in an adaptive Gaussian window: (N, 4) x, y, sigma of the position, flux.
 
-    The center c solves f(c) = sum(w I (x - c)) = 0 with w = exp(-|x - c|^2 / 2 s^2), by Newton's method with the
-    derivative -sum(w I (1 - (x - c)^2 / s^2)). The first SIZING_ITERATIONS iterations also set s^2 to
-    WINDOW_VARIANCE_RATIO times the star's variance. Rows are NaN where it does not converge.
+    The center c solves f(c) = sum(w I (x - c)) = 0 with w = exp(-|x - c|^2 / 2 s^2). Newton's method repeats:
+
+    1. Sum the moments in the window about c.
+    2. Move c by f / sum(w I (1 - (x - c)^2 / s^2)): the divisor is -df/dc, as the window moves with c.
+    3. In the first SIZING_ITERATIONS iterations, set s^2 to WINDOW_VARIANCE_RATIO times the star's variance.
+    4. Stop when c no longer moves. With S the divisor and M = sum(w I),
+       var(c) = sum(w^2 (x - c)^2 (I / g + n^2)) / S^2 + sampling_variance (M / S)^2.
+
+    Rows are NaN where it does not converge.
 
     With t the window's variance over the star's, the error exceeds the minimum by a factor (t + 1)^2 / 4 t if the sky's
     noise dominates, and (t + 1)^2 / t (t + 2) if the star's photon noise dominates: 1.125 in both cases at t = 2. A
@@ -160,6 +197,7 @@ def gaussian_windowed(
         s2 = 1.0
         sigma2 = (interpolate(noise, height, width, cy, cx) / FILTERED_NOISE) ** 2
         for iteration in range(MAX_ITERATIONS):
+            # 1. Moments within four sigma of the window
             reach = 4 * sqrt(s2)
             x0 = max(round(cx - reach), 0)
             y0 = max(round(cy - reach), 0)
@@ -182,7 +220,7 @@ def gaussian_windowed(
                     pixel_variance = max(light, 0.0) / gain_e_dn + sigma2
                     moment_variance += w * w * (u * u + v * v) / 2 * pixel_variance
                     flux += light
-            # Negative derivative of the first moment: the window moves with c, which subtracts m2 / s2.
+            # 2. Newton's step, of at most 0.7 px, with the mean of both coordinates' derivatives
             slope = total - second_moment / s2
             if not (total > 0 and slope > 0):
                 break
@@ -191,16 +229,18 @@ def gaussian_windowed(
             scale = min(1.0, 0.7 / max(abs(dx), abs(dy), 1e-300))
             cx = cx + scale * dx
             cy = cy + scale * dy
+            # Too far from the blob: another source
             if abs(cx - xy[n, 0]) > 2 + sqrt(s2) or abs(cy - xy[n, 1]) > 2 + sqrt(s2):
                 break
             if iteration < SIZING_ITERATIONS:
-                # A star of variance q times the window has the variance 1 / (1/q + 1/s2): solve for q.
+                # 3. A star of variance q times the window has the variance 1 / (1/q + 1/s2): solve for q.
                 apparent = second_moment / total
                 variance = (
                     1 / (1 / apparent - 1 / s2) if 0 < apparent < 0.95 * s2 else MAX_WINDOW_PX**2
                 )
                 s2 = min(max(WINDOW_VARIANCE_RATIO * variance, MIN_WINDOW_PX**2), MAX_WINDOW_PX**2)
             elif max(abs(dx), abs(dy)) < 1e-10:
+                # 4. Converged
                 sampling_error2 = sampling_variance(second_moment / total) * (total / slope) ** 2
                 out[n, 0] = cx
                 out[n, 1] = cy
@@ -212,9 +252,10 @@ def gaussian_windowed(
 
 @jit
 def sampling_variance(variance_px2: float) -> float:
-    """Mean square of the S-curve of a Gaussian of variance v sampled at points; the amplitude is 4 pi v exp(-2 pi^2 v).
+    """Return the mean square of the S-curve of a Gaussian of variance v that is sampled at the pixel centers.
 
-    It is the first harmonic of the Poisson summation of (x - c) exp(-(x - c)^2 / 2 v) over the pixels.
+    The S-curve's amplitude is A = 4 pi v exp(-2 pi^2 v), the first harmonic of the Poisson summation of
+    (x - c) exp(-(x - c)^2 / 2 v) over the pixels; its mean square is A^2 / 2.
     """
     return (4 * pi * variance_px2 * exp(-2 * pi * pi * variance_px2)) ** 2 / 2
 
@@ -233,7 +274,7 @@ def neighbors(boxes: Ints, n: int, x0: int, y0: int, x1: int, y1: int, buffer: I
 
 @jit
 def belongs_to_neighbor(boxes: Ints, neighbor_rows: Ints, n: int, x: int, y: int) -> bool:
-    """Whether a pixel is closer to the box of another blob than to that of blob n."""
+    """Return whether a pixel is closer to the box of another blob than to that of blob n."""
     if len(neighbor_rows) == 0:
         return False
     own = _distance2_to_box(boxes[n], x, y)
@@ -245,7 +286,7 @@ def belongs_to_neighbor(boxes: Ints, neighbor_rows: Ints, n: int, x: int, y: int
 
 @jit
 def _distance2_to_box(box: Ints, x: int, y: int) -> float:
-    """Squared distance of a pixel to a box; 0 inside."""
+    """Return the squared distance of a pixel to a box (x0, y0, x1, y1); 0 inside."""
     dx = max(box[0] - x, 0, x - box[2])
     dy = max(box[1] - y, 0, y - box[3])
     return dx * dx + dy * dy

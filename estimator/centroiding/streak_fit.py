@@ -1,13 +1,17 @@
 """Streak fit of one smeared star: a line segment blurred by a Gaussian, by weighted least squares.
 
-The model is a uniform segment of length L and direction a, convolved with a Gaussian of width w (see `_rows` for the
-equation). Gauss-Newton solves for center, flux, length, direction, width and sky. Length, direction and width have
-Gaussian priors around the streak shared by the frame: without them, the fit of a faint streak would settle on its
+The model is a uniform segment of length L and direction a, convolved with a Gaussian of width w. With u along and v
+across the streak from its center,
+
+    I = sky + F / L [erf((u + L/2) / (w sqrt 2)) - erf((u - L/2) / (w sqrt 2))] / 2 exp(-v^2 / 2 w^2) / (w sqrt(2 pi)).
+
+Gauss-Newton solves for center, flux, length, direction, width and sky (`_fit`). Length, direction and width have
+Gaussian priors around the streak shared by the frame: without them, the fit of a faint streak would converge to its
 brightest piece. The covariance is the Cramer-Rao bound of the center, inflated by the reduced chi-square where the
 model does not fit, plus the error along the streak of misplacing its ends in noise (`_end_variance_px2`).
 
-For the angular rate, the streak's vector is also given without its priors (`_own_vector`): all stars share the mean of
-the priors, so that its error would not average out.
+For the angular rate, the streak's vector is also computed without its priors (`_own_vector`): all stars share the mean
+of the priors, so that its error would not average out.
 """
 
 from __future__ import annotations
@@ -23,24 +27,24 @@ from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 from estimator.detection.background import FILTERED_NOISE, interpolate
 
-# margin of the window about the streak, and its largest half-width
+# Margin of the window about the streak, and its largest half-width.
 MARGIN_PX = 4
 MAX_HALF_WINDOW_PX = 96
-REACH_PX = 4.5  # from the initial line: pixels farther away contain only sky and are not used
+REACH_PX = 4.5  # largest distance of a pixel from the initial line; farther ones contain only sky
 MIN_STREAK_PX = 1.5  # shortest streak whose length and direction can be measured
 MAX_ITERATIONS = 40
-# Priors (1 sigma): difference of a star's streak from the frame's, as slow rotation about the boresight and distortion
-# make streaks vary over the field; and of its width from that of the star before.
+# Standard deviations of the priors: difference of a star's streak from the frame's, because slow rotation about the
+# boresight and distortion make streaks vary over the field; difference of its width from that of the star before.
 LENGTH_FRACTION = 0.15
 LENGTH_PX = 0.5
 ANGLE_RAD = 0.15
 WIDTH_FRACTION = 0.15
-FAR_SIGMA = 5.0  # from an end of the line: 3e-7 of the light is beyond
+FAR_SIGMA = 5.0  # distance from an end of the line beyond which only 3e-7 of the light is left
 # Parameters: center, flux, length, direction, width, sky.
 X, Y, FLUX, LENGTH, ANGLE, WIDTH, SKY = range(7)
 OUTPUTS = 13
 MAX_OWN_ERROR = (
-    0.3  # largest relative error of a length without priors: the fit is linear for smaller ones
+    0.3  # largest relative error of a length without priors that the linear theory holds for
 )
 
 
@@ -55,10 +59,15 @@ def fit_all(
     gain_e_dn: float,
     saturation: float,
 ) -> Floats:
-    """Fit every blob, around its streak as expected (N, 2): (N, 13); NaN if not a streak.
+    """Fit every blob around its expected streak; return (N, 13), NaN if it is not a streak.
 
-    Columns: x, y, flux, dx, dy, and xx, yy, xy of the center's covariance; then dx, dy without the priors and their
-    xx, yy, xy, NaN if the star alone does not tell its streak.
+    The columns are x, y, flux, dx, dy; xx, yy, xy of the center's covariance; dx, dy without the priors; and xx, yy, xy
+    of their covariance. The last five are NaN if the star alone does not determine its streak.
+
+    Parameters
+    ----------
+    streaks
+        (N, 2) expected streak (dx, dy) of each blob, px
     """
     height, width = image.shape
     out = np.full((len(xy), OUTPUTS), np.nan)
@@ -89,6 +98,7 @@ def fit_all(
         neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
         sky = interpolate(level, height, width, xy[n, 1], xy[n, 0])
         sigma = interpolate(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
+        # Initial values: the expected streak at the blob's center
         p[X] = xy[n, 0]
         p[Y] = xy[n, 1]
         p[FLUX] = 0.0
@@ -96,6 +106,7 @@ def fit_all(
         p[ANGLE] = angle
         p[WIDTH] = width_px
         p[SKY] = sky
+        # Pixels near the line; the initial flux includes the saturated ones.
         count = 0
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
@@ -116,7 +127,7 @@ def fit_all(
 
 @jit
 def _half_window(streak: Floats) -> tuple[int, int]:
-    """Half the window's width and height about a streak; -1 if it is too long."""
+    """Return half the window's width and height about a streak; (-1, -1) if it is too long."""
     half_x = int(abs(streak[0]) / 2) + MARGIN_PX
     half_y = int(abs(streak[1]) / 2) + MARGIN_PX
     return (half_x, half_y) if max(half_x, half_y) <= MAX_HALF_WINDOW_PX else (-1, -1)
@@ -124,15 +135,16 @@ def _half_window(streak: Floats) -> tuple[int, int]:
 
 @jit
 def length_sigma_px(length_px: float) -> float:
-    """Standard deviation of the prior on a streak's length."""
+    """Return the standard deviation of the prior on a streak's length."""
     return LENGTH_FRACTION * length_px + LENGTH_PX
 
 
 @jit
 def _distance_to_line(p: Floats, x: float, y: float) -> float:
-    """Distance of a pixel from the line segment."""
+    """Return the distance of a pixel from the line segment, px."""
     along_x = cos(p[ANGLE])
     along_y = sin(p[ANGLE])
+    # u along and v across the line
     u = (x - p[X]) * along_x + (y - p[Y]) * along_y
     v = (y - p[Y]) * along_x - (x - p[X]) * along_y
     return hypot(max(abs(u) - p[LENGTH] / 2, 0.0), v)
@@ -150,13 +162,27 @@ def _fit(
 ) -> bool:
     """Fit one streak by Gauss-Newton, starting from `p`; return False if it does not converge near its start.
 
-    The start is the frame's streak; it is also the mean of the priors on length, direction and width. Where the model
-    does not fit (two crossing streaks) the covariance is inflated by the residuals.
+    The start is the frame's streak; it is also the mean of the priors on length, direction and width.
+
+    1. Compute derivatives, residuals and weights at every pixel (`_rows`).
+    2. Sum the normal equations, add the priors, and solve for the step.
+    3. Apply the step, shortened to about a pixel, and give up far from the start.
+    4. At convergence, read the center's covariance from the inverse normal matrix. Where the model does not fit (two
+       crossing streaks) the residuals inflate it.
+    5. Compute the streak's vector without its priors, and add the error of the ends to the covariance.
 
     Parameters
     ----------
     pixels
         (3, K) x, y and value of the pixels used
+    noise
+        Standard deviation of a pixel of the sky
+    rows, weight
+        Work arrays for `_rows`
+    p
+        (7,) parameters, updated in place
+    out
+        (13,) row of `fit_all`
     """
     count = pixels.shape[1]
     start_x = p[X]
@@ -168,7 +194,9 @@ def _fit(
     normal = np.empty((8, 8))
     step = np.empty(7)
     for _ in range(MAX_ITERATIONS):
+        # 1. Derivatives
         _rows(pixels, noise, gain_e_dn, p, rows, weight)
+        # 2. Step
         least_squares.normal_equations(rows, weight, count, normal)
         least_squares.add_prior(normal, LENGTH, start_length - p[LENGTH], length_sigma)
         least_squares.add_prior(normal, ANGLE, start_angle - p[ANGLE], ANGLE_RAD)
@@ -178,7 +206,7 @@ def _fit(
             return False
         largest_step = max(abs(step[X]), abs(step[Y]), abs(step[LENGTH]))
         end_shift = abs(step[ANGLE]) * p[LENGTH] / 2
-        # The step is shortened so that center, length and direction move an end by about a pixel at most.
+        # 3. The step is shortened so that center, length and direction move an end by about a pixel at most.
         scale = min(1.0, 1 / max(largest_step, end_shift, 2 * abs(step[WIDTH]), 1e-300))
         for k in range(len(p)):
             p[k] += scale * step[k]
@@ -187,6 +215,7 @@ def _fit(
             return False
         if p[FLUX] <= 0 or not MIN_STREAK_PX < p[LENGTH] < 2 * start_length + 4:
             return False
+        # 4. Convergence
         if largest_step < least_squares.CONVERGED_PX or fall < least_squares.CONVERGED_CHI2:
             out[0] = p[X]
             out[1] = p[Y]
@@ -197,7 +226,7 @@ def _fit(
             # Degrees of freedom: seven parameters, three priors.
             misfit = least_squares.misfit_factor(normal[7, 7], count - 4)
             out[5:8] *= misfit
-            # A scalar variance along the streak becomes a covariance in x and y.
+            # 5. The variance along the streak becomes a covariance in x and y: times (dx, dy)^T (dx, dy) / L^2.
             end_variance_px2 = _end_variance_px2(p, noise, gain_e_dn)
             _own_vector(
                 normal, p, start_length, start_angle, misfit, 8 * end_variance_px2, step, out[8:]
@@ -224,9 +253,22 @@ def _own_vector(
     """Write dx, dy of a streak without the priors on length and angle, and xx, yy, xy of their covariance.
 
     With the prior's information P and the posterior's covariance S and mean m, the data alone have the information
-    D = S^-1 - P and the mean m + D^-1 P (m - prior), as all are Gaussian near the solution. `ends_px2` is the variance
-    of the length by ends misplaced in noise: eight times that of the center.
+    D = S^-1 - P and the mean m + D^-1 P (m - prior), as all are Gaussian near the solution.
+
+    1. Read S of length and angle from the factor of the normal matrix.
+    2. Subtract the prior's information: D and its inverse. Leave `out` NaN if D is not positive definite.
+    3. Compute the mean without the prior.
+    4. Inflate the covariance by the misfit, and add the variance of the ends. Leave `out` NaN if it is too large.
+    5. Convert length and angle to dx and dy.
+
+    Parameters
+    ----------
+    ends_px2
+        Variance of the length from ends misplaced in noise: eight times that of the center
+    column
+        Work array
     """
+    # 1. S: columns of the inverse normal matrix
     cov = np.empty((2, 2))
     for i in range(2):
         column[:] = 0.0
@@ -234,6 +276,7 @@ def _own_vector(
         least_squares.cholesky_solve(factor, column)
         cov[i, 0] = column[LENGTH]
         cov[i, 1] = column[ANGLE]
+    # 2. D = S^-1 - P, and then D^-1, with elements ll, aa, la of length and angle
     prior_l = 1 / length_sigma_px(prior_length) ** 2
     prior_a = 1 / ANGLE_RAD**2
     det = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
@@ -244,15 +287,18 @@ def _own_vector(
     if not (ll > 0 and aa > 0 and det > 0):
         return
     ll, aa, la = aa / det, ll / det, -la / det
+    # 3. m + D^-1 P (m - prior)
     pull_l = prior_l * (p[LENGTH] - prior_length)
     pull_a = prior_a * (p[ANGLE] - prior_angle)
     length = p[LENGTH] + ll * pull_l + la * pull_a
     angle = p[ANGLE] + la * pull_l + aa * pull_a
+    # 4. Errors
     ll = misfit * ll + ends_px2
     aa = misfit * aa
     la = misfit * la
     if not (ll < (MAX_OWN_ERROR * length) ** 2 and aa < MAX_OWN_ERROR**2 and length > 0):
         return
+    # 5. (dx, dy) = L (c, s): errors of the length are along the streak, L times those of the angle across it.
     c = cos(angle)
     s = sin(angle)
     across = length**2 * aa
@@ -266,12 +312,13 @@ def _own_vector(
 
 @jit
 def _end_variance_px2(p: Floats, noise: float, gain_e_dn: float) -> float:
-    """Variance along the streak that the Cramer-Rao bound omits: the error of locating its ends in noise.
+    """Return the variance along the streak that the Cramer-Rao bound omits: the error of locating its ends in noise.
 
     Where light of brightness a per pixel of length begins in noise of deviation n, the maximum-likelihood position of
     the onset has a mean square error of 26 (n / a)^4 px^2 (Yao 1987: the maximum of a Brownian motion with a drift
     down to both sides). Two ends at a known distance shift together; their likelihood falls twice as steeply, so the
-    variance is a quarter of that. After optimal weighting across the streak, n^2 is 2 sqrt(pi) w times that of a pixel.
+    variance is a quarter of that, 6.5 (n / a)^4. After optimal weighting across the streak, n^2 is 2 sqrt(pi) w times
+    the variance of a pixel, sky and light together, and a = F / L.
     """
     across = 2 * sqrt(pi) * p[WIDTH]
     variance = noise * noise + p[FLUX] / (across * p[LENGTH]) / gain_e_dn
@@ -284,8 +331,9 @@ def _rows(
 ) -> None:
     """Fill the model's derivatives by the seven parameters, the residual and the weight of every pixel.
 
-    The model is F / L * [erf((u + L/2) / (w sqrt 2)) - erf((u - L/2) / (w sqrt 2))] / 2 * exp(-v^2 / 2 w^2) /
-    (w sqrt(2 pi)) at u along and v across the streak. The pixel's width is part of w: w^2 = sigma^2 + 1/12.
+    The model is that of the module, F times `unit`. The pixel's width is part of w: w^2 = sigma^2 + 1/12. With the
+    derivatives of `unit` by u and v, the chain rule gives those by the center, u = dx cos a + dy sin a and
+    v = dy cos a - dx sin a, and by the direction, du/da = v and dv/da = -u.
     """
     along_x = cos(p[ANGLE])
     along_y = sin(p[ANGLE])
@@ -297,12 +345,14 @@ def _rows(
         dy = pixels[1, k] - p[Y]
         u = dx * along_x + dy * along_y
         v = dy * along_x - dx * along_y
+        # Distances from both ends in units of w, their integrals and densities
         head = (u + length / 2) / w
         tail = (u - length / 2) / w
         head_sum, head_bell = _gaussian_integral(head)
         tail_sum, tail_bell = _gaussian_integral(tail)
         across = exp(-v * v / (2 * w * w)) / (w * sqrt(2 * pi) * length)
         unit = (head_sum - tail_sum) * across
+        # Derivatives of `unit` by u and v
         by_u = (head_bell - tail_bell) / w * across
         by_v = -v / (w * w) * unit
         rows[X, k] = -flux * (along_x * by_u - along_y * by_v)
@@ -318,7 +368,7 @@ def _rows(
 
 @jit
 def _gaussian_integral(t: float) -> tuple[float, float]:
-    """Return a unit Gaussian's integral from 0 to t and its density at t; the limits beyond FAR_SIGMA, to save time."""
+    """Return a unit Gaussian's integral from 0 to t and its density; beyond FAR_SIGMA their limits, to save time."""
     if abs(t) > FAR_SIGMA:
         return (0.5 if t > 0 else -0.5), 0.0
     return erf(t * sqrt(0.5)) / 2, exp(-t * t / 2) / sqrt(2 * pi)

@@ -17,17 +17,12 @@ from estimator.core.jit import jit
 
 Distortion = tuple[float, float, float, float, float]
 
-# Horizontal fields of view that `Camera.from_fov` takes: a number of degrees is beyond WIDEST_RAD as radians, and a
-# number of radians is below NARROWEST_DEG as degrees.
+# Limits of the horizontal field of view in `Camera.from_fov`. They do not overlap: a usual number of degrees is above
+# WIDEST_RAD as radians, and a number of radians is below NARROWEST_DEG as degrees.
 WIDEST_RAD = 2.7
 NARROWEST_DEG = 1.6
-COLORS = (
-    1,
-    2,
-    3,
-    4,
-)  # channels of a color image, with transparency, or of one that is gray already
-
+# Numbers of channels of an image with a channel axis: gray or color, without or with transparency.
+COLORS = (1, 2, 3, 4)
 
 _FIELDS = f"fov_deg from {NARROWEST_DEG} to {math.degrees(WIDEST_RAD):.0f}, or fov_rad above 0 to {WIDEST_RAD}"
 
@@ -38,6 +33,8 @@ class Camera:
 
     Attributes
     ----------
+    width_px, height_px
+        Size of the image
     focal_px
         Focal length divided by the pixel pitch
     center_px
@@ -54,7 +51,7 @@ class Camera:
     Raises
     ------
     ImageError
-        For numbers that no camera has.
+        For impossible numbers.
     """
 
     width_px: int
@@ -99,7 +96,10 @@ class Camera:
             object.__setattr__(self, name, tuple(array.tolist()))
 
     def _is_plain(self) -> bool:
-        """Whether all numbers are possible ones of the declared types; a lens fit makes a hundred cameras."""
+        """Return whether all numbers are possible and of the declared types.
+
+        It is a quick check, since a lens fit makes a hundred cameras.
+        """
         size = (self.width_px, self.height_px)
         lens = (self.center_px, self.distortion)
         if not (
@@ -125,11 +125,15 @@ class Camera:
         *,
         fov_deg: float | None = None,
     ) -> Camera:
-        """An undistorted camera from its horizontal field of view, in radians or in degrees.
+        """Return an undistorted camera from its horizontal field of view, in radians or in degrees.
 
         The field is the angle between the centers of the edge columns: f = (width - 1) / 2 / tan(fov / 2).
-        Raises ImageError unless exactly one of the two is given, and for what is in the other's range: fov_rad above
-        WIDEST_RAD, fov_deg below NARROWEST_DEG.
+
+        Raises
+        ------
+        ImageError
+            Unless exactly one of the two is given; for a number in the range of the other unit:
+            fov_rad above WIDEST_RAD, fov_deg below NARROWEST_DEG.
         """
         if (fov_rad is None) == (fov_deg is None):
             raise ImageError("from_fov: takes either fov_rad or fov_deg")
@@ -201,11 +205,14 @@ class Camera:
         return (x >= low) & (x <= right) & (y >= low) & (y <= bottom)
 
     def row_delays_s(self, xy_px: Floats) -> Floats:
-        """(N,) time of each light's mid-exposure after that of the middle row, to which an attitude refers."""
+        """Return the (N,) times of the lights' mid-exposures after that of the middle row: tau (y - y_mid).
+
+        An attitude refers to the middle row.
+        """
         return np.asarray(self.row_time_s * (xy_px[:, 1] - (self.height_px - 1) / 2))
 
     def _fold(self) -> float:
-        """Squared tangent at which the radial distortion folds back; infinite if it does not.
+        """Return the squared tangent at which the radial distortion folds back; infinite if it does not.
 
         Beyond it, directions outside the field would project into the field. It is the least positive root r^2 of
         d(r radial)/dr = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6.
@@ -223,7 +230,11 @@ class Camera:
 
 @jit
 def _distort(x: float, y: float, distortion: Distortion) -> tuple[float, float]:
-    """Apply the distortion to one tangent (Brown 1966, in OpenCV's form)."""
+    """Apply the distortion to one tangent (Brown 1966, in OpenCV's form).
+
+    x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2),
+    y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y.
+    """
     k1, k2, p1, p2, k3 = distortion
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))

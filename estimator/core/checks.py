@@ -1,8 +1,8 @@
-"""Checks of what a caller passes: each raises ImageError in one line that says what, where, and what is allowed.
+"""Checks of a caller's arguments: each raises ImageError with one line that says what, where, and what is allowed.
 
-The checks run at the public entries, before compiled code, which would read beyond a short array. They also turn arrays
-and numbers into the one type for which the loops are compiled: a Fortran-ordered, flipped, read-only or big-endian
-array, or an int in place of a float, would cost a compilation of seconds.
+The checks run at the public entries, before compiled code, which would read beyond a short array. They also convert
+arrays and numbers to the one type for which the loops are compiled: a Fortran-ordered, flipped, read-only or big-endian
+array, or an int in place of a float, would cause a compilation of seconds.
 """
 
 from __future__ import annotations
@@ -17,17 +17,14 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.core.errors import ImageError as ImageError
-
-# Array types.
-
+from estimator.core.errors import ImageError
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
 def known(what: str, name: object, allowed: Iterable[str]) -> None:
-    """Raise ImageError unless a name is one of the allowed ones; it lists them, and the nearest one."""
+    """Raise ImageError unless a name is one of the allowed ones; the message lists them and suggests the nearest."""
     names = sorted(allowed)
     if name not in names:
         close = difflib.get_close_matches(str(name), names, 1)
@@ -38,7 +35,17 @@ def known(what: str, name: object, allowed: Iterable[str]) -> None:
 def number(
     what: str, value: object, low: float, high: float, allowed: str, integer: bool = False
 ) -> Any:
-    """A number as a plain float (or int) within [low, high]. Raises ImageError for anything else, NaN included."""
+    """Return a number as a plain float (or int) within [low, high]. Raises ImageError for anything else, NaN included.
+
+    Parameters
+    ----------
+    what
+        Name of the number, for the message
+    allowed
+        Allowed values in words, for the message
+    integer
+        Whether only whole numbers are allowed
+    """
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value[()]
     if isinstance(value, Integral if integer else Real) and not isinstance(value, bool | np.bool_):
@@ -58,7 +65,7 @@ def of_type(what: str, value: object, *kinds: type) -> None:
 
 
 def each_of_type(what: str, values: object, kind: type) -> None:
-    """Raise ImageError unless a value is a list or tuple of things of one type."""
+    """Raise ImageError unless a value is a list or tuple whose elements are of one type."""
     of_type(what, values, list, tuple)
     for k, one in enumerate(values):  # type: ignore[arg-type,var-annotated]
         of_type(f"{what}: number {k}", one, kind)
@@ -74,7 +81,7 @@ def one_rotation(what: str, value: object) -> None:
 
 
 def pixel_step(what: str, value: object) -> tuple[float, float] | None:
-    """(dx, dy) as two finite floats, or None. Raises ImageError for anything else."""
+    """Return (dx, dy) as two finite floats, or None. Raises ImageError for anything else."""
     if value is None:
         return None
     pair = floats(what, value, (2,))
@@ -84,9 +91,17 @@ def pixel_step(what: str, value: object) -> tuple[float, float] | None:
 
 
 def floats(what: str, value: object, shape: tuple[int | None, ...]) -> Floats:
-    """An array as C-contiguous, aligned, writable float64; `shape` has None where any length is allowed.
+    """Return an array as C-contiguous, aligned, writable float64; a copy only if it is needed.
 
-    A copy only if it is needed. Raises ImageError for another shape, or what is no array of real numbers.
+    Parameters
+    ----------
+    shape
+        Allowed shape, with None where any length is allowed
+
+    Raises
+    ------
+    ImageError
+        For another shape, and for anything that is no array of real numbers.
     """
     array = native(what, value, np.float64)
     if array.ndim != len(shape) or any(
@@ -97,7 +112,10 @@ def floats(what: str, value: object, shape: tuple[int | None, ...]) -> Floats:
 
 
 def native(what: str, value: object, dtype: DTypeLike) -> NDArray[Any]:
-    """An array of a dtype, as compiled code takes it: C-contiguous, aligned, writable. A copy only if it is needed."""
+    """Return an array of a dtype in the form for compiled code; a copy only if it is needed.
+
+    The form is C-contiguous, aligned, writable. Raises ImageError for anything that is no array of real numbers.
+    """
     if type(value) is np.ndarray and value.dtype == dtype:
         if not value.flags.c_contiguous:
             return np.ascontiguousarray(value)
@@ -112,7 +130,7 @@ def native(what: str, value: object, dtype: DTypeLike) -> NDArray[Any]:
 
 
 def rows(what: str, value: object, count: int | None, width: int) -> Floats:
-    """(count, width) finite floats. Raises ImageError for another shape, and for NaN or infinity."""
+    """Return (count, width) finite floats. Raises ImageError for another shape, and for NaN or infinity."""
     array = floats(what, value, (count, width))
     if not np.isfinite(array).all():
         finite = np.asarray(np.isfinite(array).all(axis=1))
@@ -121,7 +139,7 @@ def rows(what: str, value: object, count: int | None, width: int) -> Floats:
 
 
 def unit_rows(what: str, value: object, count: int | None) -> Floats:
-    """(count, 3) unit vectors, to 1e-6. Raises ImageError otherwise."""
+    """Return (count, 3) vectors of unit length, to 1e-6. Raises ImageError for others."""
     array = rows(what, value, count, 3)
     length = np.sqrt(np.einsum("ij,ij->i", array, array))
     good = np.abs(length - 1) < 1e-6
@@ -132,7 +150,7 @@ def unit_rows(what: str, value: object, count: int | None) -> Floats:
 
 
 def row_numbers(what: str, value: object, below: int) -> NDArray[np.int64]:
-    """(K,) whole numbers from 0 to below - 1, as int64. Raises ImageError otherwise."""
+    """Return (K,) whole numbers from 0 to below - 1, as int64. Raises ImageError for others."""
     array = np.asarray(value)
     if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
         raise ImageError(
@@ -147,7 +165,10 @@ def row_numbers(what: str, value: object, below: int) -> NDArray[np.int64]:
 
 
 def row_pairs(*columns: tuple[str, object, int]) -> list[NDArray[np.int64]]:
-    """Columns of rows that belong together, each as (name, rows, number of rows there are): see `row_numbers`."""
+    """Return columns of row numbers of equal lengths, each given as (name, rows, number of existing rows).
+
+    Raises ImageError for different lengths, and as `row_numbers`.
+    """
     arrays = [row_numbers(*column) for column in columns]
     if len({len(array) for array in arrays}) > 1:
         lengths = ", ".join(
@@ -158,22 +179,23 @@ def row_pairs(*columns: tuple[str, object, int]) -> list[NDArray[np.int64]]:
 
 
 def first_bad(good: NDArray[np.bool_]) -> int:
-    """Number of the first False."""
+    """Return the index of the first False."""
     return int(np.argmin(good))
 
 
 def angle_guess(what: str, value_rad: float) -> str:
-    """What an angle too great for radians is in degrees, for a message."""
+    """Return a text that converts an angle too large for radians to degrees, for a message."""
     guess = "; degrees?" if 0 < value_rad < math.inf else ";"
     return f"{what} {value_rad:g} rad is {math.degrees(value_rad):.0f}°{guess}"
 
 
 def excerpt(value: object, most: int = 60) -> str:
-    """A value in one line of at most `most` characters."""
+    """Return a value's text in one line of at most `most` characters."""
     text = " ".join((str(value) if isinstance(value, Exception) else repr(value)).split())
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
 def _shape_text(shape: tuple[int | None, ...]) -> str:
+    """Return the text of a shape, with N for any length."""
     words = ["N" if length is None else str(length) for length in shape]
     return f"({', '.join(words)}{',' * (len(words) == 1)})"

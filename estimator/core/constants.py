@@ -16,9 +16,8 @@ STANDARD_PRESSURE_HPA = 1013.25  # one atmosphere
 STANDARD_TEMPERATURE_K = 288.15  # of Edlen's refractivity: 15 C
 ARCSEC_RAD = np.pi / 180 / 3600
 MAS_RAD = np.pi / 180 / 3.6e6
-SIGMA_PER_MAD = (
-    1.4826  # standard deviation of a normal distribution over its median absolute deviation
-)
+# Standard deviation of a normal distribution over its median absolute deviation.
+SIGMA_PER_MAD = 1.4826
 
 DAY_S = 86_400.0
 JULIAN_YEAR_DAY = 365.25

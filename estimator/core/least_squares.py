@@ -1,8 +1,14 @@
 """Normal equations of small Gauss-Newton fits: a few parameters, fitted to the pixels of one source.
 
 A fit linearizes its model at the current parameters p: with slopes J, residuals r and weights w, the step is
-dp = N^-1 g, N = J^T W J, g = J^T W r. `normal_equations` computes N, g and chi-square r^T W r in one matrix, `step`
-solves for dp by Cholesky factorization, and `position_covariance` reads the position's covariance from N^-1.
+dp = N^-1 g, N = J^T W J, g = J^T W r. The functions compute
+
+- N, g and chi-square r^T W r in one matrix (`normal_equations`), with priors (`add_prior`);
+- dp by Cholesky factorization (`step`);
+- the position's covariance from N^-1 (`position_covariance`);
+- the factor of a covariance whose residuals exceed their errors (`misfit_factor`, `variance_factor`).
+
+`fit_soft_l1` is a robust fit by Levenberg-Marquardt, for models without derivatives.
 """
 
 from __future__ import annotations
@@ -20,16 +26,16 @@ from estimator.core.jit import jit
 CONVERGED_CHI2 = 1e-4
 CONVERGED_PX = 1e-3
 
-# Robust fit: step of the slopes' differences in units of the parameters' scale; limits of the damping and of the steps;
-# relative fall of the loss at which it has converged; diagonal for a parameter without effect.
-SLOPE_STEP = 1e-4
+# Robust fit.
+SLOPE_STEP = 1e-4  # step of the difference quotients, in units of the parameters' scale
 MIN_DAMPING = 1e-9
 MAX_DAMPING = 1e6
 MAX_STEPS = 40
-CONVERGED_FALL = 1e-10
-TINY = 1e-12
+CONVERGED_FALL = 1e-10  # relative fall of the loss at convergence
+TINY = 1e-12  # diagonal for a parameter without effect
 
-# Prior of the factor of claimed variances: probability that it is 1, else from 1 to this, evenly in its logarithm.
+# Prior of the factor of claimed variances: the probability that it is 1. Otherwise it is from 1 to MAX_VARIANCE_FACTOR,
+# evenly in its logarithm.
 PRIOR_RIGHT = 0.5
 MAX_VARIANCE_FACTOR = 100.0
 FACTORS = np.geomspace(1.0, MAX_VARIANCE_FACTOR, 60)
@@ -37,13 +43,17 @@ FACTORS = np.geomspace(1.0, MAX_VARIANCE_FACTOR, 60)
 
 @jit(fastmath={"reassoc", "contract"})
 def normal_equations(rows: Floats, weight: Floats, count: int, normal: Floats) -> None:
-    """Fill the lower triangle of `normal` with sum(w r_i r_j) over `count` pixels.
+    """Fill the lower triangle of `normal` with sum(w r_i r_j) over `count` pixels: [[N, .], [g^T, chi2]].
 
     Parameters
     ----------
     rows
-        (P + 1, K) the model's derivatives with respect to its P parameters, then the residual.
+        (P + 1, K) derivatives of the model with respect to its P parameters, then the residual.
         The last row of `normal` is therefore the gradient, and its last element is chi-square
+    weight
+        (K,) weight of each pixel
+    normal
+        (P + 1, P + 1) matrix
     """
     for i in range(len(rows)):
         for j in range(i + 1):
@@ -56,7 +66,10 @@ def normal_equations(rows: Floats, weight: Floats, count: int, normal: Floats) -
 
 @jit
 def add_prior(normal: Floats, n: int, offset: float, sigma: float) -> None:
-    """Add a Gaussian prior on parameter n: mean at `offset` from the current value, standard deviation sigma."""
+    """Add a Gaussian prior on parameter n: mean at `offset` from the current value, standard deviation sigma.
+
+    It adds 1 / sigma^2 to the diagonal of N, offset / sigma^2 to g, and (offset / sigma)^2 to chi-square.
+    """
     last = len(normal) - 1
     weight = 1 / sigma**2
     normal[n, n] += weight
@@ -74,9 +87,11 @@ def step(normal: Floats, out: Floats) -> float:
     count = len(out)
     if not cholesky(normal[:count, :count]):
         return np.nan
+    # N dp = g
     for i in range(count):
         out[i] = normal[count, i]
     cholesky_solve(normal, out)
+    # g^T dp
     fall = 0.0
     for i in range(count):
         fall += normal[count, i] * out[i]
@@ -111,6 +126,7 @@ def cholesky(normal: Floats, min_pivot: float = 1e-12) -> bool:
 def cholesky_solve(factor: Floats, vector: Floats) -> None:
     """Replace v by N^-1 v, given the Cholesky factor of N: forward, then back substitution."""
     count = len(vector)
+    # L y = v, then L^T x = y
     for i in range(count):
         for k in range(i):
             vector[i] -= factor[i, k] * vector[k]
@@ -127,6 +143,7 @@ def position_covariance(factor: Floats, column: Floats) -> tuple[float, float, f
 
     With weights that are inverse variances this is the Cramer-Rao bound.
     """
+    # Columns 0 and 1 of the inverse
     column[:] = 0.0
     column[0] = 1.0
     cholesky_solve(factor, column)
@@ -140,10 +157,10 @@ def position_covariance(factor: Floats, column: Floats) -> tuple[float, float, f
 
 @jit
 def misfit_factor(chi2: float, degrees_of_freedom: int) -> float:
-    """Factor that inflates a covariance where the model does not fit the pixels: the reduced chi-square.
+    """Return the factor that inflates a covariance where the model does not fit the pixels.
 
-    Applied only if the reduced chi-square exceeds 1 + 4 sqrt(2 / n) with n degrees of freedom, four standard
-    deviations; otherwise 1.
+    It is the reduced chi-square if that exceeds 1 + 4 sqrt(2 / n), by four standard deviations with n degrees of
+    freedom; otherwise 1.
     """
     if degrees_of_freedom < 1:
         return 1.0
@@ -152,7 +169,7 @@ def misfit_factor(chi2: float, degrees_of_freedom: int) -> float:
 
 
 def variance_factor(chi2: float, degrees_of_freedom: float) -> float:
-    """Expected factor of the claimed variances, given the chi-square of residuals: 1 where they agree with the claim.
+    """Return the expected factor of the claimed variances, given the chi-square of residuals; 1 where both agree.
 
     The factor v is 1 with the probability PRIOR_RIGHT, else anything to MAX_VARIANCE_FACTOR with equal probabilities of
     equal ratios (Jeffreys' prior of a scale). With the likelihood v^(-n/2) exp(-chi2 / (2 v)), n degrees of freedom,
@@ -162,6 +179,7 @@ def variance_factor(chi2: float, degrees_of_freedom: float) -> float:
     With many degrees of freedom it is the reduced chi-square, wherever that is significant (the ratio of R. T. Birge,
     Phys. Rev. 40, 207 (1932); Gelman et al., Bayesian Data Analysis, 3rd ed., sections 3.2 and 14.2).
     """
+    # ln L(v) / L(1)
     log_ratio = 0.5 * (chi2 * (1 - 1 / FACTORS) - degrees_of_freedom * np.log(FACTORS))
     highest = max(float(log_ratio.max()), 0.0)
     wrong = (1 - PRIOR_RIGHT) * np.exp(log_ratio - highest) / len(FACTORS)
@@ -177,13 +195,20 @@ def fit_soft_l1(
 ) -> Floats:
     """Return the parameters that minimize sum(2 (sqrt(1 + r^2) - 1)), the soft L1 loss of residuals (N,).
 
-    It grows as |r| beyond 1, so that a few gross errors have little effect. Levenberg-Marquardt on the weights
-    1 / sqrt(1 + r^2) of iteratively reweighted least squares; slopes by differences of SLOPE_STEP times the scale.
+    The loss grows as |r| beyond 1, so that a few gross errors have little effect. Levenberg-Marquardt on the weights of
+    iteratively reweighted least squares repeats:
+
+    1. Compute the slopes J by difference quotients, with steps of SLOPE_STEP times the scale.
+    2. Sum the normal equations with the weights 1 / sqrt(1 + r^2).
+    3. Solve them, with more damping until the loss does not rise.
+    4. Reduce the damping; stop if the loss hardly falls.
 
     Parameters
     ----------
+    residual
+        Function of the (P,) parameters that returns the (N,) residuals, in standard deviations
     scale
-        (P,) change of each parameter that changes the residuals by about as much as any other's
+        (P,) changes of the parameters that change the residuals by about equal amounts
     converged_fall
         The fit ends at a step that lowers the loss by no more than this fraction
     """
@@ -191,12 +216,14 @@ def fit_soft_l1(
     r = residual(start)
     damping = 1e-4
     for _ in range(MAX_STEPS):
-        slopes = np.column_stack(
-            [(residual(point + step) - r) / SLOPE_STEP for step in np.diag(SLOPE_STEP * scale)]
-        )
+        # 1. Slopes
+        columns = [(residual(point + one) - r) / SLOPE_STEP for one in np.diag(SLOPE_STEP * scale)]
+        slopes = np.column_stack(columns)
+        # 2. Normal equations
         weight = 1 / np.sqrt(1 + r**2)
         normal = (weight[:, None] * slopes).T @ slopes
         gradient = slopes.T @ (weight * r)
+        # 3. Step
         while damping < MAX_DAMPING:
             change = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + TINY), -gradient)
             tried = residual(point + scale * change)
@@ -205,6 +232,7 @@ def fit_soft_l1(
             damping *= 10
         else:
             return point
+        # 4. Convergence
         point = point + scale * change
         fall = soft_l1(r) - soft_l1(tried)
         r = tried
@@ -215,5 +243,5 @@ def fit_soft_l1(
 
 
 def soft_l1(residual: Floats) -> float:
-    """Soft L1 loss of residuals: their squares where they are small, twice their absolute values where large."""
+    """Return sum(2 (sqrt(1 + r^2) - 1)): squares of small residuals, twice the absolute values of large ones."""
     return float(np.sum(2 * (np.sqrt(1 + residual**2) - 1)))

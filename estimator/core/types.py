@@ -25,15 +25,15 @@ class FramePriors:
         (dx, dy) by which stars move over the sensor during the exposure, from the gyro; None if
         unknown. The sign does not matter: a streak looks the same in either direction
     saturation
-        Smallest value of a saturated pixel
+        Least value of a saturated pixel; inf if unknown
     turn_rad
-        By which stars turn about the frame's center meanwhile, of the sign of streak_px; as in
-        Blobs
+        Rotation of the stars about the frame's center during the exposure, with the sign of
+        streak_px; as in Blobs
 
     Raises
     ------
     ImageError
-        For what are no such numbers.
+        For anything but such numbers.
     """
 
     streak_px: tuple[float, float] | None = None
@@ -60,12 +60,12 @@ class RateEstimate:
     Attributes
     ----------
     rate_rad_s
-        (3,) in camera axes: cam_from_ref changes by exp(-[rate] t) in the time t
+        (3,) rate in camera axes: cam_from_ref changes by exp(-[rate] t) in the time t
     covariance_rad2_s2
-        (3, 3)
+        (3, 3) covariance of the rate
     sign_known
-        False if the frame cannot tell the rate from its negative, as one frame of a global
-        shutter
+        False if the rate and its negative explain the data equally well, as in one frame of a
+        global shutter
     """
 
     rate_rad_s: Floats
@@ -73,10 +73,10 @@ class RateEstimate:
     sign_known: bool = True
 
     def resolved(self, other: RateEstimate) -> RateEstimate:
-        """The one of the two signs that is nearer to another rate, by both covariances; itself if the sign is known.
+        """Return the rate with the sign that is nearer to another rate, by both covariances; itself if it is known.
 
-        The sign stays unknown where the other rate fits both: unless the squared Mahalanobis distances differ by
-        SIGN_CHI2, or the sign of the other rate is unknown too.
+        The sign stays unknown if the sign of the other rate is unknown too, or if both signs fit: the squared
+        Mahalanobis distances differ by less than SIGN_CHI2.
         """
         if self.sign_known or not other.sign_known:
             return self
@@ -87,7 +87,9 @@ class RateEstimate:
         return RateEstimate(rate_rad_s, self.covariance_rad2_s2, abs(plus - minus) > SIGN_CHI2)
 
 
-SIGN_CHI2 = 16.0  # by which the chi-squares of both signs of a rate differ if the sign is known
+SIGN_CHI2 = (
+    16.0  # least difference of the chi-squares of both signs of a rate that determines the sign
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +99,8 @@ class Background:
     Attributes
     ----------
     level, noise
-        (rows, columns) in the image's units, interpolated bilinearly between the centers
+        (rows, columns) sky level, and noise of the filtered image, in the image's units; bilinear
+        between the centers
     tile_px
         Side of a tile
     """
@@ -124,15 +127,15 @@ class Blobs:
     area_px
         (N,) number of pixels
     background
-        The level and noise used for the detection
+        Level and noise used for the detection
     flag
         (N,) bits of `estimator.detection.classify.Flag`, 0 for a normal star
     streak_px
         (dx, dy) by which the frame's stars are smeared, sign arbitrary; None if they are round
         or too few
     turn_rad
-        Rotation of the stars about the frame's center c meanwhile, from the pixels' x to y: a
-        star at (x, y) is smeared by streak_px + turn_rad (c_y - y, x - c_x)
+        Rotation of the stars about the frame's center c during the exposure, from the pixels' x
+        to y: a star at (x, y) is smeared by streak_px + turn_rad (c_y - y, x - c_x)
     """
 
     box_px: Ints
@@ -166,28 +169,33 @@ OPTIONAL_SHAPES = {
 class Centroids:
     """Measured positions of the blobs, brightest first: the search begins with the first ones.
 
-    Any array of numbers is taken; it is kept as C-contiguous float64. Raises ImageError for other shapes, or for arrays
-    of different lengths; the trackers check the numbers (`check_values`).
+    Any array of numbers is accepted; it is stored as C-contiguous float64. The trackers check the numbers
+    (`check_values`).
 
     Attributes
     ----------
     xy_px
-        (N, 2) x to the right and y down; the center of the first pixel is (0, 0)
+        (N, 2) positions, x to the right and y down; the center of the first pixel is (0, 0)
     sigma_px
         (N,) standard deviation per coordinate; the root of the mean variance where x and y
         differ
     flux
-        (N,) above the background, in any unit
+        (N,) flux above the background, in any unit
     covariance_px2
-        (N, 2, 2) from a centroider that models x and y separately (streaks), else None
+        (N, 2, 2) covariance from a centroider that models x and y separately (streaks), else None
     streak_px
         (N, 2) vector of each light's streak, sign arbitrary, NaN where it is not measured; None
         if none is
     streak_covariance_px2
-        (N, 2, 2) of streak_px
+        (N, 2, 2) covariance of streak_px
     moments_px2
         (N, 3) second moments xx - yy, 2 xy, xx + yy of lights that are disks; None if not
         measured
+
+    Raises
+    ------
+    ImageError
+        For other shapes, or for arrays of different lengths.
     """
 
     xy_px: Floats
@@ -213,7 +221,7 @@ class Centroids:
                 )
 
     def check_values(self) -> None:
-        """Raise ImageError unless positions are finite, sigmas in their range and fluxes above 0; in a microsecond."""
+        """Raise ImageError unless positions are finite, sigmas in range and fluxes above 0; it takes a microsecond."""
         spread = self.covariance_px2
         row, fault = _first_fault(
             self.xy_px, self.sigma_px, self.flux, NO_SPREAD if spread is None else spread
@@ -228,6 +236,7 @@ class Centroids:
 
     @classmethod
     def empty(cls) -> Centroids:
+        """Return no centroids."""
         return cls(np.empty((0, 2)), np.empty(0), np.empty(0))
 
     def take(self, which: NDArray[Any]) -> Centroids:
@@ -243,8 +252,10 @@ class Centroids:
 
 
 NO_SPREAD = np.empty((0, 2, 2))
-MAX_SIGMA_PX = 20.0  # with less accurate lights every star is a candidate for each: a search would take minutes
-FAULTS = {  # by the number that `_first_fault` returns
+# With less accurate lights every star is a candidate for each of them, and a search would take minutes.
+MAX_SIGMA_PX = 20.0
+# Attribute and allowed values of each fault, by the number that `_first_fault` returns.
+FAULTS = {
     1: ("xy_px", "finite numbers"),
     2: ("sigma_px", f"above 0, up to {MAX_SIGMA_PX:g}"),
     3: ("flux", "finite, above 0"),
@@ -256,7 +267,7 @@ FAULTS = {  # by the number that `_first_fault` returns
 def _first_fault(
     xy_px: Floats, sigma_px: Floats, flux: Floats, spread_px2: Floats
 ) -> tuple[int, int]:
-    """Row and number of the first fault of centroids, as in FAULTS; (0, 0) without one."""
+    """Return row and number of the first fault of centroids, as in FAULTS; (0, 0) without one."""
     for n in range(len(xy_px)):
         if not (abs(xy_px[n, 0]) < np.inf and abs(xy_px[n, 1]) < np.inf):
             return n, 1
@@ -290,9 +301,9 @@ class StarMatch:
     star
         (K,) row of its catalog star
     cam_from_ref
-        The attitude with which the matches were verified
+        Attitude with which the matches were verified
     log10_chance
-        log10 of the expected number of equally good chance matches over the whole search
+        Logarithm of the expected number of equally good chance matches over the whole search
     """
 
     observed: Ints
@@ -310,21 +321,20 @@ class Attitude:
     status
         "solved", or the reason why there is no attitude
     cam_from_ref
-        Reference (ICRS for stars, lab for the dome) to camera, at mid-exposure (of the middle
-        row with a rolling shutter); None unless solved
+        Rotation from the reference frame (ICRS for stars, lab for the dome) to camera axes, at
+        mid-exposure (of the middle row with a rolling shutter); None unless solved
     covariance_rad2
-        (3, 3) of the small rotation in camera axes; None unless solved
+        (3, 3) covariance of the small rotation in camera axes; None unless solved
     match
-        The stars used; None unless solved
+        Stars used; None unless solved
     rms_px
         RMS residual of the matched centroids; NaN unless solved
     camera
-        The calibration used, fitted where it was uncertain; None unless solved
+        Calibration used, fitted where it was uncertain; None unless solved
     systematic_rad2
-        (3, 3) the part of covariance_rad2 that is common to successive frames; None if there is
-        none
+        (3, 3) part of covariance_rad2 that is common to successive frames; None if there is none
     rate
-        Of the camera at the attitude's time; None where neither streaks nor rows tell it
+        Rate of the camera at the attitude's time; None where neither streaks nor rows determine it
     """
 
     status: str
@@ -338,6 +348,7 @@ class Attitude:
 
     @property
     def solved(self) -> bool:
+        """Whether there is an attitude."""
         return self.cam_from_ref is not None
 
     @property
@@ -355,13 +366,15 @@ class FilterState:
 
     Attributes
     ----------
+    t_s
+        Time
     body_from_ref
-        Reference (ICRS, or lab under the dome) to body
+        Rotation from the reference frame (ICRS, or lab under the dome) to body axes
     bias_rad_s
-        (3,) of the gyro, in body axes
+        (3,) bias of the gyro, in body axes
     covariance
-        (N, N) of the small rotation in body axes (rad^2), of the bias (rad^2/s^2), then of
-        `others` in order; N is 6 without others
+        (N, N) covariance of the small rotation in body axes (rad^2), of the bias (rad^2/s^2),
+        then of `others` in order; N is 6 without others
     others
         Estimates of the filter's other states by name: "scale" (3,) of the gyro's axes,
         "misalignment" (6,) of its matrix off the diagonal, row by row (rad), "mounting" (3,) of
@@ -386,7 +399,7 @@ class FilterState:
         return np.sqrt(np.diag(self.covariance)[3:6])
 
     def sigma(self, name: str) -> Floats:
-        """Standard deviations of one of the `others`; raises KeyError for a name that is not among them."""
+        """Return the standard deviations of one of the `others`. Raises KeyError for a name that is not among them."""
         first = 6
         for other, values in self.others.items():
             if other == name:
@@ -396,9 +409,10 @@ class FilterState:
 
 
 def ra_dec_roll_rad(cam_from_icrs: Rotation) -> tuple[float, float, float]:
-    """Right ascension, declination of the boresight, and the position angle of the image's up direction.
+    """Return right ascension and declination of the boresight, and the roll: the position angle of the image's up.
 
-    The roll is measured at the boresight from north through east; radians, ra in [0, 2 pi), roll in (-pi, pi].
+    The roll is measured at the boresight from north through east. All are in radians, ra in [0, 2 pi), roll in
+    (-pi, pi].
     """
     _, down, boresight = cam_from_icrs.as_matrix()
     # The second modulo is needed because -1e-17 % 2 pi is 2 pi.

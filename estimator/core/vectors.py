@@ -14,12 +14,13 @@ Vector = tuple[float, float, float]
 
 @jit
 def row(array: Floats, n: int) -> Vector:
+    """Return row n of an (N, 3) array as a tuple."""
     return array[n, 0], array[n, 1], array[n, 2]
 
 
 @jit
 def chord(u: Vector, v: Vector) -> float:
-    """Chord length |u - v| of two unit vectors: 2 sin(angle / 2), never larger than the angle."""
+    """Return the chord |u - v| of two unit vectors: 2 sin(angle / 2), never larger than the angle."""
     return sqrt((u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2)
 
 
@@ -36,6 +37,7 @@ def rotate(matrix: Floats, u: Vector) -> Vector:
 @jit
 def pair_frame(u: Vector, v: Vector, out: Floats) -> None:
     """Write right-handed axes to the columns of out (3, 3): bisector of two unit vectors, their normal, third axis."""
+    # u + v and u x v, then normalized
     out[0, 0] = u[0] + v[0]
     out[1, 0] = u[1] + v[1]
     out[2, 0] = u[2] + v[2]
@@ -46,6 +48,7 @@ def pair_frame(u: Vector, v: Vector, out: Floats) -> None:
         inverse = 1 / sqrt(out[0, c] ** 2 + out[1, c] ** 2 + out[2, c] ** 2)
         for k in range(3):
             out[k, c] *= inverse
+    # The cross product of the first two
     out[0, 2] = out[1, 0] * out[2, 1] - out[2, 0] * out[1, 1]
     out[1, 2] = out[2, 0] * out[0, 1] - out[0, 0] * out[2, 1]
     out[2, 2] = out[0, 0] * out[1, 1] - out[1, 0] * out[0, 1]
@@ -63,9 +66,10 @@ def multiply_transposed(a: Floats, b: Floats, out: Floats) -> None:
 def rotate_in_place(w: Floats, matrix: Floats) -> None:
     """Left-multiply a rotation matrix by exp([w]) in place, to second order, then orthonormalize it.
 
-    The second-order term makes the error of the small rotation w of order |w|^3; Gram-Schmidt on the rows removes the
-    remaining loss of orthogonality.
+    1. Multiply each column v: v <- v + w x v + w x (w x v) / 2, whose error is of order |w|^3.
+    2. Orthonormalize the rows (Gram-Schmidt), which removes the remaining loss of orthogonality.
     """
+    # 1. Second-order rotation
     for c in range(3):
         x = matrix[0, c]
         y = matrix[1, c]
@@ -76,10 +80,12 @@ def rotate_in_place(w: Floats, matrix: Floats) -> None:
         matrix[0, c] = x + cx + (w[1] * cz - w[2] * cy) / 2
         matrix[1, c] = y + cy + (w[2] * cx - w[0] * cz) / 2
         matrix[2, c] = z + cz + (w[0] * cy - w[1] * cx) / 2
+    # 2. First row: unit length
     u = row(matrix, 0)
     inverse = 1 / sqrt(u[0] ** 2 + u[1] ** 2 + u[2] ** 2)
     for c in range(3):
         matrix[0, c] *= inverse
+    # Second row: without its part along the first one, unit length
     projection = (
         matrix[0, 0] * matrix[1, 0] + matrix[0, 1] * matrix[1, 1] + matrix[0, 2] * matrix[1, 2]
     )
@@ -88,6 +94,7 @@ def rotate_in_place(w: Floats, matrix: Floats) -> None:
     inverse = 1 / sqrt(matrix[1, 0] ** 2 + matrix[1, 1] ** 2 + matrix[1, 2] ** 2)
     for c in range(3):
         matrix[1, c] *= inverse
+    # Third row: the cross product
     for c in range(3):
         n = (c + 1) % 3
         m = (c + 2) % 3
@@ -96,10 +103,12 @@ def rotate_in_place(w: Floats, matrix: Floats) -> None:
 
 @jit
 def quaternion_xyzw(R: Floats) -> Floats:
-    """(4,) quaternion (x, y, z, w) of a rotation matrix, by its largest component (Shepperd 1978, J. Guidance 1, 223).
+    """Return the (4,) quaternion (x, y, z, w) of a rotation matrix (Shepperd 1978, J. Guidance 1, 223).
 
-    Solving for the largest component first avoids a division by a small number.
+    The diagonal shows which component is largest. Solving for that one first, 4 q_i q_j of all j, avoids a division by
+    a small number; the result is normalized.
     """
+    # Largest diagonal element, against the trace
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     q = np.empty(4)
     i = 0 if R[0, 0] >= R[1, 1] else 1

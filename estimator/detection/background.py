@@ -1,10 +1,13 @@
 """Background estimation: sky level and noise on a coarse grid, from a sparse sample of the frame.
 
-The frame is divided into tiles of about 64x64 pixels. In each tile a few rows are sampled after a 3x3 binomial filter
-[1 2 1] x [1 2 1] / 16, the filter that the detector uses too. The estimate starts from the median and the scaled median
-absolute deviation of a few samples, which stars hardly disturb, and is refined by two rounds of sigma clipping at 3
-sigma over all samples of the tile. The variance of the clipped samples is divided by that of a Gaussian truncated at 3
-sigma. Between the tile centers level and noise are interpolated bilinearly (`interpolate`).
+The frame is divided into tiles of about 64x64 pixels. For each tile (`_tiles`):
+
+1. Sample a few rows after a 3x3 binomial filter [1 2 1] x [1 2 1] / 16, the filter that the detector uses too.
+2. Start from the median and the scaled median absolute deviation of a few samples, which stars hardly disturb.
+3. Refine both by two rounds of sigma clipping at 3 sigma over all samples of the tile. The variance of the clipped
+   samples is divided by that of a Gaussian truncated at 3 sigma.
+
+Between the tile centers level and noise are interpolated bilinearly (`interpolate`).
 
 The noise is measured on the filtered image. For white noise it is FILTERED_NOISE times the noise of a raw pixel.
 """
@@ -23,20 +26,21 @@ TILE_PX = 64
 SAMPLE_ROWS = 6  # sampled per tile: some 370 filtered pixels, of which about 130 are independent
 INITIAL_SAMPLES = 33  # samples of the robust initial estimate; odd, as `_median_by_counting` needs
 CLIP_SIGMA = 3.0
-CLIPPED_VARIANCE = 0.9733  # of a unit Gaussian truncated at 3 sigma: 1 - 6 phi(3) / (2 Phi(3) - 1)
+# Variance of a unit Gaussian truncated at 3 sigma: 1 - 6 phi(3) / (2 Phi(3) - 1).
+CLIPPED_VARIANCE = 0.9733
 FLOAT_STEPS = 65535  # quantization steps assumed over the range of an image of floats
-FILTERED_NOISE = (
-    0.375  # the binomial filter reduces the deviation of white noise to (1 + 4 + 1) / 16
-)
+# Standard deviation of white noise after the binomial filter, over that before: (1 + 4 + 1) / 16.
+FILTERED_NOISE = 0.375
 
 
 def estimate_background(image: NDArray, tile_px: int = TILE_PX) -> Background:
     """Estimate the sigma-clipped mean and standard deviation of the 3x3-filtered image, tile by tile.
 
-    The noise is measured on the filtered image itself, so correlated noise (JPEG, demosaicing) is included. Its floor
-    is the quantization noise, as a dark JPEG can have tiles without any noise: that of an integer image's own step,
-    and of 16 bits for floats, a dynamic range that no sensor exceeds. In a simulated frame without noise a threshold
-    below that would join stars by the wings of their images and by readout smear.
+    The noise is measured on the filtered image itself, so correlated noise (JPEG, demosaicing) is included. Its least
+    value is the quantization noise, step / sqrt(12), as a dark JPEG can have tiles without any noise. The step is 1 for
+    integers, and that of 16 bits over the range of an image of floats, a dynamic range that no sensor exceeds. In a
+    simulated frame without noise a threshold below that would join stars by the wings of their images and by readout
+    smear.
     """
     tile_px = min(tile_px, *image.shape)
     sum_type = accumulator_type(image.dtype)
@@ -53,9 +57,11 @@ def accumulator_type(pixel: np.dtype, greatest: float = np.inf) -> type:
 
     Parameters
     ----------
+    pixel
+        Type of the pixels
     greatest
         Largest pixel value, if known: 12-bit pixels stored in 16 bits fit a narrower type than
-        their own dtype suggests
+        their own type suggests
     """
     if pixel.kind not in "iu" or pixel.itemsize > 2:
         return np.float64
@@ -64,7 +70,7 @@ def accumulator_type(pixel: np.dtype, greatest: float = np.inf) -> type:
 
 @jit
 def filtered(image: NDArray, y: int, x: int) -> float:
-    """The 3x3 binomial filter [1 2 1] x [1 2 1] / 16 at one pixel; the edge rows and columns are repeated."""
+    """Return the 3x3 binomial filter [1 2 1] x [1 2 1] / 16 at one pixel; the edge rows and columns are repeated."""
     height, width = image.shape
     up = max(y - 1, 0)
     down = min(y + 1, height - 1)
@@ -90,6 +96,7 @@ def filtered_row(image: NDArray, y: int, sums: NDArray, out: NDArray) -> None:
     left = sums[:width]
     middle = sums[1 : width + 1]
     right = sums[2:]
+    # Vertical sums, padded by their end values
     for x in range(width):
         middle[x] = above[x] + 2 * row[x] + below[x]
     sums[0], sums[width + 1] = sums[1], sums[width]
@@ -121,12 +128,12 @@ def interpolate(grid: Floats, height: int, width: int, y: float, x: float) -> fl
 def _tiles(
     image: NDArray, tile_px: int, smooth: NDArray, samples: NDArray
 ) -> tuple[Floats, Floats]:
-    """Compute level and noise of every tile from SAMPLE_ROWS of its rows.
+    """Compute level and noise of every tile, (rows, columns) each: the numbered steps of the module.
 
     Parameters
     ----------
     smooth, samples
-        Buffers; their dtypes select the types of the computation
+        Buffers; their types select those of the computation
     """
     height, width = image.shape
     rows = max(height // tile_px, 1)
@@ -139,6 +146,7 @@ def _tiles(
     for row in range(rows):
         y0 = row * height // rows
         y1 = (row + 1) * height // rows
+        # 1. Rows at even distances, filtered once for all tiles side by side
         for k in range(SAMPLE_ROWS):
             filtered_row(image, y0 + (2 * k + 1) * (y1 - y0) // (2 * SAMPLE_ROWS), sums, smooth)
             for column in range(columns):
@@ -146,16 +154,18 @@ def _tiles(
                 x1 = (column + 1) * width // columns
                 source = smooth[x0:x1]
                 sampled = values[column, k * (x1 - x0) : (k + 1) * (x1 - x0)]
-                for x in range(
-                    len(source)
-                ):  # a slice's assignment would take longer to compile than all the rest
+                # Assigning a slice would take longer to compile than all the rest.
+                for x in range(len(source)):
                     sampled[x] = source[x]
         for column in range(columns):
             size = (column + 1) * width // columns - column * width // columns
             tile_values = values[column, : SAMPLE_ROWS * size]
+            # 2. Median and deviation
             middle, spread = _robust_estimate(tile_values, samples)
+            # 3. Sigma clipping
             for _ in range(2):
                 middle, spread = _clip(tile_values, middle, spread)
+            # `filtered_row` gives 16 times the filtered values.
             level[row, column] = middle / 16
             noise[row, column] = spread / 16
     return level, noise
@@ -163,17 +173,21 @@ def _tiles(
 
 @jit
 def median(values: Floats) -> float:
-    """Median of an array without NaN, without NumPy's argument checks, which cost more than a short list."""
+    """Return the median of an array without NaN. NumPy's checks of arguments would take longer than a short array."""
     return _median_in_place(values.flatten())
 
 
 @jit
 def _median_in_place(values: NDArray) -> float:
-    """Median of (N,) values by Hoare's selection (C. A. R. Hoare, Comm. ACM 4, 321 (1961)), which reorders them."""
+    """Return the median of (N,) values by Hoare's selection (C. A. R. Hoare, Comm. ACM 4, 321 (1961)); reorders them.
+
+    Each round partitions the values from `low` to `high` at a pivot, and keeps the part that contains the middle one.
+    """
     half = len(values) // 2
     low = 0
     high = len(values) - 1
     while low < high:
+        # Partition: values before i are at most the pivot, those after j at least.
         pivot = values[half]
         i = low
         j = high
@@ -190,6 +204,7 @@ def _median_in_place(values: NDArray) -> float:
         high = j if half < i else high
     if len(values) % 2:
         return values[half]
+    # An even number: the mean of the middle value and the largest one before it
     below = -np.inf
     for k in range(half):
         below = max(below, values[k])
@@ -198,7 +213,7 @@ def _median_in_place(values: NDArray) -> float:
 
 @jit
 def _robust_estimate(values: NDArray, samples: NDArray) -> tuple[float, float]:
-    """Return median and 1.4826 MAD (a Gaussian's sigma) of len(starters) values, sampled evenly."""
+    """Return median and 1.4826 MAD (a Gaussian's sigma) of len(samples) of the values, at even distances."""
     count = len(samples)
     for k in range(count):
         samples[k] = values[(2 * k + 1) * len(values) // (2 * count)]
@@ -210,7 +225,7 @@ def _robust_estimate(values: NDArray, samples: NDArray) -> tuple[float, float]:
 
 @jit
 def _median_by_counting(values: NDArray) -> float:
-    """Median of an odd number of values: the value with at most half below it and more than half up to it.
+    """Return the median of an odd number of values: that with at most half below it, and more than half up to it.
 
     Counting takes quadratic time but has no branches; for a few tens of values it is faster than sorting.
     """
@@ -228,7 +243,7 @@ def _median_by_counting(values: NDArray) -> float:
 
 @jit(fastmath={"reassoc", "contract"})
 def _clip(values: NDArray, middle: float, spread: float) -> tuple[float, float]:
-    """Mean and standard deviation of the values within 3 sigma; the latter is corrected for the truncated tails."""
+    """Return mean and standard deviation of the values within 3 sigma; the latter corrected for the truncated tails."""
     real = values.dtype.type
     center = real(middle)
     reach = real(CLIP_SIGMA * spread)
@@ -244,6 +259,5 @@ def _clip(values: NDArray, middle: float, spread: float) -> tuple[float, float]:
     if count < 1:
         return middle, spread
     mean = float(total) / count
-    return float(center) + mean, np.sqrt(
-        max(float(squares) / count - mean * mean, 0.0) / CLIPPED_VARIANCE
-    )
+    variance = max(float(squares) / count - mean * mean, 0.0)
+    return float(center) + mean, np.sqrt(variance / CLIPPED_VARIANCE)

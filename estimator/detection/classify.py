@@ -2,10 +2,17 @@
 
 The shape is described by second moments. A uniform line of length L has a variance along it that exceeds the variance
 across it by L^2 / 12, so 12 (xx - yy, 2 xy) = L^2 (cos 2a, sin 2a) gives length and direction a. In this form a line
-and its reverse are equal, and lines are averaged and compared as plain vectors. If most of the brightest blobs agree on
-one line, the frame is smeared (a streak); a line that differs from the others is a particle track or a satellite.
-Where the camera rolls about its boresight the streaks differ: v(x) = t + w J (x - c) with J (x, y) = (-y, x). Any two
-of them, each up to its sign, give t and w; if most of the brightest blobs agree on such a field, it is the frame's.
+and its reverse are equal, and lines are averaged and compared as plain vectors. `classify` takes these steps:
+
+1. Measure the shape of each blob (`_shapes`).
+2. Find lines of text that are burned into the picture (`find_captions`).
+3. Find the streak that the frame's stars share (`_common_line`): most of the brightest blobs agree on one line.
+4. Find a field of streaks (`_field`). Where the camera rolls about its boresight the streaks differ:
+   v(x) = t + w J (x - c) with J (x, y) = (-y, x). Any two of them, each up to its sign, give t and w; if most of the
+   brightest blobs agree on such a field, it is the frame's.
+5. Flag each blob by its shape, its line and its surroundings (`_flags`): a line that differs from the frame's streak is
+   a particle track or a satellite.
+6. Flag the pieces into which a faint track breaks (`_join_tracks`).
 """
 
 from __future__ import annotations
@@ -24,20 +31,28 @@ from estimator.detection.background import FILTERED_NOISE, filtered, interpolate
 
 # Text burned into a picture: dates, names of cameras, exposure times.
 
-
-MIN_HEIGHT_PX = 7  # of letters; smaller ones are not read
+MIN_HEIGHT_PX = 7  # smallest letters that are searched for
 MIN_LETTERS = 5
-# greatest difference of their tops and base lines over the height; of brightness
+# Largest difference of the tops and of the base lines of letters, over their height; of their peaks, relative.
 SAME_HEIGHT = 0.2
 SAME_PEAK = 0.15
-GAP = 1.5  # greatest gap of neighbors over the height: a space between words
+GAP = 1.5  # largest gap between neighbors over the height: a space between words
 UNEQUAL_WIDTH = 1.25  # least ratio of the widest to the narrowest letter
-MARGIN = 0.5  # of the height: around a line of text
+MARGIN = 0.5  # margin around a line of text over the height
 
 
 @jit
 def find_captions(boxes: Ints, peak: Floats) -> NDArray[np.bool_]:
-    """Return (N,) whether a blob belongs to a line of text, from the blobs' boxes (x0, y0, x1, y1) and peaks."""
+    """Return (N,) whether a blob belongs to a line of text, from the blobs' boxes (x0, y0, x1, y1) and peaks.
+
+    A line of text is a chain of blobs side by side on one base line that are equally high and equally bright, and
+    differ in width, as letters do and disks or streaks do not. What is between them (points, hyphens, parts of letters)
+    belongs to it.
+
+    1. Grow a line from each blob that is high enough for a letter (`_grow`).
+    2. Accept it if it has enough letters of different widths.
+    3. Mark its letters, and the smaller blobs within its box and a margin.
+    """
     out = np.zeros(len(boxes), np.bool_)
     letter = np.zeros(len(boxes), np.bool_)
     line = np.empty(4, np.int64)
@@ -45,13 +60,16 @@ def find_captions(boxes: Ints, peak: Floats) -> NDArray[np.bool_]:
         height = boxes[n, 3] - boxes[n, 1] + 1
         if out[n] or height < MIN_HEIGHT_PX:
             continue
+        # 1. Line of text
         letter[:] = False
         letter[n] = True
         for side in range(4):
             line[side] = boxes[n, side]
         count, narrow, wide = _grow(boxes, peak, n, letter, line)
+        # 2. Letters
         if count < MIN_LETTERS or wide < UNEQUAL_WIDTH * narrow:
             continue
+        # 3. Marks
         margin = MARGIN * height
         for k in range(len(boxes)):
             x = (boxes[k, 0] + boxes[k, 2]) / 2
@@ -67,14 +85,16 @@ def find_captions(boxes: Ints, peak: Floats) -> NDArray[np.bool_]:
 def _grow(
     boxes: Ints, peak: Floats, first: int, letter: NDArray, line: Ints
 ) -> tuple[int, int, int]:
-    """Extend a line from its first letter, in place; return the number of letters and their extreme widths.
+    """Extend a line of text from its first letter, in place; return the number of letters and their extreme widths.
 
     Parameters
     ----------
+    first
+        Number of the first letter's blob
     letter
-        (N,) whether a blob is a letter of it
+        (N,) whether a blob is a letter of the line
     line
-        (4,) its box
+        (4,) box of the line
     """
     top = boxes[first, 1]
     base = boxes[first, 3]
@@ -82,10 +102,12 @@ def _grow(
     count = 1
     narrow = wide = boxes[first, 2] - boxes[first, 0] + 1
     near_px = max(SAME_HEIGHT * height, 1.5)
+    # Each letter widens the line, so that the next one may be near enough.
     found = True
     while found:
         found = False
         for m in range(len(boxes)):
+            # The same height, near the line, and equally bright
             if letter[m] or abs(boxes[m, 1] - top) > near_px or abs(boxes[m, 3] - base) > near_px:
                 continue
             if max(boxes[m, 0] - line[2], line[0] - boxes[m, 2]) > GAP * height:
@@ -103,25 +125,27 @@ def _grow(
     return count, narrow, wide
 
 
-# Sum of the four neighbors over the central pixel: about .5 for a centered Gaussian of sigma 0.4 px, 0 for a spike.
+# Classification.
+
+# Least sum of the four neighbors over the central pixel: about .5 for a centered Gaussian of sigma 0.4 px, 0 for a
+# spike.
 MIN_NEIGHBOR_RATIO = 0.25
-MAX_SIZE_FRACTION = (
-    0.05  # of the frame's shorter side: no star is that wide; the Moon and trees are
-)
-MAX_NOISE_RATIO = 4.0  # local noise over the frame's median noise
-CLEAR_SIGMA = 10.0  # of a pixel: bright enough for its shape to be significant
+# Largest width of a star over the frame's shorter side; the Moon and trees are wider.
+MAX_SIZE_FRACTION = 0.05
+MAX_NOISE_RATIO = 4.0  # largest local noise over the frame's median noise
+CLEAR_SIGMA = 10.0  # peak in sigmas of a pixel that makes a blob's shape significant
 VOTING_BLOBS = 15  # number of brightest blobs that decide whether the frame is smeared
 VOTES = 0.6  # share of them that must agree
-SAME_TURNED = 5  # least number of streaks that show a roll: two determine it
-# where streaks break up: least number of whole ones, and their least length
+SAME_TURNED = 5  # least number of streaks that show a roll; two determine it
+# Where streaks break up: least number of whole ones, and their least length.
 SAME_STREAKS = 3
 MIN_BROKEN_PX = 12.0
-# Shortest streak that most of the brightest blobs share, and shortest line of one blob: shorter ones are explained by
-# noise or, of one blob, by a pair of stars or defocus.
+# Shortest streak that most of the brightest blobs share, and shortest line of one blob. Noise explains shorter ones, or
+# for one blob a pair of stars or defocus.
 MIN_STREAK_PX = 2.0
 MIN_TRACK_PX = 6.0
-# Of a line from the shared one, relative to it: the streaks of one frame differ in length and direction by rotation and
-# distortion, and the ends of bright ones are seen farther out.
+# Largest difference of a line from the shared one, relative to it: the streaks of one frame differ in length and
+# direction by rotation and distortion, and the ends of bright ones are detected farther out.
 SAME_LINE = 0.5
 # A faint track breaks into pieces: blobs of at least MIN_PIECE_PX on one straight line, within PIECE_OFF_PX of it and
 # within an angle whose double has the cosine PARALLEL (20 degrees). Three of them, or two with a whole track, are one.
@@ -148,7 +172,7 @@ class Flag(IntFlag):
     TEXTURE
         In a part of the frame much noisier than the rest: trees, clouds
     TEXT
-        Of a line of text that is burned into the picture
+        Part of a line of text that is burned into the picture
     """
 
     SATURATED = 1
@@ -160,25 +184,27 @@ class Flag(IntFlag):
 
 
 NO_STAR = Flag.HOT | Flag.TRACK | Flag.HUGE | Flag.TEXTURE | Flag.TEXT
-SATURATED, HOT, TRACK, HUGE, TEXTURE, TEXT = (
-    int(flag) for flag in Flag
-)  # plain integers for compiled code
+# Plain integers for compiled code.
+SATURATED, HOT, TRACK, HUGE, TEXTURE, TEXT = (int(flag) for flag in Flag)
 
 
 def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
     """Return the blobs with their flags, and with the streak (dx, dy) that the frame's stars share, if any.
 
-    Streak and turn are those of the priors if given, otherwise the ones that most of the brightest blobs share.
+    Streak and turn are those of the priors if given, otherwise those that most of the brightest blobs share. The
+    numbered steps are those of the module.
     """
     if not len(blobs):
         return replace(blobs, streak_px=priors.streak_px)
     background = blobs.background
+    # 1. Shapes
     shape = _shapes(image, blobs.box_px, background.level, background.noise)
+    # 2. Text
     text = find_captions(blobs.box_px, blobs.peak)
     streak_px = priors.streak_px
     turn_rad = priors.turn_rad
     if streak_px is None:
-        # Columns of readout smear are no streaks: what crosses half the frame has no say.
+        # 3. and 4. Shared streaks. Columns of readout smear are no streaks: a blob across half the frame does not vote.
         x0, y0, x1, y1 = blobs.box_px.T
         votes = ~text & (x1 - x0 < image.shape[1] / 2) & (y1 - y0 < image.shape[0] / 2)
         lines = shape[votes, 3:]
@@ -188,6 +214,7 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
             streak_px = x, y
     else:
         x, y = streak_px
+    # 5. Flags; integers have quantization noise at least.
     flag = _flags(
         shape,
         blobs.box_px,
@@ -200,13 +227,14 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
         priors.saturation,
         FILTERED_NOISE * (image.dtype.kind in "iu"),
     )
+    # 6. Pieces of a track. In a smeared frame they would be pieces of streaks.
     if streak_px is None:
         _join_tracks(flag, shape, blobs.xy_px)
     return replace(blobs, flag=flag | TEXT * text, streak_px=streak_px, turn_rad=turn_rad)
 
 
 def streaks_px(blobs: Blobs, shape: tuple[int, ...], streak_px: tuple[float, float]) -> Floats:
-    """Return the (N, 2) streak of each blob of an image of this shape, from that at its center and the blobs' turn."""
+    """Return the (N, 2) streak of each blob: v(x) = t + w J (x - c), with the streak t at the image's center c."""
     x, y = (blobs.xy_px - np.array([shape[1] - 1, shape[0] - 1]) / 2).T
     return np.array(streak_px) + blobs.turn_rad * np.column_stack([-y, x])
 
@@ -215,6 +243,7 @@ def moments(image: NDArray, blobs: Blobs) -> Floats:
     """Return the (N, 3) second moments of each blob, px^2: xx - yy, 2 xy and xx + yy."""
     background = blobs.background
     _, _, across, x, y = _shapes(image, blobs.box_px, background.level, background.noise).T
+    # xx + yy is the sum of the eigenvalues: twice the smaller one, and their difference.
     return np.column_stack([x / 12, y / 12, 2 * across + np.hypot(x, y) / 12])
 
 
@@ -235,12 +264,16 @@ def _flags(
 
     Parameters
     ----------
+    shape
+        (N, 5) rows of `_shapes`
+    size
+        Height and width of the image
     field
         Shared streak (dx, dy) at the center, and turn
     smeared
         Whether the frame has streaks
     step
-        Floor of the noise, from quantization
+        Least noise, from quantization
     """
     height, width = size
     typical_noise = max(median(noise), step)
@@ -252,6 +285,7 @@ def _flags(
         local_noise = interpolate(noise, height, width, xy[n, 1], xy[n, 0])
         pixel_noise = local_noise / FILTERED_NOISE
         shared_x, shared_y = _line_at(field, xy[n, 0] - center[0], xy[n, 1] - center[1])
+        # Squared lengths of the shared streak at the blob, and of the difference from it
         shared2 = hypot(shared_x, shared_y)
         diff2 = hypot(line_x - shared_x, line_y - shared_y)
         # 6 pixel_noise: three sigma of the sum of four pixels.
@@ -273,12 +307,16 @@ def _flags(
 
 @jit
 def _join_tracks(flag: Ints, shape: Floats, xy: Floats) -> None:
-    """Flag the pieces into which a faint track breaks, in place: one track, however many blobs it is.
+    """Flag the pieces into which a faint track breaks, in place.
 
-    A piece is longer than wide and parallel to the line through it and another one; on a line through two pieces there
-    are MIN_PIECES, where one that is a track by itself counts twice. Round stars have no direction, so among the few
-    blobs with one the chance that three agree is below 1e-3.
+    1. Select the pieces: blobs that are longer than wide.
+    2. For each two pieces, check that both are parallel to the line through them.
+    3. Count the pieces on that line; one that is a track by itself counts twice.
+    4. Flag them if there are MIN_PIECES or more.
+
+    Round stars have no direction, so among the few blobs with one the chance that three agree is below 1e-3.
     """
+    # 1. Pieces
     piece = np.empty(MAX_PIECES, np.int64)
     count = 0
     for n in range(len(shape)):
@@ -296,14 +334,17 @@ def _join_tracks(flag: Ints, shape: Floats, xy: Floats) -> None:
             b = piece[j]
             x = xy[b, 0] - xy[a, 0]
             y = xy[b, 1] - xy[a, 1]
+            # 2. Directions
             if not (_along(shape[a], x, y) and _along(shape[b], x, y)):
                 continue
+            # 3. Number of pieces on the line
             weight = 0
             for k in range(count):
                 if _on_line(shape[piece[k]], xy[piece[k]], xy[a], x, y):
                     weight += 2 if flag[piece[k]] & TRACK else 1
             if weight < MIN_PIECES:
                 continue
+            # 4. Flags
             for k in range(count):
                 if _on_line(shape[piece[k]], xy[piece[k]], xy[a], x, y):
                     flag[piece[k]] |= TRACK
@@ -311,7 +352,8 @@ def _join_tracks(flag: Ints, shape: Floats, xy: Floats) -> None:
 
 @jit
 def _along(shape: Floats, x: float, y: float) -> bool:
-    """Whether a blob's line is parallel to a vector."""
+    """Return whether a blob's line is parallel to a vector."""
+    # The cosine of twice the angle between them
     line_x, line_y = _double_angle(x, y)
     along = shape[3] * line_x + shape[4] * line_y
     return along > PARALLEL * hypot(shape[3], shape[4]) * (x * x + y * y)
@@ -319,23 +361,26 @@ def _along(shape: Floats, x: float, y: float) -> bool:
 
 @jit
 def _on_line(shape: Floats, xy: Floats, start: Floats, x: float, y: float) -> bool:
-    """Whether a blob lies on a line from a start along a vector, and is parallel to it."""
+    """Return whether a blob is on a line from a start along a vector, and parallel to it."""
     off = (xy[0] - start[0]) * y - (xy[1] - start[1]) * x
     return abs(off) < PIECE_OFF_PX * hypot(x, y) and _along(shape, x, y)
 
 
 @jit
 def _common_line(lines: Floats) -> tuple[float, float]:
-    """Return the line, as L^2 (cos 2a, sin 2a), shared by over 60 % of the brightest blobs, or (0, 0).
+    """Return the line, as L^2 (cos 2a, sin 2a), that over 60 % of the brightest blobs share, or (0, 0).
 
-    Long faint streaks break up into pieces. If there is no such line, it is therefore that of the brightest blob with
-    SAME_STREAKS like it and over 60 % that are parallel to it and no longer.
+    1. Take the median line if over 60 % are like it.
+    2. Otherwise take the line of the brightest blob that SAME_STREAKS are like, and to which over 60 % are parallel and
+       no longer: long faint streaks break up into pieces.
     """
+    # 1. Median
     voting = lines[:VOTING_BLOBS]
     x = median(voting[:, 0])
     y = median(voting[:, 1])
     if _count_same(voting, x, y) > VOTES * len(voting):
         return x, y
+    # 2. Broken streaks
     for k in range(len(voting)):
         x, y = voting[k]
         if hypot(x, y) < MIN_BROKEN_PX**2 or _count_same(voting, x, y) < SAME_STREAKS:
@@ -347,7 +392,7 @@ def _common_line(lines: Floats) -> tuple[float, float]:
 
 @jit
 def _count_pieces(lines: Floats, x: float, y: float) -> int:
-    """Number of lines that are parallel to one and no longer."""
+    """Return the number of lines that are parallel to the line (x, y) and no longer."""
     pieces = 0
     square = hypot(x, y)
     for n in range(len(lines)):
@@ -359,7 +404,7 @@ def _count_pieces(lines: Floats, x: float, y: float) -> int:
 
 @jit
 def _count_same(lines: Floats, x: float, y: float) -> int:
-    """Number of lines that are like one."""
+    """Return the number of lines that differ from the line (x, y) by less than SAME_LINE of it."""
     same = 0
     for n in range(len(lines)):
         same += hypot(lines[n, 0] - x, lines[n, 1] - y) < SAME_LINE * hypot(x, y)
@@ -370,11 +415,21 @@ def _count_same(lines: Floats, x: float, y: float) -> int:
 def _field(
     lines: Floats, xy: Floats, center: tuple[float, float], line: tuple[float, float]
 ) -> tuple[float, float, float]:
-    """Return the streak (dx, dy) at the center and the turn shared by most of the brightest blobs.
+    """Return the streak (dx, dy) at the center and the turn that most of the brightest blobs share.
 
-    The turn is 0, and the streak that of the common line, unless a blob would be a track then, and another field, given
-    by two of the blobs, agrees with more of them, and with no fewer than are pieces of a long line.
+    1. Take the common line without a turn, if no blob would be a track then.
+    2. Otherwise search the field that agrees with most blobs (`_agreement`), among the fields through any two of them,
+       each streak with both signs. It must agree with more blobs than the common line, with over 60 %, and with no
+       fewer than there are pieces of a long line.
+
+    Parameters
+    ----------
+    lines, xy
+        (N, 2) lines L^2 (cos 2a, sin 2a) and positions of the blobs, brightest first
+    line
+        Common line
     """
+    # 1. Common line
     count = min(len(lines), VOTING_BLOBS)
     tracks = 0
     dx, dy = _half_angle(line)
@@ -384,6 +439,7 @@ def _field(
         tracks += diff2 > max(MIN_TRACK_PX**2, SAME_LINE * hypot(line[0], line[1]))
     if not tracks:
         return best
+    # 2. Fields through two blobs
     best_score = max(int(_agreement(lines, xy, center, best)[0]), int(VOTES * count)) + 1.0
     if hypot(dx, dy) >= MIN_BROKEN_PX:
         best_score = max(best_score, float(_count_pieces(lines[:count], line[0], line[1])))
@@ -408,7 +464,10 @@ def _field_of_two(
     second: tuple[float, float],
     center: tuple[float, float],
 ) -> tuple[float, float, float]:
-    """Field of two streaks at two places by least squares: the turn from their difference, the rest from their mean."""
+    """Return the field (dx, dy, turn) of two streaks at two places by least squares.
+
+    The turn w follows from their difference, w J (x2 - x1), and the streak t at the center from their mean.
+    """
     x = end[0] - start[0]
     y = end[1] - start[1]
     turn = ((second[1] - first[1]) * x - (second[0] - first[0]) * y) / max(x * x + y * y, 1.0)
@@ -425,7 +484,11 @@ def _field_of_two(
 def _agreement(
     lines: Floats, xy: Floats, center: tuple[float, float], field: tuple[float, float, float]
 ) -> tuple[float, int]:
-    """Return how many of the brightest blobs are like a field's streaks, with how like as a fraction, and streaks."""
+    """Return the score of a field, and how many of the blobs that agree with it are streaks.
+
+    The score is the number of the brightest blobs that agree with the field's streaks. Its fraction, below 1, is larger
+    for smaller differences.
+    """
     score = 0.0
     streaks = 0
     count = min(len(lines), VOTING_BLOBS)
@@ -441,19 +504,19 @@ def _agreement(
 
 @jit
 def _line_at(field: tuple[float, float, float], x: float, y: float) -> tuple[float, float]:
-    """The line L^2 (cos 2a, sin 2a) of a field's streak at a place from the center."""
+    """Return the line L^2 (cos 2a, sin 2a) of a field's streak at (x, y) from the center."""
     return _double_angle(field[0] - field[2] * y, field[1] + field[2] * x)
 
 
 @jit
 def _double_angle(x: float, y: float) -> tuple[float, float]:
-    # (dx, dy) to L^2 (cos 2a, sin 2a).
+    """Return L^2 (cos 2a, sin 2a) of a streak (dx, dy)."""
     return x * x - y * y, 2 * x * y
 
 
 @jit
 def _half_angle(line: tuple[float, float]) -> tuple[float, float]:
-    # L^2 (cos 2a, sin 2a) to (dx, dy).
+    """Return the streak (dx, dy), up to its sign, of a line L^2 (cos 2a, sin 2a)."""
     length = sqrt(hypot(line[0], line[1]))
     angle = atan2(line[1], line[0]) / 2
     return length * cos(angle), length * sin(angle)
@@ -461,11 +524,11 @@ def _half_angle(line: tuple[float, float]) -> tuple[float, float]:
 
 @jit
 def _shapes(image: NDArray, boxes: Ints, level: Floats, noise: Floats) -> Floats:
-    """Return (N, 5): the shape of each blob.
+    """Return the shape of each blob, (N, 5).
 
-    Columns: the largest pixel above the sky, the sum of its four neighbors above the sky, the variance across the
-    longer axis, and 12 (xx - yy, 2 xy) = L^2 (cos 2a, sin 2a). The moments use the pixels whose filtered value is above
-    3 sigma.
+    The columns are the largest pixel above the sky, the sum of its four neighbors above the sky, the variance across
+    the longer axis, and 12 (xx - yy, 2 xy) = L^2 (cos 2a, sin 2a). With the light I, xx = sum(I x^2) / sum(I) -
+    (sum(I x) / sum(I))^2, and likewise yy and xy, over the pixels whose filtered value is above 3 sigma.
     """
     height, width = image.shape
     out = np.zeros((len(boxes), 5))
@@ -494,6 +557,7 @@ def _shapes(image: NDArray, boxes: Ints, level: Floats, noise: Floats) -> Floats
                     xx += light * dx * dx
                     yy += light * dy * dy
                     xy += light * dx * dy
+        # Peak and its four neighbors
         sky = interpolate(level, height, width, peak_y, peak_x)
         out[n, 0] = peak_light
         for a, b in (
@@ -503,6 +567,7 @@ def _shapes(image: NDArray, boxes: Ints, level: Floats, noise: Floats) -> Floats
             (peak_x, peak_y + 1),
         ):
             out[n, 1] += float(image[min(max(b, 0), height - 1), min(max(a, 0), width - 1)]) - sky
+        # Central moments
         if total > 0:
             xx = xx / total - (x_sum / total) ** 2
             yy = yy / total - (y_sum / total) ** 2

@@ -1,9 +1,13 @@
 """Connected components: thresholding of the filtered frame into runs, and labeling of connected runs as blobs.
 
-A run is a row's sequence of adjacent pixels above the threshold. `runs_above` filters each row and compares it with the
-threshold, `label_runs` joins the runs that touch (eight-connected) by union-find, and `accumulate_blobs` sums flux,
-moments and bounding box of each blob over its runs. Memory and time of the last two depend on the number of bright
-pixels, not on the size of the frame.
+A run is a row's sequence of adjacent pixels above the threshold.
+
+1. `runs_above` filters each row and compares it with the threshold.
+2. `label_runs` joins the runs that touch (eight-connected) by union-find.
+3. `accumulate_blobs` sums flux, moments and bounding box of each blob over its runs.
+4. `brightest_blobs` selects the blobs that are significant, brightest first.
+
+Memory and time of steps 2 to 4 depend on the number of bright pixels, not on the size of the frame.
 
 The threshold varies over the frame: it is a tile grid, interpolated bilinearly. Interpolating it at every pixel would
 dominate the cost. So each row is first compared, in vector instructions, with a lower bound that is constant within a
@@ -23,11 +27,12 @@ from estimator.detection.background import accumulator_type, filtered, filtered_
 
 Ints32 = NDArray[np.int32]  # half the memory where there are millions of runs
 FIRST_RUNS = 2048  # capacity of the first pass; a second pass follows if there are more runs
-# Columns of a blob's sums. STRONG: pixels above the higher threshold. TOP: largest filtered value above the sky.
+# Columns of a blob's sums: number of pixels; number of pixels above the higher threshold; sums of I, I x and I y;
+# largest pixel; largest filtered value above the sky, and its x and y.
 AREA, STRONG, FLUX, X, Y, PEAK, TOP, TOP_X, TOP_Y = range(9)
 SUMS = 9
 CHUNK_PX = (
-    64  # pixels that are tested together; only a chunk with a bright pixel is examined further
+    64  # pixels that are tested together; only chunks with a bright pixel are examined further
 )
 ONE_TAP = np.zeros((1, 2), np.int64)
 
@@ -38,7 +43,7 @@ def runs_above(image: NDArray, threshold: Floats, taps: Ints | None = None) -> I
     Parameters
     ----------
     threshold
-        (rows, columns) on tile centers, interpolated bilinearly
+        (rows, columns) values on tile centers, interpolated bilinearly
     taps
         (K, 2) x, y offsets over which the filtered image is averaged, for streaks; None for
         round stars
@@ -53,6 +58,7 @@ def runs_above(image: NDArray, threshold: Floats, taps: Ints | None = None) -> I
     width = image.shape[1]
     sums = np.empty(width + 2, sum_type)
     ring = np.empty((2 * reach + 1, width + 2 * reach), ring_type)
+    # The scan counts all runs, so that a second pass has room for them.
     capacity = FIRST_RUNS
     while True:
         runs = np.empty((capacity, 3), np.int32)
@@ -68,11 +74,17 @@ def _scan(
 ) -> int:
     """Fill `runs` and return the number of runs, which may exceed its capacity.
 
+    For each row:
+
+    1. Compute the lower bounds of the threshold (`_lower_bounds`).
+    2. Filter the row, and average it along the taps.
+    3. Compare chunks of pixels with the bounds.
+    4. Compare the pixels above their bound with the exact threshold, and add them to the runs.
+
     Parameters
     ----------
     ring
-        Circular buffer of filtered rows, (2 reach + 1) of them, so that each row is filtered
-        only once
+        Circular buffer of 2 reach + 1 filtered rows, so that each row is filtered only once
     """
     height, width = image.shape
     reach = len(ring) // 2
@@ -89,7 +101,9 @@ def _scan(
     cell = np.int64(-1)
     ready = np.int64(0)
     for y in range(height):
+        # 1. Lower bounds
         cell = _lower_bounds(threshold, height, y, cell, scale, bound)
+        # 2. Filtered row
         if reach == 0:
             filtered_row(image, y, sums, row)
         else:
@@ -102,16 +116,15 @@ def _scan(
             start = max(min(first, width - CHUNK_PX), 0)
             chunk = values[start : start + CHUNK_PX]
             chunk_bounds = bounds[start : start + CHUNK_PX]
+            # 3. The loop has a constant length, so that the compiler unrolls it into vector instructions.
             hit = False
-            for i in range(
-                CHUNK_PX
-            ):  # constant length: the compiler unrolls it into vector instructions
+            for i in range(CHUNK_PX):
                 hit |= chunk[i] > chunk_bounds[i]
             if not hit:
                 continue
             for i in range(CHUNK_PX):
                 mask[i] = chunk[i] > chunk_bounds[i]
-            # Eight mask bytes are tested as one integer, to skip dark pixels quickly.
+            # 4. Eight mask bytes are tested as one integer, to skip dark pixels quickly.
             for k in range(len(words)):
                 if words[k] == 0:
                     continue
@@ -172,6 +185,7 @@ def _lower_bounds(
     """
     rows, columns = threshold.shape
     width = len(bound)
+    # The cell row as in `background.interpolate`
     v = min(max((y + 0.5) * rows / height - 0.5, 0.0), rows - 1.0)
     cell_row = min(int(v), max(rows - 2, 0))
     if cell_row == cell:
@@ -199,9 +213,12 @@ def _lower_bounds(
 def label_runs(runs: Ints32) -> tuple[Ints32, int]:
     """Return the blob number of each run, from 0 in raster order, and the number of blobs.
 
-    Two runs of adjacent rows are connected if they overlap or touch at a corner. The runs of the row above (i) and of
-    this row (j) are merged like two sorted lists, always advancing the one that ends first, so that every touching pair
-    is met once; each pair is joined in a union-find forest. A root is the first run of its blob in raster order.
+    Two runs of adjacent rows are connected if they overlap or touch at a corner.
+
+    1. Merge the runs of the row above (i) and of this row (j) like two sorted lists, always advancing the one that ends
+       first, so that every touching pair occurs once.
+    2. Join each pair in a union-find forest. A root is the first run of its blob in raster order.
+    3. Number the roots in raster order, and give every run the number of its root.
     """
     count = len(runs)
     parent = np.arange(count, dtype=np.int32)
@@ -212,10 +229,12 @@ def label_runs(runs: Ints32) -> tuple[Ints32, int]:
         first = k
         while k < count and runs[k, 0] == y:
             k += 1
+        # 1. Merge with the row above, if that has runs.
         if end > start and runs[start, 0] == y - 1:
             i = start
             j = first
             while i < end and j < k:
+                # 2. Join runs that touch.
                 if runs[i, 1] <= runs[j, 2] + 1 and runs[j, 1] <= runs[i, 2] + 1:
                     _join(parent, i, j)
                 if runs[i, 2] < runs[j, 2]:
@@ -224,9 +243,10 @@ def label_runs(runs: Ints32) -> tuple[Ints32, int]:
                     j += 1
         start = first
         end = k
+    # 3. A root precedes all other runs of its blob, so that its number is known.
     blob = np.empty(count, np.int32)
     blobs = 0
-    for n in range(count):  # a root precedes all other runs of its blob, so its number is known
+    for n in range(count):
         root = _find(parent, n)
         if root == n:
             blob[n] = blobs
@@ -238,6 +258,7 @@ def label_runs(runs: Ints32) -> tuple[Ints32, int]:
 
 @jit
 def _find(parent: Ints32, n: int) -> int:
+    """Return the root of a run's tree."""
     # Path halving: each node visited is linked to its grandparent, which keeps the trees flat.
     while parent[n] != n:
         parent[n] = parent[parent[n]]
@@ -247,9 +268,10 @@ def _find(parent: Ints32, n: int) -> int:
 
 @jit
 def _join(parent: Ints32, a: int, b: int) -> None:
+    """Join the trees of two runs; the earlier root becomes the root of both, as `label_runs` requires."""
     a = _find(parent, a)
     b = _find(parent, b)
-    if a != b:  # the earlier run becomes the root, as `label_runs` relies on
+    if a != b:
         parent[max(a, b)] = min(a, b)
 
 
@@ -257,7 +279,15 @@ def _join(parent: Ints32, a: int, b: int) -> None:
 def accumulate_blobs(
     image: NDArray, level: Floats, strong: Floats, runs: Ints32, blob: Ints32, blobs: int
 ) -> tuple[Ints32, Floats]:
-    """Return (blobs, 4) bounding boxes and (blobs, SUMS) sums over each blob's pixels, in the columns AREA .. TOP_Y."""
+    """Return (blobs, 4) bounding boxes and (blobs, SUMS) sums over each blob's pixels, in the columns AREA to TOP_Y.
+
+    Parameters
+    ----------
+    level, strong
+        Grids of the sky level and of the higher threshold
+    runs, blob, blobs
+        Runs of `runs_above`, the blob number of each, and the number of blobs, as of `label_runs`
+    """
     height, width = image.shape
     boxes = np.empty((blobs, 4), np.int32)
     boxes[:, :2] = max(height, width)
@@ -301,7 +331,8 @@ def brightest_blobs(
     """Return boxes, (x, y), flux, peak and area of the `max_blobs` brightest accepted blobs, and the number accepted.
 
     A blob is accepted if it has `min_strong_px` pixels above the higher threshold, or if its total is significant: at
-    least `min_total_px` pixels in all, with a flux of at least `min_flux_per_root_px` sqrt(area).
+    least `min_total_px` pixels in all, with a flux of at least `min_flux_per_root_px` sqrt(area). Its position is
+    (sum(I x), sum(I y)) / sum(I).
     """
     rows = np.empty(len(sums), np.int64)
     count = 0
@@ -312,6 +343,7 @@ def brightest_blobs(
         if flux > 0 and (sums[n, STRONG] >= min_strong_px or significant):
             rows[count] = n
             count += 1
+    # The brightest of the accepted blobs
     rows = _by_flux(sums, rows[:count])
     kept = min(count, max_blobs)
     box = np.empty((kept, 4), np.int64)
@@ -333,7 +365,8 @@ def brightest_blobs(
 
 @jit
 def _by_flux(sums: Floats, rows: Ints) -> Ints:
-    """The (N,) rows in decreasing order of flux, in their own order where it is equal: a merge sort from the bottom."""
+    """Return the (N,) rows in decreasing order of flux; those of equal flux keep their order."""
+    # A merge sort from the bottom: sorted parts of 1, 2, 4, ... rows.
     count = len(rows)
     length = 1
     merged = np.empty(count, np.int64)
@@ -341,6 +374,7 @@ def _by_flux(sums: Floats, rows: Ints) -> Ints:
         for start in range(0, count, 2 * length):
             middle = min(start + length, count)
             end = min(start + 2 * length, count)
+            # Merge two sorted parts, start to middle and middle to end.
             i = start
             j = middle
             for k in range(start, end):

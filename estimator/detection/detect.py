@@ -3,6 +3,16 @@
 Each detector takes a frame and returns `Blobs`. `default` is a matched filter: the frame is correlated with an
 approximation of the star's image (the 3x3 binomial filter, averaged along the streak for smeared stars) and compared
 with a threshold in units of the filtered noise. The other detectors follow published trackers, for comparison.
+
+Every detector has the parameters
+
+- `image`: (H, W) array of any real type;
+- `threshold_sigma`: threshold above the sky, in units of the noise;
+- `min_area_px`: least number of pixels above the threshold;
+- `max_blobs`: largest number of blobs that are returned;
+- `priors`: prior information about the frame: streak, saturation;
+
+and raises ImageError for an image that cannot be used (see `check_image`).
 """
 
 from __future__ import annotations
@@ -26,31 +36,30 @@ from estimator.detection.components import (
 from estimator.detection.shefex_detection import maximum_scan, sequential_scan
 
 MAX_BLOBS = 20_000
-GROW_SIGMA = 3.5
-SPARE = 4  # blobs that are classified, per blob returned: hot pixels and tracks do not take the places of stars
+GROW_SIGMA = 3.5  # lower threshold, down to which a blob extends
+SPARE = 4  # blobs classified per blob returned, so that hot pixels and tracks do not replace stars
 MIN_GROWN_PX = 8  # smallest area of a blob that is significant only as a whole
 # With fewer stars than FEW_STARS, faint streaks of SEARCH_LENGTH_PX are searched in DIRECTIONS directions.
 FEW_STARS = 8
 DIRECTIONS = 8
 SEARCH_LENGTH_PX = 10.0
-# Streaks that are followed: shorter ones are those of a turn about the field, and texture grows to any length.
+# Shortest and longest streaks for which longer filters are tried: shorter ones come from a rotation about the field,
+# and texture grows to any length.
 SHORTEST_PX = 2.0
 MAX_GROWN_PX = 64
-# length of the next filter, and growth of the streak that justifies it
+# Length of the next filter over the last streak, and the growth of the streak that justifies it.
 LONGER = 1.5
 LENGTHENED = 1.15
 LARGE_PX = 150  # a blob this large is not a faint streak, and a line filter finds many in its noise
-MAX_STREAK_PX = 1024  # longest streak filtered for: a longer one spreads the star too thinly
-MAX_TURN_PX = 4.0  # largest difference of streaks by a roll, at the corners, for which they are filtered along one
-MIN_STREAK_AREA_PX = (
-    5  # noise averaged along a line is correlated: several pixels exceed the threshold
-)
+MAX_STREAK_PX = 1024  # longest streak that has a filter: a longer one spreads the star too thinly
+# Largest difference of the streaks at the corners, from a roll, for which one filter serves all of them.
+MAX_TURN_PX = 4.0
+# Least area of a streak: noise averaged along a line is correlated, so that several pixels exceed the threshold.
+MIN_STREAK_AREA_PX = 5
 THESIS_INTENSITY = 0.04
 THESIS_AREA_PX = 50
 
-# (image, threshold_sigma, min_area_px, max_blobs, priors): the image is (H, W) of any real dtype. Each raises
-# ImageError for an image that cannot be used (see `check_image`).
-Detector = Callable[..., Blobs]
+Detector = Callable[..., Blobs]  # (image, threshold_sigma, min_area_px, max_blobs, priors)
 
 
 def default(
@@ -60,79 +69,85 @@ def default(
     max_blobs: int = 200,
     priors: FramePriors = NO_PRIORS,
 ) -> Blobs:
-    """Matched filters for round and for smeared stars above the local sky, with two thresholds (hysteresis).
+    """Detect round and smeared stars above the local sky by matched filters, with two thresholds (hysteresis).
 
     Round stars: the binomial filter [1 2 1] x [1 2 1] / 16 is close to the matched filter of sigma 0.7 px. A blob is a
     set of connected pixels above 3.5 sigma. It is accepted if `min_area_px` of them are above `threshold_sigma`, or if
-    its total flux is significant by one sigma more than that. The low threshold keeps noise from breaking a faint
+    its total flux is significant by one sigma more than that. The low threshold prevents that noise breaks a faint
     streak into pieces.
 
     Smeared stars: the filtered image is averaged along the streak (dx, dy), which improves the signal-to-noise ratio by
-    the square root of its length. The streak is that of the priors (from the gyro); otherwise the one that the
-    brightest blobs share; otherwise, if few stars were found, the direction in which most streaks are found. Streaks
-    longer than MAX_STREAK_PX are detected with the filter for round stars.
+    the square root of its length.
 
-    Of the blobs found, those that cannot be stars (`classify`) are returned as far as the stars leave room.
+    1. If the priors have the streak (from the gyro), detect with the filter along it.
+    2. Otherwise detect with the round filter. If the brightest blobs share a streak, detect again with the filter
+       along it. Streaks longer than MAX_STREAK_PX keep the round filter.
+    3. If few stars were found, search for faint streaks in several directions (`detect_faint_streaks`).
+    4. Lengthen the filter as long as the streak grows (`in_full_length`).
+    5. Return the brightest blobs that may be stars, and of the others (`classify`) as many as there is room for.
     """
     image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
     of_type("priors", priors, FramePriors)
-    return _stars_first(
-        _classified(image, threshold_sigma, min_area_px, SPARE * max_blobs, priors), max_blobs
-    )
+    blobs = _classified(image, threshold_sigma, min_area_px, SPARE * max_blobs, priors)
+    return _stars_first(blobs, max_blobs)
 
 
 def _classified(
     image: NDArray, threshold_sigma: float, min_area_px: int, max_blobs: int, priors: FramePriors
 ) -> Blobs:
-    """The brightest blobs with their flags, detected with the filter along the frame's streak if it is smeared."""
+    """Return the brightest blobs with their flags: steps 1 to 4 of `default`."""
     background = estimate_background(image)
-    # Where a roll makes the streaks differ by more at the corners, no filter along one of them is that of all.
+    # A roll that makes the streaks differ by more at the corners leaves no filter that fits them all.
     largest_turn_rad = MAX_TURN_PX / np.hypot(*image.shape) * 2
     known = priors.streak_px is not None and abs(priors.turn_rad) <= largest_turn_rad
-    if not known or not 2 <= max(map(abs, priors.streak_px or ())) <= MAX_STREAK_PX:
-        blobs = detect_blobs(
-            image,
-            background,
-            threshold_sigma * background.noise,
-            min_area_px,
-            max_blobs,
-            GROW_SIGMA,
-        )
-        blobs = classify.classify(image, blobs, priors)
-        if blobs.streak_px is None:
-            # Round or too few. With very few stars, the rest may be streaks too faint for the round filter.
-            stars = int(np.count_nonzero(blobs.flag & classify.NO_STAR == 0))
-            if (
-                priors.streak_px is not None
-                or stars >= FEW_STARS
-                or np.any(blobs.area_px >= LARGE_PX)
-            ):
-                return blobs
-            faint = detect_faint_streaks(image, background, threshold_sigma, max_blobs, priors)
-            if len(faint) <= stars + 1:
-                return blobs
-            return in_full_length(
-                image, classify.classify(image, faint, priors), threshold_sigma, max_blobs, priors
-            )
-        if abs(blobs.turn_rad) > largest_turn_rad or max(map(abs, blobs.streak_px)) > MAX_STREAK_PX:
+    # 1. Known streak
+    if known and 2 <= max(map(abs, priors.streak_px or ())) <= MAX_STREAK_PX:
+        return _classified_streaks(image, background, threshold_sigma, max_blobs, priors)
+    # 2. Round filter
+    above = threshold_sigma * background.noise
+    blobs = detect_blobs(image, background, above, min_area_px, max_blobs, GROW_SIGMA)
+    blobs = classify.classify(image, blobs, priors)
+    if blobs.streak_px is None:
+        # 3. Round stars or too few. With very few stars, the others may be streaks too faint for the round filter.
+        stars = int(np.count_nonzero(blobs.flag & classify.NO_STAR == 0))
+        large = np.any(blobs.area_px >= LARGE_PX)
+        if priors.streak_px is not None or stars >= FEW_STARS or large:
+            return blobs
+        faint = detect_faint_streaks(image, background, threshold_sigma, max_blobs, priors)
+        if len(faint) <= stars + 1:
+            return blobs
+        streaks = classify.classify(image, faint, priors)
+    else:
+        longest_px = max(map(abs, blobs.streak_px))
+        if abs(blobs.turn_rad) > largest_turn_rad or longest_px > MAX_STREAK_PX:
             return blobs
         # The bright blobs have revealed the streak: detect again with the filter along it.
         along = FramePriors(blobs.streak_px, priors.saturation, blobs.turn_rad)
-        streaks = classify.classify(
-            image, detect_streaks(image, background, threshold_sigma, max_blobs, along), along
-        )
-        return in_full_length(image, streaks, threshold_sigma, max_blobs, priors)
-    streaks = detect_streaks(image, background, threshold_sigma, max_blobs, priors)
-    return classify.classify(image, streaks, priors)
+        streaks = _classified_streaks(image, background, threshold_sigma, max_blobs, along)
+    # 4. Longer filters
+    return in_full_length(image, streaks, threshold_sigma, max_blobs, priors)
+
+
+def _classified_streaks(
+    image: NDArray,
+    background: Background,
+    threshold_sigma: float,
+    max_blobs: int,
+    along: FramePriors,
+) -> Blobs:
+    """Return the blobs with their flags, detected with the filter along a streak."""
+    streaks = detect_streaks(image, background, threshold_sigma, max_blobs, along)
+    return classify.classify(image, streaks, along)
 
 
 def _stars_first(blobs: Blobs, max_blobs: int) -> Blobs:
-    """At most `max_blobs` blobs: the brightest that may be stars, and of the others as many as there is room for."""
+    """Return at most `max_blobs` blobs: the brightest that may be stars, and as many others as there is room for."""
     if len(blobs) <= max_blobs:
         return blobs
     star = blobs.flag & classify.NO_STAR == 0
     kept = star & (np.cumsum(star) <= max_blobs)
-    return blobs.take(kept | (~star & (np.cumsum(~star) <= max_blobs - np.count_nonzero(kept))))
+    room = max_blobs - np.count_nonzero(kept)
+    return blobs.take(kept | (~star & (np.cumsum(~star) <= room)))
 
 
 def local(
@@ -173,7 +188,12 @@ def thesis(
     """Detect blobs of at least 50 pixels above 4 % of full scale (Padro 2012, sections 3.4.1.3 and 3.5).
 
     Full scale is the saturation in the priors, otherwise the maximum of the integer type. `threshold_sigma` and
-    `min_area_px` are ignored: the thesis has two fixed thresholds. Raises ImageError for floats of unknown scale.
+    `min_area_px` are ignored: the thesis has two fixed thresholds.
+
+    Raises
+    ------
+    ImageError
+        For an image that cannot be used, and for floats of unknown scale.
     """
     check_pixel_type(image)
     pixel = image.dtype
@@ -201,7 +221,7 @@ def sequential(
     max_blobs: int = 200,
     priors: FramePriors = NO_PRIORS,
 ) -> Blobs:
-    """SHEFEX-2's sequential scan: one pass over the frame that inserts each object found into a sorted table.
+    """Detect by SHEFEX-2's sequential scan: one pass over the frame that inserts each object into a sorted table.
 
     The table holds the `max_blobs` brightest objects so far. An object is a set of eight-connected pixels above a
     global threshold, sky + `threshold_sigma` times a raw pixel's noise (reference: the SHEFEX-2 paper, fig. 3 right).
@@ -216,7 +236,10 @@ def maximum(
     max_blobs: int = 200,
     priors: FramePriors = NO_PRIORS,
 ) -> Blobs:
-    """SHEFEX-2's alternative scan: search the whole frame for its largest pixel, once per object (fig. 3 left)."""
+    """Detect by SHEFEX-2's alternative scan: search the whole frame for its largest pixel, once per object.
+
+    The source is the SHEFEX-2 paper, fig. 3 left.
+    """
     return _scan(maximum_scan, image, threshold_sigma, min_area_px, max_blobs)
 
 
@@ -243,11 +266,12 @@ def prepare_image(
 
 
 def check_image(image: NDArray) -> None:
-    """Raise ImageError with one line unless the image is a finite, non-constant (H, W) array of real numbers."""
+    """Raise ImageError unless the image is a finite, non-constant (H, W) array of real numbers."""
     check_pixel_type(image)
     if image.ndim != 2:
         raise ImageError(f"an image of shape {image.shape}; allowed: monochrome, (height, width)")
     check_size(image)
+    # A sample of the pixels is quicker than all of them.
     some = image[::97, ::89]
     if image.dtype.kind != "f" and some.min() != some.max():
         return  # integers are finite, and the sample shows that the image is not constant
@@ -275,8 +299,8 @@ def to_native(image: NDArray) -> NDArray:
     """Convert the image, without loss, to one of the three types for which the loops are compiled.
 
     uint16 stays as it is; uint8 and masks become uint16, other integers int32 if their values fit, all else float64.
-    Each further type, order of the axes or protection would cost its user half a minute of compilation. FITS files are
-    big-endian, loops are native.
+    For each further type, order of the axes or byte order the loops would be compiled again, for half a minute; FITS
+    files, for example, are big-endian.
     """
     kind = image.dtype.kind
     size = image.itemsize
@@ -290,10 +314,14 @@ def to_native(image: NDArray) -> NDArray:
 
 
 def in_row_order(image: NDArray) -> NDArray:
-    """The image as compiled loops take it, row by row in native bytes, with its own type; a copy only if needed.
+    """Return the image as compiled loops need it: rows in order, native bytes, its own type; a copy only if needed.
 
-    A frame is put in order once, before the stages of which each would do it again. Raises ImageError for what holds no
-    real numbers.
+    The caller converts a frame once, before the stages that would each do it again.
+
+    Raises
+    ------
+    ImageError
+        For an array that holds no real numbers.
     """
     check_pixel_type(image)
     return native("the image", image, image.dtype.newbyteorder("="))
@@ -311,7 +339,12 @@ def replace_bad_pixels(image: NDArray, bad_px: Ints) -> NDArray:
     """Return a copy of the image with each bad pixel, (K, 2) x and y, replaced by the median of its good neighbors.
 
     The map comes from dark frames taken on the ground. The neighbors are those within one pixel, otherwise within two;
-    without any good one the pixel gets the frame's median. Raises ImageError for a map beyond the frame.
+    without any good one the pixel gets the frame's median.
+
+    Raises
+    ------
+    ImageError
+        For a map that reaches beyond the frame.
     """
     repaired = image.copy()
     height, width = image.shape
@@ -319,6 +352,7 @@ def replace_bad_pixels(image: NDArray, bad_px: Ints) -> NDArray:
     if len(x) and not (x.min() >= 0 and x.max() < width and y.min() >= 0 and y.max() < height):
         raise ImageError(f"the bad-pixel map reaches beyond the frame of {width}x{height} pixels")
     bad = set(zip(x.tolist(), y.tolist(), strict=True))
+    # A wider neighborhood only if the near one has no good pixel
     for column, row in bad:
         for reach in (1, 2):
             good = [
@@ -351,9 +385,10 @@ def detect_blobs(
     """Detect blobs more than `above` (on the background's grid) over the level, and return the brightest.
 
     With `grow_sigma` a blob extends down to that many sigma. It is accepted if `min_area_px` of its pixels exceed
-    `above`, or if its flux is significant: flux / (pixel noise sqrt(area)) at least one more than the threshold in
+    `above`, or if its flux is significant: flux / (pixel noise sqrt(area)) is at least one more than the threshold in
     sigma.
     """
+    # Connected pixels above the lower threshold; pixels above the higher one are counted.
     strong_level = background.level + above
     grow_level = strong_level
     if grow_sigma is not None:
@@ -362,16 +397,10 @@ def detect_blobs(
     boxes, sums = accumulate_blobs(image, background.level, strong_level, runs, *label_runs(runs))
     if grow_sigma is None:
         return _to_blobs(boxes, sums, min_area_px, max_blobs, background)
-    min_flux_per_root_px = (median(above) + median(background.noise)) / FILTERED_NOISE
-    return _to_blobs(
-        boxes,
-        sums,
-        min_area_px,
-        max_blobs,
-        background,
-        max(min_area_px, MIN_GROWN_PX),
-        min_flux_per_root_px,
-    )
+    # The threshold plus one sigma, in units of the image for one raw pixel
+    min_flux = (median(above) + median(background.noise)) / FILTERED_NOISE
+    grown_px = max(min_area_px, MIN_GROWN_PX)
+    return _to_blobs(boxes, sums, min_area_px, max_blobs, background, grown_px, min_flux)
 
 
 def detect_streaks(
@@ -388,22 +417,21 @@ def detect_streaks(
     size of the streak.
     """
     assert priors.streak_px is not None
+    # Threshold in units of the noise after both filters
     taps = line_taps(priors.streak_px)
     above = threshold_sigma * noise_factor(taps) / FILTERED_NOISE * background.noise
-    runs = runs_above(image, background.level + above, taps)
-    boxes, sums = accumulate_blobs(
-        image, background.level, background.level + above, runs, *label_runs(runs)
-    )
+    limit = background.level + above
+    runs = runs_above(image, limit, taps)
+    boxes, sums = accumulate_blobs(image, background.level, limit, runs, *label_runs(runs))
     blobs = _to_blobs(
         boxes, sums, MIN_STREAK_AREA_PX, max_blobs, background, MIN_STREAK_AREA_PX, 0.0
     )
+    # Boxes of the streak's size
     half = np.abs(priors.streak_px) / 2 + 1
-    center_px = blobs.xy_px
     edge = np.array(image.shape[::-1]) - 1
-    box = np.concatenate(
-        [np.clip(center_px - half, 0, edge), np.clip(center_px + half, 0, edge)], axis=1
-    )
-    blobs.box_px[:] = np.rint(box)
+    low = np.clip(blobs.xy_px - half, 0, edge)
+    high = np.clip(blobs.xy_px + half, 0, edge)
+    blobs.box_px[:] = np.rint(np.concatenate([low, high], axis=1))
     return blobs
 
 
@@ -414,51 +442,52 @@ def detect_faint_streaks(
     max_blobs: int,
     priors: FramePriors,
 ) -> Blobs:
-    """Search for streaks without a prior: return the blobs of the line filter, out of DIRECTIONS, that finds most.
+    """Search for streaks without a prior: return the blobs of that line filter, out of DIRECTIONS, that finds most.
 
     Taking the best of several directions increases the number of false detections; the threshold is therefore raised
     by half a sigma.
     """
     candidates = []
     for angle in np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
-        streak_px = (
-            SEARCH_LENGTH_PX * float(np.cos(angle)),
-            SEARCH_LENGTH_PX * float(np.sin(angle)),
-        )
-        along = FramePriors(streak_px, priors.saturation)
-        candidates.append(
-            detect_streaks(image, background, threshold_sigma + 0.5, max_blobs, along)
-        )
+        x = SEARCH_LENGTH_PX * float(np.cos(angle))
+        y = SEARCH_LENGTH_PX * float(np.sin(angle))
+        along = FramePriors((x, y), priors.saturation)
+        found = detect_streaks(image, background, threshold_sigma + 0.5, max_blobs, along)
+        candidates.append(found)
     return max(candidates, key=len)
 
 
 def in_full_length(
     image: NDArray, found: Blobs, threshold_sigma: float, max_blobs: int, priors: FramePriors
 ) -> Blobs:
-    """Streaks, detected with longer and longer filters as long as the streak that they share grows.
+    """Return the streaks detected with longer and longer filters, as long as the streak that they share grows.
 
     Noise breaks a long faint streak into pieces with centers anywhere along it, so that a frame's first streak is too
-    short; pieces of streaks that the border cuts off do not touch it. A longer filter finds longer pieces. The last
-    detection is with the filter of the last streak, since a longer one joins neighbors.
+    short; pieces of streaks that the border cuts off do not touch it. A longer filter finds longer pieces.
+
+    1. Detect with a filter LONGER times the last streak.
+    2. Classify the blobs without a prior, which gives a new streak; stop unless that is LENGTHENED.
+    3. Detect with the filter of the last streak, since a longer one joins neighbors.
     """
     first = found
     while found.streak_px is not None:
+        # 1. Longer filter
         length_px = np.hypot(*found.streak_px)
         x, y = LONGER * np.array(found.streak_px)
         if length_px < SHORTEST_PX or max(abs(x), abs(y)) > MAX_GROWN_PX:
             break
         longer = FramePriors((float(x), float(y)), priors.saturation, found.turn_rad)
         again = detect_streaks(image, found.background, threshold_sigma, max_blobs, longer)
+        # 2. New streak
         again = classify.classify(image, again, priors)
         if again.streak_px is None or np.hypot(*again.streak_px) <= LENGTHENED * length_px:
             break
         found = again
     if found is first:
         return found
+    # 3. Last detection
     along = FramePriors(found.streak_px, priors.saturation, found.turn_rad)
-    return classify.classify(
-        image, detect_streaks(image, found.background, threshold_sigma, max_blobs, along), along
-    )
+    return _classified_streaks(image, found.background, threshold_sigma, max_blobs, along)
 
 
 def line_taps(streak_px: tuple[float, float]) -> Ints:
@@ -469,7 +498,10 @@ def line_taps(streak_px: tuple[float, float]) -> Ints:
 
 
 def noise_factor(taps: Ints) -> float:
-    """Return the factor by which the binomial filter and the mean over the taps reduce the deviation of white noise."""
+    """Return the factor by which the binomial filter and the mean over the taps reduce the deviation of white noise.
+
+    It is the root of the sum of squares of the combined kernel.
+    """
     reach = int(np.abs(taps).max()) + 1
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
     binomial = np.outer([1, 2, 1], [1, 2, 1]) / 16 / len(taps)
@@ -487,6 +519,7 @@ def _scan(
 ) -> Blobs:
     """Run one of SHEFEX's scans and convert its table to Blobs."""
     image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
+    # One level for the frame, and the noise of a raw pixel
     flat = flat_background(estimate_background(image), image.shape)
     level = float(flat.level[0, 0])
     noise = float(flat.noise[0, 0]) / FILTERED_NOISE

@@ -1,9 +1,9 @@
 """SHEFEX-2's two scans of a frame: one sequential pass with a sorted table, or a repeated search for the maximum.
 
-Both scans threshold the raw pixels at one level for the frame and collect each object by flood fill. The sequential
-scan passes over the frame once and inserts each object into a table sorted by brightness, which keeps the brightest.
-The maximum scan looks for the greatest pixel of the whole frame, takes its object away, and begins again: one pass for
-each object.
+Both scans threshold the raw pixels at one level for the frame and collect each object by flood fill (the SHEFEX-2
+paper, fig. 3). The sequential scan passes over the frame once and inserts each object into a table sorted by
+brightness, which keeps the brightest. The maximum scan searches the largest pixel of the whole frame, removes its
+object, and begins again: one pass for each object.
 """
 
 from __future__ import annotations
@@ -22,8 +22,11 @@ def sequential_scan(
 ) -> tuple[Ints, Floats]:
     """Return boxes (N, 4) and sums (N, SUMS) of the N <= table_size brightest objects, brightest first.
 
-    One raster pass. Each pixel above the threshold that does not belong to an object yet starts a new one: all pixels
-    connected to it are summed, and the object is inserted into the table by intensity; the faintest one drops out.
+    In one raster pass, for each pixel above the threshold that does not belong to an object yet:
+
+    1. Sum all pixels connected to it: a new object.
+    2. Skip it if it is too small, or fainter than all objects of a full table.
+    3. Insert it into the table by intensity; the faintest one drops out.
     """
     height, width = image.shape
     assigned = np.zeros(image.shape, np.uint8)
@@ -37,11 +40,14 @@ def sequential_scan(
         for x in range(width):
             if image[y, x] <= threshold or assigned[y, x]:
                 continue
+            # 1. Object
             _flood_fill(image, level, threshold, y, x, assigned, stack, box, object_sums)
+            # 2. Size and brightness
             if object_sums[AREA] < min_area_px or (
                 count == table_size and object_sums[FLUX] <= sums[count - 1, FLUX]
             ):
                 continue
+            # 3. Table
             count = _insert(boxes, sums, count, box, object_sums)
     return boxes[:count], sums[:count]
 
@@ -50,10 +56,10 @@ def sequential_scan(
 def maximum_scan(
     image: NDArray, level: float, threshold: float, min_area_px: int, table_size: int
 ) -> tuple[Ints, Floats]:
-    """As `sequential_scan`, but search the whole frame for the largest remaining pixel before each object.
+    """Scan as `sequential_scan`, but search the whole frame for the largest remaining pixel before each object.
 
-    Ends when that pixel is below the threshold or the table is full; the table then holds the objects with the highest
-    peaks.
+    The scan ends when that pixel is below the threshold or the table is full; the table then holds the objects with the
+    highest peaks.
     """
     height, width = image.shape
     assigned = np.zeros(image.shape, np.uint8)
@@ -64,6 +70,7 @@ def maximum_scan(
     object_sums = np.empty(SUMS)
     count = 0
     while count < table_size:
+        # Largest pixel that belongs to no object yet
         top = threshold
         top_y = -1
         top_x = -1
@@ -95,7 +102,7 @@ def _flood_fill(
 ) -> None:
     """Sum all pixels above the threshold connected to (y, x) by sides or corners, and mark them in `assigned`.
 
-    The paper's recursive centroiding as a flood fill with an explicit stack instead of recursion.
+    This is the paper's recursive centroiding with an explicit stack instead of recursion.
     """
     height, width = image.shape
     box[0] = x
@@ -104,6 +111,7 @@ def _flood_fill(
     box[3] = y
     object_sums[:] = 0.0
     object_sums[PEAK] = -np.inf
+    # The stack holds pixels that are assigned but not summed yet.
     stack[0, 0] = y
     stack[0, 1] = x
     assigned[y, x] = 1
@@ -120,6 +128,7 @@ def _flood_fill(
         object_sums[PEAK] = max(object_sums[PEAK], float(image[v, u]))
         box[0], box[1] = min(box[0], u), min(box[1], v)
         box[2], box[3] = max(box[2], u), max(box[3], v)
+        # Its eight neighbors, inside the image
         for b in range(max(v - 1, 0), min(v + 2, height)):
             for a in range(max(u - 1, 0), min(u + 2, width)):
                 if image[b, a] > threshold and not assigned[b, a]:
@@ -131,7 +140,8 @@ def _flood_fill(
 
 @jit
 def _insert(boxes: Ints, sums: Floats, count: int, box: Ints, object_sums: Floats) -> int:
-    """Insert an object into the table by intensity; return the number of objects it then holds."""
+    """Insert an object into the table by intensity; return the number of objects in it."""
+    # Move the fainter objects down; the last of a full table drops out.
     k = min(count, len(sums) - 1)
     while k > 0 and sums[k - 1, FLUX] < object_sums[FLUX]:
         sums[k] = sums[k - 1]

@@ -1,7 +1,9 @@
 """Detection in windows: search for blobs only where stars are expected, without processing the rest of the frame.
 
-Used in tracking mode. In each window the largest filtered value in units of the local noise is the peak; a flood fill
-around it collects the connected pixels above 3 sigma.
+It is used in tracking mode. For each window:
+
+1. Find the peak: the largest filtered value above the sky, in units of the local noise (`_brightest`).
+2. Collect the connected pixels above 3 sigma around it by flood fill (`_grow`).
 """
 
 from __future__ import annotations
@@ -29,14 +31,19 @@ def in_windows(
     """Detect the brightest blob of each window with a peak `threshold_sigma` above the local sky; brightest first.
 
     A blob is the set of eight-connected pixels above 3 sigma of the 3x3-filtered image around its peak; it may extend
-    beyond its window. A blob found in two windows is returned once. Raises ImageError for an image that cannot be used.
+    beyond its window. A blob found in two windows is returned once.
 
     Parameters
     ----------
     image
-        (H, W) real
+        (H, W) real numbers
     center_px
         (N, 2) centers of square windows of half-width `half_px`
+
+    Raises
+    ------
+    ImageError
+        For an image that cannot be used.
     """
     image = prepare_image(image)
     # The background is a sparse sample of the frame; only the windows are read in full.
@@ -45,14 +52,12 @@ def in_windows(
     noise = background.noise
     rows = np.ascontiguousarray(center_px, dtype=float)
     boxes, sums, count = _brightest(image, rows, half_px, level, noise, threshold_sigma)
-    boxes = boxes[:count]
-    sums = sums[:count]
-    order = np.argsort(-sums[:, 1], kind="stable")
-    boxes = boxes[order]
+    # Brightest first
+    order = np.argsort(-sums[:count, 1], kind="stable")
     sums = sums[order]
     flux = sums[:, 1]
     blobs = Blobs(
-        boxes,
+        boxes[order],
         sums[:, 2:4] / flux[:, None],
         flux,
         sums[:, 4],
@@ -72,9 +77,9 @@ def _brightest(
     noise: Floats,
     threshold_sigma: float,
 ) -> tuple[Ints, Floats, int]:
-    """Return boxes (N, 4), sums (N, 5: area, flux, flux x, flux y, peak) and the number of blobs."""
+    """Return boxes (N, 4), sums (N, 5: area, flux, flux x, flux y, peak) and the number of blobs in the first rows."""
     height, width = image.shape
-    # bounds of the interpolated sky: most pixels need no more
+    # Lower bounds of the interpolated sky and noise, which suffice to reject most pixels.
     darkest = level.min()
     least = max(noise.min(), 1e-12)
     boxes = np.empty((len(center_px), 4), np.int64)
@@ -83,6 +88,7 @@ def _brightest(
     for n in range(len(center_px)):
         x0, x1 = _span(center_px[n, 0], half_px, width)
         y0, y1 = _span(center_px[n, 1], half_px, height)
+        # 1. Peak
         best = threshold_sigma
         at_x = -1
         at_y = -1
@@ -102,6 +108,7 @@ def _brightest(
         for m in range(count):
             inside = boxes[m, 0] <= at_x <= boxes[m, 2] and boxes[m, 1] <= at_y <= boxes[m, 3]
             new = new and not inside
+        # 2. Connected pixels
         if new:
             _grow(image, at_x, at_y, level, noise, boxes[count], sums[count])
             count += sums[count, 1] > 0
@@ -122,8 +129,9 @@ def _span(middle_px: float, half_px: float, size: int) -> tuple[int, int]:
 def _grow(
     image: NDArray, x: int, y: int, level: Floats, noise: Floats, box: NDArray, total: NDArray
 ) -> None:
-    """Sum the pixels connected to a peak by flood fill; stops at 4096 pixels."""
+    """Sum the pixels connected to a peak into `box` and `total` by flood fill, up to 4096 pixels."""
     height, width = image.shape
+    # Pixels to be summed, and all pixels that have ever been among them
     stack = [(x, y)]
     visited = {(x, y)}
     box[0] = x
@@ -141,6 +149,7 @@ def _grow(
         total[4] = max(total[4], float(image[py, px]))
         box[0], box[1] = min(box[0], px), min(box[1], py)
         box[2], box[3] = max(box[2], px), max(box[3], py)
+        # Its eight neighbors, inside the image
         for qy in range(max(py - 1, 0), min(py + 2, height)):
             for qx in range(max(px - 1, 0), min(px + 2, width)):
                 if (qx, qy) in visited:

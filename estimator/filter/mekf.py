@@ -7,7 +7,14 @@ its unit norm and the covariance is not singular. The equations are in the docst
 
 Solutions arrive late. The filter therefore keeps its recent history: the states after the solutions used, and the gyro
 samples since. A late solution is applied to the state at its own time, and the later samples and solutions are applied
-again.
+again. One update (`AttitudeFilter.update`) is:
+
+1. Find the state before the solution's time, and propagate it to that time.
+2. Compute the innovation: residual and Mahalanobis distance.
+3. Inside the gate: correct the state by Schmidt's update.
+4. Outside the gate: refuse the solution, unless it and earlier refused ones agree and the odds are that the filter is
+   wrong; then adopt it.
+5. Repeat the later solutions, and propagate the last state to the present.
 
 Sources: Farrenkopf 1978 (J. Guidance & Control 1, 282) for the gyro's noise; Lefferts, Markley & Shuster 1982 (J.
 Guidance 5, 417) for the six-state filter; Crassidis & Junkins, Optimal Estimation of Dynamic Systems, chapter 7, for
@@ -61,9 +68,9 @@ OUTSIDE_GATE = "refused: outside the gate"
 DISPUTED = "refused: solutions agree, but the gyros missed nothing"
 TOO_OLD = "refused: older than the filter remembers"
 
-# Duration of the history of samples and solutions; at least half of it is kept. `assumed`: some frames.
+# Duration of the history of samples and solutions; at least half of it is kept (`assumed`: some frames).
 HISTORY_S = 10.0
-# A solution's time may be ahead of the last gyro sample by this much, for rounding.
+# Rounding by which a solution's time may be later than the last gyro sample.
 ROUNDING_S = 1e-9
 
 
@@ -80,13 +87,14 @@ class Update:
     residual_rad
         (3,) rotation vector in body axes from the filter's attitude to the solution's
     distance
-        Mahalanobis distance of the residual, the root of a chi-square with 3 degrees of
-        freedom, or less with a systematic error
+        Mahalanobis distance of the residual: the root of a chi-square with 3 degrees of freedom,
+        or less with a systematic error
     agreeing
         Number of solutions outside the gate in a row that agree with this one, itself included;
         0 if used
     log_odds
-        natural-log odds that the filter is wrong and not these solutions (`jumps`); NaN if used
+        Natural-log odds that the filter is wrong and not these solutions
+        (`consistency.log_odds`); NaN if used
     """
 
     status: str
@@ -97,9 +105,17 @@ class Update:
 
 
 class _Segment(NamedTuple):
-    """History from one used solution to the next: the state after it, the gyro samples since, and the solution.
+    """History from one used solution to the next.
 
-    The solution of the oldest segment is not applied again, and is None if it begins between two solutions.
+    Attributes
+    ----------
+    state
+        State after the solution
+    samples
+        (M, 5) gyro samples since, rows as of `states.advance`
+    solution
+        The solution; None for the oldest segment if that begins between two solutions. The oldest
+        segment's solution is not applied again
     """
 
     state: MekfState
@@ -110,28 +126,29 @@ class _Segment(NamedTuple):
 class AttitudeFilter:
     """Attitude filter of a star tracker: the attitude as a quaternion, its error e as a small rotation in body axes.
 
-    With ref_from_body = estimate exp(e), a gyro sample a in the interval T is the rotation p = A (a - T b) with
-    A = (I + M)^-1, bias b and matrix M of scale factors and misalignments (GyroModel), and gives
+    Let ref_from_body = estimate exp(e). With A = (I + M)^-1, the bias b and the matrix M of scale factors and
+    misalignments (GyroModel), a gyro sample a in the interval T is the rotation p = A (a - T b). It gives
 
         e+ = exp(-[p]) e - J(p) A (T db + dM p + noise),      db+ = exp(-T / bias_time) db + noise,
-        J(p) = 1 - (1 - cos p) / p^2 [p] + (p - sin p) / p^3 [p]^2,
+        J(p) = I - (1 - cos p) / p^2 [p] + (p - sin p) / p^3 [p]^2,
 
     and Farrenkopf's process noise with v = arw, u^2 = 2 bias^2 / bias_time: v^2 T + u^2 T^3 / 3 in the angle,
     -u^2 T^2 / 2 in the cross-covariance, u^2 T in the bias. Each sample is propagated separately (1 us each,
     compiled), so the result does not depend on how the samples are divided among calls.
 
-    Considered states (Schmidt 1966). Their uncertainty is in the covariance and in the gain; their value stays 0 and
-    their variance as it was. So a state that the data hardly shows cannot take up other errors.
+    Considered states (Schmidt 1966). Their uncertainty is in the covariance and in the gain; their values stay 0 and
+    their variances as they were. A state that the data hardly determines can then not absorb other errors.
 
     Systematic errors. An error that many solutions share (of a survey, of distortion) does not average out: the
     filter's attitude tends to it. It is the considered state "systematic": a slow error whose covariance is the
     solution's own `systematic_rad2` plus that of TrackerModel. The covariance of the attitude then tends to it too, for
-    any number of solutions. A constant one cannot be seen in the residuals, so the filter has to be given its size.
+    any number of solutions. A constant error has no effect on the residuals, so the filter must receive its size.
 
-    Several heads. Each solution is truth exp(o_n + v), as above, with the offset o_n = m_0 + m_n + L slow_n of head n
-    and m_n, its mounting relative to that of the first head, estimated. At rest the solutions show only m_n, so m_0 is
-    considered. Where the body turns about more than one axis and the gyro is accurate, they show m_0 too, the rotation
-    of the first head relative to the gyro's axes: it is estimated if `considered` is without "mounting".
+    Several heads. Each solution is truth exp(o_n + v) (`correct.innovation`). The offset of head n is
+    o_n = m_0 + m_n + L slow_n, where m_0 is the mounting of the first head and m_n that of head n relative to it. The
+    filter estimates m_n. At rest the solutions determine only m_n, so m_0 is considered. Where the body rotates about
+    more than one axis and the gyro is accurate, they also determine m_0, the rotation of the first head relative to the
+    gyro's axes: the filter estimates it if `considered` is without "mounting".
 
     Saturation. While the gyro is at its rate limit, the true rate can be anything above it. The rate error is assumed
     constant throughout the saturation, with a standard deviation on each axis as large as the measured rate
@@ -146,15 +163,16 @@ class AttitudeFilter:
     order.
 
     Gate. A wrong solution is worse than none, so an improbable one is refused and changes nothing. But a filter whose
-    own state is wrong would refuse correct solutions forever. So refused solutions that agree with each other (each
-    propagated to the next by the gyro, within the gate of their own covariances and the gyro's) are weighed against the
-    filter (`jumps.log_odds`): could the gyros have missed this motion, or was the filter wrong before? If three or more
-    agree and the odds are 100 to 1, the filter adopts the last of them with its covariance. The bias is kept, but its
-    variance is increased by the initial variance, as a wrong bias may have been the cause. After a saturation, an
-    outage or a shock, or for a start that no solution has confirmed, three are enough. Against a filter that many
-    solutions confirmed and a gyro that missed nothing, it takes dozens; meanwhile the status is DISPUTED.
+    own state is wrong would refuse correct solutions forever. Refused solutions that agree with each other (each
+    propagated to the next by the gyro, within the gate of their own covariances and the gyro's) are therefore weighed
+    against the filter (`consistency.log_odds`): could the gyros have missed this motion, or was the filter wrong
+    before? If three or more agree and the odds are 100 to 1, the filter adopts the last of them with its covariance.
+    The bias is kept, but its variance is increased by the initial variance, as a wrong bias may have been the cause.
+    After a saturation, an outage or a shock, or for a start that no solution has confirmed, three are enough. Against a
+    filter that many solutions confirmed and a gyro that missed nothing, dozens are needed; meanwhile the status is
+    DISPUTED.
 
-    Attributes
+    Parameters
     ----------
     gyro
         Error model of the gyro
@@ -163,15 +181,17 @@ class AttitudeFilter:
     sigma_attitude_rad, sigma_bias_rad_s
         Standard deviations at the start, one number or (3,) in body axes
     floor_rad
-        Added in quadrature to every solution's noise, for what its stars share and no other
-        solution
+        Standard deviation that is added in quadrature to every solution's noise, for errors that
+        its stars share but other solutions do not
     gate_sigma
         A solution is refused if its distance is less probable than so many sigma of a scalar
         Gaussian
-    tracker, jumps
-        Errors that solutions share; wrong solutions and missed motions
+    tracker
+        Errors that solutions share
+    jumps
+        Probabilities of wrong solutions and of missed motions
     considered
-        Names of the states that are considered and not estimated, of "bias", "scale",
+        Names of the states that are considered and not estimated, out of "bias", "scale",
         "misalignment", "mounting", "systematic"
     heads
         Number of star cameras on the body, each with its own mounting and slow error
@@ -202,6 +222,7 @@ class AttitudeFilter:
         self._gate = float(chdtri(3, chdtrc(1, not_negative("gate_sigma", gate_sigma) ** 2)))
         self._layout = build_layout(gyro, self._tracker, considered, heads)
         self._heads = heads
+        # Standard deviations at the start; the slow error is normalized.
         sigma_bias = not_negative("sigma_bias_rad_s", sigma_bias_rad_s) * np.ones(3)
         sigmas: dict[str, ArrayLike] = {
             "attitude": not_negative("sigma_attitude_rad", sigma_attitude_rad) * np.ones(3),
@@ -213,20 +234,18 @@ class AttitudeFilter:
         }
         self._initial_bias_variance = sigma_bias**2
         self._current = start_state(float(t_s), wxyz_of(body_from_ref), sigmas, self._layout)
-        self._segments = [
-            _Segment(self._current, np.empty((0, 5)), None)
-        ]  # rows of checked_samples
-        self._refused: list[
-            tuple[MekfState, AttitudeFix]
-        ] = []  # in a row, each agrees with the one before
+        self._segments = [_Segment(self._current, np.empty((0, 5)), None)]
+        # Consecutive refused solutions, each of which agrees with the one before, and the states before them.
+        self._refused: list[tuple[MekfState, AttitudeFix]] = []
         self._measured_rad_s = np.zeros(3)
 
     @property
     def state(self) -> FilterState:
-        """Attitude, bias, the gyro's and the mount's errors, and their covariance after the last gyro sample."""
+        """Attitude, bias, errors of the gyro and the mounting, and their covariance, after the last gyro sample."""
         state = self._current
         slices = self._layout.reported
         size = max(rows.stop for rows in slices.values())
+        # Attitude and bias are the first six states.
         return FilterState(
             state.t_s,
             state.body_from_ref,
@@ -237,11 +256,12 @@ class AttitudeFilter:
 
     @property
     def body_from_ref(self) -> Rotation:
+        """Attitude after the last gyro sample."""
         return self._current.body_from_ref
 
     @property
     def ref_from_body_wxyz(self) -> Floats:
-        """(4,) quaternion of the inverse of body_from_ref, scalar first, as stored: for callers in every tick."""
+        """(4,) quaternion of ref_from_body, scalar first, as stored: quick enough for callers in every tick."""
         return self._current.ref_from_body_wxyz
 
     @property
@@ -251,8 +271,8 @@ class AttitudeFilter:
 
     @property
     def rate_rad_s(self) -> Floats:
-        """(3,) measured rate less the gyro's errors, in body axes: the mean over the last call's samples; 0 before."""
-        rate = self._measured_rad_s - self._current.values[3:6]
+        """(3,) rate in body axes, corrected for the gyro's errors: the mean over the last call's samples; 0 before."""
+        rate = self._measured_rad_s - self.bias_rad_s
         return inverse_response(self._current.values, self._layout.columns) @ rate
 
     def propagate(
@@ -273,8 +293,8 @@ class AttitudeFilter:
         saturated
             (N,) whether the gyro was at its rate limit
         missing
-            (N,) whether there is no sample (an outage) and its angle is a guess, NaN for 0;
-            None: never
+            (N,) whether the sample is missing (an outage): its angle is then a guess, NaN for 0;
+            None: none is missing
 
         Raises
         ------
@@ -286,6 +306,7 @@ class AttitudeFilter:
         samples = checked_samples(start_s, t_s, angle_rad, saturated, missing, self._gyro)
         self._current = self._propagate_state(self._current, samples)
         self._measured_rad_s = samples[:, 1:4].sum(axis=0) / (samples[-1, 0] - start_s)
+        # The samples belong to the history since the last solution.
         last = self._segments[-1]
         self._segments[-1] = last._replace(samples=np.concatenate([last.samples, samples]))
         self._trim_history(float(samples[-1, 0]) - HISTORY_S)
@@ -298,14 +319,18 @@ class AttitudeFilter:
         systematic_rad2: ArrayLike | None = None,
         head: int = 0,
     ) -> Update:
-        """Apply a star tracker's solution for the current or a past time, then repropagate from there to the present.
+        """Apply a star tracker's solution for the current or a past time: the numbered steps of the module.
 
         Parameters
         ----------
+        t_s
+            Time of the solution
+        body_from_ref_measured
+            Attitude of the solution
         covariance_rad2
-            (3, 3) of the small rotation error of the solution, in body axes
+            (3, 3) covariance of the solution's small rotation error, in body axes
         systematic_rad2
-            (3, 3) the part of it that is common to successive solutions; None for 0
+            (3, 3) part of the covariance that is common to successive solutions; None for 0
         head
             Number of the star camera, from 0
 
@@ -313,7 +338,7 @@ class AttitudeFilter:
         ------
         ValueError
             For a covariance that is not symmetric and positive definite, a systematic part that
-            is not less, a head that there is not, or a time after the last sample.
+            is not less, an unknown head, or a time after the last sample.
         """
         checks.one_rotation("update: body_from_ref_measured", body_from_ref_measured)
         t_s = checks.number("update: t_s", t_s, -math.inf, math.inf, "a time in seconds")
@@ -327,24 +352,22 @@ class AttitudeFilter:
             )
         if t_s < self._segments[0].state.t_s:
             return Update(TOO_OLD, np.full(3, np.nan), math.nan)
-        # Find the segment that contains t_s, and propagate its state to that time.
-        k = next(
-            k for k in reversed(range(len(self._segments))) if self._segments[k].state.t_s <= t_s
-        )
+        # 1. Find the segment that contains t_s, and propagate its state to that time.
+        k = max(k for k, segment in enumerate(self._segments) if segment.state.t_s <= t_s)
         segment = self._segments[k]
         before, after = _split(segment.samples, segment.state.t_s, min(float(t_s), now_s))
         prior = self._prior(segment.state, before)
+        # 2. Innovation
         found = innovation(prior, solution, self._layout)
         update = Update(USED, found.residual_rad, math.sqrt(found.distance2))
         if found.distance2 <= self._gate:
-            # Split the segment at the solution, then repeat the later solutions from the corrected state.
+            # 3. Correct the state and split the segment at the solution; 5. repeat the later solutions.
             corrected = correct(prior, found, self._layout)
-            self._segments[k : k + 1] = [
-                segment._replace(samples=before),
-                _Segment(corrected, after, solution),
-            ]
+            first = segment._replace(samples=before)
+            self._segments[k : k + 1] = [first, _Segment(corrected, after, solution)]
             self._replay(k + 1)
         else:
+            # 4. Refuse the solution, or adopt it.
             shock = shock_rad(segment.state.t_s, before, self._gyro.arw_rad_sqrt_s)
             update = self._weigh(prior._replace(lost_rad=prior.lost_rad + shock), solution, update)
             if update.status != RESET:
@@ -355,6 +378,7 @@ class AttitudeFilter:
                 prior, solution, self._layout, self._initial_bias_variance, update.agreeing
             )
             self._segments = [_Segment(adopted, rest, None)]
+        # 5. Propagate to the present.
         self._refused = []
         self._current = self._propagate_state(self._segments[-1].state, self._segments[-1].samples)
         return update
@@ -366,53 +390,51 @@ class AttitudeFilter:
         systematic_rad2: ArrayLike | None,
         head: int,
     ) -> AttitudeFix:
-        """The solution with the filter's floor and systematic error added to its covariances, after checks."""
+        """Check a solution's covariances, and return it with the filter's floor and systematic error added to them."""
         noise, systematic = checked_covariances(total_rad2, systematic_rad2)
         unit = np.eye(3)
         common = systematic + self._tracker.systematic_rad**2 * unit
         return AttitudeFix(body_from_ref, noise + self._floor_rad2 * unit, common, head)
 
     def _weigh(self, prior: MekfState, solution: AttitudeFix, update: Update) -> Update:
-        """The update by a solution outside the gate: refused, or a reset if the filter is probably wrong."""
+        """Return the update by a solution outside the gate: refused, or a reset if the filter is probably wrong."""
+        # Extend the series of agreeing solutions, or begin a new one.
         if self._refused and not self._agrees(prior, solution):
             self._refused = []
         self._refused.append((prior, solution))
         agreeing = len(self._refused)
         angle_rad = float(np.linalg.norm(update.residual_rad))
-        jump = Jump(
-            angle_rad,
-            update.distance,
-            agreeing,
-            prior.t_s - prior.used_s,
-            prior.lost_rad,
-            prior.support,
-        )
+        since_s = prior.t_s - prior.used_s
+        jump = Jump(angle_rad, update.distance, agreeing, since_s, prior.lost_rad, prior.support)
         odds = log_odds(jump, self._jumps)
+        # Adopt only what is confirmed and probable.
         status = OUTSIDE_GATE
         if agreeing >= CONFIRMATIONS:
             status = RESET if odds >= ENOUGH else DISPUTED
         return Update(status, update.residual_rad, update.distance, agreeing, odds)
 
     def _agrees(self, prior: MekfState, solution: AttitudeFix) -> bool:
-        """Whether a refused solution agrees with the one before, by the gyro alone: none was used in between."""
+        """Return whether a refused solution agrees with the one before it, propagated by the gyro alone.
+
+        No solution was used between the two, so the filter's states give the gyro's rotation.
+        """
         state, earlier = self._refused[-1]
         later_from_earlier = prior.body_from_ref * state.body_from_ref.inv()
-        difference = (
-            later_from_earlier * earlier.body_from_ref * solution.body_from_ref.inv()
-        ).as_rotvec()
-        # Both covariances in the later body axes, plus what the gyro's noise and bias add in the gap.
+        predicted = later_from_earlier * earlier.body_from_ref
+        difference = (predicted * solution.body_from_ref.inv()).as_rotvec()
+        # Both covariances in the later body axes, plus those of the gyro's noise and bias in the gap.
         gap_s = abs(prior.t_s - state.t_s)
         R = later_from_earlier.as_matrix()
         covariance = R @ (earlier.noise_rad2 + earlier.systematic_rad2) @ R.T
         covariance += solution.noise_rad2 + solution.systematic_rad2
-        covariance += (
-            gap_s * self._gyro.arw_rad_sqrt_s**2 * np.eye(3) + gap_s**2 * prior.covariance[3:6, 3:6]
-        )
+        by_noise = gap_s * self._gyro.arw_rad_sqrt_s**2 * np.eye(3)
+        covariance += by_noise + gap_s**2 * prior.covariance[3:6, 3:6]
         return bool(difference @ np.linalg.solve(covariance, difference) <= self._gate)
 
     def _replay(self, k: int) -> None:
-        """Apply again the solutions after segment k, from its new state; they have passed the gate already."""
+        """Apply the solutions after segment k again, from its new state. They have passed the gate already."""
         for j in range(k + 1, len(self._segments)):
+            # State before solution j, from the new state after the one before it
             earlier = self._segments[j - 1]
             segment = self._segments[j]
             assert segment.solution is not None
@@ -432,18 +454,20 @@ class AttitudeFilter:
             self._segments[0] = _Segment(state, first.samples[half:], None)
 
     def _propagate_state(self, state: MekfState, samples: Floats) -> MekfState:
+        """Return the state after gyro samples, by the filter's own models."""
         return propagate_state(state, samples, self._gyro, self._tracker, self._layout)
 
     def _prior(self, state: MekfState, samples: Floats) -> MekfState:
-        """The state at a solution, before it: propagated by the samples from the last solution that was used."""
+        """Return the state before a solution: propagated by the samples since the last solution that was used."""
         return decorrelate(self._propagate_state(state, samples), self._tracker, self._layout)
 
 
 def _split(samples: Floats, start_s: float, t_s: float) -> tuple[Floats, Floats]:
     """Split samples at t_s into those before and after; the first interval begins at start_s.
 
-    An interval that contains t_s is divided, assuming a constant rate in it.
+    An interval that contains t_s is divided in proportion, assuming a constant rate in it.
     """
+    # k is the interval that contains t_s.
     k = int(np.searchsorted(samples[:, 0], t_s, side="right"))
     begin_s = samples[k - 1, 0] if k else start_s
     if k == len(samples) or begin_s == t_s:

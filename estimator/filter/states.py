@@ -1,4 +1,17 @@
-"""States of the attitude filter: which there are, in which order, and their estimate at one time."""
+"""States of the attitude filter: error models, order of the states, and their propagation by gyro samples.
+
+Each gyro sample is a rotation vector (`advance`):
+
+1. Remove the gyro's estimated errors: bias, scale factors, misalignments.
+2. Multiply the exponential of the rotation into the quaternion.
+3. Let the bias and the slow errors decay.
+4. Multiply the covariance by the discrete transition of the error state, P <- F P F^T, with the right Jacobian of the
+   rotation.
+5. Add the process noise. While the gyro is saturated or gives no samples, the attitude's standard deviation grows
+   linearly with time.
+
+The equations are in the docstring of `mekf.AttitudeFilter`.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +27,9 @@ from estimator.core import checks
 from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 
-# Compiled propagation of the filter: gyro samples advance attitude, other states and covariance
-# between solutions.
+# Compiled propagation by gyro samples.
 
-
-# The last column of a sample.
+# Kinds of a sample, in its last column.
 MEASURED = 0
 SATURATED = 1
 MISSING = 2
@@ -33,23 +44,24 @@ def advance(
     inverse: Floats,
     slow: tuple[int, int],
 ) -> tuple[Floats, Floats, Floats, float, float]:
-    """Return attitude, values, covariance, saturation_rad and lost_rad after the samples; equations: AttitudeFilter.
+    """Return wxyz, values, covariance, saturation_rad and lost_rad after the samples: the numbered steps of the module.
 
     Parameters
     ----------
     state
-        t_s, ref_from_body_wxyz, values (N,), covariance (N, N), saturation_rad, lost_rad
+        The first six fields of MekfState: t_s, ref_from_body_wxyz, values (N,), covariance (N, N),
+        saturation_rad, lost_rad
     samples
-        (M, 5) rows of t_s, the rotation in the interval that ends there (3), and MEASURED,
+        (M, 5) rows of the end t_s of an interval, the rotation in it (3), and its kind: MEASURED,
         SATURATED or MISSING
     noise
         arw^2, bias^2, 1 / bias_time, 1 / systematic_time, outage_rad_s
     columns
-        (9,) state of each element of the gyro's matrix M, row by row; -1 if it is none
+        (9,) state number of each element of the gyro's matrix M, row by row; -1 for no state
     inverse
-        (3, 3) `inverse_response` of the values, of which no element of M changes here
+        (3, 3) A = (I + M)^-1 of `inverse_response`, which is constant here
     slow
-        First and last + 1 of the normalized systematic states
+        First number of the normalized systematic states, and last + 1
     """
     t_s, wxyz, values, covariance, saturation_rad, lost_rad = state
     arw2, bias2, decay_per_s, slow_per_s, outage_rad_s = noise
@@ -65,18 +77,22 @@ def advance(
     for n in range(len(samples)):
         step_s = samples[n, 0] - t_s
         t_s = samples[n, 0]
-        # Integral of the decaying bias over the interval, divided by the bias.
+        # 1. The effective time is the integral of the decaying bias over the interval, divided by the bias.
         effective_s = step_s * (1 - step_s * decay_per_s / 2)
         remove_errors(samples[n, 1:4], effective_s, values, inverse, rotation)
+        # 2. Attitude
         rotate_quaternion(wxyz, rotation)
+        # Attitude rows of F, which depend on the values before they decay.
         transition(rotation, 1.0, exponential)
         fill_rows(exponential, inverse, rotation, effective_s, columns, rows)
+        # 3. Decay
         decay[3:6] = math.exp(-step_s * decay_per_s)
         decay[slow[0] : slow[1]] = math.exp(-step_s * slow_per_s)
         for i in range(3, size):
             values[i] *= decay[i]
+        # 4. P <- F P F^T
         propagate_covariance(rows, decay, covariance, buffer)
-        # While the rate is unknown the standard deviation grows linearly: the variance by a difference of squares.
+        # 5. While the rate is unknown the standard deviation grows linearly: the variance by a difference of squares.
         previous_rad = saturation_rad
         grown_rad = unknown_rad(samples[n], outage_rad_s * step_s)
         saturation_rad = previous_rad + grown_rad if grown_rad > 0 else 0.0
@@ -85,6 +101,7 @@ def advance(
         bias_variance = -bias2 * math.expm1(-2 * step_s * decay_per_s)
         missed_variance = saturation_rad**2 - min(previous_rad, saturation_rad) ** 2
         add_noise(covariance, arw2 * step_s + missed_variance, bias_variance, step_s)
+        # The slow error is normalized: its noise is 1 - exp(-2 T / time).
         for i in range(slow[0], slow[1]):
             covariance[i, i] -= math.expm1(-2 * step_s * slow_per_s)
     return wxyz, values, covariance, saturation_rad, lost_rad
@@ -94,7 +111,7 @@ def advance(
 def remove_errors(
     angle: Floats, effective_s: float, values: Floats, inverse: Floats, out: Floats
 ) -> None:
-    """Fill the rotation (3,) A (a - T b) of a measured angle a."""
+    """Fill `out` (3,) with the rotation A (a - T b) of a measured angle a, with the effective time T and the bias b."""
     for i in range(3):
         out[i] = 0.0
         for j in range(3):
@@ -103,7 +120,10 @@ def remove_errors(
 
 @jit
 def unknown_rad(sample: Floats, outage_rad: float) -> float:
-    """Standard deviation of the rotation that a sample leaves unknown: 0, or while saturated as much as is measured."""
+    """Return the standard deviation of the rotation that a sample leaves unknown.
+
+    It is 0 for a measured sample, the largest measured angle for a saturated one, and `outage_rad` for a missing one.
+    """
     if sample[4] == MISSING:
         return outage_rad
     return max(abs(sample[1]), abs(sample[2]), abs(sample[3])) if sample[4] == SATURATED else 0.0
@@ -113,7 +133,11 @@ def unknown_rad(sample: Floats, outage_rad: float) -> float:
 def add_noise(
     covariance: Floats, angle_variance: float, bias_variance: float, step_s: float
 ) -> None:
-    """Add Farrenkopf's process noise of an interval to attitude and bias; `angle_variance` without the bias's part."""
+    """Add Farrenkopf's process noise of an interval T to attitude and bias, in place.
+
+    With the variance u^2 T that the bias gains: angle_variance + u^2 T^3 / 3 in the angle, -u^2 T^2 / 2 in the
+    cross-covariance, u^2 T in the bias.
+    """
     for i in range(3):
         covariance[i, i] += angle_variance + bias_variance * step_s**2 / 3
         covariance[i, i + 3] -= bias_variance * step_s / 2
@@ -122,7 +146,7 @@ def add_noise(
 
 
 def inverse_response(values: Floats, columns: Ints) -> Floats:
-    """(3, 3) inverse of I + M, with the elements of M among the values."""
+    """Return A = (I + M)^-1, (3, 3), with the elements of M from the values; those that are no states are 0."""
     used = columns >= 0
     if not used.any():
         return np.eye(3)
@@ -135,18 +159,26 @@ def inverse_response(values: Floats, columns: Ints) -> Floats:
 def fill_rows(
     exponential: Floats, inverse: Floats, p: Floats, effective_s: float, columns: Ints, rows: Floats
 ) -> None:
-    """Fill the attitude rows (3, N) of the transition matrix: exp(-[p]), -T J A, and -(J A)_i p_j for M_ij.
+    """Fill the attitude rows (3, N) of the transition matrix F.
+
+    From e+ = exp(-[p]) e - J A (T db + dM p) they are exp(-[p]) in the columns of the attitude, -T J A in those of the
+    bias, and -(J A)_ij p_k in row i of the column of M_jk.
 
     Parameters
     ----------
     exponential
-        (3, 6) of `transition` with an effective time of 1
+        (3, 6) matrix [exp(-[p]), -J] of `transition` with an effective time of 1
     inverse
-        A = (I + M)^-1
+        (3, 3) A = (I + M)^-1
+    p
+        (3,) rotation in the interval
+    columns
+        (9,) state number of each element of M, row by row; -1 for no state
     """
     for i in range(3):
         for j in range(3):
             rows[i, j] = exponential[i, j]
+            # -(J A)_ij
             total = 0.0
             for k in range(3):
                 total += exponential[i, 3 + k] * inverse[k, j]
@@ -158,14 +190,16 @@ def fill_rows(
 
 @jit
 def propagate_covariance(rows: Floats, decay: Floats, covariance: Floats, buffer: Floats) -> None:
-    """covariance <- F covariance F^T, exactly symmetric; F has these three rows, and below them `decay` as diagonal."""
+    """Replace P by F P F^T, exactly symmetric. F has the three attitude `rows`; below, its diagonal is `decay`."""
     size = len(decay)
+    # buffer = the attitude rows of F P
     for i in range(3):
         for j in range(size):
             total = 0.0
             for k in range(size):
                 total += rows[i, k] * covariance[k, j]
             buffer[i, j] = total
+    # Attitude rows and columns of F P F^T
     for i in range(3):
         for j in range(i + 1):
             total = 0.0
@@ -174,6 +208,7 @@ def propagate_covariance(rows: Floats, decay: Floats, covariance: Floats, buffer
             covariance[i, j] = covariance[j, i] = total
         for j in range(3, size):
             covariance[i, j] = covariance[j, i] = buffer[i, j] * decay[j]
+    # The other states only decay.
     for i in range(3, size):
         for j in range(3, i + 1):
             covariance[i, j] = covariance[j, i] = covariance[i, j] * decay[i] * decay[j]
@@ -181,11 +216,14 @@ def propagate_covariance(rows: Floats, decay: Floats, covariance: Floats, buffer
 
 @jit
 def transition(p: Floats, effective_s: float, out: Floats) -> None:
-    """Fill the attitude rows of the transition matrix: out[:3] = [exp(-[p]), -effective_s J(p)], with [p] v = p x v."""
+    """Fill out[:3] with [exp(-[p]), -effective_s J(p)], (3, 6), where [p] v = p x v.
+
+    exp(-[p]) = I - (sin p / p) [p] + ((1 - cos p) / p^2) [p]^2 (Rodrigues), and
+    J(p) = I - ((1 - cos p) / p^2) [p] + ((p - sin p) / p^3) [p]^2.
+    """
     square = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
-    if (
-        square < 1e-6
-    ):  # series, whose error in `out` is below 1e-16; the quotients would lose digits
+    # Below 1e-6 a series, whose error in `out` is below 1e-16: the quotients would lose digits.
+    if square < 1e-6:
         sine = 1 - square / 6
         cosine = 0.5 - square / 24
         cubic = 1 / 6 - square / 120
@@ -196,8 +234,8 @@ def transition(p: Floats, effective_s: float, out: Floats) -> None:
         cubic = (1 - sine) / square
     for i in range(3):
         for j in range(3):
-            # Element (i, j) of [p] is the third axis' component with the sign of the permutation; [p]^2 = p p^T -
-            # |p|^2 I.
+            # Element (i, j) of [p] is the component of the third axis with the sign of the permutation;
+            # [p]^2 = p p^T - |p|^2 I.
             cross = 0.0 if i == j else p[3 - i - j] * (1.0 if (j - i) % 3 == 2 else -1.0)
             identity = 1.0 if i == j else 0.0
             cross_squared = p[i] * p[j] - square * identity
@@ -209,7 +247,8 @@ def transition(p: Floats, effective_s: float, out: Floats) -> None:
 def rotate_quaternion(ref_from_body_wxyz: Floats, rotation_rad: Floats) -> None:
     """Multiply the unit quaternion by that of a rotation vector in body axes (Hamilton product), in place."""
     q = ref_from_body_wxyz
-    (x, y, z) = rotation_rad
+    # Quaternion (w, x, y, z) of the rotation vector: (cos(p / 2), sin(p / 2) p / |p|)
+    x, y, z = rotation_rad
     half = math.sqrt(x * x + y * y + z * z) / 2
     scale = math.sin(half) / (2 * half) if half > 1e-9 else 0.5
     w = math.cos(half)
@@ -221,13 +260,15 @@ def rotate_quaternion(ref_from_body_wxyz: Floats, rotation_rad: Floats) -> None:
     q[1] = a * x + b * w + c * z - d * y
     q[2] = a * y - b * z + c * w + d * x
     q[3] = a * z + b * y - c * x + d * w
+    # Rounding would otherwise accumulate in the norm.
     norm = math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
     for i in range(4):
         q[i] /= norm
 
 
-# Error models of the attitude filter: of the gyro, of the star tracker, and of jumps.
-
+# Error models of the gyro, of the star tracker, and of jumps. A standard deviation of 0 removes its state from the
+# filter. CONSIDERED are the states whose uncertainty counts but whose value is not estimated (Schmidt's filter), unless
+# AttitudeFilter gets others.
 
 STATES = ("bias", "scale", "misalignment", "mounting", "systematic")
 CONSIDERED = ("mounting", "systematic")
@@ -242,25 +283,30 @@ class GyroModel:
     sense axes elsewhere, all constant. A common rotation of the axes is among the misalignments.
 
     Farrenkopf's random walk of the bias with density u (rad / s^1.5) is the limit of a long time t with
-    bias_rad_s = u sqrt(t / 2). Raises ValueError for negative or unusable numbers.
+    bias_rad_s = u sqrt(t / 2).
 
     Attributes
     ----------
     arw_rad_sqrt_s
         Angle random walk, rad / sqrt(s)
     bias_rad_s
-        Standard deviation of the bias, a first-order Gauss-Markov process (ignored if its time
-        is inf)
+        Standard deviation of the bias, a first-order Gauss-Markov process (ignored if
+        bias_time_s is inf)
     bias_time_s
-        Its correlation time, long compared with a sample interval; inf for a constant bias
+        Correlation time of the bias, long compared with a sample interval; inf for a constant bias
     scale, misalignment_rad
         Standard deviations of M's elements on the diagonal and off it
     limit_rad_s
-        The largest rate about an axis that is measured; inf if saturation is flagged with the
-        samples
+        The largest rate about an axis that the gyro measures; inf if saturation is flagged with
+        the samples
     outage_rad_s
         Standard deviation of the rate about each axis while the gyro gives no samples
         (`assumed`)
+
+    Raises
+    ------
+    ValueError
+        For negative or unusable numbers.
     """
 
     arw_rad_sqrt_s: float
@@ -280,22 +326,27 @@ class TrackerModel:
     """Errors that successive solutions of a star tracker share: they do not average out.
 
     The slow error is a first-order Gauss-Markov process with the correlation exp(-T / time - rotation / angle). The
-    covariance that a solution names (`Attitude.systematic_rad2`) is part of the same process, and is added to
-    systematic_rad^2. The times and angles are `assumed`. Raises ValueError for negative or unusable numbers.
+    covariance that comes with a solution (`Attitude.systematic_rad2`) is part of the same process, and is added to
+    systematic_rad^2. The times and angles are `assumed`.
 
     Attributes
     ----------
     systematic_rad
-        Standard deviation about each axis of the slow error: distortion across the field, a
-        survey
+        Standard deviation about each axis of the slow error (distortion across the field, a
+        survey)
     systematic_time_s
-        Its correlation time; inf for a constant
+        Correlation time of the slow error; inf for a constant
     systematic_angle_rad
-        Rotation after which it is another one, because other stars are in the field
+        Rotation in which its correlation falls by a factor e, because other stars are in the field
     mounting_rad
-        Standard deviation about each axis of the rotation from assumed to true mount
+        Standard deviation about each axis of the rotation from assumed to true mounting
     mounting_drift_rad_sqrt_s
-        Its random walk about each axis, rad / sqrt(s); 0 for a constant one
+        Random walk of the mounting about each axis, rad / sqrt(s); 0 for a constant one
+
+    Raises
+    ------
+    ValueError
+        For negative or unusable numbers.
     """
 
     systematic_rad: float = 0.0
@@ -312,16 +363,16 @@ class TrackerModel:
 
 @dataclass(frozen=True, slots=True)
 class JumpModel:
-    """What is assumed of wrong solutions and of motions that a gyro misses; all `assumed`. See `jumps.log_odds`.
+    """Probabilities of wrong solutions and of motions that a gyro misses, for `consistency.log_odds`; all `assumed`.
 
     Attributes
     ----------
     missed_per_s
         Rate at which a gyro that flags nothing misses a motion, 1e-4 an hour
     wrong_share
-        Probability that a wrong solution begins at any given one
+        Probability that any given solution is the first of a series of wrong ones
     wrong_repeat
-        Probability that a wrong solution is followed by one that agrees with it
+        Probability that the next solution is wrong too and agrees with a wrong one
     wrong_start
         Probability that the initial attitude is wrong beyond its standard deviation
 
@@ -355,6 +406,9 @@ def _check(model: GyroModel | TrackerModel, what: str, above_0: tuple[str, ...])
             raise ValueError(f"{what}: {field.name} is {value}; allowed: finite, 0 or more")
 
 
+# Order of the states, and their estimate at one time.
+
+# Elements of the gyro's matrix M, row by row.
 DIAGONAL = np.arange(0, 9, 4)
 OFF_DIAGONAL = np.array([1, 2, 3, 5, 6, 7])
 
@@ -362,24 +416,24 @@ OFF_DIAGONAL = np.array([1, 2, 3, 5, 6, 7])
 class Layout(NamedTuple):
     """Order of the error states: attitude (3), bias (3), then those in use, then the slow error (3) of each head.
 
-    The slow error is normalized: its standard deviation is 1, and each solution has the matrix that makes it an angle.
-    Heads are the star cameras on the body. The states of head n above 0 have its number in their name: "mounting_1",
-    which is relative to the mounting of the first head.
+    The slow error is normalized: its standard deviation is 1, and each solution has the matrix that maps it to an
+    angle. Heads are the star cameras on the body. The states of head n above 0 have its number in their name:
+    "mounting_1" is relative to the mounting of the first head.
 
     Attributes
     ----------
     size
-        N
+        Number N of states
     slices
-        Of each state by name, "attitude" and "systematic" included
+        Slice of each state by name, "attitude" and "systematic" included
     slow
-        That of the slow errors of all heads
+        Slice of the slow errors of all heads
     mountings
-        (M,) index of each state of a mounting
+        (M,) number of each state of a mounting
     columns
-        (9,) state of each element of the gyro's matrix M, row by row; -1 if it is none
+        (9,) state number of each element of the gyro's matrix M, row by row; -1 for no state
     estimated
-        (N,) whether its value is estimated; False if it is only considered
+        (N,) 1 if the state's value is estimated, 0 if the state is only considered
     """
 
     size: int
@@ -402,18 +456,22 @@ class MekfState(NamedTuple):
 
     Attributes
     ----------
+    t_s
+        Time
+    ref_from_body_wxyz
+        (4,) attitude as a unit quaternion, scalar first
     values
-        (N,) estimates in the order of Layout; those of the attitude are 0
+        (N,) estimates in the order of Layout; those of the attitude error are 0
     covariance
-        (N, N) of the errors
+        (N, N) covariance of the errors
     saturation_rad
-        Standard deviation of the attitude from the saturation or outage that now lasts, else 0
+        Standard deviation of the attitude from the current saturation or outage; 0 without one
     lost_rad
         Rotation that the gyro may have missed since the last solution that was used
     used_s, used_wxyz
         Time and attitude of the last solution that was used, or of the start
     support
-        Number of solutions used in agreement, see Jump
+        Number of solutions used in agreement: see `consistency.Jump`
     """
 
     t_s: float
@@ -432,14 +490,14 @@ class MekfState(NamedTuple):
 
 
 def of_head(name: str, head: int) -> str:
-    """The name of a head's state."""
+    """Return the name of a head's state: "mounting" of the first head, "mounting_1" of the second."""
     return f"{name}_{head}" if head else name
 
 
 def build_layout(
     gyro: GyroModel, tracker: TrackerModel, considered: tuple[str, ...], heads: int = 1
 ) -> Layout:
-    """The states in use. Raises ValueError for a considered one that there is not."""
+    """Return the layout of the states in use. Raises ValueError for an unknown name among the considered ones."""
     unknown = sorted(set(considered) - set(STATES))
     if unknown:
         raise ValueError(f"considered: {unknown[0]!r}; allowed: {', '.join(STATES)}")
@@ -451,12 +509,12 @@ def build_layout(
         **{of_head("mounting", head): 3 * (tracker.mounting_rad > 0) for head in range(heads)},
         **{of_head("systematic", head): 3 for head in range(heads)},
     }
-    # The mount of the first head defines the attitude of the body, so the others can be estimated beside it.
-    fixed = {
-        of_head(name, head)
-        for name in considered
-        for head in range(heads if name == "systematic" else 1)
-    }
+    # "systematic" means the slow errors of all heads; "mounting" only that of the first head, which defines the
+    # attitude of the body, so that the others can be estimated relative to it.
+    fixed = set(considered)
+    if "systematic" in fixed:
+        fixed |= {of_head("systematic", head) for head in range(heads)}
+    # Number the states in this order.
     slices = {}
     size = 0
     estimated = []
@@ -465,10 +523,12 @@ def build_layout(
             slices[name] = slice(size, size + count)
             size += count
             estimated += [float(name not in fixed)] * count
+    # State of each element of M
     columns = np.full(9, -1)
     for name, elements in (("scale", DIAGONAL), ("misalignment", OFF_DIAGONAL)):
         if name in slices:
             columns[elements] = np.arange(slices[name].start, slices[name].stop)
+    # The slow errors are the last states; the mountings of all heads are side by side.
     slow = slice(slices["systematic"].start, size)
     mounts = [rows for name, rows in slices.items() if name.startswith("mounting")]
     mountings = [row for rows in mounts for row in range(rows.start, rows.stop)]
@@ -478,7 +538,7 @@ def build_layout(
 def start_state(
     t_s: float, wxyz: Floats, sigmas: dict[str, ArrayLike], layout: Layout
 ) -> MekfState:
-    """The state at the start: all values 0, all states independent with these standard deviations."""
+    """Return the initial state: all values 0, all states independent, with the given standard deviations by name."""
     sigma = np.empty(layout.size)
     for name, rows in layout.slices.items():
         sigma[rows] = sigmas[name.partition("_")[0]]
@@ -488,7 +548,7 @@ def start_state(
 def propagate_state(
     state: MekfState, samples: Floats, gyro: GyroModel, tracker: TrackerModel, layout: Layout
 ) -> MekfState:
-    """Propagate a state through gyro samples, rows as of `advance`."""
+    """Return the state after gyro samples, rows as of `advance`."""
     if not len(samples):
         return state
     noise = (
@@ -503,7 +563,7 @@ def propagate_state(
     wxyz, values, covariance, saturation_rad, lost_rad = advance(
         tuple(state[:6]), samples, noise, layout.columns, inverse, (slow.start, slow.stop)
     )
-    # Nothing else depends on a mounting between two solutions, so its random walk can be added at the end.
+    # No other state depends on a mounting between two solutions, so its random walk can be added at the end.
     walked_rad2 = tracker.mounting_drift_rad_sqrt_s**2 * (float(samples[-1, 0]) - state.t_s)
     covariance[layout.mountings, layout.mountings] += walked_rad2
     return state._replace(
@@ -517,11 +577,16 @@ def propagate_state(
 
 
 def decorrelate(state: MekfState, tracker: TrackerModel, layout: Layout) -> MekfState:
-    """Let the slow errors change by the rotation since the last solution that was used."""
+    """Return the state with the slow errors changed by the rotation since the last solution that was used.
+
+    They keep the share k = exp(-rotation / systematic_angle_rad): values and covariances are multiplied by k, and their
+    variance gains 1 - k^2.
+    """
     rows = layout.slow
     # The angle between two quaternions; the scalar product may exceed 1 by rounding.
     turned_rad = 2 * math.acos(min(abs(float(state.ref_from_body_wxyz @ state.used_wxyz)), 1.0))
     kept = math.exp(-turned_rad / tracker.systematic_angle_rad)
+    # P <- D P D with D = k for the slow errors and 1 for the others
     factor = np.ones(layout.size)
     factor[rows] = kept
     covariance = state.covariance * np.outer(factor, factor)

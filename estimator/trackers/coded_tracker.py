@@ -1,8 +1,13 @@
-"""Star tracker for a dome whose LEDs blink their names: lights are tracked over frames, and their codes read.
+"""Star tracker for a dome whose LEDs blink coded names: it follows lights over frames and reads their codes.
 
-Each frame is detected and centroided as by `DomeTracker`. Its lights continue the tracks of the frames before
-(`leds.tracks`); the brightness of each in the last frames is compared with the words of all LEDs (`leds.codes`); codes
-and places together give the names and an attitude (`leds.naming`), which `DomeTracker` refines with the exact geometry.
+For each frame:
+
+1. Detect and centroid the lights as `DomeTracker`.
+2. Continue the tracks of the frames before with them (`led_codes.LightTracks`).
+3. Compare the brightness of each light in the last frames with the words of all LEDs (`led_codes.misfits`).
+4. Name the lights by codes and positions together, which gives an attitude (`led_naming.identify`).
+5. Refine the attitude with the exact geometry as `DomeTracker`.
+
 A frame without enough bits, or whose lights contradict each other, has no attitude.
 """
 
@@ -27,13 +32,11 @@ from estimator.trackers.pipeline import Clock, Report, Settings, direction_sigma
 from estimator.trackers.star_tracker import NO_STARS
 
 COLLECTING = "codes: too few lights have been seen long enough"
-MISSED_FRAMES = (
-    2  # successive frames without a light after which its track ends, if LEDs are never dark
-)
+MISSED_FRAMES = 2  # missed frames after which a light's track ends, if LEDs are never dark
 MIN_BITS = 3  # a light measured in fewer frames could be any LED
-MIN_FREE_BITS = 8  # where the code's time is unknown
+MIN_FREE_BITS = 8  # the same where the code's time is unknown
 PHASE_REACH = (
-    25.0  # phases of the code's clock with a misfit above the best one's by more are left out
+    25.0  # largest difference from the best misfit of a phase of the code's clock that is kept
 )
 
 
@@ -44,12 +47,12 @@ class DecoderSettings:
     Attributes
     ----------
     flux_sigma
-        Relative error of a light's brightness beside its photon noise: pulses, the chip,
+        Relative error of a light's brightness besides its photon noise: pulses, the chip,
         detection
     gate_px
-        Greatest motion of a light between two frames that is not predicted
+        Largest motion of a light between two frames that is not predicted
     frames
-        Whose brightness is used, the last ones; None: as many as the code has bits
+        Number of last frames whose brightness is used; None: as many as the code has bits
 
     Raises
     ------
@@ -71,15 +74,20 @@ class DecoderSettings:
 
 
 class CodedTracker(DomeTracker):
-    """Tracker under a dome of coded LEDs. Stateful: it takes the frames in order, with their times and numbers.
+    """Tracker under a dome of coded LEDs. It has a memory: it needs the frames in order, with their times and numbers.
 
-    A frame that is not later than the last one begins anew; so does one without a time, whose lights have no names.
-    Raises ImageError as DomeTracker does, for a code of other LEDs, and for a rolling shutter with free-running bits.
+    A frame that is not later than the last one clears the memory; so does one without a time, whose lights have no
+    names.
 
     Attributes
     ----------
     code
-        The words of the LEDs of the map
+        Words of the LEDs of the map
+
+    Raises
+    ------
+    ImageError
+        As DomeTracker, for a code of other LEDs, and for a rolling shutter with free-running bits.
     """
 
     def __init__(
@@ -121,11 +129,10 @@ class CodedTracker(DomeTracker):
         )
         self.templates = np.zeros((len(code.phases), len(code.levels), self.tracks.frames))
         self.spread = np.zeros_like(self.templates)
-        self.phases = np.ones(
-            len(code.phases), bool
-        )  # those of the code's clock that the lights have not excluded
+        # Phases of the code's clock that the lights have not excluded
+        self.phases = np.ones(len(code.phases), bool)
         self.last_s: float | None = None
-        led_codes.misfits(*np.ones((4, 1, 1)))  # compiles it, or loads it, before the frames
+        led_codes.misfits(*np.ones((4, 1, 1)))  # compiles or loads it before the frames
 
     def solve(
         self,
@@ -141,7 +148,12 @@ class CodedTracker(DomeTracker):
         Parameters
         ----------
         streak_px, rate, exposure_s
-            As for `DomeTracker.solve`; the rate also predicts the lights' motion
+            Streak, rate and exposure time as in `DomeTracker.solve`; the rate also predicts the
+            lights' motion
+        t_s
+            Mid-exposure time; None if unknown
+        frame
+            Number of the frame
         """
         solve = partial(
             self.solve_centroids, rate=rate, exposure_s=exposure_s, t_s=t_s, frame=frame
@@ -162,17 +174,18 @@ class CodedTracker(DomeTracker):
         centroids.check_values()
         clock = clock or Clock()
         exposure_s = exposure_s or 0.0
+        # 2. Tracks
         self._advance(centroids, t_s, rate)
+        # Expected brightness of all LEDs in this frame
         middle_s = t_s or 0.0
         templates, spread = self.code.templates(
             frame, middle_s - exposure_s / 2, middle_s + exposure_s / 2
         )
-        self.templates[:, :, self.tracks.column], self.spread[:, :, self.tracks.column] = (
-            templates,
-            spread,
-        )
+        self.templates[:, :, self.tracks.column] = templates
+        self.spread[:, :, self.tracks.column] = spread
         if not len(centroids):
             return Attitude(NO_STARS)
+        # 3. to 5. Names and attitude
         return self._solve_identified(centroids, self._identify_codes(centroids), clock)
 
     def _advance(self, centroids: Centroids, t_s: float | None, rate: RateEstimate | None) -> None:
@@ -193,15 +206,16 @@ class CodedTracker(DomeTracker):
         self.tracks.advance(centroids, centroids.flux * relative, elapsed_s, turn)
 
     def _identify_codes(self, centroids: Centroids) -> StarMatch | str:
-        """The LEDs of the tracks that are seen now, or the reason for a refusal."""
+        """Return the LEDs of the tracks that are in this frame, or the reason for a refusal."""
+        # Tracks that are long enough
         tracks = self.tracks
         measured = np.isfinite(tracks.light).sum(axis=1)
-        usable = np.flatnonzero(
-            (tracks.row >= 0) & (measured >= (MIN_BITS if len(self.phases) == 1 else MIN_FREE_BITS))
-        )
+        least = MIN_BITS if len(self.phases) == 1 else MIN_FREE_BITS
+        usable = np.flatnonzero((tracks.row >= 0) & (measured >= least))
         if len(usable) < 2:
             return COLLECTING
-        # An error of the same size in all frames of a light: relative errors of its dim frames would invite noise.
+        # 3. Misfits. The error is the same in all frames of a light: relative errors would give dim frames too much
+        # weight.
         greatest = np.nanmax(tracks.sigma[usable], axis=1, keepdims=True)
         sigma = np.where(np.isfinite(tracks.light[usable]), greatest, 1.0)
         misfit = self._misfit(tracks.light[usable], sigma)
@@ -213,6 +227,7 @@ class CodedTracker(DomeTracker):
             self.phases[:] = True
             return COLLECTING
         misfit = misfit / led_codes.excess_noise(misfit.min(axis=(0, 2)), measured[usable])
+        # 4. Names
         row = tracks.row[usable]
         named = led_naming.NamedLights(*self._tangents(centroids.take(row)), misfit.min(axis=0))
         match = led_naming.identify(named, self.sphere)
@@ -223,7 +238,7 @@ class CodedTracker(DomeTracker):
         return replace(match, observed=row[match.observed])
 
     def _misfit(self, light: Floats, sigma: Floats) -> Floats:
-        """(P, T, N) misfit of each LED's code at each of the phases of the code's clock that all lights allow.
+        """Return the (P, T, N) misfit of T lights with the codes of N LEDs, at the P phases that all lights allow.
 
         The next frame tries these phases and their neighbors.
         """
@@ -239,6 +254,7 @@ class CodedTracker(DomeTracker):
                 row[None], error[None], templates[likely], spread[likely]
             )[0]
         each = flat.reshape(-1, len(tried), leds)
+        # Misfit of each phase: the sum over the lights of that with the best LED
         common = each.min(axis=2).sum(axis=0)
         allowed = common <= common.min() + PHASE_REACH
         self.phases[:] = False
@@ -247,7 +263,7 @@ class CodedTracker(DomeTracker):
         return np.asarray(each[:, allowed].swapaxes(0, 1))
 
     def _tangents(self, centroids: Centroids) -> tuple[Floats, Floats]:
-        """(K, 3) rays of centroids and (K,) errors of their tangents, of the LED map and the lever too."""
+        """Return the (K, 3) rays of centroids and the (K,) errors of their tangents, map and lever included."""
         rays = self.camera.rays(centroids.xy_px)
         focal_px = self.camera.focal_px
         own = np.hypot(

@@ -1,7 +1,11 @@
 """Star tracker for an LED dome: from a frame to an attitude, with the camera on a lever arm about the bearing center.
 
-Stages: detect and centroid (`pipeline`), identify LEDs, match the whole field with the exact near-field geometry,
-reject blended LEDs, and solve.
+1. Detect and centroid the lights (`pipeline`).
+2. Identify LEDs among the brightest lights (IDENTIFIERS).
+3. Match the whole field with the exact near-field geometry, with decreasing radii.
+4. Reject blended LEDs by their residuals.
+5. Solve the attitude with the solver of the settings (`attitude.nearfield`).
+6. Compute the covariance with the errors of the survey, the focal length and the lever.
 """
 
 from __future__ import annotations
@@ -43,18 +47,17 @@ from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_strea
 from estimator.trackers.star_tracker import NO_STARS
 
 MIN_ERROR_PX = 0.3  # least centroid error of an LED, for effects outside of survey and calibration
-FOCAL_UNCERTAINTY = 0.12  # greatest relative error of a focal length that is not calibrated
-FOCAL_CHECKS = 10_000_000  # effort of its search: a second at most
-MAX_FOCAL_SIGMA = 0.5  # of a `Camera`
-FITS_FOCAL = (
-    "non_dimensional",
-)  # identifiers after which the focal length is fitted with the attitude
+FOCAL_UNCERTAINTY = 0.12  # largest relative error of a focal length that is not calibrated
+FOCAL_CHECKS = 10_000_000  # largest number of checks of its search, which take a second
+MAX_FOCAL_SIGMA = 0.5  # largest focal_sigma of a `Camera`
+# Identifiers after which the focal length is fitted with the attitude.
+FITS_FOCAL = ("non_dimensional",)
 SETTINGS = Settings(identifier="led_pairs", solver="rotation_only")
 Identify = Callable[[Floats, Floats, Floats | None], StarMatch | str]
 
 
 def led_pairs(camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
-    """The default LED identifier: pair hypotheses and evidence; see `identification.leds.search.identify`."""
+    """Return the default LED identifier: pair hypotheses and evidence; see `led_search.identify`."""
     sight = build_dome_index(leds, lever, camera)
     least_rad = MIN_ERROR_PX / camera.focal_px
     return lambda rays_cam, sigma_rad, flux_s: led_search.identify(
@@ -63,10 +66,10 @@ def led_pairs(camera: Camera, leds: LedMap, lever: Lever, settings: Settings) ->
 
 
 def non_dimensional(camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
-    """LEDs for a focal length that is known to FOCAL_UNCERTAINTY, or to three standard deviations if they are more.
+    """Return the LED identifier for a focal length with the uncertainty FOCAL_UNCERTAINTY, or three sigma if larger.
 
-    See `identification.leds.search`. The index holds the pairs of the widest field that the camera may have, and the
-    field of the assumed one, in whose tangents the detections are.
+    See `led_search.identify`. The index holds the pairs of the widest field that the camera may have. It has the field
+    of view of the assumed camera, in whose tangents the detections are.
     """
     uncertainty = min(max(FOCAL_UNCERTAINTY, 3 * camera.focal_sigma), 0.5)
     nominal = build_dome_index(leds, lever, camera)
@@ -81,10 +84,10 @@ def non_dimensional(camera: Camera, leds: LedMap, lever: Lever, settings: Settin
 def star_identifier(
     name: str, camera: Camera, leds: LedMap, lever: Lever, settings: Settings
 ) -> Identify:
-    """A star identifier applied to directions from the bearing, where the rays meet one sphere of the median radius.
+    """Return a star identifier that works on directions from the bearing, where the rays meet one sphere.
 
-    On a dome that is not a sphere this changes the angles; the tolerance therefore has a stretch, from the spread of
-    the radii and the lever.
+    The sphere has the median radius of the LEDs. On a dome that is not a sphere this changes the angles; the tolerance
+    therefore has a stretch, from the spread of the radii and the lever.
     """
     radius = np.linalg.norm(leds.position_m, axis=1)
     median_radius_m = float(np.median(radius))
@@ -110,8 +113,8 @@ def star_identifier(
     return identify
 
 
-# Each maps (camera, leds, lever, settings) to a function that identifies (N, 3) rays with (N,) errors and, if the
-# exposure is known, (N,) fluxes per second: it returns the match, or the reason for a refusal.
+# Each entry maps (camera, leds, lever, settings) to a function that identifies (N, 3) rays with (N,) errors and, if the
+# exposure is known, (N,) fluxes per second. That function returns the match, or the reason for a refusal.
 IDENTIFIERS: dict[str, Callable[[Camera, LedMap, Lever, Settings], Identify]] = {
     "led_pairs": led_pairs,
     "non_dimensional": non_dimensional,
@@ -121,10 +124,10 @@ IDENTIFIERS: dict[str, Callable[[Camera, LedMap, Lever, Settings], Identify]] = 
 
 
 def led_sigma_rad(leds: LedMap, lever: Lever) -> Floats:
-    """(L,) standard deviation of the direction to each LED from the camera, by the error of its place.
+    """Return the (L,) standard deviation of the direction to each LED from the camera, from the error of its position.
 
-    Equal errors of all LEDs are divided by the least distance of any. Otherwise the rms across the line from the
-    bearing is divided by the LED's own distance less the lever.
+    Equal errors of all LEDs are divided by the least distance of any LED from the camera. Otherwise the rms across the
+    line from the bearing is divided by the LED's own distance less the lever.
     """
     radius_m = np.linalg.norm(leds.position_m, axis=1)
     lever_m = float(np.linalg.norm(lever.camera_body_m))
@@ -137,17 +140,28 @@ def led_sigma_rad(leds: LedMap, lever: Lever) -> Floats:
 
 
 def focal_error_rad(rays_cam: Floats, camera: Camera) -> Floats:
-    """(N,) standard deviation of rays' tangents by the error of the focal length, rms of both axes."""
-    return np.asarray(
-        camera.focal_sigma * np.linalg.norm(rays_cam[:, :2] / rays_cam[:, 2:], axis=1) / np.sqrt(2)
-    )
+    """Return the (N,) standard deviation of rays' tangents from the error of the focal length, rms of both axes."""
+    tangent = np.linalg.norm(rays_cam[:, :2] / rays_cam[:, 2:], axis=1)
+    return np.asarray(camera.focal_sigma * tangent / np.sqrt(2))
 
 
 class DomeTracker:
     """Lost-in-space tracker under an LED dome, with the camera on a lever arm about the bearing center.
 
-    cam_from_ref of the result is cam_from_lab; `lever` converts it to the vehicle's attitude. Raises ImageError if
-    the lever is longer than the dome is wide, if there are too few LEDs, or for anything that is not as described.
+    cam_from_ref of the result is cam_from_lab; `lever` converts it to the vehicle's attitude.
+
+    Attributes
+    ----------
+    camera, leds, lever
+        On-board calibration, map of the dome, and position and orientation of the camera
+    settings
+        Algorithms of the stages, and their parameters
+
+    Raises
+    ------
+    ImageError
+        If the lever is longer than the distance of the nearest LED, if there are too few LEDs, or
+        for anything that is not as described.
     """
 
     def __init__(
@@ -167,9 +181,7 @@ class DomeTracker:
         self.settings = settings
         self.identify = IDENTIFIERS[settings.identifier](camera, leds, lever, settings)
         self.led_sigma_rad = led_sigma_rad(leds, lever)
-        self.focal_fitted = (
-            False  # whether the camera's focal length is one that this frame's lights gave
-        )
+        self.focal_fitted = False  # whether the camera's focal length is fitted to this frame
 
     def solve(
         self,
@@ -178,18 +190,18 @@ class DomeTracker:
         rate: RateEstimate | None = None,
         exposure_s: float | None = None,
     ) -> Report:
-        """Solve one frame. Raises ImageError for bad input; any other failure is reported in the status.
+        """Solve one frame. Raises ImageError for bad input; the status reports any other failure.
 
         Parameters
         ----------
         streak_px
-            (dx, dy) that lights move during the exposure, from the gyro; None: unknown, or from
-            `rate`
+            (dx, dy) by which lights move during the exposure, from the gyro; None: unknown, or
+            from `rate`
         rate
-            Of the camera, from the gyro; None: with a rolling shutter it is estimated from the
-            frame
+            Rate of the camera, from the gyro; None: with a rolling shutter it is estimated from
+            the frame
         exposure_s
-            To estimate the rate from streaks; None if unknown
+            Exposure time, to estimate the rate from streaks; None if unknown
         """
         solve = partial(self.solve_centroids, rate=rate, exposure_s=exposure_s)
         return process_frame(image, self.camera, self.settings, solve, streak_px, rate, exposure_s)
@@ -202,17 +214,15 @@ class DomeTracker:
         Parameters
         ----------
         dtype
-            Of the frames' pixels
+            Type of the frames' pixels
         """
+        # The richest field of some forty with an LED on the boresight
         fields = []
-        for toward_m in self.leds.position_m[:: max(len(self.leds.position_m) // 40, 1)]:
+        position_m = self.leds.position_m
+        for toward_m in position_m[:: max(len(position_m) // 40, 1)]:
             cam_from_lab, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [toward_m])
-            xy_px = project(
-                self.lever.cam_from_body.inv() * cam_from_lab,
-                self.leds.position_m,
-                self.lever,
-                self.camera,
-            )
+            body_from_lab = self.lever.cam_from_body.inv() * cam_from_lab
+            xy_px = project(body_from_lab, position_m, self.lever, self.camera)
             fields.append(xy_px[self.camera.contains(np.nan_to_num(xy_px, nan=-1e9), 2.0)])
         xy_px = max(fields, key=len)
         warm_up.run(self.camera, xy_px, np.ones(len(xy_px)), dtype, self.solve)
@@ -225,7 +235,13 @@ class DomeTracker:
         rate: RateEstimate | None = None,
         exposure_s: float | None = None,
     ) -> Attitude:
-        """Identify and solve centroids from any source (the truth included); rate, exposure_s : as in `solve`."""
+        """Identify and solve centroids from any source (the truth included).
+
+        Parameters
+        ----------
+        rate, exposure_s
+            Rate and exposure time as in `solve`
+        """
         checks.of_type("centroids", centroids, Centroids)
         centroids.check_values()
         clock = clock or Clock()
@@ -241,7 +257,7 @@ class DomeTracker:
         )
 
     def _with_errors(self, centroids: Centroids, star: NDArray) -> Centroids:
-        """K centroids with their total errors: the LEDs' places and the focal length too."""
+        """Return K centroids with their total errors, those of the LEDs' positions and the focal length included."""
         rays = self.camera.rays(centroids.xy_px)
         pixel_rad = np.hypot(
             direction_sigma_rad(centroids, self.camera, self.settings),
@@ -265,7 +281,7 @@ class DomeTracker:
     def _solve_identified(
         self, centroids: Centroids, match: StarMatch | str, clock: Clock
     ) -> Attitude:
-        """The attitude of a match, or without one for the reason of a refusal."""
+        """Return the attitude of a match, or the refusal."""
         clock.lap("identify")
         if isinstance(match, str):
             return Attitude(match)
@@ -277,8 +293,8 @@ class DomeTracker:
         """Match every centroid with the exact geometry, then solve these matches with the solver of the settings.
 
         Where the focal length is uncertain (FITS_FOCAL), it is first fitted with the attitude to the identified LEDs,
-        and once more to all that match, with the distortion at the new scale. The answer's camera has it, with its
-        standard deviation, which counts in the covariance.
+        and once more to all that match, with the distortion at the new scale. The result's camera has the fitted focal
+        length with its standard deviation, which is part of the covariance.
         """
         if self.settings.identifier not in FITS_FOCAL:
             return self._solve_calibrated(centroids, match)
@@ -296,7 +312,7 @@ class DomeTracker:
         return attitude
 
     def _with_fitted_focal(self, centroids: Centroids, match: StarMatch) -> DomeTracker:
-        """This tracker with the focal length that fits the matches, and its error by centroids and map."""
+        """Return this tracker with the focal length that fits the matches, and its error from centroids and map."""
         observed = match.observed
         star = match.star
         rays = self.camera.rays(centroids.xy_px[observed])
@@ -309,23 +325,22 @@ class DomeTracker:
         fitted = copy(self)
         fitted.camera = self.camera.zoomed(ratio)
         fitted.focal_fitted = True
+        # Variance of the logarithm of the focal length, the fourth unknown of the fit
         view, common_rad = fitted._common_rad(match.cam_from_ref, star)
         view = systematic.with_focal(view)
-        variance = systematic.from_independent(view, sigma_rad, systematic.isotropic(sigma_rad))[
-            3, 3
-        ]
+        errors_rad2 = systematic.isotropic(sigma_rad)
+        variance = systematic.from_independent(view, sigma_rad, errors_rad2)[3, 3]
         variance += systematic.from_common(view, sigma_rad, common_rad)[3, 3]
-        fitted.camera = replace(
-            fitted.camera, focal_sigma=min(float(np.sqrt(variance)), MAX_FOCAL_SIGMA)
-        )
+        focal_sigma = min(float(np.sqrt(variance)), MAX_FOCAL_SIGMA)
+        fitted.camera = replace(fitted.camera, focal_sigma=focal_sigma)
         return fitted
 
     def _focal_rad(self, rays: Floats) -> Floats:
-        """(N,) `focal_error_rad` of rays; 0 where the focal length is fitted: its error is then of the fit."""
+        """Return the (N,) `focal_error_rad` of rays; 0 where the focal length is fitted, as the fit has its error."""
         return np.zeros(len(rays)) if self.focal_fitted else focal_error_rad(rays, self.camera)
 
     def _solve_calibrated(self, centroids: Centroids, match: StarMatch) -> Attitude:
-        """The attitude for a known focal length.
+        """Return the attitude for a known focal length: steps 3 to 6 of the module.
 
         The matching always uses the exact solver: an approximate one could lose matches. All solvers are therefore
         compared on the same matches.
@@ -337,13 +352,11 @@ class DomeTracker:
         pixel_rad = np.hypot(
             direction_sigma_rad(centroids, self.camera, self.settings), self._focal_rad(rays)
         )
-        radius_px = max(
-            4.0,
-            4
-            * self.camera.focal_px
-            * float(np.median(np.hypot(pixel_rad, self.led_sigma_rad.max()))),
-        )
+        # Matching radius: four standard deviations, at least 4 px
+        typical_rad = float(np.median(np.hypot(pixel_rad, self.led_sigma_rad.max())))
+        radius_px = max(4.0, 4 * self.camera.focal_px * typical_rad)
         try:
+            # 3. Matches of the whole field
             for factor in (3.0, 1.0):
                 sigma_rad = self._sigma_rad("rotation_only", pixel_rad, rays, observed, star)
                 body_from_lab, _ = self._solve(
@@ -353,10 +366,12 @@ class DomeTracker:
                 # The exact geometry must confirm as many matches as identification found.
                 if len(observed) < len(match.observed):
                     return Attitude(NO_MATCH)
+            # 4. Blends
             sigma_rad = self._sigma_rad("rotation_only", pixel_rad, rays, observed, star)
             observed, star, misfit = self._reject_blends(
                 centroids, sigma_rad, observed, star, body_from_lab
             )
+            # 5. Attitude
             solver = self.settings.solver
             sigma_rad = self._sigma_rad(solver, pixel_rad, rays, observed, star)
             body_from_lab, covariance = self._solve(
@@ -364,6 +379,7 @@ class DomeTracker:
             )
         except (ValueError, np.linalg.LinAlgError) as error:
             return Attitude(f"no attitude: {error}")
+        # 6. Covariance in camera axes
         cam_from_lab = self.lever.cam_from_body * body_from_lab
         R_cam_from_body = self.lever.cam_from_body.as_matrix()
         residual = self._residual_px(centroids, observed, star, body_from_lab)
@@ -385,10 +401,9 @@ class DomeTracker:
     def _sigma_rad(
         self, solver: str, pixel_rad: Floats, rays: Floats, observed: NDArray, star: NDArray
     ) -> Floats:
-        """(K,) standard deviation of a solver's residuals for K matches, from the centroids and the LED positions."""
-        return np.hypot(
-            fitted_sigma_rad(solver, rays[observed], pixel_rad[observed]), self.led_sigma_rad[star]
-        )
+        """Return the (K,) standard deviation of a solver's residuals, from the centroids and the LED positions."""
+        by_centroid_rad = fitted_sigma_rad(solver, rays[observed], pixel_rad[observed])
+        return np.hypot(by_centroid_rad, self.led_sigma_rad[star])
 
     def _with_survey(
         self,
@@ -399,46 +414,43 @@ class DomeTracker:
         sigma_rad: Floats,
         star: NDArray,
     ) -> tuple[Floats, Floats]:
-        """The covariance of K matches with the survey's errors as they are, and the part that successive frames share.
+        """Return the covariance of K matches with all errors of the survey, and the part that successive frames share.
 
         Parameters
         ----------
         covariance
-            (3, 3) in camera axes, with each LED's error independent of the others' and equal in
-            all directions
+            (3, 3) covariance in camera axes, in which each LED's error is independent of the
+            others' and equal in all directions
         misfit
             Factor of `_reject_blends` on all but the common errors
-        sigma_rad
-            (K,) errors on which it is based, (K, 3) rays and (K,) LEDs
+        rays, sigma_rad, star
+            (K, 3) rays, the (K,) errors on which the covariance is based, and (K,) rows of the LEDs
         """
         led_rad = self.led_sigma_rad[star]
         focal_rad = self._focal_rad(rays)
-        if (
-            self.leds.covariance_m2 is None
-            and self.leds.common_m is None
-            and not self.camera.focal_sigma
-        ):
-            # The LEDs' share of the error variance of a ray: of the covariance too, if it is the same for all rays.
-            return misfit * covariance, float(
-                np.mean(led_rad**2 / sigma_rad**2)
-            ) * misfit * covariance
+        simple = self.leds.covariance_m2 is None and self.leds.common_m is None
+        if simple and not self.camera.focal_sigma:
+            # The LEDs' share of the variance of a ray is their share of the covariance too, if all rays are alike.
+            share = float(np.mean(led_rad**2 / sigma_rad**2))
+            return misfit * covariance, share * misfit * covariance
         view, common_rad = self._common_rad(cam_from_lab, star)
+        # Errors of each LED's own position, as tangents
         own_rad2 = systematic.isotropic(led_rad)
         if self.leds.covariance_m2 is not None:
             by_place = view.gradient @ cam_from_lab.as_matrix()
             own_rad2 = by_place @ self.leds.covariance_m2[star] @ np.moveaxis(by_place, 1, 2)
-        noise_rad2 = systematic.isotropic(
-            np.sqrt(np.maximum(sigma_rad**2 - led_rad**2 - focal_rad**2, 0))
-        )
+        # The rest of each ray's variance is noise of the frame.
+        variance_rad2 = np.maximum(sigma_rad**2 - led_rad**2 - focal_rad**2, 0)
+        noise_rad2 = systematic.isotropic(np.sqrt(variance_rad2))
         errors = misfit * noise_rad2, misfit * own_rad2, common_rad
         return systematic.with_survey(covariance, view, sigma_rad, *errors, self.focal_fitted)
 
     def _common_rad(
         self, cam_from_lab: Rotation, star: NDArray
     ) -> tuple[systematic.Geometry, Floats]:
-        """K LEDs as the camera sees them, and the (M, K, 2) change of their tangents by the errors that all share.
+        """Return the geometry of K LEDs, and the (M, K, 2) change of their tangents by the errors that all share.
 
-        Each is changed by one standard deviation: of the focal length first, unless it is fitted, then of the map's
+        Each change is by one standard deviation: of the focal length first, unless it is fitted, then of the map's
         common errors.
         """
         place_cam = cam_from_lab.apply(self.leds.position_m[star])
@@ -455,7 +467,7 @@ class DomeTracker:
     def _residual_px(
         self, centroids: Centroids, observed: NDArray, star: NDArray, body_from_lab: Rotation
     ) -> Floats:
-        """(K, 2) predicted minus observed pixels."""
+        """Return the (K, 2) predicted minus observed pixels."""
         predicted = project(body_from_lab, self.leds.position_m[star], self.lever, self.camera)
         return predicted - centroids.xy_px[observed]
 
@@ -467,19 +479,24 @@ class DomeTracker:
         star: NDArray,
         body_from_lab: Rotation,
     ) -> tuple[NDArray, NDArray, float]:
-        """Reject matches with outlying residuals; returns the rest and a factor for their covariance.
+        """Reject matches with outlying residuals; return the others and a factor for their covariance.
 
-        Two LEDs whose images touch form one blob at neither's position. Residual lengths are divided by their sigmas;
-        those above 5 times the median (above 5 if the median is below 1) are rejected. The rest has 2 K - 3 degrees of
-        freedom, one less if the focal length is fitted; its chi-square has that mean, and more by what the fit cannot
-        absorb of the common errors. If it exceeds its mean by more than 3 standard deviations, their ratio is the
-        factor, else 1.
+        Two LEDs whose images touch form one blob at neither's position.
+
+        a. Divide the residuals' lengths by their sigmas, and reject those above 5 times the median (above 5 if the
+           median is below 1).
+        b. Compute mean and standard deviation of the chi-square of the others. It has 2 K - 3 degrees of freedom, one
+           less if the focal length is fitted; the part of the common errors that the fit cannot absorb increases both
+           (`systematic.residual_products`).
+        c. If chi-square exceeds its mean by more than 3 standard deviations, their ratio is the factor, else 1.
         """
+        # a. Outliers
         residual = self._residual_px(centroids, observed, star, body_from_lab)
         length = np.linalg.norm(residual, axis=1) / (sigma_rad * self.camera.focal_px)
         inlier = length <= 5 * max(float(np.median(length)), 1.0)
         if inlier.sum() < max(MIN_EVIDENCE_MATCHES, len(inlier) / 2):
             inlier[:] = True
+        # b. Mean and standard deviation of chi-square
         dof = 2 * int(inlier.sum()) - (4 if self.focal_fitted else 3)
         mean = float(dof)
         spread = np.sqrt(2 * dof)
@@ -497,13 +514,16 @@ class DomeTracker:
             spread = np.sqrt(
                 2 * noise**2 * dof + 4 * noise * np.trace(left) + 2 * np.trace(left @ left)
             )
+        # c. Factor
         chi2 = float(np.sum(length[inlier] ** 2))
         return observed[inlier], star[inlier], chi2 / mean if chi2 > mean + 3 * spread else 1.0
 
     def _lever_covariance(self, cam_from_lab: Rotation, star: NDArray) -> Floats:
-        """(3, 3) covariance in camera axes from the error of the pupil's position, which is common to all frames.
+        """Return the (3, 3) covariance in camera axes from the error of the pupil's position, common to all frames.
 
         A shift of the pupil has the same effect on a light at p from the bearing as a rotation by p x shift / |p|^2.
+        For lights about the mean position p, and the shift's variance sigma^2 along each axis, the covariance is
+        (sigma / |p|)^2 (I - u u^T), u = p / |p|.
         """
         mean_m = cam_from_lab.apply(self.leds.position_m[star].mean(axis=0))
         direction = mean_m / np.linalg.norm(mean_m)
@@ -519,7 +539,7 @@ class DomeTracker:
         star: NDArray,
         body_from_lab: Rotation,
     ) -> tuple[Rotation, Floats]:
-        """body_from_lab and its covariance in body axes, from the matched rays."""
+        """Return body_from_lab and its covariance in body axes, from the matched rays."""
         position_m = self.leds.position_m[star]
         return SOLVERS[solver](
             rays[observed], sigma_rad, position_m, self.leds, self.lever, body_from_lab
@@ -528,7 +548,7 @@ class DomeTracker:
     def _nearest(
         self, centroids: Centroids, body_from_lab: Rotation, radius_px: float
     ) -> tuple[NDArray, NDArray]:
-        """Mutual nearest neighbors of centroids and LEDs within a radius: rows of both."""
+        """Return mutual nearest neighbors of centroids and LEDs within a radius: rows of both."""
         xy = project(body_from_lab, self.leds.position_m, self.lever, self.camera)
         # An LED whose center is just off the chip may still have light on it.
         inside = np.flatnonzero(self.camera.contains(np.nan_to_num(xy, nan=-1e9), -30.0))

@@ -2,7 +2,7 @@
 
 Two flags decide. `saturated`: the mean of the frame is above a reference, for example because a bright body shines into
 the lens; or at least four objects have more than one saturated pixel each, so that a single planet does not shorten the
-exposure. `no_stars`: fewer than four objects, too few to identify. A step is 2 ms.
+exposure. `no_stars`: there are fewer than four objects, too few to identify. A step is 2 ms.
 
     saturated                shorter by a step
     not saturated, no_stars  longer by a step
@@ -37,11 +37,14 @@ class Control:
     Attributes
     ----------
     mean_dn
-        Reference mean; a frame with a greater mean is saturated
-    longest_s
-        50 ms is the paper's on-board limit, for a smear of 4.5 px at 2 deg/s
+        Reference mean; a frame with a larger mean is saturated
+    shortest_s, longest_s
+        Limits of the exposure time; 50 ms is the paper's on-board limit, for a smear of 4.5 px at
+        2 deg/s
+    step_s
+        Change of the exposure time from frame to frame
     min_stars
-        With fewer objects the flag no_stars is set
+        Least number of objects; with fewer the flag no_stars is set
     overexposed_objects, saturated_px
         A frame is saturated if at least overexposed_objects objects have more than saturated_px
         saturated pixels each
@@ -89,7 +92,7 @@ class Observation:
     Attributes
     ----------
     mean_dn
-        Of all pixels
+        Mean of all pixels
     stars
         Number of objects from centroiding
     overexposed
@@ -103,7 +106,7 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class NextExposure:
-    """The next exposure time, and the flags of the frame that it is based on."""
+    """Next exposure time, and the flags of the frame on which it is based."""
 
     time_s: float
     saturated: bool = False
@@ -111,7 +114,7 @@ class NextExposure:
 
 
 def step(state: NextExposure, observation: Observation, control: Control) -> NextExposure:
-    """The next exposure from one frame's measurements, within the limits and in whole microseconds."""
+    """Return the next exposure from one frame's measurements, within the limits and in whole microseconds."""
     saturated = (
         observation.mean_dn > control.mean_dn
         or observation.overexposed >= control.overexposed_objects
@@ -129,7 +132,9 @@ def observe(image: NDArray, box_px: Ints, saturation_dn: float, control: Control
     Parameters
     ----------
     image
-        (H, W); box_px : (N, 4) x0, y0, x1, y1 of the objects, both ends included, as in Blobs
+        (H, W) frame
+    box_px
+        (N, 4) x0, y0, x1, y1 of the objects, both ends included, as in Blobs
     saturation_dn
         Least value of a saturated pixel
 
@@ -163,7 +168,8 @@ def observe(image: NDArray, box_px: Ints, saturation_dn: float, control: Control
 
 @jit
 def _measure(image: NDArray, box_px: Ints, saturation_dn: float, allowed: int) -> tuple[float, int]:
-    """Mean of the frame, and number of boxes with more than `allowed` saturated pixels."""
+    """Return the mean of the frame, and the number of boxes with more than `allowed` saturated pixels."""
+    # Mean: the sum of the rows' sums
     total = 0.0
     for y in range(image.shape[0]):
         row = 0.0

@@ -1,10 +1,14 @@
 """Errors that exceed the model: a solution's matches, lens and covariance where its residuals are too great.
 
 The claimed centroid errors may be too small, and the lens may have drifted from its calibration. Both show in the
-chi-square of the residuals, but only in part: matches beyond the gate are lost. The errors are therefore multiplied by
-the factor that the residuals tell and the field is matched again, as long as the evidence rises (`widened`). Then the
-focal length and the first radial distortion coefficient are fitted with the attitude (`with_lens`), and what the
-residuals still exceed multiplies the covariance (`least_squares.variance_factor`).
+chi-square of the residuals, but only in part: matches beyond the gate are lost. `refit` therefore takes these steps:
+
+1. Multiply the errors by several factors and match the field again with each; keep the factor of most evidence
+   (`widened`).
+2. Fit the focal length and the first radial distortion coefficient with the attitude (`with_lens`).
+3. Multiply the covariance by the factor that the remaining residuals imply (`least_squares.variance_factor`).
+
+`with_companions` increases the errors of catalog stars whose residuals indicate a companion.
 """
 
 from __future__ import annotations
@@ -37,14 +41,13 @@ from estimator.identification.star_detections import (
 )
 from estimator.identification.star_evidence import Solution
 
-TELLING = 1.5  # variance factor above which matches and lens are tried anew
-DOUBTFUL = 0.7  # reduced chi-square above which greater errors are tried, also where every centroid is matched
-TRIED = 2.0 ** np.arange(7)  # factors of the variances
-PRIOR_WRONG_DEX = log10(
-    (1 - PRIOR_RIGHT) / PRIOR_RIGHT / (len(TRIED) - 1)
-)  # of each, beside the claimed errors
+TELLING = 1.5  # variance factor above which the lens is fitted
+DOUBTFUL = 0.7  # reduced chi-square above which larger errors are tried, also where every centroid is matched
+TRIED = 2.0 ** np.arange(7)  # factors of the variances that are tried
+# log10 of the prior odds of each larger factor against the claimed errors.
+PRIOR_WRONG_DEX = log10((1 - PRIOR_RIGHT) / PRIOR_RIGHT / (len(TRIED) - 1))
 LENS_MATCHES = 6  # least number of matches for a fit of the lens
-# standard deviations: relative focal length, distortion at the corner
+# Prior standard deviations of the lens: relative focal length, and relative distortion at the corner.
 FOCAL_PRIOR = 0.01
 CORNER_PRIOR = 0.01
 LENS_ROUNDS = 4
@@ -52,7 +55,13 @@ SHEAR_CHANCE = 1e-4  # probability of random residuals that look sheared
 
 
 def variance_of(residual: Floats, parameters: int) -> float:
-    """Factor of the claimed variances by (K, 2) residuals in standard deviations, after a fit of some parameters."""
+    """Return the factor of the claimed variances, from (K, 2) residuals in standard deviations after a fit.
+
+    Parameters
+    ----------
+    parameters
+        Number of parameters of the fit
+    """
     return variance_factor(float(np.sum(residual**2)), max(residual.size - parameters, 1))
 
 
@@ -60,26 +69,30 @@ def variance_of(residual: Floats, parameters: int) -> float:
 def widened(
     solution: Solution, R_cam_from_ref: Floats, detections: Detections, sky: SkyIndex
 ) -> tuple[Solution, float]:
-    """The solution with the errors of most evidence, and the expected factor of the variances over all that were tried.
+    """Return the solution with the errors of most evidence, and the expected factor of the variances.
 
-    The gates hide how great the errors are, so that each factor has its own matches; their Bayes factors, with the
-    prior of `least_squares.variance_factor`, are their weights. The covariance is multiplied by the factor.
+    Matches beyond the gates are lost, so each factor has its own matches.
+
+    1. If no unmatched detection is near a star, no factor changes the matches: scale the evidence (`_scaled`).
+    2. Otherwise match the field with each factor, and compute the evidence.
+    3. The expected factor is the mean over all, weighted by their Bayes factors with the prior of
+       `least_squares.variance_factor`. It multiplies the covariance.
 
     Parameters
     ----------
     detections
-        With the errors of the model, and the focal uncertainty with which the solution was
-        found
+        Detections with the errors of the model, and with the focal uncertainty with which the
+        solution was found
     """
+    # 1. Detections near a star within the widest gates
     gates = gates_of(detections, 1.5 * sqrt(TRIED[-1]))
     ratio = solution.focal_ratio
-    if (
-        star_evidence.count_near(
-            detections.tangent, sky, R_cam_from_ref, ratio, solution.observed, gates
-        )
-        == 0
-    ):
+    near = star_evidence.count_near(
+        detections.tangent, sky, R_cam_from_ref, ratio, solution.observed, gates
+    )
+    if near == 0:
         return _scaled(solution, 4 if detections.focal_uncertainty > 0 else 3)
+    # 2. Evidence of each factor
     best = solution
     chosen = 0
     best_dex = solution.dex
@@ -95,13 +108,14 @@ def widened(
             best = star_evidence.build_solution(wide, sky, found)
             chosen = n
             best_dex = dex[n]
+    # 3. Expected factor
     variance = _mean_factor(dex, best_dex)
     return with_errors(best, variance / TRIED[chosen], best.chi2, best.dex), variance
 
 
 @jit
 def _mean_factor(dex: Floats, best_dex: float) -> float:
-    """Mean of the factors TRIED, weighted by their Bayes factors."""
+    """Return the mean of the factors TRIED, weighted by their Bayes factors 10^dex."""
     total = weights = 0.0
     for n in range(len(TRIED)):
         weight = 10 ** (dex[n] - best_dex)
@@ -112,10 +126,11 @@ def _mean_factor(dex: Floats, best_dex: float) -> float:
 
 @jit
 def _scaled(solution: Solution, parameters: int) -> tuple[Solution, float]:
-    """As `widened`, where no factor changes the matches.
+    """Return the result of `widened` where no factor changes the matches.
 
     With n matches, p parameters and the variances times v, chi-square is divided by v, the density of each match by v,
-    and the posterior's volume is multiplied by v^(p/2).
+    and the posterior's volume is multiplied by v^(p/2). The evidence gains
+    chi2 / 2 (1 - 1 / v) + (p / 2 - n) ln v.
     """
     count = len(solution.star)
     dex = np.empty(len(TRIED))
@@ -134,7 +149,7 @@ def _scaled(solution: Solution, parameters: int) -> tuple[Solution, float]:
 
 @jit
 def with_errors(solution: Solution, factor: float, chi2: float, dex: float) -> Solution:
-    """The solution with its covariance times a factor, and another chi-square and evidence."""
+    """Return the solution with its covariance times a factor, and with another chi-square and evidence."""
     covariance_rad2 = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -155,10 +170,11 @@ def with_errors(solution: Solution, factor: float, chi2: float, dex: float) -> S
 def identify(
     lights: FlatCentroids, sensor: Sensor, stars: SkyIndex, max_detections: int, max_checks: int
 ) -> tuple[Solution, float]:
-    """Search centroids of a calibrated camera by pairs, and match and scale anew where the residuals are doubtful.
+    """Search centroids of a calibrated camera by pairs, and match the field again where the residuals are doubtful.
 
-    Returns the solution of `search.lost_in_space`, and the factor of the variances: that of `widened`, 1 without doubt.
-    It is 0 where the residuals are so great that the calibration may be wrong: the solution is then as it was found.
+    Returns the solution of `star_search.lost_in_space` and the factor of the variances: that of `widened`, or 1 without
+    doubt. The factor is 0 where the residuals are so large that the calibration may be wrong: the solution is then as
+    it was found.
     """
     detections = detections_of(lights, sensor, 0.0)
     solution = star_search.lost_in_space(detections, stars, max_detections, max_checks)
@@ -175,23 +191,24 @@ def identify(
 
 @jit
 def residuals_too_great(solution: Solution) -> bool:
-    """Whether the residuals of a solution exceed their errors by more than three standard deviations of chi-square."""
+    """Return whether a solution's reduced chi-square exceeds 1 by more than three standard deviations."""
     return solution.chi2 > 1 + 3 / sqrt(max(len(solution.star), 1))
 
 
 class Refit(NamedTuple):
-    """A solution with the errors and the lens that its residuals tell.
+    """A solution with the errors and the lens that its residuals imply.
 
     Attributes
     ----------
     solution
-        With the covariance multiplied by `variance`
+        Solution with the covariance multiplied by `variance`
     camera
-        With the fitted lens
+        Camera with the fitted lens
     variance
         Factor of the claimed variances
     sheared
-        Whether the field is stretched or sheared, as by a rolling shutter: its attitude is none
+        Whether the field is stretched or sheared, as by a rolling shutter: the attitude is then
+        unusable
     """
 
     solution: Solution
@@ -209,23 +226,27 @@ def refit(
     fit_lens: bool,
     variance: float = 0.0,
 ) -> Refit:
-    """The solution matched, fitted and scaled anew by its residuals.
+    """Match, fit and scale a solution again by its residuals: the numbered steps of the module.
 
     Parameters
     ----------
     detections
-        With the errors of the model, and the focal uncertainty with which the solution was
-        found
+        Detections with the errors of the model, and with the focal uncertainty with which the
+        solution was found
     camera
-        Of the solution
+        Camera of the solution
     xy_px
         (N, 2) centroids
+    fit_lens
+        Whether the lens may be fitted
     variance
-        Factor of the variances if the solution has been matched anew (`widened`); else 0
+        Factor of the variances if step 1 has been done (`widened`); else 0
     """
+    # 1. Matches
     if not variance:
         R_cam_from_ref = matrix_of(tuple(solution.cam_from_ref_xyzw.tolist()))
         solution, variance = widened(solution, R_cam_from_ref, detections, sky)
+    # 2. and 3. Lens
     if fit_lens and variance >= TELLING and len(solution.star) >= LENS_MATCHES:
         return with_lens(solution, detections, sky, camera, xy_px, variance)
     return Refit(solution, camera, variance)
@@ -241,9 +262,15 @@ def with_lens(
 ) -> Refit:
     """Fit attitude, focal length and the first radial distortion coefficient to the matches of a solution.
 
-    Gauss-Newton steps of the tangents t: t changes by J w with a small rotation w, by t with the logarithm of the focal
-    length, and by |t|^2 t with the coefficient. Both have normal priors about the calibration. Each round drops matches
-    beyond GATE_SIGMA of the errors that the last one found. The covariance is that of the attitude, whatever the lens.
+    The tangents t change by J w with a small rotation w, by t with the logarithm of the focal length, and by |t|^2 t
+    with the coefficient. The two lens parameters have normal priors about the calibration. Each round:
+
+    1. Linearize, and divide residuals and slopes by their errors (whiten).
+    2. Solve the normal equations of the five unknowns, and apply the step (Gauss-Newton).
+    3. Compute the factor of the variances from the remaining residuals.
+    4. Reject matches beyond GATE_SIGMA of these errors.
+
+    The covariance is that of the attitude, with the lens unknown.
     """
     cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
     keep = np.ones(len(solution.star), bool)
@@ -256,13 +283,14 @@ def with_lens(
     lens = camera
     change = np.zeros(5)
     for _ in range(LENS_ROUNDS):
+        # 1. Linearization
         seen = cam_from_ref.apply(vectors_ref)
         view = geometry(seen, seen)
         radial = view.tangent * np.sum(view.tangent**2, axis=1)[:, None]
-        slopes = whiten @ np.concatenate(
-            [view.jacobian, view.tangent[:, :, None], radial[:, :, None]], axis=2
-        )
+        by_unknowns = [view.jacobian, view.tangent[:, :, None], radial[:, :, None]]
+        slopes = whiten @ np.concatenate(by_unknowns, axis=2)
         residual = (whiten @ (lens.tangents(xy_px) - view.tangent)[:, :, None])[:, :, 0]
+        # 2. Step
         kept = slopes[keep].reshape(-1, 5)
         count = int(keep.sum())
         normal = kept.T @ kept / variance + prior
@@ -270,9 +298,11 @@ def with_lens(
         change[3:] += step[3:]
         cam_from_ref = Rotation.from_rotvec(step[:3]) * cam_from_ref
         lens = _lens_of(camera, *change[3:])
+        # 3. Factor of the variances
         distance2 = np.sum((residual - slopes @ step) ** 2, axis=1)
         chi2 = float(distance2[keep].sum())
         found = variance_factor(chi2, 2 * count - 5)
+        # 4. Gate
         near = distance2 <= GATE_SIGMA**2 * found
         if near.sum() < LENS_MATCHES:
             break
@@ -294,10 +324,10 @@ def with_lens(
 
 
 def _is_sheared(whiten: Floats, tangent: Floats, slopes: Floats, residual: Floats) -> bool:
-    """Whether a stretch (x, -y) and a shear (y, x) of the field explain the residuals of K matches.
+    """Return whether a stretch (x, -y) and a shear (y, x) of the field explain the residuals of K matches.
 
-    By an F-test, whatever the errors: with m degrees of freedom left, random residuals keep no more than the share q of
-    their chi-square with the probability q^(m/2).
+    This is an F-test, which does not depend on the size of the errors: with m degrees of freedom left, random residuals
+    keep no more than the share q of their chi-square with the probability q^(m/2).
     """
     x, y = tangent.T
     change = np.stack([np.stack([x, -y], axis=1), np.stack([y, x], axis=1)], axis=2)
@@ -309,11 +339,12 @@ def _is_sheared(whiten: Floats, tangent: Floats, slopes: Floats, residual: Float
 
 
 def _tangents(seen_cam: Floats) -> Floats:
+    """Return the (K, 2) tangents (x / z, y / z) of (K, 3) vectors in camera axes."""
     return np.asarray(seen_cam[:, :2] / seen_cam[:, 2:])
 
 
 def _lens_of(camera: Camera, log_focal: float, k1: float) -> Camera:
-    """The camera with its log focal length and first distortion coefficient changed."""
+    """Return the camera with its log focal length and first distortion coefficient changed by these amounts."""
     focal_px = camera.focal_px * float(np.exp(log_focal))
     distortion = (camera.distortion[0] + float(k1), *camera.distortion[1:])
     return replace(camera, focal_px=focal_px, distortion=distortion)
@@ -321,8 +352,8 @@ def _lens_of(camera: Camera, log_focal: float, k1: float) -> Camera:
 
 # Errors of catalog stars with a companion: a double star is not where its catalog entry is.
 
-
-# Of the entries of Hipparcos to V = 5.75: their distances from the center of light of Gaia's stars within 40".
+# Shares of the entries of Hipparcos to V = 5.75, and their errors along each axis: distances from the center of light
+# of Gaia's stars within 40".
 SHARE = np.array([0.86, 0.08, 0.04, 0.02])
 ERROR_RAD = np.array([0.0, 0.3, 1.0, 4.0]) * ARCSEC_RAD
 MIN_STARS = 4  # a star and three others
@@ -331,27 +362,40 @@ CHANGED = 0.9  # share of a star's information below which the field is fitted a
 
 
 def are_small(sigma_rad: Floats) -> bool:
-    """Whether the errors of all centroids are greater than those of any companion, so that none can show."""
+    """Return whether the errors of any companion are smaller than those of all centroids, so that none can show."""
     return bool(sigma_rad.min(initial=np.inf) > ERROR_RAD.max())
 
 
 def with_companions(
     solution: Solution, detections: Detections, sky: SkyIndex
 ) -> tuple[Solution, Detections]:
-    """The solution and its detections, with the errors of the stars whose residuals tell of a companion.
+    """Return the solution and its detections with larger errors for stars whose residuals indicate a companion.
 
-    Unchanged where every centroid's own error is greater than any companion's.
+    A catalog gives a double star the position of one component, of the center of light in another band, or of a mean
+    epoch. Most entries are better than any centroid, but some are wrong by arcseconds. In a field with a bright double
+    the attitude would follow it, and the covariance would not include that error. The share p_j of the stars has errors
+    of c_j along each axis. Each round:
+
+    1. Predict each star from all others: the residual r and the covariance P of the prediction
+       (`prediction_by_others`).
+    2. With the covariance S of the centroid, r has the density sum_j p_j N(0, S + P + c_j^2 I), which gives the
+       posterior probabilities g_j. The star then has the information sum_j g_j (S + c_j^2 I)^-1 (`mean_information`).
+    3. Fit the attitude again with this information; stop if it hardly changes, or if matches are lost.
+
+    Both are unchanged where every centroid's own error is larger than any companion's.
     """
     if len(solution.star) < MIN_STARS or are_small(detections.sigma):
         return solution, detections
     best = solution
     changed = detections
     for _ in range(ROUNDS):
+        # 1. Prediction by the other stars
         seen = Rotation.from_quat(best.cam_from_ref_xyzw).apply(sky.vectors[best.star])
         view = geometry(seen, seen)
         residual = detections.tangent[best.observed] - best.focal_ratio * view.tangent
         own, used = (information_of(one.weight[best.observed]) for one in (detections, changed))
         alone, spread = prediction_by_others(residual, view.jacobian, used)
+        # 2. Mean information
         mean = mean_information(own, alone, spread)
         before = changed.weight[best.observed]
         weight = detections.weight.copy()
@@ -360,6 +404,7 @@ def with_companions(
         sigma[best.observed] = 1 / np.sqrt(np.linalg.eigvalsh(mean)[:, 0])
         if np.min(weight[best.observed][:, :2] / before[:, :2]) > CHANGED:
             break
+        # 3. New attitude
         tried = detections._replace(weight=weight, sigma=sigma)
         R_cam_from_ref = Rotation.from_quat(best.cam_from_ref_xyzw).as_matrix()
         found = star_evidence.evaluate(
@@ -375,19 +420,21 @@ def with_companions(
 def prediction_by_others(
     residual: Floats, jacobian: Floats, information: Floats
 ) -> tuple[Floats, Floats]:
-    """(K, 2) residuals of stars from the attitude of all others, and (K, 2, 2) the covariances of what these predict.
+    """Return the (K, 2) residuals of stars from the attitude of all others, and the (K, 2, 2) covariances of these.
 
-    With the information N of the attitude and J' W J that of one star, the attitude without it moves by
-    -(N - J' W J)^-1 J' W r.
+    With the information N of the attitude and J^T W J of one star, the attitude without that star moves by
+    -(N - J^T W J)^-1 J^T W r, and predicts it with the covariance J (N - J^T W J)^-1 J^T.
 
     Parameters
     ----------
     residual, jacobian, information
-        (K, 2), (K, 2, 3) and (K, 2, 2) of the attitude that fits them all
+        (K, 2) residuals r, (K, 2, 3) Jacobians J and (K, 2, 2) inverse covariances W, for the
+        attitude that fits all stars
     """
     weighted = np.swapaxes(jacobian, 1, 2) @ information
     each = weighted @ jacobian
     others = each.sum(axis=0) - each
+    # N - J^T W J, inverted with a unit diagonal and a small term against singular matrices
     size = np.sqrt(np.einsum("kii->ki", others))
     scaled = others / (size[:, :, None] * size[:, None, :]) + 1e-9 * np.eye(3)
     covariance = np.linalg.inv(scaled) / (size[:, :, None] * size[:, None, :])
@@ -397,17 +444,21 @@ def prediction_by_others(
 
 
 def mean_information(information: Floats, residual: Floats, spread: Floats) -> Floats:
-    """(K, 2, 2) mean inverse covariances of stars by their residuals (K, 2) from what the others predict.
+    """Return sum_j g_j (S + c_j^2 I)^-1, (K, 2, 2): mean inverse covariances of stars (`with_companions`).
 
     Parameters
     ----------
-    information, spread
-        (K, 2, 2) of the centroid alone, and covariance of the prediction
+    information
+        (K, 2, 2) S^-1, inverse covariance of each centroid alone
+    residual, spread
+        (K, 2) residuals r from the prediction by the others, and its (K, 2, 2) covariance P
     """
+    # S + c_j^2 I, and with the prediction's P
     excess = ERROR_RAD[:, None, None, None] ** 2 * np.eye(2)
     covariance = np.linalg.inv(information) + excess
     total = covariance + spread
     distance2 = np.einsum("ki,jkim,km->jk", residual, np.linalg.inv(total), residual)
+    # Posterior probabilities g_j, from ln p_j - ln det / 2 - r^T (S + P + c_j^2 I)^-1 r / 2
     log_density = np.log(SHARE)[:, None] - 0.5 * np.log(np.linalg.det(total)) - 0.5 * distance2
     probability = np.exp(log_density - log_density.max(axis=0))
     probability /= probability.sum(axis=0)

@@ -1,9 +1,13 @@
 """Settings and processing stages common to all trackers: detection, centroiding, timing.
 
 A frame passes through four stages, each a function named in `Settings`: detect (frame to blobs), centroid (blobs to
-positions with errors), identify (positions to stars or LEDs) and solve (matches to an attitude). Here are the first
-two. Blobs that cannot be stars (hot pixels, tracks, the Moon, texture) or touch the border are dropped, saturated ones
-get a greater error, and centroids that are too inaccurate to tell one star from another are left out.
+positions with errors), identify (positions to stars or LEDs) and solve (matches to an attitude). This module has the
+first two (`detect_and_centroid`):
+
+1. Check the frame: its shape, saturation, and bad pixels.
+2. Detect blobs, and drop those that cannot be stars (hot pixels, tracks, the Moon, texture) or touch the border.
+3. Centroid them, with larger errors for saturated blobs and bad pixels.
+4. Drop centroids that are too inaccurate to distinguish stars.
 """
 
 from __future__ import annotations
@@ -32,13 +36,12 @@ SATURATED = "the frame is saturated"
 # with deeper saturation.
 SATURATED_SIGMA_PX = 0.05
 MAX_CENTROID_SIGMA_PX = 5.0  # less accurate centroids are dropped: they could match any star
-BAD_PIXEL_SIGMA_PX = (
-    0.06  # extra error of a centroid on an interpolated bad pixel, from Monte Carlo
-)
+# Extra error of a centroid on an interpolated bad pixel, from Monte Carlo.
+BAD_PIXEL_SIGMA_PX = 0.06
 
 
 class Allowed(NamedTuple):
-    """The allowed values of a setting: low to high, in words, and whether they are whole numbers."""
+    """Allowed values of a setting: low to high, in words, and whether they are whole numbers."""
 
     low: float
     high: float
@@ -74,8 +77,16 @@ class Settings:
 
     Attributes
     ----------
+    detector, centroider, identifier, solver
+        Names of the algorithms
+    threshold_sigma, min_area_px, max_blobs
+        Parameters of the detector (`detection.detect`)
+    gain_e_dn
+        Gain in electrons per unit of the image
+    saturation
+        Least value of a saturated pixel; inf if unknown
     centroid_sigma_px
-        Floor of a centroid's error, for errors beyond its own noise
+        Standard deviation added in quadrature to a centroid's error, for errors beyond its noise
     base_stars
         Number of brightest blobs from which the published identifiers form patterns
     searched_stars
@@ -89,7 +100,7 @@ class Settings:
     magnitude_sigma
         Standard deviation of a star's magnitude, including the effect of its color
     missed_dex
-        See `identification.options.Options`
+        Penalty of a missed star: see `identification.solver_options`
     reject
         Flags of `detection.classify.Flag` that exclude a blob
     bad_px
@@ -150,7 +161,7 @@ class Settings:
 def check_algorithms(
     settings: Settings, identifiers: Iterable[str], solvers: Iterable[str]
 ) -> None:
-    """Raise ImageError unless each stage's algorithm is there; identifiers and solvers are those of the tracker."""
+    """Raise ImageError for an unknown algorithm of a stage; identifiers and solvers are those of the tracker."""
     checks.of_type("settings", settings, Settings)
     stages: dict[str, Iterable[str]] = {
         "detector": DETECTORS,
@@ -179,6 +190,7 @@ class Clock:
         self._last = time.perf_counter()
 
     def lap(self, name: str) -> None:
+        """Add the time since the last lap to a name's seconds."""
         now = time.perf_counter()
         self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
         self._last = now
@@ -192,18 +204,19 @@ def detect_and_centroid(
     streak_px: tuple[float, float] | None = None,
     turn_rad: float = 0.0,
 ) -> Centroids:
-    """Detect blobs and compute their centroids, without those that cannot be stars or are too inaccurate.
+    """Detect blobs and compute their centroids: the numbered steps of the module.
 
     Parameters
     ----------
     streak_px, turn_rad
-        Of FramePriors, from the gyro; None if unknown
+        Streak and turn of FramePriors, from the gyro; None if unknown
 
     Raises
     ------
     ImageError
         For a frame of another shape than the camera's, or a saturated one.
     """
+    # 1. Frame
     check_frame(image, camera)
     image = in_row_order(image)
     streak_px = checks.pixel_step("streak_px", streak_px)
@@ -213,6 +226,7 @@ def detect_and_centroid(
             raise ImageError(f"{SATURATED}: over half of its pixels are at {settings.saturation:g}")
     if settings.bad_px is not None:
         image = replace_bad_pixels(image, settings.bad_px)
+    # 2. Blobs
     priors = FramePriors(streak_px, settings.saturation, turn_rad)
     blobs = DETECTORS[settings.detector](
         image, settings.threshold_sigma, settings.min_area_px, settings.max_blobs, priors
@@ -221,12 +235,14 @@ def detect_and_centroid(
     if not stars.all():
         blobs = blobs.take(stars)
     clock.lap("detect")
+    # 3. Centroids
     centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn, priors)
     centroids = inflate_uncertainty(centroids, blobs, settings)
     if camera.row_time_s and streak_px is None and centroids.streak_px is None:
         # The rows of a frame are far apart in time, so that even a rough rate is needed to identify its lights.
         centroids = replace(centroids, moments_px2=classify.moments(to_native(image), blobs))
     clock.lap("centroid")
+    # 4. Usable centroids
     sigma_px = centroids.sigma_px
     valid = camera.contains(centroids.xy_px) & (sigma_px > 0) & (sigma_px < MAX_CENTROID_SIGMA_PX)
     valid &= (centroids.flux > 0) & (centroids.flux < np.inf)
@@ -234,7 +250,7 @@ def detect_and_centroid(
 
 
 def inflate_uncertainty(centroids: Centroids, blobs: Blobs, settings: Settings) -> Centroids:
-    """The centroids with increased errors for saturated blobs and for blobs that touch bad pixels."""
+    """Return the centroids with larger errors for saturated blobs and for blobs that touch bad pixels."""
     extra = SATURATED_SIGMA_PX * (blobs.flag & int(Flag.SATURATED) != 0)
     if settings.bad_px is not None and len(blobs):
         bad_px = np.asarray(settings.bad_px)[:, None]
@@ -261,9 +277,9 @@ def process_frame(
     rate: RateEstimate | None = None,
     exposure_s: float | None = None,
 ) -> Report:
-    """Process a frame through all stages: detect, centroid, then `solve`. Returns the report with timings.
+    """Process a frame through all stages: detect, centroid, then `solve`; return the report with timings.
 
-    Without streak_px, a rate of known sign and the exposure time give the streak.
+    Without streak_px, a rate of known sign and the exposure time give the streak and the turn.
     """
     clock = Clock()
     turn_rad = 0.0
@@ -275,16 +291,16 @@ def process_frame(
 
 
 def brightest(centroids: Centroids, settings: Settings) -> Centroids:
-    """The brightest centroids, 2 * base_stars at most, for identification."""
+    """Return the brightest centroids, 2 * base_stars at most, for identification."""
     return centroids.take(np.arange(min(len(centroids), 2 * settings.base_stars)))
 
 
 def direction_sigma_rad(centroids: Centroids, camera: Camera, settings: Settings) -> Floats:
-    """(N,) standard deviation of a direction, rad: the centroid's own error and the floor centroid_sigma_px."""
+    """Return the (N,) standard deviation of a direction, rad, from the centroid's own error and centroid_sigma_px."""
     return np.hypot(centroids.sigma_px, settings.centroid_sigma_px) / camera.focal_px
 
 
 def away_from_border(box_px: NDArray, camera: Camera) -> NDArray:
-    """(N,) whether a blob's box is away from the border; a blob cut off by the border has a biased centroid."""
+    """Return (N,) whether a blob's box is inside the border; a blob cut off by the border has a biased centroid."""
     x0, y0, x1, y1 = box_px.T
     return (x0 > 0) & (y0 > 0) & (x1 < camera.width_px - 1) & (y1 < camera.height_px - 1)

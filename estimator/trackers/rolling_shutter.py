@@ -1,9 +1,16 @@
-"""Frames of a rolling shutter: put every light at the time of the middle row, and solve as a global shutter's frame.
+"""Frames of a rolling shutter: move every light to the time of the middle row, and solve as a global shutter's frame.
 
-The rate of the camera moves the lights (`attitude.motion`). It is given by a gyro, or taken from the streaks, in both
-signs, or without any assumed to be slow, with an error that covers streaks too short to be seen. The identified lights
-then tell attitude and rate together (`attitude.rolling`), and the frame is solved once more with that rate. Every stage
-of the tracker therefore works on lights of one time, and its tests against a wrong camera model stay as they are.
+The rate of the camera moves the lights (`attitude.rate`). `solve_rolling` takes these steps:
+
+1. Choose candidates of the rate (`candidates`): from a gyro; otherwise from the streaks, in both signs; without
+   streaks a slow one, with an error that covers streaks too short to be measured.
+2. Move the lights to the time of the middle row with a candidate, and identify and solve them.
+3. Fit attitude and rate together to the identified lights (`attitude.rolling`), and solve the frame again with that
+   rate, until the matches stay the same.
+4. Add the rate's error to the covariance.
+
+Every stage of the tracker therefore works on lights of one time, and its tests against a wrong camera model remain
+valid.
 """
 
 from __future__ import annotations
@@ -29,27 +36,31 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids, RateEstimate
 
-SHORT_STREAK_PX = 1.5  # standard deviation of a streak that is too short to be seen
-SLOW_RAD_S = np.radians(0.5)  # that of a rate without streaks, if the exposure is unknown
-SMALL_SHEAR_PX = 1.0  # at the first and last row: tried before the full range of slow rates
-PRIOR_FACTOR = (
-    4.0  # of slow rates, in the fit: streaks that differ over the field are not seen either
+SHORT_STREAK_PX = 1.5  # standard deviation of a streak that is too short to be measured
+SLOW_RAD_S = np.radians(
+    0.5
+)  # standard deviation of a rate without streaks, if the exposure is unknown
+SMALL_SHEAR_PX = (
+    1.0  # shear at the first and last row that is tried before the full range of slow rates
 )
-SAME_FOCAL = 2e-3  # relative difference of focal lengths that a rate not yet fitted causes
-ROUNDS = 5  # of the fit: the lights change with the rate
+# Factor of the slow rates' standard deviation in the prior of the fit: streaks that differ over the field are not
+# measured either.
+PRIOR_FACTOR = 4.0
+SAME_FOCAL = 2e-3  # largest relative difference of focal lengths that a rate not yet fitted causes
+ROUNDS = 5  # largest number of fits: the matches change with the rate
 
 
 class Lights(NamedTuple):
-    """The lights of a tracker.
+    """Lights of a tracker.
 
     Attributes
     ----------
     place_ref
-        (N, 3) unit vectors of stars, or LEDs from the bearing, m
+        (N, 3) unit vectors of stars, or positions of LEDs from the bearing, m
     lever_cam_m
-        (3,) the camera from the bearing, in camera axes; zeros for stars
+        (3,) position of the camera from the bearing, in camera axes; zeros for stars
     with_errors
-        Returns K centroids of given lights (K,) with their total errors
+        Function that returns K centroids of given lights (K,) with their total errors
     """
 
     place_ref: Floats
@@ -58,7 +69,7 @@ class Lights(NamedTuple):
 
     @property
     def sight(self) -> Sight:
-        """All lights at the median distance."""
+        """Sight of all lights, at their median distance."""
         return Sight(self.lever_cam_m, float(np.median(np.linalg.norm(self.place_ref, axis=1))))
 
 
@@ -70,25 +81,26 @@ def solve_rolling(
     rate: RateEstimate | None = None,
     exposure_s: float | None = None,
 ) -> Attitude:
-    """Attitude and rate at the middle row of a rolling shutter; the last refusal if no candidate of the rate solves.
+    """Return attitude and rate at the middle row of a rolling shutter; the last refusal if no candidate solves.
 
-    Where streaks leave the sign of the rate open, some stars may match with the wrong one as well: both signs are
-    tried, and the one with more evidence is kept.
+    The numbered steps are those of the module. Where streaks leave the sign of the rate open, some stars may match with
+    the wrong one as well: both signs are tried, and the one with more evidence is kept.
 
     Parameters
     ----------
     solve_global
-        Solves centroids of one time
+        Function that solves centroids of one time
     rate
-        From a gyro; None: from the frame
+        Rate from a gyro; None: from the frame
     exposure_s
-        None: streaks tell nothing of the rate
+        Exposure time; None: streaks do not determine the rate
     """
     best: Attitude | None = None
+    # 1. Candidates of the rate
     for candidate, prior in candidates(camera, lights.sight, centroids, rate, exposure_s):
-        attitude = _solve_with(
-            camera, lights, centroids, solve_global, (candidate, prior), exposure_s
-        )
+        # 2. to 4. Solution with a candidate
+        start = (candidate, prior)
+        attitude = _solve_with(camera, lights, centroids, solve_global, start, exposure_s)
         if attitude.solved and (best is None or _chance(attitude) < _chance(best)):
             best = attitude
         if best is not None and candidate.sign_known:
@@ -97,7 +109,7 @@ def solve_rolling(
 
 
 def _chance(attitude: Attitude) -> float:
-    """log10 of the probability of a chance match."""
+    """Return log10 of the expected number of chance matches of a solution."""
     assert attitude.match is not None
     return attitude.match.log10_chance
 
@@ -110,25 +122,29 @@ def _solve_with(
     start: tuple[RateEstimate, RateEstimate],
     exposure_s: float | None,
 ) -> Attitude:
-    """Attitude and rate from one candidate of the rate with its prior."""
+    """Return attitude and rate from one candidate of the rate with its prior: steps 2 to 4 of the module."""
+    # 2. Identification
     candidate = start[0]
     attitude = solve_global(at_middle_row(camera, centroids, candidate, lights.sight))
     fitted = candidate
     matched = np.empty((2, 0), int)
     for _ in range(ROUNDS):
-        if attitude.match is None or np.array_equal(
-            (attitude.match.observed, attitude.match.star), matched
-        ):
+        # 3. Fit, until the matches stay the same
+        if attitude.match is None:
             break
-        matched = np.stack([attitude.match.observed, attitude.match.star])
+        rows = np.stack([attitude.match.observed, attitude.match.star])
+        if np.array_equal(rows, matched):
+            break
+        matched = rows
         try:
             fitted = _fit(camera, lights, centroids, attitude, start, exposure_s)
         except ValueError as error:
             return Attitude(f"no attitude: {error}")
+        # The rate's error is common to all lights, and is added in step 4.
         exact = replace(fitted, covariance_rad2_s2=np.zeros((3, 3)))
-        attitude = solve_global(
-            at_middle_row(camera, centroids, exact, _sight_of(lights, attitude, centroids))
-        )
+        sight = _sight_of(lights, attitude, centroids)
+        attitude = solve_global(at_middle_row(camera, centroids, exact, sight))
+    # 4. Error of the rate
     return _with_rate(camera, lights, centroids, attitude, fitted) if attitude.solved else attitude
 
 
@@ -139,9 +155,10 @@ def candidates(
     rate: RateEstimate | None,
     exposure_s: float | None,
 ) -> Iterator[tuple[RateEstimate, RateEstimate]]:
-    """Rates with which a frame is identified, and the prior with which attitude and rate are then fitted.
+    """Yield rates with which a frame is identified, each with the prior with which attitude and rate are then fitted.
 
-    The gyro's alone, if it is given; else those of the streaks, in both signs; slow ones where no streak is seen.
+    They are the gyro's alone, if it is given; otherwise those of the streaks or disks, in both signs; slow ones where
+    no streak is measured.
     """
     if rate is not None:
         yield from ((signed, signed) for signed in _signs(rate))
@@ -155,9 +172,9 @@ def candidates(
     if streaks:
         yield from ((streak, anything) for streak in streaks)
         return
-    slow_rad_s = (
-        SHORT_STREAK_PX / camera.focal_px / exposure_s if exposure_s is not None else SLOW_RAD_S
-    )
+    slow_rad_s = SLOW_RAD_S
+    if exposure_s is not None:
+        slow_rad_s = SHORT_STREAK_PX / camera.focal_px / exposure_s
     shear_px = slow_rad_s * camera.focal_px * abs(camera.row_time_s) * camera.height_px / 2
     # About the boresight a streak is short near the center: at half the height it is as long for a greater rate.
     sigma = slow_rad_s * np.array([1.0, 1.0, 2 * camera.focal_px / camera.height_px])
@@ -165,16 +182,13 @@ def candidates(
         RateEstimate(np.zeros(3), np.diag((factor * sigma) ** 2)) for factor in (1, PRIOR_FACTOR)
     )
     if shear_px > SMALL_SHEAR_PX:
-        yield (
-            replace(
-                slow, covariance_rad2_s2=slow.covariance_rad2_s2 * (SMALL_SHEAR_PX / shear_px) ** 2
-            ),
-            prior,
-        )
+        covariance = slow.covariance_rad2_s2 * (SMALL_SHEAR_PX / shear_px) ** 2
+        yield replace(slow, covariance_rad2_s2=covariance), prior
     yield slow, prior
 
 
 def _signs(rate: RateEstimate) -> list[RateEstimate]:
+    """Return a rate, and its negative if the sign is unknown."""
     return [rate] if rate.sign_known else [rate, replace(rate, rate_rad_s=-rate.rate_rad_s)]
 
 
@@ -186,30 +200,33 @@ def _fit(
     start: tuple[RateEstimate, RateEstimate],
     exposure_s: float | None,
 ) -> RateEstimate:
-    """The rate from the matched lights of a frame, `start` being a candidate and its prior.
+    """Return the rate from the matched lights of a frame.
 
-    The rows alone tell the rate with its sign. The streaks are used if the rows tell their sign beyond doubt.
+    The times of the rows alone determine the rate with its sign. The streaks are used too if that rate determines their
+    sign beyond doubt.
+
+    Parameters
+    ----------
+    start
+        Candidate of the rate, and its prior
     """
     match = attitude.match
     lens = _lens(attitude, camera)
-    (candidate, prior) = start
+    candidate, prior = start
     assert match is not None
     seen = lights.with_errors(centroids.take(match.observed), match.star)
     places = lights.place_ref[match.star]
-    by_rows = rolling.fit(
-        lens, seen, places, lights.lever_cam_m, (match.cam_from_ref, candidate.rate_rad_s), prior
-    )
-    streaks = (
-        from_streaks(lens, seen, exposure_s, _radii(lights, places))
-        if exposure_s is not None
-        else []
-    )
+    # Rows alone
+    first = match.cam_from_ref, candidate.rate_rad_s
+    by_rows = rolling.fit(lens, seen, places, lights.lever_cam_m, first, prior)
+    if exposure_s is None:
+        return by_rows.rate
+    # Rows and streaks
+    streaks = from_streaks(lens, seen, exposure_s, _radii(lights, places))
     if not streaks:
         return by_rows.rate
-    signed = min(
-        (streak.resolved(by_rows.rate) for streak in streaks),
-        key=lambda one: _apart(one, by_rows.rate),
-    )
+    resolved = [streak.resolved(by_rows.rate) for streak in streaks]
+    signed = min(resolved, key=lambda one: _apart(one, by_rows.rate))
     if not signed.sign_known:
         return by_rows.rate
     first = by_rows.cam_from_ref, signed.rate_rad_s
@@ -217,13 +234,16 @@ def _fit(
 
 
 def _lens(attitude: Attitude, camera: Camera) -> Camera:
-    """The camera of a solution; the calibration where both agree, as a search that fits the focal length fits shear."""
+    """Return the camera of a solution, or the calibration where both agree.
+
+    A search that fits the focal length also absorbs a part of the shear with it.
+    """
     fitted = attitude.camera or camera
     return fitted if abs(fitted.focal_px / camera.focal_px - 1) > SAME_FOCAL else camera
 
 
 def _apart(one: RateEstimate, other: RateEstimate) -> float:
-    """Squared Mahalanobis distance of two rates."""
+    """Return the squared Mahalanobis distance of two rates."""
     difference = one.rate_rad_s - other.rate_rad_s
     return float(
         difference @ np.linalg.solve(one.covariance_rad2_s2 + other.covariance_rad2_s2, difference)
@@ -231,24 +251,23 @@ def _apart(one: RateEstimate, other: RateEstimate) -> float:
 
 
 def _radii(lights: Lights, places: Floats) -> Sight:
-    """The sight of identified lights: each at its own distance from the bearing, which no attitude changes."""
+    """Return the sight of identified lights: each at its own distance from the bearing, which no attitude changes."""
     return Sight(lights.lever_cam_m, np.linalg.norm(places, axis=1))
 
 
 def _sight_of(lights: Lights, attitude: Attitude, centroids: Centroids) -> Sight:
-    """The sight of all centroids, those at their own distance that are identified."""
-    assert attitude.match is not None
+    """Return the sight of all centroids: identified ones at their own distance, others at the median one."""
+    match = attitude.match
+    assert match is not None
     radius_m = np.full(len(centroids), lights.sight.radius_m)
-    radius_m[attitude.match.observed] = np.linalg.norm(
-        lights.place_ref[attitude.match.star], axis=1
-    )
+    radius_m[match.observed] = np.linalg.norm(lights.place_ref[match.star], axis=1)
     return Sight(lights.lever_cam_m, radius_m)
 
 
 def _with_rate(
     camera: Camera, lights: Lights, centroids: Centroids, attitude: Attitude, rate: RateEstimate
 ) -> Attitude:
-    """The attitude with its rate, whose error is added to the covariance."""
+    """Return the attitude with its rate, and with the rate's error added to the covariance."""
     match = attitude.match
     cam_from_ref = attitude.cam_from_ref
     assert match is not None
@@ -269,7 +288,7 @@ def with_streak_rate(
     gyro: RateEstimate | None = None,
     lights: Lights | None = None,
 ) -> Attitude:
-    """The attitude of a global shutter with the rate that the streaks of its lights tell; a gyro tells their sign."""
+    """Return the attitude of a global shutter with the rate from the streaks of its lights; a gyro gives their sign."""
     match = attitude.match
     camera = attitude.camera
     if match is None or camera is None or exposure_s is None:

@@ -1,11 +1,12 @@
 """Star tracker for the real sky: from a frame to an attitude, lost in space. `dome_tracker` does the same for a dome.
 
-Stages: detect and centroid (`pipeline`), identify, solve. The default identifier computes identity, attitude and
-covariance in one step by Bayesian evidence, from pairs of stars (`identification/stars/search.py`). If the focal length
-is uncertain, quads of stars (`quads.py`) are searched first, and the focal length and the first radial distortion
-coefficient are fitted to each frame's stars. Quads also find a calibrated focal length that is wrong: where a short
-search by pairs fails, or where its residuals are too great. The candidates of a published identifier (`registry`) are
-matched to the full catalog, refined, and accepted if the match is significant.
+The stages are detection and centroiding (`pipeline`), identification, and solution. The default identifier computes
+identity, attitude and covariance in one step by Bayesian evidence, from pairs of stars
+(`identification/star_search.py`). If the focal length is uncertain, quads of stars (`identification/star_quads.py`) are
+searched first, and the focal length and the first radial distortion coefficient are fitted to each frame's stars. Quads
+also find a calibrated focal length that is wrong: where a short search by pairs fails, or where its residuals are too
+large. The candidates of a published identifier (`registry`) are matched to the full catalog, refined, and accepted if
+the match is significant.
 """
 
 from __future__ import annotations
@@ -55,9 +56,11 @@ from estimator.trackers.refinement import NO_MATCH, FieldMatcher
 from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
 
 NO_STARS = "too few stars detected"
-AIR_ROUNDS = 2  # by which refraction is undone at another time than the air's epoch
-SAME_AIR_S = 1.0  # the zenith moves by 15" a second, and a refraction by 0.02"
-MIN_ERROR_PX = 0.005  # least centroid error of a star: a calibrated lens, a catalog's places
+AIR_ROUNDS = 2  # number of corrections for refraction at another time than the air's epoch
+SAME_AIR_S = 1.0  # time in which the zenith moves by 15", and a refraction changes by 0.02"
+MIN_ERROR_PX = (
+    0.005  # least centroid error of a star, for a calibrated lens and the catalog's positions
+)
 
 
 class SearchModel(NamedTuple):
@@ -70,11 +73,11 @@ class SearchModel(NamedTuple):
     relative_error
         Additional error, as a fraction of the distance from the principal point
     max_checks
-        Greatest number of star look-ups; 400,000 take about 0.02 s
+        Largest number of star look-ups; 400,000 take about 0.02 s
     by_quads
         Whether quads are searched in place of pairs
     focal_uncertainty
-        Relative, if it is greater than that of the tracker
+        Relative uncertainty of the focal length, if it is larger than that of the tracker
     """
 
     min_error_px: float
@@ -100,9 +103,8 @@ UNCALIBRATED_SEARCHES = (
     SearchModel(1.0, 0.005, 200_000),
     SearchModel(2.0, 0.01, 100_000),
 )
-QUAD_SEARCHES = tuple(
-    model for model in UNCALIBRATED_SEARCHES if model.by_quads
-)  # of an unknown field of view
+# Searches for an unknown field of view.
+QUAD_SEARCHES = tuple(model for model in UNCALIBRATED_SEARCHES if model.by_quads)
 CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 SETTINGS = Settings()
 
@@ -113,19 +115,21 @@ class StarTracker:
     Attributes
     ----------
     camera
-        on-board calibration
+        On-board calibration
     stars
-        on-board star list
+        On-board star list
     vectors
         (N, 3) apparent directions of `stars` at the time of the frames
+    settings
+        Algorithms of the stages, and their parameters
     focal_uncertainty
-        Relative; 0 for a calibrated camera, 0.05 if the field of view is only known to 5 %.
-        Unless it is 0, the focal length and, with enough stars, the radial distortion are
-        fitted in each frame.
+        Relative uncertainty of the focal length: 0 for a calibrated camera, 0.05 if the field of
+        view is only known to 5 %. Unless it is 0, the focal length and, with enough stars, the
+        radial distortion are fitted in each frame
     searches
-        Of the default identifier; empty for those that suit the focal uncertainty
+        Searches of the default identifier; empty for those that suit the focal uncertainty
     air
-        Over the tracker's site, whose refraction is undone; None in space
+        Air over the tracker's site, whose refraction is corrected; None in space
 
     Raises
     ------
@@ -161,13 +165,13 @@ class StarTracker:
         self.searches = searches or (
             UNCALIBRATED_SEARCHES if focal_uncertainty else CALIBRATED_SEARCHES
         )
+        # Stars that a frame can show, and the brighter ones among them that form patterns
         apparent_stars = replace(stars, vectors=vectors)
         self.stars = catalog.merge_doubles(apparent_stars, settings.merge_px / camera.focal_px)
         field_sr = camera.width_px * camera.height_px / camera.focal_px**2
-        index_stars = self.stars.take(
-            self.stars.v_mag
-            <= catalog.limit_for_density(self.stars, field_sr, settings.field_stars)
-        )
+        limit_mag = catalog.limit_for_density(self.stars, field_sr, settings.field_stars)
+        index_stars = self.stars.take(self.stars.v_mag <= limit_mag)
+        # Longest pair: the diagonal of the widest field that the camera may have
         longest_rad = 1.02 * camera.zoomed(1 - focal_uncertainty).diagonal_rad
         if all(model.by_quads for model in self.searches):
             longest_rad = quad_index.LONGEST * self._height_rad
@@ -184,6 +188,7 @@ class StarTracker:
         self.field_matcher = FieldMatcher(
             camera, self.stars, self.sky, settings, focal_uncertainty, self.pairs
         )
+        # Field of view in tangents: least and largest x, least and largest y
         corners = camera.tangents(CORNERS * [camera.width_px, camera.height_px] - 0.5)
         self.field = np.array(
             [corners[:, 0].min(), corners[:, 0].max(), corners[:, 1].min(), corners[:, 1].max()]
@@ -194,16 +199,14 @@ class StarTracker:
 
     @functools.cached_property
     def quads(self) -> quad_index.QuadIndex:
-        """The quads of the stars that form pairs, built when they are first needed."""
+        """Quads of the stars that form pairs, built on first use."""
         return quad_index.build(self.sky, self._height_rad)
 
     @property
     def _height_rad(self) -> float:
         """The smaller side of the field of view."""
-        return float(
-            2
-            * np.arctan(min(self.camera.width_px, self.camera.height_px) / 2 / self.camera.focal_px)
-        )
+        side_px = min(self.camera.width_px, self.camera.height_px)
+        return float(2 * np.arctan(side_px / 2 / self.camera.focal_px))
 
     @classmethod
     def for_sky(
@@ -216,15 +219,15 @@ class StarTracker:
         settings: Settings = SETTINGS,
         focal_uncertainty: float = 0.0,
     ) -> StarTracker:
-        """A tracker for the sky as seen from the Earth at a date.
+        """Return a tracker for the sky as seen from the Earth at a date.
 
         Parameters
         ----------
         limit_mag
-            Faintest V magnitude of the on-board catalog; None: 6 without `stars`, else all of
-            them
+            Faintest V magnitude of the on-board catalog; None: 6 without `stars`, otherwise all
+            stars
         date
-            UTC, ISO 8601 or datetime: fixes proper motion, parallax and aberration
+            UTC, ISO 8601 or datetime, which determines proper motion, parallax and aberration
         stars
             Another catalog than the Hipparcos subset that comes with the package, which ends at
             Hp 6.5
@@ -252,18 +255,18 @@ class StarTracker:
         exposure_s: float | None = None,
         t_s: float = 0.0,
     ) -> Report:
-        """Solve one frame. Raises ImageError for bad input; any other failure is reported in the status.
+        """Solve one frame. Raises ImageError for bad input; the status reports any other failure.
 
         Parameters
         ----------
         streak_px
-            (dx, dy) that stars move during the exposure, from the gyro; None: unknown, or from
-            `rate`
+            (dx, dy) by which stars move during the exposure, from the gyro; None: unknown, or
+            from `rate`
         rate
-            Of the camera, from the gyro; None: with a rolling shutter it is estimated from the
-            frame
+            Rate of the camera, from the gyro; None: with a rolling shutter it is estimated from
+            the frame
         exposure_s
-            To estimate the rate from streaks; None if unknown
+            Exposure time, to estimate the rate from streaks; None if unknown
         t_s
             Time of the frame since the air's epoch
         """
@@ -281,15 +284,15 @@ class StarTracker:
         Parameters
         ----------
         dtype
-            Of the frames' pixels
+            Type of the frames' pixels
         """
         cam_from_ref, xy_px, light = self.rich_field()
         warm_up.run(self.camera, xy_px, light, dtype, self.solve)
-        # Residuals of two and of four standard deviations: the errors are matched and fitted anew then.
+        # Residuals of two and of four standard deviations cause a new match and a new fit of the errors.
         for step_px in 0.2, 0.4:
             moved_px = xy_px + step_px * (-1.0) ** np.arange(len(xy_px))[:, None]
             self.solve_centroids(Centroids(moved_px, np.full(len(xy_px), 0.1), light))
-        # As many false lights as stars: whether the camera model fits the field is tested then.
+        # As many false lights as stars cause a test whether the camera model fits the field.
         xy_px = np.concatenate([xy_px, xy_px[:, ::-1]])
         centroids = Centroids(xy_px, np.full(len(xy_px), 0.1), np.concatenate([light, light / 2]))
         self.solve_centroids(centroids)
@@ -297,7 +300,10 @@ class StarTracker:
         self.solve_matches(centroids, np.arange(min(len(rows), 3)), rows[:3])
 
     def rich_field(self) -> tuple[Rotation, Floats, Floats]:
-        """An attitude with many stars on the sensor, of forty; their (N, 2) pixels and (N,) light, brightest first."""
+        """Return the attitude with most stars on the sensor, of forty, and their (N, 2) pixels and (N,) light.
+
+        The stars are in the order of brightness.
+        """
         fields = []
         for cam_from_ref in Rotation.random(40, np.random.Generator(np.random.PCG64(1))):
             rows, xy_px = self.field_matcher.in_field(self.camera, cam_from_ref)
@@ -306,7 +312,7 @@ class StarTracker:
 
     @property
     def efforts(self) -> int:
-        """Number of searches, with different error models and efforts, that are made before a frame is given up."""
+        """Number of searches, with different error models and efforts, before a frame is given up."""
         return len(self.searches) if self.index is None else 1
 
     def solve_centroids(
@@ -321,10 +327,14 @@ class StarTracker:
 
         Parameters
         ----------
+        centroids
+            Centroids of one frame
+        clock
+            Stopwatch of the stages; None: a new one
         effort
-            Run only this one of the `efforts` searches, from 0; None: all of them in turn
+            Number of the only search to run, out of `efforts`, from 0; None: all of them in turn
         rate, exposure_s
-            As in `solve`
+            Rate and exposure time as in `solve`
         """
         checks.of_type("centroids", centroids, Centroids)
         centroids.check_values()
@@ -351,28 +361,32 @@ class StarTracker:
         centroids: Centroids,
         clock: Clock | None = None,
     ) -> Attitude:
-        """Solve centroids seen through the air. The catalog is as seen at the air's epoch; the Earth has turned since.
+        """Solve centroids seen through the air at t_s after the epoch for which the catalog has been refracted.
 
-        The attitude tells where the zenith is, and so where the stars would have been seen at the epoch; they are
-        solved again there. The second time the first one's error of a refraction, some arcseconds, does not matter.
+        1. Solve with the catalog as it is; the Earth has rotated since the epoch.
+        2. The attitude determines the zenith, and so the directions in which the stars would have been seen at the
+           epoch. Move the centroids there.
+        3. Solve again; a second round makes the error of the first attitude's refraction, some arcseconds, negligible.
         """
+        # 1. Catalog of the epoch
         attitude = solve(centroids, clock)
         for _ in range(AIR_ROUNDS if abs(t_s) > SAME_AIR_S else 0):
             if attitude.cam_from_ref is None:
                 break
+            # 2. Refraction now removed, that of the epoch applied
             now = attitude.cam_from_ref.inv().apply(self.camera.rays(centroids.xy_px))
             at_epoch = air.seen(air.without_air(now, t_s), 0.0)
             xy_px = self.camera.pixels(attitude.cam_from_ref.apply(at_epoch))
+            # 3. Solution
             attitude = solve(replace(centroids, xy_px=xy_px), clock)
         return attitude
 
     def with_errors(self, centroids: Centroids) -> Centroids:
-        """The centroids with their total errors as covariances."""
+        """Return the centroids with their total errors as covariances."""
         sigma_px = self.sigma_px(centroids)
         excess_px2 = (sigma_px**2 - centroids.sigma_px**2)[:, None, None] * np.eye(2)
-        return replace(
-            centroids, sigma_px=sigma_px, covariance_px2=covariance_of(centroids) + excess_px2
-        )
+        covariance_px2 = covariance_of(centroids) + excess_px2
+        return replace(centroids, sigma_px=sigma_px, covariance_px2=covariance_px2)
 
     def _solve_global(self, centroids: Centroids, clock: Clock, effort: int | None) -> Attitude:
         """Identify and solve centroids of one time."""
@@ -389,7 +403,7 @@ class StarTracker:
         return Attitude(NO_MATCH)
 
     def _candidates(self, centroids: Centroids) -> Iterator[tuple[Camera, Rotation]]:
-        """Candidate cameras and attitudes by the published identifier that the settings name."""
+        """Return candidate cameras and attitudes by the published identifier that the settings name."""
         from estimator.identification.registry import candidates  # several compiled modules
 
         settings = self.settings
@@ -406,12 +420,17 @@ class StarTracker:
     def solve_matches(self, centroids: Centroids, observed: Ints, star: Ints) -> Attitude:
         """Solve the attitude for given matches from any source (the truth included), without identification.
 
-        The match is not tested against chance: its log10_chance is NaN. Raises ImageError for rows that there are not.
+        The match is not tested against chance: its log10_chance is NaN.
 
         Parameters
         ----------
         observed, star
             (K,) rows of the centroids and of `self.stars`, K >= 2
+
+        Raises
+        ------
+        ImageError
+            For rows outside of the centroids or stars.
         """
         checks.of_type("centroids", centroids, Centroids)
         centroids.check_values()
@@ -426,9 +445,10 @@ class StarTracker:
             cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
         except ValueError as error:
             return Attitude(f"no attitude: {error}")
+        # Covariance, with the errors that the residuals imply
         seen_cam = cam_from_ref.apply(vectors)
-        residual = self.camera.pixels(seen_cam) - centroids.xy_px[observed]
         xy_px = centroids.xy_px[observed]
+        residual = self.camera.pixels(seen_cam) - xy_px
         sigma_rad = sigma_rad * np.sqrt(misfit.variance_of(residual / sigma_px[:, None], 3))
         covariance_rad2 = covariance(rays, sigma_rad, self.settings.solver)
         covariance_rad2, common_rad2 = with_focal_error(
@@ -443,9 +463,10 @@ class StarTracker:
     def sigma_px(
         self, centroids: Centroids, min_error_px: float = MIN_ERROR_PX, relative_error: float = 0.0
     ) -> Floats:
-        """(N,) total centroid error: its own, a floor, and relative_error times the distance from the image center.
+        """Return the (N,) total centroid errors, px.
 
-        The error of a calibrated focal length is the least relative_error.
+        They are the root of the sum of squares of the centroid's own error, a least error, and relative_error times the
+        distance from the image center. The error of a calibrated focal length is the least relative_error.
         """
         sigma_px = np.hypot(centroids.sigma_px, max(self.settings.centroid_sigma_px, min_error_px))
         relative_error = max(relative_error, self.camera.focal_sigma)
@@ -457,20 +478,17 @@ class StarTracker:
     def detections(
         self, centroids: Centroids, sigma_px: Floats, focal_uncertainty: float = 0.0
     ) -> Detections:
-        """The centroids as input of the search, with magnitudes if the zero point is known.
+        """Return the centroids as input of the search, with magnitudes if the zero point is known.
 
         Parameters
         ----------
         sigma_px
             (N,) total errors
         focal_uncertainty
-            Relative, if it is greater than that of the tracker
+            Relative uncertainty of the focal length, if it is larger than that of the tracker
         """
-        return detections_of(
-            _lights(centroids, sigma_px),
-            self.sensor,
-            max(self.focal_uncertainty, focal_uncertainty),
-        )
+        uncertainty = max(self.focal_uncertainty, focal_uncertainty)
+        return detections_of(_lights(centroids, sigma_px), self.sensor, uncertainty)
 
     def _identify_by_evidence(
         self,
@@ -480,40 +498,47 @@ class StarTracker:
     ) -> Attitude:
         """Solve by the default identifier.
 
-        With a calibrated camera a solution that only a part of the field fits is dropped. With an uncertain focal
-        length the lens is fitted to all stars, unless an undistorted one explains the solution; if that fit fails, a
-        search without relative_error returns the solution, otherwise the next search follows.
+        Each search, until one gives an attitude:
+
+        1. Search with this model of the errors (`_search`). With a calibrated camera and residuals that are too large,
+           also search for a wrong focal length.
+        2. Match and fit again by the residuals (`refit`).
+        3. Drop the solution of a calibrated camera that fits only a part of the field, and a sheared field.
+        4. With an uncertain focal length, fit the lens to all stars, unless an undistorted one explains the solution.
+           If that fit fails, a search without relative_error returns the solution; otherwise the next search follows.
         """
         for model in searches:
+            # 1. Search
             sigma_px = self.sigma_px(centroids, model.min_error_px, model.relative_error)
             solution, variance = self._search(centroids, sigma_px, model)
             calibrated = not (self.focal_uncertainty or model.by_quads)
             if calibrated and not variance and misfit.residuals_too_great(solution):
-                # Of a camera with a wrong focal length a part of the stars may match, at a wrong attitude.
+                # With a wrong focal length a part of the stars may match, at a wrong attitude.
                 other, _ = self._search(centroids, sigma_px, WRONG_FOCAL_SEARCH)
-                solution = (
-                    other if other.dex > solution.dex + star_search.WRONG_FOCAL_DEX else solution
-                )
+                if other.dex > solution.dex + star_search.WRONG_FOCAL_DEX:
+                    solution = other
             clock.lap("identify")
             if not len(solution.star):
                 continue
+            # 2. Residuals
             refitted = self.refit(centroids, solution, sigma_px, variance)
+            # 3. Wrong camera model
             partial = not self.focal_uncertainty and self.field_matcher.misfits(
                 refitted.solution, centroids
             )
             if partial or refitted.sheared:
                 continue
             attitude = self.attitude_of(centroids, refitted, sigma_px)
+            # 4. Lens
             if self.focal_uncertainty and not (
                 model.min_error_px == MIN_ERROR_PX
                 and self.field_matcher.fits(solution, centroids, sigma_px)
             ):
-                fitted = self.field_matcher.refine(
-                    centroids,
-                    self.camera.zoomed(solution.focal_ratio),
-                    Rotation.from_quat(solution.cam_from_ref_xyzw),
-                )
-                attitude = attitude if not (fitted.solved or model.relative_error) else fitted
+                zoomed = self.camera.zoomed(solution.focal_ratio)
+                start = Rotation.from_quat(solution.cam_from_ref_xyzw)
+                fitted = self.field_matcher.refine(centroids, zoomed, start)
+                if fitted.solved or model.relative_error:
+                    attitude = fitted
             clock.lap("solve")
             if attitude.solved:
                 return attitude
@@ -522,7 +547,7 @@ class StarTracker:
     def _search(
         self, centroids: Centroids, sigma_px: Floats, model: SearchModel
     ) -> tuple[Solution, float]:
-        """One search of the default identifier, and the factor of the variances if it is known, else 0."""
+        """Return the solution of one search, and the factor of the variances if it is known, else 0."""
         most = self.settings.searched_stars
         at_once = not (model.by_quads or self.focal_uncertainty or self.camera.row_time_s)
         if at_once and misfit.are_small(sigma_px / self.camera.focal_px):
@@ -532,28 +557,29 @@ class StarTracker:
         if not model.by_quads:
             return star_search.lost_in_space(detections, self.sky, most, model.max_checks), 0.0
         known = not self.focal_uncertainty
-        return star_quads.identify(
+        solution = star_quads.identify(
             detections, self.quads, self.sky, most, model.max_checks, known
-        ), 0.0
+        )
+        return solution, 0.0
 
     def refit(
         self, centroids: Centroids, solution: Solution, sigma_px: Floats, variance: float = 0.0
     ) -> Refit:
-        """A solution with the errors and, of a calibrated global shutter, the lens that its residuals tell.
+        """Return a solution with the errors and, of a calibrated global shutter, the lens that its residuals imply.
 
         Parameters
         ----------
+        sigma_px
+            (N,) total errors of the centroids
         variance
-            Factor of the variances if the solution has been matched anew already; else 0
+            Factor of the variances if the solution has been matched again already; else 0
         """
-        camera = (
-            self.camera if solution.focal_ratio == 1 else self.camera.zoomed(solution.focal_ratio)
-        )
+        same_focal = solution.focal_ratio == 1
+        camera = self.camera if same_focal else self.camera.zoomed(solution.focal_ratio)
         if not len(solution.star) or 0 < variance < misfit.TELLING:
             return Refit(solution, camera, variance or 1.0)
-        detections = self.detections(
-            centroids, sigma_px, 0.0 if solution.focal_ratio == 1 else star_search.WRONG_FOCAL
-        )
+        uncertainty = 0.0 if same_focal else star_search.WRONG_FOCAL
+        detections = self.detections(centroids, sigma_px, uncertainty)
         if not variance:
             solution, detections = misfit.with_companions(solution, detections, self.sky)
             # A few stars may fit by luck within gates that are too narrow for the others.
@@ -563,18 +589,15 @@ class StarTracker:
             # The lens or the rate is fitted afterwards: matches beyond the gate belong to it.
             dof = max(2 * len(solution.star) - 4, 1)
             variance = variance_factor(dof * solution.chi2, dof)
-            return Refit(
-                solution._replace(covariance_rad2=variance * solution.covariance_rad2),
-                camera,
-                variance,
-            )
+            scaled = solution._replace(covariance_rad2=variance * solution.covariance_rad2)
+            return Refit(scaled, camera, variance)
         fit_lens = not self.camera.focal_sigma
         return misfit.refit(
             solution, detections, self.sky, camera, centroids.xy_px, fit_lens, variance
         )
 
     def attitude_of(self, centroids: Centroids, refitted: Refit, sigma_px: Floats) -> Attitude:
-        """The attitude of a solution; solved again from its matches if the settings name another solver."""
+        """Return the attitude of a solution; solved again from its matches if the settings name another solver."""
         solution, camera, variance, _ = refitted
         cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
         covariance_rad2 = solution.covariance_rad2
@@ -598,13 +621,13 @@ class StarTracker:
 
 
 def _lights(centroids: Centroids, sigma_px: Floats) -> FlatCentroids:
-    """Centroids as compiled code takes them, with their total errors (N,)."""
+    """Return centroids in the form for compiled code, with their total errors (N,)."""
     spread_px2 = NO_SPREAD if centroids.covariance_px2 is None else centroids.covariance_px2
     return FlatCentroids(centroids.xy_px, centroids.sigma_px, centroids.flux, spread_px2, sigma_px)
 
 
 def _published() -> Mapping[str, Callable[..., StarMatch | None]]:
-    """The identifiers by name: several compiled modules, which the default does without."""
+    """Return the identifiers by name; imported here, since the default does not need their compiled modules."""
     from estimator.identification.registry import IDENTIFIERS
 
     return IDENTIFIERS

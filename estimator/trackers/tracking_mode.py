@@ -1,9 +1,10 @@
 """Tracking mode of a star tracker: predict the attitude, centroid only in windows around the predicted stars.
 
-The prediction is the last attitude, propagated with the gyros or with the last rate. Stars are searched for in small
-windows around their predicted positions, and the fitted attitude is accepted by the same Bayes factor as in the
-lost-in-space search, increased because the prediction restricts the volume of possible attitudes. If that fails, or the
-last attitude is too old, the whole frame is solved lost in space.
+1. Predict the attitude from the last one, with the gyros or with the last rate.
+2. Search for the brightest predicted stars in small windows around their positions.
+3. Match and fit the attitude, and accept it by the same Bayes factor as in the lost-in-space search, increased because
+   the prediction restricts the volume of possible attitudes.
+4. If that fails, or the last attitude is too old, solve the whole frame lost in space.
 """
 
 from __future__ import annotations
@@ -31,13 +32,11 @@ from estimator.trackers.pipeline import Clock, Report, detect_and_centroid, infl
 from estimator.trackers.rolling_shutter import with_streak_rate
 from estimator.trackers.star_tracker import StarTracker
 
-WINDOW_SIGMA = (
-    4.0  # detection threshold in windows: lower than in a frame, as fewer pixels are searched
-)
+WINDOW_SIGMA = 4.0  # detection threshold: lower than in a frame, as fewer pixels are searched
 LONGEST_STREAK_PX = 4.0  # longer streaks are detected with the streak filter in the whole frame
 RATE_CHANGE = 0.3  # relative difference of a rate from its mean since the last attitude
 ROUGH = 3.0  # reduced chi-square above which a solution is flagged
-# Least share of the expected stars in a tracked solution. Where the prediction misses, three stars in the windows may
+# Least share of the expected stars in a tracked solution. Where the prediction is wrong, three stars in the windows may
 # fit by chance: in 2 of 2,400 frames at the limits of rate and acceleration, with 3 of 15 and 16 stars.
 LEAST_SHARE = 1 / 3
 
@@ -62,9 +61,9 @@ class TrackedReport(Report):
     Attributes
     ----------
     health
-        flags
+        Quality flags
     log10_odds
-        log10 of the odds of the attitude over chance; -inf without an attitude
+        Logarithm of the odds of the attitude over chance; -inf without an attitude
     chi2_per_dof
         Reduced chi-square of the residuals; NaN without an attitude
     expected
@@ -79,7 +78,17 @@ class TrackedReport(Report):
 
 @dataclass(frozen=True, slots=True)
 class LastSolution:
-    """The last attitude, with its time and the angular rate of the stars in camera axes, minus that of the camera."""
+    """The last attitude.
+
+    Attributes
+    ----------
+    t_s
+        Time of the attitude
+    cam_from_ref
+        Attitude
+    rate_rad_s
+        (3,) rate of the stars in camera axes: the negative of the camera's rate
+    """
 
     t_s: float
     cam_from_ref: Rotation
@@ -92,13 +101,13 @@ class TrackingMode:
     Attributes
     ----------
     tracker
-        lost-in-space tracker with a calibrated camera and the default identifier
+        Lost-in-space tracker with a calibrated camera and the default identifier
     reach_px
-        Half the side of a window: greatest error of the prediction
+        Half the side of a window: largest error of the prediction
     max_windows
-        Greatest number of windows, for the brightest stars
+        Largest number of windows, for the brightest stars
     max_age_s
-        Greatest age of the last attitude for a prediction
+        Largest age of the last attitude for a prediction
 
     Raises
     ------
@@ -139,20 +148,20 @@ class TrackingMode:
         streak_px: tuple[float, float] | None = None,
         exposure_s: float | None = None,
     ) -> TrackedReport:
-        """Solve the frame at t_s. Raises ImageError for bad input; any other failure is reported in the status.
+        """Solve the frame at t_s. Raises ImageError for bad input; the status reports any other failure.
 
-        A rate by streaks gets its sign from the last attitude. The frames of a rolling shutter are solved lost in
+        A rate from streaks gets its sign from the last attitude. The frames of a rolling shutter are solved lost in
         space, with that rate.
 
         Parameters
         ----------
         now_from_then
-            cam(t_s) from cam at the last solved frame, from the gyros; None: the last rate is
-            extrapolated
+            Rotation of the camera axes from the last solved frame to t_s, from the gyros; None:
+            the last rate is extrapolated
         streak_px
-            (dx, dy) that stars move during the exposure, from the gyros
+            (dx, dy) by which stars move during the exposure, from the gyros
         exposure_s
-            To estimate the rate from streaks
+            Exposure time, to estimate the rate from streaks
         """
         check_frame(image, self.tracker.camera)
         image = in_row_order(image)
@@ -160,9 +169,12 @@ class TrackingMode:
         t_s = checks.number("t_s", t_s, -1e300, 1e300, "a finite time in seconds")
         if now_from_then is not None:
             checks.one_rotation("now_from_then", now_from_then)
+        # 1. Prediction
         predicted = None if self.tracker.camera.row_time_s else self._predict(t_s, now_from_then)
         clock = Clock()
+        # 2. and 3. Windows
         report = self._track(image, predicted, streak_px, clock) if predicted is not None else None
+        # 4. Lost in space
         if report is None:
             report = self._search(image, streak_px, clock, exposure_s)
         report.attitude = self._with_rate(t_s, report.attitude, report.centroids, exposure_s)
@@ -170,12 +182,12 @@ class TrackingMode:
         return report
 
     def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
-        """Compile all that `solve` uses, in windows and in whole frames: `StarTracker.warm_up`; the memory is kept.
+        """Compile all that `solve` uses, in windows and in whole frames, as `StarTracker.warm_up`; keep the memory.
 
         Parameters
         ----------
         dtype
-            Of the frames' pixels
+            Type of the frames' pixels
         """
         self.tracker.warm_up(dtype)
         cam_from_ref, xy_px, light = self.tracker.rich_field()
@@ -188,7 +200,7 @@ class TrackingMode:
         warm_up.run(self.tracker.camera, xy_px, light, dtype, look)
 
     def _predict(self, t_s: float, now_from_then: Rotation | None) -> Rotation | None:
-        """Predicted cam_from_ref, or None without a recent attitude."""
+        """Return the predicted cam_from_ref, or None without a recent attitude."""
         last = self.last
         if last is None or not 0 <= t_s - last.t_s <= self.max_age_s:
             return None
@@ -199,18 +211,16 @@ class TrackingMode:
     def _with_rate(
         self, t_s: float, attitude: Attitude, centroids: Centroids, exposure_s: float | None
     ) -> Attitude:
-        """The attitude with the rate of its streaks, whose sign the last attitude tells."""
+        """Return the attitude with the rate of its streaks, whose sign the last attitude determines."""
         if attitude.rate is None:
             attitude = with_streak_rate(attitude, centroids, exposure_s)
         last = self.last
         cam_from_ref = attitude.cam_from_ref
-        if (
-            attitude.rate is None
-            or cam_from_ref is None
-            or last is None
-            or not 0 < t_s - last.t_s <= self.max_age_s
-        ):
+        if attitude.rate is None or cam_from_ref is None or last is None:
             return attitude
+        if not 0 < t_s - last.t_s <= self.max_age_s:
+            return attitude
+        # Mean rate of the camera since the last attitude
         between_rad_s = -(cam_from_ref * last.cam_from_ref.inv()).as_rotvec() / (t_s - last.t_s)
         sigma_rad_s = RATE_CHANGE * float(np.linalg.norm(between_rad_s))
         between = RateEstimate(between_rad_s, sigma_rad_s**2 * np.eye(3))
@@ -236,10 +246,13 @@ class TrackingMode:
         streak_px: tuple[float, float] | None,
         clock: Clock,
     ) -> TrackedReport | None:
-        """Solve from the detections in windows.
+        """Solve from the detections in windows; None if that fails.
 
-        None if the evidence is below ACCEPT_DEX, fewer stars than LEAST_SHARE are found, or the field is sheared.
+        1. Detect and centroid in the windows.
+        2. Match the detections at the predicted attitude, and compute the evidence. Refuse it below ACCEPT_DEX.
+        3. Fit the attitude. Refuse it if fewer stars than LEAST_SHARE match, or if the field is sheared.
         """
+        # 1. Detections
         tracker = self.tracker
         window_centers_px = self.window_centers_px(predicted)
         if len(window_centers_px) < MIN_EVIDENCE_MATCHES:
@@ -247,6 +260,7 @@ class TrackingMode:
         centroids, saturated = self._in_windows(image, window_centers_px, streak_px, clock)
         if len(centroids) < MIN_EVIDENCE_MATCHES:
             return None
+        # 2. Evidence
         sigma_px = tracker.sigma_px(centroids)
         detections = tracker.detections(centroids, sigma_px)
         reach_rad = self.reach_px / tracker.camera.focal_px
@@ -257,11 +271,11 @@ class TrackingMode:
         # The prior volume of attitudes is not 8 pi^2 but that of the prediction: the boresight in a square of side
         # 2 reach_rad, the roll in an interval of 2 reach_rad over the half field.
         half = float(np.min(tracker.field[1::2] - tracker.field[::2])) / 2
-        prior_gain_dex = log10(
-            8 * pi**2 / ((2 * reach_rad) ** 2 * min(2 * reach_rad / half, 2 * pi))
-        )
+        prior_volume = (2 * reach_rad) ** 2 * min(2 * reach_rad / half, 2 * pi)
+        prior_gain_dex = log10(8 * pi**2 / prior_volume)
         if hypothesis.dex + prior_gain_dex < ACCEPT_DEX:
             return None
+        # 3. Attitude
         solution = star_evidence.build_solution(detections, tracker.sky, hypothesis)
         refitted = tracker.refit(centroids, solution, sigma_px)
         if refitted.sheared or len(refitted.solution.star) < LEAST_SHARE * len(window_centers_px):
@@ -290,9 +304,9 @@ class TrackingMode:
         )
 
     def window_centers_px(self, cam_from_ref: Rotation) -> Floats:
-        """(N, 2) predicted pixels of the brightest stars whose windows are on the sensor.
+        """Return the (N, 2) predicted pixels of the brightest stars whose windows are on the sensor.
 
-        Of stars closer than reach_px only the brightest is kept.
+        Of stars closer together than reach_px only the brightest is kept.
         """
         tracker = self.tracker
         rows, xy = tracker.field_matcher.in_field(tracker.camera, cam_from_ref)
@@ -309,9 +323,10 @@ class TrackingMode:
         streak_px: tuple[float, float] | None,
         clock: Clock,
     ) -> tuple[Centroids, bool]:
-        """Centroids of the detections in windows, and whether any of them is saturated."""
+        """Return the centroids of the detections in windows, and whether any of them is saturated."""
         settings = self.tracker.settings
-        priors = FramePriors(streak_px, self.tracker.settings.saturation)
+        priors = FramePriors(streak_px, settings.saturation)
+        # Long streaks need the streak filter: the whole frame is processed, and only the windows are used.
         if streak_px is not None and np.hypot(*streak_px) > LONGEST_STREAK_PX:
             centroids = detect_and_centroid(image, self.tracker.camera, settings, clock, streak_px)
             near = np.abs(centroids.xy_px[:, None] - window_centers_px).max(axis=2) < self.reach_px
@@ -335,7 +350,7 @@ class TrackingMode:
         saturated: bool,
         streak_px: tuple[float, float] | None,
     ) -> TrackedReport:
-        """The report with quality flags."""
+        """Return the report with quality flags."""
         if attitude.match is None or attitude.cam_from_ref is None:
             return TrackedReport(attitude, centroids, clock.seconds)
         match: StarMatch = attitude.match

@@ -1,8 +1,9 @@
-"""Compile before the flight: frames of the tracker's own lights, drawn here, on which every stage runs once.
+"""Compilation before the flight: frames of the tracker's own lights, drawn here, on which every stage runs once.
 
 numba compiles a function for the types of its first call, which takes seconds, and keeps the code on disk. The frames
 reach every compiled function of a tracker: round lights and streaks, dim and bright ones for both widths of the
-detector's sums, a square that no fit takes, too few lights, and a mirrored sky, for which every search runs to its end.
+detector's sums, a square that no model fits, too few lights, and a mirrored sky, for which every search runs to its
+end.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from estimator.detection.detect import to_native
 
 SKY = 100.0
 NOISE = 2.0
-# peaks of the brightest light: 12-bit pixels have narrower sums than 16-bit ones
+# Peaks of the brightest light: 12-bit pixels have narrower sums than 16-bit ones.
 DIM = 1500.0
 BRIGHT = 6000.0
 SPOT_SIGMA_PX = 1.0
@@ -30,7 +31,7 @@ Step = tuple[float, float]
 
 
 def loop_type(dtype: DTypeLike) -> np.dtype:
-    """The type of pixels for which the loops are compiled: `to_native` of an image of this type."""
+    """Return the type of pixels for which the loops are compiled: that of `to_native` for an image of this type."""
     try:
         return to_native(np.zeros((1, 1), dtype)).dtype
     except (TypeError, ImageError):
@@ -42,7 +43,17 @@ def loop_type(dtype: DTypeLike) -> np.dtype:
 def draw(
     camera: Camera, xy_px: Floats, peak: Floats, dtype: np.dtype, streak_px: Step = (0.0, 0.0)
 ) -> NDArray:
-    """A frame with Gaussian spots of (N,) peak light at (N, 2) places, drawn out along a streak, over sky and noise."""
+    """Return a frame with Gaussian spots over sky and noise.
+
+    Parameters
+    ----------
+    xy_px, peak
+        (N, 2) positions and (N,) peak light of the spots
+    dtype
+        Type of the pixels
+    streak_px
+        (dx, dy) along which each spot is smeared
+    """
     image = np.random.Generator(np.random.PCG64(1)).normal(
         SKY, NOISE, (camera.height_px, camera.width_px)
     )
@@ -66,7 +77,7 @@ def run(
     dtype: DTypeLike,
     look: Callable[[NDArray, Step | None], object],
 ) -> None:
-    """Call `look(image, streak_px)` on every kind of frame of lights at (N, 2) places with (N,) relative brightness."""
+    """Call `look(image, streak_px)` on every kind of frame of lights at (N, 2) pixels with (N,) relative brightness."""
     kind = loop_type(dtype)
     spots = slice(0, MAX_SPOTS)
     xy_px = xy_px[spots]
