@@ -201,7 +201,7 @@ def to_samples(
     start: datetime.datetime,
     rotation: str | None,
 ) -> Samples:
-    """Samples of checked columns; `places` are the lines or rows of a file that has them, `unit` says which."""
+    """Samples of checked columns. `places` (N,) are their lines or rows, as `unit` says."""
     absolute = "utc" in columns
     t_s = (
         seconds_since(source, places, columns["utc"], start, "UTC", unit)
