@@ -1,8 +1,8 @@
 """Build the star tracker of a scene, and solve frames with it.
 
-`build_tracker` chooses the class by the scene: DomeTracker under LEDs, CodedTracker if it reads their codes, StarTracker
-under stars, ExternalTracker for an external tracker. Each gets the camera and map (onboard_model.py) and the settings
-(`assumed_settings`) that the tracker assumes, which may differ from the simulated hardware.
+`build_tracker` chooses the class by the scene: DomeTracker under LEDs, CodedTracker if it reads their codes,
+StarTracker under stars, ExternalTracker for an external tracker. Each gets the camera and map (onboard_model.py) and
+the settings (`assumed_settings`) that the tracker assumes, which may differ from the simulated hardware.
 """
 
 from __future__ import annotations

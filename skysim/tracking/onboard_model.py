@@ -98,8 +98,9 @@ def assumed_air(scene: Scene) -> SiteAir | None:
     """
     light = scene.light
     site = scene.site
-    corrects = scene.tracker.refraction and isinstance(light, StarsConfig) and light.air
-    if not corrects or site.longitude_deg is None:
+    if not isinstance(light, StarsConfig) or light.air is None or site.longitude_deg is None:
+        return None
+    if not scene.tracker.refraction:
         return None
     weather = weather_of(light.air, site, Band.from_camera(scene.camera))
     return SiteAir(
