@@ -1,7 +1,7 @@
 """Physical constants and conversion factors, each with its unit in the name and its source.
 
-The estimator keeps its own (`estimator/core/constants.py`), so that an error here cannot cancel there. Times and
-epochs are in `skysim/core/time.py`; numbers of one formula only stand beside it.
+The estimator has its own constants (`estimator/core/constants.py`), so that an error here cannot cancel there. Times
+and epochs are in `skysim/core/time.py`. A number that only one formula uses is defined next to the formula.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ LUMINOUS_EFFICACY_LM_W = 683.0  # of light at 540 THz, 555 nm
 STANDARD_GRAVITY_M_S2 = 9.80665  # CGPM 1901
 ZERO_CELSIUS_K = 273.15
 STANDARD_PRESSURE_HPA = 1013.25  # one atmosphere, CGPM 1954
-STANDARD_TEMPERATURE_K = 288.15  # at the sea, International Standard Atmosphere (ISO 2533)
+STANDARD_TEMPERATURE_K = 288.15  # at sea level, International Standard Atmosphere (ISO 2533)
 
 # Angles and lengths.
 ARCSEC_RAD = math.pi / 180 / 3600
@@ -31,13 +31,13 @@ PPM = 1e-6
 HOUR_S = 3600.0
 DAY_S = 86_400.0
 JULIAN_YEAR_DAY = 365.25  # IAU
-RPM_RAD_S = math.pi / 30  # rad/s of one revolution a minute
-DEG_H_RAD_S = math.radians(1) / 3600  # rad/s of one degree an hour
+RPM_RAD_S = math.pi / 30  # one revolution per minute in rad/s
+DEG_H_RAD_S = math.radians(1) / 3600  # one degree per hour in rad/s
 
 # The Earth: WGS 84 (NGA.STND.0036), J2 of EGM2008.
-EARTH_RADIUS_M = 6_378_137.0  # of the equator
+EARTH_RADIUS_M = 6_378_137.0  # at the equator
 EARTH_FLATTENING = 1 / 298.257223563
-EARTH_MU_M3_S2 = 3.986004418e14  # with its air
+EARTH_MU_M3_S2 = 3.986004418e14  # with the atmosphere
 EARTH_J2 = 1.08262668e-3
 EARTH_RATE_RAD_S = 7.292115e-5  # sidereal, 15.041 deg/h
 

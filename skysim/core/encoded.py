@@ -1,8 +1,8 @@
 """PNG, TIFF, JPEG and BMP images, whose declared size is checked before OpenCV decodes them.
 
 A few bytes of a damaged or hostile file can declare an image that exceeds the memory. Pillow reads the headers of JPEG
-and BMP. PNG and TIFF headers are parsed here, because a PNG chunk can be as harmful as its size, and because Pillow
-does not open TIFF files of 64-bit floats, or uses the last of a repeated tag where libtiff uses the first.
+and BMP. PNG and TIFF headers are parsed here: the chunks of a PNG can be as harmful as its size, and Pillow does not
+open TIFF files of 64-bit floats and uses the last of a repeated tag where libtiff uses the first.
 """
 
 from __future__ import annotations
@@ -25,13 +25,11 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 
-# Directories of TIFF files, and of the EXIF blocks of JPEG and PNG files, which have the same
-# structure.
-
+# Directories of TIFF files, and of the EXIF blocks of JPEG and PNG files, which have the same structure.
 
 MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
-# Integer types of 8, 16, 32 and 64 bits. libtiff accepts signed types for a size too. All are read as unsigned, so a
+# Integer types of 8, 16, 32 and 64 bits. libtiff also accepts signed types for a size. All are read as unsigned, so a
 # negative size, which libtiff rejects, is a huge one here.
 INTEGER_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q", 6: "B", 8: "H", 9: "I", 17: "Q"}
 WIDTH_TAG = 256
@@ -46,7 +44,7 @@ MAX_ENTRIES = 1 << 16
 
 
 class TiffEntry(NamedTuple):
-    """An entry of a directory: its tag, type and number of values, and where its value field begins."""
+    """An entry of a directory: its tag, type, number of values, and the offset of its value field."""
 
     tag: int
     kind: int
@@ -62,7 +60,7 @@ class Tiff:
 
     @property
     def order(self) -> str:
-        """Byte order, as for struct."""
+        """Byte order as a format character of struct."""
         return "<" if self.data.startswith(b"II") else ">"
 
     @property
@@ -71,15 +69,16 @@ class Tiff:
         return self.number("H", 2) == 43
 
     def number(self, kind: str, at: int) -> int:
-        """The integer of this type of struct at an offset."""
+        """The integer at an offset, of this type of struct."""
         return int(struct.unpack_from(self.order + kind, self.data, at)[0])
 
     def entries(self, at: int | None = None) -> Iterator[TiffEntry]:
-        """The entries of the directory at an offset, or of the first directory."""
+        """Yield the entries of the directory at an offset, or of the first directory."""
         big = self.is_big
         if at is None:
             at = self.number("Q" if big else "I", 8 if big else 4)
         count = self.number("Q" if big else "H", at)
+        # Bytes of an entry, of the count before the first one, and offset of the value field in an entry.
         size, head, value = (20, 8, 12) if big else (12, 2, 8)
         for n in range(min(count, MAX_ENTRIES)):
             begin = at + head + n * size
@@ -89,24 +88,21 @@ class Tiff:
 
     def value(self, entry: TiffEntry) -> int | None:
         """The first value of an entry, if it is an integer in the entry itself; else None."""
-        return (
-            self.number(INTEGER_TYPES[entry.kind], entry.at)
-            if entry.kind in INTEGER_TYPES
-            else None
-        )
+        if entry.kind not in INTEGER_TYPES:
+            return None
+        return self.number(INTEGER_TYPES[entry.kind], entry.at)
 
     def most_bits(self, entry: TiffEntry) -> int:
-        """Bits of the first sample by a BITS_TAG, whose values are in the entry itself, or where it points to."""
+        """Bits of the first sample by a BITS_TAG, whose values are in the entry itself or at an offset in it."""
         inside = entry.values * 2 <= (8 if self.is_big else 4)
-        return self.number(
-            "H", entry.at if inside else self.number("Q" if self.is_big else "I", entry.at)
-        )
+        at = entry.at if inside else self.number("Q" if self.is_big else "I", entry.at)
+        return self.number("H", at)
 
 
 def image_size(data: bytes) -> tuple[int, int, int, int, bool] | None:
-    """Width, height, samples a pixel, bits a sample, and whether the samples are planar; None without a size.
+    """Width, height, samples per pixel, bits per sample, and whether samples are planar; None without a size.
 
-    Of a repeated tag the greatest value counts: libtiff uses the first.
+    The greatest value of a repeated tag counts, since libtiff uses the first.
     """
     tiff = Tiff(data)
     values = {WIDTH_TAG: 0, HEIGHT_TAG: 0, SAMPLES_TAG: 1, PLANAR_TAG: 1}
@@ -121,14 +117,14 @@ def image_size(data: bytes) -> tuple[int, int, int, int, bool] | None:
 
 
 class Exif(NamedTuple):
-    """What a camera wrote beside the pixels (Exif 2.32, CIPA DC-008).
+    """Metadata that a camera wrote with the pixels (Exif 2.32, CIPA DC-008).
 
     Attributes
     ----------
     orientation
-        1 to 8; 1 if the rows are stored as they are to be seen
+        1 to 8; 1 if the stored image is upright
     focal_35mm
-        FocalLengthIn35mmFilm, mm; None if unknown
+        FocalLengthIn35mmFilm in mm; None if unknown
     """
 
     orientation: int = 1
@@ -136,7 +132,7 @@ class Exif(NamedTuple):
 
 
 def read_exif_block(data: bytes) -> Exif:
-    """Orientation and focal length of an EXIF block or a TIFF file; the defaults for what is missing or damaged."""
+    """Orientation and focal length in an EXIF block or a TIFF file; defaults for values that are missing or damaged."""
     found: dict[int, int] = {}
     if not data.startswith(MAGICS):
         return Exif()
@@ -146,22 +142,20 @@ def read_exif_block(data: bytes) -> Exif:
         found |= {ORIENTATION_TAG: main.get(ORIENTATION_TAG) or 1}
         if at := main.get(EXIF_TAG):
             found |= {entry.tag: tiff.value(entry) or 0 for entry in tiff.entries(at)}
-    except struct.error:  # it ends before its last entry
-        pass
+    except struct.error:
+        pass  # the block ends before its last entry
     orientation = found.get(ORIENTATION_TAG, 1)
     return Exif(orientation if 1 <= orientation <= 8 else 1, found.get(FOCAL_35MM_TAG) or None)
 
 
-# What the readers of images share: limits on the size by the header, and C libraries that print
-# nothing.
-
+# Limits of the size, and output of C libraries.
 
 MAX_PIXELS = 1 << 28
-MAX_BYTES = 600 << 20  # of a file, and of its pixels when decoded: 2^28 of 16 bits, and a header
+MAX_BYTES = 600 << 20  # of a file, and of its decoded pixels: 2^28 of 16 bits, and a header
 
 
 def check_pixels(path: Path, *sides: int, each_bytes: int = 1) -> None:
-    """Raise InputError for more pixels than MAX_PIXELS, or more than MAX_BYTES when decoded."""
+    """Raise InputError for more pixels than MAX_PIXELS, or for more than MAX_BYTES after decoding."""
     size = "x".join(map(str, sides)) if len(sides) < 5 else f"{prod(sides):.3g}"
     if prod(sides) > MAX_PIXELS:
         raise InputError(path, f"{size} pixels by its header", f"up to {MAX_PIXELS}")
@@ -191,7 +185,7 @@ def silent_opencv() -> Iterator[None]:
 
 @contextmanager
 def silent_stderr() -> Iterator[None]:
-    """Suppress output of C libraries: libpng and OpenCV write their messages directly to file descriptor 2."""
+    """Suppress output of C libraries: libpng and OpenCV write messages directly to file descriptor 2."""
     sys.stderr.flush()
     saved = os.dup(2)
     devnull = os.open(os.devnull, os.O_WRONLY)
@@ -204,6 +198,8 @@ def silent_stderr() -> Iterator[None]:
         os.close(devnull)
 
 
+# Decoding.
+
 MAX_DEFLATE_RATIO = 1032  # greatest compression ratio of deflate (zlib's technical details)
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 JPEG_MAGIC = b"\xff\xd8\xff"
@@ -212,9 +208,9 @@ SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
 
 
 def decode_image(path: Path, data: bytes) -> NDArray:
-    """The pixels of a file's bytes, (H, W) or (H, W, channels), blue first. Raises InputError with one line.
+    """The pixels (H, W) or (H, W, channels), blue first, of a file's bytes. Raises InputError.
 
-    OpenCV turns a TIFF image as its orientation says, and leaves PNG and JPEG as stored.
+    OpenCV applies the orientation of a TIFF file, but not that of PNG and JPEG.
     """
     check_encoded_size(path, data)
     check_planes(path, data)
@@ -233,43 +229,38 @@ def check_encoded_size(path: Path, data: bytes) -> None:
     reader = next((reader for magic, reader in FORMATS.items() if data.startswith(magic)), None)
     try:
         sizes = list(reader(data)) if reader else []
-    except Exception:  # of many types, from Pillow or struct, for a truncated or damaged header
-        sizes = []
+    except Exception:
+        sizes = []  # Pillow and struct raise many types of exception for a damaged header
     if not sizes:
         raise InputError(path, "cannot be decoded; it may be truncated or not an image")
     for sides, each_bytes in sizes:
         check_pixels(path, *sides, each_bytes=each_bytes)
 
 
-Sizes = Iterator[
-    tuple[tuple[int, ...], int]
-]  # width and height, and the bytes of each pixel as OpenCV decodes it
-PNG_SAMPLES = {
-    0: 1,
-    2: 3,
-    3: 4,
-    4: 4,
-    6: 4,
-}  # by color type: OpenCV adds colors to gray with alpha, alpha to a palette
+# Width and height, and the bytes of each pixel as decoded by OpenCV.
+Sizes = Iterator[tuple[tuple[int, ...], int]]
+# Samples by color type: OpenCV adds colors to gray with alpha, and alpha to a palette.
+PNG_SAMPLES = {0: 1, 2: 3, 3: 4, 4: 4, 6: 4}
 
 
 def png_size(data: bytes) -> Sizes:
-    """Size from IHDR, the first chunk (PNG, section 11.2.2); nothing if a chunk or the rows exceed the file.
+    """Yield the size from IHDR, the first chunk (PNG, section 11.2.2); nothing if a chunk or the rows exceed the file.
 
-    OpenCV allocates memory for a chunk before it reads it, so every chunk must end within the file, and the rows must
-    be no more than the file can hold at deflate's greatest compression.
+    OpenCV allocates memory for a chunk before it reads it, so every chunk must end within the file. The rows must not
+    exceed what the file can hold at deflate's greatest compression.
     """
     width, height, bits, color = struct.unpack_from(">IIBB", data, 16)
-    end = [chunk_end for _, _, chunk_end in png_chunks(data)][-1] + 4  # behind the chunk's checksum
-    complete = end <= len(data) and height * (1 + width * bits // 8) <= MAX_DEFLATE_RATIO * len(
-        data
-    )
-    if complete or width * height > MAX_PIXELS:  # the caller reports an excessive size
+    # A checksum of four bytes follows the last chunk.
+    end = [chunk_end for _, _, chunk_end in png_chunks(data)][-1] + 4
+    rows_bytes = height * (1 + width * bits // 8)
+    complete = end <= len(data) and rows_bytes <= MAX_DEFLATE_RATIO * len(data)
+    # The caller reports an excessive size.
+    if complete or width * height > MAX_PIXELS:
         yield (width, height), PNG_SAMPLES.get(color, 4) * max(bits // 8, 1)
 
 
 def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
-    """Kind of each chunk, and where its body begins and ends, up to IEND (PNG, section 5.3)."""
+    """Yield kind, begin and end of the body of each chunk up to IEND (PNG, section 5.3)."""
     at = len(PNG_MAGIC)
     kind = b""
     while kind != b"IEND" and at < len(data):
@@ -279,17 +270,17 @@ def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
 
 
 def pillow_size(data: bytes) -> Sizes:
-    """Size of a JPEG or BMP file."""
+    """Yield the size of a JPEG or BMP file."""
     with opened_by_pillow(data) as image:
         yield image.size, 1 if image.mode in ("1", "L") else 4
 
 
 @contextmanager
 def opened_by_pillow(data: bytes) -> Iterator[Any]:
-    """A JPEG or BMP file as an image of Pillow, which reads the header only; its warnings are left out."""
+    """A JPEG or BMP file as an image of Pillow, which reads only the header; its warnings are suppressed."""
     from PIL import BmpImagePlugin, JpegImagePlugin
 
-    # The class, not Image.open: that has a limit of its own.
+    # Image.open has its own limit of size, so its class is used.
     plugin = (
         BmpImagePlugin.BmpImageFile if data.startswith(BMP_MAGIC) else JpegImagePlugin.JpegImageFile
     )
@@ -300,7 +291,7 @@ def opened_by_pillow(data: bytes) -> Iterator[Any]:
 
 
 def tiff_size(data: bytes) -> Sizes:
-    """Size from the first directory. Only here are samples counted as pixels, because each may have eight bytes."""
+    """Yield the size from the first directory; samples count as pixels, because each may have eight bytes."""
     if size := image_size(data):
         width, height, samples, bits, _ = size
         yield (width, height, samples) if samples > 1 else (width, height), min(bits // 8, 8)
@@ -325,16 +316,15 @@ def check_planes(path: Path, data: bytes) -> None:
 
 
 def read_exif(data: bytes) -> Exif:
-    """EXIF of a PNG, TIFF or JPEG file that can be decoded; the defaults without one.
+    """EXIF of a PNG, TIFF or JPEG file that can be decoded; defaults without it.
 
-    OpenCV has applied the orientation of a TIFF file, but not that of PNG and JPEG.
+    The orientation of a TIFF file is 1, because OpenCV has applied it.
     """
     if data.startswith(MAGICS):
         return read_exif_block(data)._replace(orientation=1)
     if data.startswith(PNG_MAGIC):
-        return read_exif_block(
-            next((data[at:end] for kind, at, end in png_chunks(data) if kind == b"eXIf"), b"")
-        )
+        blocks = [data[at:end] for kind, at, end in png_chunks(data) if kind == b"eXIf"]
+        return read_exif_block(blocks[0] if blocks else b"")
     if data.startswith(JPEG_MAGIC):
         with opened_by_pillow(data) as image:
             return read_exif_block(image.info.get("exif", b"").removeprefix(b"Exif\0\0"))
@@ -342,7 +332,8 @@ def read_exif(data: bytes) -> Exif:
 
 
 def upright(image: NDArray, orientation: int) -> NDArray:
-    """The image as it is to be seen: (H, W, ...) turned and mirrored by EXIF's orientation, 1 to 8."""
+    """The upright image (H, W, ...): rotated and mirrored by EXIF's orientation, 1 to 8."""
+    # Orientations above 4 are transposed; the other two bits mirror rows and columns.
     if orientation > 4:
         image = image.swapaxes(0, 1)
     rows, columns = {1: (1, 1), 2: (1, -1), 3: (-1, -1), 0: (-1, 1)}[orientation % 4]

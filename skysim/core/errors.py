@@ -17,14 +17,13 @@ def note(message: str) -> None:
 
 
 def printable(text: object) -> str:
-    """Text from outside on one line, with ? for control characters and others that a terminal cannot show."""
-    return "".join(
-        character if character.isprintable() else "?" for character in " ".join(str(text).split())
-    )
+    """Text from outside on one line, with ? for control and other characters that a terminal cannot show."""
+    one_line = " ".join(str(text).split())
+    return "".join(character if character.isprintable() else "?" for character in one_line)
 
 
 def unknown_name(kind: str, name: object, allowed: Iterable[object]) -> tuple[str, str]:
-    """Problem of a name that is not allowed, and the allowed ones: `unknown solver 'magic'`, `quest, svd`."""
+    """The problem with a name that is not allowed, and the allowed names: `unknown solver 'magic'`, `quest, svd`."""
     return f"unknown {kind} {name!r}", ", ".join(map(str, allowed))
 
 
@@ -33,10 +32,12 @@ class Where(NamedTuple):
 
     Attributes
     ----------
+    file
+        The file
     line
-        None if the place is the file as a whole
+        Line or row, from 1; None for the file as a whole
     unit
-        What `line` counts: lines, or rows of a table
+        Unit of `line`: line, or row of a table
     """
 
     file: str | Path
@@ -44,30 +45,29 @@ class Where(NamedTuple):
     unit: str = "line"
 
     def __str__(self) -> str:
-        return printable(
-            self.file if self.line is None else f"{self.file}, {self.unit} {self.line}"
-        )
+        place = "" if self.line is None else f", {self.unit} {self.line}"
+        return printable(f"{self.file}{place}")
 
 
-OVERRIDES = Where("overrides")  # of a value that the caller gave in place of the file's
+OVERRIDES = Where("overrides")  # place of a value that the caller gave instead of the file
 
 
 class InputError(ValueError):
-    """The user's input is wrong; `str` says where, what, and what is allowed, in one printable line.
+    """An error in the user's input; `str` gives key, problem, allowed values and place in one printable line.
 
-    No code reads the text of an error: the command line and the page word it from these parts. A caller that knows more
-    raises a changed copy: `under`, `within`, `at`.
+    No code reads the text of an error: the command line and the page compose it from these parts. A caller that knows
+    more raises a changed copy (`under`, `within`, `at`).
 
     Attributes
     ----------
     key
-        The input at fault: a dotted key, a parameter or a file; empty if it has no name
+        Input at fault: a dotted key, a parameter or a file; empty if it has no name
     problem
-        What is wrong with it; may be empty if `allowed` says all
+        The problem; empty if `allowed` is sufficient
     allowed
-        What it may be; may be empty if `problem` says all
+        Allowed values; empty if `problem` is sufficient
     where
-        Place of the key in a file; for the file that is the key itself, the place in it
+        Place of the key in a file; if the key is the file itself, the place in it
     """
 
     key: str
@@ -78,29 +78,28 @@ class InputError(ValueError):
     def __init__(
         self, key: object, problem: object, allowed: object = "", where: Where | None = None
     ) -> None:
-        self.key = printable(key)  # the parts may quote a file, and a file may hold anything
+        # The parts may quote a file, and a file may contain any character.
+        self.key = printable(key)
         self.problem = printable(problem)
         self.allowed = printable(allowed)
         self.where = where and where._replace(file=str(where.file))
-        super().__init__(
-            self.key, self.problem, self.allowed, self.where
-        )  # from these it is unpickled
+        # Unpickling calls the constructor with the arguments of the base class.
+        super().__init__(self.key, self.problem, self.allowed, self.where)
 
     @property
     def fault(self) -> str:
-        """The problem and what is allowed, without the key and the place."""
-        return "; ".join(
-            part for part in (self.problem, self.allowed and f"allowed: {self.allowed}") if part
-        )
+        """The problem and the allowed values, without the key and the place."""
+        parts = (self.problem, self.allowed and f"allowed: {self.allowed}")
+        return "; ".join(part for part in parts if part)
 
     @property
     def is_of_file(self) -> bool:
-        """Whether the key is the file that `where` is in."""
+        """Whether the key is the file of `where`."""
         return self.where is not None and printable(self.where.file) == self.key
 
     @property
     def subject(self) -> str:
-        """The key; of a file with the place in it."""
+        """The key; if it is a file, with the place in the file."""
         return str(self.where) if self.is_of_file else self.key
 
     def __str__(self) -> str:
@@ -108,12 +107,12 @@ class InputError(ValueError):
         return text if self.where is None or self.is_of_file else f"{text} ({self.where})"
 
     def under(self, prefix: object) -> InputError:
-        """The error with the key of the section around it before its own."""
+        """The error with the key of the enclosing section before its own key."""
         key = f"{prefix}.{self.key}" if self.key else prefix
         return InputError(key, self.problem, self.allowed, self.where)
 
     def within(self, key: object) -> InputError:
-        """The error with the key whose value names what is at fault; the problem then begins with that name."""
+        """The error with a key whose value names the input at fault; the problem then begins with that name."""
         problem = f"{self.subject}: {self.problem}" if self.key else self.problem
         return InputError(key, problem, self.allowed, None if self.is_of_file else self.where)
 

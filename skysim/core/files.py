@@ -1,4 +1,4 @@
-"""Atomic writes of files and folders, tables, images and JSON."""
+"""Atomic writes of files and folders, tables, images and JSON, and the folders of shipped scenes and data."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ACTIVE_PATHS: set[Path] = set()  # temporary paths in use by this process
 
 @contextlib.contextmanager
 def temporary_path(path: Path) -> Iterator[Path]:
-    """Yield a hidden name beside `path` with host and process id, for a file or a folder; removed at the end."""
+    """Yield a hidden path beside `path` with host and process id, for a file or a folder that is removed at the end."""
     temporary = path.with_name(f".{path.stem}.skysim-{HOST}-{os.getpid()}{path.suffix}")
     ACTIVE_PATHS.add(temporary.absolute())
     try:
@@ -42,26 +42,29 @@ def temporary_path(path: Path) -> Iterator[Path]:
 
 
 def remove_stale_temporaries(folder: Path) -> None:
-    """Remove temporary files that processes of this machine left in the folder and that no longer run."""
+    """Remove temporary files in the folder whose processes, of this machine, no longer run."""
     for path in folder.glob(".*.skysim-*"):
         match = TEMPORARY_NAME.fullmatch(path.name)
         if match and not writer_is_running(int(match[1]), path):
-            with contextlib.suppress(OSError):  # a permission error will surface at the next write
+            # A permission error will surface at the next write.
+            with contextlib.suppress(OSError):
                 remove(path)
 
 
 def writer_is_running(pid: int, path: Path) -> bool:
-    """Whether the process that was writing a file still runs. Our own process number may be a reused one."""
+    """Whether the process that was writing a file still runs."""
+    # The number of this process may be one that an earlier process had.
     if pid == os.getpid():
         return path.absolute() in ACTIVE_PATHS
-    if os.name != "posix":  # signal 0 is not available
+    # Signal 0 tests whether a process exists; it is not available on other systems.
+    if os.name != "posix":
         return True
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    except PermissionError:  # it runs as another user
-        return True
+    except PermissionError:
+        return True  # it runs as another user
     return True
 
 
@@ -92,7 +95,7 @@ def name_in_errors(path: Path) -> Iterator[None]:
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Write a file atomically: yields a temporary name beside `path`, which replaces `path` at the end.
+    """Yield a temporary path beside `path`, whose file replaces that of `path` at the end.
 
     If the body raises an exception, the temporary file is removed and `path` is unchanged.
     """
@@ -103,18 +106,18 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """As `atomic_file`, for a folder: yields a temporary one that replaces `path` and any previous content."""
+    """As `atomic_file`, for a folder, which replaces `path` and its previous content."""
     backup = path.with_name(f"{path.stem}.old{path.suffix}")
     with temporary_path(path) as temporary, temporary_path(backup) as old, name_in_errors(path):
         yield temporary
-        # Two renames are fast; the old folder is removed afterward. So an interruption leaves one of the two complete.
+        # Two renames are fast, and the old folder is removed afterward: an interruption leaves one of the two complete.
         if path.exists():
             path.rename(old)
         temporary.rename(path)
 
 
 def make_folder(path: Path) -> Path:
-    """The folder, created if it does not exist, without temporary files of our processes that were killed.
+    """The folder, created if it does not exist, without temporary files of killed processes.
 
     Raises
     ------
@@ -130,32 +133,29 @@ def make_folder(path: Path) -> Path:
 
 
 def write_png16(path: Path, image_dn: NDArray) -> None:
-    """16-bit PNG of the digital numbers; a noise-free frame is rounded."""
+    """Write digital numbers as a 16-bit PNG; those of a noise-free frame are rounded."""
     numbers = np.clip(np.rint(image_dn), 0, 65535).astype(np.uint16)
     write_image(path, numbers)
 
 
-UNCOMPRESSED_TIFF = (
-    cv2.IMWRITE_TIFF_COMPRESSION,
-    cv2.IMWRITE_TIFF_COMPRESSION_NONE,
-)  # some readers support no other
+# Some readers do not support compressed TIFF.
+UNCOMPRESSED_TIFF = (cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE)
 
 
 def write_image(path: Path, image: NDArray) -> None:
-    """Write an image in the format of the name's suffix.
+    """Write an image in the format of the path's suffix.
 
     Raises
     ------
     InputError
-        If it cannot be encoded
+        If it cannot be encoded.
     OSError
-        If it cannot be written. OpenCV encodes in memory, because it would not report why a
-        file cannot be written.
+        If it cannot be written.
     """
+    # Encode in memory, because OpenCV does not report why a file cannot be written.
+    options = UNCOMPRESSED_TIFF if path.suffix == ".tif" else ()
     try:
-        encoded, data = cv2.imencode(
-            path.suffix, image, UNCOMPRESSED_TIFF if path.suffix == ".tif" else ()
-        )
+        encoded, data = cv2.imencode(path.suffix, image, options)
     except cv2.error:
         encoded = False
     if not encoded:
@@ -168,54 +168,56 @@ def write_image(path: Path, image: NDArray) -> None:
 
 
 def write_table(path: Path, table: Any) -> None:
-    """An astropy table as ECSV."""
+    """Write an astropy table as ECSV."""
     with atomic_file(path) as temporary:
         table.write(temporary, format="ascii.ecsv", overwrite=True)
 
 
 def read_table(path: Path) -> Any:
-    """Read an ECSV file as an astropy table. Raises InputError (one line) if the file is not valid ECSV."""
+    """The astropy table in an ECSV file. Raises InputError if the file is not valid ECSV."""
     from astropy.table import Table
 
     try:
         return Table.read(path, format="ascii.ecsv")
-    except (
-        Exception
-    ) as error:  # astropy's parsers raise many types of exception for a file that is not ECSV
+    except Exception as error:
+        # astropy's parsers raise many types of exception for a file that is not ECSV.
         raise InputError(path, f"not an ECSV table: {' '.join(str(error).split())[:120]}") from None
 
 
 def header_numbers(path: Path, meta: dict[str, Any], key: str, count: int) -> list[float]:
-    """`count` finite numbers under a key of an ECSV header, positive for a size or focal length. Raises InputError."""
+    """The `count` numbers under a key of an ECSV header.
+
+    Raises InputError unless they are finite, and positive for a size or focal length.
+    """
     try:
         numbers = np.atleast_1d(np.array(meta.get(key), dtype=float))
     except (TypeError, ValueError):
         numbers = np.array([np.nan])
     positive = key in ("size_px", "focal_px")
-    if (
-        numbers.shape != (count,)
-        or not np.isfinite(numbers).all()
-        or (positive and numbers.min() <= 0)
-    ):
+    valid = numbers.shape == (count,) and np.isfinite(numbers).all()
+    if not valid or (positive and numbers.min() <= 0):
         what = f"{count} finite number{'s' if count > 1 else ''}{' above 0' if positive else ''}"
         raise InputError(path, f"{key} in the header is {meta.get(key)!r}", what)
     return [float(number) for number in numbers]
 
 
 def write_text(path: Path, text: str) -> None:
+    """Write a text file in UTF-8."""
     with atomic_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file of bytes."""
     with atomic_file(path) as temporary:
         temporary.write_bytes(data)
 
 
 def to_json(data: Any) -> str:
-    """JSON with null for NaN and infinity."""
+    """JSON text of data, with null for NaN and infinity."""
 
     def without_nan(value: Any) -> Any:
+        """The value with NumPy's numbers as Python's, and None for NaN and infinity."""
         if isinstance(value, dict):
             return {key: without_nan(item) for key, item in value.items()}
         if isinstance(value, list | tuple):
@@ -227,9 +229,7 @@ def to_json(data: Any) -> str:
     return json.dumps(without_nan(data), indent=1, allow_nan=False)
 
 
-# Folders of the scenes and the data that are shipped with skysim, and the titles of scene and study
-# files.
-
+# Folders of the scenes and the data that are shipped with skysim, and the titles of scene and study files.
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -242,15 +242,12 @@ CATALOGS = DATA / "catalogs"
 
 
 def title_of(path: Path) -> str:
-    """Title of a scene or study file, or of the base of a scene without one; "" if there is none that can be read.
+    """Title of a scene or study file, or that of its base if it has none; "" if none can be read.
 
-    Only its line is parsed: a list of all scenes would otherwise take a second.
+    Only the lines of these keys are parsed: a list of all scenes would otherwise take a second.
     """
-    lines = dict(
-        re.findall(
-            r"^(title|base):(.*)", path.read_text(encoding="utf-8", errors="replace"), re.MULTILINE
-        )
-    )
+    text = path.read_text(encoding="utf-8", errors="replace")
+    lines = dict(re.findall(r"^(title|base):(.*)", text, re.MULTILINE))
     try:
         values = {key: str(yaml.safe_load(text) or "") for key, text in lines.items()}
     except yaml.YAMLError:

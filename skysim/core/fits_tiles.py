@@ -1,4 +1,4 @@
-"""Script for `core.io.guarded`: decode a compressed FITS image. Wrong sizes make the decoder overrun memory.
+"""Script for `core.guarded`: decode a compressed FITS image. Wrong sizes make the decoder overrun memory.
 
 Arguments: the file, the number of the image's HDU, and the .npy file to write.
 """
@@ -13,7 +13,7 @@ from astropy.io import fits
 
 
 def decode(path: str, number: str, out: str) -> None:
-    """Raises exceptions of many types for a damaged file."""
+    """Write the pixels of HDU `number` to a .npy file. Raises exceptions of many types for a damaged file."""
     warnings.simplefilter("error")
     with open(path, "rb") as file, fits.open(file, memmap=False) as hdus:
         pixels = hdus[int(number)].data

@@ -1,4 +1,4 @@
-"""Run a script on an untrusted file in a child process with limits: libraries in C may crash, hang or fill memory.
+"""Run a script on an untrusted file in a child process with limits, since C libraries may crash, hang or fill memory.
 
 The child is `python -m skysim.core.guarded CPU_S MEMORY_BYTES SCRIPT ARGUMENTS`. It imports this module, then
 the script as a file, without the packages that contain it.
@@ -15,29 +15,26 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 
-WALL_S = 15.0  # for a child that waits, or on a loaded machine
-MESSAGE_BYTES = 1000  # of a child's last words
-# One thread: the stacks and arenas of a pool for many cores would exceed the limit of memory.
+WALL_S = 15.0  # elapsed time, for a child that waits, or on a loaded machine
+MESSAGE_BYTES = 1000  # of the child's standard error that are read
+# One thread: the stacks and arenas of a pool for many cores would exceed the memory limit.
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
 def run_guarded(script: Path, *arguments: str, cpu_s: int, memory_bytes: int) -> str:
-    """Run a script to its end; return "" on success, else why it failed, in one line.
+    """Run a script to its end; return "" on success, else the reason of the failure in one line.
 
     Parameters
     ----------
+    script, arguments
+        Script and its arguments
     cpu_s
-        Processor time, with start-up; memory_bytes : address space, with the libraries
+        Limit of processor time, including start-up
+    memory_bytes
+        Limit of address space, including libraries
     """
-    command = [
-        sys.executable,
-        "-m",
-        __name__,
-        str(cpu_s),
-        str(memory_bytes),
-        str(script),
-        *arguments,
-    ]
+    limits = (str(cpu_s), str(memory_bytes))
+    command = [sys.executable, "-m", __name__, *limits, str(script), *arguments]
     with tempfile.TemporaryFile() as errors:
         try:
             code = subprocess.run(
@@ -56,15 +53,18 @@ def run_guarded(script: Path, *arguments: str, cpu_s: int, memory_bytes: int) ->
         return f"it takes more than {cpu_s} s"
     if code < 0:
         return f"it crashes its reader ({signal.Signals(-code).name})"
-    return (lines[-1] if lines else f"its reader exits with code {code}") if code else ""
+    if code == 0:
+        return ""
+    return lines[-1] if lines else f"its reader exits with code {code}"
 
 
 def main() -> None:
-    """The child: set the limits, then run the script with its arguments."""
-    import resource  # not on every system, and the parent does without
+    """Main function of the child: set the limits, then run the script with its arguments."""
+    import resource  # not available on every system, and not needed by the parent
 
     cpu_s, memory_bytes, script, *arguments = sys.argv[1:]
-    with suppress(ValueError, OSError):  # a system without this limit, or with a lower one
+    # A system may not have a limit, or have a lower one.
+    with suppress(ValueError, OSError):
         resource.setrlimit(resource.RLIMIT_AS, (int(memory_bytes),) * 2)
     with suppress(ValueError, OSError):
         resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_s),) * 2)

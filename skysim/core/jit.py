@@ -1,7 +1,7 @@
 """Numba options of all compiled functions.
 
-Options missing on a callee are inherited from the caller that compiles it first, and are cached on disk. All of them
-are set here, so the results (division by zero, exceptions, order of additions) do not depend on the call order.
+A callee inherits missing options from the caller that compiles it first, and they are cached on disk. All options are
+set here, so the results (division by zero, exceptions, order of additions) do not depend on the call order.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ jit = partial(numba.njit, cache=True, error_model="numpy", fastmath=False, no_cf
 
 
 class CompilationNotice(event.Listener):
-    """Prints a note at the first compilation; functions loaded from numba's cache do not compile."""
+    """Listener that prints a note at the first compilation; functions from numba's cache are not compiled."""
 
     def on_start(self, _: event.Event) -> None:
+        """Called by numba before it compiles a function."""
         event.unregister("numba:compile", self)
         errors.note(
             "compiling numba functions (once after an installation or update): about a minute"

@@ -1,8 +1,13 @@
-"""Code that users bring: star trackers and controllers, as an entry point of a package or as a program behind a pipe.
+"""External star trackers and controllers: an entry point of a package, or a program behind a pipe.
 
-`PluginKind` knows the names. A `Program` is started once and answers each message on standard input with a line of
-JSON; it leads its own process group, which is killed when the program ends, when skysim ends, or after a timeout. An
-entry point runs in a process of its own too, where `serve` answers; what it prints goes to standard error.
+`PluginKind` has the names of a kind. A `Program` is started once and answers each message on standard input with a line
+of JSON:
+
+1. `start` starts it, sends the set-up, and waits until it is ready.
+2. `exchange` writes a message and reads the answer within a time limit.
+3. `close` ends it. It leads its own process group, which is killed when it ends, when skysim ends, or after a timeout.
+
+An entry point also runs in its own process, where `serve` answers; its output goes to standard error.
 """
 
 from __future__ import annotations
@@ -32,17 +37,16 @@ import numpy as np
 from skysim.core.errors import InputError, printable, unknown_name
 from skysim.core.types import Floats
 
-START_LIMIT_S = 120.0  # for the program to report ready
-GRACE_S = 1.0  # for the program to exit after its input is closed
-MAX_ANSWER_BYTES = 16_000_000  # largest answer
-MAX_STATUS_CHARS = 300  # characters of a status
+START_LIMIT_S = 120.0  # time limit for the program to report that it is ready
+GRACE_S = 1.0  # time limit for the program to exit after its input is closed
+MAX_ANSWER_BYTES = 16_000_000
+MAX_STATUS_CHARS = 300
 CHUNK_BYTES = 1 << 20
-QUOTED_LINES = 3  # of standard error that an error message quotes
+QUOTED_LINES = 3  # lines of standard error that an error message quotes
 FOLDER = re.compile(r"\{folder(?::(\w+))?\}")
 
-Respond = Callable[
-    [dict[str, Any], IO[bytes]], dict[str, Any]
-]  # a message's header and what follows it, to an answer
+# Function from the header of a message, and the stream of the bytes that follow it, to an answer.
+Respond = Callable[[dict[str, Any], IO[bytes]], dict[str, Any]]
 
 
 class PluginKind(NamedTuple):
@@ -51,13 +55,13 @@ class PluginKind(NamedTuple):
     Attributes
     ----------
     kind
-        What it is, for messages
+        Name of the kind, for messages
     group
         Group of the entry points
     key
-        Key of the scene that names one
+        Key of the scene that names a plug-in
     own
-        Names of skysim's own, which no plug-in may take
+        Names of skysim's own implementations, which no plug-in may have
     """
 
     kind: str
@@ -66,7 +70,7 @@ class PluginKind(NamedTuple):
     own: tuple[str, ...]
 
     def entry_points(self) -> dict[str, metadata.EntryPoint]:
-        """The plug-ins of installed packages by name; none is loaded."""
+        """The plug-ins of installed packages by name, without loading any."""
         return {
             point.name: point
             for point in metadata.entry_points(group=self.group)
@@ -74,7 +78,7 @@ class PluginKind(NamedTuple):
         }
 
     def release(self, name: str) -> str:
-        """Name and version of the package that offers a plug-in; empty for skysim's own and for programs."""
+        """Name and version of the package with this plug-in; empty for skysim's own and for programs."""
         point = self.entry_points().get(name) if name not in self.own else None
         return f"{point.dist.name} {point.dist.version}" if point and point.dist else ""
 
@@ -87,7 +91,7 @@ class PluginKind(NamedTuple):
 
 
 def to_lists(value: Any) -> Any:
-    """Convert arrays to lists, in mappings and sequences at any depth."""
+    """The value with arrays converted to lists, in mappings and sequences at any depth."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):
@@ -96,7 +100,7 @@ def to_lists(value: Any) -> Any:
 
 
 def finite_array(value: Any, name: str, shape: tuple[int, ...]) -> Floats:
-    """An array of finite numbers of the given shape. Raises ValueError."""
+    """The value as an array. Raises ValueError unless it has this shape and finite numbers."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -114,7 +118,7 @@ class ProgramError(Exception):
 
 @dataclass
 class RunningProcess:
-    """A running process with the last lines of its standard error and its folder; `stop` cleans up all of it."""
+    """A running process with its folder and the last lines of its standard error; `stop` cleans up all of them."""
 
     process: subprocess.Popen[bytes]
     folder: Path | None
@@ -122,7 +126,7 @@ class RunningProcess:
     stderr_reader: threading.Thread | None = None
 
     def collect_stderr(self, errors: IO[bytes]) -> None:
-        """Read standard error and keep the last lines, so that a full pipe never blocks the program."""
+        """Read standard error and keep the last lines, so a full pipe never blocks the program."""
         with errors:
             for line in iter(lambda: errors.readline(4096), b""):
                 text = printable(line.decode(errors="replace"))
@@ -153,7 +157,7 @@ class RunningProcess:
         return code
 
     def exit_message(self) -> str:
-        """How the process ended, with its last lines of standard error."""
+        """Text on the end of the process, with its last lines of standard error."""
         code = self.stop()
         reason = f"code {code}" if code >= 0 else signal.Signals(-code).name
         return f"the program ended ({reason}): {' | '.join(self.last_lines) or 'nothing on standard error'}"
@@ -167,18 +171,18 @@ class Program:
     key, name
         Key of the scene that names it, and its name, for error messages
     arguments
-        The command; `{folder}` in it becomes a temporary folder
+        Command; `{folder}` in it becomes a temporary folder
     setup
         JSON object that is sent first
     limit_s
-        Time limit per answer
+        Time limit for each answer
     environment
-        In place of this process's
+        Environment of the program; None for that of this process
 
     Raises
     ------
     InputError
-        Where it cannot be started or refuses the set-up.
+        If it cannot be started, or refuses the set-up.
     """
 
     def __init__(
@@ -250,7 +254,10 @@ class Program:
             raise self.fail(f"{line[:80].decode(errors='replace')!r} is not JSON") from None
 
     def transfer(self, message: bytes, until_s: float, limit_s: float) -> bytes:
-        """Serve both pipes at once: the program may answer before it has read everything, and must not deadlock."""
+        """Write a message and read a line, serving both pipes at once.
+
+        The program may answer before it has read the whole message, which must not cause a deadlock.
+        """
         assert self.running is not None
         process = self.running.process
         assert process.stdin is not None
@@ -260,9 +267,8 @@ class Program:
             pipes.register(process.stdout, selectors.EVENT_READ)
             pipes.register(process.stdin, selectors.EVENT_WRITE)
             while unsent or b"\n" not in self.received:
-                ready = {
-                    key.fileobj for key, _ in pipes.select(max(until_s - time.monotonic(), 0.0))
-                }
+                left_s = max(until_s - time.monotonic(), 0.0)
+                ready = {key.fileobj for key, _ in pipes.select(left_s)}
                 if time.monotonic() >= until_s:
                     raise self.fail(f"no answer within {limit_s:g} s", 0.0)
                 if process.stdin in ready and unsent:
@@ -279,7 +285,7 @@ class Program:
         return line
 
     def receive(self, chunk: bytes) -> None:
-        """Buffer what the program wrote. Raises ProgramError when it ends or when an answer is too long."""
+        """Buffer output of the program. Raises ProgramError if the program ended or an answer is too long."""
         if not chunk:
             assert self.running is not None
             raise self.fail(self.running.exit_message())
@@ -303,7 +309,7 @@ class Program:
 def host_command(module: str, name: str) -> tuple[list[str], dict[str, str]]:
     """Command and environment of a Python process that hosts the plug-in `name` (see `serve`).
 
-    The child gets this process's import path, so that it finds the same entry points.
+    The child gets the import path of this process, so it finds the same entry points.
     """
     path = os.pathsep.join(folder or os.getcwd() for folder in sys.path)
     return [sys.executable, "-m", module, name], {**os.environ, "PYTHONPATH": path}
@@ -317,13 +323,19 @@ def describe_error(error: Exception) -> str:
 def serve(create: Callable[[dict[str, Any]], Respond]) -> None:
     """Set up the plug-in from the first line of the input, then answer each message until the input ends.
 
-    create(setup) : returns the function that answers; an exception becomes {"ready": false, "status": reason}
+    Parameters
+    ----------
+    create
+        Function from the set-up to the function that answers; an exception becomes
+        {"ready": false, "status": reason}
     """
+    # Answers go to the original standard output, all other output to standard error.
     messages = sys.stdin.buffer
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
 
     def send(reply: dict[str, Any]) -> None:
+        """Write an answer as one line."""
         answers.write(json.dumps(reply) + "\n")
         answers.flush()
 

@@ -1,7 +1,7 @@
-"""Single unit quaternions for the loops of every control tick; for arrays of rotations SciPy's `Rotation` is used.
+"""Single unit quaternions for the loops of every control period; arrays of rotations use SciPy's `Rotation`.
 
-Each is (4,) w, x, y, z (scalar first, Hamilton's product), named a_from_b like every rotation. SciPy takes 14-35 us
-to multiply or construct one, a tenth of the time available in a control period of 10 ms.
+A quaternion is (4,) w, x, y, z (scalar first, Hamilton's product), named a_from_b like every rotation. SciPy takes
+14-35 us to multiply or construct one, which would add up to a tenth of a control period of 10 ms.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 
 
 def from_rotation(a_from_b: Rotation) -> Floats:
-    """(4,) wxyz of one Rotation, reordered here: SciPy's scalar_first takes 30 us."""
+    """(4,) wxyz of one Rotation. It reorders the components itself, since SciPy's scalar_first takes 30 us."""
     x, y, z, w = a_from_b.as_quat()
     return np.array([w, x, y, z])
 
@@ -31,7 +31,10 @@ def to_rotation(a_from_b: Floats) -> Rotation:
 
 @jit
 def multiply(a_from_b: Floats, b_from_c: Floats) -> Floats:
-    """a_from_c = a_from_b * b_from_c."""
+    """(4,) a_from_c = a_from_b * b_from_c:
+
+    w = aw bw - a . b,    v = aw b + bw a + a x b    with the vector parts a and b
+    """
     aw = a_from_b[0]
     ax = a_from_b[1]
     ay = a_from_b[2]
@@ -52,13 +55,14 @@ def multiply(a_from_b: Floats, b_from_c: Floats) -> Floats:
 
 @jit
 def inverse(a_from_b: Floats) -> Floats:
-    """b_from_a, the conjugate."""
+    """(4,) b_from_a, the conjugate."""
     return np.array([a_from_b[0], -a_from_b[1], -a_from_b[2], -a_from_b[3]])
 
 
 @jit
 def apply(a_from_b: Floats, v_b: Floats) -> Floats:
-    """v_a (3,) of v_b (3,): v + 2 w (u x v) + 2 u x (u x v) with u the vector part."""
+    """(3,) v_a of v_b: v + 2 w (u x v) + 2 u x (u x v), with the vector part u."""
+    # (a, b, c) = 2 u x v.
     w = a_from_b[0]
     x = a_from_b[1]
     y = a_from_b[2]
@@ -76,7 +80,7 @@ def apply(a_from_b: Floats, v_b: Floats) -> Floats:
 
 @jit
 def to_matrix(a_from_b: Floats) -> Floats:
-    """(3, 3) a_from_b."""
+    """(3, 3) matrix a_from_b."""
     w = a_from_b[0]
     x = a_from_b[1]
     y = a_from_b[2]
@@ -96,9 +100,10 @@ def to_matrix(a_from_b: Floats) -> Floats:
 
 @jit
 def from_rotvec(rotvec_rad: Floats) -> Floats:
-    """The rotation by |turn_rad| about turn_rad (3,): (cos(a / 2), sin(a / 2) axis)."""
+    """(4,) rotation by a rotation vector (3,) of length a: (cos(a / 2), sin(a / 2) axis)."""
     angle = math.sqrt(rotvec_rad[0] ** 2 + rotvec_rad[1] ** 2 + rotvec_rad[2] ** 2)
-    scale = math.sin(angle / 2) / angle if angle > 1e-9 else 0.5  # the limit for small angles
+    # sin(a / 2) / a tends to 1 / 2.
+    scale = math.sin(angle / 2) / angle if angle > 1e-9 else 0.5
     return np.array(
         [math.cos(angle / 2), scale * rotvec_rad[0], scale * rotvec_rad[1], scale * rotvec_rad[2]]
     )
@@ -106,7 +111,7 @@ def from_rotvec(rotvec_rad: Floats) -> Floats:
 
 @jit
 def to_rotvec(a_from_b: Floats) -> Floats:
-    """(3,) axis times angle, the angle at most pi."""
+    """(3,) rotation vector: axis times angle, at most pi."""
     # q and -q are the same rotation: take the one with w >= 0.
     sign = 1.0 if a_from_b[0] >= 0 else -1.0
     x = sign * a_from_b[1]
@@ -119,7 +124,7 @@ def to_rotvec(a_from_b: Floats) -> Floats:
 
 @jit
 def cross(a: Floats, b: Floats) -> Floats:
-    """a x b; np.cross takes ten times as long for a single pair."""
+    """(3,) a x b; np.cross takes ten times as long for a single pair."""
     return np.array(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )
@@ -127,7 +132,7 @@ def cross(a: Floats, b: Floats) -> Floats:
 
 @jit
 def matrix_vector(matrix: Floats, v: Floats) -> Floats:
-    """matrix (3, 3) times v (3,)."""
+    """(3,) matrix (3, 3) times v (3,)."""
     p = v[0]
     q = v[1]
     r = v[2]
@@ -146,26 +151,30 @@ def interpolate(
 ) -> Floats:
     """(M, 4) attitudes between knots (N, 4): cubic Hermite in the rotation vector from the previous knot.
 
+    With the elapsed fraction s of the step, the rotation vector r to the next knot and its derivatives r0', r1':
+
+        r(s) = s^2 (3 - 2 s) r + s (1 - s)^2 r0' - s^2 (1 - s) r1'
+
     Parameters
     ----------
+    knots_wxyz
+        (N, 4) attitudes at the knots
     hermite_rad
-        (N - 1, 3, 3) rotation vector to the next knot, and its derivatives at both ends times
-        the step
+        (N - 1, 3, 3) rotation vector to the next knot, and its derivatives at both ends times the step
     knot, fraction
-        (M,) index of the knot before each time, and the elapsed fraction of the step
+        (M,) index of the knot before each time, and elapsed fraction of the step
     """
     out = np.empty((len(knot), 4))
     for m in range(len(knot)):
         k = knot[m]
         s = fraction[m]
-        # Hermite basis: value at the end, slope at the beginning, slope at the end. The value at the beginning is zero.
+        # Hermite basis: value at the end, slopes at the beginning and the end. The value at the beginning is zero.
         a = s * s * (3 - 2 * s)
         b = s * (1 - s) ** 2
         c = -s * s * (1 - s)
         rotvec, begin, end = hermite_rad[k]
         turned = multiply(knots_wxyz[k], from_rotvec(a * rotvec + b * begin + c * end))
-        for n in range(
-            4
-        ):  # an assignment to the row would take longer to compile than all the rest
+        # An assignment to the row would take longer to compile than the rest of the function.
+        for n in range(4):
             out[m, n] = turned[n]
     return out

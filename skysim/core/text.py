@@ -1,5 +1,6 @@
-"""Text files of samples over time: numbers and epochs with the line of what is wrong, and CCSDS's keyword = value
-notation: segments of metadata and data lines.
+"""Text files of samples over time: lines, numbers, epochs, CSV, and CCSDS's keyword = value notation.
+
+Errors name the line of the fault.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ from skysim.core.time import GPS_MINUS_TAI_S, SCALES
 from skysim.core.types import Floats
 
 MAX_BYTES = 200_000_000  # of a file: a million lines of 200 characters
-MAX_EXCERPT = 40  # characters of a value in a message
+MAX_EXCERPT = 40  # number of characters of a value in a message
 EPOCH = re.compile(r"(?:19|20|21)\d\d-(\d\d-\d\d|\d{3})[T ]\d\d:\d\d:\d\d(\.\d{0,15})?Z?", re.ASCII)
 
-Line = tuple[int, str]  # number from 1, and content
+Line = tuple[int, str]  # number, from 1, and content
 
 
 def read_lines(path: Path) -> list[Line]:
-    """The numbered lines of a text file, without blank ones. Raises InputError for one too large or not UTF-8 text."""
+    """The numbered lines of a text file, without blank lines. Raises InputError if it is too large or not UTF-8."""
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
@@ -47,7 +48,7 @@ def excerpt(text: object) -> str:
 def to_numbers(
     source: str, places: Sequence[int], rows: Sequence[Sequence[str]], width: int
 ) -> Floats:
-    """(N, width) finite numbers of the words of each line. Raises InputError for the first line that has others."""
+    """(N, width) numbers of the words of each line. Raises InputError for the first line without finite numbers."""
     for line, words in zip(places, rows, strict=True):
         if len(words) != width:
             raise InputError(source, f"{len(words)} numbers", width, where=Where(source, line))
@@ -82,11 +83,12 @@ def seconds_since(
 ) -> Floats:
     """(N,) seconds from a start in UTC to epochs (ISO 8601, calendar or day of year) of a time system of SCALES.
 
-    UTC is taken as uniform, like the scene's own times: a leap second between the two is not counted. Raises
-    InputError for the first epoch that is not one.
+    Like the scene's own times, UTC is taken as uniform: a leap second in between is not counted. Raises InputError for
+    the first text that is not an epoch.
     """
     from astropy.time import Time
 
+    # 1. The form of the texts, which must be the same for all.
     bad = [n for n, epoch in enumerate(epochs) if not EPOCH.fullmatch(epoch)]
     bad += [
         n for n, epoch in enumerate(epochs) if len(epoch.split("-")) != len(epochs[0].split("-"))
@@ -98,6 +100,7 @@ def seconds_since(
             "2012-06-22T21:00:00.5, or all of the form 2012-174T21:00:00.5",
             where=Where(source, places[min(bad)], unit),
         )
+    # 2. UTC, by astropy.
     texts = [epoch.rstrip("Z").replace(" ", "T") for epoch in epochs]
     ordinal = bool(texts) and texts[0].count("-") == 1
     kind = "yday" if ordinal else "isot"
@@ -116,6 +119,7 @@ def seconds_since(
                 where=Where(source, places[n], unit),
             ) from None
         times.precision = 9
+    # 3. Difference from the start in whole nanoseconds.
     try:
         nanoseconds = np.array(times.isot, dtype="datetime64[ns]") - np.datetime64(start, "ns")
     except ValueError:
@@ -124,7 +128,7 @@ def seconds_since(
 
 
 def is_time(text: str, kind: str, scale: str) -> bool:
-    """Whether astropy takes the text for a time."""
+    """Whether astropy accepts the text as a time."""
     from astropy.time import Time
 
     try:
@@ -137,21 +141,25 @@ def is_time(text: str, kind: str, scale: str) -> bool:
 def read_named_rows(
     path: Path, name: str, needed: Sequence[str], refusal: InputError, also: Sequence[str] = ()
 ) -> tuple[list[str], Floats]:
-    """Names and numbers of a CSV file whose first line names its columns; # begins a comment.
+    """Names of the rows and numbers (N, K) of a CSV file whose first line names its columns; # begins a comment.
 
     Parameters
     ----------
-    name, needed
-        Columns that it must have, of the rows' names, each once, and of numbers
-    also
-        Columns of numbers that it may have, after `needed` in the result;  others are not used
+    path
+        The file
+    name
+        Column with the names of the rows, each of which occurs once
+    needed
+        Columns of numbers that the file must have
     refusal
-        Of a file without these columns or rows
+        Error to raise for a file without these columns or without rows
+    also
+        Columns of numbers that it may have, after `needed` in the result; others are not used
 
     Raises
     ------
     InputError
-        With one line.
+        For a file that cannot be read in this way.
     """
     lines = [(n, line) for n, line in read_lines(path) if not line.startswith("#")]
     columns = [cell.strip() for cell in lines[0][1].split(",")] if lines else []
@@ -177,20 +185,20 @@ def read_named_rows(
 
 
 class TextSegment(NamedTuple):
-    """A segment: its metadata with their lines, and its data lines split into words."""
+    """A segment: metadata with their line numbers by keyword, and data lines split into words."""
 
     metadata: dict[str, Line]
     data: list[tuple[int, list[str]]]
 
     def require(self, path: str | Path, keys: Sequence[str]) -> None:
-        """Raise InputError for the first keyword that the metadata lack."""
+        """Raise InputError for the first keyword that is missing in the metadata."""
         for key in keys:
             if key not in self.metadata:
                 raise InputError(path, f"{key} is missing in the metadata of a segment")
 
 
 def keyword_value(path: str | Path, n: int, line: str) -> tuple[str, str]:
-    """The keyword and the value of a line. Raises InputError for another line."""
+    """The keyword and the value of a line. Raises InputError if it is not KEYWORD = value."""
     key, equals, value = (part.strip() for part in line.partition("="))
     if not equals:
         raise InputError(path, f"{excerpt(line)} is not KEYWORD = value", where=Where(path, n))
@@ -198,13 +206,13 @@ def keyword_value(path: str | Path, n: int, line: str) -> tuple[str, str]:
 
 
 def check_version(path: str | Path, keyword: str, version: str, allowed: Sequence[str]) -> None:
-    """Raise InputError for a version of the message that is not read."""
+    """Raise InputError for a version of the message that is not supported."""
     if version not in allowed:
         raise InputError(path, f"{keyword} is {excerpt(version)}", ", ".join(allowed))
 
 
 def one_of(path: str | Path, metadata: dict[str, Line], key: str, allowed: Iterable[str]) -> str:
-    """A keyword's value, in capitals, if it is allowed. Raises InputError."""
+    """The value of a keyword in capitals. Raises InputError if it is not allowed."""
     line, value = metadata[key]
     names = list(allowed)
     if value.upper() not in names:

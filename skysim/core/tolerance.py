@@ -1,14 +1,14 @@
-"""Errors as a data sheet states them: the standard deviation of a Gaussian, or a tolerance.
+"""Sizes of errors as in data sheets: the standard deviation of a Gaussian, or a tolerance.
 
-A key of a scene that is the size of an error takes a plain quantity, the standard deviation of a Gaussian, or a
-section with a tolerance, the bound that no error exceeds:
+A key of a scene that is the size of an error takes a quantity, which is the standard deviation of a Gaussian, or a
+section with a tolerance, which no error exceeds:
 
     led_sigma: "0.2 mm"
     led_sigma: {tolerance: "±0.5 mm"}
     led_sigma: {tolerance: "±0.5 mm", distribution: truncated_normal, sigma: "0.2 mm"}
 
-In Python the value is the equivalent standard deviation, a float: what a covariance takes. A tolerance is a
-`Tolerance`, a float that knows its distribution too; `scaled_errors` draws from either.
+In Python the value is the equivalent standard deviation, a float, for covariances. A tolerance is a `Tolerance`, a
+float that also has its distribution. `scaled_errors` draws from either.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.core.units import ConfigModel, Length, Number, Time
 
-SIGMAS_OF_TOLERANCE = (
-    3.0  # of a truncated normal distribution whose sigma is not given: 99.73 % (GUM 4.3.9, note 2)
-)
+# Tolerance over sigma of a truncated normal distribution whose sigma is not given: 99.73 % (GUM 4.3.9, note 2).
+SIGMAS_OF_TOLERANCE = 3.0
 
 
 class Tolerance(float):
-    """The standard deviation of an error within +-half_width, and the distribution that it has there.
+    """The standard deviation of an error that is within +-half_width, with its distribution.
 
-    Uniform (GUM 4.3.7, JCGM 100:2008): half_width / sqrt(3). Truncated normal: with k = half_width / parent_sigma and
-    the standard normal density phi, parent_sigma sqrt(1 - 2 k phi(k) / erf(k / sqrt 2)) (Johnson, Kotz & Balakrishnan
-    1994, Continuous Univariate Distributions 1, ch. 13.10.1).
+        uniform:          half_width / sqrt(3)
+        truncated normal: parent_sigma sqrt(1 - 2 k phi(k) / erf(k / sqrt 2)),    k = half_width / parent_sigma
+
+    phi is the standard normal density. Uniform: GUM 4.3.7, JCGM 100:2008. Truncated normal: Johnson, Kotz &
+    Balakrishnan 1994, Continuous Univariate Distributions 1, ch. 13.10.1.
 
     Attributes
     ----------
     half_width
         The tolerance, above 0
     parent_sigma
-        Standard deviation of the normal distribution before it is truncated at the tolerance;
-        None: the error is uniform
+        Standard deviation of the normal distribution before it is truncated at the tolerance; None for a uniform error
     """
 
     half_width: float
@@ -74,7 +74,7 @@ class Tolerance(float):
         return hash(self.__reduce__())
 
     def from_normal(self, normal: Floats) -> Floats:
-        """Errors with this distribution from standard normal numbers, at equal probabilities (Gaussian copula)."""
+        """Errors with this distribution from standard normal numbers, at equal probability (Gaussian copula)."""
         from scipy.special import ndtr, ndtri
 
         probability = ndtr(normal)
@@ -85,37 +85,37 @@ class Tolerance(float):
 
 
 def scaled_errors(sigma: float, normal: Floats) -> Floats:
-    """Errors of this size from standard normal numbers: sigma times them, or as the tolerance is distributed.
+    """Errors of this size from standard normal numbers: sigma times them, or distributed like the tolerance.
 
-    A tolerance in place of a sigma leaves the random streams as they were.
+    A tolerance instead of a sigma does not change the random streams.
     """
     return sigma.from_normal(normal) if isinstance(sigma, Tolerance) else np.asarray(sigma * normal)
 
 
 class ToleranceConfig(ConfigModel):
-    """Base of a tolerance's section; `tolerance` and `sigma` are quantities of the key's own kind.
+    """Base of the section of a tolerance; `tolerance` and `sigma` are quantities of the kind of the key.
 
     Attributes
     ----------
     tolerance
-        Greatest error, plus and minus, as a data sheet states it: "±0.5 mm", or without the
-        sign
+        Greatest error in both directions, with or without the sign: "±0.5 mm"
     distribution
-        Uniform (the usual reading of a data sheet, and the default), or a normal distribution
-        truncated at the tolerance; normal has no tolerance
+        Uniform (the usual meaning in a data sheet, and the default), or a normal distribution truncated at the
+        tolerance; normal has no tolerance
     sigma
-        Of the normal distribution before it is truncated; a third of the tolerance if left out
+        Standard deviation of the normal distribution before it is truncated; a third of the tolerance if left out
     """
 
     distribution: Literal["uniform", "truncated_normal", "normal"] | None = None
 
     def numbers(self) -> tuple[float | None, float | None]:
-        """Tolerance and sigma in SI units, as given."""
+        """Tolerance and sigma in SI units; None for one that is left out."""
         half_width, sigma = (getattr(self, name) for name in list(type(self).model_fields)[1:])
         return half_width, sigma
 
     @model_validator(mode="after")
     def check_distribution(self) -> Self:
+        """Check that tolerance and sigma fit the distribution."""
         half_width, sigma = self.numbers()
         if half_width is None and (sigma is None or self.distribution not in (None, "normal")):
             raise InputError(
@@ -134,18 +134,17 @@ class ToleranceConfig(ConfigModel):
         return self
 
     def error(self) -> float:
-        """The error's size: a plain standard deviation, or a `Tolerance`."""
+        """The size of the error: a plain standard deviation, or a `Tolerance`."""
         half_width, sigma = self.numbers()
         if half_width is None:
             return float(sigma or 0.0)
-        truncated = self.distribution == "truncated_normal"
-        return Tolerance(
-            half_width, (sigma or half_width / SIGMAS_OF_TOLERANCE) if truncated else None
-        )
+        if self.distribution != "truncated_normal":
+            return Tolerance(half_width)
+        return Tolerance(half_width, sigma or half_width / SIGMAS_OF_TOLERANCE)
 
 
 def without_sign(value: Any) -> Any:
-    """A tolerance without the sign before it: "±0.5 mm" is "0.5 mm"."""
+    """The text of a tolerance without its sign: "0.5 mm" for "±0.5 mm"."""
     if not isinstance(value, str):
         return value
     return value.strip().removeprefix("±").removeprefix("+/-").removeprefix("+-").strip()
@@ -198,17 +197,15 @@ class NumberToleranceConfig(ToleranceConfig):
 
 
 def error_of(value: Any) -> Any:
-    """The size of an error from a quantity or from a tolerance's section."""
+    """The size of an error from a quantity or from the section of a tolerance."""
     return value.error() if isinstance(value, ToleranceConfig) else value
 
 
 def in_file(value: float) -> Any:
-    """For `model_dump`: a number for a Gaussian, and all that defines a tolerance for the rest."""
-    return (
-        {"tolerance": value.half_width, "sigma": value.parent_sigma}
-        if isinstance(value, Tolerance)
-        else value
-    )
+    """The value for `model_dump`: a number for a Gaussian, tolerance and sigma for a tolerance."""
+    if isinstance(value, Tolerance):
+        return {"tolerance": value.half_width, "sigma": value.parent_sigma}
+    return value
 
 
 @dataclass(frozen=True)

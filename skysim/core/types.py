@@ -16,7 +16,7 @@ from skysim.core.jit import jit
 from skysim.core.quaternion import interpolate
 
 Floats = NDArray[np.float64]
-ROUNDING = 1e-12  # more than the rounding errors of a cosine
+ROUNDING = 1e-12  # greater than the rounding error of a cosine
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class Mount:
     Attributes
     ----------
     camera_body_m
-        (3,) entrance pupil in the body frame, whose origin is the bearing center
+        (3,) position of the entrance pupil in the body frame, whose origin is the bearing center
     cam_from_body
         Rotation of the body frame into the camera frame (+x right, +y down, +z boresight)
     """
@@ -42,11 +42,11 @@ class Trajectory:
     Attributes
     ----------
     t_s
-        (N,) strictly increasing
+        (N,) strictly increasing times
     lab_from_body
         N rotations
     rate_body_rad_s
-        (N, 3) angular velocity of body in lab, in body axes
+        (N, 3) angular velocity of the body in the lab, in body axes
     """
 
     t_s: Floats
@@ -64,12 +64,12 @@ class Trajectory:
     def at_rate(
         cls, lab_from_body: Rotation, rate_body_rad_s: Floats, at_s: float, t_s: Floats
     ) -> Trajectory:
-        """A constant rate (3,) in body axes, with this attitude at at_s; sampled at times (N,)."""
+        """A constant rate (3,) in body axes, with this attitude at the time at_s; sampled at times (N,)."""
         turned = Rotation.from_rotvec(np.outer(t_s - at_s, rate_body_rad_s))
         return cls(t_s, lab_from_body * turned, np.tile(rate_body_rad_s, (len(t_s), 1)))
 
     def since(self, begin_s: float) -> Trajectory:
-        """The same motion; if it begins later than that, after a turn at the rate of its start."""
+        """The same motion; if it begins after begin_s, preceded by a rotation at the rate of its start."""
         if self.t_s[0] <= begin_s:
             return self
         before = Trajectory.at_rate(
@@ -95,10 +95,10 @@ class Trajectory:
         return self._segments[0]
 
     def attitude_at(self, t_s: float | Floats) -> Rotation:
-        """lab_from_body at any time within the history.
+        """lab_from_body at any time within the history. Raises ValueError outside of it.
 
-        Cubic Hermite in the rotation vector from the previous sample, with the rates at both ends: exact to fourth
-        order in the step. Raises ValueError outside the history.
+        The interpolation is cubic Hermite in the rotation vector from the previous sample, with the rates at both ends.
+        Its error is of fourth order in the step.
         """
         t = np.atleast_1d(np.asarray(t_s, dtype=float))
         if t.min() < self.t_s[0] - 1e-9 or t.max() > self.t_s[-1] + 1e-9:
@@ -120,7 +120,15 @@ class Trajectory:
 
 
 class Mounting(NamedTuple):
-    """Rotation of a camera from its assumed mount in body axes: the filter's estimate, its sigma, the truth; (K, 3)."""
+    """Rotation of a camera from its assumed mount at K times, in body axes.
+
+    Attributes
+    ----------
+    estimate_rad, sigma_rad
+        (K, 3) estimate of the filter, and its standard deviation
+    true_rad
+        (K, 3) truth
+    """
 
     estimate_rad: Floats
     sigma_rad: Floats
@@ -129,42 +137,43 @@ class Mounting(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Telemetry:
-    """True and estimated states of the vehicle at K ticks of its computer; None for what it does not have.
+    """True and estimated states of the vehicle at the starts of K control periods; None for missing hardware.
 
     Attributes
     ----------
-    t_s
-        (K,); period_s between them
-    lab_from_body
-        K, the truth, without the added jitter; rate_body_rad_s (K, 3) likewise
-    lab_from_ref
-        K, the commanded attitude
+    t_s, period_s
+        (K,) times, and the control period
+    lab_from_body, rate_body_rad_s
+        K true attitudes and (K, 3) true rates in body axes, without the added vibration
     torque_nm
-        (K, 3) torque demanded by the controller, in body axes
+        (K, 3) torque commanded by the controller, in body axes
     disturbance_nm
-        (K, 3) disturbance torque, without gravity, drag, spring and actuators
+        (K, 3) disturbance torque in body axes, without gravity, drag, spring and actuators
     momentum_nms
-        (K, 3) stored in wheels and CMGs, in body axes
+        (K, 3) momentum stored in wheels and CMGs, in body axes
     wheel_rad_s, gimbal_rad
-        (K, n)
+        (K, n) speeds of the wheels, and angles of the gimbals
     joints
         (K, nq) MuJoCo's positions of all joints, for rendering
     manipulability
-        (K,) of the CMGs: 1 far from a singularity, 0 at one
+        (K,) manipulability of the CMGs: 1 far from a singularity, 0 at a singularity
+    lab_from_ref
+        K commanded attitudes
     lab_from_imu
-        K, the navigator's attitude
+        K attitudes of the inertial navigator
     saturated
-        (K,) whether the gyros were at their limit in the previous tick
+        (K,) whether the gyros were at their limit in the previous period
     bias_rad_s
-        (K, 3) rate error of the gyros: bias, scale, misalignment, and the Earth rate if not
-        compensated
+        (K, 3) rate error of the gyros: bias, scale, misalignment, and the Earth rate if it is not compensated
     lab_from_filter
-        K, the filter's attitude; sigma_attitude_rad (K, 3) its standard deviation about the
-        body's axes; assumed_bias_rad_s (K, 3) its bias estimate, sigma_bias_rad_s (K, 3) the
-        bias's standard deviation
+        K attitudes of the filter
+    sigma_attitude_rad
+        (K, 3) its standard deviation of the attitude about the body's axes
+    assumed_bias_rad_s, sigma_bias_rad_s
+        (K, 3) its estimate of the bias, and the standard deviation of the bias
     mountings
-        By name of the camera, where the filter has these states: "main" relative to the gyro's
-        axes, the others relative to "main"
+        Mounting states of the filter by name of the camera: "main" relative to the axes of the gyros, the others
+        relative to "main"
     """
 
     t_s: Floats
@@ -196,30 +205,28 @@ class Sources:
     Attributes
     ----------
     id
-        (N,) number of the star in its catalog (Hipparcos'), or LED number
+        (N,) number of the star in its catalog (Hipparcos), or of the LED
     place
-        (N, 4) homogeneous: (direction, 0) for a star at infinity, (x, y, z in m, 1) for an LED
+        (N, 4) homogeneous coordinates: (direction, 0) for a star at infinity, (x, y, z in m, 1) for an LED
     normal
         (N, 3) unit normal of the emitting disk; zeros for a star
     radius_m
         (N,) radius of the emitting disk; 0 for a star
     strength
-        (N,) in photo-electrons, that is photons weighted with the chip's quantum efficiency at
-        each wavelength: star: e- s^-1 m^-2 at the aperture; LED: e- s^-1 sr^-1 along its
-        normal. Its decrease with angle and distance is given by `led.Emitter`
+        (N,) strength in photo-electrons, which are photons weighted with the detector's quantum efficiency. For a
+        star e- s^-1 m^-2 at the aperture; for an LED e- s^-1 sr^-1 along its normal, and `led.Emitter` has its
+        decrease with angle and distance
     period_s, start_s, on_s
-        (N,) pulse train: lit from start_s for on_s in every period_s, by its controller's clock
+        (N,) pulse train: lit from start_s for on_s in every period_s of its controller's clock
     clock
-        (N,) number of that clock, from 0; LEDs of one controller share it; 0 for a star
+        (N,) number of that clock, from 0; the LEDs of a controller share it; 0 for a star
     magnitude
         (N,) V magnitude of a star; NaN for an LED
     motion
-        (N, 2, 3) velocity s^-1 and acceleration s^-2 of `place` at mid-exposure; None where
-        nothing moves
+        (N, 2, 3) velocity in s^-1 and acceleration in s^-2 of `place` at mid-exposure; None without motion
     chromatic
-        (N, 4) mean and standard deviation, over the light's photo-electrons, of the lens's
-        shift of focus in m and of its shift at the chip's corner in px; None for a lens without
-        chromatic aberration
+        (N, 4) mean and standard deviation, over the photo-electrons, of the lens's shift of focus in m and of its
+        lateral shift at the detector's corner in px; None for a lens without chromatic aberration
     """
 
     id: NDArray[np.int64]
@@ -239,7 +246,7 @@ class Sources:
         return len(self.id)
 
     def take(self, which: NDArray[Any]) -> Sources:
-        """The chosen sources, by mask or index."""
+        """The sources selected by a mask or by indices."""
         rows = np.flatnonzero(which) if which.dtype == bool else which
         columns = (getattr(self, name) for name in Sources.__slots__)
         chosen: list[Any] = [
@@ -249,19 +256,20 @@ class Sources:
 
 
 class StarSources(Sources):
-    """Stars alone, which are found by direction: the time of a frame does not grow with the catalog."""
+    """Stars sorted for a search by direction, so the time of a frame does not grow with the catalog."""
 
     @cached_property
     def by_z(self) -> tuple[NDArray[np.int64], Floats]:
-        """Rows in the order of z, and their (N, 3) directions in it."""
+        """Rows in ascending order of z, and their directions (N, 3) in this order."""
         order = np.argsort(self.place[:, 2], kind="stable")
         return order, np.ascontiguousarray(self.place[order, :3])
 
     def within(self, direction: Floats, angle_rad: float) -> NDArray[np.int64]:
-        """Rows, in order, of the stars within an angle of a unit vector: those of a band in z are tested.
+        """Ascending rows of the stars within an angle of a unit vector.
 
-        The band is read from end to end, in half of the time in which a search tree finds the stars of a field.
+        Stars in a band of z are tested, which takes half of the time of a search tree for the stars of a field.
         """
+        # The band contains all directions within the angle.
         order, sorted_place = self.by_z
         from_pole = math.acos(min(max(float(direction[2]), -1.0), 1.0))
         ends = (
@@ -269,15 +277,15 @@ class StarSources(Sources):
             math.cos(max(from_pole - angle_rad, 0.0)),
         )
         first, last = np.searchsorted(sorted_place[:, 2], (ends[0] - ROUNDING, ends[1] + ROUNDING))
+        # An angle a is a chord 2 sin(a / 2) of the unit sphere.
         chord = 2.0 * math.sin(min(angle_rad, math.pi) / 2.0)
-        return np.sort(
-            order[first + _closer(sorted_place[first:last], np.asarray(direction), chord)]
-        )
+        near = _closer(sorted_place[first:last], np.asarray(direction), chord)
+        return np.sort(order[first + near])
 
 
 @jit
 def _closer(place: Floats, direction: Floats, chord: float) -> NDArray[np.int64]:
-    """Which of (N, 3) unit vectors are at most a chord from another one."""
+    """Rows of the unit vectors (N, 3) whose distance from another one is at most a chord."""
     found = np.empty(len(place), np.int64)
     count = 0
     for n in range(len(place)):
@@ -290,7 +298,7 @@ def _closer(place: Floats, direction: Floats, chord: float) -> NDArray[np.int64]
 
 
 def with_sources(parts: Sequence[Sources]) -> Sources:
-    """All sources of several sets of which none moves, in their order."""
+    """All sources of several sets without motion, in their order."""
     columns = {name: [getattr(part, name) for part in parts] for name in Sources.__slots__}
     return Sources(
         **{name: np.concatenate(own) for name, own in columns.items() if own[0] is not None}
@@ -304,28 +312,28 @@ class SourceTruth:
     Attributes
     ----------
     id
-        (N,)
+        (N,) numbers of the sources
     xy_px
-        (N, 2) pixel at mid-exposure; with a rolling shutter that of the middle row
+        (N, 2) image position at mid-exposure; with a rolling shutter that of the middle row
     flux_xy_px
-        (N, 2) flux-weighted mean pixel over the exposure
+        (N, 2) flux-weighted mean position over the exposure
     electrons
-        (N,) mean photo-electrons on the chip
+        (N,) mean photo-electrons on the detector
     peak_e
         (N,) mean electrons in the source's brightest pixel
     streak_px
-        (N,) path length over the exposure; with a rolling shutter that of the first row
+        (N,) length of the path over the exposure; with a rolling shutter that of the first row
     area_px
-        (N,) noise-equivalent area (sum s)^2 / sum s^2 of its image
+        (N,) noise-equivalent area (sum s)^2 / sum s^2 of the image
     peak_xy
-        (N, 2) the brightest pixel
+        (N, 2) brightest pixel
     saturated
         (N,) whether that pixel is expected to be full
     snr
-        (N,) signal-to-noise ratio of its electrons over that area, without saturation
+        (N,) signal-to-noise ratio of the electrons over that area, without saturation
     streak_xy_px
-        (N, 2) displacement of the image from the begin to the end of the exposure of the row
-        that it is on; NaN where it has no image at one of them
+        (N, 2) displacement of the image from the beginning to the end of the exposure of its row; NaN if it has no
+        image at one of them
     """
 
     id: NDArray[np.int64]
@@ -343,12 +351,12 @@ class SourceTruth:
 
 @dataclass(frozen=True, slots=True)
 class BodyTruth:
-    """Sun, Moon or a planet in a frame, none of which is in a star catalog; `id` is its number in the sources' truth.
+    """Sun, Moon or a planet in a frame; `id` is its number in the truth of the sources.
 
     Attributes
     ----------
     ra_deg, dec_deg
-        Apparent place of the disc's center in ICRS axes
+        Apparent place of the center of the disc in ICRS axes
     phase_deg
         Angle at the body between the Sun and the observer
     """
@@ -364,22 +372,22 @@ class BodyTruth:
 
 @dataclass(frozen=True, slots=True)
 class SatelliteTruth:
-    """An artificial satellite in a frame, at mid-exposure; `id` is its number in the sources' truth.
+    """An artificial satellite in a frame at mid-exposure; `id` is its number in the truth of the sources.
 
     Attributes
     ----------
     v_mag
-        As it is lit
-    sunlit
-        Part of the Sun's disc that the satellite sees
+        Magnitude with its present illumination
     ra_deg, dec_deg
         Apparent place in ICRS axes
     rate_deg_s
-        Against the stars
+        Rate relative to the stars
     range_km
-        From the camera
+        Distance from the camera
     phase_deg
-        Angle at the satellite between the Sun and the camera; NaN for a random one
+        Angle at the satellite between the Sun and the camera; NaN for a random satellite
+    sunlit
+        Fraction of the Sun's disc that the satellite sees
     """
 
     id: int
@@ -400,18 +408,17 @@ class Truth:
     Attributes
     ----------
     t_s
-        mid-exposure, seconds from the scene's start
+        Mid-exposure, from the scene's start
     lab_from_body
         Attitude at mid-exposure
     cam_from_lab
-        The camera's attitude at mid-exposure
+        Attitude of the camera at mid-exposure
     rate_cam_rad_s
         (3,) angular velocity in camera axes
     sources
-        The sources on the frame
+        Sources on the frame
     hidden
-        (M,) ids of sources that are occluded and would otherwise be on the frame at
-        mid-exposure
+        (M,) ids of sources that are occluded and would otherwise be on the frame at mid-exposure
     bodies
         Sun, Moon and planets on the frame
     satellites
@@ -430,7 +437,21 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One camera frame: image_dn (H, W), uint16 from a detector or float64 when every noise is off."""
+    """One camera frame.
+
+    Attributes
+    ----------
+    index
+        Number of the frame
+    image_dn
+        (H, W) image, uint16 from a detector or float64 without noise
+    t_mid_s
+        Time tag of mid-exposure, from the scene's start
+    exposure_s
+        Exposure time
+    saturation_dn
+        Digital number at which the detector saturates
+    """
 
     index: int
     image_dn: NDArray[Any]
@@ -446,22 +467,21 @@ class FrameRow:
     Attributes
     ----------
     truth_deg, estimate_deg
-        (RA, Dec, roll) of the camera under the stars, (roll, pitch, yaw) of the vehicle under
-        the dome
+        (RA, Dec, roll) of the camera under the stars, (roll, pitch, yaw) of the vehicle under the dome
     wrong
-        Solved, but off by more than ten arcminutes and by more than the tracker claims
+        Whether the solution has an error of more than ten arcminutes and of more than the tracker claims
         (`metrics.is_wrong`)
+    filter
+        Status of the attitude filter's update with the solution; empty without a filter
     cross_sigma_arcsec, roll_sigma_arcsec
         Standard deviations that the tracker claims
     log10_chance
-        Of its matches
+        Logarithm of the probability that its matches are chance
     rate_error_deg_s
-        Angular rate of the camera by the tracker minus the truth, length of the vector; of the
-        two signs the nearer one if the tracker does not know the sign
+        Length of the tracker's angular rate of the camera minus the truth; with the nearer of the two signs if the
+        tracker does not know the sign
     rate_sigma_deg_s
-        That it claims
-    filter
-        Verdict of the attitude filter on the solution; empty without a filter
+        Standard deviation that the tracker claims for the rate
     """
 
     frame: int

@@ -1,8 +1,8 @@
 """Values with units, read from YAML; the base class of every section of a file.
 
-Two rules name every key. A key whose value carries its own unit has none in its name (`focal_length: "35 mm"`);
-a key whose value is a bare number ends in its unit (`tilt_stop_deg: 30`). In Python the former gains the SI
-suffix (`camera.focal_length_m`), so that every name shows its unit.
+Two rules name every key. A key whose value has a unit has none in its name (`focal_length: "35 mm"`). A key whose value
+is a bare number ends in its unit (`tilt_stop_deg: 30`). In Python the former has an SI suffix
+(`camera.focal_length_m`), so every name shows its unit.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ QUANTITY_PATTERN = (
     r"^\s*[-+.]?\d.*[a-zA-Z]"  # pattern of a quantity in the JSON schema, for editors
 )
 
-# Suffixes that the YAML key lacks, of fields that `quantity` parses. `dark_e_s` and `rate_deg_s` are bare numbers and
-# keep theirs.
+# Suffixes of fields that `quantity` parses, which the YAML keys do not have. `dark_e_s` and `rate_deg_s` are bare
+# numbers and keep their suffixes.
 SI_SUFFIX = re.compile(
     r"(?<!_deg)(?<!_rad)(?<!_e)(?<!^e)(?<!_cm2)(?<!_um)_(m|s|n|kg|kg_m|kg_m2|cd|w_sr|nm|nm_rad|nms|nms2)$"
 )
 
-# The SI unit of each suffix, as the loader accepts it.
+# The SI unit of each suffix, in the form that the loader accepts.
 SI_UNITS = {
     "m": "m",
     "s": "s",
@@ -56,6 +56,7 @@ def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
     """A validator that converts a quantity such as "48 in" to a float in `si_unit`. It raises InputError."""
 
     def parse(value: Any) -> float:
+        """The quantity in SI units."""
         if not isinstance(value, str):
             raise InputError("", f"{value!r} has no unit", f"a {what} such as {examples}")
         try:
@@ -76,7 +77,7 @@ def with_unit(si_unit: str, what: str, examples: str) -> BeforeValidator:
     )
 
 
-# Factors of the units that scenes use most, as astropy has them, to the bit: astropy takes 0.2 s to import.
+# Factors of common units, equal to those of astropy to the bit, because astropy takes 0.2 s to import.
 COMMON_UNITS = {
     "m": {
         "m": 1.0,
@@ -100,7 +101,7 @@ COMMON_QUANTITY = re.compile(r"([-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?) ?([a-zA-Z][a-z
 
 
 def in_si(value: str, si_unit: str | None = None) -> float:
-    """The value of a quantity such as "48 in" in `si_unit`, or else in SI units. Raises InputError."""
+    """The value of a quantity such as "48 in" in `si_unit`, or in SI base units. Raises InputError."""
     match = COMMON_QUANTITY.fullmatch(value) if len(value) <= MAX_CHARACTERS else None
     if match and (factor := COMMON_UNITS.get(si_unit or "", {}).get(match[2])) is not None:
         return float(match[1]) * factor
@@ -114,15 +115,13 @@ def in_si(value: str, si_unit: str | None = None) -> float:
         try:
             number = units.Quantity(value)
             return float(number.to_value(si_unit) if si_unit else number.si.value)
-        except (
-            TypeError,
-            ValueError,
-            ArithmeticError,
-        ) as error:  # UnitsError is a ValueError; "3 m(1/0)", "3 m(9e9)"
+        except (TypeError, ValueError, ArithmeticError) as error:
+            # UnitsError is a ValueError; "3 m(1/0)" and "3 m(9e9)" raise others.
             raise InputError("", error) from None
 
 
 def finite(value: float) -> float:
+    """The value. Raises InputError if it is not finite."""
     if not math.isfinite(value):
         raise InputError("", f"{value} is not a finite number")
     return value
@@ -152,7 +151,7 @@ NotNegative = Annotated[Number, Field(ge=0)]
 Ascending = Annotated[tuple[Number, ...], Field(min_length=2)]
 
 
-# SI unit, what it is, example, least and greatest value of a quantity.
+# SI unit, name, example, least and greatest value of a quantity.
 QuantityRange = tuple[str, str, str, float, float]
 
 
@@ -164,11 +163,11 @@ def quantities_within(
     Parameters
     ----------
     section
-        Of the keys in errors
+        Section of the keys in errors
     ranges
-        By the name of the quantity
+        Ranges by the name of the quantity
     texts
-        One each, in that order
+        One text for each quantity, in the same order
     """
     values = []
     for text, (name, (unit, what, example, low, high)) in zip(texts, ranges.items(), strict=True):
@@ -198,7 +197,7 @@ class ConfigModel(BaseModel):
 def check_table(
     first: Sequence[float], values: Sequence[float], name: str, first_name: str = "angle_deg"
 ) -> None:
-    """Raise InputError unless two columns have equal length and the first, the angle, ascends."""
+    """Raise InputError unless two columns have equal length and the first one ascends strictly."""
     if len(first) != len(values):
         raise InputError("", f"{first_name} has {len(first)} numbers, {name} has {len(values)}")
     if any(b <= a for a, b in itertools.pairwise(first)):

@@ -1,9 +1,11 @@
 """Read YAML files safely, and turn a pydantic validation error into an InputError with file and line.
 
-Input files may come from untrusted sources, so their size, depth and number of values are limited (`StrictLoader`),
-and duplicate keys are rejected (`reject_duplicate_keys`). `explain` takes the first error that pydantic reports,
-translates its location to the keys of the YAML tree, and `where_of` finds the line of that key in the file that defines
-it.
+Input files may come from untrusted sources, so their size, depth and number of values are limited (`StrictLoader`), and
+duplicate keys are rejected (`reject_duplicate_keys`). `explain` makes the error message of a validation:
+
+1. Take the first error that pydantic reports.
+2. Translate its location to the keys of the YAML tree (`yaml_keys`), and its type to a problem (`fault_of`).
+3. Find the line of that key in the file that defines it (`where_of`).
 """
 
 from __future__ import annotations
@@ -25,13 +27,13 @@ from skysim.core import __version__
 from skysim.core.errors import OVERRIDES, InputError, Where, printable, unknown_name
 
 Files = list[tuple[Path, str]]  # paths and texts
-VERSION = 1  # of scene and study files; raised by an incompatible change, with a conversion of old files here
-
+# Version of scene and study files. An incompatible change increases it and adds a conversion of old files here.
+VERSION = 1
 
 MAX_BYTES = 1 << 20  # of a file: a minute of reading
-MAX_KEPT = 1 << 15  # characters of a text whose values are kept
+MAX_KEPT = 1 << 15  # number of characters of a text whose values are cached
 MAX_NODES = 100_000  # of a document, counting the content of an alias each time
-MAX_EXCERPT = 200  # characters of a value in a message
+MAX_EXCERPT = 200  # number of characters of a value in a message
 MAX_DEPTH = 40  # levels of nesting
 
 
@@ -41,9 +43,12 @@ class StrictLoader(yaml.SafeLoader):
     def __init__(self, text: str) -> None:
         super().__init__(text)
         self.depth = self.nodes = 0
-        self.size: dict[int, int] = {}  # nodes within each completely composed node, by id
+        self.size: dict[
+            int, int
+        ] = {}  # number of nodes in each completely composed node, by its id
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """As in SafeLoader, with the limits."""
         before = self.nodes
         mark = self.peek_event().start_mark
         aliased = self.check_event(yaml.AliasEvent)
@@ -55,7 +60,7 @@ class StrictLoader(yaml.SafeLoader):
             )
         node = super().compose_node(parent, index)
         self.depth -= 1
-        # An alias of a node that is not yet complete lies within that node: it is recursive.
+        # An alias of a node that is not yet complete is part of that node: it is recursive.
         if aliased and id(node) not in self.size:
             raise yaml.composer.ComposerError(None, None, "an alias within its own anchor", mark)
         self.nodes += self.size[id(node)] if aliased else 1
@@ -65,7 +70,7 @@ class StrictLoader(yaml.SafeLoader):
         return node
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        """As in SafeLoader, but report invalid numbers and dates as YAML errors."""
+        """As in SafeLoader, but invalid numbers and dates are YAML errors."""
         try:
             return super().construct_object(node, deep)
         except (ValueError, TypeError, LookupError, OverflowError, AttributeError) as error:
@@ -76,7 +81,7 @@ class StrictLoader(yaml.SafeLoader):
 
 
 def parse_yaml(text: str, kind: type[StrictLoader] = StrictLoader) -> tuple[yaml.Node | None, Any]:
-    """The node tree of a YAML document, and its values. Raises YAMLError."""
+    """The node tree of a YAML document, and its value. Raises YAMLError."""
     loader = kind(text)
     try:
         node = loader.get_single_node()
@@ -87,13 +92,15 @@ def parse_yaml(text: str, kind: type[StrictLoader] = StrictLoader) -> tuple[yaml
 
 @functools.lru_cache(maxsize=16)
 def parse_kept(text: str) -> tuple[yaml.Node | None, Any]:
-    """`parse_yaml`, kept for the next time: each point of a study has the same scene and camera file, whose parsing
-    takes ten times as long as all else of it. The result must not be changed."""
+    """`parse_yaml` with a cache. The result must not be changed.
+
+    All points of a study have the same scene and camera file, whose parsing takes ten times as long as the rest.
+    """
     return parse_yaml(text)
 
 
 def is_file(path: Path) -> bool:
-    """Whether the file exists; False for a name that no file can have."""
+    """Whether the file exists; False for a name that is not possible for a file."""
     try:
         return path.is_file()
     except OSError:
@@ -101,14 +108,14 @@ def is_file(path: Path) -> bool:
 
 
 def existing_file(value: str) -> str:
-    """Validator of a key: the path of a file that exists. Raises InputError."""
+    """The path of a file, as the validator of a key. Raises InputError if there is no such file."""
     if not is_file(Path(value)):
         raise InputError("", f"{value!r} is not a file", "a path, or a file in the scene's folder")
     return value
 
 
 def find_file(name: str, folder: Path, what: str) -> Path:
-    """The path of a file given by path, or by its name in a folder. Raises InputError."""
+    """The path of a .yaml file given by its path, or by its name in a folder. Raises InputError."""
     path = Path(name)
     shipped = folder / f"{name}.yaml"
     if path.suffix in {".yaml", ".yml"} and is_file(path):
@@ -123,7 +130,7 @@ def find_file(name: str, folder: Path, what: str) -> Path:
 
 
 def excerpt(value: object) -> str:
-    """A value for a message: on one line, truncated to LONGEST characters."""
+    """A value for a message: on one line, truncated to MAX_EXCERPT characters."""
     text = printable(value)
     return text if len(text) <= MAX_EXCERPT else f"{text[:MAX_EXCERPT]}…"
 
@@ -131,7 +138,7 @@ def excerpt(value: object) -> str:
 def parse_overrides(
     sets: list[str] | None, parameter: str = "overrides", form: str = "path.to.key=value"
 ) -> dict[str, str]:
-    """Keys and values of texts `path.to.key=value`, or of another form. Raises InputError that names the parameter."""
+    """Values by key from texts `path.to.key=value`, or of another form. Raises InputError that names the parameter."""
     overrides = {}
     for item in sets or []:
         key, equals, value = item.partition("=")
@@ -142,7 +149,7 @@ def parse_overrides(
 
 
 def override_texts(overrides: Mapping[str, Any] | None) -> dict[str, str]:
-    """The values of overrides as YAML text, as `--set` takes them: strings unchanged, other values as JSON."""
+    """The values of overrides as YAML texts, like those of `--set`: strings unchanged, other values as JSON."""
     return {
         key: value if isinstance(value, str) else json.dumps(value)
         for key, value in (overrides or {}).items()
@@ -188,34 +195,34 @@ def reject_duplicate_keys(node: yaml.Node | None, path: Path) -> None:
 
 
 def check_version(tree: Mapping[str, Any], path: Path, text: str) -> None:
-    """Raise InputError for a file of another schema version, before its unknown keys are reported as mistakes."""
+    """Raise InputError for a file of another schema version, so that its keys are not reported as unknown."""
     if "schema" not in tree:
         raise InputError("schema", f"missing; add the line schema: {VERSION}", where=Where(path))
     version = tree["schema"]
     if type(version) is int and version == VERSION:
         return
     problem = f"unknown version {excerpt(repr(version))}"
-    if type(version) is int:
-        problem = f"version {version} is " + (
-            f"newer than skysim {__version__} supports"
-            if version > VERSION
-            else "no longer supported"
-        )
+    if type(version) is int and version > VERSION:
+        problem = f"version {version} is newer than skysim {__version__} supports"
+    elif type(version) is int:
+        problem = f"version {version} is no longer supported"
     raise InputError("schema", problem, VERSION, where_of(["schema"], [(path, text)], {}))
 
 
 def set_key(tree: dict[str, Any], key: str, value: str) -> None:
-    """Set one dotted key of the raw scene; the value is YAML. A number is an index into a list: `camera_body.2`."""
+    """Set one dotted key of a raw tree to a YAML value. A number is an index into a list: `camera_body.2`.
+
+    Raises InputError for a value that is not YAML, and for a key below a value.
+    """
     *parents, last = key.split(".")
     if not all((*parents, last)):
         raise InputError(OVERRIDES.file, f"{excerpt(key)}={excerpt(value)}", "path.to.key=value")
     node: Any = tree
     for depth, parent in enumerate(parents):
-        node = (
-            node.setdefault(parent, {})
-            if isinstance(node, dict)
-            else node[list_index(node, parent, key)]
-        )
+        if isinstance(node, dict):
+            node = node.setdefault(parent, {})
+        else:
+            node = node[list_index(node, parent, key)]
         if not isinstance(node, dict | list):
             section = excerpt(".".join(parents[: depth + 1]))
             raise InputError(excerpt(key), f"{section} holds a value, not keys", where=OVERRIDES)
@@ -227,8 +234,16 @@ def set_key(tree: dict[str, Any], key: str, value: str) -> None:
         ) from error
 
 
+def shared_depth(first: Sequence[str], second: Sequence[str]) -> int:
+    """Number of leading keys that two nested keys have in common."""
+    depth = 0
+    while depth < min(len(first), len(second)) and first[depth] == second[depth]:
+        depth += 1
+    return depth
+
+
 def list_index(values: list[Any], component: str, key: str) -> int:
-    """The list index that a component of a dotted key gives. Raises InputError."""
+    """A component of a dotted key as a list index. Raises InputError if it is none."""
     digits = component.isascii() and component.isdigit() and len(component) < 10
     if not digits or int(component) >= len(values):
         raise InputError(
@@ -240,7 +255,7 @@ def list_index(values: list[Any], component: str, key: str) -> int:
     return int(component)
 
 
-# What a value should be, by pydantic's type of the error, with its context.
+# The allowed values by pydantic's type of the error, with placeholders for its context.
 EXPECTED = {
     "greater_than": "greater than {gt}",
     "greater_than_equal": "greater than or equal to {ge}",
@@ -281,26 +296,39 @@ def explain(
 ) -> InputError:
     """The first error of a validation: `light.kind: unknown kind 'domes'; allowed: … (scenes/x.yaml, line 31)`.
 
-    tree is the merged content of the files; files are their paths and texts, the one with the highest priority first.
+    Parameters
+    ----------
+    error
+        Error of pydantic
+    model
+        Model that was validated
+    tree
+        Merged content of the files
+    files
+        Paths and texts of the files, the one with the highest priority first
+    overrides
+        YAML texts by dotted key
     """
-    # A misspelled key causes two errors, unknown and missing. Report the unknown one.
+    # 1. A misspelled key causes two errors, unknown and missing. Report the unknown one.
     first = min(error.errors(), key=lambda item: item["type"] == "missing")
     missing = first["type"] == "missing"
+    # 2. Keys and problem.
     keys = [str(key) for key in yaml_keys(first["loc"], tree, missing)]
     found = fault_of(first, model)
     if found.key:
         keys += found.key.split(".")
-    # A missing key has no line of its own, so its section's is given. (A file may have it in a section or list that
-    # another file replaces.)
+    # 3. A missing key has no line of its own, so the line is that of its section. (A file may have the key in a section
+    # or list that another file replaces.)
     where = where_of(keys[:-1] if missing else keys, files, overrides)
     return InputError(excerpt(".".join(keys)), found.problem, found.allowed, where)
 
 
 def fault_of(error: ErrorDetails, model: type[BaseModel]) -> InputError:
-    """One error of pydantic; its key is relative to the error's location."""
+    """One error of pydantic as InputError; its key is relative to the error's location."""
     kind = error["type"]
     context = error.get("ctx", {})
-    if kind == "value_error":  # a validator's own, which may name a key below
+    # An error of a validator, which may name a key below.
+    if kind == "value_error":
         cause = context["error"]
         return cause if isinstance(cause, InputError) else InputError("", cause)
     if kind == "extra_forbidden":
@@ -310,10 +338,8 @@ def fault_of(error: ErrorDetails, model: type[BaseModel]) -> InputError:
     if kind == "missing":
         return InputError("", "missing")
     if kind == "union_tag_invalid":
-        return InputError(
-            "kind",
-            *unknown_name("kind", context["tag"], [context["expected_tags"].replace("'", "")]),
-        )
+        kinds = [context["expected_tags"].replace("'", "")]
+        return InputError("kind", *unknown_name("kind", context["tag"], kinds))
     if kind == "union_tag_not_found":
         return InputError("", "kind is missing")
     value = excerpt(repr(error["input"]))
@@ -324,22 +350,26 @@ def fault_of(error: ErrorDetails, model: type[BaseModel]) -> InputError:
 
 
 def plain_number(value: Any) -> Any:
-    """A float without an exponent, 0.000001, as text; other values unchanged."""
+    """The text of a float without an exponent, such as 0.000001; other values unchanged."""
     return f"{Decimal(repr(value)).normalize():f}" if isinstance(value, float) else value
 
 
 def where_of(keys: list[str], files: Files, overrides: Mapping[str, str]) -> Where:
-    """Where a key was given: OVERRIDES, or the place in the file that has most of its components."""
+    """The place that sets a key: OVERRIDES, or the line in the file that has most components of the key."""
     dotted = ".".join(keys)
     if any(k == dotted or dotted.startswith(k + ".") for k in overrides):
         return OVERRIDES
     matches = [(*line_of(text, keys), path) for path, text in files]
-    _, line, path = max(matches, key=lambda match: match[0])  # the first of equal depth
+    # `max` takes the first file of those with equal depth.
+    _, line, path = max(matches, key=lambda match: match[0])
     return Where(path, line)
 
 
 def yaml_keys(loc: tuple[int | str, ...], tree: Any, missing: bool) -> list[int | str]:
-    """The error's location as keys of the tree, without pydantic's names of union branches; the last may be missing."""
+    """The location of an error as keys of the tree, without pydantic's names of union branches.
+
+    The last key may be missing in the tree.
+    """
     keys: list[int | str] = []
     for n, key in enumerate(loc):
         last = missing and n == len(loc) - 1
@@ -353,18 +383,16 @@ def yaml_keys(loc: tuple[int | str, ...], tree: Any, missing: bool) -> list[int 
 
 
 def allowed_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
-    """The keys that a section takes, found by following an error's location through the JSON schema."""
+    """The allowed keys of a section, found by following an error's location through the JSON schema."""
     schema = model.model_json_schema(by_alias=True)
     node: dict[str, Any] = schema
     for key in loc:
         node = resolve(node, schema)
         # Branches of a union; an optional section has its union nested one level deeper.
-        options = [
-            resolve(option, schema) for option in node.get("anyOf", []) + node.get("oneOf", [])
-        ]
-        options += [
-            resolve(option, schema) for outer in options for option in outer.get("oneOf", [])
-        ]
+        branches = node.get("anyOf", []) + node.get("oneOf", [])
+        options = [resolve(option, schema) for option in branches]
+        nested = [option for outer in options for option in outer.get("oneOf", [])]
+        options += [resolve(option, schema) for option in nested]
         if key in node.get("properties", {}):
             node = node["properties"][key]
         elif isinstance(key, int):
@@ -376,7 +404,7 @@ def allowed_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str
 
 
 def resolve(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
-    """The schema that a node refers to; for an optional section, the section's."""
+    """The schema to which a node refers; for an optional section, that of the section."""
     options = [option for option in node.get("anyOf", []) if option.get("type") != "null"]
     if len(options) == 1:
         node = options[0]
@@ -384,17 +412,18 @@ def resolve(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
 
 
 def kind_of(node: dict[str, Any]) -> str | None:
+    """The literal of the key `kind` in a schema; None without one."""
     return node.get("properties", {}).get("kind", {}).get("const")
 
 
 def suggestion(word: str, allowed: Sequence[str]) -> str:
-    """The most similar of the allowed words, as the end of a problem; empty if none is similar."""
+    """Text with the most similar of the allowed words, to end a problem; empty if none is similar."""
     close = difflib.get_close_matches(word, allowed, 1)
     return f"; did you mean {close[0]}?" if close else ""
 
 
 def line_of(text: str, keys: list[str]) -> tuple[int, int | None]:
-    """How many components of a dotted key occur in the text, and the line of the last one that does."""
+    """The number of leading components of a dotted key that are in the text, and the line of the last of them."""
     node = yaml.compose(text, yaml.SafeLoader)
     depth = 0
     line = None
@@ -402,16 +431,12 @@ def line_of(text: str, keys: list[str]) -> tuple[int, int | None]:
         entry = None
         if isinstance(node, yaml.MappingNode):
             entry = next(((k, v) for k, v in node.value if k.value == key), None)
-        elif (
-            isinstance(node, yaml.SequenceNode)
-            and key.isascii()
-            and key.isdigit()
-            and int(key) < len(node.value)
-        ):
-            entry = (node.value[int(key)],) * 2
+        elif isinstance(node, yaml.SequenceNode) and key.isascii() and key.isdigit():
+            item = node.value[int(key)] if int(key) < len(node.value) else None
+            entry = item and (item, item)
         if not entry:
             break
-        depth = depth + 1
+        depth += 1
         line = entry[0].start_mark.line + 1
         node = entry[1]
     return depth, line

@@ -14,29 +14,49 @@ from skysim.core.types import Floats
 from skysim.dynamics.guidance import Reference
 from skysim.scene.sections.motion import ControlConfig
 
-TORQUE_DEFICIT = (
-    0.01  # relative torque deficit that counts as a limit; damped steering gives smaller ones
-)
+# Relative torque deficit that counts as saturation; damped steering laws give smaller ones.
+TORQUE_DEFICIT = 0.01
 
 
 @dataclass(slots=True)
 class Pid:
-    """Proportional, integral and derivative torque on the rotation vector of the error, with feed-forward.
+    """PID control on the rotation vector of the attitude error, with feed-forward. Stateful: one object per motion.
 
-        torque = J (alpha_ref - kp e - ki int(e) - kd (w - w_ref)) + w x (J w + h)
+    1. The attitude error e is the rotation vector of ref_from_body; the rate error is w - w_ref.
+    2. The proportional and integral terms are limited together to kd times the return rate
 
-    The proportional and integral terms together are limited to kd times the rate
+           w_max = min(rate limit, sqrt(a |e|)),    a = authority / greatest moment of inertia.
 
-        w_most = min(rate limit, sqrt(a |e|)),    a = authority / greatest moment of inertia,
+       Half of the authority then still brakes within the angle |e| (cascade saturation: Wie & Lu 1995, J. Guidance
+       18, 1372; its variable limit: Wie, Bailey & Heiberg 2002, J. Guidance 25, 96; both `assumed`). Without this
+       limit a large error drives the torque from one limit to the other and the vehicle never comes to rest.
+    3. The torque is Euler's equation for the commanded acceleration minus the feedback:
 
-    from which half of the authority still brakes within the angle |e| (cascade saturation: Wie & Lu 1995, J.
-    Guidance 18, 1372; its variable limit: Wie, Bailey & Heiberg 2002, J. Guidance 25, 96; both `assumed`). Without
-    this limit a large error or rate drives the torque from one limit to the other and the vehicle never comes to
-    rest.
+           torque = J (alpha_ref - kp e - ki int(e) - kd (w - w_ref)) + w x (J w + h)
 
-    Here e is the rotation vector of ref_from_body and h the momentum stored in wheels or CMGs. The feed-forward
-    J alpha + w x (J w + h) is Euler's equation, so that the feedback only has to reject disturbances. Rates and
-    torques are in body axes; J is (3, 3). Stateful: one motion each. ki = 0 is a PD controller.
+       so the feedback only has to reject disturbances. h is the momentum stored in wheels or CMGs.
+    4. After the actuators have answered, the error is integrated, except on saturated axes (`integrate`).
+
+    Rates and torques are in body axes. ki = 0 is a PD controller.
+
+    Attributes
+    ----------
+    reference
+        Commanded attitude, rate and acceleration over time
+    inertia_kg_m2
+        (3, 3) inertia J about the bearing, in body axes
+    kp, ki, kd
+        Gains in 1/s2, 1/s3 and 1/s, the same on each axis
+    authority_nm
+        Torque that the actuators can give in every direction
+    rate_limit_rad_s
+        Greatest return rate
+    limited
+        Whether step 2 limited the last command
+    error_rad
+        (3,) attitude error of the last command
+    error_sum_rad_s
+        (3,) integral of the error
     """
 
     reference: Reference
@@ -53,7 +73,7 @@ class Pid:
     def torque_nm(
         self, t_s: float, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats, momentum_nms: Floats
     ) -> Floats:
-        """(3,) the commanded torque at t_s, to be held until the next call."""
+        """(3,) torque commanded at t_s, which is held until the next call."""
         gains = self.kp, self.ki, self.kd, self.authority_nm, self.rate_limit_rad_s
         self.error_rad, torque_nm, self.limited = pid_torque(
             self.reference.state_at(t_s),
@@ -66,10 +86,10 @@ class Pid:
         return torque_nm
 
     def integrate(self, commanded_nm: Floats, achieved_nm: Floats, period_s: float) -> None:
-        """Integrate the error, except on axes that got less torque than commanded (anti-windup), and not while limited.
+        """Integrate the error, except while the return rate is limited or on an axis whose torque saturates.
 
-        A positive error commands a negative torque, so on an axis at the positive torque limit a positive error is
-        still integrated.
+        A positive error commands a negative torque. On an axis at its positive torque limit a positive error is
+        therefore still integrated: it reduces the command.
         """
         if not self.limited:
             integrate_error(
@@ -86,14 +106,31 @@ def pid_torque(
     momentum: Floats,
     gains: tuple[float, float, float, float, float],
 ) -> tuple[Floats, Floats, bool]:
-    """Error and torque, (3,) each, of Pid's equation, and whether it was limited; compiled, called every period."""
+    """Attitude error (3,) and torque (3,) by steps 1 to 3 of `Pid`, and whether step 2 limited the feedback.
+
+    Parameters
+    ----------
+    reference
+        lab_from_ref_wxyz (4,), rate (3,) and acceleration (3,) in the reference's axes
+    state
+        lab_from_body_wxyz (4,) and rate (3,) in body axes
+    error_sum
+        (3,) integral of the error
+    inertia
+        (3, 3) inertia about the bearing
+    momentum
+        (3,) momentum stored in wheels and CMGs
+    gains
+        kp, ki, kd, authority in N m, rate limit in rad/s
+    """
     lab_from_ref, rate_ref, accel_ref = reference
     lab_from_body, rate = state
     kp, ki, kd, authority, rate_limit = gains
+    # 1. Errors. e is the rotation vector of ref_from_body, the inverse of body_from_ref.
     body_from_ref = multiply(inverse(lab_from_body), lab_from_ref)
-    # e is the rotation vector of ref_from_body, the inverse of body_from_ref.
     error = -to_rotvec(body_from_ref)
     rate_error = rate - apply(body_from_ref, rate_ref)
+    # 2. Limit the return rate.
     feedback = kp * error + ki * error_sum
     feedback_size = math.sqrt((feedback**2).sum())
     error_angle = math.sqrt((error**2).sum())
@@ -105,21 +142,19 @@ def pid_torque(
     limited = feedback_size > feedback_limit and kp * error_angle > feedback_limit
     if limited:
         feedback = feedback * (feedback_limit / feedback_size)
+    # 3. Euler's equation, with the gyroscopic torque of the body and of the stored momentum.
     acceleration = apply(body_from_ref, accel_ref) - feedback - kd * rate_error
-    return (
-        error,
-        matrix_vector(inertia, acceleration) + cross(rate, matrix_vector(inertia, rate) + momentum),
-        limited,
-    )
+    gyroscopic = cross(rate, matrix_vector(inertia, rate) + momentum)
+    return error, matrix_vector(inertia, acceleration) + gyroscopic, limited
 
 
 @jit
 def integrate_error(
     error_sum: Floats, error: Floats, commanded: Floats, achieved: Floats, period_s: float
 ) -> None:
-    """`Pid.integrate` on one error sum (3,), in place."""
+    """Step 4 of `Pid`: add error times period_s to error_sum (3,), in place."""
     for i in range(3):
-        # Anti-windup: do not integrate further into a limit, but do integrate out of it.
+        # Anti-windup: do not integrate further into saturation, but do integrate out of it.
         saturated = abs(achieved[i]) < abs(commanded[i]) * (1 - TORQUE_DEFICIT)
         if not saturated or error[i] * commanded[i] > 0:
             error_sum[i] += error[i] * period_s
@@ -132,24 +167,34 @@ def build_controller(
     authority_nm: float = math.inf,
     rate_limit_rad_s: float = math.inf,
 ) -> Pid:
-    """A controller with its poles placed: the error obeys (s^2 + 2 z b s + b^2)(s + p) = 0 on each axis.
+    """The controller whose gains place the poles: the error obeys (s^2 + 2 z b s + b^2)(s + p) = 0 on each axis.
 
-    Bandwidth b and damping z are those of the attitude loop; p, integral_rad_s, is the pole that removes the steady
-    error of a constant torque, such as an unbalanced bearing's; law pd is p = 0, and leaves torque / (J b^2). The
-    defaults settle in some 5 s, slow enough for a control period of 10 ms (b x period = 0.03).
+        kp = b^2 + 2 z b p,    ki = b^2 p,    kd = 2 z b + p
+
+    b and z are the bandwidth and damping of the attitude loop. p = integral_rad_s is the pole that removes the
+    steady error of a constant torque, such as that of an unbalanced bearing. Law pd has p = 0, which leaves the
+    error torque / (J b^2). The defaults settle in about 5 s, slow enough for a control period of 10 ms
+    (b x period = 0.03).
 
     Parameters
     ----------
+    reference
+        Commanded attitude over time
     inertia_kg_m2
         (3,) principal moments or (3, 3) tensor about the bearing, in body axes
+    config
+        The scene's `motion.control`; None for its defaults
     authority_nm
-        Torque available in every direction; rate_limit_rad_s : greatest return rate
+        Torque that the actuators can give in every direction
+    rate_limit_rad_s
+        Greatest return rate
     """
     config = config or ControlConfig()
     inertia = np.asarray(inertia_kg_m2, dtype=float)
     b = config.bandwidth_rad_s
     z = config.damping
     p = config.integral_rad_s if config.law == "pid" else 0.0
+    # The gains are the coefficients of the expanded polynomial.
     return Pid(
         reference,
         inertia if inertia.ndim == 2 else np.diag(inertia).copy(),

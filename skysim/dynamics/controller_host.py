@@ -20,7 +20,7 @@ from skysim.dynamics.controllers import (
 
 
 def create(name: str, tree: dict[str, Any]) -> Respond:
-    """The function that answers a control period, for `serve`."""
+    """The function with which `serve` answers a control period: the torque, or a status if the controller fails."""
     setup = ControllerSetup.of_tree(tree)
     law = build_law(CONTROLLERS.entry_points()[name].load(), setup)
 

@@ -1,4 +1,13 @@
-"""An external controller as a control law of the flight computer: in this process, or in one of its own."""
+"""External attitude controllers: their interface, and the control law that calls one.
+
+A factory makes the controller: any callable, such as a class, that takes a `ControllerSetup` and returns the law. The
+law is a callable that takes a `ControllerInput` every control period and returns the torque on the body, (3,) in N m
+in body axes. The scene's actuators then allocate the torque, as they do for skysim's own laws.
+
+A factory is given to `skysim.simulate` and runs in this process, or an entry point of the group `skysim.controllers`
+names it and it runs in a process of its own. A program behind a pipe exchanges the same values as JSON.
+docs/howto/controller.md has examples.
+"""
 
 from __future__ import annotations
 
@@ -29,38 +38,34 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 
-# The interface for external attitude controllers: set-up, input, torque, and discovery by entry
-# points.
-
+# The interface.
 
 CONTROLLERS = PluginKind(
     "law", "skysim.controllers", "motion.control.law", (*BUILT_IN_LAWS, PRESCRIBED)
 )
-PROTOCOL = 1  # version, the first key of the set-up
-MAX_AUTHORITIES = (
-    1000.0  # largest torque over the actuators' authority: larger ones are errors of unit or sign
-)
+PROTOCOL = 1  # version of the protocol, the first key of the set-up
+# Largest torque over the actuators' authority; a larger torque is an error of unit or sign.
+MAX_AUTHORITIES = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
 class ControllerSetup:
-    """What a controller gets before the first control period.
+    """The data that a controller gets before the first control period.
 
     Attributes
     ----------
     period_s
         Control period: time between two calls
     inertia_kg_m2
-        (3, 3) about the bearing, in body axes
+        (3, 3) inertia about the bearing, in body axes
     authority_nm
-        Torque that the actuators can give in every direction; a larger one is limited by them
+        Torque that the actuators can give in every direction; they limit a larger one
     rate_limit_rad_s
-        Rate above which the gyros saturate, with a margin; None if the controller does not use
-        them
+        Rate above which the gyros saturate, with a margin; None if they are not used
     actuators, feedback, bandwidth_rad_s, damping, integral_rad_s, options
-        Of the scene's `motion.control`
+        Values of these keys in the scene's `motion.control`
     seed
-        For a controller that draws random numbers
+        The scene's seed, for a controller that draws random numbers
     """
 
     period_s: float
@@ -76,7 +81,7 @@ class ControllerSetup:
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def as_tree(self) -> dict[str, Any]:
-        """As a JSON object; arrays become lists."""
+        """The set-up as a JSON object; arrays become lists."""
         tree: dict[str, Any] = to_lists(asdict(self))
         return {"skysim_controller": PROTOCOL, **tree}
 
@@ -89,7 +94,9 @@ class ControllerSetup:
 
 @dataclass(frozen=True, slots=True)
 class ControllerInput:
-    """What a controller gets at the start of a control period. Quaternions are unit, scalar last: v_lab = q v q*.
+    """The data that a controller gets at the start of a control period.
+
+    Quaternions are unit quaternions, scalar last: v_lab = q v q*.
 
     Attributes
     ----------
@@ -98,17 +105,17 @@ class ControllerInput:
     t_s
         Seconds since the scene's start
     lab_from_body_xyzw
-        (4,) measured attitude
+        (4,) measured attitude, from the source that `motion.control.feedback` names
     rate_body_rad_s
-        (3,) measured rate in body axes. The source of both is `motion.control.feedback`
+        (3,) measured rate in body axes, from the same source
     lab_from_ref_xyzw
         (4,) commanded attitude
     rate_ref_rad_s, acceleration_ref_rad_s2
-        (3,) each, commanded, in the commanded attitude's own axes
+        (3,) commanded rate and acceleration, in the axes of the commanded attitude
     momentum_nms
-        (3,) stored in wheels and CMGs, in body axes
+        (3,) momentum stored in wheels and CMGs, in body axes
     achieved_nm
-        (3,) torque that the actuators gave for the last command; zeros at the first
+        (3,) torque that the actuators gave for the last command; zeros in the first period
     """
 
     tick: int
@@ -132,7 +139,7 @@ class ControllerInput:
         return _rotation(self.lab_from_ref_xyzw)
 
     def as_tree(self) -> dict[str, Any]:
-        """As a JSON object; arrays become lists."""
+        """The input as a JSON object; arrays become lists."""
         return {item.name: to_lists(getattr(self, item.name)) for item in fields(self)}
 
     @classmethod
@@ -150,7 +157,7 @@ Factory = Callable[[ControllerSetup], Law]
 
 
 def build_law(factory: Any, setup: ControllerSetup) -> Law:
-    """The law that a factory makes of a set-up. Raises TypeError if it is not callable."""
+    """The law that a factory returns for a set-up. Raises TypeError if it is not callable."""
     law = factory(setup)
     if not callable(law):
         raise TypeError(
@@ -160,7 +167,7 @@ def build_law(factory: Any, setup: ControllerSetup) -> Law:
 
 
 def check_torque(torque_nm: Any, authority_nm: float) -> Floats:
-    """(3,) torque, finite and at most MAX_AUTHORITIES times the authority. Raises ValueError."""
+    """(3,) torque. Raises ValueError unless it is finite and at most MAX_AUTHORITIES times the authority."""
     torque = finite_array(torque_nm, "torque_nm", (3,))
     if np.linalg.norm(torque) > MAX_AUTHORITIES * authority_nm:
         raise ValueError(
@@ -171,7 +178,7 @@ def check_torque(torque_nm: Any, authority_nm: float) -> Floats:
 
 
 def torque_of_reply(reply: Any, tick: int, authority_nm: float) -> Floats:
-    """The torque in a program's answer to a tick, a parsed JSON value. Raises ValueError."""
+    """The torque (3,) in a program's reply to a tick, a parsed JSON value. Raises ValueError for any other reply."""
     if not isinstance(reply, dict) or reply.get("tick") != tick:
         raise ValueError(f"no answer to tick {tick}, but {printable(reply)[:80]!r}")
     if "status" in reply:
@@ -188,22 +195,25 @@ def _rotation(a_from_b_xyzw: Floats) -> Rotation:
     return Rotation.from_quat(a_from_b_xyzw)
 
 
+# The control law that calls an external controller.
+
+
 class ControllerSource(NamedTuple):
-    """Where external controllers come from, beside entry points.
+    """External controllers other than entry points.
 
     Attributes
     ----------
     programs
-        Commands by name, from the user's command line
+        Commands of programs by name, from the user's command line
     factory
-        The controller given to `skysim.simulate`, in place of the one that the scene names
+        Factory given to `skysim.simulate`, which replaces the law that the scene names
     """
 
     programs: Mapping[str, str] = {}
     factory: Factory | None = None
 
     def check_name(self, law: str) -> None:
-        """Raise InputError for an unknown name of a law."""
+        """Raise InputError if no controller has this name."""
         if self.factory is None:
             CONTROLLERS.check_name(law, self.programs)
 
@@ -212,14 +222,14 @@ NO_SOURCE = ControllerSource()
 
 
 class ExternalLaw:
-    """An external controller with the methods of `attitude_control.Pid`. Stateful: one motion each.
+    """An external controller with the methods of `attitude_control.Pid`. Stateful: one object per motion.
 
     Attributes
     ----------
     answer
-        Returns the checked torque for an input, or raises an exception
+        Function from an input to the checked torque (3,); raises an exception if there is none
     program
-        The running program, None for a callable in this process
+        Running program; None for a callable in this process
     """
 
     def __init__(
@@ -239,7 +249,7 @@ class ExternalLaw:
     def torque_nm(
         self, t_s: float, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats, momentum_nms: Floats
     ) -> Floats:
-        """(3,) the commanded torque at t_s. Raises InputError that names the controller if it gives none."""
+        """(3,) torque commanded at t_s. Raises InputError that names the controller if it gives none."""
         lab_from_ref_wxyz, rate_ref, acceleration_ref = self.reference.state_at(t_s)
         inputs = ControllerInput(
             self.tick,
@@ -267,7 +277,8 @@ class ExternalLaw:
         return self.commanded_nm
 
     def integrate(self, commanded_nm: Floats, achieved_nm: Floats, period_s: float) -> None:
-        """Keep the torque that the actuators gave: the controller gets it in its next input."""
+        """Keep the torque that the actuators gave; the controller gets it in its next input."""
+        # The difference between the two arguments is the actuators' deficit, with or without a momentum dump.
         self.achieved_nm = self.commanded_nm - (commanded_nm - achieved_nm)
 
     def close(self) -> None:

@@ -1,7 +1,12 @@
 """Disturbance torques: bearing turbine torque, Earth rotation, air currents, impulses.
 
-The cable's spring and the air drag depend on the state within a step and are part of the MuJoCo model
-(multibody/model.py), not of this module.
+`DisturbanceModel.torque_nm` adds them for each control period:
+
+1. Constant in the lab: the turbine torque of the bearing's air jets, and the air current of this period.
+2. Apparent torque of the Earth's rotation, from the body's rate and the stored momentum.
+3. Impulses (knocks), as the mean torque of each step.
+
+The cable's spring and the air drag depend on the state within a step. MuJoCo computes them (multibody/model.py).
 """
 
 from __future__ import annotations
@@ -26,13 +31,16 @@ def earth_torque_nm(
 ) -> Floats:
     """(3,) apparent torque of the Earth's rotation on a vehicle in the lab, in body axes.
 
-    With the body's rate w in the lab, the Earth's rate W in body axes (dW/dt = -w x W there), the inertia J and the
-    rotors' momentum h in the body, Euler's equation J (w + W)' + h' + (w + W) x (J (w + W) + h) = T is that of a lab
-    at rest with one more torque,
+    w is the body's rate in the lab, W the Earth's rate (dW/dt = -w x W in body axes), J the inertia and h the
+    rotors' momentum. Euler's equation in inertial space,
+
+        J (w + W)' + h' + (w + W) x (J (w + W) + h) = T,
+
+    equals that of a lab at rest with the additional torque
 
         T_earth = J (w x W) - w x J W - W x (J w + J W + h).
 
-    All in body axes, (3,) and (3, 3). Gravity is along the plumb line.
+    Everything is in body axes, (3,) and (3, 3). Gravity is along the plumb line, so the centrifugal force is in it.
     """
     earth_momentum = matrix_vector(inertia_kg_m2, earth_body_rad_s)
     total_momentum = matrix_vector(inertia_kg_m2, rate_body_rad_s) + earth_momentum + momentum_nms
@@ -50,13 +58,18 @@ def lab_and_earth_torque(
     inertia_kg_m2: Floats,
     state: tuple[Floats, Floats, Floats],
 ) -> Floats:
-    """(3,) body torque of a torque constant in the lab plus the Earth's rotation; compiled, called every control
-    period.
+    """(3,) sum of a torque given in lab axes and of `earth_torque_nm`, in body axes.
 
-    Returns
-    -------
-    present
-        lab_from_body_wxyz (4,), the body's rate (3,) and the rotors' momentum (3,)
+    Parameters
+    ----------
+    torque_lab_nm
+        (3,) torque in lab axes
+    earth_lab_rad_s
+        (3,) Earth's rate in lab axes
+    inertia_kg_m2
+        (3, 3) inertia about the bearing, in body axes
+    state
+        lab_from_body_wxyz (4,), body's rate (3,) and rotors' momentum (3,) in body axes
     """
     lab_from_body, rate, momentum = state
     body_from_lab = inverse(lab_from_body)
@@ -67,10 +80,12 @@ def lab_and_earth_torque(
 
 
 class AirCurrent:
-    """Air currents: an Ornstein-Uhlenbeck torque about each lab axis, (3,) at every control period.
+    """Torque of air currents: an Ornstein-Uhlenbeck process about each lab axis, sampled every control period.
 
-    Exact for samples a period apart: T' = a T + sqrt(1 - a^2) rms N(0, 1), a = exp(-period / correlation time),
-    started in its stationary distribution. Its autocorrelation is rms^2 exp(-|lag| / correlation time).
+        T' = a T + sqrt(1 - a^2) rms N(0, 1),    a = exp(-period / correlation time)
+
+    This is exact for samples a period apart. The process starts in its stationary distribution; its
+    autocorrelation is rms^2 exp(-|lag| / correlation time).
     """
 
     def __init__(self, config: AirCurrentConfig, period_s: float, rng: np.random.Generator) -> None:
@@ -80,7 +95,7 @@ class AirCurrent:
         self.torque_nm = self.rms_nm * rng.standard_normal(3)
 
     def sample(self) -> Floats:
-        """The torque of this control period, in lab axes; draw the next."""
+        """(3,) torque of this control period in lab axes; draws that of the next period."""
         current = self.torque_nm
         innovation = math.sqrt(1 - self.decay**2) * self.rms_nm * self.rng.standard_normal(3)
         self.torque_nm = self.decay * current + innovation
@@ -89,18 +104,20 @@ class AirCurrent:
 
 @dataclass(slots=True)
 class DisturbanceModel:
-    """The disturbances of a vehicle, period by period. Stateful: one motion each.
+    """The disturbances of a vehicle, period by period. Stateful: one object per motion.
 
     Attributes
     ----------
     turbine_lab_nm
-        (3,) constant
+        (3,) constant turbine torque in lab axes
     earth_lab_rad_s
-        (3,) the Earth's rate, zeros where it is off
+        (3,) Earth's rate in lab axes; zeros if it is off
     air_current
-        None if it is off
+        Air current; None if it is off
+    impulses
+        Knocks in order of time
     inertia_kg_m2
-        (3, 3) about the bearing, in body axes
+        (3, 3) inertia about the bearing, in body axes
     """
 
     turbine_lab_nm: Floats
@@ -145,17 +162,19 @@ class DisturbanceModel:
         rate_body_rad_s: Floats,
         momentum_nms: Floats,
     ) -> NDArray[np.float64]:
-        """(K, 3) body torque in each of K steps between the (K + 1,) times of a control period.
+        """(K, 3) torque in body axes in each of K steps between the (K + 1,) times of a control period.
 
-        Attitude, rate and the rotors' momentum (3,) are those at its start, held over it: in 10 ms they change by a
-        thousandth. An impulse is a half-sine of torque whose integral is J times its change of rate; each step gets
-        the mean torque of its part.
+        Attitude (4,), rate (3,) and rotors' momentum (3,) are those at the start of the period and are held over
+        it: in 10 ms they change by a thousandth. An impulse is a half-sine of torque whose integral is J times its
+        change of rate; each step gets the mean torque of its part.
         """
+        # 1. Torque that is constant in the lab.
         torque_lab_nm = (
             self.turbine_lab_nm + self.air_current.sample()
             if self.air_current
             else self.turbine_lab_nm
         )
+        # 2. The same in body axes, and the Earth's rotation.
         torque_nm = np.empty((len(times_s) - 1, 3))
         torque_nm[:] = lab_and_earth_torque(
             torque_lab_nm,
@@ -163,10 +182,10 @@ class DisturbanceModel:
             self.inertia_kg_m2,
             (lab_from_body_wxyz, rate_body_rad_s, momentum_nms),
         )
+        # 3. Impulses that overlap this period.
         for impulse in self.impulses:
             if impulse.begin_s < times_s[-1] and times_s[0] < impulse.begin_s + impulse.duration_s:
-                # Impulse fraction of each step over its length: the mean torque of the step for a unit
-                # impulse.
+                # The fraction of the impulse in a step over the step's length is the mean torque of a unit impulse.
                 mean_per_impulse = [
                     impulse.fraction(a, b) / (b - a) for a, b in itertools.pairwise(times_s)
                 ]

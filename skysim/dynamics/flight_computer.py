@@ -1,8 +1,11 @@
-"""Flight computer: at every control period compute the control torque and allocate it to the actuators.
+"""Flight computer: compute the control torque of every control period and allocate it to the actuators.
 
-`FlightComputer.compute_controls` calls the control law (attitude_control.py) with the measured attitude and rate,
-subtracts the fans' torque of momentum dumping, and allocates the rest to the chosen actuator set (`allocate`). The
-torque that the actuators can give is returned to the law for its anti-windup.
+`FlightComputer.compute_controls` does the following:
+
+1. Call the control law (attitude_control.py or an external controller) with the measured attitude and rate.
+2. Subtract the torque of the fans that dump momentum.
+3. Allocate the rest to the chosen actuators.
+4. Return the torque that they can give to the law, for its anti-windup.
 """
 
 from __future__ import annotations
@@ -29,46 +32,57 @@ from skysim.dynamics.multibody.fans import Desaturator, MomentumDump
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import BUILT_IN_LAWS, ControlConfig
 
-GYRO_RATE_FRACTION = 0.7  # of the gyros' rate limit (`assumed`)
+GYRO_RATE_FRACTION = 0.7  # return rate of the controller over the gyros' rate limit (`assumed`)
 
 
 def authority_nm(actuators: Actuators) -> float:
-    """Torque available in every direction with every command within its limit."""
+    """Torque available in every direction with every command within its limit.
+
+    A torque T of unit length in the worst direction demands max |command_from_torque T| = the greatest row norm.
+    """
     command_from_torque, limit = actuators.command_map()
     return float(limit / np.linalg.norm(command_from_torque, axis=1).max())
 
 
 def usage(actuators: Actuators, torque_nm: Floats) -> Floats:
-    """(N,) greatest command over its limit, for torques (N, 3) on the body."""
+    """(N,) ratio of the greatest command to its limit, for torques (N, 3) on the body."""
     command_from_torque, limit = actuators.command_map()
     return np.asarray(np.abs(torque_nm @ command_from_torque.T).max(axis=1) / limit)
 
 
 def ideal_torque(vehicle: VehicleModel) -> IdealTorque:
-    """The ideal torques about the body's axes."""
+    """The ideal actuator of a vehicle, which applies torques about the body's axes."""
     return IdealTorque(vehicle.torques, vehicle.config.torque_limit_nm)
 
 
 def controlling_actuator(
     config: ControlConfig, actuator_sets: Mapping[str, Actuators], vehicle: VehicleModel
 ) -> Actuators:
-    """The actuators that the controller's torque is given to."""
+    """The actuators that receive the controller's torque."""
     if config.actuators == "ideal":
         return ideal_torque(vehicle)
     return actuator_sets[config.actuators]
 
 
 class FlightComputer:
-    """Attitude control with one set of actuators, and momentum dumping with the fans. Stateful: one motion each.
+    """Attitude control with one set of actuators, and momentum dumping with the fans. Stateful: one object per motion.
 
     Attributes
     ----------
-    source
-        Of external controllers
+    config
+        The scene's `motion.control`; None if the motion is prescribed
+    period_s
+        Control period
     actuator_sets
         All actuators that are switched on, by their key in `vehicle`
+    actuator
+        Actuators that receive the control torque
+    nu
+        Number of controls of the MuJoCo model
     control_torque_nm
-        (3,) control torque of the last period, zeros without a controller
+        (3,) control torque of the last period in body axes; zeros without a controller
+    momentum_dump
+        Momentum dumping; None if it is off
     """
 
     def __init__(
@@ -127,7 +141,7 @@ class FlightComputer:
             self.law.close()
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
-        """(3,) stored in wheels and CMGs, in body axes; the arguments are all of qpos and qvel."""
+        """(3,) momentum stored in wheels and CMGs, in body axes; the arguments are the full qpos and qvel."""
         stored = np.zeros(3)
         for actuator_set in self.actuator_sets.values():
             stored += actuator_set.momentum_nms(angles_rad, speeds_rad_s)
@@ -140,36 +154,45 @@ class FlightComputer:
         momentum_nms: Floats,
         torque_nm: Floats | None = None,
     ) -> Floats:
-        """(nu,) controls for this period from the measured attitude (4,) and the stored momentum (3,).
+        """(nu,) controls for this period.
 
         Parameters
         ----------
+        inputs
+            Time, measured rate and encoder readings
+        lab_from_body_wxyz
+            (4,) measured attitude
+        momentum_nms
+            (3,) momentum stored in wheels and CMGs, in body axes
         torque_nm
-            (3,) in body axes, in place of the control law's
+            (3,) torque in body axes that replaces that of the control law
         """
         control = np.zeros(self.nu)
         if self.config is None and torque_nm is None:
             return control
+        # 1. Control law, unless the caller gives a torque.
         if torque_nm is None:
             self.control_torque_nm = self.law.torque_nm(
                 inputs.t_s, lab_from_body_wxyz, inputs.rate_body_rad_s, momentum_nms
             )
         else:
             self.control_torque_nm = torque_nm
+        # 2. The actuators hold the body against the fans, which takes momentum out of them.
         actuator_torque_nm = self.control_torque_nm
         if self.momentum_dump:
-            # The other actuators give the commanded torque minus the fans', which removes their momentum.
             actuator_torque_nm = actuator_torque_nm - self.momentum_dump.allocate(
                 control, momentum_nms, inputs
             )
+        # 3. Allocation.
         achieved_nm = self.actuator.allocate(control, actuator_torque_nm, inputs)
+        # 4. Anti-windup.
         if torque_nm is None:
             self.law.integrate(actuator_torque_nm, achieved_nm, self.period_s)
         return control
 
 
 def return_rate_limit_rad_s(scene: Scene) -> float:
-    """Rate limit of the controller's return to the reference: below the gyros' limit if it uses them, else infinite.
+    """Rate limit of the return to the reference: below the gyros' limit if the controller uses them, else infinite.
 
     A saturated gyro reads less than the true rate, so a return faster than its limit would not be braked.
     """

@@ -1,8 +1,13 @@
 """Guidance: the reference attitude over time from a scene's list of maneuvers, and its impulses and vibration.
 
-Independent of the simulator and the controller. A reference is a chain of legs, each of which begins at the attitude
-at which the previous one ended. Attitudes are unit quaternions `lab_from_ref_wxyz` (4,), scalar first; rates and
-accelerations are (3,) in the reference's own axes.
+`plan` makes the reference in three steps:
+
+1. Start attitude and rate (`start_attitude`, `start_rate_rad_s`).
+2. One leg for each maneuver, by the function in `LEGS`; each begins at the attitude at which the previous one ended.
+3. A last leg without end, at the rate at which the list ended.
+
+Guidance is independent of the simulator and the controller. Attitudes are unit quaternions `lab_from_ref_wxyz` (4,),
+scalar first; rates and accelerations are (3,) in the reference's own axes.
 """
 
 from __future__ import annotations
@@ -50,23 +55,25 @@ from skysim.scene.sections.motion import (
 
 State = tuple[Floats, Floats, Floats]  # lab_from_ref_wxyz, rate_rad_s, acceleration_rad_s2
 
-KNOT_RAD = 0.01  # a change of rate is integrated in steps of at most this rotation ...
-MIN_KNOTS = 128  # ... and at least this many: error 2e-10 rad, see `RateChangeLeg`
+# A change of rate is integrated in steps of at most KNOT_RAD, and in at least MIN_KNOTS steps: error 2e-10 rad, see
+# `RateChangeLeg`.
+KNOT_RAD = 0.01
+MIN_KNOTS = 128
 MAX_KNOTS = 5_000_000
-# of attitude and rate where a profile begins
+# Greatest jump of attitude and rate at the beginning of a profile.
 MAX_JUMP_DEG = 0.1
 MAX_JUMP_DEG_S = 0.1
 
 
 def attitude(angles: AttitudeConfig) -> Rotation:
-    """3-2-1 Euler angles (intrinsic ZYX) to lab_from_body = Rz(yaw) Ry(pitch) Rx(roll); degrees in."""
+    """lab_from_body = Rz(yaw) Ry(pitch) Rx(roll) of 3-2-1 Euler angles (intrinsic ZYX) in degrees."""
     return Rotation.from_euler(
         "ZYX", [angles.yaw_deg, angles.pitch_deg, angles.roll_deg], degrees=True
     )
 
 
 def start_attitude(motion: MotionConfig, profiles: Sequence[AttitudeSpline] = ()) -> Rotation:
-    """lab_from_body at the start: the identity for a pointing, since then the lab is defined by the body."""
+    """lab_from_body at the start; the identity for a pointing, since then the body's axes define the lab's."""
     if motion.start == "profile":
         return quaternion.to_rotation(profile_start(motion, profiles)[0])
     return (
@@ -75,7 +82,7 @@ def start_attitude(motion: MotionConfig, profiles: Sequence[AttitudeSpline] = ()
 
 
 def start_rate_rad_s(motion: MotionConfig, profiles: Sequence[AttitudeSpline] = ()) -> Floats:
-    """(3,) rate at the start, in body axes."""
+    """(3,) rate at the start, in body axes, rad/s."""
     return (
         profile_start(motion, profiles)[1]
         if motion.start == "profile"
@@ -84,7 +91,7 @@ def start_rate_rad_s(motion: MotionConfig, profiles: Sequence[AttitudeSpline] = 
 
 
 def profile_start(motion: MotionConfig, profiles: Sequence[AttitudeSpline]) -> State:
-    """The state at the start of a first maneuver that is a profile."""
+    """The state at the start of the first maneuver, which is a profile."""
     element = motion.maneuver[0]
     assert isinstance(element, ProfileConfig)
     return profiles[0].state_at(profiles[0].t_s[0] if element.begin == "first_sample" else 0.0)
@@ -98,19 +105,22 @@ def rotated_state(
     rate_rad_s: float,
     acceleration_rad_s2: float,
 ) -> tuple[Floats, Floats, Floats]:
-    """The state after a rotation by an angle about a unit axis, which is the same in lab and body axes."""
+    """The state after a rotation by an angle about a fixed unit axis (3,), given in body axes.
+
+    lab_from_ref = lab_from_start exp(angle axis),    rate = angle' axis,    acceleration = angle'' axis
+    """
     lab_from_ref_wxyz = quaternion.multiply(
         lab_from_start_wxyz, quaternion.from_rotvec(angle_rad * axis)
     )
     return lab_from_ref_wxyz, rate_rad_s * axis, acceleration_rad_s2 * axis
 
 
-# Legs: one for each maneuver of the list, with a duration and the state at 0 <= t_s <= duration_s after its start.
+# Kinds of legs. Each has a duration and the state at 0 <= t_s <= duration_s after its start.
 
 
 @dataclass(frozen=True, slots=True)
 class FixedAxisLeg:
-    """A rotation about one fixed axis (3,) with a profile of its angle; a zero axis is no rotation."""
+    """A rotation about one fixed axis (3,) in body axes with a profile of its angle; zeros for no rotation."""
 
     lab_from_start_wxyz: Floats
     axis: Floats
@@ -125,13 +135,17 @@ class FixedAxisLeg:
 class RateChangeLeg:
     """A smooth change of the rate: rate_rad_s + change_rad_s (3x^2 - 2x^3), x = t / duration.
 
-    rotates by a goes as a^3 / n^4: below 2e-10 rad for the knots that `spin_up` takes.
+    The attitude is integrated from knots by Magnus' expansion. For a change that rotates by an angle a in n steps
+    its error is proportional to a^3 / n^4: below 2e-10 rad for the knots that `spin_up` takes.
 
     Attributes
     ----------
     lab_from_knot_wxyz
-        (K, 4) attitudes at K even steps. The error of Magnus' expansion in n steps of a change
-        that
+        (K, 4) attitudes at the beginnings of K equal steps
+    rate_rad_s
+        (3,) rate at the start, in body axes
+    change_rad_s
+        (3,) change of the rate over the leg
     """
 
     lab_from_knot_wxyz: Floats
@@ -147,7 +161,7 @@ class RateChangeLeg:
 
 @dataclass(frozen=True, slots=True)
 class ProfileLeg:
-    """A profile of attitude samples, from its time begin_s on."""
+    """A profile of attitude samples, beginning at its time begin_s."""
 
     spline: AttitudeSpline
     begin_s: float
@@ -161,8 +175,20 @@ Leg = FixedAxisLeg | RateChangeLeg | ProfileLeg
 
 
 class LegStart(NamedTuple):
-    """Start of a leg: attitude and rate of the reference, the frame of its Euler angles, the time since the start of
-    the motion, and the spline of a profile.
+    """The start of a leg.
+
+    Attributes
+    ----------
+    lab_from_ref_wxyz
+        (4,) attitude of the reference
+    rate_rad_s
+        (3,) rate of the reference, in its own axes
+    lab_from_home
+        Frame from which the Euler angles of maneuvers count
+    begin_s
+        Time since the start of the motion
+    spline
+        Spline of a profile; None for other maneuvers
     """
 
     lab_from_ref_wxyz: Floats
@@ -173,13 +199,14 @@ class LegStart(NamedTuple):
 
 
 def length_and_direction(vector: Floats) -> tuple[float, Floats]:
-    """Length and (3,) unit direction of a vector; the direction of zeros is zeros."""
+    """The length and the (3,) unit direction of a vector; the direction of zeros is zeros."""
     length = float(np.linalg.norm(vector))
     return length, vector / length if length else np.zeros(3)
 
 
 def hold(element: Any, start: LegStart) -> Leg:
     """Rest at the present attitude; a preceding rate drops to zero at once."""
+    # A bump rests as well, until the end of its second impulse.
     caught_s = element.caught_after_s if isinstance(element, BumpConfig) else None
     return FixedAxisLeg(
         start.lab_from_ref_wxyz, np.zeros(3), element.duration_s + (caught_s or 0.0), still
@@ -195,9 +222,10 @@ def step(element: StepConfig, start: LegStart) -> Leg:
 def slew(element: SlewConfig, start: LegStart) -> Leg:
     """The shortest eigen-axis rotation from rest to rest, as fast as the two limits allow.
 
-    A ramp to the rate v takes 1.5 v / a and 0.75 v^2 / a of angle; a rotation too short for two of them peaks at
-    v = sqrt(a angle / 1.5) and never cruises.
+    With the greatest acceleration a, a ramp to the rate v takes the time 1.5 v / a and the angle 0.75 v^2 / a. A
+    rotation too short for two ramps peaks at v = sqrt(a angle / 1.5) and never cruises.
     """
+    # 1. Eigen-axis and angle of the rotation.
     lab_from_there = quaternion.from_rotation(start.lab_from_home * attitude(element))
     back_wxyz = quaternion.inverse(start.lab_from_ref_wxyz)
     angle, axis = length_and_direction(
@@ -205,6 +233,7 @@ def slew(element: SlewConfig, start: LegStart) -> Leg:
     )
     if angle < 1e-12:
         return FixedAxisLeg(start.lab_from_ref_wxyz, np.zeros(3), 0.0, still)
+    # 2. Peak rate, duration of a ramp, and duration of the whole: two ramps, and a cruise over the rest of the angle.
     accel = math.radians(element.acceleration_deg_s2)
     rate = min(math.radians(element.rate_deg_s), math.sqrt(accel * angle / 1.5))
     ramp = 1.5 * rate / accel
@@ -218,23 +247,24 @@ def slew(element: SlewConfig, start: LegStart) -> Leg:
 
 
 def rate(element: RateConfig, start: LegStart) -> Leg:
-    """A constant rate, start exp(w t), from the first moment on: the rate jumps."""
+    """A constant rate w from the start of the leg, where the rate jumps: attitude start exp(w t)."""
     size, axis = length_and_direction(np.radians(element.rate_deg_s))
     return FixedAxisLeg(start.lab_from_ref_wxyz, axis, element.duration_s, partial(steady, size))
 
 
 def spin_up(element: SpinUpConfig, start: LegStart) -> Leg:
-    """Change the present rate to another, each component along a smoothstep; the axis may move.
+    """Change the present rate to another one, each component along a smoothstep; the axis may move.
 
     Raises
     ------
     InputError
-        (one line) where more than five million knots would be needed.
+        If more than MAX_KNOTS knots would be needed.
     """
     duration_s = element.duration_s
     start_rate = start.rate_rad_s
     change = np.radians(element.rate_deg_s) - start_rate
     fastest = max(float(np.linalg.norm(start_rate)), float(np.linalg.norm(start_rate + change)))
+    # With a fixed axis one step of Magnus' expansion is exact.
     axis_moves = np.linalg.norm(np.cross(start_rate, change)) > 1e-12 * fastest**2
     count = max(MIN_KNOTS, math.ceil(fastest * duration_s / KNOT_RAD)) if axis_moves else 1
     if count > MAX_KNOTS:
@@ -255,8 +285,8 @@ def spin_up(element: SpinUpConfig, start: LegStart) -> Leg:
 def sine(element: SineConfig, start: LegStart) -> Leg:
     """Oscillate about the attitude: rotation vector amplitude envelope(t) sin(2 pi f t) in body axes.
 
-    The three axes have the same phase, so that the axis of rotation is fixed. The envelope rises and falls within a
-    period, or half of the duration if that is shorter.
+    The three axes have the same phase, so the axis of rotation is fixed. The envelope rises and falls within a
+    period each, or within half of the duration if that is shorter.
     """
     duration_s = element.duration_s
     omega = 2 * math.pi * element.frequency_hz
@@ -267,10 +297,12 @@ def sine(element: SineConfig, start: LegStart) -> Leg:
 
 
 def chirp(element: ChirpConfig, start: LegStart) -> Leg:
-    """Oscillate about the attitude as `sine` does, while the frequency sweeps from one to another.
+    """Oscillate about the attitude as `sine` does, while the frequency sweeps from f0 to f1 within the duration T.
 
-    linear: f = f0 + (f1 - f0) t / T;  log: f = f0 (f1 / f0)^(t / T). The envelope rises within a period of f0 and falls
-    within one of f1.
+        linear: f = f0 + (f1 - f0) t / T
+        log:    f = f0 (f1 / f0)^(t / T)
+
+    The envelope rises within a period of f0 and falls within a period of f1.
     """
     duration_s = element.duration_s
     omega = 2 * math.pi * element.from_hz
@@ -288,16 +320,18 @@ def chirp(element: ChirpConfig, start: LegStart) -> Leg:
 
 
 def profile(element: ProfileConfig, start: LegStart) -> Leg:
-    """The attitudes of a file or table. Between its first sample and the maneuver's beginning the first cubic is
-    continued, by one step at most.
+    """Follow the attitudes of a file or table.
+
+    If the maneuver begins before the first sample, the first cubic is continued backwards by one step at most.
 
     Raises
     ------
     InputError
-        (one line) for samples at other times, and where attitude or rate would jump.
+        If the samples are at other times, or if attitude or rate would jump.
     """
     spline = start.spline
     assert spline is not None
+    # 1. The time of the profile at which the maneuver begins.
     first_s = float(spline.t_s[0])
     last_s = float(spline.t_s[-1])
     begin_s = first_s if element.begin == "first_sample" else start.begin_s * spline.absolute
@@ -309,6 +343,7 @@ def profile(element: ProfileConfig, start: LegStart) -> Leg:
             " maneuver's beginning",
             f"from {step_s:.3g} s (a step) at most, to a time after it; or begin: first_sample",
         )
+    # 2. The jump from the end of the previous maneuver.
     lab_from_ref, rate_rad_s, _ = spline.state_at(begin_s)
     jump = quaternion.multiply(quaternion.inverse(start.lab_from_ref_wxyz), lab_from_ref)
     jump_deg = math.degrees(float(np.linalg.norm(quaternion.to_rotvec(jump))))
@@ -322,7 +357,7 @@ def profile(element: ProfileConfig, start: LegStart) -> Leg:
     return ProfileLeg(spline, begin_s, last_s - begin_s)
 
 
-# The leg of each kind of maneuver. To add one, add a class to scene/motion.py and a function here.
+# The leg of each kind of maneuver. To add a kind, add a class to scene/sections/motion.py and a function here.
 LEGS: dict[str, Callable[[Any, LegStart], Leg]] = {
     "hold": hold,
     "step": step,
@@ -339,12 +374,14 @@ LEGS: dict[str, Callable[[Any, LegStart], Leg]] = {
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """The commanded attitude over time: leg after leg, the last of which continues without end.
+    """The commanded attitude over time: a sequence of legs, the last of which has no end.
 
     Attributes
     ----------
+    legs
+        Legs in order of time
     start_s
-        When each leg starts, ascending from 0
+        Start time of each leg, ascending from 0
     """
 
     legs: tuple[Leg, ...]
@@ -352,13 +389,13 @@ class Reference:
 
     @property
     def duration_s(self) -> float:
-        """Duration of the list, after which the last leg begins."""
+        """Duration of the list of maneuvers."""
         return self.start_s[-1]
 
     def state_at(self, t_s: float) -> State:
         """lab_from_ref_wxyz (4,), rate (rad/s) and acceleration (rad/s2), each (3,) in the reference's own axes.
 
-        At the time where two legs meet, the later one applies. Before 0 the state is that at 0.
+        The state at the time where two legs meet is that of the later one. Before 0 the state is that at 0.
         """
         k = max(bisect.bisect_right(self.start_s, t_s) - 1, 0)
         leg = self.legs[k]
@@ -376,26 +413,32 @@ def plan(
     lab_from_start: Rotation | None = None,
     profiles: Sequence[AttitudeSpline] = (),
 ) -> Reference:
-    """The reference of the list of maneuvers; each begins where the previous one ended.
+    """The reference of the list of maneuvers.
 
-    lab_from_start defaults to motion.start, or to the identity where that is a pointing among the stars. The Euler
-    angles of steps and slews are those of the body in the lab; where the start is a pointing they are relative to
-    the attitude at the start, whatever axes lab_from_start is in. A spin_up begins at the rate at which the
-    previous maneuver ended, which is zero except after a rate, a profile or another spin_up; the first begins at the
-    vehicle's own, motion.rate_deg_s.
+    Attitude: each maneuver begins where the previous one ended; only a step jumps. The Euler angles of steps and
+    slews are those of the body in the lab. If the start is a pointing they are relative to the attitude at the
+    start, whatever axes lab_from_start is in.
 
-    After its end the reference continues as it ended: at rest, or at the rate of a last rate, spin_up or profile.
-    Between maneuvers only a step lets the attitude jump. The rate jumps at the start of a rate, and where anything but
-    a spin_up or profile follows a rate, spin_up or profile.
+    Rate: a maneuver ends at rest, except a rate, a spin_up or a profile. A spin_up begins at the rate at which the
+    previous maneuver ended; a first one begins at motion.rate_deg_s. The rate jumps at the start of a rate, and
+    between a rate, spin_up or profile and any following maneuver other than a spin_up or profile.
+
+    After the list the reference continues at the rate at which it ended.
 
     Parameters
     ----------
+    motion
+        The scene's section `motion`
+    lab_from_start
+        lab_from_body at the start; None for motion.start, or for the identity if that is a pointing
     profiles
-        Of the maneuvers of kind profile, in their order (`profiles.load.load_profiles`)
+        Splines of the maneuvers of kind profile, in their order (`profiles.load_profiles`)
     """
+    # 1. Start.
     first = lab_from_start if lab_from_start is not None else start_attitude(motion, profiles)
     home = first if isinstance(motion.start, PointingConfig) else Rotation.identity()
     leg_start = LegStart(quaternion.from_rotation(first), start_rate_rad_s(motion, profiles), home)
+    # 2. One leg for each maneuver.
     legs: list[Leg] = []
     splines = iter(profiles)
     for element in motion.maneuver:
@@ -405,20 +448,21 @@ def plan(
         leg_start = LegStart(
             lab_from_ref_wxyz, rate_rad_s, home, leg_start.begin_s + legs[-1].duration_s
         )
+    # 3. The last leg; an empty list rests.
     size, axis = length_and_direction(leg_start.rate_rad_s if legs else np.zeros(3))
     final_leg = FixedAxisLeg(leg_start.lab_from_ref_wxyz, axis, math.inf, partial(steady, size))
     start_times_s = itertools.accumulate((leg.duration_s for leg in legs), initial=0.0)
     return Reference((*legs, final_leg), tuple(start_times_s))
 
 
-# Impulses and vibration that are scheduled in the list.
+# Impulses and vibration of the list.
 
 
 @dataclass(frozen=True, slots=True)
 class Impulse:
-    """An impulse: a half-sine of torque that alone would change the vehicle's rate by rate_rad_s, (3,) in body axes.
+    """A half-sine of torque that alone would change the vehicle's rate by rate_rad_s, (3,) in body axes.
 
-    Its impulse is the inertia times that.
+    The integral of the torque is J rate_rad_s.
     """
 
     begin_s: float
@@ -426,7 +470,7 @@ class Impulse:
     rate_rad_s: Floats
 
     def fraction(self, from_s: float, to_s: float) -> float:
-        """The fraction of the impulse between two times: (cos(pi a) - cos(pi b)) / 2, a, b in durations."""
+        """Fraction of the impulse between two times: (cos(pi a) - cos(pi b)) / 2, a and b in durations."""
         a, b = (
             min(max((t_s - self.begin_s) / self.duration_s, 0.0), 1.0) for t_s in (from_s, to_s)
         )
@@ -434,7 +478,7 @@ class Impulse:
 
 
 def impulses(motion: MotionConfig, reference: Reference) -> tuple[Impulse, ...]:
-    """The impulses of the list's bumps in order of time; a caught bump is two, equal and opposite."""
+    """The impulses of the bumps in order of time; a caught bump has two, equal and opposite."""
     result: list[Impulse] = []
     for begin_s, bump in zip(reference.start_s, motion.maneuver, strict=False):
         if isinstance(bump, BumpConfig):
@@ -448,7 +492,7 @@ def impulses(motion: MotionConfig, reference: Reference) -> tuple[Impulse, ...]:
 def vibration_intervals(
     motion: MotionConfig, reference: Reference
 ) -> tuple[tuple[float, float, tuple[JitterPart, ...]], ...]:
-    """(begin_s, end_s, parts) of the list's vibrations in order of time."""
+    """(begin_s, end_s, parts of the spectrum) of each vibration in order of time."""
     start_times = zip(reference.start_s, motion.maneuver, strict=False)
     return tuple(
         (begin_s, begin_s + element.duration_s, element.components)

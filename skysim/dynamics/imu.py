@@ -6,8 +6,8 @@
    quantization.
 3. `Navigator.add` integrates the gyro increments to an attitude.
 
-The unit's axes are the body's. Its outputs are increments (delta angle, delta velocity), as of a strapdown unit, so
-motion between two samples is not missed; only its order within the interval is lost.
+The unit's axes are the body's. Its outputs are increments (delta angle, delta velocity), as those of a strapdown
+unit. They contain all motion between two samples; only its order within the interval is lost.
 """
 
 from __future__ import annotations
@@ -33,12 +33,10 @@ from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats
 from skysim.scene.sections.vehicle import AccelerometerConfig, GyroConfig, ImuConfig, SiteConfig
 
-CUBIC_POINTS = (
-    4  # knots per polynomial: a cubic, with an error of the fourth order in their spacing
-)
-GAUSS_OFFSET = 0.5 / math.sqrt(
-    3
-)  # the two Gauss-Legendre points, at +-this from the middle: exact for a cubic
+# Knots per polynomial: a cubic, with an error of fourth order in their spacing.
+CUBIC_POINTS = 4
+# Distance of the two Gauss-Legendre points from the middle of a unit interval; they integrate a cubic exactly.
+GAUSS_OFFSET = 0.5 / math.sqrt(3)
 TIME_TOLERANCE_S = 1e-9  # tolerance for rounding of sample times
 NO_RATE = np.zeros(3)
 
@@ -52,16 +50,15 @@ class Increments:
     t_s
         (N,) ends of the intervals
     step_s
-        Length of each
+        Length of each interval
     angle_rad
-        (N, 3) integral of the rate about each body axis; a rotation vector only if the axis is
-        constant
+        (N, 3) integral of the rate about each body axis; a rotation vector only if the axis is constant
     velocity_m_s
         (N, 3) integral of the specific force, which is +g along the vertical for a unit at rest
     saturated
-        (N,) a gyro was at its limit; False if ideal
+        (N,) whether a gyro was at its limit; False for an ideal unit
     overloaded
-        (N,) an accelerometer was at its limit; False if ideal
+        (N,) whether an accelerometer was at its limit; False for an ideal unit
     """
 
     t_s: Floats
@@ -73,9 +70,11 @@ class Increments:
 
 
 def earth_rate_lab_rad_s(site: SiteConfig) -> Floats:
-    """(3,) Earth rate against the stars in lab axes: up by its sine of latitude, north by its cosine.
+    """(3,) Earth rate relative to the stars, in lab axes.
 
-    Lab z is up, x at the azimuth from north through east, y = z cross x.
+        up: W sin(latitude),    north: W cos(latitude)
+
+    Lab z is up, x is at the azimuth from north through east, y = z cross x.
     """
     latitude = math.radians(site.latitude_deg)
     azimuth = math.radians(site.x_azimuth_deg)
@@ -100,29 +99,39 @@ def ideal_increments(
         w = rate + body_from_lab earth_rate           angle    = int w dt
         f = dw/dt x r + w x (w x r) - g_body          velocity = int f dt
 
-    (Titterton & Weston, Strapdown Inertial Navigation Technology, ch. 3; `assumed`). With w the inertial rate, f
-    also has the centripetal and Coriolis acceleration of the lab's rotation; g is plumb-line gravity, (0, 0,
-    -gravity) in the lab, which includes the Earth's centrifugal part at the origin. int dw/dt x r is the difference
-    of w between both ends, crossed with r.
+    (Titterton & Weston, Strapdown Inertial Navigation Technology, ch. 3; `assumed`). Since w is the inertial rate,
+    f includes the centripetal and Coriolis acceleration of the lab's rotation. g is plumb-line gravity,
+    (0, 0, -gravity) in the lab, which includes the Earth's centrifugal acceleration at the origin.
 
-    Between knots every component is the cubic through the four nearest, integrated exactly: fourth order in the
-    spacing h. If the acceleration jumps by dalpha at a knot, the angle has an error of dalpha h^2 / 12, once.
-    Raises InputError for fewer than two knots or an interval outside them.
+    1. Compute w, and f without dw/dt x r, at the knots (`inertial_knots`).
+    2. Between knots every component is the cubic through the four nearest knots (`add_cubic`). Integrate it exactly
+       by two Gauss points. The error is of fourth order in the spacing h; if the acceleration jumps by dalpha at a
+       knot, the angle has an error of dalpha h^2 / 12, once.
+    3. int dw/dt x r dt = (w(end) - w(begin)) x r.
 
     Parameters
     ----------
     t_s
         (K,) knots of the motion, ascending, K >= 2, in any spacing
     lab_from_body_wxyz
-        (K, 4) attitudes there
+        (K, 4) attitudes at the knots
     rate_body_rad_s
-        (K, 3) rates of the body in the lab, in body axes
-    ends_s, step_s
-        (N,) ends of the sample intervals and their length; they need not coincide with knots
+        (K, 3) rates of the body in the lab at the knots, in body axes
+    ends_s
+        (N,) ends of the sample intervals; they need not coincide with knots
+    step_s
+        Length of the sample intervals
     position_body_m
-        (3,) r, the unit's position on the body
+        (3,) position r of the unit, in body axes
+    gravity_m_s2
+        Plumb-line gravity along lab -z, a positive number
     earth_rate_lab_rad_s
-        (3,) zeros for a unit that does not sense the Earth rate
+        (3,) Earth rate in lab axes; zeros for a unit that does not sense it
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two knots, or an interval is outside them.
     """
     if len(t_s) < 2:
         raise InputError("imu", f"{len(t_s)} samples of the motion", "two or more")
@@ -137,6 +146,7 @@ def ideal_increments(
             f"within the motion, {t_s[0]:.6f} to {t_s[-1]:.6f} s",
         )
     position = np.asarray(position_body_m, dtype=float)
+    # 1. Rate and specific force at the knots.
     knots = inertial_knots(
         np.ascontiguousarray(lab_from_body_wxyz),
         np.ascontiguousarray(rate_body_rad_s),
@@ -144,6 +154,7 @@ def ideal_increments(
         gravity_m_s2,
         earth_rate_lab_rad_s,
     )
+    # 2. and 3. Integrals over the sample intervals.
     angle, velocity = integrate_intervals(
         np.ascontiguousarray(t_s), knots, np.ascontiguousarray(ends_s), step_s, position
     )
@@ -159,7 +170,7 @@ def inertial_knots(
     gravity_m_s2: float,
     earth_rate: Floats,
 ) -> Floats:
-    """(K, 6) at every knot: inertial rate, then specific force without the term dw/dt x r."""
+    """(K, 6) inertial rate w and specific force w x (w x r) - g_body at every knot, in body axes."""
     knots = np.empty((len(rate_body_rad_s), 6))
     up = np.array([0.0, 0.0, gravity_m_s2])
     for k in range(len(knots)):
@@ -179,7 +190,8 @@ def integrate_intervals(
 ) -> tuple[Floats, Floats]:
     """(N, 3) angle and (N, 3) velocity of every sample interval from the knots of `inertial_knots`.
 
-    An interval is split at the knots; each part is one cubic, which two Gauss points integrate exactly.
+    An interval is split at the knots. Each part is one cubic, which two Gauss points integrate exactly:
+    int f dt = length / 2 (f(middle - g length) + f(middle + g length)), g = 1 / (2 sqrt 3).
     """
     angle = np.empty((len(ends_s), 3))
     velocity = np.empty((len(ends_s), 3))
@@ -192,6 +204,7 @@ def integrate_intervals(
         total = np.zeros(6)
         change = np.zeros(6)
         add_cubic(t_s, knots, first, begin, -1.0, change)
+        # The parts of the interval, from knot to knot.
         for k in range(first, last + 1):
             stop = end if k == last else min(end, t_s[k + 1])
             middle = (begin + stop) / 2
@@ -202,6 +215,7 @@ def integrate_intervals(
             if stop >= end:
                 break
         add_cubic(t_s, knots, k, end, 1.0, change)
+        # The tangential part of the specific force, int dw/dt x r dt.
         turned = quaternion.cross(change[:3], position_m)
         for i in range(3):
             angle[n, i] = total[i]
@@ -211,10 +225,13 @@ def integrate_intervals(
 
 @jit
 def add_cubic(t_s: Floats, knots: Floats, k: int, at_s: float, factor: float, out: Floats) -> None:
-    """Add to out (C,) factor times the value at at_s of the cubic (Lagrange) through the knots about t_s[k]..t_s[k+1].
+    """Add to out (C,) factor times the value at at_s of the Lagrange cubic through the four knots nearest to step k.
+
+        p(t) = sum_i f_i prod_(j != i) (t - t_j) / (t_i - t_j)
 
     If there are fewer than four knots, the polynomial goes through all of them.
     """
+    # The knots k - 1 to k + 2, shifted inwards at both ends.
     count = min(CUBIC_POINTS, len(t_s))
     first = min(max(k - 1, 0), len(t_s) - count)
     for i in range(first, first + count):
@@ -228,27 +245,31 @@ def add_cubic(t_s: Floats, knots: Floats, k: int, at_s: float, factor: float, ou
 
 @dataclass(slots=True)
 class Triad:
-    """Three orthogonal sensors of one kind and their errors; SI units, x is rad or m/s.
+    """Three orthogonal sensors of one kind and their errors, in SI units.
+
+    The unit x of an increment is rad for gyros and m/s for accelerometers.
 
     Attributes
     ----------
     matrix
-        (3, 3) response of each sensor to motion along each body axis: 1 + scale error on the
-        diagonal, the misalignment of sensor i towards axis j off it
+        (3, 3) response of each sensor to motion along each body axis: 1 + scale error on the diagonal, the
+        misalignment of sensor i towards axis j at [i, j]
     turn_on_bias
         (3,) constant bias, x/s
     markov_bias
-        (3,) Gauss-Markov bias (bias instability), x/s: a state
-    markov_sd, markov_time_s
-        Its standard deviation and correlation time
+        (3,) Gauss-Markov bias (bias instability), x/s; a state
+    markov_sd
+        Standard deviation of the Gauss-Markov bias, x/s
+    markov_time_s
+        Correlation time of the Gauss-Markov bias
     white
         Random walk of the integral, x/sqrt(s)
     limit
-        x/s at which the output saturates
+        Input at which the output saturates, x/s
     quantum
-        X of one count; 0 for none
+        Size of one count, x; 0 for no quantization
     remainder
-        (3,) x not yet counted: a state
+        (3,) input not yet counted, x; a state
     """
 
     matrix: Floats
@@ -264,7 +285,18 @@ class Triad:
     def measure(
         self, ideal: Floats, step_s: float, normal: Floats
     ) -> tuple[Floats, NDArray[np.bool_]]:
-        """(N, 3) measured increments, and (N,) whether one was limited; see `corrupt`. normal : (N, 6) draws."""
+        """(N, 3) measured increments, and (N,) whether one was limited; see `corrupt`.
+
+        Parameters
+        ----------
+        ideal
+            (N, 3) ideal increments
+        step_s
+            Length of the intervals
+        normal
+            (N, 6) standard normal draws: white noise, then innovations of the Gauss-Markov biases
+        """
+        # A step of the Gauss-Markov process: decay exp(-h / tau), innovation sd sqrt(1 - exp(-2 h / tau)).
         decay = math.exp(-step_s / self.markov_time_s)
         innovation = self.markov_sd * math.sqrt(-math.expm1(-2 * step_s / self.markov_time_s))
         counted, limited = corrupt(
@@ -298,22 +330,37 @@ def corrupt(
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Apply the sensor errors to increments (N, 3); markov_bias and remainder (3,) are updated in place.
 
-        b_n = decay b_(n-1) + innovation z      exact for a Gauss-Markov process (Gelb 1974, ch. 3; `assumed`)
-        x_n = matrix ideal_n + (turn_on_bias + b_n) step + white z',   clipped to +-limit, quantized
+    1. b_n = decay b_(n-1) + innovation z, exact for a Gauss-Markov process (Gelb 1974, ch. 3; `assumed`)
+    2. x_n = matrix ideal_n + (turn_on_bias + b_n) step + white z'
+    3. Clip x_n to +-limit; the clipped part is lost.
+    4. Quantize; the remainder is carried to the next sample.
 
-    The clipped part is lost; the quantization remainder is carried to the next sample.
+    Parameters
+    ----------
+    normal
+        (N, 6) standard normal draws z' and z
+    parameters
+        Interval in s, decay, innovation, white noise, limit and quantum of one increment
+
+    Returns
+    -------
+    (N, 3) measured increments, and (N,) whether one was limited
     """
     step, decay, innovation, white, limit, quantum = parameters
     counted = np.empty(ideal.shape)
     limited = np.zeros(len(ideal), dtype=np.bool_)
     for n in range(len(ideal)):
         for i in range(3):
+            # 1. Gauss-Markov bias.
             markov_bias[i] = decay * markov_bias[i] + innovation * normal[n, 3 + i]
+            # 2. Scale, misalignment, bias and white noise.
             x = matrix[i, 0] * ideal[n, 0] + matrix[i, 1] * ideal[n, 1] + matrix[i, 2] * ideal[n, 2]
             x += (turn_on_bias[i] + markov_bias[i]) * step + white * normal[n, i]
+            # 3. Saturation.
             if abs(x) > limit:
                 x = math.copysign(limit, x)
                 limited[n] = True
+            # 4. Quantization.
             if quantum > 0:
                 remainder[i] += x
                 x = quantum * np.rint(remainder[i] / quantum)
@@ -323,7 +370,15 @@ def corrupt(
 
 
 def gyro_triad(config: GyroConfig, hardware: Floats, start: Floats) -> Triad:
-    """The gyro triad from standard normal draws: hardware (4, 3), start (3,) of the Gauss-Markov bias."""
+    """The gyro triad from standard normal draws.
+
+    Parameters
+    ----------
+    hardware
+        (4, 3) draws of the fixed errors: bias, then the rows of the response matrix
+    start
+        (3,) draws of the initial Gauss-Markov bias
+    """
     return Triad(
         matrix=response_matrix(config.scale_ppm, config.misalignment_arcsec, hardware[1:]),
         turn_on_bias=DEG_H_RAD_S * scaled_errors(config.turn_on_bias_deg_h, hardware[0]),
@@ -337,8 +392,9 @@ def gyro_triad(config: GyroConfig, hardware: Floats, start: Floats) -> Triad:
 
 
 def accelerometer_triad(config: AccelerometerConfig, hardware: Floats, start: Floats) -> Triad:
-    """The accelerometer triad, as `gyros`. Its noise density in ug/sqrt(Hz), squared, is the variance of a mean
-    over 1 s.
+    """The accelerometer triad, as `gyro_triad`.
+
+    The square of the noise density in ug/sqrt(Hz) is the variance of a mean over 1 s.
     """
     ug = PPM * STANDARD_GRAVITY_M_S2
     return Triad(
@@ -354,7 +410,7 @@ def accelerometer_triad(config: AccelerometerConfig, hardware: Floats, start: Fl
 
 
 def response_matrix(scale_ppm: float, misalignment_arcsec: float, normal: Floats) -> Floats:
-    """(3, 3) identity plus the scale errors on its diagonal and every sensor's misalignment off it."""
+    """(3, 3) response: 1 + scale error on the diagonal, the sensors' misalignments off it; normal : (3, 3) draws."""
     scale = PPM * scaled_errors(scale_ppm, normal)
     tilt_rad = ARCSEC_RAD * scaled_errors(misalignment_arcsec, normal)
     return np.eye(3) + np.where(np.eye(3) > 0, scale, tilt_rad)
@@ -362,10 +418,10 @@ def response_matrix(scale_ppm: float, misalignment_arcsec: float, normal: Floats
 
 @dataclass(slots=True)
 class Imu:
-    """One inertial measurement unit: fixed hardware errors, Gauss-Markov biases, quantization remainders.
+    """An inertial measurement unit with its fixed errors and its states (biases, remainders).
 
-    Twelve numbers are drawn per sample, whichever errors are on: a run split into pieces equals one run bit for bit,
-    and switching one error does not change the others.
+    Twelve numbers are drawn per sample, whichever errors are on. A run split into pieces therefore equals one run bit
+    for bit, and switching one error does not change the others.
     """
 
     gyro: Triad
@@ -374,7 +430,9 @@ class Imu:
 
     @classmethod
     def from_config(cls, config: ImuConfig, rng: np.random.Generator) -> Imu:
-        """The unit of hardware_seed at turn-on: the Gauss-Markov biases start in their stationary distribution."""
+        """The unit of the scene's hardware_seed at turn-on; its Gauss-Markov biases start in their stationary
+        distribution.
+        """
         hardware = random_stream(config.hardware_seed).standard_normal((2, 4, 3))
         start = rng.standard_normal((2, 3))
         return cls(
@@ -394,20 +452,20 @@ class Imu:
 
     @property
     def gyro_bias_rad_s(self) -> Floats:
-        """(3,) bias at the last sample, turn-on plus Gauss-Markov part; before the first sample, the initial one."""
+        """(3,) gyro bias, turn-on plus Gauss-Markov part, at the last sample; initially that at turn-on."""
         return self.gyro.turn_on_bias + self.gyro.markov_bias
 
 
 @dataclass(slots=True)
 class Navigator:
-    """Attitude by integration of the gyro increments from the attitude at which the vehicle was zeroed.
+    """Inertial navigator: integrates the gyro increments from the attitude at which the vehicle was zeroed.
 
     Attributes
     ----------
     lab_from_body_wxyz
-        (4,) estimate; at the start that of the home position
+        (4,) estimated attitude, at first that of the home position
     earth_rate_lab_rad_s
-        (3,) Earth rate to compensate; with zeros the Earth's rotation appears as the vehicle's
+        (3,) Earth rate to compensate; with zeros the Earth's rotation appears as one of the vehicle
     """
 
     lab_from_body_wxyz: Floats
@@ -431,11 +489,13 @@ class Navigator:
 def integrate_attitude(
     lab_from_body_wxyz: Floats, angle_rad: Floats, earth_rate: Floats, step_s: float
 ) -> Floats:
-    """The attitude after (N, 3) increments: lab_from_body <- exp(-earth_rate step) lab_from_body exp(angle).
+    """(4,) attitude after (N, 3) increments:
 
-    The left factor is the rotation of the lab, in lab axes, so that the Earth rate is compensated continuously and
-    not at the attitude of the sample's start. Each increment is taken as a rotation vector. If the axis moves
-    within a sample, this has an error of half the integral of angle x rate (coning; `assumed`).
+        lab_from_body <- exp(-earth_rate step) lab_from_body exp(angle)
+
+    The left factor is the rotation of the lab, in lab axes. The Earth rate is therefore compensated continuously and
+    not at the attitude of the sample's start. Each increment is taken as a rotation vector; if the axis moves within
+    a sample, the error is half the integral of angle x rate (coning; `assumed`).
     """
     lab_now_from_before = quaternion.from_rotvec(-step_s * earth_rate)
     attitude = lab_from_body_wxyz
@@ -450,9 +510,9 @@ def integrate_attitude(
 
 
 def tilt_rad(velocity_m_s: Floats) -> tuple[float, float]:
-    """(roll, pitch) of a vehicle at rest from its accelerometers, whose specific force points up.
+    """(roll, pitch) of a vehicle at rest from velocity increments (N, 3) of its accelerometers.
 
-    In body axes it is g (-sin pitch, sin roll cos pitch, cos roll cos pitch). velocity_m_s : (N, 3) increments.
+    The specific force points up. In body axes it is g (-sin pitch, sin roll cos pitch, cos roll cos pitch).
     """
     x, y, z = map(float, np.mean(velocity_m_s, axis=0))
     return math.atan2(y, z), math.atan2(-x, math.hypot(y, z))

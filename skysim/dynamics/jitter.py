@@ -1,8 +1,12 @@
 """Vibration: small rotations about the body axes added to the simulated attitude, always or for an interval.
 
-A vibration is a sum of sines of the rotation vector in body axes: single frequencies (`line`) or a random spectrum
-(`band`). It is kinematic: MuJoCo does not simulate it, but the IMU senses it (`Motion.last_knots`) and it
-smears the images.
+1. `Vibration.draw` draws each vibration as a sum of sines of the rotation vector in body axes: single frequencies
+   (`line`) or a random spectrum (`band`).
+2. `Vibration.subdivisions` finds how finely the trajectory must be sampled.
+3. `Vibration.add_to` adds the rotation and its rate to the samples.
+
+Vibration is kinematic: MuJoCo does not simulate it, but the IMU senses it (`Motion.last_knots`) and it smears the
+images.
 """
 
 from __future__ import annotations
@@ -29,24 +33,25 @@ from skysim.scene.sections.motion import (
     MotionConfig,
 )
 
-SINES_PER_BAND = 128  # sines in a band; even a steep spectrum has tens of similar amplitude
+SINES_PER_BAND = 128  # even a steep spectrum has tens of sines of similar amplitude
 # Samples per shortest period: cubic Hermite interpolation has an error of (2 pi / 16)^4 / 384 = 6e-5.
 SAMPLES_PER_PERIOD = 16
 MAX_SAMPLES = 5_000_000
-RISE_FRACTION = 0.1  # duration of the rise and of the fall, as a fraction of the interval ...
-MAX_RISE_S = 1.0  # ... at most
+# Duration of the rise and of the fall: a fraction of the interval, at most MAX_RISE_S.
+RISE_FRACTION = 0.1
+MAX_RISE_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class Sines:
-    """phi(t) = sum over K of sine sin(omega t) + cosine cos(omega t), a rotation vector in body axes.
+    """A rotation vector in body axes: phi(t) = sum_k sine_k sin(omega_k t) + cosine_k cos(omega_k t).
 
     Attributes
     ----------
     omega_rad_s
-        (K,)
+        (K,) angular frequencies
     sine_rad, cosine_rad
-        (K, 3)
+        (K, 3) amplitudes about each body axis
     """
 
     omega_rad_s: Floats
@@ -60,27 +65,30 @@ def line(config: JitterLineConfig, rng: np.random.Generator) -> Sines:
 
 
 def band(config: JitterBandConfig, rng: np.random.Generator) -> Sines:
-    """Power spectral density proportional to f^slope from from_hz to to_hz, the sum of many sines.
+    """A power spectral density proportional to f^slope from from_hz to to_hz, as a sum of many sines.
 
-    The band is split into pieces of equal frequency ratio. Each has one sine with the piece's whole power, so that
-    the rms is exact in every draw, at a frequency drawn from the spectrum within the piece, so that the density is
-    exact in expectation (Shinozuka & Deodatis 1991, ASME Appl. Mech. Rev. 44, 191, whose frequencies are fixed;
-    `assumed`).
+    1. Split the band into pieces of equal frequency ratio.
+    2. Give each piece one sine with the whole power of the piece, so the rms is exact in every draw.
+    3. Draw its frequency from the spectrum within the piece, so the density is exact in expectation.
+    4. Draw its phases.
+
+    (Shinozuka & Deodatis 1991, ASME Appl. Mech. Rev. 44, 191, whose frequencies are fixed; `assumed`.) With
+    u = ln(f / from_hz) the power per du is proportional to exp((slope + 1) u).
     """
-    edges = np.linspace(
-        0, math.log(config.to_hz / config.from_hz), SINES_PER_BAND + 1
-    )  # logarithm of f / from_hz
-    exponent = config.slope + 1  # power up to f is proportional to f^exponent
+    # 1. Pieces, as intervals low to high of u.
+    edges = np.linspace(0, math.log(config.to_hz / config.from_hz), SINES_PER_BAND + 1)
+    exponent = config.slope + 1
     low = edges[:-1]
     high = edges[1:]
     uniform = rng.uniform(size=SINES_PER_BAND)
+    # 2. and 3. Power of each piece, and a u drawn from it by inverting its cumulative power.
     if abs(exponent) < 1e-6:
         power = high - low
         middle = low + uniform * (high - low)
     else:
-        # Power of each piece, and a frequency drawn from it by inverting its cumulative power.
         power = np.exp(exponent * low) * np.expm1(exponent * (high - low)) / exponent
         middle = low + np.log1p(uniform * np.expm1(exponent * (high - low))) / exponent
+    # 4. Phases.
     return with_phases(config.from_hz * np.exp(middle), power / power.sum(), config.rms_arcsec, rng)
 
 
@@ -90,27 +98,34 @@ def with_phases(
     rms_arcsec: Sequence[float],
     rng: np.random.Generator,
 ) -> Sines:
-    """Sines of (K,) frequencies and fractions of the power, with independent random phases for each axis."""
+    """Sines of (K,) frequencies and fractions of the power, with independent random phases for each axis.
+
+    A sine of amplitude A has the power A^2 / 2, so A = sqrt(2 fraction) rms.
+    """
     amplitude = np.sqrt(2 * power_fraction)[:, None] * np.radians(np.array(rms_arcsec) / 3600)
     phase = rng.uniform(0, 2 * np.pi, amplitude.shape)
     return Sines(2 * np.pi * frequency_hz, amplitude * np.cos(phase), amplitude * np.sin(phase))
 
 
-# Spectra by kind. To add one, add a class to scene/motion.py and a function here.
+# Spectra by kind. To add one, add a class to scene/sections/motion.py and a function here.
 SPECTRA: dict[str, Callable[[Any, np.random.Generator], Sines]] = {"line": line, "band": band}
 
 
 @dataclass(frozen=True, slots=True)
 class VibrationComponent:
-    """Sines and their interval: phi(t) = envelope(t) sines(t), from begin_s to end_s.
+    """Sines within an interval: phi(t) = envelope(t) sines(t) from begin_s to end_s.
 
-    The envelope is 1 except for a rise and a fall of a tenth of the interval each, a second at most, along
-    10x^3 - 15x^4 + 6x^5: phi, its rate and its acceleration are continuous. Without an interval it is 1.
+    The envelope is 1 except for a rise and a fall along 10x^3 - 15x^4 + 6x^5. Each takes a tenth of the interval, a
+    second at most. phi, its rate and its acceleration are continuous. Without an interval the envelope is 1.
 
     Attributes
     ----------
+    sines
+        Sines of the vibration
     name
-        Where in the scene it is declared
+        Place in the scene that declares it, for messages
+    begin_s, end_s
+        Interval; infinite for a vibration that is always on
     """
 
     sines: Sines
@@ -124,17 +139,17 @@ class VibrationComponent:
 
     @property
     def highest_hz(self) -> float:
-        """The frequency that sets the sampling: the sines' highest plus one period per rise.
+        """The frequency that sets the sampling: the highest of the sines plus one period per rise.
 
-        The envelope is smoother than a sine of that frequency. The error of cubic Hermite interpolation follows
-        from the fourth derivative, at most 360 / rise^4, and the jumps of the third, 60 / rise^3; for the sine they
-        are 1559 and 248.
+        The envelope is smoother than a sine with a period of one rise. The error of cubic Hermite interpolation
+        follows from the fourth derivative and the jumps of the third. They are at most 360 / rise^4 and 60 / rise^3
+        for the envelope, 1559 / rise^4 and 248 / rise^3 for the sine.
         """
         edge_hz = 1 / self.rise_s if math.isfinite(self.begin_s) else 0.0
         return float(self.sines.omega_rad_s.max()) / (2 * np.pi) + edge_hz
 
     def active(self, t_s: Floats) -> NDArray[np.bool_]:
-        """(N - 1,) whether it is active between each of (N,) times and the next."""
+        """(N - 1,) whether the vibration is active between each of (N,) times and the next."""
         return np.asarray((t_s[:-1] < self.end_s) & (self.begin_s < t_s[1:]))
 
     def evaluate(self, t_s: Floats) -> tuple[Floats, Floats]:
@@ -144,13 +159,14 @@ class VibrationComponent:
         )
         if not math.isfinite(self.begin_s):
             return phi, rate
+        # Product rule.
         gain, slope = envelopes(t_s - self.begin_s, self.end_s - self.begin_s, self.rise_s)
         return gain * phi, gain * rate + slope * phi
 
 
 @dataclass(frozen=True, slots=True)
 class Vibration:
-    """All vibration of one run. Its phases are drawn once, so that evaluation piece by piece equals one evaluation."""
+    """All vibration of one run. Its phases are drawn once, so evaluation piece by piece equals one evaluation."""
 
     components: tuple[VibrationComponent, ...]
 
@@ -158,12 +174,16 @@ class Vibration:
     def draw(
         cls, motion: MotionConfig, rng: np.random.Generator, reference: Reference | None = None
     ) -> Vibration:
-        """The vibration of `motion.jitter`, always on, and of each jitter maneuver during its interval.
+        """The vibration of `motion.jitter`, which is always on, and of each jitter maneuver during its interval.
 
         Parameters
         ----------
+        motion
+            The scene's section `motion`
+        rng
+            Generator of the frequencies and phases
         reference
-            That of the maneuvers; by default planned here, which a profile does not allow
+            Reference of the maneuvers; by default it is planned here, which is not possible with a profile
         """
         components = [draw_component(motion.jitter, rng, "motion.jitter")]
         for begin_s, end_s, configs in vibration_intervals(motion, reference or plan(motion)):
@@ -186,18 +206,24 @@ class Vibration:
         return phi, rate
 
     def add_to(self, trajectory: Trajectory) -> Trajectory:
-        """Add the vibration to a trajectory, or to a part of one: lab_from_body exp(phi(t)), phi in body axes.
+        """A trajectory, or a part of one, with the vibration added: attitude lab_from_body exp(phi(t)).
 
-        Where vibration is active the trajectory is resampled so finely that `Trajectory.at` between two samples
-        keeps phi to 1e-4 of its amplitude; all samples are kept. The body rate becomes exp(-phi) omega + J(phi)
-        dphi/dt, in the vibrating axes, with omega linear between the samples of the trajectory. Without active
-        vibration the same object is returned. Raises InputError (one line) where more than five million samples
-        would be needed.
+        1. Resample where vibration is active, so finely that interpolation by `Trajectory.at` keeps phi to 1e-4 of
+           its amplitude. All samples of the trajectory are kept.
+        2. Evaluate phi and dphi/dt at the samples.
+        3. Rotate. The rate in the vibrating axes is exp(-phi) omega + J(phi) dphi/dt, J of `rotvec_body_rate`, with
+           omega linear between the samples of the trajectory.
+
+        Without active vibration the same object is returned. Raises InputError if more than MAX_SAMPLES would be
+        needed.
         """
         if not any(component.active(trajectory.t_s).any() for component in self.components):
             return trajectory
+        # 1. Resample.
         t_s = subdivide(trajectory.t_s, self.subdivisions(trajectory.t_s))
+        # 2. Rotation vector and its derivative.
         phi, phi_rate = self.evaluate(t_s)
+        # 3. Attitude and rate in the vibrating axes.
         vibration = Rotation.from_rotvec(phi)
         rate = np.column_stack(
             [np.interp(t_s, trajectory.t_s, axis) for axis in trajectory.rate_body_rad_s.T]
@@ -209,14 +235,16 @@ class Vibration:
         )
 
     def subdivisions(self, t_s: Floats) -> NDArray[np.int64]:
-        """(N - 1,) number of pieces of each step, so that every period has PER_PERIOD samples.
+        """(N - 1,) number of pieces of each step between (N,) times: SAMPLES_PER_PERIOD samples in every period.
+
+        Before vibration is added piece by piece, call this once with all times: it counts all samples.
 
         Raises
         ------
         InputError
-            If there are too many samples. Before applying vibration piece by piece, call this
-            with all times.
+            If there are more than MAX_SAMPLES samples.
         """
+        # The highest frequency that is active in each step.
         highest_hz = np.zeros(len(t_s) - 1)
         for component in self.components:
             np.maximum(
@@ -225,6 +253,7 @@ class Vibration:
         count = np.ceil(np.maximum(np.diff(t_s) * highest_hz * SAMPLES_PER_PERIOD * (1 - 1e-12), 1))
         needed = int(count.sum()) + 1
         if self.components and needed > MAX_SAMPLES:
+            # Name the vibration that needs most of the samples.
             densest = max(
                 self.components,
                 key=lambda component: (
@@ -247,7 +276,7 @@ def draw_component(
     begin_s: float = -math.inf,
     end_s: float = math.inf,
 ) -> VibrationComponent | None:
-    """Draw a vibration's parts; None if all have zero rms."""
+    """One vibration with the parts of its spectrum drawn; None if all have zero rms."""
     active = [config for config in configs if any(config.rms_arcsec)]
     if not active:
         return None
@@ -257,7 +286,7 @@ def draw_component(
 
 
 def concatenate(sets: Sequence[Sines]) -> Sines:
-    """Join several sets of sines."""
+    """The sines of several sets as one set."""
     return Sines(
         np.concatenate([sines.omega_rad_s for sines in sets]),
         np.concatenate([sines.sine_rad for sines in sets]),
@@ -266,8 +295,9 @@ def concatenate(sets: Sequence[Sines]) -> Sines:
 
 
 def subdivide(t_s: Floats, counts: NDArray[np.int64]) -> Floats:
-    """The sample times with each step divided evenly into its pieces."""
-    begin = np.repeat(np.cumsum(counts) - counts, counts)  # the first sample of the step of each
+    """(M,) sample times: (N,) times with each step divided evenly into counts (N - 1,) pieces."""
+    # For each new sample: the number of the first sample in its step, and the fraction of the step before it.
+    begin = np.repeat(np.cumsum(counts) - counts, counts)
     within = (np.arange(len(begin)) - begin) / np.repeat(counts, counts)
     return np.append(
         np.repeat(t_s[:-1], counts) + within * np.repeat(np.diff(t_s), counts), t_s[-1]
@@ -275,15 +305,16 @@ def subdivide(t_s: Floats, counts: NDArray[np.int64]) -> Floats:
 
 
 def rotvec_body_rate(phi: Floats, phi_rate: Floats) -> Floats:
-    """(N, 3) angular velocity of exp(phi) in its own axes, by the rotations' right Jacobian:
+    """(N, 3) angular velocity of the rotation exp(phi) in its own axes, J(phi) dphi/dt by the right Jacobian:
 
         dphi/dt - (1 - cos a) / a^2 phi x dphi/dt + (a - sin a) / a^3 phi x (phi x dphi/dt),  a = |phi|
 
     (Bullo & Murray 1995; `assumed`).
     """
+    # (1 - cos a) / a^2 = sinc(a / 2 pi)^2 / 2 has no cancellation at small a; NumPy's sinc(x) is sin(pi x) / (pi x).
     angle = np.linalg.norm(phi, axis=1, keepdims=True)
     first = np.sinc(angle / (2 * np.pi)) ** 2 / 2
-    # For small a the quotient loses precision; there it is 1/6 to a^2 / 120, and its term is only a^2 of the rate.
+    # (a - sin a) / a^3 loses precision at small a. There it is 1/6 to a^2 / 120, and its term is only a^2 of the rate.
     second = np.where(
         angle > 1e-4, (1 - np.sinc(angle / np.pi)) / np.maximum(angle, 1e-4) ** 2, 1 / 6
     )
@@ -293,7 +324,7 @@ def rotvec_body_rate(phi: Floats, phi_rate: Floats) -> Floats:
 
 @jit
 def envelopes(t_s: Floats, duration_s: float, rise_s: float) -> tuple[Floats, Floats]:
-    """(N, 1) envelope and (N, 1) its derivative."""
+    """(N, 1) envelope and (N, 1) its derivative at (N,) times after its beginning."""
     gain = np.empty((len(t_s), 1))
     slope = np.empty((len(t_s), 1))
     for n in range(len(t_s)):
@@ -305,10 +336,11 @@ def envelopes(t_s: Floats, duration_s: float, rise_s: float) -> tuple[Floats, Fl
 def evaluate_sines(
     t_s: Floats, omega_rad_s: Floats, sine_rad: Floats, cosine_rad: Floats
 ) -> tuple[Floats, Floats]:
-    """(N, 3) phi and (N, 3) its derivative at every time."""
+    """(N, 3) phi of `Sines` and (N, 3) its derivative at (N,) times."""
     phi = np.empty((len(t_s), 3))
     rate = np.empty((len(t_s), 3))
     for n in numba.prange(len(t_s)):
+        # phi is (x, y, z), its derivative (u, v, w).
         x = y = z = u = v = w = 0.0
         for k in range(len(omega_rad_s)):
             omega = omega_rad_s[k]

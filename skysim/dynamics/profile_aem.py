@@ -1,10 +1,14 @@
 """Attitude samples from a CCSDS Attitude Ephemeris Message (AEM) in keyword = value notation, versions 1.0 and 2.0.
 
-CCSDS 504.0-B-1 and 504.0-B-2. The quaternion "from A to B" turns the axes of A into those of B (annex F2 of the
-latter), which is the quaternion of the rotation a_from_b of coordinates. Version 1.0 also names the direction
-(ATTITUDE_DIR: A2B or B2A) and whether the scalar is FIRST or LAST (QUATERNION_TYPE); from version 2.0 on it is A to B,
-scalar last. A file of version 2.0 that has these keywords nevertheless is read by them. Rates and derivatives after the
-quaternion, and the interpolation that the file recommends, are not used.
+CCSDS 504.0-B-1 and 504.0-B-2. The quaternion "from A to B" turns the axes of A into those of B (annex F2 of 504.0-B-2),
+which is the quaternion of the rotation a_from_b of coordinates. Version 1.0 also names the direction (ATTITUDE_DIR: A2B
+or B2A) and whether the scalar is FIRST or LAST (QUATERNION_TYPE). In version 2.0 the direction is A to B and the scalar
+is last, but these keywords are obeyed if a file has them. Rates and derivatives after the quaternion are not used, nor
+is the interpolation that the file recommends.
+
+1. `split_segments` reads the lines into segments of metadata and data.
+2. `segment_samples` converts each segment to checked samples within its useable span.
+3. `join` appends them to each other.
 """
 
 from __future__ import annotations
@@ -44,7 +48,7 @@ TYPES = {"QUATERNION": 4, "QUATERNION/DERIVATIVE": 8, "QUATERNION/RATE": 7, "QUA
 DIRECTIONS = ("A2B", "B2A")
 ORDERS = ("FIRST", "LAST")
 REQUIRED = ("REF_FRAME_A", "REF_FRAME_B", "TIME_SYSTEM", "ATTITUDE_TYPE")
-SAME_ATTITUDE_RAD = 1e-6  # of a sample that both of two adjoining segments have
+SAME_ATTITUDE_RAD = 1e-6  # greatest difference of one sample that two adjoining segments share
 
 
 def read_aem(path: Path, lines: list[Line], start: datetime.datetime) -> Samples:
@@ -60,7 +64,7 @@ def read_aem(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
 
 
 def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[TextSegment]]:
-    """The version, and the segments of the message. Raises InputError for a line out of place."""
+    """The version and the segments of the message. Raises InputError for a line out of place."""
     version = ""
     segments = list[TextSegment]()
     section = ""
@@ -104,7 +108,14 @@ def next_section(where: Where, section: str, keyword: str) -> str:
 def segment_samples(
     path: Path, version: str, segment: TextSegment, start: datetime.datetime
 ) -> Samples:
-    """The samples of one segment within its useable span. Raises InputError."""
+    """The samples of one segment within its useable span. Raises InputError for invalid metadata or data.
+
+    1. Check the metadata: keywords, time system, and two frames of which one is inertial and one of the vehicle.
+    2. Convert epochs and numbers.
+    3. Order the quaternion's components and the frames as the file's conventions say.
+    4. Apply the frame bias, and keep the useable span.
+    """
+    # 1. Metadata.
     metadata = segment.metadata
     source = str(path)
     segment.require(
@@ -121,6 +132,7 @@ def segment_samples(
             "one of the two an inertial or laboratory frame, the other of the vehicle",
             where=Where(path, metadata["REF_FRAME_B"][0]),
         )
+    # 2. Data lines: an epoch, and the numbers.
     for n, words in segment.data:
         if len(words) != width + 1:
             raise InputError(
@@ -129,19 +141,18 @@ def segment_samples(
     lines = [n for n, _ in segment.data]
     numbers = to_numbers(source, lines, [words[1:] for _, words in segment.data], width)
     t_s = seconds_since(source, lines, [words[0] for _, words in segment.data], start, system)
-    last = (
-        one_of(path, metadata, "QUATERNION_TYPE", ORDERS) == "LAST"
-        if "QUATERNION_TYPE" in metadata
-        else True
+    # 3. Conventions: scalar last and A to B, unless the keywords say otherwise.
+    first = (
+        "QUATERNION_TYPE" in metadata
+        and one_of(path, metadata, "QUATERNION_TYPE", ORDERS) == "FIRST"
     )
     reverse = (
-        one_of(path, metadata, "ATTITUDE_DIR", DIRECTIONS) == "B2A"
-        if "ATTITUDE_DIR" in metadata
-        else False
+        "ATTITUDE_DIR" in metadata and one_of(path, metadata, "ATTITUDE_DIR", DIRECTIONS) == "B2A"
     )
-    xyzw: Floats = numbers[:, [0, 1, 2, 3] if last else [1, 2, 3, 0]]
+    xyzw: Floats = numbers[:, [1, 2, 3, 0] if first else [0, 1, 2, 3]]
     a, b = frames[::-1] if reverse else frames
     samples = from_quaternions(source, "line", lines, t_s, (a, b), xyzw, absolute=True)
+    # 4. Frame bias and useable span.
     useable = within_span(path, metadata, t_s, start, system)
     return take(to_icrs(samples, names), useable)
 
@@ -149,7 +160,7 @@ def segment_samples(
 def within_span(
     path: Path, metadata: dict[str, Line], t_s: Floats, start: datetime.datetime, system: str
 ) -> slice:
-    """The samples from USEABLE_START_TIME to USEABLE_STOP_TIME; all where a keyword is missing."""
+    """The range of samples from USEABLE_START_TIME to USEABLE_STOP_TIME; a missing keyword sets no limit."""
     ends_s = [-np.inf, np.inf]
     for side, key in enumerate(("USEABLE_START_TIME", "USEABLE_STOP_TIME")):
         if key in metadata:
@@ -170,7 +181,7 @@ def take(samples: Samples, which: slice) -> Samples:
 
 
 def to_icrs(samples: Samples, names: list[str]) -> Samples:
-    """The samples with the bias between EME2000 and the ICRS applied, if one of the two frames is EME2000."""
+    """The samples with the frame bias applied, if one of the two frames is EME2000."""
     bias = Rotation.identity()
     for name in names:
         bias = icrs_from(name) * bias
@@ -184,10 +195,11 @@ def join(first: Samples, second: Samples) -> Samples:
     Raises
     ------
     InputError
-        For segments of different frames, that overlap or that leave a gap.
+        If the segments are in different frames, overlap, or leave a gap.
     """
     if not len(first.t_s) or not len(second.t_s):
         return first if len(first.t_s) else second
+    # The same frames, in the same direction.
     direction = second.direction
     if direction != first.direction:
         second = second.inverted()
@@ -195,6 +207,7 @@ def join(first: Samples, second: Samples) -> Samples:
         raise second.error(
             0, f"a segment of {direction} after one of {first.direction}", "the same frames"
         )
+    # No overlap, except of one sample that both share.
     gap_s = second.t_s[0] - first.t_s[-1]
     if (
         gap_s == 0
@@ -205,6 +218,7 @@ def join(first: Samples, second: Samples) -> Samples:
         raise second.error(
             0, f"a segment that begins {-gap_s:.6g} s before the end of the one before it"
         )
+    # No gap, except that of a usual step.
     longest_s = max(float(np.diff(part.t_s).max(initial=0.0)) for part in (first, second))
     if gap_s > 1.5 * longest_s:
         raise second.error(

@@ -1,4 +1,4 @@
-"""Attitude samples as read from a file or a table, with their checks: every fault is named with its line."""
+"""Attitude samples as read from a file or a table, and their checks. An error message names the line of the fault."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ from skysim.core.text import excerpt
 from skysim.core.time import J2000_JD
 from skysim.core.types import Floats
 
-# a not-a-knot cubic takes four
-MIN_SAMPLES = 4
+MIN_SAMPLES = 4  # a not-a-knot cubic needs four
 MAX_SAMPLES = 1_000_000
-UNIT_TOLERANCE = 1e-3  # of a quaternion's norm
+UNIT_TOLERANCE = 1e-3  # greatest deviation of a quaternion's norm from 1
 MAX_TIME_S = 1e9
 MIN_STEP_S = 1e-6
-# Largest rotation between two samples. The interpolated attitude of a constant rate errs with the fifth power of it,
-# most in the first and the last step: by 0.04 arcsec at 10 deg, by 1.3 arcsec at 20 (measured).
+# Largest rotation between two samples. At a constant rate the error of the interpolated attitude grows with its fifth
+# power, most in the first and the last step: 0.04 arcsec at 10 deg, 1.3 arcsec at 20 deg (measured).
 MAX_STEP_DEG = 10.0
 
 
@@ -32,18 +31,19 @@ class Samples:
     Attributes
     ----------
     source
-        File, or what else the samples come from, for messages
+        Path of the file or name of the table, for messages
     unit
-        What `places` count: line of a file, or row of a table
+        Unit of `places`: line of a file, or row of a table
     places
-        (N,) where each sample stands, from 1
+        (N,) line or row of each sample, from 1
     t_s
-        (N,) seconds from the scene's start if `absolute` (the samples have epochs), else from
-        the file's zero
+        (N,) seconds from the scene's start if `absolute`, else from the zero of the file's times
     a, b
         Frames of the rotations: one of icrs and lab, and one of body and cam, in any order
     a_from_b
         N rotations
+    absolute
+        Whether the samples have epochs
     """
 
     source: str
@@ -56,7 +56,7 @@ class Samples:
     absolute: bool = False
 
     def error(self, n: int, problem: str, allowed: str = "") -> InputError:
-        """The error of one sample."""
+        """The error for sample n, with its line or row."""
         return InputError(
             self.source, problem, allowed, Where(self.source, int(self.places[n]), self.unit)
         )
@@ -80,7 +80,7 @@ def from_quaternions(
     xyzw: Floats,
     absolute: bool = False,
 ) -> Samples:
-    """Samples of quaternions (N, 4), scalar last. Raises InputError for the first one that is not a unit quaternion."""
+    """Samples of quaternions (N, 4), scalar last. Raises InputError for the first one whose norm is not 1."""
     places = np.asarray(places, np.int64)
     norm = np.linalg.norm(xyzw, axis=1) if len(xyzw) else np.empty(0)
     bad = np.flatnonzero(~(np.abs(norm - 1) <= UNIT_TOLERANCE))  # NaN is bad, too
@@ -97,9 +97,11 @@ def from_quaternions(
 
 def check_samples(samples: Samples) -> Samples:
     """The samples. Raises InputError for too few or too many, times that do not ascend, or samples too far apart."""
+    # 1. Number.
     count = len(samples.t_s)
     if not MIN_SAMPLES <= count <= MAX_SAMPLES:
         raise InputError(samples.source, f"{count} attitudes", f"{MIN_SAMPLES} to {MAX_SAMPLES}")
+    # 2. Times. NaN is rejected, too.
     if len(bad := np.flatnonzero(~(np.abs(samples.t_s) <= MAX_TIME_S))):
         raise samples.error(
             int(bad[0]),
@@ -113,6 +115,7 @@ def check_samples(samples: Samples) -> Samples:
         raise samples.error(
             n, f"time {after:.9g} s is not after {before:.9g} s, by a microsecond at least"
         )
+    # 3. Rotation from each sample to the next.
     angle_deg = np.degrees((samples.a_from_b[:-1].inv() * samples.a_from_b[1:]).magnitude())
     if len(bad := np.flatnonzero(angle_deg > MAX_STEP_DEG)):
         n = int(bad[0]) + 1
@@ -124,26 +127,21 @@ def check_samples(samples: Samples) -> Samples:
     return samples
 
 
-# Reference frames of attitude files by the names that CCSDS and STK give them.
+# Names of frames in CCSDS and STK attitude files.
 
-
-# as skysim writes them
+# The names that skysim writes.
 ICRF = "ICRF"
 LAB = "LAB"
 CAMERA = "STARTRACKER_1"
 BODY = "SC_BODY_1"
 EME2000 = ("EME2000", "J2000")
-REFERENCES = {
-    ICRF: "icrs",
-    "GCRF": "icrs",
-    LAB: "lab",
-    **dict.fromkeys(EME2000, "icrs"),
-}  # frame of Samples, by name
+# Frames of `Samples` by the names that are read.
+REFERENCES = {ICRF: "icrs", "GCRF": "icrs", LAB: "lab", **dict.fromkeys(EME2000, "icrs")}
 VEHICLES = {BODY: "body", "SC_BODY": "body", CAMERA: "cam", "STARTRACKER": "cam"}
 
 
 def frame_of(where: Where, name: str) -> str:
-    """The frame (icrs, lab, body or cam) that a file's name stands for. Raises InputError."""
+    """The frame (icrs, lab, body or cam) with this name in a file. Raises InputError for an unknown name."""
     frames = REFERENCES | VEHICLES
     if name.upper() not in frames:
         raise InputError(where.file, f"unknown frame {excerpt(name)}", ", ".join(frames), where)
@@ -151,9 +149,9 @@ def frame_of(where: Where, name: str) -> str:
 
 
 def icrs_from(name: str) -> Rotation:
-    """Rotation to the ICRS's axes from those of an inertial frame: the frame bias of 23 mas from EME2000, else none.
+    """Rotation from the axes of an inertial frame to those of the ICRS: identity, except for EME2000.
 
-    The bias is that of IAU 2006 (ERFA's bp06).
+    The frame bias of EME2000 is 23 mas, by IAU 2006 (ERFA's bp06).
     """
     import erfa
 

@@ -1,8 +1,8 @@
 """Attitude samples from an STK attitude file (`.a`): AttitudeTimeQuaternions and its scalar-first variant.
 
-The format is described in STK's help, "Attitude File Format (*.a)". A quaternion is that of the rotation that turns the
-axes of CoordinateAxes into the body's, which converts coordinates from body to reference: ref_from_body. Times are
-seconds from ScenarioEpoch (UTC). The interpolation that the file asks for is not used.
+STK's help describes the format in "Attitude File Format (*.a)". A quaternion is that of the rotation that turns the
+axes of CoordinateAxes into those of the body. It converts coordinates from body to reference: ref_from_body. Times are
+seconds from ScenarioEpoch (UTC). The interpolation that the file names is not used.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from skysim.core.errors import InputError, Where, unknown_name
 from skysim.core.text import Line, excerpt, to_numbers
 from skysim.dynamics.profile_samples import REFERENCES, Samples, from_quaternions, icrs_from
 
-# Numbers of a data line with its time, and the columns of x, y, z, w.
+# By section: count of numbers in a data line, including its time, and the columns of x, y, z, w.
 SECTIONS = {
     "attitudetimequaternions": (5, [1, 2, 3, 4]),
     "attitudetimequatscalarfirst": (5, [2, 3, 4, 1]),
@@ -45,7 +45,11 @@ MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", 
 
 
 def read_stk(path: Path, lines: list[Line], start: datetime.datetime) -> Samples:
-    """The samples of an attitude file. Raises InputError for other data than quaternions in ICRF, J2000 or LAB."""
+    """The samples of an attitude file. Raises InputError for data other than quaternions in ICRF, J2000 or LAB.
+
+    After the version a file has BEGIN Attitude, lines of keyword and value, the name of the data section, rows of
+    numbers, and END Attitude.
+    """
     keywords: dict[str, Line] = {}
     section = ""
     rows = list[tuple[int, list[str]]]()
@@ -86,7 +90,8 @@ def to_samples(
     rows: list[tuple[int, list[str]]],
     start: datetime.datetime,
 ) -> Samples:
-    """The samples of the rows, by the keywords. Raises InputError."""
+    """The samples of the data rows. Raises InputError for values or keywords that are not supported."""
+    # 1. Keywords.
     width, columns = SECTIONS[section]
     rows = rows[: point_count(path, keywords, len(rows))]
     for key, allowed in (("CentralBody", "Earth"), ("TimeFormat", "EpSec")):
@@ -97,11 +102,13 @@ def to_samples(
     if axes.upper() not in REFERENCES:
         where = Where(path, line) if line else None
         raise InputError(path, f"CoordinateAxes {excerpt(axes)}", ", ".join(REFERENCES), where)
+    # 2. Numbers; times count from the scene's start if the file has an epoch.
     places = [n for n, _ in rows]
     values = to_numbers(str(path), places, [words for _, words in rows], width)
     t_s = values[:, 0]
     if "ScenarioEpoch" in keywords:
         t_s = t_s + (scenario_epoch(path, *keywords["ScenarioEpoch"]) - start).total_seconds()
+    # 3. Quaternions, with the frame bias of J2000.
     frames = (REFERENCES[axes.upper()], "body")
     samples = from_quaternions(
         str(path),
@@ -116,7 +123,7 @@ def to_samples(
 
 
 def point_count(path: Path, keywords: dict[str, Line], count: int) -> int:
-    """How many of the rows NumberOfAttitudePoints takes; all without it. Raises InputError if there are fewer."""
+    """Number of rows to read: NumberOfAttitudePoints, or all. Raises InputError if there are fewer."""
     if "NumberOfAttitudePoints" not in keywords:
         return count
     line, text = keywords["NumberOfAttitudePoints"]

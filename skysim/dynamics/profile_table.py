@@ -1,6 +1,6 @@
 """Attitude samples from named columns: a CSV or ECSV file, or an astropy Table or pandas DataFrame.
 
-The columns' names say what they hold, so that nothing is guessed:
+The names of the columns define their content, so nothing is guessed:
 
 time     : `t_s`, or `utc` (ISO 8601)
 attitude : a quaternion `A_from_B_qw`, `_qx`, `_qy`, `_qz` of one of the rotations in QUATERNIONS, or the components
@@ -50,7 +50,8 @@ COLUMNS = (
 def read_csv(
     path: Path, lines: list[Line], start: datetime.datetime, rotation: str | None
 ) -> Samples:
-    """Samples of a CSV file: a line of column names, then a line each; lines that begin with # are comments."""
+    """Samples of a CSV file: a line of column names, then a line for each sample. Lines with # are comments."""
+    # 1. Split the lines into cells.
     rows = [
         (n, [cell.strip() for cell in line.split(",")])
         for n, line in lines
@@ -69,6 +70,7 @@ def read_csv(
                 f"{len(names)}, one for each column",
                 where=Where(path, n),
             )
+    # 2. Convert to columns; epochs stay texts.
     places = [n for n, _ in body]
     columns = dict[str, Any]()
     if "utc" in names:
@@ -81,14 +83,26 @@ def read_csv(
 
 
 def read_ecsv(path: Path, start: datetime.datetime, rotation: str | None) -> Samples:
-    """Samples of an ECSV file; units of its columns are checked."""
+    """Samples of an ECSV file. Raises InputError, also for wrong units of the columns."""
     return from_table(files.read_table(path), str(path), start, rotation)
 
 
 def from_table(
     table: Any, source: str, start: datetime.datetime, rotation: str | None = None
 ) -> Samples:
-    """Samples of an astropy Table, a pandas DataFrame or a mapping of columns. Raises InputError."""
+    """Samples of an astropy Table, a pandas DataFrame or a mapping of columns. Raises InputError.
+
+    Parameters
+    ----------
+    table
+        Table with the columns of the module's docstring
+    source
+        Name of the table or file, for messages
+    start
+        The scene's start in UTC, from which epochs count
+    rotation
+        Name of the rotation of columns q_x, q_y, q_z, q_w; None for other columns
+    """
     try:
         names = [
             str(name) for name in (table.colnames if hasattr(table, "colnames") else table.keys())
@@ -117,7 +131,7 @@ def from_table(
 
 
 def to_column(source: str, name: str, column: Any) -> Floats:
-    """A column as (N,) finite numbers. Raises InputError that names the first row with another value."""
+    """(N,) numbers of a column. Raises InputError that names the first row without a finite number."""
     try:
         numbers = np.ma.filled(np.ma.asarray(column).astype(np.float64), np.nan)
     except (TypeError, ValueError):
@@ -134,7 +148,7 @@ def to_column(source: str, name: str, column: Any) -> Floats:
 
 
 def to_epochs(column: Any) -> list[str]:
-    """A column of texts, datetimes, numpy or pandas dates, or an astropy Time, as ISO 8601."""
+    """ISO 8601 texts of a column of texts, datetimes, numpy or pandas dates, or an astropy Time."""
     if hasattr(column, "utc") and hasattr(column, "isot"):  # an astropy Time
         exact = column.utc.replicate()
         exact.precision = 9
@@ -149,10 +163,11 @@ def to_epochs(column: Any) -> list[str]:
 
 
 def check_names(where: Where, names: Sequence[str], rotation: str | None) -> None:
-    """Raise InputError unless the columns are one time and one attitude, and no others."""
+    """Raise InputError unless the columns are exactly one time and one attitude."""
     repeated = [name for n, name in enumerate(names) if name in names[:n]]
     if repeated:
         raise InputError(where.file, f"two columns {excerpt(repeated[0])}", "one", where)
+    # The sets of columns that make an attitude.
     attitudes = [tuple(f"{name}_q{end}" for end in "xyzw") for name in QUATERNIONS]
     attitudes += [BARE, BODY_ANGLES, CAMERA_ANGLES]
     known = {*TIMES, *(name for columns in attitudes for name in columns)}
@@ -186,7 +201,7 @@ def to_samples(
     start: datetime.datetime,
     rotation: str | None,
 ) -> Samples:
-    """Samples of checked columns."""
+    """Samples of checked columns. `places` (N,) are their lines or rows, as `unit` says."""
     absolute = "utc" in columns
     t_s = (
         seconds_since(source, places, columns["utc"], start, "UTC", unit)
@@ -194,9 +209,11 @@ def to_samples(
         else np.asarray(columns["t_s"], dtype=np.float64)
     )
     ends = np.array(places, np.int64)
+    # 3-2-1 angles of the body in the lab.
     if "yaw_deg" in columns:
         body = Rotation.from_euler("ZYX", stack(columns, BODY_ANGLES[::-1]), degrees=True)
         return Samples(source, unit, ends, t_s, "lab", "body", body, absolute)
+    # Right ascension, declination and roll of the camera.
     if "ra_deg" in columns:
         if len(bad := np.flatnonzero(np.abs(columns["dec_deg"]) > 90)):
             raise InputError(
@@ -207,6 +224,7 @@ def to_samples(
             )
         camera = cam_from_icrs(*stack(columns, CAMERA_ANGLES).T)
         return Samples(source, unit, ends, t_s, "cam", "icrs", camera, absolute)
+    # A quaternion, whose rotation is named by the columns or by the maneuver.
     first = next(name for name in columns if name.endswith(("_qw", "q_w")))
     prefix = first.removesuffix("w")
     a, _, b = (rotation or first.removesuffix("_qw")).partition("_from_")
@@ -215,5 +233,5 @@ def to_samples(
 
 
 def stack(columns: Mapping[str, Any], names: Sequence[str]) -> Floats:
-    """(N, K) numbers of some columns."""
+    """(N, K) matrix of the columns with K names."""
     return np.column_stack([columns[name] for name in names])

@@ -1,8 +1,15 @@
-"""The attitude profiles of a scene: read, checked, converted to lab_from_body and fitted by a spline."""
+"""Attitude profiles of a scene.
+
+1. `read_profile` reads the samples of a file or table (profile_aem.py, profile_stk.py, profile_table.py).
+2. `to_body` converts them to lab_from_body.
+3. `profile_samples.check_samples` checks their number, times and steps.
+4. `reference_curves.fit_spline` interpolates them.
+"""
 
 from __future__ import annotations
 
 import datetime
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +28,21 @@ TABLE = "profile"  # source of a table given in Python
 
 
 def load_profiles(scene: Scene, mount: Mount, given: Any = None) -> tuple[AttitudeSpline, ...]:
-    """The profiles of a scene's maneuvers, in their order.
+    """The splines of a scene's maneuvers of kind profile, in their order.
 
     Parameters
     ----------
+    scene
+        The scene
+    mount
+        The camera's mount, for profiles of the camera's attitude
     given
-        Astropy Table, pandas DataFrame or mapping of columns in place of the first profile's
-        file
+        Astropy Table, pandas DataFrame or mapping of columns that replaces the file of the first profile
 
     Raises
     ------
     InputError
-        That begins with the key.
+        For an invalid profile; its key is that of the maneuver.
     """
     profiles: list[AttitudeSpline] = []
     for n, element in enumerate(scene.motion.maneuver):
@@ -47,23 +57,28 @@ def load_profiles(scene: Scene, mount: Mount, given: Any = None) -> tuple[Attitu
 
 
 def read_profile(source: Any, start: datetime.datetime, rotation: str | None = None) -> Samples:
-    """The samples of a file, whose format its content tells, or of a table. Raises InputError.
+    """The samples of a file or a table. The format follows from the first line of the file. Raises InputError.
 
     Parameters
     ----------
+    source
+        Path of a file, or a table
     start
-        The scene's start in UTC, from which epochs are counted
+        The scene's start in UTC, from which epochs count
+    rotation
+        Name of the rotation of columns q_x, q_y, q_z, q_w; None for other columns
     """
     if not isinstance(source, Path):
         return profile_table.from_table(source, TABLE, start, rotation)
     lines = read_lines(source)
     first = next((line for _, line in lines if not line.startswith("COMMENT")), "")
-    named = first.startswith("CCSDS_AEM_VERS"), first.lower().startswith("stk.v.")
-    if any(named) and rotation is not None:
+    is_aem = first.startswith("CCSDS_AEM_VERS")
+    is_stk = first.lower().startswith("stk.v.")
+    if (is_aem or is_stk) and rotation is not None:
         raise InputError(source, "the file names its frames", "no key rotation in the maneuver")
-    if named[0]:
+    if is_aem:
         return profile_aem.read_aem(source, lines, start)
-    if named[1]:
+    if is_stk:
         return profile_stk.read_stk(source, lines, start)
     if first.startswith("# %ECSV"):
         return profile_table.read_ecsv(source, start, rotation)
@@ -75,7 +90,10 @@ def read_profile(source: Any, start: datetime.datetime, rotation: str | None = N
 
 
 def to_body(samples: Samples, scene: Scene, mount: Mount) -> Samples:
-    """The samples as lab_from_body; under the stars the lab's axes are the ICRS's. Raises InputError for others."""
+    """The samples as lab_from_body. Raises InputError for attitudes that the scene's light does not allow.
+
+    Under the stars the lab's axes are those of the ICRS.
+    """
     if samples.a in ("body", "cam"):
         samples = samples.inverted()
     sky = isinstance(scene.light, StarsConfig)
@@ -89,13 +107,4 @@ def to_body(samples: Samples, scene: Scene, mount: Mount) -> Samples:
     lab_from_body = (
         samples.a_from_b * mount.cam_from_body if samples.b == "cam" else samples.a_from_b
     )
-    return Samples(
-        samples.source,
-        samples.unit,
-        samples.places,
-        samples.t_s,
-        "lab",
-        "body",
-        lab_from_body,
-        samples.absolute,
-    )
+    return replace(samples, a="lab", b="body", a_from_b=lab_from_body)

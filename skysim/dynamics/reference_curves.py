@@ -1,6 +1,8 @@
-"""One angle over time, for rotations about a fixed axis: angle, rate and acceleration by analytic laws.
+"""Curves of the reference attitude: analytic laws of one angle, smooth changes of rate, and splines of samples.
 
-Each function returns (angle, rate, acceleration) at a time in seconds: rad, rad/s, rad/s2.
+1. One angle about a fixed axis: each function returns (angle, rate, acceleration) at a time, in rad, rad/s, rad/s2.
+2. A smooth change of the rate whose axis may move: knots of attitude by Magnus' expansion (`magnus_rotvec`).
+3. Attitude samples, interpolated by a C2 spline (`AttitudeSpline`).
 """
 
 from __future__ import annotations
@@ -16,17 +18,19 @@ from skysim.core.jit import jit
 from skysim.core.types import Floats
 from skysim.dynamics.profile_samples import Samples
 
-AngleProfile = Callable[[float], tuple[float, float, float]]
 Derivatives = tuple[float, float, float]  # a value and its first two derivatives by time
+AngleProfile = Callable[[float], Derivatives]
+
+# 1. One angle over time, for rotations about a fixed axis.
 
 
 def still(t_s: float) -> Derivatives:
-    """No motion."""
+    """The angle, rate and acceleration without motion."""
     return 0.0, 0.0, 0.0
 
 
 def steady(rate_rad_s: float, t_s: float) -> Derivatives:
-    """A constant rate."""
+    """The angle, rate and acceleration at a constant rate."""
     return rate_rad_s * t_s, rate_rad_s, 0.0
 
 
@@ -34,12 +38,14 @@ def steady(rate_rad_s: float, t_s: float) -> Derivatives:
 def rest_to_rest(
     angle_rad: float, rate_rad_s: float, ramp_s: float, duration_s: float, t_s: float
 ) -> Derivatives:
-    """The rate rises along the smoothstep 3x^2 - 2x^3 (x = t / ramp), cruises at rate_rad_s and falls likewise.
+    """A rotation from rest to rest: the rate rises along a smoothstep, cruises at rate_rad_s and falls likewise.
+
+        rate(x) = rate (3 x^2 - 2 x^3),    x = t / ramp
 
     The acceleration is continuous: zero at both ends of a ramp and 1.5 rate / ramp at its middle.
     """
-    # Symmetric profile: the braking half is the first half in reversed time.
-    braking = t_s > duration_s / 2  # the second half mirrors the first
+    # The profile is symmetric: the braking half is the first half in reversed time.
+    braking = t_s > duration_s / 2
     ramp_time_s = duration_s - t_s if braking else t_s
     x = min(ramp_time_s / ramp_s, 1.0)
     angle = rate_rad_s * (ramp_s * x**3 * (1 - x / 2) + max(ramp_time_s - ramp_s, 0.0))
@@ -50,11 +56,13 @@ def rest_to_rest(
 
 @jit
 def envelope(t_s: float, duration_s: float, rise_s: float, fall_s: float) -> Derivatives:
-    """1 in the middle, 0 at and beyond both ends, and its two derivatives (1/s, 1/s2), all three continuous.
+    """A gain of 1 in the middle and 0 at and beyond both ends, with its derivatives (1/s, 1/s2), all continuous.
 
-    It rises along 10x^3 - 15x^4 + 6x^5 (x = t / rise_s) and falls likewise in fall_s; the two together are at most
-    duration_s.
+        gain(x) = 10 x^3 - 15 x^4 + 6 x^5,    x = t / rise_s
+
+    It falls likewise within fall_s; rise and fall together last duration_s at most.
     """
+    # The fall is the rise in reversed time, so its slope changes sign and its curvature does not.
     falling = t_s > duration_s - fall_s
     growth_s = fall_s if falling else rise_s
     x = min(max((duration_s - t_s if falling else t_s) / growth_s, 0.0), 1.0)
@@ -66,6 +74,7 @@ def envelope(t_s: float, duration_s: float, rise_s: float, fall_s: float) -> Der
 @jit
 def modulated_sine(amplitude_rad: float, gain: Derivatives, phase: Derivatives) -> Derivatives:
     """amplitude gain(t) sin(phase(t)), and its two derivatives by the product rule."""
+    # e and phi are the gain and the phase; the other names are their derivatives.
     e, slope, curvature = gain
     phi, omega, chirp = phase
     s = math.sin(phi)
@@ -107,13 +116,12 @@ def log_sweep(
     return modulated_sine(amplitude_rad, envelope(t_s, duration_s, rise_s, fall_s), phase)
 
 
-# Attitude during a smooth change of the rate, during which its axis may move: rate + change (3x^2 -
-# 2x^3).
+# 2. Attitude during a smooth change of the rate, rate + change (3x^2 - 2x^3), whose axis may move.
 
 
 @jit
 def rate_at(t_s: float, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats) -> Floats:
-    """(3,) rate + change (3x^2 - 2x^3), x = t / duration."""
+    """(3,) rate at a time, rate + change (3x^2 - 2x^3), x = t / duration."""
     x = t_s / duration_s
     return rate_rad_s + x**2 * (3 - 2 * x) * change_rad_s
 
@@ -122,13 +130,15 @@ def rate_at(t_s: float, duration_s: float, rate_rad_s: Floats, change_rad_s: Flo
 def magnus_rotvec(
     begin_s: float, step_s: float, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats
 ) -> Floats:
-    """(3,) rotation vector of the motion in a short step: Magnus' expansion to fourth order, two Gauss points.
+    """(3,) rotation vector of the motion in a short step h: Magnus' expansion to fourth order.
 
         phi = h (w1 + w2) / 2 + sqrt(3) / 12 h^2 w1 x w2
 
-    (Iserles & Norsett 1999, `assumed`; the sign is that of rates in moving axes). The first term is exact here, the
-    rate being a cubic of time; if the axis is fixed, the second term is zero for any step.
+    (Iserles & Norsett 1999, `assumed`; the sign is that of rates in moving axes). w1 and w2 are the rates at the
+    two Gauss points of the step. The first term is exact, since the rate is a cubic of time. If the axis is fixed,
+    the second term is zero for any step.
     """
+    # Gauss points: the middle +- h / sqrt(12).
     middle = begin_s + step_s / 2
     offset = step_s / math.sqrt(12.0)
     early = rate_at(middle - offset, duration_s, rate_rad_s, change_rad_s)
@@ -146,7 +156,7 @@ def integrate_knots(
     rate_rad_s: Floats,
     change_rad_s: Floats,
 ) -> Floats:
-    """(count, 4) attitudes at 0, 1, ... count - 1 times duration / count."""
+    """(count, 4) attitudes lab_from_knot_wxyz at the times k duration / count, k = 0 ... count - 1."""
     lab_from_knot_wxyz = np.empty((count, 4))
     attitude = lab_from_start_wxyz
     step_s = duration_s / count
@@ -154,9 +164,8 @@ def integrate_knots(
         lab_from_knot_wxyz[k] = attitude
         rotvec = magnus_rotvec(k * step_s, step_s, duration_s, rate_rad_s, change_rad_s)
         attitude = quaternion.multiply(attitude, quaternion.from_rotvec(rotvec))
-        attitude = attitude / math.sqrt(
-            (attitude**2).sum()
-        )  # prevents drift of the norm, 1e-16 a step
+        # Normalization prevents a drift of the norm by 1e-16 a step.
+        attitude = attitude / math.sqrt((attitude**2).sum())
     return lab_from_knot_wxyz
 
 
@@ -168,7 +177,10 @@ def rate_change_state(
     change_rad_s: Floats,
     t_s: float,
 ) -> tuple[Floats, Floats, Floats]:
-    """The state within a change of rate, integrated from the previous knot by the rule that made the knots."""
+    """Attitude (4,), rate (3,) and acceleration (3,) within a change of rate.
+
+    The attitude is integrated from the previous knot by the rule that made the knots.
+    """
     step_s = duration_s / len(lab_from_knot_wxyz)
     k = min(int(t_s / step_s), len(lab_from_knot_wxyz) - 1)
     rotvec = magnus_rotvec(k * step_s, t_s - k * step_s, duration_s, rate_rad_s, change_rad_s)
@@ -180,23 +192,29 @@ def rate_change_state(
     )
 
 
-# Attitude samples interpolated by a C2 spline: attitude, rate and acceleration are continuous.
+# 3. Attitude samples interpolated by a C2 spline: attitude, rate and acceleration are continuous.
 
 
 @dataclass(frozen=True, slots=True)
 class AttitudeSpline:
-    """Attitudes over time.
+    """Attitude samples interpolated by a C2 spline.
+
+    The spline is SciPy's `CubicSpline` (not-a-knot) of the four components of the quaternion with continuous sign.
+    It is normalized where it is evaluated. Its error is of fourth order in the step up to both ends.
+    `RotationSpline`, which interpolates the rotation vector, is C2 as well but takes the mean rate of the first and
+    the last step for the rates at the ends: for a tumble at 13 deg/s, sampled at 10 Hz, its error there is
+    21 arcsec, against 0.04 arcsec here. 100,000 samples take 0.02 s here, and 0.8 s there.
 
     Attributes
     ----------
     source
-        Where the samples come from, for messages
+        Name of the file or table, for messages
     t_s
-        (N,) sample times, ascending. They count from the scene's start if `absolute`, else from
-        the start of the maneuver
+        (N,) ascending sample times, from the scene's start if `absolute`, else from the start of the maneuver
     coefficients
-        (N - 1, 4, 4) of the steps' cubics in t - t_s[k], from the third power down, of w, x, y,
-        z
+        (N - 1, 4, 4) coefficients of each step's cubics in t - t_s[k]: third power first, then components w, x, y, z
+    absolute
+        Whether the samples have epochs
     """
 
     source: str
@@ -220,11 +238,10 @@ def fit_spline(samples: Samples) -> AttitudeSpline:
     """The spline through checked samples of lab_from_body."""
     from scipy.interpolate import CubicSpline
 
+    # q and -q are the same attitude: choose the signs so that no component jumps.
     wxyz = samples.a_from_b.as_quat(scalar_first=True)
     dot = np.sum(wxyz[1:] * wxyz[:-1], axis=1)
-    sign = np.concatenate(
-        [[1.0], np.cumprod(np.where(dot < 0, -1.0, 1.0))]
-    )  # q and -q are the same attitude
+    sign = np.concatenate([[1.0], np.cumprod(np.where(dot < 0, -1.0, 1.0))])
     cubic = CubicSpline(samples.t_s, wxyz * sign[:, None])
     return AttitudeSpline(
         samples.source,
@@ -240,8 +257,9 @@ def spline_state(t_s: Floats, coefficients: Floats, at_s: float) -> tuple[Floats
 
         q = p / |p|,  rate = 2 vec(p* p') / |p|^2,  acceleration = (2 vec(p* p'') - 2 (p . p') rate) / |p|^2
 
-    The rate follows from q' = q (0, rate) / 2; the derivative of |p| drops out, being along q.
+    The rate follows from q' = q (0, rate) / 2. The derivative of |p| is along q and has no vector part in it.
     """
+    # The cubic of the step, and its derivatives, by Horner's rule.
     k = min(max(int(np.searchsorted(t_s, at_s, side="right")) - 1, 0), len(t_s) - 2)
     s = at_s - t_s[k]
     (c3, c2, c1, c0) = coefficients[k]
@@ -256,7 +274,7 @@ def spline_state(t_s: Floats, coefficients: Floats, at_s: float) -> tuple[Floats
 
 @jit
 def spline_states(t_s: Floats, coefficients: Floats, at_s: Floats) -> tuple[Floats, Floats, Floats]:
-    """`spline_state` at (K,) times."""
+    """`spline_state` at (K,) times: (K, 4), (K, 3), (K, 3)."""
     attitude = np.empty((len(at_s), 4))
     rate = np.empty((len(at_s), 3))
     acceleration = np.empty((len(at_s), 3))

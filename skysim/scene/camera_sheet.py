@@ -1,7 +1,8 @@
-"""A camera file from the numbers of a data sheet: what to ask, and what is assumed where the sheet is silent.
+"""A camera file from the numbers of a data sheet, for `skysim camera new`.
 
-Answers are texts as a user types them. The file is a preset (`camera.preset`); each value has a comment: [S1] if the
-data sheet states it, otherwise `assumed` with the reason.
+`QUESTIONS` are the numbers to ask. `fill` makes the values of the file from the answers, which are texts that a user
+types; a number that the data sheet does not state is assumed. The file is a preset (`camera.preset`). Each value has a
+comment: [S1] if the data sheet states it, otherwise `assumed` with the reason.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ import yaml
 
 from skysim.core.errors import InputError, printable
 
-# Parsers of the answers, from a typed text to a value of the file. Each raises InputError with what
-# is allowed.
+# Parsers of the answers, from a typed text to a value of the file. Each raises InputError with the allowed values.
 
 
 def pixels(text: str) -> tuple[int, int]:
+    """Width and height of the detector."""
     match = re.fullmatch(r"(\d{1,6})\s*(?:px)?\s*[x×*,]\s*(\d{1,6})\s*(?:px)?", text.strip())
     if not match:
         raise InputError("", "", "width x height, such as 1936x1216")
@@ -27,7 +28,7 @@ def pixels(text: str) -> tuple[int, int]:
 
 
 def quantity_text(si_unit: str, what: str, example: str) -> Callable[[str], str]:
-    """A parser that checks a quantity and returns its text."""
+    """A parser that checks a quantity with its unit and returns its text."""
 
     def parse(text: str) -> str:
         from skysim.core.units import quantity
@@ -42,6 +43,7 @@ def quantity_text(si_unit: str, what: str, example: str) -> Callable[[str], str]
 
 
 def finite(value: float) -> float:
+    """The value. Raises InputError if it is not finite."""
     if not math.isfinite(value):
         raise InputError("", "not finite")
     return value
@@ -53,7 +55,7 @@ def plain(value: float) -> float:
 
 
 def number(units: str, example: str) -> Callable[[str], float]:
-    """A parser of a number without or with its unit. units : a pattern"""
+    """A parser of a number with or without its unit; `units` is a pattern of the unit."""
 
     def parse(text: str) -> float:
         match = re.fullmatch(rf"([-+.\de]*?\d\.?)\s*(?:{units})?", text.strip(), re.IGNORECASE)
@@ -67,13 +69,14 @@ def number(units: str, example: str) -> Callable[[str], float]:
 
 
 def share(text: str) -> float:
-    """A fraction, or a percentage with its sign."""
+    """A fraction, from a fraction or a percentage with its sign."""
     digits, percent, _ = text.partition("%")
     value = number("", '0.65, or "65 %"')(digits)
     return rounded(value / 100, 12) if percent else value
 
 
 def bits(text: str) -> int:
+    """Number of bits of a pixel."""
     value = number("bits?", "12")(text)
     if value not in range(1, 17):
         raise InputError("", "", "1 to 16")
@@ -81,19 +84,20 @@ def bits(text: str) -> int:
 
 
 def f_number(text: str) -> float:
+    """F-number, from a number with or without `f/`."""
     return number("", "1.4")(re.sub(r"^\s*f\s*/?\s*", "", text, flags=re.IGNORECASE))
 
 
 def gain(text: str) -> float:
-    """Electrons a digital number; EMVA 1288 states the inverse, in DN/e-."""
+    """Electrons per digital number; EMVA 1288 states the inverse, in DN/e-."""
     inverse = re.fullmatch(r"(.*?)\s*(?:DN|ADU)\s*/\s*e-?", text.strip(), re.IGNORECASE)
-    value = number(r"e-?\s*/\s*(?:DN|ADU)", '2.64, "2.64 e-/DN" or "0.379 DN/e-"')(
-        inverse[1] if inverse else text
-    )
+    parse = number(r"e-?\s*/\s*(?:DN|ADU)", '2.64, "2.64 e-/DN" or "0.379 DN/e-"')
+    value = parse(inverse[1] if inverse else text)
     return rounded(1 / value, 6) if inverse and value else value
 
 
 def shutter(text: str) -> str:
+    """Kind of the shutter."""
     kinds = ("global", "rolling", "frame_transfer", "interline")
     kind = text.strip().lower().replace(" ", "_").replace("-", "_").removesuffix("_shutter")
     if kind not in kinds:
@@ -102,17 +106,18 @@ def shutter(text: str) -> str:
 
 
 def rounded(value: float, digits: int = 4) -> float:
+    """The value rounded to this number of significant digits."""
     return plain(float(f"{value:.{digits}g}"))
 
 
-# The numbers of a data sheet: how they are asked, where they are stated, and what is assumed if
-# they are not.
-
+# The numbers of a data sheet.
 
 Values = Mapping[str, Any]  # parsed answers, by the name of the question
 
-WELL_E_UM2 = 900.0  # full well of a square micrometer: the least of the cameras in data/cameras, that of the IMX264
-TRANSFER = "1 us"  # time of a row of a charge-coupled device
+WELL_E_UM2 = (
+    900.0  # full well per square micrometer of the IMX264, the least of the cameras in data/cameras
+)
+TRANSFER = "1 us"  # transfer time of a row of a charge-coupled device
 
 
 class AssumedValue(NamedTuple):
@@ -128,18 +133,19 @@ class Question(NamedTuple):
     Attributes
     ----------
     keys
-        Of the section `camera` that the answer gives
+        Keys of the section `camera` that the answer sets
+    ask
+        Text of the question
     where
-        Where a data sheet states it
+        Place in a data sheet that states the number
     parse
-        From the typed text to the value of the file, several for several keys; raises
-        InputError
+        Function from the typed text to the value of the file, several for several keys; raises InputError
     assume
-        From the values known so far to the assumption; None if the key is then left out
+        Function from the values known so far to the assumption; None leaves the key out
     consequence
-        Of not knowing it; empty if it must be given
+        Consequence of not knowing it; empty if it must be given
     skipped
-        Why it is not asked, by the values known so far; empty if it is
+        Function from the values known so far to the reason for not asking; empty if it is asked
     """
 
     keys: tuple[str, ...]
@@ -152,47 +158,48 @@ class Question(NamedTuple):
 
 
 def assumed(value: Any, why: str) -> Callable[[Values], AssumedValue]:
+    """An assumption that does not depend on the other values."""
     return lambda values: AssumedValue(value, why)
 
 
 def without_lens(values: Values) -> str:
+    """The reason for not asking for properties of a lens that is not given."""
     return "" if "focal_length" in values else "without focal_length"
 
 
 def not_by_rows(values: Values) -> str:
+    """The reason for not asking for the row time of a global shutter."""
     return "with a global shutter" if values.get("shutter", "global") == "global" else ""
 
 
 def row_time(values: Values) -> AssumedValue:
-    """Time from row to row of a shutter that is not global."""
+    """Assumed time from row to row of a shutter that is not global."""
     if values["shutter"] != "rolling":
         return AssumedValue(TRANSFER, "a fast transfer")
     return AssumedValue(f"{rounded(1e6 / 30 / values['pixels'][1])} us", "30 frames a second")
 
 
 def full_well(values: Values) -> AssumedValue:
-    """Electrons, from the range of the converter if the gain is known, otherwise from the area of a pixel."""
+    """Assumed full well: the converter's range in electrons if the gain is known, otherwise from the pixel's area."""
     if "gain" in values:
-        return AssumedValue(
-            rounded(values["gain"] * range_dn(values)), "where the converter's range ends"
-        )
+        well_e = values["gain"] * range_dn(values)
+        return AssumedValue(rounded(well_e), "where the converter's range ends")
     from skysim.core.units import in_si
 
-    area_um2 = (1e6 * in_si(values["pitch"], "m")) ** 2
-    return AssumedValue(
-        rounded(WELL_E_UM2 * area_um2), f"{WELL_E_UM2:g} e- a square micrometer, as in the IMX264"
-    )
+    well_e = WELL_E_UM2 * (1e6 * in_si(values["pitch"], "m")) ** 2
+    why = f"{WELL_E_UM2:g} e- a square micrometer, as in the IMX264"
+    return AssumedValue(rounded(well_e), why)
 
 
 def gain_of_well(values: Values) -> AssumedValue:
-    """Electrons a digital number that map the full well to the end of the range, rounded up."""
+    """Assumed gain, which maps the full well to the end of the range; rounded up to four digits."""
     exact = max(values["full_well"], 1e-3) / range_dn(values)
     step = 10.0 ** (math.floor(math.log10(exact)) - 3)
     return AssumedValue(rounded(step * math.ceil(exact / step)), "the range ends at the full well")
 
 
 def range_dn(values: Values) -> float:
-    """Digital numbers from the black level to the end of the converter."""
+    """Digital numbers from the black level to the end of the converter's range."""
     return max(2 ** values["bits"] - 1 - values["black_level"], 1)
 
 
@@ -326,21 +333,15 @@ QUESTIONS: dict[str, Question] = {
 }
 REQUIRED = tuple(name for name, question in QUESTIONS.items() if question.consequence == "")
 
+# The camera file.
 
-CURVES = {
-    "interline": "interline",
-    "frame_transfer": "thick_ccd",
-}  # shapes of the quantum efficiency by shutter
-PLACEHOLDERS = {
-    "pixels": "1000x1000",
-    "pitch": "5 um",
-}  # to check an answer before these two are given
+# Curve of the quantum efficiency by shutter.
+CURVES = {"interline": "interline", "frame_transfer": "thick_ccd"}
+# Values with which an answer is checked before these two are given.
+PLACEHOLDERS = {"pixels": "1000x1000", "pitch": "5 um"}
 PLACEHOLDER_LENS = {"focal_length": "1 m", "f_number": 1.0}  # to validate a camera without a lens
-SI = {
-    "pixel": " m",
-    "focal_length": " m",
-    "shutter.row_time": " s",
-}  # units of the limits in messages
+# Units of the limits in messages.
+SI = {"pixel": " m", "focal_length": " m", "shutter.row_time": " s"}
 COMMENT_COLUMN = 34
 
 
@@ -353,7 +354,7 @@ class SheetLine(NamedTuple):
 
 
 class Missing(NamedTuple):
-    """A number that is not stated: what is assumed (empty: the key is left out), and the consequence."""
+    """A number that is not stated: the assumption (empty if the key is left out), and the consequence."""
 
     name: str
     assumed: str
@@ -361,14 +362,15 @@ class Missing(NamedTuple):
 
 
 class Sheet(NamedTuple):
-    """The values of a camera file, and what the data sheet does not state."""
+    """The values of a camera file, and the numbers that the data sheet does not state."""
 
     lines: list[SheetLine]
     missing: list[Missing]
 
 
 def fill(answers: Mapping[str, str]) -> Sheet:
-    """The camera of some answers, with assumptions for the rest. Raises InputError; its key is `answers.NAME`."""
+    """The camera of some answers, with assumptions for the rest. Raises InputError with a key `answers.NAME`."""
+    # Questions are in an order in which each assumption only needs earlier values.
     values = {name: parsed(name, text) for name, text in answers.items()}
     missing = []
     comments = dict.fromkeys(values, "[S1]")
@@ -392,7 +394,9 @@ def fill(answers: Mapping[str, str]) -> Sheet:
 
 
 def outstanding(answers: Mapping[str, str]) -> dict[str, Missing]:
-    """What some answers leave open, by name; pixels and pitch may still be missing. Raises InputError as `fill`."""
+    """The numbers that are missing in some answers, by name. Raises InputError as `fill`; pixels and pitch may be
+    missing.
+    """
     return {one.name: one for one in fill(PLACEHOLDERS | dict(answers)).missing}
 
 
@@ -405,12 +409,12 @@ def parsed(name: str, text: str) -> Any:
 
 
 def quoted(text: str) -> str:
-    """The begin of an answer, for messages."""
+    """The beginning of an answer, for messages."""
     return repr(printable(text)[:40])
 
 
 def lines_of(values: Values, comments: Mapping[str, str]) -> Iterator[SheetLine]:
-    """The lines of the file in the order of the questions, with what is needed and not asked."""
+    """Yield the values of the file in the order of the questions, with those that are needed and not asked."""
     for name, question in QUESTIONS.items():
         if name not in values:
             continue
@@ -441,7 +445,7 @@ def tree_of(lines: list[SheetLine]) -> dict[str, Any]:
 
 
 def check(sheet: Sheet, answers: Mapping[str, str]) -> None:
-    """Validate the camera. Raises InputError of the first wrong answer."""
+    """Validate the camera. Raises InputError for the first wrong answer."""
     from pydantic import ValidationError
 
     from skysim.core.yaml_reader import fault_of, yaml_keys
@@ -460,57 +464,48 @@ def check(sheet: Sheet, answers: Mapping[str, str]) -> None:
 
 
 def blame(faults: list[InputError], answers: Mapping[str, str]) -> InputError:
-    """The first fault that is of an answer, as an error of that answer; otherwise the first."""
+    """The first fault of a key that an answer sets, as an error of the answer; otherwise the first fault."""
     for name, text in answers.items():
         for fault in faults:
-            if fault.key in QUESTIONS[name].keys:
-                if fault.allowed:
-                    return InputError(
-                        f"answers.{name}", quoted(text), fault.allowed + SI.get(fault.key, "")
-                    )
+            if fault.key not in QUESTIONS[name].keys:
+                continue
+            if not fault.allowed:
                 return InputError(f"answers.{name}", f"{quoted(text)}: {fault.problem}")
+            allowed = fault.allowed + SI.get(fault.key, "")
+            return InputError(f"answers.{name}", quoted(text), allowed)
     return faults[0].under("camera")
 
 
 def text(sheet: Sheet, name: str) -> str:
-    """The file: YAML with a comment at each value."""
+    """The text of the file: YAML with a comment at each value."""
     lines = [
         f"# {printable(name)}. Written by `skysim camera new`.",
         "# [S1] the data sheets of camera and lens. A value marked `assumed` is not stated there.",
-        *(
-            f"# Not stated: {one.name}; {one.consequence}."
-            for one in sheet.missing
-            if not one.assumed
-        ),
-        *yaml_lines(sheet.lines),
     ]
-    return "\n".join(lines) + "\n"
+    left_out = [one for one in sheet.missing if not one.assumed]
+    lines += [f"# Not stated: {one.name}; {one.consequence}." for one in left_out]
+    return "\n".join([*lines, *yaml_lines(sheet.lines)]) + "\n"
 
 
 def yaml_value(value: Any) -> str:
-    """A value in one line of YAML; a text with spaces is quoted."""
+    """A value as one line of YAML; a text with spaces is quoted."""
     if isinstance(value, str):
         return f'"{value}"' if " " in value else value
-    return (
-        yaml.safe_dump(value, default_flow_style=True, width=math.inf)
-        .removesuffix("\n")
-        .removesuffix("\n...")
-    )
+    dumped = yaml.safe_dump(value, default_flow_style=True, width=math.inf)
+    return dumped.removesuffix("\n").removesuffix("\n...")
 
 
 def yaml_lines(camera: list[SheetLine]) -> list[str]:
-    """A section `camera` in YAML, with the comment of each value."""
+    """The lines of a section `camera` in YAML, with the comment of each value."""
+    from skysim.core.yaml_reader import shared_depth
+
     lines = ["camera:"]
     open_ = list[str]()
     for line in camera:
         *parents, last = line.key.split(".")
-        depth = next(
-            (n for n, pair in enumerate(zip(open_, parents, strict=False)) if pair[0] != pair[1]),
-            len(open_),
-        )
-        lines += [
-            f"{'  ' * (n + 1)}{parents[n]}:" for n in range(min(depth, len(parents)), len(parents))
-        ]
+        # Open the sections that the previous value does not share.
+        shared = shared_depth(open_, parents)
+        lines += [f"{'  ' * (n + 1)}{parents[n]}:" for n in range(shared, len(parents))]
         open_ = parents
         written = f"{'  ' * (len(parents) + 1)}{last}: {yaml_value(line.value)}"
         lines.append(f"{written.ljust(COMMENT_COLUMN)} # {line.comment}")

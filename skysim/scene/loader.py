@@ -1,10 +1,15 @@
-"""Load a scene: presets, calibration files, `base` scenes and overrides, then validation.
+"""Load a scene: `base` scenes, overrides, camera presets and calibration files, then validation.
 
-The raw YAML tree is built in layers, the later ones over the earlier: the `base` scene (recursively), the scene's own
-keys, then the overrides of `--set`. A layer that names a camera preset also drops the keys that this preset defines
-from the layers below (`over_base`). Next, the camera section is merged over its preset, and a calibration file's
-values over both (`with_preset`). Only then does pydantic validate the tree. Last, an option that has no effect is
-refused (`unused`). Every error becomes an InputError of one line with key, file and line.
+`load` makes a scene in one pass:
+
+1. Read the scene's file and its `base` scenes as layers (`read_layers`).
+2. Merge them, each over its base, then the overrides of `--set` (`merged`, `with_overrides`). A layer that names a
+   camera preset also drops the keys that this preset defines from the layers below (`over_base`).
+3. Merge the camera section over its preset, and the values of a calibration file over both (`apply_preset`).
+4. Validate the tree by pydantic.
+5. Refuse options that have no effect (unused.py).
+
+Every error becomes an InputError of one line with key, file and line.
 """
 
 from __future__ import annotations
@@ -45,7 +50,7 @@ def list_cameras() -> list[str]:
 
 
 def preset_path(name: str, where: str = "camera.preset") -> Path:
-    """The file of a camera preset: a name in data/cameras, or a file. Raises InputError for an unknown name."""
+    """The file of a camera preset, which is a name in data/cameras or a path. Raises InputError for an unknown name."""
     path = PRESETS / f"{name}.yaml" if name in list_cameras() else Path(name)
     if path.suffix not in (".yaml", ".yml") or not is_file(path):
         problem, names = unknown_name("preset", name, list_cameras())
@@ -66,9 +71,9 @@ def preset(name: str, where: str = "camera.preset") -> dict[str, Any]:
 
 
 def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
-    """The raw scene with its camera's preset and calibration applied. Raises InputError.
+    """The raw scene with the preset and the calibration of its camera applied. Raises InputError.
 
-    The camera's own keys override the preset's; the calibration's values are added to both.
+    The camera's own keys override those of the preset; the values of the calibration are added to both.
     """
     camera = tree.get("camera")
     if not isinstance(camera, dict) or not {"preset", "calibration"} & set(camera):
@@ -89,7 +94,7 @@ def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def with_heads(tree: dict[str, Any]) -> dict[str, Any]:
-    """The raw scene with the sections of each head as its own keys over those of the main camera. Raises InputError."""
+    """The raw scene with complete heads: the keys of each head over those of the main camera. Raises InputError."""
     heads = tree.get("heads")
     if not isinstance(heads, list):
         return tree
@@ -97,7 +102,7 @@ def with_heads(tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def completed_head(tree: dict[str, Any], head: Any, n: int) -> Any:
-    """The raw head n with complete sections; unchanged if it is no mapping, which validation reports."""
+    """The raw head n with complete sections; unchanged if it is not a mapping, which validation reports."""
     if not isinstance(head, dict):
         return head
     own = {key: head[key] for key in HEAD_SECTIONS if isinstance(head.get(key), dict)}
@@ -146,7 +151,7 @@ def calibrated_keys(path: Path, camera: dict[str, Any]) -> dict[str, Any]:
 
 
 def merge(base: dict[str, Any], override: dict[str, Any]) -> dict[str, Any]:
-    """Merge two mappings, `override` over `base`, recursively; sections of different kinds are replaced."""
+    """The mapping `override` merged over `base`, recursively; a section of another kind replaces that of the base."""
     merged = base | override
     for key, value in override.items():
         section = base.get(key)
@@ -162,14 +167,18 @@ def over_base(
     own: dict[str, Any],
     camera_of: Callable[[Any], dict[str, Any]] = lambda name: preset(str(name)),
 ) -> dict[str, Any]:
-    """The keys of a scene over those of its base. A camera preset in `own` also replaces the base's keys, and
-    `motion.start: profile` the base's rate, which the profile gives.
+    """The keys of a scene over those of its base.
+
+    A camera preset in `own` also removes the keys of the base that it defines. `motion.start: profile` removes the
+    rate of the base, which the profile defines.
 
     Parameters
     ----------
+    base, own
+        Raw trees
     camera_of
-        The camera section of a preset. An unknown preset replaces nothing; `with_preset`
-        reports it.
+        Function from the name of a preset to its camera section. An unknown preset removes nothing; `with_preset`
+        reports it
     """
     camera = own.get("camera")
     below = base.get("camera")
@@ -180,31 +189,30 @@ def over_base(
     motion = own.get("motion")
     moving = base.get("motion")
     if isinstance(motion, dict) and isinstance(moving, dict):
+        # In `provenance` a value is an object that also has its origin.
         start = motion.get("start")
-        if (
-            getattr(start, "value", start) == "profile"
-        ):  # in `provenance` a value has its origin beside it
-            base = base | {
-                "motion": {key: value for key, value in moving.items() if key != "rate_deg_s"}
-            }
+        if getattr(start, "value", start) == "profile":
+            kept = {key: value for key, value in moving.items() if key != "rate_deg_s"}
+            base = base | {"motion": kept}
     return merge(base, own)
 
 
-REPLACING = ("camera.preset", "motion.start")  # keys that replace others of the base: `over_base`
+REPLACING = (
+    "camera.preset",
+    "motion.start",
+)  # keys that remove others of the base, see `over_base`
 
 
 def undefined_keys(section: dict[str, Any], defined: dict[str, Any]) -> dict[str, Any]:
-    """The keys of a section that another one does not define; of two sections of different kinds, nothing."""
+    """The keys of a section that another one does not define; nothing of a section of another kind."""
     kept: dict[str, Any] = {}
     for key, value in section.items():
         other = defined.get(key)
         if key not in defined:
             kept[key] = value
-        elif (
-            isinstance(value, dict)
-            and isinstance(other, dict)
-            and value.get("kind") in (None, other.get("kind"))
-        ):
+            continue
+        sections = isinstance(value, dict) and isinstance(other, dict)
+        if sections and value.get("kind") in (None, other.get("kind")):
             kept[key] = undefined_keys(value, other)
     return kept
 
@@ -223,22 +231,29 @@ def find(name: str) -> Path:
 def load(
     name: str | Path, overrides: Mapping[str, str] | None = None, refuses_unused: bool = True
 ) -> Scene:
-    """Read, override (`path.to.key` -> YAML value) and validate a scene.
+    """The validated scene of a file with overrides.
 
     Parameters
     ----------
+    name
+        Name in scenes/, or path
+    overrides
+        YAML texts by dotted key, `path.to.key`
     refuses_unused
-        Whether an option that has no effect is an error (scene/unused.py)
+        Whether an option without effect is an error (unused.py)
 
     Raises
     ------
     InputError
-        With one line: the key, what is wrong with it, what is allowed, the file and line.
+        With one line: the key, the problem, the allowed values, the file and the line.
     """
     path = find(str(name))
     overrides = overrides or {}
+    # 1. Files.
     layers = read_layers(path)
+    # 2. to 4. Merging and validation.
     scene = validate(layers, overrides)
+    # 5. Options without effect.
     if refuses_unused:
         unused.check(
             scene, layers[0].tree, overrides, locations(layers), lambda: validate(layers, {})
@@ -247,7 +262,7 @@ def load(
 
 
 def validate(layers: list[Layer], overrides: Mapping[str, str]) -> Scene:
-    """The scene of some layers and overrides. Raises InputError with one line."""
+    """The scene of layers and overrides: steps 2 to 4 of the module's docstring. Raises InputError."""
     tree = with_overrides(merged(layers), overrides)
     files = locations(layers)
     try:
@@ -258,7 +273,7 @@ def validate(layers: list[Layer], overrides: Mapping[str, str]) -> Scene:
 
 
 def with_overrides(tree: dict[str, Any], overrides: Mapping[str, str]) -> dict[str, Any]:
-    """The raw scene with dotted keys overridden; `tree` may be changed. Keys in REPLACING come before the others."""
+    """The raw scene with dotted keys overridden, those in REPLACING first. `tree` may be changed."""
     for key in REPLACING:
         if key in overrides:
             named: dict[str, Any] = {}
@@ -270,11 +285,11 @@ def with_overrides(tree: dict[str, Any], overrides: Mapping[str, str]) -> dict[s
 
 
 def load_scene(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
-    """`load` for Python: override values may also be numbers, lists and mappings.
+    """`load` for Python: values of overrides may also be numbers, lists and mappings.
 
         load_scene("shefex2", {"exposure.frames": 3, "exposure.time": "20 ms"})
 
-    A string is YAML, as on the command line; None switches a section off. Raises InputError with one line.
+    A string is YAML, as on the command line; None switches a section off. Raises InputError.
     """
     return load(name, yaml_reader.override_texts(overrides))
 
@@ -285,7 +300,7 @@ def list_scenes() -> list[str]:
 
 
 def located(error: InputError, name: str, overrides: Mapping[str, str]) -> InputError:
-    """An error about a key that was only checked after loading, with file and line; any other error unchanged."""
+    """The error with file and line, if it is about a key of the scene that was checked after loading."""
     keys = error.key.split(".")
     if error.where or keys[0] not in Scene.model_fields:
         return error
@@ -293,7 +308,15 @@ def located(error: InputError, name: str, overrides: Mapping[str, str]) -> Input
 
 
 class Layer(NamedTuple):
-    """One file of a scene: its path, its text and its keys, without `base`."""
+    """One file of a scene.
+
+    Attributes
+    ----------
+    path, text
+        Path and text
+    tree
+        Its keys, without `base`
+    """
 
     path: Path
     text: str
@@ -301,15 +324,18 @@ class Layer(NamedTuple):
 
 
 def read_layers(path: Path, derived: tuple[Path, ...] = ()) -> list[Layer]:
-    """A scene's file, its `base` scene, the base of that, and so on. Raises InputError.
+    """The layers of a scene: its file, its `base` scene, the base of that, and so on. Raises InputError.
 
     Parameters
     ----------
+    path
+        File of the scene
     derived
-        Scenes that have this one as their base, to detect a cycle
+        Files that have this one as their base, to detect a cycle
     """
     tree, text = read_yaml(path)
-    if derived or tree.keys() != {"camera"}:  # a file with a camera only has no schema version
+    # A file with only a camera has no schema version.
+    if derived or tree.keys() != {"camera"}:
         check_version(tree, path, text)
     tree = resolve_files(path, tree)
     if "base" not in tree:
@@ -317,7 +343,8 @@ def read_layers(path: Path, derived: tuple[Path, ...] = ()) -> list[Layer]:
     base = tree.pop("base")
     where = where_of(["base"], [(path, text)], {})
     try:
-        base_path = find(str(path.parent / base) if is_file(path.parent / str(base)) else str(base))
+        beside = path.parent / str(base)
+        base_path = find(str(beside if is_file(beside) else base))
     except InputError as error:
         raise error.within("base").at(where) from None
     if base_path.resolve() in (*derived, path.resolve()):
@@ -326,18 +353,18 @@ def read_layers(path: Path, derived: tuple[Path, ...] = ()) -> list[Layer]:
 
 
 def merged(layers: list[Layer]) -> dict[str, Any]:
-    """The keys of a scene merged over those of its base scenes; a copy, which `set_key` may change."""
+    """A copy of the keys of a scene, merged over those of its base scenes."""
     tree = functools.reduce(over_base, (layer.tree for layer in reversed(layers)))
     return copy.deepcopy(tree)
 
 
 def locations(layers: list[Layer]) -> Files:
-    """Paths and texts of the layers, for the locations in messages."""
+    """Paths and texts of the layers, to locate keys for messages."""
     return [(layer.path, layer.text) for layer in layers]
 
 
 def read(path: Path) -> tuple[dict[str, Any], Files]:
-    """A scene's keys merged over those of its `base` scene, and the files read, this one first. Raises InputError."""
+    """The keys of a scene merged over those of its base scenes, and its files, its own first. Raises InputError."""
     layers = read_layers(path)
     return merged(layers), locations(layers)
 
@@ -345,14 +372,14 @@ def read(path: Path) -> tuple[dict[str, Any], Files]:
 def apply_preset(
     tree: dict[str, Any], files: Files, overrides: Mapping[str, str]
 ) -> dict[str, Any]:
-    """`with_preset` of the camera and of the heads, with file and line added to its errors."""
+    """The tree with presets and calibrations of camera and heads applied. Raises InputError with file and line."""
     try:
         return with_preset(with_heads(tree))
     except InputError as error:
         raise error.at(where_of(error.key.split("."), files, overrides)) from None
 
 
-# Keys whose value may be a file in the scene's folder; * is every item of a list.
+# Keys whose value may be a file in the scene's folder; * stands for every item of a list.
 FILE_KEYS = (
     ("vehicle", "model"),
     ("motion", "maneuver", "*", "file"),
@@ -377,7 +404,7 @@ FILE_KEYS += tuple(("heads", "*", *keys) for keys in FILE_KEYS if keys[0] in HEA
 
 
 def resolve_files(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
-    """The scene with file names made absolute if such a file exists in the scene's folder."""
+    """The raw scene with file names made absolute if the file is in the folder of the scene."""
     folder = path.resolve().parent
     for keys in FILE_KEYS:
         tree = resolve_file(folder, tree, *keys)
@@ -388,21 +415,18 @@ def resolve_file(folder: Path, tree: Any, *keys: str) -> Any:
     """The tree with the file name under these nested keys made absolute if the file is in the folder."""
     if not keys:
         return str(folder / tree) if isinstance(tree, str) and is_file(folder / tree) else tree
-    if keys[0] == "*":
-        return (
-            [resolve_file(folder, item, *keys[1:]) for item in tree]
-            if isinstance(tree, list)
-            else tree
-        )
-    if not isinstance(tree, dict) or keys[0] not in tree:
-        return tree
-    return tree | {keys[0]: resolve_file(folder, tree[keys[0]], *keys[1:])}
+    if keys[0] == "*" and isinstance(tree, list):
+        return [resolve_file(folder, item, *keys[1:]) for item in tree]
+    if isinstance(tree, dict) and keys[0] in tree:
+        return tree | {keys[0]: resolve_file(folder, tree[keys[0]], *keys[1:])}
+    return tree
 
 
 def file_names(tree: Any) -> Iterator[tuple[str, str]]:
-    """The dotted keys under which a scene may name files, with the text there."""
+    """Yield the dotted keys under which a scene may name files, with their values."""
 
     def below(node: Any, keys: tuple[str, ...], path: tuple[str, ...]) -> Iterator[tuple[str, str]]:
+        """Those below a node that is at path, under further keys."""
         if not keys:
             if isinstance(node, str):
                 yield ".".join(path), node
@@ -419,28 +443,32 @@ def file_names(tree: Any) -> Iterator[tuple[str, str]]:
 def load_camera(
     path: Path, lens: Mapping[str, Any] | None = None, overrides: Mapping[str, str] | None = None
 ) -> CameraConfig:
-    """The `camera` section of a scene, or of a file with a camera only. Raises InputError with one line.
+    """The `camera` section of a scene, or of a file with only a camera. Raises InputError.
 
     Parameters
     ----------
+    path
+        The file
     lens
         Values for keys that a preset leaves to its scene; keys of the file override them
+    overrides
+        YAML texts by dotted key
     """
+    overrides = overrides or {}
     tree, files = read(path)
-    tree = with_overrides(tree, overrides or {})
+    tree = with_overrides(tree, overrides)
     if isinstance(tree.get("camera"), dict):
         tree = tree | {"camera": {**(lens or {}), **tree["camera"]}}
     try:
-        return CameraFileConfig.model_validate(
-            camera_tree(path, tree, files, overrides or {})
-        ).camera
+        raw = camera_tree(path, tree, files, overrides)
+        return CameraFileConfig.model_validate(raw).camera
     except ValidationError as error:
-        raise explain(error, CameraFileConfig, tree, files, overrides or {}) from None
+        raise explain(error, CameraFileConfig, tree, files, overrides) from None
 
 
 def camera_tree(
     path: Path, tree: dict[str, Any], files: Files, overrides: Mapping[str, str]
 ) -> dict[str, Any]:
-    """The raw section `camera` alone of a scene's tree, with its preset and calibration."""
+    """A tree with only the section `camera` of a scene, with its preset and calibration applied."""
     own = resolve_files(path, {key: tree[key] for key in tree if key == "camera"})
     return apply_preset(own, files, overrides)

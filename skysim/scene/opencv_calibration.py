@@ -1,4 +1,4 @@
-"""Camera calibrations in OpenCV's YAML format: read with checks, and written so that OpenCV can read them."""
+"""Camera calibrations in OpenCV's YAML format: read them with checks, and write them for OpenCV."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from skysim.core.errors import InputError
 from skysim.core.yaml_reader import StrictLoader, excerpt, parse_yaml
 
 MAX_BYTES = 1 << 20  # enough for a calibration with the points of all its views
-# Allowed relative difference of fx and fy, the calibration's own error: a chip's pixels are square.
+# Allowed relative difference of fx and fy: a detector's pixels are square, so it is an error of the calibration.
 MAX_ASPECT_ERROR = 1e-3
-MAX_SIDE_PX = 20000  # a side of the chip, as in a scene's camera
+MAX_SIDE_PX = 20000  # a side of the detector, as in a scene's camera
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 
 
@@ -26,12 +26,14 @@ class OpencvCalibration:
 
     Attributes
     ----------
+    width_px, height_px
+        Size of the image
     focal_px
         Focal length (strictly, the image distance) over the pixel pitch
     center_px
         Principal point (x, y); the center of pixel (0, 0) is (0, 0), as in OpenCV
     distortion
-        k1, k2, p1, p2, k3 in OpenCV's order
+        Coefficients k1, k2, p1, p2, k3 in OpenCV's order
     """
 
     width_px: int
@@ -42,7 +44,7 @@ class OpencvCalibration:
 
     @property
     def field_deg(self) -> tuple[float, float, float]:
-        """Angles between the centers of opposite edges and corners: width, height, diagonal; without distortion."""
+        """Field of view along width, height and diagonal, 2 atan(side / 2 f), without distortion."""
         sides_px = self.width_px, self.height_px, math.hypot(self.width_px, self.height_px)
         width, height, diagonal = (
             2 * math.degrees(math.atan(px / 2 / self.focal_px)) for px in sides_px
@@ -51,7 +53,7 @@ class OpencvCalibration:
 
     @property
     def arcsec_px(self) -> float:
-        """Angle of a pixel on the axis."""
+        """Angle of a pixel on the axis, in arcsec."""
         return 1 / self.focal_px / ARCSEC_RAD
 
     def field_text(self) -> str:
@@ -63,10 +65,11 @@ class OpencvCalibration:
 
 
 class Loader(StrictLoader):
-    """`StrictLoader`, with OpenCV's matrices as mappings."""
+    """`StrictLoader` that reads OpenCV's matrices as mappings."""
 
 
 def matrix_node(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
+    """The mapping of a node with the tag opencv-matrix."""
     if not isinstance(node, yaml.MappingNode):
         raise yaml.constructor.ConstructorError(
             None, None, "a matrix that is not a mapping", node.start_mark
@@ -78,7 +81,7 @@ Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", matrix_node)
 
 
 def looks_like_calibration(path: Path) -> bool:
-    """Whether a file looks like OpenCV's: it has a camera_matrix, or OpenCV's first line."""
+    """Whether a file has a camera_matrix, or OpenCV's first line."""
     try:
         with path.open("rb") as file:
             head = file.read(MAX_BYTES)
@@ -92,11 +95,12 @@ def looks_like_calibration(path: Path) -> bool:
 
 
 def read(path: Path) -> OpencvCalibration:
-    """Read a file of OpenCV's calibration samples (or of ROS, whose keys are the same).
+    """The calibration in a file of OpenCV's calibration samples, or of ROS, which has the same keys.
 
-    Keys: image_width, image_height, camera_matrix, distortion_coefficients; others are ignored. Raises InputError
-    with one line for another file, and for another lens model: fisheye, rational, skewed.
+    It reads image_width, image_height, camera_matrix and distortion_coefficients and ignores other keys. Raises
+    InputError for another file, and for another lens model: fisheye, rational, skewed.
     """
+    # 1. Lens model and size.
     tree = parse_file(path)
     for key, allowed in (("fisheye_model", (0, False)), ("distortion_model", ("plumb_bob",))):
         if key in tree and tree[key] not in allowed:
@@ -104,6 +108,7 @@ def read(path: Path) -> OpencvCalibration:
                 path, f"{key}: {excerpt(repr(tree[key]))}", ", ".join(map(str, allowed))
             )
     width, height = (image_side(path, tree, key) for key in ("image_width", "image_height"))
+    # 2. Camera matrix of a pinhole without skew and with square pixels.
     fx, skew, cx, zero, fy, cy, *last = matrix(path, tree, "camera_matrix", ((3, 3),))
     if min(fx, fy) <= 0 or skew or zero or last != [0, 0, 1]:
         raise InputError(
@@ -117,6 +122,7 @@ def read(path: Path) -> OpencvCalibration:
             f"camera_matrix: fx {fx:g} and fy {fy:g} differ by {100 * abs(fx / fy - 1):.2g} %",
             f"square pixels, to {100 * MAX_ASPECT_ERROR:g} % (calibrate with CALIB_FIX_ASPECT_RATIO)",
         )
+    # 3. Distortion: the terms beyond the fifth, of other models, must be zero.
     shapes = tuple(shape for n in (4, 5, 8, 12, 14) for shape in ((1, n), (n, 1)))
     coefficients = matrix(path, tree, "distortion_coefficients", shapes)
     if any(coefficients[5:]):
@@ -128,7 +134,10 @@ def read(path: Path) -> OpencvCalibration:
 
 
 def parse_file(path: Path) -> dict[str, Any]:
-    """The file's mapping. OpenCV before 5 begins it with %YAML:1.0, which is invalid YAML. Raises InputError."""
+    """The mapping in the file. Raises InputError.
+
+    OpenCV before version 5 begins a file with %YAML:1.0, which is invalid YAML.
+    """
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -149,7 +158,7 @@ def parse_file(path: Path) -> dict[str, Any]:
 
 
 def image_side(path: Path, tree: dict[str, Any], key: str) -> int:
-    """The width or height of the image, px. Raises InputError."""
+    """The width or height of the image. Raises InputError."""
     value = tree.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_SIDE_PX:
         problem = f"{key}: {excerpt(repr(value))} is not allowed"
@@ -173,24 +182,20 @@ def matrix(
             ", ".join(f"{rows}x{cols}" for rows, cols in shapes),
         )
     count = shape[0] * shape[1]
-    if (
-        not isinstance(data, list)
-        or len(data) != count
-        or not all(is_number(value) for value in data)
-    ):
+    if not isinstance(data, list) or len(data) != count or not all(map(is_number, data)):
         raise InputError(path, f"{key}: other data", f"{count} finite numbers")
     return [float(value) for value in data]
 
 
 def is_number(value: Any) -> bool:
-    """Whether the value is a finite number."""
+    """Whether the value is a number below 1e12, which excludes infinity and NaN."""
     return type(value) in (int, float) and abs(value) < 1e12
 
 
 def text(calibration: OpencvCalibration) -> str:
-    """The calibration as YAML that `read` and OpenCV's FileStorage (4 and 5) read."""
+    """The calibration as YAML for `read` and for OpenCV's FileStorage (versions 4 and 5)."""
     fx = calibration.focal_px
-    (cx, cy) = calibration.center_px
+    cx, cy = calibration.center_px
     return (
         "%YAML:1.0\n---\n"
         f"image_width: {calibration.width_px}\nimage_height: {calibration.height_px}\n"
@@ -200,7 +205,7 @@ def text(calibration: OpencvCalibration) -> str:
 
 
 def matrix_text(key: str, rows: int, cols: int, data: list[float]) -> str:
-    """A matrix of 64-bit floats, with all digits."""
+    """The YAML of a matrix of 64-bit floats, with all digits."""
     numbers = ", ".join(number_text(value) for value in data)
     return f"{key}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: [ {numbers} ]\n"
 

@@ -1,7 +1,8 @@
-"""The effective scene: every key with its value and where the value comes from.
+"""The effective scene: every key with its value and the origin of the value.
 
-The raw trees of all files are merged as `loader` merges them, but with leaves that know their origin (`Located`). The
-fields of the validated scene are then looked up in that tree; one that is not there has its default.
+1. Merge the raw trees of all files as `loader` does, with values that know their origin (`located_tree`).
+2. Look up each field of the validated scene in that tree; a field that is not there has its default (`entries`).
+3. Mark the keys that have no effect (unused.py).
 """
 
 from __future__ import annotations
@@ -17,16 +18,16 @@ from typing import Any, NamedTuple
 import yaml
 
 from skysim.core.units import ConfigModel, si_unit
-from skysim.core.yaml_reader import parse_yaml, read_yaml
+from skysim.core.yaml_reader import parse_yaml, read_yaml, shared_depth
 from skysim.scene import loader, unused
 from skysim.scene.loader import CALIBRATED_KEYS, Layer, merge
 from skysim.scene.scene import NAME_ALIAS
 
-COMMENT_COLUMN = 44  # of the origins; longer lines have theirs at their end
+COMMENT_COLUMN = 44  # column of the origins; a longer line has its origin at its end
 
 
 class Origin(NamedTuple):
-    """Where a value comes from: a description, and the file and the line if it is from a file."""
+    """The origin of a value: a description, and file and line if it is from a file."""
 
     what: str
     file: str = ""
@@ -41,12 +42,18 @@ OVERRIDE = Origin("--set")
 
 
 class Entry(NamedTuple):
-    """One key of the effective scene: its path, its value as YAML has it, and where it comes from.
+    """One key of the effective scene.
 
     Attributes
     ----------
+    path
+        Nested keys
+    value
+        Value as in YAML
+    origin
+        Origin of the value
     no_effect
-        Why the key does nothing in this scene; empty if it does something
+        Reason why the key has no effect in this scene; empty if it has one
     """
 
     path: tuple[str, ...]
@@ -57,26 +64,30 @@ class Entry(NamedTuple):
 
 @dataclass(frozen=True)
 class Located:
-    """A raw value with its origin; two are equal if their values are, as `merge` compares kinds."""
+    """A raw value with its origin. Two are equal if their values are, because `merge` compares kinds."""
 
     value: Any
     origin: Origin = field(compare=False)
 
 
 def effective(name: str | Path, overrides: Mapping[str, str] | None = None) -> list[Entry]:
-    """Every key of a scene in the order of the schema. Raises InputError as `loader.load`."""
+    """All keys of a scene in the order of the schema. Raises InputError as `loader.load`."""
+    # 1. Tree with origins.
     overrides = overrides or {}
     scene = loader.load(name, overrides)
     tree = located_tree(loader.read_layers(loader.find(str(name))), overrides)
-    found = [entry for entry in entries(scene, tree) if entry.path != (NAME_ALIAS,)]
-    reasons = (
-        "" if entry.value is None else unused.reason(".".join(entry.path), scene) for entry in found
-    )
-    return [entry._replace(no_effect=reason) for entry, reason in zip(found, reasons, strict=True)]
+    # 2. Fields of the scene. 3. Reasons.
+    found = []
+    for entry in entries(scene, tree):
+        if entry.path != (NAME_ALIAS,):
+            unset = entry.value is None
+            reason = "" if unset else unused.reason(".".join(entry.path), scene)
+            found.append(entry._replace(no_effect=reason))
+    return found
 
 
 def located_tree(layers: list[Layer], overrides: Mapping[str, str]) -> dict[str, Any]:
-    """The raw scene with preset, calibration and overrides applied, and an origin for each value."""
+    """The raw scene with preset, calibration and overrides applied, and the origin of each value."""
     whats = ["this file", *(f"base {layer.path.name}" for layer in layers[1:])]
     trees = [with_origins(*layer, what) for layer, what in zip(layers, whats, strict=True)]
     tree: dict[str, Any] = functools.reduce(over_base, reversed(trees))
@@ -95,7 +106,7 @@ def over_base(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 
 
 def preset_camera(preset: Located) -> dict[str, Any]:
-    """The camera of a preset with the origin of each value; empty if there is none."""
+    """The camera section of a preset with the origin of each value; empty if there is no preset."""
     if preset.value is None:
         return {}
     path = loader.preset_path(str(preset.value))
@@ -105,7 +116,7 @@ def preset_camera(preset: Located) -> dict[str, Any]:
 
 
 def with_preset(camera: dict[str, Any]) -> dict[str, Any]:
-    """The camera's keys over those of its preset, and a calibration's over both."""
+    """The keys of a camera over those of its preset, and the keys of a calibration over both."""
     own = {key: value for key, value in camera.items() if key not in ("preset", "calibration")}
     if preset := camera.get("preset"):
         own = merge(preset_camera(preset), own)
@@ -117,10 +128,11 @@ def with_preset(camera: dict[str, Any]) -> dict[str, Any]:
 
 
 def with_origins(path: Path, text: str, tree: Mapping[str, Any], what: str) -> dict[str, Any]:
-    """A file's tree with the origin of each value; lists are values."""
+    """The tree of a file with the origin of each value; a list is one value."""
     lines = lines_of(text)
 
     def locate(value: Any, keys: tuple[str, ...]) -> Any:
+        """The value at nested keys with its origin, or the mapping with those of its values."""
         if isinstance(value, dict):
             return {key: locate(inner, (*keys, str(key))) for key, inner in value.items()}
         return Located(value, Origin(what, str(path), lines.get(keys, 0)))
@@ -130,10 +142,11 @@ def with_origins(path: Path, text: str, tree: Mapping[str, Any], what: str) -> d
 
 
 def lines_of(text: str) -> dict[tuple[str, ...], int]:
-    """The line of every key of a YAML text, by its path."""
+    """The line of every key of a YAML text, by nested keys."""
     lines: dict[tuple[str, ...], int] = {}
 
     def visit(node: yaml.Node | None, keys: tuple[str, ...]) -> None:
+        """Add the lines below a node at nested keys."""
         for key, value in node.value if isinstance(node, yaml.MappingNode) else ():
             lines[(*keys, str(key.value))] = key.start_mark.line + 1
             visit(value, (*keys, str(key.value)))
@@ -143,11 +156,12 @@ def lines_of(text: str) -> dict[tuple[str, ...], int]:
 
 
 def put(tree: Any, keys: list[str], value: Any) -> Any:
-    """The tree with the value of an override; an element of a list makes the list the override's."""
+    """The tree with the value of an override at nested keys; an override of an element is the origin of its list."""
     if keys and (isinstance(tree, dict) or tree is None):
         tree = tree or {}
         return tree | {keys[0]: put(tree.get(keys[0]), keys[1:], value)}
-    if keys:  # within a list
+    # Keys that are left lead into a list.
+    if keys:
         return Located(None, OVERRIDE)
     if isinstance(value, dict):
         return {key: put(None, [], inner) for key, inner in value.items()}
@@ -155,13 +169,17 @@ def put(tree: Any, keys: list[str], value: Any) -> Any:
 
 
 def entries(model: ConfigModel, tree: Any, parent: tuple[str, ...] = ()) -> Iterator[Entry]:
-    """The keys of a section, with those of its sections; tree: the located values of the section, or one for all."""
+    """Yield the keys of a section and of the sections in it.
+
+    `tree` has the located values of the section, or is one located value for the section as a whole.
+    """
     for name, info in type(model).model_fields.items():
         key = info.alias or name
         value = getattr(model, name)
         raw = tree.get(key) if isinstance(tree, dict) else None
+        # A section may be written as one value, such as control: pid.
         if isinstance(tree, Located) and tree.value == value:
-            raw = tree  # a section in short: control: pid
+            raw = tree
         if isinstance(value, ConfigModel):
             yield from entries(value, raw, (*parent, key))
         else:
@@ -171,7 +189,7 @@ def entries(model: ConfigModel, tree: Any, parent: tuple[str, ...] = ()) -> Iter
 
 
 def origins_in(tree: Any) -> Iterator[Origin]:
-    """The origins of the values within a tree: of a key whose value is any mapping."""
+    """Yield the origins of the values within a tree, since the value of a key may be any mapping."""
     if isinstance(tree, Located):
         yield tree.origin
     for inner in tree.values() if isinstance(tree, dict) else ():
@@ -184,12 +202,9 @@ def sections(value: Any) -> bool:
 
 
 def plain(value: Any, name: str) -> Any:
-    """A value of the schema as YAML has it: quantities with their unit, sections of a list as mappings.
+    """A value of the schema as in YAML: quantities with their unit, sections of a list as mappings.
 
-    Parameters
-    ----------
-    name
-        Of its field, whose suffix gives the unit
+    The suffix of the field's name gives the unit.
     """
     if isinstance(value, ConfigModel):
         return {
@@ -206,13 +221,13 @@ def plain(value: Any, name: str) -> Any:
 
 
 def tidy(value: float) -> float | int:
-    """The number without the digits of rounding in its unit's conversion: the shortest within 1e-15 of it."""
+    """The number rounded to 15 digits, without the rounding error of its unit's conversion."""
     short = float(f"{value:.15g}")
     return int(short) if short.is_integer() and abs(short) < 1e15 else short
 
 
 def as_dicts(found: list[Entry]) -> list[dict[str, Any]]:
-    """The entries for JSON: key, value, what, file, line, no_effect; dates as ISO 8601."""
+    """The entries as JSON objects: key, value, what, file, line, no_effect; dates as ISO 8601."""
     return [
         {
             "key": ".".join(path),
@@ -225,18 +240,15 @@ def as_dicts(found: list[Entry]) -> list[dict[str, Any]]:
 
 
 def text(found: list[Entry]) -> str:
-    """The effective scene as YAML; each line ends with the origin of its value, and `no effect` if it has none."""
+    """The effective scene as YAML; each line ends with the origin of its value, and `no effect` if that is so."""
     lines: list[tuple[str, str]] = []
-    open_: tuple[str, ...] = ()
+    open_: list[str] = []
     for path, value, origin, no_effect in found:
         *parents, key = path
-        shared = next(
-            (n for n, pair in enumerate(zip(open_, parents, strict=False)) if pair[0] != pair[1]),
-            len(open_),
-        )
-        shared = min(shared, len(parents))
+        # Open the sections that the previous key does not share.
+        shared = shared_depth(open_, parents)
         lines += [(f"{'  ' * depth}{parents[depth]}:", "") for depth in range(shared, len(parents))]
-        open_ = tuple(parents)
+        open_ = parents
         indent = "  " * len(parents)
         comment = f"{origin}; no effect" if no_effect else str(origin)
         if not (isinstance(value, list) and value and isinstance(value[0], dict)):

@@ -30,24 +30,24 @@ from skysim.scene.sections.vehicle import SiteConfig, VehicleConfig
 
 NAME_ALIAS = "(the file's name)"  # alias of Scene.name, not a valid key in a file
 
-EPHEMERIS_KEYS = "bodies", "satellites"  # of a light, whose places need the ephemeris
+EPHEMERIS_KEYS = "bodies", "satellites"  # keys of a light that need the ephemeris
 BODIES_YEARS = 1972, 2100  # UTC has leap seconds from 1972; the ephemeris ends with 2100
-# of a run, limited by memory
+# Of a run, limited by memory.
 MAX_FRAMES = 1_000_000
 MAX_DURATION_S = DAY_S
 
 
 class ExposureConfig(ConfigModel):
-    """Exposure time, frame rate, number of frames, the time of the first, and the camera's timing errors.
+    """Exposure time, frame rate, number of frames, time of the first frame, and the camera's timing errors.
 
     Attributes
     ----------
     trigger_jitter
-        An exposure begins up to so much late, uniformly distributed
+        Greatest delay of the beginning of an exposure, uniformly distributed
     time_tag_offset
-        The time given to a frame minus the true time of mid-exposure, on average
+        Mean of a frame's time tag minus the true time of mid-exposure
     time_tag_jitter
-        Its standard deviation from frame to frame, or a tolerance
+        Standard deviation of that difference from frame to frame, or a tolerance
     """
 
     time_s: Annotated[Time, Field(ge=1e-6)]
@@ -60,6 +60,7 @@ class ExposureConfig(ConfigModel):
 
     @model_validator(mode="after")
     def check_period(self) -> ExposureConfig:
+        """Check that an exposure ends before the next begins, and that the run is not too long."""
         if self.time_s + self.trigger_jitter_s > 1 / self.rate_hz:
             jitter = (
                 f" plus trigger_jitter {self.trigger_jitter_s:g} s" if self.trigger_jitter_s else ""
@@ -79,26 +80,24 @@ class ExposureConfig(ConfigModel):
 
 
 class HeadConfig(ConfigModel):
-    """A further star camera on the vehicle, beside that of the sections `camera` and `tracker`, the main one.
+    """A further star camera on the vehicle, in addition to the main one of the sections `camera` and `tracker`.
 
     Attributes
     ----------
     name
-        Of its folder in the results, and in messages
+        Name of its folder in the results, and in messages
     position
-        Of its entrance pupil on the body
+        Position of its entrance pupil on the body
     rotation_deg
-        Its axes are those of the main camera turned by this rotation vector, about the main
-        camera's axes (+x right, +y down, +z boresight): [0, 90, 0] looks to the right of the
-        main camera's image
+        Rotation vector from the axes of the main camera to its own, in the axes of the main camera (+x right, +y down,
+        +z boresight): [0, 90, 0] looks to the right of the main camera's image
     mount_error_arcsec
-        Rotation of the real camera from the assumed mount, about its own axes; its tracker does
-        not know of it
+        Rotation of the real camera from the assumed mount, about its own axes, unknown to its tracker
     mount_arcsec_k
         The same for each kelvin of `thermal`
     camera, tracker, exposure
-        Keys that differ from those of the main camera. Its camera is another unit: its
-        hardware_seed is the next one unless it is given
+        Keys that differ from those of the main camera. The camera is another unit: its hardware_seed is the next one
+        unless it is given
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z]\w*$", max_length=40)]
@@ -112,11 +111,8 @@ class HeadConfig(ConfigModel):
 
 
 MAX_HEADS = 8
-HEAD_SECTIONS = (
-    "camera",
-    "tracker",
-    "exposure",
-)  # whose keys in a head are put over those of the main camera
+# Sections of a head, whose keys override those of the main camera.
+HEAD_SECTIONS = ("camera", "tracker", "exposure")
 
 
 class Scene(ConfigModel):
@@ -143,23 +139,24 @@ class Scene(ConfigModel):
 
     @model_validator(mode="after")
     def check_light_source(self) -> Scene:
-        """Check what depends on the kind of light source, and that the shutter reads all rows within a frame period."""
-        # Survey errors and maps need LEDs. The start is a pointing under the stars and an attitude otherwise.
+        """Check keys that depend on the kind of light, and that the shutter reads all rows within a frame period."""
         sky = self.light.kind == "stars"
         tracker = self.tracker
-        # Without LEDs the focal length alone is surveyed.
-        lens = {
-            "focal_length_sigma_m": tracker.survey.focal_length_sigma_m,
-            "seed": tracker.survey.seed,
-        }
-        lens_only = SurveyErrorsConfig().model_copy(
-            update=lens if tracker.survey.focal_length_sigma_m else {}
-        )
+        # Survey errors and maps need LEDs; without LEDs only the focal length is surveyed.
+        lens_only = SurveyErrorsConfig()
+        if tracker.survey.focal_length_sigma_m:
+            lens_only = lens_only.model_copy(
+                update={
+                    "focal_length_sigma_m": tracker.survey.focal_length_sigma_m,
+                    "seed": tracker.survey.seed,
+                }
+            )
         if not isinstance(self.light, DomeConfig) and (tracker.survey != lens_only or tracker.map):
             key = "map" if tracker.map else "survey"
             raise InputError(
                 f"tracker.{key}", f"light of kind {self.light.kind} has no LEDs to survey", "dome"
             )
+        # The start is a pointing under the stars, else an attitude.
         if self.motion.start != "profile" and sky != isinstance(self.motion.start, PointingConfig):
             keys = "ra_deg, dec_deg, roll_deg" if sky else "roll_deg, pitch_deg, yaw_deg"
             raise InputError("motion.start", f"light of kind {self.light.kind} requires {keys}")
@@ -177,7 +174,7 @@ class Scene(ConfigModel):
 
     @model_validator(mode="after")
     def complete_layout(self) -> Scene:
-        """The scene whose optimized layout has a field of view and a camera: those that it leaves out are its own."""
+        """The scene with the field of view and the camera position of an optimized layout completed by its own."""
         layout = self.light.layout if isinstance(self.light, DomeConfig) else None
         nested = isinstance(layout, OnPoints)
         points = layout.points if isinstance(layout, OnPoints) else layout
@@ -199,7 +196,7 @@ class Scene(ConfigModel):
 
     @model_validator(mode="after")
     def check_code(self) -> Scene:
-        """Check that the decoder has a code, and the code a shutter whose rows show the same bits."""
+        """Check that the decoder has a code, and that all rows of the shutter show the same bits."""
         code = self.light.led.code if isinstance(self.light, DomeConfig) else None
         if self.tracker.decoder and code is None:
             raise InputError("tracker.decoder", "requires light.led.code")
@@ -213,7 +210,7 @@ class Scene(ConfigModel):
 
     @model_validator(mode="after")
     def check_bodies(self) -> Scene:
-        """Check that the ephemeris of the bodies holds at the scene's time."""
+        """Check that the ephemeris is valid at the scene's time."""
         first, last = BODIES_YEARS
         sections = {
             "orbit": self.orbit,
@@ -226,7 +223,7 @@ class Scene(ConfigModel):
 
     @model_validator(mode="after")
     def check_orbit(self) -> Scene:
-        """Check that an orbit is under the stars, and that satellites have a place from which they are seen."""
+        """Check that an orbit is under the stars, and that satellites have an orbit or a site."""
         if self.orbit and not isinstance(self.light, StarsConfig):
             raise InputError(
                 "orbit", f"light of kind {self.light.kind} is in a laboratory", "stars"
@@ -240,9 +237,9 @@ class Scene(ConfigModel):
 
     @model_validator(mode="after")
     def check_air(self) -> Scene:
-        """Check that the air has a site, and that the ephemeris of the Sun and the Moon that light it holds."""
+        """Check that the air has a site, and that the ephemeris of its light, Sun and Moon, is valid."""
         air = getattr(self.light, "air", None)
-        (first, last) = BODIES_YEARS
+        first, last = BODIES_YEARS
         if air and self.orbit:
             raise InputError(
                 "light.air", "the camera is in an orbit, above the air", "light.air or orbit"
@@ -263,7 +260,7 @@ class Scene(ConfigModel):
 
     @model_validator(mode="after")
     def check_exposure_limits(self) -> Scene:
-        """Check that any exposure the exposure control may select ends before the next one begins."""
+        """Check that every exposure that the exposure control may select ends before the next one begins."""
         control = self.tracker.exposure_control
         period_s = 1 / self.exposure.rate_hz
         if control is None:
@@ -283,7 +280,7 @@ class Scene(ConfigModel):
 
     @model_validator(mode="after")
     def check_control(self) -> Scene:
-        """Check that the controller's actuators and its source of the attitude are in the scene."""
+        """Check that the actuators of the controller and its source of the attitude are in the scene."""
         control = self.motion.control
         imu = self.vehicle.imu
         if self.filter and not imu:
@@ -311,7 +308,7 @@ class Scene(ConfigModel):
 
     @model_validator(mode="after")
     def check_rates(self) -> Scene:
-        """Check that a control period is a whole number of milliseconds and of IMU samples, and samples every sine."""
+        """Check that a control period is a whole number of milliseconds and of IMU samples, and resolves every sine."""
         rate_hz = self.control_rate_hz
         if abs(1000 / rate_hz - round(1000 / rate_hz)) > 1e-9:
             raise InputError(
@@ -343,7 +340,7 @@ class Scene(ConfigModel):
 
     @model_validator(mode="after")
     def check_heads(self) -> Scene:
-        """Check that heads have different names, and each camera and tracker against the rest of the scene."""
+        """Check that heads have different names, and that each makes a valid scene with its camera and tracker."""
         names = [head.name for head in self.heads]
         for n, head in enumerate(self.heads):
             if head.name in ("main", *names[:n]):
@@ -351,13 +348,11 @@ class Scene(ConfigModel):
             if any(head.mount_arcsec_k) and not self.thermal:
                 raise InputError(f"heads.{n}.mount_arcsec_k", "requires the section thermal")
             own = self.of_head(n)
+            values = {
+                field.alias or key: getattr(own, key) for key, field in Scene.model_fields.items()
+            }
             try:
-                Scene.model_validate(
-                    {
-                        field.alias or key: getattr(own, key)
-                        for key, field in Scene.model_fields.items()
-                    }
-                )
+                Scene.model_validate(values)
             except ValidationError as error:
                 first = error.errors()[0]
                 section = ".".join(map(str, ("heads", n, *first["loc"])))
@@ -365,7 +360,7 @@ class Scene(ConfigModel):
         return self
 
     def of_head(self, n: int) -> Scene:
-        """The scene with head n as its only camera. Its noise and timing are drawn from a seed of its own."""
+        """The scene with head n as its only camera, whose noise and timing have their own seed."""
         head = self.heads[n]
         main = self.camera
         camera = head.camera or main
@@ -390,7 +385,7 @@ class Scene(ConfigModel):
 
     @property
     def summary(self) -> list[tuple[str, str]]:
-        """What the scene has, one line a section, for tables."""
+        """Name and description of each section of the scene, for tables."""
         camera = self.camera
         exposure = self.exposure
         control = self.motion.control
@@ -421,7 +416,7 @@ class Scene(ConfigModel):
         ]
 
     def _repr_html_(self) -> str:
-        """For notebooks: what the scene has, one row a section."""
+        """A table of the scene's sections for notebooks."""
         cells = "".join(
             f"<tr><th>{key}</th><td>{html.escape(text)}</td></tr>" for key, text in self.summary
         )
@@ -429,5 +424,5 @@ class Scene(ConfigModel):
 
     @property
     def control_rate_hz(self) -> float:
-        """Tick rate of the vehicle's computer, with or without a controller."""
+        """Rate of the control periods, with or without a controller."""
         return self.motion.control.rate_hz if self.motion.control else 100.0

@@ -1,12 +1,14 @@
-"""Refuse options that have no effect: the table of rules, and the search for keys that break one.
+"""Refuse options that have no effect: the rules of a scene, and the search for keys that one of them applies to.
 
-A rule names keys, the scenes in which they change neither the motion nor a frame nor a solution, and why. A key is
-refused where it is written: in a scene's own file if it has no effect in the scene that this file makes, and in an
-override (`--set`, a study's `set` or factor) if it has none in the resulting scene. Keys of a base scene or a preset
-are tolerated, and so are keys of the file that only an override makes useless, and values that equal the default.
+A rule names keys, the scenes in which they change neither the motion nor a frame nor a solution, and the reason. A key
+is refused where it is written: in a scene's own file if it has no effect in the scene of this file, and in an override
+(`--set`, a study's `set` or factor) if it has none in the resulting scene. Keys of a base scene or a preset are
+tolerated. So are keys of the file that only an override makes useless, and values that equal the default.
 
-Not refused is what is used elsewhere although a run does not use it: the time tags of frames and `start_time`, which
-are written to the results, and limits of actuators, which other controllers and the exported model obey.
+Keys that have a use outside of a run are not refused: the time tags of frames and `start_time`, which are written to
+the results, and limits of actuators, which other controllers and the exported model obey.
+
+Studies have further rules (experiments/study/unused_options.py), which `find` searches in the same way.
 """
 
 from __future__ import annotations
@@ -33,20 +35,22 @@ from skysim.scene.sections.leds import DirectConfig, PwmConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.scene.sections.surroundings import NEGLIGIBLE_PX
 
-SURFACE_SOLVERS = ("thesis", "ray_on_surface")  # the solvers that use the surveyed surface
-FIXED_DETECTORS = ("thesis",)  # the detectors with thresholds of their own
+SURFACE_SOLVERS = ("thesis", "ray_on_surface")  # solvers that use the surveyed surface
+FIXED_DETECTORS = ("thesis",)  # detectors with their own thresholds
 OWN = "own"  # skysim's tracker
 
 
 class Rule(NamedTuple):
-    """Keys that have no effect where `applies` is true, why, and what is allowed.
+    """Keys that have no effect in some scenes.
 
     Attributes
     ----------
     keys
-        Dotted keys; that of a section stands for all keys in it
+        Dotted keys; the key of a section stands for all keys in it
     applies
-        Takes the scene (in the rules of studies, the scene and the trial)
+        Function of the scene (for a study's rule, of the scene and the trial): whether the keys have no effect
+    reason, allowed
+        Reason and alternative for the error message
     """
 
     keys: tuple[str, ...]
@@ -55,7 +59,11 @@ class Rule(NamedTuple):
     allowed: str
 
 
+# Conditions of the rules.
+
+
 def under_dome(scene: Scene) -> bool:
+    """Whether the light is an LED dome."""
     return isinstance(scene.light, DomeConfig)
 
 
@@ -65,7 +73,7 @@ def steady(scene: Scene) -> bool:
 
 
 def equally_bright(scene: Scene) -> bool:
-    """Whether all LEDs of a dome have one nominal brightness; LEDs of a file and of a sky have not."""
+    """Whether all LEDs of a dome have one nominal brightness; those of a file and of a sky do not."""
     if not isinstance(scene.light, DomeConfig):
         return False
     layout = scene.light.layout
@@ -81,7 +89,7 @@ def equally_bright(scene: Scene) -> bool:
 
 
 def free_running_code(scene: Scene) -> bool:
-    """Whether the LEDs' bits have a clock of their own."""
+    """Whether the LEDs' bits have their own clock."""
     code = scene.light.led.code if isinstance(scene.light, DomeConfig) else None
     return code is not None and code.bit_time_s != "frame"
 
@@ -92,6 +100,7 @@ def actuators(scene: Scene) -> str:
 
 
 def external(scene: Scene) -> bool:
+    """Whether the tracker is an external one."""
     return scene.tracker.name != OWN
 
 
@@ -102,7 +111,7 @@ def surface_unused(scene: Scene) -> bool:
 
 
 def survey_draws_nothing(scene: Scene) -> bool:
-    """Whether no survey error is drawn from `tracker.survey.seed`."""
+    """Whether `tracker.survey.seed` draws no survey error."""
     survey = scene.tracker.survey
     surface_m = scene.light.surface.error_m if isinstance(scene.light, DomeConfig) else 0.0
     drawn = (
@@ -115,12 +124,13 @@ def survey_draws_nothing(scene: Scene) -> bool:
 
 
 def listed_boards(scene: Scene) -> bool:
+    """Whether the layout lists its boards."""
     layout = getattr(scene.light, "layout", None)
     return isinstance(layout, PatchBoardsConfig) and bool(layout.boards)
 
 
 def dome_draws_nothing(scene: Scene) -> bool:
-    """Whether LEDs, their brightness and their pulses are all without anything random."""
+    """Whether neither the places of the LEDs nor their brightness nor their pulses are random."""
     if not isinstance(scene.light, DomeConfig) or not steady(scene):
         return False
     led = scene.light.led
@@ -130,8 +140,9 @@ def dome_draws_nothing(scene: Scene) -> bool:
     if isinstance(layout, FibersConfig) and (layout.radius_variation or layout.aiming):
         return False
     points = layout.points if isinstance(layout, OnPoints) else layout
+    # The level of each LED of a spiral is drawn from the list.
     if isinstance(points, FibonacciConfig):
-        return len(set(points.dimming)) == 1  # the level of each LED is drawn from the list
+        return len(set(points.dimming)) == 1
     return isinstance(points, ListedConfig | CelestialConfig)
 
 
@@ -141,54 +152,59 @@ def cold(detector: DetectorConfig) -> bool:
 
 
 def uniform_chip(detector: DetectorConfig) -> bool:
-    """Whether the chip has no fixed pattern."""
+    """Whether the detector has no fixed pattern."""
     dsnu = detector.dsnu and detector.dark_e_s
     hot = detector.hot_pixels and detector.hot_e_s
     return not (detector.prnu or detector.column_offset_e or dsnu or hot)
 
 
 def earth_unused(scene: Scene) -> bool:
+    """Whether neither the dynamics nor the IMU has the Earth's rotation."""
     imu = scene.vehicle.imu
-    return not scene.vehicle.disturbances.earth_rotation and (
-        imu is None or imu.earth_rate == "none"
-    )
+    sensed = imu is not None and imu.earth_rate != "none"
+    return not (scene.vehicle.disturbances.earth_rotation or sensed)
 
 
 def flat_wall(scene: Scene) -> bool:
+    """Whether the LEDs are on a flat wall."""
     return isinstance(scene.light, DomeConfig) and scene.light.surface.kind == "flat"
 
 
 def has_floor(scene: Scene) -> bool:
+    """Whether a floor reflects the LEDs."""
     reflection = getattr(scene.light, "reflection", None)
     return reflection is not None and reflection.floor is not None
 
 
 def seen_from_earth(scene: Scene) -> bool:
-    """Whether bodies or satellites are seen from the Earth: from its center or from a site."""
+    """Whether bodies or satellites are seen from the Earth: from its center, or from a site."""
     bodies, satellites = (getattr(scene.light, key, None) for key in ("bodies", "satellites"))
     return scene.orbit is None and bool(bodies or (satellites and satellites.file))
 
 
 def has_air(scene: Scene) -> bool:
+    """Whether there is air between the camera and the stars."""
     return getattr(scene.light, "air", None) is not None
 
 
 def seen_from_ground(scene: Scene) -> bool:
-    """Whether what is seen depends on the place on the Earth."""
+    """Whether the view depends on the place on the Earth."""
     return has_air(scene) or (seen_from_earth(scene) and scene.site.longitude_deg is not None)
 
 
 def nothing_beside_the_field(scene: Scene) -> bool:
-    """Whether no body and no lit Earth throws stray light."""
+    """Whether neither a body nor the lit Earth causes stray light."""
     lit_earth = scene.orbit is not None and scene.orbit.earth is not None
     return getattr(scene.light, "bodies", None) is None and not lit_earth
 
 
 def seeing_is_narrow(scene: Scene) -> bool:
+    """Whether the seeing is negligible compared with a pixel."""
     air = getattr(scene.light, "air", None)
     return air is not None and not air.seeing_px(scene.camera.focal_px)
 
 
+# The rules, by section of the scene.
 RULES = (
     Rule(
         ("tracker.catalog", "tracker.limit_mag"),
@@ -504,13 +520,15 @@ def check(
     Parameters
     ----------
     scene
-        With the overrides
+        The scene, with the overrides
     own
-        Keys of its own file, not of its base
+        Keys of its own file, without those of its base
+    overrides
+        YAML texts by dotted key
     files
-        For the location
+        Paths and texts of the files, to locate a key
     without_overrides
-        Makes the scene of the file alone
+        Returns the scene of the file alone
     """
     check_overrides([scene], overrides)
     for key in set_keys(own):
@@ -522,11 +540,10 @@ def check(
 
 
 def check_heads(scene: Scene, own: Mapping[str, Any], files: Files) -> None:
-    """Raise InputError for the first key of a head of the scene's own file that has no effect in that head's scene."""
+    """Raise InputError for the first key of a head in the scene's own file that has no effect in the head's scene."""
     for n, head in enumerate(own.get("heads") or ()):
-        for key in set_keys(
-            {section: head[section] for section in HEAD_SECTIONS if section in head}
-        ):
+        sections = {section: head[section] for section in HEAD_SECTIONS if section in head}
+        for key in set_keys(sections):
             if broken := find(RULES, [key], scene.of_head(n)):
                 error = no_effect(*broken).under(f"heads.{n}")
                 raise error.at(where_of(["heads", str(n), *key.split(".")], files, {}))
@@ -541,7 +558,7 @@ def check_overrides(scenes: Sequence[Scene], overrides: Mapping[str, str]) -> No
 
 
 def useless_in_file(key: str, without_overrides: Callable[[], Scene]) -> bool:
-    """Whether a key of a file has no effect there; False if the file alone is not a valid scene."""
+    """Whether a key of a file has no effect without overrides; False if the file alone is not a valid scene."""
     try:
         return find(RULES, [key], without_overrides()) is not None
     except InputError:
@@ -549,47 +566,47 @@ def useless_in_file(key: str, without_overrides: Callable[[], Scene]) -> bool:
 
 
 def no_effect(key: str, rule: Rule) -> InputError:
-    """The error of a key that has no effect: why, and what is allowed."""
-    return InputError(
-        key, f"has no effect: {rule.reason}", f"{rule.allowed}, or no {key.rpartition('.')[2]}"
-    )
+    """The error for a key that has no effect, with the rule's reason and alternative."""
+    last = key.rpartition(".")[2]
+    return InputError(key, f"has no effect: {rule.reason}", f"{rule.allowed}, or no {last}")
 
 
 def find(
     rules: Iterable[Rule], keys: Iterable[str], model: ConfigModel, *subject: Any
 ) -> tuple[str, Rule] | None:
-    """The first of the dotted keys whose value in the model is not the default and has no effect, and its rule.
+    """The first dotted key whose value has no effect and is not the default, and the rule; None without such a key.
 
     Parameters
     ----------
+    rules, keys
+        Rules and dotted keys to search
+    model
+        Validated section with the values, usually the scene
     subject
-        Arguments of the rules; the model if left out
+        Arguments of the rules; the model by default
     """
+    arguments = subject or (model,)
     for key in keys:
         for rule in rules:
             section = section_of(key, rule)
-            if (
-                section
-                and differs(model, section.split("."))
-                and rule.applies(*(subject or (model,)))
-            ):
+            if section and differs(model, section.split(".")) and rule.applies(*arguments):
                 return key, rule
     return None
 
 
 def reason(key: str, scene: Scene) -> str:
-    """Why a dotted key has no effect in a scene; empty if it has one."""
+    """The reason why a dotted key has no effect in a scene; empty if it has one."""
     rules = (rule for rule in RULES if section_of(key, rule) and rule.applies(scene))
     return next((rule.reason for rule in rules), "")
 
 
 def section_of(key: str, rule: Rule) -> str:
-    """The key of a rule that is a dotted key or a section that contains it; empty if there is none."""
+    """The rule's key that equals a dotted key or names a section that contains it; empty if there is none."""
     return next((name for name in rule.keys if key == name or key.startswith(f"{name}.")), "")
 
 
 def differs(model: Any, path: list[str]) -> bool:
-    """Whether the value at a path of YAML keys is in the model, and not the default of its field."""
+    """Whether the model has a value at a path of YAML keys that is not the default of its field."""
     for depth, key in enumerate(path):
         name = field_names(type(model)).get(key) if isinstance(model, ConfigModel) else None
         if name is None:
@@ -605,12 +622,12 @@ def differs(model: Any, path: list[str]) -> bool:
 
 @cache
 def field_names(model: type[ConfigModel]) -> dict[str, str]:
-    """The names of a model's fields by YAML key."""
+    """Names of a model's fields by YAML key."""
     return {field.alias or name: name for name, field in model.model_fields.items()}
 
 
 def set_keys(tree: Mapping[str, Any], parent: str = "") -> Iterator[str]:
-    """The dotted keys that a raw section sets; lists are values."""
+    """Yield the dotted keys that a raw section sets; a list is a value."""
     for key, value in tree.items():
         if isinstance(value, dict) and value:
             yield from set_keys(value, f"{parent}{key}.")
@@ -619,5 +636,5 @@ def set_keys(tree: Mapping[str, Any], parent: str = "") -> Iterator[str]:
 
 
 def override_keys(overrides: Mapping[str, str]) -> list[str]:
-    """The dotted keys that overrides set; a section as a value sets all keys in it."""
+    """The dotted keys that overrides set; a value that is a section sets all keys in it."""
     return list(set_keys({key: parse_yaml(text)[1] for key, text in overrides.items()}))

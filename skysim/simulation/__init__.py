@@ -1,4 +1,4 @@
 """Run a scene: build the lab, fly it, expose the frames, close the loop.
 
-`lab` is what is there, `flight` moves it and yields the exposures, `checks` forecasts them.
+`lab` holds the hardware, `flight` moves it and yields the exposures, `checks` predicts them.
 """

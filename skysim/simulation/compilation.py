@@ -1,9 +1,13 @@
 """Compile the tracker in a second process while the first one compiles the renderer, which halves the time.
 
 numba compiles one function at a time and keeps the result on disk, where every process finds it. The packages skysim
-and estimator share no compiled function, so two processes can compile them at once. The command
-`python -m skysim.simulation.compilation SCENE [KEY=VALUE ...]` builds the scene's tracker and solves a synthetic
-frame, which needs no renderer.
+and estimator share no compiled function, so two processes can compile them at once:
+
+1. `TrackerCompilation` starts the second process when the first function of skysim is compiled.
+2. The second process, `python -m skysim.simulation.compilation SCENE [KEY=VALUE ...]`, builds the scene's tracker and
+   solves a synthetic frame, which needs no renderer.
+3. Before the first process compiles a function of estimator, it waits for the second one. Later functions then come
+   from numba's cache.
 """
 
 from __future__ import annotations
@@ -28,23 +32,21 @@ from skysim.simulation.timing import exposure_window
 from skysim.tracking import factory
 from skysim.tracking.onboard_model import assumed_camera
 
-SPOT_SIGMA_PX = 2.0  # wide enough for every shipped scene's smallest area, or nothing after the detector is compiled
+# Wide enough for the smallest area of every shipped scene: without detections, no later stage would be compiled.
+SPOT_SIGMA_PX = 2.0
 NOISE_DN = 3.0
 MAX_SPOTS = 50
 
 
 class TrackerCompilation(event.Listener):
-    """Starts the second process when the first function of `skysim` is compiled.
-
-    Before a function of `estimator` is compiled here it waits for that process, so that all functions but this one then
-    come from numba's cache.
-    """
+    """Listener to numba that starts the second process, and waits for it, as the module's docstring says."""
 
     def __init__(self, arguments: Sequence[str]) -> None:
         self.command = [sys.executable, "-m", __name__, *arguments]
         self.process: subprocess.Popen[bytes] | None = None
 
     def on_start(self, compilation: event.Event) -> None:
+        """Called by numba before it compiles a function."""
         module = compilation.data["dispatcher"].py_func.__module__
         if self.process is None and module.startswith("skysim."):
             silent = subprocess.DEVNULL
@@ -60,7 +62,7 @@ class TrackerCompilation(event.Listener):
 
 @contextmanager
 def on_two_processes(scene: str, overrides: Mapping[str, str]) -> Iterator[None]:
-    """While this context lasts, compile the scene's tracker in a second process, if the renderer must be compiled."""
+    """Within this context, compile the scene's tracker in a second process if the renderer must be compiled."""
     listener = TrackerCompilation([scene, *(f"{key}={value}" for key, value in overrides.items())])
     event.register("numba:compile", listener)
     try:
@@ -77,8 +79,10 @@ def compile_tracker(scene: str, overrides: Sequence[str] = ()) -> None:
 
     Parameters
     ----------
+    scene
+        Name or path of the scene
     overrides
-        `KEY=VALUE` as on the command line
+        Texts `KEY=VALUE` as on the command line
     """
     lab = build_lab(loader.load(scene, parse_overrides(list(overrides))))
     warm_up(lab.camera, lab.start, build_tracker(lab.camera))
@@ -94,7 +98,8 @@ def warm_up(camera: StarCamera, lab_from_body: Rotation, tracker: factory.Estima
 
 
 def synthetic_frame(camera: StarCamera, lab_from_body: Rotation) -> Frame:
-    """A frame at an attitude with equal Gaussian spots at the LEDs or the brightest stars; it needs no renderer."""
+    """A frame at an attitude with equal Gaussian spots at the brightest LEDs or stars; it needs no renderer."""
+    # 1. Pixel positions of the sources in front of the camera.
     assumed = assumed_camera(camera.scene)
     when = exposure_window(camera.scene, 0)
     place = camera.sources.place[np.argsort(camera.sources.magnitude, kind="stable")]
@@ -102,6 +107,7 @@ def synthetic_frame(camera: StarCamera, lab_from_body: Rotation) -> Frame:
     vectors_cam = (camera.mount.cam_from_body * lab_from_body.inv()).apply(toward)
     xy_px = assumed.pixels(vectors_cam[vectors_cam[:, 2] > 0])
     xy_px = xy_px[assumed.contains(xy_px)][:MAX_SPOTS]
+    # 2. Background with noise, and the spots.
     full_dn = saturation_dn(camera.scene.camera.detector)
     image_dn = random_stream(0).normal(
         0.1 * full_dn, NOISE_DN, (assumed.height_px, assumed.width_px)
@@ -109,13 +115,11 @@ def synthetic_frame(camera: StarCamera, lab_from_body: Rotation) -> Frame:
     x = np.arange(assumed.width_px)
     y = np.arange(assumed.height_px)
     for x_px, y_px in xy_px:
-        along, down = (
-            np.exp(-(((axis - at) / SPOT_SIGMA_PX) ** 2) / 2) for axis, at in ((x, x_px), (y, y_px))
-        )
+        along = np.exp(-(((x - x_px) / SPOT_SIGMA_PX) ** 2) / 2)
+        down = np.exp(-(((y - y_px) / SPOT_SIGMA_PX) ** 2) / 2)
         image_dn += 0.5 * full_dn * np.outer(down, along)
-    return Frame(
-        0, np.clip(image_dn, 0, full_dn).astype(np.uint16), when.open_s, when.exposure_s, full_dn
-    )
+    image = np.clip(image_dn, 0, full_dn).astype(np.uint16)
+    return Frame(0, image, when.open_s, when.exposure_s, full_dn)
 
 
 if __name__ == "__main__":

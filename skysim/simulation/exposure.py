@@ -1,8 +1,11 @@
-"""Render one frame with its truth.
+"""Render one frame with its truth (`render_frame`).
 
-The lights of the camera are asked for the exposure (lights/light.py), and what comes through the lens is drawn:
-extended light first, then the points and the discs along each way through the lens (camera/render.py, camera/discs),
-then its glare. Charge smear of the shutter and the detector follow (camera/detector).
+1. Collect the light that reaches the lens in the exposure (lights/light.py).
+2. Draw extended light (camera/glow).
+3. Draw points and discs along each path through the lens (camera/render.py, camera/discs), then the lens's glare.
+4. Add the charge smear of the shutter (camera/detector).
+5. Convert the light to digital numbers: noise, charge, analog-to-digital conversion (camera/detector).
+6. Collect the truth of the frame.
 """
 
 from __future__ import annotations
@@ -33,7 +36,7 @@ from skysim.simulation.timing import (
     window_from,
 )
 
-KNOTS = 5  # of the motion in an exposure of constant rate
+KNOTS = 5  # attitude samples of an exposure at a constant rate
 
 
 def render_frame(
@@ -44,33 +47,48 @@ def render_frame(
     window: Window | None = None,
     added: AddedCharge | None = None,
 ) -> tuple[Frame, Truth]:
-    """Render one frame and its truth, both for mid-exposure of the middle row.
+    """A frame and its truth, both for mid-exposure of the middle row.
 
-    They depend only on the camera, its motion, the index and the window (the scene's if left out), not on other frames.
+    They do not depend on other frames.
 
     Parameters
     ----------
+    camera
+        Star camera
+    trajectory
+        Motion of the vehicle during the exposure
+    index
+        Number of the frame, which selects its random numbers
+    clock
+        Clock that measures the stages
+    window
+        Exposure window; by default that of the scene's schedule
     added
-        Gets the masks of smear and particles
+        Receives the masks of smear and particles
     """
     clock = clock or Clock()
     scene = camera.scene
     detector = camera.detector
     window = window or exposure_window(scene, index)
+    # 1. Light.
     exposure = exposure_of(camera, trajectory, index, window, camera.seeds)
     beam = beam_of(camera.lights, exposure)
-    # The canvas is reused for every frame: the glow overwrites it, all else is added to it.
+    # 2. Extended light. The canvas is reused for every frame: the glow overwrites it, the rest is added to it.
     light_e = camera.canvas
     draw_glow(light_e, beam, window.exposure_s)
+    # 3. Points, discs, glare.
     sources = draw_lights(light_e, beam, exposure)
+    # 4. Smear.
     smear(light_e, window.exposure_s, detector.shutter, added)
     # Saturation and SNR need the light of the whole frame, which `expose` then overwrites.
     sources = add_snr_and_saturation(sources, light_e, window.exposure_s, detector)
     clock.lap("render")
+    # 5. Detector.
     image = expose(
         light_e, window.exposure_s, detector, random_stream(scene.seed, DETECTOR, index), added
     )
     clock.lap("detector")
+    # 6. Frame with the camera's time tag, and truth.
     tagged_s = exposure.t_s + time_tag_error_s(scene, index)
     frame = Frame(index, image, tagged_s, window.exposure_s, saturation_dn(scene.camera.detector))
     return frame, truth_of(beam, exposure, sources)
@@ -79,21 +97,28 @@ def render_frame(
 def render_at_rest(
     camera: StarCamera, lab_from_body: Rotation, index: int = 0
 ) -> tuple[Frame, Truth]:
-    """Render one frame of a vehicle that is at rest at an attitude."""
-    return render_frame(
-        camera, Trajectory.at_rest(lab_from_body, frame_end_s(camera.scene, index)), index
-    )
+    """A frame of a vehicle at rest at an attitude, and its truth."""
+    trajectory = Trajectory.at_rest(lab_from_body, frame_end_s(camera.scene, index))
+    return render_frame(camera, trajectory, index)
 
 
 def exposure_of(
     camera: StarCamera, trajectory: Trajectory, index: int, window: Window, seeds: Seeds | None
 ) -> Exposure:
-    """An exposure of a camera, whose mount and lens are as error and temperature have them at mid-exposure.
+    """An exposure of a camera, with mount error and temperature of mid-exposure applied to mount and lens.
 
     Parameters
     ----------
+    camera
+        Star camera
+    trajectory
+        Motion of the vehicle during the exposure
+    index
+        Number of the frame
+    window
+        Exposure window
     seeds
-        None for the expectation, see `Exposure`
+        Seeds of the run; None for the expectation, see `Exposure`
     """
     mount = camera.mount
     optics = camera.optics
@@ -120,10 +145,16 @@ def exposure_of(
 def expected_exposure(
     camera: StarCamera, lab_from_body: Rotation, rate_body_rad_s: Floats, t_s: float
 ) -> Exposure:
-    """An exposure at an attitude and a constant rate, (3,) in body axes, in which nothing is drawn at random.
+    """An exposure at an attitude and a constant rate, without random draws.
 
     Parameters
     ----------
+    camera
+        Star camera
+    lab_from_body
+        Attitude at mid-exposure
+    rate_body_rad_s
+        (3,) rate in body axes
     t_s
         Middle of the first row's exposure; NaN for that of the first frame
     """
@@ -140,7 +171,7 @@ def expected_exposure(
 
 
 def draw_glow(image: NDArray[Any], beam: Beam, exposure_s: float) -> None:
-    """Set the (H, W) image to the extended light of a beam: first the smooth light together, then light with edges."""
+    """Set the (H, W) image to the extended light of a beam in electrons: smooth light, then light with edges."""
     smooth = sum(lit.glow() for lit in beam.lits if lit.glow)
     background.fill(image, np.atleast_2d(smooth), exposure_s)
     for edged in (lit.edged for lit in beam.lits if lit.edged):
@@ -150,8 +181,12 @@ def draw_glow(image: NDArray[Any], beam: Beam, exposure_s: float) -> None:
 
 
 def draw_lights(image: NDArray[Any], beam: Beam, exposure: Exposure) -> SourceTruth:
-    """Add the points and discs of a beam to the (H, W) image, in place, and the lens's glare; return their truth."""
+    """Add the points and discs of a beam to the (H, W) image in place, and the glare of the lens.
+
+    Returns the truth of their images.
+    """
     truths = []
+    # The first path is the image, the others are ghosts.
     for path in beam.paths:
         exposed = exposure.exposed(path.optics)
         for lit in beam.lits:
@@ -169,7 +204,7 @@ def draw_lights(image: NDArray[Any], beam: Beam, exposure: Exposure) -> SourceTr
 
 
 def truth_of(beam: Beam, exposure: Exposure, sources: SourceTruth) -> Truth:
-    """The truth of an exposure, from that of its images."""
+    """The truth of an exposure, from the truth of its images."""
     return Truth(
         exposure.t_s,
         exposure.lab_from_body,
@@ -183,15 +218,16 @@ def truth_of(beam: Beam, exposure: Exposure, sources: SourceTruth) -> Truth:
 
 
 def hidden_ids(beam: Beam, exposure: Exposure) -> NDArray[np.int64]:
-    """(M,) ids of the points that something hides and that would otherwise be on the chip at mid-exposure."""
+    """(M,) ids of the points that something hides and that would otherwise be on the detector at mid-exposure."""
     return np.concatenate([np.zeros(0, np.int64), *(hidden_of(lit, exposure) for lit in beam.lits)])
 
 
 def hidden_of(lit: Lit, exposure: Exposure) -> NDArray[np.int64]:
-    """(M,) the ids of `hidden_ids` of one light."""
+    """(M,) ids of `hidden_ids` among the points of one light."""
     occludes = lit.occlusion
     if lit.points is None or occludes is None:
         return np.zeros(0, np.int64)
+    # The detector ends half a pixel outside of the centers of its outer pixels.
     near = lit.points.take(in_view(lit.points, exposure.optics, exposure.pose, reach=0.0))
     xy_px = project(near, exposure.optics, exposure.pose)[0][0]
     size_px = np.array([exposure.optics.camera.width_px, exposure.optics.camera.height_px])

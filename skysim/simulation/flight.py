@@ -1,9 +1,11 @@
-"""A lab in flight: its motion, the exposures of its cameras as they become due, and what the vehicle recorded.
+"""A lab in flight: its motion, the exposures of its cameras as they become due, and the recorded telemetry.
 
-Every control period the flight computer reads the true or the estimated attitude and sets the actuators, MuJoCo
-integrates the equations of motion, and the IMU samples the motion (motion.py). A frame is rendered once, when its
-exposure and its latency have passed; it is solved, and with a filter the solution updates the attitude that the
-controller may use in the next period.
+`Flight.events` is the closed loop. Every control period:
+
+1. `Flight.advance`: the flight computer reads the true or the estimated attitude and sets the actuators, MuJoCo
+   integrates the equations of motion, and the IMU samples the motion (motion.py).
+2. `Flight.capture_due`: a frame is rendered once, when its exposure and its latency have passed. It is solved.
+3. With a filter the solution updates the attitude that the controller may use in the next period.
 """
 
 from __future__ import annotations
@@ -38,9 +40,8 @@ from skysim.simulation.motion import Motion, history_s
 from skysim.tracking import factory, navigation
 from skysim.tracking.factory import ExposureController
 
-FIRST_OBSERVATION = (
-    1_000_000  # index of the first frame beside the schedule; it selects the frame's noise
-)
+# Index of the first frame outside of the schedule. The index of a frame selects its noise.
+FIRST_OBSERVATION = 1_000_000
 
 Progress = Callable[[float, float], None]
 FrameSelector = Callable[[int, float], bool]
@@ -48,18 +49,22 @@ FrameSelector = Callable[[int, float], bool]
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One exposure: its frame and truth, and what the star tracker made of it.
+    """One exposure: its frame and truth, and the solution of the star tracker.
 
     Attributes
     ----------
+    camera
+        Star camera
+    frame, truth
+        Image and truth
     report
-        Of the tracker; None if the frame was not solved
+        Report of the tracker; None if the frame was not solved
     rate
-        Of the gyro as the tracker got it; None without `tracker.gyro`
+        Rate from the gyros that the tracker received; None without `tracker.gyro`
     update_status
-        The filter's verdict on the solution; empty without a filter
+        Status of the filter's update with the solution; empty without a filter
     seconds
-        By stage of the rendering
+        Computing time by stage of the rendering
     """
 
     camera: StarCamera
@@ -73,16 +78,20 @@ class Shot:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """The vehicle now, in truth.
+    """The true state of the vehicle.
 
     Attributes
     ----------
+    t_s
+        Time since the scene's start
     lab_from_body
-        attitude
+        Attitude
     rate_body_rad_s
-        (3,) in body axes
-    wheel_rad_s, gimbal_rad
-        (n,) speeds of the wheels, angles of the CMGs' gimbals
+        (3,) rate in body axes
+    wheel_rad_s
+        (n,) speeds of the reaction wheels
+    gimbal_rad
+        (n,) angles of the CMGs' gimbals
     """
 
     t_s: float
@@ -97,10 +106,18 @@ class Schedule:
 
     Attributes
     ----------
+    camera, number
+        Star camera and its number in the lab
+    frames
+        Number of frames; infinite in an endless flight
+    exposure_control
+        Chooses the exposure time of the next frame
+    latency_s
+        Time from the end of an exposure to its solution
     index
-        Of the next frame
+        Index of the next frame
     exposures_s
-        Exposure times by index, of the frames that were exposed
+        Exposure times of the frames exposed so far, by index
     """
 
     def __init__(self, camera: StarCamera, number: int, frames: float) -> None:
@@ -119,19 +136,19 @@ class Schedule:
 
     @property
     def window(self) -> Window:
-        """Of the next frame."""
+        """Exposure window of the next frame."""
         return timing.exposure_window(
             self.camera.scene, self.index, self.exposure_control.exposure_s
         )
 
     @property
     def close_s(self) -> float:
-        """When the exposure of the next frame ends."""
+        """Time at which the exposure of the next frame ends."""
         return self.window.close_s(self.camera.scene.camera.height_px)
 
     @property
     def due_s(self) -> float:
-        """When the next frame is due: exposed, its solution ready, and the time come that it is tagged with."""
+        """Time at which the next frame is due: it is exposed, its solution is ready, and its time tag has passed."""
         scene = self.camera.scene
         rows = scene.camera.height_px
         window = self.window
@@ -140,24 +157,25 @@ class Schedule:
 
 
 class Flight:
-    """A lab in motion, from t = 0 on. The only object that has a state; use one for one motion.
+    """A lab in motion, from t = 0 on. Stateful: use one object for one motion.
 
-    Attributes
+    Close it, or use it as a context manager: an external controller has a process.
+
+    Parameters
     ----------
+    lab
+        Laboratory to move
     parts
-        What the user gives in place of the scene's parts
+        User's parts that replace those of the scene
     endless
-        Frames continue without end, whatever the scene's number
+        Expose frames without end, whatever the scene's number of frames
     keeps_history
-        Keep all past states, for telemetry and trajectory; else only those that the next frame
-        needs
+        Keep all past states, for telemetry and trajectory; else only those that the next frame needs
 
     Raises
     ------
     InputError
-        For a maneuver that the vehicle cannot follow, and for an endless flight that is to keep
-        its history. Close it, or use it as a context manager: an external controller has a
-        process.
+        For a maneuver that the vehicle cannot follow, and for an endless flight that keeps its history.
     """
 
     def __init__(
@@ -209,7 +227,7 @@ class Flight:
 
     @property
     def state(self) -> State:
-        """The vehicle now."""
+        """The present state of the vehicle."""
         simulation = self.motion.simulation
         vehicle = self.lab.vehicle
         return State(
@@ -226,14 +244,14 @@ class Flight:
         Parameters
         ----------
         torque_nm
-            (3,) in body axes that the scene's actuators are to give, in place of the
-            controller's; the ideal actuator gives it where the scene has no controller
+            (3,) torque in body axes that replaces that of the controller. The scene's actuators give it, or the
+            ideal actuator if the scene has no controller
 
         Raises
         ------
         InputError
-            Inside a loop over `shots`, at the end of the motion, for a torque on a prescribed
-            motion, and for one that is not of three finite numbers.
+            Inside a loop over `shots`, at the end of the motion, for a torque on a prescribed motion, and for a
+            torque that is not three finite numbers.
         """
         self.refuse_in_shots("step")
         if self.is_over:
@@ -259,19 +277,19 @@ class Flight:
             )
 
     def simulate_motion(self, progress: Progress | None = None) -> Self:
-        """Simulate the rest of the motion. Only the frames that a filter needs are rendered.
+        """Simulate the rest of the motion, and return the flight. Only the frames that a filter needs are rendered.
 
         Parameters
         ----------
         progress
-            Called as progress(t_s, duration_s) as the motion goes on
+            Called as progress(t_s, duration_s) after every step of the motion
         """
         for _ in self.events(self.filter_schedules, progress=progress, captures_late=False):
             pass
         return self
 
     def advance(self, schedules: Sequence[Schedule]) -> None:
-        """Simulate one control period; as many as the next exposure needs if nothing depends on the motion."""
+        """Simulate one control period; if nothing depends on the motion, all periods to the next due frame."""
         motion = self.motion
         periods = 1
         if motion.is_free:
@@ -282,11 +300,11 @@ class Flight:
 
     @property
     def filter_schedules(self) -> list[Schedule]:
-        """Of the cameras whose solutions the filter needs: with a filter all, else none."""
+        """Schedules of the cameras whose solutions the filter needs: with a filter all, else none."""
         return self.schedules if self.lab.scene.filter and self.motion.navigation else []
 
     def trajectory(self) -> Trajectory:
-        """The motion until now, with the vibration; of a flight without history its last part."""
+        """The motion until now, with the vibration; only its last part in a flight without history."""
         if not self.is_over:
             return self.motion.trajectory()
         if self.flown is None:
@@ -294,12 +312,12 @@ class Flight:
         return self.flown
 
     def telemetry(self) -> Telemetry:
-        """True and estimated states at the ticks of the flight computer.
+        """True and estimated states at every control period.
 
         Raises
         ------
         InputError
-            Without history, and before the first step.
+            In a flight without history, and before the first step.
         """
         recorder = self.motion.recorder
         if recorder is None:
@@ -310,7 +328,7 @@ class Flight:
         return recorder.telemetry(reference, self.lab.cameras)
 
     def imu_samples(self, since_s: float = -math.inf) -> imu.Increments | None:
-        """The IMU's samples since about a time, as far as they are kept; None without an IMU."""
+        """Samples of the IMU from about the time since_s on, as far as they are kept; None without an IMU."""
         return self.motion.navigation.imu_samples(since_s) if self.motion.navigation else None
 
     # The exposures
@@ -325,17 +343,17 @@ class Flight:
     ) -> Iterator[Shot]:
         """Simulate the rest of the motion; yield every exposure as it becomes due.
 
-        selects(index, close_s) : whether to render a frame of the main camera. Skipping one does not change the others,
-            except that exposure control and filter do not see it
-
         Parameters
         ----------
         cameras
-            Numbers of the cameras whose exposures are yielded; all if left out
+            Numbers of the cameras whose exposures are yielded; None for all
         solves
-            Solve the frames; with a filter they are solved in any case
+            Whether to solve the frames; with a filter they are solved in any case
+        selects
+            selects(index, close_s) says whether to render a frame of the main camera. A skipped frame does not
+            change the others, except that exposure control and filter do not see it
         progress
-            Called as progress(t_s, duration_s) as the motion goes on
+            Called as progress(t_s, duration_s) after every step of the motion
         """
         wanted = [n for n in range(len(self.schedules)) if cameras is None or n in cameras]
         schedules = self.filter_schedules or [self.schedules[n] for n in wanted]
@@ -351,18 +369,24 @@ class Flight:
         progress: Progress | None = None,
         captures_late: bool = True,
     ) -> Iterator[Shot | None]:
-        """The shots of some cameras as in `shots`, and None whenever the motion has gone on.
+        """Yield the shots of some cameras as in `shots`, and None after every step of the motion.
 
         Parameters
         ----------
+        schedules
+            Schedules of the cameras
+        solves, selects, progress
+            As in `shots`
         captures_late
-            Also those that are due only after the end of the motion
+            Whether to yield the shots that are due only after the end of the motion
         """
         self.refuse_in_shots("shots")
         self.is_in_shots = True
         try:
             while not self.is_over:
+                # 1. Motion.
                 self.advance(schedules)
+                # 2. and 3. Frames that became due.
                 yield from self.capture_due(schedules, solves, selects)
                 yield None
                 if progress:
@@ -378,7 +402,7 @@ class Flight:
         solves: bool = False,
         selects: FrameSelector | None = None,
     ) -> Iterator[Shot]:
-        """Yield the exposures that are due and not yet rendered, in order; with a filter they update it."""
+        """Yield the exposures that are due and not yet rendered, in order; a filter is updated with each."""
         has_filter = bool(self.filter_schedules)
         while due := [one for one in schedules if not one.is_over and one.due_s <= self.now_s]:
             yield from self.capture_next(
@@ -388,14 +412,14 @@ class Flight:
     def capture_late(
         self, schedules: Sequence[Schedule], solves: bool, selects: FrameSelector | None
     ) -> Iterator[Shot]:
-        """Yield the exposures that were over at the end of the motion, but due only later; no filter gets them."""
+        """Yield the exposures that ended within the motion but are due after its end; the filter is not updated."""
         while late := [one for one in schedules if not one.is_over and one.close_s <= self.now_s]:
             yield from self.capture_next(earliest(late), solves, selects, updates_filter=False)
 
     def capture_next(
         self, schedule: Schedule, solves: bool, selects: FrameSelector | None, updates_filter: bool
     ) -> Iterator[Shot]:
-        """Yield the next exposure of a camera, unless it is not selected."""
+        """Yield the next exposure of a camera if it is selected."""
         index = schedule.index
         window = schedule.window
         close_s = schedule.close_s
@@ -412,10 +436,21 @@ class Flight:
     ) -> Shot:
         """Render an exposure, solve it, and update the filter with the solution.
 
+        Parameters
+        ----------
+        schedule
+            Schedule of the camera
+        index, window
+            Index of the frame and its exposure window
+        solves
+            Whether to solve the frame
+        updates_filter
+            Whether to update the filter with the solution
+
         Raises
         ------
         InputError
-            For an exposure that began before the states that the flight keeps.
+            For an exposure that began before the oldest state that the flight keeps.
         """
         camera = schedule.camera
         simulation = self.motion.simulation
@@ -423,9 +458,11 @@ class Flight:
             raise InputError(
                 "shots", f"the flight has forgotten frame {index}", "keeps_history=True"
             )
+        # Render.
         clock = Clock()
         trajectory = self.trajectory() if self.is_over else self.motion.trajectory(window.open_s)
         frame, truth = render_frame(camera, trajectory.since(window.open_s), index, clock, window)
+        # Solve.
         rate = self.measured_rate(camera, window)
         report = None
         if solves:
@@ -440,9 +477,9 @@ class Flight:
         return Shot(camera, frame, truth, report, rate, update_status, clock.seconds)
 
     def tracker_of(self, schedule: Schedule, frame: Frame) -> factory.Estimator:
-        """The tracker of a camera, compiled by a first solution of the frame, so that times are those of solving.
+        """The tracker of a camera. A new one first solves the frame once, so later times contain no compilation.
 
-        External trackers are not: each frame must reach them once, in order.
+        External trackers do not: each frame must reach them once, in order.
         """
         number = schedule.number
         if number not in self.trackers:
@@ -453,7 +490,7 @@ class Flight:
         return self.trackers[number]
 
     def measured_rate(self, camera: StarCamera, window: Window) -> RateEstimate | None:
-        """The gyro's rate during an exposure as the tracker gets it; None without `tracker.gyro`."""
+        """Rate from the gyros during an exposure that the tracker receives; None without `tracker.gyro`."""
         scene = camera.scene
         config = scene.vehicle.imu
         if config is None or not scene.tracker.gyro:
@@ -466,7 +503,14 @@ class Flight:
         )
 
     def render(self, index: int, camera: int = 0) -> tuple[Frame, Truth]:
-        """Render an exposure of the schedule from the motion so far; bit for bit that of `shots`.
+        """Render an exposure of the schedule again from the motion so far; the frame equals that of `shots`.
+
+        Parameters
+        ----------
+        index
+            Index of the frame
+        camera
+            Number of the camera
 
         Raises
         ------
@@ -490,9 +534,9 @@ class Flight:
         return render_frame(schedule.camera, self.trajectory(), index, None, window)
 
     def observe(self, camera: int = 0, *, solves: bool = True) -> Shot:
-        """Render and solve an exposure that ends now, beside the schedule; the filter does not get it.
+        """Render and solve an exposure that ends now, outside of the schedule; the filter is not updated.
 
-        Each has noise of its own. Before t = 0 the vehicle has turned at the rate of its start.
+        Each observation has its own noise. Before t = 0 the vehicle rotates at its initial rate.
         """
         schedule = self.schedules[camera]
         scene = schedule.camera.scene
@@ -504,7 +548,7 @@ class Flight:
 
 
 def earliest(schedules: Sequence[Schedule]) -> Schedule:
-    """The one whose next exposure is due first; of equal ones the first."""
+    """The schedule whose next exposure is due first; the first one of several that are due at once."""
     return min(schedules, key=lambda schedule: schedule.due_s)
 
 
@@ -518,7 +562,7 @@ def open_flight(
     endless: bool = False,
     keeps_history: bool = True,
 ) -> Flight:
-    """Build the lab of a scene and open a flight of it; the parts are those of `skysim.simulate`.
+    """A flight of a scene. The parts controller, tracker, profile and programs are those of `skysim.simulate`.
 
     Raises
     ------
@@ -530,5 +574,5 @@ def open_flight(
 
 
 def simulate_motion(scene: Scene, progress: Progress | None = None) -> Flight:
-    """A flight of the scene at its end. Only the frames that a filter needs are rendered."""
+    """A flight of the scene after its end. Only the frames that a filter needs are rendered."""
     return open_flight(scene).simulate_motion(progress)

@@ -1,4 +1,11 @@
-"""The laboratory of a scene: the vehicle and its star cameras, with the lights that they see."""
+"""The laboratory of a scene: the vehicle and its star cameras, with the lights that they see.
+
+`with_parts` puts parts given in Python into a scene. `build_lab` builds the laboratory:
+
+1. Check the names of algorithms and the files, before any long work.
+2. Vehicle, mount of the camera, attitude profiles.
+3. Main camera with its lights, then the further cameras (heads).
+"""
 
 from __future__ import annotations
 
@@ -46,27 +53,25 @@ from skysim.tracking import factory
 from skysim.tracking.external_tracker import FunctionTracker
 from skysim.tracking.tracker_interface import TRACKERS
 
-# A scene with parts that are given in Python: a controller, a star tracker, or an attitude profile.
+# Parts that are given in Python: a controller, a star tracker, or an attitude profile.
 
-
-GIVEN_TABLE = "(table)"  # in place of a profile's file
+GIVEN_TABLE = "(table)"  # stands for the file of a profile that is given as a table
 
 
 @dataclass(frozen=True, slots=True)
 class UserParts:
-    """What a user gives in place of the scene's own parts.
+    """User's parts that replace those of the scene.
 
     Attributes
     ----------
     programs
-        Commands of external trackers and controllers by name; only the user's command line sets
-        them
+        Commands of external trackers and controllers by name; only the user's command line sets them
     controller
-        Makes the control law
+        Factory of the control law
     tracker
-        Of the main camera
+        Star tracker of the main camera
     profile
-        Table of attitudes, in place of the file of the first maneuver of kind profile
+        Table of attitudes that replaces the file of the first maneuver of kind profile
     """
 
     programs: Mapping[str, str] = field(default_factory=dict)
@@ -76,7 +81,7 @@ class UserParts:
 
     @property
     def controllers(self) -> ControllerSource:
-        """Where external controllers come from, beside entry points."""
+        """External controllers other than entry points."""
         return ControllerSource(self.programs, self.controller)
 
 
@@ -90,12 +95,12 @@ def with_parts(
     tracker: Any = None,
     profile: Any = None,
 ) -> tuple[Scene, UserParts]:
-    """The scene that names these parts in place of its own, and the parts; see `results.simulate.simulate`.
+    """The scene with the names of these parts, and the parts; see `results.simulate.simulate` for their types.
 
     Raises
     ------
     InputError
-        For a part of another type.
+        For a part of a wrong type.
     """
     motion = scene.motion
     law = None
@@ -112,7 +117,7 @@ def with_parts(
 
 
 def with_controller(motion: MotionConfig, controller: Any) -> tuple[MotionConfig, Any]:
-    """The motion with a controller, and the factory of one that is not given by name."""
+    """The motion with a controller, and the factory of the controller; None if it is given by name."""
     config = motion.control or ControlConfig()
     if not (isinstance(controller, str) or callable(controller)):
         raise InputError(
@@ -124,7 +129,7 @@ def with_controller(motion: MotionConfig, controller: Any) -> tuple[MotionConfig
 
 
 def with_profile(motion: MotionConfig, profile: Any) -> MotionConfig:
-    """The motion along a profile only, from its own start; prescribed if there is no controller."""
+    """The motion along a profile alone, from the start of the profile; prescribed if there is no controller."""
     if isinstance(profile, str | Path) and not is_file(Path(profile)):
         raise InputError("profile", f"{profile} is not a file", "a file, or a table")
     file = str(profile) if isinstance(profile, str | Path) else GIVEN_TABLE
@@ -140,7 +145,7 @@ def with_profile(motion: MotionConfig, profile: Any) -> MotionConfig:
 
 
 def with_tracker(scene: Scene, tracker: Any) -> tuple[Scene, factory.Estimator | None]:
-    """The scene with a tracker, and the tracker if it is not given by name."""
+    """The scene with the name of a tracker, and the tracker; None if it is given by name."""
     estimator: factory.Estimator | None = None
     if isinstance(tracker, StarTracker | DomeTracker):
         estimator = tracker
@@ -163,6 +168,8 @@ def name_of(part: Any) -> str:
     return re.sub(r"\W", "", getattr(part, "__name__", type(part).__name__)) or "function"
 
 
+# The laboratory.
+
 MAIN = "main"  # name of the camera of the scene's section `camera`
 
 
@@ -173,20 +180,24 @@ class StarCamera:
     Attributes
     ----------
     name
-        "main" for the camera of the scene's section `camera`, else that of the head
+        "main" for the camera of the scene's section `camera`, else the name of the head
     scene
-        As this camera sees it, see `Scene.of_head`
+        The scene with this camera's settings, see `Scene.of_head`
+    mount
+        Assumed position and attitude on the body
+    optics, detector, band
+        Hardware of the camera
     canvas
-        (H, W) array in which every frame's light is drawn; float64 where noise is off, since
-        such a frame is the expectation itself, and float32 otherwise
+        (H, W) array in which the light of every frame is drawn: float32, or float64 without noise, since such a
+        frame is the expectation itself
     lights
-        In this camera's band, from the farthest to the lens, see `simulation.lights`
+        Lights in this camera's band, from the farthest to the lens, see `simulation.lights`
     orbit
-        About the Earth; None for a camera on the ground
+        Orbit about the Earth; None for a camera on the ground
     run_seed
-        Of what all cameras share in a run; what is drawn for this camera has its scene's seed
+        Seed of the draws that all cameras share in a run; the camera's own draws use the seed of its scene
     mount_error
-        Rotation of the real camera from the assumed mount; None for none
+        Rotation of the real camera from the assumed mount; None if there is no error
     """
 
     name: str
@@ -203,17 +214,17 @@ class StarCamera:
 
     @property
     def viewpoint(self) -> Viewpoint:
-        """Its place on the Earth or in its orbit, in the time of its scene."""
+        """Place of the camera on the Earth or in its orbit, as a function of time."""
         return Viewpoint(self.scene.start_time, self.scene.site, self.orbit)
 
     @property
     def seeds(self) -> Seeds:
-        """Of the lights in this run."""
+        """Seeds of the lights in this run."""
         return Seeds(self.run_seed, self.scene.seed)
 
     @property
     def known(self) -> KnownLight:
-        """The light of the scene's section `light`, by which a tracker can find itself."""
+        """The light of the scene's section `light`, from which a tracker can determine the attitude."""
         return next(light for light in self.lights if isinstance(light, KnownLight))
 
     @property
@@ -224,16 +235,20 @@ class StarCamera:
 
 @dataclass(frozen=True, slots=True)
 class Lab:
-    """What is in the laboratory: the vehicle and its cameras. It has no time and no results; a `Flight` moves it.
+    """The laboratory: the vehicle and its cameras. It has no time and no results; a `Flight` moves it.
 
     Attributes
     ----------
+    scene
+        The scene
+    vehicle
+        Vehicle on its bearing
     cameras
-        The main one first, then the scene's heads in their order
+        The main camera, then the heads of the scene in their order
     start
         lab_from_body at t = 0
     profiles
-        Attitude profiles of the maneuvers of that kind, in their order
+        Attitude profiles of the maneuvers of kind profile, in their order
     """
 
     scene: Scene
@@ -249,11 +264,11 @@ class Lab:
 
     @property
     def duration_s(self) -> float:
-        """Duration of the motion: to the end of the last frame's longest exposure, of all cameras."""
+        """Duration of the motion: until the longest exposure of the last frame ends, of all cameras."""
         return max(timing.duration_s(camera.scene) for camera in self.cameras)
 
     def in_run(self, seed: int) -> Lab:
-        """The same hardware in the run of another seed: other noise, jitter, timing and phases of the LEDs' clocks."""
+        """The same hardware in the run of another seed: other noise, vibration, timing, and phases of LED clocks."""
         lab = self.with_scene(self.scene.model_copy(update={"seed": seed}))
         return replace(lab, cameras=tuple(replace(camera, run_seed=seed) for camera in lab.cameras))
 
@@ -262,22 +277,22 @@ class Lab:
         return replace(self, cameras=(replace(self.camera, **changes), *self.cameras[1:]))
 
     def with_light(self, light: Light) -> Lab:
-        """The lab with a light in place of that of the same class, before its main camera."""
+        """The lab with one light of the main camera replaced: that of the same class."""
         return self.with_camera(
             lights=tuple(light if type(one) is type(light) else one for one in self.camera.lights)
         )
 
     def with_sources(self, sources: Sources) -> Lab:
-        """The lab with other stars or LEDs before its main camera."""
+        """The lab with other stars or LEDs for its main camera."""
         return self.with_light(self.camera.known.with_sources(sources))
 
     def of_camera(self, number: int) -> Lab:
-        """The lab with one of its cameras only."""
+        """The lab with only one of its cameras, which becomes the main one."""
         camera = self.cameras[number]
         return replace(self, scene=camera.scene, cameras=(camera,))
 
     def with_scene(self, scene: Scene) -> Lab:
-        """The same hardware for another scene, of which it would be built alike: other trackers, exposures or times."""
+        """The same hardware with a scene that has the same hardware: other trackers, exposures or times."""
         scenes = [scene, *(scene.of_head(n) for n in range(len(scene.heads)))]
         cameras = tuple(
             replace(camera, scene=own) for camera, own in zip(self.cameras, scenes, strict=True)
@@ -297,40 +312,44 @@ class Lab:
 
 
 def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:
-    """Build the vehicle and the cameras of a scene.
+    """The laboratory of a scene.
 
     Parameters
     ----------
+    scene
+        The scene
     parts
-        What the user gives in place of the scene's own. A table of attitudes replaces the file
-        of the first maneuver of kind profile; of the others only the names are checked
+        User's parts. A table of attitudes replaces the file of the first maneuver of kind profile; the names of the
+        other parts are checked
 
     Raises
     ------
     InputError
-        For wrong names of algorithms, trackers, controllers or catalogs and for an unreadable
-        PSF or profile, before any long work.
+        For wrong names of algorithms, trackers, controllers or catalogs and for an unreadable PSF or profile, before
+        any long work.
     """
+    # 1. Names and files.
     check_hardware(scene, parts.programs, parts.tracker is None)
     if scene.motion.control:
         parts.controllers.check_name(scene.motion.control.law)
+    # 2. Vehicle.
     vehicle = multibody.build(scene.vehicle)
     mount = multibody.camera_mount(vehicle)
     profiles = load_profiles(scene, mount, parts.profile)
+    # 3. Cameras.
     shown = light_catalog(scene)
     main = build_camera(scene, vehicle, mount, shown)
     heads = [
         build_head(scene, n, vehicle, main, shown, parts.programs) for n in range(len(scene.heads))
     ]
-    return Lab(
-        scene, vehicle, (main, *heads), lab_from_body_start(scene, mount, profiles), tuple(profiles)
-    )
+    start = lab_from_body_start(scene, mount, profiles)
+    return Lab(scene, vehicle, (main, *heads), start, profiles)
 
 
 def build_camera(
     scene: Scene, vehicle: multibody.VehicleModel, mount: Mount, shown: catalog.Catalog | None
 ) -> StarCamera:
-    """The main camera of a scene, with the light in its band."""
+    """The main camera of a scene, with its lights; `shown` is the catalog of the scene's light."""
     band = Band.from_camera(scene.camera)
     orbit = build_orbit(scene.orbit, scene.start_time)
     viewpoint = Viewpoint(scene.start_time, scene.site, orbit)
@@ -349,18 +368,21 @@ def build_camera(
 
 
 def build_canvas(scene: Scene) -> NDArray[Any]:
-    """The array in which a camera's frames are drawn, see `StarCamera`."""
+    """The (H, W) array in which a camera's frames are drawn, see `StarCamera`."""
     dtype = np.float32 if scene.camera.detector.noise else np.float64
     return np.empty((scene.camera.height_px, scene.camera.width_px), dtype)
 
 
 def check_hardware(scene: Scene, programs: Mapping[str, str], has_tracker: bool) -> None:
-    """Raise InputError for unusable names and files of the camera and, if it is the scene's, of the tracker."""
-    factory.assumed_settings(scene)  # raises for a wrong algorithm name
+    """Raise InputError for unusable names and files of a camera and its tracker.
+
+    has_tracker says whether the scene names the tracker; else the user gives it.
+    """
+    factory.assumed_settings(scene)  # checks the names of algorithms
     if has_tracker:
         TRACKERS.check_name(scene.tracker.name, programs)
     catalog.require_catalog("tracker.catalog", scene.tracker.catalog)
-    EXTENT[scene.camera.psf.kind](scene.camera.psf, scene.camera)  # raises for a bad PSF file
+    EXTENT[scene.camera.psf.kind](scene.camera.psf, scene.camera)  # checks the file of the PSF
 
 
 def build_head(
@@ -373,7 +395,8 @@ def build_head(
 ) -> StarCamera:
     """Head n of the scene: a further camera on the same vehicle under the same lights.
 
-    The lights' strengths are those in the band of the head's camera.
+    The strengths of the lights are those in the band of the head. A head without a camera of its own has the main
+    camera's band and light.
     """
     head = main_scene.heads[n]
     scene = main_scene.of_head(n)
@@ -403,13 +426,11 @@ def build_head(
 def lab_from_body_start(
     scene: Scene, mount: Mount, profiles: Sequence[AttitudeSpline] = ()
 ) -> Rotation:
-    """The attitude at t = 0. For a star scene the lab frame is the ICRS."""
+    """lab_from_body at t = 0. In a star scene the lab frame is the ICRS."""
     start = scene.motion.start
     if isinstance(start, PointingConfig):
-        return (
-            stars.cam_from_icrs(start.ra_deg, start.dec_deg, start.roll_deg).inv()
-            * mount.cam_from_body
-        )
+        cam_from_icrs = stars.cam_from_icrs(start.ra_deg, start.dec_deg, start.roll_deg)
+        return cam_from_icrs.inv() * mount.cam_from_body
     return guidance.start_attitude(scene.motion, profiles)
 
 
@@ -427,6 +448,8 @@ def build_tracker(
 
     Parameters
     ----------
+    camera
+        Star camera
     programs
         Commands of external trackers by name
     """

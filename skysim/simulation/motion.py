@@ -1,4 +1,14 @@
-"""The vehicle in motion: flight computer, dynamics, disturbances, vibration and IMU, one control period at a time."""
+"""The vehicle in motion: flight computer, dynamics, disturbances, vibration and IMU, one control period at a time.
+
+`check_reference` refuses a maneuver that exceeds the vehicle's limits. `Motion.advance` simulates a control period:
+
+1. The controller reads the attitude and the rate, true or estimated.
+2. The flight computer sets the actuators.
+3. Disturbance torques are added.
+4. `TelemetryRecorder` records the state, before it changes.
+5. MuJoCo integrates the equations of motion; the controls are held.
+6. The IMU samples the motion with its vibration, and the navigation takes the samples.
+"""
 
 from __future__ import annotations
 
@@ -29,12 +39,10 @@ from skysim.simulation import timing
 from skysim.simulation.lab import Lab, StarCamera
 from skysim.tracking.navigation import Navigation
 
-# Refuse a maneuver that asks for more than the vehicle can do: tilt, and for profiles and chirps
-# rate and torque.
-
+# Limits of the vehicle: tilt, and rate and torque of profiles and chirps.
 
 TILT_CHECK_S = 0.05  # sampling interval of a maneuver when its tilt is checked
-ROUNDING = 1e-6  # relative
+ROUNDING = 1e-6  # relative excess over a limit that counts as rounding
 
 
 def check_reference(
@@ -42,7 +50,8 @@ def check_reference(
 ) -> None:
     """Raise InputError for a maneuver beyond the tilt stop, the gyros' range or the actuators' torque.
 
-    The controller would push against the stop, or fall behind. A prescribed motion needs no torque.
+    The controller would push against the stop, or fall behind. The torque of a rate w and an acceleration a is
+    J a + w x J w. A prescribed motion needs no torque.
     """
     motion = scene.motion
     vehicle = scene.vehicle
@@ -80,9 +89,10 @@ def check_tilt(reference: guidance.Reference, vehicle: VehicleConfig, duration_s
 
 
 def demands(leg: guidance.Leg, period_s: float) -> tuple[Floats, Floats, Floats]:
-    """(K,) times since the leg's start, (K, 3) rates and (K, 3) accelerations: at a profile's samples, else every tick.
+    """(K,) times since the leg's start, (K, 3) rates and (K, 3) accelerations in body axes.
 
-    Between two samples the acceleration of a profile is nearly linear in time, so it is greatest at a sample.
+    They are those at the samples of a profile, else at every control period. Between two samples the acceleration of
+    a profile is nearly linear in time, so it is greatest at a sample.
     """
     if isinstance(leg, guidance.ProfileLeg):
         knots_s = leg.spline.t_s - leg.begin_s
@@ -95,7 +105,7 @@ def demands(leg: guidance.Leg, period_s: float) -> tuple[Floats, Floats, Floats]
 
 
 def check_rate(key: str, t_s: Floats, rate_rad_s: Floats, vehicle: VehicleConfig) -> None:
-    """Raise InputError for a rate about a body axis that saturates the gyros."""
+    """Raise InputError if a rate (K, 3) about a body axis saturates the gyros."""
     if vehicle.imu is None:
         return
     limit_deg_s = vehicle.imu.gyro.rate_limit_deg_s
@@ -112,7 +122,7 @@ def check_rate(key: str, t_s: Floats, rate_rad_s: Floats, vehicle: VehicleConfig
 def check_torque(
     key: str, t_s: Floats, used: Floats, torque_nm: Floats, control: ControlConfig
 ) -> None:
-    """Raise InputError for a torque (K, 3) that the actuators cannot give. used : (K,) times what they can"""
+    """Raise InputError if the actuators cannot give a torque (K, 3); `used` (K,) is its ratio to their limit."""
     n = int(used.argmax())
     if used[n] > 1 + ROUNDING:
         torque = ", ".join(f"{component:.3g}" for component in torque_nm[n])
@@ -124,13 +134,13 @@ def check_torque(
         )
 
 
-# Record what the vehicle did and what its navigation estimated, at every control period.
+# Records of true and estimated states.
 
 
 class TelemetryRecorder:
     """Records of a simulated motion, one row per control period; `telemetry` returns them as a table.
 
-    Quantities in the simulation's states are read from them at the end; only the others are recorded on the way.
+    The simulation keeps its states, so only the other quantities are recorded during the motion.
     """
 
     def __init__(
@@ -151,13 +161,10 @@ class TelemetryRecorder:
         self.filter_wxyz = np.zeros((rows, 4))
         self.saturated = np.zeros(rows, dtype=bool)
         self.bias_rad_s = np.zeros((rows, 3))
-        self.filter_estimates = np.zeros(
-            (rows, 3, 3)
-        )  # filter: sigma of the attitude, bias, its sigma
-        mounted = mounting_states(navigation)
-        self.mountings = np.zeros(
-            (len(mounted), 2, rows, 3)
-        )  # filter: estimate and sigma of each mounting
+        # Of the filter: sigma of the attitude, bias, and sigma of the bias.
+        self.filter_estimates = np.zeros((rows, 3, 3))
+        # Of the filter: estimate and sigma of each mounting.
+        self.mountings = np.zeros((len(mounting_states(navigation)), 2, rows, 3))
 
     @property
     def row(self) -> int:
@@ -172,10 +179,8 @@ class TelemetryRecorder:
         """Record the rest of this control period, after the controls are set and before the vehicle moves."""
         k = self.row
         self.recorded[k] = True
-        self.torque_nm[k], self.momentum_nms[k] = (
-            self.flight_computer.control_torque_nm,
-            momentum_nms,
-        )
+        self.torque_nm[k] = self.flight_computer.control_torque_nm
+        self.momentum_nms[k] = momentum_nms
         if self.navigation:
             self.record_estimates(k, self.navigation)
 
@@ -198,13 +203,13 @@ class TelemetryRecorder:
                 self.mountings[n, :, k] = state.others[name], state.sigma(name)
 
     def telemetry(self, reference: Reference | None, cameras: Sequence[StarCamera]) -> Telemetry:
-        """All rows as Telemetry; reference is the commanded attitude profile, if there is one."""
+        """The rows so far as Telemetry; reference is the commanded attitude, None without a controller."""
         simulation = self.simulation
         vehicle = self.simulation.vehicle
         steps = self.at_step[self.at_step < simulation.step]
         states = simulation.states[steps]
         nq = simulation.model.nq
-        # Several control periods of a free motion are integrated at once, and only the first is recorded.
+        # Several control periods of a free motion are integrated at once, and only the first of them is recorded.
         for k in np.flatnonzero(~self.recorded[: len(steps)]):
             self.momentum_nms[k] = self.flight_computer.momentum_nms(
                 states[k, 1 : 1 + nq], states[k, 1 + nq :]
@@ -243,7 +248,10 @@ class TelemetryRecorder:
     def mountings_by_camera(
         self, t_s: Floats, cameras: Sequence[StarCamera]
     ) -> dict[str, Mounting]:
-        """The filter's mounting states, and what they are in truth."""
+        """Estimates, sigmas and truth of the filter's mounting states, by name of the camera.
+
+        The state of a head is relative to that of the main camera.
+        """
         if not len(self.mountings):
             return {}
         names = [camera.name for camera in cameras]
@@ -258,17 +266,17 @@ class TelemetryRecorder:
 
 
 def mounting_states(navigation: Navigation | None) -> list[str]:
-    """Names of the filter's mounting states, the main camera's first."""
+    """Names of the filter's mounting states, that of the main camera first."""
     if navigation is None or navigation.filter is None:
         return []
     return [name for name in navigation.filter.state.others if name.startswith("mounting")]
 
 
 def mounting_rad(camera: StarCamera, t_s: Floats) -> Floats:
-    """(K, 3) the error that a camera's real mount makes of the body's attitude, in body axes.
+    """(K, 3) rotation vector of the attitude error from a camera's mount error and temperature, in body axes.
 
-    The real camera is turned by e from its assumed mount C, cam = exp(e) C body. Its tracker's attitude of the body is
-    C^-1 exp(e) C body = exp(C^-1 e) body, so that ref_from_body = truth exp(-C^-1 e).
+    The real camera is rotated by e from its assumed mount C: cam = exp(e) C body. The attitude of the body by its
+    tracker is C^-1 exp(e) C body = exp(C^-1 e) body, so ref_from_body = truth exp(-C^-1 e).
     """
     error = camera.mount_error or Rotation.identity()
     config = camera.scene.thermal
@@ -279,23 +287,31 @@ def mounting_rad(camera: StarCamera, t_s: Floats) -> Floats:
 
 
 def rotation(wxyz: Floats) -> Rotation:
+    """Rotations of quaternions (N, 4), scalar first."""
     return Rotation.from_quat(wxyz, scalar_first=True)
 
 
-class Motion:
-    """The motion of a lab's vehicle. Stateful: use one instance for one motion.
+# The motion.
 
-    Attributes
+
+class Motion:
+    """The motion of a lab's vehicle. Stateful: use one object for one motion.
+
+    Parameters
     ----------
+    lab
+        Laboratory
+    controllers
+        External controllers other than entry points
     duration_s
-        At most; may be infinite with `kept_s`
+        Greatest duration; may be infinite with `kept_s`
     kept_s
-        How long past states and IMU samples are kept; None: all of them
+        Time for which past states and IMU samples are kept; None keeps all of them
 
     Raises
     ------
     InputError
-        For a maneuver that the vehicle cannot follow, and for too fast vibration.
+        For a maneuver that the vehicle cannot follow, and for vibration that needs too many samples.
     """
 
     def __init__(
@@ -315,7 +331,7 @@ class Motion:
             scene.motion, random_stream(scene.seed, JITTER, 0), self.reference
         )
         if kept_s is None:
-            # Raises InputError before any long work.
+            # This raises InputError for too many samples before any long work.
             self.vibration.subdivisions(self.simulation.times_s(0, self.simulation.last_step + 1))
         self.flight_computer = FlightComputer(scene, vehicle, self.reference, controllers)
         self.navigation = build_navigation(lab, math.inf if kept_s is None else kept_s)
@@ -348,15 +364,14 @@ class Motion:
         return round(self.flight_computer.period_s / self.simulation.step_s)
 
     def advance(self, steps: int, torque_nm: Floats | None = None) -> None:
-        """Simulate one control period, or the rest of the motion, and record it.
-
-        The order is: attitude and rate as the controller gets them, controls, disturbance torques, integration, IMU.
-        The controls are held over the period.
+        """Simulate some steps with controls that are held over them, by the steps of the module's docstring.
 
         Parameters
         ----------
+        steps
+            Number of integration steps: those of a control period, or more if nothing depends on the motion
         torque_nm
-            (3,) in body axes, in place of the controller's
+            (3,) torque in body axes that replaces that of the controller
         """
         simulation = self.simulation
         flight_computer = self.flight_computer
@@ -367,29 +382,32 @@ class Motion:
         attitude = simulation.lab_from_body_wxyz
         rate = simulation.rate_body_rad_s
         momentum = flight_computer.momentum_nms(angles, speeds)
-        # The controller sees the truth or, with feedback imu or filter, the navigation's estimates.
+        # 1. The controller gets the truth or, with feedback imu or filter, the estimates of the navigation.
         measured_attitude = attitude
         measured_rate = rate
         feedback = flight_computer.config.feedback if flight_computer.config else "truth"
         if feedback != "truth" and navigation:
             measured_attitude = navigation.attitude_wxyz(feedback)
             measured_rate = navigation.body_rate_rad_s(feedback)
+        # 2. Controls.
         inputs = ControlInput(t_s, flight_computer.period_s, measured_rate, angles, speeds)
         control = np.empty((min(steps, simulation.steps_left), simulation.model.nu))
         control[:] = flight_computer.compute_controls(
             inputs, measured_attitude, momentum, torque_nm
         )
+        # 3. Disturbances act through the model's ideal torque actuators. They change at every step; commands do not.
         if not (self.disturbances.inactive or self.lab.scene.motion.is_prescribed):
             times_s = simulation.times_s(simulation.step, simulation.step + len(control) + 1)
             disturbance = self.disturbances.torque_nm(times_s, attitude, rate, momentum)
-            # Disturbances act through the model's ideal torque actuators, step by step; commands are constant.
             control[:, simulation.vehicle.torques] += disturbance
             if self.recorder:
                 self.recorder.record_disturbance(disturbance.sum(axis=0) / len(control))
+        # 4. Record before the motion advances, so that all columns of a row are of the same time.
         if self.recorder:
-            # Before the motion advances: every column of a row is of the same time.
             self.recorder.record(momentum)
+        # 5. Integration.
         simulation.advance(control)
+        # 6. IMU.
         if navigation:
             navigation.sample_imu(simulation.now_s, *self.last_knots(len(control)))
 
@@ -399,7 +417,7 @@ class Motion:
         return self.vibration.add_to(self.simulation.trajectory(first))
 
     def last_knots(self, steps: int) -> tuple[Floats, Floats, Floats]:
-        """Times (K,), attitudes (K, 4) as wxyz and rates (K, 3) of the last steps, with the vibration."""
+        """Times (K,), lab_from_body_wxyz (K, 4) and rates (K, 3) in body axes of the last steps, with the vibration."""
         simulation = self.simulation
         begin = max(simulation.step - steps, 0)
         if not self.vibration.components:
@@ -413,14 +431,14 @@ class Motion:
 
 
 def history_s(lab: Lab) -> float:
-    """Seconds of past states that a frame of any camera needs when it is due."""
+    """Duration of past states that a frame of any camera needs when it is due."""
     return max(timing.history_s(camera.scene) for camera in lab.cameras)
 
 
 def build_simulation(
     lab: Lab, reference: guidance.Reference, duration_s: float, kept_s: float | None
 ) -> multibody.Simulation:
-    """The simulation of the motion at its start: by dynamics, or along the reference if the motion is prescribed."""
+    """The simulation at its start: by dynamics, or along the reference if the motion is prescribed."""
     motion = lab.scene.motion
     if motion.is_prescribed:
         return multibody.PrescribedMotion(
@@ -431,7 +449,7 @@ def build_simulation(
 
 
 def build_navigation(lab: Lab, kept_s: float) -> Navigation | None:
-    """The on-board navigation, or None without an IMU. kept_s: how long it keeps IMU samples."""
+    """The on-board navigation, which keeps IMU samples for kept_s; None without an IMU."""
     if lab.scene.vehicle.imu is None:
         return None
     position_m = multibody.imu_position_m(lab.vehicle)

@@ -1,4 +1,4 @@
-"""When a scene's frames are exposed: windows, trigger jitter, time tags, and how long a motion must last for them."""
+"""Timing of a scene's frames: exposure windows, trigger jitter, time tags, and the duration of the motion."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from skysim.core.tolerance import scaled_errors
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import RollingShutterConfig
 
-MARGIN_S = 2e-3  # simulated beyond the last exposure
-HISTORY_MARGIN_S = 0.05  # kept of past states beyond what a frame needs
+MARGIN_S = 2e-3  # time that is simulated after the last exposure
+HISTORY_MARGIN_S = 0.05  # duration of past states that is kept beyond the needs of a frame
 
 
 def exposure_window(scene: Scene, index: int, exposure_s: float | None = None) -> Window:
-    """The exposure window of a frame, opened late by its jitter; as long as the scene's if no time is given."""
+    """The exposure window of a frame, which opens late by its trigger jitter; exposure_s defaults to the scene's."""
     jitter_s = scene.exposure.trigger_jitter_s
     late_s = jitter_s * timing_draws(scene.seed, index)[0] if jitter_s else 0.0
     begin_s = scene.exposure.first_s + index / scene.exposure.rate_hz + late_s
@@ -25,14 +25,14 @@ def exposure_window(scene: Scene, index: int, exposure_s: float | None = None) -
 
 
 def window_from(scene: Scene, begin_s: float, exposure_s: float | None = None) -> Window:
-    """The window of an exposure that begins at that time, by the camera's shutter."""
+    """The window of an exposure that begins at begin_s, with the row time of the camera's shutter."""
     shutter = scene.camera.shutter
     row_time_s = shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0
     return Window(begin_s, scene.exposure.time_s if exposure_s is None else exposure_s, row_time_s)
 
 
 def time_tag_error_s(scene: Scene, index: int) -> float:
-    """The time that the camera gives to a frame minus the true time of mid-exposure."""
+    """Time tag of a frame minus the true time of mid-exposure."""
     exposure = scene.exposure
     if not exposure.time_tag_jitter_s:
         return exposure.time_tag_offset_s
@@ -42,7 +42,10 @@ def time_tag_error_s(scene: Scene, index: int) -> float:
 
 @lru_cache(maxsize=64)
 def timing_draws(seed: int, index: int) -> tuple[float, float]:
-    """The uniform number of a frame's trigger and the normal one of its time tag; asked for in every control period."""
+    """A uniform draw for the trigger of a frame, and a standard normal draw for its time tag.
+
+    They are cached, since every control period needs those of the next frame.
+    """
     trigger, tag = (random_stream(seed, CAMERA_TIMING, index, part) for part in range(2))
     return trigger.random(), float(tag.standard_normal())
 
@@ -54,17 +57,17 @@ def longest_exposure_s(scene: Scene) -> float:
 
 
 def frame_end_s(scene: Scene, index: int, exposure_s: float | None = None) -> float:
-    """How long a motion must last for a frame."""
+    """Time until which a motion must last for a frame."""
     return exposure_window(scene, index, exposure_s).close_s(scene.camera.height_px) + MARGIN_S
 
 
 def duration_s(scene: Scene) -> float:
-    """Duration of a motion to the end of the last frame's longest exposure."""
+    """Duration of a motion until the longest exposure of the last frame ends."""
     return frame_end_s(scene, scene.exposure.frames - 1, longest_exposure_s(scene))
 
 
 def history_s(scene: Scene) -> float:
-    """Seconds of past states that a frame needs when due: longest exposure, latency, two control periods."""
+    """Duration of past states that a frame needs when it is due: longest exposure, latency, two control periods."""
     latency_s = scene.filter.latency_s if scene.filter else 0.0
     window = exposure_window(scene, 0, longest_exposure_s(scene))
     return (

@@ -1,1 +1,1 @@
-"""The star tracker on board: build the estimator of a scene with the hardware parameters that it assumes."""
+"""The star tracker on board: build a scene's estimator with the hardware parameters that it assumes."""

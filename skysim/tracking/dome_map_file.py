@@ -16,23 +16,24 @@ from skysim.core.types import Floats
 
 @dataclass(frozen=True, slots=True)
 class DomeMap:
-    """A surveyed dome and its camera in the lab frame; `tracker.map` names its file.
-
-    focal_px, center_px, distortion (k1, k2, p1, p2, k3), and the standard deviation of each number; 0 where
-    it was held
+    """A surveyed dome and its camera; `tracker.map` names its file.
 
     Attributes
     ----------
     id, position_m
-        (N,) and (N, 3) of the LEDs surveyed, m
+        Numbers (N,) of the surveyed LEDs, and their positions (N, 3) in the lab
     sigma_m
-        (N,) standard deviation of an LED's position, rms of the three axes, m
+        (N,) standard deviations of the positions, rms of the three axes
     camera_body_m
-        (3,) the entrance pupil in the body frame, m
+        (3,) position of the entrance pupil in body axes
     lever_sigma_m
-        Its standard deviation, rms of the three axes, m
+        Standard deviation of that position, rms of the three axes
     size_px
-        Width and height of the chip
+        Width and height of the detector
+    focal_px, center_px, distortion
+        Focal length, principal point and k1, k2, p1, p2, k3
+    focal_sigma_px, center_sigma_px, distortion_sigma
+        Standard deviations of these numbers; 0 for a number that the survey held fixed
     """
 
     id: NDArray[np.int64]
@@ -51,7 +52,7 @@ class DomeMap:
 
 MAP_COLUMNS = ("id", "x_m", "y_m", "z_m", "sigma_m")
 
-# Keys in the header of a dome map, and how many numbers each holds.
+# Keys in the header of a dome map, and the count of numbers in each.
 MAP_META = {
     "size_px": 2,
     "focal_px": 1,
@@ -66,7 +67,7 @@ MAP_META = {
 
 
 def write_dome_map(path: Path, dome: DomeMap) -> None:
-    """Write a surveyed dome as ECSV: one row per LED, the camera in the header."""
+    """Write a surveyed dome as ECSV: one row for each LED, the camera in the header."""
     from astropy.table import Table
 
     table = Table(dict(zip(MAP_COLUMNS, (dome.id, *dome.position_m.T, dome.sigma_m), strict=True)))
@@ -75,7 +76,7 @@ def write_dome_map(path: Path, dome: DomeMap) -> None:
 
 
 def read_dome_map(path: Path) -> DomeMap:
-    """Read what `write_dome_map` wrote. Raises InputError with one line for any other file."""
+    """The dome map in a file that `write_dome_map` wrote. Raises InputError for any other file."""
     import warnings
 
     from astropy.table import Table
@@ -96,12 +97,14 @@ def read_dome_map(path: Path) -> DomeMap:
         )
     except (TypeError, ValueError):
         raise InputError(path, "", f"numbers in the columns {', '.join(MAP_COLUMNS)}") from None
+    # Each LED once, with finite numbers.
     invalid = np.flatnonzero(~np.isfinite(numbers).all(axis=1) | (numbers[:, 4] <= 0))
     if len(invalid):
         raise InputError(path, f"row {invalid[0] + 1}", "finite numbers, and a sigma_m above 0")
     id_, count = np.unique(numbers[:, 0].astype(np.int64), return_counts=True)
     if count.max() > 1:
         raise InputError(path, f"LED {id_[count > 1][0]} occurs {count.max()} times", "once")
+    # The camera.
     meta = {key: header_numbers(path, table.meta, key, count) for key, count in MAP_META.items()}
     fields: dict[str, Any] = {
         key: value[0] if len(value) == 1 else tuple(value) for key, value in meta.items()

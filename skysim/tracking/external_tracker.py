@@ -1,4 +1,8 @@
-"""Adapter for an external star tracker in its own process; it gets the same set-up and frames as skysim's own."""
+"""Adapters for external star trackers: a program in its own process, or a Python function in this one.
+
+They get the same set-up and frames as skysim's own tracker, and their answers become the same reports. Every failure of
+an external tracker becomes the status of a frame.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +40,7 @@ from skysim.tracking.tracker_interface import (
 
 
 class ExternalTracker:
-    """A tracker in its own process. Every failure there becomes the status of a frame."""
+    """A tracker in its own process."""
 
     def __init__(self, program: tracker_interface.TrackerProgram) -> None:
         self.program = program
@@ -51,26 +55,24 @@ class ExternalTracker:
         commands: Mapping[str, str],
     ) -> ExternalTracker:
         """Start the tracker that the scene names. Raises InputError if it is unknown or refuses the set-up."""
-        config = scene.tracker
         name = scene.tracker.name
         TRACKERS.check_name(name, commands)
         setup = build_setup(scene, camera, settings, lights)
+        image_format = None
+        environment = None
         if name in commands:
             arguments, image_format = tracker_interface.split_command(name, commands[name])
-            return cls(
-                tracker_interface.TrackerProgram(
-                    name, arguments, image_format, setup, config.time_limit_s
-                )
-            )
-        host, environment = host_command("skysim.tracking.tracker_host", name)
+        else:
+            arguments, environment = host_command("skysim.tracking.tracker_host", name)
+        limit_s = scene.tracker.time_limit_s
         return cls(
             tracker_interface.TrackerProgram(
-                name, host, None, setup, config.time_limit_s, environment
+                name, arguments, image_format, setup, limit_s, environment
             )
         )
 
     def solve_frame(self, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
-        """Send a frame; return the tracker's report."""
+        """The tracker's report on a frame; streak_px is as in `Picture`."""
         picture = Picture(frame.image_dn, frame.index, frame.t_mid_s, frame.exposure_s, streak_px)
         try:
             return to_report(self.program.solve(picture))
@@ -78,14 +80,14 @@ class ExternalTracker:
             return Report(Attitude(f"{FAILED}{error}"), Centroids.empty())
 
     def solve_centroids(self, centroids: Centroids) -> Attitude:
-        """Not supported by external trackers. Raises InputError."""
+        """Raise InputError: external trackers do not support this."""
         raise InputError("tracker.name", f"{self.program.name} solves frames, not centroids", OWN)
 
 
 def build_setup(
     scene: scenes.Scene, camera: Camera, settings: Settings, lights: Stars | Leds
 ) -> Setup:
-    """The set-up sent to the tracker: the same assumed hardware as skysim's own tracker gets."""
+    """The set-up that is sent to the tracker: the hardware that skysim's own tracker would assume."""
     return Setup(
         "icrs" if isinstance(scene.light, StarsConfig) else "lab",
         scene.start_time.isoformat(),
@@ -104,7 +106,7 @@ def build_setup(
 
 
 def star_map(catalog: StarCatalog, direction: Floats) -> Stars:
-    """The on-board catalog."""
+    """The on-board catalog with the apparent directions (N, 3) of its stars."""
     return Stars(catalog.id, direction, catalog.v_mag)
 
 
@@ -114,7 +116,7 @@ def led_map(leds: LedMap, lever: Lever) -> Leds:
 
 
 def to_report(answer: Answer) -> Report:
-    """Convert a checked answer to a Report. External trackers do not say which star is which."""
+    """The report of a checked answer; it has no identifications, since external trackers do not return any."""
     xy_px = answer.centroids_px
     unmeasured = np.full(len(xy_px), np.nan)
     seconds = {} if answer.seconds is None else {"solve": answer.seconds}
@@ -127,20 +129,21 @@ def to_report(answer: Answer) -> Report:
     return Report(attitude, Centroids(xy_px, unmeasured, unmeasured), seconds)
 
 
-# A Python function as a star tracker: in this process, from a frame's image to an attitude.
+# A Python function as a star tracker.
 
-
-NO_ATTITUDE = "no attitude"  # status where the function returned None
+NO_ATTITUDE = "no attitude"  # status if the function returned None
 
 
 class FunctionTracker:
-    """A tracker that is a function. Every failure there becomes the status of a frame.
+    """A tracker that is a function in this process.
 
     Attributes
     ----------
+    name
+        Name for messages and reports
     function
-        Takes the image (H, W) and returns an Answer, the attitude cam_from_ref as a Rotation or
-        as a unit quaternion (4,) scalar last, or None for no attitude
+        Function from an image (H, W) to an Answer, to the attitude cam_from_ref as a Rotation or as a unit quaternion
+        (4,) scalar last, or to None for no attitude
     """
 
     def __init__(self, name: str, function: Callable[[NDArray[Any]], Any]) -> None:
@@ -148,7 +151,7 @@ class FunctionTracker:
         self.function = function
 
     def solve_frame(self, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
-        """The tracker's report on a frame; the function gets a copy of its image."""
+        """The tracker's report on a frame; the function gets a copy of the image."""
         begin_s = time.perf_counter()
         try:
             answer = check_answer(to_answer(self.function(np.array(frame.image_dn))))
@@ -159,12 +162,12 @@ class FunctionTracker:
         return report
 
     def solve_centroids(self, centroids: Centroids) -> Attitude:
-        """Not supported: a function takes an image. Raises InputError."""
+        """Raise InputError: a function takes an image, not centroids."""
         raise InputError("tracker.name", f"{self.name} solves frames, not centroids", OWN)
 
 
 def to_answer(value: Any) -> Any:
-    """What a function may return, as an Answer; other values unchanged, for `check_answer` to refuse."""
+    """The value that a function returned, as an Answer; `check_answer` refuses other values, which stay unchanged."""
     if value is None:
         return Answer(NO_ATTITUDE)
     if isinstance(value, Rotation):

@@ -1,8 +1,8 @@
 """Build the star tracker of a scene, and solve frames with it.
 
-`build_tracker` chooses the class by scene: DomeTracker under LEDs, CodedTracker if it reads their codes, StarTracker
-under stars, ExternalTracker for another program. All get the camera, map and settings that the tracker assumes
-(onboard_model.py, settings.py), which may differ from the simulated hardware.
+`build_tracker` chooses the class by the scene: DomeTracker under LEDs, CodedTracker if it reads their codes,
+StarTracker under stars, ExternalTracker for an external tracker. Each gets the camera and map (onboard_model.py) and
+the settings (`assumed_settings`) that the tracker assumes, which may differ from the simulated hardware.
 """
 
 from __future__ import annotations
@@ -49,15 +49,15 @@ from skysim.tracking.onboard_model import (
 )
 from skysim.tracking.tracker_interface import OWN
 
-# Settings of the tracker from a scene; the names of algorithms are checked here.
+# Settings of the tracker from a scene.
 
-
+# Default algorithms under a dome; under stars each stage has one with the name "default".
 DOME_ALGORITHMS = {
     "detector": "local",
     "centroider": "cog",
     "identifier": "led_pairs",
     "solver": "rotation_only",
-}  # defaults under a dome; "default" under stars
+}
 STAR_ALGORITHMS: dict[str, Mapping[str, object]] = {
     "detector": DETECTORS,
     "centroider": CENTROIDERS,
@@ -67,19 +67,17 @@ STAR_ALGORITHMS: dict[str, Mapping[str, object]] = {
 
 
 def assumed_settings(scene: Scene) -> Settings:
-    """The tracker's algorithms and thresholds as the scene sets them. Raises InputError for an unknown name.
+    """The tracker's algorithms and thresholds that the scene sets. Raises InputError for an unknown name.
 
     Defaults depend on the light: a dome uses the local detector, centers of gravity and LED pairs.
     """
     config = scene.tracker
     default = Settings()
     usual = DOME_ALGORITHMS if isinstance(scene.light, DomeConfig) else {}
-    chosen: dict[str, Any] = {
-        stage: require_algorithm(
-            stage, getattr(config, stage) or usual.get(stage, "default"), table
-        )
-        for stage, table in algorithm_tables(scene).items()
-    }
+    chosen: dict[str, Any] = {}
+    for stage, table in algorithm_tables(scene).items():
+        name = getattr(config, stage) or usual.get(stage, "default")
+        chosen[stage] = require_algorithm(stage, name, table)
     return Settings(
         max_blobs=config.brightest or default.max_blobs,
         base_stars=min(config.brightest or default.base_stars, default.base_stars),
@@ -94,7 +92,7 @@ def assumed_settings(scene: Scene) -> Settings:
 
 
 def algorithm_tables(scene: Scene) -> dict[str, Mapping[str, object]]:
-    """The algorithms by name that a scene's tracker may use, by stage."""
+    """The algorithms that a scene's tracker may use: by stage, then by name."""
     near: dict[str, Mapping[str, object]] = {}
     if isinstance(scene.light, DomeConfig):
         near = {"identifier": NEAR_IDENTIFIERS, "solver": NEAR_SOLVERS}
@@ -102,12 +100,12 @@ def algorithm_tables(scene: Scene) -> dict[str, Mapping[str, object]]:
 
 
 def algorithm_names(scene: Scene) -> dict[str, tuple[str, ...]]:
-    """All algorithms that a scene's tracker may name, by stage."""
+    """The names of the algorithms that a scene's tracker may use, by stage."""
     return {stage: tuple(table) for stage, table in algorithm_tables(scene).items()}
 
 
 def require_algorithm(stage: str, name: str, algorithms: Mapping[str, object]) -> str:
-    """Return the name if it is one of the algorithms, else raise InputError.
+    """The name, if it is one of the algorithms; else raise InputError.
 
     Only the estimator has the list, and the scene package may not import it, so the name is checked here.
     """
@@ -115,6 +113,8 @@ def require_algorithm(stage: str, name: str, algorithms: Mapping[str, object]) -
         raise InputError(f"tracker.{stage}", *unknown_name(stage, name, algorithms))
     return name
 
+
+# Trackers.
 
 UserTracker = ExternalTracker | FunctionTracker  # each frame must reach it once, in order
 Estimator = StarTracker | DomeTracker | CodedTracker | UserTracker
@@ -125,11 +125,21 @@ NO_PROGRAMS: Mapping[str, str] = {}
 def build_tracker(
     scene: Scene, mount: Mount, sources: Sources, programs: Mapping[str, str] = NO_PROGRAMS
 ) -> Estimator:
-    """The star tracker with the hardware parameters that it assumes: those of the scene's `tracker` section,
-    else the true ones.
+    """The star tracker with the hardware parameters that it assumes: those of the scene's section `tracker`, or the
+    true ones.
+
+    1. Camera and settings.
+    2. Under a dome: LED map and lever, from the survey or from a map's file, and a tracker of LEDs.
+    3. Under stars: catalog with apparent directions, and a tracker of stars.
 
     Parameters
     ----------
+    scene
+        The scene
+    mount
+        Mount of the camera
+    sources
+        LEDs or stars of the scene's light
     programs
         Commands of external trackers by name, for `tracker.name`
 
@@ -138,8 +148,10 @@ def build_tracker(
     InputError
         For a dome or a catalog that the tracker cannot use.
     """
+    # 1. Camera and settings.
     camera = assumed_camera(scene)
     settings = assumed_settings(scene)
+    # 2. Dome.
     if isinstance(scene.light, DomeConfig):
         leds = assumed_dome(scene, scene.light, sources)
         lever = assumed_lever(scene, mount)
@@ -158,13 +170,14 @@ def build_tracker(
             return CodedTracker(camera, leds, lever, settings, code, decoder)
         except ImageError as error:
             raise InputError("light", f"the star tracker cannot use this dome: {error}") from None
+    # 3. Stars.
     stars = catalog.brighter_than(
         onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag
     )
     orbit = assumed_orbit(scene)
     directions = catalog.apparent(stars, assumed_observer(scene, orbit))
     if isinstance(scene.light, CollimatedDisplayConfig):
-        # The display's mounting defines where the stars are in the lab frame.
+        # The mounting of the display defines the stars' directions in the lab frame.
         directions = display.lab_from_icrs(scene.light).apply(directions)
     if scene.tracker.name != OWN:
         return ExternalTracker.start(
@@ -181,14 +194,18 @@ def solve_frame(
     streak_px: tuple[float, float] | None = None,
     rate: RateEstimate | None = None,
 ) -> Report:
-    """The tracker's report on a frame; an image that it refuses (empty, saturated) gives a report with that status.
+    """The tracker's report on a frame; for an image that it refuses (empty, saturated) the status is the reason.
 
     Parameters
     ----------
+    estimator
+        Star tracker
+    frame
+        The frame
     streak_px
-        (dx, dy) that lights move in the exposure, if a gyro measures it
+        Motion (dx, dy) of the images in the exposure, if a gyro measures it
     rate
-        Of the camera, if a gyro measures it; external trackers get streak_px only
+        Rate of the camera, if a gyro measures it; external trackers get only streak_px
     """
     if isinstance(estimator, UserTracker):
         return estimator.solve_frame(frame, streak_px)
@@ -205,13 +222,13 @@ def solve_frame(
 
 
 def solve_centroids(estimator: Estimator, centroids: Centroids, exposure_s: float) -> Attitude:
-    """The tracker's attitude of centroids of an exposure; the dome's tracker needs it for the lights' brightness."""
+    """The tracker's attitude from centroids; a dome tracker needs the exposure time for the lights' brightness."""
     if isinstance(estimator, DomeTracker):
         return estimator.solve_centroids(centroids, exposure_s=exposure_s)
     return estimator.solve_centroids(centroids)
 
 
-# Automatic exposure: set the next exposure time from the last frame.
+# Automatic exposure.
 
 
 class ExposureController:
@@ -219,8 +236,12 @@ class ExposureController:
 
     Attributes
     ----------
+    control
+        Constants of the control law; None for fixed exposure times
+    settings
+        Settings of the tracker
     exposure_s
-        Of the next frame; always the scene's `exposure.time` without `tracker.exposure_control`
+        Exposure time of the next frame; always the scene's `exposure.time` without `tracker.exposure_control`
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -231,23 +252,21 @@ class ExposureController:
     def update(self, frame: Frame) -> None:
         """Update the exposure time from a frame, which was exposed for `frame.exposure_s`."""
         if self.control:
-            state = NextExposure(frame.exposure_s)
-            self.exposure_s = step(
-                state, observe_frame(self.settings, self.control, frame), self.control
-            ).time_s
+            observed = observe_frame(self.settings, self.control, frame)
+            self.exposure_s = step(NextExposure(frame.exposure_s), observed, self.control).time_s
 
 
 def control_settings(scene: Scene) -> Control | None:
-    """The constants of the control law from the scene; None where exposure times are fixed."""
+    """The constants of the control law from the scene; None for fixed exposure times."""
     config = scene.tracker.exposure_control
     return Control(**dict(config)) if config else None
 
 
 def observe_frame(settings: Settings, control: Control, frame: Frame) -> Observation:
-    """What the control law needs from a frame: brightness statistics of the detected blobs.
+    """The input of the control law from a frame: brightness statistics of the detected blobs.
 
-    Blobs that are not stars (defects, tracks, the Moon) are left out. A pixel counts as saturated near the camera's
-    saturation value.
+    Blobs that are not stars (defects, tracks, the Moon) are left out. A pixel near the camera's saturation value counts
+    as saturated.
     """
     try:
         blobs = DETECTORS[settings.detector](

@@ -1,7 +1,10 @@
 """On-board navigation: IMU, inertial navigator, attitude filter, and the attitude that the controller gets.
 
-The IMU's samples are integrated to an attitude (`imu.Navigator`) and, if the scene has a filter, propagate a
-multiplicative extended Kalman filter (`estimator.filter.mekf`). Each star-tracker attitude updates the filter.
+1. `Navigation.sample_imu` takes the samples of the IMU. The inertial navigator (`imu.Navigator`) integrates them to an
+   attitude.
+2. With a filter, they also propagate a multiplicative extended Kalman filter (`estimator.filter.mekf`).
+3. `Navigation.update_filter` updates the filter with each attitude of a star tracker.
+4. `attitude_wxyz` and `body_rate_rad_s` are the estimates that the controller gets.
 """
 
 from __future__ import annotations
@@ -25,19 +28,26 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.tracker import FilterConfig
 from skysim.scene.sections.vehicle import ImuConfig
 
-# The gyro's rate of a frame, for the star tracker: mean of the IMU's samples over the frame's
-# exposure.
+# Rate of a frame from the gyros, for the star tracker.
 
 
 def rate_of_frame(
     samples: Increments, window: Window, rows: int, config: ImuConfig, mount: Mount
 ) -> RateEstimate | None:
-    """Rate of the camera in its own axes, with the covariance of the data sheet; None without samples, or saturated.
+    """Mean rate of the camera in its own axes over an exposure, with the covariance by the gyros' data sheet.
+
+    None without samples, and if a gyro was saturated.
 
     Parameters
     ----------
+    samples
+        Samples of the IMU
     window, rows
-        Exposure of a sensor of so many rows, to the end of its last row
+        Exposure window and number of rows: the exposure ends with that of the last row
+    config
+        The scene's `vehicle.imu`
+    mount
+        Mount of the camera
     """
     begin_s = window.open_s
     end_s = window.close_s(rows)
@@ -50,7 +60,14 @@ def rate_of_frame(
 
 
 def sigma_rad_s(config: ImuConfig, rate_rad_s: float, duration_s: float) -> float:
-    """Standard deviation about each axis of a mean rate: by noise, counts, bias, scale factors and axes."""
+    """Standard deviation about each axis of a mean rate: the root of the sum of squares of
+
+    1. white noise, sigma / sqrt(duration)
+    2. quantization of both ends, quantum / sqrt(6) / duration
+    3. bias instability and turn-on bias
+    4. scale factor and misalignment times the rate
+    5. the Earth rate, if the gyros sense it
+    """
     gyro = config.gyro
     return math.hypot(
         math.radians(gyro.arw_deg_sqrt_h) / 60 / math.sqrt(duration_s),
@@ -64,7 +81,7 @@ def sigma_rad_s(config: ImuConfig, rate_rad_s: float, duration_s: float) -> floa
 
 
 def latest(samples: list[Increments], kept_s: float) -> list[Increments]:
-    """Without the samples that ended more than kept_s before the last one."""
+    """The samples that ended at most kept_s before the last one."""
     if not math.isfinite(kept_s):
         return samples
     since_s = samples[-1].t_s[-1] - kept_s
@@ -72,20 +89,22 @@ def latest(samples: list[Increments], kept_s: float) -> list[Increments]:
 
 
 class Navigation:
-    """The vehicle's attitude estimates: integrated gyros, and the filter that the star tracker corrects.
+    """The vehicle's attitude estimates: integrated gyros, and the filter that star trackers correct.
 
-    Attributes
+    Parameters
     ----------
     scene
-        With `vehicle.imu`, and optionally `filter`
+        The scene, with `vehicle.imu` and optionally `filter`
     mounts
-        Of the cameras, as assumed; the main one's first
-    lab_from_body_wxyz
-        (4,) the true attitude at the start, when the navigator is zeroed
+        Assumed mounts of the cameras, that of the main camera first
+    lab_from_body
+        True attitude at the start, when the navigator is zeroed
     position_body_m, gravity_m_s2
-        Of the accelerometers
+        Position (3,) of the accelerometers in body axes, and gravity
+    rng
+        Generator of the IMU's noise
     kept_s
-        How long IMU samples are kept, for `imu_samples`
+        Time for which IMU samples are kept, for `imu_samples`
     """
 
     def __init__(
@@ -123,11 +142,16 @@ class Navigation:
     def sample_imu(
         self, now_s: float, t_s: Floats, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats
     ) -> None:
-        """Take the IMU samples due up to now_s; update navigator and filter with them.
+        """Take the IMU samples that are due up to now_s; update navigator and filter with them.
 
-        t_s (K,), lab_from_body_wxyz (K, 4), rate_body_rad_s (K, 3) : knots of the motion since the last call
+        Parameters
+        ----------
+        now_s
+            Present time
+        t_s, lab_from_body_wxyz, rate_body_rad_s
+            Times (K,), attitudes (K, 4) and rates (K, 3) in body axes of the motion since the last call
         """
-        # The small term keeps a sample that is due exactly now from being lost to rounding.
+        # 1. Samples. The small term keeps rounding from losing a sample that is due exactly now.
         due = int(now_s / self.step_s + 1e-6) - self.samples
         if due < 1:
             return
@@ -146,19 +170,20 @@ class Navigation:
         measured = self.imu.measure(ideal)
         self.measured.append(measured)
         self.measured = latest(self.measured, self.kept_s)
+        # 2. Navigator, and the mean rate of this period.
         self.navigator.add(measured)
         self.saturated = bool(measured.saturated.any())
         compensation = self.earth_body_rad_s(self.navigator.lab_from_body_wxyz)
         self.rate_rad_s = measured.angle_rad.mean(axis=0) / self.step_s - compensation
         if self.filter:
-            # The filter's reference is the lab, so the Earth rate is removed at its own attitude estimate.
+            # 3. Filter. Its reference is the lab, so the Earth rate is removed at its own attitude estimate.
             compensation = self.earth_body_rad_s(self.attitude_wxyz("filter"))
             self.filter.propagate(
                 ends_s, measured.angle_rad - compensation * self.step_s, measured.saturated
             )
 
     def imu_samples(self, since_s: float = -math.inf) -> imu.Increments:
-        """The kept IMU samples from about this time on: whole control periods."""
+        """The kept IMU samples of whole control periods from about since_s on."""
         if not self.measured:
             none = np.zeros((0, 3))
             return imu.Increments(
@@ -178,10 +203,10 @@ class Navigation:
         return imu.Increments(t_s, self.step_s, angle, velocity, saturated, overloaded)
 
     def apparent_bias_rad_s(self, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats) -> Floats:
-        """(3,) error of the measured rate, without noise, at this true attitude and rate (3,).
+        """(3,) error of the measured rate without noise at a true attitude (4,) and rate (3,), in body axes.
 
-        The sum of the gyro bias, of scale factor and misalignment errors times the rate, and of the Earth rate if
-        it is not compensated.
+        It is the sum of the gyro bias, the scale factor and misalignment errors times the rate, and the Earth rate if
+        that is not compensated.
         """
         uncompensated = self.earth_sensed_rad_s - self.earth_compensated_rad_s
         earth = quaternion.apply(quaternion.inverse(lab_from_body_wxyz), uncompensated)
@@ -201,11 +226,13 @@ class Navigation:
     def update_filter(self, t_s: float, solution: Attitude, camera: int = 0) -> str:
         """Update the filter with a camera's attitude at mid-exposure t_s; return the status of the update.
 
-        Without filter, attitude or covariance the tracker's own status is returned. The time's standard deviation s
-        adds s^2 w w^T to the covariance, w the filter's rate: a late tag turns the attitude along the motion.
+        Without filter, attitude or covariance the status of the tracker is returned. An error of the time tag rotates
+        the attitude along the motion, so its standard deviation s adds s^2 w w^T to the covariance, with the filter's
+        rate w.
         """
         if self.filter is None or solution.cam_from_ref is None or solution.covariance_rad2 is None:
             return solution.status
+        # Covariance in body axes.
         body_from_cam = self.body_from_cam[camera]
         R_body_from_cam = body_from_cam.as_matrix()
         covariance = R_body_from_cam @ solution.covariance_rad2 @ R_body_from_cam.T
@@ -224,21 +251,24 @@ class Navigation:
         return self.filter.ref_from_body_wxyz
 
     def body_rate_rad_s(self, feedback: str) -> Floats:
-        """(3,) body rate in the lab from the same source: the mean over the last control period for the IMU."""
-        return (
-            self.rate_rad_s if feedback == "imu" or self.filter is None else self.filter.rate_rad_s
-        )
+        """(3,) body rate in the lab, in body axes, from the same source.
+
+        That of the IMU is the mean over the last control period.
+        """
+        if feedback == "imu" or self.filter is None:
+            return self.rate_rad_s
+        return self.filter.rate_rad_s
 
 
 def zeroed_attitude(lab_from_body: Rotation, error_deg: tuple[float, float, float]) -> Rotation:
-    """The attitude to which the navigator is zeroed: the true one less the error in roll, pitch, yaw."""
+    """The attitude to which the navigator is zeroed: the true one minus the error in roll, pitch, yaw."""
     yaw, pitch, roll = lab_from_body.as_euler("ZYX", degrees=True)
     angles_deg = [yaw - error_deg[2], pitch - error_deg[1], roll - error_deg[0]]
     return Rotation.from_euler("ZYX", angles_deg, degrees=True)
 
 
 def build_filter(config: FilterConfig, lab_from_body: Rotation, cameras: int = 1) -> AttitudeFilter:
-    """The attitude filter at the start; its reference frame is the lab."""
+    """The attitude filter at the start, in SI units; its reference frame is the lab."""
     gyro = GyroModel(
         math.radians(config.arw_deg_sqrt_h) / math.sqrt(HOUR_S),
         math.radians(config.bias_deg_h) / HOUR_S,

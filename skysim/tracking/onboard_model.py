@@ -1,4 +1,7 @@
-"""The tracker's models of its camera, lever arm, dome and sky: the true values with calibration and survey errors."""
+"""The tracker's models of its camera, lever arm, dome and sky: the true values with calibration and survey errors.
+
+Functions `assumed_...` return the model of a scene. `OrbitStarTracker` is the tracker in an orbit.
+"""
 
 from __future__ import annotations
 
@@ -39,9 +42,9 @@ from skysim.tracking import dome_map_file
 def assumed_dome(scene: Scene, light: DomeConfig, sources: Sources) -> LedMap:
     """The dome map that the tracker uses: the true LED positions and surface with the errors of the survey.
 
-    The one sigma of LEDs that an instrument measured is the greatest across the line from the bearing. It sets the
-    matching radius of the identification, which must not exceed that of the final match (`DomeTracker.solve_match`): an
-    LED that only the first one admits makes the tracker refuse the frame.
+    If an instrument measured the LEDs, the map's single sigma is the greatest one across the line from the bearing. It
+    sets the matching radius of the identification, which must not exceed that of the final match
+    (`DomeTracker.solve_match`): an LED that only the first one admits makes the tracker refuse the frame.
     """
     inside = surface.build_surface(light.surface)
     survey = scene.tracker.survey
@@ -57,15 +60,16 @@ def assumed_dome(scene: Scene, light: DomeConfig, sources: Sources) -> LedMap:
 
 
 def with_brightness(scene: Scene, light: DomeConfig, leds: LedMap, lever: Lever) -> LedMap:
-    """The map with the flux of each LED in DN per second of exposure, as the data sheets say it: without scatter.
+    """The map with the flux of each LED in DN per second of exposure by the data sheets, without scatter.
 
-    Each is seen along its normal by the camera that points at it, at its distance from the bearing less the lever.
+    The camera points at each LED and sees it along its normal, at its distance from the bearing minus the lever.
     """
     if scene.tracker.brightness_sigma is None:
         return leds
     nominal = led_list.design_leds(
         light, surface.build_surface(light.surface), Band.from_camera(scene.camera)
     )
+    # The design's LEDs in the order of the map.
     order = np.argsort(nominal.id)
     nominal = nominal.take(order[np.searchsorted(nominal.id, leds.id, sorter=order)])
     distance_m = np.linalg.norm(leds.position_m, axis=1) - np.linalg.norm(lever.camera_body_m)
@@ -73,16 +77,13 @@ def with_brightness(scene: Scene, light: DomeConfig, leds: LedMap, lever: Lever)
     light_e_s_m2 = irradiance_e_s_m2(
         strength, Emitter.from_config(light.led), np.ones(1), np.ones(1), distance_m
     )
-    flux_s = (
-        light_e_s_m2
-        * Optics.from_camera(scene.camera).collecting_m2
-        / scene.camera.detector.gain_e_dn
-    )
+    collecting_m2 = Optics.from_camera(scene.camera).collecting_m2
+    flux_s = light_e_s_m2 * collecting_m2 / scene.camera.detector.gain_e_dn
     return replace(leds, flux_s=flux_s, flux_sigma=scene.tracker.brightness_sigma)
 
 
 def assumed_code(light: DomeConfig, sources: Sources, leds: LedMap) -> LedCode:
-    """The words of the LEDs of the tracker's map, as the dome has them."""
+    """The code words of the LEDs in the tracker's map, which are those of the dome."""
     assert light.led.code is not None
     code = light.led.code
     row = np.searchsorted(sources.id, leds.id, sorter=np.argsort(sources.id))
@@ -91,24 +92,31 @@ def assumed_code(light: DomeConfig, sources: Sources, leds: LedMap) -> LedCode:
 
 
 def assumed_air(scene: Scene) -> SiteAir | None:
-    """The air that the tracker undoes with `tracker.refraction`: the site, the date and the weather as they are."""
+    """The air whose refraction the tracker corrects, with the true site, date and weather.
+
+    None without `tracker.refraction`.
+    """
     light = scene.light
     site = scene.site
-    if (
-        not (scene.tracker.refraction and isinstance(light, StarsConfig) and light.air)
-        or site.longitude_deg is None
-    ):
+    if not isinstance(light, StarsConfig) or light.air is None or site.longitude_deg is None:
         return None
-    band = Band.from_camera(scene.camera)
-    weather = weather_of(light.air, site, band)
-    air = weather.pressure_hpa, weather.temperature_c, weather.wavelength_m
-    return SiteAir(site.latitude_deg, site.longitude_deg, scene.start_time, *air)
+    if not scene.tracker.refraction:
+        return None
+    weather = weather_of(light.air, site, Band.from_camera(scene.camera))
+    return SiteAir(
+        site.latitude_deg,
+        site.longitude_deg,
+        scene.start_time,
+        weather.pressure_hpa,
+        weather.temperature_c,
+        weather.wavelength_m,
+    )
 
 
 def assumed_lever(scene: Scene, mount: Mount) -> Lever:
-    """The camera's lever arm that the tracker assumes: `assumed_camera_body_m`, else the true one with survey error.
+    """The lever arm of the camera that the tracker assumes: `assumed_camera_body_m`, or the true one with survey error.
 
-    The camera's attitude on the vehicle is known exactly.
+    The tracker knows the camera's attitude on the vehicle exactly.
     """
     survey = scene.tracker.survey
     lever_m = scene.tracker.assumed_camera_body_m or survey_errors.assumed_m(
@@ -120,10 +128,11 @@ def assumed_lever(scene: Scene, mount: Mount) -> Lever:
 def surveyed_dome(
     scene: Scene, path: str, leds: LedMap, lever: Lever
 ) -> tuple[Camera, LedMap, Lever]:
-    """Camera, LEDs and lever arm from a survey's file; surface and boards stay those of the given LedMap.
+    """Camera, LED map and lever arm from the file of a survey; surface and boards stay those of the given map.
 
-    One sigma serves for all LEDs, the median of the file's. Raises InputError for a file of another dome or camera.
+    The single sigma of the map is the median of the file's. Raises InputError for a file of another dome or camera.
     """
+    # 1. The file is of this camera and of LEDs of this dome.
     dome_map = dome_map_file.read_dome_map(Path(path))
     size_px = (scene.camera.width_px, scene.camera.height_px)
     if dome_map.size_px != size_px:
@@ -141,6 +150,7 @@ def surveyed_dome(
             f"{path}: unknown LED {unknown[0]}",
             f"the {len(order)} LEDs of this dome",
         )
+    # 2. The surveyed values.
     board = None if leds.board is None else leds.board[row]
     surveyed = replace(
         leds,
@@ -157,15 +167,12 @@ def surveyed_dome(
         center_px=dome_map.center_px,
         distortion=dome_map.distortion,
     )
-    return (
-        camera,
-        surveyed,
-        Lever(dome_map.camera_body_m, lever.cam_from_body, dome_map.lever_sigma_m),
-    )
+    lever = Lever(dome_map.camera_body_m, lever.cam_from_body, dome_map.lever_sigma_m)
+    return camera, surveyed, lever
 
 
 def assumed_camera(scene: Scene) -> Camera:
-    """The camera calibration that the tracker uses."""
+    """The camera calibration that the tracker assumes: `tracker.assumed_...`, or the true one with survey error."""
     config = scene.tracker
     camera = calibration(scene.camera)
     if config.assumed_distortion is not None:
@@ -184,22 +191,26 @@ def assumed_camera(scene: Scene) -> Camera:
 
 def calibration(camera: CameraConfig) -> Camera:
     """The exact calibration of a camera, as the estimator's Camera."""
-    row_time_s = (
-        camera.shutter.row_time_s if isinstance(camera.shutter, RollingShutterConfig) else 0.0
-    )
-    size_px = camera.width_px, camera.height_px
+    shutter = camera.shutter
     return Camera(
-        *size_px, camera.focal_px, camera.center_px, camera.distortion, row_time_s=row_time_s
+        camera.width_px,
+        camera.height_px,
+        camera.focal_px,
+        camera.center_px,
+        camera.distortion,
+        row_time_s=shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0,
     )
 
 
 def onboard_catalog(key: str, name: str) -> catalog.StarCatalog:
-    """The tracker's star catalog, a name in data/catalogs/ or a file, by the estimator's own reader.
+    """The tracker's star catalog, read by the estimator's own reader. Raises InputError.
 
     Parameters
     ----------
     key
-        The scene's key or the option that gives it, for the message of InputError
+        Key of the scene, or option, that names the catalog, for the error message
+    name
+        Name in data/catalogs/, or a file
     """
     try:
         return catalog.read(require_catalog(key, name))
@@ -213,10 +224,10 @@ def onboard_catalog(key: str, name: str) -> catalog.StarCatalog:
 class OrbitStarTracker(StarTracker):
     """A StarTracker whose attitudes are corrected for the orbit's velocity at each frame.
 
-    Its catalog has the apparent directions of the orbit's start. Since then the velocity has changed by dv, and a star
-    in direction u is displaced by (dv - (dv.u) u) / c. About the boresight b this is the rotation b x dv / c, by which
-    the attitude is corrected. At an angle a from the boresight up to 5" sin a (10" sin a after half an orbit) is left,
-    the same on opposite sides, a change of scale.
+    Its catalog has the apparent directions at the start of the orbit. Since then the velocity has changed by dv, which
+    displaces a star in direction u by (dv - (dv.u) u) / c. At the boresight b this is the rotation b x dv / c, by which
+    the attitude is corrected. At an angle a from the boresight up to 5" sin a (10" sin a after half an orbit) remains.
+    It is the same on opposite sides, which is a change of scale.
     """
 
     def __init__(
@@ -239,31 +250,28 @@ class OrbitStarTracker(StarTracker):
         exposure_s: float | None = None,
         t_s: float = 0.0,
     ) -> Report:
-        """As `StarTracker.solve`; t_s : time of the frame since the orbit's start."""
+        """As `StarTracker.solve`; t_s is the time of the frame since the start of the orbit."""
         report = super().solve(image, streak_px, rate, exposure_s)
         return replace(report, attitude=self.corrected(report.attitude, t_s))
 
     def corrected(self, attitude: Attitude, t_s: float) -> Attitude:
-        """The attitude of a frame at a time since the scene's start."""
+        """The attitude of a frame at a time since the start, corrected by the rotation b x dv / c."""
         if attitude.cam_from_ref is None:
             return attitude
         boresight = attitude.cam_from_ref.inv().apply([0.0, 0.0, 1.0])
-        changed = (
-            state_at(self.orbit, t_s).velocity_m_s - self.start_m_s
-        ) / catalog.SPEED_OF_LIGHT_M_S
+        changed_m_s = state_at(self.orbit, t_s).velocity_m_s - self.start_m_s
+        changed = changed_m_s / catalog.SPEED_OF_LIGHT_M_S
         now_from_start = Rotation.from_rotvec(np.cross(boresight, changed))
         return replace(attitude, cam_from_ref=attitude.cam_from_ref * now_from_start.inv())
 
 
 def assumed_orbit(scene: Scene) -> CameraOrbit | None:
-    """The orbit whose velocity the tracker knows; None on the ground, or if it does not know it."""
+    """The orbit whose velocity the tracker knows; None on the ground, or without `tracker.orbit_velocity`."""
     return build_orbit(scene.orbit, scene.start_time) if scene.tracker.orbit_velocity else None
 
 
 def assumed_observer(scene: Scene, orbit: CameraOrbit | None) -> catalog.Observer:
-    """The observer of the tracker's catalog at the scene's start: at the Earth's center, with the `assumed_orbit`'s
-    velocity.
-    """
+    """The observer of the tracker's catalog at the scene's start: at the Earth's center, with the orbit's velocity."""
     observer = catalog.on_earth(scene.start_time)
     if orbit is None:
         return observer

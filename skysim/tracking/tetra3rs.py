@@ -1,8 +1,15 @@
 """tetra3rs (github.com/ssmichael1/tetra3rs, MIT) as a star tracker: its own catalog (Gaia), centroids and solver.
 
-The entry point `tetra3rs`; the package comes with the extra `oracle`. Options, from `tracker.options`:
-fast : single-pass centroiding instead of the full one;  sigma : threshold;  brightest : most centroids
-limit_mag : of its catalog; if left out, it takes as many stars as the field needs
+It is the entry point `tetra3rs`; the package comes with the extra `oracle`. Options in `tracker.options`:
+
+fast
+    Single-pass centroiding instead of the full one
+sigma
+    Detection threshold
+brightest
+    Greatest number of centroids
+limit_mag
+    Limiting magnitude of its catalog; if left out, it takes as many stars as the field needs
 """
 
 from __future__ import annotations
@@ -24,7 +31,7 @@ class Tetra3rs:
     """Lost-in-space solution of every frame. It assumes a calibrated camera and an observer on Earth."""
 
     def __init__(self, setup: Setup) -> None:
-        """Raises ValueError for a set-up that it cannot work with, ImportError where tetra3rs is not installed."""
+        """Raises ValueError for a set-up that it cannot use, ImportError if tetra3rs is not installed."""
         if setup.reference != "icrs":
             raise ValueError(
                 "tetra3rs solves star fields only; allowed: scenes with light.kind: stars"
@@ -54,8 +61,9 @@ class Tetra3rs:
         )
 
     def solve(self, picture: Picture) -> Answer:
-        """Solve one frame. The quaternion is scalar first, ICRS to camera; the covariance uses other
-        angles: left out.
+        """The solution of one frame.
+
+        tetra3rs's quaternion is scalar first, ICRS to camera. Its covariance is of other angles and is left out.
         """
         extraction = self.extract(
             picture.image_dn,
@@ -68,10 +76,8 @@ class Tetra3rs:
             camera_model=self.camera,
             observer_velocity_km_s=self.velocity_km_s,
         )
-        xy_px = (
-            np.array([(centroid.x, centroid.y) for centroid in extraction.centroids]).reshape(-1, 2)
-            + self.image_center_px
-        )
+        centered_px = np.array([(centroid.x, centroid.y) for centroid in extraction.centroids])
+        xy_px = centered_px.reshape(-1, 2) + self.image_center_px
         if not solution:
             return Answer(str(solution.status).replace("_", " "), centroids_px=xy_px)
         w, x, y, z = solution.quaternion
@@ -84,11 +90,12 @@ def image_center_px(setup: Setup) -> Any:
 
 
 def camera_model(tetra3rs: Any, setup: Setup) -> Any:
-    """tetra3rs's camera model: the same distortion polynomial in pixels, so coefficients are divided by powers
-    of the focal length.
+    """tetra3rs's camera model.
+
+    Its distortion polynomial is in pixels, so the coefficients are divided by powers of the focal length.
     """
     f = setup.focal_px
-    (k1, k2, p1, p2, k3) = setup.distortion
+    k1, k2, p1, p2, k3 = setup.distortion
     distortion = tetra3rs.RadialDistortion(
         k1=k1 / f**2, k2=k2 / f**4, k3=k3 / f**6, p1=p1 / f, p2=p2 / f
     )

@@ -26,7 +26,7 @@ from skysim.tracking.tracker_interface import (
 
 
 def receive_picture(header: dict[str, Any], frames: IO[bytes]) -> Picture:
-    """Read the pixels of a frame whose header has been read."""
+    """The frame of a header, with its pixels read from the stream."""
     count = header["bytes"]
     image = np.frombuffer(frames.read(count), header["dtype"]).reshape(
         header["height_px"], header["width_px"]
@@ -48,7 +48,7 @@ def solve_picture(tracker: Tracker, picture: Picture) -> Answer:
 
 
 def create_tracker(name: str, setup: Setup) -> Tracker:
-    """Load an entry point and build its tracker."""
+    """The tracker of an entry point. Raises TypeError if it has no method `solve`."""
     tracker = TRACKERS.entry_points()[name].load()(setup)
     if not callable(getattr(tracker, "solve", None)):
         raise TypeError(f"{type(tracker).__name__} has no method solve")
@@ -56,7 +56,7 @@ def create_tracker(name: str, setup: Setup) -> Tracker:
 
 
 def create(name: str, setup: dict[str, Any]) -> Respond:
-    """The function that answers frames, for `serve`."""
+    """The function with which `serve` answers frames."""
     tracker = create_tracker(name, Setup.of_tree(setup))
 
     def respond(header: dict[str, Any], frames: IO[bytes]) -> dict[str, Any]:

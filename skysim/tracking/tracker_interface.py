@@ -1,7 +1,8 @@
-"""The interface for external star trackers: set-up, frame, answer, and discovery by entry points `skysim.trackers`.
+"""The interface for external star trackers: set-up, frame, answer, and the programs that exchange them.
 
-An entry point names a callable that makes a `Tracker` from a `Setup`. It runs in its own process, so that a hang or
-a crash there becomes a failed answer and does not end the run; docs/howto/external_tracker.md has examples.
+An entry point of the group `skysim.trackers` names a callable that makes a `Tracker` from a `Setup`. It runs in its own
+process, so a hang or a crash becomes a failed answer and does not end the run. A program from the user's command line
+answers each frame with a line of JSON; no file can name a command. docs/howto/external_tracker.md has examples.
 """
 
 from __future__ import annotations
@@ -30,36 +31,37 @@ from skysim.core.plugins import (
     finite_array,
     to_lists,
 )
+from skysim.core.types import Floats
 from skysim.dynamics.controllers import CONTROLLERS
 
 OWN = "own"  # the name of skysim's own estimator
 TRACKERS = PluginKind("tracker", "skysim.trackers", "tracker.name", (OWN,))
 SOLVED = "solved"
 FAILED = "failed: "  # start of the status after an exception, hang, crash or invalid answer
-PROTOCOL = 1  # version, the first key of the set-up
-UNIT_TOLERANCE = 1e-3  # of a quaternion's norm: single precision passes and is normalized
+PROTOCOL = 1  # version of the protocol, the first key of the set-up
+UNIT_TOLERANCE = (
+    1e-3  # deviation of a quaternion's norm from 1: single precision passes and is normalized
+)
+MIN_RAD2 = 1e-24  # smallest eigenvalue of a covariance: (0.2 micro-arcseconds)^2
 MAX_RAD2 = (2 * np.pi) ** 2  # largest eigenvalue of a covariance: no information
-EXTRAS = {
-    "skysim.tracking.tetra3rs:Tetra3rs": ("tetra3rs", "oracle")
-}  # module and extra of the trackers in our own package
-MIN_RAD2 = 1e-24  # smallest eigenvalue: (0.2 micro-arcseconds)^2
 MAX_CENTROIDS = 100_000
 MAX_CENTROID_PX = 1e6  # distance from the first pixel along x and y
-
-Floats = NDArray[np.float64]
+# Module and extra of the trackers in skysim, by their entry point.
+EXTRAS = {"skysim.tracking.tetra3rs:Tetra3rs": ("tetra3rs", "oracle")}
 
 
 @dataclass(frozen=True, slots=True)
 class Stars:
     """The star catalog given to the tracker, brightest first.
 
-    (proper motion, parallax, aberration); magnitude : (N,) V
-
     Attributes
     ----------
     id
-        (N,) Hipparcos numbers; direction : (N, 3) apparent unit vectors in the reference frame
-        at the scene's date
+        (N,) Hipparcos numbers
+    direction
+        (N, 3) apparent unit vectors in the reference frame at the scene's date (proper motion, parallax, aberration)
+    magnitude
+        (N,) magnitudes in V
     """
 
     id: NDArray[np.int64]
@@ -74,9 +76,13 @@ class Leds:
     Attributes
     ----------
     id
-        (N,); position_m : (N, 3) in the lab
+        (N,) numbers of the LEDs
+    position_m
+        (N, 3) positions in the lab
     camera_body_m
-        (3,) entrance pupil in body axes; cam_from_body_xyzw : (4,) body axes to camera axes
+        (3,) position of the entrance pupil in body axes
+    cam_from_body_xyzw
+        (4,) rotation from body axes to camera axes, scalar last
     """
 
     id: NDArray[np.int64]
@@ -87,23 +93,24 @@ class Leds:
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What a tracker gets before the first frame: the hardware as the scene's tracker assumes it.
+    """The data that a tracker gets before the first frame: the hardware that the scene's tracker assumes.
 
     Attributes
     ----------
     reference
         Frame of the attitudes: "icrs" under the stars, "lab" under a dome or on a bench
     time_utc
-        ISO 8601, when t_s is 0
+        Date of t_s = 0, ISO 8601
     width_px, height_px, focal_px, center_px
-        A pinhole in camera axes, +x right, +y down, +z boresight; the center of the first pixel
-        is (0, 0)
+        Pinhole in camera axes, +x right, +y down, +z boresight; the center of the first pixel is (0, 0)
     distortion
-        k1, k2, p1, p2, k3 of Brown and Conrady, in OpenCV's order
-    stars, leds
-        The map; one of them is None
+        Coefficients k1, k2, p1, p2, k3 of Brown and Conrady, in OpenCV's order
+    gain_e_dn, saturation_dn
+        Gain of the detector, and the value at which it saturates
     seed
-        For a tracker that draws random numbers
+        The scene's seed, for a tracker that draws random numbers
+    stars, leds
+        Catalog or dome; the other one is None
     options
         The scene's `tracker.options`
     """
@@ -123,7 +130,7 @@ class Setup:
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def as_tree(self) -> dict[str, Any]:
-        """As a JSON object; arrays become lists."""
+        """The set-up as a JSON object; arrays become lists."""
         tree: dict[str, Any] = to_lists(asdict(self))
         return {"skysim_tracker": PROTOCOL, **tree}
 
@@ -136,25 +143,27 @@ class Setup:
                 values[name] = map_type(
                     **{key: np.array(value) for key, value in values[name].items()}
                 )
-        values["center_px"], values["distortion"] = (
-            tuple(values["center_px"]),
-            tuple(values["distortion"]),
-        )
+        for name in ("center_px", "distortion"):
+            values[name] = tuple(values[name])
         return cls(**values)
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One frame as a tracker gets it.
+    """One frame that a tracker gets.
 
     Attributes
     ----------
     image_dn
-        (height_px, width_px), uint16; float64 from a camera without noise
+        (height_px, width_px) image, uint16; float64 from a camera without noise
     frame
-        Its number; t_s : mid-exposure since the scene's start; exposure_s
+        Number of the frame
+    t_s
+        Mid-exposure, from the scene's start
+    exposure_s
+        Exposure time
     streak_px
-        (dx, dy) that lights move in the exposure, if a gyro measures it; else None
+        Motion (dx, dy) of the images in the exposure, if a gyro measures it; else None
     """
 
     image_dn: NDArray[Any]
@@ -171,16 +180,15 @@ class Answer:
     Attributes
     ----------
     status
-        "solved", or why there is no attitude
+        "solved", or the reason why there is no attitude
     cam_from_ref_xyzw
-        (4,) unit quaternion, scalar last: v_cam = q v_ref q*, reference to camera; only if
-        solved
+        (4,) unit quaternion from reference to camera, scalar last: v_cam = q v_ref q*; None if not solved
     covariance_rad2
-        (3, 3) of the small rotation in camera axes, optional; an attitude filter needs it
+        (3, 3) covariance of the small rotation in camera axes; optional, but an attitude filter needs it
     centroids_px
-        (N, 2) x and y of the lights found, optional
+        (N, 2) positions x and y of the lights found; optional
     seconds
-        Processing time; if None, the time from sending the frame to its answer
+        Processing time; None for the time from sending the frame to its answer
     """
 
     status: str
@@ -190,7 +198,7 @@ class Answer:
     seconds: float | None = None
 
     def as_tree(self) -> dict[str, Any]:
-        """As a JSON object; entries that are None are left out."""
+        """The answer as a JSON object; entries that are None are left out."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
         return {name: to_lists(value) for name, value in values.items() if value is not None}
 
@@ -207,15 +215,18 @@ class Answer:
 
 
 class Tracker(Protocol):
-    """What an entry point's callable makes of a `Setup`; the callable raises for a set-up that it cannot use."""
+    """The object that an entry point's callable returns for a `Setup`.
+
+    The callable raises an exception for a set-up that it cannot use.
+    """
 
     def solve(self, picture: Picture) -> Answer:
-        """The attitude at mid-exposure, or why there is none."""
+        """The attitude at mid-exposure, or the reason why there is none."""
         ...
 
 
 def check_answer(answer: Any) -> Answer:
-    """Check an answer (shapes of arrays, quaternion, covariance) and normalize its quaternion. Raises ValueError."""
+    """The answer with a normalized quaternion. Raises ValueError for wrong shapes, quaternion, covariance or time."""
     if not isinstance(answer, Answer):
         raise ValueError(f"the tracker returned {type(answer).__name__}; allowed: Answer")
     status = printable(answer.status)[:MAX_STATUS_CHARS] if isinstance(answer.status, str) else ""
@@ -240,7 +251,7 @@ def check_answer(answer: Any) -> Answer:
 
 
 def normalize_quaternion(quaternion: Floats) -> Floats:
-    """Normalize a quaternion whose norm is within UNIT_TOLERANCE of 1. Raises ValueError for others."""
+    """The normalized quaternion (4,). Raises ValueError if its norm is not within UNIT_TOLERANCE of 1."""
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > UNIT_TOLERANCE:
         raise ValueError(f"cam_from_ref_xyzw has norm {norm:.6g}; allowed: 1")
@@ -248,7 +259,10 @@ def normalize_quaternion(quaternion: Floats) -> Floats:
 
 
 def check_covariance(covariance: Floats) -> Floats:
-    """Check that a covariance is symmetric and positive definite within plausible limits. Raises ValueError."""
+    """The covariance (3, 3), made exactly symmetric.
+
+    Raises ValueError unless it is symmetric and positive definite within plausible limits.
+    """
     if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=0):
         raise ValueError("covariance_rad2 is not symmetric")
     eigenvalues = np.linalg.eigvalsh(covariance)
@@ -261,8 +275,11 @@ def check_covariance(covariance: Floats) -> Floats:
 
 
 def check_centroids(centroids: Any) -> Floats:
-    """(N, 2) centroids as finite numbers, not far out of the frame; empty for None. Raises ValueError."""
-    count = 0 if centroids is None else np.shape(centroids)[0] if np.ndim(centroids) else -1
+    """(N, 2) centroids; empty for None. Raises ValueError unless they are finite and not far outside the frame."""
+    if centroids is None:
+        return np.empty((0, 2))
+    # A number instead of an array has no rows, so that `finite_array` refuses it.
+    count = np.shape(centroids)[0] if np.ndim(centroids) else -1
     if count > MAX_CENTROIDS:
         raise ValueError(f"centroids_px has {count} rows; allowed: up to {MAX_CENTROIDS}")
     xy_px = finite_array(centroids, "centroids_px", (count, 2)) if count else np.empty((0, 2))
@@ -274,20 +291,20 @@ def check_centroids(centroids: Any) -> Floats:
 
 
 def missing_extra(point: metadata.EntryPoint) -> str:
-    """The extra to install for one of skysim's own plug-ins, if it is missing; else empty. Imports nothing."""
+    """The extra to install for one of skysim's own plug-ins if its package is missing; else "". Imports nothing."""
     plugin = EXTRAS.get(point.value)
     return f"skysim[{plugin[1]}]" if plugin and find_spec(plugin[0]) is None else ""
 
 
-# Programs, and the one that is an external tracker: it answers each frame with a line of JSON.
-
+# Programs as external trackers.
 
 MAX_FAILURES = 3  # consecutive failures after which a program is not restarted
 NAME = re.compile(r"[a-z][a-z0-9_-]*")
 
 
 def program_commands(options: Sequence[str] | None) -> dict[str, str]:
-    """Parse texts `NAME=COMMAND` (trackers, controllers) to commands by name. Raises InputError."""
+    """Commands by name from texts `NAME=COMMAND` (trackers, controllers). Raises InputError."""
+    kinds = (TRACKERS, CONTROLLERS)
     programs: dict[str, str] = {}
     for option in options or ():
         name, equals, command = option.partition("=")
@@ -295,15 +312,8 @@ def program_commands(options: Sequence[str] | None) -> dict[str, str]:
             raise InputError(
                 "programs", option, "NAME=COMMAND, NAME of lower-case letters, digits, _ and -"
             )
-        taken = {
-            *programs,
-            *(
-                known
-                for kind in (TRACKERS, CONTROLLERS)
-                for known in (*kind.own, *kind.entry_points())
-            ),
-        }
-        if name in taken:
+        taken = {known for kind in kinds for known in (*kind.own, *kind.entry_points())}
+        if name in taken or name in programs:
             raise InputError(f"programs.{name}", "name already in use", "another one")
         split_command(name, command)
         programs[name] = command
@@ -311,7 +321,7 @@ def program_commands(options: Sequence[str] | None) -> dict[str, str]:
 
 
 def split_command(name: str, command: str) -> tuple[list[str], str | None]:
-    """Split a command into its arguments; also return the file format of `{folder}`, None without one."""
+    """The arguments of a command, and the file format of its `{folder}`; None without one. Raises InputError."""
     try:
         arguments = shlex.split(command)
     except ValueError as error:
@@ -334,7 +344,7 @@ def write_png(path: Path, picture: Picture) -> None:
 
 
 def write_fits(path: Path, picture: Picture) -> None:
-    """Write the frame as FITS with times in the header, without the truth that a run's own frames carry."""
+    """Write the frame as FITS with times in the header, but without the truth that the frames of a run contain."""
     from astropy.io import fits
 
     from skysim.core import files
@@ -352,19 +362,23 @@ WRITERS: dict[str, Callable[[Path, Picture], None]] = {"png": write_png, "fits":
 class TrackerProgram(Program):
     """An external tracker program. After a failure it is restarted for the next frame, up to MAX_FAILURES in a row.
 
-    Attributes
+    Parameters
     ----------
+    name
+        Name of the tracker, for messages
     arguments, image_format
-        Of `split_command`
+        Arguments and file format from `split_command`
+    setup
+        Set-up to send
     limit_s
-        Time limit per frame
+        Time limit for each frame
     environment
-        In place of this process's
+        Environment of the program; None for that of this process
 
     Raises
     ------
     InputError
-        Where it cannot be started or refuses the set-up.
+        If it cannot be started, or refuses the set-up.
     """
 
     def __init__(
@@ -396,7 +410,7 @@ class TrackerProgram(Program):
             answer = self.to_answer(reply, picture.frame)
         except ProgramError as error:
             if self.running is None:
-                self.failures = self.failures + 1
+                self.failures += 1
                 self.last_failure = str(error)
             raise
         self.failures = 0
@@ -404,7 +418,7 @@ class TrackerProgram(Program):
         return replace(answer, seconds=own_s)
 
     def to_answer(self, reply: Any, frame: int) -> Answer:
-        """Convert JSON to an Answer. Raises ProgramError; an answer to another frame ends the program."""
+        """The checked answer of a JSON reply. Raises ProgramError; an answer to another frame ends the program."""
         if not isinstance(reply, dict) or reply.get("frame") != frame:
             raise self.fail(f"no answer to frame {frame}, but {str(reply)[:80]!r}")
         try:
@@ -415,12 +429,12 @@ class TrackerProgram(Program):
             raise ProgramError(str(error)) from None
 
     def frame_message(self, picture: Picture) -> list[bytes]:
-        """A frame's header and, unless it is written to the folder, its pixels, row by row, little-endian.
+        """The header of a frame and, unless the frame is written to the folder, its pixels: row by row, little-endian.
 
         Raises
         ------
         ProgramError
-            Where the program has made its folder unusable.
+            If the program has made its folder unusable.
         """
         header: dict[str, Any] = {
             "frame": picture.frame,

@@ -1,4 +1,4 @@
-"""Multibody dynamics of the vehicle on its bearing by MuJoCo. The only package that imports MuJoCo."""
+"""Multibody dynamics of the vehicle on its bearing, by MuJoCo. No other package imports MuJoCo."""
 
 from skysim.dynamics.multibody.integrator import PrescribedMotion as PrescribedMotion
 from skysim.dynamics.multibody.integrator import Simulation as Simulation

@@ -1,4 +1,4 @@
-"""What the flight computer and the model ask of a kind of actuator."""
+"""The interface of a kind of actuator, and the helpers that the kinds share."""
 
 from __future__ import annotations
 
@@ -15,15 +15,21 @@ from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats
 
-RANK_TOLERANCE = (
-    1e-6  # directions with a smaller fraction of the largest singular value get no torque
-)
+# Directions whose singular value is a smaller fraction of the largest get no torque.
+RANK_TOLERANCE = 1e-6
 
 
 class ControlInput(NamedTuple):
-    """The controller's inputs at the start of a control period: measured body rate (3,), all of qpos and qvel.
+    """The inputs of an actuator set at the start of a control period.
 
-    Of the latter only angles and speeds of wheels and gimbals are used, as encoders without errors.
+    Attributes
+    ----------
+    t_s, period_s
+        Time since the scene's start, and length of the control period
+    rate_body_rad_s
+        (3,) measured rate of the body, in body axes
+    angles_rad, speeds_rad_s
+        The full qpos and qvel; only those of wheels, rotors and gimbals are used, as encoders without errors
     """
 
     t_s: float
@@ -34,10 +40,10 @@ class ControlInput(NamedTuple):
 
 
 class Actuators(Protocol):
-    """An actuator set: converts a torque (3,) on the body to entries of the controls (nu,)."""
+    """A set of actuators of one kind: converts a torque (3,) on the body to entries of the controls (nu,)."""
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
-        """Write the commands; return (3,) the torque that they will give."""
+        """Write the commands into control; return the torque (3,) that they will give."""
         ...
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
@@ -45,12 +51,12 @@ class Actuators(Protocol):
         ...
 
     def command_map(self) -> tuple[Floats, float]:
-        """(n, 3) commands per torque on the body with every gimbal at zero, and the limit of each command."""
+        """(n, 3) commands per unit of torque on the body, with every gimbal at zero, and the limit of a command."""
         ...
 
 
 def nothing(*_: Any) -> None:
-    """Default of the functions that a kind does not need."""
+    """Do nothing: the default of functions that a kind does not need."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,17 +66,17 @@ class ActuatorKind:
     Attributes
     ----------
     key
-        Of its section in the scene's `vehicle`, which switches it on
+        Key of its section in the scene's `vehicle`, which switches it on
     joints, sites
-        Beginnings of the names of its joints and sites in the vehicle's file
+        Prefixes of the names of its joints and sites in the vehicle's file
     add
-        Adds its motors to a spec; (spec, the compiled spec, config)
+        (spec, compiled spec, config): adds its motors to the spec
     control
-        Makes the set that the flight computer commands; (compiled model, config)
+        (compiled model, config): returns the set that the flight computer commands
     start
-        Sets the joints' angles and speeds in the data of a model; (model, data, config)
+        (model, data, config): sets the initial angles and speeds of its joints in the data
     check
-        Raises InputError for joints that do not fit together; (spec, path of the file)
+        (spec, path of the file): raises InputError for joints that do not fit together
     """
 
     key: str
@@ -84,14 +90,15 @@ class ActuatorKind:
 
 @jit
 def scale_to_limit(command: Floats, limit: float) -> Floats:
-    """Scale all elements of a command by one factor, so that none exceeds the limit and the direction is kept."""
+    """The command, scaled by one factor so that no element exceeds the limit; its direction is kept."""
     peak = np.abs(command).max()
     return command * (limit / peak if peak > limit else 1.0)
 
 
 def unit_columns(axes: Floats, name: str) -> Floats:
-    """(3, n) floats; raises InputError unless they are unit vectors."""
-    columns = np.ascontiguousarray(axes, dtype=float)  # one layout, or numba compiles for each
+    """(3, n) axes as floats. Raises InputError unless they are unit vectors."""
+    # One memory layout, since numba compiles for each.
+    columns = np.ascontiguousarray(axes, dtype=float)
     if columns.ndim != 2 or len(columns) != 3 or not columns.size:
         raise InputError(name, f"shape {columns.shape}", "(3, n), one column each")
     norm = np.linalg.norm(columns, axis=0)
@@ -101,7 +108,7 @@ def unit_columns(axes: Floats, name: str) -> Floats:
 
 
 def positive_values(value: Floats, n: int, name: str) -> Floats:
-    """(n,) positive floats; raises InputError otherwise."""
+    """(n,) values as floats. Raises InputError unless they are n positive numbers."""
     values = np.asarray(value, dtype=float)
     if values.shape != (n,) or not np.all(values > 0):
         raise InputError(name, values.tolist(), f"{n} positive numbers")
@@ -109,7 +116,6 @@ def positive_values(value: Floats, n: int, name: str) -> Floats:
 
 
 # Joints, sites and motors of actuators in the MuJoCo model.
-
 
 UNIT_GEAR = (1, 0, 0, 0, 0, 0)
 
@@ -121,15 +127,15 @@ class Hinges:
     Attributes
     ----------
     names
-        (n)
+        Names of the n joints
     axes
-        (3, n) unit axes in body axes, with all joints at zero
+        (3, n) unit vectors of the axes in body axes, with all joints at zero
     inertia_kg_m2
-        (n,) about each axis, of all that rotates with it
+        (n,) inertia about each axis of everything that rotates with it
     qpos, dof
-        (n,) indices of angle and speed in qpos and qvel
+        (n,) indices of the angles in qpos and of the speeds in qvel
     motor
-        (n,) actuator numbers, -1 without one
+        (n,) numbers of the actuators; -1 for a joint without one
     """
 
     names: tuple[str, ...]
@@ -141,9 +147,10 @@ class Hinges:
 
     @classmethod
     def from_model(cls, model: Any, prefix: str) -> Hinges:
-        """All joints whose name begins with prefix."""
+        """All joints of a compiled model whose name begins with prefix."""
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
+        # The diagonal of the joint-space inertia matrix is the inertia about each axis.
         full = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, full)
         names = sorted(
@@ -167,7 +174,7 @@ class Hinges:
 
 
 def all_names(element: Any, count: int) -> list[str]:
-    """Names of a compiled model's elements of one kind; `element` is its accessor by number."""
+    """Names of all elements of one kind of a compiled model; `element` returns an element by its number."""
     return [element(k).name for k in range(count)]
 
 
@@ -193,7 +200,7 @@ def add_motor(
     limit: float | None = None,
     gear: Sequence[float] = UNIT_GEAR,
 ) -> Any:
-    """Add a motor: force = control, which is limited to +-limit if one is given."""
+    """Add a motor whose force is gear times its control; the control is limited to +-limit if one is given."""
     motor = spec.add_actuator(name=name, trntype=kind, target=target, gear=gear)
     motor.set_to_motor()
     if limit is not None:
@@ -203,7 +210,7 @@ def add_motor(
 
 
 def member_values(values: tuple[float, ...], count: int, key: str) -> Floats:
-    """One value for each of `count` members; zeros if none are given. Raises InputError for another count."""
+    """(count,) values, one for each member; zeros if none are given. Raises InputError for another number."""
     if values and len(values) != count:
         raise InputError(key, f"{len(values)} values", f"{count}, one for each, or none")
     return np.array(values or (0.0,) * count)

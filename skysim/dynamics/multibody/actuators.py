@@ -1,7 +1,7 @@
-"""All kinds of actuators, and what the model does with those that a scene switches on.
+"""All kinds of actuators, and their use in a vehicle's model.
 
-A new kind is a file beside this one, an entry in `KINDS`, and its section in scene/sections/vehicle.py. A vehicle's
-MJCF places the actuators by the names of joints and sites; the scene sets their limits.
+A new kind is a file beside this one, an entry in `KINDS`, and its section in scene/sections/vehicle.py. The MJCF of a
+vehicle places the actuators by the names of joints and sites; the scene sets their limits.
 """
 
 from __future__ import annotations
@@ -47,22 +47,22 @@ def build_actuators(vehicle: VehicleConfig, model: Any) -> dict[str, Actuators]:
 
 
 def set_start(vehicle: VehicleConfig, model: Any, data: Any) -> None:
-    """Set angles and speeds of the actuators' joints in the data of a model to those of the scene's start."""
+    """Set the angles and speeds of the actuators' joints in the data of a model to those at the scene's start."""
     for kind in kinds_on(vehicle):
         kind.start(model, data, getattr(vehicle, kind.key))
 
 
 def add_actuators(spec: Any, model: Any, vehicle: VehicleConfig) -> None:
-    """Add the motors of all actuators that are on, and three ideal torques; model is the compiled spec."""
+    """Add three ideal torques and the motors of all actuators that are on; model is the compiled spec."""
     for name, axis in zip(TORQUES, np.eye(3), strict=True):
-        # A ball joint's motor acts about a body axis.
+        # The motor of a ball joint acts about an axis of the body.
         add_motor(spec, name, mujoco.mjtTrn.mjTRN_JOINT, "bearing", gear=[*axis, 0, 0, 0])
     for kind in kinds_on(vehicle):
         kind.add(spec, model, getattr(vehicle, kind.key))
 
 
 class IdealTorque:
-    """Ideal actuator: body-axis torques clipped to a limit."""
+    """Ideal actuator: torques about the body's axes, each clipped to a limit. The methods are those of `Actuators`."""
 
     def __init__(self, motor: NDArray[np.int64], limit_nm: float) -> None:
         self.motor = motor
@@ -80,12 +80,14 @@ class IdealTorque:
 
 
 def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]:
-    """Delete the joints of actuators that are off. Raises InputError if an actuator that is on has no joint.
+    """Delete the joints of actuators that are off, which locks them; check those of actuators that are on.
 
-    Returns the names of the deleted joints, each with the scene's key that would have kept it.
+    Returns the names of the deleted joints, each with the key of the scene that would have kept it. Raises
+    InputError if an actuator that is on has no joint, or for names in the file that skysim reserves.
     """
     locked: dict[str, str] = {}
     check_names(spec, path)
+    # 1. Joints: delete or check.
     prefixes_by_key = {kind.key: kind.joints for kind in KINDS} | {"trim": (TRIM,)}
     for key, prefixes in prefixes_by_key.items():
         for prefix in prefixes:
@@ -96,11 +98,13 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
                     spec.delete(joint)
             else:
                 check_joints(found, prefix, key, path)
+    # 2. The kinds' own checks, and their sites.
     for kind in kinds_on(vehicle):
         kind.check(spec, path)
         for prefix in kind.sites:
             if not sites(spec, prefix):
                 raise InputError(path, f"no site {prefix}*, which vehicle.{kind.key} needs")
+    # 3. Names of the motors that `add_actuators` adds.
     for actuator in spec.actuators:
         if actuator.name in TORQUES or actuator.name.startswith(PREFIXES):
             problem = f"actuator {actuator.name}: an actuator of this name is added; remove it from the file"
@@ -109,7 +113,7 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
 
 
 def check_joints(found: Sequence[Any], prefix: str, key: str, path: Path) -> None:
-    """Raise InputError for missing joints of an actuator, and for joints of another type or with properties."""
+    """Raise InputError if joints of an actuator are missing, have another type, or have properties (`check_bare`)."""
     wanted = mujoco.mjtJoint.mjJNT_SLIDE if prefix == TRIM else mujoco.mjtJoint.mjJNT_HINGE
     if not found:
         raise InputError(path, f"no joint {prefix}*, which vehicle.{key} needs")
@@ -122,7 +126,8 @@ def check_joints(found: Sequence[Any], prefix: str, key: str, path: Path) -> Non
 
 
 def locked_joint_hint(spec: Any, locked: dict[str, str]) -> str:
-    """An addition to the problem of a model that does not compile, if it refers to a joint that was deleted."""
+    """Text to add to the error of a model that does not compile, if it refers to a deleted joint; else ""."""
+    # All names that sensors, actuators and constraints refer to.
     named = {sensor.objname for sensor in spec.sensors} | {
         actuator.target for actuator in spec.actuators
     }
@@ -132,7 +137,10 @@ def locked_joint_hint(spec: Any, locked: dict[str, str]) -> str:
 
 
 def check_names(spec: Any, path: Path) -> None:
-    """Raise InputError for a joint or site whose name nearly matches an actuator's: it would silently not be one."""
+    """Raise InputError for a joint or site whose name lacks the underscore of a prefix.
+
+    It would silently not be an actuator.
+    """
     for element in (*spec.joints, *spec.sites):
         prefix = next((p for p in PREFIXES if element.name.startswith(p[:-1])), None)
         if prefix and not element.name.startswith(prefix):
@@ -142,9 +150,7 @@ def check_names(spec: Any, path: Path) -> None:
 
 
 def check_bare(joint: Any, path: Path) -> None:
-    """Raise InputError for limits, springs, damping or drives of an actuator's joint in the file: the
-    scene sets them.
-    """
+    """Raise InputError if the file gives an actuator's joint a limit, spring, damping or drive; the scene sets them."""
     attributes = {
         "range": joint.range,
         "stiffness": joint.stiffness,

@@ -1,4 +1,15 @@
-"""Control moment gyroscopes: hinge joints `gimbal_*`, each carrying a hinge joint `rotor_*` with the same suffix."""
+"""Control moment gyroscopes (CMGs): hinge joints `gimbal_*`, each of which carries `rotor_*` with the same suffix.
+
+Frames and signs are those of wheels.py. The steering of each control period:
+
+1. The rotor axles at the gimbal angles, and their derivative (`rotor_axles`).
+2. The Jacobian A of the stored momentum h by the gimbal angles: columns g x h (`CmgSet.jacobian`).
+3. Gimbal rates with A d(angle)/dt = dh/dt = -T, by a steering law of `STEERING`. Variable-speed CMGs also use rotor
+   torques (`vscmg_commands`).
+4. One factor scales all commands to their limits, so the torque's direction is kept.
+
+A is singular if all g x h are in a plane. Then no gimbal rate gives a torque along the plane's normal.
+"""
 
 from __future__ import annotations
 
@@ -34,14 +45,17 @@ ROTOR = "rotor_"
 
 # Generalized singularity-robust inverse and the weights of variable-speed CMGs: the sizes are `assumed`.
 DAMPING = 0.01  # lambda at a singularity, in units of the rotors' momentum squared
-DITHER = 0.01  # off-diagonal part of the damping
-DITHER_RAD_S = math.pi / 2
-DAMPING_DECAY = 10.0  # of both away from a singularity: exp(-DAMPING_DECAY det A A^T)
+DITHER = 0.01  # amplitude of the off-diagonal elements of E
+DITHER_RAD_S = math.pi / 2  # their angular frequency
+DAMPING_DECAY = 10.0  # away from a singularity lambda decays as exp(-DAMPING_DECAY det A A^T)
 
 
 @jit
 def solve_gram(gram: Floats, rhs: Floats) -> Floats:
-    """x of gram x = rhs for a symmetric positive semidefinite (3, 3); singular directions get zero."""
+    """(3,) x of gram x = rhs for a symmetric positive semidefinite gram (3, 3); singular directions get zero.
+
+    x = sum_k v_k (v_k . rhs) / lambda_k over the eigenvectors v_k whose eigenvalue lambda_k is not negligible.
+    """
     value, vector = np.linalg.eigh(gram)
     x = np.zeros(3)
     for k in range(3):
@@ -52,7 +66,10 @@ def solve_gram(gram: Floats, rhs: Floats) -> Floats:
 
 @jit
 def gram_determinant(m: Floats) -> float:
-    """Determinant of A A^T (3, 3), clipped at zero against rounding; np.linalg.det takes several times as long."""
+    """Determinant of A A^T (3, 3) by cofactors, clipped at zero against rounding.
+
+    np.linalg.det takes several times as long.
+    """
     minor_0 = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
     minor_1 = m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0]
     minor_2 = m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0]
@@ -61,7 +78,7 @@ def gram_determinant(m: Floats) -> float:
 
 @jit
 def pseudo_inverse(jacobian_unit: Floats, momentum_rate: Floats, t_s: float) -> Floats:
-    """The smallest gimbal rates that give a momentum rate, A^T (A A^T)^-1 dh/dt; no singularity avoidance.
+    """(n,) smallest gimbal rates that give a momentum rate: A^T (A A^T)^-1 dh/dt, without singularity avoidance.
 
     The rates grow without bound near a singularity, and this law tends to steer into one.
     """
@@ -70,20 +87,21 @@ def pseudo_inverse(jacobian_unit: Floats, momentum_rate: Floats, t_s: float) -> 
 
 @jit
 def singularity_robust(jacobian_unit: Floats, momentum_rate: Floats, t_s: float) -> Floats:
-    """Gimbal rates by the generalized singularity-robust inverse: A^T (A A^T + lambda E)^-1 dh/dt.
+    """(n,) gimbal rates by the generalized singularity-robust inverse: A^T (A A^T + lambda E)^-1 dh/dt.
 
-    Near a singularity lambda = 0.01 exp(-10 det A A^T) keeps the rates bounded, at the price of an error in the
-    torque. The off-diagonal elements e_i = 0.01 sin(pi t / 2 + phase_i) of the matrix E, of unit diagonal, move the
-    gimbals sideways for a torque along the singular direction, and so out of the singularity. Wie, Bailey & Heiberg
-    2001, J. Guidance, Control, and Dynamics 24 (5), 865; the numbers are `assumed`.
+    Near a singularity lambda = 0.01 exp(-10 det A A^T) keeps the rates bounded, at the cost of an error in the
+    torque. E has a unit diagonal and the off-diagonal elements e_i = 0.01 sin(pi t / 2 + phase_i). For a torque
+    along the singular direction these move the gimbals sideways, and so out of the singularity. Wie, Bailey &
+    Heiberg 2001, J. Guidance, Control, and Dynamics 24 (5), 865; the numbers are `assumed`.
     """
     gram = jacobian_unit @ jacobian_unit.T
+    # A A^T + lambda E. The loop visits each row twice, so each visit adds half of the diagonal element.
     damping = DAMPING * math.exp(-DAMPING_DECAY * gram_determinant(gram))
     for row, column, phase in ((1, 2, 0.0), (0, 2, math.pi / 2), (0, 1, math.pi)):
         dither = damping * DITHER * math.sin(DITHER_RAD_S * t_s + phase)
         gram[row, column] += dither
         gram[column, row] += dither
-        gram[row, row] += damping / 2  # each row is visited twice
+        gram[row, row] += damping / 2
         gram[column, column] += damping / 2
     return jacobian_unit.T @ solve_gram(gram, momentum_rate)
 
@@ -97,7 +115,10 @@ STEERING: dict[str, Callable[[Floats, Floats, float], Floats]] = {
 
 @jit
 def rotor_axles(spin_axes: Floats, cross_axes: Floats, angle_rad: Floats) -> tuple[Floats, Floats]:
-    """Rotor axles (3, n) at the gimbal angles, s cos + t sin, and their derivative (3, n) by the gimbal angles."""
+    """Rotor axles (3, n) at the gimbal angles, and their derivative (3, n) by the gimbal angles.
+
+    axle = s cos(angle) + (g x s) sin(angle),    derivative = (g x s) cos(angle) - s sin(angle)
+    """
     cosine = np.cos(angle_rad)
     sine = np.sin(angle_rad)
     return spin_axes * cosine + cross_axes * sine, cross_axes * cosine - spin_axes * sine
@@ -112,43 +133,61 @@ def vscmg_commands(
     rate_limit: float,
     torque_limit: float,
 ) -> tuple[Floats, Floats]:
-    """Variable-speed CMGs: gimbals and rotors share dh/dt (3,), with the rotors active near gimbal singularities.
+    """Gimbal rates (n,) and rotor torques (n,) of variable-speed CMGs that together give dh/dt (3,).
 
-    The exact solution that is smallest in a weighted norm: gimbal rates in units of their limit, rotor torques in
-    units of theirs times exp(-5 det A A^T) (A of unit rotor momentum), which keeps the rotors idle away from
-    singularities. Beyond a limit all are scaled together. Schaub, Vadali & Junkins 1998, J. Astronautical Sciences
-    46 (3); weighting by the limits is our own choice, the number is `assumed`.
+    1. Weights: gimbal rates are measured in units of their limit, rotor torques in units of their limit times
+       exp(-5 det A A^T), A of unit rotor momentum. This keeps the rotors idle away from singularities.
+    2. The exact solution that is smallest in the weighted norm,
+
+           x = W B^T (B W B^T)^-1 dh/dt,    B = [A, axle],    W = diag(weights^2).
+
+    3. One factor scales all commands to their limits.
+
+    Schaub, Vadali & Junkins 1998, J. Astronautical Sciences 46 (3); weighting by the limits is our own choice, the
+    number is `assumed`.
     """
+    # 1. Weights, squared.
     gram = jacobian @ jacobian.T
     determinant = gram_determinant(gram) / unit_nms**6 if unit_nms > 0 else 0.0
     gimbal_weight = rate_limit**2
     rotor_weight = torque_limit**2 * math.exp(-DAMPING_DECAY * determinant)
-    # Weighted minimum norm: x = W B^T (B W B^T)^-1 dh/dt with B = [jacobian, axle] and W = diag(limits^2).
+    # 2. Weighted minimum norm.
     multiplier = solve_gram(gimbal_weight * gram + rotor_weight * (axle @ axle.T), momentum_rate_nm)
     rate = gimbal_weight * (jacobian.T @ multiplier)
     torque = rotor_weight * (axle.T @ multiplier)
+    # 3. Limits.
     scale = 1 / max(1.0, np.abs(rate).max() / rate_limit, np.abs(torque).max() / torque_limit)
     return rate * scale, torque * scale
 
 
 @dataclass(frozen=True, slots=True)
 class CmgSet:
-    """Control moment gyroscopes: rotating a spinning rotor's axle gives the torque d(angle)/dt x h.
+    """A set of n control moment gyroscopes: rotating the axle of a spinning rotor gives a torque.
 
-    A rotor's axle points along s cos(angle) + g x s sin(angle), g the gimbal's and s the spin axis. The torque of
-    accelerating a gimbal about its own axis is left out. Raises InputError (one line) for axes that are not unit
-    vectors or not at right angles, and for an unknown steering law.
+        torque on the body = -d(angle)/dt g x h
+
+    g is the gimbal axis and h the rotor's momentum along its axle. The torque that accelerates a gimbal about its
+    own axis is left out.
 
     Attributes
     ----------
-    gimbal_axes, spin_axes
-        (3, n) unit vectors at right angles; the rotor's axle at gimbal angle zero
+    gimbal_axes
+        (3, n) unit vectors g in body axes
+    spin_axes
+        (3, n) unit vectors s of the rotors' axles at gimbal angle zero, at right angles to g
     rotor_inertia_kg_m2
-        (n,) of each rotor about its axle
+        (n,) inertia of each rotor about its axle
+    gimbal_rate_limit_rad_s
+        Greatest gimbal rate
     rotor_torque_limit_nm
-        None leaves the rotors to spin; a torque makes them variable-speed CMGs
+        Greatest motor torque of variable-speed CMGs; None for rotors that spin freely
     steering
         A key of STEERING, which variable-speed CMGs do not use
+
+    Raises
+    ------
+    InputError
+        If axes are not unit vectors or not at right angles, or for an unknown steering law.
     """
 
     gimbal_axes: Floats
@@ -175,20 +214,22 @@ class CmgSet:
         object.__setattr__(self, "cross_axes", np.ascontiguousarray(np.cross(gimbal, spin, axis=0)))
 
     def momentum(self, angle_rad: Floats, rotor_rad_s: Floats) -> Floats:
-        """Angular momentum (3,) of the rotors relative to the body: sum of inertia speed axle."""
+        """Angular momentum (3,) of the rotors relative to the body: h = sum axle inertia speed."""
         axle, _ = rotor_axles(self.spin_axes, self.cross_axes, angle_rad)
         return axle @ (self.rotor_inertia_kg_m2 * rotor_rad_s)
 
     def jacobian(self, angle_rad: Floats, rotor_rad_s: Floats) -> Floats:
-        """A (3, n), derivative of the momentum by the gimbal angles; columns g x h."""
+        """(3, n) Jacobian A: derivative of the momentum by the gimbal angles, with columns g x h."""
         _, derivative = rotor_axles(self.spin_axes, self.cross_axes, angle_rad)
         return derivative * (self.rotor_inertia_kg_m2 * rotor_rad_s)
 
     def manipulability(self, angle_rad: Floats, rotor_rad_s: Floats) -> Floats:
-        """Distance from singularity: 1 if torque is equally easy in every direction, 0 if a direction has none.
+        """Distance from singularity (...) at angles and speeds (..., n), between 0 and 1.
 
-        sqrt(det A A^T) over its greatest value for the same trace, (sum h^2 / 3)^1.5, which is independent of the
-        rotors' size and number. 0 with the rotors at rest. (..., n) -> (...).
+            sqrt(det A A^T) / (trace(A A^T) / 3)^1.5
+
+        It is 1 if torque is equally easy in every direction, and 0 if there is no torque in one direction, or if the
+        rotors are at rest. It does not depend on the size and number of the rotors.
         """
         angle = np.asarray(angle_rad)[..., None, :]
         spin = np.asarray(rotor_rad_s)[..., None, :]
@@ -206,31 +247,34 @@ class CmgSet:
         rotor_rad_s: Floats,
         t_s: float,
     ) -> tuple[Floats, Floats]:
-        """Gimbal rates (n,) and motor torques (n,) on the rotors that give torque_nm (3,) on the body.
+        """Gimbal rates (n,) and motor torques u (n,) on the rotors that give torque_nm (3,) on the body.
 
-        torque on the body = -A d(angle)/dt - sum axle u, with A from the rotors' inertial spin, which is their
-        speed plus the body's rate along the axle. The body also feels -rate x h: the controller's feed-forward has
-        to include +rate x h in torque_nm, it is not added here.
+            torque on the body = -A d(angle)/dt - sum axle u
 
-        Without a rotor torque limit the rotors get no torque. Beyond a limit everything is scaled together, which
+        A is that of the rotors' inertial spin, which is their speed plus the body's rate along the axle. The body
+        also feels -rate x h. The controller's feed-forward must include +rate x h in torque_nm; it is not added here.
+
+        Without a rotor torque limit the rotors get no torque. One factor scales all commands to their limits, which
         keeps the torque's direction.
         """
+        # 1. Axles.
         axle, derivative = rotor_axles(self.spin_axes, self.cross_axes, angle_rad)
-        # A gimbal rotates the rotor's inertial angular momentum, which includes the body's rate along the axle.
+        # 2. Jacobian. A gimbal rotates the inertial angular momentum, which includes the body's rate along the axle.
         spin_nms = self.rotor_inertia_kg_m2 * (rotor_rad_s + rate_body_rad_s @ axle)
         jacobian = derivative * spin_nms
         unit_nms = float(np.abs(spin_nms).mean())
+        # 3. and 4. Steering within the limits. Rotors at rest give no gyroscopic torque.
         if self.rotor_torque_limit_nm is not None:
             limits = self.gimbal_rate_limit_rad_s, self.rotor_torque_limit_nm
             return vscmg_commands(axle, jacobian, unit_nms, -torque_nm, *limits)
-        if unit_nms == 0:  # rotors at rest give no gyroscopic torque
+        if unit_nms == 0:
             return np.zeros_like(spin_nms), np.zeros_like(spin_nms)
         rate = STEERING[self.steering](jacobian / unit_nms, torque_nm / -unit_nms, t_s)
         return scale_to_limit(rate, self.gimbal_rate_limit_rad_s), np.zeros_like(rate)
 
 
 class CmgActuator:
-    """Control moment gyroscopes as the flight computer commands them, see `CmgSet`."""
+    """Actuators of the flight computer: control moment gyroscopes, see `CmgSet`."""
 
     def __init__(self, model: Any, config: CmgsConfig) -> None:
         self.gimbals = Hinges.from_model(model, GIMBAL)
@@ -250,6 +294,7 @@ class CmgActuator:
         spin = inputs.speeds_rad_s[self.rotors.dof]
         rate, torque = self.model.drive(torque_nm, inputs.rate_body_rad_s, angle, spin, inputs.t_s)
         control[self.gimbals.motor] = rate
+        # T = -A d(angle)/dt - sum axle u; the second term is the momentum of speeds u / inertia.
         achieved_nm = -self.model.jacobian(angle, spin) @ rate
         if self.model.rotor_torque_limit_nm is not None:
             control[self.rotors.motor] = torque
@@ -260,16 +305,15 @@ class CmgActuator:
         jacobian = self.model.jacobian(
             np.zeros(len(self.gimbals)), np.full(len(self.rotors), self.rotor_rad_s)
         )
-        return np.asarray(
-            np.linalg.pinv(jacobian), dtype=np.float64
-        ), self.model.gimbal_rate_limit_rad_s
+        rates_from_torque = np.asarray(np.linalg.pinv(jacobian), dtype=np.float64)
+        return rates_from_torque, self.model.gimbal_rate_limit_rad_s
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         return self.model.momentum(angles_rad[self.gimbals.qpos], speeds_rad_s[self.rotors.dof])
 
 
 def check_rotor_pairs(spec: Any, path: Path) -> None:
-    """Check that each rotor is on the gimbal with the same suffix. Raises InputError."""
+    """Raise InputError unless each rotor is on the gimbal with the same suffix."""
     for gimbal in joints(spec, GIMBAL):
         suffix = gimbal.name.removeprefix(GIMBAL)
         rotor = spec.joint(ROTOR + suffix)
@@ -282,11 +326,14 @@ def check_rotor_pairs(spec: Any, path: Path) -> None:
 
 
 def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
-    """A rate servo at each gimbal, and a motor at each variable-speed rotor; other rotors keep their momentum.
+    """Add a rate servo at each gimbal, and a motor at each variable-speed rotor; other rotors keep their momentum.
 
-    The servo's set-point is the integral of the commanded rate. A critically damped spring pulls the gimbal to it
-    with the scene's time constant, so that the rate is held against gyroscopic torque from the vehicle's rotation;
-    a damper alone would not hold it.
+    The set-point of a servo is the integral of the commanded rate. A critically damped spring pulls the gimbal to it
+    with the scene's time constant tau,
+
+        torque = kp (set-point - angle) - kv d(angle)/dt,    kp = inertia / tau^2,    kv = 2 inertia / tau,
+
+    which holds the rate against gyroscopic torque from the vehicle's rotation. A damper alone would not hold it.
     """
     tau_s = cmgs.gimbal_time_constant_s
     for joint, inertia in zip(
@@ -304,7 +351,7 @@ def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
 
 
 def start_cmgs(model: Any, data: Any, config: CmgsConfig) -> None:
-    """Set the gimbals' angles at the start, and the rotors' speed."""
+    """Set the gimbal angles and rotor speeds at the start."""
     gimbals = Hinges.from_model(model, GIMBAL)
     angles = np.radians(member_values(config.start_deg, len(gimbals), "vehicle.cmgs.start_deg"))
     data.qpos[gimbals.qpos] = angles

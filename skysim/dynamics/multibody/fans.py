@@ -1,4 +1,4 @@
-"""Fans: sites `fan_*`, which push along their own z, with a first-order lag."""
+"""Fans: sites `fan_*`, which push along their own z axis with a first-order lag; momentum dumping by fans."""
 
 from __future__ import annotations
 
@@ -31,7 +31,19 @@ FAN = "fan_"
 
 @dataclass(frozen=True, slots=True)
 class Fans:
-    """Fans, in the order of their names: (3, n) thrust directions and positions, and actuator numbers."""
+    """Fans of a compiled model, in the order of their names.
+
+    Attributes
+    ----------
+    names
+        Names of the n fans
+    axes
+        (3, n) unit vectors of the thrust directions, in body axes
+    positions_m
+        (3, n) positions in body axes
+    motor
+        (n,) numbers of the actuators
+    """
 
     names: tuple[str, ...]
     axes: Floats
@@ -55,19 +67,21 @@ class Fans:
 
 @dataclass(frozen=True, slots=True)
 class FanSet:
-    """Fans: thrust with a lever arm about the bearing's center rotates the vehicle, T = sum position x axis thrust.
+    """A set of n fans, whose thrust has a lever arm about the bearing's center: T = sum position x axis thrust.
 
     Attributes
     ----------
     force_axes
-        (3, n) unit vectors along which a positive thrust pushes the body
+        (3, n) unit vectors along which a positive thrust pushes the body, in body axes
     positions_m
-        (3, n) from the center of rotation
+        (3, n) positions from the center of rotation, in body axes
+    thrust_limit_n
+        Greatest thrust of each fan
 
     Raises
     ------
     InputError
-        (one line) for axes that are not unit vectors and positions of another shape.
+        If axes are not unit vectors, or positions have another shape.
     """
 
     force_axes: Floats
@@ -92,16 +106,16 @@ class FanSet:
         return self.torque_per_thrust_m @ thrust_n
 
     def drive(self, torque_nm: Floats) -> Floats:
-        """Thrusts (n,), the smallest that give the torque (3,), or the nearest to it in least squares.
+        """The smallest thrusts (n,) that give the torque (3,), or the nearest to it in least squares.
 
-        Beyond the limit all are scaled together, which keeps the direction. Each fan can blow either way. The
-        bearing takes the net force.
+        One factor scales all thrusts to the limit, which keeps the direction of the torque. Each fan can blow either
+        way. The bearing takes the net force.
         """
         return scale_to_limit(self.thrust_from_torque @ torque_nm, self.thrust_limit_n)
 
 
 class FanActuator:
-    """Fans, commanded as if they had no lag; see `FanSet`."""
+    """Actuators of the flight computer: fans, commanded as if they had no lag; see `FanSet`."""
 
     def __init__(self, model: Any, config: FansConfig) -> None:
         fans = Fans.from_model(model)
@@ -123,17 +137,18 @@ class FanActuator:
 
 @dataclass(slots=True)
 class Desaturator:
-    """Momentum dumping by fans: torque -h / time on the body, once the stored momentum h exceeds a threshold.
+    """Law of momentum dumping: torque -h / time on the body, once the stored momentum h exceeds a threshold.
 
-    The controller holds the body still against this torque, so that the wheels or CMGs absorb it and h decays as
-    exp(-t / time). Stateful: one motion each.
+    The controller holds the body still against this torque. The wheels or CMGs absorb it, and h decays as
+    exp(-t / time). Stateful: one object per motion.
     """
 
     config: DesaturationConfig
     running: bool = False
 
     def torque(self, momentum_nms: Floats) -> Floats:
-        """Torque (3,) that the fans should give on the body: zero until |h| > start, then -h / time down to stop."""
+        """Torque (3,) that the fans should give: zero until |h| > start, then -h / time until |h| < stop."""
+        # Two thresholds (hysteresis), so that the fans do not switch on and off at one.
         magnitude = math.sqrt(float(momentum_nms @ momentum_nms))
         self.running = (
             magnitude >= self.config.stop_nms if self.running else magnitude > self.config.start_nms
@@ -151,10 +166,11 @@ class MomentumDump:
         self.fan_torque_nm = np.zeros(3)
 
     def allocate(self, control: Floats, momentum_nms: Floats, inputs: ControlInput) -> Floats:
-        """Command the fans; return (3,) the torque that they give now according to the lag model."""
+        """Command the fans; return the torque (3,) that they give now according to the lag model."""
         present_nm = self.fan_torque_nm
         commanded_nm = self.fans.allocate(control, self.desaturator.torque(momentum_nms), inputs)
-        # First-order lag of the fans over one period; the torque at its start is the one that acts now.
+        # First-order lag over one period, T' = T + (command - T) (1 - exp(-period / lag)). The torque at its start
+        # acts now.
         self.fan_torque_nm = present_nm + (commanded_nm - present_nm) * -math.expm1(
             -inputs.period_s / self.fans.lag_s
         )
@@ -162,7 +178,7 @@ class MomentumDump:
 
 
 def add_fans(spec: Any, _: Any, config: FansConfig) -> None:
-    """A force at each fan, along its site's z, which follows the command with a first-order lag."""
+    """Add a force at each fan along z of its site, which follows the command with a first-order lag."""
     for site in sites(spec, FAN):
         limit = config.thrust_limit_n
         fan = add_motor(

@@ -1,7 +1,11 @@
-"""Integrate the equations of motion: the model is stepped with given controls, and every state is kept.
+"""Integrate the equations of motion: step the model with given controls, and keep every state.
 
-MuJoCo computes the multibody dynamics and integrates by the fourth-order Runge-Kutta method with a fixed step
-(model.STEP_S). Controls are constant within each step.
+MuJoCo computes the multibody dynamics and integrates them by the fourth-order Runge-Kutta method with a fixed step
+(model.STEP_S). Controls are constant within each step. `Simulation.advance` does the following:
+
+1. Make room for the new states.
+2. Integrate one step for each row of controls.
+3. Raise an error if MuJoCo warned.
 """
 
 from __future__ import annotations
@@ -21,7 +25,7 @@ from skysim.dynamics.multibody.model import VehicleModel
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CONTROL = mujoco.mjtState.mjSTATE_CTRL
-MAX_STEPS = 2**62  # steps
+MAX_STEPS = 2**62  # stands for an infinite duration
 
 Controller = Callable[[float, Rotation, Floats], Floats]
 
@@ -29,19 +33,28 @@ Controller = Callable[[float, Rotation, Floats], Floats]
 class Simulation:
     """A simulated motion in progress. `advance` integrates some steps with given controls and keeps all states.
 
-    MuJoCo's rollout steps in C and writes every state directly into `states`, so that there is no overhead per step.
-    The present is the last state; angles, rates and speeds are views of it, without a copy. A row of `states` is
-    MuJoCo's full physics state: time, qpos (its first four lab_from_body), qvel, actuator states.
+    MuJoCo's rollout steps in C and writes every state directly into `states`, so there is no overhead per step. The
+    present is the last state; angles, rates and speeds are views of it.
+
+    Parameters
+    ----------
+    vehicle
+        Vehicle to simulate
+    lab_from_body
+        Attitude at the start
+    rate_body_rad_s
+        (3,) rate at the start, in body axes
+    duration_s
+        Greatest duration of this motion, which sets the memory; may be infinite with history_s
+    history_s
+        Age of the oldest states to keep; there is memory for twice as many. None keeps all states
 
     Attributes
     ----------
-    lab_from_body
-        At the start; rate_body_rad_s : (3,) likewise
-    duration_s
-        The longest that this motion can last, which sets the memory. With history_s it may be
-        inf
-    history_s
-        Keep only states of this age or younger; memory is for twice as many
+    states
+        (rows, size) MuJoCo's full physics states: time, qpos (lab_from_body wxyz first), qvel, actuator states
+    step, first_step
+        Numbers of the present step and of the step in the first row of `states`
     """
 
     def __init__(
@@ -62,15 +75,13 @@ class Simulation:
         )
         rows = min(self.last_step, 2 * self.history_steps) + 1
         self.states = np.empty((rows, mujoco.mj_stateSize(self.model, int(STATE))))
-        self.step = self.first_step = (
-            0  # step number of the present, and of the first row of `states`
-        )
+        self.step = self.first_step = 0
         self.data = mujoco.MjData(self.model)
         self.rollout = Rollout(nthread=0)
         self.set_initial_state(lab_from_body, rate_body_rad_s)
 
     def set_initial_state(self, lab_from_body: Rotation, rate_body_rad_s: Floats) -> None:
-        """Set the initial state; speeds and gimbal angles are those of the scene."""
+        """Set the initial state; wheel speeds, rotor speeds and gimbal angles are those of the scene."""
         vehicle = self.vehicle
         data = self.data
         data.qpos[:4] = lab_from_body.as_quat(scalar_first=True)
@@ -81,30 +92,32 @@ class Simulation:
 
     @property
     def steps_left(self) -> int:
+        """Number of steps up to the greatest duration."""
         return self.last_step - self.step
 
     @property
     def now_s(self) -> float:
+        """Time since the start."""
         return self.step * self.step_s
 
     @property
     def lab_from_body_wxyz(self) -> Floats:
-        """(4,) scalar first."""
+        """(4,) present attitude, scalar first."""
         return self.states[self.row, 1:5]
 
     @property
     def rate_body_rad_s(self) -> Floats:
-        """(3,)"""
+        """(3,) present rate in body axes."""
         return self.states[self.row, 1 + self.model.nq :][:3]
 
     @property
     def angles_rad(self) -> Floats:
-        """All of qpos; `Hinges.qpos` has the indices of the joints."""
+        """(nq,) present qpos; `Hinges.qpos` has the indices of the joints."""
         return self.states[self.row, 1 : 1 + self.model.nq]
 
     @property
     def speeds_rad_s(self) -> Floats:
-        """All of qvel; `Hinges.dof` has the indices of the joints."""
+        """(nv,) present qvel; `Hinges.dof` has the indices of the joints."""
         return self.states[self.row, 1 + self.model.nq :][: self.model.nv]
 
     @property
@@ -113,9 +126,10 @@ class Simulation:
         return self.step - self.first_step
 
     def discard_old(self, steps: int) -> None:
-        """If there is no room for so many steps, drop states older than `history_steps`."""
+        """Drop states older than `history_steps` if there is no room for this number of new steps."""
         if self.row + steps < len(self.states):
             return
+        # Move the kept states to the front.
         old = max(self.row - self.history_steps, 0)
         self.states[: self.row - old + 1] = self.states[old : self.row + 1]
         self.first_step += old
@@ -123,12 +137,14 @@ class Simulation:
     def advance(self, control: Floats) -> None:
         """Integrate one step for each row of control (K, nu). Raises InputError if MuJoCo warned.
 
-        MuJoCo resets an unstable model to its start and continues, and clears its warnings with the next call, so
-        they are checked after every call.
+        MuJoCo resets an unstable model to its start and continues. The next call clears its warnings, so they are
+        checked after every call.
         """
+        # 1. Room.
         self.discard_old(len(control))
         row = self.row
         end = self.row + len(control)
+        # 2. Integration. The warm start carries the solver's state over to this call.
         with mujoco_warnings():
             self.rollout.rollout(
                 [self.model],
@@ -142,9 +158,11 @@ class Simulation:
                 state=self.states[None, row + 1 : end + 1],
             )
         self.step += len(control)
+        # 3. Stability.
         self.check_warnings()
 
     def check_warnings(self) -> None:
+        """Raise InputError if the last call made MuJoCo warn."""
         if self.data.warning.number.any():
             raise InputError(
                 "motion",
@@ -153,28 +171,24 @@ class Simulation:
             )
 
     def warning_names(self) -> str:
-        """Names of MuJoCo's warnings."""
-        warnings = [
-            warning
-            for warning in mujoco.mjtWarning.__members__.values()
-            if int(warning) < len(self.data.warning)
-        ]
-        return ", ".join(
-            str(warning.name) for warning in warnings if self.data.warning[int(warning)].number
-        )
+        """Names of the kinds of warnings that MuJoCo counted."""
+        counts = [warning.number for warning in self.data.warning]
+        # The last member of MuJoCo's enumeration is its length, which has no count.
+        warnings = list(mujoco.mjtWarning.__members__.values())[: len(counts)]
+        return ", ".join(str(warning.name) for warning in warnings if counts[int(warning)])
 
     def times_s(self, begin: int, end: int) -> Floats:
-        """Times of the steps from begin to before end."""
+        """(end - begin,) times of the steps begin, ..., end - 1."""
         return np.arange(begin, end) * np.float64(self.step_s)
 
     def knots(self, begin: int = 0) -> tuple[Floats, Floats, Floats]:
-        """Times (K,), lab_from_body (K, 4) as wxyz and rates (K, 3) from a step on."""
+        """Times (K,), attitudes lab_from_body_wxyz (K, 4) and rates (K, 3) in body axes, from step begin on."""
         states = self.states[begin - self.first_step : self.row + 1]
         nq = self.model.nq
         return self.times_s(begin, self.step + 1), states[:, 1:5], states[:, 1 + nq : 4 + nq]
 
     def trajectory(self, begin: int = 0) -> Trajectory:
-        """The motion from a step on, as a Trajectory."""
+        """The motion from step begin on, as a Trajectory."""
         t_s, lab_from_body_wxyz, rate = self.knots(begin)
         return Trajectory(
             t_s, Rotation.from_quat(lab_from_body_wxyz, scalar_first=True), rate.copy()
@@ -182,12 +196,12 @@ class Simulation:
 
 
 class PrescribedMotion(Simulation):
-    """A motion along given attitudes, without dynamics; wheels and gimbals stay as they are at the start.
+    """A motion along given attitudes, without dynamics; wheels and gimbals stay in their initial state.
 
     Attributes
     ----------
     state_at
-        Time in s to lab_from_body_wxyz (4,) and rate (3,) in body axes
+        Function from the time in s to lab_from_body_wxyz (4,) and rate (3,) in body axes
     """
 
     def __init__(
@@ -204,7 +218,7 @@ class PrescribedMotion(Simulation):
         )
 
     def advance(self, control: Floats) -> None:
-        """Advance one step for each row of control (K, nu), whose values have no effect."""
+        """Advance one step for each row of control (K, nu); its values have no effect."""
         self.discard_old(len(control))
         rate_column = 1 + self.model.nq
         for _ in range(len(control)):
@@ -222,16 +236,24 @@ def simulate(
     controller: Controller | None = None,
     control_period_s: float = 0.01,
 ) -> Trajectory:
-    """The vehicle's motion under gravity, its stop and a controller's ideal torques, sampled at every step.
-
-    controller(t_s, lab_from_body, rate_body_rad_s) -> (3,) torque in N m about the body axes. It is called at
-    the start and every control period (whole steps); its torque, clipped to the limit, is held in between.
+    """The motion of the vehicle under gravity, its tilt stop and a controller's ideal torques, sampled at every step.
 
     Parameters
     ----------
+    lab_from_body_start
+        Attitude at the start
     rate_body_rad_s
-        (3,) at the start. Raises InputError for a start beyond the tilt stop, and if MuJoCo
-        warned.
+        (3,) rate at the start, in body axes
+    controller
+        (t_s, lab_from_body, rate_body_rad_s) to a torque (3,) in N m in body axes. It is called at the start and
+        every control period; its torque, clipped to the limit, is held in between
+    control_period_s
+        Control period, rounded to whole steps
+
+    Raises
+    ------
+    InputError
+        For a start beyond the tilt stop, and if MuJoCo warned.
     """
     simulation = Simulation(vehicle, lab_from_body_start, rate_body_rad_s, duration_s)
     steps = (
@@ -249,7 +271,7 @@ def simulate(
 
 
 def tilt_deg(lab_from_body: Rotation) -> Floats:
-    """Angle between the body's z axis and the lab's, of one attitude or of many."""
+    """Angle in degrees between the z axes of body and lab, of one attitude or of many."""
     return np.degrees(np.arccos(np.clip(lab_from_body.as_matrix()[..., 2, 2], -1, 1)))
 
 

@@ -1,8 +1,11 @@
 """Mass properties: compute those of the vehicle, set those that the scene declares, and move its trim masses.
 
-Trim masses are motorized masses on slides that bring the center of mass to the bearing's center. A motor with a lead
-screw holds its mass where it is, so that a mass does not move during a run: its body is moved along the joint's axis,
-and the joint is removed.
+1. `tree_mass` adds up the bodies of a compiled model.
+2. `declare_mass` gives body bus the difference between the declared mass properties and those of what it carries.
+3. `unbalance` offsets and tilts the wheels' mass.
+4. `hold_trims` moves the trim masses: motorized masses on slides that bring the center of mass to the bearing's
+   center. A motor with a lead screw holds its mass in place during a run, so the body is moved along the axis of the
+   joint, and the joint is removed.
 """
 
 from __future__ import annotations
@@ -27,7 +30,17 @@ CAMERA = "star_camera"
 
 @dataclass(frozen=True, slots=True)
 class MassProperties:
-    """Of the vehicle, in body axes: mass, center of mass (3,), inertia (3, 3) about the body's origin."""
+    """Mass properties of the vehicle, in body axes.
+
+    Attributes
+    ----------
+    mass_kg
+        Mass
+    center_m
+        (3,) center of mass
+    inertia_kg_m2
+        (3, 3) inertia about the body's origin
+    """
 
     mass_kg: float
     center_m: Floats
@@ -35,11 +48,13 @@ class MassProperties:
 
 
 def tree_mass(model: Any, without_bus: bool = False) -> MassProperties:
-    """Mass properties of the bus and all it carries, from the compiled model; with without_bus of what
-    it carries only.
+    """Mass properties of body bus and all that it carries, from the compiled model; without_bus leaves out the bus.
+
+    M = sum m,    center = sum m c / M,    J = sum R diag(I) R^T + m (c.c E - c c^T)    (Steiner)
     """
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
+    # At zero joint angles the body frame is the lab frame, so lab positions and axes are those in body axes.
     bus = model.body("bus").id
     counted = model.body_rootid == bus
     counted[bus] &= not without_bus
@@ -54,18 +69,22 @@ def tree_mass(model: Any, without_bus: bool = False) -> MassProperties:
 
 
 def parallel_axis(mass_kg: float, position_m: Floats) -> Floats:
-    """(3, 3) inertia of a point mass about the origin: m (r.r E - r r^T) (Steiner)."""
+    """(3, 3) inertia of a point mass at r (3,) about the origin: m (r.r E - r r^T)."""
     return mass_kg * (position_m @ position_m * np.eye(3) - np.outer(position_m, position_m))
 
 
 def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> MassProperties:
-    """Set the bus's inertial so that the vehicle has the declared mass properties: declared minus what it
-    carries.
+    """Set the mass properties of body bus so that the vehicle has the declared ones, which are returned.
 
-    Mass and inertia that the scene leaves out stay as in the file; the center of mass is always the scene's.
-    The inertia is that about the bearing's center, with principal axes along the body's. No part is moved: only the
-    bus's inertial changes (in place of a lab's balance masses), and the camera keeps its position.
+    1. The declared properties: mass and inertia of the scene, or of the file if the scene leaves them out, and the
+       scene's center of mass. The inertia is about the bearing's center, with principal axes along the body's.
+    2. The bus has the declared mass and first moment minus those of what it carries.
+    3. Its inertia about its own center is the declared one minus that of what it carries, minus Steiner's term.
+
+    No part moves: the bus's properties change in place of a lab's balance masses, and the camera keeps its position.
+    Raises InputError if the bus would need an impossible mass or inertia.
     """
+    # 1. Declared properties.
     total = tree_mass(model)
     carried = tree_mass(model, without_bus=True)
     center = np.array(vehicle.center_of_mass_m)
@@ -73,6 +92,7 @@ def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Ma
         total.inertia_kg_m2 if vehicle.inertia_kg_m2 is None else np.diag(vehicle.inertia_kg_m2)
     )
     declared = MassProperties(vehicle.mass_kg or total.mass_kg, center, inertia)
+    # 2. Mass and center of the bus.
     mass = declared.mass_kg - carried.mass_kg
     if mass <= 0:
         raise InputError(
@@ -80,9 +100,10 @@ def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Ma
             f"{declared.mass_kg:g} kg",
             f"more than the {carried.mass_kg:g} kg that the bus carries ({path})",
         )
-    # The bus's own center follows from the first moments: total minus carried, over the bus's mass.
     center_bus = (declared.mass_kg * declared.center_m - carried.mass_kg * carried.center_m) / mass
+    # 3. Inertia of the bus about its center.
     own_inertia = inertia - carried.inertia_kg_m2 - parallel_axis(mass, center_bus)
+    # The error message names the camera if its lever arm alone makes the inertia impossible.
     subject = ("vehicle.inertia", f"less what the bus carries ({path}), its")
     if vehicle.camera_m is not None and is_lever_too_long(
         own_inertia, model, np.array(vehicle.camera_m)
@@ -97,7 +118,7 @@ def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Ma
 
 
 def is_lever_too_long(bus_inertia_kg_m2: Floats, model: Any, camera_m: Floats) -> bool:
-    """Whether the bus's inertia is impossible only because the scene puts the camera's housing far from the bearing."""
+    """Whether the bus's inertia is impossible only because the scene puts the camera far from the bearing."""
     carrier = model.cam_bodyid[model.camera(CAMERA).id]
     if carrier == model.body("bus").id:
         return False
@@ -110,45 +131,56 @@ def is_lever_too_long(bus_inertia_kg_m2: Floats, model: Any, camera_m: Floats) -
 def unbalance(model: Any, wheel_joints: list[Any], wheels: WheelsConfig, path: Path) -> None:
     """Unbalance the wheels: offset each center of mass from the axle and tilt the principal axes.
 
-    Static: the rotor's center is moved across the axle by static_imbalance / mass; the axle feels the force
-    U_s speed^2, the bearing its moment. Dynamic: a product of inertia U_d between the axle and the second axis
-    across it; the axle feels the torque U_d speed^2, 90 deg from the former. Changes the joints' bodies; model is
-    what they compiled to while balanced.
+    1. Two directions across the axle.
+    2. Static imbalance U_s: offset the center of mass across the axle by U_s / mass. The axle feels the rotating
+       force U_s speed^2, and the bearing its moment.
+    3. Dynamic imbalance U_d: add a product of inertia between the axle and the second direction. The axle feels the
+       rotating torque U_d speed^2, 90 deg from the force.
+
+    The bodies of wheel_joints are changed; model is the compiled model with balanced wheels.
     """
     if not (wheels.static_imbalance_kg_m or wheels.dynamic_imbalance_kg_m2):
         return
     for joint in wheel_joints:
         rotor = joint.parent
         own = model.body(joint.parent.name)
-        axle = model.joint(
-            joint.name
-        ).axis  # in the rotor's axes, whatever frame the file gave it in
+        # 1. Directions in the rotor's axes; the compiled model has the axle in them.
+        axle = model.joint(joint.name).axis
         across = np.cross(axle, np.eye(3)[np.argmin(np.abs(axle))])
         across /= np.linalg.norm(across)
+        # 2. Center of mass.
+        center_m = own.ipos + wheels.static_imbalance_kg_m / own.mass[0] * across
+        # 3. Inertia.
         product = np.outer(axle, np.cross(axle, across))
         axes = Rotation.from_quat(own.iquat, scalar_first=True).as_matrix()
-        inertia = axes @ np.diag(own.inertia) @ axes.T + wheels.dynamic_imbalance_kg_m2 * (
-            product + product.T
-        )
-        center_m = own.ipos + wheels.static_imbalance_kg_m / own.mass[0] * across
+        balanced = axes @ np.diag(own.inertia) @ axes.T
+        inertia = balanced + wheels.dynamic_imbalance_kg_m2 * (product + product.T)
         subject = ("vehicle.wheels.dynamic_imbalance", f"with it {joint.name}'s ({path})")
         set_inertial(rotor, own.mass[0], center_m, inertia, subject)
 
 
 def is_possible(moments: NDArray[Any]) -> bool:
-    """Whether a rigid body can have these principal moments, in ascending order."""
+    """Whether a rigid body can have these principal moments I1 <= I2 <= I3: 0 < I1 and I3 <= I1 + I2."""
     return bool(moments[0] > 0 and moments[2] <= (moments[0] + moments[1]) * (1 + 1e-12))
 
 
 def set_inertial(
     body: Any, mass_kg: float, center_m: Floats, inertia_kg_m2: Floats, subject: tuple[str, str]
 ) -> None:
-    """Set mass, center and inertia (3, 3) about it in a body of a spec. Raises InputError for impossible inertia.
+    """Set the mass properties of a body of a spec. Raises InputError for an impossible inertia.
 
     Parameters
     ----------
+    body
+        Body of the spec
+    mass_kg
+        Mass
+    center_m
+        (3,) center of mass, in the body's axes
+    inertia_kg_m2
+        (3, 3) inertia about the center of mass
     subject
-        The key at fault, and whose moments they are
+        Key of the error, and the possessive with which its message begins
     """
     key, whose = subject
     moments, axes = np.linalg.eigh(inertia_kg_m2)
@@ -175,14 +207,16 @@ class Trims:
 
     Attributes
     ----------
+    names
+        Names of the n joints
     axes
-        (3, n) directions in body axes
+        (3, n) unit vectors of the slides, in body axes
     centers_m
-        (3, n) centers of mass at position zero
+        (3, n) centers of mass at position zero, in body axes
     mass_kg
-        (n,)
+        (n,) masses
     position_m
-        (n,) where they are held
+        (n,) positions along the slides at which they are held
     """
 
     names: tuple[str, ...]
@@ -195,8 +229,9 @@ class Trims:
         return len(self.names)
 
     def added(self, position_m: Floats) -> tuple[Floats, Floats]:
-        """Inertia (3, 3) about the bearing's center and moment (3,), mass times position, that moving the masses from
-        zero to these positions (n,) adds.
+        """Changes of the inertia (3, 3) about the bearing's center and of the first moment (3,), mass times position.
+
+        They are those of moving the masses from zero to these positions (n,).
         """
         moved_m = self.centers_m + self.axes * position_m
         inertia = np.zeros((3, 3))
@@ -205,14 +240,14 @@ class Trims:
         return inertia, np.asarray(self.axes @ (self.mass_kg * position_m))
 
     def moved_mass(self, at_zero: MassProperties) -> MassProperties:
-        """The vehicle's mass properties with the masses where they are held, from those with all at zero."""
+        """The vehicle's mass properties with the masses at their positions, from those with all masses at zero."""
         inertia, moment = self.added(self.position_m)
         center_m = at_zero.center_m + moment / at_zero.mass_kg
         return MassProperties(at_zero.mass_kg, center_m, at_zero.inertia_kg_m2 + inertia)
 
 
 def held_position_m(config: TrimConfig, names: tuple[str, ...]) -> Floats:
-    """(n,) positions that the motors can hold: whole steps. Raises InputError for another number of positions."""
+    """(n,) positions of the scene, rounded to whole steps of the motors. Raises InputError for a wrong number."""
     if config.position_m and len(config.position_m) != len(names):
         raise InputError(
             "vehicle.trim.position",
@@ -224,7 +259,8 @@ def held_position_m(config: TrimConfig, names: tuple[str, ...]) -> Floats:
 
 
 def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Trims:
-    """Move the trim masses of a spec to their places and remove their joints; model is the compiled spec before."""
+    """Move the trim masses of a spec to their positions and remove their joints; model is the compiled spec before."""
+    # 1. Axes and centers at position zero, from the compiled model.
     slides = joints(spec, TRIM) if vehicle.trim else []
     names = tuple(joint.name for joint in slides)
     data = mujoco.MjData(model)
@@ -233,6 +269,7 @@ def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Tri
     bodies = model.jnt_bodyid[ids]
     axes = data.xaxis[ids].T.copy()
     centers_m = data.subtree_com[bodies].T.copy()
+    # 2. Move the bodies.
     position_m = held_position_m(vehicle.trim, names) if vehicle.trim else np.zeros(0)
     for joint, axis, at_m in zip(slides, axes.T, position_m, strict=True):
         body = joint.parent
@@ -241,6 +278,6 @@ def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Tri
                 path,
                 f"joint {joint.name} must be on a body directly in body bus, not in another body",
             )
-        body.pos = body.pos + at_m * axis  # the bus's axes are the lab's in the model
+        body.pos = body.pos + at_m * axis  # in the model the axes of bus are those of the lab
         spec.delete(joint)
     return Trims(names, axes, centers_m, model.body_subtreemass[bodies].copy(), position_m)

@@ -1,8 +1,18 @@
-"""Read and compile MJCF files; report MuJoCo's errors in one line."""
+"""Read and compile MJCF files; report MuJoCo's errors in one line.
+
+A file is not trusted, since MuJoCo itself would read any file that it names. `load` reads it in three steps:
+
+1. `check_confined` checks that the file, and all that it includes, name only files within its own folder and only
+   finite numbers. The check must see the same names as MuJoCo's parser. XML that two parsers could read differently
+   is refused: encodings other than UTF-8, a DOCTYPE, namespaces. All paths at which MuJoCo may look for a name are
+   checked.
+2. `trial_fault` compiles the file in a child process with limits.
+3. MuJoCo reads it.
+"""
 
 from __future__ import annotations
 
-import math
+import itertools
 import os.path
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,11 +29,9 @@ from skysim.core.files import SCENES
 from skysim.core.guarded import run_guarded
 from skysim.core.yaml_reader import excerpt, is_file
 
-# Check that an untrusted MJCF file and all it includes name only files within its own folder, and
-# only finite numbers.
+# 1. Files that a model names, and its numbers.
 
-
-# In lower case: MuJoCo finds <INCLUDE> too.
+# Elements that name XML files. They are in lower case, since MuJoCo also reads <INCLUDE>.
 XML_ELEMENTS = {"include", "model"}
 CUBE_SIDES = ("right", "left", "up", "down", "front", "back")
 FOLDER_ATTRIBUTES = {"meshdir", "texturedir", "assetdir"}
@@ -34,10 +42,20 @@ MAX_CANDIDATES = 100_000  # candidate paths of a model's files
 
 
 class FileReference(NamedTuple):
-    """A file or folder as a model names it."""
+    """A file or folder that a model names.
+
+    Attributes
+    ----------
+    value
+        Name as written
+    source
+        Element that names it, for the error message
+    is_xml
+        Whether it is an XML file that MuJoCo reads in turn
+    """
 
     value: str
-    source: str  # which element names it, for the error message
+    source: str
     is_xml: bool
 
 
@@ -47,10 +65,14 @@ class References:
 
     Attributes
     ----------
+    folder
+        Folder of the model, which must contain all files
     bases
-        Folders that a relative name may start from
+        Folders from which a relative name may start
     folders
         Values of meshdir and the like
+    files
+        References to files
     """
 
     folder: Path
@@ -60,29 +82,26 @@ class References:
 
     def add(self, path: Path) -> None:
         """Add the names in an XML file."""
-        # Normalized, since a file that includes itself through `..` would otherwise give new folders without end.
-        # The other two cover how the system resolves `..` after a link.
+        # Normalize, since a file that includes itself through `..` would otherwise give new folders without end.
+        # The other two folders are those of a system that resolves `..` after a link.
         self.bases |= {
             os.path.normpath(path.parent),
             str(path.parent.resolve()),
             str(path.resolve().parent),
         }
         for element in xml_root(path).iter():
-            tag = element.tag.lower()
+            is_xml = element.tag.lower() in XML_ELEMENTS
             for key, value in element.attrib.items():
-                if key.lower() in FOLDER_ATTRIBUTES | FILE_ATTRIBUTES:
-                    target = self.files if key.lower() in FILE_ATTRIBUTES else self.folders
-                    target.add(
-                        FileReference(
-                            value,
-                            f"{path}: {element.tag} {key}={excerpt(repr(value))}",
-                            tag in XML_ELEMENTS,
-                        )
-                    )
+                source = f"{path}: {element.tag} {key}={excerpt(repr(value))}"
+                if key.lower() in FILE_ATTRIBUTES:
+                    self.files.add(FileReference(value, source, is_xml))
+                elif key.lower() in FOLDER_ATTRIBUTES:
+                    self.folders.add(FileReference(value, source, is_xml))
 
     def candidates(self) -> Iterator[tuple[FileReference, Path]]:
-        """All paths where MuJoCo may look for each name. Some versions remove `..` before they follow links,
-        some after.
+        """All paths at which MuJoCo may look for each name.
+
+        Some versions remove `..` before they follow links, some after.
         """
         subfolders = {"", *(reference.value for reference in self.folders)}
         if len(self.bases) * len(subfolders) * len(self.files) > MAX_CANDIDATES:
@@ -91,26 +110,28 @@ class References:
             )
         for base in self.bases:
             for reference in self.folders:
-                yield from (
-                    (reference, candidate) for candidate in path_variants(base, reference.value)
-                )
+                for candidate in path_variants(base, reference.value):
+                    yield reference, candidate
             for reference in self.files:
-                for name in {reference.value, os.path.basename(reference.value)}:  # strippath
-                    for folder in subfolders:
-                        yield from (
-                            (reference, candidate)
-                            for candidate in path_variants(base, folder, name)
-                        )
+                # The compiler's option strippath leaves only the last part of a name.
+                names = {reference.value, os.path.basename(reference.value)}
+                for name, folder in itertools.product(names, subfolders):
+                    for candidate in path_variants(base, folder, name):
+                        yield reference, candidate
 
 
 def path_variants(*parts: str) -> tuple[Path, Path]:
-    """A joined path as it is, and normalized (each `..` removed with the part before it)."""
+    """The joined path as it is, and normalized: each `..` removed with the part before it."""
     path = os.path.join(*parts)
     return Path(path), Path(os.path.normpath(path))
 
 
 def check_confined(path: Path) -> None:
-    """Raise InputError (one line) for a model that names files outside of its folder."""
+    """Raise InputError for a model that names files outside of its folder.
+
+    Each pass collects the names in new XML files and checks all paths, since a new setting of meshdir changes the
+    paths of earlier names. XML files found in a pass are read in the next one.
+    """
     references = References(path.resolve().parent, set())
     checked = set[tuple[FileReference, Path]]()
     pending = [path]
@@ -130,7 +151,7 @@ def check_confined(path: Path) -> None:
 
 
 def check_candidate(reference: FileReference, candidate: Path, folder: Path) -> None:
-    """Raise InputError (one line) for a path outside of the folder, and for one that is not a plain file."""
+    """Raise InputError for a path outside of the folder, and for one that is neither a plain file nor a folder."""
     if "\\" in reference.value or not resolved(candidate).is_relative_to(folder):
         raise InputError("", f"{reference.source} is outside {folder}", "files in it")
     if os.path.exists(candidate) and not (os.path.isfile(candidate) or os.path.isdir(candidate)):
@@ -138,12 +159,12 @@ def check_candidate(reference: FileReference, candidate: Path, folder: Path) -> 
 
 
 def file_identity(path: Path) -> tuple[str, Path, Path]:
-    """Identity of a file: equal for two paths only if they are one file and relative names resolve alike."""
+    """Identity of a file: equal for two paths only if they are one file and resolve relative names alike."""
     return os.path.normpath(path), resolved(path.parent), resolved(path)
 
 
 def resolved(path: Path) -> Path:
-    """The path with all links followed; the root, which is in no folder, if links form a circle."""
+    """The path with all links followed; the root, which is within no folder, if links form a circle."""
     try:
         return path.resolve()
     except (OSError, RuntimeError):
@@ -151,7 +172,7 @@ def resolved(path: Path) -> Path:
 
 
 def xml_root(path: Path) -> ElementTree.Element:
-    """The parsed XML, if MuJoCo's parser reads it the same way. Raises InputError with one line."""
+    """The parsed XML. Raises InputError unless MuJoCo's parser would read it the same way."""
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -160,7 +181,7 @@ def xml_root(path: Path) -> ElementTree.Element:
     require(path, len(data) <= MAX_BYTES, f"up to {MAX_BYTES} bytes")
     require(path, b"<!DOCTYPE" not in data, "XML without DOCTYPE")
     try:
-        # UTF-8 whatever the XML declaration says, as in MuJoCo.
+        # Like MuJoCo, read UTF-8 whatever the XML declaration says.
         root = ElementTree.fromstring(data.decode("utf-8"))
     except (ElementTree.ParseError, ValueError) as error:
         raise unreadable(path, error) from None
@@ -179,23 +200,25 @@ def xml_root(path: Path) -> ElementTree.Element:
 
 
 def is_moderate(word: str) -> bool:
-    """False for a number that is not finite or is beyond MAX_NUMBER. Any other word is moderate."""
+    """Whether a word is no number, or a finite number up to MAX_NUMBER."""
     try:
-        return math.isfinite(number := float(word)) and abs(number) <= MAX_NUMBER
+        return abs(float(word)) <= MAX_NUMBER  # False for NaN
     except ValueError:
         return True
 
 
 def unreadable(path: Path, error: Exception) -> InputError:
-    """The error for a file that cannot be read, or is not UTF-8 or not XML."""
+    """The error for a file that cannot be read, is not UTF-8 or is not XML."""
     return InputError(path, f"not a MuJoCo model: {error}")
 
 
 def require(path: Path, condition: bool, allowed: str) -> None:
-    """Raise InputError (one line) where a rule for model files is violated."""
+    """Raise InputError unless a condition for model files holds."""
     if not condition:
         raise InputError(path, "not a MuJoCo model that skysim reads", allowed)
 
+
+# 2. and 3. Trial in a child process, and reading.
 
 TRIAL = Path(__file__).parent / "mjcf_trial.py"
 TRIAL_CPU_S = 3
@@ -203,7 +226,7 @@ TRIAL_BYTES = 1 << 30
 
 
 def load(path: Path) -> Any:
-    """The MJCF file as an MjSpec."""
+    """The MJCF file as an MjSpec. Raises InputError if it is not a model that skysim reads."""
     if not path.is_file():
         raise InputError(
             path, "no such file; vehicle.model is a path relative to the scene or to scenes/"
@@ -219,12 +242,14 @@ def load(path: Path) -> Any:
 
 @lru_cache(maxsize=64)
 def trial_fault(path: Path, modified_ns: int) -> str:
-    """Why MuJoCo does not survive the file, in one line; "" if it does. A shipped file needs no trial.
+    """One line on why MuJoCo does not survive the file; "" if it does. A shipped file needs no trial.
 
     Parameters
     ----------
+    path
+        MJCF file
     modified_ns
-        So that a changed file is tried again
+        Time of the last change; part of the cache's key, so a changed file is tried again
     """
     data = path.read_bytes()
     if any(data == shipped.read_bytes() for shipped in (SCENES / "vehicles").glob("*.xml")):
@@ -233,6 +258,7 @@ def trial_fault(path: Path, modified_ns: int) -> str:
 
 
 def compile_spec(spec: Any, path: Path) -> Any:
+    """The compiled model of a spec that was read from path. Raises InputError with MuJoCo's message."""
     try:
         return spec.compile()
     except (ValueError, mujoco.FatalError) as error:
@@ -241,7 +267,7 @@ def compile_spec(spec: Any, path: Path) -> Any:
 
 @contextmanager
 def mujoco_warnings() -> Iterator[list[str]]:
-    """Collect MuJoCo's warnings, which it would otherwise print and append to a file in the working folder."""
+    """Collect MuJoCo's warnings in a list; otherwise it prints them and appends them to a file where it runs."""
     caught: list[str] = []
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(caught.append)
@@ -252,4 +278,5 @@ def mujoco_warnings() -> Iterator[list[str]]:
 
 
 def one_line(error: Exception) -> str:
+    """The message of an error with its line breaks removed."""
     return " ".join(str(error).split())

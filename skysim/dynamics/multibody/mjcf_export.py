@@ -1,7 +1,8 @@
 """Export the laboratory as one MJCF file, for MuJoCo's viewer and for `picture`.
 
-What is added to the vehicle is for display only: no mass, no contacts, no constraints. Groups of the viewer:
-0 vehicle, floor and pedestal, 1 dome and LEDs or stars, 2 the star camera's field of view; 4, hidden, the tilt stop.
+`mjcf` writes the file; `laboratory` reads the shapes of one for other drawing programs. The elements that `mjcf` adds
+to the vehicle are for display only: no mass, no contacts, no constraints. Groups of MuJoCo's viewer: 0 vehicle, floor
+and pedestal; 1 dome and LEDs or stars; 2 the star camera's field of view; 4, hidden, the tilt stop.
 """
 
 from __future__ import annotations
@@ -41,11 +42,10 @@ SKY_RADIUS_M = 5.0
 SKY = Ellipsoid(np.zeros(3), np.full(3, SKY_RADIUS_M))
 MAX_STARS = 300
 LED_RADIUS_M = 5e-3  # larger than the true disk, which would be less than a pixel
-# steps of brightness, and the darkest over the brightest
-LEVELS = 12
-DIM = 0.15
+LEVELS = 12  # steps of brightness
+DIM = 0.15  # brightness of the darkest LED over that of the brightest
 RIM_M = 0.03
-# of the dome's mesh
+# Number of vertices of the dome's mesh around its axis and down from its top.
 SECTORS = 72
 RINGS = 24
 FLOOR_BELOW_M = 0.95
@@ -57,17 +57,30 @@ FIELD_RGB = np.array([0.25, 0.75, 1.0])
 def mjcf(vehicle: VehicleModel, scene: Scene, sources: Sources, lab_from_body: Rotation) -> str:
     """The laboratory as the text of one MJCF file, which MuJoCo's own viewer can open and simulate.
 
-    The simulated model is not changed. Raises InputError for a start beyond the tilt stop, and for a vehicle that
-    has a camera named `lab`.
+    1. Copy the vehicle's spec, hide the tilt stop, and copy mesh files into it.
+    2. Add background and room, and the dome with a view from the side, or a view of the sky.
+    3. Add LEDs or stars, the camera's field of view, and the keyframe `start`.
+    4. Compile and write.
+
+    The simulated model is not changed.
 
     Parameters
     ----------
+    vehicle
+        Vehicle of the scene
+    scene
+        The scene
     sources
-        LEDs in lab coordinates (m), or stars, of which the brightest are put on a sphere
+        LEDs in lab coordinates (m), or stars; the brightest stars are put on a sphere
     lab_from_body
-        Attitude in the keyframe `start`, which also has the speeds and gimbal angles of the
-        scene
+        Attitude in the keyframe `start`, which also has the scene's speeds and gimbal angles
+
+    Raises
+    ------
+    InputError
+        For a start beyond the tilt stop, and for a vehicle that has a camera named `lab`.
     """
+    # 1. Vehicle.
     spec = vehicle.spec.copy()
     mount = camera_mount(vehicle)
     if spec.camera(LAB_CAMERA):
@@ -81,6 +94,7 @@ def mjcf(vehicle: VehicleModel, scene: Scene, sources: Sources, lab_from_body: R
     )
     hide_tilt_stop(spec)
     inline_meshes(spec, vehicle.model)
+    # 2. Surroundings.
     add_backdrop(spec, on_earth)
     if on_earth:
         add_room(spec)
@@ -91,16 +105,18 @@ def mjcf(vehicle: VehicleModel, scene: Scene, sources: Sources, lab_from_body: R
     else:
         boresight = lab_from_body.apply(mount.cam_from_body.inv().apply([0.0, 0.0, 1.0]))
         look_at(spec, *sky_view(vehicle, boresight))
+    # 3. Lights, field of view, keyframe.
     add_lights(spec, sources)
     add_field(spec, mount, field_corners(scene.camera, mount, lab_from_body, inside))
     add_start_keyframe(spec, vehicle, scene, lab_from_body)
+    # 4. Text.
     with mujoco_warnings(), full_precision():
         compile_spec(spec, SCENES / scene.vehicle.model)
         return shorten_colors(spec.to_xml())
 
 
 def hide_tilt_stop(spec: Any) -> None:
-    """Put the tilt stop's tendon and its ends, which are not hardware, into the hidden group."""
+    """Put the tendon of the tilt stop and its ends into the hidden group, since they are not hardware."""
     for element in (*spec.tendons, *spec.sites):
         if element.name.startswith("tilt_stop"):
             element.group = GROUP_HIDDEN
@@ -135,7 +151,7 @@ def inline_meshes(spec: Any, model: Any) -> None:
 
 
 def add_backdrop(spec: Any, on_earth: bool) -> None:
-    """A dim room or black space as background, and a lamp."""
+    """Add a dim room or black space as background, and a lamp."""
     top, bottom = (
         ([0.16, 0.19, 0.24], [0.03, 0.035, 0.05]) if on_earth else ([0.0, 0.0, 0.01], [0.0] * 3)
     )
@@ -164,7 +180,7 @@ def add_backdrop(spec: Any, on_earth: bool) -> None:
 
 
 def add_room(spec: Any) -> None:
-    """A tiled floor, and the pedestal whose cup holds the bearing's ball."""
+    """Add a tiled floor, and the pedestal whose cup holds the ball of the bearing."""
     spec.add_texture(
         name="stage_tiles",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -206,38 +222,39 @@ def add_room(spec: Any) -> None:
 
 
 def add_visual_geom(body: Any, name: str, kind: Any, **more: Any) -> Any:
-    """A geom for display only: no mass, no contact."""
+    """Add and return a geom for display only: no mass, no contact."""
     return body.add_geom(name=name, type=kind, mass=0.0, contype=0, conaffinity=0, **more)
 
 
 def add_dome(spec: Any, rings_m: Floats) -> None:
-    """The dome, opaque from inside and transparent from outside, with a rim."""
+    """Add the dome, opaque from inside and transparent from outside, with a rim."""
     add_sheet(spec, "stage_dome", rings_m, [0.16, 0.19, 0.27, 1.0], [0.60, 0.72, 0.90, 0.10])
     rim_m = np.stack([rings_m[-1], rings_m[-1] - [0.0, 0.0, RIM_M]])
     add_sheet(spec, "stage_rim", rim_m, [0.45, 0.50, 0.58, 1.0], [0.45, 0.50, 0.58, 0.6])
 
 
 def shell_m(inside: Surface, cap_rad: float) -> Floats:
-    """(RINGS, SECTORS, 3) points of the dome, ring under ring from its top down, each counterclockwise from above.
+    """(RINGS, SECTORS, 3) points of the dome in the lab: rings from its top down, each counterclockwise from above.
 
-    A panel ends slightly beyond its LEDs; an upright ellipsoid without a rim ends where it is widest, or above the
-    vehicle if that is higher; every other surface ends where it does as seen from the bearing.
+    1. A panel ends slightly beyond its LEDs.
+    2. An upright ellipsoid without a rim ends where it is widest, or above the vehicle if that is higher.
+    3. Any other surface ends at its edge as seen from the bearing (`visible_shell_m`).
     """
     azimuth = np.arange(SECTORS) * (2 * np.pi / SECTORS)
     around = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(SECTORS)], axis=1)
     up = np.array([0.0, 0.0, 1.0])
+    # 1. Panel: circles about its center, clipped to its edges.
     if isinstance(inside, Plane):
-        radius = np.linspace(1e-3, inside.height_m * np.tan(min(cap_rad + 0.1, 1.3)), RINGS)[
-            :, None, None
-        ]
+        outer_m = inside.height_m * np.tan(min(cap_rad + 0.1, 1.3))
+        radius_m = np.linspace(1e-3, outer_m, RINGS)[:, None, None]
         half_m = np.append(inside.half_m, np.inf)
-        return np.asarray(
-            inside.center_m
-            + np.clip(radius * around, -half_m, half_m) @ inside.lab_from_own.as_matrix().T
-        )
+        panel_m = np.clip(radius_m * around, -half_m, half_m)
+        return np.asarray(inside.center_m + panel_m @ inside.lab_from_own.as_matrix().T)
+    # 3. Any other surface.
     upright = inside.lab_from_own.magnitude() == 0
     if not (isinstance(inside, Ellipsoid) and upright and inside.rim.unbounded):
         return visible_shell_m(inside, around)
+    # 2. Upright ellipsoid: rings of equal polar angle.
     middle = inside.center_m[2]
     half = inside.semi_axes_m[2]
     lowest = max(middle, 0.35 * (middle + half))
@@ -248,25 +265,32 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
 
 
 def visible_shell_m(inside: Surface, around: Floats) -> Floats:
-    """(RINGS, SECTORS, 3) points where rays from the bearing meet a surface, from its upper edge to its rim.
+    """(RINGS, SECTORS, 3) points at which rays from the bearing meet a surface, from its upper edge to its rim.
+
+    Edge and rim are found to a fifth of a degree, between 0 and 80 deg from the zenith and above a third of the
+    surface's height.
 
     Parameters
     ----------
+    inside
+        The surface
     around
-        (SECTORS, 3) horizontal unit vectors. Edge and rim are found to a fifth of a degree,
-        between 0 and 80 deg from the zenith and above a third of the surface's height
+        (SECTORS, 3) horizontal unit vectors
     """
     up = np.array([0.0, 0.0, 1.0])
 
     def points_at(polar: Floats) -> Floats:
+        """(..., 3) points at these polar angles (..., SECTORS)."""
         rays = np.sin(polar)[..., None] * around + np.cos(polar)[..., None] * up
         return inside.meet(np.zeros(3), rays.reshape(-1, 3)).reshape(rays.shape)
 
+    # The first and the last of 400 polar angles in each direction at which a ray meets the surface.
     polar = np.broadcast_to(np.linspace(1e-3, np.radians(80), 400)[:, None], (400, len(around)))
     height_m = np.nan_to_num(points_at(polar)[..., 2], nan=-np.inf)
     on_surface = height_m > 0.35 * height_m.max()
     first = on_surface.argmax(axis=0)
     last = 399 - on_surface[::-1].argmax(axis=0)
+    # Rings of equal steps between the two.
     fraction = np.linspace(0, 1, RINGS)[:, None]
     return points_at(polar[first, 0] * (1 - fraction) + polar[last, 0] * fraction)
 
@@ -274,14 +298,20 @@ def visible_shell_m(inside: Surface, around: Floats) -> Floats:
 def add_sheet(
     spec: Any, name: str, rings_m: Floats, inside_rgba: list[float], outside_rgba: list[float]
 ) -> None:
-    """A surface with a color for each side; OpenGL does not draw the back of a triangle, so it is two meshes.
+    """Add a surface with a color for each side: two meshes, since OpenGL does not draw the back of a triangle.
 
     Parameters
     ----------
+    spec
+        Spec of the file
+    name
+        Beginning of the names of the meshes
     rings_m
-        (K, n, 3) each counterclockwise seen from above, every one beneath or around the
-        previous one
+        (K, n, 3) rings, each counterclockwise seen from above, beneath or around the previous one
+    inside_rgba, outside_rgba
+        Colors of the two sides
     """
+    # Two triangles for each quadrilateral a, b, c, d of neighbors on one ring and the next.
     index = np.arange(rings_m.shape[0] * rings_m.shape[1]).reshape(rings_m.shape[:2])
     a = index[:-1].ravel()
     d = index[1:].ravel()
@@ -313,7 +343,7 @@ def add_mesh(
     group: int,
     **more: Any,
 ) -> None:
-    """A mesh, open or closed, and its geom; its inertia is that of a shell, which needs no volume."""
+    """Add a mesh, open or closed, and its geom; its inertia is that of a shell, which needs no volume."""
     mesh = spec.add_mesh(
         name=name, uservert=np.round(vertices_m, 6).ravel(), userface=faces.astype(np.int32).ravel()
     )
@@ -324,13 +354,14 @@ def add_mesh(
 
 
 def add_lights(spec: Any, sources: Sources) -> None:
-    """A glowing octahedron for each LED, and for each of the brightest stars; brightness from its mean strength.
+    """Add a glowing octahedron for each LED, or for each of the brightest stars.
 
-    An LED's color shows its strength; a star's size does, by the square root. Markers of similar color share
-    one mesh: as many sites would make a step eight times as slow, and a picture take seconds.
+    The color of an LED shows its mean strength. The size of a star does, by the square root. Markers of similar color
+    share one mesh: as many sites would make a step eight times as slow, and a picture take seconds.
     """
     glow = spec.add_material(name="stage_glow", emission=0.8, specular=0.0)
     mean = sources.strength * sources.on_s / sources.period_s
+    # Mean strength over a period, brightest first. A place whose fourth component is 0 is a direction.
     stars = bool((sources.place[:, 3] == 0).any())
     shown = np.argsort(-mean, kind="stable")[: MAX_STARS if stars else len(mean)]
     fraction = mean[shown] / mean.max(initial=1e-300)
@@ -351,21 +382,23 @@ def octahedra(position_m: Floats, radius_m: Floats) -> tuple[Floats, NDArray[np.
     corners = np.concatenate([np.eye(3), -np.eye(3)])
     signs = np.array([[x, y, z] for x in (0, 3) for y in (0, 3) for z in (0, 3)])
     faces = signs + np.arange(3)
-    odd = (signs > 0).sum(axis=1) % 2 == 1  # mirrored: reverse the order, to face outwards
+    # A mirrored octant reverses the order of the corners; undo that, so that all faces are outwards.
+    odd = (signs > 0).sum(axis=1) % 2 == 1
     faces[odd] = faces[odd][:, ::-1]
     vertices = position_m[:, None, :] + radius_m[:, None, None] * corners
-    return vertices.reshape(-1, 3), (6 * np.arange(len(position_m))[:, None, None] + faces).reshape(
-        -1, 3
-    )
+    all_faces = 6 * np.arange(len(position_m))[:, None, None] + faces
+    return vertices.reshape(-1, 3), all_faces.reshape(-1, 3)
 
 
 def field_corners(
     camera: CameraConfig, mount: Mount, lab_from_body: Rotation, inside: Surface
 ) -> Floats:
-    """(4, 3) in body axes: where a pinhole's rays of the chip's corners meet dome or sky, at a given attitude.
+    """(4, 3) points in body axes at which the rays of the detector's corners meet dome or sky, at a given attitude.
 
-    A ray that misses a flat panel, or meets it far away, ends at the distance of the sky.
+    The camera is taken as a pinhole. A ray that misses a flat panel, or meets it far away, ends at the distance of
+    the sky.
     """
+    # Corners are half a pixel outside of the outer pixels' centers.
     x = np.array([-0.5, camera.width_px - 0.5, camera.width_px - 0.5, -0.5]) - camera.center_px[0]
     y = np.array([-0.5, -0.5, camera.height_px - 0.5, camera.height_px - 0.5]) - camera.center_px[1]
     rays_cam = np.column_stack([x, y, np.full(4, camera.focal_px)])
@@ -377,12 +410,11 @@ def field_corners(
 
 
 def add_field(spec: Any, mount: Mount, corners_m: Floats) -> None:
-    """The star camera's field of view as a translucent pyramid on the vehicle, with its edges."""
+    """Add the star camera's field of view as a translucent pyramid on the vehicle, with its edges."""
     bus = spec.body("bus")
     tip = mount.camera_body_m
-    sides = np.array(
-        [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]]
-    )  # open, so that it does not block the camera's own view
+    # The pyramid has no base, which would block the camera's own view.
+    sides = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]])
     glow = spec.add_material(name="stage_field", emission=0.6, specular=0.0)
     more = {"material": glow.name, "group": GROUP_FIELD}
     vertices = np.vstack([tip, corners_m])
@@ -402,9 +434,9 @@ def add_field(spec: Any, mount: Mount, corners_m: Floats) -> None:
 
 
 def dome_view(rings_m: Floats) -> tuple[Floats, Floats, Floats, float]:
-    """(eye, target, up, size), m: from the side, so that one sees under the dome's rim and through it.
+    """(eye, target, up, size) in m of a view from the side, which shows the inside under the dome's rim.
 
-    The eye's distance makes dome and vehicle fill a picture of 4:3; the rim's near side is the widest.
+    At the eye's distance dome and vehicle fill a picture of 4:3; the near side of the rim is the widest part.
     """
     wide = np.hypot(*rings_m[-1, :, :2].T).max()
     top = rings_m[..., 2].max()
@@ -421,7 +453,7 @@ def dome_view(rings_m: Floats) -> tuple[Floats, Floats, Floats, float]:
 
 
 def sky_view(vehicle: VehicleModel, boresight: Floats) -> tuple[Floats, Floats, Floats, float]:
-    """As `dome_view`, from beside and behind the vehicle, with the camera's field along the picture's diagonal."""
+    """As `dome_view`, from beside and behind the vehicle, with the boresight along the picture's diagonal."""
     size = float(vehicle.model.stat.extent) / 2 + SKY_RADIUS_M / 2
     beside = np.cross(boresight, np.eye(3)[np.argmin(np.abs(boresight))])
     back = beside / np.linalg.norm(beside) - 0.5 * boresight
@@ -430,13 +462,15 @@ def sky_view(vehicle: VehicleModel, boresight: Floats) -> tuple[Floats, Floats, 
 
 
 def direction(azimuth_deg: float, elevation_deg: float) -> Floats:
+    """(3,) unit vector in lab axes."""
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
     ring = np.cos(elevation)
     return np.array([ring * np.cos(azimuth), ring * np.sin(azimuth), np.sin(elevation)])
 
 
 def look_at(spec: Any, eye_m: Floats, middle_m: Floats, up: Floats, size_m: float) -> None:
-    """Add the camera `lab` and set the viewer's initial view: MuJoCo's cameras look along -z, y is up."""
+    """Add the camera `lab` and set the initial view of MuJoCo's viewer."""
+    # MuJoCo's cameras look along -z, y is up.
     back = (eye_m - middle_m) / np.linalg.norm(eye_m - middle_m)
     right = np.cross(up, back) / np.linalg.norm(np.cross(up, back))
     lab_from_view = Rotation.from_matrix(np.column_stack([right, np.cross(back, right), back]))
@@ -454,7 +488,7 @@ def look_at(spec: Any, eye_m: Floats, middle_m: Floats, up: Floats, size_m: floa
 def add_start_keyframe(
     spec: Any, vehicle: VehicleModel, scene: Scene, lab_from_body: Rotation
 ) -> None:
-    """The keyframe `start`: attitude and rate, wheel and rotor speeds, gimbal angles and servo set-points."""
+    """Add the keyframe `start`: attitude and rate, wheel and rotor speeds, gimbal angles and servo set-points."""
     simulation = Simulation(vehicle, lab_from_body, np.radians(scene.motion.rate_deg_s), 0.0)
     data = simulation.data
     spec.add_key(name="start", qpos=data.qpos, qvel=data.qvel, act=data.act, ctrl=data.ctrl)
@@ -462,9 +496,9 @@ def add_start_keyframe(
 
 @contextmanager
 def full_precision() -> Iterator[None]:
-    """Write MJCF with fifteen digits; MuJoCo's six would shift a balanced vehicle's center of mass.
+    """Make MuJoCo write MJCF with fifteen digits; its usual six would shift a balanced vehicle's center of mass.
 
-    MuJoCo's switch for it is private; if a version lacks it, six digits are written.
+    MuJoCo's switch for this is private; a version that lacks it writes six digits.
     """
     library = ctypes.CDLL(mujoco._functions.__file__)
     switch = getattr(library, "_mjPRIVATE__set_xml_precision", lambda digits: None)
@@ -476,7 +510,7 @@ def full_precision() -> Iterator[None]:
 
 
 def shorten_colors(text: str) -> str:
-    """Write colors with four digits: they are single precision, so fifteen digits make 0.1 into 0.100000001490116."""
+    """The text with four digits in colors: in single precision, fifteen digits make 0.1 into 0.100000001490116."""
     return re.sub(
         r'(rgba|rgb1|rgb2)="([^"]*)"',
         lambda m: f'{m[1]}="{" ".join(f"{float(x):.4g}" for x in m[2].split())}"',
@@ -484,8 +518,7 @@ def shorten_colors(text: str) -> str:
     )
 
 
-# The geometry of an MJCF file as plain shapes, for other drawing programs than MuJoCo's.
-
+# The geometry of an MJCF file as plain shapes, for drawing programs other than MuJoCo's.
 
 KINDS = {
     mujoco.mjtGeom.mjGEOM_PLANE: "plane",
@@ -496,7 +529,7 @@ KINDS = {
     mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
     mujoco.mjtGeom.mjGEOM_MESH: "mesh",
 }
-LIGHTS = ("stage_leds", "stage_stars")  # begin of the names of the lights' geoms
+LIGHTS = ("stage_leds", "stage_stars")  # prefixes of the names of the lights' geoms
 
 
 class Shape(NamedTuple):
@@ -505,15 +538,21 @@ class Shape(NamedTuple):
     Attributes
     ----------
     name
-        Of the geom; empty if it has none
+        Name of the geom; empty if it has none
     kind
-        Of KINDS
+        One of the values of KINDS
     size_m
-        As MuJoCo has it: half edges, radius and half length along z, semi-axes
+        Size as defined by MuJoCo: half edges, radius and half length along z, or semi-axes
+    position_m
+        (3,) position of its center
+    parent_from_shape_wxyz
+        (4,) rotation from the shape's axes to those of lab or body
+    rgba
+        (4,) color
     on_vehicle
-        Whether it turns with the vehicle
+        Whether it rotates with the vehicle
     vertices_m, faces
-        (N, 3) and (M, 3) of a mesh, in the shape's axes; empty of other kinds
+        (N, 3) vertices and (M, 3) faces of a mesh, in the shape's axes; empty for other kinds
     """
 
     name: str
@@ -528,7 +567,15 @@ class Shape(NamedTuple):
 
 
 class Laboratory(NamedTuple):
-    """All visible shapes of a laboratory without its lights, and the camera `lab`: (3,) eye and what it looks at, m."""
+    """All visible shapes of a laboratory except its lights, and the view of the camera `lab`.
+
+    Attributes
+    ----------
+    shapes
+        Shapes of vehicle, dome and room
+    eye_m, target_m
+        (3,) positions in the lab of the camera and of the point at which it looks
+    """
 
     shapes: tuple[Shape, ...]
     eye_m: Floats
@@ -536,7 +583,7 @@ class Laboratory(NamedTuple):
 
 
 def laboratory(mjcf: str) -> Laboratory:
-    """The laboratory of an MJCF text, see `mjcf_export.mjcf`."""
+    """The laboratory of an MJCF text from `mjcf`."""
     with mujoco_warnings():
         model = mujoco.MjModel.from_xml_string(mjcf)
         data = mujoco.MjData(model)
@@ -547,13 +594,14 @@ def laboratory(mjcf: str) -> Laboratory:
 
 
 def is_shown(model: mujoco.MjModel, n: int) -> bool:
+    """Whether the geom with index n is visible and is no light."""
     kind = mujoco.mjtGeom(model.geom_type[n])
     name = model.geom(n).name
     return kind in KINDS and model.geom_group[n] != GROUP_HIDDEN and not name.startswith(LIGHTS)
 
 
 def shape(model: mujoco.MjModel, data: mujoco.MjData, n: int) -> Shape:
-    """The geom with index n, in the pose of data."""
+    """The geom with index n as a shape, in the pose of data."""
     wxyz = np.empty(4)
     mujoco.mju_mat2Quat(wxyz, data.geom_xmat[n])
     vertices_m, faces = mesh(model, n)
@@ -571,8 +619,9 @@ def shape(model: mujoco.MjModel, data: mujoco.MjData, n: int) -> Shape:
 
 
 def color(model: mujoco.MjModel, n: int) -> Floats:
-    """(4,) of a geom: its own, or its material's if it has none of its own."""
+    """(4,) color of a geom: its own, or that of its material if it has none."""
     material = model.geom_matid[n]
+    # MuJoCo's default color marks a geom without one.
     unset = (model.geom_rgba[n] == (0.5, 0.5, 0.5, 1.0)).all()
     return np.asarray(
         model.mat_rgba[material] if material >= 0 and unset else model.geom_rgba[n], float
@@ -580,7 +629,7 @@ def color(model: mujoco.MjModel, n: int) -> Floats:
 
 
 def mesh(model: mujoco.MjModel, n: int) -> tuple[Floats, NDArray[np.int32]]:
-    """Vertices and faces of a geom's mesh; empty if it is none."""
+    """Vertices (N, 3) and faces (M, 3) of the mesh of a geom; empty for other kinds."""
     if model.geom_type[n] != mujoco.mjtGeom.mjGEOM_MESH:
         return np.empty((0, 3)), np.empty((0, 3), np.int32)
     k = model.geom_dataid[n]

@@ -1,7 +1,8 @@
-"""Script for `core.io.guarded`: read and compile an MJCF file, to see whether MuJoCo survives it.
+"""Script for `core.guarded`: read and compile an MJCF file, to see whether MuJoCo survives it.
 
-It fails if memory runs out or the model is too large. Any other error of MuJoCo is left to the caller, who meets it
-again and reports it. The compilation is then repeated without joints: the caller may lock those that MuJoCo rejects.
+It fails if memory runs out or the model is too large. It ignores any other error of MuJoCo: the caller gets the same
+error and reports it. After such an error it compiles again without joints, since the caller may lock the joints that
+MuJoCo rejects.
 """
 
 from __future__ import annotations
@@ -13,15 +14,15 @@ from typing import Any
 import mujoco
 
 ERRORS = (ValueError, mujoco.FatalError)
-MAX_ELEMENTS = {
-    "nbody": 2000,
-    "ngeom": 2000,
-    "nv": 1000,
-}  # occlusion takes the square of the geoms, inertia of nv
+# Occlusion takes a time proportional to the square of ngeom, inertia to the square of nv.
+MAX_ELEMENTS = {"nbody": 2000, "ngeom": 2000, "nv": 1000}
 
 
 def run_trial(path: str) -> None:
-    """Raises MemoryError, or RuntimeError, MuJoCo's for a failed allocation in C++; SystemExit for a large model."""
+    """Read and compile the file at path.
+
+    Raises MemoryError, or RuntimeError after a failed allocation in MuJoCo, and SystemExit for a large model.
+    """
     try:
         spec = mujoco.MjSpec.from_file(path)
     except ERRORS:
@@ -36,6 +37,7 @@ def run_trial(path: str) -> None:
 
 
 def check_model(model: Any) -> None:
+    """Exit with a message if the model is too large; else compute its forward dynamics once."""
     for name, limit in MAX_ELEMENTS.items():
         if (count := getattr(model, name)) > limit:
             sys.exit(f"it has {name} {count}; allowed: up to {limit}")

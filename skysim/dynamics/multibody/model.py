@@ -1,10 +1,17 @@
 """Build the MuJoCo model: the vehicle's MJCF on its bearing, with the actuators that the scene switches on.
 
-`compose` loads the file, moves body bus to the lab's origin and frees it of joints, places the camera, locks the
-joints of unused actuators, sets the declared mass properties, and adds a ball joint (the air bearing) with drag,
-cable spring and tilt stop. `build` compiles this and looks up the actuators.
+`compose` makes the model as an MjSpec:
 
-MuJoCo's qpos of a ball joint is lab_from_body as wxyz, its qvel the angular rate in body axes.
+1. Load the file, and move body bus to the lab's origin without joints of its own.
+2. Place the camera.
+3. Lock the joints of unused actuators.
+4. Set the declared mass properties.
+5. Add a ball joint (the air bearing) with drag, cable spring and tilt stop.
+6. Check that MuJoCo compiles it as declared.
+7. Unbalance the wheels, add the motors, and move the trim masses.
+
+`build` compiles it and looks up the actuators. MuJoCo's qpos of a ball joint is lab_from_body as wxyz, its qvel the
+angular rate in body axes.
 """
 
 from __future__ import annotations
@@ -52,8 +59,8 @@ REQUIRED = f"body bus and camera {CAMERA}"
 # MuJoCo's camera has +y up and looks along -z; ours has +y down and looks along +z.
 CAM_FROM_MJCAM = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
-# The tilt stop's two ends, above the bearing in the lab and on the vehicle. Unequal, so that the distance between
-# them never vanishes and its derivative is not zero at any tilt except 0.
+# Heights of the two ends of the tilt stop above the bearing, in the lab and on the vehicle. They are unequal, so the
+# distance between the ends never vanishes, and its derivative by the tilt is zero only at zero tilt.
 STOP_LAB_M = 1.0
 STOP_BODY_M = 0.5
 
@@ -65,16 +72,17 @@ class VehicleModel:
     Attributes
     ----------
     spec
-        mujoco.MjSpec that the model was made from
+        mujoco.MjSpec from which the model was compiled
     model
-        mujoco.MjModel, whose first four qpos and three qvel are the bearing's
+        mujoco.MjModel, whose first four qpos and three qvel are those of the bearing
+    config
+        The scene's section `vehicle`
     mass
-        Mass properties of the whole vehicle, with balanced wheels and the trim masses in their
-        places
+        Mass properties of the whole vehicle, with balanced wheels and the trim masses at their positions
     torques
-        (3,) actuator numbers of the ideal torques about body x, y, z
+        (3,) numbers of the actuators for ideal torques about body x, y, z
     wheels, gimbals, rotors, fans, trims
-        The actuators, empty where they are not switched on
+        Actuators; empty if they are not switched on
     """
 
     spec: Any
@@ -100,7 +108,7 @@ class VehicleModel:
 
 
 def build(vehicle: VehicleConfig) -> VehicleModel:
-    """Compose and compile the vehicle, and look up its actuators. Raises InputError with one line."""
+    """The compiled vehicle with its actuators. Raises InputError for a file or section that makes no vehicle."""
     path = SCENES / vehicle.model
     with mujoco_warnings():
         spec, mass, trims = compose(vehicle, path)
@@ -120,12 +128,11 @@ def build(vehicle: VehicleConfig) -> VehicleModel:
 
 
 def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Trims]:
-    """The vehicle's MJCF on a bearing at the lab's origin, as MjSpec; its mass properties and its trim masses.
+    """The vehicle's MJCF on a bearing at the lab's origin as MjSpec, its mass properties, and its trim masses.
 
-    mount `air_bearing`: gravity along lab -z and a tilt stop. mount `free`: neither, and the vehicle rotates
-    about its center of mass, which must be the body's origin. Mass properties are as declared, apart from trim masses
-    in other places than zero. Joints of actuators that the scene does not switch on are locked. Raises InputError with
-    one line.
+    Mount `air_bearing` has gravity along lab -z and a tilt stop. Mount `free` has neither; the vehicle rotates about
+    its center of mass, which must be the body's origin. The steps are those of the module's docstring. Raises
+    InputError.
     """
     if vehicle.mount == "free" and any(vehicle.center_of_mass_m):
         raise InputError(
@@ -133,26 +140,31 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Tr
             "a free vehicle rotates about it, so it must be the body's origin",
             "0",
         )
+    # 1. Body bus. The compiler must not fuse bodies until the bearing is added.
     spec = load(path)
-    spec.compiler.fusestatic = False  # keep bodies separate until the bearing is added
+    spec.compiler.fusestatic = False
     bus = put_at_origin(spec, path)
+    # 2. Camera.
     place_camera(spec, vehicle)
-    # Locking comes before the mass: a locked rotor is part of the rigid vehicle.
+    # 3. Locking comes before the mass: a locked rotor is part of the rigid vehicle.
     locked = lock_unused(spec, vehicle, path)
     try:
         bare = compile_spec(spec, path)
     except InputError as error:
         raise InputError(error.key, f"{error.problem}{locked_joint_hint(spec, locked)}") from None
+    # 4. Mass properties.
     mass = declare_mass(bus, bare, vehicle, path)
+    # 5. Bearing.
     try:
         add_bearing(spec, bus, vehicle)
     except ValueError as error:  # a name is taken
         raise InputError(
             path, f"a name is reserved for skysim's bearing: {one_line(error)}"
         ) from error
+    # 6. Check while the wheels are balanced, since `unbalance` changes the mass properties on purpose.
     balanced = compile_spec(spec, path)
-    # Checked while the wheels are balanced, since `unbalance` changes the mass properties on purpose.
     check_compiled(balanced, mass, path)
+    # 7. Actuators.
     if vehicle.wheels:
         unbalance(balanced, joints(spec, WHEEL), vehicle.wheels, path)
     add_actuators(spec, balanced, vehicle)
@@ -161,7 +173,8 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Tr
 
 
 def put_at_origin(spec: Any, path: Path) -> Any:
-    """Return body bus, moved to the origin without joints of its own: the bearing defines both."""
+    """Body bus of the spec, moved to the lab's origin and without joints of its own. Raises InputError."""
+    # The file must have the bus, as a child of the world, and the camera.
     required = {"body bus": spec.body("bus"), f"camera {CAMERA}": spec.camera(CAMERA)}
     missing = [name for name, element in required.items() if element is None]
     if missing:
@@ -175,19 +188,20 @@ def put_at_origin(spec: Any, path: Path) -> Any:
         if joint.name.startswith(tuple(prefix for kind in KINDS for prefix in kind.joints)):
             raise InputError(path, f"joint {joint.name} must be on a child body of bus")
         spec.delete(joint)
-    for key in list(spec.keys):  # keyframes are lists of joint positions, which no longer fit
+    # Keyframes are lists of joint positions, which no longer fit.
+    for key in list(spec.keys):
         spec.delete(key)
-    bus.alt.type = (
-        mujoco.mjtOrientation.mjORIENTATION_QUAT
-    )  # an euler or axisangle would win over the quat
+    # Without this an euler or axisangle of the file would override the quaternion.
+    bus.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     bus.pos = [0.0, 0.0, 0.0]
     bus.quat = [1.0, 0.0, 0.0, 0.0]
     return bus
 
 
 def place_camera(spec: Any, vehicle: VehicleConfig) -> None:
-    """Move the camera's pupil to the scene's position: move the body that carries the camera, or the
-    camera if on bus.
+    """Move the camera's pupil to the position that the scene gives.
+
+    The body that carries the camera moves, or the camera itself if it is on bus.
     """
     if vehicle.camera_m is None:
         return
@@ -205,9 +219,10 @@ def place_camera(spec: Any, vehicle: VehicleConfig) -> None:
 def add_bearing(spec: Any, bus: Any, vehicle: VehicleConfig) -> None:
     """Add a ball joint with air drag and cable spring; for an air bearing also gravity and a tilt stop.
 
-    Drag and spring are MuJoCo's own, so that they are evaluated at every stage of a Runge-Kutta step:
-    T = -(viscous + quadratic |rate|) rate about each axis, T = -stiffness times the rotation vector of
-    lab_from_body.
+        drag:   T = -(viscous + quadratic |rate|) rate    about each axis
+        spring: T = -stiffness rotvec(lab_from_body)
+
+    MuJoCo computes both, at every stage of a Runge-Kutta step.
     """
     drag = vehicle.drag
     cable = vehicle.disturbances.cable
@@ -221,26 +236,29 @@ def add_bearing(spec: Any, bus: Any, vehicle: VehicleConfig) -> None:
     spec.option.gravity = [0.0, 0.0, -STANDARD_GRAVITY_M_S2 if on_bearing else 0.0]
     spec.option.timestep = STEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
-    # In units of the mean inertia: MuJoCo's 1e-8 would hide a small wheel's friction in a heavy vehicle. No cost.
+    # The solver's tolerance is in units of the mean inertia: MuJoCo's default of 1e-8 would hide the friction of a
+    # small wheel in a heavy vehicle. The smaller one costs no time.
     spec.option.tolerance = 1e-16
-    # Few constraints on one tree: no contacts, no search for islands; PGS is the fastest solver here.
+    # There are few constraints, on one tree: no contacts, no search for islands. PGS is the fastest solver for this.
     spec.option.disableflags |= int(
         mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_ISLAND
     )
     spec.option.solver = mujoco.mjtSolver.mjSOL_PGS
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    spec.compiler.fusestatic = True  # one rigid body instead of ten: 14 us a step instead of 20
+    # One rigid body instead of ten takes 14 us a step instead of 20.
+    spec.compiler.fusestatic = True
     if on_bearing:
         add_tilt_stop(spec, bus, vehicle.tilt_stop_deg)
 
 
 def add_tilt_stop(spec: Any, bus: Any, stop_deg: float) -> None:
-    """Limit the tilt by a tendon between the lab's z axis and the body's: its length depends on tilt only, so
-    yaw is free.
+    """Limit the tilt by a tendon from a point on the lab's z axis at L to a point on the body's z axis at b.
 
-    length^2 = L^2 + b^2 - 2 L b cos(tilt). A ball joint's own range would limit the whole rotation, yaw too.
-    The limit has the shortest time constant that MuJoCo allows, two steps, and twice the critical damping: it
-    yields by 0.001 deg for each deg/s of impact and returns 6 % of that rate.
+        length^2 = L^2 + b^2 - 2 L b cos(tilt)
+
+    The length depends on tilt only, so yaw is free; the range of a ball joint would limit the whole rotation. The
+    limit has the shortest time constant that MuJoCo allows, two steps, and twice the critical damping. It yields by
+    0.001 deg for each deg/s of impact and returns 6 % of that rate.
     """
     spec.worldbody.add_site(name="tilt_stop_lab", pos=[0.0, 0.0, STOP_LAB_M])
     bus.add_site(name="tilt_stop_body", pos=[0.0, 0.0, STOP_BODY_M])
@@ -258,7 +276,8 @@ def add_tilt_stop(spec: Any, bus: Any, stop_deg: float) -> None:
 
 
 def check_compiled(model: Any, declared: MassProperties, path: Path) -> None:
-    """Check that the compiled model is as declared; MuJoCo may change it silently. Raises InputError."""
+    """Raise InputError unless the compiled model is as declared; MuJoCo may change it silently."""
+    # All sites of actuators, all joints and the camera are on bus or its children.
     bus = model.body("bus").id
     mass = tree_mass(model)
     for prefix in (prefix for kind in KINDS for prefix in kind.sites):
@@ -273,6 +292,7 @@ def check_compiled(model: Any, declared: MassProperties, path: Path) -> None:
         raise InputError(path, "a joint outside body bus", "joints of bus and its children")
     if model.body_rootid[model.cam_bodyid[model.camera(CAMERA).id]] != bus:
         raise InputError(path, f"camera {CAMERA} must be on body bus or its children")
+    # Mass, center and inertia.
     matches = (
         abs(mass.mass_kg - declared.mass_kg) < 1e-9 * declared.mass_kg
         and np.abs(mass.center_m - declared.center_m).max() < 1e-9
@@ -288,8 +308,9 @@ def check_compiled(model: Any, declared: MassProperties, path: Path) -> None:
 
 
 def camera_mount(vehicle: VehicleModel) -> Mount:
-    """Position and attitude of the camera on the body. The only place where MuJoCo's camera axes are
-    converted to ours.
+    """Position and attitude of the camera on the body.
+
+    Only this function converts MuJoCo's camera axes to skysim's.
     """
     data = mujoco.MjData(vehicle.model)
     mujoco.mj_forward(vehicle.model, data)  # at qpos0 the body frame is the lab frame
@@ -299,7 +320,7 @@ def camera_mount(vehicle: VehicleModel) -> Mount:
 
 
 def imu_position_m(vehicle: VehicleModel) -> Floats:
-    """(3,) position of the accelerometers on the body: site `imu`, else the bearing's center."""
+    """(3,) position of the accelerometers in body axes: site `imu`, or the bearing's center if there is none."""
     if IMU not in [vehicle.model.site(k).name for k in range(vehicle.model.nsite)]:
         return np.zeros(3)
     data = mujoco.MjData(vehicle.model)

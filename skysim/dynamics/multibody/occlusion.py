@@ -1,7 +1,11 @@
-"""Occlusion of sources by the vehicle and the lab: MuJoCo's ray casting.
+"""Occlusion of sources by the vehicle and the lab, by MuJoCo's ray casting.
 
-Sources and pupil are points: a source is visible or not, at the pose of mid-exposure. Wheels and gimbals are as at
-the start.
+1. `build_obstacles` compiles the vehicle once, with its attitude free to set, and finds the geoms of the camera's
+   housing, which let light through.
+2. `occluded` sets the attitude and casts a ray from the pupil to each source.
+
+Sources and pupil are points: a source is visible or not, at the pose of mid-exposure. Wheels and gimbals keep their
+initial angles.
 """
 
 from __future__ import annotations
@@ -24,23 +28,22 @@ from skysim.dynamics.multibody.mass import CAMERA
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel, camera_mount, place_camera, put_at_origin
 
-# groups of geoms: those that block light, and the camera's own housing
+# Groups of geoms: those that block light, and the camera's own housing. Rays are tested against the first only.
 OPAQUE = 0
 TRANSPARENT = 5
-GROUPS = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)  # rays are tested against the first only
+GROUPS = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
 class Obstacles:
-    """Everything that can hide a source; the vehicle's attitude can be set.
+    """The geoms that can hide a source, on a vehicle whose attitude can be set.
 
     Attributes
     ----------
     model, data
-        MuJoCo model and data of their own, not the simulated ones; body bus is set as a mocap
-        body
+        MuJoCo model and data, separate from the simulated ones; body bus is a mocap body
     camera_body_m
-        (3,) the pupil, where all rays end
+        (3,) position of the pupil, where all rays begin, in body axes
     """
 
     model: Any
@@ -49,25 +52,30 @@ class Obstacles:
 
 
 def build_obstacles(vehicle: VehicleModel, mount: Mount | None = None) -> Obstacles:
-    """Compile the vehicle's file again with separate bodies: the simulated model has all rigid ones fused into bus.
+    """The obstacles of a vehicle for its main camera, or for a further camera with the given mount.
 
-    The camera's housing lets light through: all geoms of the body that carries the camera, if it is not bus, and any
-    geom that surrounds the pupil, since the camera then looks out through a hole in it. A further camera, whose
-    `mount` is given, has no housing of its own, and that of the main one is in its way like all else. MuJoCo's rays
-    ignore geoms with an alpha of 0.
+    1. Compile the vehicle's file again with separate bodies, since the simulated model has all rigid bodies fused
+       into bus.
+    2. The camera's housing lets light through: all geoms of the body that carries the camera, if it is not bus, and
+       any geom that surrounds the pupil, since the camera then looks out through a hole in it. A further camera has
+       no housing of its own, and the housing of the main camera blocks its light.
+
+    MuJoCo's rays ignore geoms with an alpha of 0.
     """
+    # 1. Model with the initial angles of wheels and gimbals.
     path = SCENES / vehicle.config.model
     with mujoco_warnings():
         spec = load(path)
         spec.compiler.fusestatic = False
         bus = put_at_origin(spec, path)
         place_camera(spec, vehicle.config)
-        bus.mocap = True  # its pose is set, not simulated
+        bus.mocap = True  # the pose of a mocap body is set, not simulated
         lock_unused(spec, vehicle.config, path)
         model = compile_spec(spec, path)
     data = mujoco.MjData(model)
     set_start(vehicle.config, model, data)
     mujoco.mj_kinematics(model, data)
+    # 2. Housing.
     camera_body_m = (mount or camera_mount(vehicle)).camera_body_m
     housing = camera_housing(model, data, camera_body_m, is_main=mount is None)
     model.geom_group[:] = np.where(housing, TRANSPARENT, OPAQUE)
@@ -77,25 +85,30 @@ def build_obstacles(vehicle: VehicleModel, mount: Mount | None = None) -> Obstac
 def camera_housing(
     model: Any, data: Any, camera_body_m: Floats, is_main: bool
 ) -> NDArray[np.bool_]:
-    """(ngeom,) which geoms belong to the camera's housing. Overwrites the geoms' groups."""
+    """(ngeom,) whether each geom belongs to the camera's housing. Overwrites the geoms' groups."""
     body = model.cam_bodyid[model.camera(CAMERA).id]
     is_housing = (model.geom_bodyid == body) & (body != model.body("bus").id) & is_main
+    # A geom surrounds the pupil if rays in six directions meet it, with all other geoms transparent.
     six_directions = np.vstack([np.eye(3), -np.eye(3)])
     for geom in np.flatnonzero(~is_housing):
-        model.geom_group[:], model.geom_group[geom] = TRANSPARENT, OPAQUE
-        is_housing[geom] = np.isfinite(
-            free_distance_m(model, data, camera_body_m, six_directions)
-        ).all()
+        model.geom_group[:] = TRANSPARENT
+        model.geom_group[geom] = OPAQUE
+        distance_m = free_distance_m(model, data, camera_body_m, six_directions)
+        is_housing[geom] = np.isfinite(distance_m).all()
     return np.asarray(is_housing)
 
 
 def occluded(obstacles: Obstacles, lab_from_body: Rotation, place: Floats) -> NDArray[np.bool_]:
-    """(N,) whether a part of the vehicle or the lab is on the line from the pupil to each LED or star at that attitude.
+    """(N,) whether a part of the vehicle or the lab is between the pupil and each LED or star.
 
     Parameters
     ----------
+    obstacles
+        Geoms that block light
+    lab_from_body
+        Attitude of the vehicle
     place
-        (N, 4), as in `Sources`
+        (N, 4) places as in `Sources`: positions of LEDs in the lab in m and 1, or directions of stars and 0
     """
     lab_from_body_wxyz = quaternion.from_rotation(lab_from_body)
     camera_m = quaternion.apply(lab_from_body_wxyz, obstacles.camera_body_m)
@@ -107,7 +120,7 @@ def occluded(obstacles: Obstacles, lab_from_body: Rotation, place: Floats) -> ND
 
 @jit
 def _rays(place: Floats, camera_m: Floats) -> tuple[Floats, Floats]:
-    """(N, 3) unit vectors from the pupil to sources, and (N,) where these rays end: in m, infinity for stars."""
+    """(N, 3) unit vectors from the pupil to the sources, and (N,) the sources' distances in m, infinite for stars."""
     rays = np.empty((len(place), 3))
     end_m = np.empty(len(place))
     for n in range(len(place)):
@@ -123,7 +136,7 @@ def _rays(place: Floats, camera_m: Floats) -> tuple[Floats, Floats]:
 
 
 def free_distance_m(model: Any, data: Any, from_m: Floats, rays: Floats) -> Floats:
-    """(N,) distance from a point of the lab along unit vectors (N, 3) to the next geom that blocks; inf if none."""
+    """(N,) distance in m from a point of the lab along unit vectors (N, 3) to the next opaque geom; inf if none."""
     count = len(rays)
     geom = np.empty(count, np.int32)
     distance_m = np.empty(count)

@@ -1,4 +1,4 @@
-"""Render pictures of the laboratory by MuJoCo without a screen, and animations of them."""
+"""Pictures and animations of the laboratory, which MuJoCo renders without a screen."""
 
 from __future__ import annotations
 
@@ -25,31 +25,34 @@ from skysim.dynamics.multibody.mjcf import mujoco_warnings, one_line
 
 Picture = NDArray[np.uint8]
 
-LAB_CAMERA = "lab"  # the MJCF's camera that sees everything
-# width, height
+LAB_CAMERA = "lab"  # camera of the MJCF that sees the whole laboratory
+# Width and height.
 PICTURE_PX = (960, 720)
 FILM_PX = (480, 360)
 NO_OPENGL = (
     "no picture of the lab: {why}; MuJoCo draws with OpenGL by EGL: apt-get install libegl1 libgl1-mesa-dri"
     " (or libosmesa6, and MUJOCO_GL=osmesa)"
 )
-ANIMATED = {  # browser formats, with encoder options for less than 20 kB per frame of FILM_PX
+# Formats that browsers show, with encoder options for less than 20 kB per frame of FILM_PX.
+ANIMATED = {
     ".gif": [cv2.IMWRITE_GIF_DITHER, 3],
     ".webp": [cv2.IMWRITE_WEBP_QUALITY, 75],
 }
 
 
 class NoPicture(RuntimeError):
-    """Rendering is not possible here; the message is one line and says what to install."""
+    """Rendering is not possible on this machine; the message is one line and says what to install."""
 
 
 def picture(mjcf: str, qpos: Floats, size_px: tuple[int, int] = PICTURE_PX) -> Picture:
-    """(H, W, 3) RGB: the laboratory from its camera `lab`, in the state qpos (nq,). Raises NoPicture.
+    """(H, W, 3) RGB picture of the laboratory from its camera `lab`. Raises NoPicture.
 
     Parameters
     ----------
     mjcf
-        From `mjcf_export.mjcf`
+        Text from `mjcf_export.mjcf`
+    qpos
+        (nq,) joint positions
     size_px
         Width and height, at most `mjcf_export.MAX_PX`
     """
@@ -57,10 +60,10 @@ def picture(mjcf: str, qpos: Floats, size_px: tuple[int, int] = PICTURE_PX) -> P
 
 
 def film(mjcf: str, qpos: Floats, size_px: tuple[int, int] = FILM_PX) -> Iterator[Picture]:
-    """As `picture`, for each row of qpos (N, nq), yielded as they are rendered.
+    """Yield a `picture` for each row of qpos (N, nq), as it is rendered.
 
-    Rendering runs in its own process: MuJoCo chooses its OpenGL when first imported, by MUJOCO_GL (here EGL by
-    default), and a graphics driver may crash the whole process.
+    Rendering runs in its own process. MuJoCo chooses its OpenGL when it is first imported, by MUJOCO_GL (here EGL
+    by default), and a graphics driver may crash the whole process.
     """
     width, height = size_px
     with tempfile.TemporaryFile() as task, tempfile.TemporaryFile() as errors:
@@ -86,13 +89,23 @@ def film(mjcf: str, qpos: Floats, size_px: tuple[int, int] = FILM_PX) -> Iterato
 
 
 def write_film(pictures: Iterable[Picture], path: Path, fps: float) -> None:
-    """Write RGB pictures as .gif, or as .webp, which is a quarter as large. Raises InputError for other types;
-    OSError.
+    """Write RGB pictures as .gif, or as .webp, which is a quarter as large.
 
     Parameters
     ----------
+    pictures
+        (H, W, 3) RGB pictures
+    path
+        File to write
     fps
-        Pictures a second; a GIF counts in hundredths of a second, and browsers show 50 at most
+        Pictures per second; a GIF counts in hundredths of a second, and browsers show 50 at most
+
+    Raises
+    ------
+    InputError
+        For another type of file.
+    OSError
+        If the file cannot be written.
     """
     if path.suffix not in ANIMATED:
         raise InputError(path, *unknown_name("animation format", path.suffix, ANIMATED))
@@ -107,7 +120,7 @@ def write_film(pictures: Iterable[Picture], path: Path, fps: float) -> None:
 
 
 def failure_reason(code: int, errors: IO[bytes]) -> str:
-    """The last line that the rendering process wrote to standard error, or how it ended."""
+    """The last line that the rendering process wrote to standard error, or its signal or exit code."""
     errors.seek(0)
     lines = errors.read().decode(errors="replace").strip().splitlines()
     if code < 0:
@@ -116,13 +129,13 @@ def failure_reason(code: int, errors: IO[bytes]) -> str:
 
 
 def render_task() -> None:
-    """The rendering process: task as npz on stdin, raw pictures on stdout, errors on stderr."""
+    """Main function of the rendering process: task as npz on stdin, raw pictures on stdout, errors on stderr."""
     with os.fdopen(os.dup(1), "wb") as out:
-        os.dup2(2, 1)  # a driver's output must not reach the pictures
+        os.dup2(2, 1)  # output of a driver to stdout must not reach the pictures
         with np.load(io.BytesIO(sys.stdin.buffer.read())) as task, mujoco_warnings():
             text = str(task["mjcf"])
             states = task["qpos"]
-            (width, height) = task["size_px"].tolist()
+            width, height = task["size_px"].tolist()
             model = mujoco.MjModel.from_xml_string(text)
             data = mujoco.MjData(model)
             with mujoco.Renderer(model, height, width) as renderer:

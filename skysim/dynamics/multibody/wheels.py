@@ -1,11 +1,12 @@
 """Reaction wheels: hinge joints `wheel_*`.
 
-Here and in the other kinds every vector is in body axes and a set's n members are the columns of (3, n). A torque T is
-on the body; the stored momentum h changes by its opposite, dh/dt = -T. Stored momentum also acts on a rotating body,
-with -rate x h; the actuators do not compensate this: the controller adds +rate x h to its command.
+Conventions of all kinds of actuators: every vector is in body axes, and the n members of a set are the columns of
+(3, n). A torque T acts on the body and changes the stored momentum h by its opposite, dh/dt = -T. On a rotating body
+the stored momentum also exerts -rate x h. The actuators do not compensate this; the controller adds +rate x h to its
+command.
 
-The inertia that responds to the torque is that of the body without its rotors' inertia about their axles, which do
-not follow the body about these: J - sum inertia axle axle^T.
+Rotors do not follow the body's rotation about their axles, so the inertia that responds to a torque is
+J - sum inertia axle axle^T.
 """
 
 from __future__ import annotations
@@ -37,30 +38,32 @@ WHEEL = "wheel_"
 
 @dataclass(frozen=True, slots=True)
 class WheelSet:
-    """Reaction wheels: a motor's torque on its wheel acts oppositely on the body, T = -sum axis u.
+    """A set of n reaction wheels. A motor torque u on a wheel acts oppositely on the body: T = -sum axis u.
 
     Attributes
     ----------
     axes
-        (3, n) unit vectors; a positive speed is right-handed about them
+        (3, n) unit vectors in body axes; a positive speed is right-handed about them
     inertia_kg_m2
-        (n,) of each wheel about its axle
+        (n,) inertia of each wheel about its axle
+    torque_limit_nm
+        Greatest motor torque
     speed_limit_rad_s
-        Relative to the body
+        Greatest speed relative to the body
+    motor_from_torque
+        (n, 3) minus the pseudo-inverse of the axes
 
     Raises
     ------
     InputError
-        (one line) for axes that are not unit vectors and inertias that are not positive.
+        If axes are not unit vectors, or inertias are not positive.
     """
 
     axes: Floats
     inertia_kg_m2: Floats
     torque_limit_nm: float
     speed_limit_rad_s: float
-    motor_from_torque: Floats = field(
-        init=False, repr=False
-    )  # (n, 3) minus the pseudo-inverse of the axes
+    motor_from_torque: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         axes = unit_columns(self.axes, "wheel axes")
@@ -70,20 +73,21 @@ class WheelSet:
         object.__setattr__(self, "motor_from_torque", -np.linalg.pinv(axes, rcond=RANK_TOLERANCE))
 
     def momentum(self, speed_rad_s: Floats) -> Floats:
-        """Angular momentum (3,) that the wheels (n,) hold relative to the body: sum axis inertia speed."""
+        """Angular momentum (3,) of wheels at speeds (n,) relative to the body: h = sum axis inertia speed."""
         return self.axes @ (self.inertia_kg_m2 * speed_rad_s)
 
     def drive(self, torque_nm: Floats, speed_rad_s: Floats, period_s: float) -> Floats:
         """Motor torques (n,) on the wheels that give torque_nm (3,) on the body for the next period_s.
 
-        The smallest ones that do; if the axes do not span space (n < 3, or all in a plane), those nearest in
-        least squares.
-        Beyond the torque limit all are scaled together, which keeps the direction. A torque that would carry a wheel
-        beyond its speed limit is then reduced to what just reaches it (I d(speed)/dt = u, without the body's own
-        acceleration): a wheel at its limit can only be braked, and the direction is not kept.
+        1. The smallest torques that give it, u = -axes^+ T; if the axes do not span space (n < 3, or all in a plane),
+           the nearest in least squares.
+        2. One factor scales them to the torque limit, which keeps the direction of T.
+        3. Clip each to the torque that just reaches the speed limit within the period, by inertia d(speed)/dt = u
+           without the body's own acceleration. A wheel at its limit can only be braked. This may change the direction.
         """
-        # Scaling keeps the torque's direction; the clip to the speed limits afterwards may change it.
+        # 1. and 2. Minimum norm, torque limit.
         motor = scale_to_limit(self.motor_from_torque @ torque_nm, self.torque_limit_nm)
+        # 3. Speed limit.
         torque_per_speed = self.inertia_kg_m2 / period_s
         upper = np.maximum(torque_per_speed * (self.speed_limit_rad_s - speed_rad_s), 0.0)
         lower = np.minimum(-torque_per_speed * (self.speed_limit_rad_s + speed_rad_s), 0.0)
@@ -91,7 +95,7 @@ class WheelSet:
 
 
 class WheelActuator:
-    """Reaction wheels as the flight computer commands them, see `WheelSet`."""
+    """Actuators of the flight computer: reaction wheels, see `WheelSet`."""
 
     def __init__(self, model: Any, config: WheelsConfig) -> None:
         self.joints = hinges = Hinges.from_model(model, WHEEL)
@@ -113,7 +117,7 @@ class WheelActuator:
 
 
 def add_wheels(spec: Any, _: Any, wheels: WheelsConfig) -> None:
-    """A motor at each wheel, and its axle's friction; Coulomb friction is MuJoCo's, which holds at rest."""
+    """Add a motor at each wheel, and the friction of its axle; MuJoCo's Coulomb friction also holds a wheel at rest."""
     for joint in joints(spec, WHEEL):
         joint.frictionloss = wheels.coulomb_nm
         joint.damping = [wheels.viscous_nms, 0.0, 0.0]
@@ -121,7 +125,7 @@ def add_wheels(spec: Any, _: Any, wheels: WheelsConfig) -> None:
 
 
 def start_wheels(model: Any, data: Any, config: WheelsConfig) -> None:
-    """Set the wheels' speeds at the start."""
+    """Set the wheel speeds at the start."""
     hinges = Hinges.from_model(model, WHEEL)
     data.qvel[hinges.dof] = (
         member_values(config.start_rpm, len(hinges), "vehicle.wheels.start_rpm") * RPM_RAD_S

@@ -1,8 +1,8 @@
 """Refuse options of a study that have no effect: keys of `set`, `trial` and factors.
 
-A key is refused if it has no effect at any level of any factor, each factor varied alone. The rules of scenes
-(`scene.unused`) hold, and those below for the kinds of trial. `exposure.rate_hz` is always tolerated, because it
-bounds the exposure time.
+A key is refused if it has no effect at any level of any factor, each factor varied alone. The rules are those of scenes
+(`scene.unused`) and, for the kinds of trial, those below. `exposure.rate_hz` is always tolerated, because it bounds the
+exposure time.
 """
 
 from __future__ import annotations
@@ -28,10 +28,8 @@ from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.scene.unused import Rule
 from skysim.tracking import factory
 
-STREAK_ALGORITHMS = (
-    "default",
-    "streak",
-)  # detectors and centroiders that use the streak measured by a gyro
+# Detectors and centroiders that use the streak measured by a gyro.
+STREAK_ALGORITHMS = ("default", "streak")
 DYNAMICS = (
     "motion",
     "filter",
@@ -50,7 +48,7 @@ DYNAMICS = (
 
 
 def on_ground(scene: Scene, trial: Trial) -> bool:
-    """Whether what a trial sees depends on the site."""
+    """Whether the view of a trial depends on the site."""
     near = getattr(trial, "near", None)
     return unused.seen_from_ground(scene) or (near is not None and near.body == "zenith")
 
@@ -102,11 +100,12 @@ def tracks(scene: Scene) -> bool:
 
 
 def in_dome(scene: Scene, trial: Trial) -> bool:
+    """Whether the light is an LED dome."""
     return isinstance(scene.light, DomeConfig)
 
 
 def merges_stars(scene: Scene) -> bool:
-    """Whether an LED's size decides which stars share an LED."""
+    """Whether the size of an LED decides which stars share an LED."""
     layout = getattr(scene.light, "layout", None)
     points = layout.points if isinstance(layout, OnPoints) else layout
     return isinstance(points, CelestialConfig)
@@ -224,10 +223,14 @@ class CheckedPoint(NamedTuple):
 
     Attributes
     ----------
+    factor, level
+        The factor and its level
     own
         Settings of that factor alone
     settings
-        Of all factors
+        Settings of all factors
+    scene, trial
+        Scene and trial with these settings
     """
 
     factor: str
@@ -239,7 +242,7 @@ class CheckedPoint(NamedTuple):
 
 
 class Fault(NamedTuple):
-    """A key that has no effect, the rule that says so, and the point where it was found."""
+    """A key that has no effect, its rule, and the point at which it was found."""
 
     key: str
     rule: Rule
@@ -250,25 +253,31 @@ Resolve = Callable[[Settings], tuple[Scene, Trial]]
 
 
 def check(plan: Plan, points: Iterable[CheckedPoint], resolve: Resolve) -> None:
-    """Raise InputError, which begins with a key of the study, for an option that has no effect.
+    """Raise InputError for an option that has no effect; its key is one of the study.
+
+    1. Find the keys that have no effect at any point: of `set` and `trial`, and of each factor's levels.
+    2. Refuse a key of `set` or `trial`.
+    3. Refuse a key of a level, unless it has an effect at some level of another factor.
 
     Parameters
     ----------
+    plan
+        The study
     points
-        Every level of every factor, the other factors at their middle
+        Every level of every factor, with the other factors at their middle
     resolve
-        Makes the scene and the trial from the settings of all factors
+        Function from the settings of all factors to the scene and the trial
     """
+    # 1. Faults by factor and level ("" for `set` and `trial`), and key; None for a key with an effect.
     written = [*plan.spec.base, *(f"{TRIAL}{key}" for key in plan.spec.trial if key != "kind")]
-    faults: dict[
-        tuple[str, str, str], Fault | None
-    ] = {}  # by factor and level ("" for `set` and `trial`), and key
+    faults: dict[tuple[str, str, str], Fault | None] = {}
     for point in points:
         keys = [("", "", key) for key in written if key not in point.settings]
         keys += [(point.factor, repr(point.level), key) for key in point.own]
         for where in keys:
-            if faults.get(where, point) is not None:  # None: it has an effect at an earlier point
+            if faults.get(where, point) is not None:
                 faults[where] = find(where[2], plan, point)
+    # 2. and 3. Refusals.
     for (name, level, key), fault in faults.items():
         if fault is None:
             continue
@@ -280,23 +289,17 @@ def check(plan: Plan, points: Iterable[CheckedPoint], resolve: Resolve) -> None:
 
 
 def unused_overrides(overrides: Mapping[str, str], scene: Scene, trial: Trial) -> set[str]:
-    """The overrides of a scene that have no effect on a trial.
-
-    Parameters
-    ----------
-    scene
-        With the overrides
-    """
-    keys = {key: unused.override_keys({key: text}) for key, text in overrides.items()}
-    return {
-        key
-        for key, below in keys.items()
-        if all(unused.find(RULES, [one], scene, scene, trial) for one in below)
-    }
+    """The overrides that have no effect on a trial of the resulting scene."""
+    useless = set()
+    for key, text in overrides.items():
+        below = unused.override_keys({key: text})
+        if all(unused.find(RULES, [one], scene, scene, trial) for one in below):
+            useless.add(key)
+    return useless
 
 
 def find(key: str, plan: Plan, point: CheckedPoint) -> Fault | None:
-    """The first key, of those that a key of the study sets at a point, that has no effect."""
+    """The fault of the first key without effect among those that a key of the study sets at a point."""
     scene = point.scene
     trial = point.trial
     if key.startswith(TRIAL):
@@ -315,11 +318,9 @@ def has_effect_elsewhere(plan: Plan, point: CheckedPoint, key: str, resolve: Res
     middle = {name: factor.value_at(0.5) for name, factor in others.items()}
     for name, factor in others.items():
         for option in factor.options():
-            everything = make_point(middle | {name: option}).settings | point.own
-            scene, trial = resolve(everything)
-            if (
-                find(key, plan, point._replace(settings=everything, scene=scene, trial=trial))
-                is None
-            ):
+            settings = make_point(middle | {name: option}).settings | point.own
+            scene, trial = resolve(settings)
+            varied = point._replace(settings=settings, scene=scene, trial=trial)
+            if find(key, plan, varied) is None:
                 return True
     return False

@@ -1,4 +1,4 @@
-"""Schema of the scene section `camera`: lens, chip and electronics as the hardware is."""
+"""Schema of the scene section `camera`: the true hardware of lens, detector and electronics."""
 
 from __future__ import annotations
 
@@ -31,9 +31,8 @@ from skysim.core.units import (
 )
 from skysim.scene.opencv_calibration import OpencvCalibration
 
-FocusText = Annotated[
-    str, Field(description='a length such as "33 in", or infinity')
-]  # shown by editors, from the JSON schema
+# Type in the JSON schema, which editors show.
+FocusText = Annotated[str, Field(description='a length such as "33 in", or infinity')]
 
 Electrons = Annotated[Number, Field(ge=0, le=1e9)]
 
@@ -44,9 +43,9 @@ Tangential = Annotated[Number, Field(ge=-0.1, le=0.1)]  # a larger value would f
 
 def focus_distance(value: Any) -> float:
     """A length in m; infinity for the word infinity."""
-    return (
-        math.inf if value == "infinity" else quantity("m", "length", '"33 in", or infinity')(value)
-    )
+    if value == "infinity":
+        return math.inf
+    return quantity("m", "length", '"33 in", or infinity')(value)
 
 
 class PsfConfig(ConfigModel):
@@ -55,8 +54,8 @@ class PsfConfig(ConfigModel):
     Attributes
     ----------
     corner_sigma_px
-        Standard deviation at the farthest corner of the chip, proportional to the field radius,
-        added in quadrature (field curvature and coma, to first order)
+        Standard deviation at the farthest corner of the detector, proportional to the field radius and added in
+        quadrature (field curvature and coma, to first order)
     """
 
     corner_sigma_px: Annotated[Number, Field(ge=0, le=20)] = 0.0
@@ -108,7 +107,7 @@ Psf = Annotated[
 
 
 class TwoStopsConfig(ConfigModel):
-    """Mechanical vignetting by two equal round stops, one behind the other; zero transmission at cutoff_deg."""
+    """Mechanical vignetting by two equal round stops in a row, with zero transmission at cutoff_deg."""
 
     kind: Literal["two_stops"]
     cutoff_deg: Annotated[Number, Field(gt=0, lt=90)]
@@ -128,16 +127,17 @@ class VignettingTableConfig(ConfigModel):
 
 
 class ChromaticConfig(ConfigModel):
-    """Chromatic aberration: where light of other wavelengths is imaged, linear between them, constant beyond them.
+    """Chromatic aberration by wavelength, linear between the wavelengths and constant beyond them.
 
     Attributes
     ----------
+    wavelength
+        Ascending wavelengths of the columns
     focus
-        Axial color: the image distance minus that of the lens's focal length, for a light at
-        infinity
+        Axial color: image distance minus that of the lens's focal length, for a light at infinity
     corner_px
-        Lateral color: shift away from the principal point at the farthest corner of the chip,
-        proportional to the distance from it
+        Lateral color: shift away from the principal point at the farthest corner of the detector, proportional to the
+        distance from the principal point
     """
 
     wavelength_m: Annotated[
@@ -165,17 +165,17 @@ class ChromaticConfig(ConfigModel):
 
 
 class GhostConfig(ConfigModel):
-    """A ghost of every light: light that a pair of the lens's surfaces reflects back to the chip.
+    """A ghost of every light: light that a pair of the lens's surfaces reflects back to the detector.
 
     Attributes
     ----------
     magnification
-        Its distance from the principal point over the image's, on the other side of it; below 0
-        on the same
+        Distance of the ghost from the principal point over that of the image, on the other side of it; negative on the
+        same side
     share
-        Its light over the image's: the product of the two reflectances
+        Light of the ghost over that of the image: the product of the two reflectances
     radius_px
-        Of the disk over which it is spread, out of focus
+        Radius of the disk over which it is spread, out of focus
     """
 
     magnification: Annotated[Number, Field(ge=-20, le=20)]
@@ -193,14 +193,16 @@ class GhostConfig(ConfigModel):
 
 
 class GlareConfig(ConfigModel):
-    """Veiling glare: light scattered over the chip, (1 + (r / core_px)^2)^(-exponent / 2) at the distance r.
+    """Veiling glare: light scattered over the detector, proportional to (1 + (r / core_px)^2)^(-exponent / 2).
 
     Attributes
     ----------
     share
-        Of all light
+        Scattered fraction of all light
+    exponent
+        Exponent of the power law at distances r far above core_px
     core_px
-        Where the law of the power begins
+        Distance r at which the power law begins
     """
 
     share: Annotated[Fraction, Field(gt=0, lt=1)]
@@ -209,14 +211,13 @@ class GlareConfig(ConfigModel):
 
 
 class BaffleConfig(ConfigModel):
-    """Point source transmittance (PST) of baffle and lens, by which bodies outside the field light the chip.
+    """Point source transmittance (PST) of baffle and lens for the light of bodies outside the field.
 
     Attributes
     ----------
     angle_deg, pst
-        Irradiance on the chip over irradiance before the lens, against the angle from the
-        boresight. Its logarithm is linear between the rows; beyond them it is constant. A curve
-        of `transmission` counts in addition
+        Irradiance on the detector over irradiance before the lens, by the angle from the boresight. Its logarithm is
+        linear between the rows and constant beyond them. A curve of `transmission` is a further factor
     """
 
     angle_deg: Ascending
@@ -244,14 +245,14 @@ class RollingShutterConfig(ConfigModel):
 
 
 class FrameTransferConfig(ConfigModel):
-    """Charge is shifted, still exposed, into a covered store, row_time per row: a pixel collects along its column."""
+    """Exposed charge is shifted into a covered store, row_time per row, so a pixel collects along its column."""
 
     kind: Literal["frame_transfer"]
     row_time_s: Annotated[Time, Field(gt=0)]
 
 
 class InterlineConfig(ConfigModel):
-    """The covered register leaks: it collects the fraction `leak` of each passed row's light, row_time per row."""
+    """The covered register is not opaque: it collects the fraction `leak` of the light of each row that it passes."""
 
     kind: Literal["interline"]
     row_time_s: Annotated[Time, Field(gt=0)]
@@ -270,13 +271,11 @@ class ParticlesConfig(ConfigModel):
     Attributes
     ----------
     per_cm2_s
-        Crossings per square centimeter of the chip and second, from all sides: half of the
-        omnidirectional flux
+        Crossings per square centimeter of the detector and second, from all sides: half of the omnidirectional flux
     depth_m
         Thickness of the sensitive layer
     electrons_um
-        Most probable charge per micrometer of track (about 80 for a fast singly charged
-        particle)
+        Most probable charge per micrometer of track (about 80 for a fast singly charged particle)
     diffusion_px
         Standard deviation of the charge cloud
     """
@@ -293,9 +292,9 @@ class EfficiencyConfig(ConfigModel):
     Attributes
     ----------
     curve
-        In data/qe, or a file
+        Name in data/qe, or a file
     peak
-        Electrons per photon at its highest point
+        Electrons per photon at the highest point of the curve
     """
 
     curve: str
@@ -309,7 +308,7 @@ class EfficiencyConfig(ConfigModel):
 
 
 def efficiency_tag(value: Any) -> str:
-    """Tag of the kind of quantum efficiency, so that an error names its keys only where it is a section."""
+    """Tag of the kind of quantum efficiency; an error then names the keys of the section only if there is one."""
     if isinstance(value, dict | EfficiencyConfig):
         return "EfficiencyConfig"
     return "name" if isinstance(value, str) else "number"
@@ -324,11 +323,12 @@ Efficiency = Annotated[
 
 
 def transmission_tag(value: Any) -> str:
-    """Tag of the kind of transmission: a text that ends in .csv is a curve, all else a number."""
+    """Tag of the kind of transmission: a text that ends in .csv is a curve, any other value a number."""
     return "curve" if isinstance(value, str) and value.endswith(".csv") else "number"
 
 
 def curve_exists(value: str) -> str:
+    """The path of a curve. Raises InputError if there is no such file."""
     if not Path(value).is_file():
         raise InputError(
             "", f"no file {value!r}", "a CSV file of wavelength_nm and response, or a number to 1"
@@ -344,38 +344,42 @@ Transmission = Annotated[
 
 
 class DetectorConfig(ConfigModel):
-    """The chip and its electronics, in the order of the signal path. Each effect's parameter can switch it off.
+    """The detector and its electronics, in the order of the signal path. A parameter can switch off each effect.
 
     Attributes
     ----------
     quantum_efficiency
-        One number for 400-1000 nm, the name of a curve in data/qe (or a file), or a curve with
-        its peak: {curve: cmos, peak: 0.6}
+        One number for 400-1000 nm, the name of a curve in data/qe (or a file), or a curve with its peak:
+        {curve: cmos, peak: 0.6}
     hardware_seed
-        This chip's fixed pattern: PRNU, DSNU, hot pixels, column offsets
+        Seed of the fixed pattern: PRNU, DSNU, hot pixels, column offsets
     prnu
         Standard deviation of the pixels' relative sensitivity
     dark_e_s
         Mean dark current at dark_temperature_c; it doubles every dark_doubling_c
+    temperature_c
+        Temperature of the detector; dark_temperature_c if left out
     dsnu
         Standard deviation of the pixels' relative dark current
     hot_pixels
-        Fraction of hot pixels, whose dark current is exponentially distributed with mean
-        hot_e_s
+        Fraction of hot pixels, whose dark current is exponentially distributed with the mean hot_e_s
+    particles
+        Ionizing particles of several kinds
     blooming
-        Column: charge beyond a full well flows along its column; anti_blooming: the drained
-        fraction
+        `column`: charge beyond a full well flows along its column; `none`: it is lost
+    anti_blooming
+        Fraction of the charge beyond a full well that is drained
     cti_parallel, cti_serial
-        Fraction of the charge left behind in each transfer
+        Fraction of the charge that each transfer leaves behind
     read_noise_e, reset_noise_e
-        Gaussian, every pixel, every frame
+        Standard deviations of Gaussian noise, drawn for every pixel and frame
     column_offset_e
-        Standard deviation of the columns' fixed offsets
+        Standard deviation of the fixed offsets of the columns
     nonlinearity
-        Fraction of the signal missing at full well: e (1 - nonlinearity e / full_well)
+        Fraction of the signal that is missing at full well: e (1 - nonlinearity e / full_well)
     noise
-        False gives the expected value, not rounded: with fixed pattern and transfer loss, but
-        without particles, full-well limit, nonlinearity and converter range
+        False gives the expected value, not rounded, with fixed pattern and transfer loss, but without particles,
+        full-well limit, nonlinearity and converter range
     """
 
     quantum_efficiency: Efficiency
@@ -424,11 +428,10 @@ class DetectorConfig(ConfigModel):
 
     @property
     def doublings(self) -> float:
-        """How many times the dark current doubles from dark_temperature_c to the chip's temperature."""
-        difference_c = (
-            0.0 if self.temperature_c is None else self.temperature_c - self.dark_temperature_c
-        )
-        return difference_c / self.dark_doubling_c
+        """Number of times that the dark current doubles from dark_temperature_c to temperature_c."""
+        if self.temperature_c is None:
+            return 0.0
+        return (self.temperature_c - self.dark_temperature_c) / self.dark_doubling_c
 
     @model_validator(mode="after")
     def check_offset(self) -> DetectorConfig:
@@ -440,17 +443,17 @@ class DetectorConfig(ConfigModel):
 
 
 class CameraConfig(ConfigModel):
-    """Lens and chip as the hardware is. What the tracker assumes about them is in `tracker`.
+    """The true lens and detector. The section `tracker` has the assumptions of the tracker.
 
     Attributes
     ----------
     transmission
-        Of the lens: one number for all wavelengths, or a CSV file of wavelength_nm and
-        transmission, 0 beyond its ends
+        Transmission of the lens: one number for all wavelengths, or a CSV file of wavelength_nm and transmission, which
+        is 0 beyond its ends
     ghosts, glare
-        Stray light of what is in the field
+        Stray light of lights in the field
     baffle
-        Stray light of the bodies and of the Earth, where they are at the time; none if left out
+        Stray light of the bodies and of the Earth at their present places; none if left out
     """
 
     width_px: Annotated[int, Field(ge=16, le=20000)]
@@ -491,22 +494,22 @@ class CameraConfig(ConfigModel):
 
     @property
     def gray_transmission(self) -> float:
-        """Transmission of the lens at all wavelengths; 1 where it has a curve, which is in the band (`Band`)."""
+        """Transmission of the lens at all wavelengths; 1 if it has a curve, which is part of the band (`Band`)."""
         return 1.0 if isinstance(self.transmission, str) else self.transmission
 
     @property
     def image_distance_m(self) -> float:
-        """Distance from lens to chip, by the thin lens: 1/v = 1/f - 1/u. The focal length if focused at infinity."""
+        """Distance v from lens to detector, by the thin lens: 1/v = 1/f - 1/u; f if focused at infinity."""
         return 1 / (1 / self.focal_length_m - 1 / self.focus_m)
 
     @property
     def focal_px(self) -> float:
-        """Image distance in pixels: pixels per unit tangent, the focal length of a star tracker."""
+        """Image distance in pixels, which is the focal length of a star tracker: pixels per unit tangent."""
         return self.image_distance_m / self.pixel_m
 
     @property
     def center_px(self) -> tuple[float, float]:
-        """The principal point; the chip's center by default."""
+        """The principal point; by default the center of the detector."""
         return self.principal_point_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
 
     def calibration(self) -> OpencvCalibration:
@@ -517,11 +520,11 @@ class CameraConfig(ConfigModel):
 
     @property
     def corner_px(self) -> float:
-        """Distance from the principal point to the farthest corner of the chip."""
+        """Distance from the principal point to the farthest corner of the detector."""
         x, y = self.center_px
-        return math.hypot(
-            max(x + 0.5, self.width_px - 0.5 - x), max(y + 0.5, self.height_px - 0.5 - y)
-        )
+        far_x = max(x + 0.5, self.width_px - 0.5 - x)
+        far_y = max(y + 0.5, self.height_px - 0.5 - y)
+        return math.hypot(far_x, far_y)
 
 
 CURVE_FOLDER = DATA / "qe"

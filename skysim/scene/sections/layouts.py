@@ -1,4 +1,4 @@
-"""Schema of the layouts of a dome's LEDs: where they are, and how bright each is."""
+"""Schema of the layouts of a dome's LEDs: positions and brightness."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skysim.core.errors import InputError
 from skysim.core.tolerance import LengthError, NumberError
 from skysim.core.units import ConfigModel, Length, Number
 
-HOLES = 9  # of a patch board: 3x3
+HOLES = 9  # holes of a patch board, 3x3
 Level = Annotated[Number, Field(gt=0, le=1)]
 Levels = Annotated[tuple[Level, ...], Field(min_length=1)]
 Magnitudes = Annotated[tuple[Annotated[Number, Field(ge=-30, le=30)], ...], Field(min_length=1)]
@@ -25,9 +25,8 @@ FieldOfView = Annotated[Number, Field(ge=1, le=90)]
 
 def relative_levels(magnitudes: Sequence[float]) -> tuple[float, ...]:
     """Levels by Pogson's law, 10^(-0.4 m), relative to the brightest of the list, which has level 1."""
-    return tuple(
-        10.0 ** (-0.4 * (float(magnitude) - float(min(magnitudes)))) for magnitude in magnitudes
-    )
+    brightest = float(min(magnitudes))
+    return tuple(10.0 ** (-0.4 * (float(magnitude) - brightest)) for magnitude in magnitudes)
 
 
 class BoardConfig(ConfigModel):
@@ -36,13 +35,13 @@ class BoardConfig(ConfigModel):
     Attributes
     ----------
     azimuth_deg, tilt_deg
-        From the lab's +x toward +y, and from the zenith
+        Angles of the direction from the lab's +x toward +y, and from the zenith
     rotation_deg
         Rotation of its columns about its normal
     leds
-        The holes that hold an LED, 0 to 8, row by row
+        Holes with an LED, 0 to 8, row by row
     levels
-        One per LED, full brightness if left out
+        Brightness of each LED; full brightness if left out
     """
 
     azimuth_deg: Number
@@ -66,19 +65,21 @@ class PatchBoardsConfig(ConfigModel):
     Attributes
     ----------
     cap_deg
-        Angle from the zenith, seen from the bearing, to which the dome carries LEDs; so for
-        every layout
+        Greatest angle of LEDs from the zenith, seen from the bearing; the same in every layout
     spacing, lit, pwm_levels
-        Of boards that are spread; `boards` replaces them
+        Distance of the boards, least and greatest number of LEDs on a board, and their levels, which are drawn;
+        `boards` replaces all three
+    pitch
+        Distance of the holes of a board
     spread
-        Spiral: as evenly as possible; grid: rows and columns along the lab's x and y, seen from
-        above. The number of boards on a spiral is that of a dome with the apex's height in all
-        directions
+        `spiral`: as evenly as possible, with the number of boards on a dome that has the height of the apex in all
+        directions; `grid`: rows and columns along the lab's x and y, seen from above
+    boards
+        Boards by list
     glue_scatter
-        Standard deviation of an LED's place along each axis of its board, or its tolerance
+        Standard deviation of an LED's position along each axis of its board, or its tolerance
     glue_tilt_deg
-        Greatest angle between a board's normal and the surface's; normals are uniform over that
-        cap
+        Greatest angle between the normals of a board and of the surface; normals are uniform over this cap
     """
 
     kind: Literal["patch_boards"]
@@ -117,14 +118,14 @@ class PatchBoardsConfig(ConfigModel):
 class DimmedConfig(ConfigModel):
     """Base of the layouts of single LEDs: their brightness, as fractions of full brightness or as magnitudes.
 
-    Each LED's brightness is drawn from the list (in `listed`, the list has one value per LED). The smallest magnitude
-    is full brightness.
+    The brightness of each LED is drawn from the list (in `listed`, the list has one value for each LED). The smallest
+    magnitude is full brightness.
 
     Attributes
     ----------
     unique_neighbors
-        The levels are drawn so that each LED with so many nearest ones looks different from all
-        others, however the field is turned
+        Number of nearest neighbors with which the levels of each LED form a pattern that is unique under rotation;
+        levels are drawn independently if left out
     """
 
     cap_deg: Cap
@@ -152,14 +153,14 @@ class DimmedConfig(ConfigModel):
 
 
 class FibonacciConfig(DimmedConfig):
-    """`count` LEDs on a Fibonacci spiral: as evenly as possible."""
+    """`count` LEDs on a Fibonacci spiral, as evenly as possible."""
 
     kind: Literal["fibonacci"]
     count: Count
 
 
 class PoissonDiskConfig(DimmedConfig):
-    """LEDs at random with a least spacing: as many as fit at `spacing`, or `count` of them as far apart as they fit."""
+    """LEDs at random with a least spacing: as many as fit at `spacing`, or `count` LEDs as far apart as possible."""
 
     kind: Literal["poisson_disk"]
     spacing_m: Annotated[Length, Field(gt=0)] | None = None
@@ -173,17 +174,17 @@ class PoissonDiskConfig(DimmedConfig):
 
 
 class RandomPlacesConfig(DimmedConfig):
-    """`count` LEDs at independent random places."""
+    """`count` LEDs at independent random positions."""
 
     kind: Literal["random"]
     count: Count
 
 
 class LitConfig(DimmedConfig):
-    """Base of the regular layouts: of their places, drawn by hardware_seed, `lit_fraction` carry an LED that is lit.
+    """Base of the regular layouts: the fraction `lit_fraction` of their positions, drawn by hardware_seed, has an LED.
 
-    All fields of a regular layout look alike, so that a tracker without other information cannot tell them apart
-    unless LEDs are left out or differ in brightness. An LED keeps its number among all places.
+    All fields of a regular layout look alike, so a tracker without other information cannot distinguish them unless
+    LEDs are left out or differ in brightness. An LED keeps its number among all positions.
     """
 
     lit_fraction: Annotated[Number, Field(gt=0, le=1)] = 1.0
@@ -195,13 +196,12 @@ class GeodesicConfig(LitConfig):
     Attributes
     ----------
     frequency
-        Parts into which an edge of the icosahedron is divided (class I), or twice the parts
-        into which half of a face's height is divided (class II: even)
+        Number of parts of an edge of the icosahedron (class I), or twice the number of parts of half of a face's height
+        (class II; even)
     class
-        I: lines of the division parallel to the icosahedron's edges; II: perpendicular to them
+        `I`: lines of the division parallel to the edges of the icosahedron; `II`: perpendicular to them
     rotation_deg
-        About the zenith; at 0 one of the five edges from the zenith's vertex runs along the
-        lab's x
+        Rotation about the zenith; at 0 one of the five edges from the vertex at the zenith is along the lab's x
     """
 
     kind: Literal["geodesic"]
@@ -222,19 +222,17 @@ class StringConfig(LitConfig):
     Attributes
     ----------
     winding
-        Latitude: circles at equal angles from the zenith, each cut where it closes, the first
-        half a spacing from the apex; spiral: one tape from the apex to the rim; meridian:
-        straight strips down to the rim, each from where it has half a spacing to its neighbors
+        `latitude`: circles at equal angles from the zenith, each cut where it closes, the first half a spacing from the
+        apex; `spiral`: one tape from the apex to the rim; `meridian`: straight strips down to the rim, each beginning
+        where its neighbors are half a spacing away
     pitch
-        From one LED of the tape to the next, along the surface
+        Distance of successive LEDs of the tape, along the surface
     spacing
-        Between two circles or turns, along the surface, in the mean of all azimuths; greatest
-        one of two strips
+        Distance of two circles or turns along the surface, in the mean of all azimuths; greatest distance of two strips
     pitch_error
         Relative standard deviation of a tape's pitch, or its tolerance
     glue_scatter
-        Standard deviation of a tape's place sideways, or its tolerance; it wanders over GLUE_M
-        of tape
+        Standard deviation of the sideways position of a tape, or its tolerance; it varies over GLUE_M of tape
     """
 
     kind: Literal["string"]
@@ -246,24 +244,23 @@ class StringConfig(LitConfig):
 
 
 class OptimizedConfig(DimmedConfig):
-    """`count` LEDs placed for one camera's best accuracy at its worst attitudes: tilts to tilt_deg, any yaw.
+    """`count` LEDs placed for the best accuracy of a camera at its worst attitudes: tilts to tilt_deg, any yaw.
 
     Attributes
     ----------
     field_deg
-        The camera's field of view along body x and y; the scene's camera's if left out, its
-        rows along x
+        Field of view of the camera along body x and y; that of the scene's camera if left out, with its rows along x
     camera
-        Its entrance pupil on the body, `vehicle.camera` if left out; it looks along body z
+        Entrance pupil of the camera on the body, which looks along body z; `vehicle.camera` if left out
     spacing
         Least distance between two LEDs
     coincidence
-        LEDs of two fields coincide if they are closer than this when one field is laid on the
-        other: a few times the survey's error
+        Distance below which LEDs of two fields coincide when one field is laid on the other: a few times the error of
+        the survey
     min_leds
-        LEDs that every field should hold; fewer are penalized
+        Number of LEDs that every field should have; fewer are penalized
     rounds
-        How often each LED is offered another position
+        Number of times that another position is tried for each LED
     """
 
     kind: Literal["optimized"]
@@ -278,25 +275,25 @@ class OptimizedConfig(DimmedConfig):
 
 
 class CelestialConfig(ConfigModel):
-    """The real sky: an LED for each of the brightest stars, where the camera at its nominal position sees it.
-
-    count or limit_mag : number of LEDs for the brightest stars on the dome, or all stars to this V
+    """The real sky: an LED for each of the brightest stars, at the direction seen from the camera's nominal position.
 
     Attributes
     ----------
+    catalog
+        Name in data/catalogs, or a file
+    count, limit_mag
+        Number of LEDs for the brightest stars on the dome, or the V magnitude to which all stars have an LED
+    brightness
+        `band`: each LED is as bright as the camera measures the star, since the LED has another color; `v`: by its V
+    brightest_mag
+        Magnitude of full brightness; brighter stars are limited to it. That of the brightest star if left out
     camera
-        The entrance pupil in the lab when the vehicle is level
+        Entrance pupil in the lab when the vehicle is level
     zenith_ra_deg, zenith_dec_deg, roll_deg
-        The direction at the zenith, and the position angle there of the lab's -y (a level
-        camera's up), as `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
+        Direction at the zenith, and position angle there of the lab's -y (up for a level camera), like `ra_deg`,
+        `dec_deg`, `roll_deg` of a camera that looks up
     epoch
         Time of the apparent places, UTC
-    brightness
-        Band: each LED is as bright as the chip measures its star, whose color the LED lacks; v:
-        as its V
-    brightest_mag
-        No star is shown brighter than this, which is full brightness; the brightest star's if
-        left out
     """
 
     kind: Literal["celestial"]
@@ -323,16 +320,17 @@ class CelestialConfig(ConfigModel):
 
 
 class ListedConfig(DimmedConfig):
-    """LEDs by list: places in the lab, or directions from the bearing onto the surface, or a CSV file of either.
+    """LEDs by list: positions in the lab, or directions from the bearing onto the surface, or a CSV file of either.
 
     Attributes
     ----------
+    positions
+        Positions in the lab
     directions_deg
         Azimuth from +x toward +y, and tilt from the zenith
     file
-        Columns x_m, y_m, z_m or azimuth_deg, tilt_deg; optionally level or magnitude, and id,
-        the LEDs' numbers. `skysim scenes export --out leds.csv` and `skysim survey` write such
-        files
+        File with columns x_m, y_m, z_m or azimuth_deg, tilt_deg; optionally level or magnitude, and id, the numbers of
+        the LEDs. `skysim scenes export --out leds.csv` and `skysim survey` write such files
     """
 
     kind: Literal["listed"]
@@ -378,13 +376,13 @@ class AimingConfig(ConfigModel):
     Attributes
     ----------
     laser
-        Where its axes meet, in the lab
+        Intersection of its axes, in the lab
     pointing_sigma_arcsec
-        Of its line about two axes across it, or its tolerance; of each hole
+        Standard deviation of its direction about two axes across it, or its tolerance; drawn for each hole
     orientation_sigma_arcsec
-        Of the mount about each axis of the lab, or its tolerance; common to all holes
+        Standard deviation of the mount's attitude about each axis of the lab, or its tolerance; common to all holes
     drill_sigma
-        Of a hole off its mark, along two axes in the surface, or its tolerance; of each hole
+        Standard deviation of a hole from its mark along two axes in the surface, or its tolerance; drawn for each hole
     """
 
     laser_m: tuple[Length, Length, Length]
@@ -398,13 +396,14 @@ class FibersConfig(ConfigModel):
 
     Attributes
     ----------
+    points
+        Layout of the fibers
     radius_variation
-        Greatest error of the dome's radius at a fiber, as a fraction of the distance from the
-        bearing, uniformly distributed: the end is displaced along the surface's normal, inward
-        or outward
+        Greatest error of the dome's radius at a fiber as a fraction of the distance from the bearing, uniformly
+        distributed: the end is displaced along the normal of the surface, inward or outward
     aiming
-        A laser that marked the places, with its errors; the shell's error is then along its
-        line. The places are as designed, but for the shell's error, if left out
+        Laser that marked the positions, with its errors; the error of the shell is then along its direction. If left
+        out, the positions are those of the design, except for the error of the shell
     """
 
     kind: Literal["fibers"]
@@ -427,25 +426,25 @@ class FibersConfig(ConfigModel):
 
     @property
     def cap_deg(self) -> float:
-        """Angle from the zenith to which there are points."""
+        """Greatest angle of points from the zenith."""
         return self.points.cap_deg
 
 
 class PixelsConfig(ConfigModel):
-    """A display's grid and gray levels, common to an LCD panel, a projector and a collimated micro-display.
+    """Grid and gray levels of a display, common to an LCD panel, a projector and a collimated micro-display.
 
     Attributes
     ----------
     pixels
-        Columns and rows
+        Numbers of columns and rows
     pitch
-        From one pixel to the next, along both
+        Distance of neighboring pixels in both directions
     block
-        A star is drawn as a square of this many pixels a side, all of one gray
+        Side, in pixels, of the square of one gray that shows a star
     gray_levels, gamma
         Gray g = 0, 1, ... transmits (g / (gray_levels - 1))^gamma of white
     contrast
-        White over black, which glows all over the display; none: black is dark
+        White over black, which glows over the whole display; without it black is dark
     """
 
     pixels: tuple[Annotated[int, Field(ge=1, le=20_000)], Annotated[int, Field(ge=1, le=20_000)]]
@@ -469,8 +468,8 @@ class PixelsConfig(ConfigModel):
 class LcdConfig(PixelsConfig):
     """A flat LCD panel (the Naval Postgraduate School's screen): any layout of single LEDs, drawn on its pixels.
 
-    It is centered on the flat surface and ends where its pixels end, with columns along the surface's own x and rows
-    along its y, which a level camera sees as right and down. `led` is one white pixel while its backlight is lit; its
+    It is centered on the flat surface and ends at its outer pixels. Its columns are along the surface's own x and its
+    rows along y, which a level camera sees as right and down. `led` is one white pixel while its backlight is lit; its
     disk_diameter is that of a disk of the pixel's area.
     """
 
@@ -486,27 +485,30 @@ class LcdConfig(PixelsConfig):
 class ProjectorConfig(PixelsConfig):
     """A projector in the dome that shows any layout of single LEDs on the matt inside, each on the nearest pixels.
 
-    `led` is the light of one white pixel on the axis as the wall sends it back: intensity along the wall's normal
-    (share / pi of the pixel's lumens, in candela), lobe of the wall; disk_diameter is the blur of lens and paint. The
-    beam is not hidden by the vehicle.
+    `led` is the light of one white pixel on the axis after reflection by the wall: the intensity along the normal of
+    the wall (share / pi of the pixel's lumens, in candela), and the lobe of the wall; disk_diameter is the blur of lens
+    and paint. The vehicle does not hide the beam.
 
     Attributes
     ----------
+    points
+        Layout that is shown
     position, aim
-        The lens's entrance pupil, and the point of the lab on its axis
+        Entrance pupil of the lens, and a point on its axis, in the lab
     rotation_deg
-        Of the picture about the axis; at 0 its rows run along the lab's +x as far as the axis
-        lets them
-    pitch, focal_length, f_number
-        Of the chip's pixels and of the lens
+        Rotation of the picture about the axis; at 0 its rows are along the lab's +x, projected across the axis
+    pitch
+        Distance of the pixels on the projector's chip
+    focal_length, f_number
+        Focal length and f-number of the lens
     focus
-        Distance along the axis at which it is sharp; that of `aim` if left out
+        Distance along the axis at which the picture is sharp; that of `aim` if left out
     distortion
-        K of the lens: a direction at the tangent t from the axis is at f t (1 + k t^2) on the
-        chip. The picture is drawn for it
+        Coefficient k of the lens: a direction at the tangent t from the axis is at f t (1 + k t^2) on the chip. The
+        picture is corrected for it
     falloff
-        A pixel's light falls as cos^falloff of its angle from the axis; 4 is a lens's natural
-        vignetting
+        Exponent of the cosine of a pixel's angle from the axis, by which its light decreases; 4 is the natural
+        vignetting of a lens
     """
 
     kind: Literal["projector"]
@@ -539,7 +541,7 @@ class ProjectorConfig(PixelsConfig):
         return self
 
 
-OnPoints = FibersConfig | LcdConfig | ProjectorConfig  # layouts that show another layout's points
+OnPoints = FibersConfig | LcdConfig | ProjectorConfig  # layouts that show the points of another one
 
 Layout = Annotated[
     PatchBoardsConfig

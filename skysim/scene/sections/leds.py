@@ -50,7 +50,7 @@ Lobe = Annotated[CosineLobeConfig | LobeTableConfig, Field(discriminator="kind")
 
 
 class DirectConfig(ConfigModel):
-    """Direct current: always lit, the level scales the strength."""
+    """Direct current: the LEDs are always lit, and the level scales their strength."""
 
     kind: Literal["direct"]
 
@@ -61,10 +61,9 @@ class LowPassConfig(ConfigModel):
     Attributes
     ----------
     time_constant
-        R C
+        Time constant R C
     error
-        Relative standard deviation of R C from LED to LED, or its tolerance (both parts'
-        together)
+        Relative standard deviation of R C from LED to LED, or its tolerance (of both parts together)
     """
 
     time_constant_s: Annotated[Time, Field(gt=0)]
@@ -72,12 +71,12 @@ class LowPassConfig(ConfigModel):
 
 
 class PwmConfig(ConfigModel):
-    """Hardware PWM: lit for its level of every led.pwm_period, each LED with a random phase.
+    """Hardware PWM: an LED is lit for the fraction `level` of every led.pwm_period, with a random phase.
 
     Attributes
     ----------
     filter
-        Turns the pulses into nearly steady light; none if left out
+        Filter that makes the light nearly steady; none if left out
     """
 
     kind: Literal["pwm"] = "pwm"
@@ -85,13 +84,15 @@ class PwmConfig(ConfigModel):
 
 
 class SequentialConfig(ConfigModel):
-    """An Arduino's software PWM: its LEDs in sequence, each lit for its level of its slot.
+    """Software PWM of an Arduino: its LEDs are lit in sequence, each for the fraction `level` of its slot.
 
     Attributes
     ----------
+    slot
+        Duration of a slot
     controller
-        `board`: one per patch board; `dome`: one for all; or how many LEDs, by number, share
-        one
+        `board`: one controller for each patch board; `dome`: one for all; or the number of LEDs that share one, in the
+        order of their numbers
     """
 
     kind: Literal["sequential"]
@@ -100,8 +101,11 @@ class SequentialConfig(ConfigModel):
 
 
 class RefreshConfig(ConfigModel):
-    """A display that is lit for `duty` of every frame: a panel's rows one after another from the top, over the course
-    of a frame; a projector's pixels at once (a color wheel: the share of a turn with the color, or its shutter)."""
+    """A display that is lit for the fraction `duty` of every frame.
+
+    The rows of a panel are lit one after another from the top in the course of a frame. The pixels of a projector are
+    lit together; duty is then the share of the color on its color wheel, or that of its shutter.
+    """
 
     kind: Literal["refresh"]
     rate_hz: Annotated[Number, Field(gt=0)]
@@ -119,10 +123,9 @@ class ClockConfig(ConfigModel):
     Attributes
     ----------
     offset_ppm
-        Standard deviation of their frequency offsets, or their tolerance, from the layout's
-        hardware_seed
+        Standard deviation of their frequency offsets, or its tolerance; drawn by the layout's hardware_seed
     drift_ppm_h
-        Standard deviation of the drift of the frequency per hour, from the scene's seed
+        Standard deviation of the frequency drift per hour, or its tolerance; drawn by the scene's seed
     """
 
     offset_ppm: Annotated[NumberError, Field(le=10_000)] = 50.0
@@ -130,20 +133,19 @@ class ClockConfig(ConfigModel):
 
 
 class CodeConfig(ConfigModel):
-    """A name for each LED in time: its light changes between levels by a word, over and over.
+    """A code that identifies each LED over time: its light repeats a word of levels.
 
-    The words are given by LED number, in order. A failed bit shows another level.
+    Words are assigned in the order of the LED numbers. A failed bit shows another level.
 
     Attributes
     ----------
     depth
-        Part of its light that an LED lacks at its lowest level; 1 is on and off
+        Fraction of its light that an LED loses at its lowest level; 1 is on and off
     bit_time
-        Of one bit, by a clock of the dome's own (`clock`) that runs freely; `frame`: the
-        camera's trigger advances the code, one bit a frame
+        Duration of a bit by the dome's own free-running clock (`clock`); `frame`: the camera's trigger advances the
+        code by one bit a frame
     dropout
-        Probability that an LED's bit fails, independent of all others; drawn from the scene's
-        seed
+        Probability that a bit of an LED fails, independently of all others; drawn by the scene's seed
     """
 
     depth: Annotated[Number, Field(gt=0, le=1)] = 0.5
@@ -157,7 +159,7 @@ class TriggeredCodeConfig(CodeConfig):
     Attributes
     ----------
     levels
-        Of light, equally spaced in magnitude; 4 show two bits a frame and 8 show three
+        Number of levels of light, equally spaced in magnitude; 4 show two bits a frame and 8 show three
     """
 
     levels: Literal[2, 4, 8] = 2
@@ -179,24 +181,23 @@ class PlainCodeConfig(TriggeredCodeConfig):
     Attributes
     ----------
     kind
-        Gray: numbers, distance 1; hamming: extended and shortened, distance 4; gold: all
-        sequences and shifts, distance 12 of 31 bits; de_bruijn: one sequence that moves along
-        the LEDs, in which any few successive LEDs and any few successive frames of an LED are
-        unique: the data of a shift register
+        `gray`: numbers, distance 1; `hamming`: extended and shortened, distance 4; `gold`: all sequences and shifts,
+        distance 12 of 31 bits; `de_bruijn`: one sequence that moves along the LEDs like the data of a shift register,
+        in which a few successive LEDs, or a few successive frames of one LED, are unique
     """
 
     kind: Literal["gray", "hamming", "gold", "de_bruijn"]
 
 
 class BchCodeConfig(TriggeredCodeConfig):
-    """The shortest BCH code for the LEDs with a designed distance."""
+    """The shortest BCH code with enough words for the LEDs and this designed distance."""
 
     kind: Literal["bch"]
     distance: Literal[3, 5, 7, 11] = 5
 
 
 class CyclicCodeConfig(CodeConfig):
-    """Words of a cyclic BCH code that differ at all shifts: they are read without knowing where a word begins."""
+    """Words of a cyclic BCH code that differ at all shifts, so they can be read without knowing where a word begins."""
 
     kind: Literal["cyclic"]
     distance: Literal[3, 5, 7, 11] = 7
@@ -206,18 +207,17 @@ Code = Annotated[PlainCodeConfig | BchCodeConfig | CyclicCodeConfig, Field(discr
 
 
 class AgingConfig(ConfigModel):
-    """Light lost over the hours of operation: each LED has exp(-a hours) of its light left, a = ln(1 / 0.7) / life
-    (IES TM-21).
+    """Loss of light over the hours of operation: exp(-a hours) is left, a = ln(1 / 0.7) / life_hours (IES TM-21).
 
     Attributes
     ----------
     hours
-        Of operation so far
+        Hours of operation so far
     life_hours
         L70 of the data sheet, after which 70 % of the light is left
     scatter
-        Of a from LED to LED: standard deviation of its logarithm, or its tolerance as a
-        fraction; from the layout's hardware_seed
+        Standard deviation of ln a from LED to LED, or the tolerance of a as a fraction; drawn by the layout's
+        hardware_seed
     """
 
     hours: Annotated[Number, Field(gt=0, le=1e6)]
@@ -233,16 +233,17 @@ class AgingConfig(ConfigModel):
 
 
 class WarmUpConfig(ConfigModel):
-    """Light lost while the LEDs warm up from the scene's start, when they are switched on.
+    """Loss of light while the LEDs warm up from the scene's start, when they are switched on.
 
-    steady + (1 - steady) exp(-t / time) is left of the light of cold LEDs, which is that of a pulsed data sheet.
+    The fraction steady + (1 - steady) exp(-t / time) is left of the light of cold LEDs, for which data sheets state
+    pulsed values.
 
     Attributes
     ----------
     steady
-        Share that is left when they are warm
+        Fraction that is left when they are warm
     time
-        In which 63 % of the loss are reached
+        Time after which 63 % of the loss is reached
     """
 
     steady: Annotated[Number, Field(gt=0, lt=1)]
@@ -262,17 +263,15 @@ def spectrum_file(spectrum: str) -> Path:
 
 
 def spectrum_exists(spectrum: str) -> str:
+    """The name of a spectrum. Raises InputError if it has no file."""
     spectrum_file(spectrum)
     return spectrum
 
 
 def spectrum_tag(value: Any) -> str:
-    """Tag of the kind of spectrum: white or a text that ends in .csv is measured, all else a wavelength."""
-    return (
-        "measured"
-        if isinstance(value, str) and (value == "white" or value.endswith(".csv"))
-        else "wavelength"
-    )
+    """Tag of the kind of spectrum: white, or a text that ends in .csv, is measured; any other value is a wavelength."""
+    measured = isinstance(value, str) and (value == "white" or value.endswith(".csv"))
+    return "measured" if measured else "wavelength"
 
 
 Wavelength = Annotated[
@@ -288,31 +287,34 @@ LedSpectrum = Annotated[
 
 
 class LedConfig(ConfigModel):
-    """The one LED type of the dome: intensity along its normal, in candela or in watts per steradian.
+    """The LED type of the dome, which all LEDs share.
 
     Attributes
     ----------
+    intensity, radiant_intensity
+        Intensity along its normal in candela, or in watts per steradian
+    disk_diameter
+        Diameter of the emitting disk
     spectrum
-        White (data/led/white.csv) or a CSV file of wavelength_nm and relative power, or the
-        peak wavelength of a colored LED
+        `white` (data/led/white.csv), a CSV file of wavelength_nm and relative power, or the peak wavelength of a
+        colored LED
     fwhm
-        Width of a colored LED's spectrum at half maximum, a Gaussian in power; a narrow line if
-        left out
+        Full width at half maximum of a colored LED's spectrum, a Gaussian in power; a narrow line if left out
     color_scatter
-        Of the peak wavelength from LED to LED, at the same intensity: standard deviation or
-        tolerance (a bin); from the layout's hardware_seed
+        Standard deviation of the peak wavelength from LED to LED at the same intensity, or its tolerance (a bin); drawn
+        by the layout's hardware_seed
     scatter
-        Of the intensity from LED to LED: standard deviation of its logarithm, or its tolerance
-        as a fraction (a bin of ±10 %: {tolerance: 0.1})
+        Standard deviation of the logarithm of the intensity from LED to LED, or the tolerance of the intensity as a
+        fraction (a bin of ±10 %: {tolerance: 0.1})
     aging, warm_up
-        How much light is left of it
+        Loss of light by operation and by warm-up
     drive
-        How its level is made; pwm_period belongs to the kind pwm
+        Generation of its level; pwm_period belongs to the kind pwm
     clock
-        The oscillators that time the pulses; every run starts with phases of its own
+        Oscillators that time the pulses; every run has its own phases at the start
     code
-        Of the light over frames, by which the tracker knows an LED (`tracker.decoder`); steady
-        if left out
+        Code of the light over the frames, from which the tracker identifies an LED (`tracker.decoder`); steady light if
+        left out
     """
 
     intensity_cd: Annotated[Intensity, Field(gt=0)] | None = None

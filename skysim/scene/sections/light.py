@@ -1,4 +1,10 @@
-"""Schema of the scene sections `light` and `background`: a dome with its LEDs, stars or a star simulator, and glow."""
+"""Schema of the scene sections `light`, `background` and `lights`.
+
+The light is a dome with its LEDs, stars, or a star simulator; the background is glow. The section `lights` has further
+lights, of kinds that modules or installed packages add. Such a kind is a class derived from `LightConfig` with a
+literal `kind`, which `simulation.lights.registry.register` adds with its function. A package offers it by an entry
+point of the group `skysim.lights` with the name of the kind, which names the module that registers it.
+"""
 
 from __future__ import annotations
 
@@ -34,26 +40,25 @@ from skysim.scene.sections.layouts import Layout, PixelsConfig
 from skysim.scene.sections.leds import LedConfig
 from skysim.scene.sections.surroundings import AirConfig, SatellitesConfig
 
-SKY = "gaia_v8.0"  # as faint as any camera of a shipped scene detects
+SKY = "gaia_v8.0"  # its faintest stars are as faint as any camera of a shipped scene detects
 Tilt = Annotated[Number, Field(ge=-45, le=45)]
 
 
 class SurfaceConfig(ConfigModel):
     """The inside of the dome, in the lab frame (meters, bearing center at the origin): keys common to all kinds.
 
-    Sizes, apex and rim are the dome's before it is displaced, its axis upright through the bearing's center.
+    Sizes, apex and rim are those of the dome before its displacement, with its axis upright through the bearing's
+    center.
 
     Attributes
     ----------
     offset
-        The whole dome's displacement
+        Displacement of the whole dome
     tilt_deg
-        About the lab's x, then about its y, through the surface's own center (the origin of
-        surveyed points)
+        Rotation about the lab's x, then about its y, through the surface's own center (the origin of surveyed points)
     error
-        Standard deviation of the lab's survey of it, along the normal, or a tolerance: one draw
-        for the whole surface, because errors of single points average out; drawn by
-        `tracker.survey.seed`
+        Standard deviation of its survey along the normal, or a tolerance. There is one draw for the whole surface, by
+        `tracker.survey.seed`, because errors of single points average out
     """
 
     kind: Literal["sphere", "ellipsoid", "flat", "cylinder", "surveyed"]
@@ -76,7 +81,7 @@ class SurfaceConfig(ConfigModel):
 
 
 class RimmedConfig(SurfaceConfig):
-    """A surface with a rim: at a height above the bearing, or at an angle from its axis seen from the bearing."""
+    """A surface with a rim at a height above the bearing, or at an angle from its axis seen from the bearing."""
 
     rim_height_m: Length | None = None
     rim_deg: Annotated[Number, Field(gt=0, lt=180)] | None = None
@@ -98,9 +103,9 @@ class WallConfig(ConfigModel):
     Attributes
     ----------
     base_deg
-        The angle of thickness_base, beyond which the thickness is constant
+        Angle of thickness_base, beyond which the thickness is constant
     radius_of
-        The face that is a sphere: the outside, or the middle of the wall
+        Face that is a sphere: the outside, or the middle of the wall
     """
 
     thickness_apex_m: Annotated[Length, Field(gt=0)]
@@ -145,7 +150,7 @@ class FlatSurfaceConfig(SurfaceConfig):
 
 
 class CylinderSurfaceConfig(SurfaceConfig):
-    """A vault along the lab's x or y, or a drum about z; its highest point is at apex, its ends half a length away."""
+    """A vault along the lab's x or y, or a drum about z, with its highest point at apex; length is its whole length."""
 
     kind: Literal["cylinder"]
     axis: Literal["x", "y", "z"]
@@ -171,9 +176,11 @@ class SurveyedSurfaceConfig(RimmedConfig):
     Attributes
     ----------
     file
-        Comments (#), a line of names, then lines of x, y, z in `unit`, z up
+        File of comments (#), a line of names, then lines of x, y, z in `unit`, z up
+    degree
+        Degree of the polynomials
     rms_limit
-        Of the points' distances from the smooth surface
+        Greatest rms distance of the points from the smooth surface
     """
 
     kind: Literal["surveyed"]
@@ -200,7 +207,7 @@ SURFACE_CONFIGS: dict[Any, type[SurfaceConfig]] = {
 
 
 def check_surface_kind(value: Any) -> Any:
-    """The value; an unknown kind raises an error at the key `kind`, with the allowed kinds."""
+    """The value. Raises an error at the key `kind`, with the allowed kinds, for an unknown kind."""
     if isinstance(value, dict) and "kind" in value and value["kind"] not in list(SURFACE_CONFIGS):
         SurfaceConfig.model_validate({"kind": value["kind"]})
     return value
@@ -218,26 +225,26 @@ AnySurface = Annotated[
 
 
 class RoomConfig(ConfigModel):
-    """The room in which the dome is to be built; a dome that does not fit is refused. Limits left out are not checked.
+    """The room for the dome; a dome that does not fit is refused. Limits that are left out are not checked.
 
-    The shell is the surface within its rim or its width and height, else up to the layout's cap_deg, and as thick as
-    `thickness` outside of it.
+    The shell is the surface within its rim or its width and height, else up to the layout's cap_deg, with `thickness`
+    outside of it.
 
     Attributes
     ----------
     height
-        Of the ceiling above the floor; the shell's top must be below
+        Height of the ceiling above the floor; the top of the shell must be below it
     bearing_height
-        Of the bearing's center above the floor, where the shell must end
+        Height of the bearing's center above the floor; the shell must end above the floor
     width, length
-        Of the floor along the lab's x and y; the shell must fit between the walls
+        Size of the floor along the lab's x and y; the shell must fit between the walls
     door
-        Width and height of the narrowest opening on the way in. Every part of the shell must go
-        through: two sides of a box around it, turned as fits best, must be within the door's
+        Width and height of the narrowest opening on the way in. Every part of the shell must pass: two sides of the
+        smallest box around it must fit
     segments
-        Equal parts, cut along planes through the vertical, in which the shell is carried in
+        Number of equal parts, cut along planes through the vertical, in which the shell is carried in
     thickness
-        Of the shell with its ribs
+        Thickness of the shell with its ribs
     """
 
     height_m: Annotated[Length, Field(gt=0)] | None = None
@@ -265,11 +272,11 @@ class FloorConfig(ConfigModel):
     Attributes
     ----------
     share
-        Of the light that it scatters
+        Fraction of the light that it scatters
     depth
-        Below the bearing's center
+        Depth below the bearing's center
     radius
-        The wall should not be between it and the LEDs: up to that of the rim
+        Radius, at most that of the rim, so that the wall is not between it and the LEDs
     """
 
     share: Annotated[Fraction, Field(gt=0, lt=1)]
@@ -283,14 +290,14 @@ class ReflectionConfig(ConfigModel):
     Attributes
     ----------
     diffuse
-        Share of the light on the wall that it scatters by Lambert's law: a glow
+        Fraction of the light on the wall that it scatters by Lambert's law, which makes a glow
     specular
-        Share that it mirrors, at any angle: images of the LEDs
+        Fraction that it mirrors at any angle, which makes images of the LEDs
     refractive_index
-        Of a polished wall, which mirrors by Fresnel's equations for unpolarized light; in place
-        of specular. Acrylic has 1.49
+        Refractive index of a polished wall, which mirrors by Fresnel's equations for unpolarized light, instead of
+        specular; 1.49 for acrylic
     floor
-        Black if left out
+        Floor that scatters light; black if left out
     """
 
     diffuse: Annotated[Fraction, Field(lt=1)] = 0.0
@@ -328,11 +335,11 @@ class DomeConfig(ConfigModel):
     Attributes
     ----------
     occlusion
-        Whether the vehicle's parts and the dome's own wall hide LEDs
+        Whether parts of the vehicle and the wall of the dome hide LEDs
     reflection
-        Of wall and floor; black if left out
+        Reflection of wall and floor; black if left out
     room
-        Limits of the room in which it is to be built; unlimited if left out
+        Limits of the room for the dome; unlimited if left out
     """
 
     kind: Literal["dome"]
@@ -345,10 +352,8 @@ class DomeConfig(ConfigModel):
 
     @model_validator(mode="after")
     def check_controller(self) -> DomeConfig:
-        if (
-            getattr(self.led.drive, "controller", None) == "board"
-            and self.layout.kind != "patch_boards"
-        ):
+        controller = getattr(self.led.drive, "controller", None)
+        if controller == "board" and self.layout.kind != "patch_boards":
             raise InputError(
                 "led.drive.controller",
                 f"{self.layout.kind} has no boards",
@@ -378,13 +383,12 @@ class DomeConfig(ConfigModel):
 
 
 class BodiesConfig(ConfigModel):
-    """Bodies of the solar system at the scene's time, seen from `site` if it has a longitude, else from the Earth's
-    center.
+    """Bodies of the solar system at the scene's time, from `site` if it has a longitude, else from the Earth's center.
 
     Attributes
     ----------
     planets
-        Mercury, Venus, Mars, Jupiter, Saturn, Uranus, Neptune
+        Whether to show Mercury, Venus, Mars, Jupiter, Saturn, Uranus and Neptune
     """
 
     sun: bool = True
@@ -404,20 +408,20 @@ class StarsConfig(ConfigModel):
     Attributes
     ----------
     catalog
-        A name in data/catalogs, or a file of `skysim catalog build`; the tracker has its own
+        Name in data/catalogs, or a file of `skysim catalog build`; the tracker has its own catalog
     limit_mag
-        Faintest V; all stars of the catalog if left out
+        Faintest V magnitude; all stars of the catalog if left out
     variability_seed
-        Of the magnitudes of variable stars at the scene's time, which scatter as Hipparcos saw
-        them; means if left out
+        Seed of the magnitudes of variable stars at the scene's time, with the scatter that Hipparcos measured; mean
+        magnitudes if left out
     bodies
         Sun, Moon and planets; none if left out
     satellites
         Artificial satellites; none if left out
     air
-        The atmosphere over `site`, which needs a longitude; none if left out
+        Atmosphere over `site`, which needs a longitude; none if left out
     occlusion
-        Whether the vehicle's parts hide stars
+        Whether parts of the vehicle hide stars
     """
 
     kind: Literal["stars"]
@@ -433,24 +437,23 @@ class StarsConfig(ConfigModel):
 class CollimatedDisplayConfig(PixelsConfig):
     """A star simulator: a micro-display in the focus of a collimator, above the level camera.
 
-    Its axis is the lab's zenith; the display's columns run along the lab's x and its rows along y. The exit pupil
-    covers the lens wherever it moves. The collimator's color and image errors and the display's refresh are
+    Its axis is the lab's zenith; the columns of the display are along the lab's x and its rows along y. The exit pupil
+    covers the lens at every attitude. Color and image errors of the collimator and the refresh of the display are
     neglected.
 
     Attributes
     ----------
     focal_length
-        Of the collimator
+        Focal length of the collimator
     catalog, limit_mag
-        The stars shown, to this V (all if left out), at the scene's start_time
+        Catalog of the stars that are shown at the scene's start_time, and their faintest V (all if left out)
     axis_ra_deg, axis_dec_deg, roll_deg
-        The direction at the display's center, and the position angle there of the lab's -y (a
-        level camera's up), as `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
+        Direction at the center of the display, and position angle there of the lab's -y (up for a level camera), like
+        `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
     brightest_mag
-        V of a white block for the camera, in the Sun's color; brighter stars are limited to it
+        V magnitude of a white block for the camera, in the Sun's color; brighter stars are limited to it
     conjugate
-        Distance of the stars from the bearing's center, from an error of collimation; none:
-        infinite
+        Distance of the stars from the bearing's center, by an error of collimation; infinite if left out
     """
 
     kind: Literal["collimated_display"]
@@ -472,7 +475,7 @@ class UniformGlowConfig(ConfigModel):
 
 
 class SkyGlowConfig(ConfigModel):
-    """The night sky's surface brightness at the boresight, with a relative gradient along the image's axes."""
+    """Surface brightness of the night sky at the boresight, with a relative gradient along the axes of the image."""
 
     kind: Literal["sky"]
     mag_arcsec2: Annotated[Number, Field(ge=0, le=30)]
@@ -480,14 +483,14 @@ class SkyGlowConfig(ConfigModel):
 
 
 class MoonGlowConfig(ConfigModel):
-    """Moonlight scattered by the atmosphere (Krisciunas & Schaefer 1991), the Moon at ra_deg, dec_deg.
+    """Moonlight scattered by the atmosphere (Krisciunas & Schaefer 1991), with the Moon at ra_deg, dec_deg.
 
     Attributes
     ----------
     phase_angle_deg
-        0 at full moon, 90 at the quarters
+        Phase angle: 0 at full moon, 90 at the quarters
     extinction_mag
-        Of the atmosphere at the zenith, in V
+        Extinction of the atmosphere at the zenith, in V
     moon_zenith_deg, field_zenith_deg
         Zenith distances of the Moon and of the boresight
     """
@@ -507,12 +510,11 @@ class StrayLightConfig(ConfigModel):
     Attributes
     ----------
     ra_deg, dec_deg
-        Its direction, in the lab's axes (under the stars those of the ICRS)
+        Direction of the body in the lab's axes (under the stars those of the ICRS)
     v_mag
-        Its V magnitude; the Sun's -26.74 if left out
+        V magnitude of the body; the Sun's -26.74 if left out
     angle_deg, pst
-        Irradiance on the chip over irradiance before the lens, against the angle from the
-        boresight
+        Irradiance on the detector over irradiance before the lens, by the angle from the boresight
     """
 
     kind: Literal["stray"]
@@ -534,7 +536,7 @@ class FaintStarsGlowConfig(ConfigModel):
     Attributes
     ----------
     fainter_than_mag
-        Where the catalog, or its limit_mag, ends
+        Faintest magnitude of the catalog, or its limit_mag
     """
 
     kind: Literal["faint_stars"]
@@ -550,16 +552,14 @@ Glow = Annotated[
 Light = DomeConfig | StarsConfig | CollimatedDisplayConfig
 
 
-# Schema of the scene section `lights`: further lights, of kinds that modules or installed packages
-# add.
-
+# The scene section `lights`: further lights.
 
 PLUGINS = PluginKind("light", "skysim.lights", "lights.kind", ())
-CONFIGS: dict[str, type[LightConfig]] = {}  # of the kinds that were added
+CONFIGS: dict[str, type[LightConfig]] = {}  # schemas of the kinds that were added
 
 
 def check_kind(kind: str) -> str:
-    """The name of a kind. Raises InputError for an unknown one, with the known ones."""
+    """The name of a kind of light. Raises InputError, with the known kinds, for an unknown one."""
     if kind not in CONFIGS:
         raise InputError(
             "", *unknown_name("light", kind, sorted({*CONFIGS, *PLUGINS.entry_points()}))
@@ -568,7 +568,7 @@ def check_kind(kind: str) -> str:
 
 
 class LightConfig(ConfigModel):
-    """A further light; each kind has a class derived from this one."""
+    """A further light. Each kind has a class derived from this one."""
 
     model_config = ConfigDict(json_schema_extra={"additionalProperties": True})
 
@@ -582,12 +582,12 @@ class LightConfig(ConfigModel):
         """Validate a section with the class of its `kind` when called on the base class."""
         kind = value.get("kind") if cls is LightConfig and isinstance(value, dict) else None
         if kind not in CONFIGS and kind in PLUGINS.entry_points():
-            PLUGINS.entry_points()[kind].load()  # it registers the kind
+            PLUGINS.entry_points()[kind].load()  # the module registers the kind
         return CONFIGS[kind].model_validate(value) if kind in CONFIGS else handler(value)
 
 
 def add_kind(config: type[LightConfig]) -> str:
-    """Add a kind of light to the schema; returns its name, the literal of its `kind`."""
+    """Add a kind of light to the schema, and return its name, the literal of its `kind`."""
     (kind,) = get_args(config.model_fields["kind"].annotation)
     CONFIGS[kind] = config
     return str(kind)

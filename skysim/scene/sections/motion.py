@@ -36,7 +36,7 @@ class PointingConfig(ConfigModel):
 
 
 def start_tag(value: Any) -> str:
-    """Tag of the kind of start, so that an error in one kind is not reported with the keys of the other."""
+    """Tag of the kind of start; an error in one kind is then not reported with the keys of the other."""
     if isinstance(value, str):
         return "profile"
     keys = value if isinstance(value, dict) else ()
@@ -53,7 +53,7 @@ Start = Annotated[
 
 
 class JitterLineConfig(ConfigModel):
-    """A vibration at one frequency: rms_arcsec about each of the body's axes, random phases."""
+    """A vibration at one frequency: rms_arcsec about each axis of the body, with random phases."""
 
     kind: Literal["line"]
     frequency_hz: Positive
@@ -61,7 +61,7 @@ class JitterLineConfig(ConfigModel):
 
 
 class JitterBandConfig(ConfigModel):
-    """Random vibration between two frequencies, power spectral density proportional to f^slope."""
+    """Random vibration between two frequencies, with a power spectral density proportional to f^slope."""
 
     kind: Literal["band"]
     from_hz: Positive
@@ -94,7 +94,7 @@ class StepConfig(AttitudeConfig):
 
 
 class SlewConfig(AttitudeConfig):
-    """Rest-to-rest eigenaxis rotation to a 3-2-1 attitude, at most at rate_deg_s."""
+    """Rest-to-rest eigenaxis rotation to a 3-2-1 attitude, with greatest rate and acceleration."""
 
     kind: Literal["slew"]
     rate_deg_s: Positive = 2.0
@@ -102,7 +102,7 @@ class SlewConfig(AttitudeConfig):
 
 
 class RateConfig(ConfigModel):
-    """Rotate at a constant rate: rate_deg_s about body x, y, z, from the first moment."""
+    """Rotate at a constant rate, rate_deg_s about body x, y, z, from the beginning of the maneuver."""
 
     kind: Literal["rate"]
     rate_deg_s: RatesDegS
@@ -132,10 +132,9 @@ class ChirpConfig(ConfigModel):
     Attributes
     ----------
     amplitude_deg
-        About body x, y, z, in phase; constant but for a smooth beginning and end of one period
-        each
+        Amplitude about body x, y, z, in phase; constant except for a smooth beginning and end of one period each
     sweep
-        Linear: the frequency changes evenly with time; log: by equal factors in equal times
+        `linear`: the frequency changes evenly with time; `log`: by equal factors in equal times
     """
 
     kind: Literal["chirp"]
@@ -166,14 +165,12 @@ class ProfileConfig(ConfigModel):
     Attributes
     ----------
     file
-        CSV or ECSV table, CCSDS AEM, or STK attitude file; its content tells which
+        CSV or ECSV table, CCSDS AEM, or STK attitude file; its content determines the format
     begin
-        The maneuver's beginning in the file: `zero`: t_s = 0; epochs apply as they are, with
-        the scene's
-        start_time at its t = 0. `first_sample`: the first sample, whatever its time
+        Time in the file at which the maneuver begins. `zero`: t_s = 0, while epochs count from the scene's start_time;
+        `first_sample`: that of the first sample
     rotation
-        Which rotation columns q_x, q_y, q_z, q_w are; columns such as lab_from_body_qx name it
-        themselves
+        Rotation of the columns q_x, q_y, q_z, q_w; columns such as lab_from_body_qx name it themselves
     """
 
     kind: Literal["profile"]
@@ -193,7 +190,7 @@ class ProfileConfig(ConfigModel):
 
 
 class ShakeConfig(ConfigModel):
-    """Hold while the vehicle vibrates, as `motion.jitter` but for this duration only."""
+    """Hold the attitude while the vehicle vibrates, like `motion.jitter` but only for this duration."""
 
     kind: Literal["jitter"]
     duration_s: Duration
@@ -208,9 +205,9 @@ class BumpConfig(ConfigModel):
     rate_deg_s
         Change of the rate about body x, y, z that the impulse alone would cause
     duration
-        Of the impulse, a half-sine of torque
+        Duration of the impulse, a half-sine of torque
     caught_after
-        Time from its beginning to an equal and opposite impulse; none if left out
+        Time from the beginning of the impulse to an equal and opposite one; none if left out
     """
 
     kind: Literal["bump"]
@@ -243,12 +240,14 @@ Maneuver = Annotated[
 
 
 class DesaturationConfig(ConfigModel):
-    """The fans unload momentum from wheels or CMGs: from above start until below stop.
+    """Unloading of momentum from wheels or CMGs by the fans.
 
     Attributes
     ----------
+    start, stop
+        Stored momentum above which unloading starts, and below which it stops
     time
-        The fans' torque is the stored momentum over this time, within their limits
+        Stored momentum over the torque of the fans, within their limits
     """
 
     start_nms: Annotated[Momentum, Field(gt=0)]
@@ -270,21 +269,24 @@ class ControlConfig(ConfigModel):
     Attributes
     ----------
     law
-        Pid, or pd, which leaves the offset caused by a constant torque; or your own: an entry
-        point of the group skysim.controllers, or a program given on the command line
-        (`--program`). `prescribed` is no controller: the vehicle moves exactly along the
-        maneuver, without dynamics
+        `pid`, or `pd`, which leaves the offset by a constant torque; or an external controller: an entry point of the
+        group skysim.controllers, or a program given on the command line (`--program`). `prescribed` is no controller:
+        the vehicle moves exactly along the maneuver, without dynamics
     options, time_limit
-        Options of an external controller, and its time limit per control period
+        Options of an external controller, and its time limit for each control period
     actuators
-        Ideal torques about the body's axes, or one of the sets that `vehicle` switches on
+        `ideal` torques about the body's axes, or one of the sets that `vehicle` switches on
     feedback
-        Source of the attitude: truth, imu (the navigator), filter (star tracker and gyro)
+        Source of the attitude: `truth`, `imu` (the navigator), `filter` (star tracker and gyro)
+    rate_hz
+        Rate of the control periods
     bandwidth_rad_s, damping
-        Of the attitude loop
+        Bandwidth and damping of the attitude loop. The bandwidth times the delay (a control period, and with fans
+        their time constant) should be well below 1, such as 0.3
     integral_rad_s
-        The pole of the integral. Keep the bandwidth times the delay (a period of rate_hz, and
-        the fans' time constant with fans) well below 1: 0.3 is fine
+        Pole of the integral
+    desaturation
+        Unloading of momentum by the fans; none if left out
     """
 
     law: LawName = "pid"
@@ -301,30 +303,25 @@ class ControlConfig(ConfigModel):
     @model_validator(mode="after")
     def check_options(self) -> ControlConfig:
         """Refuse keys that have no effect with the law."""
-        unused: tuple[str, ...] = ()
+        unused: list[str] = []
         if self.law in BUILT_IN_LAWS:
-            unused = ("options", "time_limit_s")
+            unused = ["options", "time_limit_s"]
         elif self.law == PRESCRIBED:
-            unused = tuple(
-                name for name in type(self).model_fields if name not in ("law", "rate_hz")
-            )
-        given = [
-            name.removesuffix("_s")
-            for name in unused
-            if getattr(self, name) != default_of(self, name)
-        ]
-        if given:
-            raise InputError("", f"{given[0]} has no effect with law {self.law}", "none")
+            unused = [name for name in type(self).model_fields if name not in ("law", "rate_hz")]
+        for name in unused:
+            if getattr(self, name) != default_of(self, name):
+                key = name.removesuffix("_s")
+                raise InputError("", f"{key} has no effect with law {self.law}", "none")
         return self
 
 
 def default_of(config: ConfigModel, name: str) -> Any:
-    """The default of a key."""
+    """The default of a field."""
     return type(config).model_fields[name].get_default(call_default_factory=True)
 
 
 def expand_control(value: Any) -> Any:
-    """`control: NAME` is short for {law: NAME}, `none` for no controller."""
+    """The full section of `control: NAME`, which is {law: NAME}; None for `none`."""
     if value == "none":
         return None
     return {"law": value} if isinstance(value, str) else value
@@ -336,8 +333,15 @@ class MotionConfig(ConfigModel):
     Attributes
     ----------
     start
-        An attitude, or under the stars a pointing; `profile`: attitude and rate of the first
-        maneuver, a profile
+        Attitude, or pointing under the stars; `profile`: attitude and rate of the first maneuver, which is a profile
+    rate_deg_s
+        Rate at the start about body x, y, z
+    control
+        Controller; none if left out
+    maneuver
+        Maneuvers in their order
+    jitter
+        Vibration that is always on
     """
 
     start: Start = AttitudeConfig()
@@ -367,7 +371,7 @@ class MotionConfig(ConfigModel):
 
     @model_validator(mode="after")
     def check_prescribed(self) -> MotionConfig:
-        """A prescribed motion has no dynamics: nothing can hit the vehicle, and its attitude cannot jump."""
+        """Check that a prescribed motion, which has no dynamics, has neither an impulse nor a jump of the attitude."""
         refused = [leg.kind for leg in self.maneuver if leg.kind in ("bump", "step")]
         if self.is_prescribed and refused:
             raise InputError(

@@ -1,4 +1,4 @@
-"""Schema of what surrounds camera and laboratory: `light.air`, `thermal`, `orbit`, and satellites."""
+"""Schema of the surroundings of camera and laboratory: `light.air`, `thermal`, `orbit`, and satellites."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from skysim.core.errors import InputError
 from skysim.core.units import Ascending, ConfigModel, Fraction, Length, Number, Time, check_table
 from skysim.core.yaml_reader import existing_file
 
+# The scene section `light.air`: the atmosphere between the camera of a sky scene and the stars.
+
 NEGLIGIBLE_PX = 0.02  # a blur of this sigma makes an image of 0.7 px wider by 0.0003 px
 Altitude = Annotated[Number, Field(ge=0, lt=90)]
 
 
 class HorizonConfig(ConfigModel):
-    """A skyline: apparent altitudes below which nothing is seen, linear between the azimuths (from north through east).
+    """A skyline: apparent altitudes below which nothing is visible, by azimuth from north through east.
 
-    The table continues around the circle from its last row to its first.
+    The altitude is linear between the azimuths, also from the last row to the first.
     """
 
     azimuth_deg: Ascending
@@ -34,14 +36,14 @@ class HorizonConfig(ConfigModel):
 
 
 class AirGlowConfig(ConfigModel):
-    """The sky's glow, which follows from time and place.
+    """The glow of the sky at the scene's time and place.
 
     Attributes
     ----------
     dark_mag_arcsec2
         V surface brightness of the moonless night sky at the zenith
     moonlight, twilight
-        Scattered light of the Moon and of the Sun
+        Whether there is scattered light of the Moon and of the Sun
     """
 
     dark_mag_arcsec2: Annotated[Number, Field(ge=10, le=30)] = 21.7
@@ -50,26 +52,26 @@ class AirGlowConfig(ConfigModel):
 
 
 class AirConfig(ConfigModel):
-    """The atmosphere over `site`. Of the standard atmosphere at the site's height what is left out.
+    """The atmosphere over `site`.
 
     Attributes
     ----------
     pressure_hpa, temperature_c
-        At the site
+        Pressure and temperature at the site; those of the standard atmosphere at the site's height if left out
     humidity
-        Relative, 0 to 1
+        Relative humidity, 0 to 1
     wavelength
-        Of refraction; the mean of a G2 star's photo-electrons if left out
+        Wavelength of the refraction; the mean of a G2 star's photo-electrons if left out
     extinction_mag
-        k' at the zenith in the camera's band
+        Extinction k' at the zenith in the camera's band
     color_extinction_mag
-        k''. A star loses (k' + k'' (B-V)) mag for each air mass
+        Color coefficient k'': a star loses (k' + k'' (B-V)) mag for each air mass
     scintillation
-        Whether stars twinkle
+        Whether stars scintillate
     seeing_arcsec
-        Full width of a star's image at the zenith, half maximum, at a long exposure
+        Full width at half maximum of a star's image at the zenith in a long exposure
     horizon
-        The skyline; altitude 0 all around if left out
+        Skyline; altitude 0 at all azimuths if left out
     glow
         Sky, twilight and moonlight; none if left out
     """
@@ -86,27 +88,26 @@ class AirConfig(ConfigModel):
     glow: AirGlowConfig | None = None
 
     def seeing_px(self, focal_px: float) -> float:
-        """Standard deviation of a star's image at the zenith by the seeing; 0 where it is too small to matter."""
+        """Standard deviation of a star's image at the zenith by the seeing; 0 if it is negligible."""
         sigma_px = math.radians(self.seeing_arcsec / 3600) * (1 / FWHM_PER_SIGMA) * focal_px
         return sigma_px if sigma_px > NEGLIGIBLE_PX else 0.0
 
 
-# Schema of the scene section `thermal`: the temperature of the laboratory, and what moves with it.
-
+# The scene section `thermal`: the temperature of the laboratory and its effects.
 
 Temperature = Annotated[Number, Field(ge=-150, le=150)]
 Coefficient = Annotated[Number, Field(ge=-10_000, le=10_000)]
 
 
 class SteadyTemperatureConfig(ConfigModel):
-    """The same temperature all along."""
+    """A constant temperature."""
 
     kind: Literal["steady"]
     temperature_c: Temperature
 
 
 class LinearTemperatureConfig(ConfigModel):
-    """A temperature that rises or falls evenly from start_c."""
+    """A temperature that changes evenly from start_c."""
 
     kind: Literal["linear"]
     start_c: Temperature
@@ -114,7 +115,7 @@ class LinearTemperatureConfig(ConfigModel):
 
 
 class SineTemperatureConfig(ConfigModel):
-    """A temperature that goes up and down: mean + amplitude sin(2 pi t / period + phase)."""
+    """A periodic temperature: mean + amplitude sin(2 pi t / period + phase)."""
 
     kind: Literal["sine"]
     mean_c: Temperature
@@ -146,18 +147,17 @@ Temperatures = Annotated[
 
 
 class ThermalConfig(ConfigModel):
-    """What has moved since survey and calibration, which were at reference_c. The tracker does not know of it.
+    """Thermal motion since survey and calibration, which were at reference_c. It is unknown to the tracker.
 
     Attributes
     ----------
     temperature
-        Of dome, mount and lens alike, against the time since the scene's start
+        Temperature of dome, mount and lens over the time since the scene's start
     speed
-        The temperature's history runs so many times as fast as the clock, so that a short run
-        has hours
+        Factor by which the history of the temperature is faster than time, so that a short run can have hours of it
     dome_ppm_k
-        Linear expansion of the dome with its LEDs, from the level anchor_height above the
-        bearing's center on its axis; acrylic has 70, steel 12
+        Linear expansion of the dome with its LEDs from the point at anchor_height above the bearing's center on its
+        axis; 70 for acrylic, 12 for steel
     creep
         Displacement of the dome since its survey
     mount_arcsec_k
@@ -191,9 +191,7 @@ class ThermalConfig(ConfigModel):
         return self
 
 
-# Schema of the scene section `orbit`, of the satellites in a sky scene, and of what the Earth does
-# to the camera.
-
+# The scene sections `orbit`, with the Earth's light and exclusion angles, and `light.satellites`.
 
 ElementsFile = Annotated[str, AfterValidator(existing_file)]
 Magnitude = Annotated[Number, Field(ge=-30, le=30)]
@@ -201,19 +199,18 @@ Rate = Annotated[Number, Field(gt=0, le=30)]
 
 
 class RandomSatellitesConfig(ConfigModel):
-    """Sunlit satellites on random paths, drawn anew for each frame: anywhere in the field, in any direction.
+    """Sunlit satellites on random paths anywhere in the field and in any direction, drawn for each frame.
 
     Attributes
     ----------
     per_field
-        Mean number in the camera's field (the circle around its chip) at any moment
+        Mean number in the camera's field (the circle around its detector) at any time
     rate_deg_s
-        Least and greatest angular rate against the stars; its logarithm is uniformly
-        distributed
+        Least and greatest angular rate relative to the stars; its logarithm is uniformly distributed
     v_mag
         Least and greatest V magnitude, uniformly distributed
     seed
-        Of all these draws, together with the scene's
+        Seed of these draws, together with the scene's seed
     """
 
     per_field: Annotated[Number, Field(gt=0, le=1000)]
@@ -231,14 +228,14 @@ class RandomSatellitesConfig(ConfigModel):
 
 
 class SatellitesConfig(ConfigModel):
-    """Artificial satellites, seen from the scene's `orbit`, or else from `site` with its longitude.
+    """Artificial satellites, seen from the scene's `orbit`, or from `site` with its longitude.
 
     Attributes
     ----------
     file
-        Mean elements: TLE, or OMM as CSV, XML or JSON
+        File of mean elements: TLE, or OMM as CSV, XML or JSON
     standard_mag
-        V at a range of 1000 km and a phase angle of 90 degrees, of all satellites of the file
+        V magnitude of all satellites of the file at a range of 1000 km and a phase angle of 90 degrees
     random
         Further satellites on random paths
     """
@@ -255,16 +252,16 @@ class SatellitesConfig(ConfigModel):
 
 
 class ExclusionConfig(ConfigModel):
-    """When the tracker can be used in its orbit, for `skysim availability`.
+    """Limits of the tracker's use in its orbit, for `skysim availability`.
 
     Attributes
     ----------
     sun_deg, moon_deg
-        Least angle of the boresight from their centers
+        Least angles of the boresight from the centers of Sun and Moon
     earth_deg
-        From the Earth's limb
+        Least angle of the boresight from the Earth's limb
     stars
-        Least number of stars to `tracker.limit_mag` in a round field of the chip's area
+        Least number of stars to `tracker.limit_mag` in a round field of the detector's area
     """
 
     sun_deg: Annotated[Number, Field(ge=0, lt=180)] = 0.0
@@ -279,9 +276,9 @@ class EarthConfig(ConfigModel):
     Attributes
     ----------
     albedo
-        Of the ground with its clouds
-    airglow
-        V surface brightness of the layer seen from straight above
+        Albedo of the ground with its clouds
+    airglow_mag_arcsec2
+        V surface brightness of the airglow layer seen vertically from above
     """
 
     albedo: Fraction = 0.3
@@ -294,7 +291,7 @@ class OrbitConfig(ConfigModel):
     Attributes
     ----------
     earth
-        The Earth's light; if left out it is dark, but hides stars
+        Light of the Earth; if left out, the Earth is dark but hides stars
     exclusion
         Limits of the tracker's use; none if left out
     """
@@ -304,14 +301,14 @@ class OrbitConfig(ConfigModel):
 
 
 class CircularOrbitConfig(OrbitConfig):
-    """A circular orbit at the scene's start, in GCRS axes, turned by the Earth's flattening (J2).
+    """An orbit in GCRS axes that is circular at the scene's start and precesses by the Earth's flattening (J2).
 
     Attributes
     ----------
     altitude
-        Above the Earth's equatorial radius, 6378.137 km
+        Height above the Earth's equatorial radius, 6378.137 km
     argument_deg
-        From the ascending node to the camera at start_time
+        Angle from the ascending node to the camera at start_time
     """
 
     kind: Literal["circular"]
@@ -327,7 +324,7 @@ class TleOrbitConfig(OrbitConfig):
     Attributes
     ----------
     number
-        The satellite's catalog number, for a file of several
+        Catalog number of the satellite, for a file of several satellites
     """
 
     kind: Literal["tle"]

@@ -13,30 +13,30 @@ from skysim.core.yaml_reader import existing_file
 
 
 class TotalStationConfig(ConfigModel):
-    """A total station that measures every LED by a horizontal direction, a zenith angle and a distance from one place.
+    """A total station that measures every LED by a horizontal direction, a zenith angle and a distance from one point.
 
-    Errors of the sight are drawn for each LED; those of the set-up once, and are common to all LEDs. See
+    Errors of a sight are drawn for each LED. Errors of the set-up are drawn once and are common to all LEDs. See
     `skysim.sources.dome.survey_errors`. Sizes are standard deviations or tolerances.
 
     Attributes
     ----------
     position
-        Of its center, where its axes meet, in the lab
+        Intersection of its axes, in the lab
     angle_sigma_arcsec
-        Of a direction and of a zenith angle, measured in both faces (ISO 17123-3); of each LED
+        Error of a direction and of a zenith angle, measured in both faces (ISO 17123-3); for each LED
     distance_sigma
-        A of the data sheet's a + b ppm (ISO 17123-4), without reflector if LEDs have none; of
+        Error of a distance, a of the data sheet's a + b ppm (ISO 17123-4), without reflector if the LEDs have none; for
         each LED
     distance_ppm
-        B, an error of the distances' scale; common
+        Error of the scale of distances, b of the data sheet; common
     zero_sigma
-        Of the distance meter's zero point on these targets (additive constant); common
+        Error of the distance meter's zero point on these targets (additive constant); common
     centering
-        Of its place along each axis of the lab; common
+        Error of its position along each axis of the lab; common
     orientation_sigma_arcsec
-        Of its horizontal circle's zero (the backsight), about the vertical; common
+        Error of the zero of its horizontal circle (the backsight), about the vertical; common
     leveling_sigma_arcsec
-        Of its vertical axis, about each horizontal axis (the compensator); common
+        Error of its vertical axis, about each horizontal axis (the compensator); common
     """
 
     kind: Literal["total_station"]
@@ -51,24 +51,26 @@ class TotalStationConfig(ConfigModel):
 
 
 class SurveyErrorsConfig(ConfigModel):
-    """Errors of the survey of LEDs and camera, drawn once from their own seed; also draws `light.surface.error`.
+    """Errors of the survey of LEDs and camera, drawn once from their own seed, which also draws `light.surface.error`.
 
     Attributes
     ----------
-    instrument
-        That measured the LEDs, with its own errors; none if left out
-    led_sigma
-        Standard deviation of every LED's surveyed place, along each axis of the lab, or its
-        tolerance; of the target (where in its window the LED is), if there is an instrument
-    lever_sigma
-        Of the camera's surveyed place, along each axis of the body
-    focal_length_sigma
-        Of the focal length that the tracker assumes, about the true one
     rotation_deg
-        Rotation vector of the survey's axes relative to the lab's: the error of the level or
-        IMU that it was referenced to. All surveyed LEDs are rotated by it
+        Rotation vector of the survey's axes relative to the lab's, which rotates all surveyed LEDs: the error of the
+        level or IMU to which the survey was referenced
     surface_seed
-        Draws `light.surface.error`; `seed` if left out
+        Seed of `light.surface.error`; `seed` if left out
+    led_sigma
+        Standard deviation of each LED's surveyed position along each axis of the lab, or its tolerance; with an
+        instrument it is that of the target (the LED in its window)
+    lever_sigma
+        Standard deviation of the camera's surveyed position along each axis of the body, or its tolerance
+    focal_length_sigma
+        Standard deviation of the assumed focal length about the true one, or its tolerance
+    instrument
+        Instrument that measured the LEDs, with its own errors; none if left out
+    seed
+        Seed of the errors
     """
 
     rotation_deg: tuple[Spin, Spin, Spin] = (0.0, 0.0, 0.0)
@@ -83,18 +85,20 @@ class SurveyErrorsConfig(ConfigModel):
 class ExposureControlConfig(ConfigModel):
     """Exposure control from frame to frame: the SHEFEX-2 flow chart (Samaan & Theil 2011).
 
-    `exposure.time` is that of the first frame. If a frame is too bright, the next exposure is one step shorter;
-    otherwise, if it has too few stars, one step longer. Each exposure time depends on earlier frames, so with
-    exposure control a frame cannot be rendered on its own. See `estimator.trackers.exposure_control`.
+    The first frame has `exposure.time`. If a frame is too bright, the next exposure is one step shorter; otherwise, if
+    it has too few stars, one step longer. Each exposure time depends on earlier frames, so with exposure control a
+    frame cannot be rendered on its own. See `estimator.trackers.exposure_control`.
 
     Attributes
     ----------
     mean_dn
-        Mean of a frame above which it is overexposed: twice its bias and sky, for example
+        Mean of a frame above which it is overexposed, for example twice its bias and sky
+    shortest, longest, step
+        Limits of the exposure time, and its change from frame to frame
     min_stars
-        Fewer cannot be identified
-    overexposed_objects
-        Number of objects with more than saturated_px full pixels each that is too many
+        Number of stars below which the exposure is too short
+    overexposed_objects, saturated_px
+        Number of objects with more than saturated_px full pixels each from which a frame is overexposed
     """
 
     mean_dn: Positive
@@ -115,18 +119,17 @@ class ExposureControlConfig(ConfigModel):
 
 
 class DecoderConfig(ConfigModel):
-    """Reading the codes of a dome's LEDs (`light.led.code`) over the frames.
+    """Decoding of the codes of a dome's LEDs (`light.led.code`) over the frames.
 
     Attributes
     ----------
     flux_sigma
-        Relative error of a light's brightness that the decoder assumes beside its photon noise
+        Relative error of a light's brightness that the decoder assumes in addition to photon noise
     gate_px
-        Greatest motion of a light between two frames beyond what `tracker.gyro` or the last
-        motion predicts
+        Greatest difference of an image's motion between two frames from the prediction by `tracker.gyro` or by the last
+        motion
     frames
-        Number of frames whose brightness is used, the last ones; as many as the code has bits
-        if left out
+        Number of last frames whose brightness is used; that of the bits of the code if left out
     """
 
     flux_sigma: Annotated[Number, Field(ge=1e-6, le=1)] = 0.03
@@ -135,48 +138,45 @@ class DecoderConfig(ConfigModel):
 
 
 class TrackerConfig(ConfigModel):
-    """Settings of the star tracker and its assumed values of the hardware; `null` for an assumed value is the true one.
+    """Settings of the star tracker and its assumed values of the hardware; an assumed value of `null` is the true one.
 
     Attributes
     ----------
     name
-        Own, or an external tracker: an entry point, or a program given on the command line
-        (`--program`)
+        `own`, or an external tracker: an entry point, or a program given on the command line (`--program`)
     options, time_limit
-        Options of an external tracker, and its time limit per frame
-    catalog
-        Its stars under the sky, not the simulator's: a name in data/catalogs, or a file of
-        `skysim catalog build`
-    map
-        A file that `skysim survey` wrote: LEDs, lever, focal length and distortion as measured
+        Options of an external tracker, and its time limit for each frame
     detector, centroider, identifier, solver
-        If left out, under a dome local, cog, led_pairs and rotation_only, and under the stars
-        all of them `default`. The dome's identifier `non_dimensional` takes an assumed focal
-        length that is wrong by up to 12 %, and the tracker then fits it with the attitude
+        Algorithms. If left out, `local`, `cog`, `led_pairs` and `rotation_only` under a dome, `default` under the
+        stars. With the dome's identifier `non_dimensional` the assumed focal length may be wrong by up to 12 %, and the
+        tracker fits it with the attitude
+    catalog
+        Star catalog of the tracker, not that of the simulator: a name in data/catalogs, or a file of
+        `skysim catalog build`
     assumed_distortion
-        k1, k2, p1, p2, k3 of the lens; as it is if left out
+        Assumed coefficients k1, k2, p1, p2, k3 of the lens; the true ones if left out
     assumed_row_time
-        Of a rolling shutter; 0 for a tracker that takes all rows as exposed at once
+        Assumed row time of a rolling shutter; 0 for a tracker that assumes a global shutter
     gyro
-        Whether the tracker gets the mean rate that `vehicle.imu` measures during each exposure,
-        unless saturated, for smear and a rolling shutter. Without it, as in the published labs,
-        both follow from the frame alone
+        Whether the tracker gets the mean rate that `vehicle.imu` measures during each exposure, unless saturated, for
+        smear and rolling shutter. Without it, as in the published laboratories, both follow from the frame alone
     orbit_velocity
-        Whether the tracker gets the velocity of the scene's `orbit`, and corrects for its
-        aberration (5")
-    brightest
-        Only this many of the brightest detections of a frame are used
+        Whether the tracker gets the velocity of the scene's `orbit` and corrects its aberration (5")
     refraction
-        Whether the tracker knows `site`, weather and the time, and undoes the refraction of
-        `light.air`
+        Whether the tracker knows `site`, weather and time, and corrects the refraction of `light.air`
+    brightest
+        Number of the brightest detections of a frame that are used
+    survey
+        Errors of the survey
     exposure_control
-        Every frame is exposed for `exposure.time` if left out
+        Control of the exposure time; every frame has `exposure.time` if left out
     decoder
-        Identifies LEDs by their codes over the frames, in order; without it frame by frame, by
-        their places
+        Identification of LEDs by their codes over the frames, in order; without it frame by frame, by their positions
     brightness_sigma
-        LEDs are identified by their brightness too, whose logarithm has this standard deviation
-        over the data sheet's: scatter, aging, angle, flicker; by their places alone if left out
+        Standard deviation of the logarithm of the LEDs' brightness over that of the data sheet (scatter, aging, angle,
+        flicker), for identification by brightness and position; by position alone if left out
+    map
+        File that `skysim survey` wrote: measured LEDs, lever, focal length and distortion
     """
 
     name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")] = "own"
@@ -240,48 +240,48 @@ class FilterConfig(ConfigModel):
     """Noise model and settings of the attitude filter (MEKF: attitude and gyro errors), for gyro and star tracker.
 
     The bias is modeled as a Gauss-Markov process about zero in body axes. If imu.earth_rate is uncompensated, the
-    filter estimates the Earth rate as bias while the attitude is constant. When the vehicle rotates, this bias
-    changes in body axes, so bias_deg_h must allow for it (15) and bias_time must be that of the rotation. The gyro's
-    scale factors and misalignments, the tracker's slow error and its mount are states too, if their standard deviation
-    is not 0; one that is `considered` counts in the covariance, but its value is not estimated.
+    filter estimates the Earth rate as a bias while the attitude is constant. When the vehicle rotates, this bias
+    changes in body axes, so bias_deg_h must contain it (15) and bias_time must be that of the rotation. The gyro's
+    scale factors and misalignments, the tracker's slow error and its mount are states, too, if their standard deviation
+    is not 0. A state that is `considered` is in the covariance, but its value is not estimated.
 
     Attributes
     ----------
-    arw_deg_sqrt_h, bias_deg_h, bias_time
-        Of the gyro; the bias a Gauss-Markov process
+    arw_deg_sqrt_h
+        Angle random walk of the gyros
+    bias_deg_h, bias_time
+        Standard deviation and correlation time of the gyro bias
     scale_ppm, misalignment_arcsec
-        Standard deviation of the gyro's scale factors and of its axes' directions
+        Standard deviations of the gyros' scale factors and of the directions of their axes
     rate_limit_deg_s
-        Largest rate that the gyro measures; from nine tenths of it a rate counts as saturated,
-        also where the IMU does not say so
+        Largest rate that the gyros measure; from nine tenths of it a rate counts as saturated, even if the IMU does not
+        report it
     start_deg, start_bias_deg_h
-        Standard deviation of attitude and bias about each axis at the start
+        Standard deviations of attitude and bias about each axis at the start
     systematic_arcsec
-        Standard deviation about each axis of the tracker's slow error, which does not average
-        out; added to what a dome tracker knows of its survey
+        Standard deviation about each axis of the tracker's slow error, which does not average out; added to the error
+        of the survey that a dome tracker reports
     systematic_time, systematic_angle_deg
-        Time and rotation after which the slow error is another one
+        Time and rotation after which the slow error has changed
     mounting_arcsec
-        Standard deviation of the tracker's mount about each axis, and of those of `heads`
-        relative to it, which are estimated
+        Standard deviation about each axis of the tracker's mount, and of those of `heads` relative to it, which are
+        estimated
     mounting_drift_arcsec_sqrt_h
         Random walk of each mount about each axis
     floor_arcsec
-        Error that all lights of one frame share, another one in every frame, added to the
-        covariance
+        Error that all lights of a frame share and that differs from frame to frame, added to the covariance
     considered
         States that are considered
     gate_sigma
-        A solution with a larger innovation is rejected
+        Largest innovation of a solution that is accepted
     missed_per_h
-        How often the gyro misses a motion in silence
+        Number of motions per hour that the gyros miss without a report
     wrong_share, wrong_repeat
-        Probability that a wrong solution begins at a frame, and that the next agrees with it
+        Probability that a wrong solution begins at a frame, and that the next one agrees with it
     latency
-        From the end of an exposure to its solution
+        Time from the end of an exposure to its solution
     time_tag_sigma
-        Standard deviation of a frame's time, which adds sigma^2 w w^T to the covariance at the
-        rate w
+        Standard deviation of a frame's time tag, which adds sigma^2 w w^T to the covariance at the rate w
     """
 
     arw_deg_sqrt_h: NotNegative = 0.07

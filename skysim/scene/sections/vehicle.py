@@ -27,9 +27,8 @@ from skysim.core.units import (
     Triple,
 )
 
-ActuatorsName = Literal[
-    "ideal", "wheels", "fans", "cmgs"
-]  # a key of `vehicle`, but for the ideal torques
+# Keys of `vehicle`, and the ideal torques.
+ActuatorsName = Literal["ideal", "wheels", "fans", "cmgs"]
 TorqueLimit = Annotated[Torque, Field(gt=0)]
 TorqueLevel = Annotated[Torque, Field(ge=0)]
 
@@ -45,15 +44,16 @@ class WheelsConfig(ActuatorsConfig):
 
     Attributes
     ----------
+    torque_limit, speed_limit_rpm
+        Greatest motor torque and speed
     coulomb, viscous
         Bearing friction, T = coulomb sign(speed) + viscous speed
     static_imbalance
-        Mass times offset of the rotor's center from its axle; disturbs with the speed squared
+        Mass times offset of the rotor's center of mass from its axle; its disturbance grows with the speed squared
     dynamic_imbalance
-        Product of inertia between the axle and a line across it; disturbs with the speed
-        squared
+        Product of inertia between the axle and a line across it; its disturbance grows with the speed squared
     start_rpm
-        Speed of each at the start; at rest if left out
+        Speed of each wheel at the start; at rest if left out
     """
 
     stores_momentum: ClassVar[bool] = True
@@ -77,8 +77,10 @@ class FansConfig(ActuatorsConfig):
 
     Attributes
     ----------
+    thrust_limit
+        Greatest thrust
     time_constant
-        Of the first-order lag between command and thrust
+        Time constant of the first-order lag between command and thrust
     """
 
     thrust_limit_n: Annotated[Force, Field(gt=0)] = 0.5
@@ -90,12 +92,16 @@ class CmgsConfig(ActuatorsConfig):
 
     Attributes
     ----------
+    rotor_rpm
+        Speed of the rotors
+    gimbal_rate_limit_deg_s, gimbal_time_constant
+        Greatest gimbal rate, and time constant of the servos
     steering
-        Method that computes gimbal rates; a key of STEERING
+        Method that computes the gimbal rates; a key of STEERING
     start_deg
         Gimbal angles at the start; those of the model if left out
     rotor_torque_limit
-        None keeps the rotor speeds constant; a torque makes them variable-speed CMGs
+        Greatest motor torque on the rotors of variable-speed CMGs; the rotor speeds are constant if left out
     """
 
     stores_momentum: ClassVar[bool] = True
@@ -108,17 +114,17 @@ class CmgsConfig(ActuatorsConfig):
 
 
 class TrimConfig(ConfigModel):
-    """Motorized trim masses: every slide joint `trim_*` of the model, held in its place during a run.
+    """Motorized trim masses: every slide joint `trim_*` of the model, held at its position during a run.
 
     Attributes
     ----------
     position
-        Of each along its joint's axis, from its place in the model; `skysim balance` finds the
-        balanced ones
+        Position of each mass along the axis of its joint, from that in the model; `skysim balance` finds the balanced
+        positions
     travel
-        Largest position, either way
+        Largest position in both directions
     step
-        Of the motors: a mass is held at a multiple of it
+        Step of the motors; a mass is held at a multiple of it
     """
 
     position_m: tuple[Length, ...] = ()
@@ -140,7 +146,7 @@ class DragConfig(ConfigModel):
 
 
 class CableConfig(ConfigModel):
-    """A cable attached to the vehicle: a torsional spring that turns it back to (0, 0, 0) by the shorter rotation."""
+    """A cable attached to the vehicle: a torsional spring that rotates it back to (0, 0, 0) by the shorter rotation."""
 
     stiffness_nm_rad: Annotated[Stiffness, Field(gt=0)]
 
@@ -158,10 +164,11 @@ class DisturbancesConfig(ConfigModel):
     Attributes
     ----------
     turbine
-        Turbine torque of the bearing's air jets, constant about the lab's axes
+        Turbine torque of the bearing's air jets, constant in the lab's axes
     earth_rotation
-        The lab rotates with the Earth (`site` gives its latitude), the vehicle's momentum does
-        not
+        Whether the lab rotates with the Earth (`site` has its latitude)
+    cable, air_current
+        Cable and air currents
     """
 
     turbine_nm: tuple[Torque, Torque, Torque] = (0.0, 0.0, 0.0)
@@ -171,22 +178,22 @@ class DisturbancesConfig(ConfigModel):
 
 
 class GyroConfig(ConfigModel):
-    """Three fiber-optic gyroscopes. The defaults are an LN-200's, of which only the first two have a source.
+    """Three fiber-optic gyroscopes. The defaults are those of an LN-200, of which only the first two have a source.
 
     Attributes
     ----------
     arw_deg_sqrt_h
         Angle random walk
-    bias_deg_h
-        Bias instability: standard deviation of a Gauss-Markov process with bias_time
+    bias_deg_h, bias_time
+        Bias instability: standard deviation and correlation time of a Gauss-Markov process
     turn_on_bias_deg_h
-        Constant part of the bias, standard deviation over units, or a tolerance
+        Standard deviation over units of the constant part of the bias, or its tolerance
     scale_ppm, misalignment_arcsec
-        Of each axis, standard deviations over units, or tolerances
+        Standard deviations over units of the scale factor and misalignment of each axis, or their tolerances
     quantum_arcsec
         Step of the angle counter
     rate_limit_deg_s
-        The output saturates at this rate
+        Rate at which the output saturates
     """
 
     arw_deg_sqrt_h: NotNegative = 0.07
@@ -200,7 +207,7 @@ class GyroConfig(ConfigModel):
 
 
 class AccelerometerConfig(ConfigModel):
-    """Three accelerometers, with the errors named as for the gyros. The defaults are `assumed`."""
+    """Three accelerometers, with errors named like those of the gyros. The defaults are `assumed`."""
 
     vrw_ug_sqrt_hz: NotNegative = 50.0
     bias_ug: NotNegative = 50.0
@@ -217,13 +224,15 @@ class ImuConfig(ConfigModel):
 
     Attributes
     ----------
+    rate_hz
+        Rate of the samples
     earth_rate
-        None: the gyros do not measure the Earth's rotation; uncompensated: they do, and the
-        navigator takes it for the vehicle's; compensated: the navigator subtracts it
+        `none`: the gyros do not measure the Earth's rotation; `uncompensated`: they do, and the navigator treats it as
+        that of the vehicle; `compensated`: the navigator subtracts it
     home_error_deg
         Roll, pitch, yaw error of the vehicle's attitude when the navigator was zeroed
     hardware_seed
-        Selects one unit of the production: its turn-on bias, scale factors and misalignments
+        Seed of the unit's turn-on bias, scale factors and misalignments
     """
 
     rate_hz: Annotated[Number, Field(ge=10, le=1000)] = 400.0
@@ -235,18 +244,24 @@ class ImuConfig(ConfigModel):
 
 
 class VehicleConfig(ConfigModel):
-    """The moving body: an MJCF file, and values of the scene that replace the file's.
+    """The moving body: an MJCF file, and values of the scene that replace those of the file.
 
     Attributes
     ----------
+    model
+        Name of the MJCF file
+    mount
+        `air_bearing`: gravity and a tilt stop; `free`: neither
+    mass, inertia, center_of_mass
+        Mass properties with all trim masses at zero; mass and inertia are those of the file if left out
     camera
-        Entrance pupil on the body, the housing moves with it; the MJCF's if left out
+        Entrance pupil on the body, with which the housing moves; that of the file if left out
     torque_limit
-        Of each of the ideal torques about body x, y, z
+        Limit of each ideal torque about body x, y, z
     wheels, fans, cmgs
-        The actuators that are switched on; joints of the others are locked
+        Actuators that are switched on; joints of the others are locked
     trim
-        The trim masses' places; center_of_mass and inertia are those with all of them at zero
+        Trim masses
     """
 
     model: str
@@ -290,14 +305,16 @@ class VehicleConfig(ConfigModel):
 
 
 class SiteConfig(ConfigModel):
-    """Where on the Earth the lab is, and the azimuth of its x axis from north through east.
+    """Place of the lab on the Earth.
 
     Attributes
     ----------
     longitude_deg
-        East; `light.bodies` are seen from there, without it from the Earth's center
+        East longitude; without it `light.bodies` are seen from the Earth's center
     height
-        Above the ellipsoid
+        Height above the ellipsoid
+    x_azimuth_deg
+        Azimuth of the lab's x axis from north through east
     """
 
     latitude_deg: Annotated[Number, Field(ge=-90, le=90)] = 39.8

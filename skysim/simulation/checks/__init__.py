@@ -1,7 +1,7 @@
 """Check a plan before its run: facts about field, lights, images and expected errors, and warnings.
 
-`plan.check` computes all of it from a lab whose motion is not simulated yet: `attitudes` samples directions,
-`views` projects the lights, `detection` and `expected_error` predict the tracker, `facts` and `findings` say it.
+`check.check` computes all of it from a lab whose motion is not simulated: `attitudes` samples directions, `views`
+projects the lights, `detection` and `expected_error` predict the tracker, `facts` and `findings` put it into words.
 """
 
 from skysim.simulation.checks.check import LEAST_ALIKE as LEAST_ALIKE

@@ -1,6 +1,6 @@
-"""Attitudes at which a scene is checked: those of its frames, and all that its motion could reach.
+"""Attitudes at which a scene is checked: those of its frames, and a sample of those that its motion could reach.
 
-The frames' attitudes are those of the reference maneuver, or of a constant rate if there is no controller: the motion
+The attitudes of the frames are those of the reference maneuver, or of a constant rate without a controller. The motion
 itself is not simulated.
 """
 
@@ -20,11 +20,9 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.lab import Lab
 
-MAX_FRAMES = (
-    400  # frames at which the reference is evaluated to find the fastest and the most tilted one
-)
-FRAMES = 16  # frames that are checked
-DIRECTIONS = 48  # attitudes that the motion could reach
+MAX_FRAMES = 400  # frames among which the fastest and the most tilted one are sought
+FRAMES = 16  # evenly spaced frames that are checked
+DIRECTIONS = 48  # attitudes that sample the reach of the motion
 GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
 
 
@@ -36,11 +34,11 @@ class CheckedAttitudes(NamedTuple):
     lab_from_body
         N rotations
     rate_body_rad_s
-        (N, 3) in body axes; zeros where only the direction is of interest
+        (N, 3) rates in body axes; zeros if only the direction matters
     t_s
-        (N,) time of the frame; NaN where it is none
+        (N,) times of the frames; NaN for an attitude that is not of a frame
     acceleration_body_rad_s2
-        (N, 3) in body axes; None for zeros
+        (N, 3) angular accelerations in body axes; None for zeros
     """
 
     lab_from_body: Rotation
@@ -55,19 +53,23 @@ class CheckedAttitudes(NamedTuple):
 
 
 def of_frames(lab: Lab) -> CheckedAttitudes:
-    """Attitudes at mid-exposure of some frames: evenly spaced ones, the fastest and the most tilted."""
+    """Attitudes at mid-exposure of some frames: evenly spaced ones, the fastest and the most tilted.
+
+    Raises InputError for a motion beyond the tilt stop, as a run would.
+    """
+    # 1. The reference at many frames.
     scene = lab.scene
-    count = lab.scene.exposure.frames
     exposure = scene.exposure
+    count = exposure.frames
     index = np.unique(np.linspace(0, count - 1, min(count, MAX_FRAMES)).astype(int))
     t_s = exposure.first_s + index / exposure.rate_hz + exposure.time_s / 2
     every = attitudes_at(lab, t_s)
+    # 2. Evenly spaced frames, the fastest and the most tilted.
     chosen = set(np.linspace(0, len(index) - 1, min(len(index), FRAMES)).astype(int))
-    chosen |= {
-        int(np.linalg.norm(every.rate_body_rad_s, axis=1).argmax()),
-        int(tilts_rad(every).argmax()),
-    }
+    chosen.add(int(np.linalg.norm(every.rate_body_rad_s, axis=1).argmax()))
+    chosen.add(int(tilts_rad(every).argmax()))
     rows = np.array(sorted(chosen))
+    # 3. Without a controller the vehicle may reach the stop later; the frames before are checked.
     tilt_rad = tilts_rad(every)[rows]
     if scene.vehicle.mount == "air_bearing":
         check_stop(scene, t_s[rows], np.degrees(tilt_rad))
@@ -83,7 +85,7 @@ def of_frames(lab: Lab) -> CheckedAttitudes:
 def check_stop(scene: Scene, t_s: Floats, tilt_deg: Floats) -> None:
     """Raise InputError for a start or a maneuver beyond the tilt stop, as a run would."""
     stop_deg = scene.vehicle.tilt_stop_deg
-    beyond = np.flatnonzero(tilt_deg > scene.vehicle.tilt_stop_deg)
+    beyond = np.flatnonzero(tilt_deg > stop_deg)
     if len(beyond) == len(tilt_deg):
         raise InputError(
             "motion.start",
@@ -99,30 +101,26 @@ def check_stop(scene: Scene, t_s: Floats, tilt_deg: Floats) -> None:
 
 
 def attitudes_at(lab: Lab, t_s: Floats) -> CheckedAttitudes:
-    """The commanded attitudes at (N,) times; without a controller those of the initial rate, kept constant."""
+    """The commanded attitudes at (N,) times; without a controller those of the constant initial rate."""
     scene = lab.scene
-    lab_from_start = lab.start
     if scene.motion.control is None:
         rate = np.radians(scene.motion.rate_deg_s)
-        return CheckedAttitudes(
-            lab_from_start * Rotation.from_rotvec(np.outer(t_s, rate)),
-            np.tile(rate, (len(t_s), 1)),
-            t_s,
-        )
-    reference = guidance.plan(scene.motion, lab_from_start, lab.profiles)
+        lab_from_body = lab.start * Rotation.from_rotvec(np.outer(t_s, rate))
+        return CheckedAttitudes(lab_from_body, np.tile(rate, (len(t_s), 1)), t_s)
+    reference = guidance.plan(scene.motion, lab.start, lab.profiles)
     states = [reference.state_at(float(t)) for t in t_s]
-    lab_from_body = Rotation.from_quat(np.array([state[0] for state in states]), scalar_first=True)
-    rates, accelerations = (np.array([state[k] for state in states]) for k in (1, 2))
+    wxyz, rates, accelerations = (np.array(column) for column in zip(*states, strict=True))
+    lab_from_body = Rotation.from_quat(wxyz, scalar_first=True)
     return CheckedAttitudes(lab_from_body, rates, t_s, accelerations)
 
 
 def tilts_rad(attitudes: CheckedAttitudes) -> Floats:
-    """(N,) angles between the body's z and the lab's."""
+    """(N,) angles between the z axes of body and lab."""
     return np.radians(multibody.tilt_deg(attitudes.lab_from_body))
 
 
 def greatest_tilt_rad(scene: Scene, frames: CheckedAttitudes) -> float:
-    """The greatest tilt of the maneuver; without a controller on a bearing, the tilt stop."""
+    """The greatest tilt at the frames; without a controller on a bearing, the tilt stop."""
     if scene.motion.control is None and scene.vehicle.mount == "air_bearing":
         return math.radians(scene.vehicle.tilt_stop_deg)
     return float(tilts_rad(frames).max())
@@ -131,14 +129,21 @@ def greatest_tilt_rad(scene: Scene, frames: CheckedAttitudes) -> float:
 def within_reach(
     scene: Scene, mount: Mount, frames: CheckedAttitudes, tilt_deg: float | None = None
 ) -> CheckedAttitudes:
-    """Attitudes that a motion could reach: under the stars all, else any azimuth and yaw up to the greatest tilt.
+    """A sample of the attitudes in reach: under the stars all, else any azimuth and yaw up to the greatest tilt.
 
-    Directions are even on a Fibonacci spiral; the angles about them are even too.
+    Directions are evenly spread on a Fibonacci spiral. The rotations about them are multiples of the golden ratio,
+    which spreads them evenly too.
 
     Parameters
     ----------
+    scene
+        The scene
+    mount
+        Mount of the camera
+    frames
+        Attitudes of the frames, whose greatest tilt is the default
     tilt_deg
-        The greatest tilt, of a study's trials for example; that of `greatest_tilt_rad` if None
+        Greatest tilt, for example that of a study's trials; None for `greatest_tilt_rad`
     """
     n = np.arange(DIRECTIONS)
     turn_rad = 2 * np.pi * np.mod(n / GOLDEN_RATIO, 1.0)
@@ -153,9 +158,8 @@ def within_reach(
             greatest_tilt_rad(scene, frames) if tilt_deg is None else math.radians(tilt_deg)
         )
         cosine = math.cos(greatest_rad)
-        tilt_rad = np.arccos(
-            1 - n / (DIRECTIONS - 1) * (1 - cosine)
-        )  # the last one is the greatest tilt
+        # Equal steps of the cosine are equal areas; the last attitude has the greatest tilt.
+        tilt_rad = np.arccos(1 - n / (DIRECTIONS - 1) * (1 - cosine))
         azimuth_rad = n * GOLDEN_ANGLE_RAD
         # With a yaw of minus the azimuth, the tilt is about a horizontal axis.
         angles = np.column_stack([azimuth_rad, tilt_rad, turn_rad - azimuth_rad])
@@ -164,7 +168,7 @@ def within_reach(
 
 
 def describe(attitudes: CheckedAttitudes, n: int, scene: Scene, mount: Mount) -> str:
-    """An attitude in words: RA and Dec of the boresight, or the vehicle's roll, pitch, yaw and tilt; and the time."""
+    """Attitude n in words: RA and Dec of the boresight, or roll, pitch, yaw and tilt of the vehicle; and the time."""
     lab_from_body = attitudes.lab_from_body[n]
     t_s = attitudes.t_s[n]
     if isinstance(scene.light, StarsConfig):
@@ -173,9 +177,8 @@ def describe(attitudes: CheckedAttitudes, n: int, scene: Scene, mount: Mount) ->
         dec_deg = math.degrees(math.asin(min(max(z, -1.0), 1.0)))
         where = f"RA {ra_deg:.1f}° Dec {dec_deg:+.1f}°"
     else:
-        yaw, pitch, roll = (
-            angle + 0.0 for angle in np.round(lab_from_body.as_euler("ZYX", degrees=True), 1)
-        )  # no -0
+        # Adding 0 turns -0 into 0.
+        yaw, pitch, roll = np.round(lab_from_body.as_euler("ZYX", degrees=True), 1) + 0.0
         tilt_deg = float(multibody.tilt_deg(lab_from_body))
         where = f"roll {roll:.1f}° pitch {pitch:.1f}° yaw {yaw:.1f}°, a tilt of {tilt_deg:.1f}°"
     return where if math.isnan(t_s) else f"{where} (t = {t_s:.1f} s)"

@@ -1,12 +1,7 @@
-"""What the tracker believes of lights and hardware, and how that differs from the truth or may differ from it.
+"""The tracker's beliefs about lights and hardware, and their differences from the truth.
 
-Stars are measured elsewhere than believed because of the catalog's errors and because of neighbors: one within a star's
-image displaces its centroid. A weighted fit of a Gaussian g of N electrons over a background of b electrons^2 a pixel
-responds to f electrons at the distance d with the displacement along d
-
-    r = sum(w g' f g(x - d)) / sum(w (N + f exp(-d^2 / 4 s^2)) g'^2),      w = 1 / (b + N g),
-
-to first order; for d far below s this is f d / (N + f), the center of light.
+The measured direction of a star differs from the believed one because of the catalog's errors and of neighbors within
+the star's image, which displace its centroid (`response_px`).
 """
 
 from __future__ import annotations
@@ -38,37 +33,37 @@ from skysim.tracking.onboard_model import (
     onboard_catalog,
 )
 
-REACH_PX = 7.0  # of neighbors
-WINDOW_PX = 3  # half the side of the fit's window
+REACH_PX = 7.0  # greatest distance of a neighbor that displaces a centroid
+WINDOW_PX = 3  # half side of the fit's window
 
 
 @dataclass(frozen=True, slots=True)
 class Beliefs:
-    """What the tracker believes. Standard deviations are of a survey that is still to be drawn.
+    """The beliefs of a tracker. Standard deviations are over surveys, of which a run draws one.
 
     Attributes
     ----------
     lights
-        The sources that it knows, N of them
+        The N sources that it knows
     direction_error
-        (N, 3) measured minus believed direction of each star, from the catalog's error and from
-        neighbors, in lab axes; zeros for LEDs
+        (N, 3) measured minus believed direction of each star in lab axes, from the catalog's errors and from
+        neighbors; zeros for LEDs
     led_sigma_m, lever_sigma_m
-        Of the surveyed places, about each axis (rms of LEDs measured by an instrument)
+        Standard deviations of the surveyed places along each axis (rms of the LEDs if an instrument measured them)
     surface_sigma_m
-        Of the surveyed surface, along its normal, common to all LEDs
+        Standard deviation of the surveyed surface along its normal, common to all LEDs
     rotation_rad
-        (3,) rotation of the survey's axes, in lab axes
+        (3,) rotation vector of the survey's axes, in lab axes
     lever_error_m
-        (3,) believed minus true place of the camera, in body axes
+        (3,) believed minus true position of the camera, in body axes
     focal_error, focal_sigma
-        Relative error of the focal length, and its standard deviation
+        Relative error of the focal length, and its relative standard deviation
     camera
-        The camera with the believed distortion
+        Camera with the believed distortion
     faintest_mag
-        Of the stars that it knows; infinite under a dome
+        Magnitude of the faintest star that it knows; infinite under a dome
     epoch_jyear
-        Of its star catalog; NaN under a dome
+        Epoch of its star catalog; NaN under a dome
     """
 
     lights: Sources
@@ -87,6 +82,7 @@ class Beliefs:
 
 def of(lab: Lab, camera: CameraModel) -> Beliefs:
     """The beliefs of a lab's tracker. Raises InputError for a map or a catalog that cannot be read."""
+    # 1. Lights and camera.
     scene = lab.scene
     tracker = scene.tracker
     believed = assumed_camera(scene)
@@ -97,6 +93,7 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
     lever_error_m = (
         np.zeros(3) if assumed_m is None else np.array(assumed_m) - lab.camera.mount.camera_body_m
     )
+    # 2. A self-calibrated map has its own uncertainties, and its axes and lever are right on average.
     if tracker.map:
         mapped = dome_map_file.read_dome_map(Path(tracker.map))
         return Beliefs(
@@ -113,15 +110,17 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
             faintest_mag,
             epoch_jyear,
         )
+    # 3. Else those of the survey. An instrument gives each LED its own covariance.
     survey = tracker.survey
     surface_m = scene.light.surface.error_m if isinstance(scene.light, DomeConfig) else 0.0
+    led_sigma_m = survey.led_sigma_m
     own_m2 = led_covariance_m2(lights.place[:, :3], survey)
+    if own_m2 is not None:
+        led_sigma_m = float(np.sqrt(np.trace(own_m2, axis1=1, axis2=2).mean() / 3))
     return Beliefs(
         lights,
         direction_error,
-        survey.led_sigma_m
-        if own_m2 is None
-        else float(np.sqrt(np.trace(own_m2, axis1=1, axis2=2).mean() / 3)),
+        led_sigma_m,
         survey.lever_sigma_m,
         surface_m,
         np.radians(survey.rotation_deg),
@@ -135,7 +134,7 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
 
 
 def known_lights(lab: Lab, camera: CameraModel) -> tuple[Sources, Floats, float, float]:
-    """The sources that the tracker knows, (N, 3) errors of their directions, the faintest star, the catalog's epoch."""
+    """The N sources that the tracker knows, their direction errors (N, 3), the faintest magnitude, the epoch."""
     scene = lab.scene
     sources = lab.camera.sources
     if isinstance(scene.light, DomeConfig):
@@ -149,7 +148,10 @@ def known_lights(lab: Lab, camera: CameraModel) -> tuple[Sources, Floats, float,
 
 
 def believed_stars(lab: Lab) -> StarCatalog:
-    """The tracker's stars at their believed directions in lab axes, unresolved ones merged. Raises InputError."""
+    """The tracker's stars at their believed directions in lab axes, with unresolved doubles merged.
+
+    Raises InputError for a catalog that cannot be read.
+    """
     scene = lab.scene
     stars = catalog.brighter_than(
         onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag
@@ -162,7 +164,7 @@ def believed_stars(lab: Lab) -> StarCatalog:
 
 
 def known_stars(lab: Lab, stars: StarCatalog, camera: CameraModel) -> tuple[Sources, Floats]:
-    """The sources that the tracker knows, and (N, 3) measured minus believed direction of each, in lab axes."""
+    """The N stars that the tracker knows, and measured minus believed direction (N, 3) of each, in lab axes."""
     sources = lab.camera.sources
     row, star = common(sources.id, stars.id)
     place = sources.place[:, :3] / np.linalg.norm(sources.place[:, :3], axis=1, keepdims=True)
@@ -182,8 +184,11 @@ def neighbor_shift(
     rate_e_s
         (M,) photo-electrons per second
     row
-        (N,) the stars
+        (N,) rows of the stars among the sources
+    camera
+        Camera
     """
+    # 1. Pairs of a star and another source within reach.
     focal_px = camera.optics.camera.focal_px
     reach = cKDTree(place[row]).sparse_distance_matrix(
         cKDTree(place), REACH_PX / focal_px, output_type="ndarray"
@@ -194,6 +199,7 @@ def neighbor_shift(
     apart = place[second] - place[first]
     apart_px = focal_px * np.linalg.norm(apart, axis=1)
     electrons = rate_e_s * camera.exposure_s
+    # 2. The displacements by all neighbors of a star add up.
     moved_px = response_px(apart_px, electrons[first], electrons[second], camera)
     shift = np.zeros((len(row), 3))
     np.add.at(shift, pairs["i"], (moved_px / np.maximum(apart_px, 1e-9))[:, None] * apart)
@@ -203,13 +209,31 @@ def neighbor_shift(
 def response_px(
     apart_px: Floats, star_e: Floats, neighbor_e: Floats, camera: CameraModel
 ) -> Floats:
-    """(P,) displacement of a star's fitted position toward a neighbor; see the module's description."""
-    x, y = (
-        axis.ravel() for axis in np.mgrid[-WINDOW_PX : WINDOW_PX + 1, -WINDOW_PX : WINDOW_PX + 1]
-    )
+    """(P,) displacement of a star's fitted position toward a neighbor, for P pairs.
+
+    A weighted fit of a Gaussian image g, of deviation s and N electrons, over a background of b electrons^2 a pixel
+    responds to f electrons at the distance d with a displacement along d of, to first order,
+
+        r = sum(w g' f g(x - d)) / sum(w (N + f exp(-d^2 / 4 s^2)) g'^2),      w = 1 / (b + N g).
+
+    For d far below s this is f d / (N + f), the center of light.
+
+    Parameters
+    ----------
+    apart_px
+        (P,) distances d
+    star_e, neighbor_e
+        (P,) electrons N and f
+    camera
+        Camera with the image's deviation and the background
+    """
+    side = np.arange(-WINDOW_PX, WINDOW_PX + 1)
+    x = np.repeat(side, len(side))
+    y = np.tile(side, len(side))
     s2 = camera.lens_px**2
 
     def image(offset_px: Floats) -> Floats:
+        """(P, window) share of a Gaussian's light in each pixel, with its center displaced along x."""
         return np.asarray(np.exp(-((x - offset_px) ** 2 + y**2) / (2 * s2)) / (2 * math.pi * s2))
 
     own = image(np.zeros(1))
@@ -217,24 +241,22 @@ def response_px(
     slope = own * x / s2
     weight = 1 / (camera.noise_e**2 + star_e[:, None] * own)
     total_e = star_e + neighbor_e * np.exp(-(apart_px**2) / (4 * s2))
-    return np.asarray(
-        neighbor_e
-        * (weight * slope * other).sum(axis=1)
-        / (total_e * (weight * slope**2).sum(axis=1))
-    )
+    pull = neighbor_e * (weight * slope * other).sum(axis=1)
+    stiffness = total_e * (weight * slope**2).sum(axis=1)
+    return np.asarray(pull / stiffness)
 
 
 def common(
     first: NDArray[np.int64], second: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The rows of equal numbers in two lists, in the order of the first."""
+    """Rows of the numbers that are in both lists, in the order of the first list."""
     _, a, b = np.intersect1d(first, second, return_indices=True)
     order = np.argsort(a)
     return a[order], b[order]
 
 
 def describe(beliefs: Beliefs, scene: Scene) -> list[str]:
-    """What the tracker believes, one line for each thing that is uncertain or wrong; else that all is as it is."""
+    """The beliefs in words: one line for each that is uncertain or wrong, or one that says that all are exact."""
     lines = []
     if not math.isnan(beliefs.epoch_jyear):
         error_arcsec = np.degrees(np.linalg.norm(beliefs.direction_error, axis=1)) * 3600

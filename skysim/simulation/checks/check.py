@@ -1,4 +1,12 @@
-"""Check a plan before its run: what will be in the field, how accurate solutions will be, and what to change."""
+"""Check a plan before its run: lights in the field, accuracy of the solutions, and recommended changes.
+
+`check` does the following:
+
+1. Sample the attitudes of the frames, and those in reach of the motion (attitudes.py).
+2. Evaluate what the camera sees there and what the tracker detects (sampling.py).
+3. Collect the facts (facts.py) and the warnings (findings.py, dome_warnings.py, sky_warnings.py).
+4. Do the same for each head, and combine the expected errors.
+"""
 
 from __future__ import annotations
 
@@ -23,13 +31,9 @@ from skysim.simulation.lab import Lab
 from skysim.simulation.motion import check_reference
 from skysim.sources.dome.layouts.ambiguity import Ambiguity
 
-OWN_KEYS = (
-    "camera.",
-    "tracker.",
-    "exposure.",
-    "rotation_deg:",
-)  # of a head; other findings are about the scene
-# of an ambiguity map: least fraction sought, fields times LEDs in a field
+# Keys of a head; findings with other keys are about the scene.
+OWN_KEYS = ("camera.", "tracker.", "exposure.", "rotation_deg:")
+# Of an ambiguity map: the least fraction of coincident LEDs, and the greatest number of fields times LEDs in a field.
 LEAST_ALIKE = 0.3
 MAP_WORK = 60_000
 SKY_FINDINGS = (
@@ -41,13 +45,13 @@ SKY_FINDINGS = (
 
 
 class Check(NamedTuple):
-    """The facts of a plan, and its warnings: one line each, which begins with the key to change."""
+    """The facts of a plan, and its warnings: one line each, beginning with the key to change."""
 
     facts: list[Fact]
     findings: list[str]
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """The check as a JSON object."""
         numbers = {
             fact.name.replace(" ", "_"): {"text": fact.lines, **fact.values} for fact in self.facts
         }
@@ -55,16 +59,16 @@ class Check(NamedTuple):
 
 
 def check(lab: Lab, tilt_deg: float | None = None, rate_body_rad_s: Floats | None = None) -> Check:
-    """Check the plan of a lab whose motion need not be simulated.
+    """Facts and warnings of a lab. Its motion is not simulated.
 
     Parameters
     ----------
+    lab
+        Laboratory
     tilt_deg
-        Greatest tilt under a dome, if it is not that of the scene's motion (random attitudes of
-        a study)
+        Greatest tilt under a dome; None for that of the scene's motion
     rate_body_rad_s
-        (3,) rate of all frames in body axes, in place of the motion's, for trials of single
-        frames
+        (3,) rate of all frames in body axes, for trials of single frames; None for the rates of the motion
 
     Raises
     ------
@@ -72,13 +76,11 @@ def check(lab: Lab, tilt_deg: float | None = None, rate_body_rad_s: Floats | Non
         For unreadable files, and for a maneuver that a run would refuse.
     """
     scene = lab.scene
-    first = [
-        line
-        for line in [dome_warnings.camera_outside_warning(scene, lab.camera.mount, lab.start)]
-        if line
-    ]
-    if first:
-        return Check([], first)  # all else assumes that the camera is inside
+    # The rest assumes that the camera is inside the dome.
+    outside = dome_warnings.camera_outside_warning(scene, lab.camera.mount, lab.start)
+    if outside:
+        return Check([], [outside])
+    # 1. Attitudes.
     context = context_of(lab)
     frames = attitudes.of_frames(lab)
     if rate_body_rad_s is not None:
@@ -87,24 +89,26 @@ def check(lab: Lab, tilt_deg: float | None = None, rate_body_rad_s: Floats | Non
     check_reference(
         guidance.plan(scene.motion, lab.start, lab.profiles), scene, lab.vehicle, lab.duration_s
     )
+    # 2. Views.
     samples = samples_of(context, frames, tilt_deg)
-    facts = [
-        fact
-        for build in (*FACTS, sky_warnings.faintest_star, sky_warnings.fact)
-        if (fact := build(context, samples)) is not None
+    # 3. Facts and warnings.
+    built = [
+        build(context, samples) for build in (*FACTS, sky_warnings.faintest_star, sky_warnings.fact)
     ]
-    findings = [
-        line
-        for find in (*FINDINGS, *SKY_FINDINGS, dome_warnings.mirror_images)
-        if (line := find(context, samples))
+    facts = [fact for fact in built if fact is not None]
+    found = [
+        find(context, samples) for find in (*FINDINGS, *SKY_FINDINGS, dome_warnings.mirror_images)
     ]
+    findings = [line for line in found if line]
     for finder in (sky_warnings.bodies_near, sky_warnings.stray_light, sky_warnings.exclusion):
         findings += finder(context, samples)
     alike = dome_warnings.of(context, samples)
     if alike is not None and isinstance(scene.light, DomeConfig):
         facts.insert(2, dome_warnings.fact(alike))
-        findings += [line for line in [dome_warnings.finding(alike, scene.light)] if line]
+        warning = dome_warnings.finding(alike, scene.light)
+        findings += [warning] if warning else []
     findings += broken_assumptions(lab)
+    # 4. Heads.
     heads = [lab.of_camera(number) for number in range(1, len(lab.cameras))]
     checked = [check(head, tilt_deg, rate_body_rad_s) for head in heads]
     if checked:
@@ -115,9 +119,10 @@ def check(lab: Lab, tilt_deg: float | None = None, rate_body_rad_s: Floats | Non
 
 
 def ambiguity_map(lab: Lab) -> tuple[Ambiguity, float]:
-    """The most similar other field of the field about each LED within the greatest tilt, and what coincides, m.
+    """The most similar other field of each field within the greatest tilt, and the distance of coincidence in m.
 
-    The LEDs are numbered by their rows in the tracker's map. Raises InputError where fields are not compared.
+    A field is centered on an LED. LEDs are numbered by their rows in the tracker's map. Raises InputError if fields
+    cannot be compared.
     """
     context = context_of(lab)
     samples = samples_of(context, attitudes.of_frames(lab), None)
@@ -129,31 +134,36 @@ def ambiguity_map(lab: Lab) -> tuple[Ambiguity, float]:
 def samples_of(
     context: Context, frames: CheckedAttitudes, tilt_deg: float | None
 ) -> CheckedSamples:
-    """What the camera sees at the frames and within reach."""
+    """The views of the camera at the frames and at the attitudes in reach."""
     reach = attitudes.within_reach(context.lab.scene, context.lab.camera.mount, frames, tilt_deg)
     return CheckedSamples(sampled(frames, context), sampled(reach, context))
 
 
 def broken_assumptions(lab: Lab) -> list[str]:
-    """Warnings where the scene breaks an assumption of its tracker, of the renderer or of the frames' WCS."""
+    """Warnings that the scene breaks an assumption of its tracker, or of the WCS of its frames."""
     scene = lab.scene
     if isinstance(scene.light, StarsConfig):
-        return [line for line in [wcs.accuracy_warning(scene.camera)] if line]
+        warning = wcs.accuracy_warning(scene.camera)
+        return [warning] if warning else []
     if not isinstance(scene.light, DomeConfig):
         return []
     return dome_warnings.warnings(scene, lab.camera.sources, lab.camera.mount)
 
 
 def errors_arcsec(facts: Sequence[Fact]) -> tuple[float, float]:
-    """Expected cross and roll error at the frames, of the facts of one camera; NaN without a solution."""
-    frames = next((fact.values["frames"] for fact in facts if fact.name == "expected error"), None)
-    return (
-        (frames["cross_arcsec"], frames["roll_arcsec"]) if frames else (float("nan"), float("nan"))
-    )
+    """Expected cross and roll error at the frames from the facts of one camera; NaN without a solution."""
+    for fact in facts:
+        if fact.name == "expected error":
+            frames = fact.values["frames"]
+            return frames["cross_arcsec"], frames["roll_arcsec"]
+    return float("nan"), float("nan")
 
 
 def information(cross: float, roll: float) -> Floats:
-    """(3, 3) inverse covariance about the camera's axes, rad^-2; zeros without a solution."""
+    """(3, 3) inverse covariance about the camera's axes in rad^-2, of errors in arcsec; zeros without a solution.
+
+    The variance of cross is the sum of those about x and y, half of it each.
+    """
     if not np.isfinite([cross, roll]).all():
         return np.zeros((3, 3))
     across2 = (cross * ARCSEC_RAD) ** 2 / 2
@@ -162,9 +172,9 @@ def information(cross: float, roll: float) -> Floats:
 
 
 def together_arcsec(lab: Lab, errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Expected cross and roll error about the main boresight of all cameras together.
+    """Expected cross and roll error of all cameras together about the boresight of the main one.
 
-    Solutions of independent errors have the sum of their information: P^-1 = sum R_n P_n^-1 R_n^T with R_n the rotation
+    The information of solutions with independent errors adds up: P^-1 = sum R_n P_n^-1 R_n^T, with R_n the rotation
     from the axes of camera n to those of the main one.
     """
     total = np.zeros((3, 3))
@@ -179,7 +189,7 @@ def together_arcsec(lab: Lab, errors: Sequence[tuple[float, float]]) -> tuple[fl
 
 
 def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
-    """The expected errors of each head at the frames, and of all cameras together; facts : of each camera."""
+    """The expected errors of each head at the frames, and of all cameras together, from the facts of each camera."""
     errors = [errors_arcsec(own) for own in facts]
     names = [head.name for head in lab.scene.heads]
     lines = [
@@ -198,7 +208,7 @@ def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
 
 
 def errors_text(cross: float, roll: float) -> str:
-    """Expected errors as a sentence."""
+    """Expected errors in arcsec as text."""
     return (
         f"cross {short(cross)}{ARCSEC}, roll {short(roll)}{ARCSEC} (1σ)"
         if cross == cross
@@ -208,9 +218,6 @@ def errors_text(cross: float, roll: float) -> str:
 
 def head_findings(n: int, own: Sequence[str], main: Sequence[str]) -> list[str]:
     """The warnings of head n that are not those of the main camera, with the key of the head."""
-    # A head is pointed elsewhere by its mount.
-    lines = [
-        line.replace("motion.start:", "rotation_deg:", 1) if line not in main else line
-        for line in own
-    ]
+    # The mount of a head points it elsewhere, not the start of the motion.
+    lines = [line.replace("motion.start:", "rotation_deg:", 1) for line in own if line not in main]
     return [f"heads.{n}.{line}" for line in lines if line.startswith(OWN_KEYS) and line not in main]

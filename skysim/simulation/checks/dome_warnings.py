@@ -1,4 +1,11 @@
-"""Warnings about a dome: where it breaks an assumption of its tracker."""
+"""Warnings about a dome: broken assumptions of its tracker, fields that look alike, and images in its wall.
+
+A regular layout of LEDs is ambiguous however accurate its survey. Two fields are alike if ALIKE of the LEDs of the
+larger coincide when one is laid on the other, within SIGMAS standard deviations of an image position (survey and
+centroid); `layouts.ambiguity` tries the pairs and their rotations. The share of such fields is the share of frames that
+`led_pairs` refuses as ambiguous without a prior: to 0.15 for Poisson, Fibonacci, geodesic and two tape layouts with
+surveys of 0.05, 0.2 and 1 mm, under AFIT's camera (50 attitudes each).
+"""
 
 from __future__ import annotations
 
@@ -33,7 +40,7 @@ MAX_IMAGE_PX = 32.0
 
 
 def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
-    """The warnings for a dome whose inside holds the camera, one line each."""
+    """The warnings about assumptions of the tracker, one line each, for a camera inside the dome."""
     assert isinstance(scene.light, DomeConfig)
     inside = surface.build_surface(scene.light.surface)
     lines = [
@@ -46,7 +53,7 @@ def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
 
 
 def camera_outside_warning(scene: Scene, mount: Mount, start: Rotation) -> str:
-    """Warn where the camera is outside of the dome at the start (lab_from_body), so that its frames may be black."""
+    """Warn if the camera is outside of the dome at the start (lab_from_body), where its frames may be black."""
     camera_m = start.apply(mount.camera_body_m)
     if not isinstance(scene.light, DomeConfig) or surface.build_surface(scene.light.surface).inside(
         camera_m
@@ -59,7 +66,7 @@ def camera_outside_warning(scene: Scene, mount: Mount, start: Rotation) -> str:
 
 
 def surface_fit_warning(light: DomeConfig, inside: Surface) -> str:
-    """How far the points of a surveyed surface are from the smooth surface fitted to them; else empty."""
+    """The distance of the points of a surveyed surface from the fitted one, in words; empty for other surfaces."""
     config = light.surface
     fit = inside.fit if isinstance(inside, Radial) else None
     if fit is None or not isinstance(config, SurveyedSurfaceConfig):
@@ -71,7 +78,7 @@ def surface_fit_warning(light: DomeConfig, inside: Surface) -> str:
 
 
 def ellipsoid_warning(inside: Surface) -> str:
-    """Warn where the surface is not the ellipsoid that the tracker's methods assume: MAX_ELLIPSOID_RMS_M rms."""
+    """Warn if the surface differs by more than MAX_ELLIPSOID_RMS_M rms from the ellipsoid that the tracker assumes."""
     rms_m = inside.nearest_ellipsoid().rms_m
     if rms_m <= MAX_ELLIPSOID_RMS_M:
         return ""
@@ -82,10 +89,10 @@ def ellipsoid_warning(inside: Surface) -> str:
 
 
 def image_width_warning(scene: Scene, sources: Sources, mount: Mount) -> str:
-    """Warn where the local detector would take an LED's image for background.
+    """Warn if the local detector would treat the image of an LED as background.
 
-    The image of a disk of diameter D at a distance d is D f / d wide. Defocus by the thin lens adds the blur disk of
-    the pupil A, A |1 / d - 1 / focus| f wide.
+    The image of a disk of diameter D at the distance d has the width D f / d. Defocus of a thin lens with the pupil A
+    adds A |1 / d - 1 / focus| f.
     """
     if scene.tracker.detector != "local":
         return ""
@@ -103,7 +110,7 @@ def image_width_warning(scene: Scene, sources: Sources, mount: Mount) -> str:
 
 
 def exposure_warning(scene: Scene, sources: Sources) -> str:
-    """Warn where the exposure is shorter than the drive's cycle, so that a frame shows only some of the LEDs."""
+    """Warn if the exposure is shorter than the LED drive's cycle, so that a frame shows only some of the LEDs."""
     duty_cycled = sources.on_s < sources.period_s
     if not duty_cycled.any():
         return ""
@@ -116,22 +123,28 @@ def exposure_warning(scene: Scene, sources: Sources) -> str:
     )
 
 
-# Fields of an LED dome that look like another one: a regular layout is ambiguous however accurate
-# its survey.
+# Fields that look alike.
 
-
-ALIKE = 0.9  # fraction of coincident LEDs
+ALIKE = 0.9  # fraction of coincident LEDs from which two fields are alike
 BELOW = ALIKE - 1e-9
-SIGMAS = 3.0  # within which two LEDs coincide
-MAX_ALIKE = 0.05  # share of the fields that gives no warning
-MAX_WORK = (
-    20_000  # fields that are compared, those at the least tilts, times LEDs in a field: some 0.2 s
-)
-MIN_LEDS = 5  # in a field, on average: with fewer, any two fields are alike
+SIGMAS = 3.0  # distance within which two LEDs coincide, in standard deviations
+MAX_ALIKE = 0.05  # share of such fields that gives no warning
+MAX_WORK = 20_000  # number of fields compared times LEDs in a field, which takes about 0.2 s
+MIN_LEDS = 5  # mean number of LEDs in a field; with fewer, any two fields are alike
 
 
 class Lookalike(NamedTuple):
-    """The share of the fields that look like another one, how many were compared, and what coincides, m."""
+    """Fields of a dome that look like another one.
+
+    Attributes
+    ----------
+    share
+        Their share of the fields compared
+    fields
+        Number of fields compared
+    coincidence_m
+        Distance within which two LEDs coincide
+    """
 
     share: float
     fields: int
@@ -139,19 +152,17 @@ class Lookalike(NamedTuple):
 
 
 def of(context: Context, samples: CheckedSamples) -> Lookalike | None:
-    """The fields of a dome, each about an LED within the greatest tilt; None for few or coded LEDs, or stars."""
+    """The fields of a dome that look alike; None for few or coded LEDs, or stars."""
     if why_not_compared(context, samples):
         return None
     found, coincidence_m = compared(context, samples, BELOW, MAX_WORK)
-    return (
-        Lookalike(float((found.fraction > BELOW).mean()), len(found.led), coincidence_m)
-        if len(found.led)
-        else None
-    )
+    if not len(found.led):
+        return None
+    return Lookalike(float((found.fraction > BELOW).mean()), len(found.led), coincidence_m)
 
 
 def why_not_compared(context: Context, samples: CheckedSamples) -> str:
-    """Why fields are not compared; empty if they are."""
+    """The reason why fields cannot be compared; empty if they can."""
     if not isinstance(context.lab.scene.light, DomeConfig):
         return "light.kind: stars: only the layout of a dome can be ambiguous; allowed: dome"
     if context.lab.scene.tracker.decoder is not None:
@@ -165,17 +176,20 @@ def why_not_compared(context: Context, samples: CheckedSamples) -> str:
 def compared(
     context: Context, samples: CheckedSamples, least: float, most_work: int
 ) -> tuple[Ambiguity, float]:
-    """The most similar other field of each field within the greatest tilt, and what coincides, m.
+    """The most similar other field of each field within the greatest tilt, and the distance of coincidence in m.
 
-    a field
+    A field is centered on an LED.
 
     Parameters
     ----------
+    context, samples
+        Data of the checks
     least
-        Fraction below which none is sought
+        Least fraction of coincident LEDs; less similar fields are not sought
     most_work
-        Fields compared, those at the least tilts, times LEDs in
+        Greatest number of fields times LEDs in a field; the fields at the least tilts are compared
     """
+    # 1. Distance within which LEDs coincide, from the tracker's standard deviation of an image position.
     lab = context.lab
     camera = context.camera.optics.camera
     sigma_px = [
@@ -184,18 +198,22 @@ def compared(
         if len(view)
     ]
     distance_m = float(np.median(samples.reach.joined("distance_m")))
-    coincidence_m = (
-        SIGMAS * float(np.median(np.concatenate(sigma_px))) * distance_m / camera.focal_px
-    )
+    typical_px = float(np.median(np.concatenate(sigma_px)))
+    coincidence_m = SIGMAS * typical_px * distance_m / camera.focal_px
+    # 2. Greatest tilt of the fields, reduced to what most_work allows.
     place_m = context.beliefs.lights.place[:, :3]
     most = int(most_work / np.mean([len(view) for view in samples.reach.seen]))
     zenith_rad = np.sort(np.arctan2(np.hypot(*place_m.T[:2]), place_m[:, 2]))
     tilt_rad = float(attitudes.tilts_rad(samples.reach.attitudes).max())
+    if len(zenith_rad) >= most:
+        tilt_rad = min(tilt_rad, float(zenith_rad[most - 1]))
+    # 3. Comparison, with circular fields of the detector's area.
+    radius_px = math.sqrt(camera.width_px * camera.height_px / math.pi)
     found = field_ambiguity(
         place_m,
         float(np.linalg.norm(lab.camera.mount.camera_body_m)),
-        min(tilt_rad, float(zenith_rad[most - 1])) if len(zenith_rad) >= most else tilt_rad,
-        math.atan(math.sqrt(camera.width_px * camera.height_px / math.pi) / camera.focal_px),
+        tilt_rad,
+        math.atan(radius_px / camera.focal_px),
         coincidence_m,
         least,
     )
@@ -203,7 +221,7 @@ def compared(
 
 
 def fact(found: Lookalike) -> Fact:
-    """How many fields look like another one."""
+    """The fact about the fields that look alike."""
     share = (
         f"{100 * found.share:.0f} % of {found.fields}" if found.share else f"none of {found.fields}"
     )
@@ -212,7 +230,7 @@ def fact(found: Lookalike) -> Fact:
 
 
 def finding(found: Lookalike, light: DomeConfig) -> str:
-    """Warn where many fields look like another one."""
+    """Warn if many fields look like another one."""
     if found.share <= MAX_ALIKE:
         return ""
     points = light.layout.points if isinstance(light.layout, OnPoints) else light.layout
@@ -226,11 +244,11 @@ def finding(found: Lookalike, light: DomeConfig) -> str:
     )
 
 
-# Whether the tracker detects images of LEDs in the dome's wall.
+# Images of LEDs in the dome's wall.
 
 
 def mirror_images(context: Context, samples: CheckedSamples) -> str:
-    """Warn where images of LEDs in the wall are bright enough to be taken for LEDs: false lights."""
+    """Warn if the tracker detects images of LEDs in the wall, which are false lights."""
     lab = context.lab
     frames = samples.frames
     mirror = find_light(lab.camera.lights, Mirror)

@@ -1,8 +1,8 @@
 """Expected error of a solution, from the Jacobians of the image positions, and its causes.
 
-A solution is a rotation of the camera, found by weighted least squares from the image positions x_i of n lights. For a
-small rotation w of the lights in camera axes, dx_i = J_i w. An error e_i of the measured or predicted position causes,
-to first order, the attitude error
+A solution is a rotation of the camera that is fitted to the image positions x_i of n lights by weighted least squares.
+For a small rotation w of the lights in camera axes, dx_i = J_i w. An error e_i of the measured or predicted position
+causes, to first order, the attitude error
 
     w = sum_i K_i e_i,      K_i = M^-1 J_i' / s_i^2,      M = sum_i J_i' J_i / s_i^2,
 
@@ -12,7 +12,8 @@ Each cause is an e_i, so each has its own covariance of w:
     independent in each light, covariance S_i      sum_i K_i S_i K_i'         centroid noise, LED survey
     common to all lights, E_i p, p unit variance   B B',  B = sum_i K_i E_i   lever, surface, focal length, ...
 
-A known error is one of the second kind with p = 1. With G_i the derivative of x_i by the light's place in camera axes:
+A known error is one of the second kind with p = 1. With G_i the derivative of x_i by the light's position in camera
+axes and R the rotation from lab to camera axes:
 
     centroid noise : S_i of `centroid_variance`
     LED survey     : S_i = sigma^2 G_i G_i'                  lever survey : E_i = -sigma G_i
@@ -22,10 +23,15 @@ A known error is one of the second kind with p = 1. With G_i the derivative of x
     angular acceleration a : E_i = -J_i a T^2 / 24 against the attitude at mid-exposure: the images are rotated by
         rate t + a t^2 / 2 at the time t from it, and the mean of t^2 / 2 over an exposure T is T^2 / 24
 
-The error of a solver's own approximation (thesis, infinity, ...) is what it errs for exact rays. `pnp` also fits the
-camera's place, so its J_i has three more columns. Variances about x and y add up to cross, that about z is roll.
-Star places are those of the catalog and of images with
-neighbors (star_places.py). Errors that are left out: neighbors of LEDs, jitter, a light's identity.
+The approximation of a solver (thesis, infinity, ...) has the error of its solution for exact rays. `pnp` also fits the
+camera's position, so its J_i has three more columns. Errors of star places are those of the catalog and of neighbors
+(beliefs.py). Neighbors of LEDs, jitter and wrong identifications are left out.
+
+`causes_at` computes the variances at one attitude:
+
+1. The gain K_i of each light (`gains`).
+2. The errors e_i of each cause (`CAUSES`).
+3. Their covariances of w (`covariance`). The variances about x and y add up to cross, that about z is roll.
 """
 
 from __future__ import annotations
@@ -54,64 +60,61 @@ from skysim.sources.dome import survey_errors
 
 
 class Independent(NamedTuple):
-    """An error that is independent in each light: (n, 2, 2) covariances of the image positions, px^2."""
+    """An error that is independent in each light: covariances (n, 2, 2) of the image positions in px^2."""
 
     covariance_px2: Floats
 
 
 class Common(NamedTuple):
-    """Errors common to all lights: (n, 2, k) displacement of the image positions by k of unit variance, px."""
+    """Errors common to all lights: displacements (n, 2, k) of the image positions in px by k unit-variance errors."""
 
     displacement_px: Floats
 
 
 class Expected(NamedTuple):
-    """Variances of the attitude error at A attitudes, by cause: (A,) each, rad^2; NaN with too few lights."""
+    """Variances (A,) of the attitude error at A attitudes in rad^2, by cause; NaN with too few lights."""
 
     cross_rad2: dict[str, Floats]
     roll_rad2: dict[str, Floats]
 
     def by_cause(self, angle: str) -> dict[str, Floats]:
-        """The variances of `cross` or `roll`."""
+        """The variances of the angle `cross` or `roll`, by cause."""
         return self.cross_rad2 if angle == "cross" else self.roll_rad2
 
     def total(self, angle: str) -> Floats:
-        """(A,) variance of `cross` or `roll` of all causes together; NaN with too few lights."""
+        """(A,) variance of the angle `cross` or `roll` by all causes together; NaN with too few lights."""
         return np.asarray(sum(self.by_cause(angle).values()))
 
     def rms_arcsec(self) -> tuple[float, float]:
-        """Root mean square of cross and roll over the attitudes; NaN without any solution."""
+        """Root mean square of cross and roll over the attitudes in arcsec; NaN without any solution."""
         return mean_root(self.total("cross")), mean_root(self.total("roll"))
 
 
 def mean_root(variance_rad2: Floats) -> float:
-    """Root of the mean of the finite variances, arcseconds; NaN if there is none."""
+    """Root of the mean of the finite variances in arcsec; NaN if there is none."""
     finite = variance_rad2[np.isfinite(variance_rad2)]
     return float(np.sqrt(finite.mean()) / ARCSEC_RAD) if len(finite) else math.nan
 
 
-# Causes of the attitude error. Each returns the errors of the image positions, or None if there is no such cause.
+# Causes of the attitude error. Each returns the errors of the image positions, or None if the scene does not have it.
 
 
 def led_survey(view: View, lab_from_cam: Rotation, context: Context) -> Independent | None:
-    sigma_m = context.beliefs.led_sigma_m
-    survey = context.lab.scene.tracker.survey
+    """Errors of the surveyed LED positions, S_i = sigma^2 G_i G_i', or G_i C_i G_i' if an instrument gives C_i."""
     place_m = context.beliefs.lights.place[view.row, :3]
-    own_m2 = survey_errors.led_covariance_m2(place_m, survey)
+    own_m2 = survey_errors.led_covariance_m2(place_m, context.lab.scene.tracker.survey)
     if own_m2 is not None:
-        gradient_lab = (
-            view.gradient @ lab_from_cam.inv().as_matrix()
-        )  # of the image with respect to a place in the lab
+        # Derivative of the image by a position in lab axes.
+        gradient_lab = view.gradient @ lab_from_cam.inv().as_matrix()
         return Independent(gradient_lab @ own_m2 @ np.swapaxes(gradient_lab, 1, 2))
-    return (
-        Independent(sigma_m**2 * view.gradient @ np.swapaxes(view.gradient, 1, 2))
-        if sigma_m
-        else None
-    )
+    sigma_m = context.beliefs.led_sigma_m
+    if not sigma_m:
+        return None
+    return Independent(sigma_m**2 * view.gradient @ np.swapaxes(view.gradient, 1, 2))
 
 
 def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
-    """Errors of the instrument's set-up, common to all LEDs."""
+    """Errors of the set-up of the survey's instrument, common to all LEDs."""
     instrument = context.lab.scene.tracker.survey.instrument
     if instrument is None:
         return None
@@ -123,11 +126,13 @@ def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Common
 
 
 def lever_survey(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    """Error of the surveyed lever (camera's position), E_i = -sigma G_i."""
     sigma_m = context.beliefs.lever_sigma_m
     return Common(-sigma_m * view.gradient) if sigma_m else None
 
 
 def surface_survey(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    """Error of the surveyed surface along its normal, E_i = sigma G_i R n_i."""
     sigma_m = context.beliefs.surface_sigma_m
     surface = context.surface
     if not sigma_m or surface is None:
@@ -137,33 +142,36 @@ def surface_survey(view: View, lab_from_cam: Rotation, context: Context) -> Comm
 
 
 def survey_rotation(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    """Rotation r of the survey's axes, E_i = G_i R (r x P_i)."""
     rotation_rad = context.beliefs.rotation_rad
     if not rotation_rad.any():
         return None
-    return displacement(
-        view, np.cross(rotation_rad, context.beliefs.lights.place[view.row, :3]), lab_from_cam
-    )
+    shift_m = np.cross(rotation_rad, context.beliefs.lights.place[view.row, :3])
+    return displacement(view, shift_m, lab_from_cam)
 
 
 def assumed_lever(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    """Error of the lever that the scene makes the tracker assume, E_i = -G_i error."""
     error_m = context.beliefs.lever_error_m
     if not error_m.any() or context.surface is None:
         return None
-    return Common(
-        -(view.gradient @ context.lab.camera.mount.cam_from_body.apply(error_m))[:, :, None]
-    )
+    error_cam_m = context.lab.camera.mount.cam_from_body.apply(error_m)
+    return Common(-(view.gradient @ error_cam_m)[:, :, None])
 
 
 def focal_length(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    """Relative error of the focal length, E_i = error (x_i - center)."""
     error = math.hypot(context.beliefs.focal_error, context.beliefs.focal_sigma)
-    if not error:
-        return None
-    return Common(
-        error * (view.xy_px - np.array(context.camera.optics.camera.center_px))[:, :, None]
-    )
+    return Common(error * from_center_px(view, context)) if error else None
+
+
+def from_center_px(view: View, context: Context) -> Floats:
+    """(n, 2, 1) image positions relative to the principal point: their derivative by the relative focal length."""
+    return (view.xy_px - np.array(context.camera.optics.camera.center_px))[:, :, None]
 
 
 def distortion(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    """Difference of the image positions with the believed and the true distortion."""
     believed = context.beliefs.camera
     if believed.distortion == context.camera.optics.camera.distortion:
         return None
@@ -172,11 +180,13 @@ def distortion(view: View, lab_from_cam: Rotation, context: Context) -> Common |
 
 
 def star_places(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    """Errors of the stars' believed directions, from the catalog and from neighbors."""
     error = context.beliefs.direction_error[view.row]
     return displacement(view, error, lab_from_cam) if error.any() else None
 
 
 def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    """Motion of the images during the difference of true and assumed delay of their rows from the middle row."""
     camera = context.camera.optics.camera
     if not isinstance(camera.shutter, RollingShutterConfig):
         return None
@@ -185,17 +195,17 @@ def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Com
     if not error_s:
         return None
     delay_s = error_s * (view.xy_px[:, 1] - (camera.height_px - 1) / 2)
-    return Common(
-        (view.streak_px / context.lab.scene.exposure.time_s * delay_s[:, None])[:, :, None]
-    )
+    velocity_px_s = view.streak_px / context.lab.scene.exposure.time_s
+    return Common((velocity_px_s * delay_s[:, None])[:, :, None])
 
 
 def angular_acceleration(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    """Mean displacement of the images in the exposure from those at mid-exposure, E_i = -J_i a T^2 / 24."""
     return Common(view.bend_px[:, :, None]) if view.bend_px.any() else None
 
 
 def displacement(view: View, shift_lab: Floats, lab_from_cam: Rotation) -> Common:
-    """The displacement of the images by shifts (n, 3) of the lights in lab axes."""
+    """The displacement of the images by shifts (n, 3) of the lights in lab axes, E_i = G_i R shift_i."""
     return Common(
         np.einsum("nij,nj->ni", view.gradient, lab_from_cam.inv().apply(shift_lab))[:, :, None]
     )
@@ -215,26 +225,28 @@ CAUSES: dict[str, Callable[[View, Rotation, Context], Independent | Common | Non
     "angular acceleration": angular_acceleration,
 }
 UNKNOWN_TO_TRACKER = ("focal length", "distortion", "assumed lever", "rolling shutter")
-OUTSIDE_OF_GATE = (
-    "survey set-up",
-    "surface survey",
-)  # drawn once: in the tracker's covariance, not in its radius
-# the causes that are not displacements of all images
+# A survey draws these once. The tracker's covariance contains them, its matching radius does not.
+OUTSIDE_OF_GATE = ("survey set-up", "surface survey")
+# Two more causes, which are no displacements of all images.
 CENTROIDS = "centroid noise"
 SOLVER = "solver"
-EXACT_SOLVERS = ("rotation_only", "pnp")  # without an error of their own
+EXACT_SOLVERS = ("rotation_only", "pnp")  # solvers without an approximation
 
 
 # Propagation to the attitude.
 
 
 def gains(view: View, sigma_px: Floats, fitted: Floats | None = None) -> Floats:
-    """(n, 3, 2) K_i: the rotation by a unit error of each image position, for weights 1 / sigma^2.
+    """(n, 3, 2) gains K_i = M^-1 J_i' / s_i^2: rotation vector by a unit error of each image position.
 
     Parameters
     ----------
+    view
+        The n lights
+    sigma_px
+        (n,) standard deviations s_i
     fitted
-        (n, 2, k) derivatives of the image positions by what is fitted beside the rotation
+        (n, 2, k) derivatives of the image positions by k parameters that are fitted with the rotation
 
     Raises
     ------
@@ -243,7 +255,7 @@ def gains(view: View, sigma_px: Floats, fitted: Floats | None = None) -> Floats:
     """
     jacobian = view.jacobian if fitted is None else np.concatenate([view.jacobian, fitted], axis=2)
     weighted = jacobian / sigma_px[:, None, None] ** 2
-    # Columns are scaled, because a rotation and a shift in meters have different sizes.
+    # Scale the columns, because a rotation in rad and a shift in meters have different sizes.
     size = np.sqrt(np.einsum("nij,nij->j", jacobian, jacobian))
     information = np.einsum("nij,nik->jk", weighted, jacobian) / np.outer(size, size)
     if np.linalg.cond(information) > 1e14:
@@ -253,7 +265,7 @@ def gains(view: View, sigma_px: Floats, fitted: Floats | None = None) -> Floats:
 
 
 def covariance(gain: Floats, errors: Independent | Common) -> Floats:
-    """(3, 3) covariance of the rotation in camera axes, rad^2."""
+    """(3, 3) covariance of the rotation in camera axes in rad^2: sum K_i S_i K_i', or B B' with B = sum K_i E_i."""
     if isinstance(errors, Independent):
         return np.asarray(np.einsum("nij,njk,nlk->il", gain, errors.covariance_px2, gain))
     response = np.einsum("nij,njk->ik", gain, errors.displacement_px)
@@ -261,31 +273,31 @@ def covariance(gain: Floats, errors: Independent | Common) -> Floats:
 
 
 def believed_sigma_px(view: View, noise: Independent, context: Context) -> Floats:
-    """(n,) standard deviation of an image position as the tracker believes it: centroid, floor and LED survey."""
+    """(n,) standard deviation of each image position that the tracker believes: centroid, floor and LED survey.
+
+    The tracker takes the LED survey's part at the nearest LED for all.
+    """
     settings = context.settings
     beliefs = context.beliefs
     own2 = np.trace(noise.covariance_px2, axis1=1, axis2=2) / 2
     survey_px = 0.0
     if beliefs.led_sigma_m:
-        survey_px = (
-            context.camera.optics.camera.focal_px
-            * beliefs.led_sigma_m
-            / float(view.distance_m.min())
-        )
+        focal_px = context.camera.optics.camera.focal_px
+        survey_px = focal_px * beliefs.led_sigma_m / float(view.distance_m.min())
     return np.asarray(np.sqrt(own2 + settings.centroid_sigma_px**2 + survey_px**2))
 
 
 class Mismatch(NamedTuple):
-    """How far images are from where the tracker expects them, after the best attitude for that.
+    """Distances of images from their expected positions, after the best rotation.
 
     Attributes
     ----------
     residual_px
-        (n,) of all errors together, of those drawn once 1 sigma
+        (n,) distances by all errors together, with 1 sigma of the errors that are drawn once
     gate_px
-        (n,) at which the tracker takes a light for another
+        (n,) matching radius of the tracker
     by_cause
-        Rms of the residual of each cause
+        Rms distance by each cause
     """
 
     residual_px: Floats
@@ -294,12 +306,12 @@ class Mismatch(NamedTuple):
 
 
 def fits_focal_length(context: Context) -> bool:
-    """Whether the tracker fits the focal length with the attitude: under a dome some identifiers do."""
+    """Whether the tracker fits the focal length with the attitude, as some identifiers do under a dome."""
     return context.surface is not None and context.settings.identifier in FITS_FOCAL
 
 
 def finds_focal_length(context: Context) -> bool:
-    """Whether the tracker solves with the right focal length instead: the default identifier does under the stars."""
+    """Whether the tracker finds the right focal length: by a fit, or by the default identifier under the stars."""
     scene = context.lab.scene
     if fits_focal_length(context):
         return abs(context.beliefs.focal_error) < FOCAL_UNCERTAINTY
@@ -313,11 +325,14 @@ def finds_focal_length(context: Context) -> bool:
 def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch | None:
     """The mismatch by errors that the tracker's matching radius leaves out; None if there is none, or too few lights.
 
-    A known error displaces every image by its vector; an error that is drawn once for all lights by 1 sigma of each of
-    its parts, which add in quadrature.
+    1. Displacements by each of these causes. A known error displaces every image by its vector; an error that is drawn
+       once displaces it by 1 sigma of each of its parts.
+    2. The best rotation removes a part of each: shift_i - J_i sum_k K_k shift_k is left.
+    3. Known errors add up as vectors, the others in quadrature.
     """
     if len(view) < MIN_EVIDENCE_MATCHES:
         return None
+    # 1. Displacements.
     causes = {
         name: CAUSES[name](view, lab_from_cam, context)
         for name in (*UNKNOWN_TO_TRACKER, *OUTSIDE_OF_GATE)
@@ -328,7 +343,7 @@ def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch |
         if isinstance(errors, Common)
     }
     if context.beliefs.focal_sigma or finds_focal_length(context):
-        shifts.pop("focal length", None)  # the tracker allows for it
+        shifts.pop("focal length", None)  # the tracker corrects it
     if not shifts:
         return None
     sigma_px = believed_sigma_px(view, Independent(centroid_variance(view, context)), context)
@@ -336,11 +351,13 @@ def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch |
         gain = gains(view, sigma_px)
     except np.linalg.LinAlgError:
         return None
+    # 2. Residuals of the best rotation.
     left = {
         name: shift - view.jacobian @ np.einsum("nij,njk->ik", gain, shift)
         for name, shift in shifts.items()
     }
     rms = {name: float(np.sqrt((shift**2).sum(axis=(1, 2)).mean())) for name, shift in left.items()}
+    # 3. Sum of all causes.
     known = sum(
         (shift for name, shift in left.items() if name in UNKNOWN_TO_TRACKER),
         np.zeros((len(view), 2, 1)),
@@ -351,7 +368,7 @@ def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch |
 
 
 def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
-    """(3,) rotation vector in camera axes by which the dome's solver errs for exact rays; None if it is exact."""
+    """(3,) error of the dome's solver for exact rays, a rotation vector in camera axes; None for an exact solver."""
     lab = context.lab
     name = context.settings.solver
     surface = context.surface
@@ -362,24 +379,23 @@ def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats
     leds = LedMap(view.row, place_m, center_m, semi_axes_m, None, 0.0)
     lever = Lever(lab.camera.mount.camera_body_m, lab.camera.mount.cam_from_body, 0.0)
     rays = view.offset_m / np.linalg.norm(view.offset_m, axis=1, keepdims=True)
-    body_from_lab = lab.camera.mount.cam_from_body.inv() * lab_from_cam.inv()
+    cam_from_body = lab.camera.mount.cam_from_body
+    body_from_lab = cam_from_body.inv() * lab_from_cam.inv()
     try:
         solved, _ = SOLVERS[name](
             rays, np.full(len(rays), 1e-5), place_m, leds, lever, body_from_lab
         )
     except (ValueError, np.linalg.LinAlgError):
         return None
-    cam_from_body = lab.camera.mount.cam_from_body
-    return np.asarray(
-        (cam_from_body * solved * body_from_lab.inv() * cam_from_body.inv()).as_rotvec()
-    )
+    error = cam_from_body * solved * body_from_lab.inv() * cam_from_body.inv()
+    return np.asarray(error.as_rotvec())
 
 
 def expected(views: list[View], attitudes: CheckedAttitudes, context: Context) -> Expected:
-    """The expected errors at some attitudes with the lights that the tracker uses there."""
-    cross, roll = (
-        {name: np.zeros(len(views)) for name in (CENTROIDS, *CAUSES, SOLVER)} for _ in range(2)
-    )
+    """The expected errors at some attitudes, from the views of the lights that the tracker uses there."""
+    names = (CENTROIDS, *CAUSES, SOLVER)
+    cross = {name: np.zeros(len(views)) for name in names}
+    roll = {name: np.zeros(len(views)) for name in names}
     cam_from_body = context.lab.camera.mount.cam_from_body
     for a, view in enumerate(views):
         variances = causes_at(view, attitudes.lab_from_body[a] * cam_from_body.inv(), context)
@@ -390,11 +406,12 @@ def expected(views: list[View], attitudes: CheckedAttitudes, context: Context) -
 
 
 def causes_at(view: View, lab_from_cam: Rotation, context: Context) -> dict[str, Floats]:
-    """(3,) variances about the camera's axes at one attitude by cause, rad^2; NaN if the lights are too few."""
+    """(3,) variances about the camera's axes at one attitude in rad^2, by cause; NaN with too few lights."""
+    # 1. Gains, with the parameters that the tracker fits as well.
     noise = Independent(centroid_variance(view, context))
     fitted = None
     if fits_focal_length(context):
-        fitted = (view.xy_px - np.array(context.camera.optics.camera.center_px))[:, :, None]
+        fitted = from_center_px(view, context)
     elif context.surface is not None and context.settings.solver == "pnp":
         fitted = view.gradient
     try:
@@ -403,9 +420,10 @@ def causes_at(view: View, lab_from_cam: Rotation, context: Context) -> dict[str,
         gain = gains(view, believed_sigma_px(view, noise, context), fitted)
     except np.linalg.LinAlgError:
         return {CENTROIDS: np.full(3, np.nan)}
-    causes = {name: cause(view, lab_from_cam, context) for name, cause in CAUSES.items()} | {
-        CENTROIDS: noise
-    }
+    # 2. Causes.
+    causes = {name: cause(view, lab_from_cam, context) for name, cause in CAUSES.items()}
+    causes[CENTROIDS] = noise
+    # 3. Variances, and the solver's own error squared.
     variances = {
         name: np.diag(covariance(gain, errors))
         for name, errors in causes.items()

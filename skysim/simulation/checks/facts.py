@@ -1,4 +1,7 @@
-"""The facts of a plan, as text and as numbers: field, lights, spot, peak, smear, focus, beliefs, expected error."""
+"""The facts of a plan as text and as numbers: field, lights, image size, peak, smear, focus, beliefs, expected error.
+
+Each function in `FACTS` returns one fact from the context and the samples, or None if the plan does not have it.
+"""
 
 from __future__ import annotations
 
@@ -22,14 +25,14 @@ from skysim.sources.dome.layouts.led_list import max_tilt_deg
 from skysim.sources.dome.room import fit
 
 GAUSSIAN_WIDTH = 4.0  # width of an image over its rms radius: D4sigma (ISO 11146), the diameter of a uniform disk
-SIDES = 12  # to which the greatest tilt is tried, and rays around the field
-MIN_SHARE = 0.005  # of the variance of a cause that is printed
+SIDES = 12  # number of azimuths of the greatest tilt, and of rays around the field
+MIN_SHARE = 0.005  # least share of the variance of a cause that is printed
 ARCSEC = "″"
 TRACKER_KNOWS = "tracker knows"
 
 
 def short(value: float, digits: int = 3) -> str:
-    """A number with some significant digits and without an exponent."""
+    """A number as text with this number of significant digits and without an exponent."""
     return f"{float(f'{value:.{digits}g}'):.10g}"
 
 
@@ -42,7 +45,7 @@ class Fact(NamedTuple):
 
 
 def field_of_view(context: Context, samples: CheckedSamples) -> Fact:
-    """Angles between the centers of opposite edges and corners of the chip, without distortion."""
+    """Angles between the centers of opposite edges and between opposite corners of the detector, without distortion."""
     lens = context.camera.optics.camera.calibration()
     return Fact(
         "field of view",
@@ -52,7 +55,7 @@ def field_of_view(context: Context, samples: CheckedSamples) -> Fact:
 
 
 def lights_in_field(context: Context, samples: CheckedSamples) -> Fact:
-    """How many lights the tracker knows and detects in the field: mean and least, and where the least are."""
+    """Number of lights that the tracker knows and detects in the field: mean, least, and the attitude of the least."""
     scene = context.lab.scene
     mount = context.lab.camera.mount
     lines = []
@@ -91,33 +94,28 @@ def lights_in_field(context: Context, samples: CheckedSamples) -> Fact:
 
 
 def other_lights(context: Context, samples: CheckedSamples) -> Fact | None:
-    """Lights at the frames that the tracker detects and does not know, by their names; None if there are none."""
+    """Lights at the frames that the tracker detects and does not know, by name; None if there are none."""
     others = samples.frames.others
-    most = {
-        name: max(len(one.get(name, ())) for one in others)
-        for name in {name for one in others for name in one}
-    }
-    if not most:
-        return None
-    frames = {name: sum(name in one for one in others) for name in most}
-    lines = [
-        f"{name}: up to {most[name]} at {frames[name]} of {len(others)} frames, which the tracker does not know"
-        for name in sorted(most)
-    ]
-    values = {
-        name: {"most": most[name], "share": frames[name] / len(others)} for name in sorted(most)
-    }
-    return Fact("other lights", lines, values)
+    lines = []
+    values = {}
+    for name in sorted({name for one in others for name in one}):
+        most = max(len(one.get(name, ())) for one in others)
+        frames = sum(name in one for one in others)
+        lines.append(
+            f"{name}: up to {most} at {frames} of {len(others)} frames, which the tracker does not know"
+        )
+        values[name] = {"most": most, "share": frames / len(others)}
+    return Fact("other lights", lines, values) if lines else None
 
 
 def reached(context: Context, samples: CheckedSamples) -> str:
-    """What directions the motion could reach, in words."""
+    """The directions in reach of the motion, in words."""
     tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
     return f"any azimuth and yaw to {tilt_deg:.1f}° of tilt"
 
 
 def spot(context: Context, samples: CheckedSamples) -> Fact:
-    """Width of the median image without motion, and what it is made of."""
+    """Width of the median image without motion, and its parts: lens, LED and defocus."""
     sampled = samples.frames if sum(map(len, samples.frames.seen)) else samples.reach
     sigma, disk, defocus = (sampled.joined(name) for name in ("sigma_px", "disk_px", "defocus_px"))
     lens_px = GAUSSIAN_WIDTH * context.camera.lens_px
@@ -135,7 +133,7 @@ def spot(context: Context, samples: CheckedSamples) -> Fact:
 
 
 def fill(context: Context, samples: CheckedSamples) -> Floats:
-    """Peaks of all lights at the frames over the full well, or over the converter's range if that is less."""
+    """(n,) peaks of all lights at the frames over the full well, or over the range of the converter if that is less."""
     return samples.frames.joined("peak_e") / full_scale_e(context.lab.scene.camera.detector)
 
 
@@ -184,18 +182,20 @@ def smear(context: Context, samples: CheckedSamples) -> Fact:
 
 
 class CapMargin(NamedTuple):
-    """The cap of a dome's LEDs, a tilt, and what the field needs there; degrees from the zenith.
+    """The cap of a dome's LEDs and the reach of the field at a tilt, in degrees from the zenith.
 
     Attributes
     ----------
     cap_deg
-        Where the LEDs end; of a `listed` layout, the farthest one
+        End of the LEDs; of a `listed` layout, that of the farthest one
+    tilt_deg
+        The tilt
     needed_deg
-        For the middle of the field's longer side
+        Reach of the middle of the field's longer side
     corner_deg
-        For its corner
+        Reach of the field's corner
     limit_deg
-        The layout's `cap_deg`, to which shell and wires reach
+        `cap_deg` of the layout, to which shell and wires extend
     """
 
     cap_deg: float
@@ -206,7 +206,7 @@ class CapMargin(NamedTuple):
 
     @property
     def text(self) -> str:
-        """What the field needs, and the margins, in words."""
+        """The reach of the field and the margins in words."""
         edge, corner = (self.cap_deg - needed for needed in (self.needed_deg, self.corner_deg))
         return (
             f"the field's edge reaches {self.needed_deg:.1f}°, its corner {self.corner_deg:.1f}°: margin {edge:+.1f}°"
@@ -217,16 +217,18 @@ class CapMargin(NamedTuple):
 def cap_margin(
     context: Context, samples: CheckedSamples, tilt_deg: float | None = None
 ) -> CapMargin | None:
-    """How far the LEDs reach beyond the field at a tilt; None without a layout that fills a cap.
+    """The cap of the LEDs and the reach of the field at a tilt; None without a layout that fills a cap.
 
-    Any side or corner of the field may point outward. Rays at these angles from the boresight are traced to the surface
-    from the pupil, at the tilt to all sides; their angle from the zenith, as seen from the bearing, is what
-    `light.layout.cap_deg` is compared with.
+    Any side or corner of the field may point outward. `field_reach_deg` traces rays at their angles from the boresight
+    to the surface, at the tilt to all sides. `light.layout.cap_deg` is compared with their angle from the zenith as
+    seen from the bearing.
 
     Parameters
     ----------
+    context, samples
+        Data of the checks
     tilt_deg
-        The greatest of the attitudes in reach if None
+        The tilt; None for the greatest of the attitudes in reach
     """
     light = context.lab.scene.light
     camera = context.camera.optics.camera
@@ -241,34 +243,31 @@ def cap_margin(
     )
     if tilt_deg is None:
         tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
-    size_px = (camera.width_px, camera.height_px)
-    edge, corner = (
-        field_reach_deg(context, radius_px, tilt_deg)
-        for radius_px in (max(size_px) / 2, camera.corner_px)
-    )
+    edge = field_reach_deg(context, max(camera.width_px, camera.height_px) / 2, tilt_deg)
+    corner = field_reach_deg(context, camera.corner_px, tilt_deg)
     return CapMargin(cap_deg, tilt_deg, edge, corner, float(points.cap_deg))
 
 
 def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> float:
-    """Greatest angle from the zenith, at the bearing, at which a circle of the field meets the dome at a tilt."""
+    """Greatest angle from the zenith, seen from the bearing, at which a circle of the field meets the tilted dome.
+
+    The circle has the radius radius_px about the boresight. The tilt is tried to SIDES azimuths.
+    """
     mount = context.lab.camera.mount
     surface = context.surface
     azimuth = 2 * np.pi * np.arange(SIDES) / SIDES
     assert surface is not None
     radius = radius_px / context.camera.optics.camera.focal_px
-    tilt_rad = math.radians(tilt_deg)
     rays_cam = np.column_stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.ones(SIDES)])
+    tilts = np.column_stack([azimuth, np.full(SIDES, math.radians(tilt_deg)), -azimuth])
     needed_deg = 0.0
-    for lab_from_body in Rotation.from_euler(
-        "ZYZ", np.column_stack([azimuth, np.full(SIDES, tilt_rad), -azimuth])
-    ):
+    for lab_from_body in Rotation.from_euler("ZYZ", tilts):
         rays = lab_from_body.apply(mount.cam_from_body.inv().apply(rays_cam))
         met = surface.meet(lab_from_body.apply(mount.camera_body_m), rays)
-        # A ray that misses the surface passes below its rim: its own direction is the least that it needs.
+        # A ray that misses the surface passes below its rim: its own direction is the least angle that it needs.
         met = np.where(np.isnan(met), rays, met)
-        needed_deg = max(
-            needed_deg, float(np.degrees(np.arctan2(np.hypot(*met.T[:2]), met[:, 2])).max())
-        )
+        zenith_rad = np.arctan2(np.hypot(*met.T[:2]), met[:, 2])
+        needed_deg = max(needed_deg, float(np.degrees(zenith_rad).max()))
     return needed_deg
 
 
@@ -296,7 +295,7 @@ def cap(context: Context, samples: CheckedSamples) -> Fact | None:
 
 
 def room(context: Context, samples: CheckedSamples) -> Fact | None:
-    """How the dome fits into the room where it is to be built, which a scene that does not fit refuses."""
+    """The size of the dome and its parts in the room and its door; a scene that does not fit was refused before."""
     light = context.lab.scene.light
     surface = context.surface
     if not isinstance(light, DomeConfig) or light.room is None or surface is None:
@@ -323,7 +322,7 @@ def room(context: Context, samples: CheckedSamples) -> Fact | None:
 
 
 def depth_of_focus(context: Context, samples: CheckedSamples) -> Fact:
-    """Distances at which the defocus disk is one pixel wide: 1 / u = 1 / focus ± pixel / (pupil image_distance)."""
+    """Distances u at which the defocus disk is one pixel wide: 1 / u = 1 / focus ± pixel / (pupil image_distance)."""
     camera = context.camera.optics.camera
     spread = camera.pixel_m / (camera.pupil_m * camera.image_distance_m)
     near_m = 1 / (1 / camera.focus_m + spread)
@@ -346,7 +345,7 @@ def depth_of_focus(context: Context, samples: CheckedSamples) -> Fact:
 
 
 def tracker_beliefs(context: Context, samples: CheckedSamples) -> Fact:
-    """What the tracker believes, and what of it is uncertain or wrong."""
+    """The beliefs of the tracker that are uncertain or wrong."""
     believed = context.beliefs
     values = {
         "led_sigma_m": believed.led_sigma_m,
@@ -363,7 +362,7 @@ def tracker_beliefs(context: Context, samples: CheckedSamples) -> Fact:
 
 
 def expected_error(context: Context, samples: CheckedSamples) -> Fact:
-    """Expected cross and roll error, 1 sigma, and the causes in the order of their share."""
+    """Expected cross and roll error, 1 sigma, and their causes, the largest first."""
     scene = context.lab.scene
     mount = context.lab.camera.mount
     lines: list[str] = []
@@ -410,7 +409,7 @@ SURVEYED = ("LED survey", "survey set-up", "lever survey", "surface survey")
 
 
 def causes(sampled: Sampled, angle: str) -> dict[str, float]:
-    """The causes of an error and their size, rms over the attitudes, arcseconds, the largest first."""
+    """The rms over the attitudes of the error by each cause in arcsec, the largest first."""
     by_cause = sampled.error.by_cause(angle)
     known = np.isfinite(sampled.error.total(angle))
     size = {name: mean_root(variance[known]) for name, variance in by_cause.items()}
@@ -420,7 +419,7 @@ def causes(sampled: Sampled, angle: str) -> dict[str, float]:
 
 
 def cause_text(sampled: Sampled, angle: str) -> str:
-    """The causes with their size and their share of the variance."""
+    """The causes as text, with their size and their share of the variance."""
     sizes = causes(sampled, angle)
     total = math.fsum(size**2 for size in sizes.values())
     parts = [

@@ -1,4 +1,8 @@
-"""Warnings about a plan: each names the key to change, what is wrong, and what to change it to."""
+"""Warnings about a plan: each names the key to change, the problem, and a better value.
+
+Each function in `FINDINGS` returns one line, or an empty text if there is nothing to warn of. A warning is left out if
+another one explains the problem.
+"""
 
 from __future__ import annotations
 
@@ -30,36 +34,34 @@ from skysim.simulation.checks.sampling import CheckedSamples
 from skysim.simulation.checks.views import View
 from skysim.simulation.lights.starlight import BACKGROUND
 
-MAX_SATURATED = (
-    0.25  # fraction of saturated lights that gives no warning: a bright star or LED now and then
+MAX_SATURATED = 0.25  # fraction of saturated lights that gives no warning
+TARGET_FILL = (
+    0.7  # recommended peak over full well of the light that a fraction MAX_SATURATED exceeds
 )
-TARGET_FILL = 0.7  # of full well, for the light that a fraction MAX_SATURATED exceeds
-# of the cameras and lenses that advice names
+# Limits of exposure times and lenses that a warning recommends.
 SHORTEST_S = 10e-6
 LARGEST_F_NUMBER = 22.0
-FILTER_BELOW = 0.1  # factor of the light that calls for a filter
-MIN_LIGHTS = 4  # that an identification needs
-MIN_DETECTED = 0.5  # fraction of the lights on the chip that the tracker should detect
-# fraction of the directions in reach that may have fewer; of the whole sky
+FILTER_BELOW = 0.1  # factor of the light below which a filter is recommended
+MIN_LIGHTS = 4  # number of lights that an identification needs
+MIN_DETECTED = 0.5  # fraction of the lights on the detector that the tracker should detect
+# Fraction of the directions in reach, or of the whole sky, that may have fewer than MIN_LIGHTS.
 MAX_FEW = 0.02
 MAX_FEW_SKY = 0.5
-HIGH_THRESHOLD = (
-    20.0  # sigma, beyond which the threshold is the reason that lights are not detected
-)
-MAX_BACKGROUND = 0.5  # of full scale
-MAX_BEYOND = 0.25  # fraction of the images that may lie beyond the tracker's matching radius: more are not identified
-# a path that is longer than both gives a warning; in widths of the image
+HIGH_THRESHOLD = 20.0  # threshold in sigma above which it is the reason for missing detections
+MAX_BACKGROUND = 0.5  # fraction of full scale
+MAX_BEYOND = 0.25  # fraction of images beyond the tracker's matching radius up to which frames are identified
+# A path that is longer than both gives a warning; the second is in widths of the image.
 MAX_SMEAR_PX = 4.0
 MAX_SMEAR_WIDTHS = 2.0
 MAX_DEFOCUS = 0.5  # width of the defocus disk over that of the image in focus
 MIN_DEFOCUS_PX = 1.0
-# error of frames' times over the filter's claim; and the turn in that time
+# Error of the time tags over the filter's value, and the rotation in that time, up to which there is no warning.
 MAX_TAG_RATIO = 1.3
 MAX_TAG_ARCSEC = 1.0
 
 
 def saturation(context: Context, samples: CheckedSamples) -> str:
-    """Warn where many lights are saturated."""
+    """Warn if many lights are saturated."""
     ratio = fill(context, samples)
     scene = context.lab.scene
     full = float((ratio >= 1).mean()) if len(ratio) else 0.0
@@ -70,19 +72,18 @@ def saturation(context: Context, samples: CheckedSamples) -> str:
         f"{100 * full:.0f} % of the lights are saturated, the median light at {short(np.median(ratio), 2)} times"
         f" {full_scale_e(scene.camera.detector):.0f} electrons; change it to"
     )
-    cures = dimmer(context, factor)
-    first, value = next(iter(cures.items()))
-    others = "".join(f", or {key} to {other}" for key, other in cures.items() if key != first)
+    (first, value), *more = dimmer(context, factor).items()
+    others = "".join(f", or {key} to {other}" for key, other in more)
     if factor < FILTER_BELOW and isinstance(transmission := scene.camera.transmission, float):
         others += f", or camera.transmission to {short(factor * transmission, 2)}, a gray filter"
     return f"{first}: {text} {value}{others}"
 
 
 def dimmer(context: Context, factor: float) -> dict[str, str]:
-    """Keys with values that make every light dimmer by this factor, the LEDs first; those that a camera can have.
+    """Keys with values that make every light dimmer by this factor, those of the LEDs first.
 
-    An exposure is no shorter than SHORTEST_S and than the LED drive's cycle, in which each LED is lit once; a lens is
-    not stopped down beyond LARGEST_F_NUMBER.
+    An exposure is recommended only if it is not shorter than SHORTEST_S and the LED drive's cycle, in which each LED is
+    lit once, and an f-number only up to LARGEST_F_NUMBER. Stars always get an exposure.
     """
     scene = context.lab.scene
     sources = context.lab.camera.sources
@@ -103,7 +104,7 @@ def dimmer(context: Context, factor: float) -> dict[str, str]:
 
 
 def bright_background(context: Context, samples: CheckedSamples) -> str:
-    """Warn where extended light alone fills the pixels."""
+    """Warn if extended light alone fills the pixels."""
     scene = context.lab.scene
     camera = context.camera
     full_e = full_scale_e(scene.camera.detector)
@@ -119,9 +120,9 @@ def bright_background(context: Context, samples: CheckedSamples) -> str:
 
 
 def dark_corners(context: Context, samples: CheckedSamples) -> str:
-    """Warn where the lens passes no light to a part of the chip."""
+    """Warn if the lens passes no light to a part of the detector."""
     camera = context.camera.optics.camera
-    stops = context.camera.optics.camera.vignetting
+    stops = camera.vignetting
     corner_deg = math.degrees(math.atan(camera.corner_px / camera.focal_px))
     if not isinstance(stops, TwoStopsConfig) or stops.cutoff_deg >= corner_deg:
         return ""
@@ -132,18 +133,26 @@ def dark_corners(context: Context, samples: CheckedSamples) -> str:
 
 
 def few_lights(context: Context, samples: CheckedSamples) -> str:
-    """Warn where the tracker has too few lights: at the frames, or in reach."""
+    """Warn if the tracker has too few lights at the frames or in reach.
+
+    1. Leave it to the warning that explains it: a cap that is too small, dark corners, or a bright background.
+    2. Find too few lights, hidden ones counted, since `hidden_lights` explains them.
+    3. Leave it to `undetected` if the lights are on the detector.
+    4. Recommend more LEDs, or fainter stars.
+    """
     scene = context.lab.scene
     mount = context.lab.camera.mount
     needed = least_lights(scene)
+    # 1. More lights where there are some would not help.
     if any(find(context, samples) for find in (cap_too_small, dark_corners, bright_background)):
-        return ""  # more lights where there are some would not help
+        return ""
     if scene.tracker.brightest is not None and scene.tracker.brightest < needed:
         return f"tracker.brightest: the tracker uses {scene.tracker.brightest} lights; change it to {needed} or more"
+    # 2. At the frames none may have too few, in reach some directions.
     in_reach = MAX_FEW_SKY if scene.vehicle.mount == "free" else MAX_FEW
     for sampled, allowed in ((samples.frames, 0.0), (samples.reach, in_reach)):
         counts = sampled.counts()
-        unhidden = counts + sampled.hidden_counts()  # `hidden_lights` says what hides them
+        unhidden = counts + sampled.hidden_counts()
         few = float((unhidden < needed).mean())
         if few > allowed:
             break
@@ -155,8 +164,10 @@ def few_lights(context: Context, samples: CheckedSamples) -> str:
         f"fewer than {needed} lights that the tracker detects at {100 * few:.0f} % of the"
         f" {'frames' if sampled is samples.frames else 'directions in reach'}, least {counts.min()} at {where}"
     )
+    # 3. Lights on the detector.
     if (on_chip[counts < needed] >= needed).mean() > MIN_DETECTED:
-        return ""  # they are on the chip: `undetected` says why they are not detected
+        return ""
+    # 4. Recommendation.
     if isinstance(scene.light, DomeConfig):
         return f"{density_key(scene.light.layout)}: {text}; {denser(scene.light.layout, float(on_chip.mean()))}"
     fainter = scene.tracker.limit_mag + 1
@@ -167,7 +178,7 @@ def few_lights(context: Context, samples: CheckedSamples) -> str:
 
 
 def hidden_lights(context: Context, samples: CheckedSamples) -> str:
-    """Warn where something hides so many lights that the tracker has too few: at the frames."""
+    """Warn if something hides so many lights at a frame that the tracker has too few."""
     frames = samples.frames
     scene = context.lab.scene
     mount = context.lab.camera.mount
@@ -188,12 +199,12 @@ def hidden_lights(context: Context, samples: CheckedSamples) -> str:
 
 
 def least_lights(scene: Scene) -> int:
-    """Number of lights that an identification needs: two, if their codes name them."""
+    """Number of lights that an identification needs; two if codes identify them."""
     return 2 if scene.tracker.decoder else MIN_LIGHTS
 
 
 def density_key(layout: Layout) -> str:
-    """The key that sets how many LEDs a layout has."""
+    """The key that sets the number of LEDs of a layout."""
     key = "light.layout"
     points = layout
     if isinstance(layout, OnPoints):
@@ -206,7 +217,10 @@ def density_key(layout: Layout) -> str:
 
 
 def denser(layout: Layout, mean: float) -> str:
-    """How to get a mean of three times the lights that an identification needs, from the mean number on the chip."""
+    """The change of a layout that gives a mean of three times the lights that an identification needs.
+
+    `mean` is the mean number of lights on the detector.
+    """
     points = layout.points if isinstance(layout, OnPoints) else layout
     factor = max(3 * MIN_LIGHTS / max(mean, 0.5), 1.5)
     count = getattr(points, "count", None)
@@ -219,10 +233,10 @@ def denser(layout: Layout, mean: float) -> str:
 
 
 def undetected(context: Context, samples: CheckedSamples) -> str:
-    """Warn where most of the lights on the chip are too faint or too small for the detector."""
+    """Warn if most lights on the detector are too faint or too small to be detected."""
     scene = context.lab.scene
     settings = context.settings
-    # As many as the tracker takes from a frame, if more are there.
+    # The tracker takes at most max_blobs of a frame.
     seen = sum(min(len(view), settings.max_blobs) for view in samples.frames.seen)
     used = sum(map(len, samples.frames.used))
     explained = (bright_background, dark_corners, long_smear)
@@ -244,7 +258,10 @@ def undetected(context: Context, samples: CheckedSamples) -> str:
 
 
 def brighter(scene: Scene, factor: float, text: str) -> str:
-    """The key that makes lights brighter by a factor, and its value: the exposure, if frames leave the time for it."""
+    """A warning that recommends to make lights brighter by a factor.
+
+    It names the exposure time if the frame rate allows it, else the lens for stars and the current for LEDs.
+    """
     exposure_s = factor * scene.exposure.time_s
     led = getattr(scene.light, "led", None)
     if exposure_s <= 1 / scene.exposure.rate_hz:
@@ -261,7 +278,7 @@ def brighter(scene: Scene, factor: float, text: str) -> str:
 
 
 def not_where_expected(context: Context, samples: CheckedSamples) -> str:
-    """Warn where errors that the tracker does not know of displace images beyond its matching radius."""
+    """Warn if errors that are unknown to the tracker displace images beyond its matching radius."""
     frames = samples.frames
     scene = context.lab.scene
     cam_from_body = context.lab.camera.mount.cam_from_body
@@ -272,9 +289,8 @@ def not_where_expected(context: Context, samples: CheckedSamples) -> str:
     ]
     if not found:
         return ""
-    residual_px, gate_px = (
-        np.concatenate([getattr(one, name) for one in found]) for name in ("residual_px", "gate_px")
-    )
+    residual_px = np.concatenate([one.residual_px for one in found])
+    gate_px = np.concatenate([one.gate_px for one in found])
     beyond = float((residual_px > gate_px).mean())
     if beyond <= MAX_BEYOND:
         return ""
@@ -290,12 +306,12 @@ def not_where_expected(context: Context, samples: CheckedSamples) -> str:
 
 
 def surface_error_m(scene: Scene) -> float:
-    """The survey error of the dome's surface; 0 without a dome."""
+    """Survey error of the dome's surface; 0 without a dome."""
     return float(scene.light.surface.error_m) if isinstance(scene.light, DomeConfig) else 0.0
 
 
 def row_time_us(scene: Scene) -> float:
-    """The row time of a rolling shutter; 0 for another one."""
+    """Row time of a rolling shutter in us; 0 for another shutter."""
     shutter = scene.camera.shutter
     return 1e6 * shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0
 
@@ -308,7 +324,7 @@ MISMATCH_KEYS = {
     "survey set-up": "tracker.survey.instrument",
     "surface survey": "light.surface.error",
 }
-# What to change, from the scene and how many times too large the displacement is.
+# The recommended change, as a function of the scene and of the ratio of the displacement to the allowed one.
 CHANGES: dict[str, Callable[[Scene, float], str]] = {
     "focal length": lambda scene, excess: (
         f"change it to {short(1e3 * scene.camera.focal_length_m, 5)} mm"
@@ -331,13 +347,14 @@ CHANGES: dict[str, Callable[[Scene, float], str]] = {
 
 
 def cap_too_small(context: Context, samples: CheckedSamples) -> str:
-    """Warn where the field reaches beyond the LEDs at the greatest tilt."""
+    """Warn if the field reaches beyond the LEDs at the greatest tilt."""
     found = cap_margin(context, samples)
     light = context.lab.scene.light
     if found is None or not isinstance(light, DomeConfig) or found.needed_deg <= found.cap_deg:
         return ""
+    # No key changes the positions of listed LEDs.
     if getattr(light.layout, "points", light.layout).kind == "listed":
-        return ""  # its LEDs are where they are
+        return ""
     key = (
         "light.layout.points.cap_deg" if hasattr(light.layout, "points") else "light.layout.cap_deg"
     )
@@ -354,25 +371,26 @@ def cap_too_small(context: Context, samples: CheckedSamples) -> str:
 
 
 def out_of_focus(context: Context, samples: CheckedSamples) -> str:
-    """Warn where the defocus disk is wide beside the image in focus."""
+    """Warn if the defocus disk is wide compared with the image in focus."""
     sampled = samples.frames
-    defocus, sigma, distance_m = (
-        sampled.joined(name) for name in ("defocus_px", "sigma_px", "distance_m")
-    )
+    defocus = sampled.joined("defocus_px")
+    sigma = sampled.joined("sigma_px")
+    distance_m = sampled.joined("distance_m")
     if not len(defocus):
         return ""
     blur_px = 2 * float(np.median(defocus))
     sharp_px = GAUSSIAN_WIDTH * float(np.median(np.sqrt(np.maximum(sigma**2 - defocus**2 / 4, 0))))
     if blur_px <= max(MAX_DEFOCUS * sharp_px, MIN_DEFOCUS_PX):
         return ""
-    middle = float(1 / distance_m.min() + 1 / distance_m.max()) / 2  # 1/m; 0 for stars
+    # Defocus is proportional to the difference of 1 / distance, so the best focus is at the middle of it; 0 for stars.
+    middle = float(1 / distance_m.min() + 1 / distance_m.max()) / 2
     best = f"{1 / middle:.3g} m" if middle else "infinity"
     text = f"images are {blur_px:.1f} px out of focus and would be {sharp_px:.1f} px wide"
     return f"camera.focus: {text}; change it to {best}"
 
 
 def long_smear(context: Context, samples: CheckedSamples) -> str:
-    """Warn where images move by more than some pixels and than their own width."""
+    """Warn if images move by more than MAX_SMEAR_PX and MAX_SMEAR_WIDTHS of their own width."""
     frames = samples.frames
     scene = context.lab.scene
     length_px = frames.joined("streak_length_px")
@@ -392,7 +410,7 @@ def long_smear(context: Context, samples: CheckedSamples) -> str:
 
 
 def unknown_tag_error(context: Context, samples: CheckedSamples) -> str:
-    """Warn where frames' times err by more than the filter assumes, and the vehicle turns in that time."""
+    """Warn if time tags have larger errors than the filter assumes, and the vehicle rotates in that time."""
     scene = context.lab.scene
     sigma_s = float(scene.exposure.time_tag_jitter_s)
     if scene.filter is None or sigma_s <= MAX_TAG_RATIO * scene.filter.time_tag_sigma_s:
@@ -409,16 +427,14 @@ def unknown_tag_error(context: Context, samples: CheckedSamples) -> str:
 
 
 def thermal_drift(context: Context, samples: CheckedSamples) -> str:
-    """Warn where dome, mount and lens drift so far that solutions err by more than expected."""
+    """Warn if thermal drift of dome, mount and lens causes larger errors than expected otherwise."""
     thermal_config = context.lab.scene.thermal
     frames = samples.frames
     if thermal_config is None:
         return ""
     at = frames.attitudes
-    turns = [
-        drift_rad(*row, context)
-        for row in zip(frames.used, at.lab_from_body, at.t_s.tolist(), strict=True)
-    ]
+    rows = zip(frames.used, at.lab_from_body, at.t_s.tolist(), strict=True)
+    turns = [drift_rad(*row, context) for row in rows]
     cross_rad = np.hypot(*np.array(turns)[:, :2].T)
     expected_rad = np.sqrt(frames.error.total("cross"))
     if not (cross_rad > expected_rad).any():
@@ -434,8 +450,10 @@ def thermal_drift(context: Context, samples: CheckedSamples) -> str:
 
 
 def drift_rad(view: View, lab_from_body: Rotation, t_s: float, context: Context) -> Floats:
-    """(3,) rotation in camera axes by which a solution errs, to first order, after the hardware's drift with the
-    temperature; NaN with too few lights."""
+    """(3,) error of a solution by thermal drift, to first order, a rotation vector in camera axes.
+
+    It is sum K_i (drifted - surveyed image position); NaN with too few lights.
+    """
     config = context.lab.scene.thermal
     assert config is not None
     if len(view) < MIN_LIGHTS:
@@ -451,7 +469,7 @@ def drift_rad(view: View, lab_from_body: Rotation, t_s: float, context: Context)
 
 
 def image_px(lights: Sources, mount: Mount, optics: Optics, lab_from_body: Rotation) -> Floats:
-    """(n, 2) pixels of lights at an attitude."""
+    """(n, 2) image positions of lights at an attitude."""
     camera_m = lab_from_body.apply(mount.camera_body_m)
     offset_m = lights.place[:, :3] - lights.place[:, 3:] * camera_m
     return optics.project((mount.cam_from_body * lab_from_body.inv()).apply(offset_m))

@@ -1,7 +1,7 @@
-"""What the camera sees at the attitudes that are checked: the lights, as the renderer would draw them, in closed form.
+"""Views of the camera at the attitudes that are checked: the lights that the renderer would draw, in closed form.
 
-Each attitude is an exposure for which the camera's own lights are asked. At directions without a time, lights that only
-add what no tracker knows are left out.
+`sampled` evaluates the camera's lights for an exposure at each attitude. At an attitude without a time, lights that
+only add light unknown to the tracker are left out.
 """
 
 from __future__ import annotations
@@ -22,20 +22,26 @@ from skysim.simulation.lights.light import Beam, Exposure, beam_of
 
 
 class Sampled(NamedTuple):
-    """Some attitudes, what the camera sees there, and the expected errors.
+    """A attitudes, the views of the camera there, and the expected errors.
 
     Attributes
     ----------
+    attitudes
+        The attitudes
+    exposures, beams
+        Exposure and light at each attitude
     known
-        The lights on the chip that the tracker knows, also hidden ones
+        Lights on the detector that the tracker knows, hidden ones included
     seen
-        Of them those that nothing hides
+        Those of `known` that are not hidden
     used
-        Those that it also detects
+        Those of `seen` that the tracker detects and uses
     hidden
-        How many of them are hidden, by the name of what hides them
+        Number of hidden lights by the name of the occluder
     others
-        The lights that it detects and does not know, by their names
+        Lights that the tracker detects and does not know, by name
+    error
+        Expected errors
     """
 
     attitudes: CheckedAttitudes
@@ -53,23 +59,24 @@ class Sampled(NamedTuple):
         return np.array([len(view) for view in self.used])
 
     def hidden_counts(self) -> Floats:
-        """(A,) number of lights that it knows and that are hidden."""
+        """(A,) number of hidden lights that the tracker knows."""
         return np.array([sum(hidden.values()) for hidden in self.hidden])
 
     def joined(self, name: str) -> Floats:
-        """A column of the views of all attitudes end to end."""
+        """A column of the views `seen`, concatenated over all attitudes."""
         return np.concatenate([getattr(view, name) for view in self.seen])
 
 
 class CheckedSamples(NamedTuple):
-    """The two sets of attitudes: those of the frames, and all that the motion could reach."""
+    """Samples at the attitudes of the frames, and at attitudes in reach of the motion."""
 
     frames: Sampled
     reach: Sampled
 
 
 def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
-    """What the camera sees at some attitudes, and the expected errors there."""
+    """The views at some attitudes, and the expected errors there."""
+    # 1. Light of each exposure.
     camera = context.lab.camera
     rows = zip(at.lab_from_body, at.rate_body_rad_s, at.t_s.tolist(), strict=True)
     exposures = [expected_exposure(camera, *row) for row in rows]
@@ -78,30 +85,29 @@ def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
         beam_of(main if math.isnan(t_s) else camera.lights, exposure)
         for exposure, t_s in zip(exposures, at.t_s.tolist(), strict=True)
     ]
+    # 2. Known and other lights on the detector.
     known = []
     seen = []
     hidden = []
+    others = []
     for exposure, beam, acceleration in zip(exposures, beams, at.accelerations(), strict=True):
         found, names = known_lights(beam, exposure, context, acceleration)
         known.append(found)
         seen.append(found.take(found.behind == VISIBLE))
         hidden.append(Counter(names[number] for number in found.behind[found.behind != VISIBLE]))
+        others.append(other_lights(beam, exposure, context))
+    # 3. Detected lights, and the expected errors of a solution with them.
     used = [usable(view, context) for view in seen]
-    others = [
-        other_lights(beam, exposure, context)
-        for beam, exposure in zip(beams, exposures, strict=True)
-    ]
-    return Sampled(
-        at, exposures, beams, known, seen, used, hidden, others, expected(used, at, context)
-    )
+    error = expected(used, at, context)
+    return Sampled(at, exposures, beams, known, seen, used, hidden, others, error)
 
 
 def known_lights(
     beam: Beam, exposure: Exposure, context: Context, acceleration_body_rad_s2: Floats
 ) -> tuple[View, list[str]]:
-    """The lights on the chip that the tracker knows, by their rows in its beliefs, and the names of what may hide them.
+    """The lights on the detector that the tracker knows, hidden ones included, and the names of their occluders.
 
-    Those that something hides are among them.
+    `row` of the view is the row in the tracker's beliefs.
     """
     lit = next(lit for lit in beam.lits if lit.known)
     assert lit.points is not None
@@ -112,7 +118,7 @@ def known_lights(
 
 
 def other_lights(beam: Beam, exposure: Exposure, context: Context) -> dict[str, View]:
-    """The points of other lights that the tracker detects, by the names of the lights."""
+    """The points of unknown lights that the tracker detects, by the name of the light."""
     found = {}
     for lit in beam.lits:
         if lit.points is not None and not lit.known:

@@ -1,4 +1,4 @@
-"""What the air does to a scene's frames that the tracker does not know."""
+"""Facts and warnings about a scene under the stars: refraction, bodies, errors, stray light, limiting magnitude."""
 
 from __future__ import annotations
 
@@ -34,14 +34,16 @@ from skysim.sources.ephemeris import place
 from skysim.sources.photometry import SUN, star_flux_e_s_m2
 from skysim.tracking.tracker_interface import OWN
 
-MIN_RAISED_ARCSEC = 1.0  # of a refraction that matters
+# Refraction.
+
+MIN_RAISED_ARCSEC = 1.0  # least refraction that gives a warning
 
 
 def refraction(context: Context, samples: CheckedSamples) -> str:
-    """Warn where stars are raised by more than the expected error and the tracker does not undo it: the lowest frame.
+    """Warn if refraction at the lowest frame exceeds the expected error and the tracker does not correct it.
 
-    The attitude errs by the refraction at the boresight, and the field's height is shortened by the difference of the
-    refractions at its two ends.
+    The refraction at the boresight is an error of the attitude. The difference of the refractions at both ends of the
+    field shortens its height.
     """
     lab = context.lab
     at = samples.frames.attitudes
@@ -73,15 +75,14 @@ def refraction(context: Context, samples: CheckedSamples) -> str:
     return f"tracker.name: {text}; change it to own, with tracker.refraction: true, or point higher"
 
 
-# Whether the Sun, the Moon or a planet is in the field of a scene's frames, and whether Sun or Moon
-# is near it.
+# Sun, Moon and planets in the field or near it.
 
-
-NEAR_DEG = {"sun": 60.0, "moon": 30.0}  # from the boresight, where their stray light would matter
+NEAR_DEG = {"sun": 60.0, "moon": 30.0}  # angle from the boresight within which stray light matters
 
 
 def bodies_near(context: Context, samples: CheckedSamples) -> Iterator[str]:
-    """A line for each body: the frame at which it is nearest to the boresight, if it is in the field or near it."""
+    """Warn of each body in the field or near it, at the frame where it is nearest to the boresight."""
+    # 1. The nearest frame of each body.
     lab = context.lab
     at = samples.frames.attitudes
     cam_from_lab = lab.camera.mount.cam_from_body * at.lab_from_body.inv()
@@ -91,6 +92,7 @@ def bodies_near(context: Context, samples: CheckedSamples) -> Iterator[str]:
             z = float(cam_from_lab[n].apply(body.place.direction)[2])
             off = math.acos(max(min(z, 1.0), -1.0)), n, body
             closest[body.name] = min(closest.get(body.name, off), off, key=lambda found: found[0])
+    # 2. Warnings.
     for name, (off_rad, n, body) in closest.items():
         seen = body.truth()
         where = attitudes.describe(at, n, lab.scene, lab.camera.mount)
@@ -103,18 +105,19 @@ def bodies_near(context: Context, samples: CheckedSamples) -> Iterator[str]:
 
 
 def in_field(direction_cam: Floats, radius_rad: float, camera: CameraConfig) -> bool:
-    """Whether a disc about a direction (3,) overlaps the chip of a lens without distortion."""
+    """Whether a disc about a direction (3,) in camera axes overlaps the detector, for a lens without distortion."""
     if direction_cam[2] <= 0:
         return False
     xy_px = camera.focal_px * np.abs(direction_cam[:2]) / direction_cam[2]
-    half_px = np.array([camera.width_px, camera.height_px]) / 2 + camera.focal_px * math.tan(
-        radius_rad
-    )
-    return bool((xy_px < half_px).all())
+    size_px = np.array([camera.width_px, camera.height_px])
+    return bool((xy_px < size_px / 2 + camera.focal_px * math.tan(radius_rad)).all())
 
 
 def peak_fill(context: Context, body: BodyLight) -> float:
-    """Electrons in the brightest pixel of a body at rest over saturation; a phase is a disk of its bright area."""
+    """Electrons in the brightest pixel of a body at rest over saturation.
+
+    A partly lit body counts as a full disk of the lit area.
+    """
     camera = context.camera
     scene = context.lab.scene
     lit = (1 + math.cos(body.place.phase_rad)) / 2
@@ -123,24 +126,25 @@ def peak_fill(context: Context, body: BodyLight) -> float:
     radius = np.array([radius_px])
     none = np.zeros(1)
     electrons = body.flux_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s
-    return (
-        electrons
-        * float(peak_share(lens2_px2, radius, none, none)[0])
-        / full_scale_e(scene.camera.detector)
-    )
+    share = float(peak_share(lens2_px2, radius, none, none)[0])
+    return electrons * share / full_scale_e(scene.camera.detector)
 
 
-# Whether the errors that the tracker will claim are true: the mean NEES that the checks expect
-# under the stars.
+# Claimed errors: the expected normalized estimation error squared (NEES) under the stars.
 
-
-MAX_FACTOR = 1.3  # by which claimed errors may be too small
+MAX_FACTOR = 1.3  # factor by which claimed errors may be too small
 TRUE_NEES = 3.0
 LARGEST_FLOOR_PX = 1.0
 
 
 def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
-    """Median of the expected NEES over some attitudes, with a least error of the centroids; NaN without lights."""
+    """Median of the expected NEES over some attitudes; NaN without lights.
+
+    The tracker claims the covariance M^-1, the inverse Fisher information for the standard deviations s_i that it
+    believes: those of photon and read-out noise, and the least centroid error floor_px (`tracker.centroid_sigma_px`)
+    in quadrature. The errors of the centroids have a covariance C of noise, the pixels' sensitivity and star places.
+    The mean of the NEES, e' M e, is trace(M C): 3 if the claim is true.
+    """
     found = []
     cam_from_body = context.lab.camera.mount.cam_from_body
     for view, lab_from_body in zip(sampled.used, sampled.attitudes.lab_from_body, strict=True):
@@ -152,6 +156,7 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
             gain = None
         if gain is None:
             continue
+        # C, then M.
         places = star_places(view, lab_from_body * cam_from_body.inv(), context)
         errors = covariance(gain, Independent(centroid_variance(view, context)))
         errors = errors if places is None else errors + covariance(gain, places)
@@ -161,14 +166,14 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
 
 
 def claimed(context: Context, samples: CheckedSamples) -> float:
-    """The expected NEES over the whole sky with the tracker's floor; NaN under other lights."""
+    """The expected NEES over the whole sky with the tracker's least centroid error; NaN under other lights."""
     if not isinstance(context.lab.scene.light, StarsConfig):
         return math.nan
     return expected_nees(samples.reach, context, context.settings.centroid_sigma_px)
 
 
 def fact(context: Context, samples: CheckedSamples) -> Fact | None:
-    """The expected NEES in words."""
+    """The fact about the expected NEES; None under other lights."""
     nees = claimed(context, samples)
     if math.isnan(nees):
         return None
@@ -178,7 +183,10 @@ def fact(context: Context, samples: CheckedSamples) -> Fact | None:
 
 
 def floor_too_small(context: Context, samples: CheckedSamples) -> str:
-    """Warn where the tracker will claim errors that are too small, because its floor of the centroids' error is."""
+    """Warn if the tracker will claim too small errors because its least centroid error is too small.
+
+    The recommended value, at which the claim is true, is found by bisection.
+    """
     nees = claimed(context, samples)
     factor = math.sqrt(nees / TRUE_NEES) if nees > 0 else 0.0
     if factor <= MAX_FACTOR:
@@ -187,30 +195,27 @@ def floor_too_small(context: Context, samples: CheckedSamples) -> str:
     high = LARGEST_FLOOR_PX
     while high / low > 1.02:
         middle = math.sqrt(low * high)
-        low, high = (
-            (middle, high)
-            if expected_nees(samples.reach, context, middle) > TRUE_NEES
-            else (low, middle)
-        )
+        if expected_nees(samples.reach, context, middle) > TRUE_NEES:
+            low = middle
+        else:
+            high = middle
     return (
         f"tracker.centroid_sigma_px: the tracker will claim errors that are {factor:.2g} times too small (NEES"
         f" {nees:.2g}; 3 if true); change it to {short(high, 2)}"
     )
 
 
-# Whether stray light past the baffle costs stars, and whether a body is within the tracker's
-# exclusion angles.
+# Stray light past the baffle, and exclusion angles.
 
-
-MAX_LOSS_MAG = 0.5  # of the faintest star
+MAX_LOSS_MAG = 0.5  # loss of limiting magnitude that gives no warning
 STRAY_NAMES = {"sun": "the Sun", "moon": "the Moon", "earth": "the Earth"}
 
 
 def stray_light(context: Context, samples: CheckedSamples) -> Iterator[str]:
-    """Warn where stray light makes the noise of a pixel so large that fainter stars are lost.
+    """Warn if the noise of stray light hides faint stars.
 
-    With n0 the noise without it and s electrons of it the noise is sqrt(n0^2 + s), and the faintest star brighter by
-    1.25 log10(1 + s / n0^2) magnitudes.
+    n0 is the noise of a pixel without stray light. With s electrons of stray light the noise is sqrt(n0^2 + s), and
+    the faintest star is brighter by 1.25 log10(1 + s / n0^2) magnitudes.
     """
     lab = context.lab
     at = samples.frames.attitudes
@@ -235,7 +240,7 @@ def stray_light(context: Context, samples: CheckedSamples) -> Iterator[str]:
 
 
 def exclusion(context: Context, samples: CheckedSamples) -> Iterator[str]:
-    """Warn where a frame's boresight is within an exclusion angle of the orbit's tracker: the frame nearest to it."""
+    """Warn if the boresight of a frame is within an exclusion angle of the orbit's tracker, at the nearest frame."""
     lab = context.lab
     at = samples.frames.attitudes
     limits = lab.scene.orbit.exclusion if lab.scene.orbit else None
@@ -245,9 +250,8 @@ def exclusion(context: Context, samples: CheckedSamples) -> Iterator[str]:
     angles_deg = np.array(
         [beside_deg(context, t, axis) for t, axis in zip(at.t_s.tolist(), boresight, strict=True)]
     )
-    for column, (name, limit_deg) in enumerate(
-        (("sun", limits.sun_deg), ("earth", limits.earth_deg), ("moon", limits.moon_deg))
-    ):
+    limits_deg = {"sun": limits.sun_deg, "earth": limits.earth_deg, "moon": limits.moon_deg}
+    for column, (name, limit_deg) in enumerate(limits_deg.items()):
         n = int(angles_deg[:, column].argmin())
         if angles_deg[n, column] < limit_deg:
             what = f"{STRAY_NAMES[name]}'s limb" if name == "earth" else STRAY_NAMES[name]
@@ -258,7 +262,7 @@ def exclusion(context: Context, samples: CheckedSamples) -> Iterator[str]:
 
 
 def beside_deg(context: Context, t_s: float, boresight: Floats) -> Floats:
-    """(3,) angles of a boresight from the Sun's center, the Earth's limb and the Moon's center at a time."""
+    """(3,) angles of a boresight from the Sun's center, the Earth's limb and the Moon's center at a time, in deg."""
     here = context.lab.camera.viewpoint.observer_at(t_s)
     sun, moon = (
         float(angular_separation_deg(boresight, place(name, here).direction))
@@ -268,21 +272,18 @@ def beside_deg(context: Context, t_s: float, boresight: Floats) -> Floats:
     return np.array([sun, limb_deg, moon])
 
 
-# How deep the camera sees, and whether the simulated sky and the tracker's catalog are as deep.
+# Limiting magnitudes of the camera, the simulated sky and the tracker's catalog.
 
-
-# by which the camera may see fainter stars than a catalog, a limit
+# Magnitudes by which the camera may detect fainter stars than those of a catalog, or of a limit in the scene.
 CATALOG_MARGIN_MAG = 0.3
 LIMIT_MARGIN_MAG = 0.5
-MIN_KNOWN = (
-    0.2  # share of the stars detected that the tracker should know: among more others it needs luck
-)
-DEEPEST_V = 10.0  # of a sky that `skysim catalog build` makes
+MIN_KNOWN = 0.2  # least share of the detected stars that the tracker should know
+DEEPEST_V = 10.0  # faintest magnitude of a catalog that `skysim catalog build` makes
 SNR = 5.0
 
 
 def faintest_star(context: Context, samples: CheckedSamples) -> Fact | None:
-    """V of the faintest star that the tracker detects, and of that with a signal-to-noise ratio of 5."""
+    """V of the faintest star that the tracker detects, and of a star with the signal-to-noise ratio SNR."""
     scene = context.lab.scene
     believed = context.beliefs
     if not isinstance(scene.light, StarsConfig):
@@ -317,7 +318,7 @@ def known_share(context: Context, limit_mag: float) -> float:
 
 
 def sky_too_shallow(context: Context, samples: CheckedSamples) -> str:
-    """Warn where the camera detects fainter stars than the simulated sky holds."""
+    """Warn if the camera detects fainter stars than the simulated sky has."""
     light = context.lab.scene.light
     sky = context.lab.camera.sources.magnitude
     if not isinstance(light, StarsConfig) or not len(sky):
@@ -326,15 +327,11 @@ def sky_too_shallow(context: Context, samples: CheckedSamples) -> str:
     faintest_mag = float(np.nanmax(sky))
     text = f"the camera detects stars to V {limit_mag:.1f}, but the sky ends at V {faintest_mag:.1f}; change it to"
     if light.limit_mag is not None:
-        said = few_lights(context, samples).startswith(
-            "light.limit_mag"
-        )  # which asks for a deeper one already
-        deeper = limit_mag > light.limit_mag + LIMIT_MARGIN_MAG and not said
-        return (
-            f"light.limit_mag: {text} {math.ceil(2 * limit_mag) / 2:g}, or leave it out"
-            if deeper
-            else ""
-        )
+        # `few_lights` may recommend a fainter limit already.
+        said = few_lights(context, samples).startswith("light.limit_mag")
+        if said or limit_mag <= light.limit_mag + LIMIT_MARGIN_MAG:
+            return ""
+        return f"light.limit_mag: {text} {math.ceil(2 * limit_mag) / 2:g}, or leave it out"
     if limit_mag <= min(faintest_mag + CATALOG_MARGIN_MAG, DEEPEST_V):
         return ""
     wanted = min(math.ceil(2 * limit_mag) / 2, DEEPEST_V)
@@ -344,7 +341,7 @@ def sky_too_shallow(context: Context, samples: CheckedSamples) -> str:
 
 
 def tracker_too_shallow(context: Context, samples: CheckedSamples) -> str:
-    """Warn where most of the stars that the tracker detects are fainter than those that it knows."""
+    """Warn if most stars that the tracker detects are fainter than those that it knows."""
     if not isinstance(context.lab.scene.light, StarsConfig):
         return ""
     limit_mag = detection_limit_mag(context, samples)
@@ -360,7 +357,7 @@ def tracker_too_shallow(context: Context, samples: CheckedSamples) -> str:
 
 
 def detection_limit_mag(context: Context, samples: CheckedSamples) -> float:
-    """V of the faintest star like the Sun that is detected at the slowest frame, about half of such stars being so.
+    """V of a star of the Sun's color that is detected in about half of the cases, at the slowest frame.
 
     A Gaussian of variance s^2 has the least area A above the threshold T if its peak is T exp(A / (2 pi s^2)), see
     `detection.detected_area_px`.
@@ -379,19 +376,18 @@ def detection_limit_mag(context: Context, samples: CheckedSamples) -> float:
 
 
 def snr_limit_mag(context: Context, samples: CheckedSamples) -> float:
-    """V of a star like the Sun with a signal-to-noise ratio of 5 over the noise-equivalent area, at the slowest frame.
+    """V of a star of the Sun's color with a signal-to-noise ratio of 5 over the noise-equivalent area A.
 
-    S / sqrt(S + A n^2) = 5, n the noise of a pixel, gives S = (25 + sqrt(25^2 + 100 A n^2)) / 2. A Gaussian of
-    deviation s has the area A = 4 pi s^2, moved by L much more than s it has 2 sqrt(pi) s L; between them the
-    hypotenuse.
+    It is that of the slowest frame. With the noise n of a pixel,
+
+        S / sqrt(S + A n^2) = 5    gives    S = (25 + sqrt(25^2 + 100 A n^2)) / 2.
+
+    A Gaussian of deviation s has A = 4 pi s^2; on a path L much longer than s it has 2 sqrt(pi) s L. The root of the
+    sum of their squares is taken in between.
     """
     camera = context.camera
-    area_px = (
-        2
-        * math.sqrt(math.pi)
-        * camera.lens_px
-        * math.hypot(2 * math.sqrt(math.pi) * camera.lens_px, least_streak_px(samples))
-    )
+    width_px = 2 * math.sqrt(math.pi) * camera.lens_px
+    area_px = width_px * math.hypot(width_px, least_streak_px(samples))
     signal_e = (SNR**2 + math.sqrt(SNR**4 + 4 * SNR**2 * area_px * camera.noise_e**2)) / 2
     reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
     return 2.5 * math.log10(
@@ -400,10 +396,6 @@ def snr_limit_mag(context: Context, samples: CheckedSamples) -> float:
 
 
 def least_streak_px(samples: CheckedSamples) -> float:
-    """Path of the images at the slowest frame."""
-    return float(
-        min(
-            (np.median(view.streak_length_px) for view in samples.frames.known if len(view)),
-            default=0.0,
-        )
-    )
+    """Length of the images' path at the slowest frame."""
+    lengths_px = [np.median(view.streak_length_px) for view in samples.frames.known if len(view)]
+    return float(min(lengths_px, default=0.0))

@@ -1,18 +1,12 @@
-"""What the camera has in its field at an attitude: positions, electrons and image sizes of the lights, in closed form.
+"""The lights in the camera's field at an attitude: positions, electrons and image sizes, in closed form.
 
-A light's image is a point-spread function convolved with the LED's disk, the defocus disk and the path during the
-exposure. It is described by variances and a peak, so that no frame is rendered:
+The image of a light is a point-spread function convolved with the LED's disk, the defocus disk and the path during the
+exposure. Variances and a peak describe it, so no frame is rendered:
 
     sigma^2 = lens^2 + disk^2 / 4 + defocus^2 / 4,
 
-lens the standard deviation of the Gaussian with the lens's peak (pixel included), disk and defocus the radii of uniform
-disks. The share of the light in the brightest pixel is that of a disk of radius R, the larger of the two, blurred by a
-Gaussian of variance s^2 = lens^2 + r^2 / 4, r the smaller one,
-
-    peak = (1 - exp(-R^2 / 2 s^2)) / (pi R^2),      1 / (2 pi s^2) for R = 0,
-
-exact for one disk and a Gaussian lens. A path of length L spreads it over a trace: it falls by the factor
-sqrt(2 pi) S erf(L / (2 sqrt 2 S)) / L with S = 1 / sqrt(2 pi peak).
+with lens the standard deviation of the Gaussian that has the peak of the lens's image (pixel included), disk and
+defocus the radii of uniform disks. `peak_share` is the share of the light in the brightest pixel.
 """
 
 from __future__ import annotations
@@ -37,38 +31,40 @@ from skysim.simulation.lights.light import Beam, Exposure, Lit, Occluder, beam_o
 
 STEP = 1e-6  # relative displacement of a light, for the numerical derivative of its image
 NO_ACCELERATION = np.zeros(3)
-VISIBLE = -1
+VISIBLE = -1  # number in place of an occluder's for a light that is not hidden
 
 
 class View(NamedTuple):
-    """The lights on the chip at one attitude, (n,) each.
+    """The n lights on the detector at one attitude.
 
     Attributes
     ----------
     row
-        Row of the sources
+        (n,) rows among the sources
     xy_px
-        (n, 2)
+        (n, 2) image positions
     offset_m
-        (n, 3) from the pupil to the light in camera axes; a unit vector for a star
+        (n, 3) vectors from the pupil to the lights in camera axes; unit vectors for stars
     arm_m
-        (n, 3) from the bearing to the light in camera axes; the same as offset_m for a star
+        (n, 3) vectors from the bearing to the lights in camera axes; equal to offset_m for stars
     gradient
-        (n, 2, 3) derivative of xy_px by offset_m
+        (n, 2, 3) derivatives of xy_px by offset_m
     distance_m
-        Along the boresight; infinite for a star
+        (n,) distances along the boresight; infinite for stars
     electrons
-        Mean photo-electrons of an exposure
-    disk_px, defocus_px, sigma_px
-        Radii of the LED's and of the defocus disk, rms radius per axis without motion
+        (n,) mean photo-electrons of an exposure
+    disk_px, defocus_px
+        (n,) radii of the LED's disk and of the defocus disk
+    sigma_px
+        (n,) rms radii along each axis without motion
     streak_px
-        (n, 2) path during the exposure
+        (n, 2) paths during the exposure
     peak_e
-        Mean electrons in the brightest pixel, background included
+        (n,) mean electrons in the brightest pixel, background included
     bend_px
-        (n, 2) mean of the path minus its middle, by the angular acceleration
+        (n, 2) means of the paths minus their middles, by the angular acceleration
     behind
-        Number of the occluder that hides the light; VISIBLE for none
+        (n,) numbers of the occluders that hide the lights; VISIBLE for none
     """
 
     row: NDArray[np.int64]
@@ -91,7 +87,7 @@ class View(NamedTuple):
 
     @property
     def jacobian(self) -> Floats:
-        """(n, 2, 3) derivative of xy_px by a small rotation w of the lights in camera axes, about the bearing.
+        """(n, 2, 3) derivatives J_i of xy_px by a small rotation w of the lights about the bearing, in camera axes.
 
         d(offset) = w x arm, so a row of the gradient g gives g . (w x arm) = w . (arm x g).
         """
@@ -104,30 +100,31 @@ class View(NamedTuple):
 
     @property
     def blur2_px2(self) -> Floats:
-        """(n,) variance of the lens's image, without LED, defocus and motion."""
+        """(n,) variances of the lens's image, without LED, defocus and motion."""
         return self.sigma_px**2 - (self.disk_px**2 + self.defocus_px**2) / 4
 
     def take(self, which: NDArray[Any]) -> View:
-        """The chosen lights, by mask or index."""
+        """The lights selected by a mask or by indices."""
         return View(*(column[which] for column in self))
 
 
 class CameraModel(NamedTuple):
-    """What all views share.
+    """The camera's properties that all views share.
 
     Attributes
     ----------
     optics
-        Lens and chip geometry
+        Geometry of lens and detector
     lens_px
         Standard deviation of the Gaussian that has the peak of the lens's image, pixel included
     background_e
-        Mean electrons in a pixel, of extended light and dark current
+        Mean electrons in a pixel from extended light and dark current
     glow_e
-        Of them those of each light, by name; of light with edges its median over the chip
+        Mean electrons in a pixel from the extended light of each light, by name; light with edges counts by its median
+        over the detector
     noise_e
-        Standard deviation of a pixel without light: of that charge, of the read-out, of the
-        converter, and of the fixed pattern (without hot pixels)
+        Standard deviation of a pixel without light: shot noise of that charge, read-out noise, quantization, and fixed
+        pattern (without hot pixels)
     exposure_s
         Exposure time
     """
@@ -141,7 +138,7 @@ class CameraModel(NamedTuple):
 
     @property
     def stray_e(self) -> float:
-        """Mean electrons in a pixel that come past the baffle."""
+        """Mean electrons in a pixel from stray light past the baffle."""
         return self.glow_e.get(STRAY_LIGHT, 0.0)
 
     @classmethod
@@ -154,6 +151,7 @@ class CameraModel(NamedTuple):
         glow_e = glow_by_light_e(beam_of(lab.camera.lights, exposure), exposure_s)
         dark_e_s = detector.dark_e_s * 2.0**detector.doublings
         background_e = sum(glow_e.values()) + dark_e_s * exposure_s
+        # Variances of the fixed pattern and of the read-out; a converter's step q has the variance q^2 / 12.
         pattern_e2 = (detector.dsnu * dark_e_s * exposure_s) ** 2 + detector.column_offset_e**2
         read_e2 = (
             detector.read_noise_e**2
@@ -167,7 +165,7 @@ class CameraModel(NamedTuple):
 
 
 def glow_by_light_e(beam: Beam, exposure_s: float) -> dict[str, float]:
-    """Electrons in a pixel that each light gives it, see `CameraModel`."""
+    """Mean electrons in a pixel from the extended light of each light, by name, see `CameraModel`."""
     found: dict[str, float] = {}
     for lit in beam.lits:
         smooth = float(np.mean(lit.glow())) if lit.glow else 0.0
@@ -176,7 +174,7 @@ def glow_by_light_e(beam: Beam, exposure_s: float) -> dict[str, float]:
 
 
 def before_lights_e_s(lit: Lit) -> float:
-    """Electrons s^-1 px^-1 of light with edges behind which lights are seen: none of what hides them."""
+    """Electrons s^-1 px^-1 of light with edges in the background of other lights; 0 if it hides them."""
     glow = lit.edged.e_s() if lit.edged and lit.hides is None else None
     return 0.0 if glow is None or lit.edged is None else lit.edged.share * float(np.median(glow))
 
@@ -188,11 +186,30 @@ def view(
     occluders: Sequence[Occluder] = (),
     acceleration_body_rad_s2: Floats = NO_ACCELERATION,
 ) -> View:
-    """The points of a light on the chip in an exposure, also those that one of the occluders hides.
+    """The points of a light on the detector in an exposure, hidden ones included.
 
-    At the time t from mid-exposure the lights are rotated by -(rate t + acceleration t^2 / 2), with the vehicle's rate
-    and its acceleration (3,) in body axes; the mean over the exposure T is -acceleration T^2 / 24.
+    1. Select the points on the detector.
+    2. Electrons, from rate and on-time.
+    3. Vectors to the lights, and the derivatives of the images.
+    4. Paths. At the time t from mid-exposure the lights are rotated by -(rate t + acceleration t^2 / 2), with the
+       vehicle's rate and acceleration in body axes. The mean over the exposure T is -acceleration T^2 / 24. Moving
+       lights add their own motion.
+    5. Sizes of lens image, LED disk and defocus disk.
+
+    Parameters
+    ----------
+    lit
+        Light with points
+    exposure
+        Exposure
+    camera
+        Camera
+    occluders
+        Occluders of the points; their numbers are in `behind`
+    acceleration_body_rad_s2
+        (3,) angular acceleration in body axes
     """
+    # 1. Points on the detector.
     assert lit.points is not None
     mount = exposure.mount
     optics = exposure.optics
@@ -209,23 +226,23 @@ def view(
     xy_px, distance_m, cos_out, cos_in = (
         one[on_chip] for one in (xy_px, distance_m, cos_out, cos_in)
     )
+    # 2. Electrons.
     rate_e_s = rates_e_s(chosen, optics, lit.emitter, distance_m, cos_out, cos_in)
     electrons = rate_e_s * np.minimum(chosen.on_s / chosen.period_s, 1.0) * exposure_s
+    # 3. Derivatives.
     arm_m = exposure.cam_from_lab.apply(chosen.place[:, :3])
     offset_m = arm_m - chosen.place[:, 3:] * mount.cam_from_body.apply(mount.camera_body_m)
     gradient = image_gradient(optics, offset_m)
     jacobian = np.cross(arm_m[:, None, :], gradient)
-    rate_body_rad_s = exposure.trajectory.rate_at(exposure.t_s)
-    streak_px, bend_px = (
-        -factor * np.einsum("nij,j->ni", jacobian, mount.cam_from_body.apply(body))
-        for factor, body in (
-            (exposure_s, rate_body_rad_s),
-            (exposure_s**2 / 24, acceleration_body_rad_s2),
-        )
-    )
+    # 4. Paths.
+    rate_cam = mount.cam_from_body.apply(exposure.trajectory.rate_at(exposure.t_s))
+    acceleration_cam = mount.cam_from_body.apply(acceleration_body_rad_s2)
+    streak_px = -exposure_s * np.einsum("nij,j->ni", jacobian, rate_cam)
+    bend_px = -(exposure_s**2 / 24) * np.einsum("nij,j->ni", jacobian, acceleration_cam)
     if chosen.motion is not None:
         motion_cam = exposure.cam_from_lab.apply(chosen.motion[:, 0])
         streak_px = streak_px + exposure_s * np.einsum("nij,nj->ni", gradient, motion_cam)
+    # 5. Sizes.
     depth_m = np.where(is_led, offset_m[:, 2], np.inf)
     disk_px = np.where(is_led, optics.camera.focal_px * chosen.radius_m / distance_m, 0.0)
     lens2_px2 = camera.lens_px**2 + field_sigma_px(optics.camera.psf, optics.camera, xy_px) ** 2
@@ -255,7 +272,7 @@ def view(
 
 
 def hiding(occluders: Sequence[Occluder], place: Floats) -> NDArray[np.int64]:
-    """(N,) number of the occluder that hides each of N places, the last one that does; VISIBLE for none."""
+    """(N,) number of the last occluder that hides each of N places; VISIBLE for none."""
     found = np.full(len(place), VISIBLE)
     for number, occluder in enumerate(occluders):
         found[occluder.hides(place)] = number
@@ -263,19 +280,29 @@ def hiding(occluders: Sequence[Occluder], place: Floats) -> NDArray[np.int64]:
 
 
 def image_gradient(optics: Optics, offset_m: Floats) -> Floats:
-    """(n, 2, 3) derivative of the image position by the offset in camera axes, from central differences."""
+    """(n, 2, 3) derivatives of the image positions by the offsets in camera axes, from central differences."""
     step_m = STEP * np.linalg.norm(offset_m, axis=1)[:, None, None] * np.eye(3)
     ahead, behind = (optics.project(offset_m[:, None, :] + sign * step_m) for sign in (1, -1))
     return np.asarray(np.swapaxes(ahead - behind, 1, 2) / (2 * step_m.max(axis=2)[:, None, :]))
 
 
 def peak_share(lens2_px2: Floats, disk_px: Floats, defocus_px: Floats, streak_px: Floats) -> Floats:
-    """(n,) share of the light in the brightest pixel; see the module's description."""
+    """(n,) share of the light in the brightest pixel.
+
+    The image is a disk of radius R, the larger of LED and defocus disk, blurred by a Gaussian of variance
+    s^2 = lens^2 + r^2 / 4 with the smaller radius r:
+
+        peak = (1 - exp(-R^2 / 2 s^2)) / (pi R^2),      1 / (2 pi s^2) for R = 0
+
+    This is exact for one disk and a Gaussian lens. A path of length L spreads it over a trace, which reduces it by the
+    factor sqrt(2 pi) S erf(L / (2 sqrt 2 S)) / L with S = 1 / sqrt(2 pi peak).
+    """
     large = np.maximum(disk_px, defocus_px)
     small = np.minimum(disk_px, defocus_px)
     s2 = lens2_px2 + small**2 / 4
     still = -np.expm1(-(large**2) / (2 * s2)) / np.maximum(np.pi * large**2, 1e-12)
     still = np.where(large > 1e-3, still, 1 / (2 * np.pi * s2))
+    # With x = L / (2 sqrt 2 S) the factor is sqrt(pi) / 2 erf(x) / x.
     sigma = 1 / np.sqrt(2 * np.pi * still)
     x = np.maximum(streak_px, 1e-9) / (2 * np.sqrt(2) * sigma)
     return np.asarray(still * np.sqrt(np.pi) / 2 * special.erf(x) / x)

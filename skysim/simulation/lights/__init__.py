@@ -1,1 +1,1 @@
-"""The lights of a scene: what shines, what hides it, and what air, wall and lens make of it; one module for each."""
+"""The lights of a scene: sources, obstacles that hide them, and the effects of air, wall and lens."""

@@ -1,7 +1,7 @@
-"""The air over the site: it raises, dims and blurs what is above it, and glows; the skyline hides what is low.
+"""The air over the site: refraction, extinction, scintillation, seeing and airglow, and the skyline.
 
-It is the air of mid-exposure: the site turns by 15" in a second, which changes a refraction by less than 0.02" at 15
-degrees of altitude.
+Everything is computed for mid-exposure. The site rotates by 15" in a second, which changes the refraction by less than
+0.02" at an altitude of 15 deg.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from skysim.sources.air import Air, Sky
 
 @dataclass(frozen=True)
 class AirEffects(Light):
-    """Refraction, extinction, scintillation and seeing, for all lights before it."""
+    """Refraction, extinction, scintillation and seeing of all lights before it in the list."""
 
     air: Air
 
@@ -68,15 +68,16 @@ class AirGlow(Light):
 
 
 def seen_through(sky: Sky, lit: Lit, exposure: Exposure) -> Lit:
-    """A light raised and dimmed by the air."""
+    """The light with the refraction and extinction of the air."""
     points = None if lit.points is None else seen_points(sky, lit.points, exposure)
     return lit._replace(points=points, discs=tuple(sky.body_seen(disc) for disc in lit.discs))
 
 
 def seen_points(sky: Sky, points: Sources, exposure: Exposure) -> Sources:
-    """Points raised and dimmed: of those at rest the ones near the field, which twinkle."""
+    """Points with refraction and extinction; of points at rest those near the field, with scintillation."""
     if points.motion is not None:
         return sky.points_seen(points)
+    # In the expectation, without seeds, nothing scintillates.
     seen = sky.points_seen(points.take(in_view(points, exposure.optics, exposure.few_poses)))
     if not sky.air.config.scintillation or exposure.seeds is None:
         return seen
@@ -85,6 +86,7 @@ def seen_points(sky: Sky, points: Sources, exposure: Exposure) -> Sources:
 
 
 def build(plan: LightPlan) -> Iterator[Light]:
+    """The effects of `light.air`; none without it."""
     light = plan.scene.light
     if isinstance(light, StarsConfig) and light.air and plan.catalog is not None:
         air = Air.from_config(light.air, plan.scene.site, plan.catalog, plan.band)

@@ -1,4 +1,4 @@
-"""Lights in a laboratory: the LEDs of a dome, a panel's pixels in their place, and a display behind a collimator."""
+"""Known lights: the LEDs of a dome or pixels of a panel, the stars of a collimated display, and stars of the sky."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from skysim.sources.dome import display
 from skysim.sources.dome.codes import Clocks, LedCodes, build_clocks, build_codes
 from skysim.sources.dome.led import Emitter, warm_up_factor
 
-MAX_RUNS = 4  # whose timing is kept
+MAX_RUNS = 4  # number of runs whose timing is cached
 
 
 class LedTiming(NamedTuple):
-    """The LEDs' timing in one run.
+    """The timing of the LEDs in one run.
 
     Attributes
     ----------
     clocks
-        The controllers' oscillators; None where all light is steady
+        Oscillators of the LED controllers; None if all light is steady
     codes
-        The LEDs' words and the clock of their bits; None without light.led.code
+        Code words of the LEDs and the clock of their bits; None without light.led.code
     """
 
     clocks: Clocks | None
@@ -39,12 +39,14 @@ class LedTiming(NamedTuple):
 
 @dataclass(frozen=True)
 class LedDome(KnownLight):
-    """A dome's LEDs: warmed up, moved by the temperature, and lit by their controllers' pulses and codes.
+    """The LEDs of a dome, with warm-up, thermal motion, and the pulses and codes of their controllers.
 
     Attributes
     ----------
+    config
+        The scene's section `light`
     thermal
-        What has moved since the survey; None for nothing
+        Thermal motion since the survey; None if there is none
     """
 
     config: DomeConfig
@@ -52,13 +54,21 @@ class LedDome(KnownLight):
     _timing: dict[int, LedTiming] = field(init=False, repr=False, default_factory=dict)
 
     def during(self, exposure: Exposure) -> Lit:
-        """The LEDs and the light of black pixels; with no seed the LEDs are lit for their share of the time."""
+        """The LEDs and the light of black pixels. Without seeds the LEDs are lit for their share of the time.
+
+        1. Warm-up reduces the strength of all LEDs.
+        2. Temperature moves them.
+        3. Pulses and codes of this run set their on-times.
+        """
+        # 1. Warm-up.
         left = warm_up_factor(self.config.led.warm_up, exposure.t_s)
         leds = self.sources
         if left < 1:
             leds = replace(leds, strength=left * leds.strength)
+        # 2. Thermal motion.
         if self.thermal is not None:
             leds = leds_at(self.thermal, leds, exposure.t_s)
+        # 3. Pulses and codes.
         if exposure.seeds is not None:
             leds = self.pulsed(
                 leds, exposure.seeds.run, exposure.index, exposure.window, exposure.t_s
@@ -70,7 +80,7 @@ class LedDome(KnownLight):
     def pulsed(
         self, leds: Sources, seed: int, index: int, window: Window, middle_s: float
     ) -> Sources:
-        """The LEDs with their pulses and codes in a frame of the run of a seed; middle_s : mid-exposure."""
+        """The LEDs with their pulses and codes in a frame of the run with this seed; middle_s is mid-exposure."""
         timing = self.timing(seed)
         if timing.clocks:
             leds = timing.clocks.lights_at(leds, middle_s, window.exposure_s)
@@ -79,7 +89,7 @@ class LedDome(KnownLight):
         return leds
 
     def timing(self, seed: int) -> LedTiming:
-        """The timing in the run of a seed, which is drawn once."""
+        """The timing in the run with this seed, which is drawn once and cached."""
         if seed not in self._timing:
             while len(self._timing) >= MAX_RUNS:
                 self._timing.pop(next(iter(self._timing)))
@@ -90,7 +100,7 @@ class LedDome(KnownLight):
 
 @dataclass(frozen=True)
 class CollimatedDisplay(KnownLight):
-    """The stars of a star simulator's display, and the light of its black pixels."""
+    """The stars on a display behind a collimator, and the light of its black pixels."""
 
     config: CollimatedDisplayConfig
 
@@ -103,7 +113,7 @@ class CollimatedDisplay(KnownLight):
 def black_pixels(
     config: DomeConfig | CollimatedDisplayConfig, exposure: Exposure, share: float = 1.0
 ) -> EdgedGlow:
-    """The light of a display's black pixels; none without a display, or if its black is dark."""
+    """The light of a display's black pixels, of which a share is left; none without a display or if black is dark."""
     optics = exposure.optics
     cam_from_lab = exposure.cam_from_lab
     camera_m = exposure.camera_m
@@ -112,8 +122,7 @@ def black_pixels(
     )
 
 
-# The scene's own light, which a tracker can know: stars, LEDs of a dome, or stars on a collimated
-# display.
+# The light of the scene's section `light`.
 
 
 def of_dome(config: DomeConfig, plan: LightPlan) -> KnownLight:
@@ -130,7 +139,7 @@ def of_display(config: CollimatedDisplayConfig, plan: LightPlan) -> KnownLight:
     return CollimatedDisplay(shown, Emitter(), config)
 
 
-# By the kind of the section `light`.
+# By the kind of the scene's section `light`.
 KNOWN: dict[str, Callable[[Any, LightPlan], KnownLight]] = {
     "dome": of_dome,
     "stars": stars_of,
@@ -139,5 +148,5 @@ KNOWN: dict[str, Callable[[Any, LightPlan], KnownLight]] = {
 
 
 def known_light(plan: LightPlan) -> KnownLight:
-    """The light of the section `light`; that of the plan, if it has been made."""
+    """The light of the scene's section `light`; that of the plan if it has one."""
     return plan.known or KNOWN[plan.scene.light.kind](plan.scene.light, plan)

@@ -1,4 +1,4 @@
-"""The laboratory around the lights: a wall that sends light on, and what stands between a light and the camera."""
+"""The laboratory around the lights: wall and floor that reflect them, and obstacles that hide them."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ from skysim.sources.dome.interreflection import ReflectingDome, reflecting_dome
 from skysim.sources.dome.led import warm_up_factor
 from skysim.sources.dome.surface import Surface, build_surface
 
+# Reflections: a glow if the surface scatters, images if it mirrors.
+
 
 def images_of(name: str) -> str:
-    """The name of the images of lights in the wall."""
+    """The name of the images of the lights with this name in the wall."""
     return f"images of {name} in the wall"
 
 
@@ -32,7 +34,7 @@ IMAGES = images_of("LEDs")
 
 @dataclass(frozen=True)
 class WallGlow(Light):
-    """The glow of wall and floor, which wanes with the LEDs as they warm up."""
+    """The glow of wall and floor, which decreases with the strength of the LEDs as they warm up."""
 
     only_adds: ClassVar[bool] = True
     dome: ReflectingDome
@@ -63,7 +65,7 @@ class Mirror(Light):
         return beam
 
     def image(self, lit: Lit, exposure: Exposure) -> Lit:
-        """The images of one light, which the same things hide."""
+        """The images of one light in the wall; the same obstacles hide them."""
         assert lit.points is not None
         images = images_in_wall(
             self.dome, lit.points, exposure.optics, exposure.cam_from_lab, exposure.camera_m
@@ -72,7 +74,7 @@ class Mirror(Light):
 
 
 def build_wall(plan: LightPlan) -> Iterator[Light]:
-    """What a wall or a floor reflects: a glow if it scatters, images if it mirrors."""
+    """The light that the wall or the floor of a dome reflects."""
     light = plan.scene.light
     dome = reflecting_dome(light, known_light(plan).sources)
     if isinstance(light, DomeConfig) and dome is not None:
@@ -82,18 +84,15 @@ def build_wall(plan: LightPlan) -> Iterator[Light]:
             yield Mirror(dome)
 
 
-# What stands in the laboratory between a light and the camera: the vehicle's parts, and the dome's
-# wall.
+# Obstacles between a light and the camera: parts of the vehicle, and the dome's wall.
 
-
-INWARD_FRACTION = (
-    1e-6  # an LED is moved off its wall by this fraction of its distance from the bearing
-)
+# For the ray to the camera, an LED is moved off its wall by this fraction of its distance from the bearing.
+INWARD_FRACTION = 1e-6
 
 
 @dataclass(frozen=True)
 class Vehicle(Obstacle):
-    """Parts of the vehicle that are in the way at mid-exposure."""
+    """The parts of the vehicle, at mid-exposure."""
 
     obstacles: multibody.Obstacles
 
@@ -104,12 +103,13 @@ class Vehicle(Obstacle):
 
 @dataclass(frozen=True)
 class DomeWall(Obstacle):
-    """The dome's wall before its own LEDs, for a camera that is outside of it."""
+    """The wall of the dome, which hides its own LEDs from a camera outside of it."""
 
     wall: Surface
 
     def during(self, exposure: Exposure) -> Lit:
         def hides(place: Floats) -> NDArray[np.bool_]:
+            """(N,) whether a place (N, 4) is that of an LED behind the wall."""
             hidden = place[:, 3] > 0
             hidden[hidden] = behind_wall(self.wall, exposure.camera_m, place[hidden, :3])
             return hidden
@@ -118,9 +118,9 @@ class DomeWall(Obstacle):
 
 
 def behind_wall(wall: Surface, camera_m: Floats, position_m: Floats) -> NDArray[np.bool_]:
-    """(N,) whether the line from LEDs at (N, 3) to the camera passes through the dome's wall (not beneath its rim).
+    """(N,) whether the line from an LED at (N, 3) to the camera passes through the dome's wall (not beneath its rim).
 
-    A camera inside sees no LED through the wall, as convex surfaces cannot hide their inside; all surfaces here are
+    The wall hides nothing from a camera inside, since a convex surface cannot hide its inside. All surfaces here are
     convex, except for the millimeters of a surveyed one.
     """
     behind = np.zeros(len(position_m), dtype=bool)
@@ -129,14 +129,13 @@ def behind_wall(wall: Surface, camera_m: Floats, position_m: Floats) -> NDArray[
     for n, led_m in enumerate(position_m * (1 - INWARD_FRACTION)):
         ray = (camera_m - led_m)[None]
         wall_m = wall.meet(led_m, ray)[0]
-        behind[n] = np.linalg.norm(wall_m - led_m) < np.linalg.norm(
-            ray
-        )  # NaN, beneath the rim, is not
+        # A ray beneath the rim meets no wall: its distance is NaN, which is not smaller.
+        behind[n] = np.linalg.norm(wall_m - led_m) < np.linalg.norm(ray)
     return behind
 
 
 def build_obstacles(plan: LightPlan) -> Iterator[Light]:
-    """What `light.occlusion` lets hide a light; a collimated display has nothing in its beam."""
+    """The obstacles, if `light.occlusion` is on; a collimated display has none in its beam."""
     light = plan.scene.light
     if getattr(light, "occlusion", False):
         yield Vehicle(multibody.build_obstacles(plan.vehicle, plan.mount))

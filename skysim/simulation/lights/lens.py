@@ -1,4 +1,4 @@
-"""What the lens and its baffle make of the light: light from beside the field, ghosts, and veiling glare."""
+"""Effects of the lens and its baffle: stray light from outside the field, ghosts, and veiling glare."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STRAY_LIGHT = "stray light"
 
 @dataclass(frozen=True)
 class Baffle(Light):
-    """Light past the baffle: of all bodies that nothing hides, and of the Earth, even over the chip."""
+    """Stray light past the baffle from all bodies that nothing hides, and from the Earth, uniform over the detector."""
 
     only_adds: ClassVar[bool] = True
     config: BaffleConfig
@@ -32,7 +32,7 @@ class Baffle(Light):
         )
 
     def stray_e_s(self, beam: Beam, exposure: Exposure) -> dict[str, float]:
-        """Electrons s^-1 px^-1 by the name of the body that sends them."""
+        """Stray light in electrons s^-1 px^-1, by the name of the body that emits it."""
         bodies = [disc for lit in beam.lits for disc in visible_discs(lit)]
         found = stray_of_bodies_e_s_m2(self.config, bodies, exposure.boresight)
         for lit in beam.lits:
@@ -45,14 +45,14 @@ class Baffle(Light):
 
 
 def visible_discs(lit: Lit) -> Iterator[BodyLight]:
-    """The discs of a light whose centers nothing hides."""
+    """The discs of a light whose centers are not hidden."""
     occludes = lit.occlusion
     hidden = occludes(centers_of(lit.discs).place) if occludes else np.zeros(len(lit.discs), bool)
     return itertools.compress(lit.discs, ~hidden)
 
 
 def stray_e_s(lights: Sequence[Light], exposure: Exposure) -> dict[str, float]:
-    """Electrons s^-1 px^-1 that each body, and the Earth, sends past the baffle; empty without a baffle."""
+    """Stray light past the baffle in electrons s^-1 px^-1, by name of the body; empty without a baffle."""
     for n, light in enumerate(lights):
         if isinstance(light, Baffle):
             return light.stray_e_s(beam_of(lights[:n], exposure), exposure)
@@ -61,7 +61,7 @@ def stray_e_s(lights: Sequence[Light], exposure: Exposure) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Ghosts(Light):
-    """Pairs of surfaces of the lens by which light reaches the chip a second time."""
+    """Ghost images: pairs of surfaces of the lens reflect light onto the detector a second time."""
 
     only_adds: ClassVar[bool] = True
     ghosts: tuple[GhostConfig, ...]
@@ -76,7 +76,7 @@ class Ghosts(Light):
 
 @dataclass(frozen=True)
 class Glare(Light):
-    """Light that the lens scatters over the chip."""
+    """Veiling glare: light that the lens scatters over the detector."""
 
     only_adds: ClassVar[bool] = True
     config: GlareConfig
@@ -86,12 +86,14 @@ class Glare(Light):
 
 
 def build_baffle(plan: LightPlan) -> Iterator[Light]:
+    """The stray light of `camera.baffle`; none without it."""
     baffle = plan.scene.camera.baffle
     if baffle:
         yield Baffle(baffle)
 
 
 def build(plan: LightPlan) -> Iterator[Light]:
+    """The effects of `camera.ghosts` and `camera.glare`; none without them."""
     camera = plan.scene.camera
     if camera.ghosts:
         yield Ghosts(camera.ghosts)

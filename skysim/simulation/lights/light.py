@@ -1,9 +1,13 @@
-"""What a light is asked, and what it answers: `Exposure`, `Lit`, and the `Beam` of all lights together.
+"""The interface of lights: `Exposure` is their input, `Lit` the output of one, and `Beam` that of all together.
 
-A camera's lights are one tuple, from the farthest to the lens (registry.py has the order). For each exposure the light
-goes through them in this order: one that shines adds what it gives (`Lit`), one that hides is added to what hides those
-before it, and air, wall and lens change what the others gave. The renderer draws the beam that comes out, and the
-forecast (`simulation.checks`) counts it.
+A camera's lights are one tuple, from the farthest to the lens (registry.py has the order). `beam_of` passes the beam of
+an exposure through them in this order:
+
+1. A source adds its light (`Lit`).
+2. An obstacle is added to the occluders of all lights before it.
+3. Air, wall and lens change the lights before them.
+
+The renderer draws the final beam, and `simulation.checks` predicts from it.
 """
 
 from __future__ import annotations
@@ -36,7 +40,15 @@ from skysim.sources.satellites import ExposureView
 
 
 class Seeds(NamedTuple):
-    """Seeds of a run: of what all cameras share (the LED controllers' clocks), and of this camera's own draws."""
+    """Seeds of a run.
+
+    Attributes
+    ----------
+    run
+        Seed of the draws that all cameras share (clocks of the LED controllers)
+    camera
+        Seed of this camera's own draws
+    """
 
     run: int
     camera: int
@@ -44,26 +56,26 @@ class Seeds(NamedTuple):
 
 @dataclass(frozen=True)
 class Exposure:
-    """One exposure of one camera, as its lights see it.
+    """One exposure of one camera: the input of its lights.
 
     Attributes
     ----------
     index
-        Of the frame
+        Index of the frame
     window
-        When it is exposed
+        Exposure window
     trajectory
-        Of the vehicle
+        Motion of the vehicle
     lab_from_body
-        Its attitude at mid-exposure
+        Attitude of the vehicle at mid-exposure
     mount, optics
-        At mid-exposure, as temperature and errors of the mount have them
+        True mount and optics at mid-exposure, with temperature and mount error
     band
-        Of the chip
+        Spectral band of the camera
     viewpoint
-        The camera's place on the Earth or in its orbit
+        Place of the camera on the Earth or in its orbit
     seeds
-        Of the run; None for the expectation, in which nothing is drawn at random
+        Seeds of the run; None for the expectation, without random draws
     """
 
     index: int
@@ -78,7 +90,7 @@ class Exposure:
 
     @cached_property
     def t_s(self) -> float:
-        """Mid-exposure of the middle row, seconds from the scene's start."""
+        """Mid-exposure of the middle row, in seconds from the scene's start."""
         return self.window.middle_s(self.optics.camera.height_px)
 
     @cached_property
@@ -88,40 +100,40 @@ class Exposure:
 
     @cached_property
     def observer(self) -> ObserverPlace:
-        """The camera among the bodies of the solar system at mid-exposure."""
+        """Place and velocity of the camera in the solar system at mid-exposure."""
         return self.viewpoint.observer_at(self.t_s)
 
     @cached_property
     def cam_from_lab(self) -> Rotation:
-        """The camera's attitude at mid-exposure."""
+        """Attitude of the camera at mid-exposure."""
         return self.mount.cam_from_body * self.lab_from_body.inv()
 
     @cached_property
     def camera_m(self) -> Floats:
-        """(3,) the entrance pupil in the lab at mid-exposure."""
+        """(3,) position of the entrance pupil in the lab at mid-exposure."""
         return self.lab_from_body.apply(self.mount.camera_body_m)
 
     @cached_property
     def boresight(self) -> Floats:
-        """(3,) unit vector in lab axes at mid-exposure."""
+        """(3,) unit vector of the boresight in lab axes at mid-exposure."""
         return self.cam_from_lab.inv().apply([0.0, 0.0, 1.0])
 
     @cached_property
     def view(self) -> ExposureView:
-        """What the camera can see from the first row's opening to the last row's end."""
+        """Region of the sky that the camera sees from the opening of the first row to the end of the last row."""
         duration_s = self.window.close_s(self.optics.camera.height_px) - self.window.open_s
         turn_rad = float(np.linalg.norm(self.trajectory.rate_at(self.t_s))) * duration_s
         return ExposureView(self.boresight, self.optics.field_rad, turn_rad, duration_s)
 
     @cached_property
     def few_poses(self) -> Poses:
-        """FEW poses over the exposure, to look for what is near the field."""
+        """FEW poses over the exposure, to find sources near the field."""
         end_s = self.window.close_s(self.optics.camera.height_px)
         return poses(self.trajectory, self.mount, np.linspace(self.window.open_s, end_s, FEW))
 
     @cached_property
     def pose(self) -> Poses:
-        """The one pose of mid-exposure."""
+        """The pose at mid-exposure."""
         return Poses(self.cam_from_lab.as_matrix()[None], self.camera_m[None])
 
     def exposed(self, optics: Optics) -> Exposed:
@@ -130,16 +142,16 @@ class Exposure:
 
 
 class Occluder(NamedTuple):
-    """What hides lights.
+    """An object that hides lights.
 
     Attributes
     ----------
     name
-        For messages, such as "the Earth"
+        Name for messages, such as "the Earth"
     hides
-        Which of N places, as in `Sources`, are behind it
+        Function from places (N, 4), as in `Sources`, to (N,) whether each is behind it
     whole
-        Whether it hides a disc as a whole, by its center
+        Whether it hides a disc as a whole, if its center is behind it
     """
 
     name: str
@@ -148,7 +160,7 @@ class Occluder(NamedTuple):
 
 
 def any_of(occluders: Sequence[Occluder]) -> OcclusionTest | None:
-    """The test for places that any of these hides; None for none of them."""
+    """The test for places that any of the occluders hides; None without occluders."""
 
     def hidden(place: Floats) -> NDArray[np.bool_]:
         return np.any([occluder.hides(place) for occluder in occluders], axis=0)
@@ -162,10 +174,10 @@ class EdgedGlow(NamedTuple):
     Attributes
     ----------
     e_s
-        Gives (h, w) electrons s^-1 px^-1 at even nodes from the first pixel's center to the
-        last one's, or of all pixels; None if none of it is in the field
+        Returns (h, w) electrons s^-1 px^-1 at evenly spaced nodes from the center of the first pixel to that of the
+        last, or of all pixels; None if no light is in the field
     share
-        Of that light that is left
+        Fraction of that light that is left
     """
 
     e_s: Callable[[], Floats | None]
@@ -173,34 +185,33 @@ class EdgedGlow(NamedTuple):
 
 
 class Lit(NamedTuple):
-    """What one light gives to an exposure. Extended light, which takes longest, is computed when it is asked for.
+    """The light that one `Light` adds to an exposure. Extended light is slow, so functions compute it when needed.
 
     Attributes
     ----------
     name
-        What it is, for messages
+        Name for messages
     known
-        Whether a tracker can find itself by it
+        Whether a tracker can determine the attitude from it
     points
-        Whose images are drawn along their paths
+        Point sources
     emitter
-        How points in the laboratory shine
+        Angular emission of points in the laboratory
     discs
         Resolved bodies, the farthest first
     glow
-        Gives its smooth extended light, electrons s^-1 px^-1: a number, or (h, w) at
-        `background.node_directions`
+        Returns smooth extended light in electrons s^-1 px^-1: a number, or (h, w) at `background.node_directions`
     edged
-        Its extended light with edges
+        Extended light with edges
     around
-        Gives (M, 3) directions and (M,) irradiances, photo-electrons s^-1 m^-2, of extended
-        light also beside the field, which a baffle may let through
+        Returns directions (M, 3) and irradiances (M,), photo-electrons s^-1 m^-2, of extended light inside and
+        outside the field, which a baffle may let through
     hides
-        What it hides of the lights before it
+        Occluder that this object is for the lights before it
     hidden_by
-        What may hide this light
+        Occluders that may hide this light
     satellites
-        The truth of those of the points that are satellites
+        Truth of the points that are satellites
     """
 
     name: str
@@ -216,7 +227,7 @@ class Lit(NamedTuple):
     satellites: tuple[SatelliteTruth, ...] = ()
 
     def behind(self, occluder: Occluder) -> Lit:
-        """The same light with one more thing that may hide it."""
+        """The same light with one more occluder."""
         if occluder.whole and self.discs:
             hidden = occluder.hides(centers_of(self.discs).place)
             return self._replace(discs=tuple(itertools.compress(self.discs, ~hidden)))
@@ -224,36 +235,46 @@ class Lit(NamedTuple):
 
     @property
     def occlusion(self) -> OcclusionTest | None:
-        """The test for places that anything hides; None if nothing can hide the light."""
+        """The test for places that any occluder hides; None if nothing can hide the light."""
         return any_of(self.hidden_by)
 
 
 class LightPath(NamedTuple):
-    """One way of the light through the lens: 0 is the image, and the others, from 1, are ghosts."""
+    """One path of the light through the lens: number 0 is the image, 1 and above are ghosts."""
 
     number: int
     optics: Optics
 
 
 class Beam(NamedTuple):
-    """All light of an exposure on its way to the chip: of each light so far, the ways through the lens, its glare."""
+    """All light of an exposure on its way to the detector.
+
+    Attributes
+    ----------
+    lits
+        Light of each source so far
+    paths
+        Paths through the lens: the image first, then ghosts
+    glares
+        Veiling glares of the lens
+    """
 
     lits: tuple[Lit, ...]
     paths: tuple[LightPath, ...]
     glares: tuple[GlareConfig, ...] = ()
 
     def plus(self, lit: Lit) -> Beam:
-        """The beam with the light of one more, which hides what it can of those before."""
+        """The beam with one more light, which becomes an occluder of the lights before it if it hides."""
         occluder = lit.hides
         before = self.changed(lambda one: one.behind(occluder)) if occluder else self
         return before._replace(lits=(*before.lits, lit))
 
     def changed(self, change: Callable[[Lit], Lit]) -> Beam:
-        """The beam with each light changed."""
+        """The beam with a function applied to each light."""
         return self._replace(lits=tuple(change(lit) for lit in self.lits))
 
     def blurred(self, blur_px: float) -> Beam:
-        """The beam with the blur of the air, a Gaussian of this standard deviation, in its image."""
+        """The beam with the blur of the air in its image, a Gaussian of this standard deviation."""
         image, *ghosts = self.paths
         blurred = image._replace(optics=replace(image.optics, blur_px=blur_px))
         return self._replace(paths=(blurred, *ghosts))
@@ -264,7 +285,7 @@ class Beam(NamedTuple):
         return tuple(disc for lit in self.lits for disc in lit.discs)
 
     def before(self, lit: Lit) -> tuple[Occluder, ...]:
-        """All that may hide the points of a light: what it is behind, and the discs, if it is at infinity."""
+        """Occluders of the points of a light: its own, and all discs, which hide points at infinity."""
         return (
             *lit.hidden_by,
             *(Occluder(disc.title, partial(behind_disc, disc)) for disc in self.discs),
@@ -272,7 +293,7 @@ class Beam(NamedTuple):
 
 
 def behind_disc(disc: BodyLight, place: Floats) -> NDArray[np.bool_]:
-    """(N,) which of N places are at infinity and behind a disc."""
+    """(N,) whether each place (N, 4) is at infinity and behind a disc."""
     return (place[:, 3] == 0) & disc.hides(place[:, :3])
 
 
@@ -280,38 +301,38 @@ AnyLight = TypeVar("AnyLight", bound="Light")
 
 
 class Light:
-    """Anything that shines, or hides or changes the light of those before it; made once, and asked for each exposure.
+    """A source, an obstacle, or an effect on the lights before it. It is made once and evaluated for each exposure.
 
-    A light that shines or hides overrides `during`; one that changes what others give overrides `through`. What is
-    drawn at random is drawn from the exposure's seeds, so that the same lights serve any run.
+    Sources and obstacles override `during`, effects override `through`. Random draws use the seeds of the exposure, so
+    the same lights serve any run.
 
     Attributes
     ----------
     only_adds
-        Whether it neither hides nor changes others, and no tracker knows it
+        Whether it neither hides nor changes other lights, and no tracker knows it
     """
 
     only_adds: ClassVar[bool] = False
 
     def during(self, exposure: Exposure) -> Lit:
-        """What it gives to an exposure."""
+        """The light of this source in an exposure."""
         raise NotImplementedError
 
     def through(self, beam: Beam, exposure: Exposure) -> Beam:
-        """The beam after this light: what it gives is added, and it hides what it can of those before."""
+        """The beam after this light: with its own light added, and with its effect on the lights before it."""
         return beam.plus(self.during(exposure))
 
 
 @dataclass(frozen=True)
 class KnownLight(Light):
-    """The light of a scene by which a tracker can find itself: stars or LEDs.
+    """The light of a scene from which a tracker can determine the attitude: stars or LEDs.
 
     Attributes
     ----------
     sources
-        All of them, at the scene's start
+        All sources at the scene's start
     emitter
-        How those in the laboratory shine
+        Angular emission of sources in the laboratory
     """
 
     sources: Sources
@@ -323,7 +344,7 @@ class KnownLight(Light):
 
 
 class Obstacle(Light):
-    """Something that hides lights; `during` gives its occluder, and is quick."""
+    """An object that hides lights; `during` returns its occluder, and is fast."""
 
 
 def find_light(lights: Iterable[Light], kind: type[AnyLight]) -> AnyLight | None:
@@ -332,36 +353,33 @@ def find_light(lights: Iterable[Light], kind: type[AnyLight]) -> AnyLight | None
 
 
 def beam_of(lights: Iterable[Light], exposure: Exposure) -> Beam:
-    """The light of all lights in an exposure."""
+    """The beam of an exposure after all lights."""
     beam = Beam((), (LightPath(0, exposure.optics),))
     for light in lights:
         beam = light.through(beam, exposure)
     return beam
 
 
-# What a camera's lights are built from.
-
-
 @dataclass(frozen=True, slots=True)
 class LightPlan:
-    """The scene and the hardware around a camera.
+    """The input from which the lights of a camera are built.
 
     Attributes
     ----------
     scene
-        As the camera sees it, see `Scene.of_head`
+        The scene with the camera's settings, see `Scene.of_head`
     band
-        Of its chip
+        Spectral band of the camera
     vehicle
-        That carries it
+        Vehicle that carries the camera
     viewpoint
-        Its place on the Earth or in its orbit
+        Place of the camera on the Earth or in its orbit
     catalog
-        The stars of the scene's light; None under a dome
+        Catalog of the scene's light; None under a dome
     known
-        The scene's light in this band, where another camera has it already
+        The scene's light in this band, if another camera has it already
     mount
-        Of a further camera; None for the main one
+        Mount of a further camera; None for the main one
     """
 
     scene: Scene

@@ -1,9 +1,10 @@
-"""All kinds of lights in the order in which their light is gathered, and the kinds that programs add.
+"""All kinds of lights, in the order in which their light passes to the lens, and the kinds that programs add.
 
-An entry of `LIGHTS` makes none, one or more lights from a `Plan`. Something hides what comes before it, air, wall and
-lens change what comes before them, and lights are drawn in this order. Kinds of the scene's list `lights` are added by
-`register`, from any module that is imported, or from an installed package by an entry point of the group
-`skysim.lights` (see scene/sections/lights.py).
+An entry of `LIGHTS` makes none, one or more lights from a `LightPlan`. An obstacle hides the lights before it; air,
+wall and lens change the lights before them. Lights are drawn in this order.
+
+`register` adds a kind of the scene's list `lights`. Any imported module may call it, or a module of an installed
+package that an entry point of the group `skysim.lights` names (see scene/sections/light.py).
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ def register(config: type[LightConfig], build: Callable[[Any, LightPlan], Light]
     Parameters
     ----------
     config
-        The schema of its section, with a literal `kind`
+        Schema of its section, with a literal `kind`
     build
-        Makes the light of such a section
+        Function from a section and a plan to the light
     """
     KINDS[add_kind(config)] = build
 
@@ -55,6 +56,7 @@ LIGHTS: dict[str, Callable[[LightPlan], Iterable[Light]]] = {
 
 
 def build_lights(plan: LightPlan) -> tuple[Light, ...]:
-    """All lights of a camera. Raises InputError for files that cannot be read and for a dome that does not fit."""
+    """All lights of a camera. Raises InputError for unreadable files, and for a dome that does not fit its room."""
+    # Several entries need the known light; make it once.
     plan = replace(plan, known=known_light(plan))
     return tuple(light for build in LIGHTS.values() for light in build(plan))

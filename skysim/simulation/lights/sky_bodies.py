@@ -1,4 +1,4 @@
-"""The Earth under a camera in orbit: what it hides, and the light of its day side and its air."""
+"""The Earth under a camera in orbit, artificial satellites, and Sun, Moon and planets."""
 
 from __future__ import annotations
 
@@ -28,6 +28,8 @@ from skysim.sources.ephemeris import GcrsState
 from skysim.sources.orbit_elements import MeanElements, read_elements
 from skysim.sources.satellites import MovingLight, as_sources, known_satellites, random_satellites
 
+# The Earth under a camera in orbit: it hides stars, and its day side and its air shine.
+
 NAME = "the Earth"
 
 
@@ -35,7 +37,7 @@ NAME = "the Earth"
 class DarkEarth(Obstacle):
     """An Earth that only hides: stars one by one, and bodies as a whole.
 
-    Satellites, which may be before it, come after it in the list of lights.
+    Satellites may be in front of it, so they follow it in the list of lights.
     """
 
     def during(self, exposure: Exposure) -> Lit:
@@ -59,17 +61,15 @@ class LitEarth(DarkEarth):
         optics = exposure.optics
         cam_from_lab = exposure.cam_from_lab
         band = exposure.band
-        return (
-            super()
-            .during(exposure)
-            ._replace(
-                edged=EdgedGlow(lambda: earth_light(*seen_from, optics, cam_from_lab, band)),
-                around=lambda: earth_around(*seen_from, band),
-            )
+        dark = super().during(exposure)
+        return dark._replace(
+            edged=EdgedGlow(lambda: earth_light(*seen_from, optics, cam_from_lab, band)),
+            around=lambda: earth_around(*seen_from, band),
         )
 
 
 def build_earth(plan: LightPlan) -> Iterator[Light]:
+    """The Earth under a camera in orbit; none on the ground."""
     orbit = plan.scene.orbit
     if orbit:
         yield LitEarth(orbit.earth) if orbit.earth else DarkEarth()
@@ -80,12 +80,14 @@ def build_earth(plan: LightPlan) -> Iterator[Light]:
 
 @dataclass(frozen=True)
 class Satellites(Light):
-    """Satellites that can cross the field, those of the file first.
+    """Artificial satellites that can cross the field: those of a file, then random ones.
 
     Attributes
     ----------
+    config
+        The scene's section `light.satellites`
     elements
-        Of the file; None without one
+        Orbital elements of the file; None without a file
     """
 
     only_adds: ClassVar[bool] = True
@@ -93,17 +95,17 @@ class Satellites(Light):
     elements: MeanElements | None
 
     def during(self, exposure: Exposure) -> Lit:
-        """Their streaks; with no seed without the random ones."""
+        """The satellites in the exposure; in the expectation, without seeds, there are no random ones."""
+
+        def observer_at(after_s: float) -> GcrsState:
+            """The camera's state at a time after mid-exposure."""
+            return exposure.viewpoint.state_at(exposure.t_s + after_s)
+
         found: list[MovingLight] = []
         if self.elements:
-
-            def observer_at(after_s: float) -> GcrsState:
-                return exposure.viewpoint.state_at(exposure.t_s + after_s)
-
-            known = known_satellites(
+            found += known_satellites(
                 self.elements, self.config.standard_mag, exposure.view, exposure.time, observer_at
             )
-            found += known
         if self.config.random and exposure.seeds:
             found += random_satellites(
                 self.config.random, exposure.view, exposure.seeds.camera, exposure.index
@@ -113,6 +115,7 @@ class Satellites(Light):
 
 
 def build_satellites(plan: LightPlan) -> Iterator[Light]:
+    """The satellites of `light.satellites`; none without it. Raises InputError for an unreadable file."""
     light = plan.scene.light
     if isinstance(light, StarsConfig) and light.satellites:
         file = light.satellites.file
@@ -124,7 +127,7 @@ def build_satellites(plan: LightPlan) -> Iterator[Light]:
 
 @dataclass(frozen=True)
 class SolarSystem(Light):
-    """The bodies that `light.bodies` chooses, seen from the camera's place."""
+    """The bodies that `light.bodies` selects, as seen from the camera's place."""
 
     config: BodiesConfig
 
@@ -134,6 +137,7 @@ class SolarSystem(Light):
 
 
 def build_solar_system(plan: LightPlan) -> Iterator[Light]:
+    """The bodies of `light.bodies`; none without it."""
     light = plan.scene.light
     if isinstance(light, StarsConfig) and light.bodies:
         yield SolarSystem(light.bodies)

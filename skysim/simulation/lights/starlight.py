@@ -1,4 +1,4 @@
-"""Stars of a catalog: as seen from the ground, or from an orbit with the aberration of each frame's velocity."""
+"""Stars of a catalog, as seen from the ground or from an orbit, and extended light of the scene's `background`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from skysim.sources.dome.led import Emitter
 
 @dataclass(frozen=True)
 class FixedStars(KnownLight):
-    """Stars whose places hold for the whole scene."""
+    """Stars whose apparent places are constant during the scene."""
 
     def during(self, exposure: Exposure) -> Lit:
         return Lit("stars", True, self.sources, self.emitter)
@@ -28,34 +28,34 @@ class FixedStars(KnownLight):
 
 @dataclass(frozen=True)
 class StarsInOrbit(KnownLight):
-    """Stars displaced by the velocity of an orbit, which turns by a degree in 15 s when it is low.
+    """Stars displaced by the aberration of an orbit, whose velocity turns by a degree in 15 s in a low orbit.
 
     Attributes
     ----------
     velocity_m_s
-        (3,) barycentric velocity for which `sources` are
+        (3,) barycentric velocity at which `sources` are the apparent places
     """
 
     velocity_m_s: Floats
 
     def during(self, exposure: Exposure) -> Lit:
-        """The stars near the field at the velocity of mid-exposure: in a second a star moves by 0.006"."""
+        """The stars near the field at the velocity of mid-exposure; in a second the aberration changes by 0.006"."""
         view = exposure.view
+        # A margin for the corners of the field, and the rotation during the exposure.
         reach_rad = 1.25 * view.field_rad + 0.02 + view.turn_rad
         assert isinstance(self.sources, StarSources)
         near = self.sources.take(self.sources.within(view.boresight, reach_rad))
         now_m_s = 1e3 * exposure.observer.velocity_km_s
         direction = stars.seen_at_velocity(near.place[:, :3], self.velocity_m_s, now_m_s)
-        return Lit(
-            "stars",
-            True,
-            replace(near, place=np.column_stack([direction, np.zeros(len(near))])),
-            self.emitter,
-        )
+        place = np.column_stack([direction, np.zeros(len(near))])
+        return Lit("stars", True, replace(near, place=place), self.emitter)
 
 
 def stars_of(config: StarsConfig, plan: LightPlan) -> KnownLight:
-    """The stars of a scene at its start, in the lab's axes, which are the ICRS. Raises InputError."""
+    """The stars of a scene at its start, in the lab's axes, which are those of the ICRS.
+
+    Raises InputError if variability is on and the catalog has no variable stars.
+    """
     catalog = plan.catalog
     scene = plan.scene
     viewpoint = plan.viewpoint
@@ -66,6 +66,7 @@ def stars_of(config: StarsConfig, plan: LightPlan) -> KnownLight:
                 "light.variability_seed", f"{config.catalog} has no variable stars", "gaia_v8.0"
             )
         catalog = stars.varied(catalog, config.variability_seed)
+    # Anything that depends on the place of the camera makes its velocity matter for the aberration, too.
     velocity_m_s: Floats | tuple[float, ...] = stars.AT_REST
     if config.bodies or config.satellites or config.air or viewpoint.orbit:
         velocity_m_s = viewpoint.state_at(0.0).velocity_m_s
@@ -78,7 +79,6 @@ def stars_of(config: StarsConfig, plan: LightPlan) -> KnownLight:
 
 
 # The scene's section `background`: light leaks and the glow of the sky.
-
 
 BACKGROUND = "background"
 
@@ -100,4 +100,5 @@ class BackgroundLight(Light):
 
 
 def build(plan: LightPlan) -> Iterator[Light]:
+    """The light of the scene's section `background`."""
     yield BackgroundLight(plan.scene.background)
