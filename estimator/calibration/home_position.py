@@ -25,7 +25,8 @@ from estimator.attitude.nearfield import thesis_points
 from estimator.catalog.catalog import unit
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError, Ints
+from estimator.core.checks import Floats, Ints
+from estimator.core.errors import ImageError
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,7 +47,8 @@ from estimator.calibration.mass_dynamics import (
     transition,
     turn,
 )
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.filter.states import TrackerModel
 
 MAX_ITERATIONS = 30

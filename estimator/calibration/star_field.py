@@ -38,8 +38,9 @@ from estimator.calibration.dome_survey import CAUCHY, GATE
 from estimator.catalog.catalog import StarCatalog
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError, Ints
+from estimator.core.checks import Floats, Ints
 from estimator.core.constants import SIGMA_PER_MAD
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 
 # Photometric zero point: the offset between instrumental magnitudes and catalog magnitudes.

@@ -29,8 +29,9 @@ from scipy.spatial import cKDTree
 
 from estimator.catalog import sky_index
 from estimator.catalog.sky_index import Cells
-from estimator.core.checks import Floats, ImageError, Ints
+from estimator.core.checks import Floats, Ints
 from estimator.core.constants import ARCSEC_RAD
+from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
 

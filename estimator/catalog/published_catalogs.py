@@ -32,7 +32,8 @@ from numpy.typing import NDArray
 from estimator.catalog import catalog, sky_index
 from estimator.catalog.catalog import StarCatalog
 from estimator.catalog.sky_index import Cells, within
-from estimator.core.checks import Floats, ImageError, Ints
+from estimator.core.checks import Floats, Ints
+from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
 # Color indexes of a G2 star, used where the catalog has no color.

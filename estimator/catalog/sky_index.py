@@ -29,7 +29,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
 # Spatial grid for searches by direction: the cube [-1, 1]^3 about the unit sphere, divided into cells.

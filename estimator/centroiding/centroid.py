@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from estimator.centroiding import disk_fit, moments, streak_fit
 from estimator.centroiding import gaussian_fit as gaussian
 from estimator.core import checks
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Blobs, Centroids, FramePriors
 from estimator.detection.classify import streaks_px
 from estimator.detection.detect import check_pixel_type, to_native

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimator.core import checks
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
 Distortion = tuple[float, float, float, float, float]

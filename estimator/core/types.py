@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError, Ints
+from estimator.core.checks import Floats, Ints
+from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
 

@@ -22,7 +22,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.checks import Floats, ImageError, Ints, native, number, of_type
+from estimator.core.checks import Floats, Ints, native, number, of_type
+from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Background, Blobs, FramePriors
 from estimator.detection import classify
 from estimator.detection.background import FILTERED_NOISE, estimate_background, median

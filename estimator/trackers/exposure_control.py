@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.core import checks
-from estimator.core.checks import ImageError, Ints
+from estimator.core.checks import Ints
+from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.detection.detect import check_pixel_type, to_native
 

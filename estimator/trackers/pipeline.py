@@ -25,7 +25,8 @@ from estimator.attitude.rate import center_streak_px
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import checks
 from estimator.core.camera import Camera, check_frame
-from estimator.core.checks import Floats, ImageError, Ints
+from estimator.core.checks import Floats, Ints
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Blobs, Centroids, FramePriors, RateEstimate
 from estimator.detection import classify
 from estimator.detection.classify import NO_STAR, Flag

@@ -16,7 +16,7 @@ from estimator.attitude.nearfield import SOLVERS as NEAR_SOLVERS
 from estimator.attitude.solvers import SOLVERS
 from estimator.catalog import catalog
 from estimator.centroiding.centroid import CENTROIDERS
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, FramePriors, RateEstimate
 from estimator.detection.detect import DETECTORS
 from estimator.identification.registry import IDENTIFIERS

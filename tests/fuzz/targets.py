@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from estimator.catalog import catalog, published_catalogs
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import validate
 from skysim.apps.stream import sinks
 from skysim.camera.psf import otf

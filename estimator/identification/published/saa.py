@@ -30,7 +30,8 @@ from estimator.attitude.solvers import quest
 from estimator.catalog.pair_index import PairCatalog, PairIndex, candidates, pair_range
 from estimator.catalog.sky_index import Cells, within
 from estimator.core import vectors
-from estimator.core.checks import Floats, ImageError, Ints
+from estimator.core.checks import Floats, Ints
+from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail

@@ -30,7 +30,8 @@ from scipy.spatial.transform import Rotation
 
 from estimator.catalog import catalog as star_catalog
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, ra_dec_roll_rad
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_centroid

@@ -20,7 +20,8 @@ from estimator.calibration.home_position import (
 )
 from estimator.catalog.catalog import unit
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 
 # AFIT's SimSat: 35 mm lens, 4 um pixels, camera 15 in above the bearing, apex at 48 in, LEDs 8 mm apart.
 CAMERA = Camera(1600, 1200, 8750.0, (799.5, 599.5))

@@ -12,7 +12,7 @@ from hypothesis import strategies as some
 
 from estimator.catalog import refraction
 from estimator.catalog.refraction import SiteAir
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from tests.helpers.laws import SEEDS, law, units
 
 ARCSEC = erfa.DAS2R

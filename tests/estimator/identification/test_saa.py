@@ -13,7 +13,8 @@ from estimator.catalog import pair_index
 from estimator.catalog.catalog import unit
 from estimator.catalog.pair_index import ARCSEC_RAD, PairCatalog, build_pair_catalog
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.types import StarMatch
 from estimator.identification.published.saa import saa
 

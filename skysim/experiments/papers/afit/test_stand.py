@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude import nearfield
 from estimator.calibration.home_position import instrument_brightness
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import FramePriors
 from estimator.detection import detect
 from skysim.camera.optics import Optics

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate
 from estimator.trackers.coded_tracker import CodedTracker
 from estimator.trackers.dome_tracker import DomeTracker
