@@ -220,9 +220,8 @@ def set_key(tree: dict[str, Any], key: str, value: str) -> None:
     node: Any = tree
     for depth, parent in enumerate(parents):
         if isinstance(node, dict):
-            node = node.setdefault(parent, {})
-        else:
-            node = node[list_index(node, parent, key)]
+            node.setdefault(parent, {})
+        node = node[parent if isinstance(node, dict) else list_index(node, parent, key)]
         if not isinstance(node, dict | list):
             section = excerpt(".".join(parents[: depth + 1]))
             raise InputError(excerpt(key), f"{section} holds a value, not keys", where=OVERRIDES)

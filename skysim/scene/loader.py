@@ -154,11 +154,8 @@ def merge(base: dict[str, Any], override: dict[str, Any]) -> dict[str, Any]:
     """The mapping `override` merged over `base`, recursively; a section of another kind replaces that of the base."""
     merged = base | override
     for key, value in override.items():
-        section = base.get(key)
-        if not isinstance(value, dict) or not isinstance(section, dict):
-            continue
-        if value.get("kind") in (None, section.get("kind")):
-            merged[key] = merge(section, value)
+        if is_same_kind(value, base.get(key)):
+            merged[key] = merge(base[key], value)
     return merged
 
 
@@ -207,14 +204,20 @@ def undefined_keys(section: dict[str, Any], defined: dict[str, Any]) -> dict[str
     """The keys of a section that another one does not define; nothing of a section of another kind."""
     kept: dict[str, Any] = {}
     for key, value in section.items():
-        other = defined.get(key)
         if key not in defined:
             kept[key] = value
-            continue
-        sections = isinstance(value, dict) and isinstance(other, dict)
-        if sections and value.get("kind") in (None, other.get("kind")):
-            kept[key] = undefined_keys(value, other)
+        elif is_same_kind(value, defined[key]):
+            kept[key] = undefined_keys(value, defined[key])
     return kept
+
+
+def is_same_kind(own: Any, base: Any) -> bool:
+    """Whether two values are sections of one kind; a section without `kind` is of any kind."""
+    return (
+        isinstance(own, dict)
+        and isinstance(base, dict)
+        and own.get("kind") in (None, base.get("kind"))
+    )
 
 
 class CameraFileConfig(ConfigModel):
