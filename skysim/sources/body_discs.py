@@ -23,9 +23,8 @@ LAMBERT = 2
 ACROSS = 12  # elements on the diameter of a small disc
 SAMPLES = 16  # points across an element at which the brightness is sampled
 RIM = 20  # cells within the rim in which the mean over a cell matters
-PHASE_STEP_DEG = (
-    0.05  # phases of small discs are rounded to this, so that frames share their elements
-)
+# Phases of small discs are rounded to this, so that frames share their elements.
+PHASE_STEP_DEG = 0.05
 
 
 @jit

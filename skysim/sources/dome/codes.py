@@ -25,9 +25,8 @@ from skysim.sources.dome.codebooks import Words, codebook, light_levels
 # Clocks of the LED controllers: each times its pulses with an oscillator of its own.
 
 
-LONGEST_ON_S = (
-    HOUR_S  # a controller was switched on up to so long before the run; many times any period
-)
+# A controller was switched on up to so long before the run; many times any period.
+LONGEST_ON_S = HOUR_S
 FILTER_STREAM = 4  # spawn key, under the hardware's seed, of the filters' errors
 
 
