@@ -1,7 +1,11 @@
 """Charge transport in the chip: blooming, transfer loss and smear, in place on a frame.
 
 A frame is (H, W) electrons, float32 or float64. It is read out towards row 0 and then towards column 0: the packet
-of pixel (x, y) makes y + 1 parallel and x + 1 serial transfers.
+of pixel (x, y) makes y + 1 parallel and x + 1 serial transfers. Every function keeps the equation that it computes:
+
+- `bloom`: charge above the full well spreads along its column; sum and first moment are conserved.
+- `transfer_loss`: of n transfers each leaves a fraction behind; the charge arrives late by the negative binomial law.
+- `frame_transfer_smear`, `interline_smear`: charge that is moved under light collects it from every row it passes.
 """
 
 from __future__ import annotations
@@ -25,13 +29,19 @@ def bloom(electrons: NDArray[Any], full_well_e: float, anti_blooming: float = 0.
 
     The final state does not depend on the order of the halvings, and it conserves the charge's sum and first moment
     (the divisible sandpile in one dimension: Levine & Peres 2009, Potential Anal. 30, 1; `assumed`). These two
-    conserved numbers give the ends of the streak directly, see `_settle`. Columns without excess are skipped.
+    conserved numbers give the ends of the streak directly (`_settle`).
+
+    1. Find the columns with excess; the others are skipped.
+    2. A drain removes the fraction `anti_blooming` of every pixel's excess.
+    3. Settle the pixels with excess one after another (`_settle`).
 
     Parameters
     ----------
+    electrons
+        (H, W) charge, changed in place
     anti_blooming
-        Fraction of every pixel's excess that a drain removes first; the rest is conserved,
-        except for what leaves the ends of the column, which is lost.
+        Fraction of every pixel's excess that a drain removes first. The rest is conserved, except for what leaves the
+        ends of the column, which is lost.
     """
     columns = np.flatnonzero(electrons.max(axis=0) > full_well_e)
     if len(columns):
@@ -42,19 +52,23 @@ def bloom(electrons: NDArray[Any], full_well_e: float, anti_blooming: float = 0.
 def _bloom(
     electrons: NDArray[Any], columns: NDArray[np.int64], full_well_e: float, anti_blooming: float
 ) -> None:
+    """Spread the excess of the chosen columns, in parallel."""
     height = electrons.shape[0]
     for k in numba.prange(len(columns)):
         x = columns[k]
+        # Range of rows that change.
         headroom = np.empty(height)  # remaining capacity; negative: excess
         first = height
         last = -1
+        # 2. The drain takes its fraction of the excess before the rest spreads.
         for y in range(height):
             headroom[y] = full_well_e - electrons[y, x]
             if headroom[y] < 0:
-                # The drain takes its fraction of the excess before the rest spreads.
                 headroom[y] *= 1 - anti_blooming
                 first = min(first, y)
                 last = max(last, y)
+        # 3. Settling fills neighbors; their own excess joins it, so each pixel is settled once at
+        # most.
         for y in range(height):
             if headroom[y] < 0:
                 a, b = _settle(headroom, y)
@@ -69,22 +83,27 @@ def _bloom(
 def _settle(headroom: Floats, y: int) -> tuple[int, int]:
     """Spread the excess of pixel y until it fits; return the two ends of the streak, which are filled partly.
 
-    All pixels between the ends a and b are full. The charge that is left over, `excess` with its first moment `moment`
-    about y, is split between a and b so that sum and first moment are conserved (the lever rule). An end pixel that
-    cannot hold its part is filled and the end moves on; if that pixel has excess itself (negative room), its excess
-    joins the charge to spread. Beyond the column's ends any amount fits, and is lost.
+    All pixels between the ends a and b are full. The charge that is left over, Q with its first moment M about y, is
+    split between a and b so that sum and first moment are conserved (the lever rule):
+
+        Q_b = (M + Q (y - a)) / (b - a),    Q_a = Q - Q_b.
+
+    An end pixel that cannot hold its part is filled and the end moves on, with Q and M less what the pixel took; if
+    that pixel has excess itself (negative room), its excess joins Q. Beyond the column's ends any amount fits, and is
+    lost.
     """
     height = len(headroom)
-    # moment about y
+    # Q and M, its moment about y.
     excess = -headroom[y]
     moment = 0.0
     headroom[y] = 0.0
     a = y - 1
     b = y + 1
     while True:
-        # Lever rule: the charge left over is split so that its sum and its moment about y are conserved.
+        # Lever rule.
         to_b = (moment + excess * (y - a)) / (b - a)
         to_a = excess - to_b
+        # Fill end a or end b, whichever overflows, and move it on.
         if a >= 0 and to_a > headroom[a]:
             excess = excess - headroom[a]
             moment = moment - headroom[a] * (a - y)
@@ -105,17 +124,21 @@ def _settle(headroom: Floats, y: int) -> tuple[int, int]:
 
 
 def transfer_loss(electrons: NDArray[Any], cti_parallel: float, cti_serial: float) -> None:
-    """Charge-transfer inefficiency: every transfer leaves a fraction behind, which joins the next packet:
-    trailing tails.
+    """Charge-transfer inefficiency: every transfer leaves a fraction behind, which joins the next packet.
 
-    Of a packet that makes n transfers, C(n + k - 1, k) cti^k (1 - cti)^n arrives k pixels late: it takes k
-    failures before the n-th success, the negative binomial law. What arrives later than the frame's last row or
-    column is in the overscan and not in the frame; nothing else is lost.
+    This gives trailing tails. Of a packet that makes n transfers the fraction
+
+        C(n + k - 1, k) cti^k (1 - cti)^n
+
+    arrives k pixels late: it takes k failures before the n-th success, the negative binomial law. What arrives later
+    than the frame's last row or column is in the overscan and not in the frame; nothing else is lost.
 
     Parameters
     ----------
+    electrons
+        (H, W) charge, changed in place
     cti_parallel, cti_serial
-        That fraction, the same for every charge (linear, no traps that fill).
+        Fraction that a transfer leaves behind, the same for every charge (linear, no traps that fill)
     """
     height, width = electrons.shape
     if cti_parallel > 0:
@@ -126,25 +149,28 @@ def transfer_loss(electrons: NDArray[Any], cti_parallel: float, cti_serial: floa
 
 @functools.lru_cache(maxsize=8)
 def delayed_fractions(transfers: int, cti: float) -> Floats:
-    """(K + 1, transfers) fraction of the packet of n + 1 transfers that arrives k pixels late; columns add up to 1.
+    """(K + 1, transfers) fractions that arrive k pixels late, of the packet of n + 1 transfers; columns add up to 1.
 
-    The terms follow from one another: C(n + k - 1, k) = C(n + k - 2, k - 1) (n + k - 1) / k. K is where less than 1e-6
-    of the charge with the most transfers is later still; that is counted as K pixels late.
+    Each term follows from the one before: C(n + k - 1, k) = C(n + k - 2, k - 1) (n + k - 1) / k. K is the delay from
+    which less than TAIL of the packet with the most transfers is still missing; that rest counts as K pixels late.
     """
     n = np.arange(1, transfers + 1)
     fractions = [(1 - cti) ** n]
+    # Until the packet with the most transfers has arrived but for TAIL.
     while (later := 1 - np.sum(fractions, axis=0))[-1] > TAIL:
         k = len(fractions)
         fractions.append(fractions[-1] * cti * (n + k - 1) / k)
-    fractions[-1] = np.maximum(fractions[-1] + later, 0)  # `later` may be minus a rounding error
+    # `later` may be a small negative number by rounding.
+    fractions[-1] = np.maximum(fractions[-1] + later, 0)
     table = np.array(fractions)
+    # The array is cached and shared, so it must not change.
     table.flags.writeable = False
     return table
 
 
 @jit(parallel=True)
 def _delay_rows(electrons: NDArray[Any], fraction: Floats) -> None:
-    """Apply the parallel loss from the last row to the first: each row gathers from rows that are not yet changed."""
+    """Apply the parallel loss in place: row y gathers the late charge of the rows below it in number."""
     height, width = electrons.shape
     for block in numba.prange((width + BLOCK - 1) // BLOCK):
         first = block * BLOCK
@@ -153,6 +179,7 @@ def _delay_rows(electrons: NDArray[Any], fraction: Floats) -> None:
         # Backwards, so that the rows that row y gathers from still hold the charge before transfer.
         for y in range(height - 1, -1, -1):
             gathered[:] = 0
+            # new[y] = sum over k of fraction[k, y - k] old[y - k].
             for k in range(min(len(fraction), y + 1)):
                 weight = electrons.dtype.type(fraction[k, y - k])
                 packets = electrons[y - k, first:last]
@@ -163,11 +190,18 @@ def _delay_rows(electrons: NDArray[Any], fraction: Floats) -> None:
 
 @jit(parallel=True)
 def _delay_columns(electrons: NDArray[Any], fraction: NDArray[Any]) -> None:
-    """Apply the serial loss. fraction : of the electrons' type"""
+    """Apply the serial loss in place, row by row.
+
+    Parameters
+    ----------
+    fraction
+        (K + 1, W) as from `delayed_fractions`, of the electrons' type
+    """
     height, width = electrons.shape
     for y in numba.prange(height):
         row = electrons[y]
         gathered = np.zeros(width, electrons.dtype)
+        # new[x + k] += fraction[k, x] old[x].
         for k in range(min(len(fraction), width)):
             weight = fraction[k]
             late = gathered[k:]
@@ -177,18 +211,19 @@ def _delay_columns(electrons: NDArray[Any], fraction: NDArray[Any]) -> None:
 
 
 def frame_transfer_smear(light_e: NDArray[Any], exposure_s: float, row_time_s: float) -> None:
-    """Smear of a frame-transfer chip: rows shifted under light collect row_time / exposure of the light of every
-    row passed.
+    """Smear of a frame-transfer chip, which is shifted into its store row by row before the exposure as after it.
 
-    The chip is shifted into its store row by row before the exposure as after it. A pixel that ends at row y was
-    shifted in, empty, over the rows above y (greater y) and is shifted out over those below, for row_time in each.
-    So it passes every other row of its column once, with the same brightness as in the exposure.
+    A pixel that ends at row y was shifted in, empty, over the rows above y (greater y) and is shifted out over those
+    below, for row_time in each. So it passes every other row of its column once, with the same brightness as in the
+    exposure, and collects row_time / exposure of each row's light L:
+
+        smear(y) = row_time / exposure sum over j != y of L(j).
 
     Parameters
     ----------
     light_e
-        Light of the exposure; the smear is added in place. Dark current is the same in every
-        row, so it is not affected.
+        (H, W) light of the exposure; the smear is added in place. Dark current is the same in every row, so it is not
+        affected.
     """
     _smear(light_e, row_time_s / exposure_s)
 
@@ -196,14 +231,15 @@ def frame_transfer_smear(light_e: NDArray[Any], exposure_s: float, row_time_s: f
 def interline_smear(
     light_e: NDArray[Any], exposure_s: float, row_time_s: float, leak: float
 ) -> None:
-    """Smear of an interline chip: the covered register collects `leak` of the light of every row passed.
+    """Smear of an interline chip: the covered register collects the fraction `leak` of the light of every row passed.
+
+    The register is clocked all the time, so the register cell that takes over a pixel's charge has passed the rows
+    above it and will pass those below: smear(y) = leak row_time / exposure sum over j != y of L(j).
 
     Parameters
     ----------
     light_e
-        Light of the exposure; the smear is added in place. The register is clocked all the
-        time, so the register cell that takes over a pixel's charge has passed the rows above it
-        and will pass those below.
+        (H, W) light of the exposure; the smear is added in place
     """
     _smear(light_e, leak * row_time_s / exposure_s)
 
@@ -215,14 +251,15 @@ def _smear(light_e: NDArray[Any], fraction: float) -> None:
     for block in numba.prange((width + BLOCK - 1) // BLOCK):
         first = block * BLOCK
         last = min((block + 1) * BLOCK, width)
+        # The column's sum contains the pixel itself, whose fraction is taken off: (1 - fraction) L
+        # + fraction sum.
         total = np.zeros(last - first)
         for y in range(height):
             total += light_e[y, first:last]
         smear = (fraction * total).astype(light_e.dtype)
         own = light_e.dtype.type(1 - fraction)
         for y in range(height):
-            row = light_e[
-                y, first:last
-            ]  # contiguous for the compiler, which rows of a block of columns are not
+            # A row is contiguous for the compiler, which rows of a block of columns are not.
+            row = light_e[y, first:last]
             for x in range(len(row)):
                 row[x] = own * row[x] + smear[x]

@@ -1,7 +1,18 @@
 """The detector model: mean photo-electrons to digital numbers, one function per step, in the order of the signal.
 
-Light and shutter smear, PRNU and dark current, Poisson counting, particles, full well or blooming, transfer loss,
-read noise, nonlinearity and the converter. Each step is switched off by its parameter.
+1. `smear`: light that frame-transfer and interline chips collect while charge moves.
+2. PRNU and dark current scale and add to the mean; Poisson counting (`_count_row`).
+3. Ionizing particles (cosmic_rays.py).
+4. Full well: charge above it blooms along the column or is lost.
+5. Charge-transfer loss (charge_transfer.py).
+6. Column offset, read noise, nonlinearity, gain, rounding and clipping (`_read_row`).
+
+Each step is switched off by its parameter. The noise law that follows, for a pixel that collects N electrons on
+average of light and dark current together, far below the full well, is
+
+    variance = N + read_noise^2 + reset_noise^2 + gain^2 / 12    e-^2,
+
+the last term that of rounding to whole numbers of gain e-/DN.
 """
 
 from __future__ import annotations
@@ -31,8 +42,7 @@ from skysim.scene.sections.camera import (
 )
 from skysim.sources.photometry import snr
 
-# Pixels to which something other than light adds charge: smear of the shutter and particles, for
-# labelled frames.
+# Masks of the pixels to which the shutter's smear or particles add charge, for labelled frames.
 
 
 SMEAR = "smear"
@@ -40,9 +50,9 @@ PARTICLES = "cosmic_ray"
 
 
 class AddedCharge:
-    """Masks of the pixels that gain more than threshold_e electrons while they are watched, by what adds them.
+    """Masks of the pixels that gain more than threshold_e electrons in a watched step, by the step's name.
 
-    A frame is watched only where its masks are wanted, since that takes a copy of it.
+    Watching takes a copy of the frame, so a frame is watched only where its masks are wanted.
     """
 
     def __init__(self, threshold_e: float) -> None:
@@ -51,14 +61,14 @@ class AddedCharge:
 
     @contextmanager
     def watch(self, name: str, electrons: NDArray[Any]) -> Iterator[None]:
-        """Compare a frame of electrons before and after the body of this context, which changes it in place."""
+        """Compare a frame of electrons before and after the body of this context changes it in place."""
         before = electrons.copy()
         yield
         np.subtract(electrons, before, out=before)
         self.masks[name] = before > self.threshold_e
 
 
-ROWS = 16  # that share memory for their random numbers
+ROWS = 16  # rows that share one buffer for their random numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +78,11 @@ class Detector:
     Attributes
     ----------
     sensitivity
-        (H, W) relative, mean 1: PRNU
+        (H, W) relative sensitivity of the pixels (PRNU), mean 1
     dark_e_s
-        (H, W) dark current at the chip's temperature, with DSNU and hot pixels
+        (H, W) dark current at the chip's temperature in e-/s, with DSNU and hot pixels
     column_offset_e
-        (W,) offsets of the column amplifiers
+        (W,) offsets of the column amplifiers in electrons
     """
 
     config: DetectorConfig
@@ -84,7 +94,7 @@ class Detector:
 
     @classmethod
     def from_camera(cls, camera: CameraConfig) -> Detector:
-        """Draw the fixed pattern."""
+        """Draw the fixed pattern of a camera's chip; each kind has its own random stream."""
         config = camera.detector
         shape = (camera.height_px, camera.width_px)
         prnu, dark, column = (random_stream(config.hardware_seed, key) for key in range(3))
@@ -119,13 +129,16 @@ def dark_current_e_s(
     add an exponential of mean hot_e_s. Generation in the depletion region doubles every 6 to 8 K near room
     temperature (Janesick 2001, Scientific Charge-Coupled Devices, ch. 7).
     """
+    # Lognormal DSNU of mean 1.
     dark = np.full(shape, config.dark_e_s, np.float32)
     if config.dsnu > 0 and config.dark_e_s > 0:
         s2 = np.log1p(config.dsnu**2)
         normal = rng.standard_normal(shape, np.float32)
         dark *= np.exp(np.float32(np.sqrt(s2)) * normal - np.float32(s2 / 2))
+    # Hot pixels: their number is binomial, their places are random.
     hot = rng.choice(dark.size, rng.binomial(dark.size, config.hot_pixels), replace=False)
     dark.reshape(-1)[hot] += rng.exponential(config.hot_e_s, len(hot)).astype(np.float32)
+    # From the reference temperature to the chip's.
     dark *= np.float32(2.0**config.doublings)
     return dark
 
@@ -137,7 +150,7 @@ def expose(
     rng: Generator,
     added: AddedCharge | None = None,
 ) -> NDArray[Any]:
-    """Convert a frame's light to digital numbers. Returns (H, W) uint16.
+    """Convert a frame's light to digital numbers, by steps 2 to 6 of the module. Returns (H, W) uint16.
 
     With noise off the frame is the expected value in digital numbers, of light_e's own type, neither rounded nor
     clipped, for tests of the steps that follow.
@@ -145,10 +158,9 @@ def expose(
     Parameters
     ----------
     light_e
-        (H, W) float32 mean photo-electrons of a perfect pixel, including the shutter's `smear`;
-        overwritten
+        (H, W) float32 mean photo-electrons of a perfect pixel, including the shutter's `smear`; overwritten
     added
-        Gets the mask of the particles' pixels
+        Receives the mask of the particles' pixels
     """
     config = detector.config
     if not config.noise:
@@ -174,22 +186,30 @@ def expose(
             frame,
         )
         return frame
+    # 2. Counting.
     _count(light_e, *pattern, constants, count_seeds, guide)
+    # 3. Particles.
     if config.particles:
         with added.watch(PARTICLES, light_e) if added else nullcontext():
             cosmic_rays.add_particles(light_e, exposure_s, detector.pixel_m, config.particles, rng)
+    # 4. Full well.
     if config.blooming == "column":
         charge_transfer.bloom(light_e, config.full_well_e, config.anti_blooming)
     else:
         np.minimum(light_e, config.full_well_e, out=light_e)
+    # 5. Transfer loss.
     if config.cti_parallel or config.cti_serial:
         charge_transfer.transfer_loss(light_e, config.cti_parallel, config.cti_serial)
+    # 6. Read-out.
     _read_out(light_e, detector.column_offset_e, constants, read_seeds, frame)
     return frame
 
 
 def expectation(light_e: NDArray[Any], exposure_s: float, detector: Detector) -> NDArray[Any]:
-    """Expected digital numbers without full well, nonlinearity and particles."""
+    """Expected digital numbers without full well, nonlinearity and particles.
+
+    DN = (PRNU light + dark t, after transfer loss, + column offset) / gain + offset.
+    """
     config = detector.config
     mean_e = light_e * detector.sensitivity + detector.dark_e_s * exposure_s
     charge_transfer.transfer_loss(mean_e, config.cti_parallel, config.cti_serial)
@@ -199,9 +219,14 @@ def expectation(light_e: NDArray[Any], exposure_s: float, detector: Detector) ->
 def smear(
     light_e: NDArray[Any], exposure_s: float, shutter: Shutter, added: AddedCharge | None = None
 ) -> None:
-    """Add the smear of a frame-transfer or interline shutter to the light (in place). Other shutters add none.
+    """Step 1: add the smear of a frame-transfer or interline shutter to the light, in place. Other shutters add none.
 
-    Rolling shutters are part of the time integral in render.py. added : gets the mask of the pixels
+    Rolling shutters are part of the time integral in render.py.
+
+    Parameters
+    ----------
+    added
+        Receives the mask of the smeared pixels
     """
     if not isinstance(shutter, FrameTransferConfig | InterlineConfig):
         return
@@ -213,7 +238,7 @@ def smear(
 
 
 class ReadoutConstants(NamedTuple):
-    """Detector parameters for the compiled loops."""
+    """Detector parameters for the compiled loops, in single precision."""
 
     exposure_s: np.float32
     well_e: np.float32
@@ -248,9 +273,10 @@ def _count_row(
     guide: Any,
     memory: noise.Scratch,
 ) -> None:
-    """Count electrons, light and dark together: Poisson, variance equal to the mean. One row, in place.
+    """Count the electrons of one row, light and dark current together, in place.
 
-    PRNU is a pixel's relative quantum efficiency, so it scales the mean and the sum stays a Poisson variable.
+    n ~ Poisson(sensitivity light + dark t): variance equal to the mean. PRNU is a pixel's relative quantum efficiency,
+    so it scales the mean, and the sum of light and dark current stays a Poisson variable.
     """
     for x in range(row.size):
         # Interpolated images may be slightly negative (about 1e-6).
@@ -267,10 +293,10 @@ def _read_row(
     memory: noise.Scratch,
     dn_row: Any,
 ) -> None:
-    """Convert charge to numbers: full well, column offset and read noise, nonlinearity, gain, rounding, clipping.
+    """Convert one row's charge to digital numbers: full well, offset, noise, nonlinearity, gain, rounding, clipping.
 
-    Without blooming a well holds at most its capacity. The amplifier gives e (1 - nonlinearity e / full_well);
-    DN = round(that / gain + offset), clipped to the converter's bits.
+    e  = min(n, full_well) + column offset + sigma_read z, z standard normal; no limit with blooming
+    DN = round(e (1 - nonlinearity e / full_well) / gain + offset), clipped to 0 and the converter's maximum.
     """
     noise_row = memory.normals
     noise.normal(noise_row, seed, memory)
@@ -280,6 +306,7 @@ def _read_row(
             e * (float32(1) - constants.nonlinearity_per_e * e) * constants.dn_per_e
             + constants.offset_dn
         )
+        # offset_dn contains the 0.5 by which truncation rounds.
         dn_row[x] = np.uint16(int32(min(max(dn, float32(0)), constants.top_dn)))
 
 
@@ -292,7 +319,7 @@ def _count(
     seeds: Any,
     guide: Any,
 ) -> None:
-    """Light to electrons, in place; see `_count_row`."""
+    """Convert a frame's light to electrons, in place, blocks of rows in parallel; see `_count_row`."""
     height, width = light_e.shape
     for block in numba.prange((height + ROWS - 1) // ROWS):
         memory = noise.scratch(width)
@@ -304,7 +331,7 @@ def _count(
 def _read_out(
     electrons: Any, offset_e: Any, constants: ReadoutConstants, seeds: Any, frame: Any
 ) -> None:
-    """Electrons to digital numbers; see `_read_row`."""
+    """Convert a frame's electrons to digital numbers, blocks of rows in parallel; see `_read_row`."""
     height, width = electrons.shape
     for block in numba.prange((height + ROWS - 1) // ROWS):
         memory = noise.scratch(width)
@@ -324,7 +351,10 @@ def _count_and_read(
     guide: Any,
     frame: Any,
 ) -> None:
-    """`_count` and `_read_out` fused row by row: the same numbers, faster. Only if no charge leaves its row between."""
+    """`_count` and `_read_out` in one pass over the rows: the same numbers, faster.
+
+    Only for chips on which no charge leaves its row in between.
+    """
     height, width = light_e.shape
     for block in numba.prange((height + ROWS - 1) // ROWS):
         memory = noise.scratch(width)
@@ -336,8 +366,9 @@ def _count_and_read(
 
 
 def saturation_dn(config: DetectorConfig) -> float:
-    """The digital number from which a pixel counts as saturated: full well less three sigma of the read-out noise,
-    or the converter's maximum.
+    """The digital number from which a pixel counts as saturated.
+
+    The lower of the full well less three sigma of the read-out noise and the converter's maximum.
     """
     well_e = config.full_well_e - 3 * hypot(config.read_noise_e, config.reset_noise_e)
     well_dn = (
@@ -350,26 +381,27 @@ def saturation_dn(config: DetectorConfig) -> float:
 def add_snr_and_saturation(
     sources: SourceTruth, light_e: NDArray[Any], exposure_s: float, detector: Detector
 ) -> SourceTruth:
-    """Which sources are expected to saturate, and the signal-to-noise ratio of each.
+    """Add to the truth which sources are expected to saturate, and the signal-to-noise ratio of each.
 
     Both use the incident light: losses by full well or nonlinearity are not subtracted. A source is saturated if the
-    expected value in its brightest pixel reaches `saturation_dn`. The SNR is that of the CCD equation over the
+    expected value in its brightest pixel reaches `saturation_dn`. The SNR is that of the CCD equation (`snr`) over the
     noise-equivalent area of its image, with all other charge in its brightest pixel as background, and with the
-    converter's rounding added to the read noise.
+    converter's rounding, gain / sqrt(12), added to the read noise.
 
     Parameters
     ----------
     light_e
-        (H, W) mean photo-electrons of the whole frame, smear included, before `expose`
-        overwrites it
+        (H, W) mean photo-electrons of the whole frame, smear included, before `expose` overwrites it
     """
     config = detector.config
     x, y = sources.peak_xy.T
+    # Expected charge in the brightest pixel: the source's own, and all of it.
     own_e = sources.peak_e * detector.sensitivity[y, x]
     mean_e = light_e[y, x] * detector.sensitivity[y, x] + detector.dark_e_s[y, x] * exposure_s
     read_e = mean_e * (1 - config.nonlinearity * np.minimum(mean_e / config.full_well_e, 1))
     # The relative nonlinearity is held at its value at full well, since beyond it the parabola turns down.
     is_saturated = read_e / config.gain_e_dn + config.offset_dn >= saturation_dn(config)
+    # Read noise and rounding; background is what the source itself does not give.
     noise_e = np.sqrt(config.read_noise_e**2 + config.reset_noise_e**2 + config.gain_e_dn**2 / 12)
     sources_snr = snr(sources.electrons, sources.area_px, np.maximum(mean_e - own_e, 0), noise_e)
     return replace(sources, saturated=is_saturated, snr=sources_snr)

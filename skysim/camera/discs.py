@@ -1,4 +1,14 @@
-"""Draw the Sun, the Moon and the planets: points, small discs of a few points, and large discs by convolution."""
+"""Draw the Sun, the Moon and the planets: points, small discs of a few points, and large discs by convolution.
+
+A large disc (`disc_image`) is a star's image convolved with a map of the disc's light:
+
+1. A lattice of 1 / s pixels covers the disc. All its points with the same sub-pixel phase have the same image,
+   displaced by whole pixels. s is chosen so that the rim's frequencies that the lattice folds back are those that the
+   star's image does not pass (LATTICE).
+2. `star_images` draws the star's image at each of the s^2 phases by the renderer, with lens, streak and shutter.
+3. `light_on_lattice` maps the disc's light on the lattice, without what nearer bodies and the vehicle hide.
+4. `convolved` adds the s^2 discrete convolutions of image and map at equal phase.
+"""
 
 from __future__ import annotations
 
@@ -33,11 +43,10 @@ from skysim.sources.body_discs import DiscSurface, cell_light, disc_elements, in
 from skysim.sources.dome.led import Emitter
 from skysim.sources.stars import steady_points
 
-# The light of a disc on a lattice of sub-pixels, sampled several times a point where that is
-# needed.
+# The light of a disc on a lattice of sub-pixels, with several samples per point where that is needed.
 
 
-REACH = 3  # points to either side among which a sample's light is shared
+REACH = 3  # a sample's light is shared among this many points to either side
 
 
 def lattice_light(
@@ -48,24 +57,36 @@ def lattice_light(
     radius_from_px: Floats,
     shown: Any,
 ) -> Floats:
-    """(count, count) shares of the disc's light at the points of a lattice, [y, x], which zeros must surround.
+    """Map a disc's light on a square lattice of points, [y, x]; the disc must not reach the lattice's edge.
+
+    1. Sample the brightness at `subsamples` places per point in both directions (`cell_light`).
+    2. Share each sample's light among the columns (`_light_rows`), then among the rows (`_light_columns`).
+    3. Scale to unit sum of what the disc emits, hidden or not: sunlight 1 / (1 + e) and earthshine e / (1 + e).
 
     Parameters
     ----------
     axis_px
-        (count * subsamples,) even coordinates of the samples in both directions
+        (count * subsamples,) evenly spaced coordinates of the samples in both directions, px from the disc's center
+    radius_from_px
+        (2, 2) coordinates on the disc, in units of its radius, from pixels
     shown
-        (len(axis_px), len(axis_px)) the part of each sample that nothing hides; (0, 0) where
-        all are seen
+        (len(axis_px), len(axis_px)) fraction of each sample that nothing hides; (0, 0) where nothing is hidden
+
+    Returns
+    -------
+    Floats
+        (count, count) fractions of the disc's light
     """
     fine = len(axis_px)
     weights = sharing_weights(subsamples)
+    # Side of a sample's cell in units of the disc's radius.
     step = float(axis_px[1] - axis_px[0]) * math.sqrt(abs(float(np.linalg.det(radius_from_px))))
     matrix = np.ascontiguousarray(radius_from_px)
     has_earthshine = surface.earthshine > 0
     sunlit = np.empty((fine, count))
     earthlit = np.empty((fine, count) if has_earthshine else (0, 0))
     totals = np.empty((fine, 2))
+    # 1. and 2. Sunlight and earthshine apart: each is scaled by its own sum.
     _light_rows(
         sunlit,
         earthlit,
@@ -79,6 +100,7 @@ def lattice_light(
         shown,
     )
     of_sun, of_earth = totals.sum(axis=0)
+    # 3. The sum may be 0 for a vanishing crescent.
     light = np.empty((count, count))
     of_all = 1 + surface.earthshine
     _light_columns(light, sunlit, weights, 1 / (of_all * max(of_sun, 1e-300)), False)
@@ -90,12 +112,14 @@ def lattice_light(
 def sharing_weights(subsamples: int) -> Floats:
     """(subsamples, 2 REACH + 1) weights of a sample's light at the points -REACH to REACH from its own.
 
-    Light between two points is shared between them by linear weights: a triangular filter, whose spectrum sinc^2
-    suppresses the frequencies that the lattice folds back. Below them it is undone by the second differences
-    D = -delta^2: 1 / sinc^2 = 1 + D / 12 + D^2 / 90 + ...
+    Linear weights share the light between the two points next to a sample: a triangular filter, whose spectrum sinc^2
+    suppresses the frequencies that the lattice folds back. Second differences D = -delta^2 undo it at the lower
+    frequencies: 1 / sinc^2 = 1 + D / 12 + D^2 / 90 + ...
     """
+    # The triangle's weights at the points before, at and after the sample's own.
     offset = (np.arange(subsamples) + 0.5) / subsamples - 0.5
     linear = np.stack([np.maximum(-offset, 0), 1 - np.abs(offset), np.maximum(offset, 0)], axis=1)
+    # 1 + D / 12 + D^2 / 90 as weights of the points -2 to 2.
     second = np.array([-1.0, 2.0, -1.0])
     undone = np.convolve(second, second) / 90
     undone[1:4] += second / 12
@@ -116,12 +140,14 @@ def _light_rows(
     weights: Floats,
     shown: Any,
 ) -> None:
-    """Light of each row of samples, shared among the lattice's columns, from the Sun and from the observer's side.
+    """Light of each row of samples, shared among the lattice's columns.
 
     Parameters
     ----------
+    sunlit, earthlit
+        (fine, count) receive the light from the Sun and from the observer's side (earthshine); `earthlit` may be empty
     totals
-        (fine, 2) sums of the rows with what is hidden
+        (fine, 2) receive the sums of each row, hidden light included
     """
     count = sunlit.shape[1]
     subsamples = len(weights)
@@ -131,13 +157,13 @@ def _light_rows(
     with_earth = len(earthlit) > 0
     masked = len(shown) > 0
     for j in numba.prange(len(axis_px)):
-        own = np.zeros(
-            (2, subsamples, count + 2 * REACH)
-        )  # with a margin, so that no point has an edge
+        # The margin spares tests for the ends of the row.
+        own = np.zeros((2, subsamples, count + 2 * REACH))
         of_sun = of_earth = 0.0
         for k in range(count):
             for m in range(subsamples):
                 i = k * subsamples + m
+                # The sample's coordinates on the disc, in units of its radius.
                 x = matrix[0, 0] * axis_px[i] + matrix[0, 1] * axis_px[j]
                 y = matrix[1, 0] * axis_px[i] + matrix[1, 1] * axis_px[j]
                 from_sun, from_earth = cell_light(law, sine, cosine, x, y, step, inner)
@@ -155,7 +181,7 @@ def _light_rows(
 
 @jit
 def _share(points: Any, samples: Floats, weights: Floats) -> None:
-    """Light of (subsamples, count + 2 REACH) samples shared among (count,) points, in place."""
+    """Share the light of (subsamples, count + 2 REACH) samples among (count,) points, in place."""
     for k in range(len(points)):
         points[k] = 0.0
     for d in range(2 * REACH + 1):
@@ -167,13 +193,14 @@ def _share(points: Any, samples: Floats, weights: Floats) -> None:
 
 @jit(parallel=True)
 def _light_columns(light: Any, rows: Floats, weights: Floats, scale: float, add: bool) -> None:
-    """Rows of samples shared among the lattice's rows, scaled, in place of `light` or in addition to it."""
+    """Share rows of samples among the lattice's rows, scaled; replaces `light` or adds to it."""
     count = light.shape[1]
     subsamples = len(weights)
     for k in numba.prange(count):
         if not add:
             for i in range(count):
                 light[k, i] = 0.0
+        # Only rows of the lattice that exist: no margin here.
         for d in range(max(k + REACH - count + 1, 0), min(2 * REACH, k + REACH) + 1):
             for m in range(subsamples):
                 weight = scale * weights[m, d]
@@ -182,19 +209,18 @@ def _light_columns(light: Any, rows: Floats, weights: Floats, scale: float, add:
                     light[k, i] += weight * rows[j, i]
 
 
-# The image of a disc as a convolution of a star's image with a map of the disc's light.
+# The image of a disc: a star's image convolved with a map of the disc's light.
 
 
-LATTICE = (
-    0.7  # largest spacing of the lattice, in units of the star image's sharpest feature (sigma)
-)
+# Largest spacing of the lattice, in units of the star image's sharpest feature (sigma).
+LATTICE = 0.7
 SUBSAMPLES = 2  # least number of samples across a point of the lattice
-# across a disc
+# Number of samples across a disc.
 MIN_SAMPLES = 160
 MAX_SAMPLES = 480
 CRESCENT_SAMPLES = 4  # wanted across a crescent
 ON_DISC = 1.2  # square of the radius within which a sample can have light
-SMALL = 1e-3  # of the radius: the step by which the disc's scale on the chip is found
+SMALL = 1e-3  # step, in units of the radius, by which the disc's scale on the chip is found
 
 
 class Exposed(NamedTuple):
@@ -207,14 +233,14 @@ class Exposed(NamedTuple):
 
 
 class DiscOnChip(NamedTuple):
-    """Where a disc lies on the chip at mid-exposure.
+    """Place and scale of a disc on the chip at mid-exposure.
 
     Attributes
     ----------
     center_px
-        (2,)
+        (2,) pixel coordinates (x, y) of the disc's center
     px_from_radius
-        (2, 2) pixels (x, y) from coordinates on the disc in units of its radius
+        (2, 2) matrix from coordinates on the disc, in units of its radius, to pixels (x, y)
     """
 
     center_px: Floats
@@ -230,12 +256,16 @@ def disc_on_chip(body: BodyLight, exposed: Exposed) -> DiscOnChip:
     rows = exposed.optics.camera.height_px
     xy = SMALL * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     middle = poses(exposed.trajectory, exposed.mount, np.array([window.middle_s(rows)]))
+    # Columns of the matrix by difference quotients.
     center, x, y = project(points_of(body, xy), exposed.optics, middle)[0][0]
     return DiscOnChip(center, np.column_stack([x - center, y - center]) / SMALL)
 
 
 def points_of(body: BodyLight, xy: Floats, share: Floats | None = None) -> Any:
-    """Points (M, 2) of a body's disc as Sources with (M,) shares of its light, all of it each if left out."""
+    """Points (M, 2) of a body's disc as Sources.
+
+    Point m has the fraction share[m] of the body's light; without `share` each has all of it.
+    """
     share = np.ones(len(xy)) if share is None else share
     ids = np.full(len(xy), body.id, np.int64)
     magnitude = np.full(len(xy), body.magnitude)
@@ -244,18 +274,18 @@ def points_of(body: BodyLight, xy: Floats, share: Floats | None = None) -> Any:
 
 
 class DisplacedImages(NamedTuple):
-    """A point of the disc's full light at its center and displaced by sub-pixel phases.
+    """Images of a point with all of the disc's light, at the disc's center and displaced by sub-pixel phases.
 
     Attributes
     ----------
     patches
-        (s, s, h, w) electrons, at phases (q / s, p / s) pixels down and right
+        (s, s, h, w) electrons; patch (q, p) is displaced by q / s pixels down and p / s pixels right
     corner_px
-        (2,) chip's pixel (x, y) of a patch's first one
+        (2,) chip pixel (x, y) of a patch's first pixel
     speed_px_s
         (2,) velocity of the image at mid-exposure
     streak_px
-        Path length
+        Path length of the image during the exposure
     """
 
     patches: Floats
@@ -265,7 +295,12 @@ class DisplacedImages(NamedTuple):
 
 
 def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> DisplacedImages:
-    """Draw a point with all of the body's light at the disc's center and at s^2 sub-pixel phases from it."""
+    """Draw a point with all of the body's light at the disc's center and at s^2 sub-pixel phases from it.
+
+    1. The number s of phases per pixel follows from the star image's sharpest feature.
+    2. Project a point at each phase over the exposure.
+    3. Draw each on a patch of its own; all patches have the size that the longest reach needs.
+    """
     optics = exposed.optics
     camera = exposed.optics.camera
     t_s = sample_times(
@@ -273,16 +308,16 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> Displace
     )
     all_poses = poses(exposed.trajectory, exposed.mount, t_s)
     star = star_kernel(optics, disc.center_px, body.chromatic)
+    # 1. Phases (x, y) in pixels, x fastest.
     steps = math.ceil(1 / (LATTICE * float(star.sharp_px[0])))
-    phase_px = np.stack(np.meshgrid(*2 * (np.arange(steps) / steps,)), axis=-1).reshape(
-        -1, 2
-    )  # x fastest
+    phase = np.arange(steps) / steps
+    phase_px = np.stack(np.meshgrid(phase, phase), axis=-1).reshape(-1, 2)
+    # 2. Their directions and tracks.
     points = points_of(body, phase_px @ np.linalg.inv(disc.px_from_radius).T)
     tracks, distance_m, cos_in = image_tracks(points, optics, all_poses, t_s, Emitter())
     xy_px = tracks.xy_px
     middle = len(t_s) // 2
     is_led = np.zeros(len(points), bool)
-    blur_px = optics.blur_px
     kernels = source_kernels(
         camera,
         xy_px[middle],
@@ -291,17 +326,18 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> Displace
         distance_m,
         cos_in,
         None,
-        blur_px,
+        optics.blur_px,
         points.chromatic,
     )
+    # 3. One size of patch for all phases, in whole pixels of the chip.
     reach_px = kernels.reach_px.max() + 2
     low = np.floor(np.nanmin(xy_px, axis=(0, 1)) - reach_px).astype(np.int64)
-    width, height = (
-        np.ceil(np.nanmax(xy_px, axis=(0, 1)) + reach_px).astype(np.int64) - low + 1
-    ).tolist()
-    # Side by side in one strip, each in a patch of its own.
+    high = np.ceil(np.nanmax(xy_px, axis=(0, 1)) + reach_px).astype(np.int64)
+    width, height = (high - low + 1).tolist()
+    # The patches stand side by side in one strip, which `draw` takes for a chip.
     strip = np.zeros((height, len(points) * width))
     moved = xy_px - low + width * np.column_stack([np.arange(len(points)), np.zeros(len(points))])
+    # The strip's first row is the chip's row low[1], which a rolling shutter exposes later.
     window = exposed.window._replace(
         open_s=exposed.window.open_s + low[1] * exposed.window.row_time_s
     )
@@ -312,7 +348,7 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> Displace
 
 
 def star_kernel(optics: Optics, xy_px: Floats, chromatic: Floats | None) -> Kernels:
-    """The kernel of a point at a place on the chip; chromatic: (4,) of its light."""
+    """The kernel of a point of light at a place (2,) on the chip, with `chromatic` (4,) as in `Sources`."""
     one = np.ones(1)
     is_led = np.zeros(1, bool)
     colors = None if chromatic is None else chromatic[None]
@@ -322,8 +358,18 @@ def star_kernel(optics: Optics, xy_px: Floats, chromatic: Floats | None) -> Kern
 
 
 class DiscImage(NamedTuple):
-    """(h, w) electrons, the chip's pixel (x, y) of the first one, the path length, and the (2,) displacement at the
-    speed of mid-exposure.
+    """The image of a disc, also beyond the chip.
+
+    Attributes
+    ----------
+    electrons
+        (h, w) mean photo-electrons
+    corner_px
+        (2,) chip pixel (x, y) of the first one
+    streak_px
+        Path length of the image during the exposure
+    streak_xy_px
+        (2,) displacement during the exposure at the velocity of mid-exposure
     """
 
     electrons: Floats
@@ -335,33 +381,38 @@ class DiscImage(NamedTuple):
 def disc_image(
     body: BodyLight, disc: DiscOnChip, exposed: Exposed, hidden: Hidden | None
 ) -> DiscImage:
-    """The mean photo-electrons of a disc, also those beyond the chip.
+    """The mean photo-electrons of a disc, also those beyond the chip, by the module's steps.
 
-    In a rolling shutter a point d below the center is exposed d rows later, and the image has moved by v row_time d
-    more: the map is sheared by the inverse of I - v row_time e_y^T. The rotation of the disc about its center during
-    the exposure is neglected.
+    In a rolling shutter a point d rows below the center is exposed d row_time later, when the image has moved by
+    v row_time d: the map is sheared by the inverse of I - v row_time e_y^T. The rotation of the disc about its center
+    during the exposure is neglected.
     """
+    # 1. and 2. The star's image at the phases of the lattice.
     star = star_images(body, disc, exposed)
     steps = len(star.patches)
+    # 3. The map of the light, on a lattice that the whole disc fits on.
     sheared = np.eye(2) - np.outer(star.speed_px_s * exposed.window.row_time_s, [0.0, 1.0])
     radius_from_px = np.asarray(np.linalg.inv(disc.px_from_radius) @ sheared, float)
     reach_px = math.ceil(float(np.linalg.norm(np.linalg.inv(radius_from_px), 2))) + 4
     light = light_on_lattice(body, radius_from_px, reach_px, steps, hidden)
+    # 4. The convolution begins that much up and left.
     corner_px = star.corner_px - reach_px
     streak_xy_px = star.speed_px_s * exposed.window.exposure_s
     return DiscImage(convolved(light, star.patches), corner_px, star.streak_px, streak_xy_px)
 
 
 def convolved(light: Floats, patches: Floats) -> Floats:
-    """The sum over phases (q, p) of the convolutions of light[q::s, p::s] with patches[q, p], in full.
+    """The sum over phases (q, p) of the full convolutions of light[q::s, p::s] with patches[q, p].
 
-    The transforms round where there is no light; what falls below zero is cut, as a disc's edge alone may be on the
-    chip, whose light would be negative.
+    The Fourier transforms leave rounding errors where there is no light, of either sign. Negative values are set to
+    zero: if only the disc's edge is on the chip, its total could be negative.
     """
     steps, _, height, width = patches.shape
     full = (len(light) // steps + height - 1, len(light) // steps + width - 1)
     shape = [fft.next_fast_len(size, real=True) for size in full]
+    # (q, p, row, column): the lattice's points by their phase.
     by_phase = light.reshape(len(light) // steps, steps, -1, steps).transpose(1, 3, 0, 2)
+    # Convolutions are products of spectra, which add before the one inverse transform.
     spectrum = (fft.rfft2(by_phase, shape) * fft.rfft2(patches, shape)).sum(axis=(0, 1))
     return np.maximum(fft.irfft2(spectrum, shape)[: full[0], : full[1]], 0.0)
 
@@ -369,15 +420,18 @@ def convolved(light: Floats, patches: Floats) -> Floats:
 def light_on_lattice(
     body: BodyLight, radius_from_px: Floats, reach_px: int, steps: int, hidden: Hidden | None
 ) -> Floats:
-    """Shares of the light of the lattice's points, (n, n) from -reach_px to reach_px in both directions."""
+    """Fractions of the disc's light on the lattice, (n, n) points from -reach_px to reach_px in both directions."""
     count = (2 * reach_px + 1) * steps
     radius_px = 1 / float(np.linalg.norm(radius_from_px, 2))
-    crescent = 1 + math.cos(body.place.phase_rad)  # its width in units of the radius
+    # A crescent is 1 + cos(phase) wide in units of the radius.
+    crescent = 1 + math.cos(body.place.phase_rad)
     samples = min(max(MIN_SAMPLES, 2 * CRESCENT_SAMPLES / max(crescent, 1e-9)), MAX_SAMPLES)
+    # Enough samples across the disc and across its crescent.
     subsamples = max(SUBSAMPLES, math.ceil(samples / (2 * radius_px * steps)))
     fine = count * subsamples
     # The cells of points 0, 1/s, ... are centered on them.
     axis_px = (np.arange(fine) + 0.5) / (steps * subsamples) - 0.5 / steps - reach_px
+    # What hides the disc is asked for samples that can have light alone.
     shown = np.ones((fine, fine)) if hidden else np.ones((0, 0))
     if hidden:
         xy = np.stack(np.meshgrid(axis_px, axis_px), axis=-1) @ radius_from_px.T
@@ -386,8 +440,9 @@ def light_on_lattice(
     return lattice_light(body.surface, count, subsamples, axis_px, radius_from_px, shown)
 
 
-POINT_PX = 0.3  # a disc of a smaller diameter is a point: its image is wider by 0.006 px^2, or half a percent
-SMALL_PX = 4.0  # one of a smaller diameter is a few points
+# A disc of a smaller diameter is a point: its image is wider by 0.006 px^2, or half a percent.
+POINT_PX = 0.3
+SMALL_PX = 4.0  # a disc of a smaller diameter is a few points
 COARSE = 16  # places across a disc at which the vehicle is tested for hiding it
 FEW = 9  # poses in an exposure at which a body is looked for in the field
 
@@ -398,9 +453,10 @@ def render_bodies(
     exposed: Exposed,
     occluded: OcclusionTest | None = None,
 ) -> list[SourceTruth]:
-    """Add the light of the bodies, farthest first, to the (H, W) image, in place; return the truth of each in view.
+    """Add the light of the bodies, farthest first, to the (H, W) image, in place.
 
-    Lens, motion and shutter act on a disc as on a star (see disc_image.py). What is behind a nearer body is left out.
+    Returns the truth of each body in view. Lens, motion and shutter act on a disc as on a star (`disc_image`). Light
+    that a nearer body hides is left out.
     """
     window = exposed.window
     few_poses = poses(
@@ -412,11 +468,13 @@ def render_bodies(
     for n in in_view(centers_of(bodies), exposed.optics, few_poses).tolist():
         body = bodies[n]
         disc = disc_on_chip(body, exposed)
+        # Behind the camera the scale is NaN; the body is then drawn as a point, which has no image.
         diameter_px = (
             2 * float(np.linalg.norm(disc.px_from_radius, 2))
             if np.isfinite(disc.center_px).all()
             else 0.0
         )
+        # The bodies come farthest first, so those after it are nearer.
         nearer = bodies[n + 1 :]
         if diameter_px > SMALL_PX:
             drawn = disc_image(body, disc, exposed, hidden_points(body, nearer, occluded))
@@ -430,7 +488,7 @@ def render_bodies(
 
 
 def centers_of(bodies: Sequence[BodyLight]) -> Sources:
-    """The centers of bodies as points with all of their light."""
+    """The centers of bodies as points with all of their light, as Sources."""
     number = [(body.id, body.flux_e_s_m2, body.magnitude) for body in bodies]
     ids, flux_e_s_m2, magnitude = np.array(number, float).reshape(-1, 3).T
     directions = np.array([body.place.direction for body in bodies]).reshape(-1, 3)
@@ -445,10 +503,11 @@ def render_points(
     hidden: OcclusionTest | None,
     center_px: Floats,
 ) -> list[SourceTruth]:
-    """Draw a small disc as points, one at the center of its light if it is not resolved."""
+    """Draw a small disc as a few points, or as one at the center of its light if it is not resolved."""
     elements = disc_elements(body.surface)
     if not resolved:
         elements = elements.merged()
+    # The truth of a body is that of its points' light together, so it needs an image of its own.
     own = np.zeros_like(image) if resolved else image
     truth = render(own, points_of(body, *elements), *exposed, None, hidden)
     if not resolved or not len(truth.id):
@@ -461,9 +520,10 @@ def render_points(
 def add_disc(
     image: NDArray[Any], disc: DiscImage, body: BodyLight, center_px: Floats
 ) -> list[SourceTruth]:
-    """Add a disc's image to the chip's; return its truth, none if it misses the chip."""
+    """Add a disc's image to the chip's; return its truth, or an empty list if it misses the chip."""
     size = np.array(disc.electrons.shape[::-1])
     limit = np.array(image.shape[::-1])
+    # The part of the disc's image that is on the chip.
     low = np.clip(disc.corner_px, 0, limit)
     high = np.clip(disc.corner_px + size, 0, limit)
     (x0, y0), (x1, y1) = low - disc.corner_px, high - disc.corner_px
@@ -482,11 +542,12 @@ def whole(
     streak_px: float,
     streak_xy_px: Floats,
 ) -> SourceTruth:
-    """The truth of one body, a row, from its own light in a part of the image that begins at a corner (x, y)."""
+    """The truth of one body, as one row, from its own light on a part of the image that begins at corner_px (x, y)."""
     electrons = own_e.sum(dtype=float)
     y, x = np.unravel_index(np.argmax(own_e), own_e.shape)
     columns = own_e.sum(axis=0, dtype=float)
     rows = own_e.sum(axis=1, dtype=float)
+    # Center of gravity (sum e x, sum e y) / sum e.
     center = np.array([columns @ np.arange(len(columns)), rows @ np.arange(len(rows))]) / electrons
     return SourceTruth(
         id=np.array([body.id]),
@@ -504,7 +565,7 @@ def whole(
 
 
 def behind(bodies: Sequence[BodyLight], occluded: OcclusionTest | None) -> OcclusionTest | None:
-    """The test for sources that the discs of these bodies or anything else hide; None if nothing can."""
+    """The test whether nearer bodies' discs or the vehicle hide a source; None if nothing can."""
 
     def hidden(place: Floats) -> NDArray[np.bool_]:
         by_discs = [body.hides(place[:, :3]) for body in bodies]
@@ -516,9 +577,9 @@ def behind(bodies: Sequence[BodyLight], occluded: OcclusionTest | None) -> Occlu
 def hidden_points(
     body: BodyLight, nearer: Sequence[BodyLight], occluded: OcclusionTest | None
 ) -> Hidden | None:
-    """The test for points (M, 2) of a disc that nearer bodies or the vehicle hide; None if nothing does.
+    """The test whether nearer bodies or the vehicle hide points (M, 2) of a disc; None if nothing does.
 
-    The vehicle is tested at COARSE places across the disc.
+    The vehicle's test is slow, so it is made once, at COARSE places across the disc.
     """
     overlapping = [other for other in nearer if body.overlaps(other)]
     axis = (np.arange(COARSE) + 0.5) * (2 / COARSE) - 1
@@ -542,7 +603,7 @@ def hidden_points(
 
 
 def concatenated(truths: Sequence[SourceTruth]) -> SourceTruth:
-    """The rows of several truths, in their order."""
+    """The rows of several truths, in their order, as one."""
     if len(truths) == 1:
         return truths[0]
     names = [field.name for field in fields(SourceTruth)]

@@ -1,4 +1,7 @@
-"""The lens: projection of directions to pixels with distortion, and throughput with vignetting."""
+"""The lens: projection of directions to pixels with distortion, and throughput with vignetting.
+
+This is the hardware as it is; what a tracker believes about its camera is separate code (estimator/core/camera.py).
+"""
 
 from __future__ import annotations
 
@@ -13,11 +16,12 @@ from skysim.scene.sections.camera import CameraConfig, TwoStopsConfig, Vignettin
 
 
 def two_stops(config: TwoStopsConfig, field_rad: Floats) -> Floats:
-    """Fraction of the light that passes two equal round stops: the overlap area of two circles, over a circle's.
+    """Fraction of the light that passes two equal round stops: the overlap area of two circles, over a circle's area.
 
     V = (2 / pi) (acos u - u sqrt(1 - u^2)), u = tan(field) / tan(cutoff): seen obliquely, one stop is displaced
     against the other by u diameters.
     """
+    # 1.57 is just below pi / 2, where the tangent overflows.
     u = np.clip(np.tan(np.minimum(field_rad, 1.57)) / np.tan(np.radians(config.cutoff_deg)), 0, 1)
     return np.asarray(2 / np.pi * (np.arccos(u) - u * np.sqrt(1 - u**2)))
 
@@ -37,11 +41,11 @@ class Optics:
     Attributes
     ----------
     camera
-        Focal length, principal point, distortion, point-spread function
+        Focal length, principal point, distortion and point-spread function
     collecting_m2
-        Entrance pupil's area times transmission, where that is one number
+        Area of the entrance pupil times the transmission, if that is one number for all wavelengths
     fold_r
-        Tangent of the field angle at which strong barrel distortion folds back: no image beyond
+        Tangent of the field angle at which strong barrel distortion folds back; no image beyond it
     field_rad
         Greatest field angle (from the boresight) on the chip
     blur_px
@@ -56,16 +60,19 @@ class Optics:
 
     @classmethod
     def from_camera(cls, camera: CameraConfig) -> Optics:
-        """The optics of a scene's camera."""
+        """The optics of a scene's camera, without seeing."""
         area_m2 = np.pi / 4 * camera.pupil_m**2
         fold = fold_r(camera.distortion)
         return cls(camera, float(area_m2 * camera.gray_transmission), fold, field_rad(camera, fold))
 
     def project(self, vectors_cam: Floats) -> Floats:
-        """(..., 3) vectors in camera axes to (..., 2) pixels; NaN behind the camera and beyond the fold.
+        """Project (..., 3) vectors in camera axes to (..., 2) pixels; NaN behind the camera and beyond the fold.
 
+        With x = X / Z, y = Y / Z and r^2 = x^2 + y^2:
         x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), y' likewise (Brown 1971).
+        Pixel = center + f x'.
         """
+        # NaN in Z marks directions without an image.
         z = np.where(vectors_cam[..., 2] > 0, vectors_cam[..., 2], np.nan)
         x = vectors_cam[..., 0] / z
         y = vectors_cam[..., 1] / z
@@ -76,14 +83,16 @@ class Optics:
         return np.stack([x * focal + center[0], y * focal + center[1]], axis=-1)
 
     def _distort(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Brown's distortion of (...,) tangents x and y; NaN beyond the fold."""
         r2 = x**2 + y**2
         scale = np.where(r2 < self.fold_r**2, radial(self.camera.distortion, r2), np.nan)
         shift_x, shift_y = tangential(self.camera.distortion, x, y)
         return x * scale + shift_x, y * scale + shift_y
 
     def throughput(self, cos_field: Floats) -> Floats:
-        """Cosine of the field angle (foreshortening of the pupil) times vignetting. Zero behind the
-        camera. Any shape.
+        """Relative throughput at field angles theta of any shape: cos(theta) V(theta), zero behind the camera.
+
+        The cosine is the foreshortening of the pupil, V the vignetting.
         """
         cosine = np.maximum(cos_field, 0)
         config = self.camera.vignetting
@@ -100,13 +109,13 @@ class ScaledOptics(Optics):
 
     @classmethod
     def of(cls, optics: Optics, scale: float) -> ScaledOptics:
-        """A lens with its image scaled, and all else unchanged."""
+        """The lens `optics` with its image scaled, and without its blur."""
         return cls(
             optics.camera, optics.collecting_m2, optics.fold_r, optics.field_rad, scale=scale
         )
 
     def project(self, vectors_cam: Floats) -> Floats:
-        """As `Optics.project`, then scaled."""
+        """As `Optics.project`, then scaled about the principal point."""
         center = np.array(self.camera.center_px)
         return center + self.scale * (Optics.project(self, vectors_cam) - center)
 
@@ -118,24 +127,26 @@ def radial(distortion: tuple[float, ...], r2: Floats) -> Floats:
 
 
 def tangential(distortion: tuple[float, ...], x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Tangential (decentering) distortion: 2 p1 x y + p2 (r^2 + 2 x^2) and p1 (r^2 + 2 y^2) + 2 p2 x y."""
+    """Tangential (decentering) distortion: 2 p1 x y + p2 (r^2 + 2 x^2) and p1 (r^2 + 2 y^2) + 2 p2 x y (p1, p2)."""
     p1, p2 = distortion[2:4]
     r2 = x**2 + y**2
     return 2 * p1 * x * y + p2 * (r2 + 2 * x**2), p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
 
 
 def field_rad(camera: CameraConfig, fold_r: float) -> float:
-    """Field angle of the chip's farthest corner, with the radial distortion inverted."""
+    """Field angle of the chip's farthest corner, with the radial distortion inverted by interpolation."""
     corner_r = camera.corner_px / camera.focal_px
     r = np.linspace(0, min(fold_r, 20 * corner_r), 4001)
     return float(np.arctan(np.interp(corner_r, r * radial(camera.distortion, r**2), r)))
 
 
 def fold_r(distortion: tuple[float, ...]) -> float:
-    """The least r at which r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing; infinity if it always grows."""
+    """The least r at which r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing; infinity if it always grows.
+
+    There the derivative 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6 vanishes.
+    """
     k1, k2, _, _, k3 = distortion
-    roots = np.roots(
-        [1.0, 3 * k1, 5 * k2, 7 * k3]
-    )  # polynomial in 1 / r^2: its leading coefficient is never 0
+    # A polynomial in 1 / r^2, whose leading coefficient is never 0; its largest real root is the least r.
+    roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
     extrema = roots.real[(abs(roots.imag) < 1e-9 * (1 + abs(roots.real))) & (roots.real > 1e-12)]
     return float(1 / np.sqrt(extrema.max())) if len(extrema) else float("inf")

@@ -1,14 +1,20 @@
 """Integrate the sources' images over an exposure to mean photo-electrons per pixel.
 
-A source's contribution to a pixel is a time integral over the exposure of its rate times its pixel-integrated image
-at its moving position. Smear by body rate, jitter, pulsed LEDs and rolling shutters are all part of this integral.
+The smear integral: a source n gives the pixel (i, j) the mean number of electrons
 
-1. `image_tracks` projects every source at K even times of the exposure: positions in pixels and rates.
-2. `source_kernels` (psf/kernel_cache.py) gives each source its pixel-integrated image and the size of that image's
-   sharpest feature.
-3. `draw` integrates each source on a patch of its own (`_integrate`): the exposure is cut into pieces in which the
+    E_ij = integral over the exposure of rate_n(t) on_n(t) K_n(i - x_n(t), j - y_n(t)) dt,
+
+with its rate, the pulses on_n (0 or 1), its pixel-integrated image K_n (unit sum) and the moving position (x_n, y_n)
+of that image. Smear by body rate, jitter, pulsed LEDs and rolling shutters are all part of this integral.
+
+1. `in_view` keeps the sources that come near the field at any time of the exposure.
+2. `image_tracks` projects them at K even times: positions in pixels and rates. Between the times they are interpolated
+   by cubics.
+3. `source_kernels` (psf/kernel_cache.py) gives each source its image K_n and the size of that image's sharpest feature.
+4. `draw` integrates each source on a patch of its own (`_integrate`): the exposure is cut into pieces in which the
    image moves by less than STEP times that feature, and each piece is replaced by two points of light (a two-point
-   Gauss rule for steady light), added by psf/splat.py. The patches are then added to the frame.
+   Gauss rule for steady light), added by psf/splat.py or psf/ellipse.py.
+5. The patches are added to the frame.
 """
 
 from __future__ import annotations
@@ -31,24 +37,25 @@ from skysim.core.jit import jit
 from skysim.core.types import Floats, Mount, Sources, SourceTruth, StarSources, Trajectory
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2, lit_moments_s
 
-STEP = 1.3  # largest motion in one piece of the exposure, in units of the image's sharpest feature (sigma)
+# Largest motion in one piece of the exposure, in units of the image's sharpest feature (sigma).
+STEP = 1.3
 MAX_PIECES = 100_000
-# number of poses in an exposure
+# Number of poses in an exposure.
 MIN_POSES = 9
 MAX_POSES = 32_769
-SINGLE_PIECE_STEPS = (
-    0.4  # path length, in steps, up to which one piece is enough: error 1e-4 of the peak
-)
-STILL_PX = 1e-3  # an image that moves less is drawn as one point
-MIN_BAND_STARS = 20_000  # below, a pass over all takes less than 50 us
-MAX_BAND_SHARE = (
-    0.1  # of the sky, up to which a band of it holds a field's stars sooner than a pass over all
-)
-MAX_PATCH_PIXELS = 1 << 20  # pixels of patches held in memory at once, or as many as the frame has
+# Path length, in steps, up to which one piece is enough: error 1e-4 of the peak.
+SINGLE_PIECE_STEPS = 0.4
+# An image that moves less is drawn as one point.
+STILL_PX = 1e-3
+# In a catalog with fewer stars a test of every star takes less than 50 us.
+MIN_BAND_STARS = 20_000
+# Fraction of the sky up to which a look-up of the stars by direction is faster than a test of every star.
+MAX_BAND_SHARE = 0.1
+# Pixels of patches held in memory at once, or as many as the frame has.
+MAX_PATCH_PIXELS = 1 << 20
 
-OcclusionTest = Callable[
-    [Floats], NDArray[np.bool_]
-]  # (N,) which of N sources at `Sources.place` are occluded
+# (N,) which of N sources at `Sources.place` are occluded
+OcclusionTest = Callable[[Floats], NDArray[np.bool_]]
 
 
 class Window(NamedTuple):
@@ -59,7 +66,7 @@ class Window(NamedTuple):
     row_time_s: float = 0.0
 
     def close_s(self, rows: int) -> float:
-        """End of the last row's exposure for a chip of so many rows."""
+        """End of the last row's exposure on a chip of `rows` rows."""
         return self.open_s + self.exposure_s + self.row_time_s * (rows - 1)
 
     def middle_s(self, rows: int) -> float:
@@ -73,9 +80,9 @@ class Poses(NamedTuple):
     Attributes
     ----------
     cam_from_lab
-        (K, 3, 3) matrices
+        (K, 3, 3) rotation matrices
     camera_m
-        (K, 3) entrance pupil in the lab
+        (K, 3) positions of the entrance pupil, lab frame
     """
 
     cam_from_lab: Floats
@@ -88,13 +95,13 @@ class Tracks(NamedTuple):
     Attributes
     ----------
     first_s, step_s
-        The times
+        Time of the first sample and interval between samples
     xy_px
-        (K, N, 2) position of the image, NaN where it has none
+        (K, N, 2) positions of the images, NaN where a source has none
     rate_e_s
-        (K, N) photo-electrons a second while lit
+        (K, N) photo-electrons per second while the source is lit
     pulse_s
-        (N, 3) period, start and duration of its pulses
+        (N, 3) period, start and duration of the source's pulses
     """
 
     first_s: float
@@ -114,28 +121,33 @@ def render(
     emitter: Emitter | None = None,
     occluded: OcclusionTest | None = None,
 ) -> SourceTruth:
-    """Add the mean photo-electrons of every source to the (H, W) image, in place; return the truth of those that
-    gave any.
+    """Add the mean photo-electrons of every source to the (H, W) image, in place.
+
+    Returns the truth of the sources that gave light to the chip.
 
     Each image moves along its true path while it is lit. A piece of the exposure in which it moves by less than its
     own blur is drawn as two points of light whose mean time and variance are those of the light in the piece (for
     steady light the two-point Gauss rule). Total light and mean position are exact for any pulses, and the streak's
     profile converges with the fourth power of the piece. In a rolling shutter every row has its own exposure.
+    The numbers in the code are those of the module's steps.
     """
     rows = image.shape[0]
     t_s = sample_times(window.open_s, window.close_s(rows), trajectory)
     all_poses = poses(trajectory, mount, t_s)
-    # Coarse selection with a few poses, before the sources are projected at all of them.
+    # 1. Coarse selection with a few poses, before the sources are projected at all of them.
+    # It knows no motion of sources, so moving sources are all kept.
     few_poses = Poses(*(samples[:: len(t_s) // 8] for samples in all_poses))
     candidates = (
         sources.take(in_view(sources, optics, few_poses)) if sources.motion is None else sources
     )
     if occluded:
         candidates = candidates.take(~occluded(candidates.place))
+    # 2. Project them at all poses; the pose in the middle gives the frame's truth.
     emitter = emitter or Emitter()
     middle = len(t_s) // 2
     tracks, distance_m, cos_in = image_tracks(candidates, optics, all_poses, t_s, emitter)
     mid_px = tracks.xy_px[middle]
+    # 3. Each source keeps the image K_n that it has at mid-exposure.
     disks = led_images(
         candidates, optics, Poses(*(samples[middle] for samples in all_poses)), emitter
     )
@@ -151,6 +163,7 @@ def render(
         optics.blur_px,
         candidates.chromatic,
     )
+    # 4. and 5. Integrate and add to the frame.
     table = draw(image, tracks, kernels, STEP * kernels.sharp_px, window)
     # Only sources that gave light to the chip are reported.
     on_chip = table[:, 0] > 0
@@ -162,9 +175,10 @@ def render(
         electrons=electrons,
         peak_e=peak,
         streak_px=length,
+        # Noise-equivalent area (sum I)^2 / sum I^2.
         area_px=electrons**2 / squares,
         peak_xy=table[on_chip, 6:8].astype(np.int64),
-        saturated=np.zeros(len(electrons), bool),  # set by the detector
+        saturated=np.zeros(len(electrons), bool),  # set by the detector, as is the SNR
         snr=np.full(len(electrons), np.nan),
         streak_xy_px=streak_vectors_px(tracks, mid_px, window, rows)[on_chip],
     )
@@ -172,6 +186,7 @@ def render(
 
 def streak_vectors_px(tracks: Tracks, mid_px: Floats, window: Window, rows: int) -> Floats:
     """(N, 2) displacement of each image over the exposure of the row that it is on at mid-exposure."""
+    # A row's exposure begins row_time_s after that of the row above it.
     row = np.clip(np.nan_to_num(mid_px[:, 1]), 0, rows - 1)
     begin_s = window.open_s + window.row_time_s * row
     return _displacement(tracks, begin_s, begin_s + window.exposure_s)
@@ -179,6 +194,7 @@ def streak_vectors_px(tracks: Tracks, mid_px: Floats, window: Window, rows: int)
 
 @jit
 def _displacement(tracks: Tracks, begin_s: Floats, end_s: Floats) -> Floats:
+    """(N, 2) difference of the images' positions between two times (N,)."""
     out = np.empty((len(begin_s), 2))
     for n in range(len(begin_s)):
         x0, y0, _ = _interpolate(tracks, n, begin_s[n])
@@ -189,7 +205,7 @@ def _displacement(tracks: Tracks, begin_s: Floats, end_s: Floats) -> Floats:
 
 
 def sample_times(open_s: float, close_s: float, trajectory: Trajectory) -> Floats:
-    """K even times over the exposure, as dense as the attitude's samples; K is odd, so that one is in the middle.
+    """K even times over the exposure, as dense as the attitude's samples; K is odd, so one is at mid-exposure.
 
     Raises
     ------
@@ -197,6 +213,7 @@ def sample_times(open_s: float, close_s: float, trajectory: Trajectory) -> Float
         For more samples than memory should hold: dropping samples could drop the jitter.
     """
     first, last = np.searchsorted(trajectory.t_s, (open_s, close_s))
+    # `| 1` makes the count odd.
     count = max(int(last - first) + 1, MIN_POSES) | 1
     if count > MAX_POSES:
         raise InputError(
@@ -208,7 +225,11 @@ def sample_times(open_s: float, close_s: float, trajectory: Trajectory) -> Float
 
 
 def poses(trajectory: Trajectory, mount: Mount, t_s: Floats) -> Poses:
-    """The camera's poses at K times."""
+    """The camera's poses at K times.
+
+    cam_from_lab = cam_from_body body_from_lab; the pupil is at lab_from_body applied to its place on the body, since
+    the lab's origin is the bearing's center.
+    """
     lab_from_body = trajectory.attitude_at(t_s).as_matrix()
     cam_from_lab = mount.cam_from_body.as_matrix() @ lab_from_body.transpose(0, 2, 1)
     return Poses(cam_from_lab, lab_from_body @ mount.camera_body_m)
@@ -217,7 +238,11 @@ def poses(trajectory: Trajectory, mount: Mount, t_s: Floats) -> Poses:
 def image_tracks(
     sources: Sources, optics: Optics, poses: Poses, t_s: Floats, emitter: Emitter
 ) -> tuple[Tracks, Floats, Floats]:
-    """The tracks of N sources, their mean distances (N,) in m (1 for stars) and mean field-angle cosines (N,)."""
+    """Project N sources over the exposure.
+
+    Returns their tracks, their mean distances (N,) in m (1 for stars) and mean field-angle cosines (N,).
+    """
+    # Motions of sources are given about mid-exposure.
     xy, distance_m, cos_out, cos_in = project(sources, optics, poses, t_s - t_s[len(t_s) // 2])
     rate_e_s = rates_e_s(sources, optics, emitter, distance_m, cos_out, cos_in)
     pulse_s = np.column_stack([sources.period_s, sources.start_s, sources.on_s])
@@ -233,7 +258,11 @@ def rates_e_s(
     cos_out: Floats,
     cos_in: Floats,
 ) -> Floats:
-    """(..., N) photo-electrons a second of N lit sources, from what `project` returns."""
+    """(..., N) photo-electrons per second of N lit sources, from what `project` returns.
+
+    A star gives strength T(theta) A; an LED its irradiance at the pupil, by the laws of its lobe and of distance, times
+    A. T is the throughput at the field angle theta, A the collecting area.
+    """
     throughput = optics.throughput(cos_in)
     rate = sources.strength * throughput
     is_led = sources.place[:, 3] > 0
@@ -246,8 +275,8 @@ def rates_e_s(
     return rate * optics.collecting_m2
 
 
-NOW = np.zeros(1)
-NO_MOTION = np.empty((0, 2, 3))
+NOW = np.zeros(1)  # at mid-exposure
+NO_MOTION = np.empty((0, 2, 3))  # for sources at rest
 
 
 def project(
@@ -255,7 +284,8 @@ def project(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Project N sources at each of K poses, (K,) seconds after mid-exposure, each in its color.
 
-    Returns (K, N, 2) pixels, (K, N) distances in m (1 for stars), (K, N) cosines at the emitter and at the aperture.
+    Returns (K, N, 2) pixels, (K, N) distances in m (1 for stars), (K, N) cosines of the angles at the emitter (from its
+    normal) and at the aperture (from the boresight).
     """
     motion = NO_MOTION if sources.motion is None else sources.motion
     cam_from_lab, camera_m = map(np.ascontiguousarray, poses)
@@ -268,12 +298,14 @@ def project(
 def project_each(
     sources: Sources, optics: Optics, poses: Poses, ends: NDArray[np.int64]
 ) -> tuple[Floats, ...]:
-    """As `project` at mid-exposure, of sources in groups, each at a pose of its own: the results are (N, 2) and (N,).
+    """Project sources in K groups, each group at a pose of its own, at mid-exposure.
+
+    Returns the quantities of `project` for each source once: (N, 2) and three times (N,).
 
     Parameters
     ----------
     ends
-        (K + 1,) 0, and the number of sources up to the end of each group
+        (K + 1,) row of the first source of each group, and the number of sources
     """
     direction_cam, distance, cos_out = _directions_each(
         sources.place, NO_MOTION, NOW, sources.normal, *poses, ends
@@ -282,7 +314,7 @@ def project_each(
 
 
 def _pixels(sources: Sources, optics: Optics, direction_cam: Floats) -> Floats:
-    """(..., N, 2) pixels of (..., N, 3) directions, each source in its color."""
+    """(..., N, 2) pixels of (..., N, 3) directions; lateral color displaces each along its radius."""
     xy_px = optics.project(direction_cam)
     if sources.chromatic is not None:
         camera = optics.camera
@@ -299,14 +331,23 @@ def _directions(
     cam_from_lab: Floats,
     camera_m: Floats,
 ) -> tuple[Floats, Floats, Floats]:
-    """(K, N, 3) unit directions in camera axes, (K, N) distances in m and cosines at the emitters.
+    """Directions from the entrance pupil to N sources at K poses.
+
+    A source has a homogeneous place (p, w): w = 1 for an LED at p, w = 0 for a star in the direction p. Its offset from
+    the pupil c is o = p - w c + v t + a t^2 / 2, so a star has no parallax.
 
     Parameters
     ----------
     motion
-        As of `Sources`, or of length 0 where nothing moves
+        (N, 2, 3) velocity v and acceleration a, as in `Sources`, or (0, 2, 3) where nothing moves
     after_s
-        (K,), or (1,) for all poses
+        (K,) times t after mid-exposure, or (1,) for all poses
+
+    Returns
+    -------
+    tuple
+        (K, N, 3) unit directions in camera axes, (K, N) distances |o| in m, (K, N) cosines of the angles between the
+        emitter's normal and the direction to the camera
     """
     poses = len(cam_from_lab)
     count = len(place)
@@ -318,6 +359,7 @@ def _directions(
     for k in range(poses):
         t = after_s[min(k, len(after_s) - 1)]
         for n in range(count):
+            # Offset from the pupil, and its length.
             square = 0.0
             for i in range(3):
                 offset[i] = place[n, i] - place[n, 3] * camera_m[k, i]
@@ -325,11 +367,13 @@ def _directions(
                     offset[i] += t * (motion[n, 0, i] + t / 2 * motion[n, 1, i])
                 square += offset[i] * offset[i]
             distance[k, n] = math.sqrt(square)
+            # Unit direction, and its angle with the emitter's normal.
             outward = 0.0
             for i in range(3):
                 offset[i] /= distance[k, n]
                 outward += offset[i] * normal[n, i]
             cosine[k, n] = -outward
+            # From the lab's axes to the camera's.
             for i in range(3):
                 turned = 0.0
                 for j in range(3):
@@ -348,7 +392,7 @@ def _directions_each(
     camera_m: Floats,
     ends: NDArray[np.int64],
 ) -> tuple[Floats, Floats, Floats]:
-    """As `_directions` of sources in groups, each at a pose of its own: (N, 3), (N,) and (N,)."""
+    """As `_directions`, for sources in groups, each at a pose of its own: (N, 3), (N,) and (N,)."""
     direction = np.empty((len(place), 3))
     distance = np.empty(len(place))
     cosine = np.empty(len(place))
@@ -369,19 +413,19 @@ def _directions_each(
 def led_images(
     sources: Sources, optics: Optics, pose: Poses, emitter: Emitter
 ) -> DiskImages | None:
-    """The geometric images of N sources at one pose, NaN for stars; None if all are stars."""
+    """Geometric images of the LEDs' disks among N sources at one pose, NaN for stars; None if all are stars."""
     led = np.flatnonzero(sources.radius_m * sources.place[:, 3] > 0)
     if not len(led):
         return None
     cam_from_lab, camera_m = pose
-    offset_cam, normal_cam = (
-        a @ cam_from_lab.T for a in (sources.place[led, :3] - camera_m, sources.normal[led])
-    )
+    offset_cam = (sources.place[led, :3] - camera_m) @ cam_from_lab.T
+    normal_cam = sources.normal[led] @ cam_from_lab.T
     images = disk_images(optics, emitter, offset_cam, normal_cam, sources.radius_m[led])
     if len(led) == len(sources):
         return images
-    spread = (np.full((len(sources), *part.shape[1:]), np.nan) for part in images)
-    for whole, part in zip(full := DiskImages(*spread), images, strict=True):
+    # Fill the rows of the stars with NaN.
+    full = DiskImages(*(np.full((len(sources), *part.shape[1:]), np.nan) for part in images))
+    for whole, part in zip(full, images, strict=True):
         whole[led] = part
     return full
 
@@ -391,18 +435,19 @@ def in_view(
 ) -> NDArray[np.int64]:
     """Rows of the sources within a cone about the boresight at any of these poses.
 
-    The cone's half-angle is the field's circle, `reach` of it more for images that reach in from outside, and half of
-    the largest rotation between two poses for sources that cross the field between them. Stars in a small part of the
-    sky are looked up by direction, so the time is that of the stars in the field and not of those in the catalog.
+    The cone's half-angle is the sum of the field's half-diagonal, a fraction `reach` of it for images that reach in
+    from outside, and half of the largest rotation between successive poses, for sources that cross the field between
+    them. Stars in a small part of the sky are looked up by direction, so the time grows with the number of stars in the
+    field and not in the catalog.
     """
     boresight = np.ascontiguousarray(poses.cam_from_lab[:, 2])
     rotation_rad, span_rad = _rotations_rad(boresight)
     half_rad = (1 + reach) * optics.field_rad + 0.02 + rotation_rad / 2
-    cos_limit, cos_any = (
-        math.cos(min(angle_rad, math.pi)) for angle_rad in (half_rad, half_rad + span_rad)
-    )
+    cos_limit = math.cos(min(half_rad, math.pi))
+    cos_any = math.cos(min(half_rad + span_rad, math.pi))
     place = sources.place
     camera_m = np.ascontiguousarray(poses.camera_m)
+    # A cap of half-angle h covers (1 - cos h) / 2 of the sky.
     by_band = len(sources) >= MIN_BAND_STARS and (1 - cos_any) / 2 <= MAX_BAND_SHARE
     if by_band and isinstance(sources, StarSources):
         near = sources.within(boresight[0], half_rad + span_rad)
@@ -412,7 +457,7 @@ def in_view(
 
 @jit
 def _rotations_rad(boresight: Floats) -> tuple[float, float]:
-    """The greatest angles of K boresights between one and the next, and between any and the first."""
+    """The greatest angles between successive boresights (K, 3), and between any boresight and the first."""
     next_rad = 0.0
     first_rad = 0.0
     for k in range(1, len(boresight)):
@@ -430,16 +475,20 @@ def _rotations_rad(boresight: Floats) -> tuple[float, float]:
 def _in_cone(
     place: Floats, boresight: Floats, camera_m: Floats, cos_limit: float, cos_any: float
 ) -> Any:
-    """(N,) whether a source's direction from any of K cameras is within the cone: cosine with the boresight
-    above `cos_limit`. A star whose cosine with the first boresight is below `cos_any` is in none of the cones.
+    """(N,) whether a source is within the cone about the boresight of any of K cameras.
+
+    It is within a cone if the cosine with the boresight is above `cos_limit`. A star whose cosine with the first
+    boresight is below `cos_any` is in none of the cones.
     """
     inside = np.zeros(len(place), np.bool_)
     first = boresight[0]
     for n in range(len(place)):
+        # A star far from the first boresight needs no test against the others.
         at_first = place[n, 0] * first[0] + place[n, 1] * first[1] + place[n, 2] * first[2]
         if place[n, 3] == 0 and at_first < cos_any:
             continue
         for k in range(len(boresight)):
+            # o . b > |o| cos(limit), with the offset o from the camera and the boresight b.
             along = 0.0
             square = 0.0
             for i in range(3):
@@ -455,17 +504,16 @@ def _in_cone(
 def draw(
     image: NDArray[Any], tracks: Tracks, kernels: Kernels, step_px: Floats, window: Window
 ) -> Floats:
-    """Draw every source on a patch of its own and add the patches to the image, as many at a time as memory allows.
+    """Integrate every source on a patch of its own and add the patches to the image.
 
     Returns (N, 8): electrons on the chip, those of the brightest pixel, flux-weighted mean x and y, sum of the
     squared pixels, path length in pixels, and the brightest pixel's x and y. The mean is that of the whole image,
-    but in a rolling shutter of the part on the chip, since there each row has its own time.
+    except in a rolling shutter, where it is that of the part on the chip, since there each row has its own time.
 
     Parameters
     ----------
     step_px
-        (N,) largest motion of each image in one piece of the exposure; of an ellipse in units
-        of `sharpest_px`
+        (N,) largest motion of each image in one piece of the exposure, px; for an ellipse in units of `sharpest_px`
     """
     boxes = patches(tracks.xy_px, kernels.reach_px, image.shape)
     areas = (boxes[:, 1] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 2])
@@ -473,10 +521,12 @@ def draw(
     budget = max(image.size, MAX_PATCH_PIXELS)
     first = 0
     while first < len(boxes):
+        # As many patches at once as memory allows, at least one.
         total = np.cumsum(areas[first:])
         last = first + max(1, int(np.searchsorted(total, budget, side="right")))
         starts = np.concatenate([[0], total[: last - first]])
         buffer = np.zeros(starts[-1])
+        # Patches are drawn in parallel and added in order, so the sum does not depend on threads.
         _draw(buffer, starts, boxes[first:last], first, tracks, kernels, step_px, window, out)
         _deposit(image, buffer, starts, boxes[first:last])
         first = last
@@ -484,16 +534,16 @@ def draw(
 
 
 def patches(xy_px: Floats, reach_px: Floats, shape: tuple[int, ...]) -> NDArray[np.int64]:
-    """(N, 4) first and last + 1 column, first and last + 1 row that each image can reach; empty where it misses
-    the chip.
-    """
+    """(N, 4) first column, last + 1, first row, last + 1 that each image can reach; empty where it misses the chip."""
     if not xy_px.shape[1]:
         return np.zeros((0, 4), np.int64)
+    # Extent of the path; NaN positions do not count.
     hidden = np.isnan(xy_px)
     low = np.where(hidden, np.inf, xy_px).min(axis=0)
     high = np.where(hidden, -np.inf, xy_px).max(axis=0)
     jump = np.nan_to_num(np.abs(np.diff(xy_px, axis=0))).max(axis=0)
-    margin = reach_px[:, None] + 1 + jump / 4  # a curved path leaves the chord between two samples
+    # A curved path leaves the chord between two samples; a quarter of the longest one covers it.
+    margin = reach_px[:, None] + 1 + jump / 4
     limit = np.array(shape[1::-1])
     begin = np.clip(np.floor(low - margin), 0, limit)
     end = np.clip(np.ceil(high + margin) + 1, begin, limit)
@@ -512,6 +562,7 @@ def _draw(
     window: Window,
     out: Any,
 ) -> None:
+    """Integrate the sources of these patches in parallel, each into its part of the buffer and its row of `out`."""
     for i in numba.prange(len(boxes)):
         x0, x1, y0, y1 = boxes[i]
         if x1 > x0 and y1 > y0:
@@ -542,8 +593,12 @@ def _expose_source(
     window: Window,
     row: Any,
 ) -> None:
-    """Integrate one source on its patch; write the light's mean position and the path length into row[2:6]."""
+    """Integrate one source on its patch, whose first pixel is (x0, y0).
+
+    Writes the light's mean position and the path length into row[2:4] and row[5].
+    """
     end_s = window.open_s + window.exposure_s
+    # The table of an ellipse is made for this source alone; other kinds share tables.
     table = _sampled(n, kernels)
     if len(table):
         step_px *= sharpest_px(table)
@@ -557,6 +612,7 @@ def _expose_source(
         sums = _integrate(
             patch, j, j + rows, x0, y0, n, tracks, kernels, table, step_px, begin_s, end_s + delay_s
         )
+    # Mean position: of the light itself where all rows share one interval, without the chip's cut.
     if rolling:
         row[2], row[3] = _centroid(patch, x0, y0)
     elif sums[0] > 0:
@@ -581,11 +637,11 @@ def _integrate(
 ) -> Any:
     """Add the light of one source from begin_s to end_s to the rows [row0, row1) of its patch.
 
-    The interval is cut into equal pieces short enough that the image moves by less than its blur in each. In a
-    piece the light has a duration `lit`, a mean time and a standard deviation `spread` (from the pulses). Two
-    points of half the light each at mean - spread and mean + spread reproduce these moments: for steady light
-    spread = length / (2 sqrt 3), which is the two-point Gauss-Legendre rule, with an error of the fourth order in
-    the length.
+    1. The interval is cut into equal pieces, short enough that the image moves by less than its blur in each.
+    2. In a piece the light has a duration `lit`, a mean time and a standard deviation `spread` (from the pulses).
+    3. Two points of half the light each, at mean - spread and mean + spread, reproduce these moments: for steady light
+       spread = length / (2 sqrt 3), which is the two-point Gauss-Legendre rule, with an error of the fourth order in
+       the length. An image that hardly moves within the piece needs one point.
 
     Returns the electrons of the whole image and their first moments in x and y.
     """
@@ -594,16 +650,18 @@ def _integrate(
     total_y = 0.0
     speed = _speed(tracks, n, begin_s, end_s)
     steps = speed * (end_s - begin_s) / step_px
-    # One piece more than the motion needs: in a short path the ends, where the error is largest, weigh more.
+    # 1. One piece more than the motion needs: in a short path the ends, where the error is largest, weigh more.
     pieces = 1 if steps < SINGLE_PIECE_STEPS else int(min(np.ceil(steps) + 1, MAX_PIECES))
     for k in range(pieces):
         a = begin_s + (end_s - begin_s) * k / pieces
         b = begin_s + (end_s - begin_s) * (k + 1) / pieces
+        # 2. Duration, mean and standard deviation of the light's times in this piece.
         lit, mean, spread = lit_moments_s(
             a, b, tracks.pulse_s[n, 0], tracks.pulse_s[n, 1], tracks.pulse_s[n, 2]
         )
         if lit <= 0:  # no pulse in this piece
             continue
+        # 3. One point at the mean, or two at mean -+ spread.
         points = 1 if speed * spread < STILL_PX else 2
         for p in range(points):
             x, y, rate = _interpolate(tracks, n, mean + spread * (2 * p - points + 1))
@@ -619,7 +677,7 @@ def _integrate(
 
 @jit
 def _sampled(n: int, kernels: Kernels) -> Any:
-    """The table of an ellipse; empty for other kinds."""
+    """The sampled image of an ellipse; empty for other kinds of kernel."""
     if kernels.kind[n] != ELLIPSE:
         return np.empty((0, 0, 0), np.float32)
     begin, end, waves, samples = kernels.table[n]
@@ -656,7 +714,8 @@ def _splat_point(
     kernels: Kernels,
     table: Singles,
 ) -> None:
-    """Add the image of a point of light to the patch, by its kind of kernel."""
+    """Add the image of a point of light at (x, y) of the patch, by the source's kind of kernel."""
+    # Numbers of a table: its place in `tables` and the size of its axes.
     begin, end, p, q = kernels.table[n]
     if kernels.kind[n] == GAUSS:
         add_gaussian(patch, row0, row1, x, y, electrons, kernels.sigma_px[n])
@@ -672,9 +731,14 @@ def _splat_point(
 
 @jit
 def _interpolate(tracks: Tracks, n: int, t_s: float) -> Any:
-    """Position and rate of a source at any time, by the cubic (Lagrange) through the four nearest samples."""
+    """Position and rate of a source at any time, by the cubic (Lagrange) through the four nearest samples.
+
+    f(u) = sum_i w_i f_i with w_i = product over j != i of (u - j) / (i - j), u in steps from the first of the four.
+    The rate is 0 where the source has no image.
+    """
     last = tracks.xy_px.shape[0] - 4
     u = (t_s - tracks.first_s) / tracks.step_s
+    # Two samples before the time and two after it, where there are.
     k = min(max(int(u) - 1, 0), last)
     u -= k
     w0 = (u - 1) * (u - 2) * (u - 3) / -6
@@ -691,20 +755,20 @@ def _interpolate(tracks: Tracks, n: int, t_s: float) -> Any:
 
 @jit
 def _speed(tracks: Tracks, n: int, begin_s: float, end_s: float) -> float:
-    """The greatest speed of a source's image between two times, pixels a second."""
+    """The greatest speed of a source's image between two times, px/s, by differences of samples."""
     first = max(int((begin_s - tracks.first_s) / tracks.step_s), 0)
     last = min(int(np.ceil((end_s - tracks.first_s) / tracks.step_s)), tracks.xy_px.shape[0] - 1)
     fastest = 0.0
     for k in range(first, last):
         dx = tracks.xy_px[k + 1, n, 0] - tracks.xy_px[k, n, 0]
         dy = tracks.xy_px[k + 1, n, 1] - tracks.xy_px[k, n, 1]
-        fastest = max(fastest, np.hypot(dx, dy) / tracks.step_s)  # a NaN is no greater
+        fastest = max(fastest, np.hypot(dx, dy) / tracks.step_s)  # a NaN leaves it unchanged
     return fastest
 
 
 @jit
 def _length(tracks: Tracks, n: int, begin_s: float, end_s: float) -> float:
-    """Path length of a source's image between two times, pixels, as a sum of chords."""
+    """Path length of a source's image between two times, px, as a sum of chords between samples."""
     chords = max(int(np.ceil((end_s - begin_s) / tracks.step_s)), 8)
     total = 0.0
     x, y, _ = _interpolate(tracks, n, begin_s)
@@ -719,7 +783,7 @@ def _length(tracks: Tracks, n: int, begin_s: float, end_s: float) -> float:
 
 @jit
 def _patch_statistics(patch: Any, x0: int, y0: int, row: Any) -> None:
-    """Sum, peak, sum of squares and brightest pixel of a finished patch."""
+    """Write a finished patch's sum, peak, sum of squares and brightest pixel into row[0, 1, 4, 6, 7]."""
     for j in range(patch.shape[0]):
         for i in range(patch.shape[1]):
             e = patch[j, i]
@@ -733,7 +797,7 @@ def _patch_statistics(patch: Any, x0: int, y0: int, row: Any) -> None:
 
 @jit
 def _centroid(patch: Any, x0: int, y0: int) -> Any:
-    """Center of gravity of a patch; its corner if it is empty."""
+    """Center of gravity of a patch in chip pixels, (sum e x, sum e y) / sum e; its corner if it is empty."""
     total = 0.0
     x = 0.0
     y = 0.0

@@ -1,4 +1,7 @@
-"""What moves with the temperature: LEDs with the dome's expansion, the camera on its mount, the lens's focal length."""
+"""Thermal motion: LEDs move with the dome's expansion, the camera on its mount, the image with the focal length.
+
+Each effect is linear in the difference dT from the reference temperature, at which the set-up was surveyed.
+"""
 
 from __future__ import annotations
 
@@ -22,23 +25,23 @@ from skysim.scene.sections.surroundings import (
 
 
 def steady(config: SteadyTemperatureConfig, _hours: float) -> float:
-    """The same temperature all along."""
+    """A constant temperature in deg C."""
     return config.temperature_c
 
 
 def linear(config: LinearTemperatureConfig, hours: float) -> float:
-    """start + rate t."""
+    """A temperature that changes at a constant rate: start + rate t."""
     return config.start_c + config.rate_c_h * hours
 
 
 def sine(config: SineTemperatureConfig, hours: float) -> float:
-    """mean + amplitude sin(2 pi t / period + phase)."""
+    """A daily or other cycle: mean + amplitude sin(2 pi t / period + phase)."""
     turns = hours * HOUR_S / config.period_s + config.phase_deg / 360
     return config.mean_c + config.amplitude_c * float(np.sin(2 * np.pi * turns))
 
 
 def table(config: TemperatureTableConfig, hours: float) -> float:
-    """Linear between the measured times, constant beyond them."""
+    """A measured temperature, linear between the measured times, constant beyond them."""
     return float(np.interp(hours, config.hours, config.temperature_c))
 
 
@@ -51,36 +54,36 @@ TEMPERATURES: dict[str, Callable[[Any, float], float]] = {
 
 
 def temperature_c(config: ThermalConfig, t_s: float) -> float:
-    """The temperature at a time since the scene's start."""
+    """The temperature in deg C at a time since the scene's start; `speed` hastens its clock."""
     return TEMPERATURES[config.temperature.kind](config.temperature, t_s * config.speed / HOUR_S)
 
 
 def turned(config: ThermalConfig, t_s: float) -> Rotation:
-    """The camera's rotation on its mount since the calibration, about its own axes, at a time since the start."""
+    """The camera's rotation since the calibration, about its own axes, at a time since the start: beta dT."""
     difference_k = temperature_c(config, t_s) - config.reference_c
     return Rotation.from_rotvec(np.array(config.mount_arcsec_k) * (ARCSEC_RAD * difference_k))
 
 
 def leds_at(config: ThermalConfig, leds: Sources, t_s: float) -> Sources:
-    """The LEDs where they are at a time since the scene's start, from where they were surveyed.
+    """Move the LEDs from their surveyed places to their places at a time since the scene's start.
 
-    With the temperature's difference dT an LED at x is at a + (1 + alpha dT)(x - a) + creep, a the anchor on the axis.
+    An LED at x is at a + (1 + alpha dT)(x - a) + creep, with the anchor a on the dome's axis.
     """
     difference_k = temperature_c(config, t_s) - config.reference_c
     anchor_m = np.array([0.0, 0.0, config.anchor_height_m])
     place = leds.place.copy()
     moved_m = PPM * config.dome_ppm_k * difference_k * (place[:, :3] - anchor_m) + config.creep_m
-    place[:, :3] += place[:, 3:] * moved_m  # stars stay
+    # Stars have w = 0 and stay.
+    place[:, :3] += place[:, 3:] * moved_m
     return replace(leds, place=place)
 
 
 def camera_at(
     config: ThermalConfig, mount: Mount, optics: Optics, t_s: float
 ) -> tuple[Mount, Optics]:
-    """Mount and lens as they are at a time since the scene's start, from what they were at the calibration.
+    """The camera's mount and lens at a time since the scene's start, from those at the calibration.
 
-    With the temperature's difference dT the camera is turned by beta dT about its own axes, and the image is
-    1 + gamma dT times as large.
+    The camera is turned by beta dT about its own axes, and the image is 1 + gamma dT times as large.
     """
     difference_k = temperature_c(config, t_s) - config.reference_c
     mount = replace(mount, cam_from_body=turned(config, t_s) * mount.cam_from_body)

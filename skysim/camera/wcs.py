@@ -15,10 +15,11 @@ from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig
 
 MAX_ORDER = 9  # the highest that SIP allows
-TARGET_ERROR_PX = 1e-4  # error at which the order is high enough
-MAX_ERROR_PX = 0.01  # error above which a warning is given
-GRID_SIDE = 41  # points along each side of the field that the polynomials are fitted to; checked at three times as many
-MARGIN = 0.02  # of the chip's sides: the fit extends beyond the edges by this
+TARGET_ERROR_PX = 1e-4  # the fit stops at the first order with a smaller error
+MAX_ERROR_PX = 0.01  # a larger error gives a warning
+# Points along each side of the field that the polynomials are fitted to; checked at three times as many.
+GRID_SIDE = 41
+MARGIN = 0.02  # the fit extends beyond the chip's edges by this fraction of its sides
 
 Coefficients = dict[tuple[int, int], float]
 
@@ -30,11 +31,11 @@ class Sip:
     Attributes
     ----------
     a, b
-        From distorted pixel offsets u, v to what is added to get the undistorted offsets
+        Polynomials of the distorted pixel offsets (u, v): what to add to get the undistorted offsets
     ap, bp
         The inverse, which is Brown's law (1971) itself, a polynomial of at most seventh order
     worst_px
-        The greatest error of a and b on the chip
+        Greatest error of a and b on the chip
     """
 
     a: Coefficients
@@ -47,13 +48,14 @@ class Sip:
 def header(camera: CameraConfig, cam_from_icrs: Rotation) -> dict[str, Any]:
     """TAN-SIP header (TAN without distortion) of the true pointing (Calabretta & Greisen 2002; Shupe et al. 2005).
 
-    CD carries pixel offsets to degrees east (xi) and north (eta) of the tangent point; rows of the attitude
-    matrix are the camera's axes in the ICRS, so its products with the local east and north are the CD's columns.
-    Axes are the ICRS's; directions are apparent, aberration included (`sky.apparent`).
+    CD converts pixel offsets to degrees east (xi) and north (eta) of the tangent point. The rows of the attitude
+    matrix are the camera's axes in the ICRS, so CD's columns are their products with the local east and north.
+    The axes are those of the ICRS; directions are apparent, aberration included (`sky.apparent`).
     """
     right, down, boresight = cam_from_icrs.as_matrix()
     ra = np.arctan2(boresight[1], boresight[0])
     dec = np.arcsin(np.clip(boresight[2], -1, 1))
+    # Unit vectors to the east and to the north at the tangent point.
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
     north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
     scale = np.degrees(1 / camera.focal_px)
@@ -77,7 +79,7 @@ def header(camera: CameraConfig, cam_from_icrs: Rotation) -> dict[str, Any]:
 
 
 def keywords(distortion: Sip) -> dict[str, Any]:
-    """The polynomials as FITS keywords, with SIPERR (not in the standard), their greatest error in pixels."""
+    """The polynomials as FITS keywords, and their greatest error in pixels as SIPERR (not in the standard)."""
     cards: dict[str, Any] = {"SIPERR": distortion.worst_px}
     for name in ("A", "B", "AP", "BP"):
         table: Coefficients = getattr(distortion, name.lower())
@@ -87,7 +89,7 @@ def keywords(distortion: Sip) -> dict[str, Any]:
 
 
 def accuracy_warning(camera: CameraConfig) -> str:
-    """A warning if the WCS of this camera's frames is inaccurate; else empty."""
+    """A warning if the WCS of this camera's frames is inaccurate; otherwise an empty string."""
     distortion = fit_sip(camera)
     if distortion is None or distortion.worst_px <= MAX_ERROR_PX:
         return ""
@@ -101,20 +103,24 @@ def accuracy_warning(camera: CameraConfig) -> str:
 def fit_sip(camera: CameraConfig) -> Sip | None:
     """The camera's distortion as SIP; None without distortion, or if distortion keeps all light off the chip.
 
-    Polynomials of increasing order are fitted until one is within TARGET_ERROR_PX, else the most accurate is taken.
-    The error is checked by a round trip on the chip: undistort by the polynomials, distort by the lens.
+    1. Make points on the chip and slightly beyond, without and with distortion; more of them for checks.
+    2. Fit polynomials of increasing order by least squares.
+    3. Check each by a round trip on the chip: undistort by the polynomials, distort by the lens.
+    4. Stop at the first order within TARGET_ERROR_PX; else take the most accurate.
     """
     if not any(camera.distortion):
         return None
+    # 1. Points for the fit and for the check.
     undistorted_px, distorted_px, on_chip = fit_grid(camera, GRID_SIDE)
     _, checked_px, checked_on_chip = fit_grid(camera, 3 * GRID_SIDE)
     chip_px = checked_px[checked_on_chip]
     if not on_chip.any():
         return None
-    # Offsets are scaled to 1, or the high powers would make the least squares ill-conditioned.
+    # Offsets are scaled to 1; high powers of pixels would make the least squares ill-conditioned.
     scale = np.abs(distorted_px).max()
     fits = []
     for order in range(2, MAX_ORDER + 1):
+        # 2. All powers p + q from 2 to the order.
         powers = [(p, n - p) for n in range(2, order + 1) for p in range(n, -1, -1)]
         solution = np.linalg.lstsq(
             monomials(distorted_px / scale, powers), undistorted_px - distorted_px, rcond=None
@@ -126,29 +132,36 @@ def fit_sip(camera: CameraConfig) -> Sip | None:
             }
             for column in solution.T
         )
+        # 3. Round trip.
         round_trip = distorted(chip_px + monomials(chip_px / scale, powers) @ solution, camera)
         fits.append(
             Sip(a, b, *brown(camera), float(np.linalg.norm(round_trip - chip_px, axis=1).max()))
         )
+        # 4.
         if fits[-1].worst_px <= TARGET_ERROR_PX:
             break
     return min(fits, key=lambda fit: fit.worst_px)
 
 
 def monomials(xy: Floats, powers: list[tuple[int, int]]) -> Floats:
-    """(N, len(powers)) x^p y^q."""
+    """(N, len(powers)) values of x^p y^q at (N, 2) points."""
     x, y = (np.vander(side, MAX_ORDER + 1, increasing=True) for side in xy.T)
     return np.column_stack([x[:, p] * y[:, q] for p, q in powers])
 
 
 def fit_grid(camera: CameraConfig, side: int) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Offsets (N, 2) from the principal point, px, without and with distortion; (N,) which are on the chip.
+    """A grid of image points with their places without distortion.
 
-    The others are slightly beyond its edges, so that the fit does not extrapolate at an edge.
+    Returns
+    -------
+    tuple
+        (N, 2) offsets from the principal point in px without distortion, the same with distortion, and (N,) which
+        points are on the chip. The others are slightly beyond its edges, so that the fit does not extrapolate there.
     """
     center = np.array(camera.center_px)
     size = np.array([camera.width_px, camera.height_px])
     corner = camera.focal_px * np.tan(Optics.from_camera(camera).field_rad)
+    # Barrel distortion draws points in, so the undistorted grid must be wider than the chip.
     widening = max(corner / camera.corner_px, 1.0) * (1 + 2 * MARGIN)
     edges = np.array([-0.5 - center, size - 0.5 - center])
     low, high = edges * np.where((edges < 0) == [[True], [False]], widening, 1 / widening)
@@ -158,6 +171,7 @@ def fit_grid(camera: CameraConfig, side: int) -> tuple[Floats, Floats, NDArray[n
     pixels = distorted_px + center
 
     def inside(out: float) -> NDArray[np.bool_]:
+        # Distorted pixels within the chip and a fraction `out` of its sides.
         return np.asarray(
             ((pixels >= -0.5 - out * size) & (pixels <= size - 0.5 + out * size)).all(axis=1)
         )
@@ -177,9 +191,10 @@ def distorted(undistorted_px: Floats, camera: CameraConfig) -> Floats:
 
 
 def brown(camera: CameraConfig) -> tuple[Coefficients, Coefficients]:
-    """Brown's distortion as polynomials in the undistorted offsets, multiplied out.
+    """Brown's distortion as polynomials in the undistorted offsets U, V in pixels.
 
-    x (k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (3 x^2 + y^2), y likewise, with x = U / focal; r^2n by the binomial.
+    x (k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (3 x^2 + y^2), y likewise, with x = U / focal. Powers of r^2 = x^2 +
+    y^2 are multiplied out by the binomial theorem.
     """
     k1, k2, p1, p2, k3 = camera.distortion
     binomials = {1: (1, 1), 2: (1, 2, 1), 3: (1, 3, 3, 1)}
@@ -191,6 +206,8 @@ def brown(camera: CameraConfig) -> tuple[Coefficients, Coefficients]:
             q = 2 * m
             across[p + 1, q] = k * times
             down[p, q + 1] = k * times
+    # From tangents to pixels: a term of degree p + q is divided by focal^(p + q) and multiplied by
+    # focal.
     focal = camera.focal_px
     return tuple(  # type: ignore[return-value]
         {(p, q): value * focal ** (1 - p - q) for (p, q), value in table.items() if value}

@@ -1,4 +1,4 @@
-"""The air over a site at a time: what it does to the directions and the light of stars and bodies."""
+"""The air over a site at a time: refraction, extinction, scintillation and seeing of stars and bodies."""
 
 from __future__ import annotations
 
@@ -26,7 +26,19 @@ from skysim.sources.refraction import (
     standard_temperature_c,
 )
 
-# How much stars twinkle, for any aperture and exposure, in weak turbulence.
+# Scintillation, for any aperture and exposure, in weak turbulence. A layer of the strength Cn^2 dz at the distance z
+# along the ray gives a star's light the power spectrum
+#
+#     S(f) = 1.534 lambda^-2 f^(-11/3) sin^2(pi lambda z f^2) Cn^2 dz
+#
+# over the spatial frequencies f. An aperture D averages it by (2 J1(pi D f) / (pi D f))^2, and an exposure t, in which
+# the wind V carries the pattern past, by sinc^2(f_x V t), whose mean over the directions of f is 2 (int J0 - J1) / x,
+# with the integral from 0 to x = 2 pi f V t. The variance is the integral over frequencies and layers. Its limits are
+#
+#     19.12 lambda^(-7/6) X^(11/6) int Cn^2 h^(5/6) dh           a point, an instant (Rytov)
+#     10.66 D^(-4/3) t^-1 X^3 int Cn^2 h^2 / V dh                a wide aperture, a long exposure (Young)
+#
+# at the air mass X. Sources: Roddier 1981, Progress in Optics 19, 281, section 8; Dravins et al. 1998, PASP 110, 610.
 
 
 SPECTRUM = 1.534  # 4 x 0.3834
@@ -35,10 +47,11 @@ YOUNG_M_S = 10e-6  # of the variance at D = 1 m, t = 1 s, m^(4/3) s
 C_Y = 1.56  # median of the sites in Osborn et al. (2015)
 SCALE_HEIGHT_M = 8000.0  # of the turbulence in Young's law
 TOP_M = 25_000.0
-# within 0.3 % of finer ones
+# Numbers of layers and frequencies: within 0.3 % of finer ones.
 LAYERS = 20
 FREQUENCIES = 300
 FREQUENCY_1_M = 1e-2, 3e3  # lowest and highest
+# Nodes of the table.
 AIR_MASSES = np.geomspace(1.0, 40.0, 12)
 EXPOSURES_S = np.geomspace(1e-5, 1e2, 22)
 
@@ -46,45 +59,47 @@ EXPOSURES_S = np.geomspace(1e-5, 1e2, 22)
 def variance(
     air_masses: Floats, aperture_m: float, exposure_s: float, height_m: float, wavelength_m: float
 ) -> Floats:
-    """(N,) relative variances of stars' light at these air masses, from a site at a height."""
+    """(N,) relative variances of stars' light at these air masses, seen from a site at a height above the sea."""
     spline = variance_table(aperture_m, height_m, wavelength_m)
     within_s = min(max(exposure_s, EXPOSURES_S[0]), EXPOSURES_S[-1])
     at_masses = spline.ev(np.log(np.clip(air_masses, 1.0, AIR_MASSES[-1])), np.log(within_s))
+    # Beyond the table's longest exposure the variance falls with its inverse.
     return np.asarray(np.exp(at_masses) * min(within_s / exposure_s, 1.0))
 
 
 @lru_cache(maxsize=8)
 def variance_table(aperture_m: float, height_m: float, wavelength_m: float) -> RectBivariateSpline:
-    """The logarithm of the variance against those of air mass and exposure.
+    """The logarithm of the variance as a spline in the logarithms of air mass and exposure.
 
-    The turbulence is scaled so that the limit of wide apertures and long exposures is Young's law, 10^-5 C_Y^2 D^(-4/3)
-    t^-1 X^3 exp(-2 h / 8 km) (Young 1967, AJ 72, 747; Osborn et al. 2015, MNRAS 452, 1707, equation 7).
+    1. Layers of the model atmosphere, scaled so that the limit of wide apertures and long exposures is Young's law,
+       10^-5 C_Y^2 D^(-4/3) t^-1 X^3 exp(-2 h / 8 km) (Young 1967, AJ 72, 747; Osborn et al. 2015, MNRAS 452, 1707,
+       equation 7).
+    2. The spectrum behind the aperture, integrated as S(f) 2 pi f df in even steps of ln f.
+    3. Its sum over layers and frequencies, each weighted with the filter of the exposure.
     """
+    # 1.
     above_m, strength = layers(height_m)
     wind_m_s = wind(height_m + above_m)
     scale = YOUNG_M_S * C_Y**2 * np.exp(-2 * height_m / SCALE_HEIGHT_M)
     scale /= YOUNG * float(np.sum(strength * above_m**2 / wind_m_s))
     f = np.geomspace(*FREQUENCY_1_M, FREQUENCIES)
-    # The integral of S(f) 2 pi f df in even steps of ln f.
-    density = (
-        SPECTRUM
-        * wavelength_m**-2
-        * f ** (-5 / 3)
-        * 2
-        * np.pi
-        * np.log(f[1] / f[0])
-        * airy(aperture_m * f) ** 2
-    )
+    # 2. f^(-5/3) is f^(-11/3) f df / d(ln f).
+    spectrum = SPECTRUM * wavelength_m**-2 * f ** (-5 / 3)
+    density = spectrum * 2 * np.pi * np.log(f[1] / f[0]) * airy(aperture_m * f) ** 2
     distance_m = AIR_MASSES[:, None] * above_m
     fresnel = np.sin(np.pi * wavelength_m * distance_m[..., None] * f**2) ** 2
     spectra = AIR_MASSES[:, None, None] * (scale * strength)[:, None] * fresnel * density
+    # 3. (air masses, exposures), as a product of matrices.
     moved = exposure_filter(EXPOSURES_S[:, None, None] * wind_m_s[:, None] * f)
     found = spectra.reshape(len(AIR_MASSES), -1) @ moved.reshape(len(EXPOSURES_S), -1).T
     return RectBivariateSpline(np.log(AIR_MASSES), np.log(EXPOSURES_S), np.log(found))
 
 
 def layers(height_m: float) -> tuple[Floats, Floats]:
-    """(L,) heights above a site, and Cn^2 dh of the layers there: a Gauss-Legendre rule in the root of the height."""
+    """(L,) heights above a site, and Cn^2 dh of the layers there: a Gauss-Legendre rule in the root of the height.
+
+    With h = top s^2, dh = 2 top s ds; the root puts more layers near the ground.
+    """
     x, weight = np.polynomial.legendre.leggauss(LAYERS)
     root = (1 + x) / 2
     above_m = TOP_M * root**2
@@ -101,37 +116,40 @@ def hufnagel_valley(sea_m: Floats, above_m: Floats) -> Floats:
 
 
 def wind(sea_m: Floats) -> Floats:
-    """Bufton's wind in m/s at heights above the sea, 5 on the ground (Andrews & Phillips 2005, section 12.2)."""
+    """Bufton's wind in m/s at heights above the sea; 5 on the ground (Andrews & Phillips 2005, section 12.2)."""
     return np.asarray(5 + 30 * np.exp(-(((sea_m - 9400) / 4800) ** 2)))
 
 
 def airy(x: Floats) -> Floats:
-    """2 J1(pi x) / (pi x)."""
+    """2 J1(pi x) / (pi x), the amplitude that a round aperture of x cycles across passes."""
     u = np.pi * np.maximum(x, 1e-9)
     return np.asarray(2 * special.j1(u) / u)
 
 
 def exposure_filter(turns: Floats) -> Floats:
-    """Mean of sinc^2(turns cos phi) over phi: 2 (∫ J0 - J1) / x, x = 2 pi turns."""
+    """Mean of sinc^2(turns cos phi) over phi: 2 (int J0 - J1) / x, x = 2 pi turns."""
     x = 2 * np.pi * np.maximum(turns, 1e-4)
     return np.asarray(2 * (special.itj0y0(x)[0] - special.j1(x)) / x)
 
 
 def factors(variances: Floats, rng: np.random.Generator) -> Floats:
-    """(N,) factors of stars' light with mean 1 and these variances, log-normal (Dravins et al. 1997, PASP 109, 173)."""
+    """(N,) factors of stars' light with mean 1 and these variances, log-normal (Dravins et al. 1997, PASP 109, 173).
+
+    exp(s g - s^2 / 2) with s^2 = ln(1 + variance) and g standard normal.
+    """
     log_variance = np.log1p(variances)
     return np.asarray(
         np.exp(np.sqrt(log_variance) * rng.standard_normal(len(variances)) - log_variance / 2)
     )
 
 
-# What the air takes from starlight: extinction.
+# Extinction: the light that the air absorbs and scatters.
 
 
 def air_mass(altitude_rad: Floats) -> Floats:
     """Air masses along the line of sight over that at the zenith: X = 1 / sin(h + 244 / (165 + 47 h^1.1)).
 
-    h is the apparent altitude in degrees; 38.75 on the horizon, which holds below it.
+    h is the apparent altitude in degrees. X is 38.75 on the horizon, and the same below it.
     Source: Pickering (2002), DIO 12, 20.
     """
     h_deg = np.degrees(np.maximum(altitude_rad, 0.0))
@@ -139,7 +157,7 @@ def air_mass(altitude_rad: Floats) -> Floats:
 
 
 def transmission(air_masses: Floats, extinction_mag: float | Floats) -> Floats:
-    """Bouguer's law: 10^(-0.4 k X) of the light passes X air masses."""
+    """Bouguer's law: the fraction 10^(-0.4 k X) of the light passes X air masses."""
     return np.asarray(10 ** (-0.4 * extinction_mag * air_masses))
 
 
@@ -150,13 +168,13 @@ class Air:
     Attributes
     ----------
     site
-        With a longitude
+        Place on the ground, with a longitude
     refraction
-        For its weather and the camera's band
+        Refraction for the site's weather and the camera's band
     star_id, b_v
         (N,) ascending numbers of the catalog's stars, and their colors
     wavelength_m
-        Of scintillation: the mean of a G2 star's photo-electrons
+        Wavelength of scintillation: the mean of a G2 star's photo-electrons
     """
 
     config: AirConfig
@@ -179,18 +197,24 @@ class Air:
         return Sky(self, time, topocentric_axes(time, self.site))
 
     def b_v_of(self, ids: NDArray[np.int64]) -> Floats:
-        """(M,) B-V of lights by their numbers: of the catalog's stars, and for all others the Sun's."""
+        """(M,) B-V of lights by their numbers; lights that are no star of the catalog have the Sun's."""
         row = np.minimum(np.searchsorted(self.star_id, ids), len(self.star_id) - 1)
         return np.where(self.star_id[row] == ids, self.b_v[row], SUN[0])
 
     def extinction_mag(self, b_v: float | Floats) -> float | Floats:
-        """k' + k'' (B-V): magnitudes for each air mass."""
+        """Magnitudes of extinction per air mass: k' + k'' (B-V)."""
         return self.config.extinction_mag + self.config.color_extinction_mag * b_v
 
 
 @dataclass(frozen=True, slots=True)
 class Sky:
-    """The air at a time. axes: (3, 3) rows north, east and zenith of the site in ICRS axes."""
+    """The air at a time.
+
+    Attributes
+    ----------
+    axes
+        (3, 3) rows north, east and zenith of the site in ICRS axes
+    """
 
     air: Air
     time: datetime.datetime
@@ -215,7 +239,7 @@ class Sky:
         return np.asarray(up < np.sin(limit_rad))
 
     def points_seen(self, lights: Sources) -> Sources:
-        """Lights at infinity raised and dimmed, in their order; their motion is as without air."""
+        """Lights at infinity, raised by refraction and dimmed by extinction, in their order; motions are unchanged."""
         b_v = self.air.b_v_of(lights.id)
         directions = self.air.refraction.apparent(lights.place[:, :3], self.zenith)
         passed = transmission(self.air_mass(directions), self.air.extinction_mag(b_v))
@@ -225,24 +249,29 @@ class Sky:
     def twinkling(
         self, seen: Sources, aperture_m: float, exposure_s: float, rng: np.random.Generator
     ) -> Sources:
-        """The stars of `points_seen` with the scintillation of one exposure through an aperture of this diameter."""
+        """The stars of `points_seen` with the scintillation of one exposure through an aperture of this diameter.
+
+        Each star's light is multiplied by a random factor of mean 1.
+        """
         air_masses = self.air_mass(seen.place[:, :3])
         optics = aperture_m, exposure_s, self.air.site.height_m, self.air.wavelength_m
         variances = variance(air_masses, *optics)
         return replace(seen, strength=seen.strength * factors(variances, rng))
 
     def body_seen(self, body: BodyLight) -> BodyLight:
-        """A body raised and dimmed; its disc stays round, and does not twinkle."""
+        """A body raised by refraction and dimmed by extinction; its disc stays round and does not twinkle."""
         direction = self.air.refraction.apparent(body.place.direction[None], self.zenith)[0]
+        # The bright limb stays perpendicular to the new direction.
         along = body.place.toward_sun - (body.place.toward_sun @ direction) * direction
         place = body.place._replace(direction=direction, toward_sun=along / np.linalg.norm(along))
+        # The body's color: the Sun's, and the ratio of its albedos.
         blue, visual = ALBEDO[body.name][:2]
         b_v = SUN[0] - 2.5 * np.log10(blue / visual)
         passed = transmission(self.air_mass(direction[None]), self.air.extinction_mag(b_v))
         return replace(body, place=place, flux_e_s_m2=body.flux_e_s_m2 * float(passed[0]))
 
     def seeing_px(self, boresight: Floats, focal_px: float) -> float:
-        """Standard deviation of the seeing at the boresight: that at the zenith times X^0.6 (Fried 1966)."""
+        """Standard deviation of the seeing at the boresight in pixels: that at the zenith times X^0.6 (Fried 1966)."""
         at_zenith_px = self.air.config.seeing_px(focal_px)
         return at_zenith_px and at_zenith_px * float(self.air_mass(boresight[None])[0] ** 0.6)
 
@@ -251,17 +280,18 @@ class Sky:
 def topocentric_axes(time: datetime.datetime, site: SiteConfig) -> Floats:
     """(3, 3) rows north, east and the ellipsoid's zenith at a site, in ICRS axes at a time.
 
-    Earth rotation angle of UT1, precession and nutation of IAU 2006/2000A, as in `observer.site_in_gcrs`. Polar motion
-    (0.3") and the deflection of the vertical (some arcseconds) are neglected: they move the zenith, and so change a
+    Earth rotation angle of UT1, precession and nutation of IAU 2006/2000A, as in `ephemeris.site_in_gcrs`. Polar motion
+    (0.3") and the deflection of the vertical (some arcseconds) are neglected: they move the zenith, and so change the
     refraction by less than 0.01".
     """
-    assert site.longitude_deg is not None  # checked in scene.py
+    assert site.longitude_deg is not None  # the scene's validation requires it
     longitude, latitude = np.radians([site.longitude_deg, site.latitude_deg])
     sidereal = longitude + erfa.era00(ut1_jd(time), 0.0)
     sin_l = np.sin(sidereal)
     cos_l = np.cos(sidereal)
     sin_b = np.sin(latitude)
     cos_b = np.cos(latitude)
+    # North, east and zenith at the site in axes of the intermediate equator.
     in_cirs = [
         [-sin_b * cos_l, -sin_b * sin_l, cos_b],
         [-sin_l, cos_l, 0.0],
@@ -271,7 +301,7 @@ def topocentric_axes(time: datetime.datetime, site: SiteConfig) -> Floats:
 
 
 def horizon_rad(config: HorizonConfig | None, azimuth_rad: Floats) -> Floats:
-    """(N,) altitude of the skyline at azimuths, linear between the rows of its table and across north."""
+    """(N,) altitudes of the skyline at azimuths, linear between the rows of its table and across north."""
     if config is None:
         return np.zeros(len(azimuth_rad))
     table_rad = np.radians(config.azimuth_deg)
@@ -281,7 +311,7 @@ def horizon_rad(config: HorizonConfig | None, azimuth_rad: Floats) -> Floats:
 
 
 def weather_of(config: AirConfig, site: SiteConfig, band: Band) -> Weather:
-    """The weather at a site: what the section says, else the standard atmosphere."""
+    """The weather at a site: that of the scene's section, with the standard atmosphere for what it leaves out."""
     pressure_hpa = config.pressure_hpa
     temperature_c = config.temperature_c
     return Weather(
@@ -295,10 +325,8 @@ def weather_of(config: AirConfig, site: SiteConfig, band: Band) -> Weather:
 
 
 def mean_wavelength_m(band: Band) -> float:
-    """Mean wavelength of a G2 star's photo-electrons."""
+    """Mean wavelength of a G2 star's photo-electrons: int lambda n R d lambda / int n R d lambda."""
     sun_k = temperature_k(*SUN)
     total = band.integral(lambda wavelength_m: black_body_v0(wavelength_m, sun_k))
-    return float(
-        band.integral(lambda wavelength_m: wavelength_m * black_body_v0(wavelength_m, sun_k))
-        / total
-    )
+    weighted = band.integral(lambda wavelength_m: wavelength_m * black_body_v0(wavelength_m, sun_k))
+    return float(weighted / total)

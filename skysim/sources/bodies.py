@@ -22,17 +22,14 @@ from skysim.sources.body_discs import (
 from skysim.sources.ephemeris import ObserverPlace, Place, place
 from skysim.sources.photometry import SUN, Band, black_body_v0, chromatic_moments, temperature_k
 
-# Photo-electrons of reflected sunlight, by the albedo of a body at four wavelengths.
+# Reflected sunlight in photo-electrons, by the albedo of a body at four wavelengths. A planet is no star: methane makes
+# Uranus brightest in blue and dark beyond 700 nm, a color that no black body has.
 
 
 Albedo = tuple[float, float, float, float]
 
-BANDS_M = (
-    438e-9,
-    545e-9,
-    641e-9,
-    798e-9,
-)  # effective wavelengths of B, V, Cousins' R and I (Bessell 2005, ARA&A 43, 293)
+# Effective wavelengths of B, V, Cousins' R and I (Bessell 2005, ARA&A 43, 293).
+BANDS_M = (438e-9, 545e-9, 641e-9, 798e-9)
 WHITE: Albedo = (1.0, 1.0, 1.0, 1.0)
 # Planets: geometric albedos of Mallama, Krobusek & Pavlov 2017, Icarus 282, 19 (arXiv:1609.05048), table 7. The Moon,
 # relative to V: Kieffer & Stone 2005, AJ 129, 2887, equation 10 and table 4 at a phase angle of 45 degrees without
@@ -51,21 +48,22 @@ ALBEDO: dict[str, Albedo] = {
 
 
 def reflected_flux_e_s_m2(v_mag: float, albedo: Albedo, band: Band) -> float:
-    """Photo-electrons s^-1 m^-2 of a body of this V magnitude: 10^(-0.4 V) ∫ n(λ) p(λ) / p(V) QE(λ) dλ.
+    """Photo-electrons s^-1 m^-2 of a body of this V magnitude: 10^(-0.4 V) int n(l) p(l) / p(V) R(l) dl.
 
-    n is the photon flux of a star like the Sun of V = 0, p the albedo, linear between the four bands and constant
-    beyond them.
+    n is the photon flux of a star like the Sun of V = 0 at the wavelength l, R the band's response, and p the albedo,
+    linear between the four bands and constant beyond them.
     """
     return float(_flux_v0_e_s_m2(albedo, band) * 10 ** (-0.4 * v_mag))
 
 
 @lru_cache(maxsize=64)
 def _flux_v0_e_s_m2(albedo: Albedo, band: Band) -> float:
+    """`reflected_flux_e_s_m2` for V = 0."""
     return float(band.integral(lambda wavelength_m: reflected_v0(wavelength_m, albedo)))
 
 
 def reflected_v0(wavelength_m: Floats, albedo: Albedo) -> Floats:
-    """Spectral photon flux of a body of V = 0, as `black_body_v0`."""
+    """Spectral photon flux of a body of V = 0, in the units of `black_body_v0`."""
     relative = np.array(albedo) / albedo[1]
     return np.asarray(
         black_body_v0(wavelength_m, temperature_k(*SUN))
@@ -81,13 +79,25 @@ def reflected_chromatic(albedo: Albedo, band: Band) -> Floats | None:
     return chromatic_moments(band, lambda wavelength_m: reflected_v0(wavelength_m, albedo))
 
 
+# Bodies of the solar system as light sources: points, or discs of many points.
+
+
 ID_BASE = 9_000_000  # a body's number is this + NAIF's
 
 
 class Body(NamedTuple):
-    """Properties of a body: NAIF's number, mean radius, and how its surface scatters.
+    """Properties of a body.
 
     Radii: IAU WGCCRE 2015 (Archinal et al. 2018, Celest. Mech. 130, 22), the Sun's IAU 2015 B3.
+
+    Attributes
+    ----------
+    naif
+        NAIF's number of the body
+    radius_km
+        Mean radius
+    law
+        Law of its surface's brightness, see `body_discs.brightness`
     """
 
     naif: int
@@ -120,11 +130,11 @@ class BodyLight:
     Attributes
     ----------
     radius_rad
-        Of its disc
+        Angular radius of the disc
     flux_e_s_m2
-        photo-electrons at the aperture
+        Photo-electrons s^-1 m^-2 at the aperture
     earthshine
-        See `Surface`
+        As in `DiscSurface`
     chromatic
         (4,) a row of `Sources.chromatic`
     """
@@ -143,7 +153,7 @@ class BodyLight:
 
     @property
     def title(self) -> str:
-        """Its name in a sentence."""
+        """The body's name within a sentence."""
         return {"sun": "the Sun", "moon": "the Moon"}.get(self.name, self.name.capitalize())
 
     @property
@@ -151,7 +161,7 @@ class BodyLight:
         return DiscSurface(BODIES[self.name].law, self.place.phase_rad, self.earthshine)
 
     def truth(self) -> BodyTruth:
-        """What a frame's truth says of the body."""
+        """The body's row in a frame's truth."""
         x, y, z = self.place.direction
         ra_deg = np.degrees(np.arctan2(y, x)) % 360
         dec_deg = np.degrees(np.arcsin(z))
@@ -161,7 +171,7 @@ class BodyLight:
         return BodyTruth(self.id, self.name, *numbers)
 
     def directions(self, xy: Floats) -> Floats:
-        """(M, 3) unit vectors toward points (M, 2) of the disc, in units of its radius."""
+        """(M, 3) unit vectors toward points (M, 2) of the disc, whose x points to the Sun, in units of its radius."""
         x_axis = self.place.toward_sun
         center = self.place.direction
         offset = xy @ np.stack([x_axis, np.cross(center, x_axis)])
@@ -169,17 +179,17 @@ class BodyLight:
         return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
     def overlaps(self, other: BodyLight) -> bool:
-        """Whether two discs overlap."""
+        """Whether the disc overlaps another body's disc."""
         cosine = float(self.place.direction @ other.place.direction)
         return cosine > np.cos(self.radius_rad + other.radius_rad)
 
     def hides(self, directions: Floats) -> NDArray[np.bool_]:
-        """(M,) which of these unit vectors (M, 3) lie behind the disc."""
+        """(M,) which of the unit vectors (M, 3) point to the disc, so that what is behind it is hidden."""
         return directions @ self.place.direction > np.cos(self.radius_rad)
 
 
 def bodies_from(config: BodiesConfig, observer: ObserverPlace, band: Band) -> list[BodyLight]:
-    """The chosen bodies as an observer sees them, the farthest first."""
+    """The chosen bodies as an observer sees them, the farthest first, so that nearer ones are drawn over them."""
     lights = [
         body_light(name, place(name, observer), observer.tt_jd, band) for name in chosen(config)
     ]

@@ -1,4 +1,9 @@
-"""Sunlight from the Moon and the planets: V magnitudes by phase, and how a disc's brightness is distributed."""
+"""Sunlight from the Moon and the planets: V magnitudes by phase, and how brightness is distributed over a disc.
+
+The disc's plane is spanned by x, toward the Sun (the bright limb), and y; its rim is the unit circle. At (x, y) the
+cosine of the emission angle is mu = sqrt(1 - x^2 - y^2), and at a phase angle a that of the incidence angle is
+mu0 = x sin a + mu cos a; the terminator, mu0 = 0, is half an ellipse of semi-axes 1 and |cos a|.
+"""
 
 from __future__ import annotations
 
@@ -16,32 +21,25 @@ from skysim.core.time import J2000_JD
 from skysim.core.types import Floats
 from skysim.sources.ephemeris import Place
 
-# laws of `brightness`
+# Laws of `brightness`.
 LIMB_DARKENED = 0
 LOMMEL_SEELIGER = 1
 LAMBERT = 2
 ACROSS = 12  # elements on the diameter of a small disc
 SAMPLES = 16  # points across an element at which the brightness is sampled
-RIM = 20  # cells within the rim in which the mean over a cell matters
-PHASE_STEP_DEG = (
-    0.05  # phases of small discs are rounded to this, so that frames share their elements
-)
+RIM = 20  # number of cells next to the rim in which the mean over a cell matters
+# Phases of small discs are rounded to this, so that frames share their elements.
+PHASE_STEP_DEG = 0.05
 
 
 @jit
 def brightness(law: int, mu: float, mu0: float) -> float:
-    """Relative brightness of a surface.
+    """Relative brightness of a surface by one of three laws.
 
-    Returns
-    -------
-    LIMB_DARKENED
-        The Sun at 550 nm: 0.30 + 0.93 mu - 0.23 mu^2 (Cox 2000, Allen's Astrophysical
-        Quantities)
-    LOMMEL_SEELIGER
-        A dark rough surface, in which light is scattered once: mu0 / (mu0 + mu) (Hapke 1981,
-        JGR 86, 3039). The full disc is uniform, as the full Moon's is; the maria are left out.
-    LAMBERT
-        A bright cloud deck, in which light is scattered many times: mu0
+    LIMB_DARKENED: the Sun at 550 nm, 0.30 + 0.93 mu - 0.23 mu^2 (Cox 2000, Allen's Astrophysical Quantities).
+    LOMMEL_SEELIGER: a dark rough surface, in which light is scattered once, mu0 / (mu0 + mu) (Hapke 1981, JGR 86,
+    3039); the full disc is uniform, as the full Moon's is; the maria are left out.
+    LAMBERT: a bright cloud deck, in which light is scattered many times, mu0.
     """
     if law == LIMB_DARKENED:
         return 0.30 + 0.93 * mu - 0.23 * mu**2
@@ -56,9 +54,11 @@ class DiscSurface(NamedTuple):
     Attributes
     ----------
     law
-        Of `brightness`
+        Law of `brightness`
+    phase_rad
+        Phase angle
     earthshine
-        Light of the disc as lit from the observer's side, over that of the sunlit one
+        Light of the disc as lit from the observer's side, over that of the sunlit disc
     """
 
     law: int
@@ -67,14 +67,12 @@ class DiscSurface(NamedTuple):
 
 
 def light_map(surface: DiscSurface, axis: Floats) -> Floats:
-    """Shares of the disc's light at the points of a square lattice that covers it; they add up to 1.
-
-    Returns (n, n), [y, x].
+    """Fractions of the disc's light at the points of a square lattice that covers it, (n, n), [y, x]; their sum is 1.
 
     Parameters
     ----------
     axis
-        (n,) the lattice's even coordinates in both directions, in units of the disc's radius
+        (n,) evenly spaced coordinates of the lattice in both directions, in units of the disc's radius
     """
     sunlit, earthlit = np.zeros((2, len(axis), len(axis)))
     _fill(sunlit, earthlit, surface.law, surface.phase_rad, axis)
@@ -87,7 +85,7 @@ def light_map(surface: DiscSurface, axis: Floats) -> Floats:
 
 @jit
 def _fill(sunlit: Any, earthlit: Any, law: int, phase_rad: float, axis: Floats) -> None:
-    """Light of each point's cell, lit from the Sun and from the observer."""
+    """Write the light of each point's cell, lit from the Sun and from the observer."""
     sine = sin(phase_rad)
     cosine = cos(phase_rad)
     step = axis[1] - axis[0]
@@ -101,7 +99,7 @@ def _fill(sunlit: Any, earthlit: Any, law: int, phase_rad: float, axis: Floats) 
 
 @jit
 def inner_radius2(step: float) -> float:
-    """Square of the radius within which the brightness at a cell's center is its mean."""
+    """Square of the radius up to which the brightness at a cell's center is taken for its mean."""
     return max(1 - RIM * step, 0.0) ** 2
 
 
@@ -109,11 +107,12 @@ def inner_radius2(step: float) -> float:
 def cell_light(
     law: int, sine: float, cosine: float, x: float, y: float, step: float, inner: float
 ) -> tuple[float, float]:
-    """Brightness at (x, y) times the part of a cell of width `step` that is on the disc, lit from the Sun and from the
-    observer, at a phase angle with this sine and cosine.
+    """Light of a cell of width `step` at (x, y): its mean brightness times its part on the disc.
 
     Near the rim mu varies as a square root: the mean of mu over the cell's radial extent on the disc, from m1 inside
     to m2, is 2/3 (m1^2 + m1 m2 + m2^2) / (m1 + m2), as mu^2 is linear in the radius there.
+
+    Returns the light for the Sun at the phase angle with this sine and cosine, and for a light at the observer.
     """
     rho2 = x * x + y * y
     if rho2 > (1 + step / 2) ** 2:
@@ -121,35 +120,36 @@ def cell_light(
     covered = 1.0
     inward = 1.0
     mu = 0.0
+    # Away from the rim the center's brightness is the mean.
     if rho2 < inner:
         mu = sqrt(1 - rho2)
     else:
+        # At the rim: the part of the cell on the disc, the mean of mu, and the center of that part.
         rho = sqrt(rho2)
         covered = min(max(0.5 + (1 - rho) / step, 0.0), 1.0)
         m1 = sqrt(max(1 - max(rho - step / 2, 0.0) ** 2, 0.0))
         m2 = sqrt(max(1 - (rho + step / 2) ** 2, 0.0))
         mu = 2 / 3 * (m1 * m1 + m1 * m2 + m2 * m2) / (m1 + m2) if m1 > 0 else 0.0
         inward = 1.0 if covered == 1 else (1 + rho - step / 2) / (2 * rho)
-    return covered * brightness(law, mu, inward * x * sine + mu * cosine), covered * brightness(
-        law, mu, mu
-    )
+    mu0 = inward * x * sine + mu * cosine
+    return covered * brightness(law, mu, mu0), covered * brightness(law, mu, mu)
 
 
 class DiscElements(NamedTuple):
-    """M elements of a disc: (M, 2) centers of light in units of its radius, (M,) shares of the light."""
+    """M elements of a disc: centers of light (M, 2) in units of its radius, and fractions of the light (M,)."""
 
     xy: Floats
     share: Floats
 
     def merged(self) -> DiscElements:
-        """All light at its center."""
+        """One element with all light, at the center of light."""
         return DiscElements((self.share @ self.xy)[None], np.array([self.share.sum()]))
 
 
 def disc_elements(surface: DiscSurface) -> DiscElements:
-    """A small disc as elements on a square lattice, ACROSS on its diameter; dark ones are left out.
+    """A small disc as elements on a square lattice, ACROSS on its diameter, without the dark ones.
 
-    An element has the light of its cell and lies at the center of that light.
+    An element has the light of its cell and is at the center of that light. Phase and earthshine are rounded.
     """
     phase_steps = round(np.degrees(surface.phase_rad) / PHASE_STEP_DEG)
     return _elements(surface.law, phase_steps, float(f"{surface.earthshine:.2g}"))
@@ -157,44 +157,46 @@ def disc_elements(surface: DiscSurface) -> DiscElements:
 
 @lru_cache(maxsize=32)
 def _elements(law: int, phase_steps: int, earthshine: float) -> DiscElements:
+    """`disc_elements` for a phase angle in steps of PHASE_STEP_DEG; cached."""
     fine = ACROSS * SAMPLES
     axis = np.asarray((np.arange(fine) + 0.5) * (2 / fine) - 1, float)
-    light = light_map(
-        DiscSurface(law, float(np.radians(phase_steps * PHASE_STEP_DEG)), earthshine), axis
-    )
+    phase_rad = float(np.radians(phase_steps * PHASE_STEP_DEG))
+    light = light_map(DiscSurface(law, phase_rad, earthshine), axis)
+    # Light and its first moments in each element.
     cells = (ACROSS, SAMPLES, ACROSS, SAMPLES)
     weighted = (light, light * axis, light * axis[:, None])
     share, share_x, share_y = (one.reshape(cells).sum(axis=(1, 3)).ravel() for one in weighted)
     lit = share > 0
-    return DiscElements(
-        np.column_stack([share_x[lit], share_y[lit]]) / share[lit, None], share[lit]
-    )
+    center = np.column_stack([share_x[lit], share_y[lit]]) / share[lit, None]
+    return DiscElements(center, share[lit])
 
 
-# V magnitudes of the Sun, the Moon and the planets by distance and phase.
+# V magnitudes. A body at r au from the Sun and d au from the observer, at a phase angle of a degrees, has
+#
+#     V = 5 log10(r d) + V(1, 0) + f(a).
+#
+# The planets' polynomials are those of the Astronomical Almanac: Mallama & Hilton 2018, Astronomy and Computing 25, 10
+# (arXiv:1808.01973). The rotation of Mars (0.06 mag) is left out.
 
 
 MOON_KM = 384400.0  # mean distance
 FULL_MOON_MAG = -12.73  # at this distance, the Sun at 1 au
-EARTH = (-3.99, -1.060e-3, 2.054e-4)
-POLES_DEG = {
-    "saturn": (40.589, 83.537),
-    "uranus": (257.311, -15.175),
-}  # right ascension, declination (IAU WGCCRE 2015)
+EARTH = (-3.99, -1.060e-3, 2.054e-4)  # polynomial of the Earth as a planet
+# Right ascension and declination of the planets' poles (IAU WGCCRE 2015).
+POLES_DEG = {"saturn": (40.589, 83.537), "uranus": (257.311, -15.175)}
 URANUS_FLATTENING = 0.0022927
 
 
 def magnitude(name: str, place: Place, tt_jd: float) -> float:
-    """V of a body above the atmosphere. Phase angles that the Earth never sees are extrapolated."""
+    """V of a body above the atmosphere. The laws are extrapolated to phase angles that the Earth never sees."""
     if name == "sun":
         return float(SUN_V_MAG + 5 * np.log10(place.distance_km / AU_KM))
     sun_au = place.sun_distance_km / AU_KM
     phase_deg = float(np.degrees(place.phase_rad))
     if name == "moon":
         return moon_magnitude(place.distance_km, sun_au, phase_deg)
-    return float(
-        5 * np.log10(sun_au * place.distance_km / AU_KM) + PLANETS[name](phase_deg, place, tt_jd)
-    )
+    at_1_au = PLANETS[name](phase_deg, place, tt_jd)
+    return float(5 * np.log10(sun_au * place.distance_km / AU_KM) + at_1_au)
 
 
 def moon_magnitude(distance_km: float, sun_au: float, phase_deg: float) -> float:
@@ -211,23 +213,22 @@ def moon_magnitude(distance_km: float, sun_au: float, phase_deg: float) -> float
 def earthshine_fraction(moon: Place) -> float:
     """Light of the earthlit Moon over that of the sunlit Moon.
 
-    The Earth, as bright from the Moon as its phase polynomial says at a phase angle of 180 degrees less the Moon's,
-    shines on the Moon from the observer's direction. So the earthlit Moon is a full Moon (phase angle 0) fainter by
-    the magnitude of the Earth less that of the Sun, both as seen from the Moon.
+    Seen from the Moon, the Earth's phase angle is 180 degrees less the Moon's. It shines on the Moon from the
+    observer's direction, so the earthlit Moon is a full Moon (phase angle 0), fainter by the magnitude of the Earth
+    less that of the Sun, both as seen from the Moon.
     """
     sun_au = moon.sun_distance_km / AU_KM
     moon_au = moon.distance_km / AU_KM
     phase_deg = float(np.degrees(moon.phase_rad))
     earth_mag = polynomial(180 - phase_deg, EARTH) + 5 * np.log10(moon_au * sun_au)
     fainter = earth_mag - (SUN_V_MAG + 5 * np.log10(sun_au))
-    full, sunlit = (
-        moon_magnitude(moon.distance_km, sun_au, angle_deg) for angle_deg in (0.0, phase_deg)
-    )
+    full = moon_magnitude(moon.distance_km, sun_au, 0.0)
+    sunlit = moon_magnitude(moon.distance_km, sun_au, phase_deg)
     return float(10 ** (-0.4 * (full + fainter - sunlit)))
 
 
 def polynomial(phase_deg: float, coefficients: tuple[float, ...]) -> float:
-    """The sum of c_k a^k."""
+    """The sum of c_k a^k of the phase angle a in degrees."""
     return float(sum(c * phase_deg**k for k, c in enumerate(coefficients)))
 
 
@@ -238,7 +239,7 @@ def mercury(phase_deg: float, _place: Place, _tt_jd: float) -> float:
 
 
 def venus(phase_deg: float, _place: Place, _tt_jd: float) -> float:
-    """Two polynomials: near inferior conjunction sunlight is scattered forward."""
+    """Two polynomials: near inferior conjunction the clouds scatter sunlight forward."""
     far = (-4.384, -1.044e-3, 3.687e-4, -2.814e-6, 8.938e-9)
     return polynomial(phase_deg, far if phase_deg < 163.7 else (236.05828, -2.81914, 8.39034e-3))
 
@@ -255,14 +256,17 @@ def jupiter(phase_deg: float, _place: Place, _tt_jd: float) -> float:
 
 
 def saturn(phase_deg: float, place: Place, _tt_jd: float) -> float:
-    """Globe and rings; b is the geometric mean of the latitudes of Sun and observer, 0 if the rings are seen unlit."""
+    """Globe and rings: -8.914 - 1.825 sin b + 0.026 a - 0.378 sin b exp(-2.25 a).
+
+    b is the geometric mean of the latitudes of Sun and observer, 0 if the rings are seen from their unlit side.
+    """
     to_sun, to_observer = latitudes_rad("saturn", place)
     tilt = math.sin(math.sqrt(max(to_sun * to_observer, 0.0)))
     return -8.914 - 1.825 * tilt + 0.026 * phase_deg - 0.378 * tilt * math.exp(-2.25 * phase_deg)
 
 
 def uranus(phase_deg: float, place: Place, _tt_jd: float) -> float:
-    """Fainter toward the equator; the latitudes are planetographic."""
+    """Fainter toward the equator, by the mean of the planetographic latitudes of Sun and observer."""
     latitudes_deg = np.degrees(
         np.arctan(np.tan(latitudes_rad("uranus", place)) / (1 - URANUS_FLATTENING) ** 2)
     )
@@ -271,7 +275,7 @@ def uranus(phase_deg: float, place: Place, _tt_jd: float) -> float:
 
 
 def neptune(phase_deg: float, _place: Place, tt_jd: float) -> float:
-    """It brightened from 1980 to 2000."""
+    """Neptune brightened from 1980 to 2000."""
     year = 2000 + (tt_jd - J2000_JD) / JULIAN_YEAR_DAY
     at_full = min(max(-6.89 - 0.0054 * (year - 1980), -7.0), -6.89)
     return at_full + (polynomial(phase_deg, (0.0, 7.944e-3, 9.617e-5)) if phase_deg > 1.9 else 0.0)

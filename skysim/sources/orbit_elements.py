@@ -1,8 +1,8 @@
-"""Mean elements of satellites from TLE and OMM files, and their places by SGP4.
+"""Orbits from files: mean elements (TLE, OMM) with places by SGP4, and orbit ephemerides (OEM).
 
 SGP4's theory and its constants (WGS 72) belong to the elements, which were fitted with it. Source: Hoots & Roehrich
 1980, Spacetrack Report No. 3; Vallado, Crawford, Hujsak & Kelso 2006, Revisiting Spacetrack Report #3 (AIAA 2006-6753),
-whose code the package `sgp4` compiles. Formats: CCSDS 502.0-B-3 (OMM).
+whose code the package `sgp4` compiles. Formats: CCSDS 502.0-B-2 and 502.0-B-3 (OMM, OEM).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from skysim.core.text import (
 from skysim.core.time import J2000_JD, SCALES, tt_jd, ut1_jd, utc_days
 from skysim.core.types import Floats
 
-MAX_SATELLITES = 100_000  # of a file
+MAX_SATELLITES = 100_000  # in a file
 REQUIRED = (
     "NORAD_CAT_ID",
     "EPOCH",
@@ -49,7 +49,7 @@ REQUIRED = (
     "MEAN_ANOMALY",
     "BSTAR",
 )
-# What SGP4 does not use: a message may lack it.
+# Fields that SGP4 does not use, with values for messages that lack them.
 OPTIONAL = {
     "CLASSIFICATION_TYPE": "U",
     "OBJECT_ID": "",
@@ -65,20 +65,26 @@ TLE_LENGTHS = 68, 69  # without and with the checksum
 
 
 class MeanElements(NamedTuple):
-    """N satellites: their catalog numbers, names, and SGP4's records."""
+    """Mean elements of N satellites: their catalog numbers, names, and SGP4's records."""
 
     numbers: tuple[int, ...]
     names: tuple[str, ...]
     records: tuple[Any, ...]
 
     def take(self, which: Iterable[int]) -> MeanElements:
-        """The chosen satellites."""
+        """The elements of the chosen satellites."""
         rows = list(which)
         return MeanElements(*(tuple(column[n] for n in rows) for column in self))  # type: ignore[arg-type]
 
 
 def read_elements(path: str) -> MeanElements:
-    """The satellites of a file, told by its content: TLE, or OMM as CSV, XML or JSON. Raises InputError."""
+    """The satellites of a file: TLE, or OMM as CSV, XML or JSON, recognized by its content.
+
+    Raises
+    ------
+    InputError
+        For a file that is none of these, or with more than MAX_SATELLITES.
+    """
     lines = read_lines(Path(path))
     if not lines:
         raise InputError(path, "empty", "a TLE or an OMM")
@@ -95,17 +101,20 @@ def read_elements(path: str) -> MeanElements:
 
 
 def read_tle(path: str, lines: list[tuple[int, str]]) -> Iterator[tuple[int, str, Any]]:
-    """Number, name and record of each pair of lines, before which its name may be. Raises InputError."""
+    """Yield number, name and record of each pair of lines; a line with the name may precede it. Raises InputError."""
+    # sgp4 is imported where it is used: few scenes have satellites.
     from sgp4.api import Satrec
 
     rest = iter(lines)
     for n, line in rest:
         name = ""
+        # A line that is not line 1 of a TLE is a name.
         if not line.startswith("1 ") or len(line) < TLE_LENGTHS[0]:
             name = line.removeprefix("0 ").strip()
             n, line = next(rest, (n, ""))
         second = next(rest, (n, ""))[1]
         pair = line[: TLE_LENGTHS[1]], second[: TLE_LENGTHS[1]]
+        # Both lines must be complete, and their checksums right if they have any.
         for begin, one in zip("12", pair, strict=True):
             if not one.startswith(f"{begin} ") or len(one) not in TLE_LENGTHS:
                 raise InputError(
@@ -125,12 +134,12 @@ def read_tle(path: str, lines: list[tuple[int, str]]) -> Iterator[tuple[int, str
 
 
 def checksum(line: str) -> str:
-    """The last character of a line of a TLE: the sum of its digits, a minus counting 1, modulo 10."""
+    """The last character of a line of a TLE: the sum of its digits modulo 10, where a minus counts 1."""
     return str(sum(int(c) if c.isdigit() and c.isascii() else c == "-" for c in line[:68]) % 10)
 
 
 def messages(path: str, text: str) -> Iterator[Mapping[str, Any]]:
-    """The keywords of each message of OMMs. Raises InputError."""
+    """Yield the keywords of each message of an OMM file in XML, JSON or CSV. Raises InputError."""
     from xml.etree import ElementTree
 
     try:
@@ -148,7 +157,7 @@ def messages(path: str, text: str) -> Iterator[Mapping[str, Any]]:
 
 
 def satellite(path: str, n: int, fields: Mapping[str, Any]) -> tuple[int, str, Any]:
-    """Number, name and record of the n-th message. Raises InputError."""
+    """Number, name and record of the n-th message of an OMM file. Raises InputError."""
     from sgp4 import omm
     from sgp4.api import Satrec
 
@@ -166,16 +175,16 @@ def satellite(path: str, n: int, fields: Mapping[str, Any]) -> tuple[int, str, A
             where=Where(path, n, "message"),
         )
     try:
-        omm.initialize(
-            record, {**OPTIONAL, **texts, "EPOCH": epoch if "." in epoch else f"{epoch}.0"}
-        )
+        # sgp4 reads epochs with a fraction of a second only.
+        full_epoch = epoch if "." in epoch else f"{epoch}.0"
+        omm.initialize(record, OPTIONAL | texts | {"EPOCH": full_epoch})
     except (ValueError, OverflowError) as error:
         raise InputError(path, excerpt(error), where=Where(path, n, "message")) from None
     return usable(path, n, texts.get("OBJECT_NAME", ""), record)
 
 
 def usable(path: str, n: int, name: str, record: Any) -> tuple[int, str, Any]:
-    """Number, name and record. Raises InputError for elements that SGP4 refuses at their own epoch."""
+    """Number, name and record of a satellite. Raises InputError for elements that SGP4 refuses at their own epoch."""
     from sgp4.api import SGP4_ERRORS
 
     error, place_km, _ = record.sgp4(record.jdsatepoch, record.jdsatepochF)
@@ -196,10 +205,16 @@ def age_days(elements: MeanElements, time: datetime.datetime) -> Floats:
 def gcrs_states(
     elements: MeanElements, time: datetime.datetime, after_s: Floats
 ) -> tuple[Floats, Floats, NDArray[np.int64]]:
-    """Positions (N, K, 3) in m and velocities in m/s in GCRS axes at K times after a time, and SGP4's errors (N, K)."""
+    """States of N satellites at K times after a time, by SGP4.
+
+    Returns
+    -------
+    tuple
+        (N, K, 3) positions in m and velocities in m/s in GCRS axes, and (N, K) error codes of SGP4
+    """
     from sgp4.api import SatrecArray
 
-    # In one number with the Julian date a satellite would be off by 0.3 m.
+    # Dates are in two numbers: in one with the Julian date a satellite would be off by 0.3 m.
     days = utc_days(time) + np.asarray(after_s, float) / DAY_S
     errors, place_km, velocity_km_s = SatrecArray(list(elements.records)).sgp4(
         np.full(len(days), J2000_JD), days
@@ -210,10 +225,10 @@ def gcrs_states(
 
 @lru_cache(maxsize=64)
 def gcrs_from_teme(time: datetime.datetime) -> Floats:
-    """(3, 3) matrix to GCRS axes from SGP4's true equator and mean equinox.
+    """(3, 3) matrix from SGP4's true equator and mean equinox (TEME) to GCRS axes.
 
-    TEME and the axes that turn with the Earth differ by Greenwich mean sidereal time of 1982 about the pole, and those
-    differ from the celestial intermediate system by the Earth rotation angle; the latter follows by precession and
+    TEME and the axes that rotate with the Earth differ by Greenwich mean sidereal time of 1982 about the pole. Those
+    axes differ from the celestial intermediate system by the Earth rotation angle; GCRS axes follow by precession and
     nutation of IAU 2006/2000A. Source: Vallado et al. 2006, appendix C; IERS Conventions 2010, chapter 5.
     """
     ut1 = ut1_jd(time)
@@ -221,14 +236,15 @@ def gcrs_from_teme(time: datetime.datetime) -> Floats:
     return np.asarray(erfa.c2i06a(tt_jd(time), 0.0).T @ erfa.rz(angle, np.eye(3)))
 
 
-# Positions and velocities from a CCSDS Orbit Ephemeris Message (OEM) in keyword = value notation.
+# OEM: segments of metadata (META_START ... META_STOP) and lines of an epoch, a position in km, a velocity in km/s and,
+# if present, an acceleration in km/s^2. Covariances are not used.
 
 
 VERSION = "CCSDS_OEM_VERS"
 VERSIONS = ("1.0", "2.0", "3.0")
 FRAMES = ("ICRF", "GCRF", "EME2000", "J2000")
 OEM_REQUIRED = ("CENTER_NAME", "REF_FRAME", "TIME_SYSTEM")
-SAME_M = 1.0  # of a sample that both of two adjoining segments have
+SAME_M = 1.0  # adjoining segments may share a sample; its positions then differ by less than this
 KEYWORDS = ("META_START", "META_STOP", "COVARIANCE_START", "COVARIANCE_STOP")
 
 
@@ -237,11 +253,12 @@ class OrbitEphemeris(NamedTuple):
 
     Attributes
     ----------
+    source
+        The file
     t_s
-        (N,) since the scene's start, strictly increasing
+        (N,) times since the scene's start, strictly increasing
     path
-        A polynomial of the fifth degree between two samples, of their positions, velocities and
-        accelerations
+        Polynomial of the fifth degree between two samples, from their positions, velocities and accelerations
     """
 
     source: str
@@ -249,7 +266,7 @@ class OrbitEphemeris(NamedTuple):
     path: BPoly
 
     def at(self, after_s: Floats) -> tuple[Floats, Floats]:
-        """Positions (K, 3) in m and velocities in m/s. Raises InputError outside the samples."""
+        """Positions (K, 3) in m and velocities in m/s at K times. Raises InputError outside the samples."""
         first, last = self.t_s[[0, -1]]
         if after_s.min() < first or after_s.max() > last:
             worst = after_s.min() if after_s.min() < first else after_s.max()
@@ -261,17 +278,26 @@ class OrbitEphemeris(NamedTuple):
 
 
 def read_oem(path: str, start: datetime.datetime) -> OrbitEphemeris:
-    """The orbit of an OEM. Raises InputError.
+    """The orbit of an OEM file.
 
-    Without accelerations in the file, those of gravity with J2 are taken. The error between two samples of a low orbit
-    is 1 mm at a step of 2 min and 0.2 m at 5 min.
+    1. Read the segments and their samples.
+    2. Join them; a sample that two segments share is taken once.
+    3. Accelerations that the file lacks are those of gravity with J2. The error between two samples of a low orbit is
+       then 1 mm at a step of 2 min and 0.2 m at 5 min.
+
+    Raises
+    ------
+    InputError
+        For a file that is not an OEM, or whose epochs are not in order.
     """
+    # 1.
     segments = split_segments(path)
     if not segments:
         raise InputError(
             path, "no segment", "META_START ... META_STOP, then lines of an epoch and numbers"
         )
     parts = [segment_samples(path, segment, start) for segment in segments]
+    # 2.
     t_s, samples = parts[0]
     for t, more in parts[1:]:
         if t[0] == t_s[-1] and np.linalg.norm(more[0, :3] - samples[-1, :3]) < SAME_M:
@@ -281,13 +307,17 @@ def read_oem(path: str, start: datetime.datetime) -> OrbitEphemeris:
         samples = np.concatenate([samples, more])
     if len(t_s) < 2 or (np.diff(t_s) <= 0).any():
         raise InputError(path, f"the epochs of {len(t_s)} samples", "two or more, in order of time")
+    # 3.
     missing = np.isnan(samples[:, 6])
     samples[missing, 6:] = gravity_m_s2(samples[missing, :3])
     return OrbitEphemeris(path, t_s, BPoly.from_derivatives(t_s, samples.reshape(-1, 3, 3)))
 
 
 def gravity_m_s2(position_m: Floats) -> Floats:
-    """(N, 3) acceleration by the Earth's mass and J2 at (N, 3). Source: Vallado 2013, section 8.7.1."""
+    """(N, 3) accelerations by the Earth's mass and J2 at (N, 3) positions (Vallado 2013, section 8.7.1).
+
+    a = -mu r / |r|^3 (1 + 1.5 J2 (R / |r|)^2 ((1, 1, 3) - 5 (z / |r|)^2)).
+    """
     r = np.linalg.norm(position_m, axis=1, keepdims=True)
     flattened = 1.5 * EARTH_J2 * (EARTH_RADIUS_M / r) ** 2
     polar = 5 * (position_m[:, 2:] / r) ** 2
@@ -296,7 +326,7 @@ def gravity_m_s2(position_m: Floats) -> Floats:
 
 
 def split_segments(path: str) -> list[TextSegment]:
-    """The segments of a message. Raises InputError for a line out of place."""
+    """The segments of an OEM file. Raises InputError for a line out of place."""
     version = ""
     segments = list[TextSegment]()
     section = ""
@@ -310,6 +340,7 @@ def split_segments(path: str) -> list[TextSegment]:
                 segments.append(TextSegment({}, []))
             elif not segments:
                 raise InputError(path, f"{word} before META_START", where=Where(path, n))
+        # Keywords stand in the header and in the metadata; data follow META_STOP.
         elif section in ("", "META_START"):
             key, value = keyword_value(path, n, line)
             if section:
@@ -325,7 +356,13 @@ def split_segments(path: str) -> list[TextSegment]:
 def segment_samples(
     path: str, segment: TextSegment, start: datetime.datetime
 ) -> tuple[Floats, Floats]:
-    """Times (N,) and positions, velocities, accelerations (N, 9) of a segment, SI, GCRS axes. Raises InputError."""
+    """Samples of a segment in SI units and GCRS axes. Raises InputError.
+
+    Returns
+    -------
+    tuple
+        (N,) times since `start`, and (N, 9) positions, velocities and accelerations, NaN where the file has none
+    """
     metadata = segment.metadata
     segment.require(path, OEM_REQUIRED)
     frame = one_of(path, metadata, "REF_FRAME", FRAMES)
@@ -342,6 +379,7 @@ def segment_samples(
     t_s = seconds_since(path, lines, [words[0] for _, words in segment.data], start, system)
     if width == 6:
         numbers = np.column_stack([numbers, np.full((len(numbers), 3), np.nan)])
+    # From the mean equator of J2000.0 to the GCRS by the frame bias.
     if frame in ("EME2000", "J2000"):
         bias, _, _ = erfa.bp06(J2000_JD, 0.0)
         numbers = (numbers.reshape(-1, 3) @ bias).reshape(-1, 9)

@@ -2,8 +2,10 @@
 
 A star is a black body of its effective temperature, which follows from its colors along the measured sequence of
 dwarfs, scaled to its V magnitude. An LED has a tabulated spectrum, a Gaussian one or a single line. In all cases
+
     electrons = integral of photons(lambda) R(lambda) d lambda,
-with `Band` as the response R: the chip's quantum efficiency, times the lens's transmission where that is a curve.
+
+with the camera's response R (`Band`): the chip's quantum efficiency, times the lens's transmission if that is a curve.
 """
 
 from __future__ import annotations
@@ -35,13 +37,11 @@ HC_J_M = PLANCK_J_S * SPEED_OF_LIGHT_M_S  # energy of a photon times its wavelen
 HC_K_M = HC_J_M / BOLTZMANN_J_K
 V0_W_M3 = 3.63e-2  # irradiance of a star of V = 0: 3.63e-9 erg s^-1 cm^-2 A^-1 (reference §2)
 
-FLAT_M = (
-    400e-9,
-    1000e-9,
-)  # the silicon camera's bandpass, where one number stands for a curve (reference §2)
+# Bandpass of the silicon camera for a quantum efficiency that is one number (reference §2).
+FLAT_M = (400e-9, 1000e-9)
 
-STEP_M = 1e-9
-LONGEST_NM = 10_000.0  # of a curve: beyond, its integral has too many steps
+STEP_M = 1e-9  # of the integrals
+LONGEST_NM = 10_000.0  # of a curve; the integral of a longer one would take too many steps
 SUN = (0.650, 0.713)  # B-V and V-I of a G2 star, the zero point of every instrumental magnitude
 Spectrum = str | float  # of an LED: "white" or a file, or the peak wavelength in m
 
@@ -53,11 +53,11 @@ class Band:
     Attributes
     ----------
     wavelength_m
-        (K,) ascending; the response is zero beyond its ends
+        (K,) ascending wavelengths; the response is zero beyond their ends
     response
-        (K,) electrons per photon, linear in between
+        (K,) electrons per photon, linear between the wavelengths
     chromatic
-        The lens's chromatic aberration, which weighs its wavelengths by this response
+        Chromatic aberration of the lens, which is averaged over a light's photo-electrons
     """
 
     wavelength_m: Floats
@@ -66,12 +66,13 @@ class Band:
 
     @classmethod
     def from_camera(cls, camera: CameraConfig) -> Band:
-        """The quantum efficiency of a camera's chip, times its lens's transmission where that is a curve; cached.
+        """The response of a camera: its chip's quantum efficiency times its lens's transmission curve; cached.
 
-        Raises as `from_efficiency`.
+        A transmission that is one number is part of `Optics.collecting_m2`. Raises as `from_efficiency`.
         """
         band = cls.from_efficiency(camera.detector.quantum_efficiency)
         if isinstance(camera.transmission, str):
+            # The time of change is part of the cache's key.
             path = Path(camera.transmission)
             band = _product(band, _read_curve(path, path.stat().st_mtime_ns))
         return _through(band, camera.chromatic) if camera.chromatic else band
@@ -95,7 +96,7 @@ class Band:
         return _flat(float(quantum_efficiency))
 
     def response_at(self, wavelength_m: Floats | float) -> Floats:
-        """The response at any wavelengths, linearly interpolated."""
+        """The response at wavelengths of any shape, by linear interpolation; 0 beyond the curve's ends."""
         return np.asarray(
             np.interp(wavelength_m, self.wavelength_m, self.response, left=0.0, right=0.0)
         )
@@ -112,8 +113,12 @@ class Band:
         Parameters
         ----------
         spectrum
-            Function of (M,) wavelengths in m, per meter of wavelength, that returns (..., M).
-            Returns (...).
+            Function of (M,) wavelengths in m that returns (..., M) values per meter of wavelength
+
+        Returns
+        -------
+        Floats
+            (...,)
         """
         grid = self.grid_m()
         return np.asarray(np.trapezoid(spectrum(grid) * self.response_at(grid), grid, axis=-1))
@@ -121,26 +126,27 @@ class Band:
 
 @lru_cache(maxsize=64)
 def _flat(quantum_efficiency: float) -> Band:
+    """A constant response over FLAT_M."""
     return Band(np.array(FLAT_M), np.full(2, quantum_efficiency))
 
 
 @lru_cache(maxsize=64)
 def _scaled(band: Band, peak: float) -> Band:
+    """A response scaled to another peak."""
     return Band(band.wavelength_m, band.response * (peak / band.response.max()))
 
 
 @lru_cache(maxsize=64)
 def _through(band: Band, chromatic: ChromaticConfig) -> Band:
+    """A response with the chromatic aberration of a lens."""
     return replace(band, chromatic=chromatic)
 
 
 @lru_cache(maxsize=64)
 def _product(first: Band, second: Band) -> Band:
     """The product of two curves where both reach, sampled every nanometer and at the samples of both."""
-    low_m, high_m = (
-        choose(first.wavelength_m[end], second.wavelength_m[end])
-        for choose, end in ((max, 0), (min, -1))
-    )
+    low_m = max(first.wavelength_m[0], second.wavelength_m[0])
+    high_m = min(first.wavelength_m[-1], second.wavelength_m[-1])
     if not low_m < high_m:
         raise InputError(
             "camera.transmission",
@@ -156,7 +162,7 @@ def _product(first: Band, second: Band) -> Band:
 def _read_curve(path: Path, _changed_ns: int = 0, largest: float = 1.0) -> Band:
     """Read a curve: comments (#), a line of names, then lines of wavelength in nm and response, 0 to `largest`.
 
-    _changed_ns is the file's modification time: a changed file has another key in the cache.
+    _changed_ns is the file's modification time: a changed file has another key in the cache. Raises InputError.
     """
     try:
         lines = [
@@ -183,7 +189,7 @@ def _read_curve(path: Path, _changed_ns: int = 0, largest: float = 1.0) -> Band:
 
 
 class StellarSequence(NamedTuple):
-    """The measured sequence of stars from hot to cool, (K,) each; see data/bands/stellar_sequence.csv."""
+    """The measured sequence of stars from hot to cool, (K,) each, from data/bands/stellar_sequence.csv."""
 
     temperature_k: Floats
     b_v: Floats
@@ -204,10 +210,14 @@ def complete_colors(b_v: float | Floats, v_i: float | Floats) -> tuple[Floats, F
     Parameters
     ----------
     b_v, v_i
-        Johnson B-V and Cousins V-I, any shapes that broadcast. NaN is missing. Hipparcos writes
-        zeros in both (and in their errors) if it has neither, and a V-I of 0 with |B-V| > 0.1
-        fits no star. If both are missing they become a G2 star's (the median of the catalog is
-        .2 bluer). Values beyond the sequence's ends (a V-I of 9) are clipped.
+        Johnson B-V and Cousins V-I, any shapes that broadcast. NaN is missing. Hipparcos writes zeros in both (and in
+        their errors) if it has neither, and a V-I of 0 with |B-V| > 0.1 fits no star.
+
+    Returns
+    -------
+    tuple
+        B-V and V-I. If both are missing they are a G2 star's (the median of the catalog is .2 bluer). Values beyond the
+        sequence's ends (a V-I of 9) are clipped.
     """
     b_v, v_i = np.broadcast_arrays(np.asarray(b_v, dtype=float), np.asarray(v_i, dtype=float))
     neither = (b_v == 0) & (v_i == 0)
@@ -229,7 +239,7 @@ def temperature_k(b_v: float | Floats, v_i: float | Floats) -> Floats:
     for M stars, whose B-V is constant, and depends least on gravity and metallicity. A star reddened by dust gets a
     lower temperature, which matches how its light is distributed over the chip's band. The colors are not a black
     body's: one of the Sun's temperature has B-V = .45 instead of .65 (reference §2). The sequence is that of dwarfs;
-    K giants come out 5 % too warm. Beyond the table's ends, 33,300 K and 2,680 K, the end value is returned. Shapes
+    K giants come out 5 % too warm. Colors beyond the table's ends get the end values, 33,300 K and 2,680 K. Shapes
     as in `complete_colors`.
     """
     stars = stellar_sequence()
@@ -239,9 +249,21 @@ def temperature_k(b_v: float | Floats, v_i: float | Floats) -> Floats:
 def black_body_v0(wavelength_m: Floats, temperature_k: Floats) -> Floats:
     """Spectral photon flux of a black body of V = 0: Planck's law, scaled to V's zero point.
 
-    wavelength_m (M,), temperature_k (...). Returns (..., M) photons s^-1 m^-2 per meter of wavelength.
-    The energy-weighted mean spectral flux in Bessell's V is 3.63e-9 erg s^-1 cm^-2 A^-1. (The same zero point applied
-    at 5450 A alone makes a G2 star 1.3 % fainter, and puts it 1.3 % off the reference's 56,200 photons s^-1 mm^-2.)
+    B(lambda, T) / (h c / lambda), in photons s^-1 m^-2 per meter of wavelength. The energy-weighted mean spectral flux
+    in Bessell's V is 3.63e-9 erg s^-1 cm^-2 A^-1. (The same zero point applied at 5450 A alone makes a G2 star 1.3 %
+    fainter, and puts it 1.3 % off the reference's 56,200 photons s^-1 mm^-2.)
+
+    Parameters
+    ----------
+    wavelength_m
+        (M,)
+    temperature_k
+        (...,)
+
+    Returns
+    -------
+    Floats
+        (..., M)
     """
     kelvin = np.asarray(temperature_k, dtype=float)[..., None]
 
@@ -256,7 +278,7 @@ def black_body_v0(wavelength_m: Floats, temperature_k: Floats) -> Floats:
 
 @lru_cache(maxsize=64)
 def _black_bodies(band: Band) -> tuple[Floats, Floats]:
-    """(256,) inverse temperatures and log10 of the photo-electrons s^-1 m^-2 at V = 0, a smooth function of them."""
+    """(256,) inverse temperatures, and log10 of the photo-electrons s^-1 m^-2 at V = 0, a smooth function of them."""
     range_k = stellar_sequence().temperature_k[[0, -1]]
     inverse_k = np.linspace(1 / range_k[0], 1 / range_k[1], 256)
     return inverse_k, np.log10(
@@ -270,7 +292,7 @@ def star_flux_e_s_m2(
     """Pogson's law for a black body of the star's effective temperature: photo-electrons above the atmosphere.
 
     Returns photo-electrons s^-1 m^-2 of collecting area, in the band and before any loss in the lens:
-    10^(-0.4 V) ∫ n(λ, T) QE(λ) dλ, from a table per band, accurate to 1e-5.
+    10^(-0.4 V) int n(lambda, T) R(lambda) d lambda, from a table for each band, accurate to 1e-5.
     Error of the black body: in Gaia's G, as broad as silicon, its G-V relative to a G2 star agrees with measured
     stars within .045 mag from B5 to K0. Molecules darken cooler stars in V, so the black body makes them too faint:
     .05 mag at K3, .09 at K5, .19 at M0, .25 at M1, .44 at M3.
@@ -279,7 +301,7 @@ def star_flux_e_s_m2(
     ----------
     v_mag, b_v, v_i
         Johnson V, Johnson B-V, Cousins V-I, shapes that broadcast. To convert Hp to V see
-        `hipparcos.v_from_hp`; for missing colors `complete_colors`.
+        `star_archives.v_from_hp`; for missing colors `complete_colors`.
     """
     inverse_k, log_e = _black_bodies(band)
     log_v0 = np.interp(1 / temperature_k(b_v, v_i), inverse_k, log_e)
@@ -288,7 +310,7 @@ def star_flux_e_s_m2(
 
 @lru_cache(maxsize=64)
 def _black_body_moments(band: Band) -> tuple[Floats, Floats]:
-    """(256,) inverse temperatures and (256, 4) `chromatic_moments`."""
+    """(256,) inverse temperatures, and the `chromatic_moments` (256, 4) of black bodies of these temperatures."""
     inverse_k, _ = _black_bodies(band)
     return inverse_k, chromatic_moments(
         band, lambda wavelength_m: black_body_v0(wavelength_m, 1 / inverse_k)
@@ -305,7 +327,8 @@ def star_chromatic(b_v: float | Floats, v_i: float | Floats, band: Band) -> Floa
 
 
 def led_chromatic(spectrum: Spectrum, band: Band, fwhm_m: float | None = None) -> Floats:
-    """(4,) `chromatic_moments` of an LED; arguments as in `led_strength_e_s_sr`."""
+    """(4,) `chromatic_moments` of an LED, with arguments as in `led_strength_e_s_sr`."""
+    # A line has no spread.
     if not isinstance(spectrum, str) and fwhm_m is None:
         focus_m, corner_px = chromatic_shifts(band, np.array([spectrum]))[:, 0]
         return np.array([focus_m, 0.0, corner_px, 0.0])
@@ -318,16 +341,23 @@ def led_chromatic(spectrum: Spectrum, band: Band, fwhm_m: float | None = None) -
 
 
 def chromatic_moments(band: Band, photons: Callable[[Floats], Floats]) -> Floats:
-    """(..., 4) mean and standard deviation over a light's photo-electrons of the shift of focus, m, and at the corner,
-    px; 0 for a light that the camera does not see.
+    """Mean and standard deviation of the lens's chromatic shifts over a light's photo-electrons.
 
     Parameters
     ----------
     photons
         Spectrum in photons, to any scale, as in `Band.integral`
+
+    Returns
+    -------
+    Floats
+        (..., 4) mean and standard deviation of the shift of focus in m, then of the shift at the chip's corner in px;
+        0 for a light that the camera does not see
     """
+    # The least positive number avoids a division by zero.
     total = np.maximum(band.integral(photons), np.finfo(float).tiny)
 
+    # Mean of (shift - origin)^power.
     def mean_of(power: int, column: int, origin: Floats) -> Floats:
         def weighted(wavelength_m: Floats) -> Floats:
             return (
@@ -343,7 +373,7 @@ def chromatic_moments(band: Band, photons: Callable[[Floats], Floats]) -> Floats
 
 
 def chromatic_shifts(band: Band, wavelength_m: Floats) -> Floats:
-    """(2, M) shift of the focus, m, and at the chip's corner, px, of light of (M,) wavelengths."""
+    """(2, M) shift of the focus in m, and at the chip's corner in px, at (M,) wavelengths."""
     config = band.chromatic
     assert config is not None
     none = np.zeros(len(config.wavelength_m))
@@ -365,13 +395,17 @@ def synthetic_mag(
 def sky_radiance_e_s_m2_sr(mag_arcsec2: float | Floats, band: Band) -> Floats:
     """Radiance of a sky with this V magnitude per square arcsecond and sunlight's color.
 
-    Airglow has emission lines, which a V magnitude does not describe.
+    Moonlight and zodiacal light are sunlight. Airglow has emission lines, which a V magnitude does not describe.
 
     Parameters
     ----------
     mag_arcsec2
-        Any shape. Returns photo-electrons s^-1 m^-2 sr^-1. Moonlight and zodiacal light are
-        sunlight.
+        V magnitude per square arcsecond, any shape
+
+    Returns
+    -------
+    Floats
+        Photo-electrons s^-1 m^-2 sr^-1
     """
     return np.asarray(star_flux_e_s_m2(mag_arcsec2, *SUN, band) / ARCSEC2_SR)
 
@@ -379,19 +413,21 @@ def sky_radiance_e_s_m2_sr(mag_arcsec2: float | Floats, band: Band) -> Floats:
 def led_strength_e_s_sr(
     intensity_cd: float | Floats, spectrum: Spectrum, band: Band, fwhm_m: float | None = None
 ) -> Floats:
-    """Candela to photo-electrons: luminous intensity / luminous efficacy * electrons per joule.
-
-    Returns photo-electrons s^-1 sr^-1. Raises InputError for a line outside the visible range, which has no candelas.
+    """Candela to photo-electrons s^-1 sr^-1: luminous intensity / luminous efficacy * electrons per joule.
 
     Parameters
     ----------
     intensity_cd
-        Any shape, along the LED's normal
+        Luminous intensity along the LED's normal, any shape
     spectrum
-        "white" (data/led/white.csv, 304 lm/W) or a file, or the peak wavelength in m of a
-        colored LED
+        "white" (data/led/white.csv, 304 lm/W) or a file, or the peak wavelength in m of a colored LED
     fwhm_m
         Width of its spectrum at half maximum; None for a narrow line
+
+    Raises
+    ------
+    InputError
+        For a line outside the visible range, which has no candelas.
     """
     watts_sr = np.asarray(intensity_cd, dtype=float) / lumens_per_watt(spectrum, fwhm_m)
     return radiant_strength_e_s_sr(watts_sr, spectrum, band, fwhm_m)
@@ -400,7 +436,10 @@ def led_strength_e_s_sr(
 def radiant_strength_e_s_sr(
     intensity_w_sr: float | Floats, spectrum: Spectrum, band: Band, fwhm_m: float | None = None
 ) -> Floats:
-    """Radiant intensity to photo-electrons s^-1 sr^-1: I_e ∫ S λ/(h c) QE dλ / ∫ S dλ, S the spectrum's shape."""
+    """Radiant intensity to photo-electrons s^-1 sr^-1: I_e int S R l / (h c) dl / int S dl over the wavelength l.
+
+    S is the spectrum's shape, R the camera's response.
+    """
     if isinstance(spectrum, str):
         power = measured(spectrum)
         electrons = band.integral(
@@ -418,28 +457,29 @@ def radiant_strength_e_s_sr(
 
 
 def measured(spectrum: str) -> Band:
-    """The relative power of an LED per nanometer: that of data/led/white.csv, or a file's. Features narrower than the
-    steps of `Band.integral` are not resolved. Raises InputError for a file that is not a curve.
+    """The relative power of an LED per nanometer: data/led/white.csv or a file.
+
+    Features narrower than the steps of `Band.integral` are not resolved. Raises InputError for a file that is not a
+    curve.
     """
     path = spectrum_file(spectrum)
     return _read_curve(path, path.stat().st_mtime_ns, math.inf)
 
 
 def colored(peak_m: float, fwhm_m: float) -> Callable[[Floats], Floats]:
-    """Gaussian spectrum of a colored LED, per meter of wavelength and with unit integral: s = FWHM / (8 ln 2)^(1/2)."""
+    """Gaussian spectrum of a colored LED, per meter of wavelength, with unit integral: sigma = FWHM / sqrt(8 ln 2)."""
     sigma_m = fwhm_m / FWHM_PER_SIGMA
     scale = 1 / (math.sqrt(2 * math.pi) * sigma_m)
     return lambda wavelength_m: scale * np.exp(-0.5 * ((wavelength_m - peak_m) / sigma_m) ** 2)
 
 
 def lumens_per_watt(spectrum: Spectrum, fwhm_m: float | None = None) -> float:
-    """Luminous efficacy of radiation, lm/W: 683 ∫ S V dλ / ∫ S dλ, V the eye's response.
+    """Luminous efficacy of radiation in lm/W: 683 int S V dl / int S dl, with the eye's response V.
 
     Raises
     ------
     InputError
-        For a colored LED whose peak is where V is zero, and for a measured spectrum without
-        light there.
+        For a colored LED whose peak is where V is zero, and for a measured spectrum without light there.
     """
     photopic = _read_curve(DATA / "bands" / "photopic.csv")
     if isinstance(spectrum, str):
@@ -475,11 +515,11 @@ def snr(
     Parameters
     ----------
     signal_e
-        Electrons of the star in these n = area_px pixels
+        Electrons S of the star in these n = area_px pixels
     background_e
-        Mean electrons per pixel of everything else (sky, dark current)
+        Mean electrons B per pixel of everything else (sky, dark current)
     read_noise_e
-        R, per pixel
+        Read noise R per pixel
     """
     signal_e = np.asarray(signal_e, dtype=float)
     noise = np.sqrt(signal_e + area_px * (background_e + np.square(read_noise_e)))

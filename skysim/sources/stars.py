@@ -23,7 +23,7 @@ from skysim.sources.catalog import Catalog
 from skysim.sources.photometry import Band, star_chromatic, star_flux_e_s_m2
 
 LAST_HIPPARCOS = 120_416  # number of the catalog's last star
-AT_REST = (0.0, 0.0, 0.0)
+AT_REST = (0.0, 0.0, 0.0)  # velocity of an observer at the Earth's center
 
 
 def apparent(
@@ -33,10 +33,12 @@ def apparent(
 ) -> Floats:
     """Apparent directions of stars: proper motion, annual parallax, light deflection and aberration.
 
-    Returns (N, 3) unit vectors in ICRS axes. In order:
-    proper motion and annual parallax (up to 0.75", alpha Centauri), `erfa.pmpx`;
-    the Sun's deflection of light (4 mas at 90 degrees, 1.7" at its limb), `erfa.ldsun`;
-    aberration of the observer's barycentric velocity (up to 20.5"), `erfa.ab`; the Earth from `erfa.epv00`.
+    Returns (N, 3) unit vectors in ICRS axes.
+
+    1. Proper motion and annual parallax (up to 0.75", alpha Centauri), `erfa.pmpx`.
+    2. The Sun's deflection of light (4 mas at 90 degrees, 1.7" at its limb), `erfa.ldsun`.
+    3. Aberration by the observer's barycentric velocity (up to 20.5"), `erfa.ab`; the Earth's from `erfa.epv00`.
+
     Neglected: radial velocity (not in the catalog, < 2 mas in 35 years except for a handful of stars), the planets'
     deflection, the observer's distance from the Earth's center (< 0.04 mas).
     Source: IERS Conventions 2010, chapters 5 and 7; the SOFA routines of these names.
@@ -46,25 +48,28 @@ def apparent(
     time
         UTC (a naive datetime is UTC)
     observer_velocity_m_s
-        (3,) relative to the Earth's center, ICRS axes; an orbit's 7.6 km/s is 5.2", the
-        ground's 0.46 km/s is 0.3"
+        (3,) velocity relative to the Earth's center, ICRS axes; an orbit's 7.6 km/s is 5.2", the ground's 0.46 km/s is
+        0.3"
     """
     tt_day = tt_days(time)
-    heliocentric, barycentric = erfa.epv00(J2000_JD, tt_day)  # au, au/day; TT for TDB is 2 ms off
+    # The Earth's position and velocity in au and au/day; TT for TDB is 2 ms off.
+    heliocentric, barycentric = erfa.epv00(J2000_JD, tt_day)
     years = tt_day / JULIAN_YEAR_DAY + 2000.0 - catalog.epoch_jyear
+    # 1. SOFA takes the rate of right ascension itself, without cos(delta).
     geometric = erfa.pmpx(
         catalog.ra_rad,
         catalog.dec_rad,
-        catalog.pm_ra_rad_yr
-        / np.cos(catalog.dec_rad),  # SOFA takes the rate of right ascension itself
+        catalog.pm_ra_rad_yr / np.cos(catalog.dec_rad),
         catalog.pm_dec_rad_yr,
         catalog.parallax_rad / ARCSEC_RAD,
         0.0,
         years,
         barycentric["p"],
     )
+    # 2. Deflection.
     sun_au = float(np.linalg.norm(heliocentric["p"]))
     deflected = erfa.ldsun(geometric, heliocentric["p"] / sun_au, sun_au)
+    # 3. Aberration.
     own_beta = np.asarray(observer_velocity_m_s, dtype=float) / SPEED_OF_LIGHT_M_S
     beta = barycentric["v"] / SPEED_OF_LIGHT_AU_DAY + own_beta
     apparent_direction = erfa.ab(deflected, beta, sun_au, np.sqrt(1.0 - beta @ beta))
@@ -79,6 +84,7 @@ def varied(stars: Catalog, seed: int) -> Catalog:
     The draw is normal, with the standard deviation that Hipparcos saw over three years, and belongs to the star's
     Hipparcos number: the same star has the same magnitude whatever the catalog's limit. The colors stay.
     """
+    # Every Hipparcos number has a draw; stars with other numbers share draw 0, and do not vary.
     draws = random_stream(seed, VARIABLE_STARS).standard_normal(LAST_HIPPARCOS + 1)
     numbered = np.where(stars.hip <= LAST_HIPPARCOS, stars.hip, 0)
     return replace(stars, v_mag=stars.v_mag + stars.scatter_mag * draws[numbered])
@@ -87,7 +93,8 @@ def varied(stars: Catalog, seed: int) -> Catalog:
 def seen_at_velocity(apparent_direction: Floats, from_m_s: Floats, to_m_s: Floats) -> Floats:
     """Apparent directions (N, 3) of stars for another velocity of the observer.
 
-    The aberration of the first velocity is undone by that of its opposite, and that of the second applied (`erfa.ab`).
+    The aberration of the first velocity is undone by that of its opposite, then that of the second is applied
+    (`erfa.ab`).
 
     Parameters
     ----------
@@ -118,13 +125,13 @@ def sources(
     Parameters
     ----------
     limit_mag
-        Faintest Johnson V kept; None: all
+        Faintest Johnson V that is kept; None keeps all stars
     lab_from_icrs
-        Orientation of the lab's axes in the ICRS at that time
+        Rotation from the ICRS to the lab's axes at that time
     band
-        Quantum efficiency of the chip
+        Response of the camera
     observer_velocity_m_s
-        See `apparent`
+        As in `apparent`
     """
     selected = stars.to_limit(limit_mag)
     direction = np.zeros((0, 3))
@@ -154,7 +161,9 @@ def steady_points(
     ones = np.ones(count)
     return StarSources(
         id=ids,
-        place=np.ascontiguousarray(np.column_stack([direction, zeros])),  # rows are taken from it
+        place=np.ascontiguousarray(
+            np.column_stack([direction, zeros])
+        ),  # contiguous: rows are taken from it
         normal=np.zeros((count, 3)),
         radius_m=zeros,
         strength=flux_e_s_m2,
@@ -172,9 +181,9 @@ def cam_from_icrs(
 ) -> Rotation:
     """Camera attitude from the boresight's right ascension and declination and the position angle of the image's up.
 
-    Returns cam_from_icrs; its matrix has the camera's x (right), y (down), z (boresight) as rows.
-    Up is cos(roll) N + sin(roll) E and x = y × z, so that at roll 0 north is up and east is to the left: the
-    sky is seen from inside. At the poles N and E are those of the meridian ra_deg.
+    Returns cam_from_icrs; its matrix has the camera's x (right), y (down), z (boresight) as rows. Up is
+    cos(roll) N + sin(roll) E and x = y × z, so that at roll 0 north is up and east is to the left: the sky is seen from
+    inside. At the poles N and E are those of the meridian ra_deg.
 
     Parameters
     ----------
@@ -184,6 +193,7 @@ def cam_from_icrs(
         Position angle of the image's up (-y) at the boresight, from north through east
     """
     ra, dec, roll = (np.radians(angle) for angle in (ra_deg, dec_deg, roll_deg))
+    # Unit vectors to the east, to the north and along the boresight.
     east = np.stack([-np.sin(ra), np.cos(ra), np.zeros_like(ra)], axis=-1)
     north = np.stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)], axis=-1)
     z = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)

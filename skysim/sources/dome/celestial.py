@@ -1,8 +1,9 @@
 """The real sky on a dome: where an LED must be, and how bright, to appear as a star to the camera.
 
-Each star's apparent direction is traced from the camera's nominal place to the surface. Stars closer than an LED's
-diameter are merged into one LED at their center of light. Levels compensate for the distance and emission angle of
-each LED, so that the irradiance at the camera follows the magnitudes.
+1. Each star's apparent direction is traced from the camera's nominal place to the surface (`project_stars`).
+2. Stars closer than an LED's diameter are merged into one LED at their center of light (`merge_close_stars`).
+3. Levels compensate for the distance and emission angle of each LED, so that the irradiance at the camera follows the
+   magnitudes (`led_levels`).
 """
 
 from __future__ import annotations
@@ -24,12 +25,16 @@ from skysim.sources.photometry import Band, synthetic_mag
 
 
 class ProjectedStars(NamedTuple):
-    """Stars on the dome, brightest first: hip, v_mag, shown_mag (N,), place_m (N, 3) in the lab.
+    """Stars on the dome, brightest first.
 
     Attributes
     ----------
+    hip, v_mag
+        (N,) Hipparcos numbers and V magnitudes
     shown_mag
-        Magnitude that the LED has to show: V, or the instrumental magnitude in the chip's band
+        (N,) magnitudes that the LEDs have to show: V, or the instrumental magnitude in the chip's band
+    place_m
+        (N, 3) places in the lab
     """
 
     hip: NDArray[np.int64]
@@ -43,9 +48,17 @@ def project_stars(
 ) -> ProjectedStars:
     """Stars as LED places: apparent directions at config.epoch, traced from the camera's nominal place to the surface.
 
-    The lab's +z is the zenith at RA, Dec; roll is the position angle of the lab's -y there. Of the stars on the
-    dome's cap the brightest are taken; those that one LED's disk would cover are merged, see `merge_close_stars`.
-    Raises InputError for a camera outside the dome, and if there are no stars or too few.
+    The lab's +z is the zenith at RA, Dec; roll is the position angle of the lab's -y there.
+
+    1. Apparent directions of the stars above the horizon.
+    2. Places on the dome within its cap, the brightest star first.
+    3. Take the brightest, and merge those that one LED's disk would cover (`merge_close_stars`).
+    4. A merged place is a mean of points on the surface and so is inside it: trace it back onto the surface.
+
+    Raises
+    ------
+    InputError
+        For a camera outside the dome, and if there are no stars or too few.
     """
     camera_m = np.array(config.camera_m)
     if not surface.inside(camera_m):
@@ -55,6 +68,7 @@ def project_stars(
             f"{distance_m:g} m from the bearing's center, outside of the dome",
             "inside",
         )
+    # 1.
     stars = catalog.read_for("light.layout.catalog", config.catalog)
     lab_from_icrs = star_sources.cam_from_icrs(
         config.zenith_ra_deg, config.zenith_dec_deg, config.roll_deg
@@ -62,6 +76,7 @@ def project_stars(
     direction = lab_from_icrs.apply(star_sources.apparent(stars, config.epoch))
     above_horizon = direction[:, 2] > 0
     stars = stars.take(above_horizon)
+    # 2.
     place_m = surface.meet(camera_m, direction[above_horizon])
     within = place_m[:, 2] >= np.cos(np.radians(config.cap_deg)) * np.linalg.norm(place_m, axis=1)
     stars = stars.take(within)
@@ -69,19 +84,16 @@ def project_stars(
     order = np.argsort(stars.v_mag, kind="stable")
     stars = stars.take(order)
     place_m = place_m[order]
-    mag = (
-        synthetic_mag(stars.v_mag, stars.b_v, stars.v_i, band)
-        if config.brightness == "band"
-        else stars.v_mag
-    )
-    selected = select_brightest(
-        ProjectedStars(stars.hip, stars.v_mag, mag, place_m), config, led.disk_diameter_m
-    )
+    mag = stars.v_mag
+    if config.brightness == "band":
+        mag = synthetic_mag(stars.v_mag, stars.b_v, stars.v_i, band)
+    # 3.
+    projected = ProjectedStars(stars.hip, stars.v_mag, mag, place_m)
+    selected = select_brightest(projected, config, led.disk_diameter_m)
+    # 4.
     rays = selected.place_m - camera_m
-    # A merged place is a mean of points on the surface and so lies inside it: trace it back onto the surface.
-    return selected._replace(
-        place_m=surface.meet(camera_m, rays / np.linalg.norm(rays, axis=1, keepdims=True))
-    )
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return selected._replace(place_m=surface.meet(camera_m, rays))
 
 
 def merge_targets(place_m: Floats, separation_m: float) -> NDArray[np.int64]:
@@ -90,7 +102,7 @@ def merge_targets(place_m: Floats, separation_m: float) -> NDArray[np.int64]:
     Parameters
     ----------
     place_m
-        (N, 3), brightest first, so that a star's target does not depend on fainter stars.
+        (N, 3) places, brightest first, so that a star's target does not depend on fainter stars
     """
     target = np.arange(len(place_m))
     # Sorted pairs: when a pair is reached, it is decided whether its brighter star is a target.
@@ -101,17 +113,19 @@ def merge_targets(place_m: Floats, separation_m: float) -> NDArray[np.int64]:
 
 
 def merge_stars(stars: ProjectedStars, target: NDArray[np.int64]) -> ProjectedStars:
-    """The stars with the light of each added to its target's, at their center of light.
+    """Merge stars: the light of each is added to its target's, at their center of light.
 
-    The numbers are the targets'; the order is by combined V.
+    The merged stars have the targets' numbers, and the order of combined V. m = -2.5 log10(sum 10^(-0.4 m_i)).
     """
     first, group = np.unique(target, return_inverse=True)
 
     def combined_mag(mag: Floats) -> Floats:
+        # A single star keeps its magnitude to the last digit.
         single = np.bincount(group, minlength=len(first)) == 1
         sum_mag = -2.5 * np.log10(np.bincount(group, 10 ** (-0.4 * mag)))
         return np.where(single, mag[first], sum_mag)
 
+    # Center of light, sum of light times place.
     light = 10 ** (-0.4 * stars.shown_mag)
     weight = light / np.bincount(group, light)[group]
     place_m = np.array(
@@ -127,11 +141,10 @@ def merge_stars(stars: ProjectedStars, target: NDArray[np.int64]) -> ProjectedSt
 def merge_close_stars(stars: ProjectedStars, count: int, separation_m: float) -> ProjectedStars:
     """The first `count` stars as LEDs, no two nearer to each other than separation_m.
 
-    A merged LED is between the places of its stars and may be too near a third, so merging repeats until none is.
+    A merged LED is between the places of its stars and may be too near a third star, so merging repeats until no two
+    LEDs are too near.
     """
-    selected = ProjectedStars(
-        stars.hip[:count], stars.v_mag[:count], stars.shown_mag[:count], stars.place_m[:count]
-    )
+    selected = ProjectedStars(*(column[:count] for column in stars))
     while True:
         target = merge_targets(selected.place_m, separation_m)
         if np.all(target == np.arange(len(target))):
@@ -142,7 +155,7 @@ def merge_close_stars(stars: ProjectedStars, count: int, separation_m: float) ->
 def select_brightest(
     stars: ProjectedStars, config: layouts.CelestialConfig, separation_m: float
 ) -> ProjectedStars:
-    """The brightest stars, merged into config.count LEDs, or all stars to config.limit_mag. Raises InputError."""
+    """The brightest stars merged into config.count LEDs, or all stars to config.limit_mag. Raises InputError."""
     if config.limit_mag is not None:
         count = int(np.sum(stars.v_mag <= config.limit_mag))
         if not count:
@@ -156,9 +169,8 @@ def select_brightest(
     count = min(wanted, len(stars.hip))
     merged = merge_close_stars(stars, count, separation_m)
     while len(merged.hip) < wanted and count < len(stars.hip):
-        count = min(
-            count + wanted - len(merged.hip), len(stars.hip)
-        )  # each star adds one LED at most
+        # Each star adds one LED at most.
+        count = min(count + wanted - len(merged.hip), len(stars.hip))
         merged = merge_close_stars(stars, count, separation_m)
     if len(merged.hip) < wanted:
         raise InputError(
@@ -174,10 +186,19 @@ def led_levels(
 ) -> Floats:
     """(N,) levels for which the irradiance at the camera's nominal place follows Pogson's law, 10^(-0.4 m).
 
-    m is stars.shown_mag. All LEDs have one color, so the magnitudes hold for this chip only, where m should be its
-    instrumental magnitude. The level compensates for the LED's distance and emission angle; the LED that needs most
-    has level 1. No star is shown brighter than config.brightest_mag. normal : (N, 3) of the LEDs.
-    Raises InputError for an LED whose lobe does not reach the camera.
+    m is stars.shown_mag, but no star is shown brighter than config.brightest_mag. All LEDs have one color, so the
+    magnitudes hold for this chip only, and m should be its instrumental magnitude. The level compensates for the LED's
+    distance and emission angle; the LED that needs most light has level 1.
+
+    Parameters
+    ----------
+    normal
+        (N, 3) normals of the LEDs
+
+    Raises
+    ------
+    InputError
+        For an LED whose lobe does not reach the camera.
     """
     to_camera = np.array(config.camera_m) - stars.place_m
     distance_m = np.linalg.norm(to_camera, axis=1)
@@ -191,8 +212,7 @@ def led_levels(
             f"the LED of HIP {stars.hip[gain <= 0][0]} does not reach the camera",
             "a wider lobe",
         )
-    shown_mag = np.maximum(
-        stars.shown_mag, -np.inf if config.brightest_mag is None else config.brightest_mag
-    )
+    brightest_mag = -np.inf if config.brightest_mag is None else config.brightest_mag
+    shown_mag = np.maximum(stars.shown_mag, brightest_mag)
     needed = 10 ** (-0.4 * shown_mag) / gain
     return np.asarray(needed / needed.max())

@@ -16,9 +16,10 @@ Two levels of light show one bit. Four show two bits and eight three, each by it
 error by one level is one wrong bit; a word of b bits takes b / 2 or b / 3 frames. A De Bruijn sequence has symbols of
 2, 4 or 8 levels itself.
 
-Words without the highest level or without another one are left out: an LED of unknown brightness would not tell them
-from words that are shifted in level, which are equally spaced in magnitude. Of words as good otherwise those with as
-many ones as zeros come first; a Gray code stays in its order, in which LEDs of successive numbers differ in one bit.
+Words without the highest level or without another one are left out: a tracker that does not know an LED's brightness
+cannot tell them from words that are shifted in level, which are equally spaced in magnitude. Among words of equal
+distance those with as many ones as zeros come first; a Gray code stays in its order, in which LEDs of successive
+numbers differ in one bit.
 
 References: Lin and Costello 2004, Error Control Coding, chapters 4 to 6; Gold 1967, IEEE Trans. Inf. Theory 13, 619;
 Fredricksen and Maiorana 1978, Discrete Mathematics 23, 207 (De Bruijn sequences).
@@ -43,17 +44,16 @@ Ints = NDArray[np.int64]
 PRIMITIVE = {3: 0b1011, 4: 0b10011, 5: 0b100101, 6: 0b1000011, 7: 0b10001001}
 # With the first of the degree, Gold's preferred pairs.
 PREFERRED = {5: 0b111101, 6: 0b1100111, 7: 0b10001111}
+
 MAX_DATA_BITS = 20  # 2^20 words are listed at most
 
 
-@lru_cache(maxsize=8)  # every trial of a study asks for the same one
+@lru_cache(maxsize=8)  # every trial of a study asks for the same codebook
 def codebook(config: Code, count: int) -> Words:
     """(count, frames) levels of a scene's code, 0 the lowest; read-only.
-
-    Raises
     ------
     InputError
-        If the kind has not so many words.
+        If the kind has fewer words.
     """
     if isinstance(config, BchCodeConfig):
         words = packed(partial(bch, distance=config.distance), count, config.levels)
@@ -74,15 +74,18 @@ def codebook(config: Code, count: int) -> Words:
 
 
 def light_levels(config: Code, words: Words) -> Floats:
-    """Part of its light that an LED shows at the levels of words: from 1 - depth to 1, equally spaced in magnitude."""
+    """Fraction of its light that an LED shows at the levels of words: from 1 - depth to 1, equal steps in magnitude."""
     steps = getattr(config, "levels", 2) - 1
-    return np.array(
-        [(1 - config.depth) ** ((steps - level) / steps) for level in range(steps + 1)]
-    )[words]
+    shown = [(1 - config.depth) ** ((steps - level) / steps) for level in range(steps + 1)]
+    return np.array(shown)[words]
 
 
 def packed(kind: Callable[[int], Words], count: int, levels: int) -> Words:
-    """(count, frames) words of a binary code, log2(levels) bits in each level of light, or as many as there are."""
+    """(count, frames) words of a binary code, log2(levels) bits in each level of light.
+
+    Fewer than `count` if the code has fewer. Packed words may become unreadable, so more words are made until enough
+    are readable.
+    """
     bits = levels.bit_length() - 1
     wanted = count
     while True:
@@ -94,28 +97,33 @@ def packed(kind: Callable[[int], Words], count: int, levels: int) -> Words:
 
 
 def symbols_of(words: Words, bits: int) -> Words:
-    """(N, ceil(B / bits)) levels whose reflected binary numbers are the bits of (N, B) words, padded with zeros."""
+    """(N, ceil(B / bits)) levels whose reflected binary numbers are the bits of (N, B) words, padded with zeros.
+
+    From reflected to plain binary digits each digit is the exclusive or of all digits before it.
+    """
     padded = np.pad(words, ((0, 0), (0, -words.shape[1] % bits))).reshape(len(words), -1, bits)
     digits = np.bitwise_xor.accumulate(padded, axis=2)
     return (digits @ (1 << np.arange(bits)[::-1])).astype(np.uint8)
 
 
 def readable(words: Words, levels: int) -> Words:
-    """The words with the highest level and another one."""
+    """The words that contain the highest level and another one."""
     return words[(words.max(axis=1) == levels - 1) & (words.min(axis=1) < levels - 1)]
 
 
 def de_bruijn(count: int, levels: int) -> Words:
-    """(count, levels^k) shifts of a De Bruijn sequence with the least k that gives so many.
+    """(count, levels^k) shifts of a De Bruijn sequence, with the least k that gives `count` shifts.
 
-    Every k successive symbols of the sequence are unique in it, so that an LED is known by its last k frames, and k
-    LEDs that follow each other by one frame. The sequence joins the Lyndon words whose lengths divide k, in
+    Every k successive symbols of the sequence occur once in it, so an LED is identified by its last k frames, and so
+    are k LEDs that follow each other by one frame. The sequence joins the Lyndon words whose lengths divide k, in
     lexicographic order (Fredricksen and Maiorana).
     """
     k = next(k for k in range(2, 32) if levels**k >= count)
     word = [0]
     sequence = [0]
     while word:
+        # Next Lyndon word: repeat to the length k, drop the highest symbols at the end, raise the
+        # last (Duval).
         word = (word * k)[:k]
         while word and word[-1] == levels - 1:
             word.pop()
@@ -127,31 +135,31 @@ def de_bruijn(count: int, levels: int) -> Words:
 
 
 def gray(count: int) -> Words:
-    """(count, bits) numbers n in the reflected binary code n xor n / 2; the least distance is 1."""
+    """(count, bits) numbers n in the reflected binary code, n xor n / 2; the least distance is 1."""
     bits = max((count + 1).bit_length(), 2)
     number = np.arange(2**bits)
     return without_constant(bits_of(number ^ number >> 1, bits))[:count]
 
 
 def hamming(count: int) -> Words:
-    """(count, bits) words of the extended Hamming code, shortened: the least distance is 4.
+    """(count, bits) words of the extended Hamming code, shortened; the least distance is 4.
 
-    The code of a parity check matrix with distinct columns that are not 0 has the distance 3 (Lin and Costello 4.1);
+    A code whose parity check matrix has distinct columns that are not 0 has the distance 3 (Lin and Costello 4.1);
     the parity bit makes it 4.
     """
     data = data_bits(count)
     checks = next(r for r in range(2, 32) if 2**r >= data + r + 1)
-    columns = [n for n in range(1, 2**checks) if n & (n - 1)][
-        :data
-    ]  # not a power of 2: that is a check bit's own
+    # A power of 2 is a check bit's own column.
+    columns = [n for n in range(1, 2**checks) if n & (n - 1)][:data]
     word = bits_of(np.arange(2**data), data)
     parity = word @ bits_of(np.array(columns), checks) % 2
     word = np.hstack([word, parity])
+    # Extended by the parity of the whole word.
     return balanced(np.hstack([word, word.sum(axis=1, keepdims=True) % 2]))[:count]
 
 
 def bch(count: int, distance: int) -> Words:
-    """(count, bits) words of the shortest shortened BCH code of a designed distance."""
+    """(count, bits) words of the shortest shortened BCH code of a designed distance: multiples of its generator."""
     data = data_bits(count)
     for degree in PRIMITIVE:
         generator = bch_generator(degree, distance)
@@ -163,7 +171,7 @@ def bch(count: int, distance: int) -> Words:
 
 
 def cyclic(count: int, distance: int) -> Words:
-    """(count, bits) words of a BCH code of which no two are shifts of each other, nor one of itself.
+    """(count, bits) words of a BCH code of which no two are shifts of each other, and none is a shift of itself.
 
     The distance between any two words at any shifts, and of a word from itself shifted, is that of the code.
     """
@@ -171,7 +179,7 @@ def cyclic(count: int, distance: int) -> Words:
         generator = bch_generator(degree, distance)
         length = 2**degree - 1
         data = min(length - generator.bit_length() + 1, MAX_DATA_BITS)
-        # Of every orbit of `length` words about one in `length` has its leading data bits in the part that is listed.
+        # Of the `length` words of an orbit about one has its leading data bits in the part that is listed.
         if data < 1 or 2**data < count:
             continue
         word = orbits(multiply(np.arange(1, 2**data), generator), length)
@@ -190,16 +198,16 @@ def gold(count: int) -> Words:
         length = 2**degree - 1
         if length * (length + 2) < count:
             continue
-        u, v = (maximal_sequence(polynomial, degree) for polynomial in (PRIMITIVE[degree], second))
+        u = maximal_sequence(PRIMITIVE[degree], degree)
+        v = maximal_sequence(second, degree)
         family = np.vstack([u, v, *(u ^ np.roll(v, shift) for shift in range(length))])
-        return balanced(np.vstack([np.roll(family, shift, axis=1) for shift in range(length)]))[
-            :count
-        ]
+        shifted = [np.roll(family, shift, axis=1) for shift in range(length)]
+        return balanced(np.vstack(shifted))[:count]
     return np.zeros((0, 1), np.uint8)
 
 
 def maximal_sequence(polynomial: int, degree: int) -> Words:
-    """(2^degree - 1,) output of the linear feedback shift register of a primitive polynomial."""
+    """(2^degree - 1,) output of the linear feedback shift register of a primitive polynomial, started with ones."""
     taps = [k for k in range(degree) if polynomial >> k & 1]
     out = np.ones(2**degree - 1, np.uint8)
     for n in range(degree, len(out)):
@@ -212,15 +220,22 @@ def bch_generator(degree: int, distance: int) -> int:
 
     alpha is a root of the primitive polynomial. The minimal polynomial of alpha^i is the product of x - alpha^j over
     the cyclotomic coset j = i, 2 i, 4 i, ... modulo n (Lin and Costello, section 6.1).
+
+    1. Powers of alpha as bits, and their logarithms.
+    2. All roots, each once.
+    3. Multiply the factors x - root with arithmetic in GF(2^degree).
     """
+    # 1.
     order = 2**degree - 1
     power = [1]
     for _ in range(order - 1):
         doubled = power[-1] << 1
         power.append(doubled ^ PRIMITIVE[degree] if doubled >> degree else doubled)
     log = {value: n for n, value in enumerate(power)}
+    # 2.
     roots = sorted({i * 2**k % order for i in range(1, distance) for k in range(degree)})
-    polynomial = [1]  # coefficients in GF(2^degree), the constant first
+    # 3. Coefficients in GF(2^degree), the constant first.
+    polynomial = [1]
     for root in roots:
         times_root = [power[(log[c] + root) % order] if c else 0 for c in polynomial]
         polynomial = [a ^ b for a, b in zip([0, *polynomial], [*times_root, 0], strict=True)]
@@ -228,7 +243,7 @@ def bch_generator(degree: int, distance: int) -> int:
 
 
 def multiply(words: Ints, generator: int) -> Ints:
-    """Products of polynomials over GF(2), as bits, with one of them."""
+    """Products of polynomials over GF(2), as bits, with the polynomial `generator`."""
     product = np.zeros_like(words)
     for k in range(generator.bit_length()):
         if generator >> k & 1:
@@ -237,7 +252,7 @@ def multiply(words: Ints, generator: int) -> Ints:
 
 
 def orbits(words: Ints, length: int) -> Ints:
-    """The least word of each orbit of these words under cyclic shifts, where all `length` shifts differ."""
+    """The least word of each orbit of these words under cyclic shifts, if all its `length` shifts differ."""
     least = words.copy()
     shifted = words.copy()
     mask = (1 << length) - 1
@@ -255,22 +270,22 @@ def bits_of(numbers: Ints, bits: int) -> Words:
 
 
 def data_bits(count: int) -> int:
-    """The number of bits for `count` words and the two whose bits are all equal."""
+    """The number of bits for `count` words and the two words whose bits are all equal."""
     return max((count + 1).bit_length(), 2)
 
 
 def without_constant(words: Words) -> Words:
-    """The words that have a one and a zero."""
+    """The words that have both a one and a zero."""
     ones = words.sum(axis=1)
     return words[(ones > 0) & (ones < words.shape[1])]
 
 
 def balanced(words: Words) -> Words:
-    """The words that have a one and a zero, those with as many of both first."""
+    """The words that have both a one and a zero, those with as many ones as zeros first."""
     words = without_constant(words)
-    return words[
-        np.argsort(np.abs(2 * words.sum(axis=1, dtype=np.int64) - words.shape[1]), kind="stable")
-    ]
+    excess = np.abs(2 * words.sum(axis=1, dtype=np.int64) - words.shape[1])
+    return words[np.argsort(excess, kind="stable")]
 
 
+# Binary codes without options, by kind.
 PLAIN: dict[str, Callable[[int], Words]] = {"gray": gray, "hamming": hamming, "gold": gold}

@@ -1,9 +1,9 @@
-"""LEDs that show their names: the light of each by its word, integrated over an exposure.
+"""LEDs that show their names: the light of each by its word, integrated over an exposure; and the controllers' clocks.
 
-In bit k of the code's time an LED shines with the part of its light that its word has there, or with that of another
-level if the bit fails. The code's clock is the camera's trigger, one bit a frame, or a free-running oscillator with
-offset and drift (`clocks`). An exposure that crosses a bit's edge gets the mean of both bits by their times in it. The
-drive's pulses are much faster than a bit; the code scales their light.
+In bit k of the code's time an LED shines with the fraction of its light that its word has there, or with that of
+another level if the bit fails. The code's clock is the camera's trigger, one bit a frame, or a free-running oscillator
+with offset and drift (`Clocks`). An exposure that crosses a bit's edge gets the mean of both bits by their times in
+it. The drive's pulses are much faster than a bit; the code scales their light.
 """
 
 from __future__ import annotations
@@ -22,12 +22,18 @@ from skysim.scene.sections.leds import ClockConfig, Code, DirectConfig, PwmConfi
 from skysim.scene.sections.light import DomeConfig, Light
 from skysim.sources.dome.codebooks import Words, codebook, light_levels
 
-# Clocks of the LED controllers: each times its pulses with an oscillator of its own.
+# Clocks of the LED controllers: each times its pulses with an oscillator of its own. No two oscillators agree, and they
+# are not synchronized with the camera: the phase of a pulse train wanders through the exposures, and flicker averages
+# out over frames as in a laboratory. A controller's time is
+#
+#     tau(t) = tau_0 + (1 + y) t + d t^2 / 2
+#
+# with its frequency offset y (of the hardware), its drift d and the time tau_0 since it was switched on (of the run).
+# This is the usual model of an oscillator over minutes (Riley 2008, NIST SP 1065, section 3.1), without its noise.
 
 
-LONGEST_ON_S = (
-    HOUR_S  # a controller was switched on up to so long before the run; many times any period
-)
+# Longest time before the run at which a controller was switched on; many times any period.
+LONGEST_ON_S = HOUR_S
 FILTER_STREAM = 4  # spawn key, under the hardware's seed, of the filters' errors
 
 
@@ -38,11 +44,11 @@ class Clocks:
     Attributes
     ----------
     on_s
-        tau_0, controller's time at t = 0
+        tau_0, the controllers' times at t = 0
     offset
-        Y, relative frequency offset at t = 0
+        y, relative frequency offsets at t = 0
     drift_s
-        D, change of the relative frequency per second
+        d, changes of the relative frequency per second
     filter_s
         (N,) time constants of the LEDs' low-pass filters; None without them
     """
@@ -61,7 +67,7 @@ class Clocks:
         seed: int,
         stream: int = LED_CLOCKS,
     ) -> Clocks:
-        """Draw the offsets from the hardware's seed, drifts and switch-on times from the run's."""
+        """Draw the offsets from the hardware's seed, and drifts and switch-on times from the run's."""
         offset_ppm = scaled_errors(
             config.offset_ppm, random_stream(hardware_seed, stream).standard_normal(count)
         )
@@ -71,9 +77,10 @@ class Clocks:
         return cls(on_s, PPM * offset_ppm, PPM / HOUR_S * drift_ppm_h)
 
     def lights_at(self, sources: Sources, t_s: float, exposure_s: float) -> Sources:
-        """The sources with their pulse trains about t_s, or as their filters smooth them over an exposure about it.
+        """The sources with their light during an exposure about t_s.
 
-        In a rolling shutter the ripple that a filter leaves is that of the middle row's exposure.
+        Without filters these are their pulse trains; filters smooth each train to its mean over the exposure. In a
+        rolling shutter the ripple that a filter leaves is that of the middle row's exposure.
         """
         pulses = self.pulses_at(sources, t_s)
         if self.filter_s is None:
@@ -101,31 +108,37 @@ class Clocks:
 
 
 def filtered_share(pulses: Sources, filter_s: Floats, begin_s: float, end_s: float) -> Floats:
-    """(N,) mean of the filters' voltages, 1 if always on, from begin to end."""
+    """(N,) mean of the filters' voltages between two times; 1 for an LED that is always on.
+
+    The low-pass filter smooths the pulses u(t), 0 or 1: its voltage has RC V' = u - V, so that its mean over an
+    exposure is the pulses' mean less RC (V(end) - V(begin)) / (end - begin). In the steady state, at the time s after
+    a pulse's beginning, V = 1 - (1 - V0) exp(-s / RC) while it lasts, for `on` of the period T, and decays by exp(-(s
+    - on) / RC) afterwards, with V0 = (exp(-(T - on) / RC) - exp(-T / RC)) / (1 - exp(-T / RC)).
+    """
     period_s = pulses.period_s
     on_s = np.minimum(pulses.on_s, pulses.period_s)
+    # V0, without cancellation for short periods.
     rise = np.exp(-(period_s - on_s) / filter_s)
     first = (rise - np.exp(-period_s / filter_s)) / -np.expm1(-period_s / filter_s)
 
     def lit_s_and_voltage(t_s: float) -> tuple[Floats, Floats]:
+        # Complete periods since the train's beginning, and the time in the present one.
         cycles, since_s = np.divmod(t_s - pulses.start_s, period_s)
         lit_s = np.minimum(since_s, on_s)
-        voltage = (1 - (1 - first) * np.exp(-lit_s / filter_s)) * np.exp(
-            (lit_s - since_s) / filter_s
-        )
+        rising = 1 - (1 - first) * np.exp(-lit_s / filter_s)
+        voltage = rising * np.exp((lit_s - since_s) / filter_s)
         return cycles * on_s + lit_s, voltage
 
-    (lit0_s, voltage0), (lit1_s, voltage1) = lit_s_and_voltage(begin_s), lit_s_and_voltage(end_s)
+    lit0_s, voltage0 = lit_s_and_voltage(begin_s)
+    lit1_s, voltage1 = lit_s_and_voltage(end_s)
     return np.asarray((lit1_s - lit0_s - filter_s * (voltage1 - voltage0)) / (end_s - begin_s))
 
 
 def build_clocks(light: Light, sources: Sources, seed: int) -> Clocks | None:
-    """The clocks of a dome's controllers in the run of that seed; None where all light is steady."""
-    if (
-        not isinstance(light, DomeConfig)
-        or isinstance(light.led.drive, DirectConfig)
-        or not len(sources)
-    ):
+    """The clocks of a dome's controllers in the run of that seed; None if all light is steady."""
+    if not isinstance(light, DomeConfig) or not len(sources):
+        return None
+    if isinstance(light.led.drive, DirectConfig):
         return None
     hardware = hardware_seed(light.layout)
     clocks = Clocks.draw(light.led.clock, int(sources.clock.max()) + 1, hardware, seed)
@@ -133,13 +146,12 @@ def build_clocks(light: Light, sources: Sources, seed: int) -> Clocks | None:
     if low_pass is None:
         return clocks
     normal = random_stream(hardware, FILTER_STREAM).standard_normal(len(sources))
-    return replace(
-        clocks, filter_s=low_pass.time_constant_s * (1 + scaled_errors(low_pass.error, normal))
-    )
+    error = scaled_errors(low_pass.error, normal)
+    return replace(clocks, filter_s=low_pass.time_constant_s * (1 + error))
 
 
 def hardware_seed(layout: Layout) -> int:
-    """The seed of a layout's hardware; a panel's or a shell's is that of the points on it."""
+    """The seed of a layout's hardware; for points on a panel or a shell the seed of the points' layout."""
     return hardware_seed(layout.points) if isinstance(layout, OnPoints) else layout.hardware_seed
 
 
@@ -150,11 +162,11 @@ class LedCodes:
     Attributes
     ----------
     words
-        (N, B) levels, in the order of the dome's LEDs
+        (N, B) levels of the LEDs in each bit, in the order of the dome's LEDs
     clock
-        One oscillator; None if the camera's trigger advances the code
+        The code's oscillator; None if the camera's trigger advances the code
     seed
-        Of the run, which draws the bits that fail
+        Seed of the run, from which the bits that fail are drawn
     """
 
     words: Words
@@ -164,15 +176,15 @@ class LedCodes:
 
     def shown(self, sources: Sources, open_s: float, exposure_s: float, frame: int) -> Sources:
         """The dome's LEDs with their mean light in the exposure of a frame."""
-        return replace(
-            sources, strength=sources.strength * self.mean_level(open_s, exposure_s, frame)
-        )
+        level = self.mean_level(open_s, exposure_s, frame)
+        return replace(sources, strength=sources.strength * level)
 
     def mean_level(self, open_s: float, exposure_s: float, frame: int) -> Floats:
-        """(N,) mean part of their light in an exposure: sum over its bits of level and share of the time."""
+        """(N,) mean fraction of the LEDs' light in an exposure: sum over its bits of level times share of the time."""
         if self.clock is None:
             return self.level(frame)
         bit_s = float(self.config.bit_time_s)
+        # The exposure in the code's time, in bits.
         begin, end = (self.time_s(t) / bit_s for t in (open_s, open_s + exposure_s))
         bits = range(math.floor(begin), max(math.ceil(end), math.floor(begin) + 1))
         shares = [(min(k + 1, end) - max(k, begin)) / (end - begin) for k in bits]
@@ -180,32 +192,36 @@ class LedCodes:
         return np.array(shares) @ levels
 
     def level(self, bit: int) -> Floats:
-        """(N,) part of their light in bit number `bit` of the code's time."""
+        """(N,) fraction of the LEDs' light in bit number `bit` of the code's time."""
         shown = self.words[:, bit % self.words.shape[1]]
         if self.config.dropout:
             rng = random_stream(self.seed, LED_CODE, bit)
             levels = int(self.words.max()) + 1
             failed = rng.random(len(shown)) < self.config.dropout
-            shown = (
-                shown + failed * (rng.integers(1, levels, len(shown)) if levels > 2 else 1)
-            ) % levels
+            # A failed bit shows one of the other levels at random.
+            shift = rng.integers(1, levels, len(shown)) if levels > 2 else 1
+            shown = (shown + failed * shift) % levels
         return light_levels(self.config, shown)
 
     def time_s(self, t_s: float) -> float:
-        """The code clock's time."""
+        """The time of the code's clock: tau_0 + t (1 + y + d t / 2)."""
         assert self.clock is not None
         rate = self.clock.offset[0] + self.clock.drift_s[0] * t_s / 2
         return float(self.clock.on_s[0] + t_s * (1 + rate))
 
 
 def build_codes(light: Light, sources: Sources, seed: int) -> LedCodes | None:
-    """The code of a dome's LEDs in the run of that seed; None without one. Raises InputError for too many LEDs."""
+    """The code of a dome's LEDs in the run of that seed; None without one.
+
+    Raises
+    ------
+    InputError
+        For more LEDs than the code has words.
+    """
     if not isinstance(light, DomeConfig) or light.led.code is None:
         return None
     code = light.led.code
-    clock = (
-        None
-        if code.bit_time_s == "frame"
-        else Clocks.draw(light.led.clock, 1, hardware_seed(light.layout), seed, LED_CODE_CLOCK)
-    )
+    clock = None
+    if code.bit_time_s != "frame":
+        clock = Clocks.draw(light.led.clock, 1, hardware_seed(light.layout), seed, LED_CODE_CLOCK)
     return LedCodes(codebook(code, len(sources)), code, clock, seed)

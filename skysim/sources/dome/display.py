@@ -1,7 +1,8 @@
-"""Stars shown by displays instead of LEDs: an LCD panel, a collimated micro-display.
+"""Stars shown by displays instead of LEDs: an LCD panel, a collimated micro-display, a projector.
 
-A display rounds places to its pixels and levels to its gray levels (`draw_blocks`). On an LCD panel each star is a
-block of pixels at a finite distance; behind a collimator it is a parallel beam, a source at infinity.
+1. A display rounds places to its pixels and levels to its gray levels (`draw_blocks`).
+2. On an LCD panel each star is a block of pixels at a finite distance (`panel_sources`); behind a collimator it is a
+   parallel beam, a source at infinity (`display_sources`); a projector lights a disk on the wall (`projector_sources`).
 """
 
 from __future__ import annotations
@@ -40,14 +41,12 @@ PanelConfig = layouts.LcdConfig | layouts.ProjectorConfig
 class PixelBlocks(NamedTuple):
     """Stars on a display, one for each of M lit blocks.
 
-    Attributes
-    ----------
     star
-        (M,) index of the star; where several fall on one block, of the brightest
+        (M,) index of the star; of several stars on one block the brightest
     corner_px
         (M, 2) column and row of the block's first pixel
     center_px
-        (M, 2) column and row of its center, from the display's center
+        (M, 2) column and row of the block's center, from the display's center
     level
         (M,) transmitted light above that of black, as a fraction of a white block's
     """
@@ -67,9 +66,9 @@ def draw_blocks(config: layouts.PixelsConfig, position_m: Floats, level: Floats)
     Parameters
     ----------
     position_m
-        (N, 2) places on the display along its columns' and its rows' direction, from its center
+        (N, 2) places on the display along the directions of its columns and its rows, from its center
     level
-        (N,) fraction of white; stars on one block add up, to white at most
+        (N,) fractions of white; stars on one block add up, to white at most
     """
     pixels = np.array(config.pixels)
     exact_px = position_m / config.pitch_m + (pixels - 1) / 2 - (config.block - 1) / 2
@@ -82,16 +81,12 @@ def draw_blocks(config: layouts.PixelsConfig, position_m: Floats, level: Floats)
     total = np.minimum(np.bincount(block, level[order], len(first)), 1.0)
     star = order[first]
     center_px = corner[star] + (config.block - 1) / 2 - (pixels - 1) / 2
-    return PixelBlocks(
-        star,
-        corner[star],
-        center_px,
-        gray_transmission(config, total) * (1 - black_transmission(config)),
-    )
+    transmitted = gray_transmission(config, total) * (1 - black_transmission(config))
+    return PixelBlocks(star, corner[star], center_px, transmitted)
 
 
 def black_transmission(config: layouts.PixelsConfig) -> float:
-    """Transmission of a black pixel, as a fraction of white."""
+    """Transmission of a black pixel, as a fraction of white: 1 / contrast, or 0."""
     return 1 / config.contrast if config.contrast else 0.0
 
 
@@ -129,7 +124,7 @@ def panel_surface(config: layouts.LcdConfig, surface: Any) -> Plane:
 
 
 def ideal_led(led: leds.LedConfig) -> leds.LedConfig:
-    """The LED as new, on direct current, without scatter: its strength is the level that a layout assigns to a star."""
+    """The LED as new, on direct current, without scatter: its strength is the level that a layout gives a star."""
     ideal = {
         "drive": leds.DirectConfig(kind="direct"),
         "scatter": 0.0,
@@ -140,7 +135,7 @@ def ideal_led(led: leds.LedConfig) -> leds.LedConfig:
 
 
 def panel_strength_e_s_sr(led: leds.LedConfig, band: Band) -> float:
-    """Strength of a white pixel of a panel, whose backlight ages as one."""
+    """Strength of a white pixel of a panel in photo-electrons s^-1 sr^-1; the backlight ages as one LED."""
     return full_strength_e_s_sr(led, band) * float(aging_factors(led.aging, np.zeros(1))[0])
 
 
@@ -149,14 +144,20 @@ def panel_sources(
 ) -> Sources:
     """Stars on an LCD panel, each a block of n x n equal pixels: n^2 times a pixel's light from n times its width.
 
-    Places and gray levels as in `draw_blocks`. A block is represented by a disk of its area; numbers are those of the
-    stars. Raises InputError for a star nearer to black than to the first gray level.
+    Places and gray levels are those of `draw_blocks`. A block is represented by a disk of its area, with the star's
+    number.
 
     Parameters
     ----------
     stars
-        As LEDs that are always lit, on the panel or near it; they are projected onto it
+        Stars as LEDs that are always lit, on the panel or near it; they are projected onto it
+
+    Raises
+    ------
+    InputError
+        For a star nearer to black than to the first gray level.
     """
+    # In the panel's own frame, and back from the rounded places.
     own_m = panel.lab_from_own.inv().apply(stars.place[:, :3] - panel.center_m)
     blocks = visible_blocks(config, own_m[:, :2], stars.strength / full_strength_e_s_sr(led, band))
     flat_m = np.column_stack([blocks.center_px * config.pitch_m, np.zeros(len(blocks.star))])
@@ -167,7 +168,13 @@ def panel_sources(
 
 
 def visible_blocks(config: PanelConfig, position_m: Floats, level: Floats) -> PixelBlocks:
-    """`draw_blocks`; raises InputError for a star that is nearer to black than to the first gray level."""
+    """`draw_blocks`, without black stars.
+
+    Raises
+    ------
+    InputError
+        For a star nearer to black than to the first gray level.
+    """
     blocks = draw_blocks(config, position_m, level)
     if not np.all(blocks.level > 0):
         raise InputError(
@@ -179,8 +186,17 @@ def visible_blocks(config: PanelConfig, position_m: Floats, level: Floats) -> Pi
 
 
 class LitBlocks(NamedTuple):
-    """M blocks of pixels as they are lit: place and inward normal (M, 3), radius of the disk, and the light of one of
-    their pixels over that of the white pixel `led`."""
+    """M lit blocks of pixels.
+
+    Attributes
+    ----------
+    place_m, normal
+        (M, 3) places, and inward normals of the surface
+    radius_m
+        Radius of the disk that represents a block
+    gain
+        Light of a block's pixel over that of the white pixel `led`
+    """
 
     place_m: Floats
     normal: Floats
@@ -197,16 +213,16 @@ def block_sources(
     patches: LitBlocks,
     row: Floats | float,
 ) -> Sources:
-    """The blocks as sources, n^2 times the light of a pixel each; row : of `DriveInput`."""
+    """The blocks as sources, each with n^2 times the light of a pixel; `row` as in `DriveInput`."""
     rng = random_stream(config.points.hardware_seed)
     count = len(blocks.star)
     # Pixels scatter independently: the mean of n^2 of them scatters by 1 / n as much, and is nearly Gaussian.
-    scatter = strength_factors(
-        led.scatter if config.block == 1 else led.scatter / config.block, rng.standard_normal(count)
-    )
+    spread = led.scatter if config.block == 1 else led.scatter / config.block
+    scatter = strength_factors(spread, rng.standard_normal(count))
     pulses = DRIVES[led.drive.kind](
         led, DriveInput(blocks.level, np.zeros(count, dtype=np.int64), row), rng
     )
+    # n^2 pixels of the panel, each dimmed by scatter, gray level and lens.
     return Sources(
         id=stars.id[blocks.star],
         place=np.column_stack([patches.place_m, np.ones(count)]),
@@ -227,7 +243,7 @@ def block_sources(
 
 
 def lab_from_icrs(config: light.CollimatedDisplayConfig) -> Rotation:
-    """Rotation from ICRS to lab axes: the collimator's axis is lab +z, and roll is the position angle of lab -y."""
+    """Rotation from ICRS to lab axes: the collimator's axis is lab +z, roll is the position angle of lab -y."""
     return star_sources.cam_from_icrs(config.axis_ra_deg, config.axis_dec_deg, config.roll_deg)
 
 
@@ -236,22 +252,29 @@ def display_sources(
 ) -> Sources:
     """Stars on a collimated display: a pixel (x, y) off the axis is a parallel beam along (x, y, focal length).
 
+    1. Apparent directions of the stars, and their places on the display.
+    2. Round to pixels and gray levels.
+    3. The blocks as beams.
+
     Returns Sources in lab axes: points at infinity, or, with config.conjugate_m = D, at D from the bearing's center, so
     that a camera off it by r sees them shifted by r / D. Strength is that of a star of config.brightest_mag and the
     Sun's color, times the gray level; magnitude is the catalog's. Pixels are not resolved.
-    Raises InputError if no star is in the field, and for a star nearer to black than to the first gray level.
 
     Parameters
     ----------
     time
-        UTC, of the apparent places shown
+        UTC of the apparent places that are shown
+
+    Raises
+    ------
+    InputError
+        If no star is in the field, and for a star nearer to black than to the first gray level.
     """
+    # 1.
     stars = stars.to_limit(config.limit_mag)
-    direction = (
-        lab_from_icrs(config).apply(star_sources.apparent(stars, time))
-        if len(stars)
-        else np.zeros((0, 3))
-    )
+    direction = np.zeros((0, 3))
+    if len(stars):
+        direction = lab_from_icrs(config).apply(star_sources.apparent(stars, time))
     in_front = direction[:, 2] > 0
     stars = stars.take(in_front)
     direction = direction[in_front]
@@ -266,6 +289,7 @@ def display_sources(
             "no star of the catalog is on the display to this limit",
             "a fainter one",
         )
+    # 2.
     level = np.minimum(10 ** (-0.4 * (stars.v_mag - config.brightest_mag)), 1.0)
     blocks = draw_blocks(config, on_display_m, level)
     if not np.all(blocks.level > 0):
@@ -275,6 +299,7 @@ def display_sources(
             f"stars of V {stars.v_mag.max():.3g} are black on {config.gray_levels} gray levels",
             f"to {darkest_mag:.3g}",
         )
+    # 3.
     beam = np.column_stack(
         [blocks.center_px * config.pitch_m, np.full(len(blocks.star), config.focal_length_m)]
     )
@@ -287,7 +312,10 @@ def display_sources(
 def beam_sources(
     config: light.CollimatedDisplayConfig, beam: Floats, flux_e_s_m2: Floats, stars: Catalog
 ) -> Sources:
-    """Beams along (N, 3) as steady sources at infinity or, for an imperfect collimator, at config.conjugate_m."""
+    """Beams along (N, 3) as steady sources at infinity or, for an imperfect collimator, at config.conjugate_m.
+
+    At the distance D a source has the strength F D^2, which gives the flux F at the bearing.
+    """
     direction = beam / np.linalg.norm(beam, axis=1, keepdims=True)
     zeros = np.zeros(len(beam))
     ones = np.ones(len(beam))
@@ -312,26 +340,37 @@ def beam_sources(
     )
 
 
-# A projector in the dome: a grid of pixels through a lens onto the matt wall, from a place off the
-# center.
+# A projector in the dome: a grid of pixels through a lens onto the matt wall, from a place off the center. A pixel at
+# the chip's coordinates c is the ray whose tangents t from the axis have c = f t (1 + k t^2). It spans the solid angle
+#
+#     w = (p / f)^2 cos^3(theta) / [(1 + k t^2) (1 + 3 k t^2)]
+#
+# and lights w D^2 / cos(i) of the wall, with the angle theta from the axis, the distance D and the angle of incidence
+# i: so a pixel grows with distance and incidence, and the wall gets darker as E = I cos(i) / D^2, while the light of a
+# pixel as a whole is lost only by the lens, cos^n(theta) (n = 4: natural vignetting). The wall sends it back by its
+# own lobe: a Lambertian wall of reflectance rho that receives the flux F has the intensity rho F / pi along its
+# normal. A point in focus at the depth F along the axis has at the depth z a disk of diameter (f / N) |z - F| / F.
 
 
-NEWTON_STEPS = 12
+NEWTON_STEPS = 12  # of the inversion of the distortion
 
 
 def own_from_lab(config: ProjectorConfig) -> Rotation:
     """Rotation from the lab's axes to the projector's: x along its rows, y along its columns, z along its axis."""
     axis = np.array(config.aim_m) - config.position_m
     axis /= np.linalg.norm(axis)
+    # The rows are level before the rotation about the axis: along lab x, as far as the axis allows.
     right = np.array([1.0, 0.0, 0.0]) - axis[0] * axis
-    right = Rotation.from_rotvec(np.radians(config.rotation_deg) * axis).apply(
-        right / np.linalg.norm(right)
-    )
+    right = right / np.linalg.norm(right)
+    right = Rotation.from_rotvec(np.radians(config.rotation_deg) * axis).apply(right)
     return Rotation.from_matrix(np.array([right, np.cross(axis, right), axis]))
 
 
 def on_chip_m(config: ProjectorConfig, own: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """(N, 2) places on the chip of directions (N, 3) in the projector's axes, and whether they are on its pixels."""
+    """(N, 2) places on the chip of directions (N, 3) in the projector's axes, and (N,) whether they are on its pixels.
+
+    A direction beyond the fold of the distortion, where 1 + 3 k t^2 = 0, is not on them.
+    """
     in_front = own[:, 2] > 0
     tangent = own[:, :2] / np.where(in_front, own[:, 2], np.nan)[:, None]
     tangent2 = np.sum(tangent**2, axis=1, keepdims=True)
@@ -342,7 +381,7 @@ def on_chip_m(config: ProjectorConfig, own: Floats) -> tuple[Floats, NDArray[np.
 
 
 def rays(config: ProjectorConfig, chip_m: Floats) -> Floats:
-    """(N, 3) unit rays in the lab of places (N, 2) on the chip; Newton's method inverts the distortion."""
+    """(N, 3) unit rays in the lab through places (N, 2) on the chip; Newton's method inverts the distortion."""
     radius = np.linalg.norm(chip_m, axis=1) / config.focal_length_m
     tangent = radius
     for _ in range(NEWTON_STEPS if config.distortion else 0):
@@ -350,13 +389,12 @@ def rays(config: ProjectorConfig, chip_m: Floats) -> Floats:
         tangent = tangent - excess / (1 + 3 * config.distortion * tangent**2)
     stretch = np.divide(tangent, radius, out=np.ones_like(radius), where=radius > 0)
     own = np.column_stack([chip_m / config.focal_length_m * stretch[:, None], np.ones(len(chip_m))])
-    return np.asarray(
-        own_from_lab(config).inv().apply(own / np.linalg.norm(own, axis=1, keepdims=True))
-    )
+    own /= np.linalg.norm(own, axis=1, keepdims=True)
+    return np.asarray(own_from_lab(config).inv().apply(own))
 
 
 def pixel_sr(config: ProjectorConfig, cos_axis: Floats) -> Floats:
-    """(N,) solid angle of a pixel at these cosines from the axis."""
+    """(N,) solid angles w of pixels at these cosines from the axis."""
     tangent2 = 1 / cos_axis**2 - 1
     stretch = (1 + config.distortion * tangent2) * (1 + 3 * config.distortion * tangent2)
     return np.asarray((config.pitch_m / config.focal_length_m) ** 2 * cos_axis**3 / stretch)
@@ -365,20 +403,24 @@ def pixel_sr(config: ProjectorConfig, cos_axis: Floats) -> Floats:
 def spot_radius_m(
     config: ProjectorConfig, surface: Surface, chip_m: Floats, place_m: Floats, normal: Floats
 ) -> Floats:
-    """(N,) radius of a uniform disk with the mean square radius of each block's image on the wall.
+    """(N,) radii of uniform disks with the mean square radius of each block's image on the wall.
 
     A parallelogram with the edges a, b has the mean square distance (a^2 + b^2) / 12 from its center, a disk r^2 / 2.
-    The edges are traced. The defocus disk is projected along the ray onto the wall: v to v - (n . v) / (n . u) u.
+
+    1. The edges a, b are traced from the chip to the wall.
+    2. The defocus disk is projected along the ray onto the wall: v to v - (n . v) / (n . u) u.
     """
     position_m = np.array(config.position_m)
     R_own_from_lab = own_from_lab(config).as_matrix()
     ray = rays(config, chip_m)
     square_m2 = np.zeros(len(chip_m))
     half_m = config.block * config.pitch_m / 2
+    # 1. The mean square of a parallelogram as r^2 of a disk: (a^2 + b^2) / 6.
     for axis in np.eye(2):
         ends = [rays(config, chip_m + side * half_m * axis) for side in (1, -1)]
         first_m, last_m = (surface.exit_m(position_m, end)[:, None] * end for end in ends)
         square_m2 += np.sum((first_m - last_m) ** 2, axis=1) / 6
+    # 2. Depth along the axis, and radius of the defocus disk there.
     depth_m = (place_m - position_m) @ R_own_from_lab[2]
     focus_m = config.focus_m or float(np.linalg.norm(np.array(config.aim_m) - position_m))
     blur_m = config.focal_length_m / config.f_number / 2 * np.abs(depth_m / focus_m - 1)
@@ -393,11 +435,15 @@ def projector_sources(
 ) -> Sources:
     """Stars drawn on the nearest blocks of pixels, as disks on the wall where the projector's rays meet it.
 
+    1. Places of the stars on the chip.
+    2. Round to pixels and gray levels. The picture is drawn for the lens's distortion, so a star is off by the rounding
+       alone.
+    3. Trace the pixels to the wall; size and light of their disks there.
+
     Parameters
     ----------
     stars
-        As LEDs that are always lit, on the surface. Numbers are theirs; the picture is drawn
-        for the lens's distortion, so that a star is off by the rounding to pixels alone
+        Stars as LEDs that are always lit, on the surface, with their numbers
 
     Raises
     ------
@@ -410,6 +456,7 @@ def projector_sources(
         raise InputError(
             "light.layout.position", f"{config.position_m} m is outside of the dome", "inside"
         )
+    # 1.
     chip_m, shown = on_chip_m(config, own_from_lab(config).apply(stars.place[:, :3] - position_m))
     if not shown.all():
         raise InputError(
@@ -417,8 +464,10 @@ def projector_sources(
             f"{np.sum(~shown)} of {len(shown)} stars are outside of the projector's picture",
             "a smaller cap_deg, a shorter focal_length, or another position",
         )
+    # 2.
     blocks = visible_blocks(config, chip_m, stars.strength / full_strength_e_s_sr(led, band))
     drawn_m = blocks.center_px * config.pitch_m
+    # 3.
     ray = rays(config, drawn_m)
     place_m = surface.meet(position_m, ray)
     if np.isnan(place_m).any():
@@ -428,17 +477,15 @@ def projector_sources(
     normal = surface.inward(place_m)
     lens_disk_m = spot_radius_m(config, surface, drawn_m, place_m, normal)
     cos_axis = ray @ own_from_lab(config).as_matrix()[2]
-    patches = LitBlocks(
-        place_m, normal, np.hypot(lens_disk_m, led.disk_diameter_m / 2), cos_axis**config.falloff
-    )
+    radius_m = np.hypot(lens_disk_m, led.disk_diameter_m / 2)
+    patches = LitBlocks(place_m, normal, radius_m, cos_axis**config.falloff)
     return block_sources(config, led, band, stars, blocks, patches, 0.0)
 
 
 def white_wall_per_m2(config: ProjectorConfig, place_m: Floats, normal: Floats) -> Floats:
-    """(N,) light of white pixels per area of the wall at places (N, 3), over that of one pixel on the axis, 1/m^2.
+    """(N,) light of white pixels per area of the wall at places (N, 3), over that of one pixel on the axis, in 1/m^2.
 
-    E = I cos(i) / D^2 in units of a pixel's: cos^n(theta) over the area w D^2 / cos(i) that it lights; 0 outside of the
-    picture, and for NaN.
+    cos^n(theta) over the area w D^2 / cos(i) that a pixel lights; 0 outside of the picture, and for NaN.
     """
     sight_m = place_m - np.array(config.position_m)
     own = own_from_lab(config).apply(sight_m)

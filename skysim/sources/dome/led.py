@@ -34,8 +34,8 @@ from skysim.sources.photometry import (
     radiant_strength_e_s_sr,
 )
 
-LIFE_SHARE = 0.7  # of its light that is left of an LED at the end of its life, L70
-COLORS = 129  # wavelengths at which a colored LED's strength is computed
+LIFE_SHARE = 0.7  # fraction of its light that an LED has left at the end of its life, L70
+COLORS = 129  # number of wavelengths at which the strength of a colored LED is computed
 Falloff = Callable[[Floats], Floats]
 
 
@@ -44,6 +44,7 @@ def inverse_square(distance_m: Floats) -> Floats:
     return 1.0 / distance_m**2
 
 
+# Laws by the name in the scene, `led.falloff`.
 FALLOFF: dict[str, Falloff] = {"inverse_square": inverse_square}
 
 
@@ -74,7 +75,7 @@ class Emitter:
     falloff
         A key of FALLOFF
     lobe
-        Its kind is a key of LOBES
+        Section of the scene whose kind is a key of LOBES
     """
 
     falloff: str = "inverse_square"
@@ -93,20 +94,22 @@ def irradiance_e_s_m2(
     cos_incidence: Floats,
     distance_m: Floats,
 ) -> Floats:
-    """Irradiance at the aperture: E = I_0 L(theta) cos(phi) f(d), zero where either surface faces away.
+    """Irradiance at the aperture in photo-electrons s^-1 m^-2: E = I_0 L(theta) cos(phi) f(d).
 
-    The arrays broadcast. Returns photo-electrons s^-1 m^-2.
+    Zero where LED or aperture faces away. The arrays broadcast.
 
     Parameters
     ----------
     strength_e_s_sr
-        photo-electrons s^-1 sr^-1 along the LED's normal
+        I_0, photo-electrons s^-1 sr^-1 along the LED's normal
+    emitter
+        Its lobe L and its falloff f
     cos_emission
-        Of theta, at the LED from its normal; L is the emitter's lobe
+        Cosines of theta, the angle at the LED from its normal
     cos_incidence
-        Of phi, at the aperture from the boresight
+        Cosines of phi, the angle at the aperture from the boresight
     distance_m
-        F is the emitter's falloff
+        Distances d
     """
     facing = (np.asarray(cos_emission) > 0) & (np.asarray(cos_incidence) > 0)
     emitted = LOBES[emitter.lobe.kind](emitter.lobe, cos_emission)
@@ -127,9 +130,9 @@ def full_strength_e_s_sr(led: LedConfig, band: Band) -> float:
 
 
 def color_factors(led: LedConfig, band: Band, normal: Floats) -> Floats:
-    """Strengths of LEDs of other peak wavelengths over the nominal one's, at the same intensity, from normal numbers.
+    """Strengths of LEDs with scattered peak wavelengths over that of the nominal one, at the same intensity.
 
-    They are interpolated between COLORS wavelengths.
+    `normal` (N,) are standard normal numbers. The strengths are interpolated between COLORS wavelengths.
     """
     peak_m, grid_m = peaks_m(led, normal)
     strengths = [
@@ -140,14 +143,14 @@ def color_factors(led: LedConfig, band: Band, normal: Floats) -> Floats:
 
 
 def peaks_m(led: LedConfig, normal: Floats) -> tuple[Floats, Floats]:
-    """(N,) peak wavelengths of LEDs, from standard normal numbers, and COLORS ones from the least to the greatest."""
+    """(N,) peak wavelengths of LEDs from standard normal numbers, and COLORS wavelengths that span them."""
     assert not isinstance(led.spectrum, str)
     peak_m = led.spectrum + scaled_errors(led.color_scatter_m, normal)
     return peak_m, np.linspace(peak_m.min(), peak_m.max(), COLORS)
 
 
 def chromatic_of(led: LedConfig, band: Band, normal: Floats) -> Floats | None:
-    """(N, 4) `Sources.chromatic` of LEDs, from the numbers of `color_factors`; None for a lens without aberration."""
+    """(N, 4) `Sources.chromatic` of LEDs with the numbers of `color_factors`; None for a lens without aberration."""
     if band.chromatic is None:
         return None
     if not led.color_scatter_m:
@@ -160,20 +163,19 @@ def chromatic_of(led: LedConfig, band: Band, normal: Floats) -> Floats | None:
 def strength_factors(scatter: float, normal: Floats) -> Floats:
     """Strengths of LEDs over the nominal one, from standard normal numbers.
 
-    Lognormal with this standard deviation of the logarithm, for which AFIT's Table 2 gives .07 to .09; within a
-    tolerance, 1 plus an error as the tolerance says.
+    exp(scatter g): lognormal with this standard deviation of the logarithm, for which AFIT's Table 2 gives .07 to .09.
+    For a tolerance, 1 plus an error of the tolerance's law.
     """
-    return (
-        1 + scaled_errors(scatter, normal)
-        if isinstance(scatter, Tolerance)
-        else np.exp(scatter * normal)
-    )
+    if isinstance(scatter, Tolerance):
+        return 1 + scaled_errors(scatter, normal)
+    return np.exp(scatter * normal)
 
 
 def aging_factors(aging: AgingConfig | None, normal: Floats) -> Floats:
-    """Light left of LEDs after their hours of operation, from standard normal numbers: exp(-a t) (IES TM-21, eq. 1).
+    """Fraction of light that LEDs have left after their hours of operation: exp(-a t) (IES TM-21, eq. 1).
 
-    a = ln(1 / 0.7) / L70, times the scatter of the rates; the projection's constant B is 1.
+    a = ln(1 / 0.7) / L70, times the scatter of the rates from standard normal numbers; the projection's constant B is
+    1.
     """
     if aging is None:
         return np.ones(len(normal))
@@ -182,7 +184,7 @@ def aging_factors(aging: AgingConfig | None, normal: Floats) -> Floats:
 
 
 def warm_up_factor(warm_up: WarmUpConfig | None, t_s: float) -> float:
-    """Light left of all LEDs t_s after they were switched on, over that of the cold ones."""
+    """Light of all LEDs t_s after they were switched on, over that of the cold ones: s + (1 - s) exp(-t / tau)."""
     if warm_up is None:
         return 1.0
     return warm_up.steady + (1 - warm_up.steady) * exp(-t_s / warm_up.time_s)
@@ -198,7 +200,7 @@ class DriveInput(NamedTuple):
     board
         Number of the board that carries the LED
     row
-        Of a pixel on its panel, from 0 at the top to below 1; 0 for LEDs
+        Position of a pixel's row on its panel, from 0 at the top to below 1; 0 for LEDs
     """
 
     level: Floats
@@ -207,9 +209,9 @@ class DriveInput(NamedTuple):
 
 
 class PulseTrains(NamedTuple):
-    """Output of a drive per LED, (N,): lit from start_s for on_s in every period_s; relative strength while lit.
+    """Output of a drive, (N,) each: an LED is lit from start_s for on_s in every period_s, with a relative strength.
 
-    The times are those of the LED's controller; `clock` is the number of its oscillator (timing/clocks.py).
+    The times are those of the LED's controller; `clock` is the number of its oscillator (`codes.Clocks`).
     """
 
     period_s: Floats
@@ -226,7 +228,7 @@ def direct(_led: LedConfig, inputs: DriveInput, _rng: np.random.Generator) -> Pu
 
 
 def pwm(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTrains:
-    """Hardware PWM: V_avg = D V_max, D = t_on / T (thesis, eqs 35 and 36); T is led.pwm_period_s.
+    """Hardware PWM: V_avg = D V_max, D = t_on / T (thesis, eqs 35 and 36), with T = led.pwm_period_s.
 
     The channels of a board have random phases and share its oscillator.
     """
@@ -241,12 +243,13 @@ def pwm(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTr
 def sequential(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTrains:
     """Software PWM of a controller that lights its LEDs one after another: D_i = t_on,i / sum T (thesis, eq. 37).
 
-    Each LED of a controller has a slot T and is lit for its level of it; the controller's cycle is the sum of its
-    slots. The controllers' phases are random. The microcontroller's own delays are neglected, as in the thesis.
+    Each LED of a controller has a slot T and is lit for the fraction `level` of it; the controller's cycle is the sum
+    of its slots. The controllers' phases are random. The microcontroller's own delays are neglected, as in the thesis.
     """
     drive = led.drive
     count = len(inputs.level)
     assert isinstance(drive, SequentialConfig)
+    # Number of each LED's controller.
     if drive.controller == "board":
         group = inputs.board
     elif drive.controller == "dome":
@@ -256,7 +259,7 @@ def sequential(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> 
     _, controller, led_count = np.unique(group, return_inverse=True, return_counts=True)
     # Number the LEDs of each controller: in the stable order they are consecutive, minus the index of its first.
     order = np.argsort(controller, kind="stable")
-    slot = np.empty(count)  # index of the LED's slot on its controller: 0, 1, ...
+    slot = np.empty(count)  # number of the LED's slot on its controller: 0, 1, ...
     slot[order] = np.arange(count) - np.repeat(np.cumsum(led_count) - led_count, led_count)
     cycle_s = led_count * np.float64(drive.slot_s)
     start_s = rng.uniform(0, cycle_s)[controller] + slot * drive.slot_s
@@ -286,7 +289,7 @@ def refresh(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> Pul
     )
 
 
-# Each takes (the LED section, the drive's input, the hardware's random stream) and returns the pulse trains.
+# Drives by kind: (the LED section, the drive's input, the hardware's random stream) to the pulse trains.
 DRIVES: dict[str, Callable[[LedConfig, DriveInput, np.random.Generator], PulseTrains]] = {
     "direct": direct,
     "pwm": pwm,
@@ -299,25 +302,29 @@ DRIVES: dict[str, Callable[[LedConfig, DriveInput, np.random.Generator], PulseTr
 def lit_moments_s(
     begin_s: float, end_s: float, period_s: float, start_s: float, on_s: float
 ) -> Any:
-    """On-time of a pulse train within [begin, end], s, its mean time and the standard deviation about it.
+    """On-time of a pulse train within [begin, end] in s, its mean time, and the standard deviation about the mean.
 
-    The train is lit from start_s for on_s in every period_s, before and after. The result is exact for any interval:
-    the first and the last pulse are clipped to it; the n complete pulses between them have the moments of a comb, whose
-    centers have the variance period^2 (n^2 - 1) / 12, each pulse adding on^2 / 12. Returns (0, the middle, 0) if it
-    is dark.
+    The train is lit from start_s for on_s in every period_s, before and after. Sums of w, w t and w (t^2 + w^2 / 12)
+    over the pulses, each of width w and center t, are exact for any interval:
+
+    1. The first and the last pulse are clipped to the interval.
+    2. The n complete pulses between them have the moments of a comb, whose centers have the variance
+       period^2 (n^2 - 1) / 12; each pulse adds on^2 / 12.
+
+    Returns (0, the middle, 0) if the interval is dark.
     """
     middle = (begin_s + end_s) / 2
-    if on_s >= period_s:
+    if on_s >= period_s:  # always lit
         return end_s - begin_s, middle, (end_s - begin_s) / sqrt(12.0)
+    # Numbers of the first and the last pulse that are lit within the interval.
     first = floor((begin_s - start_s - on_s) / period_s) + 1
     last = ceil((end_s - start_s) / period_s) - 1
     lit_s = 0.0
     sum1 = 0.0
     sum2 = 0.0
-    # Times are taken from the middle of the interval, where the squares lose the fewest digits.
-    for j in range(
-        first, last + 1, max(last - first, 1)
-    ):  # the two pulses at the ends, or the only one
+    # 1. The two pulses at the ends, or the only one. Times are taken from the middle of the interval, where the squares
+    # lose the fewest digits.
+    for j in range(first, last + 1, max(last - first, 1)):
         edge = max(start_s + j * period_s, begin_s)
         width = min(start_s + j * period_s + on_s, end_s) - edge
         if width > 0:
@@ -325,12 +332,14 @@ def lit_moments_s(
             lit_s = lit_s + width
             sum1 = sum1 + width * center
             sum2 = sum2 + width * (center**2 + width**2 / 12)
+    # 2. The complete pulses in between.
     n = last - first - 1
     if n > 0:
         center = start_s + (first + 1) * period_s + on_s / 2 + (n - 1) * period_s / 2 - middle
         lit_s += n * on_s
         sum1 += n * on_s * center
         sum2 += n * on_s * (center**2 + (period_s**2 * (n * n - 1) + on_s**2) / 12)
+    # Mean, and variance by <t^2> - <t>^2.
     if lit_s <= 0:
         return 0.0, middle, 0.0
     mean = sum1 / lit_s

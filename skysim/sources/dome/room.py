@@ -1,6 +1,6 @@
-"""Whether a dome fits into the room where it is to be built: under the ceiling, between the walls, through the door.
+"""Fit of a dome into the room where it is to be built: under the ceiling, between the walls, through the door.
 
-The shell is sampled along meridians about the vertical through the bearing, from its inner surface and from the outer
+The shell is sampled along meridians about the vertical through the bearing, on its inner surface and on the outer
 one, `thickness` outside. The rim and the apex are among the samples, and between samples 2 deg apart on a meridian a
 shell bulges by 1.5e-4 of its radius at most.
 """
@@ -15,23 +15,25 @@ from numpy.typing import NDArray
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene.sections.light import RoomConfig
-from skysim.sources.dome.surface import Plane, Surface
+from skysim.sources.dome.surface import Plane, Surface, directions
 
 TILTS = 91  # from the zenith to the nadir
 MERIDIANS = 72  # of the whole shell, divisible by 4
 MERIDIANS_OF_PART = 17  # of one part, its edges and its middle included
 BISECTIONS = 40
-TURNS = 91  # of the box about a part, from 0 to 90 deg
+TURNS = 91  # orientations of the box about a part, from 0 to 90 deg
 PROPOSED_SEGMENTS = (2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24)  # in the message about a door
+ALL_ROUND_RAD = np.linspace(
+    0.0, 2 * np.pi, MERIDIANS, endpoint=False
+)  # azimuths of the whole shell
 
 
 def check_room(room: RoomConfig, surface: Surface, cap_deg: float) -> None:
     """Raise InputError, one line with the size and the limit, for a dome that does not fit into the room."""
-    points_m = shell_m(
-        room, surface, cap_deg, np.linspace(0.0, 2 * np.pi, MERIDIANS, endpoint=False)
-    )
+    points_m = shell_m(room, surface, cap_deg, ALL_ROUND_RAD)
     low_m = points_m.min(axis=0)
     high_m = points_m.max(axis=0)
+    # Heights above the floor, if the bearing's height is known.
     if room.bearing_height_m is not None:
         top_m = room.bearing_height_m + high_m[2]
         bottom_m = room.bearing_height_m + low_m[2]
@@ -47,6 +49,7 @@ def check_room(room: RoomConfig, surface: Surface, cap_deg: float) -> None:
                 f"{room.bearing_height_m:.3f} m puts the dome's rim {-bottom_m:.3f} m below the floor",
                 f"{-low_m[2]:.3f} m or more, or a higher rim",
             )
+    # Widths between the walls.
     for axis, (key, limit_m) in enumerate((("width", room.width_m), ("length", room.length_m))):
         if limit_m is not None and high_m[axis] - low_m[axis] > limit_m:
             raise InputError(
@@ -59,32 +62,22 @@ def check_room(room: RoomConfig, surface: Surface, cap_deg: float) -> None:
 
 
 def fit(room: RoomConfig, surface: Surface, cap_deg: float) -> dict[str, Any]:
-    """Size of a dome in its room, m.
+    """Sizes of a dome in its room in m, as a dict.
 
-    Returns
-    -------
-    extent_m
-        (3,) along x, y, z, thickness included
-    top_m, rim_m
-        Above the floor, if the room has bearing_height
-    part_m
-        Sides of the box about the part that fits the door least, ascending, if the room has a
-        door
+    `extent_m`: (3,) along x, y, z, thickness included. `top_m`, `rim_m`: heights above the floor, if the room has
+    bearing_height. `part_m`: sides of the box about the part that fits the door least, ascending, if the room has a
+    door.
     """
-    points_m = shell_m(
-        room, surface, cap_deg, np.linspace(0.0, 2 * np.pi, MERIDIANS, endpoint=False)
-    )
+    points_m = shell_m(room, surface, cap_deg, ALL_ROUND_RAD)
     low_m = points_m.min(axis=0)
     high_m = points_m.max(axis=0)
     found: dict[str, Any] = {"extent_m": (high_m - low_m).tolist()}
     if room.bearing_height_m is not None:
-        found["top_m"], found["rim_m"] = (
-            room.bearing_height_m + float(end_m[2]) for end_m in (high_m, low_m)
-        )
+        found["top_m"] = room.bearing_height_m + float(high_m[2])
+        found["rim_m"] = room.bearing_height_m + float(low_m[2])
     if room.door_m is not None:
-        found["part_m"] = largest_part_m(room, room.door_m, surface, cap_deg, room.segments)[
-            0
-        ].tolist()
+        box_m, _ = largest_part_m(room, room.door_m, surface, cap_deg, room.segments)
+        found["part_m"] = box_m.tolist()
     return found
 
 
@@ -95,6 +88,7 @@ def check_door(
     box_m, ratio = largest_part_m(room, door_m, surface, cap_deg, room.segments)
     if ratio <= 1:
         return
+    # The least number of segments that would fit is part of the message.
     more = [n for n in PROPOSED_SEGMENTS if n > room.segments]
     enough = next(
         (n for n in more if largest_part_m(room, door_m, surface, cap_deg, n)[1] <= 1), None
@@ -114,24 +108,22 @@ def check_door(
 def largest_part_m(
     room: RoomConfig, door_m: tuple[float, float], surface: Surface, cap_deg: float, segments: int
 ) -> tuple[Floats, float]:
-    """Sides of the box about the part that fits the door least, ascending, and how many times too large it is."""
+    """The part of the shell that fits the door least: ascending sides of its box, and its ratio to the door."""
     if segments == 1:
-        whole = np.linspace(0.0, 2 * np.pi, MERIDIANS, endpoint=False)
-        return best_box(shell_m(room, surface, cap_deg, whole), 0.0, door_m)
+        return best_box(shell_m(room, surface, cap_deg, ALL_ROUND_RAD), 0.0, door_m)
     width_rad = 2 * np.pi / segments
     boxes = []
     for part in range(segments):
         azimuth_rad = width_rad * (part + np.linspace(0.0, 1.0, MERIDIANS_OF_PART))
-        boxes.append(
-            best_box(shell_m(room, surface, cap_deg, azimuth_rad), width_rad * (part + 0.5), door_m)
-        )
+        part_m = shell_m(room, surface, cap_deg, azimuth_rad)
+        boxes.append(best_box(part_m, width_rad * (part + 0.5), door_m))
     return max(boxes, key=lambda box: box[1])
 
 
 def best_box(
     points_m: Floats, middle_rad: float, door_m: tuple[float, float]
 ) -> tuple[Floats, float]:
-    """The box about (N, 3) points that goes best through the door: ascending sides, m, and the ratio to the door.
+    """The box about (N, 3) points that goes best through the door: ascending sides in m, and the ratio to the door.
 
     A box goes through if its smallest side is within the door's smaller one and its next within the larger one; the
     ratio is the greater of the two.
@@ -139,13 +131,15 @@ def best_box(
     Parameters
     ----------
     middle_rad
-        Azimuth of the vertical plane in which the box is turned
+        Azimuth of the vertical plane in which the box is turned, that of the part's middle
     """
+    # Axes of the box at each orientation: one stays level, two turn in the vertical plane.
     across = np.array([-np.sin(middle_rad), np.cos(middle_rad), 0.0])
     outward = np.array([np.cos(middle_rad), np.sin(middle_rad), 0.0])
     turn = np.linspace(0, np.pi / 2, TURNS)[:, None]
     first = np.cos(turn) * outward + np.sin(turn) * np.array([0.0, 0.0, 1.0])
     second = -np.sin(turn) * outward + np.cos(turn) * np.array([0.0, 0.0, 1.0])
+    # Sides along the three axes.
     sides_m = np.column_stack([np.ptp(points_m @ axes.T, axis=0) for axes in (first, second)])
     sides_m = np.sort(np.column_stack([sides_m, np.full(TURNS, np.ptp(points_m @ across))]), axis=1)
     ratio = (sides_m[:, :2] / np.sort(door_m)).max(axis=1)
@@ -156,9 +150,16 @@ def best_box(
 def shell_m(room: RoomConfig, surface: Surface, cap_deg: float, azimuth_rad: Floats) -> Floats:
     """(N, 3) points of the shell on meridians of these azimuths about the bearing, inside and outside.
 
-    Each meridian is sampled at equal steps of the angle from the zenith, and at the angles where the shell begins and
-    ends, to 1e-13 rad by bisection. Raises InputError if the shell has no part on the meridians.
+    1. Sample each meridian at equal steps of the angle from the zenith.
+    2. Find the angles where the shell begins and ends, to 1e-13 rad by bisection.
+    3. Add the outer surface.
+
+    Raises
+    ------
+    InputError
+        If the shell has no part on the meridians.
     """
+    # 1. A surface without a rim is cut at the cap.
     ends = (
         np.isfinite(surface.half_m).all()
         if isinstance(surface, Plane)
@@ -170,7 +171,8 @@ def shell_m(room: RoomConfig, surface: Surface, cap_deg: float, azimuth_rad: Flo
     met = meet(surface, tilts, azimuths)
     on_shell = np.isfinite(met[:, 0]).reshape(TILTS, len(azimuth_rad))
     edges = []
-    for step in (1, -1):  # a neighbor that is not on the shell: above, or below
+    # 2. A neighbor that is not on the shell: above, or below.
+    for step in (1, -1):
         inner, column = np.nonzero(on_shell & ~np.roll(on_shell, step, axis=0))
         outer = inner - step
         inside = (outer >= 0) & (outer < TILTS)
@@ -183,20 +185,17 @@ def shell_m(room: RoomConfig, surface: Surface, cap_deg: float, azimuth_rad: Flo
         raise InputError(
             "light.room", "the dome has no shell within cap_deg", "a surface over the bearing"
         )
+    # 3.
     return np.concatenate([points_m, points_m - room.thickness_m * surface.inward(points_m)])
 
 
 def meet(surface: Surface, tilt_rad: Floats, azimuth_rad: Floats) -> Floats:
     """(N, 3) points where rays from the bearing meet the surface; NaN where they miss."""
-    ring = np.sin(tilt_rad)
-    rays = np.column_stack(
-        [ring * np.cos(azimuth_rad), ring * np.sin(azimuth_rad), np.cos(tilt_rad)]
-    )
-    return surface.meet(np.zeros(3), rays)
+    return surface.meet(np.zeros(3), directions(tilt_rad, azimuth_rad))
 
 
 def find_edges(surface: Surface, on_rad: Floats, off_rad: Floats, azimuth_rad: Floats) -> Floats:
-    """(N, 3) last points of the shell between tilts on it and off it, by bisection."""
+    """(N, 3) last points of the shell between tilts on it and tilts off it, by bisection."""
     for _ in range(BISECTIONS):
         middle_rad = (on_rad + off_rad) / 2
         met: NDArray[np.bool_] = np.isfinite(meet(surface, middle_rad, azimuth_rad)[:, 0])

@@ -3,8 +3,7 @@
 Every surface is a level set f(x) = 0 in its own frame, f < 0 inside. The frame's origin is the surface's center; its
 axes are the lab's unless the surface is tilted. A ray from the inside meets the surface where f first becomes zero:
 in closed form for planes and quadrics (`exit_distance`), by safeguarded Newton steps for a radius over
-direction (`Radial`).
-SURFACES maps the scene's `light.surface.kind` to the function that builds the surface.
+direction (`Radial`). SURFACES maps the scene's `light.surface.kind` to the function that builds the surface.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ from skysim.scene.sections import light
 from skysim.sources.dome import point_cloud
 from skysim.sources.dome.point_cloud import FittedEllipsoid, fit_ellipsoid
 
-FLAT_RADIUS_M = 1e6  # of a sphere that is flat to a micrometer within a meter
-# of the samples to which an ellipsoid is fitted
+FLAT_RADIUS_M = 1e6  # radius of a sphere that is flat to a micrometer within a meter
+# Samples to which an ellipsoid is fitted.
 RINGS = 60
 SECTORS = 72
 MAX_STEPS = 200  # of the ray intersection
@@ -35,14 +34,14 @@ SLACK_M = 1e-12  # rounding tolerance that keeps points on the rim within it
 
 @dataclass(frozen=True, slots=True)
 class Rim:
-    """Where a surface ends, in its own frame.
+    """The end of a surface, in its own frame.
 
     Attributes
     ----------
     bearing_m
-        (3,) the bearing's center before the surface was displaced
+        (3,) center of the bearing before the surface was displaced
     lowest_m
-        Height of the lowest point
+        Height of the lowest point of the surface
     half_rad
         Greatest angle from the upright axis, seen from the bearing
     """
@@ -58,6 +57,7 @@ class Rim:
 
     def contains(self, own_m: Floats) -> NDArray[np.bool_]:
         """(N,) whether (N, 3) points in the surface's own frame are within the rim; False for NaN."""
+        # cos(angle) >= cos(half_rad), times the distance from the bearing.
         from_bearing_m = own_m - self.bearing_m
         slack = SLACK_M - np.cos(self.half_rad) * np.linalg.norm(from_bearing_m, axis=1)
         return np.asarray(
@@ -74,11 +74,11 @@ class Surface(ABC):
     center_m
         (3,) origin of its own frame, in the lab
     rim
-        Where it ends
+        The surface's end
     lab_from_own
-        Its tilt
+        The surface's tilt
     survey_sigma_m
-        Standard deviation, along the normal, of the lab's survey of it
+        Standard deviation, along the normal, of the lab's survey of the surface
     """
 
     center_m: Floats
@@ -88,7 +88,7 @@ class Surface(ABC):
 
     @abstractmethod
     def level(self, own_m: Floats) -> Floats:
-        """(N,) level at (N, 3) points in its own frame: negative inside, zero on the surface."""
+        """(N,) level f at (N, 3) points in the surface's own frame: negative inside, zero on the surface."""
 
     @abstractmethod
     def gradient(self, own_m: Floats) -> Floats:
@@ -96,7 +96,7 @@ class Surface(ABC):
 
     @abstractmethod
     def distance(self, start_m: Floats, along: Floats) -> Floats:
-        """(N,) distance at which a ray from the inside leaves, in lengths of `along` (N, 3); NaN if it never does."""
+        """(N,) distance at which a ray from the inside leaves, in lengths of `along` (N, 3); NaN if it never leaves."""
 
     def within(self, own_m: Floats) -> NDArray[np.bool_]:
         """(N,) whether points of the level set belong to the surface."""
@@ -113,7 +113,7 @@ class Surface(ABC):
         return np.asarray(origin_m + np.where(within, distance, np.nan)[:, None] * rays)
 
     def exit_m(self, origin_m: Floats, rays: Floats) -> Floats:
-        """(N,) `distance` of rays in the lab's axes, to the surface or to where it would be beyond its rim."""
+        """(N,) distances of rays in the lab's axes to the surface, or to its continuation beyond the rim."""
         R_lab_from_own = self.lab_from_own.as_matrix()
         return self.distance((origin_m - self.center_m) @ R_lab_from_own, rays @ R_lab_from_own)
 
@@ -124,7 +124,7 @@ class Surface(ABC):
         return np.asarray(-gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
 
     def inside(self, point_m: Floats) -> bool:
-        """Whether a point of the lab, (3,), is inside; the rim is ignored."""
+        """Whether a point (3,) of the lab is inside; the rim is ignored."""
         own = (point_m - self.center_m) @ self.lab_from_own.as_matrix()
         return bool(self.level(own[None])[0] < 0)
 
@@ -134,10 +134,7 @@ class Surface(ABC):
         ring_z = 1 - (np.arange(RINGS) + 0.5) / RINGS * (1 - min_z)
         sectors = np.arange(SECTORS) * (2 * np.pi / SECTORS)
         z, azimuth = (grid.ravel() for grid in np.meshgrid(ring_z, sectors, indexing="ij"))
-        ring = np.sqrt(1 - z**2)
-        rays = self.lab_from_own.apply(
-            np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
-        )
+        rays = self.lab_from_own.apply(unit_vectors(z, azimuth))
         met = self.meet(np.zeros(3), rays)
         return met[np.isfinite(met[:, 0])]
 
@@ -146,13 +143,28 @@ class Surface(ABC):
         return fit_ellipsoid(self.samples_m())
 
     def as_ellipsoid(self) -> tuple[Floats, Floats]:
-        """Center and semi-axes, (3,) each, m, of the ellipsoid that estimators use, see `nearest_ellipsoid`."""
+        """Center and semi-axes of the ellipsoid that estimators use, (3,) each in m: `nearest_ellipsoid`."""
         nearest = self.nearest_ellipsoid()
         return nearest.center_m, nearest.semi_axes_m
 
 
+def unit_vectors(z: Floats, azimuth: Floats) -> Floats:
+    """(N, 3) unit vectors at heights z = cos(angle from +z) and azimuths from +x toward +y, (N,) each."""
+    ring = np.sqrt(1 - z**2)
+    return np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
+
+
+def directions(tilt_rad: Floats, azimuth_rad: Floats) -> Floats:
+    """(..., 3) unit vectors at angles from +z and azimuths from +x toward +y, (...,) each."""
+    ring = np.sin(tilt_rad)
+    return np.stack(
+        [ring * np.cos(azimuth_rad), ring * np.sin(azimuth_rad), np.cos(tilt_rad)], axis=-1
+    )
+
+
 def perpendicular(unit: Floats) -> Floats:
-    """(N, 3) a unit vector perpendicular to each of these unit vectors, along the surface if they are normals."""
+    """(N, 3) one unit vector perpendicular to each of (N, 3) unit vectors; along the surface for its normals."""
+    # The axis on which the vector has its least component is never parallel to it.
     across = np.cross(unit, np.eye(3)[np.abs(unit).argmin(axis=1)])
     return np.asarray(across / np.linalg.norm(across, axis=1, keepdims=True))
 
@@ -160,9 +172,9 @@ def perpendicular(unit: Floats) -> Floats:
 def exit_distance(start: Floats, along: Floats) -> Floats:
     """(N,) the greater root s > 0 of |start + s along| = 1; NaN where there is none.
 
-    With q = |b| + sqrt(b^2 - a c) the greater root is -c / q for b > 0 and q / a otherwise, free of cancellation.
+    a s^2 + 2 b s + c = 0. With q = |b| + sqrt(b^2 - a c) the greater root is -c / q for b > 0 and q / a otherwise, free
+    of cancellation.
     """
-    # a s^2 + 2 b s + c = 0
     a = np.sum(along**2, axis=1)
     b = along @ start
     c = start @ start - 1
@@ -175,7 +187,7 @@ def exit_distance(start: Floats, along: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Ellipsoid(Surface):
-    """sum((x / semi_axes)^2) = 1 in its own frame. A sphere has equal semi-axes."""
+    """An ellipsoid: sum((x / semi_axes)^2) = 1 in its own frame. A sphere has equal semi-axes."""
 
     semi_axes_m: Floats
 
@@ -202,7 +214,7 @@ class Plane(Surface):
     Attributes
     ----------
     half_m
-        (2,) half its extent along its own x and y
+        (2,) half the panel's extent along its own x and y
     """
 
     half_m: Floats = field(default_factory=lambda: np.full(2, np.inf))
@@ -234,14 +246,14 @@ class Plane(Surface):
 
 @dataclass(frozen=True, slots=True)
 class Cylinder(Surface):
-    """sum((x_i / radius)^2) = 1 over the two axes i across, in its own frame.
+    """A cylinder: sum((x_i / radius)^2) = 1 over the two axes i across it, in its own frame.
 
     Attributes
     ----------
     axis
-        0, 1, 2 for its own x, y, z
+        0, 1 or 2 for an axis along its own x, y or z
     half_length_m
-        Half its extent along the axis
+        Half the extent along the axis
     """
 
     radius_m: float
@@ -249,6 +261,7 @@ class Cylinder(Surface):
     half_length_m: float = math.inf
 
     def semi_axes_m(self, along_m: float = math.inf) -> Floats:
+        """Semi-axes of the cylinder as an ellipsoid, of this length along the axis."""
         return np.where(np.arange(3) == self.axis, along_m, self.radius_m)
 
     def level(self, own_m: Floats) -> Floats:
@@ -273,7 +286,7 @@ class Cylinder(Surface):
 
 @dataclass(frozen=True, slots=True)
 class Shell:
-    """Inner radius of a formed wall: r = R - f t(angle), t linear from apex to base and constant beyond.
+    """Inner radius of a formed wall: r = R - f t(angle), with t linear from apex to base and constant beyond.
 
     AFIT's design contour, 48.033 in at the apex and 48.010 in at 40 deg (Padro 2012, sec. 3.7), follows from its
     0.2036 in and 0.25 in of acrylic about R = 48.135 in as the mid-wall radius. With R as the outer radius it does
@@ -283,11 +296,14 @@ class Shell:
     ----------
     max_m
         R, the upper bound of the radius
-    cover_rad
-        Angle from the axis to which the radius is defined
     inner_fraction
-        F, the part of the wall's thickness inside R: 1 if R is the outer radius, 1/2 if the
-        mid-wall's
+        f, the fraction of the wall's thickness inside R: 1 if R is the outer radius, 1/2 if it is the mid-wall's
+    thickness_m
+        Thickness at the apex and at the base
+    base_rad
+        Angle of the base from the axis
+    cover_rad
+        Angle from the axis up to which the radius is defined
     """
 
     max_m: float
@@ -297,14 +313,12 @@ class Shell:
     cover_rad: float = math.pi
 
     def evaluate(self, unit: Floats) -> tuple[Floats, Floats]:
+        """(N,) radius over (N, 3) unit vectors, and (N, 3) its gradient on the unit sphere."""
         ring = np.hypot(unit[:, 0], unit[:, 1])
         angle = np.arctan2(ring, unit[:, 2])
         slope = -self.inner_fraction * (self.thickness_m[1] - self.thickness_m[0]) / self.base_rad
-        radius = (
-            self.max_m
-            - self.inner_fraction * self.thickness_m[0]
-            + slope * np.minimum(angle, self.base_rad)
-        )
+        at_apex = self.max_m - self.inner_fraction * self.thickness_m[0]
+        radius = at_apex + slope * np.minimum(angle, self.base_rad)
         # Unit vector toward greater angles; zero at the apex, where the law has no tangent.
         tangent = np.column_stack(
             [unit[:, :2] * (unit[:, 2] / np.where(ring > 0, ring, np.inf))[:, None], -ring]
@@ -318,8 +332,10 @@ class Radial(Surface):
 
     Attributes
     ----------
+    radius
+        Law of the radius over direction
     fit
-        The measured points that it was fitted to, if any
+        The fit to measured points that gave it, if any
     """
 
     radius: Shell | point_cloud.Zernike
@@ -332,28 +348,37 @@ class Radial(Surface):
         return self.level_and_gradient(own_m)[1]
 
     def level_and_gradient(self, own_m: Floats) -> tuple[Floats, Floats]:
-        """(N,) level |x| - r and (N, 3) its gradient x/|x| - (grad r - its part along x) / |x|."""
+        """(N,) level f = |x| - r and (N, 3) its gradient x/|x| - (grad r less its part along x) / |x|."""
         distance_m = np.linalg.norm(own_m, axis=1, keepdims=True)
-        distance_m = np.where(
-            distance_m > 0, distance_m, np.finfo(float).tiny
-        )  # avoids 0 / 0 at the center
+        # The least positive number avoids 0 / 0 at the center.
+        distance_m = np.where(distance_m > 0, distance_m, np.finfo(float).tiny)
         unit = own_m / distance_m
         radius, slope = self.radius.evaluate(unit)
         across = slope - np.sum(slope * unit, axis=1, keepdims=True) * unit
         return distance_m[:, 0] - radius, unit - across / distance_m
 
     def within(self, own_m: Floats) -> NDArray[np.bool_]:
+        """(N,) whether points are within the rim and in directions for which the radius is defined."""
         cosine = own_m[:, 2] - np.cos(self.radius.cover_rad) * np.linalg.norm(own_m, axis=1)
         return np.asarray(self.rim.contains(own_m) & (cosine >= -SLACK_M))
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
-        """Newton's method within a bracket: the level is negative at its low end and not negative at its high end.
+        """Newton's method within a bracket, for all rays at once.
 
-        The bracket ends on the sphere of the greatest radius. A step is a bisection if Newton's step would leave the
-        bracket or if the last step did not halve the level; so the iteration converges. Raises ArithmeticError if a
-        level larger than a few roundings remains. A ray leaves a convex inside only once; otherwise one of several
-        crossings is found.
+        1. The level is negative at the bracket's low end, the start, and not negative at its high end, on the sphere of
+           the greatest radius.
+        2. The point of the last step replaces one of the ends.
+        3. Take Newton's step, or bisect if that step would leave the bracket or the last step did not halve the level;
+           so the iteration converges.
+
+        A ray leaves a convex inside only once; otherwise one of several crossings is found.
+
+        Raises
+        ------
+        ArithmeticError
+            If a level larger than a few roundings remains.
         """
+        # 1.
         low = np.zeros(len(along))
         high = exit_distance(start_m / self.radius.max_m, along / self.radius.max_m)
         if self.level(start_m[None])[0] >= 0:
@@ -366,8 +391,10 @@ class Radial(Surface):
             unconverged = np.abs(level) > 16 * np.finfo(float).eps * self.radius.max_m
             if not unconverged.any():
                 return distance
+            # 2.
             low = np.where(level < 0, distance, low)
             high = np.where(level > 0, distance, high)
+            # 3.
             slope = np.sum(gradient * along, axis=1)
             step = distance - level / np.where(slope > 0, slope, np.nan)
             newton = (step > low) & (step < high) & (np.abs(level) <= before / 2)
@@ -379,7 +406,10 @@ class Radial(Surface):
 
 
 def pose_and_rim(config: light.SurfaceConfig, center_m: float) -> dict[str, Any]:
-    """Arguments common to all surfaces: center, rim, tilt, survey error. center_m is the height above the bearing."""
+    """Arguments common to all surfaces: center, rim, tilt, survey error.
+
+    center_m is the height of the surface's center above the bearing. Own and lab frame differ by it before the tilt.
+    """
     height_m = getattr(config, "rim_height_m", None)
     half_deg = getattr(config, "rim_deg", None)
     lowest_m = -math.inf if height_m is None else height_m - center_m
@@ -433,7 +463,13 @@ def cylinder(config: light.CylinderSurfaceConfig) -> Surface:
 
 
 def surveyed(config: light.SurveyedSurfaceConfig) -> Surface:
-    """A smooth surface fitted to measured points; tilted about the origin of the points. Raises InputError."""
+    """A smooth surface fitted to measured points, tilted about the origin of the points.
+
+    Raises
+    ------
+    InputError
+        For points that are far from a smooth surface, or do not reach the rim.
+    """
     fit = point_cloud.fit(point_cloud.read(config.file, config.unit), config.degree, config.file)
     if fit.rms_m > config.rms_limit_m:
         raise InputError(
@@ -456,6 +492,7 @@ def surveyed(config: light.SurveyedSurfaceConfig) -> Surface:
     return Radial(radius=fit.radius, fit=fit, **pose)
 
 
+# Surfaces by the name in the scene, `light.surface.kind`.
 SURFACES: dict[str, Callable[[Any], Surface]] = {
     "sphere": sphere,
     "ellipsoid": ellipsoid,
@@ -466,12 +503,12 @@ SURFACES: dict[str, Callable[[Any], Surface]] = {
 
 
 def build_surface(config: light.SurfaceConfig) -> Surface:
-    """The surface that a scene describes.
+    """The surface of a scene.
 
     Raises
     ------
     InputError
-        Unless the bearing's center is inside the surface and sees a part of it.
+        If the bearing's center is outside of the surface or sees no part of it.
     """
     surface = SURFACES[config.kind](config)
     if not surface.inside(np.zeros(3)):
@@ -493,29 +530,30 @@ AREA_SECTORS = 180
 
 
 def cap_area_m2(surface: Surface, cap_deg: float) -> float:
-    """Area of a surface within an angle from the zenith, seen from the bearing, m^2; of a panel with sides all of it.
+    """Area in m^2 of a surface within an angle from the zenith, seen from the bearing.
 
-    A cone of directions of solid angle dW about the unit vector u meets the surface at the distance r, where its inward
-    normal is n, in the area
+    Of a panel with sides it is the whole area. Else a cone of directions of solid angle dW about the unit vector u
+    meets the surface at the distance r, where its inward normal is n, in the area
 
         dA = r^2 dW / -(u . n),
 
     integrated over the cosine of the zenith angle by Gauss and Legendre's rule, and over the azimuth in equal steps,
-    which is exact to rounding for a smooth surface. Beyond a rim there is none, to one part in RINGS.
+    which is exact to rounding for a smooth surface. A rim within the angle is resolved to one part in AREA_RINGS.
     """
     if isinstance(surface, Plane) and np.isfinite(surface.half_m).all():
         return float(np.prod(2 * surface.half_m))
+    # Nodes in the cosine from 1 to that of the cap.
     node, weight = np.polynomial.legendre.leggauss(AREA_RINGS)
     least = np.cos(np.radians(cap_deg))
     cosine = (1 + least) / 2 + (1 - least) / 2 * node
     azimuth = np.arange(AREA_SECTORS) * (2 * np.pi / AREA_SECTORS)
     z, angle = (grid.ravel() for grid in np.meshgrid(cosine, azimuth, indexing="ij"))
-    ring = np.sqrt(1 - z**2)
-    rays = np.column_stack([ring * np.cos(angle), ring * np.sin(angle), z])
+    rays = unit_vectors(z, angle)
     place_m = surface.meet(np.zeros(3), rays)
     met = np.isfinite(place_m[:, 0])
     place_m = place_m[met]
     rays = rays[met]
+    # dA / dW, and the weights dW.
     element_m2 = np.sum(place_m**2, axis=1) / -np.sum(rays * surface.inward(place_m), axis=1)
     solid = np.repeat(weight, AREA_SECTORS)[met] * (1 - least) / 2 * (2 * np.pi / AREA_SECTORS)
     return float(element_m2 @ solid)

@@ -17,15 +17,32 @@ from skysim.core.types import Floats
 from skysim.scene.sections.tracker import SurveyErrorsConfig, TotalStationConfig
 from skysim.sources.dome.surface import Surface
 
-# Errors of a survey of LEDs by a total station: a horizontal direction, a zenith angle and a
-# distance to each.
+# A total station measures a horizontal direction, a zenith angle and a distance to each LED. The station at s sees an
+# LED at p = s + D u, with the distance D and the unit vector u of the direction H and the zenith angle V. Each LED has
+# errors of its own in H, V and D. The set-up has errors that all LEDs share: place, orientation and leveling of the
+# station, scale and zero point of its distances. To first order an LED is displaced by
+#
+#     e_D u + D e_V v + D sin V e_H h          by its own errors,
+#     c + r x (D u) + (m D + z) u              by those of the set-up,
+#
+# with u, v (toward greater V) and h (toward greater H) orthogonal, the station's displacement c, its rotation r
+# (leveling about the lab's x and y, orientation about z), the relative error m of the scale and the error z of the
+# zero point. So the own errors of an LED have the covariance
+#
+#     sigma_D^2 u u' + (D sigma_A)^2 (v v' + sin^2 V h h').
+#
+# (Ghilani 2017, Adjustment Computations, 6th ed., ch. 7: errors of conventional surveys; EDM law sigma^2 = a^2 +
+# (b D)^2. ISO 17123-3 and 17123-4 define the figures of data sheets: 0.5" to 5", 1 mm + 1 ppm or 1.5 ppm to a prism,
+# 2 mm + 2 ppm without.) Part b is an error of the meter's frequency and of the air's refraction, and so common to all
+# LEDs; in a dome it is some micrometers. A direction's error grows as 1 / sin V for sights near the zenith where
+# pointing dominates: `survey.led_sigma`, the target's own, contains pointing.
 
 
 SETUP_ERRORS = 8  # centering 3, leveling 2, orientation, scale, zero point
 
 
 def polar(config: TotalStationConfig, place_m: Floats) -> tuple[Floats, Floats, Floats]:
-    """Horizontal direction from the lab's x toward its y and zenith angle, rad, and distance, m, (N,) each.
+    """Horizontal direction H from the lab's x toward its y and zenith angle V in rad, and distance D in m, (N,) each.
 
     Raises
     ------
@@ -57,7 +74,7 @@ def axes(direction_rad: Floats, zenith_rad: Floats) -> tuple[Floats, Floats, Flo
 
 
 def setup_sigmas(config: TotalStationConfig) -> list[float]:
-    """Sizes of the common errors in SI units: place x, y, z; rotation about x, y, z; scale; zero point."""
+    """Sizes of the common errors: place x, y, z (m); rotation about x, y, z (arcsec); scale (ppm); zero point (m)."""
     level = config.leveling_sigma_arcsec
     orientation = config.orientation_sigma_arcsec
     return [
@@ -70,11 +87,12 @@ def setup_sigmas(config: TotalStationConfig) -> list[float]:
     ]
 
 
-SETUP_UNITS = np.array([1, 1, 1, ARCSEC_RAD, ARCSEC_RAD, ARCSEC_RAD, PPM, 1])  # of setup_sigmas
+# SI units of `setup_sigmas`.
+SETUP_UNITS = np.array([1, 1, 1, ARCSEC_RAD, ARCSEC_RAD, ARCSEC_RAD, PPM, 1])
 
 
 def draw_setup(config: TotalStationConfig, normal: Floats) -> Floats:
-    """(8,) errors of the set-up, SI units, from standard normal numbers (8,)."""
+    """(8,) errors of the set-up in SI units, from standard normal numbers (8,)."""
     drawn = [
         float(scaled_errors(sigma, one))
         for sigma, one in zip(setup_sigmas(config), normal, strict=True)
@@ -83,7 +101,7 @@ def draw_setup(config: TotalStationConfig, normal: Floats) -> Floats:
 
 
 def moved_m(config: TotalStationConfig, place_m: Floats, setup: Floats) -> Floats:
-    """(..., 3) places moved as a rigid body by the set-up's errors: station's place, leveling and orientation."""
+    """(..., 3) places moved as a rigid body by the set-up's errors c and r: station's place, leveling, orientation."""
     station_m = np.array(config.position_m)
     return np.asarray(
         station_m + setup[:3] + Rotation.from_rotvec(setup[3:6]).apply(place_m - station_m)
@@ -91,26 +109,31 @@ def moved_m(config: TotalStationConfig, place_m: Floats, setup: Floats) -> Float
 
 
 def surveyed_m(config: TotalStationConfig, place_m: Floats, own: Floats, setup: Floats) -> Floats:
-    """(N, 3) places in the lab that the survey yields for LEDs at place_m.
+    """(N, 3) places in the lab that the survey yields for LEDs at place_m (N, 3).
+
+    1. Directions, zenith angles and distances of the LEDs, with the errors of each and of the distance meter.
+    2. Places in the station's axes, moved by the set-up's errors.
 
     Parameters
     ----------
     own
-        (N, 3) standard normal numbers of each LED's direction, zenith angle and distance
+        (N, 3) standard normal numbers for each LED's direction, zenith angle and distance
     setup
-        (8,) of `draw_setup`
+        (8,) errors from `draw_setup`
     """
+    # 1.
     direction_rad, zenith_rad, distance_m = polar(config, place_m)
     angles_rad = ARCSEC_RAD * scaled_errors(config.angle_sigma_arcsec, own[:, :2])
     distance_m = (
         distance_m * (1 + setup[6]) + setup[7] + scaled_errors(config.distance_sigma_m, own[:, 2])
     )
+    # 2.
     along, _, _ = axes(direction_rad + angles_rad[:, 0], zenith_rad + angles_rad[:, 1])
     return moved_m(config, np.array(config.position_m) + distance_m[:, None] * along, setup)
 
 
 def station_covariance_m2(config: TotalStationConfig, place_m: Floats) -> Floats:
-    """(N, 3, 3) covariance of each LED's own error, in the lab."""
+    """(N, 3, 3) covariances of the LEDs' own errors: sigma_D^2 u u' + (D sigma_A)^2 (v v' + sin^2 V h h')."""
     direction_rad, zenith_rad, distance_m = polar(config, place_m)
     along, down, across = axes(direction_rad, zenith_rad)
     angle_rad = ARCSEC_RAD * float(config.angle_sigma_arcsec)
@@ -125,7 +148,8 @@ def station_covariance_m2(config: TotalStationConfig, place_m: Floats) -> Floats
 
 
 def station_displacements_m(config: TotalStationConfig, place_m: Floats) -> Floats:
-    """(M, N, 3) displacement of each LED by one standard deviation of each error of the set-up, without those of 0."""
+    """(M, N, 3) displacements of the LEDs by one standard deviation of each error of the set-up that is not 0."""
+    # Fields of a unit error: c along x, y, z; r x (D u) about x, y, z; m D u; z u.
     sight_m = place_m - np.array(config.position_m)
     unit = np.eye(3)
     fields = [np.broadcast_to(axis, sight_m.shape) for axis in unit]
@@ -136,25 +160,24 @@ def station_displacements_m(config: TotalStationConfig, place_m: Floats) -> Floa
     return np.array(chosen).reshape(len(chosen), *place_m.shape)
 
 
+# Random streams, one for each kind of error.
 STREAM = {"leds": 1, "lever": 2, "surface": 3, "sights": 4, "setup": 5, "focal": 6}
 
 
 def standard_normals(seed: int, kind: str, shape: tuple[int, ...]) -> Floats:
-    """Standard normal numbers of that shape; they depend on the seed and the kind of error only."""
+    """Standard normal numbers of a shape, which depend on the seed and the kind of error only."""
     return random_stream(seed, STREAM[kind]).standard_normal(shape)
 
 
 def assumed_m(place_m: Floats, sigma_m: float, seed: int, kind: str) -> Floats:
-    """Surveyed places: the true ones (..., 3) plus an error of this size along each axis; unchanged for 0."""
-    return (
-        place_m + scaled_errors(sigma_m, standard_normals(seed, kind, place_m.shape))
-        if sigma_m
-        else place_m
-    )
+    """Surveyed places: the true places (..., 3) plus an error of sigma_m along each axis; unchanged for 0."""
+    if not sigma_m:
+        return place_m
+    return place_m + scaled_errors(sigma_m, standard_normals(seed, kind, place_m.shape))
 
 
 def surface_seed(config: SurveyErrorsConfig) -> int:
-    """Seed of the surface's survey error."""
+    """Seed of the surface's survey error: surface_seed, or the survey's own."""
     return config.seed if config.surface_seed is None else config.surface_seed
 
 
@@ -166,45 +189,50 @@ def rotate_survey(places_m: Floats, config: SurveyErrorsConfig) -> Floats:
 
 
 def surface_offset_m(surface: Surface, seed: int) -> float:
-    """Offset of the surveyed surface, outward along the normal of the true one, of the size light.surface.error.
+    """Offset of the surveyed surface in m, outward along the normal of the true one.
 
-    One draw for the whole surface (the arm's zero, its probe's radius). Independent errors of a thousand points
-    average out in a fitted ellipsoid.
+    One draw for the whole surface, of the size light.surface.error (the arm's zero, its probe's radius). Independent
+    errors of a thousand points would average out in a fitted ellipsoid.
     """
     return float(scaled_errors(surface.survey_sigma_m, standard_normals(seed, "surface", (1,)))[0])
 
 
 def assumed_leds_m(surface: Surface, place_m: Floats, config: SurveyErrorsConfig) -> Floats:
-    """(N, 3) surveyed LED places: independent errors, the surface's common offset and the rotation of the axes.
+    """(N, 3) surveyed places of the LEDs.
 
-    An instrument adds the errors of its sights and of its set-up.
+    1. The surface's common offset along its normals.
+    2. With an instrument, the errors of its sights and of its set-up.
+    3. Independent errors, and the rotation of the axes.
     """
+    # 1.
     offset_m = surface_offset_m(surface, surface_seed(config))
     displaced_m = place_m - offset_m * surface.inward(place_m) if offset_m else place_m
+    # 2.
     if config.instrument is not None:
         sights = standard_normals(config.seed, "sights", place_m.shape)
         displaced_m = surveyed_m(config.instrument, displaced_m, sights, setup_errors(config))
+    # 3.
     return rotate_survey(assumed_m(displaced_m, config.led_sigma_m, config.seed, "leds"), config)
 
 
 def setup_errors(config: SurveyErrorsConfig) -> Floats:
-    """(8,) errors of the instrument's set-up, drawn."""
+    """(8,) errors of the instrument's set-up, drawn from the survey's seed."""
     assert config.instrument is not None
     drawn = standard_normals(config.seed, "setup", (SETUP_ERRORS,))
     return draw_setup(config.instrument, drawn)
 
 
 def led_covariance_m2(place_m: Floats, config: SurveyErrorsConfig) -> Floats | None:
-    """(N, 3, 3) covariance of each LED's own error; None if it is that of led_sigma alone."""
+    """(N, 3, 3) covariances of the LEDs' own errors; None if they are those of led_sigma alone."""
     if config.instrument is None:
         return None
     return station_covariance_m2(config.instrument, place_m) + config.led_sigma_m**2 * np.eye(3)
 
 
 def across_sigma_m(place_m: Floats, covariance_m2: Floats) -> Floats:
-    """(N,) standard deviation of LEDs across the line from the bearing, per axis, from their (N, 3, 3) covariances.
+    """(N,) standard deviations of LEDs across the line from the bearing, per axis, from their (N, 3, 3) covariances.
 
-    sigma^2 = (trace C - u' C u) / 2, u the direction from the bearing. The error along u hardly moves an image.
+    sigma^2 = (trace C - u' C u) / 2, with the direction u from the bearing. The error along u hardly moves an image.
     """
     along = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
     along_m2 = np.einsum("ni,nij,nj->n", along, covariance_m2, along)
@@ -214,9 +242,9 @@ def across_sigma_m(place_m: Floats, covariance_m2: Floats) -> Floats:
 def common_displacements_m(
     surface: Surface, place_m: Floats, config: SurveyErrorsConfig
 ) -> Floats | None:
-    """(M, N, 3) displacement of each LED by one standard deviation of each error that all share; None without any.
+    """(M, N, 3) displacements of the LEDs by one standard deviation of each error that all share; None without any.
 
-    The survey error of the surface, along its normals, and the errors of the instrument's set-up.
+    These are the survey error of the surface, along its normals, and the errors of the instrument's set-up.
     """
     fields = []
     if surface.survey_sigma_m:
@@ -228,11 +256,17 @@ def common_displacements_m(
 
 
 def assumed_ellipsoid(surface: Surface, config: SurveyErrorsConfig) -> tuple[Floats, Floats]:
-    """Center and semi-axes, (3,) each, m, of the surveyed ellipsoid: the nearest one, longer by `surface_offset_m`.
+    """Center and semi-axes of the surveyed ellipsoid, (3,) each in m.
 
-    That displaces an ellipsoid by sum(a_i n_i^2) / sqrt(sum(a_i^2 n_i^2)) of the offset where the normal is n: by all
-    of it on the axes and on a sphere, and never by less than 2 sqrt(a b) / (a + b), a and b its longest and shortest
-    semi-axis. An instrument's set-up moves it as a rigid body. Raises InputError if a semi-axis is not positive.
+    The nearest ellipsoid, with semi-axes longer by the offset `surface_offset_m`. That displaces an ellipsoid by
+    sum(a_i n_i^2) / sqrt(sum(a_i^2 n_i^2)) of the offset where the normal is n: by all of it on the axes and on a
+    sphere, and never by less than 2 sqrt(a b) / (a + b), with a and b its longest and shortest semi-axis. An
+    instrument's set-up moves it as a rigid body.
+
+    Raises
+    ------
+    InputError
+        If a semi-axis is not positive.
     """
     center_m, semi_axes_m = surface.as_ellipsoid()
     assumed_axes_m = semi_axes_m + surface_offset_m(surface, surface_seed(config))

@@ -30,9 +30,8 @@ from skysim.sources.dome.layouts.placing import (
 from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band
 
-DARTS_PER_SPACING2 = (
-    100  # random points per spacing^2: a gap of .03 of that area is found with probability .95
-)
+# Random points per spacing^2: a gap of .03 of that area is found with probability .95.
+DARTS_PER_SPACING2 = 100
 MAX_DARTS = 3_000_000
 DARTS_PER_LED = 30  # random points per LED, if a count is given
 UNDIMMED = {
