@@ -168,9 +168,8 @@ def browser_cpu_s() -> float:
 
 def reached(url: str) -> None:
     """Wait until a server responds at the address. Raises TimeoutError."""
-    opener = urllib.request.build_opener(
-        urllib.request.HTTPCookieProcessor()
-    )  # the token is passed on as a cookie
+    # The token is passed on as a cookie.
+    opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
     end = time.monotonic() + WARM_S
     while time.monotonic() < end:
         with suppress(OSError):
@@ -431,9 +430,8 @@ def crowd(tabs: Any, other: Any, server: Server) -> list[dict[str, Any]]:
     begin = time.monotonic()
     others[0].close()
     shown(others[WORKERS_LIMIT - 1])
-    waited_s = (
-        time.monotonic() - begin - RECONNECT_S
-    )  # in which the closed page could have come back
+    # In which the closed page could have come back.
+    waited_s = time.monotonic() - begin - RECONNECT_S
     for page in (first, *others[1:]):
         page.close()
     median = float(np.median(alone))

@@ -103,7 +103,6 @@ def cam_from_icrs(ra_rad: float, dec_rad: float, roll_rad: float) -> Rotation:
     boresight = [cd * ca, cd * sa, sd]
     s = math.sin(roll_rad)
     c = math.cos(roll_rad)
-    seen: Floats = np.array(
-        [[-s, -c, 0.0], [-c, s, 0.0], [0.0, 0.0, 1.0]]
-    )  # of north, east and the boresight
+    # Of north, east and the boresight.
+    seen: Floats = np.array([[-s, -c, 0.0], [-c, s, 0.0], [0.0, 0.0, 1.0]])
     return Rotation.from_matrix(seen.T @ np.array([north, east, boresight]))

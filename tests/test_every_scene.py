@@ -110,9 +110,8 @@ def test_the_light_of_the_sources_is_on_the_frame(flown: Flown) -> None:
     """
     detector_config = flown.scene.camera.detector
     step_e = detector_config.full_well_e / 60000
-    offset_dn = (
-        detector_config.offset_dn * detector_config.gain_e_dn / step_e
-    )  # the same in electrons, or noise would be cut off at 0
+    # The same in electrons, or noise would be cut off at 0.
+    offset_dn = detector_config.offset_dn * detector_config.gain_e_dn / step_e
     fine = {"bits": "16", "gain_e_dn": str(step_e), "offset_dn": str(offset_dn)}
     fine = {f"camera.detector.{key}": value for key, value in fine.items()}
     flight = simulate_motion(scene_of(flown.scene.name, 1, **fine))
@@ -162,9 +161,8 @@ def test_the_first_frames_are_solved_correctly(flown: Flown) -> None:
     assert len(flown.shots) == 2
     for shot in flown.shots:
         answer = shot.report.attitude
-        if (
-            flown.scene.name in SHOWN
-        ):  # seen, each where it is, to half a pixel; two alone are no attitude
+        # Seen, each where it is, to half a pixel; two alone are no attitude.
+        if flown.scene.name in SHOWN:
             found_px = shot.report.centroids.xy_px
             seen_px = shot.truth.sources.xy_px
             apart_px = np.linalg.norm(found_px[:, None] - seen_px, axis=2)

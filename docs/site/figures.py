@@ -46,11 +46,8 @@ from skysim.sources.satellites import GHOST, MIRRORED
 mpl.rcParams.update(
     {"svg.fonttype": "none", "svg.hashsalt": "skysim", "font.family": "sans-serif", "font.size": 11}
 )
-LABEL_BOX = {
-    "facecolor": "white",
-    "edgecolor": "none",
-    "pad": 1.0,
-}  # an opaque background for labels
+# An opaque background for labels.
+LABEL_BOX = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
 INK = "#333333"
 LAB = "#666666"
 BODY = "#1f6fb2"
@@ -219,9 +216,8 @@ def roll(path: Path) -> None:
             ORION, optics.project(cam_from_icrs.apply(directions[rows])), strict=True
         ):
             if name not in ("Alnilam", "Mintaka"):
-                side = (
-                    -1 if name in ("Betelgeuse", "Alnitak") else 1
-                )  # where no arrow and no star stands
+                # Where no arrow and no star stands.
+                side = -1 if name in ("Betelgeuse", "Alnitak") else 1
                 ax.annotate(
                     name,
                     place,

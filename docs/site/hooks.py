@@ -24,9 +24,8 @@ BLOCK = re.compile(r'<div class="math">(.*?)</div>', re.DOTALL)
 INLINE = re.compile(r"\$<code>(.*?)</code>\$", re.DOTALL)
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".xml": "xml", ".json": "json", ".csv": "text"}
 
-repository_paths: dict[
-    str, str
-] = {}  # path in the repository of each Markdown page, by its path in the site
+# Path in the repository of each Markdown page, by its path in the site.
+repository_paths: dict[str, str] = {}
 
 
 def on_files(files: Any, config: Any) -> Any:

@@ -37,9 +37,8 @@ from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids, RateEstimate
 
 SHORT_STREAK_PX = 1.5  # standard deviation of a streak that is too short to be measured
-SLOW_RAD_S = np.radians(
-    0.5
-)  # standard deviation of a rate without streaks, if the exposure is unknown
+# Standard deviation of a rate without streaks, if the exposure is unknown.
+SLOW_RAD_S = np.radians(0.5)
 SMALL_SHEAR_PX = (
     1.0  # shear at the first and last row that is tried before the full range of slow rates
 )

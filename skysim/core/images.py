@@ -53,14 +53,10 @@ MAX_COLUMNS = 999  # of a table (FITS standard 4.0, section 7.3.1)
 TILES_CPU_S = 10
 TILES_BYTES = 1 << 31
 EXPOSURE_KEYS = ("EXPTIME", "EXPOSURE")  # seconds
-TEMPERATURE_KEYS = (
-    "CCD-TEMP",
-    "DET-TEMP",
-)  # of the chip, degrees Celsius: conventions of imaging programs
-TOP_DOWN = {
-    "TOP-DOWN": True,
-    "BOTTOM-UP": False,
-}  # values of ROWORDER, which is a convention of imaging programs
+# Of the chip, degrees Celsius: conventions of imaging programs.
+TEMPERATURE_KEYS = ("CCD-TEMP", "DET-TEMP")
+# Values of ROWORDER, which is a convention of imaging programs.
+TOP_DOWN = {"TOP-DOWN": True, "BOTTOM-UP": False}
 
 
 class FitsImage(NamedTuple):
@@ -108,9 +104,8 @@ def read_fits_image(path: Path) -> FitsImage:
                     pixels = np.ascontiguousarray(hdu.data.astype(hdu.data.dtype.newbyteorder("=")))
                 else:
                     place = hdu.fileinfo()
-                    check_header(
-                        path, file, place["datLoc"] + place["datSpan"]
-                    )  # the next one, before it is opened
+                    # The next one, before it is opened.
+                    check_header(path, file, place["datLoc"] + place["datSpan"])
                     continue
                 return FitsImage(
                     channels_last(path, pixels), *header_values(hdu.header, hdus[0].header)

@@ -43,9 +43,8 @@ class StrictLoader(yaml.SafeLoader):
     def __init__(self, text: str) -> None:
         super().__init__(text)
         self.depth = self.nodes = 0
-        self.size: dict[
-            int, int
-        ] = {}  # number of nodes in each completely composed node, by its id
+        # Number of nodes in each completely composed node, by its id.
+        self.size: dict[int, int] = {}
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """As in SafeLoader, with the limits."""

@@ -137,9 +137,10 @@ def ideal_increments(
         raise InputError("imu", f"{len(t_s)} samples of the motion", "two or more")
     first_s = np.min(ends_s, initial=np.inf) - step_s
     last_s = np.max(ends_s, initial=-np.inf)
+    # Also rejects NaN.
     if len(ends_s) and not (
         t_s[0] - TIME_TOLERANCE_S <= first_s and last_s <= t_s[-1] + TIME_TOLERANCE_S
-    ):  # also rejects NaN
+    ):
         raise InputError(
             "imu",
             f"samples from {first_s:.6f} to {last_s:.6f} s",
@@ -410,7 +411,13 @@ def accelerometer_triad(config: AccelerometerConfig, hardware: Floats, start: Fl
 
 
 def response_matrix(scale_ppm: float, misalignment_arcsec: float, normal: Floats) -> Floats:
-    """(3, 3) response: 1 + scale error on the diagonal, the sensors' misalignments off it; normal : (3, 3) draws."""
+    """(3, 3) response: 1 + scale error on the diagonal, the sensors' misalignments off it
+
+    Parameters
+    ----------
+    normal
+        (3, 3) draws.
+    """
     scale = PPM * scaled_errors(scale_ppm, normal)
     tilt_rad = ARCSEC_RAD * scaled_errors(misalignment_arcsec, normal)
     return np.eye(3) + np.where(np.eye(3) > 0, scale, tilt_rad)

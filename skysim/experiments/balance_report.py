@@ -144,7 +144,13 @@ def filter_rows(one: Iteration, assumptions: Assumptions) -> list[dict[str, Any]
 
 
 def balance_report(statistics: dict[str, Any], picture: bytes, command: str) -> Report:
-    """The report of a balance. picture : see `balance_figure`, PNG"""
+    """The report of a balance.
+
+    Parameters
+    ----------
+    picture
+        See `balance_figure`, PNG
+    """
     blocks = [
         verdict(statistics),
         Facts(

@@ -244,9 +244,8 @@ def run_lengths(mask: NDArray[Any], least: float = True) -> list[int]:
     """
     rows = np.flatnonzero(mask.max(axis=1) >= least)  # most have no pixel that is set
     y, x = np.nonzero(mask[rows] >= least)
-    flat = np.sort(
-        x * len(mask) + rows[y]
-    )  # a copy of the transposed mask would take ten times longer
+    # A copy of the transposed mask would take ten times longer.
+    flat = np.sort(x * len(mask) + rows[y])
     if not len(flat):
         return [mask.size]
     breaks = np.flatnonzero(np.diff(flat) != 1)

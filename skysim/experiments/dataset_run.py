@@ -48,9 +48,8 @@ from skysim.experiments.study.plan import (
 
 
 KEYS = ("schema", "set", "trial", "factors", "hardware")  # of a file of variations
-AS_IT_IS: dict[str, Any] = {
-    "variation": {"levels": {"none": {}}}
-}  # factors of a scene without variations
+# Factors of a scene without variations.
+AS_IT_IS: dict[str, Any] = {"variation": {"levels": {"none": {}}}}
 TRACKED = f"{TRIAL}tracked"
 DRAW = (
     2  # first of the four numbers of a draw's key; seeds of trials and of hardware have up to three
@@ -400,7 +399,6 @@ def run(
             progress.failed += len(plan.frames_of(result.shard)) if result.error else 0
         if watch:
             watch(progress)
-    storage.prepare(
-        folders_of(plan)
-    )  # workers of a killed run may have been writing when this one began
+    # Workers of a killed run may have been writing when this one began.
+    storage.prepare(folders_of(plan))
     return progress

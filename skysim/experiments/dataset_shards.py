@@ -336,9 +336,8 @@ def mask_box(counts: list[int], height: int) -> list[float]:
     last = ends[1::2] - 1
     x0 = int(first[0] // height)
     x1 = int(last[-1] // height)
-    whole = (
-        first // height != last // height
-    )  # a run over the end of a column has its first and its last row
+    # A run over the end of a column has its first and its last row.
+    whole = first // height != last // height
     y0 = 0 if whole.any() else int((first % height).min())
     y1 = height - 1 if whole.any() else int((last % height).max())
     return [float(x0), float(y0), float(x1 - x0 + 1), float(y1 - y0 + 1)]

@@ -75,9 +75,8 @@ def normalized_error_squared(
 
 CONFIDENCE = 0.95
 TAILS = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2  # probabilities below the ends of an interval
-SIGMAS = float(
-    scipy.special.ndtri((1 + CONFIDENCE) / 2)
-)  # half of the interval of a normal variable, in sigmas
+# Half of the interval of a normal variable, in sigmas.
+SIGMAS = float(scipy.special.ndtri((1 + CONFIDENCE) / 2))
 RESAMPLES = 999
 MANY_VALUES = 2000  # beyond, the bootstrap is `bootstrap_of_many`
 EXTREMES = 50  # values that it draws one by one, at most
@@ -284,9 +283,8 @@ def quantile_ranks(count: int, probability: float) -> tuple[int, int] | None:
     spread = math.sqrt(count * probability * (1 - probability))
     first = max(int(middle - RANK_SIGMAS * spread) - 1, 0)
     last = min(int(middle + RANK_SIGMAS * spread) + 2, count - 1)
-    below = scipy.stats.binom.cdf(
-        np.arange(first, last + 1), count, probability
-    )  # B(r - 1) of each rank r, from 1
+    # B(r - 1) of each rank r, from 1.
+    below = scipy.stats.binom.cdf(np.arange(first, last + 1), count, probability)
     highs = np.searchsorted(below, below + (CONFIDENCE - 1e-12))
     lows = np.flatnonzero(highs < len(below))
     if not len(lows):
@@ -364,12 +362,8 @@ QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
 }
 
 
-MORE_IS_BETTER = (
-    "stars",
-    "detected",
-    "matched",
-    "availability",
-)  # quantities; of others less is better
+# Quantities; of others less is better.
+MORE_IS_BETTER = ("stars", "detected", "matched", "availability")
 # Quantities that are responses by themselves, with the statistic that this name stands for.
 DEFAULT_STATISTICS = {"nees": "mean", "centroid_px": "rms", "streak_px": "median"}
 
@@ -409,9 +403,8 @@ def mismatched(c: Columns) -> Summary:
     Matches of one frame are not independent, so it has no interval.
     """
     known = np.isfinite(c["wrong_matches"]) & np.isfinite(c["matched"])
-    matches = np.sum(
-        c["matched"][known] * c["frames"][known]
-    )  # `matched` is a mean over the frames of a flight
+    # `matched` is a mean over the frames of a flight.
+    matches = np.sum(c["matched"][known] * c["frames"][known])
     if not matches:
         return NO_VALUE
     return Summary(

@@ -40,14 +40,28 @@ FENCE = re.compile(r"^`{3,}", re.MULTILINE)
 
 
 def markdown_page(title: str, command: str, blocks: Sequence[Block], pictures: str = "") -> str:
-    """The page. pictures : what the paths of the figures begin with; they are left out without it"""
+    """The page.
+
+    Parameters
+    ----------
+    pictures
+        What the paths of the figures begin with; they are left out without it
+    """
     begin = [Code(command, "sh")] if command else []
     names = iter([pictures + name for name, _ in figure_files(blocks)] if pictures else [])
     return "\n\n".join(paragraphs(Section(title, [*begin, *blocks]), 1, names)) + "\n"
 
 
 def paragraphs(block: Block, level: int, names: Iterator[str]) -> Iterator[str]:
-    """A block's paragraphs. level : of a section's heading;  names : of the figures from this one on"""
+    """A block's paragraphs.
+
+    Parameters
+    ----------
+    level
+        Of a section's heading
+    names
+        Of the figures from this one on
+    """
     match block:
         case Section(title=title, folded=folded):
             opened = (
@@ -292,15 +306,8 @@ PRINTERS: dict[type[Block], Callable[[Any], None]] = {
 
 
 SUFFIXES = (".html", ".md", ".json")
-LOOKS = (
-    "folded",
-    "id",
-    "image",
-    "kind",
-    "name",
-    "on_terminal",
-    "optional",
-)  # fields that JSON leaves out
+# Fields that JSON leaves out.
+LOOKS = ("folded", "id", "image", "kind", "name", "on_terminal", "optional")
 
 
 @dataclass(frozen=True)
@@ -334,7 +341,13 @@ class Report:
         return html_page(self.title, self.command, self.version, self.blocks)
 
     def markdown(self, pictures: str = "") -> str:
-        """A Markdown page. pictures : what the paths of its figures begin with; without it they are left out"""
+        """A Markdown page.
+
+        Parameters
+        ----------
+        pictures
+            What the paths of its figures begin with; without it they are left out
+        """
         return markdown_page(self.title, self.command, self.blocks, pictures)
 
     def json(self) -> dict[str, Any]:

@@ -68,7 +68,13 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Block:
-    """A part of a report. on_terminal : whether it is printed too, and not on the page alone"""
+    """A part of a report.
+
+    Attributes
+    ----------
+    on_terminal
+        Whether it is printed too, and not on the page alone
+    """
 
     on_terminal: bool = True
 
@@ -129,7 +135,15 @@ class Table(Block):
 
 @dataclass(frozen=True)
 class Figure(Block):
-    """An image. kind : png, jpeg or gif;  name : of its file, without suffix; numbered if left out"""
+    """An image.
+
+    Attributes
+    ----------
+    kind
+        Png, jpeg or gif
+    name
+        Of its file, without suffix; numbered if left out
+    """
 
     image: bytes
     caption: str

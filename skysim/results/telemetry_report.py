@@ -46,9 +46,8 @@ def summary(log: Telemetry) -> dict[str, float]:
     if pointing is not None:
         statistics |= {"pointing_deg_worst": pointing.max(), "pointing_deg_end": pointing[-1]}
         statistics["torque_nm_worst"] = np.abs(log.torque_nm).max()
-    controlled = (
-        log.lab_from_ref is not None
-    )  # a prescribed motion leaves wheels and gimbals as they were
+    # A prescribed motion leaves wheels and gimbals as they were.
+    controlled = log.lab_from_ref is not None
     if controlled and (log.wheel_rad_s.size or log.gimbal_rad.size):
         statistics["momentum_nms_worst"] = np.linalg.norm(log.momentum_nms, axis=1).max()
     if controlled and log.wheel_rad_s.size:

@@ -194,10 +194,8 @@ def over_base(
     return merge(base, own)
 
 
-REPLACING = (
-    "camera.preset",
-    "motion.start",
-)  # keys that remove others of the base, see `over_base`
+# Keys that remove others of the base, see `over_base`.
+REPLACING = ("camera.preset", "motion.start")
 
 
 def undefined_keys(section: dict[str, Any], defined: dict[str, Any]) -> dict[str, Any]:

@@ -154,9 +154,8 @@ def test_each_cause_of_a_refusal_is_named(change: Change, fov_deg: float, says: 
     "length_px", [60, 90]
 )  # at 100, one noise in ten leaves too few; at 150, two in three
 def test_long_trails_are_solved_at_the_true_attitude(length_px: int) -> None:
-    centered = trail(length_px)[
-        : length_px // 2 + 1
-    ]  # the whole kernel would move the stars by a quarter of its side
+    # The whole kernel would move the stars by a quarter of its side.
+    centered = trail(length_px)[: length_px // 2 + 1]
     report, _ = plate_solver.solve_array(
         spread(centered)(photograph()), make_solver(FOV_DEG, None), None
     )

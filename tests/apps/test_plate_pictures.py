@@ -153,9 +153,8 @@ def test_exif_gives_the_field_by_the_diagonal(
     assert focal_35mm == 133
     assert search[0] < 3 < 99 < search[1]
     assert narrow < 0.93 * FOV_DEG < 1.07 * FOV_DEG < wide
-    assert math.sqrt(narrow * wide) == pytest.approx(
-        FOV_DEG, rel=0.01
-    )  # the longer side would be 4 % off
+    # The longer side would be 4 % off.
+    assert math.sqrt(narrow * wide) == pytest.approx(FOV_DEG, rel=0.01)
 
 
 @pytest.mark.parametrize("focal_35mm", [133, 138])
@@ -180,9 +179,8 @@ def test_both_ways_to_convert_a_focal_length_are_within_its_uncertainty(
 
 def test_trackers_are_cached_by_their_uncertainty(gray: NDArray) -> None:
     default_solver = plate_solver.make_solver(20.0, None)
-    by_exif = solver.replace(
-        default_solver, fov_uncertainty=0.1
-    )  # of the same picture: they share their trackers' cache
+    # Of the same picture: they share their trackers' cache.
+    by_exif = solver.replace(default_solver, fov_uncertainty=0.1)
     first, second, again = (
         next(one.trackers(640, 480, None)) for one in (default_solver, by_exif, default_solver)
     )

@@ -198,12 +198,10 @@ def test_scattered_moonlight_decreases_to_90_degrees_and_vanishes_without_air() 
     rho = np.linspace(0.3, 90, 2000)
     assert (np.diff(moonlight_nl(rho, 10.0, 0.172, 45.0, 30.0)) < 0).all()
     assert not moonlight_nl(rho, 10.0, 0.0, 45.0, 30.0).any()
-    assert (
-        np.abs(np.diff(np.log(scattering(rho)))[rho[1:] > 5]).max() < 0.02
-    )  # no step where the laws change
-    assert scattering(2.0) / scattering(4.0) == pytest.approx(
-        4, rel=0.1
-    )  # 1 / rho^2 and a little Rayleigh
+    # No step where the laws change.
+    assert np.abs(np.diff(np.log(scattering(rho)))[rho[1:] > 5]).max() < 0.02
+    # 1 / rho^2 and a little Rayleigh.
+    assert scattering(2.0) / scattering(4.0) == pytest.approx(4, rel=0.1)
     assert scattering(0.0) == scattering(0.26)
 
 

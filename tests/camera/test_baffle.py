@@ -67,9 +67,8 @@ def test_the_sun_s_light_is_its_irradiance_times_the_transmittance() -> None:
     assert 40 < angle_deg < 50
     wavelength_m = np.linspace(100e-9, 100e-6, 400_001)
     power = wavelength_m**-5 / np.expm1(0.014387769 / (wavelength_m * 5772))
-    power *= (
-        1361 / integrate.simpson(power, x=wavelength_m) / 1.0165**2
-    )  # aphelion was ten days later
+    # Aphelion was ten days later.
+    power *= 1361 / integrate.simpson(power, x=wavelength_m) / 1.0165**2
     response = np.interp(
         wavelength_m, lab.camera.band.wavelength_m, lab.camera.band.response, left=0, right=0
     )

@@ -71,9 +71,8 @@ def test_a_track_s_image_has_the_length_of_depth_times_tangent() -> None:
     tracks = draw_tracks(protons(), SHAPE, 1.0, PIXEL_M, np.random.default_rng(3))
     along = np.hypot(tracks["end_x_px"] - tracks["x_px"], tracks["end_y_px"] - tracks["y_px"])
     np.testing.assert_allclose(np.hypot(along * PIXEL_M, 10e-6), tracks["length_m"], rtol=1e-12)
-    assert np.median(along) == pytest.approx(
-        1.0, abs=4 * 1.0 / np.sqrt(len(tracks))
-    )  # 45 degrees, 10 um, 10 um
+    # 45 degrees, 10 um, 10 um.
+    assert np.median(along) == pytest.approx(1.0, abs=4 * 1.0 / np.sqrt(len(tracks)))
 
 
 def test_the_most_probable_charge_follows_from_the_path_length() -> None:
@@ -114,9 +113,8 @@ def test_charge_is_spread_evenly_along_the_track() -> None:
     deposit(image, np.array([[20.0, 20.0, 120.0, 20.0]]), np.array([1000.0]), 0.5)
     columns = image.sum(axis=0)
     rows = image.sum(axis=1)
-    np.testing.assert_allclose(
-        columns[25:116], 10.0, rtol=0.02
-    )  # whole steps are no whole part of a pixel
+    # Whole steps are no whole part of a pixel.
+    np.testing.assert_allclose(columns[25:116], 10.0, rtol=0.02)
     assert np.average(np.arange(141), weights=columns) == pytest.approx(70.0, abs=1e-6)
     share = np.diff(stats.norm.cdf(np.arange(42) - 0.5, 20.0, 0.5))
     np.testing.assert_allclose(rows / 1000, share, rtol=0, atol=1e-8)
@@ -130,9 +128,8 @@ def test_diffusion_widens_the_cloud() -> None:
         image = np.zeros((61, 61))
         deposit(image, np.array([[30.0, 30.0, 30.0, 30.0]]), np.array([1.0]), sigma_px)
         spots.append(image.sum(axis=0) @ (np.arange(61) - 30.0) ** 2)
-    np.testing.assert_allclose(
-        spots, [0.49 + 1 / 12, 2.25 + 1 / 12], rtol=1e-3
-    )  # Sheppard: the pixel's own 1/12
+    # Sheppard: the pixel's own 1/12.
+    np.testing.assert_allclose(spots, [0.49 + 1 / 12, 2.25 + 1 / 12], rtol=1e-3)
 
 
 @pytest.mark.slow

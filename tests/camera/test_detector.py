@@ -223,9 +223,8 @@ def test_the_gain_divides_and_the_offset_adds(gain: float) -> None:
 def test_the_amplifier_has_its_declared_nonlinearity_at_full_well() -> None:
     bent = {"nonlinearity": 0.05, "full_well_e": 40000.0}
     for mean_e in (4000.0, 20000.0, 36000.0):
-        wanted = (
-            mean_e * (1 - 0.05 * mean_e / 40000) - 0.05 * mean_e / 40000
-        )  # <e^2> is mean^2 + mean
+        # <e^2> is mean^2 + mean.
+        wanted = mean_e * (1 - 0.05 * mean_e / 40000) - 0.05 * mean_e / 40000
         assert frame(mean_e, **bent).mean() - 1000 == pytest.approx(
             wanted, abs=4 * np.sqrt(mean_e / N)
         )
@@ -369,9 +368,8 @@ def test_the_mean_of_many_frames_is_the_frame_without_noise() -> None:
     quiet = frame(1234.5, noise=False, **settings)
     mean = np.mean([frame(1234.5, seed, **settings) for seed in range(40)], axis=0)
     sigma = np.sqrt((1234.5 + 10 + 100) / 25 + 1 / 12) / np.sqrt(40)
-    assert ((mean - quiet) / sigma).std() == pytest.approx(
-        1, abs=0.15
-    )  # hot pixels and PRNU change sigma a little
+    # Hot pixels and PRNU change sigma a little.
+    assert ((mean - quiet) / sigma).std() == pytest.approx(1, abs=0.15)
     assert (mean - quiet).mean() == pytest.approx(0, abs=4 * sigma / np.sqrt(N))
 
 

@@ -35,10 +35,8 @@ def test_a_focused_star_has_a_gaussian_kernel_and_a_lamp_a_disk() -> None:
     sharp = shapes(camera(focus="infinity"), [0.0], [False], [1.0])
     assert sharp.kind.tolist() == [GAUSS]
     both = shapes(camera(), [0.0, 1e-3], [False, True], [1.0, 1.0])
-    assert both.kind.tolist() == [
-        ROUND,
-        ROUND,
-    ]  # focused on the lamp, the star is a disk of confusion
+    # Focused on the lamp, the star is a disk of confusion.
+    assert both.kind.tolist() == [ROUND, ROUND]
     assert both.reach_px[0] != both.reach_px[1]
 
 

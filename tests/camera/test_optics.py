@@ -55,9 +55,8 @@ def test_distortion_matches_opencv(distortion: tuple[float, ...]) -> None:
     wanted, _ = cv2.projectPoints(
         vectors, np.zeros(3), np.zeros(3), matrix(lens), np.array(distortion)
     )
-    np.testing.assert_allclose(
-        lens.project(vectors), wanted[:, 0], rtol=0, atol=1e-9
-    )  # rounding of 1e3 px
+    # Rounding of 1e3 px.
+    np.testing.assert_allclose(lens.project(vectors), wanted[:, 0], rtol=0, atol=1e-9)
 
 
 def test_a_distortion_too_small_to_matter_does_no_harm() -> None:
@@ -165,9 +164,8 @@ def test_the_field_undoes_distortion(k1: float) -> None:
     found, _ = cv2.projectPoints(
         edge, np.zeros(3), np.zeros(3), matrix(lens), np.array([k1, 0, 0, 0, 0.0])
     )
-    np.testing.assert_allclose(
-        found[0, 0], corner, rtol=0, atol=2e-3
-    )  # a table of 4,001 rows, linear between
+    # A table of 4,001 rows, linear between.
+    np.testing.assert_allclose(found[0, 0], corner, rtol=0, atol=2e-3)
 
 
 def test_a_field_that_ends_before_the_corner_ends_at_the_fold() -> None:

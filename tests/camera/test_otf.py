@@ -184,9 +184,8 @@ def test_airy_s_first_dark_ring_encloses_the_textbook_s_light() -> None:
     size = 2 * math.ceil(image.reach_px) + 1
     y, x = np.indices((size, size)) - size // 2
     inside = draw(image, size // 2, size // 2, size)[np.hypot(x, y) <= 1.2197 * unit].sum()
-    beyond = (
-        2 / (np.pi**2) * unit / image.reach_px
-    )  # mean light beyond the reach, put back into the image
+    # Mean light beyond the reach, put back into the image.
+    beyond = 2 / (np.pi**2) * unit / image.reach_px
     assert inside * (1 - beyond) == pytest.approx(0.838, abs=0.004)
 
 

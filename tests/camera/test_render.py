@@ -53,9 +53,8 @@ def blurred(sigma_px: float, radius_px: float = 0.0) -> Optics:
 
 
 LENS = lens_of()
-AT_CENTER = Mount(
-    np.zeros(3), Rotation.identity()
-)  # camera axes are the body's: it looks along lab z
+# Camera axes are the body's: it looks along lab z.
+AT_CENTER = Mount(np.zeros(3), Rotation.identity())
 
 
 def turning(rate_rad_s: Floats | list[float], start: Rotation | None = None) -> Trajectory:
@@ -209,9 +208,8 @@ def test_a_still_star_s_centroid_is_its_projected_pixel(x_px: float) -> None:
     image, seen = shot(star_at(x_px, 20.3), lens=blurred(1.2))
     np.testing.assert_allclose(seen.xy_px, [[x_px, 20.3]], rtol=0, atol=1e-10)
     np.testing.assert_allclose(seen.flux_xy_px, seen.xy_px, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(
-        moments(image)[0], [x_px, 20.3], rtol=0, atol=1e-8
-    )  # cut at 6.5 sigma
+    # Cut at 6.5 sigma.
+    np.testing.assert_allclose(moments(image)[0], [x_px, 20.3], rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("sigma_px", [0.2, 0.25, 0.3, 0.4, 0.5, 0.6])
@@ -281,12 +279,10 @@ def test_an_led_s_image_has_the_diameter_of_thin_geometry(
     lens = lens_of(pixel=f"{pixel_um} um", focal_length="35 mm", focus=f"{distance_in} in", psf=psf)
     image, _ = shot(led_at(0, 0, distance_m), lens=lens)
     radius_px = 2 * np.sqrt(moments(image)[1] - 1 - 1 / 12)
-    wanted = (
-        2e-3 * 35e-3 / (distance_m - 35e-3) / (pixel_um * 1e-6)
-    )  # reference §2: 20.8 px at 33 in, 4.2 um
-    np.testing.assert_allclose(
-        2 * radius_px, wanted, rtol=0, atol=0.01
-    )  # sizes are rounded to 0.01 px
+    # Reference §2: 20.8 px at 33 in, 4.2 um.
+    wanted = 2e-3 * 35e-3 / (distance_m - 35e-3) / (pixel_um * 1e-6)
+    # Sizes are rounded to 0.01 px.
+    np.testing.assert_allclose(2 * radius_px, wanted, rtol=0, atol=0.01)
 
 
 # Smear
@@ -310,13 +306,11 @@ def test_a_smeared_star_has_its_path_s_length_and_is_centered_at_mid_exposure(
     assert seen.streak_px[0] == pytest.approx(length_px, rel=1e-4)
     np.testing.assert_allclose(seen.xy_px, [[31.5, 23.5]], rtol=0, atol=1e-9)
     np.testing.assert_allclose(seen.flux_xy_px, [[31.5, 23.5]], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(
-        mean, [31.5, 23.5], rtol=0, atol=1e-4
-    )  # the S-curve of sigma .7 is 2e-5
+    # The S-curve of sigma .7 is 2e-5.
+    np.testing.assert_allclose(mean, [31.5, 23.5], rtol=0, atol=1e-4)
     along = 0.7**2 + 1 / 12 + length_px**2 / 12
-    np.testing.assert_allclose(
-        variance, [along, 0.7**2 + 1 / 12], rtol=0, atol=2e-4
-    )  # the same of the second moment
+    # The same of the second moment.
+    np.testing.assert_allclose(variance, [along, 0.7**2 + 1 / 12], rtol=0, atol=2e-4)
 
 
 def test_stars_move_opposite_to_the_camera() -> None:
@@ -348,9 +342,8 @@ def test_the_peak_of_a_smeared_star_matches_the_line_integral(
     _, still = shot(star_at(31.0, 23.0))
     _, smeared = shot(star_at(31.0, 23.0), turning([0, length_px / 2500, 0]))
     measured = float(smeared.peak_e[0] / still.peak_e[0])
-    assert measured == pytest.approx(
-        exact, rel=2e-3
-    )  # parts of a quarter pixel: (0.25 / 0.7)^2 / 24 at the ends
+    # Parts of a quarter pixel: (0.25 / 0.7)^2 / 24 at the ends.
+    assert measured == pytest.approx(exact, rel=2e-3)
     assert measured == pytest.approx(ratio, abs=0.03)
 
 
@@ -583,9 +576,8 @@ def test_jitter_widens_a_star_by_its_own_variance() -> None:
     wide = (np.radians([120 / 3600, 60 / 3600]) * 2500) ** 2  # about y it swings along x
     np.testing.assert_allclose(moments(image)[1], 0.7**2 + 1 / 12 + wide, rtol=2e-3, atol=0)
     assert image.sum() == pytest.approx(1, rel=1e-4)
-    assert seen.streak_px[0] > 40 * 4 * np.sqrt(
-        2 * wide.max()
-    )  # four amplitudes a period, at the least
+    # Four amplitudes a period, at the least.
+    assert seen.streak_px[0] > 40 * 4 * np.sqrt(2 * wide.max())
 
 
 def test_a_step_of_the_attitude_draws_two_stars() -> None:
@@ -669,9 +661,8 @@ def test_a_patch_holds_the_bend_of_a_path_between_two_samples() -> None:
     x0, x1, y0, y1 = rendering.patches(xy[:, None], np.array([3.0]), (300, 300))[0]
     assert max(x0, y0) <= 150 - 100 - 3
     assert min(x1, y1) > 150 + 100 + 3
-    assert (
-        x1 - x0 < 2 * (100 + 3) + 2 * 77 / 4 + 4
-    )  # and no more than a quarter of a chord of 77 px wider
+    # And no more than a quarter of a chord of 77 px wider.
+    assert x1 - x0 < 2 * (100 + 3) + 2 * 77 / 4 + 4
 
 
 def test_a_cubic_path_is_followed_exactly_from_its_first_sample_to_its_last() -> None:

@@ -157,9 +157,8 @@ def test_a_truth_table_round_trips(sky: Shot, written: Path) -> None:
     assert table["saturated"].dtype == bool
     np.testing.assert_array_equal(table["saturated"], seen.saturated)
     for name, values in columns.items():
-        np.testing.assert_allclose(
-            table[name], values, rtol=1e-8, atol=0
-        )  # nine digits are written
+        # Nine digits are written.
+        np.testing.assert_allclose(table[name], values, rtol=1e-8, atol=0)
     back = Rotation.from_quat(table.meta["cam_from_lab_xyzw"])
     assert (back * truth.cam_from_lab.inv()).magnitude() < 1e-15
     back = Rotation.from_quat(table.meta["lab_from_body_xyzw"])
@@ -319,9 +318,8 @@ def test_only_temporary_files_of_killed_processes_are_removed(tmp_path: Path) ->
     }
     for other in others:
         (tmp_path / other).write_text("mine")
-    ours_before = tmp_path / name.replace(
-        f"-{pid}.", f"-{os.getpid()}."
-    )  # of an earlier process by our number
+    # Of an earlier process by our number.
+    ours_before = tmp_path / name.replace(f"-{pid}.", f"-{os.getpid()}.")
     ours_before.write_text("half")
     with files.atomic_file(tmp_path / "truth.ecsv") as temporary:
         temporary.write_text("whole")

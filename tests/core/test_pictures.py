@@ -22,9 +22,8 @@ from skysim.core import images as fits_images
 from skysim.core.errors import InputError
 
 RNG = np.random.default_rng(4)
-GRAY = np.kron(
-    RNG.integers(0, 255, (5, 7), np.uint8), np.ones((8, 8), np.uint8)
-)  # blocks, which JPEG keeps
+# Blocks, which JPEG keeps.
+GRAY = np.kron(RNG.integers(0, 255, (5, 7), np.uint8), np.ones((8, 8), np.uint8))
 # Exif 2.32, tables 4 to 8
 ORIENTATION = 0x0112
 EXIF = 0x8769
@@ -41,9 +40,8 @@ def with_exif(
     if focal_35mm is not None:
         exif.get_ifd(EXIF)[FOCAL_35MM] = focal_35mm
     written = Image.Exif()
-    written.load(
-        exif.tobytes()
-    )  # without this, Pillow leaves the inner directory out of a TIFF file
+    # Without this, Pillow leaves the inner directory out of a TIFF file.
+    written.load(exif.tobytes())
     Image.fromarray(image).save(
         path, exif=written, **({"quality": 95} if path.suffix == ".jpg" else {})
     )
@@ -72,16 +70,14 @@ def test_an_image_is_read_upright_like_pillow(
     path = with_exif(
         tmp_path / f"x{suffix}", np.dstack([GRAY, GRAY[::-1], GRAY]) if color else GRAY, orientation
     )
-    with Image.open(
-        io.BytesIO(path.read_bytes())
-    ) as stored:  # by its path, Pillow does not turn a gray TIFF
+    # By its path, Pillow does not turn a gray TIFF.
+    with Image.open(io.BytesIO(path.read_bytes())) as stored:
         shown = np.asarray(ImageOps.exif_transpose(stored))
     seen = images.read_picture(path).pixels
     assert seen.shape == shown.shape
     assert seen.flags["C_CONTIGUOUS"]
-    np.testing.assert_allclose(
-        seen[..., ::-1] if color else seen, shown, atol=2
-    )  # two JPEG decoders
+    # Two JPEG decoders.
+    np.testing.assert_allclose(seen[..., ::-1] if color else seen, shown, atol=2)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -105,9 +101,8 @@ def test_upright_undoes_the_orientation_tag(orientation: int) -> None:
 def test_the_focal_length_of_35_mm_film_is_read(tmp_path: Path, suffix: str) -> None:
     assert images.read_picture(with_exif(tmp_path / f"x{suffix}", GRAY, 1, 26)).focal_35mm == 26
     assert images.read_picture(with_exif(tmp_path / f"y{suffix}", GRAY, 6)).focal_35mm is None
-    assert (
-        images.read_picture(with_exif(tmp_path / f"z{suffix}", GRAY, 6, 0)).focal_35mm is None
-    )  # 0: unknown
+    # 0: unknown.
+    assert images.read_picture(with_exif(tmp_path / f"z{suffix}", GRAY, 6, 0)).focal_35mm is None
 
 
 def exif_block(order: str, *entries: tuple[int, int, int, int], first: int = 8) -> bytes:

@@ -29,11 +29,8 @@ DATES = (
     "2017-01-01T00:00:00",
     "2024-02-29T12:34:56.789",
 )
-UNKNOWN = (
-    "1905-01-01T00:00:00",
-    "2030-01-01T00:00:00",
-    "2099-12-31T23:59:59",
-)  # no UTC yet; leap seconds to come
+# No UTC yet; leap seconds to come.
+UNKNOWN = ("1905-01-01T00:00:00", "2030-01-01T00:00:00", "2099-12-31T23:59:59")
 
 
 @pytest.mark.parametrize("text", DATES + UNKNOWN)

@@ -62,9 +62,8 @@ def test_a_tolerance_has_the_deviation_of_its_distribution(
     assert np.abs(drawn).max() <= half
     assert stats.kstest(drawn, oracle.cdf).pvalue > 1e-6
     assert abs(drawn.mean()) < 5 * float(tolerance) / np.sqrt(COUNT)
-    kurtosis = (
-        float(oracle.stats("k")) + 2
-    )  # the variance of a variance is (kurtosis + 2) sigma^4 / N
+    # The variance of a variance is (kurtosis + 2) sigma^4 / N.
+    kurtosis = float(oracle.stats("k")) + 2
     assert drawn.var() == pytest.approx(oracle.var(), rel=5 * np.sqrt(kurtosis / COUNT))
 
 

@@ -53,15 +53,8 @@ LONG = {
     "howto/stream.md",
 }
 NEEDS = {"howto/query_results.md": "duckdb"}  # of the extra that `make test-slow` installs
-LANGUAGES = {
-    "sh",
-    "python",
-    "yaml",
-    "toml",
-    "json",
-    "text",
-    "math",
-}  # all that a page may have; the last four are not run
+# All that a page may have; the last four are not run.
+LANGUAGES = {"sh", "python", "yaml", "toml", "json", "text", "math"}
 FENCE = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 FILE = re.compile(r"# ([\w.]+\.(?:py|yaml))\n")
 NUMBER = re.compile(r"[-+−]?\d[\d.,e+]*")

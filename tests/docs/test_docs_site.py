@@ -120,9 +120,8 @@ def test_the_keys_link_to_their_sections_and_name_what_a_text_may_be(name: str) 
     assert len(linked) > 10
     assert linked <= {heading.lower() for heading in headings}
     assert re.findall(r".*\| (?:list of any length: )?text(?: or null)? \|.*", page) == []
-    assert (
-        re.findall(r"^\| `\w+` \|.* (?!\[)\w+Config\b.*", page, re.MULTILINE) == []
-    )  # every section has a link
+    # Every section has a link.
+    assert re.findall(r"^\| `\w+` \|.* (?!\[)\w+Config\b.*", page, re.MULTILINE) == []
 
 
 def test_every_response_has_a_row_with_its_meaning() -> None:

@@ -18,13 +18,11 @@ from skysim.dynamics.multibody.wheels import WheelSet
 from skysim.scene.sections.motion import DesaturationConfig
 from tests.helpers.interpreted import interpreted
 
-BUS = np.array(
-    [[3.0, 0.2, -0.1], [0.2, 4.0, 0.3], [-0.1, 0.3, 5.0]]
-)  # kg m2, less the rotors about their axles
+# Kg m2, less the rotors about their axles.
+BUS = np.array([[3.0, 0.2, -0.1], [0.2, 4.0, 0.3], [-0.1, 0.3, 5.0]])
 BUS_INVERSE = np.linalg.inv(BUS)
-SKEW = math.acos(
-    1 / math.sqrt(3)
-)  # 54.74 deg: the pyramid with nearly the same momentum in every direction
+# 54.74 deg: the pyramid with nearly the same momentum in every direction.
+SKEW = math.acos(1 / math.sqrt(3))
 SLANT = math.cos(SKEW)
 STILL = np.zeros(3)
 
@@ -395,16 +393,14 @@ def test_the_pseudo_inverse_is_stuck_at_the_internal_singularity():
     momentum, rates, angles = pushed_along_x(pyramid_set("pseudo_inverse"), 60)
     reached = 2 * SLANT
     before = round(0.99 * reached / 0.1 / 0.01)
-    grown = 0.001 * np.arange(
-        1, before
-    )  # until then all is well; Euler's steps of 10 ms are good to a percent
+    # Until then all is well; Euler's steps of 10 ms are good to a percent.
+    grown = 0.001 * np.arange(1, before)
     np.testing.assert_allclose(momentum[: before - 1, 0], grown, rtol=0, atol=0.01 * reached)
     assert momentum[:, 0].max() <= reached * (1 + 1e-12)
     assert momentum[2000:, 0].min() > 0.999 * reached
     np.testing.assert_allclose(np.degrees(angles[2000:]), [[-90, 0, 90, 0]] * 4000, rtol=0, atol=2)
-    assert np.abs(rates[2000:]).max() == pytest.approx(
-        1, rel=1e-12
-    )  # at the limit, to and fro, for nothing
+    # At the limit, to and fro, for nothing.
+    assert np.abs(rates[2000:]).max() == pytest.approx(1, rel=1e-12)
 
 
 @pytest.mark.slow
@@ -416,9 +412,8 @@ def test_the_robust_inverse_passes_the_internal_singularity_and_reaches_saturati
     assert np.abs(rates).max() < 0.9
     assert np.abs(momentum[:, 1:]).max() < 0.05 * full
     inside = (momentum[:, 0] > 0.999 * 2 * SLANT) & (momentum[:, 0] < 1.001 * 2 * SLANT)
-    assert (
-        np.linalg.norm(angles[inside] - np.radians([-90, 0, 90, 0]), axis=1).min() < 0.1
-    )  # it went through there
+    # It went through there.
+    assert np.linalg.norm(angles[inside] - np.radians([-90, 0, 90, 0]), axis=1).min() < 0.1
     folded = np.degrees(np.mod(angles[-1] + 0.5, 2 * np.pi) - 0.5)
     np.testing.assert_allclose(folded, [270, 180, 90, 0], rtol=0, atol=5)
 
@@ -457,9 +452,8 @@ def test_rotors_deliver_what_singular_gimbals_cannot():
         set_.gimbal_axes, set_.spin_axes, set_.rotor_inertia_kg_m2, angles, THREE, STILL
     )
     np.testing.assert_allclose(torque_felt(body, rate, motor), torque, rtol=0, atol=3e-7)
-    assert along @ (body.axles(angles) @ motor) == pytest.approx(
-        -along @ torque, rel=1e-12
-    )  # all by the rotors
+    # All by the rotors.
+    assert along @ (body.axles(angles) @ motor) == pytest.approx(-along @ torque, rel=1e-12)
     fixed = CmgSet(set_.gimbal_axes, set_.spin_axes, set_.rotor_inertia_kg_m2, 1.0)
     stuck, _ = fixed.drive(along, STILL, angles, THREE, 0.0)
     assert np.linalg.norm(along @ fixed.jacobian(angles, THREE) * stuck) < 1e-14
@@ -557,12 +551,10 @@ def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
     # The loop of 2 rad/s follows the fans by 2 damping / bandwidth = 0.8 s.
     assert stopped * period == pytest.approx(8 * math.log(7.5), abs=1.0)
     assert stored[stopped] < 0.2
-    assert stored[stopped + 80] == pytest.approx(
-        stored[-1], abs=0.001
-    )  # stays, once the loop has settled
-    assert (
-        max(turned) < 0.2 / 3 / 4 * 1.2
-    )  # a torque of 1.5 / 8 N m against stiffness 4 BUS, and some overshoot
+    # Stays, once the loop has settled.
+    assert stored[stopped + 80] == pytest.approx(stored[-1], abs=0.001)
+    # A torque of 1.5 / 8 N m against stiffness 4 BUS, and some overshoot.
+    assert max(turned) < 0.2 / 3 / 4 * 1.2
     assert turned[-1] < 1e-3 * max(turned)
 
 

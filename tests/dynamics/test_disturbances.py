@@ -19,9 +19,8 @@ from skysim.scene.sections.vehicle import AirCurrentConfig, DisturbancesConfig, 
 from skysim.simulation.flight import Flight, simulate_motion
 
 AXES = Rotation.from_rotvec([0.2, -0.4, 0.3]).as_matrix()
-TENSOR = (
-    AXES @ np.diag([6.0, 6.5, 9.0]) @ AXES.T
-)  # of a vehicle whose principal axes are not the body's
+# Of a vehicle whose principal axes are not the body's.
+TENSOR = AXES @ np.diag([6.0, 6.5, 9.0]) @ AXES.T
 NONE = np.zeros(3)
 BALANCED = {
     "vehicle.center_of_mass": "[0 m, 0 m, 0 m]",
@@ -171,9 +170,8 @@ def test_motion_in_a_rotating_lab_equals_inertial_motion_seen_from_it(stored: Fl
     assert np.linalg.norm((expected.inv() * lab_from_body).as_rotvec(), axis=1).max() < 1e-9
     np.testing.assert_allclose(found, fast - expected.inv().apply(earth), rtol=0, atol=1e-9)
     ignored, _ = integrated(lambda _, w: among_stars(_, w), start, rate, t_s)
-    assert (
-        expected.inv() * ignored
-    ).magnitude().max() > 0.5  # without the torque it is somewhere else
+    # Without the torque it is somewhere else.
+    assert (expected.inv() * ignored).magnitude().max() > 0.5
 
 
 def test_a_vehicle_at_rest_among_the_stars_rotates_with_them_in_the_lab() -> None:
@@ -276,9 +274,8 @@ def test_a_room_is_quiet_if_nothing_is_switched_on() -> None:
         {"air_current": {"rms": ["1 uN m"] * 3}},
     ):
         assert not room(DisturbancesConfig.model_validate(part)).inactive
-    assert room(
-        DisturbancesConfig.model_validate({"cable": {"stiffness": "1 N m / rad"}})
-    ).inactive  # it is MuJoCo's
+    # It is MuJoCo's.
+    assert room(DisturbancesConfig.model_validate({"cable": {"stiffness": "1 N m / rad"}})).inactive
 
 
 def test_a_room_without_disturbances_gives_no_torque() -> None:

@@ -292,11 +292,8 @@ def test_sine_begins_and_ends_at_rest_without_a_jump_of_the_torque(duration_s: f
     ref = reference(HOLD, SINE | {"duration": f"{duration_s} s"}, HOLD)
     for t in ref.start_s[1:3]:
         assert between(there(ref, t), euler(*START.values())) < 1e-15
-        for near in (
-            t - 1e-9,
-            t,
-            t + 1e-9,
-        ):  # a ns of jerk, up to 60 amplitude / growth^3 = 1e3 rad/s3
+        # A ns of jerk, up to 60 amplitude / growth^3 = 1e3 rad/s3.
+        for near in (t - 1e-9, t, t + 1e-9):
             np.testing.assert_allclose(ref.state_at(near)[1:], np.zeros((2, 3)), rtol=0, atol=2e-6)
     inside = np.linspace(2.0, 2.0 + duration_s, 100)
     assert (

@@ -163,10 +163,8 @@ CONE = Cone()
 
 def test_the_earth_rate_matches_a_hand_calculation() -> None:
     """sin and cos of 39.8 deg of 15.041 deg/h: 9.63 up, 11.56 north."""
-    up_north_of = {
-        90.0: (2, 1, 0),
-        0.0: (2, 0, 1),
-    }  # with x east, y is north; with x north, y is west
+    # With x east, y is north; with x north, y is west.
+    up_north_of = {90.0: (2, 1, 0), 0.0: (2, 0, 1)}
     for azimuth, (up, north, across) in up_north_of.items():
         rate = earth_rate_lab_rad_s(SiteConfig(latitude_deg=39.8, x_azimuth_deg=azimuth)) / DEG_H
         np.testing.assert_allclose(
@@ -591,9 +589,8 @@ def test_quantization_loses_no_angle() -> None:
     np.testing.assert_allclose(counts, np.rint(counts), rtol=0, atol=1e-8)
     missed = np.cumsum(got - np.tile(ideal.angle_rad, (2, 1)), axis=0)
     assert np.abs(missed).max() < 0.5001 * quantum
-    np.testing.assert_allclose(
-        missed.std(), quantum / np.sqrt(12), rtol=0.02
-    )  # evenly spread, of 12,000
+    # Evenly spread, of 12,000.
+    np.testing.assert_allclose(missed.std(), quantum / np.sqrt(12), rtol=0.02)
 
 
 def test_a_rotation_below_one_count_is_counted_eventually() -> None:

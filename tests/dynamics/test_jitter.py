@@ -109,14 +109,12 @@ def test_periodogram_of_a_band_rises_with_its_slope(slope: float) -> None:
         )
         power = (np.abs(np.fft.rfft(phi * window, axis=0)) ** 2).sum(axis=1)
         frequency = np.fft.rfftfreq(len(t), 1 / rate_hz)
-        outside = (frequency < 4.0 - 0.5) | (
-            frequency > 64.0 + 0.5
-        )  # four bins: Hann leaks 1e-3 beyond
+        # Four bins: Hann leaks 1e-3 beyond.
+        outside = (frequency < 4.0 - 0.5) | (frequency > 64.0 + 0.5)
         assert power[outside].sum() < 2e-3 * power.sum()
         shares.append(np.histogram(frequency, edges, weights=power)[0] / power.sum())
-    octave = np.exp2(
-        (slope + 1) * np.arange(4)
-    )  # power of an octave over that of the one below is 2^(slope + 1)
+    # Power of an octave over that of the one below is 2^(slope + 1).
+    octave = np.exp2((slope + 1) * np.arange(4))
     scatter = np.std(shares, axis=0) / np.sqrt(len(shares))
     # Within 4 sigma, and 1 % that the window carries over an octave's edge.
     assert np.all(np.abs(np.mean(shares, axis=0) - octave / octave.sum()) < 4 * scatter + 0.01)
@@ -273,17 +271,15 @@ def test_there_is_no_vibration_outside_its_interval() -> None:
     outside = (t < 1) | ((t > 3) & (t < 4)) | (t > 7)
     phi, rate = vibration.evaluate(np.sort(t[outside]))
     np.testing.assert_array_equal([phi, rate], np.zeros((2, outside.sum(), 3)))
-    assert (
-        np.abs(shaken_by(calm, shaken, t[outside])).max() < 1e-9
-    )  # rounding: 1e-15 rad is 2e-10 arcsec
+    # Rounding: 1e-15 rad is 2e-10 arcsec.
+    assert np.abs(shaken_by(calm, shaken, t[outside])).max() < 1e-9
     assert (np.abs(shaken_by(calm, shaken, t[~outside])).max(axis=0) > RMS).all()
     silent = (shaken.t_s <= 1) | ((shaken.t_s >= 3) & (shaken.t_s <= 4)) | (shaken.t_s >= 7)
     np.testing.assert_allclose(
         shaken.rate_body_rad_s[silent], [[0.1, 0.2, -0.1]] * silent.sum(), rtol=1e-14
     )
-    np.testing.assert_allclose(
-        np.diff(shaken.t_s[shaken.t_s <= 1]), 0.01, rtol=1e-9
-    )  # no finer where it is calm
+    # No finer where it is calm.
+    np.testing.assert_allclose(np.diff(shaken.t_s[shaken.t_s <= 1]), 0.01, rtol=1e-9)
 
 
 def test_two_intervals_of_the_same_vibration_have_independent_phases() -> None:

@@ -127,9 +127,8 @@ def shaking_rad(vehicle: multibody.VehicleModel, rad_s: float) -> Floats:
 def torque_of_imbalance(axis: int, static_kg_m: float, dynamic_kg_m2: float) -> Floats:
     """(3,) complex: T = Re(this w^2 exp(i w t)) of simsat.xml's wheel along an axis, but for its phase."""
     place = {0: [0.30, 0, -0.02], 1: [0, 0.30, -0.02], 2: [-0.30, 0, -0.02]}[axis]
-    line = np.roll(np.eye(3)[0], axis + 1) - 1j * np.roll(
-        np.eye(3)[0], axis + 2
-    )  # what turns with the wheel
+    # What turns with the wheel.
+    line = np.roll(np.eye(3)[0], axis + 1) - 1j * np.roll(np.eye(3)[0], axis + 2)
     return static_kg_m * np.cross(place, line) + dynamic_kg_m2 * line
 
 

@@ -108,9 +108,8 @@ def test_angular_momentum_is_conserved_with_wheels_and_gimbals_driven() -> None:
 def test_energy_and_momentum_are_conserved_without_control() -> None:
     """To 1e-8 J (of 1112) and 1e-8 N m s (of 5.6), with every wheel, rotor and gimbal free."""
     vehicle = multibody.build(vehicle_config(**SPINNING))
-    vehicle.model.opt.disableflags |= int(
-        mujoco.mjtDisableBit.mjDSBL_ACTUATION
-    )  # no servo holds the gimbals
+    # No servo holds the gimbals.
+    vehicle.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
     flight = multibody.Simulation(
         vehicle, Rotation.from_rotvec([0.3, -0.2, 0.5]), np.array([0.1, 0.2, -0.15]), 60.0
     )
@@ -255,9 +254,8 @@ def test_a_heavy_top_agrees_with_an_independent_integrator() -> None:
 
     run = solve_ivp(law, (0, 5), [*begin.as_quat(), *rate], method="DOP853", rtol=1e-12, atol=1e-13)
     flight = multibody.simulate(vehicle, begin, rate, 5.0)
-    assert (
-        flight.lab_from_body.as_matrix()[:, 2, 2] > math.cos(math.radians(85))
-    ).all()  # the stop had no part
+    # The stop had no part.
+    assert (flight.lab_from_body.as_matrix()[:, 2, 2] > math.cos(math.radians(85))).all()
     assert (Rotation.from_quat(run.y[:4, -1]).inv() * flight.attitude_at(5.0)).magnitude() < 1e-9
     np.testing.assert_allclose(flight.rate_body_rad_s[-1], run.y[4:, -1], rtol=0, atol=1e-9)
 

@@ -83,9 +83,8 @@ def test_rate_and_acceleration_are_continuous_at_every_sample() -> None:
     np.testing.assert_allclose(before[1], after[1], rtol=0, atol=1e-8)
     np.testing.assert_allclose(before[2], after[2], rtol=0, atol=1e-8)
     jerk = np.diff(spline.states_at(TIMES)[2], axis=0) / 0.1
-    assert (
-        np.abs(np.diff(jerk, axis=0)).max() > 1e-3
-    )  # the next derivative does jump, so the test can fail
+    # The next derivative does jump, so the test can fail.
+    assert np.abs(np.diff(jerk, axis=0)).max() > 1e-3
 
 
 @pytest.mark.compiles

@@ -56,9 +56,8 @@ def test_a_trimmed_vehicle_swings_with_its_new_period() -> None:
     )
     roll = flight.lab_from_body.as_rotvec()[:, 0]
     falling = np.flatnonzero((roll[:-1] > 0) & (roll[1:] <= 0))
-    assert 4 * flight.t_s[falling[0]] == pytest.approx(
-        period_s, rel=0.02
-    )  # products of inertia couple a little
+    # Products of inertia couple a little.
+    assert 4 * flight.t_s[falling[0]] == pytest.approx(period_s, rel=0.02)
 
 
 def test_trim_masses_move_in_whole_steps_and_are_locked_without_their_section() -> None:

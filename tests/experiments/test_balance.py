@@ -106,9 +106,8 @@ def test_maneuver_stays_within_what_wheels_and_stop_allow(name: str) -> None:
     assert inertia * np.linalg.norm(accelerations, axis=1).max() < 0.6 * wheels.torque_limit_nm
     assert inertia * np.linalg.norm(rates, axis=1).max() < 0.6 * capacity
     attitudes = Rotation.from_quat([state[0] for state in states], scalar_first=True)
-    assert multibody.tilt_deg(attitudes).max() == pytest.approx(
-        7.3, abs=0.1
-    )  # the sine fades in and out
+    # The sine fades in and out.
+    assert multibody.tilt_deg(attitudes).max() == pytest.approx(7.3, abs=0.1)
     turned = (attitudes[0].inv() * attitudes).as_rotvec()
     assert np.degrees(np.abs(turned[:, 2]).max()) > 115
 

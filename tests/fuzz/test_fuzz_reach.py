@@ -17,9 +17,8 @@ from tests.fuzz.__main__ import NAMES, seeds
 from tests.fuzz.targets import TARGETS
 
 SEEDS = 12  # of each target: its readers are reached by any
-READER = re.compile(
-    r"((read|load|unpack|parse)(e?d)?(_\w+)?|of_tree)$"
-)  # by its name, if it is public
+# By its name, if it is public.
+READER = re.compile(r"((read|load|unpack|parse)(e?d)?(_\w+)?|of_tree)$")
 PARSERS = {  # by what it calls, whatever its name
     "json.loads",
     "np.loadtxt",

@@ -375,9 +375,8 @@ class Judge:
         path.write_bytes(case.data if case.picture is None else encoded(case.picture, case.suffix))
         solver = self.solver(prior, case.picture.shape if case.picture is not None else ())
         answer, seconds, memory_bytes = timed(path, solver)
-        if any(
-            defects(case, answer | {"prior": prior}, seconds, memory_bytes)
-        ):  # solve again, because compilation may have caused the defect
+        # Solve again, because compilation may have caused the defect.
+        if any(defects(case, answer | {"prior": prior}, seconds, memory_bytes)):
             answer, seconds, memory_bytes = timed(path, solver)
         return family.__name__, case, answer | {"prior": prior}, seconds, memory_bytes
 

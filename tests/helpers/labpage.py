@@ -168,9 +168,8 @@ class opened:
         status(self.page, "solved")
         self.page.locator(".lab-frame canvas[data-frame]").wait_for()
         self.page.set_default_timeout(QUICK_MS)
-        self.page.wait_for_timeout(
-            300
-        )  # no person types in the moment in which fields are filled in
+        # No person types in the moment in which fields are filled in.
+        self.page.wait_for_timeout(300)
 
     def __enter__(self) -> Any:
         return self.page

@@ -58,10 +58,8 @@ SCENES = {
         "camera.shutter": "{kind: global}",
     },
 }
-TWEAK_ORDER = {
-    "shefex2": 1,
-    "shefex2, wide": 3,
-}  # order of astrometry.net's distortion polynomials: 1 is a lens without distortion
+# Order of astrometry.net's distortion polynomials: 1 is a lens without distortion.
+TWEAK_ORDER = {"shefex2": 1, "shefex2, wide": 3}
 SIDE = 9  # lattice points along each side of the frame at which world coordinates are compared
 CLASSES = 12  # number of brightness classes, each with its own centroid variance
 MISTAKEN = (
@@ -167,9 +165,8 @@ def lattice(width_px: int, height_px: int) -> NDArray:
 def directions(header: fits.Header, xy_px: NDArray) -> NDArray:
     """(N, 3) directions of pixels from the WCS of a FITS header, by astropy."""
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", FITSFixedWarning
-        )  # astrometry.net's header belongs to no image
+        # astrometry.net's header belongs to no image.
+        warnings.simplefilter("ignore", FITSFixedWarning)
         wcs = WCS(header, fix=False)
     return unit_vectors(*wcs.all_pix2world(xy_px, 0).T)
 
@@ -304,11 +301,8 @@ def astrometry_net(name: str) -> Solve | None:
     options = ["--overwrite", "--no-plots", "--no-verify", "--crpix-center", "--cpulimit", "30"]
     options += ["--scale-units", "degwidth", "--scale-low", f"{0.95 * width_deg}"]
     options += ["--scale-high", f"{1.05 * width_deg}", "--tweak-order", str(order)]
-    options += [
-        "--no-remove-lines",
-        "--uniformize",
-        "0",
-    ]  # skip its Python steps, which need more packages
+    # Skip its Python steps, which need more packages.
+    options += ["--no-remove-lines", "--uniformize", "0"]
     options += [
         part
         for kind in ("new-fits", "rdls", "match", "index-xyls")

@@ -80,9 +80,8 @@ NO_PLACE = ("decorator", "raise_stmt", "fstring", "import_from", "tfpdef")
 
 def is_left_out(node: Any) -> bool:
     """Whether a parso node is in an annotation, a decorator, an error's message or an import, or cannot be changed."""
-    if (
-        node.type == "except_clause" and "." in node.get_code()
-    ):  # cosmic-ray replaces plain names of exceptions only
+    # cosmic-ray replaces plain names of exceptions only.
+    if node.type == "except_clause" and "." in node.get_code():
         return True
     while parent := node.parent:
         if parent.type in NO_PLACE:
@@ -424,9 +423,8 @@ def main() -> None:
     tests = Tests()
     drawn = draw(count, seed)
     lines = results.read_text().splitlines() if results.exists() else []
-    done = {
-        key_of(result): result for result in map(json.loads, lines)
-    }  # of a mutant that was tried again, the last
+    # Of a mutant that was tried again, the last.
+    done = {key_of(result): result for result in map(json.loads, lines)}
     survivors = [result for result in done.values() if result["outcome"] == "survived"]
     left = [mutant for mutant in drawn if key_of(mutant) not in done]
     for mutant in survivors if "--again" in sys.argv else left:

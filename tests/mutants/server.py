@@ -137,9 +137,8 @@ def compiled_names(function: FunctionType) -> Iterator[CPUDispatcher]:
     """Compiled functions that the names in a function's code stand for, in tables and modules too."""
     names = {name for code in nested(function.__code__) for name in code.co_names}
     values = [function.__globals__.get(name) for name in names]
-    values += [
-        cell.cell_contents for cell in function.__closure__ or () if cell != CellType()
-    ]  # not an empty one
+    # Not an empty one.
+    values += [cell.cell_contents for cell in function.__closure__ or () if cell != CellType()]
     for value in values:
         if isinstance(value, ModuleType):
             members = [vars(value).get(name) for name in names]
@@ -191,9 +190,8 @@ class Server:
             return "import anew"
 
         def change() -> None:
-            numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = str(
-                scratch
-            )  # of what is imported from now on
+            # Of what is imported from now on.
+            numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = str(scratch)
             for function in self.program.functions[key]:
                 function.__code__ = marshal.loads(code)
             for one in users:

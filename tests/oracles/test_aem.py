@@ -107,9 +107,8 @@ def test_the_page_s_code_reads_our_aem(
         if "ccsds_ndm" in block
     ]
     (tmp_path / "out/shefex2").mkdir(parents=True)
-    meant = Rotation.from_euler(
-        "y", [[90]], degrees=True
-    )  # the camera's boresight along the ICRF's x
+    # The camera's boresight along the ICRF's x.
+    meant = Rotation.from_euler("y", [[90]], degrees=True)
     text = run_export.message("shefex2", [], (run_export.ICRF, run_export.CAMERA), utc(1), meant)
     files.write_text(tmp_path / "out/shefex2/truth.aem", text)
     monkeypatch.chdir(tmp_path)

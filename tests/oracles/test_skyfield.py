@@ -40,9 +40,8 @@ def skyfield() -> Skyfield:
     api = pytest.importorskip("skyfield.api")
     data = pytest.importorskip("skyfield_data")
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", RuntimeWarning
-        )  # tables of UT1 that it has, but does not use here, are old
+        # Tables of UT1 that it has, but does not use here, are old.
+        warnings.simplefilter("ignore", RuntimeWarning)
         load = api.Loader(data.get_skyfield_data_path())
     return Skyfield(load("de421.bsp"), load.timescale(builtin=True), api.wgs84.latlon)
 

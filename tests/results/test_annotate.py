@@ -42,9 +42,8 @@ def test_a_small_frame_is_doubled_and_its_marks_with_it() -> None:
     )
     assert picture.shape == (400 + plots.LEGEND_PX, 600, 3)
     ticks = colored(picture[:400], plots.TRUTH_BGR)
-    assert (
-        np.abs(ticks.min(axis=0) + ticks.max(axis=0) - [401, 201]).max() < 80
-    )  # the label leans to one side
+    # The label leans to one side.
+    assert np.abs(ticks.min(axis=0) + ticks.max(axis=0) - [401, 201]).max() < 80
 
 
 def test_invisible_sources_are_not_marked_and_a_legend_names_the_colors() -> None:
@@ -73,6 +72,5 @@ def test_a_contact_sheet_stretches_all_frames_equally() -> None:
     assert left.shape == right.shape == (80 + 26, 100 + 4)
     peaks = [part[24 + 41, 2 + 51] for part in (left, right)]
     assert peaks[0] == 255
-    assert (
-        0.3 < (peaks[1] / 255) ** 2 / (200 / 900) < 3
-    )  # the square root's share, not a maximum of its own
+    # The square root's share, not a maximum of its own.
+    assert 0.3 < (peaks[1] / 255) ** 2 / (200 / 900) < 3

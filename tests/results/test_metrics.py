@@ -108,8 +108,7 @@ def test_overconfident_means_rarer_than_one_correct_error_in_1e8() -> None:
 
     limit = float(brentq(lambda x: math.log(tail(x) / 1e-8), 10.0, 100.0))
     nees = np.array([0.1, 0.99 * limit, 1.01 * limit, 2 * limit, np.nan, 2 * limit])
-    frames = np.array(
-        [1, 1, 1, 1, 1, 20]
-    )  # no solution in the fifth trial, a mean over many frames in the sixth
+    # No solution in the fifth trial, a mean over many frames in the sixth.
+    frames = np.array([1, 1, 1, 1, 1, 20])
     share = metrics.overconfident({"nees": nees, "frames": frames})
     assert (share.value, share.trials) == (0.5, 4)

@@ -60,11 +60,8 @@ def test_the_parts_of_a_sphere_of_single_leds_are_counted() -> None:
 
 def test_individually_driven_and_coded_leds_need_driver_channels() -> None:
     pwm = bought(light__led__drive="{kind: pwm, filter: {time_constant: 20 ms}}")
-    assert (pwm["driver"], pwm["microcontroller"], pwm["filter"]) == (
-        19,
-        1,
-        300,
-    )  # 300 / 16, rounded up
+    # 300 / 16, rounded up.
+    assert (pwm["driver"], pwm["microcontroller"], pwm["filter"]) == (19, 1, 300)
     assert "resistor" not in pwm
     coded = bought(light__led__code="{kind: hamming}", tracker__decoder="{}")
     assert (coded["driver"], coded["trigger"]) == (19, 1)
@@ -207,6 +204,5 @@ def test_a_missing_price_or_file_is_refused_in_one_line(tmp_path: Path) -> None:
 def test_a_byte_order_mark_in_a_table_is_ignored(tmp_path: Path) -> None:
     path = tmp_path / "mine.csv"
     path.write_bytes(b"\xef\xbb\xbf" + find_prices("assumed").read_bytes())
-    assert repr(read_prices(path).parts) == repr(
-        read_prices(find_prices("assumed")).parts
-    )  # NaN differs from NaN
+    # NaN differs from NaN.
+    assert repr(read_prices(path).parts) == repr(read_prices(find_prices("assumed")).parts)

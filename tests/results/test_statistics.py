@@ -55,12 +55,8 @@ def test_a_claim_needs_as_many_trials_as_its_bound(share: float, count: int) -> 
 def test_intervals_have_their_stated_coverage():
     """Of 400 samples of 60 each: how often the truth is inside, within four standard errors of 95 % or above it."""
     rng = np.random.default_rng(2)
-    truth = {
-        "mean": 1.0,
-        "rms": math.sqrt(2),
-        "median": math.log(2),
-        "p90": math.log(10),
-    }  # of an exponential
+    # Of an exponential.
+    truth = {"mean": 1.0, "rms": math.sqrt(2), "median": math.log(2), "p90": math.log(10)}
     inside = dict.fromkeys(truth, 0)
     for _ in range(400):
         sample = rng.exponential(size=60)
@@ -68,12 +64,10 @@ def test_intervals_have_their_stated_coverage():
             estimate = metrics.STATISTICS[name](sample)
             inside[name] += estimate.low <= value <= estimate.high
     error = math.sqrt(0.95 * 0.05 / 400)
-    assert (
-        min(inside["median"], inside["p90"]) / 400 > 0.95 - 4 * error
-    )  # at least, for they are ranks
-    assert (
-        0.85 < inside["mean"] / 400 < 0.95 + 4 * error
-    )  # the bootstrap's is short on few of a skew law
+    # At least, for they are ranks.
+    assert min(inside["median"], inside["p90"]) / 400 > 0.95 - 4 * error
+    # The bootstrap's is short on few of a skew law.
+    assert 0.85 < inside["mean"] / 400 < 0.95 + 4 * error
     assert 0.80 < inside["rms"] / 400 < 0.95 + 4 * error
 
 

@@ -72,9 +72,8 @@ def test_every_assumption_is_marked_and_has_its_consequence(tmp_path: Path) -> N
     }
     assert comments["full_well_e"] == "assumed: 900 e- a square micrometer, as in the IMX264"
     chip = load(tmp_path, answers).detector
-    assert chip.full_well_e == pytest.approx(
-        900 * 3.45**2, rel=1e-3
-    )  # 10,712 e-; the IMX250's measured 10,700
+    # 10,712 e-; the IMX250's measured 10,700.
+    assert chip.full_well_e == pytest.approx(900 * 3.45**2, rel=1e-3)
     assert 0.99 * 4095 < chip.full_well_e / chip.gain_e_dn + chip.offset_dn <= 4095
 
 

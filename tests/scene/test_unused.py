@@ -282,9 +282,8 @@ def test_every_rule_has_a_case() -> None:
     covered = {
         rule.reason for case in CASES for rule in unused.RULES if unused.section_of(case.key, rule)
     }
-    covered |= {
-        rule.reason for rule in unused.RULES if "vehicle.cmgs.steering" in rule.keys
-    }  # set with its section
+    # Set with its section.
+    covered |= {rule.reason for rule in unused.RULES if "vehicle.cmgs.steering" in rule.keys}
     missing = [rule.keys for rule in unused.RULES if rule.reason not in covered]
     assert missing == []
 

@@ -247,9 +247,8 @@ def test_a_solution_arrives_after_its_latency(latency_s: float) -> None:
 def test_the_loop_with_latency_survives_the_accident() -> None:
     flight = open_flight(changed(**EARLY | EXACT_MAP, filter__latency="0.2 s"))
     shots = list(flight.shots())
-    assert [shot.update_status for shot in shots] == ["used"] * 7 + [
-        ""
-    ]  # the last comes after the motion's end
+    # The last comes after the motion's end.
+    assert [shot.update_status for shot in shots] == ["used"] * 7 + [""]
     telemetry = flight.telemetry()
     assert in_sigma(telemetry)[1:].max() < 4
     assert off_deg(telemetry)[telemetry.t_s > 7].max() < 0.05

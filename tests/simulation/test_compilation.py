@@ -10,11 +10,8 @@ from skysim.simulation.compilation import synthetic_frame
 from skysim.simulation.lab import build_lab, build_tracker
 from skysim.tracking import factory
 
-SYMMETRIC = {
-    "afit_test1",
-    "afit_test2",
-    "afit_test3",
-}  # too few or too regular LEDs for an attitude
+# Too few or too regular LEDs for an attitude.
+SYMMETRIC = {"afit_test1", "afit_test2", "afit_test3"}
 CODED = {"coded_spiral"}  # a frame alone does not name its LEDs
 NAMES = {path.stem.removesuffix("_ideal") for path in SCENES.glob("*.yaml")} - SYMMETRIC - CODED
 

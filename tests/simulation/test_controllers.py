@@ -199,9 +199,8 @@ def test_a_controller_gets_the_documented_setup_and_input() -> None:
             [now.rate_ref_rad_s, now.acceleration_ref_rad_s2], [rate, acceleration]
         )
     np.testing.assert_array_equal(seen[0].achieved_nm, np.zeros(3))
-    assert seen[1].achieved_nm[2] == pytest.approx(
-        0.6, rel=1e-9
-    )  # the wheels' limit, not the 5 N m asked for
+    # The wheels' limit, not the 5 N m asked for.
+    assert seen[1].achieved_nm[2] == pytest.approx(0.6, rel=1e-9)
 
 
 @pytest.mark.slow

@@ -262,9 +262,8 @@ def test_positions_electrons_peaks_and_paths_match_the_renderer(
     np.testing.assert_allclose(
         seen.streak_length_px[row], truth.sources.streak_px[other], rtol=2e-3
     )
-    share = (
-        truth.sources.electrons[other] / seen.electrons[row]
-    )  # a pulse more or less in the exposure
+    # A pulse more or less in the exposure.
+    share = truth.sources.electrons[other] / seen.electrons[row]
     assert np.median(share) == pytest.approx(1, abs=0.02)
     peak = (seen.peak_e[row] - context.camera.background_e) * share / truth.sources.peak_e[other]
     assert np.min(peak) > 0.98

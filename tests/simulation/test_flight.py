@@ -327,9 +327,8 @@ def test_a_torque_replaces_the_controller_s_on_the_actuators_of_the_scene(actuat
         wheel_nms, abs=2e-4
     )
     flight.simulate_motion()
-    assert (
-        abs(flight.state.rate_body_rad_s[2]) < 0.1 * pushed.rate_body_rad_s[2]
-    )  # the controller is back
+    # The controller is back.
+    assert abs(flight.state.rate_body_rad_s[2]) < 0.1 * pushed.rate_body_rad_s[2]
 
 
 def test_a_torque_that_cannot_be_given_is_refused() -> None:

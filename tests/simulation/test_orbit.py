@@ -108,9 +108,8 @@ def test_a_satellite_ahead_on_the_same_orbit_is_seen(tmp_path: Path) -> None:
     _, truth = render_at_rest(lab.camera, lab.start, 0)
     assert [satellite.id for satellite in truth.satellites] == [ID_BASE + 2]
     assert truth.satellites[0].range_km == pytest.approx(60, abs=1.5)
-    assert truth.satellites[0].rate_deg_s == pytest.approx(
-        0.063, rel=0.1
-    )  # it turns with the orbit
+    # It turns with the orbit.
+    assert truth.satellites[0].rate_deg_s == pytest.approx(0.063, rel=0.1)
 
 
 def test_an_orbit_needs_the_sky() -> None:

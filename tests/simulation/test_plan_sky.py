@@ -92,9 +92,8 @@ def test_bodies_within_the_exclusion_angles_are_warned_of() -> None:
         r"orbit.exclusion.earth_deg: the Earth's limb is (-[\d.]+)° from the boresight", limb
     )
     assert angle
-    assert float(angle[1]) == pytest.approx(
-        dip_deg - 30, abs=0.15
-    )  # the pole's radius is 21 km less
+    # The pole's radius is 21 km less.
+    assert float(angle[1]) == pytest.approx(dip_deg - 30, abs=0.15)
     assert (
         list(
             sky_warnings.exclusion(

@@ -233,9 +233,8 @@ def test_streaks_are_rate_times_exposure_times_focal_length() -> None:
     middle = np.hypot(*(seen.xy_px - [329, 246]).T) < 120
     assert middle.sum() >= 3
     wanted = np.radians(0.5) * 0.040 * 25e-3 / 9.9e-6
-    np.testing.assert_allclose(
-        seen.streak_px[middle], wanted, rtol=5e-3, atol=0
-    )  # 1 + tan^2 at 120 px: .2 %
+    # 1 + tan^2 at 120 px: .2 %.
+    np.testing.assert_allclose(seen.streak_px[middle], wanted, rtol=5e-3, atol=0)
 
 
 def test_the_camera_rides_fifteen_inches_above_the_bearing() -> None:
@@ -444,10 +443,8 @@ def test_the_shutter_s_smear_adds_to_saturation_and_noise() -> None:
 
 # Exposure control
 
-COMA = {
-    "motion.start": "{ra_deg: 190, dec_deg: 25}",
-    "motion.rate_deg_s": "[0, 0, 0]",
-}  # no bright stars
+# No bright stars.
+COMA = {"motion.start": "{ra_deg: 190, dec_deg: 25}", "motion.rate_deg_s": "[0, 0, 0]"}
 
 
 def controlled(frames: int, start: str, control: str, **more: str) -> Scene:

@@ -152,9 +152,8 @@ def kasten_young(altitude_rad: Floats) -> Floats:
 def test_air_masses_match_kasten_and_young() -> None:
     altitude = np.radians(np.linspace(3, 90, 200))
     np.testing.assert_allclose(starlight.air_mass(altitude), kasten_young(altitude), rtol=0.012)
-    assert starlight.air_mass(np.array([0.0]))[0] == pytest.approx(
-        38.75, abs=0.01
-    )  # Pickering's own value
+    # Pickering's own value.
+    assert starlight.air_mass(np.array([0.0]))[0] == pytest.approx(38.75, abs=0.01)
     assert starlight.air_mass(np.array([-0.1]))[0] == starlight.air_mass(np.array([0.0]))[0]
 
 

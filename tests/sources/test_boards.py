@@ -25,6 +25,5 @@ def test_glue_tilts_are_uniform_over_a_cap_without_rotation_about_the_normal() -
     np.testing.assert_allclose(
         frame @ frame.swapaxes(1, 2), np.tile(np.eye(3), (count, 1, 1)), rtol=0, atol=1e-14
     )
-    np.testing.assert_allclose(
-        tilted.u[:, 1], tilted.v[:, 0], rtol=0, atol=1e-15
-    )  # no turn about the normal
+    # No turn about the normal.
+    np.testing.assert_allclose(tilted.u[:, 1], tilted.v[:, 0], rtol=0, atol=1e-15)

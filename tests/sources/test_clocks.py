@@ -173,9 +173,8 @@ def test_exposure_starts_and_time_tags_have_the_declared_errors() -> None:
     )
     assert 0 <= late_s.min() < 1e-6
     assert 399e-6 < late_s.max() < 400e-6
-    assert late_s.mean() == pytest.approx(
-        200e-6, abs=4 * 115e-6 / np.sqrt(2000)
-    )  # uniform: deviation 1 / sqrt 12
+    # Uniform: deviation 1 / sqrt 12.
+    assert late_s.mean() == pytest.approx(200e-6, abs=4 * 115e-6 / np.sqrt(2000))
     error_s = np.array([time_tag_error_s(scene, k) for k in indices])
     assert error_s.mean() == pytest.approx(1e-3, abs=4 * 200e-6 / np.sqrt(2000))
     assert error_s.std() == pytest.approx(200e-6, rel=0.07)

@@ -86,9 +86,8 @@ def test_fiber_displacement_along_the_normal_is_uniform_within_its_declared_shar
     n = len(share)
     assert np.abs(share).max() <= 1 + 1e-9
     assert abs(share.mean()) < 4 / np.sqrt(3 * n)
-    assert share.var() == pytest.approx(
-        1 / 3, abs=4 * np.sqrt(4 / 45 / n)
-    )  # (1/5 - 1/9) of the fourth moment
+    # (1/5 - 1/9) of the fourth moment.
+    assert share.var() == pytest.approx(1 / 3, abs=4 * np.sqrt(4 / 45 / n))
     for name in ("id", "strength", "normal", "radius_m", "start_s"):
         np.testing.assert_array_equal(getattr(real, name), getattr(ideal, name))
 

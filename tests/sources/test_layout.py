@@ -232,9 +232,8 @@ def test_boards_on_a_grid_have_equal_areas_and_straight_rows() -> None:
     row = made[np.abs(made[:, 1]) < 1e-12]
     # Equal steps of 2 sin(t / 2) along the row through the zenith.
     out = np.sort(np.sign(row[:, 0]) * 2 * np.sin(np.arccos(np.clip(row[:, 2], -1, 1)) / 2))
-    np.testing.assert_allclose(
-        np.diff(out), 0.04, rtol=0, atol=1e-9
-    )  # the arc cosine's rounding at the zenith
+    # The arc cosine's rounding at the zenith.
+    np.testing.assert_allclose(np.diff(out), 0.04, rtol=0, atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(made, axis=1), 1, rtol=0, atol=1e-15)
 
 
@@ -697,9 +696,8 @@ def test_each_led_has_its_board_s_number_if_there_are_boards() -> None:
     boards = dome.board_of(config.layout, leds.id)
     assert boards is not None
     middle = np.array([leds.place[boards == b, :3].mean(axis=0) for b in np.unique(boards)])
-    assert (
-        np.linalg.norm(middle[boards] - leds.place[:, :3], axis=1).max() < 0.0227
-    )  # corner to corner
+    # Corner to corner.
+    assert np.linalg.norm(middle[boards] - leds.place[:, :3], axis=1).max() < 0.0227
     spread = loader.load(
         "afit_simsat", {"light.layout": "{kind: fibonacci, cap_deg: 9, count: 5}"}
     ).light
@@ -845,9 +843,8 @@ def test_the_measured_order_and_ratio_of_levels_matches_table_7() -> None:
     leds = lit(sequential(5, levels=levels), drive={"kind": "sequential"})
     ours = np.array([light_s(leds, which, 0.0123, 40e-3) for which in range(5)])
     np.testing.assert_array_equal(np.argsort(-ours), np.argsort(-np.array(list(TABLE_7.values()))))
-    np.testing.assert_allclose(
-        ours, 8e-6 * np.array(list(TABLE_7)), rtol=1e-9, atol=0
-    )  # eight cycles of 5 ms
+    # Eight cycles of 5 ms.
+    np.testing.assert_allclose(ours, 8e-6 * np.array(list(TABLE_7)), rtol=1e-9, atol=0)
     slopes = np.array(
         [TABLE_7[on_us] / ours[n] for n, on_us in enumerate(TABLE_7) if 200 <= on_us <= 500]
     )

@@ -171,9 +171,8 @@ def test_reference_electrons_of_a_bright_led() -> None:
     strength = led_strength_e_s_sr(0.6, "white", Band.from_efficiency(0.30))
     at_camera = irradiance_e_s_m2(strength, LAMBERT, ONE, ONE, 33 * 0.0254 * ONE)
     pupil_m2 = np.pi / 4 * (0.035 / 8) ** 2
-    assert float(at_camera[0] * pupil_m2 * 0.85 * 1e-3) == pytest.approx(
-        3.1e7, rel=0.02
-    )  # two digits
+    # Two digits.
+    assert float(at_camera[0] * pupil_m2 * 0.85 * 1e-3) == pytest.approx(3.1e7, rel=0.02)
 
 
 def test_every_falloff_law_can_be_named_in_a_scene() -> None:

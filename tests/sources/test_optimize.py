@@ -191,9 +191,8 @@ def test_the_layout_s_information_matches_the_estimator_s(best: Sources) -> None
     _, covariance = rotation_only(
         rays, np.ones(len(q)), leds.position_m, leds, lever, Rotation.identity()
     )
-    assert fisher.variance(total) == pytest.approx(
-        np.trace(covariance), rel=1e-3
-    )  # the prior's part
+    # The prior's part.
+    assert fisher.variance(total) == pytest.approx(np.trace(covariance), rel=1e-3)
 
 
 def on_sphere(tilt_deg: Floats, azimuth_deg: Floats) -> Floats:
@@ -208,12 +207,8 @@ def test_a_rotated_field_coincides_wholly_and_a_mirrored_one_does_not() -> None:
         np.array([0, 1.2, 2.1, 2.6, 3.1, 3.5, 3.8]), np.array([0, 20, 250, 110, 305, 170, 60])
     )
     turned = Rotation.from_euler("ZYZ", [40, 30, 75], degrees=True).apply(pattern)
-    seen = (
-        0.3,
-        np.radians(60),
-        np.radians(6),
-        1e-4,
-    )  # each LED in the middle of its pattern has all others about it
+    # Each LED in the middle of its pattern has all others about it.
+    seen = (0.3, np.radians(60), np.radians(6), 1e-4)
     whole = field_ambiguity(np.concatenate([pattern, turned]), *seen)
     assert whole.fraction[0] == 1
     np.testing.assert_array_equal(whole.other[[0, 7]], [7, 0])

@@ -125,9 +125,8 @@ def test_black_body_colors_follow_planck_s_law() -> None:
 def test_five_magnitudes_are_a_factor_of_a_hundred() -> None:
     flux = star_flux_e_s_m2(np.array([[-1.0, 4.0], [1.5, 6.5]]), 0.3, 0.4, ALL)
     assert flux.shape == (2, 2)
-    np.testing.assert_allclose(
-        flux[:, 0] / flux[:, 1], 100.0, rtol=1e-12, atol=0
-    )  # Pogson's definition
+    # Pogson's definition.
+    np.testing.assert_allclose(flux[:, 0] / flux[:, 1], 100.0, rtol=1e-12, atol=0)
 
 
 def test_liebe_s_rate_is_a_third_of_the_photons() -> None:
@@ -355,9 +354,8 @@ def test_ec655_has_the_reference_s_signal_to_noise(
     It prints no background. With none we get 56.2, 27.1, 19.7, 11.9 (2-8 % more); any background of 23 to 29 e-
     a pixel gives all eight numbers as printed, so it had one of about 25.
     """
-    signal = (
-        np.array([6008, 2392, 1655, 952]) * 0.99929
-    )  # within 5 x 5 px: erf(5 / (2 sqrt(2) .7))^2
+    # Within 5 x 5 px: erf(5 / (2 sqrt(2) .7))^2.
+    signal = np.array([6008, 2392, 1655, 952]) * 0.99929
     off = np.abs(snr(signal, 25, 25.0, read_noise_e) - printed)
     assert np.all(off <= rounding)
 
@@ -390,9 +388,8 @@ def test_efficiency_curves_are_plausible_and_state_their_source(curve: str) -> N
     assert text.startswith("#")
     assert "assumed" in text.split("wavelength_nm")[0]
     assert np.all((band.response >= 0) & (band.response <= 0.96))
-    assert (
-        380e-9 <= band.wavelength_m[0] < band.wavelength_m[-1] <= 1110e-9
-    )  # glass to silicon's edge
+    # Glass to silicon's edge.
+    assert 380e-9 <= band.wavelength_m[0] < band.wavelength_m[-1] <= 1110e-9
     assert Band.from_efficiency(curve) is band
 
 

@@ -86,9 +86,8 @@ def test_the_largest_common_share_of_two_fields_is_over_all_rotations() -> None:
         """Largest common share of two fields at any rotation, except of a field with itself without rotation."""
         turn = fields[j] / fields[i][:, None]
         unit = np.isclose(np.abs(turn), 1) & ~(np.eye(*turn.shape, dtype=bool) & (i == j))
-        far = np.abs(
-            fields[i][:, None] * turn[unit][:, None, None] - fields[j]
-        )  # (turns, of i, of j)
+        # (turns, of i, of j).
+        far = np.abs(fields[i][:, None] * turn[unit][:, None, None] - fields[j])
         return float(
             (1 + (far.min(axis=2) < 0.02).sum(axis=1).max())
             / (1 + max(len(fields[i]), len(fields[j])))

@@ -271,9 +271,8 @@ def test_reflected_images_are_as_bright_as_traced_rays(name: str) -> None:
         half = 0.02
         count = 400_000
         radius_m = 0.1 * 0.02 * distance_m
-        rays = (
-            axis + rng.uniform(-half, half, (count, 2)) @ np.linalg.svd(axis[None])[2][1:]
-        )  # even in solid angle
+        # Even in solid angle.
+        rays = axis + rng.uniform(-half, half, (count, 2)) @ np.linalg.svd(axis[None])[2][1:]
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         hit, along = bounce(name, led_m, rays)
         steps = np.sum((CAMERA_M - hit) * toward, axis=1) / np.sum(along * toward, axis=1)
@@ -316,9 +315,8 @@ def test_fresnel_reflectances_match_the_textbook() -> None:
     n = 1.49
     config = ReflectionConfig(refractive_index=n)
     brewster = math.atan(n)
-    s = (
-        math.sin(brewster - math.asin(math.sin(brewster) / n)) ** 2
-    )  # r_p = 0, r_s = sin(i - t) / sin(i + t), i + t = 90 deg
+    # r_p = 0, r_s = sin(i - t) / sin(i + t), i + t = 90 deg.
+    s = math.sin(brewster - math.asin(math.sin(brewster) / n)) ** 2
     expected = [((n - 1) / (n + 1)) ** 2, s / 2, 1.0]
     np.testing.assert_allclose(
         reflectance(config, np.array([1.0, math.cos(brewster), 0.0])), expected, atol=1e-12

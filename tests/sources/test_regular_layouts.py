@@ -59,9 +59,8 @@ def edges(vertices: np.ndarray) -> np.ndarray:
 def test_a_class_1_sphere_has_ten_times_the_square_and_two(frequency: int) -> None:
     vertices = geodesic_vertices(frequency, "I")
     assert len(vertices) == 10 * frequency**2 + 2
-    assert (
-        len(edges(vertices)) == 30 * frequency**2
-    )  # Euler: a triangulation of V vertices has 3 V - 6 edges
+    # Euler: a triangulation of V vertices has 3 V - 6 edges.
+    assert len(edges(vertices)) == 30 * frequency**2
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1, rtol=0, atol=1e-15)
 
 
@@ -225,9 +224,8 @@ def test_strips_follow_meridians_with_leds_a_pitch_apart_to_the_rim(on: dict[str
         {"kind": "string", "winding": "meridian", "pitch": "33 mm", "spacing": "10 cm"}, on
     ).place[:, :3]
     tilt, azimuth = angles(place_m)
-    strips = (
-        np.rint(azimuth % (2 * np.pi) * 64 / (2 * np.pi)).astype(int) % 64
-    )  # rim of 5 m: 64 strips
+    # Rim of 5 m: 64 strips.
+    strips = np.rint(azimuth % (2 * np.pi) * 64 / (2 * np.pi)).astype(int) % 64
     assert azimuth % (2 * np.pi / 64) == pytest.approx(0, abs=1e-9) or len(np.unique(strips)) in (
         32,
         64,

@@ -175,9 +175,8 @@ def test_the_earth_s_shadow_is_a_cone() -> None:
     assert lit(edge) == pytest.approx(0.5, abs=0.01)
     assert lit(edge - 1.02 * sun_rad) == 1
     assert lit(edge + 1.02 * sun_rad) == 0
-    half = (
-        0.5 + (0.5 * np.sqrt(0.75) + np.arcsin(0.5)) / np.pi
-    )  # area of a disc above a chord at half its radius
+    # Area of a disc above a chord at half its radius.
+    half = 0.5 + (0.5 * np.sqrt(0.75) + np.arcsin(0.5)) / np.pi
     assert lit(edge - 0.5 * sun_rad) == pytest.approx(half, abs=0.01)
 
 

@@ -60,9 +60,8 @@ def test_the_moon_s_distance_and_phase_match_skyfield() -> None:
     moon = ephemeris.place("moon", seen)
     geometric_km = ephemeris.load_ephemeris().position_km("moon", seen.tt_jd)
     assert np.linalg.norm(geometric_km) == pytest.approx(368405.543, abs=0.01)
-    assert np.degrees(moon.phase_rad) == pytest.approx(
-        69.0819, abs=0.006
-    )  # Skyfield's with 20" of aberration
+    # Skyfield's with 20" of aberration.
+    assert np.degrees(moon.phase_rad) == pytest.approx(69.0819, abs=0.006)
     of_date_axes = erfa.pnm06a(seen.tt_jd, 0.0)
     direction = of_date_axes @ moon.direction
     toward_sun = of_date_axes @ moon.toward_sun

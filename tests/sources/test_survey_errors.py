@@ -119,9 +119,8 @@ def test_leds_are_on_a_raised_ellipsoid_within_kantorovich_s_bound() -> None:
     leds = eyes.leds
     directions = (lab.camera.sources.place[:, :3] - leds.center_m) / leds.semi_axes_m**2
     normals = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    support = np.linalg.norm(
-        normals * leds.semi_axes_m, axis=1
-    )  # of the plane that touches it with that normal
+    # Of the plane that touches it with that normal.
+    support = np.linalg.norm(normals * leds.semi_axes_m, axis=1)
     true_axes_m = leds.semi_axes_m - raised_m
     share = (support - np.linalg.norm(normals * true_axes_m, axis=1)) / raised_m
     longest = true_axes_m.max()

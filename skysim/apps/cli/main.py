@@ -99,12 +99,10 @@ def listing_hint(text: str, context: typer.Context | None) -> str:
 def main() -> None:
     """Run the command. A user error prints one line and exits with code 2; Ctrl-C and SIGTERM exit with 130."""
     errors.running_as_command = True
-    gc.set_threshold(
-        50_000
-    )  # importing creates a hundred thousand objects: 5 % of the time of a short command
-    signal.signal(
-        signal.SIGTERM, signal.default_int_handler
-    )  # clean up after SIGTERM as after Ctrl-C
+    # Importing creates a hundred thousand objects: 5 % of the time of a short command.
+    gc.set_threshold(50_000)
+    # Clean up after SIGTERM as after Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         code = app(standalone_mode=False)
     except InputError as error:

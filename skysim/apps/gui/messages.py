@@ -15,12 +15,8 @@ from skysim.results import plots
 
 Triple = tuple[float, float, float]
 NAN = float("nan")
-LIMITS = (
-    "automatic",
-    "zscale",
-    "min to max",
-    "manual",
-)  # of the display; the last are set in the browser
+# Of the display; the last are set in the browser.
+LIMITS = ("automatic", "zscale", "min to max", "manual")
 
 
 class Display(NamedTuple):

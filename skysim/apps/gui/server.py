@@ -42,11 +42,8 @@ from skysim.scene.loader import find
 # Garbage collection of the server, while no page gets a frame.
 
 
-THRESHOLDS = (
-    2_000,
-    10,
-    1_000,
-)  # new objects until a collection, and collections until one of older objects
+# New objects until a collection, and collections until one of older objects.
+THRESHOLDS = (2_000, 10, 1_000)
 QUIET_S = 1.0  # after a page was closed, and without a new frame on any page, before closed pages are collected
 PATIENCE_S = 60.0  # after which they are collected although frames follow one another
 
@@ -245,9 +242,8 @@ class Guard:
             return PlainTextResponse("request of another site refused", 403)
         if int(headers.get("content-length") or 0) > LIMIT_BYTES + 2**16:
             return PlainTextResponse("request too large; allowed: 64 MB", 413)
-        if token_matches(
-            request.query_params.get("token", ""), self.token
-        ):  # the address does not keep it
+        # The address does not keep it.
+        if token_matches(request.query_params.get("token", ""), self.token):
             response = RedirectResponse("/", 303)
             response.set_cookie(self.cookie, self.token, path="/", httponly=True, samesite="strict")
             user = user_of(request.cookies) or secrets.token_hex(USER_BYTES)

@@ -222,9 +222,8 @@ def few_lights(refusal: Refusal) -> str:
 def unknown_cause(refusal: Refusal) -> str:
     """No cause was found: what is left."""
     solver = refusal.solvers[0]
-    unknown = replace(
-        solver, fov_deg=None, camera=None, opencv_calibration=None
-    )  # `other_field` tried it
+    # `other_field` tried it.
+    unknown = replace(solver, fov_deg=None, camera=None, opencv_calibration=None)
     narrow_deg = min(one.tried_fov_deg(*refusal.size_px)[0] for one in (unknown, *refusal.solvers))
     text = (
         f"no cause found: no field of {narrow_deg:.1g}° to {FIELD_SEARCH.widest_deg:g}° fits, nor the mirrored picture;"

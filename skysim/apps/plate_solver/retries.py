@@ -99,10 +99,8 @@ TOPHAT_PX = 15  # wider than a sharp star
 # sides of the squares; shorter trails are seen as one
 TRAIL_FACTORS = (3, 2, 4)
 MIN_TRAIL_PX = 10.0
-ROUND = (
-    0.0,
-    0.0,
-)  # streak of sharp stars: what is left of the edges of trees is parallel, as streaks are
+# Streak of sharp stars: what is left of the edges of trees is parallel, as streaks are.
+ROUND = (0.0, 0.0)
 FLAT_SIGMA_PX = 0.25  # of their centroids: JPEG has removed a part of what is faint beside clouds
 FLAT = "its stars were found without its clouds"
 HALF = "its stars were found in its {} half alone"

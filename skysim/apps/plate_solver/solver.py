@@ -375,9 +375,8 @@ def solve_array(
         centroids, solver, (width_px, height_px), date_utc, clock, efforts
     )
     if attitude.camera:
-        attitude = replace(
-            attitude, camera=replace(attitude.camera, height_px=height_px)
-        )  # the picture's, of a half
+        # The picture's, of a half.
+        attitude = replace(attitude, camera=replace(attitude.camera, height_px=height_px))
     return Report(attitude, centroids, clock.seconds), tracker
 
 

@@ -79,7 +79,13 @@ class SenderStats:
     late_ms: deque[float] = field(default_factory=lambda: deque(maxlen=DELAY_WINDOW))
 
     def record(self, late_ms: float, dropped: int) -> None:
-        """Record a rendered frame; dropped : number of frames dropped so far."""
+        """Record a rendered frame
+
+        Parameters
+        ----------
+        dropped
+            Number of frames dropped so far.
+        """
         self.rendered = self.rendered + 1
         self.dropped = dropped
         if self.rendered > 1:  # the first frame starts the clock, so it has no delay

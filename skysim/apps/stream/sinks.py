@@ -67,7 +67,13 @@ class Packet(NamedTuple):
 
 
 def build_packet(shot: Shot, due_unix_s: float, made_unix_s: float, dropped: int) -> Packet:
-    """Make the packet of a shot. Times: due and made, Unix seconds;  dropped : frames dropped before it."""
+    """Make the packet of a shot. Times: due and made, Unix seconds
+
+    Parameters
+    ----------
+    dropped
+        Frames dropped before it.
+    """
     frame = shot.frame
     truth = shot.truth
     pixels = np.ascontiguousarray(frame.image_dn, frame.image_dn.dtype.newbyteorder("<"))
@@ -170,9 +176,8 @@ class Sink:
 
     def offer(self, packet: Packet, patient: bool) -> None:
         """Queue a packet. If the queue is full, wait if `patient`, else drop the packet."""
-        packet = packet.plus_dropped(
-            self.dropped
-        )  # the header's count includes frames dropped by this sink
+        # The header's count includes frames dropped by this sink.
+        packet = packet.plus_dropped(self.dropped)
         while not self.fault:
             try:
                 self.packets.put(packet, timeout=0.1 if patient else 0.0001)

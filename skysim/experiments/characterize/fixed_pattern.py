@@ -83,7 +83,13 @@ def is_resolved(rates: Floats, noise: RateNoise) -> bool:
 
 
 def fit(rates: Floats, noise: RateNoise, greatest: float) -> DarkCurrent:
-    """Fit the rates of all pixels, in DN/s. greatest : rate beyond which a pixel saturates in the longest dark"""
+    """Fit the rates of all pixels, in DN/s.
+
+    Parameters
+    ----------
+    greatest
+        Rate beyond which a pixel saturates in the longest dark
+    """
     start, hot = start_values(rates, noise)
     enough = hot >= LEAST_HOT
     kept = rates if enough else np.sort(rates)[: rates.size - hot]
@@ -208,9 +214,8 @@ def start_values(rates: Floats, noise: RateNoise) -> tuple[Floats, int]:
 ORDER = 4  # of the polynomial that is the light's distribution
 SAMPLE = 8  # rows and columns of a block, for the fit of the polynomial
 
-Planes = tuple[
-    Floats, Floats, Floats
-]  # (H, W) at exposure 0 in DN, (H, W) rate in DN/s, (L,) weights of the rate
+# (H, W) at exposure 0 in DN, (H, W) rate in DN/s, (L,) weights of the rate.
+Planes = tuple[Floats, Floats, Floats]
 
 
 def dark_planes(darks: Sequence[Level], transfer: Transfer, half: str) -> Planes:

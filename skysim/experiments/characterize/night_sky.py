@@ -379,9 +379,8 @@ def check_trails(frames: list[NightFrame]) -> None:
         stretch = math.hypot(along, across)
         variance = float(np.median(one.stars.variance_px2))
         if stretch > MAX_STRETCH * variance:
-            trail_px = math.sqrt(
-                12 * stretch
-            )  # a uniform streak of length L has the variance L^2 / 12
+            # A uniform streak of length L has the variance L^2 / 12.
+            trail_px = math.sqrt(12 * stretch)
             angle_deg = math.degrees(math.atan2(across, along)) / 2
             raise InputError(
                 one.path,

@@ -221,7 +221,15 @@ GAIN, CURVATURE, READ, BLACK, LIGHT, FIRST_DARK = range(6)  # places of the para
 
 
 class TransferPoint(NamedTuple):
-    """A level as the fit sees it. dark : index of its temperature;  lit : 1 for a flat, 0 for a dark."""
+    """A level as the fit sees it.
+
+    Attributes
+    ----------
+    dark
+        Index of its temperature
+    lit
+        1 for a flat, 0 for a dark.
+    """
 
     exposure_s: float
     lit: int
@@ -297,14 +305,19 @@ def model(points: Sequence[TransferPoint], values: Floats) -> tuple[Floats, Floa
 
 
 def fit(points: Sequence[TransferPoint], flicker: float) -> Transfer:
-    """Fit levels of darks and flats. flicker : relative, from `lamp_flicker`"""
+    """Fit levels of darks and flats.
+
+    Parameters
+    ----------
+    flicker
+        Relative, from `lamp_flicker`
+    """
     kept = list(points)
     mean, mean_sigma, variance, variance_sigma = np.array([one.moments for one in kept]).T
     black = min(mean)
     lit = np.array([one.lit for one in kept])
-    mean_sigma = np.hypot(
-        mean_sigma, lit * flicker * (mean - black) / np.sqrt(2)
-    )  # of a pair at least
+    # Of a pair at least.
+    mean_sigma = np.hypot(mean_sigma, lit * flicker * (mean - black) / np.sqrt(2))
     start = start_values(kept)
 
     def residuals(values: Floats) -> Floats:

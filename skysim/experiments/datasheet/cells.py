@@ -44,12 +44,8 @@ TRUE_STARS = 20
 BENDS_PX = (1.0, 4.0, 16.0, 64.0)  # acceleration times the exposure time's square
 TRACKED = 2  # frames that are followed before one in tracking mode: the second has a rate
 TRACKED_STREAKS_PX = (2.0, 8.0, 16.0, 32.0)  # of the rates in tracking mode
-MISSED_PX = (
-    3.0,
-    6.0,
-    12.0,
-    24.0,
-)  # acceleration times the square of the time between frames, in tracking mode
+# Acceleration times the square of the time between frames, in tracking mode.
+MISSED_PX = (3.0, 6.0, 12.0, 24.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +173,13 @@ class Designer:
         return max(len(self.temperatures_c), 1)
 
     def settings(self, draw: Draw, turn_deg: float = 0.0) -> Settings:
-        """Settings of a draw, with new noise. turn_deg : in addition to that of the draw's attitude"""
+        """Settings of a draw, with new noise.
+
+        Parameters
+        ----------
+        turn_deg
+            In addition to that of the draw's attitude
+        """
         self.noise += 1
         chosen: Settings = {key: 1000 + draw.unit for key in self.seeds}
         if self.temperatures_c:

@@ -337,7 +337,13 @@ def find_faults(run: SurveyRun) -> DomeFaults:
 
 
 def fault_lines(faults: Mapping[str, Any]) -> Iterator[str]:
-    """Faults as lines of text, by LED number, and a summary. faults : the fields of a `DomeFaults`"""
+    """Faults as lines of text, by LED number, and a summary.
+
+    Parameters
+    ----------
+    faults
+        The fields of a `DomeFaults`
+    """
     for led in faults["dark"]:
         yield f"LED {led} is dark"
     for led, distance_m in faults["displaced"].items():

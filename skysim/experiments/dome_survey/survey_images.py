@@ -35,14 +35,8 @@ ATTITUDES = "attitudes.csv"
 FRAME = "frame_{:04d}.fits"
 COLUMNS = ("file", "roll_deg", "pitch_deg", "yaw_deg")
 MIN_IMAGES = 3
-FORMATS = (
-    ".fits",
-    ".fit",
-    ".fits.gz",
-    ".tif",
-    ".tiff",
-    ".png",
-)  # of several images of one name the first is read
+# Of several images of one name the first is read.
+FORMATS = (".fits", ".fit", ".fits.gz", ".tif", ".tiff", ".png")
 
 
 class SurveyImage(NamedTuple):
@@ -121,7 +115,13 @@ def read_attitudes(path: Path) -> dict[str, Rotation]:
 def write_attitudes(
     path: Path, names: Sequence[str], lab_from_body: Rotation, leds: NDArray[np.int64] | None = None
 ) -> None:
-    """Write attitudes as `read_attitudes` reads them; leds : number of LEDs in view, for a plan."""
+    """Write attitudes as `read_attitudes` reads them
+
+    Parameters
+    ----------
+    leds
+        Number of LEDs in view, for a plan.
+    """
     lines = [",".join((*COLUMNS, "leds") if leds is not None else COLUMNS)]
     for n, (name, angles) in enumerate(
         zip(names, survey_frames.angles_deg(lab_from_body), strict=True)

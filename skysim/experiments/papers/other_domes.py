@@ -208,10 +208,8 @@ ARCSEC_TICKS = (0.2, 0.5, 1, 2, 5, 10)
 OLED_MAX_TILT_DEG = 10.0
 CAP_DEG = 18.0
 MEASURED = {"led_sigma": "0.2 mm", "lever_sigma": "0.2 mm"}  # of a laser tracker or a measuring arm
-BY_FRAMES = {
-    "led_sigma": "0.08 mm",
-    "lever_sigma": "0.09 mm",
-}  # left by `skysim survey`, docs/findings/dome.md
+# Left by `skysim survey`, docs/findings/dome.md.
+BY_FRAMES = {"led_sigma": "0.08 mm", "lever_sigma": "0.09 mm"}
 LEVEL_SIGMA_DEG = 0.005  # orientation error of the survey's axes
 
 

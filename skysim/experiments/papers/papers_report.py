@@ -41,7 +41,13 @@ MEANINGS = (
 def papers_report(
     reproductions: Sequence[Reproduction], ids: Sequence[str], quick: bool, seed: int
 ) -> Report:
-    """The report of some experiments. ids, quick, seed : as the command names them"""
+    """The report of some experiments.
+
+    Parameters
+    ----------
+    ids, quick, seed
+        As the command names them
+    """
     papers = dict.fromkeys(one.published.paper for one in reproductions)
     blocks = [
         verdict(reproductions),

@@ -134,11 +134,8 @@ EVENTS = {
     "wrong": "Wrong attitudes (an error beyond 10′ that the covariance does not allow, or beyond 1°)",
 }
 SHARES = (*EVENTS, "ambiguous", "misled", "refused")
-RESPONSES = (
-    *SHARES,
-    "mismatched",
-    "nees",
-)  # responses that the answers need besides those of the study
+# Responses that the answers need besides those of the study.
+RESPONSES = (*SHARES, "mismatched", "nees")
 
 
 def headline(

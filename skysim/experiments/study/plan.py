@@ -551,9 +551,8 @@ def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:
     local = Path(spec.folder) / name
     path = local if local.suffix in {".yaml", ".yml"} and is_file(local) else find_scene(name)
     overrides = {key: one_line(value) for key, value in values.items() if not key.startswith(TRIAL)}
-    return load_scene(
-        path, overrides, refuses_unused=False
-    ), trial  # `unused_options` refuses, for the whole study
+    # `unused_options` refuses, for the whole study.
+    return load_scene(path, overrides, refuses_unused=False), trial
 
 
 def resolve_trial(spec: TrialSpec, settings: Settings) -> Trial:

@@ -86,9 +86,8 @@ def format_level(value: Any) -> str:
     """Text of a factor's level, numbers rounded to four digits."""
     if isinstance(value, float):
         return f"{value:.4g}"
-    if isinstance(value, str) and (
-        match := LONG_QUANTITY.match(value)
-    ):  # a sampled quantity with a unit
+    # A sampled quantity with a unit.
+    if isinstance(value, str) and (match := LONG_QUANTITY.match(value)):
         return f"{float(match[1]):.4g}{match[2]}"
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 

@@ -135,9 +135,8 @@ SAMPLED_FRAMES = 9  # about this many frames determine the black and white level
 FOURCC = "mp4v"  # MPEG-4 part 2, which every wheel of OpenCV can write
 PROBE_BYTES = 1 << 20
 
-Bar = Callable[
-    [Iterable[Any], int, str], Iterator[Any]
-]  # progress bar over items: items, count, label
+# Progress bar over items: items, count, label.
+Bar = Callable[[Iterable[Any], int, str], Iterator[Any]]
 
 # Unit by the ending of a column's name; the longest matching ending applies.
 UNITS = {

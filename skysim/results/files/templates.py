@@ -107,13 +107,8 @@ def to_dxf(drawing: Drawing) -> str:
         (9, "$ACADVER"),
         (1, "AC1009"),
     ]
-    groups += [
-        (9, "$INSUNITS"),
-        (70, 4),
-        (0, "ENDSEC"),
-        (0, "SECTION"),
-        (2, "ENTITIES"),
-    ]  # 4: millimeters
+    # 4: millimeters.
+    groups += [(9, "$INSUNITS"), (70, 4), (0, "ENDSEC"), (0, "SECTION"), (2, "ENTITIES")]
     for shape in drawing.shapes:
         groups += dxf_groups(shape, drawing.height_mm)
     groups += [(0, "ENDSEC"), (0, "EOF")]
@@ -189,9 +184,8 @@ def template(lab: Lab, ending: str) -> str:
         raise InputError("light.kind", f"{light.kind} has no {ending}", "dome")
     surface = build_surface(light.surface)
     leds = design_leds(light, surface, lab.camera.band)
-    cap_deg = max(
-        float(getattr(light.layout, "cap_deg", 0.0)), max_tilt_deg(leds.place[:, :3])
-    )  # boards stand out
+    # Boards stand out.
+    cap_deg = max(float(getattr(light.layout, "cap_deg", 0.0)), max_tilt_deg(leds.place[:, :3]))
     dome = Dome(
         lab.scene.name, surface, cap_deg, leds.id, leds.place[:, :3], light.led.disk_diameter_m / 2
     )

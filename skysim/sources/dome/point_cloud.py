@@ -94,9 +94,8 @@ def fit_ellipsoid(points_m: Floats) -> FittedEllipsoid:
     sphere = fit_sphere(points_m)
 
     def residual_m(parameters: Floats) -> Floats:
-        axes = (
-            np.exp(parameters[3:]) * sphere.radius_m
-        )  # logarithms as parameters keep the semi-axes positive
+        # Logarithms as parameters keep the semi-axes positive.
+        axes = np.exp(parameters[3:]) * sphere.radius_m
         w = (points_m - sphere.center_m - sphere.radius_m * parameters[:3]) / axes
         norm = np.linalg.norm(w, axis=1)
         return np.asarray((norm - 1) * norm / np.linalg.norm(w / axes, axis=1))

@@ -23,9 +23,8 @@ MERIDIANS_OF_PART = 17  # of one part, its edges and its middle included
 BISECTIONS = 40
 TURNS = 91  # orientations of the box about a part, from 0 to 90 deg
 PROPOSED_SEGMENTS = (2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24)  # in the message about a door
-ALL_ROUND_RAD = np.linspace(
-    0.0, 2 * np.pi, MERIDIANS, endpoint=False
-)  # azimuths of the whole shell
+# Azimuths of the whole shell.
+ALL_ROUND_RAD = np.linspace(0.0, 2 * np.pi, MERIDIANS, endpoint=False)
 
 
 def check_room(room: RoomConfig, surface: Surface, cap_deg: float) -> None:

@@ -77,9 +77,8 @@ def test_tabs_get_workers_in_order_and_a_closed_tab_frees_its_worker(
             assert hand is not None
             hand.close()
             if next_one == 3:
-                tabs.append(
-                    asyncio.create_task(tab(TABS))
-                )  # a newcomer looks at once, and yet is the last
+                # A newcomer looks at once, and yet is the last.
+                tabs.append(asyncio.create_task(tab(TABS)))
             await tabs[next_one]
             assert served[-1][0] == next_one
             assert len(Hand.alive) == WORKERS

@@ -315,9 +315,8 @@ def test_a_stream_ends_without_frames_and_gives_way_to_a_newer_one(
         assert await former is None
         got.append(await newer)
         frames.drawn = 1
-        await asyncio.gather(
-            *[one async for one in frames.stream(ALL_PIXELS)]
-        )  # idle from the start
+        # Idle from the start.
+        await asyncio.gather(*[one async for one in frames.stream(ALL_PIXELS)])
         frames.add(2, served(sky(2)), alone=False)
         return [*announced], got  # what comes when the loop closes is of no interest
 

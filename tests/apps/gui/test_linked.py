@@ -97,9 +97,8 @@ def test_the_strip_of_residuals_has_a_dot_for_each_identified_light_and_frame() 
     fields = strips.dot_fields([strips.Strip("first"), strip], "LED {}".format)
     assert fields["names"] == {7: "LED 7", 9: "LED 9"}
     assert (fields["grid"], fields["place"]["top"]) == (1, strips.STRIP_PX + strips.HEAD_PX)
-    assert not any(
-        curve.points for curve in strip.curves
-    )  # a chart that is drawn again does not send them again
+    # A chart that is drawn again does not send them again.
+    assert not any(curve.points for curve in strip.curves)
 
 
 def test_too_many_residuals_are_thinned_by_whole_frames() -> None:

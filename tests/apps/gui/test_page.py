@@ -254,9 +254,10 @@ def test_the_readout_has_the_pixel_s_value_and_direction(page: Any, tmp_path: Pa
         place = [float(value) for value in re.match(r"x ([\d.]+) +y ([\d.]+)", readout).groups()]
         assert int(re.search(r"(\d+) DN", readout)[1]) == frame[y, x]
         ra_deg, dec_deg = sky.pixel_to_world_values(*place)
+        # A place's 0.05 px.
         assert float(re.search(r"RA ([\d.]+)°", readout)[1]) == pytest.approx(
             float(ra_deg), abs=6e-3
-        )  # a place's 0.05 px
+        )
         shown_dec = float(re.search(r"Dec ([+−][\d.]+)°", readout)[1].replace("−", "-"))
         assert shown_dec == pytest.approx(float(dec_deg), abs=6e-3)
         hours = Angle(re.search(r"\d+h\d+m[\d.]+s", readout)[0]).degree
@@ -275,9 +276,8 @@ def test_a_cut_shows_its_profile(page: Any, tmp_path: Path) -> None:
     values, ends = (
         np.array(plot.get_attribute(f"data-{name}").split(), float) for name in ("profile", "cut")
     )
-    np.testing.assert_allclose(
-        ends, [100, 200, 160, 200], rtol=0, atol=2
-    )  # to a pixel of the screen
+    # To a pixel of the screen.
+    np.testing.assert_allclose(ends, [100, 200, 160, 200], rtol=0, atol=2)
     x, y = np.linspace(ends[:2], ends[2:], len(values)).T
     expected = RegularGridInterpolator(tuple(map(np.arange, frame.shape)), frame)((y, x))
     np.testing.assert_allclose(values, expected, rtol=0, atol=0.06)
@@ -481,9 +481,8 @@ def test_monte_carlo_of_200_by_2_runs_and_its_report_is_private(page: Any, serve
     assert float(re.search(r"identified\s+([\d.]+)", summary)[1]) > 0.9
     report = page.locator("a[href^='/report/']").first
     path = str(report.get_attribute("href")).removeprefix("/")
-    assert (
-        server.status(path, Cookie=f"skysim_gui_{server.port}={TOKEN}") == 404
-    )  # another browser that has the token
+    # Another browser that has the token.
+    assert server.status(path, Cookie=f"skysim_gui_{server.port}={TOKEN}") == 404
     with page.expect_popup() as opens:
         report.click()
     opens.value.wait_for_function("() => document.title.startsWith('Monte Carlo of')")
@@ -584,9 +583,8 @@ def test_a_live_camera_is_followed_to_its_end(browser: Any, tmp_path: Path) -> N
         page.get_by_role("button", name="Watch").click()
         page.get_by_role("status").filter(has_text="ends after 2 frames").wait_for()
         turned = rolled(page, "camera")
-        np.testing.assert_allclose(
-            still - turned, 10, rtol=0, atol=0.05
-        )  # the last frame's; the sky turns back
+        # The last frame's; the sky turns back.
+        np.testing.assert_allclose(still - turned, 10, rtol=0, atol=0.05)
         page.get_by_role("button", name="Watch").wait_for()
         identified(page)
 

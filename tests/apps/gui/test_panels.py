@@ -102,9 +102,8 @@ def test_an_arrow_key_moves_stars_by_its_share_of_the_field_even_at_the_pole(
     _, y, z = (
         mount.cam_from_body * geometry.moved(STARS, mount, before, 0.0, geometry.FINE, 0.0).inv()
     ).apply(star)
-    np.testing.assert_allclose(
-        np.arctan2(y, z), geometry.FINE * across, rtol=1e-9
-    )  # down: y is down
+    # Down: y is down.
+    np.testing.assert_allclose(np.arctan2(y, z), geometry.FINE * across, rtol=1e-9)
 
 
 def test_key_r_rolls_the_camera_clockwise_and_stars_counterclockwise() -> None:
@@ -175,9 +174,8 @@ def test_changing_a_section_s_kind_shows_its_keys_and_keeps_common_ones() -> Non
         "frame_transfer",
         "interline",
     )
-    assert at_first["light.kind"].allowed_values == (
-        "stars",
-    )  # another one needs another start of the motion
+    # Another one needs another start of the motion.
+    assert at_first["light.kind"].allowed_values == ("stars",)
     edited = {"tracker.limit_mag": "5.5", "camera.shutter.row_time": "20 us"}
     rolling = forms.with_value("shefex2", edited, "camera.shutter.kind", "rolling")
     assert rolling == {
@@ -290,10 +288,8 @@ def test_each_kind_of_mark_has_its_position_and_can_be_switched_off() -> None:
         kind: {mark["kind"]: mark["points"] for mark in of_kind["marks"]}
         for kind, of_kind in drawn.items()
     }
-    assert points["truth"] == {
-        "truth": [[10.0, 20.0]],
-        "faint": [[50.0, 60.0]],
-    }  # nothing as faint is detected
+    # Nothing as faint is detected.
+    assert points["truth"] == {"truth": [[10.0, 20.0]], "faint": [[50.0, 60.0]]}
     assert points["detected"] == {"detected": [[10.1, 20.0], [80.0, 80.0]]}
     assert points["identified"] == {"identified": [[10.1, 20.0]]}
     assert points["false"] == {"false": [[80.0, 80.0]]}

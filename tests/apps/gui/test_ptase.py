@@ -51,9 +51,8 @@ def test_all_functions_of_table_1_of_ptase_work_in_the_page(page: Any) -> None:
     assert come(lambda: "angle mean" in page.locator(".lab-panels").inner_text())
     shown = page.locator(".lab-panels").inner_text()
     found = {name: float(re.search(rf"{name}\s+([\d.]+)", shown)[1]) for name in PUBLISHED}
-    assert found["identified"] == pytest.approx(
-        PUBLISHED["identified"], abs=0.02
-    )  # three standard errors of 400 runs
+    # Three standard errors of 400 runs.
+    assert found["identified"] == pytest.approx(PUBLISHED["identified"], abs=0.02)
     for name in list(PUBLISHED)[1:]:
         assert found[name] == pytest.approx(PUBLISHED[name], rel=0.15)
     assert re.search(r"wrong\s+0\b", shown)

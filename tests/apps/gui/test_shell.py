@@ -130,9 +130,8 @@ def distance(colors: Iterable[str], eye: str) -> float:
 def test_colors_are_distinguishable_with_color_blindness(eye: str) -> None:
     """Red and green of equal lightness would be 0.04 apart in deuteranopia."""
     assert distance(["#3f9a52", "#e05555"], "deuteranopia") < 0.04
-    marks = [
-        color for kind, color in overlay.COLORS.items() if kind != "windows"
-    ]  # these are dashed
+    # These are dashed.
+    marks = [color for kind, color in overlay.COLORS.items() if kind != "windows"]
     states = [[theme[name] for name in STATES] for theme in (style.DARK, style.LIGHT)]
     for colors in (style.CURVE_COLORS, marks, *states):
         assert distance(colors, eye) > 0.1

@@ -50,9 +50,8 @@ def test_a_dome_flight_is_played_positioned_and_its_loop_opened(page: Any) -> No
     simulate(page, 8)
     page.get_by_text(re.compile(r"^\d of 8 frames solved; rms: cross")).wait_for()
     clock = page.get_by_text(re.compile(r"^\d+\.\d\d s +\d/8$"))
-    page.get_by_role(
-        "button", name="Previous frame"
-    ).click()  # a flight that is computed plays: pause it
+    # A flight that is computed plays: pause it.
+    page.get_by_role("button", name="Previous frame").click()
     chosen(page, "Speed", "5×")
     onto_the_page(page)
     page.keyboard.press("Control+k")
@@ -68,9 +67,8 @@ def test_a_dome_flight_is_played_positioned_and_its_loop_opened(page: Any) -> No
     clock.filter(has_text="7/8").wait_for()
     strips = page.locator(".nicegui-echart:visible").first
     box = strips.bounding_box()
-    page.mouse.click(
-        box["x"] + 52 + 0.03 * (box["width"] - 64), box["y"] + 70
-    )  # early in the first strip
+    # Early in the first strip.
+    page.mouse.click(box["x"] + 52 + 0.03 * (box["width"] - 64), box["y"] + 70)
     clock.filter(has_text="1/8").wait_for()
     with page.expect_download() as comes:
         page.get_by_role("button", name="CSV").click()
@@ -171,6 +169,5 @@ def test_a_shared_page_requires_its_token_and_rejects_other_origins(
                 "performance.getEntriesByType('resource').map(one => new URL(one.name).pathname)"
             )
             kept = [path for path in files if path.startswith("/_nicegui/")]
-            assert {others.status(path[1:]) for path in kept} == {
-                401
-            }  # also of files that the server keeps
+            # Also of files that the server keeps.
+            assert {others.status(path[1:]) for path in kept} == {401}

@@ -135,10 +135,8 @@ def test_late_frames_are_dropped_and_counted(frames: list[np.ndarray]) -> None:
     sender.send(streamed_flight(), Slow(0.0, 10.0), [], stats, packets.append)
     assert [one.header["index"] for one in packets] == list(range(0, FRAMES, 2))
     assert [one.header["dropped"] for one in packets] == list(range(FRAMES // 2))
-    assert (stats.rendered, stats.dropped) == (
-        FRAMES // 2,
-        FRAMES - FRAMES // 2,
-    )  # with the last, after which none came
+    # With the last, after which none came.
+    assert (stats.rendered, stats.dropped) == (FRAMES // 2, FRAMES - FRAMES // 2)
     for one in packets:
         np.testing.assert_array_equal(one.pixels, frames[one.header["index"]])
 
@@ -280,9 +278,8 @@ def test_a_client_that_disconnects_during_a_response_is_ignored(
 ) -> None:
     hub[0].publish(packet(1, pixels=np.zeros((3000, 3000), "<u2")))
     with socket.create_connection(("127.0.0.1", int(hub[1].rpartition(":")[2])), 10) as client:
-        client.setsockopt(
-            socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0)
-        )  # reset by closing
+        # Reset by closing.
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         client.sendall(b"GET /frame.raw HTTP/1.0\r\n\r\n")
         assert client.recv(100)
     time.sleep(0.3)
@@ -300,9 +297,8 @@ def test_counters_of_disconnected_clients_are_bounded_and_summed(
             assert unpack(raw) is not None
     until = time.monotonic() + 60
     index = 0
-    while (
-        len(hub[0].disconnected) + hub[0].earlier["clients"] < 100
-    ):  # who left is found out by sending
+    # Who left is found out by sending.
+    while len(hub[0].disconnected) + hub[0].earlier["clients"] < 100:
         assert time.monotonic() < until
         index += 1
         hub[0].publish(packet(index))

@@ -127,9 +127,8 @@ def test_exact_streaks_give_the_rate_in_one_of_two_signs(rng: np.random.Generato
             off = [np.linalg.norm(one.rate_rad_s - seen.rate_rad_s) for one in rates]
             assert len(rates) == 2
             assert not any(one.sign_known for one in rates)
-            assert min(off) < 1e-3 * np.linalg.norm(
-                seen.rate_rad_s
-            )  # a chord is not quite T times the velocity
+            # A chord is not quite T times the velocity.
+            assert min(off) < 1e-3 * np.linalg.norm(seen.rate_rad_s)
             opposite = rates[int(np.argmax(off))].rate_rad_s
             assert opposite @ seen.rate_rad_s < 0
             # One wrong streak of thirty is left out, or is within the gate of 16: with the leverage 3 / 30 it then
@@ -292,9 +291,8 @@ def test_moments_of_an_ellipse_match_those_of_its_pixels(rng: np.random.Generato
     xy = rng.uniform(-0.5, 0.5) * np.sqrt(xx * yy)
     offset = np.stack(np.meshgrid(np.arange(60) - 29.5, np.arange(60) - 29.5), axis=-1)
     distance2 = np.einsum("yxi,ij,yxj->yx", offset, np.linalg.inv([[xx, xy], [xy, yy]]), offset)
-    inside = (
-        distance2 < 4
-    )  # of a uniform ellipse; its moments are a quarter of the squared half axes
+    # Of a uniform ellipse; its moments are a quarter of the squared half axes.
+    inside = distance2 < 4
     image = np.where(inside, 5000.0, 0.0) + rng.normal(100, 1, (60, 60))
     blobs = local(image, 8.0, 50)
     assert len(blobs) == 1
@@ -302,9 +300,8 @@ def test_moments_of_an_ellipse_match_those_of_its_pixels(rng: np.random.Generato
     pixels = np.cov(offset[inside].T, bias=True)
     of_pixels = [pixels[0, 0] - pixels[1, 1], 2 * pixels[0, 1], pixels[0, 0] + pixels[1, 1]]
     assert_allclose(found, of_pixels, rtol=0, atol=0.005 * (xx + yy))
-    assert_allclose(
-        found, [xx - yy, 2 * xy, xx + yy], rtol=0, atol=0.07 * (xx + yy)
-    )  # whole pixels of the outline
+    # Whole pixels of the outline.
+    assert_allclose(found, [xx - yy, 2 * xy, xx + yy], rtol=0, atol=0.07 * (xx + yy))
 
 
 @law(RateEstimate.resolved)

@@ -54,9 +54,8 @@ def test_changes_of_tangents_match_their_derivatives(rng: np.random.Generator) -
     gradient = nearfield.tangent_gradients(pupil)
     moved = tangents(pupil + step_m) - view.tangent
     assert_allclose(np.einsum("kij,kj->ki", gradient, step_m), moved, rtol=0, atol=1e-11)
-    assert_allclose(
-        np.einsum("kij,kj->ki", gradient, pupil), 0, rtol=0, atol=1e-14
-    )  # along the ray nothing changes
+    # Along the ray nothing changes.
+    assert_allclose(np.einsum("kij,kj->ki", gradient, pupil), 0, rtol=0, atol=1e-14)
     jacobian = nearfield.tangent_jacobian(bearing, pupil)
     rotated = (
         tangents(pupil + Rotation.from_rotvec(turned_rad).apply(bearing) - bearing) - view.tangent
@@ -81,9 +80,8 @@ def test_a_rotation_is_found_and_leaves_no_residual(rng: np.random.Generator) ->
     products = systematic.residual_products(view, sigma, np.concatenate([change[None], other]))
     assert_allclose(products[0], 0, rtol=0, atol=1e-10 * np.abs(change / sigma[:, None]).sum() ** 2)
     assert_covariance(products)
-    assert (
-        np.diag(products)[1:] <= ((other / sigma[:, None]) ** 2).sum(axis=(1, 2))
-    ).all()  # a fit adds no residual
+    # A fit adds no residual.
+    assert (np.diag(products)[1:] <= ((other / sigma[:, None]) ** 2).sum(axis=(1, 2))).all()
 
 
 @law(systematic.with_focal)

@@ -395,16 +395,14 @@ def test_the_compiled_core_gives_the_optimum_and_its_covariance() -> None:
     for _ in range(50):
         cam, ref, sigma = same_data("many stars", rng)
         found, spread = kernel.wahba(cam, ref, sigma**-2)
-        assert (
-            error_rad(Rotation.from_matrix(found), quest(cam, ref, sigma)) < 1e-13
-        )  # rounding over the field
+        # Rounding over the field.
+        assert error_rad(Rotation.from_matrix(found), quest(cam, ref, sigma)) < 1e-13
         assert np.abs(found @ found.T - np.eye(3)).max() < 1e-15
         information = np.einsum(
             "n,nij->ij", sigma**-2, np.eye(3) - cam[:, :, None] * cam[:, None, :]
         )
-        assert (
-            np.abs(spread @ information - np.eye(3)).max() < 1e-11
-        )  # rounding over its condition, 300
+        # Rounding over its condition, 300.
+        assert np.abs(spread @ information - np.eye(3)).max() < 1e-11
 
 
 @pytest.mark.parametrize("axis", AXES)
@@ -466,9 +464,10 @@ def test_the_covariance_matches_the_scatter(count: int, name: str) -> None:
 
 def test_the_covariance_of_three_axes_matches_a_hand_calculation() -> None:
     # Directions along x, y, z of sigma s: each axis is seen by the other two: s^2 / 2.
+    # rounding.
     np.testing.assert_allclose(
         covariance(np.eye(3), np.full(3, 2e-5)), 2e-10 * np.eye(3), rtol=0, atol=1e-24
-    )  # rounding
+    )
 
 
 def looking(x: list, y: list, z: list) -> Rotation:
@@ -506,9 +505,8 @@ def test_right_ascension_declination_and_roll_match_a_hand_calculation(case: str
 
 def from_angles(ra: float, dec: float, roll: float) -> Rotation:
     """cam_from_icrs by three rotations: Z by right ascension, Y by declination, then roll about the boresight."""
-    to_sight = Rotation.from_euler(
-        "ZYX", [ra, -dec, -roll]
-    )  # intrinsic: carries +X to the sight, +Z to up
+    # Intrinsic: carries +X to the sight, +Z to up.
+    to_sight = Rotation.from_euler("ZYX", [ra, -dec, -roll])
     axes = to_sight.apply([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
     return Rotation.from_matrix(axes)
 

@@ -242,9 +242,8 @@ def test_a_reference_frame_keeps_its_attitude() -> None:
     frames = filmed(np.random.default_rng(9), turned, place, lever, SMALL, 0.02)
     assert (found.body_from_lab[4] * frames[4].body_from_lab.inv()).magnitude() < 1e-14
     # Held, it has no variance; the others have.
-    sigma = np.sqrt(
-        np.maximum(np.einsum("fii->fi", found.attitude_covariance_rad2), 0)
-    )  # rounding about none
+    # Rounding about none.
+    sigma = np.sqrt(np.maximum(np.einsum("fii->fi", found.attitude_covariance_rad2), 0))
     assert sigma[4].max() < 1e-3 * np.delete(sigma, 4, axis=0).min()
 
 
@@ -339,9 +338,8 @@ def test_a_robust_loss_tolerates_wrong_names_and_reports_them() -> None:
     assert wrong <= outliers
     # Some right ones go too: 5 sigma in two dimensions are 4e-6 of Gaussian noise, so none of a thousand.
     assert all(frames[k].led[row] != mixed[k].led[row] for k, row in outliers)
-    assert robust.misfit == pytest.approx(
-        1, abs=4 / np.sqrt(2 * 700)
-    )  # some 700 degrees of freedom
+    # Some 700 degrees of freedom.
+    assert robust.misfit == pytest.approx(1, abs=4 / np.sqrt(2 * 700))
     rms = [
         np.sqrt(np.mean(errors_rad(found.body_from_lab, turned) ** 2)) for found in (clean, robust)
     ]

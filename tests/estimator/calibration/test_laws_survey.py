@@ -271,9 +271,8 @@ def test_a_gauge_freedom_moves_no_pixel(
     by_led, by_rest = gauge.constraints(once, part)
     assert by_led.shape == (3 * LIGHTS, 4)
     led_free, rest_free = ba.gauge_freedoms(once)
-    assert (
-        np.linalg.matrix_rank(led_free.T @ by_led + rest_free.T @ by_rest) == 4
-    )  # it leaves nothing free
+    # It leaves nothing free.
+    assert np.linalg.matrix_rank(led_free.T @ by_led + rest_free.T @ by_rest) == 4
     if gauge.length is not None:  # its constraint is the known length's slope
         ends = list(gauge.length[:2])
         moved = rng.normal(0, 1e-6, once.position_m.shape)
@@ -375,9 +374,8 @@ def test_the_misfit_is_over_what_the_pixels_determine(
     led_step, rest_step = ba.step(
         terms, ba.eliminate_lights(terms, np.zeros((len(terms.rest), 0)), 0.0)
     )
-    assert (
-        terms.rhs_led @ led_step + terms.rhs_rest @ rest_step < 1e-6
-    )  # at rest where all measurements agree best
+    # At rest where all measurements agree best.
+    assert terms.rhs_led @ led_step + terms.rhs_rest @ rest_step < 1e-6
     assert np.linalg.norm(at_m - true.camera_body_m) < 6 * np.sqrt(3) * max(lever_m, ba.EXACT)
 
 

@@ -202,9 +202,8 @@ def test_equal_leds_get_the_assignment_of_least_distance(rng: np.random.Generato
     best = min(orders, key=lambda order: cost[range(4), order].sum())
     np.testing.assert_array_equal(rows, np.arange(60))
     _, sigma_m = survey_faults.displaced(listed, place_m, covariance)
-    plausible = (
-        cost[range(4), best].max() < 20 * sigma_m**2
-    )  # well below the quantile: 26 for 60 LEDs
+    # Well below the quantile: 26 for 60 LEDs.
+    plausible = cost[range(4), best].max() < 20 * sigma_m**2
     assert (new[:4].tolist() == best.tolist()) or not plausible
     np.testing.assert_array_equal(new[4:], np.arange(4, 60))
 

@@ -186,9 +186,8 @@ def test_the_covariance_of_the_attitudes_includes_the_lens_errors(
 def test_the_misfit_is_one_for_correct_sigmas(clean: list[tuple[Field, Calibration]]) -> None:
     freedom = 800 - 60 - 8
     misfit2 = np.array([found.report.misfit for _, found in clean]) ** 2
-    assert (
-        abs(misfit2.mean() - 1) < 4 * np.sqrt(2 / freedom / RUNS) + 1e-3
-    )  # 1e-3: one outlier in 270,000
+    # 1e-3: one outlier in 270,000.
+    assert abs(misfit2.mean() - 1) < 4 * np.sqrt(2 / freedom / RUNS) + 1e-3
     assert rms([found.report.rms_px for _, found in clean]) == pytest.approx(
         NOISE_PX * np.sqrt(freedom / 800), rel=0.02
     )

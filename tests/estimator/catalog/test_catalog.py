@@ -106,9 +106,8 @@ def test_the_classical_aberration_differs_by_half_a_thousandth_at_most() -> None
         EPOCH_YR,
     )
     beta = 29_800 / 299_792_458
-    far = Observer(
-        1991.25, np.array([0.0, 0.0, 1e9]), np.array([29_800.0, 0.0, 0.0])
-    )  # where no Sun bends light
+    # Where no Sun bends light.
+    far = Observer(1991.25, np.array([0.0, 0.0, 1e9]), np.array([29_800.0, 0.0, 0.0]))
     seen = catalog.apparent(star, far)
     relativistic = np.arccos((np.cos(angle) + beta) / (1 + beta * np.cos(angle)))
     off_mas = np.abs(np.arctan2(seen[:, 1], seen[:, 0]) - relativistic) / MAS_RAD
@@ -239,9 +238,8 @@ def test_the_file_is_read_whole_brightest_first(stars: StarCatalog) -> None:
     assert stars.v_mag[0] == -1.46
     ra, dec = np.radians([(6 + 45 / 60 + 8.9 / 3600) * 15, -(16 + 42 / 60 + 58 / 3600)])
     sirius = [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]
-    assert (
-        separation_rad(stars.vectors[0], np.array(sirius)) < 15 * ARCSEC_RAD
-    )  # J2000, 8.75 years at 1.34"/yr
+    # J2000, 8.75 years at 1.34"/yr.
+    assert separation_rad(stars.vectors[0], np.array(sirius)) < 15 * ARCSEC_RAD
     assert np.all(np.diff(stars.v_mag) >= 0)
     np.testing.assert_allclose(np.linalg.norm(stars.vectors, axis=1), 1, rtol=0, atol=1e-15)
     # A drift is tangent; 1e-20 is rounding of some 1e-5 rad/yr at most.

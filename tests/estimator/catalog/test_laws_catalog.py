@@ -49,9 +49,8 @@ def test_stars_move_across_the_sky_and_no_farther_than_they_can(
     seen = catalog.apparent(stars, there)
     np.testing.assert_allclose(np.linalg.norm(seen, axis=1), 1, rtol=0, atol=1e-12)
     moved = np.linalg.norm(seen - catalog.at_epoch(stars, year), axis=1)
-    away = np.linalg.norm(
-        seen + there.position_au, axis=1
-    )  # near the Sun light is bent by more than a bit
+    # Near the Sun light is bent by more than a bit.
+    away = np.linalg.norm(seen + there.position_au, axis=1)
     assert (
         moved
         < 1.01e-4 + stars.parallax_rad + 2 * catalog.SUN_DEFLECTION_RAD / np.maximum(away, 1e-9)

@@ -37,9 +37,8 @@ def test_lowering_undoes_the_raising_by_refraction(
     np.testing.assert_allclose(
         refraction.lowered(up, zenith, *constants)[high], directions[high], rtol=0, atol=1e-9
     )
-    np.testing.assert_allclose(
-        np.cross(up, directions) @ zenith, 0, rtol=0, atol=1e-12
-    )  # in a vertical plane
+    # In a vertical plane.
+    np.testing.assert_allclose(np.cross(up, directions) @ zenith, 0, rtol=0, atol=1e-12)
     air = SiteAir(50.0, 8.0, "2012-06-24T23:00", pressure_hpa, temperature_c)
     seen = air.seen(directions, 100.0)
     np.testing.assert_allclose(

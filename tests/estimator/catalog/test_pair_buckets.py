@@ -68,10 +68,8 @@ def test_eq_12_s_example_takes_the_third_and_second_bucket_from_the_end() -> Non
     stars = np.column_stack([np.sin(arc), np.zeros(21), np.cos(arc)])
     known = build_pair_catalog(stars, np.zeros(21), width, (top - 20 * width, top))
     begin, end = candidates(known, *angles)
-    assert names(known.pair[begin:end]).tolist() == [
-        2,
-        3,
-    ]  # with star 0, at theta_max - 2.5 D and - 1.5 D
+    # With star 0, at theta_max - 2.5 D and - 1.5 D.
+    assert names(known.pair[begin:end]).tolist() == [2, 3]
 
 
 @pytest.mark.parametrize("width_arcsec", [5, 100, 3600, 1e6])

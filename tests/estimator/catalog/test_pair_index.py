@@ -145,9 +145,8 @@ def test_small_angles_keep_their_digits() -> None:
     # Stars 1e-8 rad apart, where arccos of the dot product would read 0 or 1.5e-8.
     vectors = np.array([[0.0, 0, 1], [1e-8, 0, 1], [0, 3e-8, 1]])
     known = pair_index.build(vectors, 1e-3)
-    np.testing.assert_allclose(
-        known.angle_rad, [1e-8, 3e-8, np.sqrt(10) * 1e-8], rtol=1e-8, atol=0
-    )  # rounding of 1
+    # Rounding of 1.
+    np.testing.assert_allclose(known.angle_rad, [1e-8, 3e-8, np.sqrt(10) * 1e-8], rtol=1e-8, atol=0)
 
 
 def test_a_sky_without_patterns_is_refused() -> None:

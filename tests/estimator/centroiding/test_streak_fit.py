@@ -362,9 +362,8 @@ def test_streaks_below_the_single_detection_limit_are_found_by_their_common_dire
     assert len(detect.local(image)) <= 2
     assert len(blobs) == 5
     near = np.linalg.norm(unaided.xy_px[:, None] - middles, axis=2).min(axis=0)
-    assert (
-        np.sum(near < 3) >= 4
-    )  # one in five may be lost for a direction that is not quite its own
+    # One in five may be lost for a direction that is not quite its own.
+    assert np.sum(near < 3) >= 4
     assert len(unaided) <= 6
 
 

@@ -115,9 +115,8 @@ def test_the_diagonal_is_the_angle_between_opposite_corners() -> None:
     # Reference H1: SHEFEX-2's 14.868 x 11.150 degrees have a diagonal of 18.51 (24.95 mm, 9.9 um).
     camera = Camera(659, 493, 24.95e-3 / 9.9e-6, (329.0, 246.0))
     corners = camera.rays(np.array([[-0.5, -0.5], [658.5, 492.5]]))
-    assert camera.diagonal_rad == pytest.approx(
-        np.arccos(corners[0] @ corners[1]), abs=1e-12
-    )  # rounding
+    # rounding.
+    assert camera.diagonal_rad == pytest.approx(np.arccos(corners[0] @ corners[1]), abs=1e-12)
     # .05 degree: the papers leave open whether edges or middles of pixels are meant, a pixel of .023 apart.
     assert np.degrees(camera.diagonal_rad) == pytest.approx(18.51, abs=0.05)
 
@@ -127,9 +126,10 @@ def test_a_zoomed_camera_magnifies_angles_from_the_axis() -> None:
     vector = np.array([[0.1, -0.05, 1.0]])
     off = plain.pixels(vector) - plain.center_px
     zoomed = plain.zoomed(1.5)
+    # rounding.
     np.testing.assert_allclose(
         zoomed.pixels(vector) - zoomed.center_px, 1.5 * off, rtol=0, atol=1e-12
-    )  # rounding
+    )
 
 
 def test_a_sensor_ends_half_a_pixel_beyond_its_outermost_pixel_centers() -> None:

@@ -284,9 +284,8 @@ def test_a_faint_track_in_pieces_is_flagged(angle_deg: float) -> None:
     for peak in (24.0, 27.0, 30.0):
         blobs = detect.default(exposed(rng, light + peak * track))
         away = np.linalg.norm(blobs.xy_px[:, None] - xy, axis=2).min(axis=1) > 3
-        assert (
-            np.count_nonzero(~away & (blobs.flag == 0)) >= len(xy) - 1
-        )  # a star may be on the line
+        # A star may be on the line.
+        assert np.count_nonzero(~away & (blobs.flag == 0)) >= len(xy) - 1
         pieces.append(np.count_nonzero(away))
         left.append(np.count_nonzero(away & (blobs.flag & NO_STAR == 0)))
     assert max(pieces) >= 20

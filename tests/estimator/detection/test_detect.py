@@ -203,9 +203,8 @@ def test_the_thesis_s_full_scale_is_that_of_the_pixel_type() -> None:
 def test_a_boolean_mask_is_a_valid_image() -> None:
     image = np.zeros((64, 64), bool)
     image[30:34, 40:44] = True
-    np.testing.assert_allclose(
-        detect.local(image).xy_px, [[41.5, 31.5]], rtol=0, atol=1e-12
-    )  # rounding
+    # rounding.
+    np.testing.assert_allclose(detect.local(image).xy_px, [[41.5, 31.5]], rtol=0, atol=1e-12)
 
 
 def test_blobs_are_sorted_by_brightness_and_the_faintest_dropped() -> None:

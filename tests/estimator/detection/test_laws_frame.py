@@ -171,9 +171,8 @@ def test_runs_match_a_plain_filter_above_threshold(
     lower, higher = (
         background.estimate_background(frame + np.array(more, kind)) for more in (0, 50)
     )
-    np.testing.assert_allclose(
-        higher.level - lower.level, 50, rtol=0, atol=0.3
-    )  # by the median's own steps
+    # By the median's own steps.
+    np.testing.assert_allclose(higher.level - lower.level, 50, rtol=0, atol=0.3)
     for pixel in ("u1", "i1", "u2", "i2"):
         assert (
             np.iinfo(background.accumulator_type(np.dtype(pixel))).max >= 16 * np.iinfo(pixel).max

@@ -67,9 +67,8 @@ def test_any_finite_rotation_keeps_a_unit_attitude_and_a_valid_covariance(
     np.testing.assert_allclose(np.linalg.norm(mekf.ref_from_body_wxyz), 1, rtol=0, atol=1e-12)
     same = Rotation.from_quat(mekf.ref_from_body_wxyz, scalar_first=True) * mekf.body_from_ref
     assert same.magnitude() < 1e-12
-    np.testing.assert_array_equal(
-        mekf.bias_rad_s, np.zeros(3)
-    )  # a gyro alone tells nothing of its bias
+    # A gyro alone tells nothing of its bias.
+    np.testing.assert_array_equal(mekf.bias_rad_s, np.zeros(3))
 
 
 @law(AttitudeFilter.propagate, FilterState.sigma_attitude_rad, FilterState.sigma_bias_rad_s)

@@ -377,9 +377,8 @@ def test_a_late_solution_is_as_good_as_one_in_order(seen_s: float) -> None:
     for k in range(100):
         rows = slice(4 * k, 4 * k + 4)
         late.propagate(t_s[1:][rows], angle[rows], saturated[rows])
-    split = int(
-        np.searchsorted(t_s[1:], seen_s, side="left")
-    )  # the sample that contains it, or ends there
+    # The sample that contains it, or ends there.
+    split = int(np.searchsorted(t_s[1:], seen_s, side="left"))
     share = (seen_s - t_s[split]) / (t_s[split + 1] - t_s[split])
     times = np.insert(t_s[1:], split, seen_s)
     angles = np.insert(angle, split, share * angle[split], axis=0)

@@ -63,9 +63,8 @@ def test_the_evidence_of_a_brightness_is_a_bayes_factor() -> None:
         assert np.trapezoid(ratio * as_any, log_flux) == pytest.approx(1.0, abs=1e-3)
         best = log_flux[np.argmax(ratio)]
         assert abs(best - np.log(grid(LEVELS).flux_s[star])) < 0.2
-        assert (
-            ratio.min() >= STRAY * STRAY_DENSITY / as_any.max()
-        )  # a blend costs three powers of ten at most
+        # A blend costs three powers of ten at most.
+        assert ratio.min() >= STRAY * STRAY_DENSITY / as_any.max()
 
 
 @pytest.mark.parametrize("known", ["map", "exposure", "neither"])

@@ -24,10 +24,8 @@ from tests.helpers.interpreted import interpreted
 # AFIT's SimSat focused on its LEDs at 33 in; the camera is a little askew.
 CAMERA = Camera(1600, 1200, 8698.0, (799.5, 599.5))
 LEVER = Lever(np.array([0.004, -0.003, 0.381]), Rotation.from_euler("xyz", [0.01, -0.02, 0.3]))
-OVAL = (
-    np.array([0.0, 0.003, 0.492]),
-    np.array([0.9876, 0.9876, 0.7264]),
-)  # measured: 38.88 and 28.60 in
+# Measured: 38.88 and 28.60 in.
+OVAL = (np.array([0.0, 0.003, 0.492]), np.array([0.9876, 0.9876, 0.7264]))
 FLAT = np.zeros(3), np.array([np.inf, np.inf, 1.2192])  # a panel at 48 in
 NOISE_PX = 0.2
 ERROR_M = 0.2e-3
@@ -372,9 +370,8 @@ def test_a_pair_s_gates_are_the_error_of_where_it_puts_a_detection() -> None:
     for n in (1, 3):
         worst2 = np.linalg.eigvalsh(np.cov(errors[:, n].real, errors[:, n].imag)).max()
         angle = gates[n] - dome.scaling_error_rad
-        assert angle == pytest.approx(
-            3.5 * np.sqrt(worst2) * ratio, rel=0.02
-        )  # 4 deviations of a variance
+        # 4 deviations of a variance.
+        assert angle == pytest.approx(3.5 * np.sqrt(worst2) * ratio, rel=0.02)
 
 
 @pytest.mark.parametrize(

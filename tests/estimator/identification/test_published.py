@@ -83,9 +83,8 @@ def test_every_method_names_the_stars_and_gives_their_attitude(name: str, false:
         found += 1
         np.testing.assert_array_equal(match.star, rows[match.observed])
         assert len(match.star) >= 0.8 * np.count_nonzero(rows >= 0)
-        assert (
-            match.cam_from_ref * truth.inv()
-        ).magnitude() < 1e-13  # rounding over the field's 0.2 rad
+        # Rounding over the field's 0.2 rad.
+        assert (match.cam_from_ref * truth.inv()).magnitude() < 1e-13
         assert match.log10_chance < -5
     assert found >= required
 
@@ -205,9 +204,8 @@ def test_a_side_s_tolerance_includes_both_direction_errors_and_its_stretch(
     sides = np.array([0.1, 0.12, 0.14])
     tolerance = 1e-4
     stretch = 0.002
-    part = (
-        1 - sides[side] / sides.sum() if unknown else 1.0
-    )  # of a side's error that the perimeter's factor leaves
+    # Of a side's error that the perimeter's factor leaves.
+    part = 1 - sides[side] / sides.sum() if unknown else 1.0
     own_stretch = (stretch / 3 if unknown else stretch) * sides[side]
     longer = sides + np.eye(3)[side] * (share * np.sqrt(2) * tolerance + own_stretch) / part
     index = pair_index.build(triangle(longer), 0.2)
@@ -235,9 +233,8 @@ def test_a_fourth_star_has_its_angles_to_all_three_corners() -> None:
         tried = np.array([0, 1, 0])
         PYRAMID._pyramid(rays, index, np.arange(3), np.arange(3), options, 0.0, tried)
         fits = errors.max() <= np.sqrt(2) * tolerance
-        assert (
-            tried[2] == 4 + fits * 4 * 4
-        )  # four tries; four rays against the corner's four neighbors
+        # Four tries; four rays against the corner's four neighbors.
+        assert tried[2] == 4 + fits * 4 * 4
         taken += fits
     assert 20 < taken < 80
 
@@ -309,9 +306,8 @@ def test_shefex_s_gates_have_the_least_area_of_their_crossing_rings() -> None:
         areas = [
             crossing_area_sr(rays[n], [(rays[a], half[a]), (rays[b], half[b])]) for a, b in pairs
         ]
-        assert gates[n, 9] == pytest.approx(
-            min(areas), rel=0.03
-        )  # of the lattice, and of the rings' curvature
+        # Of the lattice, and of the rings' curvature.
+        assert gates[n, 9] == pytest.approx(min(areas), rel=0.03)
 
 
 def test_shefex_counts_the_other_stars_in_the_gates_by_the_binomial_law() -> None:
@@ -437,9 +433,8 @@ def test_saa_s_gate_of_positions_is_three_errors_of_the_predicted_place() -> Non
         errors.append((FIVE @ R.T - seen)[primary.others])
     for k, n in enumerate(primary.others):
         worst2 = np.linalg.eigvalsh(np.cov(np.array(errors)[:, k].T)).max()
-        assert primary.sigma_rad[k] ** 2 == pytest.approx(
-            worst2, rel=0.12
-        )  # 4 deviations of a variance of 2,000
+        # 4 deviations of a variance of 2,000.
+        assert primary.sigma_rad[k] ** 2 == pytest.approx(worst2, rel=0.12)
         far_rad = np.arccos(FIVE[n] @ primary.midpoint)
         assert primary.radius_rad[k] == pytest.approx(
             3 * primary.sigma_rad[k] + STRETCH * far_rad, rel=1e-9
@@ -514,9 +509,8 @@ def test_saa_s_partner_meets_the_four_conditions_at_the_least_cost() -> None:
         cost = np.empty(3)
         SAA._partners(stars, primary, 0, 1, nearby, partner, cost)
         for k, n in enumerate((1, 3, 4)):
-            distance = np.linalg.norm(
-                index.vectors - seen[n], axis=1
-            )  # the reference's axes are the camera's
+            # The reference's axes are the camera's.
+            distance = np.linalg.norm(index.vectors - seen[n], axis=1)
             off = np.arccos(index.vectors @ seen[[0, 2]].T) - np.arccos(seen[n] @ seen[[0, 2]].T)
             unlike = np.nan_to_num((magnitude - seen_mag[n]) / 0.3)
             fits = (np.abs(unlike) <= 3) & (2 * np.arcsin(distance / 2) <= primary.radius_rad[k])

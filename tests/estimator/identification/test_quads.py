@@ -70,9 +70,8 @@ def test_the_index_holds_every_quad_of_locally_bright_stars_by_its_code() -> Non
     }
     assert len(found) == len(index.star) > 100
     missing = expected - found.keys()
-    assert len(missing) < 0.01 * len(
-        expected
-    )  # of stars with more than NEIGHBORS neighbors, or at a bin's edge
+    # Of stars with more than NEIGHBORS neighbors, or at a bin's edge.
+    assert len(missing) < 0.01 * len(expected)
     for star, code in zip(index.star, index.code, strict=True):
         by_definition, order = code_of(vectors[star])
         np.testing.assert_allclose(code, by_definition, atol=1e-9)

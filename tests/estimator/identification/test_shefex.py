@@ -20,9 +20,8 @@ ARCSEC_RAD = np.pi / 648_000
 SCREEN_CORNERS = catalog.unit(
     np.array([[0.1, 0.1, 1], [-0.1, 0.1, 1], [0.1, -0.1, 1], [-0.1, -0.1, 1]])
 )
-PIXEL_RAD = np.radians(
-    0.02
-)  # "the angle per pixel, computed from the FOV and the CCD size (0.02 deg)"
+# "the angle per pixel, computed from the FOV and the CCD size (0.02 deg)".
+PIXEL_RAD = np.radians(0.02)
 
 
 @pytest.mark.parametrize(("centroid_px", "factor"), [(0.1, 4.95), (0.2, 2.47), (0.3, 1.65)])

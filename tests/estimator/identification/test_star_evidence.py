@@ -138,9 +138,8 @@ def test_the_focal_length_is_measured_within_its_uncertainty(ratio: float) -> No
     )
     solved = abs(ratio - 1) < 0.01
     assert hypothesis.star.tolist() == list(range(7) if solved else [])
-    assert hypothesis.focal_ratio == pytest.approx(
-        ratio if solved else 1.0, abs=1e-6
-    )  # of two Gauss-Newton steps
+    # Of two Gauss-Newton steps.
+    assert hypothesis.focal_ratio == pytest.approx(ratio if solved else 1.0, abs=1e-6)
 
 
 @pytest.mark.parametrize(("sigmas", "matched"), [(3.4, 7), (3.6, 6)])
@@ -165,9 +164,8 @@ def test_the_magnitudes_density_is_the_smoothed_catalog_s() -> None:
     sky = sky_index.build_without_pairs(vectors, mag)
     for value in (3.0, 4.0, 5.0, 5.5):
         wanted = np.mean(norm.pdf(value, mag, sky_index.MAG_SMOOTHING))
-        assert star_evidence.magnitude_density(sky, value) == pytest.approx(
-            wanted, rel=0.1
-        )  # of bins of MAG_STEP
+        # Of bins of MAG_STEP.
+        assert star_evidence.magnitude_density(sky, value) == pytest.approx(wanted, rel=0.1)
     assert star_evidence.magnitude_density(sky, -9.0) == star_evidence.magnitude_density(
         sky, mag[0]
     )

@@ -311,9 +311,8 @@ def test_a_pair_s_gates_are_the_error_of_where_it_puts_a_detection() -> None:
     gates = PLAIN.pair_gates(unequal(), a, b)
     for n in (1, 2, 3):
         worst2 = np.linalg.eigvalsh(np.cov(errors[:, n].real, errors[:, n].imag)).max()
-        assert gates[n] == pytest.approx(
-            3.5 * np.sqrt(worst2), rel=0.02
-        )  # 4 deviations of a variance of 20,000
+        # 4 deviations of a variance of 20,000.
+        assert gates[n] == pytest.approx(3.5 * np.sqrt(worst2), rel=0.02)
 
 
 @pytest.mark.parametrize("zoom", [0.0, 0.02])
@@ -360,14 +359,12 @@ def test_pairs_are_tried_once_in_order_of_length_and_rarity() -> None:
     short = np.flatnonzero(distance < least)
     assert len(short) > 1
     assert (length[a, b][short] > 100 * least).all()
-    assert (
-        np.argsort(length[a, b][short]) == np.argsort(-distance[short])
-    ).all()  # the shorter, the later
+    # The shorter, the later.
+    assert (np.argsort(length[a, b][short]) == np.argsort(-distance[short])).all()
     for n in range(5):  # within four deviations of the magnitude
         share = np.mean(np.abs(MAG - detections.mag[n]) < 4 * 0.25)
-        assert rarity[n] == pytest.approx(
-            share, rel=0.35
-        )  # the density at the middle, over a range of two magnitudes
+        # The density at the middle, over a range of two magnitudes.
+        assert rarity[n] == pytest.approx(share, rel=0.35)
     assert rarity[5] == 1
     tried = np.zeros((6, 6), bool)
     costs = []

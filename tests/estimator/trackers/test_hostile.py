@@ -32,9 +32,8 @@ ANY = some.floats(width=64)
 KINDS = some.sampled_from(["u2", "f8", ">f8"])
 IMAGES = KINDS.flatmap(lambda kind: arrays(kind, (30, 40), fill=some.just(0)))
 PIXELS = arrays("f8", some.tuples(some.integers(0, 12), some.just(2)), elements=ANY)
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::RuntimeWarning"
-)  # of overflow: what counts is the answer
+# Of overflow: what counts is the answer.
+pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 
 
 def one_line(error: Exception) -> None:

@@ -20,9 +20,8 @@ from tests.helpers.laws import SEEDS, answered, law, turn, units
 pytestmark = pytest.mark.slow
 CAMERA = Camera(640, 480, 900.0, (319.5, 239.5))
 LEVER = Lever(np.array([0.01, 0.0, 0.3]), Rotation.identity())
-WORDS = np.random.default_rng(8).integers(
-    0, 2, (120, 24)
-)  # of random words the least distance is 3
+# Of random words the least distance is 3.
+WORDS = np.random.default_rng(8).integers(0, 2, (120, 24))
 
 
 def spiral(count: int = 120) -> LedMap:

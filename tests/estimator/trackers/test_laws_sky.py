@@ -257,9 +257,8 @@ def test_stars_beside_detections_reveal_a_wrong_camera(
     count = len(rows)
     assert matcher.lens_radii_px[0] == max(matcher.lens_radii_px)
     assert min(matcher.lens_radii_px) > 1
-    moved = (
-        np.arange(count) % 2 == 1
-    )  # every second star: by more than its error, by less than the gate
+    # Every second star: by more than its error, by less than the gate.
+    moved = np.arange(count) % 2 == 1
     centroids.xy_px[moved] += 3.0 * aside
     matched = np.flatnonzero(~moved if aside else moved | ~moved)
     nothing = np.zeros((3, 3))

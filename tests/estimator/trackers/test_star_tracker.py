@@ -260,10 +260,8 @@ def test_the_residual_is_the_rms_of_the_coordinates(
     tracker: StarTracker, uncertain: StarTracker
 ) -> None:
     rng = np.random.default_rng(98)
-    for eye, noise_px in (
-        (tracker, 0.1),
-        (uncertain, 0.3),
-    ):  # 0.3 px: the lens is fitted to the stars
+    # 0.3 px: the lens is fitted to the stars.
+    for eye, noise_px in ((tracker, 0.1), (uncertain, 0.3)):
         _, pixels, _ = starfield(eye, rng, CAMERA)
         lights = centroids(pixels + noise_px * rng.standard_normal(pixels.shape))
         answer = eye.solve_centroids(lights)
@@ -279,10 +277,8 @@ def test_a_sheared_image_is_refused(tracker: StarTracker) -> None:
     for _ in range(20):
         _truth, pixels, _ = starfield(tracker, rng, CAMERA, limit_mag=7.0)
         assert tracker.solve_centroids(centroids(pixels)).solved
-        sheared = pixels + 0.01 * (pixels[:, [1]] - CAMERA.center_px[1]) * [
-            1,
-            0,
-        ]  # 2.5 px at the edge
+        # 2.5 px at the edge.
+        sheared = pixels + 0.01 * (pixels[:, [1]] - CAMERA.center_px[1]) * [1, 0]
         solved += tracker.solve_centroids(centroids(sheared)).solved
     assert solved == 0
 

@@ -79,9 +79,8 @@ def test_the_tracker_searches_once_and_then_tracks(tracker: StarTracker) -> None
     assert all(r.expected >= 8 and not r.health & Health.SEARCHED for r in reports[1:])
     assert all(r.log10_odds > 10 for r in reports)
     nees = [error(r, attitude(n * STEP_S)) for n, r in enumerate(reports)]
-    assert np.mean(nees) < 3 + 4 * np.sqrt(
-        6 / 8
-    )  # chi-square of three degrees, eight times: four deviations
+    # chi-square of three degrees, eight times: four deviations.
+    assert np.mean(nees) < 3 + 4 * np.sqrt(6 / 8)
 
 
 def error(report, truth: Rotation) -> float:
@@ -114,9 +113,8 @@ def test_a_prediction_adds_the_evidence_of_its_smaller_volume(tracker: StarTrack
     assert lost is not None
     volume = (16 / CAMERA.focal_px) ** 2 * 16 / 246.5
     gain = followed.log10_odds + lost.log10_chance
-    assert gain == pytest.approx(
-        np.log10(8 * np.pi**2 / volume), abs=1e-3
-    )  # the two fits differ by rounding
+    # The two fits differ by rounding.
+    assert gain == pytest.approx(np.log10(8 * np.pi**2 / volume), abs=1e-3)
 
 
 def test_residuals_of_one_sigma_are_counted_over_2n_less_3(tracker: StarTracker) -> None:
@@ -166,9 +164,8 @@ def test_an_outdated_attitude_is_not_used_for_prediction(tracker: StarTracker) -
     follower.solve(photograph(tracker, START), 0.0)
     assert follower.solve(photograph(tracker, START, 1), 1.5).health & Health.SEARCHED
     assert not follower.solve(photograph(tracker, START, 2), 2.0).health & Health.SEARCHED
-    assert (
-        follower.solve(photograph(tracker, START, 2), 1.0).health & Health.SEARCHED
-    )  # time ran backwards
+    # Time ran backwards.
+    assert follower.solve(photograph(tracker, START, 2), 1.0).health & Health.SEARCHED
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -88,9 +88,8 @@ def test_image_sizes_over_the_field_are_recovered_within_their_errors() -> None:
 def test_double_stars_are_left_out() -> None:
     rng = np.random.default_rng(9)
     image, places = drawn(rng, 0.8, 0.0)
-    image += np.roll(
-        np.where(np.arange(SIDE_PX) < 120, image, 0.0), (1, 2), axis=(0, 1)
-    )  # companions at the left
+    # Companions at the left.
+    image += np.roll(np.where(np.arange(SIDE_PX) < 120, image, 0.0), (1, 2), axis=(0, 1))
     stars = night_sky.fit_images(image, places, GAIN_DN_E, READ_DN**2)
     size = night_sky.image_size(stars, CENTER_PX, CORNER_PX)
     assert size is not None

@@ -326,9 +326,8 @@ def test_frames_of_the_measured_camera_are_indistinguishable_and_those_of_a_wron
     changes = {"column_offset_e": 0.0}
     found = measured(side, 11, darks=16, **changes).estimates
     values = {key: max(one.value, 0.0) for key, one in found.items()} | changes
-    light = (
-        found["gain_e_dn"].value / CHIP["gain_e_dn"]
-    )  # the lamp as the flats measured it, not as it is
+    # The lamp as the flats measured it, not as it is.
+    light = found["gain_e_dn"].value / CHIP["gain_e_dn"]
 
     def numbers(config: DetectorConfig, shot: frame_files.PlannedFrame, seed: int) -> Floats:
         one = camera(side).model_copy(update={"detector": config})

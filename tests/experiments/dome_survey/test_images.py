@@ -179,9 +179,8 @@ def test_exactly_the_injected_faults_are_named(result: dict[str, Any]) -> None:
     faults = result["faults"]
     assert faults["dark"] == [DEAD]
     assert list(faults["displaced"]) == [str(FAR)]
-    assert faults["displaced"][str(FAR)] == pytest.approx(
-        FAR_M, abs=0.005
-    )  # and its error of 1 mm about each axis
+    # And its error of 1 mm about each axis.
+    assert faults["displaced"][str(FAR)] == pytest.approx(FAR_M, abs=0.005)
     assert {(led, shows) for led, shows, _ in faults["exchanged"]} == {SWAPPED, SWAPPED[::-1]}
     assert faults["unlisted"] == []
     assert faults["list_sigma_m"] == pytest.approx(0.001, rel=0.3)
@@ -377,9 +376,8 @@ def test_written_attitudes_are_read_unchanged(tmp_path: Path) -> None:
     survey_images.write_attitudes(tmp_path / "a.csv", ["b.fits", "a.fits"], held, np.array([3, 4]))
     read = survey_images.read_attitudes(tmp_path / "a.csv")
     assert list(read) == ["b.fits", "a.fits"]
-    assert (
-        Rotation.concatenate(list(read.values())) * held.inv()
-    ).magnitude().max() < 2e-6  # four decimals
+    # Four decimals.
+    assert (Rotation.concatenate(list(read.values())) * held.inv()).magnitude().max() < 2e-6
 
 
 @pytest.mark.parametrize(

@@ -390,7 +390,6 @@ def test_a_shortened_experiment_has_correct_intervals(id: str) -> None:
 @pytest.mark.parametrize("id", ["afit-table-1", "shefex-figs-4-5", "apl"])
 def test_the_same_seed_gives_the_same_numbers(id: str) -> None:
     first, again = (reproduce(id, ExperimentOptions(quick=True, seed=5)) for _ in range(2))
-    said = [
-        files.to_json([line.as_dict() for line in one.comparisons]) for one in (first, again)
-    ]  # NaN is not NaN
+    # NaN is not NaN.
+    said = [files.to_json([line.as_dict() for line in one.comparisons]) for one in (first, again)]
     assert said[0] == said[1]

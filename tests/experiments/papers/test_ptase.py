@@ -62,9 +62,8 @@ def test_simulated_errors_match_the_covariance(sky: PairIndex) -> None:
         1 / 2 * one / (3 * ARCSEC_RAD) * np.sqrt(n)
         for one in (np.concatenate([x, y]).reshape(2, -1), roll)
     )
-    assert rms(across.ravel()) == pytest.approx(
-        1, abs=0.12
-    )  # the roll's part through a lopsided field comes on top
+    # The roll's part through a lopsided field comes on top.
+    assert rms(across.ravel()) == pytest.approx(1, abs=0.12)
     assert rms(about * np.sqrt(a2)) == pytest.approx(1, rel=0.2)
 
 

@@ -413,6 +413,5 @@ def test_a_report_begins_with_its_answer_and_one_figure(tmp_path: Path) -> None:
     places = [text.index(part) for part in parts]
     assert places == sorted(places)
     assert "Is it ambiguous anywhere?" in text
-    assert (
-        text.count("<code>skysim study replay again ") == 2
-    )  # the worst trials of a map of two attitudes
+    # The worst trials of a map of two attitudes.
+    assert text.count("<code>skysim study replay again ") == 2

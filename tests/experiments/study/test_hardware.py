@@ -66,9 +66,8 @@ def test_the_trials_are_of_different_domes_and_pooled(tmp_path: Path) -> None:
         again = runner.replay(study_plan, kept, 8, tmp_path / "trial_8")
     assert again.changed == []
     with store.writing(tmp_path / "study.sqlite") as kept:
-        runner.prepare_store(
-            study_plan, kept, resume=True
-        )  # its first and last scenes are those of their own hardware
+        # Its first and last scenes are those of their own hardware.
+        runner.prepare_store(study_plan, kept, resume=True)
 
 
 @pytest.mark.slow

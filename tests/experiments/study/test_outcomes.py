@@ -59,10 +59,8 @@ def test_a_light_matched_with_a_wrong_star_is_a_misidentification(spec: TrialSpe
         star[k] = star[k - 1]
         planted = scored(setup, with_match(report, star), lights)
         assert (planted.misidentified, planted.roll_noise, planted.wrong) == (1, 0, 0)
-        assert (planted.wrong_matches, planted.misled) == (
-            1,
-            0,
-        )  # the attitude is the right one still
+        # The attitude is the right one still.
+        assert (planted.wrong_matches, planted.misled) == (1, 0)
 
 
 @pytest.mark.parametrize("spec", [SKY, DOME])

@@ -168,9 +168,8 @@ def test_the_front_holds_the_nondominated_candidates(tmp_path: Path) -> None:
         one.objectives[0] for one in found.front
     )
     tightness = [math.prod(one.objectives) for one in found.candidates]
-    assert np.median(tightness[-15:]) < np.median(
-        tightness[:10]
-    )  # it has learnt that y costs and brings nothing
+    # It has learnt that y costs and brings nothing.
+    assert np.median(tightness[-15:]) < np.median(tightness[:10])
 
 
 def test_constraints_exclude_the_unconstrained_optimum(tmp_path: Path) -> None:
@@ -342,10 +341,8 @@ def test_each_of_few_points_is_tried_once(tmp_path: Path) -> None:
         (x, y) for x in (0.1, 0.5, 0.9) for y in (0.2, 0.4)
     ]
     assert {one.levels["y"] for one in found.front} == {0.2}
-    assert {one.levels["x"] for one in found.front} <= {
-        0.5,
-        0.9,
-    }  # as near to 0.7, but for rounding
+    # As near to 0.7, but for rounding.
+    assert {one.levels["x"] for one in found.front} <= {0.5, 0.9}
 
 
 def test_the_callback_gets_the_progress_of_the_whole_search(tmp_path: Path) -> None:

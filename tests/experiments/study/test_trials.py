@@ -241,9 +241,8 @@ def test_lights_of_a_coded_trial_are_as_bright_as_rendered_ones(code):
     assert len(inner) >= 2
     for n in inner:
         off_px = np.hypot(*(truth.sources.xy_px - xy_px[n]).T)
-        rendered_e = (
-            truth.sources.electrons[off_px.argmin()] if off_px.min() < 0.5 else 0.0
-        )  # a dark LED is no source
+        # A dark LED is no source.
+        rendered_e = truth.sources.electrons[off_px.argmin()] if off_px.min() < 0.5 else 0.0
         assert light_e[n] == pytest.approx(rendered_e, rel=0.01, abs=1)
 
 
@@ -464,9 +463,8 @@ def test_accelerated_lights_are_at_their_predicted_positions():
     truth = rendered({"trial.acceleration_deg_s2": acceleration})
     focal_px = 25e-3 / 9.9e-6
     sources = truth.sources
-    near = (
-        np.hypot(*(sources.xy_px - [329, 246]).T) < 150
-    )  # where the image's scale is that of the center
+    # Where the image's scale is that of the center.
+    near = np.hypot(*(sources.xy_px - [329, 246]).T) < 150
     lag_px = np.hypot(*(sources.flux_xy_px - sources.xy_px)[near].T)
     bend_px = np.radians(acceleration) * time_s**2 * focal_px
     assert near.sum() >= 3

@@ -42,9 +42,8 @@ class CameraGroup(TyperGroup):
 
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
         """Subcommands, and what `show` takes."""
-        item = type(
-            super().shell_complete(ctx, "")[0]
-        )  # the class of typer's own parser or of click
+        # The class of typer's own parser or of click.
+        item = type(super().shell_complete(ctx, "")[0])
         names = [] if incomplete.startswith("-") else complete_camera(incomplete)
         return [*super().shell_complete(ctx, incomplete), *map(item, names)]
 

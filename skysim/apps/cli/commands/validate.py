@@ -104,7 +104,13 @@ def check(
 
 
 def check_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})) -> FileVerdict:
-    """Check one file; errors become the verdict's `fault`. programs : of trackers and controllers, by name"""
+    """Check one file; errors become the verdict's `fault`.
+
+    Parameters
+    ----------
+    programs
+        Of trackers and controllers, by name
+    """
     try:
         return FileVerdict(str(path), *describe_file(path, programs))
     except (InputError, OSError) as error:

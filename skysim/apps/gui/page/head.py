@@ -117,7 +117,13 @@ class Head:
             self.noise.set_value(info.noise if info else True)
 
     async def export(self, item: str) -> None:
-        """Download a file of the image on the page, or all of them. item : of the menu"""
+        """Download a file of the image on the page, or all of them.
+
+        Parameters
+        ----------
+        item
+            Of the menu
+        """
         files = await self.page.run_task("export")
         if not files:
             return

@@ -38,7 +38,13 @@ COLUMNS = (
 
 
 class LogPanel:
-    """The log, the newest line first. rows : of the identifications, with the cells of COLUMNS"""
+    """The log, the newest line first.
+
+    Attributes
+    ----------
+    rows
+        Of the identifications, with the cells of COLUMNS
+    """
 
     def __init__(self, page: Shown) -> None:
         self.page = page

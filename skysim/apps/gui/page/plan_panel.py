@@ -276,7 +276,13 @@ class PlanPanel:
 
 
 async def confirmed(question: str, action: str) -> bool:
-    """Ask before something is lost. action : the label of the button that does it"""
+    """Ask before something is lost.
+
+    Parameters
+    ----------
+    action
+        The label of the button that does it
+    """
     with ui.dialog() as dialog, ui.card():
         ui.label(question)
         with ui.row():

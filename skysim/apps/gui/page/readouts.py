@@ -163,7 +163,13 @@ class LightsTable(ui.element, component="js/lights.js"):  # type: ignore[call-ar
 
 
 class LightsPanel:
-    """Panel with the table. sent : number of the frame in it"""
+    """Panel with the table.
+
+    Attributes
+    ----------
+    sent
+        Number of the frame in it
+    """
 
     def __init__(self, sensor: SensorView) -> None:
         self.sensor = sensor

@@ -149,7 +149,13 @@ class RunPanel:
         )
 
     def set_scene(self, feedback: str | None) -> None:
-        """Take over a new scene, which has no flight yet. feedback : of its controller; None without one"""
+        """Take over a new scene, which has no flight yet.
+
+        Parameters
+        ----------
+        feedback
+            Of its controller; None without one
+        """
         self.pause()
         self.clear()
         self.feedback = feedback
@@ -195,9 +201,8 @@ class RunPanel:
         self.loop.disable()  # no second change while this one runs
         await self.page.open(state.scene, others | maneuver | control)
         if self.page.is_open:
-            self.loop.set_value(
-                self.feedback or ""
-            )  # the old value, if the scene refused the change
+            # The old value, if the scene refused the change.
+            self.loop.set_value(self.feedback or "")
             self.loop.enable()
 
     # Computing.

@@ -56,7 +56,13 @@ window.skysimMoment = (t_s) => {{
 
 @dataclass(frozen=True)
 class StripCurve:
-    """One curve of a strip. kind : line, dots (a value per frame), or band (an area of 3 standard errors)."""
+    """One curve of a strip.
+
+    Attributes
+    ----------
+    kind
+        Line, dots (a value per frame), or band (an area of 3 standard errors).
+    """
 
     name: str
     points: Points
@@ -90,7 +96,13 @@ class Dots(ui.element, component="js/strips.js"):  # type: ignore[call-arg]
 def strips(
     rows: Sequence[FlightRow], log: MotionLog, residuals: Sequence[tuple[float, int, float]] = ()
 ) -> list[Strip]:
-    """The strips of a flight that have something to show. residuals : see `FlightStep`"""
+    """The strips of a flight that have something to show.
+
+    Parameters
+    ----------
+    residuals
+        See `FlightStep`
+    """
 
     def of_frames(value: Callable[[FlightRow], float]) -> Points:
         pairs = ((row.t_s, value(row)) for row in rows)
@@ -170,7 +182,13 @@ class StripChart:
         self.chart.set_visibility(False)
 
     def draw(self, drawn: list[Strip], end_s: float, name: Callable[[int], str]) -> None:
-        """Draw strips up to a time. name : of a light"""
+        """Draw strips up to a time.
+
+        Parameters
+        ----------
+        name
+            Of a light
+        """
         if any(strip.dots for strip in (*self.strips, *drawn)):
             self.dots.run_method("show", dot_fields(drawn, name))
         self.strips = drawn

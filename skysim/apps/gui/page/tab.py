@@ -338,7 +338,13 @@ class Tab:
         return True
 
     def set_scene(self, info: SceneInfo, feedback: str | None) -> None:
-        """Show a new scene in all parts of the page. feedback : of its controller; None without one"""
+        """Show a new scene in all parts of the page.
+
+        Parameters
+        ----------
+        feedback
+            Of its controller; None without one
+        """
         self.head.set_scene(info)
         self.attitude.set_scene(info)
         self.scene_3d.set_scene(info)
@@ -393,7 +399,13 @@ class Tab:
         self.head.set_state(self.state)
 
     def show_frame(self, view: FrameView, **state: Any) -> None:
-        """Show a frame of the scene: live, or of its flight. state : changes of what the page shows"""
+        """Show a frame of the scene: live, or of its flight.
+
+        Returns
+        -------
+        state
+            Changes of what the page shows
+        """
         self.set_state(**state)
         self.view = view
         self.attitude.show(view)
@@ -459,7 +471,13 @@ class Tab:
         return result if self.is_open else None
 
     async def run_task(self, task: str, *arguments: Any, activity: str = "") -> Any:
-        """`ask`, with the mark of a busy page. activity : message until the task ends; it replaces an older one"""
+        """`ask`, with the mark of a busy page.
+
+        Parameters
+        ----------
+        activity
+            Message until the task ends; it replaces an older one
+        """
         self.show_message(activity, "quiet")
         self.head.busy.set_visibility(True)
         try:

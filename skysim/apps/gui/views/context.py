@@ -50,7 +50,13 @@ class Asked(Protocol):
         """Return the result of a task."""
 
     async def run_task(self, task: str, *arguments: Any, activity: str = "") -> Any:
-        """`ask`, with the mark of a busy page. activity : message until the task ends; it replaces an older one"""
+        """`ask`, with the mark of a busy page.
+
+        Parameters
+        ----------
+        activity
+            Message until the task ends; it replaces an older one
+        """
 
     async def show_live(self, task: str, *arguments: Any) -> FrameView | None:
         """Show the frame of the live scene that a task renders."""
@@ -82,10 +88,22 @@ class Notified(Protocol):
         """Change fields of `Shown.state`."""
 
     def show_frame(self, view: FrameView, **state: Any) -> None:
-        """Show a frame of the scene in all views. state : changes of `Shown.state` that belong to it"""
+        """Show a frame of the scene in all views.
+
+        Returns
+        -------
+        state
+            Changes of `Shown.state` that belong to it
+        """
 
     def show_photo(self, image: Photo, /, **state: Any) -> None:
-        """Show an image that is not of the scene as it is now: a photograph, or a trial again. state : see above"""
+        """Show an image that is not of the scene as it is now: a photograph, or a trial again.
+
+        Returns
+        -------
+        state
+            See above
+        """
 
     def stop_playback(self) -> None:
         """Stop playback, a pushed vehicle and the live camera, because something else is to be shown."""

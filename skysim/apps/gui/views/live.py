@@ -19,7 +19,13 @@ from skysim.core.errors import OVERRIDES, InputError
 
 
 class Contents:
-    """The contents of a tab's live fields. send : called with all of them when some have changed without a frame"""
+    """The contents of a tab's live fields.
+
+    Attributes
+    ----------
+    send
+        Called with all of them when some have changed without a frame
+    """
 
     def __init__(self) -> None:
         self.all = dict[int, dict[str, str]]()
@@ -58,7 +64,13 @@ class LiveField(ui.element, component="js/live_field.js", esm={"skysim-views": "
 
 
 class LiveText(LiveField):
-    """A text. state : its style class, such as good or warn"""
+    """A text.
+
+    Attributes
+    ----------
+    state
+        Its style class, such as good or warn
+    """
 
     def __init__(self, contents: Contents, text: str = "") -> None:
         super().__init__(contents, "div")
@@ -69,7 +81,13 @@ class LiveText(LiveField):
 
 
 class LiveInput(LiveField):
-    """A field to type into, or a slider. type : as in HTML"""
+    """A field to type into, or a slider.
+
+    Attributes
+    ----------
+    type
+        As in HTML
+    """
 
     def __init__(self, contents: Contents, type: str) -> None:
         super().__init__(contents, "input", type)

@@ -295,7 +295,13 @@ class TabFrames:
     added_s: float = -math.inf
 
     def add(self, number: int, frame: ServedFrame, alone: bool) -> None:
-        """Keep a frame and send it, or its number. alone : not over the stream, because messages belong to it"""
+        """Keep a frame and send it, or its number.
+
+        Parameters
+        ----------
+        alone
+            Not over the stream, because messages belong to it
+        """
         self.newest[number] = frame
         self.added_s = time.monotonic()
         self.newest.pop(min(self.newest) if len(self.newest) > KEPT_FRAMES else -1, None)
@@ -326,9 +332,8 @@ class TabFrames:
         finally:
             if self.waiting is waiting:
                 self.waiting = None
-                if self.drawn < max(
-                    self.newest, default=0
-                ):  # the connection was lost before the browser got it
+                # The connection was lost before the browser got it.
+                if self.drawn < max(self.newest, default=0):
                     self.announce(max(self.newest))
 
 

@@ -154,7 +154,13 @@ class SensorView:
         self.update_marks()
 
     def display_image(self, pixels: Pixels, alone: bool) -> None:
-        """Display a new image, as large as the window allows. alone : see `TabFrames.add`"""
+        """Display a new image, as large as the window allows.
+
+        Parameters
+        ----------
+        alone
+            See `TabFrames.add`
+        """
         if not self.sent_number:
             self.wait.set_visibility(False)
         self.sent_number += 1  # so that each frame has its own address

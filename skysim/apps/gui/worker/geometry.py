@@ -113,9 +113,8 @@ def scene_pose(lab: Lab, lens: Lens, truth: Truth) -> Pose:
     length = np.linalg.norm(rays_cam, axis=1)
     dome = surface.build_surface(lab.scene.light.surface)
     points_m = dome.meet(place_m, lab_from_cam.apply(rays_cam / length[:, None]))
-    depth_m = (
-        np.linalg.norm(points_m - place_m, axis=1) / length
-    )  # along the boresight; NaN where a ray meets nothing
+    # Along the boresight; NaN where a ray meets nothing.
+    depth_m = np.linalg.norm(points_m - place_m, axis=1) / length
     return Pose(rotation, tuple(place_m.tolist()), tuple(rounded(depth_m)))
 
 

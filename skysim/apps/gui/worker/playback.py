@@ -23,9 +23,8 @@ from skysim.simulation.timing import exposure_window
 
 MAX_POINTS = 500  # of a curve on the page, roughly
 FLOOR = 1e-3  # arcsec; lower limit of values on a logarithmic axis
-KEPT_BYTES = (
-    2**28
-)  # of frames in the file, beyond which they are rendered again when they are shown
+# Of frames in the file, beyond which they are rendered again when they are shown.
+KEPT_BYTES = 2**28
 
 
 @dataclass

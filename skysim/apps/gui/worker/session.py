@@ -132,7 +132,13 @@ class Workers:
 
     @staticmethod
     def prepare(scene: str) -> None:
-        """Start the process from which workers are forked, see `template`. scene : the file that it sets up"""
+        """Start the process from which workers are forked, see `template`.
+
+        Parameters
+        ----------
+        scene
+            The file that it sets up
+        """
         os.environ[SCENE] = scene
         multiprocessing.get_context("forkserver").set_forkserver_preload([TEMPLATE])
         forkserver.ensure_running()
@@ -142,7 +148,13 @@ class Workers:
         return Session() if len(Session.alive) < self.limit else None
 
     async def wait(self, wanted: Callable[[], bool], tell: Callable[[str], None]) -> Session | None:
-        """`take`, once it is this tab's turn; None if none is wanted any more. tell : gets what it waits for"""
+        """`take`, once it is this tab's turn; None if none is wanted any more.
+
+        Parameters
+        ----------
+        tell
+            Gets what it waits for
+        """
         ticket = object()
         self.queue.append(ticket)
         try:

@@ -220,7 +220,13 @@ def tilt_deg(scene: Scene) -> float:
 def survey_plan(
     lab_from_body: Rotation, shown: Mask, steps: tuple[tuple[int, int, float | None], ...]
 ) -> SurveyPlan:
-    """A plan as the page has it. shown : (F, N) LEDs that each attitude shows"""
+    """A plan as the page has it.
+
+    Parameters
+    ----------
+    shown
+        (F, N) LEDs that each attitude shows
+    """
     angles = tuple(tuple(row) for row in stops.angles_deg(lab_from_body).tolist())
     return SurveyPlan(angles, tuple(shown.sum(axis=1).tolist()), shown.shape[1], steps)
 

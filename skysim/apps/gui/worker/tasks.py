@@ -130,7 +130,13 @@ class Worker:
         solve: bool,
         angles_deg: Triple | None = None,
     ) -> tuple[SceneInfo, FrameView]:
-        """Set up a scene and render a first frame; angles_deg : of another attitude than the kept one or the start."""
+        """Set up a scene and render a first frame
+
+        Parameters
+        ----------
+        angles_deg
+            Of another attitude than the kept one or the start.
+        """
         bench = Workbench.open(scene, overrides, self.current)
         if angles_deg is not None:
             bench.lab_from_body = geometry.from_angles(

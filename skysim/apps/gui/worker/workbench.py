@@ -188,7 +188,13 @@ def id_prefix(lab: Lab) -> str:
 
 
 def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> LightColumns:
-    """The true lights of a frame, the brightest first. magnitude : V by number, of stars and LEDs"""
+    """The true lights of a frame, the brightest first.
+
+    Parameters
+    ----------
+    magnitude
+        V by number, of stars and LEDs
+    """
     sources = truth.sources
     of_bodies = {body.id: body.v_mag for body in truth.bodies}
     of_bodies |= {satellite.id: satellite.v_mag for satellite in truth.satellites}
@@ -228,7 +234,13 @@ def tracker_result(
 def detection_views(
     report: Report, names: Mapping[int, tuple[int, float]]
 ) -> tuple[Detection, ...]:
-    """Detections with id and residual of their matched lights. names : (id, residual in pixels) by centroid row"""
+    """Detections with id and residual of their matched lights.
+
+    Parameters
+    ----------
+    names
+        (id, residual in pixels) by centroid row
+    """
     centroids = report.centroids
     rows = zip(
         centroids.xy_px.tolist(), centroids.sigma_px.tolist(), centroids.flux.tolist(), strict=True

@@ -173,9 +173,8 @@ def count_above(image: GrayImage, xy_px: Floats, threshold: float) -> ThresholdC
     areas = np.bincount(label.ravel())
     areas[0] = 0
     x, y = np.rint(xy_px).astype(int).T
-    distance_px, _ = cKDTree(xy_px).query(
-        np.argwhere(above)[:, ::-1]
-    )  # of each lit pixel from the nearest LED
+    # Of each lit pixel from the nearest LED.
+    distance_px, _ = cKDTree(xy_px).query(np.argwhere(above)[:, ::-1])
     dark_px = int(np.sum(distance_px > DARK_RADIUS_PX))
     glare_px = int(np.sum(distance_px > GLARE_RADIUS_PX)) - dark_px
     return ThresholdCounts(areas[label[y - y0, x - x0]].astype(float), glare_px, dark_px)

@@ -48,11 +48,8 @@ from skysim.simulation.lab import Lab
 from skysim.sources.dome.surface import Surface, build_surface
 from skysim.tracking import onboard_model
 
-PLACES_DEG = (
-    0.0,
-    14.0,
-    28.0,
-)  # tilts of the scene's places: apex, halfway, edge within the tilt stop
+# Tilts of the scene's places: apex, halfway, edge within the tilt stop.
+PLACES_DEG = (0.0, 14.0, 28.0)
 HALFWAY_DEG = 23.6
 BOARD_TILT_DEG = 5.5
 SMALLER_BOARD_TILT_DEG = 4.0

@@ -114,9 +114,8 @@ def photograph(
     camera = onboard_model.calibration(lab.scene.camera)
     settings = tracker_settings.assumed_settings(lab.scene)
     sightings = []
-    for seed in rng.integers(
-        2**62, size=images
-    ):  # each image in a run of its own, for a random phase of the LEDs
+    # Each image in a run of its own, for a random phase of the LEDs.
+    for seed in rng.integers(2**62, size=images):
         frame, truth = render_at_rest(lab.in_run(int(seed)).camera, lab_from_body)
         priors = FramePriors(None, frame.saturation_dn)
         blobs = DETECTORS["thesis"](frame.image_dn, priors=priors)
@@ -178,11 +177,8 @@ BUMPED_POSITION = 4
 TRUE_ANGLES_DEG = (*IMU_DEG[:BUMPED_POSITION], ALGORITHM_DEG[BUMPED_POSITION])
 ON_US = np.array([1000.0, 500.0, 400.0, 200.0, 1.0])
 LINEAR_LEDS = slice(1, 4)  # LEDs of 500, 400 and 200 us
-TABLE_8_GROUPS = (
-    (0, 4),
-    (4, 8),
-    (8, 10),
-)  # rows of neighbors, diagonals, opposite ends of the cross
+# Rows of neighbors, diagonals, opposite ends of the cross.
+TABLE_8_GROUPS = ((0, 4), (4, 8), (8, 10))
 MIN_DIFFERENCE_ARCSEC = (
     100.0  # width of the catalog's buckets; angles closer than this count as one
 )

@@ -139,9 +139,8 @@ def solve_coded(
     lab = lab.in_run(int(rng.integers(2**62)))
     ((rows, xy_px, electrons),) = visible_rows(lab, Rotation.concatenate([lab_from_body]))
     electrons = electrons * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(rows)))
-    per_frame = trial.model_copy(
-        update={"magnitude_sigma": 0.0}
-    )  # the error of a brightness is that of the LED
+    # The error of a brightness is that of the LED.
+    per_frame = trial.model_copy(update={"magnitude_sigma": 0.0})
     tracker.last_s = None  # begins anew
     first = int(rng.integers(tracker.code.bits))
     for frame in range(first, first + tracker.code.bits):

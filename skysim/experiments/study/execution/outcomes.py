@@ -123,12 +123,8 @@ class Outcome:
 
 
 FIELDS = tuple(field.name for field in fields(Outcome))
-IDENTITY = (
-    "misidentified",
-    "roll_noise",
-    "misled",
-    "wrong_matches",
-)  # unknown of an external tracker
+# Unknown of an external tracker.
+IDENTITY = ("misidentified", "roll_noise", "misled", "wrong_matches")
 FAILED = Outcome("failed")
 DIRECTION = FIELDS[-8:]  # attitude and direction
 
@@ -256,9 +252,8 @@ def count_wrong_matches(
         return len(observed_px)
     nearest, _ = nearest_light(claimed_px, lights.xy_px)
     expected_px = claimed_px + lights.flux_xy_px[nearest] - lights.xy_px[nearest]
-    return int(
-        np.sum(~(np.linalg.norm(observed_px - expected_px, axis=1) <= reach_px))
-    )  # NaN is wrong
+    # NaN is wrong.
+    return int(np.sum(~(np.linalg.norm(observed_px - expected_px, axis=1) <= reach_px)))
 
 
 def centroid_error_px(centroids_px: Floats, true_px: Floats, reach_px: float) -> float:

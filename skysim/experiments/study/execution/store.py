@@ -44,17 +44,8 @@ BLOCK_TRIALS = 100_000  # numbers of trials of a block of `Store.blocks`
 TEXT_FIELDS = {"status"}
 INTEGER_FIELDS = {"frames", "solved", "wrong", "ambiguous"}
 
-COLUMNS = (
-    "trial",
-    "point",
-    "replicate",
-    "seed",
-    "scene",
-    "code",
-    *FIELDS,
-    "error",
-    "time_ms",
-)  # of `Store.columns`
+# Of `Store.columns`.
+COLUMNS = ("trial", "point", "replicate", "seed", "scene", "code", *FIELDS, "error", "time_ms")
 
 SQL_TYPES = dict.fromkeys(TEXT_FIELDS, "TEXT") | dict.fromkeys(INTEGER_FIELDS, "INTEGER")
 OUTCOME_COLUMNS = ", ".join(f"{name} {SQL_TYPES.get(name, 'REAL')}" for name in FIELDS)
@@ -245,9 +236,8 @@ class Store:
 
     def parts(self) -> list[Part]:
         """All parts, in the order in which they were written."""
-        if self.meta("format") != str(
-            FORMAT_OF_PARTS
-        ):  # a store of an earlier skysim has no such table
+        # A store of an earlier skysim has no such table.
+        if self.meta("format") != str(FORMAT_OF_PARTS):
             return []
         rows = self.db.execute("SELECT part, rows, wrong, first, last FROM parts ORDER BY part")
         known = (self.checked(row, int, int, int, int, int) for row in rows)

@@ -182,9 +182,8 @@ def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
             scene = scene or REFUSED
             error = str(raised)
         else:
-            error = traceback.format_exc().replace(
-                f"{ROOT}/", ""
-            )  # independent of the installation path
+            # Independent of the installation path.
+            error = traceback.format_exc().replace(f"{ROOT}/", "")
     seconds = (time.perf_counter() - start_s) / len(seeds)
     return [
         Row(trial, segment.point, replicate, seed, scene, code_version(), outcome, error, seconds)
@@ -390,7 +389,13 @@ def render_trial_frame(
 
 
 class MovingCamera(NamedTuple):
-    """The camera of a frame trial in its motion. streak_px : (dx, dy) of its frame that a gyro measures, if any"""
+    """The camera of a frame trial in its motion.
+
+    Attributes
+    ----------
+    streak_px
+        (dx, dy) of its frame that a gyro measures, if any
+    """
 
     camera: StarCamera
     trajectory: Trajectory

@@ -135,7 +135,13 @@ def shell_command(study: str, out: Path | None, overrides: Mapping[str, str], ve
 
 
 def analyze(plan: Plan, store: Store, command: Callable[[str], str]) -> Analysis:
-    """The analysis of the trials in a store. command : see `commands`"""
+    """The analysis of the trials in a store.
+
+    Parameters
+    ----------
+    command
+        See `commands`
+    """
     study = plan.study
     about = overview(plan)
     lines = tables.table(store, list(dict.fromkeys([*responses(study), *answer.RESPONSES])))
@@ -364,7 +370,13 @@ def runs_section(store: Store) -> Section:
 def study_figures(
     lines: Sequence[PointRow], study: Study, columns_of: ColumnsOf, replay: str
 ) -> list[Block]:
-    """The study's figures: maps with their worst trials, others with their numbers. columns_of : trials of a point"""
+    """The study's figures: maps with their worst trials, others with their numbers.
+
+    Parameters
+    ----------
+    columns_of
+        Trials of a point
+    """
     blocks: list[Block] = []
     for one in layout.figures(study, lines):
         if isinstance(one, Map):

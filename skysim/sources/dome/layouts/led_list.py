@@ -16,11 +16,8 @@ from skysim.sources.dome.led import full_strength_e_s_sr
 from skysim.sources.dome.surface import Surface, build_surface
 from skysim.sources.photometry import Band
 
-BUILT = {
-    "glue_scatter_m": 0.0,
-    "glue_tilt_deg": 0.0,
-    "pitch_error": 0.0,
-}  # errors of a layout as built
+# Errors of a layout as built.
+BUILT = {"glue_scatter_m": 0.0, "glue_tilt_deg": 0.0, "pitch_error": 0.0}
 AIMED = {"aiming": None, "radius_variation": 0.0}  # and of places that a laser marks
 HEADER = """\
 # LEDs of {name}: x_m, y_m, z_m from the center of the bearing in the lab (z up); azimuth from +x toward +y, and tilt

@@ -34,11 +34,8 @@ from skysim.sources.photometry import Band
 DARTS_PER_SPACING2 = 100
 MAX_DARTS = 3_000_000
 DARTS_PER_LED = 30  # random points per LED, if a count is given
-UNDIMMED = {
-    "levels": None,
-    "magnitudes": None,
-    "unique_neighbors": None,
-}  # brightness does not move an LED
+# Brightness does not move an LED.
+UNDIMMED = {"levels": None, "magnitudes": None, "unique_neighbors": None}
 BISECTIONS = 14  # bisection steps from the dome's width: to some tenths of a millimeter
 
 
@@ -170,9 +167,8 @@ def geodesic(config: GeodesicConfig, surface: Surface, led: LedConfig, band: Ban
 def geodesic_vertices(frequency: int, class_: str) -> Floats:
     """(10 T + 2, 3) unit vectors of all vertices; see the module's docstring. frequency is even in class II."""
     corners = icosahedron()
-    weights: set[tuple[tuple[int, int], ...]] = (
-        set()
-    )  # corners with their weights: the same from every face
+    # Corners with their weights: the same from every face.
+    weights: set[tuple[tuple[int, int], ...]] = set()
     for face in icosahedron_faces():
         for lattice in lattice_points(frequency, class_):
             weights.add(

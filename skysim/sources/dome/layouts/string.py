@@ -220,9 +220,8 @@ def strips(config: StringConfig, surface: Surface, meridian: Meridian) -> list[T
     steps = max(STEPS_PER_TURN, int(STEPS_PER_PITCH * float(meridian.arc_m[-1]) / config.pitch_m))
     tapes = []
     for number in range(count):
-        neighbors = count // math.gcd(
-            number, count // 4
-        )  # strips of the coarsest set that holds this one
+        # Strips of the coarsest set that holds this one.
+        neighbors = count // math.gcd(number, count // 4)
         first_rad = np.interp(
             neighbors * config.spacing_m / (4 * np.pi), widest_m, meridian.tilt_rad
         )
