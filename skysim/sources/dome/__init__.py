@@ -1,4 +1,9 @@
-"""The dome's inside and the LEDs on it, in the lab frame."""
+"""The dome's inside and the LEDs on it, in the lab frame.
+
+surface.py: the wall as a surface; layouts/: places of the LEDs; led.py: their light; codes.py: their clocks and codes;
+display.py: stars on panels and projectors; interreflection.py and mirror.py: light that the wall sends back;
+survey_errors.py: what a survey of it all yields.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +24,7 @@ from skysim.sources.photometry import Band
 
 
 def sources(config: light.DomeConfig, band: Band) -> Sources:
-    """All LEDs of the dome; strength is in photo-electrons s^-1 sr^-1 in the chip's band.
+    """All LEDs of a scene's dome; strength is in photo-electrons s^-1 sr^-1 in the chip's band.
 
     Raises
     ------

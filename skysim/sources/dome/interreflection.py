@@ -4,9 +4,14 @@ The irradiance E of Lambertian surfaces of reflectance rho obeys
 
     E(x) = E_0(x) + integral rho(y) E(y) K(x, y) dA(y),    K = cos(theta_x) cos(theta_y) / (pi d^2),
 
-with E_0 from the LEDs directly (the radiosity equation; Siegel & Howell, Thermal Radiation Heat Transfer, ch. 7). It is
-solved at patches of the surfaces (Nystroem's method), and any other point then gets its light from LEDs and patches by
-the same sum. On a sphere K = 1 / (4 pi R^2) everywhere, so LEDs of the power P in a sphere of the area A give
+with E_0 from the LEDs directly (the radiosity equation; Siegel & Howell, Thermal Radiation Heat Transfer, ch. 7).
+
+1. Divide wall and floor into patches (`wall_patches`, `floor_patches`).
+2. Light of the LEDs on each patch, E_0 (`irradiance`).
+3. Solve the equation at the patches, (1 - K rho A) E = E_0 (Nystroem's method).
+4. Any other point gets its light from LEDs and patches by the same sum.
+
+On a sphere K = 1 / (4 pi R^2) everywhere, so LEDs of the power P in a sphere of the area A give
 E = P / (A (1 - rho)), the law of the integrating sphere.
 """
 
@@ -23,20 +28,24 @@ from skysim.core.types import Floats, Sources
 from skysim.scene.sections.leds import Lobe
 from skysim.scene.sections.light import DomeConfig, FloorConfig, ReflectionConfig
 from skysim.sources.dome.led import LOBES
-from skysim.sources.dome.surface import Surface, build_surface
+from skysim.sources.dome.surface import Surface, build_surface, unit_vectors
 
 PATCHES = 700  # on the wall, and as many on the floor
-MAX_DIRECTIONS = 20_000  # from the bearing, for a wall that fills little of its sky
-LOBE_SAMPLES = 2049  # of a lobe, at even cosines: within 1e-5 of cos^10
+MAX_DIRECTIONS = 20_000  # from the bearing, for a wall that fills a small part of its sky
+LOBE_SAMPLES = 2049  # of a lobe, at evenly spaced cosines: within 1e-5 of cos^10
 
 
 class Emitters(NamedTuple):
-    """N small emitters: places, unit normals, strengths in e- s^-1 sr^-1 along the normals, and their common lobe.
+    """N small emitters.
 
     Attributes
     ----------
+    place_m, normal
+        (N, 3) places and unit normals
+    strength
+        (N,) photo-electrons s^-1 sr^-1 along the normals
     lobe
-        (K,) relative intensity at even cosines of the emission angle, from 0 to 1
+        (K,) relative intensity of all emitters at evenly spaced cosines of the emission angle, from 0 to 1
     """
 
     place_m: Floats
@@ -46,7 +55,7 @@ class Emitters(NamedTuple):
 
 
 class Patches(NamedTuple):
-    """Patches of wall and floor: places, unit normals, areas and diffuse reflectances."""
+    """P patches of wall and floor: places and unit normals (P, 3), areas and diffuse reflectances (P,)."""
 
     place_m: Floats
     normal: Floats
@@ -61,28 +70,31 @@ class DiffuseLight(NamedTuple):
     patches: Emitters
 
     def irradiance_e_s_m2(self, points_m: Floats, normals: Floats) -> Floats:
-        """(M,) mean irradiance of points on the wall or the floor, in photo-electrons s^-1 m^-2."""
-        return irradiance(points_m, normals, self.leds) + irradiance(
-            points_m, normals, self.patches
-        )
+        """(M,) mean irradiance of points (M, 3) on the wall or the floor, in photo-electrons s^-1 m^-2 (step 4)."""
+        by_leds = irradiance(points_m, normals, self.leds)
+        return by_leds + irradiance(points_m, normals, self.patches)
 
 
 def diffuse_light(
     config: ReflectionConfig, wall: Surface, leds: Sources, lobe: Lobe
 ) -> DiffuseLight:
     """Solve the radiosity equation for the mean light of a dome's LEDs, without their flicker."""
+    # 1. Patches.
     patches = wall_patches(wall, config.diffuse)
     if config.floor:
-        patches = joined(patches, floor_patches(config.floor))
+        floor = floor_patches(config.floor)
+        patches = Patches(*(np.concatenate(pair) for pair in zip(patches, floor, strict=True)))
+    # 2. Direct light.
     emitters = led_emitters(leds, lobe)
     direct = irradiance(patches.place_m, patches.normal, emitters)
+    # 3. Sum over the patches: K rho A E.
     transfer = kernel(patches) * (patches.reflectance * patches.area_m2)
     total = np.asarray(np.linalg.solve(np.eye(len(transfer)) - transfer, direct))
     return DiffuseLight(emitters, patch_emitters(patches, total))
 
 
 def led_emitters(leds: Sources, lobe: Lobe) -> Emitters:
-    """The LEDs, with their mean strengths over their pulses."""
+    """The LEDs as emitters, with their strengths averaged over their pulses."""
     duty = np.minimum(leds.on_s / leds.period_s, 1.0)
     sampled = LOBES[lobe.kind](lobe, np.linspace(0, 1, LOBE_SAMPLES))
     place_m = np.ascontiguousarray(leds.place[:, :3])
@@ -90,13 +102,17 @@ def led_emitters(leds: Sources, lobe: Lobe) -> Emitters:
 
 
 def patch_emitters(patches: Patches, irradiance_e_s_m2: Floats) -> Emitters:
-    """Lambertian patches of this irradiance: the radiance is rho E / pi."""
+    """Lambertian patches of this irradiance as emitters: the radiance is rho E / pi."""
     strength = patches.reflectance * irradiance_e_s_m2 * patches.area_m2 / np.pi
     return Emitters(patches.place_m, patches.normal, strength, np.linspace(0, 1, 2))
 
 
 def wall_patches(wall: Surface, reflectance: float) -> Patches:
-    """Some PATCHES patches of the wall, of equal solid angle as seen from the bearing's center."""
+    """About PATCHES patches of the wall, of equal solid angle as seen from the bearing's center.
+
+    A solid angle w at the distance r covers the area r^2 w / cos(incidence).
+    """
+    # The fraction of the sky that the wall fills gives the number of directions.
     share = max(
         float(np.isfinite(wall.meet(np.zeros(3), spiral(2000))[:, 0]).mean()),
         PATCHES / MAX_DIRECTIONS,
@@ -112,7 +128,7 @@ def wall_patches(wall: Surface, reflectance: float) -> Patches:
 
 
 def floor_patches(config: FloorConfig) -> Patches:
-    """PATCHES patches of the floor, of equal area, on a spiral."""
+    """PATCHES patches of the floor, of equal area, on a Fibonacci spiral."""
     radius_m = config.radius_m * np.sqrt((np.arange(PATCHES) + 0.5) / PATCHES)
     azimuth = np.arange(PATCHES) * GOLDEN_ANGLE_RAD
     place_m = np.column_stack(
@@ -124,27 +140,23 @@ def floor_patches(config: FloorConfig) -> Patches:
     )
 
 
-def joined(wall: Patches, floor: Patches) -> Patches:
-    """Wall and floor, the wall first."""
-    return Patches(*(np.concatenate(pair) for pair in zip(wall, floor, strict=True)))
-
-
 def spiral(count: int) -> Floats:
-    """(N, 3) unit vectors of a Fibonacci spiral: all of nearly the same solid angle 4 pi / N."""
+    """(N, 3) unit vectors of a Fibonacci spiral over the sphere, each for nearly the same solid angle 4 pi / N."""
     z = 1 - (2 * np.arange(count) + 1) / count
     azimuth = np.arange(count) * GOLDEN_ANGLE_RAD
-    ring = np.sqrt(1 - z**2)
-    return np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
+    return unit_vectors(z, azimuth)
 
 
 def kernel(patches: Patches) -> Floats:
-    """(N, N) K between patches, which nothing hides from each other; on the diagonal that of the nearest other patch.
+    """(N, N) K between patches. No patch hides another.
 
-    K of a smooth surface has a finite limit, its mean squared curvature over 4 pi, which a neighbor has nearly too.
+    The diagonal has K to the nearest other patch. K of a smooth surface has a finite limit, its mean squared curvature
+    over 4 pi, which a neighbor has nearly too.
     """
     offset = patches.place_m[None] - patches.place_m[:, None]
     square = np.sum(offset**2, axis=2)
     np.fill_diagonal(square, np.inf)
+    # Positive where the patches face each other.
     cos_from = np.einsum("ijk,ik->ij", offset, patches.normal)
     cos_to = -np.einsum("ijk,jk->ij", offset, patches.normal)
     values = np.maximum(cos_from, 0) * np.maximum(cos_to, 0) / (np.pi * square**2)
@@ -153,7 +165,10 @@ def kernel(patches: Patches) -> Floats:
 
 
 def irradiance(points_m: Floats, normals: Floats, emitters: Emitters) -> Floats:
-    """(M,) irradiance of points with unit normals (M, 3) by all emitters, in photo-electrons s^-1 m^-2."""
+    """(M,) irradiance of points with unit normals (M, 3) by all emitters, in photo-electrons s^-1 m^-2.
+
+    E = sum over emitters of I(theta) cos(phi) / d^2.
+    """
     return np.asarray(
         _irradiance(np.ascontiguousarray(points_m), np.ascontiguousarray(normals), *emitters)
     )
@@ -168,7 +183,7 @@ def _irradiance(
     strength: Floats,
     lobe: Floats,
 ) -> Any:
-    """Sum of I(theta) cos(phi) / d^2 over the emitters."""
+    """The sum of `irradiance`, points in parallel."""
     out = np.zeros(len(points_m))
     last = len(lobe) - 1
     for m in numba.prange(len(points_m)):
@@ -178,6 +193,7 @@ def _irradiance(
             y = points_m[m, 1] - place_m[n, 1]
             z = points_m[m, 2] - place_m[n, 2]
             square = x * x + y * y + z * z
+            # A point on the emitter itself gets no light from it.
             if square < 1e-24:
                 continue
             distance = np.sqrt(square)
@@ -186,6 +202,7 @@ def _irradiance(
             ) / distance
             incidence = -(x * normals[m, 0] + y * normals[m, 1] + z * normals[m, 2]) / distance
             if emission > 0 and incidence > 0:
+                # The lobe between its samples.
                 at = min(emission, 1.0) * last
                 k = min(int(at), last - 1)
                 intensity = lobe[k] + (at - k) * (lobe[k + 1] - lobe[k])
@@ -194,11 +211,11 @@ def _irradiance(
     return out
 
 
-# A dome that reflects, as a scene describes it.
+# A dome that reflects, as a scene gives it.
 
 
 class ReflectingDome(NamedTuple):
-    """Wall and floor; `diffuse` is their light, None if they only mirror."""
+    """Wall and floor of a dome; `diffuse` is the light that they scatter, None if they only mirror."""
 
     config: ReflectionConfig
     wall: Surface
@@ -211,9 +228,7 @@ def reflecting_dome(light: object, leds: Sources) -> ReflectingDome | None:
         return None
     config = light.reflection
     wall = build_surface(light.surface)
-    diffuse = (
-        diffuse_light(config, wall, leds, light.led.lobe)
-        if config.diffuse or config.floor
-        else None
-    )
+    diffuse = None
+    if config.diffuse or config.floor:
+        diffuse = diffuse_light(config, wall, leds, light.led.lobe)
     return ReflectingDome(config, wall, diffuse)

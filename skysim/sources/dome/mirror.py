@@ -4,10 +4,14 @@ A ray from the camera in the direction u meets the wall at Q, with the inward no
 
     r = u - 2 (u . N) N .
 
-An LED at P is seen in the wall where P lies on that ray (the law of reflection, by which the path's length is
-stationary, as Fermat says: Alhazen's problem on a sphere). The LED's offset F = P - Q - ((P - Q) . r) r from the ray is
-brought to zero by Newton's method for the two angles of u, from all directions of a grid where the LED is nearest to
-the ray.
+An LED at P is seen in the wall if P is on that ray (the law of reflection, by which the length of the path is
+stationary, Fermat's principle; Alhazen's problem on a sphere). The LED's offset from the ray is
+F = P - Q - ((P - Q) . r) r.
+
+1. Reflect the rays of a grid, and start at each at which the LED is nearest to the ray (`nearest_rays`).
+2. Bring F to zero by Newton's method for the two angles of u (`linearized`).
+3. Keep the solutions that converged, are on the wall and in the field, each once.
+4. Place a virtual LED in the direction u at the distance d below.
 
 A bundle of rays of the solid angle dOmega from the camera has the cross-section dA = |det dF / du| dOmega at the LED.
 By reciprocity a bundle from the LED spreads as much on its way to the camera. So the LED's image is as bright and, in
@@ -33,12 +37,14 @@ from skysim.scene.sections.light import ReflectionConfig
 from skysim.sources.dome.surface import Surface, perpendicular
 from skysim.sources.satellites import MIRRORED
 
-STEP_RAD = 1e-5  # of the differences: error 1e-10
+STEP_RAD = 1e-5  # of the difference quotients: error 1e-10
 STEPS = 12  # of Newton's method
 REACH = 12.0  # largest angle from an LED to a ray of the grid to start from, in the grid's spacing
-TOUCHING = 1e-4  # an image as near to the LED itself, in the camera's distance, is no reflection
-SAME_RAD = 1e-7  # images of an LED nearer to each other are one
-CLOSE = 1e-9  # of the distance: the largest offset from the ray of a solution
+TOUCHING = (
+    1e-4  # an image nearer to the LED itself, in units of the camera's distance, is no reflection
+)
+SAME_RAD = 1e-7  # two solutions for an LED nearer to each other are one image
+CLOSE = 1e-9  # largest offset of a solution from the ray, in units of the LED's distance
 
 
 class Rays(NamedTuple):
@@ -50,14 +56,20 @@ class Rays(NamedTuple):
 
 
 class Image(NamedTuple):
-    """K images: rows of their LEDs, directions from the camera, virtual distances, and cosines of the incidence.
+    """K images of LEDs in the wall.
 
     Attributes
     ----------
+    led
+        (K,) rows of the LEDs
+    toward, distance_m
+        (K, 3) directions from the camera, and (K,) virtual distances
+    cosine
+        (K,) cosines of the angle of incidence
     wall_m
-        (K, 3) where they are mirrored
+        (K, 3) places on the wall where the LEDs are mirrored
     along
-        (K, 3) from there toward the LED
+        (K, 3) directions from there toward the LEDs
     """
 
     led: NDArray[np.int64]
@@ -71,14 +83,14 @@ class Image(NamedTuple):
 def mirrored(
     config: ReflectionConfig, wall: Surface, leds: Sources, camera_m: Floats, grid: Floats
 ) -> Sources:
-    """The images of the LEDs that the camera sees in the wall; their numbers are in `false_lights.MIRRORED`.
+    """The images of the LEDs that the camera sees in the wall; their numbers are `satellites.MIRRORED` and the LED's.
 
-    Images closer together than the grid's directions, near a caustic, can be missed. None for a camera outside.
+    Images closer together than the grid's directions, near a caustic, can be missed. No images for a camera outside.
 
     Parameters
     ----------
     camera_m
-        (3,) the entrance pupil
+        (3,) entrance pupil
     grid
         (h, w, 3) unit vectors that cover the field
     """
@@ -87,6 +99,7 @@ def mirrored(
     images = find_images(wall, leds.place[:, :3], camera_m, grid)
     sources = leds.take(images.led)
     normal = wall.inward(images.wall_m) if len(images.led) else np.zeros((0, 3))
+    # 4. The virtual LED's normal is the LED's, mirrored at the wall.
     across = np.sum(sources.normal * normal, axis=1, keepdims=True)
     place = np.column_stack(
         [camera_m + images.toward * images.distance_m[:, None], np.ones(len(sources))]
@@ -101,18 +114,19 @@ def mirrored(
 
 
 def numbered(led: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(K,) the number of each image among those of its LED, from 1; the images of an LED follow each other."""
+    """(K,) number of each image among those of its LED, from 1, for `led` (K,) in ascending order."""
     return np.arange(len(led)) - np.searchsorted(led, led) + 1
 
 
 def reflectance(config: ReflectionConfig, cosine: Floats) -> Floats:
-    """Share of the light that the wall mirrors at these cosines of the incidence: constant, or Fresnel's.
+    """Fraction of the light that the wall mirrors at these cosines of the incidence: constant, or Fresnel's law.
 
     R = (r_s^2 + r_p^2) / 2, r_s = (cos i - n cos t) / (cos i + n cos t), r_p = (n cos i - cos t) / (n cos i + cos t).
     """
     n = config.refractive_index
     if n is None:
         return np.full(len(cosine), config.specular)
+    # Snell's law: sin t = sin i / n.
     refracted = np.sqrt(1 - (1 - cosine**2) / n**2)
     r_s = (cosine - n * refracted) / (cosine + n * refracted)
     r_p = (n * cosine - refracted) / (n * cosine + refracted)
@@ -120,25 +134,29 @@ def reflectance(config: ReflectionConfig, cosine: Floats) -> Floats:
 
 
 def find_images(wall: Surface, led_m: Floats, camera_m: Floats, grid: Floats) -> Image:
-    """All images of LEDs at (N, 3) in the directions of a grid (h, w, 3), in the LEDs' order."""
+    """All images of LEDs at (N, 3) in the directions of a grid (h, w, 3), in the LEDs' order: steps 1 to 3."""
+    # 1.
     led, start = nearest_rays(wall, led_m, camera_m, grid)
     toward = grid.reshape(-1, 3)[start]
+    # 2. A step is limited, since far from the solution the linear law may lead anywhere.
     for _ in range(STEPS):
         offset, jacobian, axes = linearized(wall, led_m[led], camera_m, toward)
         with np.errstate(invalid="ignore", divide="ignore"):
             step = -np.einsum("kij,kj->ki", inverse(jacobian), offset)
         toward = toward + np.einsum("ki,kij->kj", np.clip(step, -0.1, 0.1), axes)
         toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    # 3. What a solution must satisfy: F = 0, an LED off the wall and ahead of the reflected ray, in
+    # the field.
     offset, jacobian, _ = linearized(wall, led_m[led], camera_m, toward)
     rays = reflect(wall, camera_m, toward)
     to_led = led_m[led] - rays.wall_m
     far_m = np.linalg.norm(to_led, axis=1)
     path_m = np.linalg.norm(rays.wall_m - camera_m, axis=1)
     solved = (np.linalg.norm(offset, axis=1) < CLOSE * far_m) & (far_m > TOUCHING * path_m)
-    solved &= np.isfinite(wall.meet(camera_m, toward)[:, 0]) & (
-        np.sum(to_led * rays.along, axis=1) > 0
-    )
+    on_wall = np.isfinite(wall.meet(camera_m, toward)[:, 0])
+    solved &= on_wall & (np.sum(to_led * rays.along, axis=1) > 0)
     solved &= cosines_to_grid(toward, grid) > 0
+    # d = sqrt(|det dF / du|).
     distance_m = np.sqrt(np.abs(np.linalg.det(np.nan_to_num(jacobian))))
     found = distinct(led, toward, solved & (distance_m > 0))
     wall_m, along, cosine = (part[found] for part in rays)
@@ -148,17 +166,17 @@ def find_images(wall: Surface, led_m: Floats, camera_m: Floats, grid: Floats) ->
 def distinct(
     led: NDArray[np.int64], toward: Floats, solved: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
-    """Rows of the solutions, each once, sorted by LED and direction."""
+    """Rows of the solutions, each image once, sorted by LED and direction."""
     rows = np.flatnonzero(solved)
     rows = rows[np.lexsort([*np.round(toward[rows] / SAME_RAD).T, led[rows]])]
-    same = (np.diff(led[rows]) == 0) & (
-        np.linalg.norm(np.diff(toward[rows], axis=0), axis=1) < 3 * SAME_RAD
-    )
+    same_led = np.diff(led[rows]) == 0
+    apart = np.linalg.norm(np.diff(toward[rows], axis=0), axis=1)
+    same = same_led & (apart < 3 * SAME_RAD)
     return rows[~np.concatenate([[False], same])] if len(rows) else rows
 
 
 def reflect(wall: Surface, camera_m: Floats, toward: Floats) -> Rays:
-    """Reflect rays from the camera at the wall, its rim ignored; NaN where they miss it."""
+    """Reflect rays from the camera at the wall, its rim ignored: r = u - 2 (u . N) N; NaN where they miss it."""
     wall_m = camera_m + wall.exit_m(camera_m, toward)[:, None] * toward
     normal = wall.inward(wall_m)
     cosine = -np.sum(toward * normal, axis=1)
@@ -168,7 +186,7 @@ def reflect(wall: Surface, camera_m: Floats, toward: Floats) -> Rays:
 def nearest_rays(
     wall: Surface, led_m: Floats, camera_m: Floats, grid: Floats
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """LEDs (K,) and rays of the grid (K,), flat, at which the LED's angle from the reflected ray has a minimum."""
+    """LEDs (K,) and rays (K,), as flat indices of the grid, at which an LED's angle from the reflected ray is least."""
     rays = reflect(wall, camera_m, grid.reshape(-1, 3))
     spacing_rad = float(np.arccos(np.clip(np.sum(grid[1:] * grid[:-1], axis=2), -1, 1)).max())
     limit = np.cos(min(REACH * spacing_rad, np.pi))
@@ -181,11 +199,12 @@ def nearest_rays(
 
 @jit
 def _minima(led_m: Floats, wall_m: Floats, along: Floats, limit: float) -> Any:
-    """(K, 2) LED and ray of each largest cosine among a ray and its neighbors, above a limit."""
+    """(K, 2) LED and ray of each local maximum of the cosine on the grid that is above `limit`."""
     rows, columns = wall_m.shape[:2]
     cosine = np.empty((rows, columns))
     found = []
     for n in range(len(led_m)):
+        # Cosine of the LED's angle from each reflected ray.
         for i in range(rows):
             for j in range(columns):
                 square = 0.0
@@ -196,6 +215,7 @@ def _minima(led_m: Floats, wall_m: Floats, along: Floats, limit: float) -> Any:
                     dot += offset * along[i, j, k]
                 # NaN, a ray without a wall, is no maximum.
                 cosine[i, j] = dot / np.sqrt(square) if square > 0 and dot == dot else -1.0
+        # Maxima among a ray and its eight neighbors.
         for i in range(rows):
             for j in range(columns):
                 if cosine[i, j] < limit:
@@ -215,9 +235,15 @@ def _minima(led_m: Floats, wall_m: Floats, along: Floats, limit: float) -> Any:
 def linearized(
     wall: Surface, led_m: Floats, camera_m: Floats, toward: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """(K, 2) offsets of LEDs (K, 3) from the reflected rays, across them, (K, 2, 2) their derivatives with respect to
-    two angles of the direction, and (K, 2, 3) the axes of these angles.
+    """Offsets of LEDs from the reflected rays, and how they change with the rays' directions.
+
+    Returns
+    -------
+    tuple
+        (K, 2) offsets F across the rays, (K, 2, 2) their derivatives with respect to two angles of the direction,
+        (K, 2, 3) axes of these angles
     """
+    # The ray itself, and one to either side along both axes.
     axes = axes_across(toward)
     first, second = STEP_RAD * np.moveaxis(axes, 1, 0)
     shifted = toward + np.stack([0 * toward, first, -first, second, -second])
@@ -228,25 +254,26 @@ def linearized(
     # The LEDs' offsets from the nearest points of the rays.
     to_led = led_m - wall_m
     offset = to_led - np.sum(to_led * along, axis=2, keepdims=True) * along
+    # In axes across the middle ray; derivatives by central differences.
     center, *ends = np.einsum("kij,skj->ski", axes_across(along[0]), offset)
     columns = [(ends[0] - ends[1]) / (2 * STEP_RAD), (ends[2] - ends[3]) / (2 * STEP_RAD)]
     return center, np.stack(columns, axis=2), axes
 
 
 def axes_across(unit: Floats) -> Floats:
-    """(K, 2, 3) two unit vectors perpendicular to each of these and to each other."""
+    """(K, 2, 3) two unit vectors perpendicular to each of (K, 3) unit vectors and to each other."""
     first = perpendicular(unit)
     return np.stack([first, np.cross(unit, first)], axis=1)
 
 
 def inverse(matrix: Floats) -> Floats:
-    """(K, 2, 2) inverses; infinite where there is none."""
+    """(K, 2, 2) inverses [[d, -b], [-c, a]] / (a d - b c); infinite for singular matrices."""
     (a, b), (c, d) = np.moveaxis(matrix, 0, 2)
     return np.moveaxis(np.array([[d, -b], [-c, a]]) / (a * d - b * c), 2, 0)
 
 
 def cosines_to_grid(toward: Floats, grid: Floats) -> Floats:
-    """(K,) positive for directions within the cone about the grid's middle that holds all of it."""
+    """(K,) numbers that are positive for directions within the cone about the grid's middle that contains the grid."""
     middle = grid.reshape(-1, 3).mean(axis=0)
     middle /= np.linalg.norm(middle)
     return np.asarray(toward @ middle - (grid @ middle).min() * (1 - 1e-12))

@@ -1,9 +1,11 @@
 """Measured points of the dome's inside: read, and fitted by a smooth surface with residuals.
 
-The points are those of a measuring arm. A sphere is fitted first. The distance from its center is then fitted as a
-function of direction: Zernike polynomials in the disk onto which Lambert's equal-area projection maps the cap,
-r(u) = sum_k c_k Z_k, by linear least squares (`fit`). `fit_ellipsoid` gives the nearest ellipsoid, for estimators
-that model no other surface.
+The points are those of a measuring arm.
+
+1. A sphere is fitted (`fit_sphere`).
+2. The distance from its center is fitted as a function of direction, r(u) = sum_k c_k Z_k, by linear least squares
+   (`fit`). The Z_k are Zernike polynomials in the disk onto which Lambert's equal-area projection maps the cap.
+3. `fit_ellipsoid` gives the nearest ellipsoid, for estimators that model no other surface.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ EDGE_POINTS = 72  # points on the edge of the fitted surface
 
 
 class FittedSphere(NamedTuple):
-    """The sphere nearest to points: its center (3,), radius, and the rms of the points' distances from it."""
+    """The sphere nearest to points: its center (3,), its radius, and the rms of the points' distances from it."""
 
     center_m: Floats
     radius_m: float
@@ -44,8 +46,7 @@ class FittedEllipsoid(NamedTuple):
     center_m, semi_axes_m
         (3,) each
     rms_m
-        Of the surface's distances from it, over the surface within its rim as the bearing sees
-        it
+        Rms of the surface's distances from the ellipsoid, over the surface within its rim as the bearing sees it
     """
 
     center_m: Floats
@@ -54,23 +55,28 @@ class FittedEllipsoid(NamedTuple):
 
 
 def fit_sphere(points_m: Floats) -> FittedSphere:
-    """The sphere with the least sum of squared distances from points (N, 3), iterated from the algebraic fit.
+    """The sphere with the least sum of squared distances from points (N, 3).
+
+    1. Algebraic fit, linear in the center c and r^2 - |c|^2: |x|^2 = 2 c . x + (r^2 - |c|^2).
+    2. Least squares of |x - c| - r, iterated from there.
 
     Raises
     ------
     ValueError
         For points in a plane.
     """
+    # Points are scaled to 1 about their mean, for well-conditioned equations.
     mean_m = points_m.mean(axis=0)
     scale_m = np.ptp(points_m, axis=0).max()
     scaled = (points_m - mean_m) / scale_m
-    # Algebraic fit, linear in the center c and r^2 - |c|^2: |x|^2 = 2 c . x + (r^2 - |c|^2).
+    # 1.
     design = np.column_stack([2 * scaled, np.ones(len(scaled))])
     algebraic, _, rank, _ = np.linalg.lstsq(design, np.sum(scaled**2, axis=1), rcond=1e-9)
     if rank < 4:
         raise ValueError("the points lie in a plane or on a line")
     radius = math.sqrt(algebraic[3] + algebraic[:3] @ algebraic[:3])
 
+    # 2.
     def residual(parameters: Floats) -> Floats:
         return np.asarray(np.linalg.norm(scaled - parameters[:3], axis=1) - parameters[3])
 
@@ -85,12 +91,14 @@ def fit_sphere(points_m: Floats) -> FittedSphere:
 def fit_ellipsoid(points_m: Floats) -> FittedEllipsoid:
     """The ellipsoid, with axes along the lab's, nearest to points: least squares of (|w| - 1) / |grad |w||.
 
+    With w = (x - center) / semi_axes the residual is, to first order, the distance.
+
     Parameters
     ----------
     points_m
-        (N, 3), N > 6;  w = (x - center) / semi_axes. To first order the residual is the
-        distance.
+        (N, 3), N > 6
     """
+    # The start is the nearest sphere; parameters are relative to it.
     sphere = fit_sphere(points_m)
 
     def residual_m(parameters: Floats) -> Floats:
@@ -111,13 +119,14 @@ def fit_ellipsoid(points_m: Floats) -> FittedEllipsoid:
 def zernike(degree: int, disk: Floats) -> tuple[Floats, Floats]:
     """Zernike polynomials over the unit disk to a degree, (N, K), and their gradients, (N, K, 2).
 
-    Z = Re or Im of w^m R(q), w = x + iy, q = |w|^2,
-    R(q) = sum_k (-1)^k (n - k)! / (k! ((n + m)/2 - k)! ((n - m)/2 - k)!) q^((n - m)/2 - k)  (Born & Wolf, sec. 9.2.1)
+    Z = Re or Im of w^m R(q), with w = x + iy, q = |w|^2 and
+    R(q) = sum_k (-1)^k (n - k)! / (k! ((n + m)/2 - k)! ((n - m)/2 - k)!) q^((n - m)/2 - k)  (Born & Wolf, sec. 9.2.1).
+    K = (degree + 1)(degree + 2) / 2. The first is 1, and none exceeds 1 in the disk.
 
     Parameters
     ----------
     disk
-        (N, 2). K = (degree + 1)(degree + 2) / 2; none exceeds 1 in the disk. The first is 1.
+        (N, 2) places x, y in the disk
     """
     w = disk[:, 0] + 1j * disk[:, 1]
     q = np.abs(w) ** 2
@@ -125,6 +134,7 @@ def zernike(degree: int, disk: Floats) -> tuple[Floats, Floats]:
     slopes = []
     for n in range(degree + 1):
         for m in range(n % 2, n + 1, 2):
+            # Coefficients of R(q), and the polynomial with its derivative.
             pairs = (n - m) // 2
             powers = [
                 (-1) ** k * math.comb(n - k, k) * math.comb(n - 2 * k, pairs - k)
@@ -132,12 +142,14 @@ def zernike(degree: int, disk: Floats) -> tuple[Floats, Floats]:
             ]
             radial = np.polyval(powers, q)
             radial_slope = np.polyval(np.polyder(powers), q)
+            # d(w^m R)/dx = m w^(m - 1) R + w^m R' 2 x, and likewise i m w^(m - 1) R + w^m R' 2 y.
             angular = m * w ** max(m - 1, 0) * radial
             value = w**m * radial
             slope = [
                 angular + w**m * radial_slope * 2 * disk[:, 0],
                 1j * angular + w**m * radial_slope * 2 * disk[:, 1],
             ]
+            # For m = 0 there is no imaginary part.
             for component in (np.real, np.imag)[: 1 + (m > 0)]:
                 values.append(component(value))
                 slopes.append(np.stack([component(derivative) for derivative in slope], axis=1))
@@ -153,11 +165,11 @@ class Zernike:
     Attributes
     ----------
     half_rad
-        The cap's half angle, 1 in the disk; beyond it the radius keeps its value at the edge
+        Half angle of the cap, 1 in the disk; beyond it the radius keeps its value at the edge
     cover_rad
-        Angle to which the points reach in every azimuth
+        Angle up to which there are points in every azimuth
     coefficient_m
-        (K,)
+        (K,) coefficients c_k
     """
 
     half_rad: float
@@ -172,6 +184,7 @@ class Zernike:
 
     def evaluate(self, unit: Floats) -> tuple[Floats, Floats]:
         """(N,) radius over (N, 3) unit vectors, and (N, 3) its gradient."""
+        # Directions beyond the cap get the radius of its edge.
         disk, stretch, log_slope = to_disk(unit, self.half_rad)
         distance = np.maximum(np.linalg.norm(disk, axis=1), 1.0)
         value, slope = zernike(self.degree, disk / distance[:, None])
@@ -181,9 +194,14 @@ class Zernike:
 
 
 def to_disk(unit: Floats, half_rad: float) -> tuple[Floats, Floats, Floats]:
-    """Lambert's equal-area disk of a cap: (N, 2) x, y of unit vectors (N, 3) times (N,) k; k; (N,) d ln k / dz.
+    """Lambert's equal-area disk of a cap: place (x, y) k of a unit vector (x, y, z).
 
     k = 1 / (sqrt(2 (1 + z)) sin(half / 2)). It diverges straight down and is limited there.
+
+    Returns
+    -------
+    tuple
+        (N, 2) places in the disk, (N,) k, and (N,) d ln k / dz
     """
     up = np.maximum(1 + unit[:, 2], 1e-12)
     stretch = 1 / (np.sqrt(2 * up) * math.sin(half_rad / 2))
@@ -197,13 +215,13 @@ class SurfaceFit:
     Attributes
     ----------
     center_m
-        (3,) of their best sphere, in the points' own frame
+        (3,) center of the points' best sphere, in the points' own frame
     radius
-        Radius over direction about it
+        Radius over direction about that center
     residual_m
-        (N,) points' radii minus the surface's
+        (N,) points' radii less the surface's
     sphere
-        That best sphere, with its own rms
+        The best sphere, with its own rms
     """
 
     center_m: Floats
@@ -250,14 +268,19 @@ def read(file: str, unit: str) -> Floats:
 def fit(points_m: Floats, degree: int, file: str) -> SurfaceFit:
     """Smooth surface fitted to points of a dome whose axis is about +z: linear least squares in the radius.
 
+    1. Best sphere of the points.
+    2. Directions and distances of the points from its center; angle up to which they cover the cap.
+    3. Zernike polynomials in the cap's disk, by least squares.
+    4. Refuse points that leave a part of the surface open.
+
     Parameters
     ----------
     points_m
         (N, 3) in the arm's own frame
     degree
-        Of the polynomials over direction, seen from the center of the points' best sphere
+        Degree of the polynomials over direction, seen from the center of the points' best sphere
     file
-        To name in messages
+        Name of the file, for messages
 
     Raises
     ------
@@ -270,26 +293,27 @@ def fit(points_m: Floats, degree: int, file: str) -> SurfaceFit:
         raise InputError(
             KEY, f"{file}: {len(points_m)} points", f"at least {needed} for degree {degree}"
         )
+    # 1.
     try:
         sphere = fit_sphere(points_m)
     except ValueError as error:
         raise InputError(
             KEY, f"{file}: {error}", "points of a dome (a panel is kind flat)"
         ) from None
+    # 2.
     relative_m = points_m - sphere.center_m
     radius_m = np.linalg.norm(relative_m, axis=1)
     unit = relative_m / radius_m[:, None]
     angle = np.arctan2(np.hypot(unit[:, 0], unit[:, 1]), unit[:, 2])
-    sector = (
-        np.floor((np.arctan2(unit[:, 1], unit[:, 0]) / (2 * np.pi) + 0.5) * SECTORS).astype(int)
-        % SECTORS
-    )
+    azimuth = np.arctan2(unit[:, 1], unit[:, 0])
+    sector = np.floor((azimuth / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
     # Covered angle: of the farthest point in each sector of azimuth, the least.
     cover_rad = min(float(angle[sector == n].max(initial=0.0)) for n in range(SECTORS))
     half_rad = float(angle.max())
+    # 3.
     design, _ = zernike(degree, to_disk(unit, half_rad)[0])
     coefficient, _, _, singular = np.linalg.lstsq(design, radius_m)
-    # A large ratio of singular values means polynomials that the points do not determine: an area without points.
+    # 4. A large ratio of singular values means polynomials that the points do not determine: an area without points.
     if cover_rad < half_rad / 2 or singular[-1] * MAX_CONDITION < singular[0]:
         raise InputError(
             KEY,

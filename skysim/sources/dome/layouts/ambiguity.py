@@ -4,13 +4,18 @@ A tracker identifies an attitude by the pattern of LEDs in its field. If another
 pattern, then noise, a failed LED or a reflection decides between the two. Pairs of LEDs with equal separation are
 harmless, so the whole field is compared.
 
-For each LED that a boresight can reach, the other LEDs of its field are stored in polar image coordinates: the tangent
-of the angle from the center and the azimuth. For every pair of fields (i, j) one field is laid on the other, center on
-center. Every rotation about the center that makes a second LED coincide is tried, and the LEDs that then lie within
-the tolerance are counted. The ambiguity of field i is the maximum over j and over the rotations of
+1. For each LED that a boresight can reach, the other LEDs of its field are stored in polar image coordinates: the
+   tangent of the angle from the center and the azimuth (`fields_about`).
+2. For every pair of fields (i, j) one field is laid on the other, center on center (`most_similar`). A field is also
+   compared with itself, rotated. A cheap upper bound (`upper_bound`) skips most pairs.
+3. Every rotation about the center that makes a second LED coincide is tried (`max_coincident`).
+4. The LEDs that then are within the tolerance are counted (`count_coincident`).
+
+The ambiguity of field i is the maximum over j and over the rotations of
+
     fraction = (1 + coincident LEDs) / (1 + LEDs of the larger field),
-where the 1 is the center LED. A field is also compared with itself, rotated. A cheap upper bound (`upper_bound`) skips
-most pairs.
+
+where the 1 is the center LED.
 """
 
 from __future__ import annotations
@@ -35,13 +40,13 @@ class Fields(NamedTuple):
     Attributes
     ----------
     center
-        (C,) the LED
+        (C,) numbers of the center LEDs
     first
-        (C + 1,) neighbor n belongs to center[c] where first[c] <= n < first[c + 1]
+        (C + 1,) neighbor n belongs to center[c] for first[c] <= n < first[c + 1]
     radius, angle_rad
-        (M,) tangent of the angle from the center, and the azimuth
+        (M,) tangent of the angle from the center, and azimuth
     tolerance
-        (C,) a tangent
+        (C,) greatest distance of coincident LEDs, as a tangent
     """
 
     center: Ints
@@ -57,10 +62,9 @@ class Ambiguity(NamedTuple):
     Attributes
     ----------
     led, other
-        (C,) numbers of the LEDs at the centers of the field and of its most similar one
+        (C,) numbers of the LEDs at the centers of the field and of its most similar field
     fraction
-        (C,) fraction of LEDs that coincide, of those in the larger of the two fields; the
-        center LEDs count
+        (C,) fraction of LEDs that coincide, of those in the larger of the two fields; the center LEDs count
     """
 
     led: Ints
@@ -86,18 +90,17 @@ def field_ambiguity(
     Parameters
     ----------
     place_m
-        (N, 3) in the lab, origin at the bearing's center
+        (N, 3) places in the lab, origin at the bearing's center
     height_m
-        Of the entrance pupil above the bearing, along the boresight (its lateral offset is
-        neglected)
+        Height of the entrance pupil above the bearing, along the boresight (its lateral offset is neglected)
     tilt_rad
         Fields are centered on the LEDs within this angle from the zenith
     radius_rad
-        Of the field, round
+        Radius of the round field
     coincidence_m
         Two LEDs coincide if they are nearer than this after one field is laid on the other
     least
-        Fractions below are not searched, which is much faster, and returned as this
+        Fractions below this are not searched, which is much faster, and are returned as this
     """
     fields = fields_about(place_m, height_m, tilt_rad, radius_rad, coincidence_m)
     fraction, other = most_similar(fields, least)
@@ -107,7 +110,7 @@ def field_ambiguity(
 def fields_about(
     place_m: Floats, height_m: float, tilt_rad: float, radius_rad: float, coincidence_m: float
 ) -> Fields:
-    """The neighbors of every LED within the tilt, as seen with that LED on the boresight."""
+    """The neighbors of every LED within the tilt, as seen with that LED on the boresight (step 1)."""
     range_m = np.linalg.norm(place_m, axis=1)
     up = place_m / range_m[:, None]
     center = np.flatnonzero(up[:, 2] >= math.cos(tilt_rad))
@@ -118,10 +121,12 @@ def fields_about(
     y_m = np.cross(up[center], across) @ place_m.T
     ahead_m = up[center] @ place_m.T - height_m
     radius = np.hypot(x_m, y_m) / np.where(ahead_m > 0, ahead_m, np.nan)
-    radius[np.arange(len(center)), center] = np.nan  # the center LED is not its own neighbor
+    # The center LED is not its own neighbor.
+    radius[np.arange(len(center)), center] = np.nan
     row, led = np.nonzero(radius <= math.tan(radius_rad))
     radius = radius[row, led]
     angle_rad = np.arctan2(y_m[row, led], x_m[row, led])
+    # By field, nearest first.
     order = np.lexsort((radius, row))
     first = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(center)))])
     tolerance = coincidence_m / (range_m[center] - height_m)
@@ -153,14 +158,13 @@ def most_similar(fields: Fields, least: float) -> tuple[Floats, Ints]:
 
 @jit
 def max_coincident(fields: Fields, i: int, j: int, threshold: float, farther: bool) -> int:
-    """The most neighbors of i that coincide with ones of j at any rotation, if more than `threshold`; else less.
+    """The most neighbors of i that coincide with neighbors of j at any rotation, if more than `threshold`; else less.
 
     Parameters
     ----------
     farther
-        Try only the rotations of the farther half of n neighbors, or of n - threshold if those
-        are more. They are more accurate than those of near ones, and of any n - threshold
-        neighbors one must coincide.
+        Try only the rotations of the farther half of n neighbors, or of n - threshold if that is more. They are more
+        accurate than those of near neighbors, and of any n - threshold neighbors one must coincide.
     """
     first = fields.first
     radius = fields.radius
@@ -169,6 +173,7 @@ def max_coincident(fields: Fields, i: int, j: int, threshold: float, farther: bo
     if upper_bound(fields, i, j) <= threshold:
         return 0
     most = 0
+    # First neighbor of i to try.
     begin = first[j]
     inner = max(min(int(threshold), (first[i + 1] - first[i]) // 2), 0) if farther else 0
     for k in range(first[i] + inner, first[i + 1]):
@@ -211,12 +216,14 @@ def count_coincident(fields: Fields, i: int, j: int, rotation_rad: float, thresh
     total = 0
     begin = first[j]
     for k in range(first[i], first[i + 1]):
+        # Too few are left to exceed the threshold.
         if total + first[i + 1] - k <= threshold:
             break
         while begin < first[j + 1] and radius[begin] < radius[k] - tolerance:
             begin += 1
         n = begin
         while n < first[j + 1] and radius[n] <= radius[k] + tolerance:
+            # Squared distance in polar coordinates, by the chord.
             difference_rad = angle[n] - angle[k] - rotation_rad
             chord = 2 * radius[k] * math.sin(difference_rad / 2)
             if (radius[n] - radius[k]) ** 2 + chord**2 <= tolerance**2:
@@ -226,14 +233,24 @@ def count_coincident(fields: Fields, i: int, j: int, rotation_rad: float, thresh
     return total
 
 
-# Neighborhood codes: levels of brightness by which every LED is known by its surroundings.
+# Neighborhood codes: levels of brightness by which every LED is known from its surroundings. The neighborhood of an LED
+# is its own level and those of its nearest LEDs, in the order of their azimuths about it. It is the same however the
+# field is turned: the least word of all turns represents it. Levels are drawn at random; as long as two neighborhoods
+# are alike, an LED of one gets another level if no more are alike then, as in the pseudorandom patterns of structured
+# light (Morano et al. 1998, IEEE Trans. Pattern Analysis and Machine Intelligence 20, 322).
 
 
-ROUNDS = 5000  # of new levels before it is given up
+ROUNDS = 5000  # of new levels before the search fails
 
 
 def unique_levels(levels: int, nearest: int, position_m: Floats, rng: np.random.Generator) -> Ints:
-    """(N,) number of the level of each LED at (N, 3) places. Raises InputError if no pattern is found."""
+    """(N,) numbers of the LEDs' levels at (N, 3) places, so that no two neighborhoods are alike.
+
+    Raises
+    ------
+    InputError
+        If no such pattern is found.
+    """
     count = len(position_m)
     if count <= nearest:
         raise InputError("light.layout.unique_neighbors", f"{nearest} of {count} LEDs", "fewer")
@@ -243,11 +260,11 @@ def unique_levels(levels: int, nearest: int, position_m: Floats, rng: np.random.
     for _ in range(ROUNDS):
         if not len(alike):
             return level
+        # New levels for some of the LEDs in question or their neighbors, fewer at a time toward the end.
         tried = level.copy()
-        some = rng.permutation(alike)[: max(len(alike) // 10, 1)]  # fewer at a time toward the end
-        tried[rng.choice(np.append(around[some].ravel(), some), len(some))] = rng.integers(
-            0, levels, len(some)
-        )
+        some = rng.permutation(alike)[: max(len(alike) // 10, 1)]
+        drawn = rng.integers(0, levels, len(some))
+        tried[rng.choice(np.append(around[some].ravel(), some), len(some))] = drawn
         after = alike_leds(tried, around, levels)
         if len(after) <= len(alike):
             level = tried
@@ -264,7 +281,7 @@ def neighbors(position_m: Floats, nearest: int) -> Ints:
     direction = position_m / np.linalg.norm(position_m, axis=1, keepdims=True)
     near = KDTree(direction).query(direction, nearest + 1)[1][:, 1:]
     offset = direction[near] - direction[:, None]
-    # Any two axes across the direction will do: the comparison is of all turns.
+    # Two axes across the direction; any two serve, since the comparison is of all turns.
     x = np.cross(direction, np.where(np.abs(direction[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]]))
     y = np.cross(direction, x)
     azimuth = np.arctan2(np.einsum("nki,ni->nk", offset, y), np.einsum("nki,ni->nk", offset, x))
@@ -273,14 +290,13 @@ def neighbors(position_m: Floats, nearest: int) -> Ints:
 
 def alike_leds(level: Ints, around: Ints, levels: int) -> Ints:
     """LEDs with a neighborhood that another LED has too."""
-    _, number, count = np.unique(
-        neighborhoods(level, around, levels), return_inverse=True, return_counts=True
-    )
+    words = neighborhoods(level, around, levels)
+    _, number, count = np.unique(words, return_inverse=True, return_counts=True)
     return np.flatnonzero(count[number] > 1)
 
 
 def neighborhoods(level: Ints, around: Ints, levels: int) -> Ints:
-    """(N,) number of each neighborhood, the same for all turns: its LEDs' levels as digits, the least of all turns."""
+    """(N,) number of each neighborhood: the levels as digits of base `levels`, the least number of all turns."""
     nearest = around.shape[1]
     power = levels ** np.arange(nearest)
     ring = np.min([np.roll(level[around], turn, axis=1) @ power for turn in range(nearest)], axis=0)

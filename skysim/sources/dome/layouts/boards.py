@@ -31,7 +31,17 @@ GLUE_STREAM = 1  # spawn key of the glue's own random stream, so that glue error
 
 @dataclass(frozen=True, slots=True)
 class Boards:
-    """Patch boards, (B, 3) each: center in the lab, m, unit normal, and unit vectors of the two axes of the holes."""
+    """B patch boards.
+
+    Attributes
+    ----------
+    center_m
+        (B, 3) centers in the lab
+    normal
+        (B, 3) unit normals
+    u, v
+        (B, 3) unit vectors along the two axes of the holes
+    """
 
     center_m: Floats
     normal: Floats
@@ -44,41 +54,45 @@ def patch_boards(
 ) -> Sources:
     """3x3 boards glued flat to the surface, listed or spread evenly, each with its own choice of LEDs and levels.
 
-    A board is a plane tangent at its center, so its outer LEDs are off the surface, as on the real dome. The glue
-    tilts the board, and each LED is displaced in the board's plane. Everything random here is hardware and is drawn
-    from config.hardware_seed: which LEDs are soldered, their levels and strengths, the phases of their pulses.
+    A board is a plane tangent at its center, so its outer LEDs are off the surface, as on the real dome. Everything
+    random here is hardware and is drawn from config.hardware_seed: which LEDs are soldered, their levels and strengths,
+    the phases of their pulses.
+
+    1. Places and orientations of the boards, and the holes that each uses.
+    2. The glue tilts each board, and displaces each LED in the board's plane.
+    3. Places of the LEDs: hole h is in column h % 3 and row h // 3; hole 4 is the center.
     """
     rng = random_stream(config.hardware_seed)
-    boards, holes, level = (
-        listed_boards(config, surface) if config.boards else spread_boards(config, surface, rng)
-    )
+    # 1.
+    level: Floats | None
+    if config.boards:
+        boards, holes, level = listed_boards(config, surface)
+    else:
+        boards, holes, level = spread_boards(config, surface, rng)
     board = np.repeat(np.arange(len(holes)), [len(board_holes) for board_holes in holes])
     hole = np.concatenate(holes)
     if level is None:
         level = rng.choice(config.pwm_levels, len(board))
+    # 2.
     glue = random_stream(config.hardware_seed, GLUE_STREAM)
     if config.glue_tilt_deg:
         boards = tilt_boards(boards, np.radians(config.glue_tilt_deg), glue)
     displacement_m = scaled_errors(config.glue_scatter_m, glue.standard_normal((2, len(board))))
-    # Hole h is in column h % 3 and row h // 3; hole 4 is the center.
+    # 3.
     place = (
         boards.center_m[board]
         + ((hole % 3 - 1) * config.pitch_m + displacement_m[0])[:, None] * boards.u[board]
         + ((hole // 3 - 1) * config.pitch_m + displacement_m[1])[:, None] * boards.v[board]
     )
     number = (board * HOLES + hole).astype(np.int64)
-    return led_sources(
-        PlacedLeds(number, place, boards.normal[board], level, np.full(len(board), np.nan)),
-        led,
-        band,
-        rng,
-    )
+    placed = PlacedLeds(number, place, boards.normal[board], level, np.full(len(board), np.nan))
+    return led_sources(placed, led, band, rng)
 
 
 def spread_boards(
     config: PatchBoardsConfig, surface: Surface, rng: np.random.Generator
 ) -> tuple[Boards, list[Ints], None]:
-    """Boards all over the cap as seen from the bearing, and the holes that each uses.
+    """Boards all over the cap as seen from the bearing, the holes that each uses, and no levels.
 
     On a spiral each board has a random orientation; on a grid all are aligned with its rows.
     """
@@ -94,6 +108,7 @@ def spread_boards(
         directions = cap(max(1, round(area_m2 / spacing_m**2)), half)
         rotation = rng.uniform(0, 2 * np.pi, len(directions))
     boards = tangent_boards(surface, project_from_bearing(surface, directions), rotation)
+    # A random choice of holes, as many as `lit` allows.
     holes = [
         rng.permutation(HOLES)[: rng.integers(config.lit[0], config.lit[1] + 1)]
         for _ in range(len(rotation))
@@ -104,11 +119,11 @@ def spread_boards(
 def grid(spacing_rad: float, half_angle_rad: float) -> Floats:
     """(N, 3) unit vectors in rows and columns over a cap about +z, one of them at +z.
 
-    Equal steps on Lambert's equal-area map, where a direction at the angle t from the center is at radius 2 sin(t /
-    2).
+    Equal steps on Lambert's equal-area map, where a direction at the angle t from the center is at radius 2 sin(t / 2).
     """
     steps = int(2 * np.sin(half_angle_rad / 2) / spacing_rad)
-    x, y = (axis.ravel() * spacing_rad for axis in np.meshgrid(*2 * [np.arange(-steps, steps + 1)]))
+    axis = np.arange(-steps, steps + 1)
+    x, y = (side.ravel() * spacing_rad for side in np.meshgrid(axis, axis))
     radius2 = x**2 + y**2
     within = radius2 <= (2 * np.sin(half_angle_rad / 2)) ** 2
     x = x[within]
@@ -120,7 +135,13 @@ def grid(spacing_rad: float, half_angle_rad: float) -> Floats:
 
 
 def listed_boards(config: PatchBoardsConfig, surface: Surface) -> tuple[Boards, list[Ints], Floats]:
-    """Boards at the listed places, their holes, and the level of every LED. Raises InputError if two boards overlap."""
+    """Boards at the listed places, their holes, and the level of every LED.
+
+    Raises
+    ------
+    InputError
+        If two boards overlap, or one is outside the cap.
+    """
     listed = config.boards
     directions = directions_from_angles([(board.azimuth_deg, board.tilt_deg) for board in listed])
     check_cap("light.layout.boards", directions, config.cap_deg)
@@ -140,10 +161,11 @@ def listed_boards(config: PatchBoardsConfig, surface: Surface) -> tuple[Boards, 
 
 
 def tangent_boards(surface: Surface, center_m: Floats, rotation_rad: Floats) -> Boards:
-    """Boards tangent to the surface. At turn 0 the holes' columns run along normal x (lab x)."""
+    """Boards tangent to the surface. At rotation 0 the holes' columns run along normal x (lab x)."""
     normal = surface.inward(center_m)
     across = np.cross(normal, [1.0, 0.0, 0.0])
-    edge_on = np.linalg.norm(across, axis=1) < 1e-9  # the normal is parallel to lab x
+    # The normal is parallel to lab x.
+    edge_on = np.linalg.norm(across, axis=1) < 1e-9
     across[edge_on] = [0.0, 1.0, 0.0]
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     along = np.cross(normal, across)
@@ -154,8 +176,9 @@ def tangent_boards(surface: Surface, center_m: Floats, rotation_rad: Floats) -> 
 
 
 def tilt_boards(boards: Boards, max_rad: float, rng: np.random.Generator) -> Boards:
-    """Boards tilted by the glue: normals uniform over a cap of most_rad about the surface's, centers unchanged."""
+    """Boards tilted by the glue: normals uniform over a cap of max_rad about the surface's, centers unchanged."""
     count = len(boards.normal)
+    # A tilt uniform in solid angle, about a random axis in the board's plane.
     angle = np.arccos(1 - rng.random(count) * (1 - np.cos(max_rad)))
     azimuth = rng.uniform(0, 2 * np.pi, count)[:, None]
     axis = boards.u * np.cos(azimuth) + boards.v * np.sin(azimuth)

@@ -3,13 +3,17 @@
 An LED at b in body axes, seen from the entrance pupil at r, has the line of sight q = b - r and the image tangents
 x = q_x / q_z and y = q_y / q_z. A small rotation w of the body about the bearing changes b by w x b, up to the sign.
 A tangent with the gradient d with respect to q, for example d = (1, 0, -x) / q_z, therefore changes by
+
     d . (w x b) = w . (b x d),
+
 so that b x d is a row of the Jacobian J_i (2, 3) of LED i. With independent errors of equal variance sigma^2 in each
 tangent, the rotation has the covariance sigma^2 M^-1, with the information M = sum_i J_i'J_i over the LEDs in view, and
 the total variance sigma^2 tr(M^-1). `optimize` minimizes tr(M^-1), summed over attitudes with a high power.
 
-J_i'J_i is computed once per round for every pair of a site and an attitude that sees it (`visible_from`). Moving an
-LED then only adds and subtracts terms in the sums of the attitudes concerned.
+1. `visible_from` computes J_i'J_i once per round for every pair of a site and an attitude that sees it.
+2. `sum_information` adds them to M for each attitude.
+3. `cost` is the term of an attitude in the sum that is minimized.
+4. Moving an LED only adds and subtracts terms in the sums of the attitudes concerned (`add_led`, `update_costs`).
 """
 
 from __future__ import annotations
@@ -33,13 +37,17 @@ MISSING_LED_FACTOR = 1.5  # factor on the variance for each LED that a field lac
 
 
 class Visibility(NamedTuple):
-    """Which attitudes see each of K sites: those of site k are attitude[start[k]:start[k + 1]].
+    """The attitudes that see each of K sites: those of site k are attitude[start[k]:start[k + 1]].
 
     Attributes
     ----------
+    start
+        (K + 1,) first row of each site, and the number of rows M
+    attitude
+        (M,) numbers of the attitudes
     information
-        (M, 7) J'J of one LED at the site for unit variance of the tangents: xx, yy, zz, xy, xz,
-        yz in body axes, rad^-2; and a 1, which counts LEDs when rows are added
+        (M, 7) J'J of one LED at the site for unit variance of the tangents: xx, yy, zz, xy, xz, yz in body axes,
+        rad^-2; and a 1, which counts LEDs when rows are added
     """
 
     start: Ints
@@ -49,7 +57,10 @@ class Visibility(NamedTuple):
 
 @jit
 def in_field(R: Floats, point_m: Floats, camera_m: Floats, tan_half: Floats, b: Floats) -> bool:
-    """Whether the attitude R_body_from_lab has a point in its field of view; writes the point in body axes to b."""
+    """Whether the attitude R_body_from_lab has a point in its field of view; writes the point in body axes to b.
+
+    The height is computed first: most points fail there, or in x.
+    """
     b[2] = R[2, 0] * point_m[0] + R[2, 1] * point_m[1] + R[2, 2] * point_m[2]
     ahead_m = b[2] - camera_m[2]
     b[0] = R[0, 0] * point_m[0] + R[0, 1] * point_m[1] + R[0, 2] * point_m[2]
@@ -62,7 +73,7 @@ def in_field(R: Floats, point_m: Floats, camera_m: Floats, tan_half: Floats, b: 
 @jit
 def led_information(b: Floats, camera_m: Floats, out: Floats) -> None:
     """Write the information of one LED at b (body axes) to out (7,): J'J and a 1. The module docstring derives J."""
-    # gx = b x (dx, 0, x) and gy = b x (0, dy, y): the rows of J.
+    # gx = b x (dx, 0, x) and gy = b x (0, dy, y) are the rows of J, with d = (dx, 0, x) the gradient of the tangent x.
     ahead_m = b[2] - camera_m[2]
     dx = 1 / ahead_m
     dy = 1 / ahead_m
@@ -70,6 +81,7 @@ def led_information(b: Floats, camera_m: Floats, out: Floats) -> None:
     y = -(b[1] - camera_m[1]) / ahead_m**2
     gx = (b[1] * x, b[2] * dx - b[0] * x, -b[1] * dx)
     gy = (b[1] * y - b[2] * dy, -b[0] * y, b[0] * dy)
+    # J'J, diagonal and off it, and the count.
     for i in range(3):
         out[i] = gx[i] ** 2 + gy[i] ** 2
     out[3] = gx[0] * gx[1] + gy[0] * gy[1]
@@ -81,6 +93,7 @@ def led_information(b: Floats, camera_m: Floats, out: Floats) -> None:
 @jit
 def max_chord(sites_m: Floats, camera_m: Floats, tan_half: Floats) -> float:
     """Upper bound of the chord between the unit vectors from the bearing to a boresight and to a site in its field."""
+    # The sine law: the pupil's offset from the boresight, and half the field's diagonal, at the site's range.
     lateral_m = math.hypot(camera_m[0], camera_m[1])
     chord = 0.0
     for k in range(len(sites_m)):
@@ -95,11 +108,14 @@ def max_chord(sites_m: Floats, camera_m: Floats, tan_half: Floats) -> float:
 def visible_from(
     sites_m: Floats, R_body_from_lab: Floats, camera_m: Floats, tan_half: Floats
 ) -> tuple[Ints, Ints, Floats]:
-    """Start, attitude and information as in `Visibility`, for every site.
+    """Start, attitude and information of `Visibility`, for every site.
 
-    Only attitudes whose boresight is within the chord `max_chord` of the site are tested. To find them, the boresights
-    are sorted into columns of lab x, and by lab y within each column.
+    1. Sort the boresights into columns of lab x, and by lab y within each column.
+    2. For each site test only attitudes whose boresight is within the chord `max_chord`: the columns and the part of
+       each column that the chord reaches.
+    3. Store the information of those that have the site in their field.
     """
+    # 1.
     b = np.empty(3)
     chord = max_chord(sites_m, camera_m, tan_half)
     columns = max(int(2 * COLUMNS / chord), 1)
@@ -111,11 +127,13 @@ def visible_from(
     R = R_body_from_lab[order]
     y = R_body_from_lab[order, 2, 1]
     first = np.searchsorted(column[order], np.arange(columns + 1))
+    # Number of stored rows; the buffers grow as needed.
     start = np.zeros(len(sites_m) + 1, dtype=np.int64)
     attitude = np.empty(1024, dtype=np.int64)
     information = np.empty((1024, 7))
     m = 0
     for k in range(len(sites_m)):
+        # 2.
         direction = sites_m[k] / math.sqrt(np.sum(sites_m[k] ** 2))
         left = max(int((direction[0] - chord + 1) / 2 * columns), 0)
         right = min(int((direction[0] + chord + 1) / 2 * columns), columns - 1)
@@ -127,7 +145,8 @@ def visible_from(
             ):
                 if not in_field(R[q], sites_m[k], camera_m, tan_half, b):
                     continue
-                if m == len(attitude):  # double the buffers when they are full
+                # 3. Double the buffers when they are full.
+                if m == len(attitude):
                     attitude = np.concatenate((attitude, np.empty_like(attitude)))
                     information = np.concatenate((information, np.empty_like(information)))
                 led_information(b, camera_m, information[m])
@@ -149,7 +168,7 @@ def total_information(
 def variance(m: Floats) -> float:
     """tr(M^-1) of a symmetric (3, 3) matrix given as (6,): the rotation's variance for tangents of unit variance.
 
-    Principal minors over the determinant, with PRIOR_INFORMATION added to the diagonal.
+    The sum of the principal minors over the determinant, with PRIOR_INFORMATION added to the diagonal.
     """
     a = m[0] + PRIOR_INFORMATION
     b = m[1] + PRIOR_INFORMATION
@@ -175,7 +194,8 @@ def variances(total: Floats) -> Floats:
 def cost(m: Floats, min_leds: int) -> float:
     """One attitude's term of the soft maximum: (MISSING_LED_FACTOR^missing tr(M^-1))^HARDNESS."""
     effective = variance(m)
-    for _ in range(min_leds - round(m[6])):  # LEDs missing from the field
+    # LEDs missing from the field.
+    for _ in range(min_leds - round(m[6])):
         effective *= MISSING_LED_FACTOR
     return effective**HARDNESS
 
@@ -200,7 +220,7 @@ def sum_information(chosen: Ints, visibility: Visibility, attitude_count: int) -
 
 @jit
 def add_led(site: int, sign: int, visibility: Visibility, total: Floats) -> None:
-    """Add (sign 1) or remove (-1) an LED at a site in the sums of the attitudes that see it. In place."""
+    """Add (sign 1) or remove (-1) an LED at a site in the sums of the attitudes that see it, in place."""
     for m in range(visibility.start[site], visibility.start[site + 1]):
         a = visibility.attitude[m]
         for i in range(7):
@@ -211,7 +231,7 @@ def add_led(site: int, sign: int, visibility: Visibility, total: Floats) -> None
 def update_costs(
     site: int, visibility: Visibility, total: Floats, attitude_cost: Floats, min_leds: int
 ) -> float:
-    """Recompute the cost of the attitudes that see a site, in place, and return the change of the sum."""
+    """Recompute the costs of the attitudes that see a site, in place, and return the change of their sum."""
     change = 0.0
     for m in range(visibility.start[site], visibility.start[site + 1]):
         a = visibility.attitude[m]

@@ -16,9 +16,10 @@ from skysim.sources.dome.led import full_strength_e_s_sr
 from skysim.sources.dome.surface import Surface, build_surface
 from skysim.sources.photometry import Band
 
-# Errors of a layout as built.
+# Errors of a layout as built, without which it is the design.
 BUILT = {"glue_scatter_m": 0.0, "glue_tilt_deg": 0.0, "pitch_error": 0.0}
-AIMED = {"aiming": None, "radius_variation": 0.0}  # and of places that a laser marks
+# Errors of a layout whose places a laser marks.
+AIMED = {"aiming": None, "radius_variation": 0.0}
 HEADER = """\
 # LEDs of {name}: x_m, y_m, z_m from the center of the bearing in the lab (z up); azimuth from +x toward +y, and tilt
 # from the zenith, seen from there; level: nominal brightness, 1 at the full drive{tape}.
@@ -29,27 +30,23 @@ TAPE = (
 
 
 def led_list(config: DomeConfig, band: Band, name: str) -> tuple[str, int]:
-    """The LEDs of a dome as CSV, and the cap_deg, in whole degrees, of a listed layout that holds all of them.
+    """The LEDs of a dome as CSV, and the cap_deg, in whole degrees, of a listed layout that contains all of them.
 
-    Columns are id, place, direction from the bearing and level; of tapes also the place along them. The level is that
+    Columns are id, place, direction from the bearing and level; for tapes also the place along them. The level is that
     of the drive, without the scatter from LED to LED.
     """
     leds = design_leds(config, build_surface(config.surface), band)
     place_m = leds.place[:, :3]
-    level = leds.strength / max(
-        full_strength_e_s_sr(ideal_led(config.led), band), float(leds.strength.max())
-    )
+    full = full_strength_e_s_sr(ideal_led(config.led), band)
+    level = leds.strength / max(full, float(leds.strength.max()))
     azimuth_deg = np.degrees(np.arctan2(place_m[:, 1], place_m[:, 0])) % 360
     tilt_deg = np.degrees(np.arctan2(np.hypot(*place_m[:, :2].T), place_m[:, 2]))
-    columns = {
-        "id": [f"{number}" for number in leds.id],
-        **{
-            f"{axis}_m": [f"{value:.12f}" for value in place_m[:, n]]
-            for n, axis in enumerate("xyz")
-        },
-        "azimuth_deg": [f"{value:.6f}" for value in azimuth_deg],
-        "tilt_deg": [f"{value:.6f}" for value in tilt_deg],
-    }
+    columns = {"id": [f"{number}" for number in leds.id]}
+    for n, axis in enumerate("xyz"):
+        columns[f"{axis}_m"] = [f"{value:.12f}" for value in place_m[:, n]]
+    columns["azimuth_deg"] = [f"{value:.6f}" for value in azimuth_deg]
+    columns["tilt_deg"] = [f"{value:.6f}" for value in tilt_deg]
+    # The tapes' own columns.
     if isinstance(config.layout, StringConfig):
         wound = wind(config.layout, build_surface(config.surface))
         columns |= {
@@ -63,14 +60,13 @@ def led_list(config: DomeConfig, band: Band, name: str) -> tuple[str, int]:
 
 
 def design_leds(config: DomeConfig, surface: Surface, band: Band) -> Sources:
-    """The LEDs of a dome as designed: without their scatter, and without errors of glue, tape and laser."""
+    """The LEDs of a dome as designed: without scatter, and without errors of glue, tape and laser."""
     errors = AIMED if getattr(config.layout, "aiming", None) else BUILT
-    layout = config.layout.model_copy(
-        update={key: none for key, none in errors.items() if hasattr(config.layout, key)}
-    )
+    absent = {key: none for key, none in errors.items() if hasattr(config.layout, key)}
+    layout = config.layout.model_copy(update=absent)
     return LAYOUTS[layout.kind](layout, surface, ideal_led(config.led), band)
 
 
 def max_tilt_deg(place_m: Floats) -> float:
-    """Greatest angle of these places (N, 3) from the zenith, seen from the bearing."""
+    """Greatest angle of places (N, 3) from the zenith, seen from the bearing."""
     return float(np.degrees(np.arctan2(np.hypot(*place_m[:, :2].T), place_m[:, 2])).max())

@@ -24,14 +24,22 @@ from skysim.sources.dome.layouts.placing import (
 from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band
 
-MAX_SURFACE_OFFSET_M = 0.05  # of a listed LED; more is an error in a unit or an axis
+MAX_SURFACE_OFFSET_M = 0.05  # of a listed LED; a larger one is an error in a unit or an axis
 COLUMNS = (("x_m", "y_m", "z_m"), ("azimuth_deg", "tilt_deg"))
 BRIGHTNESS = ("level", "magnitude")
 FURTHER = ("id", "tape", "tape_m", "sigma_m")  # `id` numbers the LEDs, the others are not used
 
 
 class LedFile(NamedTuple):
-    """A file of LEDs: (N, 3) places or (N, 2) azimuth and tilt; levels and numbers, (N,) each, if it has any."""
+    """Contents of a file of LEDs.
+
+    Attributes
+    ----------
+    coordinates
+        (N, 3) places, or (N, 2) azimuths and tilts
+    level, id
+        (N,) each, None if the file has no such column
+    """
 
     coordinates: Floats
     level: Floats | None = None
@@ -41,7 +49,12 @@ class LedFile(NamedTuple):
 def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
     """LEDs from a list or a CSV file: places in the lab, used unchanged, or directions from the bearing.
 
-    Normals are the surface's. Raises InputError for a place more than 5 cm off the surface or beyond the cap.
+    Normals are the surface's.
+
+    Raises
+    ------
+    InputError
+        For a place more than 5 cm off the surface or beyond the cap.
     """
     level: Floats | None = np.array(config.levels or relative_levels(config.magnitudes or ()))
     number: Ints | None = None
@@ -65,6 +78,7 @@ def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -
 
 def check_on_surface(key: str, surface: Surface, place_m: Floats) -> None:
     """Raise InputError for the first LED that is too far from the surface, along the ray from the bearing."""
+    # Written so that NaN is too far.
     directions = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
     offset_m = np.linalg.norm(project_from_bearing(surface, directions) - place_m, axis=1)
     far = np.flatnonzero(~(offset_m <= MAX_SURFACE_OFFSET_M))
@@ -79,9 +93,13 @@ def check_on_surface(key: str, surface: Surface, place_m: Floats) -> None:
 def read_csv(path: Path) -> LedFile:
     """Read a file of LEDs: columns x_m, y_m, z_m or azimuth_deg, tilt_deg; and level or magnitude, or neither.
 
-    Comments begin with #; the first other line holds the names, in any order, separated by commas or, as in an ECSV of
-    `skysim survey`, by blanks. Places are used if there are directions too. Raises InputError, one line, with the
-    line's number.
+    Comments begin with #; the first other line has the names, in any order, separated by commas or, as in an ECSV of
+    `skysim survey`, by blanks. If there are places and directions, the places are used.
+
+    Raises
+    ------
+    InputError
+        With one line, and with the number of the wrong line.
     """
     try:
         text = path.read_text(encoding="utf-8").splitlines()
@@ -97,13 +115,9 @@ def read_csv(path: Path) -> LedFile:
     chosen = next((columns for columns in COLUMNS if set(columns) <= set(names)), None)
     brightness = [name for name in names if name in BRIGHTNESS]
     known = {*BRIGHTNESS, *FURTHER, *COLUMNS[0], *COLUMNS[1]}
-    if (
-        chosen is None
-        or len(brightness) > 1
-        or len({*names}) < len(names)
-        or {*names} - known
-        or len(lines) < 2
-    ):
+    # Every column must be known and there once; one kind of place, and one of brightness at most.
+    ambiguous = len(brightness) > 1 or len({*names}) < len(names)
+    if chosen is None or ambiguous or {*names} - known or len(lines) < 2:
         raise InputError(
             path,
             "not a list of LEDs",
@@ -123,14 +137,15 @@ def read_csv(path: Path) -> LedFile:
 
 
 def split_row(line: str) -> list[str]:
-    """The cells of a line, separated by commas or else by blanks."""
+    """The cells of a line, separated by commas, or by blanks in a line without commas."""
     return [cell.strip() for cell in line.split(",")] if "," in line else line.split()
 
 
 def led_numbers(path: Path, column: Floats | None) -> Ints | None:
-    """The LED numbers of a file's column `id`; None without one. Raises InputError for other numbers."""
+    """The LED numbers in a file's column `id`; None without it. Raises InputError for other numbers."""
     if column is None:
         return None
+    # NaN and fractions differ from their whole number.
     with np.errstate(invalid="ignore"):
         number = column.astype(np.int64)
     wrong = (number != column) | (number < 0)

@@ -2,16 +2,20 @@
 
 What a camera on its lever arm can learn about the attitude a from the LEDs in its field is the Fisher information of
 the rotation-only solution, M_a = sum_i J_i'J_i (`fisher`). It does not depend on any estimator. The search minimizes
+
     sum_a (MISSING_LED_FACTOR^missing_a tr(M_a^-1))^HARDNESS,
+
 a smooth substitute for the worst case over all attitudes to the greatest tilt, in which missing_a is the number of
 LEDs that the field lacks of `min_leds`. It is a local search: each LED in turn is tried at a random site nearby, and
-the move is kept if it lowers the sum and respects the least spacing. Because no finite set of attitudes contains the
-worst one, the hardest attitudes of a fresh random sample join the set between generations (`hardest_attitudes`).
+the move is kept if it lowers the sum and respects the least spacing (`try_moves`). Because no finite set of attitudes
+contains the worst one, the hardest attitudes of a fresh random sample join the set between generations
+(`hardest_attitudes`).
 
 The search starts from even layouts: Fibonacci spirals and a Poisson-disk sample of the sites, the best of them also
 contracted toward the zenith. A final stage moves LEDs whose fields of view are too similar to another field
 (`reduce_ambiguity`). Layouts are compared by the mean variance of the worst 1 % of independent attitudes
 (`PlacementScore`). By this measure the result is never worse than the even layouts; at a single attitude it can be.
+`optimize_places` has the steps in order.
 """
 
 from __future__ import annotations
@@ -45,22 +49,13 @@ from skysim.sources.dome.surface import Surface
 
 Ints = NDArray[np.int64]
 
-GOLDEN = 1.2207440846057596  # g^4 = g + 1: base of the R3 low-discrepancy sequence (Roberts 2018; assumed)
+# g^4 = g + 1: base of the R3 low-discrepancy sequence (Roberts 2018; assumed).
+GOLDEN = 1.2207440846057596
 
 
 @dataclass(frozen=True, slots=True)
 class PlacementOptions:
     """Settings of the placement search; `OPTIONS` holds the defaults.
-
-    Sites and starting layouts
-
-    Local search
-
-    Hardest attitudes
-
-    Comparison of layouts
-
-    Ambiguity
 
     Attributes
     ----------
@@ -73,51 +68,50 @@ class PlacementOptions:
     contractions
         Fractions of the solid angle to which the best even layout is contracted
     sparse_below
-        Mean number of LEDs in a field below which the sparse settings apply, else the dense
-        ones. With few LEDs in a field evenness matters most and steps must be small; with many,
-        larger steps gain more.
+        Mean number of LEDs in a field below which the sparse settings apply, else the dense ones. With few LEDs in a
+        field evenness matters most and steps must be small; with many, larger steps gain more.
     sparse_steps, dense_steps
         (least, greatest) step in units of the LEDs' spacing
     sparse_field, dense_field
-        Fraction of the field that the search uses. The margin is for attitudes between the
-        sampled ones, which lose LEDs at the edge.
+        Fraction of the field that the search uses. The margin is for attitudes between the sampled ones, which lose
+        LEDs at the edge.
     views_per_site
-        Sampled attitudes that see a site; a field's border passes it in steps of a twentieth of
-        the field
+        Sampled attitudes that see a site; a field's border then passes it in steps of a twentieth of the field
     min_attitudes, max_attitudes
         Limits of the number of sampled attitudes
     generations
-        Rounds are divided into so many; after each the hardest of fresh attitudes join the
+        Number of generations into which the rounds are divided; after each the hardest of fresh attitudes join the
         sample
     keep_every
         Generations from one candidate layout to the next
     fresh_attitudes, hardest_attitudes
-        Size of a fresh sample, and how many of it are kept
+        Size of a fresh sample, and number of its attitudes that are kept
     perturbations, perturbation_size
-        Random rotations tried for each of these, and their size in half fields
+        Number of random rotations tried for each of these, and their size in half fields
     score_attitudes
-        Number of independent attitudes
+        Number of independent attitudes on which layouts are compared
     tail_fraction
         Fraction of them, the worst, whose mean variance is compared
     inner_field
-        Part of the field in which fewer than two LEDs count as too few
+        Fraction of the field in which fewer than two LEDs count as too few
     max_overlap
         Fraction of a field's LEDs that may coincide with another field's
     ambiguity_trials
         Tries to move one LED of an ambiguous field
     central_leds
-        LEDs nearest to the field's center, one of which is moved
+        Number of LEDs nearest to the field's center, one of which is moved
     nearby_sites
-        Nearest sites that it may take; they reach a fifth of the LEDs' own spacing
+        Number of nearest sites that it may take; they reach a fifth of the LEDs' own spacing
     variance_slack
         Relative rise of the worst variances that the moves may cost in total
     """
 
+    # Sites and starting layouts.
     sites_per_led: int = 500
     even_sites_per_led: int = 10
     bisections: int = 12
     contractions: tuple[float, ...] = (0.98, 0.96, 0.94, 0.92, 0.9, 0.88, 0.86, 0.84)
-
+    # Local search.
     sparse_below: float = 8.0
     sparse_steps: tuple[float, float] = (0.02, 0.06)
     sparse_field: float = 0.93
@@ -128,16 +122,16 @@ class PlacementOptions:
     max_attitudes: int = 20_000
     generations: int = 15
     keep_every: int = 3
-
+    # Hardest attitudes.
     fresh_attitudes: int = 20_000
     hardest_attitudes: int = 600
     perturbations: int = 6
     perturbation_size: float = 0.1
-
+    # Comparison of layouts.
     score_attitudes: int = 40_000
     tail_fraction: float = 0.01
     inner_field: float = 0.95
-
+    # Ambiguity.
     max_overlap: float = 0.5
     ambiguity_trials: int = 100
     central_leds: int = 4
@@ -149,10 +143,12 @@ OPTIONS = PlacementOptions()
 
 
 class PlacementScore(NamedTuple):
-    """Comparison of layouts on (A, 3, 3) attitudes that no search uses.
+    """Comparison of layouts on attitudes that no search uses.
 
     Attributes
     ----------
+    R_body_from_lab
+        (A, 3, 3) attitudes
     reference
         Tail variance of the best even layout, the unit of `tail_variance`
     """
@@ -167,11 +163,9 @@ class PlacementScore(NamedTuple):
 
         The single worst attitude is unstable: it depends on one LED at the field's edge and on the sampling.
         """
-        variance = np.sort(
-            variances(
-                total_information(place_m, self.R_body_from_lab, *camera_geometry(self.config))
-            )
-        )
+        geometry = camera_geometry(self.config)
+        information = total_information(place_m, self.R_body_from_lab, *geometry)
+        variance = np.sort(variances(information))
         tail = math.ceil(self.options.tail_fraction * len(variance))
         return float(variance[-tail:].mean()) / self.reference
 
@@ -181,7 +175,7 @@ class PlacementScore(NamedTuple):
         return int(np.sum(total_information(place_m, self.R_body_from_lab, *geometry)[:, 6] < 2))
 
     def score(self, place_m: Floats, rng: np.random.Generator) -> tuple[bool, bool, float]:
-        """Sort key of layouts, less is better.
+        """Sort key of layouts; less is better.
 
         In this order: whether an even layout is better in the worst attitudes; whether an attitude was found that
         sees fewer than two LEDs; the tail variance, times 1 + the fraction of ambiguous fields.
@@ -201,7 +195,7 @@ def optimize_places(
     rng: np.random.Generator,
     options: PlacementOptions,
 ) -> Floats:
-    """(N, 3) sites, m, at which config.count LEDs make the worst attitudes within the tilt as good as possible.
+    """(N, 3) sites in m at which config.count LEDs make the worst attitudes within the tilt as good as possible.
 
     1. The best even layout by `PlacementScore.tail_variance` sets the reference. It is also contracted toward the
        zenith.
@@ -212,7 +206,6 @@ def optimize_places(
     3. The best by `PlacementScore.score` of all layouts reached is kept, so no even layout is better in the worst
        attitudes.
     4. `reduce_ambiguity` changes ambiguous fields; its result is kept if `score` prefers it.
-    Raises InputError if not all LEDs find room at the spacing.
 
     Parameters
     ----------
@@ -220,9 +213,14 @@ def optimize_places(
         (K, 3) allowed places in the lab, on the surface within its rim and cap;
         options.sites_per_led times the count
     starts_m
-        (N, 3) each, layouts to start from; a Poisson-disk sample of the sites, as even as
-        possible, is added
+        (N, 3) each, layouts to start from; a Poisson-disk sample of the sites, as even as possible, is added
+
+    Raises
+    ------
+    InputError
+        If not all LEDs find room at the spacing.
     """
+    # 1. Even layouts that keep the spacing.
     few_sites_m = sites_m[: options.even_sites_per_led * config.count]
     even = [start_m for start_m in starts_m if spacing_ok(start_m, config.spacing_m)]
     chosen = spread(few_sites_m, config.spacing_m, config.count, options.bisections)
@@ -237,27 +235,27 @@ def optimize_places(
         )
     visible = visible_fraction(config, few_sites_m, rng)
     scorer = PlacementScore(config, options, sample_attitudes(config, options.score_attitudes, rng))
+    # The best of them is the reference; contracted layouts are further starts.
     even_m = min(even, key=scorer.tail_variance)
     scorer = scorer._replace(reference=scorer.tail_variance(even_m))
     contracted = [contract(even_m, sites_m, fraction) for fraction in options.contractions]
-    start_m = min(
-        [even_m, *(layout_m for layout_m in contracted if spacing_ok(layout_m, config.spacing_m))],
-        key=scorer.tail_variance,
-    )
+    roomy = [layout_m for layout_m in contracted if spacing_ok(layout_m, config.spacing_m)]
+    start_m = min([even_m, *roomy], key=scorer.tail_variance)
 
     def best(layouts_m: Sequence[Floats]) -> Floats:
         return min(layouts_m, key=lambda layout_m: scorer.score(layout_m, rng))
 
     best_m = best([even_m, start_m])
-    steps, field_fraction = (
-        (options.sparse_steps, options.sparse_field)
-        if visible * config.count < options.sparse_below
-        else (options.dense_steps, options.dense_field)
-    )
+    # 2. Settings by the mean number of LEDs in a field.
+    steps = options.dense_steps
+    field_fraction = options.dense_field
+    if visible * config.count < options.sparse_below:
+        steps = options.sparse_steps
+        field_fraction = options.sparse_field
     search = LocalSearch(config, options, sites_m, cKDTree(sites_m), steps, field_fraction)
-    count = np.clip(
-        options.views_per_site / max(visible, 1e-9), options.min_attitudes, options.max_attitudes
-    )
+    views = options.views_per_site / max(visible, 1e-9)
+    count = np.clip(views, options.min_attitudes, options.max_attitudes)
+    # 3. and 4.
     best_m = best([best_m, *descend(search, start_m, int(count), rng)])
     return best([reduce_ambiguity(scorer, best_m, sites_m, rng), best_m])
 
@@ -275,16 +273,25 @@ def contract(place_m: Floats, sites_m: Floats, fraction: float) -> Floats:
     """
     direction = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
     z = 1 - fraction * (1 - direction[:, 2])
-    xy = (
-        direction[:, :2]
-        * np.sqrt((1 - z**2) / np.maximum(1 - direction[:, 2] ** 2, 1e-12))[:, None]
-    )
+    # sin(zenith angle) after the contraction, over that before it.
+    narrower = np.sqrt((1 - z**2) / np.maximum(1 - direction[:, 2] ** 2, 1e-12))
+    xy = direction[:, :2] * narrower[:, None]
     site_direction = sites_m / np.linalg.norm(sites_m, axis=1, keepdims=True)
     return sites_m[cKDTree(site_direction).query(np.column_stack([xy, z]))[1]]
 
 
 class LocalSearch(NamedTuple):
-    """Local search: (K, 3) candidate sites, m, a k-d tree of them, the step sizes and the part of the field used."""
+    """Local search.
+
+    Attributes
+    ----------
+    sites_m, tree
+        (K, 3) candidate sites in m, and a k-d tree of them
+    steps
+        Least and greatest step in units of the LEDs' spacing
+    field_fraction
+        Fraction of the field that is used
+    """
 
     config: layouts.OptimizedConfig
     options: PlacementOptions
@@ -294,19 +301,24 @@ class LocalSearch(NamedTuple):
     field_fraction: float
 
     def propose(self, place_m: Floats, rng: np.random.Generator) -> Floats:
-        """(N, 3) one site per LED, a random step away; step lengths are log-uniform between the limits in `steps`."""
+        """(N, 3) one site for each LED, a random step away; the length is log-uniform between the limits in `steps`."""
         spacing_m = np.median(cKDTree(place_m).query(place_m, k=2)[0][:, 1])
         low, high = np.log(self.steps)
         step_m = spacing_m * np.exp(rng.uniform(low, high, (len(place_m), 1)))
-        return self.sites_m[
-            self.tree.query(place_m + step_m * rng.standard_normal(place_m.shape))[1]
-        ]
+        target_m = place_m + step_m * rng.standard_normal(place_m.shape)
+        return self.sites_m[self.tree.query(target_m)[1]]
 
 
 def descend(
     search: LocalSearch, place_m: Floats, attitude_count: int, rng: np.random.Generator
 ) -> list[Floats]:
-    """Layouts, (N, 3) sites each, reached by descent from place_m: one per `keep_every` generations, and the last.
+    """Layouts reached by descent from place_m, (N, 3) sites each: one per `keep_every` generations, and the last.
+
+    In each round one move is proposed to each LED and tried in random order:
+
+    1. At the end of a generation keep a candidate, and add the hardest attitudes of a fresh sample.
+    2. Propose a site to each LED, and compute what the attitudes see of the present and of the proposed places.
+    3. Try the moves.
 
     Parameters
     ----------
@@ -322,16 +334,16 @@ def descend(
     for n in range(config.rounds):
         if n in last_rounds[options.keep_every - 1 :: options.keep_every]:
             candidates.append(place_m)
-        # The descent improves the sampled attitudes at the expense of those between them. Adding the worst of a fresh
-        # sample closes these gaps.
+        # 1. The descent improves the sampled attitudes at the expense of those between them. Adding the worst of a
+        # fresh sample closes these gaps.
         if n in last_rounds:
             hardest = hardest_attitudes(config, options, place_m, field_fraction, rng)
             R_body_from_lab = np.concatenate([R_body_from_lab, hardest])
-        # Sites 0 to count - 1 are the present places, site count + n is the one proposed to LED n.
+        # 2. Sites 0 to count - 1 are the present places, site count + n is the one proposed to LED n.
         both_m = np.concatenate([place_m, search.propose(place_m, rng)])
-        visibility = Visibility(
-            *visible_from(both_m, R_body_from_lab, *camera_geometry(config, field_fraction))
-        )
+        geometry = camera_geometry(config, field_fraction)
+        visibility = Visibility(*visible_from(both_m, R_body_from_lab, *geometry))
+        # 3.
         chosen = np.arange(config.count)
         order = rng.permutation(config.count)
         try_moves(
@@ -363,21 +375,25 @@ def hardest_attitudes(
     field_fraction: float,
     rng: np.random.Generator,
 ) -> Floats:
-    """(H, 3, 3) R_body_from_lab with the highest cost for these LEDs: the worst of a fresh sample, then perturbed.
+    """(H, 3, 3) attitudes R_body_from_lab with the highest costs for these LEDs.
 
-    Each perturbation is kept if the cost rises. Rotations about the boresight are larger, because they move an LED
-    less than rotations across it do: by the tangent of its field angle, at most that of the field's corner.
+    1. The worst of a fresh sample.
+    2. Perturb each by random rotations, and keep those that raise its cost. Rotations about the boresight are larger,
+       because they move an LED less than rotations across it do: by the tangent of its field angle, at most that of
+       the field's corner.
     """
 
     def attitude_costs(R_body_from_lab: Floats) -> Floats:
         geometry = camera_geometry(config, field_fraction)
         return costs(total_information(place_m, R_body_from_lab, *geometry), config.min_leds)
 
+    # 1.
     sample = sample_attitudes(config, options.fresh_attitudes, rng)
     sample_cost = attitude_costs(sample)
     worst = np.argsort(sample_cost)[-options.hardest_attitudes :]
     hardest = sample[worst]
     cost = sample_cost[worst]
+    # 2. Size of the rotations across the boresight and about it.
     half = tan_half(config)
     step_rad = options.perturbation_size * half.min() * np.array([1, 1, 1 / math.hypot(*half)])
     for _ in range(options.perturbations):
@@ -396,6 +412,7 @@ def sample_attitudes(
     """(A, 3, 3) R_body_from_lab: boresights uniform over the cap of the tilt, yaw uniform; a shifted R3 lattice."""
     # R3 sequence: the multiples of 1/g, 1/g^2 and 1/g^3 modulo 1 fill the unit cube evenly.
     unit = (rng.random(3) + np.arange(count)[:, None] / GOLDEN ** np.arange(1, 4)) % 1
+    # Uniform in the cosine of the tilt.
     tilt = np.arccos(1 - unit[:, 0] * (1 - math.cos(math.radians(config.tilt_deg))))
     angles = np.column_stack([2 * math.pi * unit[:, 1], tilt, 2 * math.pi * unit[:, 2]])
     return Rotation.from_euler("ZYZ", angles).inv().as_matrix()
@@ -425,12 +442,12 @@ def field_reach_rad(config: layouts.OptimizedConfig, surface: Surface) -> float:
     cone = np.column_stack(
         [half_diagonal * np.cos(azimuth), half_diagonal * np.sin(azimuth), np.ones(24)]
     )
-    angles = [(a, math.radians(config.tilt_deg), yaw) for a in azimuth for yaw in azimuth[::2]]
+    tilt_rad = math.radians(config.tilt_deg)
+    angles = [(a, tilt_rad, yaw) for a in azimuth for yaw in azimuth[::2]]
     reach = 0.0
     for lab_from_body in Rotation.from_euler("ZYZ", angles):
-        met_m = surface.meet(
-            lab_from_body.apply(np.array(config.camera_m)), lab_from_body.apply(cone)
-        )
+        camera_m = lab_from_body.apply(np.array(config.camera_m))
+        met_m = surface.meet(camera_m, lab_from_body.apply(cone))
         met_m = met_m[np.isfinite(met_m[:, 0])]
         reach = max(reach, *np.arctan2(np.hypot(*met_m.T[:2]), met_m[:, 2]), 0.0)
     return min(reach, math.radians(config.cap_deg)) or math.radians(config.cap_deg)
@@ -438,7 +455,7 @@ def field_reach_rad(config: layouts.OptimizedConfig, surface: Surface) -> float:
 
 @jit
 def has_room(site: int, without: int, chosen: Ints, sites_m: Floats, spacing_m: float) -> bool:
-    """Whether a site keeps the spacing to every LED except `without`."""
+    """Whether a site keeps the spacing to every LED except LED number `without`."""
     for n in range(len(chosen)):
         distance2 = 0.0
         for i in range(3):
@@ -459,7 +476,7 @@ def try_moves(
     moved: Ints,
     target: Ints,
 ) -> None:
-    """One trial per LED: moved[n] goes to site target[n] if there is room and the cost falls. In place in `chosen`."""
+    """One trial for each LED: moved[n] goes to site target[n] if there is room and the cost falls; changes `chosen`."""
     total = sum_information(chosen, visibility, attitude_count)
     attitude_cost = costs(total, min_leds)
     for n in range(len(moved)):
@@ -474,7 +491,8 @@ def try_moves(
         change_old = update_costs(old, visibility, total, attitude_cost, min_leds)
         if change_old + update_costs(new, visibility, total, attitude_cost, min_leds) < 0:
             chosen[moved[n]] = new
-        else:  # undo the move
+        else:
+            # Undo the move.
             add_led(new, -1, visibility, total)
             add_led(old, 1, visibility, total)
             update_costs(old, visibility, total, attitude_cost, min_leds)
@@ -484,7 +502,7 @@ def try_moves(
 def spread(sites_m: Floats, spacing_m: float, count: int, bisections: int) -> Ints:
     """Indices of `count` sites at the widest spacing at which `thin` finds that many, by bisection.
 
-    Fewer than `count` if even spacing_m does not leave room for them.
+    Fewer than `count` if there is no room for them even at spacing_m.
     """
     chosen = thin(sites_m, spacing_m, count)
     low_m = spacing_m
@@ -501,9 +519,9 @@ def spread(sites_m: Floats, spacing_m: float, count: int, bisections: int) -> In
 
 
 def thin(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
-    """Indices of sites taken in order, each if none taken before is within the spacing, to `count`.
+    """Indices of sites taken in order, each if none taken before is within the spacing, up to `count`.
 
-    This is random sequential adsorption where the sites are in random order.
+    For sites in random order this is random sequential adsorption.
     """
     tree = cKDTree(sites_m)
     free = np.ones(len(sites_m), dtype=bool)
@@ -515,7 +533,7 @@ def thin(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
     return np.array(taken, dtype=np.int64)
 
 
-# Reduce the ambiguity between fields of view.
+# Ambiguity between fields of view.
 
 
 def layout_ambiguity(config: layouts.OptimizedConfig, place_m: Floats) -> Ambiguity:
@@ -530,11 +548,15 @@ def layout_ambiguity(config: layouts.OptimizedConfig, place_m: Floats) -> Ambigu
 def reduce_ambiguity(
     scorer: PlacementScore, place_m: Floats, sites_m: Floats, rng: np.random.Generator
 ) -> Floats:
-    """The layout after LEDs in ambiguous fields are moved to free sites nearby, where that reduces `excess_overlap`.
+    """Move LEDs in ambiguous fields to free sites nearby, where that reduces `excess_overlap`; return the layout.
 
     A field is ambiguous if more than `max_overlap` of its LEDs coincide with another field's. The worst variances may
     rise by `variance_slack` in total, but not beyond those of the best even layout. Ambiguity that remains after
     `ambiguity_trials` is accepted: with three LEDs in a field, two of them have a similar pair almost anywhere.
+
+    1. Choose an LED near the center of an ambiguous field, and a site near it that keeps the spacing.
+    2. The move must reduce the ambiguity and must not leave more attitudes with fewer than two LEDs.
+    3. It must not raise the worst variances beyond the limit.
     """
     config = scorer.config
     options = scorer.options
@@ -547,6 +569,7 @@ def reduce_ambiguity(
         ambiguous = np.flatnonzero(ambiguity.fraction > options.max_overlap)
         if not len(ambiguous):
             break
+        # 1.
         center_m = place_m[ambiguity.led[rng.choice(ambiguous)]]
         central = cKDTree(place_m).query(center_m, k=min(options.central_leds, config.count))[1]
         moved = rng.choice(central)
@@ -556,11 +579,12 @@ def reduce_ambiguity(
         distance_m = np.linalg.norm(place_m - trial_m[moved], axis=1)
         if np.delete(distance_m, moved).min() < config.spacing_m:
             continue
-        # The move must reduce the ambiguity and must not leave more attitudes with fewer than two LEDs.
+        # 2.
         trial_ambiguity = layout_ambiguity(config, trial_m)
         less_excess = excess_overlap(trial_ambiguity, options) < excess_overlap(ambiguity, options)
         if not less_excess or scorer.under_two(trial_m) > under_two:
             continue
+        # 3.
         if scorer.tail_variance(trial_m) <= max_tail:
             place_m = trial_m
             ambiguity = trial_ambiguity

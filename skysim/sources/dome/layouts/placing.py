@@ -1,4 +1,4 @@
-"""What all layouts share: directions from the bearing, their places on the surface, and LEDs as light sources."""
+"""Parts that all layouts share: directions from the bearing, their places on the surface, LEDs as light sources."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from skysim.sources.dome.led import (
     full_strength_e_s_sr,
     strength_factors,
 )
-from skysim.sources.dome.surface import Surface
+from skysim.sources.dome.surface import Surface, directions, unit_vectors
 from skysim.sources.photometry import Band
 
 Ints = NDArray[np.int64]
@@ -39,13 +39,13 @@ class PlacedLeds:
     id
         (N,) LED numbers
     place_m
-        (N, 3) in the lab
+        (N, 3) places in the lab
     normal
-        (N, 3) unit
+        (N, 3) unit normals
     level
-        (N,) fraction of full brightness, 0 < level <= 1
+        (N,) fractions of full brightness, 0 < level <= 1
     magnitude
-        (N,) of the star that the LED represents; NaN if it represents none
+        (N,) magnitudes of the stars that the LEDs represent; NaN for LEDs that represent none
     """
 
     id: Ints
@@ -60,14 +60,15 @@ def led_sources(
 ) -> Sources:
     """Sources of placed LEDs: strength with its scatter from LED to LED, and the drive's pulse timing.
 
-    rng is the hardware's.
+    `rng` is the hardware's random stream.
     """
     count = len(placed.id)
     scatter = strength_factors(led.scatter, rng.standard_normal(count))
     strength = full_strength_e_s_sr(led, band) * scatter
     pulses = DRIVES[led.drive.kind](led, DriveInput(placed.level, placed.id // HOLES), rng)
     color = np.zeros(count)
-    if led.color_scatter_m:  # drawn last, so that all else is the same without it
+    # Drawn last, so that all other numbers are the same without it.
+    if led.color_scatter_m:
         color = rng.standard_normal(count)
         strength = strength * color_factors(led, band, color)
     if led.aging:
@@ -90,9 +91,8 @@ def led_sources(
 def on_surface(surface: Surface, place_m: Floats, level: Floats) -> PlacedLeds:
     """LEDs at (N, 3) places with the surface's normals there, numbered from 0."""
     number = np.arange(len(place_m), dtype=np.int64)
-    return PlacedLeds(
-        number, place_m, surface.inward(place_m), level, np.full(len(place_m), np.nan)
-    )
+    unknown = np.full(len(place_m), np.nan)
+    return PlacedLeds(number, place_m, surface.inward(place_m), level, unknown)
 
 
 def dimmed_sources(
@@ -105,6 +105,7 @@ def dimmed_sources(
 ) -> Sources:
     """Sources of LEDs at (N, 3) places on the surface, each with a random level of the layout's `dimming`."""
     if config.unique_neighbors:
+        # Levels by which an LED is known from its neighbors.
         levels = np.unique(config.dimming)
         level = levels[unique_levels(len(levels), config.unique_neighbors, place_m, rng)]
     else:
@@ -115,42 +116,39 @@ def dimmed_sources(
 def lit_sources(
     config: LitConfig, surface: Surface, place_m: Floats, led: LedConfig, band: Band
 ) -> Sources:
-    """Sources of the drawn fraction of LEDs at (N, 3) places; each keeps its number among all places."""
+    """Sources of a random fraction `lit_fraction` of LEDs at (N, 3) places; each keeps its number among all places."""
     rng = random_stream(config.hardware_seed)
-    number = np.sort(
-        rng.permutation(len(place_m))[: max(round(config.lit_fraction * len(place_m)), 1)]
-    )
+    lit = max(round(config.lit_fraction * len(place_m)), 1)
+    number = np.sort(rng.permutation(len(place_m))[:lit])
     return replace(dimmed_sources(config, surface, place_m[number], led, band, rng), id=number)
 
 
 def cap(count: int, half_angle_rad: float) -> Floats:
-    """(count, 3) unit vectors spread evenly over a cap about +z: Fibonacci spiral, equal areas in z."""
+    """(count, 3) unit vectors spread evenly over a cap about +z: a Fibonacci spiral, equal steps in z.
+
+    Equal steps in z are equal areas on the sphere; successive azimuths differ by the golden angle.
+    """
     n = np.arange(count) + 0.5
     z = 1 - n / count * (1 - np.cos(half_angle_rad))
-    ring = np.sqrt(1 - z**2)
-    return np.column_stack(
-        [ring * np.cos(n * GOLDEN_ANGLE_RAD), ring * np.sin(n * GOLDEN_ANGLE_RAD), z]
-    )
+    return unit_vectors(z, n * GOLDEN_ANGLE_RAD)
 
 
 def scattered_cap(count: int, half_angle_rad: float, rng: np.random.Generator) -> Floats:
     """(count, 3) independent unit vectors, uniform over a cap about +z: uniform in z and in azimuth."""
     z = 1 - rng.random(count) * (1 - np.cos(half_angle_rad))
     azimuth = rng.uniform(0, 2 * np.pi, count)
-    ring = np.sqrt(1 - z**2)
-    return np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
+    return unit_vectors(z, azimuth)
 
 
 def directions_from_angles(directions_deg: Any) -> Floats:
-    """(N, 3) unit vectors from the bearing, for (N, 2) azimuth from +x toward +y and tilt from +z."""
+    """(N, 3) unit vectors from the bearing, for (N, 2) azimuths from +x toward +y and tilts from +z, in degrees."""
     azimuth, tilt = np.radians(np.asarray(directions_deg, dtype=float)).T
-    return np.column_stack(
-        [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)]
-    )
+    return directions(tilt, azimuth)
 
 
 def check_cap(key: str, directions: Floats, cap_deg: float) -> None:
     """Raise InputError for the first of (N, 3) directions from the bearing that is outside the cap."""
+    # Written so that NaN is outside.
     length = np.linalg.norm(directions, axis=1)
     tilt_deg = np.degrees(np.arctan2(np.hypot(*directions.T[:2]), directions[:, 2]))
     beyond = np.flatnonzero(~((length > 0) & (tilt_deg <= cap_deg * (1 + 1e-12))))
@@ -163,7 +161,7 @@ def check_cap(key: str, directions: Floats, cap_deg: float) -> None:
 
 
 def project_from_bearing(surface: Surface, directions: Floats) -> Floats:
-    """(N, 3) points where rays from the bearing's center meet the surface. Raises InputError where they miss it."""
+    """(N, 3) points where rays from the bearing's center meet the surface. Raises InputError if one misses it."""
     place_m = surface.meet(np.zeros(3), directions)
     if np.isnan(place_m).any():
         raise InputError(

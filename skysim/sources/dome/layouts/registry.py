@@ -1,6 +1,6 @@
-"""All layouts of LEDs by name. LAYOUTS maps the scene's `light.layout.kind` to a function that returns all LEDs.
+"""All layouts of LEDs by name: LAYOUTS maps the scene's `light.layout.kind` to a function that returns all LEDs.
 
-The real sky, and three kinds that take the points of another layout (fibers, panel, projector) are defined here;
+The real sky, and three kinds that take the points of another layout (fibers, panel, projector), are defined here,
 the others in their own modules.
 """
 
@@ -44,7 +44,8 @@ from skysim.sources.photometry import Band
 def celestial(config: CelestialConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
     """The real sky (JHU/APL's idea): an LED where the camera at its nominal place sees each of the brightest stars.
 
-    LED numbers are Hipparcos numbers. Places are from `celestial.project_stars`, levels from `celestial.led_levels`.
+    LED numbers are Hipparcos numbers. Places are those of `celestial.project_stars`, levels those of
+    `celestial.led_levels`.
     """
     stars = celestial_dome.project_stars(config, surface, led, band)
     normal = surface.inward(stars.place_m)
@@ -55,9 +56,8 @@ def celestial(config: CelestialConfig, surface: Surface, led: LedConfig, band: B
 
 def fibers(config: FibersConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
     """Ends of optical fibers at another layout's points, with the errors of shell and holes: `displace_ends`."""
-    return displace_ends(
-        config, surface, LAYOUTS[config.points.kind](config.points, surface, led, band)
-    )
+    designed = LAYOUTS[config.points.kind](config.points, surface, led, band)
+    return displace_ends(config, surface, designed)
 
 
 def lcd(config: LcdConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
@@ -68,12 +68,12 @@ def lcd(config: LcdConfig, surface: Surface, led: LedConfig, band: Band) -> Sour
 
 
 def projector(config: ProjectorConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
-    """Another layout's LEDs drawn on the nearest pixels of a projector: `projector.projector_sources`."""
+    """Another layout's LEDs drawn on the nearest pixels of a projector: `display.projector_sources`."""
     stars = LAYOUTS[config.points.kind](config.points, surface, display.ideal_led(led), band)
     return projector_sources(config, surface, led, band, stars)
 
 
-# Arguments: its section of the scene, the surface, the LED type, the chip's band. Returns all LEDs.
+# Arguments: the layout's section of the scene, the surface, the LED section, the chip's band. Returns all LEDs.
 LAYOUTS: dict[str, Callable[[Any, Surface, LedConfig, Band], Sources]] = {
     "patch_boards": patch_boards,
     "fibonacci": fibonacci,
@@ -91,6 +91,6 @@ LAYOUTS: dict[str, Callable[[Any, Surface, LedConfig, Band], Sources]] = {
 
 
 def board_of(config: Layout, led_ids: Ints) -> Ints | None:
-    """(N,) board of each of these LED numbers; None if no two boards can be distinguished: no boards, or only one."""
+    """(N,) board of each of these LED numbers; None if boards cannot tell LEDs apart: no boards, or only one."""
     board = led_ids // HOLES
     return board if isinstance(config, PatchBoardsConfig) and len(np.unique(board)) > 1 else None

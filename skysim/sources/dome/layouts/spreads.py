@@ -1,4 +1,4 @@
-"""Even and random spreads of single LEDs over the cap: Fibonacci spiral, random, Poisson disk, optimized."""
+"""Spreads of single LEDs over the cap: Fibonacci spiral, random, Poisson disk, optimized, geodesic sphere."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from skysim.sources.dome.layouts.placing import (
     project_from_bearing,
     scattered_cap,
 )
-from skysim.sources.dome.surface import Surface
+from skysim.sources.dome.surface import Surface, directions
 from skysim.sources.photometry import Band
 
 # Random points per spacing^2: a gap of .03 of that area is found with probability .95.
 DARTS_PER_SPACING2 = 100
 MAX_DARTS = 3_000_000
 DARTS_PER_LED = 30  # random points per LED, if a count is given
-# Brightness does not move an LED.
+# Brightness does not move an LED, so places are cached without it.
 UNDIMMED = {"levels": None, "magnitudes": None, "unique_neighbors": None}
 BISECTIONS = 14  # bisection steps from the dome's width: to some tenths of a millimeter
 
 
 def fibonacci(config: FibonacciConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
-    """LEDs on a Fibonacci spiral: equal solid angles about the bearing hold equal numbers, to within a few."""
+    """LEDs on a Fibonacci spiral: equal solid angles about the bearing contain equal numbers, to within a few."""
     rng = random_stream(config.hardware_seed)
     place_m = project_from_bearing(surface, cap(config.count, np.radians(config.cap_deg)))
     return dimmed_sources(config, surface, place_m, led, band, rng)
@@ -67,10 +67,16 @@ def poisson_disk(
     DARTS_PER_SPACING2 points per square of the spacing reach .52, that is .66 LEDs per square of the spacing, and a
     higher density along the rim.
     If a count is given instead, the result is the first `count` points accepted at the widest spacing that has room
-    for them. Raises InputError for a spacing that makes more LEDs than fit into memory.
+    for them.
+
+    Raises
+    ------
+    InputError
+        For a spacing that makes more LEDs than fit into memory.
     """
     rng = random_stream(config.hardware_seed)
     half = np.radians(config.cap_deg)
+    # A count: the widest spacing by bisection.
     if config.spacing_m is None:
         count = config.count or 1
         darts_m = project_from_bearing(surface, scattered_cap(DARTS_PER_LED * count, half, rng))
@@ -82,13 +88,12 @@ def poisson_disk(
     # solid angle are sparsest on the surface, so this maximum sets how many are needed.
     slant = -np.einsum("nj,nj->n", surface.inward(points), directions)
     meters2_sr = np.sum(points**2, axis=1) / slant
-    dart_count = (
-        DARTS_PER_SPACING2 * 2 * np.pi * (1 - np.cos(half)) * meters2_sr.max() / config.spacing_m**2
-    )
+    dart_count = DARTS_PER_SPACING2 * 2 * np.pi * (1 - np.cos(half)) * meters2_sr.max()
+    dart_count /= config.spacing_m**2
     if not 0 < dart_count <= MAX_DARTS:
-        min_spacing_m = (
-            config.spacing_m * np.sqrt(dart_count / MAX_DARTS) if dart_count > 0 else np.inf
-        )
+        min_spacing_m = np.inf
+        if dart_count > 0:
+            min_spacing_m = config.spacing_m * np.sqrt(dart_count / MAX_DARTS)
         raise InputError(
             "light.layout.spacing",
             f"{config.spacing_m:g} m gives too many LEDs",
@@ -100,7 +105,7 @@ def poisson_disk(
 
 
 def optimized(config: OptimizedConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
-    """LEDs at the places that make the camera's worst attitudes most accurate: see `optimize.optimize_places`.
+    """LEDs at the places that make the camera's worst attitudes most accurate: `optimize.optimize_places`.
 
     No LED is placed where no attitude's field reaches. In the mean of the worst attitudes the layout is not worse
     than a Fibonacci spiral.
@@ -115,25 +120,24 @@ def optimized(config: OptimizedConfig, surface: Surface, led: LedConfig, band: B
         project_from_bearing(surface, cap(config.count, half))
         for half in (np.radians(config.cap_deg), reach)
     ]
-    place_m, state = optimized_places(
-        config_of_places, *(points.tobytes() for points in (sites, *spirals))
-    )
+    points = (points_m.tobytes() for points_m in (sites, *spirals))
+    place_m, state = optimized_places(config_of_places, *points)
+    # The random stream goes on as if the search had not been cached.
     rng.bit_generator.state = state
     return dimmed_sources(config, surface, place_m, led, band, rng)
 
 
-@lru_cache(
-    maxsize=32
-)  # seconds each: a study's trials, its costs and its report ask for the same ones
+# A search takes seconds; a study's trials, its costs and its report ask for the same places.
+@lru_cache(maxsize=32)
 def optimized_places(
     config: OptimizedConfig, sites: bytes, *spirals: bytes
 ) -> tuple[Floats, Mapping[str, Any]]:
-    """(N, 3) read-only places of `optimized`, m, and the state of the hardware's random stream after the search.
+    """(N, 3) read-only places of `optimized` in m, and the state of the hardware's random stream after the search.
 
     Parameters
     ----------
     sites, spirals
-        (K, 3) points, m, as bytes, because arrays have no hash
+        (K, 3) points in m as bytes, because arrays have no hash
     """
     rng = random_stream(config.hardware_seed)
     points = [np.frombuffer(text).reshape(-1, 3) for text in (sites, *spirals)]
@@ -143,11 +147,20 @@ def optimized_places(
     return place_m, rng.bit_generator.state
 
 
-# LEDs at the vertices of a geodesic sphere: an icosahedron with divided faces, projected on the
-# surface.
+# Geodesic sphere: LEDs at the vertices of an icosahedron with divided faces, projected on the surface. The division of
+# a face is a triangular lattice. In barycentric coordinates over the face's corners, a point is (i, j, k) / (i + j + k)
+# with whole numbers i, j, k >= 0:
+#
+#     class I   i + j + k = frequency
+#     class II  i + j + k = 3 frequency / 2, and i, j, k leave the same remainder by 3
+#
+# (Kenner 1976, Geodesic Math and How to Use It, ch. 6 and 8; Coxeter 1971, Virus macromolecules and geodesic domes).
+# With T triangles in each face the sphere has 10 T + 2 vertices: T = frequency^2 in class I, 3 frequency^2 / 4 in class
+# II. Points of the flat faces are moved to the sphere along its radius, so edges differ in length: in class I between
+# .85 and 1.26 of the icosahedron's edge over the frequency, in the limit of high frequencies.
 
 
-CAP_SLACK = 1e-12  # relative rounding of a vertex on the rim of the cap
+CAP_SLACK = 1e-12  # relative rounding error of a vertex on the rim of the cap
 
 
 def geodesic(config: GeodesicConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
@@ -155,31 +168,29 @@ def geodesic(config: GeodesicConfig, surface: Surface, led: LedConfig, band: Ban
     vertices = geodesic_vertices(config.frequency, config.class_)
     tilt_rad = np.arctan2(np.hypot(vertices[:, 0], vertices[:, 1]), vertices[:, 2])
     azimuth_rad = np.arctan2(vertices[:, 1], vertices[:, 0])
+    # Rounded, so that vertices of equal tilt are in the order of their azimuths.
     order = np.lexsort((np.round(azimuth_rad, 9), np.round(tilt_rad, 9)))
     order = order[tilt_rad[order] <= np.radians(config.cap_deg) * (1 + CAP_SLACK)]
     turned = azimuth_rad[order] + np.radians(config.rotation_deg)
-    ring = np.sin(tilt_rad[order])
-    z = np.cos(tilt_rad[order])
-    directions = np.column_stack([ring * np.cos(turned), ring * np.sin(turned), z])
-    return lit_sources(config, surface, project_from_bearing(surface, directions), led, band)
+    directions_lab = directions(tilt_rad[order], turned)
+    return lit_sources(config, surface, project_from_bearing(surface, directions_lab), led, band)
 
 
 def geodesic_vertices(frequency: int, class_: str) -> Floats:
-    """(10 T + 2, 3) unit vectors of all vertices; see the module's docstring. frequency is even in class II."""
+    """(10 T + 2, 3) unit vectors of all vertices of a geodesic sphere. The frequency is even in class II."""
     corners = icosahedron()
-    # Corners with their weights: the same from every face.
-    weights: set[tuple[tuple[int, int], ...]] = set()
+    # Corners with their weights: a vertex on an edge is the same from both faces.
+    weights = set[tuple[tuple[int, int], ...]]()
     for face in icosahedron_faces():
         for lattice in lattice_points(frequency, class_):
-            weights.add(
-                tuple(sorted((corner, n) for corner, n in zip(face, lattice, strict=True) if n))
-            )
+            pairs = zip(face, lattice, strict=True)
+            weights.add(tuple(sorted((corner, n) for corner, n in pairs if n)))
     points = np.array([sum(n * corners[corner] for corner, n in each) for each in sorted(weights)])
     return points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
 def lattice_points(frequency: int, class_: str) -> Iterator[tuple[int, int, int]]:
-    """Whole barycentric coordinates of a face's lattice points, its edges and corners included."""
+    """Yield the whole barycentric coordinates of a face's lattice points, its edges and corners included."""
     total = frequency if class_ == "I" else 3 * frequency // 2
     for i in range(total + 1):
         for j in range(total + 1 - i):
@@ -200,7 +211,7 @@ def icosahedron() -> Floats:
 
 
 def icosahedron_faces() -> list[tuple[int, int, int]]:
-    """The corners of its 20 faces, as rows of `icosahedron`."""
+    """The corners of the icosahedron's 20 faces, as rows of `icosahedron`."""
     faces = []
     for n in range(5):
         following = (n + 1) % 5
@@ -208,6 +219,7 @@ def icosahedron_faces() -> list[tuple[int, int, int]]:
         next_upper = 1 + following
         lower = 6 + n
         next_lower = 6 + following
+        # A face at the zenith, two between the rings, one at the nadir.
         faces += [(0, upper, next_upper), (upper, lower, next_upper)]
         faces += [(lower, next_lower, next_upper), (11, lower, next_lower)]
     return faces

@@ -1,9 +1,14 @@
-"""LED tape wound on the surface: circles about the zenith, a spiral from the apex, or strips along meridians.
+"""LED tape wound on the surface, and optical fibers in it.
 
-A turn of the tape is the projection of a curve of directions from the bearing, tilt over azimuth, on the surface. The
-distance of the turns is measured along the surface's mean meridian (`Meridian`), the distance of two LEDs along the
-turn itself, by the lengths of its chords at `STEPS_PER_PITCH` steps per LED and `STEPS_PER_TURN` per turn at least.
-The chords of a circle are too short by (2 pi / STEPS_PER_TURN)^2 / 24 of their length, 3e-6.
+Tapes are circles about the zenith, a spiral from the apex, or strips along meridians. A turn of the tape is the
+projection of a curve of directions from the bearing, tilt over azimuth, on the surface. The distance of the turns is
+measured along the surface's mean meridian (`Meridian`), the distance of two LEDs along the turn itself, by the lengths
+of its chords at `STEPS_PER_PITCH` steps per LED and `STEPS_PER_TURN` per turn at least. The chords of a circle are too
+short by (2 pi / STEPS_PER_TURN)^2 / 24 of their length, 3e-6.
+
+1. The mean meridian of the surface (`mean_meridian`).
+2. Curves of the tapes (`circles`, `spiral`, `strips`), with their lengths (`tape_length_m`).
+3. An LED every pitch along each tape, with the errors of pitch and glue (`wind`, `aside`).
 """
 
 from __future__ import annotations
@@ -24,7 +29,7 @@ from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import AimingConfig, FibersConfig, StringConfig
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.placing import lit_sources, project_from_bearing
-from skysim.sources.dome.surface import Surface, perpendicular
+from skysim.sources.dome.surface import Surface, directions, perpendicular
 from skysim.sources.photometry import Band
 
 STEPS_PER_TURN = 720
@@ -33,7 +38,7 @@ MAX_STEPS = 1_000_000  # of all turns
 MERIDIAN_STEPS = 400
 MERIDIANS = 36
 TAPE_STREAM = 3  # spawn key of the errors of tapes, which leave levels and gaps unchanged
-GLUE_M = 0.3  # of tape over which its sideways error is the same, assumed
+GLUE_M = 0.3  # length of tape over which its sideways error is correlated, assumed
 
 
 class Meridian(NamedTuple):
@@ -42,11 +47,11 @@ class Meridian(NamedTuple):
     Attributes
     ----------
     tilt_rad
-        From the zenith, seen from the bearing
+        Angles from the zenith, seen from the bearing
     arc_m
-        Length along the surface from the apex, mean of the meridians
+        Lengths along the surface from the apex, mean of the meridians
     ring_m
-        Circumference of the circle of this tilt over 2 pi
+        Circumference of the circle of each tilt over 2 pi
     """
 
     tilt_rad: Floats
@@ -55,7 +60,17 @@ class Meridian(NamedTuple):
 
 
 class Tape(NamedTuple):
-    """A tape as laid: (K,) directions along it, and the length from its beginning to each; whether it is a ring."""
+    """A tape as laid.
+
+    Attributes
+    ----------
+    tilt_rad, azimuth_rad
+        (K,) directions along it, from the bearing
+    length_m
+        (K,) length of the tape from its beginning to each
+    closed
+        Whether it is a ring
+    """
 
     tilt_rad: Floats
     azimuth_rad: Floats
@@ -63,15 +78,14 @@ class Tape(NamedTuple):
     closed: bool = False
 
     def led_count(self, pitch_m: float) -> int:
-        """LEDs that fit: of a ring the last has a pitch to the first."""
+        """Number of LEDs that fit; on a ring the last has a pitch to the first."""
         fit = int(self.length_m[-1] / pitch_m)
         return max(fit, 1) if self.closed else fit + 1
 
     def rays(self, at_m: Floats) -> Floats:
-        """(N, 3) unit vectors from the bearing to places along it."""
-        tilt_rad, azimuth_rad = (
-            np.interp(at_m, self.length_m, one) for one in (self.tilt_rad, self.azimuth_rad)
-        )
+        """(N, 3) unit vectors from the bearing to places along the tape."""
+        tilt_rad = np.interp(at_m, self.length_m, self.tilt_rad)
+        azimuth_rad = np.interp(at_m, self.length_m, self.azimuth_rad)
         return directions(tilt_rad, azimuth_rad)
 
 
@@ -89,30 +103,32 @@ def string(config: StringConfig, surface: Surface, led: LedConfig, band: Band) -
 
 
 def wind(config: StringConfig, surface: Surface) -> Wound:
-    """The LEDs of all tapes, as glued; an LED's number is its row. Raises as `string` does."""
+    """The LEDs of all tapes, as glued; an LED's number is its row. Raises InputError for too long a tape."""
     meridian = mean_meridian(surface, np.radians(config.cap_deg))
     tapes = WINDINGS[config.winding](config, surface, meridian)
+    # A cap that is too small for a tape has one LED at the zenith.
     if not tapes:
-        return Wound(
-            project_from_bearing(surface, np.array([[0.0, 0.0, 1.0]])),
-            np.zeros(1, np.int64),
-            np.zeros(1),
-        )
+        zenith_m = project_from_bearing(surface, np.array([[0.0, 0.0, 1.0]]))
+        return Wound(zenith_m, np.zeros(1, np.int64), np.zeros(1))
     design_m = [
         config.pitch_m * np.arange(tape.led_count(config.pitch_m), dtype=float) for tape in tapes
     ]
     rng = random_stream(config.hardware_seed, TAPE_STREAM)
     stretch = 1 + scaled_errors(config.pitch_error, rng.standard_normal(len(tapes)))
-    place_m = [
-        aside(surface, tape, factor * at_m, scaled_errors(config.glue_scatter_m, wander(at_m, rng)))
-        for tape, at_m, factor in zip(tapes, design_m, stretch, strict=True)
-    ]
+    # The pitch errs by a factor for each tape, the glue sideways along it.
+    place_m = []
+    for tape, at_m, factor in zip(tapes, design_m, stretch, strict=True):
+        sideways_m = scaled_errors(config.glue_scatter_m, wander(at_m, rng))
+        place_m.append(aside(surface, tape, factor * at_m, sideways_m))
     number = np.repeat(np.arange(len(tapes)), [len(at_m) for at_m in design_m])
     return Wound(np.concatenate(place_m), number, np.concatenate(design_m))
 
 
 def wander(at_m: Floats, rng: np.random.Generator) -> Floats:
-    """Standard normal numbers at increasing places of a tape, correlated by exp(-d / GLUE_M) (Gauss-Markov)."""
+    """Standard normal numbers at increasing places of a tape, correlated by exp(-d / GLUE_M) (Gauss-Markov).
+
+    x_n = rho x_(n-1) + sqrt(1 - rho^2) g_n, rho = exp(-(d_n - d_(n-1)) / GLUE_M).
+    """
     normal = rng.standard_normal(len(at_m))
     kept = np.exp(-np.diff(at_m) / GLUE_M)
     for n, rho in enumerate(kept.tolist(), 1):
@@ -123,11 +139,12 @@ def wander(at_m: Floats, rng: np.random.Generator) -> Floats:
 def aside(surface: Surface, tape: Tape, at_m: Floats, sideways_m: Floats) -> Floats:
     """(N, 3) places on the surface at (N,) lengths along a tape, displaced to its side by (N,) distances.
 
-    What is beyond an end stays at the end.
+    Places beyond an end of the tape stay at the end.
     """
     place_m = project_from_bearing(surface, tape.rays(at_m))
     if not sideways_m.any():
         return place_m
+    # The tape's direction by a central difference; the side is across it and the normal.
     step_m = 1e-4 * tape.length_m[-1]
     middle_m = np.clip(at_m, step_m, tape.length_m[-1] - step_m)
     along = tape.rays(middle_m + step_m) - tape.rays(middle_m - step_m)
@@ -136,20 +153,13 @@ def aside(surface: Surface, tape: Tape, at_m: Floats, sideways_m: Floats) -> Flo
     return project_from_bearing(surface, moved)
 
 
-def directions(tilt_rad: Floats, azimuth_rad: Floats) -> Floats:
-    """(..., 3) unit vectors from the bearing."""
-    ring = np.sin(tilt_rad)
-    return np.stack(
-        [ring * np.cos(azimuth_rad), ring * np.sin(azimuth_rad), np.cos(tilt_rad)], axis=-1
-    )
-
-
 def mean_meridian(surface: Surface, half_rad: float) -> Meridian:
     """The surface's mean meridian over the cap. Raises InputError if the cap exceeds the surface."""
     tilt_rad = np.linspace(0, half_rad, MERIDIAN_STEPS + 1)
     azimuth_rad = np.arange(MERIDIANS) * (2 * np.pi / MERIDIANS)
     rays = directions(*np.meshgrid(tilt_rad, azimuth_rad, indexing="ij"))
     place_m = project_from_bearing(surface, rays.reshape(-1, 3)).reshape(rays.shape)
+    # Chords along the meridians and around the circles.
     step_m = np.linalg.norm(np.diff(place_m, axis=0), axis=2).mean(axis=1)
     around_m = np.linalg.norm(place_m - np.roll(place_m, 1, axis=1), axis=2).sum(axis=1)
     return Meridian(tilt_rad, np.append(0, np.cumsum(step_m)), around_m / (2 * np.pi))
@@ -168,36 +178,27 @@ def check_length(length_m: float, turns: float, config: StringConfig) -> None:
 
 
 def circles(config: StringConfig, surface: Surface, meridian: Meridian) -> list[Tape]:
-    """Tapes on circles of equal tilt, each from azimuth 0."""
+    """Tapes on circles of equal tilt, `spacing` apart on the mean meridian, each from azimuth 0."""
     arcs_m = np.arange(config.spacing_m / 2, meridian.arc_m[-1], config.spacing_m)
-    check_length(
-        2 * np.pi * float(np.interp(arcs_m, meridian.arc_m, meridian.ring_m).sum()),
-        len(arcs_m),
-        config,
-    )
+    length_m = 2 * np.pi * float(np.interp(arcs_m, meridian.arc_m, meridian.ring_m).sum())
+    check_length(length_m, len(arcs_m), config)
     tapes = []
     for tilt_rad in np.interp(arcs_m, meridian.arc_m, meridian.tilt_rad):
         ring_m = float(np.interp(tilt_rad, meridian.tilt_rad, meridian.ring_m))
         steps = max(STEPS_PER_TURN, int(STEPS_PER_PITCH * 2 * np.pi * ring_m / config.pitch_m))
-        tapes.append(
-            lay(
-                surface,
-                np.full(steps + 1, tilt_rad),
-                np.linspace(0, 2 * np.pi, steps + 1),
-                closed=True,
-            )
-        )
+        around_rad = np.linspace(0, 2 * np.pi, steps + 1)
+        tapes.append(lay(surface, np.full(steps + 1, tilt_rad), around_rad, closed=True))
     return tapes
 
 
 def spiral(config: StringConfig, surface: Surface, meridian: Meridian) -> list[Tape]:
-    """One tape whose turns are `spacing` apart on the mean meridian."""
+    """One tape whose turns are `spacing` apart on the mean meridian: azimuth = 2 pi arc / spacing."""
     turns = float(meridian.arc_m[-1]) / config.spacing_m
     arc_m = np.linspace(0, meridian.arc_m[-1], int(20 * turns) + 1000)
     azimuth_rad = 2 * np.pi * arc_m / config.spacing_m
-    per_rad_m = np.hypot(
-        np.interp(arc_m, meridian.arc_m, meridian.ring_m), config.spacing_m / (2 * np.pi)
-    )
+    # Length per radian of azimuth: around the circle, and down the meridian.
+    ring_m = np.interp(arc_m, meridian.arc_m, meridian.ring_m)
+    per_rad_m = np.hypot(ring_m, config.spacing_m / (2 * np.pi))
     check_length(float(np.trapezoid(per_rad_m, azimuth_rad)), turns, config)
     # Steps of equal length, and of equal azimuth near the apex, where the tape is most curved.
     per_rad = np.maximum(STEPS_PER_TURN / (2 * np.pi), STEPS_PER_PITCH * per_rad_m / config.pitch_m)
@@ -220,11 +221,10 @@ def strips(config: StringConfig, surface: Surface, meridian: Meridian) -> list[T
     steps = max(STEPS_PER_TURN, int(STEPS_PER_PITCH * float(meridian.arc_m[-1]) / config.pitch_m))
     tapes = []
     for number in range(count):
-        # Strips of the coarsest set that holds this one.
+        # Number of strips in the coarsest set that contains this one; it begins where these are half a spacing apart.
         neighbors = count // math.gcd(number, count // 4)
-        first_rad = np.interp(
-            neighbors * config.spacing_m / (4 * np.pi), widest_m, meridian.tilt_rad
-        )
+        least_ring_m = neighbors * config.spacing_m / (4 * np.pi)
+        first_rad = np.interp(least_ring_m, widest_m, meridian.tilt_rad)
         tilt_rad = np.linspace(first_rad, meridian.tilt_rad[-1], steps + 1)
         tapes.append(lay(surface, tilt_rad, np.full(steps + 1, 2 * np.pi * number / count)))
     return tapes
@@ -234,7 +234,7 @@ WINDINGS = {"latitude": circles, "spiral": spiral, "meridian": strips}
 
 
 def lay(surface: Surface, tilt_rad: Floats, azimuth_rad: Floats, closed: bool = False) -> Tape:
-    """A tape along (K,) directions from the bearing."""
+    """A tape along (K,) directions from the bearing, with its length."""
     return Tape(tilt_rad, azimuth_rad, tape_length_m(surface, tilt_rad, azimuth_rad), closed)
 
 
@@ -244,12 +244,17 @@ def tape_length_m(surface: Surface, tilt_rad: Floats, azimuth_rad: Floats) -> Fl
     return np.append(0, np.cumsum(np.linalg.norm(np.diff(place_m, axis=0), axis=1)))
 
 
-# Optical fibers in a shell (JHU/APL's dome): their ends at another layout's points, with the errors
-# of making them.
+# Optical fibers in a shell (JHU/APL's dome): their ends at another layout's points, with the errors of making them.
+# JHU/APL put a laser on the star tracker's mount, turned it to each star's direction and drilled where its spot was
+# (Boone et al. 2005, as described by Padro 2012, section 2.6; the procedure is what Padro's section 5.2.2 recommends).
+# So a hole errs by the laser's direction, and an error of the shell displaces it along the laser's line, where a
+# camera at the laser's place does not see it. Without a laser the error of the shell displaces it along the surface's
+# normal.
 
 
-# Spawn key of the shell's own random stream, which leaves the fibers' places unchanged.
-SHELL_STREAM = 2
+SHELL_STREAM = (
+    2  # spawn key of the shell's own random stream, which leaves the fibers' places unchanged
+)
 AIMING_STREAM = 5  # spawn key of the laser's errors
 
 
@@ -257,22 +262,20 @@ def displace_ends(config: FibersConfig, surface: Surface, fibers: Sources) -> So
     """Displace each fiber's end by the errors of its hole and by v R, the radius error of a stretched shell.
 
     v is uniform in +-config.radius_variation, R the end's distance from the bearing; positive is outward, along the
-    surface's normal, or with a laser along its line by v R / cos(incidence). A camera r off the place from which the
-    error is along the line of sight sees an end displaced by up to (r / R) v rad (JHU/APL's .4 % of 4 ft, 50 mm off:
-    34"). Normals are those of the design. The random stream is that of config.points.hardware_seed.
+    surface's normal, or with a laser along its line by v R / cos(incidence). If the error is along the line of sight
+    from some place, a camera r off that place sees an end displaced by up to (r / R) v rad (JHU/APL's .4 % of 4 ft,
+    50 mm off: 34"). Normals are those of the design. The random stream is that of config.points.hardware_seed.
     """
     seed = config.points.hardware_seed
     place_m = fibers.place[:, :3]
-    fraction = config.radius_variation * random_stream(seed, SHELL_STREAM).uniform(
-        -1, 1, len(fibers)
-    )
+    drawn = random_stream(seed, SHELL_STREAM).uniform(-1, 1, len(fibers))
+    fraction = config.radius_variation * drawn
     outward_m = fraction * np.linalg.norm(place_m, axis=1)
     if config.aiming is None:
         moved = place_m - outward_m[:, None] * fibers.normal
     else:
-        moved = marked_m(
-            config.aiming, surface, place_m, outward_m, random_stream(seed, AIMING_STREAM)
-        )
+        rng = random_stream(seed, AIMING_STREAM)
+        moved = marked_m(config.aiming, surface, place_m, outward_m, rng)
     return dataclasses.replace(fibers, place=np.column_stack([moved, fibers.place[:, 3]]))
 
 
@@ -285,26 +288,32 @@ def marked_m(
 ) -> Floats:
     """(N, 3) places of holes that a laser marks for designed places (N, 3) of a surface that is outward_m off there.
 
-    From the laser at s toward p the line has the direction u = (p - s) / |p - s|. It is rotated by the mount's common
-    error and by two angles across it, meets the surface at q, and the real shell, e outward, at q + e / (n . u) u, n
-    the outward normal. The drill then errs along two axes in the surface. So an angle a displaces a hole by D a across
-    its line, D the distance, and by D a / (n . u) along the surface in the plane of incidence.
-    Raises InputError for a laser outside the dome, and for a line that passes below its rim.
+    1. From the laser at s toward p the line has the direction u = (p - s) / |p - s|. It is rotated by the mount's
+       common error and by two angles across it.
+    2. It meets the surface at q, and the real shell, e outward, at q + e / (n . u) u, with the outward normal n.
+    3. The drill errs along two axes in the surface.
+
+    So an angle a displaces a hole by D a across its line, with the distance D, and by D a / (n . u) along the surface
+    in the plane of incidence.
+
+    Raises
+    ------
+    InputError
+        For a laser outside the dome, and for a line that passes below its rim.
     """
     laser_m = np.array(config.laser_m)
     if not surface.inside(laser_m):
         raise InputError(
             "light.layout.aiming.laser", f"{config.laser_m} m is outside of the dome", "inside"
         )
+    # 1.
     sight_m = place_m - laser_m
     line = sight_m / np.linalg.norm(sight_m, axis=1, keepdims=True)
     common = scaled_errors(config.orientation_sigma_arcsec, rng.standard_normal(3)) * ARCSEC_RAD
-    angles = (
-        scaled_errors(config.pointing_sigma_arcsec, rng.standard_normal((len(line), 2)))
-        * ARCSEC_RAD
-    )
-    line = Rotation.from_rotvec(common).apply(line + along_two_axes(line, angles))
+    pointing = scaled_errors(config.pointing_sigma_arcsec, rng.standard_normal((len(line), 2)))
+    line = Rotation.from_rotvec(common).apply(line + along_two_axes(line, pointing * ARCSEC_RAD))
     line /= np.linalg.norm(line, axis=1, keepdims=True)
+    # 2.
     mark_m = surface.meet(laser_m, line)
     if np.isnan(mark_m).any():
         raise InputError(
@@ -312,6 +321,7 @@ def marked_m(
         )
     normal = surface.inward(mark_m)
     mark_m += (-outward_m / np.sum(normal * line, axis=1))[:, None] * line
+    # 3.
     drill_m = scaled_errors(config.drill_sigma_m, rng.standard_normal((len(line), 2)))
     return np.asarray(mark_m + along_two_axes(normal, drill_m))
 
