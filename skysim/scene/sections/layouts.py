@@ -25,7 +25,7 @@ FieldOfView = Annotated[Number, Field(ge=1, le=90)]
 
 def relative_levels(magnitudes: Sequence[float]) -> tuple[float, ...]:
     """Levels by Pogson's law, 10^(-0.4 m), relative to the brightest of the list, which has level 1."""
-    brightest = float(min(magnitudes))
+    brightest = float(min(magnitudes, default=0.0))
     return tuple(10.0 ** (-0.4 * (float(magnitude) - brightest)) for magnitude in magnitudes)
 
 
