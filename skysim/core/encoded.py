@@ -323,8 +323,9 @@ def read_exif(data: bytes) -> Exif:
     if data.startswith(MAGICS):
         return read_exif_block(data)._replace(orientation=1)
     if data.startswith(PNG_MAGIC):
-        blocks = [data[at:end] for kind, at, end in png_chunks(data) if kind == b"eXIf"]
-        return read_exif_block(blocks[0] if blocks else b"")
+        # Chunks after eXIf are not read: the file may end in one of them.
+        blocks = (data[at:end] for kind, at, end in png_chunks(data) if kind == b"eXIf")
+        return read_exif_block(next(blocks, b""))
     if data.startswith(JPEG_MAGIC):
         with opened_by_pillow(data) as image:
             return read_exif_block(image.info.get("exif", b"").removeprefix(b"Exif\0\0"))

@@ -129,11 +129,13 @@ def pid_torque(
     # 1. Errors. e is the rotation vector of ref_from_body, the inverse of body_from_ref.
     body_from_ref = multiply(inverse(lab_from_body), lab_from_ref)
     error = -to_rotvec(body_from_ref)
+    # The reference's rate and acceleration are in its own axes.
     rate_error = rate - apply(body_from_ref, rate_ref)
     # 2. Limit the return rate.
     feedback = kp * error + ki * error_sum
     feedback_size = math.sqrt((feedback**2).sum())
     error_angle = math.sqrt((error**2).sum())
+    # w_max = min(rate limit, sqrt(a |e|)).
     feedback_limit = kd * min(
         rate_limit,
         math.sqrt(authority / max(inertia[0, 0], inertia[1, 1], inertia[2, 2]) * error_angle),

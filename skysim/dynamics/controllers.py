@@ -262,6 +262,7 @@ class ExternalLaw:
             momentum_nms.copy(),
             self.achieved_nm,
         )
+        # Any failure of the user's code ends the run with the controller's name.
         try:
             self.commanded_nm = self.answer(inputs)
         except Exception as error:
@@ -293,6 +294,7 @@ def external_law(
     """Start the controller that the scene names. Raises InputError if it is unknown or refuses the set-up."""
     name = config.law
     source.check_name(name)
+    # A factory given in Python runs in this process.
     if source.factory is not None:
         try:
             law = build_law(source.factory, setup)
@@ -301,6 +303,7 @@ def external_law(
         return ExternalLaw(
             reference, name, lambda inputs: check_torque(law(inputs), setup.authority_nm)
         )
+    # A program of the command line, or an entry point that a host process of skysim runs.
     environment = None
     if name in source.programs:
         arguments = shlex.split(source.programs[name])

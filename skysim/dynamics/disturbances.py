@@ -42,6 +42,7 @@ def earth_torque_nm(
 
     Everything is in body axes, (3,) and (3, 3). Gravity is along the plumb line, so the centrifugal force is in it.
     """
+    # J W, and the total momentum J (w + W) + h.
     earth_momentum = matrix_vector(inertia_kg_m2, earth_body_rad_s)
     total_momentum = matrix_vector(inertia_kg_m2, rate_body_rad_s) + earth_momentum + momentum_nms
     return (
@@ -92,11 +93,13 @@ class AirCurrent:
         self.rms_nm = np.array(config.rms_nm)
         self.decay = math.exp(-period_s / config.correlation_s)
         self.rng = rng
+        # The stationary distribution.
         self.torque_nm = self.rms_nm * rng.standard_normal(3)
 
     def sample(self) -> Floats:
         """(3,) torque of this control period in lab axes; draws that of the next period."""
         current = self.torque_nm
+        # The innovation keeps the variance at rms^2.
         innovation = math.sqrt(1 - self.decay**2) * self.rms_nm * self.rng.standard_normal(3)
         self.torque_nm = self.decay * current + innovation
         return current

@@ -101,6 +101,7 @@ class FlightComputer:
         self.actuator: Actuators = ideal_torque(vehicle)
         if self.config is None:
             return
+        # With a controller: its actuators, its law, and the fans that dump momentum.
         self.actuator = controlling_actuator(self.config, self.actuator_sets, vehicle)
         self.law = self.build_law(scene, vehicle, reference, source)
         if self.config.desaturation:
@@ -120,6 +121,7 @@ class FlightComputer:
             return build_controller(
                 reference, vehicle.inertia_kg_m2, config, torque_nm, rate_limit_rad_s
             )
+        # An external controller gets the same numbers that place the poles of the built-in one.
         setup = ControllerSetup(
             self.period_s,
             np.array(vehicle.inertia_kg_m2),

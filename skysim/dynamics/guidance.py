@@ -231,6 +231,7 @@ def slew(element: SlewConfig, start: LegStart) -> Leg:
     angle, axis = length_and_direction(
         quaternion.to_rotvec(quaternion.multiply(back_wxyz, lab_from_there))
     )
+    # The vehicle is there already.
     if angle < 1e-12:
         return FixedAxisLeg(start.lab_from_ref_wxyz, np.zeros(3), 0.0, still)
     # 2. Peak rate, duration of a ramp, and duration of the whole: two ramps, and a cruise over the rest of the angle.
@@ -260,6 +261,7 @@ def spin_up(element: SpinUpConfig, start: LegStart) -> Leg:
     InputError
         If more than MAX_KNOTS knots would be needed.
     """
+    # The fastest rate is at one of the two ends, since the rate changes along a line.
     duration_s = element.duration_s
     start_rate = start.rate_rad_s
     change = np.radians(element.rate_deg_s) - start_rate
@@ -289,6 +291,7 @@ def sine(element: SineConfig, start: LegStart) -> Leg:
     period each, or within half of the duration if that is shorter.
     """
     duration_s = element.duration_s
+    # A sine is a sweep whose frequency does not change.
     omega = 2 * math.pi * element.frequency_hz
     growth_s = min(1 / element.frequency_hz, duration_s / 2)
     size, axis = length_and_direction(np.radians(element.amplitude_deg))
@@ -307,6 +310,7 @@ def chirp(element: ChirpConfig, start: LegStart) -> Leg:
     duration_s = element.duration_s
     omega = 2 * math.pi * element.from_hz
     size, axis = length_and_direction(np.radians(element.amplitude_deg))
+    # The change of angular frequency: k = ln(f1 / f0) / T in exp(k t), or a rate in rad/s2.
     if element.sweep == "log":
         sweep = log_sweep
         change = math.log(element.to_hz / element.from_hz) / duration_s
@@ -397,6 +401,7 @@ class Reference:
 
         The state at the time where two legs meet is that of the later one. Before 0 the state is that at 0.
         """
+        # The last leg that starts at or before t_s.
         k = max(bisect.bisect_right(self.start_s, t_s) - 1, 0)
         leg = self.legs[k]
         return leg.state_at(min(max(t_s - self.start_s[k], 0.0), leg.duration_s))
@@ -444,6 +449,7 @@ def plan(
     for element in motion.maneuver:
         spline = next(splines) if element.kind == "profile" else None
         legs.append(LEGS[element.kind](element, leg_start._replace(spline=spline)))
+        # The next leg begins with the state at the end of this one.
         lab_from_ref_wxyz, rate_rad_s, _ = legs[-1].state_at(legs[-1].duration_s)
         leg_start = LegStart(
             lab_from_ref_wxyz, rate_rad_s, home, leg_start.begin_s + legs[-1].duration_s
@@ -471,6 +477,7 @@ class Impulse:
 
     def fraction(self, from_s: float, to_s: float) -> float:
         """Fraction of the impulse between two times: (cos(pi a) - cos(pi b)) / 2, a and b in durations."""
+        # Times in durations, limited to the impulse.
         a, b = (
             min(max((t_s - self.begin_s) / self.duration_s, 0.0), 1.0) for t_s in (from_s, to_s)
         )
@@ -484,6 +491,7 @@ def impulses(motion: MotionConfig, reference: Reference) -> tuple[Impulse, ...]:
         if isinstance(bump, BumpConfig):
             rate_rad_s = np.radians(bump.rate_deg_s)
             result.append(Impulse(begin_s, bump.duration_s, rate_rad_s))
+            # Catching the vehicle is the opposite impulse.
             if bump.caught_after_s is not None:
                 result.append(Impulse(begin_s + bump.caught_after_s, bump.duration_s, -rate_rad_s))
     return tuple(result)

@@ -146,6 +146,7 @@ def ideal_increments(
             f"samples from {first_s:.6f} to {last_s:.6f} s",
             f"within the motion, {t_s[0]:.6f} to {t_s[-1]:.6f} s",
         )
+    # Contiguous arrays, since numba compiles for each memory layout.
     position = np.asarray(position_body_m, dtype=float)
     # 1. Rate and specific force at the knots.
     knots = inertial_knots(
@@ -176,7 +177,9 @@ def inertial_knots(
     up = np.array([0.0, 0.0, gravity_m_s2])
     for k in range(len(knots)):
         body_from_lab = quaternion.inverse(lab_from_body_wxyz[k])
+        # w = rate + body_from_lab earth_rate.
         rate = rate_body_rad_s[k] + quaternion.apply(body_from_lab, earth_rate)
+        # w x (w x r) - g_body; a unit at rest feels +g upwards.
         centripetal = quaternion.cross(rate, quaternion.cross(rate, position_m))
         weight = quaternion.apply(body_from_lab, up)
         for i in range(3):
@@ -205,7 +208,7 @@ def integrate_intervals(
         total = np.zeros(6)
         change = np.zeros(6)
         add_cubic(t_s, knots, first, begin, -1.0, change)
-        # The parts of the interval, from knot to knot.
+        # The parts of the interval, from knot to knot. The last cubic also extends beyond the last knot by rounding.
         for k in range(first, last + 1):
             stop = end if k == last else min(end, t_s[k + 1])
             middle = (begin + stop) / 2
@@ -397,6 +400,7 @@ def accelerometer_triad(config: AccelerometerConfig, hardware: Floats, start: Fl
 
     The square of the noise density in ug/sqrt(Hz) is the variance of a mean over 1 s.
     """
+    # One micro-g in m/s2.
     ug = PPM * STANDARD_GRAVITY_M_S2
     return Triad(
         matrix=response_matrix(config.scale_ppm, config.misalignment_arcsec, hardware[1:]),
@@ -440,6 +444,7 @@ class Imu:
         """The unit of the scene's hardware_seed at turn-on; its Gauss-Markov biases start in their stationary
         distribution.
         """
+        # Fixed errors have the seed of the unit, states that of the run: gyros first, then accelerometers.
         hardware = random_stream(config.hardware_seed).standard_normal((2, 4, 3))
         start = rng.standard_normal((2, 3))
         return cls(
@@ -504,12 +509,14 @@ def integrate_attitude(
     not at the attitude of the sample's start. Each increment is taken as a rotation vector; if the axis moves within
     a sample, the error is half the integral of angle x rate (coning; `assumed`).
     """
+    # The lab rotates with the Earth, so the vehicle rotates backwards in it.
     lab_now_from_before = quaternion.from_rotvec(-step_s * earth_rate)
     attitude = lab_from_body_wxyz
     for n in range(len(angle_rad)):
         attitude = quaternion.multiply(
             lab_now_from_before, quaternion.multiply(attitude, quaternion.from_rotvec(angle_rad[n]))
         )
+        # Normalization prevents a drift of the norm.
         attitude = attitude / math.sqrt(
             attitude[0] ** 2 + attitude[1] ** 2 + attitude[2] ** 2 + attitude[3] ** 2
         )

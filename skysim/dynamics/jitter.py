@@ -199,6 +199,7 @@ class Vibration:
         phi = np.zeros((len(t_s), 3))
         rate = np.zeros((len(t_s), 3))
         for component in self.components:
+            # The samples within the component's interval.
             active = slice(*np.searchsorted(t_s, [component.begin_s, component.end_s]))
             component_phi, component_rate = component.evaluate(t_s[active])
             phi[active] += component_phi
@@ -225,6 +226,7 @@ class Vibration:
         phi, phi_rate = self.evaluate(t_s)
         # 3. Attitude and rate in the vibrating axes.
         vibration = Rotation.from_rotvec(phi)
+        # omega at the new samples.
         rate = np.column_stack(
             [np.interp(t_s, trajectory.t_s, axis) for axis in trajectory.rate_body_rad_s.T]
         )

@@ -71,6 +71,7 @@ def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[TextSegment
     for n, line in lines:
         if line.split(maxsplit=1)[0] == "COMMENT":
             continue
+        # A keyword that begins or ends a part, a data line, or KEYWORD = value of the header or the metadata.
         if line in ("META_START", "META_STOP", "DATA_START", "DATA_STOP"):
             section = next_section(Where(path, n), section, line)
             if line == "META_START":
@@ -166,6 +167,7 @@ def within_span(
         if key in metadata:
             line, epoch = metadata[key]
             ends_s[side] = float(seconds_since(str(path), [line], [epoch], start, system)[0])
+    # A nanosecond allows for the rounding of epochs.
     inside = np.flatnonzero((t_s >= ends_s[0] - 1e-9) & (t_s <= ends_s[1] + 1e-9))
     return slice(int(inside[0]), int(inside[-1]) + 1) if len(inside) else slice(0, 0)
 
@@ -182,6 +184,7 @@ def take(samples: Samples, which: slice) -> Samples:
 
 def to_icrs(samples: Samples, names: list[str]) -> Samples:
     """The samples with the frame bias applied, if one of the two frames is EME2000."""
+    # At most one of the two frames is inertial, so at most one factor is not the identity.
     bias = Rotation.identity()
     for name in names:
         bias = icrs_from(name) * bias

@@ -55,6 +55,7 @@ def read_stk(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
     rows = list[tuple[int, list[str]]]()
     inside = False
     for n, line in lines[1:]:  # the first has the version
+        # Keywords and section names are not case-sensitive.
         words = line.split()
         lower = line.lower()
         if line.startswith("#"):

@@ -47,6 +47,7 @@ def load_profiles(scene: Scene, mount: Mount, given: Any = None) -> tuple[Attitu
     profiles: list[AttitudeSpline] = []
     for n, element in enumerate(scene.motion.maneuver):
         if isinstance(element, ProfileConfig):
+            # A given table replaces the file of the first profile.
             source = given if given is not None and not profiles else Path(element.file)
             try:
                 samples = read_profile(source, in_utc(scene.start_time), element.rotation)
@@ -70,6 +71,7 @@ def read_profile(source: Any, start: datetime.datetime, rotation: str | None = N
     """
     if not isinstance(source, Path):
         return profile_table.from_table(source, TABLE, start, rotation)
+    # AEM and STK files name their format and frames; other files are tables.
     lines = read_lines(source)
     first = next((line for _, line in lines if not line.startswith("COMMENT")), "")
     is_aem = first.startswith("CCSDS_AEM_VERS")
@@ -104,6 +106,7 @@ def to_body(samples: Samples, scene: Scene, mount: Mount) -> Samples:
             f"attitudes {samples.direction} with light of kind {scene.light.kind}",
             f"{', '.join(allowed)}, or the inverse",
         )
+    # lab_from_cam cam_from_body.
     lab_from_body = (
         samples.a_from_b * mount.cam_from_body if samples.b == "cam" else samples.a_from_b
     )

@@ -91,6 +91,7 @@ class ActuatorKind:
 @jit
 def scale_to_limit(command: Floats, limit: float) -> Floats:
     """The command, scaled by one factor so that no element exceeds the limit; its direction is kept."""
+    # A command of zeros has no direction to keep.
     peak = np.abs(command).max()
     return command * (limit / peak if peak > limit else 1.0)
 
@@ -158,6 +159,7 @@ class Hinges:
         )
         ids = np.array([model.joint(name).id for name in names], dtype=np.int64)
         dof = model.jnt_dofadr[ids].astype(np.int64)
+        # A motor has the name of its joint.
         actuators = all_names(model.actuator, model.nu)
         motor = [actuators.index(name) if name in actuators else -1 for name in names]
         return cls(

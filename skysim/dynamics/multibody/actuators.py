@@ -141,6 +141,7 @@ def check_names(spec: Any, path: Path) -> None:
 
     It would silently not be an actuator.
     """
+    # Prefixes end with an underscore: wheel_1 is a wheel, wheel1 nearly one.
     for element in (*spec.joints, *spec.sites):
         prefix = next((p for p in PREFIXES if element.name.startswith(p[:-1])), None)
         if prefix and not element.name.startswith(prefix):
@@ -151,6 +152,7 @@ def check_names(spec: Any, path: Path) -> None:
 
 def check_bare(joint: Any, path: Path) -> None:
     """Raise InputError if the file gives an actuator's joint a limit, spring, damping or drive; the scene sets them."""
+    # Each of these would act in addition to the scene's values.
     attributes = {
         "range": joint.range,
         "stiffness": joint.stiffness,

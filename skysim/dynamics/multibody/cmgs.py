@@ -56,6 +56,7 @@ def solve_gram(gram: Floats, rhs: Floats) -> Floats:
 
     x = sum_k v_k (v_k . rhs) / lambda_k over the eigenvectors v_k whose eigenvalue lambda_k is not negligible.
     """
+    # Eigenvalues are squared singular values, in ascending order.
     value, vector = np.linalg.eigh(gram)
     x = np.zeros(3)
     for k in range(3):
@@ -70,6 +71,7 @@ def gram_determinant(m: Floats) -> float:
 
     np.linalg.det takes several times as long.
     """
+    # Cofactors of the first row.
     minor_0 = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
     minor_1 = m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0]
     minor_2 = m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0]
@@ -208,6 +210,7 @@ class CmgSet:
             raise InputError(
                 "cmgs.steering", *unknown_name("steering law", self.steering, STEERING)
             )
+        # A frozen dataclass is completed by object.__setattr__.
         arrays = {"gimbal_axes": gimbal, "spin_axes": spin, "rotor_inertia_kg_m2": inertia}
         for name, value in arrays.items():
             object.__setattr__(self, name, value)
@@ -236,6 +239,7 @@ class CmgSet:
         cross = self.cross_axes * np.cos(angle) - self.spin_axes * np.sin(angle)
         jacobian = cross * (self.rotor_inertia_kg_m2 * spin)
         gram = jacobian @ jacobian.swapaxes(-1, -2)
+        # det A A^T is greatest for three equal eigenvalues of the same trace.
         largest = (np.trace(gram, axis1=-2, axis2=-1) / 3) ** 3
         return np.sqrt(np.maximum(np.linalg.det(gram), 0.0) / np.where(largest > 0, largest, 1.0))
 
@@ -262,6 +266,7 @@ class CmgSet:
         # 2. Jacobian. A gimbal rotates the inertial angular momentum, which includes the body's rate along the axle.
         spin_nms = self.rotor_inertia_kg_m2 * (rotor_rad_s + rate_body_rad_s @ axle)
         jacobian = derivative * spin_nms
+        # The steering laws take A and dh/dt in units of the rotors' mean momentum.
         unit_nms = float(np.abs(spin_nms).mean())
         # 3. and 4. Steering within the limits. Rotors at rest give no gyroscopic torque.
         if self.rotor_torque_limit_nm is not None:
@@ -356,7 +361,8 @@ def start_cmgs(model: Any, data: Any, config: CmgsConfig) -> None:
     angles = np.radians(member_values(config.start_deg, len(gimbals), "vehicle.cmgs.start_deg"))
     data.qpos[gimbals.qpos] = angles
     driven = gimbals.motor >= 0
-    data.act[model.actuator_actadr[gimbals.motor[driven]]] = angles[driven]  # servo set-points
+    # A servo whose set-point differs from the angle would jerk the gimbal.
+    data.act[model.actuator_actadr[gimbals.motor[driven]]] = angles[driven]
     data.qvel[Hinges.from_model(model, ROTOR).dof] = config.rotor_rpm * RPM_RAD_S
 
 

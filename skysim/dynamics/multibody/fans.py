@@ -57,6 +57,7 @@ class Fans:
         mujoco.mj_forward(model, data)
         names = sorted(name for name in all_names(model.actuator, model.nu) if name.startswith(FAN))
         sites = [model.site(name).id for name in names]
+        # z axes of the sites; at zero joint angles lab and body axes coincide.
         axes = data.site_xmat[sites].reshape(-1, 3, 3)[:, :, 2]
         motor = np.array([model.actuator(name).id for name in names], dtype=np.int64)
         return cls(tuple(names), axes.T.copy(), data.site_xpos[sites].T.copy(), motor)
@@ -97,6 +98,7 @@ class FanSet:
             raise InputError(
                 "fan positions_m", f"shape {positions.shape}", f"{axes.shape}, as the axes"
             )
+        # Lever arms, and their pseudo-inverse.
         arms = np.cross(positions, axes, axis=0)
         object.__setattr__(self, "torque_per_thrust_m", arms)
         object.__setattr__(self, "thrust_from_torque", np.linalg.pinv(arms, rcond=RANK_TOLERANCE))

@@ -73,6 +73,7 @@ class Simulation:
         self.history_steps = (
             self.last_step if history_s is None else int(np.ceil(history_s / self.step_s))
         )
+        # Memory for all steps, or for twice the history, so that old states are dropped in blocks.
         rows = min(self.last_step, 2 * self.history_steps) + 1
         self.states = np.empty((rows, mujoco.mj_stateSize(self.model, int(STATE))))
         self.step = self.first_step = 0
@@ -88,6 +89,7 @@ class Simulation:
         data.qvel[:3] = rate_body_rad_s
         set_start(vehicle.config, self.model, data)
         mujoco.mj_getState(self.model, data, self.states[0], int(STATE))
+        # The forward dynamics give the warm start of the first step.
         mujoco.mj_forward(self.model, data)
 
     @property
@@ -220,6 +222,7 @@ class PrescribedMotion(Simulation):
     def advance(self, control: Floats) -> None:
         """Advance one step for each row of control (K, nu); its values have no effect."""
         self.discard_old(len(control))
+        # Only attitude and rate change.
         rate_column = 1 + self.model.nq
         for _ in range(len(control)):
             state = self.states[self.row + 1]
@@ -259,6 +262,7 @@ def simulate(
     steps = (
         max(1, round(control_period_s / simulation.step_s)) if controller else simulation.steps_left
     )
+    # One controller call for each control period, or one step over the whole duration.
     limit = vehicle.config.torque_limit_nm
     while simulation.steps_left:
         control = np.zeros((min(steps, simulation.steps_left), vehicle.model.nu))

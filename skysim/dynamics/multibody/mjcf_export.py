@@ -152,6 +152,7 @@ def inline_meshes(spec: Any, model: Any) -> None:
 
 def add_backdrop(spec: Any, on_earth: bool) -> None:
     """Add a dim room or black space as background, and a lamp."""
+    # Colors of the gradient from zenith to nadir.
     top, bottom = (
         ([0.16, 0.19, 0.24], [0.03, 0.035, 0.05]) if on_earth else ([0.0, 0.0, 0.01], [0.0] * 3)
     )
@@ -229,6 +230,7 @@ def add_visual_geom(body: Any, name: str, kind: Any, **more: Any) -> Any:
 def add_dome(spec: Any, rings_m: Floats) -> None:
     """Add the dome, opaque from inside and transparent from outside, with a rim."""
     add_sheet(spec, "stage_dome", rings_m, [0.16, 0.19, 0.27, 1.0], [0.60, 0.72, 0.90, 0.10])
+    # The rim is a short vertical strip below the last ring.
     rim_m = np.stack([rings_m[-1], rings_m[-1] - [0.0, 0.0, RIM_M]])
     add_sheet(spec, "stage_rim", rim_m, [0.45, 0.50, 0.58, 1.0], [0.45, 0.50, 0.58, 0.6])
 
@@ -367,6 +369,7 @@ def add_lights(spec: Any, sources: Sources) -> None:
     fraction = mean[shown] / mean.max(initial=1e-300)
     position_m = sources.place[shown, :3] * (SKY_RADIUS_M if stars else 1.0)
     radius_m = 0.006 + 0.04 * np.sqrt(fraction) if stars else np.full(len(shown), LED_RADIUS_M)
+    # One mesh for each step of brightness; all stars have the brightest.
     level = np.full(len(shown), LEVELS) if stars else np.ceil(fraction * LEVELS).astype(int)
     for step in np.unique(level):
         vertices, faces = octahedra(position_m[level == step], radius_m[level == step])
@@ -379,6 +382,7 @@ def add_lights(spec: Any, sources: Sources) -> None:
 
 def octahedra(position_m: Floats, radius_m: Floats) -> tuple[Floats, NDArray[np.int64]]:
     """(6 N, 3) vertices and (8 N, 3) faces of N octahedra: corners on the axes, a face in every octant."""
+    # Corners 0 to 2 are on the positive axes, 3 to 5 on the negative ones.
     corners = np.concatenate([np.eye(3), -np.eye(3)])
     signs = np.array([[x, y, z] for x in (0, 3) for y in (0, 3) for z in (0, 3)])
     faces = signs + np.arange(3)
@@ -419,6 +423,7 @@ def add_field(spec: Any, mount: Mount, corners_m: Floats) -> None:
     more = {"material": glow.name, "group": GROUP_FIELD}
     vertices = np.vstack([tip, corners_m])
     add_mesh(spec, bus, "stage_field", vertices, sides, [*FIELD_RGB, 0.4], **more)
+    # Edges of the pyramid: a ray to each corner, and the side to the previous corner.
     length_m = np.linalg.norm(corners_m - tip, axis=1).min()
     for k, corner in enumerate(corners_m):
         for kind, end in (("ray", tip), ("edge", corners_m[k - 1])):
@@ -440,6 +445,7 @@ def dome_view(rings_m: Floats) -> tuple[Floats, Floats, Floats, float]:
     """
     wide = np.hypot(*rings_m[-1, :, :2].T).max()
     top = rings_m[..., 2].max()
+    # Half of the height from the vehicle's lowest point to the top.
     size = (top + VEHICLE_BELOW_M) / 2
     tangent = np.tan(np.radians(FOVY_DEG / 2))
     distance = max(1.25 * size / tangent, wide * (1.05 / (4 / 3 * tangent) + 0.35))
@@ -455,6 +461,7 @@ def dome_view(rings_m: Floats) -> tuple[Floats, Floats, Floats, float]:
 def sky_view(vehicle: VehicleModel, boresight: Floats) -> tuple[Floats, Floats, Floats, float]:
     """As `dome_view`, from beside and behind the vehicle, with the boresight along the picture's diagonal."""
     size = float(vehicle.model.stat.extent) / 2 + SKY_RADIUS_M / 2
+    # A direction across the boresight, from the axis that is least along it.
     beside = np.cross(boresight, np.eye(3)[np.argmin(np.abs(boresight))])
     back = beside / np.linalg.norm(beside) - 0.5 * boresight
     up = Rotation.from_rotvec(np.radians(-40.0) * back / np.linalg.norm(back)).apply(boresight)
@@ -477,6 +484,7 @@ def look_at(spec: Any, eye_m: Floats, middle_m: Floats, up: Floats, size_m: floa
     spec.worldbody.add_camera(
         name=LAB_CAMERA, pos=eye_m, quat=lab_from_view.as_quat(scalar_first=True), fovy=FOVY_DEG
     )
+    # The viewer's free camera starts at the same view.
     spec.stat.center = middle_m
     spec.stat.extent = size_m
     spec.visual.map.znear = 0.01

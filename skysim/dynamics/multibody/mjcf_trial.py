@@ -27,6 +27,7 @@ def run_trial(path: str) -> None:
         spec = mujoco.MjSpec.from_file(path)
     except ERRORS:
         return
+    # If it does not compile, the caller reports it, or compiles it without some joints.
     try:
         check_model(spec.compile())
     except ERRORS:

@@ -110,9 +110,11 @@ def occluded(obstacles: Obstacles, lab_from_body: Rotation, place: Floats) -> ND
     place
         (N, 4) places as in `Sources`: positions of LEDs in the lab in m and 1, or directions of stars and 0
     """
+    # 1. Rays from the pupil at this attitude.
     lab_from_body_wxyz = quaternion.from_rotation(lab_from_body)
     camera_m = quaternion.apply(lab_from_body_wxyz, obstacles.camera_body_m)
     rays, end_m = _rays(np.ascontiguousarray(place), camera_m)
+    # 2. Pose of the vehicle, and the nearest geom on each ray.
     obstacles.data.mocap_quat[obstacles.model.body("bus").mocapid[0]] = lab_from_body_wxyz
     mujoco.mj_kinematics(obstacles.model, obstacles.data)
     return free_distance_m(obstacles.model, obstacles.data, camera_m, rays) < end_m
@@ -124,6 +126,7 @@ def _rays(place: Floats, camera_m: Floats) -> tuple[Floats, Floats]:
     rays = np.empty((len(place), 3))
     end_m = np.empty(len(place))
     for n in range(len(place)):
+        # The fourth component of a place is 1 for an LED, which is seen from the pupil, and 0 for a direction.
         square = 0.0
         for i in range(3):
             rays[n, i] = place[n, i] - place[n, 3] * camera_m[i]

@@ -65,6 +65,7 @@ def film(mjcf: str, qpos: Floats, size_px: tuple[int, int] = FILM_PX) -> Iterato
     Rendering runs in its own process. MuJoCo chooses its OpenGL when it is first imported, by MUJOCO_GL (here EGL
     by default), and a graphics driver may crash the whole process.
     """
+    # The task goes to the process as a file, and each picture comes back as raw bytes.
     width, height = size_px
     with tempfile.TemporaryFile() as task, tempfile.TemporaryFile() as errors:
         np.savez(task, mjcf=np.array(mjcf), qpos=qpos, size_px=np.array(size_px))
@@ -79,6 +80,7 @@ def film(mjcf: str, qpos: Floats, size_px: tuple[int, int] = FILM_PX) -> Iterato
             try:
                 for _ in range(len(qpos)):
                     raw = renderer.stdout.read(height * width * 3) if renderer.stdout else b""
+                    # A short read means that the process has ended.
                     if len(raw) < height * width * 3:
                         raise NoPicture(
                             NO_OPENGL.format(why=failure_reason(renderer.wait(), errors))

@@ -70,6 +70,7 @@ class WheelSet:
         object.__setattr__(self, "axes", axes)
         inertia = positive_values(self.inertia_kg_m2, axes.shape[1], "wheel inertia_kg_m2")
         object.__setattr__(self, "inertia_kg_m2", inertia)
+        # T = -axes u, solved for u.
         object.__setattr__(self, "motor_from_torque", -np.linalg.pinv(axes, rcond=RANK_TOLERANCE))
 
     def momentum(self, speed_rad_s: Floats) -> Floats:
@@ -118,6 +119,7 @@ class WheelActuator:
 
 def add_wheels(spec: Any, _: Any, wheels: WheelsConfig) -> None:
     """Add a motor at each wheel, and the friction of its axle; MuJoCo's Coulomb friction also holds a wheel at rest."""
+    # T = coulomb sign(speed) + viscous speed.
     for joint in joints(spec, WHEEL):
         joint.frictionloss = wheels.coulomb_nm
         joint.damping = [wheels.viscous_nms, 0.0, 0.0]
