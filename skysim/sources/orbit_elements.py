@@ -196,16 +196,12 @@ def usable(path: str, n: int, name: str, record: Any) -> tuple[int, str, Any]:
     return int(record.satnum), name or str(record.satnum), record
 
 
-def age_days(elements: MeanElements, time: datetime.datetime) -> Floats:
-    """(N,) days from the elements' epochs to a time; SGP4's error grows by 1 to 3 km a day in low orbits."""
-    epochs = [record.jdsatepoch - J2000_JD + record.jdsatepochF for record in elements.records]
-    return utc_days(time) - np.array(epochs)
-
-
 def gcrs_states(
     elements: MeanElements, time: datetime.datetime, after_s: Floats
 ) -> tuple[Floats, Floats, NDArray[np.int64]]:
     """States of N satellites at K times after a time, by SGP4.
+
+    SGP4's error grows by 1 to 3 km a day from the elements' epoch in low orbits.
 
     Returns
     -------

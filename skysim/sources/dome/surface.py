@@ -148,7 +148,7 @@ class Surface(ABC):
         return nearest.center_m, nearest.semi_axes_m
 
 
-def unit_vectors(z: Floats, azimuth: Floats) -> Floats:
+def unit_vectors(z: NDArray[Any], azimuth: NDArray[Any]) -> Floats:
     """(N, 3) unit vectors at heights z = cos(angle from +z) and azimuths from +x toward +y, (N,) each."""
     ring = np.sqrt(1 - z**2)
     return np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])

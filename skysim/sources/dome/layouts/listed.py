@@ -116,8 +116,8 @@ def read_csv(path: Path) -> LedFile:
     brightness = [name for name in names if name in BRIGHTNESS]
     known = {*BRIGHTNESS, *FURTHER, *COLUMNS[0], *COLUMNS[1]}
     # Every column must be known and there once; one kind of place, and one of brightness at most.
-    unusable = chosen is None or len(brightness) > 1 or len({*names}) < len(names)
-    if unusable or {*names} - known or len(lines) < 2:
+    repeated = len(brightness) > 1 or len({*names}) < len(names)
+    if chosen is None or repeated or {*names} - known or len(lines) < 2:
         raise InputError(
             path,
             "not a list of LEDs",
