@@ -68,6 +68,7 @@ def reach_px(psf: Psf, camera: CameraConfig, radius_px: Any, sigma_px: Any) -> A
 
     `sigma_px` is that of a Gaussian blur beside the lens's own.
     """
+    # Lens, fading wings, disk, blur, and the pixel's half diagonal.
     radius, sigma = EXTENT[psf.kind](psf, camera)
     fade_px = FADE_PX if psf.kind in WINGED else 0.0
     return radius + fade_px + radius_px + CUT_SIGMA * np.hypot(sigma, sigma_px) + np.sqrt(0.5)
