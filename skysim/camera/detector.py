@@ -97,6 +97,7 @@ class Detector:
         """Draw the fixed pattern of a camera's chip; each kind has its own random stream."""
         config = camera.detector
         shape = (camera.height_px, camera.width_px)
+        # Each kind of pattern has its own stream, so that changing one leaves the others.
         prnu, dark, column = (random_stream(config.hardware_seed, key) for key in range(3))
         return cls(
             config,
@@ -165,6 +166,7 @@ def expose(
     config = detector.config
     if not config.noise:
         return expectation(light_e, exposure_s, detector)
+    # Seeds of the rows' streams, for counting and for read noise.
     count_seeds = noise.seeds(rng, len(light_e))
     read_seeds = noise.seeds(rng, len(light_e))
     constants = readout_constants(config, exposure_s)
@@ -211,6 +213,7 @@ def expectation(light_e: NDArray[Any], exposure_s: float, detector: Detector) ->
     DN = (PRNU light + dark t, after transfer loss, + column offset) / gain + offset.
     """
     config = detector.config
+    # Expected electrons of light and dark current.
     mean_e = light_e * detector.sensitivity + detector.dark_e_s * exposure_s
     charge_transfer.transfer_loss(mean_e, config.cti_parallel, config.cti_serial)
     return (mean_e + detector.column_offset_e) / config.gain_e_dn + config.offset_dn
@@ -251,6 +254,7 @@ class ReadoutConstants(NamedTuple):
 
 def readout_constants(config: DetectorConfig, exposure_s: float) -> ReadoutConstants:
     """The parameters that `_count_row` and `_read_row` need, in single precision."""
+    # In the order of the fields.
     values = (
         exposure_s,
         np.inf if config.blooming == "column" else config.full_well_e,
@@ -299,6 +303,7 @@ def _read_row(
     DN = round(e (1 - nonlinearity e / full_well) / gain + offset), clipped to 0 and the converter's maximum.
     """
     noise_row = memory.normals
+    # z of this row.
     noise.normal(noise_row, seed, memory)
     for x in range(row.size):
         e = min(row[x], constants.well_e) + offset_e[x] + constants.noise_e * noise_row[x]
@@ -370,6 +375,7 @@ def saturation_dn(config: DetectorConfig) -> float:
 
     The lower of the full well less three sigma of the read-out noise and the converter's maximum.
     """
+    # A full well reads less than this in 0.1 % of the pixels.
     well_e = config.full_well_e - 3 * hypot(config.read_noise_e, config.reset_noise_e)
     well_dn = (
         well_e * (1 - config.nonlinearity * well_e / config.full_well_e) / config.gain_e_dn

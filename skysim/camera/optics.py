@@ -61,6 +61,7 @@ class Optics:
     @classmethod
     def from_camera(cls, camera: CameraConfig) -> Optics:
         """The optics of a scene's camera, without seeing."""
+        # Collecting area of the round pupil.
         area_m2 = np.pi / 4 * camera.pupil_m**2
         fold = fold_r(camera.distortion)
         return cls(camera, float(area_m2 * camera.gray_transmission), fold, field_rad(camera, fold))
@@ -85,6 +86,7 @@ class Optics:
     def _distort(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         """Brown's distortion of (...,) tangents x and y; NaN beyond the fold."""
         r2 = x**2 + y**2
+        # Beyond the fold a direction would have a second image.
         scale = np.where(r2 < self.fold_r**2, radial(self.camera.distortion, r2), np.nan)
         shift_x, shift_y = tangential(self.camera.distortion, x, y)
         return x * scale + shift_x, y * scale + shift_y
@@ -94,6 +96,7 @@ class Optics:
 
         The cosine is the foreshortening of the pupil, V the vignetting.
         """
+        # Behind the camera nothing enters the pupil.
         cosine = np.maximum(cos_field, 0)
         config = self.camera.vignetting
         if config is None:
@@ -136,6 +139,7 @@ def tangential(distortion: tuple[float, ...], x: Floats, y: Floats) -> tuple[Flo
 def field_rad(camera: CameraConfig, fold_r: float) -> float:
     """Field angle of the chip's farthest corner, with the radial distortion inverted by interpolation."""
     corner_r = camera.corner_px / camera.focal_px
+    # The radius grows up to the fold, so a table inverts it.
     r = np.linspace(0, min(fold_r, 20 * corner_r), 4001)
     return float(np.arctan(np.interp(corner_r, r * radial(camera.distortion, r**2), r)))
 
@@ -148,5 +152,6 @@ def fold_r(distortion: tuple[float, ...]) -> float:
     k1, k2, _, _, k3 = distortion
     # A polynomial in 1 / r^2, whose leading coefficient is never 0; its largest real root is the least r.
     roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
+    # Real positive roots, up to rounding.
     extrema = roots.real[(abs(roots.imag) < 1e-9 * (1 + abs(roots.real))) & (roots.real > 1e-12)]
     return float(1 / np.sqrt(extrema.max())) if len(extrema) else float("inf")

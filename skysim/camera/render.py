@@ -132,6 +132,7 @@ def render(
     The numbers in the code are those of the module's steps.
     """
     rows = image.shape[0]
+    # Times from the first row's opening to the last row's end.
     t_s = sample_times(window.open_s, window.close_s(rows), trajectory)
     all_poses = poses(trajectory, mount, t_s)
     # 1. Coarse selection with a few poses, before the sources are projected at all of them.
@@ -243,6 +244,7 @@ def image_tracks(
     Returns their tracks, their mean distances (N,) in m (1 for stars) and mean field-angle cosines (N,).
     """
     # Motions of sources are given about mid-exposure.
+    # Positions and geometry at every time, then the rates.
     xy, distance_m, cos_out, cos_in = project(sources, optics, poses, t_s - t_s[len(t_s) // 2])
     rate_e_s = rates_e_s(sources, optics, emitter, distance_m, cos_out, cos_in)
     pulse_s = np.column_stack([sources.period_s, sources.start_s, sources.on_s])
@@ -263,6 +265,7 @@ def rates_e_s(
     A star gives strength T(theta) A; an LED its irradiance at the pupil, by the laws of its lobe and of distance, times
     A. T is the throughput at the field angle theta, A the collecting area.
     """
+    # Stars first; the rows of LEDs are replaced.
     throughput = optics.throughput(cos_in)
     rate = sources.strength * throughput
     is_led = sources.place[:, 3] > 0
@@ -317,6 +320,8 @@ def _pixels(sources: Sources, optics: Optics, direction_cam: Floats) -> Floats:
     """(..., N, 2) pixels of (..., N, 3) directions; lateral color displaces each along its radius."""
     xy_px = optics.project(direction_cam)
     if sources.chromatic is not None:
+        # Lateral color moves an image along its radius, in proportion to the distance from the
+        # center.
         camera = optics.camera
         xy_px += (xy_px - camera.center_px) * (sources.chromatic[:, 2:3] / camera.corner_px)
     return xy_px
@@ -399,6 +404,7 @@ def _directions_each(
     for k in range(len(ends) - 1):
         a = ends[k]
         b = ends[k + 1]
+        # One pose for the sources a to b.
         own = _directions(
             place[a:b], motion, after_s, normal[a:b], cam_from_lab[k : k + 1], camera_m[k : k + 1]
         )
@@ -414,6 +420,7 @@ def led_images(
     sources: Sources, optics: Optics, pose: Poses, emitter: Emitter
 ) -> DiskImages | None:
     """Geometric images of the LEDs' disks among N sources at one pose, NaN for stars; None if all are stars."""
+    # Only LEDs with a size.
     led = np.flatnonzero(sources.radius_m * sources.place[:, 3] > 0)
     if not len(led):
         return None
@@ -566,6 +573,7 @@ def _draw(
     for i in numba.prange(len(boxes)):
         x0, x1, y0, y1 = boxes[i]
         if x1 > x0 and y1 > y0:
+            # Each patch is a part of one buffer.
             patch = buffer[starts[i] : starts[i + 1]].reshape(y1 - y0, x1 - x0)
             _expose_source(
                 patch,
@@ -769,6 +777,7 @@ def _speed(tracks: Tracks, n: int, begin_s: float, end_s: float) -> float:
 @jit
 def _length(tracks: Tracks, n: int, begin_s: float, end_s: float) -> float:
     """Path length of a source's image between two times, px, as a sum of chords between samples."""
+    # As many chords as samples, eight at least.
     chords = max(int(np.ceil((end_s - begin_s) / tracks.step_s)), 8)
     total = 0.0
     x, y, _ = _interpolate(tracks, n, begin_s)

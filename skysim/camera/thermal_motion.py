@@ -36,6 +36,7 @@ def linear(config: LinearTemperatureConfig, hours: float) -> float:
 
 def sine(config: SineTemperatureConfig, hours: float) -> float:
     """A daily or other cycle: mean + amplitude sin(2 pi t / period + phase)."""
+    # The phase in turns.
     turns = hours * HOUR_S / config.period_s + config.phase_deg / 360
     return config.mean_c + config.amplitude_c * float(np.sin(2 * np.pi * turns))
 

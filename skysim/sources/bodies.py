@@ -64,6 +64,7 @@ def _flux_v0_e_s_m2(albedo: Albedo, band: Band) -> float:
 
 def reflected_v0(wavelength_m: Floats, albedo: Albedo) -> Floats:
     """Spectral photon flux of a body of V = 0, in the units of `black_body_v0`."""
+    # Relative to V, in which the magnitude is given.
     relative = np.array(albedo) / albedo[1]
     return np.asarray(
         black_body_v0(wavelength_m, temperature_k(*SUN))
@@ -174,7 +175,9 @@ class BodyLight:
         """(M, 3) unit vectors toward points (M, 2) of the disc, whose x points to the Sun, in units of its radius."""
         x_axis = self.place.toward_sun
         center = self.place.direction
+        # From the disc's plane to directions: x toward the Sun, y across.
         offset = xy @ np.stack([x_axis, np.cross(center, x_axis)])
+        # On the tangent plane at the disc's center.
         vectors = center + np.tan(self.radius_rad) * offset
         return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
@@ -206,6 +209,7 @@ def body_light(name: str, at: Place, tt_jd: float, band: Band) -> BodyLight:
     """The light of a body at its place."""
     body = BODIES[name]
     v_mag = magnitude(name, at, tt_jd)
+    # Earthshine is modeled for the Moon alone.
     earthshine = earthshine_fraction(at) if name == "moon" else 0.0
     flux = reflected_flux_e_s_m2(v_mag, ALBEDO[name], band)
     radius_rad = float(np.arcsin(body.radius_km / at.distance_km))

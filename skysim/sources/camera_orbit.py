@@ -63,6 +63,7 @@ class CircularOrbit:
         """Rates of the argument of latitude and of the node."""
         radius_m = EARTH_RADIUS_M + self.config.altitude_m
         inclination = np.radians(self.config.inclination_deg)
+        # Mean motion, and the size of J2's effect.
         n = np.sqrt(EARTH_MU_M3_S2 / radius_m**3)
         k = 1.5 * EARTH_J2 * (EARTH_RADIUS_M / radius_m) ** 2
         argument = n * (1 + k * (3 - 4 * np.sin(inclination) ** 2))
@@ -84,6 +85,7 @@ class CircularOrbit:
             ],
             axis=-1,
         )
+        # Position and velocity in the orbital plane.
         radius_m = EARTH_RADIUS_M + config.altitude_m
         cosine = np.cos(along)[:, None]
         sine = np.sin(along)[:, None]
@@ -105,6 +107,7 @@ class TleOrbit:
         position_m, velocity_m_s = np.empty((2, len(after_s), 3))
         day = np.round(after_s / DAY_S)
         for one in np.unique(day):
+            # One matrix to GCRS axes for each day, that of the middle of its times.
             rows = np.flatnonzero(day == one)
             middle_s = float(after_s[rows].mean())
             time = self.start + datetime.timedelta(seconds=middle_s)
@@ -233,10 +236,12 @@ def hidden_by_earth(
     place = observer_m * TO_SPHERE
     along = direction * TO_SPHERE
     length = np.linalg.norm(along, axis=-1)
+    # Nearest point of the line to the center, and the center's distance squared.
     inward = -(along @ place if place.ndim == 1 else np.sum(along * place, axis=-1)) / length
     square = np.sum(place * place, axis=-1)
     # The line meets the sphere, ahead and before the point; the last term is for observers on or below it.
     below = square - inward**2 < np.minimum(1.0, square * (1 - 1e-12))
+    # Where the line enters the sphere.
     entry = inward - np.sqrt(np.maximum(1 - square + inward**2, 0.0))
     return np.asarray((inward > 0) & below & (np.maximum(entry, 0.0) < distance_m * length))
 
@@ -250,6 +255,7 @@ def sunlit_fraction(place_m: Floats, sun_m: Floats) -> Floats:
     low orbit) are left out. Source: Montenbruck & Gill 2000, Satellite Orbits, section 3.4.2.
     """
     to_sun = sun_m - place_m
+    # Elevation above the limb in units of the Sun's angular radius.
     h_rad = limb_elevation_rad(place_m, to_sun)
     h = np.clip(h_rad * np.linalg.norm(to_sun, axis=-1) / SUN_RADIUS_M, -1, 1)
     return np.asarray(0.5 + (h * np.sqrt(1 - h**2) + np.arcsin(h)) / np.pi)
@@ -264,6 +270,7 @@ def limb_elevation_rad(place_m: Floats, direction: Floats) -> Floats:
     toward = direction * TO_SPHERE
     radius = np.linalg.norm(place, axis=-1)
     length = np.linalg.norm(toward, axis=-1)
+    # Elevation above the plane across the vertical, then the dip of the limb.
     above_horizon = np.arcsin(np.clip(np.sum(place * toward, axis=-1) / (radius * length), -1, 1))
     return np.asarray(above_horizon + np.arccos(1 / np.maximum(radius, 1.0)))
 

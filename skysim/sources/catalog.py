@@ -120,6 +120,7 @@ def write(
     """
     columns = tuple(columns)
     text_columns = ("source", *extra)
+    # ECSV's description of the columns: numbers, then texts.
     datatype = [
         {"name": c.name}
         | ({"unit": c.unit} if c.unit else {})
@@ -127,6 +128,7 @@ def write(
         for c in columns
     ] + [{"name": name, "datatype": "string"} for name in text_columns]
     head = {"delimiter": ",", "datatype": datatype}
+    # The header is YAML in comments, its entries in the order of `head`.
     comment = yaml.safe_dump(head, sort_keys=False, default_flow_style=None)
     comment += yaml.safe_dump({"meta": meta | {"rows": len(rows)}}, sort_keys=False, width=105)
     with (
@@ -173,6 +175,7 @@ def read(name_or_path: str | Path) -> Catalog:
     path = catalog_path(name_or_path)
     meta, lines = read_meta_and_lines(path)
     header = lines[0].split(",")
+    # The scatter is an optional column.
     names = [*NUMBERS, SCATTER.name] if SCATTER.name in header else NUMBERS
     try:
         table = np.loadtxt(
@@ -180,6 +183,7 @@ def read(name_or_path: str | Path) -> Catalog:
         )
     except ValueError as error:
         raise catalog_error(path, f"damaged ({str(error).splitlines()[0]})") from error
+    # A truncated file has fewer rows than its header says.
     if len(table) != meta["rows"]:
         raise catalog_error(path, f"damaged ({len(table)} stars of {meta['rows']})")
     hip, ra, dec, pm_ra, pm_dec, parallax, v_mag, b_v, v_i, *scatter = np.ascontiguousarray(table.T)
@@ -206,6 +210,7 @@ def read_meta_and_lines(path: Path) -> tuple[dict[str, Any], list[str]]:
         raise catalog_error(path, "not found") from error
     except (OSError, UnicodeDecodeError) as error:
         raise catalog_error(path, f"unreadable ({error})") from error
+    # Comments end where the column names begin.
     header = next((n for n, line in enumerate(lines) if not line.startswith("#")), len(lines))
     # The header must state what `read` needs.
     try:
@@ -239,6 +244,7 @@ def info(name_or_path: str | Path) -> dict[str, Any]:
     path = catalog_path(name_or_path)
     meta, lines = read_meta_and_lines(path)
     stars = read(path)
+    # Whole magnitudes up to the faintest star.
     faintest = int(np.ceil(stars.v_mag.max())) if len(stars) else 0
     source = lines[0].split(",").index("source")
     return {

@@ -224,7 +224,7 @@ def lit_place(direction: Floats, from_sun_km: Floats, to_body_km: Floats) -> Pla
     """The place with the geometry of its light.
 
     With s = -from_sun / |from_sun| toward the Sun and o = -to_body / |to_body| toward the observer, the phase angle is
-    that between s and o, and the bright limb lies along the part of s perpendicular to o.
+    that between s and o, and the bright limb is along the part of s perpendicular to o.
     """
     to_observer = -to_body_km / np.linalg.norm(to_body_km)
     distance_km = float(np.linalg.norm(from_sun_km))

@@ -48,6 +48,7 @@ class Pointing(NamedTuple):
         """(K, 3) boresights for these states of the camera."""
         if self.law == "inertial":
             return np.broadcast_to(self.direction, states.position_m.shape)
+        # Local axes: up, left of the flight direction, ahead.
         up = unit(states.position_m)
         left = unit(np.cross(states.position_m, states.velocity_m_s))
         ahead = np.cross(left, up)
@@ -106,6 +107,7 @@ def sample(
     watch
         Called with the numbers of times that are done and in all
     """
+    # The stars in a field are looked up in a tree.
     tree = cKDTree(stars)
     parts = list[SkySamples]()
     places_m = {name: place_spline(name, start, float(t_s[-1])) for name in ("sun", "moon")}
@@ -133,6 +135,7 @@ def place_spline(name: str, start: datetime.datetime, last_s: float) -> CubicSpl
     """A body's place (3,) from the Earth's center in m, as a spline in seconds since the start."""
     ephemeris = load_ephemeris()
     first_jd = tt_jd(start)
+    # One node more at either end, away from the spline's edges.
     nodes_s = np.arange(-NODE_S, last_s + 2 * NODE_S, NODE_S)
     dates = first_jd + nodes_s / DAY_S
     earth_km = [ephemeris.position_km("earth", jd) for jd in dates]

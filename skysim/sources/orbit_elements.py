@@ -163,6 +163,7 @@ def satellite(path: str, n: int, fields: Mapping[str, Any]) -> tuple[int, str, A
 
     record = Satrec()
     texts = {key: str(value) for key, value in fields.items() if value not in (None, "")}
+    # Elements that SGP4 needs.
     missing = [key for key in REQUIRED if key not in texts]
     if missing:
         raise InputError(path, f"{missing[0]} is missing", where=Where(path, n, "message"))
@@ -196,16 +197,12 @@ def usable(path: str, n: int, name: str, record: Any) -> tuple[int, str, Any]:
     return int(record.satnum), name or str(record.satnum), record
 
 
-def age_days(elements: MeanElements, time: datetime.datetime) -> Floats:
-    """(N,) days from the elements' epochs to a time; SGP4's error grows by 1 to 3 km a day in low orbits."""
-    epochs = [record.jdsatepoch - J2000_JD + record.jdsatepochF for record in elements.records]
-    return utc_days(time) - np.array(epochs)
-
-
 def gcrs_states(
     elements: MeanElements, time: datetime.datetime, after_s: Floats
 ) -> tuple[Floats, Floats, NDArray[np.int64]]:
     """States of N satellites at K times after a time, by SGP4.
+
+    SGP4's error grows by 1 to 3 km a day from the elements' epoch in low orbits.
 
     Returns
     -------
@@ -231,6 +228,7 @@ def gcrs_from_teme(time: datetime.datetime) -> Floats:
     axes differ from the celestial intermediate system by the Earth rotation angle; GCRS axes follow by precession and
     nutation of IAU 2006/2000A. Source: Vallado et al. 2006, appendix C; IERS Conventions 2010, chapter 5.
     """
+    # The difference of both angles about the pole.
     ut1 = ut1_jd(time)
     angle = erfa.gmst82(ut1, 0.0) - erfa.era00(ut1, 0.0)
     return np.asarray(erfa.c2i06a(tt_jd(time), 0.0).T @ erfa.rz(angle, np.eye(3)))
@@ -267,6 +265,7 @@ class OrbitEphemeris(NamedTuple):
 
     def at(self, after_s: Floats) -> tuple[Floats, Floats]:
         """Positions (K, 3) in m and velocities in m/s at K times. Raises InputError outside the samples."""
+        # No extrapolation: the polynomials diverge.
         first, last = self.t_s[[0, -1]]
         if after_s.min() < first or after_s.max() > last:
             worst = after_s.min() if after_s.min() < first else after_s.max()
@@ -300,6 +299,7 @@ def read_oem(path: str, start: datetime.datetime) -> OrbitEphemeris:
     # 2.
     t_s, samples = parts[0]
     for t, more in parts[1:]:
+        # The same sample at the seam of two segments.
         if t[0] == t_s[-1] and np.linalg.norm(more[0, :3] - samples[-1, :3]) < SAME_M:
             t = t[1:]
             more = more[1:]
@@ -374,6 +374,7 @@ def segment_samples(
         )
     lines = [n for n, _ in segment.data]
     rows = [words[1:] for _, words in segment.data]
+    # Nine numbers with accelerations, else six.
     width = 9 if len(rows[0]) == 9 else 6
     numbers = 1e3 * to_numbers(path, lines, rows, width)
     t_s = seconds_since(path, lines, [words[0] for _, words in segment.data], start, system)

@@ -104,6 +104,7 @@ class Band:
     def grid_m(self) -> Floats:
         """Wavelengths in steps of a nanometer, and the curve's own samples, because it has kinks there."""
         first, last = self.wavelength_m[[0, -1]]
+        # Whole nanometers within the curve.
         even = np.arange(math.ceil(first / STEP_M), math.floor(last / STEP_M) + 1) * STEP_M
         return np.union1d(even[(even > first) & (even < last)], self.wavelength_m)
 
@@ -177,6 +178,7 @@ def _read_curve(path: Path, _changed_ns: int = 0, largest: float = 1.0) -> Band:
         raise InputError(
             path, f"not a response curve ({error})", "two columns, wavelength_nm and response"
         ) from None
+    # What every curve must satisfy; NaN fails each test.
     rising = np.all(np.diff(wavelength_nm, prepend=0.0) > 0) and wavelength_nm[-1] <= LONGEST_NM
     within = np.all((response >= 0) & (response <= largest) & np.isfinite(response))
     if not (rising and within and np.any(response)):
@@ -220,10 +222,12 @@ def complete_colors(b_v: float | Floats, v_i: float | Floats) -> tuple[Floats, F
         sequence's ends (a V-I of 9) are clipped.
     """
     b_v, v_i = np.broadcast_arrays(np.asarray(b_v, dtype=float), np.asarray(v_i, dtype=float))
+    # Marks of missing colors.
     neither = (b_v == 0) & (v_i == 0)
     no_b_v = np.isnan(b_v) | neither
     no_v_i = np.isnan(v_i) | neither | ((v_i == 0) & (np.abs(b_v) > 0.1))
     stars = stellar_sequence()
+    # The sequence gives each color from the other one.
     from_b_v = np.where(no_b_v, SUN[1], np.interp(b_v, stars.b_v, stars.v_i))
     from_v_i = np.where(no_v_i, SUN[0], np.interp(v_i, stars.v_i, stars.b_v))
     return (
@@ -265,12 +269,14 @@ def black_body_v0(wavelength_m: Floats, temperature_k: Floats) -> Floats:
     Floats
         (..., M)
     """
+    # One more axis, for the wavelengths.
     kelvin = np.asarray(temperature_k, dtype=float)[..., None]
 
     # Planck's law up to a constant factor, which cancels against the mean in V.
     def power(wavelength_m: Floats) -> Floats:
         return np.asarray(wavelength_m**-5.0 / np.expm1(HC_K_M / (wavelength_m * kelvin)))
 
+    # V's zero point fixes the mean of the power in V.
     johnson_v = _read_curve(DATA / "bands" / "johnson_v.csv")
     mean = johnson_v.integral(power) / johnson_v.integral(np.ones_like)
     return np.asarray(power(wavelength_m) * wavelength_m / HC_J_M * (V0_W_M3 / mean)[..., None])
@@ -279,6 +285,7 @@ def black_body_v0(wavelength_m: Floats, temperature_k: Floats) -> Floats:
 @lru_cache(maxsize=64)
 def _black_bodies(band: Band) -> tuple[Floats, Floats]:
     """(256,) inverse temperatures, and log10 of the photo-electrons s^-1 m^-2 at V = 0, a smooth function of them."""
+    # Even steps of 1/T, in which the logarithm of the flux is smooth.
     range_k = stellar_sequence().temperature_k[[0, -1]]
     inverse_k = np.linspace(1 / range_k[0], 1 / range_k[1], 256)
     return inverse_k, np.log10(
@@ -322,6 +329,7 @@ def star_chromatic(b_v: float | Floats, v_i: float | Floats, band: Band) -> Floa
     if band.chromatic is None:
         return None
     inverse_k, moments = _black_body_moments(band)
+    # Each moment is interpolated in 1/T.
     own_k = 1 / temperature_k(b_v, v_i)
     return np.stack([np.interp(own_k, inverse_k, column) for column in moments.T], axis=-1)
 
@@ -388,6 +396,7 @@ def synthetic_mag(
 
     m = -2.5 log10(e- of the star / e- of a G2 star of V = 0). Shapes as in `star_flux_e_s_m2`.
     """
+    # V is the zero point of a G2 star by definition.
     ratio = star_flux_e_s_m2(v_mag, b_v, v_i, band) / star_flux_e_s_m2(0.0, *SUN, band)
     return np.asarray(-2.5 * np.log10(ratio))
 
@@ -429,6 +438,7 @@ def led_strength_e_s_sr(
     InputError
         For a line outside the visible range, which has no candelas.
     """
+    # Candela are lumens per steradian.
     watts_sr = np.asarray(intensity_cd, dtype=float) / lumens_per_watt(spectrum, fwhm_m)
     return radiant_strength_e_s_sr(watts_sr, spectrum, band, fwhm_m)
 
@@ -447,6 +457,7 @@ def radiant_strength_e_s_sr(
         )
         electrons_per_joule = electrons / power.integral(np.ones_like)
     elif fwhm_m is None:
+        # A line has one wavelength.
         electrons_per_joule = band.response_at(spectrum) * spectrum / HC_J_M
     else:
         gaussian = colored(spectrum, fwhm_m)
@@ -481,6 +492,7 @@ def lumens_per_watt(spectrum: Spectrum, fwhm_m: float | None = None) -> float:
     InputError
         For a colored LED whose peak is where V is zero, and for a measured spectrum without light there.
     """
+    # The eye's response in daylight.
     photopic = _read_curve(DATA / "bands" / "photopic.csv")
     if isinstance(spectrum, str):
         power = measured(spectrum)
@@ -522,5 +534,6 @@ def snr(
         Read noise R per pixel
     """
     signal_e = np.asarray(signal_e, dtype=float)
+    # Variances of signal, background and read noise add.
     noise = np.sqrt(signal_e + area_px * (background_e + np.square(read_noise_e)))
     return np.asarray(signal_e / noise)

@@ -133,7 +133,9 @@ def sources(
     observer_velocity_m_s
         As in `apparent`
     """
+    # Only the stars that are drawn are transformed.
     selected = stars.to_limit(limit_mag)
+    # A catalog without stars to this limit has no directions to compute.
     direction = np.zeros((0, 3))
     if len(selected):
         direction = lab_from_icrs.apply(apparent(selected, time, observer_velocity_m_s))

@@ -69,6 +69,7 @@ def faint_starlight_s10(galactic_latitude_deg: Floats, fainter_than_mag: float) 
     slope = np.interp(latitude, LATITUDE_DEG, SLOPE)
     # The parabola's peak s / 2c, from which the integral is an error function.
     peak = slope / (2 * CURVATURE)
+    # The part of the integral beyond the limit.
     beyond = erfc(np.sqrt(CURVATURE) * (fainter_than_mag - 10 - peak))
     return np.asarray(
         np.exp(ln_light + CURVATURE * peak**2) * np.sqrt(np.pi / (4 * CURVATURE)) * beyond
@@ -137,6 +138,7 @@ def uniform_glow(config: UniformGlowConfig, view: ViewingGeometry) -> Floats:
 def sky_glow(config: SkyGlowConfig, view: ViewingGeometry) -> Floats:
     """Light of the night sky: its radiance is linear in the angles along the image axes, and never below zero."""
     x, y, z = view.toward_cam.T
+    # Gradient along x, then along y.
     slope = np.degrees(np.arctan2(x, z)) * config.gradient_per_deg[0]
     slope = slope + np.degrees(np.arctan2(y, z)) * config.gradient_per_deg[1]
     radiance = float(sky_radiance_e_s_m2_sr(config.mag_arcsec2, view.band))

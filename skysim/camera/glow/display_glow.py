@@ -96,6 +96,7 @@ def panel_radiance_e_s_m2_sr(
     """
     assert isinstance(config.layout, layouts.LcdConfig)
     panel = panel_surface(config.layout, build_surface(config.surface))
+    # Directions that meet the panel.
     hits_panel = np.isfinite(panel.meet(camera_m, toward_lab)[:, 0])
     # Directions that miss it get a harmless cosine.
     cos_emission = np.where(hits_panel, -toward_lab @ panel.inward(panel.center_m[None])[0], 1.0)
@@ -148,6 +149,7 @@ def collimated_radiance_e_s_m2_sr(
     """
     # A star of brightest_mag is a block of white pixels, behind the collimator a parallel beam for
     # each.
+    # Flux of one white pixel.
     white_e_s_m2 = float(star_flux_e_s_m2(config.brightest_mag, *SUN, band)) / config.block**2
     cos_field = np.maximum(toward_lab[:, 2], 1e-9)
     half_extent = np.array(config.pixels) * config.pitch_m / 2 / config.focal_length_m

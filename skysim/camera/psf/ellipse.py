@@ -68,6 +68,7 @@ def reach_px(psf: Psf, camera: CameraConfig, radius_px: Any, sigma_px: Any) -> A
 
     `sigma_px` is that of a Gaussian blur beside the lens's own.
     """
+    # Lens, fading wings, disk, blur, and the pixel's half diagonal.
     radius, sigma = EXTENT[psf.kind](psf, camera)
     fade_px = FADE_PX if psf.kind in WINGED else 0.0
     return radius + fade_px + radius_px + CUT_SIGMA * np.hypot(sigma, sigma_px) + np.sqrt(0.5)
@@ -91,7 +92,7 @@ def ellipse_box(psf: Psf, camera: CameraConfig, half: int) -> EllipseBox:
     waves = min(ceil(passed * size) + 1, MAX_WAVES)
     samples = max(2, min(ceil(per_wave * passband(psf, camera, 0.0, 1e-3)), 3072 // size))
     f = np.arange(waves) / size
-    # fy > 0 stands for -fy too; fx = 0 is in both halves.
+    # fy > 0 represents -fy too; fx = 0 is in both halves.
     weight = np.outer(np.where(f > 0, 1.0, 0.5), np.where(f > 0, 2.0, 1.0)) / size**2
     weight *= np.outer(np.sinc(f), np.sinc(f))
     # Lens and pixel at (fx, fy) and at (-fx, fy).

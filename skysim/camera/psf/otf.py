@@ -93,6 +93,7 @@ def blur(sigma_px: float, fx: Floats, fy: Floats) -> Floats:
 
 def uniform_disk(radius_px: float, fx: Floats, fy: Floats) -> Floats:
     """Transfer function of a uniform disk: 2 J1(z) / z, z = 2 pi a f."""
+    # The limit at 0 is 1.
     z = np.maximum(2 * np.pi * radius_px * np.hypot(fx, fy), 1e-9)
     return np.asarray(2 * special.j1(z) / z)
 
@@ -107,6 +108,7 @@ def moffat(psf: MoffatPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -
 
     The Hankel transform of (beta - 1) / (pi alpha^2) (1 + r^2 / alpha^2)^-beta (Moffat 1969, A&A 3, 455).
     """
+    # K_n diverges at 0, where the product's limit is 1.
     n = psf.beta - 1
     z = np.maximum(2 * np.pi * moffat_alpha_px(psf) * np.hypot(fx, fy), 1e-6)
     return np.asarray(2 * (z / 2) ** n * special.kv(n, z) / special.gamma(n))
@@ -119,6 +121,7 @@ def moffat_alpha_px(psf: MoffatPsfConfig) -> float:
 
 def airy(psf: AiryPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Floats:
     """Diffraction at a round pupil: (2/pi) (acos nu - nu sqrt(1 - nu^2)), nu = lambda N f / pixel (Goodman 6-32)."""
+    # Frequency over the cut-off, beyond which nothing passes.
     nu = np.minimum(airy_unit_px(psf, camera) * np.hypot(fx, fy), 1.0)
     pupil = 2 / np.pi * (np.arccos(nu) - nu * np.sqrt(1 - nu**2))
     return np.asarray(pupil * blur(psf.sigma_px, fx, fy))
@@ -161,6 +164,7 @@ def measured(psf: MeasuredPsfConfig, camera: CameraConfig, fx: Floats, fy: Float
 def cell_positions_px(psf: MeasuredPsfConfig) -> tuple[Floats, Floats]:
     """x of a measured table's columns and y of its rows in pixels, from its center of gravity."""
     cells = read_cells(psf.file)
+    # A table's cells are even steps; its center of gravity is the origin.
     position_px = np.arange(len(cells)) / psf.oversampling
     center_x = cells.sum(axis=0) @ position_px
     center_y = cells.sum(axis=1) @ position_px
@@ -216,6 +220,7 @@ def cell_response(u: Floats) -> Floats:
     four = np.sinc(4 * u)
     # Both limits are 1: sinc at u = 0, and no response where a cell's integral passes nothing.
     keys = (3 * one**2 - 3 * two**2 - two + four) / np.maximum((np.pi * u) ** 2, 1e-300)
+    # The cell's own integral is divided out.
     ratio = keys / np.where(np.abs(one) > 1e-6, one, np.inf)
     return np.asarray(np.where(np.abs(u) < 1e-4, 1.0, ratio))
 
@@ -232,6 +237,7 @@ PSFS: dict[str, Callable[[Any, CameraConfig, Floats, Floats], Otf]] = {
 def moffat_reach_px(psf: MoffatPsfConfig, camera: CameraConfig) -> float:
     """Radius where a Moffat profile falls below WING_LEVEL of its image's peak pixel; at most 64 px or four alpha."""
     alpha = moffat_alpha_px(psf)
+    # A sharp profile's peak pixel has at most all of the light.
     level = WING_LEVEL / max(1.0, (psf.beta - 1) / (np.pi * alpha**2))
     return float(min(alpha * np.sqrt(level ** (-1 / psf.beta) - 1), max(64.0, 4 * alpha)))
 

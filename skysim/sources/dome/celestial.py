@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,8 +144,9 @@ def merge_close_stars(stars: ProjectedStars, count: int, separation_m: float) ->
     A merged LED is between the places of its stars and may be too near a third star, so merging repeats until no two
     LEDs are too near.
     """
-    columns: list[Any] = [column[:count] for column in stars]
-    selected = ProjectedStars(*columns)
+    selected = ProjectedStars(
+        stars.hip[:count], stars.v_mag[:count], stars.shown_mag[:count], stars.place_m[:count]
+    )
     while True:
         target = merge_targets(selected.place_m, separation_m)
         if np.all(target == np.arange(len(target))):

@@ -97,7 +97,7 @@ class Clocks:
         n = sources.clock
         rate = (1 + self.offset + self.drift_s * t_s)[n]
         tau_s = (self.on_s + t_s * (1 + self.offset + self.drift_s * t_s / 2))[n]
-        # In the controller's time t_s lies (tau - start) mod period after the beginning of a pulse.
+        # In the controller's time t_s is (tau - start) mod period after the beginning of a pulse.
         since_s = np.mod(tau_s - sources.start_s, sources.period_s)
         return replace(
             sources,

@@ -111,6 +111,7 @@ def irradiance_e_s_m2(
     distance_m
         Distances d
     """
+    # Light leaves the front of the LED and enters the front of the lens.
     facing = (np.asarray(cos_emission) > 0) & (np.asarray(cos_incidence) > 0)
     emitted = LOBES[emitter.lobe.kind](emitter.lobe, cos_emission)
     return np.where(
@@ -145,6 +146,7 @@ def color_factors(led: LedConfig, band: Band, normal: Floats) -> Floats:
 def peaks_m(led: LedConfig, normal: Floats) -> tuple[Floats, Floats]:
     """(N,) peak wavelengths of LEDs from standard normal numbers, and COLORS wavelengths that span them."""
     assert not isinstance(led.spectrum, str)
+    # Nominal peak plus scatter.
     peak_m = led.spectrum + scaled_errors(led.color_scatter_m, normal)
     return peak_m, np.linspace(peak_m.min(), peak_m.max(), COLORS)
 
@@ -179,6 +181,7 @@ def aging_factors(aging: AgingConfig | None, normal: Floats) -> Floats:
     """
     if aging is None:
         return np.ones(len(normal))
+    # a t of an LED with the nominal rate.
     nominal = aging.hours / aging.life_hours * log(1 / LIFE_SHARE)
     return np.exp(-nominal * strength_factors(aging.scatter, normal))
 
@@ -261,6 +264,7 @@ def sequential(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> 
     order = np.argsort(controller, kind="stable")
     slot = np.empty(count)  # number of the LED's slot on its controller: 0, 1, ...
     slot[order] = np.arange(count) - np.repeat(np.cumsum(led_count) - led_count, led_count)
+    # A cycle is as many slots as the controller has LEDs.
     cycle_s = led_count * np.float64(drive.slot_s)
     start_s = rng.uniform(0, cycle_s)[controller] + slot * drive.slot_s
     return PulseTrains(
@@ -279,6 +283,7 @@ def refresh(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> Pul
     drive = led.drive
     ones = np.ones(len(inputs.level))
     assert isinstance(drive, RefreshConfig)
+    # One frame of the panel.
     period_s = 1 / drive.rate_hz
     return PulseTrains(
         ones * period_s,

@@ -130,11 +130,13 @@ class Surface(ABC):
 
     def samples_m(self) -> Floats:
         """(N, 3) points of the surface within its rim, on rings of equal solid angle as seen from the bearing."""
+        # Rings of equal steps in z have equal solid angles.
         min_z = np.cos(min(self.rim.half_rad, np.pi / 2))
         ring_z = 1 - (np.arange(RINGS) + 0.5) / RINGS * (1 - min_z)
         sectors = np.arange(SECTORS) * (2 * np.pi / SECTORS)
         z, azimuth = (grid.ravel() for grid in np.meshgrid(ring_z, sectors, indexing="ij"))
         rays = self.lab_from_own.apply(unit_vectors(z, azimuth))
+        # Keep the rays that meet the surface within its rim.
         met = self.meet(np.zeros(3), rays)
         return met[np.isfinite(met[:, 0])]
 
@@ -148,7 +150,7 @@ class Surface(ABC):
         return nearest.center_m, nearest.semi_axes_m
 
 
-def unit_vectors(z: Floats, azimuth: NDArray[np.floating]) -> Floats:
+def unit_vectors(z: NDArray[Any], azimuth: NDArray[Any]) -> Floats:
     """(N, 3) unit vectors at heights z = cos(angle from +z) and azimuths from +x toward +y, (N,) each."""
     ring = np.sqrt(1 - z**2)
     return np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
@@ -202,6 +204,7 @@ class Ellipsoid(Surface):
 
     def nearest_ellipsoid(self) -> FittedEllipsoid:
         """The ellipsoid itself; a fit if it is tilted and not a sphere."""
+        # A sphere is the same at every tilt.
         if self.lab_from_own.magnitude() > 0 and np.ptp(self.semi_axes_m) > 0:
             return fit_ellipsoid(self.samples_m())
         return FittedEllipsoid(self.center_m, self.semi_axes_m, 0.0)
@@ -232,6 +235,7 @@ class Plane(Surface):
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
         """As `Surface.distance`; NaN for rays that point down."""
+        # Only rays that point up meet the panel.
         distance = -start_m[2] / np.where(along[:, 2] > 0, along[:, 2], np.nan)
         return np.where(distance > 0, distance, np.nan)
 
@@ -316,6 +320,7 @@ class Shell:
         """(N,) radius over (N, 3) unit vectors, and (N, 3) its gradient on the unit sphere."""
         ring = np.hypot(unit[:, 0], unit[:, 1])
         angle = np.arctan2(ring, unit[:, 2])
+        # dr / d(angle) between apex and base.
         slope = -self.inner_fraction * (self.thickness_m[1] - self.thickness_m[0]) / self.base_rad
         at_apex = self.max_m - self.inner_fraction * self.thickness_m[0]
         radius = at_apex + slope * np.minimum(angle, self.base_rad)
@@ -354,6 +359,7 @@ class Radial(Surface):
         distance_m = np.where(distance_m > 0, distance_m, np.finfo(float).tiny)
         unit = own_m / distance_m
         radius, slope = self.radius.evaluate(unit)
+        # The gradient of r across x.
         across = slope - np.sum(slope * unit, axis=1, keepdims=True) * unit
         return distance_m[:, 0] - radius, unit - across / distance_m
 
@@ -395,6 +401,7 @@ class Radial(Surface):
             low = np.where(level < 0, distance, low)
             high = np.where(level > 0, distance, high)
             # 3.
+            # Derivative of the level along the ray.
             slope = np.sum(gradient * along, axis=1)
             step = distance - level / np.where(slope > 0, slope, np.nan)
             newton = (step > low) & (step < high) & (np.abs(level) <= before / 2)
@@ -412,6 +419,7 @@ def pose_and_rim(config: light.SurfaceConfig, center_m: float) -> dict[str, Any]
     """
     height_m = getattr(config, "rim_height_m", None)
     half_deg = getattr(config, "rim_deg", None)
+    # The rim's height from the surface's center.
     lowest_m = -math.inf if height_m is None else height_m - center_m
     half_rad = math.pi if half_deg is None else math.radians(half_deg)
     return {
@@ -470,6 +478,7 @@ def surveyed(config: light.SurveyedSurfaceConfig) -> Surface:
     InputError
         For points that are far from a smooth surface, or do not reach the rim.
     """
+    # A bad fit means wrong points, units or degree.
     fit = point_cloud.fit(point_cloud.read(config.file, config.unit), config.degree, config.file)
     if fit.rms_m > config.rms_limit_m:
         raise InputError(

@@ -68,11 +68,10 @@ def patch_boards(
     if config.boards:
         boards, holes, level = listed_boards(config, surface)
     else:
-        boards, holes, level = spread_boards(config, surface, rng)
+        boards, holes = spread_boards(config, surface, rng)
+        level = rng.choice(config.pwm_levels, sum(map(len, holes)))
     board = np.repeat(np.arange(len(holes)), [len(board_holes) for board_holes in holes])
     hole = np.concatenate(holes)
-    if level is None:
-        level = rng.choice(config.pwm_levels, len(board))
     # 2.
     glue = random_stream(config.hardware_seed, GLUE_STREAM)
     if config.glue_tilt_deg:
@@ -91,8 +90,8 @@ def patch_boards(
 
 def spread_boards(
     config: PatchBoardsConfig, surface: Surface, rng: np.random.Generator
-) -> tuple[Boards, list[Ints], None]:
-    """Boards all over the cap as seen from the bearing, the holes that each uses, and no levels.
+) -> tuple[Boards, list[Ints]]:
+    """Boards all over the cap as seen from the bearing, and the holes that each uses.
 
     On a spiral each board has a random orientation; on a grid all are aligned with its rows.
     """
@@ -113,7 +112,7 @@ def spread_boards(
         rng.permutation(HOLES)[: rng.integers(config.lit[0], config.lit[1] + 1)]
         for _ in range(len(rotation))
     ]
-    return boards, holes, None
+    return boards, holes
 
 
 def grid(spacing_rad: float, half_angle_rad: float) -> Floats:

@@ -64,12 +64,14 @@ def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -
         coordinates, level, number = read_csv(Path(config.file))
     else:
         coordinates = np.array(config.positions_m or config.directions_deg)
+    # Places are used as they are; directions are projected from the bearing.
     directions = coordinates if coordinates.shape[1] == 3 else directions_from_angles(coordinates)
     check_cap(key, directions, config.cap_deg)
     place_m = (
         coordinates if coordinates.shape[1] == 3 else project_from_bearing(surface, directions)
     )
     check_on_surface(key, surface, place_m)
+    # Without levels every LED is at full brightness.
     level = level if level is not None and len(level) else np.ones(len(place_m))
     placed = on_surface(surface, place_m, level)
     placed = placed if number is None else replace(placed, id=number)
@@ -116,14 +118,15 @@ def read_csv(path: Path) -> LedFile:
     brightness = [name for name in names if name in BRIGHTNESS]
     known = {*BRIGHTNESS, *FURTHER, *COLUMNS[0], *COLUMNS[1]}
     # Every column must be known and there once; one kind of place, and one of brightness at most.
-    ambiguous = len(brightness) > 1 or len({*names}) < len(names)
-    if chosen is None or ambiguous or {*names} - known or len(lines) < 2:
+    repeated = len(brightness) > 1 or len({*names}) < len(names)
+    if chosen is None or repeated or {*names} - known or len(lines) < 2:
         raise InputError(
             path,
             "not a list of LEDs",
             f"columns {' or '.join(map(', '.join, COLUMNS))}; optionally {' or '.join(BRIGHTNESS)},"
             f" {', '.join(FURTHER)}; one LED per line",
         )
+    # Each row is checked with its number in the file.
     rows = [parse_row(path, n, line, names) for n, line in lines[1:]]
     column = dict(zip(names, np.array(rows).T, strict=True))
     level = column.get("level")
@@ -150,6 +153,7 @@ def led_numbers(path: Path, column: Floats | None) -> Ints | None:
         number = column.astype(np.int64)
     wrong = (number != column) | (number < 0)
     repeated = np.ones(len(number), bool)
+    # All but the first of equal numbers.
     repeated[np.unique(number, return_index=True)[1]] = False
     found = np.flatnonzero(wrong | repeated)
     if len(found):

@@ -166,6 +166,7 @@ class PlacementScore(NamedTuple):
         geometry = camera_geometry(self.config)
         information = total_information(place_m, self.R_body_from_lab, *geometry)
         variance = np.sort(variances(information))
+        # Mean of the worst.
         tail = math.ceil(self.options.tail_fraction * len(variance))
         return float(variance[-tail:].mean()) / self.reference
 
@@ -271,6 +272,7 @@ def contract(place_m: Floats, sites_m: Floats, fraction: float) -> Floats:
     Few attitudes see the rim, so its LEDs help more where more fields overlap. With z = cos(zenith angle) the
     contraction is 1 - z' = fraction (1 - z), which scales every solid angle alike.
     """
+    # Contract the directions, then take the nearest sites.
     direction = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
     z = 1 - fraction * (1 - direction[:, 2])
     # sin(zenith angle) after the contraction, over that before it.
@@ -302,6 +304,7 @@ class LocalSearch(NamedTuple):
 
     def propose(self, place_m: Floats, rng: np.random.Generator) -> Floats:
         """(N, 3) one site for each LED, a random step away; the length is log-uniform between the limits in `steps`."""
+        # Steps are relative to the LEDs' present spacing.
         spacing_m = np.median(cKDTree(place_m).query(place_m, k=2)[0][:, 1])
         low, high = np.log(self.steps)
         step_m = spacing_m * np.exp(rng.uniform(low, high, (len(place_m), 1)))
@@ -345,6 +348,7 @@ def descend(
         visibility = Visibility(*visible_from(both_m, R_body_from_lab, *geometry))
         # 3.
         chosen = np.arange(config.count)
+        # LEDs are tried in random order.
         order = rng.permutation(config.count)
         try_moves(
             chosen,
@@ -437,6 +441,7 @@ def field_reach_rad(config: layouts.OptimizedConfig, surface: Surface) -> float:
     Rays around the cone that encloses the field are intersected with the surface, for boresights at the greatest tilt
     in all azimuths and at every yaw.
     """
+    # The circle about the field's corners.
     half_diagonal = np.hypot(*tan_half(config))
     azimuth = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     cone = np.column_stack(
@@ -538,6 +543,7 @@ def thin(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
 
 def layout_ambiguity(config: layouts.OptimizedConfig, place_m: Floats) -> Ambiguity:
     """Ambiguity of the layout (`ambiguity`), for a round field of the same area as the camera's."""
+    # A circle of the area 4 tan(w/2) tan(h/2).
     radius_rad = math.atan(math.sqrt(4 * float(np.prod(tan_half(config))) / math.pi))
     assert config.camera_m is not None, "completed by the scene"
     return field_ambiguity(

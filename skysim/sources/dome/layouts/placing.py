@@ -62,6 +62,7 @@ def led_sources(
 
     `rng` is the hardware's random stream.
     """
+    # Order of the random numbers: strengths, phases of the drive, colors, aging.
     count = len(placed.id)
     scatter = strength_factors(led.scatter, rng.standard_normal(count))
     strength = full_strength_e_s_sr(led, band) * scatter
@@ -117,6 +118,7 @@ def lit_sources(
     config: LitConfig, surface: Surface, place_m: Floats, led: LedConfig, band: Band
 ) -> Sources:
     """Sources of a random fraction `lit_fraction` of LEDs at (N, 3) places; each keeps its number among all places."""
+    # Which LEDs are lit is drawn before their levels.
     rng = random_stream(config.hardware_seed)
     lit = max(round(config.lit_fraction * len(place_m)), 1)
     number = np.sort(rng.permutation(len(place_m))[:lit])
@@ -128,6 +130,7 @@ def cap(count: int, half_angle_rad: float) -> Floats:
 
     Equal steps in z are equal areas on the sphere; successive azimuths differ by the golden angle.
     """
+    # Points at the middles of equal steps.
     n = np.arange(count) + 0.5
     z = 1 - n / count * (1 - np.cos(half_angle_rad))
     return unit_vectors(z, n * GOLDEN_ANGLE_RAD)
@@ -150,6 +153,7 @@ def check_cap(key: str, directions: Floats, cap_deg: float) -> None:
     """Raise InputError for the first of (N, 3) directions from the bearing that is outside the cap."""
     # Written so that NaN is outside.
     length = np.linalg.norm(directions, axis=1)
+    # Angle from the zenith, accurate near it too.
     tilt_deg = np.degrees(np.arctan2(np.hypot(*directions.T[:2]), directions[:, 2]))
     beyond = np.flatnonzero(~((length > 0) & (tilt_deg <= cap_deg * (1 + 1e-12))))
     if len(beyond):

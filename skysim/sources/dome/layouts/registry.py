@@ -62,6 +62,7 @@ def fibers(config: FibersConfig, surface: Surface, led: LedConfig, band: Band) -
 
 def lcd(config: LcdConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
     """Another layout's LEDs drawn on the nearest pixels of a panel: `display.panel_sources`."""
+    # The points are placed on the panel as ideal LEDs, whose strengths are levels.
     panel = display.panel_surface(config, surface)
     stars = LAYOUTS[config.points.kind](config.points, panel, display.ideal_led(led), band)
     return display.panel_sources(config, panel, led, band, stars)
