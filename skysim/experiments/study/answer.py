@@ -228,30 +228,29 @@ def placer(study: Study, lines: Sequence[PointRow]) -> Place:
     return lambda line: ", ".join(named(name, line.levels[name]) for name in varied)
 
 
-def extremes(name: str, lines: Sequence[PointRow]) -> tuple[PointRow, PointRow] | None:
-    """The points with the least and the largest value of a response; those of few values only without others."""
+def extremes(name: str, lines: Sequence[PointRow]) -> list[PointRow]:
+    """The points with a value of a response, the least value first; those of few values only without others."""
     known = [line for line in lines if np.isfinite(line.responses[name].value)]
     known = [line for line in known if not has_few_values(line, name)] or known
-    if not known:
-        return None
-
-    def value(line: PointRow) -> float:
-        return line.responses[name].value
-
-    return min(known, key=value), max(known, key=value)
+    return sorted(known, key=lambda line: line.responses[name].value)
 
 
 def response_range(name: str, lines: Sequence[PointRow], place: Place) -> str:
     """Smallest and largest value of a response over the points, as a sentence."""
     found = extremes(name, lines)
-    if found is None:
+    if not found:
         return f"{name}: no trial has a value."
-    least, most = found
-    low, high = (format_summary(line.responses[name]) for line in found)
+    least = found[0]
+    most = largest(name, found)
+    low, high = (format_summary(line.responses[name]) for line in (least, most))
     if least.responses[name].value == most.responses[name].value:
-        equal = sum(np.isfinite(line.responses[name].value) for line in lines)
-        return f"{name}: {low}" + (f" at all {equal} points." if equal > 1 else ".")
+        return f"{name}: {low}" + (f" at all {len(found)} points." if len(found) > 1 else ".")
     return f"{name}: {low} at {place(least)}, to {high} at {place(most)}."
+
+
+def largest(name: str, lines: Sequence[PointRow]) -> PointRow:
+    """The first of the points with the largest value."""
+    return max(lines, key=lambda line: line.responses[name].value)
 
 
 def range_rows(study: Study, lines: Sequence[PointRow]) -> list[list[str]]:
@@ -261,8 +260,9 @@ def range_rows(study: Study, lines: Sequence[PointRow]) -> list[list[str]]:
     rows = []
     for name in study.responses:
         if found := extremes(name, done):
-            low, high = (format_summary(line.responses[name]) for line in found)
-            rows.append([name, low, place(found[0]), high, place(found[1])])
+            ends = (found[0], largest(name, found))
+            low, high = (format_summary(line.responses[name]) for line in ends)
+            rows.append([name, low, place(ends[0]), high, place(ends[1])])
     return rows
 
 
