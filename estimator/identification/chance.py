@@ -20,7 +20,7 @@ MIN_MATCHES = 4  # matches that they need
 
 # The searches by Bayes factors: least log10 Bayes factor of an accepted attitude. By Markov's inequality, random
 # detections reach it in at most one of 10^5 frames. With 4, a mirrored sky was solved in one of 10^5 adversarial images
-# (docs/findings/robustness.md); 5 loses two in a thousand of the hardest frames (python -m benchmarks.lost_in_space),
+# (docs/findings/robustness.md); 5 loses two in a thousand of the hardest frames (python -m benchmarks lost_in_space),
 # 6 would lose twelve.
 ACCEPT_DEX = 5.0
 GATE_SIGMA = 3.5  # matching radius in standard deviations: it loses one true match in 450

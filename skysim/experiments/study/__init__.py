@@ -1,5 +1,5 @@
 """Studies: Monte Carlo trials of a scene with varied parameters; results have confidence intervals.
 
-`loader` reads a study file into a `plan`; `execution` runs the trials and stores one row per trial; `analysis` computes
-statistics and `report` shows them.
+`study_file` reads a study file into a `plan`; `execution` runs the trials and stores one row per trial; `answer`,
+`table`, `thresholds` and `search` analyze them, and `report` shows the result.
 """

@@ -31,9 +31,8 @@ from skysim.simulation.timing import MARGIN_S, exposure_window
 from skysim.sources.dome.led import lit_moments_s
 
 LEAST_SIGMA_PX = 1e-3
-FLUX_NOISE = (
-    0.02  # relative, of a light in a frame; above that of rendered ones (benchmarks/codes.py)
-)
+# Relative, of a light in a frame; above that of rendered ones (benchmarks/codes_attitudes.py).
+FLUX_NOISE = 0.02
 
 
 class VisibleSources(NamedTuple):

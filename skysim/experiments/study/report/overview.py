@@ -42,7 +42,7 @@ class Overview(NamedTuple):
     may_be_ambiguous
         Whether the tracker can refuse a frame as ambiguous
     fixed
-        Seeds of hardware that all trials share, see `loader.fixed_seeds`
+        Seeds of hardware that all trials share, see `study_file.fixed_seeds`
     """
 
     rows: list[tuple[str, str]]
