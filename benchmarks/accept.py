@@ -25,7 +25,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import AREAS
-from skysim.core.files import ROOT, to_json
+from skysim.core.files import to_json
+from skysim.core.paths import ROOT
 from skysim.experiments.study.execution.setups import code_version
 
 OUT = ROOT / "out"

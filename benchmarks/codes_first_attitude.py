@@ -13,7 +13,8 @@ import numpy as np
 
 from benchmarks.codes_attitudes import Bench
 from benchmarks.timing import figure as figure_row
-from skysim.core.files import ROOT, make_folder
+from skysim.core.files import make_folder
+from skysim.core.paths import ROOT
 
 SEQUENCES = 60
 CODES = {

@@ -22,7 +22,7 @@ from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.files import CATALOGS
+from skysim.core.paths import CATALOGS
 from skysim.results.metrics import WRONG_RAD
 from tests.helpers.drawn_frames import SETUPS, CameraSetup, render
 

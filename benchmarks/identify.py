@@ -15,7 +15,7 @@ from estimator.core.camera import Camera
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.files import CATALOGS
+from skysim.core.paths import CATALOGS
 
 FIELDS = 100
 

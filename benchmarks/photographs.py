@@ -20,8 +20,8 @@ from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from skysim.apps.plate_solver import picture as plate_picture
 from skysim.apps.plate_solver import solver as plate_solver
-from skysim.core.files import CATALOGS
 from skysim.core.images import ViewedImage
+from skysim.core.paths import CATALOGS
 from tests.helpers.photographs import CASES, EPOCH, draw, is_same
 
 # pictures of a case; of one with so many pixels

@@ -29,7 +29,7 @@ from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core import images
-from skysim.core.files import CATALOGS
+from skysim.core.paths import CATALOGS
 
 FOLDER = "SKYSIM_PHOTOGRAPHS"
 DATE = datetime.datetime(2019, 7, 29, 20, 47, 26)

@@ -20,7 +20,7 @@ from estimator.catalog import catalog, published_catalogs
 from estimator.core.errors import ImageError
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.files import CATALOGS
+from skysim.core.paths import CATALOGS
 from skysim.core.types import Frame, Trajectory
 from skysim.results.metrics import WRONG_RAD
 from skysim.scene.loader import load

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import AREAS, accept, chosen
 from benchmarks.__main__ import left_out, main
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 
 FOLDER = ROOT / "benchmarks"
 SHARED = {"__init__", "__main__", "accept", "peers", "timing"}  # of no area

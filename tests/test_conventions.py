@@ -12,7 +12,7 @@ from estimator.core.camera import Camera
 from estimator.core.types import ra_dec_roll_rad
 from skysim.camera.optics import Optics
 from skysim.camera.render import Window, render
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.core.types import Mount, Sources, Trajectory
 from skysim.dynamics import multibody
 from skysim.scene import opencv_calibration

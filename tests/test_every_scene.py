@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import project
 from skysim.camera.glow.display_glow import black_glow
-from skysim.core.files import SCENES
+from skysim.core.paths import SCENES
 from skysim.dynamics import multibody
 from skysim.experiments.study.execution.setups import TrialSetup
 from skysim.experiments.study.execution.trials import run_frame_trial

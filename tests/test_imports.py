@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 
 
 def module_of(path: Path) -> str:
@@ -76,3 +76,17 @@ def test_no_folder_holds_too_many_modules(package: str) -> None:
             "README.md",
         }
         assert len(entries) <= 18, sorted(entries)
+
+
+def test_no_file_imports_a_module_of_ours_under_two_names() -> None:
+    """Two names for one module read like two modules."""
+    for name, path in FILES.items():
+        names_of: dict[str, set[str]] = {}
+        for statement in statements(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(statement, ast.ImportFrom):
+                for alias in statement.names:
+                    module = f"{statement.module}.{alias.name}"
+                    if module in FILES:
+                        names_of.setdefault(module, set()).add(alias.asname or alias.name)
+        doubled = {module: names for module, names in names_of.items() if len(names) > 1}
+        assert doubled == {}, name

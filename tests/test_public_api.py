@@ -44,6 +44,19 @@ def test_the_command_line_loads_no_library_until_a_command_runs() -> None:
     assert done.stdout.strip() == "set()"
 
 
+@pytest.mark.parametrize("command", [["scenes"], ["study"], ["--version"]])
+def test_a_list_of_files_loads_no_library(command: list[str]) -> None:
+    script = (
+        "import sys\nfrom skysim.apps.cli.main import app\n"
+        f"app({command}, standalone_mode=False)\n"
+        "print({'numpy', 'scipy', 'numba', 'mujoco', 'cv2'} & set(sys.modules))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1] == "set()"
+
+
 def test_a_run_is_a_sequence_of_scored_frames(run) -> None:
     assert len(run) == 3
     assert [frame.row.frame for frame in run] == [0, 1, 2]

@@ -12,7 +12,7 @@ import pytest
 
 from skysim.apps import plate_solver
 from skysim.core import images
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.sources.stars import cam_from_icrs
 
 FOLDER = Path(os.environ.get("SKYSIM_REAL_SKY", ROOT.parent / "shared" / "real_sky"))

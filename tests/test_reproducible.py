@@ -19,7 +19,7 @@ from astropy.table import Table
 
 import estimator.core.jit
 import skysim.core.jit
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 
 SCENES = ("afit_simsat", "shefex2", "simsat_bump")
 # Seconds of wall clock stand in these, and in no other file.

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from skysim.apps.cli import main
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 
 
 def test_the_version_option_prints_versions_for_a_bug_report() -> None:

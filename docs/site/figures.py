@@ -25,8 +25,7 @@ from skysim.simulation.flight import simulate_motion
 from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.lights.lens import stray_e_s
 from skysim.simulation.lights.light import Exposure, beam_of
-from skysim.sources import air as scintillation
-from skysim.sources import air as starlight
+from skysim.sources import air as air_physics
 from skysim.sources import stars as star_sources
 from skysim.sources.catalog import read
 from skysim.sources.dome import surface
@@ -396,7 +395,7 @@ def air(path: Path) -> None:
         raised_rad = refraction.bending_rad(np.pi / 2 - apparent_rad + raised_rad)
     bent.loglog(altitude_deg, np.degrees(raised_rad) * 3600, color=BODY)
     bent.set(title="refraction", ylabel="raised by (arcsec)")
-    mass = starlight.air_mass(apparent_rad)
+    mass = air_physics.air_mass(apparent_rad)
     for extinction_mag, color in ((0.1, BODY), (0.17, LIGHT), (0.3, CAM)):
         dimmed.loglog(
             altitude_deg,
@@ -410,10 +409,8 @@ def air(path: Path) -> None:
         ax.set_xticklabels(["2", "5", "10", "20", "45", "90"])
         ax.minorticks_off()
     aperture_m = np.geomspace(2e-3, 1, 25)
-    ours = np.sqrt(
-        [scintillation.variance(np.ones(1), d, 0.05, 0.0, 650e-9)[0] for d in aperture_m]
-    )
-    young = np.sqrt(scintillation.YOUNG_M_S * scintillation.C_Y**2 * aperture_m ** (-4 / 3) / 0.05)
+    ours = np.sqrt([air_physics.variance(np.ones(1), d, 0.05, 0.0, 650e-9)[0] for d in aperture_m])
+    young = np.sqrt(air_physics.YOUNG_M_S * air_physics.C_Y**2 * aperture_m ** (-4 / 3) / 0.05)
     twinkling.loglog(100 * aperture_m, ours, color=BODY, label="simulated")
     twinkling.loglog(100 * aperture_m, young, color=LAB, linestyle="--", label="Young's law")
     twinkling.set(

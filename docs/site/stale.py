@@ -17,7 +17,6 @@ import ast
 import datetime
 import hashlib
 import re
-import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -144,21 +143,6 @@ def working_tree(name: str) -> dict[str, bytes]:
     return {
         str(one.relative_to(ROOT)): one.read_bytes() for one in path.rglob(pattern) if one.is_file()
     }
-
-
-def at_commit(commit: str) -> Files:
-    """The reader of packages and paths as they were at a commit."""
-
-    def git(*words: str) -> bytes:
-        return subprocess.run(["git", *words], cwd=ROOT, check=True, capture_output=True).stdout
-
-    def read(name: str) -> dict[str, bytes]:
-        listed = git("ls-tree", "-r", "--name-only", commit, "--", folder_of(name)).decode()
-        python = name.split(".")[0] in OURS
-        paths = [path for path in listed.splitlines() if not python or path.endswith(".py")]
-        return {path: git("show", f"{commit}:{path}") for path in paths}
-
-    return read
 
 
 def pages() -> list[Path]:

@@ -23,7 +23,7 @@ import yaml
 sys.path.insert(0, str(Path(__file__).parent))
 from stale import Stamp, make_stamp
 
-from skysim.core.files import STUDIES
+from skysim.core.paths import STUDIES
 from skysim.core.types import Floats
 from skysim.experiments.study import search
 from skysim.experiments.study import table as sensitivity

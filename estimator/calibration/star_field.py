@@ -83,7 +83,7 @@ def magnitude_zero(instrumental_mag: Floats, v_mag: Floats, vectors_ref: Floats)
     instrumental_mag, v_mag
         (K,) instrumental and catalog magnitude of each sighting
     vectors_ref
-        (K, 3) unit vector of each sighting's star, by which stars are told apart
+        (K, 3) unit vector of each sighting's star; it identifies the star
     """
     checks.unit_rows("vectors_ref", vectors_ref, None)
     if not len(vectors_ref):

@@ -1,4 +1,4 @@
-"""Atomic writes of files and folders, tables, images and JSON, and the folders of shipped scenes and data."""
+"""Atomic writes of files and folders, tables, images and JSON."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
@@ -227,32 +226,3 @@ def to_json(data: Any) -> str:
         return None if isinstance(value, float) and not np.isfinite(value) else value
 
     return json.dumps(without_nan(data), indent=1, allow_nan=False)
-
-
-# Folders of the scenes and the data that are shipped with skysim, and the titles of scene and study files.
-
-ROOT = Path(__file__).resolve().parents[2]
-
-# In a checkout scenes/ and data/ are beside the package; an installed package contains them.
-SHIPPED = ROOT if (ROOT / "pyproject.toml").is_file() else ROOT / "skysim"
-DATA = SHIPPED / "data"
-SCENES = SHIPPED / "scenes"
-STUDIES = SCENES / "studies"
-CATALOGS = DATA / "catalogs"
-
-
-def title_of(path: Path) -> str:
-    """Title of a scene or study file, or that of its base if it has none; "" if none can be read.
-
-    Only the lines of these keys are parsed: a list of all scenes would otherwise take a second.
-    """
-    text = path.read_text(encoding="utf-8", errors="replace")
-    lines = dict(re.findall(r"^(title|base):(.*)", text, re.MULTILINE))
-    try:
-        values = {key: str(yaml.safe_load(text) or "") for key, text in lines.items()}
-    except yaml.YAMLError:
-        return ""
-    if "title" in values:
-        return values["title"]
-    base = path.with_name(f"{values.get('base', '').removesuffix('.yaml')}.yaml")
-    return title_of(base) if "base" in values and base.is_file() and base != path else ""

@@ -25,7 +25,7 @@ from pydantic import ValidationError
 
 from skysim.core import yaml_reader
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.files import DATA, SCENES
+from skysim.core.paths import DATA, SCENES
 from skysim.core.units import ConfigModel, quantity
 from skysim.core.yaml_reader import (
     Files,

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from skysim.core import files
 from skysim.core.constants import MAS_RAD
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.files import CATALOGS
+from skysim.core.paths import CATALOGS
 from skysim.core.types import Floats
 from skysim.core.yaml_reader import excerpt, is_file, parse_yaml
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.constants import AU_KM, DAY_S, SPEED_OF_LIGHT_KM_S
-from skysim.core.files import DATA
+from skysim.core.paths import DATA
 from skysim.core.time import tt_jd, ut1_jd
 from skysim.core.types import Floats
 from skysim.scene.sections.vehicle import SiteConfig

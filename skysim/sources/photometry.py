@@ -28,7 +28,7 @@ from skysim.core.constants import (
     SPEED_OF_LIGHT_M_S,
 )
 from skysim.core.errors import InputError
-from skysim.core.files import DATA
+from skysim.core.paths import DATA
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig, ChromaticConfig, EfficiencyConfig, curve_file
 from skysim.scene.sections.leds import spectrum_file

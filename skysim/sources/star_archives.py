@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from skysim.core.constants import ARCSEC_RAD, MAS_RAD
-from skysim.core.files import CATALOGS
+from skysim.core.paths import CATALOGS
 from skysim.core.types import Floats
 from skysim.sources import catalog
 from skysim.sources.catalog import CatalogColumn

@@ -17,7 +17,7 @@ from skysim.apps import plate_solver
 from skysim.apps.plate_solver import picture as plate_picture
 from skysim.apps.plate_solver import retries
 from skysim.core import images
-from skysim.core.files import CATALOGS
+from skysim.core.paths import CATALOGS
 from tests.helpers import photographs
 
 SHOT = photographs.Shot(1600, 1200, 25.0, 5.6, radius_px=14.0)

@@ -21,7 +21,7 @@ from skysim.apps import plate_solver
 from skysim.apps.cli import terminal
 from skysim.apps.plate_solver import diagnosis
 from skysim.core import images
-from skysim.core.files import CATALOGS
+from skysim.core.paths import CATALOGS
 from skysim.scene import loader
 from skysim.simulation.flight import simulate_motion
 from skysim.sources import stars

@@ -15,7 +15,7 @@ from estimator.trackers.pipeline import Settings
 from skysim.apps import plate_solver
 from skysim.apps.plate_solver import retries
 from skysim.core import images
-from skysim.core.files import CATALOGS
+from skysim.core.paths import CATALOGS
 from tests.helpers import photographs
 
 SHOT = photographs.Shot(1280, 960, 22.0, 6.3)

@@ -18,7 +18,7 @@ from skysim.apps import plate_solver
 from skysim.apps.plate_solver import solver as searching
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.files import SCENES
+from skysim.core.paths import SCENES
 from skysim.core.types import Frame, Truth
 from skysim.scene import loader
 from skysim.simulation.flight import simulate_motion

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from tests.baseline.machine import differences
 
 DIGESTS = ROOT / "tests/baseline/digests"

@@ -7,7 +7,6 @@ import pytest
 from scipy import integrate
 
 from skysim.camera.glow import earth_glow
-from skysim.camera.glow import earth_glow as stray
 from skysim.camera.glow.earth_glow import earth_around, stray_around_e_s_m2, stray_of_bodies_e_s_m2
 from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
 from skysim.core.types import Floats
@@ -138,7 +137,7 @@ def steps(count: int) -> Floats:
 
 
 def test_the_quadrature_over_a_cone_is_exact_for_its_solid_angle() -> None:
-    directions, weights = stray.cone_rule(0.4, 0.3)
+    directions, weights = earth_glow.cone_rule(0.4, 0.3)
     assert weights.sum() == pytest.approx(2 * np.pi * 0.7)
     assert (weights @ directions) == pytest.approx([0, 0, np.pi * (1 - 0.3**2)], abs=1e-12)
 

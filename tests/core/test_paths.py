@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from skysim.core.files import title_of
+from skysim.core.paths import title_of
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from skysim.core import encoded, images
-from skysim.core import images as fits_images
 from skysim.core.errors import InputError
 
 RNG = np.random.default_rng(4)
@@ -253,7 +252,7 @@ def test_a_gzipped_file_is_unpacked_up_to_a_limit(
 ) -> None:
     """A gigabyte of zeros is a megabyte; what is beyond the limit is not unpacked."""
     monkeypatch.setattr(encoded, "MAX_BYTES", 100_000)
-    monkeypatch.setattr(fits_images, "GZIP_BLOCK", 10_000)
+    monkeypatch.setattr(images, "GZIP_BLOCK", 10_000)
     whole = fits_file(tmp_path / "x.fits", FRAME).read_bytes()
     path = tmp_path / "x.fits.gz"
     path.write_bytes(gzip.compress(whole))

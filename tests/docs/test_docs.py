@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import AREAS
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.experiments.study import plan, study_file
 
 DOME = (ROOT / "docs/findings/dome.md").read_text(encoding="utf-8")

@@ -22,7 +22,7 @@ import pytest
 import yaml
 
 from skysim.apps.cli import main
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 
 DOCS = ROOT / "docs"
 ELSEWHERE = {  # pages whose blocks have a test of their own, which knows what is to come out

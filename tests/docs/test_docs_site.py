@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from skysim.apps.cli import main
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.results import metrics
 from skysim.scene.scene import ExposureConfig
 from skysim.scene.sections.tracker import SurveyErrorsConfig

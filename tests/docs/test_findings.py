@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from benchmarks import dome_identify
-from skysim.core.files import ROOT, STUDIES
+from skysim.core.paths import ROOT, STUDIES
 from skysim.experiments.papers.compare import ExperimentOptions
 from skysim.experiments.papers.registry import reproduce
 from skysim.experiments.study.api import run_study

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from skysim.apps.cli import main
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.results.files import recording
 from skysim.results.files.run_export import EXPORTS
 

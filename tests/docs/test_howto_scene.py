@@ -13,7 +13,7 @@ import yaml
 from skysim.camera.optics import VIGNETTING
 from skysim.camera.psf.otf import PSFS
 from skysim.core.errors import InputError
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections import camera, motion, vehicle

@@ -5,7 +5,7 @@ import json
 import matplotlib
 import pytest
 
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 
 NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
 

@@ -8,7 +8,7 @@ import pytest
 import scipy.optimize
 import scipy.stats
 
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 
 PAGE = (ROOT / "docs/findings/datasheets/papers.md").read_text(encoding="utf-8")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import skysim
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from tests.helpers import doc_pages as pages
 
 README = "README.md"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 
 sys.path.insert(0, str(ROOT / "docs" / "site"))
 import stale

@@ -124,7 +124,7 @@ def test_the_body_gets_the_commanded_torque(name: str, within: float) -> None:
 
 @pytest.mark.parametrize("name", SETS)
 def test_the_reported_torque_is_the_torque_delivered(name: str) -> None:
-    """If the command is within the limits, the controller is told the full torque as delivered."""
+    """If the command is within the limits, the controller receives the full torque as delivered."""
     flight_computer, flight = manned(name)
     law = Asks(np.array([0.15, -0.1, 0.12]))
     flight_computer.law = law  # type: ignore[assignment]

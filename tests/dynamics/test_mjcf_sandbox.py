@@ -10,7 +10,7 @@ import mujoco
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.core.files import SCENES
+from skysim.core.paths import SCENES
 from skysim.dynamics.multibody import mjcf
 from skysim.dynamics.multibody.mjcf import xml_root
 

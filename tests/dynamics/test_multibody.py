@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core import quaternion
 from skysim.core.errors import InputError
-from skysim.core.files import SCENES
+from skysim.core.paths import SCENES
 from skysim.core.types import Floats, Trajectory
 from skysim.dynamics import multibody
 from skysim.dynamics.attitude_control import build_controller

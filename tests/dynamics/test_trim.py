@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.files import SCENES
+from skysim.core.paths import SCENES
 from skysim.dynamics import multibody
 from skysim.dynamics.multibody.mass import tree_mass
 from skysim.scene.sections.vehicle import VehicleConfig

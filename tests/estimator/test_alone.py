@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 
 ALLOWED = {"estimator", "numpy", "scipy", "numba", "llvmlite", "cv2"}
 BLOCK = f"""

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from tests.fuzz.__main__ import NAMES, seeds
 from tests.fuzz.targets import TARGETS
 
@@ -52,7 +52,7 @@ OUT_OF_REACH = {
     "skysim.apps.plate_solver.solver.read_catalog": "hands the file on to the estimator's `catalog.read`",
     "skysim.apps.cli.options.load": "hands a scene's name on to `loader.load`",
     "skysim.scene.loader.load_scene": "the same",
-    "skysim.core.files.title_of": "two lines of a file that lies in a folder of ours",
+    "skysim.core.paths.title_of": "two lines of a file that lies in a folder of ours",
     "skysim.apps.gui.worker.image_export.frame_files": "copies a run's files",
     "skysim.apps.gui.page.monte_carlo_panel.MonteCarloPanel.study_file": OURS,
     "skysim.apps.gui.page.history.History.read": "the page's address, which `View.from_query` checks",

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import psutil  # type: ignore[import-untyped]
 import pytest
 
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.experiments.study import plan, study_file
 from skysim.experiments.study.execution import workers
 

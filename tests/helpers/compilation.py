@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 
 Step = Sequence[str]  # words after `python -m`; {folder} is a temporary folder
 TRACKER = "skysim.simulation.compilation"

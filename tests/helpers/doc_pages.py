@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 
 SKYSIM = [sys.executable, "-m", "skysim"]
 

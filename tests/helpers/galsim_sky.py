@@ -27,7 +27,7 @@ from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps import plate_solver
 from skysim.core import images
-from skysim.core.files import CATALOGS
+from skysim.core.paths import CATALOGS
 from skysim.results.files import recording
 from skysim.results.metrics import normalized_error_squared
 from tests.helpers.oracles import Agreement, aberrated, lattice, unit_vectors

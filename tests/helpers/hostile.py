@@ -26,8 +26,8 @@ from estimator.core.camera import Camera
 from estimator.trackers.star_tracker import CORNERS
 from skysim.apps import plate_solver
 from skysim.apps.cli.terminal import progress
-from skysim.core.files import CATALOGS, SCENES
 from skysim.core.images import IMAGE_SUFFIXES
+from skysim.core.paths import CATALOGS, SCENES
 from skysim.results.metrics import WRONG_RAD
 from skysim.sources import stars as star_sources
 from tests.helpers.drawn_frames import LIEBE_E, CameraSetup, paint, render

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 import pytest
 
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 
 CHROMIUM = next(
     (

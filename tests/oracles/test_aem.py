@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.dynamics.profiles import read_profile
 from skysim.results.files import run_export
 

@@ -14,7 +14,7 @@ import pytest
 
 from estimator.core.camera import Camera
 from skysim.core.errors import InputError
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.results import scoring
 from skysim.scene import loader
 from skysim.simulation.flight import open_flight

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from skysim.core.files import DATA, SCENES
+from skysim.core.paths import DATA, SCENES
 from skysim.scene import loader, opencv_calibration, provenance
 from skysim.scene.opencv_calibration import OpencvCalibration
 from skysim.scene.provenance import Entry, Origin

@@ -16,7 +16,7 @@ from skysim.camera.glow.background import BACKGROUNDS
 from skysim.camera.optics import VIGNETTING
 from skysim.camera.psf.otf import PSFS
 from skysim.core.errors import InputError
-from skysim.core.files import SCENES
+from skysim.core.paths import SCENES
 from skysim.core.tolerance import ErrorSchema, ToleranceConfig
 from skysim.core.units import SI_SUFFIX, ConfigModel
 from skysim.dynamics.guidance import LEGS

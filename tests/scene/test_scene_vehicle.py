@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from skysim.core.errors import InputError
-from skysim.core.files import SCENES
+from skysim.core.paths import SCENES
 from skysim.scene import loader, scene
 
 

@@ -17,7 +17,7 @@ from skysim.apps.cli import json_schema, main
 from skysim.apps.cli.commands.validate import check_file
 from skysim.core import yaml_reader
 from skysim.core.errors import InputError
-from skysim.core.files import DATA, ROOT, SCENES
+from skysim.core.paths import DATA, ROOT, SCENES
 from skysim.experiments.study import study_file
 from skysim.scene import opencv_calibration
 from skysim.scene.loader import load, load_camera

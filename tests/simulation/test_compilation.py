@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from skysim.core.files import SCENES
+from skysim.core.paths import SCENES
 from skysim.scene import loader
 from skysim.simulation.compilation import synthetic_frame
 from skysim.simulation.lab import build_lab, build_tracker

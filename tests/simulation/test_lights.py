@@ -15,7 +15,7 @@ import pytest
 from pydantic import Field
 
 from skysim.core.errors import InputError
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.core.types import Sources
 from skysim.core.units import Intensity, Length, Time
 from skysim.scene import loader

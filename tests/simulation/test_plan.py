@@ -16,8 +16,15 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.dynamics import multibody
 from skysim.scene import loader
-from skysim.simulation.checks import attitudes, check, detection, facts, sampling, sky_warnings
-from skysim.simulation.checks import check as plan
+from skysim.simulation.checks import (
+    Check,
+    attitudes,
+    check,
+    detection,
+    facts,
+    sampling,
+    sky_warnings,
+)
 from skysim.simulation.checks.facts import Fact
 from skysim.simulation.checks.sampling import CheckedSamples
 from skysim.simulation.exposure import render_at_rest
@@ -44,13 +51,13 @@ def lab_of(name: str, **changes: str) -> Lab:
     )
 
 
-def fact(result: plan.Check, name: str) -> Fact:
+def fact(result: Check, name: str) -> Fact:
     (found,) = [one for one in result.facts if one.name == name]
     return found
 
 
 @pytest.fixture(scope="module")
-def afit() -> plan.Check:
+def afit() -> Check:
     return check(lab_of("afit_simsat"))
 
 
@@ -124,7 +131,7 @@ def test_a_tilt_beyond_the_stop_is_refused_as_by_a_run(
 
 
 @pytest.mark.slow
-def test_field_and_pixel_scale_are_those_of_a_pinhole(afit: plan.Check) -> None:
+def test_field_and_pixel_scale_are_those_of_a_pinhole(afit: Check) -> None:
     """1600 pixels of 4 um, 36.53 mm behind the lens: 10.0 deg, as the scene says."""
     field = fact(afit, "field of view").values
     assert field["field_deg"][0] == pytest.approx(
@@ -163,7 +170,7 @@ def test_the_fewest_lights_are_at_the_stated_attitude() -> None:
 
 
 @pytest.mark.slow
-def test_the_depth_of_focus_ends_where_defocus_is_a_pixel(afit: plan.Check) -> None:
+def test_the_depth_of_focus_ends_where_defocus_is_a_pixel(afit: Check) -> None:
     """By similar triangles: a pupil of 35 / 8 mm, a chip 36.53 mm behind it focused at 33 in."""
     values = fact(afit, "depth of focus").values
     for distance_m in (values["near_m"], values["far_m"]):
@@ -567,7 +574,7 @@ def test_using_the_brightest_hundred_of_many_lights_is_not_warned_of() -> None:
 
 
 @pytest.mark.slow
-def test_only_an_led_s_image_size_includes_the_led_s_diameter(afit: plan.Check) -> None:
+def test_only_an_led_s_image_size_includes_the_led_s_diameter(afit: Check) -> None:
     assert ", LED 2" in fact(afit, "image size").lines[0]
     assert "LED" not in fact(check(lab_of("shefex2")), "image size").lines[0]
 

@@ -11,8 +11,8 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.simulation.checks import attitudes, dome_warnings, findings, sky_warnings
-from skysim.simulation.checks.check import check
 from skysim.simulation.checks.detection import Context, context_of
+from skysim.simulation.checks.plan_check import check
 from skysim.simulation.checks.sampling import CheckedSamples, sampled
 from skysim.simulation.flight import Flight
 from skysim.simulation.lab import build_lab, build_tracker

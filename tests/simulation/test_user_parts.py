@@ -19,7 +19,7 @@ from skysim.dynamics.guidance import plan
 from skysim.results.files import recording, run_export
 from skysim.results.run import Run
 from skysim.scene import loader
-from skysim.simulation.checks.check import broken_assumptions
+from skysim.simulation.checks.plan_check import broken_assumptions
 from skysim.simulation.flight import Flight, open_flight, simulate_motion
 from skysim.simulation.lab import build_lab
 from skysim.tracking.tracker_interface import Answer

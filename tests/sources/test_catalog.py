@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.core.files import CATALOGS
+from skysim.core.paths import CATALOGS
 from skysim.sources import catalog, star_archives
 from skysim.sources.catalog import Catalog
 

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import kstest
 
 from skysim.core.errors import InputError
-from skysim.core.files import CATALOGS
+from skysim.core.paths import CATALOGS
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.simulation.lab import build_lab, build_tracker

@@ -14,7 +14,7 @@ import pytest
 from scipy.integrate import quad
 
 from skysim.core.errors import InputError
-from skysim.core.files import DATA
+from skysim.core.paths import DATA
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.scene.scene import Scene

@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 from skysim.apps.cli import main
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.core.plugins import ProgramError
 from skysim.experiments import tracker_comparison
 from skysim.experiments.study import study_file as study_loader

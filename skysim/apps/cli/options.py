@@ -26,14 +26,14 @@ TYPED: dict[str, str] = {}  # keys of the scene that options of their own have s
 
 def complete_scene(incomplete: str) -> list[str]:
     """Names of shipped scenes, and YAML files and folders, that begin with what was typed."""
-    from skysim.core.files import SCENES
+    from skysim.core.paths import SCENES
 
     return complete_yaml(SCENES, incomplete)
 
 
 def complete_study(incomplete: str) -> list[str]:
     """Names of shipped studies, and YAML files and folders, that begin with what was typed."""
-    from skysim.core.files import STUDIES
+    from skysim.core.paths import STUDIES
 
     return complete_yaml(STUDIES, incomplete)
 

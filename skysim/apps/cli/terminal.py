@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -30,12 +29,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 ANIMATION_FRAMES = 60
-
-
-def eager_first(items: Iterable[T]) -> Iterator[T]:
-    """Return the same items, the first computed at once: its errors then appear before old results are cleared."""
-    iterator = iter(items)
-    return itertools.chain([next(iterator)], iterator)
 
 
 def progress(items: Iterable[T], total: int, what: str, quiet: bool = False) -> Iterator[T]:
@@ -215,7 +208,7 @@ def print_catalog(catalog: dict[str, Any], json: bool) -> None:
 
 def print_titles(folder: Path, json: bool) -> None:
     """Print names and titles of the YAML files in a folder."""
-    from skysim.core.files import title_of
+    from skysim.core.paths import title_of
 
     listed = [
         {"name": path.stem, "title": title_of(path), "file": str(path)}

@@ -38,7 +38,7 @@ from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_cent
 from estimator.trackers.refinement import NO_MATCH
 from estimator.trackers.star_tracker import QUAD_SEARCHES, StarTracker
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.files import CATALOGS
+from skysim.core.paths import CATALOGS
 from skysim.core.time import check_year
 
 if TYPE_CHECKING:

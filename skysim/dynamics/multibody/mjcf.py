@@ -25,8 +25,8 @@ from xml.etree import ElementTree
 import mujoco
 
 from skysim.core.errors import InputError
-from skysim.core.files import SCENES
 from skysim.core.guarded import run_guarded
+from skysim.core.paths import SCENES
 from skysim.core.yaml_reader import excerpt, is_file
 
 # 1. Files that a model names, and its numbers.

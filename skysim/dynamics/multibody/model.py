@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
-from skysim.core.files import SCENES
+from skysim.core.paths import SCENES
 from skysim.core.types import Floats, Mount
 from skysim.dynamics.multibody.actuator_kind import Hinges, joints
 from skysim.dynamics.multibody.actuators import (

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core import quaternion
-from skysim.core.files import SCENES
 from skysim.core.jit import jit
+from skysim.core.paths import SCENES
 from skysim.core.types import Floats, Mount
 from skysim.dynamics.multibody.actuators import lock_unused, set_start
 from skysim.dynamics.multibody.mass import CAMERA

@@ -321,7 +321,6 @@ def section_lines(
 def write(path: Path, contents: str) -> None:
     """Write the file and read it as a scene would. Raises InputError if it is no camera."""
     from skysim.core.files import make_folder, write_text
-    from skysim.scene.camera_sheet import PLACEHOLDER_LENS
     from skysim.scene.loader import load_camera
 
     make_folder(path.parent)

@@ -385,15 +385,6 @@ def parameters(lens: Camera | CameraConfig, lever: Lever | Mount) -> list[float]
     return [float(lens.focal_px), *lens.center_px, *lens.distortion[:4], *lever_mm]
 
 
-def coverage_figure(
-    so_far: Coverage, faults: DomeFaults | None, further: Rotation | None
-) -> NDArray[np.uint8]:
-    """BGR image of the dome from above: how well each LED is measured, faults, and where to point the camera next."""
-    fig, canvas = new_figure((8, 7))
-    draw_coverage(fig.subplots(), so_far, faults, further)
-    return picture_of(canvas)
-
-
 def survey_figure(
     so_far: Coverage,
     faults: DomeFaults,

@@ -25,8 +25,8 @@ from estimator.identification.published.fialho import (
 )
 from estimator.identification.solver_options import Options
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.files import CATALOGS
 from skysim.core.jit import jit
+from skysim.core.paths import CATALOGS
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.papers.compare import (

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from skysim.core.errors import InputError
-from skysim.core.files import DATA
+from skysim.core.paths import DATA
 from skysim.core.types import Floats
 from skysim.core.units import ConfigModel, NotNegative, Number
 from skysim.core.yaml_reader import explain, read_yaml

@@ -18,7 +18,7 @@ from estimator.core.checks import Ints
 from estimator.core.types import Centroids
 from estimator.identification.published.shefex import FOURTH_STAR, ShefexOptions, search
 from estimator.trackers.pipeline import Settings
-from skysim.core.files import CATALOGS
+from skysim.core.paths import CATALOGS
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey.survey_frames import detect_lights

@@ -228,29 +228,31 @@ def placer(study: Study, lines: Sequence[PointRow]) -> Place:
     return lambda line: ", ".join(named(name, line.levels[name]) for name in varied)
 
 
-def extremes(name: str, lines: Sequence[PointRow]) -> list[PointRow]:
-    """The points with a value of a response, the least value first; those of few values only without others."""
-    known = [line for line in lines if np.isfinite(line.responses[name].value)]
-    known = [line for line in known if not has_few_values(line, name)] or known
-    return sorted(known, key=lambda line: line.responses[name].value)
+def valued(name: str, lines: Sequence[PointRow]) -> list[PointRow]:
+    """The points with a value of a response; those of few values only without others."""
+    found = [line for line in lines if np.isfinite(line.responses[name].value)]
+    return [line for line in found if not has_few_values(line, name)] or found
+
+
+def extremes(name: str, lines: Sequence[PointRow]) -> tuple[PointRow, PointRow]:
+    """The points with the least and the largest value of a response."""
+
+    def value(line: PointRow) -> float:
+        return line.responses[name].value
+
+    return min(lines, key=value), max(lines, key=value)
 
 
 def response_range(name: str, lines: Sequence[PointRow], place: Place) -> str:
     """Smallest and largest value of a response over the points, as a sentence."""
-    found = extremes(name, lines)
-    if not found:
+    points = valued(name, lines)
+    if not points:
         return f"{name}: no trial has a value."
-    least = found[0]
-    most = largest(name, found)
+    least, most = extremes(name, points)
     low, high = (format_summary(line.responses[name]) for line in (least, most))
     if least.responses[name].value == most.responses[name].value:
-        return f"{name}: {low}" + (f" at all {len(found)} points." if len(found) > 1 else ".")
+        return f"{name}: {low}" + (f" at all {len(points)} points." if len(points) > 1 else ".")
     return f"{name}: {low} at {place(least)}, to {high} at {place(most)}."
-
-
-def largest(name: str, lines: Sequence[PointRow]) -> PointRow:
-    """The first of the points with the largest value."""
-    return max(lines, key=lambda line: line.responses[name].value)
 
 
 def range_rows(study: Study, lines: Sequence[PointRow]) -> list[list[str]]:
@@ -259,10 +261,10 @@ def range_rows(study: Study, lines: Sequence[PointRow]) -> list[list[str]]:
     place = placer(study, done)
     rows = []
     for name in study.responses:
-        if found := extremes(name, done):
-            ends = (found[0], largest(name, found))
-            low, high = (format_summary(line.responses[name]) for line in ends)
-            rows.append([name, low, place(ends[0]), high, place(ends[1])])
+        if points := valued(name, done):
+            least, most = extremes(name, points)
+            low, high = (format_summary(line.responses[name]) for line in (least, most))
+            rows.append([name, low, place(least), high, place(most)])
     return rows
 
 

@@ -23,7 +23,7 @@ from pydantic import (
 
 from skysim.core import yaml_reader
 from skysim.core.errors import InputError
-from skysim.core.files import STUDIES
+from skysim.core.paths import STUDIES
 from skysim.core.units import ConfigModel, Fraction, NotNegative, Number, Time, Triple
 from skysim.core.yaml_reader import explain, is_file, set_key
 from skysim.experiments.study.factors import Design, Factor, Point, Settings, Value, points

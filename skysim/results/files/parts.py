@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skysim.core.errors import InputError, Where
-from skysim.core.files import DATA
+from skysim.core.paths import DATA
 from skysim.core.text import excerpt, read_lines
 from skysim.core.types import Floats, Sources
 from skysim.core.yaml_reader import suggestion

@@ -17,7 +17,7 @@ from pydantic import (
 )
 
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.files import DATA
+from skysim.core.paths import DATA
 from skysim.core.units import (
     Ascending,
     ConfigModel,

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
 
 from skysim.core.errors import InputError
-from skysim.core.files import DATA
+from skysim.core.paths import DATA
 from skysim.core.tolerance import LengthError, NumberError, Tolerance
 from skysim.core.units import (
     Ascending,

@@ -19,7 +19,7 @@ from skysim.apps.cli import main
 from skysim.apps.cli.options import load
 from skysim.core import images
 from skysim.core.errors import InputError
-from skysim.core.files import SCENES
+from skysim.core.paths import SCENES
 from skysim.scene import loader
 
 SHEFEX = SCENES / "shefex2.yaml"

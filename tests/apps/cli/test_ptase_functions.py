@@ -24,7 +24,7 @@ from estimator.identification.published.fialho import VERSIONS, MagnitudeMatch, 
 from estimator.identification.registry import IDENTIFIERS
 from skysim.core import files, images
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.files import CATALOGS, ROOT
+from skysim.core.paths import CATALOGS, ROOT
 from skysim.core.types import Floats
 from skysim.experiments.papers.ptase_monte_carlo import (
     SIGMA_MAG,

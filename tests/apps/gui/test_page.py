@@ -19,7 +19,7 @@ from astropy.visualization import ZScaleInterval
 from astropy.wcs import WCS
 from scipy.interpolate import RegularGridInterpolator
 
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.scene import loader
 from tests.helpers.labpage import (
     CHROMIUM,

@@ -36,12 +36,11 @@ from skysim.apps.gui.worker import (
     tasks,
     workbench,
 )
-from skysim.apps.gui.worker import geometry as lenses
 from skysim.apps.gui.worker.photo import SUFFIXES
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
-from skysim.core.files import ROOT, SCENES
 from skysim.core.images import IMAGE_SUFFIXES
+from skysim.core.paths import ROOT, SCENES
 from skysim.core.types import Mount
 from skysim.dynamics import multibody
 from skysim.experiments.study import study_file as study_loader
@@ -356,8 +355,8 @@ def test_a_frame_s_pose_and_lens_map_a_light_s_pixel_back_to_the_light() -> None
         )
         lab = flight.lab
         (_, truth) = flight.render(0)
-        lens = lenses.scene_lens(lab)
-        pose = lenses.scene_pose(lab, lens, truth)
+        lens = geometry.scene_lens(lab)
+        pose = geometry.scene_pose(lab, lens, truth)
         camera = lab.scene.camera
         nodes_px = [
             np.linspace(-0.5, size - 0.5, lens.n) for size in (camera.width_px, camera.height_px)

@@ -26,7 +26,7 @@ from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core import images
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.sources import star_archives
 
 # SHEFEX-2's chip behind an uncalibrated 25 mm lens, and what its data sheet says: 1.5 % off, no distortion.

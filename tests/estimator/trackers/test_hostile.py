@@ -22,7 +22,7 @@ from estimator.detection.detect import DETECTORS
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import TrackingMode
-from skysim.core.files import CATALOGS
+from skysim.core.paths import CATALOGS
 from skysim.results import metrics
 from tests.helpers import hostile
 

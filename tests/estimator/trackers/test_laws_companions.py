@@ -16,7 +16,7 @@ from estimator.trackers import misfit
 from estimator.trackers.misfit import ARCSEC_RAD, ERROR_RAD, SHARE
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.files import CATALOGS
+from skysim.core.paths import CATALOGS
 from tests.helpers.laws import law
 
 CAMERA = Camera.from_fov(4056, 3040, np.radians(22))  # 20 arcseconds a pixel

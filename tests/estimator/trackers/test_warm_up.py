@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 
 COUNT = """
 import sys

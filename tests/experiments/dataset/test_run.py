@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.experiments import dataset_run, dataset_shards
 from skysim.experiments.study.execution import engines, workers
 from tests.helpers.small_dataset import HEIGHT, VARY, WIDTH, contents, small

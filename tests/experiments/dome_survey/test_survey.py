@@ -24,7 +24,6 @@ from estimator.trackers.dome_tracker import DomeTracker
 from skysim.apps.cli import main
 from skysim.core.errors import InputError
 from skysim.experiments.dome_survey import adjust, survey_frames, survey_prior, survey_procedure
-from skysim.experiments.dome_survey import survey_frames as survey_stops
 from skysim.experiments.dome_survey.survey_frames import SurveyFrame
 from skysim.scene import loader
 from skysim.simulation.lab import Lab, build_lab, build_tracker
@@ -183,7 +182,7 @@ def test_a_scene_beside_the_map_file_uses_it(statistics: dict[str, Any], folder:
     found = {row["what"]: row["found"] for row in statistics["values"]}
     assert tracker.camera.focal_px == pytest.approx(found["focal length px"], rel=1e-12)
     ((frame, truth),) = survey_frames.render_stops(
-        lab, survey_stops.stop_attitudes(lab.scene, "checks", 1, 10.0)
+        lab, survey_frames.stop_attitudes(lab.scene, "checks", 1, 10.0)
     )
     answer = factory.solve_frame(tracker, frame).attitude
     assert answer.cam_from_ref is not None
@@ -210,7 +209,7 @@ def test_afit_s_dome_is_measured_to_a_hundredth_of_a_degree(tmp_path: Path) -> N
 
 
 def test_stops_tilt_uniformly_over_the_cap_with_any_yaw(lab: Lab) -> None:
-    stops = survey_stops.stop_attitudes(lab.scene, "attitudes", 2000, 25.0)
+    stops = survey_frames.stop_attitudes(lab.scene, "attitudes", 2000, 25.0)
     up = stops.apply([0.0, 0.0, 1.0])
     least = np.cos(np.radians(25))
     # The height of the body's axis is uniform from cos 25 deg to 1; its azimuth and the heading are uniform too.
@@ -226,7 +225,7 @@ def test_stops_tilt_uniformly_over_the_cap_with_any_yaw(lab: Lab) -> None:
 
 
 def test_the_imu_error_about_each_axis_has_its_sigma(lab: Lab) -> None:
-    stops = survey_stops.stop_attitudes(lab.scene, "attitudes", 500, 25.0)
+    stops = survey_frames.stop_attitudes(lab.scene, "attitudes", 500, 25.0)
     off = (survey_frames.imu_attitudes(lab.scene, stops, 0.01) * stops).as_rotvec() / 0.01
     for axis in off.T:
         low, high = chi2.ppf([RARE / 2, 1 - RARE / 2], 500)
@@ -234,7 +233,7 @@ def test_the_imu_error_about_each_axis_has_its_sigma(lab: Lab) -> None:
 
 
 def test_a_frame_of_a_stop_shows_the_vehicle_at_rest(lab: Lab) -> None:
-    stops = survey_stops.stop_attitudes(lab.scene, "attitudes", 3, 18.0)
+    stops = survey_frames.stop_attitudes(lab.scene, "attitudes", 3, 18.0)
     ((_, first), *_, (frame, last)) = survey_frames.render_stops(lab, stops, 7)
     assert frame.index == 9
     assert (last.lab_from_body * stops[2].inv()).magnitude() < 1e-12
@@ -262,7 +261,7 @@ def test_an_imu_error_shifts_a_frame_as_predicted(lab: Lab) -> None:
 def test_lights_get_their_true_names_by_the_imu(lab: Lab) -> None:
     """Of ten stops' lights, 25 px aside each and 60 px all together where LEDs are some 75 px apart: 19 in 20."""
     prior = survey_prior.calibration_prior(lab)
-    stops = survey_stops.stop_attitudes(lab.scene, "attitudes", 10, 18.0)
+    stops = survey_frames.stop_attitudes(lab.scene, "attitudes", 10, 18.0)
     taken = survey_procedure.simulated_frames(lab, UNCERTAINTY, stops)
     named = right = lights = 0
     for survey_frame, (_, truth) in zip(taken, survey_frames.render_stops(lab, stops), strict=True):

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from skysim.apps.cli.main import app
 from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.experiments.papers import compare, papers_report, published
 from skysim.experiments.papers.compare import (
     Cause,

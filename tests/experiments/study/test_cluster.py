@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from skysim.core.errors import InputError
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.experiments.study import plan
 from skysim.experiments.study.execution import runner, workers
 from skysim.experiments.study.execution.setups import code_version

@@ -21,7 +21,7 @@ import pytest
 
 import skysim.experiments.study.execution
 from skysim.core.errors import InputError
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.experiments.study import plan
 from skysim.experiments.study.execution import engines, runner, setups, store, trials
 from skysim.experiments.study.execution.engines import Engine

@@ -13,7 +13,7 @@ from astropy.utils import iers
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from skysim.core.files import SCENES
+from skysim.core.paths import SCENES
 from skysim.experiments.study import plan
 from skysim.experiments.study.execution import detections, setups, trials
 from skysim.experiments.study.plan import CentroidTrial, FrameTrial, TrialSpec

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 def complete_camera(incomplete: str) -> list[str]:
     """Names of camera presets, scenes and YAML files that begin with what was typed."""
-    from skysim.core.files import DATA
+    from skysim.core.paths import DATA
 
     names = {
         path.stem for path in (DATA / "cameras").glob("*.yaml") if path.stem.startswith(incomplete)

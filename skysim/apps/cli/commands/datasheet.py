@@ -41,7 +41,7 @@ def datasheet(
     ] = None,
     markdown: Annotated[
         Path | None,
-        typer.Option(help="Also write a Markdown page, as docs/findings/datasheets/shefex2.md."),
+        typer.Option(help="Also write a Markdown page."),
     ] = None,
     model: Annotated[
         Path | None,

@@ -169,7 +169,6 @@ def characterize(
 
     The method is photon transfer, in the terms of EMVA 1288. Every value has its 95 % interval.
     """
-    from skysim.apps.cli.options import output_folder
     from skysim.experiments.characterize import characterize_camera
 
     config, raw = characterize_camera.read_camera(camera)

@@ -28,9 +28,7 @@ def reproduce(
     out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("out/reproduce"),
     markdown: Annotated[
         Path | None,
-        typer.Option(
-            help="Also write a Markdown page with its images beside it, as docs/findings/papers.md."
-        ),
+        typer.Option(help="Also write a Markdown page with its images beside it."),
     ] = None,
     open_: OpenReport = False,
     json: Json = False,

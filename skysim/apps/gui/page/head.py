@@ -12,7 +12,7 @@ from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.live import Contents, LiveText
 from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker import image_export
-from skysim.core.files import SCENES
+from skysim.core.paths import SCENES
 
 
 class Head:

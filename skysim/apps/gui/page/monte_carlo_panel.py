@@ -27,7 +27,7 @@ from skysim.apps.gui.worker.study_process import (
 )
 from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.files import STUDIES, title_of
+from skysim.core.paths import STUDIES, title_of
 from skysim.experiments.study import study_file as loader
 from skysim.experiments.study import unused_options
 from skysim.experiments.study.execution.store import STORE

@@ -14,7 +14,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from skysim.core.errors import InputError
-from skysim.core.files import SCENES
+from skysim.core.paths import SCENES
 from skysim.core.units import SI_SUFFIX, si_unit
 from skysim.core.yaml_reader import read_yaml, set_key
 from skysim.scene import unused

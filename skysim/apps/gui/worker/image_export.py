@@ -20,7 +20,7 @@ from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core import files as file_io
 from skysim.core.errors import InputError
-from skysim.core.files import SCENES
+from skysim.core.paths import SCENES
 from skysim.core.yaml_reader import VERSION, set_key
 from skysim.results import scoring
 from skysim.results.files import recording

@@ -27,7 +27,6 @@ from skysim.apps.gui.messages import (
     TrackerResult,
 )
 from skysim.apps.gui.worker import geometry
-from skysim.apps.gui.worker import geometry as lens
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Trajectory, Truth
@@ -41,7 +40,6 @@ from skysim.simulation.compilation import warm_up
 from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
 from skysim.simulation.timing import frame_end_s
 from skysim.tracking import factory, onboard_model
-from skysim.tracking import factory as tracker_settings
 
 STAGES = ("detector", "centroider", "identifier", "solver")
 
@@ -98,7 +96,7 @@ class Workbench:
             == scene
         )
         lab_from_body = before.lab_from_body if before and same else lab.start
-        views = lens.scene_lens(lab), geometry.lab_geometry(lab)
+        views = geometry.scene_lens(lab), geometry.lab_geometry(lab)
         return cls(
             scene, lab, warm_tracker(lab), lab_from_body, *views, magnitude=magnitude_by_id(lab)
         )
@@ -106,7 +104,7 @@ class Workbench:
     @property
     def stages(self) -> dict[str, str]:
         """The tracker's algorithms by stage."""
-        settings = tracker_settings.assumed_settings(self.scene)
+        settings = factory.assumed_settings(self.scene)
         return {name: getattr(settings, name) for name in STAGES}
 
     @property
@@ -162,7 +160,7 @@ class Workbench:
         """The view of a frame of this scene for the page, without its pixels."""
         height, width = frame.image_dn.shape
         return FrameView(
-            lens.scene_pose(self.lab, self.lens, truth),
+            geometry.scene_pose(self.lab, self.lens, truth),
             frame.saturation_dn,
             (width, height),
             scoring.angles_deg(truth.cam_from_lab, self.scene, self.lab.camera.mount),

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.files import DATA, ROOT
+from skysim.core.paths import DATA, ROOT
 from skysim.dynamics.controllers import CONTROLLERS
 from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.plan import Trial, TrialSpec, digest, resolve_point

@@ -25,7 +25,7 @@ from estimator.trackers.tracking_mode import Health, TrackedReport, TrackingMode
 from skysim.camera.detector import AddedCharge
 from skysim.core import quaternion
 from skysim.core.errors import InputError
-from skysim.core.files import ROOT
+from skysim.core.paths import ROOT
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Frame, Mount, Trajectory, Truth
 from skysim.experiments.study.execution.detections import (

@@ -9,10 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from skysim.core.files import STUDIES
+from skysim.core.paths import STUDIES
 from skysim.core.types import Floats
 from skysim.experiments.study import answer, search
-from skysim.experiments.study import table as sensitivity
 from skysim.experiments.study import table as tables
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
@@ -148,7 +147,7 @@ def analyze(plan: Plan, store: Store, command: Callable[[str], str]) -> Analysis
     headline = answer.headline(study, lines, about.may_be_ambiguous, command("worst"))
     headline += answer.one_unit(about.fixed) if headline else []
     indices = (
-        sensitivity.indices(plan, store)
+        tables.indices(plan, store)
         if study.design.kind == "saltelli" and not study.optimize
         else []
     )
@@ -196,11 +195,15 @@ def compose(
     ]
     shown = {one.response for one in layout.figures(study, lines)}
     left = ", ".join(name for name in study.responses if name not in shown)
+    done = progress(study, store)
     further = [*drawn[1:], Text(left and f"In the table alone: {left}.")]
     blocks = [
         Text(question(store.meta("study")), on_terminal=False),
-        *([Verdict(found.verdict, tone(store))] if found.verdict else []),
-        progress(study, store, found.verdict),
+        *(
+            [Verdict(found.verdict, done.tone), done]
+            if found.verdict
+            else [Verdict(done.text, done.tone)]
+        ),
         failures(store, command("replay")),
         *drawn[:1],
         folded("All answers", [Items(found.headline)], on_terminal=True),
@@ -242,13 +245,8 @@ def question(text: str) -> str:
     return " ".join(line.removeprefix("#").strip() for line in lines)
 
 
-def tone(store: Store) -> Tone:
-    """Bad if trials failed."""
-    return "bad" if store.counts()["failed"] else "good"
-
-
-def progress(study: Study, store: Store, answered: str) -> Verdict | Text:
-    """How many trials are done, failed, and ended in a wrong attitude; the verdict of a study without an answer."""
+def progress(study: Study, store: Store) -> Text:
+    """How many trials are done, failed, and ended in a wrong attitude; its tone says whether all are done."""
     counts = store.counts()
     trials = study.trial_count(len(store.points()))
     finished = 0 < trials <= counts["done"]
@@ -256,8 +254,8 @@ def progress(study: Study, store: Store, answered: str) -> Verdict | Text:
         trials, **counts
     )
     text += "" if finished else " Not finished: what follows is of the trials that are in."
-    shown: Tone = "bad" if counts["failed"] else "good" if finished else "warning"
-    return Text(text, shown) if answered else Verdict(text, shown)
+    tone: Tone = "bad" if counts["failed"] else "good" if finished else "warning"
+    return Text(text, tone)
 
 
 def failures(store: Store, replay: str) -> Items:

@@ -1,0 +1,37 @@
+"""Folders of the scenes and the data that are shipped with skysim, and the titles of scene and study files.
+
+Commands that only list files need these and no library: the module imports neither NumPy nor OpenCV.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# In a checkout scenes/ and data/ are beside the package; an installed package contains them.
+SHIPPED = ROOT if (ROOT / "pyproject.toml").is_file() else ROOT / "skysim"
+DATA = SHIPPED / "data"
+SCENES = SHIPPED / "scenes"
+STUDIES = SCENES / "studies"
+CATALOGS = DATA / "catalogs"
+
+
+def title_of(path: Path) -> str:
+    """Title of a scene or study file, or that of its base if it has none; "" if none can be read.
+
+    Only the lines of these keys are parsed: a list of all scenes would otherwise take a second.
+    """
+    text = path.read_text(encoding="utf-8", errors="replace")
+    lines = dict(re.findall(r"^(title|base):(.*)", text, re.MULTILINE))
+    try:
+        values = {key: str(yaml.safe_load(text) or "") for key, text in lines.items()}
+    except yaml.YAMLError:
+        return ""
+    if "title" in values:
+        return values["title"]
+    base = path.with_name(f"{values.get('base', '').removesuffix('.yaml')}.yaml")
+    return title_of(base) if "base" in values and base.is_file() and base != path else ""
