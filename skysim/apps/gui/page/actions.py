@@ -10,7 +10,7 @@ import numpy as np
 from nicegui import ui
 from nicegui.events import KeyEventArguments
 
-from skysim.apps.gui.views import keys
+from skysim.apps.gui.views import keys, widgets
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.worker import geometry
@@ -93,7 +93,7 @@ class Palette:
         self.list.clear()
         with self.list:
             if not self.found:
-                ui.label("No such action.").classes("quiet")
+                widgets.quiet("No such action.")
             for n, command in enumerate(self.found):
                 row = ui.element("div").props(
                     f'role="option" aria-selected="{str(n == self.chosen).lower()}"'

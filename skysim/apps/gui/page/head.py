@@ -7,7 +7,7 @@ from pathlib import Path
 from nicegui import ui
 
 from skysim.apps.gui.messages import SceneInfo
-from skysim.apps.gui.views import forms, keys
+from skysim.apps.gui.views import forms, widgets
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.live import Contents, LiveText
 from skysim.apps.gui.views.state import PageView
@@ -32,17 +32,12 @@ class Head:
         self.message_text = ""
         with ui.element("div").classes("lab-head"):
             ui.label("skysim gui").classes("lab-name")
-            self.picker = ui.select(
-                self.scenes(), value=page.state.scene, on_change=self.scene_picked
+            self.picker = widgets.select(
+                self.scenes(), "borderless", value=page.state.scene, on_change=self.scene_picked
             )
-            self.picker.props('dense borderless options-dense aria-label="Scene"').classes(
-                "w-44"
-            ).mark("scene")
-            self.picker.on("popup-hide", js_handler=keys.BLUR_JS)
+            self.picker.props('aria-label="Scene"').classes("w-44").mark("scene")
             self.banner = LiveText(contents, "live").classes("lab-banner").mark("banner")
-            self.live_button = (
-                ui.button("Live", on_click=self.go_live).props("dense outline size=sm").mark("live")
-            )
+            self.live_button = widgets.button("Live", self.go_live, "live")
             self.live_button.set_visibility(False)
             self.title = ui.label().classes("lab-title quiet ellipsis")
             self.message = ui.label().classes("lab-said").props('role="status"').mark("message")

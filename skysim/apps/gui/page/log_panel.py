@@ -9,6 +9,7 @@ from typing import Any
 from nicegui import ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo
+from skysim.apps.gui.views import widgets
 from skysim.apps.gui.views.context import Shown
 from skysim.apps.gui.views.live import csv_table
 
@@ -50,10 +51,8 @@ class LogPanel:
         self.page = page
         self.lines: list[str] = []
         self.rows: list[tuple[Any, ...]] = []
-        self.button = ui.button("CSV of the identifications", on_click=self.download).props(
-            "dense flat size=sm"
-        )
-        self.button.mark("log-csv").set_enabled(False)
+        self.button = widgets.button("CSV of the identifications", self.download, "log-csv", "flat")
+        self.button.set_enabled(False)
         self.label = ui.label("Nothing yet.").classes("mono lab-log").mark("log")
 
     def add(self, text: str) -> None:

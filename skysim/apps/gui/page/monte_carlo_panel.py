@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import signal
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -12,7 +13,7 @@ from urllib.parse import quote
 from nicegui import run, ui
 from pydantic import ValidationError
 
-from skysim.apps.gui.views import forms, keys
+from skysim.apps.gui.views import forms, keys, widgets
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.live import for_page, format_number
 from skysim.apps.gui.views.style import CURVE_COLORS, TOOLTIP, chart_color
@@ -69,54 +70,31 @@ class MonteCarloPanel:
         self.failed: tuple[tuple[int, str], ...] = ()
         self.stopped = False
         self.starting = False
-        with ui.row().classes("w-full no-wrap items-center gap-2"):
-            self.study_select = ui.select({}, value=None).props(
-                'dense outlined options-dense aria-label="Study"'
-            )
-            self.study_select.classes("flex-grow").mark("study").on_value_change(self.study_chosen)
-            self.study_select.on("popup-hide", js_handler=keys.BLUR_JS)
-            self.button = ui.button("Start", on_click=self.start_or_stop).props(
-                "dense outline size=sm"
-            )
-            self.button.mark("monte-carlo")
+        with widgets.row():
+            self.study_select = widgets.select({}).props('aria-label="Study"').classes("flex-grow")
+            self.study_select.mark("study").on_value_change(self.study_chosen)
+            self.button = widgets.button("Start", self.start_or_stop, "monte-carlo")
         with ui.element("div").classes("lab-trial") as self.fields:
-            self.count = ui.number("runs, F8", value=200, min=1, max=100_000, precision=0).props(
-                "dense outlined"
-            )
+            self.count = widgets.number("runs, F8", value=200, min=1, max=100_000, precision=0)
             self.count.mark("runs")
-            self.kind = ui.select(TRIAL_KINDS, value="centroids", label="of").props(
-                "dense outlined options-dense"
-            )
-            self.kind.on("popup-hide", js_handler=keys.BLUR_JS)
-            self.noise = ui.number("noise, px", value=0.1, min=0, max=10, step=0.05).props(
-                "dense outlined"
-            )
+            self.kind = widgets.select(TRIAL_KINDS, value="centroids", label="of")
+            self.noise = widgets.number("noise, px", value=0.1, min=0, max=10, step=0.05)
             self.noise.on_value_change(self.show_noise)
-            self.magnitude = ui.number("noise, mag", value=0.25, min=0, max=5, step=0.05).props(
-                "dense outlined"
-            )
-            self.false_lights = ui.number("false", value=0, min=0, max=100, precision=0).props(
-                "dense outlined"
-            )
-            self.field = ui.number("field, °", min=1, max=90).props("dense outlined").mark("field")
+            self.magnitude = widgets.number("noise, mag", value=0.25, min=0, max=5, step=0.05)
+            self.false_lights = widgets.number("false", value=0, min=0, max=100, precision=0)
+            self.field = widgets.number("field, °", min=1, max=90).mark("field")
             self.field.on("keydown.enter", self.set_field_of_view)
-        with ui.row().classes("w-full no-wrap items-center gap-3") as self.model:
-            self.with_noise = (
-                ui.checkbox("with noise", value=True).props("dense size=xs").mark("with-noise")
-            )
-            self.noise_text = ui.label().classes("quiet").mark("noise-text")
+        with widgets.row(3) as self.model:
+            self.with_noise = widgets.checkbox("with noise", value=True).mark("with-noise")
+            self.noise_text = widgets.quiet().mark("noise-text")
         self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
-        self.note = (
-            ui.label("No study has been run yet: press 2.")
-            .classes("quiet")
-            .style("margin-top: 6px")
-        )
+        self.note = widgets.quiet("No study has been run yet: press 2.").style("margin-top: 6px")
         self.note.mark("trials-note")
         self.chart = ui.echart(options()).classes("w-full").style("height: 190px").mark("histogram")
         self.table = ui.element("div").classes("mono w-full").mark("figures")
         self.failures = ui.column().classes("w-full gap-1")
         ui.separator().style("margin: 8px 0")
-        ui.label("Finished studies").classes("quiet")
+        widgets.quiet("Finished studies")
         self.reports = ui.column().classes("w-full gap-0")
         self.list_reports()
 
@@ -351,15 +329,11 @@ class MonteCarloPanel:
         self.failures.clear()
         with self.failures:
             if results.failed:
-                ui.label("Failed trials, the first of them").classes("quiet").style(
-                    "margin-top: 8px"
-                )
+                widgets.quiet("Failed trials, the first of them").style("margin-top: 8px")
             for number, reason in results.failed:
                 with ui.row().classes("items-center gap-2 no-wrap"):
                     ui.label(f"trial {number}: {reason}").classes("mono warn ellipsis")
-                    ui.button("replay", on_click=lambda number=number: self.replay(number)).props(
-                        "dense flat size=sm"
-                    )
+                    widgets.button("replay", partial(self.replay, number), look="flat")
 
     async def replay(self, number: int) -> None:
         """Repeat a failed trial and show its frame in the sensor view."""
@@ -393,7 +367,7 @@ class MonteCarloPanel:
                     )
                     link.classes("ellipsis").props["title"] = folder.name
             if not folders:
-                ui.label("none yet").classes("quiet")
+                widgets.quiet("none yet")
 
 
 def stored_study(folder: Path) -> Plan | None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from nicegui import ui
 
+from skysim.apps.gui.views import widgets
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.worker.photo import SUFFIXES, Photo, Stages
 
@@ -56,22 +57,17 @@ class PhotoPanel:
             "margin: 10px 0"
         )
         self.upload.mark("upload")
-        with ui.row().classes("w-full no-wrap items-center gap-2"):
-            self.source = ui.select(
+        with widgets.row():
+            self.source = widgets.select(
                 list(cameras), label="live camera", value=next(iter(cameras), None)
-            )
-            self.source.props("dense outlined options-dense").classes("flex-grow")
-            self.button = (
-                ui.button("Watch", on_click=self.watch)
-                .props("dense outline size=sm")
-                .mark("camera")
-            )
+            ).classes("flex-grow")
+            self.button = widgets.button("Watch", self.watch, "camera")
             if not cameras:
                 self.source.set_visibility(False)
                 self.button.set_visibility(False)
-                ui.label(
+                widgets.quiet(
                     "No live camera is offered here. Cameras are named when the lab is started."
-                ).classes("quiet")
+                )
         self.result_text = ui.label(
             "No image yet. Images are solved lost in space; uncertain matches are rejected."
         )

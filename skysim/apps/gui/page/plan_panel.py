@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.apps.gui.messages import AmbiguityMap, PlanCheck, SurveyFound, SurveyPlan
 from skysim.apps.gui.page.run_panel import RunPanel
-from skysim.apps.gui.views import forms
+from skysim.apps.gui.views import forms, widgets
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.live import for_page
 from skysim.apps.gui.views.space import Scene3D
@@ -70,17 +70,15 @@ class PlanPanel:
         self.colored: tuple[NDArray[np.int64], Floats] | None = None
         self.legends = dict[str, ui.element]()
         with self.part():
-            ui.button("Check", on_click=self.check).props("dense outline size=sm").mark("check")
+            widgets.button("Check", self.check, "check")
         self.facts = ui.column().classes("w-full gap-1").mark("check-result")
         with self.part():
-            ui.button("Map", on_click=self.map).props("dense outline size=sm").mark("map")
+            widgets.button("Map", self.map, "map")
         self.fields = ui.column().classes("w-full gap-1").mark("map-result")
         with self.part():
             self.begin = self.survey_button("Plan", self.plan_survey, "begin a new survey")
-            self.frames = (
-                ui.number(value=FRAMES, min=2, step=1, label="frames")
-                .props("dense outlined")
-                .classes("w-24")
+            self.frames = widgets.number(value=FRAMES, min=2, step=1, label="frames").classes(
+                "w-24"
             )
             self.fly = self.survey_button(
                 "Fly", self.fly_plan, "fly the vehicle to these attitudes"
@@ -97,11 +95,10 @@ class PlanPanel:
         self.set_scene()
 
     def part(self) -> ui.row:
-        return ui.row().classes("w-full no-wrap items-center gap-2").style("margin-top: 8px")
+        return widgets.row().style("margin-top: 8px")
 
     def survey_button(self, label: str, action: Callable[[], Any], title: str) -> ui.button:
-        button = ui.button(label, on_click=action).props(f'dense outline size=sm title="{title}"')
-        return button.classes("flex-none")
+        return widgets.button(label, action).props(f'title="{title}"').classes("flex-none")
 
     def set_scene(self) -> None:
         """Say what each part does, because nothing is known of a new scene; its survey goes on if there is one."""
@@ -109,7 +106,7 @@ class PlanPanel:
         for column, text in ((self.facts, UNCHECKED), (self.fields, UNMAPPED)):
             column.clear()
             with column:
-                ui.label(text).classes("quiet")
+                widgets.quiet(text)
         info = self.page.scene_info
         if not (info and info.surveyed):
             self.clear_survey()
@@ -131,7 +128,7 @@ class PlanPanel:
         self.save_map.set_enabled(False)
         self.stops.clear()
         with self.stops:
-            ui.label(UNPLANNED).classes("quiet")
+            widgets.quiet(UNPLANNED)
 
     def enable(self) -> None:
         """Let the buttons of a planned survey act."""
@@ -164,7 +161,7 @@ class PlanPanel:
                 ui.label("No warnings.").classes("good")
             with ui.element("div").classes("lab-facts"):
                 for name, lines in found.facts:
-                    ui.label(name).classes("quiet")
+                    widgets.quiet(name)
                     ui.label("\n".join(lines)).style(
                         "white-space: pre-line; overflow-wrap: anywhere"
                     )
@@ -181,7 +178,7 @@ class PlanPanel:
         with self.fields:
             ui.label(ambiguity_text(found))
             with ui.row().classes("no-wrap items-center gap-2") as self.legends["map"]:
-                ui.label(f"{100 * found.least:.0f} % or less").classes("quiet")
+                widgets.quiet(f"{100 * found.least:.0f} % or less")
                 colors = ", ".join(
                     f"rgb({r:.0f} {g:.0f} {b:.0f})"
                     for r, g, b in 255 * color_scale(np.linspace(0, 1, 8))
@@ -189,7 +186,7 @@ class PlanPanel:
                 ui.element("div").style(
                     f"width: 120px; height: 10px; background: linear-gradient(90deg, {colors})"
                 )
-                ui.label("100 % of the LEDs coincide; drawn in the 3-D view").classes("quiet")
+                widgets.quiet("100 % of the LEDs coincide; drawn in the 3-D view")
         self.color("map", found.ids, (found.fraction - found.least) / (1 - found.least))
 
     # The survey.
@@ -240,8 +237,8 @@ class PlanPanel:
                 for number, (angles, leds) in enumerate(
                     zip(plan.angles_deg, plan.shown, strict=True), 1
                 ):
-                    button = ui.button(str(number), on_click=partial(self.point, number - 1)).props(
-                        "dense flat size=sm"
+                    button = widgets.button(
+                        str(number), partial(self.point, number - 1), look="flat"
                     )
                     button.props(f'aria-label="Point to attitude {number}"')
                     for text in (*(f"{angle:.2f}" for angle in angles), str(leds)):
@@ -286,8 +283,8 @@ async def confirmed(question: str, action: str) -> bool:
     with ui.dialog() as dialog, ui.card():
         ui.label(question)
         with ui.row():
-            ui.button(action, on_click=lambda: dialog.submit(True)).props("dense outline size=sm")
-            ui.button("Cancel", on_click=lambda: dialog.submit(False)).props("dense flat size=sm")
+            widgets.button(action, partial(dialog.submit, True))
+            widgets.button("Cancel", partial(dialog.submit, False), look="flat")
     answer = await dialog
     if not dialog.is_deleted:
         dialog.delete()

@@ -10,6 +10,7 @@ import numpy as np
 from nicegui import ui
 
 from skysim.apps.gui.messages import Detection, FrameView, LightRow, SceneInfo, TrackerResult
+from skysim.apps.gui.views import widgets
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.live import Contents, LiveInput, LiveText, format_number
 from skysim.apps.gui.views.overlay import MAX_TRUTH_MARKS, NEAR_PX
@@ -36,13 +37,13 @@ class AttitudeCard:
         self.shows_photo = False
         with ui.element("div").classes("lab-card"):
             with ui.element("div").classes("lab-grid"):
-                ui.label("attitude").classes("quiet")
+                widgets.quiet("attitude")
                 self.heads = [ui.label().classes("quiet num") for _ in range(3)]
-                ui.label("true (F5)").classes("quiet")
+                widgets.quiet("true (F5)")
                 self.inputs = [self.angle_input(n) for n in range(3)]
-                ui.label("tracker").classes("quiet")
+                widgets.quiet("tracker")
                 self.estimates = [LiveText(contents, "–").classes("mono num") for _ in range(3)]
-                ui.label("error").classes("quiet")
+                widgets.quiet("error")
                 self.errors = [LiveText(contents, "–").classes("mono num") for _ in range(3)]
             self.status = LiveText(contents).classes("mono ellipsis lab-status").mark("status")
             self.stages = ui.label(" ").classes("quiet ellipsis").mark("stages")

@@ -14,7 +14,7 @@ from nicegui import ui
 
 from skysim.apps.gui.messages import FlightRow, FlightStep, MotionLog
 from skysim.apps.gui.page.strips import StripChart, rms_line, strips
-from skysim.apps.gui.views import keys
+from skysim.apps.gui.views import widgets
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.forms import FEEDBACKS, loop_overrides
 from skysim.apps.gui.views.live import Contents, LiveInput, LiveText, csv_table
@@ -89,30 +89,19 @@ class RunPanel:
         ui.on("moment", self.clicked)
 
     def build(self) -> None:
-        with ui.row().classes("w-full no-wrap items-center gap-1"):
-            self.simulate_button = ui.button("Simulate", on_click=self.simulate).props(
-                "dense outline size=sm"
-            )
-            self.simulate_button.mark("fly")
+        with widgets.row(1):
+            self.simulate_button = widgets.button("Simulate", self.simulate, "fly")
             self.back = self.player_button(
                 "skip_previous", "Previous frame", partial(self.step, -1)
             )
             self.play = self.player_button("play_arrow", "Play", self.toggle)
             self.forward = self.player_button("skip_next", "Next frame", partial(self.step, 1))
-            self.speed = ui.select(list(SPEEDS), value="real time").props(
-                'dense borderless aria-label="Speed"'
-            )
-            self.speed.classes("w-24").on("popup-hide", js_handler=keys.BLUR_JS).on_value_change(
-                self.resync
-            )
-            self.loop = ui.select({}, on_change=self.close_loop).props(
-                "dense borderless options-dense"
-            )
-            self.loop.props('aria-label="Feedback"').mark("feedback").on(
-                "popup-hide", js_handler=keys.BLUR_JS
-            )
+            self.speed = widgets.select(list(SPEEDS), "borderless", value="real time")
+            self.speed.props('aria-label="Speed"').classes("w-24").on_value_change(self.resync)
+            self.loop = widgets.select({}, "borderless", on_change=self.close_loop)
+            self.loop.props('aria-label="Feedback"').mark("feedback")
         self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
-        with ui.row().classes("w-full no-wrap items-center gap-3"):
+        with widgets.row(3):
             self.seek = LiveInput(self.contents, "range").props(
                 'min=0 step=1 aria-label="Frame of the flight"'
             )
@@ -120,11 +109,9 @@ class RunPanel:
                 "input", self.slid, js_handler="event => emit(event.target.value)"
             )
             self.clock = LiveText(self.contents).classes("mono flex-none").mark("clock")
-        with ui.row().classes("w-full no-wrap items-center gap-3"):
+        with widgets.row(3):
             self.summary = ui.label().classes("quiet flex-grow").mark("flight")
-            self.csv_button = (
-                ui.button("CSV", on_click=self.download).props("dense flat size=sm").mark("csv")
-            )
+            self.csv_button = widgets.button("CSV", self.download, "csv", "flat")
         self.strips = StripChart(self.contents)
         self.enable()
 

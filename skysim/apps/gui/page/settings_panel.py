@@ -9,7 +9,7 @@ from pathlib import Path
 from nicegui import run, ui
 
 from skysim.apps.gui.page.monte_carlo_panel import MonteCarloPanel
-from skysim.apps.gui.views import forms, keys
+from skysim.apps.gui.views import forms, keys, widgets
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.live import for_page
 from skysim.core.errors import InputError
@@ -106,6 +106,7 @@ class KeyForm:
                         self.row(field)
 
     def row(self, field: forms.FormField) -> None:
+        edit = partial(self.edit, field.key)
         with ui.row().classes("w-full no-wrap items-start gap-2") as box:
             head = (
                 ui.label(self.label(field))
@@ -115,17 +116,14 @@ class KeyForm:
             head.tooltip(field.key).classes(self.style_class(field))
             if field.allowed_values:
                 selected = field.shown if field.shown in field.allowed_values else None
-                entry: ui.input | ui.select = ui.select(list(field.allowed_values), value=selected)
-                entry.props("dense outlined options-dense").on_value_change(
-                    partial(self.edit, field.key)
-                )
-                entry.on("popup-hide", js_handler=keys.BLUR_JS)
+                entry: ui.input | ui.select = widgets.select(
+                    list(field.allowed_values), value=selected
+                ).on_value_change(edit)
                 if len(field.allowed_values) == 1:
                     entry.props("readonly hide-dropdown-icon")
             else:
                 entry = ui.input(value=field.shown).props(f'dense outlined suffix="{field.unit}"')
-                leave = partial(self.edit, field.key)
-                entry.on("keydown.enter", leave).on("blur", leave)
+                entry.on("keydown.enter", edit).on("blur", edit)
             entry.classes("flex-grow").style("width: 0; margin-bottom: 3px").mark(
                 f"key-{field.key}"
             )
@@ -203,21 +201,15 @@ class ScenePanel:
         self.folder = folder
         self.saved = saved
         self.shown: tuple[str, Mapping[str, str]] | None = None
-        with ui.row().classes("w-full no-wrap items-center gap-2").style("margin-bottom: 8px"):
+        with widgets.row().style("margin-bottom: 8px"):
             self.find = ui.input(placeholder="find a key", on_change=lambda: self.search())
             self.find.props("dense outlined clearable").classes("flex-grow").mark("find-key")
             self.name = ui.input(placeholder="new-name").props(
                 'dense outlined aria-label="Name of the new scene"'
             )
             self.name.classes("w-36").mark("save-name")
-            ui.button("Save as", on_click=self.save).props("dense outline no-wrap size=sm").mark(
-                "save"
-            )
-            self.undo = (
-                ui.button("Undo all", on_click=self.revert)
-                .props("dense flat no-wrap size=sm")
-                .mark("revert")
-            )
+            widgets.button("Save as", self.save, "save").props("no-wrap")
+            self.undo = widgets.button("Undo all", self.revert, "revert", "flat").props("no-wrap")
         self.no_match = ui.label("No key contains this text.").classes("w-full empty")
         self.no_match.set_visibility(False)
         self.form = KeyForm(page, lambda field: field.key.removeprefix(f"{field.section}."))
@@ -296,21 +288,13 @@ class TrackerPanel:
         self.shown: tuple[str, Mapping[str, str]] | None = None
         names = {key: name for group in NAMES.values() for key, name in group.items()}
         self.form = KeyForm(page, lambda field: names[field.key], opens=SENSOR)
-        ui.label(MODEL).classes("quiet").style("margin: 10px 0 4px")
-        with ui.row().classes("w-full no-wrap items-center gap-2"):
-            self.arcsec = (
-                ui.number("noise, ″ an axis", min=0, step=1)
-                .props("dense outlined")
-                .mark("noise-arcsec")
-            )
+        widgets.quiet(MODEL).style("margin: 10px 0 4px")
+        with widgets.row():
+            self.arcsec = widgets.number("noise, ″ an axis", min=0, step=1).mark("noise-arcsec")
             self.arcsec.on("blur", self.typed).on("keydown.enter", self.typed)
-            magnitude = ui.number("noise, magnitudes", min=0, max=5, step=0.05).props(
-                "dense outlined"
-            )
+            magnitude = widgets.number("noise, magnitudes", min=0, max=5, step=0.05)
             magnitude.classes("w-36 flex-none").bind_value(study.magnitude)
-            ui.checkbox("with noise").props("dense size=xs").bind_value(study.with_noise).mark(
-                "model-noise"
-            )
+            widgets.checkbox("with noise").bind_value(study.with_noise).mark("model-noise")
         study.noise.on_value_change(self.show_noise)
 
     def set_scene(self, fields: Sequence[forms.FormField]) -> None:

@@ -29,7 +29,7 @@ from skysim.apps.gui.messages import (
     SceneInfo,
     TrackerResult,
 )
-from skysim.apps.gui.views import keys, overlay
+from skysim.apps.gui.views import overlay, widgets
 from skysim.apps.gui.views.live import Contents, LiveText
 from skysim.apps.gui.views.overlay import FRAMES, NAMES, ServedFrame, Source, TabFrames, display_of
 from skysim.apps.gui.worker.photo import Photo
@@ -117,12 +117,10 @@ class SensorView:
     def build_controls(self) -> None:
         with ui.element("div").classes("lab-bar"):
             for kind in overlay.KINDS:
-                box = ui.checkbox(kind, value=kind in self.shown).props("dense size=xs")
+                box = widgets.checkbox(kind, value=kind in self.shown)
                 box.style(f"color: {overlay.COLORS[kind]}").mark(f"overlay-{kind}")
                 box.on_value_change(lambda event, kind=kind: self.toggle(kind, event.value))
-            self.grid = ui.checkbox("grid", value=False, on_change=self.update_display).props(
-                "dense size=xs"
-            )
+            self.grid = widgets.checkbox("grid", value=False, on_change=self.update_display)
             self.grid.mark("grid")
             ui.space()
             self.stretch = self.select("Stretch", STRETCHES, "w-28")
@@ -131,9 +129,10 @@ class SensorView:
 
     def select(self, name: str, options: Collection[str], width: str) -> ui.select:
         """A list of display settings."""
-        chosen = ui.select(list(options), value=next(iter(options)), on_change=self.update_display)
-        chosen.props(f'dense borderless options-dense aria-label="{name}"').classes(width)
-        return chosen.on("popup-hide", js_handler=keys.BLUR_JS)
+        chosen = widgets.select(
+            list(options), "borderless", value=next(iter(options)), on_change=self.update_display
+        )
+        return chosen.props(f'aria-label="{name}"').classes(width)
 
     def update_display(self) -> None:
         """Send the display settings; the browser applies them."""
