@@ -115,14 +115,14 @@ def deeper_catalog(solver: Solver, share: float) -> str:
     """The remedy for a field that is this share of the sphere: the shallowest Gaia catalog with enough stars."""
     first = GAIA_LIMITS_MAG[0]
     last = GAIA_LIMITS_MAG[-1]
-    for limit in (limit for limit in GAIA_LIMITS_MAG if limit > solver.stars.v_mag[-1]):
-        if GAIA_STARS * 10 ** (GAIA_DEX_PER_MAG * (limit - first)) * share >= ENOUGH_CATALOG_STARS:
-            build = (
-                ""
-                if limit == first
-                else f", after `skysim catalog build --source gaia --limit {limit}`"
-            )
-            return f"the catalog gaia_v{limit}.0{build}"
+    for limit in GAIA_LIMITS_MAG:
+        expected = GAIA_STARS * 10 ** (GAIA_DEX_PER_MAG * (limit - first)) * share
+        if limit <= solver.stars.v_mag[-1] or expected < ENOUGH_CATALOG_STARS:
+            continue
+        if limit == first:
+            return f"the catalog gaia_v{limit}.0"
+        build = f"`skysim catalog build --source gaia --limit {limit}`"
+        return f"the catalog gaia_v{limit}.0, after {build}"
     return f"a wider picture: the deepest catalog, to V {last}, has too few as well"
 
 
@@ -153,7 +153,7 @@ def other_field(refusal: Refusal) -> str:
     """It solves with another field of view than those that were tried; with little effort only."""
     if not refusal.can_be_tried or not all(solver.field_is_known for solver in refusal.solvers):
         return ""
-    unknown = replace(refusal.solvers[0], fov_deg=None, camera=None, opencv_calibration=None)
+    unknown = replace(refusal.solvers[0], fov_deg=None, camera=None)
     cameras = unknown.candidate_cameras(*refusal.size_px)
     trackers = unknown.trackers(*refusal.size_px, refusal.date_utc)
     attitude, _ = best_attitude(refusal.centroids, trackers, Clock(), 0, len(cameras))
@@ -223,7 +223,7 @@ def unknown_cause(refusal: Refusal) -> str:
     """No cause was found: what is left."""
     solver = refusal.solvers[0]
     # `other_field` tried it.
-    unknown = replace(solver, fov_deg=None, camera=None, opencv_calibration=None)
+    unknown = replace(solver, fov_deg=None, camera=None)
     narrow_deg = min(one.tried_fov_deg(*refusal.size_px)[0] for one in (unknown, *refusal.solvers))
     text = (
         f"no cause found: no field of {narrow_deg:.1g}° to {FIELD_SEARCH.widest_deg:g}° fits, nor the mirrored picture;"

@@ -203,20 +203,23 @@ def check_image(path: Path, image: NDArray, solver: Solver) -> None:
         If the image cannot come from this camera.
     """
     camera = solver.camera
-    if camera and image.ndim != 2:
+    if camera is None:
+        return
+    if camera.detector and image.ndim != 2:
         raise InputError(
             path, f"a color image of shape {image.shape}; this camera's are monochrome"
         )
-    if camera and image.dtype == np.uint8 and camera.detector.bits > 8:
-        bits = camera.detector.bits
+    bits = camera.detector.bits if camera.detector else 0
+    if image.dtype == np.uint8 and bits > 8:
         raise InputError(
             path, f"an 8-bit image; this camera's have {bits} bits, in 16-bit FITS, PNG or TIFF"
         )
-    sensor = camera or solver.opencv_calibration
-    if sensor and image.shape[:2] != (sensor.height_px, sensor.width_px):
-        size = f"{image.shape[1]}x{image.shape[0]}"
+    height_px, width_px = image.shape[:2]
+    model = camera.model
+    if (width_px, height_px) != (model.width_px, model.height_px):
         raise InputError(
-            path, f"{size} pixels; this camera's are {sensor.width_px}x{sensor.height_px}"
+            path,
+            f"{width_px}x{height_px} pixels; this camera's are {model.width_px}x{model.height_px}",
         )
 
 
@@ -242,7 +245,8 @@ def solve_again(
     refused: list[SolvedReading], date_utc: datetime.datetime | None
 ) -> SolvedReading | None:
     """The first hypothesis that is solved by other centroids of its picture (`retries`), if any."""
-    if refused[0].hypothesis.solver.camera:
+    camera = refused[0].hypothesis.solver.camera
+    if camera and camera.detector:
         return None  # a frame of a camera that is known, with its own saturation
     for pixels in {id(one.hypothesis.pixels): one.hypothesis.pixels for one in refused}.values():
         readings = [one for one in refused if one.hypothesis.pixels is pixels]

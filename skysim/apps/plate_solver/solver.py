@@ -22,7 +22,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +42,7 @@ from skysim.core.paths import CATALOGS
 from skysim.core.time import check_year
 
 if TYPE_CHECKING:
-    from skysim.scene.opencv_calibration import OpencvCalibration
-    from skysim.scene.sections.camera import CameraConfig
+    from skysim.scene.sections.camera import DetectorConfig
 
 
 # Relative uncertainty of the focal length. An OpenCV chessboard calibration gives it to about 0.1 %.
@@ -121,6 +120,24 @@ class FieldSearch:
 FIELD_SEARCH = FieldSearch()
 
 
+class KnownCamera(NamedTuple):
+    """A camera that is known by a scene, a camera file or an OpenCV calibration.
+
+    Attributes
+    ----------
+    model
+        Where its pixels point
+    uncertainty
+        Relative, of its focal length
+    detector
+        Its detector; None if a calibration alone is known
+    """
+
+    model: Camera
+    uncertainty: float = CALIBRATED_UNCERTAINTY
+    detector: DetectorConfig | None = None
+
+
 @dataclass(frozen=True, slots=True)
 class Solver:
     """Settings of the plate solver: a field of view known to 5 %, or a camera known exactly or by calibration; with
@@ -144,11 +161,10 @@ class Solver:
     """
 
     fov_deg: float | None
-    camera: CameraConfig | None
+    camera: KnownCamera | None
     stars: star_catalog.StarCatalog
     settings: Settings
     time_utc: datetime.datetime | None = None
-    opencv_calibration: OpencvCalibration | None = None
     fov_uncertainty: float = FOV_UNCERTAINTY
     search: FieldSearch = FIELD_SEARCH
     hypotheses: int = 1
@@ -160,7 +176,7 @@ class Solver:
     @property
     def field_is_known(self) -> bool:
         """Whether a single tracker solves the image."""
-        return bool(self.camera or self.opencv_calibration or self.fov_deg)
+        return bool(self.camera or self.fov_deg)
 
     def candidate_cameras(self, width_px: int, height_px: int) -> list[tuple[Camera, float]]:
         """Cameras to try for this image size, each with its relative focal-length uncertainty, the likeliest first."""
@@ -171,21 +187,10 @@ class Solver:
                 for camera, uncertainty in whole
             ]
         if self.camera:
-            from skysim.tracking.onboard_model import calibration
-
-            return [(calibration(self.camera), 0.0)]
-        if lens := self.opencv_calibration:
-            camera = Camera(
-                lens.width_px, lens.height_px, lens.focal_px, lens.center_px, lens.distortion
-            )
-            return [(camera, CALIBRATED_UNCERTAINTY)]
+            return [(self.camera.model, self.camera.uncertainty)]
         if self.fov_deg:
-            return [
-                (
-                    Camera.from_fov(width_px, height_px, math.radians(self.fov_deg)),
-                    self.fov_uncertainty,
-                )
-            ]
+            camera = Camera.from_fov(width_px, height_px, math.radians(self.fov_deg))
+            return [(camera, self.fov_uncertainty)]
         cameras = self.search.cameras(width_px, height_px)
         return [one for one in cameras if self.mean_stars(one[0]) >= self.search.least_stars]
 
@@ -271,11 +276,11 @@ def make_solver(
     time_utc, warning = validated_date(time_utc)
     if warning:
         raise InputError("solve.time_utc", warning)
-    camera, lens, settings = read_camera(camera_file) if camera_file else (None, None, Settings())
+    camera, settings = read_camera(camera_file) if camera_file else (None, Settings())
     if stages:
         check_stages(stages)
         settings = replace(settings, **stages)  # type: ignore[arg-type]
-    return Solver(fov_deg, camera, read_catalog(catalog), settings, time_utc, lens)
+    return Solver(fov_deg, camera, read_catalog(catalog), settings, time_utc)
 
 
 @functools.lru_cache(maxsize=1)
@@ -305,8 +310,15 @@ def check_stages(stages: Mapping[str, str]) -> None:
             raise InputError(f"solve.{stage}", *unknown_name(stage, name, STAR_ALGORITHMS[stage]))
 
 
-def read_camera(path: Path) -> tuple[CameraConfig | None, OpencvCalibration | None, Settings]:
-    """The camera of a scene (its file, or its name) or of a camera file, or else an OpenCV calibration; the settings.
+def read_camera(path: Path) -> tuple[KnownCamera, Settings]:
+    """Read a scene (its file, or its name), a camera file or an OpenCV calibration.
+
+    Returns
+    -------
+    camera
+        The camera of the images
+    settings
+        Those of a tracker for it: the defaults, with the detector's gain and saturation if it is known
 
     Raises
     ------
@@ -316,16 +328,18 @@ def read_camera(path: Path) -> tuple[CameraConfig | None, OpencvCalibration | No
     from skysim.camera.detector import saturation_dn
     from skysim.scene import loader
     from skysim.scene import opencv_calibration as opencv
+    from skysim.tracking.onboard_model import calibration
 
     if opencv.looks_like_calibration(path):
-        return None, opencv.read(path), Settings()
+        lens = opencv.read(path)
+        size_px = lens.width_px, lens.height_px
+        camera = Camera(*size_px, lens.focal_px, lens.center_px, lens.distortion)
+        return KnownCamera(camera), Settings()
     is_file = path.suffix or path.exists()  # else the name of a shipped scene
-    camera = loader.load_camera(path if is_file else loader.find(str(path)))
-    return (
-        camera,
-        None,
-        Settings(gain_e_dn=camera.detector.gain_e_dn, saturation=saturation_dn(camera.detector)),
-    )
+    config = loader.load_camera(path if is_file else loader.find(str(path)))
+    detector = config.detector
+    settings = Settings(gain_e_dn=detector.gain_e_dn, saturation=saturation_dn(detector))
+    return KnownCamera(calibration(config), 0.0, detector), settings
 
 
 def read_catalog(name: str | None) -> star_catalog.StarCatalog:
