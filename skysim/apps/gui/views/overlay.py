@@ -37,7 +37,7 @@ UNSOLVED_TICKS = (
     60  # of the brightest true lights of a frame without detections; fainter ones are dots
 )
 # Proper names of bright stars by Hipparcos number.
-NAMES: dict[int, str] = read_yaml(DATA / "star_names.yaml")[0]
+NAMES: dict[Any, str] = read_yaml(DATA / "star_names.yaml")[0]
 NEAR_PX = 4.0  # a detection within this distance of a true light is not false
 
 Points = list[list[float]]  # to a tenth of a pixel, for a short message

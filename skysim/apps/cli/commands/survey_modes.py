@@ -1,0 +1,310 @@
+"""What `skysim survey` does in each of its modes: plan, repeat, simulate, or survey from images."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from estimator.trackers.pipeline import Settings
+from skysim.apps.cli.terminal import print_error, progress, progress_callback
+from skysim.apps.plate_solver import read_camera
+from skysim.core import files
+from skysim.core.errors import InputError
+from skysim.experiments.dome_survey import (
+    adjust,
+    survey_findings,
+    survey_frames,
+    survey_images,
+    survey_prior,
+    survey_procedure,
+    survey_report,
+)
+from skysim.experiments.dome_survey.survey_findings import Coverage, SurveyRun
+from skysim.experiments.dome_survey.survey_frames import SurveyFrame
+from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
+from skysim.results.report import print_blocks, print_table, print_wrapped
+from skysim.results.report_blocks import Column, Table
+from skysim.scene.scene import Scene
+from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.tracking import dome_map_file, factory
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the command line asks for."""
+
+    scene: Scene
+    uncertainty: SurveyUncertainty
+    folder: Path
+    tilt_deg: float
+    attitudes: str
+    frames: int
+    distortion: bool
+    next_stops: int
+    quiet: bool  # print the result alone
+
+
+def planned(request: Request) -> tuple[Lab, CalibrationPrior, survey_procedure.HeldAttitudes]:
+    """The lab with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
+
+    return survey_procedure.plan_survey(
+        request.scene, request.uncertainty, request.frames, request.tilt_deg, request.attitudes
+    )
+
+
+def plan_only(request: Request) -> dict[str, Any]:
+    """The attitudes of a plan and the errors predicted."""
+
+    _, _, plan = planned(request)
+    path = files.make_folder(request.folder) / "plan.csv"
+    survey_procedure.write_plan(path, plan)
+    return {
+        "scene": request.scene.name,
+        "attitudes": survey_findings.stop_rows(plan.lab_from_body, plan.shown),
+        "leds": plan.shown.shape[1],
+        "noise_px": plan.model.sigma_px,
+        "predicted": [
+            {"frames": n, **survey_findings.accuracy_statistics(one)} for n, one in plan.steps()
+        ],
+        "plan": str(path),
+    }
+
+
+def repeated(request: Request, repeat: int) -> dict[str, Any]:
+    """The errors predicted and those of simulated surveys, side by side."""
+
+    lab, _, plan = planned(request)
+    surveys = survey_procedure.repeat_survey(lab, request.uncertainty, plan, repeat)
+    results = list(progress(surveys, repeat, "surveys"))
+    errors = [one for one in results if isinstance(one, survey_procedure.SimulatedErrors)]
+    failures = [one for one in results if isinstance(one, InputError)]
+    if not errors:
+        raise failures[0]
+    return {
+        "scene": request.scene.name,
+        "frames": len(plan.shown),
+        "surveys": repeat,
+        "rows": survey_procedure.comparison(plan, errors),
+        "measured": [one.measured for one in errors],
+        "false_alarms": sum(one.false_alarms for one in errors),
+        "failures": [str(one) for one in failures],
+    }
+
+
+def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str, Any]:
+    """A simulated survey, compared with the truth."""
+
+    lab, before, plan = planned(request)
+    uncertainty = request.uncertainty
+    first_tracker = build_tracker(lab.camera)
+    taken = survey_procedure.simulated_frames(lab, uncertainty, plan.lab_from_body, frames_to)
+    observations = list(progress(taken, len(plan.shown), "rendering"))
+    with (
+        progress_callback("adjusting") as update,
+        coverage_shown(request, observations, before, plan.model.sigma_px),
+    ):
+        run = adjust.run_survey(observations, before, uncertainty, request.distortion, update)
+    statistics = write_results(request, run, before, lab)
+    tracker = factory.build_tracker(
+        survey_prior.with_map(lab.scene, statistics["map"]), lab.camera.mount, lab.camera.sources
+    )
+    tests = survey_frames.render_stops(
+        lab,
+        survey_frames.stop_attitudes(lab.scene, "checks", checks, request.tilt_deg),
+        len(plan.shown),
+    )
+    statistics |= survey_report.truth_statistics(run, before, lab)
+    statistics |= survey_report.compare_trackers(
+        {"before": first_tracker, "after": tracker}, progress(tests, checks, "comparing")
+    )
+    count = len(plan.shown)
+    predicted = survey_findings.accuracy_statistics(plan.first(count))
+    return write_report(request, run, statistics | {"frames": count, "predicted": predicted})
+
+
+def from_images(request: Request, images: Path, camera_file: Path, watch: bool) -> dict[str, Any]:
+    """A survey from the images of a folder, with the LEDs of the scene as the list before it."""
+
+    known, read = read_camera(camera_file)
+    camera = known.model
+    lab = build_lab(survey_prior.as_listed(request.scene))
+    before = survey_prior.listed_prior(lab, camera)
+    stages = factory.assumed_settings(lab.scene)
+    if known.detector:
+        stages = replace(stages, gain_e_dn=read.gain_e_dn, saturation=read.saturation)
+    if watch:
+        pictures = followed(request, images, before, stages)
+    else:
+        total = len(survey_images.image_files(images))
+        pictures = list(
+            progress(survey_images.read_images(images, camera, stages), total, "reading")
+        )
+    found = survey_images.frames_with_attitude(pictures, before, request.uncertainty, stages)
+    with progress_callback("adjusting") as update, coverage_shown(request, found, before, None):
+        run = survey_procedure.survey_images(
+            pictures, found, before, request.uncertainty, stages, request.distortion, update
+        )
+    return write_report(
+        request, run, write_results(request, run, before, None) | {"frames": len(pictures)}
+    )
+
+
+def followed(
+    request: Request, images: Path, before: CalibrationPrior, stages: Settings
+) -> list[survey_images.SurveyImage]:
+    """The images of a folder while they are taken, until there are enough or Ctrl-C; prints the coverage so far."""
+
+    watched = survey_images.WatchedFolder(images, before.camera, stages)
+    with suppress(KeyboardInterrupt):
+        for news in watched.arrivals(request.frames):
+            for complaint in news.complaints:
+                print_error(str(complaint))
+            if news.read and not request.quiet:
+                print_so_far(request, watched.pictures, before, stages)
+    return watched.pictures
+
+
+def print_so_far(
+    request: Request,
+    pictures: list[survey_images.SurveyImage],
+    before: CalibrationPrior,
+    stages: Settings,
+) -> None:
+    """Print how many images there are, which LEDs they measure, and the attitudes to hold next."""
+
+    found = survey_images.frames_with_attitude(pictures, before, request.uncertainty, stages)
+    print(f"{len(pictures)} of {request.frames} images, {len(found)} with an attitude")
+    if found:
+        print_coverage(request, found, before, None)
+
+
+@contextmanager
+def coverage_shown(
+    request: Request, frames: list[SurveyFrame], prior: CalibrationPrior, noise_px: float | None
+) -> Iterator[None]:
+    """Print which LEDs the frames show, and the attitudes to hold next, if they are too few for a survey."""
+
+    try:
+        yield
+    except InputError:
+        if frames:
+            print_coverage(request, frames, prior, noise_px)
+        raise
+
+
+def print_coverage(
+    request: Request, frames: list[SurveyFrame], prior: CalibrationPrior, noise_px: float | None
+) -> None:
+    """Print which LEDs the frames show, and the attitudes to hold next."""
+    so_far = survey_findings.coverage_before(
+        frames, prior, request.uncertainty, noise_px or prior.floor_px
+    )
+    print_blocks(survey_report.coverage_blocks(with_next(request, so_far, prior)))
+
+
+def with_next(request: Request, so_far: Coverage, prior: CalibrationPrior) -> dict[str, Any]:
+    """Statistics of a coverage with the attitudes to hold next, and what they will reach."""
+
+    margin_px = survey_prior.image_sizes(prior).margin_px
+    further = survey_findings.next_stops(
+        request.scene, so_far, margin_px, request.next_stops, request.tilt_deg
+    )
+    shown = so_far.model.visible(further.lab_from_body.inv(), margin_px)
+    return {
+        "coverage": survey_findings.coverage_statistics(so_far),
+        "next": survey_findings.stop_rows(further.lab_from_body, shown),
+        "next_reaches": survey_findings.accuracy_statistics(further.accuracy),
+    }
+
+
+def write_results(
+    request: Request, run: SurveyRun, before: CalibrationPrior, lab: Lab | None
+) -> dict[str, Any]:
+    """Write map and picture of a survey, and return its statistics; a simulated one is drawn with its errors."""
+
+    folder = files.make_folder(request.folder)
+    path = folder / "leds.ecsv"
+    picture = folder / "survey.png"
+    dome_map_file.write_dome_map(path, adjust.dome_map(run.survey, request.uncertainty))
+    so_far = survey_findings.coverage(run)
+    faults = survey_findings.find_faults(run)
+    statistics = survey_report.survey_statistics(run, before) | with_next(request, so_far, before)
+    statistics |= {
+        "scene": request.scene.name,
+        "faults": asdict(faults),
+        "map": str(path),
+        "picture": str(picture),
+    }
+    further = survey_frames.from_rows(statistics["next"])
+    errors = survey_report.led_errors(run.survey, before, lab) if lab else None
+    files.write_image(
+        picture,
+        survey_report.survey_figure(
+            so_far, faults, further, errors, survey_report.list_shifts(run)
+        ),
+    )
+    return statistics
+
+
+def write_report(request: Request, run: SurveyRun, statistics: dict[str, Any]) -> dict[str, Any]:
+    """Write a survey's statistics as JSON, and its report, which is printed too; return them with the report's path."""
+
+    path = request.folder / "report.html"
+    statistics |= {"report": str(path)}
+    report = survey_report.survey_report(statistics, run, shlex.join(["skysim", *sys.argv[1:]]))
+    report.save(path)
+    files.write_text(request.folder / "survey.json", files.to_json(statistics))
+    if not request.quiet:
+        report.print()
+        print_wrapped(f"{statistics['map']}: for tracker.map; report: {path}")
+    return statistics
+
+
+# Terminal output of `--plan` and `--repeat`: the attitudes to hold, predicted and simulated errors.
+
+
+SHOWN_STOPS = 12  # attitudes of a plan that are printed; the file has all
+
+
+def print_plan(plan: dict[str, Any]) -> None:
+    print_table(survey_report.stop_table(plan["attitudes"][:SHOWN_STOPS]))
+    if len(plan["attitudes"]) > SHOWN_STOPS:
+        print(f"... {len(plan['attitudes'])} attitudes in all, in {plan['plan']}")
+    print()
+    heads = ("LED place mm", "lever mm", "focal length px")
+    columns = [
+        Column("frames"),
+        Column("LEDs measured"),
+        *(Column(head, format=".3g") for head in heads),
+    ]
+    keys = ("frames", "measured", "led_mm", "lever_mm", "focal_px")
+    table = Table(columns, [[row[key] for key in keys] for row in plan["predicted"]])
+    print_table(
+        table,
+        f"predicted errors (1σ) of {plan['leds']} LEDs, centroids to {plan['noise_px']:.2g} px",
+    )
+
+
+def print_comparison(result: dict[str, Any]) -> None:
+    columns = [
+        Column("what", kind="text"),
+        Column("predicted", format=".3g"),
+        Column("simulated", format=".3g"),
+        Column("ratio"),
+    ]
+    rows = []
+    for row in result["rows"]:
+        ratio = row["ratio"] and f"{row['ratio']:.2f} ± {row['ratio_sigma']:.2f}"
+        rows.append([row["what"], row["predicted"], row["simulated"], ratio])
+    print_table(Table(columns, rows))
+    print_wrapped(
+        f"{len(result['measured'])} surveys of {result['frames']} frames, {min(result['measured'])} to"
+        f" {max(result['measured'])} LEDs measured; {result['false_alarms']} faults reported, of none"
+    )
+    for failure in result["failures"]:
+        print_wrapped(f"one more survey failed: {failure}")
