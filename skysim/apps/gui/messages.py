@@ -364,13 +364,6 @@ class FlightStep:
     residuals: tuple[tuple[float, int, float], ...] = ()
 
 
-class PlanCheck(NamedTuple):
-    """The check of a scene: the facts, each a name and lines of text, and the warnings."""
-
-    facts: tuple[tuple[str, tuple[str, ...]], ...]
-    findings: tuple[str, ...]
-
-
 class AmbiguityMap(NamedTuple):
     """The most similar other field of the field about each LED.
 
@@ -439,17 +432,17 @@ class SurveyFound(NamedTuple):
     """
 
     frames: int
-    connected: int
     missed: int
-    measured: int
     seen_once: int
     unseen: int
-    renamed: int
-    sigma_mm: float | None
-    before_mm: float | None
-    error_mm: float | None
-    faults: tuple[str, ...]
     refusal: str
     ids: NDArray[np.int64]
     known: Floats
     plan: SurveyPlan
+    connected: int = 0
+    measured: int = 0
+    renamed: int = 0
+    sigma_mm: float | None = None
+    before_mm: float | None = None
+    error_mm: float | None = None
+    faults: tuple[str, ...] = ()

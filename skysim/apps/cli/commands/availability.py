@@ -16,7 +16,11 @@ from skysim.results.report import print_table
 from skysim.results.report_blocks import Column, Table
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from skysim.scene.scene import Scene
+    from skysim.scene.sections.surroundings import ExclusionConfig
     from skysim.sources.orbit_availability import Pointing, SkySamples
 
 SPANS_S = {"orbit": None, "day": DAY_S, "year": JULIAN_YEAR_DAY * DAY_S}
@@ -63,13 +67,13 @@ def availability(
         found = computed(
             config, pointing_of(config, law, off_deg, around_deg), SPANS_S[span], samples, watch
         )
-    fractions = fractions_of(found, config)
+    exclusion = config.orbit.exclusion
+    fractions = fractions_of(found, exclusion)
     if picture is not None:
-        write_picture(picture, found, config)
+        write_picture(picture, found, exclusion)
     if json:
         print_json({"span": span, "law": law, "samples": len(found.t_s), "fractions": fractions})
         return
-    exclusion = config.orbit.exclusion
     limits = {"Sun": exclusion.sun_deg, "Earth": exclusion.earth_deg, "Moon": exclusion.moon_deg}
     rows = [
         [name, f"more than {limit:g}° away", f"{100 * fractions[name]:.2f} %"]
@@ -136,27 +140,25 @@ def computed(
     )
 
 
-def fractions_of(found: SkySamples, scene: Scene) -> dict[str, float]:
+def fractions_of(found: SkySamples, exclusion: ExclusionConfig) -> dict[str, float]:
     """The fraction of the times at which each condition holds, and at which all do."""
+    outside = found.outside(exclusion)
+    each = {name: float(holds.mean()) for name, holds in outside.items()}
+    return {**each, "all": float(available(found, exclusion).mean())}
+
+
+def available(found: SkySamples, exclusion: ExclusionConfig) -> NDArray[np.bool_]:
+    """(N,) whether all conditions hold at a time."""
     import numpy as np
 
-    assert scene.orbit is not None
-    assert scene.orbit.exclusion is not None
-    outside = found.outside(scene.orbit.exclusion)
-    each = {name: float(np.mean(holds)) for name, holds in outside.items()}
-    return {**each, "all": float(np.mean(np.all(list(outside.values()), axis=0)))}
+    return np.all(list(found.outside(exclusion).values()), axis=0)
 
 
-def write_picture(path: Path, found: SkySamples, scene: Scene) -> None:
+def write_picture(path: Path, found: SkySamples, exclusion: ExclusionConfig) -> None:
     """The angles over time with their limits, and the times at which the tracker is available."""
-    import numpy as np
-
     from skysim.core.files import atomic_file
     from skysim.results.plots import INK, png
 
-    assert scene.orbit is not None
-    assert scene.orbit.exclusion is not None
-    exclusion = scene.orbit.exclusion
     hours = found.t_s / HOUR_S
     curves = (
         ("Sun", found.sun_deg, exclusion.sun_deg),
@@ -169,12 +171,11 @@ def write_picture(path: Path, found: SkySamples, scene: Scene) -> None:
         for color, (name, angle_deg, limit_deg) in zip(INK, curves, strict=False):
             axes.plot(hours, angle_deg, color=color, label=name)
             axes.axhline(limit_deg, color=color, linestyle=":", linewidth=0.8)
-        free = np.all(list(found.outside(exclusion).values()), axis=0)
         axes.fill_between(
             hours,
             0,
             1,
-            where=free,
+            where=available(found, exclusion),
             transform=axes.get_xaxis_transform(),
             color="#009e73",
             alpha=0.15,

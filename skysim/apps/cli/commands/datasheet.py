@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,6 +15,7 @@ from skysim.results.report import print_table, print_wrapped
 from skysim.results.report_blocks import Column, Table
 
 if TYPE_CHECKING:
+    from skysim.experiments.datasheet.cells import MeasuredFrames
     from skysim.experiments.datasheet.model_fit import Agreement
 
 
@@ -74,11 +74,8 @@ def datasheet(
     loaded = load(scene, None, seed, set_)
     overrides = parse_overrides(set_) | ({} if seed is None else {"seed": str(seed)})
     folder = out or Path("out") / f"{loaded.name}_datasheet"
+    title = f"datasheet of {loaded.name}"
     with ExitStack() as stack:
-
-        def watch(trials: int) -> Callable[[Any], Any]:
-            return stack.enter_context(trial_progress(f"datasheet of {loaded.name}", trials))
-
         sheet = cells.measure(
             scene,
             loaded,
@@ -87,7 +84,7 @@ def datasheet(
             quick=quick,
             fields=fields,
             workers=workers,
-            watch=watch,
+            watch=lambda trials: stack.enter_context(trial_progress(title, trials)),
         )
     statement = state(sheet)
     report = datasheet_report.datasheet_report(statement, quick)
@@ -95,25 +92,30 @@ def datasheet(
     if markdown:
         files.make_folder(markdown.parent)
         files.write_text(markdown, report.markdown())
-    if model:
-        agreements = model_fit.agreements(sheet)
-        constants = model_fit.constants(sheet) | {
-            "agreement": [one._asdict() for one in agreements]
-        }
-        written = model_fit.write_model(model, constants) + (
-            [model_fit.write_fmu(model)] if fmu else []
-        )
     if json:
         print_json(numbers(statement))
     else:
         report.print()
         print(f"report: {paths['report']}")
-        if model:
-            print_agreements(agreements)
-            for path in written:
-                print(path)
+    if model:
+        write_model(model, sheet, fmu, json)
     if open_:
         typer.launch(str(paths["report"]))
+
+
+def write_model(folder: Path, sheet: MeasuredFrames, fmu: bool, json: bool) -> None:
+    """Write the fast model of the errors; print its agreement with the simulation and its files, unless `json`."""
+    from skysim.experiments.datasheet import model_fit
+
+    agreements = model_fit.agreements(sheet)
+    agreement = [one._asdict() for one in agreements]
+    written = model_fit.write_model(folder, model_fit.constants(sheet) | {"agreement": agreement})
+    if fmu:
+        written.append(model_fit.write_fmu(folder))
+    if not json:
+        print_agreements(agreements)
+        for path in written:
+            print(path)
 
 
 def print_agreements(agreements: list[Agreement]) -> None:

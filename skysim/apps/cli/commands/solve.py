@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,6 +18,9 @@ from skysim.apps.cli.options import (
 )
 from skysim.apps.cli.terminal import print_error, print_json, print_solutions, progress
 from skysim.core.errors import InputError
+
+if TYPE_CHECKING:
+    from skysim.apps.plate_solver import Solver
 
 
 def solve(
@@ -82,16 +85,27 @@ def solve(
         files.write_image(paths[-1], grab_frame(live))
     if not paths:
         raise InputError("", "no images", "files, folders, or --live CAMERA")
+    solve_all(paths, settings, out, json)
+
+
+def solve_all(paths: list[Path], solver: Solver, out: Path, json: bool) -> None:
+    """Solve the images and print the solutions. Raises typer.Exit if one could not be read."""
+    from skysim.apps import plate_solver
+    from skysim.core import files
+
+    quiet = json or len(paths) == 1
     annotated = plate_solver.annotated_paths(out, paths)
-    jobs = progress(
-        list(zip(paths, annotated, strict=True)),
-        len(paths),
-        "solving",
-        quiet=json or len(paths) == 1,
-    )
-    results = [plate_solver.solve_file(path, settings, image) for path, image in jobs]
-    errors = [result["status"] for result in results if result.pop("bad_input")]
-    warnings = [warning for result in results if (warning := result.pop("warning"))]
+    results = []
+    errors = []
+    warnings = []
+    for n, path in enumerate(progress(paths, len(paths), "solving", quiet)):
+        result = plate_solver.solve_file(path, solver, annotated[n])
+        warning = result.pop("warning")
+        if warning:
+            warnings.append(warning)
+        if result.pop("bad_input"):
+            errors.append(result["status"])
+        results.append(result)
     files.write_text(out / "solutions.json", files.to_json(results))
     if json:
         print_json(results)

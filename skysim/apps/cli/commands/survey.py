@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -147,7 +148,7 @@ def survey(
         next_ or NEXT,
         json,
     )
-    show = None
+    show: Callable[[dict[str, Any]], None] | None = None
     if images is not None and camera is not None:
         statistics = survey_modes.from_images(request, images, camera, watch)
     elif plan:

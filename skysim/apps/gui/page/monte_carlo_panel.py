@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from skysim.apps.gui.views import forms, keys, widgets
 from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.live import for_page, format_number
+from skysim.apps.gui.views.live import format_number
 from skysim.apps.gui.views.style import CURVE_COLORS, TOOLTIP, chart_color
 from skysim.apps.gui.worker.study_process import (
     PAGE_STUDY,
@@ -124,14 +124,11 @@ class MonteCarloPanel:
         """Change the scene's field of view by the focal length."""
         state = self.page.state
         field_deg = float(self.field.value or 0)
-        try:
-            change = await run.io_bound(
-                forms.field_override, state.scene, state.overrides, field_deg
-            )
-        except InputError as error:
-            self.page.show_message(for_page(error))
-            return
-        await self.page.apply_overrides(change)
+        change = await self.page.run_here(
+            forms.field_override, state.scene, state.overrides, field_deg
+        )
+        if change is not None:
+            await self.page.apply_overrides(change)
 
     def focus(self) -> None:
         """Give the number of runs the keyboard focus."""
@@ -166,15 +163,10 @@ class MonteCarloPanel:
     async def start_process(self) -> bool:
         """Start the process of the chosen study; return whether it could be."""
         self.page.show_message("")
-        try:
-            StudyProcess.check_count()
-            path = await run.io_bound(self.study_file)
-            study = await run.io_bound(loader.load, path)
-            if study.study.optimize is not None:
-                raise InputError(path.stem, "has the key optimize", "studies with a design")
-        except InputError as error:
-            self.page.show_message(for_page(error))
+        found = await self.page.run_here(self.load_study)
+        if found is None:
             return False
+        path, study = found
         self.process = StudyProcess(
             path.parent if not self.study_select.value else self.out / path.stem
         )
@@ -198,6 +190,15 @@ class MonteCarloPanel:
         if not self.page.is_open:  # closed meanwhile, when there was no process to end
             self.process.stop(signal.SIGTERM)
         return True
+
+    def load_study(self) -> tuple[Path, Plan]:
+        """The file of the study to start, and its plan. Raises InputError if it cannot be started."""
+        StudyProcess.check_count()
+        path = self.study_file()
+        study = loader.load(path)
+        if study.study.optimize is not None:
+            raise InputError(path.stem, "has the key optimize", "studies with a design")
+        return path, study
 
     def study_file(self) -> Path:
         """Path of the study file: the chosen one, or a new Monte Carlo study; a stopped one if it is unchanged.

@@ -7,25 +7,26 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from nicegui import run, ui
+from nicegui import ui
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.apps.gui.messages import AmbiguityMap, PlanCheck, SurveyFound, SurveyPlan
+from skysim.apps.gui.messages import AmbiguityMap, SurveyFound, SurveyPlan
 from skysim.apps.gui.page.run_panel import RunPanel
 from skysim.apps.gui.views import forms, widgets
 from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.live import for_page
 from skysim.apps.gui.views.space import Scene3D
 from skysim.apps.gui.views.style import color_scale
-from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody
 from skysim.experiments.dome_survey import survey_frames
 from skysim.scene.sections.motion import PRESCRIBED
+
+if TYPE_CHECKING:
+    from skysim.simulation.checks.check import Check
 
 # Of a survey that is flown: few frames while the vehicle slews, and a whole exposure in each hold.
 SURVEY_RATE_HZ = 0.5
@@ -150,7 +151,7 @@ class PlanPanel:
     # The check.
 
     async def check(self) -> None:
-        found: PlanCheck | None = await self.page.run_task("check", activity="checking the scene …")
+        found: Check | None = await self.page.run_task("check", activity="checking the scene …")
         if found is None:
             return
         self.facts.clear()
@@ -160,9 +161,9 @@ class PlanPanel:
             if not found.findings:
                 ui.label("No warnings.").classes("good")
             with ui.element("div").classes("lab-facts"):
-                for name, lines in found.facts:
-                    widgets.quiet(name)
-                    ui.label("\n".join(lines)).style(
+                for fact in found.facts:
+                    widgets.quiet(fact.name)
+                    ui.label("\n".join(fact.lines)).style(
                         "white-space: pre-line; overflow-wrap: anywhere"
                     )
 
@@ -255,14 +256,10 @@ class PlanPanel:
         assert self.plan is not None
         scene = self.page.state.scene
         with self.working():
-            try:
-                overrides = await run.io_bound(
-                    survey_flight, scene, self.page.state.overrides, self.plan.angles_deg
-                )
-            except InputError as error:
-                self.page.show_message(for_page(error))
-                return
-            if self.page.is_open and await self.page.open(scene, overrides):
+            overrides = await self.page.run_here(
+                survey_flight, scene, self.page.state.overrides, self.plan.angles_deg
+            )
+            if overrides and self.page.is_open and await self.page.open(scene, overrides):
                 self.page.show_panel("Run")
                 await self.run_panel.simulate()
 

@@ -121,15 +121,13 @@ class AttitudeCard:
             for label, angle in zip(self.estimates, result.angles_deg, strict=True):
                 label.set_text(format_angle(angle))
             cross, roll = result.sigma_arcsec
-            self.errors[0].set_text(
-                "–" if math.isnan(result.cross_arcsec) else f"cross {result.cross_arcsec:.2f}″"
+            texts = (
+                (result.cross_arcsec, f"cross {result.cross_arcsec:.2f}″"),
+                (result.roll_arcsec, f"roll {result.roll_arcsec:+.1f}″"),
+                (cross, f"σ {format_number(cross)}″ {format_number(roll)}″"),
             )
-            self.errors[1].set_text(
-                "–" if math.isnan(result.roll_arcsec) else f"roll {result.roll_arcsec:+.1f}″"
-            )
-            self.errors[2].set_text(
-                "–" if math.isnan(cross) else f"σ {format_number(cross)}″ {format_number(roll)}″"
-            )
+            for label, (value, text) in zip(self.errors, texts, strict=True):
+                label.set_text("–" if math.isnan(value) else text)
         color, text = status_line(result)
         self.status.set_text(text, color)
 

@@ -174,16 +174,13 @@ class RunPanel:
         others = {
             key: value for key, value in state.overrides.items() if not key.startswith(CONTROL_KEYS)
         }
-        controls = {
-            key: value
-            for key, value in self.closed_overrides.items()
-            if key.startswith(CONTROL_KEYS)
-        }
-        maneuver = {
-            key: value
-            for key, value in controls.items()
-            if feedback and key.startswith("motion.maneuver")
-        }
+        controls = {}
+        maneuver = {}
+        for key, value in self.closed_overrides.items():
+            if key.startswith(CONTROL_KEYS):
+                controls[key] = value
+            if feedback and key.startswith("motion.maneuver"):
+                maneuver[key] = value
         control = loop_overrides(state.scene, others | controls, feedback)
         self.loop.disable()  # no second change while this one runs
         await self.page.open(state.scene, others | maneuver | control)

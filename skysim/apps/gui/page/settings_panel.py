@@ -251,12 +251,10 @@ class ScenePanel:
         title_before = info.title.removesuffix(", changed") if info else ""
         title = f"{title_before}, changed" if title_before else name
         state = self.page.state
-        try:
-            path = await run.io_bound(
-                forms.save, self.folder, name, state.scene, state.overrides, title
-            )
-        except InputError as error:
-            self.page.show_message(for_page(error))
+        path = await self.page.run_here(
+            forms.save, self.folder, name, state.scene, state.overrides, title
+        )
+        if path is None:
             return
         self.page.log(f"saved {path}")
         self.saved()

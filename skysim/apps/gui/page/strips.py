@@ -22,6 +22,14 @@ MAX_DOTS = 20_000  # of lights; of more, some frames are left out
 Points = list[list[float]]
 LEFT_PX = 52  # from a strip to the left edge of the chart
 RIGHT_PX = 12
+ZOOM = {
+    "type": "inside",
+    "xAxisIndex": "all",
+    "zoomOnMouseWheel": "ctrl",
+    "moveOnMouseMove": "shift",
+    "moveOnMouseWheel": False,
+    "filterMode": "none",
+}
 # A click on a strip, and the line of the shown moment over all strips. The line is an element of its own, because the
 # chart would draw all curves again for it.
 CHART_JS = """() => {
@@ -106,13 +114,11 @@ def strips(
 
     def of_frames(value: Callable[[FlightRow], float]) -> Points:
         pairs = ((row.t_s, value(row)) for row in rows)
-        return [[round(t, 4), float(f"{y:.5g}")] for t, y in pairs if not math.isnan(y)]
+        return [point(t_s, y) for t_s, y in pairs if not math.isnan(y)]
 
     def of_motion(name: str) -> StripCurve:
         values = log.curves.get(name, ())
-        return StripCurve(
-            name, [[round(t, 4), float(f"{y:.5g}")] for t, y in zip(log.t_s, values, strict=False)]
-        )
+        return StripCurve(name, [point(*pair) for pair in zip(log.t_s, values, strict=False)])
 
     found = [
         Strip(
@@ -151,6 +157,11 @@ def strips(
         Strip("momentum, N m s", (of_motion("momentum"),)),
     ]
     return [strip for strip in found if strip.drawn or strip.dots]
+
+
+def point(t_s: float, value: float) -> list[float]:
+    """A point of a curve, with the digits that are drawn."""
+    return [round(t_s, 4), float(f"{value:.5g}")]
 
 
 def thinned(residuals: Sequence[tuple[float, int, float]]) -> Points:
@@ -227,54 +238,29 @@ def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
         "right": 10,
         "padding": 0,
     }
-    tops = [n * STRIP_PX for n in range(len(drawn))]
     grid = {"left": LEFT_PX, "right": RIGHT_PX, "height": INNER_PX}
     x_axis = {"type": "value", "min": 0, "max": round(end_s, 3), "splitLine": {"show": False}}
-    last = len(drawn) - 1
-    return {
+    found: dict[str, list[dict[str, Any]]] = {
+        name: [] for name in ("title", "legend", "grid", "xAxis", "yAxis", "series")
+    }
+    for n, strip in enumerate(drawn):
+        top = n * STRIP_PX
+        label = text | {"show": n == len(drawn) - 1, "formatter": "{value} s"}
+        names = [curve.name for curve in strip.drawn]
+        found["title"].append(title | {"text": strip.title, "top": top + 3})
+        found["legend"].append(legend | {"top": top + 3, "data": names})
+        found["grid"].append(grid | {"top": top + HEAD_PX})
+        found["xAxis"].append(x_axis | {"gridIndex": n, "axisLabel": label, "axisTick": rule})
+        found["yAxis"].append(y_axis(strip, n) | {"axisLabel": text, "splitLine": rule})
+        found["series"] += [series(curve, n, k) for k, curve in enumerate(strip.drawn)]
+    return found | {
         "animation": False,
-        "title": [
-            title | {"text": one.title, "top": top + 3}
-            for one, top in zip(drawn, tops, strict=True)
-        ],
-        "legend": [
-            legend | {"top": top + 3, "data": [curve.name for curve in one.drawn]}
-            for one, top in zip(drawn, tops, strict=True)
-        ],
         "tooltip": TOOLTIP,
         "axisPointer": {
             "link": [{"xAxisIndex": "all"}],
             "lineStyle": {":color": chart_color("text")},
         },
-        "dataZoom": [
-            {
-                "type": "inside",
-                "xAxisIndex": "all",
-                "zoomOnMouseWheel": "ctrl",
-                "moveOnMouseMove": "shift",
-            }
-            | {"moveOnMouseWheel": False, "filterMode": "none"}
-        ],
-        "grid": [grid | {"top": top + HEAD_PX} for top in tops],
-        "xAxis": [
-            x_axis
-            | {
-                "gridIndex": n,
-                "axisLabel": text | {"show": n == last, "formatter": "{value} s"},
-                "axisTick": rule,
-            }
-            for n in range(len(drawn))
-        ],
-        "yAxis": [
-            y_axis(one, n) | {"axisLabel": text, "splitLine": rule} for n, one in enumerate(drawn)
-        ],
-        "series": [
-            *(
-                series(curve, n, k)
-                for n, one in enumerate(drawn)
-                for k, curve in enumerate(one.drawn)
-            ),
-        ],
+        "dataZoom": [ZOOM],
     }
 
 
@@ -318,16 +304,8 @@ def series(curve: StripCurve, n: int, k: int) -> dict[str, Any]:
         }
     line = {"lineStyle": {"width": 0.8 if curve.kind == "band" else 1.5, "color": color}}
     kind = "scatter" if curve.kind == "dots" else "line"
-    return (
-        {"name": curve.name, "type": kind, "data": curve.points, "animation": False}
-        | look
-        | line
-        | in_strip(n)
-    )
-
-
-def in_strip(n: int) -> dict[str, int]:
-    return {"xAxisIndex": n, "yAxisIndex": n}
+    data = {"name": curve.name, "type": kind, "data": curve.points, "animation": False}
+    return data | look | line | {"xAxisIndex": n, "yAxisIndex": n}
 
 
 def rms_line(rows: Sequence[FlightRow]) -> str:
@@ -336,7 +314,7 @@ def rms_line(rows: Sequence[FlightRow]) -> str:
     if not solved:
         return f"{len(rows)} frames, none solved" if rows else ""
     cross, roll = (
-        math.sqrt(sum(value**2 for value in values) / len(solved))
-        for values in ([row.cross_arcsec for row in solved], [row.roll_arcsec for row in solved])
+        math.hypot(*errors) / math.sqrt(len(solved))
+        for errors in zip(*((row.cross_arcsec, row.roll_arcsec) for row in solved), strict=True)
     )
     return f"{len(solved)} of {len(rows)} frames solved; rms: cross {cross:.3g}″, roll {roll:.3g}″"

@@ -470,6 +470,14 @@ class Tab:
             return None
         return result if self.is_open else None
 
+    async def run_here(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Result of a function that runs in a thread of the server; None after an error, which is shown."""
+        try:
+            return await run.io_bound(function, *arguments)
+        except InputError as error:
+            self.show_message(for_page(error))
+            return None
+
     async def run_task(self, task: str, *arguments: Any, activity: str = "") -> Any:
         """`ask`, with the mark of a busy page.
 

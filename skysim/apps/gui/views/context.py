@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
@@ -48,6 +48,9 @@ class Asked(Protocol):
 
     async def ask(self, task: str, *arguments: Any) -> Any:
         """Return the result of a task."""
+
+    async def run_here(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return the result of a function that runs in a thread of the server."""
 
     async def run_task(self, task: str, *arguments: Any, activity: str = "") -> Any:
         """`ask`, with the mark of a busy page.

@@ -9,9 +9,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Report
-from skysim.apps.gui.messages import NAN, FlightRow, FlightStep, FrameView, MotionLog
+from skysim.apps.gui.messages import FlightRow, FlightStep, FrameView, MotionLog, TrackerResult
 from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker.workbench import Workbench, tracker_result
 from skysim.core import quaternion
@@ -21,6 +22,7 @@ from skysim.results import telemetry_report
 from skysim.simulation.flight import Flight, Shot
 from skysim.simulation.timing import exposure_window
 
+NO_RESULT = TrackerResult("", (), 0.0)  # of a frame that was not solved
 MAX_POINTS = 500  # of a curve on the page, roughly
 FLOOR = 1e-3  # arcsec; lower limit of values on a logarithmic axis
 # Of frames in the file, beyond which they are rendered again when they are shown.
@@ -140,19 +142,7 @@ class Playback:
 
 def frame_row(view: FrameView) -> FlightRow:
     """A frame of a flight in numbers."""
-    result = view.result
-    if result is None:
-        return FlightRow(
-            view.t_s,
-            NAN,
-            NAN,
-            NAN,
-            NAN,
-            len(view.lights),
-            0,
-            view.filter_arcsec,
-            view.innovation_arcsec,
-        )
+    result = view.result or NO_RESULT
     cross_sigma, roll_sigma = result.sigma_arcsec
     errors = result.cross_arcsec, cross_sigma, result.roll_arcsec, roll_sigma
     counts = len(view.lights), result.identified
@@ -192,14 +182,15 @@ def with_filter_errors(kept: KeptFrame, log: Telemetry, mount: Mount) -> FrameVi
     if log.lab_from_filter is None:
         return view
     n = min(int(np.searchsorted(log.t_s, view.t_s)), len(log.t_s) - 1)
-    error_arcsec = (
-        float((log.lab_from_filter[n].inv() * log.lab_from_body[n]).magnitude()) / ARCSEC_RAD
-    )
+    lab_from_filter = log.lab_from_filter[n]
+    view = replace(view, filter_arcsec=angle_arcsec(lab_from_filter, log.lab_from_body[n]))
     cam_from_lab = kept.report.attitude.cam_from_ref
-    innovation_arcsec = math.nan
-    if cam_from_lab is not None:
-        lab_from_body = cam_from_lab.inv() * mount.cam_from_body
-        innovation_arcsec = (
-            float((lab_from_body.inv() * log.lab_from_filter[n]).magnitude()) / ARCSEC_RAD
-        )
-    return replace(view, filter_arcsec=error_arcsec, innovation_arcsec=innovation_arcsec)
+    if cam_from_lab is None:
+        return view
+    lab_from_body = cam_from_lab.inv() * mount.cam_from_body
+    return replace(view, innovation_arcsec=angle_arcsec(lab_from_body, lab_from_filter))
+
+
+def angle_arcsec(first: Rotation, second: Rotation) -> float:
+    """Angle of the rotation from one attitude to another."""
+    return float((first.inv() * second).magnitude()) / ARCSEC_RAD

@@ -99,26 +99,28 @@ class Survey:
                 frames, self.before, UNCERTAINTY, self.noise_px
             )
         counts = survey_findings.coverage_statistics(so_far)
-        truth = survey_report.truth_statistics(run, self.before, self.lab) if run else {}
         found = SurveyFound(
             frames=len(taken),
-            connected=int(run.survey.tied.sum()) if run else 0,
             missed=missed,
-            measured=counts["measured"] if run else 0,
             seen_once=counts["seen_once"],
             unseen=counts["unseen"],
-            renamed=truth.get("renamed", 0),
-            sigma_mm=1e3 * run.accuracy.led_rms_m if run else None,
-            before_mm=truth.get("led_mm_before"),
-            error_mm=truth.get("led_mm_after"),
-            faults=tuple(survey_findings.fault_lines(asdict(survey_findings.find_faults(run))))
-            if run
-            else (),
             refusal=refusal,
             ids=so_far.model.leds.id,
             known=known_share(run),
             plan=self.next_plan(so_far, len(taken), count),
         )
+        if run:
+            truth = survey_report.truth_statistics(run, self.before, self.lab)
+            faults = survey_findings.fault_lines(asdict(survey_findings.find_faults(run)))
+            found = found._replace(
+                connected=int(run.survey.tied.sum()),
+                measured=counts["measured"],
+                renamed=truth["renamed"],
+                sigma_mm=1e3 * run.accuracy.led_rms_m,
+                before_mm=truth["led_mm_before"],
+                error_mm=truth["led_mm_after"],
+                faults=tuple(faults),
+            )
         self.taken = taken
         self.run = run or self.run
         return found

@@ -17,7 +17,6 @@ from skysim.apps.gui.messages import (
     FlightStep,
     FrameView,
     Pixels,
-    PlanCheck,
     PushedView,
     SceneInfo,
     SurveyFound,
@@ -30,6 +29,8 @@ from skysim.apps.gui.worker.geometry import Grip, Push
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core import images
 from skysim.core.errors import InputError
+from skysim.simulation import checks
+from skysim.simulation.checks.check import Check
 
 KEPT_IMAGES = 3  # the page may still show one before the newest
 
@@ -183,8 +184,9 @@ class Worker:
             view, float(np.linalg.norm(self.pushed.torque_nm)), math.degrees(rate_rad_s)
         )
 
-    def check(self) -> PlanCheck:
-        return planning.check(self.workbench.lab)
+    def check(self) -> Check:
+        """The facts of the scene and its warnings, as `skysim check` prints them."""
+        return checks.check(self.workbench.lab)
 
     def ambiguity(self) -> AmbiguityMap:
         return planning.ambiguity(self.workbench.lab)

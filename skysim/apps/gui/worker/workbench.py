@@ -22,7 +22,6 @@ from skysim.apps.gui.messages import (
     LabGeometry,
     Lens,
     LightColumns,
-    PlanCheck,
     SceneInfo,
     TrackerResult,
 )
@@ -293,17 +292,6 @@ def search_windows_px(
     _, xy_px = predicted_lights(estimator, attitude)
     inside = estimator.camera.contains(np.nan_to_num(xy_px, nan=-1e9))
     return tuple((float(x), float(y)) for x, y in xy_px[inside][:200])
-
-
-# What a lab wants to know before it runs a scene: its check and its ambiguous fields.
-
-
-def check(lab: Lab) -> PlanCheck:
-    """The facts of a scene and its warnings, as `skysim check` prints them."""
-    found = checks.check(lab)
-    return PlanCheck(
-        tuple((fact.name, tuple(fact.lines)) for fact in found.facts), tuple(found.findings)
-    )
 
 
 def ambiguity(lab: Lab) -> AmbiguityMap:
