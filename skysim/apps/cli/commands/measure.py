@@ -6,7 +6,7 @@ import shlex
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,6 +15,12 @@ from skysim.apps.cli.options import Json, Out, Overrides, SceneArg, Seed, load, 
 from skysim.apps.cli.terminal import print_json, progress, progress_callback
 from skysim.core.errors import InputError
 from skysim.results.report import print_wrapped
+
+if TYPE_CHECKING:
+    from skysim.experiments.balance_flight import Uncertainty
+    from skysim.experiments.balance_procedure import BalancePlan, Iteration
+    from skysim.results.report import Report
+    from skysim.scene.scene import Scene
 
 
 class Excitation(StrEnum):
@@ -94,33 +100,43 @@ def balance(
     plan = balance_procedure.BalancePlan(
         excite.value, tilt, bars.torque_nm, flights or 6, not estimate_only
     )
-    folder = output_folder(out, loaded.name)
-    iterations = []
-    with progress_callback("flying") as watch:
-        for one in balance_procedure.balance(loaded, plan, uncertainty, watch):
-            iterations.append(one)
-            if not json:
-                print_flight(balance_report.flight_row(len(iterations), one))
-    statistics = balance_report.statistics(loaded.name, plan, iterations)
+    assumed = balance_procedure.assumed(loaded, uncertainty)
+    flown = fly(loaded, plan, uncertainty, json)
+    statistics = balance_report.statistics(loaded.name, plan, flown)
     if in_flight:
-        statistics["in_flight"] = balance_report.filter_rows(
-            iterations[-1], balance_procedure.assumed(loaded, uncertainty)
-        )
-    report = balance_report.write_all(
-        folder, statistics, iterations, shlex.join(["skysim", *sys.argv[1:]])
+        statistics["in_flight"] = balance_report.filter_rows(flown[-1], assumed)
+    folder = output_folder(out, loaded.name)
+    command = shlex.join(["skysim", *sys.argv[1:]])
+    print_report(statistics, balance_report.write_all(folder, statistics, flown, command), json)
+    balance_flight.check_observed(
+        flown[-1].estimate,
+        assumed.prior,
+        [one.flight.record for one in flown],
+        bars.inertia,
+        bars.moment_kg_m(flown[-1].flight.vehicle),
     )
+
+
+def fly(scene: Scene, plan: BalancePlan, uncertainty: Uncertainty, json: bool) -> list[Iteration]:
+    """Fly and move the trim masses until the vehicle is balanced; print each flight, unless `json`."""
+    from skysim.experiments import balance_procedure, balance_report
+
+    flown = []
+    with progress_callback("flying") as watch:
+        for one in balance_procedure.balance(scene, plan, uncertainty, watch):
+            flown.append(one)
+            if not json:
+                print_flight(balance_report.flight_row(len(flown), one))
+    return flown
+
+
+def print_report(statistics: dict[str, Any], report: Report, json: bool) -> None:
+    """Print a report and its path, or the statistics as JSON."""
     if json:
         print_json(statistics)
     else:
         report.print()
         print_wrapped(f"report: {statistics['report']}")
-    balance_flight.check_observed(
-        iterations[-1].estimate,
-        balance_procedure.assumed(loaded, uncertainty).prior,
-        [one.flight.record for one in iterations],
-        bars.inertia,
-        bars.moment_kg_m(iterations[-1].flight.vehicle),
-    )
 
 
 def print_flight(row: dict[str, Any]) -> None:
@@ -182,14 +198,10 @@ def characterize(
     found = characterize_camera.measure_sensor(config, *folders)
     sky = characterize_camera.measure_night(config, raw, night, found) if night else None
     name = Path(camera).stem
-    statistics, report = characterize_camera.write_results(
+    written = characterize_camera.write_results(
         output_folder(out, name), config, raw, found, sky, name
     )
-    if json:
-        print_json(statistics)
-    else:
-        report.print()
-        print_wrapped(f"report: {statistics['report']}")
+    print_report(*written, json)
 
 
 def write_simulated(config: Any, folder: Path, seed: int, json: bool) -> None:

@@ -15,6 +15,8 @@ from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
     from skysim.apps.stream.http import FrameHub
+    from skysim.apps.stream.sinks import Sink
+    from skysim.simulation.flight import Flight
 
 
 HOST = "127.0.0.1"
@@ -54,8 +56,6 @@ def stream(
     json: Json = False,
 ) -> None:
     """Stream a scene's frames in real time, for hardware or a processor in the loop."""
-    from skysim.apps.stream import sender
-    from skysim.apps.stream.sender import Pace
     from skysim.apps.stream.sinks import READER_GONE, Sink, folder_writer, pipe_writer
     from skysim.core import files
     from skysim.simulation.flight import open_flight
@@ -74,9 +74,26 @@ def stream(
         sinks.append(Sink("folder", folder_writer(folder)))
     if pipe is not None:
         sinks.append(Sink("pipe", pipe_writer(pipe)))
+    statistics = send_all(flight, sinks, speed, http, host)
+    output = sys.stderr if pipe == "-" else sys.stdout
+    print(files.to_json(statistics) if json else summary(statistics), file=output)
+    for sink in sinks:
+        if sink.fault not in ("", READER_GONE):
+            raise InputError(f"--{sink.name}", sink.fault)
+
+
+def send_all(
+    flight: Flight, sinks: list[Sink], speed: float, port: int | None, host: str
+) -> dict[str, Any]:
+    """Send all frames of a flight, and return the counters of the sender and its receivers.
+
+    Ctrl-C ends the stream. Flight and sinks are closed at its end.
+    """
+    from skysim.apps.stream import sender
+
     stats = sender.SenderStats()
-    pace = Pace(speed, flight.lab.scene.exposure.rate_hz)
-    with serving(http, host, lambda: stats.statistics(sinks)) as hub:
+    pace = sender.Pace(speed, flight.lab.scene.exposure.rate_hz)
+    with serving(port, host, lambda: stats.statistics(sinks)) as hub:
         try:
             sender.send(flight, pace, sinks, stats, hub.publish if hub else None)
         except KeyboardInterrupt:
@@ -85,12 +102,7 @@ def stream(
             flight.close()
             for sink in sinks:
                 sink.close()
-    statistics = stats.statistics(sinks) | (hub.counters() if hub else {})
-    output = sys.stderr if pipe == "-" else sys.stdout
-    print(files.to_json(statistics) if json else summary(statistics), file=output)
-    for sink in sinks:
-        if sink.fault not in ("", READER_GONE):
-            raise InputError(f"--{sink.name}", sink.fault)
+    return stats.statistics(sinks) | (hub.counters() if hub else {})
 
 
 @contextmanager
