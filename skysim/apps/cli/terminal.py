@@ -18,13 +18,12 @@ if TYPE_CHECKING:
 
     from skysim.core.types import Telemetry
     from skysim.experiments.study.execution.runner import Progress
-    from skysim.experiments.tracker_comparison import TrackerScore
-    from skysim.simulation.checks.facts import Fact
-    from skysim.simulation.lab import Lab
-if TYPE_CHECKING:
     from skysim.experiments.study.execution.store import Store
     from skysim.experiments.study.plan import Plan
     from skysim.experiments.study.worst import WorstTrial
+    from skysim.experiments.tracker_comparison import TrackerScore
+    from skysim.simulation.checks.facts import Fact
+    from skysim.simulation.lab import Lab
 
 
 T = TypeVar("T")
@@ -109,31 +108,28 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
         Column("tracker", kind="text"),
         Column("frames"),
         Column("right", "%", ".1f"),
-        Column("(95 %)"),
+        *map(Column, ("(95 %)", "wrong", "refused", "failed")),
+        *(Column(head, "″", ".3g") for head in ("cross", "worst", "roll", "worst")),
+        *(Column(head, format=".3g") for head in ("ms", "95 % ms")),
     ]
-    columns += [Column("wrong"), Column("refused"), Column("failed")]
-    columns += [Column(head, "″", ".3g") for head in ("cross", "worst", "roll", "worst")]
-    columns += [Column("ms", format=".3g"), Column("95 % ms", format=".3g")]
-    rows = []
-    for line in lines:
-        interval = f"{100 * line.right.low:.1f} to {100 * line.right.high:.1f}"
-        wrong = Cell(str(line.wrong), "bad" if line.wrong else "")
-        outcomes = [
+    rows = [
+        [
             line.tracker,
             line.frames,
             100 * line.right.value,
-            interval,
-            wrong,
+            f"{100 * line.right.low:.1f} to {100 * line.right.high:.1f}",
+            Cell(str(line.wrong), "bad" if line.wrong else ""),
             line.refused,
             line.failed,
-        ]
-        errors = [
             line.cross_arcsec_median,
             line.cross_arcsec_worst,
             line.roll_arcsec_median,
             line.roll_arcsec_worst,
+            line.time_ms_median,
+            line.time_ms_p95,
         ]
-        rows.append([*outcomes, *errors, line.time_ms_median, line.time_ms_p95])
+        for line in lines
+    ]
     left_out = ((12,), (11,), (3,), (10,), (8,))  # the times, the interval, the worst errors
     print_table(Table(columns, rows, optional=left_out))
     for line in lines:
@@ -147,13 +143,11 @@ def print_solutions(solutions: list[dict[str, Any]], out: Path) -> None:
     columns += [Column(name, "°", ".4f") for name in ("RA", "Dec", "roll", "fov")]
     columns += [Column("stars"), Column("rms", "″", ".1f"), Column("ms", format=".0f")]
     keys = ("ra_deg", "dec_deg", "roll_deg", "fov_deg", "matches", "rms_arcsec", "time_ms")
-    statuses = [one["status"] if one["time_ms"] is not None else "bad input" for one in solutions]
-    found = zip(solutions, statuses, strict=True)
-    print_table(
-        Table(
-            columns, [[one["file"], status, *(one[key] for key in keys)] for one, status in found]
-        )
-    )
+    rows = []
+    for one in solutions:
+        status = one["status"] if one["time_ms"] is not None else "bad input"
+        rows.append([one["file"], status, *(one[key] for key in keys)])
+    print_table(Table(columns, rows))
     for solution in solutions:
         print_remarks(solution)
     print(f"annotated images and solutions.json in {out}")

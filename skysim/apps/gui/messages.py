@@ -86,7 +86,9 @@ class LightColumns(Sequence[LightRow]):
     Attributes
     ----------
     id, electrons, magnitude
-        (N,) and xy_px : (N, 2), see `Light`
+        (N,) see `LightRow`
+    xy_px
+        (N, 2) pixels
     """
 
     id: NDArray[np.int64]

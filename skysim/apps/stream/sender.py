@@ -79,12 +79,12 @@ class SenderStats:
     late_ms: deque[float] = field(default_factory=lambda: deque(maxlen=DELAY_WINDOW))
 
     def record(self, late_ms: float, dropped: int) -> None:
-        """Record a rendered frame
+        """Record a rendered frame.
 
         Parameters
         ----------
         dropped
-            Number of frames dropped so far.
+            Number of frames dropped so far
         """
         self.rendered = self.rendered + 1
         self.dropped = dropped

@@ -67,12 +67,14 @@ class Packet(NamedTuple):
 
 
 def build_packet(shot: Shot, due_unix_s: float, made_unix_s: float, dropped: int) -> Packet:
-    """Make the packet of a shot. Times: due and made, Unix seconds
+    """Make the packet of a shot.
 
     Parameters
     ----------
+    due_unix_s, made_unix_s
+        Unix times at which its exposure ended and the frame was ready
     dropped
-        Frames dropped before it.
+        Number of frames dropped before it
     """
     frame = shot.frame
     truth = shot.truth

@@ -109,7 +109,7 @@ def check_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})) -
     Parameters
     ----------
     programs
-        Of trackers and controllers, by name
+        Commands of external trackers and controllers, by name
     """
     try:
         return FileVerdict(str(path), *describe_file(path, programs))

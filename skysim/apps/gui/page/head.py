@@ -117,7 +117,7 @@ class Head:
         Parameters
         ----------
         item
-            Of the menu
+            Entry of the menu, a key of FILE_BY_ITEM
         """
         files = await self.page.run_task("export")
         if not files:

@@ -44,7 +44,7 @@ class LogPanel:
     Attributes
     ----------
     rows
-        Of the identifications, with the cells of COLUMNS
+        Identifications, with the cells of COLUMNS
     """
 
     def __init__(self, page: Shown) -> None:

@@ -180,10 +180,8 @@ class PlanPanel:
             ui.label(ambiguity_text(found))
             with ui.row().classes("no-wrap items-center gap-2") as self.legends["map"]:
                 widgets.quiet(f"{100 * found.least:.0f} % or less")
-                colors = ", ".join(
-                    f"rgb({r:.0f} {g:.0f} {b:.0f})"
-                    for r, g, b in 255 * color_scale(np.linspace(0, 1, 8))
-                )
+                scale = 255 * color_scale(np.linspace(0, 1, 8))
+                colors = ", ".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in scale)
                 ui.element("div").style(
                     f"width: 120px; height: 10px; background: linear-gradient(90deg, {colors})"
                 )
@@ -275,7 +273,7 @@ async def confirmed(question: str, action: str) -> bool:
     Parameters
     ----------
     action
-        The label of the button that does it
+        Label of the button that confirms
     """
     with ui.dialog() as dialog, ui.card():
         ui.label(question)
@@ -312,11 +310,9 @@ def prediction_text(plan: SurveyPlan) -> str:
 
 def survey_lines(found: SurveyFound) -> list[str]:
     """What the frames of a survey have measured, and the faults of the dome."""
-    missed = (
-        [f"{found.missed} attitudes have no frame: the vehicle did not rest there."]
-        if found.missed
-        else []
-    )
+    missed = []
+    if found.missed:
+        missed = [f"{found.missed} attitudes have no frame: the vehicle did not rest there."]
     unmeasured = f"{found.seen_once} seen once, {found.unseen} not seen"
     if found.refusal:
         return [
@@ -350,18 +346,16 @@ def survey_flight(
     for angles in angles_deg:
         attitude = survey_frames.from_angles(np.array([angles]))[0]
         if greatest_tilt_deg(at, attitude) > before.vehicle.tilt_stop_deg - TILT_MARGIN_DEG:
-            legs += [
-                slew((0.0, 0.0, yaw_deg))
-                for yaw_deg in (float(at.as_euler("ZYX", degrees=True)[0]), angles[2])
-            ]
+            yaw_deg = float(at.as_euler("ZYX", degrees=True)[0])
+            legs += [slew((0.0, 0.0, yaw_deg)), slew((0.0, 0.0, angles[2]))]
         legs += [slew(angles), {"kind": "hold", "duration": f"{HOLD_PERIODS / rate_hz:g} s"}]
         at = attitude
     flown = {
         **overrides,
         "motion.maneuver": forms.yaml_line(legs),
         "exposure.rate_hz": f"{rate_hz:g}",
+        "exposure.first": "0 s",
     }
-    flown["exposure.first"] = "0 s"
     if before.motion.control is None:
         flown["motion.control"] = PRESCRIBED
     duration_s = guidance.plan(forms.validated_scene(scene, flown).motion).duration_s
@@ -380,8 +374,5 @@ def slew(angles_deg: Sequence[float]) -> dict[str, object]:
 def greatest_tilt_deg(first: Rotation, last: Rotation) -> float:
     """Greatest tilt of the vehicle between two attitudes lab_from_body, along the rotation about one axis."""
     share = np.linspace(0, 1, TILT_STEPS)[:, None]
-    return float(
-        multibody.tilt_deg(
-            first * Rotation.from_rotvec(share * (first.inv() * last).as_rotvec())
-        ).max()
-    )
+    turn = Rotation.from_rotvec(share * (first.inv() * last).as_rotvec())
+    return float(multibody.tilt_deg(first * turn).max())

@@ -167,7 +167,7 @@ class LightsPanel:
     Attributes
     ----------
     sent
-        Number of the frame in it
+        Number of the frame in the table
     """
 
     def __init__(self, sensor: SensorView) -> None:

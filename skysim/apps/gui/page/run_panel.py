@@ -141,7 +141,7 @@ class RunPanel:
         Parameters
         ----------
         feedback
-            Of its controller; None without one
+            Feedback of its controller; None without a controller
         """
         self.pause()
         self.clear()

@@ -69,7 +69,7 @@ class StripCurve:
     Attributes
     ----------
     kind
-        Line, dots (a value per frame), or band (an area of 3 standard errors).
+        line, dots (a value per frame), or band (an area of 3 standard errors)
     """
 
     name: str
@@ -104,12 +104,12 @@ class Dots(ui.element, component="js/strips.js"):  # type: ignore[call-arg]
 def strips(
     rows: Sequence[FlightRow], log: MotionLog, residuals: Sequence[tuple[float, int, float]] = ()
 ) -> list[Strip]:
-    """The strips of a flight that have something to show.
+    """Return the strips of a flight that have something to show.
 
     Parameters
     ----------
     residuals
-        See `FlightStep`
+        Of the identified lights, see `FlightStep`
     """
 
     def of_frames(value: Callable[[FlightRow], float]) -> Points:
@@ -198,7 +198,7 @@ class StripChart:
         Parameters
         ----------
         name
-            Of a light
+            Returns the name of a light
         """
         if any(strip.dots for strip in (*self.strips, *drawn)):
             self.dots.run_method("show", dot_fields(drawn, name))

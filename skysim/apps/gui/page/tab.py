@@ -343,7 +343,7 @@ class Tab:
         Parameters
         ----------
         feedback
-            Of its controller; None without one
+            Feedback of its controller; None without a controller
         """
         self.head.set_scene(info)
         self.attitude.set_scene(info)
@@ -401,10 +401,10 @@ class Tab:
     def show_frame(self, view: FrameView, **state: Any) -> None:
         """Show a frame of the scene: live, or of its flight.
 
-        Returns
-        -------
+        Parameters
+        ----------
         state
-            Changes of what the page shows
+            Changes of the fields of `PageView`
         """
         self.set_state(**state)
         self.view = view
@@ -479,7 +479,7 @@ class Tab:
             return None
 
     async def run_task(self, task: str, *arguments: Any, activity: str = "") -> Any:
-        """`ask`, with the mark of a busy page.
+        """Do as `ask`, with the mark of a busy page.
 
         Parameters
         ----------

@@ -53,7 +53,7 @@ class Asked(Protocol):
         """Return the result of a function that runs in a thread of the server."""
 
     async def run_task(self, task: str, *arguments: Any, activity: str = "") -> Any:
-        """`ask`, with the mark of a busy page.
+        """Do as `ask`, with the mark of a busy page.
 
         Parameters
         ----------
@@ -93,19 +93,19 @@ class Notified(Protocol):
     def show_frame(self, view: FrameView, **state: Any) -> None:
         """Show a frame of the scene in all views.
 
-        Returns
-        -------
+        Parameters
+        ----------
         state
-            Changes of `Shown.state` that belong to it
+            Changes of `Shown.state` that belong to the frame
         """
 
     def show_photo(self, image: Photo, /, **state: Any) -> None:
         """Show an image that is not of the scene as it is now: a photograph, or a trial again.
 
-        Returns
-        -------
+        Parameters
+        ----------
         state
-            See above
+            Changes of `Shown.state` that belong to the image
         """
 
     def stop_playback(self) -> None:

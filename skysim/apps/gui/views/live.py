@@ -24,7 +24,7 @@ class Contents:
     Attributes
     ----------
     send
-        Called with all of them when some have changed without a frame
+        Called with all contents when some have changed without a frame
     """
 
     def __init__(self) -> None:
@@ -64,13 +64,7 @@ class LiveField(ui.element, component="js/live_field.js", esm={"skysim-views": "
 
 
 class LiveText(LiveField):
-    """A text.
-
-    Attributes
-    ----------
-    state
-        Its style class, such as good or warn
-    """
+    """A text, with a style class as its state, such as good or warn."""
 
     def __init__(self, contents: Contents, text: str = "") -> None:
         super().__init__(contents, "div")
@@ -81,13 +75,7 @@ class LiveText(LiveField):
 
 
 class LiveInput(LiveField):
-    """A field to type into, or a slider.
-
-    Attributes
-    ----------
-    type
-        As in HTML
-    """
+    """A field to type into, or a slider, by the `type` of HTML."""
 
     def __init__(self, contents: Contents, type: str) -> None:
         super().__init__(contents, "input", type)

@@ -31,6 +31,7 @@ COLORS = {
     "windows": "#7f8a9a",
 }
 KINDS = tuple(COLORS)
+KIND_BY_MARK = {kind: kind for kind in KINDS} | {"faint": "truth"}
 MAX_LABELS = 40  # most names; the brightest lights get them
 MAX_TRUTH_MARKS = 400  # most marks of true lights
 UNSOLVED_TICKS = (
@@ -49,22 +50,25 @@ def marks(
     shown: Collection[str],
     name: Callable[[int], str],
 ) -> dict[str, Any]:
-    """What frame.js draws: marks by kind (ticks for true lights, dots for those fainter than any identified one,
-    squares for detections, circles for identified ones, crosses for false ones, dashed squares for predicted windows),
-    names of identified lights, and all lights that the cursor may find.
+    """Return what frame.js draws.
 
-    lights of the answer : (x, y, number or -1, whether it is a detection), detections last
+    Returns
+    -------
+    marks
+        Places by kind: ticks for true lights, dots for those fainter than any identified one, squares for
+        detections, circles for identified ones, crosses for false ones, dashed squares for predicted windows
+    names
+        (x, y, name) of identified lights
+    lights
+        (x, y, number or -1, whether it is a detection) of all lights that the cursor may find, detections last
     """
     detections = result.detections if result else ()
     ids = [one.id for one in detections]
     found_px = np.array([(one.x, one.y) for one in detections], float).reshape(-1, 2)
     is_identified = np.array(ids, np.int64) >= 0
     visible = lights[:MAX_TRUTH_MARKS]
-    near_x, near_y = (
-        np.abs(np.subtract.outer(*pair)) < NEAR_PX
-        for pair in zip(lights.xy_px.T, found_px.T, strict=True)
-    )
-    near = near_x & near_y  # of each true light and each detection
+    offset_px = np.abs(lights.xy_px[:, None] - found_px)  # of each true light and each detection
+    near = (offset_px < NEAR_PX).all(axis=2)
     bright = bright_count(visible, ids, near[: len(visible)])
     is_false = ~near.any(axis=0) & bool(len(lights))  # without true lights it is not known
     true = rounded(visible.xy_px)
@@ -77,16 +81,17 @@ def marks(
         "identified": list(compress(found, is_identified)),
         "false": list(compress(found, is_false)),
     }
+    true_lights = [(*at, id, 0) for at, id in zip(true, visible.id.tolist(), strict=True)]
+    detected_lights = [(*at, id, 1) for at, id in zip(found, ids, strict=True)]
     named = list(compress(zip(found, ids, strict=True), is_identified))[:MAX_LABELS]
     return {
         "marks": [
             {"kind": drawn, "color": COLORS[kind], "points": points[drawn]}
-            for kind, drawn in (*((kind, kind) for kind in KINDS), ("truth", "faint"))
+            for drawn, kind in KIND_BY_MARK.items()
             if kind in shown and points[drawn]
         ],
         "names": [(*place, name(id)) for place, id in named] if "identified" in shown else [],
-        "lights": [(*place, id, 0) for place, id in zip(true, visible.id.tolist(), strict=True)]
-        + [(*place, id, 1) for place, id in zip(found, ids, strict=True)],
+        "lights": true_lights + detected_lights,
     }
 
 
@@ -207,7 +212,7 @@ class TabFrames:
         Parameters
         ----------
         alone
-            Not over the stream, because messages belong to it
+            Whether the frame must not go over the stream, because messages belong to it
         """
         self.newest[number] = frame
         self.added_s = time.monotonic()

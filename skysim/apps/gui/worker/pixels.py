@@ -67,12 +67,12 @@ def header(levels: PixelLevels) -> bytes:
 
 
 def levels_from(data: bytes, size_px: tuple[int, int]) -> PixelLevels:
-    """The levels that `Levels.data` has encoded.
+    """Return the levels that `PixelLevels.data` has encoded.
 
     Parameters
     ----------
     size_px
-        Width and height
+        Width and height of the image
     """
     offset, step = np.frombuffer(data, float, 2).tolist()
     kind = np.uint8 if len(data) - HEADER_BYTES == math.prod(size_px) else np.uint16

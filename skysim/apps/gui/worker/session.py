@@ -137,7 +137,7 @@ class Workers:
         Parameters
         ----------
         scene
-            The file that it sets up
+            File of the scene that it sets up
         """
         os.environ[SCENE] = scene
         multiprocessing.get_context("forkserver").set_forkserver_preload([TEMPLATE])
@@ -148,12 +148,12 @@ class Workers:
         return Session() if len(Session.alive) < self.limit else None
 
     async def wait(self, wanted: Callable[[], bool], tell: Callable[[str], None]) -> Session | None:
-        """`take`, once it is this tab's turn; None if none is wanted any more.
+        """Do as `take`, once it is this tab's turn; return None if no worker is wanted any more.
 
         Parameters
         ----------
         tell
-            Gets what it waits for
+            Called with what the tab waits for, in words
         """
         ticket = object()
         self.queue.append(ticket)

@@ -222,12 +222,12 @@ def tilt_deg(scene: Scene) -> float:
 def survey_plan(
     lab_from_body: Rotation, shown: Mask, steps: tuple[tuple[int, int, float | None], ...]
 ) -> SurveyPlan:
-    """A plan as the page has it.
+    """Return a plan as the page has it.
 
     Parameters
     ----------
     shown
-        (F, N) LEDs that each attitude shows
+        (F, N) whether an attitude shows an LED
     """
     angles = tuple(tuple(row) for row in stops.angles_deg(lab_from_body).tolist())
     return SurveyPlan(angles, tuple(shown.sum(axis=1).tolist()), shown.shape[1], steps)

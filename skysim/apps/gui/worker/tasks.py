@@ -131,12 +131,12 @@ class Worker:
         solve: bool,
         angles_deg: Triple | None = None,
     ) -> tuple[SceneInfo, FrameView]:
-        """Set up a scene and render a first frame
+        """Set up a scene and render a first frame.
 
         Parameters
         ----------
         angles_deg
-            Of another attitude than the kept one or the start.
+            Attitude, if it is neither the kept one nor the start
         """
         bench = Workbench.open(scene, overrides, self.current)
         if angles_deg is not None:

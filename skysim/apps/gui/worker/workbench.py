@@ -185,12 +185,12 @@ def id_prefix(lab: Lab) -> str:
 
 
 def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> LightColumns:
-    """The true lights of a frame, the brightest first.
+    """Return the true lights of a frame, the brightest first.
 
     Parameters
     ----------
     magnitude
-        V by number, of stars and LEDs
+        V magnitude by number, of stars and LEDs
     """
     sources = truth.sources
     of_bodies = {body.id: body.v_mag for body in truth.bodies}
@@ -231,7 +231,7 @@ def tracker_result(
 def detection_views(
     report: Report, names: Mapping[int, tuple[int, float]]
 ) -> tuple[Detection, ...]:
-    """Detections with id and residual of their matched lights.
+    """Return detections with id and residual of their matched lights.
 
     Parameters
     ----------
