@@ -72,12 +72,9 @@ class FrameHub:
             if len(self.disconnected) > KEPT_DISCONNECTED:
                 old = self.disconnected.popleft()
                 self.clients.remove(old)
-                for name, increment in (
-                    ("clients", 1),
-                    ("sent", old.sent),
-                    ("dropped", old.dropped),
-                ):
-                    self.earlier[name] += increment
+                self.earlier["clients"] += 1
+                self.earlier["sent"] += old.sent
+                self.earlier["dropped"] += old.dropped
 
     def counters(self) -> dict[str, Any]:
         """Counters of each client, and the sums of the earlier ones."""

@@ -20,13 +20,13 @@ from skysim.dynamics import guidance
 from skysim.experiments.dome_survey import (
     adjust,
     survey_findings,
+    survey_frames,
     survey_prior,
     survey_procedure,
     survey_report,
 )
-from skysim.experiments.dome_survey import survey_frames as stops
 from skysim.experiments.dome_survey.survey_findings import Coverage, SurveyRun
-from skysim.experiments.dome_survey.survey_frames import SurveyFrame, detect_lights, imu_attitudes
+from skysim.experiments.dome_survey.survey_frames import SurveyFrame
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import HoldConfig, SlewConfig
@@ -87,7 +87,7 @@ class Survey:
         allow(count)
         new, missed = self.new_frames(flight, views)
         taken = [*self.taken, *new]
-        frames = self.survey_frames(taken)
+        frames = self.with_imu(taken)
         try:
             run = adjust.run_survey(frames, self.before, UNCERTAINTY)
             refusal = ""
@@ -153,14 +153,14 @@ class Survey:
         for row in (row for row in rows if row not in known):
             frame, _ = flight.render(row)
             lab_from_body = quaternion.to_rotation(np.array(views[row].body_wxyz))
-            lights = detect_lights(settings, camera, frame.image_dn)
+            lights = survey_frames.detect_lights(settings, camera, frame.image_dn)
             new.append(TakenFrame(flight.lab.scene, row, lab_from_body, lights))
         return new, holds - len(rows)
 
-    def survey_frames(self, taken: Sequence[TakenFrame]) -> list[SurveyFrame]:
+    def with_imu(self, taken: Sequence[TakenFrame]) -> list[SurveyFrame]:
         """Frames with the IMU's attitudes."""
         lab_from_body = Rotation.concatenate([frame.lab_from_body for frame in taken])
-        measured = imu_attitudes(self.scene, lab_from_body, UNCERTAINTY.imu_sigma_rad)
+        measured = survey_frames.imu_attitudes(self.scene, lab_from_body, UNCERTAINTY.imu_sigma_rad)
         return [
             SurveyFrame(frame.lights, at, frame.row)
             for frame, at in zip(taken, measured, strict=True)
@@ -229,7 +229,7 @@ def survey_plan(
     shown
         (F, N) whether an attitude shows an LED
     """
-    angles = tuple(tuple(row) for row in stops.angles_deg(lab_from_body).tolist())
+    angles = tuple(tuple(row) for row in survey_frames.angles_deg(lab_from_body).tolist())
     return SurveyPlan(angles, tuple(shown.sum(axis=1).tolist()), shown.shape[1], steps)
 
 
