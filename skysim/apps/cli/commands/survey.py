@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -148,21 +147,16 @@ def survey(
         next_ or NEXT,
         json,
     )
-    show: Callable[[dict[str, Any]], None] | None = None
     if images is not None and camera is not None:
         statistics = survey_modes.from_images(request, images, camera, watch)
     elif plan:
         statistics = survey_modes.plan_only(request)
-        show = survey_modes.print_plan
     elif repeat:
         statistics = survey_modes.repeated(request, repeat)
-        show = survey_modes.print_comparison
     else:
         statistics = survey_modes.simulated(request, checks or CHECKS, frames_to)
     if json:
         print_json(statistics)
-    elif show:
-        show(statistics)
 
 
 # What each mode of the command does not use.

@@ -58,12 +58,12 @@ def planned(request: Request) -> tuple[Lab, CalibrationPrior, survey_procedure.H
 
 
 def plan_only(request: Request) -> dict[str, Any]:
-    """The attitudes of a plan and the errors predicted."""
+    """Return the attitudes of a plan and the errors predicted; print them."""
 
     _, _, plan = planned(request)
     path = files.make_folder(request.folder) / "plan.csv"
     survey_procedure.write_plan(path, plan)
-    return {
+    result = {
         "scene": request.scene.name,
         "attitudes": survey_findings.stop_rows(plan.lab_from_body, plan.shown),
         "leds": plan.shown.shape[1],
@@ -73,10 +73,13 @@ def plan_only(request: Request) -> dict[str, Any]:
         ],
         "plan": str(path),
     }
+    if not request.quiet:
+        print_plan(result)
+    return result
 
 
 def repeated(request: Request, repeat: int) -> dict[str, Any]:
-    """The errors predicted and those of simulated surveys, side by side."""
+    """Return the errors predicted and those of simulated surveys, side by side; print them."""
 
     lab, _, plan = planned(request)
     surveys = survey_procedure.repeat_survey(lab, request.uncertainty, plan, repeat)
@@ -85,7 +88,7 @@ def repeated(request: Request, repeat: int) -> dict[str, Any]:
     failures = [one for one in results if isinstance(one, InputError)]
     if not errors:
         raise failures[0]
-    return {
+    result = {
         "scene": request.scene.name,
         "frames": len(plan.shown),
         "surveys": repeat,
@@ -94,6 +97,9 @@ def repeated(request: Request, repeat: int) -> dict[str, Any]:
         "false_alarms": sum(one.false_alarms for one in errors),
         "failures": [str(one) for one in failures],
     }
+    if not request.quiet:
+        print_comparison(result)
+    return result
 
 
 def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str, Any]:
