@@ -63,6 +63,11 @@ class RowResult(NamedTuple):
     cause: Cause | None = None
 
 
+Results = dict[
+    str, RowResult | Summary
+]  # by the key of the published row; a number alone needs no note
+
+
 def with_cause(
     cause: str, statistic: Callable[[Any], Summary], ours: Any, theirs: Any, *, note: str = ""
 ) -> RowResult:
@@ -82,7 +87,7 @@ class FigureDrawing(NamedTuple):
 class ExperimentResult:
     """Results of an experiment: one for every published row, by key, and figures."""
 
-    results: Mapping[str, RowResult]
+    results: Mapping[str, RowResult | Summary]
     drawings: tuple[FigureDrawing, ...] = ()
 
 
@@ -145,12 +150,11 @@ class Reproduction:
     @property
     def counts(self) -> dict[str, int]:
         """Number of rows by verdict, of rows with a derived number (`derived`), and of open verdicts (`open`)."""
-        counts: dict[str, int] = {
-            verdict: sum(comparison.verdict == verdict for comparison in self.comparisons)
-            for verdict in VERDICTS
-        }
-        counts["derived"] = sum(comparison.row.derived for comparison in self.comparisons)
-        counts["open"] = sum(bool(comparison.weakness) for comparison in self.comparisons)
+        counts = dict.fromkeys((*VERDICTS, "derived", "open"), 0)
+        for one in self.comparisons:
+            counts[one.verdict] += 1
+            counts["derived"] += one.row.derived
+            counts["open"] += bool(one.weakness)
         return counts
 
 
@@ -168,27 +172,29 @@ def compare(
         raise ValueError(
             f"{id}: rows that are only published or only computed: {', '.join(sorted(unmatched))}"
         )
-    comparisons = tuple(
-        Comparison(id, row, experiment.results[key], verdict(row, experiment.results[key]))
-        for key, row in published.rows.items()
-    )
-    return Reproduction(id, published, comparisons, experiment.drawings, seconds)
+    comparisons = []
+    for key, row in published.rows.items():
+        ours = experiment.results[key]
+        result = ours if isinstance(ours, RowResult) else RowResult(ours)
+        comparisons.append(Comparison(id, row, result, verdict(row, result)))
+    return Reproduction(id, published, tuple(comparisons), experiment.drawings, seconds)
 
 
 def verdict(row: PublishedRow, result: RowResult) -> Verdict:
     """agrees: our interval overlaps the published number's band; explained: it does so only with the cause."""
     if intervals_overlap(row, result.ours):
         return "agrees"
-    return (
-        "explained" if result.cause and intervals_overlap(row, result.cause.ours) else "disagrees"
-    )
+    if result.cause and intervals_overlap(row, result.cause.ours):
+        return "explained"
+    return "disagrees"
 
 
 def intervals_overlap(row: PublishedRow, ours: Summary) -> bool:
     """Return True if our interval (the number itself if it has none) and the row's band overlap."""
     low, high = row.band
-    our_low, our_high = (ours.value if math.isnan(end) else end for end in (ours.low, ours.high))
-    return our_low <= high and our_high >= low
+    if math.isnan(ours.low):
+        return low <= ours.value <= high
+    return ours.low <= high and ours.high >= low
 
 
 def format_with_source(row: PublishedRow) -> str:
@@ -210,12 +216,10 @@ def format_published(row: PublishedRow) -> str:
         text = f"{row.published:.6g}"
     elif row.at_least is None:
         text = f"≤ {row.at_most:.6g}"
+    elif row.at_most is None:
+        text = f"≥ {row.at_least:.6g}"
     else:
-        text = (
-            f"≥ {row.at_least:.6g}"
-            if row.at_most is None
-            else f"{row.at_least:.6g}..{row.at_most:.6g}"
-        )
+        text = f"{row.at_least:.6g}..{row.at_most:.6g}"
     return f"{text} ± {row.tolerance:.3g}" if row.tolerance else text
 
 
@@ -245,10 +249,8 @@ def prediction_interval(
     draws = np.asarray(values, float)
     count = count or len(draws)
     mean = float(np.mean(draws))
-    half = float(
-        stdtrit(count - 1, 0.975) * np.std(draws, ddof=1) * np.sqrt(own_variance + 1 / count)
-    )
-    return symmetric_interval(mean, half, count)
+    std = np.std(draws, ddof=1) * np.sqrt(own_variance + 1 / count)
+    return symmetric_interval(mean, float(stdtrit(count - 1, 0.975) * std), count)
 
 
 def symmetric_interval(value: float, half: float, trials: int) -> Summary:
@@ -279,13 +281,11 @@ def widen_interval(summary: Summary) -> Summary:
     """
     if summary.trials < 2:
         return summary
-    factor = (
-        stdtrit(summary.trials - 1, 0.975) / 1.96 * np.sqrt(summary.trials / (summary.trials - 1))
-    )
-    low, high = (
-        summary.value + factor * (end - summary.value) for end in (summary.low, summary.high)
-    )
-    return summary._replace(low=float(low), high=float(high))
+    freedom = summary.trials - 1
+    factor = float(stdtrit(freedom, 0.975) / 1.96 * np.sqrt(summary.trials / freedom))
+    low = summary.value + factor * (summary.low - summary.value)
+    high = summary.value + factor * (summary.high - summary.value)
+    return summary._replace(low=low, high=high)
 
 
 def bootstrap_of_means(columns: Floats, statistic: Callable[[Floats], Any]) -> Summary:

@@ -28,6 +28,7 @@ from skysim.experiments.papers.compare import (
     ExperimentOptions,
     ExperimentResult,
     FigureDrawing,
+    Results,
     bootstrap_interval,
     with_cause,
 )
@@ -224,7 +225,7 @@ def initial_error_trials(options: ExperimentOptions) -> ExperimentResult:
         "iterated": SolutionSeries.mean_euler_angle,
     }
     cause = "the camera 0.30 m to the side and 0.20 m up, fitted"
-    results = {
+    results: Results = {
         key: with_cause(cause, one, scene_camera, fitted_camera) for key, one in statistics.items()
     }
     caption = "Stars matched, and the solutions' error, by the initial attitude's error; shaded where NPS succeeded."

@@ -18,6 +18,7 @@ from skysim.experiments.papers.compare import (
     ExperimentOptions,
     ExperimentResult,
     FigureDrawing,
+    Results,
     RowResult,
     bootstrap_interval,
 )
@@ -147,17 +148,13 @@ def discrepancies_and_counts(options: ExperimentOptions) -> ExperimentResult:
     def excess_stars(diameter_deg: float) -> float:
         return count_fibers(lab, diameter_deg, inner_boresights).mean() - MEAN_STARS
 
-    results = {
-        "fibers": RowResult(exact(len(lab.camera.sources))),
-        "variation": RowResult(extremum(100 * np.abs(radius_change), np.max)),
-        "off_50mm": RowResult(extremum(large_offset, np.max)),
-        "off_1mm": RowResult(extremum(small_offset, np.max)),
-        "stars_10deg": RowResult(
-            bootstrap_interval(count_fibers(lab, CIRCLE_DEG, boresights), np.mean)
-        ),
-        "field_5stars": RowResult(
-            extremum(np.array([brentq(excess_stars, 5, 90, xtol=0.05)]), np.max)
-        ),
+    results: Results = {
+        "fibers": exact(len(lab.camera.sources)),
+        "variation": extremum(100 * np.abs(radius_change), np.max),
+        "off_50mm": extremum(large_offset, np.max),
+        "off_1mm": extremum(small_offset, np.max),
+        "stars_10deg": bootstrap_interval(count_fibers(lab, CIRCLE_DEG, boresights), np.mean),
+        "field_5stars": extremum(np.array([brentq(excess_stars, 5, 90, xtol=0.05)]), np.max),
     }
     # Worst discrepancies without and with the pupil's offset known.
     worst = [
@@ -296,7 +293,7 @@ def noise_and_absolute_error(options: ExperimentOptions) -> ExperimentResult:
         for sigmas in (MEASURED, BY_FRAMES)
     )
     cause = f"{MANY_LIGHTS} lights in the field"
-    results = {
+    results: Results = {
         "across": RowResult(few.cross_boresight, cause=Cause(cause, many.cross_boresight)),
         "roll": RowResult(few.roll, cause=Cause(cause, many.roll)),
         "absolute": RowResult(

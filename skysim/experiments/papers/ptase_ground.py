@@ -25,6 +25,7 @@ from skysim.experiments.papers.compare import (
     ExperimentOptions,
     ExperimentResult,
     FigureDrawing,
+    Results,
     RowResult,
     bootstrap_interval,
     sample_std,
@@ -179,7 +180,7 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
         overrides = uncalibrated_overrides(rng.uniform(0, 2 * np.pi))
         uncalibrated.append(photograph_and_solve(overrides, local, int(rng.integers(2**31))))
         options.watch(n + 1, lenses)
-    results = {
+    results: Results = {
         f"{angle}_{row}": RowResult(
             extremum(calibrated.estimated_deg[n : n + 1, axis], np.max), "of one frame"
         )
@@ -187,25 +188,23 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
         for axis, angle in enumerate(ANGLES)
     }
     zenith_deg = zenith_distance_deg(calibrated.estimated_deg[0])
-    results["zenith"] = RowResult(extremum(np.array([zenith_deg]), np.max))
+    results["zenith"] = extremum(np.array([zenith_deg]), np.max)
     # Least-squares slope of the right ascension, with the 95 % interval from its residuals.
     slope, covariance = np.polyfit(calibrated.minutes, calibrated.estimated_deg[:, 0], 1, cov=True)
     rate = symmetric_interval(slope[0], 1.96 * np.sqrt(covariance[0, 0]), len(local))
-    results["rate"] = results["rate_fit"] = RowResult(rate)
+    results["rate"] = results["rate_fit"] = rate
     results |= scatter_results(calibrated, uncalibrated)
     error_rad = np.concatenate([solutions.error_rad for solutions in uncalibrated])
     for key, is_hit in (("failed", np.isnan(error_rad)), ("wrong", error_rad > WRONG_RAD)):
-        results[key] = RowResult(proportion(int(is_hit.sum()), len(is_hit)))
+        results[key] = proportion(int(is_hit.sum()), len(is_hit))
     return ExperimentResult(results, drawings(calibrated, uncalibrated))
 
 
-def scatter_results(
-    calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]
-) -> dict[str, RowResult]:
+def scatter_results(calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]) -> Results:
     """Standard deviation of each angle, and mean error. The interval with the cause is over lenses, because the frames
     of one lens share its distortion."""
     name = "optics decentered and not calibrated, and vibration, fitted"
-    results = {}
+    results: Results = {}
     for axis, angle in enumerate(ANGLES):
         stds = np.array(
             [sample_std(solutions.errors_arcsec[:, axis]) for solutions in uncalibrated]

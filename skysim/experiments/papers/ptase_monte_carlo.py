@@ -34,6 +34,7 @@ from skysim.experiments.papers.compare import (
     ExperimentOptions,
     ExperimentResult,
     FigureDrawing,
+    Results,
     RowResult,
     bootstrap_interval,
     percent,
@@ -221,16 +222,16 @@ def table_1(options: ExperimentOptions) -> ExperimentResult:
     cause = Cause(
         f"a gate for magnitudes of {FITTED_GATE_SIGMAS} sigma, fitted", success_percent(wider_gate)
     )
-    results = {}
+    results: Results = {}
     for name, runs_of_version in by_version.items():
         number = name[-1]
         success = success_percent(runs_of_version)
         results[f"success_{number}"] = RowResult(success, cause=cause if number in "12" else None)
         for statistic, values in runs_of_version.right._asdict().items():
-            results[f"{statistic}_{number}"] = RowResult(bootstrap_interval(values, np.mean))
+            results[f"{statistic}_{number}"] = bootstrap_interval(values, np.mean)
     versions = by_version.values()
-    results["wrong"] = RowResult(
-        proportion(sum(one.wrong for one in versions), sum(one.runs for one in versions))
+    results["wrong"] = proportion(
+        sum(one.wrong for one in versions), sum(one.runs for one in versions)
     )
     results |= scatter(by_version["fialho_2"])
     return ExperimentResult(results, drawings(by_version))
@@ -241,7 +242,7 @@ def success_percent(runs_of_version: VersionRuns) -> Summary:
     return percent(proportion(runs_of_version.solved, runs_of_version.runs))
 
 
-def scatter(runs_of_version: VersionRuns) -> dict[str, RowResult]:
+def scatter(runs_of_version: VersionRuns) -> Results:
     """Standard deviation of a simulation's mean over 1000 runs: that of one run divided by sqrt(1000)."""
     values = {name: getattr(runs_of_version.right, name) for name in ("attitude", "roll", "axis")}
     values["success"] = np.where(
@@ -252,8 +253,7 @@ def scatter(runs_of_version: VersionRuns) -> dict[str, RowResult]:
         return sample_std(samples, axis) / np.sqrt(SIMULATION_RUNS)
 
     return {
-        f"{name}_sd": RowResult(bootstrap_interval(samples, std_of_mean))
-        for name, samples in values.items()
+        f"{name}_sd": bootstrap_interval(samples, std_of_mean) for name, samples in values.items()
     }
 
 

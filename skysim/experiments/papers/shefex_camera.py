@@ -22,6 +22,7 @@ from skysim.experiments.papers.compare import (
     ExperimentOptions,
     ExperimentResult,
     FigureDrawing,
+    Results,
     RowResult,
     bootstrap_interval,
     bootstrap_of_means,
@@ -59,7 +60,7 @@ def scan_times(options: ExperimentOptions) -> ExperimentResult:
     times_note = f"ours: {median_ms[0]:.2f} and {median_ms[1]:.2f} ms, {passes.mean():.1f} passes"
     overlap = np.mean([overlap for _, overlap in table])
     overlap_note = f"overlap of the {MAX_CENTROIDS} with most light and of those with the highest peak: {overlap:.2f}"
-    results = {
+    results: Results = {
         "ratio": RowResult(
             quantile(times_s[:, 1] / times_s[:, 0], 0.5),
             f"{times_note}; times vary from run to run",
@@ -241,21 +242,19 @@ def exposure_control(options: ExperimentOptions) -> ExperimentResult:
     }
     ground_ms = steady_ms["ground"]
     space_and_ground_ms = np.column_stack([steady_ms["space"], ground_ms])
-    results = {
-        "step": RowResult(exact(dark_ms[1] - dark_ms[0])),
-        "limit": RowResult(exact(max(dark_ms))),
+    results: Results = {
+        "step": exact(dark_ms[1] - dark_ms[0]),
+        "limit": exact(max(dark_ms)),
         "rest": RowResult(
             bootstrap_interval(ground_ms, np.mean),
             f"from {ground_ms.min():g} to {ground_ms.max():g}",
             Cause("8 bits of 157 e-", bootstrap_interval(steady_ms["8 bits"], np.mean)),
         ),
-        "space": RowResult(
-            bootstrap_of_means(space_and_ground_ms, lambda m: m[..., 0] / m[..., 1])
-        ),
+        "space": bootstrap_of_means(space_and_ground_ms, lambda m: m[..., 0] / m[..., 1]),
     }
     for name, values in changes_ms.items():  # the mean, with minimum and maximum as the interval
-        results[name] = RowResult(
-            Summary(float(values.mean()), float(values.min()), float(values.max()), len(values))
+        results[name] = Summary(
+            float(values.mean()), float(values.min()), float(values.max()), len(values)
         )
     drawing = FigureDrawing(
         "Fig. 2: exposure, frame after frame.", partial(draw_control, attitudes[0])

@@ -23,6 +23,7 @@ from skysim.experiments.papers.compare import (
     ExperimentOptions,
     ExperimentResult,
     FigureDrawing,
+    Results,
     RowResult,
     bootstrap_of_means,
 )
@@ -198,7 +199,7 @@ def figs_7_to_10(options: ExperimentOptions) -> ExperimentResult:
     return ExperimentResult(results, drawings)
 
 
-def time_results(curves: Curves) -> dict[str, RowResult]:
+def time_results(curves: Curves) -> Results:
     """Fig. 7: the ends of the curves relative to their minimum, and how far the minimum moves with centroid error."""
     low = [bootstrap_of_means(work.T, lambda m: m[..., 0] / m.min(axis=-1)) for work in curves.work]
     high = [
@@ -212,21 +213,19 @@ def time_results(curves: Curves) -> dict[str, RowResult]:
     return {
         "least_low": RowResult(min(low), "smallest of the three centroid errors"),
         "least_high": RowResult(min(high), "smallest of the three centroid errors"),
-        "optimum": RowResult(
-            bootstrap_of_means(np.vstack([curves.work[0], curves.work[-1]]).T, moved)
-        ),
+        "optimum": bootstrap_of_means(np.vstack([curves.work[0], curves.work[-1]]).T, moved),
     }
 
 
-def success_results(curves: Curves) -> dict[str, RowResult]:
+def success_results(curves: Curves) -> Results:
     """Fig. 8: rise with cosError, order of the curves, and the success rate at the chosen cosError."""
     chosen = curves.right[1, INDEX_OF[CHOSEN_COS_ERROR]]
     has_four_stars = curves.has_four_stars
     increase = chosen - curves.right[1, INDEX_OF[1e-5]]
     difference = curves.right[0, INDEX_OF[2e-5]] - curves.right[2, INDEX_OF[2e-5]]
     return {
-        "success_rises": RowResult(bootstrap_of_mean(increase)),
-        "success_sharper": RowResult(bootstrap_of_mean(difference)),
+        "success_rises": bootstrap_of_mean(increase),
+        "success_sharper": bootstrap_of_mean(difference),
         "success_chosen": RowResult(
             proportion(chosen[has_four_stars].sum(), has_four_stars.sum()),
             f"over all attitudes, {1 - has_four_stars.mean():.0%} with fewer than four stars: {chosen.mean():.3f}",
@@ -234,7 +233,7 @@ def success_results(curves: Curves) -> dict[str, RowResult]:
     }
 
 
-def wrong_results(curves: Curves) -> dict[str, RowResult]:
+def wrong_results(curves: Curves) -> Results:
     """Fig. 9: rise with the number of spikes and with cosError, and the rate at the chosen cosError."""
     by_spikes = curves.wrong[-1, -1] - curves.wrong[0, -1]
     by_cos_error = curves.wrong[-1, -1] - curves.wrong[-1, 0]
@@ -245,14 +244,14 @@ def wrong_results(curves: Curves) -> dict[str, RowResult]:
     )
     return {
         "wrong_spikes": RowResult(bootstrap_of_mean(by_spikes), note),
-        "wrong_cos_error": RowResult(bootstrap_of_mean(by_cos_error)),
-        "wrong_chosen": RowResult(
-            proportion(curves.wrong[SPIKES.index(4), chosen].sum(), len(curves.has_four_stars))
+        "wrong_cos_error": bootstrap_of_mean(by_cos_error),
+        "wrong_chosen": proportion(
+            curves.wrong[SPIKES.index(4), chosen].sum(), len(curves.has_four_stars)
         ),
     }
 
 
-def attitude_results(curves: Curves) -> dict[str, RowResult]:
+def attitude_results(curves: Curves) -> Results:
     """Fig. 10: errors at 0.45 px, and the centroid error at which yaw exceeds the limit, as rms and as 2 sigma."""
     yaw = curves.error_deg[:, :, 2].T
     cross = np.hypot(curves.error_deg[:, :, 0], curves.error_deg[:, :, 1]).T
@@ -263,17 +262,17 @@ def attitude_results(curves: Curves) -> dict[str, RowResult]:
         bootstrap_of_means(yaw_squared, partial(error_at_limit, times)) for times in (1.0, 2.0)
     )
     return {
-        "yaw_mean": RowResult(bootstrap_of_mean(np.abs(yaw_at_limit))),
-        "yaw_rms": RowResult(bootstrap_of_rms(yaw_at_limit)),
-        "yaw_2_sigma": RowResult(bootstrap_of_rms(yaw_at_limit, 2.0)),
+        "yaw_mean": bootstrap_of_mean(np.abs(yaw_at_limit)),
+        "yaw_rms": bootstrap_of_rms(yaw_at_limit),
+        "yaw_2_sigma": bootstrap_of_rms(yaw_at_limit, 2.0),
         "passes": RowResult(one_sigma, cause=Cause("2 sigma drawn, not rms", two_sigma)),
-        "increasing": RowResult(
-            bootstrap_of_means(yaw_squared, lambda m: np.diff(np.sqrt(m), axis=-1).min(axis=-1))
+        "increasing": bootstrap_of_means(
+            yaw_squared, lambda m: np.diff(np.sqrt(m), axis=-1).min(axis=-1)
         ),
-        "yaw_over_pitch": RowResult(
-            bootstrap_of_means(yaw_and_cross, lambda m: np.sqrt(m[..., 0] / m[..., 1]))
+        "yaw_over_pitch": bootstrap_of_means(
+            yaw_and_cross, lambda m: np.sqrt(m[..., 0] / m[..., 1])
         ),
-        "pitch": RowResult(bootstrap_of_means(yaw_and_cross[:, 1:], lambda m: np.sqrt(m[..., 0]))),
+        "pitch": bootstrap_of_means(yaw_and_cross[:, 1:], lambda m: np.sqrt(m[..., 0])),
     }
 
 
@@ -293,10 +292,10 @@ def error_at_limit(times: float, squares: Floats) -> Floats:
     return np.apply_along_axis(lambda row: np.interp(LIMIT_DEG, row, ERRORS_PX), -1, yaw_deg)
 
 
-def equation_results(rng: np.random.Generator) -> dict[str, RowResult]:
+def equation_results(rng: np.random.Generator) -> Results:
     """Eq. 1 by a search that finds nothing, eqs 3 and 4 by our k-vector's ranges, eq. 5 as printed and corrected."""
-    results = {
-        f"c_{n}": RowResult(exact(CHOSEN_COS_ERROR / eq3_cos_error(centroid_px, 1.0)))
+    results: Results = {
+        f"c_{n}": exact(CHOSEN_COS_ERROR / eq3_cos_error(centroid_px, 1.0))
         for n, centroid_px in enumerate(CENTROID_PX, 1)
     }
     # Half the range of catalog angles that a k-vector search returns for an angle (eqs 4, 5 corrected).
@@ -304,10 +303,10 @@ def equation_results(rng: np.random.Generator) -> dict[str, RowResult]:
         interval = angle_interval(np.radians(angle_deg), CHOSEN_COS_ERROR)
         low, high = pair_index.pair_range(pairs(), *interval)
         half_rad = (pairs().angle_rad[high - 1] - pairs().angle_rad[low]) / 2
-        results[f"gate_{name}"] = RowResult(exact(np.degrees(half_rad)))
-    results["triangles"] = RowResult(exact(count_triangles(rng)))
+        results[f"gate_{name}"] = exact(np.degrees(half_rad))
+    results["triangles"] = exact(count_triangles(rng))
     for key, failures in zip(("eq5_printed", "eq5_mended"), eq5_failures(rng), strict=True):
-        results[key] = RowResult(extremum(np.array([failures]), np.max))
+        results[key] = extremum(np.array([failures]), np.max)
     return results
 
 

@@ -27,6 +27,7 @@ from skysim.experiments.papers.compare import (
     ExperimentOptions,
     ExperimentResult,
     FigureDrawing,
+    Results,
     RowResult,
     bootstrap_interval,
     format_summary,
@@ -59,23 +60,23 @@ DEFOCUS_M = 1e-4
 EXPOSURE_S = 0.05
 
 
-def optics_results(options: ExperimentOptions) -> dict[str, RowResult]:
+def optics_results(options: ExperimentOptions) -> Results:
     """Answers that need no night-sky frames."""
     horizontal, vertical, diagonal = field_deg(onboard_model.calibration(shefex_lab().scene.camera))
     absorbed = star_image(ground_lab(), 0.05).sum() / star_image(shefex_lab(), 0.035).sum()
-    results = {
-        "field_h": RowResult(exact(horizontal)),
-        "field_v": RowResult(exact(vertical)),
+    results: Results = {
+        "field_h": exact(horizontal),
+        "field_v": exact(vertical),
         "diagonal": RowResult(
             exact(diagonal), f"hypotenuse of both fields {np.hypot(horizontal, vertical):.3f}"
         ),
-        "diagonal_true": RowResult(exact(diagonal)),
-        "absorbed": RowResult(exact(absorbed)),
-        "blur": RowResult(exact(blur_px())),
+        "diagonal_true": exact(diagonal),
+        "absorbed": exact(absorbed),
+        "blur": exact(blur_px()),
         "focal": RowResult(*calibrated_focal_mm(options)),
     }
     for rate in (2, 4):
-        results[f"smear_{rate}"] = RowResult(exact(smear_px(rate)))
+        results[f"smear_{rate}"] = exact(smear_px(rate))
         results[f"loss_{rate}"] = peak_loss(rate, options.trials(60, 5), options.seed)
     return results
 
@@ -336,7 +337,7 @@ def night_results(options: ExperimentOptions) -> ExperimentResult:
     return ExperimentResult(frame_results(results) | optics_results(options), drawings)
 
 
-def frame_results(results: dict[str, NightResults]) -> dict[str, RowResult]:
+def frame_results(results: dict[str, NightResults]) -> Results:
     """Answers from the frames to the statements of sections 4 and 5."""
     at_rest = results["ground 0"]
     centroids = results["40 ms"].centroids
@@ -365,7 +366,7 @@ def frame_results(results: dict[str, NightResults]) -> dict[str, RowResult]:
         "rate_2": success("ground 2"),
         "rate_5": success("ground 5", "ground 4", "at 4 deg/s"),
         "defocus": success("defocus", "half defocus", "at 0.05 mm"),
-        "centroids": RowResult(Summary(float(median), float(fewest), float(most), len(centroids))),
+        "centroids": Summary(float(median), float(fewest), float(most), len(centroids)),
     }
 
 

@@ -26,7 +26,7 @@ from skysim.experiments.papers.compare import (
     ExperimentOptions,
     ExperimentResult,
     FigureDrawing,
-    RowResult,
+    Results,
     bootstrap_of_means,
     with_cause,
 )
@@ -216,19 +216,17 @@ def catalog_statistics(options: ExperimentOptions) -> ExperimentResult:
     pool = stars().take(stars().v_mag <= FAINTEST_MAG)
     uniform_with_all_bright = published_catalogs.uniform(pool, len(uniform), BRIGHT_LIMIT_MAG)
     uniform_faint = [count_between(one, 5.25, 5.75) for one in (uniform, uniform_with_all_bright)]
-    results = {
+    results: Results = {
         "asymmetric_faint": with_cause("the thinning of the chosen catalog", exact, *faint),
-        "asymmetric_faintest": RowResult(exact(asymmetric.v_mag.max())),
+        "asymmetric_faintest": exact(asymmetric.v_mag.max()),
         "uniform_faint": with_cause("all stars to 4.5 mag kept", exact, *uniform_faint),
-        "chosen_stars": RowResult(exact(len(chosen))),
-        "chosen_pairs": RowResult(exact(count_pairs(chosen))),
-        "chosen_bright": RowResult(exact(np.isin(bright, chosen.id).mean())),
-        "uniform_pairs": RowResult(exact(count_pairs(uniform))),
-        "spread": RowResult(
-            bootstrap_of_means(np.hstack([counts, counts**2]), relative_dispersion)
-        ),
-        "poor": RowResult(
-            bootstrap_of_means((counts < MIN_STARS).astype(float), lambda m: m[..., 1] - m[..., 0])
+        "chosen_stars": exact(len(chosen)),
+        "chosen_pairs": exact(count_pairs(chosen)),
+        "chosen_bright": exact(np.isin(bright, chosen.id).mean()),
+        "uniform_pairs": exact(count_pairs(uniform)),
+        "spread": bootstrap_of_means(np.hstack([counts, counts**2]), relative_dispersion),
+        "poor": bootstrap_of_means(
+            (counts < MIN_STARS).astype(float), lambda m: m[..., 1] - m[..., 0]
         ),
     }
     drawings = (

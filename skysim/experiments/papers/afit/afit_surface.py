@@ -15,6 +15,7 @@ from skysim.experiments.papers.compare import (
     ExperimentOptions,
     ExperimentResult,
     FigureDrawing,
+    Results,
     RowResult,
     with_cause,
 )
@@ -75,7 +76,7 @@ def table_1(options: ExperimentOptions) -> ExperimentResult:
         np.array([width_in(panel, height_in, angle) for angle in ANGLES_DEG])
         for height_in in (STATED_HEIGHT_IN, FITTED_HEIGHT_IN)
     )
-    results = {}
+    results: Results = {}
     for n, angle in enumerate(ANGLES_DEG):
         values = {"width": [width[n] for width in (stated, fitted)]}
         if n:  # the difference from the first width, in percent of their mean (the thesis's definition)
@@ -86,7 +87,7 @@ def table_1(options: ExperimentOptions) -> ExperimentResult:
             results[f"{name}_{angle}"] = with_cause(f"M = {FITTED_HEIGHT_IN} in", exact, *pair)
     dome = build_surface(SPHERE)
     chords = [chord_in(dome, STATED_HEIGHT_IN, angle) for angle in ANGLES_DEG]
-    results["sphere"] = RowResult(exact(np.ptp(chords)))
+    results["sphere"] = exact(np.ptp(chords))
     caption = "Table 1: width of the image on a flat surface."
     return ExperimentResult(results, (FigureDrawing(caption, lambda fig: draw(fig, panel)),))
 
@@ -112,7 +113,7 @@ def draw(fig: Any, panel: Surface) -> None:
     axes.legend()
 
 
-def contour(dome: Surface) -> dict[str, RowResult]:
+def contour(dome: Surface) -> Results:
     """Dimensions of the designed and of the measured inner surface (section 3.5.3), from our surface models; inches."""
     design = build_surface(DESIGN)
     rays = tilted_direction(0.0), tilted_direction(EDGE_RAD)
@@ -128,12 +129,12 @@ def contour(dome: Surface) -> dict[str, RowResult]:
     horizontal_in = axes_m[0] / INCH_M
     vertical_in = axes_m[2] / INCH_M
     return {
-        "design_apex": RowResult(exact(radii[0])),
-        "design_edge": RowResult(exact(radii[1])),
-        "design_change": RowResult(exact(100 * (radii[0] / radii[1] - 1))),
-        "design_across": RowResult(exact(design_horizontal_in)),
-        "differs_v": RowResult(exact(relative_difference(radii[0], vertical_in))),
-        "differs_h": RowResult(exact(relative_difference(design_horizontal_in, horizontal_in))),
+        "design_apex": exact(radii[0]),
+        "design_edge": exact(radii[1]),
+        "design_change": exact(100 * (radii[0] / radii[1] - 1)),
+        "design_across": exact(design_horizontal_in),
+        "differs_v": exact(relative_difference(radii[0], vertical_in)),
+        "differs_h": exact(relative_difference(design_horizontal_in, horizontal_in)),
         **rim_and_radii(dome),
         **best_sphere(dome),
     }
@@ -150,24 +151,24 @@ def intersections_in(dome: Surface, tilt_rad: Any) -> Floats:
     return np.asarray(replace(dome, rim=Rim(dome.rim.bearing_m)).meet(np.zeros(3), rays) / INCH_M)
 
 
-def rim_and_radii(dome: Surface) -> dict[str, RowResult]:
+def rim_and_radii(dome: Surface) -> Results:
     """Rim of the measured surface (where it is as wide as the dome), and its distances from the bearing."""
     rim_rad = brentq(lambda tilt: intersections_in(dome, tilt)[0, 0] - DOME_WIDTH_IN / 2, 0.5, 0.9)
     rim = intersections_in(dome, rim_rad)[0]
-    height = RowResult(exact(intersections_in(dome, 0.0)[0, 2] - rim[2]))
+    height = exact(intersections_in(dome, 0.0)[0, 2] - rim[2])
     tilt_rad = np.linspace(0, rim_rad, 4001)
     rho = np.linalg.norm(intersections_in(dome, tilt_rad), axis=1)
     return {
         "height": height,
         "height_by_axes": height,
-        "rim_z": RowResult(exact(rim[2])),
-        "rim_rho": RowResult(exact(float(np.linalg.norm(rim)))),
-        "rho_max": RowResult(exact(rho.max())),
-        "rho_max_at": RowResult(exact(np.degrees(tilt_rad[rho.argmax()]))),
+        "rim_z": exact(rim[2]),
+        "rim_rho": exact(float(np.linalg.norm(rim))),
+        "rho_max": exact(rho.max()),
+        "rho_max_at": exact(np.degrees(tilt_rad[rho.argmax()])),
     }
 
 
-def best_sphere(dome: Surface) -> dict[str, RowResult]:
+def best_sphere(dome: Surface) -> Results:
     """Least-squares sphere of the measured surface, sampled uniformly by area over the design's cap, and the rms of the
     contour's distance from it.
 
@@ -183,8 +184,8 @@ def best_sphere(dome: Surface) -> dict[str, RowResult]:
     contour_in = intersections_in(dome, fraction * cap_rad)
     error_in = np.linalg.norm(contour_in - sphere.center_m, axis=1) - sphere.radius_m
     return {
-        "best_sphere": RowResult(exact(sphere.radius_m)),
-        "best_center": RowResult(exact(float(sphere.center_m[2]))),
+        "best_sphere": exact(sphere.radius_m),
+        "best_center": exact(float(sphere.center_m[2])),
         "best_rms": RowResult(
             exact(float(np.sqrt(np.mean(error_in**2)))), f"weighted by area {sphere.rms_m:.3f}"
         ),

@@ -28,6 +28,7 @@ from skysim.experiments.papers.compare import (
     ExperimentOptions,
     ExperimentResult,
     FigureDrawing,
+    Results,
     RowResult,
     confidence_interval,
     with_cause,
@@ -94,14 +95,8 @@ def board_scene(
     height_in = CAMERA_IN + distance_in
     across_mm = PITCH_MM * np.array([1.0, 0.0, -1.0])
     positions = [[f"{x} mm", f"{y} mm", f"{height_in} in"] for x in across_mm for y in across_mm]
-    listed = ListedConfig.model_validate(
-        {
-            "kind": "listed",
-            "cap_deg": 27,
-            "levels": list(levels),
-            "positions": positions[: len(levels)],
-        }
-    )
+    leds = {"levels": list(levels), "positions": positions[: len(levels)]}
+    listed = ListedConfig.model_validate({"kind": "listed", "cap_deg": 27} | leds)
     scene = load("afit_test1_ideal")
     panel = FlatSurfaceConfig.model_validate({"kind": "flat", "apex": f"{height_in} in"})
     scene = with_config(scene, "light", surface=panel, layout=listed, occlusion=False)
@@ -186,7 +181,8 @@ def led_tests(options: ExperimentOptions) -> ExperimentResult:
     rng = [random_stream(options.seed, stage) for stage in range(5)]
     # Light of an LED tilted by 60 deg from the camera relative to one that faces it, in electrons (Fig. 44).
     lobe_60 = led_electrons(60.0, rng[0]) / led_electrons(0.0, rng[0])
-    results = {"lobe_60": RowResult(exact(lobe_60))} | duty_cycles(rng[1])
+    results: Results = {"lobe_60": exact(lobe_60)}
+    results |= duty_cycles(rng[1])
     options.watch(1, 4)
     results |= thresholds(images, rng[2])
     options.watch(2, 4)
@@ -226,19 +222,20 @@ def led_electrons(angle_deg: float, rng: np.random.Generator) -> float:
     return float(render_at_attitude(lab, Rotation.identity(), rng)[1].sources.electrons[0])
 
 
-def duty_cycles(rng: np.random.Generator) -> dict[str, RowResult]:
+def duty_cycles(rng: np.random.Generator) -> Results:
     """Eq. 37: light of each of nine multiplexed LEDs relative to one that is always on."""
     pulses_us = [1000.0, 500.0, 400.0, 200.0, 1.0, 1000.0, 1000.0, 1000.0, 1000.0]
     lab = with_exposure(white_board(pulses_us), 4 * 9 * SLOT_S)
     always_on = lab.with_sources(replace(lab.camera.sources, on_s=lab.camera.sources.period_s))
-    pulsed, unpulsed = (
-        render_at_attitude(board, Rotation.identity(), rng)[1].sources for board in (lab, always_on)
-    )
-    fraction = pulsed.electrons[np.argsort(pulsed.id)] / unpulsed.electrons[np.argsort(unpulsed.id)]
-    return {f"duty_{int(pulses_us[n])}": RowResult(exact(100 * fraction[n])) for n in range(5)}
+    electrons = []
+    for board in (lab, always_on):
+        sources = render_at_attitude(board, Rotation.identity(), rng)[1].sources
+        electrons.append(sources.electrons[np.argsort(sources.id)])
+    percent = 100 * electrons[0] / electrons[1]
+    return {f"duty_{int(pulses_us[n])}": exact(percent[n]) for n in range(5)}
 
 
-def thresholds(images: int, rng: np.random.Generator) -> dict[str, RowResult]:
+def thresholds(images: int, rng: np.random.Generator) -> Results:
     """Fig. 37: pixels of the first board above thresholds of 2, 10 and 25 %."""
     own_noise, test2_noise = (
         [apply_thresholds(*take_image(lab, rng)) for _ in range(images)]
@@ -246,9 +243,8 @@ def thresholds(images: int, rng: np.random.Generator) -> dict[str, RowResult]:
     )
 
     def both(statistic: Callable[[BoardImage], Any], note: str = "") -> RowResult:
-        ours, theirs = (
-            [float(statistic(one)) for one in images] for images in (own_noise, test2_noise)
-        )
+        ours = list(map(statistic, own_noise))
+        theirs = list(map(statistic, test2_noise))
         return with_cause(CAUSE_NOISE, confidence_interval, ours, theirs, note=note)
 
     lens = LensSettings(noise_e=INTERMEDIATE_NOISE_GRAY * E_PER_GRAY)
@@ -289,20 +285,18 @@ def outside_px(counts: ThresholdCounts) -> int:
     return counts.glare_px + counts.dark_px
 
 
-def apertures(images: int, rng: np.random.Generator) -> dict[str, RowResult]:
+def apertures(images: int, rng: np.random.Generator) -> Results:
     """Fig. 36: LEDs found with a wide aperture in focus, a narrow one out of focus, and a balanced one."""
-    results: dict[str, RowResult] = {}
+    results: Results = {}
     for name, lens in APERTURES.items():
         lab = color_board(lens)
         taken = [take_image(lab, rng) for _ in range(images)]
-        found = [
-            float(np.sum(count_above(*image_and_px, 0.10).area_px >= MIN_AREA_PX))
-            for image_and_px in taken
-        ]
-        results[f"found_{name}"] = RowResult(confidence_interval(found))
+        areas_px = np.array([count_above(*one, 0.10).area_px for one in taken])
+        found = np.sum(areas_px >= MIN_AREA_PX, axis=1)
+        results[f"found_{name}"] = confidence_interval(found)
         if name == "wide":
-            full_px = [float(np.sum(image == WHITE)) for image, _ in taken]
-            results["full_wide"] = RowResult(confidence_interval(full_px))
+            full_px = [np.sum(image == WHITE) for image, _ in taken]
+            results["full_wide"] = confidence_interval(full_px)
     return results
 
 
@@ -313,7 +307,7 @@ APERTURES = {
 }
 
 
-def viewing_angles(images: int, rng: np.random.Generator) -> dict[str, RowResult]:
+def viewing_angles(images: int, rng: np.random.Generator) -> Results:
     """Figs 38 and 40: how much an LED's area varies between positions, for a directional and a diffuse lobe."""
     narrow = color_board(lobe=NARROW_LOBE)
     misalignment = Rotation.from_euler("y", MISALIGNMENT_DEG, degrees=True)
@@ -331,7 +325,7 @@ def viewing_angles(images: int, rng: np.random.Generator) -> dict[str, RowResult
     note = f"{test2_percent:.2f} with {CAUSE_NOISE}; {intermediate_percent:.4f} with {INTERMEDIATE_NOISE_GRAY}"
     return {
         "directional": with_cause(cause, confidence_interval, *directional),
-        "diffuse": RowResult(confidence_interval(areas.min(axis=1))),
+        "diffuse": confidence_interval(areas.min(axis=1)),
         "outside_4": RowResult(confidence_interval(stray), note),
     }
 
@@ -346,14 +340,13 @@ def area_variation(
         taken = [take_image(lab, rng, roll_pitch_deg) for roll_pitch_deg in VIEW_ANGLES_DEG]
         counted = [count_above(image, xy_px, threshold) for image, xy_px in taken]
         area = np.array([counts.area_px for counts in counted])
-        ratio.append(
-            np.where(area.any(axis=0), area.min(axis=0) / np.maximum(area.max(axis=0), 1), 1.0)
-        )
-        stray.append(np.mean([100 * outside_px(counts) / taken[0][0].size for counts in counted]))
+        largest = np.maximum(area.max(axis=0), 1)
+        ratio.append(np.where(area.any(axis=0), area.min(axis=0) / largest, 1.0))
+        stray.append(100 * np.mean([outside_px(one) for one in counted]) / taken[0][0].size)
     return np.array(ratio), np.array(stray)
 
 
-def brightness(images: int, rng: np.random.Generator) -> tuple[dict[str, RowResult], Floats]:
+def brightness(images: int, rng: np.random.Generator) -> tuple[Results, Floats]:
     """Figs 43 and 46: magnitude of five LEDs against their pulse, and whether LEDs of 1 us are detected."""
     long_us = 1e6 * ON_FRACTION * SLOT_S
     pulses_us = np.array(PULSES_US[:4])
@@ -362,9 +355,8 @@ def brightness(images: int, rng: np.random.Generator) -> tuple[dict[str, RowResu
     magnitudes = np.array([led_magnitudes(long_pulse, rng) for _ in range(images)])
     per_us = magnitudes[:, :4] / pulses_us
     saturating = white_board(PULSES_US, SATURATION_FRACTION)
-    saturating_per_us = (
-        np.array([led_magnitudes(saturating, rng)[:4] for _ in range(images)]) / pulses_us
-    )
+    saturated = np.array([led_magnitudes(saturating, rng)[:4] for _ in range(images)])
+    saturating_per_us = saturated / pulses_us
     mean = ", ".join(f"{magnitude:.1f}" for magnitude in magnitudes.mean(axis=0))
     note = f"ours with Test 2's intensity: {mean}; Table 7: {', '.join(map(str, table_7_magnitudes()))}"
     board = (1000.0, 500.0, 1.0) * 3

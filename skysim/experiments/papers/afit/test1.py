@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration.home_position import pooled
@@ -26,7 +27,7 @@ from skysim.experiments.papers.compare import (
     ExperimentOptions,
     ExperimentResult,
     FigureDrawing,
-    RowResult,
+    Results,
     confidence_interval,
     with_cause,
 )
@@ -113,11 +114,11 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
     return ExperimentResult(ranks(*runs) | separations(found_arcsec), drawings)
 
 
-def ranks(full_cycles: Sequence[Floats], frame_time: Sequence[Floats]) -> dict[str, RowResult]:
+def ranks(full_cycles: Sequence[Floats], frame_time: Sequence[Floats]) -> Results:
     """Table 2: mean and pooled standard deviation of each rank, over boards, magnitudes scaled to the published mean;
     and the relative standard deviation among the nine LEDs of a board, percent."""
     published_mean = published_by_rank("mean").mean()
-    results: dict[str, RowResult] = {}
+    results: Results = {}
     for name, statistic in (("mean", partial(np.mean, axis=0)), ("sd", pooled_std_by_rank)):
         ours, theirs = (
             np.array([published_mean / board.mean() * statistic(board) for board in boards])
@@ -128,9 +129,7 @@ def ranks(full_cycles: Sequence[Floats], frame_time: Sequence[Floats]) -> dict[s
                 CAUSE, confidence_interval, ours[:, n], theirs[:, n]
             )
     mean = np.array([board.mean(axis=0) for board in full_cycles])
-    results["scatter"] = RowResult(
-        confidence_interval(100 * mean.std(axis=1, ddof=1) / mean.mean(axis=1))
-    )
+    results["scatter"] = confidence_interval(100 * mean.std(axis=1, ddof=1) / mean.mean(axis=1))
     return results
 
 
@@ -149,34 +148,28 @@ def lattice_angles(lab: Lab, images: int, rng: np.random.Generator) -> Floats:
     """(n, 36) angles of all pairs, ascending, by the thesis's scale: four spacings of the first image average 8 mm."""
     camera = onboard_model.assumed_camera(lab.scene)
     angles_arcsec: list[Floats] = []
-    for lab_from_body in attitudes(lab.scene):
-        for _ in range(images):
-            frame, truth = render_at_attitude(lab, lab_from_body, rng)
-            xy_px = measure_lights(gray_levels(frame, lab)).xy_px
-            if not angles_arcsec:
-                nearest = [
-                    int(np.argmin(np.linalg.norm(xy_px - led_px, axis=1)))
-                    for led_px in truth.sources.xy_px
-                ]
-                spacing_px = [
-                    np.linalg.norm(xy_px[nearest[a]] - xy_px[nearest[b]]) for a, b in NEIGHBORS
-                ]
-                distance_m = lab.camera.sources.place[4, 2] - lab.camera.mount.camera_body_m[2]
-                camera = camera.zoomed(
-                    float(np.mean(spacing_px)) * distance_m / PITCH_M / camera.focal_px
-                )
-            angles_arcsec.append(np.sort(separations_arcsec(xy_px, lab, camera)))
+    poses = [lab_from_body for lab_from_body in attitudes(lab.scene) for _ in range(images)]
+    for lab_from_body in poses:
+        frame, truth = render_at_attitude(lab, lab_from_body, rng)
+        xy_px = measure_lights(gray_levels(frame, lab)).xy_px
+        if not angles_arcsec:
+            _, nearest = cKDTree(xy_px).query(truth.sources.xy_px)
+            first, second = xy_px[nearest[np.transpose(NEIGHBORS)]]
+            spacing_px = float(np.mean(np.linalg.norm(first - second, axis=1)))
+            distance_m = lab.camera.sources.place[4, 2] - lab.camera.mount.camera_body_m[2]
+            camera = camera.zoomed(spacing_px * distance_m / PITCH_M / camera.focal_px)
+        angles_arcsec.append(np.sort(separations_arcsec(xy_px, lab, camera)))
     return np.array(angles_arcsec)
 
 
-def separations(angles_arcsec: Floats) -> dict[str, RowResult]:
+def separations(angles_arcsec: Floats) -> Results:
     """Number of distinct angles, and the five of them."""
     mean_arcsec = angles_arcsec.mean(axis=0)
     gaps = np.flatnonzero(np.diff(mean_arcsec) > GAP_ARCSEC) + 1
-    results = {"distinct": RowResult(exact(len(gaps) + 1))}
+    results: Results = {"distinct": exact(len(gaps) + 1)}
     for n, columns in enumerate(np.split(angles_arcsec, np.cumsum(PAIR_COUNTS)[:-1], axis=1), 1):
         means = columns.mean(axis=1).reshape(POSITIONS, -1).mean(axis=1)
-        results[f"angle_{n}"] = RowResult(confidence_interval(means))
+        results[f"angle_{n}"] = confidence_interval(means)
     return results
 
 
@@ -232,10 +225,9 @@ def draw_angles(fig: Any, angles_arcsec: Floats) -> None:
     axes = fig.subplots()
     axes.hist(angles_arcsec.ravel(), np.arange(1200, 4000, 20), color=INK[0], label="ours")
     # Angles about the bearing of two LEDs of the lattice, in a board at 48 in.
-    for n, angle_rad in enumerate(
-        2 * np.arctan(PITCH_M * np.sqrt(SQUARED_DISTANCES) / 2 / (48 * INCH_M))
-    ):
+    angles_rad = 2 * np.arctan(PITCH_M * np.sqrt(SQUARED_DISTANCES) / 2 / (48 * INCH_M))
+    for n, angle_arcsec in enumerate(np.degrees(angles_rad) * 3600):
         label = "8 mm lattice" if n == 0 else None
-        axes.axvline(np.degrees(angle_rad) * 3600, ls="--", color=INK[1], label=label)
+        axes.axvline(angle_arcsec, ls="--", color=INK[1], label=label)
     axes.set(xlabel="angle of a pair (arcsec)", ylabel="pairs in all images")
     axes.legend()

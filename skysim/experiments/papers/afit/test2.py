@@ -6,6 +6,7 @@ are simulated: camera noise, a board that is not parallel to the dome, a dome of
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -29,7 +30,7 @@ from skysim.experiments.papers.compare import (
     ExperimentOptions,
     ExperimentResult,
     FigureDrawing,
-    RowResult,
+    Results,
     bootstrap_interval,
     confidence_interval,
     sample_std,
@@ -169,17 +170,14 @@ def tables_3_to_5(options: ExperimentOptions) -> ExperimentResult:
     return ExperimentResult(results, drawings)
 
 
-def magnitudes(runs: NoiseRuns, images: int) -> dict[str, RowResult]:
+def magnitudes(runs: NoiseRuns, images: int) -> Results:
     """Table 3, and the relative change of the bright LED's magnitude from the first place to the last."""
-    results: dict[str, RowResult] = {}
-    counts = [
-        f"{len(own.magnitude)} and {len(more.magnitude)}" for own, more in zip(*runs, strict=True)
-    ]
+    results: Results = {}
     for led, name in enumerate(("bright", "dim")):
         ours, theirs = ([one.magnitude[:, led] for one in places] for places in runs)
-        for n, (own, more) in enumerate(zip(ours, theirs, strict=True)):
-            note = f"the pair is detected in {counts[n]} of {images} images"
-            results[f"{name}_{n + 1}"] = with_cause(
+        for n, (own, more) in enumerate(zip(ours, theirs, strict=True), 1):
+            note = f"the pair is detected in {len(own)} and {len(more)} of {images} images"
+            results[f"{name}_{n}"] = with_cause(
                 CAUSE_NOISE, confidence_interval, own, more, note=note
             )
         results[f"{name}_avg"] = with_cause(CAUSE_NOISE, mean_of_places, ours, theirs)
@@ -193,59 +191,58 @@ def relative_gain(places: Sequence[Floats]) -> Summary:
     first = confidence_interval(places[0])
     last = confidence_interval(places[-1])
     value = 100 * (last.value / first.value - 1)
-    half = 100 * float(np.hypot(last.high - last.value, first.high - first.value)) / first.value
+    half = 100 * math.hypot(last.high - last.value, first.high - first.value) / first.value
     return symmetric_interval(value, half, first.trials + last.trials)
 
 
 def mean_of_places(places: Sequence[Floats]) -> Summary:
     """Mean of the places' means; independent errors add in quadrature."""
     means = [confidence_interval(values) for values in places]
-    value = float(np.mean([mean.value for mean in means]))
-    half = float(np.sqrt(sum((mean.high - mean.value) ** 2 for mean in means)) / len(means))
+    value = sum(mean.value for mean in means) / len(means)
+    half = math.hypot(*(mean.high - mean.value for mean in means)) / len(means)
     return symmetric_interval(value, half, sum(mean.trials for mean in means))
 
 
-def standard_deviations(runs: NoiseRuns) -> dict[str, RowResult]:
+def standard_deviations(runs: NoiseRuns) -> Results:
     """Table 4, and the standard deviations of Table 5."""
-    values: dict[str, tuple[Floats, ...]] = {}
-    for led, name in enumerate(("bright", "dim")):
-        columns = [[one.magnitude[:, led] for one in places] for places in runs]
-        values |= {f"{name}_{n}": pair for n, pair in enumerate(zip(*columns, strict=True), 1)}
-        values[f"{name}_all"] = tuple(np.concatenate(column) for column in columns)
-    for n, (own, more) in enumerate(zip(*runs, strict=True), 1):
-        values[f"angle_{n}"] = own.angle_arcsec, more.angle_arcsec
+    results: Results = {}
     std_interval = partial(bootstrap_interval, statistic=sample_std)
-    return {
-        f"sd_{key}": with_cause(CAUSE_NOISE, std_interval, *pair) for key, pair in values.items()
-    }
+    for led, name in enumerate(("bright", "dim")):
+        every = (np.concatenate([one.magnitude for one in places])[:, led] for places in runs)
+        results[f"sd_{name}_all"] = with_cause(CAUSE_NOISE, std_interval, *every)
+    for n, (own, more) in enumerate(zip(*runs, strict=True), 1):
+        columns = {
+            f"sd_bright_{n}": (own.magnitude[:, BRIGHT], more.magnitude[:, BRIGHT]),
+            f"sd_dim_{n}": (own.magnitude[:, DIM], more.magnitude[:, DIM]),
+            f"sd_angle_{n}": (own.angle_arcsec, more.angle_arcsec),
+        }
+        for key, pair in columns.items():
+            results[key] = with_cause(CAUSE_NOISE, std_interval, *pair)
+    return results
 
 
-def angles(
-    lab: Lab, runs: NoiseRuns, images: int, rng: np.random.Generator
-) -> dict[str, RowResult]:
+def angles(lab: Lab, runs: NoiseRuns, images: int, rng: np.random.Generator) -> Results:
     """Table 5's means, with the effect of each cause on the last two."""
+
+    def angles_at(*place: float) -> Floats:
+        return series(lab, BoardPlace(*place), images, rng).angle_arcsec
+
     edge = PLACES_DEG[2]
-    halfway, decentered, tilted, tilted_decentered, more_tilted_decentered = (
-        series(lab, place, images, rng).angle_arcsec
-        for place in (
-            BoardPlace(HALFWAY_DEG),
-            BoardPlace(edge, 0.0, DECENTER_IN),
-            BoardPlace(edge, BOARD_TILT_DEG),
-            BoardPlace(edge, SMALLER_BOARD_TILT_DEG, DECENTER_IN),
-            BoardPlace(edge, BOARD_TILT_DEG, DECENTER_IN),
-        )
-    )
+    halfway = angles_at(HALFWAY_DEG)
+    decentered = angles_at(edge, 0.0, DECENTER_IN)
+    tilted = angles_at(edge, BOARD_TILT_DEG)
+    tilted_decentered = angles_at(edge, SMALLER_BOARD_TILT_DEG, DECENTER_IN)
+    more_tilted_decentered = angles_at(edge, BOARD_TILT_DEG, DECENTER_IN)
     glare_arcsec = glare_bias_arcsec(lab, images, rng)
-    noise_bias_arcsec = [
-        float(more.angle_arcsec.mean() - own.angle_arcsec.mean())
-        for own, more in zip(*runs, strict=True)
-    ]
+    apex_bias, _, edge_bias = (
+        more.angle_arcsec.mean() - own.angle_arcsec.mean() for own, more in zip(*runs, strict=True)
+    )
     at_apex, at_halfway, at_edge = (own.angle_arcsec for own in runs.own)
     note = (
         f'the dome {DECENTER_IN} in off center alone: {decentered.mean():.1f}"; with that, tilted by'
         f' {SMALLER_BOARD_TILT_DEG:g} deg: {tilted_decentered.mean():.1f}", tilted by {BOARD_TILT_DEG:g} deg:'
         f' {more_tilted_decentered.mean():.1f}"; centroid bias of the dim LED, in the noise:'
-        f' {noise_bias_arcsec[2] - noise_bias_arcsec[0]:+.1f}" from apex to edge, by glare of a lens with wide'
+        f' {edge_bias - apex_bias:+.1f}" from apex to edge, by glare of a lens with wide'
         f' wings: {glare_arcsec:+.1f}"'
     )
     cause = f"a board tilted by {BOARD_TILT_DEG:g} deg"
@@ -253,7 +250,7 @@ def angles(
         geometric_angle_arcsec(lab, BoardPlace(float(tilt))) for tilt in np.linspace(20, 34, 29)
     )
     return {
-        "angle_1": RowResult(confidence_interval(at_apex)),
+        "angle_1": confidence_interval(at_apex),
         "angle_2": with_cause(
             f"the board at {HALFWAY_DEG} deg", confidence_interval, at_halfway, halfway
         ),
@@ -261,7 +258,7 @@ def angles(
         "fall": with_cause(
             cause, partial(relative_decrease, float(at_apex.mean())), at_edge, tilted
         ),
-        "least": RowResult(exact(smallest)),
+        "least": exact(smallest),
     }
 
 
@@ -279,13 +276,11 @@ def glare_bias_arcsec(lab: Lab, images: int, rng: np.random.Generator) -> float:
     """
     psf = MoffatPsfConfig(kind="moffat", fwhm_px=2.5, beta=1.5)
     stand = build_test_stand(with_config(scene(2 * ON_FRACTION), "camera", psf=psf))
-    edge = BoardPlace(PLACES_DEG[2])
-    apex = BoardPlace(0.0)
     at_edge, at_apex = (
-        series(stand, place, images, rng).angle_arcsec.mean() for place in (edge, apex)
+        series(stand, place, images, rng).angle_arcsec.mean() - geometric_angle_arcsec(lab, place)
+        for place in (BoardPlace(PLACES_DEG[2]), BoardPlace(0.0))
     )
-    expected_edge, expected_apex = (geometric_angle_arcsec(lab, place) for place in (edge, apex))
-    return float(at_edge - at_apex - expected_edge + expected_apex)
+    return float(at_edge - at_apex)
 
 
 def geometric_angle_arcsec(lab: Lab, place: BoardPlace) -> float:

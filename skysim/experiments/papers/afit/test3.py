@@ -34,6 +34,7 @@ from skysim.experiments.papers.compare import (
     ExperimentOptions,
     ExperimentResult,
     FigureDrawing,
+    Results,
     RowResult,
     bootstrap_interval,
 )
@@ -93,7 +94,7 @@ def build_test3(overrides: Mapping[str, str] | None = None) -> Lab:
     return lab.with_camera(mount=Mount(lab.camera.mount.camera_body_m, cam_from_body))
 
 
-def lab_from_body(angles_deg: Sequence[float]) -> Rotation:
+def lab_from_body(angles_deg: Sequence[float] | Floats) -> Rotation:
     """lab_from_body from roll, pitch and yaw."""
     roll, pitch, yaw = angles_deg
     return guidance.attitude(AttitudeConfig(roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw))
@@ -122,14 +123,12 @@ def photograph(
         lights = CENTROIDERS["cog"](frame.image_dn, blobs, settings.gain_e_dn, priors)
         inside = camera.contains(lights.xy_px)
         _, nearest = cKDTree(truth.sources.xy_px).query(lights.xy_px[inside])
-        magnitude = instrument_brightness(blobs.flux / blobs.area_px, blobs.area_px.astype(float))[
-            inside
-        ]
+        magnitude = instrument_brightness(blobs.flux / blobs.area_px, blobs.area_px.astype(float))
         led, led_row = np.unique(truth.sources.id[nearest], return_index=True)
         if len(led) == LEDS:
-            xy_px = lights.xy_px[inside][led_row]
+            row = np.flatnonzero(inside)[led_row]
             sightings.append(
-                Sighting(position, lab_from_body.inv(), led, xy_px, magnitude[led_row])
+                Sighting(position, lab_from_body.inv(), led, lights.xy_px[row], magnitude[row])
             )
     return sightings
 
@@ -162,13 +161,12 @@ class Measurements:
 def measure(lab: Lab, sightings: Sequence[Sighting]) -> Measurements:
     """Measure the images as in the thesis."""
     body_m = np.array([light_positions_m(lab, sighting.xy_px) for sighting in sightings])
-    lab_m = np.array(
-        [one.body_from_lab.inv().apply(led_m) for one, led_m in zip(sightings, body_m, strict=True)]
-    )
-    position, magnitude = (
-        np.array([getattr(one, name) for one in sightings]) for name in ("stop", "brightness")
-    )
-    return Measurements(position, magnitude, body_m, lab_m)
+    lab_m = [
+        one.body_from_lab.inv().apply(led_m) for one, led_m in zip(sightings, body_m, strict=True)
+    ]
+    position = np.array([one.stop for one in sightings])
+    magnitude = np.array([one.brightness for one in sightings])
+    return Measurements(position, magnitude, body_m, np.array(lab_m))
 
 
 ID = "afit-table-6-9"
@@ -212,18 +210,20 @@ def tables_6_to_9(options: ExperimentOptions) -> ExperimentResult:
         lab = build_test3(fitted_overrides | overrides)
         rng = random_stream(options.seed, done)
         series[name] = ImageSeries(lab, photograph_positions(lab, n_images, rng))
-    ours, with_faults, nominal = (
-        series[name].measurements for name in ("ours", "camera faults", "nominal")
-    )
+    ours = series["ours"].measurements
+    with_faults = series["camera faults"].measurements
+    nominal = series["nominal"].measurements
     bumped = series["ours"].bumped(BUMPED_POSITION)
     drifted = series["ours"].bumped(*range(len(IMU_DEG)))
     results = magnitudes(ours, with_faults, series["stated levels"]) | separations(
         ours, with_faults, nominal
     )
     results |= epsilons(ours, with_faults, bumped, drifted) | buckets()
-    caption = f"Figs 74 and 75: magnitudes of 250 images, ours with {CAUSE}."
     drawings = (
-        FigureDrawing(caption, lambda fig: draw_magnitudes(fig, with_faults)),
+        FigureDrawing(
+            f"Figs 74 and 75: magnitudes of 250 images, ours with {CAUSE}.",
+            lambda fig: draw_magnitudes(fig, with_faults),
+        ),
         FigureDrawing(
             f"Fig. 76: angles of all pairs, ours with {CAUSE}.",
             lambda fig: draw_separations(fig, with_faults),
@@ -250,16 +250,13 @@ class ImageSeries(NamedTuple):
 
     def bumped(self, *positions: int) -> Measurements:
         """The same images, with the IMU errors of Tables 10-14 at these positions."""
-        imu_attitudes = {
-            n: lab_from_body((np.add(TRUE_ANGLES_DEG[n], IMU_DEG[n]) - ALGORITHM_DEG[n]).tolist())
-            for n in positions
-        }
-        sightings = [
-            replace(one, body_from_lab=imu_attitudes[one.stop].inv())
-            if one.stop in imu_attitudes
-            else one
-            for one in self.sightings
-        ]
+        sightings = []
+        for one in self.sightings:
+            if one.stop in positions:
+                imu_error_deg = np.subtract(IMU_DEG[one.stop], ALGORITHM_DEG[one.stop])
+                by_imu = lab_from_body(np.add(TRUE_ANGLES_DEG[one.stop], imu_error_deg))
+                one = replace(one, body_from_lab=by_imu.inv())
+            sightings.append(one)
         return measure(self.lab, sightings)
 
 
@@ -303,10 +300,7 @@ def expected_angles_arcsec(lab: Lab, position_m: Floats) -> Floats:
         for angles_deg in TRUE_ANGLES_DEG
     ]
     body_m = np.array([light_positions_m(lab, xy_px) for xy_px in pixels])
-    zeros = np.zeros((len(body_m), len(position_m)))
-    return Measurements(np.arange(len(body_m)), zeros, body_m, body_m).separation_arcsec.mean(
-        axis=0
-    )
+    return pair_angles_arcsec(body_m).mean(axis=0)
 
 
 # Statistics of the images, with intervals over the images.
@@ -340,7 +334,8 @@ def stratified_bootstrap(
 
 
 def with_camera_faults(
-    runs: tuple[Measurements, Measurements],
+    baseline: Measurements,
+    with_faults: Measurements,
     quantity: str,
     columns: Any,
     statistic: Statistic,
@@ -348,7 +343,8 @@ def with_camera_faults(
 ) -> RowResult:
     """A statistic of columns of a quantity, of our images and of those with likely faults of the camera."""
     ours, theirs = (
-        stratified_bootstrap(one, getattr(one, quantity)[:, columns], statistic) for one in runs
+        stratified_bootstrap(one, getattr(one, quantity)[:, columns], statistic)
+        for one in (baseline, with_faults)
     )
     return RowResult(ours, note, Cause(CAUSE, theirs))
 
@@ -382,51 +378,46 @@ def slope(values: Floats) -> Any:
 
 def magnitudes(
     ours: Measurements, with_faults: Measurements, stated_levels: ImageSeries
-) -> dict[str, RowResult]:
+) -> Results:
     """Table 7: means and standard deviations of the magnitudes."""
-    results = {}
+    results: Results = {}
     for n in range(len(ON_US)):
-        for key, statistic in (("magnitude", mean), ("magnitude_sd", largest_std)):
-            results[f"{key}_{n + 1}"] = with_camera_faults(
-                (ours, with_faults), "magnitude", [n], statistic
-            )
+        magnitude = with_camera_faults(ours, with_faults, "magnitude", [n], mean)
+        spread = with_camera_faults(ours, with_faults, "magnitude", [n], largest_std)
+        results |= {f"magnitude_{n + 1}": magnitude, f"magnitude_sd_{n + 1}": spread}
     # Only images with five LEDs are kept, so every one of `stated_levels` shows the LED of 1 us.
-    dimmest = exact(
-        stated_levels.measurements.magnitude[:, -1].mean() if stated_levels.sightings else 0.0
-    )
-    results["magnitude_5"] = RowResult(
-        dimmest, cause=Cause("75 us of light (fitted)", results["magnitude_5"].ours)
-    )
-    results["slope"] = RowResult(stratified_bootstrap(ours, ours.magnitude[:, LINEAR_LEDS], slope))
+    dimmest = 0.0
+    if stated_levels.sightings:
+        dimmest = stated_levels.measurements.magnitude[:, -1].mean()
+    longer = Cause("75 us of light (fitted)", magnitude.ours)
+    results["magnitude_5"] = RowResult(exact(dimmest), cause=longer)
+    results["slope"] = stratified_bootstrap(ours, ours.magnitude[:, LINEAR_LEDS], slope)
     means = ours.magnitude.mean(axis=0)
-    results["order"] = RowResult(exact(1 + np.sum(np.diff(means) < 0)))
+    results["order"] = exact(1 + np.sum(np.diff(means) < 0))
     return results
 
 
-def separations(
-    ours: Measurements, with_faults: Measurements, nominal: Measurements
-) -> dict[str, RowResult]:
+def separations(ours: Measurements, with_faults: Measurements, nominal: Measurements) -> Results:
     """Table 8: separations of the pairs in ascending order."""
     order = np.argsort(ours.separation_arcsec.mean(axis=0))
     angle = ours.separation_arcsec[:, order]
-    results = {}
+    results: Results = {}
     for n, pair in enumerate(order.tolist(), 1):
-        results[f"separation_{n}"] = RowResult(stratified_bootstrap(ours, angle[:, [n - 1]], mean))
-        spread = with_camera_faults((ours, with_faults), "separation_arcsec", [pair], largest_std)
-        results[f"separation_sd_{n}"] = spread
+        results[f"separation_{n}"] = stratified_bootstrap(ours, angle[:, [n - 1]], mean)
+        results[f"separation_sd_{n}"] = with_camera_faults(
+            ours, with_faults, "separation_arcsec", [pair], largest_std
+        )
     nominal_angle = np.sort(nominal.separation_arcsec, axis=1)
     for n, (first, last) in enumerate(TABLE_8_GROUPS, 1):
-        results[f"class_{n}"] = RowResult(
-            stratified_bootstrap(nominal, nominal_angle[:, first:last], mean)
-        )
+        results[f"class_{n}"] = stratified_bootstrap(nominal, nominal_angle[:, first:last], mean)
     is_distinct = np.diff(angle.mean(axis=0)) > MIN_DIFFERENCE_ARCSEC
-    results["classes"] = RowResult(exact(1 + np.sum(is_distinct)))
+    results["classes"] = exact(1 + np.sum(is_distinct))
     return results
 
 
 def epsilons(
     ours: Measurements, with_faults: Measurements, bumped: Measurements, drifted: Measurements
-) -> dict[str, RowResult]:
+) -> Results:
     """Table 9 and Figs 77-79: the largest pooled standard deviations; positions in millimeters."""
     position = {
         name: stratified_bootstrap(
@@ -438,42 +429,41 @@ def epsilons(
     separation_note = f"{at_one_position}; the rest is the error of eq. 44 between positions"
     column_mm = np.sort(bumped.lab_m[bumped.position == BUMPED_POSITION, :, 0].mean(axis=0) * 1e3)
     return {
-        "epsilon_mag": with_camera_faults(
-            (ours, with_faults), "magnitude", slice(None), largest_std
-        ),
+        "epsilon_mag": with_camera_faults(ours, with_faults, "magnitude", slice(None), largest_std),
         "epsilon_pos": RowResult(
             position["ours"],
             f"with all differences of Tables 10-14 attributed to the IMU: {position['drifted'].value:.2f}",
             Cause("position 5 bumped", position["bumped"]),
         ),
         "epsilon_sep": with_camera_faults(
-            (ours, with_faults), "separation_arcsec", slice(None), largest_std, separation_note
+            ours, with_faults, "separation_arcsec", slice(None), largest_std, separation_note
         ),
-        "columns": RowResult(extremum(column_mm, lambda x: (x[-1] - x[0]) / 2)),
-        "height": RowResult(extremum(ours.lab_m[:, :, 2].ravel() * 1e3, np.ptp)),
+        "columns": extremum(column_mm, lambda x: (x[-1] - x[0]) / 2),
+        "height": extremum(ours.lab_m[:, :, 2].ravel() * 1e3, np.ptp),
     }
 
 
-def buckets() -> dict[str, RowResult]:
+def buckets() -> Results:
     """Section 2.4.6: length of the example's bucket table, percentage searched outside the gate, and eq. 12."""
-    low, high = np.radians([1.5, 8.0])
+    low = np.radians(1.5)
+    high = np.radians(8.0)
     width = 5 * ARCSEC_RAD
     gate = 20 * ARCSEC_RAD
     stars = unit(random_stream(0).standard_normal((500, 3)))
     entries = len(build_pair_catalog(stars, np.zeros(len(stars)), width, (low, high)).table) - 1
     # Average over the phase of a pair's angle within a bucket.
     angle = (low + high) / 2 + width * (np.arange(1000) + 0.5) / 1000
-    first, last = (bucket_of(angle + end, high, width, entries) for end in (-gate, gate))
+    first = bucket_of(angle - gate, high, width, entries)
+    last = bucket_of(angle + gate, high, width, entries)
     searched_rad = (last - first + 1).mean() * width
     # Eq. 12: a pair 1.7 buckets below the end, a gate of 0.6.
-    example_buckets = bucket_of(
-        high - np.array([1.7 + 0.6, 1.7 - 0.6]) * width, high, width, entries
-    )
+    example_rad = high - np.array([2.3, 1.1]) * width
+    example_low, example_high = bucket_of(example_rad, high, width, entries)
     return {
-        "buckets": RowResult(exact(entries)),
-        "extra": RowResult(exact(100 * (searched_rad / (2 * gate) - 1))),
-        "example_low": RowResult(exact(entries - example_buckets[0])),
-        "example_high": RowResult(exact(entries - example_buckets[1] - 1)),
+        "buckets": exact(entries),
+        "extra": exact(100 * (searched_rad / (2 * gate) - 1)),
+        "example_low": exact(entries - example_low),
+        "example_high": exact(entries - example_high - 1),
     }
 
 

@@ -51,6 +51,7 @@ from skysim.experiments.papers.compare import (
     ExperimentOptions,
     ExperimentResult,
     FigureDrawing,
+    Results,
     RowResult,
     percent,
     prediction_interval,
@@ -105,26 +106,20 @@ def bump(options: ExperimentOptions) -> ExperimentResult:
         options.watch(n, 3)
         runs.append(simulate_bumps(bump_deg_s, options.trials(10, 2), options.seed))
     with_fitted = runs[1]
-    # Absolute errors of the IMU's angles at the end, (runs, 3).
+    # Absolute errors of the IMU's angles at the end, (3, runs).
     without_deg, fitted_deg, assumed_deg = (
-        np.abs([run.imu_deg[-1] for run in imus]) for imus in runs
+        np.abs([run.imu_deg[-1] for run in imus]).T for imus in runs
     )
-    results = {
-        f"theta_{n + 1}": with_cause(
-            CAUSE, prediction_interval, without_deg[:, n], fitted_deg[:, n]
-        )
-        for n in range(3)
-    }
+    results: Results = {}
+    for n, pair in enumerate(zip(without_deg, fitted_deg, strict=True), 1):
+        results[f"theta_{n}"] = with_cause(CAUSE, prediction_interval, *pair)
     cause = f"the scene's bump of {ASSUMED_BUMP} deg/s"
-    results["order"] = with_cause(cause, prediction_interval, without_deg[:, 2], assumed_deg[:, 2])
+    results["order"] = with_cause(cause, prediction_interval, without_deg[2], assumed_deg[2])
     saturated_s = [[run.saturated_s for run in imus] for imus in runs[:2]]
     results["limited"] = with_cause(CAUSE, prediction_interval, *saturated_s)
-    results["tracker"] = RowResult(
-        prediction_interval([run.tracker_error_deg for run in with_fitted])
-    )
-    results["filter"] = RowResult(
-        prediction_interval([filter_errors_after(run).max() for run in with_fitted])
-    )
+    results["tracker"] = prediction_interval([run.tracker_error_deg for run in with_fitted])
+    after_deg = [run.filter_deg[run.t_s > NEXT_IMAGE_S].max() for run in with_fitted]
+    results["filter"] = prediction_interval(after_deg)
     caption = "The IMU loses 0.8 deg in the bump; the filter corrects it with the next image."
     return ExperimentResult(
         results, (FigureDrawing(caption, lambda fig: draw(fig, with_fitted[0])),)
@@ -135,11 +130,6 @@ def simulate_bumps(bump_deg_s: BumpRate | None, imus: int, seed: int) -> list[Bu
     """Simulate the same motion with `imus` IMUs of random hardware seeds."""
     seeds = random_stream(seed, 14).integers(2**31, size=imus)
     return [simulate_bump(bump_deg_s, int(imu_seed)) for imu_seed in seeds]
-
-
-def filter_errors_after(run: BumpRun) -> Floats:
-    """(K,) the filter's errors after the first image that follows the bump."""
-    return run.filter_deg[run.t_s > NEXT_IMAGE_S]
 
 
 def simulate_bump(bump_deg_s: BumpRate | None, seed: int) -> BumpRun:
@@ -173,23 +163,18 @@ def tracker_error_deg(shot: Shot) -> float:
     """The star tracker's error; infinite if the image was not solved."""
     assert shot.report is not None
     estimate = shot.report.attitude.cam_from_ref
-    return (
-        math.inf
-        if estimate is None
-        else float(np.degrees((estimate * shot.truth.cam_from_lab.inv()).magnitude()))
-    )
+    if estimate is None:
+        return math.inf
+    return float(np.degrees((estimate * shot.truth.cam_from_lab.inv()).magnitude()))
 
 
 def draw(fig: Any, run: BumpRun) -> None:
     axes = fig.subplots()
     rows = experiments()["afit-bump"].rows
     for axis in range(3):
-        axes.plot(
-            run.t_s,
-            np.abs(run.imu_deg[:, axis]),
-            color=INK[(0, 2, 5)[axis]],
-            label=f"IMU, theta_{axis + 1}",
-        )
+        error_deg = np.abs(run.imu_deg[:, axis])
+        color = INK[(0, 2, 5)[axis]]
+        axes.plot(run.t_s, error_deg, color=color, label=f"IMU, theta_{axis + 1}")
         published = rows[f"theta_{axis + 1}"].published
         label = f"published, theta_{axis + 1}"
         axes.plot(run.t_s[-1] + 0.15, published, "os^"[axis], color=INK[1], label=label)
@@ -208,6 +193,7 @@ STATISTICS: dict[str, Callable[..., Any]] = {
     "mean": np.mean,
     "sd": sample_std,
 }
+ANGLES = {"theta_1": [0], "theta_2": [1], "theta_3": [2], "averaged": [0, 1, 2]}  # columns
 CAUSE_CAMERA = "two LEDs under a rolling shutter"
 CAUSE_IMU = f"{CAUSE_CAMERA}, an LN-200 with {HOLD_MIN} min per position"
 CAUSE_BUMP = f"{CAUSE_IMU}, position 5 bumped"
@@ -274,12 +260,27 @@ def tables_10_to_15(options: ExperimentOptions) -> ExperimentResult:
     results["worst"] = with_draws(CAUSE_BUMP, worst[0], worst[1], causes.bumps)
     named, named_with_noise = (percent(proportion(*one.named)) for one in (clean, camera))
     results["named"] = RowResult(named, cause=Cause(CAUSE_CAMERA, named_with_noise))
-    yaw_change = [one[:, 3, 0] - one[:, 2, 0] for one in (clean.error_deg, causes.error_deg)]
-    with_earth = yaw_change[1].mean() + earth_deg[3, 0] - earth_deg[2, 0]
-    results["turns_back"] = with_draws(
-        CAUSE_IMU, yaw_change[0], yaw_change[1], causes.images, with_earth
+    change, change_with_causes = (
+        one[:, 3, 0] - one[:, 2, 0] for one in (clean.error_deg, causes.error_deg)
     )
-    return ExperimentResult(results, make_drawings(causes, drift_deg))
+    with_earth = change_with_causes.mean() + earth_deg[3, 0] - earth_deg[2, 0]
+    results["turns_back"] = with_draws(
+        CAUSE_IMU, change, change_with_causes, causes.images, with_earth
+    )
+    drawings = (
+        FigureDrawing(
+            "Tables 10-14: the algorithm minus the IMU, and 95 % of ours with camera noise, the IMU's drift and the"
+            " bump; diamonds: with the Earth rate in the IMU too.",
+            lambda fig: draw_differences(fig, causes),
+            (7.4, 3.5),
+        ),
+        FigureDrawing(
+            "Errors of an IMU that measures the Earth rate against the time at a position, and those of Table 15.",
+            lambda fig: draw_holds(fig, drift_deg),
+            (7.4, 3.3),
+        ),
+    )
+    return ExperimentResult(results, drawings)
 
 
 def with_draws(
@@ -310,14 +311,14 @@ def combine_causes(
     return AllCauses(error_deg, min(counts[:2]), min(counts), earth_deg)
 
 
-def tables_10_to_14(clean: Floats, causes: AllCauses) -> dict[str, RowResult]:
+def tables_10_to_14(clean: Floats, causes: AllCauses) -> Results:
     """Tables 10-14: the algorithm's angles minus the IMU's."""
-    results = {}
+    results: Results = {}
     for position, axis in np.ndindex(clean.shape[1:]):
         key = f"position_{position + 1}_theta_{axis + 1}"
         ours = clean[:, position, axis]
         if position == HOME:
-            results[key] = RowResult(prediction_interval(ours))
+            results[key] = prediction_interval(ours)
             continue
         error_deg = causes.error_deg[:, position, axis]
         with_earth = error_deg.mean() + causes.earth_deg[position, axis]
@@ -327,18 +328,15 @@ def tables_10_to_14(clean: Floats, causes: AllCauses) -> dict[str, RowResult]:
     return results
 
 
-def table_15(clean: Floats, causes: AllCauses) -> dict[str, RowResult]:
+def table_15(clean: Floats, causes: AllCauses) -> Results:
     """Minimum, maximum, mean and standard deviation (n - 1) of an angle's five differences, and the angles' average."""
-    results = {}
+    results: Results = {}
+    cases = (clean, causes.error_deg, causes.error_deg + causes.earth_deg)
     for name, statistic in STATISTICS.items():
-        ours, with_causes, with_earth = (
-            statistic(np.abs(one), axis=1)
-            for one in (clean, causes.error_deg, causes.error_deg + causes.earth_deg)
-        )
-        for column, key in enumerate(("theta_1", "theta_2", "theta_3", "averaged")):
+        ours, with_causes, with_earth = (statistic(np.abs(one), axis=1) for one in cases)
+        for key, columns in ANGLES.items():
             clean_deg, causes_deg, earth_deg = (
-                one.mean(axis=1) if column == 3 else one[:, column]
-                for one in (ours, with_causes, with_earth)
+                one[:, columns].mean(axis=1) for one in (ours, with_causes, with_earth)
             )
             results[f"{name}_{key}"] = with_draws(
                 CAUSE_BUMP, clean_deg, causes_deg, causes.bumps, earth_deg.mean()
@@ -428,12 +426,12 @@ def imu_drift(hold_min: float, units: int, rng: np.random.Generator, earth: bool
     )
     # Every second start is the end of a hold, and the first that of home.
     stops = np.searchsorted(t_s[1:], np.array(reference.start_s[::2]) - KNOT_S)
-    configs = [
-        config.model_copy(update={"hardware_seed": int(seed)})
-        for seed in rng.integers(2**31, size=units)
-    ]
-    measured = (imu.Imu.from_config(config, rng).measure(increments) for config in configs)
-    return np.array([integrated_angles(one, stops) - IMU_DEG for one in measured])
+    errors_deg = []
+    for seed in rng.integers(2**31, size=units).tolist():
+        unit_config = config.model_copy(update={"hardware_seed": seed})
+        measured = imu.Imu.from_config(unit_config, rng).measure(increments)
+        errors_deg.append(integrated_angles(measured, stops) - IMU_DEG)
+    return np.array(errors_deg)
 
 
 def integrated_angles(measured: imu.Increments, stops: Ints) -> Floats:
@@ -447,22 +445,6 @@ def integrated_angles(measured: imu.Increments, stops: Ints) -> Floats:
 
 
 # Figures.
-
-
-def make_drawings(causes: AllCauses, drift: dict[float, Floats]) -> tuple[FigureDrawing, ...]:
-    return (
-        FigureDrawing(
-            "Tables 10-14: the algorithm minus the IMU, and 95 % of ours with camera noise, the IMU's drift and the"
-            " bump; diamonds: with the Earth rate in the IMU too.",
-            lambda fig: draw_differences(fig, causes),
-            (7.4, 3.5),
-        ),
-        FigureDrawing(
-            "Errors of an IMU that measures the Earth rate against the time at a position, and those of Table 15.",
-            lambda fig: draw_holds(fig, drift),
-            (7.4, 3.3),
-        ),
-    )
 
 
 def plot_quantiles(axes: Any, x: Any, values: Floats, **style: Any) -> None:
@@ -490,10 +472,8 @@ def draw_holds(fig: Any, drift: dict[float, Floats]) -> None:
     """Mean absolute difference of roll and of pitch against the duration of a stay."""
     published = np.abs(np.subtract(ALGORITHM_DEG, IMU_DEG)).mean(axis=0)
     for axis, axes in enumerate(fig.subplots(1, 2, sharey=True)):
-        mean = np.array(
-            [np.abs(error_deg[:, :, axis]).mean(axis=1) for error_deg in drift.values()]
-        )
-        plot_quantiles(axes, list(drift), mean.T, fmt="s-", label="ours, 95 % of IMUs")
+        mean = [np.abs(error_deg[:, :, axis]).mean(axis=1) for error_deg in drift.values()]
+        plot_quantiles(axes, list(drift), np.transpose(mean), fmt="s-", label="ours, 95 % of IMUs")
         axes.axhline(published[axis], color=INK[1], label="published")
         axes.set(xlabel="minutes at a position", title=f"theta_{axis + 1}")
     fig.axes[0].set(ylabel="mean difference (deg)")

@@ -41,10 +41,8 @@ class MeasuredLights(NamedTuple):
     magnitude: Floats
 
 
-@cache
-def base_lab() -> Lab:
-    """Lab of Test 1, whose vehicle and detector all AFIT scenes share."""
-    return build_lab(load("afit_test1_ideal"))
+# Lab of Test 1, whose vehicle and detector all AFIT scenes share.
+base_lab = cache(lambda: build_lab(load("afit_test1_ideal")))
 
 
 def build_test_stand(scene: Scene) -> Lab:
