@@ -432,4 +432,4 @@ def timing_covariance(t_s: Floats, lab_from_body: Rotation, jitter_s: float) -> 
     """(N, 3, 3) s^2 w w^T of attitudes whose times have the error s, with the rate w of their differences."""
     turned = (lab_from_body[:-1].inv() * lab_from_body[1:]).as_rotvec() / np.diff(t_s)[:, None]
     rate = np.vstack([turned[:1], (turned[1:] + turned[:-1]) / 2, turned[-1:]])
-    return np.asarray(jitter_s**2 * rate[:, :, None] * rate[:, None, :])
+    return jitter_s**2 * rate[:, :, None] * rate[:, None, :]

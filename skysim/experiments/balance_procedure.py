@@ -7,6 +7,7 @@ gravity torque that remains is at most g |m r|; it is below the bar if the estim
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -134,7 +135,7 @@ class Iteration:
     def torque_bound_nm(self) -> float:
         """The same with CONFIDENCE standard deviations in the worst direction."""
         worst = float(np.linalg.eigvalsh(self.estimate.covariance[MOMENT, MOMENT])[2])
-        return self.torque_nm + CONFIDENCE * self.gravity_m_s2 * float(np.sqrt(worst))
+        return self.torque_nm + CONFIDENCE * self.gravity_m_s2 * math.sqrt(worst)
 
     @property
     def true_torque_nm(self) -> float:
@@ -240,4 +241,4 @@ def balanced_position_m(vehicle: VehicleModel, moment_kg_m: Floats, scene: Scene
             f"vehicle.trim.travel {1e3 * config.travel_m:g} mm: first move ballast along its axis, by"
             f" {1e6 * excess_kg_m:.3g} g mm",
         )
-    return np.asarray(position_m)
+    return position_m

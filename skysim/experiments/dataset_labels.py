@@ -231,7 +231,7 @@ def across_sigma_px(area_px: Floats, streak_px: Floats) -> Floats:
     (4 pi s^2)^2 + (2 sqrt(pi) s L)^2 = area^2 has both limits, and an error of 6 % at most between them.
     """
     square = streak_px**2
-    return np.asarray(np.sqrt((np.sqrt(square**2 + 4 * area_px**2) - square) / (8 * math.pi)))
+    return np.sqrt((np.sqrt(square**2 + 4 * area_px**2) - square) / (8 * math.pi))
 
 
 def run_lengths(mask: NDArray[Any], least: float = True) -> list[int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,8 +68,8 @@ def row(
             nees = metrics.normalized_error_squared(attitude.cam_from_ref, cam_from_lab, covariance)
         wrong = metrics.is_wrong(np.hypot(cross, roll), nees)
         variance = np.diag(covariance)
-        cross_sigma = float(np.sqrt(variance[:2].sum()))
-        roll_sigma = float(np.sqrt(variance[2]))
+        cross_sigma = math.sqrt(variance[:2].sum())
+        roll_sigma = math.sqrt(variance[2])
         chance = attitude.match.log10_chance if attitude.match else chance
     rate_error, rate_sigma = rate_errors_deg_s(attitude.rate, truth)
     return FrameRow(

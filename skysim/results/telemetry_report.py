@@ -19,7 +19,7 @@ EULER = ("roll", "pitch", "yaw")
 
 def euler_deg(lab_from_body: Rotation) -> Floats:
     """(K, 3) roll, pitch, yaw of the 3-2-1 sequence, degrees."""
-    return np.asarray(lab_from_body.as_euler("ZYX", degrees=True)[:, ::-1])
+    return lab_from_body.as_euler("ZYX", degrees=True)[:, ::-1]
 
 
 def attitude_error_deg(attitude: Rotation | None, truth: Rotation) -> Floats | None:

@@ -256,7 +256,7 @@ def column_offset(first: Floats, second: Floats, usable: Mask, gain_e_dn: float)
     variance = gain_e_dn**2 * product.mean()
     sigma = gain_e_dn**2 * product.std() / np.sqrt(columns)
     if variance > 3 * sigma:
-        return Estimate.lognormal(float(np.sqrt(variance)), float(sigma / (2 * np.sqrt(variance))))
+        return Estimate.lognormal(math.sqrt(variance), float(sigma / (2 * np.sqrt(variance))))
     return Estimate.root(float(variance), float(sigma))
 
 

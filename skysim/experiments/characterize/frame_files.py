@@ -460,7 +460,7 @@ def block_medians(image: Floats) -> Floats:
     side = max(min(BLOCK, *(size // 3 for size in image.shape)), 1)
     rows, columns = (size // side for size in image.shape)
     blocks = image[: rows * side, : columns * side].reshape(rows, side, columns, side)
-    return np.asarray(np.median(blocks, axis=(1, 3)))
+    return np.median(blocks, axis=(1, 3))
 
 
 def extremes(medians: Floats) -> BrightSpots:

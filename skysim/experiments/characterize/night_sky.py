@@ -113,7 +113,7 @@ def model(p: Floats) -> tuple[Floats, Floats]:
     (gx, dx, wx), (gy, dy, wy) = integrals(p[:, X], p[:, LN_SX]), integrals(p[:, Y], p[:, LN_SY])
 
     def plane(by_y: Floats, by_x: Floats) -> Floats:
-        return np.asarray((by_y[:, :, None] * by_x[:, None, :]).reshape(len(p), -1))
+        return (by_y[:, :, None] * by_x[:, None, :]).reshape(len(p), -1)
 
     flux = p[:, FLUX, None]
     image = plane(gy, gx)
@@ -347,7 +347,7 @@ def measurable(
         & (peak < MAX_PEAK * saturation_dn)
         & (snr > LEAST_SNR)
     )
-    return np.asarray(xy[kept])
+    return xy[kept]
 
 
 def trail_px2(stars: StarImages) -> tuple[float, float]:

@@ -146,7 +146,7 @@ class Level:
         ) / 2
         return Moments(
             float(mean),
-            float(np.sqrt(variance.mean() / self.count / variance.size)),
+            math.sqrt(variance.mean() / self.count / variance.size),
             float(variance.mean()),
             float(variance.std() / np.sqrt(variance.size)),
         )
@@ -273,7 +273,7 @@ class Transfer(NamedTuple):
 
     @property
     def offset_dn(self) -> Estimate:
-        return Estimate.normal(self.values[BLACK], float(np.sqrt(self.covariance[BLACK, BLACK])))
+        return Estimate.normal(self.values[BLACK], math.sqrt(self.covariance[BLACK, BLACK]))
 
     @property
     def light_e_s(self) -> Estimate:
@@ -290,7 +290,7 @@ class Transfer(NamedTuple):
 def linear_dn(signal_dn: Floats, curvature: float) -> Floats:
     """The lower root x of s = x - c x^2, in a form that is exact for c = 0; the top of the parabola beyond it."""
     root = np.sqrt(np.maximum(1 - 4 * curvature * signal_dn, 0.0))
-    return np.asarray(2 * signal_dn / (1 + root))
+    return 2 * signal_dn / (1 + root)
 
 
 def model(points: Sequence[TransferPoint], values: Floats) -> tuple[Floats, Floats]:
@@ -382,6 +382,6 @@ def lamp_flicker(
     signal = np.array([one.moments.mean_dn for one in points]) - black_dn
     noise = 2 * np.array([one.moments.variance_dn2 for one in points]) / pixels
     excess = (np.array(difference_dn2) - noise) / (2 * signal**2)
-    chance = math.sqrt(2 / len(points)) * float(np.sqrt(np.mean((noise / (2 * signal**2)) ** 2)))
+    chance = math.sqrt(2 / len(points)) * math.sqrt(np.mean((noise / (2 * signal**2)) ** 2))
     mean = float(np.mean(excess))
     return math.sqrt(mean) if mean > SIGNIFICANT * chance else 0.0

@@ -135,9 +135,8 @@ def steady_pixels(one: Level, variance_dn2: float | Floats) -> Mask:
 
     Each half is the mean of count / 2 frames, so that their difference has four times the variance over count.
     """
-    return np.asarray(
-        np.abs(one.first_dn - one.second_dn)
-        <= HIT_SIGMAS * np.sqrt(4 * np.maximum(variance_dn2, 0.2) / one.count)
+    return np.abs(one.first_dn - one.second_dn) <= HIT_SIGMAS * np.sqrt(
+        4 * np.maximum(variance_dn2, 0.2) / one.count
     )
 
 

@@ -136,7 +136,7 @@ def axes_rad(sheet: MeasuredFrames, rate_deg_s: float) -> Floats:
     axes = np.array(
         [trials.attitude_and_axis(setup, trials.streams(setup, seed)[0])[1] for seed in seeds]
     )
-    return np.asarray(np.arctan2(axes[:, 1], axes[:, 0]))
+    return np.arctan2(axes[:, 1], axes[:, 0])
 
 
 def lagged(sheet: MeasuredFrames, mean: list[float]) -> tuple[Floats, Floats, Floats]:
@@ -275,7 +275,7 @@ def turning(model: ErrorModel, rate_deg_s: float) -> Floats:
     """(DRAWN, 3) errors at a rate, each in another field and about another axis."""
     rng = random_stream(1)
     axis_rad = rng.uniform(0, 2 * np.pi, DRAWN)
-    return np.asarray(model.draw(np.full(DRAWN, rate_deg_s), APART_STEP_S, rng, axis_rad=axis_rad))
+    return model.draw(np.full(DRAWN, rate_deg_s), APART_STEP_S, rng, axis_rad=axis_rad)
 
 
 def at_rest(model: ErrorModel) -> Floats:

@@ -135,7 +135,7 @@ def consistency(sheet: MeasuredFrames) -> dict[str, Any]:
 
 def noise_equivalent_angle(first: Floats, second: Floats) -> float:
     """Standard deviation of the temporal noise, rms(a - b) / sqrt(2), from pairs of frames that differ in noise."""
-    return float(np.sqrt(mean_known((first - second) ** 2) / 2))
+    return math.sqrt(mean_known((first - second) ** 2) / 2)
 
 
 def pair_row(sheet: MeasuredFrames, rows: list[int]) -> dict[str, Any]:

@@ -290,7 +290,7 @@ def mean_errors(sheet: MeasuredFrames) -> list[Bounded]:
 
 def squares_by_field(sheet: MeasuredFrames, rows: list[int], axes: slice) -> Floats:
     """(fields,) mean squares of one axis, NaN in fields without an attitude."""
-    return np.asarray(mean_known(sheet.errors(rows)[axes] ** 2, (0, 1)))
+    return mean_known(sheet.errors(rows)[axes] ** 2, (0, 1))
 
 
 def causes(sheet: MeasuredFrames) -> list[dict[str, Any]]:
@@ -311,4 +311,4 @@ def causes(sheet: MeasuredFrames) -> list[dict[str, Any]]:
 
 def rms(sheet: MeasuredFrames, rows: list[int], axes: slice) -> float:
     """Root mean square of the errors about one axis, arcseconds, over all frames with a right attitude."""
-    return float(np.sqrt(mean_known(sheet.errors(rows)[axes] ** 2)))
+    return math.sqrt(mean_known(sheet.errors(rows)[axes] ** 2))

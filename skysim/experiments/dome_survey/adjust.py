@@ -368,7 +368,7 @@ def dome_map(survey: DomeSurvey, uncertainty: SurveyUncertainty) -> DomeMap:
         position_m=survey.leds.position_m[surveyed],
         sigma_m=led_sigma_m(survey, uncertainty)[surveyed],
         camera_body_m=survey.lever.camera_body_m,
-        lever_sigma_m=float(np.sqrt(np.trace(survey.lever_covariance_m2) / 3)),
+        lever_sigma_m=math.sqrt(np.trace(survey.lever_covariance_m2) / 3),
         size_px=(survey.camera.width_px, survey.camera.height_px),
         focal_px=survey.camera.focal_px,
         focal_sigma_px=focal_sigma_px,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -96,7 +97,7 @@ class SurveyRun:
         """Standard deviation of a centroid's coordinates, as the residuals have it; of the mean information."""
         pairs = zip(self.frames, self.inliers, strict=True)
         sigma_px = np.concatenate([frame.lights.sigma_px[match.light] for frame, match in pairs])
-        return self.survey.noise_scale / float(np.sqrt(np.mean(sigma_px**-2.0)))
+        return self.survey.noise_scale / math.sqrt(np.mean(sigma_px**-2.0))
 
     @property
     def accuracy(self) -> SurveyAccuracy:
@@ -114,7 +115,7 @@ class SurveyRun:
         """The uncertainty of the IMU and of LEDs that are not measured, and that of the lever and the lens found."""
         accuracy = self.accuracy
         before = self.uncertainty
-        lever_m = float(np.sqrt(np.mean(accuracy.lever_sigma_m**2)))
+        lever_m = math.sqrt(np.mean(accuracy.lever_sigma_m**2))
         focal = float(accuracy.lens_sigma[0] / self.survey.camera.focal_px)
         return replace(before, lever_sigma_m=lever_m, focal_error=focal)
 
@@ -399,7 +400,7 @@ def accuracy_statistics(accuracy: SurveyAccuracy | None) -> dict[str, float | in
     return {
         "measured": int(accuracy.measured.sum()),
         "led_mm": 1e3 * accuracy.led_rms_m,
-        "lever_mm": 1e3 * float(np.sqrt(np.mean(accuracy.lever_sigma_m**2))),
+        "lever_mm": 1e3 * math.sqrt(np.mean(accuracy.lever_sigma_m**2)),
         "focal_px": float(accuracy.lens_sigma[0]),
     }
 
@@ -420,4 +421,4 @@ def stop_rows(lab_from_body: Rotation, shown: Mask) -> list[dict[str, float | in
 def rows_of(numbers: Sequence[int], ids: Ints) -> Ints:
     """Rows of LEDs by their numbers."""
     order = np.argsort(ids)
-    return np.asarray(order[np.searchsorted(ids[order], np.array(numbers, dtype=np.int64))])
+    return order[np.searchsorted(ids[order], np.array(numbers, dtype=np.int64))]

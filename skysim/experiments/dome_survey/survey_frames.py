@@ -99,7 +99,7 @@ def planned_stops(
 
 def angles_deg(lab_from_body: Rotation) -> Floats:
     """(F, 3) roll, pitch and yaw, as a scene's `motion` has them: lab_from_body = Rz(yaw) Ry(pitch) Rx(roll)."""
-    return np.asarray(lab_from_body.as_euler("ZYX", degrees=True)[:, ::-1])
+    return lab_from_body.as_euler("ZYX", degrees=True)[:, ::-1]
 
 
 def from_angles(roll_pitch_yaw_deg: Floats) -> Rotation:

@@ -91,7 +91,7 @@ class CalibrationPrior:
         """(F, N) relative light that each LED gives in frames of these numbers, 0 if its code has it off."""
         if self.code is None or self.code.bit_time_s is not None:
             return np.tile(self.levels, (len(index), 1))
-        return np.asarray(self.levels * self.code.levels[:, index % self.code.bits].T)
+        return self.levels * self.code.levels[:, index % self.code.bits].T
 
     @property
     def nearest_m(self) -> float:

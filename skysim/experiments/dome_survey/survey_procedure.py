@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -242,7 +243,7 @@ def comparison(plan: HeldAttitudes, errors: list[SimulatedErrors]) -> list[dict[
 def compared(what: str, sigma: float | None, squares: Floats) -> dict[str, Any]:
     """One row: the root of the mean square has the relative error std(square) / (2 mean sqrt(n))."""
     mean = float(squares.mean())
-    simulated = float(np.sqrt(mean))
+    simulated = math.sqrt(mean)
     relative = float(squares.std() / (2 * mean * np.sqrt(len(squares))))
     ratio = simulated / sigma if sigma else None
     return {

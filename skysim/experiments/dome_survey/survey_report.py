@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -491,7 +492,7 @@ def draw_coverage(
 
 def draw_errors(axes: Any, title: str, place_m: Floats, error_m: Floats) -> None:
     """Arrows of LED errors; the scale is in the key, and color is the vertical error."""
-    rms_mm = 1e3 * float(np.sqrt(np.mean(error_m**2)))
+    rms_mm = 1e3 * math.sqrt(np.mean(error_m**2))
     scale_mm = 1e3 * float(np.quantile(np.linalg.norm(error_m, axis=1), 0.95)) or 1.0
     x_m, y_m, _ = place_m.T
     arrows = axes.quiver(

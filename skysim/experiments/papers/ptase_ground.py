@@ -116,7 +116,7 @@ class FrameSolutions(NamedTuple):
         """(M, 3) errors of the solved frames minus their mean: RA times cos(dec), declination, roll."""
         error_deg = (self.estimated_deg - self.true_deg) * [np.cos(np.radians(TABLE_2[0, 1])), 1, 1]
         error_deg = error_deg[np.isfinite(error_deg[:, 0])] * 3600
-        return np.asarray(error_deg - error_deg.mean(axis=0))
+        return error_deg - error_deg.mean(axis=0)
 
 
 def uncalibrated_overrides(direction_rad: float) -> dict[str, str]:

@@ -208,7 +208,7 @@ def time_results(curves: Curves) -> Results:
 
     def moved(means: Floats) -> Floats:
         first, last = (half.argmin(axis=-1) for half in np.split(means, 2, axis=-1))
-        return np.asarray(COS_ERRORS[last] / COS_ERRORS[first])
+        return COS_ERRORS[last] / COS_ERRORS[first]
 
     return {
         "least_low": RowResult(min(low), "smallest of the three centroid errors"),

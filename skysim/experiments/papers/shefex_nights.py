@@ -6,6 +6,7 @@ the paper's processing chain and through our default one. Varied: exposure time,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import cache, partial
 from typing import Any, NamedTuple
@@ -143,7 +144,7 @@ def smear_px(rate_deg_s: float) -> float:
     moving, at_rest = (
         variance_px2(star_image(shefex_lab(), EXPOSURE_S, rate))[0] for rate in (rate_deg_s, 0.0)
     )
-    return float(np.sqrt(12 * (moving - at_rest)))
+    return math.sqrt(12 * (moving - at_rest))
 
 
 def peak_loss(rate_deg_s: float, count: int, seed: int) -> RowResult:
@@ -211,7 +212,7 @@ def calibrated_focal_mm(options: ExperimentOptions) -> tuple[Summary, str]:
     calibrated = self_calibrate(frames, tracker, nominal_camera, 0.01, EXPOSURE_S)
     mm_per_px = 1e3 * lab.scene.camera.pixel_m
     value = calibrated.camera.focal_px * mm_per_px
-    half_width = 1.96 * mm_per_px * float(np.sqrt(calibrated.covariance[0, 0]))
+    half_width = 1.96 * mm_per_px * math.sqrt(calibrated.covariance[0, 0])
     note = f"from {len(frames)} frames, starting from {NOMINAL_FOCAL_MM:g} mm"
     return symmetric_interval(value, half_width, len(frames)), note
 

@@ -272,7 +272,7 @@ def relative_dispersion(means: Floats) -> Floats:
     mean = means[..., :2]
     square = means[..., 2:]
     dispersion_index = (square - mean**2) / mean
-    return np.asarray(dispersion_index[..., 1] / dispersion_index[..., 0])
+    return dispersion_index[..., 1] / dispersion_index[..., 0]
 
 
 def draw(star_catalog: StarCatalog, fig: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -203,10 +204,10 @@ def response_indices(plan: Plan, store: Store, response: str) -> list[Index]:
         for index in zip(estimate, low, high, strict=True)
     )
     # The variance of the cross-boresight error is the sum of the variances about its two axes.
-    sigma_arcsec = float(
-        np.sqrt(np.var(np.concatenate([a, b], axis=1), axis=1).mean() * len(AXES[response]))
+    sigma_arcsec = math.sqrt(
+        np.var(np.concatenate([a, b], axis=1), axis=1).mean() * len(AXES[response])
     )
-    rms_arcsec = [sigma_arcsec * float(np.sqrt(max(one.value, 0.0))) for one in first]
+    rms_arcsec = [sigma_arcsec * math.sqrt(max(one.value, 0.0)) for one in first]
     columns = zip(names, first, total, rms_arcsec, strict=True)
     return [Index(name, response, one, other, rms) for name, one, other, rms in columns]
 

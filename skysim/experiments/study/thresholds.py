@@ -135,9 +135,7 @@ def trials_needed(share: float, limit: float, above: bool) -> int:
 
 def isotonic(proportion: Floats, weight: Floats, rising: bool) -> Floats:
     """(L,) isotonic fit of proportions, by pooling adjacent violators."""
-    return np.asarray(
-        scipy.optimize.isotonic_regression(proportion, weights=weight, increasing=rising).x
-    )
+    return scipy.optimize.isotonic_regression(proportion, weights=weight, increasing=rising).x
 
 
 def log_likelihood(hits: Floats, trials: Floats, proportion: Floats) -> float:

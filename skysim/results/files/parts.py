@@ -225,9 +225,7 @@ class DomeDesign(NamedTuple):
         """(N,) lengths along the surface from places to the cap's rim, on the mean meridian."""
         meridian = mean_meridian(self.surface, math.radians(self.cap_deg))
         tilt_rad = np.arctan2(np.hypot(place_m[:, 0], place_m[:, 1]), place_m[:, 2])
-        return np.asarray(
-            meridian.arc_m[-1] - np.interp(tilt_rad, meridian.tilt_rad, meridian.arc_m)
-        )
+        return meridian.arc_m[-1] - np.interp(tilt_rad, meridian.tilt_rad, meridian.arc_m)
 
 
 def parts_list(scene: Scene, prices: Prices) -> PartsList:

@@ -224,10 +224,10 @@ def read_column(path: Path, name: str) -> Array:
         # Texts are read as numbers of distinct texts, since there are few of them.
         column = pyarrow.parquet.ParquetFile(path).read([name]).column(name)
         if not pyarrow.types.is_string(column.type):
-            return np.asarray(column.to_numpy())
+            return column.to_numpy()
         coded = column.combine_chunks().dictionary_encode()
         texts = np.array([*coded.dictionary.to_pylist(), None], dtype=object)
-        return np.asarray(texts[coded.indices.fill_null(len(texts) - 1).to_numpy()])
+        return texts[coded.indices.fill_null(len(texts) - 1).to_numpy()]
 
 
 @contextmanager

@@ -116,7 +116,7 @@ def continuous_quaternions(xyzw: Floats) -> Floats:
     dot = np.sum(xyzw[1:] * xyzw[:-1], axis=1)
     first = -1.0 if xyzw[0, 3] < 0 else 1.0
     sign = first * np.concatenate([[1.0], np.cumprod(np.where(dot < 0, -1.0, 1.0))])
-    return np.asarray(xyzw * sign[:, None] + 0.0)  # + 0.0 turns -0.0 into 0.0
+    return xyzw * sign[:, None] + 0.0  # + 0.0 turns -0.0 into 0.0
 
 
 def epoch(utc: datetime.datetime) -> str:

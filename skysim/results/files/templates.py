@@ -199,7 +199,7 @@ def at(surface: Surface, rays: Floats) -> Floats:
 
 def length_m(points_m: Floats) -> Floats:
     """(...) lengths of polylines (..., K, 3)."""
-    return np.asarray(np.linalg.norm(np.diff(points_m, axis=-2), axis=-1).sum(axis=-1))
+    return np.linalg.norm(np.diff(points_m, axis=-2), axis=-1).sum(axis=-1)
 
 
 def on_paper_m(surface: Surface, rays: Floats, meridian_rad: float) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -148,7 +149,7 @@ def relative_difference(a: float, b: float) -> float:
 def intersections_in(dome: Surface, tilt_rad: Any) -> Floats:
     """(N, 3) points where rays from the bearing, tilted by tilt_rad, meet a surface extended beyond its rim; inches."""
     rays = np.array([tilted_direction(tilt) for tilt in np.atleast_1d(tilt_rad)])
-    return np.asarray(replace(dome, rim=Rim(dome.rim.bearing_m)).meet(np.zeros(3), rays) / INCH_M)
+    return replace(dome, rim=Rim(dome.rim.bearing_m)).meet(np.zeros(3), rays) / INCH_M
 
 
 def rim_and_radii(dome: Surface) -> Results:
@@ -187,6 +188,6 @@ def best_sphere(dome: Surface) -> Results:
         "best_sphere": exact(sphere.radius_m),
         "best_center": exact(float(sphere.center_m[2])),
         "best_rms": RowResult(
-            exact(float(np.sqrt(np.mean(error_in**2)))), f"weighted by area {sphere.rms_m:.3f}"
+            exact(math.sqrt(np.mean(error_in**2))), f"weighted by area {sphere.rms_m:.3f}"
         ),
     }

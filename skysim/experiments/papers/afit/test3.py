@@ -102,7 +102,7 @@ def lab_from_body(angles_deg: Sequence[float] | Floats) -> Rotation:
 
 def angles_deg(lab_from_body: Rotation) -> Floats:
     """(..., 3) roll, pitch, yaw."""
-    return np.asarray(lab_from_body.as_euler("ZYX", degrees=True)[..., ::-1])
+    return lab_from_body.as_euler("ZYX", degrees=True)[..., ::-1]
 
 
 def photograph(

@@ -113,7 +113,7 @@ def pair_angles_arcsec(vectors: Floats) -> Floats:
     directions = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
     a, b = np.triu_indices(directions.shape[-2], 1)
     chord = np.linalg.norm(directions[..., a, :] - directions[..., b, :], axis=-1)
-    return np.asarray(2 * np.arcsin(chord / 2) / ARCSEC_RAD)
+    return 2 * np.arcsin(chord / 2) / ARCSEC_RAD
 
 
 def separations_arcsec(xy_px: Floats, lab: Lab, camera: Camera | None = None) -> Floats:

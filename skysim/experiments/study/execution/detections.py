@@ -174,4 +174,4 @@ def brightness(lab: Lab, rows: NDArray[np.int64], frame: int) -> Floats:
     pulses = zip(shown.period_s.tolist(), shown.start_s.tolist(), shown.on_s.tolist(), strict=True)
     lit_s = np.array([lit_moments_s(begin_s, end_s, *one)[0] for one in pulses])
     mean = steady.strength * np.minimum(steady.on_s / steady.period_s, 1.0)
-    return np.asarray(shown.strength * lit_s / window.exposure_s / mean)
+    return shown.strength * lit_s / window.exposure_s / mean

@@ -501,7 +501,7 @@ def rate_axis(axis: str | AxisConfig, azimuth_rad: float, mount: Mount) -> Float
         if axis.body is not None
         else np.array(axis.camera, dtype=float)
     )
-    return np.asarray(vector / np.linalg.norm(vector))
+    return vector / np.linalg.norm(vector)
 
 
 def constant_rate(scene: Scene, middle: Rotation, rate_body: Floats) -> Trajectory:

@@ -125,9 +125,7 @@ def trial_rate_rad_s(trial: Trial, lab: Lab) -> Floats | None:
         return np.zeros(3)
     # A random axis is taken between the camera's x and y: rows of a rolling shutter are both sheared and stretched.
     axis_cam = rate_axis(trial.rate_axis, math.pi / 4, lab.camera.mount)
-    return np.asarray(
-        lab.camera.mount.cam_from_body.inv().apply(math.radians(trial.rate_deg_s) * axis_cam)
-    )
+    return lab.camera.mount.cam_from_body.inv().apply(math.radians(trial.rate_deg_s) * axis_cam)
 
 
 def checked_points(plan: Plan) -> Iterator[tuple[str, Point]]:
