@@ -14,6 +14,7 @@ from skysim.core import files
 from skysim.core.types import Floats
 from skysim.experiments.balance_flight import Assumptions, BalanceFlight, largest_tilt_deg
 from skysim.experiments.balance_procedure import BalancePlan, Iteration, filtered
+from skysim.results.plots import bgr_image
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
     Block,
@@ -25,7 +26,9 @@ from skysim.results.report_blocks import (
     Table,
     Text,
     Verdict,
+    text_column,
 )
+from skysim.results.telemetry_report import EULER, euler_deg
 
 INERTIA_NAMES = ("Jxx", "Jyy", "Jzz", "Jxy", "Jxz", "Jyz")
 MOMENT_NAMES = ("x", "y", "z")
@@ -83,12 +86,10 @@ def estimate_rows(flight: BalanceFlight, estimate: MassEstimate) -> list[dict[st
     """One row per mass property, of the vehicle with its trim masses at zero: offsets in micrometers."""
     scale = np.repeat([1.0, 1e6 / flight.vehicle.mass.mass_kg], [6, 3])
     names = (*INERTIA_NAMES, *(f"offset {axis} um" for axis in MOMENT_NAMES))
-    columns = (scale * estimate.values[:9], scale * estimate.sigma[:9], scale * true_values(flight))
+    columns = scale * [estimate.values[:9], estimate.sigma[:9], true_values(flight)]
     return [
         {"what": name, "estimate": value, "sigma": sigma, "truth": truth}
-        for name, value, sigma, truth in zip(
-            names, *(column.tolist() for column in columns), strict=True
-        )
+        for name, (value, sigma, truth) in zip(names, columns.T.tolist(), strict=True)
     ]
 
 
@@ -101,11 +102,11 @@ def nees(flight: BalanceFlight, estimate: MassEstimate) -> float:
 
 def balance_figure(iterations: Sequence[Iteration], torque_bar_nm: float) -> NDArray[np.uint8]:
     """BGR image: gravity torque and offset of the center of mass flight by flight, and the last flight's attitude."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    return bgr_image(lambda fig: draw_flights(fig, iterations, torque_bar_nm), (15, 4.5))
 
-    fig = Figure(figsize=(15, 4.5), layout="constrained")
-    canvas = FigureCanvasAgg(fig)
+
+def draw_flights(fig: Any, iterations: Sequence[Iteration], torque_bar_nm: float) -> None:
+    """Draw the three panels of `balance_figure`."""
     torque, offset, motion = fig.subplots(1, 3)
     numbers = np.arange(1, len(iterations) + 1)
     torque.semilogy(numbers, [one.torque_nm for one in iterations], "o-", label="estimate")
@@ -128,14 +129,10 @@ def balance_figure(iterations: Sequence[Iteration], torque_bar_nm: float) -> NDA
         yscale="symlog",
     )
     record = iterations[-1].flight.record
-    angles_deg = record.lab_from_body.as_euler("ZYX", degrees=True)[:, ::-1]
-    for name, angle in zip(("roll", "pitch", "yaw"), angles_deg.T, strict=True):
-        motion.plot(record.t_s, angle, ".-", label=name)
+    motion.plot(record.t_s, euler_deg(record.lab_from_body), ".-", label=EULER)
     motion.set(xlabel="t [s]", ylabel="measured attitude [deg]", title=f"flight {len(iterations)}")
     for axes in (torque, offset, motion):
         axes.legend(fontsize="small")
-    canvas.draw()
-    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[:, :, 2::-1])
 
 
 def filter_rows(one: Iteration, assumptions: Assumptions) -> list[dict[str, Any]]:
@@ -220,7 +217,7 @@ def offset_text(flight: dict[str, Any]) -> str:
 def mass_blocks(rows: Sequence[dict[str, Any]]) -> list[Block]:
     """Estimates of the mass properties beside the simulated vehicle's."""
     heads = ("estimate", "1σ", "simulated vehicle")
-    columns = [Column("what", kind="text"), *(Column(head, format=".5g") for head in heads)]
+    columns = [text_column("what"), *(Column(head, format=".5g") for head in heads)]
     values = [[row[key] for key in ("what", "estimate", "sigma", "truth")] for row in rows]
     for row in values:
         row.append((row[1] - row[3]) / row[2])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import io as std_io
+import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -42,25 +42,31 @@ LOOK: Any = {
 def png(draw: Callable[[Any], None], size_in: tuple[float, float]) -> bytes:
     """PNG bytes of the figure that `draw` fills, in the shared style, without a software tag (reproducible bytes)."""
     import matplotlib
-    from matplotlib.figure import Figure as Canvas
+    from matplotlib.figure import Figure
 
     with matplotlib.rc_context(LOOK):
-        fig = Canvas(figsize=size_in, layout="constrained")
+        fig = Figure(figsize=size_in, layout="constrained")
         draw(fig)
         return figure_png(fig, dpi=DPI, metadata={"Software": None})
 
 
 def figure_png(fig: Any, **options: Any) -> bytes:
-    """PNG bytes of a figure.
-
-    Returns
-    -------
-    options
-        Of `savefig`
-    """
-    buffer = std_io.BytesIO()
+    """PNG bytes of a figure. options : of `savefig`"""
+    buffer = io.BytesIO()
     fig.savefig(buffer, format="png", **options)
     return buffer.getvalue()
+
+
+def bgr_image(draw: Callable[[Any], None], size_in: tuple[float, float]) -> NDArray[np.uint8]:
+    """(H, W, 3) BGR image of the figure that `draw` fills, in the default style of matplotlib."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=size_in, layout="constrained")
+    canvas = FigureCanvasAgg(fig)
+    draw(fig)
+    canvas.draw()
+    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[:, :, 2::-1])
 
 
 def stacked_axes(heights_in: Sequence[float]) -> tuple[Any, list[Any]]:
@@ -92,9 +98,6 @@ def stacked_axes(heights_in: Sequence[float]) -> tuple[Any, list[Any]]:
         axes.grid(alpha=0.3)
     stack[-1].set_xlabel("time [s]")
     return fig, stack
-
-
-# Draw markers and captions on frames: truth, detections and identified sources.
 
 
 # Convert frames to 8-bit images for display, and encode them as JPEG.
@@ -140,12 +143,11 @@ def to_8bit(
     """
     low, high = levels_dn or display_levels(image)
     top = low + max(high - low, 1.0)  # at least 1 DN, to avoid division by zero in a flat frame
-    if image.dtype != np.uint16:
-        return (255 * CURVES[curve](np.clip((image - low) / (top - low), 0, 1))).astype(np.uint8)
-    levels = np.arange(int(image.max()) + 1)
-    return (255 * CURVES[curve](np.clip((levels - low) / (top - low), 0, 1))).astype(np.uint8)[
-        image
-    ]
+    tabulated = image.dtype == np.uint16
+    levels = np.arange(int(image.max()) + 1) if tabulated else image
+    stretched = 255 * CURVES[curve](np.clip((levels - low) / (top - low), 0, 1))
+    gray = stretched.astype(np.uint8)
+    return gray[image] if tabulated else gray
 
 
 def frame_statistics(image: NDArray, saturation_dn: float) -> FrameStatistics:
@@ -190,8 +192,8 @@ def frame_levels(image: NDArray) -> tuple[float, float]:
 
     The higher of the two, so that a few bright sources do not leave a large part of the image white.
     """
-    low, high = np.percentile(image, (30, 99.95))
-    return float(low), max(float(high), float(low) + 1.0, float(image.max()) * 0.25)
+    low, high = np.percentile(image, (30, 99.95)).tolist()
+    return low, max(high, low + 1.0, float(image.max()) * 0.25)
 
 
 def enlarged(image: NDArray) -> tuple[NDArray[np.uint8], int, int]:

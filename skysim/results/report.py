@@ -53,7 +53,7 @@ def markdown_page(title: str, command: str, blocks: Sequence[Block], pictures: s
 
 
 def paragraphs(block: Block, level: int, names: Iterator[str]) -> Iterator[str]:
-    """A block's paragraphs.
+    """The paragraphs of a block.
 
     Parameters
     ----------
@@ -64,13 +64,13 @@ def paragraphs(block: Block, level: int, names: Iterator[str]) -> Iterator[str]:
     """
     match block:
         case Section(title=title, folded=folded):
-            opened = (
-                '<details markdown="1"><summary>{}</summary>' if folded else "#" * level + " {}"
-            )
-            yield opened.format(inline(title))
+            opened = '<details markdown="1"><summary>{}</summary>'
+            heading = opened if folded else "#" * level + " {}"
+            yield heading.format(inline(title))
             for one in block.blocks:
                 yield from paragraphs(one, level + 1, names)
-            yield from ["</details>"] if folded else []
+            if folded:
+                yield "</details>"
         case Figure(caption=caption):
             if name := next(names, ""):
                 yield f"![{inline(caption).replace('[', '(').replace(']', ')')}]({name})"
@@ -80,18 +80,15 @@ def paragraphs(block: Block, level: int, names: Iterator[str]) -> Iterator[str]:
         case Text(text=text):
             yield inline(text)
         case Items(lines=lines, title=title):
-            yield from [f"**{inline(title)}**"] if title else []
+            if title:
+                yield f"**{inline(title)}**"
             yield "\n".join(f"- {inline(line)}" for line in lines)
         case Facts(rows=rows):
-            yield table(
-                ["", ""],
-                [[cell(Cell(name)), "<br>".join(map(cell, lines))] for name, lines in rows],
-            )
+            facts = [[cell(name), "<br>".join(map(cell, lines))] for name, lines in rows]
+            yield table(["", ""], facts)
         case Table():
-            yield table(
-                [inline(one.head) for one in block.columns],
-                [list(map(cell, row)) for row in block.cells()],
-            )
+            heads = [inline(one.head) for one in block.columns]
+            yield table(heads, [list(map(cell, row)) for row in block.cells()])
         case Code(text=text, language=language):
             fence = max(["```", *(found + "`" for found in FENCE.findall(text))], key=len)
             yield f"{fence}{language}\n{text}\n{fence}"
@@ -193,49 +190,41 @@ def print_items(items: Items) -> None:
 def print_facts(facts: Facts) -> None:
     """Print facts, names at the left."""
     for name, lines in facts.rows:
-        texts = [one.text if isinstance(one, Cell) else one for one in lines]
-        wrapped = [
-            part
-            for text in texts
-            for part in textwrap.wrap(printable(text), FACT_WIDTH - FACT_COLUMN)
-        ]
-        for head, line in zip([name, *[""] * (len(wrapped) - 1)], wrapped, strict=True):
-            print(f"{head:{FACT_COLUMN}}{line}")
+        head = name
+        for one in lines:
+            text = printable(one.text if isinstance(one, Cell) else one)
+            for line in textwrap.wrap(text, FACT_WIDTH - FACT_COLUMN):
+                print(f"{head:{FACT_COLUMN}}{line}")
+                head = ""
 
 
 def print_table(table: Table, title: str = "") -> None:
     """Print a table's first MAX_ROWS rows; optional columns are left out if it is too wide. Asides follow below it."""
-    from rich.table import Table as Grid
+    from rich import table as rich_table
 
-    rows = table.cells()
-    shown = fitting_columns(table, rows[:MAX_ROWS])
-    grid = Grid(
-        box=None,
-        header_style="bold",
-        pad_edge=False,
-        title=styled(Cell(title), "") if title else None,
-    )
+    every = table.cells()
+    rows = every[:MAX_ROWS]
+    shown = fitting_columns(table, rows)
+    heading = styled(Cell(title), "") if title else None
+    grid = rich_table.Table(box=None, header_style="bold", pad_edge=False, title=heading)
     grid.title_justify = "left"
     for n in shown:
         column = table.columns[n]
         justify: Any = "right" if column.kind == "number" else "left"
         grid.add_column(styled(Cell(column.head), ""), justify=justify, no_wrap=True)
-    for row in rows[:MAX_ROWS]:
+    for row in rows:
         grid.add_row(*(styled(row[n], COLORS.get(row[n].tone, "")) for n in shown))
     console().print(grid)
-    for row in rows[:MAX_ROWS]:
+    for row in rows:
         for column, one in zip(table.columns, row, strict=True):
             if column.kind == "aside" and one.text:
                 name = "" if one.text.startswith(row[0].text) else f"{row[0].text}: "
                 print_wrapped(name + one.text, first="  ", others="    ")
-    if left_out := [
-        column.head
-        for n, column in enumerate(table.columns)
-        if n not in shown and column.kind != "aside"
-    ]:
+    hidden = (column for n, column in enumerate(table.columns) if n not in shown)
+    if left_out := [column.head for column in hidden if column.kind != "aside"]:
         print_wrapped(f"in the report, or in a wider terminal: {', '.join(left_out)}")
-    if len(rows) > MAX_ROWS:
-        print(f"and {len(rows) - MAX_ROWS} more rows in the report")
+    if len(every) > MAX_ROWS:
+        print(f"and {len(every) - MAX_ROWS} more rows in the report")
 
 
 def fitting_columns(table: Table, rows: Sequence[Sequence[Cell]]) -> list[int]:
@@ -254,9 +243,9 @@ def fitting_columns(table: Table, rows: Sequence[Sequence[Cell]]) -> list[int]:
 
 def styled(cell: Cell, style: str) -> Any:
     """A cell's text literally: rich's markup in it has no effect."""
-    from rich.text import Text as RichText
+    from rich import text
 
-    return RichText(printable(cell.text), style)
+    return text.Text(printable(cell.text), style)
 
 
 def print_wrapped(text: str, first: str = "", others: str = "  ", width: int | None = None) -> None:
@@ -268,15 +257,8 @@ def print_wrapped(text: str, first: str = "", others: str = "  ", width: int | N
         What the first line and the others begin with
     """
     width = width or max(terminal_width(), NARROW)
-    print(
-        textwrap.fill(
-            printable(text),
-            width,
-            initial_indent=first,
-            subsequent_indent=others,
-            break_on_hyphens=False,
-        )
-    )
+    lines = textwrap.TextWrapper(width, first, others, break_on_hyphens=False)
+    print(lines.fill(printable(text)))
 
 
 def console() -> Any:
@@ -341,13 +323,7 @@ class Report:
         return html_page(self.title, self.command, self.version, self.blocks)
 
     def markdown(self, pictures: str = "") -> str:
-        """A Markdown page.
-
-        Parameters
-        ----------
-        pictures
-            What the paths of its figures begin with; without it they are left out
-        """
+        """A Markdown page; its figures are left out if no `pictures`, the beginning of their paths, is given."""
         return markdown_page(self.title, self.command, self.blocks, pictures)
 
     def json(self) -> dict[str, Any]:

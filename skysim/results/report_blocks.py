@@ -66,6 +66,11 @@ class Column(NamedTuple):
         )
 
 
+def text_column(title: str) -> Column:
+    """Head of a column of texts."""
+    return Column(title, kind="text")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Block:
     """A part of a report.
@@ -73,7 +78,7 @@ class Block:
     Attributes
     ----------
     on_terminal
-        Whether it is printed too, and not on the page alone
+        Whether it is printed on a terminal too, and not on the page alone
     """
 
     on_terminal: bool = True
@@ -140,9 +145,9 @@ class Figure(Block):
     Attributes
     ----------
     kind
-        Png, jpeg or gif
+        Format of the image: png, jpeg or gif
     name
-        Of its file, without suffix; numbered if left out
+        Name of its file without suffix; by default its number in the report
     """
 
     image: bytes

@@ -25,6 +25,7 @@ from skysim.results.report_blocks import (
     Text,
     Tone,
     Verdict,
+    text_column,
 )
 
 MOTION = {  # sentences of the motion's statistics, by the statistic that a scene must have
@@ -166,7 +167,7 @@ def frame_table(angles: tuple[str, str, str], rows: Sequence[FrameRow]) -> Table
         Column("detected"),
         Column("used"),
     ]
-    columns += [Column("time", "ms", ".1f"), Column("status", kind="text")]
+    columns += [Column("time", "ms", ".1f"), text_column("status")]
     lines = []
     for row in rows:
         motion = [row.frame, row.t_s, 1e3 * row.exposure_s, row.rate_deg_s, *row.truth_deg]

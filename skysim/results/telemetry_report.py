@@ -18,8 +18,8 @@ EULER = ("roll", "pitch", "yaw")
 
 
 def euler_deg(lab_from_body: Rotation) -> Floats:
-    """(K, 3) roll, pitch, yaw of the 3-2-1 sequence, degrees."""
-    return lab_from_body.as_euler("ZYX", degrees=True)[:, ::-1]
+    """(..., 3) roll, pitch, yaw in degrees: lab_from_body = Rz(yaw) Ry(pitch) Rx(roll)."""
+    return lab_from_body.as_euler("ZYX", degrees=True)[..., ::-1]
 
 
 def attitude_error_deg(attitude: Rotation | None, truth: Rotation) -> Floats | None:
@@ -38,35 +38,31 @@ def summary(log: Telemetry) -> dict[str, float]:
     Only the entries that the telemetry supports are present: pointing error with a reference attitude, wheel speed
     with wheels, and so on.
     """
-    pointing, imu, by_filter = (
-        attitude_error_deg(attitude, log.lab_from_body)
-        for attitude in (log.lab_from_ref, log.lab_from_imu, log.lab_from_filter)
-    )
-    statistics: dict[str, float] = {}
+    pointing = attitude_error_deg(log.lab_from_ref, log.lab_from_body)
+    imu = attitude_error_deg(log.lab_from_imu, log.lab_from_body)
+    by_filter = attitude_error_deg(log.lab_from_filter, log.lab_from_body)
+    statistics: dict[str, Any] = {}
     if pointing is not None:
         statistics |= {"pointing_deg_worst": pointing.max(), "pointing_deg_end": pointing[-1]}
         statistics["torque_nm_worst"] = np.abs(log.torque_nm).max()
-    # A prescribed motion leaves wheels and gimbals as they were.
-    controlled = log.lab_from_ref is not None
-    if controlled and (log.wheel_rad_s.size or log.gimbal_rad.size):
-        statistics["momentum_nms_worst"] = np.linalg.norm(log.momentum_nms, axis=1).max()
-    if controlled and log.wheel_rad_s.size:
-        statistics["wheel_rpm_worst"] = np.abs(log.wheel_rad_s).max() / RPM_RAD_S
-    if controlled and log.manipulability is not None:
-        statistics["manipulability_least"] = log.manipulability.min()
+        # A prescribed motion, without a reference, leaves wheels and gimbals as they were.
+        if log.wheel_rad_s.size or log.gimbal_rad.size:
+            statistics["momentum_nms_worst"] = np.linalg.norm(log.momentum_nms, axis=1).max()
+        if log.wheel_rad_s.size:
+            statistics["wheel_rpm_worst"] = np.abs(log.wheel_rad_s).max() / RPM_RAD_S
+        if log.manipulability is not None:
+            statistics["manipulability_least"] = log.manipulability.min()
     if imu is not None and log.saturated is not None:
         statistics |= {"imu_deg_worst": imu.max(), "imu_deg_end": imu[-1]}
         statistics["gyro_saturated_s"] = log.saturated.sum() * log.period_s
     if by_filter is not None and log.assumed_bias_rad_s is not None and log.bias_rad_s is not None:
         bias_error = per_hour(log.assumed_bias_rad_s - log.bias_rad_s)[-1]
-        statistics |= {
-            "filter_deg_worst": by_filter.max(),
-            "filter_arcsec_end": by_filter[-1] / ARCSEC_DEG,
-        }
-        statistics["filter_bias_deg_h_end"] = float(np.linalg.norm(bias_error))
+        statistics["filter_deg_worst"] = by_filter.max()
+        statistics["filter_arcsec_end"] = by_filter[-1] / ARCSEC_DEG
+        statistics["filter_bias_deg_h_end"] = np.linalg.norm(bias_error)
     for name, mounting in log.mountings.items():
         error_rad = mounting.estimate_rad[-1] - mounting.true_rad[-1]
-        statistics[f"mounting_{name}_arcsec_end"] = float(np.linalg.norm(error_rad)) / ARCSEC_RAD
+        statistics[f"mounting_{name}_arcsec_end"] = np.linalg.norm(error_rad) / ARCSEC_RAD
     return {name: float(value) for name, value in statistics.items()}
 
 
@@ -77,9 +73,8 @@ def table(log: Telemetry) -> Any:
     columns: dict[str, Any] = {"t_s": log.t_s}
 
     def add(name: str, values: Floats, components: tuple[str, ...], unit: str) -> None:
-        columns.update(
-            {f"{name}_{component}_{unit}": values[:, n] for n, component in enumerate(components)}
-        )
+        for component, column in zip(components, values.T, strict=True):
+            columns[f"{name}_{component}_{unit}"] = column
 
     for name, attitude in (
         ("true", log.lab_from_body),
@@ -95,11 +90,11 @@ def table(log: Telemetry) -> Any:
     add("torque", log.torque_nm, AXES, "nm")
     add("disturbance", log.disturbance_nm, AXES, "nm")
     add("momentum", log.momentum_nms, AXES, "nms")
-    numbers = tuple(
-        str(n + 1) for n in range(max(log.wheel_rad_s.shape[1], log.gimbal_rad.shape[1]))
-    )
-    add("wheel", log.wheel_rad_s / RPM_RAD_S, numbers[: log.wheel_rad_s.shape[1]], "rpm")
-    add("gimbal", np.degrees(log.gimbal_rad), numbers[: log.gimbal_rad.shape[1]], "deg")
+    for name, values, unit in (
+        ("wheel", log.wheel_rad_s / RPM_RAD_S, "rpm"),
+        ("gimbal", np.degrees(log.gimbal_rad), "deg"),
+    ):
+        add(name, values, tuple(map(str, range(1, values.shape[1] + 1))), unit)
     if log.manipulability is not None:
         columns["manipulability"] = log.manipulability
     if log.saturated is not None:
@@ -131,20 +126,17 @@ def imu_table(record: Increments) -> Any:
     columns: dict[str, Any] = {"t_s": record.t_s}
     columns |= {f"angle_{end}_rad": record.angle_rad[:, n] for n, end in enumerate(AXES)}
     columns |= {f"velocity_{end}_m_s": record.velocity_m_s[:, n] for n, end in enumerate(AXES)}
-    level = np.degrees([tilt_rad(velocity[None]) for velocity in record.velocity_m_s])
-    columns |= {"level_roll_deg": level[:, 0], "level_pitch_deg": level[:, 1]}
+    level_deg = np.degrees([tilt_rad(velocity[None]) for velocity in record.velocity_m_s])
+    columns["level_roll_deg"], columns["level_pitch_deg"] = level_deg.T
     columns |= {"gyro_saturated": record.saturated, "accelerometer_overloaded": record.overloaded}
     return Table(columns)
 
 
 def attitude_panel(log: Telemetry, axes: Any) -> None:
-    true_deg = euler_deg(log.lab_from_body)
-    for n, name in enumerate(EULER):
-        axes.plot(log.t_s, true_deg[:, n], color=f"C{n}", label=name)
-        if log.lab_from_ref is not None:
-            axes.plot(
-                log.t_s, euler_deg(log.lab_from_ref)[:, n], "--", color=f"C{n}", alpha=0.6, lw=1
-            )
+    axes.plot(log.t_s, euler_deg(log.lab_from_body), label=EULER)
+    if log.lab_from_ref is not None:
+        axes.set_prop_cycle(None)  # the same three colors again
+        axes.plot(log.t_s, euler_deg(log.lab_from_ref), "--", alpha=0.6, lw=1)
     axes.set_ylabel("attitude [deg]\n(dashed: commanded)")
 
 
@@ -169,57 +161,73 @@ def attitude_error_panel(log: Telemetry, axes: Any) -> None:
     axes.set_ylabel("error [deg]")
 
 
+def draw_estimate(
+    axes: Any,
+    t_s: Floats,
+    true: Floats,
+    estimate: Floats,
+    sigma: Floats,
+    prefix: str = "",
+    color: int = 0,
+) -> None:
+    """Draw the three components of an estimate with bands of 3 sigma, and the true ones dashed.
+
+    Parameters
+    ----------
+    true, estimate, sigma
+        (K, 3)
+    prefix
+        Text before the axis in the legend
+    color
+        Number of the first component's color
+    """
+    for n, axis in enumerate(AXES):
+        style = {"color": f"C{color + n}"}
+        axes.plot(t_s, true[:, n], "--", lw=1, **style)
+        axes.plot(t_s, estimate[:, n], label=prefix + axis, **style)
+        low = estimate[:, n] - 3 * sigma[:, n]
+        high = estimate[:, n] + 3 * sigma[:, n]
+        axes.fill_between(t_s, low, high, alpha=0.12, lw=0, **style)
+
+
 def bias_panel(log: Telemetry, axes: Any) -> None:
     assert log.bias_rad_s is not None
     assert log.assumed_bias_rad_s is not None
     assert log.sigma_bias_rad_s is not None
-    true, estimate, sigma = map(
-        per_hour, (log.bias_rad_s, log.assumed_bias_rad_s, log.sigma_bias_rad_s)
-    )
-    for n, name in enumerate(AXES):
-        axes.plot(log.t_s, true[:, n], "--", color=f"C{n}", lw=1)
-        axes.plot(log.t_s, estimate[:, n], color=f"C{n}", label=name)
-        band = estimate[:, n] - 3 * sigma[:, n], estimate[:, n] + 3 * sigma[:, n]
-        axes.fill_between(log.t_s, *band, color=f"C{n}", alpha=0.12, lw=0)
+    true = per_hour(log.bias_rad_s)
+    estimate = per_hour(log.assumed_bias_rad_s)
+    sigma = per_hour(log.sigma_bias_rad_s)
+    draw_estimate(axes, log.t_s, true, estimate, sigma)
     limit = max(np.abs(true).max(), np.abs(estimate).max()) + 3 * sigma[len(sigma) // 4 :].max()
     axes.set_ylim(-limit, limit)
     axes.set_ylabel("gyro bias [deg/h]\n(dashed: true, band: 3σ)")
 
 
 def mounting_panel(log: Telemetry, axes: Any) -> None:
-    for k, (name, mounting) in enumerate(log.mountings.items()):
+    late = []
+    for n, (name, mounting) in enumerate(log.mountings.items()):
         estimate, sigma, true = (values / ARCSEC_RAD for values in mounting)
-        for n, axis in enumerate(AXES):
-            color = f"C{3 * k + n}"
-            axes.plot(log.t_s, true[:, n], "--", color=color, lw=1)
-            axes.plot(log.t_s, estimate[:, n], color=color, label=f"{name} {axis}")
-            band = estimate[:, n] - 3 * sigma[:, n], estimate[:, n] + 3 * sigma[:, n]
-            axes.fill_between(log.t_s, *band, color=color, alpha=0.12, lw=0)
-    late = [
-        values[len(log.t_s) // 4 :] / ARCSEC_RAD
-        for mounting in log.mountings.values()
-        for values in mounting
-    ]
-    limit = max(np.abs(values).max() for values in late) * 1.3
+        draw_estimate(axes, log.t_s, true, estimate, sigma, f"{name} ", 3 * n)
+        late += [values[len(log.t_s) // 4 :] for values in (estimate, sigma, true)]
+    limit = np.abs(late).max() * 1.3
     axes.set_ylim(-limit, limit)
     axes.set_ylabel("mounting [arcsec]\n(dashed: true, band: 3σ)")
 
 
 def torque_panel(log: Telemetry, axes: Any) -> None:
-    for n, name in enumerate(AXES):
-        axes.plot(log.t_s, log.torque_nm[:, n], color=f"C{n}", label=name)
+    axes.plot(log.t_s, log.torque_nm, label=AXES)
     axes.set_ylabel("commanded torque\n[N m]")
 
 
 def wheels_panel(log: Telemetry, axes: Any) -> None:
-    for n, speed in enumerate(log.wheel_rad_s.T):
-        axes.plot(log.t_s, speed / RPM_RAD_S, label=f"wheel {n + 1}")
+    names = [f"wheel {n + 1}" for n in range(log.wheel_rad_s.shape[1])]
+    axes.plot(log.t_s, log.wheel_rad_s / RPM_RAD_S, label=names)
     axes.set_ylabel("wheels [rpm]")
 
 
 def gimbals_panel(log: Telemetry, axes: Any) -> None:
-    for n, angle in enumerate(log.gimbal_rad.T):
-        axes.plot(log.t_s, np.degrees(angle), label=f"gimbal {n + 1}")
+    names = [f"gimbal {n + 1}" for n in range(log.gimbal_rad.shape[1])]
+    axes.plot(log.t_s, np.degrees(log.gimbal_rad), label=names)
     axes.set_ylabel("gimbals [deg]")
     if log.manipulability is not None:
         right = axes.twinx()
@@ -229,8 +237,7 @@ def gimbals_panel(log: Telemetry, axes: Any) -> None:
 
 
 def momentum_panel(log: Telemetry, axes: Any) -> None:
-    for n, name in enumerate(AXES):
-        axes.plot(log.t_s, log.momentum_nms[:, n], color=f"C{n}", label=name)
+    axes.plot(log.t_s, log.momentum_nms, label=AXES)
     axes.plot(log.t_s, np.linalg.norm(log.momentum_nms, axis=1), color="k", lw=1, label="norm")
     axes.set_ylabel("stored momentum\n[N m s]")
 

@@ -27,7 +27,16 @@ from skysim.experiments.characterize.photon_transfer import (
 from skysim.experiments.characterize.sensor_fit import MeasuredSensor
 from skysim.results.plots import INK, png
 from skysim.results.report import Report
-from skysim.results.report_blocks import Column, Facts, Figure, Items, Section, Table, Verdict
+from skysim.results.report_blocks import (
+    Column,
+    Facts,
+    Figure,
+    Items,
+    Section,
+    Table,
+    Verdict,
+    text_column,
+)
 from skysim.scene import loader
 from skysim.scene.camera_sheet import PLACEHOLDER_LENS, SheetLine, yaml_lines
 from skysim.scene.sections.camera import CameraConfig, GaussianPsfConfig
@@ -98,8 +107,8 @@ def facts(statistics: dict[str, Any]) -> Facts:
 
 def value_table(statistics: dict[str, Any]) -> Table:
     """The values with their intervals, and those of the camera's file."""
-    columns = [Column("what", kind="text"), Column("measured", format=".5g"), Column("95 %")]
-    columns += [Column("file", format=".5g"), Column("unit", kind="text")]
+    columns = [text_column("what"), Column("measured", format=".5g"), Column("95 %")]
+    columns += [Column("file", format=".5g"), text_column("unit")]
     values = statistics["values"] + (statistics["night"]["values"] if statistics["night"] else [])
     interval = "{low:.5g} to {high:.5g}"
     rows = [

@@ -30,6 +30,7 @@ from skysim.experiments.dome_survey.survey_prior import (
     image_sizes,
     survey_model,
 )
+from skysim.results.telemetry_report import euler_deg
 from skysim.scene.scene import Scene
 
 # A survey of a dome as its last round has it: frames, correspondences, what they show of each LED,
@@ -410,7 +411,7 @@ def stop_rows(lab_from_body: Rotation, shown: Mask) -> list[dict[str, float | in
     up = lab_from_body.apply([0.0, 0.0, 1.0])
     tilt_deg = np.degrees(np.arctan2(np.hypot(up[:, 0], up[:, 1]), up[:, 2]))
     columns = (
-        *survey_frames.angles_deg(lab_from_body).T.tolist(),
+        *euler_deg(lab_from_body).T.tolist(),
         tilt_deg.tolist(),
         shown.sum(axis=1).tolist(),
     )

@@ -97,11 +97,6 @@ def planned_stops(
     return candidates[chosen].inv()
 
 
-def angles_deg(lab_from_body: Rotation) -> Floats:
-    """(F, 3) roll, pitch and yaw, as a scene's `motion` has them: lab_from_body = Rz(yaw) Ry(pitch) Rx(roll)."""
-    return lab_from_body.as_euler("ZYX", degrees=True)[:, ::-1]
-
-
 def from_angles(roll_pitch_yaw_deg: Floats) -> Rotation:
     """lab_from_body of (F, 3) roll, pitch and yaw."""
     return Rotation.from_euler("ZYX", roll_pitch_yaw_deg[:, ::-1], degrees=True)

@@ -30,6 +30,7 @@ from skysim.core.text import excerpt, read_named_rows
 from skysim.experiments.dome_survey import survey_frames
 from skysim.experiments.dome_survey.survey_frames import SurveyFrame, detect_lights
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
+from skysim.results.telemetry_report import euler_deg
 
 ATTITUDES = "attitudes.csv"
 FRAME = "frame_{:04d}.fits"
@@ -123,12 +124,10 @@ def write_attitudes(
         Number of LEDs in view, for a plan.
     """
     lines = [",".join((*COLUMNS, "leds") if leds is not None else COLUMNS)]
-    for n, (name, angles) in enumerate(
-        zip(names, survey_frames.angles_deg(lab_from_body), strict=True)
-    ):
-        cells = [name, *(f"{angle:.4f}" for angle in angles)] + (
-            [f"{leds[n]}"] if leds is not None else []
-        )
+    for n, (name, angles) in enumerate(zip(names, euler_deg(lab_from_body), strict=True)):
+        cells = [name, *(f"{angle:.4f}" for angle in angles)]
+        if leds is not None:
+            cells.append(f"{leds[n]}")
         lines.append(",".join(cells))
     with atomic_file(path) as temporary:
         temporary.write_text("\n".join([*lines, ""]), encoding="utf-8")

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import Lever, on_surface
 from estimator.calibration.dome_survey import DomeSurvey
+from estimator.calibration.survey_plan import Mask
 from estimator.core.camera import Camera
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Mount, Truth
@@ -29,7 +30,7 @@ from skysim.experiments.dome_survey.survey_findings import (
 )
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
 from skysim.results import metrics
-from skysim.results.plots import INK, png
+from skysim.results.plots import INK, bgr_image, png
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
     Block,
@@ -41,6 +42,7 @@ from skysim.results.report_blocks import (
     Table,
     Text,
     Verdict,
+    text_column,
 )
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.lab import Lab
@@ -107,13 +109,8 @@ def value_table(statistics: dict[str, Any]) -> Table:
             f"{one:.5g}" if what[0] in "kp" else f"{one:.3f}" for one in numbers
         )
         rows += [[what, before, found, f"{row['sigma']:.2g}", *known]] if row["sigma"] else []
-    return Table(
-        [
-            Column("", kind="text"),
-            *map(Column, ["before", "found", "1σ", *["truth"] * bool(truth)]),
-        ],
-        rows,
-    )
+    heads = ["before", "found", "1σ"] + ["truth"] * bool(truth)
+    return Table([text_column(""), *map(Column, heads)], rows)
 
 
 def truth_blocks(statistics: dict[str, Any]) -> list[Block]:
@@ -138,7 +135,7 @@ def truth_blocks(statistics: dict[str, Any]) -> list[Block]:
     ]
     heads = ("cross, median", "worst", "roll, median", "worst")
     columns = [
-        Column("the tracker", kind="text"),
+        text_column("the tracker"),
         Column("solved"),
         *(Column(head, "″", ".3g") for head in heads),
     ]
@@ -154,9 +151,7 @@ def accuracy_table(statistics: dict[str, Any], reached: Mapping[str, Any]) -> Ta
     columns |= {"true error, rms": {"led_mm": after}} if after is not None else {}
     columns["with the next attitudes"] = statistics["next_reaches"]
     rows = [[what, *(one.get(key) for one in columns.values())] for key, what in REACHED.items()]
-    return Table(
-        [Column("1σ", kind="text"), *(Column(head, format=".3g") for head in columns)], rows
-    )
+    return Table([text_column("1σ"), *(Column(head, format=".3g") for head in columns)], rows)
 
 
 def coverage_blocks(statistics: dict[str, Any]) -> list[Block]:
@@ -185,34 +180,24 @@ def stop_table(stops: list[dict[str, Any]]) -> Table:
 
 def fault_blocks(faults: dict[str, Any]) -> list[Block]:
     """The faults as a table; their numbers, the error of the list's other places, and which exchanges can be found."""
-    columns = [Column("LED"), Column("fault", kind="text"), Column("details", kind="text")]
+    columns = [Column("LED"), text_column("fault"), text_column("details")]
     *_, counts = fault_lines(faults)
     return [Table(columns, fault_rows(faults)), Text(counts)]
 
 
 def fault_rows(faults: dict[str, Any]) -> list[tuple[str, str, str]]:
     """LED, fault and details, one row a fault."""
+    found = {led: f"at {coordinates(place_m)}" for led, place_m in faults["found_m"].items()}
     rows = [(str(led), "dark", "no frame shows it") for led in faults["dark"]]
     for led, off_m in faults["displaced"].items():
-        rows.append(
-            (
-                str(led),
-                "displaced",
-                f"{1e3 * off_m:.1f} mm from its place in the list, {place(faults, led)}",
-            )
-        )
+        details = f"{1e3 * off_m:.1f} mm from its place in the list, {found[led]}"
+        rows.append((str(led), "displaced", details))
     for led, shows, others in faults["exchanged"]:
         alike = f" (or {', '.join(map(str, others))})" if others else ""
-        rows.append(
-            (str(led), "exchanged", f"LED {shows}{alike} shines at its place, {place(faults, led)}")
-        )
+        details = f"LED {shows}{alike} shines at its place, {found[led]}"
+        rows.append((str(led), "exchanged", details))
     rows += [("", "not in the list", f"a light at {coordinates(at)}") for at in faults["unlisted"]]
     return rows
-
-
-def place(faults: dict[str, Any], led: int) -> str:
-    """Where an LED with a fault was found."""
-    return f"at {coordinates(faults['found_m'][led])}"
 
 
 def coordinates(place_m: list[float]) -> str:
@@ -292,12 +277,11 @@ def error_statistics(
     statistics: dict[str, float | int | None] = {"stops": stops, "solved": len(errors_rad)}
     errors_arcsec = np.abs(errors_rad).reshape(-1, 2) / ARCSEC_RAD
     for name, error_arcsec in zip(("cross", "roll"), errors_arcsec.T, strict=True):
-        statistics[f"{name}_arcsec_median"] = (
-            float(np.median(error_arcsec)) if len(error_arcsec) else None
-        )
-        statistics[f"{name}_arcsec_worst"] = (
-            float(error_arcsec.max()) if len(error_arcsec) else None
-        )
+        median = worst = None
+        if len(error_arcsec):
+            median = float(np.median(error_arcsec))
+            worst = float(error_arcsec.max())
+        statistics |= {f"{name}_arcsec_median": median, f"{name}_arcsec_worst": worst}
     return statistics
 
 
@@ -344,10 +328,7 @@ def survey_statistics(run: SurveyRun, before: CalibrationPrior) -> dict[str, Any
     """Statistics of a survey without the truth. `values` holds one row per lens and lever parameter that is fitted."""
     survey = run.survey
     sigma_mm = 1e3 * run.accuracy.led_sigma_m[survey.surveyed]
-    columns = [
-        parameters(lens, lever)
-        for lens, lever in ((before.camera, before.lever), (survey.camera, survey.lever))
-    ]
+    columns = [parameters(one.camera, one.lever) for one in (before, survey)]
     lever_sigma_mm = 1e3 * np.sqrt(np.diag(survey.lever_covariance_m2))
     sigma = [*lens_sigma(survey)[:7].tolist(), *lever_sigma_mm.tolist()]
     return {
@@ -400,27 +381,14 @@ def survey_figure(
             ("error before the survey", errors.true_m, errors.before_m),
             ("after", errors.true_m, errors.after_m),
         ]
-    fig, canvas = new_figure((7 * (1 + len(panels)), 6.5))
-    first, *rest = fig.subplots(1, 1 + len(panels))
-    draw_coverage(first, so_far, faults, further)
-    for axes, (title, place_m, error_m) in zip(rest, panels, strict=True):
-        draw_errors(axes, title, place_m, error_m)
-    return picture_of(canvas)
 
+    def draw(fig: Any) -> None:
+        first, *rest = fig.subplots(1, 1 + len(panels))
+        draw_coverage(first, so_far, faults, further)
+        for axes, panel in zip(rest, panels, strict=True):
+            draw_errors(axes, *panel)
 
-def new_figure(size_in: tuple[float, float]) -> tuple[Any, Any]:
-    """A figure and its canvas."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    fig = Figure(figsize=size_in, layout="constrained")
-    return fig, FigureCanvasAgg(fig)
-
-
-def picture_of(canvas: Any) -> NDArray[np.uint8]:
-    """BGR image of a canvas."""
-    canvas.draw()
-    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[:, :, 2::-1])
+    return bgr_image(draw, (7 * (1 + len(panels)), 6.5))
 
 
 def draw_coverage(
@@ -434,23 +402,15 @@ def draw_coverage(
     x_m, y_m, _ = leds.position_m.T
     once = so_far.seen.any(axis=0) & ~measured
     unseen = ~measured & ~once
-    axes.scatter(
-        x_m[unseen],
-        y_m[unseen],
-        s=14,
-        facecolor="none",
-        edgecolor="0.6",
-        label=f"not seen: {unseen.sum()}",
-    )
-    axes.scatter(
-        x_m[once], y_m[once], s=14, color="0.75", label=f"seen, not measured: {once.sum()}"
-    )
+
+    def dots(which: Mask, name: str, **style: Any) -> Any:
+        return axes.scatter(x_m[which], y_m[which], s=14, label=f"{name}: {which.sum()}", **style)
+
+    dots(unseen, "not seen", facecolor="none", edgecolor="0.6")
+    dots(once, "seen, not measured", color="0.75")
     if so_far.accuracy is not None:
         sigma_mm = 1e3 * so_far.accuracy.led_sigma_m[measured]
-        label = f"measured: {measured.sum()}"
-        points = axes.scatter(
-            x_m[measured], y_m[measured], s=14, c=sigma_mm, norm=LogNorm(), label=label
-        )
+        points = dots(measured, "measured", c=sigma_mm, norm=LogNorm())
         axes.figure.colorbar(
             points, ax=axes, label="standard deviation about each axis [mm]", shrink=0.8
         )
@@ -468,13 +428,8 @@ def draw_coverage(
             if len(rows):
                 axes.scatter(x_m[rows], y_m[rows], 70, marker=marker, label=name, **colors)
             for row in rows:
-                axes.annotate(
-                    str(leds.id[row]),
-                    (x_m[row], y_m[row]),
-                    (6, 6),
-                    textcoords="offset points",
-                    color=color,
-                )
+                text = {"textcoords": "offset points", "color": color}
+                axes.annotate(str(leds.id[row]), (x_m[row], y_m[row]), (6, 6), **text)
     if further is not None:
         lever = so_far.model.lever
         toward = further.apply(lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])).reshape(-1, 3)

@@ -19,6 +19,7 @@ from skysim.results.report_blocks import (
     Text,
     Tone,
     Verdict,
+    text_column,
 )
 
 KINDS = (*VERDICTS, "derived", "open")
@@ -84,7 +85,7 @@ def verdict(reproductions: Sequence[Reproduction]) -> Verdict:
 
 def contents(reproductions: Sequence[Reproduction]) -> Table:
     """Counts and seconds of each experiment, with links, and their sums."""
-    columns = [Column("experiment", kind="text"), Column("", kind="text"), *map(Column, KINDS)]
+    columns = [text_column("experiment"), text_column(""), *map(Column, KINDS)]
     rows = []
     for one in reproductions:
         counts = [
@@ -124,8 +125,8 @@ def section(reproduction: Reproduction, drawn: bool = True) -> Section:
 
 def comparison_table(comparisons: Sequence[Comparison]) -> Table:
     """The published numbers beside ours."""
-    columns = [Column("what", kind="text"), Column("published"), Column("ours (95 %)")]
-    columns += [Column("verdict", kind="text"), Column("note", kind="aside")]
+    columns = [text_column("what"), Column("published"), Column("ours (95 %)")]
+    columns += [text_column("verdict"), Column("note", kind="aside")]
     rows = []
     for one in comparisons:
         numbers = [compare.format_with_source(one.row), compare.format_summary(one.result.ours)]

@@ -87,8 +87,8 @@ def format_level(value: Any) -> str:
     """Text of a factor's level, numbers rounded to four digits."""
     if isinstance(value, float):
         return f"{value:.4g}"
-    # A sampled quantity with a unit.
-    if isinstance(value, str) and (match := LONG_QUANTITY.match(value)):
+    match = LONG_QUANTITY.match(value) if isinstance(value, str) else None
+    if match:  # a sampled quantity with a unit
         return f"{float(match[1]):.4g}{match[2]}"
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
@@ -140,11 +140,9 @@ def level_columns(store: Store) -> dict[str, NDArray[Any]]:
 def to_array(levels: Sequence[Any]) -> NDArray[Any]:
     """Levels of a factor as an array; those that numpy has no type for as texts."""
     array = np.array([format_level(one) if isinstance(one, list) else one for one in levels])
-    return (
-        array
-        if array.dtype != object
-        else np.array([one if one is None else str(one) for one in levels], object)
-    )
+    if array.dtype != object:
+        return array
+    return np.array([one if one is None else str(one) for one in levels], object)
 
 
 def with_levels(rows: Rows, levels: dict[str, NDArray[Any]]) -> Rows:
@@ -195,21 +193,20 @@ def response_indices(plan: Plan, store: Store, response: str) -> list[Index]:
     rng = random_stream(1)
     # Resample rows of A, B and AB together, so that each resample is a valid Saltelli sample.
     selections = rng.integers(count, size=(RESAMPLES, count))
-    resampled = np.array(
-        [generalized(a[:, rows], b[:, rows], ab[:, :, rows]) for rows in selections]
-    )
+    resampled = [generalized(a[:, rows], b[:, rows], ab[:, :, rows]) for rows in selections]
     low, high = np.quantile(resampled, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], axis=0)
     first, total = (
-        [Summary(float(v), float(lo), float(hi), count) for v, lo, hi in zip(*index, strict=True)]
-        for index in zip(estimate, low, high, strict=True)
+        [Summary(value, least, most, count) for value, least, most in index]
+        for index in np.stack([estimate, low, high], axis=-1).tolist()
     )
     # The variance of the cross-boresight error is the sum of the variances about its two axes.
-    sigma_arcsec = math.sqrt(
-        np.var(np.concatenate([a, b], axis=1), axis=1).mean() * len(AXES[response])
-    )
-    rms_arcsec = [sigma_arcsec * math.sqrt(max(one.value, 0.0)) for one in first]
-    columns = zip(names, first, total, rms_arcsec, strict=True)
-    return [Index(name, response, one, other, rms) for name, one, other, rms in columns]
+    variance = np.var(np.concatenate([a, b], axis=1), axis=1).mean() * len(AXES[response])
+    sigma_arcsec = math.sqrt(variance)
+    found = []
+    for name, one, other in zip(names, first, total, strict=True):
+        alone_arcsec = sigma_arcsec * math.sqrt(max(one.value, 0.0))
+        found.append(Index(name, response, one, other, alone_arcsec))
+    return found
 
 
 def sample_outputs(
@@ -259,8 +256,12 @@ UNITS = {
     "_mag": "mag",
     "_px": "px",
     "_um": "um",
+    "_mm": "mm",
+    "_ms": "ms",
+    "_hz": "Hz",
+    "_m": "m",
+    "_s": "s",
 }
-UNITS |= {"_mm": "mm", "_ms": "ms", "_hz": "Hz", "_m": "m", "_s": "s"}
 Shown = Figure | Threshold
 
 
@@ -314,12 +315,9 @@ def label(name: str, unit: str = "") -> str:
     ending = next((ending for ending in UNITS if stem.endswith(ending)), "")
     unit = unit or UNITS.get(ending, "")
     text = stem.removesuffix(ending).replace("_", " ") + tail
-    return text + (f" [{unit}]" if unit else " [share]" if is_share(name) else "")
-
-
-def is_share(name: str) -> bool:
-    """Whether a response is a proportion between 0 and 1."""
-    return metrics.is_proportion(name)
+    if unit:
+        return f"{text} [{unit}]"
+    return f"{text} [share]" if metrics.is_proportion(name) else text
 
 
 def axis(study: Study, lines: Sequence[PointRow], name: str) -> Axis:
@@ -374,10 +372,9 @@ def suits_log_scale(numbers: Floats) -> bool:
     """
     if len(numbers) < 4 or numbers[0] <= 0 or numbers[-1] < LOG_FACTOR_RATIO * numbers[0]:
         return False
-    variation = [
-        np.std(steps) / np.mean(steps) for steps in (np.diff(np.log(numbers)), np.diff(numbers))
-    ]
-    return bool(variation[0] < variation[1])
+    steps = np.diff(numbers)
+    ratios = np.diff(np.log(numbers))
+    return bool(np.std(ratios) / np.mean(ratios) < np.std(steps) / np.mean(steps))
 
 
 # Selection of points.
@@ -428,18 +425,23 @@ def points_at(
 
 
 def group_points(
-    lines: Sequence[PointRow], group_axis: Axis, name: str, study: Study
+    all_lines: Sequence[PointRow], shown: Shown, study: Study
 ) -> dict[str, list[PointRow]]:
-    """Table lines grouped by the level of factor `name`, in the order of its axis `group_axis`."""
+    """The table lines that a figure or threshold is about, by the level of its `by`; under "" if it has none."""
+    lines = shown_points(all_lines, shown, study)
+    name = shown.axes.get("by")
+    if name is None:
+        return {"": lines}
+    group_axis = axis(study, all_lines, name)
     # A sampled factor has about as many levels as points: divide the sorted points into GROUPS groups of equal size.
     if is_sampled(study) and group_axis.numeric and len(group_axis.levels) > 2 * GROUPS:
         ordered = sorted(lines, key=lambda line: group_axis.coordinate(line.levels[name]))
         bounds = [round(n * len(ordered) / GROUPS) for n in range(GROUPS + 1)]
-        parts = [ordered[a:b] for a, b in itertools.pairwise(bounds) if b > a]
-        spans = [[group_axis.coordinate(part[n].levels[name]) for n in (0, -1)] for part in parts]
-        return {
-            f"{low:.3g} to {high:.3g}": part for (low, high), part in zip(spans, parts, strict=True)
-        }
+        groups = {}
+        for part in (ordered[a:b] for a, b in itertools.pairwise(bounds) if b > a):
+            low, high = (group_axis.coordinate(part[n].levels[name]) for n in (0, -1))
+            groups[f"{low:.3g} to {high:.3g}"] = part
+        return groups
     return {
         group_axis.tick_label(one): [line for line in lines if same(line.levels[name], one)]
         for one in group_axis.levels

@@ -73,29 +73,29 @@ def crossing(x: Floats, hits: Floats, trials: Floats, limit: float, log: bool = 
     log
         Interpolate between the levels in the logarithm of x
     """
-    fits = {rising: isotonic(hits / trials, trials, rising) for rising in (False, True)}
-    rising = log_likelihood(hits, trials, fits[True]) > log_likelihood(hits, trials, fits[False])
-    deviance = 2 * (
-        log_likelihood(hits, trials, hits / trials) - log_likelihood(hits, trials, fits[rising])
-    )
+    falls, rises = (isotonic(hits / trials, trials, rising) for rising in (False, True))
+    rising = log_likelihood(hits, trials, rises) > log_likelihood(hits, trials, falls)
+    best = rises if rising else falls
+    saturated = log_likelihood(hits, trials, hits / trials)
+    deviance = 2 * (saturated - log_likelihood(hits, trials, best))
     if deviance > scipy.stats.chi2.isf(MISFIT_PROBABILITY, max(len(x) - 1, 1)):
         return Crossing(math.nan, -math.inf, math.inf, rising)
     # In the order in which the proportion falls, `above` and `below` are certain levels.
     order = slice(None, None, -1) if rising else slice(None)
     sign = -1.0 if rising else 1.0
     places = (np.log(x) if log else x)[order]
-    fit = fits[rising][order]
+    fit = best[order]
     value = sign * math.inf
     between = None
     below = np.flatnonzero(fit < limit)
-    if len(below):
+    if len(below) and not below[0]:
+        value = -value
+    elif len(below):
         n = int(below[0])
-        share = (fit[n - 1] - limit) / (fit[n - 1] - fit[n]) if n else 0.0
-        value = (
-            float(places[n - 1] + share * (places[n] - places[n - 1])) if n else -sign * math.inf
-        )
-        value = math.exp(value) if log and n else value
-        if n and too_few(trials, limit):
+        share = (fit[n - 1] - limit) / (fit[n - 1] - fit[n])
+        value = float(places[n - 1] + share * (places[n] - places[n - 1]))
+        value = math.exp(value) if log else value
+        if too_few(trials, limit):
             first, second = sorted(x[order][n - 1 : n + 1].tolist())
             between = first, second
     above, beneath = certain_levels(x[order], hits[order], trials[order], limit)
@@ -104,13 +104,11 @@ def crossing(x: Floats, hits: Floats, trials: Floats, limit: float, log: bool = 
         sign * math.inf if beneath is None else beneath,
     )
     open_ends = [end for end, level in ((0, above), (-1, beneath)) if level is None]
-    needs = [
-        (float(x[order][end]), trials_needed(float(fit[end]), limit, above=end == 0))
-        for end in open_ends
-    ]
-    return Crossing(
-        value, min(ends), max(ends), rising, between, tuple((at, n) for at, n in needs if n)
-    )
+    needs = []
+    for end in open_ends:
+        if count := trials_needed(float(fit[end]), limit, above=end == 0):
+            needs.append((float(x[order][end]), count))
+    return Crossing(value, min(ends), max(ends), rising, between, tuple(needs))
 
 
 def too_few(trials: Floats, limit: float) -> bool:
@@ -140,12 +138,9 @@ def isotonic(proportion: Floats, weight: Floats, rising: bool) -> Floats:
 
 def log_likelihood(hits: Floats, trials: Floats, proportion: Floats) -> float:
     """Binomial log-likelihood of proportions, without the term that does not depend on them."""
-    return float(
-        np.sum(
-            scipy.special.xlogy(hits, proportion)
-            + scipy.special.xlogy(trials - hits, 1 - proportion)
-        )
-    )
+    hit = scipy.special.xlogy(hits, proportion)
+    missed = scipy.special.xlogy(trials - hits, 1 - proportion)
+    return float(np.sum(hit + missed))
 
 
 def certain_levels(
@@ -213,12 +208,7 @@ def crossings(
 ) -> dict[str, Crossing | None]:
     """The crossing for each level of `by`, by its label, or by "" without `by`; None without trials at two levels."""
     axis = table.axis(study, lines, threshold.along)
-    chosen = table.shown_points(lines, threshold, study)
-    groups = {"": chosen}
-    if threshold.by is not None:
-        groups = table.group_points(
-            chosen, table.axis(study, lines, threshold.by), threshold.by, study
-        )
+    groups = table.group_points(lines, threshold, study)
     return {label: group_crossing(threshold, group, axis) for label, group in groups.items()}
 
 
@@ -274,14 +264,15 @@ def interval_text(found: Crossing, name: str, unit: str) -> str:
         f"about {trials:,} trials at {name} = {level:.4g}{unit}" for level, trials in found.needs
     )
     needs = f"; needs {counts}" if counts else ""
-    low, high = (f"{end:.4g}" for end in (found.low, found.high))
     if math.isinf(found.low) and math.isinf(found.high):
-        return f"{100 * metrics.CONFIDENCE:g} %: no level is certain{needs}"
-    if math.isinf(found.low):
-        return f"{100 * metrics.CONFIDENCE:g} %: below {high}{needs}"
-    if math.isinf(found.high):
-        return f"{100 * metrics.CONFIDENCE:g} %: above {low}{needs}"
-    return f"{100 * metrics.CONFIDENCE:g} %: {low} to {high}"
+        span = f"no level is certain{needs}"
+    elif math.isinf(found.low):
+        span = f"below {found.high:.4g}{needs}"
+    elif math.isinf(found.high):
+        span = f"above {found.low:.4g}{needs}"
+    else:
+        span = f"{found.low:.4g} to {found.high:.4g}"
+    return f"{100 * metrics.CONFIDENCE:g} %: {span}"
 
 
 def brief(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> str:
@@ -303,12 +294,9 @@ def brief(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> str:
         for label, one in found
         if math.isfinite(one.value)
     ]
-    always = [
-        label for label, one in found if math.isinf(one.value) and (one.value > 0) != one.rising
-    ]
-    never = [
-        label for label, one in found if math.isinf(one.value) and (one.value > 0) == one.rising
-    ]
+    beyond = [(label, one) for label, one in found if math.isinf(one.value)]
+    always = [label for label, one in beyond if (one.value > 0) != one.rising]
+    never = [label for label, one in beyond if (one.value > 0) == one.rising]
     parts = []
     if at:
         crosses = "reaches" if any(one.rising for _, one in found) else "falls below"

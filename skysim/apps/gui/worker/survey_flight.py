@@ -28,6 +28,7 @@ from skysim.experiments.dome_survey import (
 from skysim.experiments.dome_survey.survey_findings import Coverage, SurveyRun
 from skysim.experiments.dome_survey.survey_frames import SurveyFrame
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
+from skysim.results.telemetry_report import euler_deg
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import HoldConfig, SlewConfig
 from skysim.simulation.flight import Flight
@@ -229,7 +230,7 @@ def survey_plan(
     shown
         (F, N) whether an attitude shows an LED
     """
-    angles = tuple(tuple(row) for row in survey_frames.angles_deg(lab_from_body).tolist())
+    angles = tuple(tuple(row) for row in euler_deg(lab_from_body).tolist())
     return SurveyPlan(angles, tuple(shown.sum(axis=1).tolist()), shown.shape[1], steps)
 
 

@@ -100,11 +100,6 @@ def lab_from_body(angles_deg: Sequence[float] | Floats) -> Rotation:
     return guidance.attitude(AttitudeConfig(roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw))
 
 
-def angles_deg(lab_from_body: Rotation) -> Floats:
-    """(..., 3) roll, pitch, yaw."""
-    return lab_from_body.as_euler("ZYX", degrees=True)[..., ::-1]
-
-
 def photograph(
     lab: Lab, position: int, lab_from_body: Rotation, images: int, rng: np.random.Generator
 ) -> list[Sighting]:

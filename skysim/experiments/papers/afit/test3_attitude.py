@@ -40,7 +40,6 @@ from skysim.experiments.papers.afit.test3 import (
     HOME,
     IMU_DEG,
     LEDS,
-    angles_deg,
     build_test3,
     lab_from_body,
     photograph,
@@ -61,6 +60,7 @@ from skysim.experiments.papers.compare import (
 from skysim.experiments.papers.published import experiments
 from skysim.results.metrics import proportion
 from skysim.results.plots import INK
+from skysim.results.telemetry_report import euler_deg
 from skysim.scene import loader
 from skysim.simulation.flight import Shot, open_flight
 from skysim.simulation.lab import Lab, build_lab
@@ -152,7 +152,7 @@ def simulate_bump(bump_deg_s: BumpRate | None, seed: int) -> BumpRun:
     assert log.saturated is not None
     return BumpRun(
         log.t_s,
-        angles_deg(log.lab_from_imu) - angles_deg(log.lab_from_body),
+        euler_deg(log.lab_from_imu) - euler_deg(log.lab_from_body),
         np.degrees((log.lab_from_filter * log.lab_from_body.inv()).magnitude()),
         float(log.saturated.sum() * log.period_s),
         max(errors_deg),
@@ -374,7 +374,7 @@ def algorithm_errors(
             correct += int(np.array_equal(star, order))
             rows = order[:lights]
             body_from_home = quest(vectors[:lights], catalog.vectors[rows], np.ones(lights))
-            error_deg[n_set, n] = angles_deg(body_from_home.inv()) - IMU_DEG[n]
+            error_deg[n_set, n] = euler_deg(body_from_home.inv()) - IMU_DEG[n]
     return AlgorithmErrors(error_deg, (correct, len(sets) * len(IMU_DEG)))
 
 
@@ -441,7 +441,7 @@ def integrated_angles(measured: imu.Increments, stops: Ints) -> Floats:
     for increments in np.split(measured.angle_rad, stops)[: len(stops)]:
         wxyz = imu.integrate_attitude(wxyz, increments, np.zeros(3), measured.step_s)
         attitudes.append(wxyz)
-    return angles_deg(Rotation.from_quat(attitudes, scalar_first=True))
+    return euler_deg(Rotation.from_quat(attitudes, scalar_first=True))
 
 
 # Figures.

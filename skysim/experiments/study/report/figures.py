@@ -18,12 +18,11 @@ from skysim.experiments.study.table import (
     PointRow,
     axis,
     is_sampled,
-    is_share,
     label,
     shown_points,
 )
 from skysim.experiments.study.thresholds import crossings, thresholds_of
-from skysim.results.metrics import MORE_IS_BETTER, split_name
+from skysim.results.metrics import MORE_IS_BETTER, is_proportion, split_name
 from skysim.results.plots import INK, MARKS, png
 
 if TYPE_CHECKING:
@@ -35,29 +34,30 @@ if TYPE_CHECKING:
 
 SHARE_COLORS = "cividis"  # color map of all proportions
 COLORS = "YlOrRd"  # of other responses, dark where they are bad: reversed where more is better
+# A cell without value.
 HATCHED: Any = {
     "facecolor": "#eeeeee",
     "edgecolor": "#b8b8b8",
     "hatch": "////",
     "linewidth": 0,
-}  # a cell without value
+}
 
 
 def add_color_bar(fig: Any, image: Any, figure: Heat | Map, **where: Any) -> None:
     """Add the color bar, labeled with the response."""
-    locator, formatter = ticks(image.norm.vmin, image.norm.vmax) if figure.log else (None, None)
-    fig.colorbar(
-        image, label=label(figure.response), ticks=locator, format=formatter, **where
-    ).minorticks_off()
+    if figure.log:
+        where["ticks"], where["format"] = ticks(image.norm.vmin, image.norm.vmax)
+    fig.colorbar(image, label=label(figure.response), **where).minorticks_off()
 
 
 def color_scale(values: Floats, figure: Heat | Map) -> dict[str, Any]:
     """Color map and normalization of a response: every proportion has the same, from 0 to 1."""
     from matplotlib.colors import Normalize
 
-    if is_share(figure.response) and not figure.log:
+    share = is_proportion(figure.response)
+    if share and not figure.log:
         return {"cmap": SHARE_COLORS, "norm": Normalize(0, 1)}
-    colors = SHARE_COLORS if is_share(figure.response) else COLORS
+    colors = SHARE_COLORS if share else COLORS
     if split_name(figure.response)[0] in MORE_IS_BETTER:
         colors += "_r"
     return {"cmap": colors, "norm": color_norm(values, figure.log)}
@@ -81,12 +81,15 @@ def ticks(low: float, high: float) -> tuple[Any, Any]:
     """
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
-    where = (
-        LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,))
-        if high > 8 * low
-        else MaxNLocator(5)
-    )
+    where: Any = MaxNLocator(5)
+    if high > 8 * low:
+        where = LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,))
     return where, FuncFormatter(lambda value, _: f"{value:.6g}")
+
+
+def is_light(rgba: Sequence[float]) -> bool:
+    """Whether a color is so light that text on it must be dark: its luma (ITU-R BT.601) is above one half."""
+    return float(np.dot(rgba[:3], (0.299, 0.587, 0.114))) > 0.5
 
 
 def halo() -> Any:
@@ -115,11 +118,9 @@ def figure_png(lines: Sequence[PointRow], figure: Curve | Heat, study: Study) ->
         return png(lambda fig: draw_scatter(fig, lines, figure, study), (7.0, 4.4))
     cells = layout.grid(lines, figure, study)
     rows, columns = cells.value.shape
-    size = (
-        float(np.clip(2.6 + 0.6 * columns, 4.6, 9.6)),
-        float(np.clip(1.2 + 0.42 * rows, 2.6, 7.0)),
-    )
-    return png(lambda fig: draw_heat(fig, cells, figure), size)
+    width_in = min(max(2.6 + 0.6 * columns, 4.6), 9.6)
+    height_in = min(max(1.2 + 0.42 * rows, 2.6), 7.0)
+    return png(lambda fig: draw_heat(fig, cells, figure), (width_in, height_in))
 
 
 # Curves.
@@ -137,15 +138,17 @@ def draw_curve(fig: Any, lines: Sequence[PointRow], figure: Curve, study: Study)
     if (expected := layout.expected_value(figure.y)) is not None:
         axes.axhline(expected, color="#777777", linestyle=":", linewidth=1.2)
     group_axis = axis(study, lines, figure.by) if figure.by is not None else None
-    for n, one in enumerate(shown):
-        ink = color(n, len(shown), group_axis is not None and group_axis.numeric)
-        wide_pt = min(3.0, 20 / len(shown)) if x_axis.numeric else min(6.0, 60 / len(shown))
-        step_pt = (n - (len(shown) - 1) / 2) * wide_pt  # bars side by side
+    inks = colors(len(shown), group_axis)
+    widest_pt = 3.0 if x_axis.numeric else 6.0
+    for n, (one, ink) in enumerate(zip(shown, inks, strict=True)):
+        mark = MARKS[n % len(MARKS)]
         if sampled:
-            draw_points(axes, one, ink, MARKS[n % len(MARKS)], x_axis.numeric, dots)
+            draw_points(axes, one, ink, mark, x_axis.numeric, dots)
         else:
-            draw_line(axes, one, ink, MARKS[n % len(MARKS)], x_axis, step_pt)
-    draw_thresholds(axes, figure, study, lines)
+            # Bars are side by side.
+            wide_pt = min(widest_pt, (20 if x_axis.numeric else 60) / len(shown))
+            draw_line(axes, one, ink, mark, x_axis, (n - (len(shown) - 1) / 2) * wide_pt)
+    draw_thresholds(axes, figure, study, lines, group_axis)
     if not any(np.isfinite(one.value).any() for one in shown):
         axes.text(0.5, 0.5, "nothing yet", transform=axes.transAxes, ha="center", color="#888888")
     if group_axis is not None and shown:
@@ -155,17 +158,17 @@ def draw_curve(fig: Any, lines: Sequence[PointRow], figure: Curve, study: Study)
         )
 
 
-def draw_thresholds(axes: Any, figure: Curve, study: Study, lines: Sequence[PointRow]) -> None:
+def draw_thresholds(
+    axes: Any, figure: Curve, study: Study, lines: Sequence[PointRow], group_axis: Axis | None
+) -> None:
     """Draw the thresholds of this curve: the limit dashed, a tick at each crossing and a bar over its interval."""
     for threshold in thresholds_of(figure, study, lines):
         axes.axhline(threshold.limit, color="#777777", linestyle="--", linewidth=0.8)
         found = crossings(threshold, study, lines)
-        group_axis = axis(study, lines, figure.by) if figure.by is not None else None
         first, last = axes.get_xlim()
-        for n, one in enumerate(found.values()):
+        for one, ink in zip(found.values(), colors(len(found), group_axis), strict=True):
             if one is None or not np.isfinite(one.value):
                 continue
-            ink = color(n, len(found), group_axis is not None and group_axis.numeric)
             low, high = np.clip([one.low, one.high], first, last)
             axes.hlines(threshold.limit, low, high, color=ink, linewidth=6, alpha=0.25)
             axes.plot(one.value, threshold.limit, "|", color=ink, markersize=13, markeredgewidth=2)
@@ -178,7 +181,8 @@ def set_up_y_axis(
     bounds = [end for one in shown for end in (one.low, one.high)] if bars else []
     expected = layout.expected_value(name)
     marked = [np.array([expected])] if expected is not None else []
-    low, high = layout.limits([*(one.value for one in shown), *marked], bounds, log, is_share(name))
+    values = [*(one.value for one in shown), *marked]
+    low, high = layout.limits(values, bounds, log, is_proportion(name))
     if log:
         logarithmic(axes, "y", low, high)
     axes.set_ylim(low, high)
@@ -198,7 +202,7 @@ def draw_line(axes: Any, one: Series, ink: Any, mark: str, x_axis: Axis, step_pt
         offset = axes.transData
         axes.fill_between(one.x, low, high, color=ink, alpha=0.15, linewidth=0)
     else:
-        draw_bars(axes, one, ink, offset)
+        draw_bars(axes, one.x, one, ink, offset)
     # A line joins no point of few values, which is that of the easy trials alone.
     style = {"color": ink, "transform": offset}
     joined = np.where(one.few, np.nan, one.value)
@@ -207,27 +211,16 @@ def draw_line(axes: Any, one: Series, ink: Any, mark: str, x_axis: Axis, step_pt
     draw_few(axes, one, mark, **style)
     if axes.get_yscale() == "log":
         none = (one.value <= 0) & (one.high > 0)
-        axes.plot(
-            one.x[none], one.high[none], "v", color=ink, markerfacecolor="white", transform=offset
-        )
+        axes.plot(one.x[none], one.high[none], "v", markerfacecolor="white", **style)
 
 
 def draw_few(axes: Any, one: Series, mark: str, **style: Any) -> None:
     """Draw the points of few values: hollow, with their number."""
     axes.plot(one.x[one.few], one.value[one.few], mark, markerfacecolor="white", **style)
-    for x, value, count in zip(
-        one.x[one.few], one.value[one.few], one.values[one.few], strict=True
-    ):
-        if np.isfinite(value):
-            place = {
-                "xy": (x, value),
-                "xytext": (4, 4),
-                "textcoords": "offset points",
-                "xycoords": style["transform"],
-            }
-            axes.annotate(
-                f"n={count}", **place, fontsize=6.5, color=style["color"], path_effects=[halo()]
-            )
+    text = {"fontsize": 6.5, "color": style["color"], "path_effects": [halo()]}
+    text |= {"xytext": (4, 4), "textcoords": "offset points", "xycoords": style["transform"]}
+    for n in np.flatnonzero(one.few & np.isfinite(one.value)):
+        axes.annotate(f"n={one.values[n]}", (one.x[n], one.value[n]), **text)
 
 
 def draw_points(axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots: bool) -> None:
@@ -237,7 +230,7 @@ def draw_points(axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots
     """
     style = {"marker": mark, "color": ink, "linestyle": "none"}
     if not dots:
-        draw_bars(axes, one, ink, axes.transData)
+        draw_bars(axes, one.x, one, ink, axes.transData)
         axes.plot(one.x, np.where(one.few, np.nan, one.value), label=one.label or None, **style)
         draw_few(axes, one, mark, color=ink, transform=axes.transData)
         return
@@ -250,16 +243,12 @@ def draw_points(axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots
         axes.plot(*level_medians(one), color=ink, label=one.label or None, **medians)
 
 
-def draw_bars(
-    axes: Any, one: Series | Panel, ink: Any, where: Any, x: Floats | None = None
-) -> None:
+def draw_bars(axes: Any, x: Floats, one: Series | Panel, ink: Any, where: Any) -> None:
     """Draw intervals as bars with caps."""
-    places = one.x if isinstance(one, Series) else x
-    axes.vlines(
-        places, *drawn_interval(axes, one), color=ink, alpha=0.6, linewidth=1, transform=where
-    )
+    style = {"color": ink, "alpha": 0.6, "transform": where}
+    axes.vlines(x, *drawn_interval(axes, one), linewidth=1, **style)
     for end in (one.low, one.high):
-        axes.plot(places, end, "_", color=ink, alpha=0.6, markersize=6, transform=where)
+        axes.plot(x, end, "_", markersize=6, **style)
 
 
 def drawn_interval(axes: Any, one: Series | Panel) -> tuple[Floats, Floats]:
@@ -284,15 +273,13 @@ def level_medians(one: Series) -> tuple[Floats, Floats]:
     return places, np.array([np.nanmedian(one.value[one.x == coordinate]) for coordinate in places])
 
 
-def color(n: int, count: int, ordered: bool) -> Any:
-    """Color of line n of `count`: from a color scale if the lines are ordered, else from the palette."""
+def colors(count: int, group_axis: Axis | None) -> list[Any]:
+    """Colors of so many lines: from a color scale if their axis is numeric, else from the palette."""
     from matplotlib import colormaps
 
-    return (
-        colormaps["viridis"](0.82 * n / max(count - 1, 1))
-        if ordered and count > 2
-        else INK[n % len(INK)]
-    )
+    if count > 2 and group_axis is not None and group_axis.numeric:
+        return list(colormaps["viridis"](np.linspace(0, 0.82, count)))
+    return [INK[n % len(INK)] for n in range(count)]
 
 
 def set_up_x_axis(axes: Any, x_axis: Axis) -> None:
@@ -321,9 +308,9 @@ def set_up_x_axis(axes: Any, x_axis: Axis) -> None:
 
 def wrapped(name: str, count: int) -> str:
     """A tick label wrapped so that `count` labels fit below the axis without overlap."""
-    return (
-        textwrap.fill(name, max(LABEL_WIDTH // count, 8)) if count <= MAX_WRAPPED_LABELS else name
-    )
+    if count > MAX_WRAPPED_LABELS:
+        return name
+    return textwrap.fill(name, max(LABEL_WIDTH // count, 8))
 
 
 def logarithmic(axes: Any, which: str, low: float, high: float) -> None:
@@ -361,21 +348,15 @@ def draw_heat(fig: Any, cells: Grid, figure: Heat) -> None:
     if max(rows, columns) <= MAX_CELLS_WITH_TEXT:
         for (row, column), value in np.ndenumerate(cells.value):
             if np.isfinite(value):
-                light = np.dot(image.to_rgba([value])[0][:3], (0.299, 0.587, 0.114)) > 0.5
-                ink = "#111111" if light else "white"
+                ink = "#111111" if is_light(image.to_rgba([value])[0]) else "white"
                 text = f"{value:.0f}" if 1000 <= abs(value) < 1e5 else f"{value:.3g}"
                 text += f"\nn={cells.values[row, column]}" if cells.few[row, column] else ""
                 axes.text(column, row, text, ha="center", va="center", color=ink, fontsize=8)
     for which, one, most in (("x", cells.x, MAX_TICKS * 2 // 3), ("y", cells.y, MAX_TICKS)):
-        step = (
-            max(math.ceil(len(one.levels) / most), 1)
-            if len(one.levels) > MAX_CELLS_WITH_TEXT
-            else 1
-        )
-        names = [
-            wrapped(one.tick_label(level), max(columns, 4) if which == "x" else 4)
-            for level in one.levels[::step]
-        ]
+        count = len(one.levels)
+        step = math.ceil(count / most) if count > MAX_CELLS_WITH_TEXT else 1
+        width = max(columns, 4) if which == "x" else 4
+        names = [wrapped(one.tick_label(level), width) for level in one.levels[::step]]
         getattr(axes, f"set_{which}ticks")(range(0, len(one.levels), step), names)
         getattr(axes, f"set_{which}label")(one.label)
     axes.grid(False)
@@ -386,21 +367,19 @@ def draw_scatter(fig: Any, lines: Sequence[PointRow], figure: Heat, study: Study
     """Draw sampled points over two factors, colored by response."""
     axes = fig.subplots()
     points = shown_points(lines, figure, study)
-    x, y = (axis(study, lines, name) for name in (figure.x, figure.y))
-    places = [
-        (x.coordinate(line.levels[figure.x]), y.coordinate(line.levels[figure.y]))
-        for line in points
-    ]
+    x = axis(study, lines, figure.x)
+    y = axis(study, lines, figure.y)
+    across = [x.coordinate(line.levels[figure.x]) for line in points]
+    up = [y.coordinate(line.levels[figure.y]) for line in points]
     values = np.array([line.responses[figure.value].value for line in points])
-    xy = np.array(places).reshape(-1, 2)
-    size = float(np.clip(6000 / max(len(xy), 1), 4, 45))
+    size = min(max(6000 / max(len(points), 1), 4), 45)
     set_up_x_axis(axes, x)
     if y.log:
-        logarithmic(axes, "y", *np.quantile(xy[:, 1], (0, 1)))
+        logarithmic(axes, "y", min(up), max(up))
     elif not y.numeric:
         axes.set_yticks(range(len(y.levels)), [wrapped(y.tick_label(one), 4) for one in y.levels])
         axes.set_ylim(len(y.levels) - 0.5, -0.5)
-    dots = axes.scatter(*xy.T, c=values, s=size, **color_scale(values, figure))
+    dots = axes.scatter(across, up, c=values, s=size, **color_scale(values, figure))
     axes.set_ylabel(y.label)
     add_color_bar(fig, dots, figure)
 
@@ -425,9 +404,8 @@ def draw_indices(fig: Any, selected: Sequence[Index], response: str) -> None:
     ):
         value, low, high = np.array(parts, dtype=float).reshape(-1, 3).T
         axes.barh(rows + shift, np.nan_to_num(value), 0.36, color=ink, label=name)
-        axes.hlines(
-            rows + shift, np.clip(low, -9, 9), np.clip(high, -9, 9), color="#333333", linewidth=1
-        )
+        ends = np.clip([low, high], -9, 9)
+        axes.hlines(rows + shift, *ends, color="#333333", linewidth=1)
     bounds = np.array([end for one in selected for end in (*one.first[:3], *one.total[:3], 0.0)])
     bounds = bounds[np.isfinite(bounds)]
     axes.set_xlim(min(bounds.min() * 1.05, 0.0), max(min(bounds.max() * 1.05, 2.0), 0.1))
@@ -447,12 +425,11 @@ def search_png(panels: dict[str, Panel], points: Sequence[int], front: Sequence[
     def draw(fig: Any) -> None:
         x = np.array(points, dtype=float)
         marked = np.isin(points, front)
-        for axes, (name, one) in zip(
-            np.ravel(fig.subplots(len(panels), 1, sharex=True)), panels.items(), strict=True
-        ):
+        stack = np.ravel(fig.subplots(len(panels), 1, sharex=True))
+        for axes, (name, one) in zip(stack, panels.items(), strict=True):
             set_up_y_axis(axes, name, [one._replace(value=np.append(one.value, one.bounds))], False)
             axes.set_ylabel(one.label.replace(", ", "\n"))
-            draw_bars(axes, one, GRAY, axes.transData, x)
+            draw_bars(axes, x, one, GRAY, axes.transData)
             axes.plot(x, one.value, "o", color=GRAY, markersize=3.5)
             axes.plot(x[marked], one.value[marked], "D", color=ORANGE)
             for bound in one.bounds:
@@ -476,33 +453,30 @@ def pareto_png(
     also
         Fronts of other searches with the same objectives, (K, 2) by label
     """
-    from matplotlib.patheffects import withStroke
 
     def draw(fig: Any) -> None:
         axes = fig.subplots()
         marked = np.flatnonzero(np.isin(points, front))
         axes.plot(one.value, other.value, "o", color=GRAY, label="candidate")
         marked = marked[np.argsort(one.value[marked], kind="stable")]
-        heights = [other.value, *(values[:, 1] for values in (also or {}).values())]
-        axes.set_ylim(
-            *layout.limits(heights, [other.low[marked], other.high[marked]], False, False)
-        )
-        for name, values in (also or {}).items():
-            axes.plot(
-                *values.T, "s:", color=INK[0], markerfacecolor="none", markersize=4, label=name
-            )
-        low_m, high_m = drawn_interval(axes, Panel("", other.value, other.low, other.high, []))
-        axes.vlines(
-            one.value[marked], low_m[marked], high_m[marked], color=ORANGE, alpha=0.5, linewidth=1
-        )
-        axes.plot(one.value[marked], other.value[marked], "D--", color=ORANGE, label="front")
-        for n in marked.tolist() if len(marked) <= MAX_LABELED_POINTS else ():
-            coordinate = (one.value[n], other.value[n])
-            halo = [withStroke(linewidth=2.5, foreground="white")]
-            style = {"fontsize": 8, "color": ORANGE, "path_effects": halo}
-            axes.annotate(
-                str(points[n]), coordinate, xytext=(5, 5), textcoords="offset points", **style
-            )
+        x = one.value[marked]
+        y = other.value[marked]
+        low = other.low[marked]
+        high = other.high[marked]
+        fronts = also or {}
+        heights = [other.value, *(values[:, 1] for values in fronts.values())]
+        axes.set_ylim(*layout.limits(heights, [low, high], False, False))
+        for name, values in fronts.items():
+            style: Any = {"color": INK[0], "markerfacecolor": "none", "markersize": 4}
+            axes.plot(*values.T, "s:", label=name, **style)
+        axes.vlines(x, low, high, color=ORANGE, alpha=0.5, linewidth=1)
+        axes.plot(x, y, "D--", color=ORANGE, label="front")
+        style = {"fontsize": 8, "color": ORANGE, "path_effects": [halo()]}
+        style |= {"xytext": (5, 5), "textcoords": "offset points"}
+        for n, *at in (
+            zip(marked.tolist(), x, y, strict=True) if len(x) <= MAX_LABELED_POINTS else ()
+        ):
+            axes.annotate(str(points[n]), at, **style)
         axes.set_xlabel(one.label)
         axes.set_ylabel(other.label)
         fig.legend(loc="outside right upper")

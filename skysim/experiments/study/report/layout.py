@@ -141,9 +141,8 @@ def automatic_figure(
     """An automatic figure: a curve, or a heat map if `by` has more than MOST_LINES levels."""
     values = np.array([line.responses[y].value for line in lines])
     values = values[np.isfinite(values)]
-    log = bool(
-        len(values) and values.min() > 0 and values.max() > LOG_RESPONSE_RATIO * values.min()
-    )
+    least = values.min(initial=np.inf)
+    log = bool(0 < least < values.max(initial=0.0) / LOG_RESPONSE_RATIO)
     if by is not None and len(axes[by].levels) > MOST_LINES:
         return Heat(kind="heat", x=x, y=by, value=y, log=log)
     return Curve(kind="curve", x=x, y=y, by=by, log=log)
@@ -152,21 +151,17 @@ def automatic_figure(
 def series(lines: Sequence[PointRow], figure: Curve, study: Study) -> list[Series]:
     """The series of a curve, one for each level of `by`; for a sampled `by`, one for each of GROUPS equal groups."""
     x_axis = axis(study, lines, figure.x)
-    chosen = shown_points(lines, figure, study)
-    groups = {"": chosen}
-    if figure.by is not None:
-        groups = group_points(chosen, axis(study, lines, figure.by), figure.by, study)
     found = []
-    for name, group in groups.items():
+    for name, group in group_points(lines, figure, study).items():
+        if not group:
+            continue
         ordered = sorted(group, key=lambda line: x_axis.coordinate(line.levels[figure.x]))
-        if ordered:
-            x = np.array([x_axis.coordinate(line.levels[figure.x]) for line in ordered])
-            value, low, high = np.array(
-                [line.responses[figure.y][:3] for line in ordered], dtype=float
-            ).T
-            count = np.array([line.responses[figure.y].trials for line in ordered])
-            few = np.array([has_few_values(line, figure.y) for line in ordered])
-            found.append(Series(name, x, value, low, high, count, few))
+        x = np.array([x_axis.coordinate(line.levels[figure.x]) for line in ordered])
+        summaries = [line.responses[figure.y] for line in ordered]
+        value, low, high = np.array([one[:3] for one in summaries], dtype=float).T
+        count = np.array([one.trials for one in summaries])
+        few = np.array([has_few_values(line, figure.y) for line in ordered])
+        found.append(Series(name, x, value, low, high, count, few))
     return found
 
 
@@ -174,18 +169,15 @@ def grid(lines: Sequence[PointRow], figure: Heat, study: Study) -> Grid:
     """The axes and cell values of a heat map."""
     x = axis(study, lines, figure.x)
     y = axis(study, lines, figure.y)
-    columns, rows = (
-        {one.coordinate(level): n for n, level in enumerate(one.levels)} for one in (x, y)
-    )
+    columns, rows = ([one.coordinate(level) for level in one.levels] for one in (x, y))
     shape = len(rows), len(columns)
     value = np.full(shape, np.nan)
     count = np.zeros(shape, int)
     few = np.zeros(shape, bool)
     for line in shown_points(lines, figure, study):
-        cell = (
-            rows[y.coordinate(line.levels[figure.y])],
-            columns[x.coordinate(line.levels[figure.x])],
-        )
+        row = rows.index(y.coordinate(line.levels[figure.y]))
+        column = columns.index(x.coordinate(line.levels[figure.x]))
+        cell = row, column
         value[cell] = line.responses[figure.value].value
         count[cell] = line.responses[figure.value].trials
         few[cell] = has_few_values(line, figure.value)
@@ -248,13 +240,16 @@ def panel(
         summaries: list[Any] = [(costs.get(line.point, nan), nan, nan) for line in lines]
     else:
         summaries = [line.responses[name][:3] for line in lines]
-    ends = [(one.at_least, one.at_most) for one in search.constraints if one.response == name]
-    bounds = [bound for pair in ends for bound in pair if bound is not None]
-    better = next(
-        (f", {one.better} is better" for one in search.objectives if one.response == name), ""
-    )
+    bounds = []
+    for one in search.constraints:
+        if one.response == name:
+            bounds += [bound for bound in (one.at_least, one.at_most) if bound is not None]
+    title = label(name)
+    for goal in search.objectives:
+        if goal.response == name:
+            title += f", {goal.better} is better"
     value, low, high = np.array(summaries, dtype=float).reshape(-1, 3).T
-    return Panel(label(name) + better, value, low, high, bounds)
+    return Panel(title, value, low, high, bounds)
 
 
 # Captions.
@@ -269,20 +264,19 @@ def caption(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
     counts = [one.trials for one in summaries if one.trials]
     if not counts:
         return f"{text}. No trial of it is in yet."
-    text += (
-        f". n = {min(counts)}"
-        + (f" to {max(counts)}" if max(counts) > min(counts) else "")
-        + " a point"
-    )
+    most = f" to {max(counts)}" if max(counts) > min(counts) else ""
+    text += f". n = {min(counts)}{most} a point"
+    mark = "Dotted"
     if isinstance(figure, Curve):
-        text += curve_note(figure, study, lines, summaries)
-    text += "."
-    if isinstance(figure, Curve) and thresholds_of(figure, study, lines):
-        text += " Dashed: a limit; ticks and bars: where it is crossed, with intervals of 95 %."
-    if isinstance(figure, Curve) and expected_value(value) is not None:
-        text += f" Dotted: {expected_value(value):g}, where the claimed errors are true."
+        mark = "Hollow, without a line"
+        text += curve_note(figure, study, lines, summaries) + "."
+        if thresholds_of(figure, study, lines):
+            text += " Dashed: a limit; ticks and bars: where it is crossed, with intervals of 95 %."
+        if (expected := expected_value(value)) is not None:
+            text += f" Dotted: {expected:g}, where the claimed errors are true."
+    else:
+        text += "."
     if any(has_few_values(line, value) for line in shown):
-        mark = "Hollow, without a line" if isinstance(figure, Curve) else "Dotted"
         text += f" {mark}: few of the point's trials have a value (n of them), and these are the easy ones."
     if figure.log and any(one.value <= 0 < one.high for one in summaries):
         text += " Triangles: none was seen, and so much at most."

@@ -14,9 +14,15 @@ from numpy.typing import NDArray
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.experiments.study.plan import Map, Study
-from skysim.experiments.study.report.figures import HATCHED, add_color_bar, color_scale, halo
+from skysim.experiments.study.report.figures import (
+    HATCHED,
+    add_color_bar,
+    color_scale,
+    halo,
+    is_light,
+)
 from skysim.experiments.study.report.layout import caption_title, fixed_text
-from skysim.experiments.study.table import PointRow, axis, group_points, shown_points
+from skysim.experiments.study.table import PointRow, group_points
 from skysim.experiments.study.worst import ColumnsOf, WorstTrial, worst_trials
 from skysim.results import metrics
 from skysim.results.files.row_parts import subset
@@ -75,12 +81,8 @@ def direction_maps(
     lines: Sequence[PointRow], figure: Map, study: Study, columns_of: ColumnsOf
 ) -> list[DirectionMap]:
     """The panels of a map, one for each level of `by`. Raises InputError for points of dome and of sky."""
-    chosen = shown_points(lines, figure, study)
-    groups = {"": chosen}
-    if figure.by is not None:
-        groups = group_points(chosen, axis(study, lines, figure.by), figure.by, study)
     panels = []
-    for label, group in groups.items():
+    for label, group in group_points(lines, figure, study).items():
         columns = columns_of(*(line.point for line in group))
         panels.append(direction_map(label, columns, figure.value))
     return panels
@@ -88,10 +90,10 @@ def direction_maps(
 
 def direction_map(label: str, columns: Columns, response: str) -> DirectionMap:
     """One panel, from the columns of its trials."""
-    in_dome, in_sky = (
-        np.isfinite(columns[name]) if columns else np.zeros(0, bool)
-        for name in ("body_tilt_deg", "boresight_dec_deg")
-    )
+    if not columns:
+        return DirectionMap(label, False, [], [])
+    in_dome = np.isfinite(columns["body_tilt_deg"])
+    in_sky = np.isfinite(columns["boresight_dec_deg"])
     if in_dome.any() and in_sky.any():
         raise InputError(
             f"map of {response}", "trials under a dome and under the stars", "where, to choose one"
@@ -100,11 +102,8 @@ def direction_map(label: str, columns: Columns, response: str) -> DirectionMap:
     known = in_dome | in_sky
     if not known.any():
         return DirectionMap(label, sky, [], [])
-    radial, around = (
-        ("boresight_dec_deg", "boresight_ra_deg") if sky else ("body_tilt_deg", "body_azimuth_deg")
-    )
-    radial_deg = columns[radial]
-    around_deg = columns[around]
+    radial_deg = columns["boresight_dec_deg" if sky else "body_tilt_deg"]
+    around_deg = columns["boresight_ra_deg" if sky else "body_azimuth_deg"]
     summarize = metrics.response(response)
     cells = []
     least = least_values(response)
@@ -179,17 +178,12 @@ def cell_numbers(
 # Drawing.
 
 
-def size_in(panels: Sequence[DirectionMap]) -> tuple[float, float]:
-    """Width and height of the figure in inches."""
-    count = max(len(panels), 1)
-    sky = bool(panels) and panels[0].sky
-    width = min((6.5 if sky else 4.4) * count, 12.5)
-    return width + 1.0, width / count * (0.5 if sky else 1.0) + 0.25
-
-
 def map_png(panels: Sequence[DirectionMap], figure: Map) -> bytes:
     """A map as PNG."""
-    return png(lambda fig: draw_maps(fig, panels, figure), size_in(panels))
+    sky = panels[0].sky
+    width_in = min((6.5 if sky else 4.4) * len(panels), 12.5)
+    height_in = width_in / len(panels) * (0.5 if sky else 1.0)
+    return png(lambda fig: draw_maps(fig, panels, figure), (width_in + 1.0, height_in + 0.25))
 
 
 def draw_maps(fig: Any, panels: Sequence[DirectionMap], figure: Map) -> None:
@@ -222,15 +216,15 @@ def place(radial_deg: Floats | float, around_deg: Floats | float, sky: bool) -> 
     around_deg
         Azimuth, or RA from 180 to 540
     """
-    around = np.radians(360.0 - np.asarray(around_deg)) if sky else np.radians(around_deg)
-    if not sky:
-        return np.stack(
-            np.broadcast_arrays(radial_deg * np.cos(around), radial_deg * np.sin(around)), axis=-1
-        )
-    dec = np.radians(radial_deg)
-    divisor = np.sqrt(1 + np.cos(dec) * np.cos(around / 2))
-    x = 2 * math.sqrt(2) * np.cos(dec) * np.sin(around / 2) / divisor
-    y = math.sqrt(2) * np.sin(dec) / divisor
+    if sky:
+        dec = np.radians(radial_deg)
+        around = np.radians(360.0 - np.asarray(around_deg))
+        divisor = np.sqrt(1 + np.cos(dec) * np.cos(around / 2))
+        x = 2 * math.sqrt(2) * np.cos(dec) * np.sin(around / 2) / divisor
+        y = math.sqrt(2) * np.sin(dec) / divisor
+    else:
+        x = radial_deg * np.cos(np.radians(around_deg))
+        y = radial_deg * np.sin(np.radians(around_deg))
     return np.stack(np.broadcast_arrays(x, y), axis=-1)
 
 
@@ -240,38 +234,26 @@ def draw_cells(axes: Any, panel: DirectionMap, colors: Any) -> None:
 
     shown = [cell for cell in panel.cells if cell.shown]
     faces = [colors.to_rgba(cell.value) for cell in shown]
-    style: Any = {"facecolors": faces, "edgecolors": "white", "linewidths": 0.4}
-    axes.add_collection(PolyCollection([outline(cell, panel.sky) for cell in shown], **style))
+    edges: Any = {"facecolors": faces, "edgecolors": "white", "linewidths": 0.4}
+    axes.add_collection(PolyCollection([outline(cell, panel.sky) for cell in shown], **edges))
     empty = [outline(cell, panel.sky) for cell in panel.cells if not cell.shown]
     axes.add_collection(PolyCollection(empty, **HATCHED))
     for cell in panel.cells if len(panel.cells) <= MAX_NUMBERED else ():
-        dark = cell.shown and np.dot(colors.to_rgba(cell.value)[:3], (0.299, 0.587, 0.114)) < 0.5
-        text = {
-            "ha": "center",
-            "va": "center",
-            "fontsize": 6.5,
-            "color": "#eeeeee" if dark else "#333333",
-        }
+        dark = cell.shown and not is_light(colors.to_rgba(cell.value))
+        style = LABEL | {"fontsize": 6.5, "color": "#eeeeee" if dark else "#333333"}
+        radial_deg = (cell.low_deg + cell.high_deg) / 2
         around_deg = (cell.left_deg + cell.right_deg) / 2
-        axes.text(
-            *place((cell.low_deg + cell.high_deg) / 2, around_deg, panel.sky),
-            str(cell.values),
-            **text,
-        )
+        axes.text(*place(radial_deg, around_deg, panel.sky), str(cell.values), **style)
 
 
 def outline(cell: MapCell, sky: bool) -> Floats:
     """(K, 2) outline of a cell in the drawing."""
-    left = cell.left_deg
-    right = cell.right_deg
-    low = cell.low_deg
-    high = cell.high_deg
-    around = np.linspace(left, right, EDGE_POINTS)
-    radial = np.linspace(low, high, EDGE_POINTS)
-    bottom = place(low, around, sky)
-    end = place(radial, right, sky)
-    top = place(high, around[::-1], sky)
-    begin = place(radial[::-1], left, sky)
+    around = np.linspace(cell.left_deg, cell.right_deg, EDGE_POINTS)
+    radial = np.linspace(cell.low_deg, cell.high_deg, EDGE_POINTS)
+    bottom = place(cell.low_deg, around, sky)
+    end = place(radial, cell.right_deg, sky)
+    top = place(cell.high_deg, around[::-1], sky)
+    begin = place(radial[::-1], cell.left_deg, sky)
     return np.concatenate([bottom, end, top, begin])
 
 
@@ -307,16 +289,10 @@ def mark_worst(axes: Any, panel: DirectionMap) -> None:
         xy = place(one.tilt_deg, one.azimuth_deg, False)
         if panel.sky:
             xy = place(one.dec_deg, (one.ra_deg - 180) % 360 + 180, True)
-        axes.plot(
-            *xy,
-            "o",
-            markersize=8,
-            markerfacecolor="none",
-            markeredgecolor=MARK,
-            path_effects=[halo()],
-        )
-        text = {"fontsize": 8, "color": MARK, "path_effects": [halo()]}
-        axes.annotate(str(rank), xy, xytext=(5, 4), textcoords="offset points", **text)
+        style = {"color": MARK, "path_effects": [halo()]}
+        axes.plot(*xy, "o", markersize=8, markerfacecolor="none", **style)
+        near = {"xytext": (5, 4), "textcoords": "offset points"}
+        axes.annotate(str(rank), xy, **near, fontsize=8, **style)
 
 
 # Caption.
@@ -339,9 +315,6 @@ def caption(
     text += f". Directions of the {axis_text}. n = {min(counts)} to {max(counts)} in a cell"
     if max(len(panel.cells) for panel in panels) <= MAX_NUMBERED:
         text += ", written in it"
-    text += (
-        f"; hatched: fewer than {least_values(figure.value)}"
-        if any(not cell.shown for cell in cells)
-        else ""
-    )
+    if not all(cell.shown for cell in cells):
+        text += f"; hatched: fewer than {least_values(figure.value)}"
     return text + (". Circles: the worst." if any(panel.worst for panel in panels) else ".")

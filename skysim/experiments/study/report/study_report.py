@@ -45,6 +45,7 @@ from skysim.results.report_blocks import (
     Text,
     Tone,
     Verdict,
+    text_column,
 )
 
 POINTS = "Points"  # titles of sections
@@ -311,8 +312,8 @@ def range_table(study: Study, lines: Sequence[PointRow]) -> Table:
 def index_table(indices: Sequence[Index]) -> Table:
     """The Sobol indices, the largest total of each error first."""
     columns = [
-        Column("error", kind="text"),
-        Column("factor", kind="text"),
+        text_column("error"),
+        text_column("factor"),
         Column("alone, rms", "″", ".3g"),
     ]
     columns += [Column("first order"), Column("total")]
@@ -350,7 +351,7 @@ def from_the_last(kept: int, count: int) -> list[tuple[int]]:
 
 def runs_section(store: Store) -> Section:
     """The runs that filled the store."""
-    columns = [Column("engine", kind="text"), Column("workers"), Column("trials")]
+    columns = [text_column("engine"), Column("workers"), Column("trials")]
     columns += [Column("time", "s", ".1f"), Column("trials/s", format=".1f")]
     rows = [
         [run[name] for name in ("engine", "workers", "trials", "seconds")] for run in store.runs()
@@ -395,9 +396,9 @@ def study_figures(
 def worst_table(panels: Sequence[DirectionMap], replay: str) -> Table:
     """The worst trials of a map's panels with the commands that repeat them."""
     columns = [
-        Column("worst", kind="text"),
+        text_column("worst"),
         Column("lights", format=".0f"),
-        Column("what happened", kind="text"),
+        text_column("what happened"),
     ]
     rows = [
         [
@@ -409,7 +410,7 @@ def worst_table(panels: Sequence[DirectionMap], replay: str) -> Table:
         for panel in panels
         for one in panel.worst
     ]
-    return Table([*columns, Column("repeat it", kind="text")], rows)
+    return Table([*columns, text_column("repeat it")], rows)
 
 
 def pivot_table(figure: Curve | Heat, lines: Sequence[PointRow], study: Study) -> Table:
