@@ -141,13 +141,7 @@ def filter_rows(one: Iteration, assumptions: Assumptions) -> list[dict[str, Any]
 
 
 def balance_report(statistics: dict[str, Any], picture: bytes, command: str) -> Report:
-    """The report of a balance.
-
-    Parameters
-    ----------
-    picture
-        See `balance_figure`, PNG
-    """
+    """The report of a balance with the picture of `balance_figure` as PNG bytes."""
     blocks = [
         verdict(statistics),
         Facts(

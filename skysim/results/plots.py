@@ -51,7 +51,7 @@ def png(draw: Callable[[Any], None], size_in: tuple[float, float]) -> bytes:
 
 
 def figure_png(fig: Any, **options: Any) -> bytes:
-    """PNG bytes of a figure. options : of `savefig`"""
+    """PNG bytes of a figure, with options of `savefig`."""
     buffer = io.BytesIO()
     fig.savefig(buffer, format="png", **options)
     return buffer.getvalue()

@@ -221,13 +221,7 @@ class Run(Sequence[Score]):
 
 
 def run_of(flight: Flight, scores: Sequence[Sequence[Score]]) -> Run:
-    """The result of a flight at its end.
-
-    Parameters
-    ----------
-    scores
-        Of each camera, the main one first
-    """
+    """The result of a flight at its end, from the scores of each camera, the main one first."""
     telemetry = flight.telemetry()
     imu_samples = flight.imu_samples()
     heads = {

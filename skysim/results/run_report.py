@@ -145,13 +145,7 @@ def motion_lines(motion: Mapping[str, float]) -> list[str]:
 
 
 def frame_table(angles: tuple[str, str, str], rows: Sequence[FrameRow]) -> Table:
-    """One row per frame: truth, estimate, errors, lights and time.
-
-    Parameters
-    ----------
-    angles
-        Names of the three
-    """
+    """One row per frame: truth, estimate, errors, lights and time; `angles` names the three angles."""
     columns = [
         Column("frame"),
         Column("t", "s", ".3f"),

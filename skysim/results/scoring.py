@@ -17,8 +17,7 @@ from estimator.trackers.pipeline import Report
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Frame, FrameRow, Mount, Truth
 from skysim.results import metrics
-from skysim.results import plots as stretch
-from skysim.results.plots import annotate, visible
+from skysim.results.plots import annotate, reduce_width, visible
 from skysim.results.report import embed
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
@@ -208,5 +207,5 @@ def score(shot: Shot) -> Score:
 
 def image_tag(image: NDArray[np.uint8]) -> str:
     """An HTML <img> element of an image, reduced to at most 800 pixels in width."""
-    data = cv2.imencode(".jpg", stretch.reduce_width(image, 800))[1].tobytes()
+    data = cv2.imencode(".jpg", reduce_width(image, 800))[1].tobytes()
     return f'<img src="{embed(data, "jpeg")}">'

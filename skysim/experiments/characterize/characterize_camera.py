@@ -47,13 +47,7 @@ from skysim.scene.sections.camera import CameraConfig, GaussianPsfConfig
 def characterize_report(
     statistics: dict[str, Any], config: CameraConfig, found: MeasuredSensor, night: Night | None
 ) -> Report:
-    """The report of a characterized camera.
-
-    Parameters
-    ----------
-    statistics
-        As in `characterize.json`
-    """
+    """The report of a characterized camera from the numbers of `characterize.json`."""
     figures = [
         Figure(png(lambda fig: draw_transfer(fig.subplots(1, 2), found), SIZE_IN), TRANSFER_TEXT)
     ]
@@ -239,12 +233,12 @@ def preset_text(
     night: Night | None,
     name: str,
 ) -> str:
-    """The file: YAML with the source of each value.
+    """The text of the preset: YAML with the source of each value.
 
     Parameters
     ----------
     camera
-        Raw section of the camera that was measured
+        The raw section of the camera that was measured
     """
     head = [
         f"# {printable(name)}, measured. Written by `skysim characterize`.",

@@ -88,7 +88,7 @@ def fit(rates: Floats, noise: RateNoise, greatest: float) -> DarkCurrent:
     Parameters
     ----------
     greatest
-        Rate beyond which a pixel saturates in the longest dark
+        The rate in DN/s beyond which a pixel saturates in the longest dark
     """
     start, hot = start_values(rates, noise)
     enough = hot >= LEAST_HOT

@@ -225,10 +225,10 @@ class TransferPoint(NamedTuple):
 
     Attributes
     ----------
+    lit
+        1 for a flat, 0 for a dark
     dark
         Index of its temperature
-    lit
-        1 for a flat, 0 for a dark.
     """
 
     exposure_s: float
@@ -305,13 +305,7 @@ def model(points: Sequence[TransferPoint], values: Floats) -> tuple[Floats, Floa
 
 
 def fit(points: Sequence[TransferPoint], flicker: float) -> Transfer:
-    """Fit levels of darks and flats.
-
-    Parameters
-    ----------
-    flicker
-        Relative, from `lamp_flicker`
-    """
+    """Fit levels of darks and flats with the relative flicker of the lamp from `lamp_flicker`."""
     kept = list(points)
     mean, mean_sigma, variance, variance_sigma = np.array([one.moments for one in kept]).T
     black = min(mean)

@@ -58,6 +58,14 @@ class MeasuredSensor(NamedTuple):
     saturation_dn: float
 
 
+class Findings(NamedTuple):
+    """The photon transfer, and what was found by it so far: estimates by key, and remarks on what is unknown."""
+
+    transfer: Transfer
+    estimates: dict[str, Estimate]
+    remarks: list[str]
+
+
 def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSensor:
     """Every parameter from levels of darks and flats, which `checks` has found to be usable.
 
@@ -82,20 +90,19 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
         [*dark_points, *lit],
         photon_transfer.lamp_flicker(lit, changes, black_dn, int(usable.sum())),
     )
-    estimates: dict[str, Estimate] = {
-        "gain_e_dn": transfer.gain_e_dn,
-        "read_noise_e": transfer.read_noise_e,
-    }
-    remarks: list[str] = []
-    full_well(estimates, remarks, transfer, flat_points)
+    found = Findings(transfer, {}, [])
+    found.estimates["gain_e_dn"] = transfer.gain_e_dn
+    found.estimates["read_noise_e"] = transfer.read_noise_e
+    full_well(found, flat_points)
     chosen = best_temperature(temperatures, darks, transfer)
     at_it = [one for one in darks if one.temperature_c == temperatures[chosen]]
     first, second = (
         fixed_pattern.dark_planes(at_it, transfer, half) for half in ("first_dn", "second_dn")
     )
     ratio = rate_ratio(transfer, own, chosen)
-    dark = dark_parameters(estimates, remarks, at_it, transfer, first, second, own, ratio)
-    doubling(estimates, remarks, transfer, temperatures)
+    dark = dark_parameters(found, at_it, first, second, own, ratio)
+    doubling(found, temperatures)
+    estimates = found.estimates
     estimates["prnu"] = fixed_pattern.prnu(fitted, transfer, first, second, ratio, usable)
     columns = fixed_pattern.column_offset(first[0], second[0], usable, 1 / transfer.values[GAIN])
     estimates["column_offset_e"] = columns
@@ -106,7 +113,14 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
     error = linearity_error(flat_points, transfer)
     saturation_dn = max(one.moments.mean_dn for one in flat_points)
     return MeasuredSensor(
-        estimates, remarks, transfer, dark, temperatures[own], flat_points, error, saturation_dn
+        estimates,
+        found.remarks,
+        transfer,
+        dark,
+        temperatures[own],
+        flat_points,
+        error,
+        saturation_dn,
     )
 
 
@@ -159,17 +173,12 @@ def best_temperature(
     return max(range(len(temperatures)), key=signal)
 
 
-def full_well(
-    estimates: dict[str, Estimate],
-    remarks: list[str],
-    transfer: Transfer,
-    flats: Sequence[TransferPoint],
-) -> None:
+def full_well(found: Findings, flats: Sequence[TransferPoint]) -> None:
     """Full well and nonlinearity: electrons where the signal stays though the exposure grows, and what is missing
     there; c x of the fit."""
-    full = [
-        one for one, is_full in zip(flats, photon_transfer.saturated(flats), strict=True) if is_full
-    ]
+    transfer = found.transfer
+    is_full = photon_transfer.saturated(flats)
+    full = [one for one, chosen in zip(flats, is_full, strict=True) if chosen]
     brightest = max(flats, key=lambda one: one.moments.mean_dn)
     if full:
         level_dn = float(np.mean([one.moments.mean_dn for one in full]))
@@ -177,7 +186,7 @@ def full_well(
     else:
         level_dn = brightest.moments.mean_dn
         sigma_dn = brightest.moments.mean_sigma_dn
-        remarks.append(
+        found.remarks.append(
             f"full well: the flats end at {level_dn:.0f} DN, before the variance turns; allowed: flats to twice the"
             f" longest exposure, {brightest.exposure_s:.3g} s"
         )
@@ -189,19 +198,15 @@ def full_well(
     def signal(p: Floats) -> float:
         return float(photon_transfer.linear_dn(np.array(p[-1] - p[BLACK]), p[CURVATURE]))
 
-    estimates["full_well_e"] = Estimate.normal(
-        *propagate(lambda p: signal(p) / p[GAIN], values, covariance)
-    )
-    estimates["nonlinearity"] = Estimate.normal(
-        *propagate(lambda p: p[CURVATURE] * signal(p), values, covariance)
-    )
+    well = propagate(lambda p: signal(p) / p[GAIN], values, covariance)
+    missing = propagate(lambda p: p[CURVATURE] * signal(p), values, covariance)
+    found.estimates["full_well_e"] = Estimate.normal(*well)
+    found.estimates["nonlinearity"] = Estimate.normal(*missing)
 
 
 def dark_parameters(
-    estimates: dict[str, Estimate],
-    remarks: list[str],
+    found: Findings,
     darks: Sequence[Level],
-    transfer: Transfer,
     first: Planes,
     second: Planes,
     own: int,
@@ -216,6 +221,7 @@ def dark_parameters(
     ratio
         Dark current at it over that of these darks
     """
+    transfer = found.transfer
     weights = first[2]
     gain = transfer.values[GAIN]
     read = transfer.values[READ] + ROUNDING_DN2
@@ -231,7 +237,7 @@ def dark_parameters(
         float(np.sum(weights**2 * read / counts)), float(np.sum(weights**2 * gain * times / counts))
     )
     if not fixed_pattern.is_resolved(rates, noise):
-        unresolved(estimates, remarks, transfer, own, rates, noise, float(times.max()))
+        unresolved(found, own, rates, noise, float(times.max()))
         return None
     top_dn = max(one.greatest_dn for one in darks)
     greatest = (0.98 * top_dn - transfer.values[BLACK]) / times.max()
@@ -242,66 +248,58 @@ def dark_parameters(
         value = ratio * one.value / gain
         return Estimate.lognormal(value, value * math.hypot(one.sigma / one.value, relative))
 
-    estimates["dark_e_s"] = in_electrons(dark.mean)
-    estimates["dsnu"] = dark.dsnu
-    estimates["hot_pixels"] = dark.hot_pixels
+    found.estimates["dark_e_s"] = in_electrons(dark.mean)
+    found.estimates["dsnu"] = dark.dsnu
+    found.estimates["hot_pixels"] = dark.hot_pixels
     if dark.hot is not None:
-        estimates["hot_e_s"] = in_electrons(dark.hot)
+        found.estimates["hot_e_s"] = in_electrons(dark.hot)
     return dark
 
 
 def unresolved(
-    estimates: dict[str, Estimate],
-    remarks: list[str],
-    transfer: Transfer,
+    found: Findings,
     own: int,
     rates: Floats,
     noise: RateNoise,
     longest_s: float,
 ) -> None:
     """Mean dark current alone, where its scatter over the pixels is below the noise; with the exposure to take."""
+    transfer = found.transfer
     value, sigma = propagate(
         lambda p: p[FIRST_DARK + own] / p[GAIN], transfer.values, transfer.covariance
     )
-    estimates["dark_e_s"] = Estimate.normal(value, sigma)
+    found.estimates["dark_e_s"] = Estimate.normal(value, sigma)
     mean = float(np.median(rates))
     if mean > 0 and mean**2 > noise.reading:
         variance, error = fixed_pattern.own_variance(rates, noise)
-        estimates["dsnu"] = Estimate.root(variance / mean**2, error / mean**2)
-        remarks.append("hot pixels: all pixels have the same dark current within its noise")
+        found.estimates["dsnu"] = Estimate.root(variance / mean**2, error / mean**2)
+        found.remarks.append("hot pixels: all pixels have the same dark current within its noise")
         return
     noise_e_s = math.sqrt(noise.reading) / transfer.values[GAIN]
-    needed = (
-        f"{longest_s * noise_e_s / value:.2g} s or more"
-        if value > 3 * sigma
-        else "much longer exposures"
-    )
-    remarks.append(
+    needed = "much longer exposures"
+    if value > 3 * sigma:
+        needed = f"{longest_s * noise_e_s / value:.2g} s or more"
+    found.remarks.append(
         f"DSNU and hot pixels: the scatter of the dark current, {value:.2g} e-/s, is below the noise of"
         f" {longest_s:g} s; allowed: darks of {needed}"
     )
 
 
-def doubling(
-    estimates: dict[str, Estimate],
-    remarks: list[str],
-    transfer: Transfer,
-    temperatures: Sequence[float | None],
-) -> None:
+def doubling(found: Findings, temperatures: Sequence[float | None]) -> None:
     """Temperature that doubles the dark current: ln 2 over the slope of ln D, a weighted line through all temperatures.
 
     The same pixels are compared, so that their scatter does not count.
     """
     known = [one for one in temperatures if one is not None]
     if len(known) < 2:
-        remarks.append(
+        found.remarks.append(
             "doubling temperature: darks at one temperature; allowed: two, 5 K apart or more"
         )
         return
-    rates = transfer.values[FIRST_DARK:]
-    covariance = transfer.covariance[FIRST_DARK:, FIRST_DARK:]
+    rates = found.transfer.values[FIRST_DARK:]
+    covariance = found.transfer.covariance[FIRST_DARK:, FIRST_DARK:]
     if np.any(rates <= 0):
-        remarks.append(
+        found.remarks.append(
             "doubling temperature: no dark current at one of the temperatures; allowed: longer darks"
         )
         return
@@ -310,7 +308,8 @@ def doubling(
     normal = np.linalg.inv(design.T @ weight @ design)
     _, slope = normal @ design.T @ weight @ np.log(rates)
     value = math.log(2) / slope
-    estimates["dark_doubling_c"] = Estimate.normal(value, value / slope * math.sqrt(normal[1, 1]))
+    sigma = value / slope * math.sqrt(normal[1, 1])
+    found.estimates["dark_doubling_c"] = Estimate.normal(value, sigma)
 
 
 def linearity_error(flats: Sequence[TransferPoint], transfer: Transfer) -> float:

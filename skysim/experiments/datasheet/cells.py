@@ -173,13 +173,7 @@ class Designer:
         return max(len(self.temperatures_c), 1)
 
     def settings(self, draw: Draw, turn_deg: float = 0.0) -> Settings:
-        """Settings of a draw, with new noise.
-
-        Parameters
-        ----------
-        turn_deg
-            In addition to that of the draw's attitude
-        """
+        """Settings of a draw, with new noise; `turn_deg` is added to the rotation of the draw's attitude."""
         self.noise += 1
         chosen: Settings = {key: 1000 + draw.unit for key in self.seeds}
         if self.temperatures_c:

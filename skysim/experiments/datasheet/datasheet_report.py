@@ -11,9 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.core.files import make_folder, to_json, write_bytes, write_text
-from skysim.experiments.datasheet import statement as statements
 from skysim.experiments.datasheet.cells import MeasuredFrames
-from skysim.experiments.datasheet.statement import NAMES, Statement
+from skysim.experiments.datasheet.statement import (
+    NAMES,
+    Statement,
+    StatementSection,
+    numbers,
+    percent,
+    sections,
+    size,
+)
 from skysim.experiments.datasheet.variance_components import GROUPS, Components
 from skysim.results.plots import INK, png
 from skysim.results.report import Report
@@ -184,22 +191,22 @@ def command(sheet: MeasuredFrames, quick: bool) -> str:
 def datasheet_report(statement: Statement, quick: bool) -> Report:
     """The report of a statement."""
     sheet = statement.sheet
-    sections = [
+    shown = [
         Section(one.title, section_blocks(one, statement), on_terminal=n < PRINTED)
-        for n, one in enumerate(statements.sections(statement))
+        for n, one in enumerate(sections(statement))
     ]
     text = Text(f"{STANDARD} {sheet.columns['trial'].size} frames.", on_terminal=False)
     return Report(
         f"Datasheet: {sheet.scene.title}",
-        [verdict(statement), text, *sections],
+        [verdict(statement), text, *shown],
         command(sheet, quick),
     )
 
 
 def verdict(statement: Statement) -> Verdict:
     """How often an attitude is right, and its error."""
-    across, about = (statements.size(table.squares["total"]) for table in statement.terms.values())
-    right = statements.percent(statement.counts.share("right"))
+    across, about = (size(table.squares["total"]) for table in statement.terms.values())
+    right = percent(statement.counts.share("right"))
     return Verdict(
         f"{right} % of frames lost in space have a right attitude, {statement.counts.false} of"
         f" {statement.counts.frames} a false one; error of one axis (1 σ) {across}″ across the boresight,"
@@ -208,7 +215,7 @@ def verdict(statement: Statement) -> Verdict:
     )
 
 
-def section_blocks(section: statements.StatementSection, statement: Statement) -> list[Block]:
+def section_blocks(section: StatementSection, statement: Statement) -> list[Block]:
     """A section's texts, figures and table."""
     texts = [Text(text) for text in section.texts]
     figures = [
@@ -232,6 +239,6 @@ def write_all(folder: Path, statement: Statement, report: Report) -> dict[str, P
     for name, figure in figure_files(report.blocks):
         write_bytes(folder / name, figure.image)
     paths = {"json": folder / "datasheet.json", "report": folder / "datasheet.html"}
-    write_text(paths["json"], to_json(statements.numbers(statement)))
+    write_text(paths["json"], to_json(numbers(statement)))
     report.save(paths["report"])
     return paths

@@ -47,15 +47,16 @@ class Counts(NamedTuple):
 
 def counts(sheet: MeasuredFrames, rows: list[int]) -> Counts:
     """The outcomes of some cells."""
-    right = sheet.right(rows)
-    false = sheet.false(rows)
-    return Counts(right.size, int(right.sum()), int((~right & ~false).sum()), int(false.sum()))
+    return tally(sheet.right(rows), sheet.false(rows))
 
 
 def counts_of_fields(sheet: MeasuredFrames, rows: list[int]) -> Counts:
     """The outcomes of fields with a frame in each of some cells, which succeed and fail together."""
-    false = sheet.false(rows).any(axis=0)
-    right = sheet.right(rows).all(axis=0)
+    return tally(sheet.right(rows).all(axis=0), sheet.false(rows).any(axis=0))
+
+
+def tally(right: Any, false: Any) -> Counts:
+    """Counts from boolean arrays of right and of false attitudes; all others are refused."""
     return Counts(right.size, int(right.sum()), int((~right & ~false).sum()), int(false.sum()))
 
 
@@ -74,11 +75,10 @@ def runs_needed(share: float, failures: int = 0, confidence: float = metrics.CON
         high = 2 * high
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (
-            (middle, high)
-            if metrics.exact_bounds(failures, middle, confidence)[1] > 1 - share
-            else (low, middle)
-        )
+        if metrics.exact_bounds(failures, middle, confidence)[1] > 1 - share:
+            low = middle
+        else:
+            high = middle
     return high
 
 
@@ -121,14 +121,14 @@ def consistency(sheet: MeasuredFrames) -> dict[str, Any]:
     rows = sheet.rows("sky")
     right = sheet.right(rows)
     nees = sheet.column("nees", rows)[right]
-    within = [(level, int(np.sum(nees <= chdtri(3, 1 - level))), nees.size) for level in LEVELS]
+    within = []
+    for level in LEVELS:
+        hits = int(np.sum(nees <= chdtri(3, 1 - level)))
+        within.append({"level": level, "share": metrics.proportion(hits, nees.size)})
     x, y, _ = sheet.errors(rows)[:, right] ** 2
     return {
         "nees": metrics.resampled(nees, np.mean),
-        "within": [
-            {"level": level, "share": metrics.proportion(hits, total)}
-            for level, hits, total in within
-        ],
+        "within": within,
         "y_over_x": mean_square_ratio(y, x),
     }
 
@@ -147,8 +147,13 @@ def pair_row(sheet: MeasuredFrames, rows: list[int]) -> dict[str, Any]:
             f"nea_{name}": noise_equivalent_angle(first[axes], second[axes])
             for name, axes in GROUPS.items()
         },
-        **{f"rms_{name}": rms(sheet, rows, axes) for name, axes in GROUPS.items()},
+        **rms_by_group(sheet, rows),
     }
+
+
+def rms_by_group(sheet: MeasuredFrames, rows: list[int]) -> dict[str, float]:
+    """The rms error about one axis across and about the boresight, by `rms_` and the name of the group."""
+    return {f"rms_{name}": rms(sheet, rows, axes) for name, axes in GROUPS.items()}
 
 
 def by_rate(sheet: MeasuredFrames) -> list[dict[str, Any]]:
@@ -183,15 +188,8 @@ def by_acceleration(sheet: MeasuredFrames) -> list[dict[str, Any]]:
         lag_arcsec = 3600 * acceleration * sheet.scene.exposure.time_s**2 / 24
         at_rest = rms(sheet, sheet.rows("terms", unit=0, state=0, attitude=0), GROUPS["across"])
         predicted = math.sqrt(at_rest**2 + lag_arcsec**2 / 2)  # about one of two axes
-        errors = {f"rms_{name}": rms(sheet, rows, axes) for name, axes in GROUPS.items()}
-        found.append(
-            {
-                "acceleration_deg_s2": acceleration,
-                "counts": counts_of_fields(sheet, rows),
-                "predicted_across": predicted,
-                **errors,
-            }
-        )
+        row = {"acceleration_deg_s2": acceleration, "counts": counts_of_fields(sheet, rows)}
+        found.append(row | {"predicted_across": predicted} | rms_by_group(sheet, rows))
     return found
 
 
@@ -258,10 +256,6 @@ def disturbances(sheet: MeasuredFrames) -> list[dict[str, Any]]:
         for name in sheet.levels("disturbance", "disturbance")
     }
     return [
-        {
-            "disturbance": name,
-            "counts": counts(sheet, rows),
-            **{f"rms_{group}": rms(sheet, rows, axes) for group, axes in GROUPS.items()},
-        }
+        {"disturbance": name, "counts": counts(sheet, rows)} | rms_by_group(sheet, rows)
         for name, rows in cases.items()
     ]

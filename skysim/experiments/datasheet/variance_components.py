@@ -78,16 +78,13 @@ def effects(means: Floats, present: list[int]) -> dict[Subset, float]:
         effect = np.zeros_like(means)
         for part in subsets(list(subset)):
             others = tuple(axis for axis in range(means.ndim) if axis not in part)
-            effect = effect + (-1) ** (len(subset) - len(part)) * means.mean(
-                axis=others, keepdims=True
-            )
+            sign = (-1) ** (len(subset) - len(part))
+            effect = effect + sign * means.mean(axis=others, keepdims=True)
         freedom = np.prod([counts[axis] - 1 for axis in subset])
         square = float(np.sum(np.broadcast_to(effect, means.shape) ** 2) / freedom)
-        shared = {
-            one: float(np.prod(np.delete(counts, one))) for one in found if set(subset) < set(one)
-        }
-        rest = sum(found[one] * count for one, count in shared.items())
-        found[subset] = (square - rest) / float(np.prod(np.delete(counts, subset)))
+        larger = [one for one in found if set(subset) < set(one)]
+        shared = sum(found[one] * float(np.prod(np.delete(counts, one))) for one in larger)
+        found[subset] = (square - shared) / float(np.prod(np.delete(counts, subset)))
     return found
 
 
@@ -131,18 +128,17 @@ def of_axes(errors: Floats) -> Components:
     return Components(*np.mean([components(one) for one in errors], axis=0).tolist())
 
 
-def with_intervals(errors: Floats, confidence: float = CONFIDENCE) -> dict[str, Bounded]:
+def with_intervals(errors: Floats) -> dict[str, Bounded]:
     """The components of (axes, fields, ...) errors and their total, each with its bootstrap interval over the fields.
 
     Fields are the independent draws; units and states are those that were measured.
     """
+    names = (*Components._fields, "total")
     drawn = [of_axes(errors[:, rows]) for rows in resamples(errors.shape[1])]
     values = of_axes(errors)
-    table = np.array([(*one, one.total) for one in drawn])
-    rows = zip((*values, values.total), table.T, strict=True)
     return {
-        name: bounded(value, column, confidence)
-        for name, (value, column) in zip((*Components._fields, "total"), rows, strict=True)
+        name: bounded(getattr(values, name), np.array([getattr(one, name) for one in drawn]))
+        for name in names
     }
 
 
@@ -152,9 +148,9 @@ def resamples(count: int) -> Iterator[NDArray[np.int64]]:
     return (rng.integers(count, size=count) for _ in range(RESAMPLES))
 
 
-def bounded(value: float, drawn: Floats, confidence: float = CONFIDENCE) -> Bounded:
+def bounded(value: float, drawn: Floats) -> Bounded:
     """A value with the percentile interval of its bootstrap samples."""
-    low, high = np.percentile(drawn, [50 * (1 - confidence), 50 * (1 + confidence)])
+    low, high = np.percentile(drawn, [50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE)])
     return Bounded(float(value), float(low), float(high))
 
 
@@ -279,13 +275,11 @@ def mean_errors(sheet: MeasuredFrames) -> list[Bounded]:
 
     errors, _ = term_errors(sheet)
     means = errors.reshape(*errors.shape[:2], -1).mean(axis=2)
-    half = (
-        stdtrit(means.shape[1] - 1, 0.975) * means.std(axis=1, ddof=1) / math.sqrt(means.shape[1])
-    )
-    return [
-        Bounded(float(m), float(m - h), float(m + h))
-        for m, h in zip(means.mean(axis=1), half, strict=True)
-    ]
+    fields = means.shape[1]
+    mean = means.mean(axis=1)
+    half = stdtrit(fields - 1, 0.975) * means.std(axis=1, ddof=1) / math.sqrt(fields)
+    ends = np.column_stack([mean, mean - half, mean + half])
+    return [Bounded(*one) for one in ends.tolist()]
 
 
 def squares_by_field(sheet: MeasuredFrames, rows: list[int], axes: slice) -> Floats:
@@ -299,13 +293,11 @@ def causes(sheet: MeasuredFrames) -> list[dict[str, Any]]:
     for name in sheet.levels("cause", "cause"):
         rows = sheet.rows("cause", cause=name)
         before = [row for row in sheet.rows("total") if sheet.cells[row].levels["draw"] < len(rows)]
-        left = {
-            group: mean_square_ratio(
-                squares_by_field(sheet, rows, axes), squares_by_field(sheet, before, axes)
-            )
-            for group, axes in GROUPS.items()
-        }
-        found.append({"cause": name, **left})
+        row: dict[str, Any] = {"cause": name}
+        for group, axes in GROUPS.items():
+            after, squares = (squares_by_field(sheet, cells, axes) for cells in (rows, before))
+            row[group] = mean_square_ratio(after, squares)
+        found.append(row)
     return sorted(found, key=lambda one: one["across"].value + one["about"].value)
 
 

@@ -339,13 +339,7 @@ def find_faults(run: SurveyRun) -> DomeFaults:
 
 
 def fault_lines(faults: Mapping[str, Any]) -> Iterator[str]:
-    """Faults as lines of text, by LED number, and a summary.
-
-    Parameters
-    ----------
-    faults
-        The fields of a `DomeFaults`
-    """
+    """The fields of a `DomeFaults` as lines of text, one per fault, and a summary line."""
     for led in faults["dark"]:
         yield f"LED {led} is dark"
     for led, distance_m in faults["displaced"].items():

@@ -26,8 +26,7 @@ from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, Survey
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab
-from skysim.tracking import factory as tracker_settings
-from skysim.tracking import onboard_model
+from skysim.tracking import factory, onboard_model
 
 # Attitudes at which the vehicle is held for a survey: by a plan, or random.
 
@@ -141,7 +140,7 @@ def render_stops(
 
 def take_frames(lab: Lab, lab_from_body: Rotation) -> Iterator[tuple[Frame, Truth, Centroids]]:
     """Each frame at these stops, with its truth and its detections."""
-    settings = tracker_settings.assumed_settings(lab.scene)
+    settings = factory.assumed_settings(lab.scene)
     camera = onboard_model.assumed_camera(lab.scene)
     for frame, truth in render_stops(lab, lab_from_body):
         yield frame, truth, detect_lights(settings, camera, frame.image_dn)

@@ -116,12 +116,12 @@ def read_attitudes(path: Path) -> dict[str, Rotation]:
 def write_attitudes(
     path: Path, names: Sequence[str], lab_from_body: Rotation, leds: NDArray[np.int64] | None = None
 ) -> None:
-    """Write attitudes as `read_attitudes` reads them
+    """Write attitudes as `read_attitudes` reads them.
 
     Parameters
     ----------
     leds
-        Number of LEDs in view, for a plan.
+        (F,) number of LEDs in view at each attitude of a plan
     """
     lines = [",".join((*COLUMNS, "leds") if leds is not None else COLUMNS)]
     for n, (name, angles) in enumerate(zip(names, euler_deg(lab_from_body), strict=True)):

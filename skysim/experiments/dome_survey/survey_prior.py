@@ -170,13 +170,7 @@ def require_dome(scene: Scene) -> DomeConfig:
 def survey_model(
     known: CalibrationPrior | DomeSurvey, uncertainty: SurveyUncertainty, noise_px: float
 ) -> SurveyModel:
-    """The model by which the estimator plans and predicts.
-
-    Parameters
-    ----------
-    known
-        Before a survey, or from it
-    """
+    """The model by which the estimator plans and predicts, from what is known before a survey or by it."""
     sigmas = (
         uncertainty.led_sigma_m,
         uncertainty.lever_sigma_m,

@@ -47,7 +47,7 @@ from skysim.experiments.dome_survey.survey_prior import (
 )
 from skysim.experiments.dome_survey.survey_report import led_errors
 from skysim.experiments.tracker_comparison import with_config
-from skysim.results.files import recording as frame_files
+from skysim.results.files import recording
 from skysim.scene.scene import Scene
 from skysim.simulation.lab import Lab, build_lab
 
@@ -130,7 +130,7 @@ def simulated_frames(
         take_frames(lab, lab_from_body), measured, strict=True
     ):
         if folder is not None:
-            frame_files.write_fits(folder / FRAME.format(frame.index), frame, truth, lab.scene)
+            recording.write_fits(folder / FRAME.format(frame.index), frame, truth, lab.scene)
         yield SurveyFrame(lights, body_from_lab, frame.index)
 
 

@@ -60,13 +60,7 @@ FILES = (("map, for tracker.map", "leds.ecsv"), ("every number of this page", "s
 
 
 def survey_report(statistics: dict[str, Any], run: SurveyRun, command: str) -> Report:
-    """The report of a survey.
-
-    Parameters
-    ----------
-    statistics
-        As in `survey.json`
-    """
+    """The report of a survey from the numbers of `survey.json`."""
     reached = accuracy_statistics(run.accuracy)
     dome = Figure(
         Path(statistics["picture"]).read_bytes(),

@@ -42,13 +42,7 @@ MEANINGS = (
 def papers_report(
     reproductions: Sequence[Reproduction], ids: Sequence[str], quick: bool, seed: int
 ) -> Report:
-    """The report of some experiments.
-
-    Parameters
-    ----------
-    ids, quick, seed
-        As the command names them
-    """
+    """The report of some experiments; the other arguments are those of the command that repeats it."""
     papers = dict.fromkeys(one.published.paper for one in reproductions)
     blocks = [
         verdict(reproductions),

@@ -54,10 +54,8 @@ def claimed_errors(lines: Sequence[PointRow], place: Place) -> list[str]:
         ]
     worst, line = max(false, key=lambda pair: abs(math.log(max(pair[0].value, 1e-9) / 3)))
     factor = math.sqrt(worst.value / 3)
-    size = "small"
-    if factor < 1:
-        factor = 1 / factor
-        size = "large"
+    size = "small" if factor >= 1 else "large"
+    factor = max(factor, 1 / factor)
     at = f" at {place(line)}" if len(found) > 1 else ""
     count = f", at {len(false)} of {len(found)} points" if len(found) > 1 else ""
     wrong = line.responses.get("wrong", metrics.NO_VALUE).value
@@ -78,28 +76,22 @@ def known(nees: Summary) -> Summary:
 
 def effect_of_wrong_matches(lines: Sequence[PointRow], place: Place) -> list[str]:
     """How many matches are wrong, and whether the attitude errs more than claimed because of them; none if none are."""
-    shares = [
-        one
-        for line in lines
-        if (one := line.responses.get("mismatched", metrics.NO_VALUE)).value > 0
-    ]
+    known = [line.responses.get("mismatched", metrics.NO_VALUE) for line in lines]
+    shares = [one for one in known if one.value > 0]
     if not shares:
         return []
     matches = sum(one.trials for one in shares)
     count = round(sum(one.value * one.trials for one in shares))
     text = f"There {count:,} of {matches:,} matches {'is' if count == 1 else 'are'} wrong"
-    misled = [(one, line) for line in lines if (one := line.responses["misled"]).value > 0]
+    misled = [line for line in lines if line.responses["misled"].value > 0]
     if not misled:
         return [f"{text}; the attitude is unaffected: all errors are as claimed."]
-    most, line = max(misled, key=lambda pair: pair[0].value)
-    at = (
-        f" at {len(misled)} of {len(lines)} points, most at {place(line)}:"
-        if len(lines) > 1
-        else " in"
-    )
-    share = (
-        f"{100 * most.value:.3g} % of the frames ({100 * most.low:.3g} to {100 * most.high:.3g} %)"
-    )
+    line = max(misled, key=lambda line: line.responses["misled"].value)
+    most = line.responses["misled"]
+    at = " in"
+    if len(lines) > 1:
+        at = f" at {len(misled)} of {len(lines)} points, most at {place(line)}:"
+    share = f"{percent(most.value)} of the frames ({interval(most)})"
     return [f"{text}; the attitude errs more than claimed{at} {share}."]
 
 
@@ -155,7 +147,7 @@ def headline(
     worst
         The command that lists the worst trials
     """
-    done = [line for line in lines if line.trials and np.isfinite(line.responses["wrong"].value)]
+    done = answered(lines)
     if not done:
         return []
     place = placer(study, done)
@@ -171,12 +163,17 @@ def headline(
     return [*found, *runs_needed(done, list(EVENTS)), *claimed_errors(done, place)]
 
 
+def answered(lines: Sequence[PointRow]) -> list[PointRow]:
+    """The points of which a trial has an answer."""
+    return [line for line in lines if line.trials and np.isfinite(line.responses["wrong"].value)]
+
+
 def verdict(study: Study, lines: Sequence[PointRow]) -> str:
     """What the study answers, in three or four short sentences; "" if no trial has an answer.
 
     1. Its thresholds. 2. How many frames are refused. 3. How many attitudes are wrong.
     """
-    done = [line for line in lines if line.trials and np.isfinite(line.responses["wrong"].value)]
+    done = answered(lines)
     if not done:
         return ""
     place = placer(study, done)
@@ -207,12 +204,10 @@ def worst_share(name: str, never: str, text: str, lines: Sequence[PointRow], pla
 def ranges(study: Study, lines: Sequence[PointRow]) -> list[str]:
     """Smallest and largest value of each response over the points, but of those that the headline is about."""
     done = [line for line in lines if line.trials]
+    if not done:
+        return []
     place = placer(study, done)
-    return (
-        [response_range(name, done, place) for name in study.responses if name not in SHARES]
-        if done
-        else []
-    )
+    return [response_range(name, done, place) for name in study.responses if name not in SHARES]
 
 
 def placer(study: Study, lines: Sequence[PointRow]) -> Place:
@@ -270,20 +265,17 @@ def range_rows(study: Study, lines: Sequence[PointRow]) -> list[list[str]]:
 
 def event(text: str, shares: Sequence[Summary], lines: Sequence[PointRow], place: Place) -> str:
     """How often an event happens: the point where it is most frequent, and an upper bound where it was never seen."""
-    known = [
-        (share, line) for share, line in zip(shares, lines, strict=True) if np.isfinite(share.value)
-    ]
+    pairs = zip(shares, lines, strict=True)
+    known = [(share, line) for share, line in pairs if np.isfinite(share.value)]
     if not known:
         return f"{text}: unknown, as the tracker does not name its lights."
     never = [share for share, _ in known if share.value == 0]
     if len(never) == len(known):
         return f"{text}: {none_of(never)}."
     most, line = max(known, key=lambda pair: pair[0].value)
-    where = (
-        f" at {len(known) - len(never)} of {len(known)} points, most at {place(line)}:"
-        if len(known) > 1
-        else ""
-    )
+    where = ""
+    if len(known) > 1:
+        where = f" at {len(known) - len(never)} of {len(known)} points, most at {place(line)}:"
     found = f"{text}:{where} {percent(most.value)} of the frames ({interval(most)})"
     return f"{found}; {none_of(never)} at the other points." if never else f"{found}."
 

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from skysim.core.yaml_reader import override_texts
-from skysim.experiments.study import study_file
-from skysim.experiments.study import table as tables
+from skysim.experiments.study import study_file, table
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.plan import Plan
 from skysim.experiments.study.report.study_report import study_report
@@ -33,14 +32,14 @@ class StudyResult:
         from astropy.table import Table
 
         with store.open_store(self.path) as kept:
-            return Table(tables.to_columns(tables.table(kept, self.plan.study.responses)))
+            return Table(table.to_columns(table.table(kept, self.plan.study.responses)))
 
     def trials(self) -> Table:
         """One row per trial: design point, factors and every measured quantity."""
         from astropy.table import Table
 
         with store.open_store(self.path) as kept:
-            return Table(dict(tables.trial_columns(kept)))
+            return Table(dict(table.trial_columns(kept)))
 
     def report(self) -> Report:
         """Its report for people: answers, figures and tables."""

@@ -28,8 +28,7 @@ from skysim.core.units import ConfigModel, Fraction, NotNegative, Number, Time, 
 from skysim.core.yaml_reader import explain, is_file, set_key
 from skysim.experiments.study.factors import Design, Factor, Point, Settings, Value, points
 from skysim.results.files.parts import Prices, find_prices, read_prices
-from skysim.scene.loader import find as find_scene
-from skysim.scene.loader import load as load_scene
+from skysim.scene import loader
 from skysim.scene.scene import Scene
 
 TRIAL = "trial."
@@ -372,9 +371,8 @@ class Search(ConfigModel):
     @property
     def responses(self) -> list[str]:
         """The responses of all objectives and constraints, each once."""
-        names = [one.response for one in self.objectives] + [
-            one.response for one in self.constraints
-        ]
+        names = [one.response for one in self.objectives]
+        names += [one.response for one in self.constraints]
         return list(dict.fromkeys(names))
 
 
@@ -415,6 +413,12 @@ class Study(ConfigModel):
     figures: tuple[Figure, ...] = ()
     thresholds: tuple[Threshold, ...] = ()
     optimize: Search | None = None
+
+    @property
+    def search(self) -> Search:
+        """Section `optimize` of a study that has one."""
+        assert self.optimize is not None
+        return self.optimize
 
     def trial_count(self, points: int) -> int:
         """Number of trials at so many points or, of a search that runs to its end, of all candidates."""
@@ -487,8 +491,7 @@ class Plan:
     @property
     def digest(self) -> str:
         """Hash of everything that affects a trial's outcome; title, figures, responses and budget may change."""
-        tree = self.study.model_dump(mode="json", by_alias=True)
-        keys = (
+        keys = {
             "scene",
             "seed",
             "set",
@@ -499,9 +502,11 @@ class Plan:
             "paired",
             "hardware",
             "optimize",
-        )
-        parts = {"prices": self.prices.parts} if self.prices else {}
-        return digest({key: tree[key] for key in keys} | parts)
+        }
+        tree = self.study.model_dump(mode="json", by_alias=True, include=keys)
+        if self.prices:
+            tree["prices"] = self.prices.parts
+        return digest(tree)
 
 
 def digest(value: Any) -> str:
@@ -517,11 +522,10 @@ def find(name: str) -> Path:
 
 def make_plan(path: Path, study: Study, trial: dict[str, Any], programs: Mapping[str, str]) -> Plan:
     """The plan of a study; `trial` is the section as written in the file, with units. Raises InputError for prices."""
-    chosen = [] if study.optimize else points(study.design, study.factors, study.seed)
-    folder = str(path.resolve().parent)
+    folder = path.resolve().parent
     spec = TrialSpec(
         study.scene,
-        folder,
+        str(folder),
         study.seed,
         study.set,
         trial,
@@ -529,10 +533,10 @@ def make_plan(path: Path, study: Study, trial: dict[str, Any], programs: Mapping
         study.hardware,
         dict(programs),
     )
-    parts = study.optimize.cost.parts if study.optimize else None
-    return Plan(
-        path, study, spec, chosen, prices_of(parts, path.resolve().parent) if parts else None
-    )
+    if study.optimize is None:
+        return Plan(path, study, spec, points(study.design, study.factors, study.seed))
+    parts = study.optimize.cost.parts
+    return Plan(path, study, spec, [], prices_of(parts, folder) if parts else None)
 
 
 def prices_of(parts: str, folder: Path) -> Prices:
@@ -549,10 +553,10 @@ def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:
     values = spec.base | settings
     name = str(values.pop("scene", spec.scene))
     local = Path(spec.folder) / name
-    path = local if local.suffix in {".yaml", ".yml"} and is_file(local) else find_scene(name)
+    path = local if local.suffix in {".yaml", ".yml"} and is_file(local) else loader.find(name)
     overrides = {key: one_line(value) for key, value in values.items() if not key.startswith(TRIAL)}
-    # `unused_options` refuses, for the whole study.
-    return load_scene(path, overrides, refuses_unused=False), trial
+    # `unused_options` refuses unused keys, for the whole study.
+    return loader.load(path, overrides, refuses_unused=False), trial
 
 
 def resolve_trial(spec: TrialSpec, settings: Settings) -> Trial:

@@ -100,8 +100,7 @@ def si(value: Value) -> float:
 
 def cost(plan: Plan, point: Point) -> tuple[float, str]:
     """Cost of a point, and why it has none (NaN): base, `per` and `levels` of the factors, and the parts' total."""
-    assert plan.study.optimize is not None
-    config = plan.study.optimize.cost
+    config = plan.study.search.cost
     total = factors_cost(config, point.levels)
     if plan.prices is None:
         return total, ""
@@ -115,11 +114,8 @@ def cost(plan: Plan, point: Point) -> tuple[float, str]:
 def factors_cost(config: Cost, levels: Mapping[str, Value]) -> float:
     """base + sum of per[factor] * value + prices of the named levels, with values in SI units."""
     linear = sum(price * si(levels[name]) for name, price in config.per.items())
-    return (
-        config.base
-        + linear
-        + sum(price[str(levels[name])] for name, price in config.levels.items())
-    )
+    named = sum(price[str(levels[name])] for name, price in config.levels.items())
+    return config.base + linear + named
 
 
 STARTUP_CANDIDATES = 10  # random candidates before the sampler uses earlier results
@@ -225,8 +221,7 @@ def check_response(response: str, where: str) -> None:
 
 def evaluate_candidate(plan: Plan, number: int, point: Point, columns: Columns) -> Candidate:
     """The candidate computed from the columns of all its trials, and its cost."""
-    config = plan.study.optimize
-    assert config is not None
+    config = plan.study.search
     figures = {name: metrics.response(name)(columns) for name in config.responses if name != COST}
     price, unpriced = cost(plan, point)
     values = {name: figure.value for name, figure in figures.items()} | {COST: price}
@@ -246,17 +241,12 @@ def violation(limit: Constraint, value: float) -> float:
     """Relative violation of a constraint, (value - bound) / |bound|; <= 0 if it holds, MISSING_VIOLATION for NaN."""
     if math.isnan(value):
         return MISSING_VIOLATION
-    over = (
-        []
-        if limit.at_most is None
-        else [(value - limit.at_most) / max(abs(limit.at_most), MIN_SCALE)]
-    )
-    under = (
-        []
-        if limit.at_least is None
-        else [(limit.at_least - value) / max(abs(limit.at_least), MIN_SCALE)]
-    )
-    return max(over + under)
+    excess = []
+    if limit.at_most is not None:
+        excess.append((value - limit.at_most) / max(abs(limit.at_most), MIN_SCALE))
+    if limit.at_least is not None:
+        excess.append((limit.at_least - value) / max(abs(limit.at_least), MIN_SCALE))
+    return max(excess)
 
 
 def scene_error(columns: Columns) -> str:
@@ -273,29 +263,23 @@ def front(config: Search, candidates: Sequence[Candidate]) -> list[Candidate]:
     feasible = [one for one in candidates if one.feasible]
     sign = np.array([1.0 if one.better == "less" else -1.0 for one in config.objectives])
     values = np.array([one.objectives for one in feasible]).reshape(-1, len(sign)) * sign
-    dominated = [
-        np.any(np.all(values <= one, axis=1) & np.any(values < one, axis=1)) for one in values
-    ]
-    best = [n for n in range(len(feasible)) if not dominated[n]]
-    return [feasible[n] for n in sorted(best, key=lambda n: tuple(values[n]))]
+    best = []
+    for one, own in zip(feasible, values, strict=True):
+        if not np.any(np.all(values <= own, axis=1) & np.any(values < own, axis=1)):
+            best.append((tuple(own), one))
+    return [one for _, one in sorted(best, key=lambda pair: pair[0])]
 
 
 def front_cells(study: Study, result: SearchResult) -> tuple[list[str], list[list[str]]]:
     """Column heads and cell texts of the front: candidate, levels, objectives and what the constraints bound."""
-    assert study.optimize is not None
-    named = [one.response for one in study.optimize.objectives]
-    shown = named + [name for name in study.optimize.responses if name not in (*named, COST)]
-    rows = [
-        [
-            str(one.number),
-            *map(format_level, one.levels.values()),
-            *(
-                f"{one.cost:.4g}" if name == COST else format_summary(one.figures[name])
-                for name in shown
-            ),
-        ]
-        for one in result.front
-    ]
+    named = [one.response for one in study.search.objectives]
+    shown = named + [name for name in study.search.responses if name not in (*named, COST)]
+    rows = []
+    for one in result.front:
+        figures = {name: format_summary(figure) for name, figure in one.figures.items()}
+        figures[COST] = f"{one.cost:.4g}"
+        levels = map(format_level, one.levels.values())
+        rows.append([str(one.number), *levels, *(figures[name] for name in shown)])
     return ["candidate", *study.factors, *shown], rows
 
 
@@ -308,16 +292,13 @@ def front_columns(result: SearchResult) -> dict[str, Any]:
 def collect_result(plan: Plan, store: Store) -> SearchResult:
     """The candidates in a store whose trials are complete, and their front; the search may be unfinished."""
     study = plan.study
-    replicates = plan.study.replicates
-    assert study.optimize is not None
-    evaluated = [
-        evaluate_candidate(plan, n, point, columns)
-        for n, point in enumerate(store.points())
-        if len((columns := store.point_columns(n))["trial"]) == replicates
-    ]
-    return SearchResult(
-        evaluated, front(study.optimize, evaluated), len(evaluated) == study.optimize.candidates
-    )
+    evaluated = []
+    for n, point in enumerate(store.points()):
+        columns = store.point_columns(n)
+        if len(columns["trial"]) == study.replicates:
+            evaluated.append(evaluate_candidate(plan, n, point, columns))
+    finished = len(evaluated) == study.search.candidates
+    return SearchResult(evaluated, front(study.search, evaluated), finished)
 
 
 # The search.
@@ -329,8 +310,7 @@ def search(plan: Plan, store: Store, engine: Engine, watch: Watch | None = None)
     Raises InputError, also if optuna is not installed or proposes other candidates than those in the store.
     """
     study = plan.study
-    config = plan.study.optimize
-    assert config is not None
+    config = study.search
     sampler = create_sampler(study)
     stored = store.points()
     total = Progress(config.candidates * study.replicates, **store.counts())
@@ -367,18 +347,15 @@ def create_sampler(study: Study) -> Any:
         raise InputError(
             "optimize", "optuna is not installed", "after pip install 'skysim[optuna]'"
         ) from None
-    assert study.optimize is not None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     seed = int(np.random.SeedSequence(study.seed).generate_state(1)[0])
     sampler = optuna.samplers.TPESampler(seed=seed, n_startup_trials=STARTUP_CANDIDATES)
-    directions = [
-        "minimize" if one.better == "less" else "maximize" for one in study.optimize.objectives
-    ]
+    direction = {"less": "minimize", "more": "maximize"}
+    directions = [direction[one.better] for one in study.search.objectives]
     optuna_study = optuna.create_study(sampler=sampler, directions=directions)
-    factors = study.factors.items()
     middle = {
         name: 0.5 if isinstance(factor, Range) else len(factor.options()) // 2
-        for name, factor in factors
+        for name, factor in study.factors.items()
     }
     optuna_study.enqueue_trial(middle)
     return optuna_study
@@ -391,7 +368,6 @@ def propose(
 
     A repeated proposal gets the known result, so that the sampler moves on.
     """
-    assert study.optimize is not None
     for _ in range(MAX_REPEATS):
         # A number in [0, 1] for a range, an index for levels or values.
         proposal = sampler.ask()
@@ -405,7 +381,7 @@ def propose(
         point = make_point(chosen)
         if key_of(point) not in evaluated:
             return proposal, point
-        report_to_sampler(sampler, proposal, study.optimize, evaluated[key_of(point)])
+        report_to_sampler(sampler, proposal, study.search, evaluated[key_of(point)])
     return None, None
 
 
@@ -479,9 +455,8 @@ def failed_rows(plan: Plan, store: Store, number: int) -> list[Row]:
     replicates = plan.study.replicates
     missing = np.setdiff1d(np.arange(replicates), columns["replicate"]).tolist()
     failed = Row(0, number, 0, 0, REFUSED, code_version(), FAILED, scene_error(columns), 0.0)
-    return [
-        failed._replace(
-            trial=number * replicates + k, replicate=k, seed=seed_of(plan.spec, number, k)
-        )
-        for k in missing
-    ]
+    rows = []
+    for k in missing:
+        seed = seed_of(plan.spec, number, k)
+        rows.append(failed._replace(trial=number * replicates + k, replicate=k, seed=seed))
+    return rows

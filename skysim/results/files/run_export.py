@@ -21,8 +21,7 @@ from skysim.core.time import in_utc
 from skysim.core.types import Floats
 from skysim.dynamics.profile_samples import BODY, CAMERA, ICRF, LAB
 from skysim.results import plots
-from skysim.results.files import recording as frame_files
-from skysim.results.files.recording import FrameTruth, Recording
+from skysim.results.files.recording import ZARR, FrameTruth, Recording
 from skysim.results.files.row_parts import EXTRA
 
 # Write attitudes as a CCSDS Attitude Ephemeris Message, version 2.0, in keyword = value notation
@@ -350,7 +349,7 @@ def to_zarr(run: Recording, out: Path, bar: Bar) -> list[Path]:
         import zarr
     except ImportError:
         raise InputError("export.formats", f"zarr {EXTRA}") from None
-    path = out / frame_files.ZARR
+    path = out / ZARR
     count = len(run.stems)
     frame_truths = [replace(truth, sources=None) for truth in truths(run, bar)]
     first = run.image(run.stems[0])

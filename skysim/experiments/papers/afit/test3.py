@@ -45,8 +45,7 @@ from skysim.scene import loader
 from skysim.scene.sections.motion import AttitudeConfig
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab
-from skysim.tracking import factory as tracker_settings
-from skysim.tracking import onboard_model
+from skysim.tracking import factory, onboard_model
 
 # AFIT's Test 3 at fixed attitudes (Padro 2012, 3.7.3): five LEDs imaged from five attitudes, and
 # his measurements.
@@ -108,7 +107,7 @@ def photograph(
     The IMU's attitude is the true one. Images without all five LEDs are left out.
     """
     camera = onboard_model.calibration(lab.scene.camera)
-    settings = tracker_settings.assumed_settings(lab.scene)
+    settings = factory.assumed_settings(lab.scene)
     sightings = []
     # Each image in a run of its own, for a random phase of the LEDs.
     for seed in rng.integers(2**62, size=images):

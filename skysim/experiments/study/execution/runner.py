@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report
-from skysim.core import files as file_io
 from skysim.core.errors import InputError
+from skysim.core.files import make_folder, write_image
 from skysim.core.types import Frame, Truth
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.engines import Chunk, Engine, Pool, Serial
@@ -337,7 +337,7 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
     pictures = []
     if row.scene not in ("", REFUSED):  # an invalid scene has no lab
         setup = prepared_setup(plan.spec, segment.settings)
-        recording.remove_results(file_io.make_folder(folder))
+        recording.remove_results(make_folder(folder))
         try:
             for frame, truth, report in islice(replayed_frames(setup, row.seed), MAX_FRAMES):
                 recording.write_frame(folder, frame, truth, setup.lab.scene)
@@ -348,7 +348,7 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
                 matched_px = xy_px[match.observed] if match else np.empty((0, 2))
                 truth_px = truth.sources.xy_px[visible(truth.sources)]
                 picture = annotate(frame.image_dn, xy_px, matched_px, truth_px=truth_px)
-                file_io.write_image(pictures[-1], picture)
+                write_image(pictures[-1], picture)
         except Exception:
             if row.error is None:
                 raise

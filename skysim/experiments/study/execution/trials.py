@@ -394,7 +394,7 @@ class MovingCamera(NamedTuple):
     Attributes
     ----------
     streak_px
-        (dx, dy) of its frame that a gyro measures, if any
+        (dx, dy) streak vector of the frame as a gyro measures it; None without a gyro
     """
 
     camera: StarCamera

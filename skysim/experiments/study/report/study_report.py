@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 from skysim.core.paths import STUDIES
 from skysim.core.types import Floats
 from skysim.experiments.study import answer, search
-from skysim.experiments.study import table as tables
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
 from skysim.experiments.study.report import figures, layout, maps
@@ -23,11 +22,15 @@ from skysim.experiments.study.table import (
     Index,
     PointRow,
     axis,
+    cells,
     format_response,
     format_summary,
+    indices,
     is_sampled,
     same,
+    select_responses,
     shown_points,
+    table,
 )
 from skysim.experiments.study.worst import ColumnsOf
 from skysim.results.report import Report
@@ -95,7 +98,7 @@ class Analysis(NamedTuple):
 
 
 def study_report(plan: Plan, store: Store, study: str = "", out: Path | None = None) -> Report:
-    """The report of a study. study, out : as `commands` takes them
+    """The report of a study; `study` and `out` are those of `commands`.
 
     Raises
     ------
@@ -124,50 +127,38 @@ def commands(
 
 def shell_command(study: str, out: Path | None, overrides: Mapping[str, str], verb: str) -> str:
     """The shell command that applies `verb` to a study."""
-    changed = (
-        [f"--set={key}={value}" for key, value in overrides.items()]
-        if verb in ("run", "optimize")
-        else []
-    )
-    return shlex.join(
-        ["skysim", "study", verb, study, *(["--out", str(out)] if out else []), *changed]
-    )
+    words = ["skysim", "study", verb, study]
+    if out:
+        words += ["--out", str(out)]
+    if verb in ("run", "optimize"):
+        words += [f"--set={key}={value}" for key, value in overrides.items()]
+    return shlex.join(words)
 
 
 def analyze(plan: Plan, store: Store, command: Callable[[str], str]) -> Analysis:
-    """The analysis of the trials in a store.
-
-    Parameters
-    ----------
-    command
-        See `commands`
-    """
+    """The analysis of the trials in a store; `command` is the function of `commands`."""
     study = plan.study
     about = overview(plan)
-    lines = tables.table(store, list(dict.fromkeys([*responses(study), *answer.RESPONSES])))
+    lines = table(store, list(dict.fromkeys([*responses(study), *answer.RESPONSES])))
     headline = answer.headline(study, lines, about.may_be_ambiguous, command("worst"))
     headline += answer.one_unit(about.fixed) if headline else []
-    indices = (
-        tables.indices(plan, store)
-        if study.design.kind == "saltelli" and not study.optimize
-        else []
+    sobol = study.design.kind == "saltelli" and not study.optimize
+    return Analysis(
+        lines,
+        about,
+        answer.verdict(study, lines),
+        headline,
+        answer.ranges(study, lines),
+        indices(plan, store) if sobol else [],
+        search.collect_result(plan, store) if study.optimize else None,
     )
-    result = search.collect_result(plan, store) if study.optimize else None
-    verdict = answer.verdict(study, lines)
-    return Analysis(lines, about, verdict, headline, answer.ranges(study, lines), indices, result)
 
 
 def responses(study: Study) -> list[str]:
     """The study's responses and those used by its figures, thresholds, objectives and constraints, without `cost`."""
-    searched = study.optimize.responses if study.optimize else []
-    names = dict.fromkeys(
-        [
-            *study.responses,
-            *(one.response for one in (*study.figures, *study.thresholds)),
-            *searched,
-        ]
-    )
-    return [name for name in names if name != "cost"]
+    names = [*study.responses, *(one.response for one in (*study.figures, *study.thresholds))]
+    names += study.optimize.responses if study.optimize else []
+    return [name for name in dict.fromkeys(names) if name != "cost"]
 
 
 def compose(
@@ -186,7 +177,7 @@ def compose(
     also
         See `figures.pareto_png`
     """
-    lines = tables.select_responses(found.lines, responses(study))
+    lines = select_responses(found.lines, responses(study))
     front = [one.number for one in found.result.front] if found.result else []
     costs = {one.number: one.cost for one in found.result.candidates} if found.result else None
     drawn = [
@@ -278,7 +269,7 @@ def points_section(
     lines: Sequence[PointRow], study: Study, front: Sequence[int], costs: Mapping[int, float] | None
 ) -> Section:
     """The table of all points. Named levels sort in the order of the study file; those of a front are marked."""
-    heads, texts = tables.cells(lines)
+    heads, texts = cells(lines)
     axes = {name: axis(study, lines, name) for name in (lines[0].levels if lines else ())}
     kinds: list[Kind] = ["number", *("number" if one.numeric else "text" for one in axes.values())]
     kinds += ["number"] * len(heads[len(kinds) :])
@@ -293,14 +284,13 @@ def points_section(
     if costs is not None:
         columns.append(Column("cost", format=".4g"))
         rows = [[*row, costs.get(line.point)] for row, line in zip(rows, lines, strict=False)]
-    more = (
-        f"And {len(lines) - ROWS} points more: `skysim study export` writes them all."
-        if len(lines) > ROWS
-        else ""
-    )
-    note = "In brackets intervals of 95 %." + (" Tinted: the front." if front else "")
-    table = Table(columns, rows, from_the_last(len(axes) + 1, len(columns)))
-    return Section(POINTS, [table, Text(f"{note} {more}")], folded=len(lines) > OPEN_ROWS)
+    note = "In brackets intervals of 95 %."
+    if front:
+        note += " Tinted: the front."
+    if len(lines) > ROWS:
+        note += f" And {len(lines) - ROWS} points more: `skysim study export` writes them all."
+    shown = Table(columns, rows, from_the_last(len(axes) + 1, len(columns)))
+    return Section(POINTS, [shown, Text(note)], folded=len(lines) > OPEN_ROWS)
 
 
 def range_table(study: Study, lines: Sequence[PointRow]) -> Table:
@@ -334,14 +324,11 @@ def front_table(study: Study, result: SearchResult | None) -> list[Block]:
     if result is None:
         return []
     feasible = sum(one.feasible for one in result.candidates)
-    text = f"{len(result.candidates)} candidates, {feasible} of them feasible" + (
-        "; the front:" if feasible else "."
-    )
+    text = f"{len(result.candidates)} candidates, {feasible} of them feasible"
+    text += "; the front:" if feasible else "."
     heads, rows = search.front_cells(study, result)
-    table = Table(
-        [Column(head) for head in heads], rows, from_the_last(len(study.factors) + 1, len(heads))
-    )
-    return [Text(text), table]
+    optional = from_the_last(len(study.factors) + 1, len(heads))
+    return [Text(text), Table(list(map(Column, heads)), rows, optional)]
 
 
 def from_the_last(kept: int, count: int) -> list[tuple[int]]:
@@ -353,12 +340,12 @@ def runs_section(store: Store) -> Section:
     """The runs that filled the store."""
     columns = [text_column("engine"), Column("workers"), Column("trials")]
     columns += [Column("time", "s", ".1f"), Column("trials/s", format=".1f")]
-    rows = [
-        [run[name] for name in ("engine", "workers", "trials", "seconds")] for run in store.runs()
-    ]
-    for row in rows:
-        row.append(row[2] / row[3] if row[3] else None)
-    untimed = store.counts()["done"] - sum(run["trials"] for run in store.runs())
+    runs = store.runs()
+    rows = []
+    for run in runs:
+        rate = run["trials"] / run["seconds"] if run["seconds"] else None
+        rows.append([run["engine"], run["workers"], run["trials"], run["seconds"], rate])
+    untimed = store.counts()["done"] - sum(run["trials"] for run in runs)
     note = f"{untimed} trials are of runs that were killed." if untimed > 0 else ""
     return Section("Runs", [Table(columns, rows), Text(note)], folded=True)
 
@@ -374,7 +361,9 @@ def study_figures(
     Parameters
     ----------
     columns_of
-        Trials of a point
+        Returns the columns of the trials of some points
+    replay
+        The command that repeats a trial
     """
     blocks: list[Block] = []
     for one in layout.figures(study, lines):
