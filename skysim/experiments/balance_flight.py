@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -92,8 +93,7 @@ def parse_uncertainty(
     return Uncertainty(inertia, offset_m, wheel, mount_rad, tacho_sigma_rpm * RPM_RAD_S)
 
 
-@dataclass(frozen=True, slots=True)
-class Assumptions:
+class Assumptions(NamedTuple):
     """What the lab assumes of a vehicle with its trim masses at zero.
 
     Attributes
@@ -252,8 +252,7 @@ SWING_S = 150.0
 ProgressCallback = Callable[[float, float], None]
 
 
-@dataclass(frozen=True, slots=True)
-class BalanceFlight:
+class BalanceFlight(NamedTuple):
     """A flight's record, the true vehicle, and how many frames had no attitude or came after a contact.
 
     Attributes

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,8 +35,7 @@ CONFIDENCE = 2.0  # standard deviations that the estimated torque must stay belo
 MAX_SHRINK = 1e-6  # smallest eigenvalue of the trim axes' Gram matrix
 
 
-@dataclass(frozen=True, slots=True)
-class BalancePlan:
+class BalancePlan(NamedTuple):
     """How a vehicle is balanced.
 
     Attributes
@@ -60,8 +59,7 @@ class BalancePlan:
     moves: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Bars:
+class Bars(NamedTuple):
     """What must be reached: residual torque, and standard deviations of inertia (relative) and offset.
 
     Attributes
@@ -104,8 +102,7 @@ def parse_bars(torque: str, inertia_percent: float, offset: str | None) -> Bars:
     return Bars(torque_nm, inertia_percent / 100, offset_m)
 
 
-@dataclass(frozen=True, slots=True)
-class Iteration:
+class Iteration(NamedTuple):
     """One flight and the estimate from all flights so far.
 
     Attributes

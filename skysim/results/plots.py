@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -111,8 +110,7 @@ CURVES: dict[str, Any] = {
 SAMPLE_STRIDE = 8  # stride in rows and columns of the sample for the sky statistics
 
 
-@dataclass(frozen=True, slots=True)
-class FrameStatistics:
+class FrameStatistics(NamedTuple):
     """Statistics of a frame: sky median, sky standard deviation and peak, all in DN; number of saturated pixels."""
 
     sky_dn: float

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -189,8 +189,7 @@ def light_at_unit_distance(run: SurveyRun) -> Floats:
     return out
 
 
-@dataclass(frozen=True, slots=True)
-class Coverage:
+class Coverage(NamedTuple):
     """The frames held so far, and which LEDs they measure.
 
     Attributes
@@ -239,8 +238,7 @@ def coverage_before(
     return Coverage(model, held, seen, predicted(model, held, seen))
 
 
-@dataclass(frozen=True, slots=True)
-class NextStops:
+class NextStops(NamedTuple):
     """Attitudes to hold next, and what the survey with them will reach (None if that does not determine it)."""
 
     lab_from_body: Rotation

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,8 +76,9 @@ class CalibrationPrior:
     disk_m
         Diameter of an LED's luminous disk
     levels
-        (N,) nominal brightness of the LEDs, relative; code : what each shows in a frame, None
-        if all are steady
+        (N,) relative nominal brightness of the LEDs
+    code
+        What each LED shows in a frame; None if all are steady
     """
 
     camera: Camera
@@ -188,8 +190,7 @@ def assumed(prior: CalibrationPrior, uncertainty: SurveyUncertainty) -> Assumed:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class ImageSizes:
+class ImageSizes(NamedTuple):
     """Sizes of an LED's image: margin_px from the edge for a complete image; apart_px at which two do not merge."""
 
     margin_px: float

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -55,8 +55,7 @@ PLANNED = "plan"
 RANDOM = "random"
 
 
-@dataclass(frozen=True, slots=True)
-class HeldAttitudes:
+class HeldAttitudes(NamedTuple):
     """Attitudes to hold, one frame at each.
 
     Attributes
@@ -178,8 +177,7 @@ def survey_images(
 # --- the prediction against simulated surveys ---------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class SimulatedErrors:
+class SimulatedErrors(NamedTuple):
     """Errors of one simulated survey: mean squares of LED coordinates (m2) and of the lever's (m2), of the focal length
     (px2); LEDs measured, and faults reported although the dome has none."""
 

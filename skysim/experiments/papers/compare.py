@@ -83,8 +83,7 @@ class FigureDrawing(NamedTuple):
     size_in: tuple[float, float] = (7.4, 3.9)
 
 
-@dataclass(frozen=True, slots=True)
-class ExperimentResult:
+class ExperimentResult(NamedTuple):
     """Results of an experiment: one for every published row, by key, and figures."""
 
     results: Mapping[str, RowResult | Summary]

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from skysim.core.yaml_reader import override_texts
 from skysim.experiments.study import study_file, table
@@ -19,8 +18,7 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
 
-@dataclass(frozen=True, slots=True)
-class StudyResult:
+class StudyResult(NamedTuple):
     """A study with its trials in a store: plan, path of the store, number of failed trials."""
 
     plan: Plan

@@ -96,7 +96,9 @@ class Range(KeyedFactor):
     Attributes
     ----------
     scale
-        Equal steps (linear) or equal ratios (log); integer : rounded to whole numbers
+        Equal steps (linear) or equal ratios (log)
+    integer
+        Whether values are rounded to whole numbers
     """
 
     from_: Annotated[Value, Field(alias="from")]

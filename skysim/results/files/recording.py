@@ -6,7 +6,7 @@ import dataclasses
 import datetime
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -85,6 +85,13 @@ class Recording:
         path = self.folder / f"{name}.ecsv"
         return files.read_table(path) if path.is_file() else None
 
+    def _require(self, name: str, table: Any, columns: Sequence[str]) -> None:
+        """Raise InputError for a table of the run that lacks a column."""
+        for column in columns:
+            if column not in table.colnames:
+                path = self.folder / f"{name}.ecsv"
+                raise InputError(path, f"missing column {column}", "a table of a run")
+
     def solved(self) -> tuple[NDArray[np.int64], Rotation] | None:
         """(K,) indices of the solved frames and their attitudes.
 
@@ -95,11 +102,7 @@ class Recording:
         if solutions is None:
             return None
         names = SKY_ANGLES if self.is_celestial else LAB_ANGLES
-        missing = [name for name in ("frame", *names) if name not in solutions.colnames]
-        if missing:
-            raise InputError(
-                self.folder / "solutions.ecsv", f"missing column {missing[0]}", "a table of a run"
-            )
+        self._require("solutions", solutions, ("frame", *names))
         angles = np.column_stack(
             [np.ma.filled(solutions[name].astype(float), np.nan) for name in names]
         )
@@ -122,11 +125,7 @@ class Recording:
         if telemetry is None:
             return None
         columns = [f"true_{name}" for name in LAB_ANGLES]
-        missing = [name for name in ("t_s", *columns) if name not in telemetry.colnames]
-        if missing:
-            raise InputError(
-                self.folder / "telemetry.ecsv", f"missing column {missing[0]}", "a table of a run"
-            )
+        self._require("telemetry", telemetry, ("t_s", *columns))
         angles = np.column_stack([np.asarray(telemetry[name], dtype=float) for name in columns])
         return np.asarray(telemetry["t_s"], dtype=float), attitudes(angles, is_celestial=False)
 

@@ -8,7 +8,7 @@ faults of the camera, and with the IMU errors of Tables 10-14.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -127,8 +127,7 @@ def photograph(
     return sightings
 
 
-@dataclass(frozen=True, slots=True)
-class Measurements:
+class Measurements(NamedTuple):
     """F images of all five LEDs as the thesis measures them (eqs 43-45).
 
     Attributes
