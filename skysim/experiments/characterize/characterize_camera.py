@@ -141,21 +141,14 @@ def draw_transfer(axes: Any, found: MeasuredSensor) -> None:
         ("flats beyond the fit", beyond, {"facecolor": "none", "edgecolor": INK[0]}),
     )
     for name, points, colors in groups:
-        mean, variance = (
-            np.array([getattr(one.moments, key) for one in points])
-            for key in ("mean_dn", "variance_dn2")
-        )
-        curve.scatter(
-            np.maximum(mean - black, 0.1), np.maximum(variance, 0.05), 18, label=name, **colors
-        )
+        signal = np.array([one.moments.mean_dn for one in points]) - black
+        variance = np.array([one.moments.variance_dn2 for one in points])
+        shown = np.maximum(signal, 0.1), np.maximum(variance, 0.05)
+        curve.scatter(*shown, 18, label=name, **colors)
     expected_mean, expected_variance = model(fitted, transfer.values)
     order = np.argsort(expected_mean)
-    curve.plot(
-        np.maximum(expected_mean - black, 0.1)[order],
-        expected_variance[order],
-        color="0.4",
-        zorder=0,
-    )
+    x = np.maximum(expected_mean[order] - black, 0.1)
+    curve.plot(x, expected_variance[order], color="0.4", zorder=0)
     curve.set(xscale="log", yscale="log", xlabel="signal [DN]", ylabel="temporal variance [DN²]")
     curve.legend()
     plain_labels(curve.xaxis, curve.yaxis)
@@ -223,7 +216,6 @@ def draw_size(axes: Any, config: CameraConfig, night: Night) -> None:
 
 
 DIGITS = 6
-AT_LEAST_ZERO = ("nonlinearity", "hot_pixels")  # an estimate below 0 is 0
 
 
 def preset_text(
@@ -249,21 +241,17 @@ def preset_text(
 
 
 def measured(sensor: MeasuredSensor) -> dict[str, tuple[Any, str]]:
-    """Value and comment by key of the section camera."""
+    """Value and comment by key of the section camera; an estimate below 0 becomes 0."""
     found: dict[str, tuple[Any, str]] = {}
     for key, one in sensor.estimates.items():
-        value = max(one.value, 0.0) if key in AT_LEAST_ZERO or one.value < 0 else one.value
+        value = max(one.value, 0.0)
         found[f"detector.{key}"] = (rounded(value), comment(one))
     if sensor.dark_temperature_c is not None:
-        found["detector.dark_temperature_c"] = (
-            rounded(sensor.dark_temperature_c),
-            "[M] of the darks",
-        )
+        celsius = rounded(sensor.dark_temperature_c)
+        found["detector.dark_temperature_c"] = (celsius, "[M] of the darks")
     else:
-        found["detector.temperature_c"] = (
-            None,
-            "the darks' temperature is unknown: dark_e_s is at it",
-        )
+        why = "the darks' temperature is unknown: dark_e_s is at it"
+        found["detector.temperature_c"] = (None, why)
     found["detector.reset_noise_e"] = (0.0, "[M] contained in read_noise_e")
     return found
 
@@ -323,12 +311,9 @@ def section_lines(
 
 def write(path: Path, contents: str) -> None:
     """Write the file and read it as a scene would. Raises InputError if it is no camera."""
-    from skysim.core.files import make_folder, write_text
-    from skysim.scene.loader import load_camera
-
-    make_folder(path.parent)
-    write_text(path, contents)
-    load_camera(path, PLACEHOLDER_LENS)
+    files.make_folder(path.parent)
+    files.write_text(path, contents)
+    loader.load_camera(path, PLACEHOLDER_LENS)
 
 
 UNITS = {
@@ -447,16 +432,14 @@ def row(key: str, one: Estimate, before: object) -> dict[str, Any]:
 
 def check_folders(darks: Path | None, flats: Path | None) -> tuple[Path, Path]:
     """Both folders. Raises InputError if one is missing."""
-    for name, folder, why in (
-        ("darks", darks, "dark current and black level"),
-        ("flats", flats, "gain and full well"),
-    ):
+
+    def required(folder: Path | None, name: str, unknown: str) -> Path:
         if folder is None:
-            raise InputError(
-                f"characterize.{name}",
-                f"missing: without them {why} are unknown",
-                f"a folder of {name}",
-            )
-    assert darks is not None
-    assert flats is not None
-    return darks, flats
+            problem = f"missing: without them {unknown} are unknown"
+            raise InputError(f"characterize.{name}", problem, f"a folder of {name}")
+        return folder
+
+    return (
+        required(darks, "darks", "dark current and black level"),
+        required(flats, "flats", "gain and full well"),
+    )

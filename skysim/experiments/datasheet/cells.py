@@ -6,6 +6,7 @@ thermal state, attitude and noise by number, so that terms can be separated and 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,9 +32,9 @@ from skysim.scene.scene import BODIES_YEARS, Scene
 from skysim.scene.sections.layouts import OnPoints
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
 
-SCAN_PX = (
-    3.37  # from one attitude of a field to the next: other phases in the pixels, the same stars
-)
+# From one attitude of a field to the next: other phases in the pixels, the same stars.
+SCAN_PX = 3.37
+FIXED_PATTERN = ("prnu", "dsnu", "hot_pixels", "column_offset_e")  # keys of the detector
 STREAKS_PX = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # of the rates
 SEQUENCE = (0, 1, 2, 4, 8, 16)  # frames of a sequence at a constant rate
 SEQUENCE_RATES = 4  # beside rest, the slowest ones
@@ -121,11 +122,8 @@ def check_scene(scene: Scene) -> None:
 def unit_seeds(scene: Scene) -> list[str]:
     """Keys of the seeds that make another unit: chip, survey, LEDs."""
     chip = scene.camera.detector
-    seeds = (
-        ["camera.detector.hardware_seed"]
-        if chip.prnu or chip.dsnu or chip.hot_pixels or chip.column_offset_e
-        else []
-    )
+    has_pattern = any(getattr(chip, key) for key in FIXED_PATTERN)
+    seeds = ["camera.detector.hardware_seed"] if has_pattern else []
     seeds += ["tracker.survey.seed"] if has_survey_errors(scene) and not scene.tracker.map else []
     layout = scene.light.layout if isinstance(scene.light, DomeConfig) else None
     points, prefix = (layout.points, ".points") if isinstance(layout, OnPoints) else (layout, "")
@@ -195,9 +193,8 @@ class Designer:
         combinations = self.units * self.states
         yield from self.draws("total", math.ceil(self.size.draws / combinations) * combinations)
         for number in range(self.size.sky):
-            settings = self.settings(Draw(100 + number, number)) | {
-                "trial.attitude_seed": 1 + number
-            }
+            settings = self.settings(Draw(100 + number, number))
+            settings["trial.attitude_seed"] = 1 + number
             yield DatasheetCell("sky", {"draw": number}, settings)
         yield from self.rates()
         yield from self.sequences()
@@ -211,19 +208,10 @@ class Designer:
 
     def terms(self) -> Iterator[DatasheetCell]:
         """The crossed and nested design of `components`."""
-        for unit in range(self.units):
-            for state in range(self.states):
-                for attitude in range(self.size.attitudes):
-                    for frame in range(self.size.frames):
-                        levels = {
-                            "unit": unit,
-                            "state": state,
-                            "attitude": attitude,
-                            "frame": frame,
-                        }
-                        yield DatasheetCell(
-                            "terms", levels, self.settings(Draw(unit, state, attitude))
-                        )
+        counts = (self.units, self.states, self.size.attitudes, self.size.frames)
+        for numbers in itertools.product(*map(range, counts)):
+            levels = dict(zip(("unit", "state", "attitude", "frame"), numbers, strict=True))
+            yield DatasheetCell("terms", levels, self.settings(Draw(*numbers[:3])))
 
     def draws(
         self, experiment: str, count: int, change: Settings | None = None, **levels: str
@@ -245,22 +233,16 @@ class Designer:
         """At each rate two frames of each attitude that differ in their noise alone."""
         for rate in self.rates_deg_s(STREAKS_PX):
             for frame in range(2):
-                yield DatasheetCell(
-                    "rate",
-                    {"rate_deg_s": rate, "frame": frame},
-                    self.settings(Draw()) | {"trial.rate_deg_s": rate},
-                )
+                settings = self.settings(Draw()) | {"trial.rate_deg_s": rate}
+                yield DatasheetCell("rate", {"rate_deg_s": rate, "frame": frame}, settings)
 
     def sequences(self) -> Iterator[DatasheetCell]:
         """Frames of one unit at the scene's frame rate, at rest and at constant rates."""
         for rate in (0.0, *self.rates_deg_s(STREAKS_PX[:SEQUENCE_RATES])):
             for step in SEQUENCE:
                 settings = self.settings(Draw(), rate * step / self.scene.exposure.rate_hz)
-                yield DatasheetCell(
-                    "sequence",
-                    {"rate_deg_s": rate, "step": step},
-                    settings | {"trial.rate_deg_s": rate},
-                )
+                settings["trial.rate_deg_s"] = rate
+                yield DatasheetCell("sequence", {"rate_deg_s": rate, "step": step}, settings)
 
     def accelerations(self) -> Iterator[DatasheetCell]:
         """Two frames of each attitude at accelerations with no rate at mid-exposure."""
@@ -314,9 +296,9 @@ class Designer:
             changes["twice the exposure time"] = {"exposure.time": f"{2 * exposure.time_s} s"}
         if chip.read_noise_e:
             changes["half the read noise"] = {"camera.detector.read_noise_e": chip.read_noise_e / 2}
-        if chip.prnu or chip.dsnu or chip.hot_pixels or chip.column_offset_e:
-            none = ("prnu", "dsnu", "hot_pixels", "column_offset_e")
-            changes["no fixed pattern"] = {f"camera.detector.{key}": 0 for key in none}
+        if any(getattr(chip, key) for key in FIXED_PATTERN):
+            none = {f"camera.detector.{key}": 0 for key in FIXED_PATTERN}
+            changes["no fixed pattern"] = none
         if chip.cti_parallel or chip.cti_serial:
             changes["no transfer loss"] = {
                 "camera.detector.cti_parallel": 0,
@@ -351,29 +333,22 @@ class Designer:
             "protons, 1e4 /cm²/s": {"camera.detector.particles": [{"per_cm2_s": 1e4}]},
             "hot pixels, 0.1 %": {"camera.detector.hot_pixels": 1e-3} | hot,
             "hot pixels, 1 %": {"camera.detector.hot_pixels": 1e-2} | hot,
-            "stray light, 100 e- a pixel": {
-                "background": [*own, {"kind": "uniform", "e_s": 100 / exposure_s}]
-            },
-            "stray light, 1000 e- a pixel": {
-                "background": [*own, {"kind": "uniform", "e_s": 1000 / exposure_s}]
-            },
         }
+        for electrons in (100, 1000):
+            glow = {"kind": "uniform", "e_s": electrons / exposure_s}
+            found[f"stray light, {electrons} e- a pixel"] = {"background": [*own, glow]}
         if not self.under_stars:
             return found
         for count in (5, 20):
-            centroids = {
+            found[f"false stars, {count} among {TRUE_STARS} true"] = {
                 "trial.kind": "centroids",
                 "trial.noise_px": FALSE_STARS_PX,
                 "trial.lights": TRUE_STARS,
-            }
-            found[f"false stars, {count} among {TRUE_STARS} true"] = centroids | {
-                "trial.false_lights": count
+                "trial.false_lights": count,
             }
         if BODIES_YEARS[0] <= self.scene.start_time.year <= BODIES_YEARS[1]:
-            near = {
-                "trial.near": {"body": "moon", "off_deg": [0, float(f"{self.half_field_deg:.2g}")]}
-            }
-            found["Moon in the field"] = near | {"light.bodies": {}}
+            near = {"body": "moon", "off_deg": [0, float(f"{self.half_field_deg:.2g}")]}
+            found["Moon in the field"] = {"trial.near": near, "light.bodies": {}}
         return found
 
     @property
