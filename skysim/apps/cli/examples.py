@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from skysim.core.files import DATA
+from skysim.core.paths import DATA
 
 
 def read_examples(path: Path) -> dict[str, tuple[str, ...]]:

@@ -26,7 +26,7 @@ from skysim.experiments.dome_survey import survey_frames
 from skysim.scene.sections.motion import PRESCRIBED
 
 if TYPE_CHECKING:
-    from skysim.simulation.checks.check import Check
+    from skysim.simulation.checks.plan_check import Check
 
 # Of a survey that is flown: few frames while the vehicle slews, and a whole exposure in each hold.
 SURVEY_RATE_HZ = 0.5

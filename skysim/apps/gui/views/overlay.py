@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from skysim.apps.gui.messages import LIMITS, Display, LightColumns, Pixels, TrackerResult
 from skysim.apps.gui.worker.session import WorkerLost
 from skysim.core.errors import InputError
-from skysim.core.files import DATA
+from skysim.core.paths import DATA
 from skysim.core.types import Floats
 from skysim.core.yaml_reader import read_yaml
 from skysim.results.plots import CURVES

@@ -30,7 +30,7 @@ from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core import images
 from skysim.core.errors import InputError
 from skysim.simulation import checks
-from skysim.simulation.checks.check import Check
+from skysim.simulation.checks.plan_check import Check
 
 KEPT_IMAGES = 3  # the page may still show one before the newest
 
