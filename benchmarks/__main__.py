@@ -24,11 +24,17 @@ def main(words: list[str] | None = None) -> int:
         epilog="\n".join(["areas:", *map(described, AREAS)]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("areas", nargs="*", metavar="AREA", help="one of those below, or `accept`")
+    parser.add_argument(
+        "areas", nargs="*", metavar="AREA", help="one of those below, or `accept`"
+    )
     parser.add_argument("--quick", action="store_true", help="the quick part of each area")
-    parser.add_argument("--count", type=int, help="frames, fields or trials in place of the area's")
+    parser.add_argument(
+        "--count", type=int, help="frames, fields or trials in place of the area's"
+    )
     parser.add_argument("--seed", type=int, help="the seed in place of the area's")
-    parser.add_argument("--json", action="store_true", help="print JSON rows in place of a table")
+    parser.add_argument(
+        "--json", action="store_true", help="print JSON rows in place of a table"
+    )
     arguments = parser.parse_args(words)
     if arguments.areas == ["accept"]:
         return accept.main(arguments.quick)

@@ -73,7 +73,13 @@ def main(quick: bool) -> int:
 def quick_steps() -> list[list[str]]:
     """The commands of QUICK."""
     return [
-        ["python", "-m", "benchmarks", area, *(f"--{key}={value}" for key, value in chosen.items())]
+        [
+            "python",
+            "-m",
+            "benchmarks",
+            area,
+            *(f"--{key}={value}" for key, value in chosen.items()),
+        ]
         for area, chosen in QUICK.items()
     ]
 
@@ -89,7 +95,9 @@ def all_steps() -> list[list[str]]:
         check=True,
     )
     files = [
-        line.rpartition(":")[0] for line in listed.stdout.splitlines() if line.startswith("tests/")
+        line.rpartition(":")[0]
+        for line in listed.stdout.splitlines()
+        if line.startswith("tests/")
     ]
     return [
         *(["python", "-m", "benchmarks", area] for area in areas),
@@ -108,7 +116,12 @@ def benchmark_rows(command: list[str], quick: bool) -> Iterator[tuple[str, Row]]
     for row in rows:
         if row["met"] is None or (quick and row["unit"] not in COUNTED):
             continue
-        facts = {"figure": row["value"], "unit": row["unit"], "bar": row["bar"], "met": row["met"]}
+        facts = {
+            "figure": row["value"],
+            "unit": row["unit"],
+            "bar": row["bar"],
+            "met": row["met"],
+        }
         yield f"{area}: {row['name']}", facts
 
 
@@ -131,7 +144,10 @@ def test_rows(command: list[str]) -> Iterator[tuple[str, Row]]:
     LONG_JUNIT.unlink(missing_ok=True)
     junit = ("--junitxml", str(LONG_JUNIT))
     subprocess.run(
-        [sys.executable, "-m", *command, *junit], cwd=ROOT, stdout=subprocess.DEVNULL, check=False
+        [sys.executable, "-m", *command, *junit],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        check=False,
     )
     if not LONG_JUNIT.exists():
         yield command[-1], {"figure": None, "unit": "s", "bar": "passes", "met": False}

@@ -31,11 +31,15 @@ def measure() -> list[dict[str, Any]]:
             SOLVERS[name](cam, ref, sigma)
 
     results = [
-        versus(f"{name}, 10 stars, 100 times", partial(hundred, name), "scipy align_vectors", align)
+        versus(
+            f"{name}, 10 stars, 100 times", partial(hundred, name), "scipy align_vectors", align
+        )
         for name in SOLVERS
     ]
     spent = core_us(20)
-    results.append(verdict("wahba, 20 stars, with covariance", spent, "us", "budget", BUDGET_US))
+    results.append(
+        verdict("wahba, 20 stars, with covariance", spent, "us", "budget", BUDGET_US)
+    )
     return results
 
 

@@ -94,7 +94,9 @@ class Bench:
             )
             if solved.solved:
                 first = first or n + 1
-                wrong |= is_wrong(solved, self.tracker.lever.cam_from_body * body_from_lab, name)
+                wrong |= is_wrong(
+                    solved, self.tracker.lever.cam_from_body * body_from_lab, name
+                )
                 if not all_frames:
                     break
         return Sequence(first, wrong, fewest)
@@ -153,7 +155,9 @@ class Bench:
         distance_m = np.linalg.norm(offset_m, axis=1)
         cos_out = -np.sum(offset_m * sources.normal[seen], axis=1) / distance_m
         cos_in = self.tracker.camera.rays(xy_px[seen])[:, 2]
-        light = irradiance_e_s_m2(shown.strength[seen], dome.emitter, cos_out, cos_in, distance_m)
+        light = irradiance_e_s_m2(
+            shown.strength[seen], dome.emitter, cos_out, cos_in, distance_m
+        )
         light_e = light * lab.camera.optics.collecting_m2 * scene.exposure.time_s
         light_e = light_e * (1 + self.noise.light * rng.standard_normal(len(seen)))
         light_e += np.sqrt(np.maximum(light_e, 0)) * rng.standard_normal(len(seen))

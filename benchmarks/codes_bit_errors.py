@@ -75,7 +75,11 @@ CASES = (
     Case("duty 0.25, 4 ms", {"exposure.time": "4 ms", "light.layout.levels": "[0.25]"}),
     Case(
         "flicker: duty 0.5 of 1.5 ms, 4 ms",
-        {"exposure.time": "4 ms", "light.layout.levels": "[0.5]", "light.led.pwm_period": "1.5 ms"}
+        {
+            "exposure.time": "4 ms",
+            "light.layout.levels": "[0.5]",
+            "light.led.pwm_period": "1.5 ms",
+        }
         | WANDERING,
         depth=0.15,
     ),
@@ -93,7 +97,9 @@ CASES = (
 
 def lab_of(case: Case, depth: float) -> Lab:
     return build_lab(
-        loader.load("coded_spiral", SETTINGS | case.settings | {"light.led.code.depth": str(depth)})
+        loader.load(
+            "coded_spiral", SETTINGS | case.settings | {"light.led.code.depth": str(depth)}
+        )
     )
 
 
@@ -154,7 +160,9 @@ def window_noise_e2(lab: Lab) -> float:
     pixels = float(np.median(width * height))
     sky_share = 4 / 9 * 6 / 16 / (SAMPLE_ROWS * TILE_PX)  # of a pixel's variance
     return (
-        pixels * (1 + pixels * sky_share) * (detector.read_noise_e**2 + detector.gain_e_dn**2 / 12)
+        pixels
+        * (1 + pixels * sky_share)
+        * (detector.read_noise_e**2 + detector.gain_e_dn**2 / 12)
     )
 
 

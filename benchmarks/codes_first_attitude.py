@@ -79,7 +79,9 @@ def draw(every: list[Result], path: Path) -> None:
         for rate in RATES_DEG_S
     }
     by_count = {
-        f"{leds} LEDs": [one for one in every if (one.leds, one.rate_deg_s) == (leds, RATE_DEG_S)]
+        f"{leds} LEDs": [
+            one for one in every if (one.leds, one.rate_deg_s) == (leds, RATE_DEG_S)
+        ]
         for leds in COUNTS
     }
     for panel, groups, title in zip(
@@ -88,7 +90,9 @@ def draw(every: list[Result], path: Path) -> None:
         for shift, (label, group) in zip((-0.35, 0, 0.35), groups.items(), strict=True):
             bits = np.array([one.bits for one in group]) + shift
             median_ms = 1e3 * np.array([one.median_s for one in group])
-            above_ms = 1e3 * np.array([min(one.most_s, one.bits / 50) for one in group]) - median_ms
+            above_ms = (
+                1e3 * np.array([min(one.most_s, one.bits / 50) for one in group]) - median_ms
+            )
             panel.errorbar(
                 bits, median_ms, [0 * above_ms, above_ms], fmt="o", capsize=3, label=label
             )

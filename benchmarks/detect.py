@@ -39,7 +39,11 @@ def measure() -> list[dict[str, Any]]:
         own = min(row["value"] for row in results if name in row["name"])
         results.append(
             verdict(
-                f"detect + centroid, {name}: time", own, "ms", "the bar of a frame", BAR_MS[name]
+                f"detect + centroid, {name}: time",
+                own,
+                "ms",
+                "the bar of a frame",
+                BAR_MS[name],
             )
         )
     image, _ = frame(np.random.default_rng(2), 493, 659, 15)
@@ -76,7 +80,9 @@ def precision() -> list[dict[str, Any]]:
     results = []
     for name, error in errors.items():
         ratio = float(np.sqrt(np.mean(np.concatenate(error) ** 2))) / bound
-        row = verdict(f"centroid error, {name}", ratio, "x", f"the bound of {bound:.4f} px", 1.15)
+        row = verdict(
+            f"centroid error, {name}", ratio, "x", f"the bound of {bound:.4f} px", 1.15
+        )
         results.append(row if name == "gaussian_fit" else row | {"bar": None, "met": None})
     return results
 

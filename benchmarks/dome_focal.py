@@ -88,7 +88,12 @@ class Frame(NamedTuple):
 
 
 def frames(
-    case: Case, surface: Surface, lens: Camera, lever: Lever, trials: int, rng: np.random.Generator
+    case: Case,
+    surface: Surface,
+    lens: Camera,
+    lever: Lever,
+    trials: int,
+    rng: np.random.Generator,
 ) -> Iterator[Frame]:
     """Frames of one case at random attitudes, the lights in random order."""
     truth_m = leds_m("poisson_disk", case.leds, surface, rng)
@@ -100,7 +105,9 @@ def frames(
             error_m = case.surface_m * rng.standard_normal() * outward
             assumed_m = truth_m + error_m + case.own_m * rng.standard_normal(truth_m.shape)
             names = np.arange(len(truth_m))
-            leds = LedMap(names, assumed_m, center_m, semi_axes_m, None, case.own_m, None, common_m)
+            leds = LedMap(
+                names, assumed_m, center_m, semi_axes_m, None, case.own_m, None, common_m
+            )
             camera = lens.zoomed(1 / (1 + rng.uniform(-case.focal, case.focal)))
         body_from_lab = attitude(rng)
         xy = project(body_from_lab, truth_m, lever, lens)
@@ -114,7 +121,9 @@ def outcome(frame: Frame, answer: Attitude) -> str:
     """Whether an answer is found, WRONG (a light with another LED's name) or refused."""
     if answer.match is None:
         return "refused"
-    return "found" if np.all(frame.name[answer.match.observed] == answer.match.star) else "WRONG"
+    return (
+        "found" if np.all(frame.name[answer.match.observed] == answer.match.star) else "WRONG"
+    )
 
 
 def errors(frame: Frame, answer: Attitude, lens: Camera) -> tuple[float, float, float]:

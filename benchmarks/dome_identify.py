@@ -63,13 +63,17 @@ def leds_m(places: str, count: int, surface: Surface, rng: np.random.Generator) 
     half = np.radians(CAP_DEG)
     if places == "fibonacci":
         return placing.project_from_bearing(surface, placing.cap(count, half))
-    darts_m = placing.project_from_bearing(surface, placing.scattered_cap(100 * count, half, rng))
+    darts_m = placing.project_from_bearing(
+        surface, placing.scattered_cap(100 * count, half, rng)
+    )
     if places == "random":
         return darts_m[:count]
     area_m2 = 2 * np.pi * 1.22**2 * (1 - np.cos(half))
     thinned = darts_m[optimize.thin(darts_m, np.sqrt(0.6 * area_m2 / count))]
     return (
-        thinned[:count] if len(thinned) < count else thinned[rng.permutation(len(thinned))[:count]]
+        thinned[:count]
+        if len(thinned) < count
+        else thinned[rng.permutation(len(thinned))[:count]]
     )
 
 

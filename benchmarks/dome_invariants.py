@@ -59,7 +59,9 @@ class Bench:
         self.rng = np.random.default_rng(seed)
         self.map_m = map_m
         self.lens: Camera = calibration(lab.scene.camera).zoomed(zoom)
-        self.lever = Lever(np.array(lab.camera.mount.camera_body_m), lab.camera.mount.cam_from_body)
+        self.lever = Lever(
+            np.array(lab.camera.mount.camera_body_m), lab.camera.mount.cam_from_body
+        )
         self.place_m = leds_m(
             "poisson_disk", leds, build_surface(lab.scene.light.surface), self.rng
         )
@@ -118,7 +120,9 @@ def group_bits(
     return best[0], best[1]
 
 
-def evidence_dex(bench: Bench, name: str, xy: Floats, sigma_px: float, hypotheses: float) -> float:
+def evidence_dex(
+    bench: Bench, name: str, xy: Floats, sigma_px: float, hypotheses: float
+) -> float:
     """Power of ten of the match of all lights, by the fit to the lights that spread most, less the hypotheses tried."""
     family = TRANSFORMS[name]
     lens = bench.lens
@@ -131,8 +135,12 @@ def evidence_dex(bench: Bench, name: str, xy: Floats, sigma_px: float, hypothese
         # Prediction of a light from those that fix the transform, by propagated draws of their errors.
         draws = np.array([predicted(name, x[row], moved(x[row], sigma_px / lens.focal_px, bench.rng), x[rest])
                           for _ in range(8)])  # fmt: skip
-        variance = ((draws - x[rest, :2]) ** 2).mean(axis=(0, 2)) * lens.focal_px**2 + sigma_px**2
-        best = max(best, float(np.maximum(-np.log10(2 * pi * variance * density) - 0.43, 0).sum()))
+        variance = ((draws - x[rest, :2]) ** 2).mean(
+            axis=(0, 2)
+        ) * lens.focal_px**2 + sigma_px**2
+        best = max(
+            best, float(np.maximum(-np.log10(2 * pi * variance * density) - 0.43, 0).sum())
+        )
     return best - log10(hypotheses)
 
 
@@ -146,7 +154,9 @@ def bounds_deg(
 
     def image(unknown: Floats) -> Floats:
         turned = Rotation.from_rotvec(unknown[:3]) * body_from_lab
-        rays = bench.lever.cam_from_body.apply(turned.apply(place_m) - bench.lever.camera_body_m)
+        rays = bench.lever.cam_from_body.apply(
+            turned.apply(place_m) - bench.lever.camera_body_m
+        )
         x, y = (rays[:, :2] / rays[:, 2:]).T
         scale, aspect, skew, *center = unknown[3:]
         u = (1 + scale) * x + skew * y + center[0]
@@ -175,7 +185,9 @@ def pool_of(bench: Bench, name: str) -> Floats:
         xy = bench.field()[0]
         if len(xy) < TRANSFORMS[name].lights:
             continue
-        rows = np.argsort(bench.rng.random((500, len(xy))), axis=1)[:, : TRANSFORMS[name].lights]
+        rows = np.argsort(bench.rng.random((500, len(xy))), axis=1)[
+            :, : TRANSFORMS[name].lights
+        ]
         found += list(invariants(homogeneous(xy[rows], bench.lens), name))
     return np.array(found[:CHANCE_GROUPS])
 

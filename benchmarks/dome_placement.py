@@ -91,7 +91,9 @@ def build_setup() -> Setup:
     assert isinstance(light.layout, layouts.PatchBoardsConfig)
     surface = build_surface(light.surface)
     wide = Setup(surface, camera, lever, light.layout, light.led, lab.camera.band, 40.0)
-    reach_deg = float(np.degrees(optimize.field_reach_rad(optimized_config(wide, 3, 0), surface)))
+    reach_deg = float(
+        np.degrees(optimize.field_reach_rad(optimized_config(wide, 3, 0), surface))
+    )
     return Setup(surface, camera, lever, light.layout, light.led, lab.camera.band, reach_deg)
 
 
@@ -162,7 +164,11 @@ def sigmas_arcsec(setup: Setup, place_m: Floats) -> tuple[Floats, Floats, Floats
     matrix = total[solved][:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
     variance[solved] = np.linalg.inv(matrix).diagonal(axis1=1, axis2=2)
     unit = NOISE_PX / setup.camera.focal_px / ARCSEC_RAD
-    return unit * np.sqrt(variance[:, 2]), unit * np.sqrt(variance[:, :2].sum(axis=1)), total[:, 6]
+    return (
+        unit * np.sqrt(variance[:, 2]),
+        unit * np.sqrt(variance[:, :2].sum(axis=1)),
+        total[:, 6],
+    )
 
 
 def summarize(each: Floats) -> tuple[float, float, float]:
@@ -179,7 +185,12 @@ def tracker_results(
     rng = np.random.default_rng(seed)
     assumed_m = place_m + case.assumed_m * rng.standard_normal(place_m.shape)
     led_map = LedMap(
-        np.arange(len(place_m)), assumed_m, np.zeros(3), np.ones(3), board, sigma_m=case.assumed_m
+        np.arange(len(place_m)),
+        assumed_m,
+        np.zeros(3),
+        np.ones(3),
+        board,
+        sigma_m=case.assumed_m,
     )
     dome = build_dome_index(led_map, setup.lever, setup.camera)
     outcomes = [
@@ -214,7 +225,9 @@ def row(setup: Setup, kind: str, count: int, seed: int, frames: int) -> Row:
 def measure(count: int = FRAMES, seed: int = 1) -> list[dict[str, Any]]:
     """The results of every kind of layout with LEDS LEDs, with `count` frames for the tracker."""
     setup = build_setup()
-    return [one for kind in KINDS for one in rows_of(row(setup, kind, LEDS, seed, count), count)]
+    return [
+        one for kind in KINDS for one in rows_of(row(setup, kind, LEDS, seed, count), count)
+    ]
 
 
 def rows_of(one: Row, frames: int) -> list[dict[str, Any]]:

@@ -66,7 +66,9 @@ def closed_loop(name: str) -> dict[str, Any]:
 
 def poses() -> dict[str, Any]:
     """Time to interpolate the attitudes at POSES moments of one exposure."""
-    trajectory = simulate_motion(loader.load("simsat_slew", {"exposure.frames": "1"})).trajectory()
+    trajectory = simulate_motion(
+        loader.load("simsat_slew", {"exposure.frames": "1"})
+    ).trajectory()
     moments = np.linspace(0.5, 0.51, POSES)
     return verdict(
         f"{POSES} poses in an exposure",

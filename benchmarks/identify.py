@@ -60,7 +60,11 @@ def tetra3rs(camera: Camera, fields: list[Centroids]) -> Callable[[], Any] | Non
     degrees = float(np.degrees(camera.fov_rad))
     return lambda: [
         database.solve_from_centroids(
-            t, fov_estimate_deg=degrees, image_width=659, image_height=493, fov_max_error_deg=0.2
+            t,
+            fov_estimate_deg=degrees,
+            image_width=659,
+            image_height=493,
+            fov_max_error_deg=0.2,
         )
         for t in tables
     ]

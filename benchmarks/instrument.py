@@ -44,7 +44,9 @@ NOISE = {
 }
 
 
-def camera(width: int, height: int, focal_px: float, sigma_px: float, **noise: Any) -> CameraConfig:
+def camera(
+    width: int, height: int, focal_px: float, sigma_px: float, **noise: Any
+) -> CameraConfig:
     """A camera with square 5 um pixels and a Gaussian PSF; f/10000, so that defocus is negligible."""
     part = {
         "width_px": width,
@@ -118,7 +120,12 @@ def light_of(lens: CameraConfig, sources: Sources, rate_rad_s: float) -> Floats:
     """Mean photoelectrons of the same frame."""
     image = np.zeros((lens.height_px, lens.width_px))
     render(
-        image, sources, square_meter(lens), turning(rate_rad_s), AT_CENTER, Window(0.0, EXPOSURE_S)
+        image,
+        sources,
+        square_meter(lens),
+        turning(rate_rad_s),
+        AT_CENTER,
+        Window(0.0, EXPOSURE_S),
     )
     return image
 
@@ -193,7 +200,9 @@ def numpy_noise(mean_e: Floats) -> Callable[[], Any]:
 
 def sky_frame() -> list[dict[str, Any]]:
     """1024 x 1024 pixels over 20 deg, PSF sigma 0.8 px: the 15,200 stars to V 7 give 146 in such a field."""
-    lens = camera(1024, 1024, 512 / np.tan(np.radians(10)), 0.8, prnu=0.0, dsnu=0.0, hot_pixels=0.0)
+    lens = camera(
+        1024, 1024, 512 / np.tan(np.radians(10)), 0.8, prnu=0.0, dsnu=0.0, hot_pixels=0.0
+    )
     # Star counts grow by 0.51 dex per magnitude at V 7; this draws magnitudes from that distribution.
     magnitude = 7 + np.log10(np.random.default_rng(3).uniform(0, 1, 146)) / 0.51
     electrons = 2e4 * 10 ** (-0.4 * (magnitude - 4))
@@ -274,10 +283,16 @@ def growth() -> list[dict[str, Any]]:
         "draw 500 stars, 1024x1024", drawing(few, 500), "on 2048x2048", drawing(many, 500)
     )
     return [
-        verdict("ten times the stars beyond 500", stars["ratio"], "times as long", "linear", 11.0),
+        verdict(
+            "ten times the stars beyond 500", stars["ratio"], "times as long", "linear", 11.0
+        ),
         verdict("four times the area, drawing", area["ratio"], "times as long", "level", 1.25),
         verdict(
-            "memory of a frame being made", memory_frames(), "frames of float32", "most wanted", 6.0
+            "memory of a frame being made",
+            memory_frames(),
+            "frames of float32",
+            "most wanted",
+            6.0,
         ),
     ]
 

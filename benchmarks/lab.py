@@ -193,7 +193,8 @@ def measure() -> list[dict[str, Any]]:
         scene = Path(folder) / "square.yaml"
         scene.write_text(SCENE)
         browser, other = (
-            driver.chromium.launch(executable_path=chromium(), args=list(FLAGS)) for _ in range(2)
+            driver.chromium.launch(executable_path=chromium(), args=list(FLAGS))
+            for _ in range(2)
         )
         tabs = browser.new_context()
         with served(str(scene)) as server:
@@ -315,7 +316,9 @@ def plain(name: str, value: float, unit: str, what: str) -> dict[str, Any]:
     return verdict(name, value, unit, what, math.inf) | {"bar": None, "met": None}
 
 
-def measured(page: Any, server: Server, traffic: Traffic, action: Callable[[], None]) -> Measured:
+def measured(
+    page: Any, server: Server, traffic: Traffic, action: Callable[[], None]
+) -> Measured:
     """What an action on a page takes."""
     page.evaluate("() => { window.drawn = [] }")
     traffic.websocket = traffic.http = 0
@@ -326,7 +329,12 @@ def measured(page: Any, server: Server, traffic: Traffic, action: Callable[[], N
     after = (server.cpu_s(), browser_cpu_s())
     frames = int(page.evaluate("window.drawn.length"))
     return Measured(
-        frames, seconds, traffic.websocket, traffic.http, after[0] - before[0], after[1] - before[1]
+        frames,
+        seconds,
+        traffic.websocket,
+        traffic.http,
+        after[0] - before[0],
+        after[1] - before[1],
     )
 
 
@@ -438,7 +446,9 @@ def crowd(tabs: Any, other: Any, server: Server) -> list[dict[str, Any]]:
     worst = float(np.max(during))
     what = f"beyond {median:.0f} ms alone; median {np.median(during):.0f} ms"
     return [
-        verdict("a waiting tab opened after a worker is free", waited_s, "s", f"{CROWD} tabs", 5.0),
+        verdict(
+            "a waiting tab opened after a worker is free", waited_s, "s", f"{CROWD} tabs", 5.0
+        ),
         verdict("greatest delay of a key while they open", worst - median, "ms", what, 200.0),
     ]
 
@@ -448,8 +458,12 @@ def lower_priority() -> None:
 
     Chromium gives a page that it shows a higher priority (nice), but leaves the policy of the scheduler.
     """
-    browsers = [one for one in psutil.Process().children(recursive=True) if "chrom" in one.name()]
-    roots = [one for one in browsers if one.parent() is None or "chrom" not in one.parent().name()]
+    browsers = [
+        one for one in psutil.Process().children(recursive=True) if "chrom" in one.name()
+    ]
+    roots = [
+        one for one in browsers if one.parent() is None or "chrom" not in one.parent().name()
+    ]
     newest = max(roots, key=psutil.Process.create_time)
     for one in (newest, *newest.children(recursive=True)):
         for thread in one.threads():

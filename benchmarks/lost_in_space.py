@@ -85,7 +85,9 @@ WORKLOADS = (
     ),
     Workload("SHEFEX", SHEFEX, 659, 5.75, 0.1, brightest=15, bar_percent=100, bar_ms=0.05),
     Workload("SHEFEX, half false", SHEFEX, 659, 5.75, 0.1, brightest=15, false_share=0.5),
-    Workload("SHEFEX, .5 px, a fifth false", SHEFEX, 659, 5.75, 0.5, brightest=15, false_share=0.2),
+    Workload(
+        "SHEFEX, .5 px, a fifth false", SHEFEX, 659, 5.75, 0.5, brightest=15, false_share=0.2
+    ),
     Workload("hard, V < 6.5", (10, 7.5), 1024, 6.5, 1.0, false=3, missing=0.2),
     Workload("hard, V < 7", (10, 7.5), 1024, 7.0, 1.0, false=3, missing=0.2),
     Workload("17 x 13 deg, half false", *DENSE, false_share=0.5, bar_percent=99.5),
@@ -99,7 +101,9 @@ WORKLOADS = (
         bar_ms=20,
     ),
     Workload("6 x 6 deg, 70 % false", *NARROW, false_share=0.7, bar_percent=92),
-    Workload("6 x 6 deg, 25 hot pixels, a lattice", *NARROW, lattice=5, bar_percent=98, bar_ms=10),
+    Workload(
+        "6 x 6 deg, 25 hot pixels, a lattice", *NARROW, lattice=5, bar_percent=98, bar_ms=10
+    ),
     Workload(
         "the same, brighter than any star",
         *NARROW,
@@ -108,8 +112,12 @@ WORKLOADS = (
         bar_percent=98,
         bar_ms=10,
     ),
-    Workload("35 x 20 deg, 70 % false", (35, 20), 1280, 5.5, 0.2, false_share=0.7, bar_percent=99),
-    Workload("23 x 23 deg, 70 % false", (23, 23), 1024, 5.5, 0.2, false_share=0.7, bar_percent=97),
+    Workload(
+        "35 x 20 deg, 70 % false", (35, 20), 1280, 5.5, 0.2, false_share=0.7, bar_percent=99
+    ),
+    Workload(
+        "23 x 23 deg, 70 % false", (23, 23), 1024, 5.5, 0.2, false_share=0.7, bar_percent=97
+    ),
     Workload(
         "SHEFEX, focal known to 5 %, off 5 %",
         SHEFEX,
@@ -156,12 +164,16 @@ def sky(limit_mag: float) -> catalog.StarCatalog:
     if not path.is_file():
         star_archives.build_hipparcos(7.5, path)
     stars = catalog.brighter_than(catalog.read(path), limit_mag)
-    near = cKDTree(stars.vectors).query_pairs(2 * np.sin(DOUBLES_RAD / 2), output_type="ndarray")
+    near = cKDTree(stars.vectors).query_pairs(
+        2 * np.sin(DOUBLES_RAD / 2), output_type="ndarray"
+    )
     fainter = near.max(axis=1)  # rows are sorted by magnitude
     return stars.take(np.setdiff1d(np.arange(len(stars)), fainter))
 
 
-def fields(work: Workload, stars: catalog.StarCatalog, count: int, seed: int) -> Iterator[Field]:
+def fields(
+    work: Workload, stars: catalog.StarCatalog, count: int, seed: int
+) -> Iterator[Field]:
     """Random frames of a workload."""
     for n in range(count):
         yield field(work, stars, np.random.default_rng([seed, n]))
@@ -184,7 +196,9 @@ def field(work: Workload, stars: catalog.StarCatalog, rng: np.random.Generator) 
     false_xy = rng.uniform(-0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (false, 2))
     if work.lattice:
         steps = (np.arange(work.lattice) + 0.5) / work.lattice
-        x, y = np.meshgrid(np.round(steps * camera.width_px), np.round(steps * camera.height_px))
+        x, y = np.meshgrid(
+            np.round(steps * camera.width_px), np.round(steps * camera.height_px)
+        )
         false_xy = np.column_stack([x.ravel(), y.ravel()])
         false = work.lattice**2
     xy = np.concatenate([detected, false_xy])

@@ -47,7 +47,9 @@ class Condition:
         radial = 1 + self.focal_drift + cubic * np.sum(offset_px**2, axis=1)
         xy_px = camera.center_px + radial[:, None] * offset_px
         sigma_px = frame.centroids.sigma_px / self.noise_factor
-        return replace(frame, centroids=replace(frame.centroids, xy_px=xy_px, sigma_px=sigma_px))
+        return replace(
+            frame, centroids=replace(frame.centroids, xy_px=xy_px, sigma_px=sigma_px)
+        )
 
 
 CONDITIONS = (
@@ -84,7 +86,9 @@ def measure(
         tracker = StarTracker(work.camera, stars, stars.vectors, settings)
         for condition in conditions:
             frames = (
-                condition.apply(field(work, stars, np.random.default_rng([SEED, n])), work.camera)
+                condition.apply(
+                    field(work, stars, np.random.default_rng([SEED, n])), work.camera
+                )
                 for n in range(count)
             )
             rows += _rows(f"{work.name}, {condition.name}", scores(tracker, frames), count)
@@ -122,6 +126,11 @@ def _rows(name: str, found: Floats, fields: int) -> list[dict[str, Any]]:
         *rows,
         row(f"{name}: NEES", mean, "", None, high, low <= mean <= high),
         row(
-            f"{name}: NEES, 99.9 %", tail, "", TAIL, TAIL_FACTOR * TAIL, tail <= TAIL_FACTOR * TAIL
+            f"{name}: NEES, 99.9 %",
+            tail,
+            "",
+            TAIL,
+            TAIL_FACTOR * TAIL,
+            tail <= TAIL_FACTOR * TAIL,
         ),
     ]

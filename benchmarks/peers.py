@@ -69,7 +69,10 @@ def tetra3rs(camera: Camera, noise_px: float, focal_uncertainty: float = 0.0) ->
 def cedar(camera: Camera, focal_uncertainty: float = 0.0) -> Solve | None:
     """cedar-solve; None if it is not installed, or the field is not one of its database."""
     fov_deg = math.degrees(2 * math.atan(camera.width_px / 2 / camera.focal_px))
-    if importlib.util.find_spec("tetra3") is None or not CEDAR_DEG[0] <= fov_deg <= CEDAR_DEG[1]:
+    if (
+        importlib.util.find_spec("tetra3") is None
+        or not CEDAR_DEG[0] <= fov_deg <= CEDAR_DEG[1]
+    ):
         return None
     vars(np).setdefault("math", math)
     from tetra3 import Tetra3

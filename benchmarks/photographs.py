@@ -69,7 +69,9 @@ def measure(count: int = COUNT, seed: int = 25) -> list[dict[str, Any]]:
             )
             rows[-1] |= {"bar": SOLVED_BAR, "met": percent >= SOLVED_BAR}
         rows.append(
-            row(f"{name}: wrong, of {4 * pictures} answers possible", wrong, "wrong", None, None)
+            row(
+                f"{name}: wrong, of {4 * pictures} answers possible", wrong, "wrong", None, None
+            )
             | {"bar": 0}
         )
         rows[-1]["met"] = wrong == 0

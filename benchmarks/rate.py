@@ -48,7 +48,12 @@ def measure(
         rms = float(metrics.rms(np.array(errors)))
         rows += [
             row(
-                f"{name}: across the boresight", rms, "% rms", None, BAR_PERCENT, rms <= BAR_PERCENT
+                f"{name}: across the boresight",
+                rms,
+                "% rms",
+                None,
+                BAR_PERCENT,
+                rms <= BAR_PERCENT,
             ),
             nees_row(f"{name}: NEES", np.array(nees)),
         ]

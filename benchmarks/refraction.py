@@ -56,7 +56,8 @@ def star_frames(folder: Path) -> tuple[list[StarFrame], Camera]:
         return StarTracker(camera, stars, vectors, focal_uncertainty=focal_uncertainty)
 
     found = [
-        with_floor(detect_and_centroid(picture, sheet, Settings(), Clock())) for picture in pictures
+        with_floor(detect_and_centroid(picture, sheet, Settings(), Clock()))
+        for picture in pictures
     ]
     camera = self_calibrate(found, tracker, sheet).camera
     final = tracker(camera, 0.002)

@@ -20,7 +20,9 @@ from skysim.simulation.flight import open_flight
 
 FRAMES = 36_000
 RATE_HZ = 10.0
-WARM_S = 60.0  # simulated time after which all code was called once; growth is counted from here
+WARM_S = (
+    60.0  # simulated time after which all code was called once; growth is counted from here
+)
 MOST_GROWTH = 1.0  # %
 SCENE = {
     "seed": "11",
@@ -55,7 +57,9 @@ def measure(count: int = FRAMES) -> list[dict[str, Any]]:
             )
             print(progress, file=sys.stderr, flush=True)
     growth = 100 * (max(memory_mb) / memory_mb[0] - 1)
-    off_rad = metrics.cross_and_roll_rad(attitude, shot.truth.cam_from_lab)[0] if attitude else None
+    off_rad = (
+        metrics.cross_and_roll_rad(attitude, shot.truth.cam_from_lab)[0] if attitude else None
+    )
     what = f"{count} frames at {RATE_HZ:g} Hz"
     return [
         verdict("memory: growth after the first minute", growth, "%", what, MOST_GROWTH),

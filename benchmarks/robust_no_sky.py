@@ -78,11 +78,15 @@ def false_lights(
     camera = work.camera
     xy_px = rng.uniform(-0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (count, 2))
     return Centroids(
-        xy_px, np.full(count, work.noise_px), 10 ** (-0.4 * np.sort(rng.choice(stars.v_mag, count)))
+        xy_px,
+        np.full(count, work.noise_px),
+        10 ** (-0.4 * np.sort(rng.choice(stars.v_mag, count))),
     )
 
 
-KINDS: dict[str, tuple[Callable[[Workload, StarCatalog, np.random.Generator], Frame], float]] = {
+KINDS: dict[
+    str, tuple[Callable[[Workload, StarCatalog, np.random.Generator], Frame], float]
+] = {
     "no star": (no_star, 1.0),
     "mirrored": (mirrored, 0.1),
     "few stars": (few_stars, 0.1),
@@ -92,14 +96,18 @@ KINDS: dict[str, tuple[Callable[[Workload, StarCatalog, np.random.Generator], Fr
 @functools.cache
 def trackers() -> list[tuple[Workload, StarCatalog, StarTracker]]:
     """A tracker of each workload, with its sky, built once in each process."""
-    settings = Settings(centroid_sigma_px=0.0, field_stars=1e9, merge_px=0.0, zero_point_mag=0.0)
+    settings = Settings(
+        centroid_sigma_px=0.0, field_stars=1e9, merge_px=0.0, zero_point_mag=0.0
+    )
     skies = {work.limit_mag: sky(work.limit_mag) for work in WORKLOADS}
     out = []
     for work in WORKLOADS:
         stars = skies[work.limit_mag]
         uncertainty = 1.05 * work.focal_uncertainty
         camera = work.camera.zoomed(1 + work.focal_error)
-        out.append((work, stars, StarTracker(camera, stars, stars.vectors, settings, uncertainty)))
+        out.append(
+            (work, stars, StarTracker(camera, stars, stars.vectors, settings, uncertainty))
+        )
     return out
 
 
@@ -144,9 +152,7 @@ def measure_kind(
         total = {name: np.add(total.get(name, 0), row) for name, row in batch.items()}
         done, answers, wrong = np.sum(list(total.values()), axis=0)
         speed = done / (time.perf_counter() - begin)
-        progress = (
-            f"{done} of {frames} frames, {answers} answered, {wrong} wrong; {speed:.0f} frames/s"
-        )
+        progress = f"{done} of {frames} frames, {answers} answered, {wrong} wrong; {speed:.0f} frames/s"
         print(f"{kind}: {progress}", file=sys.stderr, flush=True)
     rows = []
     for name, (done, answers, wrong) in total.items():

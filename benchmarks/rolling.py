@@ -35,9 +35,7 @@ from skysim.tracking import factory
 
 RATES_DEG_S = (0.0, 1.0, 2.0, 5.0, 10.0)
 GYRO_RAD_S = np.radians(0.01)
-ROLL_SHARE = (
-    0.2  # of the boresight in a random axis, if stars are smeared: streaks are then nearly parallel
-)
+ROLL_SHARE = 0.2  # of the boresight in a random axis, if stars are smeared: streaks are then nearly parallel
 BAR_NEES = 0.3
 BAR_ERROR = 1.2
 CHI2_MEDIAN = (
@@ -61,8 +59,12 @@ class Work:
     tilt_deg: float | None = None
 
     def lab(self, rolling: bool) -> Lab:
-        shutter = f"{{kind: rolling, row_time: '{self.row_time}'}}" if rolling else "{kind: global}"
-        return build_lab(load(self.scene, ONE_FRAME | self.changes | {"camera.shutter": shutter}))
+        shutter = (
+            f"{{kind: rolling, row_time: '{self.row_time}'}}" if rolling else "{kind: global}"
+        )
+        return build_lab(
+            load(self.scene, ONE_FRAME | self.changes | {"camera.shutter": shutter})
+        )
 
 
 PHONE = {
@@ -214,7 +216,9 @@ def with_bound(
     rate_known = np.linalg.inv(normal[:3, :3])
     if seen.streak_px is not None:
         told = np.isfinite(seen.streak_px[:, 0])
-        by_rate = exposure_s * streak_factor(camera, velocity[told])[:, None, None] * jacobian[told]
+        by_rate = (
+            exposure_s * streak_factor(camera, velocity[told])[:, None, None] * jacobian[told]
+        )
         normal[3:, 3:] += np.sum(
             np.swapaxes(by_rate, 1, 2) @ chords(camera, seen.take(told))[1] @ by_rate, axis=0
         )
@@ -253,10 +257,19 @@ def _rows(name: str, ours: Floats, peer: Floats) -> list[dict[str, Any]]:
             )
         )
         rows.append(
-            row(f"{name}: bound of the roll over that of a known rate", ratio, "", None, None, None)
+            row(
+                f"{name}: bound of the roll over that of a known rate",
+                ratio,
+                "",
+                None,
+                None,
+                None,
+            )
         )
     for column, angle in (1, "cross"), (2, "roll"):
-        value, others = (float(np.median(np.abs(errors[both, column]))) for errors in (ours, peer))
+        value, others = (
+            float(np.median(np.abs(errors[both, column]))) for errors in (ours, peer)
+        )
         rows.append(
             row(
                 f"{name}: {angle}",

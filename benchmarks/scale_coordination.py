@@ -165,7 +165,9 @@ def storing(rows: int = 20_000, block: int = 1000) -> list[dict[str, Any]]:
             hertz = rows / (time.process_time() - begin)
         size = path.stat().st_size / rows
     return [
-        verdict(f"rows stored in a second, {block} at a time", hertz, "/s", "of CPU", 5000.0, True),
+        verdict(
+            f"rows stored in a second, {block} at a time", hertz, "/s", "of CPU", 5000.0, True
+        ),
         verdict("bytes of a row in the store", size, "B", "solved", 500.0),
     ]
 
@@ -217,7 +219,9 @@ def measure() -> list[dict[str, Any]]:
         hertz = max(one.hertz for _, one in found)
         cpu_ms = min(one.cpu_ms for _, one in found)
         rows.append(
-            verdict(f"{name}: chunks a second, {WORKERS} workers", hertz, "/s", told, 2000.0, True)
+            verdict(
+                f"{name}: chunks a second, {WORKERS} workers", hertz, "/s", told, 2000.0, True
+            )
         )
         rows.append(verdict(f"{name}: CPU of coordination", cpu_ms, "ms", "a chunk", 0.5))
     return rows

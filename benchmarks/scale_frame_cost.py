@@ -68,7 +68,9 @@ def cost_of(width_px: int, height_px: int, limit_mag: float) -> Cost:
             spent.append((time.process_time() - begin) / FRAMES)
         files = [path for path in Path(folder).rglob("*") if path.is_file()]
         size = sum(path.stat().st_size for path in files) / made.frames
-    sources = np.mean([len(one.sources) for _, _, _, one in dataset_run.labelled_frames(made, 0)])
+    sources = np.mean(
+        [len(one.sources) for _, _, _, one in dataset_run.labelled_frames(made, 0)]
+    )
     return Cost(width_px, height_px, limit_mag, float(sources), min(spent[1:]), size)
 
 
@@ -76,7 +78,9 @@ def fit(costs: list[Cost], name: str) -> Floats:
     """(3,) coefficients of a cost, by relative least squares."""
     values = np.array([getattr(one, name) for one in costs])
     terms = np.array([one.terms() for one in costs])
-    return np.asarray(np.linalg.lstsq(terms / values[:, None], np.ones(len(costs)), rcond=None)[0])
+    return np.asarray(
+        np.linalg.lstsq(terms / values[:, None], np.ones(len(costs)), rcond=None)[0]
+    )
 
 
 def measure() -> list[dict[str, Any]]:

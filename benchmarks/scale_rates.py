@@ -136,9 +136,13 @@ def parts() -> list[dict[str, Any]]:
         total = sum(spent.values())
         most = max(spent, key=lambda part: spent[part])
         rows += [
-            figure(f"CPU of a {name} frame", total, "ms", f"{most} is {spent[most] / total:.0%}")
+            figure(
+                f"CPU of a {name} frame", total, "ms", f"{most} is {spent[most] / total:.0%}"
+            )
         ]
-        rows += [figure(f"- {part}", ms, "ms", f"{ms / total:.0%}") for part, ms in spent.items()]
+        rows += [
+            figure(f"- {part}", ms, "ms", f"{ms / total:.0%}") for part, ms in spent.items()
+        ]
     return rows
 
 
@@ -223,7 +227,9 @@ class TimedPool:
     def run(self, job: engines.Job, chunks: engines.Chunks) -> Iterator[list[trials.Row]]:
         """See `engines.Engine`."""
         for rows in self.pool.run(job, chunks):
-            self.batches.append((time.perf_counter(), len(rows), sum(row.seconds for row in rows)))
+            self.batches.append(
+                (time.perf_counter(), len(rows), sum(row.seconds for row in rows))
+            )
             yield rows
 
 
@@ -270,7 +276,9 @@ def centroids() -> list[dict[str, Any]]:
     """Centroid trials in a second with the store, by two workers and by one."""
     two, one = (run_study(CENTROIDS, workers) for workers in (2, 1))
     return [
-        verdict("centroid trials with the store, two workers", two.rate, "/s", "", 5000.0, True),
+        verdict(
+            "centroid trials with the store, two workers", two.rate, "/s", "", 5000.0, True
+        ),
         verdict(
             "centroids: two workers over one",
             two.rate / one.rate,
@@ -338,7 +346,9 @@ def four_exposures(name: str) -> Plan:
     """A study of a scene with four exposure times, each of which is a setup of its own."""
     scene = loader.load(name)
     kind = "centroids" if scene.tracker.decoder else "frames"
-    times = [f"{1e3 * scene.exposure.time_s * share:.6g} ms" for share in (1.0, 0.99, 0.98, 0.97)]
+    times = [
+        f"{1e3 * scene.exposure.time_s * share:.6g} ms" for share in (1.0, 0.99, 0.98, 0.97)
+    ]
     tree = {
         "scene": name,
         "seed": 1,
@@ -347,7 +357,8 @@ def four_exposures(name: str) -> Plan:
     }
     with tempfile.NamedTemporaryFile("w", suffix=".yaml") as file:
         yaml.safe_dump(
-            tree | {"schema": 1, "title": "memory", "replicates": 1, "responses": ["identified"]},
+            tree
+            | {"schema": 1, "title": "memory", "replicates": 1, "responses": ["identified"]},
             file,
         )
         file.flush()

@@ -74,7 +74,8 @@ def build(folder: Path, rows: int, points: int) -> None:
             with database.db:
                 database.db.execute("INSERT INTO parts VALUES (?, ?, ?, ?, ?)", row)
                 database.db.execute(
-                    "UPDATE meta SET value = ? WHERE key = 'format'", (str(store.FORMAT_OF_PARTS),)
+                    "UPDATE meta SET value = ? WHERE key = 'format'",
+                    (str(store.FORMAT_OF_PARTS),),
                 )
             first += store.PART_ROWS
         insert(database, drawn(first, study.trials - first, each))
@@ -105,7 +106,9 @@ def drawn(first: int, count: int, each: int) -> dict[str, NDArray[Any]]:
     columns |= {name: np.full(count, "0" * 16, dtype=object) for name in ("scene", "code")}
     solved = rng.random(count) > 0.01
     wrong = solved & (rng.random(count) < 1e-6)
-    status = np.array(["no attitude fits the lights", "solved"], dtype=object)[solved.astype(int)]
+    status = np.array(["no attitude fits the lights", "solved"], dtype=object)[
+        solved.astype(int)
+    ]
     columns |= {"status": status, "error": np.full(count, None, dtype=object)}
     columns |= {
         "frames": np.ones(count, int),
@@ -114,7 +117,8 @@ def drawn(first: int, count: int, each: int) -> dict[str, NDArray[Any]]:
     }
     columns["ambiguous"] = np.zeros(count, int)
     columns |= {
-        name: np.zeros(count) for name in ("misidentified", "roll_noise", "misled", "wrong_matches")
+        name: np.zeros(count)
+        for name in ("misidentified", "roll_noise", "misled", "wrong_matches")
     }
     scale = np.where(wrong, 1e4, 1.0)
     for name, sigma_arcsec in (("x_arcsec", 6.0), ("y_arcsec", 6.0), ("roll_arcsec", 60.0)):
@@ -122,7 +126,10 @@ def drawn(first: int, count: int, each: int) -> dict[str, NDArray[Any]]:
     columns["nees"] = np.where(solved, rng.chisquare(3, count) * scale**2, np.nan)
     stars = rng.poisson(20, count).astype(float)
     columns |= {"stars": stars, "detected": stars, "matched": np.where(solved, stars, 0.0)}
-    columns |= {"centroid_px": rng.normal(0.1, 0.02, count), "time_ms": rng.gamma(9, 0.4, count)}
+    columns |= {
+        "centroid_px": rng.normal(0.1, 0.02, count),
+        "time_ms": rng.gamma(9, 0.4, count),
+    }
     columns |= {f"lab_from_body_{part}": rng.uniform(-0.5, 0.5, count) for part in "wxyz"}
     columns["boresight_ra_deg"] = rng.uniform(0, 360, count)
     columns["boresight_dec_deg"] = np.degrees(np.arcsin(rng.uniform(-1, 1, count)))
@@ -176,4 +183,6 @@ def timed(
         f"{what}; {cpu_s:.0f} s of CPU",
         most_s,
     )
-    yield verdict(f"study {command}: memory", 1024 * used.ru_maxrss / 1e6, "MB", what, most / 1e6)
+    yield verdict(
+        f"study {command}: memory", 1024 * used.ru_maxrss / 1e6, "MB", what, most / 1e6
+    )

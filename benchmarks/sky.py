@@ -59,7 +59,11 @@ def measure() -> list[dict[str, Any]]:
     if not DEEP.is_file():
         DEEP.parent.mkdir(parents=True, exist_ok=True)
         star_archives.build_gaia(10.0, DEEP)
-    return [*bodies(), *(row for fov_deg in FIELDS_DEG for row in narrow(fov_deg)), frame_time()]
+    return [
+        *bodies(),
+        *(row for fov_deg in FIELDS_DEG for row in narrow(fov_deg)),
+        frame_time(),
+    ]
 
 
 def bodies() -> list[dict[str, Any]]:
@@ -99,7 +103,11 @@ def narrow(fov_deg: float) -> list[dict[str, Any]]:
         "shefex2", camera, {"field": {"levels": {f"{fov_deg:g} deg": {}}}}, NARROW_FRAMES
     )
     return shares(
-        f"{fov_deg:g} deg, sky and tracker to V 10", trials, len(trials), wrong_of=trials, bar=99
+        f"{fov_deg:g} deg, sky and tracker to V 10",
+        trials,
+        len(trials),
+        wrong_of=trials,
+        bar=99,
     )
 
 
@@ -131,7 +139,9 @@ def catalog_stars(lab: Lab, trial: Any) -> int:
     return int(np.sum(lab.camera.sources.magnitude[rows] <= lab.scene.tracker.limit_mag))
 
 
-def shares(name: str, trials: Any, drawn: int, wrong_of: Any, bar: float) -> list[dict[str, Any]]:
+def shares(
+    name: str, trials: Any, drawn: int, wrong_of: Any, bar: float
+) -> list[dict[str, Any]]:
     """Rows of the solved share of some trials, and of the number of wrong attitudes among all."""
     solved = 100 * float(np.mean(trials["status"] == "solved"))
     wrong = float(np.sum(wrong_of["wrong"]))

@@ -104,7 +104,9 @@ def build_trackers(lab: Lab) -> dict[str, StarTracker]:
     )
     default = Settings(gain_e_dn=gain, centroid_sigma_px=scene.tracker.centroid_sigma_px)
     return {
-        "paper": StarTracker(camera, paper_stars, catalog.apparent(paper_stars, observer), paper),
+        "paper": StarTracker(
+            camera, paper_stars, catalog.apparent(paper_stars, observer), paper
+        ),
         "default": StarTracker(
             camera, stars_default, catalog.apparent(stars_default, observer), default
         ),
@@ -117,7 +119,11 @@ def build_trackers(lab: Lab) -> dict[str, StarTracker]:
 def measure(count: int = FRAMES, seed: int = 1) -> list[dict[str, Any]]:
     """Solved and wrong shares of `count` frames for each rate and chain."""
     rows = []
-    overrides = {"exposure.time": "50 ms", "exposure.first": "0 s", "exposure.frames": str(count)}
+    overrides = {
+        "exposure.time": "50 ms",
+        "exposure.first": "0 s",
+        "exposure.frames": str(count),
+    }
     lab = build_lab(load("shefex2", overrides))
     trackers = build_trackers(lab)
     for rate in RATES_DEG_S:

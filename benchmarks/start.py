@@ -27,7 +27,11 @@ def measure() -> list[dict[str, Any]]:
         skysim(["render", "shefex2", "--frames", "1", "--out", "."], folder)
         return [
             verdict(
-                f"skysim {words}", least_s(words.split(), folder), "s", "user + system time", bar
+                f"skysim {words}",
+                least_s(words.split(), folder),
+                "s",
+                "user + system time",
+                bar,
             )
             for words, bar in COMMANDS.items()
         ]

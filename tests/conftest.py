@@ -71,9 +71,7 @@ def with_imports(source: Path, uses: Mapping[Path, set[Path]]) -> set[Path]:
 
 
 COMPILED = pytest.StashKey[tuple[Path, Future[None]]]()
-LAST_COMPILED = (
-    "estimator/identification/__pycache__/star_quads.identify-*.nbi"  # which `make demo` leaves out
-)
+LAST_COMPILED = "estimator/identification/__pycache__/star_quads.identify-*.nbi"  # which `make demo` leaves out
 
 
 @pytest.hookimpl(optionalhook=True)

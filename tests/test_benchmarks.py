@@ -20,7 +20,9 @@ def parameters(area: str) -> set[str]:
     """The parameters of an area's `measure`, without its import."""
     tree = ast.parse((FOLDER / f"{area}.py").read_text(encoding="utf-8"))
     (measure,) = (
-        node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == "measure"
+        node
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef) and node.name == "measure"
     )
     return {argument.arg for argument in measure.args.args}
 
@@ -31,7 +33,9 @@ def test_every_file_is_an_area() -> None:
 
 @pytest.mark.parametrize("area", AREAS)
 def test_an_area_takes_the_options_of_its_quick_part(area: str) -> None:
-    assert (AREAS[area].quick or {}).keys() | accept.QUICK.get(area, {}).keys() <= parameters(area)
+    assert (AREAS[area].quick or {}).keys() | accept.QUICK.get(area, {}).keys() <= parameters(
+        area
+    )
 
 
 def test_a_group_s_name_stands_for_all_its_areas() -> None:
@@ -54,7 +58,11 @@ def test_an_unknown_area_is_refused_with_the_allowed_ones(
     assert "'optics' is not an area; allowed: instrument, detect" in capsys.readouterr().err
 
 
-PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "estimator").rglob("*.md")]
+PAGES = [
+    *ROOT.glob("*.md"),
+    *(ROOT / "docs").rglob("*.md"),
+    *(ROOT / "estimator").rglob("*.md"),
+]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -84,7 +92,8 @@ def test_rows_of_the_quick_run_are_kept_and_judged(
     monkeypatch.setattr(accept, "measured", lambda area, options: measured[area])
     assert accept.main(quick=True) == 1
     assert (
-        "missed: bad: wrong: 1 frames, bar 0 (python -m benchmarks bad)" in capsys.readouterr().out
+        "missed: bad: wrong: 1 frames, bar 0 (python -m benchmarks bad)"
+        in capsys.readouterr().out
     )
     rows = accept.rows_by_command(tmp_path / "accept.json")
     assert rows.keys() == {"python -m benchmarks good --count=2", "python -m benchmarks bad"}

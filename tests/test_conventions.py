@@ -172,7 +172,9 @@ def test_quaternions_have_their_documented_order():
 
 def test_rotation_names_chain_by_equal_frames():
     """v_a = a_from_b.apply(v_b), and neighbors cancel: cam_from_lab = cam_from_body * body_from_lab."""
-    lab_from_body = Rotation.from_euler("z", 90, degrees=True)  # the vehicle has yawed to the left
+    lab_from_body = Rotation.from_euler(
+        "z", 90, degrees=True
+    )  # the vehicle has yawed to the left
     cam_from_body = Rotation.identity()
     cam_from_lab = cam_from_body * lab_from_body.inv()
     # Something along lab y lies straight ahead of body x, which is the camera's right.
@@ -235,11 +237,15 @@ def test_a_turned_gimbal_gives_the_body_the_opposite_of_the_rotor_s_momentum_cha
     hundredth, is left out.
     """
     _, flight = flown(
-        {"cmgs": {"rotor_rpm": 2600}, "inertia": ["600 kg m2", "650 kg m2", "900 kg m2"]}, 3, 0.1
+        {"cmgs": {"rotor_rpm": 2600}, "inertia": ["600 kg m2", "650 kg m2", "900 kg m2"]},
+        3,
+        0.1,
     )
     momentum = flight.rate_body_rad_s * [600, 650, 900]
     turned = 0.1 * (1 - 2 * 0.01)  # the servo is two time constants late
-    expected = 0.6126106 * np.array([np.sin(turned) * 0.5773503, 0, -np.sin(turned) * 0.8164966])
+    expected = 0.6126106 * np.array(
+        [np.sin(turned) * 0.5773503, 0, -np.sin(turned) * 0.8164966]
+    )
     np.testing.assert_allclose(momentum[[0, 2]], expected[[0, 2]], rtol=0.01, atol=0)
 
 

@@ -63,7 +63,14 @@ def flown(request: pytest.FixtureRequest) -> Flown:
 
 
 def test_scenes_are_shipped() -> None:
-    steered = {"afit_simsat", "shefex2", "simsat_slew", "simsat_cmg", "simsat_bump", "tas2_vscmg"}
+    steered = {
+        "afit_simsat",
+        "shefex2",
+        "simsat_slew",
+        "simsat_cmg",
+        "simsat_bump",
+        "tas2_vscmg",
+    }
     lit = {
         "afit_test1",
         "afit_test2",
@@ -186,7 +193,9 @@ def test_an_ideal_scene_s_tracker_has_the_true_dome(name: str) -> None:
     ideal = loader.load(name)
     base = loader.load(name.removesuffix("_ideal"))
     assert (
-        ideal.model_copy(update={"tracker": base.tracker, "title": base.title, "name": base.name})
+        ideal.model_copy(
+            update={"tracker": base.tracker, "title": base.title, "name": base.name}
+        )
         == base
     )
     lab = build_lab(ideal)
@@ -231,11 +240,15 @@ def test_the_claimed_error_matches_the_actual_error(name: str) -> None:
     flight = simulate_motion(loader.load(name, NO_EYES.get(name)))
     flown = flight.lab.scene
     motion = flight.trajectory()
-    t_s = np.array([exposure_window(flown, index).open_s for index in range(flown.exposure.frames)])
+    t_s = np.array(
+        [exposure_window(flown, index).open_s for index in range(flown.exposure.frames)]
+    )
     turned = motion.attitude_at(t_s).inv() * motion.attitude_at(t_s + 0.01)
     trial = FrameTrial(
         kind="frames",
-        dec_deg=BENCH_DEG if isinstance(flown.light, CollimatedDisplayConfig) else (-90.0, 90.0),
+        dec_deg=BENCH_DEG
+        if isinstance(flown.light, CollimatedDisplayConfig)
+        else (-90.0, 90.0),
         tilt_deg=TILT_DEG.get(name.removesuffix("_ideal"), (0.0, 25.0)),
         rate_deg_s=float(np.degrees(np.median(turned.magnitude())) / 0.01),
     )
@@ -309,7 +322,9 @@ def at_random(config: VehicleConfig, rate_body_rad_s: np.ndarray) -> multibody.S
     """
     vehicle = multibody.build(config)
     rng = np.random.default_rng(7)
-    most = np.where(vehicle.model.actuator_ctrllimited, vehicle.model.actuator_ctrlrange[:, 1], 1.0)
+    most = np.where(
+        vehicle.model.actuator_ctrllimited, vehicle.model.actuator_ctrlrange[:, 1], 1.0
+    )
     most[vehicle.torques] = config.torque_limit_nm
     most[vehicle.gimbals.motor] = (
         np.radians(config.cmgs.gimbal_rate_limit_deg_s) if config.cmgs else 0.0

@@ -34,7 +34,9 @@ def test_after_a_blow_beyond_the_torque_limit_the_vehicle_brakes_and_returns(
     actuators: str, more: dict[str, str]
 ) -> None:
     """80 deg/s about z: J w / T = 12.6 s at the least to stop, more than once round; home within four times that."""
-    blow = "[{kind: hold, duration: 1 s}, {kind: bump, rate_deg_s: [0, 0, 80], duration: 40 ms}]"
+    blow = (
+        "[{kind: hold, duration: 1 s}, {kind: bump, rate_deg_s: [0, 0, 80], duration: 40 ms}]"
+    )
     overrides = {
         "motion.maneuver": blow,
         "motion.control": f"{{actuators: {actuators}}}",
@@ -104,7 +106,8 @@ def test_the_navigator_drifts_by_the_gyros_apparent_bias() -> None:
     assert telemetry.bias_rad_s is not None
     off = (telemetry.lab_from_imu * telemetry.lab_from_body.inv()).as_rotvec()[-1]
     drift = (
-        telemetry.lab_from_body.apply(telemetry.bias_rad_s)[:-1].sum(axis=0) * telemetry.period_s
+        telemetry.lab_from_body.apply(telemetry.bias_rad_s)[:-1].sum(axis=0)
+        * telemetry.period_s
     )
     assert np.linalg.norm(drift) > 1e-3
     np.testing.assert_allclose(off, drift, rtol=0, atol=2e-3 * np.linalg.norm(drift))

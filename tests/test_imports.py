@@ -68,7 +68,9 @@ def test_no_module_imports_itself_through_others() -> None:
 @pytest.mark.parametrize("package", ["skysim", "estimator"])
 def test_no_folder_holds_too_many_modules(package: str) -> None:
     """About a dozen modules per folder; each folder needs a description, so many small ones are no better."""
-    for folder in {path.parent for path in FILES.values() if path.is_relative_to(ROOT / package)}:
+    for folder in {
+        path.parent for path in FILES.values() if path.is_relative_to(ROOT / package)
+    }:
         entries = {path.name for path in folder.iterdir()} - {
             "__init__.py",
             "__pycache__",

@@ -74,7 +74,9 @@ def test_the_total_error_is_the_rotation_angle_of_its_parts(run) -> None:
 def test_a_frame_rendered_alone_equals_that_of_the_run(run) -> None:
     frame, truth = skysim.render(run.scene, index=2)
     np.testing.assert_array_equal(frame.image_dn, run[2].image)
-    np.testing.assert_array_equal(truth.cam_from_lab.as_quat(), run[2].truth.cam_from_lab.as_quat())
+    np.testing.assert_array_equal(
+        truth.cam_from_lab.as_quat(), run[2].truth.cam_from_lab.as_quat()
+    )
 
 
 @pytest.mark.parametrize("index", [-1, 3])

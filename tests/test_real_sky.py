@@ -31,7 +31,8 @@ def by_file(rows, quick: int = 1):
     """One test per photograph; every `quick`-th is not marked slow."""
     marks = [() if k % quick == 0 else pytest.mark.slow for k in range(len(rows))]
     params = [
-        pytest.param(row, marks=mark, id=row["file"]) for row, mark in zip(rows, marks, strict=True)
+        pytest.param(row, marks=mark, id=row["file"])
+        for row, mark in zip(rows, marks, strict=True)
     ]
     return pytest.mark.parametrize("row", params)
 
@@ -102,7 +103,9 @@ def test_every_photograph_is_solved_with_its_field_unknown(row, blind):
 @by_file(NOT_TO_SOLVE + ANY)
 def test_no_photograph_is_answered_wrongly_with_its_field_unknown(row, blind):
     found = plate_solver.solve_file(FOLDER / row["file"], blind, None)
-    right = bool(row["ra_deg"]) and found["status"] == "solved" and errors_deg(found, row)[0] < 0.05
+    right = (
+        bool(row["ra_deg"]) and found["status"] == "solved" and errors_deg(found, row)[0] < 0.05
+    )
     assert right or found["status"] != "solved"
     assert not found["bad_input"]
 
@@ -135,5 +138,7 @@ def test_a_photograph_is_solved_with_any_field_error_below_five_per_cent(row, fo
 @by_file(ANY)
 def test_a_hopeless_photograph_is_refused_or_answered_correctly(row, fov_error):
     found = answer(row, fov_error)
-    right = bool(row["ra_deg"]) and found["status"] == "solved" and errors_deg(found, row)[0] < 0.05
+    right = (
+        bool(row["ra_deg"]) and found["status"] == "solved" and errors_deg(found, row)[0] < 0.05
+    )
     assert right or found["status"] != "solved"

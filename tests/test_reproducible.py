@@ -44,7 +44,17 @@ def answers(folder: Path) -> list[str]:
 def made(scene: str, out: Path, **environment: str) -> Path:
     """Files of a run in a separate process."""
     folder = out / scene
-    command = [sys.executable, "-m", "skysim", "run", scene, "--frames", "3", "--out", str(folder)]
+    command = [
+        sys.executable,
+        "-m",
+        "skysim",
+        "run",
+        scene,
+        "--frames",
+        "3",
+        "--out",
+        str(folder),
+    ]
     subprocess.run(command, check=True, capture_output=True, env=os.environ | environment)
     return folder
 
@@ -96,7 +106,9 @@ def test_a_command_announces_compilation_once_and_not_after_it(tmp_path: Path) -
         ours, theirs = os.openpty()
         stderr = theirs if seen else subprocess.PIPE
         environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
-        done = subprocess.run([sys.executable, script], stderr=stderr, env=environment, check=True)
+        done = subprocess.run(
+            [sys.executable, script], stderr=stderr, env=environment, check=True
+        )
         os.write(theirs, b"end\n")
         output = done.stderr or b""
         while not output.endswith(b"end\r\n"):

@@ -58,7 +58,9 @@ def mounted(tmp_path: Path) -> Iterator[Path]:
     place = tmp_path / "disk"
     place.mkdir()
     done = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", place], check=False, capture_output=True
+        ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", place],
+        check=False,
+        capture_output=True,
     )
     if done.returncode:
         pytest.skip("nothing can be mounted here")
@@ -201,7 +203,9 @@ def test_an_unwritable_folder_is_reported_in_one_line(mounted: Path) -> None:
 @pytest.mark.parametrize(
     "number", [pytest.param(signal.SIGINT, marks=pytest.mark.long), signal.SIGTERM]
 )
-def test_a_run_that_is_stopped_leaves_whole_frames(tmp_path: Path, number: signal.Signals) -> None:
+def test_a_run_that_is_stopped_leaves_whole_frames(
+    tmp_path: Path, number: signal.Signals
+) -> None:
     command = [*SKYSIM, "run", "shefex2", "--frames", "400", "--out", str(tmp_path), *SMALL]
     run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=ready)
     until = time.monotonic() + 200

@@ -37,7 +37,9 @@ def field(
     pixels = pixels[tracker.camera.contains(np.nan_to_num(pixels, nan=-1e9), 12)]
     pixels = pixels[rng.uniform(size=len(pixels)) >= missing]
     seen = pixels + 0.2 * rng.standard_normal(pixels.shape)
-    strays = rng.uniform((0, 0), (tracker.camera.width_px, tracker.camera.height_px), (false, 2))
+    strays = rng.uniform(
+        (0, 0), (tracker.camera.width_px, tracker.camera.height_px), (false, 2)
+    )
     xy = rng.permutation(np.vstack([seen, strays]))
     return Centroids(xy, np.full(len(xy), 0.2), np.ones(len(xy)))
 
@@ -62,7 +64,9 @@ def field(
         "only false lights",
     ],
 )
-@pytest.mark.parametrize("fields", [FIELDS // 3, pytest.param(40 * FIELDS, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "fields", [FIELDS // 3, pytest.param(40 * FIELDS, marks=pytest.mark.long)]
+)
 def test_a_dome_is_never_solved_wrongly(afit, missing, false, least_solved, fields):
     solved = 0
     for n in range(fields):

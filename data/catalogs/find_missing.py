@@ -96,7 +96,15 @@ PICKED = (
         0.86,
         "motion Tycho-2; parallax that of p Eri B, HIP 7751",
     ),
-    Pick(HD_BASE + 23629, "24 Tau", (66715105696289024,), (19.3, -44.3), 0, 0.03, "motion Tycho-2"),
+    Pick(
+        HD_BASE + 23629,
+        "24 Tau",
+        (66715105696289024,),
+        (19.3, -44.3),
+        0,
+        0.03,
+        "motion Tycho-2",
+    ),
     Pick(
         HD_BASE + 37042,
         "theta2 Ori B",
@@ -134,7 +142,13 @@ PICKED = (
         "motion Tycho-2",
     ),
     Pick(
-        HD_BASE + 92463, "HD 92463", (5352174805905137920,), (-21.4, 4.2), 0, 0.00, "motion Tycho-2"
+        HD_BASE + 92463,
+        "HD 92463",
+        (5352174805905137920,),
+        (-21.4, 4.2),
+        0,
+        0.00,
+        "motion Tycho-2",
     ),
     Pick(
         HD_BASE + 93308,
@@ -182,7 +196,13 @@ PICKED = (
         "motion BSC5 (HR 5055); parallax that of Mizar A, HIP 65378",
     ),
     Pick(
-        HD_BASE + 124953, "CN Boo", (1233902704963092608,), (41.3, -32.2), 0, 0.25, "motion Tycho-2"
+        HD_BASE + 124953,
+        "CN Boo",
+        (1233902704963092608,),
+        (41.3, -32.2),
+        0,
+        0.25,
+        "motion Tycho-2",
     ),
     Pick(
         HD_BASE + 126111,
@@ -194,7 +214,13 @@ PICKED = (
         "motion Tycho-2",
     ),
     Pick(
-        HD_BASE + 162678, "HR 6660", (4040825358109531520,), (2.1, -4.5), 0, 0.00, "motion Tycho-2"
+        HD_BASE + 162678,
+        "HR 6660",
+        (4040825358109531520,),
+        (2.1, -4.5),
+        0,
+        0.00,
+        "motion Tycho-2",
     ),
     Pick(
         HD_BASE + 169326,

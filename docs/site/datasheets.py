@@ -61,7 +61,11 @@ def answer(sections: dict[str, str]) -> str:
     _, across_noise, _, about_noise, *_ = row("temporal noise")
     (right,) = re.findall(r"right ([\d.]+ \([^)]*\) %)", sections[KEPT[2]])
     return ANSWER.format(
-        across=across, about=about, across_noise=across_noise, about_noise=about_noise, right=right
+        across=across,
+        about=about,
+        across_noise=across_noise,
+        about_noise=about_noise,
+        right=right,
     )
 
 

@@ -11,7 +11,9 @@ CODE = re.compile(r"(`[^`]*`)")
 
 def to_markdown(text: str) -> str:
     """Convert sections to lists and escape marks; indented blocks stay code."""
-    return "\n\n".join(paragraph_to_markdown(paragraph) for paragraph in re.split(r"\n\s*\n", text))
+    return "\n\n".join(
+        paragraph_to_markdown(paragraph) for paragraph in re.split(r"\n\s*\n", text)
+    )
 
 
 def paragraph_to_markdown(paragraph: str) -> str:

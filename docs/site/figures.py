@@ -43,7 +43,12 @@ from skysim.sources.refraction import Refraction, Weather
 from skysim.sources.satellites import GHOST, MIRRORED
 
 mpl.rcParams.update(
-    {"svg.fonttype": "none", "svg.hashsalt": "skysim", "font.family": "sans-serif", "font.size": 11}
+    {
+        "svg.fonttype": "none",
+        "svg.hashsalt": "skysim",
+        "font.family": "sans-serif",
+        "font.size": 11,
+    }
 )
 # An opaque background for labels.
 LABEL_BOX = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
@@ -76,7 +81,9 @@ def axes(path: Path) -> None:
         ("cam", lab_from_cam, camera_m, CAM, 0.2),
     )
     fig, ax = plt.subplots(figsize=(6.4, 5.6))
-    ax.plot(*np.transpose([np.zeros(2), camera_m @ flat]), color=INK, linestyle=":", linewidth=1.4)
+    ax.plot(
+        *np.transpose([np.zeros(2), camera_m @ flat]), color=INK, linestyle=":", linewidth=1.4
+    )
     for name, lab_from_own, origin_m, color, length_m in frames:
         begin = origin_m @ flat
         for letter, axis in zip("xyz", lab_from_own.apply(np.eye(3)), strict=True):
@@ -132,7 +139,9 @@ def optics_with_detector() -> Optics:
 def pixels(path: Path) -> None:
     """A star drawn by the renderer, in a corner of seven by five pixels."""
     optics = optics_with_detector()
-    direction = np.array([[1.3e-3, -0.6e-3, 1.0]])  # 1.3 px right of the boresight, 0.6 px above it
+    direction = np.array(
+        [[1.3e-3, -0.6e-3, 1.0]]
+    )  # 1.3 px right of the boresight, 0.6 px above it
     direction /= np.linalg.norm(direction)
     ones = np.ones(1)
     image = np.zeros((16, 16))
@@ -207,7 +216,9 @@ def roll(path: Path) -> None:
     for ax, roll_deg in zip(panels, (0, 30), strict=True):
         cam_from_icrs = star_sources.cam_from_icrs(84.0, 0.0, roll_deg)
         xy = optics.project(cam_from_icrs.apply(directions))
-        bright = (stars.v_mag < 5) & (np.abs(xy - camera.center_px) < camera.center_px).all(axis=1)
+        bright = (stars.v_mag < 5) & (np.abs(xy - camera.center_px) < camera.center_px).all(
+            axis=1
+        )
         ax.scatter(
             *xy[bright].T, s=2 + 6 * (5 - stars.v_mag[bright]) ** 1.3, color=INK, linewidths=0
         )
@@ -228,11 +239,20 @@ def roll(path: Path) -> None:
                 )
         middle = np.array(camera.center_px)
         for name, ra_deg, dec_deg in (("N", 84.0, 7.6), ("E", 91.0, 0.0)):
-            end = optics.project(cam_from_icrs.apply(unit(*np.radians([[ra_deg], [dec_deg]]))))[0]
-            ax.annotate("", end, middle, arrowprops={"arrowstyle": "->", "color": BODY, "lw": 1.8})
-            ax.text(*(middle + 1.15 * (end - middle)), name, color=BODY, ha="center", va="center")
+            end = optics.project(cam_from_icrs.apply(unit(*np.radians([[ra_deg], [dec_deg]]))))[
+                0
+            ]
+            ax.annotate(
+                "", end, middle, arrowprops={"arrowstyle": "->", "color": BODY, "lw": 1.8}
+            )
+            ax.text(
+                *(middle + 1.15 * (end - middle)), name, color=BODY, ha="center", va="center"
+            )
         ax.annotate(
-            "", middle - [0, 120], middle, arrowprops={"arrowstyle": "->", "color": CAM, "lw": 1.8}
+            "",
+            middle - [0, 120],
+            middle,
+            arrowprops={"arrowstyle": "->", "color": CAM, "lw": 1.8},
         )
         ax.text(middle[0] - 12, middle[1] - 100, "up (-y)", color=CAM, ha="right", va="center")
         if roll_deg:
@@ -243,7 +263,9 @@ def roll(path: Path) -> None:
                     - middle
                 )
             )
-            arc = middle + 95 * np.column_stack([np.sin(north + angles), np.cos(north + angles)])
+            arc = middle + 95 * np.column_stack(
+                [np.sin(north + angles), np.cos(north + angles)]
+            )
             ax.plot(*arc.T, color=LIGHT, linewidth=2)
         ax.set(
             xlim=(-0.5, camera.width_px - 0.5),
@@ -309,7 +331,11 @@ def lever(path: Path) -> None:
     )
     ax.plot(0, 0, "o", color=INK)
     ax.set(
-        aspect="equal", xlabel="lab y (m)", ylabel="lab z (m)", ylim=(-0.2, 1.32), xlim=(-1.35, 1.7)
+        aspect="equal",
+        xlabel="lab y (m)",
+        ylabel="lab z (m)",
+        ylim=(-0.2, 1.32),
+        xlim=(-1.35, 1.7),
     )
     save(fig, path)
 
@@ -340,7 +366,9 @@ def bodies(path: Path) -> None:
         beam = beam_of(lab.camera.lights, exposure_at(lab, 0.0))
         shown = next(body for body in beam.discs if body.name == name)
         start = f"{{ra_deg: {shown.truth().ra_deg}, dec_deg: {shown.truth().dec_deg}}}"
-        scene = loader.load("shefex2", settings | {"motion.start": start, "exposure.frames": "1"})
+        scene = loader.load(
+            "shefex2", settings | {"motion.start": start, "exposure.frames": "1"}
+        )
         image = simulate_motion(scene).render(0)[0].image_dn.astype(float)
         dark = np.percentile(image, 5)
         ax.imshow(np.sqrt(np.clip(image - dark, 0, None)), cmap="gray")
@@ -350,7 +378,9 @@ def bodies(path: Path) -> None:
 
 def color(path: Path) -> None:
     """Photo-electrons of four lights by wavelength, the lateral color of a lens, and the mean of each."""
-    lens = "{wavelength: [450 nm, 550 nm, 650 nm, 850 nm], corner_px: [-0.38, -0.13, 0.12, 0.62]}"
+    lens = (
+        "{wavelength: [450 nm, 550 nm, 650 nm, 850 nm], corner_px: [-0.38, -0.13, 0.12, 0.62]}"
+    )
     band = Band.from_camera(loader.load("shefex2", {"camera.chromatic": lens}).camera)
     nm = np.arange(390.0, 1000.0)
     lights = (
@@ -409,7 +439,9 @@ def air(path: Path) -> None:
         ax.set_xticklabels(["2", "5", "10", "20", "45", "90"])
         ax.minorticks_off()
     aperture_m = np.geomspace(2e-3, 1, 25)
-    ours = np.sqrt([air_physics.variance(np.ones(1), d, 0.05, 0.0, 650e-9)[0] for d in aperture_m])
+    ours = np.sqrt(
+        [air_physics.variance(np.ones(1), d, 0.05, 0.0, 650e-9)[0] for d in aperture_m]
+    )
     young = np.sqrt(air_physics.YOUNG_M_S * air_physics.C_Y**2 * aperture_m ** (-4 / 3) / 0.05)
     twinkling.loglog(100 * aperture_m, ours, color=BODY, label="simulated")
     twinkling.loglog(100 * aperture_m, young, color=LAB, linestyle="--", label="Young's law")
@@ -449,13 +481,21 @@ def orbit(path: Path) -> None:
     )
     limits = ExclusionConfig(sun_deg=60, earth_deg=25, moon_deg=20)
     stray = [stray_e_s(camera.lights, exposure_at(lab, t)) for t in t_s.tolist()]
-    fig, (angles, light) = plt.subplots(2, 1, figsize=(8.5, 5.4), sharex=True, layout="constrained")
+    fig, (angles, light) = plt.subplots(
+        2, 1, figsize=(8.5, 5.4), sharex=True, layout="constrained"
+    )
     outside = seen.outside(limits)
     usable = outside["Sun"] & outside["Earth"] & outside["Moon"]
     minutes = t_s / 60
     for ax in (angles, light):
         ax.fill_between(
-            minutes, 0, 1, where=usable, transform=ax.get_xaxis_transform(), color="#d5e8d4", lw=0
+            minutes,
+            0,
+            1,
+            where=usable,
+            transform=ax.get_xaxis_transform(),
+            color="#d5e8d4",
+            lw=0,
         )
     for name, color in (("sun", LIGHT), ("earth", BODY), ("moon", LAB)):
         label = "the Earth's limb" if name == "earth" else f"the {name.capitalize()}"
@@ -475,7 +515,8 @@ def reflections(path: Path) -> None:
     deep = "{kind: sphere, apex: 5 ft, radius: 4 ft, rim_deg: 130}"
     settings = {"light.surface": deep, "exposure.frames": "1", "camera.detector.noise": "false"}
     settings |= {
-        f"camera.detector.{key}": "0" for key in ("prnu", "dsnu", "hot_pixels", "column_offset_e")
+        f"camera.detector.{key}": "0"
+        for key in ("prnu", "dsnu", "hot_pixels", "column_offset_e")
     }
     lens = {"camera.ghosts": "[{magnification: 0.5, share: 0.02, radius_px: 6}]"}
     wall = {"light.reflection": "{specular: 0.1}"}
@@ -487,7 +528,10 @@ def reflections(path: Path) -> None:
         light -= np.median(light)
         # Every pixel as large as seven, on a logarithmic scale, so that LEDs and ghosts are seen.
         ax.imshow(
-            np.log10(np.clip(maximum_filter(light, 7), 1e-3, None)), cmap="gray_r", vmin=-3, vmax=3
+            np.log10(np.clip(maximum_filter(light, 7), 1e-3, None)),
+            cmap="gray_r",
+            vmin=-3,
+            vmax=3,
         )
         number = truth.sources.id
         kinds = (
@@ -507,7 +551,11 @@ def reflections(path: Path) -> None:
             )
         height, width = light.shape
         ax.set(
-            xticks=[], yticks=[], title=title, xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5)
+            xticks=[],
+            yticks=[],
+            title=title,
+            xlim=(-0.5, width - 0.5),
+            ylim=(height - 0.5, -0.5),
         )
     both[1].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
     save(fig, path)

@@ -137,7 +137,9 @@ def sections(root: type[BaseModel]) -> dict[str, Section]:
     def visit(model: type[BaseModel], path: str) -> None:
         for name, field in model.model_fields.items():
             below = f"{path}.{field.alias or name}".lstrip(".")
-            direct = [one for part in (field.annotation, *field.metadata) for one in models(part)]
+            direct = [
+                one for part in (field.annotation, *field.metadata) for one in models(part)
+            ]
             for inner in (one for one in direct for one in (one, *own_subclasses(one))):
                 known = inner.__name__ in found
                 section = found.setdefault(inner.__name__, Section(inner, []))
@@ -209,7 +211,9 @@ def describe(node: dict[str, Any], unit: str, links: Iterable[str]) -> str:
 
 def describe_list(node: dict[str, Any], unit: str, links: Iterable[str]) -> str:
     """Describe a list of fixed or of any length."""
-    items = list(dict.fromkeys(describe(item, unit, links) for item in node.get("prefixItems", [])))
+    items = list(
+        dict.fromkeys(describe(item, unit, links) for item in node.get("prefixItems", []))
+    )
     if len(items) == 1:
         return f"list of {len(node['prefixItems'])}: {items[0]}"
     if items:
@@ -237,7 +241,9 @@ def model_sections(root: type[BaseModel]) -> str:
         kind = model.model_fields.get("kind")
         kinds = names(typing.get_args(kind.annotation)) if kind else ""
         where = (
-            f"Section {names(paths)}" + (f" of kind {kinds}." if kinds else ".") if paths else ""
+            f"Section {names(paths)}" + (f" of kind {kinds}." if kinds else ".")
+            if paths
+            else ""
         )
         parts += [f"## {name}", where, to_markdown(inspect.cleandoc(model.__doc__ or ""))]
         parts.append(table(model, paths, found))

@@ -37,8 +37,6 @@ def output_markdown(output: dict[str, Any]) -> str:
     if "text/html" in data:
         return f'<div class="output">{"".join(data["text/html"]).strip()}</div>'
     if "image/png" in data:
-        return (
-            f'<img alt="output" src="data:image/png;base64,{"".join(data["image/png"]).strip()}">'
-        )
+        return f'<img alt="output" src="data:image/png;base64,{"".join(data["image/png"]).strip()}">'
     text = "".join(output.get("text") or data.get("text/plain", ""))
     return f"```text\n{text.rstrip()}\n```" if text else ""

@@ -13,7 +13,9 @@ FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 def execute(path: Path) -> nbformat.NotebookNode:
     """A notebook with new outputs. Raises CellExecutionError where a cell fails."""
     notebook = nbformat.read(path, as_version=4)
-    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(FOLDER)}}).execute()
+    NotebookClient(
+        notebook, timeout=600, resources={"metadata": {"path": str(FOLDER)}}
+    ).execute()
     for cell in notebook.cells:
         cell.metadata.pop("execution", None)  # wall-clock times
         for output in cell.get("outputs", ()):

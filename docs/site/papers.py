@@ -29,7 +29,17 @@ FINDINGS = Path(__file__).parents[1] / "findings"
 PAGE = FINDINGS / "papers.md"
 TABLE = FINDINGS / "papers.csv"
 FIGURE = FINDINGS / "papers.png"
-FIELDS = ("experiment", "quantity", "published", "ours", "low", "high", "verdict", "open", "cause")
+FIELDS = (
+    "experiment",
+    "quantity",
+    "published",
+    "ours",
+    "low",
+    "high",
+    "verdict",
+    "open",
+    "cause",
+)
 KINDS = (*VERDICTS, "derived", "open")
 COMMAND = "skysim reproduce all"
 OPEN = ("interval wider than the tolerance", "the bound is within the interval")
@@ -129,7 +139,9 @@ def page(found: dict[str, list[Line]], stamp: str) -> str:
     total = counts(everything)
     worst = max(found, key=lambda id: counts(found[id])["disagrees"])
     most = counts(found[worst])["disagrees"]
-    answer = ANSWER.format(rows=len(everything), most=most, worst=f"[{worst}](#{worst})", **total)
+    answer = ANSWER.format(
+        rows=len(everything), most=most, worst=f"[{worst}](#{worst})", **total
+    )
     parts = [INTRODUCTION.format(answer=answer, rows=len(everything), command=COMMAND)]
     parts.append(summary_table(found))
     paper = ""
@@ -209,7 +221,9 @@ def main(path: Path) -> None:
     found = read(path)
     write_table(found)
     FIGURE.write_bytes(draw(found))
-    PAGE.write_text(page(found, make_stamp([*NEEDS, "data/published"], 1).line), encoding="utf-8")
+    PAGE.write_text(
+        page(found, make_stamp([*NEEDS, "data/published"], 1).line), encoding="utf-8"
+    )
     print(PAGE)
 
 

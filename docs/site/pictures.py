@@ -72,7 +72,9 @@ def screenshots() -> None:
         bellatrix = page.locator("tr", has_text="Bellatrix")
         box, (left, top, scale) = frame_placement(page)
         x, y = (float(bellatrix.locator("td").nth(column).inner_text()) for column in (3, 4))
-        page.mouse.click(box["x"] + left + (x + 0.5) * scale, box["y"] + top + (y + 0.5) * scale)
+        page.mouse.click(
+            box["x"] + left + (x + 0.5) * scale, box["y"] + top + (y + 0.5) * scale
+        )
         page.wait_for_timeout(3000)
         page.screenshot(path=IMAGES / "lab_page.jpg", quality=85)
         page.get_by_role("combobox", name="Scene").click()

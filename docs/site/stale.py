@@ -141,7 +141,9 @@ def working_tree(name: str) -> dict[str, bytes]:
         return {name: path.read_bytes()}
     pattern = "*.py" if name.split(".")[0] in OURS else "*"
     return {
-        str(one.relative_to(ROOT)): one.read_bytes() for one in path.rglob(pattern) if one.is_file()
+        str(one.relative_to(ROOT)): one.read_bytes()
+        for one in path.rglob(pattern)
+        if one.is_file()
     }
 
 
@@ -171,7 +173,9 @@ def main(arguments: Sequence[str]) -> None:
             path = Path(name)
             text = path.read_text(encoding="utf-8")
             old = read_stamp(text)
-            path.write_text(LINE.sub(make_stamp(old.needs, old.seed).line, text), encoding="utf-8")
+            path.write_text(
+                LINE.sub(make_stamp(old.needs, old.seed).line, text), encoding="utf-8"
+            )
         return
     lines = stale_lines()
     print("\n".join(lines) or f"All {len(pages())} pages are of today's code.")

@@ -265,7 +265,9 @@ def texts_of(levels: Mapping[str, Any]) -> Row:
     return {name: str(level) for name, level in levels.items()}
 
 
-def table(said: Mapping[str, Any], record: Record, where: Row) -> tuple[list[str], list[list[str]]]:
+def table(
+    said: Mapping[str, Any], record: Record, where: Row
+) -> tuple[list[str], list[list[str]]]:
     """Heads and cells of the page's table. said : its description in studies.yaml"""
     factors = said.get("rows", {})
     fixed = {name: level for name, level in where.items() if name not in factors}
@@ -283,9 +285,12 @@ def table(said: Mapping[str, Any], record: Record, where: Row) -> tuple[list[str
     for place in places:
         levels = fixed | place
         labels = [
-            evaluate(name, record, levels) if name not in place else place[name] for name in factors
+            evaluate(name, record, levels) if name not in place else place[name]
+            for name in factors
         ]
-        values = [evaluate(one, record, levels, interval=True) for one in said["columns"].values()]
+        values = [
+            evaluate(one, record, levels, interval=True) for one in said["columns"].values()
+        ]
         rows.append([*labels, *values])
     return [*factors.values(), *said["columns"]], rows
 
@@ -317,7 +322,9 @@ def draw_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> bytes:
             axis.plot(ends, [y] * len(ends), color="tab:blue", linewidth=1)
             axis.plot(value, y, "o", color="tab:blue", markersize=4)
         axis.set(
-            xlabel=heads[column].replace("″", "[″]"), yticks=range(len(rows)), yticklabels=labels
+            xlabel=heads[column].replace("″", "[″]"),
+            yticks=range(len(rows)),
+            yticklabels=labels,
         )
         axis.tick_params(labelsize=7)
         axis.grid(alpha=0.3)
@@ -365,9 +372,7 @@ def claim(line: str) -> str:
     """Whether the claimed errors are true, from a sentence of the report."""
     if match := CLAIM.search(line):
         factor = plain(float(match[2]))
-        return (
-            f"Claimed errors: too {match[1]} at {match[3]} points, by a factor of up to {factor}."
-        )
+        return f"Claimed errors: too {match[1]} at {match[3]} points, by a factor of up to {factor}."
     said = line.removeprefix("Are the claimed errors true? ")
     said = UNDECIDED.sub(
         r"no fault is seen, but at one point NEES is known to \1 only (3 if true).", said

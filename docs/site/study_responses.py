@@ -53,7 +53,9 @@ def proportions() -> str:
     rows = [
         (", ".join(f"`{name}`" for name in names.split(", ")), escape(text))
         for names, text in shares.items()
-        if any(metrics.is_proportion(name) or name == "coverage_N" for name in names.split(", "))
+        if any(
+            metrics.is_proportion(name) or name == "coverage_N" for name in names.split(", ")
+        )
     ]
     return table("name", rows)
 
@@ -66,7 +68,9 @@ def quantities() -> str:
         of_meaning.setdefault(QUANTITIES.get(name) or meaning(name, columns), []).append(
             f"`{name}`"
         )
-    return table("quantity", [(", ".join(same), escape(text)) for text, same in of_meaning.items()])
+    return table(
+        "quantity", [(", ".join(same), escape(text)) for text, same in of_meaning.items()]
+    )
 
 
 def statistics() -> str:

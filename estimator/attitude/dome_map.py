@@ -125,7 +125,9 @@ def on_surface(rays_lab: Floats, origin_lab_m: Floats, leds: LedMap) -> Floats:
     return origin_lab_m + distance[:, None] * rays_lab
 
 
-def project(body_from_lab: Rotation, position_m: Floats, lever: Lever, camera: Camera) -> Floats:
+def project(
+    body_from_lab: Rotation, position_m: Floats, lever: Lever, camera: Camera
+) -> Floats:
     """Project LEDs at (N, 3) lab positions to (N, 2) pixels; NaN behind the camera."""
     # q = A P - c: from the camera to the LED, in the body frame
     in_body = body_from_lab.apply(position_m) - lever.camera_body_m

@@ -31,7 +31,14 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.dome_map import LedMap, Lever, check_lever, on_sphere, on_surface, project
+from estimator.attitude.dome_map import (
+    LedMap,
+    Lever,
+    check_lever,
+    on_sphere,
+    on_surface,
+    project,
+)
 from estimator.attitude.solvers import quest
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
@@ -97,7 +104,11 @@ def rotation_only(
 
 
 def fit_focal_ratio(
-    rays_cam: Floats, sigma_rad: Floats, position_m: Floats, lever: Lever, body_from_lab: Rotation
+    rays_cam: Floats,
+    sigma_rad: Floats,
+    position_m: Floats,
+    lever: Lever,
+    body_from_lab: Rotation,
 ) -> float:
     """Return the ratio of the true focal length to the assumed one, from N >= 2 rays and their LEDs.
 
@@ -189,7 +200,12 @@ def _fitted_rotation(
 
 @jit
 def _residual_rows(
-    rays_cam: Floats, position_m: Floats, lever_cam_m: Floats, R: Floats, ratio: float, rows: Floats
+    rays_cam: Floats,
+    position_m: Floats,
+    lever_cam_m: Floats,
+    R: Floats,
+    ratio: float,
+    rows: Floats,
 ) -> None:
     """Fill `rows` (4 or 5, 2 N): derivatives of the tangents by the rotation (and log ratio), then the residuals.
 
@@ -311,7 +327,9 @@ def _with_covariance(
     hessian -= gradient_along_ray.T @ (by_rotation_m * np.ones_like(gradient_along_ray))
     # 3. Rotation by a ray's noise; a unit vector has noise only across itself.
     across_ray = np.eye(3) - np.einsum("ni,nj->nij", rays_body, rays_body)
-    response = np.linalg.solve(hessian, gradient @ by_ray_m @ across_ray) * sigma_rad[:, None, None]
+    response = (
+        np.linalg.solve(hessian, gradient @ by_ray_m @ across_ray) * sigma_rad[:, None, None]
+    )
     # 4. Covariance
     return body_from_lab, np.einsum("nij,nkj->ik", response, response)
 
@@ -332,10 +350,14 @@ def infinity(
     (reference, section 5).
     """
     rays = lever.cam_from_body.inv().apply(rays_cam)
-    at_infinity = np.ones(len(rays))  # equal radius and distance: the weights are those of the rays
+    at_infinity = np.ones(
+        len(rays)
+    )  # equal radius and distance: the weights are those of the rays
     body_from_lab = _wahba(rays, at_infinity, sigma_rad, position_m)
     by_ray_m = np.tile(np.eye(3), (len(rays), 1, 1))
-    return _with_covariance(body_from_lab, rays, at_infinity, sigma_rad, position_m, rays, by_ray_m)
+    return _with_covariance(
+        body_from_lab, rays, at_infinity, sigma_rad, position_m, rays, by_ray_m
+    )
 
 
 def thesis_points(
@@ -434,7 +456,9 @@ def tappe(
     rays = lever.cam_from_body.inv().apply(rays_cam)
     for _ in range(MAX_UPDATES):
         # 1. Distances. They change little with the attitude, so a few updates converge.
-        distance_m = np.linalg.norm(body_from_lab.apply(position_m) - lever.camera_body_m, axis=1)
+        distance_m = np.linalg.norm(
+            body_from_lab.apply(position_m) - lever.camera_body_m, axis=1
+        )
         # 2. Points from the bearing
         point = lever.camera_body_m + distance_m[:, None] * rays
         previous = body_from_lab
@@ -533,14 +557,18 @@ def pnp(
     # 1. With the pattern's mean as origin, rotation and translation are nearly uncorrelated.
     centroid_m = position_m.mean(axis=0)
     pattern_m = position_m - centroid_m
-    start_shift_m = lever.cam_from_body.apply(body_from_lab.apply(centroid_m) - lever.camera_body_m)
+    start_shift_m = lever.cam_from_body.apply(
+        body_from_lab.apply(centroid_m) - lever.camera_body_m
+    )
     # 2. Unweighted solution
     cam_from_lab, shift_m = _opencv_pnp(
         pattern_m, measured, lever.cam_from_body * body_from_lab, start_shift_m
     )
     # 3. Weighted solution: residuals are divided by their standard deviations.
     weight = np.repeat(1 / sigma_rad, 2)
-    cam_from_lab, covariance_cam = _gauss_newton(pattern_m, measured, cam_from_lab, shift_m, weight)
+    cam_from_lab, covariance_cam = _gauss_newton(
+        pattern_m, measured, cam_from_lab, shift_m, weight
+    )
     return lever.cam_from_body.inv() * cam_from_lab, _in_body_axes(covariance_cam, lever)
 
 

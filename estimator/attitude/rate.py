@@ -82,7 +82,9 @@ def tangent_motion(rays_cam: Floats, sight: Sight = STARS) -> Floats:
     return -tangent_jacobian(place, place - sight.lever_cam_m).reshape(-1, 2, 3)
 
 
-def center_streak_px(camera: Camera, rate: RateEstimate, exposure_s: float) -> tuple[float, float]:
+def center_streak_px(
+    camera: Camera, rate: RateEstimate, exposure_s: float
+) -> tuple[float, float]:
     """Return (dx, dy), px, of the streak of a star at the boresight over an exposure."""
     by_rate = tangent_motion(np.array([[0.0, 0.0, 1.0]]))[0]
     dx, dy = camera.focal_px * exposure_s * by_rate @ rate.rate_rad_s
@@ -198,7 +200,9 @@ def chords(camera: Camera, centroids: Centroids) -> tuple[Floats, Floats]:
     """Return the (N, 2) chords of streaks in tangents, sign arbitrary, and their (N, 2, 2) inverse covariances."""
     assert centroids.streak_px is not None
     assert centroids.streak_covariance_px2 is not None
-    begin, end = (camera.tangents(centroids.xy_px + k * centroids.streak_px) for k in (-0.5, 0.5))
+    begin, end = (
+        camera.tangents(centroids.xy_px + k * centroids.streak_px) for k in (-0.5, 0.5)
+    )
     return end - begin, camera.focal_px**2 * inverses(centroids.streak_covariance_px2)
 
 

@@ -125,7 +125,9 @@ def fit(
         raise ValueError(
             f"attitude and rate: not converged, last step {np.linalg.norm(step[:3]):.1e} rad"
         )
-    return Fit(cam_from_ref, RateEstimate(rate, np.asarray(np.linalg.inv(normal)[3:, 3:], float)))
+    return Fit(
+        cam_from_ref, RateEstimate(rate, np.asarray(np.linalg.inv(normal)[3:, 3:], float))
+    )
 
 
 def _place_rows(

@@ -54,7 +54,9 @@ def geometry(place_cam: Floats, ray_cam: Floats) -> Geometry:
 def with_focal(view: Geometry) -> Geometry:
     """Return the geometry of a fit whose fourth unknown is the logarithm of the focal length."""
     # The derivative of f (x / z) / f_0 by log f is the tangent itself.
-    return view._replace(jacobian=np.concatenate([view.jacobian, view.tangent[:, :, None]], axis=2))
+    return view._replace(
+        jacobian=np.concatenate([view.jacobian, view.tangent[:, :, None]], axis=2)
+    )
 
 
 def from_independent(view: Geometry, sigma_rad: Floats, covariance_rad2: Floats) -> Floats:

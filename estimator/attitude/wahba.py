@@ -61,7 +61,9 @@ def weights(sigma_rad: Floats) -> Floats:
     """Return (N,) 1 / sigma^2. Raises ValueError for a sigma that is not finite and above 0."""
     out = np.empty(len(sigma_rad))
     for n in range(len(out)):
-        if not 1e-150 < sigma_rad[n] < 1e150:  # so that its square neither overflows nor underflows
+        if (
+            not 1e-150 < sigma_rad[n] < 1e150
+        ):  # so that its square neither overflows nor underflows
             raise ValueError("a sigma_rad is not usable; allowed: finite, above 0")
         out[n] = 1 / sigma_rad[n] ** 2
     return out
@@ -87,8 +89,12 @@ def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
     for n in range(len(cam)):
         total += weight[n]
         # | |v|^2 - 1 | of both vectors
-        length_error = max(length_error, abs(cam[n, 0] ** 2 + cam[n, 1] ** 2 + cam[n, 2] ** 2 - 1))
-        length_error = max(length_error, abs(ref[n, 0] ** 2 + ref[n, 1] ** 2 + ref[n, 2] ** 2 - 1))
+        length_error = max(
+            length_error, abs(cam[n, 0] ** 2 + cam[n, 1] ** 2 + cam[n, 2] ** 2 - 1)
+        )
+        length_error = max(
+            length_error, abs(ref[n, 0] ** 2 + ref[n, 1] ** 2 + ref[n, 2] ** 2 - 1)
+        )
         # The directions must differ from the first one in both frames.
         max_sine2 = max(max_sine2, min(_sine2(cam, 0, n), _sine2(ref, 0, n)))
         for i in range(3):

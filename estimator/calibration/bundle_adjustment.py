@@ -232,7 +232,9 @@ def linearize(bundle: Bundle, sightings: Sightings) -> Linearization:
     # Derivatives by all eight elements of the lens; only the first are unknowns.
     by_center = np.tile(np.eye(2), (len(q), 1, 1))
     by_coefficients = focal * _by_coefficients(tangent)
-    by_lens = np.concatenate([distorted_tangent[:, :, None], by_center, by_coefficients], axis=2)
+    by_lens = np.concatenate(
+        [distorted_tangent[:, :, None], by_center, by_coefficients], axis=2
+    )
     error_px = sightings.xy_px - bundle.lens[1:3] - focal * distorted_tangent
     return Linearization(
         error_px / sightings.sigma_px[:, None],
@@ -630,7 +632,8 @@ def covariance_in_gauge(
     k_rotated = k_rest[rotated].reshape(-1, 3, 4)
     rotated_free = rest_free[rotated].reshape(-1, 3, 4)
     return Covariances(
-        blocks.by_led + _gauge_terms(k_led.reshape(-1, 3, 4), led_free.reshape(-1, 3, 4), outer),
+        blocks.by_led
+        + _gauge_terms(k_led.reshape(-1, 3, 4), led_free.reshape(-1, 3, 4), outer),
         blocks.by_rotation + _gauge_terms(k_rotated, rotated_free, outer),
         blocks.shared + _gauge_terms(k_rest[None, shared], rest_free[None, shared], outer)[0],
     )

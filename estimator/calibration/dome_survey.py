@@ -170,7 +170,9 @@ class DomeSurvey:
         leds = self.leds
         board = None if leds.board is None else leds.board[self.surveyed]
         position_m = leds.position_m[self.surveyed]
-        return LedMap(leds.id[self.surveyed], position_m, leds.center_m, leds.semi_axes_m, board)
+        return LedMap(
+            leds.id[self.surveyed], position_m, leds.center_m, leds.semi_axes_m, board
+        )
 
 
 def survey(
@@ -263,7 +265,9 @@ class _Fit(NamedTuple):
     noise_scale: float
 
 
-def _fit(start: Bundle, sightings: Sightings, gauge: Gauge, width: float, fit_noise: bool) -> _Fit:
+def _fit(
+    start: Bundle, sightings: Sightings, gauge: Gauge, width: float, fit_noise: bool
+) -> _Fit:
     """Fit the connected subset of the observations in the given gauge: the numbered steps of the module.
 
     Raises
@@ -281,7 +285,9 @@ def _fit(start: Bundle, sightings: Sightings, gauge: Gauge, width: float, fit_no
         gauge.check(subset)
         for _ in range(NOISE_ROUNDS if fit_noise else 1):
             # 3. Least squares
-            scaled = replace(subset.sightings, sigma_px=scale * sightings.sigma_px[subset.index])
+            scaled = replace(
+                subset.sightings, sigma_px=scale * sightings.sigma_px[subset.index]
+            )
             fitted, converged = ba.adjust(subset.bundle, scaled, np.inf)
             # 4. Gauge. If the map as a measurement fixes it, the fit is in that gauge already.
             if not _has_prior_gauge(fitted, gauge):
@@ -496,7 +502,9 @@ def connected_subset(full: Bundle, sightings: Sightings, keep: np.ndarray) -> Su
     return Subset(bundle, numbered, led_rows, frame_rows, index)
 
 
-def ray_angles(position_m: np.ndarray, camera_m: np.ndarray, frame: Ints, led: Ints) -> np.ndarray:
+def ray_angles(
+    position_m: np.ndarray, camera_m: np.ndarray, frame: Ints, led: Ints
+) -> np.ndarray:
     """Return the (N,) rms angle of the rays to each light from their main direction; the distance depends on it.
 
     The mean sin^2 of these angles is 1 minus the largest eigenvalue of the mean of u u^T. Without a sighting it is 0.
@@ -558,9 +566,13 @@ def _determined(fitted: Bundle, shared: Floats) -> bool:
     )
 
 
-def _report(fit: _Fit, full: Bundle, outliers: Ints, leds: LedMap, camera: Camera) -> DomeSurvey:
+def _report(
+    fit: _Fit, full: Bundle, outliers: Ints, leds: LedMap, camera: Camera
+) -> DomeSurvey:
     """Return the survey's result: the fitted subset in the full set of lights and frames."""
-    status = "converged" if fit.converged else f"stopped after {ba.STEPS} steps without convergence"
+    status = (
+        "converged" if fit.converged else f"stopped after {ba.STEPS} steps without convergence"
+    )
     subset = fit.subset
     lights = len(full.position_m)
     frames = len(full.R_body_from_lab)

@@ -81,7 +81,9 @@ class Gauge:
                     f"survey: known_length is {self.length}; allowed: two different rows below {count}, above 0 m"
                 )
         if self.frame is not None and not 0 <= self.frame < frames:
-            raise ValueError(f"survey: reference_frame is {self.frame}; allowed: 0 to {frames - 1}")
+            raise ValueError(
+                f"survey: reference_frame is {self.frame}; allowed: 0 to {frames - 1}"
+            )
 
     @property
     def is_map(self) -> bool:

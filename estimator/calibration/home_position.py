@@ -210,10 +210,14 @@ def calibrate(
         _maximum(deviation(angle, pair, stop), "pair of lights"),
     )
     # 3. Catalog
-    selected = samples.stop == sightings[0].stop if home_only else np.ones(len(samples.led), bool)
+    selected = (
+        samples.stop == sightings[0].stop if home_only else np.ones(len(samples.led), bool)
+    )
     order, mean_m, brightness, count = _brightest_first(samples, selected)
     covariance = _covariance(samples.lab_m, samples.led)[order]
-    return HomeCatalog(id_[order], unit(mean_m), brightness, mean_m, covariance, count, *epsilons)
+    return HomeCatalog(
+        id_[order], unit(mean_m), brightness, mean_m, covariance, count, *epsilons
+    )
 
 
 def _brightest_first(
@@ -262,7 +266,11 @@ def _lab_positions(
 def _check(index: int, sighting: Sighting) -> None:
     """Raise ImageError unless a sighting's arrays have matching shapes and finite values, and its ids differ."""
     lights = len(sighting.led)
-    if not lights or sighting.xy_px.shape != (lights, 2) or sighting.brightness.shape != (lights,):
+    if (
+        not lights
+        or sighting.xy_px.shape != (lights, 2)
+        or sighting.brightness.shape != (lights,)
+    ):
         raise ImageError(
             f"sighting {index}: {lights} ids, centroids {sighting.xy_px.shape}, brightness "
             f"{sighting.brightness.shape}; allowed: K ids, (K, 2) and (K,), K from 1"
@@ -283,7 +291,9 @@ def _separations(samples: _Samples) -> tuple[Floats, Ints, Ints]:
     direction = unit(samples.body_m)
     first = []
     second = []
-    for rows in np.split(np.arange(len(samples.led)), np.flatnonzero(np.diff(samples.frame)) + 1):
+    for rows in np.split(
+        np.arange(len(samples.led)), np.flatnonzero(np.diff(samples.frame)) + 1
+    ):
         i, j = np.triu_indices(len(rows), 1)
         first.append(rows[i])
         second.append(rows[j])

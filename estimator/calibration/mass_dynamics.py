@@ -340,11 +340,15 @@ class EquationsOfMotion:
         # (R m r) x g - W x H
         torque = cross(turn(q, self.moment), self.gravity) - cross(self.earth, states.momentum)
         # J J0^-1 R^T d
-        in_body = np.einsum("ijb,jb->ib", self.torque_scale, turn(q, states.torque, inverse=True))
+        in_body = np.einsum(
+            "ijb,jb->ib", self.torque_scale, turn(q, states.torque, inverse=True)
+        )
         # dq/dt = q (w, 0) / 2, a Hamilton product
         vector = q[3] * rate + cross(q[:3], rate)
         spin = np.vstack([vector, -np.sum(q[:3] * rate, axis=0)[None]]) / 2
-        return States(spin, torque + self.lab_torque + turn(q, in_body) - drag, np.zeros_like(rate))
+        return States(
+            spin, torque + self.lab_torque + turn(q, in_body) - drag, np.zeros_like(rate)
+        )
 
     def integrate(
         self, begin_s: Floats, end_s: Floats, states: States, correlation_s: float
@@ -377,7 +381,9 @@ class EquationsOfMotion:
 
 def inverse_inertia(record: BearingRecord, values: Floats) -> Floats:
     """Return the (3, 3) inverse inertia of the vehicle with a record's trim masses, for parameters (P,)."""
-    return np.asarray(np.linalg.inv(inertia_matrix(values[INERTIA]) + record.added_inertia_kg_m2))
+    return np.asarray(
+        np.linalg.inv(inertia_matrix(values[INERTIA]) + record.added_inertia_kg_m2)
+    )
 
 
 def moved_on(states: States, slope: States, by_s: Floats | float) -> States:
@@ -417,7 +423,9 @@ def transition(
     """
     count = before.momentum.shape[1]
     size = len(values)
-    largest = float(np.max(np.abs(before.momentum), initial=1e-3 * float(np.max(values[INERTIA]))))
+    largest = float(
+        np.max(np.abs(before.momentum), initial=1e-3 * float(np.max(values[INERTIA])))
+    )
     state_step, step = difference_steps(
         values, prior.sigma, largest, float(np.max(lab.torque_rms_nm))
     )
@@ -487,7 +495,12 @@ def torque_noise(
     # Random walk from the wheels' noise
     sample_s = float(np.median(np.diff(record.wheel_t_s)))
     walk = (
-        lab.wheel_sigma_nms**2 * sample_s * inverse @ lab.wheel_axes @ lab.wheel_axes.T @ inverse.T
+        lab.wheel_sigma_nms**2
+        * sample_s
+        * inverse
+        @ lab.wheel_axes
+        @ lab.wheel_axes.T
+        @ inverse.T
     )
     noise[:, :3, :3] += walk * duration_s[:, None, None]
     return np.asarray(noise)

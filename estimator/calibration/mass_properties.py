@@ -99,7 +99,9 @@ def estimate_mass(
     attitudes = sum(len(record.t_s) for record in records)
     for iteration in range(1, MAX_ITERATIONS + 1):
         # 1. Linearization and elimination
-        parts = [reduced(*one, lab, values, prior) for one in zip(records, motions, strict=True)]
+        parts = [
+            reduced(*one, lab, values, prior) for one in zip(records, motions, strict=True)
+        ]
         # 2. Information
         normal = information + sum(part.normal for part in parts)
         gradient = information @ (prior.values - values) + sum(part.gradient for part in parts)
@@ -164,7 +166,11 @@ def considered(
             continue
         # 1. K_n
         fitted = part.states_by_parameter.reshape(-1, STATE, size)[:, :3]
-        gain = covariance @ (by_bias - fitted).transpose(0, 2, 1) @ np.linalg.inv(record.noise_rad2)
+        gain = (
+            covariance
+            @ (by_bias - fitted).transpose(0, 2, 1)
+            @ np.linalg.inv(record.noise_rad2)
+        )
         # 2. K_n L_n, with the symmetric root L_n
         values, axes = np.linalg.eigh(record.systematic_rad2)
         scaled_axes = axes * np.sqrt(np.maximum(values, 0))[:, None]
@@ -227,7 +233,9 @@ def reduced(
     # 4. Elimination
     flat = border.reshape(-1, size + 1)
     try:
-        solved = solveh_banded(lower_band(diagonal, products[:, before, after]), flat, lower=True)
+        solved = solveh_banded(
+            lower_band(diagonal, products[:, before, after]), flat, lower=True
+        )
     except LinAlgError as error:
         raise ImageError(f"mass properties: {error}") from error
     corner -= flat.T @ solved
@@ -325,7 +333,9 @@ START = 20  # number of attitudes of the batch that begins the filter
 RATE_SIGMA_RAD_S = 0.01  # standard deviation of the rate from the attitudes before and after
 
 
-def filter_mass(record: BearingRecord, lab: LabConstants, prior: Prior) -> Iterator[MassEstimate]:
+def filter_mass(
+    record: BearingRecord, lab: LabConstants, prior: Prior
+) -> Iterator[MassEstimate]:
     """Yield the estimate after each attitude from number START + 2 on; its misfit is that of the innovations so far.
 
     State and parameters are those of `estimate_mass`; the parameters are constant.
@@ -363,7 +373,9 @@ def cut(record: BearingRecord, which: slice) -> BearingRecord:
         t_s=record.t_s[which],
         lab_from_body=record.lab_from_body[which],
         covariance_rad2=record.covariance_rad2[which],
-        systematic_rad2=None if record.systematic_rad2 is None else record.systematic_rad2[which],
+        systematic_rad2=None
+        if record.systematic_rad2 is None
+        else record.systematic_rad2[which],
     )
 
 

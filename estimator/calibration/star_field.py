@@ -70,7 +70,9 @@ class MagnitudeZero:
     stars: int
 
 
-def magnitude_zero(instrumental_mag: Floats, v_mag: Floats, vectors_ref: Floats) -> MagnitudeZero:
+def magnitude_zero(
+    instrumental_mag: Floats, v_mag: Floats, vectors_ref: Floats
+) -> MagnitudeZero:
     """Return the zero point: the median over different stars of each star's median difference.
 
     Colors are unknown and shift a star by some tenths of a magnitude, equally in every frame; therefore the sample is
@@ -106,7 +108,9 @@ def magnitude_zero(instrumental_mag: Floats, v_mag: Floats, vectors_ref: Floats)
 # Calibration of the lens.
 
 LENS = 8  # focal_px, center x and y, k1, k2, p1, p2, k3
-LEAST_STARS = 3  # in a frame: two determine its attitude and leave only one coordinate for the lens
+LEAST_STARS = (
+    3  # in a frame: two determine its attitude and leave only one coordinate for the lens
+)
 START_ROUNDS = 30  # iterations of the robust start attitude
 # self_calibrate stops at a round with fewer than this fraction of the most stars so far.
 MIN_STAR_FRACTION = 0.9
@@ -363,7 +367,9 @@ class _Problem(NamedTuple):
 
     def cost(self, sightings: Sightings, width: float) -> tuple[float, Floats]:
         """Return the total loss of the pixels and the prior, and the (M,) robust weights of the sightings."""
-        loss, weight = ba.cauchy(np.sum(ba.residuals(self.bundle, sightings) ** 2, axis=1), width)
+        loss, weight = ba.cauchy(
+            np.sum(ba.residuals(self.bundle, sightings) ** 2, axis=1), width
+        )
         from_prior = np.sum(((self.bundle.lens - self.prior_lens) / self.sigma) ** 2)
         return loss + float(from_prior), weight
 
@@ -460,7 +466,9 @@ def _fit_attitudes(bundle: Bundle, sightings: Sightings) -> Bundle:
     return replace(bundle, R_body_from_lab=R)
 
 
-def _normal_equations(problem: _Problem, sightings: Sightings, weight: Floats) -> _NormalEquations:
+def _normal_equations(
+    problem: _Problem, sightings: Sightings, weight: Floats
+) -> _NormalEquations:
     """Return the normal equations J^T W J and J^T W e, with one weight per sighting and the prior on the lens added."""
     terms = ba.linearize(problem.bundle, sightings)
     frames = len(problem.bundle.R_body_from_lab)
@@ -472,7 +480,9 @@ def _normal_equations(problem: _Problem, sightings: Sightings, weight: Floats) -
     rotation_blocks = np.zeros((frames, 3, 3))
     coupling = np.zeros((frames, 3, LENS))
     rhs = np.zeros((frames, 3))
-    np.add.at(rotation_blocks, sightings.frame, by_rotation.transpose(0, 2, 1) @ weighted_rotation)
+    np.add.at(
+        rotation_blocks, sightings.frame, by_rotation.transpose(0, 2, 1) @ weighted_rotation
+    )
     np.add.at(coupling, sightings.frame, by_rotation.transpose(0, 2, 1) @ weighted_lens)
     np.add.at(rhs, sightings.frame, np.einsum("mai,ma->mi", weighted_rotation, terms.residual))
     # The identity gives an unused frame a step of zero.
@@ -485,7 +495,9 @@ def _normal_equations(problem: _Problem, sightings: Sightings, weight: Floats) -
     return _NormalEquations(rotation_blocks, coupling, lens, rhs, lens_rhs)
 
 
-def _eliminate_attitudes(terms: _NormalEquations, damping: float) -> tuple[Floats, Floats, Floats]:
+def _eliminate_attitudes(
+    terms: _NormalEquations, damping: float
+) -> tuple[Floats, Floats, Floats]:
     """Eliminate the attitudes: (F, 3, 8) A^-1 C, (F, 3) A^-1 a, and the (8, 8) Schur complement D - sum(C^T A^-1 C).
 
     A are the blocks of the attitudes, C their coupling with the lens, D the block of the lens, and a the right-hand
@@ -611,7 +623,9 @@ def _magnitude(frames: Sequence[StarFrame], keep: np.ndarray) -> MagnitudeZero |
     v_mag = [frame.v_mag for frame in frames if frame.v_mag is not None]
     if not len(flux) == len(v_mag) == len(frames):
         return None
-    exposure_s = np.concatenate([np.full(len(frame.xy_px), frame.exposure_s) for frame in frames])
+    exposure_s = np.concatenate(
+        [np.full(len(frame.xy_px), frame.exposure_s) for frame in frames]
+    )
     instrumental = -2.5 * np.log10(np.concatenate(flux) / exposure_s)
     vectors = np.concatenate([frame.vectors_ref for frame in frames])
     return magnitude_zero(instrumental[keep], np.concatenate(v_mag)[keep], vectors[keep])

@@ -37,7 +37,9 @@ TINY_M2 = 1e-18  # added to variances, which could be 0
 SURFACE_SIGMA_M = 0.005
 GATE = 5.0  # largest distance of a ray from its light, in standard deviations
 MIN_SCATTER = 0.02  # least standard deviation of the logarithm of an LED's light
-CHANCE = 0.02  # probability that a light is missed although it is on, or seen although it is off
+CHANCE = (
+    0.02  # probability that a light is missed although it is on, or seen although it is off
+)
 FORBIDDEN = 1e7  # cost of a name that is not allowed
 
 
@@ -71,7 +73,9 @@ class HeldFrames:
             xy_px = np.nan_to_num(xy_px, nan=-1e9)
             inside = ((xy_px >= margin) & (xy_px <= size_px - 1 - margin)).all(axis=1)
             # Distance to the nearest other LED, one outside the frame included
-            near = np.flatnonzero(((xy_px > -apart_px) & (xy_px < size_px + apart_px)).all(axis=1))
+            near = np.flatnonzero(
+                ((xy_px > -apart_px) & (xy_px < size_px + apart_px)).all(axis=1)
+            )
             if len(near) > 1:
                 distance_px, _ = cKDTree(xy_px[near]).query(xy_px[near], 2)
                 inside[near[distance_px[:, 1] < apart_px]] = False
@@ -198,7 +202,9 @@ def stray_lights(
     points = np.nan_to_num(points, nan=1e9)
     # 2. Groups
     pairs = cKDTree(points).query_pairs(reach_m, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
+    links = coo_array(
+        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2
+    )
     groups, label = connected_components(links, directed=False)
     sigma_rad = sigma_px / held.camera.focal_px
     out = []
@@ -456,7 +462,9 @@ def _log_likelihood(table: LightTable) -> Floats:
     return np.asarray(out)
 
 
-def _observable(table: LightTable, likelihood: Floats, tested: Mask, least: float) -> float | None:
+def _observable(
+    table: LightTable, likelihood: Floats, tested: Mask, least: float
+) -> float | None:
     """Return the share of the pairs of tested LEDs whose exchange would be found; None with fewer than two LEDs.
 
     An exchange would be found if each of the two LEDs explains the other's light worse by `least`.

@@ -164,7 +164,9 @@ def _bundle(
     )
     # With pixels of 0 the residuals are the negative predictions over sigma.
     frame, led = np.nonzero(seen)
-    sightings = Sightings(frame, led, np.zeros((len(led), 2)), np.full(len(led), model.sigma_px))
+    sightings = Sightings(
+        frame, led, np.zeros((len(led), 2)), np.full(len(led), model.sigma_px)
+    )
     xy_px = -ba.residuals(bundle, sightings) * model.sigma_px
     return bundle, Sightings(frame, led, xy_px, sightings.sigma_px)
 

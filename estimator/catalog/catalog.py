@@ -134,7 +134,14 @@ class StarCatalog:
                 f"catalog: id has {len(numbers)} numbers; allowed: {count}, one a star"
             )
         stars = from_columns(
-            numbers, np.radians(ra), np.radians(dec), pm_ra, pm_dec, parallax, magnitude, epoch_yr
+            numbers,
+            np.radians(ra),
+            np.radians(dec),
+            pm_ra,
+            pm_dec,
+            parallax,
+            magnitude,
+            epoch_yr,
         )
         return stars.take(np.argsort(stars.v_mag, kind="stable"))
 
@@ -283,7 +290,9 @@ def _read(path: str | Path) -> StarCatalog:
     """Read a catalog file, and sort the stars by brightness."""
     (hip, ra_deg, dec_deg, pm_ra, pm_dec, parallax, v_mag), epoch_yr = columns(path, COLUMNS)
     radec_rad = np.radians(ra_deg), np.radians(dec_deg)
-    stars = from_columns(hip.astype(np.int64), *radec_rad, pm_ra, pm_dec, parallax, v_mag, epoch_yr)
+    stars = from_columns(
+        hip.astype(np.int64), *radec_rad, pm_ra, pm_dec, parallax, v_mag, epoch_yr
+    )
     return stars.take(np.argsort(v_mag, kind="stable"))
 
 
@@ -344,7 +353,11 @@ def columns(
             column_numbers[len(names) :], _number_or_nan
         )
         table = np.loadtxt(
-            body[1:], delimiter=delimiter, usecols=column_numbers, ndmin=2, converters=converters
+            body[1:],
+            delimiter=delimiter,
+            usecols=column_numbers,
+            ndmin=2,
+            converters=converters,
         )
         if not np.isfinite(table[:, : len(names)]).all():
             raise ValueError("some numbers are not finite")

@@ -215,7 +215,9 @@ def first_neighbor(index: PairIndex, star: int, low_rad: float) -> int:
 
 
 @jit
-def neighbor_range(index: PairIndex, star: int, low_rad: float, high_rad: float) -> tuple[int, int]:
+def neighbor_range(
+    index: PairIndex, star: int, low_rad: float, high_rad: float
+) -> tuple[int, int]:
     """The half-open range in `neighbor` of a star's neighbors at the angles [low, high]."""
     begin = first_neighbor(index, star, low_rad)
     end = begin

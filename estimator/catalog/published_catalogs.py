@@ -79,7 +79,10 @@ class OnBoard:
 
 
 def read_cat(
-    path: str | Path, limit_v_mag: float, epoch_yr: float | None = None, color: Color | None = None
+    path: str | Path,
+    limit_v_mag: float,
+    epoch_yr: float | None = None,
+    color: Color | None = None,
 ) -> OnBoard:
     """READCAT: select stars to a limiting V, propagate them to the mission epoch, compute instrumental magnitudes.
 
@@ -102,7 +105,9 @@ def read_cat(
     ImageError
         For a file that is not a catalog, and if no star is bright enough.
     """
-    numbers, file_epoch_yr = catalog.columns(path, catalog.COLUMNS, ("b_v", "v_i") if color else ())
+    numbers, file_epoch_yr = catalog.columns(
+        path, catalog.COLUMNS, ("b_v", "v_i") if color else ()
+    )
     numbers = numbers[:, numbers[6] <= limit_v_mag]
     if not numbers.shape[1]:
         raise ImageError(f"{path}: no star of V <= {limit_v_mag:g}; allowed: a fainter limit")
@@ -177,7 +182,9 @@ def log(stars: OnBoard, step_mag: float = 0.5) -> str:
         stars.components,
         strict=True,
     )
-    lines += [f"{n:6d} {ra:11.6f} {dec:+11.6f} {mag:7.3f} {c:6d}" for n, ra, dec, mag, c in columns]
+    lines += [
+        f"{n:6d} {ra:11.6f} {dec:+11.6f} {mag:7.3f} {c:6d}" for n, ra, dec, mag, c in columns
+    ]
     return "\n".join(lines) + "\n"
 
 
@@ -196,7 +203,9 @@ def asymmetric(
     return stars.take(stars.v_mag <= np.where(stars.vectors[:, 2] >= 0, north_mag, south_mag))
 
 
-def thin(stars: StarCatalog, min_separation_rad: float, bright_mag: float = -np.inf) -> StarCatalog:
+def thin(
+    stars: StarCatalog, min_separation_rad: float, bright_mag: float = -np.inf
+) -> StarCatalog:
     """Select all stars to `bright_mag`, then, brightest first, each star with no selected one closer than an angle."""
     order = np.argsort(stars.v_mag, kind="stable")
     vectors = np.ascontiguousarray(stars.vectors[order])

@@ -153,7 +153,9 @@ def refraction_constants(
     per_um2 = (1e-6 / wavelength_m) ** 2
     t_k = temperature_c + ZERO_CELSIUS_K
     standard = 1e-6 * (64.328 + 29498.1 / (146 - per_um2) + 255.4 / (41 - per_um2))
-    refractivity = standard * pressure_hpa / STANDARD_PRESSURE_HPA * STANDARD_TEMPERATURE_K / t_k
+    refractivity = (
+        standard * pressure_hpa / STANDARD_PRESSURE_HPA * STANDARD_TEMPERATURE_K / t_k
+    )
     beta = 0.001254 * t_k / ZERO_CELSIUS_K
     return refractivity * (1 - beta), -refractivity * (beta - refractivity / 2)
 

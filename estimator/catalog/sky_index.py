@@ -186,7 +186,9 @@ def nearest_in_grid(
 PAIRS_PER_BIN = 8
 STARS_PER_CELL = 0.5
 MAG_STEP = 0.1
-MAG_SMOOTHING = 0.25  # standard deviation of the Gaussian that smooths the histogram of magnitudes
+MAG_SMOOTHING = (
+    0.25  # standard deviation of the Gaussian that smooths the histogram of magnitudes
+)
 # Half-width of a face's grid in tangents. It exceeds 1 (45 degrees) so that a gate up to 0.05 rad stays on one face.
 FACE_HALF_WIDTH = 1.2
 
@@ -231,7 +233,9 @@ class SkyIndex(NamedTuple):
     @property
     def bytes(self) -> int:
         """Memory of the arrays, bytes."""
-        return sum(array.nbytes for array in (*self, *self.cells) if isinstance(array, np.ndarray))
+        return sum(
+            array.nbytes for array in (*self, *self.cells) if isinstance(array, np.ndarray)
+        )
 
 
 def build(
@@ -360,7 +364,9 @@ def _cells(vectors: Floats, side: int) -> tuple[NDArray[np.int32], NDArray[np.in
             # Gnomonic projection onto this face, of the stars before it.
             along = sign * vectors[:, axis]
             gnomonic = np.roll(vectors, -axis, axis=1)[:, 1:] / np.maximum(along, 1e-9)[:, None]
-            on_face = np.flatnonzero((along > 0) & (np.abs(gnomonic).max(axis=1) < FACE_HALF_WIDTH))
+            on_face = np.flatnonzero(
+                (along > 0) & (np.abs(gnomonic).max(axis=1) < FACE_HALF_WIDTH)
+            )
             cells = (gnomonic[on_face] + FACE_HALF_WIDTH) * side / (2 * FACE_HALF_WIDTH)
             column, row = cells.astype(np.int64).T
             cell.append(((2 * axis + (sign < 0)) * side + row) * side + column)

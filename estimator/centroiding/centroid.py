@@ -189,7 +189,9 @@ def prepare(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors)
     checks.of_type("priors", priors, FramePriors)
     checks.number("gain_e_dn", gain_e_dn, 1e-300, np.inf, "above 0; inf without photon noise")
     if image.ndim != 2:
-        raise ImageError(f"an image of shape {image.shape}; allowed: monochrome, (height, width)")
+        raise ImageError(
+            f"an image of shape {image.shape}; allowed: monochrome, (height, width)"
+        )
     # Boxes within the image: x0, y0 of 0 or more, x1, y1 below its size
     edge = np.array([image.shape[1], image.shape[0]] * 2)
     if len(blobs) and not (blobs.box_px.min() >= 0 and (blobs.box_px.max(axis=0) < edge).all()):
@@ -221,7 +223,9 @@ def _gaussian_centroids(
     return _to_centroids(_with_fallback(rows, image, blobs, gain_e_dn))
 
 
-def _fit_gaussians(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors) -> Floats:
+def _fit_gaussians(
+    image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors
+) -> Floats:
     """Return the rows of `gaussian_fit.fit_all`."""
     sky = blobs.background
     return gaussian.fit_all(
@@ -280,7 +284,9 @@ def _frame_streaks(image: NDArray, blobs: Blobs, priors: FramePriors) -> Floats:
 def _gravity_rows(image: NDArray, blobs: Blobs, gain_e_dn: float) -> Floats:
     """Return the rows of `moments.center_of_gravity`."""
     sky = blobs.background
-    return moments.center_of_gravity(image, blobs.box_px, sky.level, sky.noise, float(gain_e_dn))
+    return moments.center_of_gravity(
+        image, blobs.box_px, sky.level, sky.noise, float(gain_e_dn)
+    )
 
 
 def _with_fallback(rows: Floats, image: NDArray, blobs: Blobs, gain_e_dn: float) -> Floats:

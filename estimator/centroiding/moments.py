@@ -150,7 +150,9 @@ def squared_light(
                     light = max(light, 0.0)
                     distance2 = ((x - cx) ** 2 + (y - cy) ** 2) / 2
                     second_moment += light * light * distance2
-                    moment_variance += 4 * light * light * distance2 * (light / gain_e_dn + sigma2)
+                    moment_variance += (
+                        4 * light * light * distance2 * (light / gain_e_dn + sigma2)
+                    )
             if sweep == 0:
                 if weight == 0:
                     break
@@ -165,7 +167,9 @@ def squared_light(
         out[n, 0] = cx
         out[n, 1] = cy
         out[n, 3] = flux
-        out[n, 2] = sqrt(moment_variance / weight**2 + sampling_variance(second_moment / weight))
+        out[n, 2] = sqrt(
+            moment_variance / weight**2 + sampling_variance(second_moment / weight)
+        )
     return out
 
 
@@ -236,12 +240,18 @@ def gaussian_windowed(
                 # 3. A star of variance q times the window has the variance 1 / (1/q + 1/s2): solve for q.
                 apparent = second_moment / total
                 variance = (
-                    1 / (1 / apparent - 1 / s2) if 0 < apparent < 0.95 * s2 else MAX_WINDOW_PX**2
+                    1 / (1 / apparent - 1 / s2)
+                    if 0 < apparent < 0.95 * s2
+                    else MAX_WINDOW_PX**2
                 )
-                s2 = min(max(WINDOW_VARIANCE_RATIO * variance, MIN_WINDOW_PX**2), MAX_WINDOW_PX**2)
+                s2 = min(
+                    max(WINDOW_VARIANCE_RATIO * variance, MIN_WINDOW_PX**2), MAX_WINDOW_PX**2
+                )
             elif max(abs(dx), abs(dy)) < 1e-10:
                 # 4. Converged
-                sampling_error2 = sampling_variance(second_moment / total) * (total / slope) ** 2
+                sampling_error2 = (
+                    sampling_variance(second_moment / total) * (total / slope) ** 2
+                )
                 out[n, 0] = cx
                 out[n, 1] = cy
                 out[n, 3] = flux

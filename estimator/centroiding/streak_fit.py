@@ -30,7 +30,9 @@ from estimator.detection.background import FILTERED_NOISE, interpolate
 # Margin of the window about the streak, and its largest half-width.
 MARGIN_PX = 4
 MAX_HALF_WINDOW_PX = 96
-REACH_PX = 4.5  # largest distance of a pixel from the initial line; farther ones contain only sky
+REACH_PX = (
+    4.5  # largest distance of a pixel from the initial line; farther ones contain only sky
+)
 MIN_STREAK_PX = 1.5  # shortest streak whose length and direction can be measured
 MAX_ITERATIONS = 40
 # Standard deviations of the priors: difference of a star's streak from the frame's, because slow rotation about the
@@ -200,7 +202,9 @@ def _fit(
         least_squares.normal_equations(rows, weight, count, normal)
         least_squares.add_prior(normal, LENGTH, start_length - p[LENGTH], length_sigma)
         least_squares.add_prior(normal, ANGLE, start_angle - p[ANGLE], ANGLE_RAD)
-        least_squares.add_prior(normal, WIDTH, start_width - p[WIDTH], WIDTH_FRACTION * start_width)
+        least_squares.add_prior(
+            normal, WIDTH, start_width - p[WIDTH], WIDTH_FRACTION * start_width
+        )
         fall = least_squares.step(normal, step)
         if not fall >= 0:
             return False
@@ -229,7 +233,14 @@ def _fit(
             # 5. The variance along the streak becomes a covariance in x and y: times (dx, dy)^T (dx, dy) / L^2.
             end_variance_px2 = _end_variance_px2(p, noise, gain_e_dn)
             _own_vector(
-                normal, p, start_length, start_angle, misfit, 8 * end_variance_px2, step, out[8:]
+                normal,
+                p,
+                start_length,
+                start_angle,
+                misfit,
+                8 * end_variance_px2,
+                step,
+                out[8:],
             )
             end_variance = end_variance_px2 / p[LENGTH] ** 2
             out[5] += end_variance * out[3] ** 2

@@ -150,9 +150,13 @@ class Camera:
                 guess = "; radians?" if 0 < fov_deg < NARROWEST_DEG else ";"
                 raise ImageError(f"from_fov: fov_deg is {fov_deg:g}{guess} allowed: {_FIELDS}")
             fov_rad = math.radians(fov_deg)
-        width_px = checks.number("from_fov: width_px", width_px, 2, 1e6, "2 pixels or more", True)
+        width_px = checks.number(
+            "from_fov: width_px", width_px, 2, 1e6, "2 pixels or more", True
+        )
         focal_px = (width_px - 1) / 2 / np.tan(fov_rad / 2)
-        return cls(width_px, height_px, float(focal_px), ((width_px - 1) / 2, (height_px - 1) / 2))
+        return cls(
+            width_px, height_px, float(focal_px), ((width_px - 1) / 2, (height_px - 1) / 2)
+        )
 
     @property
     def fov_rad(self) -> float:
@@ -256,7 +260,11 @@ def distorted(tangent: Floats, distortion: Distortion) -> Floats:
 
 @jit
 def undistorted(
-    xy_px: Floats, focal_px: float, center_x_px: float, center_y_px: float, distortion: Distortion
+    xy_px: Floats,
+    focal_px: float,
+    center_x_px: float,
+    center_y_px: float,
+    distortion: Distortion,
 ) -> Floats:
     """Convert (N, 2) pixels to (N, 2) tangents without distortion.
 

@@ -48,7 +48,9 @@ def number(
     """
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value[()]
-    if isinstance(value, Integral if integer else Real) and not isinstance(value, bool | np.bool_):
+    if isinstance(value, Integral if integer else Real) and not isinstance(
+        value, bool | np.bool_
+    ):
         plain = int(value) if integer else float(value)  # type: ignore[call-overload]
         if low <= plain <= high:
             return plain

@@ -14,5 +14,10 @@ import numba
 # No wrapper for C callbacks is compiled, since no compiled function is passed as a value.
 # Division by zero gives inf or nan, as in NumPy; sums keep the order of the source unless a function sets fastmath.
 jit = partial(
-    numba.njit, cache=True, error_model="numpy", fastmath=False, no_cfunc_wrapper=True, nogil=True
+    numba.njit,
+    cache=True,
+    error_model="numpy",
+    fastmath=False,
+    no_cfunc_wrapper=True,
+    nogil=True,
 )

@@ -217,7 +217,9 @@ def fit_soft_l1(
     damping = 1e-4
     for _ in range(MAX_STEPS):
         # 1. Slopes
-        columns = [(residual(point + one) - r) / SLOPE_STEP for one in np.diag(SLOPE_STEP * scale)]
+        columns = [
+            (residual(point + one) - r) / SLOPE_STEP for one in np.diag(SLOPE_STEP * scale)
+        ]
         slopes = np.column_stack(columns)
         # 2. Normal equations
         weight = 1 / np.sqrt(1 + r**2)
@@ -225,7 +227,9 @@ def fit_soft_l1(
         gradient = slopes.T @ (weight * r)
         # 3. Step
         while damping < MAX_DAMPING:
-            change = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + TINY), -gradient)
+            change = np.linalg.solve(
+                normal + damping * np.diag(np.diag(normal) + TINY), -gradient
+            )
             tried = residual(point + scale * change)
             if soft_l1(tried) <= soft_l1(r):
                 break

@@ -212,7 +212,9 @@ class Centroids:
         object.__setattr__(self, "xy_px", xy_px)
         for name in ("sigma_px", "flux"):
             object.__setattr__(
-                self, name, checks.floats(f"centroids: {name}", getattr(self, name), (len(xy_px),))
+                self,
+                name,
+                checks.floats(f"centroids: {name}", getattr(self, name), (len(xy_px),)),
             )
         for name, shape in OPTIONAL_SHAPES.items():
             value = getattr(self, name)

@@ -23,8 +23,12 @@ from estimator.core.jit import jit
 from estimator.core.types import Background
 
 TILE_PX = 64
-SAMPLE_ROWS = 6  # sampled per tile: some 370 filtered pixels, of which about 130 are independent
-INITIAL_SAMPLES = 33  # samples of the robust initial estimate; odd, as `_median_by_counting` needs
+SAMPLE_ROWS = (
+    6  # sampled per tile: some 370 filtered pixels, of which about 130 are independent
+)
+INITIAL_SAMPLES = (
+    33  # samples of the robust initial estimate; odd, as `_median_by_counting` needs
+)
 CLIP_SIGMA = 3.0
 # Variance of a unit Gaussian truncated at 3 sigma: 1 - 6 phi(3) / (2 Phi(3) - 1).
 CLIPPED_VARIANCE = 0.9733
@@ -65,7 +69,9 @@ def accumulator_type(pixel: np.dtype, greatest: float = np.inf) -> type:
     """
     if pixel.kind not in "iu" or pixel.itemsize > 2:
         return np.float64
-    return np.uint16 if pixel == np.uint8 or (pixel.kind == "u" and greatest < 4096) else np.int32
+    return (
+        np.uint16 if pixel == np.uint8 or (pixel.kind == "u" and greatest < 4096) else np.int32
+    )
 
 
 @jit

@@ -75,7 +75,8 @@ def find_captions(boxes: Ints, peak: Floats) -> NDArray[np.bool_]:
             x = (boxes[k, 0] + boxes[k, 2]) / 2
             y = (boxes[k, 1] + boxes[k, 3]) / 2
             beside = (
-                line[0] - margin < x < line[2] + margin and line[1] - margin < y < line[3] + margin
+                line[0] - margin < x < line[2] + margin
+                and line[1] - margin < y < line[3] + margin
             )
             out[k] |= letter[k] or (beside and boxes[k, 3] - boxes[k, 1] < 2 * height)
     return out
@@ -108,7 +109,11 @@ def _grow(
         found = False
         for m in range(len(boxes)):
             # The same height, near the line, and equally bright
-            if letter[m] or abs(boxes[m, 1] - top) > near_px or abs(boxes[m, 3] - base) > near_px:
+            if (
+                letter[m]
+                or abs(boxes[m, 1] - top) > near_px
+                or abs(boxes[m, 3] - base) > near_px
+            ):
                 continue
             if max(boxes[m, 0] - line[2], line[0] - boxes[m, 2]) > GAP * height:
                 continue
@@ -566,7 +571,9 @@ def _shapes(image: NDArray, boxes: Ints, level: Floats, noise: Floats) -> Floats
             (peak_x, peak_y - 1),
             (peak_x, peak_y + 1),
         ):
-            out[n, 1] += float(image[min(max(b, 0), height - 1), min(max(a, 0), width - 1)]) - sky
+            out[n, 1] += (
+                float(image[min(max(b, 0), height - 1), min(max(a, 0), width - 1)]) - sky
+            )
         # Central moments
         if total > 0:
             xx = xx / total - (x_sum / total) ** 2

@@ -48,7 +48,9 @@ def runs_above(image: NDArray, threshold: Floats, taps: Ints | None = None) -> I
         (K, 2) x, y offsets over which the filtered image is averaged, for streaks; None for
         round stars
     """
-    sum_type = accumulator_type(image.dtype, image.max() if image.dtype == np.uint16 else np.inf)
+    sum_type = accumulator_type(
+        image.dtype, image.max() if image.dtype == np.uint16 else np.inf
+    )
     if taps is None:
         taps = ONE_TAP
         ring_type = sum_type

@@ -38,7 +38,9 @@ from estimator.detection.shefex_detection import maximum_scan, sequential_scan
 
 MAX_BLOBS = 20_000
 GROW_SIGMA = 3.5  # lower threshold, down to which a blob extends
-SPARE = 4  # blobs classified per blob returned, so that hot pixels and tracks do not replace stars
+SPARE = (
+    4  # blobs classified per blob returned, so that hot pixels and tracks do not replace stars
+)
 MIN_GROWN_PX = 8  # smallest area of a blob that is significant only as a whole
 # With fewer stars than FEW_STARS, faint streaks of SEARCH_LENGTH_PX are searched in DIRECTIONS directions.
 FEW_STARS = 8
@@ -51,8 +53,12 @@ MAX_GROWN_PX = 64
 # Length of the next filter over the last streak, and the growth of the streak that justifies it.
 LONGER = 1.5
 LENGTHENED = 1.15
-LARGE_PX = 150  # a blob this large is not a faint streak, and a line filter finds many in its noise
-MAX_STREAK_PX = 1024  # longest streak that has a filter: a longer one spreads the star too thinly
+LARGE_PX = (
+    150  # a blob this large is not a faint streak, and a line filter finds many in its noise
+)
+MAX_STREAK_PX = (
+    1024  # longest streak that has a filter: a longer one spreads the star too thinly
+)
 # Largest difference of the streaks at the corners, from a roll, for which one filter serves all of them.
 MAX_TURN_PX = 4.0
 # Least area of a streak: noise averaged along a line is correlated, so that several pixels exceed the threshold.
@@ -94,7 +100,11 @@ def default(
 
 
 def _classified(
-    image: NDArray, threshold_sigma: float, min_area_px: int, max_blobs: int, priors: FramePriors
+    image: NDArray,
+    threshold_sigma: float,
+    min_area_px: int,
+    max_blobs: int,
+    priors: FramePriors,
 ) -> Blobs:
     """Return the brightest blobs with their flags: steps 1 to 4 of `default`."""
     background = estimate_background(image)
@@ -270,7 +280,9 @@ def check_image(image: NDArray) -> None:
     """Raise ImageError unless the image is a finite, non-constant (H, W) array of real numbers."""
     check_pixel_type(image)
     if image.ndim != 2:
-        raise ImageError(f"an image of shape {image.shape}; allowed: monochrome, (height, width)")
+        raise ImageError(
+            f"an image of shape {image.shape}; allowed: monochrome, (height, width)"
+        )
     check_size(image)
     # A sample of the pixels is quicker than all of them.
     some = image[::97, ::89]
@@ -351,7 +363,9 @@ def replace_bad_pixels(image: NDArray, bad_px: Ints) -> NDArray:
     height, width = image.shape
     x, y = np.asarray(bad_px).reshape(-1, 2).T
     if len(x) and not (x.min() >= 0 and x.max() < width and y.min() >= 0 and y.max() < height):
-        raise ImageError(f"the bad-pixel map reaches beyond the frame of {width}x{height} pixels")
+        raise ImageError(
+            f"the bad-pixel map reaches beyond the frame of {width}x{height} pixels"
+        )
     bad = set(zip(x.tolist(), y.tolist(), strict=True))
     # A wider neighborhood only if the near one has no good pixel
     for column, row in bad:
@@ -395,7 +409,9 @@ def detect_blobs(
     if grow_sigma is not None:
         grow_level = background.level + np.minimum(above, grow_sigma * background.noise)
     runs = runs_above(image, grow_level)
-    boxes, sums = accumulate_blobs(image, background.level, strong_level, runs, *label_runs(runs))
+    boxes, sums = accumulate_blobs(
+        image, background.level, strong_level, runs, *label_runs(runs)
+    )
     if grow_sigma is None:
         return _to_blobs(boxes, sums, min_area_px, max_blobs, background)
     # The threshold plus one sigma, in units of the image for one raw pixel
@@ -548,5 +564,7 @@ def _to_blobs(
         boxes, sums, min_area_px, min_total_px, min_flux_per_root_px, max_blobs
     )
     if count > MAX_BLOBS:
-        raise ImageError(f"over {MAX_BLOBS} blobs: the frame is noise or texture, not a star field")
+        raise ImageError(
+            f"over {MAX_BLOBS} blobs: the frame is noise or texture, not a star field"
+        )
     return Blobs(box, xy, flux, peak, area, background, np.zeros(len(flux), np.int64))

@@ -61,7 +61,9 @@ def checked_samples(
     lost = absent != 0
     samples[:, 0] = ends_s
     samples[:, 1:4] = np.where(lost[:, None] & np.isnan(angle), 0.0, angle)
-    if not (np.isfinite(samples[:, :4]).all() and np.isfinite(np.asarray(saturated, float)).all()):
+    if not (
+        np.isfinite(samples[:, :4]).all() and np.isfinite(np.asarray(saturated, float)).all()
+    ):
         raise ValueError("propagate: NaN or infinite times or angles; allowed: finite ones")
     # Lengths of the intervals
     step_s = np.diff(ends_s, prepend=start_s)
@@ -74,7 +76,9 @@ def checked_samples(
         )
     # A mean rate near the limit means that the rate was at the limit for a part of the interval.
     limited = np.abs(samples[:, 1:4]).max(axis=1) >= NEAR_LIMIT * gyro.limit_rad_s * step_s
-    samples[:, 4] = np.where(lost, MISSING, SATURATED * (limited | (np.asarray(saturated) != 0)))
+    samples[:, 4] = np.where(
+        lost, MISSING, SATURATED * (limited | (np.asarray(saturated) != 0))
+    )
     return samples
 
 

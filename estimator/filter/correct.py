@@ -170,7 +170,9 @@ def adopt(
 def offset_rows(solution: AttitudeFix, layout: Layout) -> Floats:
     """Return the (3, N) matrix that maps the states to a solution's offset: mounting + L times the slow error."""
     offsets = np.zeros((3, layout.size))
-    offsets[:, layout.slices[of_head("systematic", solution.head)]] = root(solution.systematic_rad2)
+    offsets[:, layout.slices[of_head("systematic", solution.head)]] = root(
+        solution.systematic_rad2
+    )
     # The mounting of a further head is relative to that of the first one.
     for head in {0, solution.head}:
         if mounting := layout.slices.get(of_head("mounting", head)):

@@ -251,7 +251,11 @@ class AttitudeFilter:
             state.body_from_ref,
             self.bias_rad_s,
             state.covariance[:size, :size].copy(),
-            {name: state.values[rows].copy() for name, rows in slices.items() if rows.start >= 6},
+            {
+                name: state.values[rows].copy()
+                for name, rows in slices.items()
+                if rows.start >= 6
+            },
         )
 
     @property
@@ -345,7 +349,9 @@ class AttitudeFilter:
         now_s = self._current.t_s
         if head not in range(self._heads):
             raise ValueError(f"update: head {head}; allowed: 0 to {self._heads - 1}")
-        solution = self._solution(body_from_ref_measured, covariance_rad2, systematic_rad2, head)
+        solution = self._solution(
+            body_from_ref_measured, covariance_rad2, systematic_rad2, head
+        )
         if not t_s <= now_s + ROUNDING_S:
             raise ValueError(
                 f"update: a solution at {t_s} s; allowed: up to the last gyro sample, {now_s} s"
@@ -369,18 +375,24 @@ class AttitudeFilter:
         else:
             # 4. Refuse the solution, or adopt it.
             shock = shock_rad(segment.state.t_s, before, self._gyro.arw_rad_sqrt_s)
-            update = self._weigh(prior._replace(lost_rad=prior.lost_rad + shock), solution, update)
+            update = self._weigh(
+                prior._replace(lost_rad=prior.lost_rad + shock), solution, update
+            )
             if update.status != RESET:
                 return update
             # Solutions used later than t_s were judged by a lost filter: only their gyro samples are kept.
-            rest = np.concatenate([after, *(later.samples for later in self._segments[k + 1 :])])
+            rest = np.concatenate(
+                [after, *(later.samples for later in self._segments[k + 1 :])]
+            )
             adopted = adopt(
                 prior, solution, self._layout, self._initial_bias_variance, update.agreeing
             )
             self._segments = [_Segment(adopted, rest, None)]
         # 5. Propagate to the present.
         self._refused = []
-        self._current = self._propagate_state(self._segments[-1].state, self._segments[-1].samples)
+        self._current = self._propagate_state(
+            self._segments[-1].state, self._segments[-1].samples
+        )
         return update
 
     def _solution(
@@ -405,7 +417,9 @@ class AttitudeFilter:
         agreeing = len(self._refused)
         angle_rad = float(np.linalg.norm(update.residual_rad))
         since_s = prior.t_s - prior.used_s
-        jump = Jump(angle_rad, update.distance, agreeing, since_s, prior.lost_rad, prior.support)
+        jump = Jump(
+            angle_rad, update.distance, agreeing, since_s, prior.lost_rad, prior.support
+        )
         odds = log_odds(jump, self._jumps)
         # Adopt only what is confirmed and probable.
         status = OUTSIDE_GATE

@@ -126,7 +126,9 @@ def unknown_rad(sample: Floats, outage_rad: float) -> float:
     """
     if sample[4] == MISSING:
         return outage_rad
-    return max(abs(sample[1]), abs(sample[2]), abs(sample[3])) if sample[4] == SATURATED else 0.0
+    return (
+        max(abs(sample[1]), abs(sample[2]), abs(sample[3])) if sample[4] == SATURATED else 0.0
+    )
 
 
 @jit
@@ -157,7 +159,12 @@ def inverse_response(values: Floats, columns: Ints) -> Floats:
 
 @jit
 def fill_rows(
-    exponential: Floats, inverse: Floats, p: Floats, effective_s: float, columns: Ints, rows: Floats
+    exponential: Floats,
+    inverse: Floats,
+    p: Floats,
+    effective_s: float,
+    columns: Ints,
+    rows: Floats,
 ) -> None:
     """Fill the attitude rows (3, N) of the transition matrix F.
 
@@ -189,7 +196,9 @@ def fill_rows(
 
 
 @jit
-def propagate_covariance(rows: Floats, decay: Floats, covariance: Floats, buffer: Floats) -> None:
+def propagate_covariance(
+    rows: Floats, decay: Floats, covariance: Floats, buffer: Floats
+) -> None:
     """Replace P by F P F^T, exactly symmetric. F has the three attitude `rows`; below, its diagonal is `decay`."""
     size = len(decay)
     # buffer = the attitude rows of F P
@@ -447,7 +456,9 @@ class Layout(NamedTuple):
     def reported(self) -> dict[str, slice]:
         """The slices without the normalized slow error, whose effect is in the covariance of the attitude."""
         return {
-            name: rows for name, rows in self.slices.items() if not name.startswith("systematic")
+            name: rows
+            for name, rows in self.slices.items()
+            if not name.startswith("systematic")
         }
 
 
@@ -532,7 +543,9 @@ def build_layout(
     slow = slice(slices["systematic"].start, size)
     mounts = [rows for name, rows in slices.items() if name.startswith("mounting")]
     mountings = [row for rows in mounts for row in range(rows.start, rows.stop)]
-    return Layout(size, slices, slow, np.array(mountings, dtype=int), columns, np.array(estimated))
+    return Layout(
+        size, slices, slow, np.array(mountings, dtype=int), columns, np.array(estimated)
+    )
 
 
 def start_state(
@@ -542,7 +555,9 @@ def start_state(
     sigma = np.empty(layout.size)
     for name, rows in layout.slices.items():
         sigma[rows] = sigmas[name.partition("_")[0]]
-    return MekfState(t_s, wxyz, np.zeros(layout.size), np.diag(sigma**2), 0.0, 0.0, t_s, wxyz, 0)
+    return MekfState(
+        t_s, wxyz, np.zeros(layout.size), np.diag(sigma**2), 0.0, 0.0, t_s, wxyz, 0
+    )
 
 
 def propagate_state(

@@ -25,7 +25,9 @@ MIN_MATCHES = 4  # matches that they need
 ACCEPT_DEX = 5.0
 GATE_SIGMA = 3.5  # matching radius in standard deviations: it loses one true match in 450
 MIN_EVIDENCE_MATCHES = 3  # matches needed for a solution
-SHORT_PAIR = 0.2  # of the field size: shorter pairs determine the roll poorly and are tried last
+SHORT_PAIR = (
+    0.2  # of the field size: shorter pairs determine the roll poorly and are tried last
+)
 
 
 @jit
@@ -55,9 +57,9 @@ def counts_dex(matched: int, missing: int) -> float:
     function m! k! / (m + k + 1)!.
     """
     # ln B = ln m! + ln k! - ln (m + k + 1)!, with n! = gamma(n + 1).
-    return (lgamma(matched + 1.0) + lgamma(missing + 1.0) - lgamma(matched + missing + 2.0)) / log(
-        10.0
-    )
+    return (
+        lgamma(matched + 1.0) + lgamma(missing + 1.0) - lgamma(matched + missing + 2.0)
+    ) / log(10.0)
 
 
 @jit
@@ -71,7 +73,11 @@ def least(values: Floats) -> float:
 
 @jit
 def required_matches(
-    sigma: Floats, field_area: float, attitude_dex: float, min_dex: float, light_dex: float = 0.0
+    sigma: Floats,
+    field_area: float,
+    attitude_dex: float,
+    min_dex: float,
+    light_dex: float = 0.0,
 ) -> int:
     """Least number of matches with which the evidence can reach `min_dex`.
 

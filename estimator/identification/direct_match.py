@@ -50,7 +50,9 @@ def to_star_match(match: DirectMatch) -> StarMatch | None:
     """The match as a StarMatch, or None if it is not significant (ACCEPT_LOG10_CHANCE, MIN_MATCHES)."""
     if len(match.observed) < MIN_MATCHES or match.log10_chance > ACCEPT_LOG10_CHANCE:
         return None
-    return StarMatch(match.observed, match.star, rotation(match.R_cam_from_ref), match.log10_chance)
+    return StarMatch(
+        match.observed, match.star, rotation(match.R_cam_from_ref), match.log10_chance
+    )
 
 
 @jit
@@ -86,7 +88,9 @@ def match_field(
     # 1. and 2. The attitude of a few stars, and its matches.
     R_cam_from_ref = fit_rotation(rays[corners], index.vectors[stars])
     # The attitude of a few stars is less accurate than a star's direction: the first match has twice the tolerance.
-    observed, star, _ = match_nearest(rays, index, stars[0], R_cam_from_ref, 2 * tolerance, stretch)
+    observed, star, _ = match_nearest(
+        rays, index, stars[0], R_cam_from_ref, 2 * tolerance, stretch
+    )
     if len(observed) < MIN_MATCHES:
         return no_match()
     # 3. The attitude of all of them, and its matches.
@@ -98,7 +102,9 @@ def match_field(
         return no_match()
     # 4. The probability by chance.
     chance = log10_chance(index.group[star], len(rays), expected) + np.log10(hypotheses)
-    return DirectMatch(observed, star, fit_rotation(rays[observed], index.vectors[star]), chance)
+    return DirectMatch(
+        observed, star, fit_rotation(rays[observed], index.vectors[star]), chance
+    )
 
 
 @jit
@@ -172,7 +178,9 @@ def match_nearest(
             stretch * np.arccos(min(max(ray[2], -1.0), 1.0)) if stretch > 0 else 0.0
         )
         covered_sr += density * pi * radius**2
-        best = nearest_in_grid(index.cells, index.vectors, x, y, z, 2 * np.sin(min(radius, pi) / 2))
+        best = nearest_in_grid(
+            index.cells, index.vectors, x, y, z, 2 * np.sin(min(radius, pi) / 2)
+        )
         # A catalog star that is used already cannot match again.
         is_used = False
         for m in range(count):

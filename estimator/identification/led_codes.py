@@ -115,7 +115,8 @@ class LedCode:
         half = 0.5 / PHASES_PER_BIT
         # The mean level half a step of the phase before, at, and after each phase.
         before, at, after = (
-            (self._shown_until(begin + step + length) - self._shown_until(begin + step)).T / length
+            (self._shown_until(begin + step + length) - self._shown_until(begin + step)).T
+            / length
             for step in (-half, 0.0, half)
         )
         return at, np.maximum(np.abs(at - before), np.abs(after - at)) / np.sqrt(3)
@@ -148,14 +149,18 @@ def misfits(light: Floats, sigma: Floats, templates: Floats, spread: Floats) -> 
     Floats
         (T, W)
     """
-    arrays = (np.ascontiguousarray(one, dtype=float) for one in (light, sigma, templates, spread))
+    arrays = (
+        np.ascontiguousarray(one, dtype=float) for one in (light, sigma, templates, spread)
+    )
     out = np.empty((len(light), len(templates)))
     _misfits(*arrays, out)
     return out
 
 
 @jit
-def _misfits(light: Floats, sigma: Floats, templates: Floats, spread: Floats, out: Floats) -> None:
+def _misfits(
+    light: Floats, sigma: Floats, templates: Floats, spread: Floats, out: Floats
+) -> None:
     """Write the misfits to `out`.
 
     The brightness is fitted twice, as gross errors make the least-squares fit depend on its start: from the fit to all

@@ -122,7 +122,9 @@ def same_identification(first: LedHypothesis, second: LedHypothesis) -> bool:
     common = 0
     for n in range(len(first.observed)):
         for m in range(len(second.observed)):
-            common += first.observed[n] == second.observed[m] and first.star[n] == second.star[m]
+            common += (
+                first.observed[n] == second.observed[m] and first.star[n] == second.star[m]
+            )
     return 2 * common > min(len(first.observed), len(second.observed))
 
 
@@ -255,7 +257,9 @@ def _match(
         best = -1
         distance2 = GATE_SIGMA**2 * variance
         for n in range(total):
-            residual2 = (detections.tangent[n, 0] - x) ** 2 + (detections.tangent[n, 1] - y) ** 2
+            residual2 = (detections.tangent[n, 0] - x) ** 2 + (
+                detections.tangent[n, 1] - y
+            ) ** 2
             if residual2 < distance2 * detections.sigma[n] ** 2:
                 best = n
                 distance2 = residual2 / detections.sigma[n] ** 2
@@ -394,7 +398,9 @@ def _evidence(
     group = dome.pairs.group
     # Attitude and focal length.
     root_det = _factorize(info, np.empty_like(info))
-    total = len(info) / 2 * log10(2 * pi) - log10(max(root_det, 1e-150)) - log10(dome.prior_volume)
+    total = (
+        len(info) / 2 * log10(2 * pi) - log10(max(root_det, 1e-150)) - log10(dome.prior_volume)
+    )
     if detections.focal_uncertainty > 0:
         total -= log10(2 * detections.focal_uncertainty)
     for k in range(len(observed)):

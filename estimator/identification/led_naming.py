@@ -29,7 +29,9 @@ from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.led_search import MARGIN_DEX
 
 REACH = 30.0  # greatest misfit of a name in excess of the best name's
-STRANGER = 14.0  # misfit of a light that fits no LED: a reflection, or a track that changed its LED
+STRANGER = (
+    14.0  # misfit of a light that fits no LED: a reflection, or a track that changed its LED
+)
 TRUSTED = 5.0  # greatest excess misfit of the names, times the square root of their number
 MAX_HYPOTHESES = 150  # with so many or more, the lights are undecided
 UNDECIDED = "codes: more than one attitude fits the lights"
@@ -188,7 +190,9 @@ def _pair_names(
 
 
 @jit
-def _alike(u: Floats, v: Floats, known_u: Floats, known_v: Floats, gate: float, pairs: Ints) -> int:
+def _alike(
+    u: Floats, v: Floats, known_u: Floats, known_v: Floats, gate: float, pairs: Ints
+) -> int:
     """Find the pairs of directions u (K, 3) and v (L, 3) that are as far apart as their known directions.
 
     The cosines of two angles differ by the difference of the angles times the sine, if that difference is small.
@@ -221,11 +225,15 @@ def _seen_directions(ray: Floats, sphere: Sphere, rows: Ints) -> Floats:
     """(K, 3) directions from the bearing to the points where a ray meets the spheres of these LEDs' radii."""
     radius = sphere.radius_m[rows]
     along = float(ray @ sphere.pupil_m)
-    reach = -along + np.sqrt(np.maximum(along**2 - sphere.pupil_m @ sphere.pupil_m + radius**2, 0))
+    reach = -along + np.sqrt(
+        np.maximum(along**2 - sphere.pupil_m @ sphere.pupil_m + radius**2, 0)
+    )
     return (sphere.pupil_m + reach[:, None] * ray) / radius[:, None]
 
 
-def _attitudes(lights: NamedLights, sphere: Sphere, first: int, second: int, names: Ints) -> Floats:
+def _attitudes(
+    lights: NamedLights, sphere: Sphere, first: int, second: int, names: Ints
+) -> Floats:
     """Step 3: (M, 3, 3) R_cam_from_lab of each pair of names."""
     seen_first = _seen_directions(lights.ray[first], sphere, names[:, 0])
     seen_second = _seen_directions(lights.ray[second], sphere, names[:, 1])

@@ -63,7 +63,9 @@ from estimator.identification.led_index import DirectionGrid, DomeIndex
 
 MARGIN_DEX = 5.0  # by which the best attitude must beat every other one
 AMBIGUOUS_DEX = 2.0  # least evidence of the best attitude for a near rival to be reported
-MIN_SEPARATION = 1e-9  # of a pair, in tangents: closer detections have no direction between them
+MIN_SEPARATION = (
+    1e-9  # of a pair, in tangents: closer detections have no direction between them
+)
 AMBIGUOUS = "ambiguous: another attitude fits the lights as well"
 NO_MATCH = "no identification beyond chance"
 
@@ -111,7 +113,10 @@ def identify(
     if hypothesis.dex < ACCEPT_DEX:
         return NO_MATCH
     return StarMatch(
-        hypothesis.observed, hypothesis.star, rotation(hypothesis.R_cam_from_lab), -hypothesis.dex
+        hypothesis.observed,
+        hypothesis.star,
+        rotation(hypothesis.R_cam_from_lab),
+        -hypothesis.dex,
     )
 
 
@@ -200,7 +205,9 @@ def _search(
     for rank in range(len(order)):
         # 3. to 6. Test the next pair.
         a, b = order[rank]
-        best, rival_dex = _test_pair(detections, dome, a, b, ACCEPT_DEX, best, rival_dex, checks)
+        best, rival_dex = _test_pair(
+            detections, dome, a, b, ACCEPT_DEX, best, rival_dex, checks
+        )
         if best.dex >= ACCEPT_DEX:
             # 7. Search for rivals. One below `min_rival_dex` cannot matter. If that is below ACCEPT_DEX, `_test_pair`
             # has skipped such rivals so far, and the same pair is tested again.
@@ -315,7 +322,9 @@ def _disjoint_pair(pairs: NDArray, rank: int, best: LedHypothesis) -> int:
             for n in best.observed:
                 is_matched = is_matched or n == pairs[other, end]
             penalty += 3 * (not is_matched)
-            penalty += pairs[other, end] == pairs[rank, 0] or pairs[other, end] == pairs[rank, 1]
+            penalty += (
+                pairs[other, end] == pairs[rank, 0] or pairs[other, end] == pairs[rank, 1]
+            )
         if penalty < cost:
             best_rank = other
             cost = penalty
@@ -378,17 +387,26 @@ def _test_pair(
             )
             if abs(focal_ratio - 1) > detections.focal_uncertainty:
                 continue
-            direction_a = _direction_from_bearing(_ray(detections, a, focal_ratio), dome, radius[i])
-            direction_b = _direction_from_bearing(_ray(detections, b, focal_ratio), dome, radius[j])
+            direction_a = _direction_from_bearing(
+                _ray(detections, a, focal_ratio), dome, radius[i]
+            )
+            direction_b = _direction_from_bearing(
+                _ray(detections, b, focal_ratio), dome, radius[j]
+            )
             # 4b. Compare the angle. The index holds angles scaled to the median radius; here each ray meets the
             # LED's own radius.
-            if abs(vectors.chord(direction_a, direction_b) - vectors.chord(led_i, led_j)) > gate:
+            if (
+                abs(vectors.chord(direction_a, direction_b) - vectors.chord(led_i, led_j))
+                > gate
+            ):
                 continue
             # 4c. The attitude turns the axes of the LEDs into those of the detections.
             vectors.pair_frame(direction_a, direction_b, in_cam)
             vectors.pair_frame(led_i, led_j, in_lab)
             vectors.multiply_transposed(in_cam, in_lab, R_cam_from_lab)
-            vectors.multiply_transposed(dome.grid.R_grid_from_lab, R_cam_from_lab, R_grid_from_cam)
+            vectors.multiply_transposed(
+                dome.grid.R_grid_from_lab, R_cam_from_lab, R_grid_from_cam
+            )
             # 5. Quick check.
             counted = _quick_check(
                 detections, dome, R_grid_from_cam, focal_ratio, radius[i], a, b, gates, required

@@ -100,7 +100,9 @@ class FlatCentroids(NamedTuple):
 
 
 @jit
-def detections_of(lights: FlatCentroids, sensor: Sensor, focal_uncertainty: float) -> Detections:
+def detections_of(
+    lights: FlatCentroids, sensor: Sensor, focal_uncertainty: float
+) -> Detections:
     """The detections of centroids.
 
     The covariance of a position is that of its noise plus an isotropic excess, sigma_px^2 - own_px^2. Divided by the
@@ -195,4 +197,6 @@ def ray(tangent: Floats, n: int, focal_ratio: float) -> vectors.Vector:
 @jit
 def field_area(detections: Detections) -> float:
     """Area of the sensor, tangents squared."""
-    return (detections.field[1] - detections.field[0]) * (detections.field[3] - detections.field[2])
+    return (detections.field[1] - detections.field[0]) * (
+        detections.field[3] - detections.field[2]
+    )

@@ -329,7 +329,12 @@ def project(vectors_ref: Floats, R: Floats, star: int) -> tuple[float, float]:
 
 @jit
 def squared_mahalanobis(
-    detections: Detections, sky: SkyIndex, R: Floats, focal_ratio: float, detection: int, star: int
+    detections: Detections,
+    sky: SkyIndex,
+    R: Floats,
+    focal_ratio: float,
+    detection: int,
+    star: int,
 ) -> float:
     """Squared Mahalanobis distance of a detection from a star's predicted image: r^T W r, W the inverse covariance."""
     x, y = project(sky.vectors, R, star)
@@ -536,7 +541,9 @@ def _evidence(
         ratio = _magnitude_ratio(detections, sky, observed[k], star[k], fraction_brighter)
         total += log10(ratio * sqrt(xx * yy - xy * xy) / (2 * pi * density))
         if with_residuals:
-            distance2 = squared_mahalanobis(detections, sky, R, focal_ratio, observed[k], star[k])
+            distance2 = squared_mahalanobis(
+                detections, sky, R, focal_ratio, observed[k], star[k]
+            )
             total -= distance2 / 2 / log(10.0)
     return total - UNMATCHED_PENALTY_DEX * max(last + 1 - 2.0 * len(observed), 0.0)
 

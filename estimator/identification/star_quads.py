@@ -73,7 +73,9 @@ def identify(
 
 
 @jit
-def _search(detections: Detections, quads: QuadIndex, sky: SkyIndex, max_checks: int) -> Hypothesis:
+def _search(
+    detections: Detections, quads: QuadIndex, sky: SkyIndex, max_checks: int
+) -> Hypothesis:
     """Steps 1 to 6: the first hypothesis of the quads with DECISIVE_DEX, or else the empty one."""
     quad = np.empty(4, np.int64)
     checks = np.zeros(1, np.int64)
@@ -143,7 +145,9 @@ def _test_quad(
                     if not _alike(quads.code, q, code, gate):
                         continue
                     # 4. to 6. Test the attitude of this quad.
-                    candidate = _test_match(detections, sky, quad, quads.star[q], length, checks)
+                    candidate = _test_match(
+                        detections, sky, quad, quads.star[q], length, checks
+                    )
                     if candidate.dex >= star_search.DECISIVE_DEX:
                         return candidate
     return no_hypothesis()
@@ -153,7 +157,9 @@ def _test_quad(
 def _alike(codes: Floats, q: int, code: Floats, gate: float) -> bool:
     """Whether no coordinate of the code in row q of `codes` differs from `code` (4,) by more than the gate."""
     alike = True
-    for axis in range(4):  # without a temporary array, which would cost more than the comparison
+    for axis in range(
+        4
+    ):  # without a temporary array, which would cost more than the comparison
         alike = alike and abs(codes[q, axis] - code[axis]) <= gate
     return alike
 

@@ -44,7 +44,13 @@ from estimator.identification.chance import (
     separation,
     squared_separation,
 )
-from estimator.identification.star_detections import Detections, changed, field_area, gates_of, ray
+from estimator.identification.star_detections import (
+    Detections,
+    changed,
+    field_area,
+    gates_of,
+    ray,
+)
 from estimator.identification.star_evidence import (
     Hypothesis,
     Solution,
@@ -58,11 +64,15 @@ from estimator.identification.star_evidence import (
 
 DECISIVE_DEX = 10.0  # evidence at which the search stops without looking for rivals
 MARGIN_DEX = 3.0  # by which the solution must beat every other attitude
-NO_RIVAL_DEX = ACCEPT_DEX - MARGIN_DEX  # below this an attitude is neither acceptable nor a rival
+NO_RIVAL_DEX = (
+    ACCEPT_DEX - MARGIN_DEX
+)  # below this an attitude is neither acceptable nor a rival
 # Effort to find rivals of an accepted attitude: a multiple of the effort so far, plus a number of star look-ups.
 RIVAL_EFFORT = 2
 MIN_RIVAL_EFFORT = 2000
-MAG_GATE_SIGMA = 4.0  # greatest difference of magnitudes in the first round, in standard deviations
+MAG_GATE_SIGMA = (
+    4.0  # greatest difference of magnitudes in the first round, in standard deviations
+)
 # Cost of an evaluation in star look-ups. It is part of the effort, so that frames without a solution end in time.
 EVALUATION_COST = 6
 FEW = 20  # number of detections of the first search
@@ -71,7 +81,9 @@ SHORT_EFFORT = 1 / 16
 MANY_EFFORT = 1 / 4
 WRONG_FOCAL = 0.05  # greatest relative error of a calibrated focal length that step 9 can find
 WRONG_FOCAL_DEX = 2.0  # evidence by which another focal length must beat the calibrated one
-FREE_DEX = 1.0  # least gain by a free focal length, with the same matches, for which it is tried
+FREE_DEX = (
+    1.0  # least gain by a free focal length, with the same matches, for which it is tried
+)
 MAX_MISSES = 4  # detections without a star after which the first round drops a candidate
 
 
@@ -347,7 +359,9 @@ def _test_pair(
             focal_ratio = fit_focal_ratio(tangent, a, b, chord, catalog_chord)
             if abs(focal_ratio - 1) > focal_uncertainty:
                 continue
-            vectors.pair_frame(ray(tangent, a, focal_ratio), ray(tangent, b, focal_ratio), in_cam)
+            vectors.pair_frame(
+                ray(tangent, a, focal_ratio), ray(tangent, b, focal_ratio), in_cam
+            )
         elif abs(catalog_chord - chord) > gate:
             continue
         vectors.pair_frame(star_i, star_j, in_ref)
@@ -533,7 +547,11 @@ def attitude_dex(detections: Detections, a: int, b: int) -> float:
     """
     sigma = least(detections.sigma)
     direction_sigma = sqrt(2.0) * sigma / separation(detections.tangent, a, b)
-    dex = 1.5 * log10(2 * pi) + log10(sigma**2 / 2 * direction_sigma) - prior_volume_dex(detections)
+    dex = (
+        1.5 * log10(2 * pi)
+        + log10(sigma**2 / 2 * direction_sigma)
+        - prior_volume_dex(detections)
+    )
     # An uncertain focal length is as well known as the roll.
     if detections.focal_uncertainty > 0:
         dex += log10(sqrt(2 * pi) * direction_sigma)
@@ -645,7 +663,9 @@ def fit_to_all(
         chosen = changed(detections, len(detections.sigma), 1.0, 0.0)
         full = candidate if whole else evaluate(chosen, stars, R.copy(), 1.0, gates, -np.inf)
         # If all detections match there is none that another focal length could match.
-        free = len(full.star) < len(gates) or focal_gain_dex(detections, stars, full) >= FREE_DEX
+        free = (
+            len(full.star) < len(gates) or focal_gain_dex(detections, stars, full) >= FREE_DEX
+        )
     if free:
         # 9b. The fit with a free focal length.
         fitted = evaluate(detections, stars, R.copy(), candidate.focal_ratio, gates, -np.inf)

@@ -29,7 +29,13 @@ from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification import led_codes, led_naming
 from estimator.identification.led_codes import LedCode, LightTracks
 from estimator.trackers.dome_tracker import MIN_ERROR_PX, DomeTracker
-from estimator.trackers.pipeline import Clock, Report, Settings, direction_sigma_rad, process_frame
+from estimator.trackers.pipeline import (
+    Clock,
+    Report,
+    Settings,
+    direction_sigma_rad,
+    process_frame,
+)
 from estimator.trackers.star_tracker import NO_STARS
 
 COLLECTING = "codes: too few lights have been seen long enough"
@@ -159,7 +165,9 @@ class CodedTracker(DomeTracker):
         solve = partial(
             self.solve_centroids, rate=rate, exposure_s=exposure_s, t_s=t_s, frame=frame
         )
-        return process_frame(image, self.camera, self.settings, solve, streak_px, rate, exposure_s)
+        return process_frame(
+            image, self.camera, self.settings, solve, streak_px, rate, exposure_s
+        )
 
     def solve_centroids(
         self,
@@ -189,7 +197,9 @@ class CodedTracker(DomeTracker):
         # 3. to 5. Names and attitude
         return self._solve_identified(centroids, self._identify_codes(centroids), clock)
 
-    def _advance(self, centroids: Centroids, t_s: float | None, rate: RateEstimate | None) -> None:
+    def _advance(
+        self, centroids: Centroids, t_s: float | None, rate: RateEstimate | None
+    ) -> None:
         """Continue the tracks with a frame's centroids."""
         if t_s is not None:
             t_s = checks.number("t_s", t_s, -1e300, 1e300, "a finite time in seconds")

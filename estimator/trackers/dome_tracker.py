@@ -20,7 +20,14 @@ from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude import systematic
-from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, on_sphere, project
+from estimator.attitude.dome_map import (
+    LedMap,
+    Lever,
+    check_lever,
+    check_map,
+    on_sphere,
+    project,
+)
 from estimator.attitude.nearfield import SOLVERS, fit_focal_ratio, fitted_sigma_rad
 from estimator.catalog import pair_index
 from estimator.core import checks
@@ -46,7 +53,9 @@ from estimator.trackers.refinement import mutual_nearest
 from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
 from estimator.trackers.star_tracker import NO_STARS
 
-MIN_ERROR_PX = 0.3  # least centroid error of an LED, for effects outside of survey and calibration
+MIN_ERROR_PX = (
+    0.3  # least centroid error of an LED, for effects outside of survey and calibration
+)
 FOCAL_UNCERTAINTY = 0.12  # largest relative error of a focal length that is not calibrated
 FOCAL_CHECKS = 10_000_000  # largest number of checks of its search, which take a second
 MAX_FOCAL_SIGMA = 0.5  # largest focal_sigma of a `Camera`
@@ -96,7 +105,9 @@ def star_identifier(
     field_tan, _ = inner_field(points)
     reach_rad = np.arccos(np.clip((points @ points.T).min(), -1, 1))
     pairs = pair_index.build(leds.position_m / radius[:, None], reach_rad * 1.05, leds.board)
-    stretch = 2 * float(np.std(radius)) / (median_radius_m - float(np.linalg.norm(pupil_m))) + 5e-4
+    stretch = (
+        2 * float(np.std(radius)) / (median_radius_m - float(np.linalg.norm(pupil_m))) + 5e-4
+    )
 
     def identify(rays_cam: Floats, sigma_rad: Floats, flux_s: Floats | None) -> StarMatch | str:
         match = STAR_IDENTIFIERS[name](
@@ -204,7 +215,9 @@ class DomeTracker:
             Exposure time, to estimate the rate from streaks; None if unknown
         """
         solve = partial(self.solve_centroids, rate=rate, exposure_s=exposure_s)
-        return process_frame(image, self.camera, self.settings, solve, streak_px, rate, exposure_s)
+        return process_frame(
+            image, self.camera, self.settings, solve, streak_px, rate, exposure_s
+        )
 
     def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
         """Compile all that `solve` and `solve_centroids` use: call it before the experiment.
@@ -253,7 +266,11 @@ class DomeTracker:
             solve = partial(self._solve_global, clock=clock, exposure_s=exposure_s)
             return solve_rolling(self.camera, lights, centroids, solve, rate, exposure_s)
         return with_streak_rate(
-            self._solve_global(centroids, clock, exposure_s), centroids, exposure_s, rate, lights
+            self._solve_global(centroids, clock, exposure_s),
+            centroids,
+            exposure_s,
+            rate,
+            lights,
         )
 
     def _with_errors(self, centroids: Centroids, star: NDArray) -> Centroids:

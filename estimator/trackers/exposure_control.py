@@ -127,7 +127,9 @@ def step(state: NextExposure, observation: Observation, control: Control) -> Nex
     return NextExposure(time_s, saturated, no_stars)
 
 
-def observe(image: NDArray, box_px: Ints, saturation_dn: float, control: Control) -> Observation:
+def observe(
+    image: NDArray, box_px: Ints, saturation_dn: float, control: Control
+) -> Observation:
     """Measure a frame for the exposure control.
 
     Parameters
@@ -168,7 +170,9 @@ def observe(image: NDArray, box_px: Ints, saturation_dn: float, control: Control
 
 
 @jit
-def _measure(image: NDArray, box_px: Ints, saturation_dn: float, allowed: int) -> tuple[float, int]:
+def _measure(
+    image: NDArray, box_px: Ints, saturation_dn: float, allowed: int
+) -> tuple[float, int]:
     """Return the mean of the frame, and the number of boxes with more than `allowed` saturated pixels."""
     # Mean: the sum of the rows' sums
     total = 0.0

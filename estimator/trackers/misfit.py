@@ -99,7 +99,9 @@ def widened(
     dex = np.empty(len(TRIED))
     dex[0] = solution.dex
     for n in range(1, len(TRIED)):
-        wide = changed(detections, len(detections.sigma), TRIED[n], detections.focal_uncertainty)
+        wide = changed(
+            detections, len(detections.sigma), TRIED[n], detections.focal_uncertainty
+        )
         found = star_evidence.evaluate(
             wide, sky, R_cam_from_ref.copy(), ratio, gates_of(wide, 1.5), -np.inf
         )
@@ -294,7 +296,9 @@ def with_lens(
         kept = slopes[keep].reshape(-1, 5)
         count = int(keep.sum())
         normal = kept.T @ kept / variance + prior
-        step = np.linalg.solve(normal, kept.T @ residual[keep].ravel() / variance - prior @ change)
+        step = np.linalg.solve(
+            normal, kept.T @ residual[keep].ravel() / variance - prior @ change
+        )
         change[3:] += step[3:]
         cam_from_ref = Rotation.from_rotvec(step[:3]) * cam_from_ref
         lens = _lens_of(camera, *change[3:])

@@ -143,12 +143,23 @@ class Settings:
         for name, allowed in ALLOWED.items():
             value = getattr(self, name)
             value = checks.number(
-                f"settings: {name}", value, allowed.low, allowed.high, allowed.words, allowed.whole
+                f"settings: {name}",
+                value,
+                allowed.low,
+                allowed.high,
+                allowed.words,
+                allowed.whole,
             )
-            object.__setattr__(self, name, value)  # a plain float or int, which compiled code knows
+            object.__setattr__(
+                self, name, value
+            )  # a plain float or int, which compiled code knows
         if self.zero_point_mag is not None:
             zero = checks.number(
-                "settings: zero_point_mag", self.zero_point_mag, -100, 100, "-100 to 100, or None"
+                "settings: zero_point_mag",
+                self.zero_point_mag,
+                -100,
+                100,
+                "-100 to 100, or None",
             )
             object.__setattr__(self, "zero_point_mag", zero)
         if self.bad_px is not None:
@@ -224,7 +235,9 @@ def detect_and_centroid(
     if np.isfinite(settings.saturation):
         sample = image[::37]  # every 37th row is enough to estimate the saturated fraction
         if np.count_nonzero(sample >= settings.saturation) > 0.5 * sample.size:
-            raise ImageError(f"{SATURATED}: over half of its pixels are at {settings.saturation:g}")
+            raise ImageError(
+                f"{SATURATED}: over half of its pixels are at {settings.saturation:g}"
+            )
     if settings.bad_px is not None:
         image = replace_bad_pixels(image, settings.bad_px)
     # 2. Blobs
@@ -245,7 +258,9 @@ def detect_and_centroid(
     clock.lap("centroid")
     # 4. Usable centroids
     sigma_px = centroids.sigma_px
-    valid = camera.contains(centroids.xy_px) & (sigma_px > 0) & (sigma_px < MAX_CENTROID_SIGMA_PX)
+    valid = (
+        camera.contains(centroids.xy_px) & (sigma_px > 0) & (sigma_px < MAX_CENTROID_SIGMA_PX)
+    )
     valid &= (centroids.flux > 0) & (centroids.flux < np.inf)
     return centroids if valid.all() else centroids.take(valid)
 

@@ -115,7 +115,9 @@ class FieldMatcher:
                 return Attitude(f"no attitude: {error}")
         # 3. Significance
         rows, _ = self.in_field(camera, cam_from_ref)
-        chance = log10_chance(observed, len(centroids), len(rows), radius_px, camera, self.patterns)
+        chance = log10_chance(
+            observed, len(centroids), len(rows), radius_px, camera, self.patterns
+        )
         if chance > ACCEPT_LOG10_CHANCE:
             return Attitude(NO_MATCH)
         # The field, not the focal length: a distortion changes what a focal length means.
@@ -133,7 +135,9 @@ class FieldMatcher:
             covariance_rad2, camera, xy, seen_cam, sigma_rad
         )
         match = StarMatch(observed, star, cam_from_ref, chance)
-        return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2)
+        return Attitude(
+            "solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2
+        )
 
     def in_field(self, camera: Camera, cam_from_ref: Rotation) -> tuple[NDArray, Floats]:
         """Return rows and pixels of the catalog stars on the sensor, brightest first."""
@@ -183,7 +187,9 @@ class FieldMatcher:
         camera = self.camera.zoomed(solution.focal_ratio)
         cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
         xy_px = centroids.xy_px[observed]
-        residual_px = xy_px - camera.pixels(cam_from_ref.apply(self.stars.vectors[solution.star]))
+        residual_px = xy_px - camera.pixels(
+            cam_from_ref.apply(self.stars.vectors[solution.star])
+        )
         offset = (xy_px - camera.center_px) / camera.focal_px
         r2 = np.sum(offset**2, axis=1)
         q = r2 - np.sum(r2**2) / np.sum(r2)  # over r
@@ -222,7 +228,12 @@ class FieldMatcher:
 
 
 def log10_chance(
-    observed: NDArray, blobs: int, predicted: int, radius_px: float, camera: Camera, patterns: int
+    observed: NDArray,
+    blobs: int,
+    predicted: int,
+    radius_px: float,
+    camera: Camera,
+    patterns: int,
 ) -> float:
     """Return log10 of the expected number of matches this good by chance, over all patterns tried.
 

@@ -45,7 +45,9 @@ SMALL_SHEAR_PX = (
 # Factor of the slow rates' standard deviation in the prior of the fit: streaks that differ over the field are not
 # measured either.
 PRIOR_FACTOR = 4.0
-SAME_FOCAL = 2e-3  # largest relative difference of focal lengths that a rate not yet fitted causes
+SAME_FOCAL = (
+    2e-3  # largest relative difference of focal lengths that a rate not yet fitted causes
+)
 ROUNDS = 5  # largest number of fits: the matches change with the rate
 
 
@@ -144,7 +146,9 @@ def _solve_with(
         sight = _sight_of(lights, attitude, centroids)
         attitude = solve_global(at_middle_row(camera, centroids, exact, sight))
     # 4. Error of the rate
-    return _with_rate(camera, lights, centroids, attitude, fitted) if attitude.solved else attitude
+    return (
+        _with_rate(camera, lights, centroids, attitude, fitted) if attitude.solved else attitude
+    )
 
 
 def candidates(
@@ -178,7 +182,8 @@ def candidates(
     # About the boresight a streak is short near the center: at half the height it is as long for a greater rate.
     sigma = slow_rad_s * np.array([1.0, 1.0, 2 * camera.focal_px / camera.height_px])
     slow, prior = (
-        RateEstimate(np.zeros(3), np.diag((factor * sigma) ** 2)) for factor in (1, PRIOR_FACTOR)
+        RateEstimate(np.zeros(3), np.diag((factor * sigma) ** 2))
+        for factor in (1, PRIOR_FACTOR)
     )
     if shear_px > SMALL_SHEAR_PX:
         covariance = slow.covariance_rad2_s2 * (SMALL_SHEAR_PX / shear_px) ** 2
@@ -245,7 +250,8 @@ def _apart(one: RateEstimate, other: RateEstimate) -> float:
     """Return the squared Mahalanobis distance of two rates."""
     difference = one.rate_rad_s - other.rate_rad_s
     return float(
-        difference @ np.linalg.solve(one.covariance_rad2_s2 + other.covariance_rad2_s2, difference)
+        difference
+        @ np.linalg.solve(one.covariance_rad2_s2 + other.covariance_rad2_s2, difference)
     )
 
 

@@ -273,7 +273,9 @@ class StarTracker:
         solve = functools.partial(self.solve_centroids, rate=rate, exposure_s=exposure_s)
         if self.air is not None:
             solve = functools.partial(self._solve_through_air, solve, self.air, t_s)
-        return process_frame(image, self.camera, self.settings, solve, streak_px, rate, exposure_s)
+        return process_frame(
+            image, self.camera, self.settings, solve, streak_px, rate, exposure_s
+        )
 
     def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
         """Compile all that `solve` and `solve_centroids` use, and build the quads: call it before the flight.
@@ -294,7 +296,9 @@ class StarTracker:
             self.solve_centroids(Centroids(moved_px, np.full(len(xy_px), 0.1), light))
         # As many false lights as stars cause a test whether the camera model fits the field.
         xy_px = np.concatenate([xy_px, xy_px[:, ::-1]])
-        centroids = Centroids(xy_px, np.full(len(xy_px), 0.1), np.concatenate([light, light / 2]))
+        centroids = Centroids(
+            xy_px, np.full(len(xy_px), 0.1), np.concatenate([light, light / 2])
+        )
         self.solve_centroids(centroids)
         rows, _ = self.field_matcher.in_field(self.camera, cam_from_ref)
         self.solve_matches(centroids, np.arange(min(len(rows), 3)), rows[:3])
@@ -346,7 +350,9 @@ class StarTracker:
         if len(centroids) < MIN_EVIDENCE_MATCHES:
             return Attitude(NO_STARS)
         if self.camera.row_time_s:
-            lights = Lights(self.stars.vectors, np.zeros(3), lambda seen, _: self.with_errors(seen))
+            lights = Lights(
+                self.stars.vectors, np.zeros(3), lambda seen, _: self.with_errors(seen)
+            )
             solve = functools.partial(self._solve_global, clock=clock, effort=effort)
             return solve_rolling(self.camera, lights, centroids, solve, rate, exposure_s)
         return with_streak_rate(
@@ -461,14 +467,19 @@ class StarTracker:
         )
 
     def sigma_px(
-        self, centroids: Centroids, min_error_px: float = MIN_ERROR_PX, relative_error: float = 0.0
+        self,
+        centroids: Centroids,
+        min_error_px: float = MIN_ERROR_PX,
+        relative_error: float = 0.0,
     ) -> Floats:
         """Return the (N,) total centroid errors, px.
 
         They are the root of the sum of squares of the centroid's own error, a least error, and relative_error times the
         distance from the image center. The error of a calibrated focal length is the least relative_error.
         """
-        sigma_px = np.hypot(centroids.sigma_px, max(self.settings.centroid_sigma_px, min_error_px))
+        sigma_px = np.hypot(
+            centroids.sigma_px, max(self.settings.centroid_sigma_px, min_error_px)
+        )
         relative_error = max(relative_error, self.camera.focal_sigma)
         if relative_error == 0:
             return sigma_px
@@ -617,13 +628,17 @@ class StarTracker:
             )
         match = StarMatch(solution.observed, solution.star, cam_from_ref, -solution.dex)
         rms_px = solution.rms * self.camera.focal_px
-        return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2)
+        return Attitude(
+            "solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2
+        )
 
 
 def _lights(centroids: Centroids, sigma_px: Floats) -> FlatCentroids:
     """Return centroids in the form for compiled code, with their total errors (N,)."""
     spread_px2 = NO_SPREAD if centroids.covariance_px2 is None else centroids.covariance_px2
-    return FlatCentroids(centroids.xy_px, centroids.sigma_px, centroids.flux, spread_px2, sigma_px)
+    return FlatCentroids(
+        centroids.xy_px, centroids.sigma_px, centroids.flux, spread_px2, sigma_px
+    )
 
 
 def _published() -> Mapping[str, Callable[..., StarMatch | None]]:

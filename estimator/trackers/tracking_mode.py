@@ -171,10 +171,14 @@ class TrackingMode:
         if now_from_then is not None:
             checks.one_rotation("now_from_then", now_from_then)
         # 1. Prediction
-        predicted = None if self.tracker.camera.row_time_s else self._predict(t_s, now_from_then)
+        predicted = (
+            None if self.tracker.camera.row_time_s else self._predict(t_s, now_from_then)
+        )
         clock = Clock()
         # 2. and 3. Windows
-        report = self._track(image, predicted, streak_px, clock) if predicted is not None else None
+        report = (
+            self._track(image, predicted, streak_px, clock) if predicted is not None else None
+        )
         # 4. Lost in space
         if report is None:
             report = self._search(image, streak_px, clock, exposure_s)
@@ -279,7 +283,9 @@ class TrackingMode:
         # 3. Attitude
         solution = star_evidence.build_solution(detections, tracker.sky, hypothesis)
         refitted = tracker.refit(centroids, solution, sigma_px)
-        if refitted.sheared or len(refitted.solution.star) < LEAST_SHARE * len(window_centers_px):
+        if refitted.sheared or len(refitted.solution.star) < LEAST_SHARE * len(
+            window_centers_px
+        ):
             return None
         found = refitted.solution
         refitted = refitted._replace(solution=found._replace(dex=found.dex + prior_gain_dex))
@@ -298,7 +304,9 @@ class TrackingMode:
     ) -> TrackedReport:
         """Solve the whole frame lost in space."""
         tracker = self.tracker
-        centroids = detect_and_centroid(image, tracker.camera, tracker.settings, clock, streak_px)
+        centroids = detect_and_centroid(
+            image, tracker.camera, tracker.settings, clock, streak_px
+        )
         attitude = tracker.solve_centroids(centroids, clock, exposure_s=exposure_s)
         return self._report(
             attitude, centroids, tracker.sigma_px(centroids), clock, 0, False, streak_px
@@ -329,8 +337,12 @@ class TrackingMode:
         priors = FramePriors(streak_px, settings.saturation)
         # Long streaks need the streak filter: the whole frame is processed, and only the windows are used.
         if streak_px is not None and np.hypot(*streak_px) > LONGEST_STREAK_PX:
-            centroids = detect_and_centroid(image, self.tracker.camera, settings, clock, streak_px)
-            near = np.abs(centroids.xy_px[:, None] - window_centers_px).max(axis=2) < self.reach_px
+            centroids = detect_and_centroid(
+                image, self.tracker.camera, settings, clock, streak_px
+            )
+            near = (
+                np.abs(centroids.xy_px[:, None] - window_centers_px).max(axis=2) < self.reach_px
+            )
             return centroids.take(near.any(axis=1)), False
         blobs = in_windows(image, window_centers_px, self.reach_px, WINDOW_SIGMA, priors)
         blobs = blobs.take(blobs.flag & settings.reject == 0)

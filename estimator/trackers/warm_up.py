@@ -58,7 +58,9 @@ def draw(
     image = np.random.Generator(np.random.PCG64(1)).normal(
         SKY, NOISE, (camera.height_px, camera.width_px)
     )
-    steps = np.linspace(-0.5, 0.5, 1 + 2 * int(np.hypot(*streak_px)))[:, None] * np.array(streak_px)
+    steps = np.linspace(-0.5, 0.5, 1 + 2 * int(np.hypot(*streak_px)))[:, None] * np.array(
+        streak_px
+    )
     for middle_px, light in zip(xy_px, peak, strict=True):
         for x_px, y_px in middle_px + steps:
             left = max(int(x_px) - REACH_PX, 0)
@@ -96,6 +98,10 @@ def run(
         (square, (0.0, 0.0)),
         (few, None),
     ]
-    frames += [(smeared, None), (smeared, STREAK_PX), (np.ascontiguousarray(dim[:, ::-1]), None)]
+    frames += [
+        (smeared, None),
+        (smeared, STREAK_PX),
+        (np.ascontiguousarray(dim[:, ::-1]), None),
+    ]
     for image, streak_px in frames:
         look(image, streak_px)

@@ -50,7 +50,10 @@ def bloom(electrons: NDArray[Any], full_well_e: float, anti_blooming: float = 0.
 
 @jit(parallel=True)
 def _bloom(
-    electrons: NDArray[Any], columns: NDArray[np.int64], full_well_e: float, anti_blooming: float
+    electrons: NDArray[Any],
+    columns: NDArray[np.int64],
+    full_well_e: float,
+    anti_blooming: float,
 ) -> None:
     """Spread the excess of the chosen columns, in parallel."""
     height = electrons.shape[0]

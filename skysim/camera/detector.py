@@ -175,7 +175,10 @@ def expose(
     frame = np.empty(light_e.shape, np.uint16)
     # With no step between counting and read-out, one fused loop does both, with the same numbers.
     if not (
-        config.particles or config.blooming == "column" or config.cti_parallel or config.cti_serial
+        config.particles
+        or config.blooming == "column"
+        or config.cti_parallel
+        or config.cti_serial
     ):
         _count_and_read(
             light_e,
@@ -193,7 +196,9 @@ def expose(
     # 3. Particles.
     if config.particles:
         with added.watch(PARTICLES, light_e) if added else nullcontext():
-            cosmic_rays.add_particles(light_e, exposure_s, detector.pixel_m, config.particles, rng)
+            cosmic_rays.add_particles(
+                light_e, exposure_s, detector.pixel_m, config.particles, rng
+            )
     # 4. Full well.
     if config.blooming == "column":
         charge_transfer.bloom(light_e, config.full_well_e, config.anti_blooming)
@@ -237,7 +242,9 @@ def smear(
         if isinstance(shutter, FrameTransferConfig):
             charge_transfer.frame_transfer_smear(light_e, exposure_s, shutter.row_time_s)
         else:
-            charge_transfer.interline_smear(light_e, exposure_s, shutter.row_time_s, shutter.leak)
+            charge_transfer.interline_smear(
+                light_e, exposure_s, shutter.row_time_s, shutter.leak
+            )
 
 
 class ReadoutConstants(NamedTuple):
@@ -329,7 +336,9 @@ def _count(
     for block in numba.prange((height + ROWS - 1) // ROWS):
         memory = noise.scratch(width)
         for y in range(block * ROWS, min((block + 1) * ROWS, height)):
-            _count_row(light_e[y], sensitivity[y], dark_e_s[y], constants, seeds[y], guide, memory)
+            _count_row(
+                light_e[y], sensitivity[y], dark_e_s[y], constants, seeds[y], guide, memory
+            )
 
 
 @jit(parallel=True)
@@ -365,7 +374,13 @@ def _count_and_read(
         memory = noise.scratch(width)
         for y in range(block * ROWS, min((block + 1) * ROWS, height)):
             _count_row(
-                light_e[y], sensitivity[y], dark_e_s[y], constants, count_seeds[y], guide, memory
+                light_e[y],
+                sensitivity[y],
+                dark_e_s[y],
+                constants,
+                count_seeds[y],
+                guide,
+                memory,
             )
             _read_row(light_e[y], offset_e, constants, read_seeds[y], memory, frame[y])
 
@@ -408,6 +423,10 @@ def add_snr_and_saturation(
     # The relative nonlinearity is held at its value at full well, since beyond it the parabola turns down.
     is_saturated = read_e / config.gain_e_dn + config.offset_dn >= saturation_dn(config)
     # Read noise and rounding; background is what the source itself does not give.
-    noise_e = np.sqrt(config.read_noise_e**2 + config.reset_noise_e**2 + config.gain_e_dn**2 / 12)
-    sources_snr = snr(sources.electrons, sources.area_px, np.maximum(mean_e - own_e, 0), noise_e)
+    noise_e = np.sqrt(
+        config.read_noise_e**2 + config.reset_noise_e**2 + config.gain_e_dn**2 / 12
+    )
+    sources_snr = snr(
+        sources.electrons, sources.area_px, np.maximum(mean_e - own_e, 0), noise_e
+    )
     return replace(sources, saturated=is_saturated, snr=sources_snr)

@@ -118,7 +118,9 @@ def sharing_weights(subsamples: int) -> Floats:
     """
     # The triangle's weights at the points before, at and after the sample's own.
     offset = (np.arange(subsamples) + 0.5) / subsamples - 0.5
-    linear = np.stack([np.maximum(-offset, 0), 1 - np.abs(offset), np.maximum(offset, 0)], axis=1)
+    linear = np.stack(
+        [np.maximum(-offset, 0), 1 - np.abs(offset), np.maximum(offset, 0)], axis=1
+    )
     # 1 + D / 12 + D^2 / 90 as weights of the points -2 to 2.
     second = np.array([-1.0, 2.0, -1.0])
     undone = np.convolve(second, second) / 90
@@ -336,7 +338,9 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> Displace
     width, height = (high - low + 1).tolist()
     # The patches stand side by side in one strip, which `draw` takes for a chip.
     strip = np.zeros((height, len(points) * width))
-    moved = xy_px - low + width * np.column_stack([np.arange(len(points)), np.zeros(len(points))])
+    moved = (
+        xy_px - low + width * np.column_stack([np.arange(len(points)), np.zeros(len(points))])
+    )
     # The strip's first row is the chip's row low[1], which a rolling shutter exposes later.
     window = exposed.window._replace(
         open_s=exposed.window.open_s + low[1] * exposed.window.row_time_s
@@ -548,7 +552,9 @@ def whole(
     columns = own_e.sum(axis=0, dtype=float)
     rows = own_e.sum(axis=1, dtype=float)
     # Center of gravity (sum e x, sum e y) / sum e.
-    center = np.array([columns @ np.arange(len(columns)), rows @ np.arange(len(rows))]) / electrons
+    center = (
+        np.array([columns @ np.arange(len(columns)), rows @ np.arange(len(rows))]) / electrons
+    )
     return SourceTruth(
         id=np.array([body.id]),
         xy_px=center_px[None],

@@ -135,7 +135,9 @@ def _guide() -> Any:
                 p_high = p_high * high / n
                 f_low = f_low + p_low
                 f_high = f_high + p_high
-            guide[k, b] = n if b / BUCKETS >= below and (b + 1) / BUCKETS <= f_high else AMBIGUOUS
+            guide[k, b] = (
+                n if b / BUCKETS >= below and (b + 1) / BUCKETS <= f_high else AMBIGUOUS
+            )
     return guide
 
 
@@ -205,7 +207,9 @@ def count(row: Any, state: Any, guide: Any, memory: Scratch) -> Any:
         else:
             more, state = _uniform(state)
             found[x] = uint8(
-                _invert(float64(row[x]), (float64(int64(words[x] >> uint16(6))) + more) / BUCKETS)
+                _invert(
+                    float64(row[x]), (float64(int64(words[x] >> uint16(6))) + more) / BUCKETS
+                )
             )
     # 4. Counts back to the row; the loop without large means has no branch.
     if large == 0:
@@ -438,7 +442,9 @@ def _direction(word: Any) -> Any:
     x = (float32(2.443315711809948e-5) * z - float32(1.388731625493765e-3)) * z + float32(
         4.166664568298827e-2
     )
-    y = (float32(-1.9515295891e-4) * z + float32(8.3321608736e-3)) * z - float32(1.6666654611e-1)
+    y = (float32(-1.9515295891e-4) * z + float32(8.3321608736e-3)) * z - float32(
+        1.6666654611e-1
+    )
     x = x * z * z - float32(0.5) * z + float32(1)
     y = y * z * angle + angle
     # The quadrant: a turn by a quarter swaps the two, half a turn changes both signs.

@@ -22,7 +22,9 @@ def two_stops(config: TwoStopsConfig, field_rad: Floats) -> Floats:
     against the other by u diameters.
     """
     # 1.57 is just below pi / 2, where the tangent overflows.
-    u = np.clip(np.tan(np.minimum(field_rad, 1.57)) / np.tan(np.radians(config.cutoff_deg)), 0, 1)
+    u = np.clip(
+        np.tan(np.minimum(field_rad, 1.57)) / np.tan(np.radians(config.cutoff_deg)), 0, 1
+    )
     return np.asarray(2 / np.pi * (np.arccos(u) - u * np.sqrt(1 - u**2)))
 
 
@@ -31,7 +33,10 @@ def table(config: VignettingTableConfig, field_rad: Floats) -> Floats:
     return np.interp(np.degrees(field_rad), config.angle_deg, config.transmission)
 
 
-VIGNETTING: dict[str, Callable[[Any, Floats], Floats]] = {"two_stops": two_stops, "table": table}
+VIGNETTING: dict[str, Callable[[Any, Floats], Floats]] = {
+    "two_stops": two_stops,
+    "table": table,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +69,9 @@ class Optics:
         # Collecting area of the round pupil.
         area_m2 = np.pi / 4 * camera.pupil_m**2
         fold = fold_r(camera.distortion)
-        return cls(camera, float(area_m2 * camera.gray_transmission), fold, field_rad(camera, fold))
+        return cls(
+            camera, float(area_m2 * camera.gray_transmission), fold, field_rad(camera, fold)
+        )
 
     def project(self, vectors_cam: Floats) -> Floats:
         """Project (..., 3) vectors in camera axes to (..., 2) pixels; NaN behind the camera and beyond the fold.
@@ -153,5 +160,7 @@ def fold_r(distortion: tuple[float, ...]) -> float:
     # A polynomial in 1 / r^2, whose leading coefficient is never 0; its largest real root is the least r.
     roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
     # Real positive roots, up to rounding.
-    extrema = roots.real[(abs(roots.imag) < 1e-9 * (1 + abs(roots.real))) & (roots.real > 1e-12)]
+    extrema = roots.real[
+        (abs(roots.imag) < 1e-9 * (1 + abs(roots.real))) & (roots.real > 1e-12)
+    ]
     return float(1 / np.sqrt(extrema.max())) if len(extrema) else float("inf")

@@ -406,7 +406,12 @@ def _directions_each(
         b = ends[k + 1]
         # One pose for the sources a to b.
         own = _directions(
-            place[a:b], motion, after_s, normal[a:b], cam_from_lab[k : k + 1], camera_m[k : k + 1]
+            place[a:b],
+            motion,
+            after_s,
+            normal[a:b],
+            cam_from_lab[k : k + 1],
+            camera_m[k : k + 1],
         )
         for n in range(a, b):
             distance[n] = own[1][0, n - a]
@@ -618,7 +623,18 @@ def _expose_source(
         delay_s = (y0 + j) * window.row_time_s
         begin_s = window.open_s + delay_s
         sums = _integrate(
-            patch, j, j + rows, x0, y0, n, tracks, kernels, table, step_px, begin_s, end_s + delay_s
+            patch,
+            j,
+            j + rows,
+            x0,
+            y0,
+            n,
+            tracks,
+            kernels,
+            table,
+            step_px,
+            begin_s,
+            end_s + delay_s,
         )
     # Mean position: of the light itself where all rows share one interval, without the chip's cut.
     if rolling:
@@ -734,7 +750,9 @@ def _splat_point(
             patch, row0, row1, x + kernels.disk[n, 0], y + kernels.disk[n, 1], electrons, table
         )
     else:
-        add_grid(patch, row0, row1, x, y, electrons, kernels.tables[begin:end].reshape(p, p, q, q))
+        add_grid(
+            patch, row0, row1, x, y, electrons, kernels.tables[begin:end].reshape(p, p, q, q)
+        )
 
 
 @jit
@@ -765,7 +783,9 @@ def _interpolate(tracks: Tracks, n: int, t_s: float) -> Any:
 def _speed(tracks: Tracks, n: int, begin_s: float, end_s: float) -> float:
     """The greatest speed of a source's image between two times, px/s, by differences of samples."""
     first = max(int((begin_s - tracks.first_s) / tracks.step_s), 0)
-    last = min(int(np.ceil((end_s - tracks.first_s) / tracks.step_s)), tracks.xy_px.shape[0] - 1)
+    last = min(
+        int(np.ceil((end_s - tracks.first_s) / tracks.step_s)), tracks.xy_px.shape[0] - 1
+    )
     fastest = 0.0
     for k in range(first, last):
         dx = tracks.xy_px[k + 1, n, 0] - tracks.xy_px[k, n, 0]

@@ -56,7 +56,9 @@ TEMPERATURES: dict[str, Callable[[Any, float], float]] = {
 
 def temperature_c(config: ThermalConfig, t_s: float) -> float:
     """The temperature in deg C at a time since the scene's start; `speed` hastens its clock."""
-    return TEMPERATURES[config.temperature.kind](config.temperature, t_s * config.speed / HOUR_S)
+    return TEMPERATURES[config.temperature.kind](
+        config.temperature, t_s * config.speed / HOUR_S
+    )
 
 
 def turned(config: ThermalConfig, t_s: float) -> Rotation:
@@ -73,7 +75,9 @@ def leds_at(config: ThermalConfig, leds: Sources, t_s: float) -> Sources:
     difference_k = temperature_c(config, t_s) - config.reference_c
     anchor_m = np.array([0.0, 0.0, config.anchor_height_m])
     place = leds.place.copy()
-    moved_m = PPM * config.dome_ppm_k * difference_k * (place[:, :3] - anchor_m) + config.creep_m
+    moved_m = (
+        PPM * config.dome_ppm_k * difference_k * (place[:, :3] - anchor_m) + config.creep_m
+    )
     # Stars have w = 0 and stay.
     place[:, :3] += place[:, 3:] * moved_m
     return replace(leds, place=place)

@@ -23,7 +23,9 @@ ARCSEC_RAD = math.pi / 180 / 3600
 MAS_RAD = math.pi / 180 / 3.6e6
 ARCSEC_DEG = 1 / 3600
 ARCSEC2_SR = ARCSEC_RAD**2
-GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))  # between successive azimuths of a Fibonacci spiral
+GOLDEN_ANGLE_RAD = math.pi * (
+    3 - math.sqrt(5)
+)  # between successive azimuths of a Fibonacci spiral
 INCH_M = 0.0254  # exact: international yard and pound agreement, 1959
 PPM = 1e-6
 

@@ -84,7 +84,9 @@ class Tiff:
             begin = at + head + n * size
             tag = self.number("H", begin)
             kind = self.number("H", begin + 2)
-            yield TiffEntry(tag, kind, self.number("Q" if big else "I", begin + 4), begin + value)
+            yield TiffEntry(
+                tag, kind, self.number("Q" if big else "I", begin + 4), begin + value
+            )
 
     def value(self, entry: TiffEntry) -> int | None:
         """The first value of an entry, if it is an integer in the entry itself; else None."""
@@ -161,7 +163,9 @@ def check_pixels(path: Path, *sides: int, each_bytes: int = 1) -> None:
         raise InputError(path, f"{size} pixels by its header", f"up to {MAX_PIXELS}")
     if (size_bytes := prod(sides) * each_bytes) > MAX_BYTES:
         raise InputError(
-            path, f"{size} pixels of {size_bytes} bytes by its header", f"up to {MAX_BYTES} bytes"
+            path,
+            f"{size} pixels of {size_bytes} bytes by its header",
+            f"up to {MAX_BYTES} bytes",
         )
 
 
@@ -282,7 +286,9 @@ def opened_by_pillow(data: bytes) -> Iterator[Any]:
 
     # Image.open has its own limit of size, so its class is used.
     plugin = (
-        BmpImagePlugin.BmpImageFile if data.startswith(BMP_MAGIC) else JpegImagePlugin.JpegImageFile
+        BmpImagePlugin.BmpImageFile
+        if data.startswith(BMP_MAGIC)
+        else JpegImagePlugin.JpegImageFile
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of damaged EXIF

@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 
-HOST = f"{zlib.crc32(platform.node().encode()):08x}"  # distinguishes machines that share a folder
+HOST = (
+    f"{zlib.crc32(platform.node().encode()):08x}"  # distinguishes machines that share a folder
+)
 
 TEMPORARY_NAME = re.compile(rf"\..+\.skysim-{HOST}-(\d{{1,9}})(\.\w+)?")
 
@@ -85,7 +87,9 @@ def name_in_errors(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         # Some libraries report a full disk in the text only.
-        full = error.errno in (None, errno.ENOSPC, errno.EDQUOT) and "space" in str(error).lower()
+        full = (
+            error.errno in (None, errno.ENOSPC, errno.EDQUOT) and "space" in str(error).lower()
+        )
         number = errno.ENOSPC if full else error.errno
         if number is None:
             raise
@@ -180,7 +184,9 @@ def read_table(path: Path) -> Any:
         return Table.read(path, format="ascii.ecsv")
     except Exception as error:
         # astropy's parsers raise many types of exception for a file that is not ECSV.
-        raise InputError(path, f"not an ECSV table: {' '.join(str(error).split())[:120]}") from None
+        raise InputError(
+            path, f"not an ECSV table: {' '.join(str(error).split())[:120]}"
+        ) from None
 
 
 def header_numbers(path: Path, meta: dict[str, Any], key: str, count: int) -> list[float]:
@@ -195,7 +201,9 @@ def header_numbers(path: Path, meta: dict[str, Any], key: str, count: int) -> li
     positive = key in ("size_px", "focal_px")
     valid = numbers.shape == (count,) and np.isfinite(numbers).all()
     if not valid or (positive and numbers.min() <= 0):
-        what = f"{count} finite number{'s' if count > 1 else ''}{' above 0' if positive else ''}"
+        what = (
+            f"{count} finite number{'s' if count > 1 else ''}{' above 0' if positive else ''}"
+        )
         raise InputError(path, f"{key} in the header is {meta.get(key)!r}", what)
     return [float(number) for number in numbers]
 

@@ -37,9 +37,7 @@ from skysim.core.guarded import run_guarded
 SUFFIXES = tuple(
     f"{suffix}{packed}" for packed in ("", ".gz", ".fz") for suffix in (".fits", ".fit", ".fts")
 )
-MAGIC = (
-    b"SIMPLE  ="  # start of every FITS file; a compressed one differs, which astropy would unpack
-)
+MAGIC = b"SIMPLE  ="  # start of every FITS file; a compressed one differs, which astropy would unpack
 GZIP_BLOCK = 1 << 20  # bytes unpacked at a time
 MAX_HDUS = 1000  # that are searched for an image
 # a line of a header, and their greatest number
@@ -101,7 +99,9 @@ def read_fits_image(path: Path) -> FitsImage:
                 if hdu.header.get("ZIMAGE"):
                     pixels = decode_tiles(path, file, number)
                 elif getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0) > 0:
-                    pixels = np.ascontiguousarray(hdu.data.astype(hdu.data.dtype.newbyteorder("=")))
+                    pixels = np.ascontiguousarray(
+                        hdu.data.astype(hdu.data.dtype.newbyteorder("="))
+                    )
                 else:
                     place = hdu.fileinfo()
                     # The next one, before it is opened.
@@ -200,7 +200,9 @@ def decode_tiles(path: Path, file: BinaryIO, number: int) -> NDArray:
         out = Path(folder) / "pixels.npy"
         script = Path(__file__).with_name("fits_tiles.py")
         arguments = file.name, str(number), str(out)
-        if fault := run_guarded(script, *arguments, cpu_s=TILES_CPU_S, memory_bytes=TILES_BYTES):
+        if fault := run_guarded(
+            script, *arguments, cpu_s=TILES_CPU_S, memory_bytes=TILES_BYTES
+        ):
             raise InputError(path, f"not a complete FITS file: {fault}")
         return np.asarray(np.load(out))
 
@@ -325,7 +327,9 @@ def read_image(path: Path) -> NDArray:
 def image_suffix(name: str) -> str:
     """The suffix of an image file's name, in small letters: the longest known one; empty if there is none."""
     return max(
-        (suffix for suffix in IMAGE_SUFFIXES if name.lower().endswith(suffix)), key=len, default=""
+        (suffix for suffix in IMAGE_SUFFIXES if name.lower().endswith(suffix)),
+        key=len,
+        default="",
     )
 
 
@@ -356,7 +360,9 @@ def monochrome(image: NDArray) -> NDArray:
         return image
     if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
         raise InputError(
-            "", f"an image of shape {image.shape}", "(height, width) and color with 3 or 4 channels"
+            "",
+            f"an image of shape {image.shape}",
+            "(height, width) and color with 3 or 4 channels",
         )
     if image.shape[2] == 1:
         return np.ascontiguousarray(image[:, :, 0])

@@ -15,7 +15,9 @@ from skysim.core import errors
 
 # No wrapper for C callbacks is compiled, since no compiled function is passed as a value.
 # Division by zero gives inf or nan, as in NumPy; sums are not reordered unless a function sets fastmath itself.
-jit = partial(numba.njit, cache=True, error_model="numpy", fastmath=False, no_cfunc_wrapper=True)
+jit = partial(
+    numba.njit, cache=True, error_model="numpy", fastmath=False, no_cfunc_wrapper=True
+)
 
 
 class CompilationNotice(event.Listener):

@@ -144,7 +144,9 @@ class RunningProcess:
         until_s = time.monotonic() + grace_s
         # WNOWAIT leaves the process unreaped, so its id cannot be reused and killpg hits only this group.
         flags = os.WEXITED | os.WNOWAIT | os.WNOHANG
-        while time.monotonic() < until_s and os.waitid(os.P_PID, self.process.pid, flags) is None:
+        while (
+            time.monotonic() < until_s and os.waitid(os.P_PID, self.process.pid, flags) is None
+        ):
             time.sleep(0.005)
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self.process.pid, signal.SIGKILL)
@@ -226,7 +228,9 @@ class Program:
         except OSError as error:
             if folder:
                 shutil.rmtree(folder, ignore_errors=True)
-            raise ProgramError(f"{arguments[0]!r} cannot be started: {error.strerror}") from None
+            raise ProgramError(
+                f"{arguments[0]!r} cannot be started: {error.strerror}"
+            ) from None
         running = RunningProcess(process, folder)
         self.running = running
         self.received = bytearray()
@@ -273,7 +277,9 @@ class Program:
                     raise self.fail(f"no answer within {limit_s:g} s", 0.0)
                 if process.stdin in ready and unsent:
                     try:
-                        unsent = unsent[os.write(process.stdin.fileno(), unsent[:CHUNK_BYTES]) :]
+                        unsent = unsent[
+                            os.write(process.stdin.fileno(), unsent[:CHUNK_BYTES]) :
+                        ]
                     except BrokenPipeError:
                         unsent = unsent[:0]
                     if not unsent:

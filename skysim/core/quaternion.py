@@ -105,7 +105,12 @@ def from_rotvec(rotvec_rad: Floats) -> Floats:
     # sin(a / 2) / a tends to 1 / 2.
     scale = math.sin(angle / 2) / angle if angle > 1e-9 else 0.5
     return np.array(
-        [math.cos(angle / 2), scale * rotvec_rad[0], scale * rotvec_rad[1], scale * rotvec_rad[2]]
+        [
+            math.cos(angle / 2),
+            scale * rotvec_rad[0],
+            scale * rotvec_rad[1],
+            scale * rotvec_rad[2],
+        ]
     )
 
 

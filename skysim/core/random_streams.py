@@ -17,9 +17,7 @@ AIR_CURRENT = 4
 LED_CLOCKS = 5
 CAMERA_TIMING = 6
 SCINTILLATION = 10
-BALANCE = (
-    15  # assumptions about a vehicle; the second number is 0, or 1 for the readings of wheel speeds
-)
+BALANCE = 15  # assumptions about a vehicle; the second number is 0, or 1 for the readings of wheel speeds
 LED_CODE = 12  # the second number is the bit
 LED_CODE_CLOCK = 13
 VARIABLE_STARS = 11  # under `light.variability_seed`

@@ -20,7 +20,9 @@ from skysim.core.types import Floats
 
 MAX_BYTES = 200_000_000  # of a file: a million lines of 200 characters
 MAX_EXCERPT = 40  # number of characters of a value in a message
-EPOCH = re.compile(r"(?:19|20|21)\d\d-(\d\d-\d\d|\d{3})[T ]\d\d:\d\d:\d\d(\.\d{0,15})?Z?", re.ASCII)
+EPOCH = re.compile(
+    r"(?:19|20|21)\d\d-(\d\d-\d\d|\d{3})[T ]\d\d:\d\d:\d\d(\.\d{0,15})?Z?", re.ASCII
+)
 
 Line = tuple[int, str]  # number, from 1, and content
 
@@ -68,7 +70,9 @@ def check_numbers(where: Where, words: Sequence[str]) -> None:
         try:
             number = float(word)
         except ValueError:
-            raise InputError(where.file, f"{excerpt(word)} is not a number", where=where) from None
+            raise InputError(
+                where.file, f"{excerpt(word)} is not a number", where=where
+            ) from None
         if not np.isfinite(number):
             raise InputError(where.file, f"{excerpt(word)} is not a finite number", where=where)
 
@@ -91,7 +95,9 @@ def seconds_since(
     # 1. The form of the texts, which must be the same for all.
     bad = [n for n, epoch in enumerate(epochs) if not EPOCH.fullmatch(epoch)]
     bad += [
-        n for n, epoch in enumerate(epochs) if len(epoch.split("-")) != len(epochs[0].split("-"))
+        n
+        for n, epoch in enumerate(epochs)
+        if len(epoch.split("-")) != len(epochs[0].split("-"))
     ]
     if bad:
         raise InputError(
@@ -108,7 +114,9 @@ def seconds_since(
     if ordinal:
         texts = [text.replace("-", ":", 1).replace("T", ":", 1) for text in texts]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # "dubious year": leap seconds of the future are unknown
+        warnings.simplefilter(
+            "ignore"
+        )  # "dubious year": leap seconds of the future are unknown
         try:
             times = Time(texts, format=kind, scale=scale).utc
         except ValueError:
@@ -211,7 +219,9 @@ def check_version(path: str | Path, keyword: str, version: str, allowed: Sequenc
         raise InputError(path, f"{keyword} is {excerpt(version)}", ", ".join(allowed))
 
 
-def one_of(path: str | Path, metadata: dict[str, Line], key: str, allowed: Iterable[str]) -> str:
+def one_of(
+    path: str | Path, metadata: dict[str, Line], key: str, allowed: Iterable[str]
+) -> str:
     """The value of a keyword in capitals. Raises InputError if it is not allowed."""
     line, value = metadata[key]
     names = list(allowed)

@@ -30,7 +30,11 @@ SCALES = {"UTC": "utc", "TAI": "tai", "TT": "tt", "TDB": "tdb", "GPS": "tai"}
 
 def in_utc(moment: datetime.datetime) -> datetime.datetime:
     """The moment in UTC, without a time zone; a datetime without a time zone is in UTC."""
-    return moment if moment.tzinfo is None else moment.astimezone(datetime.UTC).replace(tzinfo=None)
+    return (
+        moment
+        if moment.tzinfo is None
+        else moment.astimezone(datetime.UTC).replace(tzinfo=None)
+    )
 
 
 def check_year(value: datetime.datetime) -> datetime.datetime:

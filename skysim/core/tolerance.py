@@ -89,7 +89,11 @@ def scaled_errors(sigma: float, normal: Floats) -> Floats:
 
     A tolerance instead of a sigma does not change the random streams.
     """
-    return sigma.from_normal(normal) if isinstance(sigma, Tolerance) else np.asarray(sigma * normal)
+    return (
+        sigma.from_normal(normal)
+        if isinstance(sigma, Tolerance)
+        else np.asarray(sigma * normal)
+    )
 
 
 class ToleranceConfig(ConfigModel):
@@ -119,17 +123,27 @@ class ToleranceConfig(ConfigModel):
         half_width, sigma = self.numbers()
         if half_width is None and (sigma is None or self.distribution not in (None, "normal")):
             raise InputError(
-                "", f"{self.distribution or 'an error'} requires a tolerance", "tolerance, or sigma"
+                "",
+                f"{self.distribution or 'an error'} requires a tolerance",
+                "tolerance, or sigma",
             )
         if half_width is not None and self.distribution == "normal":
             raise InputError(
                 "tolerance", "a normal distribution has none", "uniform, truncated_normal"
             )
-        if half_width is not None and sigma is not None and self.distribution != "truncated_normal":
+        if (
+            half_width is not None
+            and sigma is not None
+            and self.distribution != "truncated_normal"
+        ):
             raise InputError(
                 "sigma", "a uniform distribution has none", "distribution: truncated_normal"
             )
-        if half_width is not None and sigma is not None and not 0.01 <= half_width / sigma <= 100:
+        if (
+            half_width is not None
+            and sigma is not None
+            and not 0.01 <= half_width / sigma <= 100
+        ):
             raise InputError("sigma", "", "a hundredth to a hundred times the tolerance")
         return self
 
@@ -218,16 +232,21 @@ class ErrorSchema:
     def __get_pydantic_core_schema__(
         self, _source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
-        tag = self.section.__name__  # an error names the keys of the section only if there is one
+        tag = (
+            self.section.__name__
+        )  # an error names the keys of the section only if there is one
         kinds = {
             "quantity": handler.generate_schema(self.quantity),
             tag: handler.generate_schema(self.section),
         }
         chosen = core_schema.tagged_union_schema(
-            kinds, lambda value: tag if isinstance(value, dict | ToleranceConfig) else "quantity"
+            kinds,
+            lambda value: tag if isinstance(value, dict | ToleranceConfig) else "quantity",
         )
         dumped = core_schema.plain_serializer_function_ser_schema(in_file)
-        return core_schema.no_info_after_validator_function(error_of, chosen, serialization=dumped)
+        return core_schema.no_info_after_validator_function(
+            error_of, chosen, serialization=dumped
+        )
 
 
 LengthError = Annotated[float, ErrorSchema(Length, LengthToleranceConfig), Field(ge=0)]

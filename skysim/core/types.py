@@ -73,7 +73,10 @@ class Trajectory:
         if self.t_s[0] <= begin_s:
             return self
         before = Trajectory.at_rate(
-            self.lab_from_body[0], self.rate_body_rad_s[0], float(self.t_s[0]), np.array([begin_s])
+            self.lab_from_body[0],
+            self.rate_body_rad_s[0],
+            float(self.t_s[0]),
+            np.array([begin_s]),
         )
         return Trajectory(
             np.concatenate([before.t_s, self.t_s]),
@@ -276,7 +279,9 @@ class StarSources(Sources):
             math.cos(min(from_pole + angle_rad, math.pi)),
             math.cos(max(from_pole - angle_rad, 0.0)),
         )
-        first, last = np.searchsorted(sorted_place[:, 2], (ends[0] - ROUNDING, ends[1] + ROUNDING))
+        first, last = np.searchsorted(
+            sorted_place[:, 2], (ends[0] - ROUNDING, ends[1] + ROUNDING)
+        )
         # An angle a is a chord 2 sin(a / 2) of the unit sphere.
         chord = 2.0 * math.sin(min(angle_rad, math.pi) / 2.0)
         near = _closer(sorted_place[first:last], np.asarray(direction), chord)

@@ -138,7 +138,9 @@ Torque = Annotated[Number, with_unit("N m", "torque", '"0.5 N m"')]
 Force = Annotated[Number, with_unit("N", "force", '"0.5 N"')]
 Momentum = Annotated[Number, with_unit("N m s", "angular momentum", '"2 N m s"')]
 Damping = Annotated[Number, with_unit("N m s", "torque per rate", '"1e-4 N m s"')]
-QuadraticDrag = Annotated[Number, with_unit("N m s2", "torque per squared rate", '"0.01 N m s2"')]
+QuadraticDrag = Annotated[
+    Number, with_unit("N m s2", "torque per squared rate", '"0.01 N m s2"')
+]
 Stiffness = Annotated[Number, with_unit("N m rad-1", "torque per angle", '"1e-3 N m / rad"')]
 Imbalance = Annotated[Number, with_unit("kg m", "mass times offset", '"1 g cm"')]
 SemiAxis = Annotated[Length, Field(gt=0)]
@@ -170,7 +172,9 @@ def quantities_within(
         One text for each quantity, in the same order
     """
     values = []
-    for text, (name, (unit, what, example, low, high)) in zip(texts, ranges.items(), strict=True):
+    for text, (name, (unit, what, example, low, high)) in zip(
+        texts, ranges.items(), strict=True
+    ):
         key = f"{section}.{name}"
         try:
             value = quantity(unit, what, example)(text)

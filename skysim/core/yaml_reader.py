@@ -61,7 +61,9 @@ class StrictLoader(yaml.SafeLoader):
         self.depth -= 1
         # An alias of a node that is not yet complete is part of that node: it is recursive.
         if aliased and id(node) not in self.size:
-            raise yaml.composer.ComposerError(None, None, "an alias within its own anchor", mark)
+            raise yaml.composer.ComposerError(
+                None, None, "an alias within its own anchor", mark
+            )
         self.nodes += self.size[id(node)] if aliased else 1
         self.size[id(node)] = self.nodes - before
         if self.nodes > MAX_NODES:
@@ -73,13 +75,15 @@ class StrictLoader(yaml.SafeLoader):
         try:
             return super().construct_object(node, deep)
         except (ValueError, TypeError, LookupError, OverflowError, AttributeError) as error:
-            problem = (
-                f"{str(node.value)[:40]!r} is not a valid {node.tag.rpartition(':')[2]} ({error})"
-            )
-            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
+            problem = f"{str(node.value)[:40]!r} is not a valid {node.tag.rpartition(':')[2]} ({error})"
+            raise yaml.constructor.ConstructorError(
+                None, None, problem, node.start_mark
+            ) from None
 
 
-def parse_yaml(text: str, kind: type[StrictLoader] = StrictLoader) -> tuple[yaml.Node | None, Any]:
+def parse_yaml(
+    text: str, kind: type[StrictLoader] = StrictLoader
+) -> tuple[yaml.Node | None, Any]:
     """The node tree of a YAML document, and its value. Raises YAMLError."""
     loader = kind(text)
     try:
@@ -109,7 +113,9 @@ def is_file(path: Path) -> bool:
 def existing_file(value: str) -> str:
     """The path of a file, as the validator of a key. Raises InputError if there is no such file."""
     if not is_file(Path(value)):
-        raise InputError("", f"{value!r} is not a file", "a path, or a file in the scene's folder")
+        raise InputError(
+            "", f"{value!r} is not a file", "a path, or a file in the scene's folder"
+        )
     return value
 
 
@@ -125,7 +131,9 @@ def find_file(name: str, folder: Path, what: str) -> Path:
     if is_file(near):
         raise InputError(excerpt(name), f"no such {what}; did you mean {excerpt(near)}?")
     names = sorted(file.stem for file in folder.glob("*.yaml"))
-    raise InputError(excerpt(name), f"no such {what}", f"a .yaml file or one of {', '.join(names)}")
+    raise InputError(
+        excerpt(name), f"no such {what}", f"a .yaml file or one of {', '.join(names)}"
+    )
 
 
 def excerpt(value: object) -> str:
@@ -196,7 +204,9 @@ def reject_duplicate_keys(node: yaml.Node | None, path: Path) -> None:
 def check_version(tree: Mapping[str, Any], path: Path, text: str) -> None:
     """Raise InputError for a file of another schema version, so that its keys are not reported as unknown."""
     if "schema" not in tree:
-        raise InputError("schema", f"missing; add the line schema: {VERSION}", where=Where(path))
+        raise InputError(
+            "schema", f"missing; add the line schema: {VERSION}", where=Where(path)
+        )
     version = tree["schema"]
     if type(version) is int and version == VERSION:
         return
@@ -215,7 +225,9 @@ def set_key(tree: dict[str, Any], key: str, value: str) -> None:
     """
     *parents, last = key.split(".")
     if not all((*parents, last)):
-        raise InputError(OVERRIDES.file, f"{excerpt(key)}={excerpt(value)}", "path.to.key=value")
+        raise InputError(
+            OVERRIDES.file, f"{excerpt(key)}={excerpt(value)}", "path.to.key=value"
+        )
     node: Any = tree
     for depth, parent in enumerate(parents):
         if isinstance(node, dict):
@@ -223,9 +235,13 @@ def set_key(tree: dict[str, Any], key: str, value: str) -> None:
         node = node[parent if isinstance(node, dict) else list_index(node, parent, key)]
         if not isinstance(node, dict | list):
             section = excerpt(".".join(parents[: depth + 1]))
-            raise InputError(excerpt(key), f"{section} holds a value, not keys", where=OVERRIDES)
+            raise InputError(
+                excerpt(key), f"{section} holds a value, not keys", where=OVERRIDES
+            )
     try:
-        node[last if isinstance(node, dict) else list_index(node, last, key)] = parse_yaml(value)[1]
+        node[last if isinstance(node, dict) else list_index(node, last, key)] = parse_yaml(
+            value
+        )[1]
     except yaml.YAMLError as error:
         raise InputError(
             excerpt(key), f"{excerpt(repr(value))} is not YAML", where=OVERRIDES

@@ -71,7 +71,11 @@ class Pid:
     error_sum_rad_s: Floats = field(default_factory=lambda: np.zeros(3))
 
     def torque_nm(
-        self, t_s: float, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats, momentum_nms: Floats
+        self,
+        t_s: float,
+        lab_from_body_wxyz: Floats,
+        rate_body_rad_s: Floats,
+        momentum_nms: Floats,
     ) -> Floats:
         """(3,) torque commanded at t_s, which is held until the next call."""
         gains = self.kp, self.ki, self.kd, self.authority_nm, self.rate_limit_rad_s

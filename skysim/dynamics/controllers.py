@@ -182,7 +182,9 @@ def torque_of_reply(reply: Any, tick: int, authority_nm: float) -> Floats:
     if not isinstance(reply, dict) or reply.get("tick") != tick:
         raise ValueError(f"no answer to tick {tick}, but {printable(reply)[:80]!r}")
     if "status" in reply:
-        raise ValueError(printable(reply["status"])[:MAX_STATUS_CHARS] or "a status without a text")
+        raise ValueError(
+            printable(reply["status"])[:MAX_STATUS_CHARS] or "a status without a text"
+        )
     unknown = [printable(name) for name in reply if name not in ("tick", "torque_nm")]
     if unknown:
         raise ValueError(f"unknown key {unknown[0][:80]!r}; allowed: tick, torque_nm, status")
@@ -247,7 +249,11 @@ class ExternalLaw:
         self.commanded_nm = self.achieved_nm = np.zeros(3)
 
     def torque_nm(
-        self, t_s: float, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats, momentum_nms: Floats
+        self,
+        t_s: float,
+        lab_from_body_wxyz: Floats,
+        rate_body_rad_s: Floats,
+        momentum_nms: Floats,
     ) -> Floats:
         """(3,) torque commanded at t_s. Raises InputError that names the controller if it gives none."""
         lab_from_ref_wxyz, rate_ref, acceleration_ref = self.reference.state_at(t_s)
@@ -289,7 +295,10 @@ class ExternalLaw:
 
 
 def external_law(
-    reference: Reference, setup: ControllerSetup, config: ControlConfig, source: ControllerSource
+    reference: Reference,
+    setup: ControllerSetup,
+    config: ControlConfig,
+    source: ControllerSource,
 ) -> ExternalLaw:
     """Start the controller that the scene names. Raises InputError if it is unknown or refuses the set-up."""
     name = config.law

@@ -27,7 +27,10 @@ from skysim.scene.sections.vehicle import AirCurrentConfig, DisturbancesConfig
 
 @jit
 def earth_torque_nm(
-    inertia_kg_m2: Floats, momentum_nms: Floats, rate_body_rad_s: Floats, earth_body_rad_s: Floats
+    inertia_kg_m2: Floats,
+    momentum_nms: Floats,
+    rate_body_rad_s: Floats,
+    earth_body_rad_s: Floats,
 ) -> Floats:
     """(3,) apparent torque of the Earth's rotation on a vehicle in the lab, in body axes.
 
@@ -44,7 +47,9 @@ def earth_torque_nm(
     """
     # J W, and the total momentum J (w + W) + h.
     earth_momentum = matrix_vector(inertia_kg_m2, earth_body_rad_s)
-    total_momentum = matrix_vector(inertia_kg_m2, rate_body_rad_s) + earth_momentum + momentum_nms
+    total_momentum = (
+        matrix_vector(inertia_kg_m2, rate_body_rad_s) + earth_momentum + momentum_nms
+    )
     return (
         matrix_vector(inertia_kg_m2, cross(rate_body_rad_s, earth_body_rad_s))
         - cross(rate_body_rad_s, earth_momentum)
@@ -89,7 +94,9 @@ class AirCurrent:
     autocorrelation is rms^2 exp(-|lag| / correlation time).
     """
 
-    def __init__(self, config: AirCurrentConfig, period_s: float, rng: np.random.Generator) -> None:
+    def __init__(
+        self, config: AirCurrentConfig, period_s: float, rng: np.random.Generator
+    ) -> None:
         self.rms_nm = np.array(config.rms_nm)
         self.decay = math.exp(-period_s / config.correlation_s)
         self.rng = rng
@@ -187,7 +194,10 @@ class DisturbanceModel:
         )
         # 3. Impulses that overlap this period.
         for impulse in self.impulses:
-            if impulse.begin_s < times_s[-1] and times_s[0] < impulse.begin_s + impulse.duration_s:
+            if (
+                impulse.begin_s < times_s[-1]
+                and times_s[0] < impulse.begin_s + impulse.duration_s
+            ):
                 # The fraction of the impulse in a step over the step's length is the mean torque of a unit impulse.
                 mean_per_impulse = [
                     impulse.fraction(a, b) / (b - a) for a, b in itertools.pairwise(times_s)

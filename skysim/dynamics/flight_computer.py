@@ -110,7 +110,11 @@ class FlightComputer:
             )
 
     def build_law(
-        self, scene: Scene, vehicle: VehicleModel, reference: Reference, source: ControllerSource
+        self,
+        scene: Scene,
+        vehicle: VehicleModel,
+        reference: Reference,
+        source: ControllerSource,
     ) -> Pid | ExternalLaw:
         """The control law that the scene names. Raises InputError if it is unknown or refuses the set-up."""
         config = self.config

@@ -77,7 +77,9 @@ def start_attitude(motion: MotionConfig, profiles: Sequence[AttitudeSpline] = ()
     if motion.start == "profile":
         return quaternion.to_rotation(profile_start(motion, profiles)[0])
     return (
-        attitude(motion.start) if isinstance(motion.start, AttitudeConfig) else Rotation.identity()
+        attitude(motion.start)
+        if isinstance(motion.start, AttitudeConfig)
+        else Rotation.identity()
     )
 
 
@@ -250,7 +252,9 @@ def slew(element: SlewConfig, start: LegStart) -> Leg:
 def rate(element: RateConfig, start: LegStart) -> Leg:
     """A constant rate w from the start of the leg, where the rate jumps: attitude start exp(w t)."""
     size, axis = length_and_direction(np.radians(element.rate_deg_s))
-    return FixedAxisLeg(start.lab_from_ref_wxyz, axis, element.duration_s, partial(steady, size))
+    return FixedAxisLeg(
+        start.lab_from_ref_wxyz, axis, element.duration_s, partial(steady, size)
+    )
 
 
 def spin_up(element: SpinUpConfig, start: LegStart) -> Leg:
@@ -409,7 +413,8 @@ class Reference:
     def attitudes(self, t_s: Floats) -> Rotation:
         """lab_from_ref at (N,) times."""
         return Rotation.from_quat(
-            np.array([self.state_at(float(t))[0] for t in t_s]).reshape(-1, 4), scalar_first=True
+            np.array([self.state_at(float(t))[0] for t in t_s]).reshape(-1, 4),
+            scalar_first=True,
         )
 
 
@@ -442,7 +447,9 @@ def plan(
     # 1. Start.
     first = lab_from_start if lab_from_start is not None else start_attitude(motion, profiles)
     home = first if isinstance(motion.start, PointingConfig) else Rotation.identity()
-    leg_start = LegStart(quaternion.from_rotation(first), start_rate_rad_s(motion, profiles), home)
+    leg_start = LegStart(
+        quaternion.from_rotation(first), start_rate_rad_s(motion, profiles), home
+    )
     # 2. One leg for each maneuver.
     legs: list[Leg] = []
     splines = iter(profiles)
@@ -493,7 +500,9 @@ def impulses(motion: MotionConfig, reference: Reference) -> tuple[Impulse, ...]:
             result.append(Impulse(begin_s, bump.duration_s, rate_rad_s))
             # Catching the vehicle is the opposite impulse.
             if bump.caught_after_s is not None:
-                result.append(Impulse(begin_s + bump.caught_after_s, bump.duration_s, -rate_rad_s))
+                result.append(
+                    Impulse(begin_s + bump.caught_after_s, bump.duration_s, -rate_rad_s)
+                )
     return tuple(result)
 
 

@@ -228,7 +228,9 @@ def integrate_intervals(
 
 
 @jit
-def add_cubic(t_s: Floats, knots: Floats, k: int, at_s: float, factor: float, out: Floats) -> None:
+def add_cubic(
+    t_s: Floats, knots: Floats, k: int, at_s: float, factor: float, out: Floats
+) -> None:
     """Add to out (C,) factor times the value at at_s of the Lagrange cubic through the four knots nearest to step k.
 
         p(t) = sum_i f_i prod_(j != i) (t - t_j) / (t_i - t_j)
@@ -358,7 +360,11 @@ def corrupt(
             # 1. Gauss-Markov bias.
             markov_bias[i] = decay * markov_bias[i] + innovation * normal[n, 3 + i]
             # 2. Scale, misalignment, bias and white noise.
-            x = matrix[i, 0] * ideal[n, 0] + matrix[i, 1] * ideal[n, 1] + matrix[i, 2] * ideal[n, 2]
+            x = (
+                matrix[i, 0] * ideal[n, 0]
+                + matrix[i, 1] * ideal[n, 1]
+                + matrix[i, 2] * ideal[n, 2]
+            )
             x += (turn_on_bias[i] + markov_bias[i]) * step + white * normal[n, i]
             # 3. Saturation.
             if abs(x) > limit:
@@ -514,7 +520,8 @@ def integrate_attitude(
     attitude = lab_from_body_wxyz
     for n in range(len(angle_rad)):
         attitude = quaternion.multiply(
-            lab_now_from_before, quaternion.multiply(attitude, quaternion.from_rotvec(angle_rad[n]))
+            lab_now_from_before,
+            quaternion.multiply(attitude, quaternion.from_rotvec(angle_rad[n])),
         )
         # Normalization prevents a drift of the norm.
         attitude = attitude / math.sqrt(

@@ -89,7 +89,9 @@ def band(config: JitterBandConfig, rng: np.random.Generator) -> Sines:
         power = np.exp(exponent * low) * np.expm1(exponent * (high - low)) / exponent
         middle = low + np.log1p(uniform * np.expm1(exponent * (high - low))) / exponent
     # 4. Phases.
-    return with_phases(config.from_hz * np.exp(middle), power / power.sum(), config.rms_arcsec, rng)
+    return with_phases(
+        config.from_hz * np.exp(middle), power / power.sum(), config.rms_arcsec, rng
+    )
 
 
 def with_phases(
@@ -252,7 +254,9 @@ class Vibration:
             np.maximum(
                 highest_hz, component.highest_hz, out=highest_hz, where=component.active(t_s)
             )
-        count = np.ceil(np.maximum(np.diff(t_s) * highest_hz * SAMPLES_PER_PERIOD * (1 - 1e-12), 1))
+        count = np.ceil(
+            np.maximum(np.diff(t_s) * highest_hz * SAMPLES_PER_PERIOD * (1 - 1e-12), 1)
+        )
         needed = int(count.sum()) + 1
         if self.components and needed > MAX_SAMPLES:
             # Name the vibration that needs most of the samples.
@@ -283,7 +287,10 @@ def draw_component(
     if not active:
         return None
     return VibrationComponent(
-        concatenate([SPECTRA[config.kind](config, rng) for config in active]), name, begin_s, end_s
+        concatenate([SPECTRA[config.kind](config, rng) for config in active]),
+        name,
+        begin_s,
+        end_s,
     )
 
 

@@ -44,7 +44,12 @@ from skysim.dynamics.profile_samples import (
 VERSION = "CCSDS_AEM_VERS"
 VERSIONS = ("1.0", "2.0")
 # Numbers after the epoch; the first four are the quaternion.
-TYPES = {"QUATERNION": 4, "QUATERNION/DERIVATIVE": 8, "QUATERNION/RATE": 7, "QUATERNION/ANGVEL": 7}
+TYPES = {
+    "QUATERNION": 4,
+    "QUATERNION/DERIVATIVE": 8,
+    "QUATERNION/RATE": 7,
+    "QUATERNION/ANGVEL": 7,
+}
 DIRECTIONS = ("A2B", "B2A")
 ORDERS = ("FIRST", "LAST")
 REQUIRED = ("REF_FRAME_A", "REF_FRAME_B", "TIME_SYSTEM", "ATTITUDE_TYPE")
@@ -55,7 +60,9 @@ def read_aem(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
     """The samples of all segments. Raises InputError for a file that is not an AEM of quaternions."""
     version, segments = split_segments(path, lines)
     if not segments:
-        raise InputError(path, "no segment", "META_START ... META_STOP, DATA_START ... DATA_STOP")
+        raise InputError(
+            path, "no segment", "META_START ... META_STOP, DATA_START ... DATA_STOP"
+        )
     parts = [segment_samples(path, version, segment, start) for segment in segments]
     joined = parts[0]
     for part in parts[1:]:
@@ -137,7 +144,10 @@ def segment_samples(
     for n, words in segment.data:
         if len(words) != width + 1:
             raise InputError(
-                path, f"{len(words)} values", f"an epoch and {width} numbers", where=Where(path, n)
+                path,
+                f"{len(words)} values",
+                f"an epoch and {width} numbers",
+                where=Where(path, n),
             )
     lines = [n for n, _ in segment.data]
     numbers = to_numbers(source, lines, [words[1:] for _, words in segment.data], width)
@@ -148,7 +158,8 @@ def segment_samples(
         and one_of(path, metadata, "QUATERNION_TYPE", ORDERS) == "FIRST"
     )
     reverse = (
-        "ATTITUDE_DIR" in metadata and one_of(path, metadata, "ATTITUDE_DIR", DIRECTIONS) == "B2A"
+        "ATTITUDE_DIR" in metadata
+        and one_of(path, metadata, "ATTITUDE_DIR", DIRECTIONS) == "B2A"
     )
     xyzw: Floats = numbers[:, [1, 2, 3, 0] if first else [0, 1, 2, 3]]
     a, b = frames[::-1] if reverse else frames

@@ -100,7 +100,9 @@ def check_samples(samples: Samples) -> Samples:
     # 1. Number.
     count = len(samples.t_s)
     if not MIN_SAMPLES <= count <= MAX_SAMPLES:
-        raise InputError(samples.source, f"{count} attitudes", f"{MIN_SAMPLES} to {MAX_SAMPLES}")
+        raise InputError(
+            samples.source, f"{count} attitudes", f"{MIN_SAMPLES} to {MAX_SAMPLES}"
+        )
     # 2. Times. NaN is rejected, too.
     if len(bad := np.flatnonzero(~(np.abs(samples.t_s) <= MAX_TIME_S))):
         raise samples.error(

@@ -75,9 +75,13 @@ def read_stk(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
                 )
             section = lower
         else:
-            name = next((known for known in KEYWORDS if known.lower() == words[0].lower()), None)
+            name = next(
+                (known for known in KEYWORDS if known.lower() == words[0].lower()), None
+            )
             if name is None:
-                raise InputError(path, *unknown_name("keyword", words[0], KEYWORDS), Where(path, n))
+                raise InputError(
+                    path, *unknown_name("keyword", words[0], KEYWORDS), Where(path, n)
+                )
             keywords[name] = (n, " ".join(words[1:]))
     if not section:
         raise InputError(path, "no attitudes", ", ".join(SECTION_NAMES))
@@ -150,7 +154,11 @@ def scenario_epoch(path: Path, line: int, text: str) -> datetime.datetime:
         day, month, year, clock = text.split()
         hours, minutes, seconds = clock.split(":")
         date = datetime.datetime(int(year), MONTHS.index(month[:3].lower()) + 1, int(day))
-        if not 0 <= float(seconds) < 60 or not 0 <= int(minutes) < 60 or not 0 <= int(hours) < 24:
+        if (
+            not 0 <= float(seconds) < 60
+            or not 0 <= int(minutes) < 60
+            or not 0 <= int(hours) < 24
+        ):
             raise ValueError
         return date + datetime.timedelta(
             hours=int(hours), minutes=int(minutes), seconds=float(seconds)

@@ -105,7 +105,8 @@ def from_table(
     """
     try:
         names = [
-            str(name) for name in (table.colnames if hasattr(table, "colnames") else table.keys())
+            str(name)
+            for name in (table.colnames if hasattr(table, "colnames") else table.keys())
         ]
         columns = {name: table[name] for name in names}
     except (AttributeError, TypeError, KeyError):
@@ -119,7 +120,9 @@ def from_table(
     for name, column in columns.items():
         unit = getattr(column, "unit", None)
         if unit is not None and str(unit) != UNITS.get(name, ""):
-            raise InputError(source, f"column {name} is in {unit}", UNITS.get(name) or "no unit")
+            raise InputError(
+                source, f"column {name} is in {unit}", UNITS.get(name) or "no unit"
+            )
         values[name] = to_epochs(column) if name == "utc" else to_column(source, name, column)
     count = len(next(iter(values.values())))
     for name, column in values.items():
@@ -142,7 +145,9 @@ def to_column(source: str, name: str, column: Any) -> Floats:
         )
     if len(bad := np.flatnonzero(~np.isfinite(numbers))):
         raise InputError(
-            source, f"{name} is not a finite number", where=Where(source, int(bad[0]) + 1, "row")
+            source,
+            f"{name} is not a finite number",
+            where=Where(source, int(bad[0]) + 1, "row"),
         )
     return np.asarray(numbers, dtype=np.float64)
 
@@ -189,7 +194,10 @@ def check_names(where: Where, names: Sequence[str], rotation: str | None) -> Non
         )
     if found != set(BARE) and rotation is not None:
         raise InputError(
-            where.file, "the columns name the rotation", "no key rotation in the maneuver", where
+            where.file,
+            "the columns name the rotation",
+            "no key rotation in the maneuver",
+            where,
         )
 
 

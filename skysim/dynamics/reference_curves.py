@@ -252,7 +252,9 @@ def fit_spline(samples: Samples) -> AttitudeSpline:
 
 
 @jit
-def spline_state(t_s: Floats, coefficients: Floats, at_s: float) -> tuple[Floats, Floats, Floats]:
+def spline_state(
+    t_s: Floats, coefficients: Floats, at_s: float
+) -> tuple[Floats, Floats, Floats]:
     """Attitude (4,) as wxyz, rate and acceleration (3,) in body axes, of the normalized cubic p(t):
 
         q = p / |p|,  rate = 2 vec(p* p') / |p|^2,  acceleration = (2 vec(p* p'') - 2 (p . p') rate) / |p|^2
@@ -273,7 +275,9 @@ def spline_state(t_s: Floats, coefficients: Floats, at_s: float) -> tuple[Floats
 
 
 @jit
-def spline_states(t_s: Floats, coefficients: Floats, at_s: Floats) -> tuple[Floats, Floats, Floats]:
+def spline_states(
+    t_s: Floats, coefficients: Floats, at_s: Floats
+) -> tuple[Floats, Floats, Floats]:
     """`spline_state` at (K,) times: (K, 4), (K, 3), (K, 3)."""
     attitude = np.empty((len(at_s), 4))
     rate = np.empty((len(at_s), 3))

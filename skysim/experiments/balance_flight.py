@@ -111,7 +111,9 @@ class Assumptions(NamedTuple):
     wheel_inertia_kg_m2: Floats
 
 
-def draw_assumptions(scene: Scene, at_zero: VehicleModel, uncertainty: Uncertainty) -> Assumptions:
+def draw_assumptions(
+    scene: Scene, at_zero: VehicleModel, uncertainty: Uncertainty
+) -> Assumptions:
     """Draw the errors of inertia and wheels from the scene's seed; offset, lab torque and drag are assumed as zero.
 
     The level of air currents is assumed as in the scene, or LEAST_TORQUE_NM.
@@ -119,7 +121,9 @@ def draw_assumptions(scene: Scene, at_zero: VehicleModel, uncertainty: Uncertain
     rng = random_stream(scene.seed, BALANCE, 0)
     count = len(at_zero.wheels)
     true_kg_m2 = at_zero.inertia_kg_m2
-    inertia_sigma = uncertainty.inertia_sigma * np.trace(true_kg_m2) / 3 * np.repeat([1.0, 0.5], 3)
+    inertia_sigma = (
+        uncertainty.inertia_sigma * np.trace(true_kg_m2) / 3 * np.repeat([1.0, 0.5], 3)
+    )
     moment_kg_m = at_zero.mass.mass_kg * uncertainty.offset_sigma_m
     torque_nm = LAB_TORQUE_SHARE * moment_kg_m * at_zero.gravity_m_s2
     drag = torque_nm / DRAG_RATE_RAD_S ** np.array([1, 2])
@@ -137,7 +141,9 @@ def draw_assumptions(scene: Scene, at_zero: VehicleModel, uncertainty: Uncertain
     values[:6] = inertia_six(true_kg_m2) + inertia_sigma * rng.standard_normal(6)
     wheels = at_zero.wheels.inertia_kg_m2
     assumed_wheels = wheels / (1 + uncertainty.wheel_sigma * rng.standard_normal(count))
-    return Assumptions(Prior(values, sigma), known_lab(scene, at_zero, uncertainty), assumed_wheels)
+    return Assumptions(
+        Prior(values, sigma), known_lab(scene, at_zero, uncertainty), assumed_wheels
+    )
 
 
 def known_lab(scene: Scene, vehicle: VehicleModel, uncertainty: Uncertainty) -> LabConstants:
@@ -151,7 +157,8 @@ def known_lab(scene: Scene, vehicle: VehicleModel, uncertainty: Uncertainty) -> 
         np.maximum(air.rms_nm if air else 0.0, LEAST_TORQUE_NM) * np.ones(3),
         air.correlation_s if air else DEFAULT_CORRELATION_S,
         earth * disturbances.earth_rotation,
-        float(np.max(vehicle.wheels.inertia_kg_m2, initial=0.0)) * uncertainty.tacho_sigma_rad_s,
+        float(np.max(vehicle.wheels.inertia_kg_m2, initial=0.0))
+        * uncertainty.tacho_sigma_rad_s,
     )
 
 
@@ -199,7 +206,9 @@ def check_observed(
     for axis in range(3):
         if sigma[6 + axis] > moment_bar_kg_m[axis]:
             known = f"moment along {AXES[axis]} is known to {1e6 * sigma[6 + axis]:.4g} g mm"
-            needed = remedy("tilt", sigma[6 + axis], prior.sigma[6 + axis], moment_bar_kg_m[axis])
+            needed = remedy(
+                "tilt", sigma[6 + axis], prior.sigma[6 + axis], moment_bar_kg_m[axis]
+            )
             faults.append(
                 f"{known}, not {1e6 * moment_bar_kg_m[axis]:.3g}, after tilts of {tilt_deg:.1f} deg: {needed}"
             )
@@ -281,10 +290,14 @@ def check_scene(scene: Scene) -> None:
         )
     if vehicle.disturbances.cable:
         raise InputError(
-            "vehicle.disturbances.cable", "its spring acts like a low center of mass", "no cable"
+            "vehicle.disturbances.cable",
+            "its spring acts like a low center of mass",
+            "no cable",
         )
     if vehicle.cmgs:
-        raise InputError("vehicle.cmgs", "the stored momentum must be that of wheels", "no cmgs")
+        raise InputError(
+            "vehicle.cmgs", "the stored momentum must be that of wheels", "no cmgs"
+        )
 
 
 def excited_by_wheels(scene: Scene, vehicle: VehicleModel, tilt_deg: float) -> Scene:
@@ -296,14 +309,20 @@ def excited_by_wheels(scene: Scene, vehicle: VehicleModel, tilt_deg: float) -> S
     wheels = scene.vehicle.wheels
     if wheels is None:
         raise InputError(
-            "vehicle.wheels", "none, and the inertia's scale is that of the wheels", "excite swing"
+            "vehicle.wheels",
+            "none, and the inertia's scale is that of the wheels",
+            "excite swing",
         )
     largest = float(np.linalg.eigvalsh(vehicle.inertia_kg_m2)[2])
     torque = TORQUE_SHARE * wheels.torque_limit_nm / (largest * math.radians(tilt_deg))
     limit_rad_s = wheels.speed_limit_rpm * RPM_RAD_S
-    momentum = MOMENTUM_SHARE * float(vehicle.wheels.inertia_kg_m2.min()) * limit_rad_s / largest
+    momentum = (
+        MOMENTUM_SHARE * float(vehicle.wheels.inertia_kg_m2.min()) * limit_rad_s / largest
+    )
     rate_hz = min(
-        MAX_HZ, math.sqrt(torque) / (2 * math.pi), momentum / math.radians(tilt_deg) / (2 * math.pi)
+        MAX_HZ,
+        math.sqrt(torque) / (2 * math.pi),
+        momentum / math.radians(tilt_deg) / (2 * math.pi),
     )
     acceleration = math.degrees(TORQUE_SHARE * wheels.torque_limit_nm / largest)
     legs = []
@@ -333,7 +352,9 @@ def excited_by_wheels(scene: Scene, vehicle: VehicleModel, tilt_deg: float) -> S
             for key in ("bandwidth_rad_s", "damping", "integral_rad_s", "rate_hz")
         }
     motion = MotionConfig.model_validate({"control": law, "maneuver": legs[1:]})
-    return with_config(scene, "vehicle.wheels", start_rpm=()).model_copy(update={"motion": motion})
+    return with_config(scene, "vehicle.wheels", start_rpm=()).model_copy(
+        update={"motion": motion}
+    )
 
 
 def excited_by_swing(scene: Scene, tilt_deg: float, number: int) -> Scene:
@@ -359,7 +380,10 @@ def maneuver_s(scene: Scene) -> float:
 
 
 def fly(
-    scene: Scene, assumptions: Assumptions, uncertainty: Uncertainty, watch: ProgressCallback | None
+    scene: Scene,
+    assumptions: Assumptions,
+    uncertainty: Uncertainty,
+    watch: ProgressCallback | None,
 ) -> BalanceFlight:
     """Simulate a flight, render and solve its frames, and return what was measured.
 
@@ -378,7 +402,9 @@ def fly(
             if len(contact)
             else "were solved"
         )
-        raise InputError("balance", f"{len(kept)} attitudes {cause}", f"{LEAST_ATTITUDES} or more")
+        raise InputError(
+            "balance", f"{len(kept)} attitudes {cause}", f"{LEAST_ATTITUDES} or more"
+        )
     t_s, attitudes, covariances, shared = zip(*kept, strict=True)
     speeds = log.wheel_rad_s + uncertainty.tacho_sigma_rad_s * random_stream(
         scene.seed, BALANCE, 1
@@ -394,7 +420,9 @@ def fly(
         *vehicle.trims.added(vehicle.trims.position_m),
         np.array(shared),
     )
-    return BalanceFlight(record, vehicle, scene.exposure.frames, len(rows), len(rows) - len(kept))
+    return BalanceFlight(
+        record, vehicle, scene.exposure.frames, len(rows), len(rows) - len(kept)
+    )
 
 
 def measured_attitudes(
@@ -410,7 +438,9 @@ def measured_attitudes(
         attitude = shot.report.attitude
         if attitude.cam_from_ref is not None and attitude.covariance_rad2 is not None:
             systematic = (
-                np.zeros((3, 3)) if attitude.systematic_rad2 is None else attitude.systematic_rad2
+                np.zeros((3, 3))
+                if attitude.systematic_rad2 is None
+                else attitude.systematic_rad2
             )
             covariance, shared = (
                 R_body_from_cam @ one @ R_body_from_cam.T

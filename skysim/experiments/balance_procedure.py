@@ -193,9 +193,12 @@ def in_flight(scene: Scene, plan: BalancePlan, number: int, position_m: Floats) 
         scene = with_config(scene, "vehicle.trim", position_m=tuple(map(float, position_m)))
     if plan.excite == "swing":
         return balance_flight.with_frames(
-            balance_flight.excited_by_swing(scene, plan.tilt_deg, number), balance_flight.SWING_S
+            balance_flight.excited_by_swing(scene, plan.tilt_deg, number),
+            balance_flight.SWING_S,
         )
-    scene = balance_flight.excited_by_wheels(scene, multibody.build(scene.vehicle), plan.tilt_deg)
+    scene = balance_flight.excited_by_wheels(
+        scene, multibody.build(scene.vehicle), plan.tilt_deg
+    )
     return balance_flight.with_frames(scene, balance_flight.maneuver_s(scene))
 
 

@@ -34,7 +34,9 @@ INERTIA_NAMES = ("Jxx", "Jyy", "Jzz", "Jxy", "Jxz", "Jyz")
 MOMENT_NAMES = ("x", "y", "z")
 
 
-def statistics(scene: str, plan: BalancePlan, iterations: Sequence[Iteration]) -> dict[str, Any]:
+def statistics(
+    scene: str, plan: BalancePlan, iterations: Sequence[Iteration]
+) -> dict[str, Any]:
     """All numbers of a balance, SI except where a unit is in the name."""
     last = iterations[-1]
     return {
@@ -130,7 +132,9 @@ def draw_flights(fig: Any, iterations: Sequence[Iteration], torque_bar_nm: float
     )
     record = iterations[-1].flight.record
     motion.plot(record.t_s, euler_deg(record.lab_from_body), ".-", label=EULER)
-    motion.set(xlabel="t [s]", ylabel="measured attitude [deg]", title=f"flight {len(iterations)}")
+    motion.set(
+        xlabel="t [s]", ylabel="measured attitude [deg]", title=f"flight {len(iterations)}"
+    )
     for axes in (torque, offset, motion):
         axes.legend(fontsize="small")
 
@@ -149,9 +153,12 @@ def balance_report(statistics: dict[str, Any], picture: bytes, command: str) -> 
             on_terminal=False,
         ),
         Section("Balance", [Figure(picture, CAPTION)]),
-        Section("Flights", [Text(FLIGHTS), flight_table(statistics["flights"])], on_terminal=False),
         Section(
-            "With the trim masses at zero, from all flights", mass_blocks(statistics["estimates"])
+            "Flights", [Text(FLIGHTS), flight_table(statistics["flights"])], on_terminal=False
+        ),
+        Section(
+            "With the trim masses at zero, from all flights",
+            mass_blocks(statistics["estimates"]),
         ),
         Section(
             "By the filter in flight, from the last flight",
@@ -216,7 +223,11 @@ def mass_blocks(rows: Sequence[dict[str, Any]]) -> list[Block]:
     for row in values:
         row.append((row[1] - row[3]) / row[2])
     table = Table([*columns, Column("error over 1σ", format=".1f")], values)
-    return [table, Text("J in kg m², of the vehicle with its trim masses at zero.")] if rows else []
+    return (
+        [table, Text("J in kg m², of the vehicle with its trim masses at zero.")]
+        if rows
+        else []
+    )
 
 
 def write_all(

@@ -27,9 +27,7 @@ from skysim.tracking.onboard_model import assumed_camera
 
 SATURATED = "saturated"
 MASKS = (SATURATED, PARTICLES, SMEAR)
-REACH_SIGMA = (
-    3.0  # half-width of a source's rectangle, in standard deviations of its image across the streak
-)
+REACH_SIGMA = 3.0  # half-width of a source's rectangle, in standard deviations of its image across the streak
 DISC_PX = 2.0  # sources of a larger radius are discs with edges
 EDGE_PX = 3.0  # reach of the blur about the edge of a disc
 STILL_PX = 1e-6  # a shorter streak has no direction
@@ -39,7 +37,14 @@ SOURCE = np.dtype(
         *((name, "<f8") for name in ("x_px", "y_px", "flux_x_px", "flux_y_px")),
         *(
             (name, "<f4")
-            for name in ("streak_x_px", "streak_y_px", "streak_px", "electrons", "peak_e", "snr")
+            for name in (
+                "streak_x_px",
+                "streak_y_px",
+                "streak_px",
+                "electrons",
+                "peak_e",
+                "snr",
+            )
         ),
         *((name, "<f4") for name in ("sigma_px", "radius_px")),
         ("saturated", "?"),
@@ -136,7 +141,9 @@ def label_frame(setup: TrialSetup, seed: int, by: Labeller | None = None) -> Lab
         found = Centroids.empty()
     sources, unmatched = source_rows(truth.sources, found.xy_px)
     add_radii(sources, truth.bodies, scene.camera.focal_px)
-    extents = image_extents(sources, exposure_window(scene, frame.index), scene.camera.height_px)
+    extents = image_extents(
+        sources, exposure_window(scene, frame.index), scene.camera.height_px
+    )
     runs = {SATURATED: run_lengths(frame.image_dn, least_value(frame))}
     runs |= {name: run_lengths(added.masks[name]) for name in MASKS if name in added.masks}
     return LabelledFrame(frame, truth, sources, extents, unmatched, runs)
@@ -145,7 +152,9 @@ def label_frame(setup: TrialSetup, seed: int, by: Labeller | None = None) -> Lab
 def least_value(frame: Frame) -> float:
     """The least value of a saturated pixel, an integer if pixels are, which compares faster."""
     return (
-        math.ceil(frame.saturation_dn) if frame.image_dn.dtype.kind == "u" else frame.saturation_dn
+        math.ceil(frame.saturation_dn)
+        if frame.image_dn.dtype.kind == "u"
+        else frame.saturation_dn
     )
 
 

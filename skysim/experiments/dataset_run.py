@@ -51,9 +51,7 @@ KEYS = ("schema", "set", "trial", "factors", "hardware")  # of a file of variati
 # Factors of a scene without variations.
 AS_IT_IS: dict[str, Any] = {"variation": {"levels": {"none": {}}}}
 TRACKED = f"{TRIAL}tracked"
-DRAW = (
-    2  # first of the four numbers of a draw's key; seeds of trials and of hardware have up to three
-)
+DRAW = 2  # first of the four numbers of a draw's key; seeds of trials and of hardware have up to three
 FORMATS = ("webdataset", "zarr", "coco")
 
 
@@ -162,7 +160,11 @@ def load(
     plan = study_plan(scene, vary, seed, overrides or {})
     check_trial(plan, vary)
     return DatasetPlan(
-        plan.spec, dict(plan.study.factors), frames, frames_per_shard, tuple(dict.fromkeys(formats))
+        plan.spec,
+        dict(plan.study.factors),
+        frames,
+        frames_per_shard,
+        tuple(dict.fromkeys(formats)),
     )
 
 
@@ -291,7 +293,9 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
             row = dataset_shards.frame_labels(one, setup.lab.scene, numbers)
             row |= {"pixel_type": one.frame.image_dn.dtype.str, "file": name if tar else ""}
             row["position"] = (
-                dataset_shards.add_frame(tar, frame, one, row | {"levels": levels}) if tar else -1
+                dataset_shards.add_frame(tar, frame, one, row | {"levels": levels})
+                if tar
+                else -1
             )
             rows.append(row | {"levels": json.dumps(levels, default=str)})
             sources.append(one.sources)
@@ -309,7 +313,8 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
             dataset_shards.coco_file(list(map(dataset_shards.coco_image, rows)), coco),
         )
     storage.write(
-        shard_name(SOURCES, shard, "parquet"), dataset_shards.sources_table(list(frames), sources)
+        shard_name(SOURCES, shard, "parquet"),
+        dataset_shards.sources_table(list(frames), sources),
     )
     storage.write(shard_name(INDEX, shard, "parquet"), dataset_shards.index_table(rows))
     return ShardResult(shard, len(rows))
@@ -330,7 +335,9 @@ def prepare(plan: DatasetPlan, storage: Storage) -> None:
     if MANIFEST in there:
         check_manifest(storage, described | {"digest": plan.digest})
     elif there:
-        raise InputError(storage.url, f"contains {min(there)}", "an empty folder, or this dataset")
+        raise InputError(
+            storage.url, f"contains {min(there)}", "an empty folder, or this dataset"
+        )
     else:
         storage.prepare(())
         text = json.dumps(
@@ -345,7 +352,11 @@ def prepare(plan: DatasetPlan, storage: Storage) -> None:
 
 def folders_of(plan: DatasetPlan) -> tuple[str, ...]:
     """The folders of a dataset's files, without Zarr's."""
-    return (INDEX, SOURCES, *(folder for name, folder in FOLDERS.items() if name in plan.formats))
+    return (
+        INDEX,
+        SOURCES,
+        *(folder for name, folder in FOLDERS.items() if name in plan.formats),
+    )
 
 
 def check_manifest(storage: Storage, own: dict[str, Any]) -> None:
@@ -379,7 +390,9 @@ def missing_shards(plan: DatasetPlan, storage: Storage) -> list[int]:
     """The shards whose index is not there."""
     there = storage.names(INDEX)
     return [
-        shard for shard in range(plan.shards) if shard_name("", shard, "parquet")[1:] not in there
+        shard
+        for shard in range(plan.shards)
+        if shard_name("", shard, "parquet")[1:] not in there
     ]
 
 

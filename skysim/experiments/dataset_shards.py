@@ -177,7 +177,8 @@ def add_frame(tar: TarWriter, number: int, one: LabelledFrame, labels: dict[str,
     position = tar.add(f"{key}.image.npy", to_npy(image), image.data.cast("B"))
     tar.add(f"{key}.sources.npy", to_npy(one.sources), one.sources.tobytes())
     masks = {
-        name: {"size": list(image.shape), "counts": counts} for name, counts in one.masks.items()
+        name: {"size": list(image.shape), "counts": counts}
+        for name, counts in one.masks.items()
     }
     more = {
         "masks": masks,
@@ -197,7 +198,8 @@ def frame_labels(one: LabelledFrame, scene: Scene, numbers: dict[str, Any]) -> d
     for name in ("lab_from_body", "cam_from_lab"):
         rotation: Rotation = getattr(truth, name)
         labels |= {
-            f"{name}_q{end}": float(q) for end, q in zip("xyzw", rotation.as_quat(), strict=True)
+            f"{name}_q{end}": float(q)
+            for end, q in zip("xyzw", rotation.as_quat(), strict=True)
         }
     labels |= {
         f"rate_cam_{end}_rad_s": float(rate)

@@ -87,7 +87,9 @@ def build_trackers(
 
 
 def compare_frames(
-    flight: Flight, estimators: Mapping[str, factory.Estimator], progress: Progress | None = None
+    flight: Flight,
+    estimators: Mapping[str, factory.Estimator],
+    progress: Progress | None = None,
 ) -> Iterator[tuple[Frame, Truth, dict[str, FrameRow]]]:
     """Yield each frame of the main camera with its truth and the row of each tracker.
 
@@ -117,7 +119,9 @@ def score_tracker(tracker: str, rows: Sequence[FrameRow]) -> TrackerScore:
     cross = np.array([row.cross_arcsec for row in right] or [np.nan])
     roll = np.abs([row.roll_arcsec for row in right] or [np.nan])
     # Frames on which it failed are left out of the times: the time to a solution is unknown there.
-    ms = np.array([row.time_ms for row in rows if not row.status.startswith(FAILED)] or [np.nan])
+    ms = np.array(
+        [row.time_ms for row in rows if not row.status.startswith(FAILED)] or [np.nan]
+    )
     return TrackerScore(
         tracker,
         len(rows),
@@ -160,6 +164,10 @@ def as_dicts(scores: Sequence[TrackerScore]) -> list[dict[str, Any]]:
     """The statistics as dictionaries for JSON; `right` becomes three numbers."""
     return [
         asdict(score)
-        | {"right": score.right.value, "right_low": score.right.low, "right_high": score.right.high}
+        | {
+            "right": score.right.value,
+            "right_low": score.right.low,
+            "right_high": score.right.high,
+        }
         for score in scores
     ]

@@ -74,7 +74,10 @@ def normalized_error_squared(
 # Statistics of a sample.
 
 CONFIDENCE = 0.95
-TAILS = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2  # probabilities below the ends of an interval
+TAILS = (
+    (1 - CONFIDENCE) / 2,
+    (1 + CONFIDENCE) / 2,
+)  # probabilities below the ends of an interval
 # Half of the interval of a normal variable, in sigmas.
 SIGMAS = float(scipy.special.ndtri((1 + CONFIDENCE) / 2))
 RESAMPLES = 999
@@ -128,7 +131,9 @@ def proportion(hits: Any, total: Any) -> Summary:
 
 
 @lru_cache(maxsize=4096)
-def exact_bounds(hits: float, total: float, confidence: float = CONFIDENCE) -> tuple[float, float]:
+def exact_bounds(
+    hits: float, total: float, confidence: float = CONFIDENCE
+) -> tuple[float, float]:
     """One-sided bounds of a proportion, each at this confidence (Clopper & Pearson 1934).
 
     The upper one is the p for which hits or fewer of total have the probability 1 - confidence, the lower one
@@ -154,7 +159,9 @@ def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
     value = float(statistic(values))
     if len(values) < 2 or np.ptp(values) == 0:
         return without_resampling(values, value)
-    batch = max(1, 2_000_000 // len(values))  # limits the memory of a batch to two million values
+    batch = max(
+        1, 2_000_000 // len(values)
+    )  # limits the memory of a batch to two million values
     result = scipy.stats.bootstrap(
         (values,),
         statistic,
@@ -189,7 +196,10 @@ def rms_of(values: Floats) -> Summary:
         return bootstrap_of_few(np.square(values), np.sqrt)
     squares = bootstrap_of_many(np.square(values))
     return Summary(
-        math.sqrt(squares.value), math.sqrt(squares.low), math.sqrt(squares.high), squares.trials
+        math.sqrt(squares.value),
+        math.sqrt(squares.low),
+        math.sqrt(squares.high),
+        squares.trials,
     )
 
 
@@ -263,7 +273,9 @@ def quantile(values: Floats, probability: float) -> Summary:
     value = float(np.quantile(values, probability))
     ranks = quantile_ranks(count, probability)
     if ranks is None:
-        return Summary(value, math.nan, math.nan, count, values_for_quantile(probability) - count)
+        return Summary(
+            value, math.nan, math.nan, count, values_for_quantile(probability) - count
+        )
     low, high = np.partition(values, ranks)[list(ranks)]
     return Summary(value, float(low), float(high), count)
 
@@ -493,5 +505,7 @@ def split_name(name: str) -> tuple[str, str]:
 def is_proportion(name: str) -> bool:
     """Whether a response is a proportion between 0 and 1."""
     return (
-        name in PROPORTIONS or bool(COVERAGE.match(name)) or split_name(name)[0] == "availability"
+        name in PROPORTIONS
+        or bool(COVERAGE.match(name))
+        or split_name(name)[0] == "availability"
     )

@@ -257,14 +257,18 @@ def annotate_truth(image: NDArray, sources: SourceTruth) -> NDArray[np.uint8]:
         draw_ticks(picture, x, y, size, color)
         if n in labeled:
             draw_label(picture, light_name(int(sources.id[n])), x + size + 2, y - size, color)
-    return with_legend(picture, {f"true, SNR > {MIN_SNR:g}": TRUTH_BGR, "saturated": DETECTED_BGR})
+    return with_legend(
+        picture, {f"true, SNR > {MIN_SNR:g}": TRUTH_BGR, "saturated": DETECTED_BGR}
+    )
 
 
 def with_legend(
     picture: NDArray[np.uint8], meanings: dict[str, tuple[int, int, int]]
 ) -> NDArray[np.uint8]:
     """The picture with a strip below it that names the colors of its markers; pixels keep their places."""
-    strip = cv2.copyMakeBorder(picture, 0, LEGEND_PX, 0, 0, cv2.BORDER_CONSTANT, value=(0, 0, 0))
+    strip = cv2.copyMakeBorder(
+        picture, 0, LEGEND_PX, 0, 0, cv2.BORDER_CONSTANT, value=(0, 0, 0)
+    )
     x = 6
     for text, color in meanings.items():
         draw_label(strip, text, x, len(strip) - 6, color)
@@ -279,7 +283,9 @@ def draw_ticks(
     for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         begin = size - 4
         end = size + 6
-        cv2.line(picture, (x + begin * dx, y + begin * dy), (x + end * dx, y + end * dy), color, 1)
+        cv2.line(
+            picture, (x + begin * dx, y + begin * dy), (x + end * dx, y + end * dy), color, 1
+        )
 
 
 def draw_label(

@@ -122,7 +122,9 @@ def html_page(title: str, command: str, version: str, blocks: Sequence[Block]) -
     from jinja2 import Environment, PackageLoader
 
     loader = PackageLoader("skysim", "results")
-    environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(
+        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
     environment.filters |= {"parts": parts, "embed": embed, "sort_key": sort_key}
     environment.tests["cell"] = lambda one: isinstance(one, Cell)
     environment.globals["kind"] = lambda block: type(block).__name__
@@ -248,7 +250,9 @@ def styled(cell: Cell, style: str) -> Any:
     return text.Text(printable(cell.text), style)
 
 
-def print_wrapped(text: str, first: str = "", others: str = "  ", width: int | None = None) -> None:
+def print_wrapped(
+    text: str, first: str = "", others: str = "  ", width: int | None = None
+) -> None:
     """Print a text in lines of a width, by default the terminal's.
 
     Parameters

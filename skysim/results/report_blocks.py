@@ -62,7 +62,8 @@ class Column(NamedTuple):
             return Cell(value)
         missing = value is None or math.isnan(value)
         return Cell(
-            MISSING if missing else format(value, self.format), key=math.nan if missing else value
+            MISSING if missing else format(value, self.format),
+            key=math.nan if missing else value,
         )
 
 

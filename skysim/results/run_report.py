@@ -98,7 +98,9 @@ def run_report(
 
 
 FRAME_CAPTION = "Blue ticks: truth. Red squares: detected. Green circles: identified."
-ERROR_CAPTION = "Errors, lights and rate against time. Red lines mark frames that were not solved."
+ERROR_CAPTION = (
+    "Errors, lights and rate against time. Red lines mark frames that were not solved."
+)
 MOTION_CAPTION = "Attitude, estimates and actuators against time."
 
 
@@ -140,7 +142,9 @@ def motion_lines(motion: Mapping[str, float]) -> list[str]:
     """The statistics of a motion in words; those that a scene does not have are skipped."""
     lines = [text.format(**motion) for key, text in MOTION.items() if key in motion]
     mounts = re.findall(r"mounting_(\w+)_arcsec_end", " ".join(motion))
-    errors = ", ".join(f"{name} {motion[f'mounting_{name}_arcsec_end']:.3g}″" for name in mounts)
+    errors = ", ".join(
+        f"{name} {motion[f'mounting_{name}_arcsec_end']:.3g}″" for name in mounts
+    )
     return [*lines, *([f"mounting error at the end: {errors}"] if mounts else [])]
 
 

@@ -28,11 +28,15 @@ from skysim.simulation.lab import StarCamera
 def angle_names(scene: Scene) -> tuple[str, str, str]:
     """Names of the three angles of a row."""
     return (
-        ("RA", "Dec", "roll") if isinstance(scene.light, StarsConfig) else ("roll", "pitch", "yaw")
+        ("RA", "Dec", "roll")
+        if isinstance(scene.light, StarsConfig)
+        else ("roll", "pitch", "yaw")
     )
 
 
-def angles_deg(cam_from_lab: Rotation, scene: Scene, mount: Mount) -> tuple[float, float, float]:
+def angles_deg(
+    cam_from_lab: Rotation, scene: Scene, mount: Mount
+) -> tuple[float, float, float]:
     """RA, Dec, roll of the camera under the stars; otherwise roll, pitch, yaw (3-2-1 sequence) of the vehicle."""
     if isinstance(scene.light, StarsConfig):
         ra, dec, roll = np.degrees(ra_dec_roll_rad(cam_from_lab))
@@ -64,7 +68,9 @@ def row(
         nees = np.inf
         if attitude.covariance_rad2 is not None:
             covariance = attitude.covariance_rad2
-            nees = metrics.normalized_error_squared(attitude.cam_from_ref, cam_from_lab, covariance)
+            nees = metrics.normalized_error_squared(
+                attitude.cam_from_ref, cam_from_lab, covariance
+            )
         wrong = metrics.is_wrong(np.hypot(cross, roll), nees)
         variance = np.diag(covariance)
         cross_sigma = math.sqrt(variance[:2].sum())
@@ -104,7 +110,9 @@ def rate_errors_deg_s(rate: RateEstimate | None, truth: Truth) -> tuple[float, f
         return float("nan"), float("nan")
     signs = (1,) if rate.sign_known else (1, -1)
     error = min(np.linalg.norm(sign * rate.rate_rad_s - truth.rate_cam_rad_s) for sign in signs)
-    return float(np.degrees(error)), float(np.degrees(np.sqrt(np.trace(rate.covariance_rad2_s2))))
+    return float(np.degrees(error)), float(
+        np.degrees(np.sqrt(np.trace(rate.covariance_rad2_s2)))
+    )
 
 
 def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
@@ -202,7 +210,9 @@ class Score:
 def score(shot: Shot) -> Score:
     """A solved shot with the error of its solution."""
     assert shot.report is not None
-    return Score(shot, row(shot.camera, shot.frame, shot.truth, shot.report, shot.update_status))
+    return Score(
+        shot, row(shot.camera, shot.frame, shot.truth, shot.report, shot.update_status)
+    )
 
 
 def image_tag(image: NDArray[np.uint8]) -> str:

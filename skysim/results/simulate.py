@@ -72,7 +72,9 @@ def render(scene: Scene, index: int = 0) -> tuple[Frame, Truth]:
     """
     frames = scene.exposure.frames
     if not 0 <= index < frames:
-        raise InputError("index", f"{index} is outside of the scene's frames", f"0 to {frames - 1}")
+        raise InputError(
+            "index", f"{index} is outside of the scene's frames", f"0 to {frames - 1}"
+        )
     needs_all = scene.filter is not None or scene.tracker.exposure_control is not None
     with open_flight(scene) as flight:
         shots = flight.shots(
@@ -116,7 +118,9 @@ def render_at(
     if index < 0:
         raise InputError("index", f"{index} is negative", "0 or more")
     if not 0 <= camera < len(lab.cameras):
-        raise InputError("camera", f"{camera} is none of the lab's", f"0 to {len(lab.cameras) - 1}")
+        raise InputError(
+            "camera", f"{camera} is none of the lab's", f"0 to {len(lab.cameras) - 1}"
+        )
     own = lab.cameras[camera]
     rows = own.scene.camera.height_px
     window = timing.window_from(own.scene, 0.0)

@@ -55,7 +55,11 @@ def summary(log: Telemetry) -> dict[str, float]:
     if imu is not None and log.saturated is not None:
         statistics |= {"imu_deg_worst": imu.max(), "imu_deg_end": imu[-1]}
         statistics["gyro_saturated_s"] = log.saturated.sum() * log.period_s
-    if by_filter is not None and log.assumed_bias_rad_s is not None and log.bias_rad_s is not None:
+    if (
+        by_filter is not None
+        and log.assumed_bias_rad_s is not None
+        and log.bias_rad_s is not None
+    ):
         bias_error = per_hour(log.assumed_bias_rad_s - log.bias_rad_s)[-1]
         statistics["filter_deg_worst"] = by_filter.max()
         statistics["filter_arcsec_end"] = by_filter[-1] / ARCSEC_DEG
@@ -128,7 +132,10 @@ def imu_table(record: Increments) -> Any:
     columns |= {f"velocity_{end}_m_s": record.velocity_m_s[:, n] for n, end in enumerate(AXES)}
     level_deg = np.degrees([tilt_rad(velocity[None]) for velocity in record.velocity_m_s])
     columns["level_roll_deg"], columns["level_pitch_deg"] = level_deg.T
-    columns |= {"gyro_saturated": record.saturated, "accelerometer_overloaded": record.overloaded}
+    columns |= {
+        "gyro_saturated": record.saturated,
+        "accelerometer_overloaded": record.overloaded,
+    }
     return Table(columns)
 
 

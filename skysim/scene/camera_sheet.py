@@ -114,9 +114,7 @@ def rounded(value: float, digits: int = 4) -> float:
 
 Values = Mapping[str, Any]  # parsed answers, by the name of the question
 
-WELL_E_UM2 = (
-    900.0  # full well per square micrometer of the IMX264, the least of the cameras in data/cameras
-)
+WELL_E_UM2 = 900.0  # full well per square micrometer of the IMX264, the least of the cameras in data/cameras
 TRANSFER = "1 us"  # transfer time of a row of a charge-coupled device
 
 
@@ -195,7 +193,9 @@ def gain_of_well(values: Values) -> AssumedValue:
     """Assumed gain, which maps the full well to the end of the range; rounded up to four digits."""
     exact = max(values["full_well"], 1e-3) / range_dn(values)
     step = 10.0 ** (math.floor(math.log10(exact)) - 3)
-    return AssumedValue(rounded(step * math.ceil(exact / step)), "the range ends at the full well")
+    return AssumedValue(
+        rounded(step * math.ceil(exact / step)), "the range ends at the full well"
+    )
 
 
 def range_dn(values: Values) -> float:
@@ -339,7 +339,10 @@ REQUIRED = tuple(name for name, question in QUESTIONS.items() if question.conseq
 CURVES = {"interline": "interline", "frame_transfer": "thick_ccd"}
 # Values with which an answer is checked before these two are given.
 PLACEHOLDERS = {"pixels": "1000x1000", "pitch": "5 um"}
-PLACEHOLDER_LENS = {"focal_length": "1 m", "f_number": 1.0}  # to validate a camera without a lens
+PLACEHOLDER_LENS = {
+    "focal_length": "1 m",
+    "f_number": 1.0,
+}  # to validate a camera without a lens
 # Units of the limits in messages.
 SI = {"pixel": " m", "focal_length": " m", "shutter.row_time": " s"}
 COMMENT_COLUMN = 34

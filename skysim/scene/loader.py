@@ -133,7 +133,10 @@ def calibrated_keys(path: Path, camera: dict[str, Any]) -> dict[str, Any]:
         allowed = f"{error.allowed}; camera.calibration requires it, and focus"
         raise InputError("camera.pixel", error.problem, allowed) from None
     calibrated_px = calibration.width_px, calibration.height_px
-    size_px = camera.get("width_px", calibrated_px[0]), camera.get("height_px", calibrated_px[1])
+    size_px = (
+        camera.get("width_px", calibrated_px[0]),
+        camera.get("height_px", calibrated_px[1]),
+    )
     if size_px != calibrated_px:
         raise InputError(
             "camera.calibration",
@@ -426,7 +429,9 @@ def resolve_file(folder: Path, tree: Any, *keys: str) -> Any:
 def file_names(tree: Any) -> Iterator[tuple[str, str]]:
     """Yield the dotted keys under which a scene may name files, with their values."""
 
-    def below(node: Any, keys: tuple[str, ...], path: tuple[str, ...]) -> Iterator[tuple[str, str]]:
+    def below(
+        node: Any, keys: tuple[str, ...], path: tuple[str, ...]
+    ) -> Iterator[tuple[str, str]]:
         """Those below a node that is at path, under further keys."""
         if not keys:
             if isinstance(node, str):
@@ -442,7 +447,9 @@ def file_names(tree: Any) -> Iterator[tuple[str, str]]:
 
 
 def load_camera(
-    path: Path, lens: Mapping[str, Any] | None = None, overrides: Mapping[str, str] | None = None
+    path: Path,
+    lens: Mapping[str, Any] | None = None,
+    overrides: Mapping[str, str] | None = None,
 ) -> CameraConfig:
     """The `camera` section of a scene, or of a file with only a camera. Raises InputError.
 

@@ -59,9 +59,7 @@ class OpencvCalibration:
     def field_text(self) -> str:
         """The field of view and the angle of a pixel in words."""
         width, height, diagonal = self.field_deg
-        return (
-            f"{width:.2f}° × {height:.2f}°, diagonal {diagonal:.2f}°; {self.arcsec_px:.4g}″ a pixel"
-        )
+        return f"{width:.2f}° × {height:.2f}°, diagonal {diagonal:.2f}°; {self.arcsec_px:.4g}″ a pixel"
 
 
 class Loader(StrictLoader):

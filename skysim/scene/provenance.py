@@ -185,7 +185,9 @@ def entries(model: ConfigModel, tree: Any, parent: tuple[str, ...] = ()) -> Iter
         else:
             written = raw.value if isinstance(raw, Located) and not sections(value) else None
             origin = next(origins_in(raw), DEFAULT)
-            yield Entry((*parent, key), plain(value, name) if written is None else written, origin)
+            yield Entry(
+                (*parent, key), plain(value, name) if written is None else written, origin
+            )
 
 
 def origins_in(tree: Any) -> Iterator[Origin]:
@@ -247,7 +249,9 @@ def text(found: list[Entry]) -> str:
         *parents, key = path
         # Open the sections that the previous key does not share.
         shared = shared_depth(open_, parents)
-        lines += [(f"{'  ' * depth}{parents[depth]}:", "") for depth in range(shared, len(parents))]
+        lines += [
+            (f"{'  ' * depth}{parents[depth]}:", "") for depth in range(shared, len(parents))
+        ]
         open_ = parents
         indent = "  " * len(parents)
         comment = f"{origin}; no effect" if no_effect else str(origin)
@@ -257,7 +261,8 @@ def text(found: list[Entry]) -> str:
         lines.append((f"{indent}{key}:", comment))
         lines += [(f"{indent}  - {flow(item)}", "") for item in value]
     return "".join(
-        f"{line.ljust(COMMENT_COLUMN)}  # {note}\n" if note else f"{line}\n" for line, note in lines
+        f"{line.ljust(COMMENT_COLUMN)}  # {note}\n" if note else f"{line}\n"
+        for line, note in lines
     )
 
 

@@ -63,7 +63,9 @@ class ExposureConfig(ConfigModel):
         """Check that an exposure ends before the next begins, and that the run is not too long."""
         if self.time_s + self.trigger_jitter_s > 1 / self.rate_hz:
             jitter = (
-                f" plus trigger_jitter {self.trigger_jitter_s:g} s" if self.trigger_jitter_s else ""
+                f" plus trigger_jitter {self.trigger_jitter_s:g} s"
+                if self.trigger_jitter_s
+                else ""
             )
             raise InputError(
                 "time",
@@ -151,13 +153,19 @@ class Scene(ConfigModel):
                     "seed": tracker.survey.seed,
                 }
             )
-        if not isinstance(self.light, DomeConfig) and (tracker.survey != lens_only or tracker.map):
+        if not isinstance(self.light, DomeConfig) and (
+            tracker.survey != lens_only or tracker.map
+        ):
             key = "map" if tracker.map else "survey"
             raise InputError(
-                f"tracker.{key}", f"light of kind {self.light.kind} has no LEDs to survey", "dome"
+                f"tracker.{key}",
+                f"light of kind {self.light.kind} has no LEDs to survey",
+                "dome",
             )
         # The start is a pointing under the stars, else an attitude.
-        if self.motion.start != "profile" and sky != isinstance(self.motion.start, PointingConfig):
+        if self.motion.start != "profile" and sky != isinstance(
+            self.motion.start, PointingConfig
+        ):
             keys = "ra_deg, dec_deg, roll_deg" if sky else "roll_deg, pitch_deg, yaw_deg"
             raise InputError("motion.start", f"light of kind {self.light.kind} requires {keys}")
         if not sky and any(glow.kind == "faint_stars" for glow in self.background):
@@ -192,7 +200,9 @@ class Scene(ConfigModel):
             update={"camera_m": camera_m, "field_deg": points.field_deg or field_deg}
         )
         layout = layout.model_copy(update={"points": points}) if nested and layout else points
-        return self.model_copy(update={"light": self.light.model_copy(update={"layout": layout})})
+        return self.model_copy(
+            update={"light": self.light.model_copy(update={"layout": layout})}
+        )
 
     @model_validator(mode="after")
     def check_code(self) -> Scene:
@@ -218,7 +228,9 @@ class Scene(ConfigModel):
         }
         for key, section in sections.items():
             if section and not first <= self.start_time.year <= last:
-                raise InputError(key, f"start_time {self.start_time} is outside {first} to {last}")
+                raise InputError(
+                    key, f"start_time {self.start_time} is outside {first} to {last}"
+                )
         return self
 
     @model_validator(mode="after")
@@ -229,7 +241,12 @@ class Scene(ConfigModel):
                 "orbit", f"light of kind {self.light.kind} is in a laboratory", "stars"
             )
         satellites = getattr(self.light, "satellites", None)
-        if satellites and satellites.file and not self.orbit and self.site.longitude_deg is None:
+        if (
+            satellites
+            and satellites.file
+            and not self.orbit
+            and self.site.longitude_deg is None
+        ):
             raise InputError(
                 "light.satellites.file", "requires the section orbit, or a site.longitude_deg"
             )
@@ -297,7 +314,8 @@ class Scene(ConfigModel):
         stores_momentum = commanded is not None and commanded.stores_momentum
         if control.desaturation and not (self.vehicle.fans and stores_momentum):
             raise InputError(
-                "motion.control.desaturation", "requires vehicle.fans, and actuators wheels or cmgs"
+                "motion.control.desaturation",
+                "requires vehicle.fans, and actuators wheels or cmgs",
             )
         if {"truth": False, "imu": not imu, "filter": not self.filter}[control.feedback]:
             section = "vehicle.imu" if control.feedback == "imu" else "filter"
@@ -318,7 +336,8 @@ class Scene(ConfigModel):
         imu = self.vehicle.imu
         if imu and self.filter and self.filter.bias_time_s < 10 / imu.rate_hz:
             raise InputError(
-                "filter.bias_time", f"shorter than ten samples of the IMU, {10 / imu.rate_hz:g} s"
+                "filter.bias_time",
+                f"shorter than ten samples of the IMU, {10 / imu.rate_hz:g} s",
             )
         sines_hz = [leg.frequency_hz for leg in self.motion.maneuver if leg.kind == "sine"]
         chirps_hz = [
@@ -344,12 +363,15 @@ class Scene(ConfigModel):
         names = [head.name for head in self.heads]
         for n, head in enumerate(self.heads):
             if head.name in ("main", *names[:n]):
-                raise InputError(f"heads.{n}.name", f"{head.name} is the name of another camera")
+                raise InputError(
+                    f"heads.{n}.name", f"{head.name} is the name of another camera"
+                )
             if any(head.mount_arcsec_k) and not self.thermal:
                 raise InputError(f"heads.{n}.mount_arcsec_k", "requires the section thermal")
             own = self.of_head(n)
             values = {
-                field.alias or key: getattr(own, key) for key, field in Scene.model_fields.items()
+                field.alias or key: getattr(own, key)
+                for key, field in Scene.model_fields.items()
             }
             try:
                 Scene.model_validate(values)
@@ -366,7 +388,9 @@ class Scene(ConfigModel):
         camera = head.camera or main
         if camera.detector.hardware_seed == main.detector.hardware_seed:
             unit = {"hardware_seed": main.detector.hardware_seed + n + 1}
-            camera = camera.model_copy(update={"detector": camera.detector.model_copy(update=unit)})
+            camera = camera.model_copy(
+                update={"detector": camera.detector.model_copy(update=unit)}
+            )
         thermal = self.thermal and self.thermal.model_copy(
             update={"mount_arcsec_k": head.mount_arcsec_k}
         )
@@ -392,7 +416,8 @@ class Scene(ConfigModel):
         tracker = self.tracker
         dome = self.light if isinstance(self.light, DomeConfig) else None
         stages = [
-            getattr(tracker, stage) for stage in ("detector", "centroider", "identifier", "solver")
+            getattr(tracker, stage)
+            for stage in ("detector", "centroider", "identifier", "solver")
         ]
         focus = "infinity" if math.isinf(camera.focus_m) else f"{camera.focus_m:.4g} m"
         return [

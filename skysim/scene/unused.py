@@ -69,7 +69,9 @@ def under_dome(scene: Scene) -> bool:
 
 def steady(scene: Scene) -> bool:
     """Whether all light is steady."""
-    return isinstance(scene.light, DomeConfig) and isinstance(scene.light.led.drive, DirectConfig)
+    return isinstance(scene.light, DomeConfig) and isinstance(
+        scene.light.led.drive, DirectConfig
+    )
 
 
 def equally_bright(scene: Scene) -> bool:
@@ -107,7 +109,9 @@ def external(scene: Scene) -> bool:
 def surface_unused(scene: Scene) -> bool:
     """Whether a map replaces the surveyed LEDs and the solver does not use the surveyed surface."""
     tracker = scene.tracker
-    return tracker.map is not None and (external(scene) or tracker.solver not in SURFACE_SOLVERS)
+    return tracker.map is not None and (
+        external(scene) or tracker.solver not in SURFACE_SOLVERS
+    )
 
 
 def survey_draws_nothing(scene: Scene) -> bool:
@@ -225,7 +229,12 @@ RULES = (
         "tracker.name: an external tracker",
     ),
     Rule(
-        ("tracker.centroider", "tracker.identifier", "tracker.solver", "tracker.centroid_sigma_px"),
+        (
+            "tracker.centroider",
+            "tracker.identifier",
+            "tracker.solver",
+            "tracker.centroid_sigma_px",
+        ),
         external,
         "an external tracker has its own algorithms",
         "tracker.name: own, or tracker.options",
@@ -267,7 +276,12 @@ RULES = (
         "tracker.name: own",
     ),
     Rule(
-        ("tracker.detector", "tracker.threshold_sigma", "tracker.min_area_px", "tracker.brightest"),
+        (
+            "tracker.detector",
+            "tracker.threshold_sigma",
+            "tracker.min_area_px",
+            "tracker.brightest",
+        ),
         lambda scene: external(scene) and scene.tracker.exposure_control is None,
         "an external tracker has its own detection",
         "tracker.name: own, or tracker.options",
@@ -304,7 +318,8 @@ RULES = (
     Rule(
         ("light.led.pwm_period",),
         lambda scene: (
-            isinstance(scene.light, DomeConfig) and not isinstance(scene.light.led.drive, PwmConfig)
+            isinstance(scene.light, DomeConfig)
+            and not isinstance(scene.light.led.drive, PwmConfig)
         ),
         "it is the period of the drive pwm",
         "light.led.drive: {kind: pwm}",
@@ -397,7 +412,11 @@ RULES = (
         "camera.detector.prnu, dsnu, column_offset_e or hot_pixels above 0",
     ),
     Rule(
-        ("camera.detector.blooming", "camera.detector.anti_blooming", "camera.detector.particles"),
+        (
+            "camera.detector.blooming",
+            "camera.detector.anti_blooming",
+            "camera.detector.particles",
+        ),
         lambda scene: not scene.camera.detector.noise,
         "with camera.detector.noise: false a frame is the expected value without full well and particles",
         "camera.detector.noise: true",

@@ -63,7 +63,9 @@ class TrackerCompilation(event.Listener):
 @contextmanager
 def on_two_processes(scene: str, overrides: Mapping[str, str]) -> Iterator[None]:
     """Within this context, compile the scene's tracker in a second process if the renderer must be compiled."""
-    listener = TrackerCompilation([scene, *(f"{key}={value}" for key, value in overrides.items())])
+    listener = TrackerCompilation(
+        [scene, *(f"{key}={value}" for key, value in overrides.items())]
+    )
     event.register("numba:compile", listener)
     try:
         yield

@@ -20,7 +20,13 @@ from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Clock
 from skysim.camera import thermal_motion
-from skysim.camera.detector import AddedCharge, add_snr_and_saturation, expose, saturation_dn, smear
+from skysim.camera.detector import (
+    AddedCharge,
+    add_snr_and_saturation,
+    expose,
+    saturation_dn,
+    smear,
+)
 from skysim.camera.discs import concatenated, render_bodies
 from skysim.camera.glow import background, stray
 from skysim.camera.render import Window, in_view, project, render
@@ -90,7 +96,9 @@ def render_frame(
     clock.lap("detector")
     # 6. Frame with the camera's time tag, and truth.
     tagged_s = exposure.t_s + time_tag_error_s(scene, index)
-    frame = Frame(index, image, tagged_s, window.exposure_s, saturation_dn(scene.camera.detector))
+    frame = Frame(
+        index, image, tagged_s, window.exposure_s, saturation_dn(scene.camera.detector)
+    )
     return frame, truth_of(beam, exposure, sources)
 
 
@@ -191,7 +199,9 @@ def draw_lights(image: NDArray[Any], beam: Beam, exposure: Exposure) -> SourceTr
         exposed = exposure.exposed(path.optics)
         for lit in beam.lits:
             if lit.points is not None:
-                drawn = render(image, lit.points, *exposed, lit.emitter, any_of(beam.before(lit)))
+                drawn = render(
+                    image, lit.points, *exposed, lit.emitter, any_of(beam.before(lit))
+                )
                 truths.append(stray.as_ghosts(drawn, path.number))
             if lit.discs:
                 bodies = render_bodies(image, lit.discs, exposed, lit.occlusion)
@@ -219,7 +229,9 @@ def truth_of(beam: Beam, exposure: Exposure, sources: SourceTruth) -> Truth:
 
 def hidden_ids(beam: Beam, exposure: Exposure) -> NDArray[np.int64]:
     """(M,) ids of the points that something hides and that would otherwise be on the detector at mid-exposure."""
-    return np.concatenate([np.zeros(0, np.int64), *(hidden_of(lit, exposure) for lit in beam.lits)])
+    return np.concatenate(
+        [np.zeros(0, np.int64), *(hidden_of(lit, exposure) for lit in beam.lits)]
+    )
 
 
 def hidden_of(lit: Lit, exposure: Exposure) -> NDArray[np.int64]:

@@ -413,11 +413,17 @@ class Flight:
         self, schedules: Sequence[Schedule], solves: bool, selects: FrameSelector | None
     ) -> Iterator[Shot]:
         """Yield the exposures that ended within the motion but are due after its end; the filter is not updated."""
-        while late := [one for one in schedules if not one.is_over and one.close_s <= self.now_s]:
+        while late := [
+            one for one in schedules if not one.is_over and one.close_s <= self.now_s
+        ]:
             yield from self.capture_next(earliest(late), solves, selects, updates_filter=False)
 
     def capture_next(
-        self, schedule: Schedule, solves: bool, selects: FrameSelector | None, updates_filter: bool
+        self,
+        schedule: Schedule,
+        solves: bool,
+        selects: FrameSelector | None,
+        updates_filter: bool,
     ) -> Iterator[Shot]:
         """Yield the next exposure of a camera if it is selected."""
         index = schedule.index
@@ -460,8 +466,12 @@ class Flight:
             )
         # Render.
         clock = Clock()
-        trajectory = self.trajectory() if self.is_over else self.motion.trajectory(window.open_s)
-        frame, truth = render_frame(camera, trajectory.since(window.open_s), index, clock, window)
+        trajectory = (
+            self.trajectory() if self.is_over else self.motion.trajectory(window.open_s)
+        )
+        frame, truth = render_frame(
+            camera, trajectory.since(window.open_s), index, clock, window
+        )
         # Solve.
         rate = self.measured_rate(camera, window)
         report = None
@@ -526,7 +536,8 @@ class Flight:
             )
         window = timing.exposure_window(scene, index, exposure_s)
         if not (
-            0 <= index < schedule.frames and window.close_s(scene.camera.height_px) <= self.now_s
+            0 <= index < schedule.frames
+            and window.close_s(scene.camera.height_px) <= self.now_s
         ):
             raise InputError(
                 "render", f"frame {index} is not exposed at {self.now_s:g} s", "one that is"

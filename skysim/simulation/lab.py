@@ -153,7 +153,9 @@ def with_tracker(scene: Scene, tracker: Any) -> tuple[Scene, factory.Estimator |
         estimator = FunctionTracker(name_of(tracker), tracker)
     elif not isinstance(tracker, str):
         what = (
-            f"the class {tracker.__name__}" if isinstance(tracker, type) else type(tracker).__name__
+            f"the class {tracker.__name__}"
+            if isinstance(tracker, type)
+            else type(tracker).__name__
         )
         raise InputError(
             "tracker", what, "a name, a function of an image, a StarTracker or a DomeTracker"
@@ -270,7 +272,9 @@ class Lab:
     def in_run(self, seed: int) -> Lab:
         """The same hardware in the run of another seed: other noise, vibration, timing, and phases of LED clocks."""
         lab = self.with_scene(self.scene.model_copy(update={"seed": seed}))
-        return replace(lab, cameras=tuple(replace(camera, run_seed=seed) for camera in lab.cameras))
+        return replace(
+            lab, cameras=tuple(replace(camera, run_seed=seed) for camera in lab.cameras)
+        )
 
     def with_camera(self, **changes: Any) -> Lab:
         """The lab with changed fields of its main camera."""
@@ -279,7 +283,9 @@ class Lab:
     def with_light(self, light: Light) -> Lab:
         """The lab with one light of the main camera replaced: that of the same class."""
         return self.with_camera(
-            lights=tuple(light if type(one) is type(light) else one for one in self.camera.lights)
+            lights=tuple(
+                light if type(one) is type(light) else one for one in self.camera.lights
+            )
         )
 
     def with_sources(self, sources: Sources) -> Lab:
@@ -340,7 +346,8 @@ def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:
     shown = light_catalog(scene)
     main = build_camera(scene, vehicle, mount, shown)
     heads = [
-        build_head(scene, n, vehicle, main, shown, parts.programs) for n in range(len(scene.heads))
+        build_head(scene, n, vehicle, main, shown, parts.programs)
+        for n in range(len(scene.heads))
     ]
     start = lab_from_body_start(scene, mount, profiles)
     return Lab(scene, vehicle, (main, *heads), start, profiles)
@@ -406,7 +413,9 @@ def build_head(
         check_hardware(scene, programs, True)
         band = Band.from_camera(scene.camera) if head.camera else main.band
         known = None if head.camera else main.known
-        lights = build_lights(LightPlan(scene, band, vehicle, main.viewpoint, shown, known, mount))
+        lights = build_lights(
+            LightPlan(scene, band, vehicle, main.viewpoint, shown, known, mount)
+        )
     except InputError as error:
         raise error.under(f"heads.{n}") from None
     return replace(

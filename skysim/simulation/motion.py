@@ -46,7 +46,10 @@ ROUNDING = 1e-6  # relative excess over a limit that counts as rounding
 
 
 def check_reference(
-    reference: guidance.Reference, scene: Scene, model: multibody.VehicleModel, duration_s: float
+    reference: guidance.Reference,
+    scene: Scene,
+    model: multibody.VehicleModel,
+    duration_s: float,
 ) -> None:
     """Raise InputError for a maneuver beyond the tilt stop, the gyros' range or the actuators' torque.
 
@@ -73,7 +76,9 @@ def check_reference(
             check_torque(key, begin_s + t_s, used, torque_nm, motion.control)
 
 
-def check_tilt(reference: guidance.Reference, vehicle: VehicleConfig, duration_s: float) -> None:
+def check_tilt(
+    reference: guidance.Reference, vehicle: VehicleConfig, duration_s: float
+) -> None:
     """Raise InputError for a tilt beyond the stop of the air bearing."""
     if vehicle.mount != "air_bearing":
         return
@@ -144,7 +149,10 @@ class TelemetryRecorder:
     """
 
     def __init__(
-        self, simulation: Simulation, flight_computer: FlightComputer, navigation: Navigation | None
+        self,
+        simulation: Simulation,
+        flight_computer: FlightComputer,
+        navigation: Navigation | None,
     ) -> None:
         self.simulation = simulation
         self.flight_computer = flight_computer
@@ -202,7 +210,9 @@ class TelemetryRecorder:
             for n, name in enumerate(mounting_states(navigation)):
                 self.mountings[n, :, k] = state.others[name], state.sigma(name)
 
-    def telemetry(self, reference: Reference | None, cameras: Sequence[StarCamera]) -> Telemetry:
+    def telemetry(
+        self, reference: Reference | None, cameras: Sequence[StarCamera]
+    ) -> Telemetry:
         """The rows so far as Telemetry; reference is the commanded attitude, None without a controller."""
         simulation = self.simulation
         vehicle = self.simulation.vehicle
@@ -233,7 +243,9 @@ class TelemetryRecorder:
             states[:, 1 + nq + vehicle.wheels.dof],
             gimbals,
             states[:, 1 : 1 + nq].copy(),
-            cmgs.model.manipulability(gimbals, rotors) if isinstance(cmgs, CmgActuator) else None,
+            cmgs.model.manipulability(gimbals, rotors)
+            if isinstance(cmgs, CmgActuator)
+            else None,
             reference.attitudes(t_s) if reference else None,
             rotation(self.imu_wxyz[rows]) if has_imu else None,
             self.saturated[rows] if has_imu else None,
@@ -281,7 +293,8 @@ def mounting_rad(camera: StarCamera, t_s: Floats) -> Floats:
     error = camera.mount_error or Rotation.identity()
     config = camera.scene.thermal
     turned = [
-        (thermal_motion.turned(config, t) if config else Rotation.identity()) * error for t in t_s
+        (thermal_motion.turned(config, t) if config else Rotation.identity()) * error
+        for t in t_s
     ]
     return -camera.mount.cam_from_body.inv().apply(Rotation.concatenate(turned).as_rotvec())
 
@@ -332,7 +345,9 @@ class Motion:
         )
         if kept_s is None:
             # This raises InputError for too many samples before any long work.
-            self.vibration.subdivisions(self.simulation.times_s(0, self.simulation.last_step + 1))
+            self.vibration.subdivisions(
+                self.simulation.times_s(0, self.simulation.last_step + 1)
+            )
         self.flight_computer = FlightComputer(scene, vehicle, self.reference, controllers)
         self.navigation = build_navigation(lab, math.inf if kept_s is None else kept_s)
         self.disturbances = DisturbanceModel.from_config(
@@ -356,7 +371,9 @@ class Motion:
     @property
     def is_free(self) -> bool:
         """Whether nothing depends on the motion: no disturbances, no controller and no navigation."""
-        return self.disturbances.inactive and not (self.lab.scene.motion.control or self.navigation)
+        return self.disturbances.inactive and not (
+            self.lab.scene.motion.control or self.navigation
+        )
 
     @property
     def period_steps(self) -> int:

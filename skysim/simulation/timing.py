@@ -28,7 +28,9 @@ def window_from(scene: Scene, begin_s: float, exposure_s: float | None = None) -
     """The window of an exposure that begins at begin_s, with the row time of the camera's shutter."""
     shutter = scene.camera.shutter
     row_time_s = shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0
-    return Window(begin_s, scene.exposure.time_s if exposure_s is None else exposure_s, row_time_s)
+    return Window(
+        begin_s, scene.exposure.time_s if exposure_s is None else exposure_s, row_time_s
+    )
 
 
 def time_tag_error_s(scene: Scene, index: int) -> float:

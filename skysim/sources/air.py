@@ -57,7 +57,11 @@ EXPOSURES_S = np.geomspace(1e-5, 1e2, 22)
 
 
 def variance(
-    air_masses: Floats, aperture_m: float, exposure_s: float, height_m: float, wavelength_m: float
+    air_masses: Floats,
+    aperture_m: float,
+    exposure_s: float,
+    height_m: float,
+    wavelength_m: float,
 ) -> Floats:
     """(N,) relative variances of stars' light at these air masses, seen from a site at a height above the sea."""
     spline = variance_table(aperture_m, height_m, wavelength_m)
@@ -68,7 +72,9 @@ def variance(
 
 
 @lru_cache(maxsize=8)
-def variance_table(aperture_m: float, height_m: float, wavelength_m: float) -> RectBivariateSpline:
+def variance_table(
+    aperture_m: float, height_m: float, wavelength_m: float
+) -> RectBivariateSpline:
     """The logarithm of the variance as a spline in the logarithms of air mass and exposure.
 
     1. Layers of the model atmosphere, scaled so that the limit of wide apertures and long exposures is Young's law,
@@ -185,7 +191,9 @@ class Air:
     wavelength_m: float
 
     @classmethod
-    def from_config(cls, config: AirConfig, site: SiteConfig, stars: Catalog, band: Band) -> Air:
+    def from_config(
+        cls, config: AirConfig, site: SiteConfig, stars: Catalog, band: Band
+    ) -> Air:
         """The air over a site for a catalog's stars and a chip's band."""
         order = np.argsort(stars.hip)
         b_v = complete_colors(stars.b_v, stars.v_i)[0][order]
@@ -263,7 +271,9 @@ class Sky:
         direction = self.air.refraction.apparent(body.place.direction[None], self.zenith)[0]
         # The bright limb stays perpendicular to the new direction.
         along = body.place.toward_sun - (body.place.toward_sun @ direction) * direction
-        place = body.place._replace(direction=direction, toward_sun=along / np.linalg.norm(along))
+        place = body.place._replace(
+            direction=direction, toward_sun=along / np.linalg.norm(along)
+        )
         # The body's color: the Sun's, and the ratio of its albedos.
         blue, visual = ALBEDO[body.name][:2]
         b_v = SUN[0] - 2.5 * np.log10(blue / visual)
@@ -328,5 +338,7 @@ def mean_wavelength_m(band: Band) -> float:
     """Mean wavelength of a G2 star's photo-electrons: int lambda n R d lambda / int n R d lambda."""
     sun_k = temperature_k(*SUN)
     total = band.integral(lambda wavelength_m: black_body_v0(wavelength_m, sun_k))
-    weighted = band.integral(lambda wavelength_m: wavelength_m * black_body_v0(wavelength_m, sun_k))
+    weighted = band.integral(
+        lambda wavelength_m: wavelength_m * black_body_v0(wavelength_m, sun_k)
+    )
     return float(weighted / total)

@@ -234,14 +234,17 @@ def polynomial(phase_deg: float, coefficients: tuple[float, ...]) -> float:
 
 def mercury(phase_deg: float, _place: Place, _tt_jd: float) -> float:
     return polynomial(
-        phase_deg, (-0.613, 6.3280e-2, -1.6336e-3, 3.3644e-5, -3.4265e-7, 1.6893e-9, -3.0334e-12)
+        phase_deg,
+        (-0.613, 6.3280e-2, -1.6336e-3, 3.3644e-5, -3.4265e-7, 1.6893e-9, -3.0334e-12),
     )
 
 
 def venus(phase_deg: float, _place: Place, _tt_jd: float) -> float:
     """Two polynomials: near inferior conjunction the clouds scatter sunlight forward."""
     far = (-4.384, -1.044e-3, 3.687e-4, -2.814e-6, 8.938e-9)
-    return polynomial(phase_deg, far if phase_deg < 163.7 else (236.05828, -2.81914, 8.39034e-3))
+    return polynomial(
+        phase_deg, far if phase_deg < 163.7 else (236.05828, -2.81914, 8.39034e-3)
+    )
 
 
 def mars(phase_deg: float, _place: Place, _tt_jd: float) -> float:
@@ -262,7 +265,9 @@ def saturn(phase_deg: float, place: Place, _tt_jd: float) -> float:
     """
     to_sun, to_observer = latitudes_rad("saturn", place)
     tilt = math.sin(math.sqrt(max(to_sun * to_observer, 0.0)))
-    return -8.914 - 1.825 * tilt + 0.026 * phase_deg - 0.378 * tilt * math.exp(-2.25 * phase_deg)
+    return (
+        -8.914 - 1.825 * tilt + 0.026 * phase_deg - 0.378 * tilt * math.exp(-2.25 * phase_deg)
+    )
 
 
 def uranus(phase_deg: float, place: Place, _tt_jd: float) -> float:
@@ -278,7 +283,9 @@ def neptune(phase_deg: float, _place: Place, tt_jd: float) -> float:
     """Neptune brightened from 1980 to 2000."""
     year = 2000 + (tt_jd - J2000_JD) / JULIAN_YEAR_DAY
     at_full = min(max(-6.89 - 0.0054 * (year - 1980), -7.0), -6.89)
-    return at_full + (polynomial(phase_deg, (0.0, 7.944e-3, 9.617e-5)) if phase_deg > 1.9 else 0.0)
+    return at_full + (
+        polynomial(phase_deg, (0.0, 7.944e-3, 9.617e-5)) if phase_deg > 1.9 else 0.0
+    )
 
 
 PLANETS: dict[str, Callable[[float, Place, float], float]] = {

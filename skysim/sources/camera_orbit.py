@@ -11,11 +11,21 @@ import erfa
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.core.constants import DAY_S, EARTH_FLATTENING, EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M
+from skysim.core.constants import (
+    DAY_S,
+    EARTH_FLATTENING,
+    EARTH_J2,
+    EARTH_MU_M3_S2,
+    EARTH_RADIUS_M,
+)
 from skysim.core.errors import InputError
 from skysim.core.time import tt_jd
 from skysim.core.types import Floats
-from skysim.scene.sections.surroundings import CircularOrbitConfig, OemOrbitConfig, TleOrbitConfig
+from skysim.scene.sections.surroundings import (
+    CircularOrbitConfig,
+    OemOrbitConfig,
+    TleOrbitConfig,
+)
 from skysim.scene.sections.vehicle import SiteConfig
 from skysim.sources.bodies import BODIES
 from skysim.sources.ephemeris import (
@@ -114,7 +124,9 @@ class TleOrbit:
             place, velocity, errors = gcrs_states(self.elements, time, after_s[rows] - middle_s)
             if errors.any():
                 raise InputError(
-                    "orbit.file", f"SGP4 has no place of this satellite at {time}", "newer elements"
+                    "orbit.file",
+                    f"SGP4 has no place of this satellite at {time}",
+                    "newer elements",
                 )
             position_m[rows] = place[0]
             velocity_m_s[rows] = velocity[0]
@@ -147,7 +159,9 @@ def tle(config: TleOrbitConfig, start: datetime.datetime) -> TleOrbit:
     elements = read_elements(config.file)
     rows = [n for n, number in enumerate(elements.numbers) if config.number in (None, number)]
     if len(rows) != 1:
-        listed = ", ".join(map(str, elements.numbers[:5])) + ", ..." * (len(elements.numbers) > 5)
+        listed = ", ".join(map(str, elements.numbers[:5])) + ", ..." * (
+            len(elements.numbers) > 5
+        )
         raise InputError(
             "orbit.number",
             f"{config.number}: {len(rows)} satellites of {config.file}",
@@ -271,7 +285,9 @@ def limb_elevation_rad(place_m: Floats, direction: Floats) -> Floats:
     radius = np.linalg.norm(place, axis=-1)
     length = np.linalg.norm(toward, axis=-1)
     # Elevation above the plane across the vertical, then the dip of the limb.
-    above_horizon = np.arcsin(np.clip(np.sum(place * toward, axis=-1) / (radius * length), -1, 1))
+    above_horizon = np.arcsin(
+        np.clip(np.sum(place * toward, axis=-1) / (radius * length), -1, 1)
+    )
     return np.asarray(above_horizon + np.arccos(1 / np.maximum(radius, 1.0)))
 
 

@@ -142,7 +142,8 @@ def write(
         table.writerow([*(c.name for c in columns), *text_columns])
         for row in rows:
             table.writerow(
-                [format(row[c.name], c.format) for c in columns] + [row[t] for t in text_columns]
+                [format(row[c.name], c.format) for c in columns]
+                + [row[t] for t in text_columns]
             )
 
 
@@ -186,7 +187,9 @@ def read(name_or_path: str | Path) -> Catalog:
     # A truncated file has fewer rows than its header says.
     if len(table) != meta["rows"]:
         raise catalog_error(path, f"damaged ({len(table)} stars of {meta['rows']})")
-    hip, ra, dec, pm_ra, pm_dec, parallax, v_mag, b_v, v_i, *scatter = np.ascontiguousarray(table.T)
+    hip, ra, dec, pm_ra, pm_dec, parallax, v_mag, b_v, v_i, *scatter = np.ascontiguousarray(
+        table.T
+    )
     return Catalog(
         hip=hip.astype(np.int64),
         ra_rad=np.radians(ra),

@@ -57,7 +57,9 @@ class Ephemeris(NamedTuple):
         if name == "earth":
             # The Earth is opposite to the Moon about their barycenter.
             to_moon_km = self.position_km("moon", tdb_jd)
-            return self.position_km("earth_moon", tdb_jd) - to_moon_km / (1 + self.earth_moon_ratio)
+            return self.position_km("earth_moon", tdb_jd) - to_moon_km / (
+                1 + self.earth_moon_ratio
+            )
         series = self.series[name]
         interval, offset_days = divmod(tdb_jd - self.first_jd, series.days)
         coefficients = series.coefficients[:, :, int(interval)] * series.unit_km
@@ -68,7 +70,9 @@ class Ephemeris(NamedTuple):
     def barycentric_km(self, name: str, tdb_jd: float) -> Floats:
         """(3,) position in km from the solar system's barycenter, for the Moon too."""
         position_km = self.position_km(name, tdb_jd)
-        return position_km + self.position_km("earth", tdb_jd) if name == "moon" else position_km
+        return (
+            position_km + self.position_km("earth", tdb_jd) if name == "moon" else position_km
+        )
 
 
 @lru_cache(maxsize=1)
@@ -130,7 +134,9 @@ def observe_at(time: datetime.datetime, from_earth: GcrsState) -> ObserverPlace:
     tt = tt_jd(time)
     velocity_km_s = erfa.epv00(tt, 0.0)[1]["v"] * (AU_KM / DAY_S)
     position_km = load_ephemeris().position_km("earth", tt) + from_earth.position_m / 1e3
-    return ObserverPlace(tt, position_km, velocity_km_s + from_earth.velocity_m_s / 1e3, from_earth)
+    return ObserverPlace(
+        tt, position_km, velocity_km_s + from_earth.velocity_m_s / 1e3, from_earth
+    )
 
 
 def site_in_gcrs(time: datetime.datetime, tt: float, site: SiteConfig) -> GcrsState:
@@ -212,7 +218,12 @@ def place(name: str, observer: ObserverPlace) -> Place:
         body_from_sun = from_sun_km / np.linalg.norm(from_sun_km)
         au = sun_km_away / AU_KM
         deflected = erfa.ld(
-            1.0, astrometric, body_from_sun, sun_to_observer_km / sun_km_away, au, DEFLECTION_LIMIT
+            1.0,
+            astrometric,
+            body_from_sun,
+            sun_to_observer_km / sun_km_away,
+            au,
+            DEFLECTION_LIMIT,
         )
     # 3. Aberration.
     beta = observer.velocity_km_s / SPEED_OF_LIGHT_KM_S
@@ -233,6 +244,8 @@ def lit_place(direction: Floats, from_sun_km: Floats, to_body_km: Floats) -> Pla
     across = to_sun - (to_sun @ to_observer) * to_observer
     phase_rad = float(np.arctan2(np.linalg.norm(across), to_sun @ to_observer))
     # The Sun itself and a body in opposition have no bright limb, so any direction serves.
-    along = across if np.linalg.norm(across) > 1e-12 else np.eye(3)[np.argmin(np.abs(direction))]
+    along = (
+        across if np.linalg.norm(across) > 1e-12 else np.eye(3)[np.argmin(np.abs(direction))]
+    )
     along = along - (along @ direction) * direction
     return Place(direction, from_sun_km, to_body_km, phase_rad, along / np.linalg.norm(along))

@@ -129,7 +129,9 @@ def read_tle(path: str, lines: list[tuple[int, str]]) -> Iterator[tuple[int, str
         try:
             record = Satrec.twoline2rv(*pair)
         except (ValueError, IndexError) as error:
-            raise InputError(path, f"not a TLE: {excerpt(error)}", where=Where(path, n)) from None
+            raise InputError(
+                path, f"not a TLE: {excerpt(error)}", where=Where(path, n)
+            ) from None
         yield usable(path, n, name, record)
 
 
@@ -242,7 +244,9 @@ VERSION = "CCSDS_OEM_VERS"
 VERSIONS = ("1.0", "2.0", "3.0")
 FRAMES = ("ICRF", "GCRF", "EME2000", "J2000")
 OEM_REQUIRED = ("CENTER_NAME", "REF_FRAME", "TIME_SYSTEM")
-SAME_M = 1.0  # adjoining segments may share a sample; its positions then differ by less than this
+SAME_M = (
+    1.0  # adjoining segments may share a sample; its positions then differ by less than this
+)
 KEYWORDS = ("META_START", "META_STOP", "COVARIANCE_START", "COVARIANCE_STOP")
 
 
@@ -306,7 +310,9 @@ def read_oem(path: str, start: datetime.datetime) -> OrbitEphemeris:
         t_s = np.concatenate([t_s, t])
         samples = np.concatenate([samples, more])
     if len(t_s) < 2 or (np.diff(t_s) <= 0).any():
-        raise InputError(path, f"the epochs of {len(t_s)} samples", "two or more, in order of time")
+        raise InputError(
+            path, f"the epochs of {len(t_s)} samples", "two or more, in order of time"
+        )
     # 3.
     missing = np.isnan(samples[:, 6])
     samples[missing, 6:] = gravity_m_s2(samples[missing, :3])

@@ -30,7 +30,12 @@ from skysim.core.constants import (
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
 from skysim.core.types import Floats
-from skysim.scene.sections.camera import CameraConfig, ChromaticConfig, EfficiencyConfig, curve_file
+from skysim.scene.sections.camera import (
+    CameraConfig,
+    ChromaticConfig,
+    EfficiencyConfig,
+    curve_file,
+)
 from skysim.scene.sections.leds import spectrum_file
 
 HC_J_M = PLANCK_J_S * SPEED_OF_LIGHT_M_S  # energy of a photon times its wavelength
@@ -92,7 +97,9 @@ class Band:
             path = curve_file(quantum_efficiency)
             return _read_curve(path, path.stat().st_mtime_ns)
         if isinstance(quantum_efficiency, EfficiencyConfig):
-            return _scaled(cls.from_efficiency(quantum_efficiency.curve), quantum_efficiency.peak)
+            return _scaled(
+                cls.from_efficiency(quantum_efficiency.curve), quantum_efficiency.peak
+            )
         return _flat(float(quantum_efficiency))
 
     def response_at(self, wavelength_m: Floats | float) -> Floats:
@@ -385,8 +392,12 @@ def chromatic_shifts(band: Band, wavelength_m: Floats) -> Floats:
     config = band.chromatic
     assert config is not None
     none = np.zeros(len(config.wavelength_m))
-    columns = [none if column is None else column for column in (config.focus_m, config.corner_px)]
-    return np.array([np.interp(wavelength_m, config.wavelength_m, column) for column in columns])
+    columns = [
+        none if column is None else column for column in (config.focus_m, config.corner_px)
+    ]
+    return np.array(
+        [np.interp(wavelength_m, config.wavelength_m, column) for column in columns]
+    )
 
 
 def synthetic_mag(

@@ -129,7 +129,9 @@ class Atmosphere:
         tropopause = np.array(EARTH_M + TROPOPAUSE_M)
         t_k = self.t0_k - LAPSE_K_M * (float(tropopause) - self.r0_m)
         fall_per_m = self.scale_per_k / t_k
-        excess = (self.troposphere(tropopause)[0] - 1) * np.exp(-fall_per_m * (r_m - tropopause))
+        excess = (self.troposphere(tropopause)[0] - 1) * np.exp(
+            -fall_per_m * (r_m - tropopause)
+        )
         return 1 + excess, -r_m * fall_per_m * excess
 
 

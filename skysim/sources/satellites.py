@@ -30,7 +30,9 @@ from skysim.sources.photometry import Band
 from skysim.sources.stars import steady_points
 
 ID_BASE = 1_000_000_000  # a satellite's number is this + its catalog number
-RANDOM_BASE = 2_000_000_000  # the number of a random satellite is this + its number in the frame
+RANDOM_BASE = (
+    2_000_000_000  # the number of a random satellite is this + its number in the frame
+)
 STANDARD_M = 1e6  # range of the standard magnitude
 OWN_M = 10.0  # a satellite nearer than this is the camera's own
 MARGIN_RAD = 1e-3  # added to the field's radius, for light time and aberration
@@ -160,7 +162,9 @@ def path(
     toward = toward / np.linalg.norm(toward, axis=1, keepdims=True) * range_m / range_m[1]
     before, place, after = toward
     # 4. Velocity and acceleration by central differences.
-    motion = np.stack([(after - before) / (2 * half_s), (after + before - 2 * place) / half_s**2])
+    motion = np.stack(
+        [(after - before) / (2 * half_s), (after + before - 2 * place) / half_s**2]
+    )
     return place, motion
 
 
@@ -188,7 +192,10 @@ def random_satellites(
     north = np.cross(view.boresight, east)
     for n in range(rng.poisson(mean)):
         # A place uniform over the cone's cap, and a heading.
-        cosine, around, heading = rng.uniform(np.cos(reach_rad), 1), *rng.uniform(0, 2 * np.pi, 2)
+        cosine, around, heading = (
+            rng.uniform(np.cos(reach_rad), 1),
+            *rng.uniform(0, 2 * np.pi, 2),
+        )
         outward = np.cos(around) * east + np.sin(around) * north
         sine = np.sqrt(1 - cosine**2)
         place = cosine * view.boresight + sine * outward
@@ -208,7 +215,11 @@ def random_satellites(
 
 
 def moving_light(
-    id: int, name: str, v_mag: float, seen: tuple[Floats, Floats], about: tuple[float, float, float]
+    id: int,
+    name: str,
+    v_mag: float,
+    seen: tuple[Floats, Floats],
+    about: tuple[float, float, float],
 ) -> MovingLight:
     """The light of a satellite on its path.
 
@@ -222,7 +233,9 @@ def moving_light(
     place, motion = seen
     rate_deg_s = float(np.degrees(np.linalg.norm(np.cross(place, motion[0]))))
     return MovingLight(
-        SatelliteTruth(id, name, v_mag, *to_astronomical(place), rate_deg_s, *about), place, motion
+        SatelliteTruth(id, name, v_mag, *to_astronomical(place), rate_deg_s, *about),
+        place,
+        motion,
     )
 
 
@@ -233,14 +246,18 @@ def as_sources(lights: Sequence[MovingLight], band: Band) -> Sources:
     ids: NDArray[np.int64] = np.array([light.truth.id for light in lights], np.int64)
     colors = reflected_chromatic(WHITE, band)
     chromatic = None if colors is None else np.tile(colors, (len(lights), 1))
-    points = steady_points(ids, np.array([light.place for light in lights]), flux, v_mag, chromatic)
+    points = steady_points(
+        ids, np.array([light.place for light in lights]), flux, v_mag, chromatic
+    )
     return replace(points, motion=np.array([light.motion for light in lights]))
 
 
 # Numbers of lights in the truth of frames that no star and no LED has: reflections of LEDs and ghosts of a lens.
 
 
-MIRRORED = 10_000_000  # the n-th image of an LED in the wall has n times this number and the LED's
+MIRRORED = (
+    10_000_000  # the n-th image of an LED in the wall has n times this number and the LED's
+)
 GHOST = 1_000_000_000_000  # the n-th ghost of a light has n times this number and the light's
 
 

@@ -104,7 +104,9 @@ def build_hipparcos(limit_hp: float, path: Path) -> dict[str, Any]:
     stars = {row["hip"]: row for row in hip2_rows(limit_hp)}
     stars |= {row["hip"]: row for row in supplement_rows() if row["hp_mag"] <= limit_hp}
     rows = [stars[hip] for hip in sorted(stars)]
-    catalog.write(path, HIPPARCOS_COLUMNS, rows, HIPPARCOS_META | {"limit_hp_mag": float(limit_hp)})
+    catalog.write(
+        path, HIPPARCOS_COLUMNS, rows, HIPPARCOS_META | {"limit_hp_mag": float(limit_hp)}
+    )
     return catalog.info(path)
 
 
@@ -124,7 +126,10 @@ def hip2_row(line: str) -> dict[str, Any]:
     row["dec_deg"] = np.degrees(row["dec_deg"])
     row["v_mag"] = JOHNSON_V.get(row["hip"], float(v_from_hp(row["hp_mag"], row["v_i"])))
     variable = int(line[HIP2_VARIABLE]) > 0
-    return row | {"source": "hip2", "scatter_mag": float(line[HIP2_SCATTER]) if variable else 0.0}
+    return row | {
+        "source": "hip2",
+        "scatter_mag": float(line[HIP2_SCATTER]) if variable else 0.0,
+    }
 
 
 def supplement_rows() -> list[dict[str, Any]]:
@@ -135,7 +140,9 @@ def supplement_rows() -> list[dict[str, Any]]:
         row: dict[str, Any] = {
             column.name: float(cells[column.name]) for column in HIPPARCOS_COLUMNS
         }
-        rows.append(row | {"hip": int(cells["hip"]), "source": "supplement", "scatter_mag": 0.0})
+        rows.append(
+            row | {"hip": int(cells["hip"]), "source": "supplement", "scatter_mag": 0.0}
+        )
     return rows
 
 
@@ -161,7 +168,14 @@ ALPHA_CENTAURI = {
     71683: (219.8670620, -60.8325861, -3857.2, 321.3, 750.8),
     71681: (219.8651416, -60.8319889, -3382.4, 1150.1, 750.8),
 }
-RECORD = [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("g", "<f4"), ("bp", "<f4"), ("rp", "<f4")]
+RECORD = [
+    ("id", "<i8"),
+    ("ra", "<f8"),
+    ("dec", "<f8"),
+    ("g", "<f4"),
+    ("bp", "<f4"),
+    ("rp", "<f4"),
+]
 
 GAIA_COLUMNS = (*catalog.star_columns(".1f"), catalog.SCATTER)
 GAIA_META: dict[str, Any] = {
@@ -246,7 +260,9 @@ def sky_rows(limit_v: float) -> list[dict[str, Any]]:
     copy(("hip", "scatter_mag"), hip, gaia, same)
     # 3. Hipparcos' light is trusted for a single star with colors that is not too red.
     single = np.bincount(pairs["i"], minlength=len(hip["hip"])) == 1
-    trusted = single & (np.abs(hip["b_v"]) + np.abs(hip["v_i"]) > 0) & (hip["v_i"] < REDDEST_V_I)
+    trusted = (
+        single & (np.abs(hip["b_v"]) + np.abs(hip["v_i"]) > 0) & (hip["v_i"] < REDDEST_V_I)
+    )
     both = same[trusted[same["i"]]]
     copy(LIGHT, hip, gaia, both)
     gaia["source"][both["j"]] = "both"
@@ -288,7 +304,8 @@ def hipparcos_table() -> Table:
     """All stars of Hipparcos-2 and the supplement, moved to J2016.0."""
     rows = [*hip2_rows(99.0), *supplement_rows()]
     table = {
-        name: np.array([row[name] for row in rows]) for name in (*catalog.NUMBERS, "scatter_mag")
+        name: np.array([row[name] for row in rows])
+        for name in (*catalog.NUMBERS, "scatter_mag")
     } | {"source": np.full(len(rows), "hip2")}
     # Unit vectors to the east and to the north carry the proper motion.
     ra = np.radians(table["ra_deg"])
@@ -354,5 +371,7 @@ def mutual_nearest(pairs: NDArray[Any]) -> NDArray[Any]:
 def without_companions(hip: Table, gaia: Table, pairs: NDArray[Any]) -> Floats:
     """(N,) V of the Hipparcos stars without the light of Gaia's stars near them, as long as half of it is left."""
     light = 10 ** (-0.4 * hip["v_mag"])
-    near = np.bincount(pairs["i"], 10 ** (-0.4 * gaia["v_mag"][pairs["j"]]), minlength=len(light))
+    near = np.bincount(
+        pairs["i"], 10 ** (-0.4 * gaia["v_mag"][pairs["j"]]), minlength=len(light)
+    )
     return np.asarray(-2.5 * np.log10(np.where(near < light / 2, light - near, light)))

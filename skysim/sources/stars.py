@@ -197,7 +197,9 @@ def cam_from_icrs(
     ra, dec, roll = (np.radians(angle) for angle in (ra_deg, dec_deg, roll_deg))
     # Unit vectors to the east, to the north and along the boresight.
     east = np.stack([-np.sin(ra), np.cos(ra), np.zeros_like(ra)], axis=-1)
-    north = np.stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)], axis=-1)
+    north = np.stack(
+        [-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)], axis=-1
+    )
     z = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
     y = -(np.cos(roll)[..., None] * north + np.sin(roll)[..., None] * east)
     return Rotation.from_matrix(np.stack([np.cross(y, z), y, z], axis=-2))

@@ -70,7 +70,9 @@ def write_dome_map(path: Path, dome: DomeMap) -> None:
     """Write a surveyed dome as ECSV: one row for each LED, the camera in the header."""
     from astropy.table import Table
 
-    table = Table(dict(zip(MAP_COLUMNS, (dome.id, *dome.position_m.T, dome.sigma_m), strict=True)))
+    table = Table(
+        dict(zip(MAP_COLUMNS, (dome.id, *dome.position_m.T, dome.sigma_m), strict=True))
+    )
     table.meta = {key: np.array(getattr(dome, key)).tolist() for key in MAP_META}
     write_table(path, table)
 
@@ -86,7 +88,9 @@ def read_dome_map(path: Path) -> DomeMap:
             warnings.simplefilter("ignore")
             table = Table.read(path, format="ascii.ecsv")
     except Exception as error:  # astropy's parsers raise many types of error
-        raise InputError(path, f"not an ECSV table: {' '.join(str(error).split())[:120]}") from None
+        raise InputError(
+            path, f"not an ECSV table: {' '.join(str(error).split())[:120]}"
+        ) from None
     missing = [name for name in MAP_COLUMNS if name not in table.colnames]
     if missing or not len(table):
         fault = f"no column {missing[0]}" if missing else "no LED"
@@ -105,7 +109,9 @@ def read_dome_map(path: Path) -> DomeMap:
     if count.max() > 1:
         raise InputError(path, f"LED {id_[count > 1][0]} occurs {count.max()} times", "once")
     # The camera.
-    meta = {key: header_numbers(path, table.meta, key, count) for key, count in MAP_META.items()}
+    meta = {
+        key: header_numbers(path, table.meta, key, count) for key, count in MAP_META.items()
+    }
     fields: dict[str, Any] = {
         key: value[0] if len(value) == 1 else tuple(value) for key, value in meta.items()
     }

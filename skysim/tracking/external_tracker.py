@@ -73,7 +73,9 @@ class ExternalTracker:
 
     def solve_frame(self, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
         """The tracker's report on a frame; streak_px is as in `Picture`."""
-        picture = Picture(frame.image_dn, frame.index, frame.t_mid_s, frame.exposure_s, streak_px)
+        picture = Picture(
+            frame.image_dn, frame.index, frame.t_mid_s, frame.exposure_s, streak_px
+        )
         try:
             return to_report(self.program.solve(picture))
         except ProgramError as error:
@@ -81,7 +83,9 @@ class ExternalTracker:
 
     def solve_centroids(self, centroids: Centroids) -> Attitude:
         """Raise InputError: external trackers do not support this."""
-        raise InputError("tracker.name", f"{self.program.name} solves frames, not centroids", OWN)
+        raise InputError(
+            "tracker.name", f"{self.program.name} solves frames, not centroids", OWN
+        )
 
 
 def build_setup(

@@ -23,7 +23,13 @@ from estimator.identification.registry import IDENTIFIERS
 from estimator.trackers.coded_tracker import CodedTracker, DecoderSettings
 from estimator.trackers.dome_tracker import IDENTIFIERS as NEAR_IDENTIFIERS
 from estimator.trackers.dome_tracker import DomeTracker
-from estimator.trackers.exposure_control import Control, NextExposure, Observation, observe, step
+from estimator.trackers.exposure_control import (
+    Control,
+    NextExposure,
+    Observation,
+    observe,
+    step,
+)
 from estimator.trackers.pipeline import Report, Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.camera.detector import saturation_dn
@@ -169,7 +175,9 @@ def build_tracker(
             decoder = DecoderSettings(**scene.tracker.decoder.model_dump())
             return CodedTracker(camera, leds, lever, settings, code, decoder)
         except ImageError as error:
-            raise InputError("light", f"the star tracker cannot use this dome: {error}") from None
+            raise InputError(
+                "light", f"the star tracker cannot use this dome: {error}"
+            ) from None
     # 3. Stars.
     stars = catalog.brighter_than(
         onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag
@@ -211,7 +219,9 @@ def solve_frame(
         return estimator.solve_frame(frame, streak_px)
     try:
         if isinstance(estimator, StarTracker):
-            return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s, frame.t_mid_s)
+            return estimator.solve(
+                frame.image_dn, streak_px, rate, frame.exposure_s, frame.t_mid_s
+            )
         if isinstance(estimator, CodedTracker):
             return estimator.solve(
                 frame.image_dn, streak_px, rate, frame.exposure_s, frame.t_mid_s, frame.index
@@ -253,7 +263,9 @@ class ExposureController:
         """Update the exposure time from a frame, which was exposed for `frame.exposure_s`."""
         if self.control:
             observed = observe_frame(self.settings, self.control, frame)
-            self.exposure_s = step(NextExposure(frame.exposure_s), observed, self.control).time_s
+            self.exposure_s = step(
+                NextExposure(frame.exposure_s), observed, self.control
+            ).time_s
 
 
 def control_settings(scene: Scene) -> Control | None:

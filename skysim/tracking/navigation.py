@@ -199,10 +199,14 @@ class Navigation:
             ),
             strict=True,
         )
-        t_s, angle, velocity, saturated, overloaded = (np.concatenate(column) for column in columns)
+        t_s, angle, velocity, saturated, overloaded = (
+            np.concatenate(column) for column in columns
+        )
         return imu.Increments(t_s, self.step_s, angle, velocity, saturated, overloaded)
 
-    def apparent_bias_rad_s(self, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats) -> Floats:
+    def apparent_bias_rad_s(
+        self, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats
+    ) -> Floats:
         """(3,) error of the measured rate without noise at a true attitude (4,) and rate (3,), in body axes.
 
         It is the sum of the gyro bias, the scale factor and misalignment errors times the rate, and the Earth rate if
@@ -230,7 +234,11 @@ class Navigation:
         the attitude along the motion, so its standard deviation s adds s^2 w w^T to the covariance, with the filter's
         rate w.
         """
-        if self.filter is None or solution.cam_from_ref is None or solution.covariance_rad2 is None:
+        if (
+            self.filter is None
+            or solution.cam_from_ref is None
+            or solution.covariance_rad2 is None
+        ):
             return solution.status
         # Covariance in body axes.
         body_from_cam = self.body_from_cam[camera]
@@ -267,7 +275,9 @@ def zeroed_attitude(lab_from_body: Rotation, error_deg: tuple[float, float, floa
     return Rotation.from_euler("ZYX", angles_deg, degrees=True)
 
 
-def build_filter(config: FilterConfig, lab_from_body: Rotation, cameras: int = 1) -> AttitudeFilter:
+def build_filter(
+    config: FilterConfig, lab_from_body: Rotation, cameras: int = 1
+) -> AttitudeFilter:
     """The attitude filter at the start, in SI units; its reference frame is the lab."""
     gyro = GyroModel(
         math.radians(config.arw_deg_sqrt_h) / math.sqrt(HOUR_S),

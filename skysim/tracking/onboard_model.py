@@ -275,4 +275,6 @@ def assumed_observer(scene: Scene, orbit: CameraOrbit | None) -> catalog.Observe
     observer = catalog.on_earth(scene.start_time)
     if orbit is None:
         return observer
-    return replace(observer, velocity_m_s=observer.velocity_m_s + state_at(orbit, 0.0).velocity_m_s)
+    return replace(
+        observer, velocity_m_s=observer.velocity_m_s + state_at(orbit, 0.0).velocity_m_s
+    )

@@ -229,7 +229,9 @@ def check_answer(answer: Any) -> Answer:
     """The answer with a normalized quaternion. Raises ValueError for wrong shapes, quaternion, covariance or time."""
     if not isinstance(answer, Answer):
         raise ValueError(f"the tracker returned {type(answer).__name__}; allowed: Answer")
-    status = printable(answer.status)[:MAX_STATUS_CHARS] if isinstance(answer.status, str) else ""
+    status = (
+        printable(answer.status)[:MAX_STATUS_CHARS] if isinstance(answer.status, str) else ""
+    )
     if not status:
         raise ValueError(f"status {answer.status!r}; allowed: text")
     quaternion = None
@@ -244,7 +246,9 @@ def check_answer(answer: Any) -> Answer:
     covariance = answer.covariance_rad2
     if covariance is not None:
         covariance = check_covariance(finite_array(covariance, "covariance_rad2", (3, 3)))
-    seconds = None if answer.seconds is None else float(finite_array(answer.seconds, "seconds", ()))
+    seconds = (
+        None if answer.seconds is None else float(finite_array(answer.seconds, "seconds", ()))
+    )
     if seconds is not None and seconds < 0:
         raise ValueError(f"seconds {seconds:g}; allowed: 0 or more")
     return Answer(status, quaternion, covariance, check_centroids(answer.centroids_px), seconds)

@@ -27,7 +27,9 @@ SHOT = photographs.Shot(1600, 1200, 25.0, 5.6, radius_px=14.0)
 def drawn() -> tuple[NDArray, Rotation]:
     """An image with stars of 28 px hardly brighter than the noise of a pixel, and its attitude."""
     stars = catalog.read(CATALOGS / "gaia_v8.0.ecsv")
-    return photographs.draw(SHOT, stars, catalog.at_epoch(stars, 2020), np.random.default_rng(5))
+    return photographs.draw(
+        SHOT, stars, catalog.at_epoch(stars, 2020), np.random.default_rng(5)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +76,10 @@ def test_sharp_pictures_and_small_ones_are_not_binned(blurred: NDArray) -> None:
     light[rng.integers(0, 1000, 60), rng.integers(0, 1300, 60)] = rng.uniform(1000, 30_000, 60)
     sharp = 300 + 20 * rng.standard_normal(light.shape) + cv2.GaussianBlur(light, (0, 0), 1.2)
     assert list(retries.large_lights(sharp.astype(np.uint16), Settings())) == []
-    assert [factor for factor, _ in retries.large_lights(blurred[:850, :850], Settings())] == [4, 2]
+    assert [factor for factor, _ in retries.large_lights(blurred[:850, :850], Settings())] == [
+        4,
+        2,
+    ]
     assert list(retries.large_lights(blurred[:390, :390], Settings())) == []
     assert list(retries.large_lights(np.full((900, 900), 7, np.uint8), Settings())) == []
 

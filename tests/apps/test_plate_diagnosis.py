@@ -92,7 +92,10 @@ def dots(image: NDArray) -> NDArray:
     rng = np.random.default_rng(3)
     picture = rng.normal(100, 5, (480, 640))
     for x, y, light in zip(
-        rng.integers(10, 630, 40), rng.integers(10, 470, 40), rng.uniform(10, 200, 40), strict=True
+        rng.integers(10, 630, 40),
+        rng.integers(10, 470, 40),
+        rng.uniform(10, 200, 40),
+        strict=True,
     ):
         picture[y - 1 : y + 2, x - 1 : x + 2] += light * np.outer([1, 2, 1], [1, 2, 1])
     return picture.astype(np.uint16)
@@ -124,7 +127,10 @@ def hint(image: NDArray, fov_deg: float | None, catalog_name: str | None = None)
             marks=pytest.mark.slow,
         ),
         pytest.param(
-            spread(disk(30)), FOV_DEG, r"^blobs of 6\d px: out of focus\?$", marks=pytest.mark.slow
+            spread(disk(30)),
+            FOV_DEG,
+            r"^blobs of 6\d px: out of focus\?$",
+            marks=pytest.mark.slow,
         ),
         # sqrt(400^2 + 200^2) = 447, and the width of a star
         pytest.param(
@@ -141,7 +147,17 @@ def hint(image: NDArray, fov_deg: float | None, catalog_name: str | None = None)
             marks=pytest.mark.slow,
         ),
     ],
-    ids=["mirrored", "flipped", "wide", "tall", "blurred", "streaked", "white", "noise", "dots"],
+    ids=[
+        "mirrored",
+        "flipped",
+        "wide",
+        "tall",
+        "blurred",
+        "streaked",
+        "white",
+        "noise",
+        "dots",
+    ],
 )
 def test_each_cause_of_a_refusal_is_named(change: Change, fov_deg: float, says: str) -> None:
     assert hint(photograph(), FOV_DEG) == ""
@@ -192,9 +208,12 @@ def test_an_unsolved_unknown_field_gets_the_advice_for_a_narrow_one() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("focal", "expected"), [("60 mm", "5.7"), pytest.param("75 mm", "3.6", marks=pytest.mark.slow)]
+    ("focal", "expected"),
+    [("60 mm", "5.7"), pytest.param("75 mm", "3.6", marks=pytest.mark.slow)],
 )
-def test_a_too_shallow_catalog_is_named_and_a_deeper_one_solves(focal: str, expected: str) -> None:
+def test_a_too_shallow_catalog_is_named_and_a_deeper_one_solves(
+    focal: str, expected: str
+) -> None:
     """Near the galactic pole. The expectation by hand: 7996 stars on 41,253 deg^2, times the field's."""
     fov_deg = math.degrees(2 * math.atan(658 * 9.9e-3 / 2 / float(focal.removesuffix(" mm"))))
     by_hand = 7996 / 41_253 * fov_deg**2 * 493 / 659
@@ -221,18 +240,32 @@ ANGLES = ("ra_deg", "dec_deg", "roll_deg")
     ("fov_deg", "limit_mag", "says"),
     [
         (5.0, 6.7, "the catalog gaia_v8.0"),
-        (3.5, 6.7, "the catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`"),
+        (
+            3.5,
+            6.7,
+            "the catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`",
+        ),
         (
             5.0,
             8.0,
             "the catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`",
         ),  # that one was taken
-        (3.5, 8.0, "the catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`"),
-        (1.9, 6.7, "the catalog gaia_v10.0, after `skysim catalog build --source gaia --limit 10`"),
+        (
+            3.5,
+            8.0,
+            "the catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`",
+        ),
+        (
+            1.9,
+            6.7,
+            "the catalog gaia_v10.0, after `skysim catalog build --source gaia --limit 10`",
+        ),
         (1.0, 6.7, "a wider picture: the deepest catalog, to V 10, has too few as well"),
     ],
 )
-def test_the_deeper_catalog_has_enough_stars(fov_deg: float, limit_mag: float, says: str) -> None:
+def test_the_deeper_catalog_has_enough_stars(
+    fov_deg: float, limit_mag: float, says: str
+) -> None:
     """Fifteen in the field: of 4:3, 45,709 stars to V 8, 130,337 to V 9 and 357,037 to V 10 (`catalog info`)."""
     one = plate_solver.make_solver(fov_deg, None, catalog="hipparcos_hp6.5")
     limit = np.append(one.stars.v_mag[:-1], limit_mag)

@@ -55,7 +55,11 @@ STORED = {
 
 def photographed(focal: str = "25 mm") -> tuple[Scene, Frame, Truth]:
     """The SHEFEX-2 camera at rest behind a lens."""
-    still = {"exposure.frames": "1", "motion.rate_deg_s": "[0, 0, 0]", "camera.focal_length": focal}
+    still = {
+        "exposure.frames": "1",
+        "motion.rate_deg_s": "[0, 0, 0]",
+        "camera.focal_length": focal,
+    }
     scene = loader.load("shefex2", still)
     return scene, *simulate_motion(scene).render(0)
 
@@ -109,7 +113,11 @@ def check_right(found: dict[str, Any], truth: Truth, fov_deg: float = FOV_DEG) -
 @pytest.mark.parametrize("orientation", STORED)
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
 def test_the_answer_refers_to_the_image_as_viewed(
-    sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path, suffix: str, orientation: int
+    sky: tuple[Scene, Frame, Truth],
+    gray: NDArray,
+    tmp_path: Path,
+    suffix: str,
+    orientation: int,
 ) -> None:
     """This holds for mirrored storage (2, 4, 5, 7), too; the annotated image is the viewed one."""
     path = with_exif(tmp_path / f"x{suffix}", STORED[orientation](gray), orientation)
@@ -146,7 +154,9 @@ def test_exif_gives_the_field_by_the_diagonal(
     sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path
 ) -> None:
     """43.27 mm over the chip's 8.15 mm: the 25 mm lens is one of 133 mm."""
-    focal_35mm = round(25 * math.hypot(36, 24) / math.hypot(WIDTH_PX, HEIGHT_PX) / PIXEL_UM * 1000)
+    focal_35mm = round(
+        25 * math.hypot(36, 24) / math.hypot(WIDTH_PX, HEIGHT_PX) / PIXEL_UM * 1000
+    )
     found = answer(with_exif(tmp_path / "x.jpg", gray, 1, focal_35mm), None)
     check_right(found, sky[2])
     (narrow, wide), search = found["tried_fov_deg"]
@@ -244,7 +254,10 @@ def test_every_hypothesis_reduces_the_allowed_chance_probability(
 
 @pytest.mark.parametrize(
     "order",
-    ["TOP-DOWN", *(pytest.param(order, marks=pytest.mark.slow) for order in ("BOTTOM-UP", None))],
+    [
+        "TOP-DOWN",
+        *(pytest.param(order, marks=pytest.mark.slow) for order in ("BOTTOM-UP", None)),
+    ],
 )
 @pytest.mark.parametrize("highest_first", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_fits_image_has_the_same_attitude_in_either_row_order(
@@ -310,7 +323,9 @@ def test_annotated_images_have_the_images_names() -> None:
     def names(*paths: str) -> list[str]:
         return [
             path.as_posix()
-            for path in plate_solver.annotated_paths(Path("out"), [Path(path) for path in paths])
+            for path in plate_solver.annotated_paths(
+                Path("out"), [Path(path) for path in paths]
+            )
         ]
 
     assert names("my_sky.jpg", "a/m31.fits.gz") == [
@@ -338,7 +353,9 @@ def test_stars_have_their_catalog_s_designation() -> None:
 
 @pytest.mark.slow
 def test_python_gets_detections_and_attempts(gray: NDArray, tmp_path: Path) -> None:
-    path = with_exif(tmp_path / "x.png", gray, 2)  # as stored it is upright: seen, it is mirrored
+    path = with_exif(
+        tmp_path / "x.png", gray, 2
+    )  # as stored it is upright: seen, it is mirrored
     found = package.solve(path, fov_deg=FOV_DEG)
     assert (found.status, found.ra_deg, found.matches) == (
         "no identification beyond chance",
@@ -352,7 +369,9 @@ def test_python_gets_detections_and_attempts(gray: NDArray, tmp_path: Path) -> N
     assert (narrow, wide) == pytest.approx((0.948 * FOV_DEG, 1.058 * FOV_DEG), rel=2e-3)
     assert found.catalog_limit_mag == 8.0
     assert (
-        package.solve(with_exif(path, gray), fov_deg=FOV_DEG, catalog="gaia_v8.0").catalog_limit_mag
+        package.solve(
+            with_exif(path, gray), fov_deg=FOV_DEG, catalog="gaia_v8.0"
+        ).catalog_limit_mag
         == 8.0
     )
     with pytest.raises(

@@ -23,7 +23,9 @@ SHOT = photographs.Shot(1280, 960, 22.0, 6.3)
 
 def drawn(shot: photographs.Shot, seed: int) -> tuple[NDArray, Rotation]:
     stars = catalog.read(CATALOGS / "gaia_v8.0.ecsv")
-    return photographs.draw(shot, stars, catalog.at_epoch(stars, 2020), np.random.default_rng(seed))
+    return photographs.draw(
+        shot, stars, catalog.at_epoch(stars, 2020), np.random.default_rng(seed)
+    )
 
 
 def town(light: NDArray, rng: np.random.Generator) -> None:
@@ -53,12 +55,18 @@ def test_removing_clouds_keeps_the_stars() -> None:
 
     def clouds(light: NDArray, _: np.random.Generator) -> None:
         y, x = np.mgrid[:960, :1280]
-        light += np.where(y < 700, 40 * (1 + np.sin(x / 25) * np.sin(y / 25)), 0).astype(np.float32)
+        light += np.where(y < 700, 40 * (1 + np.sin(x / 25) * np.sin(y / 25)), 0).astype(
+            np.float32
+        )
 
     image, _ = drawn(replace(SHOT, spoil=clouds), 4)
     plain, _ = drawn(SHOT, 4)
     seen = [
-        len(plate_solver.solve_array(one, plate_solver.make_solver(22.0, None), None)[0].centroids)
+        len(
+            plate_solver.solve_array(one, plate_solver.make_solver(22.0, None), None)[
+                0
+            ].centroids
+        )
         for one in (image, plain)
     ]
     found = retries.without_clouds(image, Settings())

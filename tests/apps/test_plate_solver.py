@@ -41,7 +41,8 @@ def test_every_field_from_two_to_a_hundred_degrees_has_a_tracker(
     for fov_deg in np.geomspace(2, 100, 400):
         focal_px = (width_px - 1) / 2 / np.tan(np.radians(fov_deg / 2))
         assert any(
-            abs(focal_px / camera.focal_px - 1) <= uncertainty for camera, uncertainty in cameras
+            abs(focal_px / camera.focal_px - 1) <= uncertainty
+            for camera, uncertainty in cameras
         ), fov_deg
 
 
@@ -49,9 +50,9 @@ def test_a_given_field_is_the_only_one_tried() -> None:
     ((camera, uncertainty),) = plate_solver.make_solver(12.0, None).candidate_cameras(640, 480)
     assert np.degrees(camera.fov_rad) == pytest.approx(12.0, abs=1e-9)
     assert 0.05 < uncertainty < 0.06
-    ((known, none),) = plate_solver.make_solver(None, SCENES / "shefex2.yaml").candidate_cameras(
-        659, 493
-    )
+    ((known, none),) = plate_solver.make_solver(
+        None, SCENES / "shefex2.yaml"
+    ).candidate_cameras(659, 493)
     assert (known.focal_px, none) == (pytest.approx(25 / 9.9e-3, rel=1e-12), 0.0)
 
 
@@ -75,19 +76,25 @@ class FixedTracker:
         self.attitude = attitude
         self.calls = 0
 
-    def solve_centroids(self, centroids: Centroids, clock: Clock | None, effort: int) -> Attitude:
+    def solve_centroids(
+        self, centroids: Centroids, clock: Clock | None, effort: int
+    ) -> Attitude:
         self.calls += 1
         return self.attitude
 
 
 def answer(where: Rotation, log10_chance: float) -> Attitude:
     nothing = np.zeros(0, np.int64)
-    return Attitude("solved", where, np.eye(3), StarMatch(nothing, nothing, where, log10_chance))
+    return Attitude(
+        "solved", where, np.eye(3), StarMatch(nothing, nothing, where, log10_chance)
+    )
 
 
 def outcome(*solution: Attitude) -> tuple[Attitude, list[int]]:
     trackers = [FixedTracker(one) for one in solution]
-    attitude, _ = plate_solver.best_attitude(Centroids.empty(), iter(trackers), Clock(), 0, TRIES)  # type: ignore[arg-type]
+    attitude, _ = plate_solver.best_attitude(
+        Centroids.empty(), iter(trackers), Clock(), 0, TRIES
+    )  # type: ignore[arg-type]
     return attitude, [one.calls for one in trackers]
 
 
@@ -156,7 +163,9 @@ def blind() -> plate_solver.Solver:
 def photographed(focal: str) -> tuple[Frame, Truth]:
     """A frame of the SHEFEX-2 camera at rest behind a lens."""
     still = {"exposure.frames": "1", "motion.rate_deg_s": "[0, 0, 0]"}
-    return simulate_motion(loader.load("shefex2", still | {"camera.focal_length": focal})).render(0)
+    return simulate_motion(
+        loader.load("shefex2", still | {"camera.focal_length": focal})
+    ).render(0)
 
 
 @pytest.mark.slow
@@ -199,7 +208,9 @@ def test_centroids_of_smeared_frames_of_a_known_camera_use_their_streaks() -> No
 def test_a_mirrored_sky_is_refused_by_the_plate_solver(blind: plate_solver.Solver) -> None:
     """No rotation maps the sky to its mirror image, so every solution would be wrong."""
     frame, _ = photographed("25 mm")
-    found, _ = plate_solver.solve_array(np.ascontiguousarray(frame.image_dn[:, ::-1]), blind, None)
+    found, _ = plate_solver.solve_array(
+        np.ascontiguousarray(frame.image_dn[:, ::-1]), blind, None
+    )
     assert not found.attitude.solved
     assert len(found.centroids) >= 4
 

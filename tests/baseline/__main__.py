@@ -57,7 +57,9 @@ def chosen(area: str, names: list[str], every: bool) -> dict[str, Case]:
     """The cases of an area that the command line names; if none, all but those that take long, or `every`."""
     cases = AREAS[area]()
     if not names or area in names:
-        return {name: case for name, case in cases.items() if every or not name.startswith(LONG)}
+        return {
+            name: case for name, case in cases.items() if every or not name.startswith(LONG)
+        }
     return {
         case: made
         for case, made in cases.items()
@@ -130,7 +132,10 @@ def main() -> int:
     """Returns 0 if everything is the same or was recorded, else 1."""
     parser = argparse.ArgumentParser(prog="python -m tests.baseline", description=__doc__)
     parser.add_argument(
-        "names", nargs="*", metavar="NAME", help=f"{', '.join(AREAS)}, or AREA/CASE with * and ?"
+        "names",
+        nargs="*",
+        metavar="NAME",
+        help=f"{', '.join(AREAS)}, or AREA/CASE with * and ?",
     )
     parser.add_argument(
         "--record", action="store_true", help="write the digests instead of comparing with them"

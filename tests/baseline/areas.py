@@ -50,7 +50,9 @@ def scene_cases() -> dict[str, Case]:
         name: partial(run_scene, name, given["shipped"].get(name, given["frames"]))
         for name in shipped("scenes")
     }
-    cases |= {name: partial(run_variant, name, keys) for name, keys in given["variants"].items()}
+    cases |= {
+        name: partial(run_variant, name, keys) for name, keys in given["variants"].items()
+    }
     return cases | {
         f"python {name}": partial(run_python, text) for name, text in given["python"].items()
     }
@@ -121,7 +123,9 @@ def study_cases() -> dict[str, Case]:
     """Every shipped study, reduced."""
     given = CASES["studies"]
     cases: dict[str, Case] = {}
-    for name in shipped("scenes/studies"):  # one without a line in the file of cases is a KeyError
+    for name in shipped(
+        "scenes/studies"
+    ):  # one without a line in the file of cases is a KeyError
         keys = dict(given[name])
         prefix = "long " if keys.pop("long", False) else ""
         cases[prefix + name] = partial(
@@ -223,7 +227,8 @@ AREAS: dict[str, Callable[[], dict[str, Case]]] = {
     "scenes": scene_cases,
     "studies": study_cases,
     "contracts": lambda: {
-        name: partial(run_session, lines) for name, lines in CASES["contracts"]["sessions"].items()
+        name: partial(run_session, lines)
+        for name, lines in CASES["contracts"]["sessions"].items()
     },
     "streams": lambda: {
         scene: partial(run_stream, scene) for scene in ("shefex2", "afit_simsat", "simsat_bump")

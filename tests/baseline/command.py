@@ -40,7 +40,9 @@ def preload() -> None:
         "jinja2",
     ):
         importlib.import_module(name)
-    numba.njit(lambda: 0)()  # numba's own tables; no thread is started, for a fork would lose it
+    numba.njit(
+        lambda: 0
+    )()  # numba's own tables; no thread is started, for a fork would lose it
     with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
         command("--version")
 

@@ -40,7 +40,9 @@ def frame_file(path: Path) -> Entries:
 def ecsv(path: Path) -> Entries:
     """Each column of an ECSV table as it is written; and the header with units and metadata."""
     lines = path.read_text(encoding="utf-8").splitlines()
-    names, *rows = csv.reader([line for line in lines if not line.startswith("#")], delimiter=" ")
+    names, *rows = csv.reader(
+        [line for line in lines if not line.startswith("#")], delimiter=" "
+    )
     yield "header", sha("\n".join(line for line in lines if line.startswith("#")))
     for number, name in enumerate(names):
         if not CHANGING.fullmatch(name):
@@ -50,10 +52,14 @@ def ecsv(path: Path) -> Entries:
 def steady(value: Any) -> Any:
     """JSON without values that change from run to run."""
     if isinstance(value, dict):
-        return {key: steady(inner) for key, inner in value.items() if not CHANGING.fullmatch(key)}
+        return {
+            key: steady(inner) for key, inner in value.items() if not CHANGING.fullmatch(key)
+        }
     if isinstance(value, list):  # without sentences about times
         return [
-            steady(inner) for inner in value if not (isinstance(inner, str) and "time_ms" in inner)
+            steady(inner)
+            for inner in value
+            if not (isinstance(inner, str) and "time_ms" in inner)
         ]
     return value
 

@@ -26,7 +26,11 @@ def test_messages_of_wrong_scenes_match_the_baseline() -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(
-    bool(differences(json.loads((DIGESTS / "scenes.json").read_text(encoding="utf-8"))["machine"])),
+    bool(
+        differences(
+            json.loads((DIGESTS / "scenes.json").read_text(encoding="utf-8"))["machine"]
+        )
+    ),
     reason="recorded on another machine or with other versions",
 )
 def test_a_run_of_a_sky_matches_the_baseline() -> None:

@@ -54,7 +54,13 @@ def test_twilight_at_the_zenith_matches_paranal() -> None:
     Measured over 5 to 12 degrees, before the night's own light matters, where the air takes 0.13 mag. Schaefer's law,
     a magnitude for each degree, is fainter at first.
     """
-    for depression, tolerance_mag in ((5.0, 1.2), (6.0, 0.8), (8.0, 0.2), (10.0, 0.1), (12.0, 0.4)):
+    for depression, tolerance_mag in (
+        (5.0, 1.2),
+        (6.0, 0.8),
+        (8.0, 0.2),
+        (10.0, 0.1),
+        (12.0, 0.4),
+    ):
         x = depression - 5
         measured = 11.84 + 1.518 * x - 0.057 * x**2
         ours = mag_arcsec2(
@@ -130,7 +136,9 @@ def test_below_the_skyline_there_is_no_glow() -> None:
 
 def test_the_dark_glow_is_that_of_the_declared_sky() -> None:
     """At the zenith, moonless and at night: as a background of kind sky of the same magnitude."""
-    lab = lab_of("2012-12-13T23:00:00", **{"glow.dark_mag_arcsec2": "21", "extinction_mag": "0"})
+    lab = lab_of(
+        "2012-12-13T23:00:00", **{"glow.dark_mag_arcsec2": "21", "extinction_mag": "0"}
+    )
     ours = glow_toward(lab, up_pointing(lab))
     sky_glow = SkyGlowConfig(kind="sky", mag_arcsec2=21)
     even = glow_map((sky_glow,), lab.camera.optics, up_pointing(lab), lab.camera.band)

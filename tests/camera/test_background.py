@@ -56,7 +56,9 @@ def optics(**camera: object) -> Optics:
 
 
 def glow(**part: object) -> light.Glow:
-    made: light.Glow = TypeAdapter(light.Glow).validate_python(part, by_alias=True, by_name=True)
+    made: light.Glow = TypeAdapter(light.Glow).validate_python(
+        part, by_alias=True, by_name=True
+    )
     return made
 
 
@@ -71,7 +73,9 @@ def whole_map(config: light.Glow, lens: Optics) -> np.ndarray:
     """Background computed directly at every third pixel, for comparison."""
     camera = lens.camera
     x, y = np.meshgrid(np.arange(0, camera.width_px, 3), np.arange(0, camera.height_px, 3))
-    toward, pixel_sr = pixel_directions(np.column_stack([x.ravel(), y.ravel()]).astype(float), lens)
+    toward, pixel_sr = pixel_directions(
+        np.column_stack([x.ravel(), y.ravel()]).astype(float), lens
+    )
     view = viewing_geometry(toward, pixel_sr, lens, POINTING, BAND)
     return BACKGROUNDS[config.kind](config, view).reshape(x.shape)
 
@@ -105,7 +109,9 @@ def test_a_uniform_sky_falls_with_the_fourth_power_of_the_cosine() -> None:
     cosine = lens.camera.focal_px / np.hypot(lens.camera.focal_px, np.hypot(*offset.T))
     levels = glow_map((glow(**SKY),), lens, POINTING, BAND).ravel()
     middle = cosine.argmax()
-    np.testing.assert_allclose(levels / levels[middle], (cosine / cosine[middle]) ** 4, rtol=1e-5)
+    np.testing.assert_allclose(
+        levels / levels[middle], (cosine / cosine[middle]) ** 4, rtol=1e-5
+    )
     assert shape[0] * shape[1] == len(xy)
     assert cosine.min() ** 4 < 0.8  # the field is wide enough to tell
 
@@ -227,10 +233,16 @@ def test_moonlight_on_the_frame_comes_from_the_moon_s_side() -> None:
 def test_the_sun_s_stray_light_matches_its_transmittance() -> None:
     """Irradiance by Planck: 5772 K over the solar disk's 6.794e-5 sr, 400-1000 nm, with an efficiency of one half."""
     ra_deg, dec_deg = lab_place(110.0)
-    sun = glow(kind="stray", ra_deg=ra_deg, dec_deg=dec_deg, angle_deg=(20, 200), pst=(1e-4, 1e-12))
+    sun = glow(
+        kind="stray", ra_deg=ra_deg, dec_deg=dec_deg, angle_deg=(20, 200), pst=(1e-4, 1e-12)
+    )
     wavelength = np.linspace(400e-9, 1000e-9, 6001)
     photons = (
-        2 * 299792458.0 / wavelength**4 / np.expm1(0.01438777 / (wavelength * 5772.0)) * 6.794e-5
+        2
+        * 299792458.0
+        / wavelength**4
+        / np.expm1(0.01438777 / (wavelength * 5772.0))
+        * 6.794e-5
     )
     wanted = 0.5 * np.trapezoid(photons, wavelength) * 1e-8 * (5.5e-6) ** 2
     levels = glow_map((sun,), optics(), POINTING, BAND)

@@ -7,7 +7,11 @@ import pytest
 from scipy import integrate
 
 from skysim.camera.glow import earth_glow
-from skysim.camera.glow.earth_glow import earth_around, stray_around_e_s_m2, stray_of_bodies_e_s_m2
+from skysim.camera.glow.earth_glow import (
+    earth_around,
+    stray_around_e_s_m2,
+    stray_of_bodies_e_s_m2,
+)
 from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
 from skysim.core.types import Floats
 from skysim.scene import loader
@@ -25,9 +29,7 @@ EVEN = BaffleConfig(angle_deg=(0, 180), pst=(1e-4, 1e-4))
 STEEP = BaffleConfig(angle_deg=(20, 50, 90, 120), pst=(1e-3, 1e-7, 1e-9, 1e-12))
 DARK_EARTH = EarthConfig(albedo=0.3, airglow_mag_arcsec2=30.0)
 TABLE = "{angle_deg: [20, 50, 90, 120], pst: [1e-3, 1e-7, 1e-9, 1e-12]}"
-ORBIT = (
-    "{kind: circular, altitude: 500 km, inclination_deg: 97, raan_deg: 90, earth: {albedo: 0.3}}"
-)
+ORBIT = "{kind: circular, altitude: 500 km, inclination_deg: 97, raan_deg: 90, earth: {albedo: 0.3}}"
 
 
 @pytest.fixture
@@ -50,7 +52,9 @@ def in_space(ra_deg: float, dec_deg: float, **keys: str) -> Lab:
 
 
 def stray_of(lab: Lab, t_s: float = 0.0) -> dict[str, float]:
-    return stray_e_s(lab.camera.lights, expected_exposure(lab.camera, lab.start, np.zeros(3), t_s))
+    return stray_e_s(
+        lab.camera.lights, expected_exposure(lab.camera, lab.start, np.zeros(3), t_s)
+    )
 
 
 def test_the_sun_s_light_is_its_irradiance_times_the_transmittance() -> None:
@@ -71,7 +75,9 @@ def test_the_sun_s_light_is_its_irradiance_times_the_transmittance() -> None:
     response = np.interp(
         wavelength_m, lab.camera.band.wavelength_m, lab.camera.band.response, left=0, right=0
     )
-    electrons = integrate.simpson(power * wavelength_m / 1.98644586e-25 * response, x=wavelength_m)
+    electrons = integrate.simpson(
+        power * wavelength_m / 1.98644586e-25 * response, x=wavelength_m
+    )
     pst = 10 ** (-3 - 4 * (angle_deg - 20) / 30)
     expected = electrons * pst * lab.scene.camera.pixel_m**2
     assert stray_of(lab)["the Sun"] == pytest.approx(expected, rel=0.05)
@@ -127,7 +133,9 @@ def test_the_stray_light_of_a_near_earth_is_that_of_its_ground(
     )
     radiance = 0.3 * IRRADIANCE / np.pi * np.maximum(normal @ sun_m / np.linalg.norm(sun_m), 0)
     expected = np.sum(radiance * emission * area_m2 / d_m**2 * through)
-    light = stray_around_e_s_m2(STEEP, *earth_around(DARK_EARTH, place_m, sun_m, BAND), boresight)
+    light = stray_around_e_s_m2(
+        STEEP, *earth_around(DARK_EARTH, place_m, sun_m, BAND), boresight
+    )
     assert light == pytest.approx(expected, rel=0.006)
 
 
@@ -151,7 +159,9 @@ def test_a_frame_has_the_stray_light_in_every_pixel() -> None:
     lit = in_space(90.0, -5.0, **keys)
     e_s = sum(stray_of(lit, lit.scene.exposure.time_s / 2).values())
     dark = in_space(90.0, -5.0, **keys, camera__baffle="null")
-    bright_dn, dark_dn = (render_at_rest(lab.camera, lab.start)[0].image_dn for lab in (lit, dark))
+    bright_dn, dark_dn = (
+        render_at_rest(lab.camera, lab.start)[0].image_dn for lab in (lit, dark)
+    )
     detector = lit.scene.camera.detector
     assert np.median(bright_dn - dark_dn) == pytest.approx(
         e_s * lit.scene.exposure.time_s / detector.gain_e_dn, rel=1e-3

@@ -51,7 +51,11 @@ def toward(direction: Floats, off_px: tuple[float, float], optics: Optics) -> Ro
 
 
 def exposed_at(
-    optics: Optics, direction: Floats, off_px: tuple[float, float], rate: Floats, row_s: float = 0.0
+    optics: Optics,
+    direction: Floats,
+    off_px: tuple[float, float],
+    rate: Floats,
+    row_s: float = 0.0,
 ) -> Exposed:
     attitude = toward(direction, off_px, optics)
     t_s = np.linspace(0.0, 1.0, 101)
@@ -130,7 +134,9 @@ def test_a_body_s_electrons_follow_from_its_magnitude() -> None:
     exposed = exposed_at(optics, body.place.direction, (0.0, 0.0), np.zeros(3))
     image = np.zeros((SIZE, SIZE))
     drawing.render_bodies(image, [body], exposed)
-    assert image.sum() == pytest.approx(body.flux_e_s_m2 * optics.collecting_m2 * 0.04, rel=1e-4)
+    assert image.sum() == pytest.approx(
+        body.flux_e_s_m2 * optics.collecting_m2 * 0.04, rel=1e-4
+    )
 
 
 def test_a_disc_half_off_the_chip_is_cut_at_the_border() -> None:

@@ -42,7 +42,9 @@ def test_blooming_equals_the_limit_of_repeated_halving(seed: int) -> None:
     column[rng.integers(0, 60, 1 + seed % 4)] += rng.uniform(1, 9) * WELL
     image = frame(column)
     bloom(image, WELL)
-    np.testing.assert_allclose(image[:, 1], halve_till_it_fits(column), rtol=0, atol=1e-3 * WELL)
+    np.testing.assert_allclose(
+        image[:, 1], halve_till_it_fits(column), rtol=0, atol=1e-3 * WELL
+    )
 
 
 @pytest.mark.compiles
@@ -185,7 +187,9 @@ def test_deferred_charge_conserves_the_total() -> None:
     np.testing.assert_array_equal(image, before)
 
 
-def clocked_under_light(rate_e_s: np.ndarray, exposure_s: float, row_time_s: float) -> np.ndarray:
+def clocked_under_light(
+    rate_e_s: np.ndarray, exposure_s: float, row_time_s: float
+) -> np.ndarray:
     """One column: dark charge clocked in row by row under the light, exposed, and clocked out into the store."""
     charge = np.zeros(len(rate_e_s))
     store = []
@@ -202,7 +206,9 @@ def test_smear_equals_that_of_a_column_clocked_under_light() -> None:
     exposure_s = 0.05
     row_time_s = 2e-6
     rate = np.random.default_rng(7).uniform(0, 1e5, (90, 130))
-    wanted = np.array([clocked_under_light(column, exposure_s, row_time_s) for column in rate.T]).T
+    wanted = np.array(
+        [clocked_under_light(column, exposure_s, row_time_s) for column in rate.T]
+    ).T
     light = rate * exposure_s
     frame_transfer_smear(light, exposure_s, row_time_s)
     np.testing.assert_allclose(light, wanted, rtol=1e-12)

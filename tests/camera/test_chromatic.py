@@ -221,7 +221,9 @@ def test_every_light_of_a_scene_has_its_color(scene: str, keys: dict[str, str]) 
     config = lab.scene.camera
     assert sources.chromatic is not None
     assert sources.chromatic.shape == (len(sources), 4)
-    assert np.all((sources.chromatic[:, [0, 2]] > 0) & (sources.chromatic[:, [0, 2]] < [40e-6, 1]))
+    assert np.all(
+        (sources.chromatic[:, [0, 2]] > 0) & (sources.chromatic[:, [0, 2]] < [40e-6, 1])
+    )
     spread = np.ptp(sources.chromatic[:, 2])
     assert (spread > 0.01) == (scene == "shefex2" or "light.led.color_scatter" in keys)
     toward = Rotation.align_vectors([[0, 0, 1]], sources.place[:1, :3])[0]
@@ -231,7 +233,8 @@ def test_every_light_of_a_scene_has_its_color(scene: str, keys: dict[str, str]) 
     first = sources.take(np.arange(1))
     gray = Sources(*(getattr(first, name) for name in Sources.__slots__[:-1]))
     seen, nominal = (
-        project(one, lab.camera.optics, pose)[0][0, 0] - config.center_px for one in (first, gray)
+        project(one, lab.camera.optics, pose)[0][0, 0] - config.center_px
+        for one in (first, gray)
     )
     np.testing.assert_allclose(
         seen, nominal * (1 + first.chromatic[0, 2] / config.corner_px), rtol=1e-9, atol=1e-9
@@ -249,7 +252,9 @@ def test_bodies_and_satellites_have_their_colors() -> None:
     assert lights["mars"][1, 2] > lights["sun"][1, 2] + 0.02
     assert lights["uranus"][1, 2] < lights["sun"][1, 2] - 0.02
     path = np.array([0.0, 0, 1]), np.zeros((2, 3))
-    satellite = as_sources([moving_light(1, "one", 3.0, path, (500.0, 90.0, 1.0))], lab.camera.band)
+    satellite = as_sources(
+        [moving_light(1, "one", 3.0, path, (500.0, 90.0, 1.0))], lab.camera.band
+    )
     np.testing.assert_allclose(satellite.chromatic, lights["sun"][:1], rtol=1e-12)
 
 
@@ -260,7 +265,10 @@ def test_bodies_and_satellites_have_their_colors() -> None:
             "{wavelength: [400 nm, 900 nm]}",
             "nothing depends on the wavelength; allowed: focus or corner_px other than",
         ),
-        ("{wavelength: [400 nm, 900 nm], corner_px: [0, 0]}", "nothing depends on the wavelength"),
+        (
+            "{wavelength: [400 nm, 900 nm], corner_px: [0, 0]}",
+            "nothing depends on the wavelength",
+        ),
         (
             "{wavelength: [400 nm, 900 nm], corner_px: [0, 1, 2]}",
             "wavelength has 2 numbers, corner_px has 3",

@@ -56,7 +56,9 @@ def test_directions_follow_an_isotropic_flux_through_a_plate() -> None:
     cosine = 1e-9 / tracks["length_m"]
     theta = np.arccos(cosine)
     assert stats.kstest(theta, lambda t: np.sin(t) ** 2).pvalue > 1e-4
-    azimuth = np.arctan2(tracks["end_y_px"] - tracks["y_px"], tracks["end_x_px"] - tracks["x_px"])
+    azimuth = np.arctan2(
+        tracks["end_y_px"] - tracks["y_px"], tracks["end_x_px"] - tracks["x_px"]
+    )
     assert stats.kstest((azimuth + np.pi) / (2 * np.pi), "uniform").pvalue > 1e-4
 
 
@@ -164,7 +166,11 @@ def test_without_particles_the_frame_is_unchanged() -> None:
     image = np.zeros(SHAPE, np.float32)
     assert len(add_particles(image, 1.0, PIXEL_M, (), np.random.default_rng(7))) == 0
     assert (
-        len(add_particles(image, 1.0, PIXEL_M, (protons(per_cm2_s=0.0),), np.random.default_rng(7)))
+        len(
+            add_particles(
+                image, 1.0, PIXEL_M, (protons(per_cm2_s=0.0),), np.random.default_rng(7)
+            )
+        )
         == 0
     )
     assert not image.any()

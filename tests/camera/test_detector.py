@@ -84,7 +84,9 @@ def test_the_noise_histogram_matches_the_detector_s_law(
     settings = {"gain_e_dn": gain, "offset_dn": offset, "bits": bits, "full_well_e": well_e}
     made = detector_with((1000, 1000), read_noise_e=read_e, **settings)
     numbers = (
-        expose(np.full((1000, 1000), mean_e), made, seed=int(100 * mean_e)).astype(np.int64).ravel()
+        expose(np.full((1000, 1000), mean_e), made, seed=int(100 * mean_e))
+        .astype(np.int64)
+        .ravel()
     )
     wanted = law(float(np.float32(mean_e)), read_e, gain, offset, bits, well_e) * 1e6
     found = np.bincount(numbers, minlength=len(wanted))
@@ -106,7 +108,12 @@ def test_photon_transfer_slope_is_one_over_the_gain() -> None:
     frames = 10_000
     levels = np.repeat(np.geomspace(30, 30000, 16), 2)
     made = detector_with(
-        (16, 32), gain_e_dn=gain, read_noise_e=read_e, prnu=0.03, column_offset_e=9, full_well_e=2e5
+        (16, 32),
+        gain_e_dn=gain,
+        read_noise_e=read_e,
+        prnu=0.03,
+        column_offset_e=9,
+        full_well_e=2e5,
     )
     light_e = np.tile(levels, (16, 1)).astype(np.float32)
     rng = np.random.default_rng(7)
@@ -119,7 +126,9 @@ def test_photon_transfer_slope_is_one_over_the_gain() -> None:
     error = variance * np.sqrt(2 / frames)
     (slope, floor), covariance = np.polyfit(mean, variance, 1, w=1 / error, cov="unscaled")
     assert slope == pytest.approx(1 / gain, abs=4 * np.sqrt(covariance[0, 0]))
-    assert floor == pytest.approx((read_e / gain) ** 2 + 1 / 12, abs=4 * np.sqrt(covariance[1, 1]))
+    assert floor == pytest.approx(
+        (read_e / gain) ** 2 + 1 / 12, abs=4 * np.sqrt(covariance[1, 1])
+    )
     assert np.sqrt(covariance[0, 0]) < 1e-3 / gain  # so that it would see a per cent
     chi2 = (((variance - floor - slope * mean) / error) ** 2).sum()
     assert stats.chi2.sf(chi2, mean.size - 2) > 1e-4
@@ -217,7 +226,9 @@ def test_column_offsets_are_fixed() -> None:
 @pytest.mark.parametrize("gain", [1.0, 7.3, 10.0])
 def test_the_gain_divides_and_the_offset_adds(gain: float) -> None:
     made = frame(5000.0, gain_e_dn=gain, offset_dn=64.0)
-    assert made.mean() == pytest.approx(64 + 5000 / gain, abs=4 * np.sqrt(5000 / N) / gain + 1e-3)
+    assert made.mean() == pytest.approx(
+        64 + 5000 / gain, abs=4 * np.sqrt(5000 / N) / gain + 1e-3
+    )
 
 
 def test_the_amplifier_has_its_declared_nonlinearity_at_full_well() -> None:
@@ -270,7 +281,9 @@ def spot(electrons: float) -> np.ndarray:
 
 
 def test_an_overflowing_well_spills_along_its_column_without_loss() -> None:
-    made = expose(spot(2e5), detector_with((64, 32), full_well_e=20000, blooming="column")) - 1000
+    made = (
+        expose(spot(2e5), detector_with((64, 32), full_well_e=20000, blooming="column")) - 1000
+    )
     assert made[:, 10].max() == 20000
     assert (made[:, 10] == 20000).sum() in (9, 10, 11)
     assert made.sum() == pytest.approx(2e5, abs=4 * np.sqrt(2e5))
@@ -289,7 +302,10 @@ def test_transfers_leave_charge_behind_the_star() -> None:
     """31 parallel transfers of 1e-3 leave 3 % in the pixel that is read after it (away from the register)."""
     made = (
         np.mean(
-            [expose(spot(1e4), detector_with((64, 32), cti_parallel=1e-3), n) for n in range(60)],
+            [
+                expose(spot(1e4), detector_with((64, 32), cti_parallel=1e-3), n)
+                for n in range(60)
+            ],
             axis=0,
         )
         - 1000
@@ -309,7 +325,9 @@ def test_particles_add_their_tracks() -> None:
     struck = 4e4 * 0.05 * 64 * 32 * (5e-4) ** 2  # about one a frame of 64 x 32 pixels of 5 um
     assert struck == pytest.approx(1.0, abs=0.1)
     sums = [
-        (expose(np.zeros((64, 32)), detector_with((64, 32), particles=[shower]), n) - 1000).sum()
+        (
+            expose(np.zeros((64, 32)), detector_with((64, 32), particles=[shower]), n) - 1000
+        ).sum()
         for n in range(200)
     ]
     assert np.mean(np.array(sums) == 0) == pytest.approx(
@@ -388,7 +406,11 @@ sys.stdout.buffer.write(np.array(frames).tobytes())
 def test_the_same_stream_gives_the_same_frame_on_any_number_of_threads() -> None:
     part = repr(
         LENS
-        | {"height_px": 64, "width_px": 48, "detector": CLEAN | {"read_noise_e": 5, "prnu": 0.01}}
+        | {
+            "height_px": 64,
+            "width_px": 48,
+            "detector": CLEAN | {"read_noise_e": 5, "prnu": 0.01},
+        }
     )
     alone, many = (
         np.frombuffer(
@@ -409,9 +431,16 @@ def test_the_same_stream_gives_the_same_frame_on_any_number_of_threads() -> None
 def test_row_by_row_simulation_equals_step_by_step_simulation() -> None:
     """An unreachable blooming threshold selects the step-by-step code."""
     light_e = np.random.default_rng(1).uniform(0, 3000, SHAPE)
-    spread = {"read_noise_e": 5, "prnu": 0.01, "dark_e_s": 200, "dsnu": 0.3, "column_offset_e": 3}
+    spread = {
+        "read_noise_e": 5,
+        "prnu": 0.01,
+        "dark_e_s": 200,
+        "dsnu": 0.3,
+        "column_offset_e": 3,
+    }
     short, long = (
-        expose(light_e, detector_with(blooming=kind, **spread), 4) for kind in ("none", "column")
+        expose(light_e, detector_with(blooming=kind, **spread), 4)
+        for kind in ("none", "column")
     )
     np.testing.assert_array_equal(short, long)
 
@@ -449,12 +478,16 @@ def test_signal_to_noise_has_each_noise_of_a_pixel() -> None:
     light_e = np.full((64, 32), 70.0)
     noise_e = {"read_noise_e": 7.0, "reset_noise_e": 11.0, "gain_e_dn": 30.0}
     for name in noise_e:
-        one = {"read_noise_e": 0.1, "reset_noise_e": 0.0, "gain_e_dn": 1.0} | {name: noise_e[name]}
+        one = {"read_noise_e": 0.1, "reset_noise_e": 0.0, "gain_e_dn": 1.0} | {
+            name: noise_e[name]
+        }
         made = detector_with((64, 32), offset_dn=20.0, **one)
         sources = detector.add_snr_and_saturation(
             seen(1000.0, 25.0, 40.0), light_e.astype(np.float32), 0.05, made
         )
-        pixel_e2 = one["read_noise_e"] ** 2 + one["reset_noise_e"] ** 2 + one["gain_e_dn"] ** 2 / 12
+        pixel_e2 = (
+            one["read_noise_e"] ** 2 + one["reset_noise_e"] ** 2 + one["gain_e_dn"] ** 2 / 12
+        )
         assert sources.snr[0] == pytest.approx(
             1000 / np.sqrt(1000 + 25 * (30 + pixel_e2)), rel=1e-6
         )

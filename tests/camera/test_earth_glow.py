@@ -25,7 +25,9 @@ def sphere(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("phase_deg", [0.0, 60.0, 120.0])
-def test_the_earth_disc_s_light_is_that_of_a_lambert_sphere(sphere: None, phase_deg: float) -> None:
+def test_the_earth_disc_s_light_is_that_of_a_lambert_sphere(
+    sphere: None, phase_deg: float
+) -> None:
     """From far away: E (2/3) a (R / d)^2 (sin p + (pi - p) cos p) / pi; the air adds 2 H / R or a little more."""
     far_m = 200 * EARTH_RADIUS_M
     phase = np.radians(phase_deg)
@@ -87,7 +89,9 @@ def test_the_limb_is_at_its_geometric_dip() -> None:
     assert middle.max() > 0
     rows = np.flatnonzero(middle > middle.max() / 2)
     edge_px = min(
-        abs(row - camera.center_px[1]) for row in (rows[0], rows[-1]) if 0 < row < len(middle) - 1
+        abs(row - camera.center_px[1])
+        for row in (rows[0], rows[-1])
+        if 0 < row < len(middle) - 1
     )
     off_deg = np.degrees(np.arctan(edge_px / camera.focal_px))
     assert off_deg == pytest.approx(2.0, abs=0.25)  # the air blurs it by 8 km, 0.2 degrees

@@ -60,7 +60,8 @@ def test_gaia_s_starlight_follows_the_law_of_counts() -> None:
     bp = rows["bp"].astype(float)
     rp = rows["rp"].astype(float)
     v_mag = star_archives.johnson(
-        rows["g"].astype(float), np.where((bp > 0) & (rp > 0), bp - rp, star_archives.TYPICAL_BP_RP)
+        rows["g"].astype(float),
+        np.where((bp > 0) & (rp > 0), bp - rp, star_archives.TYPICAL_BP_RP),
     )[0]
     latitude = galactic_latitude_deg(star_archives.directions(rows["ra"], rows["dec"]))
     for low in (8, 9):
@@ -83,9 +84,9 @@ def test_the_total_light_of_all_stars_is_the_published_one() -> None:
 def test_the_light_of_faint_stars_is_the_integral_per_magnitude(limit_mag: float) -> None:
     for latitude, ln_light, slope in zip(LATITUDE_DEG, LN_LIGHT, SLOPE, strict=True):
         x0 = limit_mag - 10
-        whole = quad(lambda x, a=ln_light, s=slope: np.exp(a + s * x - CURVATURE * x * x), x0, 60)[
-            0
-        ]
+        whole = quad(
+            lambda x, a=ln_light, s=slope: np.exp(a + s * x - CURVATURE * x * x), x0, 60
+        )[0]
         assert faint_starlight_s10(np.array([-latitude]), limit_mag)[0] == pytest.approx(
             whole, rel=1e-6
         )

@@ -91,7 +91,9 @@ def test_a_measured_image_is_a_grid(tmp_path: Any) -> None:
     assert shapes(lens, [0.0], [False], [1.0]).kind.tolist() == [GRID]
 
 
-def test_a_full_cache_is_cleared_and_gives_the_same_images(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_cache_is_cleared_and_gives_the_same_images(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     first = shapes(camera(), [1e-3], [True], [1.0])
     table = first.tables[slice(*first.table[0, :2])].copy()
     monkeypatch.setattr("skysim.camera.psf.kernel_cache.CACHE_BYTES", first.tables.nbytes - 1)

@@ -53,9 +53,9 @@ def led(
     tilt = Rotation.from_rotvec(np.radians(around_deg) * sight).apply(
         np.cross(sight, [0.0, 1.0, 0.0])
     )
-    normal = Rotation.from_rotvec(np.radians(incidence_deg) * tilt / np.linalg.norm(tilt)).apply(
-        -sight
-    )
+    normal = Rotation.from_rotvec(
+        np.radians(incidence_deg) * tilt / np.linalg.norm(tilt)
+    ).apply(-sight)
     one = np.ones(1)
     zero = np.zeros(1)
     return Sources(
@@ -116,7 +116,11 @@ def traced(
     pupil_m = camera.pupil_m
     image_m = camera.image_distance_m
     defocus_px = (
-        pupil_m * image_m * abs(1 / source.place[0, 2] - 1 / camera.focus_m) / 2 / camera.pixel_m
+        pupil_m
+        * image_m
+        * abs(1 / source.place[0, 2] - 1 / camera.focus_m)
+        / 2
+        / camera.pixel_m
     )
     if defocus_px > 1e-9:
         e, share = disk_points(8, 20)
@@ -135,14 +139,20 @@ def traced(
     return np.s_[y : y + PATCH, x : x + PATCH], total
 
 
-@pytest.mark.parametrize("focus", [f"{DEPTH_M} m", pytest.param("0.5 m", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "focus", [f"{DEPTH_M} m", pytest.param("0.5 m", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("xy_px", [CENTER, CORNER])
 @pytest.mark.parametrize(
     ("incidence_deg", "around_deg", "exponent"),
     [(0, 0, 1.0), (30, 20, 1.0), (30, 110, 3.0), (60, 75, 1.0), (60, 160, 3.0)],
 )
 def test_an_inclined_led_s_image_matches_ray_tracing(
-    incidence_deg: float, around_deg: float, exponent: float, xy_px: tuple[float, float], focus: str
+    incidence_deg: float,
+    around_deg: float,
+    exponent: float,
+    xy_px: tuple[float, float],
+    focus: str,
 ) -> None:
     """To 5e-4 of the peak: in focus and 1.8 px out of it, on the axis and 19 deg off it, with two lobes. Drawn
     round, an LED at 30 deg is wrong by 0.4 of the peak. The mean of the light is right to 5e-4 px, where center and
@@ -210,7 +220,9 @@ def test_a_measured_lens_that_is_not_round_draws_ellipses_too(tmp_path: Any) -> 
         light * np.exp(-((x - at) ** 2 + x[:, None] ** 2) / 2 / 0.7**2) for light, at in spots
     )
     np.savetxt(tmp_path / "psf.csv", cells, delimiter=",")
-    lens = lens_of(psf={"kind": "measured", "file": str(tmp_path / "psf.csv"), "oversampling": 8})
+    lens = lens_of(
+        psf={"kind": "measured", "file": str(tmp_path / "psf.csv"), "oversampling": 8}
+    )
     source = led(lens, CENTER, 40)
     image, _ = drawn(lens, source, 2.0)
     true = np.zeros_like(image)
@@ -226,7 +238,9 @@ def test_a_moving_ellipse_is_the_mean_of_still_ones() -> None:
     source = led(lens_of(), CENTER, 50)
     t = np.linspace(0, 1, 41)
     rate = np.array([0.002, 0.006, 0.0])
-    path = Trajectory(t, Rotation.from_rotvec((t[:, None] - 0.5) * rate), np.tile(rate, (41, 1)))
+    path = Trajectory(
+        t, Rotation.from_rotvec((t[:, None] - 0.5) * rate), np.tile(rate, (41, 1))
+    )
     image = np.zeros((480, 640))
     stills = np.zeros((480, 640))
     render(image, source, lens, path, AT_CENTER, Window(0.0, 1.0))
@@ -237,14 +251,22 @@ def test_a_moving_ellipse_is_the_mean_of_still_ones() -> None:
     assert np.abs(image - stills / 64).max() < 1e-3 * image.max()
     rolled = np.zeros((480, 640))
     render(rolled, source, lens, STILL, AT_CENTER, Window(0.2, 0.5, 1e-5))
-    np.testing.assert_allclose(rolled.sum(), drawn(lens, source)[0].sum() / 2, rtol=1e-5, atol=0)
+    np.testing.assert_allclose(
+        rolled.sum(), drawn(lens, source)[0].sum() / 2, rtol=1e-5, atol=0
+    )
 
 
 @pytest.mark.slow
 @settings(max_examples=40, derandomize=True, deadline=None)
-@given(st.floats(0, 30), st.floats(0, 75), st.floats(0, 360), st.floats(0, 360), st.floats(0.5, 4))
+@given(
+    st.floats(0, 30), st.floats(0, 75), st.floats(0, 360), st.floats(0, 360), st.floats(0.5, 4)
+)
 def test_rim_and_mean_light_match_the_projected_disk(
-    field_deg: float, incidence_deg: float, around_deg: float, azimuth_deg: float, exponent: float
+    field_deg: float,
+    incidence_deg: float,
+    around_deg: float,
+    azimuth_deg: float,
+    exponent: float,
 ) -> None:
     """The rim's points are on the ellipse, whose area is cos i / cos^3 a of a circle of f r / d, and the mean of the
     light is center + A q / 4, all to third order in r / d.

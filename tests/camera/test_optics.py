@@ -62,7 +62,9 @@ def test_distortion_matches_opencv(distortion: tuple[float, ...]) -> None:
 def test_a_distortion_too_small_to_matter_does_no_harm() -> None:
     lens = optics(distortion=[0, 0, 0, 0, 1e-320])
     vectors = rays(100, 25, 1)
-    np.testing.assert_allclose(lens.project(vectors), optics().project(vectors), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        lens.project(vectors), optics().project(vectors), rtol=0, atol=1e-9
+    )
 
 
 def test_the_boresight_is_the_chip_s_center_by_default() -> None:
@@ -75,7 +77,10 @@ def test_the_boresight_is_the_chip_s_center_by_default() -> None:
 def test_right_is_plus_x_and_down_is_plus_y() -> None:
     # tan(1 deg) x 25 mm / 9.9 um = 44.078 px.
     tangent = np.tan(np.radians(1.0))
-    right, below = optics().project(np.array([[tangent, 0, 1.0], [0, tangent, 1.0]])) - [329, 246]
+    right, below = optics().project(np.array([[tangent, 0, 1.0], [0, tangent, 1.0]])) - [
+        329,
+        246,
+    ]
     np.testing.assert_allclose(right, [44.078, 0], rtol=0, atol=5e-4)
     np.testing.assert_allclose(below, [0, 44.078], rtol=0, atol=5e-4)
 
@@ -158,7 +163,9 @@ def test_the_field_undoes_distortion(k1: float) -> None:
     )
     corner = np.array([658.5, -0.5])
     aside = (
-        (corner - [300.0, 250.0]) / np.hypot(*(corner - [300.0, 250.0])) * np.tan(lens.field_rad)
+        (corner - [300.0, 250.0])
+        / np.hypot(*(corner - [300.0, 250.0]))
+        * np.tan(lens.field_rad)
     )
     edge = np.array([[*aside, 1.0]])
     found, _ = cv2.projectPoints(
@@ -170,12 +177,14 @@ def test_the_field_undoes_distortion(k1: float) -> None:
 
 def test_a_field_that_ends_before_the_corner_ends_at_the_fold() -> None:
     """At 3 mm the corner is at a distorted radius of 1.36, and the image reaches to .70 only."""
-    assert optics(focal_length="3 mm", distortion=[-0.3, 0, 0, 0, 0]).field_rad == pytest.approx(
-        np.arctan(np.sqrt(1 / 0.9)), abs=1e-12
-    )
+    assert optics(
+        focal_length="3 mm", distortion=[-0.3, 0, 0, 0, 0]
+    ).field_rad == pytest.approx(np.arctan(np.sqrt(1 / 0.9)), abs=1e-12)
 
 
-@pytest.mark.parametrize("distortion", [[0, 0, 0, 0, 0], [-0.3, 0.1, 0, 0, 0], [0.3, 0, 0, 0, 0]])
+@pytest.mark.parametrize(
+    "distortion", [[0, 0, 0, 0, 0], [-0.3, 0.1, 0, 0, 0], [0.3, 0, 0, 0, 0]]
+)
 def test_the_field_is_never_too_small(distortion: list[float]) -> None:
     """Every imaged direction is within the field."""
     lens = optics(focal_length="8 mm", principal_point_px=[500.0, 100.0], distortion=distortion)
@@ -217,7 +226,9 @@ def test_focus_obeys_newton_s_law(focus_m: float) -> None:
 
 
 def test_the_pupil_collects_its_area_times_the_transmission() -> None:
-    assert optics().collecting_m2 == pytest.approx(np.pi / 4 * (0.025 / 1.4) ** 2 * 0.85, rel=1e-14)
+    assert optics().collecting_m2 == pytest.approx(
+        np.pi / 4 * (0.025 / 1.4) ** 2 * 0.85, rel=1e-14
+    )
 
 
 def test_a_point_s_light_falls_with_the_pupil_s_foreshortening() -> None:

@@ -52,7 +52,12 @@ def camera(**own: Any) -> CameraConfig:
         "pixel": "4.2 um",
         "focal_length": "35 mm",
         "f_number": 8.0,
-        "detector": {"quantum_efficiency": 0.4, "full_well_e": 20000, "gain_e_dn": 10, "bits": 12},
+        "detector": {
+            "quantum_efficiency": 0.4,
+            "full_well_e": 20000,
+            "gain_e_dn": 10,
+            "bits": 12,
+        },
     }
     return CameraConfig.model_validate(base | own)
 
@@ -66,14 +71,19 @@ def draw(image: Kernel, x: float, y: float, size: int) -> Floats:
 def profile(image: Kernel, radii: Floats) -> Floats:
     """Profile of the image along the x axis."""
     return np.array(
-        [draw(image, 0.0, 0.0, 1)[0, 0] if r == 0 else draw(image, -r, 0.0, 1)[0, 0] for r in radii]
+        [
+            draw(image, 0.0, 0.0, 1)[0, 0] if r == 0 else draw(image, -r, 0.0, 1)[0, 0]
+            for r in radii
+        ]
     )
 
 
 # --- defocus ---
 
 
-@pytest.mark.parametrize(("f_number", "diameter_px"), [(1.4, 249), (2.8, 124), (8, 43), (16, 22)])
+@pytest.mark.parametrize(
+    ("f_number", "diameter_px"), [(1.4, 249), (2.8, 124), (8, 43), (16, 22)]
+)
 def test_the_blur_of_an_led_with_focus_at_infinity_matches_the_reference(
     f_number: float, diameter_px: float
 ) -> None:
@@ -112,7 +122,9 @@ def test_the_field_blur_grows_from_the_center_to_the_far_corner() -> None:
     psf = GaussianPsfConfig(corner_sigma_px=1.5)
     corner = np.array([1599.5, -0.5])  # the farthest of the four
     at = np.array([[500.0, 700.0], (corner + np.array([500, 700])) / 2, corner])
-    np.testing.assert_allclose(field_sigma_px(psf, lens, at), [0, 0.75, 1.5], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        field_sigma_px(psf, lens, at), [0, 0.75, 1.5], rtol=0, atol=1e-12
+    )
 
 
 # --- transfer functions ---
@@ -151,7 +163,9 @@ def test_a_transfer_function_is_the_hankel_transform_of_its_profile(kind: str) -
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_passes_all_light_and_has_an_extent(kind: str) -> None:
     assert KINDS[kind].kind == kind
-    assert PSFS[kind](KINDS[kind], camera(), np.zeros(1), np.zeros(1)) == pytest.approx(1, abs=1e-9)
+    assert PSFS[kind](KINDS[kind], camera(), np.zeros(1), np.zeros(1)) == pytest.approx(
+        1, abs=1e-9
+    )
     radius, sigma = EXTENT[kind](KINDS[kind], camera())
     assert radius + 3 * sigma > 1
 
@@ -180,7 +194,9 @@ def test_airy_s_first_dark_ring_encloses_the_textbook_s_light() -> None:
     image = build_kernel(psf, lens)
     unit = 0.55 * 8 / 0.4
     radii = np.linspace(0.9, 1.6, 281) * unit
-    assert radii[np.argmin(profile(image, radii))] == pytest.approx(1.2197 * unit, abs=0.005 * unit)
+    assert radii[np.argmin(profile(image, radii))] == pytest.approx(
+        1.2197 * unit, abs=0.005 * unit
+    )
     size = 2 * math.ceil(image.reach_px) + 1
     y, x = np.indices((size, size)) - size // 2
     inside = draw(image, size // 2, size // 2, size)[np.hypot(x, y) <= 1.2197 * unit].sum()
@@ -274,7 +290,9 @@ def test_nearly_equal_sizes_share_a_kernel() -> None:
     lens = camera()
     psf = GaussianPsfConfig(sigma_px=0.7)
     assert build_kernel(psf, lens, 0.1, 5.001, 2.0) is build_kernel(psf, lens, 0.1, 5.004, 2.0)
-    assert build_kernel(psf, lens, 0.1, 5.001, 2.0) is not build_kernel(psf, lens, 0.1, 5.02, 2.0)
+    assert build_kernel(psf, lens, 0.1, 5.001, 2.0) is not build_kernel(
+        psf, lens, 0.1, 5.02, 2.0
+    )
 
 
 @pytest.mark.long
@@ -335,7 +353,9 @@ def test_a_star_measured_in_whole_pixels_reproduces_its_image(tmp_path: Path) ->
     table /= table.sum()
     x = table.sum(axis=0) @ np.arange(5)
     y = table.sum(axis=1) @ np.arange(5)
-    image = build_kernel(MeasuredPsfConfig(kind="measured", file=cells(tmp_path, table)), camera())
+    image = build_kernel(
+        MeasuredPsfConfig(kind="measured", file=cells(tmp_path, table)), camera()
+    )
     patch = draw(image, 10 + x, 10 + y, 25)
     np.testing.assert_allclose(patch[10:15, 10:15], table, rtol=0, atol=5e-3 * table.max())
     assert patch.sum() == pytest.approx(1, abs=1e-5)
@@ -388,9 +408,9 @@ def test_a_measured_lens_is_read_from_fits_and_png_too(tmp_path: Path) -> None:
     import cv2
     from astropy.io import fits
 
-    table = np.round(gaussian_cells(0.8, 4, 5) / gaussian_cells(0.8, 4, 5).max() * 60000).astype(
-        np.uint16
-    )
+    table = np.round(
+        gaussian_cells(0.8, 4, 5) / gaussian_cells(0.8, 4, 5).max() * 60000
+    ).astype(np.uint16)
     fits.PrimaryHDU(table).writeto(tmp_path / "psf.fits")
     cv2.imwrite(str(tmp_path / "psf.png"), table)
     files = [
@@ -400,7 +420,9 @@ def test_a_measured_lens_is_read_from_fits_and_png_too(tmp_path: Path) -> None:
     ]
     csv, *others = (
         draw(
-            build_kernel(MeasuredPsfConfig(kind="measured", file=file, oversampling=4), camera()),
+            build_kernel(
+                MeasuredPsfConfig(kind="measured", file=file, oversampling=4), camera()
+            ),
             10.2,
             9.9,
             21,

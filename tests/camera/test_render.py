@@ -39,10 +39,16 @@ def lens_of(collecting_m2: float = 1.0, **changes: Any) -> Optics:
         "focal_length": "25 mm",
         "f_number": 8,
         "psf": {"kind": "gaussian", "sigma_px": 0.7},
-        "detector": {"quantum_efficiency": 0.5, "full_well_e": 4e4, "gain_e_dn": 10, "bits": 12},
+        "detector": {
+            "quantum_efficiency": 0.5,
+            "full_well_e": 4e4,
+            "gain_e_dn": 10,
+            "bits": 12,
+        },
     }
     return replace(
-        Optics.from_camera(CameraConfig.model_validate(part | changes)), collecting_m2=collecting_m2
+        Optics.from_camera(CameraConfig.model_validate(part | changes)),
+        collecting_m2=collecting_m2,
     )
 
 
@@ -86,12 +92,16 @@ def light(**fields: object) -> Sources:
 
 def star_at(x_px: float, y_px: float, electrons: float = 1.0, lens: Optics = LENS) -> Sources:
     """A star whose light through a square meter, in a second, is `electrons`."""
-    place = np.array([*(np.array([x_px, y_px]) - lens.camera.center_px) / lens.camera.focal_px, 1])
+    place = np.array(
+        [*(np.array([x_px, y_px]) - lens.camera.center_px) / lens.camera.focal_px, 1]
+    )
     place /= np.linalg.norm(place)
     return light(place=[[*place, 0.0]], strength=[electrons / place[2]])
 
 
-def led_at(x_m: float, y_m: float, z_m: float, radius_m: float = 1e-3, **fields: object) -> Sources:
+def led_at(
+    x_m: float, y_m: float, z_m: float, radius_m: float = 1e-3, **fields: object
+) -> Sources:
     """A Lambertian LED that faces straight down."""
     return light(
         place=[[x_m, y_m, z_m, 1.0]],
@@ -235,7 +245,10 @@ def test_a_star_is_a_gaussian_integrated_over_each_pixel(sigma_px: float, fine: 
     ]
     columns, rows = (d.mean(axis=1) / np.sqrt(2 * np.pi) / sigma_px for d in density)
     np.testing.assert_allclose(
-        image, np.outer(rows, columns), rtol=0, atol=2 * image.max() / (fine * sigma_px) ** 2 / 24
+        image,
+        np.outer(rows, columns),
+        rtol=0,
+        atol=2 * image.max() / (fine * sigma_px) ** 2 / 24,
     )
 
 
@@ -276,7 +289,9 @@ def test_an_led_s_image_has_the_diameter_of_thin_geometry(
     a disk is a quarter of its radius squared, the blur's and the pixel's are added."""
     distance_m = distance_in * 0.0254
     psf = {"kind": "gaussian", "sigma_px": 1.0}
-    lens = lens_of(pixel=f"{pixel_um} um", focal_length="35 mm", focus=f"{distance_in} in", psf=psf)
+    lens = lens_of(
+        pixel=f"{pixel_um} um", focal_length="35 mm", focus=f"{distance_in} in", psf=psf
+    )
     image, _ = shot(led_at(0, 0, distance_m), lens=lens)
     radius_px = 2 * np.sqrt(moments(image)[1] - 1 - 1 / 12)
     # Reference §2: 20.8 px at 33 in, 4.2 um.
@@ -378,7 +393,9 @@ def test_a_smeared_disk_s_integration_has_converged(
     assert np.abs(usual - true).max() < 5e-4 * true.max()
 
 
-def test_halving_the_steps_divides_the_error_by_sixteen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_halving_the_steps_divides_the_error_by_sixteen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Two Gaussian points a piece are exact to the third power: the error falls with the fourth."""
 
     def streak(step: float) -> Floats:
@@ -450,16 +467,18 @@ def test_an_led_off_the_axis_is_dimmed_by_the_fourth_power_of_the_cosine() -> No
     lens = lens_of(
         pixel="250 um", psf={"kind": "gaussian", "sigma_px": 0.7}, focus="1 m", f_number=1e3
     )
-    on_axis, aside = (shot(led_at(x, 0, 1.0, 1e-4), lens=lens)[1].electrons[0] for x in (0.0, 0.2))
+    on_axis, aside = (
+        shot(led_at(x, 0, 1.0, 1e-4), lens=lens)[1].electrons[0] for x in (0.0, 0.2)
+    )
     assert aside / on_axis == pytest.approx(np.cos(np.arctan(0.2)) ** 4, rel=1e-6)
 
 
 @pytest.mark.parametrize("duty", [0.35, 0.5, 0.7])
 def test_duty_scales_the_light_of_whole_periods(duty: float) -> None:
     full, dim = (
-        shot(led_at(0, 0, 1.0, period_s=[1e-3], on_s=[d * 1e-3], start_s=[3e-4]), exposure_s=0.01)[
-            0
-        ].sum()
+        shot(
+            led_at(0, 0, 1.0, period_s=[1e-3], on_s=[d * 1e-3], start_s=[3e-4]), exposure_s=0.01
+        )[0].sum()
         for d in (1.0, duty)
     )
     assert dim / full == pytest.approx(duty, rel=1e-10)
@@ -488,7 +507,9 @@ def test_parallax_matches_a_hand_calculation(tilt_deg: float) -> None:
     angle = np.radians(tilt_deg)
     mount = Mount(np.array([0, 0, height]), Rotation.identity())
     _, seen = shot(
-        led_at(0, 0, radius), turning([0, 0, 0], Rotation.from_rotvec([0, angle, 0])), mount=mount
+        led_at(0, 0, radius),
+        turning([0, 0, 0], Rotation.from_rotvec([0, angle, 0])),
+        mount=mount,
     )
     wanted = 31.5 - 2500 * radius * np.sin(angle) / (radius * np.cos(angle) - height)
     np.testing.assert_allclose(seen.xy_px, [[wanted, 23.5]], rtol=0, atol=1e-9)
@@ -524,7 +545,9 @@ def test_a_rolling_shutter_images_static_light_like_a_global_one() -> None:
     rolling, seen = draw(star_at(30.3, 20.8), Window(0.1, 0.5, 1e-3))
     still, other = draw(star_at(30.3, 20.8), Window(0.1, 0.5))
     np.testing.assert_allclose(rolling, still, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(seen.flux_xy_px, other.flux_xy_px, rtol=0, atol=1e-4)  # the S-curve
+    np.testing.assert_allclose(
+        seen.flux_xy_px, other.flux_xy_px, rtol=0, atol=1e-4
+    )  # the S-curve
 
 
 def test_a_rolling_shutter_shears_what_moves() -> None:
@@ -571,7 +594,9 @@ def test_a_rolling_shutter_bands_a_pulsed_led() -> None:
 @pytest.mark.compiles
 def test_jitter_widens_a_star_by_its_own_variance() -> None:
     line = JitterLineConfig(kind="line", frequency_hz=40.0, rms_arcsec=(60.0, 120.0, 0.0))
-    shaken = Vibration.draw(MotionConfig(jitter=(line,)), np.random.default_rng(4)).add_to(STILL)
+    shaken = Vibration.draw(MotionConfig(jitter=(line,)), np.random.default_rng(4)).add_to(
+        STILL
+    )
     image, seen = shot(star_at(31.5, 23.5), shaken)  # forty whole periods
     wide = (np.radians([120 / 3600, 60 / 3600]) * 2500) ** 2  # about y it swings along x
     np.testing.assert_allclose(moments(image)[1], 0.7**2 + 1 / 12 + wide, rtol=2e-3, atol=0)
@@ -584,7 +609,9 @@ def test_a_step_of_the_attitude_draws_two_stars() -> None:
     """Half of the exposure at each of two places 20 px apart, with a step of 1 ms between them."""
     t = np.concatenate([np.arange(0, 0.5, 1e-3), np.arange(0.5, 3, 1e-3)])
     turned = np.where(t < 0.5, 0.0, 20 / 2500)
-    leap = Trajectory(t, Rotation.from_rotvec(np.outer(turned, [0, 1, 0])), np.zeros((len(t), 3)))
+    leap = Trajectory(
+        t, Rotation.from_rotvec(np.outer(turned, [0, 1, 0])), np.zeros((len(t), 3))
+    )
     image, _ = shot(star_at(41.5, 23.5), leap)
     assert image[:, 37:47].sum() == pytest.approx(0.5, abs=2e-3)
     assert image[:, 17:27].sum() == pytest.approx(0.5, abs=2e-3)
@@ -594,7 +621,8 @@ def test_an_exposure_of_too_many_attitude_samples_is_refused() -> None:
     t = np.linspace(0, 3, 60_000)
     fine = Trajectory(t, Rotation.identity(len(t)), np.zeros((len(t), 3)))
     with pytest.raises(
-        InputError, match=r"exposure\.time: 2 s holds \d+ samples of the attitude; allowed: 32769"
+        InputError,
+        match=r"exposure\.time: 2 s holds \d+ samples of the attitude; allowed: 32769",
     ):
         draw(light(), Window(0.1, 2.0), fine)
 
@@ -713,11 +741,14 @@ def test_blur_grows_to_its_value_in_the_corner() -> None:
 
 def test_vignetting_dims_a_star_and_an_led_alike() -> None:
     lens = lens_of(
-        pixel="250 um", vignetting={"kind": "table", "angle_deg": [0, 20], "transmission": [1, 0.6]}
+        pixel="250 um",
+        vignetting={"kind": "table", "angle_deg": [0, 20], "transmission": [1, 0.6]},
     )
     plain = lens_of(pixel="250 um")
     for source in (star_at(41.5, 23.5, lens=plain), led_at(0.1, 0, 1.0, 1e-5)):
-        ratio = shot(source, lens=lens)[1].electrons[0] / shot(source, lens=plain)[1].electrons[0]
+        ratio = (
+            shot(source, lens=lens)[1].electrons[0] / shot(source, lens=plain)[1].electrons[0]
+        )
         assert ratio == pytest.approx(1 - 0.4 * np.degrees(np.arctan(0.1)) / 20, rel=1e-6)
 
 
@@ -726,7 +757,10 @@ def test_a_lobe_dims_an_led_seen_obliquely() -> None:
     lens = lens_of(pixel="250 um")
     lambert, narrow = (
         draw(
-            source, Window(0.1, 0.1), lens=lens, emitter=Emitter(lobe=CosineLobeConfig(exponent=n))
+            source,
+            Window(0.1, 0.1),
+            lens=lens,
+            emitter=Emitter(lobe=CosineLobeConfig(exponent=n)),
         )[1].electrons[0]
         for n in (1.0, 7.0)
     )

@@ -20,7 +20,12 @@ CAMERA = CameraConfig.model_validate(
         "pixel": "9.9 um",
         "focal_length": "25 mm",
         "f_number": 1.4,
-        "detector": {"quantum_efficiency": 0.4, "full_well_e": 40000, "gain_e_dn": 10, "bits": 12},
+        "detector": {
+            "quantum_efficiency": 0.4,
+            "full_well_e": 40000,
+            "gain_e_dn": 10,
+            "bits": 12,
+        },
     }
 )
 SIZE = 61
@@ -92,7 +97,9 @@ def test_the_image_s_centroid_is_at_its_requested_position(image: Kernel) -> Non
 @every_kernel
 def test_ranges_of_rows_add_up_to_the_whole(image: Kernel) -> None:
     x, y = PLACES[0]
-    parts = [draw(image, x, y, rows) for rows in ((-5, 11), (11, 27), (27, 28), (28, 28), (28, 99))]
+    parts = [
+        draw(image, x, y, rows) for rows in ((-5, 11), (11, 27), (27, 28), (28, 28), (28, 99))
+    ]
     np.testing.assert_allclose(sum(parts), draw(image, x, y), rtol=1e-12, atol=0)
     assert not parts[1][:11].any()
     assert not parts[1][27:].any()
@@ -104,8 +111,12 @@ def test_mirrored_places_give_mirrored_images(image: Kernel) -> None:
     x, y = PLACES[1]
     patch = draw(image, x, y)
     tolerance = 1e-6 * patch.max()  # single precision
-    np.testing.assert_allclose(draw(image, SIZE - 1 - x, y), patch[:, ::-1], rtol=0, atol=tolerance)
-    np.testing.assert_allclose(draw(image, x, SIZE - 1 - y), patch[::-1], rtol=0, atol=tolerance)
+    np.testing.assert_allclose(
+        draw(image, SIZE - 1 - x, y), patch[:, ::-1], rtol=0, atol=tolerance
+    )
+    np.testing.assert_allclose(
+        draw(image, x, SIZE - 1 - y), patch[::-1], rtol=0, atol=tolerance
+    )
     np.testing.assert_allclose(draw(image, y, x), patch.T, rtol=0, atol=tolerance)
 
 
@@ -127,7 +138,9 @@ def test_light_is_added_in_proportion_and_none_of_it_is_negative(image: Kernel) 
     x, y = PLACES[2]
     one = draw(image, x, y)
     assert one.min() >= -1e-8 * one.max()
-    np.testing.assert_allclose(draw(image, x, y, electrons=2e5), 2e5 * one, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(
+        draw(image, x, y, electrons=2e5), 2e5 * one, rtol=1e-6, atol=1e-9
+    )
 
 
 @every_kernel
@@ -185,4 +198,6 @@ def test_faded_wings_keep_the_total_light_at_any_position() -> None:
     """Power-law wings are faded out, so that the total does not depend on where the image stands."""
     image = build_kernel(MoffatPsfConfig(kind="moffat", fwhm_px=1.5, beta=2.5), CAMERA)
     assert image.reach_px < MIDDLE
-    np.testing.assert_allclose([draw(image, x, y).sum() for x, y in PLACES], 1, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(
+        [draw(image, x, y).sum() for x, y in PLACES], 1, rtol=0, atol=1e-5
+    )

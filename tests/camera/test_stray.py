@@ -64,7 +64,10 @@ def test_the_glow_of_a_uniform_sphere_matches_theory() -> None:
     radius = np.linalg.norm(xy_px - optics.camera.center_px, axis=1) / optics.camera.focal_px
     radiance = share * count * math.pi / (16 * math.pi) / (1 - share) / math.pi
     expected = (
-        radiance * optics.collecting_m2 * np.cos(np.arctan(radius)) ** 4 / optics.camera.focal_px**2
+        radiance
+        * optics.collecting_m2
+        * np.cos(np.arctan(radius)) ** 4
+        / optics.camera.focal_px**2
     )
     np.testing.assert_allclose(glow, expected.reshape(shape), rtol=1e-4)
 

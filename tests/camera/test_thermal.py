@@ -40,11 +40,16 @@ def config(temperature: dict[str, Any], **rest: Any) -> ThermalConfig:
             },
             24.0,
         ),
-        ({"kind": "table", "hours": [0.0, 1.0, 2.0], "temperature_c": [20.0, 22.0, 26.0]}, 24.0),
+        (
+            {"kind": "table", "hours": [0.0, 1.0, 2.0], "temperature_c": [20.0, 22.0, 26.0]},
+            24.0,
+        ),
     ],
     ids=lambda value: value["kind"] if isinstance(value, dict) else "",
 )
-def test_temperature_after_an_hour_and_a_half(history: dict[str, Any], expected_c: float) -> None:
+def test_temperature_after_an_hour_and_a_half(
+    history: dict[str, Any], expected_c: float
+) -> None:
     """The same holds after half an hour for a history three times as fast."""
     assert temperature_c(config(history), 5400.0) == pytest.approx(expected_c, abs=1e-12)
     assert temperature_c(config(history, speed=3.0, **MOUNT), 1800.0) == pytest.approx(
@@ -72,7 +77,9 @@ def leds_and_stars() -> Sources:
 
 def test_dome_expands_from_its_anchor() -> None:
     """By alpha dT of the distance from it, and creeps; stars stay where they are."""
-    settings = config(LINEAR, dome_ppm_k=70.0, anchor_height="0.9 m", creep=["0 m", "0 m", "-1 mm"])
+    settings = config(
+        LINEAR, dome_ppm_k=70.0, anchor_height="0.9 m", creep=["0 m", "0 m", "-1 mm"]
+    )
     before = leds_and_stars()
     after = leds_at(settings, before, 2 * 3600.0)
     anchor = np.array([0.0, 0.0, 0.9])
@@ -111,7 +118,9 @@ def test_boresight_drifts_by_its_coefficient_in_the_truth() -> None:
         nominal = camera.mount.cam_from_body * truth.lab_from_body.inv()
         drift_k = -1 + truth.t_s  # 2 K an hour, 1800 times as fast
         turned = (truth.cam_from_lab * nominal.inv()).as_rotvec() / ARCSEC_RAD
-        np.testing.assert_allclose(turned, np.array([300.0, -200.0, 100.0]) * drift_k, atol=1e-6)
+        np.testing.assert_allclose(
+            turned, np.array([300.0, -200.0, 100.0]) * drift_k, atol=1e-6
+        )
         stars = camera.sources.take(np.isin(camera.sources.id, truth.sources.id))
         rows = np.searchsorted(truth.sources.id, stars.id, sorter=np.argsort(truth.sources.id))
         xy_px = camera.optics.project(truth.cam_from_lab.apply(stars.place[:, :3]))

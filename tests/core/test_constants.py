@@ -20,7 +20,10 @@ from estimator.core import constants as believed
 from skysim.core import constants, time
 
 ROOT = Path(__file__).resolve().parents[2]
-OWN_FILES = {"skysim": ("core/constants.py", "core/time.py"), "estimator": ("core/constants.py",)}
+OWN_FILES = {
+    "skysim": ("core/constants.py", "core/time.py"),
+    "estimator": ("core/constants.py",),
+}
 ROUNDED = 1e-4  # relative error of a number of four digits
 
 # What others say of each constant, and how many digits ours has.
@@ -96,7 +99,9 @@ def test_no_constant_is_defined_twice(package: str) -> None:
     own = [ROOT / package / name for name in OWN_FILES[package]]
     others = [path for path in sorted((ROOT / package).rglob("*.py")) if path not in own]
     known = (
-        numbers_of(constants) | numbers_of(time) if package == "skysim" else numbers_of(believed)
+        numbers_of(constants) | numbers_of(time)
+        if package == "skysim"
+        else numbers_of(believed)
     )
     assert len(others) > 80
     assert [again for path in others for again in defined_again(path, known)] == []
@@ -166,7 +171,10 @@ def number_of(node: ast.AST) -> float | None:
         return None
     try:
         return float(
-            eval(compile(ast.Expression(node), "", "eval"), {"math": math, "np": np, "erfa": erfa})
+            eval(
+                compile(ast.Expression(node), "", "eval"),
+                {"math": math, "np": np, "erfa": erfa},
+            )
         )
     except (ArithmeticError, AttributeError, TypeError, ValueError):
         return None

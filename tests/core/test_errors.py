@@ -46,7 +46,8 @@ def test_every_part_is_printable(quoted: str) -> None:
     error = InputError(quoted, quoted, quoted, Where(quoted, 3))
     assert str(error).isprintable()
     assert all(
-        part.isprintable() for part in (error.key, error.problem, error.allowed, str(error.where))
+        part.isprintable()
+        for part in (error.key, error.problem, error.allowed, str(error.where))
     )
 
 
@@ -69,11 +70,19 @@ def test_every_part_is_printable(quoted: str) -> None:
             InputError("a.csv", "3 numbers", 4, Where("a.csv", 7)),
             "a.csv, line 7: 3 numbers; allowed: 4",
         ),
-        (InputError(Path("a.csv"), "bad", "", Where(Path("a.csv"), 7, "row")), "a.csv, row 7: bad"),
-        (InputError("a.csv", "empty", "a table", Where("a.csv")), "a.csv: empty; allowed: a table"),
+        (
+            InputError(Path("a.csv"), "bad", "", Where(Path("a.csv"), 7, "row")),
+            "a.csv, row 7: bad",
+        ),
+        (
+            InputError("a.csv", "empty", "a table", Where("a.csv")),
+            "a.csv: empty; allowed: a table",
+        ),
     ],
 )
-def test_the_error_line_has_place_problem_and_allowed_values(error: InputError, line: str) -> None:
+def test_the_error_line_has_place_problem_and_allowed_values(
+    error: InputError, line: str
+) -> None:
     assert str(error) == line
 
 

@@ -32,7 +32,9 @@ Shot = tuple[scene.Scene, Frame, Truth]
 
 
 def shoot(name: str, **overrides: str) -> Shot:
-    loaded = loader.load(name, {key.replace("__", "."): value for key, value in overrides.items()})
+    loaded = loader.load(
+        name, {key.replace("__", "."): value for key, value in overrides.items()}
+    )
     frame, truth = simulate_motion(loaded).render(0)
     return loaded, frame, truth
 
@@ -85,7 +87,9 @@ def test_a_frame_round_trips_bit_for_bit(sky: Shot, written: Path, suffix: str) 
 def test_every_16_bit_value_survives_png_and_fits(tmp_path: Path, sky: Shot) -> None:
     image = np.arange(65536, dtype=np.uint16).reshape(256, 256)
     files.write_png16(tmp_path / "all.png", image)
-    recording.write_fits(tmp_path / "all.fits", Frame(0, image, 0.1, 0.04, 65535.0), sky[2], sky[0])
+    recording.write_fits(
+        tmp_path / "all.fits", Frame(0, image, 0.1, 0.04, 65535.0), sky[2], sky[0]
+    )
     np.testing.assert_array_equal(images.read_image(tmp_path / "all.png"), image)
     np.testing.assert_array_equal(images.read_image(tmp_path / "all.fits"), image)
 
@@ -96,7 +100,9 @@ def test_a_noise_free_frame_stays_a_float_in_fits_and_is_rounded_in_png(
 ) -> None:
     loaded, frame, truth = dome
     recording.write_frame(tmp_path, frame, truth, loaded)
-    np.testing.assert_array_equal(images.read_image(tmp_path / "frame_0000.fits"), frame.image_dn)
+    np.testing.assert_array_equal(
+        images.read_image(tmp_path / "frame_0000.fits"), frame.image_dn
+    )
     rounded = images.read_image(tmp_path / "frame_0000.png").astype(float)
     assert np.abs(rounded - frame.image_dn).max() <= 0.5
 
@@ -175,7 +181,9 @@ def test_bodies_of_a_truth_table_round_trip_by_name(sky: Shot, tmp_path: Path) -
     loaded, frame, truth = sky
     moon = BodyTruth(9_000_301, "moon", -8.84, 154.86, 4.84, 1868.9, 118.4)
     for bodies in ((), (moon,)):
-        recording.write_truth(tmp_path / "truth.ecsv", frame, replace(truth, bodies=bodies), loaded)
+        recording.write_truth(
+            tmp_path / "truth.ecsv", frame, replace(truth, bodies=bodies), loaded
+        )
         meta = Table.read(tmp_path / "truth.ecsv", format="ascii.ecsv").meta
         assert meta.get("bodies", []) == [asdict(body) for body in bodies]
 
@@ -224,7 +232,9 @@ def test_astropy_puts_the_true_stars_on_their_true_pixels(
     sources = flight.lab.camera.sources
     rows = {hip: n for n, hip in enumerate(sources.id)}
     direction = sources.place[[rows[hip] for hip in truth.sources.id], :3]
-    ra, dec = np.degrees([np.arctan2(direction[:, 1], direction[:, 0]), np.arcsin(direction[:, 2])])
+    ra, dec = np.degrees(
+        [np.arctan2(direction[:, 1], direction[:, 0]), np.arcsin(direction[:, 2])]
+    )
     x, y = WCS(fits.getheader(tmp_path / "f.fits")).all_world2pix(ra, dec, 0)
     assert len(x) > 20
     np.testing.assert_allclose(np.column_stack([x, y]), truth.sources.xy_px, rtol=0, atol=1e-6)
@@ -450,7 +460,11 @@ def test_json_writes_nan_and_infinity_as_null() -> None:
         "b": [np.float64("inf"), np.int64(3)],
         "c": (np.bool_(True), "x", None),
     }
-    assert json.loads(files.to_json(data)) == {"a": None, "b": [None, 3], "c": [True, "x", None]}
+    assert json.loads(files.to_json(data)) == {
+        "a": None,
+        "b": [None, 3],
+        "c": [True, "x", None],
+    }
 
 
 def test_a_live_camera_s_frame_is_read_by_opencv_and_a_missing_one_is_reported(

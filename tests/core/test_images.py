@@ -77,16 +77,22 @@ def test_a_guarded_script_has_limits(tmp_path: Path, code: str, outcome: str) ->
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_more_axes_than_the_standard_has_are_refused_at_once(tmp_path: Path, number: int) -> None:
+def test_more_axes_than_the_standard_has_are_refused_at_once(
+    tmp_path: Path, number: int
+) -> None:
     """astropy makes a list of as many entries as the header says."""
     path = tmp_path / "axes.fits"
-    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(np.zeros((32, 32), np.int16))]).writeto(path)
+    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(np.zeros((32, 32), np.int16))]).writeto(
+        path
+    )
     data = path.read_bytes()
     start = [hit.start() for hit in re.finditer(b"NAXIS   = ", data) if hit.start() % 80 == 0][
         number
     ]
     path.write_bytes(data[: start + 10] + b"2147483647".rjust(20) + data[start + 30 :])
-    with pytest.raises(InputError, match=r"axes\.fits: NAXIS 2147483647; allowed: up to 999 axes$"):
+    with pytest.raises(
+        InputError, match=r"axes\.fits: NAXIS 2147483647; allowed: up to 999 axes$"
+    ):
         images.read_image(path)
 
 

@@ -20,7 +20,9 @@ from skysim.core.paths import title_of
         ('title: "open\n', ""),
     ],
 )
-def test_a_title_is_taken_from_the_file_or_its_base(tmp_path: Path, text: str, title: str) -> None:
+def test_a_title_is_taken_from_the_file_or_its_base(
+    tmp_path: Path, text: str, title: str
+) -> None:
     (tmp_path / "lab.yaml").write_text("title: The lab\n")
     path = tmp_path / "mine.yaml"
     path.write_text(text)

@@ -67,7 +67,9 @@ def test_an_image_is_read_upright_like_pillow(
 ) -> None:
     """OpenCV leaves JPEG and PNG as stored and turns TIFF; Pillow's `exif_transpose` is another implementation."""
     path = with_exif(
-        tmp_path / f"x{suffix}", np.dstack([GRAY, GRAY[::-1], GRAY]) if color else GRAY, orientation
+        tmp_path / f"x{suffix}",
+        np.dstack([GRAY, GRAY[::-1], GRAY]) if color else GRAY,
+        orientation,
     )
     # By its path, Pillow does not turn a gray TIFF.
     with Image.open(io.BytesIO(path.read_bytes())) as stored:
@@ -101,7 +103,9 @@ def test_the_focal_length_of_35_mm_film_is_read(tmp_path: Path, suffix: str) -> 
     assert images.read_picture(with_exif(tmp_path / f"x{suffix}", GRAY, 1, 26)).focal_35mm == 26
     assert images.read_picture(with_exif(tmp_path / f"y{suffix}", GRAY, 6)).focal_35mm is None
     # 0: unknown.
-    assert images.read_picture(with_exif(tmp_path / f"z{suffix}", GRAY, 6, 0)).focal_35mm is None
+    assert (
+        images.read_picture(with_exif(tmp_path / f"z{suffix}", GRAY, 6, 0)).focal_35mm is None
+    )
 
 
 def exif_block(order: str, *entries: tuple[int, int, int, int], first: int = 8) -> bytes:
@@ -184,7 +188,9 @@ def test_the_last_row_is_the_top_by_default(tmp_path: Path) -> None:
             ("sideways", False, False),
         ]
     ):
-        path = fits_file(tmp_path / f"{n}.fits", FRAME, **({"ROWORDER": order} if order else {}))
+        path = fits_file(
+            tmp_path / f"{n}.fits", FRAME, **({"ROWORDER": order} if order else {})
+        )
         picture = images.read_picture(path)
         np.testing.assert_array_equal(picture.pixels, FRAME if highest_first else FRAME[::-1])
         assert picture.row_order_known is known
@@ -206,14 +212,20 @@ def test_a_file_of_tiles_is_read_with_its_header(tmp_path: Path, packed: bool) -
     header = fits.Header([("ROWORDER", "TOP-DOWN"), ("DATE-OBS", "2012-06-22T21:00:00")])
     path = tmp_path / "x.fits.fz"
     fits.HDUList(
-        [fits.PrimaryHDU(), fits.CompImageHDU(np.kron(FRAME, np.ones((5, 5), np.uint16)), header)]
+        [
+            fits.PrimaryHDU(),
+            fits.CompImageHDU(np.kron(FRAME, np.ones((5, 5), np.uint16)), header),
+        ]
     ).writeto(path)
     if packed:
         path = path.rename(tmp_path / "y.fits.gz")
         path.write_bytes(gzip.compress(path.read_bytes()))
     picture = images.read_picture(path)
     np.testing.assert_array_equal(picture.pixels[::5, ::5], FRAME)
-    assert (picture.row_order_known, picture.date_utc) == (True, datetime.datetime(2012, 6, 22, 21))
+    assert (picture.row_order_known, picture.date_utc) == (
+        True,
+        datetime.datetime(2012, 6, 22, 21),
+    )
 
 
 @pytest.mark.parametrize("kind", ["i2", "u2", "i4", "f4", "f8", "u1"])
@@ -264,7 +276,9 @@ def test_a_gzipped_file_is_unpacked_up_to_a_limit(
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.999])
 def test_a_truncated_gzipped_file_is_refused_in_one_line(tmp_path: Path, share: float) -> None:
     data = gzip.compress(
-        fits_file(tmp_path / "x.fits", RNG.integers(0, 60_000, (60, 90), np.uint16)).read_bytes()
+        fits_file(
+            tmp_path / "x.fits", RNG.integers(0, 60_000, (60, 90), np.uint16)
+        ).read_bytes()
     )
     path = tmp_path / "x.fits.gz"
     path.write_bytes(data[: int(share * len(data))])
@@ -274,7 +288,9 @@ def test_a_truncated_gzipped_file_is_refused_in_one_line(tmp_path: Path, share: 
 @pytest.mark.parametrize(
     "data", [b"once upon a time", gzip.compress(b"once upon a time", mtime=0), bytes(99)]
 )
-def test_an_invalid_gzipped_fits_file_is_refused_in_one_line(tmp_path: Path, data: bytes) -> None:
+def test_an_invalid_gzipped_fits_file_is_refused_in_one_line(
+    tmp_path: Path, data: bytes
+) -> None:
     path = tmp_path / "x.fits.gz"
     path.write_bytes(data)
     assert re.search("not a complete (gzip|FITS) file", complaint(path))
@@ -300,7 +316,9 @@ def test_a_packed_file_s_pixels_are_counted_before_they_are_read(tmp_path: Path)
     )
     path = tmp_path / "x.fits.gz"
     path.write_bytes(gzip.compress((header + b"END".ljust(80)).ljust(2880) + bytes(2880)))
-    assert re.search("99999x99999 pixels by its header|not a complete FITS file", complaint(path))
+    assert re.search(
+        "99999x99999 pixels by its header|not a complete FITS file", complaint(path)
+    )
 
 
 # TIFF
@@ -316,7 +334,9 @@ def test_color_planes_of_a_tiff_are_read_right_or_refused_by_name(
     rgb = RNG.uniform(0, 250, (30, 40, 3)).astype(kind)
     path = tmp_path / "x.tif"
     order = {"planarconfig": "separate" if planes else "contig", "compression": packed}
-    tifffile.imwrite(path, np.moveaxis(rgb, 2, 0) if planes else rgb, photometric="rgb", **order)
+    tifffile.imwrite(
+        path, np.moveaxis(rgb, 2, 0) if planes else rgb, photometric="rgb", **order
+    )
     if planes and kind != "u1":
         bits = 8 * np.dtype(kind).itemsize
         assert (

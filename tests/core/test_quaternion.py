@@ -21,7 +21,9 @@ def test_rotation_vectors_round_trip_through_quaternions(turn: list[float]) -> N
     same = Rotation.from_rotvec(turn)
     assert (Rotation.from_quat(made, scalar_first=True).inv() * same).magnitude() < 1e-15
     np.testing.assert_allclose(quaternion.to_rotvec(made), same.as_rotvec(), rtol=0, atol=1e-14)
-    np.testing.assert_allclose(quaternion.to_rotvec(-made), same.as_rotvec(), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        quaternion.to_rotvec(-made), same.as_rotvec(), rtol=0, atol=1e-14
+    )
 
 
 @pytest.mark.parametrize("one", TURNS)
@@ -37,7 +39,9 @@ def test_products_and_rotated_vectors_match_scipy(one: list[float], two: list[fl
     np.testing.assert_allclose(
         quaternion.apply(wxyz(one), vector), a.apply(vector), rtol=0, atol=2e-15
     )
-    np.testing.assert_allclose(quaternion.to_matrix(wxyz(one)), a.as_matrix(), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        quaternion.to_matrix(wxyz(one)), a.as_matrix(), rtol=0, atol=1e-15
+    )
 
 
 def test_the_cross_product_matches_numpy() -> None:

@@ -108,14 +108,18 @@ def test_naive_times_equal_utc_times() -> None:
     )
     assert time.tt_days(naive) == time.tt_days(zoned)
     # JD 2460370.0 is 2024-02-29 12:00; TT is 69.184 s ahead of UTC.
-    assert time.tt_days(naive) == pytest.approx(2460370.0 - 2451545.0 + 69.184 / 86400, abs=1e-9)
+    assert time.tt_days(naive) == pytest.approx(
+        2460370.0 - 2451545.0 + 69.184 / 86400, abs=1e-9
+    )
 
 
 def test_a_year_out_of_range_is_refused() -> None:
     for year in (1899, 2101):
         with pytest.raises(ValueError, match="is outside 1900 to 2100"):
             time.check_year(datetime.datetime(year, 6, 1))
-    zoned = datetime.datetime(2100, 6, 1, 2, tzinfo=datetime.timezone(datetime.timedelta(hours=2)))
+    zoned = datetime.datetime(
+        2100, 6, 1, 2, tzinfo=datetime.timezone(datetime.timedelta(hours=2))
+    )
     assert time.check_year(zoned) == datetime.datetime(2100, 6, 1)
 
 

@@ -91,7 +91,10 @@ def test_a_plain_size_scales_standard_normal_numbers_bit_for_bit() -> None:
         ({"tolerance": "0.5 mm"}, Tolerance(5e-4)),
         ({"tolerance": "±0.5 mm", "distribution": "uniform"}, Tolerance(5e-4)),
         ({"tolerance": "+/-20 um"}, Tolerance(2e-5)),
-        ({"tolerance": "+- 1 mm", "distribution": "truncated_normal"}, Tolerance(1e-3, 1e-3 / 3)),
+        (
+            {"tolerance": "+- 1 mm", "distribution": "truncated_normal"},
+            Tolerance(1e-3, 1e-3 / 3),
+        ),
         (
             {"tolerance": "1 mm", "distribution": "truncated_normal", "sigma": "0.5 mm"},
             Tolerance(1e-3, 5e-4),
@@ -111,7 +114,9 @@ def test_a_size_is_read_as_a_sigma_or_a_tolerance(value: Any, expected: float) -
 def test_a_bare_number_takes_a_tolerance_too() -> None:
     assert size(0.08, "ratio") == 0.08
     assert (
-        size({"tolerance": 0.1}, "ratio") == size({"tolerance": "±0.1"}, "ratio") == Tolerance(0.1)
+        size({"tolerance": 0.1}, "ratio")
+        == size({"tolerance": "±0.1"}, "ratio")
+        == Tolerance(0.1)
     )
 
 
@@ -203,9 +208,12 @@ def test_leds_of_a_bin_are_as_bright_as_its_tolerance() -> None:
 
 
 def test_a_bin_that_leaves_no_light_is_refused() -> None:
-    with pytest.raises(InputError, match=r"light.led.scatter: a tolerance of 1 leaves no light"):
+    with pytest.raises(
+        InputError, match=r"light.led.scatter: a tolerance of 1 leaves no light"
+    ):
         loader.load(
-            "afit_simsat", {"light.led.scatter": "{tolerance: 1.0, distribution: truncated_normal}"}
+            "afit_simsat",
+            {"light.led.scatter": "{tolerance: 1.0, distribution: truncated_normal}"},
         )
 
 
@@ -249,7 +257,8 @@ def test_glued_leds_stay_within_their_tolerance() -> None:
     made = [
         dome.sources(
             loader.load(
-                "afit_simsat", keys | {"light.layout": keys["light.layout"].replace("GLUE", glue)}
+                "afit_simsat",
+                keys | {"light.layout": keys["light.layout"].replace("GLUE", glue)},
             ).light,
             Band.from_efficiency(0.5),
         ).place[:, :3]

@@ -43,7 +43,9 @@ def test_an_uncommon_unit_is_converted_by_astropy(text: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["shefex2", pytest.param("afit_simsat", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["shefex2", pytest.param("afit_simsat", marks=pytest.mark.slow)]
+)
 def test_a_scene_is_loaded_without_astropy(name: str) -> None:
     code = f"import sys; from skysim.scene import loader; loader.load({name!r}); print('astropy' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

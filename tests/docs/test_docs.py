@@ -23,7 +23,10 @@ COUNT = "--count"  # the word before the number of trials
 def commands(page: str = DOME) -> list[list[str]]:
     blocks = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     return [
-        shlex.split(line, comments=True) for block in blocks for line in block.splitlines() if line
+        shlex.split(line, comments=True)
+        for block in blocks
+        for line in block.splitlines()
+        if line
     ]
 
 
@@ -80,7 +83,9 @@ def test_the_page_s_survey_prints_what_the_page_shows(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     (after,) = re.findall(
-        r"^after: (\d+) of \d+.*?cross median ([\d.]+)″.*?roll median ([\d.]+)″", done.stdout, re.M
+        r"^after: (\d+) of \d+.*?cross median ([\d.]+)″.*?roll median ([\d.]+)″",
+        done.stdout,
+        re.M,
     )
     rows = dict(re.findall(r"^\| (new attitudes|cross|roll).*\| ([\d.]+)[^|]*\|$", DOME, re.M))
     shown = [float(rows[name]) for name in ("new attitudes", "cross", "roll")]

@@ -89,7 +89,9 @@ def walked() -> list[Any]:
         if {"sh", "python", "yaml"} & {block.language for block in blocks(path)}
     ]
     names = [os.path.relpath(path, DOCS) for path in running if "studies" not in path.parts]
-    return [pytest.param(name, marks=[pytest.mark.long] if name in LONG else []) for name in names]
+    return [
+        pytest.param(name, marks=[pytest.mark.long] if name in LONG else []) for name in names
+    ]
 
 
 @pytest.fixture
@@ -122,7 +124,9 @@ def test_a_page_s_blocks_run_in_order(
             Path(named[1]).write_text(block.text, encoding="utf-8")
             files.append(named[1])
         elif block.language == "yaml":
-            pytest.fail(f"a block of YAML without a file's name in its first line:\n{block.text}")
+            pytest.fail(
+                f"a block of YAML without a file's name in its first line:\n{block.text}"
+            )
         elif block.language == "python":
             with contextlib.redirect_stdout(io.StringIO()):
                 exec(compile(block.text, name, "exec"), session)
@@ -159,9 +163,9 @@ def ran(line: str) -> str:
     assert printed.getvalue(), line
     assert "failed:" not in printed.getvalue(), line
     if words[0] == "run":
-        assert re.search(r"^[1-9]\d* of \d+ frames solved, 0 wrong", printed.getvalue(), re.M), (
-            printed.getvalue()
-        )
+        assert re.search(
+            r"^[1-9]\d* of \d+ frames solved, 0 wrong", printed.getvalue(), re.M
+        ), printed.getvalue()
     return printed.getvalue()
 
 
@@ -170,7 +174,9 @@ def shape(line: str) -> str:
     return "".join(NUMBER.sub("#", line).split())
 
 
-@pytest.mark.parametrize("path", all_pages(), ids=lambda path: path.relative_to(ROOT).as_posix())
+@pytest.mark.parametrize(
+    "path", all_pages(), ids=lambda path: path.relative_to(ROOT).as_posix()
+)
 def test_every_block_states_its_language(path: Path) -> None:
     """Blocks that are not run are `text` blocks; unknown languages are refused."""
     assert [block for block in blocks(path) if block.language not in LANGUAGES] == []
@@ -268,7 +274,9 @@ def test_every_link_of_a_page_has_an_existing_target() -> None:
 def test_the_figures_are_drawn_by_their_script(tmp_path: Path) -> None:
     script = DOCS / "site/figures.py"
     subprocess.run(
-        [sys.executable, script, tmp_path], env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True
+        [sys.executable, script, tmp_path],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        check=True,
     )
     drawn = {path.name for path in tmp_path.glob("*.svg")}
     assert drawn == {path.name for path in (DOCS / "images").glob("*.svg")}

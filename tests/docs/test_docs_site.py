@@ -38,7 +38,9 @@ PAGES = {
 }
 SECTIONS = dict(
     re.findall(
-        r"^##+ `skysim ?([^`]*)`\n(.*?)(?=^##|\Z)", GENERATED["commands"], re.DOTALL | re.MULTILINE
+        r"^##+ `skysim ?([^`]*)`\n(.*?)(?=^##|\Z)",
+        GENERATED["commands"],
+        re.DOTALL | re.MULTILINE,
     )
 )
 
@@ -55,7 +57,8 @@ def helped(*words: str) -> str:
 @pytest.mark.slow
 def test_every_command_that_help_names_has_its_section() -> None:
     shown = {
-        name: re.findall(r"^│ ([a-z]+)  ", helped(*name.split()), re.MULTILINE) for name in SECTIONS
+        name: re.findall(r"^│ ([a-z]+)  ", helped(*name.split()), re.MULTILINE)
+        for name in SECTIONS
     }
     assert len(shown[""]) >= 15
     named_commands = {
@@ -108,7 +111,9 @@ def test_links_of_generated_parts_lead_to_pages_and_headings() -> None:
         for page, anchor in re.findall(r"\]\(([\w/.]+\.md)(?:#([\w-]+))?\)", text):
             linked = (ROOT / "docs" / "reference" / page).read_text(encoding="utf-8")
             headings = re.findall(r"^#+ (.*)$", linked, re.MULTILINE)
-            slugs = {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in headings}
+            slugs = {
+                re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in headings
+            }
             assert not anchor or anchor in slugs
 
 
@@ -144,7 +149,9 @@ def test_every_response_has_a_row_with_its_meaning() -> None:
 
 
 def test_names_that_a_key_allows_are_on_its_row() -> None:
-    rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|.*\|$", GENERATED["scene_keys"], re.MULTILINE))
+    rows = dict(
+        re.findall(r"^\| `(\w+)` \| (.*) \|.*\|$", GENERATED["scene_keys"], re.MULTILINE)
+    )
     assert {"`sequential`", "`local`"} <= set(rows["detector"].split(", "))
     assert "`default`" in rows["identifier"]
     assert "`led_pairs`" in rows["identifier"]
@@ -205,7 +212,9 @@ def test_every_make_target_of_ci_exists(name: str) -> None:
     )
     pages = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     assert [
-        one for one in (f".ci/{name}", *(f"make {one}" for one in parts)) if f"`{one}" not in pages
+        one
+        for one in (f".ci/{name}", *(f"make {one}" for one in parts))
+        if f"`{one}" not in pages
     ] == []
 
 

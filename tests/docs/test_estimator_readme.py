@@ -30,9 +30,9 @@ def picture(cam_from_icrs: Rotation) -> np.ndarray:
     rows, columns = np.mgrid[:800, :1000]
     for (x, y), mag in zip(xy[inside], stars.v_mag[inside], strict=True):
         light += 4000 * 10 ** (-0.4 * mag) * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 2)
-    return np.clip(light + np.random.default_rng(1).normal(10, 1.5, light.shape), 0, 255).astype(
-        np.uint8
-    )
+    return np.clip(
+        light + np.random.default_rng(1).normal(10, 1.5, light.shape), 0, 255
+    ).astype(np.uint8)
 
 
 @pytest.mark.slow
@@ -63,7 +63,11 @@ def test_five_lines_solve_an_image(tmp_path: Path, monkeypatch, capsys) -> None:
 )
 def test_the_table_names_every_algorithm(name: str, algorithms: dict) -> None:
     line = next(line for line in README.splitlines() if line.startswith(f"| `{name}`"))
-    named = {word for word in re.findall(r"`(\w+)`", line)} | {"default", "fialho_2", "fialho_3"}
+    named = {word for word in re.findall(r"`(\w+)`", line)} | {
+        "default",
+        "fialho_2",
+        "fialho_3",
+    }
     assert set(algorithms) - named == set()
 
 

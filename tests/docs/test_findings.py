@@ -69,7 +69,13 @@ MONEY = {  # the tape's pitch and spacing give the number of LEDs
     "lens": "12 mm",
     "survey": "0.05 mm",
 }
-DOME = {"radius": "36 in", "camera": "15 in", "disk": "2 mm", "focus": "in focus", "f_number": 8}
+DOME = {
+    "radius": "36 in",
+    "camera": "15 in",
+    "disk": "2 mm",
+    "focus": "in focus",
+    "f_number": 8,
+}
 SMEAR = {"rate_deg_s": 6, "exposure": "50 ms", "limit_mag": 5.75}
 CASES = [
     Case(
@@ -152,7 +158,9 @@ CASES = [
 
 def cell(page: str, row: str, column: str) -> tuple[float, float, float]:
     """Value, low and high of a cell of a page's table; its row begins with `row`."""
-    lines = [line for line in (FINDINGS / page).read_text("utf-8").splitlines() if line[:2] == "| "]
+    lines = [
+        line for line in (FINDINGS / page).read_text("utf-8").splitlines() if line[:2] == "| "
+    ]
     heads = [one.strip() for one in lines[0].split("|")]
     (found,) = [line for line in lines if line.startswith(row)]
     match = CELL.match(found.split("|")[heads.index(column)].strip())
@@ -173,7 +181,9 @@ def one_point(study: str, levels: dict[str, Any], response: str, trials: int) ->
         else:
             keys = {key: factor[key] for key in ("key", "keys") if key in factor}
             told["factors"][name] = keys | {"values": [levels[name]]}
-    return yaml.safe_dump(told | {"replicates": trials, "responses": [response]}, sort_keys=False)
+    return yaml.safe_dump(
+        told | {"replicates": trials, "responses": [response]}, sort_keys=False
+    )
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.study)
@@ -216,7 +226,9 @@ def test_the_dome_s_solvers_err_as_its_page_says() -> None:
 
 def test_the_dome_s_leds_are_found_as_its_page_says() -> None:
     found, _wrong = re.search(
-        r"^\| Fibonacci spiral \| 10\.0 \(7\) \| ([\d.]+) % \| (\d+) ", dome_page(), re.MULTILINE
+        r"^\| Fibonacci spiral \| 10\.0 \(7\) \| ([\d.]+) % \| (\d+) ",
+        dome_page(),
+        re.MULTILINE,
     ).groups()  # type: ignore[union-attr]
     (case,) = [case for case in dome_identify.CASES if case.name == "fibonacci"]
     rows = {row["name"]: row["value"] for row in dome_identify.measure_case(case, 200, 2)}

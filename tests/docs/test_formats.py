@@ -18,7 +18,9 @@ from skysim.results.files.run_export import EXPORTS
 
 PAGE = (ROOT / "docs/howto/export.md").read_text(encoding="utf-8")
 COMMANDS = [
-    line for block in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL) for line in block.splitlines()
+    line
+    for block in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
+    for line in block.splitlines()
 ]
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 

@@ -25,7 +25,9 @@ def test_the_commands_write_the_page_s_files(folder):
     assert ran == frames | {"solutions.ecsv", "telemetry.ecsv", "annotated.png", "report.html"}
     # `render` came after `run` and removed what the latter said of other frames.
     rendered = {path.name for path in (folder / "out" / "shefex2").iterdir()}
-    assert rendered == {f"frame_0000.{suffix}" for suffix in ("fits", "png", "ecsv", "preview.png")}
+    assert rendered == {
+        f"frame_0000.{suffix}" for suffix in ("fits", "png", "ecsv", "preview.png")
+    }
 
 
 def test_every_file_of_a_run_is_in_the_table(folder):

@@ -42,7 +42,9 @@ def test_the_camera_block_gives_solved_frames(folder):
     assert not set(mine["motion"]) & set(tree["motion"])
     path = folder / "mine.yaml"
     path.write_text(
-        yaml.safe_dump(tree | mine | {"motion": tree["motion"] | mine["motion"]}, sort_keys=False)
+        yaml.safe_dump(
+            tree | mine | {"motion": tree["motion"] | mine["motion"]}, sort_keys=False
+        )
     )
     report = pages.answer(folder, "run", str(path), "--frames", "2")
     assert (report["frames"], report["solved"], report["wrong"]) == (2, 2, 0)
@@ -109,7 +111,9 @@ def test_the_vehicle_block_names_every_existing_choice():
 def test_the_page_s_controller_damps_the_motion(folder):
     """Each rate dies as exp(-5 t / J), the angle is its integral; gravity on tens of micrometers adds 0.1 deg or so."""
     (block,) = pages.blocks(PAGE, "python")
-    done = subprocess.run([sys.executable, "-c", block], cwd=folder, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", block], cwd=folder, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     numbers = [float(word) for word in re.findall(r"[-\d.]+(?:e[-+]\d+)?", done.stdout)]
     turned = np.array(numbers[:3])

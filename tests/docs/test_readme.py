@@ -36,7 +36,9 @@ def test_the_commands_leave_a_report_and_a_solution(folder):
 @pytest.mark.slow
 def test_the_python_block_solves_the_frame_that_it_saves(folder):
     (block,) = pages.blocks(README, "python")
-    done = subprocess.run([sys.executable, "-c", block], cwd=folder, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", block], cwd=folder, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     status, error, *_ = done.stdout.split()
     assert status == "solved"

@@ -135,5 +135,7 @@ def test_every_picture_is_shown() -> None:
     shown = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs").rglob("*.md"))
     named = set(re.findall(r"[\w-]+\.png", shown))
     assert [
-        path.name for path in (ROOT / "docs" / "findings").rglob("*.png") if path.name not in named
+        path.name
+        for path in (ROOT / "docs" / "findings").rglob("*.png")
+        if path.name not in named
     ] == []

@@ -187,7 +187,9 @@ def test_a_torque_outside_the_plane_of_level_wheels_is_dropped(angles_deg):
     axes = tilted.apply(np.array([np.cos(a), np.sin(a), 0 * a]).T).T
     set_ = WheelSet(axes, np.full(len(a), 0.01), 1.0, 300.0)
     motor = set_.drive(tilted.apply([0.1, 0.2, 0.3]), np.zeros(len(a)), 0.01)
-    np.testing.assert_allclose(tilted.inv().apply(-axes @ motor), [0.1, 0.2, 0], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        tilted.inv().apply(-axes @ motor), [0.1, 0.2, 0], rtol=0, atol=1e-14
+    )
 
 
 # ---- fans ------------------------------------------------------------------------------------------------------
@@ -195,7 +197,9 @@ def test_a_torque_outside_the_plane_of_level_wheels_is_dropped(angles_deg):
 
 def fans(limit_n: float = 0.5) -> FanSet:
     """A pair of fans about each axis, one meter apart, whose forces cancel."""
-    places = 0.5 * np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0]]).T
+    places = (
+        0.5 * np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0]]).T
+    )
     pushes = np.array(
         [[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float
     ).T
@@ -398,7 +402,9 @@ def test_the_pseudo_inverse_is_stuck_at_the_internal_singularity():
     np.testing.assert_allclose(momentum[: before - 1, 0], grown, rtol=0, atol=0.01 * reached)
     assert momentum[:, 0].max() <= reached * (1 + 1e-12)
     assert momentum[2000:, 0].min() > 0.999 * reached
-    np.testing.assert_allclose(np.degrees(angles[2000:]), [[-90, 0, 90, 0]] * 4000, rtol=0, atol=2)
+    np.testing.assert_allclose(
+        np.degrees(angles[2000:]), [[-90, 0, 90, 0]] * 4000, rtol=0, atol=2
+    )
     # At the limit, to and fro, for nothing.
     assert np.abs(rates[2000:]).max() == pytest.approx(1, rel=1e-12)
 
@@ -510,7 +516,9 @@ def test_rotors_at_rest_work_as_wheels():
 
 # ---- desaturation ----------------------------------------------------------------------------------------------
 
-PART = DesaturationConfig.model_validate({"start": "1 N m s", "stop": "0.2 N m s", "time": "8 s"})
+PART = DesaturationConfig.model_validate(
+    {"start": "1 N m s", "stop": "0.2 N m s", "time": "8 s"}
+)
 
 
 def test_desaturation_starts_and_stops_at_different_thresholds():
@@ -532,7 +540,9 @@ def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
     set_ = wheels(3)
     fan = Desaturator(PART)
     blow = fans(limit_n=1.0)
-    body = Body.start(np.eye(3), np.eye(3), set_.inertia_kg_m2, np.zeros(3), [50.0, -50, 25], STILL)
+    body = Body.start(
+        np.eye(3), np.eye(3), set_.inertia_kg_m2, np.zeros(3), [50.0, -50, 25], STILL
+    )
     period = 0.1
     stored = []
     turned = []
@@ -541,7 +551,9 @@ def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
         held = set_.momentum(body.speed)
         outside = blow.torque(blow.drive(fan.torque(held)))
         feedback = -BUS @ (4 * body.turn + 3.2 * body.rate) + np.cross(body.rate, body.whole)
-        body = body.move(period, motor=set_.drive(feedback, body.speed, period), outside=outside)
+        body = body.move(
+            period, motor=set_.drive(feedback, body.speed, period), outside=outside
+        )
         stored.append(float(np.linalg.norm(held)))
         turned.append(float(np.linalg.norm(body.turn)))
         fanned.append(bool(outside.any()))
@@ -572,7 +584,10 @@ def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
             lambda: WheelSet(np.ones((4, 3)), np.ones(3), 1.0, 1.0),
             r"wheel axes: shape \(4, 3\); allowed: \(3, n\)",
         ),
-        (lambda: WheelSet(np.zeros((3, 0)), np.ones(0), 1.0, 1.0), r"wheel axes: shape \(3, 0\)"),
+        (
+            lambda: WheelSet(np.zeros((3, 0)), np.ones(0), 1.0, 1.0),
+            r"wheel axes: shape \(3, 0\)",
+        ),
         (
             lambda: WheelSet(np.eye(3), np.array([1.0, 0, 1]), 1.0, 1.0),
             r"inertia.*allowed: 3 positive",
@@ -582,14 +597,19 @@ def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
             lambda: FanSet(np.eye(3), np.ones((3, 2)), 1.0),
             r"fan positions_m: shape \(3, 2\); allowed: \(3, 3\)",
         ),
-        (lambda: CmgSet(np.eye(3), np.eye(3), np.ones(3), 1.0), "rotor axes: .*at right angles"),
+        (
+            lambda: CmgSet(np.eye(3), np.eye(3), np.ones(3), 1.0),
+            "rotor axes: .*at right angles",
+        ),
         (
             lambda: CmgSet(*pyramid(1.0, 3), np.ones(3), 1.0, None, "magic"),
             "unknown steering law 'magic'; allowed: pseudo_inverse, ",
         ),
     ],
 )
-def test_bad_actuator_sets_are_refused_in_one_line(make: Callable[[], object], says: str) -> None:
+def test_bad_actuator_sets_are_refused_in_one_line(
+    make: Callable[[], object], says: str
+) -> None:
     with pytest.raises(InputError, match=says) as caught:
         make()
     assert "\n" not in str(caught.value)

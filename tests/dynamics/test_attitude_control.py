@@ -20,7 +20,9 @@ from skysim.simulation.flight import simulate_motion
 
 INERTIA = np.array([6.0, 6.5, 9.0])
 AXES = Rotation.from_rotvec([0.2, -0.4, 0.3]).as_matrix()
-TENSOR = AXES @ np.diag(INERTIA) @ AXES.T  # of a vehicle whose principal axes are not the body's
+TENSOR = (
+    AXES @ np.diag(INERTIA) @ AXES.T
+)  # of a vehicle whose principal axes are not the body's
 STORED = np.array([1.5, -2.0, 3.0])  # N m s in wheels
 NONE = np.zeros(3)
 PLACED = {"bandwidth_rad_s": 2.0, "damping": 0.7, "integral_rad_s": 0.5}
@@ -85,7 +87,9 @@ def test_the_error_decays_with_the_placed_poles() -> None:
     there, rate = closed(holding(TENSOR, **PLACED), Rotation.from_rotvec(axis), 0.3 * axis, t_s)
     companion = np.array([[0, 1, 0], [0, 0, 1], -POLES[:0:-1]])
     expected = np.array([expm(companion * t) @ [0.0, 1.0, 0.3] for t in t_s])[:, 1:]
-    np.testing.assert_allclose(there.as_rotvec(), np.outer(expected[:, 0], axis), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        there.as_rotvec(), np.outer(expected[:, 0], axis), rtol=0, atol=1e-8
+    )
     np.testing.assert_allclose(rate, np.outer(expected[:, 1], axis), rtol=0, atol=1e-8)
 
 
@@ -103,7 +107,9 @@ def test_the_attitude_error_takes_the_shorter_way() -> None:
     torque = law.torque_nm(
         0.0, quaternion.from_rotation(Rotation.from_euler("z", 200, degrees=True)), NONE, NONE
     )
-    np.testing.assert_allclose(torque, [0, 0, 9.0 * 4.0 * math.radians(160)], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        torque, [0, 0, 9.0 * 4.0 * math.radians(160)], rtol=0, atol=1e-12
+    )
 
 
 def late(period_s: float) -> float:
@@ -203,13 +209,17 @@ def test_the_integral_leaves_the_limit_again() -> None:
 # --- far from its reference ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("fastest", "expected"), [(math.inf, math.sqrt(0.9 / 9.0)), (0.2, 0.2)])
+@pytest.mark.parametrize(
+    ("fastest", "expected"), [(math.inf, math.sqrt(0.9 / 9.0)), (0.2, 0.2)]
+)
 def test_a_large_error_commands_at_most_a_rate_that_can_be_braked(
     fastest: float, expected: float
 ) -> None:
     """A radian off and at rest, kd J w_most; at that rate towards the reference, nothing: w = min(limit, sqrt(a e))."""
     config = ControlConfig.model_validate(PLACED)
-    law = build_controller(planned(), INERTIA, config, authority_nm=0.9, rate_limit_rad_s=fastest)
+    law = build_controller(
+        planned(), INERTIA, config, authority_nm=0.9, rate_limit_rad_s=fastest
+    )
     here = quaternion.from_rotation(Rotation.from_rotvec([0, 0, 1.0]))
     torque = law.torque_nm(0.0, here, NONE, NONE)
     np.testing.assert_allclose(torque, [0, 0, -9.0 * law.kd * expected], rtol=1e-12, atol=1e-15)
@@ -254,7 +264,9 @@ def test_an_unbalanced_bearing_needs_the_integral(law: str) -> None:
     The spring J b^2 of a PD controller holds against them 1.03 deg off, where its bandwidth is 0.60 rad/s (J = 6
     kg m2): J b^2 e = m g r cos e. The integral leaves none.
     """
-    control = f"{{law: {law}, bandwidth_rad_s: {SOFT_RAD_S}, damping: 0.8, integral_rad_s: 0.6}}"
+    control = (
+        f"{{law: {law}, bandwidth_rad_s: {SOFT_RAD_S}, damping: 0.8, integral_rad_s: 0.6}}"
+    )
     out_of_balance = {
         "vehicle.center_of_mass": "[0 m, 0.05 mm, 0 m]",
         "motion.control": control,

@@ -32,7 +32,9 @@ QUIET = DisturbancesConfig()
 
 def flown(duration_s: float, **changes: str) -> Flight:
     """SimSat, balanced and without a controller."""
-    until = {"exposure": f"{{time: 10 ms, rate_hz: 1, frames: 1, first: {duration_s - 0.012} s}}"}
+    until = {
+        "exposure": f"{{time: 10 ms, rate_hz: 1, frames: 1, first: {duration_s - 0.012} s}}"
+    }
     given = BALANCED | until | {key.replace("__", "."): value for key, value in changes.items()}
     return simulate_motion(loader.load("afit_simsat", given))
 
@@ -91,7 +93,10 @@ def test_gusts_decorrelate_with_their_correlation_time(gusts: Floats, lag: int) 
 def test_gusts_are_stationary_from_the_start() -> None:
     """The first torque of 4,000 flights has the rms already: 4 sigma of a variance, sqrt(2 / 4000)."""
     first = np.array(
-        [AirCurrent(AIR_CURRENT, PERIOD_S, np.random.default_rng(k)).sample() for k in range(4000)]
+        [
+            AirCurrent(AIR_CURRENT, PERIOD_S, np.random.default_rng(k)).sample()
+            for k in range(4000)
+        ]
     )
     np.testing.assert_allclose(
         (first**2).mean(axis=0) / RMS_NM**2, 1, rtol=0, atol=4 * math.sqrt(2 / 4000)
@@ -106,7 +111,9 @@ def test_steady_wind_and_turbine_torques_are_along_the_lab_s_axes() -> None:
     torque = room(config).torque_nm(times, here, np.array([0.1, 0.2, 0.3]), NONE)
     np.testing.assert_allclose(torque, np.tile([0, -1e-3, 2e-3], (10, 1)), rtol=0, atol=1e-17)
     blown = DisturbancesConfig.model_validate({"air_current": {"rms": ["1 mN m"] * 3}})
-    level = room(blown).torque_nm(times, quaternion.from_rotation(Rotation.identity()), NONE, NONE)
+    level = room(blown).torque_nm(
+        times, quaternion.from_rotation(Rotation.identity()), NONE, NONE
+    )
     turned = room(blown).torque_nm(times, here, NONE, NONE)
     np.testing.assert_allclose(turned, level[:, [1, 0, 2]] * [1, -1, 1], rtol=0, atol=1e-17)
     assert np.ptp(level, axis=0).max() == 0  # held over the tick
@@ -118,7 +125,9 @@ def test_turbine_spins_a_vehicle_up() -> None:
     motion = flight.trajectory()
     telemetry = flight.telemetry()
     expected = 2e-3 / 9 * motion.t_s[-1]
-    np.testing.assert_allclose(motion.rate_body_rad_s[-1], [0, 0, expected], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        motion.rate_body_rad_s[-1], [0, 0, expected], rtol=1e-9, atol=1e-12
+    )
     wanted = np.tile([0, 0, 2e-3], (400, 1))[: len(telemetry.t_s)]
     np.testing.assert_allclose(telemetry.disturbance_nm, wanted, atol=1e-12)
 
@@ -137,7 +146,9 @@ def integrated(
         return np.concatenate([np.cross(R, w).ravel(), slope(R, w)])  # type: ignore[operator]
 
     begin = np.concatenate([attitude.as_matrix().ravel(), rate])
-    run = solve_ivp(both, (0, t_s[-1]), begin, t_eval=t_s, method="DOP853", rtol=1e-13, atol=1e-14)
+    run = solve_ivp(
+        both, (0, t_s[-1]), begin, t_eval=t_s, method="DOP853", rtol=1e-13, atol=1e-14
+    )
     return Rotation.from_matrix(run.y[:9].T.reshape(-1, 3, 3)), run.y[9:].T
 
 
@@ -246,7 +257,9 @@ def test_a_knock_gives_the_declared_rate_about_each_axis(axis: int) -> None:
     motion = flown(
         0.3, motion__maneuver=f'[{{kind: bump, rate_deg_s: {rate}, duration: "30 ms"}}]'
     ).trajectory()
-    np.testing.assert_allclose(np.degrees(motion.rate_body_rad_s[-1]), rate, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(
+        np.degrees(motion.rate_body_rad_s[-1]), rate, rtol=1e-6, atol=1e-12
+    )
 
 
 def test_a_caught_vehicle_is_at_rest_at_another_attitude() -> None:
@@ -275,11 +288,16 @@ def test_a_room_is_quiet_if_nothing_is_switched_on() -> None:
     ):
         assert not room(DisturbancesConfig.model_validate(part)).inactive
     # It is MuJoCo's.
-    assert room(DisturbancesConfig.model_validate({"cable": {"stiffness": "1 N m / rad"}})).inactive
+    assert room(
+        DisturbancesConfig.model_validate({"cable": {"stiffness": "1 N m / rad"}})
+    ).inactive
 
 
 def test_a_room_without_disturbances_gives_no_torque() -> None:
     torque = room().torque_nm(
-        np.arange(11) * 1e-3, quaternion.from_rotation(Rotation.identity()), np.ones(3), np.ones(3)
+        np.arange(11) * 1e-3,
+        quaternion.from_rotation(Rotation.identity()),
+        np.ones(3),
+        np.ones(3),
     )
     np.testing.assert_array_equal(torque, np.zeros((10, 3)))

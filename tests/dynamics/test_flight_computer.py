@@ -249,7 +249,11 @@ def test_desaturation_compensates_the_lag_of_the_fans(relieved: Telemetry) -> No
     """dh/dt = T, dT/dt = (-h / time - T) / lag: the wheels hold against the fans' torque, and slow down."""
     h0 = 0.010125 * 1800 * math.pi / 30
     run = solve_ivp(
-        lambda _, y: [y[1], (-y[0] / 5 - y[1]) / 0.2], (0, 4), [h0, 0], rtol=1e-9, dense_output=True
+        lambda _, y: [y[1], (-y[0] / 5 - y[1]) / 0.2],
+        (0, 4),
+        [h0, 0],
+        rtol=1e-9,
+        dense_output=True,
     )
     t_s = np.arange(0.5, 4, 0.5)
     held = np.interp(t_s, relieved.t_s, relieved.momentum_nms[:, 2])

@@ -47,7 +47,9 @@ BUMP = {"kind": "bump", "rate_deg_s": [30, -60, 10], "duration": "50 ms"}
 
 
 def turn_to(roll: float, pitch: float, yaw: float, **limits: float) -> dict[str, object]:
-    return {"kind": "slew", "roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw} | LIMITS | limits
+    return (
+        {"kind": "slew", "roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw} | LIMITS | limits
+    )
 
 
 def motion_config(*maneuver: object, **motion: object) -> MotionConfig:
@@ -82,7 +84,9 @@ EVERY = {
 @pytest.fixture
 def tour() -> Reference:
     """Long slews with a cruise phase, one too short for it, and holds between them."""
-    return reference(HOLD, turn_to(12, -6, -160), turn_to(-8, 14, 80), HOLD, turn_to(-2, 14, 80))
+    return reference(
+        HOLD, turn_to(12, -6, -160), turn_to(-8, 14, 80), HOLD, turn_to(-2, 14, 80)
+    )
 
 
 def sampled(ref: Reference, t_s: np.ndarray) -> tuple[Rotation, np.ndarray, np.ndarray]:
@@ -113,7 +117,11 @@ def test_euler_angles_are_yaw_then_pitch_then_roll() -> None:
     roll = 0.3
     pitch = -0.5
     yaw = 1.1
-    about_x = [[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]]
+    about_x = [
+        [1, 0, 0],
+        [0, math.cos(roll), -math.sin(roll)],
+        [0, math.sin(roll), math.cos(roll)],
+    ]
     about_y = [
         [math.cos(pitch), 0, math.sin(pitch)],
         [0, 1, 0],
@@ -152,7 +160,14 @@ def test_rate_and_acceleration_are_the_derivatives_of_the_attitude(name: str) ->
 
 
 def test_reference_visits_every_attitude_of_the_list(tour: Reference) -> None:
-    wanted = [(3, -4, 170), (3, -4, 170), (12, -6, -160), (-8, 14, 80), (-8, 14, 80), (-2, 14, 80)]
+    wanted = [
+        (3, -4, 170),
+        (3, -4, 170),
+        (12, -6, -160),
+        (-8, 14, 80),
+        (-8, 14, 80),
+        (-2, 14, 80),
+    ]
     for t, angles in zip(tour.start_s, wanted, strict=True):
         assert between(there(tour, t), euler(*angles)) < 1e-14
         # The sums of durations round; the rate leaves zero with their square.
@@ -239,7 +254,9 @@ def test_spin_up_is_the_integral_of_its_rate(begin: tuple, end: tuple, lasts_s: 
         return 0.5 * np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]) @ rate(t_s)
 
     at = np.append(np.sort(np.random.default_rng(2).uniform(0, lasts_s, 30)), lasts_s)
-    run = solve_ivp(slope, (0, lasts_s), ref.state_at(1.0)[0], "DOP853", at, rtol=1e-13, atol=1e-13)
+    run = solve_ivp(
+        slope, (0, lasts_s), ref.state_at(1.0)[0], "DOP853", at, rtol=1e-13, atol=1e-13
+    )
     wanted = Rotation.from_quat(run.y.T, scalar_first=True)
     assert between(ref.attitudes(1.0 + at), wanted).max() < 1e-9
     np.testing.assert_allclose(
@@ -252,7 +269,9 @@ def test_a_spin_up_from_or_to_rest_turns_by_half_of_rate_times_time() -> None:
     up, down = (SPIN | {"rate_deg_s": w, "duration": "10 s"} for w in ([6, 0, -12], [0, 0, 0]))
     ref = reference(HOLD, up, down)
     for t, turned_s in ((12.0, 5.0), (22.0, 10.0), (99.0, 10.0)):
-        wanted = euler(*START.values()) * Rotation.from_rotvec(np.radians([6, 0, -12]) * turned_s)
+        wanted = euler(*START.values()) * Rotation.from_rotvec(
+            np.radians([6, 0, -12]) * turned_s
+        )
         assert between(there(ref, t), wanted) < 1e-14
     np.testing.assert_array_equal(ref.state_at(30.0)[1:], np.zeros((2, 3)))
 
@@ -269,7 +288,8 @@ def test_first_spin_up_begins_at_the_vehicles_own_rate() -> None:
 def test_a_spin_up_of_too_many_knots_is_refused_in_one_line() -> None:
     fast = {"kind": "spin_up", "rate_deg_s": [0, 360, 0], "duration": "1 h"}
     with pytest.raises(
-        InputError, match=r"^motion\.maneuver: a spin_up of 36000 s .*; allowed: 2\.86e\+06 deg$"
+        InputError,
+        match=r"^motion\.maneuver: a spin_up of 36000 s .*; allowed: 2\.86e\+06 deg$",
     ):
         reference(RATE, fast | {"duration": "10 h"})
     reference(HOLD, fast | {"duration": "10 h"})  # one axis needs no knots
@@ -294,7 +314,9 @@ def test_sine_begins_and_ends_at_rest_without_a_jump_of_the_torque(duration_s: f
         assert between(there(ref, t), euler(*START.values())) < 1e-15
         # A ns of jerk, up to 60 amplitude / growth^3 = 1e3 rad/s3.
         for near in (t - 1e-9, t, t + 1e-9):
-            np.testing.assert_allclose(ref.state_at(near)[1:], np.zeros((2, 3)), rtol=0, atol=2e-6)
+            np.testing.assert_allclose(
+                ref.state_at(near)[1:], np.zeros((2, 3)), rtol=0, atol=2e-6
+            )
     inside = np.linspace(2.0, 2.0 + duration_s, 100)
     assert (
         between(ref.attitudes(inside), euler(*START.values())).max()
@@ -305,7 +327,9 @@ def test_sine_begins_and_ends_at_rest_without_a_jump_of_the_torque(duration_s: f
 def test_the_envelope_has_its_stated_derivatives() -> None:
     t = np.random.default_rng(3).uniform(-0.5, 3.5, 300)
     h = 1e-5
-    e, before, after = (np.array([envelope(s, 3.0, 0.7, 0.7) for s in t + d]) for d in (0, -h, h))
+    e, before, after = (
+        np.array([envelope(s, 3.0, 0.7, 0.7) for s in t + d]) for d in (0, -h, h)
+    )
     # Within a step of a corner, where the third derivative jumps by 60 / growth^3, off by a quarter of h times that.
     np.testing.assert_allclose(
         (after - before)[:, :2] / (2 * h), e[:, 1:], rtol=0, atol=60 / 0.7**3 * h / 4
@@ -356,7 +380,9 @@ def test_slews_join_without_a_jump_of_rate_or_torque(tour: Reference) -> None:
         )
         assert between(there(tour, joint - 1e-9), there(tour, joint + 1e-9)) < 1e-12
         np.testing.assert_allclose(rate_before, rate_after, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(accel_before, accel_after, rtol=0, atol=1e-10)  # 2 ns of jerk
+        np.testing.assert_allclose(
+            accel_before, accel_after, rtol=0, atol=1e-10
+        )  # 2 ns of jerk
 
 
 def test_spin_ups_join_without_a_jump_of_rate() -> None:

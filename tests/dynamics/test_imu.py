@@ -68,7 +68,9 @@ def euler_deg(navigator: Navigator) -> np.ndarray:
 
 
 def part(
-    gyro: dict[str, Any] | None = None, accelerometer: dict[str, Any] | None = None, seed: int = 200
+    gyro: dict[str, Any] | None = None,
+    accelerometer: dict[str, Any] | None = None,
+    seed: int = 200,
 ) -> ImuConfig:
     """A unit with only the named errors."""
     return ImuConfig.model_validate(
@@ -149,7 +151,9 @@ class Cone:
             * np.stack([np.cos(self.w * t), np.sin(self.w * t), 0 * t], axis=-1)
         )
 
-    def felt(self, knots: Floats, ends: Floats, earth: Floats, step_s: float = STEP) -> Increments:
+    def felt(
+        self, knots: Floats, ends: Floats, earth: Floats, step_s: float = STEP
+    ) -> Increments:
         return ideal_increments(
             knots, wxyz(self.attitude(knots)), self.rate(knots), ends, step_s, PLACE, G, earth
         )
@@ -166,7 +170,9 @@ def test_the_earth_rate_matches_a_hand_calculation() -> None:
     # With x east, y is north; with x north, y is west.
     up_north_of = {90.0: (2, 1, 0), 0.0: (2, 0, 1)}
     for azimuth, (up, north, across) in up_north_of.items():
-        rate = earth_rate_lab_rad_s(SiteConfig(latitude_deg=39.8, x_azimuth_deg=azimuth)) / DEG_H
+        rate = (
+            earth_rate_lab_rad_s(SiteConfig(latitude_deg=39.8, x_azimuth_deg=azimuth)) / DEG_H
+        )
         np.testing.assert_allclose(
             rate[[up, north, across]], [9.63, 11.56, 0.0], rtol=0, atol=0.005
         )
@@ -193,7 +199,9 @@ ATTITUDES = [Rotation.identity(), TILTED, Rotation.from_rotvec([1.0, 2.0, -0.5])
 
 @pytest.mark.compiles
 @pytest.mark.parametrize("attitude", ATTITUDES)
-def test_uncompensated_earth_rate_rotates_a_still_vehicle_s_navigator(attitude: Rotation) -> None:
+def test_uncompensated_earth_rate_rotates_a_still_vehicle_s_navigator(
+    attitude: Rotation,
+) -> None:
     """An hour: 15.04 deg about the Earth's own axis, whatever the vehicle's attitude."""
     navigator = Navigator(wxyz(attitude))
     navigator.add(still(attitude, 3600.0, 0.1, EARTH))
@@ -344,7 +352,8 @@ def test_sampling_a_flight_tick_by_tick_equals_sampling_it_at_once() -> None:
     ends = np.arange(1, 201) * STEP
     whole = CONE.felt(knots, ends, EARTH)
     ticks = [
-        CONE.felt(knots[10 * k : 10 * k + 11], ends[4 * k : 4 * k + 4], EARTH) for k in range(50)
+        CONE.felt(knots[10 * k : 10 * k + 11], ends[4 * k : 4 * k + 4], EARTH)
+        for k in range(50)
     ]
     for name, bar in (("angle_rad", 2.5e-10), ("velocity_m_s", 5e-9)):
         joined = np.concatenate([getattr(tick, name) for tick in ticks])
@@ -358,7 +367,9 @@ def test_a_jump_of_the_torque_has_the_stated_error() -> None:
     rate = 2.0 * np.maximum(knots - 0.01, 0.0)[:, None] * np.array([0.0, 0.0, 1.0])
     none = np.tile([1.0, 0.0, 0.0, 0.0], (21, 1))
     got = ideal_increments(knots, none, rate, np.array([0.02]), 0.02, PLACE, G)
-    np.testing.assert_allclose(got.angle_rad[0, 2] - 2.0 * 0.01**2 / 2, -2.0 * h**2 / 12, rtol=1e-6)
+    np.testing.assert_allclose(
+        got.angle_rad[0, 2] - 2.0 * 0.01**2 / 2, -2.0 * h**2 / 12, rtol=1e-6
+    )
 
 
 def test_at_rest_the_specific_force_is_g_upwards() -> None:
@@ -376,7 +387,9 @@ def test_an_accelerometer_on_a_lever_measures_the_centripetal_force() -> None:
     knots = np.arange(0, 1.001, 1e-3)
     spin = np.tile([0, 0, np.radians(60)], (len(knots), 1))
     attitude = Rotation.from_rotvec(knots[:, None] * spin)
-    got = ideal_increments(knots, wxyz(attitude), spin, np.array([0.5]), STEP, (0.2, 0.0, 0.7), G)
+    got = ideal_increments(
+        knots, wxyz(attitude), spin, np.array([0.5]), STEP, (0.2, 0.0, 0.7), G
+    )
     np.testing.assert_allclose(got.velocity_m_s[0] / STEP, [-0.219325, 0, G], rtol=0, atol=1e-6)
 
 
@@ -514,7 +527,9 @@ def test_scale_and_misalignment_change_a_known_rotation_as_declared() -> None:
     np.testing.assert_allclose(total[1] - 2 * np.pi, 2 * np.pi * (matrix[1, 1] - 1), rtol=1e-6)
     assert 0 < abs(matrix[1, 1] - 1) < 4 * 500e-6
     assert (np.abs(matrix[[0, 2], 1]) < 4 * 100 * ARCSEC).all()
-    backwards = unit({"scale_ppm": 500, "misalignment_arcsec": 100}).measure(steady(-turn, 4000))
+    backwards = unit({"scale_ppm": 500, "misalignment_arcsec": 100}).measure(
+        steady(-turn, 4000)
+    )
     np.testing.assert_allclose(backwards.angle_rad.sum(axis=0), -total, rtol=1e-12)
 
 
@@ -552,7 +567,9 @@ def test_a_rate_beyond_the_limit_reads_the_limit_and_leaves_an_attitude_error() 
     slow = steady(np.radians([0, 0, 5]), 400)
     cut = one.measure(fast)
     after = one.measure(slow)
-    np.testing.assert_array_equal(cut.angle_rad, np.tile([0, 0, np.radians(10) * STEP], (400, 1)))
+    np.testing.assert_array_equal(
+        cut.angle_rad, np.tile([0, 0, np.radians(10) * STEP], (400, 1))
+    )
     assert cut.saturated.all()
     assert not after.saturated.any()
     np.testing.assert_array_equal(after.angle_rad, slow.angle_rad)
@@ -560,7 +577,9 @@ def test_a_rate_beyond_the_limit_reads_the_limit_and_leaves_an_attitude_error() 
     navigator.add(after)
     np.testing.assert_allclose(euler_deg(navigator), [0, 0, 15], rtol=0, atol=1e-10)
     assert (
-        unit({"rate_limit_deg_s": 10}).measure(steady(np.radians([0, -20, 0]), 3)).angle_rad[:, 1]
+        unit({"rate_limit_deg_s": 10})
+        .measure(steady(np.radians([0, -20, 0]), 3))
+        .angle_rad[:, 1]
         < 0
     ).all()
 
@@ -595,9 +614,9 @@ def test_quantization_loses_no_angle() -> None:
 
 def test_a_rotation_below_one_count_is_counted_eventually() -> None:
     """1 deg/h is 0.0025 arcsec a sample, a count is 0.4 arcsec: one in 160 samples, 25 in 4000."""
-    counted = unit({"quantum_arcsec": 0.4}).measure(steady([DEG_H, 0, 0], 4000)).angle_rad[:, 0] / (
-        0.4 * ARCSEC
-    )
+    counted = unit({"quantum_arcsec": 0.4}).measure(steady([DEG_H, 0, 0], 4000)).angle_rad[
+        :, 0
+    ] / (0.4 * ARCSEC)
     assert np.count_nonzero(counted) == 25
     np.testing.assert_allclose(np.diff(np.flatnonzero(counted)), 160, rtol=0, atol=1)
 
@@ -661,7 +680,9 @@ def declared(gyro: Any, tau_s: float) -> float:
     walk = gyro.arw_deg_sqrt_h * 60 / np.sqrt(tau_s)
     counter = np.sqrt(3 / 12) * gyro.quantum_arcsec / tau_s  # 1 arcsec/s is 1 deg/h
     return float(
-        np.sqrt(walk**2 + markov_allan(tau_s, gyro.bias_deg_h, gyro.bias_time_s) ** 2 + counter**2)
+        np.sqrt(
+            walk**2 + markov_allan(tau_s, gyro.bias_deg_h, gyro.bias_time_s) ** 2 + counter**2
+        )
     )
 
 
@@ -756,7 +777,10 @@ def test_a_navigator_gives_the_same_attitude_in_pieces_and_at_once() -> None:
     for k in np.array_split(np.arange(400), 100):
         pieces.add(
             replace(
-                run, t_s=run.t_s[k], angle_rad=run.angle_rad[k], velocity_m_s=run.velocity_m_s[k]
+                run,
+                t_s=run.t_s[k],
+                angle_rad=run.angle_rad[k],
+                velocity_m_s=run.velocity_m_s[k],
             )
         )
     np.testing.assert_array_equal(whole.lab_from_body_wxyz, pieces.lab_from_body_wxyz)
@@ -776,7 +800,9 @@ def test_coning_makes_the_navigator_drift_as_theory_predicts() -> None:
     np.testing.assert_allclose(np.linalg.norm(error), missed, rtol=0.01)
 
 
-@pytest.mark.parametrize("euler", [(10.0, 20.0, 30.0), (-170.0, -85.0, 179.0), (0.0, 0.0, -90.0)])
+@pytest.mark.parametrize(
+    "euler", [(10.0, 20.0, 30.0), (-170.0, -85.0, 179.0), (0.0, 0.0, -90.0)]
+)
 def test_euler_angles_match_scipy(euler: tuple[float, float, float]) -> None:
     start = Rotation.from_euler("ZYX", euler[::-1], degrees=True)
     np.testing.assert_allclose(euler_deg(Navigator(3 * wxyz(start))), euler, rtol=0, atol=1e-10)

@@ -10,7 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.types import Trajectory
-from skysim.dynamics.jitter import SPECTRA, Vibration, concatenate, evaluate_sines, rotvec_body_rate
+from skysim.dynamics.jitter import (
+    SPECTRA,
+    Vibration,
+    concatenate,
+    evaluate_sines,
+    rotvec_body_rate,
+)
 from skysim.scene.sections.motion import JitterBandConfig, JitterLineConfig, MotionConfig
 
 ARCSEC = np.radians(1 / 3600)
@@ -37,7 +43,9 @@ def turning(
     rate_rad_s = np.array(rate)
     start = Rotation.from_rotvec([0.3, -1.0, 2.0])
     return Trajectory(
-        t, start * Rotation.from_rotvec(t[:, None] * rate_rad_s), np.tile(rate_rad_s, (samples, 1))
+        t,
+        start * Rotation.from_rotvec(t[:, None] * rate_rad_s),
+        np.tile(rate_rad_s, (samples, 1)),
     )
 
 
@@ -172,7 +180,9 @@ def test_rates_are_the_derivative_of_the_attitude() -> None:
 
 
 @pytest.mark.parametrize("angle_rad", [0.0, 1e-9, 0.9e-4, 1.1e-4, 1e-2, 1.0, 3.0])
-def test_the_jitter_s_rate_is_the_derivative_of_its_rotation_at_any_angle(angle_rad: float) -> None:
+def test_the_jitter_s_rate_is_the_derivative_of_its_rotation_at_any_angle(
+    angle_rad: float,
+) -> None:
     """Rotations by complex numbers about one axis cannot see the cross terms: central differences of scipy's can."""
     phi = angle_rad * np.array([[0.6, 0.0, 0.8]])
     phi_rate = np.array([[0.3, -1.0, 0.2]])
@@ -288,13 +298,19 @@ def test_two_intervals_of_the_same_vibration_have_independent_phases() -> None:
     # 120 periods later
     first = vibration.evaluate(t)[0]
     second = vibration.evaluate(t + 3.0)[0]
-    assert (np.sqrt(np.mean((first - second) ** 2, axis=0)) > 0.05 * ARCSEC * np.array(RMS)).any()
+    assert (
+        np.sqrt(np.mean((first - second) ** 2, axis=0)) > 0.05 * ARCSEC * np.array(RMS)
+    ).any()
 
 
 @pytest.mark.parametrize("always", [(), LOUD])
-def test_the_vibration_within_its_interval_has_its_stated_derivative(always: list[object]) -> None:
+def test_the_vibration_within_its_interval_has_its_stated_derivative(
+    always: list[object],
+) -> None:
     """The envelope's own slope included: central differences of phi over the rise, the middle and the fall."""
-    vibration = Vibration.draw(shaking(2.0, parts=LOUD, always=always), np.random.default_rng(18))
+    vibration = Vibration.draw(
+        shaking(2.0, parts=LOUD, always=always), np.random.default_rng(18)
+    )
     h = 1e-6
     t = np.sort(np.random.default_rng(19).uniform(0.9, 3.1, 3000))
     before = vibration.evaluate(t - h)[0]
@@ -320,7 +336,9 @@ def test_the_rate_with_vibration_is_the_derivative_of_the_attitude() -> None:
     rate = np.array([shaken.rate_at(t) for t in at])
     np.testing.assert_allclose(rate, turned, rtol=0, atol=4e-9)
     between = np.sort(np.random.default_rng(21).uniform(0.9, 3.1, 3000))
-    error = np.linalg.norm((shaken.attitude_at(between).inv() * body(between)).as_rotvec(), axis=1)
+    error = np.linalg.norm(
+        (shaken.attitude_at(between).inv() * body(between)).as_rotvec(), axis=1
+    )
     assert error.max() < 1e-4 * np.radians(1.0) * np.sqrt(2)
 
 
@@ -332,7 +350,9 @@ def test_a_short_vibration_interval_is_sampled_for_its_envelope() -> None:
     shaken = vibration.add_to(calm)
     t = np.linspace(0.95, 1.15, 4000)
     wanted = vibration.evaluate(t)[0] / ARCSEC
-    assert (np.abs(shaken_by(calm, shaken, t) - wanted) < 1e-4 * np.sqrt(2) * np.array(RMS)).all()
+    assert (
+        np.abs(shaken_by(calm, shaken, t) - wanted) < 1e-4 * np.sqrt(2) * np.array(RMS)
+    ).all()
     assert (np.abs(wanted).max(axis=0) > 0).all()
 
 
@@ -348,7 +368,9 @@ def test_a_flight_in_pieces_has_the_jitter_of_the_whole() -> None:
     cuts = [0, 10, 700, 1003, 1995, len(t) - 1]
     for first, last in itertools.pairwise(cuts):
         now = slice(first, last + 1)
-        piece = vibration.add_to(Trajectory(t[now], Rotation.from_rotvec(angle[now]), rate[now]))
+        piece = vibration.add_to(
+            Trajectory(t[now], Rotation.from_rotvec(angle[now]), rate[now])
+        )
         same = (whole.t_s >= t[first]) & (whole.t_s <= t[last])
         np.testing.assert_array_equal(piece.t_s, whole.t_s[same])
         np.testing.assert_allclose(
@@ -356,7 +378,8 @@ def test_a_flight_in_pieces_has_the_jitter_of_the_whole() -> None:
         )
         at = np.random.default_rng(24).uniform(t[first], t[last], 300)
         assert (
-            np.abs((whole.attitude_at(at).inv() * piece.attitude_at(at)).as_rotvec()).max() < 1e-12
+            np.abs((whole.attitude_at(at).inv() * piece.attitude_at(at)).as_rotvec()).max()
+            < 1e-12
         )
 
 
@@ -369,7 +392,9 @@ def test_a_piece_without_vibration_is_unchanged() -> None:
 
 def test_too_many_samples_of_a_vibration_are_refused_with_its_time() -> None:
     fast = [{"kind": "line", "frequency_hz": 1e6, "rms_arcsec": RMS}]
-    vibration = Vibration.draw(shaking(1.0, parts=fast, always=NOISE), np.random.default_rng(26))
+    vibration = Vibration.draw(
+        shaking(1.0, parts=fast, always=NOISE), np.random.default_rng(26)
+    )
     flight = turning(3.0, samples=3001)
     with pytest.raises(
         InputError, match=r"^motion\.maneuver jitter at 1 s: 1.*e\+06 Hz over 1 s needs 16,0.*$"

@@ -250,7 +250,9 @@ def test_the_brightest_stars_are_on_a_sphere_in_their_true_directions() -> None:
     )
     star_m = grains.reshape(-1, 6, 3).mean(axis=1)
     assert len(star_m) == mjcf_export.MAX_STARS
-    np.testing.assert_allclose(np.linalg.norm(star_m, axis=1), mjcf_export.SKY_RADIUS_M, rtol=1e-5)
+    np.testing.assert_allclose(
+        np.linalg.norm(star_m, axis=1), mjcf_export.SKY_RADIUS_M, rtol=1e-5
+    )
     brightest = sources.place[np.argsort(-sources.strength)[: mjcf_export.MAX_STARS], :3]
     apart = 1 - star_m / mjcf_export.SKY_RADIUS_M @ brightest.T
     assert apart.min(axis=0).max() < 1e-5
@@ -291,7 +293,9 @@ def test_the_viewer_starts_where_the_lab_s_camera_looks() -> None:
         mjcf_export.mjcf(star_vehicle, star_scene, stars, lab_from_body),
     ):
         model, data = loaded(text)
-        azimuth, elevation = np.radians([model.vis.global_.azimuth, model.vis.global_.elevation])
+        azimuth, elevation = np.radians(
+            [model.vis.global_.azimuth, model.vis.global_.elevation]
+        )
         ring = np.cos(elevation)
         forward = [ring * np.cos(azimuth), ring * np.sin(azimuth), np.sin(elevation)]
         camera = data.camera("lab")
@@ -401,7 +405,9 @@ def test_the_picture_changes_where_the_vehicle_tilts(drawn: Drawn) -> None:
     y, _ = np.nonzero(moved)
     rim_px = seen_px(model, data, vertices_m(model, data, "stage_rim"))[:, 1]
     assert 0.02 < moved.mean() < 0.3
-    assert (y > rim_px.min()).mean() > 0.6  # beneath the dome, the rest is the camera's field in it
+    assert (
+        y > rim_px.min()
+    ).mean() > 0.6  # beneath the dome, the rest is the camera's field in it
 
 
 @pytest.mark.long
@@ -410,7 +416,9 @@ def test_stars_are_drawn_around_a_free_vehicle(opengl: None) -> None:
     scene, vehicle, sources, lab_from_body = star_lab()
     text = mjcf_export.mjcf(vehicle, scene, sources, lab_from_body)
     drawn = scene_picture.picture(text, states(lab_from_body), SIZE_PX)
-    count, _, boxes, _ = cv2.connectedComponentsWithStats((drawn.min(axis=2) > 90).astype(np.uint8))
+    count, _, boxes, _ = cv2.connectedComponentsWithStats(
+        (drawn.min(axis=2) > 90).astype(np.uint8)
+    )
     small = boxes[1:, cv2.CC_STAT_AREA] < 100
     assert 20 < small.sum() < mjcf_export.MAX_STARS
     assert count - 1 - small.sum() >= 1  # the vehicle
@@ -448,7 +456,9 @@ def test_a_film_keeps_its_colors_and_duration(suffix: str, tmp_path: Path) -> No
     done, film = cv2.imreadanimation(str(path))
     assert done
     assert list(film.durations) == [100] * 10
-    back = np.array([cv2.cvtColor(one[:, :, :3], cv2.COLOR_BGR2RGB) for one in film.frames], float)
+    back = np.array(
+        [cv2.cvtColor(one[:, :, :3], cv2.COLOR_BGR2RGB) for one in film.frames], float
+    )
     # A GIF has few colors, WebP halves the resolution of color: 16 of 255 is a step of the former.
     np.testing.assert_allclose(back, RED_TO_GREEN, rtol=0, atol=20)
 

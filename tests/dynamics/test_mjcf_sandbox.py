@@ -51,7 +51,10 @@ WAYS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
         {},
     ),
     "attached URDF": ({"v.xml": whole(ATTACHED), "c.xml": URDF}, {}),
-    "attached meshdir": ({"v.xml": whole(ATTACHED), "c.xml": MESHED}, {"dd/x.obj": "out/x.obj"}),
+    "attached meshdir": (
+        {"v.xml": whole(ATTACHED), "c.xml": MESHED},
+        {"dd/x.obj": "out/x.obj"},
+    ),
     "namespace of an include": (
         {"v.xml": whole('<include xmlns="a" file="c.xml"/>'), "c.xml": CHILD},
         {},
@@ -99,7 +102,9 @@ WAYS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_a_path_out_of_the_folder_that_mujoco_follows_is_refused(tmp_path: Path, way: str) -> None:
+def test_a_path_out_of_the_folder_that_mujoco_follows_is_refused(
+    tmp_path: Path, way: str
+) -> None:
     """MuJoCo compiles each, and could not without the file outside."""
     files, links = WAYS[way]
     folder = tmp_path / "theirs"
@@ -212,7 +217,9 @@ def nested(count: int) -> str:
 
 
 def flexcomp(count: str) -> str:
-    flex = f'<flexcomp name="f" dim="2" count="{count}" spacing=".1 .1 .1" radius=".01" mass="1"/>'
+    flex = (
+        f'<flexcomp name="f" dim="2" count="{count}" spacing=".1 .1 .1" radius=".01" mass="1"/>'
+    )
     return f'<body name="f">{flex}</body>'
 
 
@@ -225,10 +232,15 @@ def flexcomp(count: str) -> str:
             r"crashes its reader \(SIGSEGV\)",
         ),
         (whole(f"<worldbody>{flexcomp('200 200 1')}</worldbody>"), "takes more than 1 s"),
-        (whole(f"<worldbody>{flexcomp('20 20 1')}</worldbody>"), "nv 1200; allowed: up to 1000"),
+        (
+            whole(f"<worldbody>{flexcomp('20 20 1')}</worldbody>"),
+            "nv 1200; allowed: up to 1000",
+        ),
         (whole(f"<worldbody>{nested(60)}</worldbody>"), "ngeom 3601; allowed: up to 2000"),
         (
-            whole('<asset><hfield name="h" nrow="1000000" ncol="1000000" size="1 1 1 1"/></asset>'),
+            whole(
+                '<asset><hfield name="h" nrow="1000000" ncol="1000000" size="1 1 1 1"/></asset>'
+            ),
             "more than 1024 MiB of memory",
         ),
         (whole('<size nuser_body="2147483647"/>'), "more than 1024 MiB of memory"),
@@ -248,7 +260,9 @@ def test_a_model_that_would_crash_or_never_end_is_refused(
 
 
 @pytest.mark.parametrize("value", ["inf", "1 NaN 1", "-1e300", "Infinity"])
-def test_numbers_that_are_not_finite_or_excessive_are_refused(tmp_path: Path, value: str) -> None:
+def test_numbers_that_are_not_finite_or_excessive_are_refused(
+    tmp_path: Path, value: str
+) -> None:
     (tmp_path / "v.xml").write_text(whole("").replace('size=".1"', f'size=".1" pos="{value}"'))
     with pytest.raises(
         InputError, match=r"v\.xml: geom pos='.*'; allowed: finite numbers up to 1e\+12$"

@@ -108,7 +108,8 @@ def test_an_undeclared_mass_is_taken_from_the_file() -> None:
 
 def test_mass_less_than_what_the_bus_carries_is_refused() -> None:
     with pytest.raises(
-        InputError, match=r"vehicle.mass: 5 kg; allowed: more than the 20.6 kg that the bus carries"
+        InputError,
+        match=r"vehicle.mass: 5 kg; allowed: more than the 20.6 kg that the bus carries",
     ):
         multibody.build(vehicle_config(mass="5 kg"))
     with pytest.raises(InputError, match=r"vehicle.inertia: .* impossible for a rigid body"):
@@ -244,14 +245,18 @@ def test_the_camera_tilts_with_the_vehicle_s_roll() -> None:
     boresight_lab = (seat.cam_from_body * lab_from_body.inv()).apply([0, 0, 1], inverse=True)
     np.testing.assert_allclose(boresight_lab, [0, -0.5, math.sqrt(0.75)], rtol=0, atol=1e-15)
     place = [0, -0.1905, 0.381 * math.sqrt(0.75)]
-    np.testing.assert_allclose(lab_from_body.apply(seat.camera_body_m), place, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        lab_from_body.apply(seat.camera_body_m), place, rtol=0, atol=1e-15
+    )
 
 
 @pytest.mark.parametrize(
     "model", ["vehicles/simsat.xml", "vehicles/shefex2.xml", "vehicles/tas2.xml"]
 )
 def test_shipped_cameras_look_up_with_their_right_along_x(model: str) -> None:
-    seat = multibody.camera_mount(multibody.build(VehicleConfig.model_validate({"model": model})))
+    seat = multibody.camera_mount(
+        multibody.build(VehicleConfig.model_validate({"model": model}))
+    )
     assert seat.cam_from_body.magnitude() < 1e-15
 
 
@@ -288,7 +293,8 @@ def test_tilt_stop_leaves_yaw_alone() -> None:
 
 def test_start_beyond_the_stop_is_refused() -> None:
     with pytest.raises(
-        InputError, match=r"motion.start: tilt of 35.0 deg; allowed: up to vehicle.tilt_stop_deg 30"
+        InputError,
+        match=r"motion.start: tilt of 35.0 deg; allowed: up to vehicle.tilt_stop_deg 30",
     ):
         multibody.simulate(
             multibody.build(vehicle_config()),
@@ -321,7 +327,9 @@ def test_the_controller_is_called_every_period_with_the_present_state() -> None:
     flight = multibody.simulate(
         multibody.build(vehicle_config()), LEVEL, np.array([0.1, 0.2, 0.3]), 0.2, listen, 0.02
     )
-    np.testing.assert_allclose([t for t, _, _ in asked], np.arange(10) * 0.02, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        [t for t, _, _ in asked], np.arange(10) * 0.02, rtol=0, atol=1e-15
+    )
     for t, seen, rate in asked:
         k = round(t / 1e-3)
         assert (seen.inv() * flight.lab_from_body[k]).magnitude() == 0
@@ -330,7 +338,9 @@ def test_the_controller_is_called_every_period_with_the_present_state() -> None:
 
 def test_same_flight_twice_is_the_same_to_the_last_bit() -> None:
     flown = multibody.build(vehicle_config(center_of_mass=["0 m", "0 m", "-5 mm"]))
-    one, two = (multibody.simulate(flown, LEVEL, np.array([0.1, 0.2, 0.3]), 1.0) for _ in range(2))
+    one, two = (
+        multibody.simulate(flown, LEVEL, np.array([0.1, 0.2, 0.3]), 1.0) for _ in range(2)
+    )
     np.testing.assert_array_equal(one.lab_from_body.as_quat(), two.lab_from_body.as_quat())
 
 
@@ -361,7 +371,9 @@ def test_pid_flies_the_afit_maneuver() -> None:
         law.integrate(wanted, wanted, 0.01)
         return wanted
 
-    flight = multibody.simulate(flown, start_attitude(motion), STILL, reference.duration_s, steer)
+    flight = multibody.simulate(
+        flown, start_attitude(motion), STILL, reference.duration_s, steer
+    )
     t = np.append(np.arange(0, reference.duration_s, 0.2), reference.duration_s)
     error_deg = np.degrees((reference.attitudes(t).inv() * flight.attitude_at(t)).magnitude())
     assert error_deg.max() < 0.02
@@ -386,7 +398,9 @@ def carrying(parts: str) -> str:
     return BUS.replace(CAMERA, CAMERA + parts)
 
 
-def built(folder: Path, bodies: str, more: str = "", **changes: object) -> multibody.VehicleModel:
+def built(
+    folder: Path, bodies: str, more: str = "", **changes: object
+) -> multibody.VehicleModel:
     file = folder / "mine.xml"
     file.write_text(f"<mujoco>{more}<worldbody>{bodies}</worldbody></mujoco>", encoding="utf-8")
     return multibody.build(VehicleConfig.model_validate({"model": str(file)} | changes))
@@ -412,7 +426,9 @@ def built(folder: Path, bodies: str, more: str = "", **changes: object) -> multi
         ),
     ],
 )
-def test_a_bad_vehicle_is_refused_in_one_line(tmp_path: Path, bodies: str, message: str) -> None:
+def test_a_bad_vehicle_is_refused_in_one_line(
+    tmp_path: Path, bodies: str, message: str
+) -> None:
     with pytest.raises(InputError, match=message) as caught:
         built(tmp_path, bodies)
     assert "mine.xml" in str(caught.value)
@@ -504,7 +520,8 @@ def test_imbalance_that_no_rigid_wheel_has_is_refused() -> None:
 
 def test_compiler_setting_that_undoes_the_declared_mass_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
-        InputError, match=r"the compiled mass is 50 kg .* not as declared; remove inertiafromgeom"
+        InputError,
+        match=r"the compiled mass is 50 kg .* not as declared; remove inertiafromgeom",
     ):
         built(tmp_path, BUS, '<compiler inertiafromgeom="true"/>', mass="80 kg")
 
@@ -537,7 +554,9 @@ def test_an_untrusted_vehicle_reads_no_file_outside_of_its_folder(
     (folder / "deep").mkdir(parents=True)
     (tmp_path / "secret.xml").write_text(f"<mujoco><worldbody>{BUS}</worldbody></mujoco>")
     (folder / "part.xml").write_text('<mujoco><include file="deep/part.xml"/></mujoco>')
-    (folder / "deep" / "part.xml").write_text('<mujoco><include file="../secret.xml"/></mujoco>')
+    (folder / "deep" / "part.xml").write_text(
+        '<mujoco><include file="../secret.xml"/></mujoco>'
+    )
     (folder / "linked.xml").symlink_to(tmp_path / "secret.xml")
     with pytest.raises(InputError, match=r"is outside .*theirs; allowed: files in it$"):
         built(folder, BUS, names)
@@ -593,7 +612,11 @@ def changed_model(
 @pytest.mark.parametrize(
     ("right", "wrong", "says"),
     [
-        ('name="wheel_x" axis', 'name="wheelx" axis', "wheelx; allowed: wheel_x, or another word"),
+        (
+            'name="wheel_x" axis',
+            'name="wheelx" axis',
+            "wheelx; allowed: wheel_x, or another word",
+        ),
         ('name="fan_x_1"', 'name="fanx"', "fanx; allowed: fan_x, or another word"),
         (
             'name="wheel_x" axis',

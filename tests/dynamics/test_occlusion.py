@@ -54,7 +54,9 @@ def furnished(folder: Path, mjcf: str, **changes: str) -> Lab:
     (folder / "vehicle.xml").write_text(mjcf, encoding="utf-8")
     given = QUIET | {"vehicle.model": str(folder / "vehicle.xml")}
     return build_lab(
-        loader.load("afit_simsat", given | {k.replace("__", "."): v for k, v in changes.items()})
+        loader.load(
+            "afit_simsat", given | {k.replace("__", "."): v for k, v in changes.items()}
+        )
     )
 
 
@@ -88,9 +90,13 @@ def picture(lab: Lab) -> tuple[bytes, set[int], Any]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("start", STARTS)
-def test_a_mast_on_the_vehicle_hides_exactly_the_leds_behind_it(start: str, tmp_path: Path) -> None:
+def test_a_mast_on_the_vehicle_hides_exactly_the_leds_behind_it(
+    start: str, tmp_path: Path
+) -> None:
     lab = furnished(tmp_path, on_bus(mast(MAST_M)), motion__start=start)
-    bare = furnished(tmp_path, on_bus(mast(MAST_M)), motion__start=start, light__occlusion="false")
+    bare = furnished(
+        tmp_path, on_bus(mast(MAST_M)), motion__start=start, light__occlusion="false"
+    )
     _, seen, truth = picture(lab)
     everything = picture(bare)[1]
     to_body = truth.lab_from_body.inv()
@@ -106,7 +112,8 @@ def test_a_mast_on_the_vehicle_hides_exactly_the_leds_behind_it(start: str, tmp_
     assert len(everything & gone) >= 4
     assert len(seen) >= 10
     np.testing.assert_array_equal(
-        multibody.occluded(obstacles_of(lab), truth.lab_from_body, lab.camera.sources.place), behind
+        multibody.occluded(obstacles_of(lab), truth.lab_from_body, lab.camera.sources.place),
+        behind,
     )
 
 
@@ -129,7 +136,8 @@ def test_a_beam_in_the_lab_does_not_rotate_with_the_vehicle(tmp_path: Path) -> N
 def test_an_unobstructed_frame_is_unchanged_bit_for_bit(tmp_path: Path) -> None:
     """With occlusion on and off; switched off, a mast has no effect."""
     on, off = (
-        picture(furnished(tmp_path, SIMSAT, light__occlusion=word)) for word in ("true", "false")
+        picture(furnished(tmp_path, SIMSAT, light__occlusion=word))
+        for word in ("true", "false")
     )
     assert on[:2] == off[:2]
     masted = {
@@ -152,9 +160,7 @@ def test_occlusion_is_on_by_default() -> None:
     assert hides == [True, False]
 
 
-LENS = (
-    '<geom type="cylinder" size="0.022 0.015" pos="0 0 0.065" mass="0.2" rgba="0.05 0.05 0.06 1"/>'
-)
+LENS = '<geom type="cylinder" size="0.022 0.015" pos="0 0 0.065" mass="0.2" rgba="0.05 0.05 0.06 1"/>'
 
 
 @pytest.mark.slow
@@ -228,7 +234,9 @@ def test_a_box_hides_what_is_beyond_its_face_and_within_its_edges() -> None:
         beside = [[0.1 + 3 * tangent, 0.0, 3.2, 1.0]]
         star = np.array([tangent, 0.0, 1.0]) / np.hypot(tangent, 1)
         stars = [[*star, 0.0], [*-star, 0.0]]
-        found = multibody.occluded(obstacles, Rotation.identity(), sources_at(beside + stars).place)
+        found = multibody.occluded(
+            obstacles, Rotation.identity(), sources_at(beside + stars).place
+        )
         np.testing.assert_array_equal(found, [hidden, hidden, False])
 
 
@@ -251,9 +259,9 @@ def test_occlusion_uses_the_gimbals_initial_angles() -> None:
 def test_without_sources_occlusion_returns_nothing() -> None:
     lab = build_lab(loader.load("afit_simsat"))
     no_sources = lab.camera.sources.take(np.zeros(0, np.int64))
-    assert multibody.occluded(obstacles_of(lab), Rotation.identity(), no_sources.place).shape == (
-        0,
-    )
+    assert multibody.occluded(
+        obstacles_of(lab), Rotation.identity(), no_sources.place
+    ).shape == (0,)
 
 
 # --- the dome's wall ----------------------------------------------------------------------------------------
@@ -323,12 +331,16 @@ def test_a_wall_occludes_only_if_its_scene_says_so(tmp_path: Path) -> None:
         'name="star_camera" pos="0 0 0.081"', 'name="star_camera" pos="0.5 0 0.0"'
     )
     drum = "{kind: cylinder, axis: z, apex: 3 m, radius: 0.4 m, length: 2.4 m}"
-    layout = "{kind: listed, cap_deg: 40, positions: [[-0.4 m, 0 m, 0.8 m], [-0.4 m, 0 m, 2.8 m]]}"
+    layout = (
+        "{kind: listed, cap_deg: 40, positions: [[-0.4 m, 0 m, 0.8 m], [-0.4 m, 0 m, 2.8 m]]}"
+    )
     lab = furnished_drum(tmp_path, beside, drum, layout)
     # At the near wall, 1/9 of the way over, the sights are 0.36 m and 0.58 m high; the wall begins at 0.6 m.
     np.testing.assert_array_equal(hidden_by_wall(lab), [False, False])
     # Farther out, at 1 m, half of the way: 0.55 m and 1.55 m.
-    far = SIMSAT.replace('name="star_camera" pos="0 0 0.081"', 'name="star_camera" pos="1.2 0 0.0"')
+    far = SIMSAT.replace(
+        'name="star_camera" pos="0 0 0.081"', 'name="star_camera" pos="1.2 0 0.0"'
+    )
     lab = furnished_drum(tmp_path, far, drum, layout)
     np.testing.assert_array_equal(hidden_by_wall(lab), [False, True])
 
@@ -337,7 +349,9 @@ def hidden_by_wall(lab: Lab) -> np.ndarray:
     """(N,) which LEDs the dome's wall hides from a level camera."""
     exposure = expected_exposure(lab.camera, Rotation.identity(), np.zeros(3), 0.0)
     walls = [
-        light.during(exposure).hides for light in lab.camera.lights if isinstance(light, DomeWall)
+        light.during(exposure).hides
+        for light in lab.camera.lights
+        if isinstance(light, DomeWall)
     ]
     (wall,) = walls
     assert wall is not None

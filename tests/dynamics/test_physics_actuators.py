@@ -22,7 +22,9 @@ SIMSAT = {
     "mass": "80 kg",
     "inertia": ["6 kg m2", "6.5 kg m2", "9 kg m2"],
 }
-HEAVY = {"inertia": ["6e6 kg m2", "6.5e6 kg m2", "9e6 kg m2"]}  # nothing that it carries moves it
+HEAVY = {
+    "inertia": ["6e6 kg m2", "6.5e6 kg m2", "9e6 kg m2"]
+}  # nothing that it carries moves it
 WHEEL_KG_M2 = 2.5 * 0.09**2 / 2  # simsat.xml's wheels: cylinders of 2.5 kg and 9 cm
 RPM = math.pi / 30
 
@@ -31,9 +33,13 @@ def vehicle_config(**changes: object) -> VehicleConfig:
     return VehicleConfig.model_validate(SIMSAT | changes)
 
 
-def flown(vehicle: multibody.VehicleModel, rate: Floats, control: Floats) -> multibody.Simulation:
+def flown(
+    vehicle: multibody.VehicleModel, rate: Floats, control: Floats
+) -> multibody.Simulation:
     """A whole flight, level at first, with a control (K, nu) for each step."""
-    flight = multibody.Simulation(vehicle, LEVEL, rate, len(control) * vehicle.model.opt.timestep)
+    flight = multibody.Simulation(
+        vehicle, LEVEL, rate, len(control) * vehicle.model.opt.timestep
+    )
     flight.advance(control)
     return flight
 
@@ -43,7 +49,9 @@ def still(vehicle: multibody.VehicleModel, duration_s: float) -> Floats:
     return np.zeros((round(duration_s / vehicle.model.opt.timestep), vehicle.model.nu))
 
 
-def held(vehicle: multibody.VehicleModel, motor: int, control: float, duration_s: float) -> Floats:
+def held(
+    vehicle: multibody.VehicleModel, motor: int, control: float, duration_s: float
+) -> Floats:
     """One control held, all others zero: (K, nu)."""
     controls = still(vehicle, duration_s)
     controls[:, motor] = control
@@ -69,13 +77,17 @@ def test_a_wheel_motor_turns_the_body_the_other_way_up_to_its_limit(axis: int) -
     vehicle = multibody.build(vehicle_config(mount="free", wheels={"torque_limit": "0.2 N m"}))
     flight = flown(vehicle, STILL, held(vehicle, vehicle.wheels.motor[axis], 5.0, 2.0))
     body = -0.2 * 2.0 / (INERTIA[axis] - WHEEL_KG_M2)
-    np.testing.assert_allclose(flight.rate_body_rad_s, body * np.eye(3)[axis], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        flight.rate_body_rad_s, body * np.eye(3)[axis], rtol=0, atol=1e-12
+    )
     wheel = flight.speeds_rad_s[vehicle.wheels.dof[axis]]
     assert WHEEL_KG_M2 * (wheel + body) == pytest.approx(0.2 * 2.0, rel=1e-9)
 
 
 def test_wheel_starts_at_its_speed_relative_to_the_body() -> None:
-    vehicle = multibody.build(vehicle_config(mount="free", wheels={"start_rpm": [300, -200, 100]}))
+    vehicle = multibody.build(
+        vehicle_config(mount="free", wheels={"start_rpm": [300, -200, 100]})
+    )
     flight = multibody.Simulation(vehicle, LEVEL, np.array([0.1, 0.2, 0.3]), 1.0)
     np.testing.assert_allclose(
         flight.speeds_rad_s, [0.1, 0.2, 0.3, 300 * RPM, -200 * RPM, 100 * RPM], rtol=1e-15
@@ -98,7 +110,9 @@ def test_friction_brings_a_wheel_to_rest_and_the_body_takes_its_momentum() -> No
     assert 4 < stops_s < 5
     turning = t < stops_s - 0.01
     expected = (start + 100) * np.exp(-1e-3 * t / both) - 100
-    np.testing.assert_allclose(speed[turning], expected[turning], rtol=0, atol=1e-4)  # of 52 rad/s
+    np.testing.assert_allclose(
+        speed[turning], expected[turning], rtol=0, atol=1e-4
+    )  # of 52 rad/s
     assert np.abs(speed[t > stops_s + 1]).max() < 1e-6
     body = [WHEEL_KG_M2 * start / 6, 0, 0]
     np.testing.assert_allclose(flight.rate_body_rad_s, body, rtol=0, atol=1e-9)
@@ -109,7 +123,9 @@ def test_wheel_sticks_until_its_motor_beats_coulombs_friction(
     torque_nm: float, expected: float
 ) -> None:
     """Speed after a second of a motor against 0.02 N m; MuJoCo's friction creeps, by 2e-3 rad/s here."""
-    vehicle = multibody.build(vehicle_config(mount="free", wheels={"coulomb": "0.02 N m"}, **HEAVY))
+    vehicle = multibody.build(
+        vehicle_config(mount="free", wheels={"coulomb": "0.02 N m"}, **HEAVY)
+    )
     flight = flown(vehicle, STILL, held(vehicle, vehicle.wheels.motor[2], torque_nm, 1.0))
     assert flight.speeds_rad_s[vehicle.wheels.dof[2]] == pytest.approx(expected, abs=5e-3)
 
@@ -119,7 +135,9 @@ def shaking_rad(vehicle: multibody.VehicleModel, rad_s: float) -> Floats:
     flight = flown(vehicle, STILL, still(vehicle, 0.2))
     t = np.arange(len(flight.states)) * vehicle.model.opt.timestep
     turn = Rotation.from_quat(angles(flight)[:, :4], scalar_first=True).as_rotvec()
-    laws = np.stack([np.ones_like(t), t, t**2, t**3, np.cos(rad_s * t), np.sin(rad_s * t)], axis=1)
+    laws = np.stack(
+        [np.ones_like(t), t, t**2, t**3, np.cos(rad_s * t), np.sin(rad_s * t)], axis=1
+    )
     found, *_ = np.linalg.lstsq(laws, turn, rcond=None)
     return np.hypot(found[4], found[5])
 
@@ -166,7 +184,9 @@ def test_unbalanced_wheel_shakes_the_body(
 def test_the_force_of_an_imbalance_matches_a_hand_calculation() -> None:
     """Wheel z, dynamic 10 g cm2: 1e-6 / 6 rad about x and 1e-6 / 6.5 rad about y, whatever its speed; none about z."""
     wheels = {"dynamic_imbalance": "10 g cm2", "start_rpm": [0, 0, 3000]}
-    found = shaking_rad(multibody.build(vehicle_config(mount="free", wheels=wheels)), 3000 * RPM)
+    found = shaking_rad(
+        multibody.build(vehicle_config(mount="free", wheels=wheels)), 3000 * RPM
+    )
     np.testing.assert_allclose(found, [1e-6 / 6, 1e-6 / 6.5, 0], rtol=0.01, atol=1e-10)
 
 
@@ -185,7 +205,9 @@ def test_dynamic_imbalance_pulls_about_the_line_of_the_static_one(axis: int) -> 
     torques = []
     for dynamic in (0.0, product_kg_m2):
         vehicle = multibody.build(
-            vehicle_config(mount="free", wheels=wheels | {"dynamic_imbalance": f"{dynamic} kg m2"})
+            vehicle_config(
+                mount="free", wheels=wheels | {"dynamic_imbalance": f"{dynamic} kg m2"}
+            )
         )
         data = mujoco.MjData(vehicle.model)
         data.qvel[:] = multibody.Simulation(vehicle, LEVEL, STILL, 0.1).speeds_rad_s
@@ -197,7 +219,9 @@ def test_dynamic_imbalance_pulls_about_the_line_of_the_static_one(axis: int) -> 
         heavy_m = wheel.ipos - wheel.ipos @ np.eye(3)[axis] * np.eye(3)[axis]
     line = heavy_m / np.linalg.norm(heavy_m)
     largest = product_kg_m2 * w**2
-    np.testing.assert_allclose(torques[1] - torques[0], largest * line, rtol=0, atol=0.01 * largest)
+    np.testing.assert_allclose(
+        torques[1] - torques[0], largest * line, rtol=0, atol=0.01 * largest
+    )
 
 
 # --- gyroscopes ---------------------------------------------------------------------------------------------
@@ -234,7 +258,9 @@ def test_gimbal_keeps_its_rate_while_the_vehicle_turns() -> None:
     given_way = 1.0 * 1.8 * 0.05**2 / 2 * 2600 * RPM / (own / 0.01**2)
     late = angles(flight)[:, vehicle.gimbals.qpos] - t[:, None] * rate
     assert np.abs(late[t > 0.1] + 2 * 0.01 * rate).max() < given_way
-    assert np.abs(late[t > 0.1] + 2 * 0.01 * rate).max() > given_way / 4  # it was pressed indeed
+    assert (
+        np.abs(late[t > 0.1] + 2 * 0.01 * rate).max() > given_way / 4
+    )  # it was pressed indeed
 
 
 def test_rotor_keeps_its_speed_or_is_driven_where_it_has_a_motor() -> None:
@@ -330,7 +356,9 @@ def test_drag_is_felt_about_each_axis_by_its_own_rate() -> None:
     data = mujoco.MjData(vehicle.model)
     data.qvel[:] = [0.1, -0.2, 0.3]
     mujoco.mj_forward(vehicle.model, data)
-    np.testing.assert_allclose(data.qfrc_passive, [-0.0012, 0.0028, -0.0048], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        data.qfrc_passive, [-0.0012, 0.0028, -0.0048], rtol=0, atol=1e-15
+    )
 
 
 @pytest.mark.parametrize(("axis", "amplitude_deg"), [(0, 6), (1, 6), (2, 6), (2, 120)])

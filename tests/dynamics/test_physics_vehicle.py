@@ -90,7 +90,9 @@ def test_angular_momentum_is_conserved_with_wheels_and_gimbals_driven() -> None:
     vehicle = multibody.build(vehicle_config(**SPINNING))
     rng = np.random.default_rng(4)
     control = still(vehicle, 60.0)
-    control[:40_000, vehicle.gimbals.motor] = np.repeat(rng.uniform(-1, 1, (400, 4)), 100, axis=0)
+    control[:40_000, vehicle.gimbals.motor] = np.repeat(
+        rng.uniform(-1, 1, (400, 4)), 100, axis=0
+    )
     control[:40_000, vehicle.wheels.motor] = np.repeat(
         rng.uniform(-0.3, 0.3, (400, 3)), 100, axis=0
     )
@@ -204,11 +206,15 @@ def asymmetric_top(
     rate = np.stack([first * cn, second * sn, third * dn], axis=1)
 
     size = math.sqrt(squared)
-    leans = 1 - (i2 * second / (i1 * first)) ** 2  # L^2 - I3^2 w3^2 = (I1 first)^2 (1 - leans sn^2)
+    leans = (
+        1 - (i2 * second / (i1 * first)) ** 2
+    )  # L^2 - I3^2 w3^2 = (I1 first)^2 (1 - leans sn^2)
     swing = size * (energy2 - squared / i3) / (i1 * first) ** 2 / pace
     precession = size / i3 * t_s + swing * third_kind(np.array(leans), amplitude, m)
     own = rate * inertia / size
-    angles = np.stack([precession, np.arccos(own[:, 2]), np.arctan2(own[:, 0], own[:, 1])], axis=1)
+    angles = np.stack(
+        [precession, np.arccos(own[:, 2]), np.arctan2(own[:, 0], own[:, 1])], axis=1
+    )
     momentum_from_body = Rotation.from_euler("ZXZ", angles)
     return rate, momentum_from_body[0].inv() * momentum_from_body
 
@@ -252,11 +258,15 @@ def test_a_heavy_top_agrees_with_an_independent_integrator() -> None:
         turn = np.array([[w, -z, y], [z, w, -x], [-y, x, w], [-x, -y, -z]]) @ spin / 2
         return np.concatenate([turn, torque / INERTIA])
 
-    run = solve_ivp(law, (0, 5), [*begin.as_quat(), *rate], method="DOP853", rtol=1e-12, atol=1e-13)
+    run = solve_ivp(
+        law, (0, 5), [*begin.as_quat(), *rate], method="DOP853", rtol=1e-12, atol=1e-13
+    )
     flight = multibody.simulate(vehicle, begin, rate, 5.0)
     # The stop had no part.
     assert (flight.lab_from_body.as_matrix()[:, 2, 2] > math.cos(math.radians(85))).all()
-    assert (Rotation.from_quat(run.y[:4, -1]).inv() * flight.attitude_at(5.0)).magnitude() < 1e-9
+    assert (
+        Rotation.from_quat(run.y[:4, -1]).inv() * flight.attitude_at(5.0)
+    ).magnitude() < 1e-9
     np.testing.assert_allclose(flight.rate_body_rad_s[-1], run.y[4:, -1], rtol=0, atol=1e-9)
 
 
@@ -290,7 +300,9 @@ def test_torque_of_a_cmg_is_gimbal_rate_times_momentum(k: int) -> None:
         [0.81650, 0, 0.57735]
     ) / math.hypot(0.81650, 0.57735)
     expected = h * np.cross(rate_rad_s * gimbal, axle(k, 0.6))
-    np.testing.assert_allclose(data.qfrc_inverse[:3], expected, rtol=0, atol=1e-6 * h * rate_rad_s)
+    np.testing.assert_allclose(
+        data.qfrc_inverse[:3], expected, rtol=0, atol=1e-6 * h * rate_rad_s
+    )
     assert np.linalg.norm(expected) == pytest.approx(h * rate_rad_s, rel=1e-12)
 
 
@@ -346,7 +358,9 @@ def test_the_pose_within_an_exposure_is_exact_for_a_tumbling_vehicle() -> None:
     control = still(vehicle, 2.0)
     t = np.repeat(np.arange(200), 10) * 0.01
     control[:, vehicle.torques] = np.sin(7 * t[:, None] + np.array([0.0, 1.0, 2.0]))
-    assert apart_from_a_finer_run_rad(vehicle, np.array([1.0, 1.5, -1.0]), control).max() < 1e-11
+    assert (
+        apart_from_a_finer_run_rad(vehicle, np.array([1.0, 1.5, -1.0]), control).max() < 1e-11
+    )
 
 
 def test_the_pose_within_an_exposure_is_exact_with_unbalanced_wheels() -> None:
@@ -355,12 +369,17 @@ def test_the_pose_within_an_exposure_is_exact_with_unbalanced_wheels() -> None:
     The shaking is 200 times that. A step is a twentieth of a wheel's turn; what Runge and Kutta lose in the rate of
     the first turn, some 1e-9 rad/s, is what the two runs drift apart by.
     """
-    shaking: dict[str, object] = {"static_imbalance": "1 g cm", "dynamic_imbalance": "1e-7 kg m2"}
+    shaking: dict[str, object] = {
+        "static_imbalance": "1 g cm",
+        "dynamic_imbalance": "1e-7 kg m2",
+    }
     shaking |= {"start_rpm": [3000, -2900, 2800]}
     vehicle = multibody.build(
         vehicle_config(wheels=shaking, center_of_mass=["20 um", "-10 um", "-50 um"])
     )
-    apart = apart_from_a_finer_run_rad(vehicle, np.array([0.05, 0.1, -0.2]), still(vehicle, 2.0))
+    apart = apart_from_a_finer_run_rad(
+        vehicle, np.array([0.05, 0.1, -0.2]), still(vehicle, 2.0)
+    )
     assert apart.max() < 3e-9
 
 

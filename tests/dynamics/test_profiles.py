@@ -71,7 +71,9 @@ def test_rate_and_acceleration_are_the_derivatives_of_the_attitude() -> None:
         Rotation.from_quat(before[0], scalar_first=True).inv() * attitudes(spline, t + h)
     ).as_rotvec() / (2 * h)
     np.testing.assert_allclose(turned, rate, rtol=0, atol=1e-8)
-    np.testing.assert_allclose((after[1] - before[1]) / (2 * h), acceleration, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(
+        (after[1] - before[1]) / (2 * h), acceleration, rtol=0, atol=1e-7
+    )
 
 
 @pytest.mark.compiles
@@ -142,7 +144,9 @@ def test_at_a_constant_rate_the_error_falls_with_the_fifth_power_of_the_step() -
         )
         between = np.linspace(0, 19, 4001)
         errors.append(
-            angle(attitudes(spline, between), Rotation.from_rotvec(np.outer(between, rate))).max()
+            angle(
+                attitudes(spline, between), Rotation.from_rotvec(np.outer(between, rate))
+            ).max()
         )
     assert errors[0] / ARCSEC_RAD == pytest.approx(0.04, abs=0.005)
     assert errors[0] / errors[1] == pytest.approx(32, rel=0.05)
@@ -233,7 +237,10 @@ def test_tables_of_astropy_and_pandas_are_read_with_their_dates(tmp_path: Path) 
         pd.DataFrame({"utc": pd.to_datetime(moments)} | angles),
         Table({"utc": Time(moments, scale="utc")} | angles),
         Table({"utc": [moment.isoformat() for moment in moments]} | angles),
-        csv(tmp_path / "p.csv", {"utc": [f"{moment.isoformat()}Z" for moment in moments]} | angles),
+        csv(
+            tmp_path / "p.csv",
+            {"utc": [f"{moment.isoformat()}Z" for moment in moments]} | angles,
+        ),
     ]
     for source in dated:
         read = read_profile(source, START)
@@ -330,7 +337,13 @@ def test_a_file_too_large_or_no_text_is_refused(
         read_profile(path, START)
     t = np.arange(MAX_SAMPLES + 1.0)
     many = Samples(
-        "it", "row", t.astype(int), t, "lab", "body", Rotation.from_rotvec(np.zeros((len(t), 3)))
+        "it",
+        "row",
+        t.astype(int),
+        t,
+        "lab",
+        "body",
+        Rotation.from_rotvec(np.zeros((len(t), 3))),
     )
     with pytest.raises(InputError, match="1000001 attitudes; allowed: 4 to 1000000"):
         check_samples(many)
@@ -369,7 +382,11 @@ META = {
 
 
 def segment(
-    rotations: Rotation, t_s: np.ndarray, more: str = "", scalar_first: bool = False, **meta: str
+    rotations: Rotation,
+    t_s: np.ndarray,
+    more: str = "",
+    scalar_first: bool = False,
+    **meta: str,
 ) -> str:
     rows = rotations.as_quat(scalar_first=scalar_first)
     lines = [f"{key} = {value}" for key, value in (META | meta).items() if value]
@@ -475,7 +492,9 @@ def test_the_aem_standard_s_example_is_read(tmp_path: Path) -> None:
     }
     lines = [f"{key} = {value}" for key, value in meta.items()]
     data = [f"1996-11-28T{row}" for row in rows]
-    content = aem("\n".join(["META_START", *lines, "META_STOP", "DATA_START", *data, "DATA_STOP"]))
+    content = aem(
+        "\n".join(["META_START", *lines, "META_STOP", "DATA_START", *data, "DATA_STOP"])
+    )
     (tmp_path / "p.aem").write_text(content)
     read = read_profile(tmp_path / "p.aem", datetime.datetime(1996, 11, 28, 22, 8, 0))
     np.testing.assert_allclose(read.t_s, [3.5555, 4.5555], rtol=0, atol=1e-9)
@@ -490,7 +509,9 @@ def test_the_frame_bias_matches_the_iers_conventions(tmp_path: Path) -> None:
     eme = segment(Rotation.identity(5), TIMES[:5], REF_FRAME_A="EME2000")
     icrs_from_mean = read_text(aem(eme), tmp_path).a_from_b[0].as_matrix()
     mas = ARCSEC_RAD / 1000
-    np.testing.assert_allclose(icrs_from_mean[:2, 2] / mas, [-16.617, -6.819], rtol=0, atol=0.01)
+    np.testing.assert_allclose(
+        icrs_from_mean[:2, 2] / mas, [-16.617, -6.819], rtol=0, atol=0.01
+    )
     assert icrs_from_mean[1, 0] / mas == pytest.approx(-14.6, abs=0.01)
 
 
@@ -555,7 +576,10 @@ def test_segments_are_joined(tmp_path: Path) -> None:
             aem(segment(MOTION, TIMES, ATTITUDE_TYPE="SPIN")),
             "line 16: ATTITUDE_TYPE = 'SPIN'; allowed: QUATERNION",
         ),
-        (aem(segment(MOTION, TIMES, " 7")), "line 21: 6 values; allowed: an epoch and 4 numbers"),
+        (
+            aem(segment(MOTION, TIMES, " 7")),
+            "line 21: 6 values; allowed: an epoch and 4 numbers",
+        ),
         (
             aem(segment(MOTION, TIMES)).replace("DATA_STOP", ""),
             "ends within a segment, after DATA_START",
@@ -574,7 +598,9 @@ def test_segments_are_joined(tmp_path: Path) -> None:
             "a gap of 3 s between two segments",
         ),
         (
-            aem(segment(MOTION, TIMES), segment(MOTION, TIMES + 6, REF_FRAME_B="STARTRACKER_1")),
+            aem(
+                segment(MOTION, TIMES), segment(MOTION, TIMES + 6, REF_FRAME_B="STARTRACKER_1")
+            ),
             "a segment of icrs_from_cam after one of icrs_from_body",
         ),
     ],
@@ -592,10 +618,16 @@ def test_an_error_in_an_aem_is_reported_with_its_line(
 
 
 def stk(
-    rotations: Rotation, section: str = "AttitudeTimeQuaternions", more: str = "", **keywords: str
+    rotations: Rotation,
+    section: str = "AttitudeTimeQuaternions",
+    more: str = "",
+    **keywords: str,
 ) -> str:
     rows = rotations.as_quat(scalar_first="First" in section)
-    defaults = {"NumberOfAttitudePoints": str(len(rows)), "ScenarioEpoch": "31 Dec 2016 11:59:30.5"}
+    defaults = {
+        "NumberOfAttitudePoints": str(len(rows)),
+        "ScenarioEpoch": "31 Dec 2016 11:59:30.5",
+    }
     defaults |= {"CentralBody": "Earth", "CoordinateAxes": "ICRF", "InterpolationOrder": "1"}
     lines = [f"  {key}\t{value}" for key, value in (defaults | keywords).items() if value]
     data = [
@@ -616,8 +648,12 @@ def stk(
     ],
 )
 def test_an_stk_file_has_reference_from_body(section: str, more: str, tmp_path: Path) -> None:
-    content = stk(MOTION, "AttitudeTimeQuatScalarFirst" if "first" in section else section, more)
-    content = content.replace("AttitudeTimeQuatScalarFirst", section).replace("END Attitude", "")
+    content = stk(
+        MOTION, "AttitudeTimeQuatScalarFirst" if "first" in section else section, more
+    )
+    content = content.replace("AttitudeTimeQuatScalarFirst", section).replace(
+        "END Attitude", ""
+    )
     read = read_text(content, tmp_path, "p.a")
     assert (read.direction, read.absolute) == ("icrs_from_body", True)
     np.testing.assert_allclose(read.t_s, TIMES - 29.5, rtol=0, atol=1e-9)
@@ -658,7 +694,14 @@ def test_an_stk_file_without_an_epoch_counts_from_the_maneuver(tmp_path: Path) -
                 stk(MOTION, ScenarioEpoch=f"1 Jul 2005 {clock}"),
                 f"line 5: ScenarioEpoch '1 Jul 2005 {clock}'; allowed",
             )
-            for clock in ("12:-1:00", "12:60:00", "-1:00:00", "24:00:00", "12:00:-1", "12:00:60")
+            for clock in (
+                "12:-1:00",
+                "12:60:00",
+                "-1:00:00",
+                "24:00:00",
+                "12:00:-1",
+                "12:00:60",
+            )
         ),
         (
             stk(MOTION, NumberOfAttitudePoints="62"),
@@ -766,7 +809,8 @@ def test_the_vehicle_starts_at_the_first_profile_s_attitude() -> None:
     motion = following(begin="first_sample").model_copy(update={"start": "profile"})
     start_wxyz, _, _ = profile_start(motion, (first, second))
     assert (
-        angle(Rotation.from_quat(start_wxyz, scalar_first=True), tumble(np.array([3.0]))[0]) < 1e-12
+        angle(Rotation.from_quat(start_wxyz, scalar_first=True), tumble(np.array([3.0]))[0])
+        < 1e-12
     )
 
 

@@ -42,7 +42,9 @@ def test_shapes_are_where_the_file_puts_them() -> None:
     _, _, sphere, cylinder, *_ = lab.shapes
     np.testing.assert_allclose(sphere.position_m, [0, 0, 0.7], atol=1e-12)
     np.testing.assert_allclose(cylinder.position_m, [0.1, 0, 0.5], atol=1e-12)
-    axis = Rotation.from_quat(cylinder.parent_from_shape_wxyz, scalar_first=True).apply([0, 0, 1])
+    axis = Rotation.from_quat(cylinder.parent_from_shape_wxyz, scalar_first=True).apply(
+        [0, 0, 1]
+    )
     np.testing.assert_allclose(np.abs(axis), [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(lab.eye_m, [3, 2, 1])
 

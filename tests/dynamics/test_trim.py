@@ -71,7 +71,8 @@ def test_trim_masses_move_in_whole_steps_and_are_locked_without_their_section() 
 
 def test_a_mass_that_a_motor_cannot_hold_is_refused() -> None:
     with pytest.raises(
-        InputError, match=r"^vehicle.trim.position: 2 values; allowed: 3, one for each of trim_x, "
+        InputError,
+        match=r"^vehicle.trim.position: 2 values; allowed: 3, one for each of trim_x, ",
     ):
         trimmed(1, 2)
     with pytest.raises(ValidationError, match="position: beyond travel 20 mm"):

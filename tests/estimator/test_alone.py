@@ -70,7 +70,10 @@ def test_a_blocked_module_cannot_be_imported() -> None:
 def test_estimator_solves_without_any_other_package() -> None:
     catalog = f"CATALOG = {str(ROOT / 'data/catalogs/hipparcos_hp6.5.ecsv')!r}"
     done = subprocess.run(
-        [sys.executable, "-c", f"{BLOCK}{catalog}{WORK}"], cwd=ROOT, capture_output=True, text=True
+        [sys.executable, "-c", f"{BLOCK}{catalog}{WORK}"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == (
@@ -87,7 +90,9 @@ def test_the_estimator_wheel_solves_in_a_bare_environment(tmp_path: Path) -> Non
     here.mkdir()
     quiet = ["-m", "pip", "--quiet", "--disable-pip-version-check"]
     source = ROOT / "estimator"
-    subprocess.run([sys.executable, *quiet, "wheel", "--no-deps", "-w", wheels, source], check=True)
+    subprocess.run(
+        [sys.executable, *quiet, "wheel", "--no-deps", "-w", wheels, source], check=True
+    )
     (wheel,) = wheels.glob("skysim_estimator-*.whl")
     subprocess.run([sys.executable, "-m", "venv", bare], check=True)
     python = bare / "bin/python"
@@ -98,7 +103,11 @@ def test_the_estimator_wheel_solves_in_a_bare_environment(tmp_path: Path) -> Non
 
     def printed() -> str:
         done = subprocess.run(
-            [python, "-c", f"{catalog}{WORK}"], cwd=here, env=clean, capture_output=True, text=True
+            [python, "-c", f"{catalog}{WORK}"],
+            cwd=here,
+            env=clean,
+            capture_output=True,
+            text=True,
         )
         assert done.returncode == 0, done.stderr
         return done.stdout.strip()

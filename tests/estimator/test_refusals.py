@@ -74,7 +74,11 @@ CAMERAS: list[Case] = [
     ("no field", lambda: Camera.from_fov(9, 9, fov_deg=0), "fov_deg is 0; allowed"),
     ("field NaN", lambda: Camera.from_fov(9, 9, NAN), "fov_rad is nan; allowed"),
     ("field word", lambda: Camera.from_fov(9, 9, fov_deg="15"), "fov_deg is '15'; allowed"),
-    ("one column", lambda: Camera.from_fov(1, 9, 0.3), "width_px is 1; allowed: 2 pixels or more"),
+    (
+        "one column",
+        lambda: Camera.from_fov(1, 9, 0.3),
+        "width_px is 1; allowed: 2 pixels or more",
+    ),
     ("focal 0", lambda: lens(0), "focal_px is 0; allowed: finite, above 0"),
     ("focal < 0", lambda: lens(-5.0), r"focal_px is -5\.0; allowed"),
     ("focal NaN", lambda: lens(NAN), "focal_px is nan; allowed"),
@@ -160,13 +164,21 @@ SKIES: list[Case] = [
         "settings is {} of type dict; allowed: Settings",
     ),
     ("lights", lambda: TRACKER.solve_centroids(XY), "centroids is .* allowed: Centroids"),
-    ("effort", lambda: TRACKER.solve_centroids(LIGHTS, effort=3), "effort is 3; allowed: 0 to 2"),
+    (
+        "effort",
+        lambda: TRACKER.solve_centroids(LIGHTS, effort=3),
+        "effort is 3; allowed: 0 to 2",
+    ),
     (
         "no row",
         lambda: TRACKER.solve_matches(LIGHTS, [0, 999], [1, 2]),
         "observed: 999 is no row of",
     ),
-    ("row < 0", lambda: TRACKER.solve_matches(LIGHTS, [0, 1], [-1, 2]), "star: -1 is no row of"),
+    (
+        "row < 0",
+        lambda: TRACKER.solve_matches(LIGHTS, [0, 1], [-1, 2]),
+        "star: -1 is no row of",
+    ),
     (
         "rows",
         lambda: TRACKER.solve_matches(LIGHTS, [0, 1], [1]),
@@ -180,7 +192,11 @@ SKIES: list[Case] = [
 ]
 IMAGES: list[Case] = [
     ("none", lambda: TRACKER.solve(None), "the image is a NoneType .*cv2.imread answers None"),
-    ("list", lambda: TRACKER.solve(IMAGE.tolist()), "the image is a list; allowed: a numpy array"),
+    (
+        "list",
+        lambda: TRACKER.solve(IMAGE.tolist()),
+        "the image is a list; allowed: a numpy array",
+    ),
     (
         "color",
         lambda: TRACKER.solve(COLOR),
@@ -199,7 +215,11 @@ IMAGES: list[Case] = [
         lambda: TRACKER.solve(IMAGE * 1j),
         "pixels of type complex128 are not real numbers",
     ),
-    ("masked", lambda: TRACKER.solve(MASKED), "the image has masked pixels; allowed: image.filled"),
+    (
+        "masked",
+        lambda: TRACKER.solve(MASKED),
+        "the image has masked pixels; allowed: image.filled",
+    ),
     ("NaN", lambda: TRACKER.solve(IMAGE * NAN), "NaN or infinite pixels"),
     (
         "streak",
@@ -329,7 +349,11 @@ OTHERS: list[Case] = [
     ("differ", lambda: star_field.disagreement_px(CAMERA, None), "other is None"),
     ("survey", lambda: dome_survey.survey([5], LEDS, LEVER, CAMERA), "frames: number 0 is 5"),
     ("survey map", lambda: dome_survey.survey([], None, LEVER, CAMERA), "leds is None"),
-    ("home", lambda: home_position.calibrate([5], CAMERA, LEDS, LEVER), "sightings: number 0 is 5"),
+    (
+        "home",
+        lambda: home_position.calibrate([5], CAMERA, LEDS, LEVER),
+        "sightings: number 0 is 5",
+    ),
     (
         "home by",
         lambda: home_position.calibrate([], CAMERA, LEDS, LEVER, statistic="x"),

@@ -40,12 +40,15 @@ def noisy_truth(
     noise = SIGMA_RAD**2 * np.eye(3)
     shared = np.zeros((3, 3))
     return [
-        (float(t), one, noise, shared) for t, one in zip(log.t_s[::every], attitudes, strict=True)
+        (float(t), one, noise, shared)
+        for t, one in zip(log.t_s[::every], attitudes, strict=True)
     ]
 
 
 def scene_of(name: str, **overrides: str) -> Scene:
-    return loader.load(name, {key.replace("__", "."): value for key, value in overrides.items()})
+    return loader.load(
+        name, {key.replace("__", "."): value for key, value in overrides.items()}
+    )
 
 
 @pytest.mark.slow
@@ -76,7 +79,9 @@ def test_table_is_balanced_below_the_published_torque(
 
 
 @pytest.mark.slow
-def test_simsat_is_measured_to_a_percent_and_a_micrometer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_simsat_is_measured_to_a_percent_and_a_micrometer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """In-plane offset, without trim masses; NEES of the nine as their covariance says."""
     monkeypatch.setattr(balance_flight, "measured_attitudes", noisy_truth)
     scene = scene_of("simsat_slew")
@@ -134,7 +139,11 @@ def test_trim_masses_move_to_cancel_the_moment() -> None:
 @pytest.mark.parametrize(
     ("name", "overrides", "message"),
     [
-        ("simsat_slew", {}, "vehicle.trim: none, so nothing can be moved; allowed: joints trim_"),
+        (
+            "simsat_slew",
+            {},
+            "vehicle.trim: none, so nothing can be moved; allowed: joints trim_",
+        ),
         ("shefex2", {}, "vehicle.mount: a free vehicle has no bearing"),
         ("tas2_vscmg", {}, "vehicle.cmgs: the stored momentum must be that of wheels"),
         (
@@ -172,7 +181,9 @@ def test_an_undetermined_quantity_is_named_with_a_sufficient_maneuver() -> None:
     def refusal(sigmas: Floats) -> str:
         estimate = MassEstimate(prior.values, np.diag(sigmas**2), 1.0)
         with pytest.raises(InputError) as refused:
-            balance_flight.check_observed(estimate, prior, [record_of(2.0)], 0.01, np.full(3, 1e-5))
+            balance_flight.check_observed(
+                estimate, prior, [record_of(2.0)], 0.01, np.full(3, 1e-5)
+            )
         return str(refused.value)
 
     gained = 0.04**-2 - 0.1**-2
@@ -206,7 +217,10 @@ def test_an_undetermined_quantity_is_named_with_a_sufficient_maneuver() -> None:
             ("10", "500 um", "0.1%", "0.03 deg", 1.0),
             "balance.inertia_sigma: 10; allowed: 0.001 to 0.5",
         ),
-        (("10%", "5 s", "0.1%", "0.03 deg", 1.0), "balance.offset_sigma: '5 s' is not a length"),
+        (
+            ("10%", "5 s", "0.1%", "0.03 deg", 1.0),
+            "balance.offset_sigma: '5 s' is not a length",
+        ),
         (
             ("10%", "1 m", "0.1%", "0.03 deg", 1.0),
             "balance.offset_sigma: 1 m; allowed: 1e-07 to 0.01 m",

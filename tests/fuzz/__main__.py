@@ -84,16 +84,20 @@ def seeds(name: str) -> list[bytes]:
 
 def write_dictionary(name: str) -> Path:
     """Write libFuzzer's dictionary for a target (words of its seeds and schemas, and TOKENS) and return its path."""
-    schemas = {"scenes": ("scene",), "overrides": ("scene",), "studies": ("scene", "study")}.get(
-        name, ()
-    )
+    schemas = {
+        "scenes": ("scene",),
+        "overrides": ("scene",),
+        "studies": ("scene", "study"),
+    }.get(name, ())
     texts = [
         *seeds(name),
         *((ROOT / f"data/schema/{schema}.json").read_bytes() for schema in schemas),
     ]
     words = {word for text in texts for word in re.findall(rb"[A-Za-z_][\w-]{2,40}", text)}
     path = OUT / f"{name}.dict"
-    entries = ["".join(f"\\x{byte:02x}" for byte in word) for word in sorted(words.union(TOKENS))]
+    entries = [
+        "".join(f"\\x{byte:02x}" for byte in word) for word in sorted(words.union(TOKENS))
+    ]
     path.write_text("".join(f'"{word}"\n' for word in entries))
     return path
 
@@ -165,7 +169,9 @@ def fuzz_by_coverage(names: list[str], seconds_each: float) -> int:
         from tests.fuzz.targets import TARGETS
 
         for name in names:
-            for path in (CORPUS / name).iterdir():  # imports on first use must be instrumented too
+            for path in (
+                CORPUS / name
+            ).iterdir():  # imports on first use must be instrumented too
                 with suppress(Exception):
                     TARGETS[name](path.read_bytes())
     for name, module in sorted(sys.modules.items()):

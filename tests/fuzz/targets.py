@@ -86,7 +86,8 @@ def studies(data: bytes) -> None:
 def overrides(data: bytes) -> None:
     text = data.decode("utf-8", "replace")
     rejects(
-        lambda: loader.load("shefex2", yaml_reader.parse_overrides(text.split("\n"))), InputError
+        lambda: loader.load("shefex2", yaml_reader.parse_overrides(text.split("\n"))),
+        InputError,
     )
 
 
@@ -134,7 +135,8 @@ def tables(data: bytes) -> None:
     for largest in (1.0, math.inf):  # a response, the spectrum of an LED
         # bypass the cache, whose key is the path
         rejects(
-            lambda largest=largest: photometry._read_curve.__wrapped__(path, 0, largest), InputError
+            lambda largest=largest: photometry._read_curve.__wrapped__(path, 0, largest),
+            InputError,
         )
     rejects(lambda: otf.read_cells.__wrapped__(str(path)), InputError)
     rejects(lambda: read_prices(path), InputError)

@@ -150,7 +150,10 @@ def test_a_yaml_file_of_megabytes_is_refused_unread(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "overrides",
-    [{"exposure.frames": "1000000000"}, {"exposure.frames": "5000", "exposure.rate_hz": "0.01"}],
+    [
+        {"exposure.frames": "1000000000"},
+        {"exposure.frames": "5000", "exposure.rate_hz": "0.01"},
+    ],
 )
 def test_a_flight_too_long_for_memory_is_refused(overrides: dict[str, str]) -> None:
     with pytest.raises(InputError, match="allowed: up to 1000000, over a day"):
@@ -158,7 +161,9 @@ def test_a_flight_too_long_for_memory_is_refused(overrides: dict[str, str]) -> N
 
 
 @settings(max_examples=8, deadline=None)
-@given(some.dictionaries(some.text(min_size=1, max_size=30), some.text(max_size=30), max_size=3))
+@given(
+    some.dictionaries(some.text(min_size=1, max_size=30), some.text(max_size=30), max_size=3)
+)
 def test_any_override_is_taken_or_refused(overrides: dict[str, str]) -> None:
     rejects(lambda: loader.load("shefex2", overrides), InputError)
 
@@ -185,7 +190,9 @@ def test_any_table_is_read_or_refused(
 ) -> None:
     """Points of a dome, LEDs, a quantum efficiency, a point-spread function."""
     path = tmp_path_factory.mktemp("table") / "x.csv"
-    path.write_text("\n".join([head, *(",".join(map(str, row)) for row in rows)]), encoding="utf-8")
+    path.write_text(
+        "\n".join([head, *(",".join(map(str, row)) for row in rows)]), encoding="utf-8"
+    )
     rejects(lambda: TABLES[head](path), InputError)
 
 
@@ -267,7 +274,8 @@ def test_a_png_of_zeros_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> 
     path = tmp_path / "x.png"
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(packed))
     with pytest.raises(
-        InputError, match=r"16384x16384 pixels of 2147483648 bytes by its header; allowed: up to"
+        InputError,
+        match=r"16384x16384 pixels of 2147483648 bytes by its header; allowed: up to",
     ):
         images.read_image(path)
 
@@ -295,7 +303,9 @@ def test_no_marker_hides_a_jpeg_s_size(tmp_path: Path, between: bytes) -> None:
     at = small.index(b"\xff\xc0")
     great = small[2 : at + 5] + struct.pack(">HH", 17_000, 17_000) + small[at + 9 :]
     skipped = 4 + struct.unpack(">H", great[:2])[0]
-    path.write_bytes((small[:2] + between + great).ljust(skipped, b"\0") + small[at:] + bytes(9))
+    path.write_bytes(
+        (small[:2] + between + great).ljust(skipped, b"\0") + small[at:] + bytes(9)
+    )
     with pytest.raises(InputError, match=r"17000x17000 pixels by its header|cannot be decoded"):
         images.read_image(path)
 
@@ -308,15 +318,17 @@ def test_fits_that_unpacks_to_gigapixels_is_refused(tmp_path: Path, kind: str) -
         path.write_bytes(gzip.compress(promise(".fits", 40_000, 50_000) + b"\0" * 2880))
     else:
         buffer = streams.BytesIO()
-        fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(np.zeros((20, 20), np.int16))]).writeto(
-            buffer
-        )
+        fits.HDUList(
+            [fits.PrimaryHDU(), fits.CompImageHDU(np.zeros((20, 20), np.int16))]
+        ).writeto(buffer)
         data = buffer.getvalue()
         for key, of in (("ZNAXIS1", 40_000), ("ZNAXIS2", 50_000)):
             at = data.index(key.encode())
             data = data[: at + 10] + f"{of:20d}".encode() + data[at + 30 :]
         path.write_bytes(data)
-    with pytest.raises(InputError, match=r"50000x40000 pixels by its header|not a complete FITS"):
+    with pytest.raises(
+        InputError, match=r"50000x40000 pixels by its header|not a complete FITS"
+    ):
         images.read_image(path)
 
 

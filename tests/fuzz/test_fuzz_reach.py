@@ -113,7 +113,9 @@ def readers() -> Iterator[str]:
             module = path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".")
             for name, function in functions(ast.parse(path.read_text(encoding="utf-8")), ""):
                 calls = {
-                    ast.unparse(one.func) for one in ast.walk(function) if isinstance(one, ast.Call)
+                    ast.unparse(one.func)
+                    for one in ast.walk(function)
+                    if isinstance(one, ast.Call)
                 }
                 opens = calls & PARSERS or any(call.endswith(BYTES) for call in calls)
                 if opens or READER.match(function.name):

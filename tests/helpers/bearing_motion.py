@@ -73,7 +73,9 @@ def motion(
     random_nm = random_torque(vehicle, count, rng)
     half_s = np.arange(2 * count + 1) * PERIOD_S / 2
     stored = wheels * wheel_momenta(half_s)
-    change = wheels * (wheel_momenta(half_s + small) - wheel_momenta(half_s - small)) / (2 * small)
+    change = (
+        wheels * (wheel_momenta(half_s + small) - wheel_momenta(half_s - small)) / (2 * small)
+    )
 
     def slope(half: int, state: Floats) -> Floats:
         rate = state[4:]
@@ -87,7 +89,9 @@ def motion(
         torque -= (vehicle.drag[0] + vehicle.drag[1] * np.abs(rate)) * rate
         matrix = np.array([[s, -z, y], [z, s, -x], [-y, x, s], [-x, -y, -z]])
         gyroscopic = np.cross(rate, J @ rate + stored[half])
-        return np.concatenate([matrix @ rate / 2, inverse @ (torque - change[half] - gyroscopic)])
+        return np.concatenate(
+            [matrix @ rate / 2, inverse @ (torque - change[half] - gyroscopic)]
+        )
 
     states = np.zeros((count + 1, 7))
     states[0, 3] = 1
@@ -134,7 +138,16 @@ def record(
 def prior(vehicle: Vehicle, rng: np.random.Generator) -> tuple[Prior, Vehicle]:
     """Assumed mass properties, and a vehicle with random bias and wheel errors within their standard deviations."""
     sigma = np.array(
-        [*[0.01] * 3, *[0.005] * 3, *[3e-5] * 3, *[1e-5] * 3, 1e-4, 1e-3, *[5e-4] * 3, *[1e-3] * 3]
+        [
+            *[0.01] * 3,
+            *[0.005] * 3,
+            *[3e-5] * 3,
+            *[1e-5] * 3,
+            1e-4,
+            1e-3,
+            *[5e-4] * 3,
+            *[1e-3] * 3,
+        ]
     )
     bias = 5e-4 * rng.standard_normal(3)
     wheels = 1e-3 * rng.standard_normal(3)

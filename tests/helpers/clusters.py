@@ -59,7 +59,15 @@ def cluster_of(
     everyone = ["--host", "127.0.0.1", "--no-dashboard"]
     dask = [sys.executable, "-m"]
     commands = [[*dask, "distributed.cli.dask_scheduler", "--port", str(port), *everyone]]
-    plan_ = [*dask, "distributed.cli.dask_worker", address, *everyone, "--nthreads", "1", *worker]
+    plan_ = [
+        *dask,
+        "distributed.cli.dask_worker",
+        address,
+        *everyone,
+        "--nthreads",
+        "1",
+        *worker,
+    ]
     commands += [[*plan_, "--local-directory", str(folder)]] * count
     with (folder / "log").open("wb") as log:
         processes = [

@@ -61,7 +61,9 @@ def run_commands(page: str, folder: Path) -> None:
 
 def answer(folder: Path, *words: str) -> Any:
     """JSON printed by a command with --json."""
-    done = subprocess.run([*SKYSIM, *words, "--json"], cwd=folder, capture_output=True, text=True)
+    done = subprocess.run(
+        [*SKYSIM, *words, "--json"], cwd=folder, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 

@@ -102,7 +102,9 @@ def paint(light: NDArray, xy: NDArray, flux: NDArray, streak: NDArray, psf_px: f
                 down = np.exp(-((row - y) ** 2) / 2 / psf_px**2)
                 for column in range(max(round(x) - reach, 0), min(round(x) + reach + 1, width)):
                     across = np.exp(-((column - x) ** 2) / 2 / psf_px**2)
-                    light[row, column] += flux[n] / steps * down * across / (2 * np.pi * psf_px**2)
+                    light[row, column] += (
+                        flux[n] / steps * down * across / (2 * np.pi * psf_px**2)
+                    )
 
 
 def render(
@@ -114,10 +116,16 @@ def render(
     xy = camera.pixels(truth.apply(stars.vectors))
     inside = camera.contains(np.nan_to_num(xy, nan=-1e9), -10.0)
     angle = rng.uniform(0, 2 * np.pi)
-    streak = np.tile(setup.streak_px * np.array([np.cos(angle), np.sin(angle)]), (inside.sum(), 1))
+    streak = np.tile(
+        setup.streak_px * np.array([np.cos(angle), np.sin(angle)]), (inside.sum(), 1)
+    )
     light = np.full((camera.height_px, camera.width_px), float(setup.sky_e))
     paint(
-        light, xy[inside], setup.zero_e * 10 ** (-0.4 * stars.v_mag[inside]), streak, setup.psf_px
+        light,
+        xy[inside],
+        setup.zero_e * 10 ** (-0.4 * stars.v_mag[inside]),
+        streak,
+        setup.psf_px,
     )
     if setup.nuisances:
         disturb(light, setup, rng)
@@ -137,4 +145,6 @@ def disturb(light: NDArray, setup: CameraSetup, rng: np.random.Generator) -> Non
     paint(light, rays, rng.uniform(5e3, 5e4, len(rays)), length, 0.25)
     paint(light, trail, np.array([3e5]), rng.uniform(200, 600, (1, 2)), setup.psf_px)
     mag = rng.uniform(2.0, 6.0, len(false))
-    paint(light, false, setup.zero_e * 10 ** (-0.4 * mag), np.zeros((len(false), 2)), setup.psf_px)
+    paint(
+        light, false, setup.zero_e * 10 ** (-0.4 * mag), np.zeros((len(false), 2)), setup.psf_px
+    )

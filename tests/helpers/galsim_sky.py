@@ -166,7 +166,9 @@ def plate_at(galsim: Any, setup: CameraSetup, rng: np.random.Generator, middle: 
     across = setup.scale_arcsec * np.cos(roll)
     along = setup.scale_arcsec * np.sin(roll)
     affine = galsim.AffineTransform(across, along, along, -across, origin=middle)
-    return galsim.TanWCS(affine, galsim.CelestialCoord(ra * galsim.radians, dec * galsim.radians))
+    return galsim.TanWCS(
+        affine, galsim.CelestialCoord(ra * galsim.radians, dec * galsim.radians)
+    )
 
 
 def draw(
@@ -270,7 +272,9 @@ def compare(
     return outcomes
 
 
-def agreement(frame: RenderedFrame, answer: Attitude, pixels: NDArray) -> tuple[Agreement, float]:
+def agreement(
+    frame: RenderedFrame, answer: Attitude, pixels: NDArray
+) -> tuple[Agreement, float]:
     """Compare a solution with GalSim's projection; returns the agreement and the NEES for the tracker's covariance.
 
     The true attitude is the rotation that best aligns the directions of the pixel lattice in camera axes, by the

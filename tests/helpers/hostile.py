@@ -90,7 +90,9 @@ def noise(rng: Rng) -> HostileInput:
         return HostileInput(rng.integers(0, DEPTH + 1, shape, dtype=np.uint16))
     if kind == 3:  # salt and pepper
         share = 10 ** rng.uniform(-5, -1)
-        return HostileInput(np.where(rng.uniform(size=shape) < share, DEPTH, 100).astype(np.uint16))
+        return HostileInput(
+            np.where(rng.uniform(size=shape) < share, DEPTH, 100).astype(np.uint16)
+        )
     clouds = cv2.GaussianBlur(rng.normal(size=shape), (0, 0), rng.uniform(1, 20))
     return HostileInput(np.clip(500 + 2000 * clouds, 0, DEPTH).astype(np.uint16))
 
@@ -110,7 +112,9 @@ def gradients(rng: Rng) -> HostileInput:
     y, x = np.indices(size(rng)) / WIDTH
     lamp = np.hypot(x - rng.uniform(), y - rng.uniform())
     slope = rng.uniform(-2000, 2000) * x + rng.uniform(-2000, 2000) * y
-    return HostileInput(speckled(2000 + slope + 1500 * np.exp(-lamp / rng.uniform(0.01, 1)), rng))
+    return HostileInput(
+        speckled(2000 + slope + 1500 * np.exp(-lamp / rng.uniform(0.01, 1)), rng)
+    )
 
 
 def text(rng: Rng) -> HostileInput:
@@ -161,7 +165,8 @@ def duplicated(rng: Rng) -> HostileInput:
         ground = np.median(one)
         # np.roll moves rows by shift[0] (y) and columns by shift[1] (x); near the boresight that is this rotation.
         shifted_attitude = (
-            Rotation.from_rotvec(np.array([-shift[0], shift[1], 0]) / camera().focal_px) * attitude
+            Rotation.from_rotvec(np.array([-shift[0], shift[1], 0]) / camera().focal_px)
+            * attitude
         )
         return HostileInput(
             np.clip(one + (moved - ground), 0, DEPTH).astype(np.uint16),
@@ -192,7 +197,8 @@ def kaleidoscope(rng: Rng) -> HostileInput:
     picture, attitude = starry(rng)
     half = picture[:, : WIDTH // 2]
     return HostileInput(
-        np.hstack([half, picture[:, WIDTH // 2 : WIDTH // 2 + 1], half[:, ::-1]]), skies=(attitude,)
+        np.hstack([half, picture[:, WIDTH // 2 : WIDTH // 2 + 1], half[:, ::-1]]),
+        skies=(attitude,),
     )
 
 
@@ -255,7 +261,15 @@ def broken(rng: Rng) -> HostileInput:
 
 def rubbish(rng: Rng) -> HostileInput:
     suffix = str(rng.choice(IMAGE_SUFFIXES))
-    heads = (b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*", b"SIMPLE  = ")
+    heads = (
+        b"",
+        b"\x89PNG\r\n\x1a\n",
+        b"\xff\xd8\xff",
+        b"BM",
+        b"II*\0",
+        b"MM\0*",
+        b"SIMPLE  = ",
+    )
     return HostileInput(
         None, suffix, heads[rng.integers(len(heads))] + rng.bytes(int(rng.integers(0, 5000)))
     )
@@ -310,7 +324,9 @@ def stars() -> catalog.StarCatalog:
 
 def starry(rng: Rng, lens: Camera | None = None) -> tuple[NDArray, Rotation]:
     """An image of a true sky, and its attitude."""
-    return render(CameraSetup("", lens or camera(), LIEBE_E, 7.0, 60, 15, 16, DEPTH), stars(), rng)
+    return render(
+        CameraSetup("", lens or camera(), LIEBE_E, 7.0, 60, 15, 16, DEPTH), stars(), rng
+    )
 
 
 def star_light(count: int, rng: Rng) -> NDArray:
@@ -346,9 +362,11 @@ class Judge:
         prior : information given to the solver: "camera", "field" (of view) or "nothing"
         """
         shape = shape if shape in USUAL else ()
-        how = {"camera": (None, CAMERA_FILE), "field": (FOV_DEG, None), "nothing": (None, None)}[
-            prior
-        ]
+        how = {
+            "camera": (None, CAMERA_FILE),
+            "field": (FOV_DEG, None),
+            "nothing": (None, None),
+        }[prior]
         cached = self.solvers.setdefault(prior, {})
         if shape not in cached:
             cached[shape] = plate_solver.make_solver(*how)
@@ -372,7 +390,9 @@ class Judge:
         prior = "camera" if fits_camera and rng.uniform() < 0.8 else "field"
         prior = "nothing" if rng.uniform() < SEARCHED else prior
         path = self.folder / f"{family.__name__}{case.suffix}"
-        path.write_bytes(case.data if case.picture is None else encoded(case.picture, case.suffix))
+        path.write_bytes(
+            case.data if case.picture is None else encoded(case.picture, case.suffix)
+        )
         solver = self.solver(prior, case.picture.shape if case.picture is not None else ())
         answer, seconds, memory_bytes = timed(path, solver)
         # Solve again, because compilation may have caused the defect.
@@ -441,9 +461,13 @@ def judged(count: int, seed: int, quiet: bool = True) -> dict[str, FamilyResult]
     return results
 
 
-def defects(case: HostileInput, answer: dict, seconds: float, memory_bytes: float) -> Iterator[str]:
+def defects(
+    case: HostileInput, answer: dict, seconds: float, memory_bytes: float
+) -> Iterator[str]:
     """Yield a description of each violated requirement."""
-    pixels, held = (case.picture.size, case.picture.nbytes) if case.picture is not None else (0, 0)
+    pixels, held = (
+        (case.picture.size, case.picture.nbytes) if case.picture is not None else (0, 0)
+    )
     if answer.get("raised"):
         yield answer["status"]
     if "\n" in answer["status"]:

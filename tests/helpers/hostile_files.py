@@ -49,7 +49,14 @@ def promise(suffix: str, width: int, height: int) -> bytes:
         ]
         cards += [f"NAXIS1  = {width:20d}", f"NAXIS2  = {height:20d}", "END"]
         return "".join(card.ljust(80) for card in cards).ljust(2880).encode()
-    tags = [(256, 4, width), (257, 4, height), (258, 3, 8), (259, 3, 1), (262, 3, 1), (273, 4, 8)]
+    tags = [
+        (256, 4, width),
+        (257, 4, height),
+        (258, 3, 8),
+        (259, 3, 1),
+        (262, 3, 1),
+        (273, 4, 8),
+    ]
     tags += [(277, 3, 1), (278, 4, height), (279, 4, min(width * height, 2**32 - 1))]
     return (
         b"II*\0\x08\0\0\0"

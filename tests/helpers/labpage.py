@@ -59,7 +59,16 @@ class Server:
             "--port",
             str(self.port),
         ]
-        place = ["--host", host, "--folder", str(folder), "--out", str(self.out), "--token", TOKEN]
+        place = [
+            "--host",
+            host,
+            "--folder",
+            str(folder),
+            "--out",
+            str(self.out),
+            "--token",
+            TOKEN,
+        ]
         # With pytest's own variable NiceGUI takes the server for a test of itself.
         environment = {
             name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"
@@ -204,7 +213,8 @@ def source(page: Any) -> str:
 def changed(page: Any, before: str) -> None:
     """Wait for another frame."""
     page.wait_for_function(
-        "before => document.querySelector('.lab-frame canvas').dataset.frame !== before", arg=before
+        "before => document.querySelector('.lab-frame canvas').dataset.frame !== before",
+        arg=before,
     )
 
 
@@ -228,7 +238,9 @@ def chosen(page: Any, name: str, option: str) -> None:
 
 def choose_stage(page: Any, stage: str, algorithm: str) -> None:
     """Choose an algorithm of the tracker in the panel that F6 or F7 opens."""
-    key, first = ("F6", "detector") if stage in ("detector", "centroider") else ("F7", "identifier")
+    key, first = (
+        ("F6", "detector") if stage in ("detector", "centroider") else ("F7", "identifier")
+    )
     onto_the_page(page)
     page.keyboard.press(key)
     # The panel takes the focus once its part is open; before, it would take it from what the test does next.
@@ -301,9 +313,9 @@ def frame_pixel(page: Any, x: float, y: float) -> tuple[float, float]:
 
 def picture(page: Any, **how: Any) -> np.ndarray:
     """(H, W, 3) of the screen, whole numbers that can be subtracted."""
-    return cv2.imdecode(np.frombuffer(page.screenshot(**how), np.uint8), cv2.IMREAD_COLOR).astype(
-        int
-    )
+    return cv2.imdecode(
+        np.frombuffer(page.screenshot(**how), np.uint8), cv2.IMREAD_COLOR
+    ).astype(int)
 
 
 def pixels(page: Any) -> list[tuple[int, int, int]]:
@@ -318,4 +330,6 @@ def differs(page: Any, before: np.ndarray, box: tuple[int, int, int, int]) -> bo
     """Whether a part of the screen (left, top, right, bottom) differs from an earlier picture."""
     left, top, right, bottom = box
     clip = {"x": left, "y": top, "width": right - left, "height": bottom - top}
-    return bool((np.abs(picture(page, clip=clip) - before[top:bottom, left:right]) > 20).sum() > 30)
+    return bool(
+        (np.abs(picture(page, clip=clip) - before[top:bottom, left:right]) > 20).sum() > 30
+    )

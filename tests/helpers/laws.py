@@ -22,7 +22,9 @@ from estimator.core.checks import Floats
 
 EXAMPLES = int(os.environ.get("LAW_EXAMPLES", "8"))
 ANY = some.floats(width=64)
-NUMBERS = arrays("f8", array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=6), elements=ANY)
+NUMBERS = arrays(
+    "f8", array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=6), elements=ANY
+)
 SEEDS = some.integers(0, 2**32 - 1).map(np.random.default_rng)
 PROVED: set[str] = set()
 Test = TypeVar("Test", bound=Callable[..., None])

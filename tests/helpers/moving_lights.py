@@ -14,7 +14,12 @@ from estimator.core.checks import Floats
 from estimator.core.types import Centroids
 
 CAMERA = Camera(
-    1600, 1200, 3000.0, (810.0, 590.0), distortion=(-0.1, 0.05, 1e-3, 0.0, 0.0), row_time_s=80e-6
+    1600,
+    1200,
+    3000.0,
+    (810.0, 590.0),
+    distortion=(-0.1, 0.05, 1e-3, 0.0, 0.0),
+    row_time_s=80e-6,
 )
 EXPOSURE_S = 0.02
 SIGMA_PX = 0.05
@@ -37,7 +42,9 @@ class Moving:
         rays = self.camera.rays(self.still_px)
         lever = self.sight.lever_cam_m
         along = rays @ lever
-        distance = -along + np.sqrt(along**2 - lever @ lever + np.asarray(self.sight.radius_m) ** 2)
+        distance = -along + np.sqrt(
+            along**2 - lever @ lever + np.asarray(self.sight.radius_m) ** 2
+        )
         return self.cam_from_ref.inv().apply(lever + distance[:, None] * rays)
 
     def pixels(self, t_s: Floats) -> Floats:
@@ -65,7 +72,9 @@ class Moving:
         count = len(xy_px)
         covariance_px2 = np.tile(STREAK_SIGMA_PX**2 * np.eye(2), (count, 1, 1))
         sigma_px = np.full(count, SIGMA_PX)
-        return Centroids(xy_px, sigma_px, np.ones(count), None, signs * streak_px, covariance_px2)
+        return Centroids(
+            xy_px, sigma_px, np.ones(count), None, signs * streak_px, covariance_px2
+        )
 
 
 def moving(

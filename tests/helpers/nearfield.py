@@ -110,14 +110,21 @@ def solved(method: str, geometry: Geometry, one: Trial) -> tuple[Rotation, NDArr
 
 
 def errors_deg(
-    method: str, geometry: Geometry, tilt_deg: float, trials: int, seed: int, noise_px: float = 0.0
+    method: str,
+    geometry: Geometry,
+    tilt_deg: float,
+    trials: int,
+    seed: int,
+    noise_px: float = 0.0,
 ) -> NDArray[np.float64]:
     """(trials, 3) errors about the body's axes, degrees; the same trials for every method."""
     rng = np.random.default_rng(seed)
     errors = np.empty((trials, 3))
     for n in range(trials):
         case = trial(geometry, tilt_deg, rng, noise_px)
-        errors[n] = (solved(method, geometry, case)[0] * case.truth.inv()).as_rotvec(degrees=True)
+        errors[n] = (solved(method, geometry, case)[0] * case.truth.inv()).as_rotvec(
+            degrees=True
+        )
     return errors
 
 

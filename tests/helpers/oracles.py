@@ -139,7 +139,9 @@ class Agreement:
 Solve = Callable[[Path, Frame], Found | None]
 
 
-Pair = tuple[Agreement, Agreement]  # by the oracle's own world coordinates, and by its stars alone
+Pair = tuple[
+    Agreement, Agreement
+]  # by the oracle's own world coordinates, and by its stars alone
 
 
 def load(name: str, who: str, frames: int) -> Scene:
@@ -153,7 +155,9 @@ def render_frames(scene: Scene, seed: int) -> Iterator[tuple[Frame, Truth]]:
     lab = build_lab(scene)
     for n in range(scene.exposure.frames):
         cam_from_icrs = Rotation.random(rng=np.random.default_rng([seed, n]))
-        yield render_at_rest(lab.camera, cam_from_icrs.inv() * lab.camera.mount.cam_from_body, n)
+        yield render_at_rest(
+            lab.camera, cam_from_icrs.inv() * lab.camera.mount.cam_from_body, n
+        )
 
 
 def lattice(width_px: int, height_px: int) -> NDArray:
@@ -217,7 +221,9 @@ def agreements(seen: Sequence[Sighting], camera: Camera) -> list[Pair]:
 
 
 def agreement(one: Sighting, turn: NDArray, sigma: tuple[float, float]) -> Agreement:
-    return Agreement(one.frame, float(np.hypot(*turn[:2])), float(turn[2]), *sigma, len(one.rays))
+    return Agreement(
+        one.frame, float(np.hypot(*turn[:2])), float(turn[2]), *sigma, len(one.rays)
+    )
 
 
 def star_sigmas_px(found: Sequence[Found]) -> list[NDArray]:
@@ -292,7 +298,9 @@ def plate_spread(found: Found, sigma_px: NDArray, camera: Camera) -> tuple[float
 
 def astrometry_net(name: str) -> Solve | None:
     """astrometry.net's `solve-field`, given only the field width to 5%; None if it is not installed."""
-    if not (shutil.which("solve-field") and list(Path("/usr/share/astrometry").glob("index-*"))):
+    if not (
+        shutil.which("solve-field") and list(Path("/usr/share/astrometry").glob("index-*"))
+    ):
         return None
     camera = load(name, "astrometry.net", 1).camera
     width_deg = float(np.degrees(onboard_model.calibration(camera).fov_rad))
@@ -312,14 +320,19 @@ def astrometry_net(name: str) -> Solve | None:
     def solve(path: Path, frame: Frame) -> Found | None:
         stem = path.with_suffix("")
         subprocess.run(
-            ["solve-field", *options, str(path)], capture_output=True, check=True, cwd=path.parent
+            ["solve-field", *options, str(path)],
+            capture_output=True,
+            check=True,
+            cwd=path.parent,
         )
         if not stem.with_suffix(".solved").exists():
             return None
         matched = fits.getdata(stem.with_suffix(".corr"))
         direction = directions(fits.getheader(stem.with_suffix(".wcs")), lattice(*size_px))
         utc = fits.getheader(path)["DATE-OBS"]
-        xy_px = np.column_stack([matched["field_x"], matched["field_y"]]) - 1  # FITS counts from 1
+        xy_px = (
+            np.column_stack([matched["field_x"], matched["field_y"]]) - 1
+        )  # FITS counts from 1
         left_px = xy_px + 1 - np.column_stack([matched["index_x"], matched["index_y"]])
         named = aberrated(unit_vectors(matched["index_ra"], matched["index_dec"]), utc)
         return Found(aberrated(direction, utc), order, xy_px, left_px, matched["FLUX"], named)
@@ -344,7 +357,9 @@ def tetra3rs(name: str) -> Solve | None:
     pixels = lattice(camera.width_px, camera.height_px) - tracker.image_center_px
 
     def solve(path: Path, frame: Frame) -> Found | None:
-        seen = tracker.extract(fits.getdata(path).astype(np.uint16), max_centroids=60, threads=1)
+        seen = tracker.extract(
+            fits.getdata(path).astype(np.uint16), max_centroids=60, threads=1
+        )
         answer = tracker.database.solve_from_centroids(
             seen.centroids,
             camera_model=tracker.camera,
@@ -403,6 +418,7 @@ def confront(name: str, who: str, oracle: Solve, frames: int, seed: int) -> list
 def squares(solved: Sequence[Agreement]) -> NDArray:
     """(2,) mean of (error / predicted sigma)^2, cross-boresight and roll; 1 if the prediction is correct."""
     ratio = [
-        (one.cross_rad / one.sigma_cross_rad, one.roll_rad / one.sigma_roll_rad) for one in solved
+        (one.cross_rad / one.sigma_cross_rad, one.roll_rad / one.sigma_roll_rad)
+        for one in solved
     ]
     return np.asarray(np.mean(np.square(ratio), axis=0))

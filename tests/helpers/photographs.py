@@ -76,7 +76,9 @@ def draw(
     light = np.full((shot.height_px, shot.width_px), SKY, np.float32)
     length_px = math.hypot(*shot.trail[:2])
     footprint_px = (
-        4 * math.pi * shot.sigma_px**2 + math.pi * shot.radius_px**2 + 2 * shot.sigma_px * length_px
+        4 * math.pi * shot.sigma_px**2
+        + math.pi * shot.radius_px**2
+        + 2 * shot.sigma_px * length_px
     )
     flux = (
         10
@@ -130,7 +132,9 @@ def add_star(
     else:
         along = (u * trail[0] + v * trail[1]) / length
         across = (v * trail[0] - u * trail[1]) / length
-        ends = [erf((along + side * length / 2) / (sigma_px * math.sqrt(2))) for side in (1, -1)]
+        ends = [
+            erf((along + side * length / 2) / (sigma_px * math.sqrt(2))) for side in (1, -1)
+        ]
         patch += (
             flux
             / (2 * length * math.sqrt(2 * math.pi) * sigma_px)
@@ -154,7 +158,9 @@ def caption(image: NDArray, rng: np.random.Generator) -> None:
     (width, height), _ = cv2.getTextSize(text, font, scale, thick)
     x = int(rng.uniform(10, max(image.shape[1] - width - 10, 11)))
     y = int(height + 10 if rng.random() < 0.5 else image.shape[0] - 15)
-    cv2.putText(image, text, (x, y), font, scale, int(rng.integers(180, 256)), thick, cv2.LINE_AA)
+    cv2.putText(
+        image, text, (x, y), font, scale, int(rng.integers(180, 256)), thick, cv2.LINE_AA
+    )
 
 
 def planets(light: NDArray, rng: np.random.Generator) -> None:
@@ -207,14 +213,23 @@ def lens(rng: np.random.Generator) -> Shot:
     """A camera of 1.2 megapixels behind a lens, as the cases without a size of their own use it."""
     fov_deg = float(np.exp(rng.uniform(math.log(10), math.log(40))))
     return Shot(
-        1280, 960, fov_deg, 6.3 - 2.5 * math.log10(fov_deg / 20), quality=int(rng.integers(80, 97))
+        1280,
+        960,
+        fov_deg,
+        6.3 - 2.5 * math.log10(fov_deg / 20),
+        quality=int(rng.integers(80, 97)),
     )
 
 
 def phone(rng: np.random.Generator, limit_mag: float = 5.0) -> Shot:
     """A phone of 12 megapixels."""
     return Shot(
-        4032, 3024, float(rng.uniform(50, 74)), limit_mag, 1.6, quality=int(rng.integers(80, 97))
+        4032,
+        3024,
+        float(rng.uniform(50, 74)),
+        limit_mag,
+        1.6,
+        quality=int(rng.integers(80, 97)),
     )
 
 

@@ -31,7 +31,9 @@ def observe(truth: Rotation, rng, sigma=SIGMA, zoom=1.0, vectors=VECTORS, mag=MA
     x, y, z = truth.apply(vectors).T
     tangent = zoom * np.column_stack([x, y]) / np.where(z > 0.1, z, np.inf)[:, None]
     inside = (
-        (z > 0.1) & (tangent > FIELD[[0, 2]]).all(axis=1) & (tangent < FIELD[[1, 3]]).all(axis=1)
+        (z > 0.1)
+        & (tangent > FIELD[[0, 2]]).all(axis=1)
+        & (tangent < FIELD[[1, 3]]).all(axis=1)
     )
     row = np.flatnonzero(inside)
     noisy = tangent[row] + sigma * rng.standard_normal((len(row), 2))

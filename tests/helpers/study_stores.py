@@ -26,7 +26,8 @@ def contents(path: Path) -> str:
     """Points and trials, row for row, to the last bit and with their types."""
     db = sqlite3.connect(path)
     tables = [
-        db.execute(f"SELECT * FROM {name} ORDER BY 1").fetchall() for name in ("points", "trials")
+        db.execute(f"SELECT * FROM {name} ORDER BY 1").fetchall()
+        for name in ("points", "trials")
     ]
     db.close()
     return repr(tables)

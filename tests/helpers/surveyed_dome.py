@@ -22,7 +22,9 @@ def leds(count: int, half_deg: float = 40.0) -> LedMap:
     n = np.arange(count) + 0.5
     z = 1 - n / count * (1 - np.cos(np.radians(half_deg)))
     turn = n * np.pi * (3 - np.sqrt(5))
-    along = np.column_stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z])
+    along = np.column_stack(
+        [np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z]
+    )
     place_m = on_surface(
         along, np.zeros(3), LedMap(np.arange(0), np.zeros((0, 3)), CENTER_M, AXES_M)
     )

@@ -153,7 +153,9 @@ def imports(file: str) -> frozenset[str]:
 def importers(module: str) -> dict[str, int]:
     """The module (0), the files that import it (1), those that import these (2), and so on; tests included."""
     files = [
-        path for folder in (module.split("/")[0], "tests") for path in (TREE / folder).rglob("*.py")
+        path
+        for folder in (module.split("/")[0], "tests")
+        for path in (TREE / folder).rglob("*.py")
     ]
     direct = {name: imports(name) for name in (str(path.relative_to(TREE)) for path in files)}
     steps = {module: 0}
@@ -168,9 +170,13 @@ class Tests:
     """The tests of the packages: what each enters, the time that it takes, and a server that runs them on mutants."""
 
     def __init__(self) -> None:
-        folders = [TREE / "tests" / name for names in (*PACKAGES.values(), USERS) for name in names]
+        folders = [
+            TREE / "tests" / name for names in (*PACKAGES.values(), USERS) for name in names
+        ]
         files = sorted(
-            str(path.relative_to(TREE)) for folder in folders for path in folder.rglob("test_*.py")
+            str(path.relative_to(TREE))
+            for folder in folders
+            for path in folder.rglob("test_*.py")
         )
         self.recorded = record(files)
         self.imported = set(map(tuple, self.recorded["imported"]))
@@ -225,7 +231,9 @@ def record(files: list[str]) -> dict[str, Any]:
     part.unlink(missing_ok=True)
     forked(lambda: session(changed, Recorder(TREE, part)), 7200)
     new = json.loads(part.read_text())
-    kept = {name: test for name, test in old["tests"].items() if name.split("::")[0] not in changed}
+    kept = {
+        name: test for name, test in old["tests"].items() if name.split("::")[0] not in changed
+    }
     if new["failed"]:
         print("left out, for they fail without a mutant:", *new["failed"], sep="\n  ")
     merged = {
@@ -293,7 +301,9 @@ def code_of(source: str, path: Path, function: ast.FunctionDef) -> tuple[Key, Co
     first = first_line(function)
     module = compile(source, str(path), "exec", dont_inherit=True)
     code = next(
-        one for one in nested(module) if (one.co_firstlineno, one.co_name) == (first, function.name)
+        one
+        for one in nested(module)
+        if (one.co_firstlineno, one.co_name) == (first, function.name)
     )
     return (str(path.relative_to(TREE)), first, function.name), code
 
@@ -328,7 +338,9 @@ def try_module(names: list[str], tests: Tests) -> str:
     numba.config.CACHE_DIR = str(SCRATCH)
     signal.setitimer(signal.ITIMER_PROF, 200)
     said = session(["-x", *dict.fromkeys(name.split("::")[0] for name in names)], Chosen())
-    return outcomes[0] if outcomes else "survived" if said == "exit code 0" else f"{BROKEN} {said}"
+    return (
+        outcomes[0] if outcomes else "survived" if said == "exit code 0" else f"{BROKEN} {said}"
+    )
 
 
 def try_mutant(mutant: dict[str, Any], tests: Tests) -> dict[str, Any]:

@@ -95,7 +95,9 @@ class Recorder:
     def pytest_sessionfinish(self) -> None:
         passed = {name: test for name, test in self.tests.items() if name not in self.failed}
         self.out.write_text(
-            json.dumps({"imported": self.imported, "tests": passed, "failed": sorted(self.failed)})
+            json.dumps(
+                {"imported": self.imported, "tests": passed, "failed": sorted(self.failed)}
+            )
         )
 
 

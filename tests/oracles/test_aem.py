@@ -51,7 +51,8 @@ def test_our_aem_is_valid_and_has_the_intended_metadata(
             "AFIT_SIMSAT",
         )
         epochs = [
-            datetime.datetime.fromisoformat(text) for text in segment.data.attitude_states_epochs
+            datetime.datetime.fromisoformat(text)
+            for text in segment.data.attitude_states_epochs
         ]
         assert epochs == utc(count)
         assert (metadata.start_time, metadata.stop_time) == (
@@ -84,7 +85,9 @@ def test_ccsds_ndm_refuses_a_malformed_aem() -> None:
 def test_an_aem_written_by_ccsds_ndm_is_read_by_skysim(tmp_path: Path) -> None:
     """Both readers take the same numbers for the same epochs. Theirs does not know the keywords of version 1.0."""
     meant = Rotation.from_rotvec(np.outer(np.arange(9.0), [0.01, -0.02, 0.005]))
-    text = run_export.message("x", ["of ours"], (run_export.ICRF, run_export.BODY), utc(9), meant)
+    text = run_export.message(
+        "x", ["of ours"], (run_export.ICRF, run_export.BODY), utc(9), meant
+    )
     theirs = ndm.Aem.from_str(text, "kvn")
     path = tmp_path / "theirs.aem"
     path.write_text(theirs.to_str("kvn"))
@@ -109,7 +112,9 @@ def test_the_page_s_code_reads_our_aem(
     (tmp_path / "out/shefex2").mkdir(parents=True)
     # The camera's boresight along the ICRF's x.
     meant = Rotation.from_euler("y", [[90]], degrees=True)
-    text = run_export.message("shefex2", [], (run_export.ICRF, run_export.CAMERA), utc(1), meant)
+    text = run_export.message(
+        "shefex2", [], (run_export.ICRF, run_export.CAMERA), utc(1), meant
+    )
     files.write_text(tmp_path / "out/shefex2/truth.aem", text)
     monkeypatch.chdir(tmp_path)
     exec(compile(block, "docs/howto/export.md", "exec"), {})

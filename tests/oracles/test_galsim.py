@@ -30,7 +30,12 @@ CAMERA = CameraConfig.model_validate(
         "pixel": "4.2 um",
         "focal_length": "35 mm",
         "f_number": 8.0,
-        "detector": {"quantum_efficiency": 0.4, "full_well_e": 20000, "gain_e_dn": 10, "bits": 12},
+        "detector": {
+            "quantum_efficiency": 0.4,
+            "full_well_e": 20000,
+            "gain_e_dn": 10,
+            "bits": 12,
+        },
     }
 )
 FAST = CAMERA.model_copy(update={"f_number": 1.4, "pixel_m": 9.9e-6})  # lambda N is 0.08 px
@@ -93,7 +98,9 @@ TOLERANCE = {("airy f/1.4", 4.3): 2e-3}
 def theirs_px(parts: list[Any], x: float, y: float, size: int) -> Floats:
     whole = parts[0] if len(parts) == 1 else galsim.Convolve(parts, gsparams=ACCURATE)
     image = galsim.ImageD(size, size)
-    whole.drawImage(image, scale=1, offset=(x - (size - 1) / 2, y - (size - 1) / 2), method="auto")
+    whole.drawImage(
+        image, scale=1, offset=(x - (size - 1) / 2, y - (size - 1) / 2), method="auto"
+    )
     return np.asarray(image.array)
 
 

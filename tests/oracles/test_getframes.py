@@ -77,7 +77,8 @@ def test_mean_and_variance_agree_with_getframes(mean_e: float) -> None:
 def test_fixed_pattern_noise_agrees_with_getframes() -> None:
     """PRNU of 2 % and a dark current that varies by 30 %: the scatter of the pixels' own means."""
     spread = [
-        frames.mean(axis=0).std() for frames in both(10_000.0, prnu=0.02, dsnu=0.3, dark_e_s=2000.0)
+        frames.mean(axis=0).std()
+        for frames in both(10_000.0, prnu=0.02, dsnu=0.3, dark_e_s=2000.0)
     ]
     assert spread[0] == pytest.approx(spread[1], rel=5 * np.sqrt(2 / (2 * SHAPE[0] * SHAPE[1])))
 

@@ -25,10 +25,17 @@ CAMERA = CameraConfig.model_validate(
         "pixel": "10 um",
         "focal_length": "6 mm",
         "f_number": 2.0,
-        "detector": {"quantum_efficiency": 0.5, "full_well_e": 40000, "gain_e_dn": 10, "bits": 12},
+        "detector": {
+            "quantum_efficiency": 0.5,
+            "full_well_e": 40000,
+            "gain_e_dn": 10,
+            "bits": 12,
+        },
     }
 )
-BALL_M = 0.03  # at 2 m its image is 18 px wide; perspective moves its middle by 1e-4 of the offset
+BALL_M = (
+    0.03  # at 2 m its image is 18 px wide; perspective moves its middle by 1e-4 of the offset
+)
 POSES = {  # lab_from_mjcam as a quaternion wxyz, and where the camera stands
     "as it comes": ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
     "looking up": (
@@ -153,6 +160,8 @@ def test_mujoco_draws_the_ball_where_our_optics_project_it(pose: str, tmp_path: 
 def test_mujoco_s_camera_has_the_image_axes_of_ours(tmp_path: Path) -> None:
     """By MuJoCo's manual alone: its camera looks along -z, +x is right, +y is up; row 0 is the top."""
     balls_m = np.array([[0.6, 0.0, -2.0], [0.0, 0.4, -2.0]])
-    right, above = middles(drawn(world_xml(*POSES["as it comes"]), balls_m, tmp_path / "balls.npy"))
+    right, above = middles(
+        drawn(world_xml(*POSES["as it comes"]), balls_m, tmp_path / "balls.npy")
+    )
     np.testing.assert_allclose(right, [319.5 + 600 * 0.3, 239.5], rtol=0, atol=0.25)
     np.testing.assert_allclose(above, [319.5, 239.5 - 600 * 0.2], rtol=0, atol=0.25)

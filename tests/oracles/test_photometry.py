@@ -32,7 +32,9 @@ def stars() -> dict[str, Any]:
     seen = truth.sources
     image_e = (frame.image_dn.astype(float) - part.offset_dn) * part.gain_e_dn
     image_e -= part.dark_e_s * frame.exposure_s
-    apart = np.linalg.norm(seen.xy_px[:, None] - seen.xy_px, axis=2) + 1e9 * np.eye(len(seen.id))
+    apart = np.linalg.norm(seen.xy_px[:, None] - seen.xy_px, axis=2) + 1e9 * np.eye(
+        len(seen.id)
+    )
     inside = ((seen.xy_px > 15) & (seen.xy_px < [643, 477])).all(axis=1)
     good = inside & (apart.min(axis=1) > 25) & ~seen.saturated
     assert good.sum() >= 10
@@ -71,7 +73,9 @@ def test_sep_measures_the_true_electrons(stars: dict[str, Any]) -> None:
 def test_sep_finds_the_stars_at_their_positions(stars: dict[str, Any]) -> None:
     sep = pytest.importorskip("sep")
     found = sep.extract(np.ascontiguousarray(stars["image"]), 6.0, err=stars["noise_e"])
-    away = np.linalg.norm(np.column_stack([found["x"], found["y"]])[:, None] - stars["xy"], axis=2)
+    away = np.linalg.norm(
+        np.column_stack([found["x"], found["y"]])[:, None] - stars["xy"], axis=2
+    )
     bright = stars["electrons"] > 3000
     assert bright.any()
     assert away.min(axis=0)[bright].max() < 0.2

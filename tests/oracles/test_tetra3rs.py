@@ -90,4 +90,7 @@ def test_the_page_s_commands_run_without_wrong_attitudes(command: str, tmp_path:
 
 
 def test_tetra3rs_is_an_entry_point_of_skysim() -> None:
-    assert tracker_interface.TRACKERS.entry_points()["tetra3rs"].load() is tetra3rs_tracker.Tetra3rs
+    assert (
+        tracker_interface.TRACKERS.entry_points()["tetra3rs"].load()
+        is tetra3rs_tracker.Tetra3rs
+    )

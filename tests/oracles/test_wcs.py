@@ -22,7 +22,12 @@ CAMERA = CameraConfig.model_validate(
         "focal_length": "25 mm",
         "f_number": 1.4,
         "principal_point_px": (790.25, 611.5),
-        "detector": {"quantum_efficiency": 0.5, "full_well_e": 40000, "gain_e_dn": 10, "bits": 12},
+        "detector": {
+            "quantum_efficiency": 0.5,
+            "full_well_e": 40000,
+            "gain_e_dn": 10,
+            "bits": 12,
+        },
     }
 )
 POINTINGS = [
@@ -69,6 +74,10 @@ def test_astropy_s_pixel_coordinates_equal_array_indices() -> None:
     """FITS counts from 1, arrays from 0: the pointing lands on the principal point in both counts."""
     header = WCS(Header(wcs.header(CAMERA, star_sources.cam_from_icrs(40.0, 30.0, 10.0))))
     center = SkyCoord(40.0, 30.0, unit="deg")
-    np.testing.assert_allclose(header.world_to_pixel(center), CAMERA.center_px, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        header.world_to_pixel(center), CAMERA.center_px, rtol=0, atol=1e-6
+    )
     counted_from_1 = header.all_world2pix([[40.0, 30.0]], 1)[0]
-    np.testing.assert_allclose(counted_from_1, np.array(CAMERA.center_px) + 1, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        counted_from_1, np.array(CAMERA.center_px) + 1, rtol=0, atol=1e-6
+    )

@@ -27,9 +27,9 @@ def colored(picture: np.ndarray, bgr: tuple[int, int, int]) -> np.ndarray:
 
 def test_ticks_surround_the_true_positions_without_covering_them() -> None:
     image = np.random.default_rng(1).normal(100, 5, (1000, 1200))
-    picture = plots.annotate_truth(image, seen([(300.2, 400.7), (900.0, 650.0)], [False, True]))[
-        :1000
-    ]
+    picture = plots.annotate_truth(
+        image, seen([(300.2, 400.7), (900.0, 650.0)], [False, True])
+    )[:1000]
     for place, bgr in (((300, 401), plots.TRUTH_BGR), ((900, 650), plots.DETECTED_BGR)):
         away = np.abs(colored(picture, bgr) - place).max(axis=1)
         assert away.min() >= 8

@@ -53,7 +53,9 @@ def sky_flight(folder: Path) -> Flight:
     for shot in flight.shots():
         recording.write_frame(folder, shot.frame, shot.truth, scene)
         rows.append(scoring.score(shot).row)
-    files.write_table(folder / "solutions.ecsv", scoring.table(rows, scoring.angle_names(scene)))
+    files.write_table(
+        folder / "solutions.ecsv", scoring.table(rows, scoring.angle_names(scene))
+    )
     return flight
 
 
@@ -64,7 +66,11 @@ def dome_flight(folder: Path) -> Flight:
         "motion.start": "{roll_deg: 4, yaw_deg: 70}",
         "camera.shutter": "{kind: global}",
     }
-    small = {"camera.width_px": "800", "camera.height_px": "600", "camera.detector.noise": "false"}
+    small = {
+        "camera.width_px": "800",
+        "camera.height_px": "600",
+        "camera.detector.noise": "false",
+    }
     flight = open_flight(loader.load("afit_simsat", settings | small))
     for shot in flight.shots(solves=False):
         recording.write_frame(folder, shot.frame, shot.truth, flight.lab.scene)
@@ -105,8 +111,16 @@ def matrix_b_from_a(q: Floats) -> Floats:
     return np.array(
         [
             [q1**2 - q2**2 - q3**2 + qc**2, 2 * (q1 * q2 + q3 * qc), 2 * (q1 * q3 - q2 * qc)],
-            [2 * (q1 * q2 - q3 * qc), -(q1**2) + q2**2 - q3**2 + qc**2, 2 * (q2 * q3 + q1 * qc)],
-            [2 * (q1 * q3 + q2 * qc), 2 * (q2 * q3 - q1 * qc), -(q1**2) - q2**2 + q3**2 + qc**2],
+            [
+                2 * (q1 * q2 - q3 * qc),
+                -(q1**2) + q2**2 - q3**2 + qc**2,
+                2 * (q2 * q3 + q1 * qc),
+            ],
+            [
+                2 * (q1 * q3 + q2 * qc),
+                2 * (q2 * q3 - q1 * qc),
+                -(q1**2) - q2**2 + q3**2 + qc**2,
+            ],
         ]
     )
 
@@ -176,12 +190,16 @@ def test_in_the_laboratory_the_message_puts_every_led_on_its_pixel(
 
 
 @pytest.mark.parametrize("which", ["stars", "dome"])
-def test_angles_of_a_solution_are_its_attitude(which: str, request: pytest.FixtureRequest) -> None:
+def test_angles_of_a_solution_are_its_attitude(
+    which: str, request: pytest.FixtureRequest
+) -> None:
     """What `solutions.ecsv` has of a camera's attitude in the lab, turned back: the camera's, or the body's."""
     flight, run = request.getfixturevalue(which)
     camera = flight.lab.camera
     cam_from_lab = Rotation.random(50, rng=np.random.default_rng(3))
-    angles = np.array([scoring.angles_deg(one, camera.scene, camera.mount) for one in cam_from_lab])
+    angles = np.array(
+        [scoring.angles_deg(one, camera.scene, camera.mount) for one in cam_from_lab]
+    )
     back = recording.attitudes(angles, run.is_celestial)
     meant = cam_from_lab.inv() * (
         Rotation.identity() if which == "stars" else camera.mount.cam_from_body
@@ -193,12 +211,15 @@ def test_a_message_follows_the_standard_s_notation() -> None:
     """Printable ASCII, 254 characters a line, times that ascend, quaternions that do not jump."""
     spin = Rotation.from_euler("z", np.arange(0, 800, 40)[:, None], degrees=True)
     utc = [START + n * SECOND for n in range(len(spin))]
-    text = run_export.message("ünïcode", ["″" * 400], (run_export.LAB, run_export.BODY), utc, spin)
+    text = run_export.message(
+        "ünïcode", ["″" * 400], (run_export.LAB, run_export.BODY), utc, spin
+    )
     assert all(
         line.isascii() and line.isprintable() and len(line) <= 254 for line in text.splitlines()
     )
     rows = np.array(
-        [line.split()[1:] for line in text.splitlines() if line.startswith("2012-")], dtype=float
+        [line.split()[1:] for line in text.splitlines() if line.startswith("2012-")],
+        dtype=float,
     )
     assert (np.sum(rows[1:] * rows[:-1], axis=1) > 0.9).all()
     for epochs in ([], [START, START]):
@@ -288,7 +309,9 @@ def test_a_sequence_is_chunked_by_frame_and_dated(stars: Flown, tmp_path: Path) 
     assert opened["mid_utc"].values[0] == np.datetime64("2012-06-22T21:00:00.120000")
     lab_from_body = flight.trajectory().attitude_at(opened["t_mid_s"].values)
     cam_from_lab = flight.lab.camera.mount.cam_from_body * lab_from_body.inv()
-    off = (Rotation.from_quat(opened["cam_from_lab_xyzw"].values) * cam_from_lab.inv()).magnitude()
+    off = (
+        Rotation.from_quat(opened["cam_from_lab_xyzw"].values) * cam_from_lab.inv()
+    ).magnitude()
     assert off.max() < 1e-12
 
 
@@ -321,7 +344,11 @@ def camera(distortion: tuple[float, ...], focal_length: str) -> CameraConfig:
     detector = {"quantum_efficiency": 0.5, "full_well_e": 40000, "gain_e_dn": 10, "bits": 12}
     return CameraConfig.model_validate(
         part
-        | {"principal_point_px": (790.25, 611.5), "distortion": distortion, "detector": detector}
+        | {
+            "principal_point_px": (790.25, 611.5),
+            "distortion": distortion,
+            "detector": detector,
+        }
     )
 
 
@@ -333,7 +360,9 @@ def misfits(lens: CameraConfig) -> tuple[float, float]:
     across, down = np.meshgrid(np.linspace(-0.5, 1599.5, 33), np.linspace(-0.5, 1199.5, 25))
     pixels = np.column_stack([across.ravel(), down.ravel()])
     ra, dec = np.radians(header.all_pix2world(pixels, 0)).T
-    directions = np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    directions = np.column_stack(
+        [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]
+    )
     back = Optics.from_camera(lens).project(cam_from_icrs.apply(directions))
     straight = header.wcs_world2pix(np.degrees([ra, dec]).T, 0)  # of a lens without distortion
     inverse = header.sip_foc2pix(straight + 1 - header.wcs.crpix, 1) - 1
@@ -374,7 +403,9 @@ def test_a_lens_beyond_sip_is_noted_in_header_and_warning() -> None:
     wide = loader.load(
         "shefex2", {"camera.focal_length": "4.5 mm", "camera.distortion": "[-0.4, 0, 0, 0, 0]"}
     )
-    assert any(line.startswith("camera.distortion: ") for line in check(build_lab(wide)).findings)
+    assert any(
+        line.startswith("camera.distortion: ") for line in check(build_lab(wide)).findings
+    )
 
 
 @pytest.mark.filterwarnings("ignore:.*datfix")
@@ -395,7 +426,9 @@ def test_a_distorted_frame_s_header_maps_stars_to_their_pixels(stars: Flown) -> 
         {key: value for key, value in header.items() if key[:2] not in ("A_", "B_", "AP", "BP")}
     )
     assert (
-        np.abs(bare.wcs_world2pix(np.degrees([np.arctan2(y, x), np.arcsin(z)]).T, 0) - true).max()
+        np.abs(
+            bare.wcs_world2pix(np.degrees([np.arctan2(y, x), np.arcsin(z)]).T, 0) - true
+        ).max()
         > 1.0
     )
 
@@ -403,11 +436,16 @@ def test_a_distorted_frame_s_header_maps_stars_to_their_pixels(stars: Flown) -> 
 # What cannot be
 
 
-def test_bad_input_is_refused_in_one_line_and_leaves_no_file(stars: Flown, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no frames with truth files; allowed: a folder of a run"):
+def test_bad_input_is_refused_in_one_line_and_leaves_no_file(
+    stars: Flown, tmp_path: Path
+) -> None:
+    with pytest.raises(
+        InputError, match="no frames with truth files; allowed: a folder of a run"
+    ):
         recording.open_recording(tmp_path)
     with pytest.raises(
-        InputError, match="unknown format 'jpeg'; allowed: aem, ecsv, parquet, tiff, zarr, video"
+        InputError,
+        match="unknown format 'jpeg'; allowed: aem, ecsv, parquet, tiff, zarr, video",
     ):
         run_export.export(stars[1], ["aem", "jpeg"], tmp_path / "out", quiet)
     assert list(tmp_path.iterdir()) == []

@@ -70,7 +70,9 @@ def test_wrong_begins_at_ten_arc_minutes_about_any_axis(axis: tuple[float, ...])
 def test_an_error_that_the_tracker_claims_is_wrong_beyond_one_degree() -> None:
     """Chi-square of 3 degrees of freedom exceeds x with probability erfc(sqrt(x / 2)) + sqrt(2 x / pi) e^(-x / 2)."""
     limit = 40.13
-    tail = math.erfc(math.sqrt(limit / 2)) + math.sqrt(2 * limit / math.pi) * math.exp(-limit / 2)
+    tail = math.erfc(math.sqrt(limit / 2)) + math.sqrt(2 * limit / math.pi) * math.exp(
+        -limit / 2
+    )
     assert tail == pytest.approx(1e-8, rel=1e-3)
     cases = [
         (11, limit - 0.01, False),

@@ -44,7 +44,9 @@ def test_the_command_and_python_write_the_same_files(
         app, ["run", name, "--frames", str(frames), "--out", str(tmp_path / "command")]
     )
     assert by_command.exit_code == 0, by_command.output
-    skysim.simulate(skysim.load_scene(name, {"exposure.frames": frames})).save(tmp_path / "python")
+    skysim.simulate(skysim.load_scene(name, {"exposure.frames": frames})).save(
+        tmp_path / "python"
+    )
     written = digests(tmp_path / "command")
     assert written == digests(tmp_path / "python")
     assert "frame_0001.fits" in written
@@ -73,5 +75,7 @@ def test_a_run_along_a_given_table_is_saved(tmp_path: Path) -> None:
             "yaw_deg": level,
         }
     )
-    run = skysim.simulate(skysim.load_scene("afit_simsat", {"exposure.frames": 1}), profile=table)
+    run = skysim.simulate(
+        skysim.load_scene("afit_simsat", {"exposure.frames": 1}), profile=table
+    )
     assert (run.save(tmp_path / "run") / "report.html").is_file()

@@ -52,7 +52,9 @@ def test_the_parts_of_a_sphere_of_single_leds_are_counted() -> None:
         2 * math.pi * radius_m**2 * (1 - math.cos(rim_rad)), rel=1e-9
     )
     cosine = 1 - (np.arange(300) + 0.5) / 300 * (1 - math.cos(rim_rad))
-    assert found["wire"] == pytest.approx(radius_m * np.sum(rim_rad - np.arccos(cosine)), rel=1e-4)
+    assert found["wire"] == pytest.approx(
+        radius_m * np.sum(rim_rad - np.arccos(cosine)), rel=1e-4
+    )
     assert found["power_supply"] == 1
     assert "driver" not in found
     assert "trigger" not in found
@@ -123,7 +125,9 @@ def test_the_cheapest_sufficient_survey_is_chosen() -> None:
     }.items():
         assert bought(tracker__survey__led_sigma=sigma)[part] == 300
     assert not any("survey" in part for part in bought(tracker__survey__led_sigma="0 mm"))
-    with pytest.raises(InputError, match=r"no survey reaches 0.01 mm; allowed: a line survey_NAME"):
+    with pytest.raises(
+        InputError, match=r"no survey reaches 0.01 mm; allowed: a line survey_NAME"
+    ):
         listed(tracker__survey__led_sigma="0.01 mm")
     station = "{kind: total_station, position: [0 m, 0 m, -0.4 m], angle_sigma_arcsec: 2, distance_sigma: 1 mm}"
     assert "survey_total_station" in bought(
@@ -134,7 +138,9 @@ def test_the_cheapest_sufficient_survey_is_chosen() -> None:
 def test_the_parts_table_sums_to_its_total() -> None:
     parts = listed()
     rows = [
-        row for row in csv.reader(to_csv(parts, "mine").splitlines()) if not row[0].startswith("#")
+        row
+        for row in csv.reader(to_csv(parts, "mine").splitlines())
+        if not row[0].startswith("#")
     ]
     assert tuple(rows[0]) == COLUMNS
     sums = [float(row[COLUMNS.index("sum")]) for row in rows[1:]]
@@ -174,14 +180,19 @@ def test_a_sky_scene_has_no_parts_list() -> None:
         ("part,unit,price\nled,each,-1", "line 2: price: '-1'; allowed: a number from 0"),
         ("part,unit,price\nled,each,nan", "line 2: price: 'nan'"),
         ("part,unit,price\nled,each,", "line 2: price: ''"),
-        ("part,unit,price,serves\nled,each,1,0.5", "line 2: serves: 0.5; allowed: a whole number"),
+        (
+            "part,unit,price,serves\nled,each,1,0.5",
+            "line 2: serves: 0.5; allowed: a whole number",
+        ),
         ("part,unit,price,sigma_mm\nled,each,1,1", "line 2: sigma_mm of led"),
         ("part,unit,price\nsurvey_eye,each,1", "line 2: sigma_mm of survey_eye: none"),
         ("part,unit,price\nled,each,1\nled,each,2", "line 3: led occurs twice"),
         ('part,unit,price\n"led,each,1', "line 2: .* is no line of CSV"),
     ],
 )
-def test_a_bad_price_table_is_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:
+def test_a_bad_price_table_is_refused_in_one_line(
+    text: str, message: str, tmp_path: Path
+) -> None:
     path = tmp_path / "prices.csv"
     path.write_text(text)
     with pytest.raises(InputError, match=message) as error:
@@ -192,12 +203,16 @@ def test_a_bad_price_table_is_refused_in_one_line(text: str, message: str, tmp_p
 def test_a_missing_price_or_file_is_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "prices.csv"
     path.write_text("# mine\npart,unit,price\nshell,m2,100\n")
-    with pytest.raises(InputError, match=r"no price of led; allowed: a line that begins with it"):
+    with pytest.raises(
+        InputError, match=r"no price of led; allowed: a line that begins with it"
+    ):
         parts_list(
             loader.load("afit_simsat", SPHERE | {"tracker.survey.led_sigma": "0 mm"}),
             read_prices(path),
         )
-    with pytest.raises(InputError, match=r"none\.csv: cannot be read: No such file or directory$"):
+    with pytest.raises(
+        InputError, match=r"none\.csv: cannot be read: No such file or directory$"
+    ):
         read_prices(tmp_path / "none.csv")
 
 

@@ -27,8 +27,12 @@ def attitude(lab: Lab) -> Rotation:
 
 def difference_dn(one: Frame, other: Frame) -> Floats:
     """(N,) differences of two frames in the pixels where stars add little noise."""
-    dark = (one.image_dn < 0.1 * one.saturation_dn) & (other.image_dn < 0.1 * other.saturation_dn)
-    return np.where(dark, one.image_dn.astype(float) - other.image_dn.astype(float), 0.0).ravel()
+    dark = (one.image_dn < 0.1 * one.saturation_dn) & (
+        other.image_dn < 0.1 * other.saturation_dn
+    )
+    return np.where(
+        dark, one.image_dn.astype(float) - other.image_dn.astype(float), 0.0
+    ).ravel()
 
 
 def test_the_truth_is_the_given_pose_at_mid_exposure(lab: Lab, attitude: Rotation) -> None:
@@ -98,8 +102,14 @@ def test_a_reused_lab_gives_the_frames_of_its_scene(lab: Lab, attitude: Rotation
 
 
 def test_each_camera_of_the_lab_gives_its_own_frame() -> None:
-    side_head = {"name": "side", "position": ["0.2 m", "0 m", "0 m"], "rotation_deg": [0, 90, 0]}
-    lab = skysim.build_lab(skysim.load_scene("two_heads", {"thermal": None, "heads": [side_head]}))
+    side_head = {
+        "name": "side",
+        "position": ["0.2 m", "0 m", "0 m"],
+        "rotation_deg": [0, 90, 0],
+    }
+    lab = skysim.build_lab(
+        skysim.load_scene("two_heads", {"thermal": None, "heads": [side_head]})
+    )
     (main, of_main), (side, of_side) = (
         skysim.render_at(lab, lab.start, camera=number) for number in (0, 1)
     )

@@ -39,7 +39,8 @@ def of(*blocks: Block) -> Report:
 def everywhere(text: str) -> Report:
     """A report with the text in every place that accepts outside text."""
     table = Table(
-        [Column(text), Column("note", kind="aside")], [[text, text], [Cell(text, "bad", 3.0), ""]]
+        [Column(text), Column("note", kind="aside")],
+        [[text, text], [Cell(text, "bad", 3.0), ""]],
     )
     blocks = [
         Verdict(text, "bad"),
@@ -94,7 +95,10 @@ def test_a_text_from_outside_is_text_in_html() -> None:
 def test_a_text_from_outside_opens_no_element_in_markdown() -> None:
     """Code is excepted, as Markdown shows it literally."""
     outside_of_code = re.sub(
-        r"^(`{3,})\w*\n.*?^\1$", "", everywhere(HOSTILE).markdown(), flags=re.DOTALL | re.MULTILINE
+        r"^(`{3,})\w*\n.*?^\1$",
+        "",
+        everywhere(HOSTILE).markdown(),
+        flags=re.DOTALL | re.MULTILINE,
     )
     allowed = r"</?(details|summary|br)\b"
     assert re.sub(allowed, "", outside_of_code).count("alert") > 5
@@ -190,14 +194,18 @@ def test_markdown_links_its_pictures_where_it_writes_them(tmp_path: Path) -> Non
 
 
 def test_another_suffix_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"unknown file format '.pdf'; allowed: .html, .md, .json"):
+    with pytest.raises(
+        InputError, match=r"unknown file format '.pdf'; allowed: .html, .md, .json"
+    ):
         of().save(tmp_path / "report.pdf")
 
 
 def test_the_terminal_ends_with_the_answer_and_shows_only_its_blocks(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    aside = Table([Column("what", kind="text"), Column("note", kind="aside")], [["row", "why so"]])
+    aside = Table(
+        [Column("what", kind="text"), Column("note", kind="aside")], [["row", "why so"]]
+    )
     hidden = Section("hidden", [Text("page alone")], on_terminal=False)
     of(
         Verdict("the answer"),

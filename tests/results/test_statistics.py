@@ -76,7 +76,9 @@ def test_exact_bounds_have_the_binomial_tail_of_their_confidence(hits: int, tota
     """Clopper and Pearson: at the upper bound, hits or fewer have the probability 5 %; at the lower one, or more."""
     low, high = metrics.exact_bounds(hits, total)
     if hits < total:
-        tail = sum(comb(total, k) * high**k * (1 - high) ** (total - k) for k in range(hits + 1))
+        tail = sum(
+            comb(total, k) * high**k * (1 - high) ** (total - k) for k in range(hits + 1)
+        )
         assert tail == pytest.approx(0.05, rel=1e-6)
     else:
         assert (low, high) == (pytest.approx(0.05 ** (1 / total), rel=1e-9), 1.0)
@@ -88,7 +90,9 @@ def test_none_in_ten_thousand_is_less_than_three_hundredths_of_a_percent() -> No
     assert 2.9e-4 < metrics.exact_bounds(0, 10_000)[1] < 3.0e-4
 
 
-@pytest.mark.parametrize(("probability", "fewest"), [(0.5, 6), (0.9, 29), (0.95, 59), (0.99, 299)])
+@pytest.mark.parametrize(
+    ("probability", "fewest"), [(0.5, 6), (0.9, 29), (0.95, 59), (0.99, 299)]
+)
 def test_a_quantile_has_an_interval_from_the_number_of_values_by_wilks(
     probability: float, fewest: int
 ) -> None:
@@ -188,7 +192,9 @@ def test_the_bootstrap_of_few_values_matches_scipy(name: str, count: int) -> Non
         (metrics.mean_of(values), np.mean),
         (metrics.rms_of(values), metrics.rms),
     ):
-        assert found == pytest.approx(metrics.resampled(values, statistic), rel=1e-12, nan_ok=True)
+        assert found == pytest.approx(
+            metrics.resampled(values, statistic), rel=1e-12, nan_ok=True
+        )
 
 
 def test_the_interval_of_many_values_is_as_skewed_as_the_bootstrap_s() -> None:
@@ -214,11 +220,15 @@ def test_the_interval_of_many_values_covers_the_truth(name: str) -> None:
     truth = {"exponential": 1.0, "five of degrees": rate * 1e4}[name]
     for _ in range(runs):
         values = (
-            rng.exponential(size=3000) if name == "exponential" else 1e4 * (rng.random(3000) < rate)
+            rng.exponential(size=3000)
+            if name == "exponential"
+            else 1e4 * (rng.random(3000) < rate)
         )
         estimate = metrics.mean_of(values)
         inside += estimate.low <= truth <= estimate.high
     assert (
         inside / runs
-        > {"exponential": 0.95 - 4 * math.sqrt(0.95 * 0.05 / runs), "five of degrees": 0.85}[name]
+        > {"exponential": 0.95 - 4 * math.sqrt(0.95 * 0.05 / runs), "five of degrees": 0.85}[
+            name
+        ]
     )

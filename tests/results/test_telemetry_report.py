@@ -90,7 +90,9 @@ def test_the_table_has_the_telemetry_in_degrees() -> None:
     np.testing.assert_allclose(table["rate_z_deg_s"], 10, rtol=0, atol=1e-12)
     np.testing.assert_allclose(table["wheel_2_rpm"], -200 * T_S * 30 / np.pi, rtol=1e-12)
     np.testing.assert_allclose(table["gimbal_1_deg"], T_S / DEG, rtol=1e-12)
-    np.testing.assert_allclose(table["assumed_bias_z_deg_h"] - table["bias_z_deg_h"], 1, rtol=1e-9)
+    np.testing.assert_allclose(
+        table["assumed_bias_z_deg_h"] - table["bias_z_deg_h"], 1, rtol=1e-9
+    )
     assert {"commanded_roll_deg", "imu_roll_deg", "wheel_1_rpm"}.isdisjoint(
         telemetry_report.table(bare()).colnames
     )
@@ -115,9 +117,9 @@ def test_every_sample_of_the_imu_is_in_its_table() -> None:
 @pytest.mark.slow
 def test_the_plot_has_a_panel_for_each_recorded_quantity() -> None:
     heights = [
-        cv2.imdecode(np.frombuffer(telemetry_report.figure(log), np.uint8), cv2.IMREAD_COLOR).shape[
-            0
-        ]
+        cv2.imdecode(
+            np.frombuffer(telemetry_report.figure(log), np.uint8), cv2.IMREAD_COLOR
+        ).shape[0]
         for log in (bare(), full())
     ]
     assert [len(telemetry_report.panels(log)) for log in (bare(), full())] == [1, 7]

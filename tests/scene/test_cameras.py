@@ -31,7 +31,8 @@ def camera(name: str, **own: Any) -> CameraConfig:
 def field_deg(made: CameraConfig) -> tuple[float, float]:
     """The chip's width and height as angles, by the tangent of their halves, for a lens focused at infinity."""
     half = [
-        size * made.pixel_m / 2 / made.focal_length_m for size in (made.width_px, made.height_px)
+        size * made.pixel_m / 2 / made.focal_length_m
+        for size in (made.width_px, made.height_px)
     ]
     return 2 * math.degrees(math.atan(half[0])), 2 * math.degrees(math.atan(half[1]))
 
@@ -42,7 +43,9 @@ def test_the_four_documented_presets_exist() -> None:
 
 @pytest.mark.parametrize("path", FILES, ids=NAMES)
 def test_every_preset_value_states_its_source(path: Path) -> None:
-    lines = [line for line in path.read_text().splitlines() if line and not line.startswith("#")]
+    lines = [
+        line for line in path.read_text().splitlines() if line and not line.startswith("#")
+    ]
     values = [line for line in lines if not re.fullmatch(r"\s*\w+:", line)]
     assert len(values) > 15
     assert [line for line in values if not SOURCE.search(line)] == []
@@ -53,7 +56,9 @@ def test_every_preset_value_has_its_own_line(path: Path) -> None:
     def leaves(part: Any) -> int:
         return sum(map(leaves, part.values())) if isinstance(part, dict) else 1
 
-    lines = [line for line in path.read_text().splitlines() if re.match(r"\s*\w+: +[^#\s]", line)]
+    lines = [
+        line for line in path.read_text().splitlines() if re.match(r"\s*\w+: +[^#\s]", line)
+    ]
     assert len(lines) == leaves(yaml.safe_load(path.read_text()))
 
 
@@ -148,7 +153,9 @@ def test_ec655_has_the_reference_s_field_and_dynamic_range() -> None:
     made = camera("ec655")
     assert field_deg(made) == pytest.approx((14.868, 11.150), abs=0.001)
     diagonal_m = math.hypot(made.width_px, made.height_px) * made.pixel_m
-    assert 2 * math.degrees(math.atan(diagonal_m / 2 / 0.025)) == pytest.approx(18.51, abs=0.005)
+    assert 2 * math.degrees(math.atan(diagonal_m / 2 / 0.025)) == pytest.approx(
+        18.51, abs=0.005
+    )
     detector = made.detector
     assert 20 * math.log10(detector.full_well_e / detector.read_noise_e) == pytest.approx(
         68.7, abs=0.05

@@ -58,7 +58,12 @@ def test_a_full_data_sheet_is_used_without_assumptions(tmp_path: Path) -> None:
 
 
 def test_every_assumption_is_marked_and_has_its_consequence(tmp_path: Path) -> None:
-    answers = {"pixels": "2448x2048", "pitch": "3.45 um", "focal_length": "16 mm", "f_number": "4"}
+    answers = {
+        "pixels": "2448x2048",
+        "pitch": "3.45 um",
+        "focal_length": "16 mm",
+        "f_number": "4",
+    }
     sheet = fill(answers)
     assert {one.name for one in sheet.missing} == set(QUESTIONS) - set(answers) - {"row_time"}
     assert all(one.assumed and one.consequence for one in sheet.missing)
@@ -107,8 +112,14 @@ def test_a_lens_without_an_f_number_leaves_it_to_the_scene() -> None:
 @pytest.mark.parametrize(
     ("answers", "message"),
     [
-        ({"pixels": "1936"}, "answers.pixels: '1936'; allowed: width x height, such as 1936x1216"),
-        ({"pixels": "99999x9"}, "answers.pixels: '99999x9'; allowed: less than or equal to 20000"),
+        (
+            {"pixels": "1936"},
+            "answers.pixels: '1936'; allowed: width x height, such as 1936x1216",
+        ),
+        (
+            {"pixels": "99999x9"},
+            "answers.pixels: '99999x9'; allowed: less than or equal to 20000",
+        ),
         (
             {"pitch": "5.86"},
             "answers.pitch: '5.86'; allowed: a length with its unit, such as \"5.86 um\"",

@@ -72,8 +72,14 @@ def test_a_calibration_round_trips_exactly_through_opencv_and_skysim(
     size = (file.getNode("image_width").real(), file.getNode("image_height").real())
     assert size == (calibration.width_px, calibration.height_px)
     fx, cx, fy, cy = file.getNode("camera_matrix").mat()[[0, 0, 1, 1], [0, 2, 1, 2]]
-    assert (fx, fy, cx, cy) == (calibration.focal_px, calibration.focal_px, *calibration.center_px)
-    assert tuple(file.getNode("distortion_coefficients").mat().ravel()) == calibration.distortion
+    assert (fx, fy, cx, cy) == (
+        calibration.focal_px,
+        calibration.focal_px,
+        *calibration.center_px,
+    )
+    assert (
+        tuple(file.getNode("distortion_coefficients").mat().ravel()) == calibration.distortion
+    )
 
 
 def test_a_calibration_written_by_opencv_is_read(tmp_path: Path) -> None:
@@ -112,7 +118,10 @@ MATRIX = np.array([[900.0, 0, 800], [0, 900, 600], [0, 0, 1]])
         ),
         ({"camera_matrix": np.eye(4)}, "camera_matrix: 4 rows and 4 cols; allowed: 3x3"),
         ({"camera_matrix": 7}, "camera_matrix: missing"),
-        ({"distortion_coefficients": np.full((1, 8), 0.1)}, "8 terms; allowed: k1, k2, p1, p2, k3"),
+        (
+            {"distortion_coefficients": np.full((1, 8), 0.1)},
+            "8 terms; allowed: k1, k2, p1, p2, k3",
+        ),
         ({"distortion_coefficients": np.zeros((1, 3))}, "1 rows and 3 cols; allowed: 1x4"),
         ({"image_width": 0}, "image_width: 0 is not allowed"),
         ({"image_height": 1200.5}, "image_height: 1200.5 is not allowed"),
@@ -147,7 +156,17 @@ def test_another_lens_is_refused_in_one_line(
         b"a: " + b"[" * 20_000,
         b"x: '" + b"y" * (1 << 20) + b"'\n",
     ],
-    ids=["empty", "head", "utf-16", "object", "no matrix", "odd shape", "short", "deep", "long"],
+    ids=[
+        "empty",
+        "head",
+        "utf-16",
+        "object",
+        "no matrix",
+        "odd shape",
+        "short",
+        "deep",
+        "long",
+    ],
 )
 def test_a_hostile_file_is_refused_in_one_line(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "camera.yml"
@@ -207,7 +226,9 @@ def test_a_scene_s_camera_has_opencv_s_calibration(lens: Path, focus: str) -> No
         ("calibration: lens.yml, focal_length: null, pixel: 5", "camera.pixel: 5 has no unit"),
     ],
 )
-def test_a_contradiction_is_reported_with_its_line(lens: Path, said: str, complaint: str) -> None:
+def test_a_contradiction_is_reported_with_its_line(
+    lens: Path, said: str, complaint: str
+) -> None:
     own = lens.parent / "mine.yaml"
     own.write_text(f"schema: 1\nbase: shefex2\ncamera: {{{said}}}\n")
     with pytest.raises(InputError) as raised:

@@ -51,7 +51,11 @@ def test_the_scene_s_own_keys_replace_the_preset_s(folder: Path) -> None:
 
 def test_the_preset_of_a_body_leaves_the_lens_of_the_base(folder: Path) -> None:
     camera = loader.load(write(folder, "{preset: imx477}")).camera
-    assert (camera.width_px, camera.shutter.kind, camera.focal_length_m) == (4056, "rolling", 0.035)
+    assert (camera.width_px, camera.shutter.kind, camera.focal_length_m) == (
+        4056,
+        "rolling",
+        0.035,
+    )
 
 
 def test_a_preset_of_the_base_is_dropped_whole(folder: Path) -> None:
@@ -65,7 +69,11 @@ def test_an_overridden_preset_replaces_the_file_s_keys_but_not_other_overrides(
 ) -> None:
     over = {"camera.focal_length": "50 mm", "camera.preset": str(folder / "mine.yaml")}
     camera = loader.load("afit_simsat", over).camera
-    assert (camera.focal_length_m, camera.f_number, camera.shutter.kind) == (0.05, 2.8, "rolling")
+    assert (camera.focal_length_m, camera.f_number, camera.shutter.kind) == (
+        0.05,
+        2.8,
+        "rolling",
+    )
 
 
 def test_an_unknown_preset_over_a_base_is_an_error_with_its_line(folder: Path) -> None:

@@ -68,7 +68,9 @@ def test_each_value_has_its_origin() -> None:
         assert (entry.value, entry.origin.what, Path(entry.origin.file)) == (value, what, path)
         assert entry.origin.line == line_in(path, words)
     assert found["vehicle.imu.rate_hz"].origin == Origin("default")
-    assert found["camera.detector.bits"].value == loader.load("simsat_bump").camera.detector.bits
+    assert (
+        found["camera.detector.bits"].value == loader.load("simsat_bump").camera.detector.bits
+    )
 
 
 def test_overrides_are_named_and_replace_earlier_values() -> None:

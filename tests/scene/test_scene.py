@@ -125,8 +125,18 @@ def test_a_quantity_becomes_si(key: str, quantity: str, value: float) -> None:
             "turbine_nm",
             (1e-3, -1e-3, 0.0),
         ),
-        (motion.DesaturationConfig, {"start": "2 N m s", "stop": "800 mN m s"}, "stop_nms", 0.8),
-        (motion.DesaturationConfig, {"start": "2 kg m2 / s", "stop": "1 N m s"}, "start_nms", 2.0),
+        (
+            motion.DesaturationConfig,
+            {"start": "2 N m s", "stop": "800 mN m s"},
+            "stop_nms",
+            0.8,
+        ),
+        (
+            motion.DesaturationConfig,
+            {"start": "2 kg m2 / s", "stop": "1 N m s"},
+            "start_nms",
+            2.0,
+        ),
         (
             motion.DesaturationConfig,
             {"start": "2 N m s", "stop": "1 N m s", "time": "1 min"},
@@ -224,7 +234,9 @@ def test_the_afit_scene_has_the_thesis_s_values() -> None:
     assert loaded.vehicle.tilt_stop_deg == 30
     assert (loaded.camera.width_px, loaded.camera.height_px) == (1600, 1200)
     # Focused at 33 in: the chip is 36.53 mm from the lens (§1.2).
-    assert loaded.camera.focal_px == pytest.approx(1 / (1 / 0.035 - 1 / 0.8382) / 4e-6, rel=1e-12)
+    assert loaded.camera.focal_px == pytest.approx(
+        1 / (1 / 0.035 - 1 / 0.8382) / 4e-6, rel=1e-12
+    )
     assert loaded.camera.image_distance_m == pytest.approx(36.53e-3, abs=5e-6)
     assert (loaded.name, loaded.seed) == ("afit_simsat", 1)
     assert loaded.start_time == datetime.datetime(2012, 3, 1, 12)
@@ -243,7 +255,9 @@ def test_a_scene_s_camera_is_read_without_the_rest(tmp_path: Path) -> None:
     text = SHEFEX.read_text()
     alone = tmp_path / "camera.yaml"
     alone.write_text(text[text.index("camera:") : text.index("exposure:")])
-    assert loader.load_camera(alone) == loader.load_camera(SHEFEX) == loader.load("shefex2").camera
+    assert (
+        loader.load_camera(alone) == loader.load_camera(SHEFEX) == loader.load("shefex2").camera
+    )
 
 
 # Overrides
@@ -259,9 +273,9 @@ def test_an_override_replaces_the_file_s_value() -> None:
 
 def test_an_override_may_add_a_section() -> None:
     text = {"tracker.assumed_camera_body": "['1 in', '0 m', '15 in']"}
-    assert loader.load("afit_simsat_ideal", text).tracker.assumed_camera_body_m == pytest.approx(
-        (0.0254, 0, 0.381)
-    )
+    assert loader.load(
+        "afit_simsat_ideal", text
+    ).tracker.assumed_camera_body_m == pytest.approx((0.0254, 0, 0.381))
 
 
 @pytest.mark.parametrize(
@@ -467,16 +481,24 @@ def test_an_error_in_pointing_is_not_reported_as_a_vehicle_error(
 
 def test_a_dome_with_a_start_in_the_sky_is_refused(tmp_path: Path) -> None:
     right = "start: {roll_deg: 0, pitch_deg: 0, yaw_deg: 0}"
-    message, place = complaint_and_place(tmp_path, AFIT, right, "start: {ra_deg: 83, dec_deg: 2}")
+    message, place = complaint_and_place(
+        tmp_path, AFIT, right, "start: {ra_deg: 83, dec_deg: 2}"
+    )
     assert (
-        message == f"motion.start: light of kind dome requires roll_deg, pitch_deg, yaw_deg {place}"
+        message
+        == f"motion.start: light of kind dome requires roll_deg, pitch_deg, yaw_deg {place}"
     )
 
 
 # Unions: of each the allowed kinds, as a wrong one is answered
 
 UNIONS = [
-    ("kind: gaussian", "kind: gauss", "camera.psf.kind", "gaussian, moffat, airy, disk, measured"),
+    (
+        "kind: gaussian",
+        "kind: gauss",
+        "camera.psf.kind",
+        "gaussian, moffat, airy, disk, measured",
+    ),
     (
         "kind: global",
         "kind: shut",
@@ -528,7 +550,11 @@ def test_an_unknown_kind_is_answered_with_the_known_ones(
         ("camera.psf", "{kind: moffat}", "camera.psf.fwhm_px: missing"),
         ("camera.psf", "{kind: disk, radius_px: 0}", "camera.psf.radius_px: 0 is not allowed"),
         ("camera.psf", "{sigma_px: 0.5, fwhm_px: 2}", "camera.psf: kind is missing"),
-        ("camera.psf", "{kind: airy, wavelength: 550}", "camera.psf.wavelength: 550 has no unit"),
+        (
+            "camera.psf",
+            "{kind: airy, wavelength: 550}",
+            "camera.psf.wavelength: 550 has no unit",
+        ),
         ("camera.shutter", "{kind: frame_transfer}", "camera.shutter.row_time: missing"),
         (
             "camera.shutter",
@@ -658,7 +684,10 @@ UNLOAD = "{start: 2 N m s, stop: 1 N m s}"
             {"tracker.exposure_control": "{mean_dn: 150, step: 0.1 us}"},
             "tracker.exposure_control.step: '0.1 us' is not allowed; allowed: greater than or equal to 0.000001",
         ),
-        ({"tracker.exposure_control": "{step: 2 ms}"}, "tracker.exposure_control.mean_dn: missing"),
+        (
+            {"tracker.exposure_control": "{step: 2 ms}"},
+            "tracker.exposure_control.mean_dn: missing",
+        ),
         (
             {"motion.control": "{feedback: imu}"},
             "motion.control.feedback: imu requires the section vehicle.imu",
@@ -730,7 +759,9 @@ def test_contradicting_keys_are_refused_in_one_line(changes: dict[str, str], say
 def test_keys_of_a_room_are_refused_for_a_free_vehicle(key: str, value: str, says: str) -> None:
     free = {"vehicle.mount": "free", "vehicle.center_of_mass": "[0 m, 0 m, 0 m]"}
     assert says in complaint(AFIT, free | {key: value})
-    assert loader.load(AFIT, {key: value}).vehicle.mount == "air_bearing"  # where it may have it
+    assert (
+        loader.load(AFIT, {key: value}).vehicle.mount == "air_bearing"
+    )  # where it may have it
 
 
 @pytest.mark.parametrize(
@@ -771,9 +802,21 @@ def test_keys_of_a_room_are_refused_for_a_free_vehicle(key: str, value: str, say
             "{quadratic: 1 N m s}",
             "'1 N m s' is not a torque per squared rate; allowed: a t",
         ),
-        ("vehicle.cmgs", "{steering: magic}", "allowed: 'pseudo_inverse' or 'singularity_robust'"),
-        ("vehicle.cmgs", "{gimbal_time_constant: 1 ms}", "allowed: greater than or equal to 0.005"),
-        ("vehicle.disturbances", "{cable: {}}", "vehicle.disturbances.cable.stiffness: missing"),
+        (
+            "vehicle.cmgs",
+            "{steering: magic}",
+            "allowed: 'pseudo_inverse' or 'singularity_robust'",
+        ),
+        (
+            "vehicle.cmgs",
+            "{gimbal_time_constant: 1 ms}",
+            "allowed: greater than or equal to 0.005",
+        ),
+        (
+            "vehicle.disturbances",
+            "{cable: {}}",
+            "vehicle.disturbances.cable.stiffness: missing",
+        ),
         (
             "vehicle.disturbances",
             "{cable: {stiffness: 1 N m}}",
@@ -784,7 +827,11 @@ def test_keys_of_a_room_are_refused_for_a_free_vehicle(key: str, value: str, say
             "{air_current: {rms: [1 N m]}}",
             "vehicle.disturbances.air_current.rms.1: missing",
         ),
-        ("vehicle.imu", "{earth_rate: maybe}", "allowed: 'none', 'uncompensated' or 'compensated'"),
+        (
+            "vehicle.imu",
+            "{earth_rate: maybe}",
+            "allowed: 'none', 'uncompensated' or 'compensated'",
+        ),
         (
             "vehicle.imu",
             "{gyro: {arw: 3}}",
@@ -842,7 +889,9 @@ def test_keys_of_a_room_are_refused_for_a_free_vehicle(key: str, value: str, say
         ),
     ],
 )
-def test_an_error_in_the_vehicle_is_reported_with_its_key(key: str, value: str, says: str) -> None:
+def test_an_error_in_the_vehicle_is_reported_with_its_key(
+    key: str, value: str, says: str
+) -> None:
     message = complaint(AFIT, {key: value})
     assert says in message
     assert message.endswith("(overrides)")
@@ -864,7 +913,8 @@ def test_elements_without_commands_need_no_controller(kind: str) -> None:
 
 def test_a_controller_s_name_abbreviates_its_section() -> None:
     loaded = [
-        loader.load(AFIT, {"motion.control": value}).motion.control for value in ("pd", "{law: pd}")
+        loader.load(AFIT, {"motion.control": value}).motion.control
+        for value in ("pd", "{law: pd}")
     ]
     assert loaded[0] == loaded[1] == motion.ControlConfig(law="pd")
 
@@ -912,7 +962,11 @@ def test_null_switches_a_section_of_the_base_off(tmp_path: Path) -> None:
     assert loader.load("simsat_slew").vehicle.wheels
     mine = "schema: 1\nbase: simsat_slew\nvehicle: {wheels: null, fans: null}\nmotion: {control: null, maneuver: []}\n"
     loaded = loader.load(written(tmp_path, "mine.yaml", mine))
-    assert (loaded.vehicle.wheels, loaded.vehicle.fans, loaded.motion.control) == (None, None, None)
+    assert (loaded.vehicle.wheels, loaded.vehicle.fans, loaded.motion.control) == (
+        None,
+        None,
+        None,
+    )
     assert loaded.vehicle.drag == loader.load("simsat_slew").vehicle.drag
 
 
@@ -925,7 +979,9 @@ def test_a_base_is_found_beside_the_scene_and_may_have_its_own_base(tmp_path: Pa
         "below/lower.yaml",
         "schema: 1\nbase: simsat_slew\nvehicle: {model: own.xml}\nseed: 77\n",
     )
-    mine = written(tmp_path, "mine.yaml", "schema: 1\nbase: below/lower.yaml\ntitle: Mine on top\n")
+    mine = written(
+        tmp_path, "mine.yaml", "schema: 1\nbase: below/lower.yaml\ntitle: Mine on top\n"
+    )
     loaded = loader.load(mine)
     assert loaded.vehicle.model == str(tmp_path / "below" / "own.xml")
     assert (loaded.seed, loaded.title) == (77, "Mine on top")
@@ -942,7 +998,10 @@ def test_an_override_precedes_scene_and_base(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("base", "says"),
     [
-        ("nosuch", "base: nosuch: no such scene; allowed: a .yaml file or one of afit_simsat, "),
+        (
+            "nosuch",
+            "base: nosuch: no such scene; allowed: a .yaml file or one of afit_simsat, ",
+        ),
         ("nosuch.yaml", "base: nosuch.yaml: no such scene; allowed: a .yaml file or one of "),
         ("3", "base: 3: no such scene; allowed: "),
         ("", "base: None: no such scene; allowed: "),
@@ -1015,7 +1074,11 @@ def test_a_scene_s_keys_precede_its_camera_preset(tmp_path: Path) -> None:
     )
     plain = loader.load("shefex2").camera
     mine = loader.load(path).camera
-    assert (mine.width_px, mine.detector.read_noise_e, mine.shutter.kind) == (640, 9.0, "global")
+    assert (mine.width_px, mine.detector.read_noise_e, mine.shutter.kind) == (
+        640,
+        9.0,
+        "global",
+    )
     assert (plain.width_px, plain.detector.read_noise_e, plain.shutter.kind) == (
         659,
         14.7,
@@ -1030,7 +1093,11 @@ def test_a_scene_s_keys_precede_its_camera_preset(tmp_path: Path) -> None:
 def test_an_override_precedes_the_preset() -> None:
     assert loader.load("shefex2", {"camera.detector.bits": "8"}).camera.detector.bits == 8
     other = loader.load("shefex2", {"camera.preset": "aps"}).camera
-    assert (other.width_px, other.shutter.kind, other.focal_length_m) == (1024, "rolling", 0.025)
+    assert (other.width_px, other.shutter.kind, other.focal_length_m) == (
+        1024,
+        "rolling",
+        0.025,
+    )
 
 
 def test_a_lens_is_focused_at_infinity_by_default() -> None:
@@ -1040,10 +1107,14 @@ def test_a_lens_is_focused_at_infinity_by_default() -> None:
 
 
 @pytest.mark.parametrize("focus", ["70 mm", "35 mm", "1 um"])
-def test_a_focus_nearer_than_twice_the_focal_length_is_refused(tmp_path: Path, focus: str) -> None:
+def test_a_focus_nearer_than_twice_the_focal_length_is_refused(
+    tmp_path: Path, focus: str
+) -> None:
     """Nearer, the image would be larger than the object; at the focal length there is no image."""
     message, _ = complaint_and_place(tmp_path, AFIT, 'focus: "33 in"', f'focus: "{focus}"')
-    assert re.match(r"camera.focus: \S+ m is less than twice the focal length 0.035 m \(", message)
+    assert re.match(
+        r"camera.focus: \S+ m is less than twice the focal length 0.035 m \(", message
+    )
 
 
 @pytest.mark.parametrize(
@@ -1077,7 +1148,9 @@ def test_a_missing_section_is_named(tmp_path: Path) -> None:
 def test_an_exposure_longer_than_its_period_is_refused(tmp_path: Path) -> None:
     message, place = complaint_and_place(tmp_path, AFIT, 'time: "10 ms"', 'time: "10 s"')
     late = "plus trigger_jitter 0.0001 s"
-    assert message == f"exposure.time: 10.0 s {late} is longer than the frame period 0.5 s {place}"
+    assert (
+        message == f"exposure.time: 10.0 s {late} is longer than the frame period 0.5 s {place}"
+    )
 
 
 def test_a_maneuver_without_a_controller_is_refused(tmp_path: Path) -> None:
@@ -1117,7 +1190,8 @@ def test_bytes_that_are_not_text_are_refused_in_one_line(tmp_path: Path) -> None
 @pytest.mark.parametrize("name", ["nosuch", "nosuch.yaml", "scenes/nosuch", "", "."])
 def test_an_unknown_scene_is_answered_with_the_known_ones(name: str) -> None:
     with pytest.raises(
-        InputError, match=r"no such scene; allowed: a \.yaml file or one of .*afit_simsat.*shefex2"
+        InputError,
+        match=r"no such scene; allowed: a \.yaml file or one of .*afit_simsat.*shefex2",
     ):
         loader.load(name)
 
@@ -1132,7 +1206,8 @@ def test_a_camera_file_without_a_camera_is_refused_in_one_line(tmp_path: Path) -
 def kinds(union: object) -> set[str]:
     """The kinds of a discriminated union."""
     return {
-        get_args(part.model_fields["kind"].annotation)[0] for part in get_args(get_args(union)[0])
+        get_args(part.model_fields["kind"].annotation)[0]
+        for part in get_args(get_args(union)[0])
     }
 
 

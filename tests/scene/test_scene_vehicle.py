@@ -232,7 +232,9 @@ def test_a_scene_is_not_its_own_base(tmp_path: Path) -> None:
 
 def test_an_error_names_the_file_that_contains_it(tmp_path: Path) -> None:
     written(tmp_path, "below", base="afit_simsat", exposure={"time": "3 kg"})
-    above = written(tmp_path, "above", base="below.yaml", vehicle={"wheels": {"coulomb": "1 m"}})
+    above = written(
+        tmp_path, "above", base="below.yaml", vehicle={"wheels": {"coulomb": "1 m"}}
+    )
     with pytest.raises(
         InputError, match=r"vehicle.wheels.coulomb: '1 m' is not a torque.*above.yaml, line 5\)"
     ):

@@ -79,7 +79,13 @@ CASES = [
     ),
     Case(CODED, DENSE, "tracker.identifier", "pyramid", {"tracker.decoder": "null"}),
     Case(SKY, {}, "tracker.brightness_sigma", "0.2", {}),
-    Case(CODED, DENSE | TWO_LEVELS, "tracker.brightness_sigma", "0.2", {"tracker.decoder": "null"}),
+    Case(
+        CODED,
+        DENSE | TWO_LEVELS,
+        "tracker.brightness_sigma",
+        "0.2",
+        {"tracker.decoder": "null"},
+    ),
     Case(
         DOME,
         BY_LEVELS | {"tracker.name": "guest"},
@@ -104,7 +110,11 @@ CASES = [
     ),
     Case(SKY, {"tracker.name": "tetra3rs"}, "tracker.solver", "quest", {"tracker.name": "own"}),
     Case(
-        "simsat_bump", {"tracker.name": "tetra3rs"}, "tracker.gyro", "true", {"tracker.name": "own"}
+        "simsat_bump",
+        {"tracker.name": "tetra3rs"},
+        "tracker.gyro",
+        "true",
+        {"tracker.name": "own"},
     ),
     Case(
         SKY,
@@ -146,7 +156,9 @@ CASES = [
         {},
     ),
     Case(DOME, DIRECT, "light.led.clock.offset_ppm", "7", {"light.led.drive": "{kind: pwm}"}),
-    Case(DOME, {"light.layout": BOARDS}, "light.layout.lit", "[1, 2]", {"light.layout": SPREAD}),
+    Case(
+        DOME, {"light.layout": BOARDS}, "light.layout.lit", "[1, 2]", {"light.layout": SPREAD}
+    ),
     Case(
         DOME,
         DIRECT | {"light.led.scatter": "0", "light.layout": SPIRAL},
@@ -190,7 +202,9 @@ CASES = [
         "9",
         {"camera.detector.hot_pixels": "1"},
     ),
-    Case(SKY, {}, "camera.detector.dark_doubling_c", "5", {"camera.detector.temperature_c": "30"}),
+    Case(
+        SKY, {}, "camera.detector.dark_doubling_c", "5", {"camera.detector.temperature_c": "30"}
+    ),
     Case(
         SKY,
         {"camera.detector.dark_e_s": "0", "camera.detector.hot_pixels": "0"},
@@ -215,7 +229,9 @@ CASES = [
         "column",
         {"camera.detector.noise": "true"},
     ),
-    Case(DOME, {}, "camera.detector.anti_blooming", "0.5", {"camera.detector.blooming": "column"}),
+    Case(
+        DOME, {}, "camera.detector.anti_blooming", "0.5", {"camera.detector.blooming": "column"}
+    ),
     Case(DOME, {}, "site.latitude_deg", "10", {"vehicle.disturbances.earth_rotation": "true"}),
     Case(DOME, {}, "site.x_azimuth_deg", "10", {"vehicle.disturbances.earth_rotation": "true"}),
     Case(SKY, MOON, "site.latitude_deg", "-50", {**MOON, "site.longitude_deg": "20"}),
@@ -280,7 +296,10 @@ def test_a_key_without_effect_is_refused(case: Case) -> None:
 def test_every_rule_has_a_case() -> None:
     """The rule for a map needs a file and has its own test below."""
     covered = {
-        rule.reason for case in CASES for rule in unused.RULES if unused.section_of(case.key, rule)
+        rule.reason
+        for case in CASES
+        for rule in unused.RULES
+        if unused.section_of(case.key, rule)
     }
     # Set with its section.
     covered |= {rule.reason for rule in unused.RULES if "vehicle.cmgs.steering" in rule.keys}
@@ -321,7 +340,9 @@ def test_a_refused_key_changes_neither_motion_nor_frame_nor_solution(case: Case)
     check_no_effect(case)
 
 
-OTHERS = [case for case in CASES if case.key not in SAMPLE and "tracker.name" not in case.settings]
+OTHERS = [
+    case for case in CASES if case.key not in SAMPLE and "tracker.name" not in case.settings
+]
 
 
 @pytest.mark.long
@@ -333,7 +354,9 @@ def test_no_other_refused_key_changes_anything(case: Case) -> None:
 
 def check_no_effect(case: Case) -> None:
     settings = SMALL | {"exposure.first": "50 ms"} | case.settings
-    if case.key == "vehicle.cmgs":  # switched on in both: only the limit and the steering differ
+    if (
+        case.key == "vehicle.cmgs"
+    ):  # switched on in both: only the limit and the steering differ
         settings |= {case.key: "{}"}
     if case.key == "light.layout.lit":
         settings |= {"light.layout": BOARDS}
@@ -345,7 +368,11 @@ def check_no_effect(case: Case) -> None:
 
 @pytest.mark.parametrize(
     "case",
-    [case for case in CASES if case.key in ("light.led.pwm_period", "tracker.survey.surface_seed")],
+    [
+        case
+        for case in CASES
+        if case.key in ("light.led.pwm_period", "tracker.survey.surface_seed")
+    ],
     ids=lambda case: case.key,
 )
 def test_an_allowed_key_changes_the_result(case: Case) -> None:

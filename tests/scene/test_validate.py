@@ -87,7 +87,8 @@ def test_another_version_is_refused_by_name_anywhere_in_the_file(tmp_path: Path)
     mine.write_text("schema: 1\nbase: newer.yaml\n")
     for path in (newer, mine):
         with pytest.raises(
-            InputError, match=r"^schema: version 3 is newer than skysim .*newer\.yaml, line 1\)$"
+            InputError,
+            match=r"^schema: version 3 is newer than skysim .*newer\.yaml, line 1\)$",
         ):
             load(path)
     study.write_text("title: T\nschema: 0\n")
@@ -160,14 +161,18 @@ def test_an_endless_file_is_refused_without_waiting(tmp_path: Path) -> None:
         os.mkfifo(tmp_path / f"pipe.{suffix}")
         (tmp_path / f"zero.{suffix}").symlink_to("/dev/zero")
         for name in ("pipe", "zero"):
-            assert check_file(tmp_path / f"{name}.{suffix}").fault.endswith("not a regular file")
+            assert check_file(tmp_path / f"{name}.{suffix}").fault.endswith(
+                "not a regular file"
+            )
 
 
 def test_a_wrong_key_of_a_trial_is_answered_with_the_allowed_ones(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     text = (SCENES / "studies/false_stars.yaml").read_text()
     path.write_text(text.replace("trial.false_lights", "trial.false_light"))
-    says = r"trial\.false_light: unknown key; did you mean false_lights\?; allowed: .*noise_px.*"
+    says = (
+        r"trial\.false_light: unknown key; did you mean false_lights\?; allowed: .*noise_px.*"
+    )
     assert re.fullmatch(
         rf"factors\.strays: 0: {says} \(.*mine\.yaml, line 9\)", check_file(path).fault
     )
@@ -188,6 +193,8 @@ def test_the_command_refuses_with_2_and_prints_a_schema() -> None:
     assert done.exit_code == 2
     assert [bool(one["fault"]) for one in json.loads(done.stdout)] == [False, True]
     assert (
-        json.loads(CliRunner().invoke(main.app, ["validate", "--schema", "study"]).stdout)["title"]
+        json.loads(CliRunner().invoke(main.app, ["validate", "--schema", "study"]).stdout)[
+            "title"
+        ]
         == "A study of skysim"
     )

@@ -46,7 +46,9 @@ def level(lab: Lab, altitude_deg: float) -> Rotation:
 
 def render_toward(lab: Lab, cam_from_lab: Rotation, index: int = 0) -> tuple[Frame, Truth]:
     """A frame of the camera at rest."""
-    return render_at_rest(lab.camera, cam_from_lab.inv() * lab.camera.mount.cam_from_body, index)
+    return render_at_rest(
+        lab.camera, cam_from_lab.inv() * lab.camera.mount.cam_from_body, index
+    )
 
 
 def truth_at(lab: Lab, altitude_deg: float, index: int = 0) -> Truth:
@@ -90,8 +92,12 @@ def test_the_skyline_hides_stars_and_the_truth_marks_them() -> None:
     assert np.isin(hilly.hidden, free.sources.id).all()
     lowest_px = hilly.sources.xy_px[:, 1].max()
     center_y = lab_of().scene.camera.center_px[1]
-    assert lowest_px < center_y + 3  # a circle of altitude 20 degrees rises by 4 px to the sides
-    np.testing.assert_array_equal(np.sort(hilly.hidden), np.sort(gone[np.isin(gone, hilly.hidden)]))
+    assert (
+        lowest_px < center_y + 3
+    )  # a circle of altitude 20 degrees rises by 4 px to the sides
+    np.testing.assert_array_equal(
+        np.sort(hilly.hidden), np.sort(gone[np.isin(gone, hilly.hidden)])
+    )
     assert len(truth_at(lab_of(), -20.0).sources.id) == 0
 
 
@@ -111,7 +117,9 @@ def test_scintillation_is_independent_by_frame_and_star() -> None:
     camera = lab.scene.camera
     exposure_s = lab.scene.exposure.time_s
     mass = np.array([1 / np.sin(np.radians(60))])
-    variance = air.variance(mass, camera.pupil_m, exposure_s, lab.scene.site.height_m, 660e-9)[0]
+    variance = air.variance(mass, camera.pupil_m, exposure_s, lab.scene.site.height_m, 660e-9)[
+        0
+    ]
     assert ratio.mean() == pytest.approx(1, abs=4 * np.sqrt(variance / len(ratio)))
     assert ratio.var() == pytest.approx(variance, rel=0.25)
 
@@ -141,7 +149,8 @@ def test_air_without_a_site_is_refused() -> None:
         load("shefex2", AIR | {"light.air.glow": "{}", "start_time": "1960-01-01T00:00:00"})
     with pytest.raises(InputError, match="outside the circle"):
         load(
-            "shefex2", AIR | {"light.air.horizon": "{azimuth_deg: [0, 360], altitude_deg: [0, 20]}"}
+            "shefex2",
+            AIR | {"light.air.horizon": "{azimuth_deg: [0, 360], altitude_deg: [0, 20]}"},
         )
 
 

@@ -76,7 +76,8 @@ def test_the_tracker_is_compiled_before_the_first_report_of_a_flight(
     monkeypatch.setattr(factory, "solve_frame", watched)
     shots = shots_of(
         changed(
-            exposure='{time: 10 ms, rate_hz: 5, frames: 2, first: "0.1 s"}', motion__maneuver="[]"
+            exposure='{time: 10 ms, rate_hz: 5, frames: 2, first: "0.1 s"}',
+            motion__maneuver="[]",
         )
     )
     assert [frame.index for frame in solved] == [0, 0, 1]
@@ -178,7 +179,9 @@ def test_the_star_tracker_restores_attitude_and_bias(bumped: Bumped) -> None:
     assert telemetry.lab_from_filter is not None
     assert telemetry.assumed_bias_rad_s is not None
     assert telemetry.bias_rad_s is not None
-    error_deg = np.degrees((telemetry.lab_from_filter.inv() * telemetry.lab_from_body).magnitude())
+    error_deg = np.degrees(
+        (telemetry.lab_from_filter.inv() * telemetry.lab_from_body).magnitude()
+    )
     assert error_deg[telemetry.t_s < 2.4].max() > 0.3  # it was lost too
     assert error_deg[telemetry.t_s > 2.45].max() < 0.005
     bias_error = np.abs(telemetry.assumed_bias_rad_s - telemetry.bias_rad_s)[-1]
@@ -218,7 +221,10 @@ def test_solutions_used_by_the_filter_equal_those_of_the_saved_frames(bumped: Bu
         assert shot.report is not None
         attitude = shot.report.attitude
         assert again.status == attitude.status == "solved"
-        assert np.linalg.norm((attitude.cam_from_ref * again.cam_from_ref.inv()).as_rotvec()) < 1e-9
+        assert (
+            np.linalg.norm((attitude.cam_from_ref * again.cam_from_ref.inv()).as_rotvec())
+            < 1e-9
+        )
 
 
 @pytest.mark.slow
@@ -257,11 +263,15 @@ def test_the_loop_with_latency_survives_the_accident() -> None:
 def test_a_frame_without_an_answer_does_not_change_the_filter() -> None:
     """With a capped lens there is no solution; the filter continues with the gyros and its sigma grows."""
     flight = open_flight(
-        changed(light__led__intensity="1 ucd", exposure='{time: "10 ms", rate_hz: 2, frames: 2}')
+        changed(
+            light__led__intensity="1 ucd", exposure='{time: "10 ms", rate_hz: 2, frames: 2}'
+        )
     )
     shots = list(flight.shots())
     assert "used" not in [shot.update_status for shot in shots]
-    assert [shot.update_status for shot in shots] == [shot.report.attitude.status for shot in shots]
+    assert [shot.update_status for shot in shots] == [
+        shot.report.attitude.status for shot in shots
+    ]
     sigma = flight.telemetry().sigma_attitude_rad
     assert sigma is not None
     assert (np.diff(sigma, axis=0) > 0).all()

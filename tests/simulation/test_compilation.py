@@ -21,5 +21,7 @@ NAMES = {path.stem.removesuffix("_ideal") for path in SCENES.glob("*.yaml")} - S
 def test_the_synthetic_frame_is_solved(name: str) -> None:
     """A frame that is refused earlier would leave the later stages to be compiled in the first process."""
     lab = build_lab(loader.load(name))
-    report = factory.solve_frame(build_tracker(lab.camera), synthetic_frame(lab.camera, lab.start))
+    report = factory.solve_frame(
+        build_tracker(lab.camera), synthetic_frame(lab.camera, lab.start)
+    )
     assert report.attitude.status == "solved"

@@ -75,7 +75,12 @@ for line in sys.stdin:
     print(json.dumps({"tick": now.tick, "torque_nm": law(now).tolist()}), flush=True)
 """
 SHORT = {
-    "motion.control": {"law": "pd", "actuators": "wheels", "bandwidth_rad_s": 2.5, "damping": 0.7},
+    "motion.control": {
+        "law": "pd",
+        "actuators": "wheels",
+        "bandwidth_rad_s": 2.5,
+        "damping": 0.7,
+    },
     "motion.maneuver": [
         {
             "kind": "slew",
@@ -187,7 +192,9 @@ def test_a_controller_gets_the_documented_setup_and_input() -> None:
     np.testing.assert_allclose([now.t_s for now in seen], telemetry.t_s, rtol=0, atol=1e-12)
     measured = Rotation.from_quat([now.lab_from_body_xyzw for now in seen])
     assert (measured.inv() * telemetry.lab_from_body).magnitude().max() < 1e-15
-    np.testing.assert_array_equal([now.rate_body_rad_s for now in seen], telemetry.rate_body_rad_s)
+    np.testing.assert_array_equal(
+        [now.rate_body_rad_s for now in seen], telemetry.rate_body_rad_s
+    )
     np.testing.assert_array_equal([now.momentum_nms for now in seen], telemetry.momentum_nms)
     reference = plan(scene.motion)
     for now in seen[::50]:
@@ -218,7 +225,9 @@ def test_a_controller_s_input_is_the_scene_s_feedback(feedback: str) -> None:
     telemetry = skysim.simulate(scene, controller=recorder(seen, setups)).telemetry
     measured = Rotation.from_quat([now.lab_from_body_xyzw for now in seen])
     by = {"imu": telemetry.lab_from_imu, "filter": telemetry.lab_from_filter}
-    np.testing.assert_allclose((measured.inv() * by[feedback]).magnitude(), 0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        (measured.inv() * by[feedback]).magnitude(), 0, rtol=0, atol=1e-12
+    )
     other = by["imu" if feedback == "filter" else "filter"]
     assert (measured.inv() * other).magnitude().max() > 1e-9
     assert setups[0].rate_limit_rad_s == pytest.approx(np.radians(7.0))
@@ -268,7 +277,8 @@ def test_a_function_that_fails_is_named_with_its_time(installed: Path) -> None:
     from mypd import crashing, weak
 
     with pytest.raises(
-        InputError, match=r"^motion.control.law: crashing: RuntimeError: out of fuel, at 0.03 s$"
+        InputError,
+        match=r"^motion.control.law: crashing: RuntimeError: out of fuel, at 0.03 s$",
     ):
         flown(controller=crashing)
     with pytest.raises(InputError, match=r"^motion.control.law: weak: KeyError: 'why'$"):
@@ -285,11 +295,17 @@ def test_a_function_that_fails_is_named_with_its_time(installed: Path) -> None:
 @pytest.mark.slow
 def test_an_entry_point_that_fails_is_named_with_its_time(installed: Path) -> None:
     with pytest.raises(
-        InputError, match=r"^motion.control.law: crashing: RuntimeError: out of fuel, at 0.03 s$"
+        InputError,
+        match=r"^motion.control.law: crashing: RuntimeError: out of fuel, at 0.03 s$",
     ):
         flown(controller="crashing")
-    with pytest.raises(InputError, match=r"^motion.control.law: weak: ValueError: too weak: 3$"):
-        flown(controller="weak", changes={"motion.control": {"law": "weak", "options": {"why": 3}}})
+    with pytest.raises(
+        InputError, match=r"^motion.control.law: weak: ValueError: too weak: 3$"
+    ):
+        flown(
+            controller="weak",
+            changes={"motion.control": {"law": "weak", "options": {"why": 3}}},
+        )
 
 
 READY = (
@@ -317,13 +333,17 @@ READY = (
         ('print(\'{"tick": 0, "status": "no fuel"}\')', "no fuel"),
     ],
 )
-def test_a_program_that_fails_is_named_and_ended(text: str, message: str, tmp_path: Path) -> None:
+def test_a_program_that_fails_is_named_and_ended(
+    text: str, message: str, tmp_path: Path
+) -> None:
     note = f"open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()))\n"
     control = {"motion.control": {"law": "mine", "time_limit": "0.5 s"}}
     with pytest.raises(InputError, match=message) as raised:
         flown(
             changes=control,
-            programs=command(tmp_path, READY.replace("sys.stdin", note + "sys.stdin", 1) + text),
+            programs=command(
+                tmp_path, READY.replace("sys.stdin", note + "sys.stdin", 1) + text
+            ),
         )
     assert str(raised.value).startswith("motion.control.law: mine: ")
     assert "\n" not in str(raised.value)
@@ -340,7 +360,8 @@ def test_a_program_ends_with_its_motion(tmp_path: Path) -> None:
     )
     text += "for line in sys.stdin:\n    n = json.loads(line)['tick']\n"
     programs = command(
-        tmp_path, text + "    print(json.dumps({'tick': n, 'torque_nm': [0, 0, 0]}), flush=True)\n"
+        tmp_path,
+        text + "    print(json.dumps({'tick': n, 'torque_nm': [0, 0, 0]}), flush=True)\n",
     )
 
     def scene(maneuver: list[dict[str, Any]]) -> skysim.Scene:
@@ -349,7 +370,9 @@ def test_a_program_ends_with_its_motion(tmp_path: Path) -> None:
 
     pid = tmp_path / "pid"
     with pytest.raises(InputError, match="tilt of 50 deg"):
-        open_flight(scene([{"kind": "step", "roll_deg": 50, "duration": "1 s"}]), programs=programs)
+        open_flight(
+            scene([{"kind": "step", "roll_deg": 50, "duration": "1 s"}]), programs=programs
+        )
     assert not pid.exists()
     with open_flight(scene([]), programs=programs) as flight:
         flight.simulate_motion()

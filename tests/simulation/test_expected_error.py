@@ -59,7 +59,9 @@ def ring(arm_m: Floats, offset_m: Floats, lab: Lab) -> View:
 def around(radius: float, height: float, count: int = LEDS) -> Floats:
     """(count, 3) points on a ring about the boresight."""
     angle = 2 * np.pi * np.arange(count) / count
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, height)])
+    return np.column_stack(
+        [radius * np.cos(angle), radius * np.sin(angle), np.full(count, height)]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -251,9 +253,9 @@ def test_positions_electrons_peaks_and_paths_match_the_renderer(
     )
     assert len(row) == len(seen) > 10
     inside = (
-        np.minimum(seen.xy_px, np.array(lab.camera.canvas.shape[::-1]) - seen.xy_px).min(axis=1)[
-            row
-        ]
+        np.minimum(seen.xy_px, np.array(lab.camera.canvas.shape[::-1]) - seen.xy_px).min(
+            axis=1
+        )[row]
         > 30
     )
     row = row[inside]
@@ -265,7 +267,9 @@ def test_positions_electrons_peaks_and_paths_match_the_renderer(
     # A pulse more or less in the exposure.
     share = truth.sources.electrons[other] / seen.electrons[row]
     assert np.median(share) == pytest.approx(1, abs=0.02)
-    peak = (seen.peak_e[row] - context.camera.background_e) * share / truth.sources.peak_e[other]
+    peak = (
+        (seen.peak_e[row] - context.camera.background_e) * share / truth.sources.peak_e[other]
+    )
     assert np.min(peak) > 0.98
     assert np.median(peak) < 1.2
     assert np.max(peak) < 1.7
@@ -282,7 +286,9 @@ def test_the_expected_peak_matches_a_disk_blurred_by_a_gaussian() -> None:
         assert peak_share(*values)[0] == pytest.approx(integral, rel=1e-6)
     sharp = peak_share(np.full(1, 1e-6), np.full(1, 3.0), np.zeros(1), np.zeros(1))[0]
     assert sharp == pytest.approx(1 / np.pi / 9, rel=1e-6)
-    assert peak_share(np.ones(1), *(np.zeros((3, 1))))[0] == pytest.approx(1 / 2 / np.pi, rel=1e-6)
+    assert peak_share(np.ones(1), *(np.zeros((3, 1))))[0] == pytest.approx(
+        1 / 2 / np.pi, rel=1e-6
+    )
 
 
 def test_a_neighbor_moves_a_fitted_star(stars: Lab) -> None:
@@ -313,7 +319,9 @@ def test_a_neighbor_moves_a_fitted_star(stars: Lab) -> None:
             np.array([apart_px]), np.array([star_e]), np.array([faint_e]), camera
         )[0]
         assert found == pytest.approx(fit.x[1], rel=0.12)
-    near = beliefs.response_px(np.array([1e-3]), np.array([1000.0]), np.array([500.0]), camera)[0]
+    near = beliefs.response_px(np.array([1e-3]), np.array([1000.0]), np.array([500.0]), camera)[
+        0
+    ]
     assert near == pytest.approx(1e-3 / 3, rel=0.02)
 
 
@@ -404,7 +412,9 @@ def expected_at(
     context: Context, lab_from_body: Rotation, rate_rad_s: Floats
 ) -> tuple[float, float]:
     at = CheckedAttitudes(Rotation.concatenate([lab_from_body]), rate_rad_s[None], np.zeros(1))
-    return tuple(value * ARCSEC_RAD for value in sampling.sampled(at, context).error.rms_arcsec())  # type: ignore[return-value]
+    return tuple(
+        value * ARCSEC_RAD for value in sampling.sampled(at, context).error.rms_arcsec()
+    )  # type: ignore[return-value]
 
 
 @pytest.mark.long

@@ -103,9 +103,13 @@ def test_frames_due_after_the_motion_are_not_rendered_during_it(rendered: list[i
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("changes", [{}, FILTERED, {"tracker__exposure_control": "{mean_dn: 150}"}])
+@pytest.mark.parametrize(
+    "changes", [{}, FILTERED, {"tracker__exposure_control": "{mean_dn: 150}"}]
+)
 @pytest.mark.parametrize("solves", [False, True])
-def test_a_shot_equals_the_frame_rendered_alone(changes: Mapping[str, str], solves: bool) -> None:
+def test_a_shot_equals_the_frame_rendered_alone(
+    changes: Mapping[str, str], solves: bool
+) -> None:
     """Bit for bit: from a piece of the motion when due, from the whole motion, and from another flight."""
     scene = scene_of("shefex2", 3, **changes)
     flight = open_flight(scene)
@@ -114,9 +118,14 @@ def test_a_shot_equals_the_frame_rendered_alone(changes: Mapping[str, str], solv
     for shot in shots:
         for frame, truth in (flight.render(shot.frame.index), render(scene, shot.frame.index)):
             np.testing.assert_array_equal(frame.image_dn, shot.frame.image_dn)
-            assert (frame.t_mid_s, frame.exposure_s) == (shot.frame.t_mid_s, shot.frame.exposure_s)
+            assert (frame.t_mid_s, frame.exposure_s) == (
+                shot.frame.t_mid_s,
+                shot.frame.exposure_s,
+            )
             assert (truth.cam_from_lab * shot.truth.cam_from_lab.inv()).magnitude() == 0
-    assert all((shot.report is not None) == (solves or scene.filter is not None) for shot in shots)
+    assert all(
+        (shot.report is not None) == (solves or scene.filter is not None) for shot in shots
+    )
 
 
 @pytest.mark.slow
@@ -129,7 +138,10 @@ def test_a_flight_without_history_has_the_same_shots(name: str) -> None:
     )
     assert images(shots) == images(forgetful)
     for shot, other in zip(shots, forgetful, strict=True):
-        assert (shot.camera.name, shot.frame.t_mid_s) == (other.camera.name, other.frame.t_mid_s)
+        assert (shot.camera.name, shot.frame.t_mid_s) == (
+            other.camera.name,
+            other.frame.t_mid_s,
+        )
         assert (shot.truth.cam_from_lab * other.truth.cam_from_lab.inv()).magnitude() == 0
         for one in (shot, other):
             assert one.report.attitude.solved
@@ -194,7 +206,9 @@ def test_only_selected_frames_are_rendered_and_match_those_of_the_whole_run(
     chosen = images(list(open_flight(scene).shots(solves=False, selects=odd)))
     assert chosen == every[1::2]
     assert rendered == [1, 3, 5]
-    np.testing.assert_allclose(asked, [(n, 0.14 + 0.1 * n) for n in range(6)], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        asked, [(n, 0.14 + 0.1 * n) for n in range(6)], rtol=0, atol=1e-12
+    )
 
 
 @pytest.mark.slow
@@ -257,7 +271,8 @@ def test_steps_are_control_periods_and_end_with_the_motion() -> None:
     np.testing.assert_allclose(np.diff(times_s[:-1]), 0.01, rtol=0, atol=1e-12)
     assert times_s[-1] == pytest.approx(flight.duration_s, abs=1e-3)
     with pytest.raises(
-        InputError, match=r"step: the motion has ended at .* s; allowed: more frames, or endless"
+        InputError,
+        match=r"step: the motion has ended at .* s; allowed: more frames, or endless",
     ):
         flight.step()
 
@@ -295,7 +310,9 @@ def test_a_torque_accelerates_the_vehicle_by_eulers_equation() -> None:
     np.testing.assert_allclose(
         state.lab_from_body.as_rotvec(), [0, 0, 0.15 / inertia[2, 2]], rtol=0, atol=1e-9
     )
-    np.testing.assert_array_equal(flight.telemetry().torque_nm, np.tile([0.0, 0.0, 0.3], (100, 1)))
+    np.testing.assert_array_equal(
+        flight.telemetry().torque_nm, np.tile([0.0, 0.0, 0.3], (100, 1))
+    )
     momentum = open_flight(scene)
     given = np.zeros(3)
     for _ in range(100):
@@ -309,7 +326,9 @@ def test_a_torque_accelerates_the_vehicle_by_eulers_equation() -> None:
 
 
 @pytest.mark.parametrize("actuators", ["ideal", "wheels"])
-def test_a_torque_replaces_the_controller_s_on_the_actuators_of_the_scene(actuators: str) -> None:
+def test_a_torque_replaces_the_controller_s_on_the_actuators_of_the_scene(
+    actuators: str,
+) -> None:
     """It acts in the steps for which it is given; the wheels (0.010125 kg m2) take up the opposite momentum."""
     changes = BALANCED | {
         "vehicle.wheels": "{torque_limit: '0.6 N m'}",
@@ -419,13 +438,15 @@ def test_imu_samples_since_a_time_are_the_latest_ones() -> None:
 def test_a_flight_without_history_has_no_telemetry_and_no_frames_of_the_past() -> None:
     flight = open_flight(loader.load("afit_simsat", SLEW), keeps_history=False)
     with pytest.raises(
-        InputError, match=r"telemetry: this flight keeps no history; allowed: keeps_history=True"
+        InputError,
+        match=r"telemetry: this flight keeps no history; allowed: keeps_history=True",
     ):
         flight.telemetry()
     while flight.now_s < 0.5:
         flight.step()
     with pytest.raises(
-        InputError, match=r"shots: the flight has forgotten frame 0; allowed: keeps_history=True"
+        InputError,
+        match=r"shots: the flight has forgotten frame 0; allowed: keeps_history=True",
     ):
         next(flight.shots())
 
@@ -436,13 +457,17 @@ def test_a_frame_that_is_not_exposed_is_refused() -> None:
         flight.step()
     assert flight.render(1)[0].index == 1
     for index in (2, -1):
-        with pytest.raises(InputError, match=rf"render: frame {index} is not exposed at 0\.25 s"):
+        with pytest.raises(
+            InputError, match=rf"render: frame {index} is not exposed at 0\.25 s"
+        ):
             flight.render(index)
     flight.simulate_motion()
     assert flight.render(2)[0].index == 2
     with pytest.raises(InputError, match="render: frame 3 is not exposed"):
         flight.render(3)
-    controlled = simulate_motion(scene_of("shefex2", 3, tracker__exposure_control="{mean_dn: 150}"))
+    controlled = simulate_motion(
+        scene_of("shefex2", 3, tracker__exposure_control="{mean_dn: 150}")
+    )
     with pytest.raises(InputError, match="render: frame 1 has no exposure time yet"):
         controlled.render(1)
 
@@ -461,7 +486,8 @@ def observed_at(flight: Flight, t_s: float) -> Shot:
 def test_an_observation_is_the_exposure_that_ends_now() -> None:
     """Without noise it is the scheduled one that ends at the same time, in a slew."""
     scene = loader.load(
-        "afit_simsat", SLEW | {"camera.detector.noise": "false", "camera.shutter": "{kind: global}"}
+        "afit_simsat",
+        SLEW | {"camera.detector.noise": "false", "camera.shutter": "{kind: global}"},
     )
     flight = open_flight(scene)
     for index in (0, 3):
@@ -474,7 +500,9 @@ def test_an_observation_is_the_exposure_that_ends_now() -> None:
         )
         assert (shot.truth.cam_from_lab * truth.cam_from_lab.inv()).magnitude() < 1e-9
         np.testing.assert_array_equal(shot.truth.sources.id, truth.sources.id)
-        np.testing.assert_allclose(shot.truth.sources.electrons, truth.sources.electrons, rtol=1e-6)
+        np.testing.assert_allclose(
+            shot.truth.sources.electrons, truth.sources.electrons, rtol=1e-6
+        )
         np.testing.assert_allclose(
             shot.frame.image_dn, frame.image_dn, rtol=0, atol=1e-3 * frame.image_dn.max()
         )
@@ -491,7 +519,11 @@ def test_observations_have_the_noise_of_a_scheduled_frame_and_each_its_own() -> 
     flight = simulate_motion(scene)
     scheduled = [flight.render(index)[0] for index in (0, 1)]
     observed = [flight.observe(solves=False).frame for _ in range(4)]
-    noise = [difference_dn(*scheduled), difference_dn(*observed[:2]), difference_dn(*observed[2:])]
+    noise = [
+        difference_dn(*scheduled),
+        difference_dn(*observed[:2]),
+        difference_dn(*observed[2:]),
+    ]
     sigma = [one.std() for one in noise]
     np.testing.assert_allclose(sigma, sigma[0], rtol=5 / np.sqrt(2 * noise[0].size))
     limit = 5 / np.sqrt(noise[0].size)
@@ -502,8 +534,12 @@ def test_observations_have_the_noise_of_a_scheduled_frame_and_each_its_own() -> 
 
 def difference_dn(one: Frame, other: Frame) -> Floats:
     """(N,) differences of two frames in the pixels that no star saturates."""
-    inside = (one.image_dn < 0.2 * one.saturation_dn) & (other.image_dn < 0.2 * other.saturation_dn)
-    return np.where(inside, one.image_dn.astype(float) - other.image_dn.astype(float), 0.0).ravel()
+    inside = (one.image_dn < 0.2 * one.saturation_dn) & (
+        other.image_dn < 0.2 * other.saturation_dn
+    )
+    return np.where(
+        inside, one.image_dn.astype(float) - other.image_dn.astype(float), 0.0
+    ).ravel()
 
 
 def test_an_observation_at_the_start_extrapolates_with_the_initial_rate() -> None:
@@ -553,15 +589,22 @@ def test_an_observation_gets_the_gyro_s_rate_of_its_own_exposure() -> None:
     )
     shot = observed_at(flight, 0.3)
     assert isinstance(shot.rate, RateEstimate)
-    np.testing.assert_allclose(shot.rate.rate_rad_s, shot.truth.rate_cam_rad_s, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        shot.rate.rate_rad_s, shot.truth.rate_cam_rad_s, rtol=0, atol=1e-6
+    )
 
 
 @pytest.mark.slow
 def test_a_control_loop_of_twenty_lines_brings_the_vehicle_to_its_target() -> None:
     """Attitudes from observations ten times a second, rates between them, a torque in every period."""
-    changes = BALANCED | {"vehicle.imu": "{gyro: {turn_on_bias_deg_h: 0}}", "exposure.first": "8 s"}
+    changes = BALANCED | {
+        "vehicle.imu": "{gyro: {turn_on_bias_deg_h: 0}}",
+        "exposure.first": "8 s",
+    }
     scene = scene_of(
-        "afit_simsat_ideal", 1, **{key.replace(".", "__"): value for key, value in changes.items()}
+        "afit_simsat_ideal",
+        1,
+        **{key.replace(".", "__"): value for key, value in changes.items()},
     )
     target = Rotation.from_euler("ZYX", [8.0, -3.0, 4.0], degrees=True)
     flight = open_flight(scene)

@@ -70,7 +70,11 @@ def test_keys_of_a_head_override_those_of_the_main_camera() -> None:
     }
     lab = two_heads(heads=[SIDE | lens])
     main, side = (camera.scene for camera in lab.cameras)
-    assert (side.camera.f_number, side.exposure.time_s, side.tracker.limit_mag) == (2.8, 0.08, 5.0)
+    assert (side.camera.f_number, side.exposure.time_s, side.tracker.limit_mag) == (
+        2.8,
+        0.08,
+        5.0,
+    )
     assert side.camera.focal_length_m == main.camera.focal_length_m
     assert side.exposure.frames == main.exposure.frames
     assert main.camera.f_number == 1.4
@@ -110,7 +114,9 @@ def test_an_impossible_head_is_refused_in_one_line(heads: object, message: str) 
 
 
 def test_a_drift_of_a_mount_needs_temperatures() -> None:
-    with pytest.raises(InputError, match=r"heads\.0\.mount_arcsec_k: requires the section thermal"):
+    with pytest.raises(
+        InputError, match=r"heads\.0\.mount_arcsec_k: requires the section thermal"
+    ):
         two_heads(heads=[SIDE | {"mount_arcsec_k": [1, 0, 0]}], thermal=None)
 
 
@@ -140,7 +146,9 @@ def test_under_a_dome_a_head_that_looks_below_the_rim_sees_nothing() -> None:
         top | {"name": "up", "rotation_deg": [0, 8, 0]},
         top | {"name": "down", "rotation_deg": [0, 150, 0]},
     ]
-    scene = load_scene("afit_simsat", {"exposure.frames": 1, "heads": heads, "tracker.survey": {}})
+    scene = load_scene(
+        "afit_simsat", {"exposure.frames": 1, "heads": heads, "tracker.survey": {}}
+    )
     reports = {shot.camera.name: shot.report for shot in open_flight(scene).shots()}
     solved = {name: report.attitude.solved for name, report in reports.items()}
     assert solved == {"main": True, "up": True, "down": False}

@@ -69,7 +69,8 @@ def build_lighthouse(config: LighthouseConfig, plan: LightPlan) -> Lighthouse:
     ids = np.array([LAMP_ID])
     clock = np.zeros(1, np.int64)
     return Lighthouse(
-        config, Sources(ids, place, down, zero, strength, one, zero, one, clock, np.full(1, np.nan))
+        config,
+        Sources(ids, place, down, zero, strength, one, zero, one, clock, np.full(1, np.nan)),
     )
 
 
@@ -91,7 +92,8 @@ class Curtain(Obstacle):
 
     def during(self, exposure: Exposure) -> Lit:
         return Lit(
-            "the curtain", hides=Occluder("the curtain", lambda place: place[:, 0] > self.beyond_m)
+            "the curtain",
+            hides=Occluder("the curtain", lambda place: place[:, 0] > self.beyond_m),
         )
 
 
@@ -135,7 +137,9 @@ def test_a_blinking_user_light_is_in_the_frames_in_which_it_is_lit() -> None:
         assert len(row) == is_lit
         assert (frame.image_dn.tobytes() != plain.image_dn.tobytes()) == is_lit
         if is_lit:
-            offset_m = np.array([0.0, 0.0, 1.0]) - lab.start.apply(lab.camera.mount.camera_body_m)
+            offset_m = np.array([0.0, 0.0, 1.0]) - lab.start.apply(
+                lab.camera.mount.camera_body_m
+            )
             expected_px = lab.camera.optics.project(truth.cam_from_lab.apply(offset_m[None]))
             np.testing.assert_allclose(truth.sources.xy_px[row], expected_px, atol=1e-6)
             strength = led_strength_e_s_sr(2e-3, "white", lab.camera.band)
@@ -148,7 +152,9 @@ def test_a_blinking_user_light_is_in_the_frames_in_which_it_is_lit() -> None:
             assert truth.sources.electrons[row] == pytest.approx(light_e, rel=1e-3)
 
 
-def test_the_check_counts_a_lighthouse_among_the_lights_that_the_tracker_does_not_know() -> None:
+def test_the_check_counts_a_lighthouse_among_the_lights_that_the_tracker_does_not_know() -> (
+    None
+):
     facts = check(lab_with(LAMP)).as_dict()["facts"]
     assert facts["other_lights"]["lighthouse"] == {"most": 1, "share": 0.5}
     same = check(build_lab(loader.load("afit_simsat", LEVEL))).as_dict()["facts"]
@@ -161,9 +167,13 @@ def test_a_curtain_hides_earlier_lights_and_the_forecast_names_it() -> None:
     lamp = LAMP.replace("[0 m, ", "[0.03 m, ")
     lab = lab_with(f"{lamp}, {{kind: curtain, beyond: 0.02 m}}")
     free = lab_with(lamp)
-    (_, truth), (_, open_truth) = (render_at_rest(one.camera, one.start, 1) for one in (lab, free))
+    (_, truth), (_, open_truth) = (
+        render_at_rest(one.camera, one.start, 1) for one in (lab, free)
+    )
     x_m = dict(
-        zip(lab.camera.sources.id.tolist(), lab.camera.sources.place[:, 0].tolist(), strict=True)
+        zip(
+            lab.camera.sources.id.tolist(), lab.camera.sources.place[:, 0].tolist(), strict=True
+        )
     ) | {LAMP_ID: 0.03}
     seen = [id for id in open_truth.sources.id.tolist() if x_m[id] <= 0.02]
     assert truth.sources.id.tolist() == seen
@@ -172,7 +182,9 @@ def test_a_curtain_hides_earlier_lights_and_the_forecast_names_it() -> None:
     counts = check(lab).as_dict()["facts"]["lights_in_the_field"]["frames"]
     assert set(counts["hidden"]) == {"the curtain"}
     promised = check(free).as_dict()["facts"]["lights_in_the_field"]["frames"]
-    assert counts["on_chip"] + counts["hidden"]["the curtain"] == pytest.approx(promised["on_chip"])
+    assert counts["on_chip"] + counts["hidden"]["the curtain"] == pytest.approx(
+        promised["on_chip"]
+    )
 
 
 def test_a_lighthouse_is_a_section_of_the_scene() -> None:
@@ -208,7 +220,9 @@ def test_user_lights_belong_to_the_hardware_of_every_run() -> None:
 # What the forecast knows
 
 
-BEHIND = "{kind: circular, altitude: 500 km, inclination_deg: 90, raan_deg: 83, argument_deg: 180}"
+BEHIND = (
+    "{kind: circular, altitude: 500 km, inclination_deg: 90, raan_deg: 83, argument_deg: 180}"
+)
 
 
 def test_the_forecast_and_the_run_agree_on_stars_behind_the_earth() -> None:
@@ -218,7 +232,9 @@ def test_the_forecast_and_the_run_agree_on_stars_behind_the_earth() -> None:
     checked = check(build_lab(scene))
     facts = checked.as_dict()["facts"]
     hidden = facts["lights_in_the_field"]["frames"]["hidden"]
-    free = check(build_lab(loader.load("shefex2", keys | {"orbit": BEHIND.replace("180", "0")})))
+    free = check(
+        build_lab(loader.load("shefex2", keys | {"orbit": BEHIND.replace("180", "0")}))
+    )
     promised = free.as_dict()["facts"]["lights_in_the_field"]["frames"]["on_chip"]
     assert hidden == {"the Earth": pytest.approx(promised, abs=1)}
     assert facts["lights_in_the_field"]["frames"]["mean"] == 0
@@ -271,5 +287,7 @@ def test_the_page_s_lighthouse_is_a_light(tmp_path: Path) -> None:
     assert block
     assert printed
     (tmp_path / block[1]).write_text(block[2], encoding="utf-8")
-    done = subprocess.run([sys.executable, block[1]], cwd=tmp_path, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, block[1]], cwd=tmp_path, capture_output=True, text=True
+    )
     assert done.stdout == printed[1], done.stderr

@@ -56,7 +56,9 @@ def test_stars_have_the_aberration_of_each_frame_s_velocity() -> None:
         still = star_camera.optics.project(
             truth.cam_from_lab.apply(stars.apparent(known, time)[chosen])
         )
-        moved = np.linalg.norm(still - truth.sources.xy_px, axis=1) / scene.camera.focal_px * 206265
+        moved = (
+            np.linalg.norm(still - truth.sources.xy_px, axis=1) / scene.camera.focal_px * 206265
+        )
         assert moved.mean() == pytest.approx(7617 / 299_792_458 * 206265, rel=0.05)
 
 
@@ -99,7 +101,11 @@ def test_a_satellite_ahead_on_the_same_orbit_is_seen(tmp_path: Path) -> None:
         "orbit": f"{{kind: tle, file: {path}, number: 1}}",
         "light__satellites": f"{{file: {path}}}",
     }
-    keys |= {"start_time": "2012-06-22T00:00:00", "exposure__frames": "1", "exposure__rate_hz": "1"}
+    keys |= {
+        "start_time": "2012-06-22T00:00:00",
+        "exposure__frames": "1",
+        "exposure__rate_hz": "1",
+    }
     lab = in_orbit(**keys)
     velocity = state_at(lab.camera.orbit, 0.0).velocity_m_s
     ra = np.degrees(np.arctan2(velocity[1], velocity[0])) % 360

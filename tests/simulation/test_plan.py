@@ -85,7 +85,9 @@ def test_the_check_uses_the_attitudes_of_the_planned_motion() -> None:
     assert np.degrees(np.abs(rates - frames.rate_body_rad_s)).max() < 0.1
     every = [0.005 + 1 + n / 2 for n in range(40)]
     fastest = max(np.linalg.norm(motion.rate_at(t_s)) for t_s in every)
-    assert np.linalg.norm(frames.rate_body_rad_s, axis=1).max() == pytest.approx(fastest, rel=0.01)
+    assert np.linalg.norm(frames.rate_body_rad_s, axis=1).max() == pytest.approx(
+        fastest, rel=0.01
+    )
 
 
 def test_checked_attitudes_are_uniform_up_to_the_largest_tilt_and_over_the_sky() -> None:
@@ -94,7 +96,9 @@ def test_checked_attitudes_are_uniform_up_to_the_largest_tilt_and_over_the_sky()
     frames = attitudes.of_frames(dome)
     reach = attitudes.within_reach(dome.scene, dome.camera.mount, frames)
     tilt_deg = multibody.tilt_deg(reach.lab_from_body)
-    assert tilt_deg.max() == pytest.approx(multibody.tilt_deg(frames.lab_from_body).max(), abs=1e-4)
+    assert tilt_deg.max() == pytest.approx(
+        multibody.tilt_deg(frames.lab_from_body).max(), abs=1e-4
+    )
     height = 1 - np.cos(np.radians(tilt_deg))
     assert np.median(height) == pytest.approx(height.max() / 2, rel=0.1)
     everywhere = attitudes.within_reach(sky.scene, sky.camera.mount, frames).lab_from_body
@@ -259,7 +263,10 @@ def test_the_cap_s_margin_at_the_tilt_stop_is_stated_and_a_study_is_warned_of_it
     assert "at a tilt of 30.0 deg" in warned
     free = check(lab_of("afit_simsat", motion__control="none", motion__maneuver="[]"))
     assert all(
-        "tilt stop" not in line for one in free.facts if one.name == "LED cap" for line in one.lines
+        "tilt stop" not in line
+        for one in free.facts
+        if one.name == "LED cap"
+        for line in one.lines
     )
 
 
@@ -309,7 +316,9 @@ def test_the_meaning_of_cross_and_sigma_is_stated() -> None:
     assert over_surveys in fact(surveyed, "expected error").lines
     assert over_surveys not in fact(exact, "expected error").lines
     assert [
-        one for one in fact(exact, "expected error").lines if one.startswith("cross: sqrt(x² + y²)")
+        one
+        for one in fact(exact, "expected error").lines
+        if one.startswith("cross: sqrt(x² + y²)")
     ]
 
 
@@ -411,7 +420,12 @@ def test_a_solver_s_own_error_is_listed_as_a_cause() -> None:
             "tracker.centroid_sigma_px",
             "1.3 times too small (NEES 5.4",
         ),
-        ("shefex2", {"tracker__limit_mag": "3"}, "tracker.limit_mag", "of the directions in reach"),
+        (
+            "shefex2",
+            {"tracker__limit_mag": "3"},
+            "tracker.limit_mag",
+            "of the directions in reach",
+        ),
         (
             "afit_simsat",
             {"tracker__brightest": "3"},
@@ -529,7 +543,9 @@ def test_following_the_advice_silences_the_warning(changes: dict[str, str], key:
         ("60 cd", ["camera.transmission"]),
     ],
 )
-def test_saturation_can_be_cured_by_light_exposure_or_lens(intensity: str, keys: list[str]) -> None:
+def test_saturation_can_be_cured_by_light_exposure_or_lens(
+    intensity: str, keys: list[str]
+) -> None:
     """Each cure alone ends the warning; LEDs 90 times too bright are not cured by f/76, nor 1,800 times by 3 us."""
     direct = {"light.led.drive": "{kind: direct}", "light.led.intensity": intensity}
 
@@ -569,7 +585,9 @@ def test_using_the_brightest_hundred_of_many_lights_is_not_warned_of() -> None:
         light__led__disk_diameter="1 mm",
     )
     result = check(dense)
-    assert "; the tracker uses the 100 brightest)" in fact(result, "lights in the field").lines[0]
+    assert (
+        "; the tracker uses the 100 brightest)" in fact(result, "lights in the field").lines[0]
+    )
     assert not [line for line in result.findings if "detects" in line]
 
 
@@ -585,7 +603,9 @@ def test_the_rate_at_which_smear_equals_image_width_is_stated() -> None:
     rate_deg_s = fact(result, "smear").values["width_rate_deg_s"]
     width_px = fact(result, "image size").values["width_px"]
     camera = loader.load("shefex2").camera
-    assert math.radians(rate_deg_s) * 0.04 * camera.focal_px == pytest.approx(width_px, rel=0.02)
+    assert math.radians(rate_deg_s) * 0.04 * camera.focal_px == pytest.approx(
+        width_px, rel=0.02
+    )
     assert "as long as the image is wide at" in fact(result, "smear").lines[0]
 
 
@@ -633,7 +653,10 @@ def test_similar_fields_are_those_that_the_tracker_refuses_as_ambiguous(layout: 
 def test_fields_of_coded_leds_are_not_called_similar() -> None:
     """The same spiral with its codes and without."""
     any_attitude = {"motion__control": "null", "motion__maneuver": "[]"}
-    settings = any_attitude | {"light__layout__count": "700", "tracker__survey__led_sigma": "1 mm"}
+    settings = any_attitude | {
+        "light__layout__count": "700",
+        "tracker__survey__led_sigma": "1 mm",
+    }
     without = check(
         lab_of("coded_spiral", **settings, light__led__code="null", tracker__decoder="null")
     )
@@ -655,10 +678,15 @@ def test_half_of_the_stars_at_the_limit_are_detected() -> None:
     for n in range(6):
         frame, truth = render_at_rest(lab.in_run(n).camera, Rotation.random(rng=rng))
         magnitude = dict(
-            zip(lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True)
+            zip(
+                lab.camera.sources.id.tolist(),
+                lab.camera.sources.magnitude.tolist(),
+                strict=True,
+            )
         )
         near = (
-            cKDTree(solve_frame(tracker, frame).centroids.xy_px).query(truth.sources.xy_px)[0] < 1.5
+            cKDTree(solve_frame(tracker, frame).centroids.xy_px).query(truth.sources.xy_px)[0]
+            < 1.5
         )
         v_mag = np.array([magnitude[hip] for hip in truth.sources.id.tolist()])
         found += near[np.abs(v_mag - limit + 0.5) < 0.25].tolist()
@@ -688,7 +716,9 @@ def test_the_centroid_floor_proposed_by_the_check_makes_claims_correct() -> None
     nees = [
         sky_warnings.claimed(
             *samples_of(
-                lab_of("shefex2", camera__detector__prnu="0.1", tracker__centroid_sigma_px=str(px))
+                lab_of(
+                    "shefex2", camera__detector__prnu="0.1", tracker__centroid_sigma_px=str(px)
+                )
             )
         )
         for px in (0.007, floor_px)
@@ -759,7 +789,9 @@ def test_a_shipped_plan_gives_no_warning(name: str) -> None:
 @pytest.mark.long
 def test_only_the_plans_with_saturated_and_too_few_leds_are_warned_of() -> None:
     """AFIT's tests of two and of five LEDs, as they were made, and of nine in a square, which looks alike turned."""
-    warned = {name for name in loader.list_scenes() if check(build_lab(loader.load(name))).findings}
+    warned = {
+        name for name in loader.list_scenes() if check(build_lab(loader.load(name))).findings
+    }
     assert {name.removesuffix("_ideal") for name in warned} == {
         "afit_test1",
         "afit_test2",
@@ -788,7 +820,10 @@ def test_a_profile_that_is_too_fast_is_refused_before_the_run(tmp_path: Path) ->
     file = tmp_path / "fast.csv"
     rows = [f"{t},0,0,{yaw}" for t, yaw in zip(t_s, yaw_deg, strict=True)]
     file.write_text("\n".join(["t_s,roll_deg,pitch_deg,yaw_deg", *rows]))
-    changes = {"motion__start": "profile", "motion__maneuver": f"[{{kind: profile, file: {file}}}]"}
+    changes = {
+        "motion__start": "profile",
+        "motion__maneuver": f"[{{kind: profile, file: {file}}}]",
+    }
     with pytest.raises(
         InputError, match=r"motion\.maneuver\.0: profile: needs a torque of .* times what the"
     ):

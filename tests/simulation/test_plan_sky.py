@@ -180,7 +180,9 @@ def test_detectable_reflections_in_the_wall_are_warned_of() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mount", [(20.0, -15.0, 5.0), (0.0, 0.0, 0.0)])
-def test_drift_is_a_rotation_of_the_mount_and_a_shift_of_the_dome(mount: tuple[float, ...]) -> None:
+def test_drift_is_a_rotation_of_the_mount_and_a_shift_of_the_dome(
+    mount: tuple[float, ...],
+) -> None:
     """25 K times the mount's coefficients, and a dome that creeps across by 1 mm, by first order about the bearing.
 
     A camera d from the dome, which is L from the bearing, sees a small turn w about the bearing as L w / d. So its own

@@ -133,7 +133,9 @@ def test_true_centroids_give_the_true_attitude(name: str, start: str) -> None:
     flight = quiet(name, start)
     _, truth = flight.render(0)
     assert (
-        error_deg(build_tracker(flight.lab.camera).solve_centroids(true_centroids(truth)), truth)
+        error_deg(
+            build_tracker(flight.lab.camera).solve_centroids(true_centroids(truth)), truth
+        )
         < 1e-6
     )
 
@@ -143,7 +145,9 @@ def test_true_centroids_under_the_dome_give_the_attitude_to_machine_precision() 
     flight = quiet("afit_simsat_ideal", ATTITUDES[1])
     _, truth = flight.render(0)
     assert (
-        error_deg(build_tracker(flight.lab.camera).solve_centroids(true_centroids(truth)), truth)
+        error_deg(
+            build_tracker(flight.lab.camera).solve_centroids(true_centroids(truth)), truth
+        )
         < 1e-12
     )
 
@@ -168,7 +172,9 @@ def test_a_known_distortion_causes_no_error() -> None:
     }
     flight = simulate_motion(loader.load("shefex2", QUIET_SKY | lens))
     frame, truth = flight.render(0)
-    assert error_deg(build_tracker(flight.lab.camera).solve(frame.image_dn).attitude, truth) < 1e-6
+    assert (
+        error_deg(build_tracker(flight.lab.camera).solve(frame.image_dn).attitude, truth) < 1e-6
+    )
 
 
 def test_a_wrong_lever_causes_the_reference_s_error() -> None:
@@ -247,7 +253,9 @@ def test_shutters_open_at_their_scheduled_times() -> None:
     windows = [exposure_window(loader.load("shefex2"), k) for k in (0, 1, 39)]
     assert [when.open_s for when in windows] == pytest.approx([0.1, 0.2, 4.0], abs=1e-12)
     assert {when.exposure_s for when in windows} == {0.040}
-    assert [when.close_s(493) for when in windows] == pytest.approx([0.14, 0.24, 4.04], abs=1e-12)
+    assert [when.close_s(493) for when in windows] == pytest.approx(
+        [0.14, 0.24, 4.04], abs=1e-12
+    )
 
 
 def test_a_rolling_shutter_s_truth_is_at_its_middle_row() -> None:
@@ -270,7 +278,8 @@ def test_a_rolling_shutter_s_truth_is_at_its_middle_row() -> None:
         answer = report.attitude
         assert answer.cam_from_ref is not None
         errors.append(
-            np.degrees(metrics.cross_and_roll_rad(answer.cam_from_ref, truth.cam_from_lab)) * 3600
+            np.degrees(metrics.cross_and_roll_rad(answer.cam_from_ref, truth.cam_from_lab))
+            * 3600
         )
     # At the first row's time the boresight was 35 arcsec from this.
     assert errors[0][0] < 10
@@ -301,10 +310,13 @@ def test_jitter_moves_the_camera_by_its_declared_rms() -> None:
     """100 arcsec rms about the body's x, at 20 Hz: the path's turns away from the unshaken one have that rms."""
     line = "[{kind: line, frequency_hz: 20, rms_arcsec: [100, 0, 0]}]"
     still, shaken = (
-        flown("shefex2", exposure__frames="11", motion__jitter=j).trajectory() for j in ("[]", line)
+        flown("shefex2", exposure__frames="11", motion__jitter=j).trajectory()
+        for j in ("[]", line)
     )
     t_s = np.linspace(0, 1, 2000, endpoint=False)  # twenty whole periods
-    turned = np.degrees((still.attitude_at(t_s).inv() * shaken.attitude_at(t_s)).as_rotvec()) * 3600
+    turned = (
+        np.degrees((still.attitude_at(t_s).inv() * shaken.attitude_at(t_s)).as_rotvec()) * 3600
+    )
     np.testing.assert_allclose(
         np.sqrt(np.mean(turned**2, axis=0)), [100, 0, 0], rtol=1e-3, atol=1e-3
     )
@@ -406,7 +418,9 @@ def test_the_tracker_s_camera_is_the_true_one_by_default() -> None:
     believed = onboard_model.assumed_camera(loaded)
     lens = Optics.from_camera(loaded.camera)
     vectors = Rotation.from_rotvec([0.05, -0.08, 0]).apply([[0, 0, 1.0], [0.02, 0, 1.0]])
-    np.testing.assert_allclose(believed.pixels(vectors), lens.project(vectors), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(
+        believed.pixels(vectors), lens.project(vectors), rtol=0, atol=1e-10
+    )
     longer = onboard_model.assumed_camera(
         loader.load("shefex2", {"tracker.assumed_focal_length": "25.25 mm"})
     )
@@ -513,11 +527,13 @@ def test_a_bright_body_shortens_the_exposure_and_turning_away_restores_the_stars
 @pytest.mark.slow
 def test_frames_that_the_filter_used_are_rendered_again_with_the_same_exposures() -> None:
     given = {"vehicle__imu": "{}", "filter": "{start_deg: 0.1}", "motion__control": "none"}
-    growing = (
-        "{mean_dn: 4000, min_stars: 100000, step: 1 ms, longest: 7 ms, overexposed_objects: 100000}"
-    )
+    growing = "{mean_dn: 4000, min_stars: 100000, step: 1 ms, longest: 7 ms, overexposed_objects: 100000}"
     exposure = '{time: "4 ms", rate_hz: 5, frames: 5}'
-    given |= {"motion__maneuver": "[]", "exposure": exposure, "tracker__exposure_control": growing}
+    given |= {
+        "motion__maneuver": "[]",
+        "exposure": exposure,
+        "tracker__exposure_control": growing,
+    }
     flight = open_flight(changed("afit_simsat", **given))
     shots = list(flight.shots())
     assert exposures_ms(shots) == pytest.approx([4, 5, 6, 7, 7], abs=1e-9)

@@ -45,7 +45,9 @@ def test_streaks_are_as_long_and_as_bright_as_their_satellites() -> None:
     assert np.count_nonzero(inside) >= 2
     for n in np.flatnonzero(inside):
         expected_px = (
-            np.radians(light[rows.id[n]].rate_deg_s) * lab.scene.exposure.time_s * camera.focal_px
+            np.radians(light[rows.id[n]].rate_deg_s)
+            * lab.scene.exposure.time_s
+            * camera.focal_px
         )
         assert rows.streak_px[n] == pytest.approx(expected_px, rel=0.03)
     assert np.ptp(rows.electrons[inside]) < 0.02 * rows.electrons[inside].max()
@@ -60,7 +62,13 @@ def test_a_satellite_has_its_row_and_its_details_in_the_header(tmp_path: Path) -
     assert [entry["id"] for entry in table.meta["satellites"]] == table["id"][
         table["id"] >= ID_BASE
     ].tolist()
-    assert set(table.meta["satellites"][0]) >= {"name", "v_mag", "rate_deg_s", "range_km", "sunlit"}
+    assert set(table.meta["satellites"][0]) >= {
+        "name",
+        "v_mag",
+        "rate_deg_s",
+        "range_km",
+        "sunlit",
+    }
 
 
 def test_a_file_requires_a_place_on_the_ground_or_in_orbit(tmp_path: Path) -> None:

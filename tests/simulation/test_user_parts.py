@@ -49,13 +49,16 @@ def attitudes(columns: dict[str, np.ndarray]) -> Rotation:
 def moved(
     scene: str = "afit_simsat", changes: dict[str, Any] | None = None, **parts: Any
 ) -> Flight:
-    return open_flight(skysim.load_scene(scene, ONE | (changes or {})), **parts).simulate_motion()
+    return open_flight(
+        skysim.load_scene(scene, ONE | (changes or {})), **parts
+    ).simulate_motion()
 
 
 def profile_scene(folder: Path, columns: dict[str, np.ndarray], **changes: Any) -> Path:
     """A scene file in a folder with the profile beside it."""
     rows = "".join(
-        ",".join(map(repr, row)) + "\n" for row in np.column_stack(list(columns.values())).tolist()
+        ",".join(map(repr, row)) + "\n"
+        for row in np.column_stack(list(columns.values())).tolist()
     )
     (folder / "swing.csv").write_text(",".join(columns) + "\n" + rows)
     (folder / "mine.yaml").write_text(
@@ -120,7 +123,10 @@ def test_a_prescribed_motion_is_measured_by_the_gyros() -> None:
             {"motion.control": {"law": "prescribed", "actuators": "wheels"}},
             "actuators has no effect with law prescribed",
         ),
-        ({"motion.start": "profile"}, "start: profile requires a first maneuver of kind profile"),
+        (
+            {"motion.start": "profile"},
+            "start: profile requires a first maneuver of kind profile",
+        ),
         ({"motion.start": "rest"}, "motion.start: 'rest' is not allowed; allowed: 'profile'"),
         (
             {"motion.maneuver": [{"kind": "slew", "roll_deg": 40}], "exposure.frames": 30},
@@ -141,21 +147,31 @@ def test_keys_that_contradict_a_prescribed_motion_are_refused(
 @pytest.mark.slow
 def test_a_table_is_followed_exactly_without_a_controller_and_closely_with_one() -> None:
     columns = swing(TIMES)
-    exact = moved("afit_simsat", {"motion.control": None, "motion.maneuver": []}, profile=columns)
+    exact = moved(
+        "afit_simsat", {"motion.control": None, "motion.maneuver": []}, profile=columns
+    )
     assert exact.lab.scene.motion.is_prescribed
-    assert angle(exact.trajectory().attitude_at(TIMES[:20]), attitudes(columns)[:20]).max() < 1e-12
+    assert (
+        angle(exact.trajectory().attitude_at(TIMES[:20]), attitudes(columns)[:20]).max() < 1e-12
+    )
     flown = moved("afit_simsat", {"motion.control": "pid"}, profile=columns)
-    off_deg = np.degrees(angle(flown.trajectory().attitude_at(TIMES[:20]), attitudes(columns)[:20]))
+    off_deg = np.degrees(
+        angle(flown.trajectory().attitude_at(TIMES[:20]), attitudes(columns)[:20])
+    )
     assert 1e-6 < off_deg.max() < 0.02
 
 
 @pytest.mark.slow
-def test_a_profile_beside_its_scene_starts_the_vehicle_and_ends_in_a_hold(tmp_path: Path) -> None:
+def test_a_profile_beside_its_scene_starts_the_vehicle_and_ends_in_a_hold(
+    tmp_path: Path,
+) -> None:
     """Named relative to the scene; the vehicle starts on it, moving; then the next maneuver."""
     columns = swing(np.arange(1.0, 4.05, 0.1))
     columns["t_s"] = columns["t_s"] - 1.0
     path = profile_scene(tmp_path, columns)
-    flight = simulate_motion(loader.load(path, {"exposure.frames": "1", "exposure.first": "3.5 s"}))
+    flight = simulate_motion(
+        loader.load(path, {"exposure.frames": "1", "exposure.first": "3.5 s"})
+    )
     motion = flight.trajectory()
     assert angle(motion.lab_from_body[0], attitudes(columns)[0]) < 1e-9
     assert np.degrees(np.linalg.norm(motion.rate_body_rad_s[0])) > 3
@@ -180,7 +196,8 @@ def test_an_error_in_a_profile_names_the_lines_of_file_and_scene(tmp_path: Path)
     )
     table.unlink()
     with pytest.raises(
-        InputError, match=r"motion.maneuver.0.file: .*swing.csv' is not a file; .*mine.yaml, line 7"
+        InputError,
+        match=r"motion.maneuver.0.file: .*swing.csv' is not a file; .*mine.yaml, line 7",
     ):
         loader.load(path)
 
@@ -256,7 +273,9 @@ def test_a_chirp_beyond_the_vehicle_or_the_control_rate_is_refused() -> None:
     with pytest.raises(
         InputError, match=r"a chirp of 60 Hz requires a motion\.control\.rate_hz above 120"
     ):
-        loader.load("afit_simsat", {"motion.maneuver": str(chirp(from_hz=60.0)["motion.maneuver"])})
+        loader.load(
+            "afit_simsat", {"motion.maneuver": str(chirp(from_hz=60.0)["motion.maneuver"])}
+        )
     for wrong, message in (
         ({"to_hz": 0.5}, "from_hz and to_hz are both 0.5"),
         ({"duration": "2.9 s"}, "shorter than a period"),
@@ -265,7 +284,9 @@ def test_a_chirp_beyond_the_vehicle_or_the_control_rate_is_refused() -> None:
             skysim.load_scene("afit_simsat", chirp(**wrong))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("sweep", "middle_hz"), [("linear", 1.75), ("log", math.sqrt(0.5 * 3.0))])
+@pytest.mark.parametrize(
+    ("sweep", "middle_hz"), [("linear", 1.75), ("log", math.sqrt(0.5 * 3.0))]
+)
 def test_a_chirp_has_its_declared_frequency(sweep: str, middle_hz: float) -> None:
     """From zero crossings of the angle half way: amplitude and period of the oscillation there."""
     element = {
@@ -308,10 +329,17 @@ def test_a_run_exported_and_flown_again_has_the_same_centroids(
     flown = skysim.simulate(scene)
     folder = flown.save(tmp_path)
     run_export.export(
-        recording.open_recording(folder), ["aem"], folder, lambda items, count, label: iter(items)
+        recording.open_recording(folder),
+        ["aem"],
+        folder,
+        lambda items, count, label: iter(items),
     )
     profile = [{"kind": "profile", "file": str(folder / file)}]
-    motion = {"motion.start": "profile", "motion.rate_deg_s": [0, 0, 0], "motion.maneuver": profile}
+    motion = {
+        "motion.start": "profile",
+        "motion.rate_deg_s": [0, 0, 0],
+        "motion.maneuver": profile,
+    }
     again = skysim.simulate(
         skysim.load_scene(
             name, {"exposure.frames": 4, "motion.control": "prescribed"} | changes | motion
@@ -370,7 +398,9 @@ def test_a_function_of_an_image_is_a_tracker(sky: Run) -> None:
         (ZeroDivisionError("by\nday"), "failed: ZeroDivisionError: by day"),
     ],
 )
-def test_an_exception_of_a_tracker_function_is_the_frame_s_status(answer: Any, status: str) -> None:
+def test_an_exception_of_a_tracker_function_is_the_frame_s_status(
+    answer: Any, status: str
+) -> None:
     def mine(image: np.ndarray) -> Any:
         if isinstance(answer, Exception):
             raise answer

@@ -48,7 +48,8 @@ def horizontal(axes: Floats, directions: Floats) -> tuple[Floats, Floats]:
 
 @pytest.mark.parametrize("place", SITES)
 @pytest.mark.parametrize(
-    "weather", [(1013.25, 15.0, 0.5, 550.0), (980.0, -10.0, 0.0, 450.0), (700.0, 5.0, 0.9, 900.0)]
+    "weather",
+    [(1013.25, 15.0, 0.5, 550.0), (980.0, -10.0, 0.0, 450.0), (700.0, 5.0, 0.9, 900.0)],
 )
 def test_refraction_matches_astropy(
     place: tuple[float, float, float], weather: tuple[float, ...]
@@ -109,11 +110,15 @@ def test_refraction_on_the_horizon_is_half_a_degree() -> None:
     """The Nautical Almanac's 34' at 1010 hPa and 10 C; a table is as good as the integral, and no air bends nothing."""
     weather = Weather(0.0, np.radians(45.0), 1010.0, 10.0, 0.5, 590e-9)
     air = Atmosphere.from_weather(weather)
-    assert refraction_rad(np.array([np.pi / 2]), air)[0] / ARCSEC / 60 == pytest.approx(34, abs=1)
+    assert refraction_rad(np.array([np.pi / 2]), air)[0] / ARCSEC / 60 == pytest.approx(
+        34, abs=1
+    )
     zenith_rad = np.radians(np.linspace(0.1, 89.9, 300))
     bending_rad = refraction_rad(zenith_rad, air)
     np.testing.assert_allclose(
-        Refraction(weather).bending_rad(zenith_rad + bending_rad), bending_rad, atol=1e-3 * ARCSEC
+        Refraction(weather).bending_rad(zenith_rad + bending_rad),
+        bending_rad,
+        atol=1e-3 * ARCSEC,
     )
     none = Refraction(weather._replace(pressure_hpa=0.0))
     assert not none.bending_rad(zenith_rad).any()
@@ -209,6 +214,8 @@ def test_refraction_uses_the_band_s_wavelength() -> None:
     """Of a flat band from 400 to 1000 nm by Planck's law at 5772 K, counted in photons."""
     m = np.linspace(400e-9, 1000e-9, 2001)
     photons = m**-4 / np.expm1(0.014387769 / (m * 5772))
-    assert mean_wavelength_m(BAND) == pytest.approx(np.sum(m * photons) / np.sum(photons), abs=2e-9)
+    assert mean_wavelength_m(BAND) == pytest.approx(
+        np.sum(m * photons) / np.sum(photons), abs=2e-9
+    )
     narrow = Band(np.array([500e-9, 501e-9]), np.ones(2))
     assert mean_wavelength_m(narrow) == pytest.approx(500.5e-9, abs=0.1e-9)

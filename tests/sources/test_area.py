@@ -18,7 +18,9 @@ def surface(**config: object) -> Surface:
 @pytest.mark.parametrize(
     ("apex_m", "radius_m", "cap_deg"), [(1.2, 1.2, 40), (1.2, 1.0, 70), (1.5, 3.0, 90)]
 )
-def test_a_cap_of_a_sphere_has_two_pi_r_h(apex_m: float, radius_m: float, cap_deg: float) -> None:
+def test_a_cap_of_a_sphere_has_two_pi_r_h(
+    apex_m: float, radius_m: float, cap_deg: float
+) -> None:
     """Also where the bearing is not in the sphere's center: h is from the apex to the cap's edge."""
     center_m = apex_m - radius_m
     tilt_rad = math.radians(cap_deg)

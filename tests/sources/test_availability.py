@@ -54,7 +54,12 @@ def test_the_free_share_of_an_inertial_boresight_matches_trigonometry(
 
 def test_a_boresight_off_the_zenith_keeps_its_angle_to_the_limb(sphere: CircularOrbit) -> None:
     found = sample(
-        sphere, START, revolution_s(sphere)[::40], Pointing("zenith", POLE[0], 0.6, 1.1), POLE, 0.1
+        sphere,
+        START,
+        revolution_s(sphere)[::40],
+        Pointing("zenith", POLE[0], 0.6, 1.1),
+        POLE,
+        0.1,
     )
     limb_deg = 180 - np.degrees(np.arcsin(EARTH_RADIUS_M / (EARTH_RADIUS_M + 700e3)) + 0.6)
     assert found.earth_deg == pytest.approx(np.full(500, limb_deg), abs=1e-6)

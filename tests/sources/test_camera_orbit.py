@@ -11,7 +11,11 @@ import pytest
 from skysim.core.constants import EARTH_MU_M3_S2, EARTH_RADIUS_M
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.scene.sections.surroundings import CircularOrbitConfig, OemOrbitConfig, TleOrbitConfig
+from skysim.scene.sections.surroundings import (
+    CircularOrbitConfig,
+    OemOrbitConfig,
+    TleOrbitConfig,
+)
 from skysim.sources import orbit_elements
 from skysim.sources.camera_orbit import CircularOrbit, build_orbit, state_at
 
@@ -61,7 +65,9 @@ def ellipse(t_s: Floats) -> tuple[Floats, Floats]:
     n = np.sqrt(EARTH_MU_M3_S2 / a**3)
     anomaly = n * t_s
     for _ in range(20):
-        anomaly = anomaly - (anomaly - e * np.sin(anomaly) - n * t_s) / (1 - e * np.cos(anomaly))
+        anomaly = anomaly - (anomaly - e * np.sin(anomaly) - n * t_s) / (
+            1 - e * np.cos(anomaly)
+        )
     across = np.sqrt(1 - e**2)
     rate = n / (1 - e * np.cos(anomaly))
     plane = np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
@@ -78,7 +84,9 @@ def test_a_circular_orbit_has_its_radius_speed_and_plane() -> None:
         np.sqrt(EARTH_MU_M3_S2 / radius_m[0]), rel=2e-3
     )
     normal = np.cross(states.position_m[0], states.velocity_m_s[0])
-    assert normal[2] / np.linalg.norm(normal) == pytest.approx(np.cos(np.radians(97.4)), abs=3e-4)
+    assert normal[2] / np.linalg.norm(normal) == pytest.approx(
+        np.cos(np.radians(97.4)), abs=3e-4
+    )
     start = states.position_m[0] / radius_m[0]
     assert start[2] == pytest.approx(np.sin(np.radians(40)) * np.sin(np.radians(97.4)))
 
@@ -113,7 +121,9 @@ def test_an_oem_is_interpolated_between_its_samples(
         orbit.states(between), ellipse(between), (3e-3, 2e-4), strict=True
     ):
         assert np.abs(found - expected).max() < limit
-    with pytest.raises(InputError, match=r"is from -600 to 5880 s after start_time, not at 7000 s"):
+    with pytest.raises(
+        InputError, match=r"is from -600 to 5880 s after start_time, not at 7000 s"
+    ):
         state_at(orbit, 7000.0)
 
 
@@ -128,7 +138,9 @@ def test_an_oem_is_interpolated_between_its_samples(
         ("META_START\n", "", "line 5: META_STOP before META_START"),
     ],
 )
-def test_a_bad_oem_is_refused_in_one_line(old: str, new: str, message: str, tmp_path: Path) -> None:
+def test_a_bad_oem_is_refused_in_one_line(
+    old: str, new: str, message: str, tmp_path: Path
+) -> None:
     path = tmp_path / "orbit.oem"
     t_s = np.array([0.0, 60.0])
     path.write_text(oem_text(t_s, *ellipse(t_s)).replace(old, new, 1), encoding="utf-8")

@@ -123,9 +123,13 @@ def test_stars_missing_in_hipparcos_2_are_supplied(
     years = 2000.0 - stars.epoch_jyear
     dec = stars.dec_rad[n] + stars.pm_dec_rad_yr[n] * years
     ra = stars.ra_rad[n] + stars.pm_ra_rad_yr[n] * years / np.cos(dec)
-    off = np.degrees([(ra - np.radians(ra_deg)) * np.cos(dec), dec - np.radians(dec_deg)]) * 3600
+    off = (
+        np.degrees([(ra - np.radians(ra_deg)) * np.cos(dec), dec - np.radians(dec_deg)]) * 3600
+    )
     assert np.abs(off).max() < 2.0
-    assert stars.v_mag[n] == pytest.approx(v_mag, abs=0.13)  # Gaia saturates on the two of xi UMa
+    assert stars.v_mag[n] == pytest.approx(
+        v_mag, abs=0.13
+    )  # Gaia saturates on the two of xi UMa
 
 
 def test_no_star_is_listed_twice(stars: Catalog) -> None:

@@ -44,11 +44,17 @@ def test_an_led_is_lit_by_its_controller_s_own_clock() -> None:
     """Against tau(t) = tau_0 + (1 + y) t + d t^2 / 2, in steps of a microsecond."""
     leds = pulsed_sources(12)
     clocks = Clocks(
-        np.array([10.0, 20.003, 1234.5]), np.array([5e-3, -2e-3, 0.0]), np.array([1e-6, 0.0, -3e-6])
+        np.array([10.0, 20.003, 1234.5]),
+        np.array([5e-3, -2e-3, 0.0]),
+        np.array([1e-6, 0.0, -3e-6]),
     )
     middle_s = 700.00037  # no whole number of periods
     t_s = middle_s + np.arange(-5e-3, 5e-3, 1e-6)
-    tau = clocks.on_s + (1 + clocks.offset) * t_s[:, None] + clocks.drift_s * t_s[:, None] ** 2 / 2
+    tau = (
+        clocks.on_s
+        + (1 + clocks.offset) * t_s[:, None]
+        + clocks.drift_s * t_s[:, None] ** 2 / 2
+    )
     lit = np.mod(tau[:, leds.clock] - leds.start_s, leds.period_s) < leds.on_s
     trains = clocks.pulses_at(leds, middle_s)
     for n in range(len(leds)):
@@ -61,7 +67,9 @@ def test_an_led_is_lit_by_its_controller_s_own_clock() -> None:
             np.array(
                 [
                     lit_moments_s(
-                        t, t + 1e-9, *(x[n] for x in (trains.period_s, trains.start_s, trains.on_s))
+                        t,
+                        t + 1e-9,
+                        *(x[n] for x in (trains.period_s, trains.start_s, trains.on_s)),
                     )[0]
                     for t in t_s[::97]
                 ]
@@ -126,7 +134,9 @@ def test_filtered_leds_do_not_flicker() -> None:
             "exposure.time": "1.5 ms",
         }
         lab = build_lab(
-            loader.load("afit_simsat_ideal", AT_REST | drive | {"camera.detector.noise": "false"})
+            loader.load(
+                "afit_simsat_ideal", AT_REST | drive | {"camera.detector.noise": "false"}
+            )
         )
         truths = [render_at_rest(lab.camera, Rotation.identity(), k)[1] for k in range(6)]
         electrons = np.array([truth.sources.electrons for truth in truths])
@@ -153,7 +163,9 @@ def test_flicker_differs_from_frame_to_frame_and_from_run_to_run() -> None:
         lab = build_lab(loader.load("afit_simsat", AT_REST | {"seed": seed}))
         for index in (0, 40, 80):
             sources = render_at_rest(lab.camera, lab.start, index)[1].sources
-            frames.append(dict(zip(sources.id.tolist(), sources.electrons.tolist(), strict=True)))
+            frames.append(
+                dict(zip(sources.id.tolist(), sources.electrons.tolist(), strict=True))
+            )
     ids = sorted(set.intersection(*map(set, frames)))
     electrons = np.array([[frame[n] for n in ids] for frame in frames])
     dimmed = electrons.std(axis=0) > 1e-6 * electrons.mean(axis=0)
@@ -166,7 +178,9 @@ def test_flicker_differs_from_frame_to_frame_and_from_run_to_run() -> None:
 @pytest.mark.slow
 def test_exposure_starts_and_time_tags_have_the_declared_errors() -> None:
     keys = {"trigger_jitter": "400 us", "time_tag_offset": "1 ms", "time_tag_jitter": "200 us"}
-    scene = loader.load("afit_simsat", {f"exposure.{key}": value for key, value in keys.items()})
+    scene = loader.load(
+        "afit_simsat", {f"exposure.{key}": value for key, value in keys.items()}
+    )
     indices = range(2000)
     late_s = np.array(
         [exposure_window(scene, k).open_s - scene.exposure.first_s - k / 2 for k in indices]
@@ -192,7 +206,9 @@ def test_the_filter_allows_for_the_tag_s_error_along_the_motion() -> None:
     overrides = {"filter.time_tag_sigma": "1 ms"}
     covariance = []
     for changes in (overrides, {}):
-        flight = open_flight(loader.load("simsat_bump", {"filter.time_tag_sigma": "0 s"} | changes))
+        flight = open_flight(
+            loader.load("simsat_bump", {"filter.time_tag_sigma": "0 s"} | changes)
+        )
         navigation = flight.motion.navigation
         assert navigation is not None
         assert navigation.filter is not None

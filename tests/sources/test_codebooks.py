@@ -87,7 +87,9 @@ def test_an_error_by_one_level_is_one_wrong_bit(levels: int, bits: int) -> None:
 def test_levels_are_equally_spaced_in_magnitude() -> None:
     code = PlainCodeConfig(kind="gray", levels=4, depth=0.9)
     light = codebooks.light_levels(code, np.arange(4))
-    np.testing.assert_allclose(-2.5 * np.log10(light), [2.5, 5 / 3, 5 / 6, 0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        -2.5 * np.log10(light), [2.5, 5 / 3, 5 / 6, 0], rtol=0, atol=1e-12
+    )
     two = PlainCodeConfig(kind="gray", depth=0.3)
     np.testing.assert_array_equal(codebooks.light_levels(two, np.arange(2)), [0.7, 1.0])
 
@@ -109,7 +111,9 @@ def test_a_few_frames_or_neighbors_of_a_de_bruijn_sequence_are_unique(
         len({tuple(word.tolist()) for word in words[:, 17 % levels**k : 17 % levels**k + k]})
         >= count - k
     )
-    np.testing.assert_array_equal(words[1:, :-1], words[:-1, 1:])  # the light moves along the LEDs
+    np.testing.assert_array_equal(
+        words[1:, :-1], words[:-1, 1:]
+    )  # the light moves along the LEDs
 
 
 @pytest.mark.parametrize("distance", [5, 7])
@@ -155,6 +159,7 @@ def test_generator_polynomials_match_the_published_ones(
 
 def test_a_code_with_too_few_words_is_refused() -> None:
     with pytest.raises(
-        InputError, match=r"light.led.code: 70000 LEDs; allowed: at most the \d+ words of kind gold"
+        InputError,
+        match=r"light.led.code: 70000 LEDs; allowed: at most the \d+ words of kind gold",
     ):
         codebook(PlainCodeConfig(kind="gold"), 70_000)

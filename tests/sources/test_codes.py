@@ -46,7 +46,9 @@ def test_an_exposure_has_the_mean_light_of_its_bits(open_s: float, exposure_s: f
         % shown.words.shape[1]
     )
     expected = np.where(shown.words[:, bit], 1.0, 0.4).mean(axis=1)
-    np.testing.assert_allclose(shown.mean_level(open_s, exposure_s, 0), expected, rtol=0, atol=2e-4)
+    np.testing.assert_allclose(
+        shown.mean_level(open_s, exposure_s, 0), expected, rtol=0, atol=2e-4
+    )
 
 
 def test_bits_fail_at_the_stated_rate_independently() -> None:
@@ -69,7 +71,8 @@ def test_a_bit_of_several_levels_fails_to_any_other_level() -> None:
     shown = LedCodes(words, code, None, 3)
     light = light_levels(code, np.arange(4))
     steps = [
-        (np.abs(shown.level(n)[:, None] - light).argmin(axis=1) - words[:, n % words.shape[1]]) % 4
+        (np.abs(shown.level(n)[:, None] - light).argmin(axis=1) - words[:, n % words.shape[1]])
+        % 4
         for n in range(100)
     ]
     share = np.bincount(np.concatenate(steps).astype(int), minlength=4) / 40_000
@@ -96,7 +99,11 @@ def test_a_run_s_code_phase_is_random_and_its_clock_belongs_to_the_hardware() ->
 
 def test_a_rendered_led_has_the_light_of_its_bits() -> None:
     """The same attitude in frames of different bits; the electrons of the truth, per LED, over those of another."""
-    settings = {"light.led.code.depth": "0.25", "motion.control": "null", "motion.maneuver": "[]"}
+    settings = {
+        "light.led.code.depth": "0.25",
+        "motion.control": "null",
+        "motion.maneuver": "[]",
+    }
     lab = build_lab(loader.load(SCENE, settings))
     truths = [render_at_rest(lab.camera, lab.start, index)[1].sources for index in (2, 9)]
     assert len(truths[0].id) >= 3

@@ -29,7 +29,12 @@ FOOT_M = 0.3048
 BAND = Band.from_efficiency("interline")
 TIME = datetime.datetime(2012, 6, 22, 21)
 LED = {"intensity": "13 ucd", "disk_diameter": "0.3 mm", "drive": {"kind": "direct"}}
-FLAT = {"kind": "flat", "apex": "1.4 m", "offset": ["50 mm", "-20 mm", "0 m"], "tilt_deg": [4, -3]}
+FLAT = {
+    "kind": "flat",
+    "apex": "1.4 m",
+    "offset": ["50 mm", "-20 mm", "0 m"],
+    "tilt_deg": [4, -3],
+}
 APL = {"kind": "sphere", "apex": "4 ft", "radius": "4 ft"}
 EVERYWHERE = {"kind": "random", "cap_deg": 4, "count": 2000}
 PANEL = {"kind": "lcd", "pixels": [1680, 1050], "pitch": "0.258 mm", "points": EVERYWHERE}
@@ -130,7 +135,9 @@ def test_stars_are_centered_in_blocks_of_pixels_on_the_panel(block: int) -> None
     pitches = own[:, :2] / 0.258e-3 - (block % 2) / 2
     np.testing.assert_allclose(pitches, np.rint(pitches), rtol=0, atol=1e-9)
     normal = lit(EVERYWHERE | {"count": 1}).normal[0]
-    np.testing.assert_allclose(drawn.normal, np.tile(normal, (len(drawn), 1)), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        drawn.normal, np.tile(normal, (len(drawn), 1)), rtol=0, atol=1e-14
+    )
     off_m = own[:, :2] - own_m(wanted.place)[drawn.id, :2]
     assert np.abs(off_m).max() <= 0.129e-3 * (1 + 1e-9)
     np.testing.assert_allclose(drawn.strength, block**2 * led_e_s_sr(), rtol=1e-12, atol=0)
@@ -235,7 +242,9 @@ def test_pixels_of_a_row_light_up_together_and_rows_one_after_another() -> None:
 
 
 @pytest.mark.parametrize("duty", [0.002, 0.1, 0.3])
-@pytest.mark.parametrize(("frames", "part"), [(0, 0.5), (1, 0.4), (2, 0.6), (7, 0.35), (20, 0.65)])
+@pytest.mark.parametrize(
+    ("frames", "part"), [(0, 0.5), (1, 0.4), (2, 0.6), (7, 0.35), (20, 0.65)]
+)
 def test_a_panel_s_flicker_matches_the_reference(duty: float, frames: int, part: float) -> None:
     """Reference 1.3: sqrt(f (1 - f) - w / 3) / (n + f) for pulses of a share w <= f <= 1 - w, over all beginnings."""
     got = light_s(refreshed(duty), (frames + part) / 60)
@@ -430,7 +439,10 @@ def test_a_black_panel_has_the_light_of_all_pixels_over_the_contrast() -> None:
 
 def test_a_black_bench_has_the_light_of_the_display_pixels_within_each_chip_pixel() -> None:
     """A pixel of the chip holds (81.7 / 37.1)^2 of the display's, each 1 / contrast of a white star; none beside it."""
-    changes = {"light.contrast": "400", "motion.start": "{roll_deg: 0, pitch_deg: 0, yaw_deg: 0}"}
+    changes = {
+        "light.contrast": "400",
+        "motion.start": "{roll_deg: 0, pitch_deg: 0, yaw_deg: 0}",
+    }
     lab = build_lab(loader.load("collimated_display", changes))
     glow = glow_e_s(lab)
     camera = lab.scene.camera
@@ -542,7 +554,11 @@ def test_a_wrong_panel_is_refused_in_one_line(overrides: dict[str, str], says: s
             {"light.catalog": "gaia"},
             "light.catalog: unknown catalog 'gaia'; allowed:",
         ),
-        ("collimated_display", {"light.conjugate": "1 m"}, "light.conjugate: '1 m' is not allowed"),
+        (
+            "collimated_display",
+            {"light.conjugate": "1 m"},
+            "light.conjugate: '1 m' is not allowed",
+        ),
         (
             "collimated_display",
             {"motion.start": "{ra_deg: 0, dec_deg: 0, roll_deg: 0}"},

@@ -19,7 +19,11 @@ from skysim.sources.dome.surface import SURFACES, Ellipsoid, Plane
 from skysim.sources.photometry import Band, led_strength_e_s_sr
 
 INCH_M = 0.0254
-MEASURED = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38.88 in", "38.88 in", "28.60 in"]}
+MEASURED = {
+    "kind": "ellipsoid",
+    "apex": "48 in",
+    "semi_axes": ["38.88 in", "38.88 in", "28.60 in"],
+}
 SPHERE = {
     "kind": "sphere",
     "apex": "48 in",
@@ -183,7 +187,9 @@ def test_boards_are_flat_tangent_and_touch_the_surface_at_their_middle(afit: Sou
     assert len(middle) > 50
     quadric = np.sum(((middle.place[:, :3] - made.center_m) / made.semi_axes_m) ** 2, axis=1)
     np.testing.assert_allclose(quadric, 1, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(middle.normal, made.inward(middle.place[:, :3]), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        middle.normal, made.inward(middle.place[:, :3]), rtol=0, atol=1e-14
+    )
     height = np.einsum("nj,nj->n", afit.place[:, :3], afit.normal)
     spread = [np.ptp(height[board_of(afit) == b]) for b in np.unique(board_of(afit))]
     assert max(spread) < 1e-14
@@ -253,7 +259,9 @@ def logs(leds: Sources) -> np.ndarray:
 @pytest.mark.parametrize("scatter", [0.07, 0.09])
 def test_intensities_scatter_as_declared(scatter: float) -> None:
     """Lognormal, as AFIT's Table 2 (reference A8: 7-9 %): moments of the logarithm to four of their sigmas."""
-    drawn = logs(lit_dome(led=LED | {"scatter": scatter}, lit=[9, 9], spacing="1.5 in")) / scatter
+    drawn = (
+        logs(lit_dome(led=LED | {"scatter": scatter}, lit=[9, 9], spacing="1.5 in")) / scatter
+    )
     n = len(drawn)
     assert n > 4000
     assert drawn.std() == pytest.approx(1, abs=4 / np.sqrt(2 * n))

@@ -29,7 +29,9 @@ def config(variation: float = 0.0, on: dict[str, Any] = SPHERE, **aiming: Any) -
     layout: dict[str, Any] = {"kind": "fibers", "points": POINTS, "radius_variation": variation}
     if aiming:
         layout["aiming"] = {"laser": [f"{one} m" for one in LASER_M]} | aiming
-    return DomeConfig.model_validate({"kind": "dome", "surface": on, "layout": layout, "led": LED})
+    return DomeConfig.model_validate(
+        {"kind": "dome", "surface": on, "layout": layout, "led": LED}
+    )
 
 
 def holes(variation: float = 0.0, on: dict[str, Any] = SPHERE, **aiming: Any) -> Sources:
@@ -73,10 +75,14 @@ def test_a_shell_s_error_displaces_holes_along_the_laser_s_line() -> None:
     design = places()
     marked = places(0.004, pointing_sigma_arcsec=1e-9)
     built = places(0.004)
-    np.testing.assert_allclose(unit(marked - LASER_M), unit(design - LASER_M), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        unit(marked - LASER_M), unit(design - LASER_M), rtol=0, atol=1e-12
+    )
     outward_m = np.linalg.norm(built, axis=1) - APEX_M
     cosine = np.sum(unit(design) * unit(design - LASER_M), axis=1)
-    further_m = np.linalg.norm(marked - LASER_M, axis=1) - np.linalg.norm(design - LASER_M, axis=1)
+    further_m = np.linalg.norm(marked - LASER_M, axis=1) - np.linalg.norm(
+        design - LASER_M, axis=1
+    )
     np.testing.assert_allclose(further_m, outward_m / cosine, rtol=1e-6, atol=1e-12)
     seen = np.linalg.norm(np.cross(unit(built - LASER_M), unit(design - LASER_M)), axis=1)
     assert seen.max() > 1e-4
@@ -115,8 +121,14 @@ def test_laser_errors_do_not_change_the_fibers_light_and_numbers() -> None:
             '{laser: ["0 m", "0 m", "2 m"], pointing_sigma_arcsec: 5}',
             r"aiming\.laser: .* is outside of the dome",
         ),
-        ('{laser: ["0 m", "0 m", "0 m"], drill_sigma: "1 mm"}', "the laser's place has no effect"),
-        ('{laser: ["0 m", "0 m", "0 m"], pointing_sigma_arcsec: 90000}', "passes below the rim"),
+        (
+            '{laser: ["0 m", "0 m", "0 m"], drill_sigma: "1 mm"}',
+            "the laser's place has no effect",
+        ),
+        (
+            '{laser: ["0 m", "0 m", "0 m"], pointing_sigma_arcsec: 90000}',
+            "passes below the rim",
+        ),
     ],
 )
 def test_invalid_laser_aiming_is_refused_in_one_line(aiming: str, says: str) -> None:
@@ -133,7 +145,11 @@ def dome_of(overrides: dict[str, str]) -> Sources:
 
 
 def test_the_list_for_the_builder_has_the_design_not_the_laser_s_errors() -> None:
-    text, _ = led_list(config(0.004, pointing_sigma_arcsec=60), Band.from_efficiency(0.5), "mine")
-    rows = np.genfromtxt(text.splitlines(), delimiter=",", names=True, skip_header=text.count("#"))
+    text, _ = led_list(
+        config(0.004, pointing_sigma_arcsec=60), Band.from_efficiency(0.5), "mine"
+    )
+    rows = np.genfromtxt(
+        text.splitlines(), delimiter=",", names=True, skip_header=text.count("#")
+    )
     listed = np.column_stack([rows[name] for name in ("x_m", "y_m", "z_m")])
     np.testing.assert_allclose(listed, places(), rtol=0, atol=1e-11)

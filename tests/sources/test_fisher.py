@@ -44,7 +44,9 @@ def test_each_site_is_seen_by_the_attitudes_whose_field_contains_it() -> None:
     wanted = seen(R, sites_m)
     assert 100 < wanted.sum() < 0.1 * wanted.size
     for k in range(100):
-        assert sorted(attitude[start[k] : start[k + 1]]) == np.flatnonzero(wanted[:, k]).tolist()
+        assert (
+            sorted(attitude[start[k] : start[k + 1]]) == np.flatnonzero(wanted[:, k]).tolist()
+        )
 
 
 def test_a_point_behind_the_camera_is_in_no_field() -> None:

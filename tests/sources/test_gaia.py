@@ -89,7 +89,8 @@ def test_each_healpix_cell_has_gaia_s_number_of_stars() -> None:
     bp = rows["bp"].astype(float)
     rp = rows["rp"].astype(float)
     v_mag = star_archives.johnson(
-        rows["g"].astype(float), np.where((bp > 0) & (rp > 0), bp - rp, star_archives.TYPICAL_BP_RP)
+        rows["g"].astype(float),
+        np.where((bp > 0) & (rp > 0), bp - rp, star_archives.TYPICAL_BP_RP),
     )[0]
     source = rows[v_mag <= limit]
     sky = star_archives.sky_rows(limit)
@@ -189,10 +190,14 @@ def test_doubles_have_their_published_positions(sky: Catalog, hip: int) -> None:
     y = offset @ north[primary]
     wanted = separation_arcsec * np.exp(1j * np.radians(angle_deg))
     nearest = np.argmin(
-        np.where(np.arange(len(sky)) == primary, np.inf, np.hypot(y - wanted.real, x - wanted.imag))
+        np.where(
+            np.arange(len(sky)) == primary, np.inf, np.hypot(y - wanted.real, x - wanted.imag)
+        )
     )
     assert np.hypot(x[nearest], y[nearest]) == pytest.approx(separation_arcsec, abs=0.1)
-    assert np.degrees(np.arctan2(x[nearest], y[nearest])) % 360 == pytest.approx(angle_deg, abs=1)
+    assert np.degrees(np.arctan2(x[nearest], y[nearest])) % 360 == pytest.approx(
+        angle_deg, abs=1
+    )
 
 
 def test_the_tracker_s_double_stars_err_by_their_orbital_motion(
@@ -250,12 +255,15 @@ def test_a_sky_without_variable_stars_refuses_a_seed_of_them() -> None:
 def test_variability_does_not_change_the_tracker_s_catalog() -> None:
     """The scene's stars have the drawn brightness; the tracker's catalog and all positions are unchanged."""
     labs = (
-        build_lab(loader.load("shefex2", keys)) for keys in ({}, {"light.variability_seed": "1"})
+        build_lab(loader.load("shefex2", keys))
+        for keys in ({}, {"light.variability_seed": "1"})
     )
     steady, varying = (lab.camera.sources for lab in labs)
     common = np.isin(varying.id, steady.id)
     places = dict(zip(steady.id.tolist(), steady.place[:, :3].tolist(), strict=True))
-    assert [places[n] for n in varying.id[common].tolist()] == varying.place[common, :3].tolist()
+    assert [places[n] for n in varying.id[common].tolist()] == varying.place[
+        common, :3
+    ].tolist()
     assert np.sum(np.isin(steady.strength, varying.strength)) < len(steady) - 3_000
 
 

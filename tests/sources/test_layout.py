@@ -27,7 +27,11 @@ from skysim.sources.photometry import Band, led_strength_e_s_sr
 from skysim.tracking.dome_map_file import DomeMap, write_dome_map
 
 INCH_M = 0.0254
-MEASURED = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38.88 in", "38.88 in", "28.60 in"]}
+MEASURED = {
+    "kind": "ellipsoid",
+    "apex": "48 in",
+    "semi_axes": ["38.88 in", "38.88 in", "28.60 in"],
+}
 SPHERE = {"kind": "sphere", "apex": "48 in", "radius": "48 in"}
 FLAT = {"kind": "flat", "apex": "48 in"}
 LED = {"intensity": "16 mcd", "disk_diameter": "2 mm"}
@@ -139,7 +143,8 @@ def test_a_poisson_disk_layout_has_the_density_of_random_sequential_adsorption(
     for tries in (25, 100):
         monkeypatch.setattr(spreads, "DARTS_PER_SPACING2", tries)
         domes = [
-            lit({"kind": "poisson_disk", "spacing": "1.3 in", "hardware_seed": s}) for s in range(3)
+            lit({"kind": "poisson_disk", "spacing": "1.3 in", "hardware_seed": s})
+            for s in range(3)
         ]
         inner = np.mean(
             [np.sum(unit(leds.place[:, :3])[:, 2] > np.cos(np.radians(37))) for leds in domes]
@@ -252,10 +257,14 @@ def test_listed_boards_have_their_positions_leds_and_levels() -> None:
         {"azimuth_deg": 200, "tilt_deg": 7, "leds": [4, 1]},
     )
     np.testing.assert_array_equal(leds.id, [4, 0, 8, 13, 10])
-    np.testing.assert_allclose(leds.on_s, np.array([1, 0.5, 0.25, 1, 1]) * 1e-3, rtol=1e-15, atol=0)
+    np.testing.assert_allclose(
+        leds.on_s, np.array([1, 0.5, 0.25, 1, 1]) * 1e-3, rtol=1e-15, atol=0
+    )
     tilt = np.radians([20, 7])
     azimuth = np.radians([30, 200])
-    ray = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)]).T
+    ray = np.array(
+        [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)]
+    ).T
     np.testing.assert_allclose(unit(leds.place[[0, 3], :3]), ray, rtol=0, atol=1e-15)
     apart_m = np.linalg.norm(leds.place[[1, 2], :3] - leds.place[0, :3], axis=1)
     np.testing.assert_allclose(apart_m, 0.008 * np.sqrt(2), rtol=0, atol=1e-15)
@@ -315,7 +324,10 @@ def test_glue_tilts_boards_evenly_up_to_its_limit_and_keeps_them_flat() -> None:
     leds = lit(BOARDS | {"spacing": "1.5 in", "glue_tilt_deg": 5}, MEASURED)
     middle = leds.take(leds.id % 9 == 4)
     np.testing.assert_allclose(
-        made.meet(np.zeros(3), unit(middle.place[:, :3])), middle.place[:, :3], rtol=0, atol=1e-14
+        made.meet(np.zeros(3), unit(middle.place[:, :3])),
+        middle.place[:, :3],
+        rtol=0,
+        atol=1e-14,
     )
     straight = made.inward(middle.place[:, :3])
     cosine = np.einsum("nj,nj->n", middle.normal, straight)
@@ -330,7 +342,10 @@ def test_glue_tilts_boards_evenly_up_to_its_limit_and_keeps_them_flat() -> None:
     off = np.einsum("bhj,bj->bh", corner - corner[:, 4:5], middle.normal[np.argsort(middle.id)])
     np.testing.assert_allclose(off, 0, rtol=0, atol=1e-14)
     np.testing.assert_allclose(
-        np.linalg.norm(corner[:, 8] - corner[:, 0], axis=1), 0.016 * np.sqrt(2), rtol=0, atol=1e-14
+        np.linalg.norm(corner[:, 8] - corner[:, 0], axis=1),
+        0.016 * np.sqrt(2),
+        rtol=0,
+        atol=1e-14,
     )
 
 
@@ -338,7 +353,9 @@ def test_glue_tilts_boards_evenly_up_to_its_limit_and_keeps_them_flat() -> None:
 
 
 @pytest.mark.parametrize("surface", [SPHERE, MEASURED, FLAT])
-def test_from_its_nominal_position_the_camera_sees_stars_in_true_directions(surface: dict) -> None:
+def test_from_its_nominal_position_the_camera_sees_stars_in_true_directions(
+    surface: dict,
+) -> None:
     """Angle from the zenith and position angle there, by spherical trigonometry from the apparent RA and Dec."""
     leds = lit(SKY | {"count": 60}, surface)
     stars = catalog.read("hipparcos_hp6.5")
@@ -353,7 +370,9 @@ def test_from_its_nominal_position_the_camera_sees_stars_in_true_directions(surf
     cosine = np.sin(dec) * np.sin(zenith) + np.cos(dec) * np.cos(zenith) * np.cos(ra)
     east = np.cos(dec) * np.sin(ra)
     north = np.sin(dec) * np.cos(zenith) - np.cos(dec) * np.sin(zenith) * np.cos(ra)
-    roll = np.radians(25)  # of the lab's -y, from north through east, which is -x where north is -y
+    roll = np.radians(
+        25
+    )  # of the lab's -y, from north through east, which is -x where north is -y
     expected = np.column_stack(
         [
             -(east * np.cos(roll) - north * np.sin(roll)),
@@ -403,7 +422,9 @@ def test_count_and_limit_choose_the_brightest_that_are_on_the_dome() -> None:
 def test_a_millimeter_off_the_nominal_position_causes_the_apl_dome_s_error() -> None:
     """Reference 5: on a sphere of 4 ft a camera 1 mm off its center is wrong by 169 arcsec, d/R sin of the angle."""
     dome_4ft = {"kind": "sphere", "apex": "4 ft", "radius": "4 ft"}
-    leds = lit(SKY | {"limit_mag": 6.0, "cap_deg": 80, "camera": ["0 m", "0 m", "0 m"]}, dome_4ft)
+    leds = lit(
+        SKY | {"limit_mag": 6.0, "cap_deg": 80, "camera": ["0 m", "0 m", "0 m"]}, dome_4ft
+    )
     moved = unit(leds.place[:, :3] - np.array([1e-3, 0, 0]))
     error_arcsec = np.degrees(np.linalg.norm(moved - unit(leds.place[:, :3]), axis=1)) * 3600
     across = np.sqrt(1 - unit(leds.place[:, :3])[:, 0] ** 2)
@@ -509,7 +530,9 @@ def test_an_led_is_at_its_listed_place_on_its_tape(winding: str) -> None:
         {"kind": "dome", "surface": SPHERE, "layout": layout, "led": LED}
     )
     text, _ = led_list(config, BAND, "mine")
-    rows = np.genfromtxt(text.splitlines(), delimiter=",", names=True, skip_header=text.count("#"))
+    rows = np.genfromtxt(
+        text.splitlines(), delimiter=",", names=True, skip_header=text.count("#")
+    )
     place_m = np.column_stack([rows[name] for name in ("x_m", "y_m", "z_m")])
     same = np.diff(rows["tape"]) == 0
     far = rows["tilt_deg"][:-1] > 10
@@ -566,7 +589,9 @@ def test_a_survey_s_file_is_a_list_of_leds(tmp_path: Path) -> None:
         ("x_m,y_m,z_m\n0,0,0\n", ".0: 0 deg from the zenith"),
     ],
 )
-def test_a_bad_file_of_leds_is_refused_in_one_line(tmp_path: Path, text: str, says: str) -> None:
+def test_a_bad_file_of_leds_is_refused_in_one_line(
+    tmp_path: Path, text: str, says: str
+) -> None:
     path = tmp_path / "leds.csv"
     path.write_text(text)
     with pytest.raises(InputError) as caught:
@@ -677,9 +702,7 @@ def test_a_wrong_layout_is_refused_in_one_line(layout: str, says: str) -> None:
 )
 def test_a_wrong_projected_sky_is_refused_in_one_line(more: str, says: str) -> None:
     camera = "" if "camera" in more else "camera: [0 m, 0 m, 0.3 m],"
-    layout = (
-        f"{{kind: celestial, cap_deg: 30, {camera} zenith_ra_deg: 1, zenith_dec_deg: 2, {more}}}"
-    )
+    layout = f"{{kind: celestial, cap_deg: 30, {camera} zenith_ra_deg: 1, zenith_dec_deg: 2, {more}}}"
     assert_refused({"light.layout": layout}, says)
 
 
@@ -745,7 +768,9 @@ def test_sequential_leds_are_lit_one_after_another_for_their_share() -> None:
 
 
 @pytest.mark.parametrize(("controller", "sharing"), [("board", 9), ("dome", 27), (6, 6)])
-def test_a_cycle_is_as_long_as_its_controller_has_leds(controller: str | int, sharing: int) -> None:
+def test_a_cycle_is_as_long_as_its_controller_has_leds(
+    controller: str | int, sharing: int
+) -> None:
     boards = [{"azimuth_deg": a, "tilt_deg": 20, "leds": list(range(9))} for a in (0, 120, 240)]
     layout = sequential(9) | {"boards": boards}
     leds = lit(layout, drive={"kind": "sequential", "slot": "2 ms", "controller": controller})
@@ -782,7 +807,8 @@ def test_a_layout_without_boards_requires_leds_per_controller() -> None:
         "light.led.drive.kind: unknown kind 'fm'; allowed: direct, pwm, sequential",
     )
     assert_refused(
-        {"light.led.drive": "{kind: sequential, slot: 1}"}, "light.led.drive.slot: 1 has no unit"
+        {"light.led.drive": "{kind: sequential, slot: 1}"},
+        "light.led.drive.slot: 1 has no unit",
     )
 
 
@@ -842,7 +868,9 @@ def test_the_measured_order_and_ratio_of_levels_matches_table_7() -> None:
     levels = [on_us / 1000 for on_us in TABLE_7]
     leds = lit(sequential(5, levels=levels), drive={"kind": "sequential"})
     ours = np.array([light_s(leds, which, 0.0123, 40e-3) for which in range(5)])
-    np.testing.assert_array_equal(np.argsort(-ours), np.argsort(-np.array(list(TABLE_7.values()))))
+    np.testing.assert_array_equal(
+        np.argsort(-ours), np.argsort(-np.array(list(TABLE_7.values())))
+    )
     # Eight cycles of 5 ms.
     np.testing.assert_allclose(ours, 8e-6 * np.array(list(TABLE_7)), rtol=1e-9, atol=0)
     slopes = np.array(

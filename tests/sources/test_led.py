@@ -39,7 +39,10 @@ LAMBERT = Emitter()
 
 
 def irradiance(
-    cos_out: float = 1.0, cos_in: float = 1.0, distance_m: float = 1.0, emitter: Emitter = LAMBERT
+    cos_out: float = 1.0,
+    cos_in: float = 1.0,
+    distance_m: float = 1.0,
+    emitter: Emitter = LAMBERT,
 ) -> float:
     return float(
         irradiance_e_s_m2(5e12 * ONE, emitter, cos_out * ONE, cos_in * ONE, distance_m * ONE)[0]
@@ -73,7 +76,9 @@ def test_emitter_and_aperture_each_contribute_a_cosine() -> None:
 
 def test_reference_cosine_falloff_of_the_led_at_5_10_and_30_degrees() -> None:
     # Reference §2: .9962 / .9848 / .866.
-    share = [irradiance(cos_out=float(np.cos(np.radians(angle)))) / 5e12 for angle in (5, 10, 30)]
+    share = [
+        irradiance(cos_out=float(np.cos(np.radians(angle)))) / 5e12 for angle in (5, 10, 30)
+    ]
     np.testing.assert_allclose(share, [0.9962, 0.9848, 0.866], rtol=0, atol=5e-5)  # as printed
 
 
@@ -97,7 +102,9 @@ def test_a_measured_lobe_is_interpolated_through_its_points() -> None:
 def test_a_table_of_cosines_is_lambert_s_lobe() -> None:
     """Every 5 degrees; the chord of a cosine is off by h^2 / 8 at most."""
     angle_deg = np.arange(0.0, 91.0, 5.0)
-    emitter = measured(angle_deg.tolist(), np.maximum(np.cos(np.radians(angle_deg)), 0).tolist())
+    emitter = measured(
+        angle_deg.tolist(), np.maximum(np.cos(np.radians(angle_deg)), 0).tolist()
+    )
     cos_out = np.cos(np.radians(np.arange(0.5, 90, 0.7)))
     made = irradiance_e_s_m2(np.ones(1), emitter, cos_out, np.ones(1), np.ones(1))
     np.testing.assert_allclose(made, cos_out, rtol=0, atol=np.radians(5) ** 2 / 8)
@@ -153,7 +160,9 @@ def test_every_lobe_of_the_schema_is_implemented() -> None:
     assert sorted(LOBES) == sorted(kinds)
 
 
-def test_the_falloff_that_a_scene_names_is_the_one_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_falloff_that_a_scene_names_is_the_one_used(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(FALLOFF, "cubic", lambda distance_m: distance_m**-3.0)
     assert irradiance(distance_m=2.0, emitter=Emitter("cubic")) == pytest.approx(
         5e12 / 8, rel=1e-14
@@ -183,7 +192,9 @@ def test_every_falloff_law_can_be_named_in_a_scene() -> None:
 
 
 def aging(hours: float, scatter: object = 0.0) -> AgingConfig:
-    return AgingConfig.model_validate({"hours": hours, "life_hours": 36_000.0, "scatter": scatter})
+    return AgingConfig.model_validate(
+        {"hours": hours, "life_hours": 36_000.0, "scatter": scatter}
+    )
 
 
 def test_the_tm_21_procedure_recovers_the_scene_s_lifetime() -> None:
@@ -199,7 +210,8 @@ def test_the_tm_21_procedure_recovers_the_scene_s_lifetime() -> None:
 def test_each_led_ages_at_its_own_rate(scatter: object) -> None:
     config = aging(12_000.0, scatter)
     rates = (
-        -np.log(aging_factors(config, np.random.default_rng(3).standard_normal(20_000))) / 12_000
+        -np.log(aging_factors(config, np.random.default_rng(3).standard_normal(20_000)))
+        / 12_000
     )
     nominal = math.log(1 / 0.7) / 36_000
     if isinstance(scatter, float):
@@ -255,7 +267,9 @@ def test_warm_up_follows_newton_s_law() -> None:
     solved = solve_ivp(
         lambda _, g: (0.88 - g) / 420, (0, 3000), [1.0], t_eval=times, rtol=1e-10, atol=1e-12
     ).y[0]
-    np.testing.assert_allclose([warm_up_factor(config, t_s) for t_s in times], solved, rtol=1e-8)
+    np.testing.assert_allclose(
+        [warm_up_factor(config, t_s) for t_s in times], solved, rtol=1e-8
+    )
 
 
 @pytest.mark.slow
@@ -266,9 +280,15 @@ def test_warm_up_follows_newton_s_law() -> None:
         ("nps_tas2", {"light.layout.contrast": "500"}),
     ],
 )
-def test_all_light_of_the_leds_falls_while_they_warm_up(scene: str, keys: dict[str, str]) -> None:
+def test_all_light_of_the_leds_falls_while_they_warm_up(
+    scene: str, keys: dict[str, str]
+) -> None:
     """LEDs, their images in the wall, its glow, and that of black pixels; by the law at mid-exposure of each frame."""
-    keys = keys | {"background": "[]", "camera.detector.noise": "false", "exposure.rate_hz": "0.5"}
+    keys = keys | {
+        "background": "[]",
+        "camera.detector.noise": "false",
+        "exposure.rate_hz": "0.5",
+    }
     dark = keys | {"light.led.intensity": "1e-20 cd"}
     warm = keys | {"light.led.warm_up": "{steady: 0.8, time: 2 s}"}
     for index in (0, 1):

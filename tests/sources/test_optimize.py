@@ -21,7 +21,11 @@ from skysim.sources.dome.layouts import fisher, optimize, spreads
 from skysim.sources.dome.layouts.ambiguity import field_ambiguity
 from skysim.sources.photometry import Band, star_flux_e_s_m2
 
-MEASURED = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38.88 in", "38.88 in", "28.60 in"]}
+MEASURED = {
+    "kind": "ellipsoid",
+    "apex": "48 in",
+    "semi_axes": ["38.88 in", "38.88 in", "28.60 in"],
+}
 LED = {"intensity": "16 mcd", "disk_diameter": "2 mm"}
 BAND = Band.from_efficiency("cmos")
 COUNT = 120
@@ -119,7 +123,9 @@ def sparse_is_not_worse(seed: int, **more: int) -> None:
 
     def worst(leds: Sources) -> float:
         each = fisher.variances(
-            fisher.total_information(leds.place[:, :3], unseen, *optimize.camera_geometry(config))
+            fisher.total_information(
+                leds.place[:, :3], unseen, *optimize.camera_geometry(config)
+            )
         )
         return float(np.sort(each)[-1000:].mean())
 
@@ -172,7 +178,9 @@ def test_an_optimized_layout_depends_on_its_seed_alone(monkeypatch: pytest.Monke
     few = WANTED | {"count": 20, "tilt_deg": 2, "rounds": 5}
     first, again, other = (lit(few | {"hardware_seed": seed}) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first.place, again.place)
-    assert not np.isin(other.place[:, 0], first.place[:, 0]).all()  # some may be the spiral's still
+    assert not np.isin(
+        other.place[:, 0], first.place[:, 0]
+    ).all()  # some may be the spiral's still
 
 
 @pytest.mark.long
@@ -250,7 +258,9 @@ def test_no_optimized_field_shares_half_with_another_while_spiral_fields_nearly_
 
 
 def test_too_many_leds_for_their_spacing_are_refused() -> None:
-    with pytest.raises(InputError, match=r"light.layout.spacing: \d+ of 120 LEDs fit 0.2 m apart"):
+    with pytest.raises(
+        InputError, match=r"light.layout.spacing: \d+ of 120 LEDs fit 0.2 m apart"
+    ):
         lit(WANTED | {"spacing": "200 mm"})
 
 
@@ -309,7 +319,9 @@ def test_doubles_within_a_disk_are_merged_to_one_led_of_their_light() -> None:
 
 def test_a_contracted_layout_covers_a_fraction_of_each_led_s_solid_angle() -> None:
     """1 - z is scaled by the fraction, the azimuth is kept: to the spacing of the sites, 5 mm."""
-    sites_m, layout_m = (spread("fibonacci", count, 30.0).place[:, :3] for count in (40_000, 50))
+    sites_m, layout_m = (
+        spread("fibonacci", count, 30.0).place[:, :3] for count in (40_000, 50)
+    )
     for fraction in (1.0, 0.5):
         placed = optimize.contract(layout_m, sites_m, fraction)
         wanted, found = (

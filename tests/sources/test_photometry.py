@@ -107,7 +107,9 @@ def test_any_black_body_scaled_to_v0_has_the_energy_flux_of_v0(kelvin: float) ->
     photons = black_body_v0(fine * 1e-9, np.array(kelvin))
     energy_w_m3 = photons * 6.62607015e-34 * 299792458.0 / (fine * 1e-9)
     mean = np.sum(energy_w_m3 * weight) / np.sum(weight)
-    assert mean == pytest.approx(3.63e-9 * 1e-7 / 1e-4 / 1e-10, rel=1e-4)  # 1 nm steps against 0.1
+    assert mean == pytest.approx(
+        3.63e-9 * 1e-7 / 1e-4 / 1e-10, rel=1e-4
+    )  # 1 nm steps against 0.1
 
 
 def test_black_body_colors_follow_planck_s_law() -> None:
@@ -138,9 +140,9 @@ def test_liebe_s_rate_is_a_third_of_the_photons() -> None:
 
 def test_an_interline_chip_collects_the_reference_s_rate() -> None:
     # Reference §2: 15,000 e-/s/mm². The curve's height was chosen for it; three figures.
-    assert star_flux_e_s_m2(0.0, *SUN, Band.from_efficiency("interline")) * 1e-6 == pytest.approx(
-        15_000, rel=5e-3
-    )
+    assert star_flux_e_s_m2(
+        0.0, *SUN, Band.from_efficiency("interline")
+    ) * 1e-6 == pytest.approx(15_000, rel=5e-3)
 
 
 @pytest.mark.parametrize(
@@ -212,7 +214,9 @@ def test_redder_stars_are_cooler_and_absurd_colors_are_clipped() -> None:
     assert np.all(np.diff(kelvin) < 0)
     ends = stellar_sequence().temperature_k[[0, -1]]
     np.testing.assert_array_equal(temperature_k([0.5, 0.5], [-3.0, 9.03]), ends)
-    assert np.all(np.isfinite(star_flux_e_s_m2(5.0, [-9.0, 9.0, np.nan], [-9.0, 9.0, np.nan], ALL)))
+    assert np.all(
+        np.isfinite(star_flux_e_s_m2(5.0, [-9.0, 9.0, np.nan], [-9.0, 9.0, np.nan], ALL))
+    )
 
 
 @pytest.mark.parametrize("nothing", [0.0, np.nan])
@@ -240,7 +244,9 @@ def test_the_tabulated_rate_matches_the_integral() -> None:
     v_i = np.linspace(-0.36, 4.4, 37)
     kelvin = temperature_k(np.nan, v_i)
     exact = band.integral(lambda wavelength_m: black_body_v0(wavelength_m, kelvin))
-    np.testing.assert_allclose(star_flux_e_s_m2(0.0, np.nan, v_i, band), exact, rtol=2e-5, atol=0)
+    np.testing.assert_allclose(
+        star_flux_e_s_m2(0.0, np.nan, v_i, band), exact, rtol=2e-5, atol=0
+    )
 
 
 def test_a_whole_catalog_is_converted_in_little_time() -> None:
@@ -376,7 +382,8 @@ def test_a_number_is_flat_and_its_integral_exact() -> None:
         0.4 * 600e-9, rel=1e-12
     )
     np.testing.assert_array_equal(
-        Band.from_efficiency(0.4).response_at([399e-9, 400e-9, 1000e-9, 1001e-9]), [0, 0.4, 0.4, 0]
+        Band.from_efficiency(0.4).response_at([399e-9, 400e-9, 1000e-9, 1001e-9]),
+        [0, 0.4, 0.4, 0],
     )
     assert Band.from_efficiency(0.4) is Band.from_efficiency(0.4)
 
@@ -441,7 +448,10 @@ def lens(tmp_path: Path) -> Path:
 def camera_with(transmission: Path | float) -> CameraConfig:
     return loader.load(
         "shefex2",
-        {"camera.transmission": str(transmission), "camera.detector.quantum_efficiency": "cmos"},
+        {
+            "camera.transmission": str(transmission),
+            "camera.detector.quantum_efficiency": "cmos",
+        },
     ).camera
 
 
@@ -469,9 +479,9 @@ def test_the_response_is_the_efficiency_times_the_transmission(lens: Path) -> No
         )
         assert star_flux_e_s_m2(0.0, *color, band) == pytest.approx(wanted, rel=2e-5)
     sun = float(star_flux_e_s_m2(20.0, *SUN, band))
-    assert float(sky_radiance_e_s_m2_sr(20.0, band)) * math.radians(1 / 3600) ** 2 == pytest.approx(
-        sun, rel=1e-12
-    )
+    assert float(sky_radiance_e_s_m2_sr(20.0, band)) * math.radians(
+        1 / 3600
+    ) ** 2 == pytest.approx(sun, rel=1e-12)
     assert radiant_strength_e_s_sr(1.0, 470e-9, band) == pytest.approx(
         470e-9 / HC_J_M * response(470), rel=1e-12
     )
@@ -528,7 +538,8 @@ def test_a_lens_that_blocks_all_light_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "infrared.csv"
     path.write_text("wavelength_nm,transmission\n1300,0.6\n1400,0.6\n")
     with pytest.raises(
-        InputError, match=r"^camera\.transmission: lets nothing through .*; allowed: an overlap$"
+        InputError,
+        match=r"^camera\.transmission: lets nothing through .*; allowed: an overlap$",
     ):
         Band.from_camera(camera_with(path))
 
@@ -571,7 +582,9 @@ def test_an_invisible_spectrum_has_no_candelas(tmp_path: Path) -> None:
         InputError, match=r"^light\.led\.spectrum: .*invisible.*; allowed: radiant_intensity$"
     ):
         led_strength_e_s_sr(0.3, str(path), ALL)
-    assert radiant_strength_e_s_sr(1.0, str(path), ALL) == pytest.approx(940e-9 / HC_J_M, rel=1e-3)
+    assert radiant_strength_e_s_sr(1.0, str(path), ALL) == pytest.approx(
+        940e-9 / HC_J_M, rel=1e-3
+    )
 
 
 @pytest.mark.parametrize(
@@ -582,7 +595,10 @@ def test_an_invisible_spectrum_has_no_candelas(tmp_path: Path) -> None:
             {"spectrum": "blue"},
             "'blue' is not a wavelength; allowed: a wavelength such as \"630 nm\", or white",
         ),
-        ({"fwhm": "20 nm"}, "fwhm: white is a whole spectrum; allowed: a wavelength as spectrum"),
+        (
+            {"fwhm": "20 nm"},
+            "fwhm: white is a whole spectrum; allowed: a wavelength as spectrum",
+        ),
     ],
 )
 def test_a_spectrum_is_white_a_file_or_a_wavelength(keys: dict[str, str], message: str) -> None:

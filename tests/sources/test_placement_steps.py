@@ -25,14 +25,18 @@ def test_a_site_is_free_if_only_the_moving_led_is_near() -> None:
     near = cdist(sites_m, sites_m[chosen]) < spacing_m
     for without in (0, 7):
         others = np.delete(near, without, axis=1).any(axis=1)
-        room = [OPTIMIZE.has_room(site, without, chosen, sites_m, spacing_m) for site in range(300)]
+        room = [
+            OPTIMIZE.has_room(site, without, chosen, sites_m, spacing_m) for site in range(300)
+        ]
         np.testing.assert_array_equal(room, ~others)
         found += sum(room)
     assert 50 < found < 550
 
 
 @pytest.mark.parametrize("count", [None, 9])
-def test_sites_are_taken_in_order_if_none_before_is_within_the_spacing(count: int | None) -> None:
+def test_sites_are_taken_in_order_if_none_before_is_within_the_spacing(
+    count: int | None,
+) -> None:
     sites_m = np.random.default_rng(2).uniform(0, 1, (200, 3))
     taken = OPTIMIZE.thin(sites_m, 0.3, count)
     whole: list[int] = []

@@ -114,10 +114,14 @@ def test_a_spot_is_as_wide_as_ray_tracing_gives(focus_m: float, block: int) -> N
         sharp_m = np.column_stack([chip_m / 8e-3, np.ones(500)]) * focus_m
         angle = rng.uniform(0, 2 * np.pi, 500)
         radius = 2e-3 * np.sqrt(rng.uniform(0, 1, 500))
-        pupil_m = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(500)])
+        pupil_m = np.column_stack(
+            [radius * np.cos(angle), radius * np.sin(angle), np.zeros(500)]
+        )
         start_m = PLACE_M + pupil_m @ R
         toward = (sharp_m - pupil_m) @ R
-        hit_m = np.array([shell.meet(a, b[None])[0] for a, b in zip(start_m, toward, strict=True)])
+        hit_m = np.array(
+            [shell.meet(a, b[None])[0] for a, b in zip(start_m, toward, strict=True)]
+        )
         assert np.linalg.norm(hit_m.mean(axis=0) - place_m) < 0.15 * radius_m
         square_m2 = np.sum((hit_m - hit_m.mean(axis=0)) ** 2, axis=1).mean()
         assert radius_m == pytest.approx(np.sqrt(2 * square_m2), rel=0.06)
@@ -192,7 +196,9 @@ def test_black_has_the_light_of_all_pixels_over_the_contrast() -> None:
     assert isinstance(scene.light.layout, ProjectorConfig)
     camera_m = lab.start.apply(camera.mount.camera_body_m)
     cam_from_lab = camera.mount.cam_from_body * lab.start.inv()
-    glow = display_glow.black_glow(scene.light, camera.optics, cam_from_lab, camera_m, camera.band)
+    glow = display_glow.black_glow(
+        scene.light, camera.optics, cam_from_lab, camera_m, camera.band
+    )
     assert glow is not None
     shell = surface.build_surface(scene.light.surface)
     axis = cam_from_lab.inv().apply([0.0, 0.0, 1.0])
@@ -212,7 +218,9 @@ def test_black_has_the_light_of_all_pixels_over_the_contrast() -> None:
         "light.layout.focal_length": "0.1 m",
     }
     narrow = build_lab(
-        loader.load("projected_dome", changes | spot | {"light.layout.aim": "[0 m, 0 m, 1.2 m]"})
+        loader.load(
+            "projected_dome", changes | spot | {"light.layout.aim": "[0 m, 0 m, 1.2 m]"}
+        )
     )
     assert isinstance(narrow.scene.light, DomeConfig)
     dark = display_glow.black_glow(
@@ -238,11 +246,14 @@ def test_a_wrong_projector_is_refused(more: dict[str, Any], says: str) -> None:
 
 
 def test_the_projector_s_light_does_not_pulse() -> None:
-    with pytest.raises(InputError, match="pwm cannot drive a projector; allowed: direct, refresh"):
+    with pytest.raises(
+        InputError, match="pwm cannot drive a projector; allowed: direct, refresh"
+    ):
         loader.load("projected_dome", {"light.led.drive": "{kind: pwm}"})
     with pytest.raises(
         InputError, match=r"light\.led\.color_scatter: has no effect.*share their light"
     ):
         loader.load(
-            "projected_dome", {"light.led.spectrum": "630 nm", "light.led.color_scatter": "3 nm"}
+            "projected_dome",
+            {"light.led.spectrum": "630 nm", "light.led.color_scatter": "3 nm"},
         )

@@ -73,7 +73,9 @@ def test_diffuse_light_in_a_spherical_cap_matches_theory(rim_deg: float) -> None
     share = 0.6
     edge_m = wall.meet(
         np.zeros(3),
-        np.array([[math.sin(math.radians(rim_deg) - 1e-9), 0.0, math.cos(math.radians(rim_deg))]]),
+        np.array(
+            [[math.sin(math.radians(rim_deg) - 1e-9), 0.0, math.cos(math.radians(rim_deg))]]
+        ),
     )
     fraction = (1 - (edge_m[0, 2] - HEIGHT_M) / RADIUS_M) / 2
     placed = on_wall(wall, 60)
@@ -120,9 +122,13 @@ def test_diffuse_light_of_a_floor_under_one_led_matches_a_hand_calculation() -> 
     back = np.trapezoid(
         0.5 * on_floor * 2.5**2 / (radius**2 + 2.5**2) ** 2 / np.pi * 2 * np.pi * radius, radius
     )
-    at_led = diffuse.irradiance_e_s_m2(np.array([[1e-9, 0.0, 1.5]]), np.array([[0.0, 0.0, -1.0]]))
+    at_led = diffuse.irradiance_e_s_m2(
+        np.array([[1e-9, 0.0, 1.5]]), np.array([[0.0, 0.0, -1.0]])
+    )
     assert at_led[0] == pytest.approx(back, rel=2e-3)
-    at_floor = diffuse.irradiance_e_s_m2(np.array([[0.7, 0.0, -1.0]]), np.array([[0.0, 0.0, 1.0]]))
+    at_floor = diffuse.irradiance_e_s_m2(
+        np.array([[0.7, 0.0, -1.0]]), np.array([[0.0, 0.0, 1.0]])
+    )
     assert at_floor[0] == pytest.approx(2.5**2 / (0.7**2 + 2.5**2) ** 2, rel=1e-9)
 
 
@@ -141,7 +147,9 @@ def test_a_dome_on_the_floor_conserves_its_light() -> None:
     on_cap = diffuse.irradiance_e_s_m2(*on_wall(wall, 4001)).mean() * 3 * math.pi
     turns = np.arange(900) * 2.4
     radius = np.sqrt(0.75 * (np.arange(900) + 0.5) / 900)
-    places = np.column_stack([radius * np.cos(turns), radius * np.sin(turns), np.full(900, -0.5)])
+    places = np.column_stack(
+        [radius * np.cos(turns), radius * np.sin(turns), np.full(900, -0.5)]
+    )
     on_floor = (
         diffuse.irradiance_e_s_m2(places, np.tile([0.0, 0.0, 1.0], (900, 1))).mean()
         * 0.75
@@ -190,7 +198,9 @@ def bounce(name: str, start: Floats, toward: Floats) -> tuple[Floats, Floats]:
         normal = np.tile([0.0, 0.0, -1.0], (len(toward), 1))
         hit = start + steps[:, None] * toward
     else:
-        weights = 1 / (wall.semi_axes_m if isinstance(wall, Ellipsoid) else wall.semi_axes_m()) ** 2  # type: ignore[union-attr]
+        weights = (
+            1 / (wall.semi_axes_m if isinstance(wall, Ellipsoid) else wall.semi_axes_m()) ** 2
+        )  # type: ignore[union-attr]
         a = (toward**2) @ weights
         b = 2 * (toward * (start - wall.center_m)) @ weights
         c = (start - wall.center_m) ** 2 @ weights - 1
@@ -276,11 +286,13 @@ def test_reflected_images_are_as_bright_as_traced_rays(name: str) -> None:
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         hit, along = bounce(name, led_m, rays)
         steps = np.sum((CAMERA_M - hit) * toward, axis=1) / np.sum(along * toward, axis=1)
-        caught = (np.linalg.norm(hit + steps[:, None] * along - CAMERA_M, axis=1) < radius_m).sum()
+        caught = (
+            np.linalg.norm(hit + steps[:, None] * along - CAMERA_M, axis=1) < radius_m
+        ).sum()
         irradiance = caught / count * (2 * half) ** 2 / (math.pi * radius_m**2)
-        assert 1 / distance_m**2 == pytest.approx(irradiance, rel=5 / math.sqrt(caught) + 0.01), (
-            caught
-        )
+        assert 1 / distance_m**2 == pytest.approx(
+            irradiance, rel=5 / math.sqrt(caught) + 0.01
+        ), caught
         assert images.normal[n] @ -toward == pytest.approx(normal @ axis, abs=1e-6)
         assert images.strength[n] == pytest.approx(0.04)
 

@@ -29,7 +29,12 @@ BAND = Band.from_efficiency(0.5)
 
 
 def lit(layout: dict[str, Any], on: dict[str, Any] = SPHERE, **led: Any) -> Sources:
-    config = {"kind": "dome", "surface": on, "layout": {"cap_deg": 40} | layout, "led": LED | led}
+    config = {
+        "kind": "dome",
+        "surface": on,
+        "layout": {"cap_deg": 40} | layout,
+        "led": LED | led,
+    }
     return dome.sources(DomeConfig.model_validate(config), BAND)
 
 
@@ -47,7 +52,8 @@ def edges(vertices: np.ndarray) -> np.ndarray:
     """Lengths of all edges of the triangulated sphere, by its convex hull."""
     faces = ConvexHull(vertices).simplices
     pairs = np.unique(
-        np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [0, 2]]]), axis=1), axis=0
+        np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [0, 2]]]), axis=1),
+        axis=0,
     )
     return np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
 
@@ -77,7 +83,11 @@ def test_a_class_2_sphere_has_three_quarters_as_many_triangles(frequency: int) -
         ("I", 1, {1.05146: 30}),
         ("I", 2, {0.54653: 60, 0.61803: 60}),
         ("I", 3, {0.34862: 60, 0.40355: 90, 0.41241: 120}),
-        ("I", 4, {0.25318: 60, 0.29453: 120, 0.29524: 60, 0.29859: 60, 0.31287: 120, 0.32492: 60}),
+        (
+            "I",
+            4,
+            {0.25318: 60, 0.29453: 120, 0.29524: 60, 0.29859: 60, 0.31287: 120, 0.32492: 60},
+        ),
         ("II", 2, {0.64085: 60, 0.71364: 30}),
     ],
 )
@@ -214,7 +224,9 @@ def test_circles_on_a_sphere_have_their_spacing_and_circumference() -> None:
     place_m = lit({"kind": "string", "pitch": "10 mm", "spacing": "6 cm"}).place[:, :3]
     tilt, _ = angles(place_m)
     rings, counts = np.unique(np.round(tilt, 8), return_counts=True)
-    np.testing.assert_allclose(1.2 * rings, 0.03 + 0.06 * np.arange(len(rings)), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        1.2 * rings, 0.03 + 0.06 * np.arange(len(rings)), rtol=0, atol=1e-6
+    )
     np.testing.assert_array_equal(counts, (2 * np.pi * 1.2 * np.sin(rings) / 0.01).astype(int))
 
 
@@ -226,7 +238,9 @@ def test_strips_follow_meridians_with_leds_a_pitch_apart_to_the_rim(on: dict[str
     tilt, azimuth = angles(place_m)
     # Rim of 5 m: 64 strips.
     strips = np.rint(azimuth % (2 * np.pi) * 64 / (2 * np.pi)).astype(int) % 64
-    assert azimuth % (2 * np.pi / 64) == pytest.approx(0, abs=1e-9) or len(np.unique(strips)) in (
+    assert azimuth % (2 * np.pi / 64) == pytest.approx(0, abs=1e-9) or len(
+        np.unique(strips)
+    ) in (
         32,
         64,
     )
@@ -260,7 +274,9 @@ def test_tape_led_positions_have_pitch_and_glue_errors() -> None:
     )
     sideways_mm = 1e3 * np.sum((made - ideal) * np.cross(radial, along), axis=1)
     whole = [
-        slice(a, b) for a, b in zip(begins, [*begins[1:], len(ideal)], strict=True) if b - a > 20
+        slice(a, b)
+        for a, b in zip(begins, [*begins[1:], len(ideal)], strict=True)
+        if b - a > 20
     ]
     assert len(whole) > 200
     stretch = [(np.diff(angles(made[one])[0]) / np.diff(tilt[one])).mean() - 1 for one in whole]
@@ -317,13 +333,17 @@ def test_fibers_and_panels_take_their_points(points: dict[str, Any]) -> None:
     np.testing.assert_array_equal(ends.place, plain.place)
     panel = {"kind": "lcd", "points": points, "pixels": [4000, 4000], "pitch": "0.5 mm"}
     drawn = dome.sources(
-        DomeConfig.model_validate({"kind": "dome", "surface": FLAT, "layout": panel, "led": LED}),
+        DomeConfig.model_validate(
+            {"kind": "dome", "surface": FLAT, "layout": panel, "led": LED}
+        ),
         BAND,
     )
     on_panel = lit(points, FLAT)
     assert len(drawn) == len(on_panel)
     by_number = on_panel.place[np.argsort(on_panel.id), :3]
-    assert np.abs(drawn.place[np.argsort(drawn.id), :3] - by_number).max() <= 0.00025 * (1 + 1e-9)
+    assert np.abs(drawn.place[np.argsort(drawn.id), :3] - by_number).max() <= 0.00025 * (
+        1 + 1e-9
+    )
 
 
 def test_controllers_along_a_tape_light_their_leds_in_turn() -> None:
@@ -339,7 +359,9 @@ def test_controllers_along_a_tape_light_their_leds_in_turn() -> None:
     np.testing.assert_allclose(leds.period_s[: 50 * whole], 50e-3, rtol=1e-12, atol=0)
     np.testing.assert_array_equal(leds.clock, np.arange(len(leds)) // 50)
     # Neighbors in time are neighbors on the dome.
-    assert np.linalg.norm(np.diff(leds.place[:50, :3], axis=0), axis=1).max() <= 0.04 * (1 + 1e-4)
+    assert np.linalg.norm(np.diff(leds.place[:50, :3], axis=0), axis=1).max() <= 0.04 * (
+        1 + 1e-4
+    )
 
 
 # --- what is refused
@@ -383,7 +405,8 @@ def test_an_impossible_layout_is_refused_in_one_line(layout: str, complaint: str
 def test_too_much_tape_is_refused_with_its_length(winding: str) -> None:
     layout = {"kind": "string", "winding": winding, "pitch": "1 mm", "spacing": "2 mm"}
     with pytest.raises(
-        InputError, match=r"light.layout.pitch: .* m of tape with an LED every 0.001 m are \d+ LEDs"
+        InputError,
+        match=r"light.layout.pitch: .* m of tape with an LED every 0.001 m are \d+ LEDs",
     ):
         lit(layout)
 

@@ -68,7 +68,9 @@ def test_a_panel_beside_the_zenith_is_sampled_from_its_near_edge_to_its_far_one(
         "offset": ["0.501 m", "0 m", "0 m"],
     }
     made = surface.build_surface(light.SurfaceConfig.model_validate(panel))
-    x_m = rooms.shell_m(RoomConfig.model_validate({"segments": 1}), made, 40.0, np.zeros(1))[:, 0]
+    x_m = rooms.shell_m(RoomConfig.model_validate({"segments": 1}), made, 40.0, np.zeros(1))[
+        :, 0
+    ]
     np.testing.assert_allclose([x_m.min(), x_m.max()], [0.001, 1.001], rtol=0, atol=1e-12)
 
 

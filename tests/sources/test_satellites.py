@@ -35,7 +35,14 @@ PUBLISHED = {
         -4.151817765,
         -2.093935425,
     ),
-    720.0: (-7134.59340119, 6531.68641334, 3260.27186483, -4.113793027, -2.911922039, -2.557327851),
+    720.0: (
+        -7134.59340119,
+        6531.68641334,
+        3260.27186483,
+        -4.113793027,
+        -2.911922039,
+        -2.557327851,
+    ),
 }
 OMM = {
     "OBJECT_NAME": "VANGUARD 1",
@@ -62,7 +69,11 @@ def written(folder: Path, text: str, name: str = "elements.txt") -> str:
 
 
 def tle(
-    number: int, inclination_deg: float, node_deg: float, along_deg: float, revolutions_day: float
+    number: int,
+    inclination_deg: float,
+    node_deg: float,
+    along_deg: float,
+    revolutions_day: float,
 ) -> str:
     """A circular orbit of 10 April 2024, 0 h."""
     lines = (
@@ -81,7 +92,9 @@ def low_orbits(tmp_path: Path) -> orbit_elements.MeanElements:
 
 
 def test_sgp4_gives_the_published_states(tmp_path: Path) -> None:
-    record = orbit_elements.read_elements(written(tmp_path, f"VANGUARD 1\n{VANGUARD}")).records[0]
+    record = orbit_elements.read_elements(written(tmp_path, f"VANGUARD 1\n{VANGUARD}")).records[
+        0
+    ]
     for minutes, state in PUBLISHED.items():
         error, place, velocity = record.sgp4_tsince(minutes)
         assert error == 0
@@ -92,7 +105,11 @@ def test_sgp4_gives_the_published_states(tmp_path: Path) -> None:
 def test_the_rotation_from_teme_to_gcrs_matches_the_published_one() -> None:
     """Vallado et al. 2006, appendix C: 6 April 2004, 07:51:28.386 UTC; their EOP and polar motion differ by a meter."""
     date = datetime.datetime(2004, 4, 6, 7, 51, 28, 386009)
-    place_km = orbit_elements.gcrs_from_teme(date) @ [5094.18016210, 6127.64465950, 6380.34453270]
+    place_km = orbit_elements.gcrs_from_teme(date) @ [
+        5094.18016210,
+        6127.64465950,
+        6380.34453270,
+    ]
     assert place_km == pytest.approx([5102.508958, 6123.011401, 6378.136928], abs=3e-3)
 
 
@@ -106,7 +123,9 @@ def test_omm_and_tle_give_the_same_states(kind: str, tmp_path: Path) -> None:
     xml = f"<ndm><omm><body><segment><metadata/><data>{leaves}</data></segment></body></omm></ndm>"
     omm = orbit_elements.read_elements(
         written(
-            tmp_path, {"csv": text.getvalue(), "json": json.dumps([OMM]), "xml": xml}[kind], "omm"
+            tmp_path,
+            {"csv": text.getvalue(), "json": json.dumps([OMM]), "xml": xml}[kind],
+            "omm",
         )
     )
     line = orbit_elements.read_elements(written(tmp_path, VANGUARD))
@@ -121,13 +140,19 @@ def test_omm_and_tle_give_the_same_states(kind: str, tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("", "empty"),
-        (VANGUARD.replace("4753", "4754"), "line 1: the checksum of line 1 is 4; it should be 3"),
+        (
+            VANGUARD.replace("4753", "4754"),
+            "line 1: the checksum of line 1 is 4; it should be 3",
+        ),
         (VANGUARD.splitlines()[0], "is not line 2 of a TLE"),
         ("[{}]", "message 1: NORAD_CAT_ID is missing"),
         ("<ndm>", "not an OMM"),
         (json.dumps({**OMM, "EPOCH": "yesterday"}), "message 1: EPOCH 'yesterday'"),
         (json.dumps({**OMM, "MEAN_MOTION": "fast"}), 'message 1: "could not convert'),
-        (json.dumps({**OMM, "ECCENTRICITY": "1.5"}), "satellite 1: SGP4 refuses these elements"),
+        (
+            json.dumps({**OMM, "ECCENTRICITY": "1.5"}),
+            "satellite 1: SGP4 refuses these elements",
+        ),
     ],
 )
 def test_bad_elements_are_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:
@@ -139,12 +164,18 @@ def test_bad_elements_are_refused_in_one_line(text: str, message: str, tmp_path:
 
 def test_the_phase_law_is_that_of_a_lambert_sphere() -> None:
     """The integral of mu mu0 over the part of a sphere that is lit and seen, over that at 90 degrees."""
-    z, around = np.meshgrid((np.arange(600) + 0.5) / 300 - 1, (np.arange(600) + 0.5) * np.pi / 300)
-    normal = np.stack([np.sqrt(1 - z**2) * np.cos(around), np.sqrt(1 - z**2) * np.sin(around), z])
+    z, around = np.meshgrid(
+        (np.arange(600) + 0.5) / 300 - 1, (np.arange(600) + 0.5) * np.pi / 300
+    )
+    normal = np.stack(
+        [np.sqrt(1 - z**2) * np.cos(around), np.sqrt(1 - z**2) * np.sin(around), z]
+    )
 
     def light(phase_rad: float) -> float:
         sun = np.array([np.sin(phase_rad), 0.0, np.cos(phase_rad)])
-        return float((np.maximum(normal[2], 0) * np.maximum(np.tensordot(sun, normal, 1), 0)).sum())
+        return float(
+            (np.maximum(normal[2], 0) * np.maximum(np.tensordot(sun, normal, 1), 0)).sum()
+        )
 
     for phase_rad in (0.0, 0.7, 1.5, 2.4, 2.9):
         fainter = -2.5 * np.log10(light(phase_rad) / light(np.pi / 2))
@@ -208,7 +239,9 @@ def test_a_path_matches_positions_at_its_times(low_orbits: orbit_elements.MeanEl
         for after_s in (-3.1, 4.2):
             then = place + after_s * (motion[0] + after_s / 2 * motion[1])
             time = DATE + datetime.timedelta(seconds=after_s)
-            exact, _ = satellites.path(one, time, 0.1, lambda t, at=after_s: observer_at(at + t))
+            exact, _ = satellites.path(
+                one, time, 0.1, lambda t, at=after_s: observer_at(at + t)
+            )
             off = np.linalg.norm(np.cross(then / np.linalg.norm(then), exact))
             assert np.degrees(off) * 3600 < 0.1
 
@@ -227,13 +260,17 @@ def test_satellites_of_the_field_are_those_that_cross_it(
         found = list(
             satellites.known_satellites(low_orbits, 6.0, view, DATE, lambda t, at=here: at)
         )
-        assert [light.truth.id - satellites.ID_BASE for light in found] == [n + 1] * int(lit[n] > 0)
+        assert [light.truth.id - satellites.ID_BASE for light in found] == [n + 1] * int(
+            lit[n] > 0
+        )
         for light in found:
             assert light.truth.range_km == pytest.approx(50)
 
 
 def test_random_satellites_have_their_density_rates_and_magnitudes() -> None:
-    config = RandomSatellitesConfig(per_field=30.0, rate_deg_s=(0.1, 2.0), v_mag=(3.0, 5.0), seed=8)
+    config = RandomSatellitesConfig(
+        per_field=30.0, rate_deg_s=(0.1, 2.0), v_mag=(3.0, 5.0), seed=8
+    )
     view = ExposureView(np.array([0.6, 0.0, 0.8]), 0.1, 0.0, 1.0)
     drawn = [list(satellites.random_satellites(config, view, 1, index)) for index in range(60)]
     lights = [light for frame in drawn for light in frame]

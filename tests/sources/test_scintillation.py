@@ -24,7 +24,11 @@ def profile() -> tuple[Floats, Floats, Floats]:
     strength = 0.00594 * (21 / 27) ** 2 * (1e-5 * h) ** 10 * np.exp(-h / 1000)
     strength += 2.7e-16 * np.exp(-h / 1500) + 1.7e-14 * np.exp(-h / 100)
     wind_m_s = 5 + 30 * np.exp(-(((h - 9400) / 4800) ** 2))
-    return h, strength * (1e-5 * 1.56**2 / (10.66 * np.sum(strength * h**2 / wind_m_s))), wind_m_s
+    return (
+        h,
+        strength * (1e-5 * 1.56**2 / (10.66 * np.sum(strength * h**2 / wind_m_s))),
+        wind_m_s,
+    )
 
 
 @pytest.mark.parametrize("air_mass", [1.0, 2.5])
@@ -74,7 +78,14 @@ def test_intermediate_apertures_match_the_integral_over_all_frequencies(
         moved = np.sinc(np.outer(f, np.cos(around)) * wind_m_s[layer].mean() * exposure_s) ** 2
         diffracted = np.sin(np.pi * RED_M * mean_h * air_mass * f**2) ** 2
         density = (
-            1.534 * RED_M**-2 * f ** (-5 / 3) * 2 * np.pi * diffracted * pupil * moved.mean(axis=1)
+            1.534
+            * RED_M**-2
+            * f ** (-5 / 3)
+            * 2
+            * np.pi
+            * diffracted
+            * pupil
+            * moved.mean(axis=1)
         )
         total += air_mass * np.sum(strength[layer]) * np.sum(density) * np.log(f[1] / f[0])
     assert one(air_mass, aperture_m, exposure_s) == pytest.approx(total, rel=0.02)
@@ -96,7 +107,9 @@ def test_simulated_waves_through_a_screen_match_the_spectrum() -> None:
     f[0, 0] = 0.0
     propagator = np.exp(-1j * np.pi * RED_M * distance_m * f**2)
     pupil = (
-        2 * special.j1(np.pi * 0.06 * np.maximum(f, 1e-9)) / (np.pi * 0.06 * np.maximum(f, 1e-9))
+        2
+        * special.j1(np.pi * 0.06 * np.maximum(f, 1e-9))
+        / (np.pi * 0.06 * np.maximum(f, 1e-9))
     )
     point = []
     averaged = []

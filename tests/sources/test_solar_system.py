@@ -312,7 +312,9 @@ def test_reflected_light_follows_the_albedo() -> None:
 
 def test_the_light_of_all_bodies_is_their_magnitudes() -> None:
     lights = bodies_from(
-        BodiesConfig(), ephemeris.observe_from(datetime.datetime(2012, 6, 24, 21), GEOCENTER), BAND
+        BodiesConfig(),
+        ephemeris.observe_from(datetime.datetime(2012, 6, 24, 21), GEOCENTER),
+        BAND,
     )
     assert {light.name for light in lights} == set(BODIES)
     distances = [light.place.distance_km for light in lights]

@@ -79,7 +79,9 @@ def test_annual_aberration_is_an_ellipse_of_20_5_arcsec() -> None:
         [np.cos(np.radians(66.56)) * np.array([0, -1, 0]) + [0, 0, np.sin(np.radians(66.56))]]
     )
     off = (
-        np.array([separation_rad(star_sources.apparent(pole, day), straight)[0] for day in days])
+        np.array(
+            [separation_rad(star_sources.apparent(pole, day), straight)[0] for day in days]
+        )
         / ARCSEC_RAD
     )
     assert off.max() == pytest.approx(20.4955 + 0.34, abs=0.03)
@@ -133,7 +135,9 @@ def test_the_sun_deflects_stars_outward() -> None:
     sun_side = star_sources.apparent(pole, date)[0]
     _helio, bary = star_sources.erfa.epv00(J2000_JD, tt_days(date))
     beta = bary["v"] / SPEED_OF_LIGHT_AU_DAY
-    unbent = star_sources.erfa.ab(np.array([0.0, 0.0, 1.0]), beta, 1.0, np.sqrt(1 - beta @ beta))
+    unbent = star_sources.erfa.ab(
+        np.array([0.0, 0.0, 1.0]), beta, 1.0, np.sqrt(1 - beta @ beta)
+    )
     assert (unbent - sun_side)[0] / MAS_RAD == pytest.approx(4.07, abs=0.1)
 
 
@@ -172,7 +176,9 @@ def test_north_is_up_and_east_is_left(ra_deg: float, dec_deg: float) -> None:
 def test_roll_is_the_position_angle_of_up(roll_deg: float) -> None:
     ra_deg = 150.0
     dec_deg = 35.0
-    up_icrs = star_sources.cam_from_icrs(ra_deg, dec_deg, roll_deg).inv().apply([0.0, -1e-6, 1.0])
+    up_icrs = (
+        star_sources.cam_from_icrs(ra_deg, dec_deg, roll_deg).inv().apply([0.0, -1e-6, 1.0])
+    )
     center = SkyCoord(ra_deg, dec_deg, unit="deg")
     toward = SkyCoord(*up_icrs, representation_type="cartesian").represent_as("unitspherical")
     angle = center.position_angle(SkyCoord(toward.lon, toward.lat)).deg

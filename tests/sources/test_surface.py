@@ -20,7 +20,11 @@ from skysim.sources.dome.surface import SURFACES, Radial, Surface, build_surface
 INCH_M = 0.0254
 UP = np.array([[0.0, 0.0, 1.0]])
 SPHERE = {"kind": "sphere", "apex": "48 in", "radius": "50 in"}
-MEASURED = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38.88 in", "38.88 in", "28.60 in"]}
+MEASURED = {
+    "kind": "ellipsoid",
+    "apex": "48 in",
+    "semi_axes": ["38.88 in", "38.88 in", "28.60 in"],
+}
 PROLATE = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["44 in", "44 in", "50 in"]}
 TRIAXIAL = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38 in", "45 in", "31 in"]}
 FLAT = {"kind": "flat", "apex": "48 in"}
@@ -91,7 +95,9 @@ def survey_of(path: Path, count: int, sigma_m: float, seed: int) -> dict[str, An
     return written(path, points + noise[:, None] * made(MEASURED).inward(points))
 
 
-def written(path: Path, points_m: np.ndarray, head: str = "# FARO arm\nx,y,z") -> dict[str, Any]:
+def written(
+    path: Path, points_m: np.ndarray, head: str = "# FARO arm\nx,y,z"
+) -> dict[str, Any]:
     np.savetxt(path, points_m * 1e3, delimiter=",", header=head, comments="", fmt="%.9f")
     return {"kind": "surveyed", "file": str(path), "unit": "mm"}
 
@@ -126,7 +132,9 @@ def test_points_lie_on_their_rays_and_satisfy_the_equation(name: str, origin_in:
     rays = rays_for(name, 300, 1)
     met = made(KINDS[name]).meet(origin, rays)
     assert np.isfinite(met).all()
-    np.testing.assert_allclose(off_equation(name, met), 0, rtol=0, atol=3e-14)  # rounding of a root
+    np.testing.assert_allclose(
+        off_equation(name, met), 0, rtol=0, atol=3e-14
+    )  # rounding of a root
     along = met - origin
     assert np.all(np.einsum("nj,nj->n", along, rays) > 0)
     np.testing.assert_allclose(np.cross(along, rays), 0, rtol=0, atol=1e-14)
@@ -263,7 +271,9 @@ def test_the_rim_s_height_moves_with_the_dome(name: str, cloud: dict) -> None:
 
 
 def test_a_panel_and_a_vault_end_at_their_sides() -> None:
-    rays = np.array([[0.49, 0.29, 1], [0.51, 0, 1], [0, 0.31, 1], [-0.49, -0.29, 1], [0, 0, -1]])
+    rays = np.array(
+        [[0.49, 0.29, 1], [0.51, 0, 1], [0, 0.31, 1], [-0.49, -0.29, 1], [0, 0, -1]]
+    )
     panel = made({"kind": "flat", "apex": "1 m", "width": "1 m", "height": "0.6 m"})
     missed = [False, True, True, False, True]
     np.testing.assert_array_equal(np.isnan(panel.meet(np.zeros(3), rays)[:, 0]), missed)
@@ -271,12 +281,16 @@ def test_a_panel_and_a_vault_end_at_their_sides() -> None:
         {"kind": "cylinder", "axis": "y", "apex": "1 m", "radius": "1 m", "length": "0.6 m"}
     )
     along = np.array([[0, 0.29, 1], [0, 0.31, 1], [0, -0.29, 1], [0, -0.31, 1]])
-    np.testing.assert_array_equal(np.isnan(vault.meet(np.zeros(3), along)[:, 0]), [False, True] * 2)
+    np.testing.assert_array_equal(
+        np.isnan(vault.meet(np.zeros(3), along)[:, 0]), [False, True] * 2
+    )
 
 
 def test_a_drum_extends_down_from_its_upper_edge() -> None:
     height_in = np.array([29.9, 30.1, -19.9, -20.1])
-    met = made(DRUM).meet(np.zeros(3), np.column_stack([np.full(4, 48.0), np.zeros(4), height_in]))
+    met = made(DRUM).meet(
+        np.zeros(3), np.column_stack([np.full(4, 48.0), np.zeros(4), height_in])
+    )
     np.testing.assert_array_equal(np.isnan(met[:, 0]), [False, True, False, True])
 
 
@@ -303,7 +317,9 @@ def test_the_wall_thickens_linearly_with_the_angle_down_to_its_base() -> None:
     shape = made(DESIGN)
     angle = np.radians([0, 10, 20, 30, 40, 60])
     rays = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])
-    radius_in = np.linalg.norm(shape.meet(shape.center_m, rays) - shape.center_m, axis=1) / INCH_M
+    radius_in = (
+        np.linalg.norm(shape.meet(shape.center_m, rays) - shape.center_m, axis=1) / INCH_M
+    )
     wall_in = 2 * (48.135 - radius_in)
     np.testing.assert_allclose(
         wall_in, [0.2036, 0.2152, 0.2268, 0.2384, 0.25, 0.25], rtol=0, atol=1e-11
@@ -339,7 +355,9 @@ def test_the_measured_dome_s_best_sphere_is_the_reference_s() -> None:
     np.testing.assert_allclose(ball.center_m / INCH_M, [0, 0, -0.16], rtol=0, atol=0.01)
     assert ball.rms_m / INCH_M == pytest.approx(0.083, abs=0.002)
     angle = np.radians(np.arange(0, 40.09, 0.01))
-    contour = shape.meet(np.zeros(3), np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)]))
+    contour = shape.meet(
+        np.zeros(3), np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])
+    )
     off_in = (np.linalg.norm(contour - ball.center_m, axis=1) - ball.radius_m) / INCH_M
     assert np.sqrt(np.mean(off_in**2)) == pytest.approx(0.10, abs=0.01)
 
@@ -351,7 +369,9 @@ def test_the_tracker_models_upright_quadrics_exactly() -> None:
     center, axes = made(MEASURED, offset=["1 in", "2 in", "3 in"]).as_ellipsoid()
     np.testing.assert_allclose(center / INCH_M, [1, 2, 22.4], rtol=0, atol=1e-12)
     np.testing.assert_allclose(axes / INCH_M, [38.88, 38.88, 28.60], rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(made(SPHERE, **MOVED).as_ellipsoid()[1], np.full(3, 50 * INCH_M))
+    np.testing.assert_array_equal(
+        made(SPHERE, **MOVED).as_ellipsoid()[1], np.full(3, 50 * INCH_M)
+    )
     assert made(MEASURED).nearest_ellipsoid().rms_m == 0
 
 
@@ -374,7 +394,11 @@ def test_the_nearest_ellipsoid_of_other_surfaces_states_its_residual() -> None:
     """
     wall = made(DESIGN, rim_deg=40).nearest_ellipsoid()
     assert wall.rms_m < 0.001 * INCH_M
-    assert wall.semi_axes_m[2] > wall.semi_axes_m[0] == pytest.approx(wall.semi_axes_m[1], rel=1e-6)
+    assert (
+        wall.semi_axes_m[2]
+        > wall.semi_axes_m[0]
+        == pytest.approx(wall.semi_axes_m[1], rel=1e-6)
+    )
     near, far = (
         made(MEASURED, rim_deg=35, tilt_deg=[t, 0]).nearest_ellipsoid() for t in (0.5, 1.0)
     )
@@ -608,17 +632,18 @@ def test_points_that_determine_no_smooth_dome_are_refused(tmp_path: Path) -> Non
         in surveyed_complaint(path)
     )
     written(path, good[good[:, 0] > 0])
-    assert "parts of the dome have no points; allowed: points all around +z" in surveyed_complaint(
-        path
+    assert (
+        "parts of the dome have no points; allowed: points all around +z"
+        in surveyed_complaint(path)
     )
     written(path, good + 3e-3 * rng.standard_normal(good.shape))
     assert re.search(
         r"0.00\d+ m rms off .*worst 0.0\d+ m\); allowed: rms_limit 0.001 m",
         surveyed_complaint(path),
     )
-    assert made({"kind": "surveyed", "file": str(path), "unit": "mm", "rms_limit": "5 mm"}).inside(
-        np.zeros(3)
-    )
+    assert made(
+        {"kind": "surveyed", "file": str(path), "unit": "mm", "rms_limit": "5 mm"}
+    ).inside(np.zeros(3))
     written(path, good)
     assert "do not reach the rim; allowed: a rim within 41." in surveyed_complaint(
         path, ", rim_deg: 60"
@@ -637,7 +662,8 @@ def test_every_kind_of_part_has_its_surface() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rim_deg", "mean_z"), [(None, 1 / 2), (80.0, (1 + np.cos(np.radians(80))) / 2), (40.0, None)]
+    ("rim_deg", "mean_z"),
+    [(None, 1 / 2), (80.0, (1 + np.cos(np.radians(80))) / 2), (40.0, None)],
 )
 def test_samples_are_uniform_in_solid_angle_down_to_rim_or_horizon(
     rim_deg: float | None, mean_z: float | None

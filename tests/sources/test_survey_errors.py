@@ -72,14 +72,20 @@ def test_every_led_of_the_map_has_its_own_error_about_each_axis() -> None:
     for axis in error.T:
         is_chi_square(axis)
     # The mean is zero, and no two axes or neighbors go together: sums of N independent numbers of variance 1.
-    for products in (error, error * np.roll(error, 1, axis=1), error * np.roll(error, 1, axis=0)):
+    for products in (
+        error,
+        error * np.roll(error, 1, axis=1),
+        error * np.roll(error, 1, axis=0),
+    ):
         assert np.abs(products.mean(axis=0)).max() < 5 / np.sqrt(len(error))
     np.testing.assert_array_equal(eyes.leds.id, lab.camera.sources.id)
 
 
 def test_the_camera_s_position_error_over_seeds_is_lever_sigma() -> None:
     true_m = np.array([0.0, 0.01, 0.381])
-    error = [survey_errors.assumed_m(true_m, 1e-4, seed, "lever") - true_m for seed in range(400)]
+    error = [
+        survey_errors.assumed_m(true_m, 1e-4, seed, "lever") - true_m for seed in range(400)
+    ]
     is_chi_square(np.array(error) / 1e-4)
 
 
@@ -152,7 +158,9 @@ ALL = "{{led_sigma: 0.2 mm, lever_sigma: {lever}, seed: {seed}}}"
 def test_survey_errors_depend_on_their_own_seed_and_not_on_the_run_s() -> None:
     def places(seed: int, own: int) -> tuple[bytes, ...]:
         survey = ALL.format(lever="0.1 mm", seed=own)
-        eyes, _ = believing(seed=str(seed), tracker__survey=survey, light__surface__error="0.1 mm")
+        eyes, _ = believing(
+            seed=str(seed), tracker__survey=survey, light__surface__error="0.1 mm"
+        )
         return tuple(
             one.tobytes()
             for one in (eyes.leds.position_m, eyes.lever.camera_body_m, eyes.leds.semi_axes_m)
@@ -247,7 +255,9 @@ def test_an_impossible_tracker_survey_is_refused_in_one_line(
 
 def test_a_survey_that_leaves_no_dome_is_refused() -> None:
     inside = inside_of(error="1 m")
-    seed = next(seed for seed in range(100) if survey_errors.surface_offset_m(inside, seed) < -1.0)
+    seed = next(
+        seed for seed in range(100) if survey_errors.surface_offset_m(inside, seed) < -1.0
+    )
     with pytest.raises(
         InputError,
         match=r"light\.surface\.error: 1 m makes an ellipsoid of -.* m; allowed: far less",

@@ -119,14 +119,18 @@ def test_no_leds_and_no_errors_of_the_set_up_are_empty() -> None:
 def test_range_and_angle_errors_are_along_and_across_the_sight() -> None:
     """A data sheet's 1 mm along the sight; 1" at 100 m is half a millimeter across (Leica MS60 manual)."""
     place_m = np.array([[100.0, 0.0, 0.0]])
-    config = station(position=["0 m", "0 m", "0 m"], angle_sigma_arcsec=1, distance_sigma="1 mm")
+    config = station(
+        position=["0 m", "0 m", "0 m"], angle_sigma_arcsec=1, distance_sigma="1 mm"
+    )
     covariance = survey_errors.station_covariance_m2(config, place_m)[0]
     np.testing.assert_allclose(
         np.sqrt(np.diag(covariance)), [1e-3, 100 * ARCSEC, 100 * ARCSEC], rtol=1e-12
     )
     assert 100 * ARCSEC == pytest.approx(0.5e-3, rel=0.05)  # noqa: SIM300
     # Toward the zenith the horizontal direction matters less, by the sine of the zenith angle.
-    steep = survey_errors.station_covariance_m2(config, np.array([[10.0, 0.0, 10 * np.sqrt(3)]]))[0]
+    steep = survey_errors.station_covariance_m2(
+        config, np.array([[10.0, 0.0, 10 * np.sqrt(3)]])
+    )[0]
     assert np.sqrt(steep[1, 1]) == pytest.approx(20 * ARCSEC * 0.5, rel=1e-12)
 
 
@@ -195,7 +199,9 @@ def test_the_tracker_uses_the_station_s_measurements() -> None:
     surveys = 400
     error = [
         (
-            survey_errors.assumed_leds_m(inside, place_m, survey_of(led_sigma="0.2 mm", seed=seed))
+            survey_errors.assumed_leds_m(
+                inside, place_m, survey_of(led_sigma="0.2 mm", seed=seed)
+            )
             - place_m
         ).ravel()
         for seed in range(surveys)
@@ -243,7 +249,9 @@ def test_the_final_match_and_identification_use_the_same_gates() -> None:
 def test_without_an_instrument_the_map_claims_one_sigma_for_all() -> None:
     plain = SurveyErrorsConfig.model_validate({"led_sigma": "0.2 mm"})
     inside = surface.build_surface(
-        light.SurfaceConfig.model_validate({"kind": "sphere", "apex": "1.3 m", "radius": "1.3 m"})
+        light.SurfaceConfig.model_validate(
+            {"kind": "sphere", "apex": "1.3 m", "radius": "1.3 m"}
+        )
     )
     assert survey_errors.led_covariance_m2(PLACES_M, plain) is None
     assert survey_errors.common_displacements_m(inside, PLACES_M, plain) is None
@@ -252,7 +260,9 @@ def test_without_an_instrument_the_map_claims_one_sigma_for_all() -> None:
 def test_the_survey_s_ellipsoid_moves_with_its_leds() -> None:
     """The setup's rigid motion, and not the sights' errors: LEDs stay on the believed sphere to the scale's error."""
     inside = surface.build_surface(
-        light.SurfaceConfig.model_validate({"kind": "sphere", "apex": "1.3 m", "radius": "1.3 m"})
+        light.SurfaceConfig.model_validate(
+            {"kind": "sphere", "apex": "1.3 m", "radius": "1.3 m"}
+        )
     )
     exact = {
         "angle_sigma_arcsec": 0,
@@ -289,7 +299,9 @@ def test_the_survey_s_ellipsoid_moves_with_its_leds() -> None:
         ),
     ],
 )
-def test_an_invalid_survey_is_refused_in_one_line(changes: dict[str, str], complaint: str) -> None:
+def test_an_invalid_survey_is_refused_in_one_line(
+    changes: dict[str, str], complaint: str
+) -> None:
     with pytest.raises(InputError) as caught:
         loader.load("afit_simsat", changes)
     assert complaint in str(caught.value)
@@ -304,7 +316,9 @@ def test_a_sky_has_a_focal_length_to_survey_and_no_leds() -> None:
 
 
 def test_a_station_at_an_led_is_refused() -> None:
-    with pytest.raises(InputError, match=r"^tracker.survey.instrument.position: an LED is there"):
+    with pytest.raises(
+        InputError, match=r"^tracker.survey.instrument.position: an LED is there"
+    ):
         survey_errors.station_covariance_m2(station(position=["0 m", "0 m", "1.2 m"]), PLACES_M)
 
 

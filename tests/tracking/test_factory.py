@@ -41,7 +41,9 @@ NO_CONTROL = {
 def flown(until_s: float, **changes: str) -> Flight:
     """A balanced SimSat without control, unless changed."""
     until = {"exposure": f"{{time: 10 ms, rate_hz: 1, frames: 1, first: {until_s} s}}"}
-    given = NO_CONTROL | until | {key.replace("__", "."): value for key, value in changes.items()}
+    given = (
+        NO_CONTROL | until | {key.replace("__", "."): value for key, value in changes.items()}
+    )
     return simulate_motion(loader.load("afit_simsat", given))
 
 
@@ -101,7 +103,9 @@ def test_uncompensated_earth_rate_makes_the_navigator_drift_by_15_deg_an_hour() 
 
 def test_a_compensated_earth_rate_causes_no_drift() -> None:
     flight = flown(
-        5.0, vehicle__imu=f"{{{PERFECT}, earth_rate: compensated}}", motion__rate_deg_s="[0, 0, 30]"
+        5.0,
+        vehicle__imu=f"{{{PERFECT}, earth_rate: compensated}}",
+        motion__rate_deg_s="[0, 0, 30]",
     )
     assert np.abs(error(telemetry_of(flight))).max() < 1e-4 * ARCSEC
 
@@ -128,7 +132,9 @@ def test_an_initial_attitude_error_stays_in_the_navigator() -> None:
     """Zeroed while the vehicle stood wrong by (roll, pitch, yaw): its Euler angles are short of it by that."""
     home = "home_error_deg: [0.5, -1.0, 2.0]"
     start = "{roll_deg: 5, pitch_deg: 10, yaw_deg: -40}"
-    telemetry = telemetry_of(flown(1.0, vehicle__imu=f"{{{PERFECT}, {home}}}", motion__start=start))
+    telemetry = telemetry_of(
+        flown(1.0, vehicle__imu=f"{{{PERFECT}, {home}}}", motion__start=start)
+    )
     assert telemetry.lab_from_imu is not None
     believed = telemetry.lab_from_imu.as_euler("ZYX", degrees=True)[:, ::-1]
     np.testing.assert_allclose(
@@ -140,7 +146,9 @@ def test_an_initial_attitude_error_stays_in_the_navigator() -> None:
 def test_under_imu_control_the_vehicle_follows_the_navigator_s_error() -> None:
     """The navigator is brought to the reference, (0, 0, 0), so the vehicle stands off by the home's error."""
     home = "home_error_deg: [0.5, -1.0, 2.0]"
-    flight = flown(12.0, vehicle__imu=f"{{{PERFECT}, {home}}}", motion__control="{feedback: imu}")
+    flight = flown(
+        12.0, vehicle__imu=f"{{{PERFECT}, {home}}}", motion__control="{feedback: imu}"
+    )
     telemetry = telemetry_of(flight)
     assert telemetry.lab_from_imu is not None
     start = np.degrees(telemetry.lab_from_body[0].magnitude())
@@ -148,7 +156,9 @@ def test_under_imu_control_the_vehicle_follows_the_navigator_s_error() -> None:
     assert np.degrees(telemetry.lab_from_imu[-1].magnitude()) < 1e-3
     wrong = Rotation.from_euler("ZYX", [-2.0, 1.0, -0.5], degrees=True)
     assert np.degrees((telemetry.lab_from_body[-1] * wrong).magnitude()) < 1e-3
-    ideal = telemetry_of(flown(12.0, vehicle__imu=f"{{{PERFECT}, {home}}}", motion__control="pid"))
+    ideal = telemetry_of(
+        flown(12.0, vehicle__imu=f"{{{PERFECT}, {home}}}", motion__control="pid")
+    )
     assert np.degrees(ideal.lab_from_body[-1].magnitude()) < 1e-12  # truth is not led astray
 
 
@@ -213,7 +223,9 @@ def test_samples_that_do_not_end_with_a_tick_are_not_lost() -> None:
         piece = slice(begin, end + 1)
         wxyz = knots.lab_from_body.as_quat(scalar_first=True)[piece]
         before = navigation.samples
-        navigation.sample_imu(knots.t_s[end], knots.t_s[piece], wxyz, knots.rate_body_rad_s[piece])
+        navigation.sample_imu(
+            knots.t_s[end], knots.t_s[piece], wxyz, knots.rate_body_rad_s[piece]
+        )
         counts.append(navigation.samples - before)
     assert set(counts) == {2, 3}
     assert sum(counts) == navigation.samples == 39  # 97.5 of 98 ms
@@ -344,12 +356,17 @@ def doubted_of(name: str, changes: dict[str, str]) -> list[str]:
     ("surface", "doubted"),
     [
         ("{kind: ellipsoid, apex: 1.2 m, semi_axes: [1 m, 1 m, 0.7 m]}", False),
-        ("{kind: ellipsoid, apex: 1.2 m, semi_axes: [1 m, 1 m, 0.7 m], tilt_deg: [3, 0]}", True),
+        (
+            "{kind: ellipsoid, apex: 1.2 m, semi_axes: [1 m, 1 m, 0.7 m], tilt_deg: [3, 0]}",
+            True,
+        ),
         ("{kind: sphere, apex: 1.2 m, radius: 1 m, tilt_deg: [3, 0]}", False),
         ("{kind: flat, apex: 1.2 m, tilt_deg: [3, 0]}", False),
     ],
 )
-def test_a_surface_that_is_no_upright_ellipsoid_is_warned_of(surface: str, doubted: bool) -> None:
+def test_a_surface_that_is_no_upright_ellipsoid_is_warned_of(
+    surface: str, doubted: bool
+) -> None:
     """Of a tilted ellipsoid by how much it misses: turned by e it moves (a - b) e at the most, along its normal."""
     lines = doubted_of("afit_simsat", {"light.surface": surface})
     doubts = [line for line in lines if line.startswith("light.surface")]
@@ -406,7 +423,13 @@ def test_a_warning_is_one_line_before_the_run_which_continues(
 ) -> None:
     changes = ["light.surface.tilt_deg=[8, 0]", "exposure.first=0 s"]
     run_command.run(
-        "afit_simsat", frames=1, seed=None, out=tmp_path, set_=changes, scene_3d=False, json=True
+        "afit_simsat",
+        frames=1,
+        seed=None,
+        out=tmp_path,
+        set_=changes,
+        scene_3d=False,
+        json=True,
     )
     said = capsys.readouterr()
     assert said.err.startswith("skysim: light.surface: differs by")

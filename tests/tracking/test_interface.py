@@ -38,7 +38,9 @@ from skysim.tracking import tracker_interface
 from skysim.tracking.tracker_interface import Answer, Leds, Picture, Setup, Stars, check_answer
 
 PAGE = (ROOT / "docs/howto/external_tracker.md").read_text(encoding="utf-8")
-SETUP = Setup("icrs", "2012-06-22T21:00:00", 8, 6, 100.0, (3.5, 2.5), (0.0,) * 5, 1.0, 4095.0, 1)
+SETUP = Setup(
+    "icrs", "2012-06-22T21:00:00", 8, 6, 100.0, (3.5, 2.5), (0.0,) * 5, 1.0, 4095.0, 1
+)
 PICTURE = Picture(np.arange(48, dtype=np.uint16).reshape(6, 8), 7, 0.5, 0.04)
 UNIT = [0.5, -0.5, 0.5, 0.5]
 
@@ -62,7 +64,10 @@ UNIT = [0.5, -0.5, 0.5, 0.5]
         (Answer("solved", UNIT, np.diag([1e-9, -1e-9, 1e-9])), "eigenvalues"),
         (Answer("solved", UNIT, None, [[1, 2, 3]]), "centroids_px has shape"),
         (Answer("solved", UNIT, None, 3.0), "centroids_px"),
-        (Answer("solved", UNIT, None, [[1, 2], [-1e300, 2]]), r"1e\+300; allowed: up to 1e\+06 px"),
+        (
+            Answer("solved", UNIT, None, [[1, 2], [-1e300, 2]]),
+            r"1e\+300; allowed: up to 1e\+06 px",
+        ),
         (Answer("solved", UNIT, None, None, -1.0), "allowed: 0 or more"),
         (Answer(""), "allowed: text"),
         (Answer(5), "allowed: text"),
@@ -183,7 +188,10 @@ def test_every_fault_of_a_program_is_one_line_within_the_time_limit(
     ("harm", "reason"),
     [
         ("shutil.rmtree(sys.argv[1])", "No such file or directory"),
-        ("os.remove(h['file']); os.mkdir(h['file'])", r"Is a directory|Operation not permitted"),
+        (
+            "os.remove(h['file']); os.mkdir(h['file'])",
+            r"Is a directory|Operation not permitted",
+        ),
     ],
 )
 def test_a_program_that_damages_its_folder_is_reported_and_restarted(
@@ -228,7 +236,9 @@ def test_a_program_is_restarted_and_abandoned_after_three_successive_failures(
 
 def test_child_processes_of_a_program_end_with_it(tmp_path: Path) -> None:
     beat = tmp_path / "beat"
-    child = f"import time\nwhile True:\n    open({str(beat)!r}, 'a').write('x'); time.sleep(0.02)"
+    child = (
+        f"import time\nwhile True:\n    open({str(beat)!r}, 'a').write('x'); time.sleep(0.02)"
+    )
     runs = program(
         f"import subprocess, sys; subprocess.Popen([sys.executable, '-c', {child!r}])\n"
         + FRAMES
@@ -254,7 +264,9 @@ def test_child_processes_of_a_program_end_with_it(tmp_path: Path) -> None:
         ("import sys; sys.exit('no licence')", r"ended \(code 1\): no licence"),
     ],
 )
-def test_a_program_that_does_not_start_is_refused_with_the_reason(text: str, message: str) -> None:
+def test_a_program_that_does_not_start_is_refused_with_the_reason(
+    text: str, message: str
+) -> None:
     with pytest.raises(InputError, match=message):
         program(text)
 
@@ -391,7 +403,8 @@ def test_a_tracker_can_be_a_study_s_factor(tmp_path: Path) -> None:
     path = tmp_path / "who.yaml"
     path.write_text(STUDY)
     with pytest.raises(
-        InputError, match=r"factors\.who: 'mine': tracker\.name: unknown tracker 'mine'; allowed:"
+        InputError,
+        match=r"factors\.who: 'mine': tracker\.name: unknown tracker 'mine'; allowed:",
     ):
         study_loader.load(path, programs={})
     (tmp_path / "mine.py").write_text(
@@ -434,7 +447,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     named = "Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n".format(**project)
     (about / "METADATA").write_text(named)
     points = [
-        f"{name} = {place}" for name, place in project["entry-points"]["skysim.trackers"].items()
+        f"{name} = {place}"
+        for name, place in project["entry-points"]["skysim.trackers"].items()
     ]
     (about / "entry_points.txt").write_text("\n".join(["[skysim.trackers]", *points]))
     (folder / "bin").mkdir()
@@ -456,7 +470,9 @@ def said(folder: Path, words: list[str]) -> str:
 
 @pytest.mark.long
 @pytest.mark.parametrize("words", [w for w in commands() if "tetra3rs" not in w], ids=" ".join)
-def test_the_page_s_commands_run_without_wrong_attitudes(folder: Path, words: list[str]) -> None:
+def test_the_page_s_commands_run_without_wrong_attitudes(
+    folder: Path, words: list[str]
+) -> None:
     page = said(folder, words)
     wrong = re.search(r"(\d+) wrong", page)
     assert wrong is None or wrong[1] == "0"
@@ -517,14 +533,18 @@ def test_the_page_s_adapter_reads_lost_s_axes_and_quaternion(tmp_path: Path) -> 
     """By LOST's own formulas: its stars and ours fall on the same pixels, whose corner is (-0.5, -0.5) for us."""
     lost = tmp_path / "lost"
     adapter = tmp_path / "lost.py"
-    adapter.write_text(next(block for block in blocks("python") if block.startswith("# lost.py")))
+    adapter.write_text(
+        next(block for block in blocks("python") if block.startswith("# lost.py"))
+    )
     lost.mkdir()
     (lost / "lost").write_text(LOST.format(python=sys.executable))
     (lost / "lost").chmod(0o755)
     for n, pointed in enumerate(POINTED):
         values = [1, *pointed, *of_lost(*pointed)[[1, 2, 3, 0]]]
         keys = ("known", "ra", "de", "roll", "i", "j", "k", "real")
-        rows = [f"attitude_{key} {value:.6g}\n" for key, value in zip(keys, values, strict=True)]
+        rows = [
+            f"attitude_{key} {value:.6g}\n" for key, value in zip(keys, values, strict=True)
+        ]
         (lost / str(n)).write_text("".join(rows))
     (lost / str(len(POINTED))).write_text("attitude_known 0\n")
     words = [sys.executable, str(adapter), str(lost), "{folder}"]
@@ -532,7 +552,9 @@ def test_the_page_s_adapter_reads_lost_s_axes_and_quaternion(tmp_path: Path) -> 
         "lost", words, "png", replace(SETUP, saturation_dn=255.0), 20.0
     )
     answers = [
-        check_answer(runs.solve(replace(PICTURE, frame=n, image_dn=np.full((6, 8), n, np.uint16))))
+        check_answer(
+            runs.solve(replace(PICTURE, frame=n, image_dn=np.full((6, 8), n, np.uint16)))
+        )
         for n in range(len(POINTED) + 1)
     ]
     runs.close()

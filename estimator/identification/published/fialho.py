@@ -162,7 +162,9 @@ def fialho_1(
 ) -> StarMatch | None:
     """The basic algorithm: one triangle, each list from the whole catalog, no prior boresight. See `fialho_4`."""
     settings = replace(Options(**options), boresight_ref=None)
-    return _identify(vectors_cam, index, tolerance_rad, settings, MIN_FRACTION_BASIC, False, False)
+    return _identify(
+        vectors_cam, index, tolerance_rad, settings, MIN_FRACTION_BASIC, False, False
+    )
 
 
 def fialho_2(
@@ -338,13 +340,17 @@ def triplets(
         (2,) triplets tested and angles compared so far, increased in place
     """
     i, j, k = corners
-    sides = np.array([angle(rays[i], rays[j]), angle(rays[i], rays[k]), angle(rays[j], rays[k])])
+    sides = np.array(
+        [angle(rays[i], rays[j]), angle(rays[i], rays[k]), angle(rays[j], rays[k])]
+    )
     # The index holds no longer pairs.
     if sides.max() > index.max_angle_rad:
         return no_match()
     tolerance = sqrt(2.0) * options.tolerance_rad + options.stretch * sides
     if options.optimized:
-        return _test_neighbors(rays, magnitudes, index, corners, sides, tolerance, options, tried)
+        return _test_neighbors(
+            rays, magnitudes, index, corners, sides, tolerance, options, tried
+        )
     return _test_lists(rays, magnitudes, index, corners, sides, tolerance, options, tried)
 
 
@@ -358,7 +364,9 @@ def _direct_match(
     tried: int,
 ) -> DirectMatch:
     """Step 4: the direct match of one triplet; empty if too few stars match or it is not significant."""
-    match = match_field(rays, index, corners, stars, options.tolerance_rad, options.stretch, tried)
+    match = match_field(
+        rays, index, corners, stars, options.tolerance_rad, options.stretch, tried
+    )
     # The paper's threshold on the number of matches, and the added one on their significance.
     if (
         len(match.observed) <= options.min_fraction * len(rays)
@@ -421,11 +429,16 @@ def _test_neighbors(
             for b in second[:count]:
                 if abs(angle(index.vectors[b], index.vectors[c]) - sides[2]) > tolerance[2]:
                     continue
-                if handedness * triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
+                if (
+                    handedness * triple(index.vectors[a], index.vectors[b], index.vectors[c])
+                    <= 0
+                ):
                     continue
                 # 4. The direct match.
                 tried[0] += 1
-                match = _direct_match(rays, index, corners, np.array([a, b, c]), options, tried[0])
+                match = _direct_match(
+                    rays, index, corners, np.array([a, b, c]), options, tried[0]
+                )
                 if match.log10_chance <= ACCEPT_LOG10_CHANCE:
                     return match
     return no_match()
@@ -479,7 +492,9 @@ def _test_lists(
                     continue
                 # 4. The direct match.
                 tried[0] += 1
-                match = _direct_match(rays, index, corners, np.array([a, b, c]), options, tried[0])
+                match = _direct_match(
+                    rays, index, corners, np.array([a, b, c]), options, tried[0]
+                )
                 if match.log10_chance <= ACCEPT_LOG10_CHANCE:
                     return match
     return no_match()

@@ -59,7 +59,11 @@ class MasterStarOptions(NamedTuple):
 
 
 def master_star(
-    vectors_cam: Floats, index: PairIndex, tolerance_rad: float, masters: int = 1, **options: Any
+    vectors_cam: Floats,
+    index: PairIndex,
+    tolerance_rad: float,
+    masters: int = 1,
+    **options: Any,
 ) -> StarMatch | None:
     """Identify stars by NPS's master-star method (see the module's steps).
 
@@ -210,7 +214,9 @@ def _best_match(
     # Stars at the angle of the second star from the candidate.
     for n in np.argsort(-sides)[: min(4, len(rays) - 1)]:
         tolerance = sqrt(2.0) * options.tolerance_rad + options.stretch * sides[n]
-        begin, end = neighbor_range(index, candidate, sides[n] - tolerance, sides[n] + tolerance)
+        begin, end = neighbor_range(
+            index, candidate, sides[n] - tolerance, sides[n] + tolerance
+        )
         for second in index.neighbor[begin:end]:
             stars = np.array([candidate, second], np.int64)
             tried[0] += 1

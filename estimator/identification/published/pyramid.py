@@ -174,11 +174,16 @@ def _triangle(
                 if abs(side_bc - jk) > t_jk:
                     continue
                 # 3. The mirror image has the same sides.
-                if handedness * triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
+                if (
+                    handedness * triple(index.vectors[a], index.vectors[b], index.vectors[c])
+                    <= 0
+                ):
                     continue
                 # One factor for all three sides: the assumed over the true focal length.
                 tangent_scale = (
-                    (side + side_ac + side_bc) / (ij + ik + jk) if options.focal_unknown else 1.0
+                    (side + side_ac + side_bc) / (ij + ik + jk)
+                    if options.focal_unknown
+                    else 1.0
                 )
                 misfit = max(
                     abs(side - tangent_scale * ij) - residual_stretch * ij,
@@ -191,7 +196,13 @@ def _triangle(
                 tried[1] += 1
                 scaled = _scale_tangents(rays, tangent_scale) if options.focal_unknown else rays
                 match = _pyramid(
-                    scaled, index, corners, np.array([a, b, c]), options, residual_stretch, tried
+                    scaled,
+                    index,
+                    corners,
+                    np.array([a, b, c]),
+                    options,
+                    residual_stretch,
+                    tried,
                 )
                 if match.log10_chance < ACCEPT_LOG10_CHANCE:
                     return match
@@ -235,7 +246,9 @@ def _pyramid(
                 fits = fits and misfit <= sqrt(2.0) * options.tolerance + stretch * side
             if fits:
                 tried[2] += len(rays) * (index.first[stars[0] + 1] - index.first[stars[0]])
-                return _match_with_penalty(rays, index, corners, stars, options, stretch, tried[1])
+                return _match_with_penalty(
+                    rays, index, corners, stars, options, stretch, tried[1]
+                )
     return no_match()
 
 
@@ -296,7 +309,8 @@ def _count_in_field(
         s = center if place < begin else index.neighbor[place]
         x, y, z = R_cam_from_ref @ index.vectors[s]
         inside = (
-            options.left * z < x < options.right * z and options.top * z < y < options.bottom * z
+            options.left * z < x < options.right * z
+            and options.top * z < y < options.bottom * z
         )
         count += z > 0 and inside
     return count

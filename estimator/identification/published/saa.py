@@ -244,7 +244,9 @@ def match_assumptions(
     partner_cost = np.empty(len(primary.others))
     for p in range(len(pairs)):
         # Skip pairs outside of the gate, which whole buckets include.
-        misfit = abs(angle(stars.vectors[pairs[p, 0]], stars.vectors[pairs[p, 1]]) - separation_rad)
+        misfit = abs(
+            angle(stars.vectors[pairs[p, 0]], stars.vectors[pairs[p, 1]]) - separation_rad
+        )
         if misfit > gate:
             continue
         # 4. Assume the pair in this order; 7. then in the other one.
@@ -301,7 +303,9 @@ def _partners(
     vectors.multiply_transposed(triad_ref.T, primary.triad.T, R_ref_from_cam)
     # 6. Catalog stars near the predicted place.
     for k in range(len(primary.others)):
-        x, y, z = vectors.rotate(R_ref_from_cam, vectors.row(stars.vectors_cam, primary.others[k]))
+        x, y, z = vectors.rotate(
+            R_ref_from_cam, vectors.row(stars.vectors_cam, primary.others[k])
+        )
         chord = 2 * np.sin(min(primary.radius_rad[k], np.pi) / 2)
         partner[k] = -1
         partner_cost[k] = UNMATCHED_COST
@@ -311,7 +315,9 @@ def _partners(
                 continue
             cost = magnitude_cost(stars, primary.others[k], s)
             # The angles to A and B.
-            misfit_a = abs(primary.corner_rad[0, k] - angle(stars.vectors[s], stars.vectors[first]))
+            misfit_a = abs(
+                primary.corner_rad[0, k] - angle(stars.vectors[s], stars.vectors[first])
+            )
             misfit_b = abs(
                 primary.corner_rad[1, k] - angle(stars.vectors[s], stars.vectors[second])
             )
@@ -447,7 +453,10 @@ class AssumptionPool:
     """
 
     def __init__(
-        self, stars: SearchInput, field_tan: tuple[float, float, float, float], missed_dex: float
+        self,
+        stars: SearchInput,
+        field_tan: tuple[float, float, float, float],
+        missed_dex: float,
     ) -> None:
         self.stars = stars
         self.field_tan = field_tan
@@ -516,7 +525,9 @@ class AssumptionPool:
         return StarMatch(observed, star, cam_from_ref, chance)
 
 
-def _test_pairs(pool: AssumptionPool, index: PairIndex | PairCatalog, settings: Options) -> None:
+def _test_pairs(
+    pool: AssumptionPool, index: PairIndex | PairCatalog, settings: Options
+) -> None:
     """Steps 2 to 8: add the assumptions of pair after pair to the pool.
 
     One pair is not enough: if noise moves A or B out of a gate, the truth is not among its assumptions. The search ends
@@ -559,7 +570,10 @@ def _primary_pairs(
 
 
 def _chance_statistics(
-    stars: SearchInput, primary: Primary, star: Ints, field_tan: tuple[float, float, float, float]
+    stars: SearchInput,
+    primary: Primary,
+    star: Ints,
+    field_tan: tuple[float, float, float, float],
 ) -> tuple[float, float]:
     """Chance statistics of an assumption's attitude.
 
@@ -587,7 +601,9 @@ def _chance_statistics(
     rows = np.flatnonzero(field & (from_midpoint_rad < primary.reach_rad))
     rows = rows[(rows != pair[0]) & (rows != pair[1])]
     # Of these, the number of similar brightness, for each observed star.
-    difference_mag = np.abs(stars.magnitude_cam[primary.others][:, None] - stars.magnitude[rows])
+    difference_mag = np.abs(
+        stars.magnitude_cam[primary.others][:, None] - stars.magnitude[rows]
+    )
     # NaN > x is False: an unknown magnitude passes.
     similar = len(rows) - (difference_mag > 3 * stars.gates.magnitude).sum(axis=1)
     cap_sr = 2 * np.pi * (1 - np.cos(primary.reach_rad))

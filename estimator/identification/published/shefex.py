@@ -140,7 +140,9 @@ def shefex(
 
 
 @jit
-def search(rays: Floats, index: PairIndex, options: ShefexOptions, tried: NDArray) -> DirectMatch:
+def search(
+    rays: Floats, index: PairIndex, options: ShefexOptions, tried: NDArray
+) -> DirectMatch:
     """The compiled search: steps 1 to 6.
 
     Parameters
@@ -210,7 +212,10 @@ def _triangle(
                 if not low_jk <= angle(index.vectors[b], index.vectors[c]) <= high_jk:
                     continue
                 # 3. The mirror image has the same sides.
-                if handedness * triple(index.vectors[a], index.vectors[b], index.vectors[c]) <= 0:
+                if (
+                    handedness * triple(index.vectors[a], index.vectors[b], index.vectors[c])
+                    <= 0
+                ):
                     continue
                 tried[0] += 1
                 # 4. and 5. The other stars.
@@ -299,7 +304,9 @@ def _match_others(
     density = (index.first[stars[0] + 1] - index.first[stars[0]] + 1) / cap_sr
     p = 1 - np.exp(-density * gates[:, 9].sum() / (len(rays) - 3))
     chance = log10_tail(len(rays) - 3, count - 3, p) + np.log10(tried[0])
-    return DirectMatch(observed, star, fit_rotation(rays[observed], index.vectors[star]), chance)
+    return DirectMatch(
+        observed, star, fit_rotation(rays[observed], index.vectors[star]), chance
+    )
 
 
 @jit

@@ -83,7 +83,9 @@ def relaxed(node: Any, name: str = "") -> Any:
             key in BOUND_KEYWORDS
         ):  # pydantic's keyword remains where a validator precedes the bound
             relaxed_node |= (
-                {BOUND_KEYWORDS[key]: value} if node.get("type") in ("number", "integer") else {}
+                {BOUND_KEYWORDS[key]: value}
+                if node.get("type") in ("number", "integer")
+                else {}
             )
         elif key not in DROPPED_KEYWORDS and (key != "title" or name):
             relaxed_node["anyOf" if key == "oneOf" else key] = relaxed(value)

@@ -110,7 +110,9 @@ def main() -> None:
     except ImageError as error:
         code = print_error(str(error))
     except OSError as error:
-        code = print_error(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        code = print_error(
+            f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        )
     except (MemoryError, OverflowError) as error:
         code = print_error(
             f"a value of the scene is too large for this machine: {' '.join(str(error).split())}"

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 # Loaded scenes: name and command-line overrides, for the locations in error messages.
 Loaded = tuple[str, dict[str, str]]
 LOADED: list[Loaded] = []
-TYPED: dict[str, str] = {}  # keys of the scene that options of their own have set, with the option
+TYPED: dict[
+    str, str
+] = {}  # keys of the scene that options of their own have set, with the option
 
 
 def complete_scene(incomplete: str) -> list[str]:
@@ -40,7 +42,9 @@ def complete_study(incomplete: str) -> list[str]:
 
 def complete_yaml(folder: Path, incomplete: str) -> list[str]:
     names = [path.stem for path in folder.glob("*.yaml")]
-    found = Path(incomplete if incomplete.endswith("/") else os.path.dirname(incomplete)).glob("*")
+    found = Path(incomplete if incomplete.endswith("/") else os.path.dirname(incomplete)).glob(
+        "*"
+    )
     files = [
         f"{path}/" if path.is_dir() else str(path)
         for path in found
@@ -58,7 +62,9 @@ SceneArg = Annotated[
     ),
 ]
 Frames = Annotated[int | None, typer.Option(help="Number of frames; default: the scene's.")]
-Seed = Annotated[int | None, typer.Option(help="Seed of all random streams; default: the scene's.")]
+Seed = Annotated[
+    int | None, typer.Option(help="Seed of all random streams; default: the scene's.")
+]
 Out = Annotated[Path | None, typer.Option(help="Output folder; default: out/NAME.")]
 Overrides = Annotated[
     list[str] | None,
@@ -69,9 +75,13 @@ Overrides = Annotated[
     ),
 ]
 Detector = Annotated[str | None, typer.Option(help="Detection algorithm, e.g. local.")]
-Centroider = Annotated[str | None, typer.Option(help="Centroiding algorithm, e.g. gaussian_fit.")]
+Centroider = Annotated[
+    str | None, typer.Option(help="Centroiding algorithm, e.g. gaussian_fit.")
+]
 Identifier = Annotated[str | None, typer.Option(help="Identification algorithm, e.g. pyramid.")]
-SolverName = Annotated[str | None, typer.Option("--solver", help="Attitude algorithm, e.g. quest.")]
+SolverName = Annotated[
+    str | None, typer.Option("--solver", help="Attitude algorithm, e.g. quest.")
+]
 TRACKER_HELP = "Tracker: own, or a name from `skysim trackers` or --program."
 Programs = Annotated[
     list[str] | None,
@@ -135,7 +145,9 @@ def used_programs(options: list[str] | None, names: Iterable[str | None]) -> dic
         if name not in used:
             problem = "has no effect: nothing has this name"
             raise InputError(
-                f"programs.{name}", problem, "that of --tracker, tracker.name or motion.control.law"
+                f"programs.{name}",
+                problem,
+                "that of --tracker, tracker.name or motion.control.law",
             )
     return programs
 

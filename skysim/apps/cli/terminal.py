@@ -54,12 +54,18 @@ def bar(*columns: ProgressColumn, quiet: bool = False) -> Bar:
     what = TextColumn("{task.description}", markup=False)  # a title may contain brackets
     columns = columns or (BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     return Progress(
-        what, *columns, console=console, transient=True, disable=quiet or not console.is_terminal
+        what,
+        *columns,
+        console=console,
+        transient=True,
+        disable=quiet or not console.is_terminal,
     )
 
 
 @contextmanager
-def progress_callback(what: str, quiet: bool = False) -> Iterator[Callable[[float, float], None]]:
+def progress_callback(
+    what: str, quiet: bool = False
+) -> Iterator[Callable[[float, float], None]]:
     """Show a progress bar on stderr and yield its update function done(completed, total)."""
     with bar(quiet=quiet) as shown:
         task = shown.add_task(printable(what))
@@ -167,7 +173,9 @@ def print_remarks(solution: dict[str, Any]) -> None:
             f" the background {solution['background_dn']:g} DN\n"
             f"  tried:  fields {fields} wide, stars to V {solution['catalog_limit_mag']:g}"
         )
-    print(f"  {'likely' if solution['ra_deg'] is None else 'note'}: {printable(solution['hint'])}")
+    print(
+        f"  {'likely' if solution['ra_deg'] is None else 'note'}: {printable(solution['hint'])}"
+    )
 
 
 def print_json(data: Any) -> None:
@@ -235,7 +243,9 @@ def write_3d_views(lab: Lab, log: Telemetry, folder: Path) -> list[Path]:
         files.write_image(
             image_path, scene_picture.picture(mjcf, joints[len(joints) // 2])[:, :, ::-1]
         )
-        shown = progress(scene_picture.film(mjcf, states), len(states), "rendering the animation")
+        shown = progress(
+            scene_picture.film(mjcf, states), len(states), "rendering the animation"
+        )
         scene_picture.write_film(shown, animation_path, len(states) / float(log.t_s[-1] + 1e-9))
     except scene_picture.NoPicture as error:
         print_error(str(error))

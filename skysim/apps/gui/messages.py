@@ -107,7 +107,9 @@ class LightColumns(Sequence[LightRow]):
         if isinstance(n, slice):
             return LightColumns(self.id[n], self.xy_px[n], self.electrons[n], self.magnitude[n])
         x, y = self.xy_px[n].tolist()
-        return LightRow(int(self.id[n]), x, y, float(self.electrons[n]), float(self.magnitude[n]))
+        return LightRow(
+            int(self.id[n]), x, y, float(self.electrons[n]), float(self.magnitude[n])
+        )
 
 
 NO_LIGHTS = LightColumns(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0), np.empty(0))

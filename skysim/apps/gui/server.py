@@ -181,7 +181,11 @@ class KeptFiles:
 
         if key not in self.kept:
             await self.app(scope, receive, keep)
-            if messages and messages[0].get("status") == 200 and not messages[-1].get("more_body"):
+            if (
+                messages
+                and messages[0].get("status") == 200
+                and not messages[-1].get("more_body")
+            ):
                 self.kept[key] = messages
             return
         for message in self.kept[key]:
@@ -193,7 +197,9 @@ def is_plain_file(scope: Any) -> bool:
     if scope["type"] != "http" or scope["method"] != "GET" or scope["query_string"]:
         return False
     path = scope["path"]
-    is_file = path.startswith(f"{FILES}/") and not path.startswith(f"{FILES}/dynamic_resources/")
+    is_file = path.startswith(f"{FILES}/") and not path.startswith(
+        f"{FILES}/dynamic_resources/"
+    )
     return is_file and normpath(path) == path and b"range" not in dict(scope["headers"])
 
 
@@ -245,7 +251,9 @@ class Guard:
         # The address does not keep it.
         if token_matches(request.query_params.get("token", ""), self.token):
             response = RedirectResponse("/", 303)
-            response.set_cookie(self.cookie, self.token, path="/", httponly=True, samesite="strict")
+            response.set_cookie(
+                self.cookie, self.token, path="/", httponly=True, samesite="strict"
+            )
             user = user_of(request.cookies) or secrets.token_hex(USER_BYTES)
             response.set_cookie(USER, user, YEAR_S, path="/", httponly=True, samesite="strict")
             return response

@@ -16,7 +16,9 @@ from skysim.apps.gui.worker.session import SCENE
 if TYPE_CHECKING:
     from skysim.apps.gui.worker.tasks import Worker
 
-THREADS = min(os.cpu_count() or 1, 2)  # of a frame's rendering, so that a key's frame comes sooner
+THREADS = min(
+    os.cpu_count() or 1, 2
+)  # of a frame's rendering, so that a key's frame comes sooner
 # Set before the libraries are imported. OpenMP's threads do not survive a fork, numba's own do; OpenCV refuses larger
 # images.
 ENVIRONMENT = {

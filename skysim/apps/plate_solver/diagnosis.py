@@ -81,7 +81,11 @@ class Refusal:
         detect = DETECTORS[settings.detector]
         priors = FramePriors(None, settings.saturation)
         return detect(
-            self.image, settings.threshold_sigma, settings.min_area_px, settings.max_blobs, priors
+            self.image,
+            settings.threshold_sigma,
+            settings.min_area_px,
+            settings.max_blobs,
+            priors,
         )
 
 
@@ -224,7 +228,9 @@ def unknown_cause(refusal: Refusal) -> str:
     solver = refusal.solvers[0]
     # `other_field` tried it.
     unknown = replace(solver, fov_deg=None, camera=None)
-    narrow_deg = min(one.tried_fov_deg(*refusal.size_px)[0] for one in (unknown, *refusal.solvers))
+    narrow_deg = min(
+        one.tried_fov_deg(*refusal.size_px)[0] for one in (unknown, *refusal.solvers)
+    )
     text = (
         f"no cause found: no field of {narrow_deg:.1g}° to {FIELD_SEARCH.widest_deg:g}° fits, nor the mirrored picture;"
         " are there trees, lamps or clouds? crop them away"

@@ -114,7 +114,9 @@ def pictures_in(paths: Iterable[Path]) -> list[Path]:
             continue
         names = sorted(child for child in path.iterdir() if images.image_suffix(child.name))
         names = [
-            child for child in names if child.name[0] != "." and not child.name.endswith(ANNOTATED)
+            child
+            for child in names
+            if child.name[0] != "." and not child.name.endswith(ANNOTATED)
         ]
         if not names:
             raise InputError(path, "a folder without images", ", ".join(images.IMAGE_SUFFIXES))
@@ -180,7 +182,8 @@ def read_and_solve(path: Path, solver: Solver, annotated: Path | None) -> dict[s
     result |= {"bad_input": False} | outcome_fields(outcome, date_utc)
     if annotated:
         files.write_image(
-            annotated, annotated_image(outcome.hypothesis.pixels, outcome.report, outcome.tracker)
+            annotated,
+            annotated_image(outcome.hypothesis.pixels, outcome.report, outcome.tracker),
         )
     return result
 
@@ -233,7 +236,9 @@ def solve_picture(
     centroids = dict[int, Centroids]()
     for hypothesis in tried:
         reading = id(hypothesis.pixels)
-        solved = solve_array(hypothesis.pixels, hypothesis.solver, date_utc, centroids.get(reading))
+        solved = solve_array(
+            hypothesis.pixels, hypothesis.solver, date_utc, centroids.get(reading)
+        )
         outcomes.append(SolvedReading(hypothesis, *solved, tried))
         centroids[reading] = outcomes[-1].report.centroids
         if outcomes[-1].report.attitude.solved:
@@ -248,7 +253,9 @@ def solve_again(
     camera = refused[0].hypothesis.solver.camera
     if camera and camera.detector:
         return None  # a frame of a camera that is known, with its own saturation
-    for pixels in {id(one.hypothesis.pixels): one.hypothesis.pixels for one in refused}.values():
+    for pixels in {
+        id(one.hypothesis.pixels): one.hypothesis.pixels for one in refused
+    }.values():
         readings = [one for one in refused if one.hypothesis.pixels is pixels]
         settings = readings[0].hypothesis.solver.settings
         for retry in retries.retries(pixels, readings[0].report.centroids, settings):
@@ -261,7 +268,10 @@ def solve_again(
                 if report.attitude.solved:
                     notes = [one.assumption] * bool(one.assumption) + [retry.note]
                     return SolvedReading(
-                        one._replace(assumption="; ".join(notes)), report, tracker, refused[0].tried
+                        one._replace(assumption="; ".join(notes)),
+                        report,
+                        tracker,
+                        refused[0].tried,
                     )
     return None
 
@@ -291,7 +301,9 @@ def hypotheses(picture: images.ViewedImage, solver: Solver) -> list[Reading]:
     ]
 
 
-def outcome_fields(outcome: SolvedReading, date_utc: datetime.datetime | None) -> dict[str, Any]:
+def outcome_fields(
+    outcome: SolvedReading, date_utc: datetime.datetime | None
+) -> dict[str, Any]:
     """The fields of PlateSolution: what was seen and tried, the solution, or the likely cause of a refusal."""
     report = outcome.report
     (pixels, solver, assumption) = outcome.hypothesis

@@ -54,7 +54,9 @@ def large_lights(image: NDArray, settings: Settings) -> Iterator[tuple[int, Cent
             camera = camera_of(small)
             yield (
                 factor,
-                enlarged(detect_and_centroid(small, camera, settings, Clock()), factor, settings),
+                enlarged(
+                    detect_and_centroid(small, camera, settings, Clock()), factor, settings
+                ),
             )
         except ImageError:  # nothing is left, or there are thousands of lights
             continue
@@ -94,14 +96,18 @@ MIN_LIGHTS = 10  # in a half: fewer were searched in all combinations with the o
 # searches of a half; of the upper one, the likeliest, and of other centroids
 EFFORTS = 1
 MORE_EFFORTS = 2
-UNEVEN = 2.0  # least ratio of the 90 % to the 10 % quantile of the noise of the background's tiles
+UNEVEN = (
+    2.0  # least ratio of the 90 % to the 10 % quantile of the noise of the background's tiles
+)
 TOPHAT_PX = 15  # wider than a sharp star
 # sides of the squares; shorter trails are seen as one
 TRAIL_FACTORS = (3, 2, 4)
 MIN_TRAIL_PX = 10.0
 # Streak of sharp stars: what is left of the edges of trees is parallel, as streaks are.
 ROUND = (0.0, 0.0)
-FLAT_SIGMA_PX = 0.25  # of their centroids: JPEG has removed a part of what is faint beside clouds
+FLAT_SIGMA_PX = (
+    0.25  # of their centroids: JPEG has removed a part of what is faint beside clouds
+)
 FLAT = "its stars were found without its clouds"
 HALF = "its stars were found in its {} half alone"
 TRAILED = "its stars are trails, some too faint to be seen as one in single pixels"

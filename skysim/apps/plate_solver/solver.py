@@ -47,7 +47,9 @@ if TYPE_CHECKING:
 
 # Relative uncertainty of the focal length. An OpenCV chessboard calibration gives it to about 0.1 %.
 CALIBRATED_UNCERTAINTY = 0.003
-FOV_UNCERTAINTY = 0.055  # 5 % that --fov allows, plus 0.5 % for the definition of the field of view
+FOV_UNCERTAINTY = (
+    0.055  # 5 % that --fov allows, plus 0.5 % for the definition of the field of view
+)
 FOV_LIMITS_DEG = 1.0, 120.0
 CATALOG = CATALOGS / "gaia_v8.0.ecsv"
 THREADS = min(os.cpu_count() or 1, 8)
@@ -104,7 +106,9 @@ class FieldSearch:
         narrowest, tangent = (
             math.tan(math.radians(deg) / 2) for deg in (self.narrowest_deg, self.widest_deg)
         )
-        diagonal2 = 1 + (height_px / width_px) ** 2  # of half the image, in units of half its width
+        diagonal2 = (
+            1 + (height_px / width_px) ** 2
+        )  # of half the image, in units of half its width
         while tangent > narrowest:  # of the half field at the lower end of a range
             corner2 = diagonal2 * tangent**2
             uncertainty = min(self.max_uncertainty, self.max_warp * (1 + corner2) / corner2)
@@ -197,8 +201,12 @@ class Solver:
     def tried_fov_deg(self, width_px: int, height_px: int) -> tuple[float, float]:
         """Narrowest and widest horizontal field that is tried for this image size."""
         cameras = self.candidate_cameras(width_px, height_px)
-        narrow_rad = min(camera.zoomed(1 + uncertainty).fov_rad for camera, uncertainty in cameras)
-        wide_rad = max(camera.zoomed(1 - uncertainty).fov_rad for camera, uncertainty in cameras)
+        narrow_rad = min(
+            camera.zoomed(1 + uncertainty).fov_rad for camera, uncertainty in cameras
+        )
+        wide_rad = max(
+            camera.zoomed(1 - uncertainty).fov_rad for camera, uncertainty in cameras
+        )
         return round(math.degrees(narrow_rad), 2), round(math.degrees(wide_rad), 2)
 
     def trackers(
@@ -244,7 +252,12 @@ class Solver:
         )
         searches = () if self.field_is_known else QUAD_SEARCHES
         return StarTracker(
-            camera, self.stars.take(bright), vectors[bright], self.settings, uncertainty, searches
+            camera,
+            self.stars.take(bright),
+            vectors[bright],
+            self.settings,
+            uncertainty,
+            searches,
         )
 
 
@@ -307,7 +320,9 @@ def check_stages(stages: Mapping[str, str]) -> None:
 
     for stage, name in stages.items():
         if name not in STAR_ALGORITHMS[stage]:
-            raise InputError(f"solve.{stage}", *unknown_name(stage, name, STAR_ALGORITHMS[stage]))
+            raise InputError(
+                f"solve.{stage}", *unknown_name(stage, name, STAR_ALGORITHMS[stage])
+            )
 
 
 def read_camera(path: Path) -> tuple[KnownCamera, Settings]:
@@ -351,7 +366,9 @@ def read_catalog(name: str | None) -> star_catalog.StarCatalog:
     try:
         return star_catalog.read(CATALOG)
     except ImageError as error:
-        raise InputError("solve.catalog", error, "a star catalog (.ecsv) built by skysim") from None
+        raise InputError(
+            "solve.catalog", error, "a star catalog (.ecsv) built by skysim"
+        ) from None
 
 
 def validated_date(date_utc: datetime.datetime | None) -> tuple[datetime.datetime | None, str]:
@@ -418,7 +435,9 @@ def solve_centroids(
                 break
         allowed = ACCEPT_LOG10_CHANCE - math.log10(solver.hypotheses)
         return (
-            Attitude(NO_MATCH) if log10_chance(attitude) > allowed and attitude.solved else attitude
+            Attitude(NO_MATCH)
+            if log10_chance(attitude) > allowed and attitude.solved
+            else attitude
         ), first
     tries = len(solver.candidate_cameras(*size_px)) * solver.hypotheses
     for effort in made:  # try all fields of view quickly before trying any thoroughly
@@ -468,7 +487,9 @@ def attitudes(
     running: deque[tuple[Future[Attitude], StarTracker]] = deque()
     try:
         for tracker in trackers:
-            running.append((pool.submit(tracker.solve_centroids, centroids, None, effort), tracker))
+            running.append(
+                (pool.submit(tracker.solve_centroids, centroids, None, effort), tracker)
+            )
             if len(running) == THREADS:
                 future, first = running.popleft()
                 yield future.result(), first

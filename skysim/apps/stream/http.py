@@ -79,7 +79,9 @@ class FrameHub:
     def counters(self) -> dict[str, Any]:
         """Counters of each client, and the sums of the earlier ones."""
         with self.changed:
-            clients = [{"sent": client.sent, "dropped": client.dropped} for client in self.clients]
+            clients = [
+                {"sent": client.sent, "dropped": client.dropped} for client in self.clients
+            ]
             return {"clients": clients, "earlier_clients": dict(self.earlier)}
 
     def publish(self, packet: Packet) -> None:
@@ -137,12 +139,15 @@ class Handler(BaseHTTPRequestHandler):
             self.respond(newest.pack(), "application/octet-stream", newest.header)
         else:
             self.respond(
-                files.to_json({**newest.header, "truth": newest.truth}).encode(), "application/json"
+                files.to_json({**newest.header, "truth": newest.truth}).encode(),
+                "application/json",
             )
 
     do_HEAD = do_GET  # the same without a body
 
-    def respond(self, data: bytes, content_type: str, header: dict[str, Any] | None = None) -> None:
+    def respond(
+        self, data: bytes, content_type: str, header: dict[str, Any] | None = None
+    ) -> None:
         self.send_response(200)
         self.send_header("Content-Type", content_type)
         self.send_header("Content-Length", str(len(data)))
@@ -157,7 +162,9 @@ class Handler(BaseHTTPRequestHandler):
         """Send frames until the stream ends: packets if `raw`, else multipart JPEG with numbers from the header."""
         self.send_response(200)
         content_type = (
-            "application/octet-stream" if raw else f"multipart/x-mixed-replace; boundary={BOUNDARY}"
+            "application/octet-stream"
+            if raw
+            else f"multipart/x-mixed-replace; boundary={BOUNDARY}"
         )
         self.send_header("Content-Type", content_type)
         self.send_header("Cache-Control", "no-store")
@@ -193,7 +200,8 @@ def mjpeg_part(packet: Packet) -> bytes:
     data = jpeg(to_8bit(packet.pixels, "square root"))
     head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n"
     head += "".join(
-        f"X-{name}: {packet.header[name]}\r\n" for name in ("index", "t_s", "due_unix_s", "dropped")
+        f"X-{name}: {packet.header[name]}\r\n"
+        for name in ("index", "t_s", "due_unix_s", "dropped")
     )
     return head.encode() + b"\r\n" + data + b"\r\n"
 

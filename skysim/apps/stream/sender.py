@@ -130,7 +130,9 @@ def send(
     ):
         frame = shot.frame
         window = exposure_window(scene, frame.index, frame.exposure_s)
-        end_s = window.close_s(scene.camera.height_px)  # with a rolling shutter, of the last row
+        end_s = window.close_s(
+            scene.camera.height_px
+        )  # with a rolling shutter, of the last row
         if pace.zero_s is None:
             pace.start(end_s)  # so that the first frame has no delay
         pace.wait(end_s)

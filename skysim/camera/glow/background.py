@@ -150,7 +150,9 @@ def moon_glow(config: MoonGlowConfig, view: ViewingGeometry) -> Floats:
 
     The authors give the model an accuracy of 8 to 23 %, which is more than the air mass changes over a camera's field.
     """
-    to_moon_deg = angular_separation_deg(view.toward_lab, direction(config.ra_deg, config.dec_deg))
+    to_moon_deg = angular_separation_deg(
+        view.toward_lab, direction(config.ra_deg, config.dec_deg)
+    )
     nanolamberts = moonlight_nl(
         to_moon_deg,
         config.phase_angle_deg,
@@ -189,7 +191,9 @@ def moonlight_through_nl(
     with the separation rho, the phase angle a and the extinction k in degrees and magnitudes, and the air masses X of
     the Moon and of the field (Krisciunas & Schaefer 1991, PASP 103, 1033: eqs 3, 15, 20).
     """
-    illuminance = 10 ** (-0.4 * (3.84 + 0.026 * abs(phase_angle_deg) + 4e-9 * phase_angle_deg**4))
+    illuminance = 10 ** (
+        -0.4 * (3.84 + 0.026 * abs(phase_angle_deg) + 4e-9 * phase_angle_deg**4)
+    )
     transmitted = 10 ** (-0.4 * extinction_mag * moon_masses)
     scattered = 1 - 10 ** (-0.4 * extinction_mag * field_masses)
     return np.asarray(scattering(separation_deg) * illuminance * transmitted * scattered)
@@ -235,7 +239,9 @@ def transmittance(
 def faint_star_glow(config: FaintStarsGlowConfig, view: ViewingGeometry) -> Floats:
     """Light of the stars fainter than those that are drawn, by galactic latitude; the lab's axes are the ICRS."""
     s10 = faint_starlight_s10(galactic_latitude_deg(view.toward_lab), config.fainter_than_mag)
-    return float(sky_radiance_e_s_m2_sr(S10_MAG_ARCSEC2, view.band)) * s10 * view.etendue_m2_sr()
+    return (
+        float(sky_radiance_e_s_m2_sr(S10_MAG_ARCSEC2, view.band)) * s10 * view.etendue_m2_sr()
+    )
 
 
 # Radiance models by kind. To add one, add a class to scene/sections/light.py and a function here.
@@ -261,7 +267,9 @@ def angular_separation_deg(vectors: Floats, vector: Floats) -> Floats:
     return np.degrees(np.arctan2(sine, vectors @ vector))
 
 
-def glow_map(glows: Sequence[Glow], optics: Optics, cam_from_lab: Rotation, band: Band) -> Floats:
+def glow_map(
+    glows: Sequence[Glow], optics: Optics, cam_from_lab: Rotation, band: Band
+) -> Floats:
     """(h, w) electrons s^-1 px^-1 of all extended light, at nodes evenly spread over the chip up to its edges.
 
     `fill` interpolates the frame from it, to 1e-3 for maps as smooth as these (test_background). Cusps are smoothed:

@@ -62,7 +62,11 @@ def black_glow(
 
 
 def projector_glow(
-    config: light.DomeConfig, optics: Optics, cam_from_lab: Rotation, camera_m: Floats, band: Band
+    config: light.DomeConfig,
+    optics: Optics,
+    cam_from_lab: Rotation,
+    camera_m: Floats,
+    band: Band,
 ) -> Floats:
     """`black_glow` of a projector's picture on the wall, which varies smoothly except at its edges.
 
@@ -99,7 +103,9 @@ def panel_radiance_e_s_m2_sr(
     # Directions that meet the panel.
     hits_panel = np.isfinite(panel.meet(camera_m, toward_lab)[:, 0])
     # Directions that miss it get a harmless cosine.
-    cos_emission = np.where(hits_panel, -toward_lab @ panel.inward(panel.center_m[None])[0], 1.0)
+    cos_emission = np.where(
+        hits_panel, -toward_lab @ panel.inward(panel.center_m[None])[0], 1.0
+    )
     return np.asarray(
         hits_panel * white_radiance(config.led, cos_emission, band) / config.layout.pitch_m**2
     )
@@ -156,5 +162,7 @@ def collimated_radiance_e_s_m2_sr(
     within = np.all(np.abs(toward_lab[:, :2]) <= half_extent * cos_field[:, None], axis=1)
     on_display = within & (toward_lab[:, 2] > 0)
     return np.asarray(
-        on_display * white_e_s_m2 / ((config.pitch_m / config.focal_length_m) ** 2 * cos_field**3)
+        on_display
+        * white_e_s_m2
+        / ((config.pitch_m / config.focal_length_m) ** 2 * cos_field**3)
     )

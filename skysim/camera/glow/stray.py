@@ -193,7 +193,11 @@ def spread(
 
 
 def images_in_wall(
-    dome: ReflectingDome, leds: Sources, optics: Optics, cam_from_lab: Rotation, camera_m: Floats
+    dome: ReflectingDome,
+    leds: Sources,
+    optics: Optics,
+    cam_from_lab: Rotation,
+    camera_m: Floats,
 ) -> Sources:
     """The images of the LEDs in the wall that are in the field, for a camera at rest.
 

@@ -31,7 +31,9 @@ from skysim.core.jit import jit
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig, Psf
 
-CUT_SIGMA = 4.0  # a box ends here beyond the disk: 3e-5 of the peak of a resolved disk are beyond
+CUT_SIGMA = (
+    4.0  # a box ends here beyond the disk: 3e-5 of the peak of a resolved disk are beyond
+)
 MAX_WAVES = 512  # along an axis of a box; a larger image is softened
 # Images up to so many times as wide as a point's, and wider ones, whose waves are weaker: level of the lens's transfer
 # function below which waves are left out, and samples a pixel over the frequency that the lens passes by 1e-3. The

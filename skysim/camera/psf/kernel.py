@@ -118,7 +118,8 @@ def build_kernel(
         For an unreadable file of a measured PSF.
     """
     steps = tuple(
-        round(value / QUANTUM_PX) for value in (extra_sigma_px, emitter_radius_px, blur_radius_px)
+        round(value / QUANTUM_PX)
+        for value in (extra_sigma_px, emitter_radius_px, blur_radius_px)
     )
     if psf.kind == "gaussian" and not (steps[1] or steps[2]):
         return Kernel(float(np.hypot(psf.sigma_px, extra_sigma_px)), NO_RADIAL, NO_GRID)
@@ -164,7 +165,9 @@ class PsfModel:
     def wing_margin_px(self) -> float:
         """Distance beyond the image to which wings must be followed so that aliasing is below 1e-4 of the peak."""
         return (
-            2 * EXTENT[self.psf.kind](self.psf, self.camera)[0] if self.psf.kind in WINGED else 0.0
+            2 * EXTENT[self.psf.kind](self.psf, self.camera)[0]
+            if self.psf.kind in WINGED
+            else 0.0
         )
 
 
@@ -188,7 +191,9 @@ def softening_sigma_px(bandwidth: float, highest: float) -> float:
     exp(-2 pi^2 sigma^2 f^2) = OTF_FLOOR.
     """
     return (
-        0.0 if bandwidth <= highest else float(np.sqrt(-np.log(OTF_FLOOR) / 2) / (np.pi * highest))
+        0.0
+        if bandwidth <= highest
+        else float(np.sqrt(-np.log(OTF_FLOOR) / 2) / (np.pi * highest))
     )
 
 
@@ -265,7 +270,8 @@ def round_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel | None:
     terms = fourier_bessel_series(box_px, table_px, highest, PER_PX // coarse)
     # 2. Sum the series.
     spectrum = (
-        model.otf(terms.f, np.zeros(1), softening_sigma_px(highest_passed, highest)) * terms.weight
+        model.otf(terms.f, np.zeros(1), softening_sigma_px(highest_passed, highest))
+        * terms.weight
     )
     rows = int(reach * PER_PX / coarse) + 2
     count = int(reach * PER_PX) + 1
@@ -299,9 +305,9 @@ def interpolate_cubic(samples: Floats, factor: int) -> Floats:
     padded = np.zeros((count, rows + 3))
     padded[:, 0] = samples[:, 1]
     padded[:, 1:-2] = samples
-    return np.asarray(sum(padded[:, k : k + rows, None] * weights[k] for k in range(4))).reshape(
-        count, -1
-    )
+    return np.asarray(
+        sum(padded[:, k : k + rows, None] * weights[k] for k in range(4))
+    ).reshape(count, -1)
 
 
 def pack_table(harmonics: Floats) -> Singles:
@@ -450,5 +456,7 @@ def disk_images(
     # A, tr Q and A q.
     matrix = np.moveaxis((image[1:3] - image[3:]) / 2, 0, 2)
     trace = image[1:].sum(axis=0) - 4 * image[0]
-    gradient, tilt = (np.einsum("nij,jn->ni", matrix, part) for part in (slope + 3 * depth, depth))
+    gradient, tilt = (
+        np.einsum("nij,jn->ni", matrix, part) for part in (slope + 3 * depth, depth)
+    )
     return DiskImages(matrix, trace / 8 - 0.75 * tilt, gradient)

@@ -183,7 +183,9 @@ def source_kernels(
         error = round_error(disks, axes_px, emitter, variance_px2)
         chosen = np.flatnonzero((emitter > 0) & (error > MAX_ROUND_ERROR))
         sizes = (part[chosen] for part in (axes_px, blur, extra, variance_px2))
-        disk[chosen], steps[chosen] = ellipse_disks(camera.psf, camera, disks.take(chosen), *sizes)
+        disk[chosen], steps[chosen] = ellipse_disks(
+            camera.psf, camera, disks.take(chosen), *sizes
+        )
     # 3. Gaussians need no shared table, so all have the key of sharp points.
     gaussian = camera.psf.kind == "gaussian"
     if gaussian:
@@ -199,7 +201,9 @@ def source_kernels(
     add_kernels(cache, camera, keys)
     rows = np.array([cache.rows[key] for key in keys], dtype=np.int64)[inverse]
     # Contiguous: columns of a table would be another array type, for which the renderer is compiled once more.
-    kind, sigma, reach, sharp = np.ascontiguousarray(np.array(cache.kernels).reshape(-1, 4)[rows].T)
+    kind, sigma, reach, sharp = np.ascontiguousarray(
+        np.array(cache.kernels).reshape(-1, 4)[rows].T
+    )
     spans = np.array(cache.spans, dtype=np.int64).reshape(-1, 4)[rows]
     # 4. Standard deviation and sharpness grow in proportion, the reach with them.
     if gaussian and (blur_px or camera.psf.corner_sigma_px or chromatic is not None):
@@ -210,7 +214,9 @@ def source_kernels(
         reach = np.where(point, reach * np.maximum(widening, 1), reach)
     # The Bessel table takes a while to build.
     bessel = ellipse.jinc_table() if disk.any() else np.empty(0, np.float32)
-    return Kernels(kind.astype(np.int64), sigma, reach, sharp, spans, cache.tables[0], disk, bessel)
+    return Kernels(
+        kind.astype(np.int64), sigma, reach, sharp, spans, cache.tables[0], disk, bessel
+    )
 
 
 def round_error(
@@ -228,7 +234,9 @@ def round_error(
     edge_px = np.abs(axes_px - drawn_px[:, None]).max(axis=1)
     shift_px = np.hypot(*disks.center.T)
     gradient_px = np.hypot(*disks.gradient.T)
-    gradient = np.minimum(gradient_px / np.maximum(axes_px[:, 1], 1e-9), 0.15 * gradient_px / s_px)
+    gradient = np.minimum(
+        gradient_px / np.maximum(axes_px[:, 1], 1e-9), 0.15 * gradient_px / s_px
+    )
     return np.asarray(
         (np.minimum(0.4, drawn_px / 2 / s_px) * edge_px + 0.6 * shift_px) / s_px + gradient
     )
@@ -272,7 +280,10 @@ def ellipse_disks(
     # The slope g solves A A^T g = A q, by Cramer's rule.
     with np.errstate(invalid="ignore", divide="ignore"):
         inverse = np.column_stack(
-            [yy * gradient[:, 0] - xy * gradient[:, 1], xx * gradient[:, 1] - xy * gradient[:, 0]]
+            [
+                yy * gradient[:, 0] - xy * gradient[:, 1],
+                xx * gradient[:, 1] - xy * gradient[:, 0],
+            ]
         )
         slope = np.where(wide, inverse / (xx * yy - xy**2)[:, None], 0)
     # Where the image is drawn, and what its light does across it.

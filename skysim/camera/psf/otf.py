@@ -52,7 +52,9 @@ def blur_radius_px(camera: CameraConfig, distance_m: Any, focus_shift_m: Any = 0
     distance = np.asarray(distance_m, dtype=float)
     color = focus_shift_m / camera.focal_length_m**2
     diameter_m = (
-        camera.pupil_m * camera.image_distance_m * np.abs(1 / distance - 1 / camera.focus_m + color)
+        camera.pupil_m
+        * camera.image_distance_m
+        * np.abs(1 / distance - 1 / camera.focus_m + color)
     )
     return diameter_m / (2 * camera.pixel_m)
 
@@ -80,7 +82,9 @@ def chromatic_sigma_px(camera: CameraConfig, chromatic: Floats, xy_px: Floats) -
     """
     # k: the defocus disk's radius in pixels per shift of focus in m.
     scale_px_m = (
-        camera.pupil_m * camera.image_distance_m / (2 * camera.pixel_m * camera.focal_length_m**2)
+        camera.pupil_m
+        * camera.image_distance_m
+        / (2 * camera.pixel_m * camera.focal_length_m**2)
     )
     radius = np.linalg.norm(xy_px - np.array(camera.center_px), axis=-1) / camera.corner_px
     return np.hypot(scale_px_m * chromatic[:, 1] / 2, radius * chromatic[:, 3] / math.sqrt(2))
@@ -205,7 +209,9 @@ def read_cells(file: str) -> Floats:
     total = cells.sum()
     if not (np.isfinite(total) and total > 0):
         raise InputError(
-            "camera.psf.file", f"{path}: its numbers add up to {total:g}", "a finite sum above 0"
+            "camera.psf.file",
+            f"{path}: its numbers add up to {total:g}",
+            "a finite sum above 0",
         )
     return np.asarray(cells / total)
 

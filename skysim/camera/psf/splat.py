@@ -213,7 +213,10 @@ def add_grid(
             w3 = np.float32(wy[s] * wx3)
             for i in range(sums.size):
                 sums[i] += (
-                    w0 * tables[0, i] + w1 * tables[1, i] + w2 * tables[2, i] + w3 * tables[3, i]
+                    w0 * tables[0, i]
+                    + w1 * tables[1, i]
+                    + w2 * tables[2, i]
+                    + w3 * tables[3, i]
                 )
         row = patch[j, left:right]
         for i in range(sums.size):

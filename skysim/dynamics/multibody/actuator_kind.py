@@ -190,7 +190,8 @@ def joints(spec: Any, prefix: str) -> list[Any]:
 def sites(spec: Any, prefix: str) -> list[Any]:
     """The sites of a spec whose name begins with prefix, in the order of their names."""
     return sorted(
-        (site for site in spec.sites if site.name.startswith(prefix)), key=lambda site: site.name
+        (site for site in spec.sites if site.name.startswith(prefix)),
+        key=lambda site: site.name,
     )
 
 

@@ -43,7 +43,9 @@ def kinds_on(vehicle: VehicleConfig) -> list[ActuatorKind]:
 
 def build_actuators(vehicle: VehicleConfig, model: Any) -> dict[str, Actuators]:
     """All actuators that are switched on, by their key in `vehicle`."""
-    return {kind.key: kind.control(model, getattr(vehicle, kind.key)) for kind in kinds_on(vehicle)}
+    return {
+        kind.key: kind.control(model, getattr(vehicle, kind.key)) for kind in kinds_on(vehicle)
+    }
 
 
 def set_start(vehicle: VehicleConfig, model: Any, data: Any) -> None:
@@ -146,7 +148,9 @@ def check_names(spec: Any, path: Path) -> None:
         prefix = next((p for p in PREFIXES if element.name.startswith(p[:-1])), None)
         if prefix and not element.name.startswith(prefix):
             raise InputError(
-                path, element.name, f"{prefix}{element.name[len(prefix) - 1 :]}, or another word"
+                path,
+                element.name,
+                f"{prefix}{element.name[len(prefix) - 1 :]}, or another word",
             )
 
 

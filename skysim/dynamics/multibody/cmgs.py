@@ -116,7 +116,9 @@ STEERING: dict[str, Callable[[Floats, Floats, float], Floats]] = {
 
 
 @jit
-def rotor_axles(spin_axes: Floats, cross_axes: Floats, angle_rad: Floats) -> tuple[Floats, Floats]:
+def rotor_axles(
+    spin_axes: Floats, cross_axes: Floats, angle_rad: Floats
+) -> tuple[Floats, Floats]:
     """Rotor axles (3, n) at the gimbal angles, and their derivative (3, n) by the gimbal angles.
 
     axle = s cos(angle) + (g x s) sin(angle),    derivative = (g x s) cos(angle) - s sin(angle)
@@ -154,7 +156,9 @@ def vscmg_commands(
     gimbal_weight = rate_limit**2
     rotor_weight = torque_limit**2 * math.exp(-DAMPING_DECAY * determinant)
     # 2. Weighted minimum norm.
-    multiplier = solve_gram(gimbal_weight * gram + rotor_weight * (axle @ axle.T), momentum_rate_nm)
+    multiplier = solve_gram(
+        gimbal_weight * gram + rotor_weight * (axle @ axle.T), momentum_rate_nm
+    )
     rate = gimbal_weight * (jacobian.T @ multiplier)
     torque = rotor_weight * (axle.T @ multiplier)
     # 3. Limits.
@@ -203,9 +207,13 @@ class CmgSet:
     def __post_init__(self) -> None:
         gimbal = unit_columns(self.gimbal_axes, "gimbal axes")
         spin = unit_columns(self.spin_axes, "rotor axes")
-        inertia = positive_values(self.rotor_inertia_kg_m2, gimbal.shape[1], "rotor_inertia_kg_m2")
+        inertia = positive_values(
+            self.rotor_inertia_kg_m2, gimbal.shape[1], "rotor_inertia_kg_m2"
+        )
         if spin.shape != gimbal.shape or np.abs((gimbal * spin).sum(axis=0)).max() > 1e-6:
-            raise InputError("rotor axes", "", "one for each gimbal, at right angles to its axis")
+            raise InputError(
+                "rotor axes", "", "one for each gimbal, at right angles to its axis"
+            )
         if self.steering not in STEERING:
             raise InputError(
                 "cmgs.steering", *unknown_name("steering law", self.steering, STEERING)
@@ -214,7 +222,9 @@ class CmgSet:
         arrays = {"gimbal_axes": gimbal, "spin_axes": spin, "rotor_inertia_kg_m2": inertia}
         for name, value in arrays.items():
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "cross_axes", np.ascontiguousarray(np.cross(gimbal, spin, axis=0)))
+        object.__setattr__(
+            self, "cross_axes", np.ascontiguousarray(np.cross(gimbal, spin, axis=0))
+        )
 
     def momentum(self, angle_rad: Floats, rotor_rad_s: Floats) -> Floats:
         """Angular momentum (3,) of the rotors relative to the body: h = sum axle inertia speed."""
@@ -241,7 +251,9 @@ class CmgSet:
         gram = jacobian @ jacobian.swapaxes(-1, -2)
         # det A A^T is greatest for three equal eigenvalues of the same trace.
         largest = (np.trace(gram, axis1=-2, axis2=-1) / 3) ** 3
-        return np.sqrt(np.maximum(np.linalg.det(gram), 0.0) / np.where(largest > 0, largest, 1.0))
+        return np.sqrt(
+            np.maximum(np.linalg.det(gram), 0.0) / np.where(largest > 0, largest, 1.0)
+        )
 
     def drive(
         self,
@@ -297,7 +309,9 @@ class CmgActuator:
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
         angle = inputs.angles_rad[self.gimbals.qpos]
         spin = inputs.speeds_rad_s[self.rotors.dof]
-        rate, torque = self.model.drive(torque_nm, inputs.rate_body_rad_s, angle, spin, inputs.t_s)
+        rate, torque = self.model.drive(
+            torque_nm, inputs.rate_body_rad_s, angle, spin, inputs.t_s
+        )
         control[self.gimbals.motor] = rate
         # T = -A d(angle)/dt - sum axle u; the second term is the momentum of speeds u / inertia.
         achieved_nm = -self.model.jacobian(angle, spin) @ rate
@@ -324,7 +338,8 @@ def check_rotor_pairs(spec: Any, path: Path) -> None:
         rotor = spec.joint(ROTOR + suffix)
         if rotor is None or rotor.parent.parent != gimbal.parent:
             raise InputError(
-                path, f"joint {gimbal.name} has no joint {ROTOR}{suffix} on a child body of its own"
+                path,
+                f"joint {gimbal.name} has no joint {ROTOR}{suffix} on a child body of its own",
             )
     if len(joints(spec, ROTOR)) != len(joints(spec, GIMBAL)):
         raise InputError(path, f"a joint {ROTOR}* has no joint {GIMBAL}* of the same suffix")
@@ -351,7 +366,11 @@ def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
     for joint in joints(spec, ROTOR):
         if cmgs.rotor_torque_limit_nm:
             add_motor(
-                spec, joint.name, mujoco.mjtTrn.mjTRN_JOINT, joint.name, cmgs.rotor_torque_limit_nm
+                spec,
+                joint.name,
+                mujoco.mjtTrn.mjTRN_JOINT,
+                joint.name,
+                cmgs.rotor_torque_limit_nm,
             )
 
 
@@ -367,5 +386,10 @@ def start_cmgs(model: Any, data: Any, config: CmgsConfig) -> None:
 
 
 CMGS = ActuatorKind(
-    "cmgs", add_cmgs, CmgActuator, joints=(GIMBAL, ROTOR), start=start_cmgs, check=check_rotor_pairs
+    "cmgs",
+    add_cmgs,
+    CmgActuator,
+    joints=(GIMBAL, ROTOR),
+    start=start_cmgs,
+    check=check_rotor_pairs,
 )

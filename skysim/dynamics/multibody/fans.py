@@ -55,7 +55,9 @@ class Fans:
         """The fans that have an actuator."""
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
-        names = sorted(name for name in all_names(model.actuator, model.nu) if name.startswith(FAN))
+        names = sorted(
+            name for name in all_names(model.actuator, model.nu) if name.startswith(FAN)
+        )
         sites = [model.site(name).id for name in names]
         # z axes of the sites; at zero joint angles lab and body axes coincide.
         axes = data.site_xmat[sites].reshape(-1, 3, 3)[:, :, 2]
@@ -101,7 +103,9 @@ class FanSet:
         # Lever arms, and their pseudo-inverse.
         arms = np.cross(positions, axes, axis=0)
         object.__setattr__(self, "torque_per_thrust_m", arms)
-        object.__setattr__(self, "thrust_from_torque", np.linalg.pinv(arms, rcond=RANK_TOLERANCE))
+        object.__setattr__(
+            self, "thrust_from_torque", np.linalg.pinv(arms, rcond=RANK_TOLERANCE)
+        )
 
     def torque(self, thrust_n: Floats) -> Floats:
         """Torque (3,) on the body of thrusts (n,)."""
@@ -153,7 +157,9 @@ class Desaturator:
         # Two thresholds (hysteresis), so that the fans do not switch on and off at one.
         magnitude = math.sqrt(float(momentum_nms @ momentum_nms))
         self.running = (
-            magnitude >= self.config.stop_nms if self.running else magnitude > self.config.start_nms
+            magnitude >= self.config.stop_nms
+            if self.running
+            else magnitude > self.config.start_nms
         )
         return momentum_nms * (-1.0 / self.config.time_s) if self.running else np.zeros(3)
 
@@ -170,7 +176,9 @@ class MomentumDump:
     def allocate(self, control: Floats, momentum_nms: Floats, inputs: ControlInput) -> Floats:
         """Command the fans; return the torque (3,) that they give now according to the lag model."""
         present_nm = self.fan_torque_nm
-        commanded_nm = self.fans.allocate(control, self.desaturator.torque(momentum_nms), inputs)
+        commanded_nm = self.fans.allocate(
+            control, self.desaturator.torque(momentum_nms), inputs
+        )
         # First-order lag over one period, T' = T + (command - T) (1 - exp(-period / lag)). The torque at its start
         # acts now.
         self.fan_torque_nm = present_nm + (commanded_nm - present_nm) * -math.expm1(

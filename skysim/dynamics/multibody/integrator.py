@@ -260,7 +260,9 @@ def simulate(
     """
     simulation = Simulation(vehicle, lab_from_body_start, rate_body_rad_s, duration_s)
     steps = (
-        max(1, round(control_period_s / simulation.step_s)) if controller else simulation.steps_left
+        max(1, round(control_period_s / simulation.step_s))
+        if controller
+        else simulation.steps_left
     )
     # One controller call for each control period, or one step over the whole duration.
     limit = vehicle.config.torque_limit_nm

@@ -100,7 +100,9 @@ def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Ma
             f"{declared.mass_kg:g} kg",
             f"more than the {carried.mass_kg:g} kg that the bus carries ({path})",
         )
-    center_bus = (declared.mass_kg * declared.center_m - carried.mass_kg * carried.center_m) / mass
+    center_bus = (
+        declared.mass_kg * declared.center_m - carried.mass_kg * carried.center_m
+    ) / mass
     # 3. Inertia of the bus about its center.
     own_inertia = inertia - carried.inertia_kg_m2 - parallel_axis(mass, center_bus)
     # The error message names the camera if its lever arm alone makes the inertia impossible.
@@ -235,7 +237,9 @@ class Trims:
         """
         moved_m = self.centers_m + self.axes * position_m
         inertia = np.zeros((3, 3))
-        for mass_kg, before, after in zip(self.mass_kg, self.centers_m.T, moved_m.T, strict=True):
+        for mass_kg, before, after in zip(
+            self.mass_kg, self.centers_m.T, moved_m.T, strict=True
+        ):
             inertia += parallel_axis(mass_kg, after) - parallel_axis(mass_kg, before)
         return inertia, np.asarray(self.axes @ (self.mass_kg * position_m))
 

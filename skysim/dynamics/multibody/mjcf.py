@@ -106,7 +106,9 @@ class References:
         subfolders = {"", *(reference.value for reference in self.folders)}
         if len(self.bases) * len(subfolders) * len(self.files) > MAX_CANDIDATES:
             raise InputError(
-                self.folder, "the model names too many files", f"{MAX_CANDIDATES} candidate paths"
+                self.folder,
+                "the model names too many files",
+                f"{MAX_CANDIDATES} candidate paths",
             )
         for base in self.bases:
             for reference in self.folders:
@@ -145,7 +147,11 @@ def check_confined(path: Path) -> None:
                 continue
             checked.add((reference, candidate))
             check_candidate(reference, candidate, references.folder)
-            if reference.is_xml and file_identity(candidate) not in visited and is_file(candidate):
+            if (
+                reference.is_xml
+                and file_identity(candidate) not in visited
+                and is_file(candidate)
+            ):
                 pending.append(candidate)
                 visited.add(file_identity(candidate))
 
@@ -154,7 +160,9 @@ def check_candidate(reference: FileReference, candidate: Path, folder: Path) -> 
     """Raise InputError for a path outside of the folder, and for one that is neither a plain file nor a folder."""
     if "\\" in reference.value or not resolved(candidate).is_relative_to(folder):
         raise InputError("", f"{reference.source} is outside {folder}", "files in it")
-    if os.path.exists(candidate) and not (os.path.isfile(candidate) or os.path.isdir(candidate)):
+    if os.path.exists(candidate) and not (
+        os.path.isfile(candidate) or os.path.isdir(candidate)
+    ):
         raise InputError("", f"{reference.source} is not a regular file", f"files in {folder}")
 
 

@@ -90,7 +90,9 @@ def mjcf(vehicle: VehicleModel, scene: Scene, sources: Sources, lab_from_body: R
         )
     on_earth = vehicle.config.mount == "air_bearing"
     inside = (
-        surface.build_surface(scene.light.surface) if isinstance(scene.light, DomeConfig) else SKY
+        surface.build_surface(scene.light.surface)
+        if isinstance(scene.light, DomeConfig)
+        else SKY
     )
     hide_tilt_stop(spec)
     inline_meshes(spec, vehicle.model)
@@ -347,7 +349,9 @@ def add_mesh(
 ) -> None:
     """Add a mesh, open or closed, and its geom; its inertia is that of a shell, which needs no volume."""
     mesh = spec.add_mesh(
-        name=name, uservert=np.round(vertices_m, 6).ravel(), userface=faces.astype(np.int32).ravel()
+        name=name,
+        uservert=np.round(vertices_m, 6).ravel(),
+        userface=faces.astype(np.int32).ravel(),
     )
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     add_visual_geom(
@@ -403,8 +407,14 @@ def field_corners(
     the sky.
     """
     # Corners are half a pixel outside of the outer pixels' centers.
-    x = np.array([-0.5, camera.width_px - 0.5, camera.width_px - 0.5, -0.5]) - camera.center_px[0]
-    y = np.array([-0.5, -0.5, camera.height_px - 0.5, camera.height_px - 0.5]) - camera.center_px[1]
+    x = (
+        np.array([-0.5, camera.width_px - 0.5, camera.width_px - 0.5, -0.5])
+        - camera.center_px[0]
+    )
+    y = (
+        np.array([-0.5, -0.5, camera.height_px - 0.5, camera.height_px - 0.5])
+        - camera.center_px[1]
+    )
     rays_cam = np.column_stack([x, y, np.full(4, camera.focal_px)])
     lab_from_cam = lab_from_body * mount.cam_from_body.inv()
     rays = lab_from_cam.apply(rays_cam / np.linalg.norm(rays_cam, axis=1, keepdims=True))

@@ -151,7 +151,9 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Tr
     try:
         bare = compile_spec(spec, path)
     except InputError as error:
-        raise InputError(error.key, f"{error.problem}{locked_joint_hint(spec, locked)}") from None
+        raise InputError(
+            error.key, f"{error.problem}{locked_joint_hint(spec, locked)}"
+        ) from None
     # 4. Mass properties.
     mass = declare_mass(bus, bare, vehicle, path)
     # 5. Bearing.

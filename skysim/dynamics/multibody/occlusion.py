@@ -26,7 +26,12 @@ from skysim.core.types import Floats, Mount
 from skysim.dynamics.multibody.actuators import lock_unused, set_start
 from skysim.dynamics.multibody.mass import CAMERA
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings
-from skysim.dynamics.multibody.model import VehicleModel, camera_mount, place_camera, put_at_origin
+from skysim.dynamics.multibody.model import (
+    VehicleModel,
+    camera_mount,
+    place_camera,
+    put_at_origin,
+)
 
 # Groups of geoms: those that block light, and the camera's own housing. Rays are tested against the first only.
 OPAQUE = 0

@@ -127,7 +127,9 @@ def failure_reason(code: int, errors: IO[bytes]) -> str:
     lines = errors.read().decode(errors="replace").strip().splitlines()
     if code < 0:
         return f"the renderer was ended by {signal.Signals(-code).name}"
-    return one_line(RuntimeError(lines[-1])) if lines else f"the renderer exited with code {code}"
+    return (
+        one_line(RuntimeError(lines[-1])) if lines else f"the renderer exited with code {code}"
+    )
 
 
 def render_task() -> None:

@@ -71,7 +71,9 @@ class WheelSet:
         inertia = positive_values(self.inertia_kg_m2, axes.shape[1], "wheel inertia_kg_m2")
         object.__setattr__(self, "inertia_kg_m2", inertia)
         # T = -axes u, solved for u.
-        object.__setattr__(self, "motor_from_torque", -np.linalg.pinv(axes, rcond=RANK_TOLERANCE))
+        object.__setattr__(
+            self, "motor_from_torque", -np.linalg.pinv(axes, rcond=RANK_TOLERANCE)
+        )
 
     def momentum(self, speed_rad_s: Floats) -> Floats:
         """Angular momentum (3,) of wheels at speeds (n,) relative to the body: h = sum axis inertia speed."""
@@ -106,7 +108,9 @@ class WheelActuator:
         )
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
-        motor = self.model.drive(torque_nm, inputs.speeds_rad_s[self.joints.dof], inputs.period_s)
+        motor = self.model.drive(
+            torque_nm, inputs.speeds_rad_s[self.joints.dof], inputs.period_s
+        )
         control[self.joints.motor] = motor
         return -self.model.axes @ motor
 
@@ -123,7 +127,9 @@ def add_wheels(spec: Any, _: Any, wheels: WheelsConfig) -> None:
     for joint in joints(spec, WHEEL):
         joint.frictionloss = wheels.coulomb_nm
         joint.damping = [wheels.viscous_nms, 0.0, 0.0]
-        add_motor(spec, joint.name, mujoco.mjtTrn.mjTRN_JOINT, joint.name, wheels.torque_limit_nm)
+        add_motor(
+            spec, joint.name, mujoco.mjtTrn.mjTRN_JOINT, joint.name, wheels.torque_limit_nm
+        )
 
 
 def start_wheels(model: Any, data: Any, config: WheelsConfig) -> None:

@@ -49,13 +49,19 @@ def characterize_report(
 ) -> Report:
     """The report of a characterized camera from the numbers of `characterize.json`."""
     figures = [
-        Figure(png(lambda fig: draw_transfer(fig.subplots(1, 2), found), SIZE_IN), TRANSFER_TEXT)
+        Figure(
+            png(lambda fig: draw_transfer(fig.subplots(1, 2), found), SIZE_IN), TRANSFER_TEXT
+        )
     ]
     if dark := found.dark:
-        figures.append(Figure(png(lambda fig: draw_dark(fig.subplots(), dark), SIZE_IN), DARK_TEXT))
+        figures.append(
+            Figure(png(lambda fig: draw_dark(fig.subplots(), dark), SIZE_IN), DARK_TEXT)
+        )
     if night:
         figures.append(
-            Figure(png(lambda fig: draw_size(fig.subplots(), config, night), SIZE_IN), SIZE_TEXT)
+            Figure(
+                png(lambda fig: draw_size(fig.subplots(), config, night), SIZE_IN), SIZE_TEXT
+            )
         )
     values = value_table(statistics)
     blocks = [
@@ -71,9 +77,7 @@ def verdict(statistics: dict[str, Any], values: int) -> Verdict:
     """How many values are known, and how well the law of photon transfer holds."""
     unknown = len(statistics["remarks"])
     misfit = statistics["misfit"]
-    text = (
-        f"{values} values measured, {unknown} unknown; misfit of the photon transfer {misfit:.2f}"
-    )
+    text = f"{values} values measured, {unknown} unknown; misfit of the photon transfer {misfit:.2f}"
     return Verdict(f"{text} (1 if the law holds).", "warning" if unknown else "good")
 
 
@@ -83,7 +87,10 @@ def facts(statistics: dict[str, Any]) -> Facts:
     night = statistics["night"]
     rows = [
         ("for camera.preset", [statistics["preset"]]),
-        ("dark current at", ["an unknown temperature" if celsius is None else f"{celsius:g} °C"]),
+        (
+            "dark current at",
+            ["an unknown temperature" if celsius is None else f"{celsius:g} °C"],
+        ),
         (
             "linearity error",
             [f"{100 * statistics['linearity_error']:.2g} %, of 5 to 95 % of the saturation"],
@@ -91,7 +98,9 @@ def facts(statistics: dict[str, Any]) -> Facts:
         ("flicker of the lamp", [f"{100 * statistics['flicker']:.2g} %"]),
     ]
     if night:
-        residuals = "" if night["rms_px"] is None else f", residuals {night['rms_px']:.2g} px rms"
+        residuals = (
+            "" if night["rms_px"] is None else f", residuals {night['rms_px']:.2g} px rms"
+        )
         stars = f"{night['stars']} star images in {night['frames']} frames"
         rows.append(
             ("night", [f"{stars}, of which {night['identified']} were identified{residuals}"])
@@ -103,7 +112,9 @@ def value_table(statistics: dict[str, Any]) -> Table:
     """The values with their intervals, and those of the camera's file."""
     columns = [text_column("what"), Column("measured", format=".5g"), Column("95 %")]
     columns += [Column("file", format=".5g"), text_column("unit")]
-    values = statistics["values"] + (statistics["night"]["values"] if statistics["night"] else [])
+    values = statistics["values"] + (
+        statistics["night"]["values"] if statistics["night"] else []
+    )
     interval = "{low:.5g} to {high:.5g}"
     rows = [
         [row["what"], row["value"], interval.format(**row), row["file"], row["unit"]]
@@ -149,7 +160,9 @@ def draw_transfer(axes: Any, found: MeasuredSensor) -> None:
     order = np.argsort(expected_mean)
     x = np.maximum(expected_mean[order] - black, 0.1)
     curve.plot(x, expected_variance[order], color="0.4", zorder=0)
-    curve.set(xscale="log", yscale="log", xlabel="signal [DN]", ylabel="temporal variance [DN²]")
+    curve.set(
+        xscale="log", yscale="log", xlabel="signal [DN]", ylabel="temporal variance [DN²]"
+    )
     curve.legend()
     plain_labels(curve.xaxis, curve.yaxis)
     flats = [one for one in fitted if one.lit] + beyond
@@ -262,7 +275,10 @@ def measured_lens(config: CameraConfig, night: Night) -> dict[str, tuple[Any, st
     found: dict[str, tuple[Any, str]] = {
         "psf.kind": ("gaussian", "[M]"),
         "psf.sigma_px": (rounded(size.sigma_px.value), comment(size.sigma_px)),
-        "psf.corner_sigma_px": (rounded(size.corner_sigma_px.value), comment(size.corner_sigma_px)),
+        "psf.corner_sigma_px": (
+            rounded(size.corner_sigma_px.value),
+            comment(size.corner_sigma_px),
+        ),
     }
     if night.lens is None:
         return found
@@ -271,9 +287,15 @@ def measured_lens(config: CameraConfig, night: Night) -> dict[str, tuple[Any, st
     x, y, *distortion = (lens[name] for name in LENS[1:])
     points = f"{comment(x)}, {y.low:.5g} to {y.high:.5g}"
     return found | {
-        "focal_length": (f"{focal.value:.7g} mm", f"[M] {focal.low:.7g} to {focal.high:.7g} mm"),
+        "focal_length": (
+            f"{focal.value:.7g} mm",
+            f"[M] {focal.low:.7g} to {focal.high:.7g} mm",
+        ),
         "principal_point_px": ([rounded(x.value), rounded(y.value)], points),
-        "distortion": ([rounded(one.value) for one in distortion], f"k1 {comment(distortion[0])}"),
+        "distortion": (
+            [rounded(one.value) for one in distortion],
+            f"k1 {comment(distortion[0])}",
+        ),
     }
 
 
@@ -286,7 +308,9 @@ def rounded(value: float) -> float:
     return float(f"{value:.{DIGITS}g}")
 
 
-def lines(camera: Mapping[str, Any], found: Mapping[str, tuple[Any, str]]) -> Iterator[SheetLine]:
+def lines(
+    camera: Mapping[str, Any], found: Mapping[str, tuple[Any, str]]
+) -> Iterator[SheetLine]:
     """The lines of the section with the values that were found in place of the camera's own, sections last."""
     tree = copy.deepcopy(dict(camera))
     if "psf.kind" in found:
@@ -303,7 +327,9 @@ def section_lines(
     """The lines of a section and, after its values, of the sections in it."""
     for key, value in section.items():
         if not isinstance(value, dict):
-            yield SheetLine(prefix + key, value, sources.get(prefix + key, "of the camera's file"))
+            yield SheetLine(
+                prefix + key, value, sources.get(prefix + key, "of the camera's file")
+            )
     for key, value in section.items():
         if isinstance(value, dict):
             yield from section_lines(value, f"{prefix}{key}.", sources)
@@ -341,7 +367,9 @@ def read_camera(name: str) -> tuple[CameraConfig, dict[str, Any]]:
     return camera, loader.camera_tree(path, tree, files, {})["camera"]
 
 
-def measure_sensor(camera: CameraConfig, darks_folder: Path, flats_folder: Path) -> MeasuredSensor:
+def measure_sensor(
+    camera: CameraConfig, darks_folder: Path, flats_folder: Path
+) -> MeasuredSensor:
     """The sensor from folders of darks and flats. Raises InputError for frames that do not tell."""
     shape = (camera.height_px, camera.width_px)
     bits = camera.detector.bits
@@ -383,7 +411,9 @@ def write_results(
         "preset": str(path),
         "report": str(folder / "report.html"),
         "temperature_c": found.dark_temperature_c,
-        "values": [row(key, one, raw["detector"].get(key)) for key, one in found.estimates.items()],
+        "values": [
+            row(key, one, raw["detector"].get(key)) for key, one in found.estimates.items()
+        ],
         "linearity_error": found.linearity_error,
         "flicker": found.transfer.flicker,
         "misfit": found.transfer.misfit,
@@ -407,7 +437,8 @@ def night_statistics(config: CameraConfig, night: Night) -> dict[str, Any]:
         before = [1e3 * config.focal_length_m, *config.center_px, *config.distortion]
         found = night_sky.lens_estimates(config, night.lens)
         rows += [
-            row(name, one, value) for (name, one), value in zip(found.items(), before, strict=True)
+            row(name, one, value)
+            for (name, one), value in zip(found.items(), before, strict=True)
         ]
     return {
         "values": rows,

@@ -24,7 +24,13 @@ from scipy import special, stats
 
 from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.types import Floats
-from skysim.experiments.characterize.photon_transfer import BLACK, Estimate, Level, Mask, Transfer
+from skysim.experiments.characterize.photon_transfer import (
+    BLACK,
+    Estimate,
+    Level,
+    Mask,
+    Transfer,
+)
 
 LEAST_HOT = 10  # hot pixels for a fit of their scatter
 # quantiles; the tail is the upper hundredth
@@ -94,7 +100,9 @@ def fit(rates: Floats, noise: RateNoise, greatest: float) -> DarkCurrent:
     enough = hot >= LEAST_HOT
     kept = rates if enough else np.sort(rates)[: rates.size - hot]
     edges = bin_edges(kept, greatest)
-    counts = np.bincount(np.searchsorted(edges, kept), minlength=len(edges) + 1).astype(np.float64)
+    counts = np.bincount(np.searchsorted(edges, kept), minlength=len(edges) + 1).astype(
+        np.float64
+    )
     theta, covariance = maximize(start if enough else start[:2], edges, counts, noise)
     sigma = np.sqrt(np.diag(covariance))
     values = [
@@ -228,7 +236,10 @@ def dark_planes(darks: Sequence[Level], transfer: Transfer, half: str) -> Planes
     """
     times = np.array([one.exposure_s for one in darks])
     weight = np.array(
-        [one.count / one.moments(np.ones(one.first_dn.shape, bool)).variance_dn2 for one in darks]
+        [
+            one.count / one.moments(np.ones(one.first_dn.shape, bool)).variance_dn2
+            for one in darks
+        ]
     )
     weight /= weight.sum()
     middle = weight @ times

@@ -64,7 +64,9 @@ def image_files(folder: Path) -> list[Path]:
     for path in sorted(folder.rglob("*")):
         if (suffix := images.image_suffix(path.name)) and path.name[0] != ".":
             stem = path.with_name(path.name[: -len(suffix)])
-            best[stem] = min(best.get(stem, path), path, key=lambda one: not images.is_fits(one))
+            best[stem] = min(
+                best.get(stem, path), path, key=lambda one: not images.is_fits(one)
+            )
     found = list(best.values())
     if not found:
         raise InputError(folder, "no images", ", ".join(images.IMAGE_SUFFIXES))
@@ -89,7 +91,9 @@ def read_frames(folder: Path) -> Iterator[tuple[Path, Setting, NDArray[np.uint16
 def raw_numbers(path: Path, pixels: NDArray) -> NDArray[np.uint16]:
     """The digital numbers of a frame. Raises InputError unless they are a raw monochrome frame's."""
     if pixels.ndim != 2:
-        raise InputError(path, "a color image", "monochrome frames, raw, of 8 to 16 bits a pixel")
+        raise InputError(
+            path, "a color image", "monochrome frames, raw, of 8 to 16 bits a pixel"
+        )
     if images.image_suffix(path.name) in (".jpg", ".jpeg"):
         raise InputError(path, "JPEG changes the noise", "raw frames in FITS, PNG or TIFF")
     if pixels.dtype.kind == "f" and not np.all(pixels == np.rint(pixels)):
@@ -113,7 +117,11 @@ def setting_of(
     temperature_c = picture.temperature_c
     if exposure_s is None:
         exposure_s = next(
-            (float(hit[1]) * UNITS_S[hit[2]] for name in names if (hit := EXPOSURE.search(name))),
+            (
+                float(hit[1]) * UNITS_S[hit[2]]
+                for name in names
+                if (hit := EXPOSURE.search(name))
+            ),
             None,
         )
     if temperature_c is None:
@@ -167,7 +175,9 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
         numbers = np.right_shift(frame, np.uint16(shift))
         if numbers.max() >= 2**bits:
             raise InputError(
-                path, f"{numbers.max()} DN", f"up to {2**bits - 1}, the {bits} bits of the camera"
+                path,
+                f"{numbers.max()} DN",
+                f"up to {2**bits - 1}, the {bits} bits of the camera",
             )
         builders.setdefault(setting, LevelBuilder()).add(numbers)
         stack.medians.setdefault(setting, []).append((float(np.median(numbers)), path))
@@ -236,11 +246,15 @@ def shots(config: DetectorConfig) -> Iterator[PlannedFrame]:
     """Darks at three exposures and two temperatures, flats in pairs from 2 to 150 % of the full well."""
     own_c = config.dark_temperature_c if config.temperature_c is None else config.temperature_c
     own_e_s = config.dark_e_s * 2.0**config.doublings
-    wanted_e = min(max(DARK_NOISES * config.read_noise_e**2, LEAST_DARK_E), capacity_e(config) / 16)
+    wanted_e = min(
+        max(DARK_NOISES * config.read_noise_e**2, LEAST_DARK_E), capacity_e(config) / 16
+    )
     longest_s = float(f"{wanted_e / own_e_s:.2g}") if own_e_s > 0 else 10.0
     for temperature_c in (own_c, own_c + WARMER_C):
         for part in DARK_PARTS:
-            yield PlannedFrame("darks", float(f"{part * longest_s:.3g}"), temperature_c, 0.0, DARKS)
+            yield PlannedFrame(
+                "darks", float(f"{part * longest_s:.3g}"), temperature_c, 0.0, DARKS
+            )
     for part in FLAT_PARTS:
         yield PlannedFrame(
             "flats", float(f"{part * FLAT_S:.3g}"), own_c, capacity_e(config) / FLAT_S, PAIR
@@ -252,7 +266,9 @@ def capacity_e(config: DetectorConfig) -> float:
     return min(config.full_well_e, (2**config.bits - 1 - config.offset_dn) * config.gain_e_dn)
 
 
-def frames_of(camera: CameraConfig, shot: PlannedFrame, seed: int) -> Iterator[NDArray[np.uint16]]:
+def frames_of(
+    camera: CameraConfig, shot: PlannedFrame, seed: int
+) -> Iterator[NDArray[np.uint16]]:
     """The frames of a shot by the simulated detector, uniform light."""
     at_it = camera.detector.model_copy(update={"temperature_c": shot.temperature_c})
     made = Detector.from_camera(camera.model_copy(update={"detector": at_it}))
@@ -300,9 +316,7 @@ def frame_count(config: DetectorConfig) -> int:
 LEAST_LEVELS = (
     4  # of flats that are not saturated: three rates and a curvature, with one to test them
 )
-MEDIAN_SIGMAS = (
-    0.5  # greatest difference of a dark's median from the others, in standard deviations of a pixel
-)
+MEDIAN_SIGMAS = 0.5  # greatest difference of a dark's median from the others, in standard deviations of a pixel
 MAX_ZEROS = 1e-3  # of a dark's pixels
 BLOCK = 32  # pixels: side of the blocks whose medians show structure
 MAX_DARK_RANGE = 2.0  # of the blocks' medians, in standard deviations of a pixel
@@ -425,7 +439,9 @@ def check_flats(flats: Stack, usable: Mask, black_dn: float) -> None:
         which = f"the flats of {describe(Setting(one.exposure_s, one.temperature_c))}"
         if not one.variance_dn2.any() and signal < 0.95 * top:
             raise InputError(
-                flats.folder, f"{which} are equal in every pixel", "frames of their own, no copies"
+                flats.folder,
+                f"{which} are equal in every pixel",
+                "frames of their own, no copies",
             )
         change = math.sqrt(one.difference_dn2) / signal if signal > 0.02 * top else 0.0
         if change > MAX_PAIR_CHANGE:

@@ -110,7 +110,10 @@ def integrals(center: Floats, ln_sigma: Floats) -> tuple[Floats, Floats, Floats]
 
 def model(p: Floats) -> tuple[Floats, Floats]:
     """(N, M) pixels, and (N, M, 6) their slopes, of images with the parameters p (N, 6)."""
-    (gx, dx, wx), (gy, dy, wy) = integrals(p[:, X], p[:, LN_SX]), integrals(p[:, Y], p[:, LN_SY])
+    (gx, dx, wx), (gy, dy, wy) = (
+        integrals(p[:, X], p[:, LN_SX]),
+        integrals(p[:, Y], p[:, LN_SY]),
+    )
 
     def plane(by_y: Floats, by_x: Floats) -> Floats:
         return (by_y[:, :, None] * by_x[:, None, :]).reshape(len(p), -1)
@@ -122,7 +125,9 @@ def model(p: Floats) -> tuple[Floats, Floats]:
     return p[:, SKY, None] + flux * image, np.stack(slopes, axis=2)
 
 
-def fit_images(image_dn: Floats, xy_px: Floats, gain_dn_e: float, read_dn2: float) -> StarImages:
+def fit_images(
+    image_dn: Floats, xy_px: Floats, gain_dn_e: float, read_dn2: float
+) -> StarImages:
     """Fit the stars at these pixels of a frame without black level, its signal linear; gain in DN per electron."""
     pixels, corner = windows(image_dn, xy_px)
     sky = np.median(pixels, axis=1)
@@ -177,7 +182,9 @@ def summary(
     gx = integrals(p[:, X], p[:, LN_SX])[0]
     gy = integrals(p[:, Y], p[:, LN_SY])[0]
     tilt = p[:, FLUX, None] * ((v * gy)[:, :, None] * (u * gx)[:, None, :]).reshape(len(p), -1)
-    covariance_px2 = np.sum(tilt * residual, axis=1) / np.maximum(np.sum(tilt**2, axis=1), 1e-300)
+    covariance_px2 = np.sum(tilt * residual, axis=1) / np.maximum(
+        np.sum(tilt**2, axis=1), 1e-300
+    )
     stretch = np.column_stack([sx2 - sy2, 2 * covariance_px2])
     freedom = residual.shape[1] - 6
     return StarImages(
@@ -319,7 +326,9 @@ def read_frame(
 def settings_of(transfer: Transfer, saturation_dn: float) -> Settings:
     """Settings of the tracker for this camera."""
     return Settings(
-        gain_e_dn=float(1 / transfer.values[GAIN]), saturation=saturation_dn, centroid_sigma_px=0.02
+        gain_e_dn=float(1 / transfer.values[GAIN]),
+        saturation=saturation_dn,
+        centroid_sigma_px=0.02,
     )
 
 
@@ -404,7 +413,9 @@ def find_lens(
     narrow_sr = (
         config.width_px * config.height_px / (camera.focal_px * (1 + FOCAL_UNCERTAINTY)) ** 2
     )
-    stars = stars.take(stars.v_mag <= catalog.limit_for_density(stars, narrow_sr, STARS_A_FIELD))
+    stars = stars.take(
+        stars.v_mag <= catalog.limit_for_density(stars, narrow_sr, STARS_A_FIELD)
+    )
     dates = [one.date_utc for one in frames if one.date_utc is not None]
     vectors = (
         catalog.apparent(stars, catalog.on_earth(dates[0]))

@@ -68,7 +68,9 @@ class Estimate(NamedTuple):
     def root(cls, variance: float, sigma: float) -> Estimate:
         """The square root of a variance, with the standard error of that; an interval from 0 if it is not above 0."""
         value = math.sqrt(max(variance, 0.0))
-        low, high = (math.sqrt(max(variance + sign * SIGMAS_95 * sigma, 0.0)) for sign in (-1, 1))
+        low, high = (
+            math.sqrt(max(variance + sign * SIGMAS_95 * sigma, 0.0)) for sign in (-1, 1)
+        )
         return cls(value, sigma / (2 * value) if value else high / SIGMAS_95, low, high)
 
 
@@ -142,7 +144,8 @@ class Level:
         variances, since hot pixels have more noise."""
         variance = self.variance_dn2[used].astype(np.float64)
         mean = (
-            self.first_dn[used].mean(dtype=np.float64) + self.second_dn[used].mean(dtype=np.float64)
+            self.first_dn[used].mean(dtype=np.float64)
+            + self.second_dn[used].mean(dtype=np.float64)
         ) / 2
         return Moments(
             float(mean),
@@ -268,7 +271,9 @@ class Transfer(NamedTuple):
     @property
     def read_noise_e(self) -> Estimate:
         """Of the sensor alone, without rounding."""
-        variance, sigma = propagate(lambda p: p[READ] / p[GAIN] ** 2, self.values, self.covariance)
+        variance, sigma = propagate(
+            lambda p: p[READ] / p[GAIN] ** 2, self.values, self.covariance
+        )
         return Estimate.root(variance, sigma)
 
     @property
@@ -317,7 +322,10 @@ def fit(points: Sequence[TransferPoint], flicker: float) -> Transfer:
     def residuals(values: Floats) -> Floats:
         expected_mean, expected_variance = model(kept, values)
         return np.concatenate(
-            [(mean - expected_mean) / mean_sigma, (variance - expected_variance) / variance_sigma]
+            [
+                (mean - expected_mean) / mean_sigma,
+                (variance - expected_variance) / variance_sigma,
+            ]
         )
 
     scale = np.maximum(np.abs(start), 1e-9)
@@ -338,15 +346,21 @@ def start_values(points: Sequence[TransferPoint]) -> Floats:
     )
     darkest = int(np.argmin(mean))
     brightest = int(np.argmax(mean))
-    gain = (variance[brightest] - variance[darkest]) / max(mean[brightest] - mean[darkest], 1e-9)
+    gain = (variance[brightest] - variance[darkest]) / max(
+        mean[brightest] - mean[darkest], 1e-9
+    )
     black = mean[darkest]
     temperatures = 1 + max(one.dark for one in points)
     rates = [0.0] * temperatures
     for one in points:
         if not one.lit:
-            rates[one.dark] = max(rates[one.dark], (one.moments.mean_dn - black) / one.exposure_s)
+            rates[one.dark] = max(
+                rates[one.dark], (one.moments.mean_dn - black) / one.exposure_s
+            )
     light = (mean[brightest] - black) / points[brightest].exposure_s
-    return np.array([gain, 0.0, max(variance[darkest] - ROUNDING_DN2, 0.01), black, light, *rates])
+    return np.array(
+        [gain, 0.0, max(variance[darkest] - ROUNDING_DN2, 0.01), black, light, *rates]
+    )
 
 
 def unsaturated(points: Sequence[TransferPoint], black_dn: float) -> list[bool]:
@@ -359,13 +373,17 @@ def saturated(points: Sequence[TransferPoint]) -> list[bool]:
     """Which flats are beyond the turnover of the variance, with a variance that has collapsed."""
     variance = np.array([one.moments.variance_dn2 for one in points])
     brighter = (
-        np.array([one.exposure_s for one in points]) > points[int(np.argmax(variance))].exposure_s
+        np.array([one.exposure_s for one in points])
+        > points[int(np.argmax(variance))].exposure_s
     )
     return [bool(one) for one in brighter & (variance < COLLAPSED * variance.max())]
 
 
 def lamp_flicker(
-    points: Sequence[TransferPoint], difference_dn2: Sequence[float], black_dn: float, pixels: int
+    points: Sequence[TransferPoint],
+    difference_dn2: Sequence[float],
+    black_dn: float,
+    pixels: int,
 ) -> float:
     """Relative flicker from frame to frame: of the means' differences in pairs, what their noise does not explain.
 

@@ -77,7 +77,9 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
     )
     own = nearest_index(temperatures, flats[0].temperature_c)
     dark_points = [
-        TransferPoint(one.exposure_s, 0, temperatures.index(one.temperature_c), one.moments(usable))
+        TransferPoint(
+            one.exposure_s, 0, temperatures.index(one.temperature_c), one.moments(usable)
+        )
         for one in darks
     ]
     flat_points = [TransferPoint(one.exposure_s, 1, own, one.moments(usable)) for one in flats]
@@ -104,7 +106,9 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
     doubling(found, temperatures)
     estimates = found.estimates
     estimates["prnu"] = fixed_pattern.prnu(fitted, transfer, first, second, ratio, usable)
-    columns = fixed_pattern.column_offset(first[0], second[0], usable, 1 / transfer.values[GAIN])
+    columns = fixed_pattern.column_offset(
+        first[0], second[0], usable, 1 / transfer.values[GAIN]
+    )
     estimates["column_offset_e"] = columns
     # The columns' levels are those of this chip: the mean of as many others differs by their scatter.
     scatter_dn = columns.value * transfer.values[GAIN] / math.sqrt(usable.shape[1])
@@ -234,7 +238,8 @@ def dark_parameters(
     counts = np.array([one.count for one in darks])
     times = np.array([one.exposure_s for one in darks])
     noise = RateNoise(
-        float(np.sum(weights**2 * read / counts)), float(np.sum(weights**2 * gain * times / counts))
+        float(np.sum(weights**2 * read / counts)),
+        float(np.sum(weights**2 * gain * times / counts)),
     )
     if not fixed_pattern.is_resolved(rates, noise):
         unresolved(found, own, rates, noise, float(times.max()))
@@ -273,7 +278,9 @@ def unresolved(
     if mean > 0 and mean**2 > noise.reading:
         variance, error = fixed_pattern.own_variance(rates, noise)
         found.estimates["dsnu"] = Estimate.root(variance / mean**2, error / mean**2)
-        found.remarks.append("hot pixels: all pixels have the same dark current within its noise")
+        found.remarks.append(
+            "hot pixels: all pixels have the same dark current within its noise"
+        )
         return
     noise_e_s = math.sqrt(noise.reading) / transfer.values[GAIN]
     needed = "much longer exposures"

@@ -124,9 +124,13 @@ def unit_seeds(scene: Scene) -> list[str]:
     chip = scene.camera.detector
     has_pattern = any(getattr(chip, key) for key in FIXED_PATTERN)
     seeds = ["camera.detector.hardware_seed"] if has_pattern else []
-    seeds += ["tracker.survey.seed"] if has_survey_errors(scene) and not scene.tracker.map else []
+    seeds += (
+        ["tracker.survey.seed"] if has_survey_errors(scene) and not scene.tracker.map else []
+    )
     layout = scene.light.layout if isinstance(scene.light, DomeConfig) else None
-    points, prefix = (layout.points, ".points") if isinstance(layout, OnPoints) else (layout, "")
+    points, prefix = (
+        (layout.points, ".points") if isinstance(layout, OnPoints) else (layout, "")
+    )
     seeds += [f"light.layout{prefix}.hardware_seed"] if hasattr(points, "hardware_seed") else []
     return seeds
 
@@ -218,7 +222,9 @@ class Designer:
     ) -> Iterator[DatasheetCell]:
         """Frames of other attitudes; with a change the same as without it, noise included, for a comparison."""
         for number in range(count):
-            settings = self.settings(self.in_turn(number)) | {"trial.noise_seed": 10_000 + number}
+            settings = self.settings(self.in_turn(number)) | {
+                "trial.noise_seed": 10_000 + number
+            }
             settings |= change or {}
             if settings.get("trial.kind") == "centroids":
                 del settings["trial.turn_deg"]
@@ -269,7 +275,9 @@ class Designer:
             for frame in range(2):
                 change = {f"trial.{key}": value, "trial.tracked": TRACKED}
                 yield DatasheetCell(
-                    f"tracked {key}", {key: value, "frame": frame}, self.settings(Draw()) | change
+                    f"tracked {key}",
+                    {key: value, "frame": frame},
+                    self.settings(Draw()) | change,
                 )
 
     def magnitudes(self) -> Iterator[DatasheetCell]:
@@ -295,7 +303,9 @@ class Designer:
         if 2 * exposure.time_s + exposure.trigger_jitter_s <= period_s:
             changes["twice the exposure time"] = {"exposure.time": f"{2 * exposure.time_s} s"}
         if chip.read_noise_e:
-            changes["half the read noise"] = {"camera.detector.read_noise_e": chip.read_noise_e / 2}
+            changes["half the read noise"] = {
+                "camera.detector.read_noise_e": chip.read_noise_e / 2
+            }
         if any(getattr(chip, key) for key in FIXED_PATTERN):
             none = {f"camera.detector.{key}": 0 for key in FIXED_PATTERN}
             changes["no fixed pattern"] = none
@@ -402,7 +412,9 @@ class MeasuredFrames:
     def levels(self, experiment: str, name: str) -> list[Any]:
         """The levels of an experiment, in order."""
         return list(
-            dict.fromkeys(cell.levels[name] for cell in self.cells if cell.experiment == experiment)
+            dict.fromkeys(
+                cell.levels[name] for cell in self.cells if cell.experiment == experiment
+            )
         )
 
     def column(self, name: str, rows: list[int]) -> NDArray[Any]:
@@ -501,4 +513,6 @@ def read(plan: Plan, kept: store.Store) -> dict[str, NDArray[Any]]:
         trial, error = failures[0]
         point: Point = plan.points[trial // plan.study.replicates]
         raise InputError(point.levels["cell"], error.strip().splitlines()[-1])
-    return {name: values.reshape(len(plan.points), -1) for name, values in kept.columns().items()}
+    return {
+        name: values.reshape(len(plan.points), -1) for name, values in kept.columns().items()
+    }

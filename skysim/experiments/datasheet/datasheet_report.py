@@ -106,7 +106,9 @@ def draw_sky(fig: Any, statement: Statement) -> None:
     for n, (name, chosen) in enumerate(kinds.items()):
         if chosen.any() or name == "right":
             x, y = (part[chosen] for part in place)
-            axes.plot(x, y, ".", color=INK[n], markersize=2 if name == "right" else 5, label=name)
+            axes.plot(
+                x, y, ".", color=INK[n], markersize=2 if name == "right" else 5, label=name
+            )
     axes.legend(loc="lower right", bbox_to_anchor=(1.15, 0))
 
 
@@ -223,7 +225,9 @@ def section_blocks(section: StatementSection, statement: Statement) -> list[Bloc
         for name in section.figures
     ]
     first, *others = section.headers
-    columns = [Column(head, kind="aside" if head == "what it is" else "number") for head in others]
+    columns = [
+        Column(head, kind="aside" if head == "what it is" else "number") for head in others
+    ]
     return [*texts, *figures, Table([Column(first, kind="text"), *columns], section.rows)]
 
 

@@ -97,7 +97,8 @@ class ErrorModel:
     def noise_arcsec(self, rate_deg_s: Any) -> Any:
         """(N, 3) standard deviation of the noise at (N,) rates, without what is added about the rate's axis."""
         return np.stack(
-            [np.interp(rate_deg_s, self.rates_deg_s, column) for column in self.noise.T], axis=-1
+            [np.interp(rate_deg_s, self.rates_deg_s, column) for column in self.noise.T],
+            axis=-1,
         )
 
     def along_arcsec(self, rate_deg_s: Any) -> Any:
@@ -143,14 +144,18 @@ class ErrorModel:
         noise = self.drawn_noise(rate, first.axis_rad if axis_rad is None else axis_rad, rng)
         return first.bias + self.scales(scale) * (slow + noise)
 
-    def step(self, state: State, rate_deg_s: float, step_s: float, rng: Any) -> tuple[State, Any]:
+    def step(
+        self, state: State, rate_deg_s: float, step_s: float, rng: Any
+    ) -> tuple[State, Any]:
         """The state one step later, and its (3,) errors in arcseconds."""
         turned = abs(rate_deg_s) * step_s
         new = []
         for name in ("field", "pixel", "scale"):
             left = math.exp(-turned / self.constants[f"{name}_deg"])
             old = getattr(state, name)
-            new.append(left * old + math.sqrt(1 - left * left) * rng.standard_normal(np.shape(old)))
+            new.append(
+                left * old + math.sqrt(1 - left * left) * rng.standard_normal(np.shape(old))
+            )
         later = state._replace(field=new[0], pixel=new[1], scale=float(new[2]))
         noise = self.drawn_noise(np.array([abs(rate_deg_s)]), state.axis_rad, rng)[0]
         slow = self.field * later.field + self.pixel * later.pixel

@@ -37,14 +37,17 @@ def constants(sheet: MeasuredFrames) -> dict[str, Any]:
     errors, _ = term_errors(sheet)
     found = [components(one) for one in errors]
     field, pixel = (
-        np.sqrt(np.maximum([getattr(one, name) for one in found], 0)) for name in ("field", "pixel")
+        np.sqrt(np.maximum([getattr(one, name) for one in found], 0))
+        for name in ("field", "pixel")
     )
     bias = [bias_terms(one) for one in errors]
     across, about = (log_scale(*field_variances(sheet, axes)) for axes in GROUPS.values())
     mean = [one[0] for one in bias]
     by_rate = errors_by_rate(sheet)
     squares = np.array([mean_known(one**2, (1, 2)) for one in by_rate.values()])
-    along = np.array([along_square(sheet, rate, mean, found) for rate, found in by_rate.items()])
+    along = np.array(
+        [along_square(sheet, rate, mean, found) for rate, found in by_rate.items()]
+    )
     slow = np.square(mean) + field**2 + pixel**2 + np.outer(along / 2, [1.0, 1.0, 0.0])
     noise = np.sqrt(np.maximum(squares - slow, LEAST_NOISE * squares))
     rest = np.sqrt([one.temporal for one in found])
@@ -250,7 +253,9 @@ def agreement(
     steps, errors = sequences(sheet, rate_deg_s)
     first = errors[:, 0][:, np.isfinite(errors[:, 0]).all(axis=0)]
     drawn = turning(model, rate_deg_s) if rate_deg_s else at_rest(model)
-    p_values = [float(stats.ks_2samp(*pair).pvalue) for pair in zip(first, drawn.T, strict=True)]
+    p_values = [
+        float(stats.ks_2samp(*pair).pvalue) for pair in zip(first, drawn.T, strict=True)
+    ]
     centered = errors - model.mean[:, None, None]
     found = []
     expected = []
@@ -258,7 +263,8 @@ def agreement(
         for two in range(one + 1, len(steps)):
             angle_deg = rate_deg_s * (steps[two] - steps[one]) / sheet.scene.exposure.rate_hz
             found.append(
-                mean_known(centered[:, one] * centered[:, two], 1) / mean_known(centered**2, (1, 2))
+                mean_known(centered[:, one] * centered[:, two], 1)
+                / mean_known(centered**2, (1, 2))
             )
             expected.append(model.correlation(angle_deg, rate_deg_s))
     return Agreement(

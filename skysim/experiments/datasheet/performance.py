@@ -42,7 +42,9 @@ class Counts(NamedTuple):
     def share(self, kind: str) -> Summary:
         """The share of one kind with its exact one-sided bounds, each at 95 % (Clopper & Pearson 1934)."""
         hits = getattr(self, kind)
-        return Summary(hits / self.frames, *metrics.exact_bounds(hits, self.frames), self.frames)
+        return Summary(
+            hits / self.frames, *metrics.exact_bounds(hits, self.frames), self.frames
+        )
 
 
 def counts(sheet: MeasuredFrames, rows: list[int]) -> Counts:

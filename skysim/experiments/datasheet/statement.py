@@ -270,7 +270,9 @@ def lowering_section(statement: Statement) -> StatementSection:
 def probability_section(statement: Statement) -> StatementSection:
     """Probabilities of right, refused and false attitudes, and what may be claimed."""
     counts = statement.counts
-    where = "the whole sky" if statement.sheet.designer.under_stars else "the tilts of the vehicle"
+    where = (
+        "the whole sky" if statement.sheet.designer.under_stars else "the tilts of the vehicle"
+    )
     shares = ", ".join(
         f"{kind} {percent(counts.share(kind))} %" for kind in ("right", "refused", "false")
     )
@@ -329,7 +331,10 @@ def quantile_section(statement: Statement) -> StatementSection:
         for one in statement.quantiles
     ]
     return StatementSection(
-        "Performance at a confidence", texts, ["probability", "boresight angle ″", "about ″"], rows
+        "Performance at a confidence",
+        texts,
+        ["probability", "boresight angle ″", "about ″"],
+        rows,
     )
 
 
@@ -395,7 +400,12 @@ def rate_section(statement: Statement) -> StatementSection:
         ),
     ]
     rows = [
-        [f"{row['rate_deg_s']:g}", f"{row['streak_px']:.2g}", *pair_cells(row), *outcome_cells(row)]
+        [
+            f"{row['rate_deg_s']:g}",
+            f"{row['streak_px']:.2g}",
+            *pair_cells(row),
+            *outcome_cells(row),
+        ]
         for row in statement.rates
     ]
     headers = ["rate °/s", "streak px", *PAIR_HEADERS, *FIELD_HEADERS]
@@ -433,7 +443,13 @@ def acceleration_section(statement: Statement) -> StatementSection:
         ]
         for row in statement.accelerations
     ]
-    headers = ["acceleration °/s²", "rms across ″", "predicted ″", "rms about ″", *FIELD_HEADERS]
+    headers = [
+        "acceleration °/s²",
+        "rms across ″",
+        "predicted ″",
+        "rms about ″",
+        *FIELD_HEADERS,
+    ]
     return StatementSection("By acceleration", texts, headers, rows)
 
 
@@ -453,7 +469,9 @@ def tracking_section(statement: Statement) -> StatementSection:
             "°/s²",
         ),
     ]
-    rows = [[f"{row['rate_deg_s']:g}", "", *pair_cells(row), *outcome_cells(row)] for row in rates]
+    rows = [
+        [f"{row['rate_deg_s']:g}", "", *pair_cells(row), *outcome_cells(row)] for row in rates
+    ]
     rows += [
         ["", f"{row['acceleration_deg_s2']:g}", *pair_cells(row), *outcome_cells(row)]
         for row in accelerations

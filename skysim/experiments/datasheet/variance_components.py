@@ -176,7 +176,8 @@ def sum_over_total(errors: Floats, at_once: Floats) -> Bounded:
     errors = errors[:, known]
     squares = squares[known]
     drawn = [
-        of_axes(errors[:, rows]).total / squares[rows].mean() for rows in resamples(len(squares))
+        of_axes(errors[:, rows]).total / squares[rows].mean()
+        for rows in resamples(len(squares))
     ]
     return bounded(of_axes(errors).total / float(squares.mean()), np.array(drawn))
 
@@ -264,7 +265,9 @@ def term_tables(sheet: MeasuredFrames) -> dict[str, TermTable]:
     errors, solved = term_errors(sheet)
     at_once = np.moveaxis(sheet.errors(sheet.rows("total")), 1, 2)[:, solved]
     return {
-        name: TermTable(with_intervals(errors[axes]), sum_over_total(errors[axes], at_once[axes]))
+        name: TermTable(
+            with_intervals(errors[axes]), sum_over_total(errors[axes], at_once[axes])
+        )
         for name, axes in GROUPS.items()
     }
 
@@ -292,7 +295,9 @@ def causes(sheet: MeasuredFrames) -> list[dict[str, Any]]:
     found = []
     for name in sheet.levels("cause", "cause"):
         rows = sheet.rows("cause", cause=name)
-        before = [row for row in sheet.rows("total") if sheet.cells[row].levels["draw"] < len(rows)]
+        before = [
+            row for row in sheet.rows("total") if sheet.cells[row].levels["draw"] < len(rows)
+        ]
         row: dict[str, Any] = {"cause": name}
         for group, axes in GROUPS.items():
             after, squares = (squares_by_field(sheet, cells, axes) for cells in (rows, before))

@@ -36,13 +36,19 @@ from skysim.experiments.dome_survey.survey_frames import (
     match_by_imu,
     match_by_survey,
 )
-from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty, assumed
+from skysim.experiments.dome_survey.survey_prior import (
+    CalibrationPrior,
+    SurveyUncertainty,
+    assumed,
+)
 from skysim.tracking.dome_map_file import DomeMap
 
 MIN_SHARED_LEDS = 3  # that a frame must share with others: two determine its attitude
 MAX_UNCONNECTED = 0.5  # share of the frames that may be left out at a time
 
-ROUNDS = 3  # rounds of identification and adjustment; from the second on with the adjusted values
+ROUNDS = (
+    3  # rounds of identification and adjustment; from the second on with the adjusted values
+)
 MOVED_ROUNDS = 2  # further rounds if LEDs are far from their places in the list
 
 # Share of a frame's lights that are matched, and of these that fit the adjustment: far less by chance.
@@ -122,11 +128,21 @@ def check_plausible(run: SurveyRun, before: Assumed) -> None:
     found = run.survey
     accuracy = run.accuracy
     lever = zip(
-        before.camera_body_m, found.lever.camera_body_m, accuracy.lever_sigma_m, "xyz", strict=True
+        before.camera_body_m,
+        found.lever.camera_body_m,
+        accuracy.lever_sigma_m,
+        "xyz",
+        strict=True,
     )
     lever_sigma_m, focal_sigma_px = before.weight[2:] ** -0.5
     rows = [
-        (before.focal_px, found.camera.focal_px, accuracy.lens_sigma[0], focal_sigma_px, "focal px")
+        (
+            before.focal_px,
+            found.camera.focal_px,
+            accuracy.lens_sigma[0],
+            focal_sigma_px,
+            "focal px",
+        )
     ]
     rows += [
         (1e3 * then, 1e3 * now, 1e3 * sigma, 1e3 * lever_sigma_m, f"lever {axis} mm")
@@ -184,7 +200,9 @@ def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], Calibra
     map_px = led_sigma_m(survey, run.uncertainty) * model.px_per_m
     sigma_px = np.hypot(map_px, max(survey.rms_px, prior.floor_px))
     tied = {
-        row: frame for row, frame, ok in zip(run.rows, run.frames, survey.tied, strict=True) if ok
+        row: frame
+        for row, frame, ok in zip(run.rows, run.frames, survey.tied, strict=True)
+        if ok
     }
     rows = []
     matches = []
@@ -241,7 +259,9 @@ def displaced_leds(run: SurveyRun) -> dict[int, Floats]:
     places = {int(row): survey.leds.position_m[row] for row in rows}
     strays = stray_lights(run)
     missing = np.flatnonzero(~run.seen.any(axis=0))
-    named = survey_faults.name_strays(strays, missing, run.listed.position_m, MAX_DISPLACEMENT_M)
+    named = survey_faults.name_strays(
+        strays, missing, run.listed.position_m, MAX_DISPLACEMENT_M
+    )
     return places | {led: strays[k].position_m for led, k in named}
 
 

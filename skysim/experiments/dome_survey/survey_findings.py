@@ -85,7 +85,8 @@ class SurveyRun:
         for frame, row in self.survey.outliers.tolist():
             keep[frame][row] = False
         return [
-            Correspondences(m.light[k], m.led[k]) for m, k in zip(self.matches, keep, strict=True)
+            Correspondences(m.light[k], m.led[k])
+            for m, k in zip(self.matches, keep, strict=True)
         ]
 
     @property
@@ -97,7 +98,9 @@ class SurveyRun:
     def noise_px(self) -> float:
         """Standard deviation of a centroid's coordinates, as the residuals have it; of the mean information."""
         pairs = zip(self.frames, self.inliers, strict=True)
-        sigma_px = np.concatenate([frame.lights.sigma_px[match.light] for frame, match in pairs])
+        sigma_px = np.concatenate(
+            [frame.lights.sigma_px[match.light] for frame, match in pairs]
+        )
         return self.survey.noise_scale / math.sqrt(np.mean(sigma_px**-2.0))
 
     @property
@@ -159,7 +162,9 @@ def residuals_px(run: SurveyRun) -> tuple[Floats, Floats]:
         xy_px = frame.lights.xy_px[match.light[used]]
         place_m = survey.leds.position_m[match.led[used]]
         found.append(xy_px)
-        residual.append(xy_px - project(frame.body_from_lab, place_m, survey.lever, survey.camera))
+        residual.append(
+            xy_px - project(frame.body_from_lab, place_m, survey.lever, survey.camera)
+        )
     return np.concatenate(found), np.concatenate(residual)
 
 
@@ -167,7 +172,9 @@ def light_table(run: SurveyRun) -> LightTable:
     """What the frames show of each LED, and what each must show."""
     index = np.array([frame.index for frame in run.frames])
     return LightTable(
-        light_at_unit_distance(run), run.held.shown(*margins(run)), run.prior.expected_light(index)
+        light_at_unit_distance(run),
+        run.held.shown(*margins(run)),
+        run.prior.expected_light(index),
     )
 
 
@@ -182,7 +189,9 @@ def light_at_unit_distance(run: SurveyRun) -> Floats:
     """(F, N) light of each LED in each frame, multiplied with its squared distance; NaN if it is not identified."""
     out = np.full(run.seen.shape, np.nan)
     survey = run.survey
-    camera_m = survey.body_from_lab.inv().apply(np.tile(survey.lever.camera_body_m, (len(out), 1)))
+    camera_m = survey.body_from_lab.inv().apply(
+        np.tile(survey.lever.camera_body_m, (len(out), 1))
+    )
     for k, (frame, match) in enumerate(zip(run.frames, run.inliers, strict=True)):
         squared_m2 = np.sum((survey.leds.position_m[match.led] - camera_m[k]) ** 2, axis=1)
         out[k, match.led] = np.maximum(frame.lights.flux[match.light], 1e-9) * squared_m2

@@ -254,7 +254,9 @@ def match_by_imu(
         return Correspondences(np.zeros(0, np.int64), np.zeros(0, np.int64))
     predicted = predicted[visible]
     individual_px = individual_px[visible]
-    shift = common_shift_px(detected, predicted, common_px, individual_px, prior.camera.center_px)
+    shift = common_shift_px(
+        detected, predicted, common_px, individual_px, prior.camera.center_px
+    )
     light, led = assign_lights(detected, predicted + shift, GATE_SIGMAS * individual_px)
     return Correspondences(light, visible[led])
 
@@ -282,7 +284,8 @@ def common_shift_px(
     distance_px, nearest = cKDTree(predicted_px).query(detected_px - candidates[:, None])
     sigma_px = individual_px[nearest]
     cost = np.minimum(
-        (distance_px / sigma_px) ** 2 + 4 * np.log(sigma_px / individual_px.max()), GATE_SIGMAS**2
+        (distance_px / sigma_px) ** 2 + 4 * np.log(sigma_px / individual_px.max()),
+        GATE_SIGMAS**2,
     )
     best = int(np.argmin(np.sum(candidates**2, axis=1) / common_px**2 + np.sum(cost, axis=1)))
     is_close = cost[best] < GATE_SIGMAS**2
@@ -294,7 +297,9 @@ def common_shift_px(
     )
 
 
-def assign_lights(detected_px: Floats, predicted_px: Floats, gate_px: Floats) -> tuple[Ints, Ints]:
+def assign_lights(
+    detected_px: Floats, predicted_px: Floats, gate_px: Floats
+) -> tuple[Ints, Ints]:
     """Optimal one-to-one assignment of (S, 2) detections to (P, 2) predictions with (P,) gates; returns their rows.
 
     It minimizes the sum of min(distance / gate, 1)^2. Pairs beyond their gate are left out.
@@ -317,7 +322,9 @@ def match_by_survey(
         (N,) standard deviation of each LED's predicted coordinates
     """
     predicted = prior.pixels(frame.body_from_lab)
-    visible = np.flatnonzero(prior.camera.contains(predicted, -GATE_SIGMAS * float(sigma_px.max())))
+    visible = np.flatnonzero(
+        prior.camera.contains(predicted, -GATE_SIGMAS * float(sigma_px.max()))
+    )
     light, led = assign_lights(
         frame.lights.xy_px, predicted[visible], GATE_SIGMAS * sigma_px[visible]
     )

@@ -52,7 +52,9 @@ def image_files(folder: Path) -> list[Path]:
     """The images of a folder by name, one of each stem. Raises InputError for too few, or no folder."""
     paths = best_images(folder)
     if len(paths) < MIN_IMAGES:
-        raise InputError(folder, f"{len(paths)} images", f"{MIN_IMAGES} or more, typically tens")
+        raise InputError(
+            folder, f"{len(paths)} images", f"{MIN_IMAGES} or more, typically tens"
+        )
     return paths
 
 
@@ -84,7 +86,9 @@ def read_images(folder: Path, camera: Camera, settings: Settings) -> Iterator[Su
         if name not in names:
             raise InputError(folder / ATTITUDES, f"{excerpt(name)} is no image of the folder")
     for path in paths:
-        yield SurveyImage(path.name, lights_of(path, camera, settings), attitudes.get(path.name))
+        yield SurveyImage(
+            path.name, lights_of(path, camera, settings), attitudes.get(path.name)
+        )
 
 
 def lights_of(path: Path, camera: Camera, settings: Settings) -> Centroids:
@@ -114,7 +118,10 @@ def read_attitudes(path: Path) -> dict[str, Rotation]:
 
 
 def write_attitudes(
-    path: Path, names: Sequence[str], lab_from_body: Rotation, leds: NDArray[np.int64] | None = None
+    path: Path,
+    names: Sequence[str],
+    lab_from_body: Rotation,
+    leds: NDArray[np.int64] | None = None,
 ) -> None:
     """Write attitudes as `read_attitudes` reads them.
 
@@ -162,7 +169,9 @@ def lost_in_space(
     leds: LedMap = replace(
         model.leds, sigma_m=uncertainty.led_sigma_m, covariance_m2=None, common_m=None
     )
-    lever = Lever(model.lever.camera_body_m, model.lever.cam_from_body, uncertainty.lever_sigma_m)
+    lever = Lever(
+        model.lever.camera_body_m, model.lever.cam_from_body, uncertainty.lever_sigma_m
+    )
     try:
         return DomeTracker(camera, leds, lever, settings)
     except ImageError as error:

@@ -83,7 +83,11 @@ class HeldAttitudes(NamedTuple):
 
 
 def plan_survey(
-    scene: Scene, uncertainty: SurveyUncertainty, count: int, tilt_deg: float, kind: str = PLANNED
+    scene: Scene,
+    uncertainty: SurveyUncertainty,
+    count: int,
+    tilt_deg: float,
+    kind: str = PLANNED,
 ) -> tuple[Lab, CalibrationPrior, HeldAttitudes]:
     """The lab with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
     lab = build_lab(with_survey_errors(scene, uncertainty))
@@ -118,7 +122,10 @@ def write_plan(path: Path, plan: HeldAttitudes) -> None:
 
 
 def simulated_frames(
-    lab: Lab, uncertainty: SurveyUncertainty, lab_from_body: Rotation, folder: Path | None = None
+    lab: Lab,
+    uncertainty: SurveyUncertainty,
+    lab_from_body: Rotation,
+    folder: Path | None = None,
 ) -> Iterator[SurveyFrame]:
     """The frames of a simulated survey. A folder gets each as FITS, and the IMU's attitudes, for `images`."""
     measured = imu_attitudes(lab.scene, lab_from_body, uncertainty.imu_sigma_rad)
@@ -160,7 +167,9 @@ def survey_images(
         found = run.survey
         model = replace(prior, camera=found.camera, leds=found.surveyed_leds, lever=found.lever)
         known = {frame.index: frame.body_from_lab.inv() for frame in frames}
-        named = [picture._replace(lab_from_body=known.get(n)) for n, picture in enumerate(pictures)]
+        named = [
+            picture._replace(lab_from_body=known.get(n)) for n, picture in enumerate(pictures)
+        ]
         more = frames_with_attitude(
             named,
             model,
@@ -210,7 +219,8 @@ def in_survey(lab: Lab, n: int) -> Lab:
     scene = lab.scene
     again = lab.in_run(scene.seed + n)
     return replace(
-        again, scene=with_config(again.scene, "tracker.survey", seed=scene.tracker.survey.seed + n)
+        again,
+        scene=with_config(again.scene, "tracker.survey", seed=scene.tracker.survey.seed + n),
     )
 
 

@@ -87,7 +87,9 @@ def survey_report(statistics: dict[str, Any], run: SurveyRun, command: str) -> R
 def verdict(statistics: Mapping[str, Any], led_mm: float) -> Verdict:
     """How many LEDs were measured, how well, and the number of faults."""
     faults = len(fault_rows(statistics["faults"]))
-    text = "{surveyed} of {leds} LEDs measured in {tied} of {frames} frames".format(**statistics)
+    text = "{surveyed} of {leds} LEDs measured in {tied} of {frames} frames".format(
+        **statistics
+    )
     text += f", to {led_mm:.2g} mm rms about each axis (1σ); {faults} faults."
     return Verdict(text, "warning" if faults else "good")
 
@@ -144,7 +146,9 @@ def accuracy_table(statistics: dict[str, Any], reached: Mapping[str, Any]) -> Ta
     columns["by this survey's covariance"] = reached
     columns |= {"true error, rms": {"led_mm": after}} if after is not None else {}
     columns["with the next attitudes"] = statistics["next_reaches"]
-    rows = [[what, *(one.get(key) for one in columns.values())] for key, what in REACHED.items()]
+    rows = [
+        [what, *(one.get(key) for one in columns.values())] for key, what in REACHED.items()
+    ]
     return Table([text_column("1σ"), *(Column(head, format=".3g") for head in columns)], rows)
 
 
@@ -167,9 +171,12 @@ def stop_table(stops: list[dict[str, Any]]) -> Table:
     """Attitudes as roll, pitch and yaw, with tilt and number of LEDs."""
     names = ("roll", "pitch", "yaw", "tilt")
     rows = [
-        [n, *(one[f"{name}_deg"] for name in names), one["leds"]] for n, one in enumerate(stops, 1)
+        [n, *(one[f"{name}_deg"] for name in names), one["leds"]]
+        for n, one in enumerate(stops, 1)
     ]
-    return Table([Column(""), *(Column(name, "°", ".1f") for name in names), Column("LEDs")], rows)
+    return Table(
+        [Column(""), *(Column(name, "°", ".1f") for name in names), Column("LEDs")], rows
+    )
 
 
 def fault_blocks(faults: dict[str, Any]) -> list[Block]:
@@ -190,7 +197,9 @@ def fault_rows(faults: dict[str, Any]) -> list[tuple[str, str, str]]:
         alike = f" (or {', '.join(map(str, others))})" if others else ""
         details = f"LED {shows}{alike} shines at its place, {found[led]}"
         rows.append((str(led), "exchanged", details))
-    rows += [("", "not in the list", f"a light at {coordinates(at)}") for at in faults["unlisted"]]
+    rows += [
+        ("", "not in the list", f"a light at {coordinates(at)}") for at in faults["unlisted"]
+    ]
     return rows
 
 
@@ -250,7 +259,11 @@ def draw_means(axes: Any, xy_px: Floats, residual_px: Floats, size_px: tuple[int
     )
     axes.quiverkey(arrows, 0.85, 1.04, largest_px, f"{largest_px:.2g} px", labelpos="E")
     axes.set(
-        xlim=(0, size_px[0]), ylim=(size_px[1], 0), aspect="equal", xlabel="x [px]", ylabel="y [px]"
+        xlim=(0, size_px[0]),
+        ylim=(size_px[1], 0),
+        aspect="equal",
+        xlabel="x [px]",
+        ylabel="y [px]",
     )
     axes.set_title("mean residuals over the chip", loc="left")
 
@@ -290,7 +303,9 @@ def compare_trackers(
         for name, tracker in trackers.items():
             cam_from_ref = factory.solve_frame(tracker, frame).attitude.cam_from_ref
             if cam_from_ref is not None:
-                errors[name].append(metrics.cross_and_roll_rad(cam_from_ref, truth.cam_from_lab))
+                errors[name].append(
+                    metrics.cross_and_roll_rad(cam_from_ref, truth.cam_from_lab)
+                )
     return {name: error_statistics(stops, errors_rad) for name, errors_rad in errors.items()}
 
 
@@ -398,7 +413,9 @@ def draw_coverage(
     unseen = ~measured & ~once
 
     def dots(which: Mask, name: str, **style: Any) -> Any:
-        return axes.scatter(x_m[which], y_m[which], s=14, label=f"{name}: {which.sum()}", **style)
+        return axes.scatter(
+            x_m[which], y_m[which], s=14, label=f"{name}: {which.sum()}", **style
+        )
 
     dots(unseen, "not seen", facecolor="none", edgecolor="0.6")
     dots(once, "seen, not measured", color="0.75")
@@ -459,4 +476,6 @@ def list_shifts(run: SurveyRun) -> LedErrors:
     row = np.flatnonzero(run.survey.surveyed)
     found_m = run.survey.leds.position_m[row]
     none = np.zeros(len(row), dtype=bool)
-    return LedErrors(found_m, run.listed.position_m[row] - found_m, np.zeros_like(found_m), none)
+    return LedErrors(
+        found_m, run.listed.position_m[row] - found_m, np.zeros_like(found_m), none
+    )

@@ -115,7 +115,9 @@ class Comparison(NamedTuple):
             return ""
         ours = cause.ours if cause and self.verdict == "explained" else self.result.ours
         if low > -math.inf and high < math.inf:
-            return "interval wider than the tolerance" if ours.high - ours.low > high - low else ""
+            return (
+                "interval wider than the tolerance" if ours.high - ours.low > high - low else ""
+            )
         bound = low if low > -math.inf else high
         return "the bound is within the interval" if ours.low < bound < ours.high else ""
 

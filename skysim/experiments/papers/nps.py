@@ -78,7 +78,9 @@ class PanelSolution(NamedTuple):
     @property
     def error_deg(self) -> float:
         """Error of the attitude; the true one is level. NaN without a solution."""
-        return float(np.degrees(self.body_from_lab.magnitude())) if self.body_from_lab else np.nan
+        return (
+            float(np.degrees(self.body_from_lab.magnitude())) if self.body_from_lab else np.nan
+        )
 
 
 def build_model(camera_m: Floats | None, seed: int, frames: int) -> OnboardModel:
@@ -103,7 +105,9 @@ def build_model(camera_m: Floats | None, seed: int, frames: int) -> OnboardModel
     rays_of_frames = [rays_body(lab, seed + n) for n in range(frames)]
     # Noise changes the order of brightness between frames, so sort by position before averaging.
     sorted_rays = [rays[np.lexsort((rays[:, 1], rays[:, 0]))] for rays in rays_of_frames]
-    mean = np.mean([rays for rays in sorted_rays if len(rays) == len(lab.camera.sources)], axis=0)
+    mean = np.mean(
+        [rays for rays in sorted_rays if len(rays) == len(lab.camera.sources)], axis=0
+    )
     vectors = directions(lab, panel, mean, Rotation.identity())
     return OnboardModel(lab, panel, vectors, pair_index.build(vectors, 1.0))
 
@@ -165,7 +169,9 @@ class SolutionSeries(NamedTuple):
 
     def matched(self) -> Summary:
         """Mean number of matched stars over the five trials."""
-        counts = [[solution.matched for solution in self.solutions[error]] for error in INITIAL_DEG]
+        counts = [
+            [solution.matched for solution in self.solutions[error]] for error in INITIAL_DEG
+        ]
         mean_of_frame = np.mean(counts, axis=0)  # the trials of a frame are not independent
         return bootstrap_interval(mean_of_frame, np.mean)
 
@@ -176,8 +182,12 @@ class SolutionSeries(NamedTuple):
 
     def mean_euler_angle(self) -> Summary:
         """Mean absolute Euler angle after the updates, deg; the true angles are zero."""
-        attitudes = [solution.body_from_lab for solution in self.iterated if solution.body_from_lab]
-        angles = [np.abs(attitude.as_euler("ZYX", degrees=True)).mean() for attitude in attitudes]
+        attitudes = [
+            solution.body_from_lab for solution in self.iterated if solution.body_from_lab
+        ]
+        angles = [
+            np.abs(attitude.as_euler("ZYX", degrees=True)).mean() for attitude in attitudes
+        ]
         return bootstrap_interval(np.array(angles), np.mean)
 
 
@@ -226,7 +236,8 @@ def initial_error_trials(options: ExperimentOptions) -> ExperimentResult:
     }
     cause = "the camera 0.30 m to the side and 0.20 m up, fitted"
     results: Results = {
-        key: with_cause(cause, one, scene_camera, fitted_camera) for key, one in statistics.items()
+        key: with_cause(cause, one, scene_camera, fitted_camera)
+        for key, one in statistics.items()
     }
     caption = "Stars matched, and the solutions' error, by the initial attitude's error; shaded where NPS succeeded."
     series = {"scene's camera": scene_camera, "0.30 m to the side": fitted_camera}
@@ -254,5 +265,6 @@ def draw(fig: Any, series_by_camera: dict[str, SolutionSeries]) -> None:
     above.set(ylabel="stars matched, mean", ylim=(-0.5, 9.5))
     fig.legend(loc="outside upper center", ncols=3)
     below.set(
-        ylabel="error of solutions (deg)", xlabel="error of the initial attitude, each angle (deg)"
+        ylabel="error of solutions (deg)",
+        xlabel="error of the initial attitude, each angle (deg)",
     )

@@ -67,7 +67,9 @@ def random_attitudes(count: int, rng: np.random.Generator) -> list[Rotation]:
     """Random lab_from_body: boresight (body z) uniform within MAX_TILT_DEG of the zenith, any roll."""
     tilt = np.arccos(rng.uniform(np.cos(np.radians(APL_MAX_TILT_DEG)), 1, count))
     first, last = rng.uniform(0, 2 * np.pi, (2, count))
-    return [Rotation.from_euler("ZYZ", angles) for angles in np.column_stack([first, tilt, last])]
+    return [
+        Rotation.from_euler("ZYZ", angles) for angles in np.column_stack([first, tilt, last])
+    ]
 
 
 def largest_discrepancies_arcsec(
@@ -125,7 +127,8 @@ def discrepancies_and_counts(options: ExperimentOptions) -> ExperimentResult:
     rng = random_stream(options.seed, 2005)
     lab = build_lab(loader.load("apl_dome_ideal"))
     scenes = [
-        shell_scene(0.004, int(seed)) for seed in rng.integers(2**31, size=options.trials(30, 5))
+        shell_scene(0.004, int(seed))
+        for seed in rng.integers(2**31, size=options.trials(30, 5))
     ]
     attitudes = random_attitudes(options.trials(60, 20), rng)
     large_offset = np.concatenate(
@@ -175,7 +178,9 @@ def draw_apl(fig: Any, worst_arcsec: Floats) -> None:
     rows = experiments()["apl"].rows
     offset_mm = 1e3 * np.array(OFFSETS_M)
     for n, name in enumerate(("ours, place not told", "ours, place told: the shell is left")):
-        axes.plot(offset_mm, worst_arcsec[:, n], color=INK[(0, 2)[n]], marker=MARKS[n], label=name)
+        axes.plot(
+            offset_mm, worst_arcsec[:, n], color=INK[(0, 2)[n]], marker=MARKS[n], label=name
+        )
     for key, position_mm in (("off_1mm", 1), ("off_50mm", 50)):
         published = rows[key].published
         label = f"stated: {published:g} arcsec at {position_mm} mm"
@@ -200,11 +205,19 @@ def draw_apl(fig: Any, worst_arcsec: Floats) -> None:
 NOISE_PX = 0.1
 STATED_LIGHTS = 20
 MANY_LIGHTS = 80
-SPACING_MM = {10: 30, 20: 22, 40: 15.5, 80: 11}  # by number of lights; slightly more are in view
+SPACING_MM = {
+    10: 30,
+    20: 22,
+    40: 15.5,
+    80: 11,
+}  # by number of lights; slightly more are in view
 ARCSEC_TICKS = (0.2, 0.5, 1, 2, 5, 10)
 OLED_MAX_TILT_DEG = 10.0
 CAP_DEG = 18.0
-MEASURED = {"led_sigma": "0.2 mm", "lever_sigma": "0.2 mm"}  # of a laser tracker or a measuring arm
+MEASURED = {
+    "led_sigma": "0.2 mm",
+    "lever_sigma": "0.2 mm",
+}  # of a laser tracker or a measuring arm
 # Left by `skysim survey`, docs/findings/dome.md.
 BY_FRAMES = {"led_sigma": "0.08 mm", "lever_sigma": "0.09 mm"}
 LEVEL_SIGMA_DEG = 0.005  # orientation error of the survey's axes
@@ -230,7 +243,8 @@ def build_setup(lights: int) -> TrialSetup:
     """AFIT's camera under its measured dome with randomly placed lights, of which at most `lights` are used."""
     layout = f'{{kind: poisson_disk, spacing: "{SPACING_MM[lights]} mm", cap_deg: {CAP_DEG}}}'
     scene = loader.load(
-        "afit_simsat_ideal", {"light.layout": layout, "tracker.centroid_sigma_px": str(NOISE_PX)}
+        "afit_simsat_ideal",
+        {"light.layout": layout, "tracker.centroid_sigma_px": str(NOISE_PX)},
     )
     lab = build_lab(scene)
     trial = CentroidTrial(
@@ -297,12 +311,11 @@ def noise_and_absolute_error(options: ExperimentOptions) -> ExperimentResult:
         "across": RowResult(few.cross_boresight, cause=Cause(cause, many.cross_boresight)),
         "roll": RowResult(few.roll, cause=Cause(cause, many.roll)),
         "absolute": RowResult(
-            measured, cause=Cause("LED positions surveyed with the camera's own frames", by_frames)
+            measured,
+            cause=Cause("LED positions surveyed with the camera's own frames", by_frames),
         ),
     }
-    caption = (
-        "Noise-equivalent angle by the number of lights in the field; dashed the published bounds."
-    )
+    caption = "Noise-equivalent angle by the number of lights in the field; dashed the published bounds."
     return ExperimentResult(
         results, (FigureDrawing(caption, lambda fig: draw_oled(fig, errors_by_lights)),)
     )
@@ -331,7 +344,9 @@ def draw_oled(fig: Any, errors_by_lights: dict[int, AttitudeErrors]) -> None:
         coefficient = np.exp(np.mean(np.log(value * np.sqrt(lights))))
         axes.plot(lights, coefficient / np.sqrt(lights), color=INK[n], lw=0.8)
         axes.axhline(rows[key].at_most, color=INK[n], ls="--", label=f"published bound, {name}")
-    axes.set(xscale="log", yscale="log", xlabel="lights in the field", ylabel="error, rms (arcsec)")
+    axes.set(
+        xscale="log", yscale="log", xlabel="lights in the field", ylabel="error, rms (arcsec)"
+    )
     axes.set_xticks(lights, [str(count) for count in lights])
     axes.set_yticks(ARCSEC_TICKS, [f"{tick:g}" for tick in ARCSEC_TICKS])
     axes.minorticks_off()

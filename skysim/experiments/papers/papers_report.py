@@ -23,7 +23,11 @@ from skysim.results.report_blocks import (
 )
 
 KINDS = (*VERDICTS, "derived", "open")
-TONES: dict[compare.Verdict, Tone] = {"agrees": "good", "explained": "warning", "disagrees": "bad"}
+TONES: dict[compare.Verdict, Tone] = {
+    "agrees": "good",
+    "explained": "warning",
+    "disagrees": "bad",
+}
 INTRODUCTION = (
     "All experiments with published numbers, repeated with our simulator and estimator: the published number, ours with"
     " its 95 % interval, and a verdict. Seed {seed}{quick}. The published numbers with their sources and tolerances are"
@@ -50,7 +54,9 @@ def papers_report(
         Items(MEANINGS),
         Section("Experiments", [contents(reproductions)]),
         *(
-            Section(paper, [section(one) for one in reproductions if one.published.paper == paper])
+            Section(
+                paper, [section(one) for one in reproductions if one.published.paper == paper]
+            )
             for paper in papers
         ),
     ]
@@ -86,7 +92,9 @@ def contents(reproductions: Sequence[Reproduction]) -> Table:
             Cell(str(count), "bad" if kind == "disagrees" and count else "")
             for kind, count in one.counts.items()
         ]
-        rows.append([Cell(one.id, link=f"#{one.id}"), one.published.title, *counts, one.seconds])
+        rows.append(
+            [Cell(one.id, link=f"#{one.id}"), one.published.title, *counts, one.seconds]
+        )
     total = [
         "all",
         "",
@@ -124,5 +132,7 @@ def comparison_table(comparisons: Sequence[Comparison]) -> Table:
     rows = []
     for one in comparisons:
         numbers = [compare.format_with_source(one.row), compare.format_summary(one.result.ours)]
-        rows.append([one.row.quantity, *numbers, Cell(one.verdict, TONES[one.verdict]), one.note])
+        rows.append(
+            [one.row.quantity, *numbers, Cell(one.verdict, TONES[one.verdict]), one.note]
+        )
     return Table(columns, rows)

@@ -71,7 +71,9 @@ def itrs_from_icrs(local: datetime.datetime) -> Rotation:
     """The Earth's attitude: precession, nutation and rotation (SOFA's c2t06a); polar motion is neglected."""
     utc = local + UTC_LESS_LOCAL
     ut1_days = utc_days(utc) + UT1_LESS_UTC_S / DAY_S
-    return Rotation.from_matrix(erfa.c2t06a(J2000_JD, tt_days(utc), J2000_JD, ut1_days, 0.0, 0.0))
+    return Rotation.from_matrix(
+        erfa.c2t06a(J2000_JD, tt_days(utc), J2000_JD, ut1_days, 0.0, 0.0)
+    )
 
 
 def cam_from_itrs() -> Rotation:
@@ -114,7 +116,11 @@ class FrameSolutions(NamedTuple):
     @property
     def errors_arcsec(self) -> Floats:
         """(M, 3) errors of the solved frames minus their mean: RA times cos(dec), declination, roll."""
-        error_deg = (self.estimated_deg - self.true_deg) * [np.cos(np.radians(TABLE_2[0, 1])), 1, 1]
+        error_deg = (self.estimated_deg - self.true_deg) * [
+            np.cos(np.radians(TABLE_2[0, 1])),
+            1,
+            1,
+        ]
         error_deg = error_deg[np.isfinite(error_deg[:, 0])] * 3600
         return error_deg - error_deg.mean(axis=0)
 
@@ -190,7 +196,9 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
     zenith_deg = zenith_distance_deg(calibrated.estimated_deg[0])
     results["zenith"] = extremum(np.array([zenith_deg]), np.max)
     # Least-squares slope of the right ascension, with the 95 % interval from its residuals.
-    slope, covariance = np.polyfit(calibrated.minutes, calibrated.estimated_deg[:, 0], 1, cov=True)
+    slope, covariance = np.polyfit(
+        calibrated.minutes, calibrated.estimated_deg[:, 0], 1, cov=True
+    )
     rate = symmetric_interval(slope[0], 1.96 * np.sqrt(covariance[0, 0]), len(local))
     results["rate"] = results["rate_fit"] = rate
     results |= scatter_results(calibrated, uncalibrated)
@@ -210,7 +218,9 @@ def scatter_results(calibrated: FrameSolutions, uncalibrated: list[FrameSolution
             [sample_std(solutions.errors_arcsec[:, axis]) for solutions in uncalibrated]
         )
         ours = bootstrap_interval(calibrated.errors_arcsec[:, axis], sample_std)
-        results[f"{angle}_sd"] = RowResult(ours, cause=Cause(name, bootstrap_interval(stds, rms)))
+        results[f"{angle}_sd"] = RowResult(
+            ours, cause=Cause(name, bootstrap_interval(stds, rms))
+        )
     norms, *uncalibrated_norms = (
         np.linalg.norm(one.errors_arcsec, axis=1) for one in (calibrated, *uncalibrated)
     )
@@ -230,7 +240,9 @@ def zenith_distance_deg(angles_deg: Floats) -> float:
             np.sin(latitude),
         ]
     )
-    boresight = stars.cam_from_icrs(angles_deg[0], angles_deg[1], 0.0).inv().apply([0.0, 0.0, 1.0])
+    boresight = (
+        stars.cam_from_icrs(angles_deg[0], angles_deg[1], 0.0).inv().apply([0.0, 0.0, 1.0])
+    )
     return float(np.degrees(np.arccos(itrs_from_icrs(LOCAL_TIMES[0]).apply(boresight) @ up)))
 
 
@@ -255,7 +267,9 @@ def draw_rate(fig: Any, calibrated: FrameSolutions) -> None:
     axes.plot(
         calibrated.minutes, calibrated.estimated_deg[:, 0], MARKS[0], color=INK[0], label="ours"
     )
-    axes.plot(calibrated.minutes[:4], TABLE_2[:, 0], "*", ms=11, color=INK[1], label="published")
+    axes.plot(
+        calibrated.minutes[:4], TABLE_2[:, 0], "*", ms=11, color=INK[1], label="published"
+    )
     time_range = np.array([0, calibrated.minutes.max()])
     published_rate = experiments()["ptase-table-2"].rows["rate"].published or 0.0
     sidereal_deg = calibrated.estimated_deg[0, 0] + published_rate * time_range
@@ -264,15 +278,21 @@ def draw_rate(fig: Any, calibrated: FrameSolutions) -> None:
     axes.legend()
 
 
-def draw_errors(fig: Any, calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]) -> None:
+def draw_errors(
+    fig: Any, calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]
+) -> None:
     panels = fig.subplots(3, 1, sharex=True)
     minutes = calibrated.minutes[:4]
     published = (TABLE_2 - TABLE_2.mean(axis=0)) * 3600
     published[:, 0] -= 0.250684 * (minutes - minutes.mean()) * 3600
     published[:, 0] *= np.cos(np.radians(TABLE_2[0, 1]))
-    for axis, (axes, name) in enumerate(zip(panels, ("RA cos(dec)", "dec", "roll"), strict=True)):
+    for axis, (axes, name) in enumerate(
+        zip(panels, ("RA cos(dec)", "dec", "roll"), strict=True)
+    ):
         for solutions in (*uncalibrated, calibrated):
-            style = (MARKS[0], INK[0], 4.5) if solutions is calibrated else (MARKS[1], INK[2], 2.5)
+            style = (
+                (MARKS[0], INK[0], 4.5) if solutions is calibrated else (MARKS[1], INK[2], 2.5)
+            )
             solved = solutions.minutes[np.isfinite(solutions.error_rad)]
             axes.plot(
                 solved, solutions.errors_arcsec[:, axis], style[0], color=style[1], ms=style[2]

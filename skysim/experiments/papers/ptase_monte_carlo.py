@@ -47,7 +47,9 @@ from skysim.results.plots import INK, MARKS
 HALF_FIELD_TAN = float(np.tan(np.radians(10)))
 SIGMA_RAD = 3 * ARCSEC_RAD
 SIGMA_MAG = 0.25
-TOLERANCE_RAD = 5 * SIGMA_RAD  # one star in 3e5 is outside; failures are due to the magnitude gate
+TOLERANCE_RAD = (
+    5 * SIGMA_RAD
+)  # one star in 3e5 is outside; failures are due to the magnitude gate
 DIAGONAL_RAD = 2 * np.arctan(np.sqrt(2) * HALF_FIELD_TAN)
 DOUBLES_RAD = 30 * ARCSEC_RAD
 FITTED_LIMIT_MAG = 5.1
@@ -196,7 +198,9 @@ class VersionRuns(NamedTuple):
     right: RunErrors
 
 
-def run_version(index: PairIndex, parameters: FialhoOptions, runs: int, seed: int) -> VersionRuns:
+def run_version(
+    index: PairIndex, parameters: FialhoOptions, runs: int, seed: int
+) -> VersionRuns:
     """Simulate and count. As in the paper, a wrong solution counts as solved."""
     true, estimated, _ = simulate(index, parameters, runs, seed)
     is_solved = np.isfinite(estimated[:, 0, 0])
@@ -218,15 +222,20 @@ def table_1(options: ExperimentOptions) -> ExperimentResult:
         by_version[name] = run_version(index, version(name), runs, int(seed))
         options.watch(n + 1, len(VERSIONS) + 1)
     wider_parameters = version("fialho_2")._replace(gate_mag=FITTED_GATE_SIGMAS * SIGMA_MAG)
-    wider_gate = run_version(index, wider_parameters, options.trials(10_000, 1000), int(seeds[-1]))
+    wider_gate = run_version(
+        index, wider_parameters, options.trials(10_000, 1000), int(seeds[-1])
+    )
     cause = Cause(
-        f"a gate for magnitudes of {FITTED_GATE_SIGMAS} sigma, fitted", success_percent(wider_gate)
+        f"a gate for magnitudes of {FITTED_GATE_SIGMAS} sigma, fitted",
+        success_percent(wider_gate),
     )
     results: Results = {}
     for name, runs_of_version in by_version.items():
         number = name[-1]
         success = success_percent(runs_of_version)
-        results[f"success_{number}"] = RowResult(success, cause=cause if number in "12" else None)
+        results[f"success_{number}"] = RowResult(
+            success, cause=cause if number in "12" else None
+        )
         for statistic, values in runs_of_version.right._asdict().items():
             results[f"{statistic}_{number}"] = bootstrap_interval(values, np.mean)
     versions = by_version.values()
@@ -244,7 +253,9 @@ def success_percent(runs_of_version: VersionRuns) -> Summary:
 
 def scatter(runs_of_version: VersionRuns) -> Results:
     """Standard deviation of a simulation's mean over 1000 runs: that of one run divided by sqrt(1000)."""
-    values = {name: getattr(runs_of_version.right, name) for name in ("attitude", "roll", "axis")}
+    values = {
+        name: getattr(runs_of_version.right, name) for name in ("attitude", "roll", "axis")
+    }
     values["success"] = np.where(
         np.arange(runs_of_version.runs) < runs_of_version.solved, 100.0, 0.0
     )
@@ -253,7 +264,8 @@ def scatter(runs_of_version: VersionRuns) -> Results:
         return sample_std(samples, axis) / np.sqrt(SIMULATION_RUNS)
 
     return {
-        f"{name}_sd": bootstrap_interval(samples, std_of_mean) for name, samples in values.items()
+        f"{name}_sd": bootstrap_interval(samples, std_of_mean)
+        for name, samples in values.items()
     }
 
 
@@ -282,7 +294,8 @@ def draw_histogram(fig: Any, right: RunErrors) -> None:
     published = experiments()["ptase-table-1"].rows["attitude_2"].published
     axes.axvline(published, color=INK[1], ls="--", label=f"published mean {published:.2f}")
     axes.set(
-        xlabel="attitude error |M true - M est| (arcsec; the last bin is all beyond)", ylabel="runs"
+        xlabel="attitude error |M true - M est| (arcsec; the last bin is all beyond)",
+        ylabel="runs",
     )
     axes.legend()
 
@@ -296,7 +309,9 @@ def draw_simulations(fig: Any, by_version: dict[str, VersionRuns]) -> None:
             [batch.mean() for batch in np.array_split(values, batches)]
             for values in (runs_of_version.right.roll, runs_of_version.right.attitude)
         ]
-        axes.plot(*means, MARKS[n], color=INK[(0, 2, 3, 4)[n]], alpha=0.7, label=f"ours, {name}")
+        axes.plot(
+            *means, MARKS[n], color=INK[(0, 2, 3, 4)[n]], alpha=0.7, label=f"ours, {name}"
+        )
     axes.plot(TABLE_1[:, 2], TABLE_1[:, 1], "*", color=INK[1], ms=9, label="published")
     axes.set(xlabel="mean roll error (arcsec)", ylabel="mean |M true - M est| (arcsec)")
     axes.legend()

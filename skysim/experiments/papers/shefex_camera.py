@@ -50,14 +50,20 @@ def scan_times(options: ExperimentOptions) -> ExperimentResult:
     frames = render_frames(exposure_override(50), 0.0, options.trials(60, 8), options.seed)
     images = [frame.image_dn for _, frame, _ in frames]
     times_s = np.array(
-        [[scan_time_s(scan, image) for scan in (sequential_scan, maximum_scan)] for image in images]
+        [
+            [scan_time_s(scan, image) for scan in (sequential_scan, maximum_scan)]
+            for image in images
+        ]
     )
     table, all_objects = (
-        [count_common(image, limit) for image in images] for limit in (MAX_CENTROIDS, MAX_OBJECTS)
+        [count_common(image, limit) for image in images]
+        for limit in (MAX_CENTROIDS, MAX_OBJECTS)
     )
     passes = np.array([min(objects + 1, MAX_CENTROIDS) for objects, _ in table])
     median_ms = 1e3 * np.median(times_s, axis=0)
-    times_note = f"ours: {median_ms[0]:.2f} and {median_ms[1]:.2f} ms, {passes.mean():.1f} passes"
+    times_note = (
+        f"ours: {median_ms[0]:.2f} and {median_ms[1]:.2f} ms, {passes.mean():.1f} passes"
+    )
     overlap = np.mean([overlap for _, overlap in table])
     overlap_note = f"overlap of the {MAX_CENTROIDS} with most light and of those with the highest peak: {overlap:.2f}"
     results: Results = {
@@ -71,7 +77,8 @@ def scan_times(options: ExperimentOptions) -> ExperimentResult:
         ),
     }
     return ExperimentResult(
-        results, (FigureDrawing("Fig. 3: time of the two scans.", partial(draw_scans, times_s)),)
+        results,
+        (FigureDrawing("Fig. 3: time of the two scans.", partial(draw_scans, times_s)),),
     )
 
 
@@ -96,7 +103,9 @@ def count_common(image: NDArray[Any], limit: int) -> tuple[int, float]:
     boxes = [
         {
             tuple(box)
-            for box in DETECTORS[name](image, THRESHOLD_SIGMA, MIN_AREA_PX, limit).box_px.tolist()
+            for box in DETECTORS[name](
+                image, THRESHOLD_SIGMA, MIN_AREA_PX, limit
+            ).box_px.tolist()
         }
         for name in ("maximum", "sequential")
     ]
@@ -252,7 +261,10 @@ def exposure_control(options: ExperimentOptions) -> ExperimentResult:
         ),
         "space": bootstrap_of_means(space_and_ground_ms, lambda m: m[..., 0] / m[..., 1]),
     }
-    for name, values in changes_ms.items():  # the mean, with minimum and maximum as the interval
+    for (
+        name,
+        values,
+    ) in changes_ms.items():  # the mean, with minimum and maximum as the interval
         results[name] = Summary(
             float(values.mean()), float(values.min()), float(values.max()), len(values)
         )
@@ -276,17 +288,26 @@ def draw_control(lab_from_body: Rotation, fig: Any) -> None:
     """Exposure against frames for a sequence of disturbances (SEQUENCE), for the scene's 12 bits and for 8 bits."""
     axes = fig.subplots()
     boundaries = np.cumsum([0, *(frames for _, frames, _ in SEQUENCE)])
-    for n, (name, label) in enumerate((("ground", "ours, 12 bits"), ("8 bits", "ours, 8 bits"))):
+    for n, (name, label) in enumerate(
+        (("ground", "ours, 12 bits"), ("8 bits", "ours, 8 bits"))
+    ):
         loop = ExposureLoop(CAMERAS[name], lab_from_body)
         commanded_ms = [10.0]
         for _, frames, disturbance in SEQUENCE:
             commanded_ms += exposures_ms(loop, frames, **disturbance)
         axes.plot(commanded_ms, color=INK[2 * n], marker=MARKS[n], ms=3, label=label)
-    axes.axhspan(35, 50, color=PUBLISHED, alpha=0.12, lw=0, label="published: good working range")
+    axes.axhspan(
+        35, 50, color=PUBLISHED, alpha=0.12, lw=0, label="published: good working range"
+    )
     for begin, end, (title, _, _) in zip(boundaries, boundaries[1:], SEQUENCE, strict=False):
         axes.axvline(end, color="#888888", lw=0.6)
         axes.text(
-            (begin + end) / 2, 53.5, title.replace(" ", "\n"), ha="center", va="center", fontsize=8
+            (begin + end) / 2,
+            53.5,
+            title.replace(" ", "\n"),
+            ha="center",
+            va="center",
+            fontsize=8,
         )
     axes.set(xlabel="frame", ylabel="exposure (ms)", ylim=(0, 57), xlim=(0, boundaries[-1]))
     fig.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)

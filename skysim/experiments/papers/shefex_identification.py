@@ -15,7 +15,12 @@ import numpy as np
 
 from estimator.catalog import pair_index
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
-from estimator.identification.published.shefex import FOURTH_STAR, angle_interval, cos_error, search
+from estimator.identification.published.shefex import (
+    FOURTH_STAR,
+    angle_interval,
+    cos_error,
+    search,
+)
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.papers.compare import (
@@ -54,7 +59,9 @@ ERRORS_PX = np.array([0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0])
 LIMIT_INDEX = 3  # index of 0.45 px
 LIMIT_DEG = 0.1
 EQ3_FACTOR = 2.47  # c of eq. 3 that gives the chosen cosError for 0.2 px
-WRONG_RAD = np.radians(1.0)  # a larger error is a false identification, not an inaccurate attitude
+WRONG_RAD = np.radians(
+    1.0
+)  # a larger error is a false identification, not an inaccurate attitude
 
 
 class Identification(NamedTuple):
@@ -147,7 +154,12 @@ def compute_curves(options: ExperimentOptions) -> Curves:
         """Work, right, wrong and errors of all attitudes at one point of a curve."""
         results = [
             identify(
-                field, centroid_px, cosine_error, spikes, accept, random_stream(options.seed, 1, n)
+                field,
+                centroid_px,
+                cosine_error,
+                spikes,
+                accept,
+                random_stream(options.seed, 1, n),
             )
             for n, field in enumerate(fields)
         ]
@@ -163,7 +175,15 @@ def compute_curves(options: ExperimentOptions) -> Curves:
     wrong_significant = [results_at(0.2, CHOSEN_COS_ERROR, n, significant)[2] for n in SPIKES]
     error_deg = [results_at(px, eq3_cos_error(px, EQ3_FACTOR))[3] for px in ERRORS_PX]
     has_four_stars = [len(field.xy_px) >= 4 for field in fields]
-    columns = (work, right, right_significant, wrong, wrong_significant, error_deg, has_four_stars)
+    columns = (
+        work,
+        right,
+        right_significant,
+        wrong,
+        wrong_significant,
+        error_deg,
+        has_four_stars,
+    )
     return Curves(*map(np.array, columns))
 
 
@@ -193,7 +213,8 @@ def figs_7_to_10(options: ExperimentOptions) -> ExperimentResult:
             partial(draw_wrong, curves),
         ),
         FigureDrawing(
-            "Fig. 10: attitude error against the centroid error.", partial(draw_attitude, curves)
+            "Fig. 10: attitude error against the centroid error.",
+            partial(draw_attitude, curves),
         ),
     )
     return ExperimentResult(results, drawings)
@@ -201,9 +222,12 @@ def figs_7_to_10(options: ExperimentOptions) -> ExperimentResult:
 
 def time_results(curves: Curves) -> Results:
     """Fig. 7: the ends of the curves relative to their minimum, and how far the minimum moves with centroid error."""
-    low = [bootstrap_of_means(work.T, lambda m: m[..., 0] / m.min(axis=-1)) for work in curves.work]
+    low = [
+        bootstrap_of_means(work.T, lambda m: m[..., 0] / m.min(axis=-1)) for work in curves.work
+    ]
     high = [
-        bootstrap_of_means(work.T, lambda m: m[..., -1] / m.min(axis=-1)) for work in curves.work
+        bootstrap_of_means(work.T, lambda m: m[..., -1] / m.min(axis=-1))
+        for work in curves.work
     ]
 
     def moved(means: Floats) -> Floats:
@@ -239,9 +263,7 @@ def wrong_results(curves: Curves) -> Results:
     by_cos_error = curves.wrong[-1, -1] - curves.wrong[-1, 0]
     chosen = SPIKE_COS_ERRORS.index(CHOSEN_COS_ERROR)
     wrong_by_our_rule = int(curves.wrong_significant.sum())
-    note = (
-        f"our rule, which requires significance: {wrong_by_our_rule} wrong at any number of spikes"
-    )
+    note = f"our rule, which requires significance: {wrong_by_our_rule} wrong at any number of spikes"
     return {
         "wrong_spikes": RowResult(bootstrap_of_mean(by_spikes), note),
         "wrong_cos_error": bootstrap_of_mean(by_cos_error),
@@ -317,7 +339,9 @@ def count_triangles(rng: np.random.Generator) -> int:
     """Number of base triangles that a search tests for 15 spikes."""
     camera = onboard_model.calibration(shefex_lab().scene.camera)
     counters = np.zeros(3, np.int64)
-    rays = camera.rays(rng.random((MAX_CENTROIDS, 2)) * [camera.width_px, camera.height_px] - 0.5)
+    rays = camera.rays(
+        rng.random((MAX_CENTROIDS, 2)) * [camera.width_px, camera.height_px] - 0.5
+    )
     search_limits = search_options(pairs(), CHOSEN_COS_ERROR, MAX_CENTROIDS, -np.inf)
     search(rays, pairs(), search_limits, counters)
     return int(counters[2])
@@ -362,7 +386,11 @@ def draw_success(curves: Curves, fig: Any) -> None:
     axes = fig.subplots()
     for n, centroid_px in enumerate(CENTROID_PX):
         plot_curve(
-            axes, COS_ERRORS, fractions(curves.right[n]), n, f"ours, fourth star, {centroid_px} px"
+            axes,
+            COS_ERRORS,
+            fractions(curves.right[n]),
+            n,
+            f"ours, fourth star, {centroid_px} px",
         )
     plot_curve(
         axes, COS_ERRORS, fractions(curves.right_significant), 4, "ours, beyond chance, 0.2 px"

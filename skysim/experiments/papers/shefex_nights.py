@@ -63,7 +63,9 @@ EXPOSURE_S = 0.05
 
 def optics_results(options: ExperimentOptions) -> Results:
     """Answers that need no night-sky frames."""
-    horizontal, vertical, diagonal = field_deg(onboard_model.calibration(shefex_lab().scene.camera))
+    horizontal, vertical, diagonal = field_deg(
+        onboard_model.calibration(shefex_lab().scene.camera)
+    )
     absorbed = star_image(ground_lab(), 0.05).sum() / star_image(shefex_lab(), 0.035).sum()
     results: Results = {
         "field_h": exact(horizontal),
@@ -125,7 +127,12 @@ def star_image(
     image = np.zeros(lab.camera.canvas.shape)
     trajectory = Trajectory(t_s, path, np.tile(rate_body, (len(t_s), 1)))
     render(
-        image, brightest, lab.camera.optics, trajectory, lab.camera.mount, Window(0.0, exposure_s)
+        image,
+        brightest,
+        lab.camera.optics,
+        trajectory,
+        lab.camera.mount,
+        Window(0.0, exposure_s),
     )
     return image
 
@@ -142,7 +149,8 @@ def variance_px2(image: Floats) -> Floats:
 def smear_px(rate_deg_s: float) -> float:
     """Length L of a streak in pixels: smear along a line adds L^2 / 12 to the variance of the star at rest."""
     moving, at_rest = (
-        variance_px2(star_image(shefex_lab(), EXPOSURE_S, rate))[0] for rate in (rate_deg_s, 0.0)
+        variance_px2(star_image(shefex_lab(), EXPOSURE_S, rate))[0]
+        for rate in (rate_deg_s, 0.0)
     )
     return math.sqrt(12 * (moving - at_rest))
 
@@ -200,10 +208,12 @@ def calibrated_focal_mm(options: ExperimentOptions) -> tuple[Summary, str]:
     settings = Settings(gain_e_dn=detector.gain_e_dn, saturation=saturation_dn(detector))
     first_seed = 1_000_000 * options.seed
     rendered = (
-        trials.render_trial_frame(setup, first_seed + n)[0] for n in range(options.trials(40, 8))
+        trials.render_trial_frame(setup, first_seed + n)[0]
+        for n in range(options.trials(40, 8))
     )
     frames = [
-        detect_and_centroid(frame.image_dn, nominal_camera, settings, Clock()) for frame in rendered
+        detect_and_centroid(frame.image_dn, nominal_camera, settings, Clock())
+        for frame in rendered
     ]
 
     def tracker(camera: Camera, uncertainty: float) -> StarTracker:
@@ -276,7 +286,9 @@ def render_frames(
     while rendered < count:
         trial_seed += 1
         lab_from_body = trials.random_attitude(setup, trials.streams(setup, trial_seed)[0])
-        boresight = (lab_from_body * lab.camera.mount.cam_from_body.inv()).apply([[0.0, 0.0, 1.0]])
+        boresight = (lab_from_body * lab.camera.mount.cam_from_body.inv()).apply(
+            [[0.0, 0.0, 1.0]]
+        )
         if background.angular_separation_deg(boresight, moon_direction)[0] < FROM_MOON_DEG:
             continue
         frame, truth, _ = trials.render_trial_frame(setup, trial_seed)
@@ -291,7 +303,9 @@ def process_frames(
     rows = []
     for setup, frame, truth in render_frames(overrides, rate_deg_s, count, seed):
         paper, low_threshold = (
-            processing_chain(CATALOG, sigma, setup.lab.scene.camera.focal_px).solve(frame.image_dn)
+            processing_chain(CATALOG, sigma, setup.lab.scene.camera.focal_px).solve(
+                frame.image_dn
+            )
             for sigma in (SIGMA, LOW_SIGMA)
         )
         ours = factory.solve_frame(setup.estimator, frame).attitude
@@ -312,7 +326,9 @@ def is_right(cam_from_ref: Rotation | None, truth: Truth) -> bool:
 
 def night_results(options: ExperimentOptions) -> ExperimentResult:
     """Success rates at rest (35 to 50 ms, in space), against the rate, and out of focus; and the camera's optics."""
-    rates, space_rates = (QUICK_RATES, QUICK_RATES[:1]) if options.quick else (RATES, SPACE_RATES)
+    rates, space_rates = (
+        (QUICK_RATES, QUICK_RATES[:1]) if options.quick else (RATES, SPACE_RATES)
+    )
     space = exposure_override(50)
     ground = FULL_MOON | space
     conditions: dict[str, tuple[dict[str, str], float]] = {
@@ -329,7 +345,9 @@ def night_results(options: ExperimentOptions) -> ExperimentResult:
         results[key] = process_frames(overrides, rate, options.trials(150, 10), options.seed)
         options.watch(len(results), len(conditions))
     drawings = (
-        FigureDrawing("Frames identified against the turning rate.", partial(draw_rates, results)),
+        FigureDrawing(
+            "Frames identified against the turning rate.", partial(draw_rates, results)
+        ),
         FigureDrawing(
             "Fig. 11: a frame of 40 ms, its centroids and those identified.",
             partial(draw_frame, options.seed),
@@ -388,12 +406,17 @@ def draw_rates(results: dict[str, NightResults], fig: Any) -> None:
         successes = [result.success for result in by_rate.values()]
         plot_curve(axes, list(by_rate), successes, n, f"{label}, the paper's chain")
         if n == 0:
-            ours = [proportion(result.ours.sum(), len(result.ours)) for result in by_rate.values()]
+            ours = [
+                proportion(result.ours.sum(), len(result.ours)) for result in by_rate.values()
+            ]
             plot_curve(axes, list(by_rate), ours, 2, f"{label}, our default chain")
     axes.axvspan(0, 2, color=PUBLISHED, alpha=0.25, lw=0, label="published: mostly identified")
     axes.axvspan(4, 8, color=PUBLISHED, alpha=0.1, lw=0, label="published: rarely identified")
     axes.set(
-        xlabel="turning rate (deg/s)", ylabel="frames identified", ylim=(0, 1.03), xlim=(-0.1, 8.1)
+        xlabel="turning rate (deg/s)",
+        ylabel="frames identified",
+        ylim=(0, 1.03),
+        xlim=(-0.1, 8.1),
     )
     axes.legend(fontsize=8)
 

@@ -139,7 +139,9 @@ def search_options(
     """SearchOptions of the paper's identifier for a number of lights, without a limit on its work."""
     # The angular tolerance that corresponds to cosError at the index's largest angle (inverse of eq. 3).
     max_angle_rad = index.max_angle_rad
-    tolerance_rad = float(max_angle_rad - np.arccos(min(np.cos(max_angle_rad) + cos_error, 1.0)))
+    tolerance_rad = float(
+        max_angle_rad - np.arccos(min(np.cos(max_angle_rad) + cos_error, 1.0))
+    )
     return ShefexOptions(
         cos_error, tolerance_rad, UNLIMITED, UNLIMITED, lights, accept_log10_chance
     )
@@ -177,7 +179,9 @@ def random_fields(count: int, seed: int) -> list[StarField]:
     for lab_from_body in Rotation.random(count, rng=random_stream(seed, 0)):
         xy_px, electrons = detections.visible_sources(lab, lab_from_body)
         order = np.argsort(-electrons, kind="stable")
-        result.append(StarField(xy_px[order], lab.camera.mount.cam_from_body * lab_from_body.inv()))
+        result.append(
+            StarField(xy_px[order], lab.camera.mount.cam_from_body * lab_from_body.inv())
+        )
     return result
 
 
@@ -215,7 +219,9 @@ def catalog_statistics(options: ExperimentOptions) -> ExperimentResult:
     faint = [count_between(one, 5.2, 5.4) for one in (asymmetric, chosen)]
     pool = stars().take(stars().v_mag <= FAINTEST_MAG)
     uniform_with_all_bright = published_catalogs.uniform(pool, len(uniform), BRIGHT_LIMIT_MAG)
-    uniform_faint = [count_between(one, 5.25, 5.75) for one in (uniform, uniform_with_all_bright)]
+    uniform_faint = [
+        count_between(one, 5.25, 5.75) for one in (uniform, uniform_with_all_bright)
+    ]
     results: Results = {
         "asymmetric_faint": with_cause("the thinning of the chosen catalog", exact, *faint),
         "asymmetric_faintest": exact(asymmetric.v_mag.max()),
@@ -297,7 +303,9 @@ def draw_counts(counts: Floats, fig: Any) -> None:
     edges = np.arange(-0.5, counts.max() + 1)
     for n, name in enumerate(("asymmetric", "uniform")):
         fraction, _ = np.histogram(counts[:, n], edges, density=True)
-        axes.step(edges[:-1] + 0.5, fraction, where="mid", color=INK[n * 2], label=f"ours, {name}")
+        axes.step(
+            edges[:-1] + 0.5, fraction, where="mid", color=INK[n * 2], label=f"ours, {name}"
+        )
     axes.axvline(MIN_STARS - 0.5, color=PUBLISHED, ls="--", label="published: four are needed")
     axes.set(xlabel="stars in the field", ylabel="share of the fields")
     axes.legend()

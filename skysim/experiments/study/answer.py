@@ -165,7 +165,9 @@ def headline(
 
 def answered(lines: Sequence[PointRow]) -> list[PointRow]:
     """The points of which a trial has an answer."""
-    return [line for line in lines if line.trials and np.isfinite(line.responses["wrong"].value)]
+    return [
+        line for line in lines if line.trials and np.isfinite(line.responses["wrong"].value)
+    ]
 
 
 def verdict(study: Study, lines: Sequence[PointRow]) -> str:
@@ -184,13 +186,19 @@ def verdict(study: Study, lines: Sequence[PointRow]) -> str:
             "refused", f"Every {frame} is solved", f"of the {frame}s are refused", done, place
         ),
         worst_share(
-            "wrong", "No attitude is wrong", f"of the {frame}s give a wrong attitude", done, place
+            "wrong",
+            "No attitude is wrong",
+            f"of the {frame}s give a wrong attitude",
+            done,
+            place,
         ),
     ]
     return " ".join(sentence[:1].upper() + sentence[1:] for sentence in sentences if sentence)
 
 
-def worst_share(name: str, never: str, text: str, lines: Sequence[PointRow], place: Place) -> str:
+def worst_share(
+    name: str, never: str, text: str, lines: Sequence[PointRow], place: Place
+) -> str:
     """ "No attitude is wrong (in 12,000).", or the share at the point where it is largest."""
     worst = max(lines, key=lambda line: np.nan_to_num(line.responses[name].value))
     share = worst.responses[name]
@@ -218,7 +226,9 @@ def placer(study: Study, lines: Sequence[PointRow]) -> Place:
     units = {name: unit_of(axis(study, lines, name)) for name in varied}
 
     def named(name: str, level: Value) -> str:
-        return f"{name} = {format_level(level)}" + ("" if isinstance(level, str) else units[name])
+        return f"{name} = {format_level(level)}" + (
+            "" if isinstance(level, str) else units[name]
+        )
 
     return lambda line: ", ".join(named(name, line.levels[name]) for name in varied)
 
@@ -310,7 +320,8 @@ def one_unit(fixed: Sequence[str]) -> list[str]:
     if not fixed:
         return []
     units = " and ".join(
-        "one survey" if seed.startswith("tracker.") else "one draw of the LEDs" for seed in fixed
+        "one survey" if seed.startswith("tracker.") else "one draw of the LEDs"
+        for seed in fixed
     )
     return [
         f"Intervals cover other attitudes, with {units}: `hardware: [{', '.join(fixed)}]` in the study draws"

@@ -42,7 +42,11 @@ def join_quantity(number: float, unit: str) -> Value:
     """The inverse of `split_quantity`; integral numbers become int."""
     if unit:
         return f"{number:.12g} {unit}"
-    return int(number) if number == int(number) and abs(number) < 2**53 else float(f"{number:.12g}")
+    return (
+        int(number)
+        if number == int(number) and abs(number) < 2**53
+        else float(f"{number:.12g}")
+    )
 
 
 def option_at(factor: Levels | Values, u: float) -> tuple[Value, Settings]:
@@ -163,13 +167,18 @@ class Distribution(KeyedFactor):
 
     def parameters(self) -> tuple[list[float], str]:
         """The parameters in the order of PARAMETERS, and their unit. Raises InputError."""
-        quantities = [split_quantity(getattr(self, name)) for name in PARAMETERS[self.distribution]]
+        quantities = [
+            split_quantity(getattr(self, name)) for name in PARAMETERS[self.distribution]
+        ]
         units = {
-            unit for _, unit in (quantities[:1] if self.distribution == "lognormal" else quantities)
+            unit
+            for _, unit in (quantities[:1] if self.distribution == "lognormal" else quantities)
         }
         if len(units) > 1:
             raise InputError(
-                "", f"different units {', '.join(repr(unit) for unit in sorted(units))}", "one unit"
+                "",
+                f"different units {', '.join(repr(unit) for unit in sorted(units))}",
+                "one unit",
             )
         parameters = [number for number, _ in quantities]
         if self.sigma is not None and parameters[1] <= 0:
@@ -217,7 +226,9 @@ QUANTILES: dict[str, Callable[..., Any]] = {
 def kind_of(value: Any) -> str:
     """Tag of the kind of factor, from its keys, so that error messages name the keys of that kind only."""
     keys = value if isinstance(value, dict) else getattr(value, "__dict__", {})
-    return next((name for name in ("levels", "values", "distribution") if name in keys), "range")
+    return next(
+        (name for name in ("levels", "values", "distribution") if name in keys), "range"
+    )
 
 
 Factor = Annotated[
@@ -273,7 +284,9 @@ def points(design: Design, factors: Factors, seed: int) -> list[Point]:
         and design.points is not None
         and design.points & (design.points - 1)
     ):
-        raise InputError("design.points", f"{design.points} for {design.kind}", "a power of two")
+        raise InputError(
+            "design.points", f"{design.points} for {design.kind}", "a power of two"
+        )
     for name, factor in factors.items():
         if not sampled and not factor.options():
             raise InputError(
@@ -319,7 +332,9 @@ def sample(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
     """A Latin hypercube, in which each factor's range is divided into as many strips as points, with one point in each;
     or a Sobol sequence, scrambled by the seed."""
     qmc = scipy.stats.qmc
-    sampler = (qmc.LatinHypercube if design.kind == "lhs" else qmc.Sobol)(len(factors), rng=seed)
+    sampler = (qmc.LatinHypercube if design.kind == "lhs" else qmc.Sobol)(
+        len(factors), rng=seed
+    )
     yield from points_at(factors, sampler.random(design.points or 0))
 
 

@@ -38,7 +38,16 @@ SeedKey = Annotated[str, Field(pattern=r"^[a-z_]+(\.\w+)*[._]seed$")]
 Tilt = Annotated[Number, Field(ge=0, le=90)]
 Angle = Annotated[Number, Field(ge=0, le=180)]
 BodyName = Literal[
-    "zenith", "sun", "moon", "mercury", "venus", "mars", "jupiter", "saturn", "uranus", "neptune"
+    "zenith",
+    "sun",
+    "moon",
+    "mercury",
+    "venus",
+    "mars",
+    "jupiter",
+    "saturn",
+    "uranus",
+    "neptune",
 ]
 
 
@@ -212,7 +221,8 @@ class FlightTrial(ConfigModel):
     start: Annotated[
         AttitudeRange | None,
         BeforeValidator(
-            expand_start, json_schema_input_type=AttitudeRange | Literal["scene", "random"] | None
+            expand_start,
+            json_schema_input_type=AttitudeRange | Literal["scene", "random"] | None,
         ),
     ] = None
     settle_s: Annotated[Time, Field(ge=0)] = 0.0
@@ -520,7 +530,9 @@ def find(name: str) -> Path:
     return yaml_reader.find_file(name, STUDIES, "study")
 
 
-def make_plan(path: Path, study: Study, trial: dict[str, Any], programs: Mapping[str, str]) -> Plan:
+def make_plan(
+    path: Path, study: Study, trial: dict[str, Any], programs: Mapping[str, str]
+) -> Plan:
     """The plan of a study; `trial` is the section as written in the file, with units. Raises InputError for prices."""
     folder = path.resolve().parent
     spec = TrialSpec(
@@ -554,7 +566,9 @@ def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:
     name = str(values.pop("scene", spec.scene))
     local = Path(spec.folder) / name
     path = local if local.suffix in {".yaml", ".yml"} and is_file(local) else loader.find(name)
-    overrides = {key: one_line(value) for key, value in values.items() if not key.startswith(TRIAL)}
+    overrides = {
+        key: one_line(value) for key, value in values.items() if not key.startswith(TRIAL)
+    }
     # `unused_options` refuses unused keys, for the whole study.
     return loader.load(path, overrides, refuses_unused=False), trial
 
@@ -574,7 +588,9 @@ def resolve_trial(spec: TrialSpec, settings: Settings) -> Trial:
 
 def one_line(value: Value) -> str:
     """A value as YAML on one line."""
-    return yaml.safe_dump(value, default_flow_style=True, width=1_000_000).removesuffix("\n...\n")
+    return yaml.safe_dump(value, default_flow_style=True, width=1_000_000).removesuffix(
+        "\n...\n"
+    )
 
 
 class TrialSection(ConfigModel):

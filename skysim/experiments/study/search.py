@@ -58,15 +58,15 @@ def check_cost(factors: Mapping[str, Factor], config: Cost) -> None:
             for value in values if not isinstance(factor, Levels) else [values[0]]:
                 si(value)
         except InputError as error:
-            allowed = (
-                "numbers, or quantities with units; prices of named levels: optimize.cost.levels"
-            )
+            allowed = "numbers, or quantities with units; prices of named levels: optimize.cost.levels"
             raise InputError(where, error.problem, allowed) from None
     for name, prices in config.levels.items():
         where = f"optimize.cost.levels.{name}"
         factor = require_factor(name, factors, where)
         named = (
-            [str(level) for level, _ in factor.options()] if not isinstance(factor, Range) else []
+            [str(level) for level, _ in factor.options()]
+            if not isinstance(factor, Range)
+            else []
         )
         if sorted(named) != sorted(prices):
             allowed = (
@@ -188,7 +188,9 @@ def check(study: Study) -> None:
     for n, limit in enumerate(config.constraints):
         check_response(limit.response, f"optimize.constraints.{n}.response")
         if limit.at_least is None and limit.at_most is None:
-            raise InputError(f"optimize.constraints.{n}", "no bound", "at_least, at_most or both")
+            raise InputError(
+                f"optimize.constraints.{n}", "no bound", "at_least, at_most or both"
+            )
     for name, factor in study.factors.items():
         if isinstance(factor, Distribution):
             raise InputError(
@@ -200,7 +202,9 @@ def check(study: Study) -> None:
     trials = config.candidates * study.replicates
     budget = study.budget.trials
     if budget is not None and trials > budget:
-        raise InputError("budget.trials", budget, f"at least {trials}, the trials of the search")
+        raise InputError(
+            "budget.trials", budget, f"at least {trials}, the trials of the search"
+        )
 
 
 def check_response(response: str, where: str) -> None:
@@ -222,7 +226,9 @@ def check_response(response: str, where: str) -> None:
 def evaluate_candidate(plan: Plan, number: int, point: Point, columns: Columns) -> Candidate:
     """The candidate computed from the columns of all its trials, and its cost."""
     config = plan.study.search
-    figures = {name: metrics.response(name)(columns) for name in config.responses if name != COST}
+    figures = {
+        name: metrics.response(name)(columns) for name in config.responses if name != COST
+    }
     price, unpriced = cost(plan, point)
     values = {name: figure.value for name, figure in figures.items()} | {COST: price}
     objectives = tuple(values[one.response] for one in config.objectives)
@@ -234,7 +240,9 @@ def evaluate_candidate(plan: Plan, number: int, point: Point, columns: Columns) 
     ]
     refused = scene_error(columns)
     why = refused or unpriced or ", ".join(violated)
-    return Candidate(number, point.levels, objectives, figures, price, not why, bool(refused), why)
+    return Candidate(
+        number, point.levels, objectives, figures, price, not why, bool(refused), why
+    )
 
 
 def violation(limit: Constraint, value: float) -> float:
@@ -304,7 +312,9 @@ def collect_result(plan: Plan, store: Store) -> SearchResult:
 # The search.
 
 
-def search(plan: Plan, store: Store, engine: Engine, watch: Watch | None = None) -> SearchResult:
+def search(
+    plan: Plan, store: Store, engine: Engine, watch: Watch | None = None
+) -> SearchResult:
     """Evaluate candidates until `candidates` of them are complete, all points are evaluated, or the budget is spent.
 
     Raises InputError, also if optuna is not installed or proposes other candidates than those in the store.
@@ -390,7 +400,9 @@ def key_of(point: Point) -> str:
     return json.dumps(point.settings, sort_keys=True)
 
 
-def report_to_sampler(sampler: Any, proposal: Any, config: Search, candidate: Candidate) -> None:
+def report_to_sampler(
+    sampler: Any, proposal: Any, config: Search, candidate: Candidate
+) -> None:
     """Report a candidate's objectives and constraint violations to the sampler.
 
     A candidate without values gets infinitely bad objectives and an extra violated constraint.
@@ -422,7 +434,9 @@ def run_candidate(
     # Budgets are for the whole search: subtract the time spent, and the failures of earlier candidates.
     before = replace(total)
     budget = plan.study.budget
-    left_s = None if budget.time_s is None else budget.time_s - (time.perf_counter() - total.began)
+    left_s = (
+        None if budget.time_s is None else budget.time_s - (time.perf_counter() - total.began)
+    )
     if left_s is not None and left_s <= 0:
         return False
     failures = budget.failures and budget.failures + refused - before.failed

@@ -143,7 +143,9 @@ def check(plan: Plan, to_run: bool) -> None:
         search.check(study)
     if study.budget.trials is not None and plan.trials > study.budget.trials:
         raise InputError(
-            "budget.trials", study.budget.trials, f"at least {plan.trials}, the trials of the study"
+            "budget.trials",
+            study.budget.trials,
+            f"at least {plan.trials}, the trials of the study",
         )
     for name in study.factors:
         if name in COLUMNS or name in study.responses:
@@ -161,7 +163,9 @@ def check(plan: Plan, to_run: bool) -> None:
         except InputError as error:
             raise at_factor(study, name, level, error) from None
         points.append(unused_options.CheckedPoint(name, level, own, settings, scene, trial))
-    check_measured(study, {point.trial.kind for point in points}, [point.scene for point in points])
+    check_measured(
+        study, {point.trial.kind for point in points}, [point.scene for point in points]
+    )
     unused_options.check(plan, points, partial(resolve_point, plan.spec))
 
 
@@ -175,11 +179,15 @@ def check_figures(plan: Plan) -> None:
     for where, one in named_sections(study):
         for key, factor in one.axes.items():
             if factor is not None and factor not in study.factors:
-                raise InputError(f"{where}.{key}", *unknown_name("factor", factor, study.factors))
+                raise InputError(
+                    f"{where}.{key}", *unknown_name("factor", factor, study.factors)
+                )
         metrics.response(one.response, where)
         if isinstance(one, Map) and study.trial.kind == "flight":
             raise InputError(
-                f"{where}.kind", "a map of flights, which have no single attitude", "curve, heat"
+                f"{where}.kind",
+                "a map of flights, which have no single attitude",
+                "curve, heat",
             )
         if isinstance(one, Threshold):
             thresholds.check(one, where, study, rows)
@@ -211,7 +219,9 @@ def check_hardware(study: Study) -> None:
                     f"hardware.{n}", f"{key} is set by factors.{name} too", "one of the two"
                 )
     for name, factor in study.factors.items():
-        keys = [] if isinstance(factor, Levels | Distribution) else list(factor.value_at(0.5)[1])
+        keys = (
+            [] if isinstance(factor, Levels | Distribution) else list(factor.value_at(0.5)[1])
+        )
         if keys and all(HARDWARE_SEED.search(key) for key in keys):
             raise InputError(
                 f"factors.{name}",
@@ -250,7 +260,9 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
         TRACKERS.check_name(tracker, plan.spec.programs)
         if scene.motion.control:
             CONTROLLERS.check_name(scene.motion.control.law, plan.spec.programs)
-        if tracker != OWN and isinstance(trial, CentroidTrial):  # an external tracker takes images
+        if tracker != OWN and isinstance(
+            trial, CentroidTrial
+        ):  # an external tracker takes images
             raise InputError(
                 "tracker.name", f"{tracker} needs frames", f"{OWN}, or another trial.kind"
             )
@@ -275,7 +287,9 @@ def has_survey_errors(scene: Scene) -> bool:
 def fixed_seeds(study: Study, scene: Scene) -> list[str]:
     """Seeds of the survey and of the LEDs that a scene draws once, and the study neither draws anew nor varies."""
     layout = scene.light.layout if isinstance(scene.light, DomeConfig) else None
-    points, prefix = (layout.points, ".points") if isinstance(layout, OnPoints) else (layout, "")
+    points, prefix = (
+        (layout.points, ".points") if isinstance(layout, OnPoints) else (layout, "")
+    )
     seeds = [SURVEY_SEED] if has_survey_errors(scene) else []
     seeds += [f"light.layout{prefix}.hardware_seed"] if hasattr(points, "hardware_seed") else []
     varied = {*study.hardware, *study.set}.union(
@@ -331,7 +345,9 @@ def check_random_start(scene: Scene, start: AttitudeRange) -> None:
     """Raise InputError for a random start that the scene cannot have, or whose keys have no effect in it."""
     if isinstance(scene.light, CollimatedDisplayConfig) or scene.motion.start == "profile":
         where = (
-            "a collimated display" if scene.motion.start != "profile" else "motion.start: profile"
+            "a collimated display"
+            if scene.motion.start != "profile"
+            else "motion.start: profile"
         )
         raise InputError("trial.start", f"random with {where}", "scene")
     dome = isinstance(scene.light, DomeConfig)
@@ -352,7 +368,9 @@ def check_random_start(scene: Scene, start: AttitudeRange) -> None:
         )
 
 
-def each_level(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Settings, Settings]]:
+def each_level(
+    factors: Mapping[str, Factor],
+) -> Iterator[tuple[str, Value, Settings, Settings]]:
     """Every level of every factor with the other factors at their middle: factor, level, its settings, all settings."""
     middle = {name: factor.value_at(0.5) for name, factor in factors.items()}
     for name, factor in factors.items():

@@ -64,7 +64,8 @@ def has_few_values(row: PointRow, response: str) -> bool:
 def select_responses(rows: Sequence[PointRow], responses: Sequence[str]) -> list[PointRow]:
     """The rows with only these responses."""
     return [
-        one._replace(responses={name: one.responses[name] for name in responses}) for one in rows
+        one._replace(responses={name: one.responses[name] for name in responses})
+        for one in rows
     ]
 
 
@@ -225,7 +226,9 @@ def sample_outputs(
     values[:, columns["trial"]] = [columns[name] for name in axes]
     grid = values.reshape(len(axes), -1, each).transpose(0, 2, 1).reshape(len(axes) * each, -1)
     complete = np.isfinite(grid).all(axis=1)
-    blocks = grid[complete].reshape(int(complete.sum()), width + 2, len(plan.points) // (width + 2))
+    blocks = grid[complete].reshape(
+        int(complete.sum()), width + 2, len(plan.points) // (width + 2)
+    )
     return blocks[:, 0], blocks[:, 1], blocks[:, 2:].transpose(1, 0, 2)
 
 
@@ -339,7 +342,9 @@ def axis(study: Study, lines: Sequence[PointRow], name: str) -> Axis:
         return Axis(label(name, own_unit or unit), levels, True, log)
     order = [one for one, _ in factor.options()]
     levels.sort(
-        key=lambda one: next((n for n, other in enumerate(order) if same(one, other)), len(order))
+        key=lambda one: next(
+            (n for n, other in enumerate(order) if same(one, other)), len(order)
+        )
     )
     has_text = any(isinstance(one, str | bool) for one in levels)
     return Axis(label(name, "" if has_text else unit), levels, False, False)
@@ -420,7 +425,9 @@ def points_at(
     """The table lines (points) at these levels. Raises InputError for an unknown factor or level."""
     check_levels(levels, study, lines)
     return [
-        line for line in lines if all(same(line.levels[name], one) for name, one in levels.items())
+        line
+        for line in lines
+        if all(same(line.levels[name], one) for name, one in levels.items())
     ]
 
 

@@ -59,7 +59,9 @@ class Crossing(NamedTuple):
 # Estimation.
 
 
-def crossing(x: Floats, hits: Floats, trials: Floats, limit: float, log: bool = False) -> Crossing:
+def crossing(
+    x: Floats, hits: Floats, trials: Floats, limit: float, log: bool = False
+) -> Crossing:
     """Where a monotonic proportion crosses a limit, from (L,) hits of (L,) trials at (L,) ascending levels.
 
     The isotonic fit is the maximum-likelihood estimate of a monotonic curve (Ayer et al. 1955). The interval's ends
@@ -212,13 +214,17 @@ def crossings(
     return {label: group_crossing(threshold, group, axis) for label, group in groups.items()}
 
 
-def group_crossing(threshold: Threshold, lines: Sequence[PointRow], axis: Axis) -> Crossing | None:
+def group_crossing(
+    threshold: Threshold, lines: Sequence[PointRow], axis: Axis
+) -> Crossing | None:
     """The crossing along one series of points; None without trials at two levels."""
     summaries = [
         (axis.coordinate(line.levels[threshold.along]), line.responses[threshold.response])
         for line in lines
     ]
-    rows = [(x, round(one.value * one.trials), one.trials) for x, one in summaries if one.trials]
+    rows = [
+        (x, round(one.value * one.trials), one.trials) for x, one in summaries if one.trials
+    ]
     if len(rows) < 2:
         return None
     x, hits, trials = np.array(sorted(rows), dtype=float).T
@@ -228,7 +234,11 @@ def group_crossing(threshold: Threshold, lines: Sequence[PointRow], axis: Axis) 
 def sentences(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> list[str]:
     """The threshold in words, one sentence for each level of `by`."""
     axis = table.axis(study, lines, threshold.along)
-    unit = table.unit_of(table.axis(study, lines, threshold.by)) if threshold.by is not None else ""
+    unit = (
+        table.unit_of(table.axis(study, lines, threshold.by))
+        if threshold.by is not None
+        else ""
+    )
     return [
         (f"{threshold.by} = {label}{unit}: " if label else "") + describe(one, threshold, axis)
         for label, one in crossings(threshold, study, lines).items()
@@ -261,7 +271,8 @@ def describe(found: Crossing | None, threshold: Threshold, axis: Axis) -> str:
 def interval_text(found: Crossing, name: str, unit: str) -> str:
     """The interval of a crossing in words, and how many trials it takes in all where an end is open."""
     counts = " and ".join(
-        f"about {trials:,} trials at {name} = {level:.4g}{unit}" for level, trials in found.needs
+        f"about {trials:,} trials at {name} = {level:.4g}{unit}"
+        for level, trials in found.needs
     )
     needs = f"; needs {counts}" if counts else ""
     if math.isinf(found.low) and math.isinf(found.high):

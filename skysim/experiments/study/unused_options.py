@@ -131,7 +131,10 @@ RULES = (
         "trial.dec_deg, or a scene with light of kind dome",
     ),
     Rule(
-        ("trial.dec_deg", "trial.near"), in_dome, "under a dome the tilt is drawn", "trial.tilt_deg"
+        ("trial.dec_deg", "trial.near"),
+        in_dome,
+        "under a dome the tilt is drawn",
+        "trial.tilt_deg",
     ),
     Rule(
         ("trial.dec_deg",),
@@ -139,7 +142,9 @@ RULES = (
         "the boresight is drawn about a body",
         "trial.near.off_deg",
     ),
-    Rule(("seed",), lambda scene, trial: True, "every trial has its own seed", "the study's seed"),
+    Rule(
+        ("seed",), lambda scene, trial: True, "every trial has its own seed", "the study's seed"
+    ),
     Rule(
         DYNAMICS,
         lambda scene, trial: not isinstance(trial, FlightTrial),
@@ -303,7 +308,9 @@ def find(key: str, plan: Plan, point: CheckedPoint) -> Fault | None:
     scene = point.scene
     trial = point.trial
     if key.startswith(TRIAL):
-        found = unused.find(RULES, [key], TrialSection.model_construct(trial=trial), scene, trial)
+        found = unused.find(
+            RULES, [key], TrialSection.model_construct(trial=trial), scene, trial
+        )
     else:
         keys = list(unused.set_keys({key: (plan.spec.base | point.settings)[key]}))
         found = unused.find(unused.RULES, keys, scene) or unused.find(
@@ -314,7 +321,9 @@ def find(key: str, plan: Plan, point: CheckedPoint) -> Fault | None:
 
 def has_effect_elsewhere(plan: Plan, point: CheckedPoint, key: str, resolve: Resolve) -> bool:
     """Whether a key of one factor's level has an effect at some level of another factor, varied alone."""
-    others = {name: factor for name, factor in plan.study.factors.items() if name != point.factor}
+    others = {
+        name: factor for name, factor in plan.study.factors.items() if name != point.factor
+    }
     middle = {name: factor.value_at(0.5) for name, factor in others.items()}
     for name, factor in others.items():
         for option in factor.options():

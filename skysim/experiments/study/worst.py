@@ -19,7 +19,13 @@ from skysim.results.files.row_parts import row_of, subset
 from skysim.results.metrics import Columns
 
 COUNT = 3  # number of worst trials that a report lists
-DIRECTION = ("body_tilt_deg", "body_azimuth_deg", "boresight_ra_deg", "boresight_dec_deg", "stars")
+DIRECTION = (
+    "body_tilt_deg",
+    "body_azimuth_deg",
+    "boresight_ra_deg",
+    "boresight_dec_deg",
+    "stars",
+)
 FIRST = 1000  # worst trials that are sorted at first
 APART_DEG = 5.0  # least angle between the directions of two of them; nearer ones are one place
 NEAR = math.cos(math.radians(APART_DEG))
@@ -79,7 +85,8 @@ class WorstTrial(NamedTuple):
         if math.isnan(self.yaw_deg):
             return ""
         angles = ", ".join(
-            f"{name}: {getattr(self, name):.3f}" for name in ("roll_deg", "pitch_deg", "yaw_deg")
+            f"{name}: {getattr(self, name):.3f}"
+            for name in ("roll_deg", "pitch_deg", "yaw_deg")
         )
         return f"motion.start: {{{angles}}}"
 
@@ -137,7 +144,10 @@ def worst_trial(columns: Columns) -> WorstTrial:
         int(columns["trial"][0]),
         int(columns["point"][0]),
         "misidentified" if columns["misidentified"][0] > 0 else str(columns["status"][0]),
-        *(float(metrics.QUANTITIES[name](columns)[0]) for name in ("cross_arcsec", "roll_arcsec")),
+        *(
+            float(metrics.QUANTITIES[name](columns)[0])
+            for name in ("cross_arcsec", "roll_arcsec")
+        ),
         *(float(columns[name][0]) for name in DIRECTION),
         *body_angles_deg(columns, 0),
     )
@@ -164,7 +174,8 @@ def unit_directions(columns: Columns) -> Floats:
         np.where(in_dome, columns["body_azimuth_deg"], columns["boresight_ra_deg"])
     )
     return np.stack(
-        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=1
+        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)],
+        axis=1,
     )
 
 

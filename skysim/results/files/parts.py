@@ -42,10 +42,18 @@ SURVEY = "survey"  # a line whose part begins so is a way to survey the LEDs
 UNITS = {
     **dict.fromkeys(("shell", "shell_bent", "shell_flat"), "m2"),
     **dict.fromkeys(
-        ("led", "board", "panel", "mounting_led", "mounting_board", "resistor", "filter"), "each"
+        ("led", "board", "panel", "mounting_led", "mounting_board", "resistor", "filter"),
+        "each",
     ),
     **dict.fromkeys(
-        ("driver", "microcontroller", "sequencer", "tape_controller", "trigger", "power_supply"),
+        (
+            "driver",
+            "microcontroller",
+            "sequencer",
+            "tape_controller",
+            "trigger",
+            "power_supply",
+        ),
         "each",
     ),
     **dict.fromkeys(("tape", "tape_addressable", "fiber", "mounting_tape", "wire"), "m"),
@@ -160,7 +168,9 @@ def parse_line(line: str, names: list[str]) -> tuple[str, Price]:
         raise InputError(f"unit of {part}", f"{unit!r}", UNITS.get(part, "each"))
     if survey != bool(cell.get("sigma_mm")):
         raise InputError(
-            f"sigma_mm of {part}", cell.get("sigma_mm") or "none", f"of a {SURVEY}, which needs it"
+            f"sigma_mm of {part}",
+            cell.get("sigma_mm") or "none",
+            f"of a {SURVEY}, which needs it",
         )
     price, fixed = (number(cell, key, 0.0) for key in ("price", "fixed"))
     serves = number(cell, "serves", 1.0)

@@ -60,7 +60,9 @@ class Recording:
         missing = [key for key in ("scene", "seed", "lab") if key not in header]
         if missing:
             raise InputError(
-                f"{self.stems[0]}.ecsv", f"no {missing[0]} in the header", "a truth file of a run"
+                f"{self.stems[0]}.ecsv",
+                f"no {missing[0]} in the header",
+                "a truth file of a run",
             )
         return {key: header[key] for key in ("scene", "seed", "lab")}
 
@@ -77,7 +79,9 @@ class Recording:
         """A frame's digital numbers: (H, W) uint16, or float64 from a noise-free camera. Raises InputError."""
         image = read_fits(stem.with_suffix(".fits"))
         if image.ndim != 2 or not image.size:
-            raise InputError(f"{stem}.fits", f"an image of shape {image.shape}", "(height, width)")
+            raise InputError(
+                f"{stem}.fits", f"an image of shape {image.shape}", "(height, width)"
+            )
         return image
 
     def table(self, name: str) -> Any:
@@ -221,7 +225,9 @@ ZARR = "frames.zarr"
 
 def remove_results(folder: Path) -> None:
     """Remove the files of an earlier run: its frames, solutions, reports, and the files of `skysim export`."""
-    frames = [f"frame_[0-9][0-9][0-9][0-9]*.{suffix}" for suffix in ("fits", "png", "ecsv", "tif")]
+    frames = [
+        f"frame_[0-9][0-9][0-9][0-9]*.{suffix}" for suffix in ("fits", "png", "ecsv", "tif")
+    ]
     for pattern in (*frames, "solutions.*.ecsv"):
         for path in folder.glob(pattern):
             path.unlink()
@@ -264,7 +270,9 @@ def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
 
 def utc_text(scene: Scene, t_s: float) -> str:
     """A time since the scene's start as UTC, to a microsecond."""
-    return (scene.start_time + datetime.timedelta(seconds=t_s)).isoformat(timespec="microseconds")
+    return (scene.start_time + datetime.timedelta(seconds=t_s)).isoformat(
+        timespec="microseconds"
+    )
 
 
 def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
@@ -303,5 +311,7 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
     if truth.bodies:
         table.meta["bodies"] = [dataclasses.asdict(body) for body in truth.bodies]
     if truth.satellites:
-        table.meta["satellites"] = [dataclasses.asdict(satellite) for satellite in truth.satellites]
+        table.meta["satellites"] = [
+            dataclasses.asdict(satellite) for satellite in truth.satellites
+        ]
     write_table(path, table)

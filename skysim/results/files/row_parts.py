@@ -176,7 +176,9 @@ class Part:
             point, replicate = (read_column(self.path, name) for name in ("point", "replicate"))
             if not len(point) == len(replicate) == self.rows > 0:
                 raise InputError(
-                    self.path, f"has {len(point)} rows", f"{self.rows}, as the study store lists"
+                    self.path,
+                    f"has {len(point)} rows",
+                    f"{self.rows}, as the study store lists",
                 )
             if not (are_below(point, self.last + 1) and are_below(replicate, replicates)):
                 raise InputError(
@@ -205,7 +207,9 @@ class Part:
         def column(name: str) -> Array:
             whole = trials if name == "trial" else read_column(self.path, name)
             return (
-                whole[rows[0]] if len(rows) == 1 else np.concatenate([whole[one] for one in rows])
+                whole[rows[0]]
+                if len(rows) == 1
+                else np.concatenate([whole[one] for one in rows])
             )
 
         return column if rows else None

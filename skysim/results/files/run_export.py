@@ -29,9 +29,7 @@ from skysim.results.files.row_parts import EXTRA
 
 
 MOST_CHARACTERS = 254  # limit of a line, section 6.3 of the standard
-ORIGINATOR = (
-    "SKYSIM"  # not in the SANA registry; the standard leaves that to those who exchange the files
-)
+ORIGINATOR = "SKYSIM"  # not in the SANA registry; the standard leaves that to those who exchange the files
 MEANING = {
     ICRF: "axes of the ICRS",
     LAB: "the laboratory: origin in the bearing's center, z up; known to this file's users only",
@@ -193,12 +191,17 @@ def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
         unknown = [frame for frame in solved[0].tolist() if frame not in epochs]
         if unknown:
             raise InputError(
-                run.folder / "solutions.ecsv", f"unknown frame {unknown[0]}", "frames with truth"
+                run.folder / "solutions.ecsv",
+                f"unknown frame {unknown[0]}",
+                "frames with truth",
             )
         utc = [epochs[frame] for frame in solved[0].tolist()]
         written.append(
             write(
-                "solutions", "Attitude found by the star tracker, at mid-exposure", utc, solved[1]
+                "solutions",
+                "Attitude found by the star tracker, at mid-exposure",
+                utc,
+                solved[1],
             )
         )
     motion = run.motion()
@@ -284,7 +287,9 @@ def sources_parquet(run: Recording, path: Path, bar: Bar) -> Path:
     import pyarrow.parquet
 
     def frame_table(truth: FrameTruth) -> Any:
-        truth.sources.add_column(np.full(len(truth.sources), truth.frame), name="frame", index=0)
+        truth.sources.add_column(
+            np.full(len(truth.sources), truth.frame), name="frame", index=0
+        )
         return to_arrow(truth.sources, run)
 
     tables = map(frame_table, truths(run, bar))
@@ -316,7 +321,9 @@ def to_arrow(table: Any, run: Recording) -> Any:
             else pyarrow.string(),
         )
         unit = unit_of(name)
-        fields.append(pyarrow.field(name, values.type, metadata={"unit": unit} if unit else None))
+        fields.append(
+            pyarrow.field(name, values.type, metadata={"unit": unit} if unit else None)
+        )
         columns.append(values)
     metadata = {f"skysim.{key}": str(value) for key, value in run.meta.items()}
     return pyarrow.table(columns, schema=pyarrow.schema(fields, metadata=metadata))
@@ -395,7 +402,12 @@ def frame_arrays(frame_truths: list[FrameTruth]) -> Iterator[tuple[str, Any, str
         ("lab_from_body_xyzw", "xyzw"),
         ("cam_from_lab_xyzw", "xyzw"),
     ):
-        yield name, np.array([getattr(truth, name) for truth in frame_truths]), axis, unit_of(name)
+        yield (
+            name,
+            np.array([getattr(truth, name) for truth in frame_truths]),
+            axis,
+            unit_of(name),
+        )
 
 
 def check_same_format(image: Any, first: Any, stem: Path) -> Any:
@@ -421,7 +433,9 @@ def to_video(run: Recording, out: Path, bar: Bar) -> list[Path]:
     rate_hz = 1 / float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
     sampled = run.stems[:: max(len(run.stems) // SAMPLED_FRAMES, 1)]
     low, high = np.median([plots.display_levels(run.image(stem)) for stem in sampled], axis=0)
-    height, width = (side // 2 * 2 for side in first.shape)  # color subsampling needs even sides
+    height, width = (
+        side // 2 * 2 for side in first.shape
+    )  # color subsampling needs even sides
     with files.atomic_file(path) as temporary:
         film = cv2.VideoWriter(
             str(temporary), cv2.VideoWriter.fourcc(*FOURCC), rate_hz, (width, height), False

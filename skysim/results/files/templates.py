@@ -89,9 +89,7 @@ def svg_element(shape: Shape) -> str:
             dashes = ' stroke-dasharray="4 2"' if shape.dashed else ""
             return f'<{"polygon" if shape.closed else "polyline"} points="{points}"{dashes}/>'
         case Circle():
-            return (
-                f'<circle cx="{shape.x_mm:.3f}" cy="{shape.y_mm:.3f}" r="{shape.radius_mm:.3f}"/>'
-            )
+            return f'<circle cx="{shape.x_mm:.3f}" cy="{shape.y_mm:.3f}" r="{shape.radius_mm:.3f}"/>'
         case SheetText():
             return (
                 f'<text x="{shape.x_mm:.3f}" y="{shape.y_mm:.3f}" font-size="{shape.size_mm:g}"'
@@ -147,7 +145,9 @@ MAX_WIDTH_M = 0.25  # of a gore: at its edge the paper is 0.5 % too long under a
 LEAST_GORES = 6
 STEPS = 64  # of a polyline whose length is measured
 EDGE_DEG = 0.5  # spacing of an edge's points
-FROM_INSIDE = np.array([-1.0, 1.0])  # seen from inside with the apex up, azimuths grow to the left
+FROM_INSIDE = np.array(
+    [-1.0, 1.0]
+)  # seen from inside with the apex up, azimuths grow to the left
 MARGIN_MM = 10.0
 GAP_MM = 5.0
 CAPTION_MM = 12.0
@@ -187,7 +187,12 @@ def template(lab: Lab, ending: str) -> str:
     # Boards stand out.
     cap_deg = max(float(getattr(light.layout, "cap_deg", 0.0)), max_tilt_deg(leds.place[:, :3]))
     dome = Dome(
-        lab.scene.name, surface, cap_deg, leds.id, leds.place[:, :3], light.led.disk_diameter_m / 2
+        lab.scene.name,
+        surface,
+        cap_deg,
+        leds.id,
+        leds.place[:, :3],
+        light.led.disk_diameter_m / 2,
     )
     return TEMPLATES[ending](dome)
 
@@ -240,7 +245,9 @@ def gores(dome: Dome) -> Drawing:
     """
     count = gore_count(dome.surface, dome.cap_deg)
     rays = dome.led_m / np.linalg.norm(dome.led_m, axis=1, keepdims=True)
-    nearest = np.rint(np.arctan2(rays[:, 1], rays[:, 0]) * count / (2 * np.pi)).astype(int) % count
+    nearest = (
+        np.rint(np.arctan2(rays[:, 1], rays[:, 0]) * count / (2 * np.pi)).astype(int) % count
+    )
     shapes = list[Shape]()
     left_mm = MARGIN_MM
     bottom_mm = 0.0
@@ -272,7 +279,9 @@ def outline(meridian_rad: float, half_rad: float, cap_deg: float) -> Floats:
     down = np.radians(np.linspace(0, cap_deg, math.ceil(cap_deg / EDGE_DEG) + 1))
     along = np.linspace(1, -1, STEPS) * half_rad
     tilt_rad = np.concatenate([down, np.full(STEPS, down[-1]), down[::-1]])
-    aside_rad = np.concatenate([np.full(len(down), half_rad), along, np.full(len(down), -half_rad)])
+    aside_rad = np.concatenate(
+        [np.full(len(down), half_rad), along, np.full(len(down), -half_rad)]
+    )
     return directions(tilt_rad, meridian_rad + aside_rad)
 
 

@@ -148,7 +148,8 @@ class ChromaticConfig(ConfigModel):
         | None
     ) = None
     corner_px: (
-        Annotated[tuple[Annotated[Number, Field(ge=-100, le=100)], ...], Field(min_length=2)] | None
+        Annotated[tuple[Annotated[Number, Field(ge=-100, le=100)], ...], Field(min_length=2)]
+        | None
     ) = None
 
     @model_validator(mode="after")
@@ -331,7 +332,9 @@ def curve_exists(value: str) -> str:
     """The path of a curve. Raises InputError if there is no such file."""
     if not Path(value).is_file():
         raise InputError(
-            "", f"no file {value!r}", "a CSV file of wavelength_nm and response, or a number to 1"
+            "",
+            f"no file {value!r}",
+            "a CSV file of wavelength_nm and response, or a number to 1",
         )
     return value
 
@@ -468,7 +471,13 @@ class CameraConfig(ConfigModel):
     vignetting: (
         Annotated[TwoStopsConfig | VignettingTableConfig, Field(discriminator="kind")] | None
     ) = None
-    distortion: tuple[Radial, Radial, Tangential, Tangential, Radial] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: tuple[Radial, Radial, Tangential, Tangential, Radial] = (
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+    )
     principal_point_px: tuple[Number, Number] | None = None
     psf: Psf = GaussianPsfConfig()
     chromatic: ChromaticConfig | None = None

@@ -337,13 +337,17 @@ class ListedConfig(DimmedConfig):
     positions_m: (
         Annotated[tuple[tuple[Length, Length, Length], ...], Field(min_length=1)] | None
     ) = None
-    directions_deg: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] | None = None
+    directions_deg: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] | None = (
+        None
+    )
     file: str | None = None
 
     @model_validator(mode="after")
     def check_positions(self) -> ListedConfig:
         lists = [
-            each for each in (self.positions_m, self.directions_deg, self.file) if each is not None
+            each
+            for each in (self.positions_m, self.directions_deg, self.file)
+            if each is not None
         ]
         if len(lists) != 1:
             raise InputError("", "listed takes one of positions, directions_deg, file")
@@ -415,7 +419,9 @@ class FibersConfig(ConfigModel):
     def check_aiming(self) -> FibersConfig:
         laser = self.aiming
         if laser and not (
-            self.radius_variation or laser.pointing_sigma_arcsec or laser.orientation_sigma_arcsec
+            self.radius_variation
+            or laser.pointing_sigma_arcsec
+            or laser.orientation_sigma_arcsec
         ):
             raise InputError(
                 "aiming",
@@ -447,7 +453,9 @@ class PixelsConfig(ConfigModel):
         White over black, which glows over the whole display; without it black is dark
     """
 
-    pixels: tuple[Annotated[int, Field(ge=1, le=20_000)], Annotated[int, Field(ge=1, le=20_000)]]
+    pixels: tuple[
+        Annotated[int, Field(ge=1, le=20_000)], Annotated[int, Field(ge=1, le=20_000)]
+    ]
     pitch_m: Annotated[Length, Field(gt=0)]
     block: Annotated[int, Field(ge=1)] = 1
     gray_levels: Annotated[int, Field(ge=2, le=65536)] = 256
@@ -536,12 +544,16 @@ class ProjectorConfig(PixelsConfig):
         # t (1 + k t^2) has its maximum 2 t / 3 at t^2 = -1 / (3 k).
         if self.distortion < 0 and 2 / 3 / math.sqrt(-3 * self.distortion) <= corner:
             raise InputError(
-                "distortion", f"{self.distortion:g} folds the picture's corners back", "nearer to 0"
+                "distortion",
+                f"{self.distortion:g} folds the picture's corners back",
+                "nearer to 0",
             )
         return self
 
 
-OnPoints = FibersConfig | LcdConfig | ProjectorConfig  # layouts that show the points of another one
+OnPoints = (
+    FibersConfig | LcdConfig | ProjectorConfig
+)  # layouts that show the points of another one
 
 Layout = Annotated[
     PatchBoardsConfig

@@ -203,7 +203,9 @@ class CyclicCodeConfig(CodeConfig):
     distance: Literal[3, 5, 7, 11] = 7
 
 
-Code = Annotated[PlainCodeConfig | BchCodeConfig | CyclicCodeConfig, Field(discriminator="kind")]
+Code = Annotated[
+    PlainCodeConfig | BchCodeConfig | CyclicCodeConfig, Field(discriminator="kind")
+]
 
 
 class AgingConfig(ConfigModel):
@@ -362,5 +364,7 @@ class LedConfig(ConfigModel):
     @classmethod
     def check_scatter(cls, value: float) -> float:
         if isinstance(value, Tolerance) and value.half_width >= 1:
-            raise InputError("", f"a tolerance of {value.half_width:g} leaves no light", "below 1")
+            raise InputError(
+                "", f"a tolerance of {value.half_width:g} leaves no light", "below 1"
+            )
         return value

@@ -90,7 +90,9 @@ class RimmedConfig(SurfaceConfig):
     def check_rim(self) -> Self:
         if self.rim_height_m is not None and self.rim_deg is not None:
             raise InputError("", "rim_height and rim_deg conflict", "one of the two")
-        if self.rim_height_m is not None and self.rim_height_m >= getattr(self, "apex_m", math.inf):
+        if self.rim_height_m is not None and self.rim_height_m >= getattr(
+            self, "apex_m", math.inf
+        ):
             raise InputError(
                 "rim_height", f"{self.rim_height_m:g} m is not below the apex", "less than apex"
             )
@@ -124,7 +126,9 @@ class SphereSurfaceConfig(RimmedConfig):
 
     @model_validator(mode="after")
     def check_wall(self) -> Self:
-        thickest = max(self.wall.thickness_apex_m, self.wall.thickness_base_m) if self.wall else 0.0
+        thickest = (
+            max(self.wall.thickness_apex_m, self.wall.thickness_base_m) if self.wall else 0.0
+        )
         if thickest > 0.1 * self.radius_m:
             raise InputError(
                 "", f"a wall of {thickest:g} m is too thick", "up to a tenth of the radius"
@@ -208,7 +212,11 @@ SURFACE_CONFIGS: dict[Any, type[SurfaceConfig]] = {
 
 def check_surface_kind(value: Any) -> Any:
     """The value. Raises an error at the key `kind`, with the allowed kinds, for an unknown kind."""
-    if isinstance(value, dict) and "kind" in value and value["kind"] not in list(SURFACE_CONFIGS):
+    if (
+        isinstance(value, dict)
+        and "kind" in value
+        and value["kind"] not in list(SURFACE_CONFIGS)
+    ):
         SurfaceConfig.model_validate({"kind": value["kind"]})
     return value
 
@@ -262,7 +270,9 @@ class RoomConfig(ConfigModel):
                 "", "height requires bearing_height, the bearing's center above the floor"
             )
         if self.segments > 1 and self.door_m is None:
-            raise InputError("segments", "have no effect without a door", "door, or no segments")
+            raise InputError(
+                "segments", "have no effect without a door", "door, or no segments"
+            )
         return self
 
 
@@ -544,7 +554,11 @@ class FaintStarsGlowConfig(ConfigModel):
 
 
 Glow = Annotated[
-    UniformGlowConfig | SkyGlowConfig | MoonGlowConfig | StrayLightConfig | FaintStarsGlowConfig,
+    UniformGlowConfig
+    | SkyGlowConfig
+    | MoonGlowConfig
+    | StrayLightConfig
+    | FaintStarsGlowConfig,
     Field(discriminator="kind"),
 ]
 

@@ -148,7 +148,9 @@ class ChirpConfig(ConfigModel):
     def check_frequencies(self) -> ChirpConfig:
         if self.from_hz == self.to_hz:
             raise InputError(
-                "", f"from_hz and to_hz are both {self.from_hz:g}", "different ones, or kind: sine"
+                "",
+                f"from_hz and to_hz are both {self.from_hz:g}",
+                "different ones, or kind: sine",
             )
         if self.duration_s < 1 / self.from_hz + 1 / self.to_hz:
             raise InputError(
@@ -307,7 +309,9 @@ class ControlConfig(ConfigModel):
         if self.law in BUILT_IN_LAWS:
             unused = ["options", "time_limit_s"]
         elif self.law == PRESCRIBED:
-            unused = [name for name in type(self).model_fields if name not in ("law", "rate_hz")]
+            unused = [
+                name for name in type(self).model_fields if name not in ("law", "rate_hz")
+            ]
         for name in unused:
             if getattr(self, name) != default_of(self, name):
                 key = name.removesuffix("_s")
@@ -375,7 +379,9 @@ class MotionConfig(ConfigModel):
         refused = [leg.kind for leg in self.maneuver if leg.kind in ("bump", "step")]
         if self.is_prescribed and refused:
             raise InputError(
-                "maneuver", f"{refused[0]} is not possible with control: prescribed", "control: pid"
+                "maneuver",
+                f"{refused[0]} is not possible with control: prescribed",
+                "control: pid",
             )
         return self
 
@@ -387,6 +393,8 @@ class MotionConfig(ConfigModel):
             raise InputError("start", "profile requires a first maneuver of kind profile")
         if any(self.rate_deg_s):
             raise InputError(
-                "rate_deg_s", "has no effect with start: profile, which gives the rate", "[0, 0, 0]"
+                "rate_deg_s",
+                "has no effect with start: profile, which gives the rate",
+                "[0, 0, 0]",
             )
         return self

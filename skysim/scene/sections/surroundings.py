@@ -9,7 +9,15 @@ from pydantic import AfterValidator, Field, model_validator
 
 from skysim.core.constants import FWHM_PER_SIGMA
 from skysim.core.errors import InputError
-from skysim.core.units import Ascending, ConfigModel, Fraction, Length, Number, Time, check_table
+from skysim.core.units import (
+    Ascending,
+    ConfigModel,
+    Fraction,
+    Length,
+    Number,
+    Time,
+    check_table,
+)
 from skysim.core.yaml_reader import existing_file
 
 # The scene section `light.air`: the atmosphere between the camera of a sky scene and the stars.
@@ -223,7 +231,9 @@ class RandomSatellitesConfig(ConfigModel):
         for name in ("rate_deg_s", "v_mag"):
             low, high = getattr(self, name)
             if low > high:
-                raise InputError(name, f"{low:g} is above {high:g}", "the least, then the greatest")
+                raise InputError(
+                    name, f"{low:g} is above {high:g}", "the least, then the greatest"
+                )
         return self
 
 

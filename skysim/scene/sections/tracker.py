@@ -209,11 +209,15 @@ class TrackerConfig(ConfigModel):
     def check_assumed(self) -> TrackerConfig:
         if self.assumed_camera_body_m is not None and self.survey.lever_sigma_m:
             raise InputError(
-                "survey.lever_sigma", "conflicts with assumed_camera_body", "0, or the survey alone"
+                "survey.lever_sigma",
+                "conflicts with assumed_camera_body",
+                "0, or the survey alone",
             )
         if self.assumed_focal_length_m is not None and self.survey.focal_length_sigma_m:
             raise InputError(
-                "survey.focal_length_sigma", "conflicts with assumed_focal_length", "one of the two"
+                "survey.focal_length_sigma",
+                "conflicts with assumed_focal_length",
+                "one of the two",
             )
         return self
 
@@ -298,7 +302,9 @@ class FilterConfig(ConfigModel):
     mounting_arcsec: NotNegative = 0.0
     mounting_drift_arcsec_sqrt_h: NotNegative = 0.0
     floor_arcsec: NotNegative = 0.0
-    considered: tuple[Literal["bias", "scale", "misalignment", "mounting", "systematic"], ...] = (
+    considered: tuple[
+        Literal["bias", "scale", "misalignment", "mounting", "systematic"], ...
+    ] = (
         "mounting",
         "systematic",
     )

@@ -164,7 +164,9 @@ def within_reach(
         # With a yaw of minus the azimuth, the tilt is about a horizontal axis.
         angles = np.column_stack([azimuth_rad, tilt_rad, turn_rad - azimuth_rad])
         lab_from_body = Rotation.from_euler("ZYZ", angles)
-    return CheckedAttitudes(lab_from_body, np.zeros((DIRECTIONS, 3)), np.full(DIRECTIONS, np.nan))
+    return CheckedAttitudes(
+        lab_from_body, np.zeros((DIRECTIONS, 3)), np.full(DIRECTIONS, np.nan)
+    )
 
 
 def describe(attitudes: CheckedAttitudes, n: int, scene: Scene, mount: Mount) -> str:

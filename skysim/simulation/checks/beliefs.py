@@ -91,7 +91,9 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
     focal_error = believed.focal_px / scene.camera.focal_px - 1
     assumed_m = tracker.assumed_camera_body_m
     lever_error_m = (
-        np.zeros(3) if assumed_m is None else np.array(assumed_m) - lab.camera.mount.camera_body_m
+        np.zeros(3)
+        if assumed_m is None
+        else np.array(assumed_m) - lab.camera.mount.camera_body_m
     )
     # 2. A self-calibrated map has its own uncertainties, and its axes and lever are right on average.
     if tracker.map:
@@ -168,7 +170,9 @@ def known_stars(lab: Lab, stars: StarCatalog, camera: CameraModel) -> tuple[Sour
     sources = lab.camera.sources
     row, star = common(sources.id, stars.id)
     place = sources.place[:, :3] / np.linalg.norm(sources.place[:, :3], axis=1, keepdims=True)
-    shift = neighbor_shift(place, sources.strength * lab.camera.optics.collecting_m2, row, camera)
+    shift = neighbor_shift(
+        place, sources.strength * lab.camera.optics.collecting_m2, row, camera
+    )
     return sources.take(row), place[row] + shift - stars.vectors[star]
 
 
@@ -234,7 +238,9 @@ def response_px(
 
     def image(offset_px: Floats) -> Floats:
         """(P, window) share of a Gaussian's light in each pixel, with its center displaced along x."""
-        return np.asarray(np.exp(-((x - offset_px) ** 2 + y**2) / (2 * s2)) / (2 * math.pi * s2))
+        return np.asarray(
+            np.exp(-((x - offset_px) ** 2 + y**2) / (2 * s2)) / (2 * math.pi * s2)
+        )
 
     own = image(np.zeros(1))
     other = image(apart_px[:, None])

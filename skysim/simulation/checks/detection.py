@@ -86,7 +86,14 @@ def context_of(lab: Lab) -> Context:
     timing_s = timing_sigma_s(lights.period_s, lights.on_s, lab.scene.exposure.time_s)
     row = np.argsort(lights.id, kind="stable")
     return Context(
-        lab, assumed_settings(lab.scene), believed, camera, surface, lights.id[row], row, timing_s
+        lab,
+        assumed_settings(lab.scene),
+        believed,
+        camera,
+        surface,
+        lights.id[row],
+        row,
+        timing_s,
     )
 
 
@@ -133,7 +140,9 @@ def usable(view: View, context: Context) -> View:
     edge = np.minimum(view.xy_px, far_px).min(axis=1)
     area = detected_area_px(view, context)
     found = np.flatnonzero((area >= settings.min_area_px) & (edge > np.sqrt(area / np.pi)))
-    return view.take(found[np.argsort(-view.electrons[found], kind="stable")][: settings.max_blobs])
+    return view.take(
+        found[np.argsort(-view.electrons[found], kind="stable")][: settings.max_blobs]
+    )
 
 
 def centroid_variance(view: View, context: Context, prnu: float | None = None) -> Floats:

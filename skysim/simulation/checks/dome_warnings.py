@@ -55,9 +55,9 @@ def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
 def camera_outside_warning(scene: Scene, mount: Mount, start: Rotation) -> str:
     """Warn if the camera is outside of the dome at the start (lab_from_body), where its frames may be black."""
     camera_m = start.apply(mount.camera_body_m)
-    if not isinstance(scene.light, DomeConfig) or surface.build_surface(scene.light.surface).inside(
-        camera_m
-    ):
+    if not isinstance(scene.light, DomeConfig) or surface.build_surface(
+        scene.light.surface
+    ).inside(camera_m):
         return ""
     return (
         f"vehicle.camera: {np.linalg.norm(mount.camera_body_m):.3g} m from the bearing, outside of light.surface at the"
@@ -97,7 +97,9 @@ def image_width_warning(scene: Scene, sources: Sources, mount: Mount) -> str:
     if scene.tracker.detector != "local":
         return ""
     camera = scene.camera
-    distance_m = np.linalg.norm(sources.place[:, :3], axis=1) - np.linalg.norm(mount.camera_body_m)
+    distance_m = np.linalg.norm(sources.place[:, :3], axis=1) - np.linalg.norm(
+        mount.camera_body_m
+    )
     typical_m = float(np.median(distance_m))
     blur = camera.pupil_m * abs(1 / typical_m - 1 / camera.focus_m)
     width_px = camera.focal_px * (2 * float(np.median(sources.radius_m)) / typical_m + blur)
@@ -169,7 +171,9 @@ def why_not_compared(context: Context, samples: CheckedSamples) -> str:
         return "tracker.decoder: coded LEDs are named by their codes, so that no field is ambiguous; allowed: none"
     mean = float(samples.reach.counts().mean())
     if mean < MIN_LEDS:
-        return f"light.layout: {mean:.2g} LEDs in a field on average; allowed: {MIN_LEDS} or more"
+        return (
+            f"light.layout: {mean:.2g} LEDs in a field on average; allowed: {MIN_LEDS} or more"
+        )
     return ""
 
 
@@ -223,7 +227,9 @@ def compared(
 def fact(found: Lookalike) -> Fact:
     """The fact about the fields that look alike."""
     share = (
-        f"{100 * found.share:.0f} % of {found.fields}" if found.share else f"none of {found.fields}"
+        f"{100 * found.share:.0f} % of {found.fields}"
+        if found.share
+        else f"none of {found.fields}"
     )
     text = f"{share}: {100 * ALIKE:.0f} % of the LEDs coincide within {short(1e3 * found.coincidence_m, 2)} mm"
     return Fact("fields alike", [text], found._asdict())
@@ -257,7 +263,8 @@ def mirror_images(context: Context, samples: CheckedSamples) -> str:
         return ""
     n = max(found, key=lambda n: len(found[n]))
     peak_e = (
-        max(float(images.peak_e.max()) for images in found.values()) - context.camera.background_e
+        max(float(images.peak_e.max()) for images in found.values())
+        - context.camera.background_e
     )
     share = threshold_e(context) / peak_e
     specular = mirror.dome.config.specular

@@ -253,7 +253,9 @@ def gains(view: View, sigma_px: Floats, fitted: Floats | None = None) -> Floats:
     LinAlgError
         If the lights do not determine the rotation.
     """
-    jacobian = view.jacobian if fitted is None else np.concatenate([view.jacobian, fitted], axis=2)
+    jacobian = (
+        view.jacobian if fitted is None else np.concatenate([view.jacobian, fitted], axis=2)
+    )
     weighted = jacobian / sigma_px[:, None, None] ** 2
     # Scale the columns, because a rotation in rad and a shift in meters have different sizes.
     size = np.sqrt(np.einsum("nij,nij->j", jacobian, jacobian))
@@ -356,7 +358,9 @@ def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch |
         name: shift - view.jacobian @ np.einsum("nij,njk->ik", gain, shift)
         for name, shift in shifts.items()
     }
-    rms = {name: float(np.sqrt((shift**2).sum(axis=(1, 2)).mean())) for name, shift in left.items()}
+    rms = {
+        name: float(np.sqrt((shift**2).sum(axis=(1, 2)).mean())) for name, shift in left.items()
+    }
     # 3. Sum of all causes.
     known = sum(
         (shift for name, shift in left.items() if name in UNKNOWN_TO_TRACKER),

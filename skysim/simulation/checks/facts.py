@@ -61,7 +61,9 @@ def lights_in_field(context: Context, samples: CheckedSamples) -> Fact:
     lines = []
     values = {}
     reach = (
-        "in the whole sky" if isinstance(scene.light, StarsConfig) else reached(context, samples)
+        "in the whole sky"
+        if isinstance(scene.light, StarsConfig)
+        else reached(context, samples)
     )
     for key, what, sampled in (
         ("frames", "at the frames", samples.frames),
@@ -73,13 +75,17 @@ def lights_in_field(context: Context, samples: CheckedSamples) -> Fact:
         limit = context.settings.max_blobs
         cut = f"; the tracker uses the {limit} brightest" if (counts == limit).any() else ""
         missed = (
-            f" (of {seen.mean():.1f} on the chip{cut})" if seen.mean() > counts.mean() + 0.5 else ""
+            f" (of {seen.mean():.1f} on the chip{cut})"
+            if seen.mean() > counts.mean() + 0.5
+            else ""
         )
         hidden = {
             name: count / len(counts)
             for name, count in sum(sampled.hidden, Counter[str]()).most_common()
         }
-        behind = "".join(f"; {count:.1f} more are behind {name}" for name, count in hidden.items())
+        behind = "".join(
+            f"; {count:.1f} more are behind {name}" for name, count in hidden.items()
+        )
         lines.append(
             f"{what}: mean {counts.mean():.1f}{missed}, least {counts.min()} at {where}{behind}"
         )
@@ -117,18 +123,27 @@ def reached(context: Context, samples: CheckedSamples) -> str:
 def spot(context: Context, samples: CheckedSamples) -> Fact:
     """Width of the median image without motion, and its parts: lens, LED and defocus."""
     sampled = samples.frames if sum(map(len, samples.frames.seen)) else samples.reach
-    sigma, disk, defocus = (sampled.joined(name) for name in ("sigma_px", "disk_px", "defocus_px"))
+    sigma, disk, defocus = (
+        sampled.joined(name) for name in ("sigma_px", "disk_px", "defocus_px")
+    )
     lens_px = GAUSSIAN_WIDTH * context.camera.lens_px
     if not len(sigma):
         return Fact(
-            "image size", [f"lens {lens_px:.1f} px; no light in the field"], {"lens_px": lens_px}
+            "image size",
+            [f"lens {lens_px:.1f} px; no light in the field"],
+            {"lens_px": lens_px},
         )
     width, disk_px, defocus_px = (
         float(np.median(one)) for one in (GAUSSIAN_WIDTH * sigma, 2 * disk, 2 * defocus)
     )
     led = f", LED {disk_px:.1f}" if isinstance(context.lab.scene.light, DomeConfig) else ""
     text = f"{width:.1f} px wide (D4σ): lens {lens_px:.1f}{led}, defocus {defocus_px:.1f} px"
-    values = {"width_px": width, "lens_px": lens_px, "led_px": disk_px, "defocus_px": defocus_px}
+    values = {
+        "width_px": width,
+        "lens_px": lens_px,
+        "led_px": disk_px,
+        "defocus_px": defocus_px,
+    }
     return Fact("image size", [text], values)
 
 
@@ -239,7 +254,9 @@ def cap_margin(
         return None
     listed = points.kind == "listed"
     cap_deg = (
-        max_tilt_deg(context.lab.camera.sources.place[:, :3]) if listed else float(points.cap_deg)
+        max_tilt_deg(context.lab.camera.sources.place[:, :3])
+        if listed
+        else float(points.cap_deg)
     )
     if tilt_deg is None:
         tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
@@ -258,7 +275,9 @@ def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> floa
     azimuth = 2 * np.pi * np.arange(SIDES) / SIDES
     assert surface is not None
     radius = radius_px / context.camera.optics.camera.focal_px
-    rays_cam = np.column_stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.ones(SIDES)])
+    rays_cam = np.column_stack(
+        [radius * np.cos(azimuth), radius * np.sin(azimuth), np.ones(SIDES)]
+    )
     tilts = np.column_stack([azimuth, np.full(SIDES, math.radians(tilt_deg)), -azimuth])
     needed_deg = 0.0
     for lab_from_body in Rotation.from_euler("ZYZ", tilts):
@@ -304,7 +323,8 @@ def room(context: Context, samples: CheckedSamples) -> Fact | None:
     values = fit(light.room, surface, light.layout.cap_deg)
     x_m, y_m, z_m = values["extent_m"]
     floor = [
-        f"{size:.2f} m" if size is not None else "any" for size in (limits.width_m, limits.length_m)
+        f"{size:.2f} m" if size is not None else "any"
+        for size in (limits.width_m, limits.length_m)
     ]
     text = f"{x_m:.2f} x {y_m:.2f} x {z_m:.2f} m along x, y, z (room: {floor[0]} x {floor[1]})"
     if limits.bearing_height_m is not None:
@@ -313,11 +333,10 @@ def room(context: Context, samples: CheckedSamples) -> Fact | None:
     if limits.door_m is not None:
         part = "the shell" if limits.segments == 1 else f"each of {limits.segments} segments"
         sides, door = (
-            " x ".join(f"{side:.2f}" for side in box) for box in (values["part_m"], limits.door_m)
+            " x ".join(f"{side:.2f}" for side in box)
+            for box in (values["part_m"], limits.door_m)
         )
-        text += (
-            f"; {part} goes into a box of {sides} m, shortest side first: fits the door of {door} m"
-        )
+        text += f"; {part} goes into a box of {sides} m, shortest side first: fits the door of {door} m"
     return Fact("room", [text], values)
 
 
@@ -395,7 +414,9 @@ def expected_error(context: Context, samples: CheckedSamples) -> Fact:
         for angle in ("cross", "roll")
         if causes(chosen, angle)
     ]
-    lines.append("cross: sqrt(x² + y²), x and y the errors about both axes across the boresight")
+    lines.append(
+        "cross: sqrt(x² + y²), x and y the errors about both axes across the boresight"
+    )
     named = {name for angle in ("cross", "roll") for name in causes(chosen, angle)}
     if named & {*SURVEYED, *(["focal length"] if context.beliefs.focal_sigma else [])}:
         lines.append(
@@ -414,7 +435,9 @@ def causes(sampled: Sampled, angle: str) -> dict[str, float]:
     known = np.isfinite(sampled.error.total(angle))
     size = {name: mean_root(variance[known]) for name, variance in by_cause.items()}
     return {
-        name: value for name, value in sorted(size.items(), key=lambda item: -item[1]) if value > 0
+        name: value
+        for name, value in sorted(size.items(), key=lambda item: -item[1])
+        if value > 0
     }
 
 

@@ -28,7 +28,12 @@ from skysim.simulation.checks.detection import (
     full_scale_e,
     threshold_e,
 )
-from skysim.simulation.checks.expected_error import Independent, believed_sigma_px, gains, mismatch
+from skysim.simulation.checks.expected_error import (
+    Independent,
+    believed_sigma_px,
+    gains,
+    mismatch,
+)
 from skysim.simulation.checks.facts import GAUSSIAN_WIDTH, cap_margin, fill, short
 from skysim.simulation.checks.sampling import CheckedSamples
 from skysim.simulation.checks.views import View
@@ -75,7 +80,9 @@ def saturation(context: Context, samples: CheckedSamples) -> str:
     (first, value), *more = dimmer(context, factor).items()
     others = "".join(f", or {key} to {other}" for key, other in more)
     if factor < FILTER_BELOW and isinstance(transmission := scene.camera.transmission, float):
-        others += f", or camera.transmission to {short(factor * transmission, 2)}, a gray filter"
+        others += (
+            f", or camera.transmission to {short(factor * transmission, 2)}, a gray filter"
+        )
     return f"{first}: {text} {value}{others}"
 
 
@@ -240,7 +247,11 @@ def undetected(context: Context, samples: CheckedSamples) -> str:
     seen = sum(min(len(view), settings.max_blobs) for view in samples.frames.seen)
     used = sum(map(len, samples.frames.used))
     explained = (bright_background, dark_corners, long_smear)
-    if not seen or used >= MIN_DETECTED * seen or any(find(context, samples) for find in explained):
+    if (
+        not seen
+        or used >= MIN_DETECTED * seen
+        or any(find(context, samples) for find in explained)
+    ):
         return ""
     area = np.concatenate([detected_area_px(view, context) for view in samples.frames.seen])
     text = f"the tracker detects {100 * used / seen:.0f} % of the lights in the field"
@@ -266,15 +277,21 @@ def brighter(scene: Scene, factor: float, text: str) -> str:
     led = getattr(scene.light, "led", None)
     if exposure_s <= 1 / scene.exposure.rate_hz:
         other = (
-            "light.led.intensity as much" if led is not None else "camera.f_number to a faster lens"
+            "light.led.intensity as much"
+            if led is not None
+            else "camera.f_number to a faster lens"
         )
-        return f"exposure.time: {text}; change it to {short(1e3 * exposure_s, 2)} ms, or {other}"
+        return (
+            f"exposure.time: {text}; change it to {short(1e3 * exposure_s, 2)} ms, or {other}"
+        )
     if led is None:
         return f"camera.f_number: {text}; change it to {short(scene.camera.f_number / math.sqrt(factor), 2)}"
     if led.intensity_cd is not None:
         return f"light.led.intensity: {text}; change it to {short(1e3 * factor * led.intensity_cd, 2)} mcd"
     radiant_uw_sr = 1e6 * factor * led.radiant_intensity_w_sr
-    return f"light.led.radiant_intensity: {text}; change it to {short(radiant_uw_sr, 2)} uW / sr"
+    return (
+        f"light.led.radiant_intensity: {text}; change it to {short(radiant_uw_sr, 2)} uW / sr"
+    )
 
 
 def not_where_expected(context: Context, samples: CheckedSamples) -> str:
@@ -298,7 +315,9 @@ def not_where_expected(context: Context, samples: CheckedSamples) -> str:
         f"{100 * beyond:.0f} % of the images are up to {short(residual_px.max(), 2)} px from where the tracker expects"
         f" them, beyond its matching radius of {short(np.median(gate_px), 2)} px"
     )
-    rate_deg_s = float(np.degrees(np.linalg.norm(frames.attitudes.rate_body_rad_s, axis=1)).max())
+    rate_deg_s = float(
+        np.degrees(np.linalg.norm(frames.attitudes.rate_body_rad_s, axis=1)).max()
+    )
     cause = max(found[0].by_cause, key=lambda name: max(one.by_cause[name] for one in found))
     text += f", at up to {rate_deg_s:.3g} deg/s" if cause == "rolling shutter" else ""
     excess = float(np.quantile(residual_px / gate_px, 1 - MAX_BEYOND))
@@ -329,7 +348,9 @@ CHANGES: dict[str, Callable[[Scene, float], str]] = {
     "focal length": lambda scene, excess: (
         f"change it to {short(1e3 * scene.camera.focal_length_m, 5)} mm"
     ),
-    "distortion": lambda scene, excess: f"change it to {list(scene.camera.distortion)}, the lens's",
+    "distortion": lambda scene, excess: (
+        f"change it to {list(scene.camera.distortion)}, the lens's"
+    ),
     "assumed lever": lambda scene, excess: (
         "leave it out, or fit the place with tracker.solver: pnp"
     ),
@@ -356,7 +377,9 @@ def cap_too_small(context: Context, samples: CheckedSamples) -> str:
     if getattr(light.layout, "points", light.layout).kind == "listed":
         return ""
     key = (
-        "light.layout.points.cap_deg" if hasattr(light.layout, "points") else "light.layout.cap_deg"
+        "light.layout.points.cap_deg"
+        if hasattr(light.layout, "points")
+        else "light.layout.cap_deg"
     )
     uncovered = (
         "the tilt itself is not covered"
@@ -379,7 +402,9 @@ def out_of_focus(context: Context, samples: CheckedSamples) -> str:
     if not len(defocus):
         return ""
     blur_px = 2 * float(np.median(defocus))
-    sharp_px = GAUSSIAN_WIDTH * float(np.median(np.sqrt(np.maximum(sigma**2 - defocus**2 / 4, 0))))
+    sharp_px = GAUSSIAN_WIDTH * float(
+        np.median(np.sqrt(np.maximum(sigma**2 - defocus**2 / 4, 0)))
+    )
     if blur_px <= max(MAX_DEFOCUS * sharp_px, MIN_DEFOCUS_PX):
         return ""
     # Defocus is proportional to the difference of 1 / distance, so the best focus is at the middle of it; 0 for stars.
@@ -401,7 +426,9 @@ def long_smear(context: Context, samples: CheckedSamples) -> str:
     longest_px = float(length_px.max())
     if longest_px <= limit_px:
         return ""
-    rate_deg_s = float(np.degrees(np.linalg.norm(frames.attitudes.rate_body_rad_s, axis=1)).max())
+    rate_deg_s = float(
+        np.degrees(np.linalg.norm(frames.attitudes.rate_body_rad_s, axis=1)).max()
+    )
     shorter_ms = 1e3 * scene.exposure.time_s * limit_px / longest_px
     return (
         f"exposure.time: images move by up to {longest_px:.0f} px during an exposure, at {rate_deg_s:.3g} deg/s; change"

@@ -53,12 +53,15 @@ class Check(NamedTuple):
     def as_dict(self) -> dict[str, Any]:
         """The check as a JSON object."""
         numbers = {
-            fact.name.replace(" ", "_"): {"text": fact.lines, **fact.values} for fact in self.facts
+            fact.name.replace(" ", "_"): {"text": fact.lines, **fact.values}
+            for fact in self.facts
         }
         return {"facts": numbers, "findings": self.findings}
 
 
-def check(lab: Lab, tilt_deg: float | None = None, rate_body_rad_s: Floats | None = None) -> Check:
+def check(
+    lab: Lab, tilt_deg: float | None = None, rate_body_rad_s: Floats | None = None
+) -> Check:
     """Facts and warnings of a lab. Its motion is not simulated.
 
     Parameters
@@ -93,11 +96,13 @@ def check(lab: Lab, tilt_deg: float | None = None, rate_body_rad_s: Floats | Non
     samples = samples_of(context, frames, tilt_deg)
     # 3. Facts and warnings.
     built = [
-        build(context, samples) for build in (*FACTS, sky_warnings.faintest_star, sky_warnings.fact)
+        build(context, samples)
+        for build in (*FACTS, sky_warnings.faintest_star, sky_warnings.fact)
     ]
     facts = [fact for fact in built if fact is not None]
     found = [
-        find(context, samples) for find in (*FINDINGS, *SKY_FINDINGS, dome_warnings.mirror_images)
+        find(context, samples)
+        for find in (*FINDINGS, *SKY_FINDINGS, dome_warnings.mirror_images)
     ]
     findings = [line for line in found if line]
     for finder in (sky_warnings.bodies_near, sky_warnings.stray_light, sky_warnings.exclusion):
@@ -135,7 +140,9 @@ def samples_of(
     context: Context, frames: CheckedAttitudes, tilt_deg: float | None
 ) -> CheckedSamples:
     """The views of the camera at the frames and at the attitudes in reach."""
-    reach = attitudes.within_reach(context.lab.scene, context.lab.camera.mount, frames, tilt_deg)
+    reach = attitudes.within_reach(
+        context.lab.scene, context.lab.camera.mount, frames, tilt_deg
+    )
     return CheckedSamples(sampled(frames, context), sampled(reach, context))
 
 
@@ -219,5 +226,9 @@ def errors_text(cross: float, roll: float) -> str:
 def head_findings(n: int, own: Sequence[str], main: Sequence[str]) -> list[str]:
     """The warnings of head n that are not those of the main camera, with the key of the head."""
     # The mount of a head points it elsewhere, not the start of the motion.
-    lines = [line.replace("motion.start:", "rotation_deg:", 1) for line in own if line not in main]
-    return [f"heads.{n}.{line}" for line in lines if line.startswith(OWN_KEYS) and line not in main]
+    lines = [
+        line.replace("motion.start:", "rotation_deg:", 1) for line in own if line not in main
+    ]
+    return [
+        f"heads.{n}.{line}" for line in lines if line.startswith(OWN_KEYS) and line not in main
+    ]

@@ -94,7 +94,9 @@ def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
         found, names = known_lights(beam, exposure, context, acceleration)
         known.append(found)
         seen.append(found.take(found.behind == VISIBLE))
-        hidden.append(Counter(names[number] for number in found.behind[found.behind != VISIBLE]))
+        hidden.append(
+            Counter(names[number] for number in found.behind[found.behind != VISIBLE])
+        )
         others.append(other_lights(beam, exposure, context))
     # 3. Detected lights, and the expected errors of a solution with them.
     used = [usable(view, context) for view in seen]

@@ -60,10 +60,14 @@ def refraction(context: Context, samples: CheckedSamples) -> str:
     half_rad = context.camera.optics.field_rad
     around_rad = zenith_rad + np.array([0.0, half_rad, -half_rad])
     middle, low, high = (
-        atmosphere.air.refraction.bending_rad(np.abs(around_rad)) * np.sign(around_rad) / ARCSEC_RAD
+        atmosphere.air.refraction.bending_rad(np.abs(around_rad))
+        * np.sign(around_rad)
+        / ARCSEC_RAD
     )
     expected_arcsec = samples.frames.error.rms_arcsec()[0]
-    if not middle > max(MIN_RAISED_ARCSEC, 0.0 if math.isnan(expected_arcsec) else expected_arcsec):
+    if not middle > max(
+        MIN_RAISED_ARCSEC, 0.0 if math.isnan(expected_arcsec) else expected_arcsec
+    ):
         return ""
     where = attitudes.describe(at, n, lab.scene, lab.camera.mount)
     text = (
@@ -77,7 +81,10 @@ def refraction(context: Context, samples: CheckedSamples) -> str:
 
 # Sun, Moon and planets in the field or near it.
 
-NEAR_DEG = {"sun": 60.0, "moon": 30.0}  # angle from the boresight within which stray light matters
+NEAR_DEG = {
+    "sun": 60.0,
+    "moon": 30.0,
+}  # angle from the boresight within which stray light matters
 
 
 def bodies_near(context: Context, samples: CheckedSamples) -> Iterator[str]:
@@ -91,16 +98,22 @@ def bodies_near(context: Context, samples: CheckedSamples) -> Iterator[str]:
         for body in beam.discs:
             z = float(cam_from_lab[n].apply(body.place.direction)[2])
             off = math.acos(max(min(z, 1.0), -1.0)), n, body
-            closest[body.name] = min(closest.get(body.name, off), off, key=lambda found: found[0])
+            closest[body.name] = min(
+                closest.get(body.name, off), off, key=lambda found: found[0]
+            )
     # 2. Warnings.
     for name, (off_rad, n, body) in closest.items():
         seen = body.truth()
         where = attitudes.describe(at, n, lab.scene, lab.camera.mount)
         what = f"light.bodies: {NAMES[body.id]} (V {seen.v_mag:.1f}, {short(seen.diameter_arcsec, 2)}″ wide)"
         far = f"{math.degrees(off_rad):.1f}° from the boresight at {where}"
-        if in_field(cam_from_lab[n].apply(body.place.direction), body.radius_rad, lab.scene.camera):
+        if in_field(
+            cam_from_lab[n].apply(body.place.direction), body.radius_rad, lab.scene.camera
+        ):
             yield f"{what} is in the field, {far}: {short(peak_fill(context, body), 2)} times saturation"
-        elif lab.scene.camera.baffle is None and off_rad < math.radians(NEAR_DEG.get(name, 0.0)):
+        elif lab.scene.camera.baffle is None and off_rad < math.radians(
+            NEAR_DEG.get(name, 0.0)
+        ):
             yield f"{what} is {far}; its stray light is not drawn: add camera.baffle, or a background of kind stray"
 
 
@@ -248,7 +261,10 @@ def exclusion(context: Context, samples: CheckedSamples) -> Iterator[str]:
         return
     boresight = (at.lab_from_body * lab.camera.mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
     angles_deg = np.array(
-        [beside_deg(context, t, axis) for t, axis in zip(at.t_s.tolist(), boresight, strict=True)]
+        [
+            beside_deg(context, t, axis)
+            for t, axis in zip(at.t_s.tolist(), boresight, strict=True)
+        ]
     )
     limits_deg = {"sun": limits.sun_deg, "earth": limits.earth_deg, "moon": limits.moon_deg}
     for column, (name, limit_deg) in enumerate(limits_deg.items()):
@@ -335,9 +351,7 @@ def sky_too_shallow(context: Context, samples: CheckedSamples) -> str:
     if limit_mag <= min(faintest_mag + CATALOG_MARGIN_MAG, DEEPEST_V):
         return ""
     wanted = min(math.ceil(2 * limit_mag) / 2, DEEPEST_V)
-    return (
-        f"light.catalog: {text} a file of `skysim catalog build --source gaia --limit {wanted:g}`"
-    )
+    return f"light.catalog: {text} a file of `skysim catalog build --source gaia --limit {wanted:g}`"
 
 
 def tracker_too_shallow(context: Context, samples: CheckedSamples) -> str:
@@ -368,7 +382,9 @@ def detection_limit_mag(context: Context, samples: CheckedSamples) -> float:
         context.settings.min_area_px / (2 * math.pi * blur2_px2)
     )
     none = np.zeros(1)
-    share = peak_share(np.array([blur2_px2]), none, none, np.array([least_streak_px(samples)]))[0]
+    share = peak_share(np.array([blur2_px2]), none, none, np.array([least_streak_px(samples)]))[
+        0
+    ]
     reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
     return 2.5 * math.log10(
         reference_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s * share / peak_e
@@ -397,5 +413,7 @@ def snr_limit_mag(context: Context, samples: CheckedSamples) -> float:
 
 def least_streak_px(samples: CheckedSamples) -> float:
     """Length of the images' path at the slowest frame."""
-    lengths_px = [np.median(view.streak_length_px) for view in samples.frames.known if len(view)]
+    lengths_px = [
+        np.median(view.streak_length_px) for view in samples.frames.known if len(view)
+    ]
     return float(min(lengths_px, default=0.0))

@@ -169,14 +169,18 @@ def glow_by_light_e(beam: Beam, exposure_s: float) -> dict[str, float]:
     found: dict[str, float] = {}
     for lit in beam.lits:
         smooth = float(np.mean(lit.glow())) if lit.glow else 0.0
-        found[lit.name] = found.get(lit.name, 0.0) + exposure_s * (smooth + before_lights_e_s(lit))
+        found[lit.name] = found.get(lit.name, 0.0) + exposure_s * (
+            smooth + before_lights_e_s(lit)
+        )
     return found
 
 
 def before_lights_e_s(lit: Lit) -> float:
     """Electrons s^-1 px^-1 of light with edges in the background of other lights; 0 if it hides them."""
     glow = lit.edged.e_s() if lit.edged and lit.hides is None else None
-    return 0.0 if glow is None or lit.edged is None else lit.edged.share * float(np.median(glow))
+    return (
+        0.0 if glow is None or lit.edged is None else lit.edged.share * float(np.median(glow))
+    )
 
 
 def view(
@@ -286,7 +290,9 @@ def image_gradient(optics: Optics, offset_m: Floats) -> Floats:
     return np.asarray(np.swapaxes(ahead - behind, 1, 2) / (2 * step_m.max(axis=2)[:, None, :]))
 
 
-def peak_share(lens2_px2: Floats, disk_px: Floats, defocus_px: Floats, streak_px: Floats) -> Floats:
+def peak_share(
+    lens2_px2: Floats, disk_px: Floats, defocus_px: Floats, streak_px: Floats
+) -> Floats:
     """(n,) share of the light in the brightest pixel.
 
     The image is a disk of radius R, the larger of LED and defocus disk, blurred by a Gaussian of variance

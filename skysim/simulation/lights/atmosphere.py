@@ -17,7 +17,15 @@ from skysim.core.random_streams import SCINTILLATION, random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.surroundings import AirGlowConfig
-from skysim.simulation.lights.light import Beam, Exposure, Light, LightPlan, Lit, Obstacle, Occluder
+from skysim.simulation.lights.light import (
+    Beam,
+    Exposure,
+    Light,
+    LightPlan,
+    Lit,
+    Obstacle,
+    Occluder,
+)
 from skysim.sources.air import Air, Sky
 
 

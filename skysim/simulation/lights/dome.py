@@ -128,7 +128,10 @@ def black_pixels(
 def of_dome(config: DomeConfig, plan: LightPlan) -> KnownLight:
     """The LEDs of a dome. Raises InputError for LEDs off the surface, and for a dome that does not fit its room."""
     return LedDome(
-        dome.sources(config, plan.band), Emitter.from_config(config.led), config, plan.scene.thermal
+        dome.sources(config, plan.band),
+        Emitter.from_config(config.led),
+        config,
+        plan.scene.thermal,
     )
 
 

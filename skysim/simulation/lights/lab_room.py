@@ -16,7 +16,15 @@ from skysim.dynamics import multibody
 from skysim.scene.sections.leds import WarmUpConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lights.dome import known_light
-from skysim.simulation.lights.light import Beam, Exposure, Light, LightPlan, Lit, Obstacle, Occluder
+from skysim.simulation.lights.light import (
+    Beam,
+    Exposure,
+    Light,
+    LightPlan,
+    Lit,
+    Obstacle,
+    Occluder,
+)
 from skysim.sources.dome.interreflection import ReflectingDome, reflecting_dome
 from skysim.sources.dome.led import warm_up_factor
 from skysim.sources.dome.surface import Surface, build_surface

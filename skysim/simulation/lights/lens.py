@@ -13,7 +13,15 @@ from skysim.camera.discs import centers_of
 from skysim.camera.glow.earth_glow import stray_around_e_s_m2, stray_of_bodies_e_s_m2
 from skysim.camera.glow.stray import ghost_optics
 from skysim.scene.sections.camera import BaffleConfig, GhostConfig, GlareConfig
-from skysim.simulation.lights.light import Beam, Exposure, Light, LightPath, LightPlan, Lit, beam_of
+from skysim.simulation.lights.light import (
+    Beam,
+    Exposure,
+    Light,
+    LightPath,
+    LightPlan,
+    Lit,
+    beam_of,
+)
 from skysim.sources.bodies import BodyLight
 
 STRAY_LIGHT = "stray light"
@@ -47,7 +55,9 @@ class Baffle(Light):
 def visible_discs(lit: Lit) -> Iterator[BodyLight]:
     """The discs of a light whose centers are not hidden."""
     occludes = lit.occlusion
-    hidden = occludes(centers_of(lit.discs).place) if occludes else np.zeros(len(lit.discs), bool)
+    hidden = (
+        occludes(centers_of(lit.discs).place) if occludes else np.zeros(len(lit.discs), bool)
+    )
     return itertools.compress(lit.discs, ~hidden)
 
 

@@ -26,7 +26,12 @@ from skysim.sources.bodies import bodies_from
 from skysim.sources.camera_orbit import hidden_by_earth, sun_m
 from skysim.sources.ephemeris import GcrsState
 from skysim.sources.orbit_elements import MeanElements, read_elements
-from skysim.sources.satellites import MovingLight, as_sources, known_satellites, random_satellites
+from skysim.sources.satellites import (
+    MovingLight,
+    as_sources,
+    known_satellites,
+    random_satellites,
+)
 
 # The Earth under a camera in orbit: it hides stars, and its day side and its air shine.
 
@@ -104,14 +109,20 @@ class Satellites(Light):
         found: list[MovingLight] = []
         if self.elements:
             found += known_satellites(
-                self.elements, self.config.standard_mag, exposure.view, exposure.time, observer_at
+                self.elements,
+                self.config.standard_mag,
+                exposure.view,
+                exposure.time,
+                observer_at,
             )
         if self.config.random and exposure.seeds:
             found += random_satellites(
                 self.config.random, exposure.view, exposure.seeds.camera, exposure.index
             )
         points = as_sources(found, exposure.band) if found else None
-        return Lit("satellites", points=points, satellites=tuple(light.truth for light in found))
+        return Lit(
+            "satellites", points=points, satellites=tuple(light.truth for light in found)
+        )
 
 
 def build_satellites(plan: LightPlan) -> Iterator[Light]:

@@ -71,7 +71,12 @@ def stars_of(config: StarsConfig, plan: LightPlan) -> KnownLight:
     if config.bodies or config.satellites or config.air or viewpoint.orbit:
         velocity_m_s = viewpoint.state_at(0.0).velocity_m_s
     shown = stars.sources(
-        catalog, scene.start_time, config.limit_mag, Rotation.identity(), plan.band, velocity_m_s
+        catalog,
+        scene.start_time,
+        config.limit_mag,
+        Rotation.identity(),
+        plan.band,
+        velocity_m_s,
     )
     if viewpoint.orbit is None:
         return FixedStars(shown, Emitter())

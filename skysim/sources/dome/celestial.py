@@ -78,7 +78,9 @@ def project_stars(
     stars = stars.take(above_horizon)
     # 2.
     place_m = surface.meet(camera_m, direction[above_horizon])
-    within = place_m[:, 2] >= np.cos(np.radians(config.cap_deg)) * np.linalg.norm(place_m, axis=1)
+    within = place_m[:, 2] >= np.cos(np.radians(config.cap_deg)) * np.linalg.norm(
+        place_m, axis=1
+    )
     stars = stars.take(within)
     place_m = place_m[within]
     order = np.argsort(stars.v_mag, kind="stable")
@@ -134,7 +136,10 @@ def merge_stars(stars: ProjectedStars, target: NDArray[np.int64]) -> ProjectedSt
     v_mag = combined_mag(stars.v_mag)
     order = np.argsort(v_mag, kind="stable")
     return ProjectedStars(
-        stars.hip[first][order], v_mag[order], combined_mag(stars.shown_mag)[order], place_m[order]
+        stars.hip[first][order],
+        v_mag[order],
+        combined_mag(stars.shown_mag)[order],
+        place_m[order],
     )
 
 

@@ -85,7 +85,9 @@ class Clocks:
         pulses = self.pulses_at(sources, t_s)
         if self.filter_s is None:
             return pulses
-        share = filtered_share(pulses, self.filter_s, t_s - exposure_s / 2, t_s + exposure_s / 2)
+        share = filtered_share(
+            pulses, self.filter_s, t_s - exposure_s / 2, t_s + exposure_s / 2
+        )
         return replace(pulses, strength=share * pulses.strength, on_s=pulses.period_s)
 
     def pulses_at(self, sources: Sources, t_s: float) -> Sources:
@@ -152,7 +154,9 @@ def build_clocks(light: Light, sources: Sources, seed: int) -> Clocks | None:
 
 def hardware_seed(layout: Layout) -> int:
     """The seed of a layout's hardware; for points on a panel or a shell the seed of the points' layout."""
-    return hardware_seed(layout.points) if isinstance(layout, OnPoints) else layout.hardware_seed
+    return (
+        hardware_seed(layout.points) if isinstance(layout, OnPoints) else layout.hardware_seed
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,5 +227,7 @@ def build_codes(light: Light, sources: Sources, seed: int) -> LedCodes | None:
     code = light.led.code
     clock = None
     if code.bit_time_s != "frame":
-        clock = Clocks.draw(light.led.clock, 1, hardware_seed(light.layout), seed, LED_CODE_CLOCK)
+        clock = Clocks.draw(
+            light.led.clock, 1, hardware_seed(light.layout), seed, LED_CODE_CLOCK
+        )
     return LedCodes(codebook(code, len(sources)), code, clock, seed)

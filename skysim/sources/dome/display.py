@@ -159,10 +159,14 @@ def panel_sources(
     """
     # In the panel's own frame, and back from the rounded places.
     own_m = panel.lab_from_own.inv().apply(stars.place[:, :3] - panel.center_m)
-    blocks = visible_blocks(config, own_m[:, :2], stars.strength / full_strength_e_s_sr(led, band))
+    blocks = visible_blocks(
+        config, own_m[:, :2], stars.strength / full_strength_e_s_sr(led, band)
+    )
     flat_m = np.column_stack([blocks.center_px * config.pitch_m, np.zeros(len(blocks.star))])
     place_m = panel.center_m + panel.lab_from_own.apply(flat_m)
-    patches = LitBlocks(place_m, panel.inward(place_m), config.block * led.disk_diameter_m / 2, 1.0)
+    patches = LitBlocks(
+        place_m, panel.inward(place_m), config.block * led.disk_diameter_m / 2, 1.0
+    )
     row = blocks.corner_px[:, 1] / config.pixels[1]
     return block_sources(config, led, band, stars, blocks, patches, row)
 
@@ -388,7 +392,9 @@ def rays(config: ProjectorConfig, chip_m: Floats) -> Floats:
         excess = tangent * (1 + config.distortion * tangent**2) - radius
         tangent = tangent - excess / (1 + 3 * config.distortion * tangent**2)
     stretch = np.divide(tangent, radius, out=np.ones_like(radius), where=radius > 0)
-    own = np.column_stack([chip_m / config.focal_length_m * stretch[:, None], np.ones(len(chip_m))])
+    own = np.column_stack(
+        [chip_m / config.focal_length_m * stretch[:, None], np.ones(len(chip_m))]
+    )
     own /= np.linalg.norm(own, axis=1, keepdims=True)
     return np.asarray(own_from_lab(config).inv().apply(own))
 
@@ -457,7 +463,9 @@ def projector_sources(
             "light.layout.position", f"{config.position_m} m is outside of the dome", "inside"
         )
     # 1.
-    chip_m, shown = on_chip_m(config, own_from_lab(config).apply(stars.place[:, :3] - position_m))
+    chip_m, shown = on_chip_m(
+        config, own_from_lab(config).apply(stars.place[:, :3] - position_m)
+    )
     if not shown.all():
         raise InputError(
             "light.layout.points",

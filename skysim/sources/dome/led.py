@@ -126,7 +126,9 @@ def full_strength_e_s_sr(led: LedConfig, band: Band) -> float:
     if led.intensity_cd is not None:
         return float(led_strength_e_s_sr(led.intensity_cd, led.spectrum, band, led.fwhm_m))
     return float(
-        radiant_strength_e_s_sr(led.radiant_intensity_w_sr or 0.0, led.spectrum, band, led.fwhm_m)
+        radiant_strength_e_s_sr(
+            led.radiant_intensity_w_sr or 0.0, led.spectrum, band, led.fwhm_m
+        )
     )
 
 

@@ -85,7 +85,9 @@ def fit_sphere(points_m: Floats) -> FittedSphere:
         residual, start, method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12
     )
     rms_m = float(scale_m * np.sqrt(np.mean(solution.fun**2)))
-    return FittedSphere(mean_m + scale_m * solution.x[:3], float(scale_m * solution.x[3]), rms_m)
+    return FittedSphere(
+        mean_m + scale_m * solution.x[:3], float(scale_m * solution.x[3]), rms_m
+    )
 
 
 def fit_ellipsoid(points_m: Floats) -> FittedEllipsoid:
@@ -189,7 +191,9 @@ class Zernike:
         distance = np.maximum(np.linalg.norm(disk, axis=1), 1.0)
         value, slope = zernike(self.degree, disk / distance[:, None])
         along = np.where(distance > 1, 0.0, np.einsum("nkj,k->jn", slope, self.coefficient_m))
-        gradient = np.column_stack([*(along * stretch), np.sum(along * disk.T, axis=0) * log_slope])
+        gradient = np.column_stack(
+            [*(along * stretch), np.sum(along * disk.T, axis=0) * log_slope]
+        )
         return value @ self.coefficient_m, gradient
 
 

@@ -94,7 +94,9 @@ def check_door(
     )
     sides = " x ".join(f"{side:.3f}" for side in box_m)
     whole = (
-        "the shell" if room.segments == 1 else f"a part of the shell in {room.segments} segments"
+        "the shell"
+        if room.segments == 1
+        else f"a part of the shell in {room.segments} segments"
     )
     raise InputError(
         "light.room.door",
@@ -105,7 +107,11 @@ def check_door(
 
 
 def largest_part_m(
-    room: RoomConfig, door_m: tuple[float, float], surface: Surface, cap_deg: float, segments: int
+    room: RoomConfig,
+    door_m: tuple[float, float],
+    surface: Surface,
+    cap_deg: float,
+    segments: int,
 ) -> tuple[Floats, float]:
     """The part of the shell that fits the door least: ascending sides of its box, and its ratio to the door."""
     if segments == 1:
@@ -140,7 +146,9 @@ def best_box(
     second = -np.sin(turn) * outward + np.cos(turn) * np.array([0.0, 0.0, 1.0])
     # Sides along the three axes.
     sides_m = np.column_stack([np.ptp(points_m @ axes.T, axis=0) for axes in (first, second)])
-    sides_m = np.sort(np.column_stack([sides_m, np.full(TURNS, np.ptp(points_m @ across))]), axis=1)
+    sides_m = np.sort(
+        np.column_stack([sides_m, np.full(TURNS, np.ptp(points_m @ across))]), axis=1
+    )
     ratio = (sides_m[:, :2] / np.sort(door_m)).max(axis=1)
     best = int(ratio.argmin())
     return sides_m[best], float(ratio[best])
@@ -166,7 +174,9 @@ def shell_m(room: RoomConfig, surface: Surface, cap_deg: float, azimuth_rad: Flo
     )
     limit_rad = np.pi if ends else np.radians(cap_deg)
     tilt_rad = np.linspace(0, limit_rad, TILTS)
-    tilts, azimuths = (grid.ravel() for grid in np.meshgrid(tilt_rad, azimuth_rad, indexing="ij"))
+    tilts, azimuths = (
+        grid.ravel() for grid in np.meshgrid(tilt_rad, azimuth_rad, indexing="ij")
+    )
     met = meet(surface, tilts, azimuths)
     on_shell = np.isfinite(met[:, 0]).reshape(TILTS, len(azimuth_rad))
     edges = []
@@ -193,7 +203,9 @@ def meet(surface: Surface, tilt_rad: Floats, azimuth_rad: Floats) -> Floats:
     return surface.meet(np.zeros(3), directions(tilt_rad, azimuth_rad))
 
 
-def find_edges(surface: Surface, on_rad: Floats, off_rad: Floats, azimuth_rad: Floats) -> Floats:
+def find_edges(
+    surface: Surface, on_rad: Floats, off_rad: Floats, azimuth_rad: Floats
+) -> Floats:
     """(N, 3) last points of the shell between tilts on it and tilts off it, by bisection."""
     for _ in range(BISECTIONS):
         middle_rad = (on_rad + off_rad) / 2

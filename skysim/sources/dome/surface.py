@@ -245,7 +245,9 @@ class Plane(Surface):
     def nearest_ellipsoid(self) -> FittedEllipsoid:
         """A sphere so large that it is flat to a micrometer within a meter."""
         up = self.lab_from_own.apply([0.0, 0.0, 1.0])
-        return FittedEllipsoid(self.center_m - FLAT_RADIUS_M * up, np.full(3, FLAT_RADIUS_M), 0.0)
+        return FittedEllipsoid(
+            self.center_m - FLAT_RADIUS_M * up, np.full(3, FLAT_RADIUS_M), 0.0
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -321,7 +323,9 @@ class Shell:
         ring = np.hypot(unit[:, 0], unit[:, 1])
         angle = np.arctan2(ring, unit[:, 2])
         # dr / d(angle) between apex and base.
-        slope = -self.inner_fraction * (self.thickness_m[1] - self.thickness_m[0]) / self.base_rad
+        slope = (
+            -self.inner_fraction * (self.thickness_m[1] - self.thickness_m[0]) / self.base_rad
+        )
         at_apex = self.max_m - self.inner_fraction * self.thickness_m[0]
         radius = at_apex + slope * np.minimum(angle, self.base_rad)
         # Unit vector toward greater angles; zero at the apex, where the law has no tangent.
@@ -439,10 +443,14 @@ def sphere(config: light.SphereSurfaceConfig) -> Surface:
         )
     thickness_m = (config.wall.thickness_apex_m, config.wall.thickness_base_m)
     inner_fraction = {"outside": 1.0, "mid_wall": 0.5}[config.wall.radius_of]
-    shell = Shell(config.radius_m, inner_fraction, thickness_m, math.radians(config.wall.base_deg))
+    shell = Shell(
+        config.radius_m, inner_fraction, thickness_m, math.radians(config.wall.base_deg)
+    )
     return Radial(
         radius=shell,
-        **pose_and_rim(config, config.apex_m - config.radius_m + inner_fraction * thickness_m[0]),
+        **pose_and_rim(
+            config, config.apex_m - config.radius_m + inner_fraction * thickness_m[0]
+        ),
     )
 
 
@@ -479,7 +487,9 @@ def surveyed(config: light.SurveyedSurfaceConfig) -> Surface:
         For points that are far from a smooth surface, or do not reach the rim.
     """
     # A bad fit means wrong points, units or degree.
-    fit = point_cloud.fit(point_cloud.read(config.file, config.unit), config.degree, config.file)
+    fit = point_cloud.fit(
+        point_cloud.read(config.file, config.unit), config.degree, config.file
+    )
     if fit.rms_m > config.rms_limit_m:
         raise InputError(
             "light.surface.file",
@@ -490,7 +500,9 @@ def surveyed(config: light.SurveyedSurfaceConfig) -> Surface:
     pose = pose_and_rim(config, 0.0)
     # The surface's frame has its origin at the best sphere's center; the scene's tilt and rim refer to the points'.
     pose["center_m"] = config.offset_m + pose["lab_from_own"].apply(fit.center_m)
-    pose["rim"] = Rim(-fit.center_m, pose["rim"].lowest_m - fit.center_m[2], pose["rim"].half_rad)
+    pose["rim"] = Rim(
+        -fit.center_m, pose["rim"].lowest_m - fit.center_m[2], pose["rim"].half_rad
+    )
     has_rim = config.rim_height_m is not None or config.rim_deg is not None
     if has_rim and pose["rim"].contains(fit.edge_m()).any():
         raise InputError(
@@ -526,7 +538,8 @@ def build_surface(config: light.SurfaceConfig) -> Surface:
         raise InputError("light.surface", f"the bearing's center is {place}; check {check}")
     if not len(surface.samples_m()):
         raise InputError(
-            "light.surface", "no part of it is above the bearing; check rim, width, height, length"
+            "light.surface",
+            "no part of it is above the bearing; check rim, width, height, length",
         )
     return surface
 

@@ -54,9 +54,15 @@ def polar(config: TotalStationConfig, place_m: Floats) -> tuple[Floats, Floats, 
     distance_m = np.hypot(level_m, sight_m[:, 2])
     if not np.all(distance_m > 0):
         raise InputError(
-            "tracker.survey.instrument.position", "an LED is there", "a place away from the LEDs"
+            "tracker.survey.instrument.position",
+            "an LED is there",
+            "a place away from the LEDs",
         )
-    return np.arctan2(sight_m[:, 1], sight_m[:, 0]), np.arctan2(level_m, sight_m[:, 2]), distance_m
+    return (
+        np.arctan2(sight_m[:, 1], sight_m[:, 0]),
+        np.arctan2(level_m, sight_m[:, 2]),
+        distance_m,
+    )
 
 
 def axes(direction_rad: Floats, zenith_rad: Floats) -> tuple[Floats, Floats, Floats]:
@@ -108,7 +114,9 @@ def moved_m(config: TotalStationConfig, place_m: Floats, setup: Floats) -> Float
     )
 
 
-def surveyed_m(config: TotalStationConfig, place_m: Floats, own: Floats, setup: Floats) -> Floats:
+def surveyed_m(
+    config: TotalStationConfig, place_m: Floats, own: Floats, setup: Floats
+) -> Floats:
     """(N, 3) places in the lab that the survey yields for LEDs at place_m (N, 3).
 
     1. Directions, zenith angles and distances of the LEDs, with the errors of each and of the distance meter.
@@ -125,7 +133,9 @@ def surveyed_m(config: TotalStationConfig, place_m: Floats, own: Floats, setup: 
     direction_rad, zenith_rad, distance_m = polar(config, place_m)
     angles_rad = ARCSEC_RAD * scaled_errors(config.angle_sigma_arcsec, own[:, :2])
     distance_m = (
-        distance_m * (1 + setup[6]) + setup[7] + scaled_errors(config.distance_sigma_m, own[:, 2])
+        distance_m * (1 + setup[6])
+        + setup[7]
+        + scaled_errors(config.distance_sigma_m, own[:, 2])
     )
     # 2.
     along, _, _ = axes(direction_rad + angles_rad[:, 0], zenith_rad + angles_rad[:, 1])
@@ -194,7 +204,9 @@ def surface_offset_m(surface: Surface, seed: int) -> float:
     One draw for the whole surface, of the size light.surface.error (the arm's zero, its probe's radius). Independent
     errors of a thousand points would average out in a fitted ellipsoid.
     """
-    return float(scaled_errors(surface.survey_sigma_m, standard_normals(seed, "surface", (1,)))[0])
+    return float(
+        scaled_errors(surface.survey_sigma_m, standard_normals(seed, "surface", (1,)))[0]
+    )
 
 
 def assumed_leds_m(surface: Surface, place_m: Floats, config: SurveyErrorsConfig) -> Floats:
@@ -212,7 +224,9 @@ def assumed_leds_m(surface: Surface, place_m: Floats, config: SurveyErrorsConfig
         sights = standard_normals(config.seed, "sights", place_m.shape)
         displaced_m = surveyed_m(config.instrument, displaced_m, sights, setup_errors(config))
     # 3.
-    return rotate_survey(assumed_m(displaced_m, config.led_sigma_m, config.seed, "leds"), config)
+    return rotate_survey(
+        assumed_m(displaced_m, config.led_sigma_m, config.seed, "leds"), config
+    )
 
 
 def setup_errors(config: SurveyErrorsConfig) -> Floats:

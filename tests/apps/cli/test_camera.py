@@ -46,7 +46,8 @@ def test_a_camera_shows_its_field_and_the_angle_of_a_pixel(
 
 def test_a_preset_is_shown_with_a_lens_and_without(camera: Command) -> None:
     assert (
-        line(camera("imx264"), "field of view") == "no lens: add --set camera.focal_length='16 mm'"
+        line(camera("imx264"), "field of view")
+        == "no lens: add --set camera.focal_length='16 mm'"
     )
     shown = json.loads(camera("--json", "imx264", "--set", "camera.focal_length=16 mm").stdout)
     assert shown["field_deg"][0] == pytest.approx(
@@ -117,7 +118,13 @@ def test_a_new_camera_from_options_names_what_is_not_stated(
         "30910 (900 e- a square micrometer, as in the IMX264): it is unknown"
     )
     assert (
-        len([row for row in done.stdout.splitlines() if row.startswith("  ") and row[2].isalpha()])
+        len(
+            [
+                row
+                for row in done.stdout.splitlines()
+                if row.startswith("  ") and row[2].isalpha()
+            ]
+        )
         == 11
     )
     scene = {"schema": 1, "base": "shefex2", "camera": {"preset": "my.yaml"}}
@@ -129,9 +136,26 @@ def test_a_new_camera_from_options_names_what_is_not_stated(
     assert again.stderr == "skysim: --out my.yaml: exists; allowed: a new .yaml file\n"
 
 
-def test_questions_are_asked_again_after_a_wrong_answer(camera: Command, tmp_path: Path) -> None:
+def test_questions_are_asked_again_after_a_wrong_answer(
+    camera: Command, tmp_path: Path
+) -> None:
     """An empty answer to a required question counts as wrong; lens and row-time questions depend on answers."""
-    answers = ["", "1936x1216", "5.86", "5.86 um", "", "", "", "12", "", "32513", "", "", "", ""]
+    answers = [
+        "",
+        "1936x1216",
+        "5.86",
+        "5.86 um",
+        "",
+        "",
+        "",
+        "12",
+        "",
+        "32513",
+        "",
+        "",
+        "",
+        "",
+    ]
     done = camera("new", answers="\n".join(answers) + "\n")
     assert done.stderr.splitlines()[:2] == [
         "skysim: pixels: required",

@@ -59,7 +59,9 @@ class Ran(NamedTuple):
 class Skysim:
     """Runs the command in this process; stderr is read at the file descriptor, where C libraries print too."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    ) -> None:
         self.monkeypatch = monkeypatch
         self.capfd = capfd
 
@@ -130,7 +132,9 @@ def test_export_writes_a_scene_that_mujoco_loads(skysim: Skysim, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_export_writes_a_list_of_leds_that_a_scene_reads(skysim: Skysim, tmp_path: Path) -> None:
+def test_export_writes_a_list_of_leds_that_a_scene_reads(
+    skysim: Skysim, tmp_path: Path
+) -> None:
     path = tmp_path / "leds.csv"
     done = skysim("scenes", "export", "afit_simsat", "--out", path)
     layout = f"{{kind: listed, cap_deg: 28, file: {path}}}"
@@ -164,7 +168,9 @@ def test_render_writes_only_frames_with_their_truth(rendered: Path) -> None:
 
 
 @pytest.mark.slow
-def test_an_error_at_the_first_frame_keeps_earlier_results(skysim: Skysim, tmp_path: Path) -> None:
+def test_an_error_at_the_first_frame_keeps_earlier_results(
+    skysim: Skysim, tmp_path: Path
+) -> None:
     words = ["render", "afit_simsat", "--frames", "1", "--out", str(tmp_path)]
     assert skysim(*words).code == 0
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -251,7 +257,9 @@ def test_solve_ignores_an_impossible_header_date_with_a_warning(
         with fits.open(rendered / "frame_0000.fits") as hdus:
             hdus[0].header["DATE-OBS"] = date
             hdus.writeto(frames[name])
-    ran = skysim("solve", *frames.values(), "--camera", SHEFEX, "--json", "--out", tmp_path / "out")
+    ran = skysim(
+        "solve", *frames.values(), "--camera", SHEFEX, "--json", "--out", tmp_path / "out"
+    )
     none, late, good = json.loads(ran.out)
     assert ran.code == 0
     assert ran.err == (
@@ -270,9 +278,14 @@ def test_solve_ignores_an_impossible_header_date_with_a_warning(
 def test_solve_writes_what_it_prints_and_a_picture(
     skysim: Skysim, rendered: Path, tmp_path: Path
 ) -> None:
-    ran = skysim("solve", rendered / "frame_0000.png", "--fov", "14.8", "--json", "--out", tmp_path)
+    ran = skysim(
+        "solve", rendered / "frame_0000.png", "--fov", "14.8", "--json", "--out", tmp_path
+    )
     assert json.loads((tmp_path / "solutions.json").read_text()) == json.loads(ran.out)
-    assert {p.name for p in tmp_path.iterdir()} == {"solutions.json", "frame_0000.annotated.png"}
+    assert {p.name for p in tmp_path.iterdir()} == {
+        "solutions.json",
+        "frame_0000.annotated.png",
+    }
     height, width, channels = cv2.imread(str(tmp_path / "frame_0000.annotated.png")).shape
     assert (height * 659, channels) == (width * 493, 3)
 
@@ -385,7 +398,15 @@ def test_the_stages_of_a_run_are_those_named(skysim: Skysim, tmp_path: Path) -> 
         "--set",
         "tracker.solver=magic",
     ]
-    named = ["--detector", "default", "--centroider", "cog", "--identifier", "pyramid", "--solver"]
+    named = [
+        "--detector",
+        "default",
+        "--centroider",
+        "cog",
+        "--identifier",
+        "pyramid",
+        "--solver",
+    ]
     (triad,), (quest,) = (
         json.loads(skysim(*words, *named, solver).out)["rows"] for solver in ("triad", "quest")
     )
@@ -406,7 +427,9 @@ def test_exposure_times_are_recorded_frame_by_frame(skysim: Skysim, tmp_path: Pa
     exposures_s = [fits.getheader(tmp_path / f"frame_000{n}.fits")["EXPTIME"] for n in (0, 1)]
     assert exposures_s == pytest.approx([0.040, 0.042], abs=1e-12)
     for n in (0, 1):
-        np.testing.assert_array_equal(images.read_image(tmp_path / f"frame_000{n}.fits"), solved[n])
+        np.testing.assert_array_equal(
+            images.read_image(tmp_path / f"frame_000{n}.fits"), solved[n]
+        )
 
 
 # Scenes that are wrong
@@ -442,7 +465,10 @@ def test_exposure_times_are_recorded_frame_by_frame(skysim: Skysim, tmp_path: Pa
             ["afit_simsat", "--set", "motion.start={ra_deg: 3, dec_deg: 4}"],
             "requires roll_deg, pitch_deg, yaw_deg",
         ),
-        (["afit_simsat", "--set", "motion.start={roll_deg: 40}"], "up to vehicle.tilt_stop_deg 30"),
+        (
+            ["afit_simsat", "--set", "motion.start={roll_deg: 40}"],
+            "up to vehicle.tilt_stop_deg 30",
+        ),
         (
             ["afit_simsat", "--set", "light.surface.apex=90 in"],
             "the bearing's center is outside of the dome",
@@ -509,9 +535,13 @@ def test_a_bad_scene_is_refused_in_one_line_and_leaves_no_file(
     assert not (tmp_path / "out").exists()
 
 
-def test_an_error_in_a_scene_file_is_reported_with_its_line(skysim: Skysim, tmp_path: Path) -> None:
+def test_an_error_in_a_scene_file_is_reported_with_its_line(
+    skysim: Skysim, tmp_path: Path
+) -> None:
     path = tmp_path / "mine.yaml"
-    path.write_text((SCENES / "afit_simsat.yaml").read_text().replace("inverse_square", "cubic"))
+    path.write_text(
+        (SCENES / "afit_simsat.yaml").read_text().replace("inverse_square", "cubic")
+    )
     line = path.read_text()[: path.read_text().index("falloff:")].count("\n") + 1
     said = skysim("render", path).one_line()
     assert (
@@ -589,14 +619,23 @@ BAD_IMAGES: dict[str, tuple[Any, str]] = {
         lambda at, r: as_png(at, np.dstack([frame_of(r)] * 3)),
         "a color image of shape (493, 659, 3)",
     ),
-    "empty frame": (lambda at, r: as_fits(at, np.zeros_like(frame_of(r))), "the frame is empty"),
-    "flat frame": (lambda at, r: as_fits(at, np.full_like(frame_of(r), 64)), "the frame is empty"),
+    "empty frame": (
+        lambda at, r: as_fits(at, np.zeros_like(frame_of(r))),
+        "the frame is empty",
+    ),
+    "flat frame": (
+        lambda at, r: as_fits(at, np.full_like(frame_of(r), 64)),
+        "the frame is empty",
+    ),
     "saturated": (
         lambda at, r: as_fits(at, np.full_like(frame_of(r), 4064)),
         "the frame is saturated",
     ),
     "NaN": (lambda at, r: as_fits(at, with_nan(frame_of(r))), "NaN or infinite"),
-    "truncated FITS": (lambda at, r: cut(r / "frame_0000.fits", at), "not a complete FITS file"),
+    "truncated FITS": (
+        lambda at, r: cut(r / "frame_0000.fits", at),
+        "not a complete FITS file",
+    ),
     "truncated PNG": (lambda at, r: cut(r / "frame_0000.png", at), "cannot be decoded"),
     "text": (lambda at, _: text_as_png(at), "cannot be decoded"),
     "missing": (lambda at, _: at / "nosuch.fits", "no such file"),
@@ -669,11 +708,17 @@ def test_an_image_of_noise_is_refused(skysim: Skysim, tmp_path: Path) -> None:
             "nosuch: no such scene; allowed: a .yaml file or one of afit_simsat, ",
         ),
         (["--camera", SHEFEX, "--time", "yesterday"], "--time yesterday: allowed: ISO 8601"),
-        (["--time", "9999-12-31T23:59:59"], "--time: 9999-12-31T23:59:59 is outside 1900 to 2100"),
+        (
+            ["--time", "9999-12-31T23:59:59"],
+            "--time: 9999-12-31T23:59:59 is outside 1900 to 2100",
+        ),
         (["--time", "1899-12-31T23:59:59+00:00"], "is outside 1900 to 2100"),
         (["--detector", "magic"], "--detector: unknown detector 'magic'; allowed: default, "),
         (["--centroider", "magic"], "--centroider: unknown centroider 'magic'; allowed: "),
-        (["--identifier", "magic"], "--identifier: unknown identifier 'magic'; allowed: default, "),
+        (
+            ["--identifier", "magic"],
+            "--identifier: unknown identifier 'magic'; allowed: default, ",
+        ),
         (["--solver", "magic"], "--solver: unknown solver 'magic'; allowed: default, quest, "),
     ],
 )
@@ -726,7 +771,9 @@ def test_check_as_json_has_numbers_and_findings(skysim: Skysim) -> None:
         skysim("check", "afit_simsat", "--json", "--set", "light.layout.cap_deg=15").out
     )
     assert report["facts"]["field_of_view"]["arcsec_px"] == pytest.approx(22.6, abs=0.1)
-    assert report["facts"]["expected_error"]["frames"]["cross_arcsec"] == pytest.approx(120, abs=5)
+    assert report["facts"]["expected_error"]["frames"]["cross_arcsec"] == pytest.approx(
+        120, abs=5
+    )
     assert any(line.startswith("light.layout.cap_deg: ") for line in report["findings"])
 
 

@@ -39,7 +39,11 @@ def row(frame: int) -> FrameRow:
 def score(name: str) -> TrackerScore:
     times = {"time_ms_median": 12.5, "time_ms_p95": 123.0}
     errors = dict.fromkeys(
-        [f"{angle}_arcsec_{what}" for angle in ("cross", "roll") for what in ("median", "worst")],
+        [
+            f"{angle}_arcsec_{what}"
+            for angle in ("cross", "roll")
+            for what in ("median", "worst")
+        ],
         1234.5,
     )
     return TrackerScore(
@@ -63,7 +67,9 @@ def test_a_scoreboard_fits_the_terminal_and_keeps_its_main_columns(
 
 def report(motion: dict[str, float]) -> Report:
     picture = np.zeros((4, 4, 3), np.uint8)
-    stages = dict.fromkeys(["render", "detector", "detect", "centroid", "identify", "solve"], 12.34)
+    stages = dict.fromkeys(
+        ["render", "detector", "detect", "centroid", "identify", "solve"], 12.34
+    )
     pictures = {"annotated": picture, "motion_figure": b"", "views": []}
     return run_report(
         "title",
@@ -93,12 +99,17 @@ def test_the_summary_of_a_run_fits_the_terminal(
     assert max(map(len, lines)) <= 80
     assert lines[0] == "Motion"
     assert [line.partition(":")[0] for line in lines[1:3]] == ["pointing", "IMU alone"]
-    assert lines[-2].startswith("2 of 2 frames solved, 0 wrong; ")  # the answer, above the prompt
+    assert lines[-2].startswith(
+        "2 of 2 frames solved, 0 wrong; "
+    )  # the answer, above the prompt
 
 
 @pytest.mark.parametrize(("width", "left_out"), [(80, 10), (110, 5), (240, 0)])
 def test_the_rows_of_a_run_fit_the_terminal(
-    width: int, left_out: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    width: int,
+    left_out: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(as_text, "terminal_width", lambda: width)
     as_text.print_table(frame_table(TRIPLE, [row(0), row(1)]))

@@ -24,7 +24,10 @@ STUDY = {
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("run shefex2 --program mine=cat", "--program mine: has no effect: nothing has this name"),
+        (
+            "run shefex2 --program mine=cat",
+            "--program mine: has no effect: nothing has this name",
+        ),
         (
             "check shefex2 --program mine=cat",
             "--program mine: has no effect: nothing has this name",
@@ -61,7 +64,9 @@ def test_an_option_without_effect_is_refused(
 
 
 @pytest.mark.slow
-def test_a_program_named_by_a_study_s_level_has_an_effect(command: Command, tmp_path: Path) -> None:
+def test_a_program_named_by_a_study_s_level_has_an_effect(
+    command: Command, tmp_path: Path
+) -> None:
     """It is started; its trials fail because `true` ends at once, and the report is written."""
     factors = {"tracker": {"key": "tracker.name", "values": ["own", "mine"]}}
     study = STUDY | {"factors": factors, "trial": {"kind": "frames"}, "scene": "shefex2"}

@@ -64,7 +64,9 @@ def test_every_key_of_the_table_has_an_option_that_exists() -> None:
 
 def test_no_key_of_the_table_is_a_key_of_a_scene_or_a_study() -> None:
     models = (Scene, Study)
-    keys = {field.alias or name for model in models for name, field in model.model_fields.items()}
+    keys = {
+        field.alias or name for model in models for name, field in model.model_fields.items()
+    }
     assert PARAMETERS.isdisjoint(keys)
 
 
@@ -82,7 +84,10 @@ def test_every_parameter_at_fault_below_the_apps_is_in_the_table() -> None:
     ("error", "line"),
     [
         (InputError("survey.tilt_deg", "95", "up to 30"), "--tilt: 95; allowed: up to 30"),
-        (InputError("programs.mine", "name already in use"), "--program mine: name already in use"),
+        (
+            InputError("programs.mine", "name already in use"),
+            "--program mine: name already in use",
+        ),
         (
             InputError("where.rate", "unknown level 5", "1, 2"),
             "--where rate: unknown level 5; allowed: 1, 2",
@@ -91,7 +96,10 @@ def test_every_parameter_at_fault_below_the_apps_is_in_the_table() -> None:
             InputError("overrides", "frames", "path.to.key=value"),
             "--set: frames; allowed: path.to.key=value",
         ),
-        (InputError("seed", "-1", "0 or more", OVERRIDES), "seed: -1; allowed: 0 or more (--set)"),
+        (
+            InputError("seed", "-1", "0 or more", OVERRIDES),
+            "seed: -1; allowed: 0 or more (--set)",
+        ),
         (InputError("seed", "-1", "", Where("x.yaml", 3)), "seed: -1 (x.yaml, line 3)"),
         (InputError("light.layout", "full"), "light.layout: full"),
         (InputError("", "no image"), "no image"),

@@ -20,7 +20,12 @@ from estimator.attitude.solvers import SOLVERS
 from estimator.catalog import published_catalogs
 from estimator.core.checks import Ints
 from estimator.core.types import ra_dec_roll_rad
-from estimator.identification.published.fialho import VERSIONS, MagnitudeMatch, fialho_2, fialho_4
+from estimator.identification.published.fialho import (
+    VERSIONS,
+    MagnitudeMatch,
+    fialho_2,
+    fialho_4,
+)
 from estimator.identification.registry import IDENTIFIERS
 from skysim.core import files, images
 from skysim.core.constants import ARCSEC_RAD
@@ -139,7 +144,11 @@ def screen(folder: Path) -> bool:
 def drawn_at(folder: Path, *sets: str) -> Floats:
     """(3,) right ascension, declination, roll of what is drawn, deg, from the frame's truth."""
     asked(
-        "render", *SCENE, "--out", str(folder), *(word for one in sets for word in ("--set", one))
+        "render",
+        *SCENE,
+        "--out",
+        str(folder),
+        *(word for one in sets for word in ("--set", one)),
     )
     lines = [
         line
@@ -234,7 +243,9 @@ def how_many(folder: Path) -> bool:
 
 def log_file(folder: Path) -> bool:
     flown(folder)
-    return all((folder / name).stat().st_size > 100 for name in ("solutions.ecsv", "report.html"))
+    return all(
+        (folder / name).stat().st_size > 100 for name in ("solutions.ecsv", "report.html")
+    )
 
 
 def histogram(folder: Path) -> bool:
@@ -267,7 +278,9 @@ def readcat(folder: Path) -> bool:
     """A limit, the mission's epoch, and instrumental magnitudes; the order is the file's."""
     path = CATALOGS / "hipparcos_hp6.5.ecsv"
     plain = published_catalogs.read_cat(path, 5.0)
-    later = published_catalogs.read_cat(path, 5.0, 2010.0, published_catalogs.Color(0.1, 0.2, 0.0))
+    later = published_catalogs.read_cat(
+        path, 5.0, 2010.0, published_catalogs.Color(0.1, 0.2, 0.0)
+    )
     shift = np.linalg.norm(later.vectors - plain.vectors, axis=1) / ARCSEC_RAD
     return bool(
         plain.magnitude.max() <= 5.0
@@ -303,7 +316,12 @@ def attitudes(folder: Path) -> bool:
 def true_sky(folder: Path) -> bool:
     asked("render", *SCENE, "--out", str(folder))
     solution = asked(
-        "solve", str(folder / "frame_0000.png"), "--fov", "14.87", "--out", str(folder / "solved")
+        "solve",
+        str(folder / "frame_0000.png"),
+        "--fov",
+        "14.87",
+        "--out",
+        str(folder / "solved"),
     )[0]
     return (
         solution["status"] == "solved"
@@ -338,7 +356,11 @@ def estimate(folder: Path) -> bool:
     one = field()
     known = catalog(5.1)
     axis = one.seen.mean(axis=0) / np.linalg.norm(one.seen.mean(axis=0))
-    options = {"magnitude": one.magnitude, "epsilon_mag": SIGMA_MAG, "within_rad": np.radians(15)}
+    options = {
+        "magnitude": one.magnitude,
+        "epsilon_mag": SIGMA_MAG,
+        "within_rad": np.radians(15),
+    }
     right = fialho_2(one.seen, known, TOLERANCE_RAD, boresight_ref=axis, **options)
     return (
         identified(right, one)
@@ -408,5 +430,7 @@ CHECKS: dict[str, Check] = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", CHECKS)
-def test_every_function_of_the_2005_program_has_a_counterpart(name: str, tmp_path: Path) -> None:
+def test_every_function_of_the_2005_program_has_a_counterpart(
+    name: str, tmp_path: Path
+) -> None:
     assert CHECKS[name](tmp_path)

@@ -26,7 +26,8 @@ def test_a_table_shows_cells_heads_and_title_as_they_are(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     table = Table(
-        [Column("file", kind="text"), Column(HOSTILE)], [["a[/b]/m[red].png", Cell("WRONG", "bad")]]
+        [Column("file", kind="text"), Column(HOSTILE)],
+        [["a[/b]/m[red].png", Cell("WRONG", "bad")]],
     )
     print_table(table, HOSTILE)
     title, heads, line = capsys.readouterr().out.splitlines()

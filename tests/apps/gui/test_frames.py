@@ -12,7 +12,16 @@ import numpy as np
 import pytest
 from astropy.visualization import ZScaleInterval
 
-from tests.helpers.labpage import CHROMIUM, NARROW, Server, come, exported, opened, panel, source
+from tests.helpers.labpage import (
+    CHROMIUM,
+    NARROW,
+    Server,
+    come,
+    exported,
+    opened,
+    panel,
+    source,
+)
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
@@ -23,7 +32,13 @@ from skysim.apps.gui.messages import ALL_PIXELS, LIMITS, Display, LightColumns, 
 from skysim.apps.gui.server import Guard
 from skysim.apps.gui.views import overlay as served_module
 from skysim.apps.gui.views.live import Contents
-from skysim.apps.gui.views.overlay import FRAMES, KEPT_FRAMES, ServedFrame, TabFrames, display_of
+from skysim.apps.gui.views.overlay import (
+    FRAMES,
+    KEPT_FRAMES,
+    ServedFrame,
+    TabFrames,
+    display_of,
+)
 from skysim.apps.gui.worker.pixels import (
     BINS,
     HEADER_BYTES,
@@ -96,7 +111,9 @@ def test_all_pixels_arrive_unchanged_with_the_frame_s_fields() -> None:
 
 
 @pytest.mark.parametrize("limits", [*LIMITS, (90.0, 300.0)])
-def test_fewer_pixels_have_the_same_limits_and_histogram(limits: str | tuple[float, float]) -> None:
+def test_fewer_pixels_have_the_same_limits_and_histogram(
+    limits: str | tuple[float, float],
+) -> None:
     display = Display(SCREEN, limits)
     frame = served(sky(2), display)
     fewer, whole = (response(frame, display, whole) for whole in (False, True))
@@ -116,7 +133,9 @@ def test_all_pixels_are_served_while_the_worker_keeps_them() -> None:
     assert frame.source.display == zoomed  # the worker makes the next frame so
     pixels = pixels_for(display, levels_of(image), np.inf, 2)
     for worker in (Source(image), Source(None)):  # it shows another one, and it has ended
-        assert asyncio.run(ServedFrame(pixels, {}, worker).response(display, whole=True)) is None
+        assert (
+            asyncio.run(ServedFrame(pixels, {}, worker).response(display, whole=True)) is None
+        )
 
 
 def test_limits_of_a_reduced_frame_are_those_of_all_pixels() -> None:
@@ -137,7 +156,9 @@ def test_a_shade_is_the_mean_over_its_area() -> None:
     np.testing.assert_allclose(
         reduced(image, 40), image.reshape(30, 4, 40, 4).mean(axis=(1, 3)), atol=5.6
     )
-    shares = [overlaps(length, count) for length, count in zip(image.shape, (58, 77), strict=True)]
+    shares = [
+        overlaps(length, count) for length, count in zip(image.shape, (58, 77), strict=True)
+    ]
     means = shares[0] @ image @ shares[1].T  # areas that share pixels
     np.testing.assert_allclose(reduced(image, 77), means, atol=5.6)
     assert reduced(image.astype(np.uint8), 40).shape == (30, 40)
@@ -256,7 +277,14 @@ def test_frames_are_served_only_to_logged_in_browsers(monkeypatch: pytest.Monkey
     assert whole.headers["cache-control"] == "no-store"
     fields, levels = decoded(fewer.content)
     assert (levels.shape, fields["near"]["x"]) == ((30, 40), 5)
-    wrong = ["tab/5", "tab/3?near=5,6,7", "other/3", "tab/x", "tab/3?screen=x", "tab/3?screen=-4,5"]
+    wrong = [
+        "tab/5",
+        "tab/3?near=5,6,7",
+        "other/3",
+        "tab/x",
+        "tab/3?screen=x",
+        "tab/3?screen=-4,5",
+    ]
     assert {
         answer.status_code
         for answer in asyncio.run(answers([f"/frame/{path}" for path in wrong], "right"))
@@ -442,7 +470,9 @@ def test_a_key_shows_a_reduced_frame_at_once_and_all_pixels_at_rest(
     assert come(lambda: is_whole(square))
     square.evaluate(DRAWINGS)
     square.keyboard.press("ArrowLeft")
-    assert come(lambda: square.evaluate("window.drawings.some(([, whole]) => whole === 'false')"))
+    assert come(
+        lambda: square.evaluate("window.drawings.some(([, whole]) => whole === 'false')")
+    )
     assert come(lambda: is_whole(square))
     frame = fits.getdata(exported(square, "frame, FITS", tmp_path))
     box = square.locator(".lab-frame canvas").bounding_box()
@@ -452,7 +482,9 @@ def test_a_key_shows_a_reduced_frame_at_once_and_all_pixels_at_rest(
     values = [float(word) for word in text.partition(": ")[2].split()]
     np.testing.assert_array_equal(values, frame[y : y + 7, x : x + 11].ravel())
     square.keyboard.press("ArrowLeft")  # the loupe follows at once, before all pixels are there
-    assert come(lambda: square.locator(".lab-loupe").get_attribute("aria-label") not in (text, ""))
+    assert come(
+        lambda: square.locator(".lab-loupe").get_attribute("aria-label") not in (text, "")
+    )
 
 
 @pytest.mark.browser

@@ -105,7 +105,9 @@ def test_too_many_residuals_are_thinned_by_whole_frames() -> None:
     residuals = [(t / 10, id, 0.1) for t in range(700) for id in range(60)]
     dots = strips.thinned(residuals)
     assert len(dots) <= strips.MAX_DOTS
-    assert [[dot[2] for dot in dots if dot[0] == t] for t in (0.0, 0.3)] == [list(range(60))] * 2
+    assert [[dot[2] for dot in dots if dot[0] == t] for t in (0.0, 0.3)] == [
+        list(range(60))
+    ] * 2
 
 
 # In the browser.
@@ -174,7 +176,9 @@ def test_hovering_a_light_highlights_it_in_all_views(dome: Any, tmp_path: Path) 
     height = 1200
     scale = space["height"] / height
     inside = {
-        n: at for n, at in spots.items() if abs(at[0] - width / 2) * scale < space["width"] / 2 - 10
+        n: at
+        for n, at in spots.items()
+        if abs(at[0] - width / 2) * scale < space["width"] / 2 - 10
     }
     assert len(inside) > 4
     nearest = min(inside, key=lambda n: np.hypot(inside[n][0] - 800, inside[n][1] - 700))

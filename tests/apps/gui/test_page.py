@@ -98,7 +98,9 @@ def test_keys_slew_and_the_frame_does_not_jump(page: Any) -> None:
     after = angles(page)
     turned = after - before
     assert 2 < abs(turned[1]) < 4  # a fifth of 14.9 degrees, at a roll of 20
-    assert -1.3 < turned[2] < -0.7  # clockwise: up turns to the west; the rest is the meridians'
+    assert (
+        -1.3 < turned[2] < -0.7
+    )  # clockwise: up turns to the west; the rest is the meridians'
     assert page.locator(".lab-frame canvas").bounding_box() == box
 
 
@@ -148,7 +150,8 @@ def test_a_typed_attitude_is_identified_by_key_1(page: Any) -> None:
 
 def test_every_export_reads_back(page: Any, tmp_path: Path) -> None:
     kept = {
-        name: exported(page, name, tmp_path) for name in ("truth", "solution", "figure", "scene")
+        name: exported(page, name, tmp_path)
+        for name in ("truth", "solution", "figure", "scene")
     }
     frame = fits.getdata(exported(page, "frame, FITS", tmp_path))
     gray = cv2.imread(str(exported(page, "frame, PNG", tmp_path)), cv2.IMREAD_UNCHANGED)
@@ -170,7 +173,9 @@ def test_every_export_reads_back(page: Any, tmp_path: Path) -> None:
         assert archive.read("frame.png") == (tmp_path / "frame.png").read_bytes()
 
 
-def test_hovering_shows_a_star_s_data_and_a_click_enlarges_it(page: Any, tmp_path: Path) -> None:
+def test_hovering_shows_a_star_s_data_and_a_click_enlarges_it(
+    page: Any, tmp_path: Path
+) -> None:
     spots = json.loads(exported(page, "solution", tmp_path).read_text())["spots"]
     frame = fits.getdata(exported(page, "frame, FITS", tmp_path))
     spot = max((one for one in spots if one["id"] >= 0), key=lambda one: one["flux"])
@@ -233,7 +238,9 @@ def test_the_wheel_zooms_about_the_cursor_a_drag_pans_and_fit_shows_the_whole_fr
     page.mouse.move(*at)
     page.mouse.wheel(0, -500)
     assert come(lambda: canvas.get_attribute("data-placement") != whole)
-    assert float(canvas.get_attribute("data-placement").split()[2]) > 2 * float(whole.split()[2])
+    assert float(canvas.get_attribute("data-placement").split()[2]) > 2 * float(
+        whole.split()[2]
+    )
     np.testing.assert_allclose(screen(page, *spot), at, rtol=0, atol=0.01)
     page.mouse.down()
     page.mouse.move(at[0] + 40, at[1] - 25)
@@ -251,7 +258,9 @@ def test_the_readout_has_the_pixel_s_value_and_direction(page: Any, tmp_path: Pa
     for x, y in ((100, 80), (500, 400)):
         page.mouse.move(*screen(page, x, y))
         readout = page.locator(".lab-readout .mono").inner_text()
-        place = [float(value) for value in re.match(r"x ([\d.]+) +y ([\d.]+)", readout).groups()]
+        place = [
+            float(value) for value in re.match(r"x ([\d.]+) +y ([\d.]+)", readout).groups()
+        ]
         assert int(re.search(r"(\d+) DN", readout)[1]) == frame[y, x]
         ra_deg, dec_deg = sky.pixel_to_world_values(*place)
         # A place's 0.05 px.
@@ -274,7 +283,8 @@ def test_a_cut_shows_its_profile(page: Any, tmp_path: Path) -> None:
     page.mouse.up()
     page.keyboard.up("Shift")
     values, ends = (
-        np.array(plot.get_attribute(f"data-{name}").split(), float) for name in ("profile", "cut")
+        np.array(plot.get_attribute(f"data-{name}").split(), float)
+        for name in ("profile", "cut")
     )
     # To a pixel of the screen.
     np.testing.assert_allclose(ends, [100, 200, 160, 200], rtol=0, atol=2)
@@ -425,7 +435,9 @@ def test_f6_configures_image_processing_without_keys_that_have_no_effect(page: A
     page.get_by_label("tracker.threshold_sigma", exact=True).wait_for(state="detached")
     assert page.get_by_label("tracker.min_area_px", exact=True).count() == 0
     assert come(
-        lambda: "tracker.detector%3Dthesis" in address(page) and "threshold" not in address(page)
+        lambda: (
+            "tracker.detector%3Dthesis" in address(page) and "threshold" not in address(page)
+        )
     )
     pictured(page, "f6")
     for undone in ("tracker.detector", "tracker.threshold_sigma"):
@@ -445,7 +457,9 @@ def test_the_sensor_model_s_noise_is_set_in_arcseconds(page: Any) -> None:
     panel(page, "Monte Carlo")
     page.get_by_text("noise of a centroid: 3″ an axis").wait_for()
     assert page.get_by_label("noise, mag", exact=True).input_value() == "0.4"
-    assert float(page.get_by_label("noise, px").input_value()) == pytest.approx(3 / 81.7, rel=2e-3)
+    assert float(page.get_by_label("noise, px").input_value()) == pytest.approx(
+        3 / 81.7, rel=2e-3
+    )
     page.get_by_label("noise, px").fill("0.1")
     page.get_by_label("noise, mag", exact=True).fill("0.25")
     onto_the_page(page)
@@ -468,7 +482,9 @@ def test_f8_sets_the_field_and_an_arrow_moves_a_fiftieth_of_it(page: Any) -> Non
     set_to(page, "field, °", "14.868")
 
 
-def test_monte_carlo_of_200_by_2_runs_and_its_report_is_private(page: Any, server: Server) -> None:
+def test_monte_carlo_of_200_by_2_runs_and_its_report_is_private(
+    page: Any, server: Server
+) -> None:
     frame = source(page)
     page.keyboard.press("n")  # the camera's noise, which trials of centroids do not have
     changed(page, frame)
@@ -510,7 +526,9 @@ def test_a_dropped_picture_is_solved_shown_or_refused(page: Any, tmp_path: Path)
     noise, broken, program, large = (
         tmp_path / f"{name}" for name in ("noise.png", "broken.png", "a.exe", "large.png")
     )
-    cv2.imwrite(str(noise), np.random.default_rng(1).integers(90, 110, (480, 640), dtype=np.uint8))
+    cv2.imwrite(
+        str(noise), np.random.default_rng(1).integers(90, 110, (480, 640), dtype=np.uint8)
+    )
     page.set_input_files("input[type=file]", noise)
     page.get_by_text(re.compile(r"noise\.png: (?!solved|solving)")).wait_for()
     broken.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
@@ -646,7 +664,9 @@ def test_another_shutter_is_chosen_in_the_form(page: Any) -> None:
     chosen(page, "camera.shutter.kind", "rolling")
     changed(page, frame)
     assert come(lambda: page.get_by_label("camera.shutter.leak", exact=True).count() == 0)
-    assert page.get_by_label("camera.shutter.row_time", exact=True).input_value() == "2.25e-05 s"
+    assert (
+        page.get_by_label("camera.shutter.row_time", exact=True).input_value() == "2.25e-05 s"
+    )
     pictured(page, "shutter")
     frame = source(page)
     chosen(page, "camera.shutter.kind", "interline")

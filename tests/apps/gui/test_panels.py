@@ -58,8 +58,15 @@ def test_a_solar_system_body_is_listed_with_name_and_magnitude() -> None:
         "Sirius",
         "HIP 20",
     ]
-    settings = {"light.bodies": "{}", "start_time": "2012-06-24T21:00:00", "exposure.frames": "1"}
-    settings |= {"motion.start": "{ra_deg: 154.9, dec_deg: 4.8}", "motion.rate_deg_s": "[0, 0, 0]"}
+    settings = {
+        "light.bodies": "{}",
+        "start_time": "2012-06-24T21:00:00",
+        "exposure.frames": "1",
+    }
+    settings |= {
+        "motion.start": "{ra_deg: 154.9, dec_deg: 4.8}",
+        "motion.rate_deg_s": "[0, 0, 0]",
+    }
     flight = simulate_motion(loader.load("shefex2", settings))
     lights = workbench.true_lights(flight.render(0)[1], workbench.magnitude_by_id(flight.lab))
     assert lights[0].id == 9_000_301
@@ -99,7 +106,8 @@ def test_an_arrow_key_moves_stars_by_its_share_of_the_field_even_at_the_pole(
     np.testing.assert_allclose(np.arctan2(x, z), -geometry.FINE * across, rtol=1e-9)
     np.testing.assert_allclose(y, 0.0, atol=1e-12)
     _, y, z = (
-        mount.cam_from_body * geometry.moved(STARS, mount, before, 0.0, geometry.FINE, 0.0).inv()
+        mount.cam_from_body
+        * geometry.moved(STARS, mount, before, 0.0, geometry.FINE, 0.0).inv()
     ).apply(star)
     # Down: y is down.
     np.testing.assert_allclose(np.arctan2(y, z), geometry.FINE * across, rtol=1e-9)
@@ -110,10 +118,12 @@ def test_key_r_rolls_the_camera_clockwise_and_stars_counterclockwise() -> None:
     mount = multibody.camera_mount(multibody.build(STARS.vehicle))
     before = geometry.from_angles(STARS, mount, (83.0, 2.0, 0.0))
     above = stars.cam_from_icrs(83.0, 2.0, 0.0).inv().apply([0.0, -0.1, 1.0])
-    x, y, _ = (mount.cam_from_body * geometry.moved(STARS, mount, before, 0, 0, 10.0).inv()).apply(
-        above
-    )
-    np.testing.assert_allclose(np.degrees(np.arctan2(-x, -y)), 10.0, rtol=1e-9)  # to the left of up
+    x, y, _ = (
+        mount.cam_from_body * geometry.moved(STARS, mount, before, 0, 0, 10.0).inv()
+    ).apply(above)
+    np.testing.assert_allclose(
+        np.degrees(np.arctan2(-x, -y)), 10.0, rtol=1e-9
+    )  # to the left of up
 
 
 def test_a_tilt_beyond_the_stop_and_angles_out_of_range_are_refused() -> None:
@@ -248,7 +258,9 @@ def test_the_feedback_can_be_changed_for_both_forms_of_the_control_section() -> 
     for name in ("afit_simsat", "simsat_bump", "simsat_slew"):
         values = forms.loop_overrides(name, {}, "truth")
         assert loader.load(name, values).motion.control.feedback == "truth"
-        assert loader.load(name, values).motion.control.law == loader.load(name).motion.control.law
+        assert (
+            loader.load(name, values).motion.control.law == loader.load(name).motion.control.law
+        )
         assert loader.load(name, forms.loop_overrides(name, {}, "")).motion.control is None
 
 
@@ -275,7 +287,10 @@ def test_a_scene_is_saved_as_its_differences_without_overwriting(tmp_path: Path)
 # Marks.
 
 LIGHTS = LightColumns(
-    np.array([1, 2]), np.array([[10.0, 20], [50, 60]]), np.array([1e4, 1e3]), np.array([2.0, 4.0])
+    np.array([1, 2]),
+    np.array([[10.0, 20], [50, 60]]),
+    np.array([1e4, 1e3]),
+    np.array([2.0, 4.0]),
 )
 SPOTS = (Detection(10.1, 20.0, 0.01, 5.0, 1, 0.1), Detection(80.0, 80.0, 0.1, 1.0))
 
@@ -359,7 +374,8 @@ def test_a_frame_s_pose_and_lens_map_a_light_s_pixel_back_to_the_light() -> None
         pose = geometry.scene_pose(lab, lens, truth)
         camera = lab.scene.camera
         nodes_px = [
-            np.linspace(-0.5, size - 0.5, lens.n) for size in (camera.width_px, camera.height_px)
+            np.linspace(-0.5, size - 0.5, lens.n)
+            for size in (camera.width_px, camera.height_px)
         ]
 
         def table(
@@ -374,9 +390,13 @@ def test_a_frame_s_pose_and_lens_map_a_light_s_pixel_back_to_the_light() -> None
         )
         pointed = rays_cam @ np.reshape(pose.rotation, (3, 3)).T
         if pose.depth_m:
-            pointed = np.array(pose.place_m) + table(pose.depth_m)(xy[:, ::-1])[:, None] * pointed
+            pointed = (
+                np.array(pose.place_m) + table(pose.depth_m)(xy[:, ::-1])[:, None] * pointed
+            )
         pointed /= np.linalg.norm(pointed, axis=1, keepdims=True)
-        rows = [lab.camera.sources.id.tolist().index(id) for id in truth.sources.id[:20].tolist()]
+        rows = [
+            lab.camera.sources.id.tolist().index(id) for id in truth.sources.id[:20].tolist()
+        ]
         wanted = lab.camera.sources.place[rows, :3]
         wanted = wanted / np.linalg.norm(wanted, axis=1, keepdims=True)
         assert np.linalg.norm(pointed - wanted, axis=1).max() < within_rad, scene
@@ -445,7 +465,9 @@ def test_a_local_page_requires_token_host_and_origin(
         ({"host": "lab", "cookie": "skysim_gui_8080=wrong"}, "", 401),
     ],
 )
-def test_a_shared_page_requires_its_token(headers: dict[str, str], query: str, status: int) -> None:
+def test_a_shared_page_requires_its_token(
+    headers: dict[str, str], query: str, status: int
+) -> None:
     guard = Guard(page, ("*",), "right", 8080)
     assert asyncio.run(knock(guard, headers, query)) == status
 
@@ -621,7 +643,11 @@ def test_a_study_s_report_is_visible_only_to_its_user(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         (tmp_path / name / "report.html").write_text("report")
         (tmp_path / name / "study.sqlite").touch()
-    assert [report_path(tmp_path, name, mine) is not None for name in names] == [True, False, True]
+    assert [report_path(tmp_path, name, mine) is not None for name in names] == [
+        True,
+        False,
+        True,
+    ]
     assert [report_path(tmp_path, name) is not None for name in names] == [False, False, True]
     assert user_of({"skysim_user": mine}) == mine
     assert user_of({"skysim_user": "../x"}) == user_of({}) == ""
@@ -651,7 +677,9 @@ def test_a_worker_is_forked_with_its_scene_set_up_and_a_closed_one_leaves_nothin
             assert (await first.run("move", 1.0, 0.0, 5.0, True)).angles_deg != start.angles_deg
             second = Session()
             try:
-                assert (await second.run("open", scene, {}, True))[1].angles_deg == start.angles_deg
+                assert (await second.run("open", scene, {}, True))[
+                    1
+                ].angles_deg == start.angles_deg
             finally:
                 second.close()
         finally:

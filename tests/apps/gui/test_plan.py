@@ -292,17 +292,22 @@ def test_check_map_and_survey_work_in_the_page(page: Any) -> None:
     page.get_by_label("frames", exact=True).fill("5")
     page.get_by_role("button", name="Plan", exact=True).click()
     page.get_by_text("Predicted of the 1465 LEDs").wait_for()
-    wanted = page.locator(".lab-stops .num").nth(5).inner_text()  # the first roll, after five heads
+    wanted = (
+        page.locator(".lab-stops .num").nth(5).inner_text()
+    )  # the first roll, after five heads
     page.get_by_role("button", name="Point to attitude 1", exact=True).click()
     assert come(
         lambda: abs(float(page.get_by_label("angle 1").input_value()) - float(wanted)) < 0.006
     )
     fly, adjust, save = (
-        page.get_by_role("button", name=name, exact=True) for name in ("Fly", "Adjust", "Map file")
+        page.get_by_role("button", name=name, exact=True)
+        for name in ("Fly", "Adjust", "Map file")
     )
     assert save.is_disabled()
     fly.click()
-    page.get_by_role("button", name="Stop", exact=True).wait_for()  # of the flight that is computed
+    page.get_by_role(
+        "button", name="Stop", exact=True
+    ).wait_for()  # of the flight that is computed
     page.get_by_role("button", name="Simulate", exact=True).wait_for(timeout=SLOW_MS)
     panel(page, "Plan")
     adjust.click()

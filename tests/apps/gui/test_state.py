@@ -190,7 +190,9 @@ def test_undo_and_redo_go_through_moves_and_scenes(browser: Any, server: Server)
         page.keyboard.press("Control+Shift+z")
         assert written(page, "scene=collimated_display")
         assert come(
-            lambda: page.get_by_role("combobox", name="Scene").input_value() == "collimated_display"
+            lambda: (
+                page.get_by_role("combobox", name="Scene").input_value() == "collimated_display"
+            )
         )
 
 

@@ -92,7 +92,9 @@ def test_a_dome_flight_is_played_positioned_and_its_loop_opened(page: Any) -> No
     page.get_by_role("status").filter(has_text="filter requires the section filter").wait_for()
 
 
-def test_monte_carlo_stops_resumes_and_replays_a_failed_trial(second: Any, server: Server) -> None:
+def test_monte_carlo_stops_resumes_and_replays_a_failed_trial(
+    second: Any, server: Server
+) -> None:
     panel(second, "Monte Carlo")
     second.get_by_label("noise, px").fill("8")
     second.get_by_label("runs, F8").fill("5000")
@@ -127,7 +129,9 @@ def test_two_tabs_do_not_disturb_one_another(page: Any, second: Any) -> None:
 def test_closing_a_tab_ends_its_worker_and_its_study(
     page: Any, second: Any, server: Server
 ) -> None:
-    assert server.come_to("gui.template", 3) == 3  # two tabs' and the one that they are forked from
+    assert (
+        server.come_to("gui.template", 3) == 3
+    )  # two tabs' and the one that they are forked from
     assert server.children("study")
     second.close()
     assert server.come_to("study", 0) == 0

@@ -202,11 +202,19 @@ def test_a_folder_receives_every_frame_with_its_truth(
     sets = [word for key, value in OVERRIDES.items() for word in ("--set", f"{key}={value}")]
     command = ["stream", "shefex2", "--folder", str(tmp_path), "--speed", "0", "--json", *sets]
     done = CliRunner().invoke(main.app, command)
-    assert json.loads(done.stdout)["sinks"]["folder"] == {"sent": FRAMES, "dropped": 0, "fault": ""}
+    assert json.loads(done.stdout)["sinks"]["folder"] == {
+        "sent": FRAMES,
+        "dropped": 0,
+        "fault": "",
+    }
     for n, image in enumerate(frames):
         result = json.loads((tmp_path / f"frame_{n:06d}.json").read_text())
-        np.testing.assert_array_equal(cv2.imread(str(tmp_path / f"frame_{n:06d}.png"), -1), image)
-        assert np.linalg.norm(result["truth"]["cam_from_ref_xyzw"]) == pytest.approx(1, abs=1e-12)
+        np.testing.assert_array_equal(
+            cv2.imread(str(tmp_path / f"frame_{n:06d}.png"), -1), image
+        )
+        assert np.linalg.norm(result["truth"]["cam_from_ref_xyzw"]) == pytest.approx(
+            1, abs=1e-12
+        )
         assert len(result["truth"]["ids"]) == len(result["truth"]["x_px"]) > 5
     with pytest.raises(InputError, match="holds frames of an earlier stream"):
         sinks.folder_writer(tmp_path)
@@ -261,7 +269,9 @@ def test_streams_send_every_frame(hub: tuple[http.FrameHub, str]) -> None:
 def test_clients_receive_the_last_frame_before_the_stream_ends() -> None:
     hub = http.FrameHub(dict)
     server = http.start_server(hub, "127.0.0.1", 0)
-    raw = urllib.request.urlopen(f"http://127.0.0.1:{server.server_port}/stream.raw", timeout=10)
+    raw = urllib.request.urlopen(
+        f"http://127.0.0.1:{server.server_port}/stream.raw", timeout=10
+    )
     hub.publish(packet(0))
     assert unpack(raw) is not None
     late = threading.Timer(0.1, lambda: unpack(raw))
@@ -314,7 +324,9 @@ def test_counters_of_disconnected_clients_are_bounded_and_summed(
 @pytest.mark.parametrize(
     "path", ["/", "/frame.png", "/frame.raw", "/truth.json", "/stream.raw", "/stream.mjpg"]
 )
-def test_head_answers_like_get_without_the_body(hub: tuple[http.FrameHub, str], path: str) -> None:
+def test_head_answers_like_get_without_the_body(
+    hub: tuple[http.FrameHub, str], path: str
+) -> None:
     with urllib.request.urlopen(
         urllib.request.Request(hub[1] + path, method="HEAD"), timeout=10
     ) as result:
@@ -323,7 +335,9 @@ def test_head_answers_like_get_without_the_body(hub: tuple[http.FrameHub, str], 
     assert hub[0].clients == []
     with urllib.request.urlopen(hub[1] + path, timeout=10) as received:
         same = ("Content-Type", "Content-Length", "X-Skysim-Header")
-        assert [result.headers[name] for name in same] == [received.headers[name] for name in same]
+        assert [result.headers[name] for name in same] == [
+            received.headers[name] for name in same
+        ]
 
 
 def test_an_endless_stream_continues_beyond_the_scene_s_frames_and_a_day() -> None:
@@ -344,7 +358,9 @@ def test_an_endless_stream_continues_beyond_the_scene_s_frames_and_a_day() -> No
     assert simulation.states.nbytes == size_bytes
     rotation = shots[-1].truth.cam_from_lab * shots[0].truth.cam_from_lab.inv()
     rate_rad_s = np.radians(np.linalg.norm(scene.motion.rate_deg_s))
-    assert rotation.magnitude() == pytest.approx(rate_rad_s * (mids_s[-1] - mids_s[0]), rel=1e-6)
+    assert rotation.magnitude() == pytest.approx(
+        rate_rad_s * (mids_s[-1] - mids_s[0]), rel=1e-6
+    )
 
 
 @pytest.mark.long

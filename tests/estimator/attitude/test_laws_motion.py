@@ -68,7 +68,9 @@ def test_images_move_at_the_rate_s_predicted_velocity(rng: np.random.Generator) 
     middle_px = np.array(
         [[5.0, (CAMERA.height_px - 1) / 2], [5.0, (CAMERA.height_px - 1) / 2 + 10]]
     )
-    assert_allclose(CAMERA.row_delays_s(middle_px), [0, 10 * CAMERA.row_time_s], rtol=0, atol=1e-18)
+    assert_allclose(
+        CAMERA.row_delays_s(middle_px), [0, 10 * CAMERA.row_time_s], rtol=0, atol=1e-18
+    )
     dx, dy = rate.center_streak_px(CAMERA, exact(np.array([0.1, 0.2, 5.0])), 0.5)
     assert (dx, dy) == pytest.approx((-0.2 * 0.5 * 3000, 0.1 * 0.5 * 3000))
 
@@ -109,13 +111,23 @@ def test_correction_moves_rolling_shutter_lights_to_global_shutter_positions(
         )
         assert spread.covariance_px2 is not None
         assert_allclose(
-            np.sqrt(spread.covariance_px2[:, [0, 1], [0, 1]]), np.abs(moved), rtol=0.02, atol=1e-5
+            np.sqrt(spread.covariance_px2[:, [0, 1], [0, 1]]),
+            np.abs(moved),
+            rtol=0.02,
+            atol=1e-5,
         )
     assert rate.at_middle_row(GLOBAL, found, exact(seen.rate_rad_s)) is found
 
 
 @pytest.mark.slow
-@law(rate.from_streaks, rate.chords, rate.aligned, rate.inliers, rate.inverses, rate.streak_factor)
+@law(
+    rate.from_streaks,
+    rate.chords,
+    rate.aligned,
+    rate.inliers,
+    rate.inverses,
+    rate.streak_factor,
+)
 @given(rng=SEEDS)
 def test_exact_streaks_give_the_rate_in_one_of_two_signs(rng: np.random.Generator) -> None:
     for camera in CAMERA, GLOBAL:
@@ -134,10 +146,13 @@ def test_exact_streaks_give_the_rate_in_one_of_two_signs(rng: np.random.Generato
             # One wrong streak of thirty is left out, or is within the gate of 16: with the leverage 3 / 30 it then
             # moves the rate by a squared Mahalanobis distance below 16 (1 / 10) / (9 / 10).
             wrong = replace(
-                found, streak_px=found.streak_px + np.where(np.arange(30)[:, None] == 7, 5.0, 0.0)
+                found,
+                streak_px=found.streak_px + np.where(np.arange(30)[:, None] == 7, 5.0, 0.0),
             )
             again = rate.from_streaks(camera, wrong, EXPOSURE_S, sight)
-            errors = [(one.rate_rad_s - seen.rate_rad_s, one.covariance_rad2_s2) for one in again]
+            errors = [
+                (one.rate_rad_s - seen.rate_rad_s, one.covariance_rad2_s2) for one in again
+            ]
             assert (
                 min(error @ np.linalg.solve(covariance, error) for error, covariance in errors)
                 < 1.8
@@ -161,7 +176,9 @@ def test_the_rate_from_streaks_has_its_claimed_covariance() -> None:
         rng = np.random.default_rng([21, seed])
         seen = replace(moving(rng, any_rate(rng), 12), camera=GLOBAL)
         both = rate.from_streaks(GLOBAL, seen.centroids(rng), EXPOSURE_S)
-        best = min(both, key=lambda one: float(np.linalg.norm(one.rate_rad_s - seen.rate_rad_s)))
+        best = min(
+            both, key=lambda one: float(np.linalg.norm(one.rate_rad_s - seen.rate_rad_s))
+        )
         error = best.rate_rad_s - seen.rate_rad_s
         nees.append(error @ np.linalg.solve(best.covariance_rad2_s2, error))
     assert np.mean(nees) == pytest.approx(3, abs=4 * np.sqrt(6 / 300))
@@ -187,7 +204,9 @@ def test_attitude_and_rate_are_found_together(rng: np.random.Generator) -> None:
         assert_covariance(streaks.rate.covariance_rad2_s2)
     few = found.take(np.arange(1)), places[:1]
     assert (
-        answered(lambda: rolling.fit(CAMERA, few[0], few[1], lever, (start, np.zeros(3)), ANYTHING))
+        answered(
+            lambda: rolling.fit(CAMERA, few[0], few[1], lever, (start, np.zeros(3)), ANYTHING)
+        )
         is None
     )
 
@@ -239,7 +258,9 @@ def test_a_rolling_shutter_attitude_has_its_claimed_covariance() -> None:
         )
         place = seen.cam_from_ref.apply(places)
         jacobian = nearfield.tangent_jacobian(place, place)
-        noise = np.linalg.inv(jacobian.T @ jacobian) * (found.sigma_px[0] / CAMERA.focal_px) ** 2
+        noise = (
+            np.linalg.inv(jacobian.T @ jacobian) * (found.sigma_px[0] / CAMERA.focal_px) ** 2
+        )
         by_rate = rolling.rate_covariance_rad2(
             CAMERA, found, jacobian.reshape(-1, 2, 3), fit.rate.covariance_rad2_s2
         )
@@ -264,7 +285,11 @@ def moments_of(seen: Moving, variance_px2: float) -> Floats:
         + np.einsum("ni,nj->nij", streak, streak) / 12
     )
     return np.column_stack(
-        [matrix[:, 0, 0] - matrix[:, 1, 1], 2 * matrix[:, 0, 1], matrix[:, 0, 0] + matrix[:, 1, 1]]
+        [
+            matrix[:, 0, 0] - matrix[:, 1, 1],
+            2 * matrix[:, 0, 1],
+            matrix[:, 0, 0] + matrix[:, 1, 1],
+        ]
     )
 
 
@@ -273,11 +298,16 @@ def moments_of(seen: Moving, variance_px2: float) -> Floats:
 def test_disks_of_a_rolling_shutter_determine_the_rate(rng: np.random.Generator) -> None:
     seen = moving(rng, any_rate(rng, 8.0), sight=DOME)
     disks = replace(
-        seen.centroids(), xy_px=seen.still_px, streak_px=None, moments_px2=moments_of(seen, 30.0)
+        seen.centroids(),
+        xy_px=seen.still_px,
+        streak_px=None,
+        moments_px2=moments_of(seen, 30.0),
     )
     rates = rate.from_moments(CAMERA, disks, EXPOSURE_S, DOME)
     assert len(rates) == 2
-    assert min(np.linalg.norm(one.rate_rad_s - seen.rate_rad_s) for one in rates) < np.radians(0.05)
+    assert min(np.linalg.norm(one.rate_rad_s - seen.rate_rad_s) for one in rates) < np.radians(
+        0.05
+    )
     assert_covariance(rates[0].covariance_rad2_s2)
     assert rate.from_moments(GLOBAL, disks, EXPOSURE_S, DOME) == []
     points = replace(disks, moments_px2=moments_of(seen, 0.1) * 0.01)

@@ -58,7 +58,8 @@ def test_changes_of_tangents_match_their_derivatives(rng: np.random.Generator) -
     assert_allclose(np.einsum("kij,kj->ki", gradient, pupil), 0, rtol=0, atol=1e-14)
     jacobian = nearfield.tangent_jacobian(bearing, pupil)
     rotated = (
-        tangents(pupil + Rotation.from_rotvec(turned_rad).apply(bearing) - bearing) - view.tangent
+        tangents(pupil + Rotation.from_rotvec(turned_rad).apply(bearing) - bearing)
+        - view.tangent
     )
     assert_allclose((jacobian @ turned_rad).reshape(-1, 2), rotated, rtol=0, atol=1e-11)
     assert_allclose(view.jacobian.reshape(-1, 3), jacobian, rtol=0, atol=0)
@@ -78,7 +79,9 @@ def test_a_rotation_is_found_and_leaves_no_residual(rng: np.random.Generator) ->
     assert_allclose(covariance, np.outer(turned_rad, turned_rad), rtol=0, atol=1e-18)
     other = rng.normal(0, 1e-5, (2, COUNT, 2))
     products = systematic.residual_products(view, sigma, np.concatenate([change[None], other]))
-    assert_allclose(products[0], 0, rtol=0, atol=1e-10 * np.abs(change / sigma[:, None]).sum() ** 2)
+    assert_allclose(
+        products[0], 0, rtol=0, atol=1e-10 * np.abs(change / sigma[:, None]).sum() ** 2
+    )
     assert_covariance(products)
     # A fit adds no residual.
     assert (np.diag(products)[1:] <= ((other / sigma[:, None]) ** 2).sum(axis=(1, 2))).all()
@@ -96,14 +99,18 @@ def test_a_fitted_focal_length_absorbs_a_change_of_scale_without_rotation(
     scaled = 1e-3 * view.tangent
     answer = np.einsum("kai,ki->a", systematic.response(joint, sigma), scaled)
     assert_allclose(answer, [0, 0, 0, 1e-3], rtol=0, atol=1e-9)
-    assert_allclose(systematic.residual_products(joint, sigma, scaled[None]), 0, rtol=0, atol=1e-9)
+    assert_allclose(
+        systematic.residual_products(joint, sigma, scaled[None]), 0, rtol=0, atol=1e-9
+    )
     weighted = (joint.jacobian / sigma[:, None, None]).reshape(-1, 4)
     wanted = np.linalg.inv(weighted.T @ weighted)
     errors = systematic.isotropic(sigma)
     found = systematic.from_independent(joint, sigma, errors)
     assert_allclose(found, wanted, rtol=1e-6, atol=1e-12)
     plain = systematic.from_independent(view, sigma, errors)
-    total, part = systematic.with_survey(plain, view, sigma, 0 * errors, errors, scaled[None], True)
+    total, part = systematic.with_survey(
+        plain, view, sigma, 0 * errors, errors, scaled[None], True
+    )
     assert_allclose(total, wanted[:3, :3], rtol=1e-6, atol=1e-12)
     assert_allclose(part, total, rtol=1e-9)
 
@@ -126,7 +133,9 @@ def test_the_weights_own_errors_have_the_inverse_of_the_information(
 
 @law(systematic.with_survey)
 @given(rng=SEEDS)
-def test_without_survey_errors_the_covariance_equals_the_solver_s(rng: np.random.Generator) -> None:
+def test_without_survey_errors_the_covariance_equals_the_solver_s(
+    rng: np.random.Generator,
+) -> None:
     view = systematic.geometry(*places(rng))
     sigma = sigmas(rng)
     solver = (
@@ -150,7 +159,9 @@ def test_without_survey_errors_the_covariance_equals_the_solver_s(rng: np.random
 
 @law(systematic.focal_error_px, systematic.with_focal_error, dome_tracker.focal_error_rad)
 @given(rng=SEEDS)
-def test_a_focal_length_s_error_grows_from_the_principal_point(rng: np.random.Generator) -> None:
+def test_a_focal_length_s_error_grows_from_the_principal_point(
+    rng: np.random.Generator,
+) -> None:
     xy_px = rng.uniform(0, [999, 799], (COUNT, 2))
     rays = CAMERA.rays(xy_px)
     sigma = sigmas(rng)

@@ -15,7 +15,10 @@ RADIUS_M = 1.2192
 LEVER = Lever(np.array([0.0, 0.0, 0.381]), Rotation.identity())
 ASKEW = Lever(np.array([0.02, -0.035, 0.37]), Rotation.from_euler("xyz", [0.03, -0.02, 0.7]))
 SPHERE = (np.zeros(3), np.full(3, RADIUS_M))
-MEASURED = (np.array([0.0, 0.003, 0.492]), np.array([0.9876, 0.9876, 0.7264]))  # 38.88 and 28.60 in
+MEASURED = (
+    np.array([0.0, 0.003, 0.492]),
+    np.array([0.9876, 0.9876, 0.7264]),
+)  # 38.88 and 28.60 in
 
 
 def leds_in_view(
@@ -98,7 +101,8 @@ def test_points_on_a_sphere_lie_on_it_and_on_their_rays() -> None:
 
 def test_a_camera_outside_its_sphere_is_refused() -> None:
     with pytest.raises(
-        ValueError, match=r"camera 1\.3 m from the bearing; allowed: inside the sphere of 1\.2 m"
+        ValueError,
+        match=r"camera 1\.3 m from the bearing; allowed: inside the sphere of 1\.2 m",
     ):
         dome_map.on_sphere(np.array([[0.0, 0, 1]]), np.array([1.3, 0, 0]), 1.2)
 
@@ -109,7 +113,9 @@ def test_points_on_an_ellipsoid_satisfy_its_equation_and_lie_on_their_rays() -> 
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     origin = np.array([0.1, 0.05, 0.38])
     center, axes = MEASURED
-    points = dome_map.on_surface(rays, origin, LedMap(np.arange(0), np.zeros((0, 3)), center, axes))
+    points = dome_map.on_surface(
+        rays, origin, LedMap(np.arange(0), np.zeros((0, 3)), center, axes)
+    )
     # 1e-14: rounding of a quadratic's root.
     np.testing.assert_allclose(
         np.sum(((points - center) / axes) ** 2, axis=1), 1, rtol=0, atol=1e-14
@@ -306,7 +312,12 @@ def test_one_light_seen_repeatedly_leaves_one_rotation_undetermined(
     truth = Rotation.from_rotvec([0.1, 0.05, 0.3])
     with pytest.raises(ValueError, match=f"{count} rays do not determine a rotation"):
         nearfield.rotation_only(
-            true_rays(truth, leds, lever), np.full(count, 1e-5), leds.position_m, leds, lever, truth
+            true_rays(truth, leds, lever),
+            np.full(count, 1e-5),
+            leds.position_m,
+            leds,
+            lever,
+            truth,
         )
 
 

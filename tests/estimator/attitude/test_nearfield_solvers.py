@@ -54,7 +54,9 @@ def agrees(squares: np.ndarray, published: float) -> bool:
 
 def compare(method: str, surface: str, tilts: tuple[int, ...], trials: int) -> None:
     for tilt in tilts:
-        errors = bench.errors_deg(method, bench.GEOMETRIES[surface], tilt, trials, seed=70 + tilt)
+        errors = bench.errors_deg(
+            method, bench.GEOMETRIES[surface], tilt, trials, seed=70 + tilt
+        )
         square = errors**2
         for published, squares in (
             (PUBLISHED.get((method, surface), {}).get(tilt), square[:, 0] + square[:, 1]),
@@ -139,7 +141,9 @@ def noise_alone(
         clean = bench.trial(one, tilt, rng)
         pixels = clean.pixels + noise_px * rng.standard_normal(clean.pixels.shape)
         unbiased = clean.truth if method in EXACT else bench.solved(method, one, clean)[0]
-        found, claimed[n] = bench.solved(method, one, replace(clean, pixels=pixels, start=unbiased))
+        found, claimed[n] = bench.solved(
+            method, one, replace(clean, pixels=pixels, start=unbiased)
+        )
         errors[n] = (found * unbiased.inv()).as_rotvec()
     return errors, claimed
 
@@ -209,7 +213,10 @@ def test_one_update_of_the_distances_removes_most_of_the_error(
     # The roll alone is found from the pattern's breadth, which is as small as the lever's share: hence its factor.
     assert 1e-6 < np.median(off_deg) / start_deg < corner
     monkeypatch.setattr(nearfield, "MAX_UPDATES", 5)
-    assert np.abs(bench.errors_deg("tappe", one, 20, 50, seed=80)).max() < np.median(off_deg) * 1e-3
+    assert (
+        np.abs(bench.errors_deg("tappe", one, 20, 50, seed=80)).max()
+        < np.median(off_deg) * 1e-3
+    )
 
 
 @pytest.mark.parametrize("method", SOLVERS)
@@ -230,7 +237,9 @@ def test_a_camera_mounted_askew_gives_the_body_attitude(method: str) -> None:
         np.trace(spread_cam)
     )
     in_camera = mount.as_matrix() @ spread_body @ mount.as_matrix().T
-    np.testing.assert_allclose(in_camera, spread_cam, rtol=0, atol=1e-5 * np.abs(spread_cam).max())
+    np.testing.assert_allclose(
+        in_camera, spread_cam, rtol=0, atol=1e-5 * np.abs(spread_cam).max()
+    )
 
 
 def test_unsupported_input_of_a_method_is_refused() -> None:

@@ -80,7 +80,11 @@ def test_close_directions_keep_full_precision(half_rad: float, solve: Solver) ->
     rng = np.random.default_rng(42)
     for _ in range(100):
         truth = Rotation.random(rng=rng)
-        cam = half_rad * np.array([[1, 0], [-0.5, 0.9], [-0.5, -0.9]]) * rng.uniform(0.5, 1, (3, 1))
+        cam = (
+            half_rad
+            * np.array([[1, 0], [-0.5, 0.9], [-0.5, -0.9]])
+            * rng.uniform(0.5, 1, (3, 1))
+        )
         cam = unit(np.column_stack([cam, np.ones(3)]))
         assert (
             error_rad(solve(cam, truth.inv().apply(cam), np.ones(3)), truth)
@@ -121,7 +125,9 @@ def test_half_turns_about_any_axis_are_solved(
     axis: str, short_of_rad: float, solve: Solver
 ) -> None:
     rng = np.random.default_rng(44)
-    truth = Rotation.from_rotvec((np.pi - short_of_rad) * unit(np.array(AXES[axis], dtype=float)))
+    truth = Rotation.from_rotvec(
+        (np.pi - short_of_rad) * unit(np.array(AXES[axis], dtype=float))
+    )
     for count in (2, 3, 8):
         for _ in range(20):
             ref = in_field(rng, count) if count == 8 else unit(rng.normal(size=(count, 3)))
@@ -225,7 +231,11 @@ def same_data(case: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarr
     if case == "no turn":
         truth = Rotation.identity()
     sigma = rng.uniform(2e-5, 6e-5, count)
-    return unit(seen + sigma[:, None] * rng.normal(size=seen.shape)), truth.inv().apply(seen), sigma
+    return (
+        unit(seen + sigma[:, None] * rng.normal(size=seen.shape)),
+        truth.inv().apply(seen),
+        sigma,
+    )
 
 
 CASES = [
@@ -272,7 +282,9 @@ def davenport_matrix(B: np.ndarray) -> np.ndarray:
 @pytest.mark.compiles
 @pytest.mark.parametrize("name", RAW)
 @pytest.mark.parametrize("half_turn", [False, True])
-def test_each_bare_method_solves_davenport_s_equation_itself(name: str, half_turn: bool) -> None:
+def test_each_bare_method_solves_davenport_s_equation_itself(
+    name: str, half_turn: bool
+) -> None:
     # Over the whole sky the bare methods need no refinement: K q = x q, x the greatest eigenvalue (numpy's).
     rng = np.random.default_rng(51)
     for _ in range(200):
@@ -299,7 +311,9 @@ def test_each_bare_method_is_exact_at_half_a_turn(name: str, axis: str) -> None:
     for angle in (np.pi, 0.0):
         truth = Rotation.from_rotvec(angle * unit(np.array(AXES[axis], dtype=float)))
         B = truth.apply(ref).T @ ref / 3
-        assert np.abs(RAW[name](B) - truth.as_matrix()).max() < 1e-13  # rounding over a gap of 0.3
+        assert (
+            np.abs(RAW[name](B) - truth.as_matrix()).max() < 1e-13
+        )  # rounding over a gap of 0.3
 
 
 def test_no_method_reads_outside_its_arrays() -> None:
@@ -416,7 +430,8 @@ def test_quaternions_and_matrices_match_scipy(axis: str, angle_rad: float) -> No
         < 1e-15
     )
     assert (
-        np.abs(kernel.matrix_of(tuple(3 * rotation.as_quat())) - rotation.as_matrix()).max() < 1e-15
+        np.abs(kernel.matrix_of(tuple(3 * rotation.as_quat())) - rotation.as_matrix()).max()
+        < 1e-15
     )
 
 
@@ -443,7 +458,9 @@ def monte_carlo(
 @pytest.mark.slow
 def test_fifteen_stars_have_the_reference_s_error() -> None:
     errors, claimed = monte_carlo(15, np.tan(FOV_RAD / 2), 1500, seed=45)
-    cross, roll = np.sqrt([np.mean(errors[:, :2] ** 2), np.mean(errors[:, 2] ** 2)]) / ARCSEC_RAD
+    cross, roll = (
+        np.sqrt([np.mean(errors[:, :2] ** 2), np.mean(errors[:, 2] ** 2)]) / ARCSEC_RAD
+    )
     # Reference section 3 (14.87 deg, 659 px, 0.1 px): 2.17" an axis and 21.1" rms; 1,500 trials give 1.3 and 1.8 %.
     assert cross == pytest.approx(2.17, rel=0.05)
     assert roll == pytest.approx(21.1, rel=0.06)

@@ -62,7 +62,9 @@ def assert_covariance(errors: Floats, claimed: Floats) -> None:
 
 
 def view_of(position_m: Floats) -> systematic.Geometry:
-    return systematic.geometry(LEVER.cam_from_body.apply(TRUTH.apply(position_m)), seen(position_m))
+    return systematic.geometry(
+        LEVER.cam_from_body.apply(TRUTH.apply(position_m)), seen(position_m)
+    )
 
 
 def unit(vectors: Floats) -> Floats:
@@ -83,7 +85,9 @@ def test_equal_errors_give_the_solver_s_covariance() -> None:
     )
     R = LEVER.cam_from_body.as_matrix()
     ours = systematic.from_independent(view, sigma, systematic.isotropic(sigma))
-    np.testing.assert_allclose(ours, R @ covariance @ R.T, rtol=1e-8, atol=1e-8 * covariance.max())
+    np.testing.assert_allclose(
+        ours, R @ covariance @ R.T, rtol=1e-8, atol=1e-8 * covariance.max()
+    )
 
 
 def test_own_errors_that_differ_by_led_and_direction_have_the_claimed_covariance() -> None:
@@ -114,7 +118,9 @@ def test_common_errors_have_the_claimed_covariance() -> None:
     position_m = leds_in_view(7, 4)
     sigma = np.full(7, 1e-4)
     rng = np.random.default_rng(5)
-    fields = np.array([np.tile([5e-4, 0, 0], (7, 1)), 4e-4 * np.cross([0.3, 0, 1.0], position_m)])
+    fields = np.array(
+        [np.tile([5e-4, 0, 0], (7, 1)), 4e-4 * np.cross([0.3, 0, 1.0], position_m)]
+    )
     view = view_of(position_m)
     by_place = view.gradient @ (LEVER.cam_from_body * TRUTH).as_matrix()
     changes = [np.einsum("kij,mkj->mki", by_place, fields), 1e-3 * view.tangent[None]]
@@ -124,7 +130,9 @@ def test_common_errors_have_the_claimed_covariance() -> None:
         z = rng.standard_normal(3)
         q = seen(position_m)
         q[:, :2] *= 1 + 1e-3 * z[2]
-        errors.append(solved(unit(q), sigma, position_m + np.einsum("m,mni->ni", z[:2], fields)))
+        errors.append(
+            solved(unit(q), sigma, position_m + np.einsum("m,mni->ni", z[:2], fields))
+        )
     assert_covariance(np.array(errors), claimed)
 
 
@@ -148,7 +156,11 @@ def test_the_dome_tracker_claims_the_errors_of_its_map(kind: str) -> None:
     """Errors along the lab's x for each LED, a shift of all, a focal length: whitened errors are standard normal."""
     spread = np.random.default_rng(7).normal(size=(300, 3)) + np.array([0, 0, 2])
     position_m = np.vstack([leds_in_view(9, 6), 1.2 * unit(spread)])
-    own = np.zeros((3, 3)) if kind in ("common", "focal") else np.diag([(6e-4) ** 2, 1e-10, 1e-10])
+    own = (
+        np.zeros((3, 3))
+        if kind in ("common", "focal")
+        else np.diag([(6e-4) ** 2, 1e-10, 1e-10])
+    )
     shift = 3e-4 * (kind in ("common", "all")) * np.ones(3)
     focal = 5e-4 * (kind in ("focal", "all"))
 
@@ -173,7 +185,9 @@ def test_the_dome_tracker_claims_the_errors_of_its_map(kind: str) -> None:
         xy_px = CAMERA.pixels(seen(position_m))
         xy_px = xy_px[np.nan_to_num(xy_px, nan=-1).min(axis=1) > 5]
         xy_px = xy_px[(xy_px < [1595, 1195]).all(axis=1)]
-        settings = Settings(identifier="led_pairs", solver="rotation_only", centroid_sigma_px=0.05)
+        settings = Settings(
+            identifier="led_pairs", solver="rotation_only", centroid_sigma_px=0.05
+        )
         noisy_px = xy_px + np.hypot(0.05, 0.05) * rng.standard_normal(xy_px.shape)
         return DomeTracker(camera, map_, LEVER, settings), noisy_px
 

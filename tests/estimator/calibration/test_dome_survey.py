@@ -23,7 +23,9 @@ AXES_M = np.array([38.88, 38.88, 28.60]) * INCH
 CENTER_M = np.array([0.0, 0.0, 48 * INCH - AXES_M[2]])
 FOCAL_PX = 1 / (1 / 0.035 - 1 / (33 * INCH)) / 4.2e-6
 AFIT = Camera(1600, 1200, FOCAL_PX, (805.0, 594.0))
-AFIT_LEVER = Lever(np.array([0.003, -0.002, 15 * INCH]), Rotation.from_rotvec([0.01, -0.015, 0.4]))
+AFIT_LEVER = Lever(
+    np.array([0.003, -0.002, 15 * INCH]), Rotation.from_rotvec([0.01, -0.015, 0.4])
+)
 # The small dome: a wide lens, so that 60 lights fill the field.
 SMALL = Camera(800, 600, 900.0, (398.0, 303.0), (-0.08, 0.03, 0.001, -0.0007, 0.0))
 
@@ -59,7 +61,9 @@ def dome(count: int, half_deg: float) -> np.ndarray:
     n = np.arange(count) + 0.5
     z = 1 - n / count * (1 - np.cos(np.radians(half_deg)))
     turn = n * np.pi * (3 - np.sqrt(5))
-    along = np.column_stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z])
+    along = np.column_stack(
+        [np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z]
+    )
     return dome_map.on_surface(
         along, np.zeros(3), LedMap(np.arange(0), np.zeros((0, 3)), CENTER_M, AXES_M)
     )
@@ -121,7 +125,12 @@ def small_survey(
     camera = replace(
         SMALL, focal_px=1.01 * SMALL.focal_px, center_px=(399.5, 299.5), distortion=(0.0,) * 5
     )
-    return survey(frames, start, believed, camera, fit_distortion=True, **how), place, turned, lever
+    return (
+        survey(frames, start, believed, camera, fit_distortion=True, **how),
+        place,
+        turned,
+        lever,
+    )
 
 
 def size_and_turn(found: np.ndarray, truth: np.ndarray) -> tuple[float, Rotation]:
@@ -216,7 +225,9 @@ def test_a_known_length_scales_lights_and_lever_alone() -> None:
         by_length.leds.position_m[2] - by_length.leds.position_m[9]
     ) == pytest.approx(half)
     # Both end at one minimum; the steps stop below 1e-6 of a standard deviation, 1e-9 of a meter here.
-    np.testing.assert_allclose(by_length.leds.position_m[kept], place[kept] / 2, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        by_length.leds.position_m[kept], place[kept] / 2, rtol=0, atol=1e-8
+    )
     np.testing.assert_allclose(
         by_length.lever.camera_body_m, by_map.lever.camera_body_m / 2, rtol=0, atol=1e-8
     )
@@ -233,7 +244,9 @@ def test_the_misfit_counts_the_redundant_coordinates() -> None:
     assert len(found.outliers) == 0
     coordinates = 2 * sum(int(found.surveyed[frame.led].sum()) for frame in frames)
     unknowns = 3 * int(found.surveyed.sum()) + 3 * len(frames) + 3 + 7 - 4
-    wanted = found.rms_px / frames[0].sigma_px[0] * np.sqrt(coordinates / (coordinates - unknowns))
+    wanted = (
+        found.rms_px / frames[0].sigma_px[0] * np.sqrt(coordinates / (coordinates - unknowns))
+    )
     assert found.misfit == pytest.approx(wanted, rel=1e-9)
 
 
@@ -273,7 +286,9 @@ def gauged(
     ],
     ids=["start and its size", "measured and length"],
 )
-def test_the_covariance_matches_the_scatter_of_surveys(sigma_m: float, length_known: bool) -> None:
+def test_the_covariance_matches_the_scatter_of_surveys(
+    sigma_m: float, length_known: bool
+) -> None:
     place, turned, lever = small_dome(21)
     rng = np.random.default_rng(22)
     length = (0, 7, float(np.linalg.norm(place[0] - place[7]))) if length_known else None
@@ -292,7 +307,10 @@ def test_the_covariance_matches_the_scatter_of_surveys(sigma_m: float, length_kn
             ([found.lever.camera_body_m - true_lever], [found.lever_covariance_m2]),
             ([np.subtract(lens, [SMALL.focal_px, *SMALL.center_px])], [found.lens_covariance]),
             ((found.leds.position_m - true_place)[kept], found.led_covariance_m2[kept]),
-            ((found.body_from_lab * true_turned.inv()).as_rotvec(), found.attitude_covariance_rad2),
+            (
+                (found.body_from_lab * true_turned.inv()).as_rotvec(),
+                found.attitude_covariance_rad2,
+            ),
         ]
         distance.append(
             [np.mean(np.einsum("ni,nij,nj->n", e, np.linalg.inv(c), e)) / 3 for e, c in both]
@@ -341,7 +359,8 @@ def test_a_robust_loss_tolerates_wrong_names_and_reports_them() -> None:
     # Some 700 degrees of freedom.
     assert robust.misfit == pytest.approx(1, abs=4 / np.sqrt(2 * 700))
     rms = [
-        np.sqrt(np.mean(errors_rad(found.body_from_lab, turned) ** 2)) for found in (clean, robust)
+        np.sqrt(np.mean(errors_rad(found.body_from_lab, turned) ** 2))
+        for found in (clean, robust)
     ]
     # 5 % fewer sightings: some 3 % more error; a fifth leaves room for chance.
     assert rms[1] < 1.2 * rms[0]
@@ -368,7 +387,10 @@ def test_a_light_seen_once_keeps_its_start_position_unsurveyed() -> None:
         rest = frame.led != chosen
         once.append(
             replace(
-                frame, led=frame.led[rest], xy_px=frame.xy_px[rest], sigma_px=frame.sigma_px[rest]
+                frame,
+                led=frame.led[rest],
+                xy_px=frame.xy_px[rest],
+                sigma_px=frame.sigma_px[rest],
             )
         )
     start = leds_of(place + rng.normal(0, 0.002, place.shape))
@@ -422,7 +444,10 @@ def test_frames_in_two_groups_are_refused() -> None:
             r"known_length is \(3, 3, 0.1\); allowed: two different rows below 60",
         ),
         ({"known_length": (3, 4, 0.0)}, r"known_length is \(3, 4, 0.0\)"),
-        ({"known_length": (59, 3, 0.1)}, r"known_length ends at LED row 59, which is not surveyed"),
+        (
+            {"known_length": (59, 3, 0.1)},
+            r"known_length ends at LED row 59, which is not surveyed",
+        ),
         ({"reference_frame": 40}, r"reference_frame is 40; allowed: 0 to 39"),
         ({"leds_sigma_m": 0.0}, r"leds_sigma_m is 0.0; allowed: above 0"),
         (
@@ -441,7 +466,10 @@ def test_malformed_frames_are_refused_by_number() -> None:
     frames = filmed(np.random.default_rng(2), turned, place, lever, SMALL, 0.1)
     asked = leds_of(place), lever, SMALL
     for wrong, message in [
-        (replace(frames[3], led=frames[3].led + 60), r"frame 3 has LED rows outside of 0 to 59"),
+        (
+            replace(frames[3], led=frames[3].led + 60),
+            r"frame 3 has LED rows outside of 0 to 59",
+        ),
         (
             replace(frames[3], sigma_px=0 * frames[3].sigma_px),
             r"frame 3 has a pixel that is not finite or a sigma",
@@ -473,7 +501,9 @@ def test_the_rotations_between_two_sets_of_attitudes_are_found() -> None:
     # An IMU of one degree an axis tells them to that over the root of the attitudes, at half as well about the
     # vertical, where all yaws share; chance of 5 sigma.
     many = attitudes(rng, 600, 25)
-    imu = Rotation.from_rotvec(np.radians(1) * rng.normal(size=(600, 3))) * (left * many * right)
+    imu = Rotation.from_rotvec(np.radians(1) * rng.normal(size=(600, 3))) * (
+        left * many * right
+    )
     found_left, _ = align_attitudes(many, imu)
     errors = (found_left * left.inv()).as_rotvec()
     assert np.degrees(np.abs((left.inv().apply(errors))[:2])).max() < 5 * np.sqrt(2 / 600)
@@ -518,7 +548,9 @@ def test_the_afit_dome_is_surveyed_from_its_own_frames(begin: str) -> None:
     turned = attitudes(rng, 600, 30)
     frames = filmed(rng, turned, place, AFIT_LEVER, AFIT, 0.1)
     start = leds_of(place + rng.normal(0, 0.002, place.shape))
-    believed = Lever(AFIT_LEVER.camera_body_m + rng.normal(0, 0.005, 3), AFIT_LEVER.cam_from_body)
+    believed = Lever(
+        AFIT_LEVER.camera_body_m + rng.normal(0, 0.005, 3), AFIT_LEVER.cam_from_body
+    )
     camera = replace(AFIT, focal_px=1.01 * AFIT.focal_px, center_px=(799.5, 599.5))
     if begin == "rotation_only":
         frames = [
@@ -541,7 +573,12 @@ def test_the_afit_dome_is_surveyed_from_its_own_frames(begin: str) -> None:
     began_s = perf_counter()
     worked_s = process_time()
     found = survey(
-        frames, start, believed, camera, loss="cauchy" if wrong else "linear", leds_sigma_m=0.002
+        frames,
+        start,
+        believed,
+        camera,
+        loss="cauchy" if wrong else "linear",
+        leds_sigma_m=0.002,
     )
     took_s = perf_counter() - began_s
     worked_s = process_time() - worked_s

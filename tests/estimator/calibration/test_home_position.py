@@ -48,7 +48,9 @@ PLACES_MM = np.array(
 MAGNITUDE = np.linspace(160, 20, len(PLACES_MM))
 NOISE_PX = 0.3
 NOISE_MAG = 2.0
-SIGMA_M = (R_M - M_M) * NOISE_PX / CAMERA.focal_px  # of a coordinate: eq. 43 is linear in pixels
+SIGMA_M = (
+    (R_M - M_M) * NOISE_PX / CAMERA.focal_px
+)  # of a coordinate: eq. 43 is linear in pixels
 ARCSEC = np.pi / 648_000
 # Each law below is broken by chance once in ten thousand; the draws are fixed.
 RARE = 1e-4
@@ -70,7 +72,9 @@ def sighting(
     noise_px: float = NOISE_PX,
     lever: Lever = LEVER,
 ) -> Sighting:
-    xy = project(truth, leds.position_m, lever, CAMERA) + rng.normal(0, noise_px, (len(leds.id), 2))
+    xy = project(truth, leds.position_m, lever, CAMERA) + rng.normal(
+        0, noise_px, (len(leds.id), 2)
+    )
     magnitude = MAGNITUDE[: len(leds.id)] + rng.normal(0, NOISE_MAG, len(leds.id))
     order = rng.permutation(len(leds.id))  # names, not the order, say which is which
     return Sighting(position, imu, leds.id[order], xy[order], magnitude[order])
@@ -141,7 +145,9 @@ def test_the_epsilons_at_one_stop_are_the_injected_noise() -> None:
     assert greatest_sd(1, 249)[0] < found.epsilon_sep_rad / sigma < greatest_sd(66, 249)[1]
 
 
-IMU_RAD = 1.9861e-3 / R_M  # .0933 degree: Table 9's epsilon_position, were it all the IMU's (A7)
+IMU_RAD = (
+    1.9861e-3 / R_M
+)  # .0933 degree: Table 9's epsilon_position, were it all the IMU's (A7)
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +157,9 @@ def stops() -> list[Sighting]:
     level = Rotation.identity()
     wrong = Rotation.from_rotvec(rng.normal(0, IMU_RAD, (300, 3)))
     return [
-        sighting(rng, dome(), level, imu, stop) for stop, imu in enumerate(wrong) for _ in range(2)
+        sighting(rng, dome(), level, imu, stop)
+        for stop, imu in enumerate(wrong)
+        for _ in range(2)
     ]
 
 
@@ -280,7 +288,9 @@ def test_the_mean_over_all_stops_keeps_their_imu_error_and_home_does_not() -> No
     seen = at_home(rng, 20) + [
         sighting(rng, dome(), Rotation.identity(), wrong, 1) for _ in range(20)
     ]
-    home, both = (calibrate(seen, CAMERA, SPHERE, LEVER, home_only=only) for only in (True, False))
+    home, both = (
+        calibrate(seen, CAMERA, SPHERE, LEVER, home_only=only) for only in (True, False)
+    )
     assert home.samples.tolist() == [20] * 12
     assert both.samples.tolist() == [40] * 12
     # Half of the frames are turned back by 2e-3 too much: y moves by R 1e-3 (z is up, x the axis: + y).
@@ -345,7 +355,9 @@ def test_unusable_sightings_are_refused_in_one_line() -> None:
     twice = replace(seen[0], led=np.full(12, 100))
     short = replace(seen[0], brightness=np.ones(3))
     blind = replace(seen[0], xy_px=np.full((12, 2), np.nan))
-    one = Sighting(0, Rotation.identity(), np.array([1]), np.array([[800.0, 600]]), np.array([9.0]))
+    one = Sighting(
+        0, Rotation.identity(), np.array([1]), np.array([[800.0, 600]]), np.array([9.0])
+    )
     for sightings, message in [
         ([], "no sightings"),
         ([seen[0], twice], "sighting 1: an id occurs twice"),

@@ -50,7 +50,10 @@ def test_a_change_of_states_is_recovered(rng: np.random.Generator) -> None:
         mass_dynamics.cross(a, b), np.cross(a, b, axis=0), rtol=0, atol=1e-12
     )
     np.testing.assert_allclose(
-        mass_dynamics.turn(states.quaternion, a).T, states.rotation.apply(a.T), rtol=0, atol=1e-12
+        mass_dynamics.turn(states.quaternion, a).T,
+        states.rotation.apply(a.T),
+        rtol=0,
+        atol=1e-12,
     )
     back = mass_dynamics.turn(
         states.quaternion, mass_dynamics.turn(states.quaternion, a), inverse=True
@@ -147,7 +150,9 @@ def test_elimination_equals_the_whole_normal_matrix(rng: np.random.Generator) ->
     outer = whole[: STATE * count, STATE * count :]
     schur = whole[STATE * count :, STATE * count :] - outer.T @ np.linalg.solve(inner, outer)
     scale = np.outer(assumed.sigma, assumed.sigma)
-    np.testing.assert_allclose(part.normal * scale, schur[:-1, :-1] * scale, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(
+        part.normal * scale, schur[:-1, :-1] * scale, rtol=1e-4, atol=1e-4
+    )
     band = mass_properties.lower_band(diagonal, np.zeros((count - 1, STATE, STATE)))
     np.testing.assert_array_equal(band[0], diagonal[:, range(STATE), range(STATE)].ravel())
 
@@ -169,7 +174,9 @@ def test_consider_covariance_is_the_effect_of_attitude_errors(
         RECORD, covariance_rad2=RECORD.covariance_rad2 + systematic, systematic_rad2=systematic
     )
     np.testing.assert_allclose(shared.noise_rad2, RECORD.covariance_rad2, rtol=1e-12)
-    np.testing.assert_allclose(shared.with_noise(3.0).noise_rad2, 3 * shared.noise_rad2, rtol=1e-12)
+    np.testing.assert_allclose(
+        shared.with_noise(3.0).noise_rad2, 3 * shared.noise_rad2, rtol=1e-12
+    )
     np.testing.assert_array_equal(shared.with_noise(3.0).systematic_rad2, systematic)
     turns = np.zeros((len(RECORD.t_s), 3))
     turns[at] = error
@@ -258,4 +265,6 @@ def test_momentum_scales_with_the_inertia(rng: np.random.Generator, factor: floa
         found, np.tile(np.eye(3) / factor, (4, 1, 1)), rtol=0, atol=1e-9 / factor
     )
     inverse = mass_dynamics.inverse_inertia(RECORD, scaled)
-    np.testing.assert_allclose(inverse @ inertia_matrix(scaled[:6]), np.eye(3), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        inverse @ inertia_matrix(scaled[:6]), np.eye(3), rtol=0, atol=1e-9
+    )

@@ -25,7 +25,16 @@ from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids, StarMatch
-from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units
+from tests.helpers.laws import (
+    ANY,
+    NUMBERS,
+    SEEDS,
+    answered,
+    assert_covariance,
+    law,
+    turn,
+    units,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 LIGHTS = 14
@@ -42,7 +51,9 @@ def dome(rng: np.random.Generator, noise_px: float = 0.0) -> tuple[Bundle, Sight
     )
     lean = 0.25 * units(rng, FRAMES)
     yaw = rng.uniform(0, 2 * np.pi, FRAMES)
-    turned = Rotation.from_rotvec(lean * [1, 1, 0]) * Rotation.from_rotvec(yaw[:, None] * [0, 0, 1])
+    turned = Rotation.from_rotvec(lean * [1, 1, 0]) * Rotation.from_rotvec(
+        yaw[:, None] * [0, 0, 1]
+    )
     true = Bundle(
         *(
             place,
@@ -132,7 +143,9 @@ def test_eliminating_the_lights_solves_the_whole_system(
     assert 0 <= cost <= ba.cauchy(squared, np.inf)[0] * (1 + 1e-12)
     assert ((lighter > 0) & (lighter <= 1)).all()
     np.testing.assert_allclose(bundle.cost(seen, width)[0], cost, rtol=1e-12, atol=0)
-    assert ba.robust_scale(bundle, seen) == max(1.0, np.median(np.sqrt(squared)) / ba.MEDIAN_RADIUS)
+    assert ba.robust_scale(bundle, seen) == max(
+        1.0, np.median(np.sqrt(squared)) / ba.MEDIAN_RADIUS
+    )
 
 
 @law(Assumed.less, Assumed.weight, Bundle.cost, ba.normal_equations)
@@ -148,15 +161,22 @@ def test_an_assumption_acts_as_a_measurement_of_its_weight(
     """The right-hand sides are half the cost's falling slope, and the matrix has 1 / sigma^2 more for each value."""
     true, seen = dome(rng, 0.1)
     assumed = Assumed(
-        true.camera_body_m + rng.normal(0, 0.01, 3), lever_m, LENS[0] + rng.normal(0, 5), focal_px
+        true.camera_body_m + rng.normal(0, 0.01, 3),
+        lever_m,
+        LENS[0] + rng.normal(0, 5),
+        focal_px,
     )
     bundle = replace(nudged(rng, true, 1e-3), map_sigma_m=list_m)
     known = replace(bundle, assumed=assumed)
     every = np.ones(len(seen.led))
     terms = ba.normal_equations(known, seen, every)
     more = np.diag(terms.rest - ba.normal_equations(bundle, seen, every).rest)
-    sigma = np.maximum([lever_m] * 3 + [focal_px], ba.EXACT * np.array([1, 1, 1, assumed.focal_px]))
-    np.testing.assert_allclose(more[3 * FRAMES : 3 * FRAMES + 4], sigma**-2.0, rtol=1e-3, atol=1e-3)
+    sigma = np.maximum(
+        [lever_m] * 3 + [focal_px], ba.EXACT * np.array([1, 1, 1, assumed.focal_px])
+    )
+    np.testing.assert_allclose(
+        more[3 * FRAMES : 3 * FRAMES + 4], sigma**-2.0, rtol=1e-3, atol=1e-3
+    )
     assert np.abs(np.delete(more, np.s_[3 * FRAMES : 3 * FRAMES + 4])).max() == 0
     led = rng.normal(size=3 * LIGHTS)
     rest = rng.normal(size=3 * FRAMES + 6)
@@ -190,9 +210,9 @@ def test_redundancy_is_the_share_of_residuals_that_the_unknowns_do_not_absorb(
     covariances = ba.covariance(terms, known)
     spare = 2 * rows - np.trace(np.linalg.solve(whole_matrix(terms), pixels))
     assert dome_survey.redundancy(part, covariances) == pytest.approx(spare, abs=1e-3)
-    assert (answered(lambda: dome_survey.check_redundancy(part, covariances) or True) is None) == (
-        spare < dome_survey.MIN_REDUNDANCY
-    )
+    assert (
+        answered(lambda: dome_survey.check_redundancy(part, covariances) or True) is None
+    ) == (spare < dome_survey.MIN_REDUNDANCY)
     # Without the list the pixels leave the four moves of the gauge undetermined.
     alone = replace(part, bundle=true)
     assert dome_survey.redundancy(alone, covariances) == 2 * rows - (len(pixels) - 4)
@@ -282,12 +302,16 @@ def test_a_gauge_freedom_moves_no_pixel(
                 for at in (once.position_m, once.position_m + moved)
             ]
         )
-        np.testing.assert_allclose(moved.ravel() @ by_led[:, 3], change_m[0], rtol=0, atol=1e-10)
+        np.testing.assert_allclose(
+            moved.ravel() @ by_led[:, 3], change_m[0], rtol=0, atol=1e-10
+        )
 
 
 @law(align_attitudes)
 @given(rng=SEEDS, count=some.integers(3, 12))
-def test_two_rotations_between_attitudes_are_found(rng: np.random.Generator, count: int) -> None:
+def test_two_rotations_between_attitudes_are_found(
+    rng: np.random.Generator, count: int
+) -> None:
     ours = Rotation.random(count, rng=rng)
     left = turn(rng, 0.5)
     right = turn(rng, 3)
@@ -457,12 +481,18 @@ class Namer:
     def solve_centroids(self, centroids: Centroids) -> Attitude:
         star = centroids.flux.astype(np.int64) - 1
         match = StarMatch(np.arange(len(star)), star, Rotation.identity(), -9.0)
-        return Attitude("solved", Rotation.identity(), match=match) if self.seen else Attitude("no")
+        return (
+            Attitude("solved", Rotation.identity(), match=match)
+            if self.seen
+            else Attitude("no")
+        )
 
 
 @law(star_field.self_calibrate)
 @given(rng=SEEDS, seen=some.booleans())
-def test_a_camera_is_calibrated_by_identified_stars(rng: np.random.Generator, seen: bool) -> None:
+def test_a_camera_is_calibrated_by_identified_stars(
+    rng: np.random.Generator, seen: bool
+) -> None:
     frames, _ = filmed(rng, 5)
     lights = [
         Centroids(one.xy_px, one.sigma_px, np.arange(1.0, 26.0) + 25 * k)

@@ -69,7 +69,9 @@ def test_a_longer_plan_extends_a_shorter_one(rng: np.random.Generator, count: in
         reachable = (shown & covered).sum(axis=1)
         assert reachable[row] >= min(survey_plan.LEAST_CROSSING, reachable.max())
         covered = covered | shown[row]
-    assert answered(lambda: survey_plan.choose(assumed, candidates, shown[:, :-1], count)) is None
+    assert (
+        answered(lambda: survey_plan.choose(assumed, candidates, shown[:, :-1], count)) is None
+    )
 
 
 @law(dome_survey.ray_angles)
@@ -145,7 +147,9 @@ def test_an_led_far_from_the_list_is_displaced(
 
 @law(survey_faults.stray_lights)
 @given(rng=SEEDS)
-def test_a_stationary_light_is_found_and_a_defective_pixel_is_not(rng: np.random.Generator) -> None:
+def test_a_stationary_light_is_found_and_a_defective_pixel_is_not(
+    rng: np.random.Generator,
+) -> None:
     assumed = model(60)
     held = attitudes(rng, 40)
     frames = HeldFrames(assumed.camera, assumed.leds, assumed.lever, held)
@@ -154,7 +158,9 @@ def test_a_stationary_light_is_found_and_a_defective_pixel_is_not(rng: np.random
     frame = np.flatnonzero(assumed.camera.contains(xy_px))
     hot = np.tile([400.0, 100.0], (len(held), 1))  # moves over the dome with the camera
     rows = np.concatenate([frame, np.arange(len(held))])
-    strays = survey_faults.stray_lights(frames, rows, np.vstack([xy_px[frame], hot]), 0.1, 0.004)
+    strays = survey_faults.stray_lights(
+        frames, rows, np.vstack([xy_px[frame], hot]), 0.1, 0.004
+    )
     near = [stray for stray in strays if np.linalg.norm(stray.position_m - place_m) < 2e-3]
     assert len(near) == (len(frame) >= survey_faults.MIN_FRAMES)
     assert survey_faults.stray_lights(frames, rows[:0], hot[:0], 0.1, 0.004) == []

@@ -17,7 +17,11 @@ from estimator.calibration.mass_dynamics import (
     MassEstimate,
     States,
 )
-from estimator.calibration.mass_properties import estimate_mass, estimate_with_noise, filter_mass
+from estimator.calibration.mass_properties import (
+    estimate_mass,
+    estimate_with_noise,
+    filter_mass,
+)
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
 from tests.helpers.bearing_motion import GRAVITY_M_S2, INERTIA, SMALL, Vehicle, prior, record
@@ -86,7 +90,9 @@ def nees(estimate: MassEstimate, vehicle: Vehicle) -> float:
     return float(error @ np.linalg.solve(estimate.covariance[NINE, NINE], error))
 
 
-def draws(count: int, seed: int) -> list[tuple[BearingRecord, LabConstants, float, MassEstimate]]:
+def draws(
+    count: int, seed: int
+) -> list[tuple[BearingRecord, LabConstants, float, MassEstimate]]:
     """Records with random noise, torque and assumptions, each with the NEES of the batch estimate."""
     rows = []
     for child in np.random.SeedSequence(seed).spawn(count):
@@ -107,7 +113,9 @@ def test_inertia_and_offset_are_found_with_errors_as_claimed() -> None:
     assert estimate.misfit == pytest.approx(1, abs=0.35)
     assert (estimate.sigma[:6] < 0.01 * np.max(INERTIA)).all()
     assert (estimate.sigma[6:8] < 1e-6).all()
-    np.testing.assert_allclose(estimate.inertia_kg_m2, INERTIA, rtol=0, atol=0.03 * np.max(INERTIA))
+    np.testing.assert_allclose(
+        estimate.inertia_kg_m2, INERTIA, rtol=0, atol=0.03 * np.max(INERTIA)
+    )
 
 
 @pytest.mark.long
@@ -143,7 +151,9 @@ def test_the_filter_ends_at_the_batch_solution() -> None:
 def test_a_free_swing_determines_only_the_ratio_of_inertia_and_offset() -> None:
     """Without wheels the equations are homogeneous in J and m r: their common scale stays as uncertain as assumed."""
     rng = np.random.default_rng(8)
-    vehicle = replace(SMALL, moment_kg_m=np.array([1e-5, -2e-5, -4e-4]), lab_torque_nm=np.zeros(3))
+    vehicle = replace(
+        SMALL, moment_kg_m=np.array([1e-5, -2e-5, -4e-4]), lab_torque_nm=np.zeros(3)
+    )
     assumed, _ = prior(vehicle, rng)
     estimate = estimate_mass([record(vehicle, rng, wheels=False)], vehicle.lab, assumed)
     scale = vehicle.truth[NINE] / np.linalg.norm(vehicle.truth[NINE])
@@ -182,7 +192,9 @@ def test_the_scale_of_free_swings_is_not_biased_to_small_inertias() -> None:
 def test_a_motion_of_known_trim_adds_the_scale() -> None:
     """Two free swings, the second with a known moment added: the inertia follows without wheels."""
     rng = np.random.default_rng(9)
-    vehicle = replace(SMALL, moment_kg_m=np.array([1e-5, -2e-5, -4e-4]), lab_torque_nm=np.zeros(3))
+    vehicle = replace(
+        SMALL, moment_kg_m=np.array([1e-5, -2e-5, -4e-4]), lab_torque_nm=np.zeros(3)
+    )
     added = np.array([5e-5, 3e-5, -4e-4])
     assumed, vehicle = prior(vehicle, rng)
     trimmed = replace(vehicle, moment_kg_m=vehicle.moment_kg_m + added)
@@ -213,7 +225,9 @@ def test_too_few_attitudes_and_missing_wheel_speeds_are_refused() -> None:
 
 def shared_errors(attitudes: Rotation, sigma_rad: float, rng: np.random.Generator) -> Floats:
     """(N, 3) errors whose correlation falls with the rotation between two attitudes, exp(-rotation / 0.2 rad)."""
-    turned = np.array([(attitudes[n].inv() * attitudes).magnitude() for n in range(len(attitudes))])
+    turned = np.array(
+        [(attitudes[n].inv() * attitudes).magnitude() for n in range(len(attitudes))]
+    )
     correlation = np.exp(-turned / 0.2) + 1e-9 * np.eye(len(attitudes))
     return np.asarray(
         sigma_rad * np.linalg.cholesky(correlation) @ rng.standard_normal((len(attitudes), 3))

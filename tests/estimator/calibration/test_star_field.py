@@ -39,7 +39,9 @@ NOISE_PX = 0.1
 
 
 def on_sensor(camera: Camera, count: int, rng: np.random.Generator) -> np.ndarray:
-    return rng.uniform([-0.5, -0.5], [camera.width_px - 0.5, camera.height_px - 0.5], (count, 2))
+    return rng.uniform(
+        [-0.5, -0.5], [camera.width_px - 0.5, camera.height_px - 0.5], (count, 2)
+    )
 
 
 @dataclass(frozen=True)
@@ -223,7 +225,11 @@ def test_half_a_field_of_wrong_frames_is_left_out() -> None:
     field = drawn(np.random.default_rng(94))
     rng = np.random.default_rng(95)
     nonsense = Rotation.random(rng=rng).apply(TRUE.rays(on_sensor(TRUE, 20, rng)))
-    frames = [*field.frames[:7], replace(field.frames[7], vectors_ref=nonsense), *field.frames[8:]]
+    frames = [
+        *field.frames[:7],
+        replace(field.frames[7], vectors_ref=nonsense),
+        *field.frames[8:],
+    ]
     found = calibrate(frames, SHEET)
     assert not found.report.tied[7]
     assert found.report.tied.sum() == 19
@@ -244,7 +250,10 @@ def test_bad_frames_are_refused_in_one_line() -> None:
         ([replace(good, sigma_px=np.zeros(20))], "frame 0 has a pixel .* sigma_px not above 0"),
         ([replace(good, xy_px=good.xy_px * np.nan)], "frame 0 has a pixel .* not finite"),
         (lacking[:1], "8 coordinates in frames of 3 stars or more, for 3 unknowns of attitude"),
-        (drawn(np.random.default_rng(96), stars=2).frames, "0 coordinates in frames of 3 stars"),
+        (
+            drawn(np.random.default_rng(96), stars=2).frames,
+            "0 coordinates in frames of 3 stars",
+        ),
     ]
     for frames, what in spoiled:
         with pytest.raises(ValueError, match=what) as caught:
@@ -314,7 +323,10 @@ class Nearest:
         predicted = self.camera.pixels(cam_from_ref.apply(mine))
         near = np.flatnonzero(np.linalg.norm(predicted - centroids.xy_px, axis=1) < 3)
         return Attitude(
-            "solved", cam_from_ref, np.eye(3), StarMatch(near, 20 * k + near, cam_from_ref, -20.0)
+            "solved",
+            cam_from_ref,
+            np.eye(3),
+            StarMatch(near, 20 * k + near, cam_from_ref, -20.0),
         )
 
 
@@ -324,7 +336,9 @@ def test_each_round_names_more_stars_until_none_are_gained() -> None:
     field = drawn(np.random.default_rng(98), frames=40)
     vectors = np.concatenate([one.vectors_ref for one in field.frames])
     v_mag = np.linspace(2, 6, len(vectors))
-    stars = StarCatalog(np.arange(800), vectors, np.zeros((800, 3)), np.zeros(800), v_mag, 2000.0)
+    stars = StarCatalog(
+        np.arange(800), vectors, np.zeros((800, 3)), np.zeros(800), v_mag, 2000.0
+    )
     frames = [
         Centroids(
             one.xy_px, one.sigma_px, 2.0 * 10 ** (-0.4 * (v_mag[20 * k : 20 * k + 20] - 12.5))

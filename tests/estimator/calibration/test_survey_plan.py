@@ -62,7 +62,9 @@ def simulated(
             0, true.sigma_px, (len(led), 2)
         )
         start = Rotation.from_rotvec(0.005 * rng.normal(size=3)) * attitude
-        frames.append(DomeFrame(led, xy_px, np.full(len(led), sigma_factor * true.sigma_px), start))
+        frames.append(
+            DomeFrame(led, xy_px, np.full(len(led), sigma_factor * true.sigma_px), start)
+        )
     if change:
         frames = [change(frame) for frame in frames]
     list_error_m = rng.normal(0, LIST_SIGMA_M, true.leds.position_m.shape)
@@ -104,7 +106,9 @@ def test_surveys_have_the_predicted_errors(sigma_factor: float) -> None:
     claimed = []
     for _ in range(SURVEYS):
         found = simulated(rng, true, held, sigma_factor)
-        assert abs(found.surveyed.sum() - predicted.measured.sum()) <= 2  # rays that hardly cross
+        assert (
+            abs(found.surveyed.sum() - predicted.measured.sum()) <= 2
+        )  # rays that hardly cross
         led_m = (found.leds.position_m - true.leds.position_m)[found.surveyed]
         lever_m = found.lever.camera_body_m - true.lever.camera_body_m
         squares.append(
@@ -114,7 +118,9 @@ def test_surveys_have_the_predicted_errors(sigma_factor: float) -> None:
                 (found.camera.focal_px - true.camera.focal_px) ** 2,
             ]
         )
-        claimed.append([np.nanmean(np.einsum("nii->n", found.led_covariance_m2)) / 3, found.misfit])
+        claimed.append(
+            [np.nanmean(np.einsum("nii->n", found.led_covariance_m2)) / 3, found.misfit]
+        )
         assert found.noise_scale * sigma_factor == pytest.approx(1, abs=5 / np.sqrt(2 * 150))
     rms = np.sqrt(np.mean(squares, axis=0))
     lever_m = np.sqrt(np.mean(predicted.lever_sigma_m**2))
@@ -209,7 +215,9 @@ def test_planned_attitudes_are_connected_by_rays_that_cross() -> None:
 
 
 @pytest.mark.parametrize(("arm_m", "least"), [(0.1, 20), (0.15, 25), (0.2, 15)])
-def test_a_plan_with_a_short_lever_still_connects_its_attitudes(arm_m: float, least: int) -> None:
+def test_a_plan_with_a_short_lever_still_connects_its_attitudes(
+    arm_m: float, least: int
+) -> None:
     """Few rays cross, so the requested number is not reached; LEDs that are only shared are used instead."""
     camera = Camera(640, 480, 2500.0, (319.5, 239.5))
     true = replace(model(400), camera=camera, lever_sigma_m=0.005, focal_sigma_px=9.0)
@@ -305,7 +313,13 @@ def test_codes_reveal_exchanged_leds_of_equal_brightness() -> None:
     )
     table = LightTable(light, np.ones_like(on), words)
     found, observable = survey_faults.exchanged(table)
-    assert {(one.led, one.shows) for one in found} == {(3, 9), (9, 3), (20, 30), (30, 40), (40, 20)}
+    assert {(one.led, one.shows) for one in found} == {
+        (3, 9),
+        (9, 3),
+        (20, 30),
+        (30, 40),
+        (40, 20),
+    }
     assert all(one.or_any_of == () for one in found)
     assert observable > 0.8
 

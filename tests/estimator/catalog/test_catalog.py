@@ -36,7 +36,9 @@ def stars() -> StarCatalog:
 def made_up(*rows: tuple[float, ...]) -> StarCatalog:
     """Stars of (id, ra deg, dec deg, pm_ra, pm_dec mas/yr, parallax mas, V)."""
     hip, ra, dec, *rest = np.array(rows).T
-    return catalog.from_columns(hip.astype(int), np.radians(ra), np.radians(dec), *rest, EPOCH_YR)
+    return catalog.from_columns(
+        hip.astype(int), np.radians(ra), np.radians(dec), *rest, EPOCH_YR
+    )
 
 
 def separation_rad(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -117,7 +119,8 @@ def test_the_classical_aberration_differs_by_half_a_thousandth_at_most() -> None
 def test_a_star_like_barnard_s_drifts_ten_arcseconds_a_year() -> None:
     # 10.36"/yr for 20 years, northward from dec +4.7: a rotation towards the pole but for the cube of 207".
     start, end = (
-        catalog.at_epoch(made_up((1, 269.4, 4.7, 0, 10_360, 0, 9.5)), 1991.25 + t) for t in (0, 20)
+        catalog.at_epoch(made_up((1, 269.4, 4.7, 0, 10_360, 0, 9.5)), 1991.25 + t)
+        for t in (0, 20)
     )
     moved = np.degrees(np.arcsin(end[0, 2]) - np.arcsin(start[0, 2])) * 3600
     assert moved == pytest.approx(207.2, abs=1e-3)
@@ -162,7 +165,9 @@ def test_naive_times_are_utc_like_zoned_ones() -> None:
     zoned = catalog.on_earth(datetime.datetime(2024, 5, 6, 12, tzinfo=zone))
     np.testing.assert_array_equal(naive.position_au, zoned.position_au)
     # JD 2460437.125; TT is 69.184 s later.
-    assert naive.epoch_yr == pytest.approx(2000 + (8892.125 + 69.184 / 86400) / 365.25, abs=1e-9)
+    assert naive.epoch_yr == pytest.approx(
+        2000 + (8892.125 + 69.184 / 86400) / 365.25, abs=1e-9
+    )
 
 
 def test_the_earth_moves_thirty_kilometers_a_second_about_a_sun_one_au_away() -> None:
@@ -175,7 +180,9 @@ def test_the_earth_moves_thirty_kilometers_a_second_about_a_sun_one_au_away() ->
 
 def test_two_equal_stars_ten_arcseconds_apart_merge_half_way_and_0_753_brighter() -> None:
     # -2.5 log10 2 = -0.7526.
-    pair = made_up((7, 50, -1e-3 * 5 / 3.6, 100, 0, 8, 5), (8, 50, 1e-3 * 5 / 3.6, 300, 20, 16, 5))
+    pair = made_up(
+        (7, 50, -1e-3 * 5 / 3.6, 100, 0, 8, 5), (8, 50, 1e-3 * 5 / 3.6, 300, 20, 16, 5)
+    )
     one = catalog.merge_doubles(pair, 11 * ARCSEC_RAD)
     assert one.id.tolist() == [7]
     assert one.v_mag[0] == pytest.approx(5 - 0.7526, abs=1e-4)
@@ -283,7 +290,8 @@ def test_an_invalid_catalog_is_refused_in_one_line(tmp_path: Path, name: str) ->
 
 
 @pytest.mark.parametrize(
-    "epoch", ["", "#   epoch_jyear: last year\n", "#   epoch_jyear: 1e9\n", "#   epoch_jyear: 16\n"]
+    "epoch",
+    ["", "#   epoch_jyear: last year\n", "#   epoch_jyear: 1e9\n", "#   epoch_jyear: 16\n"],
 )
 def test_a_file_without_an_epoch_is_refused(tmp_path: Path, epoch: str) -> None:
     path = tmp_path / "stars.ecsv"

@@ -44,7 +44,9 @@ def test_stars_move_across_the_sky_and_no_farther_than_they_can(
     np.testing.assert_allclose(
         catalog.at_epoch(stars, stars.epoch_yr), stars.vectors, rtol=0, atol=1e-15
     )
-    np.testing.assert_allclose(catalog.unit(stars.vectors * 7.0), stars.vectors, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        catalog.unit(stars.vectors * 7.0), stars.vectors, rtol=0, atol=1e-15
+    )
     there = catalog.Observer(year, units(rng, 1)[0], 3e4 * units(rng, 1)[0])
     seen = catalog.apparent(stars, there)
     np.testing.assert_allclose(np.linalg.norm(seen, axis=1), 1, rtol=0, atol=1e-12)
@@ -108,7 +110,9 @@ def test_spread_stars_are_apart_and_none_is_left_out_needlessly(
 
 @law(published_catalogs.chosen, slow=True)
 @given(rng=SEEDS)
-def test_the_flown_catalog_has_the_requested_number_or_is_refused(rng: np.random.Generator) -> None:
+def test_the_flown_catalog_has_the_requested_number_or_is_refused(
+    rng: np.random.Generator,
+) -> None:
     many = replace(drawn(rng, 2600), v_mag=np.linspace(4, 5.2, 2600))
     assert abs(len(published_catalogs.chosen(many)) - published_catalogs.COUNT) <= 3
     with pytest.raises(ImageError, match="2023 of"):
@@ -128,7 +132,10 @@ def test_merged_stars_keep_their_light(rng: np.random.Generator, near_rad: float
     merged = catalog.merge_doubles(stars, near_rad)
     for magnitudes in (mag, merged.v_mag):
         np.testing.assert_allclose(
-            np.sum(10 ** (-0.4 * magnitudes)), np.sum(10 ** (-0.4 * stars.v_mag)), rtol=1e-9, atol=0
+            np.sum(10 ** (-0.4 * magnitudes)),
+            np.sum(10 ** (-0.4 * stars.v_mag)),
+            rtol=1e-9,
+            atol=0,
         )
     assert set(merged.id) <= set(stars.id)
     assert (np.diff(merged.v_mag) >= 0).all()
@@ -147,7 +154,9 @@ def test_any_table_is_a_catalog_or_is_refused(
 ) -> None:
     path = tmp_path_factory.mktemp("catalog") / "x.ecsv"
     head = "# epoch_jyear: 2016.0\n" + ",".join(catalog.COLUMNS)
-    path.write_text("\n".join([head, *(",".join(map(str, row)) for row in rows)]), encoding="utf-8")
+    path.write_text(
+        "\n".join([head, *(",".join(map(str, row)) for row in rows)]), encoding="utf-8"
+    )
     answered(lambda: catalog.read(path), ImageError)
     answered(lambda: published_catalogs.read_cat(path, 5.0), ImageError)
     table = rng.uniform(1, 50, (4, 7))
@@ -211,7 +220,9 @@ def test_all_three_indexes_hold_the_existing_pairs(
         in_bin = np.repeat(np.arange(len(made.first) - 1), np.diff(made.first))
         assert np.abs(angle / made.bin_rad - in_bin - 0.5).max() < 0.5 + 1e-6
         assert len({tuple(sorted(pair)) for pair in made.pair.tolist()}) == pairs
-    known = pair_index.build_pair_catalog(vectors, mag, 0.01, (0.0, most_rad)) if pairs else None
+    known = (
+        pair_index.build_pair_catalog(vectors, mag, 0.01, (0.0, most_rad)) if pairs else None
+    )
     assert known is None or known.table[-1] == len(known.pair) == pairs
     assert sorted(sky_index.build_grid(vectors).row.tolist()) == list(range(count))
     kvector, slope, offset = pair_index.k_vector(np.sort(every))
@@ -226,7 +237,9 @@ def test_all_three_indexes_hold_the_existing_pairs(
 
 @law(pair_index.build)
 @given(vectors=RAYS, mag=NUMBERS, most_rad=ANY)
-def test_any_array_is_indexed_or_refused(vectors: NDArray, mag: NDArray, most_rad: float) -> None:
+def test_any_array_is_indexed_or_refused(
+    vectors: NDArray, mag: NDArray, most_rad: float
+) -> None:
     answered(lambda: pair_index.build(vectors, most_rad))
     answered(lambda: pair_index.build(vectors, 1.0, None, mag))
 

@@ -23,7 +23,9 @@ def of_angles(angle_rad: np.ndarray) -> pair_index.PairIndex:
     """An index with these sorted angles and arbitrary stars."""
     count, slope, offset = pair_index.k_vector(angle_rad)
     any_sky = pair_index.build(np.eye(3), 2.0)
-    return any_sky._replace(angle_rad=angle_rad, kvector=count, slope_rad=slope, offset_rad=offset)
+    return any_sky._replace(
+        angle_rad=angle_rad, kvector=count, slope_rad=slope, offset_rad=offset
+    )
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +108,9 @@ def test_a_range_of_the_real_index_holds_brute_force_s_pairs_and_few_more(
 ) -> None:
     rng = np.random.default_rng(32)
     extra = []
-    for middle, half in zip(rng.uniform(0, 0.33, 500), rng.uniform(1e-5, 1e-3, 500), strict=True):
+    for middle, half in zip(
+        rng.uniform(0, 0.33, 500), rng.uniform(1e-5, 1e-3, 500), strict=True
+    ):
         begin, end = pair_index.pair_range(sky, middle - half, middle + half)
         first, last = np.searchsorted(sky.angle_rad, [middle - half, middle + half])
         assert set(range(first, last)) <= set(range(begin, end))
@@ -146,7 +150,9 @@ def test_small_angles_keep_their_digits() -> None:
     vectors = np.array([[0.0, 0, 1], [1e-8, 0, 1], [0, 3e-8, 1]])
     known = pair_index.build(vectors, 1e-3)
     # Rounding of 1.
-    np.testing.assert_allclose(known.angle_rad, [1e-8, 3e-8, np.sqrt(10) * 1e-8], rtol=1e-8, atol=0)
+    np.testing.assert_allclose(
+        known.angle_rad, [1e-8, 3e-8, np.sqrt(10) * 1e-8], rtol=1e-8, atol=0
+    )
 
 
 def test_a_sky_without_patterns_is_refused() -> None:

@@ -27,7 +27,9 @@ def made_up(ra_arcsec: list[float], magnitude: list[float]) -> OnBoard:
     """Stars on the equator."""
     ra = np.array(ra_arcsec) * ARCSEC_RAD
     vectors = np.column_stack([np.cos(ra), np.sin(ra), 0 * ra])
-    return OnBoard(np.arange(len(ra)), vectors, np.array(magnitude), np.ones(len(ra), int), 2000.0)
+    return OnBoard(
+        np.arange(len(ra)), vectors, np.array(magnitude), np.ones(len(ra), int), 2000.0
+    )
 
 
 @pytest.mark.parametrize(("limit", "published"), [(5.0, 1618), (5.4, 2551), (6.0, 5025)])
@@ -72,7 +74,9 @@ def test_an_instrument_s_magnitudes_follow_the_formula_and_a_missing_color_is_th
     )
     seen = read_cat(path, 6.0, color=Color(0.1, -0.2, 0.3))
     # By hand: 4 + .1; 5 + .1 - .3 + .3; 5 + .1 - .2 * .65 + .3 * .72.
-    np.testing.assert_allclose(seen.magnitude, [4.1, 5.1, 5.186], rtol=0, atol=1e-12)  # rounding
+    np.testing.assert_allclose(
+        seen.magnitude, [4.1, 5.1, 5.186], rtol=0, atol=1e-12
+    )  # rounding
     # The limit is a visual one, whatever the instrument sees.
     assert read_cat(path, 4.5, color=Color(3.0)).id.tolist() == [1]
 
@@ -84,7 +88,9 @@ def test_a_double_is_one_star_of_all_the_light_at_its_center() -> None:
     assert one.components.tolist() == [2, 1]
     assert one.magnitude[0] == pytest.approx(5 - 2.5 * np.log10(1.1), abs=1e-12)
     ra = np.arctan2(one.vectors[0, 1], one.vectors[0, 0])
-    assert ra / ARCSEC_RAD == pytest.approx(100, abs=1e-4)  # a chord instead of an arc: 1e-7 of it
+    assert ra / ARCSEC_RAD == pytest.approx(
+        100, abs=1e-4
+    )  # a chord instead of an arc: 1e-7 of it
 
 
 def test_merging_keeps_light_and_star_count_and_leaves_the_rest_apart() -> None:
@@ -117,7 +123,9 @@ def test_the_histogram_counts_every_star_in_its_bin() -> None:
 
 
 def test_the_log_has_the_histogram_the_memory_and_every_star() -> None:
-    stars = proc_cat(made_up([0, 110, 4000, 3600 * 90], [7.5, 5.0, 6.0, -1.0]), 120 * ARCSEC_RAD)
+    stars = proc_cat(
+        made_up([0, 110, 4000, 3600 * 90], [7.5, 5.0, 6.0, -1.0]), 120 * ARCSEC_RAD
+    )
     lines = log(stars).splitlines()
     assert lines[0] == "3 entries from 4 stars at J2000.00; 1 of them of 2 stars"
     assert lines[1].startswith(f"{3 * BYTES_PER_ENTRY} bytes")

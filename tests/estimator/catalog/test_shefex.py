@@ -66,7 +66,8 @@ def test_fewer_fields_are_too_poor_in_the_uniform_catalog(stars: StarCatalog) ->
     radius = np.sqrt(np.radians(14.87) * np.radians(11.15) / np.pi)
     poor = [
         np.mean(
-            cKDTree(known.vectors).query_ball_point(sights, chord(radius), return_length=True) < 4
+            cKDTree(known.vectors).query_ball_point(sights, chord(radius), return_length=True)
+            < 4
         )
         for known in (even, bright)
     ]

@@ -115,7 +115,9 @@ def test_a_centroid_follows_its_star_by_whole_pixels_and_across_the_diagonal(nam
     image = np.full((80, 96), 50.0)
     image += gaussian((80, 96), 40.3, 30.8, 1e4)
     seen = CENTROIDERS[name](image, detect.local(image, min_area_px=1)).xy_px
-    turned = CENTROIDERS[name](image.T.copy(), detect.local(image.T.copy(), min_area_px=1)).xy_px
+    turned = CENTROIDERS[name](
+        image.T.copy(), detect.local(image.T.copy(), min_area_px=1)
+    ).xy_px
     np.testing.assert_allclose(turned, seen[:, ::-1], rtol=0, atol=1e-9)  # rounding
     rolled = np.roll(image, (7, -5), axis=(0, 1))
     moved = CENTROIDERS[name](rolled, detect.local(rolled, min_area_px=1)).xy_px
@@ -231,7 +233,9 @@ def test_the_windowed_centroid_s_error_is_an_eighth_above_the_minimum(sigma: flo
     """In noise of the sky a Gaussian sampled at points is placed to sqrt(8 pi) sigma^2 n / F at best in x and y."""
     y, x = np.mgrid[:61, :61]
     image = (
-        1e4 * np.exp(-((x - 30.3) ** 2 + (y - 29.8) ** 2) / (2 * sigma**2)) / (2 * np.pi * sigma**2)
+        1e4
+        * np.exp(-((x - 30.3) ** 2 + (y - 29.8) ** 2) / (2 * sigma**2))
+        / (2 * np.pi * sigma**2)
     )
     noise = np.full((1, 1), 3.0 * FILTERED_NOISE)
     box = np.array([[25, 25, 35, 35]])
@@ -365,7 +369,9 @@ def test_a_saturated_disk_is_placed_by_its_edge() -> None:
         x, y = rng.uniform(63, 64, 2)
         light = ndimage.gaussian_filter(3000 * disk((128, 128), x, y, 10.4), 0.8)
         image = (rng.poisson(light) + rng.normal(300, 20, light.shape)).clip(0, 2000)
-        found = CENTROIDERS["disk"](image, detect.default(image), 1.0, FramePriors(saturation=2000))
+        found = CENTROIDERS["disk"](
+            image, detect.default(image), 1.0, FramePriors(saturation=2000)
+        )
         off.append(found.xy_px[0] - (x, y))
         sigma.append(found.sigma_px[0])
     # 120 numbers give it to 13 %. Which pixels at the edge are full is left to the noise, and they are not weighed:

@@ -32,7 +32,8 @@ def smeared(
 
     def share(count: int, at: np.ndarray) -> np.ndarray:
         return (
-            np.diff(erf((np.arange(count + 1) - 0.5 - at[:, None]) / (sigma * 2**0.5)), axis=1) / 2
+            np.diff(erf((np.arange(count + 1) - 0.5 - at[:, None]) / (sigma * 2**0.5)), axis=1)
+            / 2
         )
 
     t = (np.arange(80) + 0.5) / 80 - 0.5
@@ -302,7 +303,9 @@ def test_a_star_s_own_vector_excludes_the_priors(seed: int) -> None:
     pull[place] = prior[place, place] * prior_mean
     p = np.linalg.solve(normal, np.linalg.solve(covariance, data_mean) + pull)
     out = np.full(5, np.nan)
-    streak_fit._own_vector(np.linalg.cholesky(normal), p, *prior_mean, 1.0, 0.01, np.empty(7), out)
+    streak_fit._own_vector(
+        np.linalg.cholesky(normal), p, *prior_mean, 1.0, 0.01, np.empty(7), out
+    )
     length, angle = data_mean[place]
     c = np.cos(angle)
     s = np.sin(angle)
@@ -433,7 +436,14 @@ def test_a_fit_uses_every_pixel_near_its_line_and_no_other() -> None:
         if at is not None:
             changed[at] += 100.0
         return plain.fit_all(
-            changed, np.array([[20.0, 20.0]]), box, 0 * grid, grid, np.array([streak_px]), 1.0, 1e9
+            changed,
+            np.array([[20.0, 20.0]]),
+            box,
+            0 * grid,
+            grid,
+            np.array([streak_px]),
+            1.0,
+            1e9,
         )
 
     y, x = np.mgrid[:41, :41]
@@ -468,7 +478,9 @@ def test_a_streak_s_length_direction_and_width_are_weighed_with_the_frame_s() ->
         along = np.diff(erf(np.array([u - p[3] / 2, u + p[3] / 2]) / (p[5] * 2**0.5)), axis=0)[
             0
         ] / (2 * p[3])
-        return p[6] + p[2] * along * np.exp(-((v / p[5]) ** 2) / 2) / (p[5] * np.sqrt(2 * np.pi))
+        return p[6] + p[2] * along * np.exp(-((v / p[5]) ** 2) / 2) / (
+            p[5] * np.sqrt(2 * np.pi)
+        )
 
     light = model(np.array([13.3, 8.2, 1000.0, 12.0, 0.1, 0.9, 7.0]))
 

@@ -30,7 +30,9 @@ def test_a_distorted_pixel_matches_a_hand_calculation() -> None:
 
 
 def test_the_boresight_lands_on_the_principal_point() -> None:
-    np.testing.assert_array_equal(DISTORTED.pixels(np.array([[0.0, 0.0, 3.0]])), [[810.5, 590.25]])
+    np.testing.assert_array_equal(
+        DISTORTED.pixels(np.array([[0.0, 0.0, 3.0]])), [[810.5, 590.25]]
+    )
 
 
 def test_x_is_to_the_right_and_y_is_down() -> None:
@@ -67,9 +69,9 @@ def test_the_distortion_matches_opencv() -> None:
 def test_the_undistortion_matches_opencv() -> None:
     pixels = pixels_over(DISTORTED, 500, seed=2)
     done = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-15)
-    oracle = cv2.undistortPoints(pixels[:, None], CV_MATRIX, np.array(LENS), criteria=done).reshape(
-        -1, 2
-    )
+    oracle = cv2.undistortPoints(
+        pixels[:, None], CV_MATRIX, np.array(LENS), criteria=done
+    ).reshape(-1, 2)
     rays = DISTORTED.rays(pixels)
     # 1e-9: both iterate to convergence; OpenCV stops by the pixel error.
     np.testing.assert_allclose(rays[:, :2] / rays[:, 2:], oracle, rtol=0, atol=1e-9)
@@ -145,7 +147,9 @@ def test_a_sensor_ends_half_a_pixel_beyond_its_outermost_pixel_centers() -> None
 
 
 def test_an_image_of_another_size_is_refused_with_both_sizes() -> None:
-    with pytest.raises(ImageError, match="the image is 20x10 pixels; this camera's are 1600x1200"):
+    with pytest.raises(
+        ImageError, match="the image is 20x10 pixels; this camera's are 1600x1200"
+    ):
         check_frame(np.zeros((10, 20)), DISTORTED)
     check_frame(np.zeros((1200, 1600)), DISTORTED)
 

@@ -48,7 +48,9 @@ def disguises(array: NDArray) -> list[NDArray]:
     spread[...] = array
     locked = array.copy()
     locked.flags.writeable = False
-    unaligned = np.frombuffer(b"\0" + array.tobytes(), array.dtype, offset=1).reshape(array.shape)
+    unaligned = np.frombuffer(b"\0" + array.tobytes(), array.dtype, offset=1).reshape(
+        array.shape
+    )
     return [
         np.asfortranarray(array),
         np.ascontiguousarray(array[::-1])[::-1],
@@ -70,7 +72,9 @@ def is_plain(array: NDArray, dtype: Any) -> bool:
     )
 
 
-@law(checks.native, checks.floats, detect.to_native, detect.in_row_order, detect.check_pixel_type)
+@law(
+    checks.native, checks.floats, detect.to_native, detect.in_row_order, detect.check_pixel_type
+)
 @given(array=MATRICES)
 def test_an_array_of_any_type_or_layout_gives_the_plain_array_s_result(array: NDArray) -> None:
     for one in disguises(array):
@@ -156,7 +160,9 @@ def test_rows_have_their_length_and_are_finite_and_present(
     row = int(rng.integers(0, count))
     checks.unit_rows("x", bad[:count], count)
     bad[row] *= 1.01
-    with pytest.raises(ImageError, match=rf"x: row {row} has length 1\.01; allowed: unit vectors"):
+    with pytest.raises(
+        ImageError, match=rf"x: row {row} has length 1\.01; allowed: unit vectors"
+    ):
         checks.unit_rows("x", bad[:count], count)
     bad[row, 1] = np.inf
     with pytest.raises(ImageError, match=f"in row {row}"):
@@ -205,7 +211,9 @@ def test_centroids_have_equal_lengths_and_valid_numbers(
         bad[row] = value
         if name == "xy_px" and np.isfinite(value):
             continue
-        with pytest.raises(ImageError, match=f"centroids: {name} of row {row} is .*; allowed: "):
+        with pytest.raises(
+            ImageError, match=f"centroids: {name} of row {row} is .*; allowed: "
+        ):
             Centroids(**good | {name: bad}).check_values()  # type: ignore[arg-type]
     for change in disguises(good["xy_px"]):
         assert is_plain(Centroids(**good | {"xy_px": change}).xy_px, np.float64)  # type: ignore[arg-type]
@@ -264,7 +272,9 @@ def test_a_catalog_whose_columns_do_not_match_is_refused() -> None:
     stars = drawn(np.random.default_rng(3))
     for name in ("vectors", "drift_rad_yr", "parallax_rad", "v_mag"):
         with pytest.raises(ImageError, match=f"{name} has shape"):
-            catalog.checked(stars.__class__(**fields(stars) | {name: getattr(stars, name)[:-1]}))
+            catalog.checked(
+                stars.__class__(**fields(stars) | {name: getattr(stars, name)[:-1]})
+            )
     with pytest.raises(ImageError, match="the catalog is empty"):
         catalog.checked(stars.take(np.empty(0, int)))
     with pytest.raises(ImageError, match="stars is None"):
@@ -328,7 +338,10 @@ def test_a_map_of_other_lengths_is_refused(rng: np.random.Generator) -> None:
 )
 def test_a_wrong_lever_is_refused(change: dict[str, Any], message: str) -> None:
     leds = LedMap(np.arange(3), 2 * np.eye(3), np.zeros(3), np.full(3, 2.0))
-    good = {"camera_body_m": np.array([0, 0, 0.5]), "cam_from_body": turn(np.random.default_rng(1))}
+    good = {
+        "camera_body_m": np.array([0, 0, 0.5]),
+        "cam_from_body": turn(np.random.default_rng(1)),
+    }
     dome_map.check_lever(leds, Lever(**good))  # type: ignore[arg-type]
     with pytest.raises(ImageError, match=f"lever: {message}|{message}"):
         dome_map.check_lever(leds, Lever(**good | change))  # type: ignore[arg-type]

@@ -10,7 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 from estimator.core.checks import Floats
-from estimator.core.least_squares import MAX_VARIANCE_FACTOR, fit_soft_l1, soft_l1, variance_factor
+from estimator.core.least_squares import (
+    MAX_VARIANCE_FACTOR,
+    fit_soft_l1,
+    soft_l1,
+    variance_factor,
+)
 from tests.helpers.laws import SEEDS, law
 
 
@@ -24,7 +29,9 @@ def test_the_loss_is_a_square_at_first_and_then_grows_as_the_residual(size: floa
 
 
 @law(fit_soft_l1)
-@given(rng=SEEDS, count=some.integers(16, 60), gross=some.integers(0, 2), units=some.floats(-3, 3))
+@given(
+    rng=SEEDS, count=some.integers(16, 60), gross=some.integers(0, 2), units=some.floats(-3, 3)
+)
 def test_the_robust_fit_finds_scipy_s_minimum(
     rng: np.random.Generator, count: int, gross: int, units: float
 ) -> None:
@@ -50,7 +57,9 @@ def test_the_robust_fit_finds_scipy_s_minimum(
 @law(fit_soft_l1)
 @given(rng=SEEDS)
 def test_a_parameter_without_effect_keeps_its_value(rng: np.random.Generator) -> None:
-    found = fit_soft_l1(lambda p: p[:1] - np.array([3.0, 3.0]), np.array([0.0, 7.0]), np.ones(2))
+    found = fit_soft_l1(
+        lambda p: p[:1] - np.array([3.0, 3.0]), np.array([0.0, 7.0]), np.ones(2)
+    )
     np.testing.assert_allclose(found, [3.0, 7.0], atol=1e-6)
 
 

@@ -50,7 +50,9 @@ def test_products_match_numpy(vectors) -> None:
     a, b = rng.normal(size=(2, 3, 3))
     vectors.multiply_transposed(a, b, out)
     np.testing.assert_allclose(out, a @ b.T, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(vectors.rotate(a, vectors.row(b, 1)), a @ b[1], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        vectors.rotate(a, vectors.row(b, 1)), a @ b[1], rtol=0, atol=1e-14
+    )
     assert vectors.chord(tuple(a[0]), tuple(b[2])) == pytest.approx(
         np.linalg.norm(a[0] - b[2]), rel=1e-14
     )

@@ -30,7 +30,9 @@ def star(
     return flux * np.outer(down, across)
 
 
-def sky_frame(rng: np.random.Generator, stars: int, sigma: float, shape: tuple[int, int] = SHAPE):
+def sky_frame(
+    rng: np.random.Generator, stars: int, sigma: float, shape: tuple[int, int] = SHAPE
+):
     """Light of stars of 4,000 to 40,000 electrons on a lattice, and their positions."""
     step = 80
     lattice = [
@@ -181,7 +183,8 @@ def test_a_short_streak_is_found_and_centered_without_a_gyro_as_with_one(
     """A round-star fit of a short streak would double the error and understate it."""
     image, xy = smeared_frame(np.random.default_rng(47), streak)
     alone, guided = (
-        detect_and_centroid(image, CAMERA, Settings(), Clock(), known) for known in (None, streak)
+        detect_and_centroid(image, CAMERA, Settings(), Clock(), known)
+        for known in (None, streak)
     )
     rms_px = [np.sqrt(np.mean(off_px(found, xy) ** 2)) for found in (alone, guided)]
     assert len(alone) == len(guided) == 15
@@ -412,9 +415,9 @@ def test_columns_of_readout_smear_are_not_taken_for_streaks(seed: int) -> None:
     assert blobs.streak_px is None
     xy_px = setup.camera.pixels(truth.apply(stars.vectors[stars.v_mag < 5.5]))
     bright = xy_px[setup.camera.contains(np.nan_to_num(xy_px, nan=-1e9), 20.0)]
-    off_px = np.linalg.norm(bright[:, None] - blobs.xy_px[blobs.flag & NO_STAR == 0], axis=2).min(
-        axis=1
-    )
+    off_px = np.linalg.norm(
+        bright[:, None] - blobs.xy_px[blobs.flag & NO_STAR == 0], axis=2
+    ).min(axis=1)
     assert np.mean(off_px < 2) >= 0.6
 
 

@@ -42,7 +42,9 @@ def test_both_component_scans_find_the_same_objects(seed: int) -> None:
     again = detect.maximum(image)
     assert len(once) == 20
     for name in ("box_px", "xy_px", "flux", "peak", "area_px"):
-        np.testing.assert_array_equal(getattr(once, name).round(6), getattr(again, name).round(6))
+        np.testing.assert_array_equal(
+            getattr(once, name).round(6), getattr(again, name).round(6)
+        )
 
 
 @pytest.mark.slow

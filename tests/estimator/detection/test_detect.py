@@ -154,7 +154,9 @@ def test_the_peak_of_an_image_below_zero_is_below_zero() -> None:
 @pytest.mark.parametrize("slope", [(0.5, 0.0), (0.0, -2.0), (3.0, 3.0), (20.0, -10.0)])
 def test_a_ramp_of_the_sky_is_not_detected(slope: tuple[float, float]) -> None:
     y, x = np.mgrid[:512, :640]
-    image = 20_000 + slope[0] * x + slope[1] * y + np.random.default_rng(8).normal(0, 5, (512, 640))
+    image = (
+        20_000 + slope[0] * x + slope[1] * y + np.random.default_rng(8).normal(0, 5, (512, 640))
+    )
     assert len(detect.local(image)) == 0
 
 
@@ -220,7 +222,9 @@ def test_hot_pixels_do_not_displace_stars_from_the_list() -> None:
     """Two hundred bright hot pixels beside the stars, and room for sixty blobs: all the stars are among them."""
     image, xy_px = field_of_stars(4)
     rng = np.random.default_rng(5)
-    row, column = np.meshgrid(*(np.arange(8, side - 8, 16) for side in image.shape), indexing="ij")
+    row, column = np.meshgrid(
+        *(np.arange(8, side - 8, 16) for side in image.shape), indexing="ij"
+    )
     places = rng.permutation(np.column_stack([row.ravel(), column.ravel()]))
     far = np.array([np.hypot(*(xy_px - place[::-1]).T).min() > 8 for place in places])
     hot = places[far][:200]
@@ -299,9 +303,9 @@ def streaked(
     rng: np.random.Generator, streak_px: tuple[float, float], flux: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """A frame with noise of 5 and ten streaks of this flux, far from each other and from the border; their centers."""
-    places = np.array([[70 + 90 * (n % 5), 70 + 160 * (n // 5)] for n in range(10)]) + rng.uniform(
-        -5, 5, (10, 2)
-    )
+    places = np.array(
+        [[70 + 90 * (n % 5), 70 + 160 * (n // 5)] for n in range(10)]
+    ) + rng.uniform(-5, 5, (10, 2))
     y, x = np.mgrid[0:300, 0:500]
     frame = 100 + 5 * rng.standard_normal(x.shape)
     steps = np.linspace(-0.5, 0.5, 200)
@@ -309,7 +313,9 @@ def streaked(
         at = place + steps[:, None] * np.array(streak_px)
         inside = np.abs(x - place[0]) + np.abs(y - place[1]) < 90
         away2 = (x[inside][:, None] - at[:, 0]) ** 2 + (y[inside][:, None] - at[:, 1]) ** 2
-        frame[inside] += flux * np.exp(-away2 / (2 * 0.8**2)).mean(axis=1) / (2 * np.pi * 0.8**2)
+        frame[inside] += (
+            flux * np.exp(-away2 / (2 * 0.8**2)).mean(axis=1) / (2 * np.pi * 0.8**2)
+        )
     return frame, places
 
 
@@ -319,7 +325,10 @@ def test_faint_streaks_are_found_at_full_length(length_px: float, angle_deg: flo
     """Streaks of 2 sigma in a pixel, of which the first filter finds pieces: without longer filters a streak of 48 px
     appears to be of 7 px.
     """
-    streak_px = length_px * np.cos(np.radians(angle_deg)), length_px * np.sin(np.radians(angle_deg))
+    streak_px = (
+        length_px * np.cos(np.radians(angle_deg)),
+        length_px * np.sin(np.radians(angle_deg)),
+    )
     frame, places = streaked(np.random.default_rng(3), streak_px, 25.0 * length_px)
     blobs = detect.default(frame)
     assert blobs.streak_px is not None

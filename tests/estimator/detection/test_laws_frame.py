@@ -21,14 +21,30 @@ from estimator.core import camera
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
-from estimator.core.types import NO_SPREAD, Attitude, Blobs, Centroids, FramePriors, ra_dec_roll_rad
+from estimator.core.types import (
+    NO_SPREAD,
+    Attitude,
+    Blobs,
+    Centroids,
+    FramePriors,
+    ra_dec_roll_rad,
+)
 from estimator.detection import background, classify, components, detect, windows
 from estimator.detection.classify import Flag
 from estimator.detection.detect import DETECTORS
 from estimator.identification.star_detections import FlatCentroids, Sensor, detections_of
 from estimator.trackers import pipeline
 from estimator.trackers.pipeline import Clock, Settings
-from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units
+from tests.helpers.laws import (
+    ANY,
+    NUMBERS,
+    SEEDS,
+    answered,
+    assert_covariance,
+    law,
+    turn,
+    units,
+)
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 WIDTH = 90
@@ -104,7 +120,8 @@ def test_blobs_lie_in_the_frame(
     most: int,
 ) -> None:
     answered(
-        lambda: DETECTORS[name](hostile, 5.0, 3, most, FramePriors(streak_px, np.inf)), ImageError
+        lambda: DETECTORS[name](hostile, 5.0, 3, most, FramePriors(streak_px, np.inf)),
+        ImageError,
     )
     frame, _ = starry(rng)
     assert_inside(DETECTORS[name](frame, 5.0, 3, most, FramePriors(streak_px, 3000.0)), most)
@@ -112,7 +129,9 @@ def test_blobs_lie_in_the_frame(
 
 @law(detect.local, detect.default, detect.components)
 @given(
-    rng=SEEDS, up=some.integers(1, 500), name=some.sampled_from(["default", "local", "components"])
+    rng=SEEDS,
+    up=some.integers(1, 500),
+    name=some.sampled_from(["default", "local", "components"]),
 )
 def test_a_brighter_sky_hides_no_star(rng: np.random.Generator, up: int, name: str) -> None:
     frame, places = starry(rng)
@@ -141,7 +160,8 @@ def test_a_lower_threshold_finds_fainter_objects(
     flat = detect.flat_background(sky, frame.shape)
     assert sky.level.min() <= flat.level.item() <= sky.level.max()
     found = [
-        detect.detect_blobs(frame, flat, more * flat.noise, 1, 99) for more in (sigma, sigma + 1)
+        detect.detect_blobs(frame, flat, more * flat.noise, 1, 99)
+        for more in (sigma, sigma + 1)
     ]
     for blobs in found:
         assert_inside(blobs, 99)
@@ -150,7 +170,9 @@ def test_a_lower_threshold_finds_fainter_objects(
     faint = detect.detect_faint_streaks(frame, sky, sigma, 99, FramePriors())
     assert_inside(faint, 99)
     assert_inside(
-        detect.in_full_length(frame, replace(faint, streak_px=streak_px), sigma, 99, FramePriors()),
+        detect.in_full_length(
+            frame, replace(faint, streak_px=streak_px), sigma, 99, FramePriors()
+        ),
         99,
     )
 
@@ -175,7 +197,8 @@ def test_runs_match_a_plain_filter_above_threshold(
     np.testing.assert_allclose(higher.level - lower.level, 50, rtol=0, atol=0.3)
     for pixel in ("u1", "i1", "u2", "i2"):
         assert (
-            np.iinfo(background.accumulator_type(np.dtype(pixel))).max >= 16 * np.iinfo(pixel).max
+            np.iinfo(background.accumulator_type(np.dtype(pixel))).max
+            >= 16 * np.iinfo(pixel).max
         )
 
 
@@ -231,9 +254,9 @@ def test_letters_are_flagged_as_text_anywhere(
         + [0, 100, 6, 106]
     )
     order = rng.permutation(letters + 6)
-    boxes = (np.concatenate([line, lights]) + rng.integers(0, 1000, 2)[[0, 1, 0, 1]])[order].astype(
-        np.int64
-    )
+    boxes = (np.concatenate([line, lights]) + rng.integers(0, 1000, 2)[[0, 1, 0, 1]])[
+        order
+    ].astype(np.int64)
     text = classify.find_captions(boxes, np.where(order < letters, 255.0, 200.0))
     assert text.tolist() == ((order < letters) & (not even)).tolist()
 
@@ -262,9 +285,13 @@ def test_streaks_of_a_roll_differ_across_their_separation(
     rng: np.random.Generator, turn_rad: float, streak_px: tuple[float, float] | None
 ) -> None:
     """By the turn times it; their mean over a frame's four corners is the streak at its center."""
-    blobs = replace(DETECTORS["local"](starry(rng)[0], 5.0, 3, 4, FramePriors()), turn_rad=turn_rad)
+    blobs = replace(
+        DETECTORS["local"](starry(rng)[0], 5.0, 3, 4, FramePriors()), turn_rad=turn_rad
+    )
     given_px = streak_px or (0.0, 0.0)
-    corners = np.array([(0, 0), (0, HEIGHT - 1), (WIDTH - 1, 0), (WIDTH - 1, HEIGHT - 1)], float)
+    corners = np.array(
+        [(0, 0), (0, HEIGHT - 1), (WIDTH - 1, 0), (WIDTH - 1, HEIGHT - 1)], float
+    )
     at_corners = classify.streaks_px(replace(blobs, xy_px=corners), (HEIGHT, WIDTH), given_px)
     np.testing.assert_allclose(at_corners.mean(axis=0), given_px, rtol=0, atol=1e-12)
     streaks = classify.streaks_px(blobs, (HEIGHT, WIDTH), given_px)
@@ -278,7 +305,9 @@ def test_windows_anywhere_hold_blobs_of_the_frame(
     rng: np.random.Generator, strange: NDArray, half_px: float
 ) -> None:
     frame, places = starry(rng)
-    assert_inside(windows.in_windows(frame, np.concatenate([strange, places]), half_px, 6.0), 13)
+    assert_inside(
+        windows.in_windows(frame, np.concatenate([strange, places]), half_px, 6.0), 13
+    )
     found = windows.in_windows(frame, places, 3.0, 6.0)
     assert len(found) == 9
     assert (np.linalg.norm(found.xy_px[:, None] - places, axis=2).min(axis=1) < 1).all()
@@ -315,7 +344,9 @@ def test_centroids_are_at_their_stars_in_any_order_of_blobs(
 
 @law(centroid.streak, centroid.streak_ends, centroid.gaussian_fit)
 @given(rng=SEEDS, long_px=some.floats(7, 11))
-def test_a_streak_s_center_is_between_its_ends(rng: np.random.Generator, long_px: float) -> None:
+def test_a_streak_s_center_is_between_its_ends(
+    rng: np.random.Generator, long_px: float
+) -> None:
     frame, _places = starry(rng, smear_px=long_px)
     priors = FramePriors((long_px, 0.0))
     blobs = DETECTORS["default"](frame, 5.0, 3, 9, priors)
@@ -337,14 +368,18 @@ def test_a_streak_s_center_is_between_its_ends(rng: np.random.Generator, long_px
     pipeline.away_from_border,
     pipeline.inflate_uncertainty,
 )
-@given(rng=SEEDS, count=some.integers(0, 60), base=some.integers(1, 30), floor_px=some.floats(0, 2))
+@given(
+    rng=SEEDS, count=some.integers(0, 60), base=some.integers(1, 30), floor_px=some.floats(0, 2)
+)
 def test_lights_are_selected_and_weighted_by_the_settings(
     rng: np.random.Generator, count: int, base: int, floor_px: float
 ) -> None:
     lights = Centroids(
         rng.uniform(0, 60, (count, 2)), rng.uniform(0.01, 1, count), -np.arange(count) + 99.0
     )
-    settings = Settings(base_stars=base, centroid_sigma_px=floor_px, bad_px=np.array([[44, 35]]))
+    settings = Settings(
+        base_stars=base, centroid_sigma_px=floor_px, bad_px=np.array([[44, 35]])
+    )
     few = pipeline.brightest(lights, settings)
     np.testing.assert_array_equal(few.xy_px, lights.xy_px[: 2 * base])
     assert len(lights.take(np.zeros(count, bool))) == len(Centroids.empty()) == 0
@@ -379,7 +414,9 @@ def test_weights_are_the_inverse_of_all_the_errors(
     weight = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -1)
     alone = sigma[:, None, None] ** 2 * np.eye(2) if even else spread
     whole = weight @ (alone + more_px**2 * np.eye(2))
-    np.testing.assert_allclose(whole, np.broadcast_to(np.eye(2), whole.shape), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        whole, np.broadcast_to(np.eye(2), whole.shape), rtol=0, atol=1e-9
+    )
     greatest = np.linalg.eigvalsh(alone + more_px**2 * np.eye(2))[:, 1]
     np.testing.assert_allclose(seen.sigma**2, greatest, rtol=1e-9)
 
@@ -397,7 +434,9 @@ def test_processing_a_frame_gives_lights_on_the_chip_and_its_duration(
     assert bool(fits) == (hostile.shape == (HEIGHT, WIDTH))
     nothing = Attitude("not solved")
     answered(
-        lambda: pipeline.process_frame(hostile, CAMERA, Settings(), lambda *_: nothing, streak_px),
+        lambda: pipeline.process_frame(
+            hostile, CAMERA, Settings(), lambda *_: nothing, streak_px
+        ),
         ImageError,
     )
     frame, _ = starry(rng)
@@ -486,7 +525,12 @@ def test_a_solver_finds_the_rotation_in_any_order_of_stars(
     scale=some.floats(0.1, 9),
 )
 def test_any_directions_are_solved_or_refused(
-    rng: np.random.Generator, cam: NDArray, ref: NDArray, sigma: NDArray, name: str, scale: float
+    rng: np.random.Generator,
+    cam: NDArray,
+    ref: NDArray,
+    sigma: NDArray,
+    name: str,
+    scale: float,
 ) -> None:
     solution = answered(lambda: SOLVERS[name](cam, ref, sigma))
     assert solution is None or np.isfinite(solution.as_quat()).all()

@@ -44,7 +44,9 @@ def squared(
     truth = tumble_body_from_ref(np.arange(SECONDS + 1.0))
     nees = []
     for _ in range(runs):
-        mounts = tracker.mounting_rad * rng.normal(size=(2, 3))  # the second relative to the first
+        mounts = tracker.mounting_rad * rng.normal(
+            size=(2, 3)
+        )  # the second relative to the first
         noise = GYRO.arw_rad_sqrt_s / np.sqrt(RATE_HZ) * rng.normal(size=(len(T_S) - 1, 3))
         angle = tumble_angle_rad(T_S) + noise
         start = Rotation.from_rotvec(1e-3 * rng.normal(size=3)) * truth[0]
@@ -60,7 +62,9 @@ def squared(
                     np.diag(NOISE_RAD2[head])
                 ) * rng.normal(size=3)
                 measured = Rotation.from_rotvec(-error) * truth[k + 1]
-                assert mekf.update(k + 1.0, measured, NOISE_RAD2[head], head=head).status == USED
+                assert (
+                    mekf.update(k + 1.0, measured, NOISE_RAD2[head], head=head).status == USED
+                )
         state = mekf.state
         turned = (state.body_from_ref * truth[-1].inv()).as_rotvec()
         errors = [
@@ -96,7 +100,9 @@ def test_a_constant_model_does_not_claim_a_walk() -> None:
     """The same flights with mountings that drift: a filter without the random walk understates their errors."""
     rng = np.random.default_rng(3)
     truth = Rotation.identity()
-    mekf = AttitudeFilter(GYRO, 0.0, truth, 1e-6, 0.0, 0.0, np.inf, MOUNTED, considered=(), heads=2)
+    mekf = AttitudeFilter(
+        GYRO, 0.0, truth, 1e-6, 0.0, 0.0, np.inf, MOUNTED, considered=(), heads=2
+    )
     walking = AttitudeFilter(
         GYRO, 0.0, truth, 1e-6, 0.0, 0.0, np.inf, WALKING, considered=(), heads=2
     )
@@ -123,7 +129,9 @@ def test_the_second_mounting_tends_to_its_rotation_relative_to_the_first() -> No
         mekf.propagate([k + 1.0], np.zeros((1, 3)), [False])
         mekf.update(k + 1.0, Rotation.from_rotvec(-first), NOISE_RAD2[0], head=0)
         mekf.update(k + 1.0, Rotation.from_rotvec(-second), NOISE_RAD2[1], head=1)
-    np.testing.assert_allclose(mekf.state.others["mounting_1"], second - first, atol=2 * ARCSEC_RAD)
+    np.testing.assert_allclose(
+        mekf.state.others["mounting_1"], second - first, atol=2 * ARCSEC_RAD
+    )
     np.testing.assert_array_equal(mekf.state.others["mounting"], np.zeros(3))
 
 
@@ -134,5 +142,7 @@ def test_an_unknown_head_is_refused() -> None:
 
 
 def test_a_walk_of_a_mounting_that_is_known_exactly_is_refused() -> None:
-    with pytest.raises(ValueError, match="mounting_drift_rad_sqrt_s needs mounting_rad above 0"):
+    with pytest.raises(
+        ValueError, match="mounting_drift_rad_sqrt_s needs mounting_rad above 0"
+    ):
         TrackerModel(mounting_drift_rad_sqrt_s=1e-6)

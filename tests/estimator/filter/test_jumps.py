@@ -68,7 +68,8 @@ class Vehicle:
 def statuses(updates: list[Update]) -> list[tuple[str, int]]:
     """Each status with its number of successive repetitions."""
     return [
-        (status, len(list(group))) for status, group in groupby(update.status for update in updates)
+        (status, len(list(group)))
+        for status, group in groupby(update.status for update in updates)
     ]
 
 
@@ -119,7 +120,9 @@ def test_solutions_agree_within_the_error_that_each_names_as_systematic() -> Non
         for k, off in enumerate((100.0, -100.0, 100.0)):
             mekf.propagate([k + 1.0], np.zeros((1, 3)), [False])
             seen = Rotation.from_rotvec([0.0, off * ARCSEC_RAD, 0.0])
-            update = mekf.update(k + 1.0, seen, (1 + systematic**2) * unit, systematic**2 * unit)
+            update = mekf.update(
+                k + 1.0, seen, (1 + systematic**2) * unit, systematic**2 * unit
+            )
         assert update.status == last
 
 
@@ -148,7 +151,11 @@ def knock(rate_rad_s: float, samples: int) -> tuple[np.ndarray, Rotation]:
 @pytest.mark.parametrize(
     ("times_limit", "samples", "known_by"),
     [
-        *((times, samples, how) for times, samples in KNOCKS for how in ("the flag", "the limit")),
+        *(
+            (times, samples, how)
+            for times, samples in KNOCKS
+            for how in ("the flag", "the limit")
+        ),
         *((times, samples, "the shock") for times, samples in KNOCKS[:3]),
     ],
 )

@@ -23,7 +23,9 @@ GYRO = GyroModel(1e-5, 1e-4, 1000.0)
 
 
 def filtering(rng: np.random.Generator) -> AttitudeFilter:
-    return AttitudeFilter(GYRO, 0.0, turn(rng), 10 ** rng.uniform(-5, 0), 10 ** rng.uniform(-6, -2))
+    return AttitudeFilter(
+        GYRO, 0.0, turn(rng), 10 ** rng.uniform(-5, 0), 10 ** rng.uniform(-6, -2)
+    )
 
 
 @law(inverse_response)
@@ -57,7 +59,9 @@ def assert_sound(state: FilterState) -> None:
     AttitudeFilter.body_from_ref,
     AttitudeFilter.bias_rad_s,
 )
-@given(rng=SEEDS, angle=arrays("f8", (7, 3), elements=some.floats(-10, 10)), full=arrays(bool, 7))
+@given(
+    rng=SEEDS, angle=arrays("f8", (7, 3), elements=some.floats(-10, 10)), full=arrays(bool, 7)
+)
 def test_any_finite_rotation_keeps_a_unit_attitude_and_a_valid_covariance(
     rng: np.random.Generator, angle: NDArray, full: NDArray
 ) -> None:
@@ -117,7 +121,9 @@ def test_an_accepted_solution_shrinks_the_covariance(
     after = mekf.state
     assert_sound(after)
     np.testing.assert_allclose(np.linalg.norm(update.residual_rad), off_rad, rtol=0, atol=1e-9)
-    shrunk = np.trace(after.covariance[3:, 3:]) <= np.trace(before.covariance[3:, 3:]) * (1 + 1e-9)
+    shrunk = np.trace(after.covariance[3:, 3:]) <= np.trace(before.covariance[3:, 3:]) * (
+        1 + 1e-9
+    )
     unchanged = np.array_equal(after.covariance, before.covariance)
     assert shrunk if update.status == USED else unchanged
 

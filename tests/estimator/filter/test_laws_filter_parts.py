@@ -62,7 +62,9 @@ def test_every_head_has_its_own_mounting_and_slow_error_states(
     """They share no row; only the first mounting can be considered, the slow errors all together."""
     layout = states.build_layout(GYRO, TRACKER, considered, heads)
     names = [
-        states.of_head(name, head) for head in range(heads) for name in ("mounting", "systematic")
+        states.of_head(name, head)
+        for head in range(heads)
+        for name in ("mounting", "systematic")
     ]
     rows = np.concatenate([np.arange(layout.size)[layout.slices[name]] for name in names])
     assert len(set(names)) == len(names)
@@ -121,7 +123,9 @@ def test_a_solution_s_covariance_is_the_sum_of_noise_and_common_errors(
     noise = covariance(rng, 3)
     common = covariance(rng, 3)
     covariances = consistency.checked_covariances(noise + common, common)
-    np.testing.assert_allclose(covariances[0], noise, rtol=0, atol=1e-12 * np.trace(noise + common))
+    np.testing.assert_allclose(
+        covariances[0], noise, rtol=0, atol=1e-12 * np.trace(noise + common)
+    )
     np.testing.assert_array_equal(covariances[1], covariances[1].T)
     assert consistency.is_covariance(noise)
     assert not consistency.is_covariance(noise - 2 * np.trace(noise) * np.eye(3))
@@ -153,7 +157,9 @@ def test_the_states_fill_the_covariance_without_gap_or_overlap(
         assert (layout.estimated[part] == (name not in considered)).all()
         assert (np.diag(started.covariance)[part] == sigmas[name] ** 2).all()
     inside = layout.columns[layout.columns >= 0]
-    assert len(set(inside)) == len(inside) == 3 * ("scale" in used) + 6 * ("misalignment" in used)
+    assert (
+        len(set(inside)) == len(inside) == 3 * ("scale" in used) + 6 * ("misalignment" in used)
+    )
 
 
 @law(states.propagate_state, states.MekfState.body_from_ref)
@@ -166,10 +172,14 @@ def test_a_gyro_sample_moves_the_errors_as_it_moves_the_truth(
     quiet = replace(GYRO, arw_rad_sqrt_s=0.0, bias_rad_s=0.0)
     known = replace(TRACKER, systematic_time_s=np.inf)
     before = state_of(rng, layout)
-    samples = np.column_stack([1.0 + np.arange(1, 5) / 20, rng.normal(0, 0.2, (4, 3)), np.zeros(4)])
+    samples = np.column_stack(
+        [1.0 + np.arange(1, 5) / 20, rng.normal(0, 0.2, (4, 3)), np.zeros(4)]
+    )
     error = rng.normal(0, 1e-6, layout.size)
     true = before._replace(
-        ref_from_body_wxyz=correct.wxyz_of(Rotation.from_rotvec(-error[:3]) * before.body_from_ref),
+        ref_from_body_wxyz=correct.wxyz_of(
+            Rotation.from_rotvec(-error[:3]) * before.body_from_ref
+        ),
         values=before.values + np.r_[np.zeros(3), error[3:]],
         covariance=np.zeros((layout.size, layout.size)),
     )
@@ -200,7 +210,9 @@ def test_the_slow_error_returns_to_its_unit_variance(
     samples = np.column_stack([1.0 + np.arange(1, 5) / 20, np.zeros((4, 4))])
     after = states.propagate_state(before, samples, GYRO, tracker, layout)
     kept = np.exp(-0.2 / time_s)
-    np.testing.assert_allclose(after.values[slow], kept * before.values[slow], rtol=1e-9, atol=0)
+    np.testing.assert_allclose(
+        after.values[slow], kept * before.values[slow], rtol=1e-9, atol=0
+    )
     variance = share * kept**2 + 1 - kept**2
     np.testing.assert_allclose(
         after.covariance[slow, slow], variance * np.eye(3), rtol=1e-9, atol=1e-15
@@ -216,7 +228,9 @@ def test_a_rotation_decorrelates_the_slow_error_alone(rng: np.random.Generator) 
     slow = layout.slices["systematic"]
     used = Rotation.from_quat(before.used_wxyz, scalar_first=True)
     kept = math.exp(-(before.body_from_ref * used).magnitude() / TRACKER.systematic_angle_rad)
-    np.testing.assert_allclose(after.values[slow], kept * before.values[slow], rtol=1e-9, atol=0)
+    np.testing.assert_allclose(
+        after.values[slow], kept * before.values[slow], rtol=1e-9, atol=0
+    )
     variance = kept**2 * before.covariance[slow, slow] + (1 - kept**2) * np.eye(3)
     np.testing.assert_allclose(after.covariance[slow, slow], variance, rtol=1e-9, atol=1e-15)
     np.testing.assert_array_equal(
@@ -303,7 +317,9 @@ def test_an_adopted_solution_leaves_no_residual_and_its_own_covariance(
     both = rows.copy()
     both[:, :3] = np.eye(3)
     left = both @ after.covariance @ both.T
-    np.testing.assert_allclose(left, solution.noise_rad2, rtol=0, atol=1e-9 * np.trace(expected))
+    np.testing.assert_allclose(
+        left, solution.noise_rad2, rtol=0, atol=1e-9 * np.trace(expected)
+    )
 
 
 @law(correct.wxyz_of, correct.right_jacobian, correct.root)
@@ -320,7 +336,9 @@ def test_rotation_vectors_and_matrix_roots_reproduce_their_arguments(
     block = np.zeros((6, 6))
     block[:3, :3] = -cross
     block[:3, 3:] = np.eye(3)
-    np.testing.assert_allclose(correct.right_jacobian(p), expm(block)[:3, 3:], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        correct.right_jacobian(p), expm(block)[:3, 3:], rtol=0, atol=1e-12
+    )
     matrix = covariance(rng, 3)
     root = correct.root(matrix)
     np.testing.assert_array_equal(correct.root(np.zeros((3, 3))), np.zeros((3, 3)))
@@ -380,7 +398,9 @@ def test_a_step_of_the_rate_is_a_shock_and_a_slope_is_not(
 
 @law(FilterState.sigma, AttitudeFilter.state)
 @given(rng=SEEDS)
-def test_the_sigma_of_each_state_is_its_part_of_the_covariance(rng: np.random.Generator) -> None:
+def test_the_sigma_of_each_state_is_its_part_of_the_covariance(
+    rng: np.random.Generator,
+) -> None:
     state = AttitudeFilter(GYRO, 0.0, turn(rng), 0.1, 0.2, tracker=TRACKER).state
     parts = [
         state.sigma_attitude_rad,

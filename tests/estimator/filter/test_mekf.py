@@ -55,7 +55,8 @@ def test_the_filter_integrates_the_gyro() -> None:
     mekf.propagate(t_s[1:], tumble_angle_rad(t_s), np.zeros(4000, bool))
     # Increments are no rotation vectors: coning, (w x w') T^3 / 12 a sample at most, 10 s of w w' = 0.02.
     assert (
-        np.abs(error_rad(mekf.state, tumble_body_from_ref(t_s)[-1])).max() < 0.02 * 10 / 400**2 / 12
+        np.abs(error_rad(mekf.state, tumble_body_from_ref(t_s)[-1])).max()
+        < 0.02 * 10 / 400**2 / 12
     )
     assert mekf.rate_rad_s == pytest.approx(tumble_angle_rad(t_s).sum(axis=0) / 10, abs=1e-12)
 
@@ -114,7 +115,9 @@ def test_the_covariance_obeys_riccati_s_equation_while_turning() -> None:
         .y[:, -1]
         .reshape(6, 6)
     )
-    mekf = AttitudeFilter(gyro, 0.0, HOME, np.sqrt(np.diag(start)[:3]), np.sqrt(np.diag(start)[3:]))
+    mekf = AttitudeFilter(
+        gyro, 0.0, HOME, np.sqrt(np.diag(start)[:3]), np.sqrt(np.diag(start)[3:])
+    )
     t_s = np.arange(1, 1201) / 400
     mekf.propagate(t_s, np.tile(rate / 400, (1200, 1)), np.zeros(1200, bool))
     scale = np.sqrt(np.outer(np.diag(oracle), np.diag(oracle)))
@@ -208,7 +211,9 @@ class World:
     bias_rad_s: np.ndarray
 
 
-def drawn(gyro: GyroModel, sigma_bias: float, t_s: np.ndarray, rng: np.random.Generator) -> World:
+def drawn(
+    gyro: GyroModel, sigma_bias: float, t_s: np.ndarray, rng: np.random.Generator
+) -> World:
     step_s = float(t_s[1])
     count = len(t_s) - 1
     decay = np.exp(-step_s / gyro.bias_time_s)
@@ -262,7 +267,9 @@ def test_the_errors_match_the_covariance() -> None:
 
 
 @pytest.mark.long
-def test_200_runs_are_within_their_bands_at_many_rates_with_frames_lost_and_out_of_order() -> None:
+def test_200_runs_are_within_their_bands_at_many_rates_with_frames_lost_and_out_of_order() -> (
+    None
+):
     # Bar-Shalom's tests: NEES at the end, NIS of each solution, both within the 95 % band of their chi-squares.
     # Gyro at 200 Hz, asked for in calls of 1 to 40 samples; solutions at 5 Hz of which a third never comes, and the
     # others 0.05 to 0.5 s late, so that they overtake one another.
@@ -420,9 +427,9 @@ def test_memory_does_not_grow_and_reaches_half_of_its_span_at_least() -> None:
         kept_s = 60 if k < 10 else HISTORY_S / 2
         assert mekf.update(max(k + 1.0 - kept_s, 0.0) + 0.01, HOME, TRACKER_RAD2).status == USED
     assert mekf.update(45.0, HOME, TRACKER_RAD2).status == TOO_OLD
-    assert sum(len(segment.samples) for segment in mekf._segments) < 10 * (HISTORY_S + 3) + 3 * len(
-        mekf._segments
-    )
+    assert sum(len(segment.samples) for segment in mekf._segments) < 10 * (
+        HISTORY_S + 3
+    ) + 3 * len(mekf._segments)
     assert len(mekf._segments) < 3 * HISTORY_S
 
 
@@ -434,7 +441,8 @@ def test_solutions_in_any_order_end_where_the_right_order_ends(order: tuple[int,
     angle = tumble_angle_rad(t_s)
     seen_s = np.array([0.2, 0.45125, 0.4513, 0.9])
     solutions = [
-        measured(truth, TRACKER_RAD2, rng) for truth in tumble_body_from_ref(np.append(seen_s, 1.0))
+        measured(truth, TRACKER_RAD2, rng)
+        for truth in tumble_body_from_ref(np.append(seen_s, 1.0))
     ]
     shuffled, ordered = (AttitudeFilter(gyro, 0.0, HOME, 0.01, 1e-3) for _ in range(2))
     for mekf, rows in ((shuffled, order), (ordered, range(4))):
@@ -462,7 +470,11 @@ class Blow:
 
     def rate_rad_s(self, t_s: np.ndarray) -> np.ndarray:
         blow = (t_s > 20.4) & (t_s < 20.6)
-        return np.where(blow, 3 * self.limit_rad_s, 0.0)[:, None] * [1.0, 0, 0] + [0.0, 0.02, -0.03]
+        return np.where(blow, 3 * self.limit_rad_s, 0.0)[:, None] * [1.0, 0, 0] + [
+            0.0,
+            0.02,
+            -0.03,
+        ]
 
     def body_from_ref(self, t_s: float) -> Rotation:
         """Attitude of three phases at constant rates."""
@@ -473,7 +485,12 @@ class Blow:
         return attitude
 
     def fly(
-        self, mekf: AttitudeFilter, from_s: int, to_s: int, flagged: bool, rng: np.random.Generator
+        self,
+        mekf: AttitudeFilter,
+        from_s: int,
+        to_s: int,
+        flagged: bool,
+        rng: np.random.Generator,
     ) -> list[str]:
         """Fly second by second with a solution after each; return their statuses."""
         statuses = []
@@ -498,7 +515,9 @@ def test_after_a_blow_the_filter_recovers_and_keeps_its_bias(limit_deg_s: float)
     before = mekf.state
     assert blow.fly(mekf, 20, 22, True, rng) == [USED, USED]
     state = mekf.state
-    assert (np.abs(error_rad(state, blow.body_from_ref(22.0))) < 4 * state.sigma_attitude_rad).all()
+    assert (
+        np.abs(error_rad(state, blow.body_from_ref(22.0))) < 4 * state.sigma_attitude_rad
+    ).all()
     assert (state.sigma_attitude_rad < 2 * before.sigma_attitude_rad).all()
     assert (np.abs(state.bias_rad_s - blow.bias_rad_s) < 4 * state.sigma_bias_rad_s).all()
     assert (np.abs(state.bias_rad_s - before.bias_rad_s) < before.sigma_bias_rad_s).all()
@@ -528,9 +547,9 @@ def test_plain_integration_keeps_the_missed_angle_as_an_error() -> None:
         rate = np.clip(blow.rate_rad_s(middle_s), -blow.limit_rad_s, blow.limit_rad_s)
         plain.propagate(middle_s + 0.5 / 400, rate / 400, np.zeros(len(rate), bool))
         # 1 %: about the other axes the vehicle turned 0.2 s x 0.036 rad/s while the gyro was lost.
-        assert np.linalg.norm(error_rad(plain.state, blow.body_from_ref(to_s))) == pytest.approx(
-            missed_rad, rel=0.01
-        )
+        assert np.linalg.norm(
+            error_rad(plain.state, blow.body_from_ref(to_s))
+        ) == pytest.approx(missed_rad, rel=0.01)
 
 
 @pytest.mark.parametrize("rate_hz", [100, 400])
@@ -542,7 +561,9 @@ def test_saturation_spreads_in_proportion_to_its_time(rate_hz: int) -> None:
     saturated = ((middle_s > 0.1) & (middle_s < 0.4)) | ((middle_s > 0.5) & (middle_s < 0.8))
     angle = np.where(saturated, -2.0, 0.5)[:, None] / rate_hz * [1.0, 0, 0]
     mekf.propagate(t_s, angle, saturated)
-    assert mekf.state.sigma_attitude_rad == pytest.approx(0.6 * np.sqrt(2) * np.ones(3), rel=1e-9)
+    assert mekf.state.sigma_attitude_rad == pytest.approx(
+        0.6 * np.sqrt(2) * np.ones(3), rel=1e-9
+    )
     assert not mekf.state.sigma_bias_rad_s.any()
 
 
@@ -660,7 +681,11 @@ def test_a_good_solution_resets_the_count_of_agreeing_outliers() -> None:
 
 
 def refused_then(
-    rate_rad_s: float, gap_s: float, spread: np.ndarray, sigma_bias: float, turns: list[Rotation]
+    rate_rad_s: float,
+    gap_s: float,
+    spread: np.ndarray,
+    sigma_bias: float,
+    turns: list[Rotation],
 ) -> str:
     """Status of the last solution of a filter that the gyro turns about x, with one solution after each gap.
 

@@ -166,7 +166,9 @@ def test_a_constant_tracker_error_is_not_averaged_down(named_by: str) -> None:
                 [k + 1.0], SIGMA_BIAS + ARW_RAD_SQRT_S * rng.normal(size=(1, 3)), [False]
             )
             seen = Rotation.from_rotvec(-offset - 10 * ARCSEC_RAD * rng.normal(size=3))
-            assert mekf.update(k + 1.0, seen, noise_rad2 + named_rad2, named_rad2).status == USED
+            assert (
+                mekf.update(k + 1.0, seen, noise_rad2 + named_rad2, named_rad2).status == USED
+            )
         state = mekf.state
         error = state.body_from_ref.as_rotvec()
         nees.append(error @ np.linalg.solve(state.covariance[:3, :3], error))
@@ -201,7 +203,8 @@ def test_a_rotation_decorrelates_the_slow_error_of_the_tracker() -> None:
         assert mekf.update(0.0, Rotation.identity(), noise_rad2).status == USED
         mekf.propagate([1.0], [[turned, 0.0, 0.0]], [False])
         assert (
-            mekf.update(1.0, Rotation.from_rotvec([-turned, 0.0, 0.0]), noise_rad2).status == USED
+            mekf.update(1.0, Rotation.from_rotvec([-turned, 0.0, 0.0]), noise_rad2).status
+            == USED
         )
         claims[turned] = mekf.state.sigma_attitude_rad[0] / sigma
     # The mean of two errors of correlation r has the variance S (1 + r) / 2.
@@ -253,7 +256,9 @@ def test_at_rest_no_scale_or_misalignment_is_observable() -> None:
     mekf = AttitudeFilter(gyro, 0.0, Rotation.identity(), SIGMA_RAD, SIGMA_BIAS)
     for k in range(20):
         mekf.propagate([k + 1.0], np.zeros((1, 3)), [False])
-        assert mekf.update(k + 1.0, Rotation.from_rotvec([1e-5, 0, 0]), NOISE_RAD2).status == USED
+        assert (
+            mekf.update(k + 1.0, Rotation.from_rotvec([1e-5, 0, 0]), NOISE_RAD2).status == USED
+        )
     for name in ("scale", "misalignment"):
         assert mekf.state.sigma(name) == pytest.approx(1e-3, rel=1e-9)
         assert np.abs(mekf.state.others[name]).max() < 1e-12  # the filter turns by an arcsecond
@@ -315,7 +320,8 @@ def test_bad_options_are_refused_in_one_line() -> None:
     ):
         built().update(0.0, Rotation.identity(), NOISE_RAD2, NOISE_RAD2)
     with pytest.raises(
-        ValueError, match=r"update: systematic_rad2 .*allowed: \(3, 3\), symmetric, not negative"
+        ValueError,
+        match=r"update: systematic_rad2 .*allowed: \(3, 3\), symmetric, not negative",
     ):
         built().update(0.0, Rotation.identity(), NOISE_RAD2, -NOISE_RAD2)
     with pytest.raises(KeyError, match="gain"):

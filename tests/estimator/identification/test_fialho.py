@@ -56,7 +56,12 @@ def field(
 
 
 def counted(
-    seen: Floats, light: Floats, sky: pair_index.PairIndex, eps: float, gate: float, optimized: bool
+    seen: Floats,
+    light: Floats,
+    sky: pair_index.PairIndex,
+    eps: float,
+    gate: float,
+    optimized: bool,
 ) -> int:
     """Number of catalog triplets similar to a triangle of three stars, by the module's search."""
     settings = Options(epsilon_mag=gate / MAG_GATE_SIGMA, max_checks=10**12)
@@ -84,7 +89,8 @@ def by_brute_force(
     separation = np.arctan2(cross, sky.vectors @ sky.vectors.T)
     similar = np.abs(sky.magnitude - light[:, None]) <= gate
     side = [
-        np.arctan2(np.linalg.norm(np.cross(seen[i], seen[j])), seen[i] @ seen[j]) for i, j in PAIRS
+        np.arctan2(np.linalg.norm(np.cross(seen[i], seen[j])), seen[i] @ seen[j])
+        for i, j in PAIRS
     ]
     ab, ac, bc = (np.abs(separation - one) <= eps for one in side)
     handed = np.linalg.det(seen)
@@ -126,7 +132,9 @@ def test_the_number_of_triplets_matches_theory(sky: pair_index.PairIndex) -> Non
         side = np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)
         to_a = np.cross(a, c)
         to_b = np.cross(b, c)
-        sin_k = np.linalg.norm(np.cross(to_a, to_b)) / (np.linalg.norm(to_a) * np.linalg.norm(to_b))
+        sin_k = np.linalg.norm(np.cross(to_a, to_b)) / (
+            np.linalg.norm(to_a) * np.linalg.norm(to_b)
+        )
         expected += (
             n
             * (n - 1)
@@ -149,7 +157,9 @@ def test_lists_from_neighbors_answer_as_lists_from_the_whole_catalog(
     for _ in range(60):
         seen, light, _, _ = field(rng, sky)
         known = {"magnitude": light, "epsilon_mag": EPSILON_MAG}
-        one, two = (method(seen, sky, 5 * SIGMA_RAD, **known) for method in (fialho_1, fialho_2))
+        one, two = (
+            method(seen, sky, 5 * SIGMA_RAD, **known) for method in (fialho_1, fialho_2)
+        )
         assert (one is None) == (two is None)
         if one is not None and two is not None:
             np.testing.assert_array_equal(one.star, two.star)
@@ -170,7 +180,9 @@ def test_one_triangle_succeeds_as_often_as_its_three_magnitudes_pass(
             found[n] += match is not None
             assert match is None or (match.star == row[match.observed]).mean() > 0.8
     passes = 0.9973002**3
-    assert found[0] == pytest.approx(runs * passes, abs=4 * np.sqrt(runs * passes * (1 - passes)))
+    assert found[0] == pytest.approx(
+        runs * passes, abs=4 * np.sqrt(runs * passes * (1 - passes))
+    )
     # Of six stars or fewer, one field in a hundred, some are not beyond chance.
     assert found[1] > 0.997 * runs
 
@@ -194,7 +206,9 @@ def test_a_false_star_among_the_brightest_stops_one_triangle_but_not_the_next(
 
 
 @pytest.mark.long
-def test_a_hint_lets_only_stars_near_the_boresight_be_candidates(sky: pair_index.PairIndex) -> None:
+def test_a_hint_lets_only_stars_near_the_boresight_be_candidates(
+    sky: pair_index.PairIndex,
+) -> None:
     rng = np.random.default_rng(107)
     for _ in range(20):
         seen, light, _, truth = field(rng, sky)
@@ -257,12 +271,17 @@ def test_stars_too_close_for_a_triangle_are_passed_over_or_refused(
     close = catalog.unit(seen[:1] + np.array([0.25 * MIN_SIDE_FRACTION * DIAGONAL_RAD, 0, 0]))
     both = np.vstack([seen[:1], close, seen[1:]])
     match = fialho_2(
-        both, sky, 5 * SIGMA_RAD, magnitude=np.insert(light, 1, light[0]), epsilon_mag=EPSILON_MAG
+        both,
+        sky,
+        5 * SIGMA_RAD,
+        magnitude=np.insert(light, 1, light[0]),
+        epsilon_mag=EPSILON_MAG,
     )
     assert match is not None
     assert row[0] in match.star
     cluster = catalog.unit(
-        np.array([0, 0, 1.0]) + rng.normal(0, 0.2 * MIN_SIDE_FRACTION * DIAGONAL_RAD / 3, (8, 3))
+        np.array([0, 0, 1.0])
+        + rng.normal(0, 0.2 * MIN_SIDE_FRACTION * DIAGONAL_RAD / 3, (8, 3))
     )
     assert fialho_3(cluster, sky, 5 * SIGMA_RAD) is None
 

@@ -25,7 +25,9 @@ SLOW = {"shefex", "master_star", "saa"}  # ten seconds and more for the 40 field
 
 def named(*names: str) -> list:
     """Algorithms as parameters; the slow ones run with `make test-long`."""
-    return [pytest.param(name, marks=pytest.mark.long if name in SLOW else ()) for name in names]
+    return [
+        pytest.param(name, marks=pytest.mark.long if name in SLOW else ()) for name in names
+    ]
 
 
 PAPERS = named("fialho_1", "fialho_2", "fialho_3", "fialho_4", "shefex", "master_star", "saa")
@@ -35,7 +37,9 @@ GIVES_UP = 1_000_000  # angles compared: on the real sky each finds within some 
 @pytest.fixture(scope="module")
 def sky() -> pair_index.PairIndex:
     """The real sky to V 5.2, stars that noise could swap merged: some 13 stars a field."""
-    stars = catalog.merge_doubles(catalog.brighter_than(catalog.read(FILE), 5.2), 180 * ARCSEC_RAD)
+    stars = catalog.merge_doubles(
+        catalog.brighter_than(catalog.read(FILE), 5.2), 180 * ARCSEC_RAD
+    )
     return pair_index.build(
         stars.vectors, 2 * np.arctan(np.sqrt(2) * HALF_TAN), magnitude=stars.v_mag
     )
@@ -89,7 +93,9 @@ def fields(
 # With three stars inside their gates of three sigmas 99.2 % of the time, 40 fields lose 3 once in a hundred times;
 # the rest have no gate that narrow, or try again.
 @pytest.mark.parametrize("name", PAPERS)
-def test_the_real_sky_is_identified_and_never_wrongly(sky: pair_index.PairIndex, name: str) -> None:
+def test_the_real_sky_is_identified_and_never_wrongly(
+    sky: pair_index.PairIndex, name: str
+) -> None:
     every = fields(sky, 40, 90)
     answers = [(one, identify(name, one, sky)) for one in every]
     found = [(one, match) for one, match in answers if match is not None]
@@ -101,7 +107,9 @@ def test_the_real_sky_is_identified_and_never_wrongly(sky: pair_index.PairIndex,
         assert match.log10_chance <= -5
         error = (match.cam_from_ref * one.cam_from_icrs.inv()).as_rotvec()
         seen = one.seen[match.observed]
-        information = (np.eye(3) - seen[:, :, None] * seen[:, None, :]).sum(axis=0) / SIGMA_RAD**2
+        information = (np.eye(3) - seen[:, :, None] * seen[:, None, :]).sum(
+            axis=0
+        ) / SIGMA_RAD**2
         chi2.append(error @ information @ error)
     # Three degrees of freedom each: mean 3, deviation sqrt(6 / n). Four deviations.
     assert np.mean(chi2) == pytest.approx(3, abs=4 * np.sqrt(6 / len(chi2)))
@@ -141,7 +149,9 @@ def test_another_sky_is_refused(sky: pair_index.PairIndex, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", named("fialho_3", "fialho_4", "shefex", "saa"))
-def test_false_stars_do_not_prevent_identification(sky: pair_index.PairIndex, name: str) -> None:
+def test_false_stars_do_not_prevent_identification(
+    sky: pair_index.PairIndex, name: str
+) -> None:
     # A third of 18 and more stars is false. A false star may pass for a star near it: once in a thousand.
     found = 0
     for one in fields(sky, 20, 94, least=12, false=6):
@@ -158,7 +168,9 @@ def test_false_stars_do_not_prevent_identification(sky: pair_index.PairIndex, na
 def test_without_magnitudes_geometry_is_enough(sky: pair_index.PairIndex, name: str) -> None:
     found = 0
     for one in fields(sky, 6, 95, least=10):
-        match = identify(name, one, sky, magnitude=None, epsilon_mag=np.inf, max_checks=20_000_000)
+        match = identify(
+            name, one, sky, magnitude=None, epsilon_mag=np.inf, max_checks=20_000_000
+        )
         if match is not None:
             np.testing.assert_array_equal(match.star, one.row[match.observed])
             found += 1
@@ -166,12 +178,15 @@ def test_without_magnitudes_geometry_is_enough(sky: pair_index.PairIndex, name: 
 
 
 @pytest.mark.parametrize("name", PAPERS)
-def test_unusable_input_of_an_identifier_is_refused(sky: pair_index.PairIndex, name: str) -> None:
+def test_unusable_input_of_an_identifier_is_refused(
+    sky: pair_index.PairIndex, name: str
+) -> None:
     one = fields(sky, 1, 96)[0]
     method: Callable[..., StarMatch | None] = IDENTIFIERS[name]
     assert method(one.seen[:3], sky, 1e-4) is None
     with pytest.raises(
-        ImageError, match="the focal length is uncertain; allowed: a calibrated camera, or pyramid"
+        ImageError,
+        match="the focal length is uncertain; allowed: a calibrated camera, or pyramid",
     ):
         method(one.seen, sky, 1e-4, focal_unknown=True)
     with pytest.raises(ImageError, match="tolerance 0"):

@@ -45,7 +45,9 @@ def test_a_template_is_the_mean_level_of_an_exposure(
 @pytest.mark.slow
 @law(led_codes.misfits, led_codes.expected_misfit, led_codes.likely)
 @given(rng=SEEDS, gross=some.integers(0, 2))
-def test_a_misfit_is_the_least_over_the_brightness(rng: np.random.Generator, gross: int) -> None:
+def test_a_misfit_is_the_least_over_the_brightness(
+    rng: np.random.Generator, gross: int
+) -> None:
     """Of the true template it is that of a fine search of brightnesses; of others at least as much as theirs."""
     template = rng.integers(0, 2, (6, 20)) * 0.5 + 0.5
     light = 1e4 * template[:1] * (1 + 0.02 * rng.standard_normal(20))
@@ -73,7 +75,9 @@ def test_a_misfit_is_the_least_over_the_brightness(rng: np.random.Generator, gro
 def test_a_true_code_word_is_seldom_called_suspicious() -> None:
     """Half of a chi-square exceeds the limit without its allowance for gross errors in 1 of 50 cases or fewer."""
     for measured in (3, 9, 19, 31):
-        limit = led_codes.expected_misfit(np.array([measured]))[0] - GROSS * max(1, measured / 6)
+        limit = led_codes.expected_misfit(np.array([measured]))[0] - GROSS * max(
+            1, measured / 6
+        )
         assert chi2.sf(2 * limit, measured) < 0.02
 
 
@@ -87,7 +91,9 @@ def test_noise_beyond_the_declared_is_found_from_the_misfits(
     least = factor**2 * rng.chisquare(measured) / 2
     least[::9] = 1e4
     found = led_codes.excess_noise(least, measured)
-    assert found == 1 if factor < 0.85 else found == pytest.approx(max(1.0, factor**2), rel=0.25)
+    assert (
+        found == 1 if factor < 0.85 else found == pytest.approx(max(1.0, factor**2), rel=0.25)
+    )
 
 
 @law(led_naming.is_supported)
@@ -162,7 +168,9 @@ def test_lights_keep_their_tracks_while_the_vehicle_turns(
         centroids = Centroids(xy_px, np.full(len(seen), 0.1), seen + 1.0)
         step = Rotation.from_rotvec(axis * rate_rad_s * 0.02) if gyro else None
         tracks.advance(centroids, 0.01 * (seen + 1.0), 0.02, step)
-        np.testing.assert_array_equal(np.sort(tracks.row[tracks.row >= 0]), np.arange(len(seen)))
+        np.testing.assert_array_equal(
+            np.sort(tracks.row[tracks.row >= 0]), np.arange(len(seen))
+        )
     shown = [set(row[row > 0].tolist()) for row in tracks.light]
     assert all(len(one) <= 1 for one in shown)
     if not dark:

@@ -34,7 +34,11 @@ def grid(levels: Floats | None, pitch_m: float = 0.03, side: int = 21) -> LedMap
         [*(one.ravel() for one in np.meshgrid(axis, axis)), np.full(side**2, 1.2192)]
     )
     leds = LedMap(
-        np.arange(side**2), place_m, np.zeros(3), np.array([np.inf, np.inf, 1.2192]), sigma_m=1e-4
+        np.arange(side**2),
+        place_m,
+        np.zeros(3),
+        np.array([np.inf, np.inf, 1.2192]),
+        sigma_m=1e-4,
     )
     if levels is None:
         return leds
@@ -102,8 +106,12 @@ def test_brightness_distinguishes_the_fields_of_a_grid() -> None:
             solved = tracker.solve_centroids(centroids, exposure_s=0.01)
             found[name] += solved.solved
             if solved.solved:
-                np.testing.assert_array_equal(seen[order][solved.match.observed], solved.match.star)
-        assert not trackers["levels"].solve_centroids(centroids).solved  # the exposure is unknown
+                np.testing.assert_array_equal(
+                    seen[order][solved.match.observed], solved.match.star
+                )
+        assert (
+            not trackers["levels"].solve_centroids(centroids).solved
+        )  # the exposure is unknown
     assert found["equal"] == 0
     assert found["levels"] >= 36
 

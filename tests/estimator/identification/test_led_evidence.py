@@ -33,7 +33,9 @@ PLACES_M = np.array(
         ([0, 1, 2, 3, 3, 3], 1, 1),
     ],
 )
-def test_matches_on_one_board_count_little(boards: list[int], second: int, further: int) -> None:
+def test_matches_on_one_board_count_little(
+    boards: list[int], second: int, further: int
+) -> None:
     """A board's first match counts in full, log10(1 / (2 pi sigma^2 rho)), its second 1, each further one 0.3.
 
     All detections are exact, so that every match that counts in full counts the same.
@@ -49,7 +51,8 @@ def test_matches_on_one_board_count_little(boards: list[int], second: int, furth
     boarded = dome._replace(pairs=dome.pairs._replace(group=np.array(boards)))
     apart = dome._replace(pairs=dome.pairs._replace(group=np.arange(6)))
     found = [
-        led_evidence.evaluate(detections, index, np.eye(3), 0, 0, 3) for index in (apart, boarded)
+        led_evidence.evaluate(detections, index, np.eye(3), 0, 0, 3)
+        for index in (apart, boarded)
     ]
     assert [len(hypothesis.star) for hypothesis in found] == [6, 6]
     area = CAMERA.width_px * CAMERA.height_px / CAMERA.focal_px**2
@@ -59,7 +62,9 @@ def test_matches_on_one_board_count_little(boards: list[int], second: int, furth
 
 
 WIDE = Camera(1600, 1200, 900.0, (799.5, 599.5))
-ASIDE = Lever(np.array([0.1, -0.05, 0.3]), Rotation.from_euler("xyz", [4, -3, 20], degrees=True))
+ASIDE = Lever(
+    np.array([0.1, -0.05, 0.3]), Rotation.from_euler("xyz", [4, -3, 20], degrees=True)
+)
 
 
 def wide_field(level_from_lab: Rotation) -> tuple[DomeIndex, LedDetections, Floats]:
@@ -79,7 +84,9 @@ def wide_field(level_from_lab: Rotation) -> tuple[DomeIndex, LedDetections, Floa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.5, -0.7, 0.5)])
-def test_two_iterations_of_the_attitude_reach_the_truth(axis: tuple[float, float, float]) -> None:
+def test_two_iterations_of_the_attitude_reach_the_truth(
+    axis: tuple[float, float, float],
+) -> None:
     """Gauss-Newton of exact detections squares the error: 0.5 deg, some 1e-4 rad, below 1e-6 rad."""
     dome, detections, R_cam_from_lab = wide_field(
         Rotation.from_euler("xyz", [5, -8, 30], degrees=True)
@@ -111,7 +118,9 @@ def test_the_information_matches_the_projection_s_derivatives(uncertainty: float
         return 1.07 * np.exp(change[3]) * (q[:, :2] / q[:, 2:]).ravel()
 
     unknowns = np.eye(4)[: 4 if uncertainty else 3]
-    slopes = np.array([(tangents(step * e) - tangents(-step * e)) / (2 * step) for e in unknowns])
+    slopes = np.array(
+        [(tangents(step * e) - tangents(-step * e)) / (2 * step) for e in unknowns]
+    )
     detections = detections._replace(focal_uncertainty=uncertainty)
     info, _ = led_evidence._fit(detections, dome, R_cam_from_lab.copy(), 1.07, rows, rows)
     np.testing.assert_allclose(

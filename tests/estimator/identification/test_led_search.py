@@ -31,7 +31,9 @@ NOISE_PX = 0.2
 ERROR_M = 0.2e-3
 
 
-def spread(count: int, surface: tuple[Floats, Floats], seed: int, cap_deg: float = 40.0) -> LedMap:
+def spread(
+    count: int, surface: tuple[Floats, Floats], seed: int, cap_deg: float = 40.0
+) -> LedMap:
     """This number of LEDs at random places on a surface with a minimum distance."""
     rng = np.random.default_rng(seed)
     z = 1 - rng.random(40 * count) * (1 - np.cos(np.radians(cap_deg)))
@@ -158,7 +160,9 @@ def test_a_pair_s_angle_at_the_usual_radius_is_within_the_slack(surface):
     leds = spread(600, surface, 9)
     dome = build_dome_index(leds, LEVER, CAMERA)
     rng = np.random.default_rng(10)
-    keys = dict(zip(map(frozenset, dome.pairs.pair.tolist()), dome.pairs.angle_rad, strict=True))
+    keys = dict(
+        zip(map(frozenset, dome.pairs.pair.tolist()), dome.pairs.angle_rad, strict=True)
+    )
     checked = 0
     for _ in range(60):
         body_from_lab = pose(rng)
@@ -172,7 +176,8 @@ def test_a_pair_s_angle_at_the_usual_radius_is_within_the_slack(surface):
             for b in range(a):
                 angle = 2 * np.arcsin(np.linalg.norm(direction[a] - direction[b]) / 2)
                 assert (
-                    abs(angle - keys[frozenset((seen[a], seen[b]))]) < dome.scaling_error_rad + 1e-9
+                    abs(angle - keys[frozenset((seen[a], seen[b]))])
+                    < dome.scaling_error_rad + 1e-9
                 )
                 checked += 1
     assert checked > 300
@@ -182,7 +187,9 @@ def boards(turns_deg: tuple[float, ...], extra: bool) -> LedMap:
     """Equal patch boards of 3x3 LEDs around the apex, one per azimuth, with an optional single LED."""
     lattice = 0.008 * np.array([[x, y, 0] for y in (-1, 0, 1) for x in (-1, 0, 1)])
     places = [
-        Rotation.from_euler("z", turn, degrees=True).apply(lattice + np.array([0.045, 0, 1.219]))
+        Rotation.from_euler("z", turn, degrees=True).apply(
+            lattice + np.array([0.045, 0, 1.219])
+        )
         for turn in turns_deg
     ]
     place = np.concatenate([*places, *([[[0.02, -0.036, 1.219]]] if extra else [])])
@@ -242,7 +249,9 @@ def test_the_covariance_includes_the_map_s_errors():
             Centroids(pixels, np.full(len(pixels), NOISE_PX), np.ones(len(pixels)))
         )
         if answer.solved:
-            error = (answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()).as_rotvec()
+            error = (
+                answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()
+            ).as_rotvec()
             nees.append(error @ np.linalg.inv(answer.covariance_rad2) @ error)
     assert len(nees) >= 97
     assert np.mean(nees) == pytest.approx(3, abs=3 * np.sqrt(6 / 100))
@@ -304,7 +313,9 @@ def test_the_index_converts_errors_and_field_to_angles() -> None:
     lever = Lever(LEVER.camera_body_m, LEVER.cam_from_body, 1e-3)
     leds = replace(leds, sigma_m=2e-4)
     dome = build_dome_index(leds, lever, CAMERA)
-    least_m = np.linalg.norm(leds.position_m, axis=1).min() - np.linalg.norm(LEVER.camera_body_m)
+    least_m = np.linalg.norm(leds.position_m, axis=1).min() - np.linalg.norm(
+        LEVER.camera_body_m
+    )
     assert dome.lever_sigma == pytest.approx(1e-3 / least_m, rel=1e-12)
     assert dome.led_sigma == pytest.approx(2e-4 / least_m, rel=1e-12)
     assert dome.field_area == pytest.approx(1600 * 1200 / 8698.0**2, rel=1e-9)
@@ -375,7 +386,8 @@ def test_a_pair_s_gates_are_the_error_of_where_it_puts_a_detection() -> None:
 
 
 @pytest.mark.parametrize(
-    ("dead", "required", "found"), [([], 4, 4), ([], 5, 5), ([4], 5, 4), ([2], 4, 4), ([2], 5, 2)]
+    ("dead", "required", "found"),
+    [([], 4, 4), ([], 5, 5), ([4], 5, 4), ([2], 4, 4), ([2], 5, 2)],
 )
 def test_the_quick_check_stops_once_the_outcome_is_decided(
     dead: list[int], required: int, found: int
@@ -388,14 +400,20 @@ def test_the_quick_check_stops_once_the_outcome_is_decided(
     leds = LedMap(np.arange(5), position_m, *FLAT)
     whole = build_dome_index(leds, lever, camera)
     kept = np.setdiff1d(np.arange(5), dead)
-    dome = build_dome_index(LedMap(kept, position_m[kept], *FLAT), lever, camera) if dead else whole
+    dome = (
+        build_dome_index(LedMap(kept, position_m[kept], *FLAT), lever, camera)
+        if dead
+        else whole
+    )
     rays = camera.rays(project(Rotation.identity(), position_m, lever, camera))
     detections = led_search.build_detections(rays, np.full(5, 1e-5), dome)
     gates = np.full(5, 1e-4)
     R_grid_from_cam = dome.grid.R_grid_from_lab
     median_m = dome.median_radius_m
     assert (
-        PLAIN._quick_check(detections, dome, R_grid_from_cam, 1.0, median_m, 0, 1, gates, required)
+        PLAIN._quick_check(
+            detections, dome, R_grid_from_cam, 1.0, median_m, 0, 1, gates, required
+        )
         == found
     )
     zoomed = led_search.build_detections(
@@ -410,7 +428,9 @@ def test_the_quick_check_stops_once_the_outcome_is_decided(
     )
     if found > 2:
         assert (
-            PLAIN._quick_check(zoomed, dome, R_grid_from_cam, 1.0, median_m, 0, 1, gates, required)
+            PLAIN._quick_check(
+                zoomed, dome, R_grid_from_cam, 1.0, median_m, 0, 1, gates, required
+            )
             < found
         )
 
@@ -498,7 +518,9 @@ def test_an_unknown_focal_length_is_found_with_the_attitude_or_nothing_is(
         if n % 3 == 0:
             outward = (truth.position_m - truth.center_m) / truth.semi_axes_m**2
             shift_m = surface_m * outward / np.linalg.norm(outward, axis=1, keepdims=True)
-            believed_m = truth.position_m + error_m * rng.standard_normal(truth.position_m.shape)
+            believed_m = truth.position_m + error_m * rng.standard_normal(
+                truth.position_m.shape
+            )
             believed_m += rng.standard_normal() * shift_m
             leds = replace(
                 truth,
@@ -514,9 +536,13 @@ def test_an_unknown_focal_length_is_found_with_the_attitude_or_nothing_is(
         )
         if answer.solved:
             assert np.array_equal(names[answer.match.observed], answer.match.star)
-            error = (answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()).as_rotvec()
+            error = (
+                answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()
+            ).as_rotvec()
             nees.append(error @ np.linalg.solve(answer.covariance_rad2, error))
-            focal.append((answer.camera.focal_px / CAMERA.focal_px - 1) / answer.camera.focal_sigma)
+            focal.append(
+                (answer.camera.focal_px / CAMERA.focal_px - 1) / answer.camera.focal_sigma
+            )
     assert len(nees) >= least * tries
     if nees:
         # Frames in threes share a map's errors, in other fields of it, but the surface's in all.

@@ -188,7 +188,9 @@ def test_the_sides_of_a_triangle_must_agree_on_one_focal_length(
     """The stretch of 0.015 is one factor of all sides if the focal length is unknown, and else each side's own."""
     sides = np.array([0.1, 0.12, 0.14])
     index = pair_index.build(triangle(sides * scale), 0.2)
-    options = pyramid.PyramidOptions(1e-5, 0.015, unknown, 10, 1000, 3, 0.0, -1.0, 1.0, -1.0, 1.0)
+    options = pyramid.PyramidOptions(
+        1e-5, 0.015, unknown, 10, 1000, 3, 0.0, -1.0, 1.0, -1.0, 1.0
+    )
     tried = np.zeros(3, np.int64)
     PYRAMID._triangle(triangle(sides), index, np.arange(3), options, tried)
     assert tried[1] == hypotheses
@@ -244,7 +246,13 @@ def test_the_number_of_triangles_tried_is_the_allowed_one(name: str) -> None:
     """The first three of four triangles have a false star; the first that has none is the last in order."""
     stars = unit(
         np.array(
-            [[-0.1, -0.02, 1], [0.06, 0.07, 1], [0.09, -0.08, 1], [-0.05, 0.06, 1], [0.01, 0.03, 1]]
+            [
+                [-0.1, -0.02, 1],
+                [0.06, 0.07, 1],
+                [0.09, -0.08, 1],
+                [-0.05, 0.06, 1],
+                [0.01, 0.03, 1],
+            ]
         )
     )
     false = unit(np.array([[0.04, -0.05, 1]]))
@@ -294,7 +302,13 @@ def crossing_area_sr(
 def test_shefex_s_gates_have_the_least_area_of_their_crossing_rings() -> None:
     rays = unit(
         np.array(
-            [[0.1, 0.02, 1], [-0.06, 0.08, 1], [-0.03, -0.09, 1], [0.02, 0.03, 1], [0.06, -0.08, 1]]
+            [
+                [0.1, 0.02, 1],
+                [-0.06, 0.08, 1],
+                [-0.03, -0.09, 1],
+                [0.02, 0.03, 1],
+                [0.06, -0.08, 1],
+            ]
         )
     )
     options = ShefexOptions(1e-5, 1e-6, 100, 10**6, 5)
@@ -304,7 +318,8 @@ def test_shefex_s_gates_have_the_least_area_of_their_crossing_rings() -> None:
         half = (gates[n, 3:6] - gates[n, :3]) / 2
         pairs = [(0, 1), (1, 2), (2, 0)]
         areas = [
-            crossing_area_sr(rays[n], [(rays[a], half[a]), (rays[b], half[b])]) for a, b in pairs
+            crossing_area_sr(rays[n], [(rays[a], half[a]), (rays[b], half[b])])
+            for a, b in pairs
         ]
         # Of the lattice, and of the rings' curvature.
         assert gates[n, 9] == pytest.approx(min(areas), rel=0.03)
@@ -334,7 +349,9 @@ def test_a_star_and_its_mirror_image_in_the_base_are_on_different_sides() -> Non
         far = int(np.argmax(np.abs(volumes)))
         normal = unit(np.cross(rays[[far]], rays[(far + 1) % 3]))[0]
         mirrored = rays[3] - 2 * (rays[3] @ normal) * normal
-        index = SimpleNamespace(vectors=Rotation.random(rng=rng).apply(np.vstack([rays, mirrored])))
+        index = SimpleNamespace(
+            vectors=Rotation.random(rng=rng).apply(np.vstack([rays, mirrored]))
+        )
         corners = np.arange(3)
         assert SHEFEX._same_side(rays, index, corners, corners, 3, 3)
         assert not SHEFEX._same_side(rays, index, corners, corners, 3, 4)
@@ -362,7 +379,8 @@ def test_shefex_takes_the_star_whose_three_angles_fit_best() -> None:
         )
         wanted = int(np.argmin(difference)) if fits.any() else -1
         assert (
-            SHEFEX._partner(rays, index, np.arange(3), np.arange(3), 3, gates[3], tried) == wanted
+            SHEFEX._partner(rays, index, np.arange(3), np.arange(3), 3, gates[3], tried)
+            == wanted
         )
         found += np.count_nonzero(fits) > 1
     assert found > 5
@@ -376,12 +394,15 @@ def test_four_stars_are_the_least_of_shefex_s_match() -> None:
     np.testing.assert_array_equal(match.star, rows[:4])
     strays = np.vstack([rays[:3], unit(np.array([[0.012, 0.034, 1.0]]))])
     assert (
-        len(SHEFEX.search(strays, index, options._replace(base=4), np.zeros(3, np.int64)).star) == 0
+        len(SHEFEX.search(strays, index, options._replace(base=4), np.zeros(3, np.int64)).star)
+        == 0
     )
     # Within wide gates of the angles, but 30 tolerances from its place.
     moved = unit(rays[:4] + np.outer([0, 0, 0, 1], [3e-4, 0, 0]))
     wide = options._replace(cos_error=1e-4, tolerance_rad=1e-5)
-    assert len(SHEFEX.search(moved, index, wide._replace(base=4), np.zeros(3, np.int64)).star) == 0
+    assert (
+        len(SHEFEX.search(moved, index, wide._replace(base=4), np.zeros(3, np.int64)).star) == 0
+    )
 
 
 # ---- SAA
@@ -439,7 +460,9 @@ def test_saa_s_gate_of_positions_is_three_errors_of_the_predicted_place() -> Non
         assert primary.radius_rad[k] == pytest.approx(
             3 * primary.sigma_rad[k] + STRETCH * far_rad, rel=1e-9
         )
-        assert primary.area_sr[k] == pytest.approx(np.pi * primary.radius_rad[k] ** 2, rel=1e-12)
+        assert primary.area_sr[k] == pytest.approx(
+            np.pi * primary.radius_rad[k] ** 2, rel=1e-12
+        )
 
 
 def test_saa_s_chance_counts_the_stars_within_its_reach() -> None:
@@ -467,7 +490,9 @@ def test_saa_s_chance_counts_the_stars_within_its_reach() -> None:
     assert p == pytest.approx(np.mean(-np.expm1(-similar * share)), rel=1e-9)
     assert missing == np.count_nonzero(in_field) - 3
     alone = stars._replace(vectors=seen, magnitude_cam=seen_mag, magnitude=magnitude[:4])
-    assert SAA._chance_statistics(alone, primary, np.arange(4), (-0.3, 0.08, -0.1, 0.07))[1] == 0
+    assert (
+        SAA._chance_statistics(alone, primary, np.arange(4), (-0.3, 0.08, -0.1, 0.07))[1] == 0
+    )
 
 
 @pytest.mark.parametrize("base", [5, 9])
@@ -477,7 +502,9 @@ def test_saa_tries_every_pair_that_gives_the_roll_the_brightest_first(base: int)
     unknown = np.full(9, np.nan)
     max_rad = 0.012
     pairs = list(
-        SAA._primary_pairs(SearchInput(rays, unknown, rays, unknown, None, gates), base, max_rad)
+        SAA._primary_pairs(
+            SearchInput(rays, unknown, rays, unknown, None, gates), base, max_rad
+        )
     )
     angle = np.arccos(np.clip(rays @ rays.T, -1, 1))
     fitting = (angle > 12 * SEPARATION_RAD) & (angle <= max_rad + 3 * SEPARATION_RAD)
@@ -511,9 +538,13 @@ def test_saa_s_partner_meets_the_four_conditions_at_the_least_cost() -> None:
         for k, n in enumerate((1, 3, 4)):
             # The reference's axes are the camera's.
             distance = np.linalg.norm(index.vectors - seen[n], axis=1)
-            off = np.arccos(index.vectors @ seen[[0, 2]].T) - np.arccos(seen[n] @ seen[[0, 2]].T)
+            off = np.arccos(index.vectors @ seen[[0, 2]].T) - np.arccos(
+                seen[n] @ seen[[0, 2]].T
+            )
             unlike = np.nan_to_num((magnitude - seen_mag[n]) / 0.3)
-            fits = (np.abs(unlike) <= 3) & (2 * np.arcsin(distance / 2) <= primary.radius_rad[k])
+            fits = (np.abs(unlike) <= 3) & (
+                2 * np.arcsin(distance / 2) <= primary.radius_rad[k]
+            )
             fits &= (np.abs(off) <= 6e-3).all(axis=1) & (np.arange(302) > 1)
             own_cost = unlike**2 + np.sum(off**2, axis=1) / 2e-3**2
             total = np.where(fits, own_cost + (distance / primary.sigma_rad[k]) ** 2, np.inf)
@@ -646,7 +677,8 @@ def test_fialho_tries_every_wide_triangle_once_up_to_its_limits(
     wide = [
         corners
         for corners in itertools.combinations(range(6), 3)
-        if shortest_side_rad(rays[list(corners)]) >= FIALHO.MIN_SIDE_FRACTION * index.max_angle_rad
+        if shortest_side_rad(rays[list(corners)])
+        >= FIALHO.MIN_SIDE_FRACTION * index.max_angle_rad
     ]
     assert len(wide) > 5
     assert asked[0] == wide[0]

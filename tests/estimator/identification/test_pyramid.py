@@ -25,7 +25,9 @@ UPSIDE_DOWN = np.array([-1.0, 1.0, 1.0])
 def sky_index(stars_a_field: float) -> pair_index.PairIndex:
     """Brightest stars of the real sky with this mean number per field, doubles merged."""
     stars = catalog.read(FILE)
-    bright = catalog.brighter_than(stars, catalog.limit_for_density(stars, FIELD_SR, stars_a_field))
+    bright = catalog.brighter_than(
+        stars, catalog.limit_for_density(stars, FIELD_SR, stars_a_field)
+    )
     merged = catalog.merge_doubles(bright, 3 / CAMERA.focal_px)
     return pair_index.build(merged.vectors, CAMERA.diagonal_rad * 1.02)
 
@@ -130,7 +132,10 @@ def test_each_blob_and_each_star_is_matched_once(sky: pair_index.PairIndex) -> N
     for _ in range(30):
         match = solved(Field(rng, sky.vectors, 0.5, 0.2).xy, sky, 2.0)
         assert (
-            len(set(match.observed)) == len(match.observed) == len(set(match.star)) >= MIN_MATCHES
+            len(set(match.observed))
+            == len(match.observed)
+            == len(set(match.star))
+            >= MIN_MATCHES
         )
 
 
@@ -163,7 +168,8 @@ def test_another_sky_is_refused(bright_sky: pair_index.PairIndex) -> None:
     other = rng.normal(size=bright_sky.vectors.shape)
     other /= np.linalg.norm(other, axis=1, keepdims=True)
     assert (
-        sum(solved(Field(rng, other, 0.0, 0.0).xy, bright_sky) is not None for _ in range(300)) == 0
+        sum(solved(Field(rng, other, 0.0, 0.0).xy, bright_sky) is not None for _ in range(300))
+        == 0
     )
 
 

@@ -190,7 +190,9 @@ def test_a_calibrated_tracker_finds_that_its_focal_length_is_wrong() -> None:
         xy = camera.pixels(truth.apply(tracker.stars.vectors))
         row = np.flatnonzero(camera.contains(np.nan_to_num(xy, nan=-1e9)))
         lights = Centroids(
-            xy[row] + 0.1 * rng.normal(size=(len(row), 2)), np.full(len(row), 0.1), 1.0 / (1 + row)
+            xy[row] + 0.1 * rng.normal(size=(len(row), 2)),
+            np.full(len(row), 0.1),
+            1.0 / (1 + row),
         )
         attitude = tracker.solve_centroids(lights)
         solved.append(attitude.solved)

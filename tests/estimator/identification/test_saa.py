@@ -64,7 +64,9 @@ def observed(
     truth = Rotation.random(rng=rng)
     seen = truth.apply(vectors)
     reflection = truth.apply(patch(rng.uniform(-2.5, 2.5, (false, 2))))
-    seen = unit(np.vstack([seen, reflection]) + rng.normal(0, SIGMA_RAD, (len(seen) + false, 3)))
+    seen = unit(
+        np.vstack([seen, reflection]) + rng.normal(0, SIGMA_RAD, (len(seen) + false, 3))
+    )
     # The patch is brought before the camera, as a field is.
     upright = Rotation.align_vectors([[0, 0, 1]], [seen.mean(axis=0)])[0]
     seen = upright.apply(seen)
@@ -205,7 +207,9 @@ def test_a_dome_calibrated_from_its_frames_is_identified_at_the_thesis_s_stops()
     attitudes = Rotation.from_euler("ZYX", stops[:, ::-1])
 
     def frame(stop: int) -> Sighting:
-        xy = project(attitudes[stop], leds.position_m, lever, camera) + rng.normal(0, 0.3, (12, 2))
+        xy = project(attitudes[stop], leds.position_m, lever, camera) + rng.normal(
+            0, 0.3, (12, 2)
+        )
         return Sighting(
             stop, attitudes[stop], leds.id, xy, MAGNITUDE + rng.normal(0, EPSILON_MAG, 12)
         )

@@ -75,7 +75,9 @@ def screen(rng: np.random.Generator) -> Floats:
     )
 
 
-def observe(rng: np.random.Generator, stars: Floats, noise_rad: float) -> tuple[Floats, Rotation]:
+def observe(
+    rng: np.random.Generator, stars: Floats, noise_rad: float
+) -> tuple[Floats, Rotation]:
     truth = Rotation.from_rotvec(rng.normal(0, 0.1, 3))
     return catalog.unit(truth.apply(stars) + rng.normal(0, noise_rad, stars.shape)), truth
 

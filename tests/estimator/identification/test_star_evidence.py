@@ -63,7 +63,9 @@ def test_evidence_is_the_integral_over_all_attitudes() -> None:
     spread, axes = np.linalg.eigh(np.linalg.inv(hypothesis.info[:3, :3]))
     step = np.arange(-6, 6.1, 0.5)
     lattice = (
-        np.stack(np.meshgrid(step, step, step), axis=-1).reshape(-1, 3) * np.sqrt(spread) @ axes.T
+        np.stack(np.meshgrid(step, step, step), axis=-1).reshape(-1, 3)
+        * np.sqrt(spread)
+        @ axes.T
     )
     rays = Rotation.from_matrix(hypothesis.R_cam_from_ref).apply(SKY.vectors[stars])
     turned = np.einsum("nij,kj->nki", Rotation.from_rotvec(lattice).as_matrix(), rays)

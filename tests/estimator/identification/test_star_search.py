@@ -43,7 +43,9 @@ def test_the_sky_holds_every_pair_in_its_bin() -> None:
     assert {tuple(sorted(pair)) for pair in SKY.pair.tolist()} == expected
     assert len(SKY.pair) == len(expected)
     one, other = VECTORS[SKY.pair].transpose(1, 0, 2)
-    angle = np.arctan2(np.linalg.norm(np.cross(one, other), axis=1), np.sum(one * other, axis=1))
+    angle = np.arctan2(
+        np.linalg.norm(np.cross(one, other), axis=1), np.sum(one * other, axis=1)
+    )
     number = np.repeat(np.arange(len(SKY.first) - 1), np.diff(SKY.first))
     offset = angle / SKY.bin_rad - number
     assert offset.min() > -1e-9  # rounding
@@ -71,7 +73,9 @@ def test_the_nearest_star_matches_a_k_d_tree(x: float, y: float, z: float, gate:
 
 
 def test_a_sky_without_a_pattern_is_refused() -> None:
-    in_a_row = Rotation.from_rotvec([[0, 0, 0], [0, 0.15, 0], [0, 0.3, 0]]).apply([0.0, 0.0, 1.0])
+    in_a_row = Rotation.from_rotvec([[0, 0, 0], [0, 0.15, 0], [0, 0.3, 0]]).apply(
+        [0.0, 0.0, 1.0]
+    )
     with pytest.raises(
         ImageError, match=r"2 pairs of stars within 12\.00 deg are too few; allowed: 3 or more"
     ):
@@ -91,7 +95,9 @@ def test_a_field_is_identified_if_its_brightest_lights_are_false(
         false = round(len(row) * share / (1 - share))
         lights = np.vstack([tangent, rng.uniform(FIELD[[0, 2]], FIELD[[1, 3]], (false, 2))])
         false_mag = (
-            rng.uniform(mag.min() - 2, mag.min() - 1, false) if brighter else rng.choice(MAG, false)
+            rng.uniform(mag.min() - 2, mag.min() - 1, false)
+            if brighter
+            else rng.choice(MAG, false)
         )
         shown = np.concatenate([mag, false_mag])
         order = np.argsort(shown)
@@ -158,7 +164,8 @@ def test_a_field_is_identified_if_half_of_its_lights_are_false(known: bool) -> N
         solution = solve(detections_of(np.concatenate([tangent[:7], strays])[order], shown))
         # Seven stars of 4": a wrong attitude would be tens of degrees off.
         solved += (
-            len(solution.star) > 0 and np.linalg.norm(attitude_error(solution, truth)) < 50 * SIGMA
+            len(solution.star) > 0
+            and np.linalg.norm(attitude_error(solution, truth)) < 50 * SIGMA
         )
     assert solved == 40
 
@@ -227,7 +234,11 @@ def test_a_sky_that_repeats_is_ambiguous() -> None:
     while not star_search.ACCEPT_DEX < dex < star_search.DECISIVE_DEX:
         truth = Rotation.random(rng=rng)
         tangent, mag, row = observe(truth, rng, sigma=loose, vectors=sparse, mag=sparse_mag)
-        dex = solve(detections_of(tangent, mag, sigma=loose), once).dex if len(row) > 3 else np.inf
+        dex = (
+            solve(detections_of(tangent, mag, sigma=loose), once).dex
+            if len(row) > 3
+            else np.inf
+        )
     copied = Rotation.from_euler("xyz", [70, 20, 30], degrees=True).apply(sparse[row])
     clear = np.linalg.norm(sparse - copied.mean(axis=0), axis=1) > 0.2
     vectors = np.concatenate([sparse[clear], copied])
@@ -269,7 +280,9 @@ def test_the_normal_equations_are_solved(seed: int) -> None:
 def test_a_matrix_has_the_rotation_of_its_quaternion(seed: int, axis) -> None:
     """This includes half turns, where the scalar part vanishes."""
     rotation = (
-        Rotation.random(rng=seed) if axis is None else Rotation.from_rotvec(np.pi * np.array(axis))
+        Rotation.random(rng=seed)
+        if axis is None
+        else Rotation.from_rotvec(np.pi * np.array(axis))
     )
     again = Rotation.from_quat(quaternion_xyzw(rotation.as_matrix()))
     assert (again * rotation.inv()).magnitude() < 1e-14 * 10
@@ -319,7 +332,9 @@ def test_a_pair_s_gates_are_the_error_of_where_it_puts_a_detection() -> None:
 def test_every_catalog_pair_that_two_detections_may_be_is_in_their_range(zoom: float) -> None:
     """Angles within 3.5 errors of a separation, or of any that the focal length allows; few others."""
     one, other = VECTORS[SKY.pair].transpose(1, 0, 2)
-    angle = np.arctan2(np.linalg.norm(np.cross(one, other), axis=1), np.sum(one * other, axis=1))
+    angle = np.arctan2(
+        np.linalg.norm(np.cross(one, other), axis=1), np.sum(one * other, axis=1)
+    )
     for a, b in ((0, 1), (1, 2), (2, 3)):
         begin, end, chord, gate = PLAIN._pair_range(unequal(zoom), SKY, a, b)
         rays = np.column_stack([PLACES[[a, b]], np.ones(2)])
@@ -343,7 +358,9 @@ def test_a_pair_s_focal_ratio_makes_its_angle_the_catalog_s() -> None:
         target = PLAIN.vectors.chord(PLAIN.ray(PLACES, 1, ratio), PLAIN.ray(PLACES, 2, ratio))
         seen = PLAIN.vectors.chord(PLAIN.ray(PLACES, 1, 1.0), PLAIN.ray(PLACES, 2, 1.0))
         # The fixed point contracts by about the square of a tangent, 5e-3, each time.
-        assert PLAIN.fit_focal_ratio(PLACES, 1, 2, seen, target) == pytest.approx(ratio, abs=1e-6)
+        assert PLAIN.fit_focal_ratio(PLACES, 1, 2, seen, target) == pytest.approx(
+            ratio, abs=1e-6
+        )
 
 
 def test_pairs_are_tried_once_in_order_of_length_and_rarity() -> None:
@@ -411,7 +428,9 @@ def test_the_quick_check_of_stars_stops_once_the_outcome_is_decided(
     true: str, required: int, max_misses: int, lookups: int, fits: bool
 ) -> None:
     """Four detections beside the pair, with (T) and without (F) a star at their place."""
-    places = np.vstack([PLACES[:2], [[0.03, 0.03], [-0.03, 0.01], [0.02, -0.05], [-0.06, -0.03]]])
+    places = np.vstack(
+        [PLACES[:2], [[0.03, 0.03], [-0.03, 0.01], [0.02, -0.05], [-0.06, -0.03]]]
+    )
     rays = np.column_stack([places, np.ones(6)])
     there = [0, 1] + [2 + n for n, letter in enumerate(true) if letter == "T"]
     sky = sky_index.build_without_pairs(
@@ -445,7 +464,12 @@ def test_an_attitude_from_the_brightest_lights_must_be_confirmed_by_all(
     )
     assert candidate.dex > star_search.ACCEPT_DEX
     found = star_search.fit_to_all(
-        lights._replace(limit_mag=limit_mag), SKY, candidate, star_search.ACCEPT_DEX, True, False
+        lights._replace(limit_mag=limit_mag),
+        SKY,
+        candidate,
+        star_search.ACCEPT_DEX,
+        True,
+        False,
     )
     assert len(found.star) == matches
 

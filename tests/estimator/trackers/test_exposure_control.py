@@ -7,7 +7,13 @@ import pytest
 
 from estimator.core.errors import ImageError
 from estimator.detection.detect import DETECTORS
-from estimator.trackers.exposure_control import Control, NextExposure, Observation, observe, step
+from estimator.trackers.exposure_control import (
+    Control,
+    NextExposure,
+    Observation,
+    observe,
+    step,
+)
 from skysim.camera.detector import saturation_dn
 from skysim.scene import loader
 from skysim.scene.sections.light import UniformGlowConfig
@@ -146,7 +152,9 @@ def flown(
     seen = []
     saturation = saturation_dn(lab.scene.camera.detector)
     for index, glare in enumerate(glare_e_s):
-        frame, _ = render_at_rest(exposed(lit(lab, glare), state.time_s).camera, lab.start, index)
+        frame, _ = render_at_rest(
+            exposed(lit(lab, glare), state.time_s).camera, lab.start, index
+        )
         blobs = DETECTORS["local"](frame.image_dn, 5.0, 3, 100)
         seen.append(observe(frame.image_dn, blobs.box_px, saturation, control))
         state = step(state, seen[-1], control)
@@ -174,7 +182,9 @@ def test_a_bright_intruder_shortens_the_exposure_until_it_leaves(lab: Lab) -> No
     assert all(state.no_stars for state in states[3:22])
     # Afterwards: longer by 2 ms after each frame with fewer than four stars, until they are there to stay.
     few = np.array([one.stars < control.min_stars for one in seen[22:]])
-    np.testing.assert_allclose(np.diff(times[21:]), np.where(few, 0.002, 0.0), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        np.diff(times[21:]), np.where(few, 0.002, 0.0), rtol=0, atol=1e-12
+    )
     assert few[0]
     assert not few[-5:].any()
 

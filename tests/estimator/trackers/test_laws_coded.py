@@ -59,7 +59,9 @@ def test_lights_are_named_correctly_by_their_codes_or_not_at_all(
         px = np.nan_to_num(project(body_from_lab, eye.leds.position_m, LEVER, CAMERA), nan=-1e9)
         star = np.flatnonzero(CAMERA.contains(px, 3))
         bit = (WORDS[star, frame] > 0) != (rng.random(len(star)) < failing)
-        light = 1e5 * np.where(bit, 1.0, 1 - depth) * (1 + 0.02 * rng.standard_normal(len(star)))
+        light = (
+            1e5 * np.where(bit, 1.0, 1 - depth) * (1 + 0.02 * rng.standard_normal(len(star)))
+        )
         star = star[light > 1e3]
         light = light[light > 1e3]
         xy_px = px[star] + rng.normal(0, 0.1, (len(star), 2))
@@ -80,7 +82,9 @@ def test_lights_are_named_correctly_by_their_codes_or_not_at_all(
 
 @law(CodedTracker.solve_centroids, slow=True)
 @given(
-    rng=SEEDS, bit_time_s=some.sampled_from([None, 0.021]), noise=some.sampled_from([0.06, 0.09])
+    rng=SEEDS,
+    bit_time_s=some.sampled_from([None, 0.021]),
+    noise=some.sampled_from([0.06, 0.09]),
 )
 def test_light_noisier_than_declared_gives_no_wrong_attitude(
     rng: np.random.Generator, bit_time_s: float | None, noise: float
@@ -94,7 +98,9 @@ def test_light_noisier_than_declared_gives_no_wrong_attitude(
     levels = np.where(WORDS[star] > 0, 1.0, 0.5)
     for frame in range(24):
         bit = frame if bit_time_s is None else int((0.02 * frame + late_s) / bit_time_s) % 24
-        light = 1e5 * levels[:, bit] * np.maximum(1 + noise * rng.standard_normal(len(star)), 0.1)
+        light = (
+            1e5 * levels[:, bit] * np.maximum(1 + noise * rng.standard_normal(len(star)), 0.1)
+        )
         found = eye.solve_centroids(
             Centroids(px[star], np.full(len(star), 0.1), light), t_s=0.02 * frame, frame=frame
         )
@@ -131,7 +137,9 @@ def test_frames_of_noise_have_no_attitude(noise: np.random.Generator) -> None:
     eye = tracker(0.5)
     for frame in range(4):
         image = noise.normal(100, 5, (480, 640))
-        assert not eye.solve(image, exposure_s=2e-3, t_s=0.02 * frame, frame=frame).attitude.solved
+        assert not eye.solve(
+            image, exposure_s=2e-3, t_s=0.02 * frame, frame=frame
+        ).attitude.solved
     assert not eye.solve(image).attitude.solved
     answered(lambda: eye.solve(image[:3]), ImageError)
 

@@ -29,7 +29,9 @@ OFF_RAD = 2.2 * ARCSEC_RAD
 @pytest.fixture(scope="module")
 def tracker() -> StarTracker:
     stars = catalog.brighter_than(catalog.hipparcos(), 5.0)
-    return StarTracker(CAMERA, stars, stars.vectors, Settings(centroid_sigma_px=0.0, merge_px=0.0))
+    return StarTracker(
+        CAMERA, stars, stars.vectors, Settings(centroid_sigma_px=0.0, merge_px=0.0)
+    )
 
 
 def test_a_bright_double_star_does_not_bias_the_attitude(tracker: StarTracker) -> None:
@@ -119,7 +121,9 @@ def test_a_star_loses_information_only_by_what_companions_explain(
     """In arcseconds: between that of its centroid and that of a star with the greatest error."""
     own = np.eye(2)[None] / (sigma * ARCSEC_RAD) ** 2
     residual = np.array([[off, 0.0]]) * ARCSEC_RAD
-    mean = misfit.mean_information(own, residual, (spread * ARCSEC_RAD) ** 2 * np.eye(2)[None])[0]
+    mean = misfit.mean_information(own, residual, (spread * ARCSEC_RAD) ** 2 * np.eye(2)[None])[
+        0
+    ]
     least = 1 / (sigma**2 + (ERROR_RAD.max() / ARCSEC_RAD) ** 2)
     share = np.diag(mean) * (sigma * ARCSEC_RAD) ** 2
     assert (share <= 1 + 1e-9).all()
@@ -146,5 +150,7 @@ def test_shares_of_companions_match_the_catalogs() -> None:
         off_arcsec.append(np.linalg.norm(center / np.linalg.norm(center) - vector) / ARCSEC_RAD)
     for limit in (0.5, 1.5):
         found = float(np.mean(np.array(off_arcsec) > limit))
-        expected = SHARE @ np.exp(-0.5 * (limit / np.maximum(ERROR_RAD / ARCSEC_RAD, 1e-9)) ** 2)
+        expected = SHARE @ np.exp(
+            -0.5 * (limit / np.maximum(ERROR_RAD / ARCSEC_RAD, 1e-9)) ** 2
+        )
         assert expected == pytest.approx(found, rel=0.5)

@@ -26,7 +26,16 @@ from estimator.core.types import Centroids
 from estimator.identification import led_index, led_search
 from estimator.trackers import dome_tracker
 from estimator.trackers.dome_tracker import DomeTracker
-from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units
+from tests.helpers.laws import (
+    ANY,
+    NUMBERS,
+    SEEDS,
+    answered,
+    assert_covariance,
+    law,
+    turn,
+    units,
+)
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 CAMERA = Camera(640, 480, 900.0, (319.5, 239.5))
@@ -60,9 +69,9 @@ def even(count: int) -> LedMap:
     z = 1 - (np.arange(count) + 0.5) / count * 0.4
     azimuth = np.arange(count) * np.pi * (3 - np.sqrt(5))
     across = np.sqrt(1 - z**2)
-    along = np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z]) + rng.normal(
-        0, 0.01, (count, 3)
-    )
+    along = np.column_stack(
+        [across * np.cos(azimuth), across * np.sin(azimuth), z]
+    ) + rng.normal(0, 0.01, (count, 3))
     return replace(
         SPHERE,
         id=np.arange(count),
@@ -75,7 +84,9 @@ def even(count: int) -> LedMap:
 
 @law(dome_map.on_sphere, dome_map.on_surface, dome_map.project, dome_map.check_lever)
 @given(
-    rng=SEEDS, radius_m=some.floats(0.1, 3), place_m=arrays("f8", 3, elements=some.floats(-2, 2))
+    rng=SEEDS,
+    radius_m=some.floats(0.1, 3),
+    place_m=arrays("f8", 3, elements=some.floats(-2, 2)),
 )
 def test_rays_intersect_the_surface_ahead_of_the_camera(
     rng: np.random.Generator, radius_m: float, place_m: Floats
@@ -94,9 +105,12 @@ def test_rays_intersect_the_surface_ahead_of_the_camera(
     pixels = dome_map.project(body_from_lab, leds.position_m, arm, CAMERA)
     np.testing.assert_allclose(CAMERA.rays(pixels), seen, rtol=0, atol=1e-9)
     far = answered(
-        lambda: dome_map.check_lever(leds, Lever(place_m, Rotation.identity())) or True, ImageError
+        lambda: dome_map.check_lever(leds, Lever(place_m, Rotation.identity())) or True,
+        ImageError,
     )
-    assert bool(far) == (np.linalg.norm(place_m) < np.linalg.norm(leds.position_m, axis=1).min())
+    assert bool(far) == (
+        np.linalg.norm(place_m) < np.linalg.norm(leds.position_m, axis=1).min()
+    )
 
 
 # Solves
@@ -116,7 +130,9 @@ def test_exact_solves_find_the_truth(
     truth = turn(rng, 0.4)
     leds, rays = seen_through(rng, OVAL, arm, truth, count)
     start = turn(rng, off_rad) * truth
-    found, covariance = SOLVERS[name](rays, np.full(count, 1e-4), leds.position_m, leds, arm, start)
+    found, covariance = SOLVERS[name](
+        rays, np.full(count, 1e-4), leds.position_m, leds, arm, start
+    )
     assert (found * truth.inv()).magnitude() < 1e-6
     assert_covariance(covariance)
 
@@ -149,7 +165,9 @@ def test_the_error_of_a_fitted_parameter_is_that_of_a_shifted_pixel(
     """By differences: of a pixel shifted along x and along y, the turn of its ray and the change of its tangents."""
     pixel = rng.uniform([0, 0], [640, 480], (9, 2))
     step = 1e-3
-    moved = np.array([CAMERA.rays(pixel + step * axis) - CAMERA.rays(pixel) for axis in np.eye(2)])
+    moved = np.array(
+        [CAMERA.rays(pixel + step * axis) - CAMERA.rays(pixel) for axis in np.eye(2)]
+    )
     turned_rad = np.sqrt(np.sum(moved**2, axis=(0, 2)) / 2)
     expected = np.full(9, step / 900) if name in ("rotation_only", "pnp") else turned_rad
     found = nearfield.fitted_sigma_rad(name, CAMERA.rays(pixel), np.full(9, step / 900))
@@ -163,7 +181,9 @@ def test_the_thesis_s_methods_are_near_the_truth(rng: np.random.Generator, name:
     arm = lever(rng)
     truth = turn(rng, 0.4)
     leds, rays = seen_through(rng, SPHERE, arm, truth, 12)
-    found, covariance = SOLVERS[name](rays, np.full(12, 1e-4), leds.position_m, leds, arm, truth)
+    found, covariance = SOLVERS[name](
+        rays, np.full(12, 1e-4), leds.position_m, leds, arm, truth
+    )
     assert (found * truth.inv()).magnitude() < np.radians(6)
     assert_covariance(covariance)
     points, reach_m = nearfield.thesis_points(rays, leds, arm, True)
@@ -182,7 +202,9 @@ def test_any_rays_are_solved_or_refused(
     rng: np.random.Generator, rays: Floats, sigma: Floats, place: Floats, name: str
 ) -> None:
     arm = lever(rng)
-    solution = answered(lambda: SOLVERS[name](rays, sigma, place, SPHERE, arm, Rotation.identity()))
+    solution = answered(
+        lambda: SOLVERS[name](rays, sigma, place, SPHERE, arm, Rotation.identity())
+    )
     assert solution is None or solution[1].shape == (3, 3)
     answered(lambda: nearfield.thesis_points(rays, SPHERE, arm))
 
@@ -192,7 +214,9 @@ def test_any_rays_are_solved_or_refused(
 
 @pytest.fixture(scope="module")
 def eye() -> DomeTracker:
-    return DomeTracker(CAMERA, even(150), Lever(np.array([0.01, 0.0, 0.3]), Rotation.identity()))
+    return DomeTracker(
+        CAMERA, even(150), Lever(np.array([0.01, 0.0, 0.3]), Rotation.identity())
+    )
 
 
 @law(
@@ -206,13 +230,17 @@ def test_lights_are_named_correctly_or_not_at_all(
     eye: DomeTracker, rng: np.random.Generator, false: int
 ) -> None:
     truth = turn(rng, 0.3)
-    px = np.nan_to_num(dome_map.project(truth, eye.leds.position_m, eye.lever, CAMERA), nan=-1e9)
+    px = np.nan_to_num(
+        dome_map.project(truth, eye.leds.position_m, eye.lever, CAMERA), nan=-1e9
+    )
     star = np.flatnonzero(CAMERA.contains(px, 3))
     xy = np.concatenate(
         [px[star] + rng.normal(0, 0.1, (len(star), 2)), rng.uniform(0, [639, 479], (false, 2))]
     )
     star = np.concatenate([star, np.full(false, -1)])
-    solution = eye.solve_centroids(Centroids(xy, np.full(len(xy), 0.1), np.linspace(2, 1, len(xy))))
+    solution = eye.solve_centroids(
+        Centroids(xy, np.full(len(xy), 0.1), np.linspace(2, 1, len(xy)))
+    )
     truth_cam = eye.lever.cam_from_body * truth
     assert not solution.solved or (solution.cam_from_ref * truth_cam.inv()).magnitude() < 0.01
     assert (
@@ -239,12 +267,16 @@ def test_lights_are_named_correctly_or_not_at_all(
 def test_no_lights_of_noise_have_an_attitude_under_a_dome(
     eye: DomeTracker, xy_px: NDArray, sigma: NDArray, noise: np.random.Generator, name: str
 ) -> None:
-    found = answered(lambda: eye.solve_centroids(Centroids(xy_px, sigma, np.ones(8))), ImageError)
+    found = answered(
+        lambda: eye.solve_centroids(Centroids(xy_px, sigma, np.ones(8))), ImageError
+    )
     assert found is None or not found.solved
     assert not eye.solve(noise.normal(100, 5, (480, 640))).attitude.solved
     answered(lambda: eye.solve(xy_px), ImageError)
     identify = dome_tracker.star_identifier(name, CAMERA, eye.leds, eye.lever, eye.settings)
-    assert isinstance(answered(lambda: identify(CAMERA.rays(xy_px), sigma, None)) or "refused", str)
+    assert isinstance(
+        answered(lambda: identify(CAMERA.rays(xy_px), sigma, None)) or "refused", str
+    )
 
 
 @law(dome_tracker.non_dimensional)
@@ -254,7 +286,9 @@ def test_leds_are_named_correctly_at_any_focal_length_or_not_at_all(
 ) -> None:
     truth = turn(rng, 0.3)
     settings = replace(eye.settings, identifier="non_dimensional")
-    px = np.nan_to_num(dome_map.project(truth, eye.leds.position_m, eye.lever, CAMERA), nan=-1e9)
+    px = np.nan_to_num(
+        dome_map.project(truth, eye.leds.position_m, eye.lever, CAMERA), nan=-1e9
+    )
     star = np.flatnonzero(CAMERA.contains(px, 3))
     xy = np.concatenate(
         [px[star] + rng.normal(0, 0.1, (len(star), 2)), rng.uniform(0, [639, 479], (false, 2))]
@@ -352,7 +386,9 @@ def test_the_mean_of_many_frames_has_the_claimed_systematic_error(
         draws_px = px + rng.normal(0, noise_px, (frames, *px.shape))
         found = [tracker.solve_centroids(Centroids(one_px, noise, flux)) for one_px in draws_px]
         assert all(one.solved for one in found)
-        errors = np.array([(one.cam_from_ref * body_from_lab.inv()).as_rotvec() for one in found])
+        errors = np.array(
+            [(one.cam_from_ref * body_from_lab.inv()).as_rotvec() for one in found]
+        )
         total = found[0].covariance_rad2
         common = found[0].systematic_rad2
         mean = errors.mean(axis=0)
@@ -386,7 +422,9 @@ def test_a_spread_scales_with_its_data_and_ignores_shifts(
     assert deviation is home_position.averaged or np.allclose(one, by_numpy, rtol=1e-9, atol=0)
     light = home_position.instrument_brightness(np.abs(value), 1.0 + group)
     np.testing.assert_allclose(
-        home_position.instrument_brightness(np.abs(value), scale * (1.0 + group)), light, rtol=1e-9
+        home_position.instrument_brightness(np.abs(value), scale * (1.0 + group)),
+        light,
+        rtol=1e-9,
     )
 
 

@@ -125,7 +125,9 @@ def test_wider_errors_in_closed_form_match_the_full_evaluation(
     assert len(matched.star) == len(slow.star)
     assert quick_factor == pytest.approx(slow_factor, rel=1e-3)
     assert quick.dex == pytest.approx(slow.dex, abs=1e-2)
-    np.testing.assert_allclose(quick.covariance_rad2, slow.covariance_rad2, rtol=1e-2, atol=1e-16)
+    np.testing.assert_allclose(
+        quick.covariance_rad2, slow.covariance_rad2, rtol=1e-2, atol=1e-16
+    )
     assert quick.chi2 == pytest.approx(slow.chi2, rel=1e-2)
 
 

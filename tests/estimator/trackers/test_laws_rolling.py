@@ -58,7 +58,9 @@ def error_arcsec(attitude: Attitude, seen: Moving) -> Floats:
     return (attitude.cam_from_ref * seen.cam_from_ref.inv()).as_rotvec() / ARCSEC_RAD
 
 
-def test_a_rolling_shutter_frame_is_solved_at_the_middle_row_s_time(tracker: StarTracker) -> None:
+def test_a_rolling_shutter_frame_is_solved_at_the_middle_row_s_time(
+    tracker: StarTracker,
+) -> None:
     blind = StarTracker(
         replace(WIDE, row_time_s=0.0), tracker.stars, tracker.stars.vectors, SETTINGS
     )
@@ -134,7 +136,9 @@ def test_of_two_signs_the_one_with_more_evidence_is_kept(
 def test_row_times_alone_determine_a_slow_rate_with_its_sign(tracker: StarTracker) -> None:
     for seed in range(3):
         seen, found = star_frame(tracker, seed, np.array([0.3, -0.2, 0.1]))
-        attitude = tracker.solve_centroids(replace(found, streak_px=None), exposure_s=EXPOSURE_S)
+        attitude = tracker.solve_centroids(
+            replace(found, streak_px=None), exposure_s=EXPOSURE_S
+        )
         assert np.linalg.norm(error_arcsec(attitude, seen)) < 0.1
         assert attitude.rate is not None
         assert attitude.rate.sign_known
@@ -166,7 +170,9 @@ def test_leds_of_a_rolling_shutter_frame_are_solved_at_the_middle_row_s_time() -
     """On a dome of two radii, with the camera on its lever arm: the images of near LEDs move more."""
     rng = np.random.default_rng(4)
     camera = Camera(1600, 1200, 8000.0, (799.5, 599.5), row_time_s=80e-6)
-    cap = Rotation.from_rotvec(np.column_stack([rng.uniform(-0.4, 0.4, (500, 2)), np.zeros(500)]))
+    cap = Rotation.from_rotvec(
+        np.column_stack([rng.uniform(-0.4, 0.4, (500, 2)), np.zeros(500)])
+    )
     place_m = cap.apply([0.0, 0.0, 1.0]) * rng.uniform(0.95, 1.0, (500, 1))
     lever = Lever(np.array([0.01, -0.02, 0.3]), Rotation.identity())
     leds = LedMap(np.arange(500), place_m, np.zeros(3), np.ones(3))
@@ -228,7 +234,9 @@ def test_rolling_shutter_candidates_include_the_true_rate_and_refusals_stay(
         (gyro, gyro)
     ]
     both = list(
-        rolling_shutter.candidates(WIDE, lights.sight, found, replace(gyro, sign_known=False), None)
+        rolling_shutter.candidates(
+            WIDE, lights.sight, found, replace(gyro, sign_known=False), None
+        )
     )
     assert_allclose(both[0][0].rate_rad_s, -both[1][0].rate_rad_s, rtol=0, atol=0)
     refused = rolling_shutter.solve_rolling(

@@ -112,7 +112,15 @@ def test_identified_stars_are_the_true_stars(
 
 
 @law(
-    pyramid, saa, shefex.shefex, master_star, fialho_1, fialho_2, fialho_3, fialho_4, to_star_match
+    pyramid,
+    saa,
+    shefex.shefex,
+    master_star,
+    fialho_1,
+    fialho_2,
+    fialho_3,
+    fialho_4,
+    to_star_match,
 )
 @given(
     rng=SEEDS,
@@ -129,14 +137,18 @@ def test_random_directions_match_each_star_once_or_none(
     for light in (None, mag):
         more = {"max_checks": 100_000, "magnitude": light}
         match = answered(lambda: IDENTIFIERS[name](rays, world.index, tolerance, **more))  # noqa: B023
-        assert match is None or (len(set(match.observed.tolist())) == len(match.observed) <= count)
+        assert match is None or (
+            len(set(match.observed.tolist())) == len(match.observed) <= count
+        )
     with pytest.raises(ImageError, match="focal length is uncertain"):
         Options(focal_unknown=True).require_known_focal(name)
 
 
 @law(candidates)
 @given(rng=SEEDS, steps=some.integers(-2, 2))
-def test_the_true_camera_and_attitude_are_a_candidate(rng: np.random.Generator, steps: int) -> None:
+def test_the_true_camera_and_attitude_are_a_candidate(
+    rng: np.random.Generator, steps: int
+) -> None:
     """The focal length is known or off by whole steps of the search."""
     world = World(rng)
     light = 10 ** (-0.4 * world.mag[world.star])
@@ -187,7 +199,9 @@ def test_a_pool_without_assumptions_gives_no_answer(rng: np.random.Generator) ->
 )
 def test_the_gate_grows_with_the_error(fov: float, errors: list[float], factor: float) -> None:
     small, large = (shefex.cos_error(fov, error, factor) for error in sorted(errors))
-    assert 0 <= small <= large <= factor * max(errors) * 1.000001 + 1e-15  # cosines of 16 digits
+    assert (
+        0 <= small <= large <= factor * max(errors) * 1.000001 + 1e-15
+    )  # cosines of 16 digits
 
 
 @law(magnitude_zero)
@@ -246,7 +260,12 @@ def test_a_field_is_matched_from_a_nearby_attitude(
     assert not found.solved or (found.cam_from_ref * truth.inv()).magnitude() < 0.02
 
 
-@law(FieldMatcher.misfits, FieldMatcher.near_misses, FieldMatcher.fits, FieldMatcher.lens_radii_px)
+@law(
+    FieldMatcher.misfits,
+    FieldMatcher.near_misses,
+    FieldMatcher.fits,
+    FieldMatcher.lens_radii_px,
+)
 @given(rng=SEEDS, aside=some.booleans())
 def test_stars_beside_detections_reveal_a_wrong_camera(
     eye: StarTracker, rng: np.random.Generator, aside: bool
@@ -307,7 +326,12 @@ def test_an_attitude_is_correct_or_none(
 
 
 @pytest.mark.long
-@law(StarTracker.solve_centroids, StarTracker.sigma_px, StarTracker.detections, StarTracker.efforts)
+@law(
+    StarTracker.solve_centroids,
+    StarTracker.sigma_px,
+    StarTracker.detections,
+    StarTracker.efforts,
+)
 @given(
     xy_px=arrays("f8", (9, 2), elements=ANY),
     sigma_px=arrays("f8", 9, elements=ANY),
@@ -388,7 +412,9 @@ def test_mutual_neighbors_are_each_other_s_nearest(
     rows = rng.permutation(100)[: len(there)]
     hit, row = refinement.mutual_nearest(seen, there, radius_px, rows)
     between = np.linalg.norm(seen[:, None] - there, axis=2)
-    mutual = {(int(a), int(np.flatnonzero(rows == b)[0])) for a, b in zip(hit, row, strict=True)}
+    mutual = {
+        (int(a), int(np.flatnonzero(rows == b)[0])) for a, b in zip(hit, row, strict=True)
+    }
     least = [(a, int(np.argmin(between[a]))) for a in range(len(seen)) if len(there)]
     assert mutual == {
         (a, b) for a, b in least if np.argmin(between[:, b]) == a and between[a, b] < radius_px
@@ -396,7 +422,9 @@ def test_mutual_neighbors_are_each_other_s_nearest(
 
 
 @law(refinement.log10_chance)
-@given(blobs=some.integers(4, 100), predicted=some.integers(1, 100), radius_px=some.floats(0.5, 5))
+@given(
+    blobs=some.integers(4, 100), predicted=some.integers(1, 100), radius_px=some.floats(0.5, 5)
+)
 def test_more_matches_are_less_likely_by_chance(
     blobs: int, predicted: int, radius_px: float
 ) -> None:

@@ -16,7 +16,9 @@ from tests.helpers.laws import law
 
 @law(warm_up.loop_type)
 @given(
-    array=some.sampled_from(["u1", "u2", ">u2", "?", "i1", "i2", ">i4", "i8", "f2", "f4", ">f8"])
+    array=some.sampled_from(
+        ["u1", "u2", ">u2", "?", "i1", "i2", ">i4", "i8", "f2", "f4", ">f8"]
+    )
 )
 def test_a_frame_is_converted_to_the_type_of_its_compiled_loop(array: str) -> None:
     assert to_native(np.ones((3, 3), array)).dtype == warm_up.loop_type(array)
@@ -47,9 +49,10 @@ def test_warm_up_spots_are_drawn_at_their_positions(x_px: float, y_px: float) ->
     )
     y, x = np.mgrid[:48, :64]
     light = np.where(np.hypot(x - x_px, y - y_px) < 6, image - warm_up.SKY, 0)
-    assert [np.sum(light * x) / np.sum(light), np.sum(light * y) / np.sum(light)] == pytest.approx(
-        [x_px, y_px], abs=1e-3
-    )
+    assert [
+        np.sum(light * x) / np.sum(light),
+        np.sum(light * y) / np.sum(light),
+    ] == pytest.approx([x_px, y_px], abs=1e-3)
     assert image[47, 1] == pytest.approx(1e6, rel=1e-3)
     kinds = []
     warm_up.run(
@@ -60,5 +63,7 @@ def test_warm_up_spots_are_drawn_at_their_positions(x_px: float, y_px: float) ->
         lambda *one: kinds.append(one),
     )
     assert {image.dtype for image, _ in kinds} == {np.dtype("u2")}
-    assert max(image.max() for image, _ in kinds) > 4096 > min(image.max() for image, _ in kinds)
+    assert (
+        max(image.max() for image, _ in kinds) > 4096 > min(image.max() for image, _ in kinds)
+    )
     assert {streak for _, streak in kinds} == {None, (0.0, 0.0), warm_up.STREAK_PX}

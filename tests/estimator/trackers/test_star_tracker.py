@@ -37,7 +37,9 @@ def uncertain() -> StarTracker:
     """A tracker with a focal length assumed 3 % too long and uncertain to 5 %."""
     stars = catalog.read(FILE)
     believed = CAMERA.zoomed(1.03)
-    return StarTracker(believed, stars, catalog.apparent(stars, OBSERVER), focal_uncertainty=0.05)
+    return StarTracker(
+        believed, stars, catalog.apparent(stars, OBSERVER), focal_uncertainty=0.05
+    )
 
 
 def starfield(
@@ -132,7 +134,9 @@ def test_too_few_stars_give_a_failure_status(tracker: StarTracker, count: int) -
         centroids(np.random.default_rng(84).uniform(0, 400, (count, 2)))
     )
     assert answer.status == NO_STARS
-    assert answer.cam_from_ref is answer.covariance_rad2 is answer.match is answer.camera is None
+    assert (
+        answer.cam_from_ref is answer.covariance_rad2 is answer.match is answer.camera is None
+    )
     assert np.isnan(answer.rms_px)
     assert not answer.solved
 
@@ -140,7 +144,8 @@ def test_too_few_stars_give_a_failure_status(tracker: StarTracker, count: int) -
 def test_spots_that_are_no_stars_give_a_failure_status(tracker: StarTracker) -> None:
     rng = np.random.default_rng(85)
     answers = [
-        tracker.solve_centroids(centroids(rng.uniform(0, [658, 492], (7, 2)))) for _ in range(10)
+        tracker.solve_centroids(centroids(rng.uniform(0, [658, 492], (7, 2))))
+        for _ in range(10)
     ]
     assert {answer.status for answer in answers} == {NO_MATCH}
     assert {answer.cam_from_ref for answer in answers} == {None}
@@ -185,7 +190,9 @@ def test_a_dark_frame_gives_a_failure_status(tracker: StarTracker) -> None:
 
 
 def test_a_frame_of_another_size_is_refused(tracker: StarTracker) -> None:
-    with pytest.raises(ImageError, match="the image is 640x480 pixels; this camera's are 659x493"):
+    with pytest.raises(
+        ImageError, match="the image is 640x480 pixels; this camera's are 659x493"
+    ):
         tracker.solve(np.random.default_rng(89).normal(300, 5, (480, 640)))
 
 
@@ -221,7 +228,9 @@ def test_a_focal_length_three_per_cent_off_is_found(uncertain: StarTracker) -> N
         assert apart_rad(answer, truth) < 1e-3
 
 
-def test_a_lamp_beside_a_faint_star_does_not_rotate_the_attitude(uncertain: StarTracker) -> None:
+def test_a_lamp_beside_a_faint_star_does_not_rotate_the_attitude(
+    uncertain: StarTracker,
+) -> None:
     """If the lens may be off by the distance of the lamp from the star, only brightness distinguishes them."""
     rng = np.random.default_rng(96)
     for _ in range(5):
@@ -230,7 +239,9 @@ def test_a_lamp_beside_a_faint_star_does_not_rotate_the_attitude(uncertain: Star
             [np.partition(np.linalg.norm(pixels - one, axis=1), 1)[1] > 12 for one in pixels]
         )
         outer = (
-            np.linalg.norm(pixels - CAMERA.center_px, axis=1) * alone * (light < np.median(light))
+            np.linalg.norm(pixels - CAMERA.center_px, axis=1)
+            * alone
+            * (light < np.median(light))
         )
         pixels[outer.argmax()] += 1.5
         light[outer.argmax()] = 10 * light.max()
@@ -265,7 +276,9 @@ def test_the_residual_is_the_rms_of_the_coordinates(
         _, pixels, _ = starfield(eye, rng, CAMERA)
         lights = centroids(pixels + noise_px * rng.standard_normal(pixels.shape))
         answer = eye.solve_centroids(lights)
-        seen = answer.camera.pixels(answer.cam_from_ref.apply(eye.stars.vectors[answer.match.star]))
+        seen = answer.camera.pixels(
+            answer.cam_from_ref.apply(eye.stars.vectors[answer.match.star])
+        )
         residual = seen - lights.xy_px[answer.match.observed]
         assert answer.rms_px == pytest.approx(np.sqrt(np.mean(residual**2)), rel=1e-3)
 
@@ -307,7 +320,9 @@ DOME_CAMERA = Camera(1600, 1200, 8750.0, (799.5, 599.5))
 WIDE_CAMERA = replace(DOME_CAMERA, focal_px=1000.0)  # 90 degrees from corner to corner
 LEVERS = {
     "axial": Lever(np.array([0.0, 0.0, 0.381]), Rotation.identity()),
-    "askew": Lever(np.array([0.01, -0.02, 0.37]), Rotation.from_euler("xyz", [0.02, -0.03, 0.9])),
+    "askew": Lever(
+        np.array([0.01, -0.02, 0.37]), Rotation.from_euler("xyz", [0.02, -0.03, 0.9])
+    ),
 }
 SHAPES = {
     "sphere": (np.zeros(3), np.full(3, 1.2192)),
@@ -399,7 +414,8 @@ def test_the_dome_tracker_refuses_too_few_and_unknown_lights() -> None:
     rng = np.random.default_rng(97)
     assert tracker.solve_centroids(centroids(rng.uniform(0, 1000, (2, 2)))).status == NO_STARS
     spots = [
-        tracker.solve_centroids(centroids(rng.uniform(0, [1599, 1199], (12, 2)))) for _ in range(10)
+        tracker.solve_centroids(centroids(rng.uniform(0, [1599, 1199], (12, 2))))
+        for _ in range(10)
     ]
     assert {answer.status for answer in spots} == {NO_MATCH}
 

@@ -46,7 +46,8 @@ def light_of_stars(tracker: StarTracker, cam_from_ref: Rotation, light: float):
     edges_y = np.arange(CAMERA.height_px + 1) - 0.5
     for (x, y), mag in zip(pixels, tracker.stars.v_mag[rows], strict=True):
         across, down = (
-            np.diff(erf((e - at) / (PSF_PX * 2**0.5))) / 2 for e, at in ((edges_x, x), (edges_y, y))
+            np.diff(erf((e - at) / (PSF_PX * 2**0.5))) / 2
+            for e, at in ((edges_x, x), (edges_y, y))
         )
         image += light * 10 ** (-0.4 * mag) * np.outer(down, across)
     return image
@@ -126,7 +127,9 @@ def test_residuals_of_one_sigma_are_counted_over_2n_less_3(tracker: StarTracker)
         match = StarMatch(np.arange(count), rows[:count], START, -9.0)
         attitude = Attitude("solved", START, np.eye(3), match)
         centroids = Centroids(xy, sigma, np.ones(count))
-        report = TrackingMode(tracker)._report(attitude, centroids, sigma, Clock(), 0, False, None)
+        report = TrackingMode(tracker)._report(
+            attitude, centroids, sigma, Clock(), 0, False, None
+        )
         assert report.chi2_per_dof == pytest.approx(2 * count / (2 * count - 3), rel=1e-6)
 
 
@@ -134,12 +137,16 @@ def test_the_rotation_measured_by_the_gyros_is_followed_at_once(tracker: StarTra
     follower = TrackingMode(tracker)
     follower.solve(photograph(tracker, attitude(0)), 0.0)
     turn = attitude(STEP_S) * attitude(0).inv()
-    report = follower.solve(photograph(tracker, attitude(STEP_S), 1), STEP_S, now_from_then=turn)
+    report = follower.solve(
+        photograph(tracker, attitude(STEP_S), 1), STEP_S, now_from_then=turn
+    )
     assert report.expected >= 8
     assert off_rad(report, attitude(STEP_S)) < 2e-4
 
 
-def test_after_a_jump_the_tracker_searches_and_never_answers_wrongly(tracker: StarTracker) -> None:
+def test_after_a_jump_the_tracker_searches_and_never_answers_wrongly(
+    tracker: StarTracker,
+) -> None:
     follower = TrackingMode(tracker)
     jumped = Rotation.from_rotvec([0.2, -0.1, 1.0]) * START
     follower.solve(photograph(tracker, START), 0.0)
@@ -148,7 +155,9 @@ def test_after_a_jump_the_tracker_searches_and_never_answers_wrongly(tracker: St
     assert off_rad(report, jumped) < 2e-4
 
 
-def test_a_frame_without_stars_is_lost_and_the_next_one_is_tracked(tracker: StarTracker) -> None:
+def test_a_frame_without_stars_is_lost_and_the_next_one_is_tracked(
+    tracker: StarTracker,
+) -> None:
     follower = TrackingMode(tracker)
     still = [follower.solve(photograph(tracker, START, n), n * STEP_S) for n in range(2)]
     dark = follower.solve(photograph(tracker, START, 5, light=0.0), 0.2)
@@ -275,7 +284,9 @@ def test_a_window_holds_its_star_and_no_other(tracker: StarTracker) -> None:
     assert len(in_windows(dark, bright, 6.0, 6.0)) == 0
 
 
-def test_most_stars_of_four_to_five_sigma_are_found_in_their_windows(tracker: StarTracker) -> None:
+def test_most_stars_of_four_to_five_sigma_are_found_in_their_windows(
+    tracker: StarTracker,
+) -> None:
     """In the filtered image; by a threshold of 4 sigma seven in ten are, by that of a frame, 5 sigma, three in ten."""
     found = []
     for light in np.geomspace(1.5e4, 6e4, 8):
@@ -290,7 +301,9 @@ def test_most_stars_of_four_to_five_sigma_are_found_in_their_windows(tracker: St
         faint = centers_px[(sigmas > 4) & (sigmas < 5)]
         for seed in range(3):
             follower.last = LastSolution(0.0, START, np.zeros(3))
-            xy_px = follower.solve(photograph(tracker, START, seed, light), STEP_S).centroids.xy_px
+            xy_px = follower.solve(
+                photograph(tracker, START, seed, light), STEP_S
+            ).centroids.xy_px
             found += (
                 np.linalg.norm(xy_px[:, None] - faint, axis=2).min(axis=0, initial=np.inf) < 2
             ).tolist()

@@ -26,7 +26,12 @@ CAMERA = {
     "width_px": SIDE,
     "height_px": SIDE,
     "pixel": "5 um",
-    "detector": {"quantum_efficiency": 0.6, "full_well_e": 10700, "gain_e_dn": 2.64, "bits": BITS},
+    "detector": {
+        "quantum_efficiency": 0.6,
+        "full_well_e": 10700,
+        "gain_e_dn": 2.64,
+        "bits": BITS,
+    },
 }
 GAIN = 2.64
 BLACK = 100.0
@@ -69,7 +74,9 @@ def lab(folder: Path, seed: int = 1, suffix: str = ".png", shift: int = 0) -> No
     for exposure_s in FLAT_S:
         for n in range(2):
             image = frame(rng, exposure_s * WELL / 0.08, exposure_s)
-            write(folder / f"flats/flat_{1e6 * exposure_s:.0f}us_20C_{n}{suffix}", image << shift)
+            write(
+                folder / f"flats/flat_{1e6 * exposure_s:.0f}us_20C_{n}{suffix}", image << shift
+            )
 
 
 @pytest.fixture(scope="module")
@@ -199,7 +206,8 @@ def vignette(folder: Path) -> None:
 
 def lamp(folder: Path) -> None:
     write(
-        folder / "flats/flat_50000us_20C_1.png", frame(np.random.default_rng(5), 6250 * 1.1, 0.05)
+        folder / "flats/flat_50000us_20C_1.png",
+        frame(np.random.default_rng(5), 6250 * 1.1, 0.05),
     )
 
 
@@ -213,7 +221,9 @@ def unnamed(folder: Path) -> None:
 
 def no_temperature(folder: Path) -> None:
     for n in range(2):
-        (folder / f"flats/flat_50000us_20C_{n}.png").rename(folder / f"flats/flat_50000us_{n}.png")
+        (folder / f"flats/flat_50000us_20C_{n}.png").rename(
+            folder / f"flats/flat_50000us_{n}.png"
+        )
 
 
 def color(folder: Path) -> None:
@@ -354,7 +364,10 @@ def command(
 
 
 def test_the_command_writes_a_preset_that_a_scene_takes(
-    good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    good: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     from skysim.scene import loader
 
@@ -374,9 +387,12 @@ def test_the_command_writes_a_preset_that_a_scene_takes(
     assert report == json.loads((tmp_path / "characterize.json").read_text())
     preset = str(tmp_path / "camera.yaml")
     scene = loader.load(
-        "shefex2", {"camera.preset": preset, "camera.focal_length": "16 mm", "camera.f_number": "2"}
+        "shefex2",
+        {"camera.preset": preset, "camera.focal_length": "16 mm", "camera.f_number": "2"},
     )
-    assert scene.camera.detector.gain_e_dn == pytest.approx(rows["gain_e_dn"]["value"], rel=1e-5)
+    assert scene.camera.detector.gain_e_dn == pytest.approx(
+        rows["gain_e_dn"]["value"], rel=1e-5
+    )
     assert scene.camera.width_px == SIDE
     code, out, _ = command(capsys, monkeypatch, *folders, "--out", tmp_path)
     assert code == 0

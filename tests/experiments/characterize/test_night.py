@@ -113,8 +113,12 @@ def test_trails_are_measured_and_refused() -> None:
     still, _ = fitted(np.random.default_rng(4), 0.8, 0.0)
     night_sky.check_trails([frame._replace(stars=still)])
     # What the trail adds to the mean variance is taken off.
-    assert np.median(night_sky.without_trail(stars).variance_px2) == pytest.approx(0.64, rel=0.03)
-    assert np.median(night_sky.without_trail(still).variance_px2) == pytest.approx(0.64, rel=0.01)
+    assert np.median(night_sky.without_trail(stars).variance_px2) == pytest.approx(
+        0.64, rel=0.03
+    )
+    assert np.median(night_sky.without_trail(still).variance_px2) == pytest.approx(
+        0.64, rel=0.01
+    )
 
 
 def test_image_slopes_match_finite_differences() -> None:
@@ -123,7 +127,9 @@ def test_image_slopes_match_finite_differences() -> None:
     for n in range(6):
         step = np.zeros(6)
         step[n] = 1e-5 * max(abs(p[0, n]), 1)
-        difference = (night_sky.model(p + step)[0] - night_sky.model(p - step)[0]) / (2 * step[n])
+        difference = (night_sky.model(p + step)[0] - night_sky.model(p - step)[0]) / (
+            2 * step[n]
+        )
         np.testing.assert_allclose(
             slopes[:, :, n], difference, rtol=1e-6, atol=1e-7 * np.abs(slopes[:, :, n]).max()
         )
@@ -134,7 +140,9 @@ def test_a_tilt_of_the_chip_is_detected() -> None:
     span = np.arange(2 * night_sky.HALF_PX + 1.0)
     light = np.zeros((len(span), len(span)))
     for t in np.linspace(-1, 1, 21):
-        light += 200 * np.outer(gaussian(span, 7 + 0.7 * t, 1.0), gaussian(span, 7 + 0.7 * t, 1.0))
+        light += 200 * np.outer(
+            gaussian(span, 7 + 0.7 * t, 1.0), gaussian(span, 7 + 0.7 * t, 1.0)
+        )
     image = np.pad(light, 10)
     stars = night_sky.fit_images(image, np.array([[17.0, 17.0]]), 1.0, 0.01)
     covariance = float(np.mean(np.linspace(-1, 1, 21) ** 2) * 0.7**2)
@@ -211,7 +219,9 @@ def test_lens_and_star_images_are_recovered_and_reproduce_the_frames(
 ) -> None:
     truth = rendered(tmp_path, TRUE, 1)
     for n, (frame, _) in enumerate(truth):
-        files.write_png16(files.make_folder(tmp_path / "night") / f"night_{n}.png", frame.image_dn)
+        files.write_png16(
+            files.make_folder(tmp_path / "night") / f"night_{n}.png", frame.image_dn
+        )
     config = CameraConfig.model_validate(SHEET)
     night = night_sky.measure_night(config, tmp_path / "night", transfer(), SATURATION_DN)
     assert night.identified == FRAMES
@@ -220,7 +230,9 @@ def test_lens_and_star_images_are_recovered_and_reproduce_the_frames(
     assert night.lens is not None
     found = night_sky.lens_estimates(config, night.lens)
     assert found["focal_length_mm"].value == pytest.approx(16.0, rel=1e-3)
-    assert disagreement_px(night.lens.camera, calibration(CameraConfig.model_validate(TRUE))) < 0.1
+    assert (
+        disagreement_px(night.lens.camera, calibration(CameraConfig.model_validate(TRUE))) < 0.1
+    )
     psf = {"kind": "gaussian", "sigma_px": night.size.sigma_px.value}
     psf["corner_sigma_px"] = night.size.corner_sigma_px.value
     measured = {

@@ -11,7 +11,12 @@ from scipy import stats
 from skysim.camera import detector
 from skysim.camera.detector import Detector
 from skysim.core.types import Floats
-from skysim.experiments.characterize import fixed_pattern, frame_files, photon_transfer, sensor_fit
+from skysim.experiments.characterize import (
+    fixed_pattern,
+    frame_files,
+    photon_transfer,
+    sensor_fit,
+)
 from skysim.experiments.characterize.fixed_pattern import RateNoise
 from skysim.experiments.characterize.photon_transfer import (
     Estimate,
@@ -75,7 +80,9 @@ def measured(side_px: int, seed: int, darks: int = 8, **changes: Any) -> Measure
     dark_levels = [
         frames(at_c, 0.0, t_s, darks) for at_c in (20.0, 30.0) for t_s in (0.1, 5.0, 20.0)
     ]
-    return sensor_fit.characterize(dark_levels, [frames(20.0, rate_e_s, t_s, 2) for t_s in FLAT_S])
+    return sensor_fit.characterize(
+        dark_levels, [frames(20.0, rate_e_s, t_s, 2) for t_s in FLAT_S]
+    )
 
 
 def test_half_the_variance_of_a_pair_s_difference_is_the_noise_without_pattern_and_flicker() -> (
@@ -85,7 +92,8 @@ def test_half_the_variance_of_a_pair_s_difference_is_the_noise_without_pattern_a
     pattern = rng.uniform(200, 4000, (200, 300))
     sigma = 7.0
     frames = [
-        np.rint(pattern * lamp + rng.normal(0, sigma, pattern.shape)) for lamp in (1, 1.0, 1, 1.0)
+        np.rint(pattern * lamp + rng.normal(0, sigma, pattern.shape))
+        for lamp in (1, 1.0, 1, 1.0)
     ]
     shifted = [frame.astype(np.uint16) + np.uint16(n) for n, frame in enumerate(frames)]
     found = level(0.1, 20.0, shifted)
@@ -209,7 +217,12 @@ def test_dark_current_of_drawn_pixels_is_found_within_its_interval() -> None:
             drawn_rates(np.random.default_rng(seed), 60_000, noise), noise, np.inf
         )
         assert found.hot is not None
-        pairs = ((found.mean, 2.0), (found.dsnu, 0.4), (found.hot_pixels, 0.004), (found.hot, 30.0))
+        pairs = (
+            (found.mean, 2.0),
+            (found.dsnu, 0.4),
+            (found.hot_pixels, 0.004),
+            (found.hot, 30.0),
+        )
         pulls.append([(one.value - truth) / one.sigma for one, truth in pairs])
     mean = np.mean(pulls, axis=0)
     spread = np.std(pulls, axis=0, ddof=1)
@@ -272,7 +285,11 @@ def test_intervals_match_their_sampling_laws() -> None:
 def test_a_chip_s_parameters_are_recovered_within_two_percent() -> None:
     """All but the hot pixels and the columns, whose number on a chip limits them: those within 3 sigma."""
     found = measured(400, 1, darks=16)
-    assert set(found.estimates) == {*CHIP} - {"quantum_efficiency", "bits", "dark_temperature_c"}
+    assert set(found.estimates) == {*CHIP} - {
+        "quantum_efficiency",
+        "bits",
+        "dark_temperature_c",
+    }
     for key, one in found.estimates.items():
         truth = float(CHIP[key])
         if key in ("hot_pixels", "hot_e_s", "column_offset_e"):

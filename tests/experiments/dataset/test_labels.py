@@ -31,7 +31,12 @@ def setup_with(
 ) -> TrialSetup:
     base = {key: parse_yaml(value)[1] for key, value in SMALL.items()}
     spec = TrialSpec(
-        "shefex2", ".", 1, {**base, **(settings or {})}, {"kind": "frames", **(trial or {})}, True
+        "shefex2",
+        ".",
+        1,
+        {**base, **(settings or {})},
+        {"kind": "frames", **(trial or {})},
+        True,
     )
     return prepared_setup(spec, {})
 
@@ -114,7 +119,8 @@ def test_the_box_of_a_still_star_is_a_square_about_it() -> None:
     rows["streak_x_px"] = [0, 1e-14, -1e-14]
     rows["sigma_px"] = 0.7
     for box, outline in zip(
-        *dataset_shards.outlines(dataset_labels.image_extents(rows, Window(0, 1), 100)), strict=True
+        *dataset_shards.outlines(dataset_labels.image_extents(rows, Window(0, 1), 100)),
+        strict=True,
     ):
         assert box == pytest.approx([10.5 - 2.1, 20.5 - 2.1, 4.2, 4.2])
         assert sorted(outline) == pytest.approx([8.4, 8.4, 12.6, 12.6, 18.4, 18.4, 22.6, 22.6])
@@ -173,14 +179,18 @@ def test_a_detection_belongs_to_the_brightest_nearby_source_alone() -> None:
 
 def test_particles_are_masked_where_a_frame_without_them_differs() -> None:
     """Both frames have the same photons and the same noise; a count is 10 electrons, and the threshold 15."""
-    with_, without = (dataset_labels.label_frame(setup_with(more), 4) for more in (PARTICLE, {}))
+    with_, without = (
+        dataset_labels.label_frame(setup_with(more), 4) for more in (PARTICLE, {})
+    )
     assert PARTICLES not in without.masks
     mask = decoded(with_.masks[PARTICLES], (HEIGHT, WIDTH))
     config = setup_with().lab.scene.camera.detector
     added_e = (with_.frame.image_dn.astype(float) - without.frame.image_dn) * config.gain_e_dn
     free = with_.frame.image_dn < with_.frame.saturation_dn
     assert 20 < mask.sum() < 4000
-    loss_e = 2 + 0.02 * np.abs(added_e)  # transfer loss moves a little charge to the next pixels
+    loss_e = 2 + 0.02 * np.abs(
+        added_e
+    )  # transfer loss moves a little charge to the next pixels
     assert (
         added_e[mask & free] > config.read_noise_e - config.gain_e_dn - loss_e[mask & free]
     ).all()

@@ -37,10 +37,14 @@ def test_the_trial_is_drawn_in_every_frame_and_the_scene_in_every_shard(tmp_path
     assert len({more["camera.detector.hardware_seed"] for _, more in levels}) == 40
 
 
-def test_draws_are_independent_of_one_another_and_of_the_number_of_frames(tmp_path: Path) -> None:
+def test_draws_are_independent_of_one_another_and_of_the_number_of_frames(
+    tmp_path: Path,
+) -> None:
     text = VARY.replace("  lens:", "  turn: {key: trial.turn_deg, from: 0, to: 1}\n  lens:")
     short, long = (small(variations(tmp_path, text), count) for count in (20, 500))
-    assert [short.draw(n // 2, n) for n in range(20)] == [long.draw(n // 2, n) for n in range(20)]
+    assert [short.draw(n // 2, n) for n in range(20)] == [
+        long.draw(n // 2, n) for n in range(20)
+    ]
     drawn = np.array(
         [[long.draw(n // 2, n)[0][name] for name in ("rate", "turn")] for n in range(500)]
     )
@@ -70,7 +74,9 @@ def test_every_setting_that_changes_the_frames_changes_the_digest(tmp_path: Path
         small(vary, overrides={"light.limit_mag": "5"}),
         small(),
     ]
-    assert len({made.digest for made in [small(variations(tmp_path)), *others]}) == 1 + len(others)
+    assert len({made.digest for made in [small(variations(tmp_path)), *others]}) == 1 + len(
+        others
+    )
     json.dumps(others[0].manifest())
 
 
@@ -95,7 +101,9 @@ def test_every_setting_that_changes_the_frames_changes_the_digest(tmp_path: Path
             "trial.tracked: no effect on single frames; allowed: studies",
         ),
         (
-            VARY.replace("trial.rate_deg_s, from: 0.1, to: 0.5", "trial.tracked, values: [1, 2]"),
+            VARY.replace(
+                "trial.rate_deg_s, from: 0.1, to: 0.5", "trial.tracked, values: [1, 2]"
+            ),
             "trial.tracked: no effe",
         ),
         (VARY.replace("schema: 1\n", ""), "schema"),
@@ -107,7 +115,9 @@ def test_every_setting_that_changes_the_frames_changes_the_digest(tmp_path: Path
         (VARY.replace("trial: {dec_deg: [-60, 60]}", "set: 3"), "set: 3"),
     ],
 )
-def test_wrong_variations_are_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
+def test_wrong_variations_are_refused_in_one_line(
+    tmp_path: Path, text: str, message: str
+) -> None:
     with pytest.raises(InputError, match=message) as raised:
         small(variations(tmp_path, text))
     assert "\n" not in str(raised.value)

@@ -57,7 +57,9 @@ def samples(folder: Path) -> dict[str, dict[str, Any]]:
                 file = tar.extractfile(member)
                 assert file is not None
                 data = file.read()
-                value = np.load(io.BytesIO(data)) if ending.endswith("npy") else json.loads(data)
+                value = (
+                    np.load(io.BytesIO(data)) if ending.endswith("npy") else json.loads(data)
+                )
                 found.setdefault(key, {})[ending] = value
     return found
 
@@ -77,16 +79,21 @@ def test_every_format_has_the_same_frames(whole: Path) -> None:
         np.testing.assert_array_equal(images[row["frame"]], image)
         with (whole / row["file"]).open("rb") as file:  # one frame without its shard
             file.seek(row["position"])
-            pixels = np.frombuffer(file.read(image.nbytes), row["pixel_type"]).reshape(image.shape)
+            pixels = np.frombuffer(file.read(image.nbytes), row["pixel_type"]).reshape(
+                image.shape
+            )
         np.testing.assert_array_equal(pixels, image)
         assert one["frame.json"]["levels"] == json.loads(row["levels"])
         assert 0.1 <= one["frame.json"]["levels"]["rate"] <= 0.5
         assert len(one["sources.npy"]) == row["sources"] > 0
     assert len({row["ra_deg"] for row in rows}) == 5
     rate = [
-        np.degrees(np.linalg.norm([row[f"rate_cam_{end}_rad_s"] for end in "xyz"])) for row in rows
+        np.degrees(np.linalg.norm([row[f"rate_cam_{end}_rad_s"] for end in "xyz"]))
+        for row in rows
     ]
-    np.testing.assert_allclose(rate, [json.loads(row["levels"])["rate"] for row in rows], rtol=1e-9)
+    np.testing.assert_allclose(
+        rate, [json.loads(row["levels"])["rate"] for row in rows], rtol=1e-9
+    )
 
 
 def test_the_table_of_sources_has_the_sources_of_the_frames(whole: Path) -> None:
@@ -320,7 +327,9 @@ def test_an_object_store_holds_the_same_bytes(
             assert data == (whole / name.removeprefix("night/")).read_bytes(), name
         client.delete_object(Bucket="frames", Key="night/index/000001.parquet")
         assert dataset_run.run(small(vary), url, engines.Serial()).now == 2
-        again = client.get_object(Bucket="frames", Key="night/index/000001.parquet")["Body"].read()
+        again = client.get_object(Bucket="frames", Key="night/index/000001.parquet")[
+            "Body"
+        ].read()
         assert again == made["night/index/000001.parquet"]
         with pytest.raises(InputError, match=r"^s3://nowhere/x: .*can be written"):
             dataset_run.run(small(vary), "s3://nowhere/x", engines.Serial())
@@ -390,7 +399,9 @@ def test_an_unknown_url_is_refused(url: str) -> None:
         dataset_shards.Storage(url)
 
 
-def test_without_the_extra_one_line_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_one_line_names_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "fsspec.core", None)
     with pytest.raises(InputError, match=r"pip install 'skysim\[dataset\]'"):
         dataset_shards.Storage("out/frames")

@@ -53,7 +53,12 @@ def test_a_single_injected_term_is_recovered_alone(name):
     """One large experiment per term: recovered to 5 %, with no leakage into the others."""
     rng = np.random.default_rng(2)
     shape = (2000, 2, 1, 4, 2)
-    drawn = {"bias": {}, "field": {"f": 2.0}, "pixel": {"fusp": 2.0}, "temporal": {"fuspt": 2.0}}
+    drawn = {
+        "bias": {},
+        "field": {"f": 2.0},
+        "pixel": {"fusp": 2.0},
+        "temporal": {"fuspt": 2.0},
+    }
     found = components(generated(rng, shape, 2.0 if name == "bias" else 0.0, **drawn[name]))
     assert getattr(found, name) == pytest.approx(4.0, rel=0.05)
     others = [value for one, value in found._asdict().items() if one != name]
@@ -64,7 +69,9 @@ def test_the_sum_is_the_mean_square_without_bias():
     """E[e^2] exactly: the mean square of independent draws is the same within its error."""
     rng = np.random.default_rng(3)
     sizes = {"u": 0.4, "f": 1.0, "fu": 0.5, "s": 0.3, "fusp": 0.7, "fuspt": 1.2}
-    sums = [components(generated(rng, (40, 3, 2, 2, 2), 0.6, **sizes)).total for _ in range(400)]
+    sums = [
+        components(generated(rng, (40, 3, 2, 2, 2), 0.6, **sizes)).total for _ in range(400)
+    ]
     expected = 0.6**2 + sum(size**2 for size in sizes.values())
     assert np.mean(sums) == pytest.approx(expected, abs=4 * np.std(sums) / 20)
     assert np.std(sums) / 20 < 0.02 * expected
@@ -98,7 +105,9 @@ def test_intervals_cover_the_truth_as_often_as_stated():
 def test_a_ratio_is_precise_if_both_terms_share_their_fields():
     rng = np.random.default_rng(6)
     squares = rng.lognormal(0, 1, 200)
-    assert mean_square_ratio(0.5 * squares, squares) == pytest.approx((0.5, 0.5, 0.5), rel=1e-12)
+    assert mean_square_ratio(0.5 * squares, squares) == pytest.approx(
+        (0.5, 0.5, 0.5), rel=1e-12
+    )
     apart = mean_square_ratio(0.5 * rng.lognormal(0, 1, 200), squares)
     assert apart.low < 0.5 < apart.high
     missing = np.where(np.arange(200) < 7, np.nan, squares)
@@ -111,7 +120,9 @@ def experiment(rng, fields):
     errors = field[..., None, None, None] + generated(
         rng, (fields, 3, 1, 3, 2), fu=0.5, fusp=0.8, fuspt=1.5
     )
-    return errors, field + np.hypot(np.hypot(0.5, 0.8), 1.5) * rng.standard_normal((1, fields, 20))
+    return errors, field + np.hypot(np.hypot(0.5, 0.8), 1.5) * rng.standard_normal(
+        (1, fields, 20)
+    )
 
 
 def test_terms_sum_to_the_error_of_independent_frames():

@@ -51,16 +51,24 @@ def test_a_process_follows_its_recursion():
 
 def test_a_process_is_stationary_and_forgets_exponentially():
     steps = np.full(200_000, 0.1)
-    values = correlated(steps, np.random.default_rng(3).standard_normal(), np.random.default_rng(4))
+    values = correlated(
+        steps, np.random.default_rng(3).standard_normal(), np.random.default_rng(4)
+    )
     assert np.var(values) == pytest.approx(1, abs=0.03)
     for lag in (1, 5, 20):
-        assert np.mean(values[lag:] * values[:-lag]) == pytest.approx(np.exp(-0.1 * lag), abs=0.03)
+        assert np.mean(values[lag:] * values[:-lag]) == pytest.approx(
+            np.exp(-0.1 * lag), abs=0.03
+        )
 
 
 def test_at_rest_only_the_noise_changes(model):
     """Of one state: the mean is the slow part, the deviation the noise at the field's scale."""
     state = State(
-        np.array([1.0, -1.0, 0.5]), np.array([0.3, 0.2, -1.0]), 0.8, np.array([2.0, -3.0, 7.0]), 1.0
+        np.array([1.0, -1.0, 0.5]),
+        np.array([0.3, 0.2, -1.0]),
+        0.8,
+        np.array([2.0, -3.0, 7.0]),
+        1.0,
     )
     errors = model.draw(np.zeros(40_000), 0.1, np.random.default_rng(5), state)
     scales = np.exp(0.5 * (0.8 * model.scale - model.scale**2 / 2))
@@ -72,7 +80,9 @@ def test_at_rest_only_the_noise_changes(model):
 def test_over_many_units_and_fields_the_variance_is_the_sum_of_the_terms(model):
     rng = np.random.default_rng(6)
     errors = np.array([model.draw(np.full(2, 1.0), 0.1, rng)[1] for _ in range(8000)])
-    expected = model.mean**2 + model.unit**2 + model.field**2 + model.pixel**2 + model.noise[1] ** 2
+    expected = (
+        model.mean**2 + model.unit**2 + model.field**2 + model.pixel**2 + model.noise[1] ** 2
+    )
     expected += model.along[1] ** 2 / 2 * np.array([1, 1, 0])
     assert np.mean(errors**2, axis=0) == pytest.approx(expected, rel=0.08)
 
@@ -87,14 +97,19 @@ def test_steps_of_a_process_have_the_statistics_of_independent_draws(model):
         pairs.append((first, model.step(state, 2.0, 0.1, rng)[1]))
     stepped = np.array(pairs) - model.mean
     drawn = np.array(
-        [model.draw(np.full(2, 2.0), 0.1, rng, model.start(rng, unit=False)) for _ in range(3000)]
+        [
+            model.draw(np.full(2, 2.0), 0.1, rng, model.start(rng, unit=False))
+            for _ in range(3000)
+        ]
     )
     drawn -= model.mean
     for one, other in ((0, 0), (0, 1)):
         found, expected = (
             np.mean(each[:, one] * each[:, other], axis=0) for each in (stepped, drawn)
         )
-        spread = np.sqrt(np.mean(stepped[:, 0] ** 2, axis=0) * np.mean(drawn[:, 0] ** 2, axis=0))
+        spread = np.sqrt(
+            np.mean(stepped[:, 0] ** 2, axis=0) * np.mean(drawn[:, 0] ** 2, axis=0)
+        )
         assert (found - expected) / spread == pytest.approx(np.zeros(3), abs=0.12)
 
 
@@ -162,7 +177,9 @@ def test_the_error_model_runs_without_skysim(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_fmu_gives_the_same_errors_in_another_tool(tmp_path: Path, model: ErrorModel) -> None:
+def test_the_fmu_gives_the_same_errors_in_another_tool(
+    tmp_path: Path, model: ErrorModel
+) -> None:
     """fmpy runs it at 1.5 degrees per second: the errors are those of the model's own steps with that seed."""
     fmpy = pytest.importorskip("fmpy")
     pytest.importorskip("pythonfmu3")

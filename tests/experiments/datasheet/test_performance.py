@@ -77,7 +77,12 @@ def test_a_limit_is_between_the_nearest_levels_shown_above_and_below():
 
 def test_a_limit_uses_the_highest_share_that_its_frames_can_demonstrate():
     """59 frames without a failure show 95 %, and 29 show 90 %."""
-    for frames, share, above in ((59, 0.95, 1), (58, 0.9, 1), (29, 0.9, 1), (28, 0.9, math.nan)):
+    for frames, share, above in (
+        (59, 0.95, 1),
+        (58, 0.9, 1),
+        (29, 0.9, 1),
+        (28, 0.9, math.nan),
+    ):
         found = bracket([{"rate": 1, "counts": Counts(frames, frames, 0, 0)}], "rate")
         assert found[:2] == pytest.approx((share, above), nan_ok=True)
 
@@ -86,7 +91,10 @@ def test_frames_of_one_field_count_once():
     """Four fields with two frames each: right, refused in the second, false in the first, refused and false."""
     outcome = {"right": [[1, 1, 0, 0], [1, 0, 1, 0]], "false": [[0, 0, 1, 0], [0, 0, 0, 1]]}
     sheet = SimpleNamespace(
-        **{name: lambda rows, name=name: np.array(outcome[name], bool)[rows] for name in outcome}
+        **{
+            name: lambda rows, name=name: np.array(outcome[name], bool)[rows]
+            for name in outcome
+        }
     )
     assert performance.counts_of_fields(sheet, [0, 1]) == Counts(4, 1, 1, 2)
 

@@ -66,7 +66,9 @@ def test_a_stopped_datasheet_resumes_with_the_same_result(small: None, tmp_path:
     whole = state(measured(tmp_path / "whole"))
     assert len(whole.times_s) == 3
     assert min(whole.times_s) > 0
-    assert numbers(whole)["limits"]["tracking"]["acceleration_deg_s2"]["below"] == pytest.approx(54)
+    assert numbers(whole)["limits"]["tracking"]["acceleration_deg_s2"][
+        "below"
+    ] == pytest.approx(54)
     with pytest.raises(KeyboardInterrupt):
         measured(tmp_path / "stopped", stop_after(4))
     again = state(measured(tmp_path / "stopped"))
@@ -92,7 +94,8 @@ def test_a_stopped_datasheet_resumes_with_the_same_result(small: None, tmp_path:
 
 def test_too_few_fields_are_refused_with_their_number(small: None, tmp_path: Path) -> None:
     with pytest.raises(
-        InputError, match=r"datasheet.fields: 4: . fields are solved .* allowed: 10 of them or more"
+        InputError,
+        match=r"datasheet.fields: 4: . fields are solved .* allowed: 10 of them or more",
     ):
         state(measured(tmp_path, fields=4))
 
@@ -117,7 +120,10 @@ def test_an_injected_bias_and_thermal_drift_are_recovered() -> None:
         rows = trials.run_segments(spec, (trials.Segment(0, cell.settings, 0, range(12)),))
         assert all(row.outcome.solved and not row.error for row in rows)
         errors.append(
-            [[row.outcome.x_arcsec, row.outcome.y_arcsec, row.outcome.roll_arcsec] for row in rows]
+            [
+                [row.outcome.x_arcsec, row.outcome.y_arcsec, row.outcome.roll_arcsec]
+                for row in rows
+            ]
         )
     shape = (1, designer.states, 2, 2, 12, 3)
     by_axis = np.moveaxis(np.array(errors).reshape(shape), (4, 5), (1, 0))

@@ -98,7 +98,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     left = [n for n in range(count) if n != DEAD]
     write_leds(made / "built.csv", left, built_m[left], level[left])
     lever = ", assumed_camera_body: [3 mm, -2 mm, 378 mm]"
-    (made / "design.yaml").write_text(SCENE.format(leds="design.csv", focal_mm=18.0, lever=lever))
+    (made / "design.yaml").write_text(
+        SCENE.format(leds="design.csv", focal_mm=18.0, lever=lever)
+    )
     (made / "built.yaml").write_text(
         SCENE.format(leds="built.csv", focal_mm=18.0 * FOCAL_RATIO, lever="")
     )
@@ -116,7 +118,9 @@ def frames(folder: Path, built: Lab) -> Path:
     uncertainty = survey_prior.survey_uncertainty("0.3 deg", "1 mm", "3 mm", "1%")
     lab = build_lab(survey_prior.as_listed(loader.load(folder / "design.yaml")))
     assumed = survey_prior.prior_of(
-        lab, survey_prior.calibration_prior(lab).camera, survey_prior.calibration_prior(lab).leds
+        lab,
+        survey_prior.calibration_prior(lab).camera,
+        survey_prior.calibration_prior(lab).leds,
     )
     model = survey_prior.survey_model(assumed, uncertainty, 0.02)
     held = survey_frames.planned_stops(built.scene, model, 8.0, STOPS, TILT_DEG)
@@ -135,7 +139,16 @@ def surveyed(folder: Path, frames: Path, out: str) -> dict[str, Any]:
         folder / "design.yaml",
         "--led-sigma",
     ]
-    words += ["1 mm", "--imu-sigma", "0.3 deg", "--tilt", TILT_DEG, "--out", folder / out, "--json"]
+    words += [
+        "1 mm",
+        "--imu-sigma",
+        "0.3 deg",
+        "--tilt",
+        TILT_DEG,
+        "--out",
+        folder / out,
+        "--json",
+    ]
     code, printed, err = command(*words)
     assert (code, err) == (0, "")
     return json.loads(printed)
@@ -161,7 +174,9 @@ def test_a_folder_of_images_alone_gives_the_dome_as_built(
     rms_m = np.sqrt(np.mean(error_m**2))
     claimed_m = np.sqrt(np.mean(np.array(found["sigma_m"]) ** 2))
     assert rms_m < 0.0005  # the list: 1 mm
-    assert claimed_m / 2 < rms_m < 2 * claimed_m  # errors that all LEDs share do not average out
+    assert (
+        claimed_m / 2 < rms_m < 2 * claimed_m
+    )  # errors that all LEDs share do not average out
     values = {line["what"]: line for line in result["values"]}
     truth = {"focal length px": built.scene.camera.focal_px}
     truth |= {
@@ -359,10 +374,15 @@ def test_images_that_cannot_be_surveyed_are_refused_in_one_line(
             ["--images", ".", "--camera", "x.yaml", "--watch", "--checks", "3"],
             "--checks: has no effect with --watch",
         ),
-        (["--plan", "--repeat", "3"], "--repeat: has no effect with --plan; allowed: one of them"),
+        (
+            ["--plan", "--repeat", "3"],
+            "--repeat: has no effect with --plan; allowed: one of them",
+        ),
     ],
 )
-def test_contradicting_survey_options_are_refused_in_one_line(words: list[str], says: str) -> None:
+def test_contradicting_survey_options_are_refused_in_one_line(
+    words: list[str], says: str
+) -> None:
     code, _, err = command("survey", "afit_simsat", *words)
     assert (code, err.count("\n")) == (2, 1)
     assert says in err
@@ -373,7 +393,9 @@ HEAD = "file,roll_deg,pitch_deg,yaw_deg\n"
 
 def test_written_attitudes_are_read_unchanged(tmp_path: Path) -> None:
     held = survey_frames.from_angles(np.array([[1.0, -20.0, 170.0], [0.5, 3.0, -90.0]]))
-    survey_images.write_attitudes(tmp_path / "a.csv", ["b.fits", "a.fits"], held, np.array([3, 4]))
+    survey_images.write_attitudes(
+        tmp_path / "a.csv", ["b.fits", "a.fits"], held, np.array([3, 4])
+    )
     read = survey_images.read_attitudes(tmp_path / "a.csv")
     assert list(read) == ["b.fits", "a.fits"]
     # Four decimals.

@@ -71,7 +71,9 @@ def test_a_survey_that_contradicts_its_assumptions_is_refused(
         )
         for focal, lever in ((0.0, 0.0), (off_px, off_m))
     )
-    accuracy = SimpleNamespace(lens_sigma=np.full(3, sigma_px), lever_sigma_m=np.full(3, sigma_m))
+    accuracy = SimpleNamespace(
+        lens_sigma=np.full(3, sigma_px), lever_sigma_m=np.full(3, sigma_m)
+    )
     run = SimpleNamespace(survey=found, accuracy=accuracy)
     if refused:
         with pytest.raises(InputError, match=f"survey: {parameter} .* contradicts the assumed"):

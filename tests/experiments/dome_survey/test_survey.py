@@ -140,7 +140,8 @@ def test_lens_and_lever_are_the_true_ones_within_their_errors_and_better_than_be
         assert abs(row["found"] - truth[row["what"]]) < 4.5 * row["sigma"], row
     for row in fitted[:1] + fitted[3:5]:
         assert (
-            abs(row["found"] - truth[row["what"]]) < abs(row["believed"] - truth[row["what"]]) / 2
+            abs(row["found"] - truth[row["what"]])
+            < abs(row["believed"] - truth[row["what"]]) / 2
         ), row
     # The assumed height happens to err by as little as the one sigma to which it is measured.
     assert abs(fitted[5]["found"] - truth["lever z mm"]) < abs(
@@ -168,7 +169,9 @@ def test_led_errors_match_their_sigmas(statistics: dict[str, Any], folder: Path)
 @pytest.mark.slow
 def test_a_scene_beside_the_map_file_uses_it(statistics: dict[str, Any], folder: Path) -> None:
     """Places, sigma, lever and lens as measured; LEDs not surveyed are left out; frames of the scene are solved."""
-    (folder / "mapped.yaml").write_text("schema: 1\nbase: small.yaml\ntracker: {map: leds.ecsv}\n")
+    (folder / "mapped.yaml").write_text(
+        "schema: 1\nbase: small.yaml\ntracker: {map: leds.ecsv}\n"
+    )
     lab = build_lab(loader.load(folder / "mapped.yaml"))
     tracker = build_tracker(lab.camera)
     assert isinstance(tracker, DomeTracker)
@@ -192,7 +195,17 @@ def test_a_scene_beside_the_map_file_uses_it(statistics: dict[str, Any], folder:
 @pytest.mark.long
 def test_afit_s_dome_is_measured_to_a_hundredth_of_a_degree(tmp_path: Path) -> None:
     """A lab wants 36″ across and 108″ about the boresight after 600 frames: the same after 200."""
-    words = ("survey", "afit_simsat", "--frames", 200, "--checks", 30, "--json", "--out", tmp_path)
+    words = (
+        "survey",
+        "afit_simsat",
+        "--frames",
+        200,
+        "--checks",
+        30,
+        "--json",
+        "--out",
+        tmp_path,
+    )
     code, out, err = command(*words)
     assert (code, err) == (0, "")
     statistics = json.loads(out)
@@ -264,7 +277,9 @@ def test_lights_get_their_true_names_by_the_imu(lab: Lab) -> None:
     stops = survey_frames.stop_attitudes(lab.scene, "attitudes", 10, 18.0)
     taken = survey_procedure.simulated_frames(lab, UNCERTAINTY, stops)
     named = right = lights = 0
-    for survey_frame, (_, truth) in zip(taken, survey_frames.render_stops(lab, stops), strict=True):
+    for survey_frame, (_, truth) in zip(
+        taken, survey_frames.render_stops(lab, stops), strict=True
+    ):
         names = survey_frames.match_by_imu(survey_frame, prior, UNCERTAINTY)
         apart_px, nearest = cKDTree(truth.sources.flux_xy_px).query(
             survey_frame.lights.xy_px[names.light]
@@ -285,7 +300,9 @@ def test_a_common_shift_beyond_the_led_spacing_is_found(seed: int) -> None:
     shift = rng.normal(0, 100, 2)
     seen = predicted[10:45] + shift + rng.normal(0, 5, (35, 2))
     seen = np.vstack([seen, rng.uniform(0, 1000, (5, 2))])  # reflections
-    found = survey_frames.common_shift_px(seen, predicted, 100.0, np.full(60, 5.0), (500.0, 500.0))
+    found = survey_frames.common_shift_px(
+        seen, predicted, 100.0, np.full(60, 5.0), (500.0, 500.0)
+    )
     # The mean of 35 lights, 5 px each, and of strangers that stand within the gate.
     assert np.linalg.norm(found - shift) < 5 * 5 / np.sqrt(35)
 
@@ -321,7 +338,9 @@ def test_a_board_that_is_displaced_is_found_whole(seed: int) -> None:
     along = np.cross(listed_m[20], [1.0, 0.0, 0.0])
     place_m = listed_m + rng.normal(0, 0.002, listed_m.shape)
     place_m[board] += 0.04 * along / np.linalg.norm(along)
-    lever = replace(dome.lever, camera_body_m=dome.lever.camera_body_m + rng.normal(0, 0.004, 3))
+    lever = replace(
+        dome.lever, camera_body_m=dome.lever.camera_body_m + rng.normal(0, 0.004, 3)
+    )
     prior = survey_prior.CalibrationPrior(
         dome.camera, dome.leds, lever, NOISE_PX, 0.002, np.ones(120)
     )
@@ -338,7 +357,9 @@ def test_a_board_that_is_displaced_is_found_whole(seed: int) -> None:
         frames.append(SurveyFrame(lights, by_imu, index))
     run = adjust.run_survey(frames, prior, UNCERTAINTY)
     survey = run.survey
-    found, _ = survey_faults.displaced(listed_m, survey.leds.position_m, survey.led_covariance_m2)
+    found, _ = survey_faults.displaced(
+        listed_m, survey.leds.position_m, survey.led_covariance_m2
+    )
     assert set(found) == set(board)
     error_m = np.linalg.norm(survey.leds.position_m - place_m, axis=1)
     assert error_m[board].max() < 0.005
@@ -356,7 +377,10 @@ def test_pairs_have_the_least_total_cost() -> None:
         assert (
             list(
                 zip(
-                    *(rows.tolist() for rows in survey_frames.assign_lights(seen, predicted, gate)),
+                    *(
+                        rows.tolist()
+                        for rows in survey_frames.assign_lights(seen, predicted, gate)
+                    ),
                     strict=True,
                 )
             )
@@ -476,7 +500,8 @@ def test_a_missing_or_ambiguous_map_is_refused_in_one_line(
 ) -> None:
     (tmp_path / "leds.ecsv").write_text("")
     statistics = {
-        key: value.replace("FILE", str(tmp_path / "leds.ecsv")) for key, value in changes.items()
+        key: value.replace("FILE", str(tmp_path / "leds.ecsv"))
+        for key, value in changes.items()
     }
     with pytest.raises(InputError, match=says) as refused:
         loader.load(folder / "small.yaml", statistics)
@@ -493,7 +518,10 @@ def test_a_missing_or_ambiguous_map_is_refused_in_one_line(
             "--tilt: 31; allowed: above 0, up to 30 degrees, the vehicle's stop",
         ),
         (["afit_simsat", "--imu-sigma", "2 mm"], "--imu-sigma: '2 mm' is not a plane angle"),
-        (["afit_simsat", "--imu-sigma", "20 deg"], "--imu-sigma: 20 deg; allowed: 0 to 0.1 rad"),
+        (
+            ["afit_simsat", "--imu-sigma", "20 deg"],
+            "--imu-sigma: 20 deg; allowed: 0 to 0.1 rad",
+        ),
         (["afit_simsat", "--led-sigma", "0 mm"], "--led-sigma: 0 mm; allowed: 1e-06 to 0.1 m"),
         (["afit_simsat", "--focal-error", "50%"], "--focal-error: 50%; allowed: -0.1 to 0.1"),
         (["afit_simsat", "--frames", "2", "--attitudes", "random"], "survey: "),

@@ -96,7 +96,9 @@ def test_a_magnitude_is_light_over_the_median_area() -> None:
     image[20:40, 20:40] = image[20:40, 100:120] = image[100:140, 150:190] = 100
     lights = measure_lights(image)
     assert lights.magnitude / lights.magnitude[-1] == pytest.approx([4, 1, 1])
-    assert lights.magnitude * np.median(lights.area_px) == pytest.approx([160_000, 40_000, 40_000])
+    assert lights.magnitude * np.median(lights.area_px) == pytest.approx(
+        [160_000, 40_000, 40_000]
+    )
 
 
 def test_a_threshold_separates_leds_from_glare_and_noise() -> None:

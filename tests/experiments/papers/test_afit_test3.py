@@ -37,11 +37,15 @@ def test_every_position_shows_all_five_leds(sightings: list[Sighting]) -> None:
     assert [one.stop for one in sightings] == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
 
 
-def test_the_epsilons_match_the_thesis_s_calibration(lab: Lab, sightings: list[Sighting]) -> None:
+def test_the_epsilons_match_the_thesis_s_calibration(
+    lab: Lab, sightings: list[Sighting]
+) -> None:
     measurements = measure(lab, sightings)
     believed = onboard_model.assumed_dome(lab.scene, lab.scene.light, lab.camera.sources)  # type: ignore[arg-type]
     lever = onboard_model.assumed_lever(lab.scene, lab.camera.mount)
-    calibration = calibrate(sightings, onboard_model.calibration(lab.scene.camera), believed, lever)
+    calibration = calibrate(
+        sightings, onboard_model.calibration(lab.scene.camera), believed, lever
+    )
     found = [
         test3.largest_std(measurements.magnitude),
         test3.largest_std(measurements.lab_m.reshape(len(sightings), -1)),
@@ -139,7 +143,10 @@ def test_gyros_lose_only_the_rate_beyond_their_limit() -> None:
 def test_the_vehicle_has_the_tables_attitudes() -> None:
     for angles in IMU_DEG:
         np.testing.assert_allclose(
-            lab_from_body(angles).as_euler("ZYX", degrees=True)[::-1], angles, rtol=0, atol=1e-12
+            lab_from_body(angles).as_euler("ZYX", degrees=True)[::-1],
+            angles,
+            rtol=0,
+            atol=1e-12,
         )
 
 

@@ -54,7 +54,9 @@ def test_a_circle_about_the_zenith_holds_its_share_of_evenly_spread_stars() -> N
     """n (1 - cos(d / 2)) of n on a hemisphere."""
     lab = build_lab(other_domes.shell_scene(0.0, 1))
     rng = np.random.default_rng(2)
-    mean = other_domes.count_fibers(lab, 10.0, other_domes.random_boresights(50_000, rng)).mean()
+    mean = other_domes.count_fibers(
+        lab, 10.0, other_domes.random_boresights(50_000, rng)
+    ).mean()
     assert mean == pytest.approx(100 * (1 - np.cos(np.radians(5))), rel=0.05)
 
 

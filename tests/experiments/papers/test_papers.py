@@ -140,7 +140,8 @@ def test_intervals_of_four_values_have_their_stated_coverage() -> None:
     """95 % by t's law; 1500 tries are good to 1.1 % (2 sigma)."""
     assert abs(covered(compare.confidence_interval, lambda rng: 3.0) - 0.95) < 0.018
     assert (
-        abs(covered(compare.prediction_interval, lambda rng: rng.normal(3.0, 2.0)) - 0.95) < 0.018
+        abs(covered(compare.prediction_interval, lambda rng: rng.normal(3.0, 2.0)) - 0.95)
+        < 0.018
     )
 
 
@@ -148,7 +149,9 @@ def test_intervals_of_four_values_have_their_stated_coverage() -> None:
 def test_a_bootstrap_of_four_values_is_widened_to_its_stated_coverage() -> None:
     """Efron's own percentiles hold a mean of four in some 80 %."""
     few = np.random.default_rng(3).normal(3.0, 2.0, (300, 4))
-    held = [[estimate.low <= 3.0 <= estimate.high for estimate in pair] for pair in map(both, few)]
+    held = [
+        [estimate.low <= 3.0 <= estimate.high for estimate in pair] for pair in map(both, few)
+    ]
     bare, wide = np.mean(held, axis=0)
     assert bare < 0.88
     assert wide > 0.91
@@ -176,13 +179,17 @@ def test_a_wrong_file_is_refused_in_one_line(tmp_path: Path) -> None:
     path.write_text(
         "paper: P\nexperiments:\n  a:\n    title: T\n    source: S\n    rows:\n      r: {published: 1}\n"
     )
-    with pytest.raises(InputError, match=r"experiments\.a\.rows\.r\.quantity: missing .*line 7"):
+    with pytest.raises(
+        InputError, match=r"experiments\.a\.rows\.r\.quantity: missing .*line 7"
+    ):
         published.read(path)
 
 
 def test_exactly_the_published_experiments_are_run() -> None:
     assert set(published.experiments()) == set(EXPERIMENTS)
-    assert all(one.title and one.source and one.paper for one in published.experiments().values())
+    assert all(
+        one.title and one.source and one.paper for one in published.experiments().values()
+    )
 
 
 # The command.
@@ -232,7 +239,9 @@ def test_disagreements_are_red_in_the_report_and_bold_in_the_page() -> None:
         {"ten": RowResult(exact(12)), "a | b": RowResult(exact(10))},
         (FigureDrawing("<empty>", lambda fig: None),),
     )
-    report = papers_report.papers_report([compare.compare("x", one, found, 0.0)], ("x",), True, 3)
+    report = papers_report.papers_report(
+        [compare.compare("x", one, found, 0.0)], ("x",), True, 3
+    )
     html = report.html()
     text = report.markdown()
     assert re.findall(r'<td class="text (\w+)">(agrees|disagrees)</td>', html) == [
@@ -375,7 +384,9 @@ def test_a_shortened_experiment_has_correct_intervals(id: str) -> None:
         worst_of_few = any(width != width for width in widths)
         share = 1.0 if id in TIMED else 0.35 if worst_of_few else 0.02
         reach = share * abs(whole.value) + (0.0 if worst_of_few else 1.5 * sum(widths))
-        assert abs(ours.value - whole.value) <= reach + line.row.tolerance + 1e-9, line.row.quantity
+        assert abs(ours.value - whole.value) <= reach + line.row.tolerance + 1e-9, (
+            line.row.quantity
+        )
     turned = [
         line.row.quantity
         for line, cells in lines
@@ -391,5 +402,7 @@ def test_a_shortened_experiment_has_correct_intervals(id: str) -> None:
 def test_the_same_seed_gives_the_same_numbers(id: str) -> None:
     first, again = (reproduce(id, ExperimentOptions(quick=True, seed=5)) for _ in range(2))
     # NaN is not NaN.
-    said = [files.to_json([line.as_dict() for line in one.comparisons]) for one in (first, again)]
+    said = [
+        files.to_json([line.as_dict() for line in one.comparisons]) for one in (first, again)
+    ]
     assert said[0] == said[1]

@@ -72,7 +72,9 @@ def test_the_earth_turns_once_in_a_sidereal_day_about_its_pole() -> None:
     begin = datetime.datetime(2003, 10, 2, 20)
     once, quarter = (ptase_ground.itrs_from_icrs(begin + part * day) for part in (1, 0.25))
     start = ptase_ground.itrs_from_icrs(begin)
-    assert (once * start.inv()).magnitude() < 0.5 * ARCSEC_RAD  # a day's precession is 0.14 arcsec
+    assert (
+        once * start.inv()
+    ).magnitude() < 0.5 * ARCSEC_RAD  # a day's precession is 0.14 arcsec
     turned = (quarter * start.inv()).as_rotvec()
     assert turned[2] == pytest.approx(-np.pi / 2, abs=1e-5)
 

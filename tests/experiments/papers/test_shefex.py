@@ -82,7 +82,9 @@ def test_the_crossing_of_a_line_and_a_limit_is_interpolated() -> None:
     """0.2 deg a pixel passes 0.1 deg at half a pixel; one that stays below ends at the last."""
     yaw_deg = 0.2 * shefex_identification.ERRORS_PX
     assert shefex_identification.error_at_limit(1.0, yaw_deg**2) == pytest.approx(0.5, abs=0.01)
-    assert shefex_identification.error_at_limit(2.0, yaw_deg**2) == pytest.approx(0.25, abs=0.01)
+    assert shefex_identification.error_at_limit(2.0, yaw_deg**2) == pytest.approx(
+        0.25, abs=0.01
+    )
     assert (
         shefex_identification.error_at_limit(1.0, 1e-4 * yaw_deg**2)
         == shefex_identification.ERRORS_PX[-1]
@@ -90,14 +92,18 @@ def test_the_crossing_of_a_line_and_a_limit_is_interpolated() -> None:
 
 
 @pytest.mark.parametrize("rate_deg_s", [2.0, 4.0])
-def test_smear_is_rate_times_time_and_the_peak_falls_as_that_of_a_line(rate_deg_s: float) -> None:
+def test_smear_is_rate_times_time_and_the_peak_falls_as_that_of_a_line(
+    rate_deg_s: float,
+) -> None:
     """A line of L pixels over one centered star's pixel: (1 / L) of erf(1 / (2 sqrt 2 sigma)), ends far away."""
     length_px = np.radians(rate_deg_s) * 0.05 * shefex_lab().scene.camera.focal_px
     assert shefex_nights.smear_px(rate_deg_s) == pytest.approx(length_px, rel=2e-3)
     alone = erf(0.5 / (0.7 * np.sqrt(2)))
     loss_mag = 2.5 * np.log10(alone * length_px)
     # The pixel's own ends are rounded by the blur: a few thousandths.
-    assert shefex_nights.peak_loss(rate_deg_s, 1, 1).ours.value == pytest.approx(loss_mag, abs=0.02)
+    assert shefex_nights.peak_loss(rate_deg_s, 1, 1).ours.value == pytest.approx(
+        loss_mag, abs=0.02
+    )
 
 
 def test_the_blur_disk_is_the_defocus_over_the_f_number() -> None:
@@ -114,7 +120,10 @@ def test_a_poisson_sky_has_the_expected_unevenness_and_an_even_sky_less() -> Non
     rng = np.random.default_rng(5)
     poisson = rng.poisson(8, (20_000, 2))
     even = np.full(20_000, 8.0) + rng.integers(-1, 2, 20_000)
-    for counts, expected in ((poisson, 1.0), (np.column_stack([poisson[:, 0], even]), (2 / 3) / 8)):
+    for counts, expected in (
+        (poisson, 1.0),
+        (np.column_stack([poisson[:, 0], even]), (2 / 3) / 8),
+    ):
         columns = np.hstack([counts, counts**2.0])
         assert shefex_setup.relative_dispersion(columns.mean(axis=0)) == pytest.approx(
             expected, rel=0.05
@@ -133,7 +142,9 @@ def test_both_scans_have_the_same_objects() -> None:
 
 def test_an_empty_frame_of_a_coarse_converter_lengthens_the_exposure() -> None:
     """Every pixel equals the offset: no star, and nothing too bright."""
-    controller = ExposureController(load("shefex2", {"tracker.exposure_control": "{mean_dn: 9}"}))
+    controller = ExposureController(
+        load("shefex2", {"tracker.exposure_control": "{mean_dn: 9}"})
+    )
     controller.update(Frame(0, np.full((493, 659), 4, np.uint16), 0.0, 0.04, 255.0))
     assert controller.exposure_s == pytest.approx(0.042, abs=1e-12)
 
@@ -162,4 +173,6 @@ def test_the_same_seed_gives_the_same_numbers() -> None:
 def test_a_lab_under_the_air_gathers_thirty_per_cent_less() -> None:
     """The light of 35 ms without air equals that of 50 ms under the air."""
     on_ground = shefex_nights.star_image(shefex_nights.ground_lab(), 0.05).sum()
-    assert on_ground == pytest.approx(shefex_nights.star_image(shefex_lab(), 0.035).sum(), rel=1e-6)
+    assert on_ground == pytest.approx(
+        shefex_nights.star_image(shefex_lab(), 0.035).sum(), rel=1e-6
+    )

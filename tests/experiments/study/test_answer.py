@@ -47,7 +47,9 @@ def study(**keys: Any) -> Study:
 
 def line(n: int, leds: int, trials: int, **hits: int) -> PointRow:
     """A point with these counts of events, and a p95 of the roll of 100 arcsec times its number."""
-    responses = {name: metrics.proportion(count, trials) for name, count in (NEVER | hits).items()}
+    responses = {
+        name: metrics.proportion(count, trials) for name, count in (NEVER | hits).items()
+    }
     p95 = {"roll_arcsec_p95": Summary(100.0 * (n + 1), 90.0, 350.0, trials)}
     return PointRow(n, {"leds": leds}, responses | p95, trials)
 
@@ -65,7 +67,9 @@ def test_without_ambiguity_the_answer_has_a_confidence() -> None:
     )
     assert pytest.approx(0.0002995, abs=1e-7) == 1 - 0.05 ** (1 / 10_000)
     assert [
-        one for one in answer.headline(study(), [line(0, 500, 10_000)], False) if "ambiguous" in one
+        one
+        for one in answer.headline(study(), [line(0, 500, 10_000)], False)
+        if "ambiguous" in one
     ] == []
 
 
@@ -93,7 +97,9 @@ def test_refusals_are_named_where_they_are_most_frequent() -> None:
         " confidence) at the other points. `skysim study worst leds.yaml --response refused` names the worst."
     )
     solved = answer.headline(study(trial={"kind": "frames"}), [line(0, 500, 100)], True)
-    assert said(solved, "Is every frame solved?").startswith("Is every frame solved? Yes. Refused")
+    assert said(solved, "Is every frame solved?").startswith(
+        "Is every frame solved? Yes. Refused"
+    )
 
 
 def test_misidentification_and_roll_noise_are_distinguished() -> None:
@@ -130,7 +136,9 @@ def test_wrong_matches_are_counted_and_their_effect_on_the_attitude() -> None:
     assert said(texts, "Is it ambiguous anywhere?").startswith("Is it ambiguous anywhere? No.")
     one.responses["misled"] = metrics.proportion(10, 200)
     (text,) = [
-        text for text in answer.headline(study(), [one, other], True) if text.startswith("There 25")
+        text
+        for text in answer.headline(study(), [one, other], True)
+        if text.startswith("There 25")
     ]
     assert (
         "the attitude errs more than claimed at 1 of 2 points, most at leds = 500: 5 % of the frames (2.74"
@@ -166,7 +174,9 @@ def test_the_next_claim_says_how_many_trials_it_needs() -> None:
         " point without any."
     )
     seen = line(0, 500, 1200, misidentified=1, misled=1, roll_noise=1, wrong=1, ambiguous=1)
-    assert not [one for one in answer.headline(study(), [seen], False) if one.startswith("None in")]
+    assert not [
+        one for one in answer.headline(study(), [seen], False) if one.startswith("None in")
+    ]
 
 
 @pytest.mark.parametrize(
@@ -200,7 +210,10 @@ def test_understated_errors_are_reported(
     for one, values in zip(lines, nees, strict=True):
         one.responses["nees"] = Summary(*values, 500)
     texts = answer.headline(study(), lines, False)
-    assert said(texts, "Are the claimed errors true?") == f"Are the claimed errors true? {expected}"
+    assert (
+        said(texts, "Are the claimed errors true?")
+        == f"Are the claimed errors true? {expected}"
+    )
     assert len(answer.ranges(study(responses=["nees"]), lines)) == 1
 
 
@@ -228,7 +241,9 @@ def loaded(folder: Path, **keys: Any) -> Any:
 
 @pytest.mark.slow
 def test_the_scene_is_in_a_table(tmp_path: Path) -> None:
-    rows = dict(overview.overview(loaded(tmp_path, hardware=["light.layout.hardware_seed"])).rows)
+    rows = dict(
+        overview.overview(loaded(tmp_path, hardware=["light.layout.hardware_seed"])).rows
+    )
     assert (
         rows["light"]
         == "dome (ellipsoid, 1.219 m above the bearing) with 500 LEDs (random) within 40°"
@@ -255,7 +270,9 @@ def test_the_tracker_s_knowledge_is_stated_as_in_the_check(tmp_path: Path) -> No
     }
     plan = loaded(tmp_path, set=STUDY["set"] | survey)
     scene, _ = resolve_point(plan.spec, plan.points[0].settings)
-    (fact,) = [one for one in checks.check(build_lab(scene)).facts if one.name == "tracker knows"]
+    (fact,) = [
+        one for one in checks.check(build_lab(scene)).facts if one.name == "tracker knows"
+    ]
     knowledge = dict(overview.overview(plan).rows)["tracker knows"]
     assert knowledge == "; ".join(fact.lines)
     assert "measured by a total station" in knowledge
@@ -275,7 +292,8 @@ def test_intervals_of_one_dome_name_the_fixed_hardware(tmp_path: Path) -> None:
     (said_,) = answer.one_unit(overview.overview(loaded(tmp_path, hardware=[survey])).fixed)
     assert f"with one draw of the LEDs: `hardware: [{layout}]`" in said_
     assert (
-        answer.one_unit(overview.overview(loaded(tmp_path, hardware=[survey, layout])).fixed) == []
+        answer.one_unit(overview.overview(loaded(tmp_path, hardware=[survey, layout])).fixed)
+        == []
     )
     units = {"unit": {"levels": {"a": {survey: 1}, "b": {survey: 2}}}}
     assert overview.overview(loaded(tmp_path, factors=units)).fixed == (layout,)
@@ -323,14 +341,17 @@ def test_checks_run_at_every_level_and_name_the_levels_of_findings(
         (["12 px of 3", "13 px of 3"], "12 px of 3 [a = 1; a = 2]"),
     ],
 )
-def test_findings_that_differ_only_in_numbers_are_merged(texts: list[str], expected: str) -> None:
+def test_findings_that_differ_only_in_numbers_are_merged(
+    texts: list[str], expected: str
+) -> None:
     at = [(text, f"a = {n}") for n, text in enumerate(texts, 1)]
     assert overview.finding_text(at, checked=3) == expected
 
 
 def test_the_location_of_an_extreme_has_its_unit() -> None:
     rates = study(
-        factors={"rate": {"key": "trial.rate_deg_s", "values": [0, 8]}}, trial={"kind": "frames"}
+        factors={"rate": {"key": "trial.rate_deg_s", "values": [0, 8]}},
+        trial={"kind": "frames"},
     )
     lines = [
         line(0, 500, 100)._replace(levels={"rate": 0}),
@@ -364,7 +385,9 @@ def test_a_finding_names_the_number_of_leds_where_the_study_varies_it(tmp_path: 
         "leds": {"key": "light.layout.count", "values": [60, 900]},
         "disk": {"levels": {"small": {}, "large": {"light.led.disk_diameter": "10 mm"}}},
     }
-    found = overview.overview(loaded(tmp_path, trial={"kind": "frames"}, factors=factors)).findings
+    found = overview.overview(
+        loaded(tmp_path, trial={"kind": "frames"}, factors=factors)
+    ).findings
     (wide,) = [one for one in found if "px wide; local treats" in one]
     assert wide.endswith("[disk = large, 60 LEDs]")
 

@@ -89,9 +89,9 @@ def test_correct_covariances_are_not_called_overconfident():
     nees = stats.chi2.rvs(3, size=100_000, random_state=4)
     share = metrics.response("overconfident")(columns(nees=nees, frames=np.ones(len(nees))))
     assert share.value == 0
-    assert stats.chi2.sf(stats.chi2.isf(metrics.OVERCONFIDENCE_PROBABILITY, 3), 3) == pytest.approx(
-        1e-8, rel=1e-6
-    )
+    assert stats.chi2.sf(
+        stats.chi2.isf(metrics.OVERCONFIDENCE_PROBABILITY, 3), 3
+    ) == pytest.approx(1e-8, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,8 @@ def test_correct_covariances_are_not_called_overconfident():
 )
 def test_an_unknown_response_is_refused_with_the_known_ones(name):
     with pytest.raises(
-        InputError, match=r"responses.2: unknown response .*; allowed: overconfident, identified"
+        InputError,
+        match=r"responses.2: unknown response .*; allowed: overconfident, identified",
     ):
         metrics.response(name, "responses.2")
 
@@ -150,7 +151,8 @@ def test_the_error_budget_attributes_errors_to_their_factors(tmp_path):
     assert found["cross_arcsec", "turn_z"].total.value < 0.05
     assert found["roll_arcsec", "turn_x"].total.value < 0.1
     assert (
-        found["cross_arcsec", "turn_x"].total.value + found["cross_arcsec", "lever_x"].total.value
+        found["cross_arcsec", "turn_x"].total.value
+        + found["cross_arcsec", "lever_x"].total.value
         > 0.9
     )
     drawn = np.degrees(1) * 3600 * 0.2 / (48 * 25.4)
@@ -187,7 +189,8 @@ def loaded_with_a_fault(path):
     bad = [
         point._replace(
             settings={
-                key: "-1 mm" if value == "30 mm" else value for key, value in point.settings.items()
+                key: "-1 mm" if value == "30 mm" else value
+                for key, value in point.settings.items()
             }
         )
         for point in study_plan.points
@@ -292,7 +295,8 @@ def test_a_trial_that_raises_in_its_tracker_is_replayed_with_its_frame(tmp_path,
 def test_a_store_of_a_changed_scene_is_not_resumed(tmp_path):
     (tmp_path / "mine.yaml").write_text("schema: 1\nbase: shefex2\n")
     study_plan, _ = done(
-        tmp_path, STUDY.replace("scene: shefex2", "scene: mine.yaml").replace('"-1 mm"', '"30 mm"')
+        tmp_path,
+        STUDY.replace("scene: shefex2", "scene: mine.yaml").replace('"-1 mm"', '"30 mm"'),
     )
     with store.writing(tmp_path / "study.sqlite") as kept:
         runner.prepare_store(study_plan, kept, resume=True)

@@ -52,7 +52,9 @@ def processes(*commands: list[str], **options: Any) -> Iterator[list[subprocess.
     environment = {
         key: value for key, value in ENVIRONMENT.items() if key not in workers.ONE_THREAD
     }
-    environment["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), environment["PATH"]])
+    environment["PATH"] = os.pathsep.join(
+        [str(Path(sys.executable).parent), environment["PATH"]]
+    )
     started = [subprocess.Popen(one, **{"env": environment, **options}) for one in commands]
     try:
         yield started
@@ -73,7 +75,9 @@ def threads_of_worker(dask_worker: Any) -> dict[str, str | None]:
 
 
 @pytest.mark.long
-def test_a_slurm_job_runs_a_study(plan_: plan.Plan, serial_contents: str, tmp_path: Path) -> None:
+def test_a_slurm_job_runs_a_study(
+    plan_: plan.Plan, serial_contents: str, tmp_path: Path
+) -> None:
     """The script that dask-jobqueue makes from the page's lines, run by bash, to which SBATCH lines are comments."""
     pytest.importorskip("dask_jobqueue")
     session: dict[str, Any] = {}
@@ -151,7 +155,9 @@ def test_the_commands_of_the_pods_run_a_study(
         for one in commands
     ]
     with processes(*here, cwd=tmp_path):
-        done(plan_, tmp_path / "pods.sqlite", on_dask(Cluster(f"tcp://127.0.0.1:{port}", []), 2))
+        done(
+            plan_, tmp_path / "pods.sqlite", on_dask(Cluster(f"tcp://127.0.0.1:{port}", []), 2)
+        )
     assert contents(tmp_path / "pods.sqlite") == serial_contents
 
 

@@ -49,7 +49,9 @@ def test_a_study_is_run_reported_exported_and_replayed(typed, tmp_path):
     assert (code, report["done"], report["trials"], report["failures"]) == (0, 60, 60, [])
     code, out, _ = typed("study", "report", "question.yaml", "--json")
     assert json.loads(out)["points"]["strays"] == [0, 5]
-    assert "skysim study run question.yaml" in (tmp_path / "out/question/report.html").read_text()
+    assert (
+        "skysim study run question.yaml" in (tmp_path / "out/question/report.html").read_text()
+    )
     assert typed("study", "export", "question.yaml", "all.csv")[0] == 0
     assert len((tmp_path / "all.csv").read_text().splitlines()) == 61
     code, out, _ = typed("study", "replay", "question.yaml", "31", "--json")
@@ -130,7 +132,9 @@ def test_the_worst_trials_are_listed_with_their_replay_command(typed):
     _, out, _ = typed(*words, "--response", "cross_arcsec_p95")
     line = r"^1\. RA [\d.]+°, Dec [+-][\d.]+°, \d+ lights: cross .*″, roll .*″ \(strays = 5\)$"
     assert re.search(line, out, re.MULTILINE)
-    assert "no trial counts for misidentified" in typed(*words, "--response", "misidentified")[1]
+    assert (
+        "no trial counts for misidentified" in typed(*words, "--response", "misidentified")[1]
+    )
     for wrong, complaint in (
         (("--where", "strays=6"), "--where strays: unknown level 6; allowed: 0, 5"),
         (("--where", "star=6"), "--where: unknown factor 'star'; allowed: strays"),
@@ -173,7 +177,10 @@ def test_a_store_of_an_earlier_skysim_is_refused_in_one_line(typed, tmp_path):
             ("run", "question.yaml", "--engine", "ray"),
             "--engine: unknown engine 'ray'; allowed: pool, serial, dask",
         ),
-        (("run", "question.yaml", "--engine", "dask"), "--scheduler: required with --engine dask"),
+        (
+            ("run", "question.yaml", "--engine", "dask"),
+            "--scheduler: required with --engine dask",
+        ),
         (
             ("run", "question.yaml", "--set", "replicates"),
             "--set: replicates; allowed: path.to.key=value",

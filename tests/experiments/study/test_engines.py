@@ -65,7 +65,9 @@ def test_a_refused_trial_keeps_its_seed_and_reason_and_the_rest_is_done(tmp_path
     lost.write_text((ROOT / "scenes" / "shefex2.yaml").read_text())
     plan_ = study(
         tmp_path,
-        STUDY.replace("trial.false_lights, values: [0, 5]", "scene, values: [lost.yaml, shefex2]"),
+        STUDY.replace(
+            "trial.false_lights, values: [0, 5]", "scene, values: [lost.yaml, shefex2]"
+        ),
     )
     lost.unlink()
     paths = [tmp_path / f"{n}.sqlite" for n in range(2)]
@@ -116,7 +118,9 @@ def stubs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 def deaths(plan_: plan.Plan) -> list[int]:
     """The trials that kill a process running `deadly`."""
-    bad = [n for n in range(plan_.trials) if setups.seed_of(plan_.spec, *divmod(n, 150)) % 200 == 5]
+    bad = [
+        n for n in range(plan_.trials) if setups.seed_of(plan_.spec, *divmod(n, 150)) % 200 == 5
+    ]
     assert 1 <= len(bad) <= 3
     return bad
 
@@ -194,7 +198,9 @@ def test_trials_lost_with_a_worker_are_retried_one_by_one(
     monkeypatch.setattr(engines, "start_pool", lambda *_: pool)
     monkeypatch.setattr(engines, "wait", pool.wait)
     rows = [
-        row for batch in engines.Pool(2).run(trials.TrialJob(plan_.spec), queue) for row in batch
+        row
+        for batch in engines.Pool(2).run(trials.TrialJob(plan_.spec), queue)
+        for row in batch
     ]
     assert sorted(row.trial for row in rows) == list(range(12))
     assert [row.trial for row in rows if row.error is not None] == failed
@@ -220,7 +226,9 @@ class Run:
         """Wait until this number of trials is in the store; return whether it was reached."""
         assert self.process.stdout is not None
         for line in self.process.stdout:
-            self.family = psutil.Process(self.process.pid).children(recursive=True) or self.family
+            self.family = (
+                psutil.Process(self.process.pid).children(recursive=True) or self.family
+            )
             if int(line) >= count:
                 return True
         return False
@@ -313,7 +321,10 @@ def test_a_chunk_travels_as_text_and_comes_back_bit_for_bit() -> None:
         "light.layout": {"kind": "boards", "lit": [3, 6]},
         "camera.focus": None,
     }
-    chunk = (trials.Segment(3, settings, 41, range(7, 12)), trials.Segment(4, {}, 46, range(0, 1)))
+    chunk = (
+        trials.Segment(3, settings, 41, range(7, 12)),
+        trials.Segment(4, {}, 46, range(0, 1)),
+    )
     assert dask_engine.decode_chunk(dask_engine.encode_chunk(chunk)) == chunk
 
 
@@ -323,7 +334,8 @@ def test_a_run_that_is_stopped_leaves_nothing_on_the_cluster(
 ) -> None:
     engine = on_dask(cluster, 2)
     rows = engine.run(
-        trials.TrialJob(plan_.spec), runner.ChunkQueue(plan_.points, 150, np.arange(plan_.trials))
+        trials.TrialJob(plan_.spec),
+        runner.ChunkQueue(plan_.points, 150, np.arange(plan_.trials)),
     )
     assert next(rows)[0].error is None
     assert {len(state) for state in engine.client.run(recipes).values()} == {1}
@@ -399,7 +411,9 @@ def test_dask_gives_the_same_rows_after_losing_a_worker(
 )
 def test_an_invalid_address_is_refused_in_one_line(scheduler: str) -> None:
     pytest.importorskip("distributed")
-    with pytest.raises(InputError, match=r"scheduler: .*such as tcp://10\.0\.0\.1:8786") as refused:
+    with pytest.raises(
+        InputError, match=r"scheduler: .*such as tcp://10\.0\.0\.1:8786"
+    ) as refused:
         dask(scheduler)
     assert "\n" not in str(refused.value)
 
@@ -415,7 +429,9 @@ def test_an_address_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.long
-def test_without_the_extra_one_line_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_one_line_names_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     monkeypatch.delitem(
         sys.modules, "skysim.experiments.study.execution.dask_engine", raising=False

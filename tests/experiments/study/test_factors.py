@@ -8,7 +8,13 @@ from pydantic import TypeAdapter, ValidationError
 from scipy import stats
 
 from skysim.core.errors import InputError
-from skysim.experiments.study.factors import Design, Factor, join_quantity, points, split_quantity
+from skysim.experiments.study.factors import (
+    Design,
+    Factor,
+    join_quantity,
+    points,
+    split_quantity,
+)
 
 READ = TypeAdapter(Factor).validate_python
 
@@ -42,7 +48,10 @@ def test_a_range_includes_its_ends_and_may_be_logarithmic():
     ("factor", "law"),
     [
         ({"distribution": "normal", "mean": 3.0, "sigma": 2.0}, stats.norm(3, 2)),
-        ({"distribution": "lognormal", "median": 3.0, "sigma": 0.5}, stats.lognorm(0.5, scale=3)),
+        (
+            {"distribution": "lognormal", "median": 3.0, "sigma": 0.5},
+            stats.lognorm(0.5, scale=3),
+        ),
         (
             {"distribution": "triangular", "low": 0.0, "mode": 1.0, "high": 4.0},
             stats.triang(0.25, 0, 4),
@@ -84,7 +93,10 @@ def test_a_drawn_factor_has_its_declared_distribution(factor, law):
             {"key": "x", "distribution": "normal", "mean": 1},
             "normal: parameters mean; allowed: mean, sigma",
         ),
-        ({"key": "x", "distribution": "normal", "mean": "1 m", "sigma": "1 mm"}, "different units"),
+        (
+            {"key": "x", "distribution": "normal", "mean": "1 m", "sigma": "1 mm"},
+            "different units",
+        ),
         ({"key": "x", "distribution": "normal", "mean": 1, "sigma": 0}, "sigma is 0; allowed"),
         (
             {"key": "x", "distribution": "triangular", "low": 0, "mode": 5, "high": 4},
@@ -149,7 +161,9 @@ def test_one_at_a_time_leaves_all_others_at_their_first():
     found = points(Design(kind="one_at_a_time"), THREE, 1)
     assert len(found) == 1 + 2 + 1 + 4
     first = found[0].levels
-    assert all(sum(point.levels[name] != first[name] for name in first) == 1 for point in found[1:])
+    assert all(
+        sum(point.levels[name] != first[name] for name in first) == 1 for point in found[1:]
+    )
 
 
 def test_a_latin_hypercube_has_one_point_in_every_strip():

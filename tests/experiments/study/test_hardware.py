@@ -47,7 +47,9 @@ def test_every_replicate_has_its_own_hardware_the_same_at_every_point(
     assert len(set(seeds)) == 100
     assert min(seeds) >= 0
     other = spec.trial_settings({"trial.noise_px": 0.2}, 7)
-    assert [other[key] for key in STUDY["hardware"]] == [drawn[7][key] for key in STUDY["hardware"]]
+    assert [other[key] for key in STUDY["hardware"]] == [
+        drawn[7][key] for key in STUDY["hardware"]
+    ]
     assert loaded(tmp_path, seed=6).spec.trial_settings({}, 7) != spec.trial_settings({}, 7)
 
 
@@ -85,7 +87,10 @@ def test_leds_and_survey_are_drawn_independently(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"hardware": ["light.layout.count"]}, r"hardware.0: 'light.layout.count' is not allowed"),
+        (
+            {"hardware": ["light.layout.count"]},
+            r"hardware.0: 'light.layout.count' is not allowed",
+        ),
         ({"hardware": ["trial.noise_seed"]}, "hardware.0: trial.noise_seed is no hardware"),
         ({"hardware": ["light.led.hardware_seed"]}, "light.led.hardware_seed: unknown key"),
         (
@@ -114,11 +119,18 @@ def test_hardware_that_cannot_be_drawn_is_refused(
 
 def test_domes_with_names_are_levels_and_seeds_may_be_sampled(tmp_path: Path) -> None:
     named = {
-        "dome": {"levels": {name: {"light.layout.hardware_seed": n} for n, name in enumerate("AB")}}
+        "dome": {
+            "levels": {name: {"light.layout.hardware_seed": n} for n, name in enumerate("AB")}
+        }
     }
     assert len(loaded(tmp_path, factors=named, hardware=[]).points) == 2
     sampled = {
-        "survey": {"key": "tracker.survey.seed", "distribution": "integers", "low": 0, "high": 99}
+        "survey": {
+            "key": "tracker.survey.seed",
+            "distribution": "integers",
+            "low": 0,
+            "high": 99,
+        }
     }
     design = {"kind": "lhs", "points": 4}
     assert len(loaded(tmp_path, factors=sampled, design=design, hardware=[]).points) == 4
@@ -126,5 +138,6 @@ def test_domes_with_names_are_levels_and_seeds_may_be_sampled(tmp_path: Path) ->
 
 def test_hardware_is_part_of_the_digest(tmp_path: Path) -> None:
     assert (
-        loaded(tmp_path).digest != loaded(tmp_path, hardware=["light.layout.hardware_seed"]).digest
+        loaded(tmp_path).digest
+        != loaded(tmp_path, hardware=["light.layout.hardware_seed"]).digest
     )

@@ -45,7 +45,11 @@ def columns(
         name: np.zeros(count)
         for name in ("wrong", "ambiguous", "misidentified", "roll_noise", "misled")
     }
-    table |= {"trial": np.arange(count), "point": np.zeros(count, int), "seed": np.arange(count)}
+    table |= {
+        "trial": np.arange(count),
+        "point": np.zeros(count, int),
+        "seed": np.arange(count),
+    }
     table |= {"frames": np.ones(count), "solved": np.ones(count), "stars": np.full(count, 9.0)}
     table |= {name: np.ones(count) for name in ("x_arcsec", "y_arcsec", "roll_arcsec", "nees")}
     table["status"] = np.full(count, "solved", dtype=object)
@@ -230,7 +234,8 @@ def test_dome_and_sky_are_not_drawn_in_one_map() -> None:
     sky = columns(50, True)
     both = {name: np.concatenate([dome[name], sky[name]]) for name in dome}
     with pytest.raises(
-        InputError, match="map of wrong: trials under a dome and under the stars; allowed: where"
+        InputError,
+        match="map of wrong: trials under a dome and under the stars; allowed: where",
     ):
         maps.direction_map("", both, "wrong")
 
@@ -246,7 +251,10 @@ def test_dome_and_sky_are_not_drawn_in_one_map() -> None:
             {"figures": [{"kind": "map", "value": "wrong", "by": "led"}]},
             "figures.0.by: unknown factor 'led'",
         ),
-        ({"figures": [{"kind": "map", "value": "wrongs"}]}, "figures.0: unknown response 'wrongs'"),
+        (
+            {"figures": [{"kind": "map", "value": "wrongs"}]},
+            "figures.0: unknown response 'wrongs'",
+        ),
         (
             {"figures": [{"kind": "map", "value": "wrong", "where": {"leds": 7}}]},
             "figures.0.where.leds: unknown level 7",
@@ -345,7 +353,9 @@ def test_the_worst_trials_are_printed_as_a_start_section() -> None:
     """`motion.start` turns the body by the stored attitude, to the digits printed."""
     lab_from_body = Rotation.random(60, rng=np.random.default_rng(4))
     quaternion = dict(zip("wxyz", lab_from_body.as_quat(scalar_first=True).T, strict=True))
-    table = columns(60, **{f"lab_from_body_{part}": column for part, column in quaternion.items()})
+    table = columns(
+        60, **{f"lab_from_body_{part}": column for part, column in quaternion.items()}
+    )
     first = worst.worst_trials(table, "roll_arcsec")[0]
     start = yaml.safe_load(first.start)["motion.start"]
     back = guidance.attitude(AttitudeConfig.model_validate(start))
@@ -368,7 +378,8 @@ def test_the_worst_trials_are_replayed_by_their_number() -> None:
         name: np.array([getattr(row.outcome, name) for row in rows]) for name in FIELDS
     }
     table |= {
-        name: np.array([getattr(row, name) for row in rows]) for name in ("trial", "point", "seed")
+        name: np.array([getattr(row, name) for row in rows])
+        for name in ("trial", "point", "seed")
     }
     first = worst.worst_trials(table, "roll_arcsec_p95")[0]
     (again,) = trials.run_segments(

@@ -136,7 +136,9 @@ def test_correctly_claimed_roll_noise_beyond_ten_arcminutes_is_not_wrong(
 
 def test_a_regular_spiral_is_refused_as_ambiguous() -> None:
     plan = study_file.load("led_count")
-    point = next(one for one in plan.points if one.levels == {"leds": 1000, "placement": "spiral"})
+    point = next(
+        one for one in plan.points if one.levels == {"leds": 1000, "placement": "spiral"}
+    )
     rows = trials.run_segments(plan.spec, (trials.Segment(0, point.settings, 0, range(20)),))
     ambiguous = [row.outcome for row in rows if row.outcome.ambiguous]
     assert len(ambiguous) > 10
@@ -145,9 +147,12 @@ def test_a_regular_spiral_is_refused_as_ambiguous() -> None:
 
 def test_centroids_scatter_as_declared_in_the_trial() -> None:
     """RMS about each axis over 200 trials of some 20 lights each: to 4 standard errors, 0.3 / sqrt(2 * 4000)."""
-    rows = trials.run_segments(SKY, (trials.Segment(0, {"trial.noise_px": 0.3}, 0, range(200)),))
+    rows = trials.run_segments(
+        SKY, (trials.Segment(0, {"trial.noise_px": 0.3}, 0, range(200)),)
+    )
     weighted = [
-        (row.outcome.centroid_px**2 * row.outcome.detected, row.outcome.detected) for row in rows
+        (row.outcome.centroid_px**2 * row.outcome.detected, row.outcome.detected)
+        for row in rows
     ]
     mean_square, lights = np.sum(weighted, axis=0)
     assert math.sqrt(mean_square / lights) == pytest.approx(
@@ -173,7 +178,9 @@ def test_a_streak_is_as_long_as_the_rate_times_the_exposure() -> None:
         math.radians(4.0) * setup.lab.scene.exposure.time_s * setup.lab.scene.camera.focal_px
     )
     assert trials.run_frame_trial(setup, 5).streak_px == pytest.approx(expected_px, rel=0.03)
-    assert math.isnan(trials.run_centroid_trials(setups.prepared_setup(SKY, {}), [5])[0].streak_px)
+    assert math.isnan(
+        trials.run_centroid_trials(setups.prepared_setup(SKY, {}), [5])[0].streak_px
+    )
 
 
 @pytest.mark.slow
@@ -199,7 +206,8 @@ def median_path_px(flight: Flight, index: int) -> float:
     for t_s in (window.open_s, window.open_s + window.exposure_s):
         lab_from_body = flight.trajectory().attitude_at(t_s)
         offset_m = (
-            lab_from_body.inv().apply(camera.sources.place[seen, :3]) - camera.mount.camera_body_m
+            lab_from_body.inv().apply(camera.sources.place[seen, :3])
+            - camera.mount.camera_body_m
         )
         ends_px.append(camera.optics.project(camera.mount.cam_from_body.apply(offset_m)))
     return float(np.median(np.hypot(*(ends_px[1] - ends_px[0]).T)))

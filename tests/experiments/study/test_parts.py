@@ -119,7 +119,9 @@ def whole(path: Path) -> dict[str, list[Any]]:
     """Every column as values, for comparison: NaN as None, with their types."""
     with store.open_store(path) as kept:
         columns = kept.columns()
-        return {name: [store.to_sql(value) for value in columns[name].tolist()] for name in columns}
+        return {
+            name: [store.to_sql(value) for value in columns[name].tolist()] for name in columns
+        }
 
 
 def in_sqlite(path: Path) -> int:
@@ -168,7 +170,9 @@ def test_rows_of_store_and_parts_are_one_table(both: tuple[Path, Path]) -> None:
     assert whole(one) == whole(other)
     with store.open_store(one) as kept, store.open_store(other) as parted:
         assert parted.counts() == kept.counts() == {"done": 120, "failed": 4, "wrong": 3}
-        assert parted.done(130).tolist() == kept.done(130).tolist() == [True] * 120 + [False] * 10
+        assert (
+            parted.done(130).tolist() == kept.done(130).tolist() == [True] * 120 + [False] * 10
+        )
         assert parted.failures() == kept.failures()
         assert parted.scenes() == kept.scenes()
         assert parted.trial_range() == kept.trial_range() == "0 to 119"
@@ -274,7 +278,13 @@ class Killer:
 
 
 STEPS = ["arrow", "written", "rename", "renamed"]
-STEPS += ["INSERT INTO parts", "DELETE FROM trials", "DELETE FROM timings", "COMMIT", "next batch"]
+STEPS += [
+    "INSERT INTO parts",
+    "DELETE FROM trials",
+    "DELETE FROM timings",
+    "COMMIT",
+    "next batch",
+]
 
 
 def die_in_step(path: Path, step: str) -> None:
@@ -317,7 +327,8 @@ def test_a_kill_in_any_step_of_a_move_loses_and_duplicates_no_row(
     kept_rows = 0 if step == "next batch" else 60
     assert in_sqlite(path) == kept_rows
     expected = {
-        name: values[:60] for name, values in whole(filled(tmp_path / "whole.sqlite", ALL)).items()
+        name: values[:60]
+        for name, values in whole(filled(tmp_path / "whole.sqlite", ALL)).items()
     }
     assert whole(path) == expected
     with store.writing(path) as kept:
@@ -325,7 +336,11 @@ def test_a_kill_in_any_step_of_a_move_loses_and_duplicates_no_row(
         assert sorted(part.path for part in kept.parts()) == sorted(
             (tmp_path / "s.parts").iterdir()
         )
-        assert kept.db.execute("SELECT COUNT(*) FROM timings").fetchone()[0] == in_sqlite(path) < 50
+        assert (
+            kept.db.execute("SELECT COUNT(*) FROM timings").fetchone()[0]
+            == in_sqlite(path)
+            < 50
+        )
         assert kept.counts()["done"] == 60
         add_all(kept, ALL[60:])
     assert whole(path) == whole(tmp_path / "whole.sqlite")
@@ -490,7 +505,10 @@ def test_a_part_that_is_missing_or_damaged_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ("UPDATE parts SET rows = 7 WHERE part = 2", r"000002\.parquet: has \d+ rows; allowed: 7"),
+        (
+            "UPDATE parts SET rows = 7 WHERE part = 2",
+            r"000002\.parquet: has \d+ rows; allowed: 7",
+        ),
         (
             "UPDATE parts SET last = 'x' WHERE part = 2",
             r"s\.sqlite: not a valid study store: .*'x'",
@@ -538,9 +556,13 @@ def test_a_part_with_invalid_values_is_refused_in_one_line(
 ) -> None:
     path = filled(tmp_path / "s.sqlite", ALL)
     part = tmp_path / "s.parts/000002.parquet"
-    columns = {name: row_parts.read_column(part, name) for name in store.COLUMNS if name != "trial"}
+    columns = {
+        name: row_parts.read_column(part, name) for name in store.COLUMNS if name != "trial"
+    }
     changed = columns | {column: values(columns[column])}
-    row_parts.write_part(part, {name: one[: len(changed[column])] for name, one in changed.items()})
+    row_parts.write_part(
+        part, {name: one[: len(changed[column])] for name, one in changed.items()}
+    )
     for read in (store.Store.trial_range, store.Store.scenes, lambda kept: kept.done(10)):
         with (
             store.open_store(path) as kept,

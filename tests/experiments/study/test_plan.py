@@ -38,7 +38,9 @@ def test_a_plan_has_every_trial_of_every_point(tmp_path):
 def test_the_digest_covers_exactly_what_determines_the_trials(tmp_path):
     study_plan = study_file.load(written(tmp_path, STUDY))
     same = study_file.load(
-        written(tmp_path, STUDY.replace("a question", "another").replace(", cross_arcsec_p95", ""))
+        written(
+            tmp_path, STUDY.replace("a question", "another").replace(", cross_arcsec_p95", "")
+        )
     )
     assert same.digest == study_plan.digest
     for change in (
@@ -47,7 +49,8 @@ def test_the_digest_covers_exactly_what_determines_the_trials(tmp_path):
         ("replicates: 4", "replicates: 5"),
     ):
         assert (
-            study_file.load(written(tmp_path, STUDY.replace(*change))).digest != study_plan.digest
+            study_file.load(written(tmp_path, STUDY.replace(*change))).digest
+            != study_plan.digest
         )
 
 
@@ -113,7 +116,10 @@ def test_an_override_changes_the_study(tmp_path):
             r"budget.trials: 23; allowed: at least 24",
         ),
         (
-            ("replicates: 4", "replicates: 4\nfigures: [{kind: curve, x: rate, y: identified}]"),
+            (
+                "replicates: 4",
+                "replicates: 4\nfigures: [{kind: curve, x: rate, y: identified}]",
+            ),
             r"figures.0.x: unknown factor 'rate'; allowed: strays, focal",
         ),
         (
@@ -145,7 +151,9 @@ def test_an_unknown_study_is_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", sorted(plan.STUDIES.glob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted(plan.STUDIES.glob("*.yaml")), ids=lambda path: path.stem
+)
 def test_every_shipped_study_loads(path):
     """Every level of every factor makes a scene; `load` has tried them all."""
     study_plan = study_file.load(path)
@@ -194,7 +202,11 @@ def test_led_codes_without_a_flight_are_refused(tmp_path):
             "{near: {body: moon}}",
             "trial.start.near: has no effect with light of kind dome",
         ),
-        ("shefex2", "{near: {body: moon, off_deg: [5, 1]}}", "5 to 1; allowed: the smaller first"),
+        (
+            "shefex2",
+            "{near: {body: moon, off_deg: [5, 1]}}",
+            "5 to 1; allowed: the smaller first",
+        ),
         (
             "afit_simsat",
             "{tilt_deg: 31}",
@@ -215,7 +227,11 @@ def test_led_codes_without_a_flight_are_refused(tmp_path):
             "random",
             "trial.start: random with a collimated display; allowed: scene",
         ),
-        ("shefex2", "anywhere", r"trial\.flight\.start|trial\.start: 'anywhere' is not allowed"),
+        (
+            "shefex2",
+            "anywhere",
+            r"trial\.flight\.start|trial\.start: 'anywhere' is not allowed",
+        ),
     ],
 )
 def test_a_random_start_must_be_possible_in_the_scene(scene, start, complaint, tmp_path):

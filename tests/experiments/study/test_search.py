@@ -77,7 +77,15 @@ class Law:
             return Row(trial, segment.point, k, seed, REFUSED, code, FAILED, str(error), 0.0)
         except ArithmeticError as error:
             return Row(
-                trial, segment.point, k, seed, "s", code, FAILED, f"ArithmeticError: {error}", 0.0
+                trial,
+                segment.point,
+                k,
+                seed,
+                "s",
+                code,
+                FAILED,
+                f"ArithmeticError: {error}",
+                0.0,
             )
 
 
@@ -229,7 +237,9 @@ def test_a_refused_candidate_is_never_the_best(tmp_path: Path) -> None:
     found = searched(loaded(tmp_path, keys), tmp_path / "s.db", Law(law))
     assert any(one.refused for one in found.candidates)
     assert (
-        found.front[0].cost == min(one.cost for one in found.candidates if not one.refused) >= 0.5
+        found.front[0].cost
+        == min(one.cost for one in found.candidates if not one.refused)
+        >= 0.5
     )
 
 
@@ -269,7 +279,9 @@ def killer(after: int) -> Callable[[Any], None]:
     return watch
 
 
-def killed_and_resumed(study_plan: plan.Plan, out: Path, engine: engines.Engine, every: int) -> int:
+def killed_and_resumed(
+    study_plan: plan.Plan, out: Path, engine: engines.Engine, every: int
+) -> int:
     """Kill a search at every nth batch until it ends normally; return the number of kills."""
     for kills in itertools.count():
         try:
@@ -306,7 +318,9 @@ def test_a_search_killed_and_resumed_leaves_the_same_store(tmp_path: Path, every
 
 
 @pytest.mark.slow
-def test_a_search_of_a_real_scene_killed_and_resumed_leaves_the_same_store(tmp_path: Path) -> None:
+def test_a_search_of_a_real_scene_killed_and_resumed_leaves_the_same_store(
+    tmp_path: Path,
+) -> None:
     keys = changed(candidates=4) | {"replicates": 3}
     made = loaded(tmp_path, keys)
     searched(made, tmp_path / "whole.db", engines.Serial())
@@ -323,7 +337,8 @@ def test_a_store_of_another_search_is_refused(tmp_path: Path) -> None:
     searched(made, tmp_path / "s.db", Law(bowl))
     with store.writing(tmp_path / "s.db") as kept:
         kept.set_points(
-            [Point({"x": 1, "y": 1}, {"trial.noise_px": 1, "trial.magnitude_sigma": 1})], first=1
+            [Point({"x": 1, "y": 1}, {"trial.noise_px": 1, "trial.magnitude_sigma": 1})],
+            first=1,
         )
         with pytest.raises(InputError, match=r"candidate 1 is .*version of optuna"):
             search.search(made, kept, Law(bowl))
@@ -349,7 +364,10 @@ def test_the_callback_gets_the_progress_of_the_whole_search(tmp_path: Path) -> N
     seen = []
     made = loaded(tmp_path, changed(candidates=5))
     searched(
-        made, tmp_path / "s.db", Law(bowl), lambda now: seen.append((now.trials, now.done, now.now))
+        made,
+        tmp_path / "s.db",
+        Law(bowl),
+        lambda now: seen.append((now.trials, now.done, now.now)),
     )
     assert {trials for trials, _, _ in seen} == {20}
     assert [done for _, done, _ in seen] == sorted({done for _, done, _ in seen})
@@ -394,7 +412,9 @@ def test_cost_is_the_total_of_the_parts(tmp_path: Path) -> None:
     """As `skysim scenes parts` has it, of the candidate's own scene; a survey that no line reaches has none."""
     made = priced(tmp_path, "assumed")
     settings: Settings = {"light.layout.count": 200, "tracker.survey.led_sigma": "1 mm"}
-    scene = scene_loader.load("coded_spiral", {key: str(value) for key, value in settings.items()})
+    scene = scene_loader.load(
+        "coded_spiral", {key: str(value) for key, value in settings.items()}
+    )
     total = parts_list(scene, read_prices(find_prices("assumed"))).total
     found, why = search.cost(made, Point({"leds": 200, "survey": "1 mm"}, settings))
     assert (found, why) == (pytest.approx(7 + total, abs=1e-9), "")
@@ -420,7 +440,8 @@ def test_bad_prices_are_reported_as_errors_of_the_study(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.csv: cannot be read: .*study\.yaml"):
         priced(tmp_path, "none.csv")
     with pytest.raises(
-        InputError, match=r"optimize\.cost\.parts: light of kind stars has no parts; allowed: dome"
+        InputError,
+        match=r"optimize\.cost\.parts: light of kind stars has no parts; allowed: dome",
     ):
         loaded(tmp_path, changed(cost={"parts": "assumed"}))
 
@@ -430,7 +451,8 @@ def test_the_terminal_s_front_has_levels_error_and_cost(
 ) -> None:
     """A table of the two nondominated candidates of three."""
     study = loaded(
-        tmp_path, changed(objectives=[{"response": "angle_arcsec_median"}, {"response": "cost"}])
+        tmp_path,
+        changed(objectives=[{"response": "angle_arcsec_median"}, {"response": "cost"}]),
     ).study
     assert study.optimize is not None
     values = ((40.0, 100.0), (30.0, 200.0), (50.0, 300.0))
@@ -495,7 +517,9 @@ LEVELS = {"levels": {"cheap": {"trial.missing": 0.1}, "precise": {"trial.missing
         ({"candidates": 300}, r"budget\.trials: 1000; allowed: at least 1200"),
     ],
 )
-def test_wrong_names_are_answered_with_the_allowed_ones(keys: dict[str, Any], says: str) -> None:
+def test_wrong_names_are_answered_with_the_allowed_ones(
+    keys: dict[str, Any], says: str
+) -> None:
     study = changed(**keys) | {
         "factors": STUDY["factors"] | {"z": LEVELS},
         "budget": {"trials": 1000},

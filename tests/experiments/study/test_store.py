@@ -106,7 +106,9 @@ def test_a_writer_killed_at_any_instant_leaves_whole_batches(
 
 
 @pytest.mark.long
-def test_a_second_run_on_the_same_store_is_refused(study_plan: plan.Plan, tmp_path: Path) -> None:
+def test_a_second_run_on_the_same_store_is_refused(
+    study_plan: plan.Plan, tmp_path: Path
+) -> None:
     path = tmp_path / "one.sqlite"
     pid = child(lambda: done(study_plan, path, watch=lambda progress: time.sleep(0.05)))
     try:
@@ -151,10 +153,18 @@ def test_another_study_or_other_code_is_refused(
     done(study_plan, path)
     with pytest.raises(InputError, match="contains 120 trials; allowed: to resume the study"):
         done(study_plan, path)
-    for key, value in {"seed": "2", "replicates": "39", "set": "{light.limit_mag: 5.5}"}.items():
+    for key, value in {
+        "seed": "2",
+        "replicates": "39",
+        "set": "{light.limit_mag: 5.5}",
+    }.items():
         with pytest.raises(InputError, match="another study"):
             done(other(study_plan, **{key: value}), path, resume=True)
-    for key, value in {"title": "another", "responses": "[wrong]", "budget": "{time: 1 h}"}.items():
+    for key, value in {
+        "title": "another",
+        "responses": "[wrong]",
+        "budget": "{time: 1 h}",
+    }.items():
         assert done(other(study_plan, **{key: value}), path, resume=True).now == 0
     monkeypatch.setattr(runner, "code_version", lambda: "0123456789abcdef")
     with pytest.raises(InputError, match=r"trials are of skysim .*; allowed: 0123456789abcdef"):
@@ -233,7 +243,9 @@ def test_a_value_of_a_wrong_type_is_refused_in_one_line(
             kept.counts(),
             kept.columns(),
         )
-    assert re.fullmatch(r"[^\n]*odd\.sqlite: not a valid study store: [^\n]+", str(refused.value))
+    assert re.fullmatch(
+        r"[^\n]*odd\.sqlite: not a valid study store: [^\n]+", str(refused.value)
+    )
     assert str(refused.value).count("odd.sqlite") == 1
 
 
@@ -286,7 +298,8 @@ def test_trials_that_raise_become_rows_up_to_a_limit(
     path = tmp_path / "fragile.sqlite"
     study_plan = other(study_plan, paired="false")
     seeds = [
-        setups.seed_of(study_plan.spec, *divmod(trial, 40)) for trial in range(study_plan.trials)
+        setups.seed_of(study_plan.spec, *divmod(trial, 40))
+        for trial in range(study_plan.trials)
     ]
     bad = [trial for trial, seed in enumerate(seeds) if seed % 4 == 0]
     stopped = done(other(study_plan, paired="false", budget="{failures: 3}"), path)
@@ -308,7 +321,17 @@ def test_trials_that_raise_become_rows_up_to_a_limit(
 
 def test_rows_round_trip_through_the_store(tmp_path: Path) -> None:
     rows = [
-        Row(1, 0, 1, 2**63 - 1, "scene", "code", Outcome("solved", 1, 1, 0, 1.5, -0.1), None, 2e-3),
+        Row(
+            1,
+            0,
+            1,
+            2**63 - 1,
+            "scene",
+            "code",
+            Outcome("solved", 1, 1, 0, 1.5, -0.1),
+            None,
+            2e-3,
+        ),
         Row(0, 0, 0, 0, "", "code", Outcome("failed"), "Traceback\nboom", 1e-3),
     ]
     with store.writing(tmp_path / "rows.sqlite") as kept:
@@ -378,7 +401,9 @@ def test_chunks_are_sized_by_time() -> None:
     assert sizes[9] == int(runner.CHUNK_S / 0.1)
 
 
-@pytest.mark.parametrize(("workers", "rate_hz"), [(1, 4), (2, 8), (16, 64), (64, 64), (1000, 64)])
+@pytest.mark.parametrize(
+    ("workers", "rate_hz"), [(1, 4), (2, 8), (16, 64), (64, 64), (1000, 64)]
+)
 def test_the_rate_of_completed_chunks_is_bounded_for_many_workers(
     workers: int, rate_hz: float
 ) -> None:

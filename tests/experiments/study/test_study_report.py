@@ -113,11 +113,15 @@ class Html(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         attributes = dict(attrs)
         self.tags.append(tag)
-        self.sources += [attributes[name] or "" for name in ("src", "href") if name in attributes]
+        self.sources += [
+            attributes[name] or "" for name in ("src", "href") if name in attributes
+        ]
         if tag == "img":
             self.images.append(attributes["src"] or "")
         if tag in ("p", "code", "div", "pre"):
-            self._inside.append((attributes.get("id") or attributes.get("class") or tag).strip())
+            self._inside.append(
+                (attributes.get("id") or attributes.get("class") or tag).strip()
+            )
         if tag in ("h2", "summary"):
             self._in_title = True
             self._title = ""
@@ -197,7 +201,9 @@ def test_the_command_is_escaped_and_nothing_is_loaded_from_outside(tmp_path: Pat
     assert html.said["command"] == COMMAND
     assert html.tags.count("script") == 1  # the page's own
     assert "<title>Which &lt;dome&gt;?</title>" in text
-    assert not re.search(r"https?:|//[a-z]", re.sub(r"data:image/png;base64,[\w+/=]+", "", text))
+    assert not re.search(
+        r"https?:|//[a-z]", re.sub(r"data:image/png;base64,[\w+/=]+", "", text)
+    )
     assert html.sources == html.images
     assert all(source.startswith("data:image/png;base64,") for source in html.sources)
 
@@ -258,7 +264,13 @@ def test_names_sort_in_the_studys_order_and_quantities_by_their_number(tmp_path:
             {"factors": {"tilt": TILT, "dome": DOME}}
             | {
                 "figures": [
-                    {"kind": "heat", "x": "tilt", "y": "dome", "value": "stars_least", "log": True}
+                    {
+                        "kind": "heat",
+                        "x": "tilt",
+                        "y": "dome",
+                        "value": "stars_least",
+                        "log": True,
+                    }
                 ]
             },
             1,
@@ -272,7 +284,9 @@ def test_names_sort_in_the_studys_order_and_quantities_by_their_number(tmp_path:
         ),
     ],
 )
-def test_every_kind_of_figure_is_drawn(tmp_path: Path, keys: dict[str, Any], count: int) -> None:
+def test_every_kind_of_figure_is_drawn(
+    tmp_path: Path, keys: dict[str, Any], count: int
+) -> None:
     asked = study(**keys)
     html = written(filled(tmp_path / "s.sqlite", asked), asked)[1]
     assert len(html.images) == count
@@ -297,8 +311,13 @@ def test_indices_and_a_search_have_figures(tmp_path: Path) -> None:
         "0.4 (0.3..0.5)",
     ]
     objectives = [{"response": "cross_arcsec_median"}, {"response": "cost"}]
-    wanted = {"objectives": objectives, "constraints": [{"response": "stars_least", "at_least": 5}]}
-    asked = study(factors=factors, optimize=wanted | {"candidates": 4}, responses=["identified"])
+    wanted = {
+        "objectives": objectives,
+        "constraints": [{"response": "stars_least", "at_least": 5}],
+    }
+    asked = study(
+        factors=factors, optimize=wanted | {"candidates": 4}, responses=["identified"]
+    )
     tried = [designs.make_point({"tilt": (n, {"a": n})}) for n in range(3)]
     path = filled(tmp_path / "b.sqlite", asked, tried)
     statistics = dict.fromkeys(("cross_arcsec_median", "stars_least"), part)
@@ -306,7 +325,9 @@ def test_indices_and_a_search_have_figures(tmp_path: Path) -> None:
         search.Candidate(n, {"tilt": n}, (1.0, cost), statistics, cost, True, False, "")
         for n, cost in enumerate((7.0, 2.5))
     ]
-    html = written(path, asked, result=search.SearchResult(candidates, candidates[1:], False))[1]
+    html = written(path, asked, result=search.SearchResult(candidates, candidates[1:], False))[
+        1
+    ]
     assert len(html.images) == 2 + 1
     assert html.marked[1:] == [False, True, False]
     assert [row[-1] for row in html.tables[POINTS]] == ["cost", "7", "2.5", "–"]
@@ -350,7 +371,9 @@ def test_figures_draw_the_arranged_data(tmp_path: Path) -> None:
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("tilt [deg]", "cross median [arcsec]")
 
 
-def test_a_point_without_an_interval_has_no_bar_and_the_caption_names_the_trials_needed() -> None:
+def test_a_point_without_an_interval_has_no_bar_and_the_caption_names_the_trials_needed() -> (
+    None
+):
     from matplotlib.figure import Figure as Canvas
 
     nan = math.nan
@@ -385,7 +408,9 @@ def test_points_of_few_values_are_hollow_numbered_and_not_connected() -> None:
     from matplotlib.figure import Figure as Canvas
 
     lines = [
-        PointRow(n, {"tilt": tilt}, {"cross_arcsec_median": Summary(3.0 + n, 2.0, 9.0, count)}, 60)
+        PointRow(
+            n, {"tilt": tilt}, {"cross_arcsec_median": Summary(3.0 + n, 2.0, 9.0, count)}, 60
+        )
         for n, (tilt, count) in enumerate([(0, 60), (10, 12), (20, 50)])
     ]
     curve = Curve(kind="curve", x="tilt", y="cross_arcsec_median")
@@ -466,8 +491,12 @@ def test_a_curve_of_nees_has_a_line_at_three() -> None:
     (axes,) = fig.axes
     assert [one.get_ydata() for one in axes.lines if one.get_linestyle() == ":"] == [[3, 3]]
     assert axes.get_ylim()[0] < 3
-    assert "Dotted: 3, where the claimed errors are true." in layout.caption(curve, study(), lines)
-    assert layout.expected_value("nees_p95") is layout.expected_value("cross_arcsec_mean") is None
+    assert "Dotted: 3, where the claimed errors are true." in layout.caption(
+        curve, study(), lines
+    )
+    assert (
+        layout.expected_value("nees_p95") is layout.expected_value("cross_arcsec_mean") is None
+    )
 
 
 def test_a_heat_map_has_its_cells_in_order_and_nan_where_nothing_is(tmp_path: Path) -> None:
@@ -495,13 +524,18 @@ def test_axes_know_numbers_quantities_names_and_lists() -> None:
     rings = axis(RING, [[0, 10], [10, 20]])
     assert rings[:3] == ("a [deg]", [[10, 20], [0, 10]], False)
     assert rings.coordinate([0, 10]) == 1
-    assert axis({"key": "x", "values": [True, False]}, [False, True])[1:3] == ([True, False], False)
+    assert axis({"key": "x", "values": [True, False]}, [False, True])[1:3] == (
+        [True, False],
+        False,
+    )
     assert axis({"key": "x", "values": ["1 m", "1 ft"]}, ["1 ft", "1 m"])[1:3] == (
         ["1 m", "1 ft"],
         False,
     )
     steps = {"key": "x", "from": 1, "to": 1000}
-    assert [axis(steps | {"scale": one}, [1, 10, 100, 1000]).log for one in ("linear", "log")] == [
+    assert [
+        axis(steps | {"scale": one}, [1, 10, 100, 1000]).log for one in ("linear", "log")
+    ] == [
         False,
         True,
     ]
@@ -530,7 +564,9 @@ def test_an_unknown_name_in_where_is_answered_with_the_known_ones() -> None:
         ({"x": 1}, "allowed: dome, tilt"),
     ):
         with pytest.raises(InputError, match=said):
-            axes.shown_points(lines, Curve(kind="curve", x="tilt", y="wrong", where=where), asked)
+            axes.shown_points(
+                lines, Curve(kind="curve", x="tilt", y="wrong", where=where), asked
+            )
 
 
 def test_default_figures_follow_from_the_factors() -> None:

@@ -39,7 +39,9 @@ def logistic(x: np.ndarray, middle: float, width: float) -> np.ndarray:
     return 1 / (1 + np.exp((x - middle) / width))
 
 
-def counted(hits: list[int], trials: int = 400, limit: float = 0.95, log: bool = False) -> Crossing:
+def counted(
+    hits: list[int], trials: int = 400, limit: float = 0.95, log: bool = False
+) -> Crossing:
     return crossing(
         LEVELS[: len(hits)] + log,
         np.array(hits, float),
@@ -111,7 +113,9 @@ def test_the_interval_keeps_its_coverage_for_a_level_just_below_the_limit() -> N
     rng = np.random.default_rng(8)
     truth = np.array([1.0, 1.0, 0.949, 0.5, 0.1, 0, 0, 0])
     draws = rng.binomial(300, truth, size=(2000, 8)).astype(float)
-    above = [thresholds.certain_levels(LEVELS, hits, np.full(8, 300.0), 0.95)[0] for hits in draws]
+    above = [
+        thresholds.certain_levels(LEVELS, hits, np.full(8, 300.0), 0.95)[0] for hits in draws
+    ]
     wrong = np.mean([level is not None and level >= 2 for level in above])
     assert 0 < wrong <= 0.025 + 4 * math.sqrt(0.025 * 0.975 / 2000)
 
@@ -161,10 +165,14 @@ def test_a_study_states_the_rate_at_which_95_percent_are_identified() -> None:
 
 
 def test_a_level_of_the_sentence_has_its_unit() -> None:
-    factors = STUDY["factors"] | {"chain": {"key": "exposure.time", "values": ["0.5 ms", "5 ms"]}}
+    factors = STUDY["factors"] | {
+        "chain": {"key": "exposure.time", "values": ["0.5 ms", "5 ms"]}
+    }
     study = Study.model_validate(STUDY | {"factors": factors})
     said = thresholds.sentences(
-        study.thresholds[0], study, lines_of(study, {"0.5 ms": [1.0] * 8, "5 ms": [1.0] * 8}, 60)
+        study.thresholds[0],
+        study,
+        lines_of(study, {"0.5 ms": [1.0] * 8, "5 ms": [1.0] * 8}, 60),
     )
     assert [one.partition(":")[0] for one in said] == ["chain = 0.5 ms", "chain = 5 ms"]
 
@@ -189,7 +197,10 @@ def test_a_threshold_needs_trials_at_two_levels() -> None:
             r"thresholds.0.response: nees is no proportion; allowed: identified.*\(.*line 2\d\)",
         ),
         ({"along": "chain", "by": None}, "thresholds.0.along: chain has no two numeric levels"),
-        ({"along": "speed"}, "thresholds.0.along: unknown factor 'speed'; allowed: rate, chain"),
+        (
+            {"along": "speed"},
+            "thresholds.0.along: unknown factor 'speed'; allowed: rate, chain",
+        ),
         ({"limit": 1.5}, "thresholds.0.limit: 1.5 is not allowed"),
         ({"where": {"rate": 99}}, "thresholds.0.where.rate: unknown level 99; allowed: 0, 1"),
     ],

@@ -108,11 +108,15 @@ def test_attitudes_near_the_zenith_are_at_their_altitudes():
 def test_attitudes_near_a_body_are_uniform_about_it():
     """By the cosine of the angle from the Moon's place and by the angle around it."""
     near = {"body": "moon", "off_deg": [2.0, 8.0]}
-    ready = setups.prepared_setup(SKY, {"start_time": "2012-07-03T18:00:00", "trial.near": near})
+    ready = setups.prepared_setup(
+        SKY, {"start_time": "2012-07-03T18:00:00", "trial.near": near}
+    )
     rng = np.random.default_rng(3)
     drawn = Rotation.concatenate([trials.random_attitude(ready, rng) for _ in range(2000)])
     boresight = drawn.apply(ready.lab.camera.mount.cam_from_body.inv().apply([0, 0, 1]))
-    moon = place("moon", observe_from(ready.lab.scene.start_time, ready.lab.scene.site)).direction
+    moon = place(
+        "moon", observe_from(ready.lab.scene.start_time, ready.lab.scene.site)
+    ).direction
     low, high = np.cos(np.radians([8.0, 2.0]))
     level = (boresight @ moon - low) / (high - low)
     east = np.cross([0, 0, 1], moon)
@@ -131,7 +135,8 @@ def test_the_roll_about_the_boresight_is_uniform():
     seen = drawn.inv().apply([0, 0, 1])
     assert np.degrees(np.arccos(seen[:, 2])) == pytest.approx(20, abs=1e-9)
     assert (
-        stats.kstest(np.arctan2(seen[:, 1], seen[:, 0]) / (2 * np.pi) % 1, "uniform").pvalue > 1e-4
+        stats.kstest(np.arctan2(seen[:, 1], seen[:, 0]) / (2 * np.pi) % 1, "uniform").pvalue
+        > 1e-4
     )
 
 
@@ -201,7 +206,9 @@ def test_a_limited_number_of_lights_keeps_the_brightest():
 
 def test_another_noise_seed_keeps_the_attitude():
     prepared = [setups.prepared_setup(SKY, {"trial.noise_seed": n}) for n in (0, 1)]
-    (first, seen), (again, other) = (trials.solved_centroids(ready, [12])[0] for ready in prepared)
+    (first, seen), (again, other) = (
+        trials.solved_centroids(ready, [12])[0] for ready in prepared
+    )
     assert (first.lab_from_body * again.lab_from_body.inv()).magnitude() == 0
     assert (first.xy_px == again.xy_px).all()
     assert not np.array_equal(seen.centroids.xy_px, other.centroids.xy_px)
@@ -268,9 +275,15 @@ def test_centroid_trials_have_the_theoretical_error():
     """QUEST's covariance holds: mean NEES of three degrees of freedom, to five standard errors."""
     spec = replace(
         SKY,
-        base={"tracker.centroid_sigma_px": 1e-3, "light.limit_mag": 5.5, "tracker.limit_mag": 5.5},
+        base={
+            "tracker.centroid_sigma_px": 1e-3,
+            "light.limit_mag": 5.5,
+            "tracker.limit_mag": 5.5,
+        },
     )
-    rows = trials.run_segments(spec, (trials.Segment(0, {"trial.noise_px": 0.2}, 0, range(400)),))
+    rows = trials.run_segments(
+        spec, (trials.Segment(0, {"trial.noise_px": 0.2}, 0, range(400)),)
+    )
     nees = np.array(
         [row.outcome.nees for row in rows if row.outcome.solved and not row.outcome.wrong]
     )
@@ -285,7 +298,9 @@ def test_a_rotating_frame_is_smeared_by_the_gyro_s_rate():
     ready = setups.prepared_setup(spec, {})
     assert isinstance(ready.trial, FrameTrial)
     _, truth, told_px = trials.render_trial_frame(ready, 77)
-    wanted = math.radians(4.0) * ready.lab.scene.exposure.time_s * ready.lab.scene.camera.focal_px
+    wanted = (
+        math.radians(4.0) * ready.lab.scene.exposure.time_s * ready.lab.scene.camera.focal_px
+    )
     assert math.hypot(*told_px) == pytest.approx(wanted, rel=1e-12)
     middle = np.argmin(
         np.hypot(*(truth.sources.xy_px - np.array(ready.lab.camera.canvas.shape[::-1]) / 2).T)
@@ -297,7 +312,9 @@ def test_a_rotating_frame_is_smeared_by_the_gyro_s_rate():
 
 @pytest.mark.slow
 def test_a_flight_counts_its_frames_after_it_settled():
-    spec = replace(DOME, base={"exposure.frames": 6}, trial={"kind": "flight", "settle": "2.1 s"})
+    spec = replace(
+        DOME, base={"exposure.frames": 6}, trial={"kind": "flight", "settle": "2.1 s"}
+    )
     ready = setups.prepared_setup(spec, {})
     came = trials.run_flight_trial(ready, 5)
     # 2 Hz from 1 s on: 1, 1.5 and 2 s are before.
@@ -404,9 +421,13 @@ def test_a_rotation_about_the_boresight_keeps_its_star_in_place():
 def test_a_flight_starts_anywhere_and_the_same_for_the_same_seed(name):
     """Start attitudes are uniform, drawn from the same stream as those of other trials."""
     trial = {"kind": "flight", "start": "random"}
-    ready = setups.prepared_setup(TrialSpec(name, ".", 1, {"exposure.frames": 1}, trial, True), {})
+    ready = setups.prepared_setup(
+        TrialSpec(name, ".", 1, {"exposure.frames": 1}, trial, True), {}
+    )
     kind = {"kind": "frames"}
-    other = setups.prepared_setup(TrialSpec(name, ".", 1, {"exposure.frames": 1}, kind, True), {})
+    other = setups.prepared_setup(
+        TrialSpec(name, ".", 1, {"exposure.frames": 1}, kind, True), {}
+    )
     starts = [trials.trial_flight(ready, seed).state.lab_from_body for seed in (5, 6, 5)]
     assert (starts[0].inv() * starts[2]).magnitude() == 0
     assert (starts[0].inv() * starts[1]).magnitude() > 0.01
@@ -495,7 +516,8 @@ def test_tracking_follows_a_motion_until_its_prediction_leaves_the_windows(gyro)
     assert near == ["solved"] * 3
     assert [status.startswith("tracking lost") for status in far] == [not gyro] * 3
     assert (
-        tracked_statuses({"trial.rate_deg_s": 2.0, "trial.gyro": gyro}, range(3)) == ["solved"] * 3
+        tracked_statuses({"trial.rate_deg_s": 2.0, "trial.gyro": gyro}, range(3))
+        == ["solved"] * 3
     )
 
 

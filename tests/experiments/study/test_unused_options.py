@@ -239,7 +239,11 @@ def test_an_option_that_has_an_effect_at_another_factor_s_level_is_allowed(
     ],
 )
 def test_a_refused_option_changes_no_outcome(
-    scene: str, trial: str, settings: dict[str, object], change: dict[str, object], tmp_path: Path
+    scene: str,
+    trial: str,
+    settings: dict[str, object],
+    change: dict[str, object],
+    tmp_path: Path,
 ) -> None:
     plan = study_file.load(study(tmp_path, scene, trial, NOISE, "{}"))
     outcomes = []

@@ -54,7 +54,9 @@ def availability(
     config = load(scene, None, None, overrides)
     if config.orbit is None or config.orbit.exclusion is None:
         raise InputError(
-            "orbit.exclusion", "the scene has none", "a scene with a section orbit with exclusion"
+            "orbit.exclusion",
+            "the scene has none",
+            "a scene with a section orbit with exclusion",
         )
     for value, allowed, name in ((law, LAWS, "law"), (span, tuple(SPANS_S), "span")):
         if value not in allowed:
@@ -72,9 +74,15 @@ def availability(
     if picture is not None:
         write_picture(picture, found, exclusion)
     if json:
-        print_json({"span": span, "law": law, "samples": len(found.t_s), "fractions": fractions})
+        print_json(
+            {"span": span, "law": law, "samples": len(found.t_s), "fractions": fractions}
+        )
         return
-    limits = {"Sun": exclusion.sun_deg, "Earth": exclusion.earth_deg, "Moon": exclusion.moon_deg}
+    limits = {
+        "Sun": exclusion.sun_deg,
+        "Earth": exclusion.earth_deg,
+        "Moon": exclusion.moon_deg,
+    }
     rows = [
         [name, f"more than {limit:g}° away", f"{100 * fractions[name]:.2f} %"]
         for name, limit in limits.items()
@@ -82,7 +90,9 @@ def availability(
     rows.append(["stars", f"at least {exclusion.stars}", f"{100 * fractions['stars']:.2f} %"])
     rows.append(["all", "available", f"{100 * fractions['all']:.2f} %"])
     columns = [Column("", kind="text"), Column("condition"), Column("fraction of time")]
-    print_table(Table(columns, rows), f"{config.name}: {span} of {found.t_s[-1] / HOUR_S:.4g} h")
+    print_table(
+        Table(columns, rows), f"{config.name}: {span} of {found.t_s[-1] / HOUR_S:.4g} h"
+    )
 
 
 def pointing_of(scene: Scene, law: str, off_deg: float, around_deg: float) -> Pointing:

@@ -25,7 +25,9 @@ def complete_camera(incomplete: str) -> list[str]:
     from skysim.core.paths import DATA
 
     names = {
-        path.stem for path in (DATA / "cameras").glob("*.yaml") if path.stem.startswith(incomplete)
+        path.stem
+        for path in (DATA / "cameras").glob("*.yaml")
+        if path.stem.startswith(incomplete)
     }
     return sorted(names | set(complete_scene(incomplete)))
 
@@ -79,7 +81,9 @@ def preset_entry(path: Path) -> dict[str, str]:
 
     tree, text = read_yaml(path)
     camera = tree["camera"]
-    comment = " ".join(line.removeprefix("#") for line in text.splitlines() if line.startswith("#"))
+    comment = " ".join(
+        line.removeprefix("#") for line in text.splitlines() if line.startswith("#")
+    )
     return {
         "name": path.stem,
         "size": f"{camera['width_px']} x {camera['height_px']} px",
@@ -118,13 +122,16 @@ def camera_show(
 
     lens, body = read_camera(file, set_)
     if lens is None and out:
-        raise InputError(f"--out {out}", f"{file} has no lens", "--set camera.focal_length='16 mm'")
+        raise InputError(
+            f"--out {out}", f"{file} has no lens", "--set camera.focal_length='16 mm'"
+        )
     if lens is not None and out:
         files.make_folder(out.parent)
         files.write_text(out, opencv_calibration.text(lens))
     if json:
         known = (
-            dataclasses.asdict(lens) | {"field_deg": lens.field_deg, "arcsec_px": lens.arcsec_px}
+            dataclasses.asdict(lens)
+            | {"field_deg": lens.field_deg, "arcsec_px": lens.arcsec_px}
             if lens
             else {}
         )
@@ -211,11 +218,12 @@ def camera_new(
     dark_current: Annotated[Answer, sheet_option("dark_current")] = None,
     prnu: Annotated[Answer, sheet_option("prnu")] = None,
     name: Annotated[
-        str, typer.Option(help="Name of camera, lens and data sheets, for the file's first line.")
+        str,
+        typer.Option(help="Name of camera, lens and data sheets, for the file's first line."),
     ] = "",
-    out: Annotated[Path, typer.Option(help="The file to write, for the key camera.preset.")] = Path(
-        "camera.yaml"
-    ),
+    out: Annotated[
+        Path, typer.Option(help="The file to write, for the key camera.preset.")
+    ] = Path("camera.yaml"),
     json: Json = False,
 ) -> None:
     """Write a camera file from the numbers of a data sheet: asks for each; with options, only those are used.
@@ -253,7 +261,9 @@ def ask_all() -> dict[str, str]:
         required = name in camera_sheet.PLACEHOLDERS
         if not required and name not in camera_sheet.outstanding(answers):
             continue  # of a lens or a shutter that this camera does not have
-        assumed = "" if required else camera_sheet.outstanding(answers)[name].assumed or "left out"
+        assumed = (
+            "" if required else camera_sheet.outstanding(answers)[name].assumed or "left out"
+        )
         print(
             f"\n{question.ask}\n  where: {question.where}"
             + (f"\n  not stated: {assumed}" if assumed else "")
@@ -289,7 +299,11 @@ def print_new(path: Path, filled: Sheet) -> None:
         line = f"{name:19s}{one.assumed or 'left out'}: {one.consequence}"
         print(
             textwrap.fill(
-                line, width, initial_indent="  ", subsequent_indent=" " * 21, break_on_hyphens=False
+                line,
+                width,
+                initial_indent="  ",
+                subsequent_indent=" " * 21,
+                break_on_hyphens=False,
             )
         )
     print(f"in a scene: camera: {{preset: {path}}}; skysim camera {path} shows it")

@@ -23,7 +23,8 @@ def dataset(
     scene: SceneArg,
     frames: Annotated[int, typer.Option(help="Number of frames.")],
     out: Annotated[
-        str, typer.Option(metavar="URL", help="Output folder, or a URL such as s3://bucket/folder.")
+        str,
+        typer.Option(metavar="URL", help="Output folder, or a URL such as s3://bucket/folder."),
     ],
     vary: Annotated[
         Path | None,
@@ -35,7 +36,8 @@ def dataset(
     to: Annotated[
         list[str] | None,
         typer.Option(
-            "--to", help="Format: webdataset, zarr, coco; repeatable. Default: webdataset and coco."
+            "--to",
+            help="Format: webdataset, zarr, coco; repeatable. Default: webdataset and coco.",
         ),
     ] = None,
     shard_frames: Annotated[int, typer.Option(help="Frames of a shard.")] = 64,
@@ -71,7 +73,12 @@ def dataset(
         trial_progress(f"dataset of {scene}", frames, "frames") as update,
     ):
         progress = dataset_run.run(made, out, chosen, update)
-    result = {"out": out, "frames": progress.done, "shards": made.shards, "failed": progress.failed}
+    result = {
+        "out": out,
+        "frames": progress.done,
+        "shards": made.shards,
+        "failed": progress.failed,
+    }
     if json:
         print_json(result | {"rate_hz": progress.rate})
     else:

@@ -52,7 +52,8 @@ def datasheet(
     fmu: Annotated[
         bool,
         typer.Option(
-            "--fmu", help="With --model: also as a co-simulation unit of FMI 3 (needs pythonfmu3)."
+            "--fmu",
+            help="With --model: also as a co-simulation unit of FMI 3 (needs pythonfmu3).",
         ),
     ] = False,
     open_: OpenReport = False,
@@ -109,7 +110,9 @@ def write_model(folder: Path, sheet: MeasuredFrames, fmu: bool, json: bool) -> N
 
     agreements = model_fit.agreements(sheet)
     agreement = [one._asdict() for one in agreements]
-    written = model_fit.write_model(folder, model_fit.constants(sheet) | {"agreement": agreement})
+    written = model_fit.write_model(
+        folder, model_fit.constants(sheet) | {"agreement": agreement}
+    )
     if fmu:
         written.append(model_fit.write_fmu(folder))
     if not json:
@@ -131,7 +134,15 @@ def print_agreements(agreements: list[Agreement]) -> None:
         ]
         for one in agreements
     ]
-    heads = ["rate °/s", "frames", "p of x", "p of y", "p of roll", "correlation", "of the model"]
+    heads = [
+        "rate °/s",
+        "frames",
+        "p of x",
+        "p of y",
+        "p of roll",
+        "correlation",
+        "of the model",
+    ]
     table = Table([Column("fitted to", kind="text"), *map(Column, heads)], rows)
     print_table(
         table,

@@ -34,7 +34,9 @@ def balance(
     scene: SceneArg,
     excite: Annotated[
         Excitation,
-        typer.Option(help="Tilt by the wheels at three yaw angles, or let go and swing freely."),
+        typer.Option(
+            help="Tilt by the wheels at three yaw angles, or let go and swing freely."
+        ),
     ] = Excitation.WHEELS,
     estimate_only: Annotated[
         bool, typer.Option("--estimate-only", help="Estimate from one flight; move nothing.")
@@ -117,7 +119,9 @@ def balance(
     )
 
 
-def fly(scene: Scene, plan: BalancePlan, uncertainty: Uncertainty, json: bool) -> list[Iteration]:
+def fly(
+    scene: Scene, plan: BalancePlan, uncertainty: Uncertainty, json: bool
+) -> list[Iteration]:
     """Fly and move the trim masses until the vehicle is balanced; print each flight, unless `json`."""
     from skysim.experiments import balance_procedure, balance_report
 
@@ -145,7 +149,9 @@ def print_flight(row: dict[str, Any]) -> None:
 
     places = "/".join(f"{one:.3f}" for one in row["next_trim_mm"])
     moved = f"; trim masses to {places} mm" if row["next_trim_mm"] != row["trim_mm"] else ""
-    contact = f", {row['after_contact']} of them after a contact" if row["after_contact"] else ""
+    contact = (
+        f", {row['after_contact']} of them after a contact" if row["after_contact"] else ""
+    )
     print_wrapped(
         f"flight {row['flight']}: {row['solved']} of {row['frames']} frames solved{contact};"
         f" center of mass at {offset_text(row)} um;"
@@ -191,7 +197,9 @@ def characterize(
     if frames_to is not None:
         given = {"darks": darks, "flats": flats, "night": night, "out": out}
         if conflict := next((name for name, value in given.items() if value is not None), None):
-            raise InputError(f"--{conflict}", "has no effect with --frames-to", "one of the two")
+            raise InputError(
+                f"--{conflict}", "has no effect with --frames-to", "one of the two"
+            )
         write_simulated(config, frames_to, seed, json)
         return
     folders = characterize_camera.check_folders(darks, flats)
@@ -213,4 +221,6 @@ def write_simulated(config: Any, folder: Path, seed: int, json: bool) -> None:
     if json:
         print_json({"frames": len(paths), "folder": str(folder)})
     else:
-        print_wrapped(f"{len(paths)} frames: --darks {folder / 'darks'} --flats {folder / 'flats'}")
+        print_wrapped(
+            f"{len(paths)} frames: --darks {folder / 'darks'} --flats {folder / 'flats'}"
+        )

@@ -86,7 +86,8 @@ def scenes_parts(
     prices: Annotated[
         str,
         typer.Option(
-            metavar="FILE", help="Table of prices (.csv); `assumed` is the one that comes along."
+            metavar="FILE",
+            help="Table of prices (.csv); `assumed` is the one that comes along.",
         ),
     ] = "assumed",
     out: Annotated[Path | None, typer.Option(help="Also write the list as CSV.")] = None,
@@ -125,7 +126,9 @@ def catalog_build(
     ] = "hipparcos",
     limit: Annotated[
         float | None,
-        typer.Option(help="Faintest Hp (hipparcos) or V (gaia); default: the shipped 6.5 and 8.0."),
+        typer.Option(
+            help="Faintest Hp (hipparcos) or V (gaia); default: the shipped 6.5 and 8.0."
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -162,12 +165,15 @@ def catalog_info(
 
 def export(
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="Output folder of `skysim run` or `render`.")
+        Path,
+        typer.Argument(metavar="FOLDER", help="Output folder of `skysim run` or `render`."),
     ],
     to: Annotated[
         list[str],
         typer.Option(
-            "--to", metavar="FORMAT", help="aem, ecsv, parquet, tiff, zarr or video; repeatable."
+            "--to",
+            metavar="FORMAT",
+            help="aem, ecsv, parquet, tiff, zarr or video; repeatable.",
         ),
     ],
     out: Annotated[Path | None, typer.Option(help="Output folder; default: FOLDER.")] = None,

@@ -52,7 +52,8 @@ def run(
     scene_3d: Annotated[
         bool,
         typer.Option(
-            "--scene-3d", help="Write 3-D views of the laboratory: scene_3d.png and scene_3d.gif."
+            "--scene-3d",
+            help="Write 3-D views of the laboratory: scene_3d.png and scene_3d.gif.",
         ),
     ] = False,
     open_: OpenReport = False,
@@ -111,7 +112,9 @@ def render(
     set_: Overrides = None,
     preview: Annotated[
         bool,
-        typer.Option("--preview", help="Write an 8-bit image of each frame with the truth marked."),
+        typer.Option(
+            "--preview", help="Write an 8-bit image of each frame with the truth marked."
+        ),
     ] = False,
     json: Json = False,
 ) -> None:
@@ -131,7 +134,9 @@ def render(
         recorder = FlightRecorder(folder, flight)
         with terminal.progress_callback(loaded.title) as update:
             for shot in flight.shots(solves=False, progress=update):
-                paths.append(str(recorder.of(shot.camera).write(shot.frame, shot.truth, preview)))
+                paths.append(
+                    str(recorder.of(shot.camera).write(shot.frame, shot.truth, preview))
+                )
     if json:
         terminal.print_json(paths)
     else:

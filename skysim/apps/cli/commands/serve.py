@@ -34,7 +34,9 @@ def stream(
             min=0, max=65535, help="Serve MJPEG and packets on this port; 0: any free port."
         ),
     ] = None,
-    host: Annotated[str, typer.Option(help="Address to serve on, without access control.")] = HOST,
+    host: Annotated[
+        str, typer.Option(help="Address to serve on, without access control.")
+    ] = HOST,
     pipe: Annotated[
         str | None,
         typer.Option(
@@ -49,7 +51,8 @@ def stream(
         ),
     ] = False,
     speed: Annotated[
-        float, typer.Option(min=0, max=1000, help="Multiple of real time; 0: as fast as possible.")
+        float,
+        typer.Option(min=0, max=1000, help="Multiple of real time; 0: as fast as possible."),
     ] = 1.0,
     seed: Seed = None,
     set_: Overrides = None,
@@ -160,8 +163,12 @@ def gui(
             help="Access token that browsers must send; default: a random one, in the printed link."
         ),
     ] = "",
-    folder: Annotated[Path, typer.Option(help="Folder in which new scenes are saved.")] = Path("."),
-    out: Annotated[Path, typer.Option(help="Folder of studies and their reports.")] = Path("out"),
+    folder: Annotated[Path, typer.Option(help="Folder in which new scenes are saved.")] = Path(
+        "."
+    ),
+    out: Annotated[Path, typer.Option(help="Folder of studies and their reports.")] = Path(
+        "out"
+    ),
     camera: Annotated[
         list[str] | None,
         typer.Option(
@@ -171,7 +178,9 @@ def gui(
     ] = None,
     workers: Annotated[
         int,
-        typer.Option(min=1, help="Most worker processes, one for each page; further pages wait."),
+        typer.Option(
+            min=1, help="Most worker processes, one for each page; further pages wait."
+        ),
     ] = 12,
     show: Annotated[bool, typer.Option("--open/--no-open", help="Open a browser.")] = True,
 ) -> None:

@@ -62,7 +62,9 @@ def solve(
     centroider: Centroider = None,
     identifier: Identifier = None,
     solver: SolverName = None,
-    out: Annotated[Path, typer.Option(help="Folder for the annotated images.")] = Path("out/solve"),
+    out: Annotated[Path, typer.Option(help="Folder for the annotated images.")] = Path(
+        "out/solve"
+    ),
     json: Json = False,
 ) -> None:
     """Solve the attitude of sky images, lost in space; uncertain matches are rejected.

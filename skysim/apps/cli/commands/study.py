@@ -51,7 +51,8 @@ StudyArg = Annotated[
     ),
 ]
 Workers = Annotated[
-    int | None, typer.Option(min=1, help="Number of worker processes; default: number of cores.")
+    int | None,
+    typer.Option(min=1, help="Number of worker processes; default: number of cores."),
 ]
 EngineName = Annotated[
     str, typer.Option("--engine", help="How trials are run: pool, serial or dask.")
@@ -125,7 +126,15 @@ def resume(
     plan, overrides = load_stored_plan(study, out, program or [], set_, grows=True)
     trial_engine = create_engine(engine, workers, scheduler)
     run_and_report(
-        plan, study, out, trial_engine, overrides, json, open_, resumed=True, repeat_failed=failed
+        plan,
+        study,
+        out,
+        trial_engine,
+        overrides,
+        json,
+        open_,
+        resumed=True,
+        repeat_failed=failed,
     )
 
 
@@ -146,7 +155,9 @@ def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
 
 
 @app.command()
-def report(study: StudyArg, out: Out = None, open_: OpenReport = False, json: Json = False) -> None:
+def report(
+    study: StudyArg, out: Out = None, open_: OpenReport = False, json: Json = False
+) -> None:
     """Write the report of a study, finished or not, and print its table."""
     study, out = located(study, out)
     plan, _ = load_stored_plan(study, out)
@@ -186,7 +197,9 @@ def replay(
         ),
     ],
     out: Out = None,
-    show: Annotated[bool, typer.Option("--open/--no-open", help="Open the first image.")] = False,
+    show: Annotated[
+        bool, typer.Option("--open/--no-open", help="Open the first image.")
+    ] = False,
     program: Programs = None,
     json: Json = False,
 ) -> None:
@@ -229,7 +242,8 @@ def worst(
     where: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="FACTOR=LEVEL", help="Only points at this level; may be given several times."
+            metavar="FACTOR=LEVEL",
+            help="Only points at this level; may be given several times.",
         ),
     ] = None,
     count: Annotated[int, typer.Option(min=1, max=100, help="Number of attitudes.")] = 3,
@@ -319,7 +333,9 @@ def run_and_report(
             f"{counts['done']} of {total} trials done within the budget; continue: {resume_command}"
         )
     if counts["failed"]:
-        print_error(f"{counts['failed']} trials failed; list them: {command(study, out, 'status')}")
+        print_error(
+            f"{counts['failed']} trials failed; list them: {command(study, out, 'status')}"
+        )
     write_report(plan, study, out, json, open_)
 
 

@@ -68,7 +68,9 @@ AttitudesBy = Annotated[
 ]
 Next = Annotated[
     int | None,
-    typer.Option("--next", min=1, help=f"Number of attitudes to propose next; default: {NEXT}."),
+    typer.Option(
+        "--next", min=1, help=f"Number of attitudes to propose next; default: {NEXT}."
+    ),
 ]
 FramesTo = Annotated[
     Path | None,
@@ -81,7 +83,9 @@ ImuSigma = Annotated[
 LedSigma = Annotated[
     str, typer.Option(help="Standard error of an LED's assumed position along each axis.")
 ]
-LeverSigma = Annotated[str, typer.Option(help="Standard error of the camera's assumed position.")]
+LeverSigma = Annotated[
+    str, typer.Option(help="Standard error of the camera's assumed position.")
+]
 FocalError = Annotated[str, typer.Option(help="Error of the assumed focal length.")]
 Distortion = Annotated[
     bool, typer.Option("--distortion", help="Also fit the distortion k1, k2, p1, p2.")
@@ -178,7 +182,9 @@ def check_mode(
     given: set[str],
 ) -> None:
     """Raise InputError for options that exclude one another or have no effect."""
-    modes = [name for name, on in (("images", images), ("plan", plan), ("repeat", repeat)) if on]
+    modes = [
+        name for name, on in (("images", images), ("plan", plan), ("repeat", repeat)) if on
+    ]
     if len(modes) > 1:
         raise InputError(f"--{modes[1]}", f"has no effect with --{modes[0]}", "one of them")
     if images is not None and camera is None:
@@ -188,7 +194,9 @@ def check_mode(
             "with --camera FILE, a scene, camera file or OpenCV calibration",
         )
     if camera is not None and images is None:
-        raise InputError("--camera", "has no effect without --images", "the scene's camera is used")
+        raise InputError(
+            "--camera", "has no effect without --images", "the scene's camera is used"
+        )
     if watch and images is None:
         raise InputError("--watch", "has no effect without --images", "with --images FOLDER")
     mode = "watch" if watch else modes[0] if modes else "simulate"

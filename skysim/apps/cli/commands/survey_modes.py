@@ -117,7 +117,9 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str
         run = adjust.run_survey(observations, before, uncertainty, request.distortion, update)
     statistics = write_results(request, run, before, lab)
     tracker = factory.build_tracker(
-        survey_prior.with_map(lab.scene, statistics["map"]), lab.camera.mount, lab.camera.sources
+        survey_prior.with_map(lab.scene, statistics["map"]),
+        lab.camera.mount,
+        lab.camera.sources,
     )
     tests = survey_frames.render_stops(
         lab,
@@ -133,7 +135,9 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str
     return write_report(request, run, statistics | {"frames": count, "predicted": predicted})
 
 
-def from_images(request: Request, images: Path, camera_file: Path, watch: bool) -> dict[str, Any]:
+def from_images(
+    request: Request, images: Path, camera_file: Path, watch: bool
+) -> dict[str, Any]:
     """A survey from the images of a folder, with the LEDs of the scene as the list before it."""
 
     known, read = read_camera(camera_file)
@@ -239,7 +243,9 @@ def write_results(
     dome_map_file.write_dome_map(path, adjust.dome_map(run.survey, request.uncertainty))
     so_far = survey_findings.coverage(run)
     faults = survey_findings.find_faults(run)
-    statistics = survey_report.survey_statistics(run, before) | with_next(request, so_far, before)
+    statistics = survey_report.survey_statistics(run, before) | with_next(
+        request, so_far, before
+    )
     statistics |= {
         "scene": request.scene.name,
         "faults": asdict(faults),
@@ -257,7 +263,9 @@ def write_results(
     return statistics
 
 
-def write_report(request: Request, run: SurveyRun, statistics: dict[str, Any]) -> dict[str, Any]:
+def write_report(
+    request: Request, run: SurveyRun, statistics: dict[str, Any]
+) -> dict[str, Any]:
     """Write a survey's statistics as JSON, and its report, which is printed too; return them with the report's path."""
 
     path = request.folder / "report.html"

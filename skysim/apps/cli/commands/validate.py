@@ -51,7 +51,8 @@ def validate(
     ] = None,
     program: Programs = None,
     schema: Annotated[
-        str | None, typer.Option(help="Print the JSON Schema of a kind of file: scene or study.")
+        str | None,
+        typer.Option(help="Print the JSON Schema of a kind of file: scene or study."),
     ] = None,
     json: Json = False,
 ) -> None:
@@ -95,7 +96,9 @@ def check(
     from skysim.simulation.lab import UserParts, build_lab
 
     loaded = load(scene, None, None, set_)
-    result = check_plan(build_lab(loaded, UserParts(used_programs(program, scene_names(loaded)))))
+    result = check_plan(
+        build_lab(loaded, UserParts(used_programs(program, scene_names(loaded))))
+    )
     findings = [with_location(finding) for finding in result.findings]
     if json:
         print_json(result._replace(findings=findings).as_dict())
@@ -126,7 +129,9 @@ def describe_file(
 
     path = path if path.suffix else find_shipped(path)
     if path.suffix not in (".yaml", ".yml", ".ecsv", ".xml"):
-        raise InputError(path, "", ".yaml, .ecsv, .xml or the name of a scene, a study or a camera")
+        raise InputError(
+            path, "", ".yaml, .ecsv, .xml or the name of a scene, a study or a camera"
+        )
     if not is_file(path):  # reading a named pipe would block
         raise InputError(path, "not a regular file")
     if path.suffix == ".ecsv":

@@ -45,7 +45,9 @@ async def perform(action: Action) -> None:
 def matching(commands: list[Command], text: str) -> list[Command]:
     """The commands whose name has every word of a text, in the order of the list."""
     words = text.lower().split()
-    return [command for command in commands if all(word in command.name.lower() for word in words)]
+    return [
+        command for command in commands if all(word in command.name.lower() for word in words)
+    ]
 
 
 class Palette:

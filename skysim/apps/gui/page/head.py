@@ -124,7 +124,9 @@ class Head:
             return
         name = image_export.FILE_BY_ITEM[item]
         if not name:
-            ui.download(image_export.zip_archive(files), f"{Path(self.page.state.scene).stem}.zip")
+            ui.download(
+                image_export.zip_archive(files), f"{Path(self.page.state.scene).stem}.zip"
+            )
         elif name in files:
             ui.download(files[name], name)
         else:
@@ -232,7 +234,10 @@ class Arrangement:
 
     async def restore(self) -> None:
         """Take the theme that the browser remembers."""
-        if await ui.run_javascript('localStorage.getItem("skysim.theme")', timeout=10) == "light":
+        if (
+            await ui.run_javascript('localStorage.getItem("skysim.theme")', timeout=10)
+            == "light"
+        ):
             self.set_dark(False)
 
     def reset(self) -> None:

@@ -51,7 +51,9 @@ class LogPanel:
         self.page = page
         self.lines: list[str] = []
         self.rows: list[tuple[Any, ...]] = []
-        self.button = widgets.button("CSV of the identifications", self.download, "log-csv", "flat")
+        self.button = widgets.button(
+            "CSV of the identifications", self.download, "log-csv", "flat"
+        )
         self.button.set_enabled(False)
         self.label = ui.label("Nothing yet.").classes("mono lab-log").mark("log")
 
@@ -66,7 +68,9 @@ class LogPanel:
         self.button.set_enabled(True)
 
     def download(self) -> None:
-        ui.download(csv_table(COLUMNS, self.rows), f"{Path(self.page.state.scene).stem}_log.csv")
+        ui.download(
+            csv_table(COLUMNS, self.rows), f"{Path(self.page.state.scene).stem}_log.csv"
+        )
 
 
 def line(view: FrameView, info: SceneInfo) -> str:
@@ -77,11 +81,10 @@ def line(view: FrameView, info: SceneInfo) -> str:
         return f"identify {noise} noise: {result.status if result else 'no result'}"
     counts = f"{result.identified} of {len(result.detections)}"
     angles = "  ".join(
-        f"{name} {angle:.4f}°" for name, angle in zip(info.names, result.angles_deg, strict=True)
+        f"{name} {angle:.4f}°"
+        for name, angle in zip(info.names, result.angles_deg, strict=True)
     )
-    errors = (
-        f"error {result.cross_arcsec:.2f}″ across, {result.roll_arcsec:+.1f}″ about the boresight"
-    )
+    errors = f"error {result.cross_arcsec:.2f}″ across, {result.roll_arcsec:+.1f}″ about the boresight"
     return f"identify {noise} noise: {result.status}, {counts}; {angles}; {errors}"
 
 

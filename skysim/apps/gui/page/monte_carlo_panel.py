@@ -71,7 +71,9 @@ class MonteCarloPanel:
         self.stopped = False
         self.starting = False
         with widgets.row():
-            self.study_select = widgets.select({}).props('aria-label="Study"').classes("flex-grow")
+            self.study_select = (
+                widgets.select({}).props('aria-label="Study"').classes("flex-grow")
+            )
             self.study_select.mark("study").on_value_change(self.study_chosen)
             self.button = widgets.button("Start", self.start_or_stop, "monte-carlo")
         with ui.element("div").classes("lab-trial") as self.fields:
@@ -88,9 +90,13 @@ class MonteCarloPanel:
             self.with_noise = widgets.checkbox("with noise", value=True).mark("with-noise")
             self.noise_text = widgets.quiet().mark("noise-text")
         self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
-        self.note = widgets.quiet("No study has been run yet: press 2.").style("margin-top: 6px")
+        self.note = widgets.quiet("No study has been run yet: press 2.").style(
+            "margin-top: 6px"
+        )
         self.note.mark("trials-note")
-        self.chart = ui.echart(options()).classes("w-full").style("height: 190px").mark("histogram")
+        self.chart = (
+            ui.echart(options()).classes("w-full").style("height: 190px").mark("histogram")
+        )
         self.table = ui.element("div").classes("mono w-full").mark("figures")
         self.failures = ui.column().classes("w-full gap-1")
         ui.separator().style("margin: 8px 0")
@@ -101,7 +107,8 @@ class MonteCarloPanel:
     def set_scene(self) -> None:
         options = {"": f"Monte Carlo of {Path(self.page.state.scene).stem}"}
         options |= {
-            path.stem: f"{path.stem}: {title_of(path)}" for path in sorted(STUDIES.glob("*.yaml"))
+            path.stem: f"{path.stem}: {title_of(path)}"
+            for path in sorted(STUDIES.glob("*.yaml"))
         }
         self.study_select.set_options(options, value=self.study_select.value or "")
         info = self.page.scene_info
@@ -245,7 +252,9 @@ class MonteCarloPanel:
             section = TrialSection.model_validate({"trial": trial})
         except ValidationError:  # the study's loader says in one line what is wrong
             return overrides
-        unused = unused_options.unused_overrides(overrides, load(scene, overrides), section.trial)
+        unused = unused_options.unused_overrides(
+            overrides, load(scene, overrides), section.trial
+        )
         return {key: text for key, text in overrides.items() if key not in unused}
 
     def show_end(self, fault: str) -> None:
@@ -339,7 +348,8 @@ class MonteCarloPanel:
     async def replay(self, number: int) -> None:
         """Repeat a failed trial and show its frame in the sensor view."""
         study = next(
-            iter(self.process.folder.glob("*.yaml")), STUDIES / f"{self.study_select.value}.yaml"
+            iter(self.process.folder.glob("*.yaml")),
+            STUDIES / f"{self.study_select.value}.yaml",
         )
         self.page.stop_playback()
         photo = await self.page.run_task(
@@ -350,7 +360,9 @@ class MonteCarloPanel:
             activity=f"replaying trial {number} …",
         )
         if photo:
-            self.page.show_photo(photo, kind="replay", study=self.process.folder.name, trial=number)
+            self.page.show_photo(
+                photo, kind="replay", study=self.process.folder.name, trial=number
+            )
             self.page.log(f"replayed trial {number}: {photo.result.status}")
 
     def list_reports(self) -> None:

@@ -53,9 +53,9 @@ class PhotoPanel:
             on_upload=weak_handler(self.uploaded),
             on_rejected=weak_handler(self.rejected),
         )
-        self.upload.props(f'flat bordered accept="{",".join(SUFFIXES)}"').classes("w-full").style(
-            "margin: 10px 0"
-        )
+        self.upload.props(f'flat bordered accept="{",".join(SUFFIXES)}"').classes(
+            "w-full"
+        ).style("margin: 10px 0")
         self.upload.mark("upload")
         with widgets.row():
             self.source = widgets.select(
@@ -120,10 +120,14 @@ class PhotoPanel:
         source = str(self.source.value)
         self.button.set_text("Stop")
         while self.live:
-            photo = await self.page.run_task("solve_camera", source, self.fov.value, self.stages)
+            photo = await self.page.run_task(
+                "solve_camera", source, self.fov.value, self.stages
+            )
             if not self.page.is_open:
                 return
-            if photo or not solved_count:  # a camera that ends keeps its last result on the page
+            if (
+                photo or not solved_count
+            ):  # a camera that ends keeps its last result on the page
                 self.show("camera", photo)
             solved_count += 1
             self.live = self.live and photo is not None

@@ -34,7 +34,9 @@ HOLD_PERIODS = 2.0
 TILT_MARGIN_DEG = 0.5  # to the vehicle's stop
 TILT_STEPS = 61  # points of a slew at which its tilt is looked at
 FRAMES = 20  # of a survey, at first
-ALIKE = 0.9  # of the LEDs that coincide: a tracker without a prior refuses the field as ambiguous
+ALIKE = (
+    0.9  # of the LEDs that coincide: a tracker without a prior refuses the field as ambiguous
+)
 UNCHECKED = "Check computes what this scene will show and how accurate its tracker will be. Nothing is rendered."
 UNMAPPED = "Map compares the fields of the dome with one another: a field that looks like another one is ambiguous."
 COLORED = "In the 3-D view the LEDs are the brighter the better they are measured."

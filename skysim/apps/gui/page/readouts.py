@@ -101,7 +101,9 @@ class AttitudeCard:
         self.set_headers(photo.names)
         self.set_placeholder("unknown")
         texts = (
-            [format_angle(angle) for angle in photo.true_deg] if photo.true_deg else ["", "", ""]
+            [format_angle(angle) for angle in photo.true_deg]
+            if photo.true_deg
+            else ["", "", ""]
         )
         for field, text in zip(self.inputs, texts, strict=True):
             field.set_value(text)
@@ -216,7 +218,15 @@ def rows(
     for n in sorted(left):
         spot = found[n]
         taken = name(spot.id) if spot.id >= 0 else ""
-        texts = ["no light", "", f"{spot.flux:.4g}", f"{spot.x:.2f}", f"{spot.y:.2f}", "", taken]
+        texts = [
+            "no light",
+            "",
+            f"{spot.flux:.4g}",
+            f"{spot.x:.2f}",
+            f"{spot.y:.2f}",
+            "",
+            taken,
+        ]
         yield {"key": f"detection {n}", "id": -1, "state": "warn", "cells": texts}
 
 

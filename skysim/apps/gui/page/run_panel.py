@@ -172,7 +172,9 @@ class RunPanel:
         if self.closed_scene != state.scene or feedback == (self.feedback or ""):
             return
         others = {
-            key: value for key, value in state.overrides.items() if not key.startswith(CONTROL_KEYS)
+            key: value
+            for key, value in state.overrides.items()
+            if not key.startswith(CONTROL_KEYS)
         }
         controls = {}
         maneuver = {}
@@ -242,7 +244,9 @@ class RunPanel:
         self.times_s += [row.t_s for row in step.rows]
         self.log = step.log or self.log
         self.bar.set_value(step.t_s / max(step.duration_s, 1e-9))
-        self.summary.set_text(f"{step.t_s:.2f} of {step.duration_s:.2f} s, {len(self.rows)} frames")
+        self.summary.set_text(
+            f"{step.t_s:.2f} of {step.duration_s:.2f} s, {len(self.rows)} frames"
+        )
         if time.monotonic() > self.drawn_s + DRAW_S and (step.rows or step.log):
             self.draw()
 

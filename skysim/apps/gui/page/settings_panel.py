@@ -122,7 +122,9 @@ class KeyForm:
                 if len(field.allowed_values) == 1:
                     entry.props("readonly hide-dropdown-icon")
             else:
-                entry = ui.input(value=field.shown).props(f'dense outlined suffix="{field.unit}"')
+                entry = ui.input(value=field.shown).props(
+                    f'dense outlined suffix="{field.unit}"'
+                )
                 entry.on("keydown.enter", edit).on("blur", edit)
             entry.classes("flex-grow").style("width: 0; margin-bottom: 3px").mark(
                 f"key-{field.key}"
@@ -135,7 +137,8 @@ class KeyForm:
     def style_class(self, field: forms.FormField) -> str:
         """Style class of a key: changed by the user, set in a file, or default."""
         changed = any(
-            field.key == key or field.key.startswith(f"{key}.") for key in self.page.state.overrides
+            field.key == key or field.key.startswith(f"{key}.")
+            for key in self.page.state.overrides
         )
         return "warn" if changed else "given" if field.is_set else "quiet"
 
@@ -161,7 +164,9 @@ class KeyForm:
             return
         before = self.page.state.overrides
         try:
-            after = await run.io_bound(forms.with_value, self.page.state.scene, before, key, value)
+            after = await run.io_bound(
+                forms.with_value, self.page.state.scene, before, key, value
+            )
         except InputError as error:
             self.show_error(key, error.fault if error.key == key else for_page(error))
             return
@@ -209,7 +214,9 @@ class ScenePanel:
             )
             self.name.classes("w-36").mark("save-name")
             widgets.button("Save as", self.save, "save").props("no-wrap")
-            self.undo = widgets.button("Undo all", self.revert, "revert", "flat").props("no-wrap")
+            self.undo = widgets.button("Undo all", self.revert, "revert", "flat").props(
+                "no-wrap"
+            )
         self.no_match = ui.label("No key contains this text.").classes("w-full empty")
         self.no_match.set_visibility(False)
         self.form = KeyForm(page, lambda field: field.key.removeprefix(f"{field.section}."))
@@ -228,7 +235,9 @@ class ScenePanel:
         text = (self.find.value or "").lower()
         for key, box in self.form.rows.items():
             box.set_visibility(text in key.lower())
-        visible = {field.section for key, field in self.form.fields.items() if text in key.lower()}
+        visible = {
+            field.section for key, field in self.form.fields.items() if text in key.lower()
+        }
         for section, expansion in self.form.expansions.items():
             expansion.set_visibility(section in visible)
         self.no_match.set_visibility(not visible)

@@ -102,7 +102,9 @@ class Dots(ui.element, component="js/strips.js"):  # type: ignore[call-arg]
 
 
 def strips(
-    rows: Sequence[FlightRow], log: MotionLog, residuals: Sequence[tuple[float, int, float]] = ()
+    rows: Sequence[FlightRow],
+    log: MotionLog,
+    residuals: Sequence[tuple[float, int, float]] = (),
 ) -> list[Strip]:
     """Return the strips of a flight that have something to show.
 
@@ -124,7 +126,9 @@ def strips(
         Strip(
             "cross-boresight error, ″",
             (
-                StripCurve("tracker", of_frames(lambda row: max(row.cross_arcsec, 1e-3)), "dots"),
+                StripCurve(
+                    "tracker", of_frames(lambda row: max(row.cross_arcsec, 1e-3)), "dots"
+                ),
                 StripCurve("3σ", of_frames(lambda row: 3 * row.cross_sigma_arcsec), "band"),
             ),
             logarithmic=True,
@@ -220,7 +224,12 @@ def dot_fields(drawn: list[Strip], name: Callable[[int], str]) -> dict[str, Any]
     n = next((n for n, strip in enumerate(drawn) if strip.dots), 0)
     dots = drawn[n].dots if drawn else []
     names = {int(id): name(int(id)) for _, _, id in dots}
-    place = {"left": LEFT_PX, "right": RIGHT_PX, "top": n * STRIP_PX + HEAD_PX, "height": INNER_PX}
+    place = {
+        "left": LEFT_PX,
+        "right": RIGHT_PX,
+        "top": n * STRIP_PX + HEAD_PX,
+        "height": INNER_PX,
+    }
     return {"dots": dots, "names": names, "grid": n, "place": place, "color": CURVE_COLORS[0]}
 
 
@@ -269,14 +278,18 @@ def y_axis(strip: Strip, n: int) -> dict[str, Any]:
     if strip.dots:
         return axis | {"min": 0, "max": round_up(max(dot[1] for dot in strip.dots))}
     return axis | (
-        decades([y for curve in strip.drawn for _, y in curve.points]) if strip.logarithmic else {}
+        decades([y for curve in strip.drawn for _, y in curve.points])
+        if strip.logarithmic
+        else {}
     )
 
 
 def round_up(value: float) -> float:
     """The next greater of 1, 2, 5, 10, ... times a power of ten."""
     decade = 10.0 ** math.floor(math.log10(max(value, 1e-6)))
-    return float(f"{next(step * decade for step in (1, 2, 5, 10) if step * decade >= value):.6g}")
+    return float(
+        f"{next(step * decade for step in (1, 2, 5, 10) if step * decade >= value):.6g}"
+    )
 
 
 def decades(values: list[float]) -> dict[str, float]:
@@ -317,4 +330,6 @@ def rms_line(rows: Sequence[FlightRow]) -> str:
         math.hypot(*errors) / math.sqrt(len(solved))
         for errors in zip(*((row.cross_arcsec, row.roll_arcsec) for row in solved), strict=True)
     )
-    return f"{len(solved)} of {len(rows)} frames solved; rms: cross {cross:.3g}″, roll {roll:.3g}″"
+    return (
+        f"{len(solved)} of {len(rows)} frames solved; rms: cross {cross:.3g}″, roll {roll:.3g}″"
+    )

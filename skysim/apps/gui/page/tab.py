@@ -140,7 +140,8 @@ class Tab:
                 for key in keys.KEYS:
                     if key.description:
                         ui.html(
-                            f"<span><kbd>{key.label}</kbd>{key.description}</span>", sanitize=False
+                            f"<span><kbd>{key.label}</kbd>{key.description}</span>",
+                            sanitize=False,
                         )
         await asyncio.sleep(PAUSE_S)
         self.history = History(self, self.state.scene, self.show_query, self.is_settling)
@@ -157,14 +158,16 @@ class Tab:
             with ui.element("div").classes("lab-space-pane"):
                 self.scene_3d = Scene3D(self, self.sensor)
             Arrangement.splitter("space", "horizontal", "Height of the 3-D view")
-            with ui.tabs().props("dense align=left no-caps indicator-color=primary") as self.tabs:
+            with ui.tabs().props(
+                "dense align=left no-caps indicator-color=primary"
+            ) as self.tabs:
                 # Otherwise the arrow keys would select tabs.
                 self.tabs.on("click", js_handler=keys.BLUR_JS)
                 for name in PANELS:
                     ui.tab(name).mark(f"tab-{name}")
-            with ui.tab_panels(self.tabs, value=PANELS[0], animated=False, keep_alive=True).classes(
-                "lab-panels"
-            ):
+            with ui.tab_panels(
+                self.tabs, value=PANELS[0], animated=False, keep_alive=True
+            ).classes("lab-panels"):
                 with ui.tab_panel("Lights"):
                     self.lights = LightsPanel(self.sensor)
                 with ui.tab_panel("Scene"):
@@ -212,10 +215,14 @@ class Tab:
         """Further commands: those of the flight, of the history and of the arrangement, panels, and exports."""
         return [
             Command("show the next frame of the flight", ".", partial(self.run_panel.step, 1)),
-            Command("show the previous frame of the flight", ",", partial(self.run_panel.step, -1)),
+            Command(
+                "show the previous frame of the flight", ",", partial(self.run_panel.step, -1)
+            ),
             Command("undo the last change", "Ctrl Z", self.history.undo),
             Command("redo the change that was undone", "Ctrl Shift Z", self.history.redo),
-            Command("compute the flight of the scene, or stop that", "", self.run_panel.simulate),
+            Command(
+                "compute the flight of the scene, or stop that", "", self.run_panel.simulate
+            ),
             Command("change between the dark and the light theme", "", self.arrangement.toggle),
             Command(
                 "give frame, 3-D view and panels their first sizes", "", self.arrangement.reset
@@ -282,7 +289,9 @@ class Tab:
         if not is_shown or wanted.angles_deg is None:
             if not await self.open(wanted.scene, wanted.overrides, wanted.angles_deg):
                 return
-        elif wanted.kind == "live" and (now.kind != "live" or now.angles_deg != wanted.angles_deg):
+        elif wanted.kind == "live" and (
+            now.kind != "live" or now.angles_deg != wanted.angles_deg
+        ):
             self.stop_playback()
             await self.show_live("point", wanted.angles_deg, self.solving)
         if wanted.study != self.state.study:
@@ -358,7 +367,9 @@ class Tab:
     ) -> None:
         """Reopen the scene with further overrides and without some; edits made meanwhile follow one after the other."""
         async with self.editing:
-            kept = {key: text for key, text in self.state.overrides.items() if key not in dropped}
+            kept = {
+                key: text for key, text in self.state.overrides.items() if key not in dropped
+            }
             await self.open(self.state.scene, {**kept, **overrides})
 
     async def fill_form(self) -> None:

@@ -174,7 +174,9 @@ def section_fields(
         else:
             subtree = short_path(subtree)
             text = yaml_line(subtree) if is_set else yaml_line(file_value(value, si_unit(name)))
-            yield FormField(key, text, display_unit(file_key), allowed_values(annotation), is_set)
+            yield FormField(
+                key, text, display_unit(file_key), allowed_values(annotation), is_set
+            )
 
 
 def short_path(value: Any) -> Any:
@@ -200,7 +202,9 @@ def allowed_values(annotation: Any) -> tuple[str, ...]:
         return tuple(str(item) for item in get_args(annotation))
     parts = [item for item in get_args(annotation) if item is not type(None)]
     return (
-        allowed_values(parts[0]) if len(parts) == 1 and get_origin(annotation) is not tuple else ()
+        allowed_values(parts[0])
+        if len(parts) == 1 and get_origin(annotation) is not tuple
+        else ()
     )
 
 
@@ -221,7 +225,9 @@ def models(annotation: Any) -> dict[str, type[BaseModel]]:
 def offered_kinds(annotation: Any) -> tuple[str, ...]:
     """The kinds that a section may be given by a choice, with NO_SECTION if it may be left out; () if there is none."""
     found = tuple(
-        kind for kind, model in models(annotation).items() if first_section(model, kind) is not None
+        kind
+        for kind, model in models(annotation).items()
+        if first_section(model, kind) is not None
     )
     return (NO_SECTION, *found) if found and NoneType in get_args(annotation) else found
 
@@ -252,17 +258,23 @@ def with_value(name: str, overrides: Mapping[str, str], key: str, text: str) -> 
     """
     section = key.removesuffix(".kind")
     changed = (
-        with_kind(name, overrides, section, text) if section != key else {**overrides, key: text}
+        with_kind(name, overrides, section, text)
+        if section != key
+        else {**overrides, key: text}
     )
     scene = load(name, changed, refuses_unused=False)
     kept = {
-        one: value for one, value in changed.items() if one == key or not unused.reason(one, scene)
+        one: value
+        for one, value in changed.items()
+        if one == key or not unused.reason(one, scene)
     }
     validated_scene(name, kept)
     return kept
 
 
-def with_kind(name: str, overrides: Mapping[str, str], section: str, kind: str) -> dict[str, str]:
+def with_kind(
+    name: str, overrides: Mapping[str, str], section: str, kind: str
+) -> dict[str, str]:
     """Overrides by which a section gets another kind: that of the file, or with the keys that this kind requires.
 
     Keys that both kinds have keep their values.
@@ -281,7 +293,9 @@ def with_kind(name: str, overrides: Mapping[str, str], section: str, kind: str) 
     now = section_at(load(name, overrides), section)[1]
     kept = {
         info.alias or field: file_value(getattr(now, field), si_unit(field))
-        for field, info in (type(now).model_fields.items() if isinstance(now, BaseModel) else ())
+        for field, info in (
+            type(now).model_fields.items() if isinstance(now, BaseModel) else ()
+        )
         if field != "kind"
         and field in now.model_fields_set
         and same_field(model, field, info.annotation)
@@ -373,7 +387,11 @@ def field_override(name: str, overrides: Mapping[str, str], field_deg: float) ->
         raise InputError("field", "", "0.5 to 120 deg")
     camera = load(name, overrides).camera
     focal_m = (
-        camera.focal_length_m / camera.focal_px * camera.width_px / 2 / tan(radians(field_deg / 2))
+        camera.focal_length_m
+        / camera.focal_px
+        * camera.width_px
+        / 2
+        / tan(radians(field_deg / 2))
     )
     return {"camera.focal_length": f"{1e3 * focal_m:.5g} mm"}
 

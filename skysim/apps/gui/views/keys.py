@@ -53,7 +53,9 @@ KEYS = (
         "Monte Carlo",
         "start a Monte Carlo study; F8 sets its number of trials",
     ),
-    Key(("F5",), "F5", "attitude", "attitude", "type an attitude; Enter points the camera there"),
+    Key(
+        ("F5",), "F5", "attitude", "attitude", "type an attitude; Enter points the camera there"
+    ),
     Key(("F6",), "F6", "sensor", "sensor", "set up image processing and the sensor's noise"),
     Key(
         ("F7",),
@@ -67,7 +69,13 @@ KEYS = (
     Key((",", "."), ", .", "step", "", "show the previous or the next frame of the flight"),
     Key(("l",), "L", "live", "", "return to the live scene"),
     Key(("Ctrl+z",), "Ctrl Z", "undo", "", "undo the last change; Ctrl Shift Z: redo"),
-    Key(("Ctrl+k",), "Ctrl K", "palette", "actions", "list every action; type a part of its name"),
+    Key(
+        ("Ctrl+k",),
+        "Ctrl K",
+        "palette",
+        "actions",
+        "list every action; type a part of its name",
+    ),
     Key(("F10",), "F10", "log", "log", "show the log of this session"),
     Key(("F1",), "F1", "help", "help", "show this help"),
     Key(("Escape",), "Esc", "close", "close", "close the help"),
@@ -100,7 +108,10 @@ def focus(field: ui.element) -> None:
 
 def help_dialog() -> ui.dialog:
     """A dialog that says what the page is for, and lists its keys."""
-    with ui.dialog() as dialog, ui.card().style("max-width: 600px; padding: 20px 24px; gap: 12px"):
+    with (
+        ui.dialog() as dialog,
+        ui.card().style("max-width: 600px; padding: 20px 24px; gap: 12px"),
+    ):
         ui.label("skysim gui").style("font-weight: 600; font-size: 15px")
         ui.label(
             "Point the star sensor, view its frame, and compare the tracker's attitude with the true one. Under a"

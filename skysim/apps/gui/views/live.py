@@ -102,7 +102,9 @@ LABELS = {  # of the fields, by the parameter's key; a key of a scene is the lab
 def for_page(error: InputError) -> str:
     """An error with the label of the field at fault; without a place if the value was typed in the page."""
     where = None if error.where == OVERRIDES else error.where
-    return str(InputError(LABELS.get(error.key, error.key), error.problem, error.allowed, where))
+    return str(
+        InputError(LABELS.get(error.key, error.key), error.problem, error.allowed, where)
+    )
 
 
 def format_number(value: float) -> str:

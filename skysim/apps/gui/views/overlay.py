@@ -67,7 +67,9 @@ def marks(
     found_px = np.array([(one.x, one.y) for one in detections], float).reshape(-1, 2)
     is_identified = np.array(ids, np.int64) >= 0
     visible = lights[:MAX_TRUTH_MARKS]
-    offset_px = np.abs(lights.xy_px[:, None] - found_px)  # of each true light and each detection
+    offset_px = np.abs(
+        lights.xy_px[:, None] - found_px
+    )  # of each true light and each detection
     near = (offset_px < NEAR_PX).all(axis=2)
     bright = bright_count(visible, ids, near[: len(visible)])
     is_false = ~near.any(axis=0) & bool(len(lights))  # without true lights it is not known
@@ -95,7 +97,9 @@ def marks(
     }
 
 
-def bright_count(lights: LightColumns, identified: Collection[int], near: NDArray[np.bool_]) -> int:
+def bright_count(
+    lights: LightColumns, identified: Collection[int], near: NDArray[np.bool_]
+) -> int:
     """How many lights, the brightest first, are as bright as the faintest identified one, or else detected one.
 
     In a field of hundreds of faint stars some detection of noise is beside one of them.

@@ -31,7 +31,14 @@ from skysim.apps.gui.messages import (
 )
 from skysim.apps.gui.views import overlay, widgets
 from skysim.apps.gui.views.live import Contents, LiveText
-from skysim.apps.gui.views.overlay import FRAMES, NAMES, ServedFrame, Source, TabFrames, display_of
+from skysim.apps.gui.views.overlay import (
+    FRAMES,
+    NAMES,
+    ServedFrame,
+    Source,
+    TabFrames,
+    display_of,
+)
 from skysim.apps.gui.worker.photo import Photo
 from skysim.core.types import Floats
 from skysim.results import plots
@@ -94,7 +101,10 @@ class SensorView:
             self.build_controls()
             with Canvas().mark("sensor") as self.canvas:
                 self.hover = LiveText(contents).classes("mono").mark("hover")
-            with self.canvas.add_slot("wait"), ui.element("div").classes("lab-wait") as self.wait:
+            with (
+                self.canvas.add_slot("wait"),
+                ui.element("div").classes("lab-wait") as self.wait,
+            ):
                 # No spinner: each takes a sixth of a core from the worker that it waits for, without a graphics card.
                 self.waited = ui.element("div").classes("lab-waited mono")
                 self.wait_label = ui.label().mark("wait")
@@ -130,7 +140,10 @@ class SensorView:
     def select(self, name: str, options: Collection[str], width: str) -> ui.select:
         """A list of display settings."""
         chosen = widgets.select(
-            list(options), "borderless", value=next(iter(options)), on_change=self.update_display
+            list(options),
+            "borderless",
+            value=next(iter(options)),
+            on_change=self.update_display,
         )
         return chosen.props(f'aria-label="{name}"').classes(width)
 
@@ -191,7 +204,9 @@ class SensorView:
     def show(self, view: FrameView, info: SceneInfo | None) -> None:
         """Show a frame of the scene."""
         self.prefix = info.prefix if info else "HIP"
-        self.statistics = statistics_text(view.size_px, view.statistics, view.result, view, info)
+        self.statistics = statistics_text(
+            view.size_px, view.statistics, view.result, view, info
+        )
         self.take(view, info.lens if info else None)
 
     def show_photo(self, photo: Photo) -> None:
@@ -252,7 +267,9 @@ class SensorView:
 
     def light_chosen(self, event: Any) -> None:
         """A click: what is known of the light there stays on the page until the mouse is on another one."""
-        self.hover_px = (event.args["x"], event.args["y"]) if event.args["id"] is not None else None
+        self.hover_px = (
+            (event.args["x"], event.args["y"]) if event.args["id"] is not None else None
+        )
         self.update_text()
 
     def nearest(self, x: float, y: float) -> tuple[Detection | None, LightRow | None]:
@@ -266,9 +283,9 @@ class SensorView:
         detections = self.result.detections if self.result else ()
         spot = nearest(np.array([(one.x, one.y) for one in detections], float).reshape(-1, 2))
         light = nearest(self.lights.xy_px)
-        return None if spot is None else detections[spot], None if light is None else self.lights[
-            light
-        ]
+        return None if spot is None else detections[
+            spot
+        ], None if light is None else self.lights[light]
 
     def light_text(self, detection: Detection | None, light: LightRow | None) -> str:
         """Text on a light: where it truly is, the detection and its error."""
@@ -287,7 +304,10 @@ class SensorView:
                 if math.isnan(detection.residual_px)
                 else f"   residual {detection.residual_px:.3f} px"
             )
-            lines += [f"           {identity}", f"           flux {detection.flux:.4g}{residual}"]
+            lines += [
+                f"           {identity}",
+                f"           flux {detection.flux:.4g}{residual}",
+            ]
             if light:
                 lines += [
                     f"           error {math.hypot(detection.x - light.x, detection.y - light.y):.3f} px"
@@ -308,7 +328,9 @@ def color_table(name: str) -> str:
     kind = COLOR_MAPS[name]
     if kind is None:
         table = np.repeat(ramp, 3, axis=1)
-        return base64.b64encode((255 - table if "inverted" in name else table).tobytes()).decode()
+        return base64.b64encode(
+            (255 - table if "inverted" in name else table).tobytes()
+        ).decode()
     return base64.b64encode(cv2.applyColorMap(ramp, kind)[:, 0, ::-1].tobytes()).decode()
 
 
@@ -323,12 +345,21 @@ def statistics_text(
     field = ("field", f"{scene_info.field_deg:.4g}°") if scene_info else ("", "")
     rows = [("frame", f"{size_px[0]} × {size_px[1]} px", *field)]
     if view:
-        rows += [("exposure", f"{1e3 * view.exposure_s:.4g} ms", "rendering", f"{view.ms:.0f} ms")]
+        rows += [
+            ("exposure", f"{1e3 * view.exposure_s:.4g} ms", "rendering", f"{view.ms:.0f} ms")
+        ]
     rows += [
         ("sky", f"{statistics.sky_dn:.5g} DN", "scatter", f"{statistics.scatter_dn:.3g} DN"),
-        ("brightest", f"{statistics.peak_dn:.5g} DN", "saturated", f"{statistics.saturated} px"),
+        (
+            "brightest",
+            f"{statistics.peak_dn:.5g} DN",
+            "saturated",
+            f"{statistics.saturated} px",
+        ),
     ]
     lights = ("lights", f"{len(view.lights)} in the field") if view else ()
-    detected = ("identified", f"{result.identified} of {len(result.detections)}") if result else ()
+    detected = (
+        ("identified", f"{result.identified} of {len(result.detections)}") if result else ()
+    )
     rows += [(*lights, *detected, "", "", "", "")[:4]]
     return "\n".join(f"{a:<11s}{b:<18s}{c:<11s}{d}".rstrip() for a, b, c, d in rows)

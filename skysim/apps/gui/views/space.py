@@ -62,7 +62,9 @@ class Scene3D:
                 button = ui.button(name, color=None, on_click=lambda name=name: self.look(name))
                 button.props("dense outline size=xs")
                 button.props(f'title="look {text}"').mark(f"look-{name}")
-        hint = ui.label("drag: rotate · drag the vehicle: push it · right drag: pan · wheel: zoom")
+        hint = ui.label(
+            "drag: rotate · drag the vehicle: push it · right drag: pan · wheel: zoom"
+        )
         hint.classes("lab-turn")
         self.push = PushControl(page, sensor, self.canvas, self.update)
 
@@ -74,7 +76,8 @@ class Scene3D:
         lab = scene_info.geometry
         outside = lab.views["outside"]
         distance_m = (
-            sum((a - b) ** 2 for a, b in zip(outside.eye_m, outside.target_m, strict=True)) ** 0.5
+            sum((a - b) ** 2 for a, b in zip(outside.eye_m, outside.target_m, strict=True))
+            ** 0.5
         )
         self.canvas.run_method(
             "build",
@@ -134,7 +137,11 @@ class PushControl:
     """
 
     def __init__(
-        self, page: PageContext, sensor: SensorView, canvas: ui.element, moved: Callable[[], None]
+        self,
+        page: PageContext,
+        sensor: SensorView,
+        canvas: ui.element,
+        moved: Callable[[], None],
     ) -> None:
         self.page = page
         self.sensor = sensor

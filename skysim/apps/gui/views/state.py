@@ -58,7 +58,9 @@ class PageView:
             ("view", self.kind if self.kind != "live" else ""),
             (
                 "at",
-                ",".join(f"{angle:.6f}" for angle in self.angles_deg) if self.angles_deg else "",
+                ",".join(f"{angle:.6f}" for angle in self.angles_deg)
+                if self.angles_deg
+                else "",
             ),
             ("t", f"{self.t_s:.4f}" if self.kind == "flight" else ""),
             ("study", self.study),
@@ -89,7 +91,9 @@ class PageView:
         if kind not in KINDS:
             raise InputError("link", f"view {kind!r}", ", ".join(KINDS))
         try:
-            angles = tuple(float(angle) for angle in one["at"].split(",")) if "at" in one else None
+            angles = (
+                tuple(float(angle) for angle in one["at"].split(",")) if "at" in one else None
+            )
             t_s = float(one.get("t", 0))
             trial = int(one.get("trial", -1))
         except ValueError:

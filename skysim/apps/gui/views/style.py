@@ -59,7 +59,9 @@ def color_scale(values: Floats) -> Floats:
     Its darkest third is left out, because it would not be seen on the dark ground.
     """
     levels = np.rint(85 + 170 * np.clip(values, 0, 1)).astype(np.uint8)
-    return np.asarray(cv2.applyColorMap(levels[:, None], cv2.COLORMAP_CIVIDIS)[:, 0, ::-1] / 255)
+    return np.asarray(
+        cv2.applyColorMap(levels[:, None], cv2.COLORMAP_CIVIDIS)[:, 0, ::-1] / 255
+    )
 
 
 CSS = f"""

@@ -163,12 +163,19 @@ def from_angles(scene: Scene, mount: Mount, angles_deg: tuple[float, float, floa
     if isinstance(scene.light, StarsConfig):
         return stars.cam_from_icrs(*angles_deg).inv() * mount.cam_from_body
     roll, pitch, yaw = angles_deg
-    start = AttitudeConfig.model_validate({"roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw})
+    start = AttitudeConfig.model_validate(
+        {"roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw}
+    )
     return within_stop(scene, guidance.attitude(start))
 
 
 def moved(
-    scene: Scene, mount: Mount, lab_from_body: Rotation, right: float, up: float, roll_deg: float
+    scene: Scene,
+    mount: Mount,
+    lab_from_body: Rotation,
+    right: float,
+    up: float,
+    roll_deg: float,
 ) -> Rotation:
     """lab_from_body after moving the boresight right and up (in fields of view) and rolling the camera clockwise.
 
@@ -189,7 +196,8 @@ def within_stop(scene: Scene, lab_from_body: Rotation) -> Rotation:
     tilt_deg = float(multibody.tilt_deg(lab_from_body))
     if vehicle.mount == "air_bearing" and tilt_deg > vehicle.tilt_stop_deg:
         raise InputError(
-            "", f"tilt of {tilt_deg:.1f} deg: the bearing stops at {vehicle.tilt_stop_deg:g} deg"
+            "",
+            f"tilt of {tilt_deg:.1f} deg: the bearing stops at {vehicle.tilt_stop_deg:g} deg",
         )
     return lab_from_body
 
@@ -251,7 +259,9 @@ class Push:
             control = np.zeros((min(period, steps - begin), simulation.model.nu))
             control[:, simulation.vehicle.torques] = self.torque_nm
             simulation.advance(control)
-        self.lab_from_body = Rotation.from_quat(simulation.lab_from_body_wxyz, scalar_first=True)
+        self.lab_from_body = Rotation.from_quat(
+            simulation.lab_from_body_wxyz, scalar_first=True
+        )
 
     def seen(self) -> Trajectory:
         """A motion of which frame 0 sees what happened until now; before it the vehicle was at rest."""
@@ -282,12 +292,18 @@ def pull_torque_nm(grip: Grip | None, lab_from_body: Rotation, inertia_kg_m2: Fl
     held = np.array(grip.held_body_m)
     moment = np.cross(held, lab_from_body.inv().apply(grip.wanted_m) - held)
     stiffness = np.trace(inertia_kg_m2) / 3 * PULL_RAD_S**2
-    return np.asarray(stiffness * moment / max(held @ held, float(np.linalg.norm(moment)), 1e-9))
+    return np.asarray(
+        stiffness * moment / max(held @ held, float(np.linalg.norm(moment)), 1e-9)
+    )
 
 
 def require_vehicle(scene: Scene) -> None:
     """Raise InputError for a scene whose vehicle does not move by dynamics."""
     if isinstance(scene.light, CollimatedDisplayConfig):
-        raise InputError("", "the camera of this scene is on a bench: there is no vehicle to push")
+        raise InputError(
+            "", "the camera of this scene is on a bench: there is no vehicle to push"
+        )
     if scene.motion.is_prescribed:
-        raise InputError("", "the motion of this scene is prescribed: its vehicle cannot be pushed")
+        raise InputError(
+            "", "the motion of this scene is prescribed: its vehicle cannot be pushed"
+        )

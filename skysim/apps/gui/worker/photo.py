@@ -79,7 +79,9 @@ class Photo:
 
 PhotoPixels = tuple[Photo, NDArray]  # with the image's pixels
 # Ends of the names of image files, as a browser's file dialog takes them: ".gz" for ".fits.gz".
-SUFFIXES = tuple(dict.fromkeys("." + suffix.rpartition(".")[2] for suffix in images.IMAGE_SUFFIXES))
+SUFFIXES = tuple(
+    dict.fromkeys("." + suffix.rpartition(".")[2] for suffix in images.IMAGE_SUFFIXES)
+)
 
 
 Stages = tuple[tuple[str, str], ...]  # chosen algorithms: pairs of stage and name
@@ -141,19 +143,25 @@ def solve_frame(image: NDArray, fov_deg: float | None, stages: Stages = ()) -> P
     check_size(image)
     return solved_photo(
         image,
-        *plate_solver.solve_array(image, plate_solver.kept_solver(fov_deg, stages=stages), None),
+        *plate_solver.solve_array(
+            image, plate_solver.kept_solver(fov_deg, stages=stages), None
+        ),
     )
 
 
 def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoPixels:
     """What the page shows of an image that a tracker has solved or refused."""
     attitude = report.attitude
-    detections = detection_views(report, matches_by_row(tracker, attitude, report.centroids.xy_px))
+    detections = detection_views(
+        report, matches_by_row(tracker, attitude, report.centroids.xy_px)
+    )
     solution = plate_solver.solution_fields(report) if attitude.solved else {}
     angles: Triple | None = (
         (solution["ra_deg"], solution["dec_deg"], solution["roll_deg"]) if solution else None
     )
-    result = TrackerResult(attitude.status, detections, 1e3 * sum(report.seconds.values()), angles)
+    result = TrackerResult(
+        attitude.status, detections, 1e3 * sum(report.seconds.values()), angles
+    )
     height, width = image.shape
     saturation_dn = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf
     statistics = plots.frame_statistics(image, saturation_dn)

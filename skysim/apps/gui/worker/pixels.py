@@ -111,7 +111,11 @@ def pixels_for(
     }
     if display.near_px:
         x, y = display.near_px
-        fields["near"] = {"x": x, "y": y, "levels": integers[y:, x:][:LOUPE_PX, :LOUPE_PX].tolist()}
+        fields["near"] = {
+            "x": x,
+            "y": y,
+            "levels": integers[y:, x:][:LOUPE_PX, :LOUPE_PX].tolist(),
+        }
     return Pixels(header(levels) + drawn.tobytes(), fields, display, number)
 
 
@@ -241,4 +245,9 @@ def histogram(integers: NDArray) -> dict[str, Any]:
     first, last = np.arcsinh((np.array([low, high]) - sky) / scatter)
     ends = first - AXIS_MARGIN, last + AXIS_MARGIN
     counts, _ = np.histogram(np.arcsinh((sample - sky) / scatter), BINS, ends)
-    return {"range": (low, high), "sky": float(sky), "scatter": scatter, "counts": counts.tolist()}
+    return {
+        "range": (low, high),
+        "sky": float(sky),
+        "scatter": scatter,
+        "counts": counts.tolist(),
+    }

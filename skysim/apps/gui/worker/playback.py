@@ -68,7 +68,9 @@ class Playback:
         self.shown: int | None = None
         self.reported = 0
         flight = self.flight
-        self.events = flight.events(flight.filter_schedules or flight.schedules[:1], solves=True)
+        self.events = flight.events(
+            flight.filter_schedules or flight.schedules[:1], solves=True
+        )
 
     def advance(self, budget_s: float) -> FlightStep:
         """Compute for about a time, and report what is new."""
@@ -105,7 +107,9 @@ class Playback:
         solved = tracker_result(bench.lab, bench.estimator, shot.frame, shot.truth, shot.report)
         view = bench.frame_view(shot.frame, shot.truth, solved, sum(shot.seconds.values()))
         t_s = exposure_window(bench.scene, shot.frame.index, shot.frame.exposure_s).open_s
-        self.frames.append(KeptFrame(replace(view, t_s=t_s), shot.report, self.keep(shot.frame)))
+        self.frames.append(
+            KeptFrame(replace(view, t_s=t_s), shot.report, self.keep(shot.frame))
+        )
 
     def keep(self, frame: Frame) -> tuple[int, int] | None:
         """Write a frame's pixels to the end of the file, and return their place there; None if the file is full."""

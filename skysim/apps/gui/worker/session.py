@@ -20,9 +20,7 @@ if TYPE_CHECKING:  # the template sets the environment of numba before it is imp
     from skysim.apps.gui.messages import Display
 
 TEMPLATE = "skysim.apps.gui.template"  # module of the worker from which the others are forked
-SCENE = (
-    "SKYSIM_GUI_SCENE"  # environment variable: the scene that the template of the workers sets up
-)
+SCENE = "SKYSIM_GUI_SCENE"  # environment variable: the scene that the template of the workers sets up
 STOPPED = "the worker of this page has stopped"
 QUEUE_S = 0.2  # between two looks for a free worker
 
@@ -37,7 +35,9 @@ def serve(pipe: Connection) -> None:
     It receives (task, arguments, display), and sends ("ok", result) or ("error", InputError).
     """
     worker = importlib.import_module(TEMPLATE).WORKER
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which closes the pipe
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C is for the server, which closes the pipe
     while True:
         try:
             task, arguments, worker.display = pipe.recv()
@@ -147,7 +147,9 @@ class Workers:
         """A new worker; None if there are as many as the limit already."""
         return Session() if len(Session.alive) < self.limit else None
 
-    async def wait(self, wanted: Callable[[], bool], tell: Callable[[str], None]) -> Session | None:
+    async def wait(
+        self, wanted: Callable[[], bool], tell: Callable[[str], None]
+    ) -> Session | None:
         """Do as `take`, once it is this tab's turn; return None if no worker is wanted any more.
 
         Parameters

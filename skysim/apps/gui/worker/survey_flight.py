@@ -161,7 +161,9 @@ class Survey:
     def with_imu(self, taken: Sequence[TakenFrame]) -> list[SurveyFrame]:
         """Frames with the IMU's attitudes."""
         lab_from_body = Rotation.concatenate([frame.lab_from_body for frame in taken])
-        measured = survey_frames.imu_attitudes(self.scene, lab_from_body, UNCERTAINTY.imu_sigma_rad)
+        measured = survey_frames.imu_attitudes(
+            self.scene, lab_from_body, UNCERTAINTY.imu_sigma_rad
+        )
         return [
             SurveyFrame(frame.lights, at, frame.row)
             for frame, at in zip(taken, measured, strict=True)
@@ -203,7 +205,9 @@ class TakenFrame:
 def begin(scene: Scene, frames: int) -> tuple[Survey, SurveyPlan]:
     """A new survey of a scene's dome and its first attitudes. Raises InputError."""
     allow(frames)
-    lab, before, plan = survey_procedure.plan_survey(scene, UNCERTAINTY, frames, tilt_deg(scene))
+    lab, before, plan = survey_procedure.plan_survey(
+        scene, UNCERTAINTY, frames, tilt_deg(scene)
+    )
     steps = tuple(plan_step(*step) for step in plan.steps())
     survey = Survey(scene, lab, before, plan.model.sigma_px)
     return survey, survey_plan(plan.lab_from_body, plan.shown, steps)
@@ -266,7 +270,9 @@ def frames_at_rest(flight: Flight, views: Sequence[FrameView]) -> tuple[list[int
     for row, view in enumerate(views):
         leg = int(np.searchsorted(reference.start_s, view.t_s, side="right")) - 1
         if leg in holds and view.t_s + view.exposure_s <= reference.start_s[leg + 1]:
-            rate_rad_s = np.linalg.norm(flight.trajectory().rate_at(view.t_s + view.exposure_s / 2))
+            rate_rad_s = np.linalg.norm(
+                flight.trajectory().rate_at(view.t_s + view.exposure_s / 2)
+            )
             if rate_rad_s * view.exposure_s * scene.camera.focal_px < REST_PX:
                 by_hold[leg] = row
     return list(by_hold.values()), len(holds)

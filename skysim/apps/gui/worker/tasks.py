@@ -23,7 +23,14 @@ from skysim.apps.gui.messages import (
     SurveyPlan,
     Triple,
 )
-from skysim.apps.gui.worker import geometry, image_export, photo, pixels, playback, survey_flight
+from skysim.apps.gui.worker import (
+    geometry,
+    image_export,
+    photo,
+    pixels,
+    playback,
+    survey_flight,
+)
 from skysim.apps.gui.worker import workbench as planning
 from skysim.apps.gui.worker.geometry import Grip, Push
 from skysim.apps.gui.worker.workbench import Workbench
@@ -122,7 +129,9 @@ class Worker:
         """All pixels of the image with a number; None if it is no longer among the newest."""
         if number not in self.shown:
             return None
-        return pixels.pixels_for(display._replace(screen_px=(0, 0)), *self.shown[number], number)
+        return pixels.pixels_for(
+            display._replace(screen_px=(0, 0)), *self.shown[number], number
+        )
 
     def open(
         self,
@@ -157,7 +166,9 @@ class Worker:
 
     def point(self, angles_deg: Triple, solve: bool) -> FrameView:
         bench = self.workbench
-        bench.lab_from_body = geometry.from_angles(bench.scene, bench.lab.camera.mount, angles_deg)
+        bench.lab_from_body = geometry.from_angles(
+            bench.scene, bench.lab.camera.mount, angles_deg
+        )
         return self.render(solve)
 
     def move(self, right: float, up: float, roll_deg: float, solve: bool) -> FrameView:

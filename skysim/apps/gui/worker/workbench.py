@@ -91,7 +91,9 @@ class Workbench:
         lab = build_lab(scene)
         same = (
             before
-            and before.scene.model_copy(update={"tracker": scene.tracker, "camera": scene.camera})
+            and before.scene.model_copy(
+                update={"tracker": scene.tracker, "camera": scene.camera}
+            )
             == scene
         )
         lab_from_body = before.lab_from_body if before and same else lab.start
@@ -217,7 +219,9 @@ def tracker_result(
     row = scoring.row(lab.camera, frame, truth, report)
     return TrackerResult(
         row.status,
-        detection_views(report, matches_by_row(estimator, report.attitude, report.centroids.xy_px)),
+        detection_views(
+            report, matches_by_row(estimator, report.attitude, report.centroids.xy_px)
+        ),
         row.time_ms,
         row.estimate_deg,
         row.cross_arcsec,
@@ -240,7 +244,10 @@ def detection_views(
     """
     centroids = report.centroids
     rows = zip(
-        centroids.xy_px.tolist(), centroids.sigma_px.tolist(), centroids.flux.tolist(), strict=True
+        centroids.xy_px.tolist(),
+        centroids.sigma_px.tolist(),
+        centroids.flux.tolist(),
+        strict=True,
     )
     return tuple(
         Detection(x, y, sigma, flux, *names.get(n, (-1, math.nan)))
@@ -259,9 +266,13 @@ def predicted_lights(
     if isinstance(estimator, DomeTracker):
         body_from_lab = estimator.lever.cam_from_body.inv() * attitude.cam_from_ref
         places = estimator.leds.position_m
-        return estimator.leds.id, project(body_from_lab, places, estimator.lever, estimator.camera)
+        return estimator.leds.id, project(
+            body_from_lab, places, estimator.lever, estimator.camera
+        )
     camera = attitude.camera or estimator.camera
-    return estimator.stars.id, camera.pixels(attitude.cam_from_ref.apply(estimator.stars.vectors))
+    return estimator.stars.id, camera.pixels(
+        attitude.cam_from_ref.apply(estimator.stars.vectors)
+    )
 
 
 def matches_by_row(
@@ -279,7 +290,11 @@ def matches_by_row(
     star = attitude.match.star
     residual_px = np.hypot(*(predicted_px[star] - xy_px[rows]).T)
     return dict(
-        zip(rows.tolist(), zip(ids[star].tolist(), residual_px.tolist(), strict=True), strict=True)
+        zip(
+            rows.tolist(),
+            zip(ids[star].tolist(), residual_px.tolist(), strict=True),
+            strict=True,
+        )
     )
 
 
@@ -304,5 +319,9 @@ def ambiguity(lab: Lab) -> AmbiguityMap:
         lab.scene, survey_prior.require_dome(lab.scene), lab.camera.sources
     ).id
     return AmbiguityMap(
-        ids[found.led], ids[found.other], found.fraction, checks.LEAST_ALIKE, 1e3 * coincidence_m
+        ids[found.led],
+        ids[found.other],
+        found.fraction,
+        checks.LEAST_ALIKE,
+        1e3 * coincidence_m,
     )

@@ -32,7 +32,9 @@ STATED_HEIGHT_IN = 14.0
 FITTED_HEIGHT_IN = 15.5
 ANGLES_DEG = (0, 10, 15, 20, 25, 30)
 FLAT = FlatSurfaceConfig.model_validate({"kind": "flat", "apex": "48 in"})
-SPHERE = SphereSurfaceConfig.model_validate({"kind": "sphere", "apex": "48 in", "radius": "48 in"})
+SPHERE = SphereSurfaceConfig.model_validate(
+    {"kind": "sphere", "apex": "48 in", "radius": "48 in"}
+)
 WALL = {
     "thickness_apex": "0.2036 in",
     "thickness_base": "0.25 in",
@@ -82,7 +84,8 @@ def table_1(options: ExperimentOptions) -> ExperimentResult:
         values = {"width": [width[n] for width in (stated, fitted)]}
         if n:  # the difference from the first width, in percent of their mean (the thesis's definition)
             values["more"] = [
-                200 * (width[n] - width[0]) / (width[n] + width[0]) for width in (stated, fitted)
+                200 * (width[n] - width[0]) / (width[n] + width[0])
+                for width in (stated, fitted)
             ]
         for name, pair in values.items():
             results[f"{name}_{angle}"] = with_cause(f"M = {FITTED_HEIGHT_IN} in", exact, *pair)
@@ -154,7 +157,9 @@ def intersections_in(dome: Surface, tilt_rad: Any) -> Floats:
 
 def rim_and_radii(dome: Surface) -> Results:
     """Rim of the measured surface (where it is as wide as the dome), and its distances from the bearing."""
-    rim_rad = brentq(lambda tilt: intersections_in(dome, tilt)[0, 0] - DOME_WIDTH_IN / 2, 0.5, 0.9)
+    rim_rad = brentq(
+        lambda tilt: intersections_in(dome, tilt)[0, 0] - DOME_WIDTH_IN / 2, 0.5, 0.9
+    )
     rim = intersections_in(dome, rim_rad)[0]
     height = exact(intersections_in(dome, 0.0)[0, 2] - rim[2])
     tilt_rad = np.linspace(0, rim_rad, 4001)

@@ -94,7 +94,9 @@ def board_scene(
     """Scene with a board of nine holes, the first len(levels) with LEDs, above the camera of a level vehicle."""
     height_in = CAMERA_IN + distance_in
     across_mm = PITCH_MM * np.array([1.0, 0.0, -1.0])
-    positions = [[f"{x} mm", f"{y} mm", f"{height_in} in"] for x in across_mm for y in across_mm]
+    positions = [
+        [f"{x} mm", f"{y} mm", f"{height_in} in"] for x in across_mm for y in across_mm
+    ]
     leds = {"levels": list(levels), "positions": positions[: len(levels)]}
     listed = ListedConfig.model_validate({"kind": "listed", "cap_deg": 27} | leds)
     scene = load("afit_test1_ideal")
@@ -111,7 +113,12 @@ def color_board(lens: LensSettings = DEFAULT_LENS, **led_values: Any) -> Lab:
     """Test stand with the first board: three colors by three resistors, always on."""
     drive = DirectConfig(kind="direct")
     scene = board_scene(
-        BOARD, BOARD_DISTANCE_IN, lens, drive=drive, intensity_cd=BOARD_INTENSITY_CD, **led_values
+        BOARD,
+        BOARD_DISTANCE_IN,
+        lens,
+        drive=drive,
+        intensity_cd=BOARD_INTENSITY_CD,
+        **led_values,
     )
     scene = with_config(scene, "camera", psf=WIDE_PSF)
     return build_test_stand(with_config(scene, "exposure", time_s=BOARD_EXPOSURE_S))
@@ -190,9 +197,12 @@ def led_tests(options: ExperimentOptions) -> ExperimentResult:
     options.watch(3, 4)
     pulses, magnitude = brightness(images, rng[4])
     rng_drawn = random_stream(options.seed, 5)
-    aperture_images = [take_image(color_board(lens), rng_drawn)[0] for lens in APERTURES.values()]
+    aperture_images = [
+        take_image(color_board(lens), rng_drawn)[0] for lens in APERTURES.values()
+    ]
     noise_images = [
-        take_image(color_board(LensSettings(noise_e=one)), rng_drawn)[0] for one in (None, NOISE_E)
+        take_image(color_board(LensSettings(noise_e=one)), rng_drawn)[0]
+        for one in (None, NOISE_E)
     ]
     drawings = (
         FigureDrawing(
@@ -276,7 +286,9 @@ class BoardImage(NamedTuple):
 
 def apply_thresholds(image: GrayImage, xy_px: Floats) -> BoardImage:
     """Count pixels above 2, 10 and 25 %, and lights above 4 %."""
-    at_2, at_10, at_25 = (count_above(image, xy_px, fraction) for fraction in (0.02, 0.10, 0.25))
+    at_2, at_10, at_25 = (
+        count_above(image, xy_px, fraction) for fraction in (0.02, 0.10, 0.25)
+    )
     return BoardImage(at_2, at_10, at_25, len(measure_lights(image).magnitude))
 
 
@@ -312,9 +324,12 @@ def viewing_angles(images: int, rng: np.random.Generator) -> Results:
     narrow = color_board(lobe=NARROW_LOBE)
     misalignment = Rotation.from_euler("y", MISALIGNMENT_DEG, degrees=True)
     sources = narrow.camera.sources
-    misaligned = narrow.with_sources(replace(sources, normal=misalignment.apply(sources.normal)))
+    misaligned = narrow.with_sources(
+        replace(sources, normal=misalignment.apply(sources.normal))
+    )
     directional = [
-        area_variation(lab, 0.10, images, rng)[0][:, DIMMEST_LED] for lab in (narrow, misaligned)
+        area_variation(lab, 0.10, images, rng)[0][:, DIMMEST_LED]
+        for lab in (narrow, misaligned)
     ]
     areas, stray = area_variation(color_board(), 0.04, images, rng)
     test2_percent, intermediate_percent = (
@@ -362,7 +377,10 @@ def brightness(images: int, rng: np.random.Generator) -> tuple[Results, Floats]:
     board = (1000.0, 500.0, 1.0) * 3
     detected = [
         [len(measure_lights(take_image(one, rng)[0]).magnitude) for _ in range(images)]
-        for one in (white_board(board), white_board(tuple(max(pulse, long_us) for pulse in board)))
+        for one in (
+            white_board(board),
+            white_board(tuple(max(pulse, long_us) for pulse in board)),
+        )
     ]
     short_magnitudes = [led_magnitudes(lab, rng) for _ in range(images)]
     first_to_last = [values[:, 0] / values[:, 3] for values in (per_us, saturating_per_us)]
@@ -392,7 +410,9 @@ def led_magnitudes(lab: Lab, rng: np.random.Generator) -> Floats:
     image, xy_px = take_image(lab, rng)
     lights = measure_lights(image)
     distance_px = np.linalg.norm(xy_px[:, None] - lights.xy_px, axis=2)
-    return np.where(distance_px.min(axis=1) < 10, lights.magnitude[distance_px.argmin(axis=1)], 0.0)
+    return np.where(
+        distance_px.min(axis=1) < 10, lights.magnitude[distance_px.argmin(axis=1)], 0.0
+    )
 
 
 def crop_board(image: GrayImage) -> GrayImage:

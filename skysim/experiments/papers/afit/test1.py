@@ -83,7 +83,8 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
     boards = options.trials(24, 3)
     images = options.trials(5, 2)
     stands = [
-        build_test_stand(scene_with_exposure(time_s)) for time_s in (FULL_CYCLES_S, FRAME_TIME_S)
+        build_test_stand(scene_with_exposure(time_s))
+        for time_s in (FULL_CYCLES_S, FRAME_TIME_S)
     ]
     runs: tuple[list[Floats], list[Floats]] = ([], [])  # with full cycles, with the frame time
     for n in range(boards):
@@ -96,7 +97,9 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
             other_leds = lab.with_scene(scene).with_light(known_light(plan))
             rng = random_stream(options.seed, stage, n)
             runs[stage].append(take_board(other_leds, images, rng))
-    found_arcsec = lattice_angles(stands[0], options.trials(20, 2), random_stream(options.seed, 2))
+    found_arcsec = lattice_angles(
+        stands[0], options.trials(20, 2), random_stream(options.seed, 2)
+    )
     drawings = (
         FigureDrawing(
             "Table 2: magnitude by rank; a bar is a rank's standard deviation over the images of a board.",
@@ -135,7 +138,9 @@ def ranks(full_cycles: Sequence[Floats], frame_time: Sequence[Floats]) -> Result
 
 def published_by_rank(statistic: str) -> Floats:
     """(9,) published `mean` or `sd` of each rank's magnitude."""
-    return published_values("afit-table-2", *(f"{statistic}_{rank}" for rank in range(1, LEDS + 1)))
+    return published_values(
+        "afit-table-2", *(f"{statistic}_{rank}" for rank in range(1, LEDS + 1))
+    )
 
 
 def pooled_std_by_rank(board: Floats) -> Floats:
@@ -167,7 +172,9 @@ def separations(angles_arcsec: Floats) -> Results:
     mean_arcsec = angles_arcsec.mean(axis=0)
     gaps = np.flatnonzero(np.diff(mean_arcsec) > GAP_ARCSEC) + 1
     results: Results = {"distinct": exact(len(gaps) + 1)}
-    for n, columns in enumerate(np.split(angles_arcsec, np.cumsum(PAIR_COUNTS)[:-1], axis=1), 1):
+    for n, columns in enumerate(
+        np.split(angles_arcsec, np.cumsum(PAIR_COUNTS)[:-1], axis=1), 1
+    ):
         means = columns.mean(axis=1).reshape(POSITIONS, -1).mean(axis=1)
         results[f"angle_{n}"] = confidence_interval(means)
     return results
@@ -185,7 +192,13 @@ def draw_ranks(fig: Any, full_cycles: Sequence[Floats], frame_time: Sequence[Flo
         std = np.mean([pooled_std_by_rank(board) for board in boards], axis=0)
         scale = published.mean() / mean.mean()
         axes.errorbar(
-            rank + shift, scale * mean, scale * std, fmt=marker, color=ink, capsize=2, label=name
+            rank + shift,
+            scale * mean,
+            scale * std,
+            fmt=marker,
+            color=ink,
+            capsize=2,
+            label=name,
         )
     axes.errorbar(
         rank,

@@ -235,7 +235,8 @@ def angles(lab: Lab, runs: NoiseRuns, images: int, rng: np.random.Generator) -> 
     more_tilted_decentered = angles_at(edge, BOARD_TILT_DEG, DECENTER_IN)
     glare_arcsec = glare_bias_arcsec(lab, images, rng)
     apex_bias, _, edge_bias = (
-        more.angle_arcsec.mean() - own.angle_arcsec.mean() for own, more in zip(*runs, strict=True)
+        more.angle_arcsec.mean() - own.angle_arcsec.mean()
+        for own, more in zip(*runs, strict=True)
     )
     at_apex, at_halfway, at_edge = (own.angle_arcsec for own in runs.own)
     note = (
@@ -265,7 +266,9 @@ def angles(lab: Lab, runs: NoiseRuns, images: int, rng: np.random.Generator) -> 
 def relative_decrease(reference: float, angles: Floats) -> Summary:
     """Decrease of a mean angle relative to `reference` in percent; the error of `reference` is neglected."""
     mean = confidence_interval(angles)
-    value, high, low = (100 * (1 - one / reference) for one in (mean.value, mean.low, mean.high))
+    value, high, low = (
+        100 * (1 - one / reference) for one in (mean.value, mean.low, mean.high)
+    )
     return Summary(value, low, high, mean.trials)
 
 
@@ -277,7 +280,8 @@ def glare_bias_arcsec(lab: Lab, images: int, rng: np.random.Generator) -> float:
     psf = MoffatPsfConfig(kind="moffat", fwhm_px=2.5, beta=1.5)
     stand = build_test_stand(with_config(scene(2 * ON_FRACTION), "camera", psf=psf))
     at_edge, at_apex = (
-        series(stand, place, images, rng).angle_arcsec.mean() - geometric_angle_arcsec(lab, place)
+        series(stand, place, images, rng).angle_arcsec.mean()
+        - geometric_angle_arcsec(lab, place)
         for place in (BoardPlace(PLACES_DEG[2]), BoardPlace(0.0))
     )
     return float(at_edge - at_apex)
@@ -298,7 +302,9 @@ def draw_magnitudes(fig: Any, places: Sequence[PlaceSeries]) -> None:
     panels = fig.subplots(1, 2)
     for column, name, axes in zip((DIM, BRIGHT), ("dim", "bright"), panels, strict=True):
         magnitudes = [one.magnitude[:, column] for one in places]
-        bins = np.linspace(np.concatenate(magnitudes).min(), np.concatenate(magnitudes).max(), 25)
+        bins = np.linspace(
+            np.concatenate(magnitudes).min(), np.concatenate(magnitudes).max(), 25
+        )
         top = 1.0
         for n, values in enumerate(magnitudes):
             style = {"color": INK[(0, 2, 4)[n]], "label": f"ours, place {n + 1}"}
@@ -328,12 +334,15 @@ def draw_angles(fig: Any, lab: Lab, places: Sequence[PlaceSeries]) -> None:
         (INK[0], INK[2], INK[4]), ("-", "--", "-."), curves, strict=True
     ):
         angle = [
-            geometric_angle_arcsec(lab, place._replace(tilt_deg=float(tilt))) for tilt in tilt_deg
+            geometric_angle_arcsec(lab, place._replace(tilt_deg=float(tilt)))
+            for tilt in tilt_deg
         ]
         axes.plot(tilt_deg, angle, style, color=ink, label=name)
     ours = [one.angle_arcsec.mean() for one in places]
     axes.plot(PLACES_DEG, ours, "s", color=INK[0], label="ours, from images")
-    mean, sd = ([rows[f"{key}_{n}"].published for n in (1, 2, 3)] for key in ("angle", "sd_angle"))
+    mean, sd = (
+        [rows[f"{key}_{n}"].published for n in (1, 2, 3)] for key in ("angle", "sd_angle")
+    )
     published_deg = (0, HALFWAY_DEG, PLACES_DEG[2])
     axes.errorbar(published_deg, mean, sd, fmt="o", capsize=3, color=INK[1], label="published")
     axes.set(xlabel="tilt of the board (deg)", ylabel="angle of the pair (arcsec)")

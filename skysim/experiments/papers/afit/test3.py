@@ -88,7 +88,8 @@ def build_test3(overrides: Mapping[str, str] | None = None) -> Lab:
     """Test 3's lab, with the camera turned so that all five positions are on the detector."""
     lab = build_lab(loader.load("afit_test3_ideal", STATED_IMAGING | dict(overrides or {})))
     cam_from_body = (
-        Rotation.from_euler("z", CAMERA_ROTATION_DEG, degrees=True) * lab.camera.mount.cam_from_body
+        Rotation.from_euler("z", CAMERA_ROTATION_DEG, degrees=True)
+        * lab.camera.mount.cam_from_body
     )
     return lab.with_camera(mount=Mount(lab.camera.mount.camera_body_m, cam_from_body))
 
@@ -117,7 +118,9 @@ def photograph(
         lights = CENTROIDERS["cog"](frame.image_dn, blobs, settings.gain_e_dn, priors)
         inside = camera.contains(lights.xy_px)
         _, nearest = cKDTree(truth.sources.xy_px).query(lights.xy_px[inside])
-        magnitude = instrument_brightness(blobs.flux / blobs.area_px, blobs.area_px.astype(float))
+        magnitude = instrument_brightness(
+            blobs.flux / blobs.area_px, blobs.area_px.astype(float)
+        )
         led, led_row = np.unique(truth.sources.id[nearest], return_index=True)
         if len(led) == LEDS:
             row = np.flatnonzero(inside)[led_row]
@@ -155,7 +158,8 @@ def measure(lab: Lab, sightings: Sequence[Sighting]) -> Measurements:
     """Measure the images as in the thesis."""
     body_m = np.array([light_positions_m(lab, sighting.xy_px) for sighting in sightings])
     lab_m = [
-        one.body_from_lab.inv().apply(led_m) for one, led_m in zip(sightings, body_m, strict=True)
+        one.body_from_lab.inv().apply(led_m)
+        for one, led_m in zip(sightings, body_m, strict=True)
     ]
     position = np.array([one.stop for one in sightings])
     magnitude = np.array([one.brightness for one in sightings])
@@ -390,7 +394,9 @@ def magnitudes(
     return results
 
 
-def separations(ours: Measurements, with_faults: Measurements, nominal: Measurements) -> Results:
+def separations(
+    ours: Measurements, with_faults: Measurements, nominal: Measurements
+) -> Results:
     """Table 8: separations of the pairs in ascending order."""
     order = np.argsort(ours.separation_arcsec.mean(axis=0))
     angle = ours.separation_arcsec[:, order]
@@ -402,7 +408,9 @@ def separations(ours: Measurements, with_faults: Measurements, nominal: Measurem
         )
     nominal_angle = np.sort(nominal.separation_arcsec, axis=1)
     for n, (first, last) in enumerate(TABLE_8_GROUPS, 1):
-        results[f"class_{n}"] = stratified_bootstrap(nominal, nominal_angle[:, first:last], mean)
+        results[f"class_{n}"] = stratified_bootstrap(
+            nominal, nominal_angle[:, first:last], mean
+        )
     is_distinct = np.diff(angle.mean(axis=0)) > MIN_DIFFERENCE_ARCSEC
     results["classes"] = exact(1 + np.sum(is_distinct))
     return results
@@ -420,9 +428,13 @@ def epsilons(
     }
     at_one_position = f"{std_within_position(ours):.2g} for a pair at one position"
     separation_note = f"{at_one_position}; the rest is the error of eq. 44 between positions"
-    column_mm = np.sort(bumped.lab_m[bumped.position == BUMPED_POSITION, :, 0].mean(axis=0) * 1e3)
+    column_mm = np.sort(
+        bumped.lab_m[bumped.position == BUMPED_POSITION, :, 0].mean(axis=0) * 1e3
+    )
     return {
-        "epsilon_mag": with_camera_faults(ours, with_faults, "magnitude", slice(None), largest_std),
+        "epsilon_mag": with_camera_faults(
+            ours, with_faults, "magnitude", slice(None), largest_std
+        ),
         "epsilon_pos": RowResult(
             position["ours"],
             f"with all differences of Tables 10-14 attributed to the IMU: {position['drifted'].value:.2f}",
@@ -499,7 +511,12 @@ def draw_separations(fig: Any, with_faults: Measurements) -> None:
     for axes, group in zip(panels, groups, strict=True):
         height = top * (1.05 + 0.06 * np.arange(len(mean[group])))
         axes.errorbar(
-            mean[group], height, xerr=sd[group], fmt="o", color=INK[1], label="published, with 1 sd"
+            mean[group],
+            height,
+            xerr=sd[group],
+            fmt="o",
+            color=INK[1],
+            label="published, with 1 sd",
         )
         axes.set(ylim=(0, 1.4 * top))
     panels[0].set(ylabel="pairs in images")

@@ -358,7 +358,8 @@ def algorithm_errors(
         Number of images per position
     """
     sightings = [
-        photograph(lab, n, lab_from_body(angles), images, rng) for n, angles in enumerate(IMU_DEG)
+        photograph(lab, n, lab_from_body(angles), images, rng)
+        for n, angles in enumerate(IMU_DEG)
     ]
     sets = list(zip(*sightings, strict=False))
     error_deg = np.empty((len(sets), len(IMU_DEG), 3))
@@ -384,21 +385,29 @@ def identify_leds(vectors: Floats, magnitude: Floats, catalog: PairCatalog) -> I
     As in the thesis, the hypothesis of lowest cost is accepted. Our own SAA also requires that a match is significant
     against chance, which five LEDs with errors of 2 mm in a cross of 8 mm rarely are.
     """
-    gates = Gates(EPSILON_SEP_ARCSEC * ARCSEC_RAD, EPSILON_POS_M / (48 * INCH_M), EPSILON_MAG, 0.0)
+    gates = Gates(
+        EPSILON_SEP_ARCSEC * ARCSEC_RAD, EPSILON_POS_M / (48 * INCH_M), EPSILON_MAG, 0.0
+    )
     stars = SearchInput(
         vectors, magnitude, catalog.vectors, catalog.magnitude, catalog.cells, gates
     )
     separation_rad = float(2 * np.arcsin(np.linalg.norm(vectors[0] - vectors[1]) / 2))
     tolerance_rad = gate_rad(gates, separation_rad)
-    begin, end = candidates(catalog, separation_rad - tolerance_rad, separation_rad + tolerance_rad)
-    star, cost, _ = match_assumptions(stars, build_primary(stars, 0, 1), catalog.pair[begin:end])
+    begin, end = candidates(
+        catalog, separation_rad - tolerance_rad, separation_rad + tolerance_rad
+    )
+    star, cost, _ = match_assumptions(
+        stars, build_primary(stars, 0, 1), catalog.pair[begin:end]
+    )
     return star[cost.argmin()].astype(np.int64) if len(cost) else np.full(len(vectors), -1)
 
 
 # The IMU.
 
 
-def imu_drift(hold_min: float, units: int, rng: np.random.Generator, earth: bool = True) -> Floats:
+def imu_drift(
+    hold_min: float, units: int, rng: np.random.Generator, earth: bool = True
+) -> Floats:
     """(U, 5, 3) error of U random IMUs at the end of each stay: roll, pitch, yaw in degrees.
 
     The vehicle follows Test 3's commanded attitudes exactly; each IMU has its own hardware seed.
@@ -416,13 +425,24 @@ def imu_drift(hold_min: float, units: int, rng: np.random.Generator, earth: bool
         leg.model_copy(update={"duration_s": 60 * hold_min}) if leg.kind == "hold" else leg
         for leg in legs
     ]
-    reference = guidance.plan(lab.scene.motion.model_copy(update={"maneuver": tuple(timed_legs)}))
+    reference = guidance.plan(
+        lab.scene.motion.model_copy(update={"maneuver": tuple(timed_legs)})
+    )
     t_s = np.arange(0, reference.duration_s, KNOT_S)
-    wxyz, rate, _ = (np.array(column) for column in zip(*map(reference.state_at, t_s), strict=True))
+    wxyz, rate, _ = (
+        np.array(column) for column in zip(*map(reference.state_at, t_s), strict=True)
+    )
     earth_rad_s = imu.earth_rate_lab_rad_s(lab.scene.site) * earth
     vehicle = lab.vehicle
     increments = imu.ideal_increments(
-        t_s, wxyz, rate, t_s[1:], KNOT_S, imu_position_m(vehicle), vehicle.gravity_m_s2, earth_rad_s
+        t_s,
+        wxyz,
+        rate,
+        t_s[1:],
+        KNOT_S,
+        imu_position_m(vehicle),
+        vehicle.gravity_m_s2,
+        earth_rad_s,
     )
     # Every second start is the end of a hold, and the first that of home.
     stops = np.searchsorted(t_s[1:], np.array(reference.start_s[::2]) - KNOT_S)
@@ -459,9 +479,13 @@ def draw_differences(fig: Any, causes: AllCauses) -> None:
     panels = fig.subplots(1, 3, sharey=True)
     for axis, axes in enumerate(panels):
         error_deg = causes.error_deg[:, :, axis]
-        plot_quantiles(axes, position + 0.1, error_deg, fmt="s", ms=4, label="ours with the causes")
+        plot_quantiles(
+            axes, position + 0.1, error_deg, fmt="s", ms=4, label="ours with the causes"
+        )
         earth = error_deg.mean(axis=0) + causes.earth_deg[:, axis]
-        axes.plot(position + 0.25, earth, "D", ms=4, color=INK[5], label="and the Earth's turning")
+        axes.plot(
+            position + 0.25, earth, "D", ms=4, color=INK[5], label="and the Earth's turning"
+        )
         axes.plot(position - 0.1, published_deg[:, axis], "o", color=INK[1], label="published")
         axes.set(xlabel="position", xticks=position, title=f"theta_{axis + 1}")
     panels[0].set(ylabel="algorithm less IMU (deg)")
@@ -473,7 +497,9 @@ def draw_holds(fig: Any, drift: dict[float, Floats]) -> None:
     published = np.abs(np.subtract(ALGORITHM_DEG, IMU_DEG)).mean(axis=0)
     for axis, axes in enumerate(fig.subplots(1, 2, sharey=True)):
         mean = [np.abs(error_deg[:, :, axis]).mean(axis=1) for error_deg in drift.values()]
-        plot_quantiles(axes, list(drift), np.transpose(mean), fmt="s-", label="ours, 95 % of IMUs")
+        plot_quantiles(
+            axes, list(drift), np.transpose(mean), fmt="s-", label="ours, 95 % of IMUs"
+        )
         axes.axhline(published[axis], color=INK[1], label="published")
         axes.set(xlabel="minutes at a position", title=f"theta_{axis + 1}")
     fig.axes[0].set(ylabel="mean difference (deg)")

@@ -84,7 +84,9 @@ def measure_lights(image: NDArray[np.uint8]) -> MeasuredLights:
     return MeasuredLights(blobs.xy_px[order], area_px[order], mean_dn[order], magnitude[order])
 
 
-def measure_frame(lab: Lab, lab_from_body: Rotation, rng: np.random.Generator) -> MeasuredLights:
+def measure_frame(
+    lab: Lab, lab_from_body: Rotation, rng: np.random.Generator
+) -> MeasuredLights:
     """Lights of a frame rendered at a fixed attitude."""
     return measure_lights(gray_levels(render_at_attitude(lab, lab_from_body, rng)[0], lab))
 

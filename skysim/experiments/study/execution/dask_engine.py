@@ -40,9 +40,7 @@ except ImportError:
     ) from None
 
 WAIT_S = 10.0  # timeout for a reply
-POLL_S = (
-    5.0  # interval between queries of the cluster's thread count, because workers join and leave
-)
+POLL_S = 5.0  # interval between queries of the cluster's thread count, because workers join and leave
 Submission = tuple[Chunk, bool]  # a submitted chunk, and whether it is the only one in flight
 ADDRESS = "a scheduler's address, such as tcp://10.0.0.1:8786"
 
@@ -83,7 +81,9 @@ def check_workers(client: Client, scheduler: str) -> None:
     except OSError:
         raise silent from None
     replies = {
-        worker: code for worker, code in versions.items() if not isinstance(code, CommClosedError)
+        worker: code
+        for worker, code in versions.items()
+        if not isinstance(code, CommClosedError)
     }
     if not replies:
         raise silent
@@ -126,7 +126,8 @@ def collect_rows(
             polled_s = time.monotonic()
         alone = bool(retries)
         new = take(
-            retries.popleft if alone else chunks.next, (1 if alone else capacity) - len(in_flight)
+            retries.popleft if alone else chunks.next,
+            (1 if alone else capacity) - len(in_flight),
         )
         # One message submits all, and results arrive in the background: a round trip for each would be the limit.
         futures = (
@@ -134,7 +135,9 @@ def collect_rows(
             if new
             else []
         )
-        in_flight |= {future: (chunk, alone) for future, chunk in zip(futures, new, strict=True)}
+        in_flight |= {
+            future: (chunk, alone) for future, chunk in zip(futures, new, strict=True)
+        }
         completed.update(futures)
         if not in_flight:
             return

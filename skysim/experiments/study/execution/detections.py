@@ -68,8 +68,12 @@ def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[VisibleSources]:
         np.array([R_cam_from_body @ each.T for each in R_lab_from_body]),
         np.array([each @ camera_body_m for each in R_lab_from_body]),
     )
-    each_pose = (Poses(*(part[n : n + 1] for part in poses)) for n in range(len(R_lab_from_body)))
-    rows = [in_view(lab.camera.sources, lab.camera.optics, pose, reach=0.0) for pose in each_pose]
+    each_pose = (
+        Poses(*(part[n : n + 1] for part in poses)) for n in range(len(R_lab_from_body))
+    )
+    rows = [
+        in_view(lab.camera.sources, lab.camera.optics, pose, reach=0.0) for pose in each_pose
+    ]
     ends = np.cumsum([0, *map(len, rows)])
     near = lab.camera.sources.take(np.concatenate(rows))
     atmosphere = find_light(lab.camera.lights, AirEffects)
@@ -79,7 +83,9 @@ def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[VisibleSources]:
     rate_e_s = rates_e_s(
         near, lab.camera.optics, lab.camera.known.emitter, distance_m, cos_out, cos_in
     )
-    electrons = rate_e_s * np.minimum(near.on_s / near.period_s, 1.0) * lab.scene.exposure.time_s
+    electrons = (
+        rate_e_s * np.minimum(near.on_s / near.period_s, 1.0) * lab.scene.exposure.time_s
+    )
     x, y = xy_px.T
     width_px, height_px = lab.camera.canvas.shape[::-1]
     visible = (x > -0.5) & (y > -0.5) & (x < width_px - 0.5) & (y < height_px - 0.5)
@@ -98,11 +104,17 @@ def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[VisibleSources]:
 def occlusion(camera: StarCamera, exposure: Exposure) -> OcclusionTest | None:
     """The test for places that something hides from a camera in an exposure; None if nothing can."""
     obstacles = [light for light in camera.lights if isinstance(light, Obstacle)]
-    return any_of([occluder for light in obstacles if (occluder := light.during(exposure).hides)])
+    return any_of(
+        [occluder for light in obstacles if (occluder := light.during(exposure).hides)]
+    )
 
 
 def simulate_detections(
-    trial: CentroidTrial, xy_px: Floats, electrons: Floats, scene: Scene, rng: np.random.Generator
+    trial: CentroidTrial,
+    xy_px: Floats,
+    electrons: Floats,
+    scene: Scene,
+    rng: np.random.Generator,
 ) -> Centroids:
     """Simulated detections, brightest first: some true sources missed, all with noise, false detections added.
 
@@ -116,11 +128,15 @@ def simulate_detections(
     flux = flux * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(xy_px)))
     xy_px = xy_px + trial.noise_px * rng.standard_normal(xy_px.shape)
     detected = detected[np.argsort(-flux[detected], kind="stable")][: trial.lights]
-    false = trial.false_lights + round(len(detected) * trial.false_share / (1 - trial.false_share))
+    false = trial.false_lights + round(
+        len(detected) * trial.false_share / (1 - trial.false_share)
+    )
     if not false:
         return Centroids(xy_px[detected], np.full(len(detected), sigma_px), flux[detected])
     false_px = rng.random((false, 2)) * [scene.camera.width_px, scene.camera.height_px] - 0.5
-    false_flux = flux[rng.integers(len(flux), size=false)] if len(flux) else rng.random(false) + 1.0
+    false_flux = (
+        flux[rng.integers(len(flux), size=false)] if len(flux) else rng.random(false) + 1.0
+    )
     all_flux = np.concatenate([flux[detected], false_flux])
     order = np.argsort(-all_flux, kind="stable")
     all_px = np.concatenate([xy_px[detected], false_px])
@@ -171,7 +187,9 @@ def brightness(lab: Lab, rows: NDArray[np.int64], frame: int) -> Floats:
     assert isinstance(dome, LedDome)
     middle_s = (begin_s + end_s) / 2
     shown = dome.pulsed(dome.sources, lab.camera.run_seed, frame, window, middle_s).take(rows)
-    pulses = zip(shown.period_s.tolist(), shown.start_s.tolist(), shown.on_s.tolist(), strict=True)
+    pulses = zip(
+        shown.period_s.tolist(), shown.start_s.tolist(), shown.on_s.tolist(), strict=True
+    )
     lit_s = np.array([lit_moments_s(begin_s, end_s, *one)[0] for one in pulses])
     mean = steady.strength * np.minimum(steady.on_s / steady.period_s, 1.0)
     return shown.strength * lit_s / window.exposure_s / mean

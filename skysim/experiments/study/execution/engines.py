@@ -97,7 +97,9 @@ class Pool:
         while not done:
             in_flight: dict[Future[TimedRows], Chunk] = {}
             try:
-                yield from self._run_until_death(self._pool_for(job), chunks, retries, in_flight)
+                yield from self._run_until_death(
+                    self._pool_for(job), chunks, retries, in_flight
+                )
                 done = True
             except BrokenProcessPool:
                 # Count a death only for a trial that was alone in flight; otherwise the culprit is unknown.
@@ -193,7 +195,11 @@ def split_chunk(chunk: Chunk) -> Iterator[Chunk]:
 
 def cores() -> int:
     """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return (
+        len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count() or 1
+    )
 
 
 # Worker processes.

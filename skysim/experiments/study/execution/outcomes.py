@@ -154,7 +154,9 @@ def true_lights(truth: Truth) -> TrueLights:
     return TrueLights(truth.lab_from_body, sources.xy_px, sources.flux_xy_px, sources.streak_px)
 
 
-def score(lab: Lab, estimator: factory.Estimator, report: Report, lights: TrueLights) -> Outcome:
+def score(
+    lab: Lab, estimator: factory.Estimator, report: Report, lights: TrueLights
+) -> Outcome:
     """Outcome of one frame from the tracker's report and the truth.
 
     Quaternions are NumPy arrays because SciPy's Rotation would take a tenth of a trial's time.
@@ -184,7 +186,9 @@ def score(lab: Lab, estimator: factory.Estimator, report: Report, lights: TrueLi
     error, nees = error_and_nees(solution, cam_from_lab)
     wrong = metrics.is_wrong(math.hypot(*error), math.inf if math.isnan(nees) else nees)
     if solution.match is not None and own_tracker:
-        claimed_px = claimed_image_px(lab, estimator, solution.match, lab_from_body, cam_from_lab)
+        claimed_px = claimed_image_px(
+            lab, estimator, solution.match, lab_from_body, cam_from_lab
+        )
         observed_px = centroids_px[solution.match.observed]
         wrong_matches = count_wrong_matches(observed_px, claimed_px, lights, reach_px)
         allowed = nees <= metrics.OVERCONFIDENT_NEES
@@ -198,7 +202,9 @@ def score(lab: Lab, estimator: factory.Estimator, report: Report, lights: TrueLi
 def error_and_nees(solution: Attitude, cam_from_lab: Floats) -> tuple[Floats, float]:
     """(3,) error rotation vector in camera axes, rad, and its NEES, NaN without a covariance."""
     estimate = quaternion.from_rotation(solution.cam_from_ref)
-    error = quaternion.to_rotvec(quaternion.multiply(estimate, quaternion.inverse(cam_from_lab)))
+    error = quaternion.to_rotvec(
+        quaternion.multiply(estimate, quaternion.inverse(cam_from_lab))
+    )
     covariance = solution.covariance_rad2
     return error, math.nan if covariance is None else float(
         error @ np.linalg.solve(covariance, error)
@@ -273,7 +279,9 @@ def nearest_light(xy_px: Floats, lights_px: Floats) -> tuple[NDArray[np.int64], 
     for k in range(len(xy_px)):
         least_px2 = math.inf
         for n in range(len(lights_px)):
-            away_px2 = (xy_px[k, 0] - lights_px[n, 0]) ** 2 + (xy_px[k, 1] - lights_px[n, 1]) ** 2
+            away_px2 = (xy_px[k, 0] - lights_px[n, 0]) ** 2 + (
+                xy_px[k, 1] - lights_px[n, 1]
+            ) ** 2
             if away_px2 < least_px2:  # never for a position behind the camera, which is NaN
                 nearest[k] = n
                 least_px2 = away_px2
@@ -322,7 +330,11 @@ def summarize_flight(log: Telemetry, outcomes: list[Outcome], settle_s: float) -
     limit = metrics.WRONG_RAD / ARCSEC_RAD
     worst = worst_frame(outcomes)
     return Outcome(
-        "solved" if solved else outcomes[-1].status if outcomes else "no frame after it settled",
+        "solved"
+        if solved
+        else outcomes[-1].status
+        if outcomes
+        else "no frame after it settled",
         len(outcomes),
         len(solved),
         sum(one.wrong for one in outcomes),

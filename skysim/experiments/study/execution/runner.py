@@ -41,7 +41,9 @@ from skysim.results.files import recording
 from skysim.results.plots import annotate, visible
 from skysim.tracking import factory
 
-CHUNK_S = 0.25  # run time of a chunk: long relative to its overhead, short in case a worker dies
+CHUNK_S = (
+    0.25  # run time of a chunk: long relative to its overhead, short in case a worker dies
+)
 MANY = 16  # workers; more have longer chunks, and complete MANY / CHUNK_S a second: a Dask scheduler handles hundreds
 MAX_CHUNK = 5000  # maximum number of trials in a chunk
 
@@ -129,14 +131,18 @@ class ChunkQueue:
             | bool(self.spec and self.spec.hardware)
         )
         breaks = np.flatnonzero(ends) + 1
-        return tuple(self._segment(trials) for trials in np.split(chosen, breaks) if len(trials))
+        return tuple(
+            self._segment(trials) for trials in np.split(chosen, breaks) if len(trials)
+        )
 
     def _segment(self, trials: NDArray[np.int64]) -> Segment:
         point, replicate = divmod(int(trials[0]), self.replicates)
         settings = self.points[point - self.first].settings
         if self.spec:
             settings = self.spec.trial_settings(settings, replicate)
-        return Segment(point, settings, int(trials[0]), range(replicate, replicate + len(trials)))
+        return Segment(
+            point, settings, int(trials[0]), range(replicate, replicate + len(trials))
+        )
 
     def report_time(self, chunk: Chunk, seconds: float) -> None:
         """Set the size of the next chunks from the run time of this one; the size at most doubles."""
@@ -175,13 +181,17 @@ def prepare_store(
     kept = stored_replicates(plan, store) if stored else plan.study.replicates
     if not kept:
         raise InputError(
-            store.path, "contains another study, or an earlier version of this one", "another store"
+            store.path,
+            "contains another study, or an earlier version of this one",
+            "another store",
         )
     if resume and not stored:
         raise InputError(store.path, "contains no trials to resume", "to run the study")
     if done and not resume:
         raise InputError(
-            store.path, f"already contains {done} trials", "to resume the study, or another store"
+            store.path,
+            f"already contains {done} trials",
+            "to resume the study, or another store",
         )
     if done and store.meta("code") != code_version():
         problem = f"its {done} trials are of skysim {store.meta('code')}"
@@ -258,7 +268,9 @@ def run_points(
     failed_before = store.counts()["failed"]
     progress = Progress(len(numbers), len(numbers) - len(missing), failed_before)
     budget = plan.study.budget
-    queue = ChunkQueue(points, replicates, missing, first, plan.spec, chunk_seconds(engine.workers))
+    queue = ChunkQueue(
+        points, replicates, missing, first, plan.spec, chunk_seconds(engine.workers)
+    )
     rows = engine.run(TrialJob(plan.spec), queue) if len(missing) else iter(())
     try:
         for batch in rows:
@@ -267,10 +279,12 @@ def run_points(
             if watch:
                 watch(progress)
             out_of_time = (
-                budget.time_s is not None and time.perf_counter() - progress.began > budget.time_s
+                budget.time_s is not None
+                and time.perf_counter() - progress.began > budget.time_s
             )
             if out_of_time or (
-                budget.failures is not None and progress.failed - failed_before >= budget.failures
+                budget.failures is not None
+                and progress.failed - failed_before >= budget.failures
             ):
                 break
     finally:
@@ -367,7 +381,11 @@ def replayed_frames(setup: TrialSetup, seed: int) -> Iterator[tuple[Frame, Truth
             **{name: getattr(trial, name) for name in ("tilt_deg", "dec_deg", "near")},
         )
         frame, truth, _ = trials.render_trial_frame(setup._replace(trial=frame_trial), seed)
-        yield frame, truth, solve_or_failed(lambda: trials.solved_centroids(setup, [seed])[0][1])
+        yield (
+            frame,
+            truth,
+            solve_or_failed(lambda: trials.solved_centroids(setup, [seed])[0][1]),
+        )
     elif isinstance(trial, FlightTrial):
         with trials.trial_flight(setup, seed) as flight:
             for shot in flight.shots(cameras=[0]):

@@ -80,11 +80,15 @@ def build_setup(spec: TrialSpec, settings: Settings) -> TrialSetup:
     # A lab whose scene differs only in section `tracker` has the same hardware.
     cached = (setup.lab for setup in CACHE.setups.values())
     same = (
-        one for one in cached if one.scene.model_copy(update={"tracker": scene.tracker}) == scene
+        one
+        for one in cached
+        if one.scene.model_copy(update={"tracker": scene.tracker}) == scene
     )
     lab = next(same, None) or build_lab(scene, UserParts(spec.programs))
     lab = lab.with_scene(scene)
-    return TrialSetup(lab, build_tracker(lab.camera, spec.programs), trial, hash_, spec.programs)
+    return TrialSetup(
+        lab, build_tracker(lab.camera, spec.programs), trial, hash_, spec.programs
+    )
 
 
 def scene_hash(scene: Scene) -> str:
@@ -117,7 +121,9 @@ def code_version() -> str:
         for path in (DATA / folder).rglob("*")
     ]
     for path in sorted(sources + [path for path in data if path.is_file()]):
-        code.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+        code.update(
+            path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0"
+        )
     return code.hexdigest()[:16]
 
 

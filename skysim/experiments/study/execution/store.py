@@ -269,7 +269,8 @@ class Store:
         rows = self.db.execute("SELECT engine, workers, trials, seconds FROM runs ORDER BY run")
         known = (self.checked(row, str, int, int, float) for row in rows)
         return [
-            dict(zip(("engine", "workers", "trials", "seconds"), row, strict=True)) for row in known
+            dict(zip(("engine", "workers", "trials", "seconds"), row, strict=True))
+            for row in known
         ]
 
     def done(self, count: int) -> NDArray[np.bool_]:
@@ -406,7 +407,8 @@ class Store:
                     arrays.append(to_array(name, column, texts))
             self.checked([text for text in texts if not isinstance(text, str | None)][:1], str)
             return {
-                name: np.concatenate(arrays) for name, arrays in zip(COLUMNS, batches, strict=True)
+                name: np.concatenate(arrays)
+                for name, arrays in zip(COLUMNS, batches, strict=True)
             }
 
     def checked(self, row: Iterable[Any], *types: type) -> tuple[Any, ...]:
@@ -414,7 +416,9 @@ class Store:
         values = tuple(row)
         if not all(map(isinstance, values, types)):
             allowed = ", ".join(dict.fromkeys(one.__name__ for one in types))
-            raise InputError(self.path, f"not a valid study store: {repr(values)[:80]}", allowed)
+            raise InputError(
+                self.path, f"not a valid study store: {repr(values)[:80]}", allowed
+            )
         return values
 
     @contextmanager

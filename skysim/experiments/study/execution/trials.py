@@ -122,7 +122,15 @@ class TrialJob:
         replicate = segment.replicates[0]
         seed = seed_of(self.spec, segment.point, replicate)
         return Row(
-            segment.first, segment.point, replicate, seed, "", code_version(), FAILED, error, 0.0
+            segment.first,
+            segment.point,
+            replicate,
+            seed,
+            "",
+            code_version(),
+            FAILED,
+            error,
+            0.0,
         )
 
 
@@ -151,7 +159,9 @@ def block_size(spec: TrialSpec, segment: Segment, key: str) -> int:
 def divided(segment: Segment, size: int) -> Iterator[Segment]:
     """The segment in parts of so many trials."""
     for n in range(0, len(segment.replicates), size):
-        yield segment._replace(first=segment.first + n, replicates=segment.replicates[n : n + size])
+        yield segment._replace(
+            first=segment.first + n, replicates=segment.replicates[n : n + size]
+        )
 
 
 def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
@@ -186,7 +196,17 @@ def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
             error = traceback.format_exc().replace(f"{ROOT}/", "")
     seconds = (time.perf_counter() - start_s) / len(seeds)
     return [
-        Row(trial, segment.point, replicate, seed, scene, code_version(), outcome, error, seconds)
+        Row(
+            trial,
+            segment.point,
+            replicate,
+            seed,
+            scene,
+            code_version(),
+            outcome,
+            error,
+            seconds,
+        )
         for (trial, replicate), seed, outcome in zip(numbers, seeds, outcomes, strict=True)
     ]
 
@@ -207,7 +227,9 @@ def run_centroid_trials(setup: TrialSetup, seeds: Sequence[int]) -> list[Outcome
     return [score(setup.lab, setup.estimator, report, lights) for lights, report in solved]
 
 
-def solved_centroids(setup: TrialSetup, seeds: Sequence[int]) -> list[tuple[TrueLights, Report]]:
+def solved_centroids(
+    setup: TrialSetup, seeds: Sequence[int]
+) -> list[tuple[TrueLights, Report]]:
     """The lights of centroid trials, and the report on the detections; of coded light on those of the last frame."""
     lab = setup.lab
     trial = setup.trial
@@ -236,7 +258,9 @@ def solved_centroids(setup: TrialSetup, seeds: Sequence[int]) -> list[tuple[True
             Report(factory.solve_centroids(estimator, each, exposure_s), each)
             for each in detections
         ]
-    lights = [TrueLights(*each, each[1], None) for each in zip(lab_from_body, seen_px, strict=True)]
+    lights = [
+        TrueLights(*each, each[1], None) for each in zip(lab_from_body, seen_px, strict=True)
+    ]
     return list(zip(lights, reports, strict=True))
 
 
@@ -267,7 +291,9 @@ def run_flight_trial(setup: TrialSetup, seed: int) -> Outcome:
     assert isinstance(trial, FlightTrial)
     with trial_flight(setup, seed) as flight:
         outcomes = [
-            one for t_s, one in flight_outcomes(flight, setup.estimator) if t_s >= trial.settle_s
+            one
+            for t_s, one in flight_outcomes(flight, setup.estimator)
+            if t_s >= trial.settle_s
         ]
         return summarize_flight(flight.telemetry(), outcomes, trial.settle_s)
 
@@ -332,7 +358,8 @@ def random_attitudes(setup: TrialSetup, rngs: Sequence[np.random.Generator]) -> 
         most = math.cos(math.radians(low))
         tilts = [math.acos(min(rng.uniform(least, most), 1.0)) for rng in rngs]
         drawn = [
-            zyz(first, tilt, last - first) for (first, last), tilt in zip(turns, tilts, strict=True)
+            zyz(first, tilt, last - first)
+            for (first, last), tilt in zip(turns, tilts, strict=True)
         ]
         return Rotation.from_quat(np.array(drawn)[:, [1, 2, 3, 0]])
     near = attitudes.near
@@ -483,7 +510,9 @@ def gyro_rate(setup: TrialSetup, truth: Truth) -> RateEstimate | None:
     """The rate in camera axes that the trial's gyro measures, without an error; None without a gyro."""
     assert isinstance(setup.trial, FrameTrial)
     return (
-        RateEstimate(truth.rate_cam_rad_s, GYRO_RAD_S**2 * np.eye(3)) if setup.trial.gyro else None
+        RateEstimate(truth.rate_cam_rad_s, GYRO_RAD_S**2 * np.eye(3))
+        if setup.trial.gyro
+        else None
     )
 
 
@@ -519,7 +548,8 @@ def constant_acceleration(
     windows = [exposure_window(scene, index) for index in range(frame + 1)]
     rows = scene.camera.height_px
     exposures = [
-        np.linspace(one.open_s - MARGIN_S, one.close_s(rows) + MARGIN_S, KNOTS) for one in windows
+        np.linspace(one.open_s - MARGIN_S, one.close_s(rows) + MARGIN_S, KNOTS)
+        for one in windows
     ]
     t_s = np.unique(np.concatenate(exposures))
     since_s = t_s - windows[-1].middle_s(rows)

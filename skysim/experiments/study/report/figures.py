@@ -104,7 +104,9 @@ MAX_WRAPPED_LABELS = (
     8  # maximum number of tick labels that are wrapped; with more, long ones are rotated
 )
 LABEL_WIDTH = 88  # characters that fit below an axis
-MAX_CELLS_WITH_TEXT = 12  # maximum rows and columns of a heat map with values written in its cells
+MAX_CELLS_WITH_TEXT = (
+    12  # maximum rows and columns of a heat map with values written in its cells
+)
 MAX_LABELED_POINTS = 12  # maximum number of Pareto points that are labeled
 GRAY = "#8fa1b3"
 ORANGE = "#d55e00"
@@ -150,7 +152,9 @@ def draw_curve(fig: Any, lines: Sequence[PointRow], figure: Curve, study: Study)
             draw_line(axes, one, ink, mark, x_axis, (n - (len(shown) - 1) / 2) * wide_pt)
     draw_thresholds(axes, figure, study, lines, group_axis)
     if not any(np.isfinite(one.value).any() for one in shown):
-        axes.text(0.5, 0.5, "nothing yet", transform=axes.transAxes, ha="center", color="#888888")
+        axes.text(
+            0.5, 0.5, "nothing yet", transform=axes.transAxes, ha="center", color="#888888"
+        )
     if group_axis is not None and shown:
         columns = math.ceil(len(shown) / 14)
         fig.legend(
@@ -171,7 +175,9 @@ def draw_thresholds(
                 continue
             low, high = np.clip([one.low, one.high], first, last)
             axes.hlines(threshold.limit, low, high, color=ink, linewidth=6, alpha=0.25)
-            axes.plot(one.value, threshold.limit, "|", color=ink, markersize=13, markeredgewidth=2)
+            axes.plot(
+                one.value, threshold.limit, "|", color=ink, markersize=13, markeredgewidth=2
+            )
 
 
 def set_up_y_axis(
@@ -189,7 +195,9 @@ def set_up_y_axis(
     axes.set_ylabel(label(name))
 
 
-def draw_line(axes: Any, one: Series, ink: Any, mark: str, x_axis: Axis, step_pt: float) -> None:
+def draw_line(
+    axes: Any, one: Series, ink: Any, mark: str, x_axis: Axis, step_pt: float
+) -> None:
     """Draw one series, offset sideways by `step_pt` points; named levels are joined by a dotted line.
 
     On a logarithmic axis a value of zero cannot be drawn; an open triangle marks its upper bound.
@@ -262,15 +270,21 @@ def drawn_interval(axes: Any, one: Series | Panel) -> tuple[Floats, Floats]:
 def running_median(one: Series) -> tuple[Floats, Floats]:
     """Medians of x and of value in twelve groups of equal size, along a series ascending in x."""
     good = np.isfinite(one.value)
-    parts = zip(np.array_split(one.x[good], 12), np.array_split(one.value[good], 12), strict=True)
-    medians = np.array([(np.median(x), np.median(y)) for x, y in parts if len(x)]).reshape(-1, 2)
+    parts = zip(
+        np.array_split(one.x[good], 12), np.array_split(one.value[good], 12), strict=True
+    )
+    medians = np.array([(np.median(x), np.median(y)) for x, y in parts if len(x)]).reshape(
+        -1, 2
+    )
     return medians[:, 0], medians[:, 1]
 
 
 def level_medians(one: Series) -> tuple[Floats, Floats]:
     """Median of the values at each distinct x."""
     places = np.unique(one.x[np.isfinite(one.value)])
-    return places, np.array([np.nanmedian(one.value[one.x == coordinate]) for coordinate in places])
+    return places, np.array(
+        [np.nanmedian(one.value[one.x == coordinate]) for coordinate in places]
+    )
 
 
 def colors(count: int, group_axis: Axis | None) -> list[Any]:
@@ -298,7 +312,9 @@ def set_up_x_axis(axes: Any, x_axis: Axis) -> None:
     if x_axis.numeric and (len(places) > MAX_TICKS or close):
         return
     names = [wrapped(x_axis.tick_label(one), len(places)) for one in x_axis.levels]
-    rotated = len(places) > MAX_WRAPPED_LABELS and max(map(len, names)) * len(names) > LABEL_WIDTH
+    rotated = (
+        len(places) > MAX_WRAPPED_LABELS and max(map(len, names)) * len(names) > LABEL_WIDTH
+    )
     axes.set_xticks(
         places, names, rotation=25 if rotated else 0, ha="right" if rotated else "center"
     )
@@ -377,7 +393,9 @@ def draw_scatter(fig: Any, lines: Sequence[PointRow], figure: Heat, study: Study
     if y.log:
         logarithmic(axes, "y", min(up), max(up))
     elif not y.numeric:
-        axes.set_yticks(range(len(y.levels)), [wrapped(y.tick_label(one), 4) for one in y.levels])
+        axes.set_yticks(
+            range(len(y.levels)), [wrapped(y.tick_label(one), 4) for one in y.levels]
+        )
         axes.set_ylim(len(y.levels) - 0.5, -0.5)
     dots = axes.scatter(across, up, c=values, s=size, **color_scale(values, figure))
     axes.set_ylabel(y.label)
@@ -391,7 +409,9 @@ def indices_png(indices: Sequence[Index], response: str) -> bytes:
     """Bar chart of the first-order and total Sobol indices of one response, largest total first, as PNG."""
     selected = [one for one in indices if one.response == response]
     selected.sort(key=lambda one: -np.nan_to_num(one.total.value, nan=-np.inf))
-    return png(lambda fig: draw_indices(fig, selected, response), (7.0, 1.1 + 0.42 * len(selected)))
+    return png(
+        lambda fig: draw_indices(fig, selected, response), (7.0, 1.1 + 0.42 * len(selected))
+    )
 
 
 def draw_indices(fig: Any, selected: Sequence[Index], response: str) -> None:
@@ -406,7 +426,9 @@ def draw_indices(fig: Any, selected: Sequence[Index], response: str) -> None:
         axes.barh(rows + shift, np.nan_to_num(value), 0.36, color=ink, label=name)
         ends = np.clip([low, high], -9, 9)
         axes.hlines(rows + shift, *ends, color="#333333", linewidth=1)
-    bounds = np.array([end for one in selected for end in (*one.first[:3], *one.total[:3], 0.0)])
+    bounds = np.array(
+        [end for one in selected for end in (*one.first[:3], *one.total[:3], 0.0)]
+    )
     bounds = bounds[np.isfinite(bounds)]
     axes.set_xlim(min(bounds.min() * 1.05, 0.0), max(min(bounds.max() * 1.05, 2.0), 0.1))
     axes.set_yticks(rows, [one.factor for one in selected])
@@ -427,7 +449,9 @@ def search_png(panels: dict[str, Panel], points: Sequence[int], front: Sequence[
         marked = np.isin(points, front)
         stack = np.ravel(fig.subplots(len(panels), 1, sharex=True))
         for axes, (name, one) in zip(stack, panels.items(), strict=True):
-            set_up_y_axis(axes, name, [one._replace(value=np.append(one.value, one.bounds))], False)
+            set_up_y_axis(
+                axes, name, [one._replace(value=np.append(one.value, one.bounds))], False
+            )
             axes.set_ylabel(one.label.replace(", ", "\n"))
             draw_bars(axes, x, one, GRAY, axes.transData)
             axes.plot(x, one.value, "o", color=GRAY, markersize=3.5)

@@ -34,7 +34,9 @@ from skysim.results.metrics import Summary
 MAX_X_WITH_BARS = (
     12  # maximum number of x values for error bars; with more, intervals are drawn as a band
 )
-MAX_POINTS_WITH_BARS = 60  # sampled points with error bars; with more, a running median is drawn
+MAX_POINTS_WITH_BARS = (
+    60  # sampled points with error bars; with more, a running median is drawn
+)
 MOST_LINES = (
     7  # maximum number of lines in an automatic curve; with more levels it becomes a heat map
 )
@@ -131,7 +133,9 @@ def figures(study: Study, lines: Sequence[PointRow]) -> list[Figure]:
     # If there are too many figures, show fewer responses, each with all of its figures.
     most = max(MOST_FIGURES * len(study.responses) // len(pairs), 1)  # responses to show
     return [
-        automatic_figure(x, by, y, axes, lines) for x, by, y in pairs if y in study.responses[:most]
+        automatic_figure(x, by, y, axes, lines)
+        for x, by, y in pairs
+        if y in study.responses[:most]
     ]
 
 
@@ -200,7 +204,9 @@ def limits(
     if log:
         inner = inner[inner > 0]
         outer = outer[outer > 0]
-        outer = outer[outer > (inner.min() if len(inner) else outer.max(initial=0.0)) / FAR_RATIO]
+        outer = outer[
+            outer > (inner.min() if len(inner) else outer.max(initial=0.0)) / FAR_RATIO
+        ]
     numbers = np.concatenate([inner, outer])
     if not len(numbers):
         return (0.1, 1.0) if log else (0.0, 1.0)
@@ -271,7 +277,9 @@ def caption(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
         mark = "Hollow, without a line"
         text += curve_note(figure, study, lines, summaries) + "."
         if thresholds_of(figure, study, lines):
-            text += " Dashed: a limit; ticks and bars: where it is crossed, with intervals of 95 %."
+            text += (
+                " Dashed: a limit; ticks and bars: where it is crossed, with intervals of 95 %."
+            )
         if (expected := expected_value(value)) is not None:
             text += f" Dotted: {expected:g}, where the claimed errors are true."
     else:

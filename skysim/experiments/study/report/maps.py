@@ -96,7 +96,9 @@ def direction_map(label: str, columns: Columns, response: str) -> DirectionMap:
     in_sky = np.isfinite(columns["boresight_dec_deg"])
     if in_dome.any() and in_sky.any():
         raise InputError(
-            f"map of {response}", "trials under a dome and under the stars", "where, to choose one"
+            f"map of {response}",
+            "trials under a dome and under the stars",
+            "where, to choose one",
         )
     sky = bool(in_sky.any())
     known = in_dome | in_sky
@@ -135,7 +137,9 @@ def radial_range(radial_deg: Floats, sky: bool) -> tuple[float, float]:
     if not sky:
         return (0.0 if low <= 1 else float(low)), float(high)
     bottom, top = SKY_RANGE_DEG
-    return (bottom if low < bottom + 5 else float(low)), (top if high > top - 5 else float(high))
+    return (bottom if low < bottom + 5 else float(low)), (
+        top if high > top - 5 else float(high)
+    )
 
 
 def partition(
@@ -280,7 +284,9 @@ def draw_sky_labels(axes: Any, panel: DirectionMap) -> None:
     for ra_deg in (240, 300, 360, 420, 480):
         axes.text(*place(0.0, ra_deg, True), f"{ra_deg % 360}°", path_effects=[halo()], **LABEL)
     for dec in (-60.0, -30.0, 0.0, 30.0, 60.0):
-        axes.text(*place(dec, 540.0, True) - [0.22, 0.0], f"{dec:+.0f}°" if dec else "0°", **LABEL)
+        axes.text(
+            *place(dec, 540.0, True) - [0.22, 0.0], f"{dec:+.0f}°" if dec else "0°", **LABEL
+        )
 
 
 def mark_worst(axes: Any, panel: DirectionMap) -> None:

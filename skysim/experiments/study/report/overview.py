@@ -155,7 +155,9 @@ def options(factor: Factor) -> list[tuple[object, dict[str, object]]]:
     """The levels of a factor; of a range its ends, of a distribution its median."""
     if isinstance(factor, Range):
         return [factor.value_at(0.0), factor.value_at(1.0)]
-    return [factor.value_at(0.5)] if isinstance(factor, Distribution) else list(factor.options())
+    return (
+        [factor.value_at(0.5)] if isinstance(factor, Distribution) else list(factor.options())
+    )
 
 
 # The table.
@@ -177,7 +179,9 @@ def scene_rows(plan: Plan, lab: Lab, facts: Sequence[Fact]) -> list[tuple[str, s
         *((fact.name, "; ".join(fact.lines)) for fact in facts if fact.name == TRACKER_KNOWS),
         (
             "trial",
-            ", ".join(f"{key}: {format_setting(value)}" for key, value in plan.spec.trial.items()),
+            ", ".join(
+                f"{key}: {format_setting(value)}" for key, value in plan.spec.trial.items()
+            ),
         ),
         *((f"varied: {name}", factor_text(factor)) for name, factor in study.factors.items()),
         ("trials", f"{study.replicates} {points}, {attitudes}; seed {study.seed}"),
@@ -236,7 +240,9 @@ def format_setting(value: object) -> str:
     """A value of a key on one line."""
     if isinstance(value, dict):
         return (
-            "{" + ", ".join(f"{key}: {format_setting(inner)}" for key, inner in value.items()) + "}"
+            "{"
+            + ", ".join(f"{key}: {format_setting(inner)}" for key, inner in value.items())
+            + "}"
         )
     return (
         f"[{', '.join(map(format_setting, value))}]"

@@ -83,7 +83,9 @@ def to_parquet(store: Store, responses: tuple[str, ...], path: Path) -> None:
     first = next(tables)
     with (
         files.atomic_file(path) as temporary,
-        pyarrow.parquet.ParquetWriter(temporary, first.schema, **encoding(first.schema)) as writer,
+        pyarrow.parquet.ParquetWriter(
+            temporary, first.schema, **encoding(first.schema)
+        ) as writer,
     ):
         for rows in itertools.chain([first], tables):
             writer.write_table(rows)

@@ -266,12 +266,18 @@ def failures(store: Store, replay: str) -> Items:
 
 
 def points_section(
-    lines: Sequence[PointRow], study: Study, front: Sequence[int], costs: Mapping[int, float] | None
+    lines: Sequence[PointRow],
+    study: Study,
+    front: Sequence[int],
+    costs: Mapping[int, float] | None,
 ) -> Section:
     """The table of all points. Named levels sort in the order of the study file; those of a front are marked."""
     heads, texts = cells(lines)
     axes = {name: axis(study, lines, name) for name in (lines[0].levels if lines else ())}
-    kinds: list[Kind] = ["number", *("number" if one.numeric else "text" for one in axes.values())]
+    kinds: list[Kind] = [
+        "number",
+        *("number" if one.numeric else "text" for one in axes.values()),
+    ]
     kinds += ["number"] * len(heads[len(kinds) :])
     columns = [Column(head, kind=kind) for head, kind in zip(heads, kinds, strict=False)]
     rows: list[list[Any]] = []
@@ -430,7 +436,8 @@ def sobol_figures(indices: Sequence[Index]) -> list[Figure]:
     """Sobol indices, one image per response."""
     named = dict.fromkeys(one.response for one in indices)
     return [
-        Figure(figures.indices_png(indices, name), SOBOL.format(name), name=name) for name in named
+        Figure(figures.indices_png(indices, name), SOBOL.format(name), name=name)
+        for name in named
     ]
 
 

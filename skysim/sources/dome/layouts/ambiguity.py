@@ -185,7 +185,8 @@ def max_coincident(fields: Fields, i: int, j: int, threshold: float, farther: bo
             # The identity, a field laid on itself without rotation, is no ambiguity.
             if i != j or n != k:
                 most = max(
-                    most, count_coincident(fields, i, j, angle[n] - angle[k], max(most, threshold))
+                    most,
+                    count_coincident(fields, i, j, angle[n] - angle[k], max(most, threshold)),
                 )
             n += 1
     return most
@@ -207,7 +208,9 @@ def upper_bound(fields: Fields, i: int, j: int) -> int:
 
 
 @jit
-def count_coincident(fields: Fields, i: int, j: int, rotation_rad: float, threshold: float) -> int:
+def count_coincident(
+    fields: Fields, i: int, j: int, rotation_rad: float, threshold: float
+) -> int:
     """Neighbors of i that coincide with one of j after i is rotated; fewer if no more than the threshold do."""
     first = fields.first
     radius = fields.radius
@@ -243,7 +246,9 @@ def count_coincident(fields: Fields, i: int, j: int, rotation_rad: float, thresh
 ROUNDS = 5000  # of new levels before the search fails
 
 
-def unique_levels(levels: int, nearest: int, position_m: Floats, rng: np.random.Generator) -> Ints:
+def unique_levels(
+    levels: int, nearest: int, position_m: Floats, rng: np.random.Generator
+) -> Ints:
     """(N,) numbers of the LEDs' levels at (N, 3) places, so that no two neighborhoods are alike.
 
     Raises
@@ -282,7 +287,9 @@ def neighbors(position_m: Floats, nearest: int) -> Ints:
     near = KDTree(direction).query(direction, nearest + 1)[1][:, 1:]
     offset = direction[near] - direction[:, None]
     # Two axes across the direction; any two serve, since the comparison is of all turns.
-    x = np.cross(direction, np.where(np.abs(direction[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]]))
+    x = np.cross(
+        direction, np.where(np.abs(direction[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
+    )
     y = np.cross(direction, x)
     azimuth = np.arctan2(np.einsum("nki,ni->nk", offset, y), np.einsum("nki,ni->nk", offset, x))
     return np.take_along_axis(near, np.argsort(azimuth, axis=1), axis=1)
@@ -299,5 +306,7 @@ def neighborhoods(level: Ints, around: Ints, levels: int) -> Ints:
     """(N,) number of each neighborhood: the levels as digits of base `levels`, the least number of all turns."""
     nearest = around.shape[1]
     power = levels ** np.arange(nearest)
-    ring = np.min([np.roll(level[around], turn, axis=1) @ power for turn in range(nearest)], axis=0)
+    ring = np.min(
+        [np.roll(level[around], turn, axis=1) @ power for turn in range(nearest)], axis=0
+    )
     return level * levels**nearest + ring

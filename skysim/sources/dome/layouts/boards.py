@@ -133,7 +133,9 @@ def grid(spacing_rad: float, half_angle_rad: float) -> Floats:
     return np.column_stack([x * scale, y * scale, 1 - radius2 / 2])
 
 
-def listed_boards(config: PatchBoardsConfig, surface: Surface) -> tuple[Boards, list[Ints], Floats]:
+def listed_boards(
+    config: PatchBoardsConfig, surface: Surface
+) -> tuple[Boards, list[Ints], Floats]:
     """Boards at the listed places, their holes, and the level of every LED.
 
     Raises
@@ -142,7 +144,9 @@ def listed_boards(config: PatchBoardsConfig, surface: Surface) -> tuple[Boards, 
         If two boards overlap, or one is outside the cap.
     """
     listed = config.boards
-    directions = directions_from_angles([(board.azimuth_deg, board.tilt_deg) for board in listed])
+    directions = directions_from_angles(
+        [(board.azimuth_deg, board.tilt_deg) for board in listed]
+    )
     check_cap("light.layout.boards", directions, config.cap_deg)
     center_m = project_from_bearing(surface, directions)
     close = cKDTree(center_m).query_pairs(3 * config.pitch_m * (1 - 1e-9))
@@ -154,7 +158,9 @@ def listed_boards(config: PatchBoardsConfig, surface: Surface) -> tuple[Boards, 
             f"overlaps board {first}, {distance_m:.3g} m away",
             f"{3 * config.pitch_m:.3g} m, three pitches",
         )
-    boards = tangent_boards(surface, center_m, np.radians([board.rotation_deg for board in listed]))
+    boards = tangent_boards(
+        surface, center_m, np.radians([board.rotation_deg for board in listed])
+    )
     level = np.concatenate([board.levels or np.ones(len(board.leds)) for board in listed])
     return boards, [np.array(board.leds, dtype=np.int64) for board in listed], level
 

@@ -31,9 +31,13 @@ Ints = NDArray[np.int64]
 
 # Prior information, rad^-2, that keeps M invertible when too few LEDs are in view.
 PRIOR_INFORMATION = 1e-6
-HARDNESS = 10  # power of the variance in the soft maximum: 1 is the mean, infinity the worst case
+HARDNESS = (
+    10  # power of the variance in the soft maximum: 1 is the mean, infinity the worst case
+)
 COLUMNS = 4  # columns of the attitude index per half width of the search window
-MISSING_LED_FACTOR = 1.5  # factor on the variance for each LED that a field lacks of the minimum
+MISSING_LED_FACTOR = (
+    1.5  # factor on the variance for each LED that a field lacks of the minimum
+)
 
 
 class Visibility(NamedTuple):

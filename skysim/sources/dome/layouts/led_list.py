@@ -24,9 +24,7 @@ HEADER = """\
 # LEDs of {name}: x_m, y_m, z_m from the center of the bearing in the lab (z up); azimuth from +x toward +y, and tilt
 # from the zenith, seen from there; level: nominal brightness, 1 at the full drive{tape}.
 """
-TAPE = (
-    "; tape: number of the\n# tape from the zenith; tape_m: from its first LED, along the surface"
-)
+TAPE = "; tape: number of the\n# tape from the zenith; tape_m: from its first LED, along the surface"
 
 
 def led_list(config: DomeConfig, band: Band, name: str) -> tuple[str, int]:

@@ -65,7 +65,9 @@ def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -
     else:
         coordinates = np.array(config.positions_m or config.directions_deg)
     # Places are used as they are; directions are projected from the bearing.
-    directions = coordinates if coordinates.shape[1] == 3 else directions_from_angles(coordinates)
+    directions = (
+        coordinates if coordinates.shape[1] == 3 else directions_from_angles(coordinates)
+    )
     check_cap(key, directions, config.cap_deg)
     place_m = (
         coordinates if coordinates.shape[1] == 3 else project_from_bearing(surface, directions)

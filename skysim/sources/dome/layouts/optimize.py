@@ -173,7 +173,9 @@ class PlacementScore(NamedTuple):
     def under_two(self, place_m: Floats) -> int:
         """Number of attitudes with fewer than two LEDs in the inner part of the field; two fix an attitude."""
         geometry = camera_geometry(self.config, self.options.inner_field)
-        return int(np.sum(total_information(place_m, self.R_body_from_lab, *geometry)[:, 6] < 2))
+        return int(
+            np.sum(total_information(place_m, self.R_body_from_lab, *geometry)[:, 6] < 2)
+        )
 
     def score(self, place_m: Floats, rng: np.random.Generator) -> tuple[bool, bool, float]:
         """Sort key of layouts; less is better.
@@ -235,7 +237,9 @@ def optimize_places(
             "fewer LEDs, less spacing, or a greater cap_deg",
         )
     visible = visible_fraction(config, few_sites_m, rng)
-    scorer = PlacementScore(config, options, sample_attitudes(config, options.score_attitudes, rng))
+    scorer = PlacementScore(
+        config, options, sample_attitudes(config, options.score_attitudes, rng)
+    )
     # The best of them is the reference; contracted layouts are further starts.
     even_m = min(even, key=scorer.tail_variance)
     scorer = scorer._replace(reference=scorer.tail_variance(even_m))
@@ -333,7 +337,9 @@ def descend(
     field_fraction = search.field_fraction
     candidates = []
     R_body_from_lab = sample_attitudes(config, attitude_count, rng)
-    last_rounds = np.linspace(0, config.rounds, options.generations + 1).round().astype(int)[1:-1]
+    last_rounds = (
+        np.linspace(0, config.rounds, options.generations + 1).round().astype(int)[1:-1]
+    )
     for n in range(config.rounds):
         if n in last_rounds[options.keep_every - 1 :: options.keep_every]:
             candidates.append(place_m)
@@ -368,7 +374,9 @@ def visible_fraction(
     config: layouts.OptimizedConfig, sites_m: Floats, rng: np.random.Generator
 ) -> float:
     """Mean fraction of the sites that an attitude sees; times the number of LEDs it is the mean number in a field."""
-    total = total_information(sites_m, sample_attitudes(config, 200, rng), *camera_geometry(config))
+    total = total_information(
+        sites_m, sample_attitudes(config, 200, rng), *camera_geometry(config)
+    )
     return float(total[:, 6].mean()) / len(sites_m)
 
 
@@ -404,7 +412,9 @@ def hardest_attitudes(
         perturbation = Rotation.from_rotvec(step_rad * rng.standard_normal((len(hardest), 3)))
         perturbed = perturbation.as_matrix() @ hardest
         new_cost = attitude_costs(perturbed)
-        harder = (new_cost > cost) & (perturbed[:, 2, 2] >= math.cos(math.radians(config.tilt_deg)))
+        harder = (new_cost > cost) & (
+            perturbed[:, 2, 2] >= math.cos(math.radians(config.tilt_deg))
+        )
         hardest[harder] = perturbed[harder]
         cost[harder] = new_cost[harder]
     return hardest
@@ -547,7 +557,11 @@ def layout_ambiguity(config: layouts.OptimizedConfig, place_m: Floats) -> Ambigu
     radius_rad = math.atan(math.sqrt(4 * float(np.prod(tan_half(config))) / math.pi))
     assert config.camera_m is not None, "completed by the scene"
     return field_ambiguity(
-        place_m, config.camera_m[2], math.radians(config.tilt_deg), radius_rad, config.coincidence_m
+        place_m,
+        config.camera_m[2],
+        math.radians(config.tilt_deg),
+        radius_rad,
+        config.coincidence_m,
     )
 
 
@@ -587,7 +601,9 @@ def reduce_ambiguity(
             continue
         # 2.
         trial_ambiguity = layout_ambiguity(config, trial_m)
-        less_excess = excess_overlap(trial_ambiguity, options) < excess_overlap(ambiguity, options)
+        less_excess = excess_overlap(trial_ambiguity, options) < excess_overlap(
+            ambiguity, options
+        )
         if not less_excess or scorer.under_two(trial_m) > under_two:
             continue
         # 3.

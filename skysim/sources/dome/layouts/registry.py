@@ -94,4 +94,6 @@ LAYOUTS: dict[str, Callable[[Any, Surface, LedConfig, Band], Sources]] = {
 def board_of(config: Layout, led_ids: Ints) -> Ints | None:
     """(N,) board of each of these LED numbers; None if boards cannot tell LEDs apart: no boards, or only one."""
     board = led_ids // HOLES
-    return board if isinstance(config, PatchBoardsConfig) and len(np.unique(board)) > 1 else None
+    return (
+        board if isinstance(config, PatchBoardsConfig) and len(np.unique(board)) > 1 else None
+    )

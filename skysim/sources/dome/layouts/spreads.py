@@ -173,7 +173,9 @@ def geodesic(config: GeodesicConfig, surface: Surface, led: LedConfig, band: Ban
     order = order[tilt_rad[order] <= np.radians(config.cap_deg) * (1 + CAP_SLACK)]
     turned = azimuth_rad[order] + np.radians(config.rotation_deg)
     directions_lab = directions(tilt_rad[order], turned)
-    return lit_sources(config, surface, project_from_bearing(surface, directions_lab), led, band)
+    return lit_sources(
+        config, surface, project_from_bearing(surface, directions_lab), led, band
+    )
 
 
 def geodesic_vertices(frequency: int, class_: str) -> Floats:
@@ -185,7 +187,9 @@ def geodesic_vertices(frequency: int, class_: str) -> Floats:
         for lattice in lattice_points(frequency, class_):
             pairs = zip(face, lattice, strict=True)
             weights.add(tuple(sorted((corner, n) for corner, n in pairs if n)))
-    points = np.array([sum(n * corners[corner] for corner, n in each) for each in sorted(weights)])
+    points = np.array(
+        [sum(n * corners[corner] for corner, n in each) for each in sorted(weights)]
+    )
     return points / np.linalg.norm(points, axis=1, keepdims=True)
 
 

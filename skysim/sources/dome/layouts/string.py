@@ -111,7 +111,8 @@ def wind(config: StringConfig, surface: Surface) -> Wound:
         zenith_m = project_from_bearing(surface, np.array([[0.0, 0.0, 1.0]]))
         return Wound(zenith_m, np.zeros(1, np.int64), np.zeros(1))
     design_m = [
-        config.pitch_m * np.arange(tape.led_count(config.pitch_m), dtype=float) for tape in tapes
+        config.pitch_m * np.arange(tape.led_count(config.pitch_m), dtype=float)
+        for tape in tapes
     ]
     rng = random_stream(config.hardware_seed, TAPE_STREAM)
     stretch = 1 + scaled_errors(config.pitch_error, rng.standard_normal(len(tapes)))
@@ -201,10 +202,14 @@ def spiral(config: StringConfig, surface: Surface, meridian: Meridian) -> list[T
     per_rad_m = np.hypot(ring_m, config.spacing_m / (2 * np.pi))
     check_length(float(np.trapezoid(per_rad_m, azimuth_rad)), turns, config)
     # Steps of equal length, and of equal azimuth near the apex, where the tape is most curved.
-    per_rad = np.maximum(STEPS_PER_TURN / (2 * np.pi), STEPS_PER_PITCH * per_rad_m / config.pitch_m)
+    per_rad = np.maximum(
+        STEPS_PER_TURN / (2 * np.pi), STEPS_PER_PITCH * per_rad_m / config.pitch_m
+    )
     steps = np.append(0, np.cumsum((per_rad[1:] + per_rad[:-1]) / 2 * np.diff(azimuth_rad)))
     fine_rad = np.interp(np.arange(int(steps[-1]) + 1), steps, azimuth_rad)
-    tilt_rad = np.interp(fine_rad, azimuth_rad, np.interp(arc_m, meridian.arc_m, meridian.tilt_rad))
+    tilt_rad = np.interp(
+        fine_rad, azimuth_rad, np.interp(arc_m, meridian.arc_m, meridian.tilt_rad)
+    )
     return [lay(surface, tilt_rad, fine_rad)]
 
 
@@ -218,7 +223,9 @@ def strips(config: StringConfig, surface: Surface, meridian: Meridian) -> list[T
     while 2 * np.pi * widest_m[-1] > count * config.spacing_m:
         count *= 2
     check_length(count * float(meridian.arc_m[-1]), count, config)
-    steps = max(STEPS_PER_TURN, int(STEPS_PER_PITCH * float(meridian.arc_m[-1]) / config.pitch_m))
+    steps = max(
+        STEPS_PER_TURN, int(STEPS_PER_PITCH * float(meridian.arc_m[-1]) / config.pitch_m)
+    )
     tapes = []
     for number in range(count):
         # Number of strips in the coarsest set that contains this one; it begins where these are half a spacing apart.
@@ -311,7 +318,9 @@ def marked_m(
     line = sight_m / np.linalg.norm(sight_m, axis=1, keepdims=True)
     common = scaled_errors(config.orientation_sigma_arcsec, rng.standard_normal(3)) * ARCSEC_RAD
     pointing = scaled_errors(config.pointing_sigma_arcsec, rng.standard_normal((len(line), 2)))
-    line = Rotation.from_rotvec(common).apply(line + along_two_axes(line, pointing * ARCSEC_RAD))
+    line = Rotation.from_rotvec(common).apply(
+        line + along_two_axes(line, pointing * ARCSEC_RAD)
+    )
     line /= np.linalg.norm(line, axis=1, keepdims=True)
     # 2.
     mark_m = surface.meet(laser_m, line)
