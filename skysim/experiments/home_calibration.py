@@ -37,6 +37,7 @@ from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
+from skysim.core.files import make_folder
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey import survey_images
 from skysim.results.plots import INK, png
@@ -48,13 +49,16 @@ from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.flight import Progress, open_flight
 from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking import onboard_model
+from skysim.tracking.dome_map_file import DomeMap, write_dome_map
 
 SAME_STOP_DEG = 0.5  # frames of a stop differ by less, two stops in a row by more
 STILL_DEG = (
     0.05  # a frame whose attitude differs by more from the frame before is taken in motion
 )
-LEAST_GATE_PX = 20.0
 CLICKS = 4
+DISTINCT_ARCSEC = (
+    100.0  # angles with a larger gap are distinct: a bucket of the thesis's pair catalog
+)
 QUEST_LEDS = 2
 INTENSITY = 0.04  # threshold, a share of full scale
 AREA_PX = 50
@@ -202,19 +206,26 @@ def apart_deg(a: Rotation, b: Rotation) -> float:
 
 
 def name_lights(known: Assumed, frame: HeldFrame) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Rows of the map and of the frame's lights that are each other's nearest, within half the least spacing."""
+    """Rows of the map and of the frame's lights that are each other's nearest, within half the least spacing.
+
+    An error of the IMU moves all images alike, so a frame with all its LEDs is first moved onto the expected ones.
+    """
     expected_px = project(
         frame.lab_from_body.inv(), known.leds.position_m, known.lever, known.camera
     )
-    led = np.flatnonzero(np.isfinite(expected_px).all(axis=1))
-    tree = cKDTree(expected_px[led])
-    spacing_px = tree.query(expected_px[led], 2)[0][:, 1] if len(led) > 1 else np.inf
-    distance_px, nearest = tree.query(frame.xy_px)
-    _, nearest_light = cKDTree(frame.xy_px).query(expected_px[led])
-    gate_px = np.maximum(np.min(spacing_px) / 2, LEAST_GATE_PX)
-    light = np.flatnonzero(
-        (nearest_light[nearest] == np.arange(len(nearest))) & (distance_px < gate_px)
-    )
+    led = np.flatnonzero(known.camera.contains(expected_px))
+    if not len(led):
+        return led, led
+    expected_px = expected_px[led]
+    xy_px = frame.xy_px
+    if len(xy_px) == len(led):
+        xy_px = xy_px - xy_px.mean(axis=0) + expected_px.mean(axis=0)
+    tree = cKDTree(expected_px)
+    spacing_px = tree.query(expected_px, 2)[0][:, 1] if len(led) > 1 else np.array([np.inf])
+    distance_px, nearest = tree.query(xy_px)
+    _, nearest_light = cKDTree(xy_px).query(expected_px)
+    is_mutual = nearest_light[nearest] == np.arange(len(nearest))
+    light = np.flatnonzero(is_mutual & (distance_px < spacing_px.min() / 2))
     order = np.argsort(led[nearest[light]])
     return led[nearest[light]][order], light[order]
 
@@ -235,12 +246,12 @@ def calibrated(known: Assumed, seen: Sequence[Sighting], clicks: int = CLICKS) -
     InputError
         If the frames show no LEDs in common, or too few frames.
     """
-    camera = scaled(known, seen[0], clicks) if seen and clicks else known.camera
+    common = complete(seen)
+    camera = scaled(known, common[0], clicks) if clicks else known.camera
     try:
-        catalog = home_position.calibrate(seen, camera, known.leds, known.lever)
+        catalog = home_position.calibrate(common, camera, known.leds, known.lever)
     except ImageError as error:
         raise InputError("frames", str(error)) from None
-    common = complete(seen)
     body_m = np.array([positions_m(known, camera, one) for one in common])
     lab_m = np.array(
         [
@@ -274,9 +285,14 @@ def calibrated(known: Assumed, seen: Sequence[Sighting], clicks: int = CLICKS) -
 
 
 def complete(seen: Sequence[Sighting]) -> list[Sighting]:
-    """The frames that show as many LEDs as the best one. Raises InputError for fewer than two such frames."""
+    """The frames that show as many LEDs as the best one, without those of a pause in a motion.
+
+    A pause has less than a tenth of the frames of the longest stop. Raises InputError for fewer than two frames.
+    """
     most = max((len(one.led) for one in seen), default=0)
-    kept = [one for one in seen if len(one.led) == most]
+    shown = [one for one in seen if len(one.led) == most]
+    frames = np.bincount([one.stop for one in shown], minlength=1)
+    kept = [one for one in shown if frames[one.stop] >= frames.max() / 10]
     if most < QUEST_LEDS or len(kept) < 2:
         raise InputError(
             "frames", f"{len(kept)} with {most} LEDs", "2 or more with 2 LEDs or more"
@@ -332,6 +348,8 @@ def statistics(found: Calibration) -> dict[str, Any]:
     angle = found.angle_rad / ARCSEC_RAD
     pairs = np.argsort(angle.mean(axis=0), kind="stable")
     sets = [found.stop == n for n in np.unique(found.stop)]
+    ascending = angle[:, pairs]
+    groups = np.flatnonzero(np.diff(ascending.mean(axis=0)) > DISTINCT_ARCSEC) + 1
     difference_deg = found.algorithm_deg - found.imu_deg
     columns_mm = 1e3 * found.lab_m
     return {
@@ -342,12 +360,18 @@ def statistics(found: Calibration) -> dict[str, Any]:
         ],
         "ranks": [spread(column, sets) for column in ranked.T],
         "pairs": [spread(angle[:, n], sets) for n in pairs],
+        "distinct": len(groups) + 1,
+        "angles": [
+            {"pairs": columns.shape[1]} | spread(columns.mean(axis=1), sets)
+            for columns in np.split(ascending, groups, axis=1)
+        ],
         "epsilon": {
             "magnitude": found.catalog.epsilon_mag,
             "position_mm": 1e3 * found.catalog.epsilon_pos_m,
             "separation_arcsec": found.catalog.epsilon_sep_rad / ARCSEC_RAD,
         },
         "height_range_mm": float(np.ptp(columns_mm[:, :, 2])),
+        "difference_deg": differences(difference_deg),
         "stops": [
             {
                 "frames": int(one.sum()),
@@ -358,6 +382,17 @@ def statistics(found: Calibration) -> dict[str, Any]:
             }
             for n, one in enumerate(sets)
         ],
+    }
+
+
+def differences(difference_deg: Floats) -> dict[str, list[float]]:
+    """Table 15: least, largest and mean absolute difference of each angle over the stops, and its deviation (n - 1)."""
+    absolute = np.abs(difference_deg)
+    return {
+        "least": absolute.min(axis=0).tolist(),
+        "largest": absolute.max(axis=0).tolist(),
+        "mean": absolute.mean(axis=0).tolist(),
+        "sd": absolute.std(axis=0, ddof=1).tolist(),
     }
 
 
@@ -421,6 +456,43 @@ def calibration_report(title: str, command: str, found: Calibration) -> Report:
         Section("Attitudes", [stops]),
     ]
     return Report(title, [Verdict(text), *figures, *sections], command)
+
+
+def write_results(
+    folder: Path, known: Assumed, found: Calibration, command: str
+) -> tuple[dict[str, Any], Report]:
+    """Write the report, and the catalog as a map for `tracker.map`; return what `--json` prints, and the report."""
+    made = calibration_report(f"Calibration of {known.scene.name}", command, found)
+    numbers = statistics(found)
+    page = make_folder(folder) / "report.html"
+    made.save(page)
+    catalog = folder / "leds.ecsv"
+    try:
+        write_dome_map(catalog, catalog_map(known, found))
+        numbers["map"] = str(catalog)
+    except ImageError as error:
+        raise InputError("catalog", str(error)) from None
+    return numbers | {"report": str(page)}, made
+
+
+def catalog_map(known: Assumed, found: Calibration) -> DomeMap:
+    """The on-board catalog (section 3.6.4), with the camera as calibrated. Raises ImageError."""
+    leds = home_position.led_map(found.catalog, known.leds)
+    camera = found.camera
+    return DomeMap(
+        leds.id,
+        leds.position_m,
+        np.full(len(leds.id), found.catalog.epsilon_pos_m),
+        known.lever.camera_body_m,
+        known.lever.sigma_m,
+        (camera.width_px, camera.height_px),
+        camera.focal_px,
+        0.0,
+        camera.center_px,
+        (0.0, 0.0),
+        camera.distortion,
+        (0.0,) * 5,
+    )
 
 
 def by_stop(found: Calibration, values: Floats) -> Iterable[tuple[int, Floats]]:

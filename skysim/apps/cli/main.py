@@ -14,7 +14,7 @@ from skysim.apps.cli.commands.availability import availability
 from skysim.apps.cli.commands.camera import app as cameras
 from skysim.apps.cli.commands.dataset import dataset
 from skysim.apps.cli.commands.datasheet import datasheet
-from skysim.apps.cli.commands.measure import balance, characterize
+from skysim.apps.cli.commands.measure import balance, calibrate, characterize
 from skysim.apps.cli.commands.reproduce import reproduce
 from skysim.apps.cli.commands.resources import catalog_app, export, scenes_app
 from skysim.apps.cli.commands.run import compare, render, run, trackers
@@ -42,6 +42,7 @@ COMMANDS = (
     datasheet,
     dataset,
     characterize,
+    calibrate,
     balance,
     reproduce,
     gui,
