@@ -26,7 +26,7 @@ from skysim.camera.optics import Optics, radial, tangential
 from skysim.core.jit import jit
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.light import (
+from skysim.scene.sections.surroundings import (
     FaintStarsGlowConfig,
     Glow,
     MoonGlowConfig,
@@ -244,7 +244,7 @@ def faint_star_glow(config: FaintStarsGlowConfig, view: ViewingGeometry) -> Floa
     )
 
 
-# Radiance models by kind. To add one, add a class to scene/sections/light.py and a function here.
+# Radiance models by kind. To add one, add a class to scene/sections/surroundings.py and a function here.
 BACKGROUNDS: dict[str, Callable[[Any, ViewingGeometry], Floats]] = {
     "uniform": uniform_glow,
     "sky": sky_glow,

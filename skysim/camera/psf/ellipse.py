@@ -402,8 +402,7 @@ def add_ellipse(
     bottom = min(center_y + half + 1, row1, height)
     if right <= left or bottom <= top:
         return
-    # Place of the first pixel among the samples, and the weights of the four samples on either
-    # axis.
+    # Place of the first pixel among the samples, and the weights of the four samples on either axis.
     at_x = (center_x - x) * samples
     at_y = (center_y - y) * samples
     first_x = floor(at_x)
