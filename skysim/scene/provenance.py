@@ -184,10 +184,8 @@ def entries(model: ConfigModel, tree: Any, parent: tuple[str, ...] = ()) -> Iter
             yield from entries(value, raw, (*parent, key))
         else:
             written = raw.value if isinstance(raw, Located) and not sections(value) else None
-            origin = next(origins_in(raw), DEFAULT)
-            yield Entry(
-                (*parent, key), plain(value, name) if written is None else written, origin
-            )
+            shown = plain(value, name) if written is None else written
+            yield Entry((*parent, key), shown, next(origins_in(raw), DEFAULT))
 
 
 def origins_in(tree: Any) -> Iterator[Origin]:

@@ -22,9 +22,9 @@ from skysim.core.units import ConfigModel, Length, Number, Spin, Time
 from skysim.core.yaml_reader import fault_of
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
-from skysim.scene.sections.light import DomeConfig, FurtherLight, Glow, Light, StarsConfig
+from skysim.scene.sections.light import DomeConfig, FurtherLight, Light, StarsConfig
 from skysim.scene.sections.motion import MotionConfig, PointingConfig
-from skysim.scene.sections.surroundings import Coefficient, Orbit, ThermalConfig
+from skysim.scene.sections.surroundings import Coefficient, Glow, Orbit, ThermalConfig
 from skysim.scene.sections.tracker import FilterConfig, SurveyErrorsConfig, TrackerConfig
 from skysim.scene.sections.vehicle import SiteConfig, VehicleConfig
 

@@ -29,7 +29,8 @@ from skysim.camera.detector import (
 )
 from skysim.camera.discs import concatenated, render_bodies
 from skysim.camera.glow import background, stray
-from skysim.camera.render import Window, in_view, project, render
+from skysim.camera.projection import in_view, project
+from skysim.camera.render import Window, render
 from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Floats, Frame, SourceTruth, Trajectory, Truth
 from skysim.simulation.lab import StarCamera

@@ -144,9 +144,8 @@ def factors(variances: Floats, rng: np.random.Generator) -> Floats:
     exp(s g - s^2 / 2) with s^2 = ln(1 + variance) and g standard normal.
     """
     log_variance = np.log1p(variances)
-    return np.asarray(
-        np.exp(np.sqrt(log_variance) * rng.standard_normal(len(variances)) - log_variance / 2)
-    )
+    normal = rng.standard_normal(len(variances))
+    return np.asarray(np.exp(np.sqrt(log_variance) * normal - log_variance / 2))
 
 
 # Extinction: the light that the air absorbs and scatters.

@@ -24,7 +24,7 @@ from skysim.camera.glow.background import (
     viewing_geometry,
 )
 from skysim.camera.optics import Optics
-from skysim.scene.sections import light
+from skysim.scene.sections import surroundings
 from skysim.scene.sections.camera import CameraConfig
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 
@@ -55,8 +55,8 @@ def optics(**camera: object) -> Optics:
     return Optics.from_camera(CameraConfig.model_validate(CAMERA | camera))
 
 
-def glow(**part: object) -> light.Glow:
-    made: light.Glow = TypeAdapter(light.Glow).validate_python(
+def glow(**part: object) -> surroundings.Glow:
+    made: surroundings.Glow = TypeAdapter(surroundings.Glow).validate_python(
         part, by_alias=True, by_name=True
     )
     return made
@@ -69,7 +69,7 @@ def lab_place(right_deg: float) -> tuple[float, float]:
     return float(np.degrees(np.arctan2(y, x)) % 360), float(np.degrees(np.arcsin(z)))
 
 
-def whole_map(config: light.Glow, lens: Optics) -> np.ndarray:
+def whole_map(config: surroundings.Glow, lens: Optics) -> np.ndarray:
     """Background computed directly at every third pixel, for comparison."""
     camera = lens.camera
     x, y = np.meshgrid(np.arange(0, camera.width_px, 3), np.arange(0, camera.height_px, 3))
@@ -80,14 +80,14 @@ def whole_map(config: light.Glow, lens: Optics) -> np.ndarray:
     return BACKGROUNDS[config.kind](config, view).reshape(x.shape)
 
 
-def drawn(config: light.Glow, lens: Optics, exposure_s: float = 1.0) -> np.ndarray:
+def drawn(config: surroundings.Glow, lens: Optics, exposure_s: float = 1.0) -> np.ndarray:
     image = np.full((lens.camera.height_px, lens.camera.width_px), np.nan, np.float32)
     fill(image, glow_map((config,), lens, POINTING, BAND), exposure_s)
     return image
 
 
 def test_every_background_kind_of_the_schema_is_implemented() -> None:
-    union = typing.get_args(typing.get_args(light.Glow)[0])
+    union = typing.get_args(typing.get_args(surroundings.Glow)[0])
     assert {typing.get_args(one.model_fields["kind"].annotation)[0] for one in union} == set(
         BACKGROUNDS
     )

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.discs import points_of
 from skysim.camera.optics import Optics
-from skysim.camera.render import Poses, Window, project, render
+from skysim.camera.projection import Poses, project
+from skysim.camera.render import Window, render
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount, Sources, Trajectory
 from skysim.scene import loader

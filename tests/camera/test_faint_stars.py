@@ -17,7 +17,7 @@ from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene import loader
-from skysim.scene.sections.light import FaintStarsGlowConfig, SkyGlowConfig
+from skysim.scene.sections.surroundings import FaintStarsGlowConfig, SkyGlowConfig
 from skysim.sources import catalog, star_archives
 from skysim.sources.photometry import Band
 from skysim.sources.stars import cam_from_icrs

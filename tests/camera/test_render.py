@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import erf
 from scipy.stats import ncx2
 
+from skysim.camera import projection
 from skysim.camera import render as rendering
 from skysim.camera.detector import Detector, expose
 from skysim.camera.optics import Optics
@@ -641,13 +642,13 @@ def test_a_star_that_crosses_the_field_between_two_poses_is_kept() -> None:
     stars.place[:, :3] = rays
     angles = np.linspace(-0.8, 0.8, 9)
 
-    def poses(angles_rad: Floats) -> rendering.Poses:
+    def poses(angles_rad: Floats) -> projection.Poses:
         turns = Rotation.from_rotvec(np.outer(angles_rad, [0, 1, 0]))
-        return rendering.Poses(turns.as_matrix(), np.zeros((len(angles_rad), 3)))
+        return projection.Poses(turns.as_matrix(), np.zeros((len(angles_rad), 3)))
 
-    fine = rendering.project(stars, LENS, poses(np.linspace(-0.8, 0.8, 201)))[0]
+    fine = projection.project(stars, LENS, poses(np.linspace(-0.8, 0.8, 201)))[0]
     on_chip = np.flatnonzero(((fine > -0.5) & (fine < [63.5, 47.5])).all(axis=2).any(axis=0))
-    kept = rendering.in_view(stars, LENS, poses(angles))
+    kept = projection.in_view(stars, LENS, poses(angles))
     assert len(on_chip) >= 10
     assert set(on_chip) <= set(kept)
     assert len(kept) < 600
@@ -667,17 +668,17 @@ def test_a_field_of_a_deep_catalog_costs_only_the_stars_near_it(
         np.zeros(25_000),
     )
     turns = Rotation.from_rotvec(np.outer(angles, [0, 1, 0])).as_matrix()
-    poses = rendering.Poses(turns, np.zeros((len(angles), 3)))
+    poses = projection.Poses(turns, np.zeros((len(angles), 3)))
     tested = []
-    in_cone = rendering._in_cone
+    in_cone = projection._in_cone
     monkeypatch.setattr(
-        rendering,
+        projection,
         "_in_cone",
         lambda place, *more: tested.append(len(place)) or in_cone(place, *more),
     )
-    rows = rendering.in_view(stars, LENS, poses)
-    monkeypatch.setattr(rendering, "MIN_BAND_STARS", 10**9)
-    assert rows.tolist() == rendering.in_view(stars, LENS, poses).tolist()
+    rows = projection.in_view(stars, LENS, poses)
+    monkeypatch.setattr(projection, "MIN_BAND_STARS", 10**9)
+    assert rows.tolist() == projection.in_view(stars, LENS, poses).tolist()
     assert tested[1] == 25_000
     assert len(rows) <= tested[0] < (0.05 * 25_000 if len(angles) < 3 else 25_001)
 
@@ -703,7 +704,7 @@ def test_a_cubic_path_is_followed_exactly_from_its_first_sample_to_its_last() ->
 
     t_s = np.linspace(0.0, 4.0, 9)
     samples = path(t_s)[:, None]
-    tracks = rendering.Tracks(
+    tracks = projection.Tracks(
         0.0, 0.5, samples[:, :, :2].copy(), samples[:, :, 2].copy(), np.ones((1, 3))
     )
     times = np.linspace(0.0, 4.0, 33)

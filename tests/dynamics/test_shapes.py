@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.dynamics.multibody.mjcf_export import laboratory
+from skysim.dynamics.multibody.scene_shapes import laboratory
 
 # The tetrahedron is neither centered nor turned as its principal axes are.
 POINTS = np.array([[0.1, 0.2, 0], [0.6, 0.2, 0.1], [0.1, 0.5, 0], [0.2, 0.2, 0.7]])

@@ -23,7 +23,7 @@ from skysim.dynamics.guidance import LEGS
 from skysim.dynamics.jitter import SPECTRA
 from skysim.dynamics.multibody.cmgs import STEERING
 from skysim.scene import loader, scene
-from skysim.scene.sections import camera, leds, light, motion, vehicle
+from skysim.scene.sections import camera, leds, light, motion, surroundings, vehicle
 from skysim.scene.sections.layouts import Layout
 from skysim.scene.sections.leds import Lobe
 from skysim.scene.sections.tracker import FilterConfig
@@ -1221,7 +1221,7 @@ def test_every_algorithm_that_the_schema_names_exists() -> None:
         VIGNETTING
     )
     assert kinds(Lobe) == set(LOBES)
-    assert kinds(light.Glow) == set(BACKGROUNDS)
+    assert kinds(surroundings.Glow) == set(BACKGROUNDS)
     assert kinds(motion.JitterPart) == set(SPECTRA)
     assert kinds(motion.Maneuver) == set(LEGS)
 

@@ -17,7 +17,7 @@ from skysim.scene import loader
 from skysim.scene.sections import layouts
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources import catalog, dome
-from skysim.sources.dome.layouts import fisher, optimize, spreads
+from skysim.sources.dome.layouts import fisher, optimize, placing, spreads
 from skysim.sources.dome.layouts.ambiguity import field_ambiguity
 from skysim.sources.photometry import Band, star_flux_e_s_m2
 
@@ -323,7 +323,7 @@ def test_a_contracted_layout_covers_a_fraction_of_each_led_s_solid_angle() -> No
         spread("fibonacci", count, 30.0).place[:, :3] for count in (40_000, 50)
     )
     for fraction in (1.0, 0.5):
-        placed = optimize.contract(layout_m, sites_m, fraction)
+        placed = placing.contract(layout_m, sites_m, fraction)
         wanted, found = (
             place / np.linalg.norm(place, axis=1, keepdims=True) for place in (layout_m, placed)
         )
@@ -337,8 +337,8 @@ def test_a_contracted_layout_covers_a_fraction_of_each_led_s_solid_angle() -> No
 
 def test_the_spacing_is_the_least_distance_of_two_leds() -> None:
     place_m = np.array([[0.0, 0, 1], [0.03, 0, 1], [0.03, 0.02, 1]])
-    assert optimize.spacing_ok(place_m, 0.0199)
-    assert not optimize.spacing_ok(place_m, 0.0201)
+    assert placing.spacing_ok(place_m, 0.0199)
+    assert not placing.spacing_ok(place_m, 0.0201)
 
 
 def test_field_and_lever_default_to_the_scene_s() -> None:

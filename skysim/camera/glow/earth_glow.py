@@ -82,7 +82,8 @@ def earth_light(
     # The angle between boresight and nadir, and the angular radius of Earth and airglow.
     boresight = cam_from_lab.inv().apply([0.0, 0.0, 1.0])
     distance_m = float(np.linalg.norm(observer_m))
-    from_nadir_rad = math.acos(max(min(float(-boresight @ observer_m) / distance_m, 1.0), -1.0))
+    cosine = float(-boresight @ observer_m) / distance_m
+    from_nadir_rad = math.acos(max(min(cosine, 1.0), -1.0))
     reach_rad = math.asin(min(LAYER[1] * EARTH_RADIUS_M / distance_m, 1.0))
     if from_nadir_rad > reach_rad + optics.field_rad:
         return None

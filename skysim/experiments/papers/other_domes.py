@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.render import Poses, in_view, project
+from skysim.camera.projection import Poses, in_view, project
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources

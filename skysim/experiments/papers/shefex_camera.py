@@ -32,7 +32,7 @@ from skysim.experiments.papers.shefex_setup import MAX_CENTROIDS, PUBLISHED
 from skysim.results.metrics import Summary, exact, quantile
 from skysim.results.plots import INK, MARKS
 from skysim.scene.loader import load
-from skysim.scene.sections.light import UniformGlowConfig
+from skysim.scene.sections.surroundings import UniformGlowConfig
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.lab import StarCamera, build_lab
 from skysim.simulation.lights.starlight import BackgroundLight

@@ -100,13 +100,7 @@ def check(
         for build in (*FACTS, sky_warnings.faintest_star, sky_warnings.fact)
     ]
     facts = [fact for fact in built if fact is not None]
-    found = [
-        find(context, samples)
-        for find in (*FINDINGS, *SKY_FINDINGS, dome_warnings.mirror_images)
-    ]
-    findings = [line for line in found if line]
-    for finder in (sky_warnings.bodies_near, sky_warnings.stray_light, sky_warnings.exclusion):
-        findings += finder(context, samples)
+    findings = warnings_of(context, samples)
     alike = dome_warnings.of(context, samples)
     if alike is not None and isinstance(scene.light, DomeConfig):
         facts.insert(2, dome_warnings.fact(alike))
@@ -121,6 +115,18 @@ def check(
     for n, head in enumerate(checked):
         findings += head_findings(n, head.findings, findings)
     return Check(facts, findings)
+
+
+def warnings_of(context: Context, samples: CheckedSamples) -> list[str]:
+    """The warnings of the views."""
+    found = [
+        find(context, samples)
+        for find in (*FINDINGS, *SKY_FINDINGS, dome_warnings.mirror_images)
+    ]
+    findings = [line for line in found if line]
+    for finder in (sky_warnings.bodies_near, sky_warnings.stray_light, sky_warnings.exclusion):
+        findings += finder(context, samples)
+    return findings
 
 
 def ambiguity_map(lab: Lab) -> tuple[Ambiguity, float]:

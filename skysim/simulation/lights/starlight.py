@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.glow.background import glow_map
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, StarSources
-from skysim.scene.sections.light import Glow, StarsConfig
+from skysim.scene.sections.light import StarsConfig
+from skysim.scene.sections.surroundings import Glow
 from skysim.simulation.lights.light import Exposure, KnownLight, Light, LightPlan, Lit
 from skysim.sources import stars
 from skysim.sources.dome.led import Emitter

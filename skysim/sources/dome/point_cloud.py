@@ -269,6 +269,16 @@ def read(file: str, unit: str) -> Floats:
     return points * UNIT_M[unit]
 
 
+def covered_rad(unit: Floats) -> tuple[float, float]:
+    """Angles from +z up to which directions (N, 3) cover all azimuths, and of the farthest direction."""
+    angle = np.arctan2(np.hypot(unit[:, 0], unit[:, 1]), unit[:, 2])
+    azimuth = np.arctan2(unit[:, 1], unit[:, 0])
+    sector = np.floor((azimuth / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
+    # Of the farthest point in each sector of azimuth, the least.
+    farthest = [float(angle[sector == n].max(initial=0.0)) for n in range(SECTORS)]
+    return min(farthest), float(angle.max())
+
+
 def fit(points_m: Floats, degree: int, file: str) -> SurfaceFit:
     """Smooth surface fitted to points of a dome whose axis is about +z: linear least squares in the radius.
 
@@ -308,12 +318,7 @@ def fit(points_m: Floats, degree: int, file: str) -> SurfaceFit:
     relative_m = points_m - sphere.center_m
     radius_m = np.linalg.norm(relative_m, axis=1)
     unit = relative_m / radius_m[:, None]
-    angle = np.arctan2(np.hypot(unit[:, 0], unit[:, 1]), unit[:, 2])
-    azimuth = np.arctan2(unit[:, 1], unit[:, 0])
-    sector = np.floor((azimuth / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
-    # Covered angle: of the farthest point in each sector of azimuth, the least.
-    cover_rad = min(float(angle[sector == n].max(initial=0.0)) for n in range(SECTORS))
-    half_rad = float(angle.max())
+    cover_rad, half_rad = covered_rad(unit)
     # 3.
     design, _ = zernike(degree, to_disk(unit, half_rad)[0])
     coefficient, _, _, singular = np.linalg.lstsq(design, radius_m)

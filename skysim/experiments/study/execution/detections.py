@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import Centroids
 from estimator.trackers.coded_tracker import CodedTracker
 from estimator.trackers.pipeline import Report
-from skysim.camera.render import OcclusionTest, Poses, Window, in_view, project_each, rates_e_s
+from skysim.camera.projection import Poses, in_view, project_each, rates_e_s
+from skysim.camera.render import OcclusionTest, Window
 from skysim.core.types import Floats, Trajectory
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene

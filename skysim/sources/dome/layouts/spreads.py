@@ -26,6 +26,8 @@ from skysim.sources.dome.layouts.placing import (
     lit_sources,
     project_from_bearing,
     scattered_cap,
+    spread,
+    thin,
 )
 from skysim.sources.dome.surface import Surface, directions
 from skysim.sources.photometry import Band
@@ -80,7 +82,7 @@ def poisson_disk(
     if config.spacing_m is None:
         count = config.count or 1
         darts_m = project_from_bearing(surface, scattered_cap(DARTS_PER_LED * count, half, rng))
-        place_m = darts_m[optimize.spread(darts_m, 0.0, count, BISECTIONS)]
+        place_m = darts_m[spread(darts_m, 0.0, count, BISECTIONS)]
         return dimmed_sources(config, surface, place_m, led, band, rng)
     directions = cap(1000, half)
     points = project_from_bearing(surface, directions)
@@ -100,7 +102,7 @@ def poisson_disk(
             f"{min_spacing_m:.3g} m or more",
         )
     darts_m = project_from_bearing(surface, scattered_cap(max(int(dart_count), 1), half, rng))
-    place_m = darts_m[optimize.thin(darts_m, config.spacing_m)]
+    place_m = darts_m[thin(darts_m, config.spacing_m)]
     return dimmed_sources(config, surface, place_m, led, band, rng)
 
 

@@ -207,9 +207,8 @@ def spiral(config: StringConfig, surface: Surface, meridian: Meridian) -> list[T
     )
     steps = np.append(0, np.cumsum((per_rad[1:] + per_rad[:-1]) / 2 * np.diff(azimuth_rad)))
     fine_rad = np.interp(np.arange(int(steps[-1]) + 1), steps, azimuth_rad)
-    tilt_rad = np.interp(
-        fine_rad, azimuth_rad, np.interp(arc_m, meridian.arc_m, meridian.tilt_rad)
-    )
+    tilt_rad = np.interp(arc_m, meridian.arc_m, meridian.tilt_rad)
+    tilt_rad = np.interp(fine_rad, azimuth_rad, tilt_rad)
     return [lay(surface, tilt_rad, fine_rad)]
 
 
@@ -223,9 +222,8 @@ def strips(config: StringConfig, surface: Surface, meridian: Meridian) -> list[T
     while 2 * np.pi * widest_m[-1] > count * config.spacing_m:
         count *= 2
     check_length(count * float(meridian.arc_m[-1]), count, config)
-    steps = max(
-        STEPS_PER_TURN, int(STEPS_PER_PITCH * float(meridian.arc_m[-1]) / config.pitch_m)
-    )
+    leds = float(meridian.arc_m[-1]) / config.pitch_m
+    steps = max(STEPS_PER_TURN, int(STEPS_PER_PITCH * leds))
     tapes = []
     for number in range(count):
         # Number of strips in the coarsest set that contains this one; it begins where these are half a spacing apart.
@@ -318,9 +316,8 @@ def marked_m(
     line = sight_m / np.linalg.norm(sight_m, axis=1, keepdims=True)
     common = scaled_errors(config.orientation_sigma_arcsec, rng.standard_normal(3)) * ARCSEC_RAD
     pointing = scaled_errors(config.pointing_sigma_arcsec, rng.standard_normal((len(line), 2)))
-    line = Rotation.from_rotvec(common).apply(
-        line + along_two_axes(line, pointing * ARCSEC_RAD)
-    )
+    line = line + along_two_axes(line, pointing * ARCSEC_RAD)
+    line = Rotation.from_rotvec(common).apply(line)
     line /= np.linalg.norm(line, axis=1, keepdims=True)
     # 2.
     mark_m = surface.meet(laser_m, line)
