@@ -2,7 +2,7 @@
 
 Motion of images. A camera that rotates at the rate w, in its own axes, sees a place b from the bearing move as
 db/dt = -w x b. The ray is that of q = b - r, with r the lever arm; a star is infinitely far, b = q. The tangents
-(q_x / q_z, q_y / q_z) move by -J w, with J the Jacobian of `nearfield.tangent_jacobian` (`tangent_motion`).
+(q_x / q_z, q_y / q_z) move by -J w, with J the Jacobian of `rotation_fit.tangent_jacobian` (`tangent_motion`).
 
 Rolling shutter. Row y is exposed tau (y - y_mid) after the middle row. An image that moves at v px/s is found where it
 is at mid-exposure of the row in which it is found. This is exact for a constant v and an image that is symmetric about
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import on_sphere
-from estimator.attitude.nearfield import tangent_jacobian
+from estimator.attitude.rotation_fit import tangent_jacobian
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError

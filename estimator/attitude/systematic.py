@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimator.attitude.nearfield import tangent_gradients, tangent_jacobian
+from estimator.attitude.rotation_fit import tangent_gradients, tangent_jacobian
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 

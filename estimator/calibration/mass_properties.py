@@ -49,7 +49,7 @@ from estimator.calibration.mass_dynamics import (
 )
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
-from estimator.filter.states import TrackerModel
+from estimator.filter.error_models import TrackerModel
 
 MAX_ITERATIONS = 30
 CONVERGED_SIGMA = 0.01  # largest step of a parameter at convergence, in its standard deviations
@@ -153,7 +153,7 @@ def considered(
        the noise, W_n the weight, B the derivative of a measured attitude by the parameters (those of the bias), and X_n
        that of the fitted one.
     2. The errors have the covariance S_n = L_n L_n^T, and a correlation r = exp(-rotation / angle) that falls with the
-       rotation between two attitudes: the process of `filter.states.TrackerModel`, without its time.
+       rotation between two attitudes: the process of `filter.error_models.TrackerModel`, without its time.
     3. They add sum_mn K_m L_m r_mn L_n^T K_n^T.
     """
     size = len(covariance)
