@@ -203,9 +203,8 @@ def residuals(bundle: Bundle, sightings: Sightings) -> Floats:
     in_front = q[:, 2] > 0
     tangent = q[:, :2] / np.where(in_front, q[:, 2], 1.0)[:, None]
     pixel = bundle.lens[1:3] + bundle.lens[0] * _distort(tangent, bundle.lens[3:])
-    return np.where(
-        in_front[:, None], (sightings.xy_px - pixel) / sightings.sigma_px[:, None], np.inf
-    )
+    residual = (sightings.xy_px - pixel) / sightings.sigma_px[:, None]
+    return np.where(in_front[:, None], residual, np.inf)
 
 
 def linearize(bundle: Bundle, sightings: Sightings) -> Linearization:
@@ -257,10 +256,9 @@ def _distort(tangent: Floats, coefficients: Floats) -> Floats:
     x, y = tangent.T
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    tangential = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    return np.column_stack(
-        [x * radial + tangential, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y]
-    )
+    tangential_x = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    tangential_y = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return np.column_stack([x * radial + tangential_x, y * radial + tangential_y])
 
 
 def _by_tangent(tangent: Floats, coefficients: Floats) -> Floats:
@@ -439,8 +437,8 @@ def eliminate_lights(terms: NormalEquations, gauge: Floats, damping: float) -> R
     """
     # A^-1, block by block
     blocks = terms.by_led * np.where(np.eye(3, dtype=bool), 1 + damping, 1.0)
-    lights = len(blocks)
-    inverse = bsr_array((np.linalg.inv(blocks), np.arange(lights), np.arange(lights + 1)))
+    start = np.arange(len(blocks) + 1)
+    inverse = bsr_array((np.linalg.inv(blocks), start[:-1], start))
     # Schur complement D - B^T A^-1 B
     elimination = csr_array(inverse @ terms.coupling.T)
     matrix = terms.rest - (terms.coupling @ elimination).toarray()
@@ -473,7 +471,8 @@ def cauchy(squared: Floats, width: float) -> tuple[float, Floats]:
     """
     if np.isinf(width):
         return float(squared.sum()), np.ones_like(squared)
-    return float(width**2 * np.log1p(squared / width**2).sum()), 1 / (1 + squared / width**2)
+    relative = squared / width**2
+    return float(width**2 * np.log1p(relative).sum()), 1 / (1 + relative)
 
 
 def robust_scale(bundle: Bundle, sightings: Sightings) -> float:
@@ -544,7 +543,8 @@ def fit_attitudes(bundle: Bundle, sightings: Sightings, rounds: int) -> Bundle:
     for _ in range(rounds):
         terms = linearize(bundle, sightings)
         squared = np.sum(terms.residual**2, axis=1)
-        _, weight = cauchy(squared, max(1.0, float(np.sqrt(np.median(squared)))))
+        width = max(1.0, float(np.sqrt(np.median(squared))))
+        _, weight = cauchy(squared, width)
         # Normal equations of each frame: 3 x 3
         by = terms.by_rotation
         matrix = np.zeros((frames, 3, 3))

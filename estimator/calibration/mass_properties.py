@@ -181,7 +181,8 @@ def considered(
     # 3. Sum over all pairs of attitudes, of all records
     effect = np.concatenate(effects)
     quaternion = Rotation.concatenate(attitudes).as_quat()
-    angle_rad = 2 * np.arccos(np.minimum(np.abs(quaternion @ quaternion.T), 1))
+    cosine = np.abs(quaternion @ quaternion.T)  # of half the angle
+    angle_rad = 2 * np.arccos(np.minimum(cosine, 1))
     shared = np.exp(-angle_rad / TrackerModel().systematic_angle_rad)
     return np.asarray(np.einsum("mpk,mn,nqk->pq", effect, shared, effect, optimize=True))
 
@@ -223,9 +224,10 @@ def reduced(
     rest = slice(2 * STATE, None)
     diagonal = np.zeros((count, STATE, STATE))
     border = np.zeros((count, STATE, size + 1))
-    for block, to in ((before, slice(None, -1)), (after, slice(1, None))):
-        diagonal[to] += products[:, block, block]
-        border[to] += products[:, block, rest]
+    diagonal[:-1] += products[:, before, before]
+    diagonal[1:] += products[:, after, after]
+    border[:-1] += products[:, before, rest]
+    border[1:] += products[:, after, rest]
     corner = products[:, rest, rest].sum(axis=0)
     # 3. Attitudes
     chi2 = float(np.sum(rows[:, :, -1] ** 2))
@@ -427,7 +429,8 @@ def first_covariance(begun: MassEstimate, record: BearingRecord, lab: LabConstan
     changed = (values, *(values + np.diag(step)))
     momenta = [first_states(one, lab, each).momentum[:, 1] for each in changed]
     slope = np.zeros((STATE, len(values)))
-    slope[3:6] = ((np.array(momenta[1:]) - momenta[0]) / step[:, None]).T
+    difference = np.array(momenta[1:]) - momenta[0]
+    slope[3:6] = difference.T / step
     # Errors that are independent of the parameters: attitude, rate and torque
     own = np.zeros((STATE, STATE))
     own[:3, :3] = record.covariance_rad2[1]

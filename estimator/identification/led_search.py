@@ -227,11 +227,7 @@ def _pair_range(
 @jit
 def _bearing_angle_ratio(dome: DomeIndex) -> float:
     """Ratio of a small angle about the bearing to that seen by the camera: (R - M) / R, M the length of the lever."""
-    return (
-        1
-        - sqrt(dome.pupil_m[0] ** 2 + dome.pupil_m[1] ** 2 + dome.pupil_m[2] ** 2)
-        / dome.median_radius_m
-    )
+    return 1 - vectors.norm(dome.pupil_m) / dome.median_radius_m
 
 
 @jit
@@ -449,7 +445,7 @@ def _direction_from_bearing(ray: Vector, dome: DomeIndex, radius_m: float) -> Ve
     """
     px, py, pz = dome.pupil_m
     # u . r, then the distance s along the ray.
-    along = ray[0] * px + ray[1] * py + ray[2] * pz
+    along = vectors.dot(ray, dome.pupil_m)
     distance = -along + sqrt(
         max(along * along - px * px - py * py - pz * pz + radius_m * radius_m, 0.0)
     )

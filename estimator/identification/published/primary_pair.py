@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimator.catalog.sky_index import Cells
+from estimator.core import vectors
 from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 from estimator.identification.direct_match import angle
@@ -106,7 +107,7 @@ def triad(a: Floats, b: Floats) -> Floats:
     rows[2] = np.cross(b, a)
     # Normalize.
     for n in range(3):
-        rows[n] /= np.sqrt(rows[n, 0] ** 2 + rows[n, 1] ** 2 + rows[n, 2] ** 2)
+        rows[n] /= vectors.norm(rows[n])
     return rows
 
 
