@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.nearfield import tangent_jacobian
 from estimator.attitude.rate import chords, covariance_of, error_gain, streak_factor
+from estimator.attitude.rotation_fit import tangent_jacobian
 from estimator.core.types import Attitude, RateEstimate
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Report

@@ -18,8 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, project
 from estimator.calibration import bundle_adjustment as ba
+from estimator.calibration import bundle_covariance
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
-from estimator.calibration.dome_survey import CONNECTING_RAD, check_redundancy, connected_subset
+from estimator.calibration.dome_survey import check_redundancy
+from estimator.calibration.survey_subset import CONNECTING_RAD, connected_subset
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints
 
@@ -130,7 +132,7 @@ def predict(
     subset = connected_subset(bundle, sightings, np.ones(len(sightings.led), dtype=bool))
     terms = ba.normal_equations(subset.bundle, subset.sightings, np.ones(len(subset.index)))
     try:
-        covariance = ba.covariance(terms, subset.bundle)
+        covariance = bundle_covariance.covariance(terms, subset.bundle)
     except LinAlgError:
         raise ValueError(
             "survey: the attitudes do not determine the unknowns; take more of them"

@@ -124,25 +124,9 @@ class StarCatalog:
             "catalog: epoch_yr", epoch_yr, *EPOCHS_YR, "a Julian year of 1800 to 2200"
         )
         _check_places(ra, dec)
-        numbers = (
-            np.arange(1, count + 1)
-            if id is None
-            else checks.row_numbers("catalog: id", id, 2**63 - 1)
-        )
-        if len(numbers) != count:
-            raise ImageError(
-                f"catalog: id has {len(numbers)} numbers; allowed: {count}, one a star"
-            )
-        stars = from_columns(
-            numbers,
-            np.radians(ra),
-            np.radians(dec),
-            pm_ra,
-            pm_dec,
-            parallax,
-            magnitude,
-            epoch_yr,
-        )
+        place = np.radians(ra), np.radians(dec)
+        numbers = _identifiers(id, count)
+        stars = from_columns(numbers, *place, pm_ra, pm_dec, parallax, magnitude, epoch_yr)
         return stars.take(np.argsort(stars.v_mag, kind="stable"))
 
     def take(self, which: NDArray[Any]) -> StarCatalog:
@@ -179,6 +163,18 @@ def _column(name: str, value: ArrayLike, count: int, one_for_all: bool) -> Float
             f"catalog: {name} has a NaN or infinity in row {checks.first_bad(np.isfinite(array))}"
         )
     return array
+
+
+def _identifiers(id: ArrayLike | None, count: int) -> Ints:
+    """(count,) identifiers; 1 to count if none are given. Raises ImageError for another number of them."""
+    if id is None:
+        return np.arange(1, count + 1)
+    numbers = checks.row_numbers("catalog: id", id, 2**63 - 1)
+    if len(numbers) != count:
+        raise ImageError(
+            f"catalog: id has {len(numbers)} numbers; allowed: {count}, one a star"
+        )
+    return numbers
 
 
 def _check_places(ra_deg: Floats, dec_deg: Floats) -> None:

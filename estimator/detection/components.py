@@ -97,7 +97,6 @@ def _scan(
     bound = bounds[:width]
     row = values[:width]
     mask = np.zeros(CHUNK_PX, np.uint8)
-    words = mask.view(np.uint64)
     # Plain 0 and -1 would be literal types, for which numba compiles every called function once more.
     count = np.int64(0)
     cell = np.int64(-1)
@@ -126,19 +125,51 @@ def _scan(
                 continue
             for i in range(CHUNK_PX):
                 mask[i] = chunk[i] > chunk_bounds[i]
-            # 4. Eight mask bytes are tested as one integer, to skip dark pixels quickly.
-            for k in range(len(words)):
-                if words[k] == 0:
-                    continue
-                for i in range(8 * k, 8 * k + 8):
-                    x = start + i
-                    if (
-                        mask[i]
-                        and x >= first
-                        and row[x] > scale * interpolate(threshold, height, width, y, x)
-                    ):
-                        count = _extend(runs, count, y, x)
+            # 4. Exact threshold
+            count = _add_pixels(
+                mask, start, first, row, threshold, scale, height, y, runs, count
+            )
     return int(count)
+
+
+@jit
+def _add_pixels(
+    mask: NDArray,
+    start: int,
+    first: int,
+    row: NDArray,
+    threshold: Floats,
+    scale: float,
+    height: int,
+    y: int,
+    runs: Ints32,
+    count: int,
+) -> int:
+    """Add the pixels of a chunk that are above the exact threshold to the runs; return the number of runs.
+
+    Parameters
+    ----------
+    mask
+        (CHUNK_PX,) whether each pixel is above its lower bound
+    start, first
+        First pixel of the chunk, and the first that the chunk before does not hold
+    row
+        Filtered row y, `scale` times its values
+    """
+    # Eight mask bytes are tested as one integer, to skip dark pixels quickly.
+    words = mask.view(np.uint64)
+    for k in range(len(words)):
+        if words[k] == 0:
+            continue
+        for i in range(8 * k, 8 * k + 8):
+            x = start + i
+            if (
+                mask[i]
+                and x >= first
+                and row[x] > scale * interpolate(threshold, height, len(row), y, x)
+            ):
+                count = _extend(runs, count, y, x)
+    return count
 
 
 @jit

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimator.core.checks import Floats
-from estimator.filter.states import MISSING, SATURATED, GyroModel, JumpModel
+from estimator.filter.error_models import GyroModel, JumpModel
+from estimator.filter.states import MISSING, SATURATED
 
 # Share of the gyro's limit from which a sample's mean rate counts as saturated (`assumed`).
 NEAR_LIMIT = 0.9

@@ -28,7 +28,8 @@ from estimator.attitude.dome_map import (
     on_sphere,
     project,
 )
-from estimator.attitude.nearfield import SOLVERS, fit_focal_ratio, fitted_sigma_rad
+from estimator.attitude.nearfield import SOLVERS, fitted_sigma_rad
+from estimator.attitude.rotation_fit import fit_focal_ratio
 from estimator.catalog import pair_index
 from estimator.core import checks
 from estimator.core.camera import Camera

@@ -18,11 +18,13 @@ from math import log, log10, sqrt
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.systematic import geometry
 from estimator.attitude.wahba import matrix_of
-from estimator.catalog.sky_index import SkyIndex
+from estimator.catalog.sky_index import SkyIndex, nearest
+from estimator.core import vectors
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.constants import ARCSEC_RAD
@@ -38,6 +40,7 @@ from estimator.identification.star_detections import (
     detections_of,
     gates_of,
     information_of,
+    ray,
 )
 from estimator.identification.star_evidence import Solution
 
@@ -87,9 +90,7 @@ def widened(
     # 1. Detections near a star within the widest gates
     gates = gates_of(detections, 1.5 * sqrt(TRIED[-1]))
     ratio = solution.focal_ratio
-    near = star_evidence.count_near(
-        detections.tangent, sky, R_cam_from_ref, ratio, solution.observed, gates
-    )
+    near = count_near(detections.tangent, sky, R_cam_from_ref, ratio, solution.observed, gates)
     if near == 0:
         return _scaled(solution, 4 if detections.focal_uncertainty > 0 else 3)
     # 2. Evidence of each factor
@@ -113,6 +114,40 @@ def widened(
     # 3. Expected factor
     variance = _mean_factor(dex, best_dex)
     return with_errors(best, variance / TRIED[chosen], best.chi2, best.dex), variance
+
+
+@jit
+def count_near(
+    tangent: Floats,
+    sky: SkyIndex,
+    R_cam_from_ref: Floats,
+    focal_ratio: float,
+    observed: NDArray,
+    gates: Floats,
+) -> int:
+    """Number of detections that are not `observed` and have a star nearby.
+
+    Parameters
+    ----------
+    observed
+        (K,) rows of the matched detections, which are left out
+    gates
+        (N,) rad, greatest distance of a star; at most 0.05 is used
+    """
+    R_ref_from_cam = R_cam_from_ref.T.copy()
+    count = 0
+    matched = np.zeros(len(gates), np.bool_)
+    for n in observed:
+        matched[n] = True
+    for n in range(len(gates)):
+        if matched[n]:
+            continue
+        # The star nearest to the detection's direction in the catalog's frame.
+        x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, n, focal_ratio))
+        gate = min(gates[n], 0.05)
+        s, _ = nearest(sky.vectors, sky.cell_first, sky.cell_star, sky.side, x, y, z, gate)
+        count += s >= 0
+    return count
 
 
 @jit
@@ -286,19 +321,15 @@ def with_lens(
     change = np.zeros(5)
     for _ in range(LENS_ROUNDS):
         # 1. Linearization
-        seen = cam_from_ref.apply(vectors_ref)
-        view = geometry(seen, seen)
-        radial = view.tangent * np.sum(view.tangent**2, axis=1)[:, None]
-        by_unknowns = [view.jacobian, view.tangent[:, :, None], radial[:, :, None]]
-        slopes = whiten @ np.concatenate(by_unknowns, axis=2)
-        residual = (whiten @ (lens.tangents(xy_px) - view.tangent)[:, :, None])[:, :, 0]
+        tangent, by_unknowns = _linearize(cam_from_ref.apply(vectors_ref))
+        slopes = whiten @ by_unknowns
+        residual = (whiten @ (lens.tangents(xy_px) - tangent)[:, :, None])[:, :, 0]
         # 2. Step
         kept = slopes[keep].reshape(-1, 5)
         count = int(keep.sum())
         normal = kept.T @ kept / variance + prior
-        step = np.linalg.solve(
-            normal, kept.T @ residual[keep].ravel() / variance - prior @ change
-        )
+        gradient = kept.T @ residual[keep].ravel() / variance - prior @ change
+        step = np.linalg.solve(normal, gradient)
         change[3:] += step[3:]
         cam_from_ref = Rotation.from_rotvec(step[:3]) * cam_from_ref
         lens = _lens_of(camera, *change[3:])
@@ -312,19 +343,27 @@ def with_lens(
             break
         keep = near
         variance = found
-    sheared = _is_sheared(
-        whiten[keep], view.tangent[keep], slopes[keep], (residual - slopes @ step)[keep]
-    )
+    rest = (residual - slopes @ step)[keep]
+    sheared = _is_sheared(whiten[keep], tangent[keep], slopes[keep], rest)
     left = lens.tangents(xy_px[keep]) - _tangents(cam_from_ref.apply(vectors_ref[keep]))
+    covariance = np.linalg.inv(kept.T @ kept / variance + prior)
     fitted = solution._replace(
         observed=solution.observed[keep],
         star=solution.star[keep],
         cam_from_ref_xyzw=cam_from_ref.as_quat(),
-        covariance_rad2=np.linalg.inv(kept.T @ kept / variance + prior)[:3, :3],
+        covariance_rad2=np.asarray(covariance[:3, :3], dtype=float),
         rms=float(np.sqrt(np.mean(left**2))),
         chi2=chi2 / (2 * count - 5),
     )
     return Refit(fitted, lens, variance, sheared)
+
+
+def _linearize(seen_cam: Floats) -> tuple[Floats, Floats]:
+    """Return the (K, 2) tangents of directions, and their (K, 2, 5) derivatives by the unknowns of `with_lens`."""
+    view = geometry(seen_cam, seen_cam)
+    radial = view.tangent * np.sum(view.tangent**2, axis=1)[:, None]
+    by_unknowns = [view.jacobian, view.tangent[:, :, None], radial[:, :, None]]
+    return view.tangent, np.concatenate(by_unknowns, axis=2)
 
 
 def _is_sheared(whiten: Floats, tangent: Floats, slopes: Floats, residual: Floats) -> bool:

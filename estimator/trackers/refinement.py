@@ -28,7 +28,6 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.least_squares import fit_soft_l1
 from estimator.core.types import Attitude, Centroids, StarMatch
-from estimator.identification import star_evidence
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identification.star_evidence import Solution
 from estimator.trackers import misfit
@@ -219,7 +218,7 @@ class FieldMatcher:
         tangent = self.camera.tangents(centroids.xy_px)
         gates = np.full(len(centroids), gate_rad)
         R = Rotation.from_quat(solution.cam_from_ref_xyzw).as_matrix()
-        near = star_evidence.count_near(
+        near = misfit.count_near(
             tangent, self.sky, R, solution.focal_ratio, solution.observed, gates
         )
         # The gates of all stars cover the share N pi gate^2 / (4 pi) of the sky.

@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.attitude import rolling
-from estimator.attitude.nearfield import tangent_jacobian
 from estimator.attitude.rate import (
     MAX_RATE_RAD_S,
     STARS,
@@ -32,6 +31,7 @@ from estimator.attitude.rate import (
     from_moments,
     from_streaks,
 )
+from estimator.attitude.rotation_fit import tangent_jacobian
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids, RateEstimate

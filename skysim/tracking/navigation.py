@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import Attitude, RateEstimate
+from estimator.filter.error_models import GyroModel, JumpModel, TrackerModel
 from estimator.filter.mekf import AttitudeFilter
-from estimator.filter.states import GyroModel, JumpModel, TrackerModel
 from skysim.camera.render import Window
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD, DEG_H_RAD_S, EARTH_RATE_RAD_S, HOUR_S, PPM

@@ -20,7 +20,7 @@ from estimator import (
 )
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.solvers import SOLVERS, covariance
-from estimator.calibration import dome_survey, home_position, star_field
+from estimator.calibration import dome_survey, home_position, star_field, zero_point
 from estimator.calibration.star_field import StarFrame
 from estimator.catalog import catalog
 from estimator.core.types import FramePriors
@@ -361,15 +361,15 @@ OTHERS: list[Case] = [
     ),
     (
         "zero",
-        lambda: star_field.magnitude_zero(SIGMA, SIGMA[:3], UNITS),
+        lambda: zero_point.magnitude_zero(SIGMA, SIGMA[:3], UNITS),
         r"v_mag has shape \(3,\)",
     ),
     (
         "zero NaN",
-        lambda: star_field.magnitude_zero(SIGMA * NAN, SIGMA, UNITS),
+        lambda: zero_point.magnitude_zero(SIGMA * NAN, SIGMA, UNITS),
         "instrumental_mag has a NaN",
     ),
-    ("no zero", lambda: star_field.magnitude_zero(SIGMA[:0], SIGMA[:0], UNITS[:0]), "no stars"),
+    ("no zero", lambda: zero_point.magnitude_zero(SIGMA[:0], SIGMA[:0], UNITS[:0]), "no stars"),
     ("control", lambda: exposure_control.Control("a"), "mean_dn is 'a'"),
     ("counts", lambda: exposure_control.Control(9.0, min_stars=-3), "min_stars is -3"),
     (

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
-from estimator.attitude.nearfield import rotation_only
+from estimator.attitude.rotation_fit import rotation_only
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Sources
 from skysim.scene import loader

@@ -36,7 +36,8 @@ from estimator.core.types import Attitude, Centroids, ra_dec_roll_rad
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_centroid
 from estimator.trackers.refinement import NO_MATCH
-from estimator.trackers.star_tracker import QUAD_SEARCHES, StarTracker
+from estimator.trackers.search_models import QUAD_SEARCHES
+from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import CATALOGS
 from skysim.core.time import check_year

@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.attitude.dome_map import LedMap
-from estimator.calibration import dome_survey, survey_faults
+from estimator.calibration import dome_survey, survey_faults, survey_subset
 from estimator.calibration.bundle_adjustment import Assumed
-from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, Unconnected
+from estimator.calibration.dome_survey import DomeFrame, DomeSurvey
+from estimator.calibration.survey_subset import Unconnected
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey.survey_findings import (
@@ -338,8 +339,8 @@ def led_visibility(
     camera_m = np.array([frame.body_from_lab.inv().apply(arm_m) for frame, _ in pairs]).reshape(
         -1, 3
     )
-    angle_rad = dome_survey.ray_angles(prior.leds.position_m, camera_m, *np.nonzero(visible))
-    return visible & (angle_rad > dome_survey.CONNECTING_RAD)
+    angle_rad = survey_subset.ray_angles(prior.leds.position_m, camera_m, *np.nonzero(visible))
+    return visible & (angle_rad > survey_subset.CONNECTING_RAD)
 
 
 def largest_connected_group(visible: NDArray[np.bool_], min_shared: int) -> list[int]:

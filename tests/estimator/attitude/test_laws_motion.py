@@ -10,7 +10,7 @@ from hypothesis import given
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude import nearfield, rate, rolling
+from estimator.attitude import rate, rolling, rotation_fit
 from estimator.attitude.rate import STARS, Sight
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
@@ -235,7 +235,7 @@ def test_an_error_of_the_rate_rotates_the_attitude(rng: np.random.Generator) -> 
     found = seen.centroids()
     wrong = rate.at_middle_row(CAMERA, found, exact(seen.rate_rad_s + error))
     place = seen.cam_from_ref.apply(seen.place_ref)
-    jacobian = nearfield.tangent_jacobian(place, place).reshape(-1, 2, 3)
+    jacobian = rotation_fit.tangent_jacobian(place, place).reshape(-1, 2, 3)
     residual = GLOBAL.tangents(wrong.xy_px) - GLOBAL.tangents(seen.still_px)
     turned, *_ = np.linalg.lstsq(jacobian.reshape(-1, 3), residual.ravel(), rcond=None)
     covariance = rolling.rate_covariance_rad2(CAMERA, found, jacobian, np.outer(error, error))
@@ -257,7 +257,7 @@ def test_a_rolling_shutter_attitude_has_its_claimed_covariance() -> None:
             CAMERA, found, places, np.zeros(3), (seen.cam_from_ref, seen.rate_rad_s), ANYTHING
         )
         place = seen.cam_from_ref.apply(places)
-        jacobian = nearfield.tangent_jacobian(place, place)
+        jacobian = rotation_fit.tangent_jacobian(place, place)
         noise = (
             np.linalg.inv(jacobian.T @ jacobian) * (found.sigma_px[0] / CAMERA.focal_px) ** 2
         )

@@ -9,7 +9,7 @@ from hypothesis import given
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude import nearfield, systematic
+from estimator.attitude import rotation_fit, systematic
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
@@ -43,7 +43,7 @@ def covariances(rng: np.random.Generator, size: int, count: int = COUNT) -> Floa
     return root @ np.moveaxis(root, 1, 2)
 
 
-@law(nearfield.tangent_gradients, nearfield.tangent_jacobian, systematic.geometry)
+@law(rotation_fit.tangent_gradients, rotation_fit.tangent_jacobian, systematic.geometry)
 @given(rng=SEEDS)
 def test_changes_of_tangents_match_their_derivatives(rng: np.random.Generator) -> None:
     bearing, pupil = places(rng)
@@ -51,12 +51,12 @@ def test_changes_of_tangents_match_their_derivatives(rng: np.random.Generator) -
     turned_rad = rng.normal(0, 1e-6, 3)
     view = systematic.geometry(bearing, pupil)
     assert_allclose(view.tangent, tangents(pupil), rtol=0, atol=1e-15)
-    gradient = nearfield.tangent_gradients(pupil)
+    gradient = rotation_fit.tangent_gradients(pupil)
     moved = tangents(pupil + step_m) - view.tangent
     assert_allclose(np.einsum("kij,kj->ki", gradient, step_m), moved, rtol=0, atol=1e-11)
     # Along the ray nothing changes.
     assert_allclose(np.einsum("kij,kj->ki", gradient, pupil), 0, rtol=0, atol=1e-14)
-    jacobian = nearfield.tangent_jacobian(bearing, pupil)
+    jacobian = rotation_fit.tangent_jacobian(bearing, pupil)
     rotated = (
         tangents(pupil + Rotation.from_rotvec(turned_rad).apply(bearing) - bearing)
         - view.tangent

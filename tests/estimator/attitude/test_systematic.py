@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude import systematic
 from estimator.attitude.dome_map import LedMap, Lever
-from estimator.attitude.nearfield import rotation_only
+from estimator.attitude.rotation_fit import rotation_only
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Centroids

@@ -8,13 +8,14 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude import dome_map, nearfield
+from estimator.attitude import dome_map, rotation_fit
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration import dome_survey
 from estimator.calibration.bundle_adjustment import Assumed
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, survey
 from estimator.calibration.gauge import align_attitudes
+from estimator.calibration.survey_subset import connected_subset
 from estimator.core.camera import Camera
 
 INCH = 0.0254
@@ -521,7 +522,7 @@ def afit_errors_deg(
         xy = frame.xy_px[known]
         sigma = np.full(len(led), 0.1 / found.camera.focal_px)
         solved.append(
-            nearfield.rotation_only(
+            rotation_fit.rotation_only(
                 found.camera.rays(xy),
                 sigma,
                 found.leds.position_m[led],
@@ -556,7 +557,7 @@ def test_the_afit_dome_is_surveyed_from_its_own_frames(begin: str) -> None:
         frames = [
             replace(
                 f,
-                body_from_lab=nearfield.rotation_only(
+                body_from_lab=rotation_fit.rotation_only(
                     camera.rays(f.xy_px),
                     f.sigma_px / camera.focal_px,
                     start.position_m[f.led],
@@ -607,7 +608,7 @@ def test_the_three_weak_moves_are_conformal_maps() -> None:
     frames = filmed(rng, turned, place, AFIT_LEVER, AFIT, 0.1, imu_deg=0.0)
     seen = dome_survey._collect(frames, 700)
     whole = dome_survey._start_bundle(frames, leds_of(place), AFIT_LEVER, AFIT, 3)
-    part = dome_survey.connected_subset(whole, seen, np.ones(len(seen.led), dtype=bool))
+    part = connected_subset(whole, seen, np.ones(len(seen.led), dtype=bool))
     terms = ba.normal_equations(part.bundle, part.sightings, np.ones(len(part.index)))
     reduced = ba.eliminate_lights(terms, ba.gauge_freedoms(part.bundle)[1], 0.0)
     spread = ba.cho_solve(reduced.factor, np.diag(reduced.scale)) * reduced.scale[:, None]

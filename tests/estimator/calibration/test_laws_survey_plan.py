@@ -11,9 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as some
 from scipy.spatial.transform import Rotation
 
-from estimator.calibration import bundle_adjustment as ba
-from estimator.calibration import dome_survey, survey_faults, survey_plan
-from estimator.calibration.dome_survey import connected_subset
+from estimator.calibration import (
+    bundle_covariance,
+    survey_faults,
+    survey_plan,
+    survey_subset,
+)
 from estimator.calibration.gauge import Gauge
 from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
 from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
@@ -27,8 +30,8 @@ from tests.helpers.surveyed_dome import attitudes, model, pixels
         survey_plan.predict,
         SurveyAccuracy.led_rms_m,
         SurveyModel.visible,
-        ba.covariance,
-        connected_subset,
+        bundle_covariance.covariance,
+        survey_subset.connected_subset,
     ),
     slow=True,
 )
@@ -74,7 +77,7 @@ def test_a_longer_plan_extends_a_shorter_one(rng: np.random.Generator, count: in
     )
 
 
-@law(dome_survey.ray_angles)
+@law(survey_subset.ray_angles)
 @given(rng=SEEDS, half_rad=some.floats(1e-3, 0.5))
 def test_rays_from_a_circle_cross_at_its_half_angle(
     rng: np.random.Generator, half_rad: float
@@ -91,7 +94,7 @@ def test_rays_from_a_circle_cross_at_its_half_angle(
     lights_m = np.array([at_m, at_m + 1, at_m - 1])
     frame = np.array([0, 1, 2, 3, 4, 2])
     led = np.array([0, 0, 0, 0, 0, 1])
-    angle_rad = dome_survey.ray_angles(lights_m, camera_m, frame, led)
+    angle_rad = survey_subset.ray_angles(lights_m, camera_m, frame, led)
     assert np.sin(half_rad) == pytest.approx(angle_rad[0], rel=1e-6)
     np.testing.assert_allclose(angle_rad[1:], 0, atol=1e-7)
 

@@ -16,9 +16,9 @@ from estimator.calibration.star_field import (
     StarFrame,
     calibrate,
     disagreement_px,
-    magnitude_zero,
     self_calibrate,
 )
+from estimator.calibration.zero_point import magnitude_zero
 from estimator.catalog import catalog
 from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera

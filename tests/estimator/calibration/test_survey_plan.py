@@ -14,14 +14,13 @@ from estimator.attitude.dome_map import Lever
 from estimator.calibration import survey_faults, survey_plan
 from estimator.calibration.bundle_adjustment import Assumed
 from estimator.calibration.dome_survey import (
-    CONNECTING_RAD,
     DomeFrame,
     DomeSurvey,
-    ray_angles,
     survey,
 )
 from estimator.calibration.survey_faults import LightTable
 from estimator.calibration.survey_plan import SurveyModel
+from estimator.calibration.survey_subset import CONNECTING_RAD, ray_angles
 from estimator.core.camera import Camera
 from tests.helpers.surveyed_dome import LIST_SIGMA_M, NOISE_PX, attitudes, leds, model, pixels
 

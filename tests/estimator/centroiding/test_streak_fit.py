@@ -303,9 +303,9 @@ def test_a_star_s_own_vector_excludes_the_priors(seed: int) -> None:
     pull[place] = prior[place, place] * prior_mean
     p = np.linalg.solve(normal, np.linalg.solve(covariance, data_mean) + pull)
     out = np.full(5, np.nan)
-    streak_fit._own_vector(
-        np.linalg.cholesky(normal), p, *prior_mean, 1.0, 0.01, np.empty(7), out
-    )
+    start = np.zeros(7)
+    start[place] = prior_mean
+    streak_fit._own_vector(np.linalg.cholesky(normal), p, start, 1.0, 0.01, out)
     length, angle = data_mean[place]
     c = np.cos(angle)
     s = np.sin(angle)

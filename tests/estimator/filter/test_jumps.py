@@ -10,16 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from estimator.filter.consistency import CONFIRMATIONS, ENOUGH, Jump, log_odds, shock_rad
-from estimator.filter.mekf import (
-    DISPUTED,
-    OUTSIDE_GATE,
-    RESET,
-    USED,
-    AttitudeFilter,
-    GyroModel,
-    JumpModel,
-    Update,
-)
+from estimator.filter.error_models import GyroModel, JumpModel
+from estimator.filter.mekf import DISPUTED, OUTSIDE_GATE, RESET, USED, AttitudeFilter, Update
 
 ARCSEC_RAD = np.pi / 180 / 3600
 ARW_RAD_SQRT_S = np.radians(0.07) / 60

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import FilterState
-from estimator.filter.mekf import USED, AttitudeFilter, GyroModel
+from estimator.filter.error_models import GyroModel
+from estimator.filter.mekf import USED, AttitudeFilter
 from estimator.filter.states import inverse_response
 from estimator.trackers import exposure_control
 from estimator.trackers.exposure_control import Control, NextExposure, Observation

@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.types import FilterState
 from estimator.filter import consistency, correct, states
+from estimator.filter.error_models import GyroModel, JumpModel, TrackerModel
 from estimator.filter.mekf import AttitudeFilter
-from estimator.filter.states import STATES, GyroModel, JumpModel, TrackerModel
+from estimator.filter.states import STATES
 from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
 from estimator.core.types import FilterState
+from estimator.filter.error_models import GyroModel
 from estimator.filter.mekf import (
     HISTORY_S,
     OUTSIDE_GATE,
@@ -17,7 +18,6 @@ from estimator.filter.mekf import (
     TOO_OLD,
     USED,
     AttitudeFilter,
-    GyroModel,
     Update,
 )
 from estimator.filter.states import transition

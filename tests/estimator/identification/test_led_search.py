@@ -15,7 +15,7 @@ from estimator.attitude.dome_map import LedMap, Lever, on_sphere, on_surface, pr
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Centroids, StarMatch
-from estimator.identification import led_search
+from estimator.identification import led_detections, led_search
 from estimator.identification.led_index import DomeIndex, build_dome_index
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Settings
@@ -146,7 +146,9 @@ def test_random_lights_give_no_attitude():
     dex = []
     for _ in range(200):
         rays = CAMERA.rays(rng.uniform(0, [1599, 1199], (8, 2)))
-        fallen = led_search.build_detections(rays, np.full(8, NOISE_PX / CAMERA.focal_px), dome)
+        fallen = led_detections.build_detections(
+            rays, np.full(8, NOISE_PX / CAMERA.focal_px), dome
+        )
         best, _ = led_search._search(fallen, dome, 10**7)
         dex.append(best.dex)
     # At most .1 of them, and three deviations of a binomial count.
@@ -336,7 +338,7 @@ def test_an_led_near_a_direction_is_found_as_by_brute_force() -> None:
         direction = np.array([x, y, np.sqrt(max(1 - x * x - y * y, 0.0))])
         gate = dome.grid.cell * rng.uniform(0.1, 3)
         near = np.linalg.norm(dome.grid.direction - direction, axis=1).min() < gate
-        assert PLAIN._has_led_near(dome.grid, tuple(direction), gate) == near
+        assert PLAIN.has_led_near(dome.grid, tuple(direction), gate) == near
         found += near
     assert 100 < found < 400
 
@@ -361,7 +363,7 @@ def test_a_pair_s_gates_are_the_error_of_where_it_puts_a_detection() -> None:
     b = 2
     places = np.array([[0.05, 0.02], [0.0, 0.03], [-0.04, 0.01], [0.07, -0.05]])
     rays = np.column_stack([places, np.ones(4)])
-    detections = led_search.build_detections(
+    detections = led_detections.build_detections(
         rays / np.linalg.norm(rays, axis=1, keepdims=True), np.full(4, sigma), dome
     )
     seen = places[:, 0] + 1j * places[:, 1]
@@ -406,7 +408,7 @@ def test_the_quick_check_stops_once_the_outcome_is_decided(
         else whole
     )
     rays = camera.rays(project(Rotation.identity(), position_m, lever, camera))
-    detections = led_search.build_detections(rays, np.full(5, 1e-5), dome)
+    detections = led_detections.build_detections(rays, np.full(5, 1e-5), dome)
     gates = np.full(5, 1e-4)
     R_grid_from_cam = dome.grid.R_grid_from_lab
     median_m = dome.median_radius_m
@@ -416,7 +418,7 @@ def test_the_quick_check_stops_once_the_outcome_is_decided(
         )
         == found
     )
-    zoomed = led_search.build_detections(
+    zoomed = led_detections.build_detections(
         camera.zoomed(1 / 1.08).rays(camera.pixels(rays)),
         np.full(5, 1e-5),
         dome,
@@ -445,7 +447,7 @@ def test_a_pair_gives_the_focal_length_at_which_it_matches_two_leds(ratio: float
         for one in ((rays[0], dome, 1.1), (rays[1], dome, 1.3))
     ]
     pixels = CAMERA.pixels(rays)
-    seen = led_search.build_detections(
+    seen = led_detections.build_detections(
         CAMERA.zoomed(1 / ratio).rays(pixels), np.full(2, 1e-5), dome, focal_uncertainty=0.12
     )
     chord = float(np.linalg.norm(ends[0] - ends[1]))
@@ -474,7 +476,7 @@ def test_the_prior_of_a_pair_s_attitude_is_its_share_of_all_attitudes() -> None:
     dome = build_dome_index(spread(60, OVAL, seed=1), LEVER, CAMERA)
     rays = np.array([[0.05, 0.02, 1.0], [-0.04, 0.01, 1.0]])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    detections = led_search.build_detections(rays, np.array([1e-5, 2e-5]), dome)
+    detections = led_detections.build_detections(rays, np.array([1e-5, 2e-5]), dome)
     across = detections.sigma.min() / np.sqrt(2)
     apart = np.hypot(0.09, 0.01)
     covariance = np.diag([across, across, np.sqrt(2) * detections.sigma.min() / apart]) ** 2
@@ -581,7 +583,7 @@ def test_random_lights_give_no_attitude_at_any_focal_length() -> None:
     dex = []
     for _ in range(200):
         rays = CAMERA.rays(rng.uniform(0, [1599, 1199], (8, 2)))
-        fallen = led_search.build_detections(
+        fallen = led_detections.build_detections(
             rays, np.full(8, NOISE_PX / CAMERA.focal_px), dome, focal_uncertainty=0.12
         )
         best, _ = led_search._search(fallen, dome, 10**7)

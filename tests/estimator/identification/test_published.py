@@ -17,7 +17,8 @@ from estimator.catalog import pair_index
 from estimator.catalog.catalog import unit
 from estimator.core.checks import Floats
 from estimator.identification.published import pyramid
-from estimator.identification.published.saa import UNMATCHED_COST, Gates, Primary, SearchInput
+from estimator.identification.published.primary_pair import Gates, Primary, SearchInput
+from estimator.identification.published.saa import UNMATCHED_COST
 from estimator.identification.published.shefex import FOURTH_STAR, ShefexOptions
 from estimator.identification.registry import IDENTIFIERS
 from estimator.identification.solver_options import Options

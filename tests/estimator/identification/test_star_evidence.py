@@ -167,11 +167,9 @@ def test_the_magnitudes_density_is_the_smoothed_catalog_s() -> None:
     for value in (3.0, 4.0, 5.0, 5.5):
         wanted = np.mean(norm.pdf(value, mag, sky_index.MAG_SMOOTHING))
         # Of bins of MAG_STEP.
-        assert star_evidence.magnitude_density(sky, value) == pytest.approx(wanted, rel=0.1)
-    assert star_evidence.magnitude_density(sky, -9.0) == star_evidence.magnitude_density(
-        sky, mag[0]
-    )
-    assert star_evidence.magnitude_density(sky, 30.0) == star_evidence.magnitude_density(
+        assert sky_index.magnitude_density(sky, value) == pytest.approx(wanted, rel=0.1)
+    assert sky_index.magnitude_density(sky, -9.0) == sky_index.magnitude_density(sky, mag[0])
+    assert sky_index.magnitude_density(sky, 30.0) == sky_index.magnitude_density(
         sky, mag[-1] + 2
     )
 
@@ -188,7 +186,7 @@ def test_a_magnitude_s_likelihoods_of_one_star_add_up_to_one(star: int) -> None:
     ratio = [
         star_evidence._magnitude_ratio(detections, sky, n, star, share) for n in range(len(mag))
     ]
-    density = [star_evidence.magnitude_density(sky, value) / share for value in mag]
+    density = [sky_index.magnitude_density(sky, value) / share for value in mag]
     # Of 5 stars in 100, variable ones and the like, the magnitude is any of those seen.
     assert np.dot(ratio, density) * 1e-3 == pytest.approx(
         0.95 + 0.05 * np.sum(density) * 1e-3, rel=2e-3

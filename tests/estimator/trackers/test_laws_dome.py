@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude import dome_map, nearfield
+from estimator.attitude import dome_map, nearfield, rotation_fit
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.nearfield import SOLVERS
 from estimator.calibration import home_position
@@ -23,7 +23,7 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
-from estimator.identification import led_index, led_search
+from estimator.identification import led_detections, led_index, led_search
 from estimator.trackers import dome_tracker
 from estimator.trackers.dome_tracker import DomeTracker
 from tests.helpers.laws import (
@@ -116,7 +116,13 @@ def test_rays_intersect_the_surface_ahead_of_the_camera(
 # Solves
 
 
-@law(nearfield.rotation_only, nearfield.tappe, nearfield.ray_on_surface, nearfield.pnp)
+@law(
+    rotation_fit.rotation_only,
+    rotation_fit.in_body_axes,
+    nearfield.tappe,
+    nearfield.ray_on_surface,
+    nearfield.pnp,
+)
 @given(
     rng=SEEDS,
     count=some.integers(6, 20),
@@ -135,9 +141,13 @@ def test_exact_solves_find_the_truth(
     )
     assert (found * truth.inv()).magnitude() < 1e-6
     assert_covariance(covariance)
+    # Back to camera axes
+    R = arm.cam_from_body.as_matrix()
+    back = R @ rotation_fit.in_body_axes(covariance, arm) @ R.T
+    np.testing.assert_allclose(back, covariance, rtol=0, atol=1e-9 * np.abs(covariance).max())
 
 
-@law(nearfield.fit_focal_ratio)
+@law(rotation_fit.fit_focal_ratio)
 @given(
     rng=SEEDS,
     count=some.integers(4, 20),
@@ -153,7 +163,9 @@ def test_a_focal_length_is_fitted_with_the_attitude(
     leds, rays = seen_through(rng, OVAL, arm, truth, count)
     seen = CAMERA.zoomed(1 / ratio).rays(CAMERA.pixels(rays))
     start = turn(rng, 0.035) * truth
-    found = nearfield.fit_focal_ratio(seen, np.full(count, sigma), leds.position_m, arm, start)
+    found = rotation_fit.fit_focal_ratio(
+        seen, np.full(count, sigma), leds.position_m, arm, start
+    )
     assert found == pytest.approx(ratio, abs=1e-9)
 
 
@@ -222,7 +234,7 @@ def eye() -> DomeTracker:
 @law(
     DomeTracker.solve_centroids,
     led_search.identify,
-    led_search.build_detections,
+    led_detections.build_detections,
     dome_tracker.led_pairs,
 )
 @given(rng=SEEDS, false=some.integers(0, 4))
@@ -250,7 +262,7 @@ def test_lights_are_named_correctly_or_not_at_all(
     rays = CAMERA.rays(xy)
     sigma = np.full(len(xy), 1e-4)
     dome = led_index.build_dome_index(eye.leds, eye.lever, CAMERA)
-    lights = led_search.build_detections(rays, sigma, dome)
+    lights = led_detections.build_detections(rays, sigma, dome)
     np.testing.assert_allclose(np.linalg.norm(lights.direction, axis=1), 1, rtol=0, atol=1e-9)
     for match in (led_search.identify(rays, sigma, dome), eye.identify(rays, sigma, None)):
         named = [] if isinstance(match, str) else match.observed.tolist()

@@ -14,14 +14,13 @@ from scipy import stats
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from estimator.calibration.star_field import magnitude_zero
+from estimator.calibration.zero_point import magnitude_zero
 from estimator.catalog import catalog, pair_index
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.identification.direct_match import to_star_match
-from estimator.identification.published import saa as saa_search
-from estimator.identification.published import shefex
+from estimator.identification.published import primary_pair, shefex
 from estimator.identification.published.fialho import fialho_1, fialho_2, fialho_3, fialho_4
 from estimator.identification.published.fialho import search_options as fialho_options
 from estimator.identification.published.master_star import master_star
@@ -182,8 +181,8 @@ def test_a_pool_without_assumptions_gives_no_answer(rng: np.random.Generator) ->
     world = World(rng, 60)
     known = world.index
     unknown = np.full(len(world.seen), np.nan)
-    gates = saa_search.Gates(1e-4, 1e-4, np.inf, 0.0)
-    seen = saa_search.SearchInput(
+    gates = primary_pair.Gates(1e-4, 1e-4, np.inf, 0.0)
+    seen = primary_pair.SearchInput(
         world.seen, unknown, known.vectors, known.magnitude, known.cells, gates
     )
     pool = AssumptionPool(seen, (-1.0, 1.0, -1.0, 1.0), 0.0)

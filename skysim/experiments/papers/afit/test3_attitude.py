@@ -19,13 +19,13 @@ from estimator.attitude.solvers import quest
 from estimator.catalog.catalog import unit
 from estimator.catalog.pair_index import PairCatalog, build_pair_catalog, candidates
 from estimator.core.checks import Ints
-from estimator.identification.published.saa import (
+from estimator.identification.published.primary_pair import (
     Gates,
     SearchInput,
     build_primary,
     gate_rad,
-    match_assumptions,
 )
+from estimator.identification.published.saa import match_assumptions
 from skysim.core.constants import ARCSEC_RAD, INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
