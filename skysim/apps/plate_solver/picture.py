@@ -23,7 +23,6 @@ from skysim.apps.plate_solver.solver import (
     FOV_LIMITS_DEG,
     PlateSolution,
     Solver,
-    annotated_image,
     kept_solver,
     make_solver,
     solution_fields,
@@ -231,9 +230,10 @@ def solve_picture(
 ) -> SolvedReading:
     """Solve the hypotheses about a monochrome picture in turn, up to the first that is solved."""
     tried = hypotheses(picture, solver)
-    # those of a reading serve all fields of view
     outcomes = []
-    centroids = dict[int, Centroids]()
+    centroids = dict[
+        int, Centroids
+    ]()  # by the pixels of a reading; they serve all fields of view
     for hypothesis in tried:
         reading = id(hypothesis.pixels)
         solved = solve_array(
@@ -324,3 +324,21 @@ def outcome_fields(
     rows_known = len({id(one.pixels) for one in outcome.tried}) == 1
     refusal = diagnosis.Refusal(pixels, report.centroids, tuple(solvers), date_utc, rows_known)
     return seen | {"hint": diagnosis.likely_cause(refusal)}
+
+
+def annotated_image(image: NDArray, report: Report, tracker: StarTracker) -> NDArray[np.uint8]:
+    """The image annotated with detections, matched stars and their numbers."""
+    from skysim.results.plots import annotate
+
+    match = report.attitude.match
+    detected_px = report.centroids.xy_px
+    if match is None:
+        return annotate(image, detected_px, np.empty((0, 2)))
+    names = [star_name(int(tracker.stars.id[star])) for star in match.star]
+    return annotate(image, detected_px, detected_px[match.observed], names)
+
+
+def star_name(number: int) -> str:
+    """Name of a star by its number in a catalog of skysim (see `skysim.sources.catalog.Catalog`)."""
+    millions, rest = divmod(number, 1_000_000)
+    return f"{('HIP', 'HD', 'Gaia')[min(millions, 2)]} {rest}"

@@ -514,7 +514,7 @@ def same_attitude(first: Attitude, second: Attitude) -> bool:
     )
 
 
-# The solution of a plate: its fields for Python and JSON, and the annotated image.
+# The solution of a plate: its fields for Python and JSON.
 
 
 @dataclass(frozen=True, slots=True)
@@ -590,21 +590,3 @@ def center_from_cam(camera: Camera) -> Rotation:
     x = np.cross(below - z, z)
     x /= np.linalg.norm(x)
     return Rotation.from_matrix(np.array([x, np.cross(z, x), z]))
-
-
-def annotated_image(image: NDArray, report: Report, tracker: StarTracker) -> NDArray[np.uint8]:
-    """The image annotated with detections, matched stars and their numbers."""
-    from skysim.results.plots import annotate
-
-    match = report.attitude.match
-    detected_px = report.centroids.xy_px
-    if match is None:
-        return annotate(image, detected_px, np.empty((0, 2)))
-    names = [star_name(int(tracker.stars.id[star])) for star in match.star]
-    return annotate(image, detected_px, detected_px[match.observed], names)
-
-
-def star_name(number: int) -> str:
-    """Name of a star by its number in a catalog of skysim (see `skysim.sources.catalog.Catalog`)."""
-    millions, rest = divmod(number, 1_000_000)
-    return f"{('HIP', 'HD', 'Gaia')[min(millions, 2)]} {rest}"

@@ -72,12 +72,12 @@ def load(
     ----------
     programs
         Commands of external trackers and controllers by name; None if the study will not be
-        run, and its trackers and controllers need not be installed
+        run, so that they need not be installed
 
     Raises
     ------
     InputError
-        With one line: the key, the fault, what is allowed, the file and line.
+        With one line: the key, the fault, allowed values, file and line.
     """
     path = find(str(name))
     tree, text = read_yaml(path)
@@ -101,9 +101,9 @@ def plan_of(
     Parameters
     ----------
     path
-        Of the text, for messages
+        Path of the text, for messages
     base
-        A file beside which scenes are, `path` if left out
+        File to whose folder scene paths are relative; `path` if left out
 
     Raises
     ------
@@ -207,7 +207,7 @@ def named_sections(study: Study) -> Iterator[tuple[str, Figure | Threshold]]:
 
 
 def check_hardware(study: Study) -> None:
-    """Raise InputError where draws of the hardware are levels of a factor, or keys that the factors set too."""
+    """Raise InputError if a key of `hardware` is of the trial or is also set by a factor, or a factor sets a seed."""
     for n, key in enumerate(study.hardware):
         if key.startswith(TRIAL):
             raise InputError(
@@ -232,7 +232,7 @@ def check_hardware(study: Study) -> None:
 
 
 def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
-    """Raise InputError where the trial does not fit the scene of a level."""
+    """Raise InputError if the trial does not fit the scene of a level."""
     if isinstance(scene.light, CollimatedDisplayConfig) and not isinstance(trial, FlightTrial):
         raise InputError("trial.kind", f"{trial.kind} with a collimated display", "flight")
     if scene.tracker.decoder and isinstance(trial, FrameTrial):
@@ -299,7 +299,7 @@ def fixed_seeds(study: Study, scene: Scene) -> list[str]:
 
 
 def at_factor(study: Study, name: str, level: Value, error: InputError) -> InputError:
-    """A level's error with the factor that sets the key at fault, and its value; one of `hardware` unchanged."""
+    """An error of a level, with the factor that sets the key at fault and its value; one of `hardware` is unchanged."""
     if error.key == "hardware":
         return error
     owners = [
