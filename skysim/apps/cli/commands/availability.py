@@ -122,7 +122,7 @@ def pointing_of(scene: Scene, law: str, off_deg: float, around_deg: float) -> Po
 def computed(
     scene: Scene, pointing: Pointing, span_s: float | None, samples: int, watch: Any
 ) -> SkySamples:
-    """The angles over the span, or over one revolution."""
+    """The angles over the span; without one, over one revolution."""
     import numpy as np
 
     from skysim.core.constants import EARTH_MU_M3_S2
@@ -159,7 +159,7 @@ def computed(
 
 
 def fractions_of(found: SkySamples, exclusion: ExclusionConfig) -> dict[str, float]:
-    """The fraction of the times at which each condition holds, and at which all do."""
+    """The fraction of the times at which each condition holds, and at which all hold."""
     outside = found.outside(exclusion)
     each = {name: float(holds.mean()) for name, holds in outside.items()}
     return {**each, "all": float(available(found, exclusion).mean())}

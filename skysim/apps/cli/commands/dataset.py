@@ -61,7 +61,7 @@ def dataset(
     from skysim.experiments import dataset_run
     from skysim.experiments.dataset_shards import Storage
 
-    Storage(out)  # refuses a wrong URL before the scene is read
+    Storage(out)  # raises for a wrong URL before the scene is read
     formats = tuple(to or ("webdataset", "coco"))
     made = dataset_run.load(
         scene,

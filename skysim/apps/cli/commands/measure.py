@@ -1,4 +1,4 @@
-"""Commands that measure hardware: `skysim balance`, the vehicle; `skysim characterize`, the camera."""
+"""Commands that measure hardware: `skysim balance` for the vehicle, `skysim characterize` for the camera."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def print_report(statistics: dict[str, Any], report: Report, json: bool) -> None
 
 
 def print_flight(row: dict[str, Any]) -> None:
-    """Print one flight: offset with its standard deviation, torque, where the trim masses go."""
+    """Print one flight: offset with its standard deviation, torque, next places of the trim masses."""
     from skysim.experiments.balance_report import offset_text
 
     places = "/".join(f"{one:.3f}" for one in row["next_trim_mm"])

@@ -82,7 +82,7 @@ def stream(
 
 
 def open_sinks(folder: Path | None, pipe: str | None) -> list[Sink]:
-    """The folder and the pipe that receive all frames, of those that are given."""
+    """Sinks for the folder and for the pipe, if they are given."""
     from skysim.apps.stream.sinks import Sink, folder_writer, pipe_writer
 
     sinks = []

@@ -84,7 +84,7 @@ def solve(
 
 
 def pictures(images: list[Path], live: str | None, out: Path) -> list[Path]:
-    """The files to solve, with a frame of the live camera that is written to `out`. Raises InputError for none."""
+    """The files to solve, with a frame of the live camera, which is written to `out`. Raises InputError without any."""
     from skysim.apps import plate_solver
     from skysim.core import files
     from skysim.core.images import grab_frame

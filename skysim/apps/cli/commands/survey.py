@@ -157,7 +157,7 @@ def survey(
         print_json(statistics)
 
 
-# Options that some modes of the command do not use, and those that each mode does not use.
+# Options that have no effect in some modes, and those without effect by mode.
 LIMITED = ("frames", "attitudes", "next", "frames-to", "checks")
 UNUSED = {
     "images": ("frames", "attitudes", "frames-to", "checks"),
