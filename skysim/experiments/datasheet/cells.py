@@ -26,11 +26,10 @@ from skysim.core.yaml_reader import parse_yaml
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.factors import Point, Settings
 from skysim.experiments.study.plan import Plan, Study, TrialSpec, make_plan
-from skysim.experiments.study.study_file import has_survey_errors
+from skysim.experiments.study.study_file import dome_seeds
 from skysim.experiments.study.unused_options import tracks
 from skysim.scene.scene import BODIES_YEARS, Scene
-from skysim.scene.sections.layouts import OnPoints
-from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
+from skysim.scene.sections.light import CollimatedDisplayConfig, StarsConfig
 
 # Step from one attitude of a field to the next: the same stars at other phases in the pixels.
 SCAN_PX = 3.37
@@ -132,15 +131,7 @@ def unit_seeds(scene: Scene) -> list[str]:
     chip = scene.camera.detector
     has_pattern = any(getattr(chip, key) for key in FIXED_PATTERN)
     seeds = ["camera.detector.hardware_seed"] if has_pattern else []
-    seeds += (
-        ["tracker.survey.seed"] if has_survey_errors(scene) and not scene.tracker.map else []
-    )
-    layout = scene.light.layout if isinstance(scene.light, DomeConfig) else None
-    points, prefix = (
-        (layout.points, ".points") if isinstance(layout, OnPoints) else (layout, "")
-    )
-    seeds += [f"light.layout{prefix}.hardware_seed"] if hasattr(points, "hardware_seed") else []
-    return seeds
+    return seeds + dome_seeds(scene)
 
 
 def states_c(scene: Scene, count: int) -> list[float]:

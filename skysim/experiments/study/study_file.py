@@ -39,6 +39,7 @@ from skysim.experiments.study.plan import (
     resolve_point,
 )
 from skysim.results import metrics
+from skysim.scene import unused
 from skysim.scene.scene import BODIES_YEARS, Scene
 from skysim.scene.sections.layouts import OnPoints
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
@@ -239,7 +240,7 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
         raise InputError(
             "trial.kind", "frames with tracker.decoder, which needs many", "centroids, flight"
         )
-    if SURVEY_SEED in plan.spec.hardware and not has_survey_errors(scene):
+    if SURVEY_SEED in plan.spec.hardware and unused.reason(SURVEY_SEED, scene):
         raise InputError(
             "hardware",
             "tracker.survey.seed has no effect without errors of the survey",
@@ -268,34 +269,23 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
             )
 
 
-def has_survey_errors(scene: Scene) -> bool:
-    """Whether the survey of a scene has errors that `tracker.survey.seed` draws."""
-    survey = scene.tracker.survey
-    dome = scene.light if isinstance(scene.light, DomeConfig) else None
-    error_m = dome.surface.error_m if dome else 0.0
-    return any(
-        (
-            survey.led_sigma_m,
-            survey.lever_sigma_m,
-            survey.focal_length_sigma_m,
-            survey.instrument,
-            error_m,
-        )
-    )
+def dome_seeds(scene: Scene) -> list[str]:
+    """Keys of the seeds of the survey and of the LEDs that have an effect in a scene."""
+    seeds = [] if unused.reason(SURVEY_SEED, scene) else [SURVEY_SEED]
+    key = "light.layout"
+    layout = scene.light.layout if isinstance(scene.light, DomeConfig) else None
+    if isinstance(layout, OnPoints):
+        key = "light.layout.points"
+        layout = layout.points
+    return seeds + [f"{key}.hardware_seed"] * hasattr(layout, "hardware_seed")
 
 
 def fixed_seeds(study: Study, scene: Scene) -> list[str]:
     """Seeds of the survey and of the LEDs that a scene draws once, and the study neither draws anew nor varies."""
-    layout = scene.light.layout if isinstance(scene.light, DomeConfig) else None
-    points, prefix = (
-        (layout.points, ".points") if isinstance(layout, OnPoints) else (layout, "")
-    )
-    seeds = [SURVEY_SEED] if has_survey_errors(scene) else []
-    seeds += [f"light.layout{prefix}.hardware_seed"] if hasattr(points, "hardware_seed") else []
     varied = {*study.hardware, *study.set}.union(
         *(factor.value_at(0.5)[1] for factor in study.factors.values())
     )
-    return [seed for seed in seeds if seed not in varied]
+    return [seed for seed in dome_seeds(scene) if seed not in varied]
 
 
 def at_factor(study: Study, name: str, level: Value, error: InputError) -> InputError:
@@ -351,10 +341,10 @@ def check_random_start(scene: Scene, start: AttitudeRange) -> None:
         )
         raise InputError("trial.start", f"random with {where}", "scene")
     dome = isinstance(scene.light, DomeConfig)
-    for unused in ("dec_deg", "near") if dome else ("tilt_deg",):
-        if unused in start.model_fields_set:
+    for key in ("dec_deg", "near") if dome else ("tilt_deg",):
+        if key in start.model_fields_set:
             raise InputError(
-                f"trial.start.{unused}",
+                f"trial.start.{key}",
                 f"has no effect with light of kind {scene.light.kind}",
                 "none",
             )
