@@ -1,4 +1,4 @@
-"""Statistics, picture and report of a balance: the estimates by flight, and beside them the simulated vehicle."""
+"""Statistics, picture and report of a balance: the estimates by flight beside the simulated vehicle."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def statistics(
 
 
 def flight_row(number: int, one: Iteration) -> dict[str, Any]:
-    """Numbers of one flight; those that begin with true are of the simulated vehicle."""
+    """Numbers of one flight; names that begin with `true` are of the simulated vehicle."""
     trims = one.flight.vehicle.trims
     mass = one.flight.vehicle.mass
     per_um = 1e6 / mass.mass_kg
@@ -96,7 +96,7 @@ def estimate_rows(flight: BalanceFlight, estimate: MassEstimate) -> list[dict[st
 
 
 def nees(flight: BalanceFlight, estimate: MassEstimate) -> float:
-    """Squared error of the nine mass properties in units of their covariance: chi-square of 9 if that is honest."""
+    """NEES of the nine mass properties: chi-square with 9 degrees of freedom if their covariance is true."""
     nine = slice(INERTIA.start, MOMENT.stop)
     error = estimate.values[nine] - true_values(flight)
     return float(error @ np.linalg.solve(estimate.covariance[nine, nine], error))
@@ -140,7 +140,7 @@ def draw_flights(fig: Any, iterations: Sequence[Iteration], torque_bar_nm: float
 
 
 def filter_rows(one: Iteration, assumptions: Assumptions) -> list[dict[str, Any]]:
-    """As `estimate_rows`, of the filter in flight over an iteration's flight alone."""
+    """As `estimate_rows`, for the filter in flight over the flight of one iteration."""
     return estimate_rows(one.flight, filtered(one.flight.record, assumptions))
 
 
@@ -176,7 +176,7 @@ FLIGHTS = (
 
 
 def verdict(statistics: dict[str, Any]) -> Verdict:
-    """Whether the vehicle is balanced, and how well that is known."""
+    """Whether the vehicle is balanced, with the torque and its bound."""
     flights = statistics["flights"]
     last = flights[-1]
     frames = sum(one["frames"] for one in flights)

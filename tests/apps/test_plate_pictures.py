@@ -341,7 +341,7 @@ def test_annotated_images_have_the_images_names() -> None:
 
 
 def test_stars_have_their_catalog_s_designation() -> None:
-    assert [solver.star_name(n) for n in (71683, 1_048_915, 2_345_678)] == [
+    assert [plate_picture.star_name(n) for n in (71683, 1_048_915, 2_345_678)] == [
         "HIP 71683",
         "HD 48915",
         "Gaia 345678",

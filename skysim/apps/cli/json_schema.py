@@ -60,7 +60,7 @@ def relaxed(node: Any, name: str = "") -> Any:
     Parameters
     ----------
     name
-        Of the definition that `node` is, for which EXTRA_KEYS may add keys
+        Name of the definition, to which EXTRA_KEYS may add keys
     """
     if isinstance(node, list):
         return [relaxed(item) for item in node]

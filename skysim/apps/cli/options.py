@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 # Loaded scenes: name and command-line overrides, for the locations in error messages.
 Loaded = tuple[str, dict[str, str]]
 LOADED: list[Loaded] = []
-TYPED: dict[
-    str, str
-] = {}  # keys of the scene that options of their own have set, with the option
+TYPED: dict[str, str] = {}  # the option by key of the scene, of keys that an option has set
 
 
 def complete_scene(incomplete: str) -> list[str]:
@@ -189,7 +187,7 @@ def selected_stages(**stages: str | None) -> dict[str, str]:
 
 
 def datetime_from_iso(text: str | None) -> datetime.datetime | None:
-    """The value of --time. Raises InputError."""
+    """The date of --time. Raises InputError."""
     if text is None:
         return None
     try:
@@ -198,10 +196,10 @@ def datetime_from_iso(text: str | None) -> datetime.datetime | None:
         raise InputError(f"--time {text}", "", "ISO 8601, e.g. 2012-06-22T21:00:00") from None
 
 
-# What errors name by key, as a user of the command line typed it: options, and `--set`.
+# Errors with the option that a user typed in place of the key.
 
 
-OPTIONS = {  # by the key of a function's parameter
+OPTIONS = {  # option by key of a function's parameter
     "overrides": "--set",
     "programs": "--program",
     "trackers": "--tracker",
@@ -242,7 +240,7 @@ OPTIONS = {  # by the key of a function's parameter
 
 
 def as_typed(error: InputError, loaded: Loaded | None = None) -> InputError:
-    """The error with the option at fault in place of its key, and the place of a key that was checked after loading.
+    """The error with the option at fault in place of its key, and with file and line of a key of the scene.
 
     Parameters
     ----------
@@ -276,6 +274,6 @@ def option_of(key: str) -> str:
 
 
 def with_location(finding: str, loaded: Loaded | None = None) -> str:
-    """A finding, `key: text`, with file and line of the key in a loaded scene, by default the last one."""
+    """A finding, `key: text`, with file and line of the key in a loaded scene; by default, in the last one."""
     key, _, text = finding.partition(": ")
     return str(as_typed(InputError(key, text), loaded)) if text else finding

@@ -11,12 +11,12 @@ from tracker_error import ErrorModel  # type: ignore[import-not-found]
 
 
 class TrackerError(Fmi3Slave):
-    """Input: the rate of the boresight. Outputs: the errors about the camera's axes, drawn anew at every step.
+    """Unit with the boresight's rate as input, and the errors about the camera's axes, drawn at every step, as outputs.
 
     Attributes
     ----------
     seed
-        Of the random numbers; read at the first step
+        Seed of the random numbers; read at the first step
     """
 
     author = "skysim"

@@ -43,8 +43,8 @@ class CameraGroup(TyperGroup):
         return super().parse_args(ctx, args)
 
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
-        """Subcommands, and what `show` takes."""
-        # The class of typer's own parser or of click.
+        """Subcommands, and arguments of `show`."""
+        # The class is that of typer's own parser or of click.
         item = type(super().shell_complete(ctx, "")[0])
         names = [] if incomplete.startswith("-") else complete_camera(incomplete)
         return [*super().shell_complete(ctx, incomplete), *map(item, names)]
@@ -154,7 +154,7 @@ def camera_show(
 def read_camera(
     name: str, overrides: list[str] | None
 ) -> tuple[OpencvCalibration | None, dict[str, int]]:
-    """The calibration, None without a lens, and the chip's size: of a scene, a camera, a preset or an OpenCV file."""
+    """Calibration (None without a lens) and chip size of a scene, a camera file, a preset or an OpenCV file."""
     from skysim.core.yaml_reader import parse_overrides
     from skysim.scene import loader, opencv_calibration
 
@@ -188,7 +188,7 @@ def read_camera(
 
 
 def sheet_option(name: str) -> Any:
-    """The option of a question of the data sheet."""
+    """The option for a question of the data sheet."""
     question = QUESTIONS[name]
     return typer.Option(
         OPTIONS[f"answers.{name}"], metavar="TEXT", help=f"{question.ask}: {question.where}."
@@ -250,7 +250,7 @@ def camera_new(
 
 
 def ask_all() -> dict[str, str]:
-    """Ask for each number of the data sheet; a wrong answer is asked again, an empty one is not stated."""
+    """Ask for each number of the data sheet. A wrong answer is asked again; an empty one leaves the number out."""
     from skysim.scene import camera_sheet
 
     print(
@@ -260,7 +260,7 @@ def ask_all() -> dict[str, str]:
     for name, question in QUESTIONS.items():
         required = name in camera_sheet.PLACEHOLDERS
         if not required and name not in camera_sheet.outstanding(answers):
-            continue  # of a lens or a shutter that this camera does not have
+            continue  # a question on a lens or a shutter that this camera does not have
         assumed = (
             "" if required else camera_sheet.outstanding(answers)[name].assumed or "left out"
         )
@@ -285,7 +285,7 @@ def ask_all() -> dict[str, str]:
 
 
 def print_new(path: Path, filled: Sheet) -> None:
-    """Print what a new camera file assumes, and how to use it."""
+    """Print the assumptions of a new camera file, and how to use it."""
     lens, body = read_camera(str(path), None)
     print(
         "{path}: {width_px} x {height_px} px".format(path=path, **body)

@@ -59,7 +59,7 @@ def stream(
     json: Json = False,
 ) -> None:
     """Stream a scene's frames in real time, for hardware or a processor in the loop."""
-    from skysim.apps.stream.sinks import READER_GONE, Sink, folder_writer, pipe_writer
+    from skysim.apps.stream.sinks import READER_GONE
     from skysim.core import files
     from skysim.simulation.flight import open_flight
 
@@ -72,17 +72,25 @@ def stream(
     if endless and frames is not None:
         raise InputError("--endless", "has no effect with --frames", "one of the two")
     flight = open_flight(load(scene, frames, seed, set_), endless=endless, keeps_history=False)
-    sinks = []
-    if folder is not None:
-        sinks.append(Sink("folder", folder_writer(folder)))
-    if pipe is not None:
-        sinks.append(Sink("pipe", pipe_writer(pipe)))
+    sinks = open_sinks(folder, pipe)
     statistics = send_all(flight, sinks, speed, http, host)
     output = sys.stderr if pipe == "-" else sys.stdout
     print(files.to_json(statistics) if json else summary(statistics), file=output)
     for sink in sinks:
         if sink.fault not in ("", READER_GONE):
             raise InputError(f"--{sink.name}", sink.fault)
+
+
+def open_sinks(folder: Path | None, pipe: str | None) -> list[Sink]:
+    """Sinks for the folder and for the pipe, if they are given."""
+    from skysim.apps.stream.sinks import Sink, folder_writer, pipe_writer
+
+    sinks = []
+    if folder is not None:
+        sinks.append(Sink("folder", folder_writer(folder)))
+    if pipe is not None:
+        sinks.append(Sink("pipe", pipe_writer(pipe)))
+    return sinks
 
 
 def send_all(

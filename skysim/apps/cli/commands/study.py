@@ -283,7 +283,7 @@ def chosen_levels(words: list[str]) -> dict[str, Any]:
     }
 
 
-# Registered last, so that it is the last in `skysim study --help`.
+# Registered last to be the last in `skysim study --help`.
 SEARCH_HELP = (
     "Search a study's factors for the best point, or the Pareto front of two objectives."
     " `resume` continues it."
@@ -307,9 +307,9 @@ def run_and_report(
     Parameters
     ----------
     resumed
-        The store may hold trials already
+        Whether the store may already hold trials
     repeat_failed
-        Repeat the failed trials too
+        Whether failed trials are repeated
     """
     from skysim.experiments.study import search
     from skysim.experiments.study.execution import runner, store
@@ -379,7 +379,7 @@ def write_report(plan: Plan, study: str, out: Path | None, json: bool, open_: bo
 
 
 def located(study: str, out: Path | None) -> tuple[str, Path | None]:
-    """The study's file and its output folder, where `study` may be the folder with its store. Raises InputError."""
+    """The study's file and its output folder; `study` may also be the folder of its store. Raises InputError."""
     from skysim.experiments.study.execution import store
 
     if out is not None or not (Path(study) / store.STORE).is_file():
@@ -407,7 +407,7 @@ def load_stored_plan(
     program
         External trackers of the command line; None if no trial will be run
     set_
-        More overrides
+        Further overrides
     grows
         Whether the study may have more replicates than its store
 

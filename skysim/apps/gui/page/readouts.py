@@ -1,4 +1,4 @@
-"""What the tracker made of the frame: the card of its attitude, and the table of its lights."""
+"""The tracker's results on the frame: the card of its attitude, and the table of its lights."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class AttitudeCard:
     Attributes
     ----------
     contents
-        Of the tab's live fields
+        Contents of the tab's live fields
     shows_photo
         Whether the card shows an image that is not of the current scene
     """
@@ -57,7 +57,7 @@ class AttitudeCard:
         )
 
     def set_scene(self, scene_info: SceneInfo) -> None:
-        """Take over a new scene: angle names and algorithms."""
+        """Show angle names and algorithms of a new scene."""
         self.set_headers(scene_info.names)
         self.stages.set_text("stages (F6, F7): " + " · ".join(scene_info.stages.values()))
         self.stages.props["title"] = ", ".join(
@@ -152,7 +152,7 @@ def status_line(result: TrackerResult | None) -> tuple[str, str]:
     return "good", f"solved; {counts}"
 
 
-# Lights panel: a table of the true lights of the frame and of what the tracker made of each.
+# Lights panel: a table of the true lights of the frame with their detections and matches.
 
 
 HEADS = ("light", "V", "e⁻", "x, px", "y, px", "error, px", "taken for")
@@ -178,7 +178,7 @@ class LightsPanel:
         self.table = LightsTable().mark("lights")
 
     def update(self) -> None:
-        """Send the table of the sensor's frame if it is another one; every UPDATE_S while the panel is open."""
+        """Send the table if the sensor shows another frame; called every UPDATE_S while the panel is open."""
         sensor = self.sensor
         if self.sent == sensor.sent_number:
             return
@@ -192,13 +192,13 @@ class LightsPanel:
 def rows(
     lights: Collection[LightRow], detections: Collection[Detection], name: Callable[[int], str]
 ) -> Iterator[dict[str, Any]]:
-    """Rows of the table: every true light with its detection, the brightest first, then detections of no light.
+    """Rows of the table: true lights with their detections, brightest first, then detections of no light.
 
     Returns
     -------
     state
-        Good if the light was identified, warn if a detection is false or taken for another
-        light, else quiet
+        `good` if the light was identified, `warn` if a detection is false or matched with another
+        light, else `quiet`
     """
     found = list(detections)
     found_px = np.array([(one.x, one.y) for one in found]).reshape(-1, 2)

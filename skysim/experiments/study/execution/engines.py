@@ -31,10 +31,10 @@ TimedRows = tuple[list[Any], float]  # rows of a chunk, and the seconds it took
 
 
 class Job(Protocol):
-    """What the items of a chunk are: a frozen value that is sent to the workers."""
+    """Work on the items of a chunk: a frozen value that is sent to the workers."""
 
     def run(self, chunk: Chunk) -> list[Any]:
-        """The rows of a chunk, one an item."""
+        """The rows of a chunk, one per item."""
 
     def failed(self, segment: Segment, error: str) -> Any:
         """The row of an item, alone in its segment, that repeatedly killed its worker."""

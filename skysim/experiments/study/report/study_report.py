@@ -1,4 +1,4 @@
-"""The report of a study, finished or not: its answers, figures and tables, made from its plan and its store."""
+"""The report of a finished or unfinished study: answers, figures and tables, made from its plan and its store."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ POINTS = "Points"  # titles of sections
 STUDY_FILE = "The study file"
 LISTED = 10  # maximum number of failures listed
 ROWS = 5000  # maximum number of rows in the table of points
-OPEN_ROWS = 20  # rows above which that table is folded
+OPEN_ROWS = 20  # number of rows above which that table is folded
 SOBOL = (
     "Sobol indices of {}: the share of its variance that would go were a factor known, and that would stay were all"
     " others known; intervals of 95 %."
@@ -63,24 +63,24 @@ SOBOL = (
 
 
 class Analysis(NamedTuple):
-    """What is known of a study's trials.
+    """The analysis of a study's trials.
 
     Attributes
     ----------
     lines
-        Of all points, with the responses of `responses` and those of the answers
+        All points, with the responses of `responses` and those of the answers
     about
-        Scene table and findings of its checks
+        Scene table and findings of the scene's checks
     verdict
         The answer in a few sentences
     headline
         All answers in words
     ranges
-        Of each response, in words
+        Range of each response, in words
     indices
-        Sobol indices, of design saltelli
+        Sobol indices, for the design saltelli
     result
-        Candidates and front, of a search
+        Candidates and front, for a search
     """
 
     lines: Sequence[PointRow]
@@ -112,12 +112,13 @@ def study_report(plan: Plan, store: Store, study: str = "", out: Path | None = N
 def commands(
     plan: Plan, store: Store, study: str = "", out: Path | None = None
 ) -> Callable[[str], str]:
-    """The function from a verb to the shell command that applies it to a study, with its overrides if it runs it.
+    """The function from a verb to the shell command that applies it to a study, with overrides if the verb runs it.
 
     Parameters
     ----------
     study, out
-        What the command names; by default the study's name or path, and the store's folder
+        Study and folder in the command; by default the study's name or path, and the store's
+        folder
     """
     if not study:
         study = plan.name if plan.path.parent == STUDIES else str(plan.path)
@@ -212,7 +213,7 @@ def compose(
 
 
 def folded(title: str, blocks: Sequence[Block], on_terminal: bool = False) -> Section:
-    """A section that a reader opens; on the page alone unless it is said."""
+    """A folded section of the page; it is printed on a terminal only with `on_terminal`."""
     return Section(title, blocks, folded=True, on_terminal=on_terminal)
 
 
@@ -228,17 +229,17 @@ def scene_sections(about: Overview, code: str) -> list[Section]:
     ]
 
 
-# What it says.
+# Texts.
 
 
 def question(text: str) -> str:
-    """The comment that a study file begins with."""
+    """The comment at the beginning of a study file."""
     lines = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
     return " ".join(line.removeprefix("#").strip() for line in lines)
 
 
 def progress(study: Study, store: Store) -> Text:
-    """How many trials are done, failed, and ended in a wrong attitude; its tone says whether all are done."""
+    """Numbers of trials that are done, that failed, and that gave a wrong attitude; the tone says if all are done."""
     counts = store.counts()
     trials = study.trial_count(len(store.points()))
     finished = 0 < trials <= counts["done"]
@@ -271,7 +272,7 @@ def points_section(
     front: Sequence[int],
     costs: Mapping[int, float] | None,
 ) -> Section:
-    """The table of all points. Named levels sort in the order of the study file; those of a front are marked."""
+    """The table of all points. Named levels sort in the order of the study file; points of a front are marked."""
     heads, texts = cells(lines)
     axes = {name: axis(study, lines, name) for name in (lines[0].levels if lines else ())}
     kinds: list[Kind] = [
@@ -300,7 +301,7 @@ def points_section(
 
 
 def range_table(study: Study, lines: Sequence[PointRow]) -> Table:
-    """The least and the largest value of each response, and where they are."""
+    """The least and the largest value of each response, with their points."""
     heads = ("response", "least", "at", "largest", "at")
     return Table([Column(head, kind="text") for head in heads], answer.range_rows(study, lines))
 
@@ -321,7 +322,7 @@ def index_table(indices: Sequence[Index]) -> Table:
 
 
 def with_key(summary: Any) -> Cell:
-    """A statistic with its interval, which sorts by its value."""
+    """A cell with a statistic and its interval, which sorts by value."""
     return Cell(format_summary(summary), key=summary.value)
 
 
@@ -338,12 +339,12 @@ def front_table(study: Study, result: SearchResult | None) -> list[Block]:
 
 
 def from_the_last(kept: int, count: int) -> list[tuple[int]]:
-    """The columns that a narrow terminal leaves out: the last first, none of the first `kept`."""
+    """The columns that a narrow terminal leaves out: the last one first, but not the first `kept`."""
     return [(column,) for column in range(count - 1, kept - 1, -1)]
 
 
 def runs_section(store: Store) -> Section:
-    """The runs that filled the store."""
+    """The runs that have filled the store."""
     columns = [text_column("engine"), Column("workers"), Column("trials")]
     columns += [Column("time", "s", ".1f"), Column("trials/s", format=".1f")]
     runs = store.runs()
@@ -362,7 +363,7 @@ def runs_section(store: Store) -> Section:
 def study_figures(
     lines: Sequence[PointRow], study: Study, columns_of: ColumnsOf, replay: str
 ) -> list[Block]:
-    """The study's figures: maps with their worst trials, others with their numbers.
+    """The study's figures: maps with tables of their worst trials, other figures with tables of their numbers.
 
     Parameters
     ----------
@@ -409,7 +410,7 @@ def worst_table(panels: Sequence[DirectionMap], replay: str) -> Table:
 
 
 def pivot_table(figure: Curve | Heat, lines: Sequence[PointRow], study: Study) -> Table:
-    """A figure's numbers: its x across, the other factor down."""
+    """A figure's numbers: a column per level of x, a row per level of the other factor."""
     across = axis(study, lines, figure.x)
     other = figure.by if isinstance(figure, Curve) else figure.y
     chosen = shown_points(lines, figure, study)
