@@ -361,7 +361,11 @@ def pnp(
 
 
 def _gauss_newton(
-    pattern_m: Floats, measured: Floats, cam_from_lab: Rotation, shift_m: Floats, weight: Floats
+    pattern_m: Floats,
+    measured: Floats,
+    cam_from_lab: Rotation,
+    shift_m: Floats,
+    weight: Floats,
 ) -> tuple[Rotation, np.ndarray]:
     """Refine the six unknowns by Gauss-Newton with step halving; return cam_from_lab and its (3, 3) covariance, rad^2.
 
@@ -386,12 +390,18 @@ def _gauss_newton(
         if np.linalg.norm(step) < 1e-12:
             break
     if not np.linalg.norm(step) < 1e-6:
-        raise ValueError(f"pnp: not converged, last step {np.linalg.norm(step):.1e} rad and m")
+        raise ValueError(
+            f"pnp: not converged, last step {np.linalg.norm(step):.1e} rad and m"
+        )
     return cam_from_lab, np.linalg.inv(jacobian.T @ jacobian)[:3, :3]
 
 
 def _six_dof_residual(
-    pattern_m: Floats, measured: Floats, cam_from_lab: Rotation, shift_m: Floats, weight: Floats
+    pattern_m: Floats,
+    measured: Floats,
+    cam_from_lab: Rotation,
+    shift_m: Floats,
+    weight: Floats,
 ) -> tuple[Floats, Floats]:
     """Return the weighted residuals of the tangents, (2 N,), and their Jacobian (2 N, 6) by rotation and shift."""
     b = cam_from_lab.apply(pattern_m)

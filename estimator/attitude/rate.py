@@ -131,7 +131,9 @@ def at_middle_row(
     by_rate = camera.focal_px * motion * delay_s[:, None, None]
     covariance_px2 += by_rate @ rate.covariance_rad2_s2 @ np.swapaxes(by_rate, 1, 2)
     sigma_px = np.sqrt(np.trace(covariance_px2, axis1=1, axis2=2) / 2)
-    return replace(centroids, xy_px=moved_px, sigma_px=sigma_px, covariance_px2=covariance_px2)
+    return replace(
+        centroids, xy_px=moved_px, sigma_px=sigma_px, covariance_px2=covariance_px2
+    )
 
 
 def error_gain(camera: Camera, velocity_tan_s: Floats) -> Floats:

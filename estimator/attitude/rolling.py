@@ -167,7 +167,9 @@ def _place_rows(
     delay_s = camera.row_delays_s(centroids.xy_px)
     # Covariance of the residuals: a centroid's error also shifts the time at which it is predicted.
     gain = error_gain(camera, -jacobian @ rate)
-    error_rad2 = gain @ covariance_of(centroids) @ np.swapaxes(gain, 1, 2) / camera.focal_px**2
+    error_rad2 = (
+        gain @ covariance_of(centroids) @ np.swapaxes(gain, 1, 2) / camera.focal_px**2
+    )
     # Slopes: J exp(-[w] t) by the rotation, -t J by the rate
     by_rotation = jacobian @ turn.as_matrix()
     by_rate = -delay_s[:, None, None] * jacobian

@@ -172,7 +172,11 @@ def focal_error_px(camera: Camera, xy_px: Floats) -> Floats:
 
 
 def with_focal_error(
-    covariance_rad2: Floats, camera: Camera, xy_px: Floats, seen_cam: Floats, sigma_rad: Floats
+    covariance_rad2: Floats,
+    camera: Camera,
+    xy_px: Floats,
+    seen_cam: Floats,
+    sigma_rad: Floats,
 ) -> tuple[Floats, Floats | None]:
     """Return the (3, 3) covariance of an attitude with the focal length's error as common to all stars, and its part.
 

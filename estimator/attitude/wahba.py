@@ -327,7 +327,9 @@ def raw_svd(B: Floats) -> Floats:
     R = np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
-            R[i, j] = U[i, 0] * Vt[0, j] + U[i, 1] * Vt[1, j] + determinant * U[i, 2] * Vt[2, j]
+            R[i, j] = (
+                U[i, 0] * Vt[0, j] + U[i, 1] * Vt[1, j] + determinant * U[i, 2] * Vt[2, j]
+            )
     return R
 
 

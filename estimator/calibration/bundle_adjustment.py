@@ -368,7 +368,9 @@ def _append_dense(left: csr_array, right: Floats) -> csr_array:
     columns = np.tile(np.arange(width) + left.shape[1], (count, 1))
     index = np.hstack([left.indices.reshape(count, per_row), columns])
     start = np.arange(count + 1) * (per_row + width)
-    return csr_array((data.ravel(), index.ravel(), start), shape=(count, left.shape[1] + width))
+    return csr_array(
+        (data.ravel(), index.ravel(), start), shape=(count, left.shape[1] + width)
+    )
 
 
 def gauge_freedoms(bundle: Bundle) -> tuple[Floats, Floats]:

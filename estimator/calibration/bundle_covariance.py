@@ -117,7 +117,9 @@ def _blocks(reduced: ReducedSystem, rest: Floats, bundle: Bundle) -> Covariances
     elimination = reduced.elimination.toarray()  # S
     product = (elimination @ rest).reshape(lights, 3, size)
     by_led = np.einsum("nik,njk->nij", product, elimination.reshape(lights, 3, size))
-    by_rotation = np.array([rest[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(frames)])
+    by_rotation = np.array(
+        [rest[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(frames)]
+    )
     shared = rest[3 * frames :, 3 * frames :]
     return Covariances(by_led + reduced.inverse_led.data, by_rotation, shared)
 

@@ -450,7 +450,9 @@ def _report(
 ) -> DomeSurvey:
     """Return the survey's result: the fitted subset in the full set of lights and frames."""
     status = (
-        "converged" if fit.converged else f"stopped after {ba.STEPS} steps without convergence"
+        "converged"
+        if fit.converged
+        else f"stopped after {ba.STEPS} steps without convergence"
     )
     subset = fit.subset
     full = subset.insert_into(start, subset.bundle)

@@ -52,7 +52,9 @@ from estimator.core.errors import ImageError
 from estimator.filter.error_models import TrackerModel
 
 MAX_ITERATIONS = 30
-CONVERGED_SIGMA = 0.01  # largest step of a parameter at convergence, in its standard deviations
+CONVERGED_SIGMA = (
+    0.01  # largest step of a parameter at convergence, in its standard deviations
+)
 # Tolerance of the logarithm of the misfit, and the largest number of fits to reach it.
 MISFIT_TOLERANCE = 0.1
 MAX_FACTORS = 8
@@ -104,7 +106,9 @@ def estimate_mass(
         ]
         # 2. Information
         normal = information + sum(part.normal for part in parts)
-        gradient = information @ (prior.values - values) + sum(part.gradient for part in parts)
+        gradient = information @ (prior.values - values) + sum(
+            part.gradient for part in parts
+        )
         # 3. Parameters
         covariance: Floats = np.asarray(np.linalg.inv(normal))
         step = covariance @ gradient

@@ -197,7 +197,9 @@ def calibrate(
     _check_enough(used)
     problem, converged = _minimize(problem, used, np.inf)
     # 6. Covariance and diagnostics
-    status = "converged" if converged else f"stopped after {ba.STEPS} steps without convergence"
+    status = (
+        "converged" if converged else f"stopped after {ba.STEPS} steps without convergence"
+    )
     return _report(status, problem, used, tied, outliers, keep, frames, camera_start)
 
 
@@ -253,7 +255,9 @@ def self_calibrate(
     for _ in range(rounds):
         # 1. Identification
         identified = _identified(frames, tracker(estimate, focal_uncertainty), exposure_s)
-        stars = np.concatenate([np.empty((0, 3)), *(frame.vectors_ref for frame in identified)])
+        stars = np.concatenate(
+            [np.empty((0, 3)), *(frame.vectors_ref for frame in identified)]
+        )
         # 2. Convergence
         if np.array_equal(stars, previous_stars) or len(stars) < MIN_STAR_FRACTION * most:
             break
@@ -416,7 +420,9 @@ def _normal_equations(
         rotation_blocks, sightings.frame, by_rotation.transpose(0, 2, 1) @ weighted_rotation
     )
     np.add.at(coupling, sightings.frame, by_rotation.transpose(0, 2, 1) @ weighted_lens)
-    np.add.at(rhs, sightings.frame, np.einsum("mai,ma->mi", weighted_rotation, terms.residual))
+    np.add.at(
+        rhs, sightings.frame, np.einsum("mai,ma->mi", weighted_rotation, terms.residual)
+    )
     # The identity gives an unused frame a step of zero.
     unused = np.bincount(sightings.frame, minlength=frames) == 0
     rotation_blocks[unused] = np.eye(3)

@@ -196,7 +196,10 @@ def stray_lights(
     # 1. Points on the surface; a ray that misses it is put far away.
     origins, directions = held.rays(frame, xy_px)
     points = np.array(
-        [on_surface(u[None], o, held.leds)[0] for o, u in zip(origins, directions, strict=True)]
+        [
+            on_surface(u[None], o, held.leds)[0]
+            for o, u in zip(origins, directions, strict=True)
+        ]
     )
     points = np.nan_to_num(points, nan=1e9)
     # 2. Groups

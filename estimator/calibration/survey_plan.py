@@ -69,7 +69,9 @@ class SurveyModel:
                 )
         for name in ("lever_sigma_m", "focal_sigma_px"):
             if not getattr(self, name) >= 0:
-                raise ValueError(f"survey: {name} is {getattr(self, name)}; allowed: 0 or more")
+                raise ValueError(
+                    f"survey: {name} is {getattr(self, name)}; allowed: 0 or more"
+                )
 
     def visible(self, body_from_lab: Rotation, margin_px: float = 0.0) -> Mask:
         """Return (F, N) whether each LED is on the chip at each of F attitudes, at least `margin_px` from its edge."""
@@ -276,7 +278,9 @@ class _Reach:
         self.row, self.led = np.nonzero(shown)
         self.camera_m, self.along_m = self.positions(candidates, self.row, self.led)
 
-    def positions(self, body_from_lab: Rotation, row: Ints, led: Ints) -> tuple[Floats, Floats]:
+    def positions(
+        self, body_from_lab: Rotation, row: Ints, led: Ints
+    ) -> tuple[Floats, Floats]:
         """Return the (K, 3) camera positions of sightings, and their (K,) components toward the LEDs."""
         camera_m = np.atleast_2d(body_from_lab.inv().apply(self.arm_m))[row]
         return camera_m, np.sum(camera_m * self.toward[led], axis=1)

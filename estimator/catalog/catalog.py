@@ -227,7 +227,10 @@ def utc(date: object) -> datetime.datetime:
         raise ImageError(
             f"date: {date!r} is not ISO 8601; allowed: for example 2012-06-22T21:00"
         ) from None
-    if not isinstance(time, datetime.datetime) or not EPOCHS_YR[0] <= time.year < EPOCHS_YR[1]:
+    if (
+        not isinstance(time, datetime.datetime)
+        or not EPOCHS_YR[0] <= time.year < EPOCHS_YR[1]
+    ):
         years = "{:g} to {:g}".format(*EPOCHS_YR)
         raise ImageError(
             f"date: {checks.excerpt(date)}; allowed: a UTC date or datetime of {years}"
@@ -292,7 +295,15 @@ def _read(path: str | Path) -> StarCatalog:
     return stars.take(np.argsort(v_mag, kind="stable"))
 
 
-COLUMNS = ("hip", "ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr", "parallax_mas", "v_mag")
+COLUMNS = (
+    "hip",
+    "ra_deg",
+    "dec_deg",
+    "pm_ra_mas_yr",
+    "pm_dec_mas_yr",
+    "parallax_mas",
+    "v_mag",
+)
 
 
 def hipparcos() -> StarCatalog:
@@ -474,7 +485,9 @@ def light_centers(values: Floats, magnitude: Floats, group: Ints) -> tuple[Float
     """
     flux = 10 ** (-0.4 * magnitude)
     total = np.bincount(group, flux)
-    means = np.column_stack([np.bincount(group, flux * column) / total for column in values.T])
+    means = np.column_stack(
+        [np.bincount(group, flux * column) / total for column in values.T]
+    )
     return means, -2.5 * np.log10(total)
 
 

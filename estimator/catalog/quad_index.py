@@ -61,8 +61,12 @@ class QuadIndex(NamedTuple):
 def build(sky: SkyIndex, height_rad: float) -> QuadIndex:
     """Build the index of the stars and pairs of `sky` for fields of the given height: the module's steps."""
     # 1. and 2. Chosen stars and their neighbors.
-    chosen = _locally_bright(sky.pair, sky.first, sky.bin_rad, height_rad / 2, len(sky.vectors))
-    neighbor, first = _neighbors(sky.pair, sky.first, sky.bin_rad, LONGEST * height_rad, chosen)
+    chosen = _locally_bright(
+        sky.pair, sky.first, sky.bin_rad, height_rad / 2, len(sky.vectors)
+    )
+    neighbor, first = _neighbors(
+        sky.pair, sky.first, sky.bin_rad, LONGEST * height_rad, chosen
+    )
     total = 1
     found = np.empty((0, 4), np.int32)
     code = np.empty((0, 4))

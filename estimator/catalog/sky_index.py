@@ -369,7 +369,9 @@ def _cells(vectors: Floats, side: int) -> tuple[NDArray[np.int32], NDArray[np.in
         for sign in (1, -1):
             # Gnomonic projection onto this face, of the stars before it.
             along = sign * vectors[:, axis]
-            gnomonic = np.roll(vectors, -axis, axis=1)[:, 1:] / np.maximum(along, 1e-9)[:, None]
+            gnomonic = (
+                np.roll(vectors, -axis, axis=1)[:, 1:] / np.maximum(along, 1e-9)[:, None]
+            )
             on_face = np.flatnonzero(
                 (along > 0) & (np.abs(gnomonic).max(axis=1) < FACE_HALF_WIDTH)
             )

@@ -349,7 +349,9 @@ def neighbors(boxes: Ints, n: int, x0: int, y0: int, x1: int, y1: int, buffer: I
     """Write to `buffer` the other blobs whose boxes overlap a window; return their number."""
     count = 0
     for m in range(len(boxes)):
-        disjoint = boxes[m, 0] > x1 or boxes[m, 2] < x0 or boxes[m, 1] > y1 or boxes[m, 3] < y0
+        disjoint = (
+            boxes[m, 0] > x1 or boxes[m, 2] < x0 or boxes[m, 1] > y1 or boxes[m, 3] < y0
+        )
         if m != n and not disjoint:
             buffer[count] = m
             count += 1

@@ -41,7 +41,9 @@ LENGTH_FRACTION = 0.15
 LENGTH_PX = 0.5
 ANGLE_RAD = 0.15
 WIDTH_FRACTION = 0.15
-FAR_SIGMA = 5.0  # distance from an end of the line beyond which only 3e-7 of the light is left
+FAR_SIGMA = (
+    5.0  # distance from an end of the line beyond which only 3e-7 of the light is left
+)
 # Parameters: center, flux, length, direction, width, sky.
 X, Y, FLUX, LENGTH, ANGLE, WIDTH, SKY = range(7)
 OUTPUTS = 13

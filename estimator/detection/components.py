@@ -23,7 +23,12 @@ from numpy.typing import NDArray
 
 from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
-from estimator.detection.background import accumulator_type, filtered, filtered_row, interpolate
+from estimator.detection.background import (
+    accumulator_type,
+    filtered,
+    filtered_row,
+    interpolate,
+)
 
 Ints32 = NDArray[np.int32]  # half the memory where there are millions of runs
 FIRST_RUNS = 2048  # capacity of the first pass; a second pass follows if there are more runs
@@ -31,9 +36,7 @@ FIRST_RUNS = 2048  # capacity of the first pass; a second pass follows if there 
 # largest pixel; largest filtered value above the sky, and its x and y.
 AREA, STRONG, FLUX, X, Y, PEAK, TOP, TOP_X, TOP_Y = range(9)
 SUMS = 9
-CHUNK_PX = (
-    64  # pixels that are tested together; only chunks with a bright pixel are examined further
-)
+CHUNK_PX = 64  # pixels that are tested together; only chunks with a bright pixel are examined further
 ONE_TAP = np.zeros((1, 2), np.int64)
 
 

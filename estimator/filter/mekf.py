@@ -345,7 +345,9 @@ class AttitudeFilter:
         # 1. Find the segment that contains t_s, and propagate its state to that time.
         k = max(k for k, segment in enumerate(self._segments) if segment.state.t_s <= t_s)
         segment = self._segments[k]
-        before, after = _split(segment.samples, segment.state.t_s, min(t_s, self._current.t_s))
+        before, after = _split(
+            segment.samples, segment.state.t_s, min(t_s, self._current.t_s)
+        )
         prior = self._prior(segment.state, before)
         # 2. Innovation
         found = innovation(prior, solution, self._layout)

@@ -384,7 +384,9 @@ def build_layout(
         "bias": 3,
         "scale": 3 * (gyro.scale > 0),
         "misalignment": 6 * (gyro.misalignment_rad > 0),
-        **{of_head("mounting", head): 3 * (tracker.mounting_rad > 0) for head in range(heads)},
+        **{
+            of_head("mounting", head): 3 * (tracker.mounting_rad > 0) for head in range(heads)
+        },
         **{of_head("systematic", head): 3 for head in range(heads)},
     }
     # "systematic" means the slow errors of all heads; "mounting" only that of the first head, which defines the
@@ -466,7 +468,9 @@ def decorrelate(state: MekfState, tracker: TrackerModel, layout: Layout) -> Mekf
     """
     rows = layout.slow
     # The angle between two quaternions; the scalar product may exceed 1 by rounding.
-    turned_rad = 2 * math.acos(min(abs(float(state.ref_from_body_wxyz @ state.used_wxyz)), 1.0))
+    turned_rad = 2 * math.acos(
+        min(abs(float(state.ref_from_body_wxyz @ state.used_wxyz)), 1.0)
+    )
     kept = math.exp(-turned_rad / tracker.systematic_angle_rad)
     # P <- D P D with D = k for the slow errors and 1 for the others
     factor = np.ones(layout.size)

@@ -111,7 +111,14 @@ def evaluate(
     midpoint = middle(detections.tangent, a, b)
     direction_variance = 2 / separation(detections.tangent, a, b) ** 2
     observed, star, missing = _match(
-        detections, dome, R_cam_from_lab, focal_ratio, center, midpoint, 1.5, direction_variance
+        detections,
+        dome,
+        R_cam_from_lab,
+        focal_ratio,
+        center,
+        midpoint,
+        1.5,
+        direction_variance,
     )
     for _ in range(2):
         dex = -np.inf
@@ -119,7 +126,9 @@ def evaluate(
         if len(observed) < MIN_EVIDENCE_MATCHES:
             break
         # 2. Fit; the range of the focal ratio has a margin, as the fit is noisy.
-        info, focal_ratio = _fit(detections, dome, R_cam_from_lab, focal_ratio, observed, star)
+        info, focal_ratio = _fit(
+            detections, dome, R_cam_from_lab, focal_ratio, observed, star
+        )
         if abs(focal_ratio - 1) > 1.2 * detections.focal_uncertainty + 1e-12:
             break
         # 3. Match again.
@@ -185,7 +194,9 @@ def _match(
             continue
         offset2 = (x - midpoint[0]) ** 2 + (y - midpoint[1]) ** 2
         gate2 = GATE_SIGMA**2 * (base_variance + direction_variance * offset2)
-        best, distance2 = _nearest_detection(detections.tangent, detections.sigma, x, y, gate2)
+        best, distance2 = _nearest_detection(
+            detections.tangent, detections.sigma, x, y, gate2
+        )
         if best < 0:
             # A missing LED counts only well inside the field.
             missing += left < x < right and top < y < bottom
@@ -357,7 +368,9 @@ def _evidence(
     # Attitude and focal length.
     root_det = _factorize(info, np.empty_like(info))
     total = (
-        len(info) / 2 * log10(2 * pi) - log10(max(root_det, 1e-150)) - log10(dome.prior_volume)
+        len(info) / 2 * log10(2 * pi)
+        - log10(max(root_det, 1e-150))
+        - log10(dome.prior_volume)
     )
     if detections.focal_uncertainty > 0:
         total -= log10(2 * detections.focal_uncertainty)

@@ -310,13 +310,23 @@ def _test_pair(
                 dome.grid.R_grid_from_lab, R_cam_from_lab, R_grid_from_cam
             )
             counted = _quick_check(
-                detections, dome, R_grid_from_cam, focal_ratio, radius[i], a, b, gates, required
+                detections,
+                dome,
+                R_grid_from_cam,
+                focal_ratio,
+                radius[i],
+                a,
+                b,
+                gates,
+                required,
             )
             if counted < required:
                 continue
             # 6. Evidence.
             checks[0] += len(detections.ray) * (index.first[i + 1] - index.first[i]) // 4
-            hypothesis = evaluate(detections, dome, R_cam_from_lab.copy(), i, a, b, focal_ratio)
+            hypothesis = evaluate(
+                detections, dome, R_cam_from_lab.copy(), i, a, b, focal_ratio
+            )
             best, rival_dex = _better(hypothesis, best, rival_dex)
     return best, rival_dex
 
@@ -467,7 +477,9 @@ def _required_matches(
     light_dex = 0.0
     if len(detections.light_density) > 0:
         light_dex = -log10(least(detections.light_density) * sqrt(2 * pi) * dome.flux_sigma)
-    return required_matches(detections.sigma, dome.field_area, attitude_dex, min_dex, light_dex)
+    return required_matches(
+        detections.sigma, dome.field_area, attitude_dex, min_dex, light_dex
+    )
 
 
 @jit
@@ -565,10 +577,21 @@ def _quick_check(
             continue
         # The direction from the bearing, then the LEDs near it.
         if focal_ratio != 1:
-            x, y, z = _direction_from_bearing(_ray(detections, n, focal_ratio), dome, radius_m)
+            x, y, z = _direction_from_bearing(
+                _ray(detections, n, focal_ratio), dome, radius_m
+            )
         else:
-            x = detections.direction[n, 0] + radius_offset_m * detections.direction_per_m[n, 0]
-            y = detections.direction[n, 1] + radius_offset_m * detections.direction_per_m[n, 1]
-            z = detections.direction[n, 2] + radius_offset_m * detections.direction_per_m[n, 2]
+            x = (
+                detections.direction[n, 0]
+                + radius_offset_m * detections.direction_per_m[n, 0]
+            )
+            y = (
+                detections.direction[n, 1]
+                + radius_offset_m * detections.direction_per_m[n, 1]
+            )
+            z = (
+                detections.direction[n, 2]
+                + radius_offset_m * detections.direction_per_m[n, 2]
+            )
         count += has_led_near(dome.grid, vectors.rotate(R_grid_from_cam, (x, y, z)), gates[n])
     return count

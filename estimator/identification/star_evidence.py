@@ -513,7 +513,9 @@ def _fraction_brighter(sky: SkyIndex, mag: Floats) -> float:
         faintest = max(faintest, value)
     if not np.isfinite(faintest):
         return 1.0
-    return max(first_from(sky.mag, 0, len(sky.mag), faintest + MAG_SMOOTHING), 1) / len(sky.mag)
+    return max(first_from(sky.mag, 0, len(sky.mag), faintest + MAG_SMOOTHING), 1) / len(
+        sky.mag
+    )
 
 
 @jit
@@ -542,7 +544,9 @@ def _magnitude_ratio(
 
 
 @jit
-def build_solution(detections: Detections, stars: SkyIndex, hypothesis: Hypothesis) -> Solution:
+def build_solution(
+    detections: Detections, stars: SkyIndex, hypothesis: Hypothesis
+) -> Solution:
     """The solution of a hypothesis, with its covariance and its residuals.
 
     The covariance is the attitude's block of info^-1: if the focal length is uncertain, it is marginalized over the
@@ -564,12 +568,19 @@ def build_solution(detections: Detections, stars: SkyIndex, hypothesis: Hypothes
         observed = hypothesis.observed[k]
         star = hypothesis.star[k]
         chi2 += squared_mahalanobis(
-            detections, stars, hypothesis.R_cam_from_ref, hypothesis.focal_ratio, observed, star
+            detections,
+            stars,
+            hypothesis.R_cam_from_ref,
+            hypothesis.focal_ratio,
+            observed,
+            star,
         )
         x, y = project(stars.vectors, hypothesis.R_cam_from_ref, star)
         tx = detections.tangent[observed, 0]
         ty = detections.tangent[observed, 1]
-        total += (tx - hypothesis.focal_ratio * x) ** 2 + (ty - hypothesis.focal_ratio * y) ** 2
+        total += (tx - hypothesis.focal_ratio * x) ** 2 + (
+            ty - hypothesis.focal_ratio * y
+        ) ** 2
     # Two residuals for each match, of which `count` are used up by the fit.
     rms = sqrt(total / max(2 * len(hypothesis.star), 1))
     chi2 /= max(2 * len(hypothesis.star) - count, 1)

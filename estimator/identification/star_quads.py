@@ -28,7 +28,12 @@ from estimator.core.jit import jit
 from estimator.identification import star_check, star_search
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.star_detections import Detections, changed, ray
-from estimator.identification.star_evidence import Hypothesis, Solution, evaluate, no_hypothesis
+from estimator.identification.star_evidence import (
+    Hypothesis,
+    Solution,
+    evaluate,
+    no_hypothesis,
+)
 
 COMBINED = 24  # number of brightest detections that are combined to quads
 
@@ -125,8 +130,12 @@ def _test_quad(
     code = np.empty(4)
     frame = np.empty((3, 3))
     vectors.pair_frame(ray_a, ray_b, frame)
-    code[0], code[1] = quad_index.in_frame(frame, ray(detections.tangent, quad[2], 1.0), length)
-    code[2], code[3] = quad_index.in_frame(frame, ray(detections.tangent, quad[3], 1.0), length)
+    code[0], code[1] = quad_index.in_frame(
+        frame, ray(detections.tangent, quad[2], 1.0), length
+    )
+    code[2], code[3] = quad_index.in_frame(
+        frame, ray(detections.tangent, quad[3], 1.0), length
+    )
     quad_index.arrange(code, quad)
     # 3. All cells within the gate of the code.
     gate = _code_gate(detections, quad, length)

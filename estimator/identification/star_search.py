@@ -68,7 +68,9 @@ FEW = 20  # number of detections of the first search
 # Fractions of `max_checks`: for the first search with FEW detections, and for that with many.
 SHORT_EFFORT = 1 / 16
 MANY_EFFORT = 1 / 4
-WRONG_FOCAL = 0.05  # greatest relative error of a calibrated focal length that step 9 can find
+WRONG_FOCAL = (
+    0.05  # greatest relative error of a calibrated focal length that step 9 can find
+)
 WRONG_FOCAL_DEX = 2.0  # evidence by which another focal length must beat the calibrated one
 FREE_DEX = (
     1.0  # least gain by a free focal length, with the same matches, for which it is tried

@@ -90,7 +90,9 @@ def widened(
     # 1. Detections near a star within the widest gates
     gates = gates_of(detections, 1.5 * sqrt(TRIED[-1]))
     ratio = solution.focal_ratio
-    near = count_near(detections.tangent, sky, R_cam_from_ref, ratio, solution.observed, gates)
+    near = count_near(
+        detections.tangent, sky, R_cam_from_ref, ratio, solution.observed, gates
+    )
     if near == 0:
         return _scaled(solution, 4 if detections.focal_uncertainty > 0 else 3)
     # 2. Evidence of each factor
@@ -174,9 +176,9 @@ def _scaled(solution: Solution, parameters: int) -> tuple[Solution, float]:
     best = 0
     chi2 = solution.chi2 * max(2 * count - parameters, 1)
     for n in range(len(TRIED)):
-        gain_dex = chi2 / 2 / log(10.0) * (1 - 1 / TRIED[n]) + (parameters / 2 - count) * log10(
-            TRIED[n]
-        )
+        gain_dex = chi2 / 2 / log(10.0) * (1 - 1 / TRIED[n]) + (
+            parameters / 2 - count
+        ) * log10(TRIED[n])
         dex[n] = solution.dex + gain_dex + (PRIOR_WRONG_DEX if n else 0.0)
         best = n if dex[n] > dex[best] else best
     variance = _mean_factor(dex, dex[best])
@@ -205,7 +207,11 @@ def with_errors(solution: Solution, factor: float, chi2: float, dex: float) -> S
 
 @jit
 def identify(
-    lights: FlatCentroids, sensor: Sensor, stars: SkyIndex, max_detections: int, max_checks: int
+    lights: FlatCentroids,
+    sensor: Sensor,
+    stars: SkyIndex,
+    max_detections: int,
+    max_checks: int,
 ) -> tuple[Solution, float]:
     """Search centroids of a calibrated camera by pairs, and match the field again where the residuals are doubtful.
 
@@ -436,7 +442,9 @@ def with_companions(
         seen = Rotation.from_quat(best.cam_from_ref_xyzw).apply(sky.vectors[best.star])
         view = geometry(seen, seen)
         residual = detections.tangent[best.observed] - best.focal_ratio * view.tangent
-        own, used = (information_of(one.weight[best.observed]) for one in (detections, changed))
+        own, used = (
+            information_of(one.weight[best.observed]) for one in (detections, changed)
+        )
         alone, spread = prediction_by_others(residual, view.jacobian, used)
         # 2. Mean information
         mean = mean_information(own, alone, spread)
@@ -502,7 +510,9 @@ def mean_information(information: Floats, residual: Floats, spread: Floats) -> F
     total = covariance + spread
     distance2 = np.einsum("ki,jkim,km->jk", residual, np.linalg.inv(total), residual)
     # Posterior probabilities g_j, from ln p_j - ln det / 2 - r^T (S + P + c_j^2 I)^-1 r / 2
-    log_density = np.log(SHARE)[:, None] - 0.5 * np.log(np.linalg.det(total)) - 0.5 * distance2
+    log_density = (
+        np.log(SHARE)[:, None] - 0.5 * np.log(np.linalg.det(total)) - 0.5 * distance2
+    )
     probability = np.exp(log_density - log_density.max(axis=0))
     probability /= probability.sum(axis=0)
     return np.asarray(

@@ -125,7 +125,9 @@ class StarTracker:
         )
         # Stars that a frame can show, and the brighter ones among them that form patterns
         apparent_stars = replace(stars, vectors=vectors)
-        self.stars = catalog.merge_doubles(apparent_stars, settings.merge_px / camera.focal_px)
+        self.stars = catalog.merge_doubles(
+            apparent_stars, settings.merge_px / camera.focal_px
+        )
         field_sr = camera.width_px * camera.height_px / camera.focal_px**2
         limit_mag = catalog.limit_for_density(self.stars, field_sr, settings.field_stars)
         index_stars = self.stars.take(self.stars.v_mag <= limit_mag)
@@ -149,9 +151,16 @@ class StarTracker:
         # Field of view in tangents: least and largest x, least and largest y
         corners = camera.tangents(CORNERS * [camera.width_px, camera.height_px] - 0.5)
         self.field = np.array(
-            [corners[:, 0].min(), corners[:, 0].max(), corners[:, 1].min(), corners[:, 1].max()]
+            [
+                corners[:, 0].min(),
+                corners[:, 0].max(),
+                corners[:, 1].min(),
+                corners[:, 1].max(),
+            ]
         )
-        zero_point_mag = np.nan if settings.zero_point_mag is None else settings.zero_point_mag
+        zero_point_mag = (
+            np.nan if settings.zero_point_mag is None else settings.zero_point_mag
+        )
         lens = camera.focal_px, camera.center_px, camera.distortion
         self.sensor = Sensor(*lens, self.field, zero_point_mag, settings.magnitude_sigma)
 
@@ -298,7 +307,12 @@ class StarTracker:
         centroids.check_values()
         if effort is not None:
             effort = checks.number(
-                "effort", effort, 0, self.efforts - 1, f"0 to {self.efforts - 1}, or None", True
+                "effort",
+                effort,
+                0,
+                self.efforts - 1,
+                f"0 to {self.efforts - 1}, or None",
+                True,
             )
         clock = clock or Clock()
         if len(centroids) < MIN_EVIDENCE_MATCHES:
@@ -348,7 +362,9 @@ class StarTracker:
         covariance_px2 = covariance_of(centroids) + excess_px2
         return replace(centroids, sigma_px=sigma_px, covariance_px2=covariance_px2)
 
-    def _solve_global(self, centroids: Centroids, clock: Clock, effort: int | None) -> Attitude:
+    def _solve_global(
+        self, centroids: Centroids, clock: Clock, effort: int | None
+    ) -> Attitude:
         """Identify and solve centroids of one time."""
         if self.index is None:
             searches = self.searches if effort is None else self.searches[effort : effort + 1]
@@ -517,7 +533,9 @@ class StarTracker:
             return misfit.identify(lights, self.sensor, self.sky, most, model.max_checks)
         detections = self.detections(centroids, sigma_px, model.focal_uncertainty)
         if not model.by_quads:
-            return star_search.lost_in_space(detections, self.sky, most, model.max_checks), 0.0
+            return star_search.lost_in_space(
+                detections, self.sky, most, model.max_checks
+            ), 0.0
         known = not self.focal_uncertainty
         solution = star_quads.identify(
             detections, self.quads, self.sky, most, model.max_checks, known
@@ -525,7 +543,11 @@ class StarTracker:
         return solution, 0.0
 
     def refit(
-        self, centroids: Centroids, solution: Solution, sigma_px: Floats, variance: float = 0.0
+        self,
+        centroids: Centroids,
+        solution: Solution,
+        sigma_px: Floats,
+        variance: float = 0.0,
     ) -> Refit:
         """Return a solution with the errors and, of a calibrated global shutter, the lens that its residuals imply.
 
@@ -558,7 +580,9 @@ class StarTracker:
             solution, detections, self.sky, camera, centroids.xy_px, fit_lens, variance
         )
 
-    def attitude_of(self, centroids: Centroids, refitted: Refit, sigma_px: Floats) -> Attitude:
+    def attitude_of(
+        self, centroids: Centroids, refitted: Refit, sigma_px: Floats
+    ) -> Attitude:
         """Return the attitude of a solution; solved again from its matches if the settings name another solver."""
         solution, camera, variance, _ = refitted
         cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)

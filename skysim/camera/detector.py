@@ -238,7 +238,10 @@ def expectation(light_e: NDArray[Any], exposure_s: float, detector: Detector) ->
 
 
 def smear(
-    light_e: NDArray[Any], exposure_s: float, shutter: Shutter, added: AddedCharge | None = None
+    light_e: NDArray[Any],
+    exposure_s: float,
+    shutter: Shutter,
+    added: AddedCharge | None = None,
 ) -> None:
     """Step 1: add the smear of a frame-transfer or interline shutter to the light, in place. Other shutters add none.
 

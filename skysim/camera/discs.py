@@ -91,7 +91,9 @@ def points_of(body: BodyLight, xy: Floats, share: Floats | None = None) -> Any:
     ids = np.full(len(xy), body.id, np.int64)
     magnitude = np.full(len(xy), body.magnitude)
     colors = None if body.chromatic is None else np.tile(body.chromatic, (len(xy), 1))
-    return steady_points(ids, body.directions(xy), share * body.flux_e_s_m2, magnitude, colors)
+    return steady_points(
+        ids, body.directions(xy), share * body.flux_e_s_m2, magnitude, colors
+    )
 
 
 class DisplacedImages(NamedTuple):
@@ -164,7 +166,9 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> Displace
     window = exposed.window._replace(
         open_s=exposed.window.open_s + low[1] * exposed.window.row_time_s
     )
-    drawn = draw(strip, tracks._replace(xy_px=moved), kernels, STEP * kernels.sharp_px, window)
+    drawn = draw(
+        strip, tracks._replace(xy_px=moved), kernels, STEP * kernels.sharp_px, window
+    )
     patches = strip.reshape(height, steps, steps, width).transpose(1, 2, 0, 3)
     speed = (xy_px[middle + 1, 0] - xy_px[middle - 1, 0]) / (2 * tracks.step_s)
     return DisplacedImages(patches, low, speed, float(drawn[0, 5]))
@@ -389,7 +393,9 @@ def whole(
     )
 
 
-def behind(bodies: Sequence[BodyLight], occluded: OcclusionTest | None) -> OcclusionTest | None:
+def behind(
+    bodies: Sequence[BodyLight], occluded: OcclusionTest | None
+) -> OcclusionTest | None:
     """The test whether nearer bodies' discs or the vehicle hide a source; None if nothing can."""
 
     def hidden(place: Floats) -> NDArray[np.bool_]:

@@ -106,7 +106,9 @@ def image_tracks(
     """
     # Motions of sources are given about mid-exposure.
     # Positions and geometry at every time, then the rates.
-    xy, distance_m, cos_out, cos_in = project(sources, optics, poses, t_s - t_s[len(t_s) // 2])
+    xy, distance_m, cos_out, cos_in = project(
+        sources, optics, poses, t_s - t_s[len(t_s) // 2]
+    )
     rate_e_s = rates_e_s(sources, optics, emitter, distance_m, cos_out, cos_in)
     pulse_s = np.column_stack([sources.period_s, sources.start_s, sources.on_s])
     tracks = Tracks(float(t_s[0]), float(t_s[1] - t_s[0]), xy, rate_e_s, pulse_s)

@@ -368,7 +368,9 @@ def _integrate(
         for p in range(points):
             x, y, rate = _interpolate(tracks, n, mean + spread * (2 * p - points + 1))
             electrons = rate * lit / points
-            if not electrons > 0:  # no image at this time (NaN position), or the LED faces away
+            if (
+                not electrons > 0
+            ):  # no image at this time (NaN position), or the LED faces away
                 continue
             _splat_point(patch, row0, row1, x - x0, y - y0, electrons, n, kernels, table)
             total = total + electrons
@@ -425,7 +427,13 @@ def _splat_point(
         add_round(patch, row0, row1, x, y, electrons, kernels.tables[begin:end].reshape(p, q))
     elif kernels.kind[n] == ELLIPSE:
         add_ellipse(
-            patch, row0, row1, x + kernels.disk[n, 0], y + kernels.disk[n, 1], electrons, table
+            patch,
+            row0,
+            row1,
+            x + kernels.disk[n, 0],
+            y + kernels.disk[n, 1],
+            electrons,
+            table,
         )
     else:
         add_grid(

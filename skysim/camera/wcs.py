@@ -130,7 +130,9 @@ def fit_sip(camera: CameraConfig) -> Sip | None:
             a[p, q] = in_a / scale ** (p + q)
             b[p, q] = in_b / scale ** (p + q)
         # 3. Round trip.
-        round_trip = distorted(chip_px + monomials(chip_px / scale, powers) @ solution, camera)
+        round_trip = distorted(
+            chip_px + monomials(chip_px / scale, powers) @ solution, camera
+        )
         worst_px = float(np.linalg.norm(round_trip - chip_px, axis=1).max())
         fits.append(Sip(a, b, *brown(camera), worst_px))
         # 4.
@@ -207,4 +209,6 @@ def brown(camera: CameraConfig) -> tuple[Coefficients, Coefficients]:
 
 def in_pixels(table: Coefficients, focal_px: float) -> Coefficients:
     """The terms that are not 0, from tangents to pixels: divided by focal^(p + q) and multiplied by focal."""
-    return {(p, q): value * focal_px ** (1 - p - q) for (p, q), value in table.items() if value}
+    return {
+        (p, q): value * focal_px ** (1 - p - q) for (p, q), value in table.items() if value
+    }

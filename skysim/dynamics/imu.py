@@ -31,7 +31,12 @@ from skysim.core.jit import jit
 from skysim.core.random_streams import random_stream
 from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats
-from skysim.scene.sections.vehicle import AccelerometerConfig, GyroConfig, ImuConfig, SiteConfig
+from skysim.scene.sections.vehicle import (
+    AccelerometerConfig,
+    GyroConfig,
+    ImuConfig,
+    SiteConfig,
+)
 
 # Knots per polynomial: a cubic, with an error of fourth order in their spacing.
 CUBIC_POINTS = 4
@@ -398,7 +403,9 @@ def gyro_triad(config: GyroConfig, hardware: Floats, start: Floats) -> Triad:
     )
 
 
-def accelerometer_triad(config: AccelerometerConfig, hardware: Floats, start: Floats) -> Triad:
+def accelerometer_triad(
+    config: AccelerometerConfig, hardware: Floats, start: Floats
+) -> Triad:
     """The accelerometer triad, as `gyro_triad`.
 
     The square of the noise density in ug/sqrt(Hz) is the variance of a mean over 1 s.

@@ -168,9 +168,7 @@ def known_lab(scene: Scene, vehicle: VehicleModel, uncertainty: Uncertainty) -> 
 
 
 LEAST_RATE_DEG_S = 0.05  # rate below which a turn does not count
-LEAST_INFORMATION = (
-    1e-3  # fraction of the needed information below which more of the same motion does not help
-)
+LEAST_INFORMATION = 1e-3  # fraction of the needed information below which more of the same motion does not help
 AXES = "xyz"
 
 
@@ -460,6 +458,8 @@ def measured_attitudes(
 
 def timing_covariance(t_s: Floats, lab_from_body: Rotation, jitter_s: float) -> Floats:
     """(N, 3, 3) covariance s^2 w w^T of attitudes whose times have the error s, with the rate w from differences."""
-    turned = (lab_from_body[:-1].inv() * lab_from_body[1:]).as_rotvec() / np.diff(t_s)[:, None]
+    turned = (lab_from_body[:-1].inv() * lab_from_body[1:]).as_rotvec() / np.diff(t_s)[
+        :, None
+    ]
     rate = np.vstack([turned[:1], (turned[1:] + turned[:-1]) / 2, turned[-1:]])
     return jitter_s**2 * rate[:, :, None] * rate[:, None, :]

@@ -102,7 +102,9 @@ def nees(flight: BalanceFlight, estimate: MassEstimate) -> float:
     return float(error @ np.linalg.solve(estimate.covariance[nine, nine], error))
 
 
-def balance_figure(iterations: Sequence[Iteration], torque_bar_nm: float) -> NDArray[np.uint8]:
+def balance_figure(
+    iterations: Sequence[Iteration], torque_bar_nm: float
+) -> NDArray[np.uint8]:
     """BGR image: gravity torque and offset of the center of mass flight by flight, and the last flight's attitude."""
     return bgr_image(lambda fig: draw_flights(fig, iterations, torque_bar_nm), (15, 4.5))
 
@@ -112,7 +114,9 @@ def draw_flights(fig: Any, iterations: Sequence[Iteration], torque_bar_nm: float
     torque, offset, motion = fig.subplots(1, 3)
     numbers = np.arange(1, len(iterations) + 1)
     torque.semilogy(numbers, [one.torque_nm for one in iterations], "o-", label="estimate")
-    torque.semilogy(numbers, [one.torque_bound_nm for one in iterations], "v--", label="bound")
+    torque.semilogy(
+        numbers, [one.torque_bound_nm for one in iterations], "v--", label="bound"
+    )
     torque.semilogy(
         numbers, [one.true_torque_nm for one in iterations], "kx", label="simulated vehicle"
     )

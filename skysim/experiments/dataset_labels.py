@@ -135,7 +135,9 @@ def label_frame(setup: TrialSetup, seed: int, by: Labeller | None = None) -> Lab
     added = AddedCharge(by.threshold_e)
     frame, truth, streak_px = trials.render_trial_frame(setup, seed, added)
     try:
-        found = detect_and_centroid(frame.image_dn, by.camera, by.settings, Clock(), streak_px)
+        found = detect_and_centroid(
+            frame.image_dn, by.camera, by.settings, Clock(), streak_px
+        )
     except ImageError:  # a saturated frame
         found = Centroids.empty()
     sources, unmatched = source_rows(truth.sources, found.xy_px)
@@ -181,7 +183,9 @@ def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Flo
 
 
 @jit
-def brightest_near(found_px: Floats, source_px: Floats, reach_px: Floats) -> NDArray[np.int64]:
+def brightest_near(
+    found_px: Floats, source_px: Floats, reach_px: Floats
+) -> NDArray[np.int64]:
     """(M,) number of the first free source within reach of each detection; -1 if there is none."""
     chosen = np.full(len(found_px), -1)
     is_free = np.ones(len(source_px), np.bool_)

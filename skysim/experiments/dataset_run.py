@@ -205,7 +205,9 @@ def study_plan(
         "set": settings,
     }
     # Scene paths are relative to the folder of the command, not to that of the variations.
-    return study_file.plan_of(tree, text, vary or Path(OVERRIDES.file), Path.cwd() / "dataset")
+    return study_file.plan_of(
+        tree, text, vary or Path(OVERRIDES.file), Path.cwd() / "dataset"
+    )
 
 
 MANIFEST = "dataset.json"
@@ -369,7 +371,9 @@ def check_manifest(storage: Storage, own: dict[str, Any]) -> None:
         ) from None
     if kept["format"] != FORMAT:
         raise InputError(
-            storage.url, f"a dataset of format {kept['format']}", f"{FORMAT}, or another folder"
+            storage.url,
+            f"a dataset of format {kept['format']}",
+            f"{FORMAT}, or another folder",
         )
     if kept["digest"] != own["digest"]:
         raise InputError(
@@ -396,7 +400,10 @@ def missing_shards(plan: DatasetPlan, storage: Storage) -> list[int]:
 
 
 def run(
-    plan: DatasetPlan, url: str, engine: Engine, watch: Callable[[Progress], Any] | None = None
+    plan: DatasetPlan,
+    url: str,
+    engine: Engine,
+    watch: Callable[[Progress], Any] | None = None,
 ) -> Progress:
     """Make the missing shards. Progress counts frames; frames of shards that killed their workers count as failed."""
     storage = Storage(url)

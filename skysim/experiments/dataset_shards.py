@@ -78,7 +78,10 @@ class Storage:
     def writer(self, name: str) -> Iterator[IO[bytes]]:
         """A file to be written from beginning to end."""
         if self.is_local:
-            with atomic_file(Path(self.path(name))) as temporary, temporary.open("wb") as file:
+            with (
+                atomic_file(Path(self.path(name))) as temporary,
+                temporary.open("wb") as file,
+            ):
                 yield file
             return
         with self.errors(), self.files.open(self.path(name), "wb") as file:
@@ -206,7 +209,9 @@ def frame_labels(one: LabelledFrame, scene: Scene, numbers: dict[str, Any]) -> d
     }
     if isinstance(scene.light, StarsConfig):
         angles = np.degrees(ra_dec_roll_rad(truth.cam_from_lab))
-        labels |= dict(zip(("ra_deg", "dec_deg", "roll_deg"), map(float, angles), strict=True))
+        labels |= dict(
+            zip(("ra_deg", "dec_deg", "roll_deg"), map(float, angles), strict=True)
+        )
     labels |= {"sources": len(one.sources), "detected": int(one.sources["detected"].sum())}
     labels["unmatched"] = len(one.unmatched_px)
     return labels | {f"{name}_pixels": sum(one.masks.get(name, [])[1::2]) for name in MASKS}
@@ -217,7 +222,9 @@ def frame_labels(one: LabelledFrame, scene: Scene, numbers: dict[str, Any]) -> d
 
 def coco_image(labels: dict[str, Any]) -> dict[str, Any]:
     """The entry of an image; its file is in the tar of the shard."""
-    name = f"{shard_name('shards', labels['shard'], 'tar')}/{key_of(labels['frame'])}.image.npy"
+    name = (
+        f"{shard_name('shards', labels['shard'], 'tar')}/{key_of(labels['frame'])}.image.npy"
+    )
     return {
         "id": labels["frame"],
         "file_name": name,
@@ -405,7 +412,9 @@ def zarr_is_there(storage: Storage) -> bool:
 def create_zarr(storage: Storage, frames: int, per_shard: int, image: NDArray[Any]) -> None:
     """Create the array of all images, with the size and type of this one; its shards are those of the dataset."""
     shape = image.shape
-    group = require_zarr().create_group(storage.zarr_store(ZARR), zarr_format=3, overwrite=True)
+    group = require_zarr().create_group(
+        storage.zarr_store(ZARR), zarr_format=3, overwrite=True
+    )
     group.create_array(
         ZARR_ARRAY,
         shape=(frames, *shape),

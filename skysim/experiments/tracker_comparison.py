@@ -102,7 +102,9 @@ def compare_frames(
     for shot in flight.shots(cameras=[0], solves=False, progress=progress):
         rows = {}
         for name in order:
-            if shot.frame.index == 0 and not isinstance(estimators[name], factory.UserTracker):
+            if shot.frame.index == 0 and not isinstance(
+                estimators[name], factory.UserTracker
+            ):
                 factory.solve_frame(
                     estimators[name], shot.frame
                 )  # so that it is compiled before it is timed
@@ -158,7 +160,9 @@ def write_scores(
         )
     score_rows = as_dicts(scores)
     columns = {
-        name: [row[name] for row in score_rows] for name in score_rows[0] if name != "refusals"
+        name: [row[name] for row in score_rows]
+        for name in score_rows[0]
+        if name != "refusals"
     }
     files.write_table(folder / "scoreboard.ecsv", Table(columns))
     return scores

@@ -132,7 +132,9 @@ def imu_table(record: Increments) -> Any:
 
     columns: dict[str, Any] = {"t_s": record.t_s}
     columns |= {f"angle_{end}_rad": record.angle_rad[:, n] for n, end in enumerate(AXES)}
-    columns |= {f"velocity_{end}_m_s": record.velocity_m_s[:, n] for n, end in enumerate(AXES)}
+    columns |= {
+        f"velocity_{end}_m_s": record.velocity_m_s[:, n] for n, end in enumerate(AXES)
+    }
     level_deg = np.degrees([tilt_rad(velocity[None]) for velocity in record.velocity_m_s])
     columns["level_roll_deg"], columns["level_pitch_deg"] = level_deg.T
     columns |= {
@@ -250,7 +252,9 @@ def gimbals_panel(log: Telemetry, axes: Any) -> None:
 
 def momentum_panel(log: Telemetry, axes: Any) -> None:
     axes.plot(log.t_s, log.momentum_nms, label=AXES)
-    axes.plot(log.t_s, np.linalg.norm(log.momentum_nms, axis=1), color="k", lw=1, label="norm")
+    axes.plot(
+        log.t_s, np.linalg.norm(log.momentum_nms, axis=1), color="k", lw=1, label="norm"
+    )
     axes.set_ylabel("stored momentum\n[N m s]")
 
 

@@ -301,7 +301,9 @@ RULES = (
     ),
     Rule(
         ("tracker.survey.surface_seed",),
-        lambda scene: not (isinstance(scene.light, DomeConfig) and scene.light.surface.error_m),
+        lambda scene: (
+            not (isinstance(scene.light, DomeConfig) and scene.light.surface.error_m)
+        ),
         "it draws light.surface.error, which is 0",
         "light.surface.error above 0",
     ),
@@ -468,7 +470,9 @@ RULES = (
     ),
     Rule(
         ("thermal.speed",),
-        lambda scene: scene.thermal is not None and scene.thermal.temperature.kind == "steady",
+        lambda scene: (
+            scene.thermal is not None and scene.thermal.temperature.kind == "steady"
+        ),
         "the temperature is steady",
         "another thermal.temperature",
     ),

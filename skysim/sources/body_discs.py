@@ -166,7 +166,9 @@ def _elements(law: int, phase_steps: int, earthshine: float) -> DiscElements:
     # Light and its first moments in each element.
     cells = (ACROSS, SAMPLES, ACROSS, SAMPLES)
     weighted = (light, light * axis, light * axis[:, None])
-    share, share_x, share_y = (one.reshape(cells).sum(axis=(1, 3)).ravel() for one in weighted)
+    share, share_x, share_y = (
+        one.reshape(cells).sum(axis=(1, 3)).ravel() for one in weighted
+    )
     lit = share > 0
     center = np.column_stack([share_x[lit], share_y[lit]]) / share[lit, None]
     return DiscElements(center, share[lit])
@@ -209,7 +211,9 @@ def lattice_light(
     fine = len(axis_px)
     weights = sharing_weights(subsamples)
     # Side of a sample's cell in units of the disc's radius.
-    step = float(axis_px[1] - axis_px[0]) * math.sqrt(abs(float(np.linalg.det(radius_from_px))))
+    step = float(axis_px[1] - axis_px[0]) * math.sqrt(
+        abs(float(np.linalg.det(radius_from_px)))
+    )
     matrix = np.ascontiguousarray(radius_from_px)
     has_earthshine = surface.earthshine > 0
     sunlit = np.empty((fine, count))
@@ -234,7 +238,9 @@ def lattice_light(
     of_all = 1 + surface.earthshine
     _light_columns(light, sunlit, weights, 1 / (of_all * max(of_sun, 1e-300)), False)
     if has_earthshine:
-        _light_columns(light, earthlit, weights, surface.earthshine / (of_all * of_earth), True)
+        _light_columns(
+            light, earthlit, weights, surface.earthshine / (of_all * of_earth), True
+        )
     return light
 
 
@@ -323,7 +329,9 @@ def _share(points: Any, samples: Floats, weights: Floats) -> None:
 
 
 @jit(parallel=True)
-def _light_columns(light: Any, rows: Floats, weights: Floats, scale: float, add: bool) -> None:
+def _light_columns(
+    light: Any, rows: Floats, weights: Floats, scale: float, add: bool
+) -> None:
     """Share rows of samples among the lattice's rows, scaled; replaces `light` or adds to it."""
     count = light.shape[1]
     subsamples = len(weights)

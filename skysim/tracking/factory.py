@@ -87,7 +87,9 @@ def assumed_settings(scene: Scene) -> Settings:
     return Settings(
         max_blobs=config.brightest or default.max_blobs,
         base_stars=min(config.brightest or default.base_stars, default.base_stars),
-        searched_stars=min(config.brightest or default.searched_stars, default.searched_stars),
+        searched_stars=min(
+            config.brightest or default.searched_stars, default.searched_stars
+        ),
         threshold_sigma=config.threshold_sigma,
         min_area_px=config.min_area_px,
         gain_e_dn=scene.camera.detector.gain_e_dn,
@@ -242,7 +244,9 @@ def solve_frame(
         return Report(Attitude(str(error)), Centroids.empty())
 
 
-def solve_centroids(estimator: Estimator, centroids: Centroids, exposure_s: float) -> Attitude:
+def solve_centroids(
+    estimator: Estimator, centroids: Centroids, exposure_s: float
+) -> Attitude:
     """The tracker's attitude from centroids; a dome tracker needs the exposure time for the lights' brightness."""
     if isinstance(estimator, DomeTracker):
         return estimator.solve_centroids(centroids, exposure_s=exposure_s)
@@ -300,6 +304,8 @@ def observe_frame(settings: Settings, control: Control, frame: Frame) -> Observa
             FramePriors(None, settings.saturation),
         )
     except ImageError:  # a coarse converter may give a frame of one value: no blobs
-        return observe(frame.image_dn, np.empty((0, 4), np.int64), settings.saturation, control)
+        return observe(
+            frame.image_dn, np.empty((0, 4), np.int64), settings.saturation, control
+        )
     box_px = blobs.box_px[blobs.flag & settings.reject == 0]
     return observe(frame.image_dn, box_px, settings.saturation, control)

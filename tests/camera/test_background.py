@@ -36,7 +36,12 @@ CAMERA = {
     "focal_length": "8 mm",
     "f_number": 1.4,
     "transmission": 0.8,
-    "detector": {"quantum_efficiency": 0.5, "full_well_e": 40000, "gain_e_dn": 10, "bits": 12},
+    "detector": {
+        "quantum_efficiency": 0.5,
+        "full_well_e": 40000,
+        "gain_e_dn": 10,
+        "bits": 12,
+    },
 }
 BENT = {"distortion": (-0.25, 0.08, 0.002, -0.001, 0.0), "principal_point_px": (380.0, 310.0)}
 POINTING = Rotation.from_euler("xyz", [0.4, -1.1, 2.0])
@@ -160,7 +165,9 @@ def test_vignetting_dims_the_sky_and_not_a_light_leak() -> None:
     ratio = drawn(glow(**SKY), dim)[300] / drawn(glow(**SKY), clear)[300]
     # The cusp on the axis is rounded off: half a node of 30 px, 0.6 degrees, costs 1.8 % there and less elsewhere.
     assert ratio[400] == pytest.approx(1, abs=0.03)
-    assert ratio[0] == pytest.approx(np.interp(edge_deg, (0, 10, 30), (1, 0.7, 0.1)), rel=1e-3)
+    assert ratio[0] == pytest.approx(
+        np.interp(edge_deg, (0, 10, 30), (1, 0.7, 0.1)), rel=1e-3
+    )
     leak = drawn(glow(kind="uniform", e_s=7.0), dim, 0.5)
     np.testing.assert_array_equal(leak, np.full((601, 801), 3.5, np.float32))
 
@@ -196,7 +203,9 @@ def test_nanolamberts_convert_to_magnitudes() -> None:
 
 def test_the_half_moon_is_2_6_magnitudes_below_the_full_moon() -> None:
     """By hand: 0.026 x 90 + 4e-9 x 90^4 = 2.602."""
-    full, half = (float(moonlight_nl(60.0, phase, 0.172, 45.0, 30.0)) for phase in (0.0, 90.0))
+    full, half = (
+        float(moonlight_nl(60.0, phase, 0.172, 45.0, 30.0)) for phase in (0.0, 90.0)
+    )
     assert 2.5 * np.log10(full / half) == pytest.approx(2.602, abs=5e-4)
 
 
@@ -287,7 +296,9 @@ def test_frames_drawn_between_nodes_are_within_a_thousandth(
 @pytest.mark.compiles
 def test_the_cusp_of_two_stops_is_rounded_off_within_a_node_of_the_axis() -> None:
     lens = optics(vignetting={"kind": "two_stops", "cutoff_deg": 50.0})
-    error = np.abs(drawn(glow(**SLOPED), lens)[::3, ::3] / whole_map(glow(**SLOPED), lens) - 1)
+    error = np.abs(
+        drawn(glow(**SLOPED), lens)[::3, ::3] / whole_map(glow(**SLOPED), lens) - 1
+    )
     assert error.max() < 0.02
     y, x = np.indices(error.shape)
     assert error[np.hypot(3 * x - 400, 3 * y - 300) > 200].max() < 1e-3
@@ -306,9 +317,9 @@ def test_the_fill_between_nodes_is_bilinear(
     fill(image, coarse, 0.25)
     axes = [np.linspace(0, size - 1, count) for size, count in zip(shape, nodes, strict=True)]
     places = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
-    wanted = 0.25 * RegularGridInterpolator(axes, coarse, bounds_error=False, fill_value=None)(
-        places
-    )
+    wanted = 0.25 * RegularGridInterpolator(
+        axes, coarse, bounds_error=False, fill_value=None
+    )(places)
     np.testing.assert_allclose(image, wanted, rtol=1e-6 if kind is np.float32 else 1e-12)
 
 

@@ -122,4 +122,6 @@ def test_a_dome_has_no_faint_stars() -> None:
     with pytest.raises(
         InputError, match=r"background: faint_stars requires light of kind stars, not dome"
     ):
-        loader.load("afit_simsat", {"background": "[{kind: faint_stars, fainter_than_mag: 8}]"})
+        loader.load(
+            "afit_simsat", {"background": "[{kind: faint_stars, fainter_than_mag: 8}]"}
+        )

@@ -34,7 +34,9 @@ def test_shapes_have_the_kinds_and_sizes_of_the_file() -> None:
     np.testing.assert_allclose(cylinder.rgba, [1, 0, 0, 1])
     assert cylinder.name == "bar"
     assert not floor.on_vehicle
-    assert all(shape.on_vehicle for shape in (box, sphere, cylinder, capsule, ellipsoid, mesh))
+    assert all(
+        shape.on_vehicle for shape in (box, sphere, cylinder, capsule, ellipsoid, mesh)
+    )
 
 
 def test_shapes_are_where_the_file_puts_them() -> None:

@@ -172,7 +172,9 @@ def test_an_optimized_layout_keeps_cap_surface_and_spacing(best: Sources) -> Non
 
 
 @pytest.mark.long
-def test_an_optimized_layout_depends_on_its_seed_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_optimized_layout_depends_on_its_seed_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     quick = replace(optimize.OPTIONS, score_attitudes=2000, fresh_attitudes=1000)
     monkeypatch.setattr(optimize, "OPTIONS", quick)
     few = WANTED | {"count": 20, "tilt_deg": 2, "rounds": 5}
@@ -236,7 +238,11 @@ def test_leds_that_are_off_by_more_than_the_tolerance_do_not_coincide() -> None:
     turned[4] += [0.0, 2e-3, 0.0]
     for coincidence_m, coincide in ((1e-4, 5), (3e-3, 6)):
         found = field_ambiguity(
-            np.concatenate([pattern, turned]), 0.3, np.radians(60), np.radians(6), coincidence_m
+            np.concatenate([pattern, turned]),
+            0.3,
+            np.radians(60),
+            np.radians(6),
+            coincidence_m,
         )
         assert found.fraction[0] == pytest.approx(coincide / 6, abs=1e-12)
 
@@ -325,7 +331,8 @@ def test_a_contracted_layout_covers_a_fraction_of_each_led_s_solid_angle() -> No
     for fraction in (1.0, 0.5):
         placed = placing.contract(layout_m, sites_m, fraction)
         wanted, found = (
-            place / np.linalg.norm(place, axis=1, keepdims=True) for place in (layout_m, placed)
+            place / np.linalg.norm(place, axis=1, keepdims=True)
+            for place in (layout_m, placed)
         )
         np.testing.assert_allclose(
             1 - found[:, 2], fraction * (1 - wanted[:, 2]), rtol=0, atol=3e-3

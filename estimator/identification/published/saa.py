@@ -58,7 +58,9 @@ MAX_ASSUMPTIONS = 100_000  # 16 MB of matches at 40 observed stars
 @jit
 def magnitude_cost(stars: SearchInput, observed: int, star: int) -> float:
     """Squared deviation of a magnitude in standard deviations, inf beyond three; 0 if a magnitude is unknown."""
-    deviation = (stars.magnitude_cam[observed] - stars.magnitude[star]) / stars.gates.magnitude
+    deviation = (
+        stars.magnitude_cam[observed] - stars.magnitude[star]
+    ) / stars.gates.magnitude
     if np.isnan(deviation):
         return 0.0
     return deviation * deviation if abs(deviation) <= 3 else np.inf

@@ -17,7 +17,9 @@ from skysim.scene.scene import NAME_ALIAS, Scene
 from skysim.scene.sections.camera import CameraConfig
 
 KINDS: Mapping[str, type[BaseModel]] = {"scene": Scene, "study": Study}
-EXTRA_KEYS: Mapping[str, dict[str, Any]] = {  # keys that the loader resolves before validation
+EXTRA_KEYS: Mapping[
+    str, dict[str, Any]
+] = {  # keys that the loader resolves before validation
     Scene.__name__: {
         "base": {
             "type": "string",

@@ -40,9 +40,9 @@ def complete_study(incomplete: str) -> list[str]:
 
 def complete_yaml(folder: Path, incomplete: str) -> list[str]:
     names = [path.stem for path in folder.glob("*.yaml")]
-    found = Path(incomplete if incomplete.endswith("/") else os.path.dirname(incomplete)).glob(
-        "*"
-    )
+    found = Path(
+        incomplete if incomplete.endswith("/") else os.path.dirname(incomplete)
+    ).glob("*")
     files = [
         f"{path}/" if path.is_dir() else str(path)
         for path in found
@@ -76,7 +76,9 @@ Detector = Annotated[str | None, typer.Option(help="Detection algorithm, e.g. lo
 Centroider = Annotated[
     str | None, typer.Option(help="Centroiding algorithm, e.g. gaussian_fit.")
 ]
-Identifier = Annotated[str | None, typer.Option(help="Identification algorithm, e.g. pyramid.")]
+Identifier = Annotated[
+    str | None, typer.Option(help="Identification algorithm, e.g. pyramid.")
+]
 SolverName = Annotated[
     str | None, typer.Option("--solver", help="Attitude algorithm, e.g. quest.")
 ]
@@ -89,7 +91,9 @@ Programs = Annotated[
         help="External tracker or controller: a program; repeatable.",
     ),
 ]
-OpenReport = Annotated[bool, typer.Option("--open", help="Open the report when it is written.")]
+OpenReport = Annotated[
+    bool, typer.Option("--open", help="Open the report when it is written.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 

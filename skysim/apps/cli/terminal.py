@@ -203,7 +203,9 @@ def print_catalog(catalog: dict[str, Any], json: bool) -> None:
     print(
         f"{catalog['path']}: {catalog['stars']} stars ({sources}), epoch J{catalog['meta']['epoch_jyear']}"
     )
-    print("  ".join(f"V<{limit}: {count}" for limit, count in catalog["brighter_than"].items()))
+    print(
+        "  ".join(f"V<{limit}: {count}" for limit, count in catalog["brighter_than"].items())
+    )
     for key, value in catalog["meta"].items():
         print(f"  {key}: {printable(value)}")
 
@@ -246,7 +248,9 @@ def write_3d_views(lab: Lab, log: Telemetry, folder: Path) -> list[Path]:
         shown = progress(
             scene_picture.film(mjcf, states), len(states), "rendering the animation"
         )
-        scene_picture.write_film(shown, animation_path, len(states) / float(log.t_s[-1] + 1e-9))
+        scene_picture.write_film(
+            shown, animation_path, len(states) / float(log.t_s[-1] + 1e-9)
+        )
     except scene_picture.NoPicture as error:
         print_error(str(error))
         return []

@@ -106,7 +106,9 @@ class LightColumns(Sequence[LightRow]):
     def __getitem__(self, n: slice) -> LightColumns: ...
     def __getitem__(self, n: int | slice) -> LightRow | LightColumns:
         if isinstance(n, slice):
-            return LightColumns(self.id[n], self.xy_px[n], self.electrons[n], self.magnitude[n])
+            return LightColumns(
+                self.id[n], self.xy_px[n], self.electrons[n], self.magnitude[n]
+            )
         x, y = self.xy_px[n].tolist()
         return LightRow(
             int(self.id[n]), x, y, float(self.electrons[n]), float(self.magnitude[n])

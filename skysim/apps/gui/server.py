@@ -44,9 +44,7 @@ from skysim.scene.loader import find
 
 # Number of new objects before a collection, and numbers of collections before one of older objects.
 THRESHOLDS = (2_000, 10, 1_000)
-QUIET_S = (
-    1.0  # time without a closed page and without a new frame before closed pages are collected
-)
+QUIET_S = 1.0  # time without a closed page and without a new frame before closed pages are collected
 PATIENCE_S = 60.0  # time after which they are collected even while pages get frames
 
 
@@ -256,12 +254,15 @@ class Guard:
                 self.cookie, self.token, path="/", httponly=True, samesite="strict"
             )
             user = user_of(request.cookies) or secrets.token_hex(USER_BYTES)
-            response.set_cookie(USER, user, YEAR_S, path="/", httponly=True, samesite="strict")
+            response.set_cookie(
+                USER, user, YEAR_S, path="/", httponly=True, samesite="strict"
+            )
             return response
         if token_matches(request.cookies.get(self.cookie, ""), self.token):
             return None
         return PlainTextResponse(
-            "token missing or wrong; open the address that the server printed: /?token=...", 401
+            "token missing or wrong; open the address that the server printed: /?token=...",
+            401,
         )
 
 

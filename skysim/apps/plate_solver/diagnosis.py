@@ -21,7 +21,12 @@ from estimator.detection.classify import streaks_px
 from estimator.detection.detect import DETECTORS
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.trackers.pipeline import Clock
-from skysim.apps.plate_solver.solver import FIELD_SEARCH, Solver, best_attitude, solve_centroids
+from skysim.apps.plate_solver.solver import (
+    FIELD_SEARCH,
+    Solver,
+    best_attitude,
+    solve_centroids,
+)
 
 # Expected numbers of stars in a field: hardly solvable below the first, safe above the second.
 MIN_CATALOG_STARS = 6.0
@@ -155,7 +160,9 @@ def reversed_columns(centroids: Centroids, width_px: int) -> Centroids:
 
 def other_field(refusal: Refusal) -> str:
     """The picture is solved, with little effort, with another field of view than those that were tried."""
-    if not refusal.can_be_tried or not all(solver.field_is_known for solver in refusal.solvers):
+    if not refusal.can_be_tried or not all(
+        solver.field_is_known for solver in refusal.solvers
+    ):
         return ""
     unknown = replace(refusal.solvers[0], fov_deg=None, camera=None)
     cameras = unknown.candidate_cameras(*refusal.size_px)

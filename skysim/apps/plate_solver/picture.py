@@ -118,7 +118,9 @@ def pictures_in(paths: Iterable[Path]) -> list[Path]:
             if child.name[0] != "." and not child.name.endswith(ANNOTATED)
         ]
         if not names:
-            raise InputError(path, "a folder without images", ", ".join(images.IMAGE_SUFFIXES))
+            raise InputError(
+                path, "a folder without images", ", ".join(images.IMAGE_SUFFIXES)
+            )
         found += names
     return found
 
@@ -214,7 +216,8 @@ def check_image(path: Path, image: NDArray, solver: Solver) -> None:
     bits = camera.detector.bits if camera.detector else 0
     if image.dtype == np.uint8 and bits > 8:
         raise InputError(
-            path, f"an 8-bit image; this camera's have {bits} bits, in 16-bit FITS, PNG or TIFF"
+            path,
+            f"an 8-bit image; this camera's have {bits} bits, in 16-bit FITS, PNG or TIFF",
         )
     height_px, width_px = image.shape[:2]
     model = camera.model
@@ -322,11 +325,15 @@ def outcome_fields(
     from skysim.apps.plate_solver import diagnosis
 
     rows_known = len({id(one.pixels) for one in outcome.tried}) == 1
-    refusal = diagnosis.Refusal(pixels, report.centroids, tuple(solvers), date_utc, rows_known)
+    refusal = diagnosis.Refusal(
+        pixels, report.centroids, tuple(solvers), date_utc, rows_known
+    )
     return seen | {"hint": diagnosis.likely_cause(refusal)}
 
 
-def annotated_image(image: NDArray, report: Report, tracker: StarTracker) -> NDArray[np.uint8]:
+def annotated_image(
+    image: NDArray, report: Report, tracker: StarTracker
+) -> NDArray[np.uint8]:
     """The image annotated with detections, matched stars and their numbers."""
     from skysim.results.plots import annotate
 

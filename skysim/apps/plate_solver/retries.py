@@ -177,7 +177,9 @@ def without_clouds(pixels: NDArray, settings: Settings) -> Centroids:
     if np.quantile(noise, 0.9) < UNEVEN * np.quantile(noise, 0.1):
         return Centroids.empty()
     light = cv2.GaussianBlur(bin_pixels(pixels, 1), (0, 0), 0.5)
-    flat = cv2.morphologyEx(light, cv2.MORPH_TOPHAT, np.ones((TOPHAT_PX, TOPHAT_PX), np.uint8))
+    flat = cv2.morphologyEx(
+        light, cv2.MORPH_TOPHAT, np.ones((TOPHAT_PX, TOPHAT_PX), np.uint8)
+    )
     try:
         # The edges of trees leave as many lights as there are stars.
         more = replace(settings, max_blobs=2 * settings.max_blobs)

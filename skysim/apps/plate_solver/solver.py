@@ -374,7 +374,9 @@ def read_catalog(name: str | None) -> star_catalog.StarCatalog:
         ) from None
 
 
-def validated_date(date_utc: datetime.datetime | None) -> tuple[datetime.datetime | None, str]:
+def validated_date(
+    date_utc: datetime.datetime | None,
+) -> tuple[datetime.datetime | None, str]:
     """Return (date in UTC, ""), or (None, reason) for a date outside the supported range; (None, "") without a date."""
     try:
         return (check_year(date_utc) if date_utc else None), ""
@@ -570,7 +572,9 @@ def solution_fields(report: Report) -> dict[str, Any]:
     assert attitude.match is not None
     camera = attitude.camera
     assert camera is not None
-    ra, dec, roll = np.degrees(ra_dec_roll_rad(center_from_cam(camera) * attitude.cam_from_ref))
+    ra, dec, roll = np.degrees(
+        ra_dec_roll_rad(center_from_cam(camera) * attitude.cam_from_ref)
+    )
     return {
         "ra_deg": float(ra),
         "dec_deg": float(dec),

@@ -62,7 +62,9 @@ class Packet(NamedTuple):
 
     def plus_dropped(self, missed: int) -> Packet:
         """The same packet for a receiver that missed further frames: its header's `dropped` is that much larger."""
-        return self._replace(header=self.header | {"dropped": self.header["dropped"] + missed})
+        return self._replace(
+            header=self.header | {"dropped": self.header["dropped"] + missed}
+        )
 
     def pack(self) -> bytes:
         """Serialize: the header line, then the pixels row by row from the top."""
@@ -96,7 +98,9 @@ def build_packet(shot: Shot, due_unix_s: float, made_unix_s: float, dropped: int
         "dropped": dropped,
     }
     truth_values = {
-        "cam_from_ref_xyzw": np.roll(quaternion.from_rotation(truth.cam_from_lab), -1).tolist(),
+        "cam_from_ref_xyzw": np.roll(
+            quaternion.from_rotation(truth.cam_from_lab), -1
+        ).tolist(),
         "rate_cam_rad_s": truth.rate_cam_rad_s.tolist(),
         "ids": truth.sources.id.tolist(),
         "x_px": truth.sources.xy_px[:, 0].round(4).tolist(),
@@ -150,7 +154,9 @@ class Sink:
         self.name = name
         self.write = write
         self.sent = self.dropped = 0
-        self.busy = False  # writing a packet that is counted neither as sent nor as dropped yet
+        self.busy = (
+            False  # writing a packet that is counted neither as sent nor as dropped yet
+        )
         self.fault = ""
         self.packets: queue.Queue[Packet | None] = queue.Queue(QUEUE_LENGTH)
         self.thread = threading.Thread(target=self.run, name=f"sink {name}", daemon=True)
@@ -167,9 +173,7 @@ class Sink:
             except OSError as error:
                 file = f"{error.filename}: " if error.filename else ""
                 self.fault = file + (error.strerror or str(error))
-            except (
-                Exception
-            ) as error:  # a dead thread without `fault` would block a patient offer() for ever
+            except Exception as error:  # a dead thread without `fault` would block a patient offer() for ever
                 self.fault = printable(f"{type(error).__name__}: {error}")
             if self.fault:
                 self.dropped += 1

@@ -227,7 +227,9 @@ def transmittance(
     angle_deg: float | Floats, table_deg: Sequence[float], pst: Sequence[float]
 ) -> Floats:
     """Interpolate the logarithm of a table of transmittances linearly; constant beyond its ends. Shape of angle_deg."""
-    return np.asarray(np.exp(np.interp(angle_deg, table_deg, np.log(np.maximum(pst, MIN_PST)))))
+    return np.asarray(
+        np.exp(np.interp(angle_deg, table_deg, np.log(np.maximum(pst, MIN_PST))))
+    )
 
 
 def faint_star_glow(config: FaintStarsGlowConfig, view: ViewingGeometry) -> Floats:
@@ -251,7 +253,9 @@ def direction(ra_deg: float, dec_deg: float) -> Floats:
     """(3,) unit vector of a right ascension and declination."""
     ra = math.radians(ra_deg)
     dec = math.radians(dec_deg)
-    return np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
+    return np.array(
+        [math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)]
+    )
 
 
 def angular_separation_deg(vectors: Floats, vector: Floats) -> Floats:
@@ -293,7 +297,9 @@ def node_directions(optics: Optics) -> tuple[Floats, Floats, tuple[int, int]]:
 def nodes_px(camera: CameraConfig) -> tuple[Floats, tuple[int, int]]:
     """(h * w, 2) pixel positions of the nodes, row by row, and (h, w)."""
     spacing = min(MAX_NODE_SPACING_PX, max(MAX_NODE_SPACING_RAD * camera.focal_px, 1.0))
-    w, h = (math.ceil((size - 1) / spacing) + 1 for size in (camera.width_px, camera.height_px))
+    w, h = (
+        math.ceil((size - 1) / spacing) + 1 for size in (camera.width_px, camera.height_px)
+    )
     return even_grid_px(camera, w, h), (h, w)
 
 

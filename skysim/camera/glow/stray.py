@@ -85,7 +85,9 @@ def add_glare(light_e: NDArray[Any], config: GlareConfig) -> None:
     height, width = (size // block for size in light_e.shape)
     coarse = light_e.reshape(height, block, width, block).mean(axis=(1, 3), dtype=float)
     # 2. Product with the transform of g.
-    spectrum = fft.dctn(coarse, type=2, norm="ortho") * transfer(config, (height, width), block)
+    spectrum = fft.dctn(coarse, type=2, norm="ortho") * transfer(
+        config, (height, width), block
+    )
     scattered = fft.idctn(spectrum, type=2, norm="ortho").astype(light_e.dtype)
     # 3. Back to pixels; `share` of the light is scattered.
     fine = ndimage.zoom(scattered, block, order=1, mode="reflect", grid_mode=True)
@@ -111,7 +113,9 @@ def transfer(config: GlareConfig, shape: tuple[int, int], block: int) -> Floats:
     scaled = config.core_px * np.hypot(rows[:, None], columns)
     # K_v is infinite at 0, where the limit of the product is 1.
     scaled[0, 0] = 1.0
-    values = 2 ** (1 - order) / special.gamma(order) * scaled**order * special.kv(order, scaled)
+    values = (
+        2 ** (1 - order) / special.gamma(order) * scaled**order * special.kv(order, scaled)
+    )
     values[0, 0] = 1.0
     return np.asarray(values)
 

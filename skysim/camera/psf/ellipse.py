@@ -237,7 +237,9 @@ def product(a: Singles, b: Singles) -> Singles:
             w2 = a[k + 2, r]
             w3 = a[k + 3, r]
             for i in range(row.size):
-                row[i] += w0 * b[k, i] + w1 * b[k + 1, i] + w2 * b[k + 2, i] + w3 * b[k + 3, i]
+                row[i] += (
+                    w0 * b[k, i] + w1 * b[k + 1, i] + w2 * b[k + 2, i] + w3 * b[k + 3, i]
+                )
         for k in range(whole, len(a)):
             w = a[k, r]
             for i in range(row.size):
@@ -315,7 +317,9 @@ def unfold(parts: Singles, samples: int, half: int, disk: EllipseDisk) -> Single
                         row[middle - 1 - i] += odd0[left + i] - up * odd1[left + i]
                 # 1 + slope (position) of the disk's light; ringing below zero is cut.
                 light = np.float32(
-                    1 + disk.slope_x * (p / samples - middle) + disk.slope_y * (j + q / samples)
+                    1
+                    + disk.slope_x * (p / samples - middle)
+                    + disk.slope_y * (j + q / samples)
                 )
                 for i in range(size):
                     row[i] = max(row[i] * (light + slope * np.float32(i)), none)

@@ -283,7 +283,9 @@ def widened(kernels: Kernels, extra_px: Floats) -> Kernels:
     widening = np.hypot(kernels.sigma_px, extra_px) / np.where(point, kernels.sigma_px, 1)
     return kernels._replace(
         sigma_px=np.where(point, kernels.sigma_px * widening, kernels.sigma_px),
-        reach_px=np.where(point, kernels.reach_px * np.maximum(widening, 1), kernels.reach_px),
+        reach_px=np.where(
+            point, kernels.reach_px * np.maximum(widening, 1), kernels.reach_px
+        ),
         sharp_px=np.where(point, kernels.sharp_px * widening, kernels.sharp_px),
     )
 
@@ -369,7 +371,9 @@ def ellipse_disks(
     return disk, np.column_stack([BOX_KEY * one, half_px, 0 * one]).astype(np.int64)
 
 
-def add_kernels(cache: KernelCache, camera: CameraConfig, keys: list[tuple[int, ...]]) -> None:
+def add_kernels(
+    cache: KernelCache, camera: CameraConfig, keys: list[tuple[int, ...]]
+) -> None:
     """Make the kernels that the cache does not hold yet; empty the cache first if it is over CACHE_BYTES.
 
     Raises
@@ -411,7 +415,9 @@ def make_kernel(
     kernel = build_kernel(camera.psf, camera, *(n * QUANTUM_PX for n in key))
     kind = GRID if len(kernel.grid) else ROUND if len(kernel.radial) else GAUSS
     table = kernel.grid if kind == GRID else kernel.radial
-    sizes = {GAUSS: (0, 0), ROUND: kernel.radial.shape[:2], GRID: kernel.grid.shape[1:3]}[kind]
+    sizes = {GAUSS: (0, 0), ROUND: kernel.radial.shape[:2], GRID: kernel.grid.shape[1:3]}[
+        kind
+    ]
     return (kind, kernel.sigma_px, kernel.reach_px, sharpness_px(kernel)), sizes, table
 
 

@@ -54,7 +54,9 @@ LIT_RGB = np.array([1.0, 0.93, 0.78])
 FIELD_RGB = np.array([0.25, 0.75, 1.0])
 
 
-def mjcf(vehicle: VehicleModel, scene: Scene, sources: Sources, lab_from_body: Rotation) -> str:
+def mjcf(
+    vehicle: VehicleModel, scene: Scene, sources: Sources, lab_from_body: Rotation
+) -> str:
     """The laboratory as the text of one MJCF file, which MuJoCo's own viewer can open and simulate.
 
     1. Copy the vehicle's spec, hide the tilt stop, and copy mesh files into it.
@@ -153,7 +155,9 @@ def add_backdrop(spec: Any, on_earth: bool) -> None:
     """Add a dim room or black space as background, and a lamp."""
     # Colors of the gradient from zenith to nadir.
     top, bottom = (
-        ([0.16, 0.19, 0.24], [0.03, 0.035, 0.05]) if on_earth else ([0.0, 0.0, 0.01], [0.0] * 3)
+        ([0.16, 0.19, 0.24], [0.03, 0.035, 0.05])
+        if on_earth
+        else ([0.0, 0.0, 0.01], [0.0] * 3)
     )
     spec.add_texture(
         name="stage_backdrop",
@@ -286,7 +290,9 @@ def visible_shell_m(inside: Surface, around: Floats) -> Floats:
         return inside.meet(np.zeros(3), rays.reshape(-1, 3)).reshape(rays.shape)
 
     # The first and the last of 400 polar angles in each direction at which a ray meets the surface.
-    polar = np.broadcast_to(np.linspace(1e-3, np.radians(80), 400)[:, None], (400, len(around)))
+    polar = np.broadcast_to(
+        np.linspace(1e-3, np.radians(80), 400)[:, None], (400, len(around))
+    )
     height_m = np.nan_to_num(points_at(polar)[..., 2], nan=-np.inf)
     on_surface = height_m > 0.35 * height_m.max()
     first = on_surface.argmax(axis=0)
@@ -369,7 +375,9 @@ def add_lights(spec: Any, sources: Sources) -> None:
     shown = np.argsort(-mean, kind="stable")[: MAX_STARS if stars else len(mean)]
     fraction = mean[shown] / mean.max(initial=1e-300)
     position_m = sources.place[shown, :3] * (SKY_RADIUS_M if stars else 1.0)
-    radius_m = 0.006 + 0.04 * np.sqrt(fraction) if stars else np.full(len(shown), LED_RADIUS_M)
+    radius_m = (
+        0.006 + 0.04 * np.sqrt(fraction) if stars else np.full(len(shown), LED_RADIUS_M)
+    )
     # One mesh for each step of brightness; all stars have the brightest.
     level = np.full(len(shown), LEVELS) if stars else np.ceil(fraction * LEVELS).astype(int)
     for step in np.unique(level):
@@ -377,7 +385,14 @@ def add_lights(spec: Any, sources: Sources) -> None:
         rgba = [*(LIT_RGB * (DIM + (1 - DIM) * step / LEVELS)), 1.0]
         name = f"stage_{'stars' if stars else 'leds'}_{step}"
         add_mesh(
-            spec, spec.worldbody, name, vertices, faces, rgba, GROUP_LIGHTS, material=glow.name
+            spec,
+            spec.worldbody,
+            name,
+            vertices,
+            faces,
+            rgba,
+            GROUP_LIGHTS,
+            material=glow.name,
         )
 
 
@@ -465,13 +480,17 @@ def dome_view(rings_m: Floats) -> tuple[Floats, Floats, Floats, float]:
     )
 
 
-def sky_view(vehicle: VehicleModel, boresight: Floats) -> tuple[Floats, Floats, Floats, float]:
+def sky_view(
+    vehicle: VehicleModel, boresight: Floats
+) -> tuple[Floats, Floats, Floats, float]:
     """As `dome_view`, from beside and behind the vehicle, with the boresight along the picture's diagonal."""
     size = float(vehicle.model.stat.extent) / 2 + SKY_RADIUS_M / 2
     # A direction across the boresight, from the axis that is least along it.
     beside = np.cross(boresight, np.eye(3)[np.argmin(np.abs(boresight))])
     back = beside / np.linalg.norm(beside) - 0.5 * boresight
-    up = Rotation.from_rotvec(np.radians(-40.0) * back / np.linalg.norm(back)).apply(boresight)
+    up = Rotation.from_rotvec(np.radians(-40.0) * back / np.linalg.norm(back)).apply(
+        boresight
+    )
     return size * (2.0 * back + 0.5 * boresight), 0.5 * size * boresight, up, 1.2 * size
 
 
@@ -487,9 +506,14 @@ def look_at(spec: Any, eye_m: Floats, middle_m: Floats, up: Floats, size_m: floa
     # MuJoCo's cameras look along -z, y is up.
     back = (eye_m - middle_m) / np.linalg.norm(eye_m - middle_m)
     right = np.cross(up, back) / np.linalg.norm(np.cross(up, back))
-    lab_from_view = Rotation.from_matrix(np.column_stack([right, np.cross(back, right), back]))
+    lab_from_view = Rotation.from_matrix(
+        np.column_stack([right, np.cross(back, right), back])
+    )
     spec.worldbody.add_camera(
-        name=LAB_CAMERA, pos=eye_m, quat=lab_from_view.as_quat(scalar_first=True), fovy=FOVY_DEG
+        name=LAB_CAMERA,
+        pos=eye_m,
+        quat=lab_from_view.as_quat(scalar_first=True),
+        fovy=FOVY_DEG,
     )
     # The viewer's free camera starts at the same view.
     spec.stat.center = middle_m

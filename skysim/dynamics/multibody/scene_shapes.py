@@ -90,7 +90,9 @@ def is_shown(model: mujoco.MjModel, n: int) -> bool:
     """Whether the geom with index n is visible and is no light."""
     kind = mujoco.mjtGeom(model.geom_type[n])
     name = model.geom(n).name
-    return kind in KINDS and model.geom_group[n] != GROUP_HIDDEN and not name.startswith(LIGHTS)
+    return (
+        kind in KINDS and model.geom_group[n] != GROUP_HIDDEN and not name.startswith(LIGHTS)
+    )
 
 
 def shape(model: mujoco.MjModel, data: mujoco.MjData, n: int) -> Shape:

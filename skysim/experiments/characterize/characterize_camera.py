@@ -45,7 +45,10 @@ from skysim.scene.sections.camera import CameraConfig, GaussianPsfConfig
 
 
 def characterize_report(
-    statistics: dict[str, Any], config: CameraConfig, found: MeasuredSensor, night: Night | None
+    statistics: dict[str, Any],
+    config: CameraConfig,
+    found: MeasuredSensor,
+    night: Night | None,
 ) -> Report:
     """The report of a characterized camera from the numbers of `characterize.json`."""
     figures = [
@@ -195,7 +198,9 @@ def draw_dark(axes: Any, dark: DarkCurrent) -> None:
     measured = dark.counts[1:-1] / width
     expected = dark.expected[1:-1] / width
     axes.stairs(measured, dark.edges, color=INK[0], fill=True, alpha=0.4, label="measured")
-    axes.plot((dark.edges[1:] + dark.edges[:-1]) / 2, expected, color=INK[1], label="expected")
+    axes.plot(
+        (dark.edges[1:] + dark.edges[:-1]) / 2, expected, color=INK[1], label="expected"
+    )
     axes.set_xscale("symlog", linthresh=dark.mean.value)
     axes.set(yscale="log", xlabel="dark current [DN/s]", ylabel="pixels per DN/s")
     axes.legend()

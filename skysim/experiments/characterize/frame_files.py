@@ -27,7 +27,12 @@ from skysim.core.files import atomic_file, make_folder
 from skysim.core.random_streams import random_stream
 from skysim.core.text import read_named_rows
 from skysim.core.types import Floats
-from skysim.experiments.characterize.photon_transfer import FIT_RANGE, Level, LevelBuilder, Mask
+from skysim.experiments.characterize.photon_transfer import (
+    FIT_RANGE,
+    Level,
+    LevelBuilder,
+    Mask,
+)
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig
 
 TABLE = "frames.csv"
@@ -79,7 +84,9 @@ def read_frames(folder: Path) -> Iterator[tuple[Path, Setting, NDArray[np.uint16
     for path in image_files(folder):
         parent = path.parent
         if parent not in tables:
-            tables[parent] = read_settings(parent / TABLE) if (parent / TABLE).exists() else {}
+            tables[parent] = (
+                read_settings(parent / TABLE) if (parent / TABLE).exists() else {}
+            )
         picture = images.read_picture(path)
         yield (
             path,
@@ -182,7 +189,9 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
         builders.setdefault(setting, LevelBuilder()).add(numbers)
         stack.medians.setdefault(setting, []).append((float(np.median(numbers)), path))
     check_settings(stack, builders)
-    for setting in sorted(builders, key=lambda one: (one.exposure_s, one.temperature_c or 0.0)):
+    for setting in sorted(
+        builders, key=lambda one: (one.exposure_s, one.temperature_c or 0.0)
+    ):
         stack.levels.append(builders[setting].level(*setting))
     return stack
 
@@ -201,7 +210,9 @@ def check_settings(stack: Stack, builders: dict[Setting, LevelBuilder]) -> None:
     for setting, builder in builders.items():
         if builder.frames < 2:
             path = stack.medians[setting][0][1]
-            raise InputError(path, f"the only frame of {describe(setting)}", "2 or more, alike")
+            raise InputError(
+                path, f"the only frame of {describe(setting)}", "2 or more, alike"
+            )
     unknown = [setting for setting in builders if setting.temperature_c is None]
     if unknown and len(unknown) < len(builders):
         path = stack.medians[unknown[0]][0][1]
@@ -242,7 +253,9 @@ class PlannedFrame(NamedTuple):
 
 def shots(config: DetectorConfig) -> Iterator[PlannedFrame]:
     """Darks at three exposures and two temperatures, flats in pairs from 2 to 150 % of the full well."""
-    own_c = config.dark_temperature_c if config.temperature_c is None else config.temperature_c
+    own_c = (
+        config.dark_temperature_c if config.temperature_c is None else config.temperature_c
+    )
     own_e_s = config.dark_e_s * 2.0**config.doublings
     wanted_e = min(
         max(DARK_NOISES * config.read_noise_e**2, LEAST_DARK_E), capacity_e(config) / 16
@@ -291,7 +304,9 @@ def write_frames(camera: CameraConfig, folder: Path, seed: int) -> Iterator[Path
 
     for shot in shots(camera.detector):
         parent = make_folder(folder / shot.kind)
-        name = f"{shot.kind[:-1]}_{shot.exposure_s:g}s_{shot.temperature_c:g}C".replace("/", "")
+        name = f"{shot.kind[:-1]}_{shot.exposure_s:g}s_{shot.temperature_c:g}C".replace(
+            "/", ""
+        )
         for n, frame in enumerate(frames_of(camera, shot, seed)):
             header = fits.Header()
             header["EXPTIME"] = (shot.exposure_s, "exposure [s]")
@@ -323,7 +338,9 @@ MAX_PAIR_CHANGE = 0.03  # greatest relative change of the light from frame to fr
 SPOT_SIGMAS = 12.0  # standard deviations above which a pixel is bright
 SPOT_PIXELS = 4  # least number of touching bright pixels of a spot
 MAX_SPOTS = 3  # greatest number of spots beyond those expected by chance
-POLYPLETS = 110  # figures of four squares that touch by sides or corners, fixed (OEIS A006770)
+POLYPLETS = (
+    110  # figures of four squares that touch by sides or corners, fixed (OEIS A006770)
+)
 
 
 class BrightSpots(NamedTuple):

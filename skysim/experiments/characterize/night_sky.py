@@ -179,7 +179,9 @@ def summary(
     v = (span - p[:, Y, None]) / sy2[:, None]
     gx = integrals(p[:, X], p[:, LN_SX])[0]
     gy = integrals(p[:, Y], p[:, LN_SY])[0]
-    tilt = p[:, FLUX, None] * ((v * gy)[:, :, None] * (u * gx)[:, None, :]).reshape(len(p), -1)
+    tilt = p[:, FLUX, None] * ((v * gy)[:, :, None] * (u * gx)[:, None, :]).reshape(
+        len(p), -1
+    )
     covariance_px2 = np.sum(tilt * residual, axis=1) / np.maximum(
         np.sum(tilt**2, axis=1), 1e-300
     )
@@ -272,7 +274,9 @@ def measure_night(
     config: CameraConfig, folder: Path, transfer: Transfer, saturation_dn: float
 ) -> Night:
     """The lens from frames of the sky. Raises InputError for frames that cannot be used."""
-    frames = [read_frame(path, config, transfer, saturation_dn) for path in image_files(folder)]
+    frames = [
+        read_frame(path, config, transfer, saturation_dn) for path in image_files(folder)
+    ]
     still = [without_trail(one.stars) for one in frames]
     stars = StarImages(*(np.concatenate(part) for part in zip(*still, strict=True)))
     if len(stars.chi2) < LEAST_STARS:
@@ -287,7 +291,9 @@ def measure_night(
     center_px = lens.camera.center_px if lens else config.center_px
     size = image_size(stars, center_px, config.corner_px)
     if size is None:
-        raise InputError(folder, "no star's image is a Gaussian", "stars in focus, not trailed")
+        raise InputError(
+            folder, "no star's image is a Gaussian", "stars in focus, not trailed"
+        )
     if size.left_out > 0.5 * len(stars.chi2):
         remarks.append(
             f"psf: {size.left_out} of {len(stars.chi2)} star images are no Gaussians, and were left out"
@@ -318,7 +324,9 @@ def read_frame(
     chosen = measurable(numbers, centroids, transfer, saturation_dn)
     gain = float(transfer.values[GAIN])
     read = float(transfer.values[READ])
-    return NightFrame(path, centroids, fit_images(signal, chosen, gain, read), picture.date_utc)
+    return NightFrame(
+        path, centroids, fit_images(signal, chosen, gain, read), picture.date_utc
+    )
 
 
 def settings_of(transfer: Transfer, saturation_dn: float) -> Settings:

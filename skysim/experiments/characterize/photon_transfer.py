@@ -266,7 +266,9 @@ class Transfer(NamedTuple):
 
     @property
     def gain_e_dn(self) -> Estimate:
-        return Estimate.normal(*propagate(lambda p: 1 / p[GAIN], self.values, self.covariance))
+        return Estimate.normal(
+            *propagate(lambda p: 1 / p[GAIN], self.values, self.covariance)
+        )
 
     @property
     def read_noise_e(self) -> Estimate:

@@ -30,9 +30,7 @@ from skysim.experiments.characterize.photon_transfer import (
 HOT_SIGMAS = (
     20.0  # above the median dark, beyond which pixels are left out of the photon transfer
 )
-HIT_SIGMAS = (
-    8.0  # difference between the halves of a pixel's frames beyond which a particle has hit it
-)
+HIT_SIGMAS = 8.0  # difference between the halves of a pixel's frames beyond which a particle has hit it
 
 
 class MeasuredSensor(NamedTuple):
@@ -77,7 +75,8 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
     """
     usable = usable_pixels(darks)
     temperatures = sorted(
-        {one.temperature_c for one in darks}, key=lambda one: -math.inf if one is None else one
+        {one.temperature_c for one in darks},
+        key=lambda one: -math.inf if one is None else one,
     )
     own = nearest_index(temperatures, flats[0].temperature_c)
     dark_points = [
@@ -86,7 +85,9 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
         )
         for one in darks
     ]
-    flat_points = [TransferPoint(one.exposure_s, 1, own, one.moments(usable)) for one in flats]
+    flat_points = [
+        TransferPoint(one.exposure_s, 1, own, one.moments(usable)) for one in flats
+    ]
     black_dn = min(point.moments.mean_dn for point in dark_points)
     below = photon_transfer.unsaturated(flat_points, black_dn)
     fitted = [one for one, is_below in zip(flats, below, strict=True) if is_below]
@@ -168,7 +169,9 @@ def nearest_index(temperatures: Sequence[float | None], temperature_c: float | N
     """Index of the darks' temperature that is nearest to a temperature; 0 if one of them is unknown."""
     if temperature_c is None or temperatures[0] is None:
         return 0
-    return int(np.argmin([abs(one - temperature_c) for one in temperatures if one is not None]))
+    return int(
+        np.argmin([abs(one - temperature_c) for one in temperatures if one is not None])
+    )
 
 
 def best_temperature(

@@ -45,7 +45,11 @@ STREAKS_PX = (
 )  # lengths of the streaks, which give the rates
 SEQUENCE = (0, 1, 2, 4, 8, 16)  # frames of a sequence at a constant rate
 SEQUENCE_RATES = 4  # number of the slowest rates that have sequences, as rest has
-FAINTER = (-1.0, -0.5, 0.5)  # magnitudes by which the limit of the tracker's catalog is varied
+FAINTER = (
+    -1.0,
+    -0.5,
+    0.5,
+)  # magnitudes by which the limit of the tracker's catalog is varied
 # Error and number of the true centroids in trials with false ones.
 FALSE_STARS_PX = 0.05
 TRUE_STARS = 20
@@ -143,7 +147,9 @@ def states_c(scene: Scene, count: int) -> list[float]:
     if config is None:
         return []
     history = config.temperature
-    hours = np.linspace(0, getattr(history, "period_s", DAY_S) / HOUR_S, count, endpoint=False)
+    hours = np.linspace(
+        0, getattr(history, "period_s", DAY_S) / HOUR_S, count, endpoint=False
+    )
     if history.kind == "table":
         hours = np.linspace(history.hours[0], history.hours[-1], count)
     if history.kind == "steady":
@@ -194,7 +200,9 @@ class Designer:
         """All cells, in the order in which they are run."""
         yield from self.terms()
         combinations = self.units * self.states
-        yield from self.draws("total", math.ceil(self.size.draws / combinations) * combinations)
+        yield from self.draws(
+            "total", math.ceil(self.size.draws / combinations) * combinations
+        )
         for number in range(self.size.sky):
             settings = self.settings(Draw(100 + number, number))
             settings["trial.attitude_seed"] = 1 + number
@@ -252,7 +260,9 @@ class Designer:
     def accelerations(self) -> Iterator[DatasheetCell]:
         """Two frames of each attitude at accelerations, with a rate of zero at mid-exposure."""
         for bend in BENDS_PX:
-            acceleration = float(f"{bend * self.pixel_deg / self.scene.exposure.time_s**2:.2g}")
+            acceleration = float(
+                f"{bend * self.pixel_deg / self.scene.exposure.time_s**2:.2g}"
+            )
             change = {"trial.acceleration_deg_s2": acceleration}
             for frame in range(2):
                 levels = {"acceleration_deg_s2": acceleration, "frame": frame}
@@ -267,7 +277,9 @@ class Designer:
         if not tracks(self.scene):
             return
         between_s = 1 / self.scene.exposure.rate_hz
-        bends = [float(f"{missed * self.pixel_deg / between_s**2:.2g}") for missed in MISSED_PX]
+        bends = [
+            float(f"{missed * self.pixel_deg / between_s**2:.2g}") for missed in MISSED_PX
+        ]
         motions = [("rate_deg_s", rate) for rate in self.rates_deg_s(TRACKED_STREAKS_PX)]
         motions += [("acceleration_deg_s2", bend) for bend in bends]
         for key, value in motions:
@@ -287,7 +299,9 @@ class Designer:
             limit = self.scene.tracker.limit_mag + step
             for frame in range(2):
                 settings = self.settings(Draw()) | {"tracker.limit_mag": limit}
-                yield DatasheetCell("magnitude", {"limit_mag": limit, "frame": frame}, settings)
+                yield DatasheetCell(
+                    "magnitude", {"limit_mag": limit, "frame": frame}, settings
+                )
 
     def causes(self) -> dict[str, Settings]:
         """Changes of the scene that would lower the error; those without effect on it are left out."""
@@ -451,7 +465,13 @@ def study_tree(
         "trial": {"kind": "frames", **attitudes(scene)},
         "factors": {"cell": {"levels": {cell.name: cell.settings for cell in cells}}},
         "replicates": size.fields,
-        "responses": ["identified", "wrong", "refused", "cross_arcsec_rms", "roll_arcsec_rms"],
+        "responses": [
+            "identified",
+            "wrong",
+            "refused",
+            "cross_arcsec_rms",
+            "roll_arcsec_rms",
+        ],
     }
 
 
@@ -505,7 +525,14 @@ def measure(
             runner.prepare_store(plan, kept, resume=kept.counts()["done"] > 0)
             runner.run(plan, kept, engine, watch(plan.trials) if watch else None)
             return MeasuredFrames(
-                scene, scene_name, overrides, size, designer, cells, read(plan, kept), plan.spec
+                scene,
+                scene_name,
+                overrides,
+                size,
+                designer,
+                cells,
+                read(plan, kept),
+                plan.spec,
             )
     finally:
         engine.close()

@@ -121,7 +121,11 @@ def draw_by(fig: Any, rows: list[dict[str, Any]], key: str, label: str) -> None:
             x, [row[f"nea_{group}"] for row in rows], "o-", color=INK[n], label=f"NEA {group}"
         )
         errors.plot(
-            x, [row[f"rms_{group}"] for row in rows], "s--", color=INK[n], label=f"rms {group}"
+            x,
+            [row[f"rms_{group}"] for row in rows],
+            "s--",
+            color=INK[n],
+            label=f"rms {group}",
         )
     errors.set_yscale("log")
     errors.yaxis.set_major_formatter("{x:g}")
@@ -186,7 +190,14 @@ def command(sheet: MeasuredFrames, quick: bool) -> str:
     for key, value in sheet.overrides.items():
         options += ["--seed", value] if key == "seed" else ["--set", f"{key}={value}"]
     return shlex.join(
-        ["skysim", "datasheet", sheet.scene_name, *options, "--fields", str(sheet.size.fields)]
+        [
+            "skysim",
+            "datasheet",
+            sheet.scene_name,
+            *options,
+            "--fields",
+            str(sheet.size.fields),
+        ]
     )
 
 

@@ -36,7 +36,9 @@ class TrackerError(Fmi3Slave):
         }
         self.register_variable(Float64("time", **independent))
         self.register_variable(
-            Int32("seed", causality=Fmi3Causality.parameter, variability=Fmi3Variability.fixed)
+            Int32(
+                "seed", causality=Fmi3Causality.parameter, variability=Fmi3Variability.fixed
+            )
         )
         self.register_variable(Float64("rate_deg_s", causality=Fmi3Causality.input))
         for name in ("x_arcsec", "y_arcsec", "roll_arcsec"):

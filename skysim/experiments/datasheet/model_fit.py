@@ -28,9 +28,7 @@ from skysim.experiments.datasheet.variance_components import (
 from skysim.experiments.study.execution import setups, trials
 
 GRID = 60  # number of correlation angles that are tried
-LEAST_NOISE = (
-    0.05  # of the mean square at a rate: noise below it cannot be separated from the slow terms
-)
+LEAST_NOISE = 0.05  # of the mean square at a rate: noise below it cannot be separated from the slow terms
 
 
 def constants(sheet: MeasuredFrames) -> dict[str, Any]:
@@ -105,7 +103,9 @@ def errors_by_rate(sheet: MeasuredFrames) -> dict[float, Floats]:
     sequenced = sheet.levels("sequence", "rate_deg_s")
     faster = [rate for rate in sheet.levels("rate", "rate_deg_s") if rate > max(sequenced)]
     found = {rate: sequences(sheet, rate)[1] for rate in sequenced}
-    return found | {rate: sheet.errors(sheet.rows("rate", rate_deg_s=rate)) for rate in faster}
+    return found | {
+        rate: sheet.errors(sheet.rows("rate", rate_deg_s=rate)) for rate in faster
+    }
 
 
 def along_square(
@@ -245,7 +245,9 @@ def agreements(sheet: MeasuredFrames) -> list[Agreement]:
 def of_one_unit(sheet: MeasuredFrames) -> ErrorModel:
     """The model of a sheet for the first of its units."""
     unit_mean = term_errors(sheet)[0][:, :, 0].mean(axis=(1, 2, 3, 4))
-    return ErrorModel(constants(sheet) | {"mean": unit_mean.tolist(), "unit": [0.0, 0.0, 0.0]})
+    return ErrorModel(
+        constants(sheet) | {"mean": unit_mean.tolist(), "unit": [0.0, 0.0, 0.0]}
+    )
 
 
 def agreement(

@@ -59,10 +59,14 @@ def counts_of_fields(sheet: MeasuredFrames, rows: list[int]) -> Counts:
 
 def tally(right: Any, false: Any) -> Counts:
     """Counts from boolean arrays of right and of false attitudes; all others are refused."""
-    return Counts(right.size, int(right.sum()), int((~right & ~false).sum()), int(false.sum()))
+    return Counts(
+        right.size, int(right.sum()), int((~right & ~false).sum()), int(false.sum())
+    )
 
 
-def runs_needed(share: float, failures: int = 0, confidence: float = metrics.CONFIDENCE) -> int:
+def runs_needed(
+    share: float, failures: int = 0, confidence: float = metrics.CONFIDENCE
+) -> int:
     """Least number of runs that show a probability of success of `share` at this confidence, with so many failures.
 
     Without a failure it is ln(1 - c) / ln(share), rounded up; with failures, the number for which the exact upper bound
@@ -188,7 +192,9 @@ def by_acceleration(sheet: MeasuredFrames) -> list[dict[str, Any]]:
     for acceleration in sheet.levels("acceleration", "acceleration_deg_s2"):
         rows = sheet.rows("acceleration", acceleration_deg_s2=acceleration)
         lag_arcsec = 3600 * acceleration * sheet.scene.exposure.time_s**2 / 24
-        at_rest = rms(sheet, sheet.rows("terms", unit=0, state=0, attitude=0), GROUPS["across"])
+        at_rest = rms(
+            sheet, sheet.rows("terms", unit=0, state=0, attitude=0), GROUPS["across"]
+        )
         predicted = math.sqrt(at_rest**2 + lag_arcsec**2 / 2)  # about one of two axes
         row = {"acceleration_deg_s2": acceleration, "counts": counts_of_fields(sheet, rows)}
         found.append(row | {"predicted_across": predicted} | rms_by_group(sheet, rows))

@@ -128,7 +128,9 @@ def limits(statement: Statement) -> dict[str, Any]:
         {
             mode: {
                 key: performance.bracket(rows, key)
-                for key, rows in zip(("rate_deg_s", "acceleration_deg_s2"), tables, strict=True)
+                for key, rows in zip(
+                    ("rate_deg_s", "acceleration_deg_s2"), tables, strict=True
+                )
             }
             for mode, tables in measured.items()
             if tables[0]
@@ -271,7 +273,9 @@ def probability_section(statement: Statement) -> StatementSection:
     """Probabilities of right, refused and false attitudes, and the claims that the frames support."""
     counts = statement.counts
     where = (
-        "the whole sky" if statement.sheet.designer.under_stars else "the tilts of the vehicle"
+        "the whole sky"
+        if statement.sheet.designer.under_stars
+        else "the tilts of the vehicle"
     )
     shares = ", ".join(
         f"{kind} {percent(counts.share(kind))} %" for kind in ("right", "refused", "false")
@@ -313,7 +317,9 @@ def probability_section(statement: Statement) -> StatementSection:
         "runs needed without failure",
         "more runs, if none fails",
     ]
-    return StatementSection("Right, refused and false attitudes", texts, headers, rows, ["sky"])
+    return StatementSection(
+        "Right, refused and false attitudes", texts, headers, rows, ["sky"]
+    )
 
 
 def quantile_section(statement: Statement) -> StatementSection:
@@ -383,7 +389,9 @@ def bracket_text(what: str, limit: Limit, unit: str) -> str:
     """A sentence on a limit, for fields that are right in both of their frames."""
     if limit.fields < runs_needed(limit.share):
         return f"Limit of {what}: not established: {limit.fields} attitudes, {runs_needed(limit.share)} needed."
-    above = "at no level tested" if math.isnan(limit.above) else f"up to {limit.above:g} {unit}"
+    above = (
+        "at no level tested" if math.isnan(limit.above) else f"up to {limit.above:g} {unit}"
+    )
     below = "at none tested" if math.isinf(limit.below) else f"from {limit.below:g} {unit} on"
     share = f"{100 * limit.share:g} %"
     return f"Limit of {what}: {share} of right attitudes are shown {above}; fewer than {share} are shown {below}."

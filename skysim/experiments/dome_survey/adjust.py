@@ -102,7 +102,9 @@ def run_survey(
         rows = [rows[k] for k in selected]
         matches = [matches[k] for k in selected]
         start.update(zip(rows, survey.body_from_lab, strict=True))
-        return with_names(SurveyRun(survey, frames, rows, matches, listed, prior, uncertainty))
+        return with_names(
+            SurveyRun(survey, frames, rows, matches, listed, prior, uncertainty)
+        )
 
     listed = prior.leds
     before = assumed(prior, uncertainty)
@@ -174,7 +176,8 @@ def identified_by_imu(
     """Rows of the frames that the IMU's attitudes identify, and their correspondences. Raises InputError for none."""
     matches = [match_by_imu(frame, prior, uncertainty) for frame in frames]
     shares = [
-        matched_share(frame, match, prior) for frame, match in zip(frames, matches, strict=True)
+        matched_share(frame, match, prior)
+        for frame, match in zip(frames, matches, strict=True)
     ]
     least = max(MIN_MATCHED, MIN_OF_MEDIAN * float(np.median(shares)))
     rows = np.flatnonzero(np.array(shares) >= least).tolist()
@@ -187,7 +190,9 @@ def identified_by_imu(
     return rows, [matches[row] for row in rows]
 
 
-def matched_share(frame: SurveyFrame, match: Correspondences, model: CalibrationPrior) -> float:
+def matched_share(
+    frame: SurveyFrame, match: Correspondences, model: CalibrationPrior
+) -> float:
     """Fraction of a frame's lights that are matched, or of its LEDs if they are fewer; 0 if too few connect it."""
     if len(match.led) < MIN_SHARED_LEDS:
         return 0.0
@@ -343,10 +348,12 @@ def led_visibility(
     """
     visible = identified([match for _, match in pairs], len(prior.leds.id))
     arm_m = prior.lever.camera_body_m
-    camera_m = np.array([frame.body_from_lab.inv().apply(arm_m) for frame, _ in pairs]).reshape(
-        -1, 3
+    camera_m = np.array(
+        [frame.body_from_lab.inv().apply(arm_m) for frame, _ in pairs]
+    ).reshape(-1, 3)
+    angle_rad = survey_subset.ray_angles(
+        prior.leds.position_m, camera_m, *np.nonzero(visible)
     )
-    angle_rad = survey_subset.ray_angles(prior.leds.position_m, camera_m, *np.nonzero(visible))
     return visible & (angle_rad > survey_subset.CONNECTING_RAD)
 
 
@@ -411,5 +418,8 @@ def dome_frame(frame: SurveyFrame, match: Correspondences) -> DomeFrame:
     """Input frame of the adjustment: matched detections with their LEDs, and the start attitude."""
     lights = frame.lights
     return DomeFrame(
-        match.led, lights.xy_px[match.light], lights.sigma_px[match.light], frame.body_from_lab
+        match.led,
+        lights.xy_px[match.light],
+        lights.sigma_px[match.light],
+        frame.body_from_lab,
     )

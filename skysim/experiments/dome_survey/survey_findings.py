@@ -268,7 +268,9 @@ def next_stops(
     return NextStops(further, predicted(model, attitudes, seen))
 
 
-def predicted(model: SurveyModel, body_from_lab: Rotation, seen: Mask) -> SurveyAccuracy | None:
+def predicted(
+    model: SurveyModel, body_from_lab: Rotation, seen: Mask
+) -> SurveyAccuracy | None:
     """The accuracy predicted; None if the frames do not determine the unknowns."""
     try:
         return survey_plan.predict(model, body_from_lab, seen)

@@ -144,7 +144,9 @@ def render_stops(
         yield render_at_rest(lab.camera, attitude, first + n)
 
 
-def take_frames(lab: Lab, lab_from_body: Rotation) -> Iterator[tuple[Frame, Truth, Centroids]]:
+def take_frames(
+    lab: Lab, lab_from_body: Rotation
+) -> Iterator[tuple[Frame, Truth, Centroids]]:
     """Each frame at these stops, with its truth and its detections."""
     settings = factory.assumed_settings(lab.scene)
     camera = onboard_model.assumed_camera(lab.scene)

@@ -228,7 +228,9 @@ class WatchedFolder:
         news = News([], [])
         paths = best_images(self.folder)
         names = {path.name for path in paths}
-        self._lights = {name: lights for name, lights in self._lights.items() if name in names}
+        self._lights = {
+            name: lights for name, lights in self._lights.items() if name in names
+        }
         for path in [*paths, self.folder / ATTITUDES]:
             stamp = stamp_of(path)
             before = self._seen.get(path.name)

@@ -151,11 +151,15 @@ def prior_of(lab: Lab, camera: Camera, leds: LedMap) -> CalibrationPrior:
     lever = onboard_model.assumed_lever(scene, lab.camera.mount)
     light = require_dome(scene)
     code = (
-        onboard_model.assumed_code(light, lab.camera.sources, leds) if light.led.code else None
+        onboard_model.assumed_code(light, lab.camera.sources, leds)
+        if light.led.code
+        else None
     )
     floor_px = scene.tracker.centroid_sigma_px
     disk_m = light.led.disk_diameter_m
-    return CalibrationPrior(camera, leds, lever, floor_px, disk_m, levels / levels.max(), code)
+    return CalibrationPrior(
+        camera, leds, lever, floor_px, disk_m, levels / levels.max(), code
+    )
 
 
 def design_of(lab: Lab) -> Sources:

@@ -165,7 +165,9 @@ def survey_images(
     run = run_survey(frames, prior, uncertainty, fit_distortion, watch)
     while len(frames) < len(pictures):
         found = run.survey
-        model = replace(prior, camera=found.camera, leds=found.surveyed_leds, lever=found.lever)
+        model = replace(
+            prior, camera=found.camera, leds=found.surveyed_leds, lever=found.lever
+        )
         known = {frame.index: frame.body_from_lab.inv() for frame in frames}
         named = [
             picture._replace(lab_from_body=known.get(n)) for n, picture in enumerate(pictures)
@@ -245,7 +247,11 @@ def comparison(plan: HeldAttitudes, errors: list[SimulatedErrors]) -> list[dict[
     rows = (
         ("LED place mm", accuracy["led_mm"], 1e6 * np.array([one.led_m2 for one in errors])),
         ("lever mm", accuracy["lever_mm"], 1e6 * np.array([one.lever_m2 for one in errors])),
-        ("focal length px", accuracy["focal_px"], np.array([one.focal_px2 for one in errors])),
+        (
+            "focal length px",
+            accuracy["focal_px"],
+            np.array([one.focal_px2 for one in errors]),
+        ),
     )
     return [compared(*row) for row in rows]
 

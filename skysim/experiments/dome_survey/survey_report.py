@@ -216,7 +216,10 @@ def residual_figure(run: SurveyRun) -> bytes:
         left, right = fig.subplots(1, 2)
         draw_histogram(left, residual_px.ravel(), run.noise_px)
         draw_means(
-            right, xy_px, residual_px, (run.survey.camera.width_px, run.survey.camera.height_px)
+            right,
+            xy_px,
+            residual_px,
+            (run.survey.camera.width_px, run.survey.camera.height_px),
         )
 
     return png(draw, (10, 4))
@@ -240,7 +243,9 @@ def draw_histogram(axes: Any, residual_px: Floats, noise_px: float) -> None:
     axes.legend()
 
 
-def draw_means(axes: Any, xy_px: Floats, residual_px: Floats, size_px: tuple[int, int]) -> None:
+def draw_means(
+    axes: Any, xy_px: Floats, residual_px: Floats, size_px: tuple[int, int]
+) -> None:
     """Mean residuals in cells of the chip: a pattern is a distortion that the lens model lacks."""
     width_px = size_px[0] / CELLS
     cell = (xy_px // width_px).astype(np.int64)
@@ -433,7 +438,9 @@ def draw_coverage(
         for name, (numbers, marker, color) in marks.items():
             rows = rows_of(numbers, leds.id)
             colors = (
-                {"color": color} if marker == "x" else {"facecolor": "none", "edgecolor": color}
+                {"color": color}
+                if marker == "x"
+                else {"facecolor": "none", "edgecolor": color}
             )
             if len(rows):
                 axes.scatter(x_m[rows], y_m[rows], 70, marker=marker, label=name, **colors)
@@ -442,7 +449,9 @@ def draw_coverage(
                 axes.annotate(str(leds.id[row]), (x_m[row], y_m[row]), (6, 6), **text)
     if further is not None:
         lever = so_far.model.lever
-        toward = further.apply(lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])).reshape(-1, 3)
+        toward = further.apply(lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])).reshape(
+            -1, 3
+        )
         for n, (u, attitude) in enumerate(zip(toward, further, strict=True)):
             at = on_surface(u[None], attitude.apply(lever.camera_body_m), leds)[0]
             axes.annotate(str(n + 1), at[:2], color="tab:blue", ha="center", weight="bold")

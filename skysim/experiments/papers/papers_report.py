@@ -50,7 +50,9 @@ def papers_report(
     papers = dict.fromkeys(one.published.paper for one in reproductions)
     blocks = [
         verdict(reproductions),
-        Text(INTRODUCTION.format(seed=seed, quick=", quick: wider intervals" if quick else "")),
+        Text(
+            INTRODUCTION.format(seed=seed, quick=", quick: wider intervals" if quick else "")
+        ),
         Items(MEANINGS),
         Section("Experiments", [contents(reproductions)]),
         *(
@@ -131,7 +133,10 @@ def comparison_table(comparisons: Sequence[Comparison]) -> Table:
     columns += [text_column("verdict"), Column("note", kind="aside")]
     rows = []
     for one in comparisons:
-        numbers = [compare.format_with_source(one.row), compare.format_summary(one.result.ours)]
+        numbers = [
+            compare.format_with_source(one.row),
+            compare.format_summary(one.result.ours),
+        ]
         rows.append(
             [one.row.quantity, *numbers, Cell(one.verdict, TONES[one.verdict]), one.note]
         )

@@ -217,13 +217,17 @@ def ranges(study: Study, lines: Sequence[PointRow]) -> list[str]:
     if not done:
         return []
     place = placer(study, done)
-    return [response_range(name, done, place) for name in study.responses if name not in SHARES]
+    return [
+        response_range(name, done, place) for name in study.responses if name not in SHARES
+    ]
 
 
 def placer(study: Study, lines: Sequence[PointRow]) -> Place:
     """The function that names a point by the levels that vary: "leds = 900, rate = 8 deg/s"."""
     varied = [
-        name for name in study.factors if len(distinct(line.levels[name] for line in lines)) > 1
+        name
+        for name in study.factors
+        if len(distinct(line.levels[name] for line in lines)) > 1
     ]
     units = {name: unit_of(axis(study, lines, name)) for name in varied}
 
@@ -258,7 +262,9 @@ def response_range(name: str, lines: Sequence[PointRow], place: Place) -> str:
     least, most = extremes(name, points)
     low, high = (format_summary(line.responses[name]) for line in (least, most))
     if least.responses[name].value == most.responses[name].value:
-        return f"{name}: {low}" + (f" at all {len(points)} points." if len(points) > 1 else ".")
+        return f"{name}: {low}" + (
+            f" at all {len(points)} points." if len(points) > 1 else "."
+        )
     return f"{name}: {low} at {place(least)}, to {high} at {place(most)}."
 
 
@@ -275,7 +281,9 @@ def range_rows(study: Study, lines: Sequence[PointRow]) -> list[list[str]]:
     return rows
 
 
-def event(text: str, shares: Sequence[Summary], lines: Sequence[PointRow], place: Place) -> str:
+def event(
+    text: str, shares: Sequence[Summary], lines: Sequence[PointRow], place: Place
+) -> str:
     """How often an event happens: the point where it is most frequent, and an upper bound where it was never seen."""
     pairs = zip(shares, lines, strict=True)
     known = [(share, line) for share, line in pairs if np.isfinite(share.value)]
@@ -287,7 +295,9 @@ def event(text: str, shares: Sequence[Summary], lines: Sequence[PointRow], place
     most, line = max(known, key=lambda pair: pair[0].value)
     where = ""
     if len(known) > 1:
-        where = f" at {len(known) - len(never)} of {len(known)} points, most at {place(line)}:"
+        where = (
+            f" at {len(known) - len(never)} of {len(known)} points, most at {place(line)}:"
+        )
     found = f"{text}:{where} {percent(most.value)} of the frames ({interval(most)})"
     return f"{found}; {none_of(never)} at the other points." if never else f"{found}."
 
@@ -307,7 +317,9 @@ def ambiguity(study: Study, lines: Sequence[PointRow], place: Place) -> str:
     return f"Is it ambiguous anywhere{unit}? {'No' if never else 'Yes'}. {text}"
 
 
-def solved_everywhere(study: Study, lines: Sequence[PointRow], place: Place, worst: str) -> str:
+def solved_everywhere(
+    study: Study, lines: Sequence[PointRow], place: Place, worst: str
+) -> str:
     """A sentence on whether every attitude is solved, and how often and where the tracker refuses one."""
     shares = [line.responses["refused"] for line in lines]
     text = event("Refused (no attitude is returned)", shares, lines, place)

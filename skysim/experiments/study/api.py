@@ -78,7 +78,9 @@ def run_study(
     path = folder / store.STORE
     try:
         with store.writing(path) as kept:
-            runner.prepare_store(plan, kept, resume=kept.counts()["done"] > 0, overrides=texts)
+            runner.prepare_store(
+                plan, kept, resume=kept.counts()["done"] > 0, overrides=texts
+            )
             progress = runner.run(plan, kept, engine)
     finally:
         engine.close()

@@ -172,7 +172,9 @@ class Distribution(KeyedFactor):
         ]
         units = {
             unit
-            for _, unit in (quantities[:1] if self.distribution == "lognormal" else quantities)
+            for _, unit in (
+                quantities[:1] if self.distribution == "lognormal" else quantities
+            )
         }
         if len(units) > 1:
             raise InputError(

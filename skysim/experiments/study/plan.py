@@ -565,7 +565,9 @@ def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:
     values = spec.base | settings
     name = str(values.pop("scene", spec.scene))
     local = Path(spec.folder) / name
-    path = local if local.suffix in {".yaml", ".yml"} and is_file(local) else loader.find(name)
+    path = (
+        local if local.suffix in {".yaml", ".yml"} and is_file(local) else loader.find(name)
+    )
     overrides = {
         key: one_line(value) for key, value in values.items() if not key.startswith(TRIAL)
     }

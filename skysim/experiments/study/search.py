@@ -184,7 +184,9 @@ def check(study: Study) -> None:
         check_response(objective.response, f"optimize.objectives.{n}.response")
     first, *others = (one.response for one in config.objectives)
     if first in others:
-        raise InputError("optimize.objectives", f"{first} occurs twice", "different responses")
+        raise InputError(
+            "optimize.objectives", f"{first} occurs twice", "different responses"
+        )
     for n, limit in enumerate(config.constraints):
         check_response(limit.response, f"optimize.constraints.{n}.response")
         if limit.at_least is None and limit.at_most is None:
@@ -387,7 +389,9 @@ def propose(
                 chosen[name] = factor.value_at(proposal.suggest_float(name, 0.0, 1.0))
             else:
                 options = factor.options()
-                chosen[name] = options[proposal.suggest_categorical(name, range(len(options)))]
+                chosen[name] = options[
+                    proposal.suggest_categorical(name, range(len(options)))
+                ]
         point = make_point(chosen)
         if key_of(point) not in evaluated:
             return proposal, point

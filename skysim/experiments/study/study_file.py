@@ -151,7 +151,9 @@ def check(plan: Plan, to_run: bool) -> None:
     for name in study.factors:
         if name in COLUMNS or name in study.responses:
             raise InputError(
-                f"factors.{name}", "the name is that of a column of the trials", "another name"
+                f"factors.{name}",
+                "the name is that of a column of the trials",
+                "another name",
             )
     check_hardware(study)
     points = []
@@ -234,7 +236,9 @@ def check_hardware(study: Study) -> None:
 
 def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
     """Raise InputError if the trial does not fit the scene of a level."""
-    if isinstance(scene.light, CollimatedDisplayConfig) and not isinstance(trial, FlightTrial):
+    if isinstance(scene.light, CollimatedDisplayConfig) and not isinstance(
+        trial, FlightTrial
+    ):
         raise InputError("trial.kind", f"{trial.kind} with a collimated display", "flight")
     if scene.tracker.decoder and isinstance(trial, FrameTrial):
         raise InputError(
@@ -254,7 +258,9 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
     if near and not BODIES_YEARS[0] <= scene.start_time.year <= BODIES_YEARS[1]:
         first, last = BODIES_YEARS
         raise InputError(
-            "trial.near", f"start_time {scene.start_time} is outside {first} to {last}", "none"
+            "trial.near",
+            f"start_time {scene.start_time} is outside {first} to {last}",
+            "none",
         )
     if to_run:
         tracker = scene.tracker.name
@@ -310,7 +316,9 @@ def check_measured(study: Study, kinds: set[str], scenes: Sequence[Scene]) -> No
         measured = MEASURED_BY.get(metrics.split_name(name)[0], kinds)
         if not kinds & set(measured):
             raise InputError(
-                key, f"{name} in trials of kind {', '.join(kinds)}", f"of {', '.join(measured)}"
+                key,
+                f"{name} in trials of kind {', '.join(kinds)}",
+                f"of {', '.join(measured)}",
             )
         if name == "ambiguous" and not any(map(may_report_ambiguity, scenes)):
             raise InputError(
@@ -348,7 +356,9 @@ def check_random_start(scene: Scene, start: AttitudeRange) -> None:
                 f"has no effect with light of kind {scene.light.kind}",
                 "none",
             )
-    greatest_deg = max(start.tilt_deg) if isinstance(start.tilt_deg, tuple) else start.tilt_deg
+    greatest_deg = (
+        max(start.tilt_deg) if isinstance(start.tilt_deg, tuple) else start.tilt_deg
+    )
     vehicle = scene.vehicle
     if dome and vehicle.mount == "air_bearing" and greatest_deg > vehicle.tilt_stop_deg:
         raise InputError(

@@ -16,7 +16,13 @@ from skysim.core.errors import InputError, unknown_name
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.study.execution.store import Store
-from skysim.experiments.study.factors import Distribution, Levels, Range, Value, split_quantity
+from skysim.experiments.study.factors import (
+    Distribution,
+    Levels,
+    Range,
+    Value,
+    split_quantity,
+)
 from skysim.experiments.study.plan import Figure, Plan, Study, Threshold
 from skysim.results import metrics
 from skysim.results.files.row_parts import Rows
@@ -406,7 +412,9 @@ def shown_points(lines: Sequence[PointRow], shown: Shown, study: Study) -> list[
     return points_at(lines, study, fixed_levels(shown, study, lines))
 
 
-def check_levels(levels: Mapping[str, Value], study: Study, lines: Sequence[PointRow]) -> None:
+def check_levels(
+    levels: Mapping[str, Value], study: Study, lines: Sequence[PointRow]
+) -> None:
     """Raise InputError for an unknown factor, or a level at which there is no point."""
     for name, level in levels.items():
         if name not in study.factors:

@@ -125,7 +125,9 @@ def trials_needed(share: float, limit: float, above: bool) -> int:
     side, sign = (0, 1.0) if above else (1, -1.0)
 
     def certain(count: int) -> bool:
-        return sign * (metrics.exact_bounds(share * count, count, 1 - TAIL)[side] - limit) >= 0
+        return (
+            sign * (metrics.exact_bounds(share * count, count, 1 - TAIL)[side] - limit) >= 0
+        )
 
     if not certain(MOST_TRIALS):
         return 0
@@ -239,7 +241,8 @@ def sentences(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> 
         else ""
     )
     return [
-        (f"{threshold.by} = {label}{unit}: " if label else "") + describe(one, threshold, axis)
+        (f"{threshold.by} = {label}{unit}: " if label else "")
+        + describe(one, threshold, axis)
         for label, one in crossings(threshold, study, lines).items()
     ]
 

@@ -50,7 +50,9 @@ DYNAMICS = (
 def on_ground(scene: Scene, trial: Trial) -> bool:
     """Whether the view of a trial depends on the site."""
     near = getattr(trial, "near", None)
-    return unused_rules.seen_from_ground(scene) or (near is not None and near.body == "zenith")
+    return unused_rules.seen_from_ground(scene) or (
+        near is not None and near.body == "zenith"
+    )
 
 
 DETECTOR = tuple(
@@ -143,7 +145,10 @@ RULES = (
         "trial.near.off_deg",
     ),
     Rule(
-        ("seed",), lambda scene, trial: True, "every trial has its own seed", "the study's seed"
+        ("seed",),
+        lambda scene, trial: True,
+        "every trial has its own seed",
+        "the study's seed",
     ),
     Rule(
         DYNAMICS,
@@ -153,13 +158,17 @@ RULES = (
     ),
     Rule(
         ("site",),
-        lambda scene, trial: not isinstance(trial, FlightTrial) and not on_ground(scene, trial),
+        lambda scene, trial: (
+            not isinstance(trial, FlightTrial) and not on_ground(scene, trial)
+        ),
         "a trial of one attitude does not simulate the motion, and its sky is that of space",
         "trial.kind: flight, light.air, light.bodies with a site.longitude_deg, or trial.near.body: zenith",
     ),
     Rule(
         ("exposure.frames",),
-        lambda scene, trial: not isinstance(trial, FlightTrial) and scene.exposure.frames != 1,
+        lambda scene, trial: (
+            not isinstance(trial, FlightTrial) and scene.exposure.frames != 1
+        ),
         "a trial is one frame",
         "1, or trial.kind: flight",
     ),
@@ -210,7 +219,9 @@ RULES = (
             "light.led.pwm_period",
             "light.led.clock",
         ),
-        lambda scene, trial: isinstance(trial, CentroidTrial) and scene.tracker.decoder is None,
+        lambda scene, trial: (
+            isinstance(trial, CentroidTrial) and scene.tracker.decoder is None
+        ),
         "a trial of kind centroids has no image: trial.noise_px is the centroids' error",
         "trial.kind: frames, or tracker.decoder, which reads the lights' brightness",
     ),
@@ -274,7 +285,10 @@ def check(plan: Plan, points: Iterable[CheckedPoint], resolve: Resolve) -> None:
         Function from the settings of all factors to the scene and the trial
     """
     # 1. Faults by factor and level ("" for `set` and `trial`), and key; None for a key with an effect.
-    written = [*plan.spec.base, *(f"{TRIAL}{key}" for key in plan.spec.trial if key != "kind")]
+    written = [
+        *plan.spec.base,
+        *(f"{TRIAL}{key}" for key in plan.spec.trial if key != "kind"),
+    ]
     faults: dict[tuple[str, str, str], Fault | None] = {}
     for point in points:
         keys = [("", "", key) for key in written if key not in point.settings]

@@ -123,7 +123,9 @@ def worst_trials(columns: Columns, response: str, count: int = COUNT) -> list[Wo
     return chosen
 
 
-def worst_first(keys: Sequence[Floats], rows: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+def worst_first(
+    keys: Sequence[Floats], rows: NDArray[np.int64]
+) -> Iterator[NDArray[np.int64]]:
     """Rows in the order of their keys, in blocks: about FIRST, then ten times as many, since few are needed."""
     most = FIRST
     while len(rows) and keys:

@@ -189,7 +189,9 @@ def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
         return path
 
     a_from_b = Rotation.concatenate([rotation for *_, rotation in true])
-    written = [write("truth", "True attitude at mid-exposure", list(epochs.values()), a_from_b)]
+    written = [
+        write("truth", "True attitude at mid-exposure", list(epochs.values()), a_from_b)
+    ]
     solved = run.solved()
     if solved is not None:
         unknown = [frame for frame in solved[0].tolist() if frame not in epochs]
@@ -453,7 +455,9 @@ def to_video(run: Recording, out: Path, bar: Bar) -> list[Path]:
                 )
             for stem in bar(run.stems, len(run.stems), "video"):
                 image = check_same_format(run.image(stem), first, stem)
-                gray = plots.to_8bit(image, "square root", levels_dn=(float(low), float(high)))
+                gray = plots.to_8bit(
+                    image, "square root", levels_dn=(float(low), float(high))
+                )
                 with silent_stderr():
                     film.write(np.ascontiguousarray(gray[:height, :width]))
         finally:

@@ -91,7 +91,9 @@ class RimmedConfig(SurfaceConfig):
             self, "apex_m", math.inf
         ):
             raise InputError(
-                "rim_height", f"{self.rim_height_m:g} m is not below the apex", "less than apex"
+                "rim_height",
+                f"{self.rim_height_m:g} m is not below the apex",
+                "less than apex",
             )
         return self
 
@@ -166,7 +168,9 @@ class CylinderSurfaceConfig(SurfaceConfig):
             raise InputError("", "a cylinder about z requires length, from apex down")
         if self.rim_height_m is not None and self.rim_height_m >= self.apex_m:
             raise InputError(
-                "rim_height", f"{self.rim_height_m:g} m is not below the apex", "less than apex"
+                "rim_height",
+                f"{self.rim_height_m:g} m is not below the apex",
+                "less than apex",
             )
         return self
 
@@ -256,7 +260,9 @@ class RoomConfig(ConfigModel):
     bearing_height_m: Annotated[Length, Field(ge=0)] | None = None
     width_m: Annotated[Length, Field(gt=0)] | None = None
     length_m: Annotated[Length, Field(gt=0)] | None = None
-    door_m: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] | None = None
+    door_m: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] | None = (
+        None
+    )
     segments: Annotated[int, Field(ge=1, le=100)] = 1
     thickness_m: Annotated[Length, Field(ge=0)] = 0.0
 
@@ -384,7 +390,8 @@ class DomeConfig(ConfigModel):
             )
         if not display and drive == "refresh":
             raise InputError(
-                "led.drive", f"refresh requires a layout of kind lcd or projector, not {layout}"
+                "led.drive",
+                f"refresh requires a layout of kind lcd or projector, not {layout}",
             )
         return self
 

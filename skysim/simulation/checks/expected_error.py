@@ -121,7 +121,9 @@ def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Common
     shifts_m = survey_errors.station_displacements_m(
         instrument, context.beliefs.lights.place[view.row, :3]
     )
-    parts = [displacement(view, shift_m, lab_from_cam).displacement_px for shift_m in shifts_m]
+    parts = [
+        displacement(view, shift_m, lab_from_cam).displacement_px for shift_m in shifts_m
+    ]
     return Common(np.concatenate(parts, axis=2)) if parts else None
 
 
@@ -199,7 +201,9 @@ def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Com
     return Common((velocity_px_s * delay_s[:, None])[:, :, None])
 
 
-def angular_acceleration(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+def angular_acceleration(
+    view: View, lab_from_cam: Rotation, context: Context
+) -> Common | None:
     """Mean displacement of the images in the exposure from those at mid-exposure, E_i = -J_i a T^2 / 24."""
     return Common(view.bend_px[:, :, None]) if view.bend_px.any() else None
 

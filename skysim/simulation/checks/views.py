@@ -152,7 +152,9 @@ class CameraModel(NamedTuple):
         dark_e_s = detector.dark_e_s * 2.0**detector.doublings
         background_e = sum(glow_e.values()) + dark_e_s * exposure_s
         # Variances of the fixed pattern and of the read-out; a converter's step q has the variance q^2 / 12.
-        pattern_e2 = (detector.dsnu * dark_e_s * exposure_s) ** 2 + detector.column_offset_e**2
+        pattern_e2 = (
+            detector.dsnu * dark_e_s * exposure_s
+        ) ** 2 + detector.column_offset_e**2
         read_e2 = (
             detector.read_noise_e**2
             + detector.reset_noise_e**2
@@ -307,7 +309,9 @@ def image_gradient(optics: Optics, offset_m: Floats) -> Floats:
     """(n, 2, 3) derivatives of the image positions by the offsets in camera axes, from central differences."""
     step_m = STEP * np.linalg.norm(offset_m, axis=1)[:, None, None] * np.eye(3)
     ahead, behind = (optics.project(offset_m[:, None, :] + sign * step_m) for sign in (1, -1))
-    return np.asarray(np.swapaxes(ahead - behind, 1, 2) / (2 * step_m.max(axis=2)[:, None, :]))
+    return np.asarray(
+        np.swapaxes(ahead - behind, 1, 2) / (2 * step_m.max(axis=2)[:, None, :])
+    )
 
 
 def peak_share(

@@ -90,7 +90,9 @@ def seen_points(sky: Sky, points: Sources, exposure: Exposure) -> Sources:
     if not sky.air.config.scintillation or exposure.seeds is None:
         return seen
     rng = random_stream(exposure.seeds.camera, SCINTILLATION, exposure.index)
-    return sky.twinkling(seen, exposure.optics.camera.pupil_m, exposure.window.exposure_s, rng)
+    return sky.twinkling(
+        seen, exposure.optics.camera.pupil_m, exposure.window.exposure_s, rng
+    )
 
 
 def build(plan: LightPlan) -> Iterator[Light]:

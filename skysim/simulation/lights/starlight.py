@@ -64,7 +64,9 @@ def stars_of(config: StarsConfig, plan: LightPlan) -> KnownLight:
     if config.variability_seed is not None:
         if not catalog.scatter_mag.any():
             raise InputError(
-                "light.variability_seed", f"{config.catalog} has no variable stars", "gaia_v8.0"
+                "light.variability_seed",
+                f"{config.catalog} has no variable stars",
+                "gaia_v8.0",
             )
         catalog = stars.varied(catalog, config.variability_seed)
     # Anything that depends on the place of the camera makes its velocity matter for the aberration, too.

@@ -39,9 +39,7 @@ from skysim.sources.satellites import MIRRORED
 
 STEP_RAD = 1e-5  # of the difference quotients: error 1e-10
 STEPS = 12  # of Newton's method
-REACH = (
-    12.0  # largest angle from an LED to a ray of the grid to start from, in the grid's spacing
-)
+REACH = 12.0  # largest angle from an LED to a ray of the grid to start from, in the grid's spacing
 TOUCHING = 1e-4  # an image nearer to the LED itself, in units of the camera's distance, is no reflection
 SAME_RAD = 1e-7  # two solutions for an LED nearer to each other are one image
 CLOSE = 1e-9  # largest offset of a solution from the ray, in units of the LED's distance

@@ -111,7 +111,13 @@ def fit_ellipsoid(points_m: Floats) -> FittedEllipsoid:
         return np.asarray((norm - 1) * norm / np.linalg.norm(w / axes, axis=1))
 
     solution = scipy.optimize.least_squares(
-        residual_m, np.zeros(6), method="lm", xtol=1e-13, ftol=1e-13, gtol=1e-13, max_nfev=4000
+        residual_m,
+        np.zeros(6),
+        method="lm",
+        xtol=1e-13,
+        ftol=1e-13,
+        gtol=1e-13,
+        max_nfev=4000,
     )
     center_m = sphere.center_m + sphere.radius_m * solution.x[:3]
     rms_m = float(np.sqrt(np.mean(solution.fun**2)))
@@ -154,7 +160,9 @@ def zernike(degree: int, disk: Floats) -> tuple[Floats, Floats]:
             # For m = 0 there is no imaginary part.
             for component in (np.real, np.imag)[: 1 + (m > 0)]:
                 values.append(component(value))
-                slopes.append(np.stack([component(derivative) for derivative in slope], axis=1))
+                slopes.append(
+                    np.stack([component(derivative) for derivative in slope], axis=1)
+                )
     return np.stack(values, axis=1), np.stack(slopes, axis=1)
 
 

@@ -38,7 +38,9 @@ def leds_in_view(
 
 
 def true_rays(body_from_lab: Rotation, leds: LedMap, lever: Lever) -> np.ndarray:
-    rays = lever.cam_from_body.apply(body_from_lab.apply(leds.position_m) - lever.camera_body_m)
+    rays = lever.cam_from_body.apply(
+        body_from_lab.apply(leds.position_m) - lever.camera_body_m
+    )
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
@@ -139,7 +141,9 @@ def test_a_sphere_is_an_ellipsoid_of_equal_axes() -> None:
 
 def test_infinite_semi_axes_are_a_ceiling() -> None:
     rays = np.array([[0.6, 0, 0.8], [0, 0, 1]])
-    flat = LedMap(np.arange(0), np.zeros((0, 3)), np.zeros(3), np.array([np.inf, np.inf, 1.2]))
+    flat = LedMap(
+        np.arange(0), np.zeros((0, 3)), np.zeros(3), np.array([np.inf, np.inf, 1.2])
+    )
     met = dome_map.on_surface(rays, np.array([0.1, 0, 0.4]), flat)
     # 0.8 m up along (.6, .8) is 0.6 m across, by hand.
     np.testing.assert_allclose(met, [[0.7, 0, 1.2], [0.1, 0, 1.2]], rtol=0, atol=1e-15)
@@ -296,7 +300,12 @@ def test_rays_on_a_sphere_instead_of_an_ellipsoid_err_by_the_surface_difference(
         real = leds_in_view(rng, truth, LEVER, 5, MEASURED)
         leds = LedMap(real.id, real.position_m, *SPHERE)
         found, _ = nearfield.ray_on_surface(
-            true_rays(truth, real, LEVER), np.full(5, 1e-5), real.position_m, leds, LEVER, truth
+            true_rays(truth, real, LEVER),
+            np.full(5, 1e-5),
+            real.position_m,
+            leds,
+            LEVER,
+            truth,
         )
         errors.append(angle_rad(found, truth))
     rms_deg = np.degrees(np.sqrt(np.mean(np.square(errors))))

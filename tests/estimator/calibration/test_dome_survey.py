@@ -157,7 +157,9 @@ def test_the_derivatives_match_finite_differences_of_the_residuals(block: str) -
     size = 3 * 3 + 3 + 8
     first = {"by_led": 0, "by_rotation": 0, "by_shared": 9}[block]
     for m in [0, len(seen.led) // 2, len(seen.led) - 1]:
-        rows = {"by_led": seen.led, "by_rotation": seen.frame, "by_shared": 0 * seen.led}[block]
+        rows = {"by_led": seen.led, "by_rotation": seen.frame, "by_shared": 0 * seen.led}[
+            block
+        ]
         one = seen.take([m])
         for n in range(exact.shape[2]):
             led = np.zeros(lights)
@@ -306,7 +308,10 @@ def test_the_covariance_matches_the_scatter_of_surveys(
         lens = [found.camera.focal_px, *found.camera.center_px]
         both = [
             ([found.lever.camera_body_m - true_lever], [found.lever_covariance_m2]),
-            ([np.subtract(lens, [SMALL.focal_px, *SMALL.center_px])], [found.lens_covariance]),
+            (
+                [np.subtract(lens, [SMALL.focal_px, *SMALL.center_px])],
+                [found.lens_covariance],
+            ),
             ((found.leds.position_m - true_place)[kept], found.led_covariance_m2[kept]),
             (
                 (found.body_from_lab * true_turned.inv()).as_rotvec(),
@@ -485,7 +490,8 @@ def test_malformed_frames_are_refused_by_number() -> None:
     with pytest.raises(ValueError, match=r"^survey: no frames"):
         survey([], *asked)
     with pytest.raises(
-        ValueError, match=r"^survey: \d+ usable coordinates for \d+ unknowns; take more frames"
+        ValueError,
+        match=r"^survey: \d+ usable coordinates for \d+ unknowns; take more frames",
     ):
         survey(frames[:3], *asked)
 
@@ -617,14 +623,19 @@ def test_the_three_weak_moves_are_conformal_maps() -> None:
     in_lab = block_diag(*R_body_from_lab.transpose(0, 2, 1))
     # Turns of the lab and of the body, the same in every frame, are no errors.
     common = np.hstack(
-        [np.tile(np.eye(3), (count // 3, 1)), R_body_from_lab.transpose(0, 2, 1).reshape(-1, 3)]
+        [
+            np.tile(np.eye(3), (count // 3, 1)),
+            R_body_from_lab.transpose(0, 2, 1).reshape(-1, 3),
+        ]
     )
     axes, _ = np.linalg.qr(common)
     without = np.eye(count) - axes @ axes.T
     moves = np.linalg.eigh(without @ in_lab @ spread[:count, :count] @ in_lab.T @ without)[1][
         :, ::-1
     ]
-    boresight = np.einsum("kji,j->ki", R_body_from_lab, AFIT_LEVER.cam_from_body.as_matrix()[2])
+    boresight = np.einsum(
+        "kji,j->ki", R_body_from_lab, AFIT_LEVER.cam_from_body.as_matrix()[2]
+    )
     boosts, _ = np.linalg.qr(
         without @ np.stack([np.cross(boresight, n).ravel() for n in np.eye(3)], axis=1)
     )

@@ -73,7 +73,9 @@ def dome(rng: np.random.Generator, noise_px: float = 0.0) -> tuple[Bundle, Sight
 
 def nudged(rng: np.random.Generator, true: Bundle, by: float) -> Bundle:
     """The parameters with small random errors."""
-    return true.apply_step(rng.normal(0, by, 3 * LIGHTS), rng.normal(0, by, 3 * FRAMES + 3 + 3))
+    return true.apply_step(
+        rng.normal(0, by, 3 * LIGHTS), rng.normal(0, by, 3 * FRAMES + 3 + 3)
+    )
 
 
 def whole_matrix(terms: ba.NormalEquations) -> Floats:
@@ -381,7 +383,15 @@ def test_the_misfit_is_over_what_the_pixels_determine(
     place_m = found.leds.position_m
     at_m = found.lever.camera_body_m
     bundle = Bundle(
-        place_m, attitudes, at_m, true.R_cam_from_body, lens, 3, leds.position_m, 0.002, assumed
+        place_m,
+        attitudes,
+        at_m,
+        true.R_cam_from_body,
+        lens,
+        3,
+        leds.position_m,
+        0.002,
+        assumed,
     )
     every = ba.linearize(bundle, seen)
     jacobian = np.zeros((len(seen.led), 2, 3 * LIGHTS + 3 * FRAMES + 6))
@@ -446,7 +456,9 @@ def filmed(rng: np.random.Generator, count: int) -> tuple[list[StarFrame], Rotat
 @given(rng=SEEDS, longer=some.floats(-0.03, 0.03))
 def test_star_fields_determine_the_lens(rng: np.random.Generator, longer: float) -> None:
     frames, truths = filmed(rng, 8)
-    sheet = replace(CAMERA.zoomed(1 + longer), center_px=(319.5, 239.5), distortion=(0.0,) * 5)
+    sheet = replace(
+        CAMERA.zoomed(1 + longer), center_px=(319.5, 239.5), distortion=(0.0,) * 5
+    )
     result = star_field.calibrate(frames, sheet)
     assert result.report.status == "converged"
     assert_covariance(result.covariance)

@@ -44,7 +44,9 @@ def test_predicted_errors_grow_with_noise_and_list_errors_and_shrink_with_frames
     seen = assumed.visible(held)
     first = answered(lambda: survey_plan.predict(assumed, held[:25], seen[:25]))
     larger = replace(
-        assumed, sigma_px=factor * assumed.sigma_px, leds_sigma_m=factor * assumed.leds_sigma_m
+        assumed,
+        sigma_px=factor * assumed.sigma_px,
+        leds_sigma_m=factor * assumed.leds_sigma_m,
     )
     scaled = answered(lambda: survey_plan.predict(larger, held[:25], seen[:25]))
     every = answered(lambda: survey_plan.predict(assumed, held, seen))
@@ -73,7 +75,8 @@ def test_a_longer_plan_extends_a_shorter_one(rng: np.random.Generator, count: in
         assert reachable[row] >= min(survey_plan.LEAST_CROSSING, reachable.max())
         covered = covered | shown[row]
     assert (
-        answered(lambda: survey_plan.choose(assumed, candidates, shown[:, :-1], count)) is None
+        answered(lambda: survey_plan.choose(assumed, candidates, shown[:, :-1], count))
+        is None
     )
 
 
@@ -260,7 +263,9 @@ def test_no_other_light_gets_the_name_of_a_dark_led(rng: np.random.Generator) ->
 
 @law(survey_faults.exchanged)
 @given(rng=SEEDS, gain=some.floats(0.1, 10))
-def test_exchanged_lights_are_found_at_any_gain(rng: np.random.Generator, gain: float) -> None:
+def test_exchanged_lights_are_found_at_any_gain(
+    rng: np.random.Generator, gain: float
+) -> None:
     levels = np.exp(np.linspace(0, -3, 12))[rng.permutation(12)]
     shown = np.ones((10, 12), dtype=bool)
     light = gain * levels * np.exp(0.03 * rng.normal(0, 1, (10, 12)))

@@ -124,6 +124,8 @@ def test_brightness_distinguishes_the_fields_of_a_grid() -> None:
         ({"flux_sigma": 0.0}, "leds: flux_sigma"),
     ],
 )
-def test_a_map_with_unusable_fluxes_is_refused(change: dict[str, object], reason: str) -> None:
+def test_a_map_with_unusable_fluxes_is_refused(
+    change: dict[str, object], reason: str
+) -> None:
     with pytest.raises(ImageError, match=reason):
         DomeTracker(CAMERA, replace(grid(LEVELS), **change), LEVER)

@@ -112,7 +112,8 @@ def test_the_information_matches_the_projection_s_derivatives(uncertainty: float
 
     def tangents(change: Floats) -> Floats:
         q = (
-            dome.position_m @ (Rotation.from_rotvec(change[:3]).as_matrix() @ R_cam_from_lab).T
+            dome.position_m
+            @ (Rotation.from_rotvec(change[:3]).as_matrix() @ R_cam_from_lab).T
             - dome.pupil_m
         )
         return 1.07 * np.exp(change[3]) * (q[:, :2] / q[:, 2:]).ravel()
@@ -138,7 +139,9 @@ def test_two_iterations_of_attitude_and_focal_length_reach_the_truth() -> None:
     off = Rotation.from_rotvec(np.radians([0.2, -0.1, 0.2])).as_matrix() @ R_cam_from_lab
     hypothesis = led_evidence.evaluate(zoomed, dome, off, 0, 0, 3, 1.07)
     assert len(hypothesis.star) == 6
-    assert Rotation.from_matrix(hypothesis.R_cam_from_lab @ R_cam_from_lab.T).magnitude() < 1e-5
+    assert (
+        Rotation.from_matrix(hypothesis.R_cam_from_lab @ R_cam_from_lab.T).magnitude() < 1e-5
+    )
     beyond = zoomed._replace(focal_uncertainty=0.05)  # to 6 % at most
     assert led_evidence.evaluate(beyond, dome, off.copy(), 0, 0, 3, 1.07).dex == -np.inf
 
@@ -154,7 +157,14 @@ def test_leds_are_matched_within_the_error_of_their_pair_s_direction(
     each is 0.5 s from the middle, 5.7 sigma from its place, where the gate is 3.5 sqrt(1 + 1 / 2 + 1 / 2) sigma.
     """
     place_m = np.array(
-        [[0.015, 0], [-0.015, 0], [0.04, 0.03], [-0.03, 0.045], [-0.045, -0.03], [0.03, -0.04]]
+        [
+            [0.015, 0],
+            [-0.015, 0],
+            [0.04, 0.03],
+            [-0.03, 0.045],
+            [-0.045, -0.03],
+            [0.03, -0.04],
+        ]
     )
     place_m = np.column_stack([place_m, np.full(6, 1.2192)])
     leds = LedMap(np.arange(6), place_m, np.zeros(3), np.array([np.inf, np.inf, 1.2192]))

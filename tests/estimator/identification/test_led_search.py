@@ -23,7 +23,9 @@ from tests.helpers.interpreted import interpreted
 
 # AFIT's SimSat focused on its LEDs at 33 in; the camera is a little askew.
 CAMERA = Camera(1600, 1200, 8698.0, (799.5, 599.5))
-LEVER = Lever(np.array([0.004, -0.003, 0.381]), Rotation.from_euler("xyz", [0.01, -0.02, 0.3]))
+LEVER = Lever(
+    np.array([0.004, -0.003, 0.381]), Rotation.from_euler("xyz", [0.01, -0.02, 0.3])
+)
 # Measured: 38.88 and 28.60 in.
 OVAL = (np.array([0.0, 0.003, 0.492]), np.array([0.9876, 0.9876, 0.7264]))
 FLAT = np.zeros(3), np.array([np.inf, np.inf, 1.2192])  # a panel at 48 in
@@ -57,7 +59,12 @@ def surveyed(leds: LedMap, seed: int) -> LedMap:
     """The tracker's map: every LED is displaced by ERROR_M along each axis."""
     error_m = ERROR_M * np.random.default_rng(seed).standard_normal(leds.position_m.shape)
     return LedMap(
-        leds.id, leds.position_m + error_m, leds.center_m, leds.semi_axes_m, leds.board, ERROR_M
+        leds.id,
+        leds.position_m + error_m,
+        leds.center_m,
+        leds.semi_axes_m,
+        leds.board,
+        ERROR_M,
     )
 
 
@@ -281,7 +288,9 @@ def test_two_leds_whose_images_touch_are_left_out_of_the_attitude():
             Centroids(pixels, np.full(len(pixels), 0.05), np.ones(len(pixels)))
         )
         assert answer.solved
-        error = (answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()).as_rotvec()
+        error = (
+            answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()
+        ).as_rotvec()
         pulls.append(error @ np.linalg.inv(answer.covariance_rad2) @ error)
     # Chi-square of three or less, a centroid's error having a floor above the noise; deviation sqrt(6 / 30).
     assert np.mean(pulls) < 3 + 3 * np.sqrt(6 / 30)
@@ -303,7 +312,9 @@ def test_the_covariance_includes_the_lever_s_error():
             Centroids(pixels, np.full(len(pixels), NOISE_PX), np.ones(len(pixels)))
         )
         assert answer.solved
-        error = (answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()).as_rotvec()
+        error = (
+            answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()
+        ).as_rotvec()
         nees.append(error[:2] @ np.linalg.inv(answer.covariance_rad2[:2, :2]) @ error[:2])
     # Chi-square of two: mean 2, deviation sqrt(4 / 60).
     assert np.mean(nees) == pytest.approx(2, abs=3 * np.sqrt(4 / 60))
@@ -425,7 +436,9 @@ def test_the_quick_check_stops_once_the_outcome_is_decided(
         focal_uncertainty=0.1,
     )
     assert (
-        PLAIN._quick_check(zoomed, dome, R_grid_from_cam, 1.08, median_m, 0, 1, gates, required)
+        PLAIN._quick_check(
+            zoomed, dome, R_grid_from_cam, 1.08, median_m, 0, 1, gates, required
+        )
         == found
     )
     if found > 2:
@@ -485,7 +498,9 @@ def test_the_prior_of_a_pair_s_attitude_is_its_share_of_all_attitudes() -> None:
     # A length errs relatively as a direction does; a uniform prior of the focal length over +-12 %.
     focal = np.log10(np.sqrt(2 * np.pi) * np.sqrt(covariance[2, 2]) / 0.24)
     uncertain = detections._replace(focal_uncertainty=0.12)
-    assert PLAIN._attitude_dex(uncertain, dome, 0, 1) == pytest.approx(wanted + focal, abs=1e-9)
+    assert PLAIN._attitude_dex(uncertain, dome, 0, 1) == pytest.approx(
+        wanted + focal, abs=1e-9
+    )
 
 
 # ---- a focal length that is known to a tenth
@@ -567,7 +582,9 @@ def test_a_calibrated_tracker_finds_nothing_at_a_focal_length_ten_percent_off() 
         tracker = DomeTracker(CAMERA.zoomed(1.1), leds, LEVER, settings)
         seen = [lights(truth, pose(rng, 25), rng)[0] for _ in range(10)]
         answers = [
-            tracker.solve_centroids(Centroids(one, np.full(len(one), 1e-3), np.ones(len(one))))
+            tracker.solve_centroids(
+                Centroids(one, np.full(len(one), 1e-3), np.ones(len(one)))
+            )
             for one in seen
         ]
         solved.append(sum(answer.solved for answer in answers))

@@ -60,7 +60,9 @@ coordinate = st.one_of(st.floats(-1, 1), st.sampled_from([-1.0, 0.0, 1.0]))
 @settings(deadline=None)
 @given(coordinate, coordinate, coordinate, st.floats(1e-4, 0.05))
 @example(-1.0, -1.0, 0.921875, 0.046875)  # the star stands at a tangent of 1.13 of the face
-def test_the_nearest_star_matches_a_k_d_tree(x: float, y: float, z: float, gate: float) -> None:
+def test_the_nearest_star_matches_a_k_d_tree(
+    x: float, y: float, z: float, gate: float
+) -> None:
     where = np.array([x, y, z]) + 1e-3
     where /= np.linalg.norm(where)
     star, chord2 = sky_index.nearest(
@@ -77,7 +79,8 @@ def test_a_sky_without_a_pattern_is_refused() -> None:
         [0.0, 0.0, 1.0]
     )
     with pytest.raises(
-        ImageError, match=r"2 pairs of stars within 12\.00 deg are too few; allowed: 3 or more"
+        ImageError,
+        match=r"2 pairs of stars within 12\.00 deg are too few; allowed: 3 or more",
     ):
         sky_index.build(in_a_row, MAG[:3], WIDE_RAD)
 

@@ -40,7 +40,9 @@ from tests.helpers.laws import (
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 CAMERA = Camera(640, 480, 900.0, (319.5, 239.5))
 SPHERE = LedMap(np.arange(0), np.empty((0, 3)), np.zeros(3), np.full(3, 1.2))
-OVAL = LedMap(np.arange(0), np.empty((0, 3)), np.array([0, 0, 0.4]), np.array([1.0, 1.0, 0.8]))
+OVAL = LedMap(
+    np.arange(0), np.empty((0, 3)), np.array([0, 0, 0.4]), np.array([1.0, 1.0, 0.8])
+)
 RAYS = arrays("f8", (5, 3), elements=ANY)
 
 
@@ -247,7 +249,10 @@ def test_lights_are_named_correctly_or_not_at_all(
     )
     star = np.flatnonzero(CAMERA.contains(px, 3))
     xy = np.concatenate(
-        [px[star] + rng.normal(0, 0.1, (len(star), 2)), rng.uniform(0, [639, 479], (false, 2))]
+        [
+            px[star] + rng.normal(0, 0.1, (len(star), 2)),
+            rng.uniform(0, [639, 479], (false, 2)),
+        ]
     )
     star = np.concatenate([star, np.full(false, -1)])
     solution = eye.solve_centroids(
@@ -303,7 +308,10 @@ def test_leds_are_named_correctly_at_any_focal_length_or_not_at_all(
     )
     star = np.flatnonzero(CAMERA.contains(px, 3))
     xy = np.concatenate(
-        [px[star] + rng.normal(0, 0.1, (len(star), 2)), rng.uniform(0, [639, 479], (false, 2))]
+        [
+            px[star] + rng.normal(0, 0.1, (len(star), 2)),
+            rng.uniform(0, [639, 479], (false, 2)),
+        ]
     )
     star = np.concatenate([star, np.full(false, -1)])
     camera = CAMERA.zoomed(1 / ratio)
@@ -382,7 +390,9 @@ def test_the_mean_of_many_frames_has_the_claimed_systematic_error(
     arm = Lever(np.array([0.01, 0.0, 0.3]), Rotation.identity())
     body_from_lab = Rotation.from_rotvec([0.1, -0.1, 0.5])
     dome = even(300)
-    px = np.nan_to_num(dome_map.project(body_from_lab, dome.position_m, arm, CAMERA), nan=-1e9)
+    px = np.nan_to_num(
+        dome_map.project(body_from_lab, dome.position_m, arm, CAMERA), nan=-1e9
+    )
     px = px[CAMERA.contains(px, 3)]
     settings = replace(dome_tracker.SETTINGS, centroid_sigma_px=1e-6)
     for survey in range(60):
@@ -391,12 +401,17 @@ def test_the_mean_of_many_frames_has_the_claimed_systematic_error(
         camera_m = arm.camera_body_m + rng.normal(0, lever_mm / 1e3, 3)
         leds = replace(dome, position_m=position_m, sigma_m=led_mm / 1e3)
         tracker = DomeTracker(
-            CAMERA, leds, replace(arm, camera_body_m=camera_m, sigma_m=lever_mm / 1e3), settings
+            CAMERA,
+            leds,
+            replace(arm, camera_body_m=camera_m, sigma_m=lever_mm / 1e3),
+            settings,
         )
         noise = np.full(len(px), noise_px)
         flux = np.linspace(2, 1, len(px))
         draws_px = px + rng.normal(0, noise_px, (frames, *px.shape))
-        found = [tracker.solve_centroids(Centroids(one_px, noise, flux)) for one_px in draws_px]
+        found = [
+            tracker.solve_centroids(Centroids(one_px, noise, flux)) for one_px in draws_px
+        ]
         assert all(one.solved for one in found)
         errors = np.array(
             [(one.cam_from_ref * body_from_lab.inv()).as_rotvec() for one in found]
@@ -431,7 +446,9 @@ def test_a_spread_scales_with_its_data_and_ignores_shifts(
     other = deviation(scale * value + shift, group, stop)
     np.testing.assert_allclose(other, scale * one, rtol=1e-6, atol=0)
     by_numpy = [np.std(value[group == g], ddof=1) for g in range(5)]
-    assert deviation is home_position.averaged or np.allclose(one, by_numpy, rtol=1e-9, atol=0)
+    assert deviation is home_position.averaged or np.allclose(
+        one, by_numpy, rtol=1e-9, atol=0
+    )
     light = home_position.instrument_brightness(np.abs(value), 1.0 + group)
     np.testing.assert_allclose(
         home_position.instrument_brightness(np.abs(value), scale * (1.0 + group)),

@@ -196,7 +196,9 @@ def test_a_pool_without_assumptions_gives_no_answer(rng: np.random.Generator) ->
     errors=some.lists(some.floats(0, 1e-3), min_size=2, max_size=2),
     factor=some.floats(0, 9),
 )
-def test_the_gate_grows_with_the_error(fov: float, errors: list[float], factor: float) -> None:
+def test_the_gate_grows_with_the_error(
+    fov: float, errors: list[float], factor: float
+) -> None:
     small, large = (shefex.cos_error(fov, error, factor) for error in sorted(errors))
     assert (
         0 <= small <= large <= factor * max(errors) * 1.000001 + 1e-15
@@ -281,7 +283,14 @@ def test_stars_beside_detections_reveal_a_wrong_camera(
     matched = np.flatnonzero(~moved if aside else moved | ~moved)
     nothing = np.zeros((3, 3))
     solution = Solution(
-        matched, rows[matched], truth.as_quat(), nothing, 1.0, 0.1 / CAMERA.focal_px, 1.0, 20.0
+        matched,
+        rows[matched],
+        truth.as_quat(),
+        nothing,
+        1.0,
+        0.1 / CAMERA.focal_px,
+        1.0,
+        20.0,
     )
     near, by_chance = matcher.near_misses(solution, centroids)
     assert near >= moved.sum() * aside
@@ -416,13 +425,17 @@ def test_mutual_neighbors_are_each_other_s_nearest(
     }
     least = [(a, int(np.argmin(between[a]))) for a in range(len(seen)) if len(there)]
     assert mutual == {
-        (a, b) for a, b in least if np.argmin(between[:, b]) == a and between[a, b] < radius_px
+        (a, b)
+        for a, b in least
+        if np.argmin(between[:, b]) == a and between[a, b] < radius_px
     }
 
 
 @law(refinement.log10_chance)
 @given(
-    blobs=some.integers(4, 100), predicted=some.integers(1, 100), radius_px=some.floats(0.5, 5)
+    blobs=some.integers(4, 100),
+    predicted=some.integers(1, 100),
+    radius_px=some.floats(0.5, 5),
 )
 def test_more_matches_are_less_likely_by_chance(
     blobs: int, predicted: int, radius_px: float

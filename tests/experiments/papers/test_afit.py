@@ -128,7 +128,9 @@ def test_one_led_in_nine_is_lit_at_any_time() -> None:
         build_test_stand(with_config(exact, "exposure", time_s=time_s))
         for time_s in (36e-3, 100e-3)
     )
-    each_e = render_at_attitude(whole, level, rng)[1].sources.electrons  # of four pulses, 4 ms
+    each_e = render_at_attitude(whole, level, rng)[
+        1
+    ].sources.electrons  # of four pulses, 4 ms
     for _ in range(3):
         lit_ms = 4 * render_at_attitude(frame, level, rng)[1].sources.electrons / each_e
         assert lit_ms.sum() == pytest.approx(100, abs=1e-3)

@@ -113,7 +113,9 @@ def pointing_of(scene: Scene, law: str, off_deg: float, around_deg: float) -> Po
 
     start = scene.motion.start
     if law == "zenith":
-        return Pointing("zenith", np.zeros(3), math.radians(off_deg), math.radians(around_deg))
+        return Pointing(
+            "zenith", np.zeros(3), math.radians(off_deg), math.radians(around_deg)
+        )
     if not isinstance(start, PointingConfig):
         raise InputError("--law inertial", "requires motion.start with ra_deg and dec_deg")
     return Pointing("inertial", direction(start.ra_deg, start.dec_deg))

@@ -106,7 +106,9 @@ def camera_show(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(help="Also write the calibration to this file, in OpenCV's YAML format."),
+        typer.Option(
+            help="Also write the calibration to this file, in OpenCV's YAML format."
+        ),
     ] = None,
     set_: Overrides = None,
     json: Json = False,
@@ -146,9 +148,13 @@ def camera_show(
     print(f"field of view    {lens.field_text()}")
     print(f"focal length     {lens.focal_px:.6g} px")
     print(f"principal point  {x:.6g}, {y:.6g} px (the center of the first pixel is 0, 0)")
-    print("distortion       " + ", ".join(f"{name} {value:g}" for name, value in coefficients))
+    print(
+        "distortion       " + ", ".join(f"{name} {value:g}" for name, value in coefficients)
+    )
     if out:
-        print(f"{out}: for OpenCV, skysim solve --camera and the scene key camera.calibration")
+        print(
+            f"{out}: for OpenCV, skysim solve --camera and the scene key camera.calibration"
+        )
 
 
 def read_camera(
@@ -180,7 +186,9 @@ def read_camera(
         camera = loader.load(path, values).camera
     else:
         camera = loader.load_camera(path, PLACEHOLDER_LENS if alone else None, values)
-    has_lens = not alone or "camera.focal_length" in values or "focal_length" in tree["camera"]
+    has_lens = (
+        not alone or "camera.focal_length" in values or "focal_length" in tree["camera"]
+    )
     return camera.calibration() if has_lens else None, {
         "width_px": camera.width_px,
         "height_px": camera.height_px,
@@ -237,7 +245,9 @@ def camera_new(
         raise InputError(
             f"--out {out}", "exists" if out.exists() else "no .yaml file", "a new .yaml file"
         )
-    answers = {key: context.params[key] for key in QUESTIONS if context.params[key] is not None}
+    answers = {
+        key: context.params[key] for key in QUESTIONS if context.params[key] is not None
+    }
     if not answers:
         answers = ask_all()
     filled = camera_sheet.fill(answers)

@@ -44,7 +44,8 @@ ModelFolder = Annotated[
 AsFmu = Annotated[
     bool,
     typer.Option(
-        "--fmu", help="With --model: also as a co-simulation unit of FMI 3 (needs pythonfmu3)."
+        "--fmu",
+        help="With --model: also as a co-simulation unit of FMI 3 (needs pythonfmu3).",
     ),
 ]
 

@@ -37,7 +37,9 @@ ExcitedBy = Annotated[
 EstimateOnly = Annotated[
     bool, typer.Option("--estimate-only", help="Estimate from one flight; move nothing.")
 ]
-Tilt = Annotated[float, typer.Option(min=0.1, max=60, help="Tilt of the excitation, degrees.")]
+Tilt = Annotated[
+    float, typer.Option(min=0.1, max=60, help="Tilt of the excitation, degrees.")
+]
 Torque = Annotated[
     str, typer.Option(help="Residual gravity torque at which the vehicle is balanced.")
 ]
@@ -121,7 +123,9 @@ def balance(
         statistics["in_flight"] = balance_report.filter_rows(flown[-1], assumed)
     folder = output_folder(out, loaded.name)
     command = shlex.join(["skysim", *sys.argv[1:]])
-    print_report(statistics, balance_report.write_all(folder, statistics, flown, command), json)
+    print_report(
+        statistics, balance_report.write_all(folder, statistics, flown, command), json
+    )
     balance_flight.check_observed(
         flown[-1].estimate,
         assumed.prior,
@@ -186,14 +190,17 @@ def characterize(
         Path | None, typer.Option(help="Folder of darks, of two exposures or more.")
     ] = None,
     flats: Annotated[
-        Path | None, typer.Option(help="Folder of flats: pairs at exposures up to saturation.")
+        Path | None,
+        typer.Option(help="Folder of flats: pairs at exposures up to saturation."),
     ] = None,
     night: Annotated[
         Path | None, typer.Option(help="Folder of frames of the night sky, stars at rest.")
     ] = None,
     frames_to: Annotated[
         Path | None,
-        typer.Option(help="Measure nothing: write the darks and flats of --camera, simulated."),
+        typer.Option(
+            help="Measure nothing: write the darks and flats of --camera, simulated."
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the frames of --frames-to.")] = 1,
     out: Out = None,
@@ -208,7 +215,9 @@ def characterize(
     config, raw = characterize_camera.read_camera(camera)
     if frames_to is not None:
         given = {"darks": darks, "flats": flats, "night": night, "out": out}
-        if conflict := next((name for name, value in given.items() if value is not None), None):
+        if conflict := next(
+            (name for name, value in given.items() if value is not None), None
+        ):
             raise InputError(
                 f"--{conflict}", "has no effect with --frames-to", "one of the two"
             )

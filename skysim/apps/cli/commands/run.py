@@ -84,10 +84,15 @@ def run(
         for finding in plan.findings:
             terminal.print_error(with_location(finding))
         recorder = FlightRecorder(output_folder(out, loaded.name), flight)
-        with on_two_processes(*LOADED[-1]), terminal.progress_callback(loaded.title) as update:
+        with (
+            on_two_processes(*LOADED[-1]),
+            terminal.progress_callback(loaded.title) as update,
+        ):
             rows = recorder.record(flight.shots(progress=update))
         command = shlex.join(["skysim", *sys.argv[1:]])
-        finished = recorder.finish(command, plan, terminal.write_3d_views if scene_3d else None)
+        finished = recorder.finish(
+            command, plan, terminal.write_3d_views if scene_3d else None
+        )
     statistics = print_results(loaded, finished, rows, plan, json)
     if open_:
         typer.launch(statistics["report"])

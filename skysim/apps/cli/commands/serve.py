@@ -26,7 +26,9 @@ def stream(
     scene: SceneArg,
     folder: Annotated[
         Path | None,
-        typer.Option(help="Write frames to a folder: a 16-bit PNG and a JSON file per frame."),
+        typer.Option(
+            help="Write frames to a folder: a 16-bit PNG and a JSON file per frame."
+        ),
     ] = None,
     http: Annotated[
         int | None,
@@ -71,7 +73,9 @@ def stream(
         )
     if endless and frames is not None:
         raise InputError("--endless", "has no effect with --frames", "one of the two")
-    flight = open_flight(load(scene, frames, seed, set_), endless=endless, keeps_history=False)
+    flight = open_flight(
+        load(scene, frames, seed, set_), endless=endless, keeps_history=False
+    )
     sinks = open_sinks(folder, pipe)
     statistics = send_all(flight, sinks, speed, http, host)
     output = sys.stderr if pipe == "-" else sys.stdout
@@ -171,9 +175,9 @@ def gui(
             help="Access token that browsers must send; default: a random one, in the printed link."
         ),
     ] = "",
-    folder: Annotated[Path, typer.Option(help="Folder in which new scenes are saved.")] = Path(
-        "."
-    ),
+    folder: Annotated[
+        Path, typer.Option(help="Folder in which new scenes are saved.")
+    ] = Path("."),
     out: Annotated[Path, typer.Option(help="Folder of studies and their reports.")] = Path(
         "out"
     ),

@@ -26,7 +26,9 @@ if TYPE_CHECKING:
 def solve(
     images: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="IMAGES", help="FITS, PNG, TIFF, JPEG, BMP files, or folders."),
+        typer.Argument(
+            metavar="IMAGES", help="FITS, PNG, TIFF, JPEG, BMP files, or folders."
+        ),
     ] = None,
     fov: Annotated[
         float | None,

@@ -57,7 +57,9 @@ Workers = Annotated[
 EngineName = Annotated[
     str, typer.Option("--engine", help="How trials are run: pool, serial or dask.")
 ]
-Scheduler = Annotated[str, typer.Option(help="Address of the Dask scheduler, tcp://HOST:PORT.")]
+Scheduler = Annotated[
+    str, typer.Option(help="Address of the Dask scheduler, tcp://HOST:PORT.")
+]
 
 
 @app.callback()
@@ -111,7 +113,9 @@ def resume(
     workers: Workers = None,
     engine: EngineName = "pool",
     scheduler: Scheduler = "",
-    failed: Annotated[bool, typer.Option("--failed", help="Repeat failed trials too.")] = False,
+    failed: Annotated[
+        bool, typer.Option("--failed", help="Repeat failed trials too.")
+    ] = False,
     set_: Overrides = None,
     program: Programs = None,
     open_: OpenReport = False,
@@ -145,7 +149,9 @@ def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
     plan, _ = load_stored_plan(study, out)
     with open_store(study, out) as stored:
         progress = study_status(plan, stored)
-        failures = [{"trial": trial, "error": error} for trial, error in stored.failures()[:10]]
+        failures = [
+            {"trial": trial, "error": error} for trial, error in stored.failures()[:10]
+        ]
     if json:
         print_json(progress | {"failures": failures})
         return
@@ -209,7 +215,9 @@ def replay(
     study, out = located(study, out)
     plan, _ = load_stored_plan(study, out, program or [])
     with open_store(study, out) as stored:
-        repeated = runner.replay(plan, stored, trial, folder_of(study, out) / f"trial_{trial}")
+        repeated = runner.replay(
+            plan, stored, trial, folder_of(study, out) / f"trial_{trial}"
+        )
     row = repeated.row
     result: dict[str, Any] = {
         "trial": trial,
@@ -317,7 +325,11 @@ def run_and_report(
     path = folder_of(study, out) / store.STORE
     total = plan.study.trial_count(len(plan.points))
     resume_command = command(study, out, "resume")
-    with store.writing(path) as stored, interruptible(resume_command, stored), closing(engine):
+    with (
+        store.writing(path) as stored,
+        interruptible(resume_command, stored),
+        closing(engine),
+    ):
         runner.prepare_store(plan, stored, resumed, overrides)
         if repeat_failed:
             stored.delete_failed()
@@ -345,7 +357,9 @@ def interruptible(resume_command: str, stored: Store) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        print_error(f"{stored.counts()['done']} trials are stored; continue: {resume_command}")
+        print_error(
+            f"{stored.counts()['done']} trials are stored; continue: {resume_command}"
+        )
         raise
 
 
@@ -388,7 +402,9 @@ def located(study: str, out: Path | None) -> tuple[str, Path | None]:
         file = stored.meta("file")
     if not Path(file).is_file():
         raise InputError(
-            study, f"no such file as its study, {file or 'not stored'}", f"STUDY --out {study}"
+            study,
+            f"no such file as its study, {file or 'not stored'}",
+            f"STUDY --out {study}",
         )
     return file, Path(study)
 

@@ -34,7 +34,8 @@ FrameCount = Annotated[
 PlanOnly = Annotated[
     bool,
     typer.Option(
-        "--plan", help="Print the attitudes to hold and the predicted errors; simulate nothing."
+        "--plan",
+        help="Print the attitudes to hold and the predicted errors; simulate nothing.",
     ),
 ]
 Images = Annotated[

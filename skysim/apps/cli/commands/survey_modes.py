@@ -53,7 +53,11 @@ def planned(request: Request) -> tuple[Lab, CalibrationPrior, survey_procedure.H
     """The lab whose onboard model has errors as before a survey, that model, and a plan."""
 
     return survey_procedure.plan_survey(
-        request.scene, request.uncertainty, request.frames, request.tilt_deg, request.attitudes
+        request.scene,
+        request.uncertainty,
+        request.frames,
+        request.tilt_deg,
+        request.attitudes,
     )
 
 
@@ -69,7 +73,8 @@ def plan_only(request: Request) -> dict[str, Any]:
         "leds": plan.shown.shape[1],
         "noise_px": plan.model.sigma_px,
         "predicted": [
-            {"frames": n, **survey_findings.accuracy_statistics(one)} for n, one in plan.steps()
+            {"frames": n, **survey_findings.accuracy_statistics(one)}
+            for n, one in plan.steps()
         ],
         "plan": str(path),
     }
@@ -155,7 +160,10 @@ def from_images(
             progress(survey_images.read_images(images, camera, stages), total, "reading")
         )
     found = survey_images.frames_with_attitude(pictures, before, request.uncertainty, stages)
-    with progress_callback("adjusting") as update, coverage_shown(request, found, before, None):
+    with (
+        progress_callback("adjusting") as update,
+        coverage_shown(request, found, before, None),
+    ):
         run = survey_procedure.survey_images(
             pictures, found, before, request.uncertainty, stages, request.distortion, update
         )
@@ -195,7 +203,10 @@ def print_so_far(
 
 @contextmanager
 def coverage_shown(
-    request: Request, frames: list[SurveyFrame], prior: CalibrationPrior, noise_px: float | None
+    request: Request,
+    frames: list[SurveyFrame],
+    prior: CalibrationPrior,
+    noise_px: float | None,
 ) -> Iterator[None]:
     """If the frames are too few for a survey, print the LEDs that they show and the attitudes to hold next."""
 
@@ -208,7 +219,10 @@ def coverage_shown(
 
 
 def print_coverage(
-    request: Request, frames: list[SurveyFrame], prior: CalibrationPrior, noise_px: float | None
+    request: Request,
+    frames: list[SurveyFrame],
+    prior: CalibrationPrior,
+    noise_px: float | None,
 ) -> None:
     """Print the LEDs that the frames show, and the attitudes to hold next."""
     so_far = survey_findings.coverage_before(
@@ -270,7 +284,9 @@ def write_report(
 
     path = request.folder / "report.html"
     statistics |= {"report": str(path)}
-    report = survey_report.survey_report(statistics, run, shlex.join(["skysim", *sys.argv[1:]]))
+    report = survey_report.survey_report(
+        statistics, run, shlex.join(["skysim", *sys.argv[1:]])
+    )
     report.save(path)
     files.write_text(request.folder / "survey.json", files.to_json(statistics))
     if not request.quiet:

@@ -176,7 +176,9 @@ class Actions:
         if action == "move":
             right, up, roll_sign = keys.MOVES[name]
             step = geometry.COARSE if event.modifiers.shift else geometry.FINE
-            roll = geometry.ROLL_COARSE_DEG if event.modifiers.shift else geometry.ROLL_FINE_DEG
+            roll = (
+                geometry.ROLL_COARSE_DEG if event.modifiers.shift else geometry.ROLL_FINE_DEG
+            )
             await self.move(right * step, up * step, roll_sign * roll)
         elif action == "step":
             await self.step(1 if name == "." else -1)

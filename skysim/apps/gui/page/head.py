@@ -33,15 +33,22 @@ class Head:
         with ui.element("div").classes("lab-head"):
             ui.label("skysim gui").classes("lab-name")
             self.picker = widgets.select(
-                self.scenes(), "borderless", value=page.state.scene, on_change=self.scene_picked
+                self.scenes(),
+                "borderless",
+                value=page.state.scene,
+                on_change=self.scene_picked,
             )
             self.picker.props('aria-label="Scene"').classes("w-44").mark("scene")
             self.banner = LiveText(contents, "live").classes("lab-banner").mark("banner")
             self.live_button = widgets.button("Live", self.go_live, "live")
             self.live_button.set_visibility(False)
             self.title = ui.label().classes("lab-title quiet ellipsis")
-            self.message = ui.label().classes("lab-said").props('role="status"').mark("message")
-            self.busy = ui.icon("hourglass_empty", size="16px").classes("lab-busy").mark("busy")
+            self.message = (
+                ui.label().classes("lab-said").props('role="status"').mark("message")
+            )
+            self.busy = (
+                ui.icon("hourglass_empty", size="16px").classes("lab-busy").mark("busy")
+            )
             self.latency = LiveText(contents).classes("lab-rate mono quiet").mark("rate")
             self.latency.props('title="latency: from the request for a frame to its arrival"')
             self.noise = ui.switch("noise", value=True, on_change=self.switch_noise).props(

@@ -15,7 +15,9 @@ from nicegui import ui
 from skysim.apps.gui.views.context import Shown
 from skysim.apps.gui.views.state import PageView
 
-SETTLED = 3  # number of timer calls without a change after which the next change is a new step
+SETTLED = (
+    3  # number of timer calls without a change after which the next change is a new step
+)
 WRITE_S = 0.4  # interval of the timer; browsers refuse more than about 200 entries in 30 s
 JS = """
 window.skysimHistory = {
@@ -91,7 +93,9 @@ class History:
     async def read(self) -> str:
         """The query of the page's address; if it has none, that of the stored view."""
         return str(
-            await ui.run_javascript(f"skysimHistory.read({json.dumps(self.home)})", timeout=10)
+            await ui.run_javascript(
+                f"skysimHistory.read({json.dumps(self.home)})", timeout=10
+            )
             or ""
         )
 

@@ -77,7 +77,9 @@ class MonteCarloPanel:
             self.study_select.mark("study").on_value_change(self.study_chosen)
             self.button = widgets.button("Start", self.start_or_stop, "monte-carlo")
         with ui.element("div").classes("lab-trial") as self.fields:
-            self.count = widgets.number("runs, F8", value=200, min=1, max=100_000, precision=0)
+            self.count = widgets.number(
+                "runs, F8", value=200, min=1, max=100_000, precision=0
+            )
             self.count.mark("runs")
             self.kind = widgets.select(TRIAL_KINDS, value="centroids", label="of")
             self.noise = widgets.number("noise, px", value=0.1, min=0, max=10, step=0.05)
@@ -89,7 +91,9 @@ class MonteCarloPanel:
         with widgets.row(3) as self.model:
             self.with_noise = widgets.checkbox("with noise", value=True).mark("with-noise")
             self.noise_text = widgets.quiet().mark("noise-text")
-        self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
+        self.bar = ui.linear_progress(0, show_value=False, size="3px").props(
+            "instant-feedback"
+        )
         self.note = widgets.quiet("No study has been run yet: press 2.").style(
             "margin-top: 6px"
         )
@@ -321,7 +325,9 @@ class MonteCarloPanel:
 
     def show(self, results: StudyResults) -> None:
         self.bar.set_value(results.done / max(self.process.total, 1))
-        self.chart.options["xAxis"]["data"] = [format_number(center) for center in results.bins]
+        self.chart.options["xAxis"]["data"] = [
+            format_number(center) for center in results.bins
+        ]
         self.chart.options["series"][0]["data"] = list(results.counts)
         self.chart.options["title"]["text"] = "" if results.counts else "no trial solved"
         self.chart.update()

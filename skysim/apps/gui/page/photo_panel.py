@@ -88,7 +88,12 @@ class PhotoPanel:
         self.page.stop_playback()
         self.show_text(f"solving {name} …", "quiet")
         photo = await self.page.run_task(
-            "solve_file", name, data, self.fov.value, self.stages, activity=f"solving {name} …"
+            "solve_file",
+            name,
+            data,
+            self.fov.value,
+            self.stages,
+            activity=f"solving {name} …",
         )
         self.show(name, photo)
 

@@ -151,7 +151,9 @@ class PlanPanel:
     # The check.
 
     async def check(self) -> None:
-        found: Check | None = await self.page.run_task("check", activity="checking the scene …")
+        found: Check | None = await self.page.run_task(
+            "check", activity="checking the scene …"
+        )
         if found is None:
             return
         self.facts.clear()
@@ -207,7 +209,9 @@ class PlanPanel:
         """Adjust the dome to the frames flown; show the results and the attitudes to hold next."""
         with self.working():
             found: SurveyFound | None = await self.page.run_task(
-                "adjust_survey", int(self.frames.value or 0), activity="adjusting the survey …"
+                "adjust_survey",
+                int(self.frames.value or 0),
+                activity="adjusting the survey …",
             )
             if found is None:
                 return

@@ -17,7 +17,9 @@ from skysim.apps.gui.views.overlay import MAX_TRUTH_MARKS, NEAR_PX
 from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.worker.photo import Photo
 
-ANGLES_JS = "() => emit([...document.querySelectorAll('.lab-angle')].map(field => field.value))"
+ANGLES_JS = (
+    "() => emit([...document.querySelectorAll('.lab-angle')].map(field => field.value))"
+)
 
 
 class AttitudeCard:
@@ -42,10 +44,14 @@ class AttitudeCard:
                 widgets.quiet("true (F5)")
                 self.inputs = [self.angle_input(n) for n in range(3)]
                 widgets.quiet("tracker")
-                self.estimates = [LiveText(contents, "–").classes("mono num") for _ in range(3)]
+                self.estimates = [
+                    LiveText(contents, "–").classes("mono num") for _ in range(3)
+                ]
                 widgets.quiet("error")
                 self.errors = [LiveText(contents, "–").classes("mono num") for _ in range(3)]
-            self.status = LiveText(contents).classes("mono ellipsis lab-status").mark("status")
+            self.status = (
+                LiveText(contents).classes("mono ellipsis lab-status").mark("status")
+            )
             self.stages = ui.label(" ").classes("quiet ellipsis").mark("stages")
 
     def angle_input(self, n: int) -> LiveInput:
@@ -185,12 +191,16 @@ class LightsPanel:
         self.sent = sensor.sent_number
         detections = sensor.result.detections if sensor.result else ()
         self.table.run_method(
-            "show", HEADS, list(rows(sensor.lights[:MAX_TRUTH_MARKS], detections, sensor.name))
+            "show",
+            HEADS,
+            list(rows(sensor.lights[:MAX_TRUTH_MARKS], detections, sensor.name)),
         )
 
 
 def rows(
-    lights: Collection[LightRow], detections: Collection[Detection], name: Callable[[int], str]
+    lights: Collection[LightRow],
+    detections: Collection[Detection],
+    name: Callable[[int], str],
 ) -> Iterator[dict[str, Any]]:
     """Rows of the table: true lights with their detections, brightest first, then detections of no light.
 

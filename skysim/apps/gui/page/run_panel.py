@@ -95,12 +95,18 @@ class RunPanel:
                 "skip_previous", "Previous frame", partial(self.step, -1)
             )
             self.play = self.player_button("play_arrow", "Play", self.toggle)
-            self.forward = self.player_button("skip_next", "Next frame", partial(self.step, 1))
+            self.forward = self.player_button(
+                "skip_next", "Next frame", partial(self.step, 1)
+            )
             self.speed = widgets.select(list(SPEEDS), "borderless", value="real time")
-            self.speed.props('aria-label="Speed"').classes("w-24").on_value_change(self.resync)
+            self.speed.props('aria-label="Speed"').classes("w-24").on_value_change(
+                self.resync
+            )
             self.loop = widgets.select({}, "borderless", on_change=self.close_loop)
             self.loop.props('aria-label="Feedback"').mark("feedback")
-        self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
+        self.bar = ui.linear_progress(0, show_value=False, size="3px").props(
+            "instant-feedback"
+        )
         with widgets.row(3):
             self.seek = LiveInput(self.contents, "range").props(
                 'min=0 step=1 aria-label="Frame of the flight"'
@@ -116,7 +122,9 @@ class RunPanel:
         self.enable()
 
     def player_button(self, icon: str, label: str, action: Any) -> ui.button:
-        button = ui.button(icon=icon, on_click=action).props(f'dense flat aria-label="{label}"')
+        button = ui.button(icon=icon, on_click=action).props(
+            f'dense flat aria-label="{label}"'
+        )
         return button.mark(label.lower())
 
     def enable(self) -> None:
@@ -295,7 +303,9 @@ class RunPanel:
         if self.playing:
             self.pause()
         elif self.rows and not self.computing:
-            self.from_s = 0.0 if self.index >= len(self.rows) - 1 else self.times_s[self.index]
+            self.from_s = (
+                0.0 if self.index >= len(self.rows) - 1 else self.times_s[self.index]
+            )
             self.start()
 
     def pause(self) -> None:

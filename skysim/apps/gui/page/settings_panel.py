@@ -95,7 +95,13 @@ class KeyForm:
         open_now = {name for name, expansion in self.expansions.items() if expansion.value}
         open_now = open_now if self.expansions else {self.opens}
         self.parts.clear()
-        for elements in (self.expansions, self.last_typed, self.rows, self.labels, self.inputs):
+        for elements in (
+            self.expansions,
+            self.last_typed,
+            self.rows,
+            self.labels,
+            self.inputs,
+        ):
             elements.clear()
         with self.parts:
             for name, fields in groups.items():
@@ -299,7 +305,9 @@ class TrackerPanel:
         self.form = KeyForm(page, lambda field: names[field.key], opens=SENSOR)
         widgets.quiet(MODEL).style("margin: 10px 0 4px")
         with widgets.row():
-            self.arcsec = widgets.number("noise, ″ an axis", min=0, step=1).mark("noise-arcsec")
+            self.arcsec = widgets.number("noise, ″ an axis", min=0, step=1).mark(
+                "noise-arcsec"
+            )
             self.arcsec.on("blur", self.typed).on("keydown.enter", self.typed)
             magnitude = widgets.number("noise, magnitudes", min=0, max=5, step=0.05)
             magnitude.classes("w-36 flex-none").bind_value(study.magnitude)
@@ -310,7 +318,10 @@ class TrackerPanel:
         """Show the fields of the current scene."""
         offered = {field.key: field for field in fields if not field.no_effect}
         self.form.show(
-            {group: [offered[key] for key in NAMES[group] if key in offered] for group in NAMES}
+            {
+                group: [offered[key] for key in NAMES[group] if key in offered]
+                for group in NAMES
+            }
         )
         self.show_noise()
 

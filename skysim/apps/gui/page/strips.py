@@ -145,7 +145,9 @@ def strips(
             "attitude error, ″",
             (
                 *map(of_motion, ("pointing", "IMU alone", "filter")),
-                StripCurve("innovation", of_frames(lambda row: row.innovation_arcsec), "dots"),
+                StripCurve(
+                    "innovation", of_frames(lambda row: row.innovation_arcsec), "dots"
+                ),
             ),
             logarithmic=True,
         ),
@@ -172,7 +174,9 @@ def thinned(residuals: Sequence[tuple[float, int, float]]) -> Points:
     """The residuals as dots: of all frames or, if they are more than MAX_DOTS, of frames at equal steps."""
     times_s = sorted({t_s for t_s, _, _ in residuals})
     kept = set(times_s[:: max(math.ceil(len(residuals) / MAX_DOTS), 1)])
-    return [[round(t_s, 4), float(f"{px:.3g}"), id] for t_s, id, px in residuals if t_s in kept]
+    return [
+        [round(t_s, 4), float(f"{px:.3g}"), id] for t_s, id, px in residuals if t_s in kept
+    ]
 
 
 class StripChart:
@@ -328,8 +332,8 @@ def rms_line(rows: Sequence[FlightRow]) -> str:
         return f"{len(rows)} frames, none solved" if rows else ""
     cross, roll = (
         math.hypot(*errors) / math.sqrt(len(solved))
-        for errors in zip(*((row.cross_arcsec, row.roll_arcsec) for row in solved), strict=True)
+        for errors in zip(
+            *((row.cross_arcsec, row.roll_arcsec) for row in solved), strict=True
+        )
     )
-    return (
-        f"{len(solved)} of {len(rows)} frames solved; rms: cross {cross:.3g}″, roll {roll:.3g}″"
-    )
+    return f"{len(solved)} of {len(rows)} frames solved; rms: cross {cross:.3g}″, roll {roll:.3g}″"

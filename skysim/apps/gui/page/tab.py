@@ -37,9 +37,7 @@ from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.scene.loader import load
 
-PAUSE_S = (
-    0.005  # pause between building parts of a page, in which the keys of other pages are served
-)
+PAUSE_S = 0.005  # pause between building parts of a page, in which the keys of other pages are served
 PANELS = ("Run", "Lights", "Scene", "Tracker", "Plan", "Monte Carlo", "Image", "Log")
 
 
@@ -216,7 +214,9 @@ class Tab:
     def commands(self) -> list[Command]:
         """Further commands: flight, history, arrangement, panels and exports."""
         return [
-            Command("show the next frame of the flight", ".", partial(self.run_panel.step, 1)),
+            Command(
+                "show the next frame of the flight", ".", partial(self.run_panel.step, 1)
+            ),
             Command(
                 "show the previous frame of the flight", ",", partial(self.run_panel.step, -1)
             ),
@@ -225,11 +225,18 @@ class Tab:
             Command(
                 "compute the flight of the scene, or stop that", "", self.run_panel.simulate
             ),
-            Command("change between the dark and the light theme", "", self.arrangement.toggle),
             Command(
-                "give frame, 3-D view and panels their first sizes", "", self.arrangement.reset
+                "change between the dark and the light theme", "", self.arrangement.toggle
             ),
-            *(Command(f"panel: {name}", "", partial(self.show_panel, name)) for name in PANELS),
+            Command(
+                "give frame, 3-D view and panels their first sizes",
+                "",
+                self.arrangement.reset,
+            ),
+            *(
+                Command(f"panel: {name}", "", partial(self.show_panel, name))
+                for name in PANELS
+            ),
             *(
                 Command(f"export: {name}", "", partial(self.head.export, name))
                 for name in image_export.FILE_BY_ITEM
@@ -259,7 +266,9 @@ class Tab:
 
     # The view of the page's address.
 
-    async def start(self, session: Session, new_session: Callable[[], Session | None]) -> None:
+    async def start(
+        self, session: Session, new_session: Callable[[], Session | None]
+    ) -> None:
         """Show the first view: that of the page's address, or of the browser's storage, or the server's scene."""
         self.use(session)
         self.new_session = new_session

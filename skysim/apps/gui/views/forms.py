@@ -173,7 +173,9 @@ def section_fields(
             yield FormField(key, value, "", tuple(dict.fromkeys((*kinds, value))), is_set)
         else:
             subtree = short_path(subtree)
-            text = yaml_line(subtree) if is_set else yaml_line(file_value(value, si_unit(name)))
+            text = (
+                yaml_line(subtree) if is_set else yaml_line(file_value(value, si_unit(name)))
+            )
             yield FormField(
                 key, text, display_unit(file_key), allowed_values(annotation), is_set
             )
@@ -215,7 +217,9 @@ def models(annotation: Any) -> dict[str, type[BaseModel]]:
         return dict.fromkeys(allowed_values(kind.annotation), annotation) if kind else {}
     found: dict[str, type[BaseModel]] = {}
     for part in (
-        get_args(annotation) if get_origin(annotation) in (Union, UnionType, Annotated) else ()
+        get_args(annotation)
+        if get_origin(annotation) in (Union, UnionType, Annotated)
+        else ()
     ):
         found |= models(part)
     return found
@@ -251,7 +255,9 @@ def first_section(
     return section
 
 
-def with_value(name: str, overrides: Mapping[str, str], key: str, text: str) -> dict[str, str]:
+def with_value(
+    name: str, overrides: Mapping[str, str], key: str, text: str
+) -> dict[str, str]:
     """Overrides with a new value of a key, without those that lose their effect by it. Raises InputError.
 
     A new kind of a section replaces the section.
@@ -376,7 +382,9 @@ FEEDBACKS = {
 }
 
 
-def field_override(name: str, overrides: Mapping[str, str], field_deg: float) -> dict[str, str]:
+def field_override(
+    name: str, overrides: Mapping[str, str], field_deg: float
+) -> dict[str, str]:
     """Override for another horizontal field of view of a scene: f = width / (2 tan(field / 2)).
 
     Raises
@@ -407,7 +415,9 @@ def loop_overrides(name: str, overrides: Mapping[str, str], feedback: str) -> di
     return {"motion.control": yaml_line(control | {"feedback": feedback})}
 
 
-def save(folder: Path, name: str, base: str, overrides: Mapping[str, str], title: str) -> Path:
+def save(
+    folder: Path, name: str, base: str, overrides: Mapping[str, str], title: str
+) -> Path:
     """Save a new scene file that consists of a base and overrides. Raises InputError, also if the file exists."""
     from skysim.apps.gui.worker.image_export import base_reference, scene_yaml
     from skysim.core import files

@@ -43,7 +43,9 @@ KEYS = (
         "roll",
         "roll the camera by a degree: E counterclockwise, R clockwise",
     ),
-    Key(("Shift",), "⇧", "coarse", "coarse", "with an arrow, E or R: steps ten times as large"),
+    Key(
+        ("Shift",), "⇧", "coarse", "coarse", "with an arrow, E or R: steps ten times as large"
+    ),
     Key(("1",), "1", "identify", "identify", "render a new frame and solve it"),
     Key(("n",), "N", "noise", "noise", "render without the camera's noise, or with it again"),
     Key(
@@ -54,7 +56,11 @@ KEYS = (
         "start a Monte Carlo study; F8 sets its number of trials",
     ),
     Key(
-        ("F5",), "F5", "attitude", "attitude", "type an attitude; Enter points the camera there"
+        ("F5",),
+        "F5",
+        "attitude",
+        "attitude",
+        "type an attitude; Enter points the camera there",
     ),
     Key(("F6",), "F6", "sensor", "sensor", "set up image processing and the sensor's noise"),
     Key(

@@ -44,7 +44,9 @@ from skysim.core.types import Floats
 from skysim.results import plots
 from skysim.sources.bodies import NAMES as BODIES
 
-FIRST_START = "The first frame on a machine takes up to a minute, because the code is compiled."
+FIRST_START = (
+    "The first frame on a machine takes up to a minute, because the code is compiled."
+)
 LABELS = NAMES | BODIES  # names of lights by number
 STRETCHES = list(plots.CURVES)
 COLOR_MAPS = {
@@ -246,12 +248,16 @@ class SensorView:
 
     def update_marks(self) -> None:
         """Send the marks of the newest frame again, as a message: NiceGUI sends all properties if one changes."""
-        self.canvas.run_method("show", {"src": self.address(self.sent_number)} | self.fields())
+        self.canvas.run_method(
+            "show", {"src": self.address(self.sent_number)} | self.fields()
+        )
 
     def description(self) -> str:
         """Text alternative of the view for screen readers."""
         detections = self.result.detections if self.result else ()
-        identified = [self.name(detection.id) for detection in detections if detection.id >= 0]
+        identified = [
+            self.name(detection.id) for detection in detections if detection.id >= 0
+        ]
         return f"Sensor view: {len(self.lights)} true lights; identified: {', '.join(identified) or 'none'}"
 
     def name(self, id: int) -> str:
@@ -317,7 +323,9 @@ class SensorView:
 def pose_fields(pose: Pose) -> dict[str, Any]:
     """A pose for frame.js."""
     fields: dict[str, Any] = {"rotation": pose.rotation}
-    return fields | ({"place_m": pose.place_m, "depth_m": pose.depth_m} if pose.depth_m else {})
+    return fields | (
+        {"place_m": pose.place_m, "depth_m": pose.depth_m} if pose.depth_m else {}
+    )
 
 
 @functools.cache

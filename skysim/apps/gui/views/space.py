@@ -59,7 +59,9 @@ class Scene3D:
         self.canvas = Space().classes("w-full h-full").mark("space")
         with ui.element("div").classes("lab-looks"):
             for name, text in VIEWS.items():
-                button = ui.button(name, color=None, on_click=lambda name=name: self.look(name))
+                button = ui.button(
+                    name, color=None, on_click=lambda name=name: self.look(name)
+                )
                 button.props("dense outline size=xs")
                 button.props(f'title="look {text}"').mark(f"look-{name}")
         hint = ui.label(

@@ -89,7 +89,8 @@ class PageView:
             return None
         if one["scene"] not in scenes:
             raise InputError(
-                "link", f"scene {one['scene']!r} is not offered here; choose one from the list"
+                "link",
+                f"scene {one['scene']!r} is not offered here; choose one from the list",
             )
         kind = one.get("view", "live")
         if kind not in KINDS:
@@ -102,7 +103,9 @@ class PageView:
             trial = int(one.get("trial", -1))
         except ValueError:
             raise InputError("link", "at, t, trial", "numbers") from None
-        if not all(map(math.isfinite, (*(angles or ()), t_s))) or (angles and len(angles) != 3):
+        if not all(map(math.isfinite, (*(angles or ()), t_s))) or (
+            angles and len(angles) != 3
+        ):
             raise InputError("link", "at", "three angles in degrees; t: seconds")
         overrides = dict(value.partition("=")[::2] for key, value in pairs if key == "set")
         study = one.get("study", "")

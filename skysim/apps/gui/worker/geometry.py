@@ -78,7 +78,9 @@ def views(lab: Lab, model: multibody.Laboratory) -> dict[str, LookFrom]:
 def look_from(
     eye_m: Floats, target_m: Floats, up: Floats, fov_deg: float, on_vehicle: bool = False
 ) -> LookFrom:
-    eye, target, upwards = ((float(x), float(y), float(z)) for x, y, z in (eye_m, target_m, up))
+    eye, target, upwards = (
+        (float(x), float(y), float(z)) for x, y, z in (eye_m, target_m, up)
+    )
     return LookFrom(eye, target, upwards, fov_deg, on_vehicle)
 
 
@@ -146,7 +148,9 @@ RANGES = {  # degrees
 }
 
 
-def from_angles(scene: Scene, mount: Mount, angles_deg: tuple[float, float, float]) -> Rotation:
+def from_angles(
+    scene: Scene, mount: Mount, angles_deg: tuple[float, float, float]
+) -> Rotation:
     """lab_from_body from RA, Dec, roll of the camera under stars, else from roll, pitch, yaw of the vehicle; degrees.
 
     Raises
@@ -253,8 +257,12 @@ class Push:
         period = round(PERIOD_S / simulation.step_s)
         steps = round(min(elapsed_s, MAX_ADVANCE_S) / simulation.step_s)
         for begin in range(0, steps, period):
-            lab_from_body = Rotation.from_quat(simulation.lab_from_body_wxyz, scalar_first=True)
-            self.torque_nm = pull_torque_nm(grip, lab_from_body, self.lab.vehicle.inertia_kg_m2)
+            lab_from_body = Rotation.from_quat(
+                simulation.lab_from_body_wxyz, scalar_first=True
+            )
+            self.torque_nm = pull_torque_nm(
+                grip, lab_from_body, self.lab.vehicle.inertia_kg_m2
+            )
             control = np.zeros((min(period, steps - begin), simulation.model.nu))
             control[:, simulation.vehicle.torques] = self.torque_nm
             simulation.advance(control)
@@ -279,7 +287,9 @@ class Push:
         return Trajectory(t_s, attitudes, rates)
 
 
-def pull_torque_nm(grip: Grip | None, lab_from_body: Rotation, inertia_kg_m2: Floats) -> Floats:
+def pull_torque_nm(
+    grip: Grip | None, lab_from_body: Rotation, inertia_kg_m2: Floats
+) -> Floats:
     """(3,) torque about the bearing, in body axes, of a force toward the wanted point.
 
     With the held point r and the vector d from it to the wanted one, T = J w^2 (r x d) / max(r^2, |r x d|). This is the

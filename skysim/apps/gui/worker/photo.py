@@ -119,7 +119,9 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     frame, truth, report = next(runner.replayed_frames(setup, row.seed))
     result = tracker_result(setup.lab, setup.estimator, frame, truth, report)
     if row.error:
-        result = TrackerResult(row.error.strip().splitlines()[-1], result.detections, result.ms)
+        result = TrackerResult(
+            row.error.strip().splitlines()[-1], result.detections, result.ms
+        )
     scene = setup.lab.scene
     (height, width) = frame.image_dn.shape
     photo = Photo(

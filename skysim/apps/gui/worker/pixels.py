@@ -105,7 +105,9 @@ def pixels_for(
     saturation = (saturation_dn - levels.offset) / levels.step
     columns = columns_for(display, width, height)
     shaded = 0 < columns < WORTHWHILE * width
-    drawn = shades(integers, columns, limits, saturation, display.curve) if shaded else integers
+    drawn = (
+        shades(integers, columns, limits, saturation, display.curve) if shaded else integers
+    )
     fields: dict[str, Any] = {
         "size": (width, height),
         "grid": drawn.shape[::-1],
@@ -132,7 +134,11 @@ def columns_for(display: Display, width: int, height: int) -> int:
 
 
 def shades(
-    integers: NDArray, columns: int, limits: tuple[float, float], saturation: float, curve: str
+    integers: NDArray,
+    columns: int,
+    limits: tuple[float, float],
+    saturation: float,
+    curve: str,
 ) -> NDArray[np.uint8]:
     """The image in fewer columns: the mean over each area, from 0 (black) to SHADES - 1 (white).
 
@@ -141,7 +147,9 @@ def shades(
     height, width = integers.shape
     rows = max(round(height * columns / width), 1)
     low, high = limits
-    fraction = np.clip((np.arange(int(integers.max()) + 1) - low) / max(high - low, 1e-9), 0, 1)
+    fraction = np.clip(
+        (np.arange(int(integers.max()) + 1) - low) / max(high - low, 1e-9), 0, 1
+    )
     table = np.rint((SHADES - 1) * plots.CURVES[curve](fraction)).astype(np.uint8)
     shaded = np.empty((rows, columns), np.uint8)
     _shade(integers, table, shaded)
@@ -223,7 +231,9 @@ def limits_of(levels: PixelLevels, limits: str | tuple[float, float]) -> tuple[f
         low, high = ((dn - levels.offset) / levels.step for dn in limits)
         return low, high
     if limits == "zscale":
-        samples = integers.ravel()[:: max(1, integers.size // ZSCALE_SAMPLES)][:ZSCALE_SAMPLES]
+        samples = integers.ravel()[:: max(1, integers.size // ZSCALE_SAMPLES)][
+            :ZSCALE_SAMPLES
+        ]
         low, high = ZScaleInterval().get_limits(samples)
         return float(low), float(high)
     if limits == "min to max":

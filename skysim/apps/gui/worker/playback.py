@@ -12,7 +12,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Report
-from skysim.apps.gui.messages import FlightRow, FlightStep, FrameView, MotionLog, TrackerResult
+from skysim.apps.gui.messages import (
+    FlightRow,
+    FlightStep,
+    FrameView,
+    MotionLog,
+    TrackerResult,
+)
 from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker.workbench import Workbench, tracker_result
 from skysim.core import quaternion
@@ -104,7 +110,9 @@ class Playback:
         """Keep a shot, and its pixels if the file has room."""
         bench = self.bench
         assert shot.report is not None
-        solved = tracker_result(bench.lab, bench.estimator, shot.frame, shot.truth, shot.report)
+        solved = tracker_result(
+            bench.lab, bench.estimator, shot.frame, shot.truth, shot.report
+        )
         view = bench.frame_view(shot.frame, shot.truth, solved, sum(shot.seconds.values()))
         t_s = exposure_window(bench.scene, shot.frame.index, shot.frame.exposure_s).open_s
         self.frames.append(

@@ -152,7 +152,9 @@ class StudyProcess:
         error_arcsec = metrics.QUANTITIES["angle_arcsec"](columns)
         bins, heights = histogram(error_arcsec[np.isfinite(error_arcsec)])
         failed = (*raised, *unsolved(columns))[:MAX_FAILED]
-        return StudyResults(counts["done"], counts["wrong"], statistics, bins, heights, failed)
+        return StudyResults(
+            counts["done"], counts["wrong"], statistics, bins, heights, failed
+        )
 
 
 def unsolved(columns: Mapping[str, Any]) -> list[tuple[int, str]]:
@@ -162,7 +164,10 @@ def unsolved(columns: Mapping[str, Any]) -> list[tuple[int, str]]:
     unsolved_trials = zip(
         columns["trial"][refused].tolist(), columns["status"][refused].tolist(), strict=True
     )
-    return [*((trial, "wrong") for trial in columns["trial"][wrong].tolist()), *unsolved_trials]
+    return [
+        *((trial, "wrong") for trial in columns["trial"][wrong].tolist()),
+        *unsolved_trials,
+    ]
 
 
 def histogram(error_arcsec: Any) -> tuple[tuple[float, ...], tuple[int, ...]]:
@@ -195,7 +200,9 @@ def is_shown(name: str, user: str) -> bool:
 def finished(folder: Path, user: str) -> list[Path]:
     """Folders of the studies that have a report and are shown to a user, newest first."""
     folders = [
-        path.parent for path in folder.glob("*/report.html") if (path.parent / STORE).is_file()
+        path.parent
+        for path in folder.glob("*/report.html")
+        if (path.parent / STORE).is_file()
     ]
     folders = [path for path in folders if is_shown(path.name, user)]
     return sorted(folders, key=lambda path: -(path / "report.html").stat().st_mtime)

@@ -93,7 +93,8 @@ class Worker:
         """Keep an image that is not of the scene, and return its view."""
         self.other, self.image = photo_pixels
         return replace(
-            self.other, pixels=self.show(pixels.levels_of(self.image), self.other.saturation_dn)
+            self.other,
+            pixels=self.show(pixels.levels_of(self.image), self.other.saturation_dn),
         )
 
     def show(self, levels: pixels.PixelLevels, saturation_dn: float) -> Pixels:
@@ -101,7 +102,9 @@ class Worker:
         self.number += 1
         self.shown[self.number] = levels, saturation_dn
         self.shown.pop(self.number - KEPT_IMAGES, None)
-        return pixels.pixels_for(self.display or ALL_PIXELS, levels, saturation_dn, self.number)
+        return pixels.pixels_for(
+            self.display or ALL_PIXELS, levels, saturation_dn, self.number
+        )
 
     @property
     def survey_of_scene(self) -> survey_flight.Survey:
@@ -245,7 +248,9 @@ class Worker:
             return image_export.photo_files(self.other, self.image)
         if self.flight:
             self.flight.render()
-        return image_export.frame_files(self.workbench, self.scene, dict(self.overrides or {}))
+        return image_export.frame_files(
+            self.workbench, self.scene, dict(self.overrides or {})
+        )
 
     def solve_file(
         self, name: str, data: bytes, fov_deg: float | None, stages: photo.Stages = ()

@@ -100,7 +100,12 @@ class Workbench:
         lab_from_body = before.lab_from_body if before and same else lab.start
         views = geometry.scene_lens(lab), geometry.lab_geometry(lab)
         return cls(
-            scene, lab, warm_tracker(lab), lab_from_body, *views, magnitude=magnitude_by_id(lab)
+            scene,
+            lab,
+            warm_tracker(lab),
+            lab_from_body,
+            *views,
+            magnitude=magnitude_by_id(lab),
         )
 
     @property
@@ -209,7 +214,9 @@ def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> LightColumns:
 def magnitude_by_id(lab: Lab) -> dict[int, float]:
     """V magnitude by a light's number; NaN for an LED."""
     return dict(
-        zip(lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True)
+        zip(
+            lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True
+        )
     )
 
 

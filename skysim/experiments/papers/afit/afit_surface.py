@@ -88,7 +88,9 @@ def table_1(options: ExperimentOptions) -> ExperimentResult:
                 for width in (stated, fitted)
             ]
         for name, pair in values.items():
-            results[f"{name}_{angle}"] = with_cause(f"M = {FITTED_HEIGHT_IN} in", exact, *pair)
+            results[f"{name}_{angle}"] = with_cause(
+                f"M = {FITTED_HEIGHT_IN} in", exact, *pair
+            )
     dome = build_surface(SPHERE)
     chords = [chord_in(dome, STATED_HEIGHT_IN, angle) for angle in ANGLES_DEG]
     results["sphere"] = exact(np.ptp(chords))
@@ -100,7 +102,9 @@ def chord_in(surface: Surface, height_in: float, angle_deg: float) -> float:
     """Chord between the points where the two edges of the field meet a surface (eq. 42), in inches."""
     tilt = np.radians(angle_deg)
     half_field = FIELD_RAD / 2
-    edges = np.array([tilted_direction(tilt - half_field), tilted_direction(tilt + half_field)])
+    edges = np.array(
+        [tilted_direction(tilt - half_field), tilted_direction(tilt + half_field)]
+    )
     ends_m = surface.meet(height_in * INCH_M * tilted_direction(tilt), edges)
     return float(np.linalg.norm(ends_m[1] - ends_m[0]) / INCH_M)
 
@@ -186,7 +190,9 @@ def best_sphere(dome: Surface) -> Results:
     rotations = Rotation.from_euler(
         "z", np.arange(SAMPLE_SECTORS)[:, None] * (2 * np.pi / SAMPLE_SECTORS)
     )
-    sphere = fit_sphere(np.concatenate([rotation.apply(profile_in) for rotation in rotations]))
+    sphere = fit_sphere(
+        np.concatenate([rotation.apply(profile_in) for rotation in rotations])
+    )
     contour_in = intersections_in(dome, fraction * cap_rad)
     error_in = np.linalg.norm(contour_in - sphere.center_m, axis=1) - sphere.radius_m
     return {

@@ -103,7 +103,9 @@ def board_scene(
     panel = FlatSurfaceConfig.model_validate({"kind": "flat", "apex": f"{height_in} in"})
     scene = with_config(scene, "light", surface=panel, layout=listed, occlusion=False)
     scene = with_config(scene, "light.led", scatter=0.0, **led_values)
-    scene = with_config(scene, "camera", f_number=lens.f_number, focus_m=lens.focus_in * INCH_M)
+    scene = with_config(
+        scene, "camera", f_number=lens.f_number, focus_m=lens.focus_in * INCH_M
+    )
     if lens.noise_e is not None:
         scene = with_config(scene, "camera.detector", read_noise_e=lens.noise_e)
     return scene
@@ -236,7 +238,9 @@ def duty_cycles(rng: np.random.Generator) -> Results:
     """Eq. 37: light of each of nine multiplexed LEDs relative to one that is always on."""
     pulses_us = [1000.0, 500.0, 400.0, 200.0, 1.0, 1000.0, 1000.0, 1000.0, 1000.0]
     lab = with_exposure(white_board(pulses_us), 4 * 9 * SLOT_S)
-    always_on = lab.with_sources(replace(lab.camera.sources, on_s=lab.camera.sources.period_s))
+    always_on = lab.with_sources(
+        replace(lab.camera.sources, on_s=lab.camera.sources.period_s)
+    )
     electrons = []
     for board in (lab, always_on):
         sources = render_at_attitude(board, Rotation.identity(), rng)[1].sources
@@ -385,7 +389,9 @@ def brightness(images: int, rng: np.random.Generator) -> tuple[Results, Floats]:
     short_magnitudes = [led_magnitudes(lab, rng) for _ in range(images)]
     first_to_last = [values[:, 0] / values[:, 3] for values in (per_us, saturating_per_us)]
     return {
-        "order": with_cause(CAUSE_LONG_PULSE, fraction_in_order, short_magnitudes, magnitudes),
+        "order": with_cause(
+            CAUSE_LONG_PULSE, fraction_in_order, short_magnitudes, magnitudes
+        ),
         "linear": RowResult(confidence_interval(per_us[:, 1] / per_us[:, 3]), note),
         "saturating": with_cause(CAUSE_SATURATION, confidence_interval, *first_to_last),
         "found_46": with_cause(CAUSE_LONG_PULSE, confidence_interval, *detected),

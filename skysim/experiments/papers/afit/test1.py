@@ -50,7 +50,13 @@ FRAME_TIME_S = 100e-3  # at 10 Hz: 11 1/9 cycles
 INTENSITY_CD = 10.4e-3  # at FRAME_S; the mean magnitude of the nine is then the published one
 PITCH_M = 8e-3
 NEIGHBORS = ((1, 4), (3, 4), (4, 5), (4, 7))  # pairs of the central LED, in the scene's order
-SQUARED_DISTANCES = (1.0, 2.0, 4.0, 5.0, 8.0)  # squared distances in a 3x3 lattice, in pitches
+SQUARED_DISTANCES = (
+    1.0,
+    2.0,
+    4.0,
+    5.0,
+    8.0,
+)  # squared distances in a 3x3 lattice, in pitches
 PAIR_COUNTS = (12, 8, 6, 8, 2)  # number of pairs at each of these distances
 CAUSE = "100 ms, 11 1/9 cycles: one LED has a twelfth pulse"
 GAP_ARCSEC = 100.0  # sorted angles with a larger gap are counted as distinct
@@ -86,7 +92,10 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
         build_test_stand(scene_with_exposure(time_s))
         for time_s in (FULL_CYCLES_S, FRAME_TIME_S)
     ]
-    runs: tuple[list[Floats], list[Floats]] = ([], [])  # with full cycles, with the frame time
+    runs: tuple[list[Floats], list[Floats]] = (
+        [],
+        [],
+    )  # with full cycles, with the frame time
     for n in range(boards):
         options.watch(n, boards)
         hardware_seed = int(random_stream(options.seed, n).integers(2**31))
@@ -132,7 +141,9 @@ def ranks(full_cycles: Sequence[Floats], frame_time: Sequence[Floats]) -> Result
                 CAUSE, confidence_interval, ours[:, n], theirs[:, n]
             )
     mean = np.array([board.mean(axis=0) for board in full_cycles])
-    results["scatter"] = confidence_interval(100 * mean.std(axis=1, ddof=1) / mean.mean(axis=1))
+    results["scatter"] = confidence_interval(
+        100 * mean.std(axis=1, ddof=1) / mean.mean(axis=1)
+    )
     return results
 
 
@@ -218,7 +229,11 @@ def draw_board(fig: Any, board: Floats) -> None:
     bins = np.linspace(board.min(), board.max(), 60)
     colors = [*INK, "#bbbbbb"]
     axes.hist(
-        list(board.T), bins, stacked=True, color=colors, label=[str(n + 1) for n in range(LEDS)]
+        list(board.T),
+        bins,
+        stacked=True,
+        color=colors,
+        label=[str(n + 1) for n in range(LEDS)],
     )
     published = published_by_rank("mean")
     axes.plot(

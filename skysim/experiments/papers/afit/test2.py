@@ -248,7 +248,8 @@ def angles(lab: Lab, runs: NoiseRuns, images: int, rng: np.random.Generator) -> 
     )
     cause = f"a board tilted by {BOARD_TILT_DEG:g} deg"
     smallest = min(
-        geometric_angle_arcsec(lab, BoardPlace(float(tilt))) for tilt in np.linspace(20, 34, 29)
+        geometric_angle_arcsec(lab, BoardPlace(float(tilt)))
+        for tilt in np.linspace(20, 34, 29)
     )
     return {
         "angle_1": confidence_interval(at_apex),
@@ -292,7 +293,10 @@ def geometric_angle_arcsec(lab: Lab, place: BoardPlace) -> float:
     lever = onboard_model.assumed_lever(lab.scene, lab.camera.mount)
     camera = onboard_model.assumed_camera(lab.scene)
     xy_px = project(
-        point_at(place).inv(), place_pair(lab, place).camera.sources.place[:, :3], lever, camera
+        point_at(place).inv(),
+        place_pair(lab, place).camera.sources.place[:, :3],
+        lever,
+        camera,
     )
     return float(separations_arcsec(xy_px, lab)[0])
 
@@ -317,7 +321,10 @@ def draw_magnitudes(fig: Any, places: Sequence[PlaceSeries]) -> None:
             axes.errorbar(mean, top * (1.1 + 0.1 * n), xerr=sd, **style)
         axes.set(xlabel=f"magnitude of the {name} LED", ylabel="images", ylim=(0, top * 1.4))
     fig.legend(
-        *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8
+        *panels[0].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=6,
+        fontsize=8,
     )
 
 
@@ -344,6 +351,8 @@ def draw_angles(fig: Any, lab: Lab, places: Sequence[PlaceSeries]) -> None:
         [rows[f"{key}_{n}"].published for n in (1, 2, 3)] for key in ("angle", "sd_angle")
     )
     published_deg = (0, HALFWAY_DEG, PLACES_DEG[2])
-    axes.errorbar(published_deg, mean, sd, fmt="o", capsize=3, color=INK[1], label="published")
+    axes.errorbar(
+        published_deg, mean, sd, fmt="o", capsize=3, color=INK[1], label="published"
+    )
     axes.set(xlabel="tilt of the board (deg)", ylabel="angle of the pair (arcsec)")
     axes.legend()

@@ -125,7 +125,9 @@ def photograph(
         if len(led) == LEDS:
             row = np.flatnonzero(inside)[led_row]
             sightings.append(
-                Sighting(position, lab_from_body.inv(), led, lights.xy_px[row], magnitude[row])
+                Sighting(
+                    position, lab_from_body.inv(), led, lights.xy_px[row], magnitude[row]
+                )
             )
     return sightings
 
@@ -455,7 +457,9 @@ def buckets() -> Results:
     width = 5 * ARCSEC_RAD
     gate = 20 * ARCSEC_RAD
     stars = unit(random_stream(0).standard_normal((500, 3)))
-    entries = len(build_pair_catalog(stars, np.zeros(len(stars)), width, (low, high)).table) - 1
+    entries = (
+        len(build_pair_catalog(stars, np.zeros(len(stars)), width, (low, high)).table) - 1
+    )
     # Average over the phase of a pair's angle within a bucket.
     angle = (low + high) / 2 + width * (np.arange(1000) + 0.5) / 1000
     first = bucket_of(angle - gate, high, width, entries)

@@ -178,7 +178,9 @@ def draw(fig: Any, run: BumpRun) -> None:
         published = rows[f"theta_{axis + 1}"].published
         label = f"published, theta_{axis + 1}"
         axes.plot(run.t_s[-1] + 0.15, published, "os^"[axis], color=INK[1], label=label)
-    axes.plot(run.t_s, run.filter_deg, color=INK[6], ls="--", label="filter with star tracker")
+    axes.plot(
+        run.t_s, run.filter_deg, color=INK[6], ls="--", label="filter with star tracker"
+    )
     axes.set(xlabel="time (s)", ylabel="error (deg)")
     axes.legend(ncols=2)
 
@@ -246,7 +248,9 @@ def tables_10_to_15(options: ExperimentOptions) -> ExperimentResult:
     )
     options.watch(2, 4)
     holds = (HOLD_MIN,) if options.quick else HOLDS_MIN
-    drift_deg = {hold: imu_drift(hold, units, random_stream(options.seed, 2)) for hold in holds}
+    drift_deg = {
+        hold: imu_drift(hold, units, random_stream(options.seed, 2)) for hold in holds
+    }
     drift_without_earth_deg = imu_drift(
         HOLD_MIN, units, random_stream(options.seed, 2), earth=False
     )
@@ -284,7 +288,11 @@ def tables_10_to_15(options: ExperimentOptions) -> ExperimentResult:
 
 
 def with_draws(
-    cause: str, clean: Floats, with_causes: Floats, draws: int, with_earth: float | None = None
+    cause: str,
+    clean: Floats,
+    with_causes: Floats,
+    draws: int,
+    with_earth: float | None = None,
 ) -> RowResult:
     """Prediction intervals of clean values, and of those with the causes, which have fewer independent `draws`.
 
@@ -293,9 +301,13 @@ def with_draws(
     with_earth
         The value if the IMU also contained the Earth rate, for the note
     """
-    note = "" if with_earth is None else f"with the Earth rate in the IMU too: {with_earth:.3f}"
+    note = (
+        "" if with_earth is None else f"with the Earth rate in the IMU too: {with_earth:.3f}"
+    )
     return RowResult(
-        prediction_interval(clean), note, Cause(cause, prediction_interval(with_causes, draws))
+        prediction_interval(clean),
+        note,
+        Cause(cause, prediction_interval(with_causes, draws)),
     )
 
 
@@ -367,7 +379,9 @@ def algorithm_errors(
     for n_set, sightings_of_set in enumerate(sets):
         # The home image is the map: all attitudes of a set are relative to it, as in the thesis (3.6.4).
         home = sightings_of_set[HOME]
-        catalog = build_pair_catalog(unit(light_positions_m(lab, home.xy_px)), home.brightness)
+        catalog = build_pair_catalog(
+            unit(light_positions_m(lab, home.xy_px)), home.brightness
+        )
         for n, sighting in enumerate(sightings_of_set):
             order = np.argsort(-sighting.brightness, kind="stable")
             vectors = unit(light_positions_m(lab, sighting.xy_px[order]))
@@ -486,7 +500,9 @@ def draw_differences(fig: Any, causes: AllCauses) -> None:
         axes.plot(
             position + 0.25, earth, "D", ms=4, color=INK[5], label="and the Earth's turning"
         )
-        axes.plot(position - 0.1, published_deg[:, axis], "o", color=INK[1], label="published")
+        axes.plot(
+            position - 0.1, published_deg[:, axis], "o", color=INK[1], label="published"
+        )
         axes.set(xlabel="position", xticks=position, title=f"theta_{axis + 1}")
     panels[0].set(ylabel="algorithm less IMU (deg)")
     fig.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)

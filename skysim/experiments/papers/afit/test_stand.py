@@ -81,7 +81,9 @@ def measure_lights(image: NDArray[np.uint8]) -> MeasuredLights:
     area_px = blobs.area_px.astype(float)
     magnitude = instrument_brightness(mean_dn, area_px) if len(blobs) else mean_dn
     order = np.argsort(-magnitude, kind="stable")
-    return MeasuredLights(blobs.xy_px[order], area_px[order], mean_dn[order], magnitude[order])
+    return MeasuredLights(
+        blobs.xy_px[order], area_px[order], mean_dn[order], magnitude[order]
+    )
 
 
 def measure_frame(

@@ -131,7 +131,9 @@ def collect_rows(
         )
         # One message submits all, and results arrive in the background: a round trip for each would limit the speed.
         futures = (
-            client.map(run_encoded, [name] * len(new), list(map(encode_chunk, new)), pure=False)
+            client.map(
+                run_encoded, [name] * len(new), list(map(encode_chunk, new)), pure=False
+            )
             if new
             else []
         )

@@ -94,7 +94,9 @@ def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[VisibleSources]:
         occludes = occlusion(camera, replace(start, lab_from_body=lab_from_body[n]))
         if occludes:
             chosen = chosen[~occludes(near.place[chosen])]
-        views.append(VisibleSources(rows[n][chosen - begin], xy_px[chosen], electrons[chosen]))
+        views.append(
+            VisibleSources(rows[n][chosen - begin], xy_px[chosen], electrons[chosen])
+        )
     return views
 
 
@@ -150,7 +152,9 @@ def solve_coded(
     """(N, 2) true pixel positions, and the report of the first frame with an attitude, or of the code's last one."""
     lab = lab.in_run(int(rng.integers(2**62)))
     ((rows, xy_px, electrons),) = visible_rows(lab, Rotation.concatenate([lab_from_body]))
-    electrons = electrons * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(rows)))
+    electrons = electrons * 10 ** (
+        0.4 * trial.magnitude_sigma * rng.standard_normal(len(rows))
+    )
     # The error of the magnitude is the LED's, equal in all frames, so `simulate_detections` adds none.
     per_frame = trial.model_copy(update={"magnitude_sigma": 0.0})
     tracker.last_s = None  # forget the frames of an earlier trial

@@ -103,7 +103,9 @@ class Pool:
                 done = True
             except BrokenProcessPool:
                 # Count a death only for a trial that was alone in flight; otherwise the culprit is unknown.
-                lost = [single for chunk in in_flight.values() for single in split_chunk(chunk)]
+                lost = [
+                    single for chunk in in_flight.values() for single in split_chunk(chunk)
+                ]
                 deaths.update(single[0].first for single in lost if len(lost) == 1)
                 for single in lost:
                     if deaths[single[0].first] == MAX_ATTEMPTS:

@@ -152,7 +152,9 @@ class TrueLights(NamedTuple):
 def true_lights(truth: Truth) -> TrueLights:
     """The lights of a rendered frame."""
     sources = truth.sources
-    return TrueLights(truth.lab_from_body, sources.xy_px, sources.flux_xy_px, sources.streak_px)
+    return TrueLights(
+        truth.lab_from_body, sources.xy_px, sources.flux_xy_px, sources.streak_px
+    )
 
 
 def score(
@@ -230,7 +232,9 @@ def claimed_image_px(
     if isinstance(estimator, DomeTracker):
         order = np.argsort(lab.camera.sources.id)
         rows = order[
-            np.searchsorted(lab.camera.sources.id, estimator.leds.id[match.star], sorter=order)
+            np.searchsorted(
+                lab.camera.sources.id, estimator.leds.id[match.star], sorter=order
+            )
         ]
         camera_m = quaternion.apply(lab_from_body, lab.camera.mount.camera_body_m)
         offset_lab = lab.camera.sources.place[rows, :3] - camera_m

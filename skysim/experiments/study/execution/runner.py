@@ -221,7 +221,9 @@ def stored_replicates(plan: Plan, store: Store) -> int:
     """Number of replicates in the store if its study is the plan's, with as many replicates or fewer; else 0."""
     if plan.digest == store.meta("digest"):
         return plan.study.replicates
-    if plan.study.optimize is not None:  # a search has chosen its candidates by all replicates
+    if (
+        plan.study.optimize is not None
+    ):  # a search has chosen its candidates by all replicates
         return 0
     with store.corruption_as_input_error():
         fewer = int(store.meta("replicates") or 0)
@@ -293,7 +295,10 @@ def run_points(
             rows.close()
         if progress.now:
             store.record_run(
-                engine.name, engine.workers, progress.now, time.perf_counter() - progress.began
+                engine.name,
+                engine.workers,
+                progress.now,
+                time.perf_counter() - progress.began,
             )
     return progress
 
@@ -331,7 +336,9 @@ def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
     points = store.points()
     each = plan.study.replicates
     if not 0 <= trial < len(points) * each:
-        raise InputError(f"trial {trial}", "not in the study", f"0 to {len(points) * each - 1}")
+        raise InputError(
+            f"trial {trial}", "not in the study", f"0 to {len(points) * each - 1}"
+        )
     point, replicate = divmod(trial, each)
     settings = plan.spec.trial_settings(points[point].settings, replicate)
     return Segment(point, settings, trial, range(replicate, replicate + 1))

@@ -45,7 +45,17 @@ TEXT_FIELDS = {"status"}
 INTEGER_FIELDS = {"frames", "solved", "wrong", "ambiguous"}
 
 # Names of `Store.columns`.
-COLUMNS = ("trial", "point", "replicate", "seed", "scene", "code", *FIELDS, "error", "time_ms")
+COLUMNS = (
+    "trial",
+    "point",
+    "replicate",
+    "seed",
+    "scene",
+    "code",
+    *FIELDS,
+    "error",
+    "time_ms",
+)
 
 SQL_TYPES = dict.fromkeys(TEXT_FIELDS, "TEXT") | dict.fromkeys(INTEGER_FIELDS, "INTEGER")
 OUTCOME_COLUMNS = ", ".join(f"{name} {SQL_TYPES.get(name, 'REAL')}" for name in FIELDS)
@@ -67,7 +77,9 @@ CREATE TABLE IF NOT EXISTS parts (
   last INTEGER NOT NULL);
 """
 
-values_of = attrgetter(*FIELDS)  # the values of an outcome; `astuple` takes twenty times longer
+values_of = attrgetter(
+    *FIELDS
+)  # the values of an outcome; `astuple` takes twenty times longer
 INSERT = f"INSERT OR REPLACE INTO trials VALUES ({', '.join('?' * (7 + len(FIELDS)))})"
 
 
@@ -136,7 +148,9 @@ class Store:
         )
         with self.snapshot():
             found = [
-                row for order in ("ASC", "DESC") for row in self.db.execute(query.format(order))
+                row
+                for order in ("ASC", "DESC")
+                for row in self.db.execute(query.format(order))
             ]
             for part in self.parts():
                 part.trials(self._replicates())  # is as listed
@@ -160,7 +174,11 @@ class Store:
 
     def _insert_points(self, points: Iterable[Point], first: int = 0) -> None:
         rows = (
-            (n, json.dumps(point.levels, default=str), json.dumps(point.settings, default=str))
+            (
+                n,
+                json.dumps(point.levels, default=str),
+                json.dumps(point.settings, default=str),
+            )
             for n, point in enumerate(points, first)
         )
         self.db.executemany("INSERT OR REPLACE INTO points VALUES (?, ?, ?)", rows)
@@ -202,7 +220,9 @@ class Store:
 
     def _move_part(self) -> int:
         """Move the rows with the lowest trial numbers and return their number; 0 if too few are without an error."""
-        where = "trial IN (SELECT trial FROM trials WHERE error IS NULL ORDER BY trial LIMIT ?)"
+        where = (
+            "trial IN (SELECT trial FROM trials WHERE error IS NULL ORDER BY trial LIMIT ?)"
+        )
         columns = self._kept_columns(where, (PART_ROWS,))
         trial = columns.pop("trial")
         if len(trial) < PART_ROWS:
@@ -241,7 +261,9 @@ class Store:
         # A store of an earlier skysim has no such table.
         if self.meta("format") != str(FORMAT_OF_PARTS):
             return []
-        rows = self.db.execute("SELECT part, rows, wrong, first, last FROM parts ORDER BY part")
+        rows = self.db.execute(
+            "SELECT part, rows, wrong, first, last FROM parts ORDER BY part"
+        )
         known = (self.checked(row, int, int, int, int, int) for row in rows)
         return [
             self._parts.setdefault(number, Part(self.part_path(number), *others))
@@ -268,7 +290,9 @@ class Store:
 
     def runs(self) -> list[dict[str, Any]]:
         """Every run that was not killed: engine, workers, trials, seconds."""
-        rows = self.db.execute("SELECT engine, workers, trials, seconds FROM runs ORDER BY run")
+        rows = self.db.execute(
+            "SELECT engine, workers, trials, seconds FROM runs ORDER BY run"
+        )
         known = (self.checked(row, str, int, int, float) for row in rows)
         return [
             dict(zip(("engine", "workers", "trials", "seconds"), row, strict=True))
@@ -293,7 +317,9 @@ class Store:
         query = "SELECT COUNT(*), COALESCE(SUM(error IS NOT NULL), 0), COALESCE(SUM(wrong), 0) FROM trials"
         with self.snapshot():
             # SQLite's sum is an integer only if all values are.
-            done, failed, wrong = self.checked(self.db.execute(query).fetchone(), int, int, int)
+            done, failed, wrong = self.checked(
+                self.db.execute(query).fetchone(), int, int, int
+            )
             parts = self.parts()
         done = done + sum(part.rows for part in parts)
         wrong = wrong + sum(part.wrong for part in parts)
@@ -340,7 +366,8 @@ class Store:
         (point,), (near, rows) = points, self._near
         if point not in near:
             last = min(
-                (part.last for part in parts if part.first <= point <= part.last), default=point
+                (part.last for part in parts if part.first <= point <= part.last),
+                default=point,
             )
             near = range(point, last + 1)
             rows = self._rows(ranges_of(range(point, last + 1), self._replicates()))
@@ -407,7 +434,9 @@ class Store:
                     COLUMNS, batches, zip(*rows, strict=True), strict=True
                 ):
                     arrays.append(to_array(name, column, texts))
-            self.checked([text for text in texts if not isinstance(text, str | None)][:1], str)
+            self.checked(
+                [text for text in texts if not isinstance(text, str | None)][:1], str
+            )
             return {
                 name: np.concatenate(arrays)
                 for name, arrays in zip(COLUMNS, batches, strict=True)

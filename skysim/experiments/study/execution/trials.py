@@ -316,7 +316,10 @@ def flight_outcomes(
     """Mid-exposure time and outcome of every frame of the main camera."""
     for shot in flight.shots(cameras=[0]):
         assert shot.report is not None
-        yield shot.truth.t_s, score(flight.lab, estimator, shot.report, true_lights(shot.truth))
+        yield (
+            shot.truth.t_s,
+            score(flight.lab, estimator, shot.report, true_lights(shot.truth)),
+        )
 
 
 def one_by_one(
@@ -541,7 +544,11 @@ def constant_rate(scene: Scene, middle: Rotation, rate_body: Floats) -> Trajecto
 
 
 def constant_acceleration(
-    scene: Scene, middle: Rotation, rate_body: Floats, acceleration_body: Floats, frame: int = 0
+    scene: Scene,
+    middle: Rotation,
+    rate_body: Floats,
+    acceleration_body: Floats,
+    frame: int = 0,
 ) -> Trajectory:
     """A trajectory through the exposures up to a frame's; in the middle of that one it has this attitude and rate.
 

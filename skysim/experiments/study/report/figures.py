@@ -238,7 +238,9 @@ def draw_few(axes: Any, one: Series, mark: str, **style: Any) -> None:
         axes.annotate(f"n={one.values[n]}", (one.x[n], one.value[n]), **text)
 
 
-def draw_points(axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots: bool) -> None:
+def draw_points(
+    axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots: bool
+) -> None:
     """Draw sampled points: with error bars, or, if they are many, with their running median.
 
     On an axis of named levels the median at each level replaces the running median.
@@ -246,7 +248,9 @@ def draw_points(axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots
     style = {"marker": mark, "color": ink, "linestyle": "none"}
     if not dots:
         draw_bars(axes, one.x, one, ink, axes.transData)
-        axes.plot(one.x, np.where(one.few, np.nan, one.value), label=one.label or None, **style)
+        axes.plot(
+            one.x, np.where(one.few, np.nan, one.value), label=one.label or None, **style
+        )
         draw_few(axes, one, mark, color=ink, transform=axes.transData)
         return
     size = min(max(4.5 * (MAX_POINTS_WITH_BARS / len(one.x)) ** 0.3, 1.8), 4.5)
@@ -254,7 +258,12 @@ def draw_points(axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots
     if numeric:
         axes.plot(*running_median(one), color=ink, linewidth=2.2, label=one.label or None)
     else:
-        medians = {"marker": "_", "markersize": 26, "markeredgewidth": 2.2, "linestyle": "none"}
+        medians = {
+            "marker": "_",
+            "markersize": 26,
+            "markeredgewidth": 2.2,
+            "linestyle": "none",
+        }
         axes.plot(*level_medians(one), color=ink, label=one.label or None, **medians)
 
 
@@ -452,7 +461,9 @@ def draw_indices(fig: Any, selected: Sequence[Index], response: str) -> None:
 # Optimizations.
 
 
-def search_png(panels: dict[str, Panel], points: Sequence[int], front: Sequence[int]) -> bytes:
+def search_png(
+    panels: dict[str, Panel], points: Sequence[int], front: Sequence[int]
+) -> bytes:
     """Responses of an optimization against candidate number, stacked panels; Pareto points marked, bounds dashed."""
 
     def draw(fig: Any) -> None:

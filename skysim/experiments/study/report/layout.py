@@ -44,9 +44,7 @@ MOST_FIGURES = 24  # maximum number of automatic figures
 LOG_RESPONSE_RATIO = (
     30  # minimum ratio of largest to smallest response for an automatic logarithmic axis
 )
-FAR_RATIO = (
-    30  # interval bounds below the smallest value / FAR_RATIO do not extend a logarithmic axis
-)
+FAR_RATIO = 30  # interval bounds below the smallest value / FAR_RATIO do not extend a logarithmic axis
 
 
 class Series(NamedTuple):
@@ -279,9 +277,7 @@ def caption(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
         mark = "Hollow, without a line"
         text += curve_note(figure, study, lines, summaries) + "."
         if thresholds_of(figure, study, lines):
-            text += (
-                " Dashed: a limit; ticks and bars: where it is crossed, with intervals of 95 %."
-            )
+            text += " Dashed: a limit; ticks and bars: where it is crossed, with intervals of 95 %."
         if (expected := expected_value(value)) is not None:
             text += f" Dotted: {expected:g}, where the claimed errors are true."
     else:
@@ -305,7 +301,9 @@ def caption_title(figure: Figure) -> str:
 def fixed_text(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
     """The levels of varied factors that a figure keeps fixed, as ", at leds = 900"; empty if there are none."""
     varied = {
-        name for name in study.factors if len(distinct(line.levels[name] for line in lines)) > 1
+        name
+        for name in study.factors
+        if len(distinct(line.levels[name] for line in lines)) > 1
     }
     fixed = fixed_levels(figure, study, lines).items()
     at = ", ".join(f"{name} = {format_level(one)}" for name, one in fixed if name in varied)

@@ -172,7 +172,9 @@ def partition(
 
 
 def cell_numbers(
-    ranges: Sequence[tuple[float, float, float, float]], radial_deg: Floats, around_deg: Floats
+    ranges: Sequence[tuple[float, float, float, float]],
+    radial_deg: Floats,
+    around_deg: Floats,
 ) -> NDArray[np.int16]:
     """(N,) number of the cell that each trial is in, by the ranges of `partition`; -1 for none."""
     number = np.full(len(radial_deg), -1, np.int16)
@@ -283,7 +285,10 @@ def draw_dome_labels(axes: Any, panel: DirectionMap) -> None:
         axes.text(*place(1.09 * edges[-1], azimuth_deg, False), text, **LABEL)
     for edge in edges:
         axes.text(
-            *place(edge, RING_LABEL_DEG, False), f"{edge:.3g}°", path_effects=[halo()], **LABEL
+            *place(edge, RING_LABEL_DEG, False),
+            f"{edge:.3g}°",
+            path_effects=[halo()],
+            **LABEL,
         )
 
 
@@ -294,7 +299,9 @@ def draw_sky_labels(axes: Any) -> None:
         axes.plot(*place(dec_deg, edge, True).T, color="#888888", linewidth=1)
     axes.set(xlim=(-3.2, 2.9), ylim=(-1.5, 1.5))
     for ra_deg in (240, 300, 360, 420, 480):
-        axes.text(*place(0.0, ra_deg, True), f"{ra_deg % 360}°", path_effects=[halo()], **LABEL)
+        axes.text(
+            *place(0.0, ra_deg, True), f"{ra_deg % 360}°", path_effects=[halo()], **LABEL
+        )
     for dec in (-60.0, -30.0, 0.0, 30.0, 60.0):
         x, y = place(dec, 540.0, True)
         axes.text(x - 0.22, y, f"{dec:+.0f}°" if dec else "0°", **LABEL)

@@ -26,7 +26,9 @@ from skysim.simulation.lab import Lab, UserParts, build_lab
 
 NUMBER = re.compile(r"\d[\d.]*")
 RATE = "trial.rate_deg_s"
-MAX_CHECKED = 8  # maximum number of scenes that are checked: building one takes up to a second
+MAX_CHECKED = (
+    8  # maximum number of scenes that are checked: building one takes up to a second
+)
 
 
 class Overview(NamedTuple):
@@ -63,7 +65,9 @@ def overview(plan: Plan) -> Overview:
         if checked == MAX_CHECKED:
             break
         try:
-            scene, trial = resolve_point(plan.spec, plan.spec.trial_settings(point.settings, 0))
+            scene, trial = resolve_point(
+                plan.spec, plan.spec.trial_settings(point.settings, 0)
+            )
             lab = build_lab(scene, UserParts(plan.spec.programs))
             found_here = checks.check(
                 lab, greatest_tilt_deg(scene, trial), trial_rate_rad_s(trial, lab)
@@ -125,7 +129,9 @@ def trial_rate_rad_s(trial: Trial, lab: Lab) -> Floats | None:
         return np.zeros(3)
     # For a random axis, one between the camera's x and y is taken: a rolling shutter then both shears and stretches.
     axis_cam = rate_axis(trial.rate_axis, math.pi / 4, lab.camera.mount)
-    return lab.camera.mount.cam_from_body.inv().apply(math.radians(trial.rate_deg_s) * axis_cam)
+    return lab.camera.mount.cam_from_body.inv().apply(
+        math.radians(trial.rate_deg_s) * axis_cam
+    )
 
 
 def checked_points(plan: Plan) -> Iterator[tuple[str, Point]]:
@@ -139,7 +145,9 @@ def checked_points(plan: Plan) -> Iterator[tuple[str, Point]]:
     yield "first levels", make_point(first)
     for name, factor in factors.items():
         rates = [
-            option for option in options(factor) if isinstance(option[1].get(RATE), int | float)
+            option
+            for option in options(factor)
+            if isinstance(option[1].get(RATE), int | float)
         ]
         fastest = max(rates, key=lambda option: float(str(option[1][RATE])), default=None)
         if fastest is not None and fastest != first[name]:
@@ -228,7 +236,9 @@ def tracker_text(scene: Scene) -> str:
 
 def factor_text(factor: Factor) -> str:
     """The levels of a factor, or its range or distribution."""
-    keys = ", ".join(dict.fromkeys(key for _, settings in options(factor) for key in settings))
+    keys = ", ".join(
+        dict.fromkeys(key for _, settings in options(factor) for key in settings)
+    )
     if isinstance(factor, Range):
         return f"{factor.from_} to {factor.to} ({keys})"
     if isinstance(factor, Distribution):

@@ -109,7 +109,9 @@ def dataset(store: Store, responses: tuple[str, ...], path: Path) -> Any:
         if frame[name].map(type).isin([list, dict]).any():
             frame[name] = frame[name].map(str)
     sizes = [frame[name].nunique() for name in factors]
-    full = factors and int(np.prod(sizes)) == len(frame) and not frame.duplicated(factors).any()
+    full = (
+        factors and int(np.prod(sizes)) == len(frame) and not frame.duplicated(factors).any()
+    )
     meta = {key: store.meta(key) for key in ("title", "code", "study")}
     indexed = frame.set_index(factors if full else ["point"])
     return xarray.Dataset.from_dataframe(indexed).assign_attrs(meta)

@@ -97,7 +97,9 @@ class Analysis(NamedTuple):
         return [*self.headline, *self.ranges]
 
 
-def study_report(plan: Plan, store: Store, study: str = "", out: Path | None = None) -> Report:
+def study_report(
+    plan: Plan, store: Store, study: str = "", out: Path | None = None
+) -> Report:
     """The report of a study; `study` and `out` are those of `commands`.
 
     Raises
@@ -126,7 +128,9 @@ def commands(
     return partial(shell_command, study, out, store.overrides())
 
 
-def shell_command(study: str, out: Path | None, overrides: Mapping[str, str], verb: str) -> str:
+def shell_command(
+    study: str, out: Path | None, overrides: Mapping[str, str], verb: str
+) -> str:
     """The shell command that applies `verb` to a study."""
     words = ["skysim", "study", verb, study]
     if out:
@@ -180,7 +184,9 @@ def compose(
     """
     lines = select_responses(found.lines, responses(study))
     front = [one.number for one in found.result.front] if found.result else []
-    costs = {one.number: one.cost for one in found.result.candidates} if found.result else None
+    costs = (
+        {one.number: one.cost for one in found.result.candidates} if found.result else None
+    )
     drawn = [
         *search_figures(lines, study, front, costs, also),
         *sobol_figures(found.indices),
@@ -220,7 +226,9 @@ def folded(title: str, blocks: Sequence[Block], on_terminal: bool = False) -> Se
 def scene_sections(about: Overview, code: str) -> list[Section]:
     """The findings of the scene's checks, and the scene as a table with the version of the code."""
     findings = (
-        Items(about.findings, tone="warning") if about.findings else Text("Nothing to warn of.")
+        Items(about.findings, tone="warning")
+        if about.findings
+        else Text("Nothing to warn of.")
     )
     facts = [*((name, [text]) for name, text in about.rows), ("code version", [code])]
     return [
@@ -260,7 +268,9 @@ def failures(store: Store, replay: str) -> Items:
         lines.append(f"`{replay} {listed[0][0]}` does one again and keeps its frames.")
     trials = "1 trial failed and counts" if count == 1 else f"{count} trials failed and count"
     first = ", the first of them" if count > len(listed) else ""
-    return Items(lines, f"{trials} in no figure but `failed`{first}:", "bad", on_terminal=False)
+    return Items(
+        lines, f"{trials} in no figure but `failed`{first}:", "bad", on_terminal=False
+    )
 
 
 # Tables.
@@ -283,7 +293,10 @@ def points_section(
     columns = [Column(head, kind=kind) for head, kind in zip(heads, kinds, strict=False)]
     rows: list[list[Any]] = []
     for line, row_texts in zip(lines[:ROWS], texts[:ROWS], strict=True):
-        keys = [line.point, *(axes[name].coordinate(one) for name, one in line.levels.items())]
+        keys = [
+            line.point,
+            *(axes[name].coordinate(one) for name, one in line.levels.items()),
+        ]
         keys += [one.value for one in line.responses.values()]
         tone: Tone = "marked" if line.point in front else ""
         row = [Cell(text, key=key) for text, key in zip(row_texts, keys, strict=True)]
@@ -295,7 +308,9 @@ def points_section(
     if front:
         note += " Tinted: the front."
     if len(lines) > ROWS:
-        note += f" And {len(lines) - ROWS} points more: `skysim study export` writes them all."
+        note += (
+            f" And {len(lines) - ROWS} points more: `skysim study export` writes them all."
+        )
     shown = Table(columns, rows, from_the_last(len(axes) + 1, len(columns)))
     return Section(POINTS, [shown, Text(note)], folded=len(lines) > OPEN_ROWS)
 
@@ -303,7 +318,9 @@ def points_section(
 def range_table(study: Study, lines: Sequence[PointRow]) -> Table:
     """The least and the largest value of each response, with their points."""
     heads = ("response", "least", "at", "largest", "at")
-    return Table([Column(head, kind="text") for head in heads], answer.range_rows(study, lines))
+    return Table(
+        [Column(head, kind="text") for head in heads], answer.range_rows(study, lines)
+    )
 
 
 def index_table(indices: Sequence[Index]) -> Table:
@@ -376,7 +393,9 @@ def study_figures(
     for one in layout.figures(study, lines):
         if isinstance(one, Map):
             panels = maps.direction_maps(lines, one, study, columns_of)
-            picture = Figure(maps.map_png(panels, one), maps.caption(panels, one, study, lines))
+            picture = Figure(
+                maps.map_png(panels, one), maps.caption(panels, one, study, lines)
+            )
             blocks += [picture, worst_table(panels, replay)]
             continue
         blocks.append(
@@ -463,6 +482,7 @@ def search_figures(
         one, other = (panels[name] for name in named)
         text = f"{named[1]} against {named[0]}: the Pareto front of {len(front)} among {len(lines)} candidates."
         shown.insert(
-            0, Figure(figures.pareto_png(one, other, points, front, also), text, name="pareto")
+            0,
+            Figure(figures.pareto_png(one, other, points, front, also), text, name="pareto"),
         )
     return shown

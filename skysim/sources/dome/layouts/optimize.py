@@ -185,7 +185,9 @@ class PlacementScore(NamedTuple):
         tail = self.tail_variance(place_m)
         ambiguity = layout_ambiguity(self.config, place_m)
         hardest = hardest_attitudes(self.config, self.options, place_m, 1.0, rng)
-        fewest = total_information(place_m, hardest, *camera_geometry(self.config))[:, 6].min()
+        fewest = total_information(place_m, hardest, *camera_geometry(self.config))[
+            :, 6
+        ].min()
         ambiguous = float(np.mean(ambiguity.fraction > self.options.max_overlap))
         return tail > 1, bool(fewest < 2), tail * (1 + ambiguous)
 
@@ -412,7 +414,9 @@ def hardest_attitudes(
     cost = sample_cost[worst]
     # 2. Size of the rotations across the boresight and about it.
     half = tan_half(config)
-    step_rad = options.perturbation_size * half.min() * np.array([1, 1, 1 / math.hypot(*half)])
+    step_rad = (
+        options.perturbation_size * half.min() * np.array([1, 1, 1 / math.hypot(*half)])
+    )
     for _ in range(options.perturbations):
         perturbation = Rotation.from_rotvec(step_rad * rng.standard_normal((len(hardest), 3)))
         perturbed = perturbation.as_matrix() @ hardest
@@ -474,7 +478,9 @@ def field_reach_rad(config: layouts.OptimizedConfig, surface: Surface) -> float:
 
 
 @jit
-def has_room(site: int, without: int, chosen: Ints, sites_m: Floats, spacing_m: float) -> bool:
+def has_room(
+    site: int, without: int, chosen: Ints, sites_m: Floats, spacing_m: float
+) -> bool:
     """Whether a site keeps the spacing to every LED except LED number `without`."""
     for n in range(len(chosen)):
         distance2 = 0.0
@@ -562,7 +568,9 @@ def reduce_ambiguity(
             break
         # 1.
         center_m = place_m[ambiguity.led[rng.choice(ambiguous)]]
-        central = cKDTree(place_m).query(center_m, k=min(options.central_leds, config.count))[1]
+        central = cKDTree(place_m).query(center_m, k=min(options.central_leds, config.count))[
+            1
+        ]
         moved = rng.choice(central)
         nearby = tree.query(place_m[moved], k=min(options.nearby_sites, len(sites_m)))[1]
         trial_m = place_m.copy()

@@ -123,7 +123,9 @@ def lit_sources(
     rng = random_stream(config.hardware_seed)
     lit = max(round(config.lit_fraction * len(place_m)), 1)
     number = np.sort(rng.permutation(len(place_m))[:lit])
-    return replace(dimmed_sources(config, surface, place_m[number], led, band, rng), id=number)
+    return replace(
+        dimmed_sources(config, surface, place_m[number], led, band, rng), id=number
+    )
 
 
 def cap(count: int, half_angle_rad: float) -> Floats:

@@ -41,7 +41,9 @@ UNDIMMED = {"levels": None, "magnitudes": None, "unique_neighbors": None}
 BISECTIONS = 14  # bisection steps from the dome's width: to some tenths of a millimeter
 
 
-def fibonacci(config: FibonacciConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+def fibonacci(
+    config: FibonacciConfig, surface: Surface, led: LedConfig, band: Band
+) -> Sources:
     """LEDs on a Fibonacci spiral: equal solid angles about the bearing contain equal numbers, to within a few."""
     rng = random_stream(config.hardware_seed)
     place_m = project_from_bearing(surface, cap(config.count, np.radians(config.cap_deg)))
@@ -81,7 +83,9 @@ def poisson_disk(
     # A count: the widest spacing by bisection.
     if config.spacing_m is None:
         count = config.count or 1
-        darts_m = project_from_bearing(surface, scattered_cap(DARTS_PER_LED * count, half, rng))
+        darts_m = project_from_bearing(
+            surface, scattered_cap(DARTS_PER_LED * count, half, rng)
+        )
         place_m = darts_m[spread(darts_m, 0.0, count, BISECTIONS)]
         return dimmed_sources(config, surface, place_m, led, band, rng)
     directions = cap(1000, half)
@@ -106,7 +110,9 @@ def poisson_disk(
     return dimmed_sources(config, surface, place_m, led, band, rng)
 
 
-def optimized(config: OptimizedConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+def optimized(
+    config: OptimizedConfig, surface: Surface, led: LedConfig, band: Band
+) -> Sources:
     """LEDs at the places that make the camera's worst attitudes most accurate: `optimize.optimize_places`.
 
     No LED is placed where no attitude's field reaches. In the mean of the worst attitudes the layout is not worse
