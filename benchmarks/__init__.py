@@ -35,7 +35,9 @@ AREAS = {
     "footprint": Area("memory and time of the estimator on one core", WHOLE),
     "frames": Area("from image to attitude beside tetra3rs and cedar-solve", {"count": 10}),
     "lost_in_space": Area("fields identified beside peers and an oracle", {"count": 20}),
-    "nees": Area("honest covariances where the tracker's noise is understated", {"count": 50}),
+    "nees": Area(
+        "honest covariances where the tracker's noise is understated", {"count": 50}
+    ),
     "rate": Area("angular rate from the streaks of one frame", {"count": 20}),
     "rolling": Area("rolling shutter against a global one"),
     "smear": Area("frames solved by rate: SHEFEX-2's chain and ours", {"count": 10}),
@@ -45,8 +47,12 @@ AREAS = {
     "refraction": Area("refraction in photographs of the real sky, which are needed"),
     "codes_attitudes": Area("LEDs that blink their names: attitudes found", {"count": 20}),
     "codes_bit_errors": Area("bit errors of blinking LEDs against theory", {"count": 50}),
-    "codes_first_attitude": Area("time to the first attitude by code, rate and number of LEDs"),
-    "dome_nearfield": Area("six methods for lights nearby under five surfaces", {"count": 20}),
+    "codes_first_attitude": Area(
+        "time to the first attitude by code, rate and number of LEDs"
+    ),
+    "dome_nearfield": Area(
+        "six methods for lights nearby under five surfaces", {"count": 20}
+    ),
     "dome_identify": Area("LEDs named without a prior attitude", {"count": 100}),
     "dome_focal": Area("LEDs named with an uncalibrated lens"),
     "dome_invariants": Area("what invariants of LED groups can tell", {"count": 3}),

@@ -102,7 +102,9 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = [list(HEADS), *cells]
     widths = [max(len(line[n]) for line in lines) for n in range(len(HEADS))]
     return "\n".join(
-        "  ".join(f"{cell:{width}}" for cell, width in zip(line, widths, strict=True)).rstrip()
+        "  ".join(
+            f"{cell:{width}}" for cell, width in zip(line, widths, strict=True)
+        ).rstrip()
         for line in lines
     )
 

@@ -61,7 +61,9 @@ def main(quick: bool) -> int:
         if kept.get(key) and all(row["code"] == code for row in kept[key]):
             continue
         print(say, file=sys.stderr, flush=True)
-        rows = test_rows(command) if command[0] == "pytest" else benchmark_rows(command, quick)
+        rows = (
+            test_rows(command) if command[0] == "pytest" else benchmark_rows(command, quick)
+        )
         kept[key] = [
             {"name": name, "command": key, **row, "code": code, "commit": commit}
             for name, row in rows
@@ -155,7 +157,12 @@ def test_rows(command: list[str]) -> Iterator[tuple[str, Row]]:
     for test in ElementTree.parse(LONG_JUNIT).iter("testcase"):
         outcomes = {outcome.tag for outcome in test}
         met = None if "skipped" in outcomes else not outcomes & {"failure", "error"}
-        facts = {"figure": float(test.get("time", 0)), "unit": "s", "bar": "passes", "met": met}
+        facts = {
+            "figure": float(test.get("time", 0)),
+            "unit": "s",
+            "bar": "passes",
+            "met": met,
+        }
         yield f"{command[-1]}::{test.get('name')}", facts
 
 

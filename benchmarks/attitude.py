@@ -32,7 +32,10 @@ def measure() -> list[dict[str, Any]]:
 
     results = [
         versus(
-            f"{name}, 10 stars, 100 times", partial(hundred, name), "scipy align_vectors", align
+            f"{name}, 10 stars, 100 times",
+            partial(hundred, name),
+            "scipy align_vectors",
+            align,
         )
         for name in SOLVERS
     ]

@@ -36,7 +36,9 @@ SCENE = "coded_spiral"
 ATTITUDES = 10_000
 RENDERED = 50
 RATES_DEG_S = (0.0, 5.0)
-BORDER_PX = 12.0  # half of an LED's image, which the tracker drops where the border cuts it off
+BORDER_PX = (
+    12.0  # half of an LED's image, which the tracker drops where the border cuts it off
+)
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,11 @@ class Bench:
         self.noise = Noise()
 
     def sequence(
-        self, rate_deg_s: float, seed: int, frames: int | None = None, all_frames: bool = False
+        self,
+        rate_deg_s: float,
+        seed: int,
+        frames: int | None = None,
+        all_frames: bool = False,
     ) -> Sequence:
         """Follow the lights over a code's length of frames from a random attitude; ends with the first attitude."""
         rng = random_stream(seed)
@@ -128,7 +134,9 @@ class Bench:
                     report.centroids.xy_px[:, None] - truth.sources.flux_xy_px, axis=2
                 )
                 wrong |= is_wrong(
-                    report.attitude, truth.cam_from_lab, truth.sources.id[apart.argmin(axis=1)]
+                    report.attitude,
+                    truth.cam_from_lab,
+                    truth.sources.id[apart.argmin(axis=1)],
                 )
         return Sequence(first, wrong, fewest)
 
@@ -163,7 +171,9 @@ class Bench:
         light_e += np.sqrt(np.maximum(light_e, 0)) * rng.standard_normal(len(seen))
         order = np.argsort(-light_e)
         order = order[light_e[order] > MIN_LIGHT_E]
-        measured_px = xy_px[seen] + self.noise.position_px * rng.standard_normal((len(seen), 2))
+        measured_px = xy_px[seen] + self.noise.position_px * rng.standard_normal(
+            (len(seen), 2)
+        )
         sigma_px = np.full(len(order), self.noise.position_px)
         flux = light_e[order] / scene.camera.detector.gain_e_dn
         return Centroids(measured_px[order], sigma_px, flux), seen[order]

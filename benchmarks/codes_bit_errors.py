@@ -133,7 +133,9 @@ def bit_error_rate(case: Case, frames: int) -> tuple[float, float]:
     light = light[:, usable]
     bits = bits[:, usable]
     full_e = np.nanmedian(full_e[:, usable], axis=0)
-    levels = [np.nanmean(np.where(bits == bit, light, np.nan), axis=0) for bit in (False, True)]
+    levels = [
+        np.nanmean(np.where(bits == bit, light, np.nan), axis=0) for bit in (False, True)
+    ]
     wrong = (light > np.mean(levels, axis=0)) != bits
     changes = float(np.mean(bits[1:] != bits[:-1]))
     noise_e2 = window_noise_e2(lab)

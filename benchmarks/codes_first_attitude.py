@@ -54,7 +54,13 @@ def result(code: str, leds: int, rate_deg_s: float, sequences: int) -> Result:
     late_s = np.where(first > 0, first, np.inf) * frame_s
     median_s, most_s = np.quantile(late_s, [0.5, 0.95], method="higher")
     return Result(
-        code, leds, rate_deg_s, bits, float(median_s), float(most_s), float(np.mean(first > 0))
+        code,
+        leds,
+        rate_deg_s,
+        bits,
+        float(median_s),
+        float(most_s),
+        float(np.mean(first > 0)),
     )
 
 
@@ -75,7 +81,9 @@ def draw(every: list[Result], path: Path) -> None:
 
     figure, panels = plt.subplots(1, 2, figsize=(8.4, 3.6), sharey=True, layout="constrained")
     by_rate = {
-        f"{rate:g} deg/s": [one for one in every if (one.leds, one.rate_deg_s) == (COUNT, rate)]
+        f"{rate:g} deg/s": [
+            one for one in every if (one.leds, one.rate_deg_s) == (COUNT, rate)
+        ]
         for rate in RATES_DEG_S
     }
     by_count = {

@@ -35,7 +35,9 @@ def measure() -> list[dict[str, Any]]:
             return gaussian_fit(image, default(image))
 
         for peer_name, peer in peers(image).items():
-            results.append(versus(f"detect + centroid, {name}", ours, peer_name, peer, bar=1.0))
+            results.append(
+                versus(f"detect + centroid, {name}", ours, peer_name, peer, bar=1.0)
+            )
         own = min(row["value"] for row in results if name in row["name"])
         results.append(
             verdict(

@@ -20,7 +20,7 @@ from estimator.identification.led_index import DomeIndex, build_dome_index
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.simulation.lab import build_lab
-from skysim.sources.dome.layouts import optimize, placing
+from skysim.sources.dome.layouts import placing
 from skysim.sources.dome.surface import Surface, build_surface
 from skysim.tracking.onboard_model import calibration
 
@@ -69,7 +69,7 @@ def leds_m(places: str, count: int, surface: Surface, rng: np.random.Generator) 
     if places == "random":
         return darts_m[:count]
     area_m2 = 2 * np.pi * 1.22**2 * (1 - np.cos(half))
-    thinned = darts_m[optimize.thin(darts_m, np.sqrt(0.6 * area_m2 / count))]
+    thinned = darts_m[placing.thin(darts_m, np.sqrt(0.6 * area_m2 / count))]
     return (
         thinned[:count]
         if len(thinned) < count

@@ -163,13 +163,17 @@ def bounds_deg(
         v = (1 + scale + aspect) * y + center[1]
         return np.asarray(lens.focal_px * np.concatenate([u, v]))
 
-    slopes = np.array([(image(step) - image(-step)) / (2 * 1e-6) for step in np.diag(steps)]).T
+    slopes = np.array(
+        [(image(step) - image(-step)) / (2 * 1e-6) for step in np.diag(steps)]
+    ).T
     across = [0, 1]
     sigmas = []
     for known in (slopes[:, :4], slopes):
         covariance = sigma_px**2 * np.linalg.pinv(known.T @ known, rcond=1e-15)
         sigmas.append(
-            float(np.degrees(np.sqrt(np.trace(covariance[:3, :3][np.ix_(across, across)]) / 2)))
+            float(
+                np.degrees(np.sqrt(np.trace(covariance[:3, :3][np.ix_(across, across)]) / 2))
+            )
         )
     return sigmas[0], sigmas[1]
 
@@ -235,7 +239,9 @@ def measure_case(
             figure(f"{case}: bits with parallax", np.median(unknown), "", what),
             figure(f"{case}: bits needed", np.median(needed), "", what),
             figure(f"{case}: evidence", np.median(dex), "dex", what),
-            figure(f"{case}: fields with enough", 100 * np.mean(dex >= ACCEPT_DEX), "%", what),
+            figure(
+                f"{case}: fields with enough", 100 * np.mean(dex >= ACCEPT_DEX), "%", what
+            ),
         ]
         if parallax:
             shift_px, focal_deg, all_deg = np.median(parallax, axis=0)
@@ -252,7 +258,9 @@ def residual(name: str, xy: Floats, other: Floats, lens: Camera) -> Floats:
     x = homogeneous(other, lens)
     y = homogeneous(xy, lens)
     if name == "affine":
-        return np.asarray((x @ np.linalg.lstsq(x, y, rcond=None)[0] - y)[:, :2] * lens.focal_px)
+        return np.asarray(
+            (x @ np.linalg.lstsq(x, y, rcond=None)[0] - y)[:, :2] * lens.focal_px
+        )
     zero = np.zeros_like(x)
     rows = np.concatenate(
         [np.hstack([x, zero, -y[:, :1] * x]), np.hstack([zero, x, -y[:, 1:2] * x])]

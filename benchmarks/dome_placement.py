@@ -99,7 +99,9 @@ def build_setup() -> Setup:
 
 def optimized_config(setup: Setup, count: int, seed: int) -> layouts.OptimizedConfig:
     """Configuration of an optimized layout, with defaults for all optional keys."""
-    half = np.array([setup.camera.width_px, setup.camera.height_px]) / 2 / setup.camera.focal_px
+    half = (
+        np.array([setup.camera.width_px, setup.camera.height_px]) / 2 / setup.camera.focal_px
+    )
     return layouts.OptimizedConfig.model_validate(
         {
             "kind": "optimized",
@@ -126,7 +128,9 @@ def leds(setup: Setup, kind: str, count: int, seed: int) -> tuple[Floats, Ints |
         configs = [optimized_config(setup, count, seed)]
     elif kind == "Fibonacci":
         configs = [
-            layouts.FibonacciConfig.model_validate({"kind": "fibonacci", "count": count} | cap)
+            layouts.FibonacciConfig.model_validate(
+                {"kind": "fibonacci", "count": count} | cap
+            )
         ]
     area_m2 = 2 * np.pi * np.square(setup.surface.meet(np.zeros(3), np.eye(3)[2:])[0, 2])
     each_m2 = area_m2 * (1 - np.cos(np.radians(setup.cap_deg))) / count
@@ -136,7 +140,10 @@ def leds(setup: Setup, kind: str, count: int, seed: int) -> tuple[Floats, Ints |
             spacing_m = np.sqrt(each_m2 * np.mean(setup.boards.lit) / density)
             configs.append(setup.boards.model_copy(update=cap | {"spacing_m": spacing_m}))
         else:
-            disk = {"kind": "poisson_disk", "spacing": f"{np.sqrt(0.66 * each_m2 / density)} m"}
+            disk = {
+                "kind": "poisson_disk",
+                "spacing": f"{np.sqrt(0.66 * each_m2 / density)} m",
+            }
             configs.append(layouts.PoissonDiskConfig.model_validate(disk | cap))
     candidates = (
         registry.LAYOUTS[config.kind](config, setup.surface, setup.led, setup.band)

@@ -80,7 +80,9 @@ def cedar(setup: CameraSetup) -> Solve | None:
 
 
 def compare(
-    setup: CameraSetup, solvers: dict[str, Solve | None], frames: list[tuple[NDArray, Rotation]]
+    setup: CameraSetup,
+    solvers: dict[str, Solve | None],
+    frames: list[tuple[NDArray, Rotation]],
 ) -> dict[str, dict[str, float]]:
     """Run all solvers frame by frame: percent solved and wrong, ms, and errors across the boresight in arcseconds."""
     available = {name: solve for name, solve in solvers.items() if solve is not None}
@@ -120,7 +122,9 @@ def compare(
     return out
 
 
-def scores(count: int, seed: int) -> Iterator[tuple[CameraSetup, dict[str, dict[str, float]]]]:
+def scores(
+    count: int, seed: int
+) -> Iterator[tuple[CameraSetup, dict[str, dict[str, float]]]]:
     """Each set-up with the scores of its solvers."""
     stars = catalog.read(CATALOGS / "hipparcos_hp6.5.ecsv")
     for setup in SETUPS:

@@ -218,7 +218,9 @@ def sky_frame() -> list[dict[str, Any]]:
     return [result, verdict("the same, in ms", result["value"], "ms", "most wanted", 5.0)]
 
 
-def galsim(lens: CameraConfig, sources: Sources, electrons: Floats) -> Callable[[], Any] | None:
+def galsim(
+    lens: CameraConfig, sources: Sources, electrons: Floats
+) -> Callable[[], Any] | None:
     """The same stars drawn by GalSim on stamps of its default size, with its CCDNoise; None if it is not installed."""
     if importlib.util.find_spec("galsim") is None:
         return None
@@ -274,7 +276,9 @@ def growth() -> list[dict[str, Any]]:
         optics = square_meter(lens)
         sources = lights(lens, count, np.full(count, 1e4))
         path = turning(0.0)
-        return lambda: render(image, sources, optics, path, AT_CENTER, Window(0.0, EXPOSURE_S))
+        return lambda: render(
+            image, sources, optics, path, AT_CENTER, Window(0.0, EXPOSURE_S)
+        )
 
     stars = versus(
         "draw 500 stars", drawing(few, 500), "ten times as many, a star", drawing(few, 5000)
@@ -286,7 +290,9 @@ def growth() -> list[dict[str, Any]]:
         verdict(
             "ten times the stars beyond 500", stars["ratio"], "times as long", "linear", 11.0
         ),
-        verdict("four times the area, drawing", area["ratio"], "times as long", "level", 1.25),
+        verdict(
+            "four times the area, drawing", area["ratio"], "times as long", "level", 1.25
+        ),
         verdict(
             "memory of a frame being made",
             memory_frames(),

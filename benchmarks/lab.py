@@ -113,7 +113,9 @@ class Server:
     def workers(self) -> list[psutil.Process]:
         """Its worker processes, the oldest first."""
         templates = [
-            one for one in self.process.children() if "gui.template" in " ".join(one.cmdline())
+            one
+            for one in self.process.children()
+            if "gui.template" in " ".join(one.cmdline())
         ]
         return sorted(
             (one for template in templates for one in template.children()),
@@ -122,7 +124,9 @@ class Server:
 
     def cpu_s(self) -> float:
         """Processor time of it and its workers."""
-        return sum(cpu_s(one) for one in [self.process, *self.process.children(recursive=True)])
+        return sum(
+            cpu_s(one) for one in [self.process, *self.process.children(recursive=True)]
+        )
 
     def settle(self, workers: int) -> None:
         """Wait until it has so many workers, and all of them wait for work."""
@@ -255,7 +259,9 @@ def speed(tabs: Any, server: Server, size: tuple[int, int]) -> list[dict[str, An
     middle, most = np.quantile(delays, [0.5, 0.9])
     return [
         verdict(f"page opened and shown, {screen}", open_s, "s", "a worker is ready", 3.0),
-        verdict(f"key to picture, median, {screen}", middle, "ms", f"{PRESSES} presses", 60.0),
+        verdict(
+            f"key to picture, median, {screen}", middle, "ms", f"{PRESSES} presses", 60.0
+        ),
         verdict(f"key to picture, 90 %, {screen}", most, "ms", f"{PRESSES} presses", 90.0),
         *held.rows(f"key held, {screen}"),
         *played.rows(f"playing, {screen}"),

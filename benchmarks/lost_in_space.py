@@ -81,7 +81,11 @@ DENSE = ((17, 13), 1024, 6.0, 0.2)
 NARROW = (6, 6), 1024, 7.5, 0.2
 WORKLOADS = (
     Workload(
-        "PTASE", (20, 20), PTASE_PX, 6.0, 3 * ARCSEC_RAD * PTASE_PX / 2 / np.tan(np.radians(10))
+        "PTASE",
+        (20, 20),
+        PTASE_PX,
+        6.0,
+        3 * ARCSEC_RAD * PTASE_PX / 2 / np.tan(np.radians(10)),
     ),
     Workload("SHEFEX", SHEFEX, 659, 5.75, 0.1, brightest=15, bar_percent=100, bar_ms=0.05),
     Workload("SHEFEX, half false", SHEFEX, 659, 5.75, 0.1, brightest=15, false_share=0.5),
@@ -235,7 +239,9 @@ def ours(work: Workload, stars: catalog.StarCatalog, identifier: str) -> Solve:
         zero_point_mag=0.0,
     )
     camera = work.camera.zoomed(1 + work.focal_error)
-    tracker = StarTracker(camera, stars, stars.vectors, settings, 1.05 * work.focal_uncertainty)
+    tracker = StarTracker(
+        camera, stars, stars.vectors, settings, 1.05 * work.focal_uncertainty
+    )
     return lambda frame: tracker.solve_centroids(frame.centroids).cam_from_ref
 
 

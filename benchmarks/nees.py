@@ -54,7 +54,10 @@ class Condition:
 
 CONDITIONS = (
     Condition("right model"),
-    *(Condition(f"noise understated {factor:g}x", noise_factor=factor) for factor in (2, 3, 5)),
+    *(
+        Condition(f"noise understated {factor:g}x", noise_factor=factor)
+        for factor in (2, 3, 5)
+    ),
     *(
         Condition(f"focal length off {percent:g} %", focal_drift=percent / 100)
         for percent in (0.1, 0.2, 0.3)

@@ -33,7 +33,9 @@ def measure(count: int = FRAMES, seed: int = 1) -> list[dict[str, Any]]:
     return rows
 
 
-def agreement_rows(name: str, frames: int, solved: Sequence[Agreement]) -> list[dict[str, Any]]:
+def agreement_rows(
+    name: str, frames: int, solved: Sequence[Agreement]
+) -> list[dict[str, Any]]:
     """The rows of one comparison; medians and worst errors are in arcseconds."""
     cross = np.array([one.cross_rad for one in solved]) / ARCSEC_RAD
     roll = np.abs([one.roll_rad for one in solved]) / ARCSEC_RAD

@@ -65,12 +65,18 @@ def measure(count: int = COUNT, seed: int = 25) -> list[dict[str, Any]]:
         for how, right in solved.items():
             percent = 100 * right / pictures
             rows.append(
-                row(f"{name}: field {how}", percent, "% solved", peer, 100 * theirs / pictures)
+                row(
+                    f"{name}: field {how}", percent, "% solved", peer, 100 * theirs / pictures
+                )
             )
             rows[-1] |= {"bar": SOLVED_BAR, "met": percent >= SOLVED_BAR}
         rows.append(
             row(
-                f"{name}: wrong, of {4 * pictures} answers possible", wrong, "wrong", None, None
+                f"{name}: wrong, of {4 * pictures} answers possible",
+                wrong,
+                "wrong",
+                None,
+                None,
             )
             | {"bar": 0}
         )

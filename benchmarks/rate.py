@@ -41,7 +41,14 @@ def measure(
             nees.append(error @ np.linalg.solve(rate.covariance_rad2_s2, error))
         name = f"SHEFEX, 50 ms, {rate_deg_s:g} deg/s"
         rows.append(
-            row(f"{name}: frames with a rate", 100 * len(errors) / count, "%", None, None, None)
+            row(
+                f"{name}: frames with a rate",
+                100 * len(errors) / count,
+                "%",
+                None,
+                None,
+                None,
+            )
         )
         if not errors:
             continue

@@ -112,7 +112,9 @@ def best_zenith(frames: Sequence[StarFrame], camera: Camera, start: Floats) -> F
     off = start + 0.08 * np.array([1.0, -1.0, 1.0])
     first = np.array([np.arctan2(off[1], off[0]), np.arcsin(off[2] / np.linalg.norm(off))])
     return direction(
-        *minimize(rms_px, first, method="Nelder-Mead", options={"maxfev": 60, "xatol": 0.004}).x
+        *minimize(
+            rms_px, first, method="Nelder-Mead", options={"maxfev": 60, "xatol": 0.004}
+        ).x
     )
 
 
@@ -135,7 +137,9 @@ def fitted_scale(
         )
     squares = np.array([report.rms_px**2 for report in reports])
     curve, slope, _ = np.polyfit(scales, squares, 2)
-    return -slope / (2 * curve), float(np.sqrt(squares.min() / (2 * reports[0].stars * curve)))
+    return -slope / (2 * curve), float(
+        np.sqrt(squares.min() / (2 * reports[0].stars * curve))
+    )
 
 
 def measure() -> list[dict[str, Any]]:

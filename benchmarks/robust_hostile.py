@@ -18,7 +18,9 @@ def measure(count: int = IMAGES, seed: int = 1) -> list[dict[str, Any]]:
     """Defects, true skies found, and the worst time and memory of each family; defects are printed to stderr."""
     rows = []
     for name, one in judged(count, seed, quiet=False).items():
-        print(*(f"{name}, input {defect}" for defect in one.defects), sep="\n", file=sys.stderr)
+        print(
+            *(f"{name}, input {defect}" for defect in one.defects), sep="\n", file=sys.stderr
+        )
         what = f"{one.looked} images"
         rows += [
             verdict(f"{name}: defects", len(one.defects), "images", what, 0),

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.nearfield import tangent_jacobian
 from estimator.attitude.rate import chords, covariance_of, error_gain, streak_factor
+from estimator.attitude.rotation_fit import tangent_jacobian
 from estimator.core.types import Attitude, RateEstimate
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Report
@@ -38,9 +38,7 @@ GYRO_RAD_S = np.radians(0.01)
 ROLL_SHARE = 0.2  # of the boresight in a random axis, if stars are smeared: streaks are then nearly parallel
 BAR_NEES = 0.3
 BAR_ERROR = 1.2
-CHI2_MEDIAN = (
-    2.366  # of chi-square with three degrees of freedom: double stars do not count in a median
-)
+CHI2_MEDIAN = 2.366  # of chi-square with three degrees of freedom: double stars do not count in a median
 ONE_FRAME = {"exposure.first": "0 s", "exposure.frames": "1"}
 
 
@@ -153,7 +151,9 @@ def frame_of(
             * np.array([np.cos(azimuth), np.sin(azimuth), 0])
         )
         middle = Rotation.from_rotvec(tilt) * Rotation.from_rotvec([0, 0, yaw])
-    axis = rng.standard_normal(3) * ([1, 1, ROLL_SHARE] if work.tilt_deg is None else [1, 1, 1])
+    axis = rng.standard_normal(3) * (
+        [1, 1, ROLL_SHARE] if work.tilt_deg is None else [1, 1, 1]
+    )
     rate_cam = np.radians(rate_deg_s) * axis / np.linalg.norm(axis)
     trajectory = constant_rate(
         camera.scene, middle, camera.mount.cam_from_body.inv().apply(rate_cam)
@@ -185,7 +185,11 @@ def score(attitude: Attitude, truth: Truth) -> Solved:
 
 
 def with_bound(
-    solved: Solved, tracker: factory.Estimator, report: Report, truth: Truth, exposure_s: float
+    solved: Solved,
+    tracker: factory.Estimator,
+    report: Report,
+    truth: Truth,
+    exposure_s: float,
 ) -> Solved:
     """The errors of a frame with its bound, from the information of its matched lights about attitude and rate."""
     attitude = report.attitude
@@ -225,7 +229,9 @@ def with_bound(
     bound = np.linalg.inv(normal)[:3, :3]
     error = (attitude.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec()
     ratio = float(np.sqrt(bound[2, 2] / rate_known[2, 2]))
-    return solved._replace(bound=float(error @ np.linalg.solve(bound, error)), roll_ratio=ratio)
+    return solved._replace(
+        bound=float(error @ np.linalg.solve(bound, error)), roll_ratio=ratio
+    )
 
 
 def _rows(name: str, ours: Floats, peer: Floats) -> list[dict[str, Any]]:
@@ -292,7 +298,12 @@ def nees_row(name: str, ours: Floats, peer: Floats | None = None) -> dict[str, A
 
 
 def row(
-    name: str, value: float, unit: str, peer: float | None, bar: float | None, met: bool | None
+    name: str,
+    value: float,
+    unit: str,
+    peer: float | None,
+    bar: float | None,
+    met: bool | None,
 ) -> dict[str, Any]:
     """A row as `python -m benchmarks` prints it; the peer is a global shutter."""
     return {

@@ -53,7 +53,9 @@ class TimedJob:
     def run(self, chunk: Chunk) -> list[Row]:
         """Wait, and return rows as large as real ones."""
         time.sleep(self.seconds)
-        return [row_of(segment, n) for segment in chunk for n in range(len(segment.replicates))]
+        return [
+            row_of(segment, n) for segment in chunk for n in range(len(segment.replicates))
+        ]
 
     def failed(self, segment: Segment, error: str) -> Row:
         """The row of a trial that failed."""

@@ -56,7 +56,11 @@ def cost_of(width_px: int, height_px: int, limit_mag: float) -> Cost:
         "light.limit_mag": f"{limit_mag}",
     }
     made = dataset_run.load(
-        "shefex2", None, FRAMES * (REPEATS + 1), overrides=CMOS | keys, frames_per_shard=FRAMES
+        "shefex2",
+        None,
+        FRAMES * (REPEATS + 1),
+        overrides=CMOS | keys,
+        frames_per_shard=FRAMES,
     )
     with tempfile.TemporaryDirectory() as folder:
         storage = Storage(f"{folder}/frames")
@@ -91,7 +95,9 @@ def measure() -> list[dict[str, Any]]:
     for name, coefficients in models.items():
         for term, value in zip(("any frame", "a Mpx", "a source"), coefficients, strict=True):
             rows.append(
-                figure(f"{name.strip('_')} of {term}", value, "s" if name == "seconds" else "B")
+                figure(
+                    f"{name.strip('_')} of {term}", value, "s" if name == "seconds" else "B"
+                )
             )
     for what, costs in (("seen", seen), ("unseen", [cost_of(*one) for one in UNSEEN])):
         for one in costs:

@@ -87,7 +87,9 @@ def small_plan(
     count: int = FRAMES, per_shard: int = PER_SHARD, keys: dict[str, str] = CMOS
 ) -> dataset_run.DatasetPlan:
     """Frames of 1024 x 1024 pixels."""
-    return dataset_run.load("shefex2", None, count, overrides=keys, frames_per_shard=per_shard)
+    return dataset_run.load(
+        "shefex2", None, count, overrides=keys, frames_per_shard=per_shard
+    )
 
 
 def frames() -> list[dict[str, Any]]:
@@ -288,7 +290,10 @@ def centroids() -> list[dict[str, Any]]:
             True,
         ),
         figure(
-            "centroids: beside the trial itself", one.overhead_ms, "ms", "a trial of one worker"
+            "centroids: beside the trial itself",
+            one.overhead_ms,
+            "ms",
+            "a trial of one worker",
         ),
     ]
 
@@ -338,7 +343,9 @@ def worker_cost() -> list[dict[str, Any]]:
     largest = max(held_mb, key=held_mb.__getitem__)
     return [
         verdict("start of a worker after the first", started_s[slowest], "s", slowest, 1.0),
-        verdict("memory of a worker with four setups", held_mb[largest], "MB", largest, 350.0),
+        verdict(
+            "memory of a worker with four setups", held_mb[largest], "MB", largest, 350.0
+        ),
     ]
 
 

@@ -96,7 +96,9 @@ def drawn(first: int, count: int, each: int) -> dict[str, NDArray[Any]]:
     """Rows of consecutive trials, by column; `each` is the number of a point's replicates."""
     rng = np.random.default_rng(first)
     trial = np.arange(first, first + count)
-    columns: dict[str, NDArray[Any]] = {name: np.full(count, np.nan) for name in store.COLUMNS}
+    columns: dict[str, NDArray[Any]] = {
+        name: np.full(count, np.nan) for name in store.COLUMNS
+    }
     columns |= {
         "trial": trial,
         "point": trial // each,

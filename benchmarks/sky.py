@@ -91,7 +91,9 @@ def narrow(fov_deg: float) -> list[dict[str, Any]]:
     """Wrong attitudes and the solved share of a narrow camera that knows the sky to V 10."""
     catalog = str(DEEP.resolve())
     focal_mm = (
-        SHEFEX_MM * math.tan(math.radians(SHEFEX_DEG / 2)) / math.tan(math.radians(fov_deg / 2))
+        SHEFEX_MM
+        * math.tan(math.radians(SHEFEX_DEG / 2))
+        / math.tan(math.radians(fov_deg / 2))
     )
     camera = {
         "camera.focal_length": f"{focal_mm:.4g} mm",
@@ -147,7 +149,12 @@ def shares(
     wrong = float(np.sum(wrong_of["wrong"]))
     return [
         verdict(
-            f"{name}: solved", solved, "%", f"{len(trials)} of {drawn} frames", bar, least=True
+            f"{name}: solved",
+            solved,
+            "%",
+            f"{len(trials)} of {drawn} frames",
+            bar,
+            least=True,
         ),
         verdict(f"{name}: wrong", wrong, "frames", f"of {drawn}", 0),
     ]
@@ -171,5 +178,9 @@ def frame_time() -> dict[str, Any]:
     ratio = min(seconds[0]) / min(seconds[1])
     what = f"{len(whole.camera.sources)} stars over {int(near.sum())}"
     return verdict(
-        "frame of 3 deg, time in a deep sky over that of its stars alone", ratio, "", what, 1.1
+        "frame of 3 deg, time in a deep sky over that of its stars alone",
+        ratio,
+        "",
+        what,
+        1.1,
     )

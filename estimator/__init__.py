@@ -12,7 +12,7 @@ MODULE_OF = {
     "Camera": "core.camera",
     "Centroids": "core.types",
     "DomeTracker": "trackers.dome_tracker",
-    "GyroModel": "filter.mekf",
+    "GyroModel": "filter.error_models",
     "Health": "trackers.tracking_mode",
     "ImageError": "core.errors",
     "Report": "trackers.pipeline",

@@ -31,7 +31,9 @@ def pytest_configure(config: pytest.Config) -> None:
         return
     for package in (ROOT / "skysim", ROOT / "estimator"):
         changed_s = {path: path.stat().st_mtime for path in package.rglob("*.py")}
-        caches = {path: path.stat().st_mtime for path in package.rglob("__pycache__/*.nb[ic]")}
+        caches = {
+            path: path.stat().st_mtime for path in package.rglob("__pycache__/*.nb[ic]")
+        }
         if min(caches.values(), default=math.inf) >= max(changed_s.values()):
             continue
         uses = {path: imported(path, changed_s.keys()) for path in changed_s}

@@ -92,7 +92,9 @@ def test_arrays_are_indexed_row_first():
 def test_camera_axes_for_a_camera_at_the_origin_of_right_ascension():
     """Boresight RA 0, Dec 0, north up: right is west (-y of ICRS), down is south (-z), boresight is +x."""
     expected = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
-    np.testing.assert_allclose(cam_from_icrs(0, 0, 0).as_matrix(), expected, rtol=0, atol=EXACT)
+    np.testing.assert_allclose(
+        cam_from_icrs(0, 0, 0).as_matrix(), expected, rtol=0, atol=EXACT
+    )
 
 
 def test_north_is_up_and_east_is_left():

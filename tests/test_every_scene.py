@@ -136,14 +136,18 @@ def test_the_light_of_the_sources_is_on_the_frame(flown: Flown) -> None:
     ) * part.gain_e_dn - pattern_e
     light_e = truth.sources.electrons
     camera_m = truth.lab_from_body.apply(camera.mount.camera_body_m)
-    glow_e_s = black_glow(scene.light, camera.optics, truth.cam_from_lab, camera_m, camera.band)
+    glow_e_s = black_glow(
+        scene.light, camera.optics, truth.cam_from_lab, camera_m, camera.band
+    )
     glow_e = 0.0 if glow_e_s is None else float(glow_e_s.sum()) * frame.exposure_s
     read = pixels * (part.read_noise_e**2 + part.reset_noise_e**2 + part.gain_e_dn**2 / 12)
     shot = light_e.sum() + glow_e + detector.dark_e_s.sum(dtype=float) * frame.exposure_s
     uneven = part.prnu**2 * np.sum(light_e**2 / truth.sources.area_px)
     # What a star beyond full well loses is less than all it has.
     clipped_e = light_e[truth.sources.saturated].sum()
-    assert abs(found_e - light_e.sum() - glow_e) < 5 * np.sqrt(read + shot + uneven) + clipped_e
+    assert (
+        abs(found_e - light_e.sum() - glow_e) < 5 * np.sqrt(read + shot + uneven) + clipped_e
+    )
 
 
 @pytest.mark.slow
@@ -266,7 +270,9 @@ def test_the_claimed_error_matches_the_actual_error(name: str) -> None:
         if survey == 0 or not isinstance(scene.light, StarsConfig):
             tracker = build_tracker(lab.with_scene(scene).camera)
         setup = TrialSetup(lab.with_scene(scene), tracker, trial, "")
-        outcomes += [run_frame_trial(setup, survey * FRAMES + frame) for frame in range(FRAMES)]
+        outcomes += [
+            run_frame_trial(setup, survey * FRAMES + frame) for frame in range(FRAMES)
+        ]
     nees = np.array([one.nees for one in outcomes if one.solved])
     assert sum(one.wrong for one in outcomes) == 0
     assert len(nees) > 0.8 * len(outcomes)
@@ -291,7 +297,9 @@ def test_the_camera_sees_five_leds_throughout_the_maneuver(whole: Flight) -> Non
     eyes = build_tracker(whole.lab.camera)
     counts = []
     for index in range(whole.lab.scene.exposure.frames):
-        body_from_lab = motion.attitude_at(exposure_window(whole.lab.scene, index).open_s).inv()
+        body_from_lab = motion.attitude_at(
+            exposure_window(whole.lab.scene, index).open_s
+        ).inv()
         pixels = project(body_from_lab, eyes.leds.position_m, eyes.lever, eyes.camera)
         counts.append(int(eyes.camera.contains(np.nan_to_num(pixels, nan=-1e9), 12).sum()))
     assert len(counts) >= 20
@@ -302,7 +310,9 @@ def test_the_camera_sees_five_leds_throughout_the_maneuver(whole: Flight) -> Non
 def test_the_vehicle_reaches_its_targets_and_stays_off_its_stop(whole: Flight) -> None:
     telemetry = whole.telemetry()
     assert telemetry.lab_from_ref is not None
-    error_deg = np.degrees((telemetry.lab_from_ref.inv() * telemetry.lab_from_body).magnitude())
+    error_deg = np.degrees(
+        (telemetry.lab_from_ref.inv() * telemetry.lab_from_body).magnitude()
+    )
     assert error_deg[-1] < 0.1  # some are still on their way
     assert np.median(error_deg) < 0.05
     up = telemetry.lab_from_body.as_matrix()[:, 2, 2]
@@ -312,7 +322,9 @@ def test_the_vehicle_reaches_its_targets_and_stays_off_its_stop(whole: Flight) -
 
 # --- the vehicles, at the hands of chance -------------------------------------------------------------------
 
-TURNS = {"cubesat.xml": 2.0}  # times the rate of the others: its wheels hold it as a gyroscope
+TURNS = {
+    "cubesat.xml": 2.0
+}  # times the rate of the others: its wheels hold it as a gyroscope
 
 
 def at_random(config: VehicleConfig, rate_body_rad_s: np.ndarray) -> multibody.Simulation:

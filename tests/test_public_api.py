@@ -96,7 +96,9 @@ def test_a_saved_run_equals_the_command_s_output(run, tmp_path) -> None:
     assert "report.html" in names
     for name in names:
         if name not in ("report.html", "solutions.ecsv"):  # which hold seconds of wall clock
-            assert (ours / name).read_bytes() == (tmp_path / "theirs" / name).read_bytes(), name
+            assert (ours / name).read_bytes() == (tmp_path / "theirs" / name).read_bytes(), (
+                name
+            )
 
 
 @pytest.mark.slow

@@ -104,7 +104,9 @@ def test_every_photograph_is_solved_with_its_field_unknown(row, blind):
 def test_no_photograph_is_answered_wrongly_with_its_field_unknown(row, blind):
     found = plate_solver.solve_file(FOLDER / row["file"], blind, None)
     right = (
-        bool(row["ra_deg"]) and found["status"] == "solved" and errors_deg(found, row)[0] < 0.05
+        bool(row["ra_deg"])
+        and found["status"] == "solved"
+        and errors_deg(found, row)[0] < 0.05
     )
     assert right or found["status"] != "solved"
     assert not found["bad_input"]
@@ -139,6 +141,8 @@ def test_a_photograph_is_solved_with_any_field_error_below_five_per_cent(row, fo
 def test_a_hopeless_photograph_is_refused_or_answered_correctly(row, fov_error):
     found = answer(row, fov_error)
     right = (
-        bool(row["ra_deg"]) and found["status"] == "solved" and errors_deg(found, row)[0] < 0.05
+        bool(row["ra_deg"])
+        and found["status"] == "solved"
+        and errors_deg(found, row)[0] < 0.05
     )
     assert right or found["status"] != "solved"

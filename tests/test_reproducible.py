@@ -139,7 +139,9 @@ def test_the_first_rendered_picture_announces_compilation(tmp_path: Path) -> Non
 
 
 @pytest.mark.long
-def test_bytes_do_not_depend_on_threads_or_on_what_was_compiled_before(tmp_path: Path) -> None:
+def test_bytes_do_not_depend_on_threads_or_on_what_was_compiled_before(
+    tmp_path: Path,
+) -> None:
     cache = {"NUMBA_CACHE_DIR": str(tmp_path / "numba")}
     for scene in SCENES:
         cold = made(scene, tmp_path / "cold", **cache, NUMBA_NUM_THREADS="1")

@@ -155,7 +155,9 @@ def test_a_film_that_lost_frames_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_stream_without_room_names_the_file_and_counts_what_was_lost(tmp_path: Path) -> None:
+def test_a_stream_without_room_names_the_file_and_counts_what_was_lost(
+    tmp_path: Path,
+) -> None:
     command = [
         "stream",
         "shefex2",

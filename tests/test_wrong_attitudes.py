@@ -24,13 +24,20 @@ def afit() -> DomeTracker:
 
 def body_from_lab(rng: np.random.Generator) -> Rotation:
     """Random body_from_lab with tilts uniform to 20 deg and any yaw."""
-    tilt, azimuth, yaw = np.radians(20) * np.sqrt(rng.uniform()), *rng.uniform(0, 2 * np.pi, 2)
+    tilt, azimuth, yaw = (
+        np.radians(20) * np.sqrt(rng.uniform()),
+        *rng.uniform(0, 2 * np.pi, 2),
+    )
     lean = Rotation.from_rotvec(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0]))
     return (lean * Rotation.from_euler("z", yaw)).inv()
 
 
 def field(
-    tracker: DomeTracker, turned: Rotation, missing: float, false: int, rng: np.random.Generator
+    tracker: DomeTracker,
+    turned: Rotation,
+    missing: float,
+    false: int,
+    rng: np.random.Generator,
 ) -> Centroids:
     """The LEDs wholly in view without a missing share, with 0.2 px of noise, and random false lights."""
     pixels = project(turned, tracker.leds.position_m, tracker.lever, tracker.camera)

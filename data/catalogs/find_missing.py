@@ -288,7 +288,8 @@ def moved(
 def photometry(stars: np.ndarray) -> tuple[float, float, float]:
     """V, Hp and V-I of the stars' light together: G-V and G-I of BP-RP (Gaia DR3 documentation, ch. 5.5)."""
     g, bp, rp = (
-        float(-2.5 * np.log10(np.sum(10 ** (-0.4 * stars[band])))) for band in ("g", "bp", "rp")
+        float(-2.5 * np.log10(np.sum(10 ** (-0.4 * stars[band]))))
+        for band in ("g", "bp", "rp")
     )
     v_mag, _b_v, v_i = gaia_dr3.johnson(g, bp - rp)
     return v_mag, v_mag - float(v_from_hp(0.0, v_i)), v_i
@@ -301,8 +302,13 @@ def row(pick: Pick, gaia: np.ndarray) -> dict[str, Any]:
         sys.exit(f"{pick.name}: not all of its Gaia sources are there")
     v_mag, hp_mag, v_i = photometry(stars)
     weight = 10 ** (-0.4 * stars["g"].astype(float))
-    ra, dec = np.average(stars["ra"], weights=weight), np.average(stars["dec"], weights=weight)
-    ra, dec = moved(ra, dec, *pick.pm_mas_yr, HIPPARCOS_EPOCH_JYEAR - gaia_dr3.GAIA_EPOCH_JYEAR)
+    ra, dec = (
+        np.average(stars["ra"], weights=weight),
+        np.average(stars["dec"], weights=weight),
+    )
+    ra, dec = moved(
+        ra, dec, *pick.pm_mas_yr, HIPPARCOS_EPOCH_JYEAR - gaia_dr3.GAIA_EPOCH_JYEAR
+    )
     return {
         "hip": pick.hip,
         "ra_deg": ra,

@@ -40,9 +40,7 @@ def section(context: Any) -> str:
     ]
     name = context.command_path
     usage = command.get_usage(context).removeprefix("Usage: ")
-    heading = (
-        f"{'##' if context.parent is None or context.parent.parent is None else '###'} `{name}`"
-    )
+    heading = f"{'##' if context.parent is None or context.parent.parent is None else '###'} `{name}`"
     table = "\n".join(["| parameter | meaning |", "|---|---|", *rows]) if rows else ""
     examples = "\n".join(EXAMPLES[name.partition(" ")[2]])
     parts = [

@@ -74,7 +74,9 @@ def axes(path: Path) -> None:
         [np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height)]
     )
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    flat = np.column_stack([right, np.cross(toward, right)])  # (3, 2) from the lab to the paper
+    flat = np.column_stack(
+        [right, np.cross(toward, right)]
+    )  # (3, 2) from the lab to the paper
     frames = (
         ("lab", Rotation.identity(), np.zeros(3), LAB, 0.26),
         ("body", lab_from_body, np.zeros(3), BODY, 0.24),
@@ -239,9 +241,9 @@ def roll(path: Path) -> None:
                 )
         middle = np.array(camera.center_px)
         for name, ra_deg, dec_deg in (("N", 84.0, 7.6), ("E", 91.0, 0.0)):
-            end = optics.project(cam_from_icrs.apply(unit(*np.radians([[ra_deg], [dec_deg]]))))[
-                0
-            ]
+            end = optics.project(
+                cam_from_icrs.apply(unit(*np.radians([[ra_deg], [dec_deg]])))
+            )[0]
             ax.annotate(
                 "", end, middle, arrowprops={"arrowstyle": "->", "color": BODY, "lw": 1.8}
             )
@@ -254,7 +256,9 @@ def roll(path: Path) -> None:
             middle,
             arrowprops={"arrowstyle": "->", "color": CAM, "lw": 1.8},
         )
-        ax.text(middle[0] - 12, middle[1] - 100, "up (-y)", color=CAM, ha="right", va="center")
+        ax.text(
+            middle[0] - 12, middle[1] - 100, "up (-y)", color=CAM, ha="right", va="center"
+        )
         if roll_deg:
             angles = np.radians(np.linspace(0, roll_deg, 30))
             north = np.arctan2(
@@ -316,7 +320,9 @@ def lever(path: Path) -> None:
             linewidth=1,
         )
         ax.plot(*np.transpose([camera, led])[1:], color=color, linewidth=1.6)
-        angle_deg = np.degrees(np.arccos((led - camera) @ bore / np.linalg.norm(led - camera)))
+        angle_deg = np.degrees(
+            np.arccos((led - camera) @ bore / np.linalg.norm(led - camera))
+        )
         label = f"roll {roll_deg:.0f}°: the LED {angle_deg:.2f}° off the boresight"
         ax.annotate(
             label, camera[1:], (at_pt, -12), textcoords="offset points", color=color, ha=side
@@ -342,7 +348,11 @@ def lever(path: Path) -> None:
 
 def bodies(path: Path) -> None:
     """Moon, earthshine, full Moon and a solar eclipse through a 200 mm lens."""
-    sunny = {"exposure.time": "1 us", "camera.f_number": "16", "camera.transmission": "0.0001"}
+    sunny = {
+        "exposure.time": "1 us",
+        "camera.f_number": "16",
+        "camera.transmission": "0.0001",
+    }
     eclipse = sunny | {"site.latitude_deg": "37", "site.longitude_deg": "-90"}
     views = (
         ("moon", "2012-06-24T21:00:00", {"exposure.time": "1 ms"}, "the Moon, 1 ms"),
@@ -378,9 +388,7 @@ def bodies(path: Path) -> None:
 
 def color(path: Path) -> None:
     """Photo-electrons of four lights by wavelength, the lateral color of a lens, and the mean of each."""
-    lens = (
-        "{wavelength: [450 nm, 550 nm, 650 nm, 850 nm], corner_px: [-0.38, -0.13, 0.12, 0.62]}"
-    )
+    lens = "{wavelength: [450 nm, 550 nm, 650 nm, 850 nm], corner_px: [-0.38, -0.13, 0.12, 0.62]}"
     band = Band.from_camera(loader.load("shefex2", {"camera.chromatic": lens}).camera)
     nm = np.arange(390.0, 1000.0)
     lights = (
@@ -417,7 +425,9 @@ def air(path: Path) -> None:
     """Refraction and extinction against altitude, and scintillation against the aperture."""
     refraction = Refraction(Weather(0.0, np.radians(53), 1013.25, 15.0, 0.5, 650e-9))
     altitude_deg = np.geomspace(2, 89.5, 300)
-    fig, (bent, dimmed, twinkling) = plt.subplots(1, 3, figsize=(11, 3.1), layout="constrained")
+    fig, (bent, dimmed, twinkling) = plt.subplots(
+        1, 3, figsize=(11, 3.1), layout="constrained"
+    )
     apparent_rad = np.radians(altitude_deg)
     # The table has zenith distances without air; the curve is drawn against the altitude that is seen.
     raised_rad = refraction.bending_rad(np.pi / 2 - apparent_rad)
@@ -442,7 +452,9 @@ def air(path: Path) -> None:
     ours = np.sqrt(
         [air_physics.variance(np.ones(1), d, 0.05, 0.0, 650e-9)[0] for d in aperture_m]
     )
-    young = np.sqrt(air_physics.YOUNG_M_S * air_physics.C_Y**2 * aperture_m ** (-4 / 3) / 0.05)
+    young = np.sqrt(
+        air_physics.YOUNG_M_S * air_physics.C_Y**2 * aperture_m ** (-4 / 3) / 0.05
+    )
     twinkling.loglog(100 * aperture_m, ours, color=BODY, label="simulated")
     twinkling.loglog(100 * aperture_m, young, color=LAB, linestyle="--", label="Young's law")
     twinkling.set(
@@ -500,9 +512,13 @@ def orbit(path: Path) -> None:
     for name, color in (("sun", LIGHT), ("earth", BODY), ("moon", LAB)):
         label = "the Earth's limb" if name == "earth" else f"the {name.capitalize()}"
         angles.plot(minutes, getattr(seen, f"{name}_deg"), color=color, label=label)
-        angles.axhline(getattr(limits, f"{name}_deg"), color=color, linestyle=":", linewidth=1)
+        angles.axhline(
+            getattr(limits, f"{name}_deg"), color=color, linestyle=":", linewidth=1
+        )
         light.semilogy(
-            minutes, [one.get(f"the {name.capitalize()}", np.nan) for one in stray], color=color
+            minutes,
+            [one.get(f"the {name.capitalize()}", np.nan) for one in stray],
+            color=color,
         )
     angles.set(ylabel="from the boresight (deg)", ylim=(-80, 180))
     angles.legend(frameon=False, ncols=3, loc="upper right")
@@ -513,7 +529,11 @@ def orbit(path: Path) -> None:
 def reflections(path: Path) -> None:
     """A frame without noise under a dome: black, and with mirror images and ghosts of its LEDs."""
     deep = "{kind: sphere, apex: 5 ft, radius: 4 ft, rim_deg: 130}"
-    settings = {"light.surface": deep, "exposure.frames": "1", "camera.detector.noise": "false"}
+    settings = {
+        "light.surface": deep,
+        "exposure.frames": "1",
+        "camera.detector.noise": "false",
+    }
     settings |= {
         f"camera.detector.{key}": "0"
         for key in ("prnu", "dsnu", "hot_pixels", "column_offset_e")

@@ -152,7 +152,9 @@ def sections(root: type[BaseModel]) -> dict[str, Section]:
     return found
 
 
-def table(model: type[BaseModel], paths: Iterable[str] = (), links: Iterable[str] = ()) -> str:
+def table(
+    model: type[BaseModel], paths: Iterable[str] = (), links: Iterable[str] = ()
+) -> str:
     """Markdown table of a section's keys; "" for a section without keys."""
     schema = model.model_json_schema(by_alias=True)
     rows = []

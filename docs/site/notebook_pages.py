@@ -14,7 +14,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages: notebooks/NAME.md from notebooks/NAME.ipynb."""
     for path in sorted(Path(config.docs_dir, "notebooks").glob("*.ipynb")):
         files.append(
-            File.generated(config, f"notebooks/{path.stem}.md", content=notebook_markdown(path))
+            File.generated(
+                config, f"notebooks/{path.stem}.md", content=notebook_markdown(path)
+            )
         )
     return files
 
@@ -25,7 +27,9 @@ def notebook_markdown(path: Path) -> str:
     parts = []
     for cell in notebook["cells"]:
         source = "".join(cell["source"])
-        parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
+        parts.append(
+            source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```"
+        )
         parts += [output_markdown(output) for output in cell.get("outputs", ())]
     parts.insert(1, f"[Download the notebook]({path.name})")
     return "\n\n".join(part for part in parts if part)

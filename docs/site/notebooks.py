@@ -20,7 +20,9 @@ def execute(path: Path) -> nbformat.NotebookNode:
         cell.metadata.pop("execution", None)  # wall-clock times
         for output in cell.get("outputs", ()):
             if "text/html" in output.get("data", {}):
-                output["data"]["text/plain"] = ""  # long, and it may hold paths of this machine
+                output["data"]["text/plain"] = (
+                    ""  # long, and it may hold paths of this machine
+                )
     return notebook
 
 

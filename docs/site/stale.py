@@ -33,7 +33,9 @@ LINE = re.compile(
 )
 COMMAND = re.compile(r"^```(?:sh|text)\n(.*?)$", re.MULTILINE)
 
-Files = Callable[[str], dict[str, bytes]]  # contents by path, of a package, a folder or a file
+Files = Callable[
+    [str], dict[str, bytes]
+]  # contents by path, of a package, a folder or a file
 
 
 class Stamp(NamedTuple):

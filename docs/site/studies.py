@@ -53,7 +53,9 @@ EVENT = re.compile(
     r"\((?P<interval>[^)]+)\)(?:; none in .*?\(less than (?P<bound>\S+ %))?"
 )
 NONE = re.compile(r": none in .*?\(less than (\S+ %)")
-UNDECIDED = re.compile(r"Nothing says otherwise, but NEES is known to (\S+ to \S+) only at .*$")
+UNDECIDED = re.compile(
+    r"Nothing says otherwise, but NEES is known to (\S+ to \S+) only at .*$"
+)
 EVENTS = {  # by the beginning of the report's sentence
     "Is every": "refused",
     "Is it ambiguous": "ambiguous",
@@ -180,7 +182,9 @@ def evaluate(expression: str, record: Record, where: Row, interval: bool = False
         raise ValueError(f"{record.name}: cannot read '{expression}'")
     extreme, name, given = match.groups()
     levels = dict(where)
-    levels |= dict(part.strip().split("=") for part in (given or "").split(",") if part.strip())
+    levels |= dict(
+        part.strip().split("=") for part in (given or "").split(",") if part.strip()
+    )
     if levels.get("front") == "-1":
         levels["front"] = str(len(record.rows))
     chosen = [row for row in record.rows if has_levels(row, levels)]
@@ -277,7 +281,10 @@ def table(
         places = [{"point": str(n)} for n in said["points"]]
     else:
         places = list(
-            map(dict, dict.fromkeys(tuple((f, row[f]) for f in factors) for row in record.rows))
+            map(
+                dict,
+                dict.fromkeys(tuple((f, row[f]) for f in factors) for row in record.rows),
+            )
         )
     if len(places) > MAX_ROWS:
         raise ValueError(f"{record.name}: a table of {len(places)} rows")
@@ -317,7 +324,8 @@ def draw_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> bytes:
     for axis, column in zip(np.atleast_1d(axes), columns, strict=True):
         for y, row in enumerate(rows):
             value, *ends = (
-                float(one.replace(",", "")) for one in re.findall(r"[\d.,]*\d", row[column])[:3]
+                float(one.replace(",", ""))
+                for one in re.findall(r"[\d.,]*\d", row[column])[:3]
             )
             axis.plot(ends, [y] * len(ends), color="tab:blue", linewidth=1)
             axis.plot(value, y, "o", color="tab:blue", markersize=4)

@@ -164,7 +164,9 @@ def check_map(leds: object) -> None:
 def check_lever(leds: LedMap, lever: Lever) -> None:
     """Raise ImageError unless the lever's numbers are usable and its arm is shorter than the nearest LED's distance."""
     checks.of_type("lever", lever, Lever)
-    if not np.isfinite(checks.floats("lever: camera_body_m", lever.camera_body_m, (3,))).all():
+    if not np.isfinite(
+        checks.floats("lever: camera_body_m", lever.camera_body_m, (3,))
+    ).all():
         raise ImageError("lever: camera_body_m has a NaN or infinity; allowed: finite")
     checks.one_rotation("lever: cam_from_body", lever.cam_from_body)
     checks.number("lever: sigma_m", lever.sigma_m, 0.0, 1e9, "finite, 0 or more")

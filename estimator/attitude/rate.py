@@ -2,7 +2,7 @@
 
 Motion of images. A camera that rotates at the rate w, in its own axes, sees a place b from the bearing move as
 db/dt = -w x b. The ray is that of q = b - r, with r the lever arm; a star is infinitely far, b = q. The tangents
-(q_x / q_z, q_y / q_z) move by -J w, with J the Jacobian of `nearfield.tangent_jacobian` (`tangent_motion`).
+(q_x / q_z, q_y / q_z) move by -J w, with J the Jacobian of `rotation_fit.tangent_jacobian` (`tangent_motion`).
 
 Rolling shutter. Row y is exposed tau (y - y_mid) after the middle row. An image that moves at v px/s is found where it
 is at mid-exposure of the row in which it is found. This is exact for a constant v and an image that is symmetric about
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import on_sphere
-from estimator.attitude.nearfield import tangent_jacobian
+from estimator.attitude.rotation_fit import tangent_jacobian
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
@@ -99,7 +99,8 @@ def streak_factor(camera: Camera, velocity_tan_s: Floats) -> Floats:
     velocity_tan_s
         (N, 2) velocity of the tangents, 1/s
     """
-    return np.asarray(1 / (1 - camera.focal_px * camera.row_time_s * velocity_tan_s[:, 1]))
+    rows = camera.focal_px * camera.row_time_s * velocity_tan_s[:, 1]  # v_y tau
+    return np.asarray(1 / (1 - rows))
 
 
 def at_middle_row(
@@ -130,7 +131,9 @@ def at_middle_row(
     by_rate = camera.focal_px * motion * delay_s[:, None, None]
     covariance_px2 += by_rate @ rate.covariance_rad2_s2 @ np.swapaxes(by_rate, 1, 2)
     sigma_px = np.sqrt(np.trace(covariance_px2, axis1=1, axis2=2) / 2)
-    return replace(centroids, xy_px=moved_px, sigma_px=sigma_px, covariance_px2=covariance_px2)
+    return replace(
+        centroids, xy_px=moved_px, sigma_px=sigma_px, covariance_px2=covariance_px2
+    )
 
 
 def error_gain(camera: Camera, velocity_tan_s: Floats) -> Floats:
@@ -200,9 +203,9 @@ def chords(camera: Camera, centroids: Centroids) -> tuple[Floats, Floats]:
     """Return the (N, 2) chords of streaks in tangents, sign arbitrary, and their (N, 2, 2) inverse covariances."""
     assert centroids.streak_px is not None
     assert centroids.streak_covariance_px2 is not None
-    begin, end = (
-        camera.tangents(centroids.xy_px + k * centroids.streak_px) for k in (-0.5, 0.5)
-    )
+    half_px = 0.5 * centroids.streak_px
+    begin = camera.tangents(centroids.xy_px - half_px)
+    end = camera.tangents(centroids.xy_px + half_px)
     return end - begin, camera.focal_px**2 * inverses(centroids.streak_covariance_px2)
 
 
@@ -224,7 +227,8 @@ def inliers(residual: Floats, information: Floats) -> NDArray[np.bool_]:
     is then the noise that is larger than assumed.
     """
     distance2 = np.einsum("ni,nij,nj->n", residual, information, residual)
-    return np.asarray(distance2 < OUTLIER_CHI2 * max(1.0, float(np.median(distance2))))
+    excess = max(1.0, float(np.median(distance2)))
+    return np.asarray(distance2 < OUTLIER_CHI2 * excess)
 
 
 def _fit(
@@ -365,7 +369,8 @@ def _fit_disks(
     for _ in range(DISK_ROUNDS):
         # 1. Choice of the root
         side = np.argmin(np.abs(roots - near), axis=0)[None]
-        z, sigma = (np.take_along_axis(table, side, axis=0)[0] for table in (roots, sigma_px))
+        z = np.take_along_axis(roots, side, axis=0)[0]
+        sigma = np.take_along_axis(sigma_px, side, axis=0)[0]
         usable = np.isfinite(z) & (sigma > 0)
         if usable.sum() < MIN_LIGHTS:
             return None
@@ -376,4 +381,5 @@ def _fit_disks(
         rate = np.linalg.solve(normal, np.einsum("nij,ni->j", weighted, measured))
         near = (motion_px @ rate) @ np.array([1, 1j])
     # The error of the moments is common to the lights: more of them do not reduce it.
-    return RateEstimate(rate, np.asarray(usable.sum() * np.linalg.inv(normal), dtype=float))
+    covariance = usable.sum() * np.linalg.inv(normal)
+    return RateEstimate(rate, np.asarray(covariance, dtype=float))

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.nearfield import tangent_jacobian
 from estimator.attitude.rate import (
     aligned,
     chords,
@@ -25,6 +24,7 @@ from estimator.attitude.rate import (
     inverses,
     streak_factor,
 )
+from estimator.attitude.rotation_fit import tangent_jacobian
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Centroids, RateEstimate
@@ -70,14 +70,11 @@ def fit(
 
     Parameters
     ----------
-    place_ref
-        (K, 3) unit vectors of stars, or positions of LEDs from the bearing, m
-    lever_cam_m
-        (3,) position of the camera from the bearing, in camera axes; zeros for stars
-    start
-        Initial cam_from_ref and (3,) rate in camera axes, rad/s
-    prior
-        Prior of the rate
+    place_ref, lever_cam_m
+        (K, 3) positions of LEDs from the bearing, m, and (3,) position of the camera from it, in camera axes; unit
+        vectors of stars, and zeros
+    start, prior
+        Initial cam_from_ref and (3,) rate in camera axes, rad/s, and the prior of the rate
     exposure_s
         Exposure time; None: the streaks are not used
 
@@ -94,40 +91,68 @@ def fit(
         # 1. q = exp(-[w] t) A P - r of each light; residuals and slopes
         turn = Rotation.from_rotvec(-delay_s[:, None] * rate)
         place = turn.apply(cam_from_ref.apply(place_ref))
-        ray = place - lever_cam_m
-        jacobian = tangent_jacobian(place, ray).reshape(-1, 2, 3)
-        rows = [_place_rows(camera, centroids, ray, jacobian, turn, rate)]
-        if exposure_s is not None and centroids.streak_px is not None:
-            rows.append(_streak_rows(camera, centroids, jacobian, rate, exposure_s))
+        rows = _rows(camera, centroids, place, lever_cam_m, turn, rate, exposure_s)
         # 2. Outliers
         if n < FREE_STEPS:
             keep = [inliers(residual, information) for residual, _, information in rows]
         # 3. Normal equations
-        normal = np.zeros((6, 6))
-        gradient = np.zeros(6)
-        for (residual, slopes, information), kept in zip(rows, keep, strict=True):
-            weighted = np.swapaxes(slopes, 1, 2) @ information * kept[:, None, None]
-            normal += np.sum(weighted @ slopes, axis=0)
-            gradient += np.einsum("nij,nj->i", weighted, residual)
+        normal, gradient = _normal_equations(rows, keep)
         normal[3:, 3:] += prior_information
         gradient[3:] += prior_information @ (prior.rate_rad_s - rate)
-        # 4. Step. The unknowns are scaled by the roots of the diagonal: a rate and an angle have different sizes.
-        size = np.sqrt(np.diag(normal))
-        sizes = np.outer(size, size)
-        if not np.all(size > 0) or np.linalg.cond(normal / sizes) > 1e12:
-            raise ValueError(f"{len(centroids)} lights do not determine attitude and rate")
-        step = np.linalg.solve(normal / sizes, gradient / size) / size
+        # 4. Step
+        step = _solve(normal, gradient, len(centroids))
         cam_from_ref = Rotation.from_rotvec(step[:3]) * cam_from_ref
         rate = rate + step[3:]
-        if np.linalg.norm(step[:3]) < CONVERGED_RAD:
+        length_rad = np.linalg.norm(step[:3])
+        if length_rad < CONVERGED_RAD:
             break
-    if not np.linalg.norm(step[:3]) < 1e-8:
-        raise ValueError(
-            f"attitude and rate: not converged, last step {np.linalg.norm(step[:3]):.1e} rad"
-        )
-    return Fit(
-        cam_from_ref, RateEstimate(rate, np.asarray(np.linalg.inv(normal)[3:, 3:], float))
-    )
+    if not length_rad < 1e-8:
+        raise ValueError(f"attitude and rate: not converged, last step {length_rad:.1e} rad")
+    rate_covariance = np.asarray(np.linalg.inv(normal)[3:, 3:], float)
+    return Fit(cam_from_ref, RateEstimate(rate, rate_covariance))
+
+
+def _rows(
+    camera: Camera,
+    centroids: Centroids,
+    place: Floats,
+    lever_cam_m: Floats,
+    turn: Rotation,
+    rate: Floats,
+    exposure_s: float | None,
+) -> list[_Rows]:
+    """Return the rows of the tangents and, with an exposure time, of the streaks."""
+    ray = place - lever_cam_m
+    jacobian = tangent_jacobian(place, ray).reshape(-1, 2, 3)
+    rows = [_place_rows(camera, centroids, ray, jacobian, turn, rate)]
+    if exposure_s is not None and centroids.streak_px is not None:
+        rows.append(_streak_rows(camera, centroids, jacobian, rate, exposure_s))
+    return rows
+
+
+def _normal_equations(
+    rows: list[_Rows], keep: list[NDArray[np.bool_]]
+) -> tuple[Floats, Floats]:
+    """Return the (6, 6) normal matrix and the (6,) gradient of the rows that are kept."""
+    normal = np.zeros((6, 6))
+    gradient = np.zeros(6)
+    for (residual, slopes, information), kept in zip(rows, keep, strict=True):
+        weighted = np.swapaxes(slopes, 1, 2) @ information * kept[:, None, None]
+        normal += np.sum(weighted @ slopes, axis=0)
+        gradient += np.einsum("nij,nj->i", weighted, residual)
+    return normal, gradient
+
+
+def _solve(normal: Floats, gradient: Floats, lights: int) -> Floats:
+    """Return the (6,) step. Raises ValueError for a singular matrix.
+
+    The unknowns are scaled by the roots of the diagonal: a rate and an angle have different sizes.
+    """
+    size = np.sqrt(np.diag(normal))
+    sizes = np.outer(size, size)
+    if not np.all(size > 0) or np.linalg.cond(normal / sizes) > 1e12:
+        raise ValueError(f"{lights} lights do not determine attitude and rate")
+    return np.asarray(np.linalg.solve(normal / sizes, gradient / size) / size)
 
 
 def _place_rows(
@@ -142,7 +167,9 @@ def _place_rows(
     delay_s = camera.row_delays_s(centroids.xy_px)
     # Covariance of the residuals: a centroid's error also shifts the time at which it is predicted.
     gain = error_gain(camera, -jacobian @ rate)
-    error_rad2 = gain @ covariance_of(centroids) @ np.swapaxes(gain, 1, 2) / camera.focal_px**2
+    error_rad2 = (
+        gain @ covariance_of(centroids) @ np.swapaxes(gain, 1, 2) / camera.focal_px**2
+    )
     # Slopes: J exp(-[w] t) by the rotation, -t J by the rate
     by_rotation = jacobian @ turn.as_matrix()
     by_rate = -delay_s[:, None, None] * jacobian

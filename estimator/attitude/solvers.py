@@ -86,7 +86,10 @@ SOLVERS: dict[str, Solver] = {
 
 
 def _solve_profile(
-    raw: Callable[[Floats], Floats], vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats
+    raw: Callable[[Floats], Floats],
+    vectors_cam: Floats,
+    vectors_ref: Floats,
+    sigma_rad: Floats,
 ) -> Rotation:
     """Solve the attitude profile with the method `raw`, then refine the solution on the vectors."""
     cam, ref, weight = _checked_arrays(vectors_cam, vectors_ref, sigma_rad)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimator.attitude.nearfield import tangent_gradients, tangent_jacobian
+from estimator.attitude.rotation_fit import tangent_gradients, tangent_jacobian
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 
@@ -54,9 +54,8 @@ def geometry(place_cam: Floats, ray_cam: Floats) -> Geometry:
 def with_focal(view: Geometry) -> Geometry:
     """Return the geometry of a fit whose fourth unknown is the logarithm of the focal length."""
     # The derivative of f (x / z) / f_0 by log f is the tangent itself.
-    return view._replace(
-        jacobian=np.concatenate([view.jacobian, view.tangent[:, :, None]], axis=2)
-    )
+    by_focal = view.tangent[:, :, None]
+    return view._replace(jacobian=np.concatenate([view.jacobian, by_focal], axis=2))
 
 
 def from_independent(view: Geometry, sigma_rad: Floats, covariance_rad2: Floats) -> Floats:
@@ -107,11 +106,12 @@ def residual_products(view: Geometry, sigma_rad: Floats, error_rad: Floats) -> F
     error_rad
         (M, K, 2) change of the tangents by one standard deviation of each error
     """
-    weighted = (error_rad / sigma_rad[:, None]).reshape(len(error_rad), 2 * len(sigma_rad))
-    jacobian = (view.jacobian / sigma_rad[:, None, None]).reshape(2 * len(sigma_rad), -1)
+    rows = 2 * len(sigma_rad)
+    weighted = (error_rad / sigma_rad[:, None]).reshape(len(error_rad), rows).T
+    jacobian = (view.jacobian / sigma_rad[:, None, None]).reshape(rows, -1)
     # The solution absorbs the part of an error that looks like a rotation; the rest is left in the residuals.
-    absorbed, _, _, _ = np.linalg.lstsq(jacobian, weighted.T, rcond=None)
-    left = weighted.T - jacobian @ absorbed
+    absorbed = np.linalg.lstsq(jacobian, weighted, rcond=None)[0]
+    left = weighted - jacobian @ absorbed
     return np.asarray(left.T @ left)
 
 
@@ -154,8 +154,8 @@ def with_survey(
     """
     # 1. Solver's response
     solver = np.linalg.cholesky(covariance_rad2)
-    least_squares = np.linalg.cholesky(from_independent(view, sigma_rad, isotropic(sigma_rad)))
-    adapt = solver @ np.linalg.inv(least_squares)
+    least_squares = from_independent(view, sigma_rad, isotropic(sigma_rad))
+    adapt = solver @ np.linalg.inv(np.linalg.cholesky(least_squares))
     # 2. Errors that successive frames share
     fitted = with_focal(view) if fits_focal else view
     own = from_independent(fitted, sigma_rad, own_rad2)
@@ -167,11 +167,16 @@ def with_survey(
 
 def focal_error_px(camera: Camera, xy_px: Floats) -> Floats:
     """Return the (N,) position errors from the focal length: its relative sigma times the distance from the center."""
-    return np.asarray(camera.focal_sigma * np.linalg.norm(xy_px - camera.center_px, axis=1))
+    distance_px = np.linalg.norm(xy_px - camera.center_px, axis=1)
+    return np.asarray(camera.focal_sigma * distance_px)
 
 
 def with_focal_error(
-    covariance_rad2: Floats, camera: Camera, xy_px: Floats, seen_cam: Floats, sigma_rad: Floats
+    covariance_rad2: Floats,
+    camera: Camera,
+    xy_px: Floats,
+    seen_cam: Floats,
+    sigma_rad: Floats,
 ) -> tuple[Floats, Floats | None]:
     """Return the (3, 3) covariance of an attitude with the focal length's error as common to all stars, and its part.
 

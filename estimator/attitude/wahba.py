@@ -27,7 +27,7 @@ import numpy as np
 from estimator.core import least_squares
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
-from estimator.core.vectors import rotate_in_place
+from estimator.core.vectors import cross, dot, norm, rotate, rotate_in_place, row
 
 Quaternion = tuple[float, float, float, float]
 
@@ -89,12 +89,8 @@ def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
     for n in range(len(cam)):
         total += weight[n]
         # | |v|^2 - 1 | of both vectors
-        length_error = max(
-            length_error, abs(cam[n, 0] ** 2 + cam[n, 1] ** 2 + cam[n, 2] ** 2 - 1)
-        )
-        length_error = max(
-            length_error, abs(ref[n, 0] ** 2 + ref[n, 1] ** 2 + ref[n, 2] ** 2 - 1)
-        )
+        for v in (row(cam, n), row(ref, n)):
+            length_error = max(length_error, abs(dot(v, v) - 1))
         # The directions must differ from the first one in both frames.
         max_sine2 = max(max_sine2, min(_sine2(cam, 0, n), _sine2(ref, 0, n)))
         for i in range(3):
@@ -297,8 +293,7 @@ def raw_esoq2(B: Floats) -> Floats:
             e[1] = v
             e[2] = w
     # 4. Quaternion
-    scalar = z[0] * e[0] + z[1] * e[1] + z[2] * e[2]
-    q = (x - trace) * e[0], (x - trace) * e[1], (x - trace) * e[2], scalar
+    q = (x - trace) * e[0], (x - trace) * e[1], (x - trace) * e[2], dot(z, e)
     return matrix_of(_undo_rotation(q, frame))
 
 
@@ -332,7 +327,9 @@ def raw_svd(B: Floats) -> Floats:
     R = np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
-            R[i, j] = U[i, 0] * Vt[0, j] + U[i, 1] * Vt[1, j] + determinant * U[i, 2] * Vt[2, j]
+            R[i, j] = (
+                U[i, 0] * Vt[0, j] + U[i, 1] * Vt[1, j] + determinant * U[i, 2] * Vt[2, j]
+            )
     return R
 
 
@@ -401,7 +398,7 @@ def raw_triad(cam: Floats, ref: Floats, weight: Floats) -> Floats:
 def _normal(u: Floats, v: Floats) -> Floats:
     """Return the unit vector along u x v."""
     w = np.cross(u, v)
-    return w / sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
+    return w / norm(w)
 
 
 @jit
@@ -420,7 +417,6 @@ def refine(R_cam_from_ref: Floats, cam: Floats, ref: Floats, weight: Floats) -> 
     minimum, so the iteration cannot converge to a wrong one.
     """
     R = R_cam_from_ref
-    a = np.empty(3)
     gradient = np.empty(3)
     normal = np.empty((3, 3))
     step = np.empty(3)
@@ -430,11 +426,10 @@ def refine(R_cam_from_ref: Floats, cam: Floats, ref: Floats, weight: Floats) -> 
         normal.fill(0.0)
         for n in range(len(cam)):
             w = weight[n]
+            a = rotate(R, row(ref, n))
+            turn = cross(a, row(cam, n))
             for i in range(3):
-                a[i] = R[i, 0] * ref[n, 0] + R[i, 1] * ref[n, 1] + R[i, 2] * ref[n, 2]
-            gradient[0] += w * (a[1] * cam[n, 2] - a[2] * cam[n, 1])
-            gradient[1] += w * (a[2] * cam[n, 0] - a[0] * cam[n, 2])
-            gradient[2] += w * (a[0] * cam[n, 1] - a[1] * cam[n, 0])
+                gradient[i] += w * turn[i]
             _add_information(normal, a, w)
         # 2. Step
         _factorize(normal)
@@ -443,7 +438,7 @@ def refine(R_cam_from_ref: Floats, cam: Floats, ref: Floats, weight: Floats) -> 
         least_squares.cholesky_solve(normal, step)
         # 3. Rotation
         rotate_in_place(step, R)
-        if step[0] ** 2 + step[1] ** 2 + step[2] ** 2 < MIN_STEP2_RAD2:
+        if dot(step, step) < MIN_STEP2_RAD2:
             break
 
 

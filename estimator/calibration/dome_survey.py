@@ -3,7 +3,7 @@
 The method is bundle adjustment (`bundle_adjustment`) from an approximate map and approximate attitudes:
 
 1. Improve the start attitudes, and reject wrong identifications (`_reject_misidentified`).
-2. Select the connected subset: lights and frames that the sightings determine (`connected_subset`).
+2. Select the connected subset: lights and frames that the sightings determine (`survey_subset`).
 3. Adjust all unknowns by least squares (`bundle_adjustment.adjust`).
 4. Transform the solution to the gauge (`Gauge.transform`).
 5. Compute the covariances, and the misfit sqrt(chi-square / redundancy). If the noise is to be fitted, multiply it by
@@ -38,13 +38,15 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import LinAlgError
-from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map
 from estimator.calibration import bundle_adjustment as ba
-from estimator.calibration.bundle_adjustment import Assumed, Bundle, Covariances, Sightings
-from estimator.calibration.gauge import Gauge, Subset
+from estimator.calibration import bundle_covariance
+from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
+from estimator.calibration.bundle_covariance import Covariances
+from estimator.calibration.gauge import Gauge
+from estimator.calibration.survey_subset import Subset, connected_subset
 from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints
@@ -56,27 +58,9 @@ GATE = 5.0  # residuals above this many robust sigmas are outliers in the final 
 GROSS_GATE = 6.0  # the same for the first rejection, after only the attitudes are fitted
 # Least number of redundant coordinates of a survey that estimates its noise from them.
 MIN_REDUNDANCY = 8
-# Least rms angle of the rays to one light from their main direction; below it, the distance is undetermined.
-CROSSING_RAD = 0.005
-# The same for lights that connect frames before they are adjusted, when the angle is not yet exact.
-CONNECTING_RAD = 2 * CROSSING_RAD
 # Estimation of the noise from the residuals: number of rounds, and the misfit's difference from 1 that ends them.
 NOISE_ROUNDS = 8
 NOISE_TOLERANCE = 0.01
-
-
-class Unconnected(ValueError):
-    """Error: the frames form several groups.
-
-    Attributes
-    ----------
-    frames
-        Rows of the frames outside the group of the frame with most LEDs
-    """
-
-    def __init__(self, message: str, frames: Ints) -> None:
-        super().__init__(message)
-        self.frames = frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +77,7 @@ class DomeFrame:
         (K,) standard deviation of each coordinate
     body_from_lab
         Start value of the attitude, accurate to a few degrees: from an IMU, or from
-        nearfield.rotation_only with the old map
+        rotation_fit.rotation_only with the old map
     """
 
     led: Ints
@@ -196,29 +180,22 @@ def survey(
         Identified LEDs, centroids and start attitude of each frame
     leds_start, lever_start, camera_start
         Start values of the map, the lever and the camera
-    known_length
-        Rows of two lights and the distance between them in m; fixes the scale
+    known_length, reference_frame
+        Rows of two lights and the distance between them in m, which fixes the scale; row of the frame whose start
+        attitude fixes the lab frame, instead of the start map
     fit_distortion
         Also fit k1, k2, p1, p2; k3 has no visible effect in a narrow field
     loss
-        "linear", or "cauchy", which tolerates wrong identifications: they are rejected with a
-        robust loss first (`_reject_misidentified`), and the rest is fitted by least squares, so
-        that the covariance is that of a least-squares fit. Errors of a light seen only twice are
-        hard to detect
-    reference_frame
-        Row of the frame whose start attitude fixes the lab frame, instead of the start map
+        "linear", or "cauchy": wrong identifications are rejected first; those of a light seen only twice hardly show
     leds_sigma_m
-        Standard deviation of the start map per axis; the map is then used as a measurement,
-        which the weakly determined moves need. inf: the map is only a start value
+        Standard deviation of the start map per axis, used as a measurement; inf: it is only a start value
     fit_noise
-        Multiply sigma_px by the misfit and fit again until the misfit is 1 (estimation of a
-        variance component: Koch 1999, Parameter Estimation and Hypothesis Testing in Linear
-        Models, section 3.6). The weights of pixels and map are then right even if the noise is
-        known only up to a factor
+        Multiply sigma_px by the misfit and fit again until the misfit is 1 (estimation of a variance component: Koch
+        1999, Parameter Estimation and Hypothesis Testing in Linear Models, section 3.6). The weights of pixels and map
+        are then right even if the noise is known only up to a factor
     assumed
-        Lever and focal length with standard deviations, used as measurements beside the map.
-        Many frames determine both better. Few frames hardly determine them: a wrong lens could
-        then fit misidentified lights
+        Lever and focal length with standard deviations, used as measurements beside the map. Few frames hardly
+        determine them: a wrong lens could then fit misidentified lights
 
     Raises
     ------
@@ -227,16 +204,7 @@ def survey(
     Unconnected
         If the frames form several groups.
     """
-    if loss not in LOSSES:
-        raise ValueError(f"survey: unknown loss {loss!r}; allowed: {', '.join(LOSSES)}")
-    if not leds_sigma_m > 0:
-        raise ValueError(
-            f"survey: leds_sigma_m is {leds_sigma_m}; allowed: above 0, inf for a start only"
-        )
-    if assumed and (np.isinf(leds_sigma_m) or known_length or reference_frame is not None):
-        raise ValueError(
-            "survey: an assumed lever needs the map for all else; allowed: a finite leds_sigma_m alone"
-        )
+    _check_options(loss, leds_sigma_m, assumed, known_length, reference_frame)
     checks.each_of_type("survey: frames", frames, DomeFrame)
     checks.of_type("survey: camera_start", camera_start, Camera)
     check_map(leds_start)
@@ -250,8 +218,27 @@ def survey(
     # The frame, and the row in it, of each rejected sighting.
     row = np.concatenate([np.arange(len(frame.led)) for frame in frames])
     outliers = np.column_stack([sightings.frame, row])[~fit.keep]
-    full = fit.subset.insert_into(start, fit.subset.bundle)
-    return _report(fit, full, outliers, leds_start, camera_start)
+    return _report(fit, start, outliers, leds_start, camera_start)
+
+
+def _check_options(
+    loss: str,
+    leds_sigma_m: float,
+    assumed: Assumed | None,
+    known_length: tuple[int, int, float] | None,
+    reference_frame: int | None,
+) -> None:
+    """Raise ValueError for an unknown loss, a map error that is not above 0, or an assumed lever without a map."""
+    if loss not in LOSSES:
+        raise ValueError(f"survey: unknown loss {loss!r}; allowed: {', '.join(LOSSES)}")
+    if not leds_sigma_m > 0:
+        raise ValueError(
+            f"survey: leds_sigma_m is {leds_sigma_m}; allowed: above 0, inf for a start only"
+        )
+    if assumed and (np.isinf(leds_sigma_m) or known_length or reference_frame is not None):
+        raise ValueError(
+            "survey: an assumed lever needs the map for all else; allowed: a finite leds_sigma_m alone"
+        )
 
 
 class _Fit(NamedTuple):
@@ -320,8 +307,9 @@ def _covariances(subset: Subset, gauge: Gauge) -> Covariances:
     bundle = subset.bundle
     terms = ba.normal_equations(bundle, subset.sightings, np.ones(len(subset.index)))
     if _has_prior_gauge(bundle, gauge):
-        return ba.covariance(terms, bundle)
-    return ba.covariance_in_gauge(terms, bundle, *gauge.constraints(bundle, subset))
+        return bundle_covariance.covariance(terms, bundle)
+    fixed = gauge.constraints(bundle, subset)
+    return bundle_covariance.covariance_in_gauge(terms, bundle, *fixed)
 
 
 def _misfit(subset: Subset, covariances: Covariances) -> float:
@@ -446,115 +434,6 @@ def _inliers(bundle: Bundle, sightings: Sightings, gate: float) -> np.ndarray:
     return length < gate * ba.robust_scale(bundle, sightings)
 
 
-def connected_subset(full: Bundle, sightings: Sightings, keep: np.ndarray) -> Subset:
-    """Return the subset that the sightings determine.
-
-    1. Remove lights seen in fewer than two frames or without crossing rays, and frames that see fewer than two of the
-       remaining lights, until nothing changes.
-    2. Check that the coordinates suffice for the unknowns, and that the frames form one group.
-    3. Renumber lights, frames and sightings from 0.
-
-    Raises
-    ------
-    ValueError
-        If too few sightings remain.
-    Unconnected
-        If they form groups of frames that are not connected.
-    """
-    in_front = np.isfinite(ba.residuals(full, sightings)).all(axis=1)
-    index = np.flatnonzero(keep & in_front)
-    lights = len(full.position_m)
-    frames = len(full.R_body_from_lab)
-    camera_m = np.einsum("kji,j->ki", full.R_body_from_lab, full.camera_body_m)  # in the lab
-    # 1. Removing a light can leave its frames with too few lights, and the reverse.
-    while True:
-        led = sightings.led[index]
-        frame = sightings.frame[index]
-        incidence = csr_array((np.ones(len(index)), (frame, led)), shape=(frames, lights)) > 0
-        angle_rad = ray_angles(full.position_m, camera_m, frame, led)
-        good_led = (incidence.sum(axis=0) >= 2) & (angle_rad > CROSSING_RAD)
-        good_frame = incidence @ good_led.astype(float) >= 2
-        valid = good_led[led] & good_frame[frame]
-        if valid.all():
-            break
-        index = index[valid]
-    # 2. Coordinates and connection
-    led_rows = np.unique(led)
-    frame_rows = np.unique(frame)
-    unknowns = 3 * len(led_rows) + 3 * len(frame_rows) + 3 + full.free_lens - 4
-    if 2 * len(index) < unknowns or not len(index):
-        raise ValueError(
-            f"survey: {2 * len(index)} usable coordinates for {unknowns} unknowns; take more frames"
-        )
-    _check_one_group(incidence, frame_rows)
-    # 3. New numbers
-    numbered = replace(
-        sightings.take(index),
-        frame=np.searchsorted(frame_rows, frame),
-        led=np.searchsorted(led_rows, led),
-    )
-    bundle = replace(
-        full,
-        position_m=full.position_m[led_rows],
-        R_body_from_lab=full.R_body_from_lab[frame_rows],
-        map_m=full.map_m[led_rows],
-    )
-    return Subset(bundle, numbered, led_rows, frame_rows, index)
-
-
-def ray_angles(
-    position_m: np.ndarray, camera_m: np.ndarray, frame: Ints, led: Ints
-) -> np.ndarray:
-    """Return the (N,) rms angle of the rays to each light from their main direction; the distance depends on it.
-
-    The mean sin^2 of these angles is 1 minus the largest eigenvalue of the mean of u u^T. Without a sighting it is 0.
-
-    Parameters
-    ----------
-    position_m
-        (N, 3) positions of the lights
-    camera_m
-        (F, 3) positions of the camera in each frame
-    frame, led
-        (K,) rows of each sighting's frame and light
-    """
-    ray = position_m[led] - camera_m[frame]
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    lights = len(position_m)
-    scatter = np.zeros((lights, 3, 3))
-    count = np.bincount(led, minlength=lights)
-    np.add.at(scatter, led, ray[:, :, None] * ray[:, None, :])
-    largest = np.linalg.eigvalsh(scatter / np.maximum(count, 1)[:, None, None])[:, 2]
-    return np.sqrt(np.where(count > 0, np.maximum(1 - largest, 0.0), 0.0))
-
-
-def _check_one_group(incidence: csr_array, frame_rows: Ints) -> None:
-    """Raise Unconnected unless the frames form one group, each sharing two or more lights with the rest.
-
-    A group that shares only one light with the rest could rotate about it. The group grows from the frame with the most
-    lights.
-    """
-    # Frames by lights; the group begins with the frame with the most lights.
-    table = incidence[frame_rows].astype(float)
-    member = np.zeros(len(frame_rows), dtype=bool)
-    member[np.argmax(table.sum(axis=1))] = True
-    while True:
-        leds_in_group = (table.T @ member.astype(float)) > 0
-        grown = member | (table @ leds_in_group.astype(float) >= 2)
-        if (grown == member).all():
-            break
-        member = grown
-    # The message names one frame of the group and one outside it.
-    if not member.all():
-        first = frame_rows[member][0]
-        second = frame_rows[~member][0]
-        raise Unconnected(
-            f"survey: the frames are not connected; {np.sum(~member)} of {len(member)}, frame {second} first, share "
-            f"fewer than two LEDs with the group of frame {first}: take frames between them",
-            frame_rows[~member],
-        )
-
-
 def _determined(fitted: Bundle, shared: Floats) -> bool:
     """Return whether the lever is determined to 10 % of the least LED distance, and the focal length to 10 %."""
     sigma = np.sqrt(np.maximum(np.diag(shared), 0))
@@ -567,13 +446,16 @@ def _determined(fitted: Bundle, shared: Floats) -> bool:
 
 
 def _report(
-    fit: _Fit, full: Bundle, outliers: Ints, leds: LedMap, camera: Camera
+    fit: _Fit, start: Bundle, outliers: Ints, leds: LedMap, camera: Camera
 ) -> DomeSurvey:
     """Return the survey's result: the fitted subset in the full set of lights and frames."""
     status = (
-        "converged" if fit.converged else f"stopped after {ba.STEPS} steps without convergence"
+        "converged"
+        if fit.converged
+        else f"stopped after {ba.STEPS} steps without convergence"
     )
     subset = fit.subset
+    full = subset.insert_into(start, subset.bundle)
     lights = len(full.position_m)
     frames = len(full.R_body_from_lab)
     surveyed = np.zeros(lights, dtype=bool)

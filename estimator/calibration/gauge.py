@@ -13,36 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.calibration.bundle_adjustment import Bundle, Sightings
-from estimator.core.checks import Floats, Ints
-
-
-@dataclass(frozen=True, slots=True)
-class Subset:
-    """Connected subset of lights, frames and sightings, renumbered from 0.
-
-    Attributes
-    ----------
-    bundle, sightings
-        Parameters and observations of the subset
-    led, frame, index
-        Rows of its lights, frames and sightings in the full set
-    """
-
-    bundle: Bundle
-    sightings: Sightings
-    led: Ints
-    frame: Ints
-    index: Ints
-
-    def insert_into(self, full: Bundle, fitted: Bundle) -> Bundle:
-        """Return the full bundle with the adjusted values of this subset inserted."""
-        # Lights and frames outside of the subset keep their values.
-        position = full.position_m.copy()
-        rotated = full.R_body_from_lab.copy()
-        position[self.led] = fitted.position_m
-        rotated[self.frame] = fitted.R_body_from_lab
-        return replace(fitted, position_m=position, R_body_from_lab=rotated, map_m=full.map_m)
+from estimator.calibration.bundle_adjustment import Bundle
+from estimator.calibration.survey_subset import Subset
+from estimator.core.checks import Floats
 
 
 @dataclass(frozen=True, slots=True)

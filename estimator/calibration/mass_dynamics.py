@@ -307,7 +307,9 @@ class EquationsOfMotion:
         inertia = inertia_matrix(parameters[INERTIA]) + record.added_inertia_kg_m2[:, :, None]
         inverse = np.asarray(np.linalg.inv(inertia.transpose(2, 0, 1)), dtype=np.float64)
         self.inverse: Floats = inverse.transpose(1, 2, 0)
-        self.torque_scale = np.einsum("ijb,jk->ikb", inertia, inverse_inertia(record, assumed))
+        self.torque_scale = np.einsum(
+            "ijb,jk->ikb", inertia, inverse_inertia(record, assumed)
+        )
         self.moment = parameters[MOMENT] + record.added_moment_kg_m[:, None]
         self.lab_torque = parameters[LAB_TORQUE]
         self.drag = parameters[DRAG]
@@ -320,7 +322,9 @@ class EquationsOfMotion:
     def stored(self, t_s: Floats) -> Floats:
         """Return A (1 + e) h, (3, B): the momentum of the wheels at times (B,), in body axes."""
         wheel_t_s = self.record.wheel_t_s
-        measured = [np.interp(t_s, wheel_t_s, one) for one in self.record.wheel_momentum_nms.T]
+        measured = [
+            np.interp(t_s, wheel_t_s, one) for one in self.record.wheel_momentum_nms.T
+        ]
         return np.asarray(self.axes @ (self.wheel_scale * np.array(measured)))
 
     def rate(self, states: States, stored: Floats) -> Floats:
@@ -338,7 +342,9 @@ class EquationsOfMotion:
         viscous, quadratic = self.drag
         drag = turn(q, (viscous + quadratic * np.abs(rate)) * rate)
         # (R m r) x g - W x H
-        torque = cross(turn(q, self.moment), self.gravity) - cross(self.earth, states.momentum)
+        torque = cross(turn(q, self.moment), self.gravity) - cross(
+            self.earth, states.momentum
+        )
         # J J0^-1 R^T d
         in_body = np.einsum(
             "ijb,jb->ib", self.torque_scale, turn(q, states.torque, inverse=True)
@@ -373,7 +379,9 @@ class EquationsOfMotion:
             # y + h / 6 (a + 2 b + 2 c + d); the quaternion is normalized.
             q, momentum = (
                 old + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-                for old, k1, k2, k3, k4 in zip(now[:2], a[:2], b[:2], c[:2], d[:2], strict=True)
+                for old, k1, k2, k3, k4 in zip(
+                    now[:2], a[:2], b[:2], c[:2], d[:2], strict=True
+                )
             )
             states = States(q / np.sqrt(np.sum(q * q, axis=0)), momentum, decay * last)
         return states

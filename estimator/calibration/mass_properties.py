@@ -49,10 +49,12 @@ from estimator.calibration.mass_dynamics import (
 )
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
-from estimator.filter.states import TrackerModel
+from estimator.filter.error_models import TrackerModel
 
 MAX_ITERATIONS = 30
-CONVERGED_SIGMA = 0.01  # largest step of a parameter at convergence, in its standard deviations
+CONVERGED_SIGMA = (
+    0.01  # largest step of a parameter at convergence, in its standard deviations
+)
 # Tolerance of the logarithm of the misfit, and the largest number of fits to reach it.
 MISFIT_TOLERANCE = 0.1
 MAX_FACTORS = 8
@@ -104,7 +106,9 @@ def estimate_mass(
         ]
         # 2. Information
         normal = information + sum(part.normal for part in parts)
-        gradient = information @ (prior.values - values) + sum(part.gradient for part in parts)
+        gradient = information @ (prior.values - values) + sum(
+            part.gradient for part in parts
+        )
         # 3. Parameters
         covariance: Floats = np.asarray(np.linalg.inv(normal))
         step = covariance @ gradient
@@ -153,7 +157,7 @@ def considered(
        the noise, W_n the weight, B the derivative of a measured attitude by the parameters (those of the bias), and X_n
        that of the fitted one.
     2. The errors have the covariance S_n = L_n L_n^T, and a correlation r = exp(-rotation / angle) that falls with the
-       rotation between two attitudes: the process of `filter.states.TrackerModel`, without its time.
+       rotation between two attitudes: the process of `filter.error_models.TrackerModel`, without its time.
     3. They add sum_mn K_m L_m r_mn L_n^T K_n^T.
     """
     size = len(covariance)
@@ -181,7 +185,8 @@ def considered(
     # 3. Sum over all pairs of attitudes, of all records
     effect = np.concatenate(effects)
     quaternion = Rotation.concatenate(attitudes).as_quat()
-    angle_rad = 2 * np.arccos(np.minimum(np.abs(quaternion @ quaternion.T), 1))
+    cosine = np.abs(quaternion @ quaternion.T)  # of half the angle
+    angle_rad = 2 * np.arccos(np.minimum(cosine, 1))
     shared = np.exp(-angle_rad / TrackerModel().systematic_angle_rad)
     return np.asarray(np.einsum("mpk,mn,nqk->pq", effect, shared, effect, optimize=True))
 
@@ -223,9 +228,10 @@ def reduced(
     rest = slice(2 * STATE, None)
     diagonal = np.zeros((count, STATE, STATE))
     border = np.zeros((count, STATE, size + 1))
-    for block, to in ((before, slice(None, -1)), (after, slice(1, None))):
-        diagonal[to] += products[:, block, block]
-        border[to] += products[:, block, rest]
+    diagonal[:-1] += products[:, before, before]
+    diagonal[1:] += products[:, after, after]
+    border[:-1] += products[:, before, rest]
+    border[1:] += products[:, after, rest]
     corner = products[:, rest, rest].sum(axis=0)
     # 3. Attitudes
     chi2 = float(np.sum(rows[:, :, -1] ** 2))
@@ -427,7 +433,8 @@ def first_covariance(begun: MassEstimate, record: BearingRecord, lab: LabConstan
     changed = (values, *(values + np.diag(step)))
     momenta = [first_states(one, lab, each).momentum[:, 1] for each in changed]
     slope = np.zeros((STATE, len(values)))
-    slope[3:6] = ((np.array(momenta[1:]) - momenta[0]) / step[:, None]).T
+    difference = np.array(momenta[1:]) - momenta[0]
+    slope[3:6] = difference.T / step
     # Errors that are independent of the parameters: attitude, rate and torque
     own = np.zeros((STATE, STATE))
     own[:3, :3] = record.covariance_rad2[1]

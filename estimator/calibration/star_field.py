@@ -35,77 +35,13 @@ from estimator.attitude.solvers import rotation
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration.bundle_adjustment import Bundle, Sightings
 from estimator.calibration.dome_survey import CAUCHY, GATE
+from estimator.calibration.zero_point import MagnitudeZero, magnitude_zero
 from estimator.catalog.catalog import StarCatalog
 from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints
-from estimator.core.constants import SIGMA_PER_MAD
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
-
-# Photometric zero point: the offset between instrumental magnitudes and catalog magnitudes.
-# The instrumental magnitude of a star is -2.5 log10(flux / exposure). Its difference from the catalog's V is the zero
-# point plus the star's color term, which is unknown but constant.
-
-
-@dataclass(frozen=True, slots=True)
-class MagnitudeZero:
-    """Zero point: median over the stars of V minus the instrumental magnitude -2.5 log10(flux / exposure).
-
-    Attributes
-    ----------
-    offset_mag
-        Zero point
-    sigma_mag
-        Standard deviation of the zero point
-    scatter_mag
-        Standard deviation of one star about the zero point, mainly because of its color
-    stars
-        Number of different stars
-    """
-
-    offset_mag: float
-    sigma_mag: float
-    scatter_mag: float
-    stars: int
-
-
-def magnitude_zero(
-    instrumental_mag: Floats, v_mag: Floats, vectors_ref: Floats
-) -> MagnitudeZero:
-    """Return the zero point: the median over different stars of each star's median difference.
-
-    Colors are unknown and shift a star by some tenths of a magnitude, equally in every frame; therefore the sample is
-    the N different stars, not the sightings. The scatter is s = 1.4826 times the median absolute deviation, and the
-    standard deviation of the median is sqrt(pi / 2) s / sqrt(N). Leave out stars near the detection limit: only those
-    with positive errors are detected, which biases the median.
-
-    Parameters
-    ----------
-    instrumental_mag, v_mag
-        (K,) instrumental and catalog magnitude of each sighting
-    vectors_ref
-        (K, 3) unit vector of each sighting's star; it identifies the star
-    """
-    checks.unit_rows("vectors_ref", vectors_ref, None)
-    if not len(vectors_ref):
-        raise ImageError("magnitude_zero: no stars; allowed: one or more")
-    for name, values in (("instrumental_mag", instrumental_mag), ("v_mag", v_mag)):
-        if not np.isfinite(checks.floats(name, values, (len(vectors_ref),))).all():
-            raise ImageError(f"{name} has a NaN or infinity; allowed: finite")
-    # Median of each star
-    _, star = np.unique(vectors_ref, axis=0, return_inverse=True)
-    star = np.ravel(star)
-    difference = v_mag - instrumental_mag
-    each = np.array([np.median(difference[star == k]) for k in range(star.max() + 1)])
-    # Median of the stars
-    offset = float(np.median(each))
-    scatter = float(SIGMA_PER_MAD * np.median(np.abs(each - offset)))
-    sigma = float(np.sqrt(np.pi / 2 / len(each))) * scatter
-    return MagnitudeZero(offset, sigma, scatter, len(each))
-
-
-# Calibration of the lens.
 
 LENS = 8  # focal_px, center x and y, k1, k2, p1, p2, k3
 LEAST_STARS = (
@@ -261,7 +197,9 @@ def calibrate(
     _check_enough(used)
     problem, converged = _minimize(problem, used, np.inf)
     # 6. Covariance and diagnostics
-    status = "converged" if converged else f"stopped after {ba.STEPS} steps without convergence"
+    status = (
+        "converged" if converged else f"stopped after {ba.STEPS} steps without convergence"
+    )
     return _report(status, problem, used, tied, outliers, keep, frames, camera_start)
 
 
@@ -286,21 +224,17 @@ def self_calibrate(
     Each round:
 
     1. Identify the stars with the camera of the last round.
-    2. Stop if they are the same stars as in the round before (an equal number is not enough), or if too many are lost
-       (MIN_STAR_FRACTION).
+    2. Stop if they are the same stars as in the round before, or if too many are lost (MIN_STAR_FRACTION).
     3. Calibrate with them, from the start camera.
 
     Parameters
     ----------
-    frames
-        Centroids of each frame
+    frames, exposure_s
+        Centroids of each frame, and their exposure time
     tracker
-        Function that makes a tracker from a camera and the relative uncertainty of its focal
-        length, which is 0 after a calibration
-    camera
-        Start camera: the chip, and the focal length to `focal_uncertainty`
-    exposure_s
-        Exposure time of the frames
+        Function that makes a tracker from a camera and the relative uncertainty of its focal length
+    camera, focal_uncertainty
+        Start camera, and the uncertainty of its focal length, which is 0 after a calibration
 
     Raises
     ------
@@ -321,7 +255,9 @@ def self_calibrate(
     for _ in range(rounds):
         # 1. Identification
         identified = _identified(frames, tracker(estimate, focal_uncertainty), exposure_s)
-        stars = np.concatenate([np.empty((0, 3)), *(frame.vectors_ref for frame in identified)])
+        stars = np.concatenate(
+            [np.empty((0, 3)), *(frame.vectors_ref for frame in identified)]
+        )
         # 2. Convergence
         if np.array_equal(stars, previous_stars) or len(stars) < MIN_STAR_FRACTION * most:
             break
@@ -484,7 +420,9 @@ def _normal_equations(
         rotation_blocks, sightings.frame, by_rotation.transpose(0, 2, 1) @ weighted_rotation
     )
     np.add.at(coupling, sightings.frame, by_rotation.transpose(0, 2, 1) @ weighted_lens)
-    np.add.at(rhs, sightings.frame, np.einsum("mai,ma->mi", weighted_rotation, terms.residual))
+    np.add.at(
+        rhs, sightings.frame, np.einsum("mai,ma->mi", weighted_rotation, terms.residual)
+    )
     # The identity gives an unused frame a step of zero.
     unused = np.bincount(sightings.frame, minlength=frames) == 0
     rotation_blocks[unused] = np.eye(3)

@@ -73,9 +73,8 @@ class HeldFrames:
             xy_px = np.nan_to_num(xy_px, nan=-1e9)
             inside = ((xy_px >= margin) & (xy_px <= size_px - 1 - margin)).all(axis=1)
             # Distance to the nearest other LED, one outside the frame included
-            near = np.flatnonzero(
-                ((xy_px > -apart_px) & (xy_px < size_px + apart_px)).all(axis=1)
-            )
+            around = (xy_px > -apart_px) & (xy_px < size_px + apart_px)
+            near = np.flatnonzero(around.all(axis=1))
             if len(near) > 1:
                 distance_px, _ = cKDTree(xy_px[near]).query(xy_px[near], 2)
                 inside[near[distance_px[:, 1] < apart_px]] = False
@@ -197,14 +196,16 @@ def stray_lights(
     # 1. Points on the surface; a ray that misses it is put far away.
     origins, directions = held.rays(frame, xy_px)
     points = np.array(
-        [on_surface(u[None], o, held.leds)[0] for o, u in zip(origins, directions, strict=True)]
+        [
+            on_surface(u[None], o, held.leds)[0]
+            for o, u in zip(origins, directions, strict=True)
+        ]
     )
     points = np.nan_to_num(points, nan=1e9)
     # 2. Groups
     pairs = cKDTree(points).query_pairs(reach_m, output_type="ndarray")
-    links = coo_array(
-        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2
-    )
+    size = len(points)
+    links = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(size, size))
     groups, label = connected_components(links, directed=False)
     sigma_rad = sigma_px / held.camera.focal_px
     out = []
@@ -284,7 +285,8 @@ def name_strays(
     distance_m = np.linalg.norm(list_m[candidates][:, None] - places_m, axis=2)
     rows, columns = linear_sum_assignment(np.minimum(distance_m, limit_m) ** 2)
     inside = distance_m[rows, columns] < limit_m
-    return list(zip(candidates[rows[inside]].tolist(), columns[inside].tolist(), strict=True))
+    leds = candidates[rows[inside]].tolist()
+    return list(zip(leds, columns[inside].tolist(), strict=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -437,7 +439,9 @@ def _log_likelihood(table: LightTable) -> Floats:
     both = seen & on
     # 1. Zero of each frame
     own = np.where(both, log_light - log_expected, np.nan)
-    zero = np.array([np.nanmedian(row) if np.isfinite(row).any() else 0.0 for row in own])
+    zero = np.zeros(len(own))
+    for frame in np.flatnonzero(np.isfinite(own).any(axis=1)):
+        zero[frame] = np.nanmedian(own[frame])
     centered = np.where(seen, log_light - zero[:, None], 0.0)
     # 2. Mean and sum of squares
     indicator = seen.T.astype(float)
@@ -457,7 +461,8 @@ def _log_likelihood(table: LightTable) -> Floats:
     # 4. Frames that contradict the LED's code
     silent = table.shown & ~seen
     wrong = indicator @ ~on + silent.T.astype(float) @ on
-    out = -((mean / between_sigma) ** 2 + within / within_sigma**2) / 2 + wrong * np.log(CHANCE)
+    chi2 = (mean / between_sigma) ** 2 + within / within_sigma**2
+    out = wrong * np.log(CHANCE) - chi2 / 2
     out[~tested] = 0.0
     return np.asarray(out)
 
@@ -472,5 +477,7 @@ def _observable(
     rows = np.flatnonzero(tested)
     if len(rows) < 2:
         return None
-    worse = np.diag(likelihood)[rows, None] - likelihood[np.ix_(rows, rows)] > least
-    return float(np.sum(worse & worse.T) / (len(rows) * (len(rows) - 1)))
+    own = np.diag(likelihood)[rows]
+    worse = own[:, None] - likelihood[np.ix_(rows, rows)] > least
+    pairs = len(rows) * (len(rows) - 1)
+    return float(np.sum(worse & worse.T) / pairs)

@@ -18,8 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, project
 from estimator.calibration import bundle_adjustment as ba
+from estimator.calibration import bundle_covariance
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
-from estimator.calibration.dome_survey import CONNECTING_RAD, check_redundancy, connected_subset
+from estimator.calibration.dome_survey import check_redundancy
+from estimator.calibration.survey_subset import CONNECTING_RAD, connected_subset
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints
 
@@ -67,7 +69,9 @@ class SurveyModel:
                 )
         for name in ("lever_sigma_m", "focal_sigma_px"):
             if not getattr(self, name) >= 0:
-                raise ValueError(f"survey: {name} is {getattr(self, name)}; allowed: 0 or more")
+                raise ValueError(
+                    f"survey: {name} is {getattr(self, name)}; allowed: 0 or more"
+                )
 
     def visible(self, body_from_lab: Rotation, margin_px: float = 0.0) -> Mask:
         """Return (F, N) whether each LED is on the chip at each of F attitudes, at least `margin_px` from its edge."""
@@ -130,7 +134,7 @@ def predict(
     subset = connected_subset(bundle, sightings, np.ones(len(sightings.led), dtype=bool))
     terms = ba.normal_equations(subset.bundle, subset.sightings, np.ones(len(subset.index)))
     try:
-        covariance = ba.covariance(terms, subset.bundle)
+        covariance = bundle_covariance.covariance(terms, subset.bundle)
     except LinAlgError:
         raise ValueError(
             "survey: the attitudes do not determine the unknowns; take more of them"
@@ -274,7 +278,9 @@ class _Reach:
         self.row, self.led = np.nonzero(shown)
         self.camera_m, self.along_m = self.positions(candidates, self.row, self.led)
 
-    def positions(self, body_from_lab: Rotation, row: Ints, led: Ints) -> tuple[Floats, Floats]:
+    def positions(
+        self, body_from_lab: Rotation, row: Ints, led: Ints
+    ) -> tuple[Floats, Floats]:
         """Return the (K, 3) camera positions of sightings, and their (K,) components toward the LEDs."""
         camera_m = np.atleast_2d(body_from_lab.inv().apply(self.arm_m))[row]
         return camera_m, np.sum(camera_m * self.toward[led], axis=1)

@@ -124,25 +124,9 @@ class StarCatalog:
             "catalog: epoch_yr", epoch_yr, *EPOCHS_YR, "a Julian year of 1800 to 2200"
         )
         _check_places(ra, dec)
-        numbers = (
-            np.arange(1, count + 1)
-            if id is None
-            else checks.row_numbers("catalog: id", id, 2**63 - 1)
-        )
-        if len(numbers) != count:
-            raise ImageError(
-                f"catalog: id has {len(numbers)} numbers; allowed: {count}, one a star"
-            )
-        stars = from_columns(
-            numbers,
-            np.radians(ra),
-            np.radians(dec),
-            pm_ra,
-            pm_dec,
-            parallax,
-            magnitude,
-            epoch_yr,
-        )
+        place = np.radians(ra), np.radians(dec)
+        numbers = _identifiers(id, count)
+        stars = from_columns(numbers, *place, pm_ra, pm_dec, parallax, magnitude, epoch_yr)
         return stars.take(np.argsort(stars.v_mag, kind="stable"))
 
     def take(self, which: NDArray[Any]) -> StarCatalog:
@@ -179,6 +163,18 @@ def _column(name: str, value: ArrayLike, count: int, one_for_all: bool) -> Float
             f"catalog: {name} has a NaN or infinity in row {checks.first_bad(np.isfinite(array))}"
         )
     return array
+
+
+def _identifiers(id: ArrayLike | None, count: int) -> Ints:
+    """(count,) identifiers; 1 to count if none are given. Raises ImageError for another number of them."""
+    if id is None:
+        return np.arange(1, count + 1)
+    numbers = checks.row_numbers("catalog: id", id, 2**63 - 1)
+    if len(numbers) != count:
+        raise ImageError(
+            f"catalog: id has {len(numbers)} numbers; allowed: {count}, one a star"
+        )
+    return numbers
 
 
 def _check_places(ra_deg: Floats, dec_deg: Floats) -> None:
@@ -231,7 +227,10 @@ def utc(date: object) -> datetime.datetime:
         raise ImageError(
             f"date: {date!r} is not ISO 8601; allowed: for example 2012-06-22T21:00"
         ) from None
-    if not isinstance(time, datetime.datetime) or not EPOCHS_YR[0] <= time.year < EPOCHS_YR[1]:
+    if (
+        not isinstance(time, datetime.datetime)
+        or not EPOCHS_YR[0] <= time.year < EPOCHS_YR[1]
+    ):
         years = "{:g} to {:g}".format(*EPOCHS_YR)
         raise ImageError(
             f"date: {checks.excerpt(date)}; allowed: a UTC date or datetime of {years}"
@@ -296,7 +295,15 @@ def _read(path: str | Path) -> StarCatalog:
     return stars.take(np.argsort(v_mag, kind="stable"))
 
 
-COLUMNS = ("hip", "ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr", "parallax_mas", "v_mag")
+COLUMNS = (
+    "hip",
+    "ra_deg",
+    "dec_deg",
+    "pm_ra_mas_yr",
+    "pm_dec_mas_yr",
+    "parallax_mas",
+    "v_mag",
+)
 
 
 def hipparcos() -> StarCatalog:
@@ -478,7 +485,9 @@ def light_centers(values: Floats, magnitude: Floats, group: Ints) -> tuple[Float
     """
     flux = 10 ** (-0.4 * magnitude)
     total = np.bincount(group, flux)
-    means = np.column_stack([np.bincount(group, flux * column) / total for column in values.T])
+    means = np.column_stack(
+        [np.bincount(group, flux * column) / total for column in values.T]
+    )
     return means, -2.5 * np.log10(total)
 
 

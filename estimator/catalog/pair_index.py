@@ -116,14 +116,8 @@ def build(
     order = np.argsort(angle, kind="stable")
     pair = np.ascontiguousarray(pair[order])
     angle = angle[order]
-    # Each pair appears in the neighbor lists of both its stars. The lists keep pairs within a group.
-    owner = np.concatenate([pair[:, 0], pair[:, 1]])
-    other = np.concatenate([pair[:, 1], pair[:, 0]])
-    both_angles = np.concatenate([angle, angle])
-    by_owner = np.lexsort((both_angles, owner))
-    first = np.searchsorted(owner[by_owner], np.arange(len(vectors) + 1))
-    neighbor = other[by_owner]
-    separation = both_angles[by_owner]
+    # The neighbor lists keep pairs within a group.
+    neighbor_lists = _neighbor_lists(pair, angle, len(vectors))
     independent = group[pair[:, 0]] != group[pair[:, 1]]
     pair = pair[independent]
     angle = angle[independent]
@@ -140,9 +134,7 @@ def build(
         kvector,
         slope,
         offset,
-        first,
-        neighbor,
-        separation,
+        *neighbor_lists,
         group,
         max_angle_rad,
         magnitudes,
@@ -156,6 +148,18 @@ def _pairs_within(vectors: Floats, chord: float) -> tuple[NDArray[np.int32], Flo
     # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
     half_chord = np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2
     return pair, 2 * np.arcsin(half_chord)
+
+
+def _neighbor_lists(
+    pair: NDArray[np.int32], angle_rad: Floats, stars: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32], Floats]:
+    """The fields `first`, `neighbor` and `separation_rad` of PairIndex: each pair is in the lists of both its stars."""
+    owner = np.concatenate([pair[:, 0], pair[:, 1]])
+    other = np.concatenate([pair[:, 1], pair[:, 0]])
+    both_angles = np.concatenate([angle_rad, angle_rad])
+    by_owner = np.lexsort((both_angles, owner))
+    first = np.searchsorted(owner[by_owner], np.arange(stars + 1))
+    return first, other[by_owner], both_angles[by_owner]
 
 
 def k_vector(angle_rad: Floats) -> tuple[NDArray[np.int64], float, float]:

@@ -39,7 +39,9 @@ from estimator.core.jit import jit
 # Color indexes of a G2 star, used where the catalog has no color.
 SUN_B_V = 0.65
 SUN_V_I = 0.72
-BYTES_PER_ENTRY = 20  # two angles and a magnitude of 4 bytes each; id, flags and checksum in 8
+BYTES_PER_ENTRY = (
+    20  # two angles and a magnitude of 4 bytes each; id, flags and checksum in 8
+)
 
 
 class Color(NamedTuple):

@@ -61,8 +61,12 @@ class QuadIndex(NamedTuple):
 def build(sky: SkyIndex, height_rad: float) -> QuadIndex:
     """Build the index of the stars and pairs of `sky` for fields of the given height: the module's steps."""
     # 1. and 2. Chosen stars and their neighbors.
-    chosen = _locally_bright(sky.pair, sky.first, sky.bin_rad, height_rad / 2, len(sky.vectors))
-    neighbor, first = _neighbors(sky.pair, sky.first, sky.bin_rad, LONGEST * height_rad, chosen)
+    chosen = _locally_bright(
+        sky.pair, sky.first, sky.bin_rad, height_rad / 2, len(sky.vectors)
+    )
+    neighbor, first = _neighbors(
+        sky.pair, sky.first, sky.bin_rad, LONGEST * height_rad, chosen
+    )
     total = 1
     found = np.empty((0, 4), np.int32)
     code = np.empty((0, 4))
@@ -160,18 +164,8 @@ def _quads(
             if b < a or length < shortest_rad:
                 continue
             vectors.pair_frame(star_a, star_b, frame)
-            # Stars nearer to A and to B than these are to each other.
-            count = 0
-            for other in range(start[a], min(start[a + 1], start[a] + NEIGHBORS)):
-                c = neighbor[other]
-                star_c = vectors.row(xyz, c)
-                if (
-                    max(vectors.chord(star_a, star_c), vectors.chord(star_b, star_c)) < length
-                    and c != b
-                ):
-                    near[count] = c
-                    place[count, 0], place[count, 1] = in_frame(frame, star_c, length)
-                    count += 1
+            candidates = neighbor[start[a] : min(start[a + 1], start[a] + NEIGHBORS)]
+            count = _stars_between(xyz, candidates, a, b, frame, near, place)
             # Pairs C, D of these.
             for k in range(count):
                 for m in range(k):
@@ -192,6 +186,34 @@ def _quads(
                         arrange(code[total], found[total])
                     total += 1
     return total
+
+
+@jit
+def _stars_between(
+    xyz: Floats,
+    candidates: NDArray,
+    a: int,
+    b: int,
+    frame: Floats,
+    near: NDArray,
+    place: Floats,
+) -> int:
+    """Number of the candidates nearer to A and to B than these are to each other.
+
+    Their rows and their coordinates in the frame of A and B are written to `near` and `place`.
+    """
+    star_a = vectors.row(xyz, a)
+    star_b = vectors.row(xyz, b)
+    length = vectors.chord(star_a, star_b)
+    count = 0
+    for c in candidates:
+        star_c = vectors.row(xyz, c)
+        farther = max(vectors.chord(star_a, star_c), vectors.chord(star_b, star_c))
+        if farther < length and c != b:
+            near[count] = c
+            place[count, 0], place[count, 1] = in_frame(frame, star_c, length)
+            count += 1
+    return count
 
 
 @jit

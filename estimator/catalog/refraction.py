@@ -74,7 +74,9 @@ class SiteAir:
         if epoch.tzinfo is not None:
             epoch = epoch.astimezone(datetime.UTC).replace(tzinfo=None)
         days = (epoch - J2000).total_seconds() / DAY_S + t_s / DAY_S
-        return zenith_icrs(days, np.radians(self.latitude_deg), np.radians(self.longitude_deg))
+        return zenith_icrs(
+            days, np.radians(self.latitude_deg), np.radians(self.longitude_deg)
+        )
 
     def seen(self, directions: Floats, t_s: float) -> Floats:
         """The (N, 3) unit vectors of stars as they are seen, from those without air (N, 3), in ICRS axes."""

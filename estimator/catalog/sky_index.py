@@ -295,10 +295,10 @@ def build_without_pairs(vectors: Floats, mag: Floats) -> SkyIndex:
     empty_pairs = np.empty((0, 2), np.int32), np.zeros(2, np.int32), np.pi
     faces = _cells(vectors, side)
     cells = build_grid(vectors)
-    return SkyIndex(vectors, *empty_pairs, mag, _magnitude_density(mag), *faces, side, cells)
+    return SkyIndex(vectors, *empty_pairs, mag, _smoothed_histogram(mag), *faces, side, cells)
 
 
-def _magnitude_density(mag: Floats) -> Floats:
+def _smoothed_histogram(mag: Floats) -> Floats:
     """Density of sorted magnitudes, 1 / mag: a histogram smoothed by a Gaussian of MAG_SMOOTHING."""
     reach = 4 * MAG_SMOOTHING
     edges = np.arange(mag[0] - reach, mag[-1] + reach + MAG_STEP, MAG_STEP)
@@ -308,6 +308,12 @@ def _magnitude_density(mag: Floats) -> Floats:
     )
     smooth = np.convolve(count, kernel / kernel.sum(), mode="same")
     return np.maximum(smooth[round(reach / MAG_STEP) :], 1e-4)
+
+
+@jit
+def magnitude_density(sky: SkyIndex, mag: float) -> float:
+    """Probability density of the catalog's magnitudes at `mag`, 1 / mag."""
+    return sky.density[cell_of((mag - sky.mag[0]) / MAG_STEP, len(sky.density) - 1)]
 
 
 @jit
@@ -363,7 +369,9 @@ def _cells(vectors: Floats, side: int) -> tuple[NDArray[np.int32], NDArray[np.in
         for sign in (1, -1):
             # Gnomonic projection onto this face, of the stars before it.
             along = sign * vectors[:, axis]
-            gnomonic = np.roll(vectors, -axis, axis=1)[:, 1:] / np.maximum(along, 1e-9)[:, None]
+            gnomonic = (
+                np.roll(vectors, -axis, axis=1)[:, 1:] / np.maximum(along, 1e-9)[:, None]
+            )
             on_face = np.flatnonzero(
                 (along > 0) & (np.abs(gnomonic).max(axis=1) < FACE_HALF_WIDTH)
             )
@@ -373,6 +381,25 @@ def _cells(vectors: Floats, side: int) -> tuple[NDArray[np.int32], NDArray[np.in
             star.append(on_face)
     first, order = counting_sort(np.concatenate(cell), 6 * side * side)
     return first, np.concatenate(star)[order].astype(np.int32)
+
+
+@jit
+def _on_face(x: float, y: float, z: float) -> tuple[int, float, float]:
+    """Face of the cube before a unit vector, and its gnomonic coordinates on it.
+
+    The largest component selects the face; the two others over it are the coordinates.
+    """
+    ax = abs(x)
+    ay = abs(y)
+    az = abs(z)
+    if ax >= ay and ax >= az:
+        inverse = 1 / ax
+        return 0 if x > 0 else 1, y * inverse, z * inverse
+    if ay >= az:
+        inverse = 1 / ay
+        return 2 if y > 0 else 3, z * inverse, x * inverse
+    inverse = 1 / az
+    return 4 if z > 0 else 5, x * inverse, y * inverse
 
 
 @jit
@@ -402,25 +429,7 @@ def nearest(
     star, distance2
         Row of the star and its squared chord; -1 and gate^2 if none is within the gate
     """
-    # The largest component selects the face; the two others over it are the gnomonic coordinates.
-    ax = abs(x)
-    ay = abs(y)
-    az = abs(z)
-    if ax >= ay and ax >= az:
-        face = 0 if x > 0 else 1
-        inverse = 1 / ax
-        u = y * inverse
-        v = z * inverse
-    elif ay >= az:
-        face = 2 if y > 0 else 3
-        inverse = 1 / ay
-        u = z * inverse
-        v = x * inverse
-    else:
-        face = 4 if z > 0 else 5
-        inverse = 1 / az
-        u = x * inverse
-        v = y * inverse
+    face, u, v = _on_face(x, y, z)
     # The cells that a square of the gate's half-width about (u, v) meets.
     scale = side / (2 * FACE_HALF_WIDTH)
     # A gnomonic coordinate changes by at most (1 + u^2 + v^2) times the angle, to first order; the last factor bounds

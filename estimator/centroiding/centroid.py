@@ -194,7 +194,9 @@ def prepare(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors)
         )
     # Boxes within the image: x0, y0 of 0 or more, x1, y1 below its size
     edge = np.array([image.shape[1], image.shape[0]] * 2)
-    if len(blobs) and not (blobs.box_px.min() >= 0 and (blobs.box_px.max(axis=0) < edge).all()):
+    if len(blobs) and not (
+        blobs.box_px.min() >= 0 and (blobs.box_px.max(axis=0) < edge).all()
+    ):
         raise ImageError(
             f"blobs reach beyond the image of {image.shape[1]}x{image.shape[0]} pixels"
         )
@@ -241,7 +243,9 @@ def _fit_gaussians(
     )
 
 
-def _fit_streaks(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors) -> Floats:
+def _fit_streaks(
+    image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors
+) -> Floats:
     """Return the rows of `streak_fit.fit_all`; all NaN for a frame that is not smeared.
 
     Without a streak from the gyro, the fit is repeated with the median of the fitted streaks until that agrees with

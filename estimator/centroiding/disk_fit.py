@@ -150,15 +150,21 @@ def _fit(
             return
         # 4. Convergence
         if largest_step < least_squares.CONVERGED_PX or fall < least_squares.CONVERGED_CHI2:
-            xx, yy, _ = least_squares.position_covariance(normal, step)
-            variance = (xx + yy) / 2 * least_squares.misfit_factor(normal[6, 6], count - 6)
-            out[0] = p[X]
-            out[1] = p[Y]
-            out[2] = sqrt(variance + MODEL_PX**2)
-            out[4] = p[RADIUS]
-            # Total flux of a blurred disk: A pi (R^2 + w^2), as the edge is symmetric about R.
-            out[3] = p[BRIGHTNESS] * pi * (p[RADIUS] ** 2 + p[EDGE] ** 2)
+            _write_disk(normal, p, count, step, out)
             return
+
+
+@jit
+def _write_disk(factor: Floats, p: Floats, pixels: int, column: Floats, out: Floats) -> None:
+    """Write x, y, sigma of the position, flux and radius of a disk; `column` (6,) is a work array."""
+    xx, yy, _ = least_squares.position_covariance(factor, column)
+    variance = (xx + yy) / 2 * least_squares.misfit_factor(factor[6, 6], pixels - 6)
+    out[0] = p[X]
+    out[1] = p[Y]
+    out[2] = sqrt(variance + MODEL_PX**2)
+    out[4] = p[RADIUS]
+    # Total flux of a blurred disk: A pi (R^2 + w^2), as the edge is symmetric about R.
+    out[3] = p[BRIGHTNESS] * pi * (p[RADIUS] ** 2 + p[EDGE] ** 2)
 
 
 @jit

@@ -123,7 +123,6 @@ def _fit(
     start_y = p[Y]
     normal = np.empty((6, 6))
     step = np.empty(5)
-    # Initial flux: the sum of the window above the sky
     p[FLUX] = max(window.sum() - window.size * p[SKY], 1e-9)
     for _ in range(MAX_ITERATIONS):
         # 1. Derivatives
@@ -145,14 +144,20 @@ def _fit(
         if largest_step < least_squares.CONVERGED_PX or fall < least_squares.CONVERGED_CHI2:
             if not MIN_SIGMA_PX < p[WIDTH] < MAX_SIGMA_PX:
                 return False
-            xx, yy, _ = least_squares.position_covariance(normal, step)
-            inflation = least_squares.misfit_factor(normal[5, 5], pixels - 5)
-            out[0] = p[X]
-            out[1] = p[Y]
-            out[2] = sqrt((xx + yy) / 2 * inflation)
-            out[3] = p[FLUX]
+            _write_star(normal, p, pixels, step, out)
             return True
     return False
+
+
+@jit
+def _write_star(factor: Floats, p: Floats, pixels: int, column: Floats, out: Floats) -> None:
+    """Write x, y, sigma of the position and flux of a star; `column` (5,) is a work array."""
+    xx, yy, _ = least_squares.position_covariance(factor, column)
+    inflation = least_squares.misfit_factor(factor[5, 5], pixels - 5)
+    out[0] = p[X]
+    out[1] = p[Y]
+    out[2] = sqrt((xx + yy) / 2 * inflation)
+    out[3] = p[FLUX]
 
 
 @jit

@@ -30,6 +30,7 @@ WINDOW_VARIANCE_RATIO = 2.0
 # Number of iterations that adapt the window's width, and largest number of all iterations.
 SIZING_ITERATIONS = 4
 MAX_ITERATIONS = 60
+Moments = tuple[float, float, float, float]
 
 
 @jit
@@ -56,37 +57,14 @@ def center_of_gravity(
     out = np.empty((len(boxes), 4))
     buffer = np.empty(len(boxes), np.int64)
     for n in range(len(boxes)):
-        # The box with its margin, cut at the image's edge
-        x0 = max(boxes[n, 0] - MARGIN_PX, 0)
-        y0 = max(boxes[n, 1] - MARGIN_PX, 0)
-        x1 = min(boxes[n, 2] + MARGIN_PX, width - 1)
-        y1 = min(boxes[n, 3] + MARGIN_PX, height - 1)
+        x0, y0, x1, y1 = _window(boxes[n], MARGIN_PX, width, height)
         neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
-        flux = sx = sy = s_light = light_xx = light_x = light_y = 0.0
-        pixels = px = py = pxx = 0.0
         origin_x = (x0 + x1) / 2
         origin_y = (y0 + y1) / 2
-        for y in range(y0, y1 + 1):
-            for x in range(x0, x1 + 1):
-                if belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
-                    continue
-                light = image[y, x] - interpolate(level, height, width, y, x)
-                u = x - origin_x
-                v = y - origin_y
-                # 1. F, sum(I u), sum(I v)
-                flux += light
-                sx += light * u
-                sy += light * v
-                # 2. Photon noise is that of the light itself, without the negative noise of the sky.
-                positive = max(light, 0.0)
-                s_light += positive
-                light_x += positive * u
-                light_y += positive * v
-                light_xx += positive * (u * u + v * v)
-                pixels += 1
-                px += u
-                py += v
-                pxx += u * u + v * v
+        # 1. and 2. Moments about the origin
+        flux, sx, sy, by_light, by_pixel = _box_moments(
+            image, boxes, neighbor_rows, n, level, (x0, y0, x1, y1)
+        )
         if flux == 0:  # the center of gravity is undefined
             out[n, :3] = np.nan
             out[n, 3] = 0.0
@@ -94,19 +72,79 @@ def center_of_gravity(
         # xbar and ybar, from the origin
         cx = sx / flux
         cy = sy / flux
-        # 3. Sums of (x - xbar)^2 + (y - ybar)^2 over the pixels, weighted by their light, and without weights.
-        by_light = light_xx - 2 * (cx * light_x + cy * light_y) + (cx * cx + cy * cy) * s_light
-        by_pixel = pxx - 2 * (cx * px + cy * py) + (cx * cx + cy * cy) * pixels
-        # 4. n^2 of one pixel, and the mean of both coordinates' variances times F^2
+        # 3. and 4. n^2 of one pixel, and the mean of both coordinates' variances times F^2
         sigma2 = (
             interpolate(noise, height, width, cy + origin_y, cx + origin_x) / FILTERED_NOISE
         ) ** 2
-        moment_variance = (by_light / gain_e_dn + sigma2 * by_pixel) / 2
+        moment_variance = (
+            _moved(by_light, cx, cy) / gain_e_dn + sigma2 * _moved(by_pixel, cx, cy)
+        ) / 2
         out[n, 0] = cx + origin_x
         out[n, 1] = cy + origin_y
         out[n, 3] = flux
         out[n, 2] = sqrt(max(moment_variance, 0.0)) / abs(flux)
     return out
+
+
+@jit
+def _box_moments(
+    image: NDArray,
+    boxes: Ints,
+    neighbor_rows: Ints,
+    n: int,
+    level: Floats,
+    window: tuple[int, int, int, int],
+) -> tuple[float, float, float, Moments, Moments]:
+    """Sum blob n's light about the center of a window: steps 1 and 2 of `center_of_gravity`.
+
+    Returns
+    -------
+    tuple
+        F, sum(I u) and sum(I v); the sums of w, w u, w v and w (u^2 + v^2), with w the positive light, and with w = 1
+    """
+    height, width = image.shape
+    x0, y0, x1, y1 = window
+    origin_x = (x0 + x1) / 2
+    origin_y = (y0 + y1) / 2
+    flux = sx = sy = s_light = light_xx = light_x = light_y = 0.0
+    count = px = py = pxx = 0.0
+    for y in range(y0, y1 + 1):
+        for x in range(x0, x1 + 1):
+            if belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
+                continue
+            light = image[y, x] - interpolate(level, height, width, y, x)
+            u = x - origin_x
+            v = y - origin_y
+            # 1. F, sum(I u), sum(I v)
+            flux += light
+            sx += light * u
+            sy += light * v
+            # 2. Photon noise is that of the light itself, without the negative noise of the sky.
+            positive = max(light, 0.0)
+            s_light += positive
+            light_x += positive * u
+            light_y += positive * v
+            light_xx += positive * (u * u + v * v)
+            count += 1
+            px += u
+            py += v
+            pxx += u * u + v * v
+    return flux, sx, sy, (s_light, light_x, light_y, light_xx), (count, px, py, pxx)
+
+
+@jit
+def _moved(moments: Moments, cx: float, cy: float) -> float:
+    """Return sum(w ((u - cx)^2 + (v - cy)^2)) from the sums of w, w u, w v and w (u^2 + v^2)."""
+    total, x, y, square = moments
+    return square - 2 * (cx * x + cy * y) + (cx * cx + cy * cy) * total
+
+
+@jit
+def _window(box: Ints, margin: int, width: int, height: int) -> tuple[int, int, int, int]:
+    """Return a box (x0, y0, x1, y1) with a margin, cut at the image's edge."""
+    x0 = max(box[0] - margin, 0)
+    y0 = max(box[1] - margin, 0)
+    return x0, y0, min(box[2] + margin, width - 1), min(box[3] + margin, height - 1)
 
 
 @jit
@@ -126,10 +164,7 @@ def squared_light(
     out = np.empty((len(boxes), 4))
     buffer = np.empty(len(boxes), np.int64)
     for n in range(len(boxes)):
-        x0 = max(boxes[n, 0] - 1, 0)
-        y0 = max(boxes[n, 1] - 1, 0)
-        x1 = min(boxes[n, 2] + 1, width - 1)
-        y1 = min(boxes[n, 3] + 1, height - 1)
+        x0, y0, x1, y1 = _window(boxes[n], 1, width, height)
         neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
         cx = cy = flux = weight = moment_variance = second_moment = 0.0
         sigma2 = 0.0
@@ -201,29 +236,10 @@ def gaussian_windowed(
         s2 = 1.0
         sigma2 = (interpolate(noise, height, width, cy, cx) / FILTERED_NOISE) ** 2
         for iteration in range(MAX_ITERATIONS):
-            # 1. Moments within four sigma of the window
-            reach = 4 * sqrt(s2)
-            x0 = max(round(cx - reach), 0)
-            y0 = max(round(cy - reach), 0)
-            x1 = min(round(cx + reach), width - 1)
-            y1 = min(round(cy + reach), height - 1)
-            neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
-            total = mx = my = second_moment = moment_variance = flux = 0.0
-            for y in range(y0, y1 + 1):
-                for x in range(x0, x1 + 1):
-                    if belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
-                        continue
-                    light = image[y, x] - interpolate(level, height, width, y, x)
-                    u = x - cx
-                    v = y - cy
-                    w = exp(-(u * u + v * v) / (2 * s2))
-                    total += w * light
-                    mx += w * light * u
-                    my += w * light * v
-                    second_moment += w * light * (u * u + v * v) / 2
-                    pixel_variance = max(light, 0.0) / gain_e_dn + sigma2
-                    moment_variance += w * w * (u * u + v * v) / 2 * pixel_variance
-                    flux += light
+            # 1. Moments
+            total, mx, my, second_moment, moment_variance, flux = _window_moments(
+                image, boxes, buffer, n, level, cx, cy, s2, gain_e_dn, sigma2
+            )
             # 2. Newton's step, of at most 0.7 px, with the mean of both coordinates' derivatives
             slope = total - second_moment / s2
             if not (total > 0 and slope > 0):
@@ -237,16 +253,8 @@ def gaussian_windowed(
             if abs(cx - xy[n, 0]) > 2 + sqrt(s2) or abs(cy - xy[n, 1]) > 2 + sqrt(s2):
                 break
             if iteration < SIZING_ITERATIONS:
-                # 3. A star of variance q times the window has the variance 1 / (1/q + 1/s2): solve for q.
-                apparent = second_moment / total
-                variance = (
-                    1 / (1 / apparent - 1 / s2)
-                    if 0 < apparent < 0.95 * s2
-                    else MAX_WINDOW_PX**2
-                )
-                s2 = min(
-                    max(WINDOW_VARIANCE_RATIO * variance, MIN_WINDOW_PX**2), MAX_WINDOW_PX**2
-                )
+                # 3. Window
+                s2 = _window_variance(second_moment / total, s2)
             elif max(abs(dx), abs(dy)) < 1e-10:
                 # 4. Converged
                 sampling_error2 = (
@@ -258,6 +266,72 @@ def gaussian_windowed(
                 out[n, 2] = sqrt(moment_variance / slope**2 + sampling_error2)
                 break
     return out
+
+
+@jit
+def _window_moments(
+    image: NDArray,
+    boxes: Ints,
+    buffer: Ints,
+    n: int,
+    level: Floats,
+    cx: float,
+    cy: float,
+    s2: float,
+    gain_e_dn: float,
+    sigma2: float,
+) -> tuple[float, float, float, float, float, float]:
+    """Sum the moments of blob n within four sigma of a window about (cx, cy): step 1 of `gaussian_windowed`.
+
+    Parameters
+    ----------
+    buffer
+        (N,) work array
+    s2, sigma2
+        Variance of the window, and n^2 of one pixel
+
+    Returns
+    -------
+    tuple[float, ...]
+        M = sum(w I), sum(w I u) and sum(w I v); the mean of both coordinates' sum(w I u^2), and of their
+        sum(w^2 u^2 (I / g + n^2)); and sum(I)
+    """
+    height, width = image.shape
+    reach = 4 * sqrt(s2)
+    x0 = max(round(cx - reach), 0)
+    y0 = max(round(cy - reach), 0)
+    x1 = min(round(cx + reach), width - 1)
+    y1 = min(round(cy + reach), height - 1)
+    neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
+    total = mx = my = second_moment = moment_variance = flux = 0.0
+    for y in range(y0, y1 + 1):
+        for x in range(x0, x1 + 1):
+            if belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
+                continue
+            light = image[y, x] - interpolate(level, height, width, y, x)
+            u = x - cx
+            v = y - cy
+            w = exp(-(u * u + v * v) / (2 * s2))
+            total += w * light
+            mx += w * light * u
+            my += w * light * v
+            second_moment += w * light * (u * u + v * v) / 2
+            pixel_variance = max(light, 0.0) / gain_e_dn + sigma2
+            moment_variance += w * w * (u * u + v * v) / 2 * pixel_variance
+            flux += light
+    return total, mx, my, second_moment, moment_variance, flux
+
+
+@jit
+def _window_variance(apparent: float, s2: float) -> float:
+    """Return the variance of the next window, from a star's apparent one in a window of variance s2.
+
+    A star of variance q has the apparent variance 1 / (1/q + 1/s2): solve for q.
+    """
+    variance = MAX_WINDOW_PX**2
+    if 0 < apparent < 0.95 * s2:
+        variance = 1 / (1 / apparent - 1 / s2)
+    return min(max(WINDOW_VARIANCE_RATIO * variance, MIN_WINDOW_PX**2), MAX_WINDOW_PX**2)
 
 
 @jit
@@ -275,7 +349,9 @@ def neighbors(boxes: Ints, n: int, x0: int, y0: int, x1: int, y1: int, buffer: I
     """Write to `buffer` the other blobs whose boxes overlap a window; return their number."""
     count = 0
     for m in range(len(boxes)):
-        disjoint = boxes[m, 0] > x1 or boxes[m, 2] < x0 or boxes[m, 1] > y1 or boxes[m, 3] < y0
+        disjoint = (
+            boxes[m, 0] > x1 or boxes[m, 2] < x0 or boxes[m, 1] > y1 or boxes[m, 3] < y0
+        )
         if m != n and not disjoint:
             buffer[count] = m
             count += 1

@@ -41,7 +41,9 @@ LENGTH_FRACTION = 0.15
 LENGTH_PX = 0.5
 ANGLE_RAD = 0.15
 WIDTH_FRACTION = 0.15
-FAR_SIGMA = 5.0  # distance from an end of the line beyond which only 3e-7 of the light is left
+FAR_SIGMA = (
+    5.0  # distance from an end of the line beyond which only 3e-7 of the light is left
+)
 # Parameters: center, flux, length, direction, width, sky.
 X, Y, FLUX, LENGTH, ANGLE, WIDTH, SKY = range(7)
 OUTPUTS = 13
@@ -75,11 +77,7 @@ def fit_all(
     out = np.full((len(xy), OUTPUTS), np.nan)
     buffer = np.empty(len(xy), np.int64)
     p = np.empty(7)
-    # The window covers the streak, with a margin, about the blob's center.
-    capacity = 0
-    for n in range(len(xy)):
-        half_x, half_y = _half_window(streaks[n])
-        capacity = max(capacity, (2 * half_x + 1) * (2 * half_y + 1))
+    capacity = _largest_window(streaks)
     pixels = np.empty((3, capacity))
     rows = np.empty((8, capacity))
     weight = np.empty(capacity)
@@ -97,34 +95,70 @@ def fit_all(
         y1 = y0 + 2 * half_y
         if x0 < 0 or y0 < 0 or x1 >= width or y1 >= height:
             continue
-        neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
-        sky = interpolate(level, height, width, xy[n, 1], xy[n, 0])
         sigma = interpolate(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
         # Initial values: the expected streak at the blob's center
         p[X] = xy[n, 0]
         p[Y] = xy[n, 1]
-        p[FLUX] = 0.0
         p[LENGTH] = length
         p[ANGLE] = angle
         p[WIDTH] = width_px
-        p[SKY] = sky
-        # Pixels near the line; the initial flux includes the saturated ones.
-        count = 0
-        for y in range(y0, y1 + 1):
-            for x in range(x0, x1 + 1):
-                if _distance_to_line(p, x, y) > REACH_PX or belongs_to_neighbor(
-                    boxes, neighbor_rows, n, x, y
-                ):
-                    continue
-                p[FLUX] += image[y, x] - sky
-                if image[y, x] < saturation:
-                    pixels[0, count] = x
-                    pixels[1, count] = y
-                    pixels[2, count] = image[y, x]
-                    count += 1
+        p[SKY] = interpolate(level, height, width, xy[n, 1], xy[n, 0])
+        own = (boxes, buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)], n)
+        count = _select_pixels(image, own, (x0, y0, x1, y1), saturation, p, pixels)
         if p[FLUX] > 0 and _fit(pixels[:, :count], sigma, gain_e_dn, rows, weight, p, out[n]):
             width_px = p[WIDTH]  # the optics are the same for the next star
     return out
+
+
+@jit
+def _largest_window(streaks: Floats) -> int:
+    """Return the number of pixels in the largest streak's window."""
+    largest = 0
+    for n in range(len(streaks)):
+        half_x, half_y = _half_window(streaks[n])
+        largest = max(largest, (2 * half_x + 1) * (2 * half_y + 1))
+    return largest
+
+
+@jit
+def _select_pixels(
+    image: NDArray,
+    blob: tuple[Ints, Ints, int],
+    window: tuple[int, int, int, int],
+    saturation: float,
+    p: Floats,
+    pixels: Floats,
+) -> int:
+    """Select the pixels near the line that are not saturated; return their number.
+
+    Parameters
+    ----------
+    blob
+        Boxes of all blobs, the rows of its neighbors, and its own row
+    window
+        x0, y0, x1, y1
+    p
+        (7,) initial parameters; the flux, saturated pixels included, is written to it
+    pixels
+        (3, K) x, y and value of the pixels, written in place
+    """
+    boxes, neighbor_rows, n = blob
+    x0, y0, x1, y1 = window
+    p[FLUX] = 0.0
+    count = 0
+    for y in range(y0, y1 + 1):
+        for x in range(x0, x1 + 1):
+            if _distance_to_line(p, x, y) > REACH_PX or belongs_to_neighbor(
+                boxes, neighbor_rows, n, x, y
+            ):
+                continue
+            p[FLUX] += image[y, x] - p[SKY]
+            if image[y, x] < saturation:
+                pixels[0, count] = x
+                pixels[1, count] = y
+                pixels[2, count] = image[y, x]
+                count += 1
+    return count
 
 
 @jit
@@ -170,8 +204,8 @@ def _fit(
     2. Sum the normal equations, add the priors, and solve for the step.
     3. Apply the step, shortened to about a pixel, and give up far from the start.
     4. At convergence, read the center's covariance from the inverse normal matrix. Where the model does not fit (two
-       crossing streaks) the residuals inflate it.
-    5. Compute the streak's vector without its priors, and add the error of the ends to the covariance.
+       crossing streaks) the residuals inflate it. Add the error of the ends (`_write_streak`).
+    5. Compute the streak's vector without its priors (`_own_vector`).
 
     Parameters
     ----------
@@ -187,12 +221,7 @@ def _fit(
         (13,) row of `fit_all`
     """
     count = pixels.shape[1]
-    start_x = p[X]
-    start_y = p[Y]
-    start_length = p[LENGTH]
-    start_angle = p[ANGLE]
-    start_width = p[WIDTH]
-    length_sigma = length_sigma_px(start_length)
+    start = p.copy()
     normal = np.empty((8, 8))
     step = np.empty(7)
     for _ in range(MAX_ITERATIONS):
@@ -200,71 +229,91 @@ def _fit(
         _rows(pixels, noise, gain_e_dn, p, rows, weight)
         # 2. Step
         least_squares.normal_equations(rows, weight, count, normal)
-        least_squares.add_prior(normal, LENGTH, start_length - p[LENGTH], length_sigma)
-        least_squares.add_prior(normal, ANGLE, start_angle - p[ANGLE], ANGLE_RAD)
-        least_squares.add_prior(
-            normal, WIDTH, start_width - p[WIDTH], WIDTH_FRACTION * start_width
-        )
+        _add_priors(normal, p, start)
         fall = least_squares.step(normal, step)
         if not fall >= 0:
             return False
-        largest_step = max(abs(step[X]), abs(step[Y]), abs(step[LENGTH]))
-        end_shift = abs(step[ANGLE]) * p[LENGTH] / 2
-        # 3. The step is shortened so that center, length and direction move an end by about a pixel at most.
-        scale = min(1.0, 1 / max(largest_step, end_shift, 2 * abs(step[WIDTH]), 1e-300))
-        for k in range(len(p)):
-            p[k] += scale * step[k]
-        p[WIDTH] = min(max(p[WIDTH], 0.3), 4.0)
-        if abs(p[X] - start_x) + abs(p[Y] - start_y) > 2 + start_length / 2:
-            return False
-        if p[FLUX] <= 0 or not MIN_STREAK_PX < p[LENGTH] < 2 * start_length + 4:
+        # 3. Shortened step
+        largest_step = _apply_step(step, p)
+        if not _is_near(p, start):
             return False
         # 4. Convergence
         if largest_step < least_squares.CONVERGED_PX or fall < least_squares.CONVERGED_CHI2:
-            out[0] = p[X]
-            out[1] = p[Y]
-            out[2] = p[FLUX]
-            out[3] = p[LENGTH] * cos(p[ANGLE])
-            out[4] = p[LENGTH] * sin(p[ANGLE])
-            out[5], out[6], out[7] = least_squares.position_covariance(normal, step)
             # Degrees of freedom: seven parameters, three priors.
             misfit = least_squares.misfit_factor(normal[7, 7], count - 4)
-            out[5:8] *= misfit
-            # 5. The variance along the streak becomes a covariance in x and y: times (dx, dy)^T (dx, dy) / L^2.
             end_variance_px2 = _end_variance_px2(p, noise, gain_e_dn)
-            _own_vector(
-                normal,
-                p,
-                start_length,
-                start_angle,
-                misfit,
-                8 * end_variance_px2,
-                step,
-                out[8:],
-            )
-            end_variance = end_variance_px2 / p[LENGTH] ** 2
-            out[5] += end_variance * out[3] ** 2
-            out[6] += end_variance * out[4] ** 2
-            out[7] += end_variance * out[3] * out[4]
+            _write_streak(normal, p, misfit, end_variance_px2, step, out)
+            # 5. The streak's own vector
+            _own_vector(normal, p, start, misfit, 8 * end_variance_px2, out[8:])
             return True
     return False
 
 
 @jit
-def _own_vector(
+def _add_priors(normal: Floats, p: Floats, start: Floats) -> None:
+    """Add the priors on length, direction and width to the normal matrix."""
+    length_sigma = length_sigma_px(start[LENGTH])
+    least_squares.add_prior(normal, LENGTH, start[LENGTH] - p[LENGTH], length_sigma)
+    least_squares.add_prior(normal, ANGLE, start[ANGLE] - p[ANGLE], ANGLE_RAD)
+    width_sigma = WIDTH_FRACTION * start[WIDTH]
+    least_squares.add_prior(normal, WIDTH, start[WIDTH] - p[WIDTH], width_sigma)
+
+
+@jit
+def _apply_step(step: Floats, p: Floats) -> float:
+    """Add a step to `p`, shortened so that center, length and direction move an end by about a pixel at most.
+
+    Returns the largest of the steps of center and length before shortening, px.
+    """
+    largest_step = max(abs(step[X]), abs(step[Y]), abs(step[LENGTH]))
+    end_shift = abs(step[ANGLE]) * p[LENGTH] / 2
+    scale = min(1.0, 1 / max(largest_step, end_shift, 2 * abs(step[WIDTH]), 1e-300))
+    for k in range(len(p)):
+        p[k] += scale * step[k]
+    p[WIDTH] = min(max(p[WIDTH], 0.3), 4.0)
+    return largest_step
+
+
+@jit
+def _is_near(p: Floats, start: Floats) -> bool:
+    """Return whether the parameters are still those of a streak near the start."""
+    if abs(p[X] - start[X]) + abs(p[Y] - start[Y]) > 2 + start[LENGTH] / 2:
+        return False
+    return p[FLUX] > 0 and MIN_STREAK_PX < p[LENGTH] < 2 * start[LENGTH] + 4
+
+
+@jit
+def _write_streak(
     factor: Floats,
     p: Floats,
-    prior_length: float,
-    prior_angle: float,
     misfit: float,
-    ends_px2: float,
+    end_variance_px2: float,
     column: Floats,
     out: Floats,
 ) -> None:
+    """Write x, y, flux, dx, dy of a streak, and xx, yy, xy of its center's covariance."""
+    out[0] = p[X]
+    out[1] = p[Y]
+    out[2] = p[FLUX]
+    out[3] = p[LENGTH] * cos(p[ANGLE])
+    out[4] = p[LENGTH] * sin(p[ANGLE])
+    out[5], out[6], out[7] = least_squares.position_covariance(factor, column)
+    out[5:8] *= misfit
+    # The variance along the streak becomes a covariance in x and y: times (dx, dy)^T (dx, dy) / L^2.
+    end_variance = end_variance_px2 / p[LENGTH] ** 2
+    out[5] += end_variance * out[3] ** 2
+    out[6] += end_variance * out[4] ** 2
+    out[7] += end_variance * out[3] * out[4]
+
+
+@jit
+def _own_vector(
+    factor: Floats, p: Floats, start: Floats, misfit: float, ends_px2: float, out: Floats
+) -> None:
     """Write dx, dy of a streak without the priors on length and angle, and xx, yy, xy of their covariance.
 
-    With the prior's information P and the posterior's covariance S and mean m, the data alone have the information
-    D = S^-1 - P and the mean m + D^-1 P (m - prior), as all are Gaussian near the solution.
+    With the prior's information P about `start` and the posterior's covariance S and mean m, the data alone have the
+    information D = S^-1 - P and the mean m + D^-1 P (m - start), as all are Gaussian near the solution.
 
     1. Read S of length and angle from the factor of the normal matrix.
     2. Subtract the prior's information: D and its inverse. Leave `out` NaN if D is not positive definite.
@@ -276,19 +325,17 @@ def _own_vector(
     ----------
     ends_px2
         Variance of the length from ends misplaced in noise: eight times that of the center
-    column
-        Work array
     """
     # 1. S: columns of the inverse normal matrix
     cov = np.empty((2, 2))
     for i in range(2):
-        column[:] = 0.0
+        column = np.zeros(len(p))
         column[LENGTH + i] = 1.0
         least_squares.cholesky_solve(factor, column)
         cov[i, 0] = column[LENGTH]
         cov[i, 1] = column[ANGLE]
     # 2. D = S^-1 - P, and then D^-1, with elements ll, aa, la of length and angle
-    prior_l = 1 / length_sigma_px(prior_length) ** 2
+    prior_l = 1 / length_sigma_px(start[LENGTH]) ** 2
     prior_a = 1 / ANGLE_RAD**2
     det = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
     ll = cov[1, 1] / det - prior_l
@@ -298,9 +345,9 @@ def _own_vector(
     if not (ll > 0 and aa > 0 and det > 0):
         return
     ll, aa, la = aa / det, ll / det, -la / det
-    # 3. m + D^-1 P (m - prior)
-    pull_l = prior_l * (p[LENGTH] - prior_length)
-    pull_a = prior_a * (p[ANGLE] - prior_angle)
+    # 3. m + D^-1 P (m - start)
+    pull_l = prior_l * (p[LENGTH] - start[LENGTH])
+    pull_a = prior_a * (p[ANGLE] - start[ANGLE])
     length = p[LENGTH] + ll * pull_l + la * pull_a
     angle = p[ANGLE] + la * pull_l + aa * pull_a
     # 4. Errors

@@ -84,7 +84,11 @@ class Camera:
         )
         object.__setattr__(self, "focal_sigma", sigma)
         row_time = checks.number(
-            "camera: row_time_s", self.row_time_s, -1.0, 1.0, "-1 to 1: seconds from row to row"
+            "camera: row_time_s",
+            self.row_time_s,
+            -1.0,
+            1.0,
+            "-1 to 1: seconds from row to row",
         )
         object.__setattr__(self, "row_time_s", row_time)
         # Plain floats: compiled code would be compiled again for a tuple of integers.
@@ -104,7 +108,9 @@ class Camera:
         size = (self.width_px, self.height_px)
         lens = (self.center_px, self.distortion)
         if not (
-            type(lens[0]) is type(lens[1]) is tuple and len(lens[0]) == 2 and len(lens[1]) == 5
+            type(lens[0]) is type(lens[1]) is tuple
+            and len(lens[0]) == 2
+            and len(lens[1]) == 5
         ):
             return False
         numbers = (self.focal_px, self.focal_sigma, self.row_time_s, *lens[0], *lens[1])
@@ -139,16 +145,22 @@ class Camera:
         if (fov_rad is None) == (fov_deg is None):
             raise ImageError("from_fov: takes either fov_rad or fov_deg")
         if fov_deg is None:
-            fov_rad = checks.number("from_fov: fov_rad", fov_rad, -math.inf, math.inf, _FIELDS)
+            fov_rad = checks.number(
+                "from_fov: fov_rad", fov_rad, -math.inf, math.inf, _FIELDS
+            )
             if not 0 < fov_rad <= WIDEST_RAD:
                 raise ImageError(
                     f"from_fov: {checks.angle_guess('fov', fov_rad)} allowed: {_FIELDS}"
                 )
         else:
-            fov_deg = checks.number("from_fov: fov_deg", fov_deg, -math.inf, math.inf, _FIELDS)
+            fov_deg = checks.number(
+                "from_fov: fov_deg", fov_deg, -math.inf, math.inf, _FIELDS
+            )
             if not NARROWEST_DEG <= fov_deg <= math.degrees(WIDEST_RAD):
                 guess = "; radians?" if 0 < fov_deg < NARROWEST_DEG else ";"
-                raise ImageError(f"from_fov: fov_deg is {fov_deg:g}{guess} allowed: {_FIELDS}")
+                raise ImageError(
+                    f"from_fov: fov_deg is {fov_deg:g}{guess} allowed: {_FIELDS}"
+                )
             fov_rad = math.radians(fov_deg)
         width_px = checks.number(
             "from_fov: width_px", width_px, 2, 1e6, "2 pixels or more", True
@@ -294,7 +306,9 @@ def check_frame(image: object, camera: Camera) -> None:
     """Raise ImageError unless the image is a monochrome array of the camera's width and height."""
     if not isinstance(image, np.ndarray):
         reason = (
-            " (cv2.imread answers None for a file that it cannot read)" if image is None else ""
+            " (cv2.imread answers None for a file that it cannot read)"
+            if image is None
+            else ""
         )
         raise ImageError(
             f"the image is a {type(image).__name__}{reason}; allowed: a numpy array, (height, width)"

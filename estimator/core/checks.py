@@ -174,7 +174,8 @@ def row_pairs(*columns: tuple[str, object, int]) -> list[NDArray[np.int64]]:
     arrays = [row_numbers(*column) for column in columns]
     if len({len(array) for array in arrays}) > 1:
         lengths = ", ".join(
-            f"{len(array)} of {name}" for (name, *_), array in zip(columns, arrays, strict=True)
+            f"{len(array)} of {name}"
+            for (name, *_), array in zip(columns, arrays, strict=True)
         )
         raise ImageError(f"{lengths}; allowed: equal numbers of both")
     return arrays

@@ -85,12 +85,12 @@ class RateEstimate:
         apart = [sign * self.rate_rad_s - other.rate_rad_s for sign in (1, -1)]
         plus, minus = (float(difference @ information @ difference) for difference in apart)
         rate_rad_s = self.rate_rad_s if plus <= minus else -self.rate_rad_s
-        return RateEstimate(rate_rad_s, self.covariance_rad2_s2, abs(plus - minus) > SIGN_CHI2)
+        return RateEstimate(
+            rate_rad_s, self.covariance_rad2_s2, abs(plus - minus) > SIGN_CHI2
+        )
 
 
-SIGN_CHI2 = (
-    16.0  # least difference of the chi-squares of both signs of a rate that determines the sign
-)
+SIGN_CHI2 = 16.0  # least difference of the chi-squares of both signs of a rate that determines the sign
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,7 +220,9 @@ class Centroids:
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(
-                    self, name, checks.floats(f"centroids: {name}", value, (len(xy_px), *shape))
+                    self,
+                    name,
+                    checks.floats(f"centroids: {name}", value, (len(xy_px), *shape)),
                 )
 
     def check_values(self) -> None:

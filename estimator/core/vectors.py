@@ -19,39 +19,52 @@ def row(array: Floats, n: int) -> Vector:
 
 
 @jit
+def dot(u: Vector, v: Vector) -> float:
+    """Return the scalar product u . v."""
+    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+@jit
+def cross(u: Vector, v: Vector) -> Vector:
+    """Return the vector product u x v."""
+    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+
+
+@jit
+def norm(u: Vector) -> float:
+    """Return the length of a vector."""
+    return sqrt(dot(u, u))
+
+
+@jit
 def chord(u: Vector, v: Vector) -> float:
     """Return the chord |u - v| of two unit vectors: 2 sin(angle / 2), never larger than the angle."""
-    return sqrt((u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2)
+    return norm((u[0] - v[0], u[1] - v[1], u[2] - v[2]))
 
 
 @jit
 def rotate(matrix: Floats, u: Vector) -> Vector:
     """Multiply a (3, 3) matrix by a vector."""
-    return (
-        matrix[0, 0] * u[0] + matrix[0, 1] * u[1] + matrix[0, 2] * u[2],
-        matrix[1, 0] * u[0] + matrix[1, 1] * u[1] + matrix[1, 2] * u[2],
-        matrix[2, 0] * u[0] + matrix[2, 1] * u[1] + matrix[2, 2] * u[2],
-    )
+    return dot(row(matrix, 0), u), dot(row(matrix, 1), u), dot(row(matrix, 2), u)
 
 
 @jit
 def pair_frame(u: Vector, v: Vector, out: Floats) -> None:
     """Write right-handed axes to the columns of out (3, 3): bisector of two unit vectors, their normal, third axis."""
-    # u + v and u x v, then normalized
-    out[0, 0] = u[0] + v[0]
-    out[1, 0] = u[1] + v[1]
-    out[2, 0] = u[2] + v[2]
-    out[0, 1] = u[1] * v[2] - u[2] * v[1]
-    out[1, 1] = u[2] * v[0] - u[0] * v[2]
-    out[2, 1] = u[0] * v[1] - u[1] * v[0]
-    for c in range(2):
-        inverse = 1 / sqrt(out[0, c] ** 2 + out[1, c] ** 2 + out[2, c] ** 2)
-        for k in range(3):
-            out[k, c] *= inverse
-    # The cross product of the first two
-    out[0, 2] = out[1, 0] * out[2, 1] - out[2, 0] * out[1, 1]
-    out[1, 2] = out[2, 0] * out[0, 1] - out[0, 0] * out[2, 1]
-    out[2, 2] = out[0, 0] * out[1, 1] - out[1, 0] * out[0, 1]
+    bisector = _unit((u[0] + v[0], u[1] + v[1], u[2] + v[2]))
+    normal = _unit(cross(u, v))
+    third = cross(bisector, normal)
+    for k in range(3):
+        out[k, 0] = bisector[k]
+        out[k, 1] = normal[k]
+        out[k, 2] = third[k]
+
+
+@jit
+def _unit(u: Vector) -> Vector:
+    """Return the unit vector in the direction of a vector."""
+    inverse = 1 / norm(u)
+    return u[0] * inverse, u[1] * inverse, u[2] * inverse
 
 
 @jit
@@ -59,7 +72,7 @@ def multiply_transposed(a: Floats, b: Floats, out: Floats) -> None:
     """Compute out = a b^T for (3, 3) matrices."""
     for i in range(3):
         for j in range(3):
-            out[i, j] = a[i, 0] * b[j, 0] + a[i, 1] * b[j, 1] + a[i, 2] * b[j, 2]
+            out[i, j] = dot(row(a, i), row(b, j))
 
 
 @jit
@@ -71,34 +84,21 @@ def rotate_in_place(w: Floats, matrix: Floats) -> None:
     """
     # 1. Second-order rotation
     for c in range(3):
-        x = matrix[0, c]
-        y = matrix[1, c]
-        z = matrix[2, c]
-        cx = w[1] * z - w[2] * y
-        cy = w[2] * x - w[0] * z
-        cz = w[0] * y - w[1] * x
-        matrix[0, c] = x + cx + (w[1] * cz - w[2] * cy) / 2
-        matrix[1, c] = y + cy + (w[2] * cx - w[0] * cz) / 2
-        matrix[2, c] = z + cz + (w[0] * cy - w[1] * cx) / 2
-    # 2. First row: unit length
-    u = row(matrix, 0)
-    inverse = 1 / sqrt(u[0] ** 2 + u[1] ** 2 + u[2] ** 2)
+        v = (matrix[0, c], matrix[1, c], matrix[2, c])
+        once = cross(w, v)
+        twice = cross(w, once)
+        for k in range(3):
+            matrix[k, c] = v[k] + once[k] + twice[k] / 2
+    # 2. First row: unit length. Second row: without its part along the first one. Third row: the cross product
+    first = _unit(row(matrix, 0))
+    x, y, z = row(matrix, 1)
+    part = dot(first, (x, y, z))
+    second = _unit((x - part * first[0], y - part * first[1], z - part * first[2]))
+    third = cross(first, second)
     for c in range(3):
-        matrix[0, c] *= inverse
-    # Second row: without its part along the first one, unit length
-    projection = (
-        matrix[0, 0] * matrix[1, 0] + matrix[0, 1] * matrix[1, 1] + matrix[0, 2] * matrix[1, 2]
-    )
-    for c in range(3):
-        matrix[1, c] -= projection * matrix[0, c]
-    inverse = 1 / sqrt(matrix[1, 0] ** 2 + matrix[1, 1] ** 2 + matrix[1, 2] ** 2)
-    for c in range(3):
-        matrix[1, c] *= inverse
-    # Third row: the cross product
-    for c in range(3):
-        n = (c + 1) % 3
-        m = (c + 2) % 3
-        matrix[2, c] = matrix[0, n] * matrix[1, m] - matrix[0, m] * matrix[1, n]
+        matrix[0, c] = first[c]
+        matrix[1, c] = second[c]
+        matrix[2, c] = third[c]
 
 
 @jit

@@ -70,7 +70,9 @@ def accumulator_type(pixel: np.dtype, greatest: float = np.inf) -> type:
     if pixel.kind not in "iu" or pixel.itemsize > 2:
         return np.float64
     return (
-        np.uint16 if pixel == np.uint8 or (pixel.kind == "u" and greatest < 4096) else np.int32
+        np.uint16
+        if pixel == np.uint8 or (pixel.kind == "u" and greatest < 4096)
+        else np.int32
     )
 
 
@@ -84,7 +86,9 @@ def filtered(image: NDArray, y: int, x: int) -> float:
     right = min(x + 1, width - 1)
     total = 4.0 * image[y, x]
     total += 2.0 * (float(image[up, x]) + image[down, x] + image[y, left] + image[y, right])
-    total += float(image[up, left]) + image[up, right] + image[down, left] + image[down, right]
+    total += (
+        float(image[up, left]) + image[up, right] + image[down, left] + image[down, right]
+    )
     return total / 16.0
 
 
@@ -154,7 +158,9 @@ def _tiles(
         y1 = (row + 1) * height // rows
         # 1. Rows at even distances, filtered once for all tiles side by side
         for k in range(SAMPLE_ROWS):
-            filtered_row(image, y0 + (2 * k + 1) * (y1 - y0) // (2 * SAMPLE_ROWS), sums, smooth)
+            filtered_row(
+                image, y0 + (2 * k + 1) * (y1 - y0) // (2 * SAMPLE_ROWS), sums, smooth
+            )
             for column in range(columns):
                 x0 = column * width // columns
                 x1 = (column + 1) * width // columns

@@ -238,7 +238,9 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
     return replace(blobs, flag=flag | TEXT * text, streak_px=streak_px, turn_rad=turn_rad)
 
 
-def streaks_px(blobs: Blobs, shape: tuple[int, ...], streak_px: tuple[float, float]) -> Floats:
+def streaks_px(
+    blobs: Blobs, shape: tuple[int, ...], streak_px: tuple[float, float]
+) -> Floats:
     """Return the (N, 2) streak of each blob: v(x) = t + w J (x - c), with the streak t at the image's center c."""
     x, y = (blobs.xy_px - np.array([shape[1] - 1, shape[0] - 1]) / 2).T
     return np.array(streak_px) + blobs.turn_rad * np.column_stack([-y, x])
@@ -500,7 +502,9 @@ def _agreement(
     for n in range(count):
         x, y = _line_at(field, xy[n, 0] - center[0], xy[n, 1] - center[1])
         square = hypot(x, y)
-        off = hypot(lines[n, 0] - x, lines[n, 1] - y) / (SAME_LINE * square + MIN_STREAK_PX**2)
+        off = hypot(lines[n, 0] - x, lines[n, 1] - y) / (
+            SAME_LINE * square + MIN_STREAK_PX**2
+        )
         if off < 1:
             score += 1 + (1 - off) / (count + 1)
             streaks += hypot(lines[n, 0], lines[n, 1]) > MIN_STREAK_PX**2

@@ -23,7 +23,12 @@ from numpy.typing import NDArray
 
 from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
-from estimator.detection.background import accumulator_type, filtered, filtered_row, interpolate
+from estimator.detection.background import (
+    accumulator_type,
+    filtered,
+    filtered_row,
+    interpolate,
+)
 
 Ints32 = NDArray[np.int32]  # half the memory where there are millions of runs
 FIRST_RUNS = 2048  # capacity of the first pass; a second pass follows if there are more runs
@@ -31,9 +36,7 @@ FIRST_RUNS = 2048  # capacity of the first pass; a second pass follows if there 
 # largest pixel; largest filtered value above the sky, and its x and y.
 AREA, STRONG, FLUX, X, Y, PEAK, TOP, TOP_X, TOP_Y = range(9)
 SUMS = 9
-CHUNK_PX = (
-    64  # pixels that are tested together; only chunks with a bright pixel are examined further
-)
+CHUNK_PX = 64  # pixels that are tested together; only chunks with a bright pixel are examined further
 ONE_TAP = np.zeros((1, 2), np.int64)
 
 
@@ -97,7 +100,6 @@ def _scan(
     bound = bounds[:width]
     row = values[:width]
     mask = np.zeros(CHUNK_PX, np.uint8)
-    words = mask.view(np.uint64)
     # Plain 0 and -1 would be literal types, for which numba compiles every called function once more.
     count = np.int64(0)
     cell = np.int64(-1)
@@ -126,19 +128,51 @@ def _scan(
                 continue
             for i in range(CHUNK_PX):
                 mask[i] = chunk[i] > chunk_bounds[i]
-            # 4. Eight mask bytes are tested as one integer, to skip dark pixels quickly.
-            for k in range(len(words)):
-                if words[k] == 0:
-                    continue
-                for i in range(8 * k, 8 * k + 8):
-                    x = start + i
-                    if (
-                        mask[i]
-                        and x >= first
-                        and row[x] > scale * interpolate(threshold, height, width, y, x)
-                    ):
-                        count = _extend(runs, count, y, x)
+            # 4. Exact threshold
+            count = _add_pixels(
+                mask, start, first, row, threshold, scale, height, y, runs, count
+            )
     return int(count)
+
+
+@jit
+def _add_pixels(
+    mask: NDArray,
+    start: int,
+    first: int,
+    row: NDArray,
+    threshold: Floats,
+    scale: float,
+    height: int,
+    y: int,
+    runs: Ints32,
+    count: int,
+) -> int:
+    """Add the pixels of a chunk that are above the exact threshold to the runs; return the number of runs.
+
+    Parameters
+    ----------
+    mask
+        (CHUNK_PX,) whether each pixel is above its lower bound
+    start, first
+        First pixel of the chunk, and the first that the chunk before does not hold
+    row
+        Filtered row y, `scale` times its values
+    """
+    # Eight mask bytes are tested as one integer, to skip dark pixels quickly.
+    words = mask.view(np.uint64)
+    for k in range(len(words)):
+        if words[k] == 0:
+            continue
+        for i in range(8 * k, 8 * k + 8):
+            x = start + i
+            if (
+                mask[i]
+                and x >= first
+                and row[x] > scale * interpolate(threshold, height, len(row), y, x)
+            ):
+                count = _extend(runs, count, y, x)
+    return count
 
 
 @jit

@@ -38,9 +38,7 @@ from estimator.detection.shefex_detection import maximum_scan, sequential_scan
 
 MAX_BLOBS = 20_000
 GROW_SIGMA = 3.5  # lower threshold, down to which a blob extends
-SPARE = (
-    4  # blobs classified per blob returned, so that hot pixels and tracks do not replace stars
-)
+SPARE = 4  # blobs classified per blob returned, so that hot pixels and tracks do not replace stars
 MIN_GROWN_PX = 8  # smallest area of a blob that is significant only as a whole
 # With fewer stars than FEW_STARS, faint streaks of SEARCH_LENGTH_PX are searched in DIRECTIONS directions.
 FEW_STARS = 8
@@ -362,7 +360,9 @@ def replace_bad_pixels(image: NDArray, bad_px: Ints) -> NDArray:
     repaired = image.copy()
     height, width = image.shape
     x, y = np.asarray(bad_px).reshape(-1, 2).T
-    if len(x) and not (x.min() >= 0 and x.max() < width and y.min() >= 0 and y.max() < height):
+    if len(x) and not (
+        x.min() >= 0 and x.max() < width and y.min() >= 0 and y.max() < height
+    ):
         raise ImageError(
             f"the bad-pixel map reaches beyond the frame of {width}x{height} pixels"
         )

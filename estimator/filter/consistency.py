@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimator.core.checks import Floats
-from estimator.filter.states import MISSING, SATURATED, GyroModel, JumpModel
+from estimator.filter.error_models import GyroModel, JumpModel
+from estimator.filter.states import MISSING, SATURATED
 
 # Share of the gyro's limit from which a sample's mean rate counts as saturated (`assumed`).
 NEAR_LIMIT = 0.9
@@ -202,7 +203,9 @@ def log_odds(jump: Jump, model: JumpModel) -> float:
         unsupported = math.exp(wrong + (jump.support - 1) * repeat)
     filter_wrong = silent + missed + own + unsupported
     # All terms underflow for a supported filter that contradicts itself at one time.
-    return math.log(min(max(filter_wrong, 1e-300), 1.0)) - wrong - (jump.agreeing - 1) * repeat
+    return (
+        math.log(min(max(filter_wrong, 1e-300), 1.0)) - wrong - (jump.agreeing - 1) * repeat
+    )
 
 
 def shock_rad(start_s: float, samples: Floats, arw_rad_sqrt_s: float) -> float:

@@ -141,7 +141,11 @@ def correct(prior: MekfState, found: Innovation, layout: Layout) -> MekfState:
 
 
 def adopt(
-    prior: MekfState, solution: AttitudeFix, layout: Layout, bias_variance: Floats, support: int
+    prior: MekfState,
+    solution: AttitudeFix,
+    layout: Layout,
+    bias_variance: Floats,
+    support: int,
 ) -> MekfState:
     """Return the state that adopts a solution: its attitude and covariance, and the filter's other states.
 

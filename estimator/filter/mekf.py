@@ -47,20 +47,16 @@ from estimator.filter.consistency import (
     shock_rad,
 )
 from estimator.filter.correct import AttitudeFix, adopt, correct, innovation, wxyz_of
+from estimator.filter.error_models import GyroModel, JumpModel, TrackerModel
 from estimator.filter.states import (
     CONSIDERED,
-    GyroModel,
-    JumpModel,
     MekfState,
-    TrackerModel,
     build_layout,
     decorrelate,
     inverse_response,
     propagate_state,
     start_state,
 )
-
-__all__ = ["AttitudeFilter", "GyroModel", "JumpModel", "TrackerModel", "Update"]
 
 USED = "used"
 RESET = "reset"
@@ -327,16 +323,12 @@ class AttitudeFilter:
 
         Parameters
         ----------
-        t_s
-            Time of the solution
-        body_from_ref_measured
-            Attitude of the solution
-        covariance_rad2
-            (3, 3) covariance of the solution's small rotation error, in body axes
+        t_s, head
+            Time of the solution, and number of the star camera, from 0
+        body_from_ref_measured, covariance_rad2
+            Attitude, and (3, 3) covariance of its small rotation error, in body axes
         systematic_rad2
             (3, 3) part of the covariance that is common to successive solutions; None for 0
-        head
-            Number of the star camera, from 0
 
         Raises
         ------
@@ -344,24 +336,18 @@ class AttitudeFilter:
             For a covariance that is not symmetric and positive definite, a systematic part that
             is not less, an unknown head, or a time after the last sample.
         """
-        checks.one_rotation("update: body_from_ref_measured", body_from_ref_measured)
-        t_s = checks.number("update: t_s", t_s, -math.inf, math.inf, "a time in seconds")
-        now_s = self._current.t_s
-        if head not in range(self._heads):
-            raise ValueError(f"update: head {head}; allowed: 0 to {self._heads - 1}")
+        t_s = self._checked_time_s(t_s)
         solution = self._solution(
             body_from_ref_measured, covariance_rad2, systematic_rad2, head
         )
-        if not t_s <= now_s + ROUNDING_S:
-            raise ValueError(
-                f"update: a solution at {t_s} s; allowed: up to the last gyro sample, {now_s} s"
-            )
         if t_s < self._segments[0].state.t_s:
             return Update(TOO_OLD, np.full(3, np.nan), math.nan)
         # 1. Find the segment that contains t_s, and propagate its state to that time.
         k = max(k for k, segment in enumerate(self._segments) if segment.state.t_s <= t_s)
         segment = self._segments[k]
-        before, after = _split(segment.samples, segment.state.t_s, min(float(t_s), now_s))
+        before, after = _split(
+            segment.samples, segment.state.t_s, min(t_s, self._current.t_s)
+        )
         prior = self._prior(segment.state, before)
         # 2. Innovation
         found = innovation(prior, solution, self._layout)
@@ -375,25 +361,28 @@ class AttitudeFilter:
         else:
             # 4. Refuse the solution, or adopt it.
             shock = shock_rad(segment.state.t_s, before, self._gyro.arw_rad_sqrt_s)
-            update = self._weigh(
-                prior._replace(lost_rad=prior.lost_rad + shock), solution, update
-            )
+            shocked = prior._replace(lost_rad=prior.lost_rad + shock)
+            update = self._weigh(shocked, solution, update)
             if update.status != RESET:
                 return update
             # Solutions used later than t_s were judged by a lost filter: only their gyro samples are kept.
-            rest = np.concatenate(
-                [after, *(later.samples for later in self._segments[k + 1 :])]
-            )
-            adopted = adopt(
-                prior, solution, self._layout, self._initial_bias_variance, update.agreeing
-            )
-            self._segments = [_Segment(adopted, rest, None)]
+            later = [segment.samples for segment in self._segments[k + 1 :]]
+            self._adopt(prior, solution, update.agreeing, np.concatenate([after, *later]))
         # 5. Propagate to the present.
         self._refused = []
-        self._current = self._propagate_state(
-            self._segments[-1].state, self._segments[-1].samples
-        )
+        last = self._segments[-1]
+        self._current = self._propagate_state(last.state, last.samples)
         return update
+
+    def _checked_time_s(self, t_s: float) -> float:
+        """Return the time of a solution. Raises ValueError for one after the last gyro sample."""
+        t_s = checks.number("update: t_s", t_s, -math.inf, math.inf, "a time in seconds")
+        now_s = self._current.t_s
+        if not t_s <= now_s + ROUNDING_S:
+            raise ValueError(
+                f"update: a solution at {t_s} s; allowed: up to the last gyro sample, {now_s} s"
+            )
+        return t_s
 
     def _solution(
         self,
@@ -402,7 +391,10 @@ class AttitudeFilter:
         systematic_rad2: ArrayLike | None,
         head: int,
     ) -> AttitudeFix:
-        """Check a solution's covariances, and return it with the filter's floor and systematic error added to them."""
+        """Check a solution, and return it with the filter's floor and systematic error added to its covariances."""
+        checks.one_rotation("update: body_from_ref_measured", body_from_ref)
+        if head not in range(self._heads):
+            raise ValueError(f"update: head {head}; allowed: 0 to {self._heads - 1}")
         noise, systematic = checked_covariances(total_rad2, systematic_rad2)
         unit = np.eye(3)
         common = systematic + self._tracker.systematic_rad**2 * unit
@@ -426,6 +418,13 @@ class AttitudeFilter:
         if agreeing >= CONFIRMATIONS:
             status = RESET if odds >= ENOUGH else DISPUTED
         return Update(status, update.residual_rad, update.distance, agreeing, odds)
+
+    def _adopt(
+        self, prior: MekfState, solution: AttitudeFix, agreeing: int, samples: Floats
+    ) -> None:
+        """Begin a new history with the state that a solution gives, and the gyro samples after it."""
+        state = adopt(prior, solution, self._layout, self._initial_bias_variance, agreeing)
+        self._segments = [_Segment(state, samples, None)]
 
     def _agrees(self, prior: MekfState, solution: AttitudeFix) -> bool:
         """Return whether a refused solution agrees with the one before it, propagated by the gyro alone.

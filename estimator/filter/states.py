@@ -1,4 +1,4 @@
-"""States of the attitude filter: error models, order of the states, and their propagation by gyro samples.
+"""States of the attitude filter: their order, and their propagation by gyro samples.
 
 Each gyro sample is a rotation vector (`advance`):
 
@@ -16,16 +16,15 @@ The equations are in the docstring of `mekf.AttitudeFilter`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from estimator.core import checks
 from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
+from estimator.filter.error_models import GyroModel, TrackerModel
 
 # Compiled propagation by gyro samples.
 
@@ -49,19 +48,13 @@ def advance(
     Parameters
     ----------
     state
-        The first six fields of MekfState: t_s, ref_from_body_wxyz, values (N,), covariance (N, N),
-        saturation_rad, lost_rad
+        The first six fields of MekfState
     samples
-        (M, 5) rows of the end t_s of an interval, the rotation in it (3), and its kind: MEASURED,
-        SATURATED or MISSING
+        (M, 5) rows of the end of an interval, the rotation in it (3), and its kind: MEASURED, SATURATED or MISSING
     noise
         arw^2, bias^2, 1 / bias_time, 1 / systematic_time, outage_rad_s
-    columns
-        (9,) state number of each element of the gyro's matrix M, row by row; -1 for no state
-    inverse
-        (3, 3) A = (I + M)^-1 of `inverse_response`, which is constant here
-    slow
-        First number of the normalized systematic states, and last + 1
+    columns, inverse, slow
+        Columns of Layout, A of `inverse_response`, and the first number of the slow errors and their last + 1
     """
     t_s, wxyz, values, covariance, saturation_rad, lost_rad = state
     arw2, bias2, decay_per_s, slow_per_s, outage_rad_s = noise
@@ -88,18 +81,15 @@ def advance(
         # 3. Decay
         decay[3:6] = math.exp(-step_s * decay_per_s)
         decay[slow[0] : slow[1]] = math.exp(-step_s * slow_per_s)
-        for i in range(3, size):
-            values[i] *= decay[i]
+        values *= decay
         # 4. P <- F P F^T
         propagate_covariance(rows, decay, covariance, buffer)
-        # 5. While the rate is unknown the standard deviation grows linearly: the variance by a difference of squares.
-        previous_rad = saturation_rad
+        # 5. Process noise
         grown_rad = unknown_rad(samples[n], outage_rad_s * step_s)
-        saturation_rad = previous_rad + grown_rad if grown_rad > 0 else 0.0
+        saturation_rad, missed_variance = _grow(saturation_rad, grown_rad)
         lost_rad += grown_rad
         # The variance gained by the bias in the interval, u^2 T to first order.
         bias_variance = -bias2 * math.expm1(-2 * step_s * decay_per_s)
-        missed_variance = saturation_rad**2 - min(previous_rad, saturation_rad) ** 2
         add_noise(covariance, arw2 * step_s + missed_variance, bias_variance, step_s)
         # The slow error is normalized: its noise is 1 - exp(-2 T / time).
         for i in range(slow[0], slow[1]):
@@ -129,6 +119,16 @@ def unknown_rad(sample: Floats, outage_rad: float) -> float:
     return (
         max(abs(sample[1]), abs(sample[2]), abs(sample[3])) if sample[4] == SATURATED else 0.0
     )
+
+
+@jit
+def _grow(saturation_rad: float, grown_rad: float) -> tuple[float, float]:
+    """Return the standard deviation from saturation after an interval, and the variance that it adds to the attitude.
+
+    While the rate is unknown the standard deviation grows linearly: the variance by a difference of squares.
+    """
+    total_rad = saturation_rad + grown_rad if grown_rad > 0 else 0.0
+    return total_rad, total_rad**2 - min(saturation_rad, total_rad) ** 2
 
 
 @jit
@@ -275,144 +275,11 @@ def rotate_quaternion(ref_from_body_wxyz: Floats, rotation_rad: Floats) -> None:
         q[i] /= norm
 
 
-# Error models of the gyro, of the star tracker, and of jumps. A standard deviation of 0 removes its state from the
-# filter. CONSIDERED are the states whose uncertainty counts but whose value is not estimated (Schmidt's filter), unless
+# CONSIDERED are the states whose uncertainty counts but whose value is not estimated (Schmidt's filter), unless
 # AttitudeFilter gets others.
 
 STATES = ("bias", "scale", "misalignment", "mounting", "systematic")
 CONSIDERED = ("mounting", "systematic")
-
-
-@dataclass(frozen=True, slots=True)
-class GyroModel:
-    """Error model of a gyro, the same for each axis: measured rate = (I + M) rate + bias + white noise.
-
-    M (Crassidis & Junkins, Optimal Estimation of Dynamic Systems, 7.2; Markley & Crassidis, Fundamentals of Spacecraft
-    Attitude Determination and Control, 4.7) has the scale factors in its diagonal and the misalignments of the three
-    sense axes elsewhere, all constant. A common rotation of the axes is among the misalignments.
-
-    Farrenkopf's random walk of the bias with density u (rad / s^1.5) is the limit of a long time t with
-    bias_rad_s = u sqrt(t / 2).
-
-    Attributes
-    ----------
-    arw_rad_sqrt_s
-        Angle random walk, rad / sqrt(s)
-    bias_rad_s
-        Standard deviation of the bias, a first-order Gauss-Markov process (ignored if
-        bias_time_s is inf)
-    bias_time_s
-        Correlation time of the bias, long compared with a sample interval; inf for a constant bias
-    scale, misalignment_rad
-        Standard deviations of M's elements on the diagonal and off it
-    limit_rad_s
-        The largest rate about an axis that the gyro measures; inf if saturation is flagged with
-        the samples
-    outage_rad_s
-        Standard deviation of the rate about each axis while the gyro gives no samples
-        (`assumed`)
-
-    Raises
-    ------
-    ValueError
-        For negative or unusable numbers.
-    """
-
-    arw_rad_sqrt_s: float
-    bias_rad_s: float
-    bias_time_s: float
-    scale: float = 0.0
-    misalignment_rad: float = 0.0
-    limit_rad_s: float = math.inf
-    outage_rad_s: float = 0.1
-
-    def __post_init__(self) -> None:
-        _check(self, "gyro", above_0=("bias_time_s", "limit_rad_s"))
-
-
-@dataclass(frozen=True, slots=True)
-class TrackerModel:
-    """Errors that successive solutions of a star tracker share: they do not average out.
-
-    The slow error is a first-order Gauss-Markov process with the correlation exp(-T / time - rotation / angle). The
-    covariance that comes with a solution (`Attitude.systematic_rad2`) is part of the same process, and is added to
-    systematic_rad^2. The times and angles are `assumed`.
-
-    Attributes
-    ----------
-    systematic_rad
-        Standard deviation about each axis of the slow error (distortion across the field, a
-        survey)
-    systematic_time_s
-        Correlation time of the slow error; inf for a constant
-    systematic_angle_rad
-        Rotation in which its correlation falls by a factor e, because other stars are in the field
-    mounting_rad
-        Standard deviation about each axis of the rotation from assumed to true mounting
-    mounting_drift_rad_sqrt_s
-        Random walk of the mounting about each axis, rad / sqrt(s); 0 for a constant one
-
-    Raises
-    ------
-    ValueError
-        For negative or unusable numbers.
-    """
-
-    systematic_rad: float = 0.0
-    systematic_time_s: float = 3600.0
-    systematic_angle_rad: float = 0.2
-    mounting_rad: float = 0.0
-    mounting_drift_rad_sqrt_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        _check(self, "tracker", above_0=("systematic_time_s", "systematic_angle_rad"))
-        if self.mounting_drift_rad_sqrt_s and not self.mounting_rad:
-            raise ValueError("tracker: mounting_drift_rad_sqrt_s needs mounting_rad above 0")
-
-
-@dataclass(frozen=True, slots=True)
-class JumpModel:
-    """Probabilities of wrong solutions and of motions that a gyro misses, for `consistency.log_odds`; all `assumed`.
-
-    Attributes
-    ----------
-    missed_per_s
-        Rate at which a gyro that flags nothing misses a motion, 1e-4 an hour
-    wrong_share
-        Probability that any given solution is the first of a series of wrong ones
-    wrong_repeat
-        Probability that the next solution is wrong too and agrees with a wrong one
-    wrong_start
-        Probability that the initial attitude is wrong beyond its standard deviation
-
-    Raises
-    ------
-    ValueError
-        Unless all are above 0 and below 1.
-    """
-
-    missed_per_s: float = 1e-4 / 3600
-    wrong_share: float = 1e-4
-    wrong_repeat: float = 0.75
-    wrong_start: float = 0.01
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            if not 0 < getattr(self, field.name) < 1:
-                raise ValueError(
-                    f"jumps: {field.name} is {getattr(self, field.name)}; allowed: above 0, below 1"
-                )
-
-
-def _check(model: GyroModel | TrackerModel, what: str, above_0: tuple[str, ...]) -> None:
-    """Raise ValueError unless the named fields are above 0 (inf too) and the others finite and 0 or more."""
-    for field in fields(model):
-        value = getattr(model, field.name)
-        checks.of_type(f"{what}: {field.name}", value, float, int, np.floating, np.integer)
-        if field.name in above_0 and not value > 0:
-            raise ValueError(f"{what}: {field.name} is {value}; allowed: above 0, also inf")
-        if field.name not in above_0 and not 0 <= value < math.inf:
-            raise ValueError(f"{what}: {field.name} is {value}; allowed: finite, 0 or more")
 
 
 # Order of the states, and their estimate at one time.
@@ -517,7 +384,9 @@ def build_layout(
         "bias": 3,
         "scale": 3 * (gyro.scale > 0),
         "misalignment": 6 * (gyro.misalignment_rad > 0),
-        **{of_head("mounting", head): 3 * (tracker.mounting_rad > 0) for head in range(heads)},
+        **{
+            of_head("mounting", head): 3 * (tracker.mounting_rad > 0) for head in range(heads)
+        },
         **{of_head("systematic", head): 3 for head in range(heads)},
     }
     # "systematic" means the slow errors of all heads; "mounting" only that of the first head, which defines the
@@ -599,7 +468,9 @@ def decorrelate(state: MekfState, tracker: TrackerModel, layout: Layout) -> Mekf
     """
     rows = layout.slow
     # The angle between two quaternions; the scalar product may exceed 1 by rounding.
-    turned_rad = 2 * math.acos(min(abs(float(state.ref_from_body_wxyz @ state.used_wxyz)), 1.0))
+    turned_rad = 2 * math.acos(
+        min(abs(float(state.ref_from_body_wxyz @ state.used_wxyz)), 1.0)
+    )
     kept = math.exp(-turned_rad / tracker.systematic_angle_rad)
     # P <- D P D with D = k for the slow errors and 1 for the others
     factor = np.ones(layout.size)

@@ -10,7 +10,7 @@ Common to the published identifiers, which find a few stars each in their own wa
 
 from __future__ import annotations
 
-from math import pi, sqrt
+from math import pi
 from typing import NamedTuple
 
 import numpy as np
@@ -116,18 +116,13 @@ def no_match() -> DirectMatch:
 @jit
 def angle(u: Floats, v: Floats) -> float:
     """Angle between unit vectors, rad: 2 arcsin(|u - v| / 2), which is accurate for small angles."""
-    half = sqrt((u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2) / 2
-    return 2 * np.arcsin(min(half, 1.0))
+    return 2 * np.arcsin(min(vectors.chord(u, v) / 2, 1.0))
 
 
 @jit
 def triple(u: Floats, v: Floats, w: Floats) -> float:
     """Triple product u . (v x w); its sign is the handedness of a triangle of directions."""
-    return (
-        u[0] * (v[1] * w[2] - v[2] * w[1])
-        + u[1] * (v[2] * w[0] - v[0] * w[2])
-        + u[2] * (v[0] * w[1] - v[1] * w[0])
-    )
+    return vectors.dot(u, vectors.cross(v, w))
 
 
 @jit

@@ -114,18 +114,20 @@ class LedCode:
         length = max((end_s - begin_s) / self.bit_time_s, 1e-6)
         half = 0.5 / PHASES_PER_BIT
         # The mean level half a step of the phase before, at, and after each phase.
-        before, at, after = (
-            (self._shown_until(begin + step + length) - self._shown_until(begin + step)).T
-            / length
-            for step in (-half, 0.0, half)
-        )
-        return at, np.maximum(np.abs(at - before), np.abs(after - at)) / np.sqrt(3)
+        before = self._mean_level(begin - half, length)
+        at = self._mean_level(begin, length)
+        after = self._mean_level(begin + half, length)
+        change = np.maximum(np.abs(at - before), np.abs(after - at))
+        return at, change / np.sqrt(3)
+
+    def _mean_level(self, begin: Floats, length: float) -> Floats:
+        """(P, N) mean level of each LED in exposures of a length that begin at P times, in bits."""
+        shown = self._shown_until(begin + length) - self._shown_until(begin)
+        return shown.T / length
 
     def _shown_until(self, time: Floats) -> Floats:
         """(N, P) integral of each LED's level from 0 to P times, in bits."""
-        total = np.concatenate(
-            [np.zeros((len(self.levels), 1)), np.cumsum(self.levels, axis=1)], axis=1
-        )
+        total = np.pad(np.cumsum(self.levels, axis=1), ((0, 0), (1, 0)))
         # Whole periods, whole bits, and a part of a bit.
         periods, within = np.divmod(time, self.bits)
         bit = np.minimum(within.astype(np.int64), self.bits - 1)
@@ -456,6 +458,7 @@ def _mutual_nearest(predicted_px: Floats, seen_px: Floats, gate_px: float) -> In
     nearest = distance.argmin(axis=1)
     track = np.arange(len(row))
     # Nearest in both directions, and within the gate.
-    good = (distance.argmin(axis=0)[nearest] == track) & (distance[track, nearest] <= gate_px)
+    mutual = distance.argmin(axis=0)[nearest] == track
+    good = mutual & (distance[track, nearest] <= gate_px)
     row[good] = nearest[good]
     return row

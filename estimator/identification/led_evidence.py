@@ -24,7 +24,7 @@ The steps of `evaluate`; the same numbers return as comments in the code:
 
 from __future__ import annotations
 
-from math import exp, log, log10, pi, sqrt
+from math import exp, log, log10, pi
 from typing import NamedTuple
 
 import numpy as np
@@ -41,43 +41,8 @@ from estimator.identification.chance import (
     middle,
     separation,
 )
+from estimator.identification.led_detections import LedDetections, light_dex
 from estimator.identification.led_index import DomeIndex
-
-STRAY = 0.01  # fraction of the lights that may have any brightness: blends, reflections
-STRAY_DENSITY = 0.1  # density of their brightness, per unit of the logarithm
-
-
-class LedDetections(NamedTuple):
-    """The detections of one frame, in camera axes.
-
-    Attributes
-    ----------
-    ray
-        (N, 3) unit vectors
-    tangent
-        (N, 2) x / z and y / z
-    sigma
-        (N,) total standard deviation of each tangent
-    direction
-        (N, 3) unit vectors from the bearing to the point where the ray meets the sphere of the median LED radius
-    direction_per_m
-        (N, 3) derivative of `direction` with respect to that radius, 1 / m
-    log_flux
-        (N,) logarithm of the flux per second of exposure; of length 0 if brightness is not used
-    light_density
-        (N,) density of that brightness, per unit of the logarithm, if the light may be any LED or none
-    focal_uncertainty
-        Greatest relative error of the focal length; 0 for a calibrated camera
-    """
-
-    ray: Floats
-    tangent: Floats
-    sigma: Floats
-    direction: Floats
-    direction_per_m: Floats
-    log_flux: Floats
-    light_density: Floats
-    focal_uncertainty: float = 0.0
 
 
 class LedHypothesis(NamedTuple):
@@ -97,23 +62,6 @@ class LedHypothesis(NamedTuple):
     star: NDArray[np.int64]
     R_cam_from_lab: Floats
     dex: float
-
-
-@jit
-def light_dex(detections: LedDetections, dome: DomeIndex, n: int, star: int) -> float:
-    """Evidence of the brightness of light n for being LED `star`; 0 if brightness is not used.
-
-        log10( ((1 - e) N(log flux - log flux of the LED) + e STRAY_DENSITY) / p )
-
-    e = STRAY is the fraction of lights of any brightness, and p the density of this brightness if the light may be
-    any LED or none.
-    """
-    if len(detections.log_flux) == 0 or len(dome.log_flux) == 0:
-        return 0.0
-    # Difference of the logarithms in standard deviations.
-    z = (detections.log_flux[n] - dome.log_flux[star]) / dome.flux_sigma
-    as_led = exp(-z * z / 2) / (sqrt(2 * pi) * dome.flux_sigma)
-    return log10(((1 - STRAY) * as_led + STRAY * STRAY_DENSITY) / detections.light_density[n])
 
 
 @jit
@@ -163,7 +111,14 @@ def evaluate(
     midpoint = middle(detections.tangent, a, b)
     direction_variance = 2 / separation(detections.tangent, a, b) ** 2
     observed, star, missing = _match(
-        detections, dome, R_cam_from_lab, focal_ratio, center, midpoint, 1.5, direction_variance
+        detections,
+        dome,
+        R_cam_from_lab,
+        focal_ratio,
+        center,
+        midpoint,
+        1.5,
+        direction_variance,
     )
     for _ in range(2):
         dex = -np.inf
@@ -171,7 +126,9 @@ def evaluate(
         if len(observed) < MIN_EVIDENCE_MATCHES:
             break
         # 2. Fit; the range of the focal ratio has a margin, as the fit is noisy.
-        info, focal_ratio = _fit(detections, dome, R_cam_from_lab, focal_ratio, observed, star)
+        info, focal_ratio = _fit(
+            detections, dome, R_cam_from_lab, focal_ratio, observed, star
+        )
         if abs(focal_ratio - 1) > 1.2 * detections.focal_uncertainty + 1e-12:
             break
         # 3. Match again.
@@ -207,15 +164,12 @@ def _match(
 ) -> tuple[NDArray, NDArray, int]:
     """Match each LED near `center` to its nearest detection within the gate, one LED for each detection: steps 1 and 3.
 
-    The squared gate is GATE_SIGMA^2 (base_variance + direction_variance d^2) times the detection's variance, d the
-    distance from `midpoint`.
+    The squared gate is GATE_SIGMA^2 (base_variance + direction_variance d^2), d the distance from `midpoint`.
 
     Parameters
     ----------
-    center
-        Row of an LED; itself and its neighbors in the pair index are matched
-    midpoint
-        (x, y) of the pair, tangents
+    center, midpoint
+        Row of an LED, which is matched with its neighbors in the pair index, and (x, y) of the pair, tangents
     base_variance, direction_variance
         Error of the attitude and of the detection, in units of the detection's variance
 
@@ -228,41 +182,21 @@ def _match(
     """
     left, right, top, bottom = dome.field_tan
     first = dome.pairs.first
-    count = 0
-    missing = 0
-    total = len(detections.ray)
-    observed = np.empty(total, np.int64)
-    star = np.empty(total, np.int64)
-    distances2 = np.empty(total)
+    count = missing = 0
+    observed = np.empty(len(detections.ray), np.int64)
+    star = np.empty_like(observed)
+    distances2 = np.empty(len(observed))
     # The LED `center` itself, then its neighbors in the pair index: all LEDs that can share a field with it.
     for entry in range(first[center] - 1, first[center + 1]):
         s = center if entry < first[center] else dome.pairs.neighbor[entry]
-        # Predict the LED's place; leave it out if it is behind the camera or outside a field widened by a tenth.
-        qx, qy, qz = _vector_from_pupil(dome, R_cam_from_lab, s)
-        qx = focal_ratio * qx
-        qy = focal_ratio * qy
-        if not (
-            qz > 0
-            and 1.1 * left * qz < qx < 1.1 * right * qz
-            and 1.1 * top * qz < qy < 1.1 * bottom * qz
-        ):
+        x, y, near_field = _predicted_place(dome, R_cam_from_lab, focal_ratio, s)
+        if not near_field:
             continue
-        x = qx / qz
-        y = qy / qz
-        # The gate of an LED: the errors of the attitude at its place and of a detection.
-        variance = base_variance + direction_variance * (
-            (x - midpoint[0]) ** 2 + (y - midpoint[1]) ** 2
+        offset2 = (x - midpoint[0]) ** 2 + (y - midpoint[1]) ** 2
+        gate2 = GATE_SIGMA**2 * (base_variance + direction_variance * offset2)
+        best, distance2 = _nearest_detection(
+            detections.tangent, detections.sigma, x, y, gate2
         )
-        # The nearest detection: squared distances are in units of the detection's variance.
-        best = -1
-        distance2 = GATE_SIGMA**2 * variance
-        for n in range(total):
-            residual2 = (detections.tangent[n, 0] - x) ** 2 + (
-                detections.tangent[n, 1] - y
-            ) ** 2
-            if residual2 < distance2 * detections.sigma[n] ** 2:
-                best = n
-                distance2 = residual2 / detections.sigma[n] ** 2
         if best < 0:
             # A missing LED counts only well inside the field.
             missing += left < x < right and top < y < bottom
@@ -271,17 +205,52 @@ def _match(
         slot = 0
         while slot < count and observed[slot] != best:
             slot += 1
-        if slot == count:
-            observed[count] = best
-            star[count] = s
-            distances2[count] = distance2
-            count += 1
-            continue
-        missing += 1  # two LEDs match one detection: the farther one is missing
-        if distance2 < distances2[slot]:
-            star[slot] = s
-            distances2[slot] = distance2
+        if slot < count:
+            missing += 1  # two LEDs match one detection: the farther one is missing
+            if distance2 >= distances2[slot]:
+                continue
+        observed[slot] = best
+        star[slot] = s
+        distances2[slot] = distance2
+        count = max(count, slot + 1)
     return observed[:count], star[:count], missing
+
+
+@jit
+def _predicted_place(
+    dome: DomeIndex, R_cam_from_lab: Floats, focal_ratio: float, star: int
+) -> tuple[float, float, bool]:
+    """Tangents of an LED, and whether it is before the camera, in a field widened by a tenth."""
+    left, right, top, bottom = dome.field_tan
+    qx, qy, qz = _vector_from_pupil(dome, R_cam_from_lab, star)
+    qx = focal_ratio * qx
+    qy = focal_ratio * qy
+    near_field = (
+        qz > 0
+        and 1.1 * left * qz < qx < 1.1 * right * qz
+        and 1.1 * top * qz < qy < 1.1 * bottom * qz
+    )
+    return qx / qz, qy / qz, near_field
+
+
+@jit
+def _nearest_detection(
+    tangent: Floats, sigma: Floats, x: float, y: float, distance2: float
+) -> tuple[int, float]:
+    """Nearest detection to (x, y) and its squared distance, in units of the detection's variance; -1 if none is nearer.
+
+    Parameters
+    ----------
+    distance2
+        Greatest squared distance
+    """
+    best = -1
+    for n in range(len(sigma)):
+        residual2 = (tangent[n, 0] - x) ** 2 + (tangent[n, 1] - y) ** 2
+        if residual2 < distance2 * sigma[n] ** 2:
+            best = n
+            distance2 = residual2 / sigma[n] ** 2
+    return best, distance2
 
 
 @jit
@@ -399,7 +368,9 @@ def _evidence(
     # Attitude and focal length.
     root_det = _factorize(info, np.empty_like(info))
     total = (
-        len(info) / 2 * log10(2 * pi) - log10(max(root_det, 1e-150)) - log10(dome.prior_volume)
+        len(info) / 2 * log10(2 * pi)
+        - log10(max(root_det, 1e-150))
+        - log10(dome.prior_volume)
     )
     if detections.focal_uncertainty > 0:
         total -= log10(2 * detections.focal_uncertainty)

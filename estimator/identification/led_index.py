@@ -16,8 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog.pair_index import PairIndex, build, k_vector
+from estimator.catalog.sky_index import cell_of
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
+from estimator.core.jit import jit
+from estimator.core.vectors import Vector
 
 # Fraction of the field in which an unmatched LED counts as missing; nearer to the border it may be cut off.
 INNER_FRACTION = 0.95
@@ -226,3 +229,35 @@ def cap_height(directions: Floats, margin_rad: float) -> float:
     # Cosine of the angle of the LED farthest from the mean.
     nearest = (directions @ mean).min() / max(np.linalg.norm(mean), 1e-9)
     return float(1 - np.cos(min(np.arccos(np.clip(nearest, -1, 1)) + margin_rad, np.pi)))
+
+
+@jit
+def has_led_near(grid: DirectionGrid, direction: Vector, gate: float) -> bool:
+    """Whether any LED is near a direction.
+
+    Parameters
+    ----------
+    direction
+        Unit vector in grid axes
+    gate
+        Greatest distance, rad
+    """
+    inverse = 1 / grid.cell
+    half = grid.side / 2
+    reach = gate / grid.cell
+    # Place in units of cells.
+    x = direction[0] * inverse + half
+    y = direction[1] * inverse + half
+    # The cells that a square of this half-width about the direction meets; those of a line are contiguous.
+    for line in range(cell_of(y - reach, grid.side), cell_of(y + reach, grid.side - 1) + 1):
+        left = line * grid.side + cell_of(x - reach, grid.side)
+        right = line * grid.side + cell_of(x + reach, grid.side - 1)
+        if left > right:
+            continue
+        for place in range(grid.first[left], grid.first[right + 1]):
+            dx = grid.direction[place, 0] - direction[0]
+            dy = grid.direction[place, 1] - direction[1]
+            dz = grid.direction[place, 2] - direction[2]
+            if dx * dx + dy * dy + dz * dz < gate * gate:
+                return True
+    return False

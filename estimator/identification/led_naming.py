@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.attitude.solvers import rotation
+from estimator.core import vectors
 from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
@@ -104,14 +105,13 @@ def identify(lights: NamedLights, sphere: Sphere) -> StarMatch | str:
         return UNDECIDED
     rows = np.arange(len(lights.ray))
     matched = star[best] >= 0
-    by_code = excess[rows[matched], star[best][matched]]
-    if by_code.sum() > TRUSTED * np.sqrt(matched.sum()) or matched.sum() < max(
-        2, 2 * len(rows) / 3
-    ):
+    observed = rows[matched]
+    leds = star[best][matched]
+    if excess[observed, leds].sum() > TRUSTED * np.sqrt(len(leds)):
         return CONTRADICTED
-    return StarMatch(
-        rows[matched], star[best][matched], rotation(R_cam_from_lab[best]), -MARGIN_DEX
-    )
+    if len(leds) < max(2, 2 * len(rows) / 3):
+        return CONTRADICTED
+    return StarMatch(observed, leds, rotation(R_cam_from_lab[best]), -MARGIN_DEX)
 
 
 def is_supported(match: StarMatch, misfit: Floats, lights: int) -> bool:
@@ -170,17 +170,12 @@ def _pair_names(
     second_rows = np.flatnonzero(excess[second] <= REACH)
     seen_first = _seen_directions(lights.ray[first], sphere, first_rows)
     seen_second = _seen_directions(lights.ray[second], sphere, second_rows)
-    directions = (
-        seen_first,
-        seen_second,
-        sphere.direction[first_rows],
-        sphere.direction[second_rows],
-    )
+    known = sphere.direction[first_rows], sphere.direction[second_rows]
     gate = float(GATE_SIGMA * np.hypot(lights.sigma[first], lights.sigma[second]))
     # Count the pairs, then store them.
-    count = _alike(*directions, gate, np.empty((0, 2), np.int64))
+    count = _alike(seen_first, seen_second, *known, gate, np.empty((0, 2), np.int64))
     pairs = np.empty((count, 2), np.int64)
-    _alike(*directions, gate, pairs)
+    _alike(seen_first, seen_second, *known, gate, pairs)
     names = np.column_stack([first_rows[pairs[:, 0]], second_rows[pairs[:, 1]]])
     # One LED cannot be both lights.
     names = names[names[:, 0] != names[:, 1]]
@@ -206,12 +201,8 @@ def _alike(
     for a in range(len(u)):
         for b in range(len(v)):
             # Cosine of the angle that is seen, and of the angle that is known.
-            cosine = u[a, 0] * v[b, 0] + u[a, 1] * v[b, 1] + u[a, 2] * v[b, 2]
-            known = (
-                known_u[a, 0] * known_v[b, 0]
-                + known_u[a, 1] * known_v[b, 1]
-                + known_u[a, 2] * known_v[b, 2]
-            )
+            cosine = vectors.dot(vectors.row(u, a), vectors.row(v, b))
+            known = vectors.dot(vectors.row(known_u, a), vectors.row(known_v, b))
             # (difference of the cosines / sine)^2 < gate^2; the sine has a floor for coincident lights.
             if (cosine - known) ** 2 < gate**2 * max(1 - cosine**2, gate**2):
                 if found < len(pairs):
@@ -237,11 +228,9 @@ def _attitudes(
     """Step 3: (M, 3, 3) R_cam_from_lab of each pair of names."""
     seen_first = _seen_directions(lights.ray[first], sphere, names[:, 0])
     seen_second = _seen_directions(lights.ray[second], sphere, names[:, 1])
-    known_first = sphere.direction[names[:, 0]]
-    known_second = sphere.direction[names[:, 1]]
     # R = sum over the axes of (axis in camera axes) (axis in the lab frame)^T.
     seen = _frames(seen_first, seen_second)
-    known = _frames(known_first, known_second)
+    known = _frames(sphere.direction[names[:, 0]], sphere.direction[names[:, 1]])
     return np.einsum("mia,mib->mab", seen, known)
 
 
@@ -281,10 +270,9 @@ def _evaluate(
         (M, T) names of the lights, -1 for none
     """
     # Predicted tangents of all LEDs at each attitude; infinite behind the camera.
-    offset = (R_cam_from_lab.reshape(-1, 3) @ sphere.position_m.T).reshape(
-        -1, 3, len(sphere.position_m)
-    )
-    offset = offset - sphere.pupil_m[:, None]
+    leds = len(sphere.position_m)
+    turned = R_cam_from_lab.reshape(-1, 3) @ sphere.position_m.T
+    offset = turned.reshape(-1, 3, leds) - sphere.pupil_m[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         tangent = np.where(offset[:, 2:] > 0, offset[:, :2] / offset[:, 2:], np.inf)
     # Geometry of the pair, for the error of its attitude.
@@ -296,12 +284,12 @@ def _evaluate(
     star = np.full((len(names), len(seen)), -1)
     star[:, pair] = names
     # Cost of each name of a light; the last column is that of no name.
-    cost = np.full((len(names), len(sphere.position_m) + 1), STRANGER)
+    cost = np.full((len(names), leds + 1), STRANGER)
     named = list(pair)
     for light in set(range(len(seen))) - set(pair):
         # The pair's attitude adds half of a light's variance, and more with the distance from the pair's middle.
         factor = 1.5 + 2 * np.sum((seen[light] - middle) ** 2) / length2
-        squared = (tangent[:, 0] - seen[light, 0]) ** 2 + (tangent[:, 1] - seen[light, 1]) ** 2
+        squared = np.sum((tangent - seen[light][:, None]) ** 2, axis=1)
         squared /= factor * lights.sigma[light] ** 2
         cost[:, :-1] = np.where(squared < GATE_SIGMA**2, squared / 2 + excess[light], np.inf)
         np.put_along_axis(cost, star[:, named], np.inf, axis=1)  # an LED is one light at most
@@ -309,6 +297,6 @@ def _evaluate(
         # The best name of this light, or none.
         star[:, light] = cost.argmin(axis=1)
         total = total + cost.min(axis=1)
-        star[star[:, light] == len(sphere.position_m), light] = -1
+        star[star[:, light] == leds, light] = -1
         named.append(light)
     return total, star

@@ -8,7 +8,7 @@ bearing, and they determine an attitude, which the other detections must confirm
 
 The steps; the same numbers return as comments in the code:
 
-1. Convert rays to directions from the bearing, with their total errors (`build_detections`).
+1. Convert rays to directions from the bearing, with their total errors (`led_detections.build_detections`).
 2. Sort the pairs of detections by the number of LED pairs of the same angle (`_ordered_pairs`).
 3. Take the next pair, and all LED pairs of its angle, in both orders (`_test_pair`).
 4. Compute the focal ratio and the exact directions with the LEDs' own radii; compare the angle; compute the attitude.
@@ -32,10 +32,8 @@ from math import log10, pi, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.attitude.dome_map import on_sphere
 from estimator.attitude.solvers import rotation
 from estimator.catalog.pair_index import pair_range
-from estimator.catalog.sky_index import cell_of
 from estimator.core import vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
@@ -51,15 +49,13 @@ from estimator.identification.chance import (
     required_matches,
     separation,
 )
+from estimator.identification.led_detections import LedDetections, build_detections
 from estimator.identification.led_evidence import (
-    STRAY,
-    STRAY_DENSITY,
-    LedDetections,
     LedHypothesis,
     evaluate,
     same_identification,
 )
-from estimator.identification.led_index import DirectionGrid, DomeIndex
+from estimator.identification.led_index import DomeIndex, has_led_near
 
 MARGIN_DEX = 5.0  # by which the best attitude must beat every other one
 AMBIGUOUS_DEX = 2.0  # least evidence of the best attitude for a near rival to be reported
@@ -118,69 +114,6 @@ def identify(
         rotation(hypothesis.R_cam_from_lab),
         -hypothesis.dex,
     )
-
-
-def build_detections(
-    rays_cam: Floats,
-    sigma_rad: Floats,
-    dome: DomeIndex,
-    flux_s: Floats | None = None,
-    focal_uncertainty: float = 0.0,
-) -> LedDetections:
-    """Step 1: rays with their total errors, which include those of the LED map and of the lever.
-
-    A lateral error of the pupil shifts all LEDs alike and is absorbed by the attitude. An axial error scales the image,
-    and adds an error proportional to the distance from the boresight.
-
-    A ray u from the pupil r meets the sphere of radius R at p = r + s u with |p| = R. Then ds/dR = R / (u . p), so
-    that the direction p / R changes by d(p / R)/dR = u / (u . p) - p / R^2.
-
-    Parameters
-    ----------
-    rays_cam, sigma_rad, dome, flux_s, focal_uncertainty
-        See `identify`
-
-    Returns
-    -------
-    LedDetections
-        The tangents' errors are those of the rays divided by z^2 = cos^2 of the angle from the boresight
-    """
-    # Total standard deviations of the tangents.
-    tangent = np.ascontiguousarray(rays_cam[:, :2] / rays_cam[:, 2:])
-    pupil_sigma = dome.lever_sigma * np.linalg.norm(tangent, axis=1)
-    ray_sigma = np.hypot(sigma_rad, dome.led_sigma) / rays_cam[:, 2] ** 2
-    # Directions from the bearing, and their change with the radius.
-    point_m = on_sphere(rays_cam, dome.pupil_m, dome.median_radius_m)
-    along_m = np.sum(rays_cam * point_m, axis=1)[:, None]
-    return LedDetections(
-        np.ascontiguousarray(rays_cam),
-        tangent,
-        np.hypot(ray_sigma, pupil_sigma),
-        point_m / dome.median_radius_m,
-        rays_cam / along_m - point_m / dome.median_radius_m**2,
-        *_brightness(flux_s, dome),
-        float(focal_uncertainty),
-    )
-
-
-def _brightness(flux_s: Floats | None, dome: DomeIndex) -> tuple[Floats, Floats]:
-    """The brightness of lights, for `led_evidence.light_dex`.
-
-    Returns
-    -------
-    log_flux
-        (N,) logarithms of the fluxes
-    light_density
-        (N,) density of each, if the light may be any LED or none
-
-    Both are empty if brightness is not used.
-    """
-    if flux_s is None or not len(dome.log_flux):
-        return np.zeros(0), np.zeros(0)
-    log_flux = np.log(np.maximum(flux_s, 1e-300))
-    z = (log_flux[:, None] - dome.log_flux) / dome.flux_sigma
-    as_any = np.exp(-(z**2) / 2).mean(axis=1) / (np.sqrt(2 * np.pi) * dome.flux_sigma)
-    return log_flux, (1 - STRAY) * as_any + STRAY * STRAY_DENSITY
 
 
 @jit
@@ -294,11 +227,7 @@ def _pair_range(
 @jit
 def _bearing_angle_ratio(dome: DomeIndex) -> float:
     """Ratio of a small angle about the bearing to that seen by the camera: (R - M) / R, M the length of the lever."""
-    return (
-        1
-        - sqrt(dome.pupil_m[0] ** 2 + dome.pupil_m[1] ** 2 + dome.pupil_m[2] ** 2)
-        / dome.median_radius_m
-    )
+    return 1 - vectors.norm(dome.pupil_m) / dome.median_radius_m
 
 
 @jit
@@ -342,7 +271,7 @@ def _test_pair(
     rival_dex: float,
     checks: NDArray,
 ) -> tuple[LedHypothesis, float]:
-    """Steps 3 to 6: test two detections against every LED pair of the same angle, in both orders.
+    """Steps 3 to 6: test two detections against all LED pairs of their angle, in both orders: best and rival_dex.
 
     Parameters
     ----------
@@ -354,21 +283,12 @@ def _test_pair(
         Best hypothesis so far, and the evidence of its best rival
     checks
         (1,) effort so far, increased in place
-
-    Returns
-    -------
-    best, rival_dex
-        Updated
     """
     index = dome.pairs
     radius = dome.radius_m
     # 3. LED pairs of the same angle, and what the quick check needs.
     begin, end, gate = _pair_range(detections, dome, a, b)
-    attitude_dex = _attitude_dex(detections, dome, a, b)
-    most_light_dex = _most_light_dex(detections, dome)
-    required = required_matches(
-        detections.sigma, dome.field_area, attitude_dex, min_dex, most_light_dex
-    )
+    required = _required_matches(detections, dome, a, b, min_dex)
     gates = _pair_gates(detections, dome, a, b)
     in_cam = np.empty((3, 3))
     in_lab = np.empty((3, 3))
@@ -379,51 +299,94 @@ def _test_pair(
         for flip in range(2):
             i = index.pair[p, flip]
             j = index.pair[p, 1 - flip]
-            led_i = vectors.row(index.vectors, i)
-            led_j = vectors.row(index.vectors, j)
-            # 4a. The focal ratio at which the chord is that of the LEDs.
-            focal_ratio = _fit_focal_ratio(
-                detections, dome, a, b, radius[i], radius[j], vectors.chord(led_i, led_j)
+            # 4. The attitude.
+            focal_ratio = _pair_attitude(
+                detections, dome, a, b, i, j, gate, in_cam, in_lab, R_cam_from_lab
             )
-            if abs(focal_ratio - 1) > detections.focal_uncertainty:
+            if not focal_ratio > 0:
                 continue
-            direction_a = _direction_from_bearing(
-                _ray(detections, a, focal_ratio), dome, radius[i]
-            )
-            direction_b = _direction_from_bearing(
-                _ray(detections, b, focal_ratio), dome, radius[j]
-            )
-            # 4b. Compare the angle. The index holds angles scaled to the median radius; here each ray meets the
-            # LED's own radius.
-            if (
-                abs(vectors.chord(direction_a, direction_b) - vectors.chord(led_i, led_j))
-                > gate
-            ):
-                continue
-            # 4c. The attitude turns the axes of the LEDs into those of the detections.
-            vectors.pair_frame(direction_a, direction_b, in_cam)
-            vectors.pair_frame(led_i, led_j, in_lab)
-            vectors.multiply_transposed(in_cam, in_lab, R_cam_from_lab)
+            # 5. Quick check.
             vectors.multiply_transposed(
                 dome.grid.R_grid_from_lab, R_cam_from_lab, R_grid_from_cam
             )
-            # 5. Quick check.
             counted = _quick_check(
-                detections, dome, R_grid_from_cam, focal_ratio, radius[i], a, b, gates, required
+                detections,
+                dome,
+                R_grid_from_cam,
+                focal_ratio,
+                radius[i],
+                a,
+                b,
+                gates,
+                required,
             )
             if counted < required:
                 continue
             # 6. Evidence.
             checks[0] += len(detections.ray) * (index.first[i + 1] - index.first[i]) // 4
-            hypothesis = evaluate(detections, dome, R_cam_from_lab.copy(), i, a, b, focal_ratio)
-            # Keep the best hypothesis and the best one with another identification.
-            same = same_identification(hypothesis, best)
-            if hypothesis.dex > best.dex:
-                rival_dex = rival_dex if same else max(rival_dex, best.dex)
-                best = hypothesis
-            elif not same:
-                rival_dex = max(rival_dex, hypothesis.dex)
+            hypothesis = evaluate(
+                detections, dome, R_cam_from_lab.copy(), i, a, b, focal_ratio
+            )
+            best, rival_dex = _better(hypothesis, best, rival_dex)
     return best, rival_dex
+
+
+@jit
+def _better(
+    hypothesis: LedHypothesis, best: LedHypothesis, rival_dex: float
+) -> tuple[LedHypothesis, float]:
+    """The better of two hypotheses, and the evidence of the best one with another identification."""
+    if not same_identification(hypothesis, best):
+        rival_dex = max(rival_dex, min(hypothesis.dex, best.dex))
+    return (hypothesis if hypothesis.dex > best.dex else best), rival_dex
+
+
+@jit
+def _pair_attitude(
+    detections: LedDetections,
+    dome: DomeIndex,
+    a: int,
+    b: int,
+    i: int,
+    j: int,
+    gate: float,
+    in_cam: Floats,
+    in_lab: Floats,
+    R_cam_from_lab: Floats,
+) -> float:
+    """Step 4: the attitude of two detections as two LEDs; returns the focal ratio, NaN if they differ in angle.
+
+    Parameters
+    ----------
+    a, b, i, j
+        Rows of the two detections and of the two LEDs
+    gate
+        Greatest difference of the angles about the bearing, rad
+    in_cam, in_lab
+        (3, 3) work arrays
+    R_cam_from_lab
+        (3, 3) attitude, written in place
+    """
+    led_i = vectors.row(dome.pairs.vectors, i)
+    led_j = vectors.row(dome.pairs.vectors, j)
+    chord = vectors.chord(led_i, led_j)
+    radius_i = dome.radius_m[i]
+    radius_j = dome.radius_m[j]
+    # 4a. The focal ratio at which the chord is that of the LEDs.
+    focal_ratio = _fit_focal_ratio(detections, dome, a, b, radius_i, radius_j, chord)
+    if abs(focal_ratio - 1) > detections.focal_uncertainty:
+        return np.nan
+    direction_a = _direction_from_bearing(_ray(detections, a, focal_ratio), dome, radius_i)
+    direction_b = _direction_from_bearing(_ray(detections, b, focal_ratio), dome, radius_j)
+    # 4b. Compare the angle. The index holds angles scaled to the median radius; here each ray meets the LED's own
+    # radius.
+    if abs(vectors.chord(direction_a, direction_b) - chord) > gate:
+        return np.nan
+    # 4c. The attitude turns the axes of the LEDs into those of the detections.
+    vectors.pair_frame(direction_a, direction_b, in_cam)
+    vectors.pair_frame(led_i, led_j, in_lab)
+    vectors.multiply_transposed(in_cam, in_lab, R_cam_from_lab)
+    return focal_ratio
 
 
 @jit
@@ -492,7 +455,7 @@ def _direction_from_bearing(ray: Vector, dome: DomeIndex, radius_m: float) -> Ve
     """
     px, py, pz = dome.pupil_m
     # u . r, then the distance s along the ray.
-    along = ray[0] * px + ray[1] * py + ray[2] * pz
+    along = vectors.dot(ray, dome.pupil_m)
     distance = -along + sqrt(
         max(along * along - px * px - py * py - pz * pz + radius_m * radius_m, 0.0)
     )
@@ -505,12 +468,18 @@ def _direction_from_bearing(ray: Vector, dome: DomeIndex, radius_m: float) -> Ve
 
 
 @jit
-def _most_light_dex(detections: LedDetections, dome: DomeIndex) -> float:
-    """Greatest evidence that the brightness of any light can give, for `required_matches`."""
-    if len(detections.light_density) == 0:
-        return 0.0
-    # The peak of the LED's density over the least density of a light.
-    return -log10(least(detections.light_density) * sqrt(2 * pi) * dome.flux_sigma)
+def _required_matches(
+    detections: LedDetections, dome: DomeIndex, a: int, b: int, min_dex: float
+) -> int:
+    """Number of matches, the pair included, without which the evidence cannot reach `min_dex`."""
+    attitude_dex = _attitude_dex(detections, dome, a, b)
+    # Greatest evidence that brightness can give: the peak of the LED's density over the least density of a light.
+    light_dex = 0.0
+    if len(detections.light_density) > 0:
+        light_dex = -log10(least(detections.light_density) * sqrt(2 * pi) * dome.flux_sigma)
+    return required_matches(
+        detections.sigma, dome.field_area, attitude_dex, min_dex, light_dex
+    )
 
 
 @jit
@@ -608,42 +577,21 @@ def _quick_check(
             continue
         # The direction from the bearing, then the LEDs near it.
         if focal_ratio != 1:
-            x, y, z = _direction_from_bearing(_ray(detections, n, focal_ratio), dome, radius_m)
+            x, y, z = _direction_from_bearing(
+                _ray(detections, n, focal_ratio), dome, radius_m
+            )
         else:
-            x = detections.direction[n, 0] + radius_offset_m * detections.direction_per_m[n, 0]
-            y = detections.direction[n, 1] + radius_offset_m * detections.direction_per_m[n, 1]
-            z = detections.direction[n, 2] + radius_offset_m * detections.direction_per_m[n, 2]
-        count += _has_led_near(dome.grid, vectors.rotate(R_grid_from_cam, (x, y, z)), gates[n])
+            x = (
+                detections.direction[n, 0]
+                + radius_offset_m * detections.direction_per_m[n, 0]
+            )
+            y = (
+                detections.direction[n, 1]
+                + radius_offset_m * detections.direction_per_m[n, 1]
+            )
+            z = (
+                detections.direction[n, 2]
+                + radius_offset_m * detections.direction_per_m[n, 2]
+            )
+        count += has_led_near(dome.grid, vectors.rotate(R_grid_from_cam, (x, y, z)), gates[n])
     return count
-
-
-@jit
-def _has_led_near(grid: DirectionGrid, direction: Vector, gate: float) -> bool:
-    """Whether any LED is near a direction.
-
-    Parameters
-    ----------
-    direction
-        Unit vector in grid axes
-    gate
-        Greatest distance, rad
-    """
-    inverse = 1 / grid.cell
-    half = grid.side / 2
-    reach = gate / grid.cell
-    # Place in units of cells.
-    x = direction[0] * inverse + half
-    y = direction[1] * inverse + half
-    # The cells that a square of this half-width about the direction meets; those of a line are contiguous.
-    for line in range(cell_of(y - reach, grid.side), cell_of(y + reach, grid.side - 1) + 1):
-        left = line * grid.side + cell_of(x - reach, grid.side)
-        right = line * grid.side + cell_of(x + reach, grid.side - 1)
-        if left > right:
-            continue
-        for place in range(grid.first[left], grid.first[right + 1]):
-            dx = grid.direction[place, 0] - direction[0]
-            dy = grid.direction[place, 1] - direction[1]
-            dz = grid.direction[place, 2] - direction[2]
-            if dx * dx + dy * dy + dz * dz < gate * gate:
-                return True
-    return False

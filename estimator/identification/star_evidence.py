@@ -36,9 +36,8 @@ from numpy.typing import NDArray
 from estimator.catalog.pair_index import first_from
 from estimator.catalog.sky_index import (
     MAG_SMOOTHING,
-    MAG_STEP,
     SkyIndex,
-    cell_of,
+    magnitude_density,
     nearest,
     within,
 )
@@ -121,12 +120,6 @@ def no_hypothesis() -> Hypothesis:
 
 
 @jit
-def magnitude_density(sky: SkyIndex, mag: float) -> float:
-    """Probability density of the catalog's magnitudes at `mag`, 1 / mag."""
-    return sky.density[cell_of((mag - sky.mag[0]) / MAG_STEP, len(sky.density) - 1)]
-
-
-@jit
 def prior_volume_dex(detections: Detections) -> float:
     """log10 of the prior volume: 8 pi^2 of attitudes, times the width of the interval of log focal_ratio."""
     width = 2 * detections.focal_uncertainty
@@ -146,10 +139,8 @@ def evaluate(
 
     Parameters
     ----------
-    R_cam_from_ref
-        (3, 3) candidate attitude, changed in place by the fit
-    focal_ratio
-        Candidate ratio of the true to the assumed focal length
+    R_cam_from_ref, focal_ratio
+        (3, 3) candidate attitude, changed in place by the fit, and ratio of the true to the assumed focal length
     gates
         (N,) rad, matching radius of each detection in the first round; later rounds use GATE_SIGMA
     min_dex
@@ -158,50 +149,43 @@ def evaluate(
     Returns
     -------
     Hypothesis
-        Empty if fewer than MIN_EVIDENCE_MATCHES stars match, if the focal ratio leaves its interval, or if the evidence
-        is below `min_dex`
+        Empty if too few stars match, if the focal ratio leaves its interval, or if the evidence is below `min_dex`
     """
     R = R_cam_from_ref
     info = np.zeros((4, 4))
     max_sigma = np.inf
     fall = np.inf
-    observed = np.empty(0, np.int64)
-    star = np.empty(0, np.int64)
-    for iteration in range(3):
-        # 1. Match. The first round allows for the error of the candidate attitude, later ones only for the detections'.
+    observed = star = np.empty(0, np.int64)
+    for n in range(3):
+        # 1. Match. Only the first round allows for the error of the candidate attitude.
         before = observed, star
         observed, star = _match(detections, sky, R, focal_ratio, gates, max_sigma)
         gates = gates_of(detections, 1.0)
         max_sigma = GATE_SIGMA
         if len(observed) < MIN_EVIDENCE_MATCHES:
             return no_hypothesis()
-        # 3. Reject most false candidates before the full evaluation, by an upper bound: exact matches, no missing star.
-        if iteration == 1 and min_dex > -np.inf:
-            # `info` is that of the first fit.
-            upper_bound_dex = _evidence(
-                detections, sky, R, focal_ratio, observed, star, info, iteration > 1
-            )
-            if upper_bound_dex + counts_dex(len(observed), 0) < min_dex:
+        # 3. Reject most false candidates early, with the information of the first fit: exact matches, no missing star.
+        if n == 1 and min_dex > -np.inf:
+            dex = _evidence(detections, sky, R, focal_ratio, observed, star, info, n > 1)
+            if dex + counts_dex(len(observed), 0) < min_dex:
                 return no_hypothesis()
         # A fit that has converged on the same matches need not be repeated.
         same = np.array_equal(observed, before[0]) and np.array_equal(star, before[1])
         if same and fall < CONVERGED_CHI2:
             break
         # 2. and 4. Fit; the interval of the focal ratio has a margin, as the fit is noisy.
-        if iteration < 2:
+        if n < 2:
             focal_ratio, fall = _fit(detections, sky, R, focal_ratio, observed, star, info)
             if abs(focal_ratio - 1) > 1.2 * detections.focal_uncertainty + 1e-12:
                 return no_hypothesis()
-            if iteration == 1 and fall < CONVERGED_CHI2:
+            if n == 1 and fall < CONVERGED_CHI2:
                 break
-    # 5. The evidence. A literal True in place of `with_residuals` would be compiled as another type.
-    matched = len(observed)
-    with_residuals = matched > 0
-    dex = _evidence(detections, sky, R, focal_ratio, observed, star, info, with_residuals)
+    # 5. The evidence, with residuals: a literal True would be compiled as another type.
+    dex = _evidence(detections, sky, R, focal_ratio, observed, star, info, n > 0)
     # Missing stars only reduce the evidence: count them if it suffices without any.
-    if dex + counts_dex(matched, 0) < min_dex:
+    if dex + counts_dex(len(observed), 0) < min_dex:
         return no_hypothesis()
-    dex += counts_dex(matched, _count_missing(detections, sky, R, focal_ratio, star))
+    dex += counts_dex(len(observed), _count_missing(detections, sky, R, focal_ratio, star))
     return Hypothesis(observed, star, R, focal_ratio, info, dex)
 
 
@@ -266,40 +250,6 @@ def _match(
 
 
 @jit
-def count_near(
-    tangent: Floats,
-    sky: SkyIndex,
-    R_cam_from_ref: Floats,
-    focal_ratio: float,
-    observed: NDArray,
-    gates: Floats,
-) -> int:
-    """Number of detections that are not `observed` and have a star nearby.
-
-    Parameters
-    ----------
-    observed
-        (K,) rows of the matched detections, which are left out
-    gates
-        (N,) rad, greatest distance of a star; at most 0.05 is used
-    """
-    R_ref_from_cam = R_cam_from_ref.T.copy()
-    count = 0
-    matched = np.zeros(len(gates), np.bool_)
-    for n in observed:
-        matched[n] = True
-    for n in range(len(gates)):
-        if matched[n]:
-            continue
-        # The star nearest to the detection's direction in the catalog's frame.
-        x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, n, focal_ratio))
-        gate = min(gates[n], 0.05)
-        s, _ = nearest(sky.vectors, sky.cell_first, sky.cell_star, sky.side, x, y, z, gate)
-        count += s >= 0
-    return count
-
-
-@jit
 def focal_gain_dex(detections: Detections, sky: SkyIndex, hypothesis: Hypothesis) -> float:
     """log10 of the Bayes factor of a free focal length over that of a hypothesis, with the same matches.
 
@@ -356,13 +306,8 @@ def _fit(
 ) -> tuple[float, float]:
     """One weighted Gauss-Newton step of the attitude R (in place) and of the focal ratio f: steps 2 and 4.
 
-    The model is t = f (x, y) / z with a star q = (x, y, z) in camera axes. A small rotation w changes q to q + w x
-    q. With (x, y) here for (x / z, y / z), the derivatives of t with respect to w and to log f are
-
-        d t_x = f (-x y,      1 + x^2,  -y,  x)
-        d t_y = f (-1 - y^2,  x y,       x,  y)
-
-    The step is info^-1 g, info = sum J^T W J, g = sum J^T W r, r the residuals and W their inverse covariances.
+    The step is info^-1 g, info = sum J^T W J, g = sum J^T W r, r the residuals, W their inverse covariances, and J the
+    derivatives of the tangents (`_slopes`).
 
     Parameters
     ----------
@@ -386,17 +331,9 @@ def _fit(
     weight = detections.weight
     vectors_ref = sky.vectors
     for k in range(len(observed)):
-        # Derivatives of the predicted tangents.
         x, y = project(vectors_ref, R, star[k])
-        d_x[0] = -f * x * y
-        d_x[1] = f * (1 + x * x)
-        d_x[2] = -f * y
-        d_x[3] = f * x
-        d_y[0] = -f * (1 + y * y)
-        d_y[1] = f * x * y
-        d_y[2] = f * x
-        d_y[3] = f * y
-        # Their weighted sums; the matrix is symmetric, so that its lower triangle suffices.
+        _slopes(x, y, f, d_x, d_y)
+        # Weighted sums of the derivatives; the matrix is symmetric, so that its lower triangle suffices.
         xx, yy, xy = vectors.row(weight, observed[k])
         residual_x = tangent[observed[k], 0] - f * x
         residual_y = tangent[observed[k], 1] - f * y
@@ -418,6 +355,26 @@ def _fit(
     for i in range(count):
         fall += gradient[i] * step[i]
     return (f * np.exp(step[3]) if count == 4 else f), fall
+
+
+@jit
+def _slopes(x: float, y: float, f: float, d_x: Floats, d_y: Floats) -> None:
+    """Fill the derivatives (4,) of a star's tangents t with respect to a small rotation w and to log f.
+
+    The model is t = f (x, y) / z with the star q = (x, y, z) in camera axes. The rotation changes q to q + w x q. With
+    (x, y) here for (x / z, y / z),
+
+        d t_x = f (-x y,      1 + x^2,  -y,  x)
+        d t_y = f (-1 - y^2,  x y,       x,  y)
+    """
+    d_x[0] = -f * x * y
+    d_x[1] = f * (1 + x * x)
+    d_x[2] = -f * y
+    d_x[3] = f * x
+    d_y[0] = -f * (1 + y * y)
+    d_y[1] = f * x * y
+    d_y[2] = f * x
+    d_y[3] = f * y
 
 
 @jit
@@ -556,7 +513,9 @@ def _fraction_brighter(sky: SkyIndex, mag: Floats) -> float:
         faintest = max(faintest, value)
     if not np.isfinite(faintest):
         return 1.0
-    return max(first_from(sky.mag, 0, len(sky.mag), faintest + MAG_SMOOTHING), 1) / len(sky.mag)
+    return max(first_from(sky.mag, 0, len(sky.mag), faintest + MAG_SMOOTHING), 1) / len(
+        sky.mag
+    )
 
 
 @jit
@@ -585,7 +544,9 @@ def _magnitude_ratio(
 
 
 @jit
-def build_solution(detections: Detections, stars: SkyIndex, hypothesis: Hypothesis) -> Solution:
+def build_solution(
+    detections: Detections, stars: SkyIndex, hypothesis: Hypothesis
+) -> Solution:
     """The solution of a hypothesis, with its covariance and its residuals.
 
     The covariance is the attitude's block of info^-1: if the focal length is uncertain, it is marginalized over the
@@ -607,12 +568,19 @@ def build_solution(detections: Detections, stars: SkyIndex, hypothesis: Hypothes
         observed = hypothesis.observed[k]
         star = hypothesis.star[k]
         chi2 += squared_mahalanobis(
-            detections, stars, hypothesis.R_cam_from_ref, hypothesis.focal_ratio, observed, star
+            detections,
+            stars,
+            hypothesis.R_cam_from_ref,
+            hypothesis.focal_ratio,
+            observed,
+            star,
         )
         x, y = project(stars.vectors, hypothesis.R_cam_from_ref, star)
         tx = detections.tangent[observed, 0]
         ty = detections.tangent[observed, 1]
-        total += (tx - hypothesis.focal_ratio * x) ** 2 + (ty - hypothesis.focal_ratio * y) ** 2
+        total += (tx - hypothesis.focal_ratio * x) ** 2 + (
+            ty - hypothesis.focal_ratio * y
+        ) ** 2
     # Two residuals for each match, of which `count` are used up by the fit.
     rms = sqrt(total / max(2 * len(hypothesis.star), 1))
     chi2 /= max(2 * len(hypothesis.star) - count, 1)

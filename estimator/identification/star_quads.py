@@ -10,7 +10,7 @@ The steps; the same numbers return as comments in the code:
 2. Call the two farthest apart A and B, and compute the code (`_test_quad`).
 3. Look up the catalog quads whose codes differ by no more than the gate (`_code_gate`).
 4. Compute the focal ratio and the attitude from A, B and their stars (`_test_match`).
-5. Quick check of the other detections (`star_search.quick_check`).
+5. Quick check of the other detections (`star_check.quick_check`).
 6. Match all detections, fit, and compute the Bayes factor (`star_evidence.evaluate`).
 7. Stop at the first candidate with DECISIVE_DEX, and fit it to all detections (`star_search.fit_to_all`).
 """
@@ -25,10 +25,15 @@ from estimator.catalog.sky_index import SkyIndex
 from estimator.core import vectors
 from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
-from estimator.identification import star_search
+from estimator.identification import star_check, star_search
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.star_detections import Detections, changed, ray
-from estimator.identification.star_evidence import Hypothesis, Solution, evaluate, no_hypothesis
+from estimator.identification.star_evidence import (
+    Hypothesis,
+    Solution,
+    evaluate,
+    no_hypothesis,
+)
 
 COMBINED = 24  # number of brightest detections that are combined to quads
 
@@ -125,8 +130,12 @@ def _test_quad(
     code = np.empty(4)
     frame = np.empty((3, 3))
     vectors.pair_frame(ray_a, ray_b, frame)
-    code[0], code[1] = quad_index.in_frame(frame, ray(detections.tangent, quad[2], 1.0), length)
-    code[2], code[3] = quad_index.in_frame(frame, ray(detections.tangent, quad[3], 1.0), length)
+    code[0], code[1] = quad_index.in_frame(
+        frame, ray(detections.tangent, quad[2], 1.0), length
+    )
+    code[2], code[3] = quad_index.in_frame(
+        frame, ray(detections.tangent, quad[3], 1.0), length
+    )
     quad_index.arrange(code, quad)
     # 3. All cells within the gate of the code.
     gate = _code_gate(detections, quad, length)
@@ -253,9 +262,9 @@ def _test_match(
     vectors.pair_frame(star_a, star_b, in_ref)
     vectors.multiply_transposed(in_ref, in_cam, R_ref_from_cam)
     # 5. Quick check of the other detections.
-    gates, order, required = star_search.trial(detections, a, b, 0, star_search.DECISIVE_DEX)
+    gates, order, required = star_check.trial(detections, a, b, 0, star_search.DECISIVE_DEX)
     grid = sky.cell_first, sky.cell_star, sky.side
-    lookups, fits = star_search.quick_check(
+    lookups, fits = star_check.quick_check(
         tangent, sky.vectors, *grid, R_ref_from_cam, ratio, gates, order, required, len(gates)
     )
     checks[0] += 1 + lookups

@@ -13,7 +13,7 @@ The steps; the same numbers return as comments in the code:
 3. Look up the catalog pairs of the same separation within GATE_SIGMA (`_pair_range`).
 4. For each catalog pair, in both orders (`_test_pair`):
    reject it by its magnitudes and its separation, and compute the focal ratio and the attitude.
-5. Quick check: look up the other detections, until enough of them or too few have a star nearby (`quick_check`).
+5. Quick check: look up the other detections, until enough of them or too few have a star nearby (`star_check`).
 6. Match all detections, fit the attitude and compute its Bayes factor (`star_evidence.evaluate`).
 7. Stop at DECISIVE_DEX. From ACCEPT_DEX on, continue only to find rivals, with limited effort (`search`).
 8. Accept an attitude that passes ACCEPT_DEX and beats every other one by MARGIN_DEX (`search`).
@@ -25,12 +25,12 @@ Angles in the image are tangents; `ref` is the frame of the catalog's vectors.
 
 from __future__ import annotations
 
-from math import log10, pi, sqrt
+from math import log10, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.sky_index import SkyIndex, cell_of, nearest
+from estimator.catalog.sky_index import SkyIndex, cell_of, magnitude_density
 from estimator.core import vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
@@ -38,28 +38,17 @@ from estimator.identification.chance import (
     ACCEPT_DEX,
     GATE_SIGMA,
     SHORT_PAIR,
-    least,
-    middle,
-    required_matches,
     separation,
-    squared_separation,
 )
-from estimator.identification.star_detections import (
-    Detections,
-    changed,
-    field_area,
-    gates_of,
-    ray,
-)
+from estimator.identification.star_check import quick_check, trial
+from estimator.identification.star_detections import Detections, changed, gates_of, ray
 from estimator.identification.star_evidence import (
     Hypothesis,
     Solution,
     build_solution,
     evaluate,
     focal_gain_dex,
-    magnitude_density,
     no_hypothesis,
-    prior_volume_dex,
 )
 
 DECISIVE_DEX = 10.0  # evidence at which the search stops without looking for rivals
@@ -79,7 +68,9 @@ FEW = 20  # number of detections of the first search
 # Fractions of `max_checks`: for the first search with FEW detections, and for that with many.
 SHORT_EFFORT = 1 / 16
 MANY_EFFORT = 1 / 4
-WRONG_FOCAL = 0.05  # greatest relative error of a calibrated focal length that step 9 can find
+WRONG_FOCAL = (
+    0.05  # greatest relative error of a calibrated focal length that step 9 can find
+)
 WRONG_FOCAL_DEX = 2.0  # evidence by which another focal length must beat the calibrated one
 FREE_DEX = (
     1.0  # least gain by a free focal length, with the same matches, for which it is tried
@@ -140,8 +131,7 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
     """Steps 2 to 8: search one set of detections for the attitude.
 
     Pairs of detections are tried by increasing cost: the expected number of catalog pairs that match them, doubled for
-    each earlier attempt with either detection, so that a false detection does not hold up the search. Pairs shorter
-    than SHORT_PAIR come last, as they determine the roll poorly.
+    each earlier attempt with either detection, so that a false detection does not hold up the search.
 
     The first round drops a candidate after MAX_MISSES detections without a star and skips stars outside of the
     magnitude gate. The second round has neither limit. It is skipped if MAX_MISSES covers all other detections
@@ -155,8 +145,7 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
     Returns
     -------
     Hypothesis
-        The first attitude with DECISIVE_DEX, or else the best one that passes ACCEPT_DEX and MARGIN_DEX, or else the
-        empty hypothesis
+        The first one with DECISIVE_DEX, or else the best if it passes ACCEPT_DEX and MARGIN_DEX, or else the empty one
     """
     total = len(detections.sigma)
     length = _pair_lengths(detections)
@@ -174,9 +163,8 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
             tried[a, b] = True
             # 3. to 6. Every attempt starts its quick checks at another MAX_MISSES detections: a fixed order would
             # drop every true candidate of a frame in which these are all false.
-            candidate = _test_pair(
-                detections, sky, a, b, attempt * MAX_MISSES, max_misses, best, checks
-            )
+            start = attempt * MAX_MISSES
+            candidate = _test_pair(detections, sky, a, b, start, max_misses, best, checks)
             same = _same_attitude(candidate, best)
             if candidate.dex > best.dex:
                 # The previous best becomes a rival unless it is the same attitude.
@@ -189,7 +177,6 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
             # 7. A decisive attitude needs no search for rivals.
             if best.dex >= DECISIVE_DEX:
                 return best
-            # The next attempts prefer other detections: one of these two may be false.
             cost[a] *= 2
             cost[b] *= 2
             if checks[0] > limit:
@@ -401,37 +388,6 @@ def _test_pair(
 
 
 @jit
-def trial(
-    detections: Detections, a: int, b: int, start: int, min_dex: float
-) -> tuple[Floats, NDArray[np.int64], int]:
-    """What the quick check of an attitude by two detections needs.
-
-    Parameters
-    ----------
-    a, b
-        Rows of the two detections
-    start
-        The other detections are looked up from this row on
-    min_dex
-        Least evidence of interest, log10
-
-    Returns
-    -------
-    gates
-        (N,) matching radius of each detection, tangents
-    order
-        (N - 2,) rows of the other detections
-    required
-        Number of matches, the pair included, without which the evidence cannot reach `min_dex`
-    """
-    gates = pair_gates(detections, a, b)
-    order = other_detections(len(detections.sigma), a, b, start)
-    pair_dex = attitude_dex(detections, a, b)
-    required = required_matches(detections.sigma, field_area(detections), pair_dex, min_dex)
-    return gates, order, required
-
-
-@jit
 def _alike(difference_a: float, difference_b: float, gate: float) -> bool:
     """Whether two differences of magnitudes are together within a gate; an unknown magnitude (NaN) passes."""
     return not difference_a * difference_a + difference_b * difference_b > gate * gate
@@ -466,20 +422,6 @@ def _pair_range(
 
 
 @jit
-def other_detections(total: int, a: int, b: int, start: int) -> NDArray[np.int64]:
-    """Rows of all N detections but a and b, from row `start` on and around: (N - 2,)."""
-    out = np.empty(total, np.int64)
-    count = 0
-    for step in range(total):
-        # Wrap around at the end.
-        n = (start + step) % total
-        if n not in (a, b):
-            out[count] = n
-            count += 1
-    return out[:count]
-
-
-@jit
 def fit_focal_ratio(tangent: Floats, a: int, b: int, chord: float, target: float) -> float:
     """The focal ratio at which the chord between two detections is `target`.
 
@@ -507,116 +449,6 @@ def fit_focal_ratio(tangent: Floats, a: int, b: int, chord: float, target: float
 
 
 @jit
-def pair_gates(detections: Detections, a: int, b: int) -> Floats:
-    """Matching radius of each detection at the attitude of a pair: its own error and that of the attitude.
-
-        gate_n = GATE_SIGMA sqrt(s_n^2 + (sa^2 + sb^2) / 4 + (sa^2 + sb^2) d_n^2 / D^2)
-
-    The second term is the variance of the pair's midpoint. The third is that of its direction, and of its relative
-    length (for an uncertain focal length), which grows with the squared distance d_n from the midpoint; D is the
-    separation.
-
-    Returns
-    -------
-    Floats
-        (N,) tangents
-    """
-    tangent = detections.tangent
-    x, y = middle(tangent, a, b)
-    pair_variance = detections.sigma[a] ** 2 + detections.sigma[b] ** 2
-    direction_variance = pair_variance / squared_separation(tangent, a, b)
-    out = np.empty(len(detections.sigma))
-    for n in range(len(out)):
-        distance2 = (tangent[n, 0] - x) ** 2 + (tangent[n, 1] - y) ** 2
-        # The detection's variance, that of the midpoint, and that of the direction at this distance.
-        out[n] = GATE_SIGMA * sqrt(
-            detections.sigma[n] ** 2 + pair_variance / 4 + direction_variance * distance2
-        )
-    return out
-
-
-@jit
-def attitude_dex(detections: Detections, a: int, b: int) -> float:
-    """Contribution of a pair's attitude alone to the evidence, for `required_matches`.
-
-        log10( (2 pi)^(3/2) (s / sqrt(2))^2 (sqrt(2) s / D) / V )
-
-    The pair determines the two axes across the boresight to s / sqrt(2), and the roll to sqrt(2) s / D, D the
-    separation. s is the least sigma of all detections, taken as isotropic, which gives a lower bound of the
-    uncertainty. V is the prior volume. An uncertain focal length adds sqrt(2 pi) sqrt(2) s / D.
-    """
-    sigma = least(detections.sigma)
-    direction_sigma = sqrt(2.0) * sigma / separation(detections.tangent, a, b)
-    dex = (
-        1.5 * log10(2 * pi)
-        + log10(sigma**2 / 2 * direction_sigma)
-        - prior_volume_dex(detections)
-    )
-    # An uncertain focal length is as well known as the roll.
-    if detections.focal_uncertainty > 0:
-        dex += log10(sqrt(2 * pi) * direction_sigma)
-    return dex
-
-
-@jit
-def quick_check(
-    tangent: Floats,
-    vectors_ref: Floats,
-    cell_first: NDArray,
-    cell_star: NDArray,
-    side: int,
-    R_ref_from_cam: Floats,
-    focal_ratio: float,
-    gates: Floats,
-    order: NDArray,
-    required: int,
-    max_misses: int,
-) -> tuple[int, bool]:
-    """Step 5: look up detections at an attitude, until it is clear whether enough of them have a star nearby.
-
-    Parameters
-    ----------
-    tangent
-        (N, 2) detections, tangents
-    vectors_ref, cell_first, cell_star, side
-        Fields of the sky index (see `nearest`)
-    R_ref_from_cam
-        (3, 3) candidate attitude
-    focal_ratio
-        Ratio of the true to the assumed focal length
-    gates
-        (N,) matching radius of each detection
-    order
-        (N - 2,) rows of the detections other than the pair, in the order of the look-ups
-    required
-        Number of matches wanted, with the pair's two
-    max_misses
-        Number of look-ups without any match after which the candidate is dropped
-
-    Returns
-    -------
-    lookups
-        Number of detections looked up
-    fits
-        Whether `required` is reached
-    """
-    count = 2
-    remaining = len(order)
-    for step in range(remaining):
-        # Out of reach, or too many misses at the start.
-        if count + remaining - step < required or (step >= max_misses and count == 2):
-            return step, False
-        # The star nearest to the detection's direction in the catalog's frame.
-        n = order[step]
-        x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, n, focal_ratio))
-        star, _ = nearest(vectors_ref, cell_first, cell_star, side, x, y, z, gates[n])
-        count += star >= 0
-        if count >= required:
-            return step + 1, True
-    return remaining, False
-
-
-@jit
 def fit_to_all(
     detections: Detections,
     stars: SkyIndex,
@@ -628,17 +460,14 @@ def fit_to_all(
     """Step 9: fit a candidate attitude of some detections to all detections and all stars.
 
     With a wrong focal length a part of the stars may still match, at a wrong attitude. The candidate of a calibrated
-    camera is therefore fitted with the calibrated and with a free focal length. The free one is taken if it has
-    WRONG_FOCAL_DEX more evidence.
+    camera is therefore also fitted with a free focal length, which is taken if it has WRONG_FOCAL_DEX more evidence.
 
     Parameters
     ----------
     detections
         All detections, with the focal uncertainty of the free fit
-    candidate
-        Best hypothesis of the search
-    accept_dex
-        Least evidence of the candidate, log10
+    candidate, accept_dex
+        Best hypothesis of the search, and its least evidence, log10
     calibrated
         Whether the focal length is calibrated
     whole

@@ -42,9 +42,7 @@ COLLECTING = "codes: too few lights have been seen long enough"
 MISSED_FRAMES = 2  # missed frames after which a light's track ends, if LEDs are never dark
 MIN_BITS = 3  # a light measured in fewer frames could be any LED
 MIN_FREE_BITS = 8  # the same where the code's time is unknown
-PHASE_REACH = (
-    25.0  # largest difference from the best misfit of a phase of the code's clock that is kept
-)
+PHASE_REACH = 25.0  # largest difference from the best misfit of a phase of the code's clock that is kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +74,12 @@ class DecoderSettings:
         checks.number("decoder: gate_px", self.gate_px, 1.0, 1e4, "1 to 10,000 pixels")
         if self.frames is not None:
             checks.number(
-                "decoder: frames", self.frames, MIN_BITS, 10_000, f"{MIN_BITS} to 10,000", True
+                "decoder: frames",
+                self.frames,
+                MIN_BITS,
+                10_000,
+                f"{MIN_BITS} to 10,000",
+                True,
             )
 
 
@@ -240,7 +243,9 @@ class CodedTracker(DomeTracker):
         misfit = misfit / led_codes.excess_noise(misfit.min(axis=(0, 2)), measured[usable])
         # 4. Names
         row = tracks.row[usable]
-        named = led_naming.NamedLights(*self._tangents(centroids.take(row)), misfit.min(axis=0))
+        named = led_naming.NamedLights(
+            *self._tangents(centroids.take(row)), misfit.min(axis=0)
+        )
         match = led_naming.identify(named, self.sphere)
         if isinstance(match, str):
             return match
@@ -278,7 +283,8 @@ class CodedTracker(DomeTracker):
         rays = self.camera.rays(centroids.xy_px)
         focal_px = self.camera.focal_px
         own = np.hypot(
-            direction_sigma_rad(centroids, self.camera, self.settings), MIN_ERROR_PX / focal_px
+            direction_sigma_rad(centroids, self.camera, self.settings),
+            MIN_ERROR_PX / focal_px,
         )
         tangent = np.linalg.norm(rays[:, :2] / rays[:, 2:], axis=1)
         lever = self.lever.sigma_m / self.sphere.radius_m.min() * tangent

@@ -28,7 +28,8 @@ from estimator.attitude.dome_map import (
     on_sphere,
     project,
 )
-from estimator.attitude.nearfield import SOLVERS, fit_focal_ratio, fitted_sigma_rad
+from estimator.attitude.nearfield import SOLVERS, fitted_sigma_rad
+from estimator.attitude.rotation_fit import fit_focal_ratio
 from estimator.catalog import pair_index
 from estimator.core import checks
 from estimator.core.camera import Camera
@@ -74,7 +75,9 @@ def led_pairs(camera: Camera, leds: LedMap, lever: Lever, settings: Settings) ->
     )
 
 
-def non_dimensional(camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
+def non_dimensional(
+    camera: Camera, leds: LedMap, lever: Lever, settings: Settings
+) -> Identify:
     """Return the LED identifier for a focal length with the uncertainty FOCAL_UNCERTAINTY, or three sigma if larger.
 
     See `led_search.identify`. The index holds the pairs of the widest field that the camera may have. It has the field
@@ -109,7 +112,9 @@ def star_identifier(
         2 * float(np.std(radius)) / (median_radius_m - float(np.linalg.norm(pupil_m))) + 5e-4
     )
 
-    def identify(rays_cam: Floats, sigma_rad: Floats, flux_s: Floats | None) -> StarMatch | str:
+    def identify(
+        rays_cam: Floats, sigma_rad: Floats, flux_s: Floats | None
+    ) -> StarMatch | str:
         match = STAR_IDENTIFIERS[name](
             on_sphere(rays_cam, pupil_m, median_radius_m) / median_radius_m,
             pairs,
@@ -292,7 +297,9 @@ class DomeTracker:
         sigma_rad = direction_sigma_rad(bright, self.camera, self.settings)
         if self.settings.identifier not in FITS_FOCAL:
             sigma_rad = np.hypot(sigma_rad, focal_error_rad(rays, self.camera))
-        match = self.identify(rays, sigma_rad, bright.flux / exposure_s if exposure_s else None)
+        match = self.identify(
+            rays, sigma_rad, bright.flux / exposure_s if exposure_s else None
+        )
         return self._solve_identified(centroids, match, clock)
 
     def _solve_identified(
@@ -354,7 +361,9 @@ class DomeTracker:
 
     def _focal_rad(self, rays: Floats) -> Floats:
         """Return the (N,) `focal_error_rad` of rays; 0 where the focal length is fitted, as the fit has its error."""
-        return np.zeros(len(rays)) if self.focal_fitted else focal_error_rad(rays, self.camera)
+        return (
+            np.zeros(len(rays)) if self.focal_fitted else focal_error_rad(rays, self.camera)
+        )
 
     def _solve_calibrated(self, centroids: Centroids, match: StarMatch) -> Attitude:
         """Return the attitude for a known focal length: steps 3 to 6 of the module.
@@ -485,7 +494,9 @@ class DomeTracker:
         self, centroids: Centroids, observed: NDArray, star: NDArray, body_from_lab: Rotation
     ) -> Floats:
         """Return the (K, 2) predicted minus observed pixels."""
-        predicted = project(body_from_lab, self.leds.position_m[star], self.lever, self.camera)
+        predicted = project(
+            body_from_lab, self.leds.position_m[star], self.lever, self.camera
+        )
         return predicted - centroids.xy_px[observed]
 
     def _reject_blends(
@@ -533,7 +544,11 @@ class DomeTracker:
             )
         # c. Factor
         chi2 = float(np.sum(length[inlier] ** 2))
-        return observed[inlier], star[inlier], chi2 / mean if chi2 > mean + 3 * spread else 1.0
+        return (
+            observed[inlier],
+            star[inlier],
+            chi2 / mean if chi2 > mean + 3 * spread else 1.0,
+        )
 
     def _lever_covariance(self, cam_from_lab: Rotation, star: NDArray) -> Floats:
         """Return the (3, 3) covariance in camera axes from the error of the pupil's position, common to all frames.

@@ -18,11 +18,13 @@ from math import log, log10, sqrt
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.systematic import geometry
 from estimator.attitude.wahba import matrix_of
-from estimator.catalog.sky_index import SkyIndex
+from estimator.catalog.sky_index import SkyIndex, nearest
+from estimator.core import vectors
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.constants import ARCSEC_RAD
@@ -38,6 +40,7 @@ from estimator.identification.star_detections import (
     detections_of,
     gates_of,
     information_of,
+    ray,
 )
 from estimator.identification.star_evidence import Solution
 
@@ -87,7 +90,7 @@ def widened(
     # 1. Detections near a star within the widest gates
     gates = gates_of(detections, 1.5 * sqrt(TRIED[-1]))
     ratio = solution.focal_ratio
-    near = star_evidence.count_near(
+    near = count_near(
         detections.tangent, sky, R_cam_from_ref, ratio, solution.observed, gates
     )
     if near == 0:
@@ -116,6 +119,40 @@ def widened(
 
 
 @jit
+def count_near(
+    tangent: Floats,
+    sky: SkyIndex,
+    R_cam_from_ref: Floats,
+    focal_ratio: float,
+    observed: NDArray,
+    gates: Floats,
+) -> int:
+    """Number of detections that are not `observed` and have a star nearby.
+
+    Parameters
+    ----------
+    observed
+        (K,) rows of the matched detections, which are left out
+    gates
+        (N,) rad, greatest distance of a star; at most 0.05 is used
+    """
+    R_ref_from_cam = R_cam_from_ref.T.copy()
+    count = 0
+    matched = np.zeros(len(gates), np.bool_)
+    for n in observed:
+        matched[n] = True
+    for n in range(len(gates)):
+        if matched[n]:
+            continue
+        # The star nearest to the detection's direction in the catalog's frame.
+        x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, n, focal_ratio))
+        gate = min(gates[n], 0.05)
+        s, _ = nearest(sky.vectors, sky.cell_first, sky.cell_star, sky.side, x, y, z, gate)
+        count += s >= 0
+    return count
+
+
+@jit
 def _mean_factor(dex: Floats, best_dex: float) -> float:
     """Return the mean of the factors TRIED, weighted by their Bayes factors 10^dex."""
     total = weights = 0.0
@@ -139,9 +176,9 @@ def _scaled(solution: Solution, parameters: int) -> tuple[Solution, float]:
     best = 0
     chi2 = solution.chi2 * max(2 * count - parameters, 1)
     for n in range(len(TRIED)):
-        gain_dex = chi2 / 2 / log(10.0) * (1 - 1 / TRIED[n]) + (parameters / 2 - count) * log10(
-            TRIED[n]
-        )
+        gain_dex = chi2 / 2 / log(10.0) * (1 - 1 / TRIED[n]) + (
+            parameters / 2 - count
+        ) * log10(TRIED[n])
         dex[n] = solution.dex + gain_dex + (PRIOR_WRONG_DEX if n else 0.0)
         best = n if dex[n] > dex[best] else best
     variance = _mean_factor(dex, dex[best])
@@ -170,7 +207,11 @@ def with_errors(solution: Solution, factor: float, chi2: float, dex: float) -> S
 
 @jit
 def identify(
-    lights: FlatCentroids, sensor: Sensor, stars: SkyIndex, max_detections: int, max_checks: int
+    lights: FlatCentroids,
+    sensor: Sensor,
+    stars: SkyIndex,
+    max_detections: int,
+    max_checks: int,
 ) -> tuple[Solution, float]:
     """Search centroids of a calibrated camera by pairs, and match the field again where the residuals are doubtful.
 
@@ -286,19 +327,15 @@ def with_lens(
     change = np.zeros(5)
     for _ in range(LENS_ROUNDS):
         # 1. Linearization
-        seen = cam_from_ref.apply(vectors_ref)
-        view = geometry(seen, seen)
-        radial = view.tangent * np.sum(view.tangent**2, axis=1)[:, None]
-        by_unknowns = [view.jacobian, view.tangent[:, :, None], radial[:, :, None]]
-        slopes = whiten @ np.concatenate(by_unknowns, axis=2)
-        residual = (whiten @ (lens.tangents(xy_px) - view.tangent)[:, :, None])[:, :, 0]
+        tangent, by_unknowns = _linearize(cam_from_ref.apply(vectors_ref))
+        slopes = whiten @ by_unknowns
+        residual = (whiten @ (lens.tangents(xy_px) - tangent)[:, :, None])[:, :, 0]
         # 2. Step
         kept = slopes[keep].reshape(-1, 5)
         count = int(keep.sum())
         normal = kept.T @ kept / variance + prior
-        step = np.linalg.solve(
-            normal, kept.T @ residual[keep].ravel() / variance - prior @ change
-        )
+        gradient = kept.T @ residual[keep].ravel() / variance - prior @ change
+        step = np.linalg.solve(normal, gradient)
         change[3:] += step[3:]
         cam_from_ref = Rotation.from_rotvec(step[:3]) * cam_from_ref
         lens = _lens_of(camera, *change[3:])
@@ -312,19 +349,27 @@ def with_lens(
             break
         keep = near
         variance = found
-    sheared = _is_sheared(
-        whiten[keep], view.tangent[keep], slopes[keep], (residual - slopes @ step)[keep]
-    )
+    rest = (residual - slopes @ step)[keep]
+    sheared = _is_sheared(whiten[keep], tangent[keep], slopes[keep], rest)
     left = lens.tangents(xy_px[keep]) - _tangents(cam_from_ref.apply(vectors_ref[keep]))
+    covariance = np.linalg.inv(kept.T @ kept / variance + prior)
     fitted = solution._replace(
         observed=solution.observed[keep],
         star=solution.star[keep],
         cam_from_ref_xyzw=cam_from_ref.as_quat(),
-        covariance_rad2=np.linalg.inv(kept.T @ kept / variance + prior)[:3, :3],
+        covariance_rad2=np.asarray(covariance[:3, :3], dtype=float),
         rms=float(np.sqrt(np.mean(left**2))),
         chi2=chi2 / (2 * count - 5),
     )
     return Refit(fitted, lens, variance, sheared)
+
+
+def _linearize(seen_cam: Floats) -> tuple[Floats, Floats]:
+    """Return the (K, 2) tangents of directions, and their (K, 2, 5) derivatives by the unknowns of `with_lens`."""
+    view = geometry(seen_cam, seen_cam)
+    radial = view.tangent * np.sum(view.tangent**2, axis=1)[:, None]
+    by_unknowns = [view.jacobian, view.tangent[:, :, None], radial[:, :, None]]
+    return view.tangent, np.concatenate(by_unknowns, axis=2)
 
 
 def _is_sheared(whiten: Floats, tangent: Floats, slopes: Floats, residual: Floats) -> bool:
@@ -397,7 +442,9 @@ def with_companions(
         seen = Rotation.from_quat(best.cam_from_ref_xyzw).apply(sky.vectors[best.star])
         view = geometry(seen, seen)
         residual = detections.tangent[best.observed] - best.focal_ratio * view.tangent
-        own, used = (information_of(one.weight[best.observed]) for one in (detections, changed))
+        own, used = (
+            information_of(one.weight[best.observed]) for one in (detections, changed)
+        )
         alone, spread = prediction_by_others(residual, view.jacobian, used)
         # 2. Mean information
         mean = mean_information(own, alone, spread)
@@ -463,7 +510,9 @@ def mean_information(information: Floats, residual: Floats, spread: Floats) -> F
     total = covariance + spread
     distance2 = np.einsum("ki,jkim,km->jk", residual, np.linalg.inv(total), residual)
     # Posterior probabilities g_j, from ln p_j - ln det / 2 - r^T (S + P + c_j^2 I)^-1 r / 2
-    log_density = np.log(SHARE)[:, None] - 0.5 * np.log(np.linalg.det(total)) - 0.5 * distance2
+    log_density = (
+        np.log(SHARE)[:, None] - 0.5 * np.log(np.linalg.det(total)) - 0.5 * distance2
+    )
     probability = np.exp(log_density - log_density.max(axis=0))
     probability /= probability.sum(axis=0)
     return np.asarray(

@@ -164,7 +164,11 @@ class Settings:
             object.__setattr__(self, "zero_point_mag", zero)
         if self.bad_px is not None:
             bad = np.asarray(self.bad_px)
-            if bad.ndim != 2 or bad.shape[1] != 2 or (bad.size and bad.dtype.kind not in "iu"):
+            if (
+                bad.ndim != 2
+                or bad.shape[1] != 2
+                or (bad.size and bad.dtype.kind not in "iu")
+            ):
                 raise ImageError(
                     f"settings: bad_px has shape {bad.shape} of {bad.dtype}; allowed: (K, 2) whole numbers"
                 )

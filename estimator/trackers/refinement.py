@@ -28,7 +28,6 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.least_squares import fit_soft_l1
 from estimator.core.types import Attitude, Centroids, StarMatch
-from estimator.identification import star_evidence
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identification.star_evidence import Solution
 from estimator.trackers import misfit
@@ -89,7 +88,9 @@ class FieldMatcher:
         reach_px = np.hypot(self.camera.width_px, self.camera.height_px) / 2
         return [0.008 * reach_px + 2, 0.004 * reach_px + 2, 4, 3, 2.5, 2.5]
 
-    def refine(self, centroids: Centroids, camera: Camera, cam_from_ref: Rotation) -> Attitude:
+    def refine(
+        self, centroids: Centroids, camera: Camera, cam_from_ref: Rotation
+    ) -> Attitude:
         """Refine a candidate attitude, or refuse it: the numbered steps of the module.
 
         If the focal length is uncertain, each round also fits the camera (`fit_camera`), and the result must be within
@@ -107,7 +108,9 @@ class FieldMatcher:
             if fit_lens:
                 camera, cam_from_ref = fit_camera(camera, cam_from_ref, xy, vectors)
             rays = camera.rays(xy)
-            centroid_rad = direction_sigma_rad(centroids.take(observed), camera, self.settings)
+            centroid_rad = direction_sigma_rad(
+                centroids.take(observed), camera, self.settings
+            )
             sigma_rad = np.hypot(centroid_rad, focal_error_px(camera, xy) / camera.focal_px)
             try:
                 cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
@@ -121,7 +124,10 @@ class FieldMatcher:
         if chance > ACCEPT_LOG10_CHANCE:
             return Attitude(NO_MATCH)
         # The field, not the focal length: a distortion changes what a focal length means.
-        if abs(self.camera.fov_rad / camera.fov_rad - 1) > 1.2 * self.focal_uncertainty + 1e-9:
+        if (
+            abs(self.camera.fov_rad / camera.fov_rad - 1)
+            > 1.2 * self.focal_uncertainty + 1e-9
+        ):
             return Attitude(NO_MATCH)
         # 4. Covariance
         seen_cam = cam_from_ref.apply(vectors)
@@ -219,7 +225,7 @@ class FieldMatcher:
         tangent = self.camera.tangents(centroids.xy_px)
         gates = np.full(len(centroids), gate_rad)
         R = Rotation.from_quat(solution.cam_from_ref_xyzw).as_matrix()
-        near = star_evidence.count_near(
+        near = misfit.count_near(
             tangent, self.sky, R, solution.focal_ratio, solution.observed, gates
         )
         # The gates of all stars cover the share N pi gate^2 / (4 pi) of the sky.
@@ -269,7 +275,9 @@ def mutual_nearest(
     """Return mutual nearest neighbors within a radius: indices of observed_px, and `rows` of the predictions."""
     if not len(predicted_px) or not len(observed_px):
         return np.empty(0, int), np.empty(0, int)
-    distance, nearest = cKDTree(predicted_px).query(observed_px, distance_upper_bound=radius_px)
+    distance, nearest = cKDTree(predicted_px).query(
+        observed_px, distance_upper_bound=radius_px
+    )
     _, back = cKDTree(observed_px).query(predicted_px)
     match = np.flatnonzero(np.isfinite(distance))
     match = match[back[nearest[match]] == match]

@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.attitude import rolling
-from estimator.attitude.nearfield import tangent_jacobian
 from estimator.attitude.rate import (
     MAX_RATE_RAD_S,
     STARS,
@@ -32,6 +31,7 @@ from estimator.attitude.rate import (
     from_moments,
     from_streaks,
 )
+from estimator.attitude.rotation_fit import tangent_jacobian
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids, RateEstimate
@@ -71,7 +71,9 @@ class Lights(NamedTuple):
     @property
     def sight(self) -> Sight:
         """Sight of all lights, at their median distance."""
-        return Sight(self.lever_cam_m, float(np.median(np.linalg.norm(self.place_ref, axis=1))))
+        return Sight(
+            self.lever_cam_m, float(np.median(np.linalg.norm(self.place_ref, axis=1)))
+        )
 
 
 def solve_rolling(
@@ -147,7 +149,9 @@ def _solve_with(
         attitude = solve_global(at_middle_row(camera, centroids, exact, sight))
     # 4. Error of the rate
     return (
-        _with_rate(camera, lights, centroids, attitude, fitted) if attitude.solved else attitude
+        _with_rate(camera, lights, centroids, attitude, fitted)
+        if attitude.solved
+        else attitude
     )
 
 
@@ -270,7 +274,11 @@ def _sight_of(lights: Lights, attitude: Attitude, centroids: Centroids) -> Sight
 
 
 def _with_rate(
-    camera: Camera, lights: Lights, centroids: Centroids, attitude: Attitude, rate: RateEstimate
+    camera: Camera,
+    lights: Lights,
+    centroids: Centroids,
+    attitude: Attitude,
+    rate: RateEstimate,
 ) -> Attitude:
     """Return the attitude with its rate, and with the rate's error added to the covariance."""
     match = attitude.match

@@ -15,7 +15,6 @@ import datetime
 import functools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -32,9 +31,7 @@ from estimator.core.checks import Floats, Ints
 from estimator.core.least_squares import variance_factor
 from estimator.core.types import NO_SPREAD, Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification import star_quads, star_search
-from estimator.identification.chance import (
-    MIN_EVIDENCE_MATCHES,
-)
+from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.star_detections import (
     Detections,
     FlatCentroids,
@@ -54,57 +51,19 @@ from estimator.trackers.pipeline import (
 )
 from estimator.trackers.refinement import NO_MATCH, FieldMatcher
 from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
+from estimator.trackers.search_models import (
+    CALIBRATED_SEARCHES,
+    MIN_ERROR_PX,
+    UNCALIBRATED_SEARCHES,
+    WRONG_FOCAL_SEARCH,
+    SearchModel,
+)
 
 NO_STARS = "too few stars detected"
 AIR_ROUNDS = 2  # number of corrections for refraction at another time than the air's epoch
 SAME_AIR_S = 1.0  # time in which the zenith moves by 15", and a refraction changes by 0.02"
-MIN_ERROR_PX = (
-    0.005  # least centroid error of a star, for a calibrated lens and the catalog's positions
-)
 
 
-class SearchModel(NamedTuple):
-    """Error model and effort of one search.
-
-    Attributes
-    ----------
-    min_error_px
-        Least centroid error
-    relative_error
-        Additional error, as a fraction of the distance from the principal point
-    max_checks
-        Largest number of star look-ups; 400,000 take about 0.02 s
-    by_quads
-        Whether quads are searched in place of pairs
-    focal_uncertainty
-        Relative uncertainty of the focal length, if it is larger than that of the tracker
-    """
-
-    min_error_px: float
-    relative_error: float
-    max_checks: int
-    by_quads: bool = False
-    focal_uncertainty: float = 0.0
-
-
-WRONG_FOCAL_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 200_000, True, star_search.WRONG_FOCAL)
-CALIBRATED_SEARCHES = (
-    SearchModel(MIN_ERROR_PX, 0.0, 25_000),
-    WRONG_FOCAL_SEARCH,
-    SearchModel(MIN_ERROR_PX, 0.0, 400_000),
-)
-UNCALIBRATED_SEARCHES = (
-    SearchModel(MIN_ERROR_PX, 0.0, 10_000, True),
-    SearchModel(MIN_ERROR_PX, 0.0, 100_000, True),
-    SearchModel(0.5, 0.0, 100_000, True),
-    SearchModel(1.0, 0.005, 100_000, True),
-    SearchModel(2.0, 0.01, 100_000, True),
-    SearchModel(0.5, 0.0, 100_000),
-    SearchModel(1.0, 0.005, 200_000),
-    SearchModel(2.0, 0.01, 100_000),
-)
-# Searches for an unknown field of view.
-QUAD_SEARCHES = tuple(model for model in UNCALIBRATED_SEARCHES if model.by_quads)
 CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 SETTINGS = Settings()
 
@@ -123,9 +82,8 @@ class StarTracker:
     settings
         Algorithms of the stages, and their parameters
     focal_uncertainty
-        Relative uncertainty of the focal length: 0 for a calibrated camera, 0.05 if the field of
-        view is only known to 5 %. Unless it is 0, the focal length and, with enough stars, the
-        radial distortion are fitted in each frame
+        Relative uncertainty of the focal length: 0 for a calibrated camera, 0.05 if the field of view is only known to
+        5 %. Unless it is 0, the focal length and, with enough stars, the radial distortion are fitted in each frame
     searches
         Searches of the default identifier; empty for those that suit the focal uncertainty
     air
@@ -167,7 +125,9 @@ class StarTracker:
         )
         # Stars that a frame can show, and the brighter ones among them that form patterns
         apparent_stars = replace(stars, vectors=vectors)
-        self.stars = catalog.merge_doubles(apparent_stars, settings.merge_px / camera.focal_px)
+        self.stars = catalog.merge_doubles(
+            apparent_stars, settings.merge_px / camera.focal_px
+        )
         field_sr = camera.width_px * camera.height_px / camera.focal_px**2
         limit_mag = catalog.limit_for_density(self.stars, field_sr, settings.field_stars)
         index_stars = self.stars.take(self.stars.v_mag <= limit_mag)
@@ -191,9 +151,16 @@ class StarTracker:
         # Field of view in tangents: least and largest x, least and largest y
         corners = camera.tangents(CORNERS * [camera.width_px, camera.height_px] - 0.5)
         self.field = np.array(
-            [corners[:, 0].min(), corners[:, 0].max(), corners[:, 1].min(), corners[:, 1].max()]
+            [
+                corners[:, 0].min(),
+                corners[:, 0].max(),
+                corners[:, 1].min(),
+                corners[:, 1].max(),
+            ]
         )
-        zero_point_mag = np.nan if settings.zero_point_mag is None else settings.zero_point_mag
+        zero_point_mag = (
+            np.nan if settings.zero_point_mag is None else settings.zero_point_mag
+        )
         lens = camera.focal_px, camera.center_px, camera.distortion
         self.sensor = Sensor(*lens, self.field, zero_point_mag, settings.magnitude_sigma)
 
@@ -224,13 +191,11 @@ class StarTracker:
         Parameters
         ----------
         limit_mag
-            Faintest V magnitude of the on-board catalog; None: 6 without `stars`, otherwise all
-            stars
+            Faintest V magnitude of the on-board catalog; None: 6 without `stars`, otherwise all stars
         date
             UTC, ISO 8601 or datetime, which determines proper motion, parallax and aberration
         stars
-            Another catalog than the Hipparcos subset that comes with the package, which ends at
-            Hp 6.5
+            Another catalog than the Hipparcos subset that comes with the package, which ends at Hp 6.5
 
         Raises
         ------
@@ -260,11 +225,9 @@ class StarTracker:
         Parameters
         ----------
         streak_px
-            (dx, dy) by which stars move during the exposure, from the gyro; None: unknown, or
-            from `rate`
+            (dx, dy) by which stars move during the exposure, from the gyro; None: unknown, or from `rate`
         rate
-            Rate of the camera, from the gyro; None: with a rolling shutter it is estimated from
-            the frame
+            Rate of the camera, from the gyro; None: with a rolling shutter it is estimated from the frame
         exposure_s
             Exposure time, to estimate the rate from streaks; None if unknown
         t_s
@@ -344,7 +307,12 @@ class StarTracker:
         centroids.check_values()
         if effort is not None:
             effort = checks.number(
-                "effort", effort, 0, self.efforts - 1, f"0 to {self.efforts - 1}, or None", True
+                "effort",
+                effort,
+                0,
+                self.efforts - 1,
+                f"0 to {self.efforts - 1}, or None",
+                True,
             )
         clock = clock or Clock()
         if len(centroids) < MIN_EVIDENCE_MATCHES:
@@ -394,7 +362,9 @@ class StarTracker:
         covariance_px2 = covariance_of(centroids) + excess_px2
         return replace(centroids, sigma_px=sigma_px, covariance_px2=covariance_px2)
 
-    def _solve_global(self, centroids: Centroids, clock: Clock, effort: int | None) -> Attitude:
+    def _solve_global(
+        self, centroids: Centroids, clock: Clock, effort: int | None
+    ) -> Attitude:
         """Identify and solve centroids of one time."""
         if self.index is None:
             searches = self.searches if effort is None else self.searches[effort : effort + 1]
@@ -502,10 +472,7 @@ class StarTracker:
         return detections_of(_lights(centroids, sigma_px), self.sensor, uncertainty)
 
     def _identify_by_evidence(
-        self,
-        centroids: Centroids,
-        searches: tuple[SearchModel, ...],
-        clock: Clock,
+        self, centroids: Centroids, searches: tuple[SearchModel, ...], clock: Clock
     ) -> Attitude:
         """Solve by the default identifier.
 
@@ -566,7 +533,9 @@ class StarTracker:
             return misfit.identify(lights, self.sensor, self.sky, most, model.max_checks)
         detections = self.detections(centroids, sigma_px, model.focal_uncertainty)
         if not model.by_quads:
-            return star_search.lost_in_space(detections, self.sky, most, model.max_checks), 0.0
+            return star_search.lost_in_space(
+                detections, self.sky, most, model.max_checks
+            ), 0.0
         known = not self.focal_uncertainty
         solution = star_quads.identify(
             detections, self.quads, self.sky, most, model.max_checks, known
@@ -574,7 +543,11 @@ class StarTracker:
         return solution, 0.0
 
     def refit(
-        self, centroids: Centroids, solution: Solution, sigma_px: Floats, variance: float = 0.0
+        self,
+        centroids: Centroids,
+        solution: Solution,
+        sigma_px: Floats,
+        variance: float = 0.0,
     ) -> Refit:
         """Return a solution with the errors and, of a calibrated global shutter, the lens that its residuals imply.
 
@@ -607,7 +580,9 @@ class StarTracker:
             solution, detections, self.sky, camera, centroids.xy_px, fit_lens, variance
         )
 
-    def attitude_of(self, centroids: Centroids, refitted: Refit, sigma_px: Floats) -> Attitude:
+    def attitude_of(
+        self, centroids: Centroids, refitted: Refit, sigma_px: Floats
+    ) -> Attitude:
         """Return the attitude of a solution; solved again from its matches if the settings name another solver."""
         solution, camera, variance, _ = refitted
         cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)

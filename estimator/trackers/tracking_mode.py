@@ -29,12 +29,19 @@ from estimator.detection.windows import in_windows
 from estimator.identification import star_evidence
 from estimator.identification.chance import ACCEPT_DEX, MIN_EVIDENCE_MATCHES
 from estimator.trackers import warm_up
-from estimator.trackers.pipeline import Clock, Report, detect_and_centroid, inflate_uncertainty
+from estimator.trackers.pipeline import (
+    Clock,
+    Report,
+    detect_and_centroid,
+    inflate_uncertainty,
+)
 from estimator.trackers.rolling_shutter import with_streak_rate
 from estimator.trackers.star_tracker import StarTracker
 
 WINDOW_SIGMA = 4.0  # detection threshold: lower than in a frame, as fewer pixels are searched
-LONGEST_STREAK_PX = 4.0  # longer streaks are detected with the streak filter in the whole frame
+LONGEST_STREAK_PX = (
+    4.0  # longer streaks are detected with the streak filter in the whole frame
+)
 RATE_CHANGE = 0.3  # relative difference of a rate from its mean since the last attitude
 ROUGH = 3.0  # reduced chi-square above which a solution is flagged
 # Least share of the expected stars in a tracked solution. Where the prediction is wrong, three stars in the windows may
@@ -226,7 +233,9 @@ class TrackingMode:
         if not 0 < t_s - last.t_s <= self.max_age_s:
             return attitude
         # Mean rate of the camera since the last attitude
-        between_rad_s = -(cam_from_ref * last.cam_from_ref.inv()).as_rotvec() / (t_s - last.t_s)
+        between_rad_s = -(cam_from_ref * last.cam_from_ref.inv()).as_rotvec() / (
+            t_s - last.t_s
+        )
         sigma_rad_s = RATE_CHANGE * float(np.linalg.norm(between_rad_s))
         between = RateEstimate(between_rad_s, sigma_rad_s**2 * np.eye(3))
         return replace(attitude, rate=attitude.rate.resolved(between))
@@ -241,7 +250,9 @@ class TrackingMode:
         if attitude.rate is not None and attitude.rate.sign_known:
             rate_rad_s = -attitude.rate.rate_rad_s
         if last is not None and 0 < t_s - last.t_s <= self.max_age_s:
-            rate_rad_s = (cam_from_ref * last.cam_from_ref.inv()).as_rotvec() / (t_s - last.t_s)
+            rate_rad_s = (cam_from_ref * last.cam_from_ref.inv()).as_rotvec() / (
+                t_s - last.t_s
+            )
         self.last = LastSolution(t_s, cam_from_ref, rate_rad_s)
 
     def _track(
@@ -341,7 +352,8 @@ class TrackingMode:
                 image, self.tracker.camera, settings, clock, streak_px
             )
             near = (
-                np.abs(centroids.xy_px[:, None] - window_centers_px).max(axis=2) < self.reach_px
+                np.abs(centroids.xy_px[:, None] - window_centers_px).max(axis=2)
+                < self.reach_px
             )
             return centroids.take(near.any(axis=1)), False
         blobs = in_windows(image, window_centers_px, self.reach_px, WINDOW_SIGMA, priors)

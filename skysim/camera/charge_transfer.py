@@ -147,7 +147,9 @@ def transfer_loss(electrons: NDArray[Any], cti_parallel: float, cti_serial: floa
     if cti_parallel > 0:
         _delay_rows(electrons, delayed_fractions(height, cti_parallel))
     if cti_serial > 0:
-        _delay_columns(electrons, delayed_fractions(width, cti_serial).astype(electrons.dtype))
+        _delay_columns(
+            electrons, delayed_fractions(width, cti_serial).astype(electrons.dtype)
+        )
 
 
 @functools.lru_cache(maxsize=8)

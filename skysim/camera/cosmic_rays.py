@@ -121,7 +121,9 @@ def draw_tracks(
 
 
 @jit
-def deposit(image: NDArray[Any], ends_px: Floats, electrons: Floats, sigma_px: float) -> Floats:
+def deposit(
+    image: NDArray[Any], ends_px: Floats, electrons: Floats, sigma_px: float
+) -> Floats:
     """Spread each charge evenly along its track, in steps of at most STEP_PX, each a pixel-integrated Gaussian.
 
     Parameters

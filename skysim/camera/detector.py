@@ -193,23 +193,36 @@ def expose(
         return frame
     # 2. Counting.
     _count(light_e, *pattern, constants, count_seeds, guide)
-    # 3. Particles.
-    if config.particles:
-        with added.watch(PARTICLES, light_e) if added else nullcontext():
-            cosmic_rays.add_particles(
-                light_e, exposure_s, detector.pixel_m, config.particles, rng
-            )
-    # 4. Full well.
-    if config.blooming == "column":
-        charge_transfer.bloom(light_e, config.full_well_e, config.anti_blooming)
-    else:
-        np.minimum(light_e, config.full_well_e, out=light_e)
-    # 5. Transfer loss.
-    if config.cti_parallel or config.cti_serial:
-        charge_transfer.transfer_loss(light_e, config.cti_parallel, config.cti_serial)
+    # 3. to 5.
+    collect_charge(light_e, exposure_s, detector, rng, added)
     # 6. Read-out.
     _read_out(light_e, detector.column_offset_e, constants, read_seeds, frame)
     return frame
+
+
+def collect_charge(
+    charge_e: NDArray[Any],
+    exposure_s: float,
+    detector: Detector,
+    rng: Generator,
+    added: AddedCharge | None,
+) -> None:
+    """Steps 3 to 5, between counting and read-out, in place."""
+    config = detector.config
+    # 3. Particles.
+    if config.particles:
+        with added.watch(PARTICLES, charge_e) if added else nullcontext():
+            cosmic_rays.add_particles(
+                charge_e, exposure_s, detector.pixel_m, config.particles, rng
+            )
+    # 4. Full well.
+    if config.blooming == "column":
+        charge_transfer.bloom(charge_e, config.full_well_e, config.anti_blooming)
+    else:
+        np.minimum(charge_e, config.full_well_e, out=charge_e)
+    # 5. Transfer loss.
+    if config.cti_parallel or config.cti_serial:
+        charge_transfer.transfer_loss(charge_e, config.cti_parallel, config.cti_serial)
 
 
 def expectation(light_e: NDArray[Any], exposure_s: float, detector: Detector) -> NDArray[Any]:
@@ -225,7 +238,10 @@ def expectation(light_e: NDArray[Any], exposure_s: float, detector: Detector) ->
 
 
 def smear(
-    light_e: NDArray[Any], exposure_s: float, shutter: Shutter, added: AddedCharge | None = None
+    light_e: NDArray[Any],
+    exposure_s: float,
+    shutter: Shutter,
+    added: AddedCharge | None = None,
 ) -> None:
     """Step 1: add the smear of a frame-transfer or interline shutter to the light, in place. Other shutters add none.
 

@@ -192,7 +192,9 @@ def count(row: Any, state: Any, guide: Any, memory: Scratch) -> Any:
     words = bits.view(np.uint16)
     table = guide.reshape(-1)
     for x in range(width):
-        k = int32(min(row[x] * float32(GUIDES_PER_E), float32(INVERSION_MAX_E * GUIDES_PER_E)))
+        k = int32(
+            min(row[x] * float32(GUIDES_PER_E), float32(INVERSION_MAX_E * GUIDES_PER_E))
+        )
         cell[x] = int32(int32(k * int32(BUCKETS)) + int32(words[x] >> uint16(6)))
     for x in range(width):
         # Unsigned: saves numba's check for negative indices.

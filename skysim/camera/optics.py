@@ -22,9 +22,8 @@ def two_stops(config: TwoStopsConfig, field_rad: Floats) -> Floats:
     against the other by u diameters.
     """
     # 1.57 is just below pi / 2, where the tangent overflows.
-    u = np.clip(
-        np.tan(np.minimum(field_rad, 1.57)) / np.tan(np.radians(config.cutoff_deg)), 0, 1
-    )
+    tangent = np.tan(np.minimum(field_rad, 1.57))
+    u = np.clip(tangent / np.tan(np.radians(config.cutoff_deg)), 0, 1)
     return np.asarray(2 / np.pi * (np.arccos(u) - u * np.sqrt(1 - u**2)))
 
 
@@ -68,10 +67,9 @@ class Optics:
         """The optics of a scene's camera, without seeing."""
         # Collecting area of the round pupil.
         area_m2 = np.pi / 4 * camera.pupil_m**2
+        collecting_m2 = float(area_m2 * camera.gray_transmission)
         fold = fold_r(camera.distortion)
-        return cls(
-            camera, float(area_m2 * camera.gray_transmission), fold, field_rad(camera, fold)
-        )
+        return cls(camera, collecting_m2, fold, field_rad(camera, fold))
 
     def project(self, vectors_cam: Floats) -> Floats:
         """Project (..., 3) vectors in camera axes to (..., 2) pixels; NaN behind the camera and beyond the fold.
@@ -160,7 +158,6 @@ def fold_r(distortion: tuple[float, ...]) -> float:
     # A polynomial in 1 / r^2, whose leading coefficient is never 0; its largest real root is the least r.
     roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
     # Real positive roots, up to rounding.
-    extrema = roots.real[
-        (abs(roots.imag) < 1e-9 * (1 + abs(roots.real))) & (roots.real > 1e-12)
-    ]
+    real = abs(roots.imag) < 1e-9 * (1 + abs(roots.real))
+    extrema = roots.real[real & (roots.real > 1e-12)]
     return float(1 / np.sqrt(extrema.max())) if len(extrema) else float("inf")

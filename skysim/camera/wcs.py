@@ -122,23 +122,21 @@ def fit_sip(camera: CameraConfig) -> Sip | None:
     for order in range(2, MAX_ORDER + 1):
         # 2. All powers p + q from 2 to the order.
         powers = [(p, n - p) for n in range(2, order + 1) for p in range(n, -1, -1)]
-        solution = np.linalg.lstsq(
-            monomials(distorted_px / scale, powers), undistorted_px - distorted_px, rcond=None
-        )[0]
-        a, b = (
-            {
-                (p, q): float(value) / scale ** (p + q)
-                for (p, q), value in zip(powers, column, strict=True)
-            }
-            for column in solution.T
-        )
+        design = monomials(distorted_px / scale, powers)
+        solution = np.linalg.lstsq(design, undistorted_px - distorted_px, rcond=None)[0]
+        a: Coefficients = {}
+        b: Coefficients = {}
+        for (p, q), (in_a, in_b) in zip(powers, solution.tolist(), strict=True):
+            a[p, q] = in_a / scale ** (p + q)
+            b[p, q] = in_b / scale ** (p + q)
         # 3. Round trip.
-        round_trip = distorted(chip_px + monomials(chip_px / scale, powers) @ solution, camera)
-        fits.append(
-            Sip(a, b, *brown(camera), float(np.linalg.norm(round_trip - chip_px, axis=1).max()))
+        round_trip = distorted(
+            chip_px + monomials(chip_px / scale, powers) @ solution, camera
         )
+        worst_px = float(np.linalg.norm(round_trip - chip_px, axis=1).max())
+        fits.append(Sip(a, b, *brown(camera), worst_px))
         # 4.
-        if fits[-1].worst_px <= TARGET_ERROR_PX:
+        if worst_px <= TARGET_ERROR_PX:
             break
     return min(fits, key=lambda fit: fit.worst_px)
 
@@ -206,10 +204,11 @@ def brown(camera: CameraConfig) -> tuple[Coefficients, Coefficients]:
             q = 2 * m
             across[p + 1, q] = k * times
             down[p, q + 1] = k * times
-    # From tangents to pixels: a term of degree p + q is divided by focal^(p + q) and multiplied by
-    # focal.
-    focal = camera.focal_px
-    return tuple(  # type: ignore[return-value]
-        {(p, q): value * focal ** (1 - p - q) for (p, q), value in table.items() if value}
-        for table in (across, down)
-    )
+    return in_pixels(across, camera.focal_px), in_pixels(down, camera.focal_px)
+
+
+def in_pixels(table: Coefficients, focal_px: float) -> Coefficients:
+    """The terms that are not 0, from tangents to pixels: divided by focal^(p + q) and multiplied by focal."""
+    return {
+        (p, q): value * focal_px ** (1 - p - q) for (p, q), value in table.items() if value
+    }

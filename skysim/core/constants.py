@@ -52,5 +52,7 @@ SUN_V_MAG = -26.74  # at 1 au (Allen 1976, Astrophysical Quantities)
 
 # Statistics.
 FWHM_PER_SIGMA = math.sqrt(8 * math.log(2))  # of a Gaussian
-MAD_PER_SIGMA = 0.6745  # median absolute deviation of a normal distribution, its upper quartile
+MAD_PER_SIGMA = (
+    0.6745  # median absolute deviation of a normal distribution, its upper quartile
+)
 SIGMA_PER_MAD = 1.4826  # the reciprocal

@@ -115,7 +115,9 @@ def image_size(data: bytes) -> tuple[int, int, int, int, bool] | None:
         elif entry.tag == BITS_TAG:
             bits = max(bits, tiff.most_bits(entry))
     width, height, samples, planar = values.values()
-    return (width, height, samples, bits, planar == 2) if width and height and samples else None
+    return (
+        (width, height, samples, bits, planar == 2) if width and height and samples else None
+    )
 
 
 class Exif(NamedTuple):
@@ -147,7 +149,9 @@ def read_exif_block(data: bytes) -> Exif:
     except struct.error:
         pass  # the block ends before its last entry
     orientation = found.get(ORIENTATION_TAG, 1)
-    return Exif(orientation if 1 <= orientation <= 8 else 1, found.get(FOCAL_35MM_TAG) or None)
+    return Exif(
+        orientation if 1 <= orientation <= 8 else 1, found.get(FOCAL_35MM_TAG) or None
+    )
 
 
 # Limits of the size, and output of C libraries.
@@ -230,7 +234,9 @@ def decode_image(path: Path, data: bytes) -> NDArray:
 
 def check_encoded_size(path: Path, data: bytes) -> None:
     """Raise InputError unless these are the bytes of a PNG, TIFF, JPEG or BMP file with at most MAX_PIXELS pixels."""
-    reader = next((reader for magic, reader in FORMATS.items() if data.startswith(magic)), None)
+    reader = next(
+        (reader for magic, reader in FORMATS.items() if data.startswith(magic)), None
+    )
     try:
         sizes = list(reader(data)) if reader else []
     except Exception:

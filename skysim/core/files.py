@@ -21,9 +21,7 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 
-HOST = (
-    f"{zlib.crc32(platform.node().encode()):08x}"  # distinguishes machines that share a folder
-)
+HOST = f"{zlib.crc32(platform.node().encode()):08x}"  # distinguishes machines that share a folder
 
 TEMPORARY_NAME = re.compile(rf"\..+\.skysim-{HOST}-(\d{{1,9}})(\.\w+)?")
 
@@ -88,7 +86,8 @@ def name_in_errors(path: Path) -> Iterator[None]:
     except OSError as error:
         # Some libraries report a full disk in the text only.
         full = (
-            error.errno in (None, errno.ENOSPC, errno.EDQUOT) and "space" in str(error).lower()
+            error.errno in (None, errno.ENOSPC, errno.EDQUOT)
+            and "space" in str(error).lower()
         )
         number = errno.ENOSPC if full else error.errno
         if number is None:
@@ -111,7 +110,11 @@ def atomic_file(path: Path) -> Iterator[Path]:
 def atomic_folder(path: Path) -> Iterator[Path]:
     """As `atomic_file`, for a folder, which replaces `path` and its previous content."""
     backup = path.with_name(f"{path.stem}.old{path.suffix}")
-    with temporary_path(path) as temporary, temporary_path(backup) as old, name_in_errors(path):
+    with (
+        temporary_path(path) as temporary,
+        temporary_path(backup) as old,
+        name_in_errors(path),
+    ):
         yield temporary
         # Two renames are fast, and the old folder is removed afterward: an interruption leaves one of the two complete.
         if path.exists():

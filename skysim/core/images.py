@@ -35,7 +35,9 @@ from skysim.core.guarded import run_guarded
 
 
 SUFFIXES = tuple(
-    f"{suffix}{packed}" for packed in ("", ".gz", ".fz") for suffix in (".fits", ".fit", ".fts")
+    f"{suffix}{packed}"
+    for packed in ("", ".gz", ".fz")
+    for suffix in (".fits", ".fit", ".fts")
 )
 MAGIC = b"SIMPLE  ="  # start of every FITS file; a compressed one differs, which astropy would unpack
 GZIP_BLOCK = 1 << 20  # bytes unpacked at a time
@@ -136,7 +138,9 @@ def open_fits(path: Path) -> Iterator[BinaryIO]:
             plain = Path(temporary.name)
         file = stack.enter_context(plain.open("rb"))
         stack.enter_context(warnings.catch_warnings())
-        warnings.simplefilter("error", AstropyWarning)  # "file may have been truncated" is one
+        warnings.simplefilter(
+            "error", AstropyWarning
+        )  # "file may have been truncated" is one
         if file.read(len(MAGIC)) != MAGIC:
             allowed = "one that begins with SIMPLE" + ("" if packed else ", not compressed")
             raise InputError(path, "not a complete FITS file", allowed)
@@ -177,7 +181,9 @@ def check_header(path: Path, file: BinaryIO, start: int = 0) -> None:
         if (hit := AXES.match(card)) and int(hit[1]) > MAX_AXES:
             raise InputError(path, f"NAXIS {int(hit[1])}", f"up to {MAX_AXES} axes")
     else:
-        raise InputError(path, f"a header of more than {MAX_CARDS} lines", f"up to {MAX_CARDS}")
+        raise InputError(
+            path, f"a header of more than {MAX_CARDS} lines", f"up to {MAX_CARDS}"
+        )
     file.seek(before)
 
 
@@ -243,7 +249,12 @@ def header_values(
         date_utc = datetime.datetime.fromisoformat(found.get("DATE-OBS", ""))
     exposure_s = first_number(found, EXPOSURE_KEYS)
     temperature_c = first_number(found, TEMPERATURE_KEYS)
-    return TOP_DOWN.get(found.get("ROWORDER", "").upper()), date_utc, exposure_s, temperature_c
+    return (
+        TOP_DOWN.get(found.get("ROWORDER", "").upper()),
+        date_utc,
+        exposure_s,
+        temperature_c,
+    )
 
 
 def first_number(found: dict[str, str], keys: tuple[str, ...]) -> float | None:
@@ -382,7 +393,9 @@ class LiveCamera:
         self.frame_count = 0
         with silent_opencv():
             self.capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
-            self.capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest frame, not a buffered one
+            self.capture.set(
+                cv2.CAP_PROP_BUFFERSIZE, 1
+            )  # the newest frame, not a buffered one
 
     def frame(self) -> NDArray:
         """The next frame, (H, W) or (H, W, 3). Raises InputError if there is none."""

@@ -145,7 +145,8 @@ class RunningProcess:
         # WNOWAIT leaves the process unreaped, so its id cannot be reused and killpg hits only this group.
         flags = os.WEXITED | os.WNOWAIT | os.WNOHANG
         while (
-            time.monotonic() < until_s and os.waitid(os.P_PID, self.process.pid, flags) is None
+            time.monotonic() < until_s
+            and os.waitid(os.P_PID, self.process.pid, flags) is None
         ):
             time.sleep(0.005)
         with contextlib.suppress(ProcessLookupError, PermissionError):

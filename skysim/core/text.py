@@ -53,7 +53,9 @@ def to_numbers(
     """(N, width) numbers of the words of each line. Raises InputError for the first line without finite numbers."""
     for line, words in zip(places, rows, strict=True):
         if len(words) != width:
-            raise InputError(source, f"{len(words)} numbers", width, where=Where(source, line))
+            raise InputError(
+                source, f"{len(words)} numbers", width, where=Where(source, line)
+            )
     try:
         numbers = np.array(rows, dtype=np.float64).reshape(-1, width)
     except ValueError:
@@ -74,7 +76,9 @@ def check_numbers(where: Where, words: Sequence[str]) -> None:
                 where.file, f"{excerpt(word)} is not a number", where=where
             ) from None
         if not np.isfinite(number):
-            raise InputError(where.file, f"{excerpt(word)} is not a finite number", where=where)
+            raise InputError(
+                where.file, f"{excerpt(word)} is not a finite number", where=where
+            )
 
 
 def seconds_since(
@@ -129,7 +133,9 @@ def seconds_since(
         times.precision = 9
     # 3. Difference from the start in whole nanoseconds.
     try:
-        nanoseconds = np.array(times.isot, dtype="datetime64[ns]") - np.datetime64(start, "ns")
+        nanoseconds = np.array(times.isot, dtype="datetime64[ns]") - np.datetime64(
+            start, "ns"
+        )
     except ValueError:
         raise InputError(source, "an epoch within a leap second", "other times") from None
     return nanoseconds.astype(np.int64) / 1e9 - (GPS_MINUS_TAI_S if system == "GPS" else 0.0)
@@ -147,7 +153,11 @@ def is_time(text: str, kind: str, scale: str) -> bool:
 
 
 def read_named_rows(
-    path: Path, name: str, needed: Sequence[str], refusal: InputError, also: Sequence[str] = ()
+    path: Path,
+    name: str,
+    needed: Sequence[str],
+    refusal: InputError,
+    also: Sequence[str] = (),
 ) -> tuple[list[str], Floats]:
     """Names of the rows and numbers (N, K) of a CSV file whose first line names its columns; # begins a comment.
 
@@ -184,7 +194,9 @@ def read_named_rows(
                 where=Where(path, place),
             )
     used = [columns.index(one) for one in (*needed, *also) if one in columns]
-    numbers = to_numbers(str(path), places, [[row[k] for k in used] for row in rows], len(used))
+    numbers = to_numbers(
+        str(path), places, [[row[k] for k in used] for row in rows], len(used)
+    )
     names = [row[columns.index(name)] for row in rows]
     repeated = next((one for n, one in enumerate(names) if one in names[:n]), None)
     if repeated is not None:
@@ -209,11 +221,15 @@ def keyword_value(path: str | Path, n: int, line: str) -> tuple[str, str]:
     """The keyword and the value of a line. Raises InputError if it is not KEYWORD = value."""
     key, equals, value = (part.strip() for part in line.partition("="))
     if not equals:
-        raise InputError(path, f"{excerpt(line)} is not KEYWORD = value", where=Where(path, n))
+        raise InputError(
+            path, f"{excerpt(line)} is not KEYWORD = value", where=Where(path, n)
+        )
     return key, value
 
 
-def check_version(path: str | Path, keyword: str, version: str, allowed: Sequence[str]) -> None:
+def check_version(
+    path: str | Path, keyword: str, version: str, allowed: Sequence[str]
+) -> None:
     """Raise InputError for a version of the message that is not supported."""
     if version not in allowed:
         raise InputError(path, f"{keyword} is {excerpt(version)}", ", ".join(allowed))

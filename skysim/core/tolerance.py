@@ -114,14 +114,18 @@ class ToleranceConfig(ConfigModel):
 
     def numbers(self) -> tuple[float | None, float | None]:
         """Tolerance and sigma in SI units; None for one that is left out."""
-        half_width, sigma = (getattr(self, name) for name in list(type(self).model_fields)[1:])
+        half_width, sigma = (
+            getattr(self, name) for name in list(type(self).model_fields)[1:]
+        )
         return half_width, sigma
 
     @model_validator(mode="after")
     def check_distribution(self) -> Self:
         """Check that tolerance and sigma fit the distribution."""
         half_width, sigma = self.numbers()
-        if half_width is None and (sigma is None or self.distribution not in (None, "normal")):
+        if half_width is None and (
+            sigma is None or self.distribution not in (None, "normal")
+        ):
             raise InputError(
                 "",
                 f"{self.distribution or 'an error'} requires a tolerance",

@@ -52,7 +52,9 @@ class Trajectory:
     t_s: Floats
     lab_from_body: Rotation
     rate_body_rad_s: Floats
-    _segments: list[tuple[Floats, Floats]] = field(init=False, repr=False, default_factory=list)
+    _segments: list[tuple[Floats, Floats]] = field(
+        init=False, repr=False, default_factory=list
+    )
 
     @classmethod
     def at_rest(cls, lab_from_body: Rotation, end_s: float) -> Trajectory:

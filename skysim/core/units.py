@@ -203,6 +203,8 @@ def check_table(
 ) -> None:
     """Raise InputError unless two columns have equal length and the first one ascends strictly."""
     if len(first) != len(values):
-        raise InputError("", f"{first_name} has {len(first)} numbers, {name} has {len(values)}")
+        raise InputError(
+            "", f"{first_name} has {len(first)} numbers, {name} has {len(values)}"
+        )
     if any(b <= a for a, b in itertools.pairwise(first)):
         raise InputError("", f"{first_name} is not strictly ascending")

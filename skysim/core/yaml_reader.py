@@ -68,7 +68,9 @@ class StrictLoader(yaml.SafeLoader):
         self.nodes += self.size[id(node)] if aliased else 1
         self.size[id(node)] = self.nodes - before
         if self.nodes > MAX_NODES:
-            raise yaml.composer.ComposerError(None, None, f"more than {MAX_NODES} values", mark)
+            raise yaml.composer.ComposerError(
+                None, None, f"more than {MAX_NODES} values", mark
+            )
         return node
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:

@@ -202,5 +202,7 @@ class DisturbanceModel:
                 mean_per_impulse = [
                     impulse.fraction(a, b) / (b - a) for a, b in itertools.pairwise(times_s)
                 ]
-                torque_nm += np.outer(mean_per_impulse, self.inertia_kg_m2 @ impulse.rate_rad_s)
+                torque_nm += np.outer(
+                    mean_per_impulse, self.inertia_kg_m2 @ impulse.rate_rad_s
+                )
         return torque_nm

@@ -32,7 +32,9 @@ from skysim.dynamics.multibody.fans import Desaturator, MomentumDump
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import BUILT_IN_LAWS, ControlConfig
 
-GYRO_RATE_FRACTION = 0.7  # return rate of the controller over the gyros' rate limit (`assumed`)
+GYRO_RATE_FRACTION = (
+    0.7  # return rate of the controller over the gyros' rate limit (`assumed`)
+)
 
 
 def authority_nm(actuators: Actuators) -> float:

@@ -96,7 +96,9 @@ def profile_start(motion: MotionConfig, profiles: Sequence[AttitudeSpline]) -> S
     """The state at the start of the first maneuver, which is a profile."""
     element = motion.maneuver[0]
     assert isinstance(element, ProfileConfig)
-    return profiles[0].state_at(profiles[0].t_s[0] if element.begin == "first_sample" else 0.0)
+    return profiles[0].state_at(
+        profiles[0].t_s[0] if element.begin == "first_sample" else 0.0
+    )
 
 
 @jit
@@ -269,7 +271,9 @@ def spin_up(element: SpinUpConfig, start: LegStart) -> Leg:
     duration_s = element.duration_s
     start_rate = start.rate_rad_s
     change = np.radians(element.rate_deg_s) - start_rate
-    fastest = max(float(np.linalg.norm(start_rate)), float(np.linalg.norm(start_rate + change)))
+    fastest = max(
+        float(np.linalg.norm(start_rate)), float(np.linalg.norm(start_rate + change))
+    )
     # With a fixed axis one step of Magnus' expansion is exact.
     axis_moves = np.linalg.norm(np.cross(start_rate, change)) > 1e-12 * fastest**2
     count = max(MIN_KNOTS, math.ceil(fastest * duration_s / KNOT_RAD)) if axis_moves else 1
@@ -463,7 +467,9 @@ def plan(
         )
     # 3. The last leg; an empty list rests.
     size, axis = length_and_direction(leg_start.rate_rad_s if legs else np.zeros(3))
-    final_leg = FixedAxisLeg(leg_start.lab_from_ref_wxyz, axis, math.inf, partial(steady, size))
+    final_leg = FixedAxisLeg(
+        leg_start.lab_from_ref_wxyz, axis, math.inf, partial(steady, size)
+    )
     start_times_s = itertools.accumulate((leg.duration_s for leg in legs), initial=0.0)
     return Reference((*legs, final_leg), tuple(start_times_s))
 
@@ -486,7 +492,8 @@ class Impulse:
         """Fraction of the impulse between two times: (cos(pi a) - cos(pi b)) / 2, a and b in durations."""
         # Times in durations, limited to the impulse.
         a, b = (
-            min(max((t_s - self.begin_s) / self.duration_s, 0.0), 1.0) for t_s in (from_s, to_s)
+            min(max((t_s - self.begin_s) / self.duration_s, 0.0), 1.0)
+            for t_s in (from_s, to_s)
         )
         return (math.cos(math.pi * a) - math.cos(math.pi * b)) / 2
 

@@ -31,7 +31,12 @@ from skysim.core.jit import jit
 from skysim.core.random_streams import random_stream
 from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats
-from skysim.scene.sections.vehicle import AccelerometerConfig, GyroConfig, ImuConfig, SiteConfig
+from skysim.scene.sections.vehicle import (
+    AccelerometerConfig,
+    GyroConfig,
+    ImuConfig,
+    SiteConfig,
+)
 
 # Knots per polynomial: a cubic, with an error of fourth order in their spacing.
 CUBIC_POINTS = 4
@@ -96,6 +101,8 @@ def ideal_increments(
 ) -> Increments:
     """Increments of an ideal unit (without errors) on a body that rotates about the lab's origin.
 
+    Raises InputError for intervals outside the knots.
+
         w = rate + body_from_lab earth_rate           angle    = int w dt
         f = dw/dt x r + w x (w x r) - g_body          velocity = int f dt
 
@@ -113,26 +120,37 @@ def ideal_increments(
     ----------
     t_s
         (K,) knots of the motion, ascending, K >= 2, in any spacing
-    lab_from_body_wxyz
-        (K, 4) attitudes at the knots
-    rate_body_rad_s
-        (K, 3) rates of the body in the lab at the knots, in body axes
-    ends_s
-        (N,) ends of the sample intervals; they need not coincide with knots
-    step_s
-        Length of the sample intervals
+    lab_from_body_wxyz, rate_body_rad_s
+        (K, 4) attitudes at the knots, and (K, 3) rates of the body in the lab, in body axes
+    ends_s, step_s
+        (N,) ends of the sample intervals, which need not coincide with knots, and their length
     position_body_m
         (3,) position r of the unit, in body axes
     gravity_m_s2
         Plumb-line gravity along lab -z, a positive number
     earth_rate_lab_rad_s
         (3,) Earth rate in lab axes; zeros for a unit that does not sense it
-
-    Raises
-    ------
-    InputError
-        If there are fewer than two knots, or an interval is outside them.
     """
+    check_times(t_s, ends_s, step_s)
+    position = np.asarray(position_body_m, dtype=float)
+    # 1. Contiguous arrays, since numba compiles for each memory layout.
+    knots = inertial_knots(
+        np.ascontiguousarray(lab_from_body_wxyz),
+        np.ascontiguousarray(rate_body_rad_s),
+        position,
+        gravity_m_s2,
+        earth_rate_lab_rad_s,
+    )
+    # 2. and 3.
+    angle, velocity = integrate_intervals(
+        np.ascontiguousarray(t_s), knots, np.ascontiguousarray(ends_s), step_s, position
+    )
+    in_range = np.zeros(len(ends_s), dtype=bool)
+    return Increments(ends_s, step_s, angle, velocity, in_range, in_range)
+
+
+def check_times(t_s: Floats, ends_s: Floats, step_s: float) -> None:
+    """Raise InputError if there are fewer than two knots, or an interval is outside them."""
     if len(t_s) < 2:
         raise InputError("imu", f"{len(t_s)} samples of the motion", "two or more")
     first_s = np.min(ends_s, initial=np.inf) - step_s
@@ -146,22 +164,6 @@ def ideal_increments(
             f"samples from {first_s:.6f} to {last_s:.6f} s",
             f"within the motion, {t_s[0]:.6f} to {t_s[-1]:.6f} s",
         )
-    # Contiguous arrays, since numba compiles for each memory layout.
-    position = np.asarray(position_body_m, dtype=float)
-    # 1. Rate and specific force at the knots.
-    knots = inertial_knots(
-        np.ascontiguousarray(lab_from_body_wxyz),
-        np.ascontiguousarray(rate_body_rad_s),
-        position,
-        gravity_m_s2,
-        earth_rate_lab_rad_s,
-    )
-    # 2. and 3. Integrals over the sample intervals.
-    angle, velocity = integrate_intervals(
-        np.ascontiguousarray(t_s), knots, np.ascontiguousarray(ends_s), step_s, position
-    )
-    in_range = np.zeros(len(ends_s), dtype=bool)
-    return Increments(ends_s, step_s, angle, velocity, in_range, in_range)
 
 
 @jit
@@ -401,7 +403,9 @@ def gyro_triad(config: GyroConfig, hardware: Floats, start: Floats) -> Triad:
     )
 
 
-def accelerometer_triad(config: AccelerometerConfig, hardware: Floats, start: Floats) -> Triad:
+def accelerometer_triad(
+    config: AccelerometerConfig, hardware: Floats, start: Floats
+) -> Triad:
     """The accelerometer triad, as `gyro_triad`.
 
     The square of the noise density in ug/sqrt(Hz) is the variance of a mean over 1 s.

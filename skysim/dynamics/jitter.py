@@ -106,7 +106,9 @@ def with_phases(
     """
     amplitude = np.sqrt(2 * power_fraction)[:, None] * np.radians(np.array(rms_arcsec) / 3600)
     phase = rng.uniform(0, 2 * np.pi, amplitude.shape)
-    return Sines(2 * np.pi * frequency_hz, amplitude * np.cos(phase), amplitude * np.sin(phase))
+    return Sines(
+        2 * np.pi * frequency_hz, amplitude * np.cos(phase), amplitude * np.sin(phase)
+    )
 
 
 # Spectra by kind. To add one, add a class to scene/sections/motion.py and a function here.
@@ -174,7 +176,10 @@ class Vibration:
 
     @classmethod
     def draw(
-        cls, motion: MotionConfig, rng: np.random.Generator, reference: Reference | None = None
+        cls,
+        motion: MotionConfig,
+        rng: np.random.Generator,
+        reference: Reference | None = None,
     ) -> Vibration:
         """The vibration of `motion.jitter`, which is always on, and of each jitter maneuver during its interval.
 

@@ -53,7 +53,9 @@ TYPES = {
 DIRECTIONS = ("A2B", "B2A")
 ORDERS = ("FIRST", "LAST")
 REQUIRED = ("REF_FRAME_A", "REF_FRAME_B", "TIME_SYSTEM", "ATTITUDE_TYPE")
-SAME_ATTITUDE_RAD = 1e-6  # greatest difference of one sample that two adjoining segments share
+SAME_ATTITUDE_RAD = (
+    1e-6  # greatest difference of one sample that two adjoining segments share
+)
 
 
 def read_aem(path: Path, lines: list[Line], start: datetime.datetime) -> Samples:
@@ -109,7 +111,9 @@ def next_section(where: Where, section: str, keyword: str) -> str:
     after = {"META_START": ("", "DATA_STOP"), "META_STOP": ("META_START",)}
     after |= {"DATA_START": ("META_STOP",), "DATA_STOP": ("DATA_START",)}
     if section not in after[keyword]:
-        raise InputError(where.file, f"{keyword} after {section or 'the header'}", where=where)
+        raise InputError(
+            where.file, f"{keyword} after {section or 'the header'}", where=where
+        )
     return keyword
 
 
@@ -131,7 +135,9 @@ def segment_samples(
     )
     system = one_of(path, metadata, "TIME_SYSTEM", SCALES)
     width = TYPES[one_of(path, metadata, "ATTITUDE_TYPE", TYPES)]
-    frames = [frame_of(Where(path, metadata[key][0]), metadata[key][1]) for key in REQUIRED[:2]]
+    frames = [
+        frame_of(Where(path, metadata[key][0]), metadata[key][1]) for key in REQUIRED[:2]
+    ]
     names = [metadata[key][1] for key in REQUIRED[:2]]
     if sum(name.upper() in REFERENCES for name in names) != 1:
         raise InputError(
@@ -199,7 +205,9 @@ def to_icrs(samples: Samples, names: list[str]) -> Samples:
     bias = Rotation.identity()
     for name in names:
         bias = icrs_from(name) * bias
-    a_from_b = bias * samples.a_from_b if samples.a == "icrs" else samples.a_from_b * bias.inv()
+    a_from_b = (
+        bias * samples.a_from_b if samples.a == "icrs" else samples.a_from_b * bias.inv()
+    )
     return replace(samples, a_from_b=a_from_b)
 
 

@@ -146,7 +146,9 @@ def frame_of(where: Where, name: str) -> str:
     """The frame (icrs, lab, body or cam) with this name in a file. Raises InputError for an unknown name."""
     frames = REFERENCES | VEHICLES
     if name.upper() not in frames:
-        raise InputError(where.file, f"unknown frame {excerpt(name)}", ", ".join(frames), where)
+        raise InputError(
+            where.file, f"unknown frame {excerpt(name)}", ", ".join(frames), where
+        )
     return frames[name.upper()]
 
 

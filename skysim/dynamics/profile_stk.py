@@ -102,11 +102,15 @@ def to_samples(
     for key, allowed in (("CentralBody", "Earth"), ("TimeFormat", "EpSec")):
         line, value = keywords.get(key, (0, allowed))
         if value.lower() != allowed.lower():
-            raise InputError(path, f"{key} {excerpt(value)}", allowed, where=Where(path, line))
+            raise InputError(
+                path, f"{key} {excerpt(value)}", allowed, where=Where(path, line)
+            )
     line, axes = keywords.get("CoordinateAxes", (0, ""))
     if axes.upper() not in REFERENCES:
         where = Where(path, line) if line else None
-        raise InputError(path, f"CoordinateAxes {excerpt(axes)}", ", ".join(REFERENCES), where)
+        raise InputError(
+            path, f"CoordinateAxes {excerpt(axes)}", ", ".join(REFERENCES), where
+        )
     # 2. Numbers; times count from the scene's start if the file has an epoch.
     places = [n for n, _ in rows]
     values = to_numbers(str(path), places, [words for _, words in rows], width)

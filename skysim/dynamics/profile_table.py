@@ -58,7 +58,9 @@ def read_csv(
         if not line.startswith("#")
     ]
     if not rows:
-        raise InputError(path, "empty", "a line of column names, then a line for each attitude")
+        raise InputError(
+            path, "empty", "a line of column names, then a line for each attitude"
+        )
     body = rows[1:]
     (head, names) = rows[0]
     check_names(Where(path, head), names, rotation)
@@ -180,7 +182,9 @@ def check_names(where: Where, names: Sequence[str], rotation: str | None) -> Non
     if unknown:
         raise InputError(where.file, f"unknown column {excerpt(unknown[0])}", COLUMNS, where)
     found = {name for name in names if name not in TIMES}
-    if len(found) + 1 != len(names) or not any(set(columns) == found for columns in attitudes):
+    if len(found) + 1 != len(names) or not any(
+        set(columns) == found for columns in attitudes
+    ):
         given = ", ".join(printable(name) for name in names)
         raise InputError(
             where.file, f"columns {given} are not one time and one attitude", COLUMNS, where

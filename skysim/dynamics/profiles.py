@@ -27,7 +27,9 @@ from skysim.scene.sections.motion import ProfileConfig
 TABLE = "profile"  # source of a table given in Python
 
 
-def load_profiles(scene: Scene, mount: Mount, given: Any = None) -> tuple[AttitudeSpline, ...]:
+def load_profiles(
+    scene: Scene, mount: Mount, given: Any = None
+) -> tuple[AttitudeSpline, ...]:
     """The splines of a scene's maneuvers of kind profile, in their order.
 
     Parameters
@@ -57,7 +59,9 @@ def load_profiles(scene: Scene, mount: Mount, given: Any = None) -> tuple[Attitu
     return tuple(profiles)
 
 
-def read_profile(source: Any, start: datetime.datetime, rotation: str | None = None) -> Samples:
+def read_profile(
+    source: Any, start: datetime.datetime, rotation: str | None = None
+) -> Samples:
     """The samples of a file or a table. The format follows from the first line of the file. Raises InputError.
 
     Parameters
@@ -77,7 +81,9 @@ def read_profile(source: Any, start: datetime.datetime, rotation: str | None = N
     is_aem = first.startswith("CCSDS_AEM_VERS")
     is_stk = first.lower().startswith("stk.v.")
     if (is_aem or is_stk) and rotation is not None:
-        raise InputError(source, "the file names its frames", "no key rotation in the maneuver")
+        raise InputError(
+            source, "the file names its frames", "no key rotation in the maneuver"
+        )
     if is_aem:
         return profile_aem.read_aem(source, lines, start)
     if is_stk:

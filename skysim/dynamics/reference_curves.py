@@ -51,7 +51,9 @@ def rest_to_rest(
     angle = rate_rad_s * (ramp_s * x**3 * (1 - x / 2) + max(ramp_time_s - ramp_s, 0.0))
     rate = rate_rad_s * x**2 * (3 - 2 * x)
     acceleration = rate_rad_s / ramp_s * 6 * x * (1 - x)
-    return (angle_rad - angle, rate, -acceleration) if braking else (angle, rate, acceleration)
+    return (
+        (angle_rad - angle, rate, -acceleration) if braking else (angle, rate, acceleration)
+    )
 
 
 @jit
@@ -72,7 +74,9 @@ def envelope(t_s: float, duration_s: float, rise_s: float, fall_s: float) -> Der
 
 
 @jit
-def modulated_sine(amplitude_rad: float, gain: Derivatives, phase: Derivatives) -> Derivatives:
+def modulated_sine(
+    amplitude_rad: float, gain: Derivatives, phase: Derivatives
+) -> Derivatives:
     """amplitude gain(t) sin(phase(t)), and its two derivatives by the product rule."""
     # e and phi are the gain and the phase; the other names are their derivatives.
     e, slope, curvature = gain
@@ -120,7 +124,9 @@ def log_sweep(
 
 
 @jit
-def rate_at(t_s: float, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats) -> Floats:
+def rate_at(
+    t_s: float, duration_s: float, rate_rad_s: Floats, change_rad_s: Floats
+) -> Floats:
     """(3,) rate at a time, rate + change (3x^2 - 2x^3), x = t / duration."""
     x = t_s / duration_s
     return rate_rad_s + x**2 * (3 - 2 * x) * change_rad_s

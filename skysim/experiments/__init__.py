@@ -1,1 +1,1 @@
-"""Many simulations, one answer: studies, the papers' experiments, the dome survey, tracker comparisons."""
+"""Experiments of many simulations: studies, the papers' experiments, dome survey, tracker comparison."""

@@ -1,4 +1,4 @@
-"""One flight of a vehicle to be balanced: excitation, frames, and what the lab measures of it."""
+"""One flight of a vehicle to be balanced: its excitation, its frames, and the measurements of the lab."""
 
 from __future__ import annotations
 
@@ -30,19 +30,21 @@ from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.motion import MotionConfig
 from skysim.simulation.flight import Flight, open_flight
 
-# What is assumed of a vehicle before it is balanced, and how uncertain it is.
+# The assumed vehicle before it is balanced, and its uncertainty.
 
 
-PARAMETERS = 17  # beside the wheels' relative errors
+PARAMETERS = 17  # number of parameters, without the wheels' relative errors
 LAB_TORQUE_SHARE = (
     0.05  # standard deviation of the constant lab torque, relative to the offset's torque
 )
-DRAG_RATE_RAD_S = 0.1  # at which the drag's standard deviation is as large as that torque
+DRAG_RATE_RAD_S = (
+    0.1  # rate at which the drag's standard deviation equals that of the lab torque
+)
 LEAST_TORQUE_NM = 1e-7  # rms of the random torque that is always assumed
 DEFAULT_CORRELATION_S = 2.0
 MAX_TACHO_RPM = 1000.0
 
-# Unit, quantity, example, minimum and maximum.
+# By option: unit, quantity, example, minimum and maximum.
 RANGES = {
     "inertia_sigma": ("", "share", '"10%"', 1e-3, 0.5),
     "offset_sigma": ("m", "length", '"300 um"', 1e-7, 0.01),
@@ -53,20 +55,20 @@ RANGES = {
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """Standard deviations of what is assumed, all Gaussian.
+    """Standard deviations of the Gaussian errors of the assumed vehicle.
 
     Attributes
     ----------
     inertia_sigma
-        Of each moment of inertia, relative to their mean; products have half of it
+        Each moment of inertia, relative to their mean; half of it for the products
     offset_sigma_m
-        Of the center of mass along each axis, assumed at the bearing's center
+        Center of mass along each axis, which is assumed to be the bearing's center
     wheel_sigma
-        Of each wheel's axial inertia, relative
+        Axial inertia of each wheel, relative
     mount_sigma_rad
-        Of the tracker's axes in the body, about each axis, assumed as known
+        Rotation of the tracker in the body about each axis
     tacho_sigma_rad_s
-        Of every reading of a wheel's speed
+        Each reading of a wheel's speed
     """
 
     inertia_sigma: float
@@ -94,14 +96,14 @@ def parse_uncertainty(
 
 
 class Assumptions(NamedTuple):
-    """What the lab assumes of a vehicle with its trim masses at zero.
+    """The lab's assumptions on a vehicle with its trim masses at zero.
 
     Attributes
     ----------
     prior
-        Of the parameters (`estimator.calibration.mass_properties`)
+        Prior of the parameters (`estimator.calibration.mass_properties`)
     lab
-        Gravity, the Earth's rate, wheel axes, level of the random torque
+        Gravity, Earth rate, wheel axes, level of the random torque
     wheel_inertia_kg_m2
         (n,) assumed axial inertias
     """
@@ -162,12 +164,11 @@ def known_lab(scene: Scene, vehicle: VehicleModel, uncertainty: Uncertainty) -> 
     )
 
 
-# Which mass properties a flight has not shown well enough, what was missing, and how much more
-# would do.
+# Mass properties that a flight has not shown well enough, with the motion that would.
 
 
-LEAST_RATE_DEG_S = 0.05  # below which there is no turn to speak of
-LEAST_INFORMATION = 1e-3  # of what is needed: below it, more of the same does not help
+LEAST_RATE_DEG_S = 0.05  # rate below which a turn does not count
+LEAST_INFORMATION = 1e-3  # fraction of the needed information below which more of the same motion does not help
 AXES = "xyz"
 
 
@@ -178,16 +179,14 @@ def check_observed(
     inertia_bar: float,
     moment_bar_kg_m: Floats,
 ) -> None:
-    """Raise InputError, in one line, if moments of inertia or the moment are less certain than asked.
-
-    of the components of the moment
+    """Raise InputError, in one line, if a moment of inertia or the static moment is less certain than required.
 
     Parameters
     ----------
     inertia_bar
         Standard deviation of a moment of inertia over its value
     moment_bar_kg_m
-        (3,) standard deviations
+        (3,) standard deviations of the components of mass times center of mass
     """
     values = estimate.values
     sigma = estimate.sigma
@@ -219,7 +218,7 @@ def check_observed(
 
 
 def remedy(motion: str, sigma: float, prior_sigma: float, bar: float) -> str:
-    """What would do: the information is that beyond the assumed, which grows with the square of the motion and time."""
+    """Advice on the motion: the information beyond the prior grows with time and with the square of the motion."""
     needed = bar**-2 - prior_sigma**-2
     gained = max(sigma**-2 - prior_sigma**-2, 0.0)
     if gained < LEAST_INFORMATION * needed:
@@ -247,9 +246,9 @@ def largest_tilt_deg(records: Sequence[BearingRecord]) -> float:
 
 
 YAWS_DEG = (0.0, 120.0, 240.0)
-AXES_DEG = (0.0, 90.0, 45.0)  # of the tilting at each of these, from body x
-PERIODS = 2  # of tilting at each yaw
-# of what the wheels can do that the maneuver takes
+AXES_DEG = (0.0, 90.0, 45.0)  # axis of the tilting at each of these yaws, from body x
+PERIODS = 2  # number of periods of tilting at each yaw
+# Fractions of the wheels' torque and momentum that the maneuver uses.
 TORQUE_SHARE = 0.3
 MOMENTUM_SHARE = 0.3
 STOP_MARGIN_DEG = 1.0
@@ -262,7 +261,7 @@ ProgressCallback = Callable[[float, float], None]
 
 
 class BalanceFlight(NamedTuple):
-    """A flight's record, the true vehicle, and how many frames had no attitude or came after a contact.
+    """A flight's record, the true vehicle, and numbers of frames: all, solved, and after a contact.
 
     Attributes
     ----------
@@ -278,7 +277,7 @@ class BalanceFlight(NamedTuple):
 
 
 def check_scene(scene: Scene) -> None:
-    """Refuse a scene whose vehicle cannot be weighed so."""
+    """Raise InputError for a scene whose vehicle cannot be measured in this way."""
     vehicle = scene.vehicle
     if vehicle.mount != "air_bearing":
         raise InputError(
@@ -301,10 +300,10 @@ def check_scene(scene: Scene) -> None:
 
 
 def excited_by_wheels(scene: Scene, vehicle: VehicleModel, tilt_deg: float) -> Scene:
-    """The scene with its wheels at rest at first and a maneuver that tilts the vehicle at three yaw angles.
+    """The scene with wheels at rest at its start and a maneuver that tilts the vehicle at three yaw angles.
 
-    The yaw separates an offset of the center of mass from a horizontal torque that is constant in the lab, the tilt
-    shows the offset's height, and the wheels' momentum, about all three axes, the moments of inertia.
+    The yaw separates an offset of the center of mass from a horizontal torque that is constant in the lab. The tilt
+    shows the height of the offset. The wheels' momentum about all three axes shows the moments of inertia.
     """
     wheels = scene.vehicle.wheels
     if wheels is None:
@@ -358,7 +357,7 @@ def excited_by_wheels(scene: Scene, vehicle: VehicleModel, tilt_deg: float) -> S
 
 
 def excited_by_swing(scene: Scene, tilt_deg: float, number: int) -> Scene:
-    """The scene with the vehicle let go at rest, tilted and at another yaw in every flight, without control."""
+    """The scene with the vehicle released at rest and tilted, at another yaw in every flight, without control."""
     start = {
         "roll_deg": tilt_deg,
         "pitch_deg": tilt_deg / 2,
@@ -385,9 +384,9 @@ def fly(
     uncertainty: Uncertainty,
     watch: ProgressCallback | None,
 ) -> BalanceFlight:
-    """Simulate a flight, render and solve its frames, and return what was measured.
+    """Simulate a flight, render and solve its frames, and return the measurements.
 
-    The frames from the first one near the tilt stop on are left out, because the torque of a contact is unknown.
+    Frames are left out from the first one near the tilt stop on, because the torque of a contact is unknown.
     """
     with open_flight(scene) as flight:
         rows = measured_attitudes(flight, watch)
@@ -428,7 +427,7 @@ def fly(
 def measured_attitudes(
     flight: Flight, watch: ProgressCallback | None
 ) -> list[tuple[float, Rotation, Floats, Floats]]:
-    """Of every frame that the tracker solved: time, attitude, (3, 3) covariance in body axes, and its shared part."""
+    """Of each solved frame: time, attitude, (3, 3) covariance in body axes, and the part of it that frames share."""
     camera = flight.lab.camera
     body_from_cam = camera.mount.cam_from_body.inv()
     R_body_from_cam = body_from_cam.as_matrix()
@@ -458,7 +457,9 @@ def measured_attitudes(
 
 
 def timing_covariance(t_s: Floats, lab_from_body: Rotation, jitter_s: float) -> Floats:
-    """(N, 3, 3) s^2 w w^T of attitudes whose times have the error s, with the rate w of their differences."""
-    turned = (lab_from_body[:-1].inv() * lab_from_body[1:]).as_rotvec() / np.diff(t_s)[:, None]
+    """(N, 3, 3) covariance s^2 w w^T of attitudes whose times have the error s, with the rate w from differences."""
+    turned = (lab_from_body[:-1].inv() * lab_from_body[1:]).as_rotvec() / np.diff(t_s)[
+        :, None
+    ]
     rate = np.vstack([turned[:1], (turned[1:] + turned[:-1]) / 2, turned[-1:]])
     return jitter_s**2 * rate[:, :, None] * rate[:, None, :]

@@ -1,8 +1,9 @@
 """The procedure of `skysim balance`: fly, estimate, move the trim masses, and fly again until the torque is small.
 
-Every estimate takes all flights so far: the trim masses' places, and so their share of inertia and moment, are known.
-The masses move by -(m r) / m_i along their axes, which would bring the center of mass to the bearing's center. The
-gravity torque that remains is at most g |m r|; it is below the bar if the estimate plus two standard deviations is.
+Each estimate is from all flights so far, since the places of the trim masses, and so their part of inertia and moment,
+are known. The masses move by -(m r) / m_i along their axes, which would bring the center of mass to the bearing's
+center. The gravity torque is at most g |m r|. The vehicle is balanced if this plus two standard deviations is below the
+bar.
 """
 
 from __future__ import annotations
@@ -31,25 +32,25 @@ from skysim.experiments.balance_flight import (
 from skysim.experiments.tracker_comparison import with_config
 from skysim.scene.scene import Scene
 
-CONFIDENCE = 2.0  # standard deviations that the estimated torque must stay below the bar
+CONFIDENCE = 2.0  # standard deviations by which the estimated torque must be below the bar
 MAX_SHRINK = 1e-6  # smallest eigenvalue of the trim axes' Gram matrix
 
 
 class BalancePlan(NamedTuple):
-    """How a vehicle is balanced.
+    """Plan by which a vehicle is balanced.
 
     Attributes
     ----------
     excite
-        Wheels or swing
+        Excitation: wheels or swing
     tilt_deg
-        Of the excitation
+        Tilt of the excitation
     torque_bar_nm
-        Residual gravity torque
+        Residual gravity torque to be reached
     max_flights
-        To try
+        Maximum number of flights
     moves
-        False: estimate from one flight only
+        Whether trim masses are moved; if not, the estimate is from one flight
     """
 
     excite: str
@@ -60,12 +61,12 @@ class BalancePlan(NamedTuple):
 
 
 class Bars(NamedTuple):
-    """What must be reached: residual torque, and standard deviations of inertia (relative) and offset.
+    """Goals: residual torque, and standard deviations of inertia (relative) and offset.
 
     Attributes
     ----------
     offset_m
-        None: half of the residual torque over the vehicle's weight
+        If None, half of the residual torque over the vehicle's weight
     """
 
     torque_nm: float
@@ -80,7 +81,7 @@ class Bars(NamedTuple):
 
 
 def parse_bars(torque: str, inertia_percent: float, offset: str | None) -> Bars:
-    """Parse the bars. Raises InputError for what is no torque or length, or not above 0."""
+    """Parse the bars. Raises InputError if one is not a torque or length, or not positive."""
     values: list[float | None] = []
     for name, text, unit, what in (
         ("torque", torque, "N m", "torque"),
@@ -108,9 +109,9 @@ class Iteration(NamedTuple):
     Attributes
     ----------
     estimate
-        Of the vehicle with its trim masses at zero
+        Estimate for the vehicle with its trim masses at zero
     next_m
-        (n,) where the trim masses go next; where they are if they stay
+        (n,) next places of the trim masses; the present ones if they stay
     """
 
     flight: BalanceFlight
@@ -120,7 +121,7 @@ class Iteration(NamedTuple):
 
     @property
     def moment_kg_m(self) -> Floats:
-        """(3,) estimated mass times center of mass, as flown."""
+        """(3,) estimated mass times center of mass, with the trim masses as flown."""
         return self.estimate.moment_kg_m + self.flight.record.added_moment_kg_m
 
     @property
@@ -130,13 +131,13 @@ class Iteration(NamedTuple):
 
     @property
     def torque_bound_nm(self) -> float:
-        """The same with CONFIDENCE standard deviations in the worst direction."""
+        """Largest gravity torque with CONFIDENCE standard deviations added in the worst direction."""
         worst = float(np.linalg.eigvalsh(self.estimate.covariance[MOMENT, MOMENT])[2])
         return self.torque_nm + CONFIDENCE * self.gravity_m_s2 * math.sqrt(worst)
 
     @property
     def true_torque_nm(self) -> float:
-        """The simulated vehicle's."""
+        """Largest gravity torque of the simulated vehicle."""
         mass = self.flight.vehicle.mass
         return float(self.gravity_m_s2 * mass.mass_kg * np.linalg.norm(mass.center_m))
 
@@ -152,7 +153,7 @@ def balance(
     Raises
     ------
     InputError
-        For a vehicle that cannot be balanced so.
+        For a vehicle that cannot be balanced in this way.
     """
     balance_flight.check_scene(scene)
     vehicle = multibody.build(scene.vehicle)
@@ -181,13 +182,13 @@ def balance(
 
 
 def assumed(scene: Scene, uncertainty: Uncertainty) -> Assumptions:
-    """What is assumed of the vehicle with its trim masses at zero."""
+    """The assumptions on the vehicle with its trim masses at zero."""
     at_zero = with_config(scene, "vehicle", trim=None) if scene.vehicle.trim else scene
     return draw_assumptions(scene, multibody.build(at_zero.vehicle), uncertainty)
 
 
 def in_flight(scene: Scene, plan: BalancePlan, number: int, position_m: Floats) -> Scene:
-    """The scene of one flight: trim masses in their places, excitation, frames over all of it, noise of its own."""
+    """The scene of one flight: trim masses in their places, excitation, frames all the time, and its own noise."""
     scene = scene.model_copy(update={"seed": scene.seed + number})
     if scene.vehicle.trim:
         scene = with_config(scene, "vehicle.trim", position_m=tuple(map(float, position_m)))
@@ -220,7 +221,7 @@ def filtered(record: BearingRecord, assumptions: Assumptions) -> MassEstimate:
 
 
 def balanced_position_m(vehicle: VehicleModel, moment_kg_m: Floats, scene: Scene) -> Floats:
-    """(n,) places of the trim masses that cancel a moment (3,) as flown. Raises InputError beyond their travel."""
+    """(n,) places of the trim masses that cancel a (3,) moment as flown. Raises InputError beyond their travel."""
     trims = vehicle.trims
     config = scene.vehicle.trim
     assert config is not None

@@ -1,4 +1,4 @@
-"""Statistics, picture and report of a balance: the estimates by flight, and beside them the simulated vehicle."""
+"""Statistics, picture and report of a balance: the estimates by flight beside the simulated vehicle."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def statistics(
 
 
 def flight_row(number: int, one: Iteration) -> dict[str, Any]:
-    """Numbers of one flight; those that begin with true are of the simulated vehicle."""
+    """Numbers of one flight; names that begin with `true` are of the simulated vehicle."""
     trims = one.flight.vehicle.trims
     mass = one.flight.vehicle.mass
     per_um = 1e6 / mass.mass_kg
@@ -96,13 +96,15 @@ def estimate_rows(flight: BalanceFlight, estimate: MassEstimate) -> list[dict[st
 
 
 def nees(flight: BalanceFlight, estimate: MassEstimate) -> float:
-    """Squared error of the nine mass properties in units of their covariance: chi-square of 9 if that is honest."""
+    """NEES of the nine mass properties: chi-square with 9 degrees of freedom if their covariance is true."""
     nine = slice(INERTIA.start, MOMENT.stop)
     error = estimate.values[nine] - true_values(flight)
     return float(error @ np.linalg.solve(estimate.covariance[nine, nine], error))
 
 
-def balance_figure(iterations: Sequence[Iteration], torque_bar_nm: float) -> NDArray[np.uint8]:
+def balance_figure(
+    iterations: Sequence[Iteration], torque_bar_nm: float
+) -> NDArray[np.uint8]:
     """BGR image: gravity torque and offset of the center of mass flight by flight, and the last flight's attitude."""
     return bgr_image(lambda fig: draw_flights(fig, iterations, torque_bar_nm), (15, 4.5))
 
@@ -112,7 +114,9 @@ def draw_flights(fig: Any, iterations: Sequence[Iteration], torque_bar_nm: float
     torque, offset, motion = fig.subplots(1, 3)
     numbers = np.arange(1, len(iterations) + 1)
     torque.semilogy(numbers, [one.torque_nm for one in iterations], "o-", label="estimate")
-    torque.semilogy(numbers, [one.torque_bound_nm for one in iterations], "v--", label="bound")
+    torque.semilogy(
+        numbers, [one.torque_bound_nm for one in iterations], "v--", label="bound"
+    )
     torque.semilogy(
         numbers, [one.true_torque_nm for one in iterations], "kx", label="simulated vehicle"
     )
@@ -140,7 +144,7 @@ def draw_flights(fig: Any, iterations: Sequence[Iteration], torque_bar_nm: float
 
 
 def filter_rows(one: Iteration, assumptions: Assumptions) -> list[dict[str, Any]]:
-    """As `estimate_rows`, of the filter in flight over an iteration's flight alone."""
+    """As `estimate_rows`, for the filter in flight over the flight of one iteration."""
     return estimate_rows(one.flight, filtered(one.flight.record, assumptions))
 
 
@@ -176,7 +180,7 @@ FLIGHTS = (
 
 
 def verdict(statistics: dict[str, Any]) -> Verdict:
-    """Whether the vehicle is balanced, and how well that is known."""
+    """Whether the vehicle is balanced, with the torque and its bound."""
     flights = statistics["flights"]
     last = flights[-1]
     frames = sum(one["frames"] for one in flights)

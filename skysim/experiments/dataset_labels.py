@@ -30,7 +30,7 @@ MASKS = (SATURATED, PARTICLES, SMEAR)
 REACH_SIGMA = 3.0  # half-width of a source's rectangle, in standard deviations of its image across the streak
 DISC_PX = 2.0  # sources of a larger radius are discs with edges
 EDGE_PX = 3.0  # reach of the blur about the edge of a disc
-STILL_PX = 1e-6  # a shorter streak has no direction
+STILL_PX = 1e-6  # length below which a streak has no direction
 SOURCE = np.dtype(
     [
         ("id", "<i8"),
@@ -60,9 +60,9 @@ class Extents(NamedTuple):
     Attributes
     ----------
     center_px
-        (N, 2)
+        (N, 2) centers
     along
-        (N, 2) unit vector of the streak
+        (N, 2) unit vectors of the streaks
     half_px
         (N, 2) half-length and half-width
     """
@@ -72,7 +72,7 @@ class Extents(NamedTuple):
     half_px: Floats
 
     def of(self, which: NDArray[np.bool_]) -> Extents:
-        """Those of some sources."""
+        """The rectangles of some sources."""
         return Extents(*(part[which] for part in self))
 
 
@@ -86,10 +86,9 @@ class LabelledFrame(NamedTuple):
     extents
         The rectangle about each image
     unmatched_px
-        (M, 2) detections that are no source of the frame: noise, particles, hot pixels
+        (M, 2) detections that are not a source: noise, particles, hot pixels
     masks
-        By name of MASKS, run lengths of `run_lengths`; a mask that the scene cannot have is
-        left out
+        Run lengths of `run_lengths` by name of MASKS, without masks that the scene cannot have
     """
 
     frame: Frame
@@ -101,14 +100,14 @@ class LabelledFrame(NamedTuple):
 
 
 class Labeller(NamedTuple):
-    """What the labels of all frames of one scene take.
+    """Values that the labels of all frames of one scene need.
 
     Attributes
     ----------
     camera, settings
-        What its tracker assumes
+        Camera and settings that the scene's tracker assumes
     threshold_e
-        Least charge that something else than light adds to a pixel of a mask
+        Least charge from particles or smear in a pixel of their masks
     """
 
     camera: Camera
@@ -124,19 +123,21 @@ def labeller(scene: Scene) -> Labeller:
 
 
 def label_frame(setup: TrialSetup, seed: int, by: Labeller | None = None) -> LabelledFrame:
-    """Render a frame trial's frame and its labels. They depend on the setup and the seed alone.
+    """Render the frame of a frame trial, and its labels. They depend only on the setup and the seed.
 
     Parameters
     ----------
     by
-        Of the setup's scene, if there is one already
+        Labeller of the setup's scene, if there is one already
     """
     scene = setup.lab.scene
     by = by or labeller(scene)
     added = AddedCharge(by.threshold_e)
     frame, truth, streak_px = trials.render_trial_frame(setup, seed, added)
     try:
-        found = detect_and_centroid(frame.image_dn, by.camera, by.settings, Clock(), streak_px)
+        found = detect_and_centroid(
+            frame.image_dn, by.camera, by.settings, Clock(), streak_px
+        )
     except ImageError:  # a saturated frame
         found = Centroids.empty()
     sources, unmatched = source_rows(truth.sources, found.xy_px)
@@ -150,7 +151,7 @@ def label_frame(setup: TrialSetup, seed: int, by: Labeller | None = None) -> Lab
 
 
 def least_value(frame: Frame) -> float:
-    """The least value of a saturated pixel, an integer if pixels are, which compares faster."""
+    """The least value of a saturated pixel; an integer if pixels are, since this compares faster."""
     return (
         math.ceil(frame.saturation_dn)
         if frame.image_dn.dtype.kind == "u"
@@ -159,9 +160,9 @@ def least_value(frame: Frame) -> float:
 
 
 def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Floats]:
-    """(N,) labels of the sources, brightest first, and the (M, 2) detections that are none of them.
+    """(N,) labels of the sources, brightest first, and the (M, 2) detections of none of them.
 
-    A detection is that of the brightest source within SAME_LIGHT_PX of it, and half of the streak.
+    A detection belongs to the brightest source whose distance is at most SAME_LIGHT_PX and half of its streak.
     """
     order = np.argsort(-truth.electrons, kind="stable")
     rows = np.zeros(len(order), SOURCE)
@@ -182,8 +183,10 @@ def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Flo
 
 
 @jit
-def brightest_near(found_px: Floats, source_px: Floats, reach_px: Floats) -> NDArray[np.int64]:
-    """(M,) number of the first source that is within its reach of each detection and has none yet; -1 without one."""
+def brightest_near(
+    found_px: Floats, source_px: Floats, reach_px: Floats
+) -> NDArray[np.int64]:
+    """(M,) number of the first free source within reach of each detection; -1 if there is none."""
     chosen = np.full(len(found_px), -1)
     is_free = np.ones(len(source_px), np.bool_)
     for m in range(len(found_px)):
@@ -208,8 +211,9 @@ def add_radii(rows: NDArray[Any], bodies: Sequence[BodyTruth], focal_px: float) 
 def image_extents(rows: NDArray[Any], window: Window, height_px: int) -> Extents:
     """The rectangle about each source's streak.
 
-    It is wider on each side by REACH_SIGMA standard deviations of the blur, or by the radius of a disc and its blurred
-    edge. A rolling shutter exposes the row of a disc's center later than the middle one, and shears the disc.
+    On each side it is wider than the streak by REACH_SIGMA standard deviations of the blur, or by the radius of a disc
+    and its blurred edge. A rolling shutter exposes the row of a disc's center at another time than the middle row, and
+    shears the disc.
     """
     streak = np.nan_to_num(
         np.column_stack([rows["streak_x_px"], rows["streak_y_px"]]).astype(float)
@@ -218,7 +222,7 @@ def image_extents(rows: NDArray[Any], window: Window, height_px: int) -> Extents
     along = np.where(
         length[:, None] > STILL_PX, streak / np.maximum(length, STILL_PX)[:, None], [1.0, 0.0]
     )
-    # Of a source at the row y at mid-exposure: delay = row_time (y + v_y delay - middle row), in exposures.
+    # For a source at the row y at mid-exposure: delay = row_time (y + v_y delay - middle row), in exposures.
     rolling = window.row_time_s / window.exposure_s
     rolling = rolling / np.maximum(1 - rolling * streak[:, 1], 0.1)
     radius = rows["radius_px"].astype(float)
@@ -244,14 +248,14 @@ def across_sigma_px(area_px: Floats, streak_px: Floats) -> Floats:
 
 
 def run_lengths(mask: NDArray[Any], least: float = True) -> list[int]:
-    """Lengths of the runs of a (H, W) mask, column by column, the first of pixels that are not set: COCO's code.
+    """Lengths of the runs of an (H, W) mask, column by column, beginning with pixels that are not set: COCO's code.
 
     Parameters
     ----------
     least
-        Of an image, the least value of a pixel that is set
+        Least value of a pixel that is set
     """
-    rows = np.flatnonzero(mask.max(axis=1) >= least)  # most have no pixel that is set
+    rows = np.flatnonzero(mask.max(axis=1) >= least)  # most rows have no pixel that is set
     y, x = np.nonzero(mask[rows] >= least)
     # A copy of the transposed mask would take ten times longer.
     flat = np.sort(x * len(mask) + rows[y])

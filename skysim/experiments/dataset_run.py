@@ -1,8 +1,8 @@
 """Make the missing shards of a dataset on an engine of the studies, and keep what was made.
 
-A shard is complete when its index, the last of its files, is there. The workers write the files; this process writes
-`dataset.json` first, which says what the dataset is, and nothing later. So it can be killed at any time, and the same
-command continues: frames that are made again have the same bytes.
+A shard is complete when its index, the last of its files, exists. The workers write the files. This process writes only
+`dataset.json`, which describes the dataset, before they begin. So it can be killed at any time, and the same command
+continues: frames that are made again have the same bytes.
 """
 
 from __future__ import annotations
@@ -43,12 +43,11 @@ from skysim.experiments.study.plan import (
     resolve_trial,
 )
 
-# What a dataset is: a scene, the random values of each frame, and how frames are divided into
-# shards.
+# The plan of a dataset: a scene, the random values of each frame, and the division of frames into shards.
 
 
-KEYS = ("schema", "set", "trial", "factors", "hardware")  # of a file of variations
-# Factors of a scene without variations.
+KEYS = ("schema", "set", "trial", "factors", "hardware")  # sections of a file of variations
+# The factors if there are no variations.
 AS_IT_IS: dict[str, Any] = {"variation": {"levels": {"none": {}}}}
 TRACKED = f"{TRIAL}tracked"
 DRAW = 2  # first of the four numbers of a draw's key; seeds of trials and of hardware have up to three
@@ -82,7 +81,7 @@ class DatasetPlan:
         return range(first, min(first + self.frames_per_shard, self.frames))
 
     def draw(self, shard: int, frame: int) -> tuple[dict[str, Value], Settings]:
-        """The level of each factor in a frame, and the settings that they make together."""
+        """The level of each factor in a frame, and the settings of all levels together."""
         levels = {}
         settings = Settings()
         for n, (name, factor) in enumerate(self.factors.items()):
@@ -97,7 +96,7 @@ class DatasetPlan:
         return seed_of(self.spec, 0, frame)
 
     def manifest(self) -> dict[str, Any]:
-        """What makes the frames, for `dataset.json`."""
+        """The description of the dataset for `dataset.json`."""
         spec = self.spec
         return {
             "scene": spec.scene,
@@ -128,7 +127,7 @@ def keys_of(factor: Factor) -> set[str]:
 
 
 def is_of_frame(factor: Factor) -> bool:
-    """Whether a factor sets keys of the trial alone, and is drawn in every frame."""
+    """Whether a factor sets only keys of the trial, so that it is drawn in every frame."""
     return all(key.startswith(TRIAL) for key in keys_of(factor))
 
 
@@ -147,7 +146,7 @@ def load(
     Parameters
     ----------
     scene
-        Name or path
+        Name or path of the scene
     vary
         File with the sections `set`, `trial`, `factors` and `hardware` of a study, or None
     """
@@ -169,7 +168,7 @@ def load(
 
 
 def check_trial(plan: Plan, vary: Path | None) -> None:
-    """Refuse the key of the trial that is for solving alone. Raises InputError."""
+    """Raise InputError for `trial.tracked`, which only affects solving."""
     keys = {*(TRIAL + key for key in plan.spec.trial)}.union(
         *map(keys_of, plan.study.factors.values())
     )
@@ -205,8 +204,10 @@ def study_plan(
         "trial": {**trial, "kind": "frames"},
         "set": settings,
     }
-    # Scenes are found from the folder of the command, not from that of the variations.
-    return study_file.plan_of(tree, text, vary or Path(OVERRIDES.file), Path.cwd() / "dataset")
+    # Scene paths are relative to the folder of the command, not to that of the variations.
+    return study_file.plan_of(
+        tree, text, vary or Path(OVERRIDES.file), Path.cwd() / "dataset"
+    )
 
 
 MANIFEST = "dataset.json"
@@ -215,11 +216,11 @@ INDEX = "index"
 SOURCES = "sources"
 SHARDS = "shards"
 COCO = "coco"
-FOLDERS = {"webdataset": SHARDS, "coco": COCO}  # of the formats that have one
+FOLDERS = {"webdataset": SHARDS, "coco": COCO}  # folders of the formats that have one
 
 
 class ShardResult(NamedTuple):
-    """A shard that was made, or why it was not."""
+    """A shard that was made, or the error that prevented it."""
 
     shard: int
     frames: int
@@ -243,7 +244,7 @@ class DatasetJob:
 
 
 class ShardQueue:
-    """The missing shards, one a chunk."""
+    """The missing shards, one per chunk."""
 
     def __init__(self, missing: list[int]) -> None:
         self.missing = list(reversed(missing))
@@ -256,7 +257,7 @@ class ShardQueue:
         return (Segment(shard, {}, shard, range(shard, shard + 1)),)
 
     def report_time(self, chunk: Chunk, seconds: float) -> None:
-        """The size of a shard is that of the plan."""
+        """Do nothing: the size of a shard is fixed by the plan."""
 
 
 # On the workers.
@@ -266,7 +267,7 @@ def labelled_frames(
     plan: DatasetPlan, shard: int
 ) -> Iterator[tuple[int, dict[str, Any], TrialSetup, LabelledFrame]]:
     """The frames of a shard: number, level of each factor, lab, frame with labels."""
-    known = None  # settings of the frame before
+    known = None  # settings of the previous frame
     for frame in plan.frames_of(shard):
         levels, settings = plan.draw(shard, frame)
         if known is None:
@@ -324,7 +325,7 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
 
 
 def prepare(plan: DatasetPlan, storage: Storage) -> None:
-    """Write the manifest of a new dataset, or check that the one that is there is the plan's. Raises InputError."""
+    """Write the manifest of a new dataset, or check that an existing one is the plan's. Raises InputError."""
     described = {
         "made_by": "skysim",
         "format": FORMAT,
@@ -351,7 +352,7 @@ def prepare(plan: DatasetPlan, storage: Storage) -> None:
 
 
 def folders_of(plan: DatasetPlan) -> tuple[str, ...]:
-    """The folders of a dataset's files, without Zarr's."""
+    """The folders of a dataset's files, except that of Zarr."""
     return (
         INDEX,
         SOURCES,
@@ -360,7 +361,7 @@ def folders_of(plan: DatasetPlan) -> tuple[str, ...]:
 
 
 def check_manifest(storage: Storage, own: dict[str, Any]) -> None:
-    """Raise InputError if a dataset is another one, or of another version."""
+    """Raise InputError if the existing dataset is another one, or of another version."""
     try:
         stored = json.loads(storage.read_text(MANIFEST))
         kept = {key: stored[key] for key in own}
@@ -370,7 +371,9 @@ def check_manifest(storage: Storage, own: dict[str, Any]) -> None:
         ) from None
     if kept["format"] != FORMAT:
         raise InputError(
-            storage.url, f"a dataset of format {kept['format']}", f"{FORMAT}, or another folder"
+            storage.url,
+            f"a dataset of format {kept['format']}",
+            f"{FORMAT}, or another folder",
         )
     if kept["digest"] != own["digest"]:
         raise InputError(
@@ -387,7 +390,7 @@ def check_manifest(storage: Storage, own: dict[str, Any]) -> None:
 
 
 def missing_shards(plan: DatasetPlan, storage: Storage) -> list[int]:
-    """The shards whose index is not there."""
+    """The shards without an index."""
     there = storage.names(INDEX)
     return [
         shard
@@ -397,9 +400,12 @@ def missing_shards(plan: DatasetPlan, storage: Storage) -> list[int]:
 
 
 def run(
-    plan: DatasetPlan, url: str, engine: Engine, watch: Callable[[Progress], Any] | None = None
+    plan: DatasetPlan,
+    url: str,
+    engine: Engine,
+    watch: Callable[[Progress], Any] | None = None,
 ) -> Progress:
-    """Make the missing shards. Progress counts frames, and as failed those of shards that killed their workers."""
+    """Make the missing shards. Progress counts frames; frames of shards that killed their workers count as failed."""
     storage = Storage(url)
     prepare(plan, storage)
     missing = missing_shards(plan, storage)

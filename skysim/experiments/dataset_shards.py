@@ -24,8 +24,7 @@ from skysim.experiments.dataset_labels import MASKS, Extents, LabelledFrame
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 
-# The folder of a dataset: any URL that fsspec knows. A local file appears whole or not at all, as
-# an object does.
+# The folder of a dataset: any URL that fsspec knows. A local file, like an object, appears whole or not at all.
 
 
 EXTRA = "needs optional packages: pip install 'skysim[dataset]'"
@@ -77,9 +76,12 @@ class Storage:
 
     @contextmanager
     def writer(self, name: str) -> Iterator[IO[bytes]]:
-        """A file that is written from its begin to its end."""
+        """A file to be written from beginning to end."""
         if self.is_local:
-            with atomic_file(Path(self.path(name))) as temporary, temporary.open("wb") as file:
+            with (
+                atomic_file(Path(self.path(name))) as temporary,
+                temporary.open("wb") as file,
+            ):
                 yield file
             return
         with self.errors(), self.files.open(self.path(name), "wb") as file:
@@ -102,7 +104,7 @@ class Storage:
 
     @contextmanager
     def errors(self) -> Iterator[None]:
-        """Raise InputError for what a server refuses or a network loses; errors of local files name their file."""
+        """Raise InputError for errors of the server or the network; errors of local files name their file."""
         try:
             yield
         except InputError:
@@ -116,7 +118,7 @@ class Storage:
 ZARR = "images.zarr"
 ZARR_ARRAY = "images"
 BLOCK = 512  # bytes of a block of a tar file
-COCO_SNR = 3.0  # sources below are no annotations; they are in the other labels
+COCO_SNR = 3.0  # sources below have no annotation; they are in the other labels
 CATEGORIES = ("source", *MASKS)
 COMMA, SPACE, MINUS, POINT, ZERO = b", -.0"
 SOURCE_JSON = (
@@ -141,7 +143,7 @@ class TarWriter:
         self.position = 0
 
     def add(self, name: str, *parts: bytes | memoryview) -> int:
-        """Append a file that is made of some parts; return the position of the last part in the tar."""
+        """Append a file made of several parts; return the position of the last part in the tar."""
         header = tarfile.TarInfo(name)
         header.size = sum(len(part) for part in parts)
         self._write(header.tobuf(tarfile.USTAR_FORMAT))
@@ -190,7 +192,7 @@ def add_frame(tar: TarWriter, number: int, one: LabelledFrame, labels: dict[str,
 
 
 def frame_labels(one: LabelledFrame, scene: Scene, numbers: dict[str, Any]) -> dict[str, Any]:
-    """The labels of a frame that are one number each, by column of the index; `numbers` come first."""
+    """The scalar labels of a frame, by column of the index; `numbers` come first."""
     truth = one.truth
     frame = one.frame
     labels = {**numbers, "height": frame.image_dn.shape[0], "width": frame.image_dn.shape[1]}
@@ -207,7 +209,9 @@ def frame_labels(one: LabelledFrame, scene: Scene, numbers: dict[str, Any]) -> d
     }
     if isinstance(scene.light, StarsConfig):
         angles = np.degrees(ra_dec_roll_rad(truth.cam_from_lab))
-        labels |= dict(zip(("ra_deg", "dec_deg", "roll_deg"), map(float, angles), strict=True))
+        labels |= dict(
+            zip(("ra_deg", "dec_deg", "roll_deg"), map(float, angles), strict=True)
+        )
     labels |= {"sources": len(one.sources), "detected": int(one.sources["detected"].sum())}
     labels["unmatched"] = len(one.unmatched_px)
     return labels | {f"{name}_pixels": sum(one.masks.get(name, [])[1::2]) for name in MASKS}
@@ -217,8 +221,10 @@ def frame_labels(one: LabelledFrame, scene: Scene, numbers: dict[str, Any]) -> d
 
 
 def coco_image(labels: dict[str, Any]) -> dict[str, Any]:
-    """The entry of an image; its file is that in the tar of the shard."""
-    name = f"{shard_name('shards', labels['shard'], 'tar')}/{key_of(labels['frame'])}.image.npy"
+    """The entry of an image; its file is in the tar of the shard."""
+    name = (
+        f"{shard_name('shards', labels['shard'], 'tar')}/{key_of(labels['frame'])}.image.npy"
+    )
     return {
         "id": labels["frame"],
         "file_name": name,
@@ -230,7 +236,7 @@ def coco_image(labels: dict[str, Any]) -> dict[str, Any]:
 def coco_annotations(one: LabelledFrame, number: int) -> bytes:
     """JSON objects, joined by commas: outlines of the sources, and masks of the rest as crowds.
 
-    Ids are unique in the dataset. A source is written as `json.dumps` would write it, ten times as fast.
+    Ids are unique in the dataset. A source is written as `json.dumps` would, but ten times as fast.
     """
     seen = one.sources["snr"] >= COCO_SNR
     rows = one.sources[seen]
@@ -298,7 +304,7 @@ def hundredths(numbers: Floats) -> list[str]:
 def _hundredths(
     steps: NDArray[np.int64], negative: NDArray[np.bool_]
 ) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """The ASCII of numbers of hundredths with their signs, and where each row ends in it, after a first 0."""
+    """ASCII text of numbers in hundredths with their signs, and the end of each row in it, after a leading 0."""
     digits = np.empty(20, np.uint8)
     ends = np.zeros(len(steps) + 1, np.int64)
     text = np.empty(steps.size * 25, np.uint8)
@@ -404,9 +410,11 @@ def zarr_is_there(storage: Storage) -> bool:
 
 
 def create_zarr(storage: Storage, frames: int, per_shard: int, image: NDArray[Any]) -> None:
-    """Create the array of all images, of the size and the type of this one; its shards are the dataset's."""
+    """Create the array of all images, with the size and type of this one; its shards are those of the dataset."""
     shape = image.shape
-    group = require_zarr().create_group(storage.zarr_store(ZARR), zarr_format=3, overwrite=True)
+    group = require_zarr().create_group(
+        storage.zarr_store(ZARR), zarr_format=3, overwrite=True
+    )
     group.create_array(
         ZARR_ARRAY,
         shape=(frames, *shape),

@@ -108,7 +108,9 @@ def assumed(lab: Lab) -> Assumed:
     """What the scene's tracker assumes. Raises InputError for a scene without LEDs."""
     scene = lab.scene
     if not isinstance(scene.light, DomeConfig):
-        raise InputError("light.kind", scene.light.kind, "dome, for a calibration by its LEDs")
+        raise InputError(
+            "light.kind", scene.light.kind, "dome, for a calibration by its LEDs"
+        )
     return Assumed(
         scene,
         onboard_model.assumed_camera(scene),
@@ -196,7 +198,11 @@ def sightings(known: Assumed, frames: Sequence[HeldFrame]) -> Iterator[Sighting]
         led, row = name_lights(known, frame)
         if len(led):
             yield Sighting(
-                stop, attitude.inv(), known.leds.id[led], frame.xy_px[row], frame.magnitude[row]
+                stop,
+                attitude.inv(),
+                known.leds.id[led],
+                frame.xy_px[row],
+                frame.magnitude[row],
             )
 
 

@@ -52,7 +52,7 @@ class TrackerScore:
     refusals
         Count of each status other than solved, most frequent first
     errors
-        Arcseconds, over correct solutions only; wrong ones are counted instead
+        Arcseconds, over right solutions only
     time_ms
         Time from image to solution, over the frames on which the tracker did not fail
     """
@@ -102,8 +102,12 @@ def compare_frames(
     for shot in flight.shots(cameras=[0], solves=False, progress=progress):
         rows = {}
         for name in order:
-            if shot.frame.index == 0 and not isinstance(estimators[name], factory.UserTracker):
-                factory.solve_frame(estimators[name], shot.frame)  # compiled before it is timed
+            if shot.frame.index == 0 and not isinstance(
+                estimators[name], factory.UserTracker
+            ):
+                factory.solve_frame(
+                    estimators[name], shot.frame
+                )  # so that it is compiled before it is timed
             report = shot.report if name == closed_loop_tracker else None
             report = report or factory.solve_frame(estimators[name], shot.frame)
             rows[name] = scoring.row(lab.camera, shot.frame, shot.truth, report)
@@ -142,8 +146,10 @@ def score_tracker(tracker: str, rows: Sequence[FrameRow]) -> TrackerScore:
 def write_scores(
     folder: Path, rows: Mapping[str, list[FrameRow]], scene: Scene
 ) -> list[TrackerScore]:
-    """Write solutions.NAME.ecsv of every tracker and scoreboard.ecsv, without `refusals`: the status of each frame is
-    in the solutions. Returns the statistics of each tracker."""
+    """Write solutions.NAME.ecsv of every tracker and scoreboard.ecsv; return the statistics of each tracker.
+
+    The scoreboard does not have `refusals`, since the status of each frame is in the solutions.
+    """
     from astropy.table import Table
 
     scores = [score_tracker(name, tracker_rows) for name, tracker_rows in rows.items()]
@@ -154,7 +160,9 @@ def write_scores(
         )
     score_rows = as_dicts(scores)
     columns = {
-        name: [row[name] for row in score_rows] for name in score_rows[0] if name != "refusals"
+        name: [row[name] for row in score_rows]
+        for name in score_rows[0]
+        if name != "refusals"
     }
     files.write_table(folder / "scoreboard.ecsv", Table(columns))
     return scores

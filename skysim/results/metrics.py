@@ -25,7 +25,9 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 
 WRONG_RAD = np.radians(10 / 60)  # limit of PTASE for a wrong attitude: ten arcminutes
-WRONG_AS_CLAIMED_RAD = np.radians(1)  # limit for an error that the tracker's covariance allows
+WRONG_AS_CLAIMED_RAD = np.radians(
+    1
+)  # limit for an error that the tracker's covariance allows
 OVERCONFIDENCE_PROBABILITY = (
     1e-8  # with which a correct covariance allows an error counted as overconfident
 )
@@ -57,7 +59,9 @@ def is_wrong(error_rad: float, nees: float = np.inf) -> bool:
     nees
         `normalized_error_squared` of the estimate; infinite without a covariance
     """
-    return bool(error_rad > (WRONG_RAD if nees > OVERCONFIDENT_NEES else WRONG_AS_CLAIMED_RAD))
+    return bool(
+        error_rad > (WRONG_RAD if nees > OVERCONFIDENT_NEES else WRONG_AS_CLAIMED_RAD)
+    )
 
 
 def normalized_error_squared(
@@ -187,7 +191,9 @@ def without_resampling(values: Floats, value: float) -> Summary:
 
 def mean_of(values: Floats) -> Summary:
     """The mean with its bootstrap interval: that of `resampled`, or beyond MANY_VALUES of `bootstrap_of_many`."""
-    return bootstrap_of_few(values) if len(values) <= MANY_VALUES else bootstrap_of_many(values)
+    return (
+        bootstrap_of_few(values) if len(values) <= MANY_VALUES else bootstrap_of_many(values)
+    )
 
 
 def rms_of(values: Floats) -> Summary:
@@ -261,7 +267,9 @@ def bootstrap_of_many(values: Floats) -> Summary:
 def resampling_draws() -> tuple[Floats, Floats]:
     """(RESAMPLES, EXTREMES) counts and (RESAMPLES,) normal variables of `bootstrap_of_many`; the seed is fixed."""
     rng = random_stream(2)
-    return rng.poisson(1.0, (RESAMPLES, EXTREMES)).astype(float), rng.standard_normal(RESAMPLES)
+    return rng.poisson(1.0, (RESAMPLES, EXTREMES)).astype(float), rng.standard_normal(
+        RESAMPLES
+    )
 
 
 def quantile(values: Floats, probability: float) -> Summary:

@@ -140,7 +140,9 @@ def to_8bit(
         `display_levels`
     """
     low, high = levels_dn or display_levels(image)
-    top = low + max(high - low, 1.0)  # at least 1 DN, to avoid division by zero in a flat frame
+    top = low + max(
+        high - low, 1.0
+    )  # at least 1 DN, to avoid division by zero in a flat frame
     tabulated = image.dtype == np.uint16
     levels = np.arange(int(image.max()) + 1) if tabulated else image
     stretched = 255 * CURVES[curve](np.clip((levels - low) / (top - low), 0, 1))
@@ -158,7 +160,9 @@ def frame_statistics(image: NDArray, saturation_dn: float) -> FrameStatistics:
     sample = image[:: 2 * SAMPLE_STRIDE, ::SAMPLE_STRIDE].astype(float)
     sky = float(np.median(sample))
     deviation = np.abs(sample - sky)
-    background = sample[deviation <= max(5 * SIGMA_PER_MAD * float(np.median(deviation)), 3.0)]
+    background = sample[
+        deviation <= max(5 * SIGMA_PER_MAD * float(np.median(deviation)), 3.0)
+    ]
     peak = float(image.max())
     saturated = int(np.count_nonzero(image >= saturation_dn)) if peak >= saturation_dn else 0
     return FrameStatistics(sky, float(background.std()), peak, saturated)
@@ -201,7 +205,8 @@ def enlarged(image: NDArray) -> tuple[NDArray[np.uint8], int, int]:
         to_8bit(image, "square root", levels_dn=frame_levels(image)), cv2.COLOR_GRAY2BGR
     )
     picture = np.asarray(
-        cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST), np.uint8
+        cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST),
+        np.uint8,
     )
     return picture, scale, max(8, min(picture.shape[:2]) // 70)
 
@@ -295,7 +300,9 @@ def draw_label(
     cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, 1, cv2.LINE_AA)
 
 
-def contact_sheet(images: list[NDArray], captions: list[str], scale: int) -> NDArray[np.uint8]:
+def contact_sheet(
+    images: list[NDArray], captions: list[str], scale: int
+) -> NDArray[np.uint8]:
     """Frames of one size side by side, enlarged `scale` times and captioned.
 
     All use the black and white levels of the first frame, so that their brightnesses can be compared.

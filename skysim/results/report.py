@@ -39,7 +39,9 @@ TAG = re.compile(r"<(?=[A-Za-z/!?])")
 FENCE = re.compile(r"^`{3,}", re.MULTILINE)
 
 
-def markdown_page(title: str, command: str, blocks: Sequence[Block], pictures: str = "") -> str:
+def markdown_page(
+    title: str, command: str, blocks: Sequence[Block], pictures: str = ""
+) -> str:
     """The page.
 
     Parameters

@@ -78,7 +78,8 @@ class Recorder:
         path = self.folder / f"frame_{frame.index:04d}.fits"
         if preview:
             write_image(
-                path.with_suffix(".preview.png"), annotate_truth(frame.image_dn, truth.sources)
+                path.with_suffix(".preview.png"),
+                annotate_truth(frame.image_dn, truth.sources),
             )
         return path
 
@@ -111,7 +112,9 @@ class Recorder:
             stage: 1e3 * float(np.median(seconds)) for stage, seconds in self.seconds.items()
         }
         flight = (
-            telemetry_report.figure(log) if len(self.rows) > 1 or log.t_s[-1] > SHORT_S else b""
+            telemetry_report.figure(log)
+            if len(self.rows) > 1 or log.t_s[-1] > SHORT_S
+            else b""
         )
         facts = [(name, [text]) for name, text in scene.summary] + [
             (fact.name, fact.lines) for fact in plan.facts

@@ -169,7 +169,11 @@ def frame_table(angles: tuple[str, str, str], rows: Sequence[FrameRow]) -> Table
     lines = []
     for row in rows:
         motion = [row.frame, row.t_s, 1e3 * row.exposure_s, row.rate_deg_s, *row.truth_deg]
-        errors = [*(row.estimate_deg or (None, None, None)), row.cross_arcsec, row.roll_arcsec]
+        errors = [
+            *(row.estimate_deg or (None, None, None)),
+            row.cross_arcsec,
+            row.roll_arcsec,
+        ]
         status = Cell("WRONG", "bad") if row.wrong else row.status
         lines.append([*motion, *errors, row.detected, row.matched, row.time_ms, status])
     return Table(columns, lines, optional=((7, 8, 9), (2,), (14,), (3,), (12,), (4, 5, 6)))

@@ -109,7 +109,9 @@ def rate_errors_deg_s(rate: RateEstimate | None, truth: Truth) -> tuple[float, f
     if rate is None:
         return float("nan"), float("nan")
     signs = (1,) if rate.sign_known else (1, -1)
-    error = min(np.linalg.norm(sign * rate.rate_rad_s - truth.rate_cam_rad_s) for sign in signs)
+    error = min(
+        np.linalg.norm(sign * rate.rate_rad_s - truth.rate_cam_rad_s) for sign in signs
+    )
     return float(np.degrees(error)), float(
         np.degrees(np.sqrt(np.trace(rate.covariance_rad2_s2)))
     )
@@ -153,7 +155,10 @@ def annotated(frame: Frame, truth: Truth, report: Report | None) -> NDArray[np.u
     match = report.attitude.match if report else None
     matched = detected[match.observed] if match else np.empty((0, 2))
     return annotate(
-        frame.image_dn, detected, matched, truth_px=truth.sources.xy_px[visible(truth.sources)]
+        frame.image_dn,
+        detected,
+        matched,
+        truth_px=truth.sources.xy_px[visible(truth.sources)],
     )
 
 

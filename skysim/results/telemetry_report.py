@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -76,47 +76,50 @@ def table(log: Telemetry) -> Any:
 
     columns: dict[str, Any] = {"t_s": log.t_s}
 
-    def add(name: str, values: Floats, components: tuple[str, ...], unit: str) -> None:
+    def add(name: str, values: Floats, components: Sequence[str], unit: str) -> None:
         for component, column in zip(components, values.T, strict=True):
             columns[f"{name}_{component}_{unit}"] = column
 
-    for name, attitude in (
-        ("true", log.lab_from_body),
-        ("commanded", log.lab_from_ref),
-        ("imu", log.lab_from_imu),
-        ("filter", log.lab_from_filter),
-    ):
+    def add_numbered(name: str, values: Floats, unit: str) -> None:
+        numbers = [str(n + 1) for n in range(values.shape[1])]
+        add(name, values, numbers, unit)
+
+    attitudes = {
+        "true": log.lab_from_body,
+        "commanded": log.lab_from_ref,
+        "imu": log.lab_from_imu,
+        "filter": log.lab_from_filter,
+    }
+    for name, attitude in attitudes.items():
         if attitude is not None:
             add(name, euler_deg(attitude), EULER, "deg")
-    if (pointing := attitude_error_deg(log.lab_from_ref, log.lab_from_body)) is not None:
+    pointing = attitude_error_deg(log.lab_from_ref, log.lab_from_body)
+    if pointing is not None:
         columns["pointing_error_deg"] = pointing
     add("rate", np.degrees(log.rate_body_rad_s), AXES, "deg_s")
     add("torque", log.torque_nm, AXES, "nm")
     add("disturbance", log.disturbance_nm, AXES, "nm")
     add("momentum", log.momentum_nms, AXES, "nms")
-    for name, values, unit in (
-        ("wheel", log.wheel_rad_s / RPM_RAD_S, "rpm"),
-        ("gimbal", np.degrees(log.gimbal_rad), "deg"),
-    ):
-        add(name, values, tuple(map(str, range(1, values.shape[1] + 1))), unit)
+    add_numbered("wheel", log.wheel_rad_s / RPM_RAD_S, "rpm")
+    add_numbered("gimbal", np.degrees(log.gimbal_rad), "deg")
     if log.manipulability is not None:
         columns["manipulability"] = log.manipulability
     if log.saturated is not None:
         columns["gyro_saturated"] = log.saturated
-    for name, rates in (
-        ("bias", log.bias_rad_s),
-        ("assumed_bias", log.assumed_bias_rad_s),
-        ("sigma_bias", log.sigma_bias_rad_s),
-    ):
+    biases = {
+        "bias": log.bias_rad_s,
+        "assumed_bias": log.assumed_bias_rad_s,
+        "sigma_bias": log.sigma_bias_rad_s,
+    }
+    for name, rates in biases.items():
         if rates is not None:
             add(name, per_hour(rates), AXES, "deg_h")
     if log.sigma_attitude_rad is not None:
         add("sigma_attitude", np.degrees(log.sigma_attitude_rad) / ARCSEC_DEG, AXES, "arcsec")
     for name, mounting in log.mountings.items():
-        for prefix, values in zip(
-            ("mounting", "sigma_mounting", "true_mounting"), mounting, strict=True
-        ):
-            add(f"{prefix}_{name}", values / ARCSEC_RAD, AXES, "arcsec")
+        add(f"mounting_{name}", mounting.estimate_rad / ARCSEC_RAD, AXES, "arcsec")
+        add(f"sigma_mounting_{name}", mounting.sigma_rad / ARCSEC_RAD, AXES, "arcsec")
+        add(f"true_mounting_{name}", mounting.true_rad / ARCSEC_RAD, AXES, "arcsec")
     return Table(columns)
 
 
@@ -129,7 +132,9 @@ def imu_table(record: Increments) -> Any:
 
     columns: dict[str, Any] = {"t_s": record.t_s}
     columns |= {f"angle_{end}_rad": record.angle_rad[:, n] for n, end in enumerate(AXES)}
-    columns |= {f"velocity_{end}_m_s": record.velocity_m_s[:, n] for n, end in enumerate(AXES)}
+    columns |= {
+        f"velocity_{end}_m_s": record.velocity_m_s[:, n] for n, end in enumerate(AXES)
+    }
     level_deg = np.degrees([tilt_rad(velocity[None]) for velocity in record.velocity_m_s])
     columns["level_roll_deg"], columns["level_pitch_deg"] = level_deg.T
     columns |= {
@@ -148,11 +153,12 @@ def attitude_panel(log: Telemetry, axes: Any) -> None:
 
 
 def attitude_error_panel(log: Telemetry, axes: Any) -> None:
-    for name, attitude, color in (
+    curves = (
         ("command", log.lab_from_ref, "0.6"),
         ("IMU alone", log.lab_from_imu, "tab:red"),
         ("filter", log.lab_from_filter, "tab:green"),
-    ):
+    )
+    for name, attitude, color in curves:
         error_deg = attitude_error_deg(attitude, log.lab_from_body)
         if error_deg is not None:
             axes.semilogy(log.t_s, np.maximum(error_deg, 1e-7), color=color, label=name)
@@ -205,7 +211,8 @@ def bias_panel(log: Telemetry, axes: Any) -> None:
     estimate = per_hour(log.assumed_bias_rad_s)
     sigma = per_hour(log.sigma_bias_rad_s)
     draw_estimate(axes, log.t_s, true, estimate, sigma)
-    limit = max(np.abs(true).max(), np.abs(estimate).max()) + 3 * sigma[len(sigma) // 4 :].max()
+    settled = sigma[len(sigma) // 4 :]
+    limit = max(np.abs(true).max(), np.abs(estimate).max()) + 3 * settled.max()
     axes.set_ylim(-limit, limit)
     axes.set_ylabel("gyro bias [deg/h]\n(dashed: true, band: 3σ)")
 
@@ -245,7 +252,9 @@ def gimbals_panel(log: Telemetry, axes: Any) -> None:
 
 def momentum_panel(log: Telemetry, axes: Any) -> None:
     axes.plot(log.t_s, log.momentum_nms, label=AXES)
-    axes.plot(log.t_s, np.linalg.norm(log.momentum_nms, axis=1), color="k", lw=1, label="norm")
+    axes.plot(
+        log.t_s, np.linalg.norm(log.momentum_nms, axis=1), color="k", lw=1, label="norm"
+    )
     axes.set_ylabel("stored momentum\n[N m s]")
 
 

@@ -58,7 +58,9 @@ def number(units: str, example: str) -> Callable[[str], float]:
     """A parser of a number with or without its unit; `units` is a pattern of the unit."""
 
     def parse(text: str) -> float:
-        match = re.fullmatch(rf"([-+.\de]*?\d\.?)\s*(?:{units})?", text.strip(), re.IGNORECASE)
+        match = re.fullmatch(
+            rf"([-+.\de]*?\d\.?)\s*(?:{units})?", text.strip(), re.IGNORECASE
+        )
         try:
             value = finite(float(match[1] if match else ""))
         except ValueError:

@@ -66,7 +66,9 @@ def preset(name: str, where: str = "camera.preset") -> dict[str, Any]:
     except InputError as error:
         raise error.within(where) from None
     if not isinstance(camera, dict) or "preset" in camera:
-        raise InputError(where, f"{path} is not a camera", "a section camera without a preset")
+        raise InputError(
+            where, f"{path} is not a camera", "a section camera without a preset"
+        )
     return camera
 
 
@@ -78,7 +80,9 @@ def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
     camera = tree.get("camera")
     if not isinstance(camera, dict) or not {"preset", "calibration"} & set(camera):
         return tree
-    own = {key: value for key, value in camera.items() if key not in ("preset", "calibration")}
+    own = {
+        key: value for key, value in camera.items() if key not in ("preset", "calibration")
+    }
     base = preset(str(camera["preset"])) if camera.get("preset") is not None else {}
     if camera.get("calibration") is None:
         return tree | {"camera": merge(base, own)}
@@ -90,7 +94,9 @@ def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
                 "one of the two (null removes a base's)",
             )
     merged = merge(base, own)
-    return tree | {"camera": merged | calibrated_keys(Path(str(camera["calibration"])), merged)}
+    return tree | {
+        "camera": merged | calibrated_keys(Path(str(camera["calibration"])), merged)
+    }
 
 
 def with_heads(tree: dict[str, Any]) -> dict[str, Any]:
@@ -113,7 +119,13 @@ def completed_head(tree: dict[str, Any], head: Any, n: int) -> Any:
         raise error.under(f"heads.{n}") from None
 
 
-CALIBRATED_KEYS = ("width_px", "height_px", "focal_length", "principal_point_px", "distortion")
+CALIBRATED_KEYS = (
+    "width_px",
+    "height_px",
+    "focal_length",
+    "principal_point_px",
+    "distortion",
+)
 
 
 def calibrated_keys(path: Path, camera: dict[str, Any]) -> dict[str, Any]:
@@ -418,7 +430,9 @@ def resolve_files(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
 def resolve_file(folder: Path, tree: Any, *keys: str) -> Any:
     """The tree with the file name under these nested keys made absolute if the file is in the folder."""
     if not keys:
-        return str(folder / tree) if isinstance(tree, str) and is_file(folder / tree) else tree
+        return (
+            str(folder / tree) if isinstance(tree, str) and is_file(folder / tree) else tree
+        )
     if keys[0] == "*" and isinstance(tree, list):
         return [resolve_file(folder, item, *keys[1:]) for item in tree]
     if isinstance(tree, dict) and keys[0] in tree:

@@ -125,10 +125,14 @@ def read(path: Path) -> OpencvCalibration:
     coefficients = matrix(path, tree, "distortion_coefficients", shapes)
     if any(coefficients[5:]):
         raise InputError(
-            path, f"distortion_coefficients: {len(coefficients)} terms", ", ".join(COEFFICIENTS)
+            path,
+            f"distortion_coefficients: {len(coefficients)} terms",
+            ", ".join(COEFFICIENTS),
         )
     k1, k2, p1, p2, k3 = [*coefficients, 0.0][:5]
-    return OpencvCalibration(width, height, math.sqrt(fx * fy), (cx, cy), (k1, k2, p1, p2, k3))
+    return OpencvCalibration(
+        width, height, math.sqrt(fx * fy), (cx, cy), (k1, k2, p1, p2, k3)
+    )
 
 
 def parse_file(path: Path) -> dict[str, Any]:

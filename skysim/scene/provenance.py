@@ -117,7 +117,9 @@ def preset_camera(preset: Located) -> dict[str, Any]:
 
 def with_preset(camera: dict[str, Any]) -> dict[str, Any]:
     """The keys of a camera over those of its preset, and the keys of a calibration over both."""
-    own = {key: value for key, value in camera.items() if key not in ("preset", "calibration")}
+    own = {
+        key: value for key, value in camera.items() if key not in ("preset", "calibration")
+    }
     if preset := camera.get("preset"):
         own = merge(preset_camera(preset), own)
     if (calibration := camera.get("calibration")) and calibration.value is not None:
@@ -184,10 +186,8 @@ def entries(model: ConfigModel, tree: Any, parent: tuple[str, ...] = ()) -> Iter
             yield from entries(value, raw, (*parent, key))
         else:
             written = raw.value if isinstance(raw, Located) and not sections(value) else None
-            origin = next(origins_in(raw), DEFAULT)
-            yield Entry(
-                (*parent, key), plain(value, name) if written is None else written, origin
-            )
+            shown = plain(value, name) if written is None else written
+            yield Entry((*parent, key), shown, next(origins_in(raw), DEFAULT))
 
 
 def origins_in(tree: Any) -> Iterator[Origin]:
@@ -215,7 +215,11 @@ def plain(value: Any, name: str) -> Any:
         }
     if isinstance(value, tuple):
         return [plain(item, name) for item in value]
-    if isinstance(value, dict) or value is None or isinstance(value, bool | datetime.datetime):
+    if (
+        isinstance(value, dict)
+        or value is None
+        or isinstance(value, bool | datetime.datetime)
+    ):
         return value
     if isinstance(value, float) and (unit := si_unit(name)):
         return f"{tidy(value)} {unit}" if math.isfinite(value) else "infinity"

@@ -22,9 +22,9 @@ from skysim.core.units import ConfigModel, Length, Number, Spin, Time
 from skysim.core.yaml_reader import fault_of
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
-from skysim.scene.sections.light import DomeConfig, FurtherLight, Glow, Light, StarsConfig
+from skysim.scene.sections.light import DomeConfig, FurtherLight, Light, StarsConfig
 from skysim.scene.sections.motion import MotionConfig, PointingConfig
-from skysim.scene.sections.surroundings import Coefficient, Orbit, ThermalConfig
+from skysim.scene.sections.surroundings import Coefficient, Glow, Orbit, ThermalConfig
 from skysim.scene.sections.tracker import FilterConfig, SurveyErrorsConfig, TrackerConfig
 from skysim.scene.sections.vehicle import SiteConfig, VehicleConfig
 
@@ -167,10 +167,13 @@ class Scene(ConfigModel):
             self.motion.start, PointingConfig
         ):
             keys = "ra_deg, dec_deg, roll_deg" if sky else "roll_deg, pitch_deg, yaw_deg"
-            raise InputError("motion.start", f"light of kind {self.light.kind} requires {keys}")
+            raise InputError(
+                "motion.start", f"light of kind {self.light.kind} requires {keys}"
+            )
         if not sky and any(glow.kind == "faint_stars" for glow in self.background):
             raise InputError(
-                "background", f"faint_stars requires light of kind stars, not {self.light.kind}"
+                "background",
+                f"faint_stars requires light of kind stars, not {self.light.kind}",
             )
         read_s = getattr(self.camera.shutter, "row_time_s", 0.0) * (self.camera.height_px - 1)
         if read_s > 1 / self.exposure.rate_hz:
@@ -194,7 +197,8 @@ class Scene(ConfigModel):
             key = f"light.layout.{'points.' if nested else ''}camera"
             raise InputError(key, "missing", "that, or vehicle.camera")
         field_deg = tuple(
-            math.degrees(2 * math.atan(side_px / 2 / self.camera.focal_px)) for side_px in chip
+            math.degrees(2 * math.atan(side_px / 2 / self.camera.focal_px))
+            for side_px in chip
         )
         points = points.model_copy(
             update={"camera_m": camera_m, "field_deg": points.field_deg or field_deg}
@@ -309,7 +313,8 @@ class Scene(ConfigModel):
         commanded = getattr(self.vehicle, control.actuators, None)
         if commanded is None and control.actuators != "ideal":
             raise InputError(
-                "motion.control.actuators", f"requires the section vehicle.{control.actuators}"
+                "motion.control.actuators",
+                f"requires the section vehicle.{control.actuators}",
             )
         stores_momentum = commanded is not None and commanded.stores_momentum
         if control.desaturation and not (self.vehicle.fans and stores_momentum):
@@ -320,7 +325,8 @@ class Scene(ConfigModel):
         if {"truth": False, "imu": not imu, "filter": not self.filter}[control.feedback]:
             section = "vehicle.imu" if control.feedback == "imu" else "filter"
             raise InputError(
-                "motion.control.feedback", f"{control.feedback} requires the section {section}"
+                "motion.control.feedback",
+                f"{control.feedback} requires the section {section}",
             )
         return self
 
@@ -443,7 +449,8 @@ class Scene(ConfigModel):
     def _repr_html_(self) -> str:
         """A table of the scene's sections for notebooks."""
         cells = "".join(
-            f"<tr><th>{key}</th><td>{html.escape(text)}</td></tr>" for key, text in self.summary
+            f"<tr><th>{key}</th><td>{html.escape(text)}</td></tr>"
+            for key, text in self.summary
         )
         return f"<h4>{html.escape(self.title)}</h4><table>{cells}</table>"
 

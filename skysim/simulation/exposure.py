@@ -29,7 +29,8 @@ from skysim.camera.detector import (
 )
 from skysim.camera.discs import concatenated, render_bodies
 from skysim.camera.glow import background, stray
-from skysim.camera.render import Window, in_view, project, render
+from skysim.camera.projection import in_view, project
+from skysim.camera.render import Window, render
 from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Floats, Frame, SourceTruth, Trajectory, Truth
 from skysim.simulation.lab import StarCamera
@@ -91,7 +92,11 @@ def render_frame(
     clock.lap("render")
     # 5. Detector.
     image = expose(
-        light_e, window.exposure_s, detector, random_stream(scene.seed, DETECTOR, index), added
+        light_e,
+        window.exposure_s,
+        detector,
+        random_stream(scene.seed, DETECTOR, index),
+        added,
     )
     clock.lap("detector")
     # 6. Frame with the camera's time tag, and truth.
@@ -111,7 +116,11 @@ def render_at_rest(
 
 
 def exposure_of(
-    camera: StarCamera, trajectory: Trajectory, index: int, window: Window, seeds: Seeds | None
+    camera: StarCamera,
+    trajectory: Trajectory,
+    index: int,
+    window: Window,
+    seeds: Seeds | None,
 ) -> Exposure:
     """An exposure of a camera, with mount error and temperature of mid-exposure applied to mount and lens.
 
@@ -223,7 +232,9 @@ def truth_of(beam: Beam, exposure: Exposure, sources: SourceTruth) -> Truth:
         sources,
         hidden_ids(beam, exposure),
         tuple(disc.truth() for disc in beam.discs if disc.id in sources.id),
-        tuple(truth for lit in beam.lits for truth in lit.satellites if truth.id in sources.id),
+        tuple(
+            truth for lit in beam.lits for truth in lit.satellites if truth.id in sources.id
+        ),
     )
 
 

@@ -187,7 +187,9 @@ class Flight:
         keeps_history: bool = True,
     ) -> None:
         if endless and keeps_history:
-            raise InputError("endless", "the history would have no end", "keeps_history=False")
+            raise InputError(
+                "endless", "the history would have no end", "keeps_history=False"
+            )
         self.lab = lab
         self.parts = parts
         self.duration_s = math.inf if endless else lab.duration_s
@@ -273,7 +275,9 @@ class Flight:
         """Raise InputError inside a loop over `shots`."""
         if self.is_in_shots:
             raise InputError(
-                name, "inside a loop over shots, which steps by itself", "observe, or after it"
+                name,
+                "inside a loop over shots, which steps by itself",
+                "observe, or after it",
             )
 
     def simulate_motion(self, progress: Progress | None = None) -> Self:
@@ -321,7 +325,9 @@ class Flight:
         """
         recorder = self.motion.recorder
         if recorder is None:
-            raise InputError("telemetry", "this flight keeps no history", "keeps_history=True")
+            raise InputError(
+                "telemetry", "this flight keeps no history", "keeps_history=True"
+            )
         if not self.now_s:
             raise InputError("telemetry", "the motion has not begun", "after a step")
         reference = self.motion.reference if self.lab.scene.motion.control else None
@@ -404,7 +410,9 @@ class Flight:
     ) -> Iterator[Shot]:
         """Yield the exposures that are due and not yet rendered, in order; a filter is updated with each."""
         has_filter = bool(self.filter_schedules)
-        while due := [one for one in schedules if not one.is_over and one.due_s <= self.now_s]:
+        while due := [
+            one for one in schedules if not one.is_over and one.due_s <= self.now_s
+        ]:
             yield from self.capture_next(
                 earliest(due), solves or has_filter, selects, updates_filter=has_filter
             )
@@ -416,7 +424,9 @@ class Flight:
         while late := [
             one for one in schedules if not one.is_over and one.close_s <= self.now_s
         ]:
-            yield from self.capture_next(earliest(late), solves, selects, updates_filter=False)
+            yield from self.capture_next(
+                earliest(late), solves, selects, updates_filter=False
+            )
 
     def capture_next(
         self,
@@ -438,7 +448,12 @@ class Flight:
         yield shot
 
     def capture(
-        self, schedule: Schedule, index: int, window: Window, solves: bool, updates_filter: bool
+        self,
+        schedule: Schedule,
+        index: int,
+        window: Window,
+        solves: bool,
+        updates_filter: bool,
     ) -> Shot:
         """Render an exposure, solve it, and update the filter with the solution.
 
@@ -460,7 +475,10 @@ class Flight:
         """
         camera = schedule.camera
         simulation = self.motion.simulation
-        if simulation.first_step and simulation.first_step * simulation.step_s > window.open_s:
+        if (
+            simulation.first_step
+            and simulation.first_step * simulation.step_s > window.open_s
+        ):
             raise InputError(
                 "shots", f"the flight has forgotten frame {index}", "keeps_history=True"
             )
@@ -532,7 +550,9 @@ class Flight:
         exposure_s = schedule.exposures_s.get(index)
         if exposure_s is None and scene.tracker.exposure_control:
             raise InputError(
-                "render", f"frame {index} has no exposure time yet", "after it came from shots"
+                "render",
+                f"frame {index} has no exposure time yet",
+                "after it came from shots",
             )
         window = timing.exposure_window(scene, index, exposure_s)
         if not (
@@ -581,7 +601,9 @@ def open_flight(
         For a part that cannot be used, before any long work.
     """
     scene, parts = with_parts(scene, programs, controller, tracker, profile)
-    return Flight(build_lab(scene, parts), parts, endless=endless, keeps_history=keeps_history)
+    return Flight(
+        build_lab(scene, parts), parts, endless=endless, keeps_history=keeps_history
+    )
 
 
 def simulate_motion(scene: Scene, progress: Progress | None = None) -> Flight:

@@ -121,7 +121,9 @@ def with_controller(motion: MotionConfig, controller: Any) -> tuple[MotionConfig
     config = motion.control or ControlConfig()
     if not (isinstance(controller, str) or callable(controller)):
         raise InputError(
-            "controller", type(controller).__name__, "a name, or a callable that takes a set-up"
+            "controller",
+            type(controller).__name__,
+            "a name, or a callable that takes a set-up",
         )
     law = controller if isinstance(controller, str) else name_of(controller)
     changed = motion.model_copy(update={"control": config.model_copy(update={"law": law})})
@@ -301,7 +303,8 @@ class Lab:
         """The same hardware with a scene that has the same hardware: other trackers, exposures or times."""
         scenes = [scene, *(scene.of_head(n) for n in range(len(scene.heads)))]
         cameras = tuple(
-            replace(camera, scene=own) for camera, own in zip(self.cameras, scenes, strict=True)
+            replace(camera, scene=own)
+            for camera, own in zip(self.cameras, scenes, strict=True)
         )
         return replace(self, scene=scene, cameras=cameras)
 
@@ -389,7 +392,9 @@ def check_hardware(scene: Scene, programs: Mapping[str, str], has_tracker: bool)
     if has_tracker:
         TRACKERS.check_name(scene.tracker.name, programs)
     catalog.require_catalog("tracker.catalog", scene.tracker.catalog)
-    EXTENT[scene.camera.psf.kind](scene.camera.psf, scene.camera)  # checks the file of the PSF
+    EXTENT[scene.camera.psf.kind](
+        scene.camera.psf, scene.camera
+    )  # checks the file of the PSF
 
 
 def build_head(

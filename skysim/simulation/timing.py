@@ -39,7 +39,9 @@ def time_tag_error_s(scene: Scene, index: int) -> float:
     if not exposure.time_tag_jitter_s:
         return exposure.time_tag_offset_s
     drawn = np.array(timing_draws(scene.seed, index)[1])
-    return exposure.time_tag_offset_s + float(scaled_errors(exposure.time_tag_jitter_s, drawn))
+    return exposure.time_tag_offset_s + float(
+        scaled_errors(exposure.time_tag_jitter_s, drawn)
+    )
 
 
 @lru_cache(maxsize=64)
@@ -60,7 +62,9 @@ def longest_exposure_s(scene: Scene) -> float:
 
 def frame_end_s(scene: Scene, index: int, exposure_s: float | None = None) -> float:
     """Time until which a motion must last for a frame."""
-    return exposure_window(scene, index, exposure_s).close_s(scene.camera.height_px) + MARGIN_S
+    return (
+        exposure_window(scene, index, exposure_s).close_s(scene.camera.height_px) + MARGIN_S
+    )
 
 
 def duration_s(scene: Scene) -> float:

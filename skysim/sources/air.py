@@ -118,7 +118,9 @@ def hufnagel_valley(sea_m: Floats, above_m: Floats) -> Floats:
     Source: Andrews & Phillips 2005, Laser Beam Propagation through Random Media, section 12.2.
     """
     high = 0.00594 * (21 / 27) ** 2 * (1e-5 * sea_m) ** 10 * np.exp(-sea_m / 1000)
-    return np.asarray(high + 2.7e-16 * np.exp(-sea_m / 1500) + 1.7e-14 * np.exp(-above_m / 100))
+    return np.asarray(
+        high + 2.7e-16 * np.exp(-sea_m / 1500) + 1.7e-14 * np.exp(-above_m / 100)
+    )
 
 
 def wind(sea_m: Floats) -> Floats:
@@ -144,9 +146,8 @@ def factors(variances: Floats, rng: np.random.Generator) -> Floats:
     exp(s g - s^2 / 2) with s^2 = ln(1 + variance) and g standard normal.
     """
     log_variance = np.log1p(variances)
-    return np.asarray(
-        np.exp(np.sqrt(log_variance) * rng.standard_normal(len(variances)) - log_variance / 2)
-    )
+    normal = rng.standard_normal(len(variances))
+    return np.asarray(np.exp(np.sqrt(log_variance) * normal - log_variance / 2))
 
 
 # Extinction: the light that the air absorbs and scatters.

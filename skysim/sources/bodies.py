@@ -20,7 +20,13 @@ from skysim.sources.body_discs import (
     magnitude,
 )
 from skysim.sources.ephemeris import ObserverPlace, Place, place
-from skysim.sources.photometry import SUN, Band, black_body_v0, chromatic_moments, temperature_k
+from skysim.sources.photometry import (
+    SUN,
+    Band,
+    black_body_v0,
+    chromatic_moments,
+    temperature_k,
+)
 
 # Reflected sunlight in photo-electrons, by the albedo of a body at four wavelengths. A planet is no star: methane makes
 # Uranus brightest in blue and dark beyond 700 nm, a color that no black body has.
@@ -194,7 +200,8 @@ class BodyLight:
 def bodies_from(config: BodiesConfig, observer: ObserverPlace, band: Band) -> list[BodyLight]:
     """The chosen bodies as an observer sees them, the farthest first, so that nearer ones are drawn over them."""
     lights = [
-        body_light(name, place(name, observer), observer.tt_jd, band) for name in chosen(config)
+        body_light(name, place(name, observer), observer.tt_jd, band)
+        for name in chosen(config)
     ]
     return sorted(lights, key=lambda light: -light.place.distance_km)
 

@@ -13,6 +13,7 @@ from functools import lru_cache
 from math import cos, sin, sqrt
 from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 
 from skysim.core.constants import AU_KM, JULIAN_YEAR_DAY, SUN_V_MAG
@@ -165,10 +166,186 @@ def _elements(law: int, phase_steps: int, earthshine: float) -> DiscElements:
     # Light and its first moments in each element.
     cells = (ACROSS, SAMPLES, ACROSS, SAMPLES)
     weighted = (light, light * axis, light * axis[:, None])
-    share, share_x, share_y = (one.reshape(cells).sum(axis=(1, 3)).ravel() for one in weighted)
+    share, share_x, share_y = (
+        one.reshape(cells).sum(axis=(1, 3)).ravel() for one in weighted
+    )
     lit = share > 0
     center = np.column_stack([share_x[lit], share_y[lit]]) / share[lit, None]
     return DiscElements(center, share[lit])
+
+
+# A large disc: its light on a lattice of sub-pixels, with several samples per point where that is needed.
+
+
+REACH = 3  # a sample's light is shared among this many points to either side
+
+
+def lattice_light(
+    surface: DiscSurface,
+    count: int,
+    subsamples: int,
+    axis_px: Floats,
+    radius_from_px: Floats,
+    shown: Any,
+) -> Floats:
+    """Map a disc's light on a square lattice of points, [y, x]; the disc must not reach the lattice's edge.
+
+    1. Sample the brightness at `subsamples` places per point in both directions (`cell_light`).
+    2. Share each sample's light among the columns (`_light_rows`), then among the rows (`_light_columns`).
+    3. Scale to unit sum of what the disc emits, hidden or not: sunlight 1 / (1 + e) and earthshine e / (1 + e).
+
+    Parameters
+    ----------
+    axis_px
+        (count * subsamples,) evenly spaced coordinates of the samples in both directions, px from the disc's center
+    radius_from_px
+        (2, 2) coordinates on the disc, in units of its radius, from pixels
+    shown
+        (len(axis_px), len(axis_px)) fraction of each sample that nothing hides; (0, 0) where nothing is hidden
+
+    Returns
+    -------
+    Floats
+        (count, count) fractions of the disc's light
+    """
+    fine = len(axis_px)
+    weights = sharing_weights(subsamples)
+    # Side of a sample's cell in units of the disc's radius.
+    step = float(axis_px[1] - axis_px[0]) * math.sqrt(
+        abs(float(np.linalg.det(radius_from_px)))
+    )
+    matrix = np.ascontiguousarray(radius_from_px)
+    has_earthshine = surface.earthshine > 0
+    sunlit = np.empty((fine, count))
+    earthlit = np.empty((fine, count) if has_earthshine else (0, 0))
+    totals = np.empty((fine, 2))
+    # 1. and 2. Sunlight and earthshine apart: each is scaled by its own sum.
+    _light_rows(
+        sunlit,
+        earthlit,
+        totals,
+        surface.law,
+        surface.phase_rad,
+        axis_px,
+        matrix,
+        step,
+        weights,
+        shown,
+    )
+    of_sun, of_earth = totals.sum(axis=0)
+    # 3. The sum may be 0 for a vanishing crescent.
+    light = np.empty((count, count))
+    of_all = 1 + surface.earthshine
+    _light_columns(light, sunlit, weights, 1 / (of_all * max(of_sun, 1e-300)), False)
+    if has_earthshine:
+        _light_columns(
+            light, earthlit, weights, surface.earthshine / (of_all * of_earth), True
+        )
+    return light
+
+
+def sharing_weights(subsamples: int) -> Floats:
+    """(subsamples, 2 REACH + 1) weights of a sample's light at the points -REACH to REACH from its own.
+
+    Linear weights share the light between the two points next to a sample: a triangular filter, whose spectrum sinc^2
+    suppresses the frequencies that the lattice folds back. Second differences D = -delta^2 undo it at the lower
+    frequencies: 1 / sinc^2 = 1 + D / 12 + D^2 / 90 + ...
+    """
+    # The triangle's weights at the points before, at and after the sample's own.
+    offset = (np.arange(subsamples) + 0.5) / subsamples - 0.5
+    linear = np.stack(
+        [np.maximum(-offset, 0), 1 - np.abs(offset), np.maximum(offset, 0)], axis=1
+    )
+    # 1 + D / 12 + D^2 / 90 as weights of the points -2 to 2.
+    second = np.array([-1.0, 2.0, -1.0])
+    undone = np.convolve(second, second) / 90
+    undone[1:4] += second / 12
+    undone[2] += 1
+    return np.stack([np.convolve(row, undone) for row in linear])
+
+
+@jit(parallel=True)
+def _light_rows(
+    sunlit: Any,
+    earthlit: Any,
+    totals: Any,
+    law: int,
+    phase_rad: float,
+    axis_px: Floats,
+    matrix: Floats,
+    step: float,
+    weights: Floats,
+    shown: Any,
+) -> None:
+    """Light of each row of samples, shared among the lattice's columns.
+
+    Parameters
+    ----------
+    sunlit, earthlit
+        (fine, count) receive the light from the Sun and from the observer's side (earthshine); `earthlit` may be empty
+    totals
+        (fine, 2) receive the sums of each row, hidden light included
+    """
+    count = sunlit.shape[1]
+    subsamples = len(weights)
+    sine = sin(phase_rad)
+    cosine = cos(phase_rad)
+    inner = inner_radius2(step)
+    with_earth = len(earthlit) > 0
+    masked = len(shown) > 0
+    for j in numba.prange(len(axis_px)):
+        # The margin spares tests for the ends of the row.
+        own = np.zeros((2, subsamples, count + 2 * REACH))
+        of_sun = of_earth = 0.0
+        for k in range(count):
+            for m in range(subsamples):
+                i = k * subsamples + m
+                # The sample's coordinates on the disc, in units of its radius.
+                x = matrix[0, 0] * axis_px[i] + matrix[0, 1] * axis_px[j]
+                y = matrix[1, 0] * axis_px[i] + matrix[1, 1] * axis_px[j]
+                from_sun, from_earth = cell_light(law, sine, cosine, x, y, step, inner)
+                of_sun += from_sun
+                of_earth += from_earth
+                part = shown[j, i] if masked else 1.0
+                own[0, m, k + REACH] = part * from_sun
+                own[1, m, k + REACH] = part * from_earth
+        totals[j, 0] = of_sun
+        totals[j, 1] = of_earth
+        _share(sunlit[j], own[0], weights)
+        if with_earth:
+            _share(earthlit[j], own[1], weights)
+
+
+@jit
+def _share(points: Any, samples: Floats, weights: Floats) -> None:
+    """Share the light of (subsamples, count + 2 REACH) samples among (count,) points, in place."""
+    for k in range(len(points)):
+        points[k] = 0.0
+    for d in range(2 * REACH + 1):
+        for m in range(len(weights)):
+            weight = weights[m, d]
+            for k in range(len(points)):
+                points[k] += weight * samples[m, k + 2 * REACH - d]
+
+
+@jit(parallel=True)
+def _light_columns(
+    light: Any, rows: Floats, weights: Floats, scale: float, add: bool
+) -> None:
+    """Share rows of samples among the lattice's rows, scaled; replaces `light` or adds to it."""
+    count = light.shape[1]
+    subsamples = len(weights)
+    for k in numba.prange(count):
+        if not add:
+            for i in range(count):
+                light[k, i] = 0.0
+        # Only rows of the lattice that exist: no margin here.
+        for d in range(max(k + REACH - count + 1, 0), min(2 * REACH, k + REACH) + 1):
+            for m in range(subsamples):
+                weight = scale * weights[m, d]
+                j = (k + REACH - d) * subsamples + m
+                for i in range(count):
+                    light[k, i] += weight * rows[j, i]
 
 
 # V magnitudes. A body at r au from the Sun and d au from the observer, at a phase angle of a degrees, has

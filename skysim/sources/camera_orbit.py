@@ -102,7 +102,9 @@ class CircularOrbit:
         position_m = radius_m * (cosine * toward_node + sine * ahead)
         velocity_m_s = radius_m * rate * (cosine * ahead - sine * toward_node)
         # The node's motion turns the whole plane about the Earth's axis.
-        return GcrsState(position_m, velocity_m_s + np.cross([0.0, 0.0, node_rate], position_m))
+        return GcrsState(
+            position_m, velocity_m_s + np.cross([0.0, 0.0, node_rate], position_m)
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +123,9 @@ class TleOrbit:
             rows = np.flatnonzero(day == one)
             middle_s = float(after_s[rows].mean())
             time = self.start + datetime.timedelta(seconds=middle_s)
-            place, velocity, errors = gcrs_states(self.elements, time, after_s[rows] - middle_s)
+            place, velocity, errors = gcrs_states(
+                self.elements, time, after_s[rows] - middle_s
+            )
             if errors.any():
                 raise InputError(
                     "orbit.file",

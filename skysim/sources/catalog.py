@@ -130,7 +130,9 @@ def write(
     head = {"delimiter": ",", "datatype": datatype}
     # The header is YAML in comments, its entries in the order of `head`.
     comment = yaml.safe_dump(head, sort_keys=False, default_flow_style=None)
-    comment += yaml.safe_dump({"meta": meta | {"rows": len(rows)}}, sort_keys=False, width=105)
+    comment += yaml.safe_dump(
+        {"meta": meta | {"rows": len(rows)}}, sort_keys=False, width=105
+    )
     with (
         files.atomic_file(path) as temporary,
         open(temporary, "w", encoding="utf-8", newline="") as out,

@@ -79,7 +79,9 @@ class Ephemeris(NamedTuple):
 def load_ephemeris() -> Ephemeris:
     """The ephemeris that is shipped with skysim."""
     with np.load(EPHEMERIS, allow_pickle=False) as arrays:
-        names = [name.removesuffix("_days") for name in arrays.files if name.endswith("_days")]
+        names = [
+            name.removesuffix("_days") for name in arrays.files if name.endswith("_days")
+        ]
         series = {
             name: ChebyshevSeries(
                 float(arrays[f"{name}_days"]), float(arrays[f"{name}_unit_km"]), arrays[name]
@@ -154,7 +156,9 @@ def site_in_gcrs(time: datetime.datetime, tt: float, site: SiteConfig) -> GcrsSt
 # Apparent places of the Sun, the Moon and the planets, with distances and the geometry of their light.
 
 
-DEFLECTION_LIMIT = 1e-6  # of `erfa.ld`: within 3' of the Sun's center its deflection is reduced
+DEFLECTION_LIMIT = (
+    1e-6  # of `erfa.ld`: within 3' of the Sun's center its deflection is reduced
+)
 
 
 class Place(NamedTuple):

@@ -126,7 +126,9 @@ def sample(
         seen = tree.query_ball_point(boresight, 2 * np.sin(field_rad / 2), return_length=True)
         seen = np.where(limb > field_rad, seen, 0)
         sun_deg, limb_deg, moon_deg = np.degrees([angles["sun"], limb, angles["moon"]])
-        parts.append(SkySamples(times, sun_deg, limb_deg, moon_deg, np.asarray(seen, np.int64)))
+        parts.append(
+            SkySamples(times, sun_deg, limb_deg, moon_deg, np.asarray(seen, np.int64))
+        )
         watch(first + len(times), len(t_s))
     return SkySamples(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 

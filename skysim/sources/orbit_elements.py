@@ -137,7 +137,9 @@ def read_tle(path: str, lines: list[tuple[int, str]]) -> Iterator[tuple[int, str
 
 def checksum(line: str) -> str:
     """The last character of a line of a TLE: the sum of its digits modulo 10, where a minus counts 1."""
-    return str(sum(int(c) if c.isdigit() and c.isascii() else c == "-" for c in line[:68]) % 10)
+    return str(
+        sum(int(c) if c.isdigit() and c.isascii() else c == "-" for c in line[:68]) % 10
+    )
 
 
 def messages(path: str, text: str) -> Iterator[Mapping[str, Any]]:

@@ -47,7 +47,10 @@ FLAT_M = (400e-9, 1000e-9)
 
 STEP_M = 1e-9  # of the integrals
 LONGEST_NM = 10_000.0  # of a curve; the integral of a longer one would take too many steps
-SUN = (0.650, 0.713)  # B-V and V-I of a G2 star, the zero point of every instrumental magnitude
+SUN = (
+    0.650,
+    0.713,
+)  # B-V and V-I of a G2 star, the zero point of every instrumental magnitude
 Spectrum = str | float  # of an LED: "white" or a file, or the peak wavelength in m
 
 
@@ -129,7 +132,9 @@ class Band:
             (...,)
         """
         grid = self.grid_m()
-        return np.asarray(np.trapezoid(spectrum(grid) * self.response_at(grid), grid, axis=-1))
+        return np.asarray(
+            np.trapezoid(spectrum(grid) * self.response_at(grid), grid, axis=-1)
+        )
 
 
 @lru_cache(maxsize=64)
@@ -186,7 +191,9 @@ def _read_curve(path: Path, _changed_ns: int = 0, largest: float = 1.0) -> Band:
             path, f"not a response curve ({error})", "two columns, wavelength_nm and response"
         ) from None
     # What every curve must satisfy; NaN fails each test.
-    rising = np.all(np.diff(wavelength_nm, prepend=0.0) > 0) and wavelength_nm[-1] <= LONGEST_NM
+    rising = (
+        np.all(np.diff(wavelength_nm, prepend=0.0) > 0) and wavelength_nm[-1] <= LONGEST_NM
+    )
     within = np.all((response >= 0) & (response <= largest) & np.isfinite(response))
     if not (rising and within and np.any(response)):
         raise InputError(
@@ -286,7 +293,9 @@ def black_body_v0(wavelength_m: Floats, temperature_k: Floats) -> Floats:
     # V's zero point fixes the mean of the power in V.
     johnson_v = _read_curve(DATA / "bands" / "johnson_v.csv")
     mean = johnson_v.integral(power) / johnson_v.integral(np.ones_like)
-    return np.asarray(power(wavelength_m) * wavelength_m / HC_J_M * (V0_W_M3 / mean)[..., None])
+    return np.asarray(
+        power(wavelength_m) * wavelength_m / HC_J_M * (V0_W_M3 / mean)[..., None]
+    )
 
 
 @lru_cache(maxsize=64)
@@ -455,7 +464,10 @@ def led_strength_e_s_sr(
 
 
 def radiant_strength_e_s_sr(
-    intensity_w_sr: float | Floats, spectrum: Spectrum, band: Band, fwhm_m: float | None = None
+    intensity_w_sr: float | Floats,
+    spectrum: Spectrum,
+    band: Band,
+    fwhm_m: float | None = None,
 ) -> Floats:
     """Radiant intensity to photo-electrons s^-1 sr^-1: I_e int S R l / (h c) dl / int S dl over the wavelength l.
 
@@ -492,7 +504,9 @@ def colored(peak_m: float, fwhm_m: float) -> Callable[[Floats], Floats]:
     """Gaussian spectrum of a colored LED, per meter of wavelength, with unit integral: sigma = FWHM / sqrt(8 ln 2)."""
     sigma_m = fwhm_m / FWHM_PER_SIGMA
     scale = 1 / (math.sqrt(2 * math.pi) * sigma_m)
-    return lambda wavelength_m: scale * np.exp(-0.5 * ((wavelength_m - peak_m) / sigma_m) ** 2)
+    return lambda wavelength_m: (
+        scale * np.exp(-0.5 * ((wavelength_m - peak_m) / sigma_m) ** 2)
+    )
 
 
 def lumens_per_watt(spectrum: Spectrum, fwhm_m: float | None = None) -> float:

@@ -17,7 +17,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from skysim.core.constants import STANDARD_PRESSURE_HPA, STANDARD_TEMPERATURE_K, ZERO_CELSIUS_K
+from skysim.core.constants import (
+    STANDARD_PRESSURE_HPA,
+    STANDARD_TEMPERATURE_K,
+    ZERO_CELSIUS_K,
+)
 from skysim.core.types import Floats
 
 # The model's own numbers (Hohenkerk & Sinclair 1985): gas constant, molar masses, radius and lapse rate.
@@ -107,7 +111,9 @@ class Atmosphere:
         humidity = weather.humidity
         vapor_hpa = 0.0
         if p_hpa > 0:
-            vapor_hpa = humidity * saturated_hpa / (1 - (1 - humidity) * saturated_hpa / p_hpa)
+            vapor_hpa = (
+                humidity * saturated_hpa / (1 - (1 - humidity) * saturated_hpa / p_hpa)
+            )
         # Vapor is lighter than dry air, so it changes the fall of the pressure with height.
         lighter_hpa = (
             vapor_hpa * (1 - WATER_KG_KMOL / DRY_KG_KMOL) * gamma / (VAPOR_EXPONENT - gamma)
@@ -191,7 +197,9 @@ class Refraction:
         apparent_rad = LOWEST_RAD * np.sin(np.linspace(0, np.pi / 2, RAYS))
         bending_rad = np.zeros(RAYS)
         if weather.pressure_hpa > 0:
-            bending_rad[1:] = refraction_rad(apparent_rad[1:], Atmosphere.from_weather(weather))
+            bending_rad[1:] = refraction_rad(
+                apparent_rad[1:], Atmosphere.from_weather(weather)
+            )
         true_rad = apparent_rad + bending_rad
         self.last_rad = float(true_rad[-1])
         self.spline = CubicSpline(true_rad, bending_rad)

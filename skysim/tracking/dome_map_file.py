@@ -100,11 +100,15 @@ def read_dome_map(path: Path) -> DomeMap:
             [np.ma.filled(table[name].astype(float), np.nan) for name in MAP_COLUMNS]
         )
     except (TypeError, ValueError):
-        raise InputError(path, "", f"numbers in the columns {', '.join(MAP_COLUMNS)}") from None
+        raise InputError(
+            path, "", f"numbers in the columns {', '.join(MAP_COLUMNS)}"
+        ) from None
     # Each LED once, with finite numbers.
     invalid = np.flatnonzero(~np.isfinite(numbers).all(axis=1) | (numbers[:, 4] <= 0))
     if len(invalid):
-        raise InputError(path, f"row {invalid[0] + 1}", "finite numbers, and a sigma_m above 0")
+        raise InputError(
+            path, f"row {invalid[0] + 1}", "finite numbers, and a sigma_m above 0"
+        )
     id_, count = np.unique(numbers[:, 0].astype(np.int64), return_counts=True)
     if count.max() > 1:
         raise InputError(path, f"LED {id_[count > 1][0]} occurs {count.max()} times", "once")

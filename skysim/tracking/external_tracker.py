@@ -71,7 +71,9 @@ class ExternalTracker:
             )
         )
 
-    def solve_frame(self, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
+    def solve_frame(
+        self, frame: Frame, streak_px: tuple[float, float] | None = None
+    ) -> Report:
         """The tracker's report on a frame; streak_px is as in `Picture`."""
         picture = Picture(
             frame.image_dn, frame.index, frame.t_mid_s, frame.exposure_s, streak_px
@@ -154,7 +156,9 @@ class FunctionTracker:
         self.name = name
         self.function = function
 
-    def solve_frame(self, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
+    def solve_frame(
+        self, frame: Frame, streak_px: tuple[float, float] | None = None
+    ) -> Report:
         """The tracker's report on a frame; the function gets a copy of the image."""
         begin_s = time.perf_counter()
         try:

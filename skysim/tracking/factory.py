@@ -87,7 +87,9 @@ def assumed_settings(scene: Scene) -> Settings:
     return Settings(
         max_blobs=config.brightest or default.max_blobs,
         base_stars=min(config.brightest or default.base_stars, default.base_stars),
-        searched_stars=min(config.brightest or default.searched_stars, default.searched_stars),
+        searched_stars=min(
+            config.brightest or default.searched_stars, default.searched_stars
+        ),
         threshold_sigma=config.threshold_sigma,
         min_area_px=config.min_area_px,
         gain_e_dn=scene.camera.detector.gain_e_dn,
@@ -134,10 +136,6 @@ def build_tracker(
     """The star tracker with the hardware parameters that it assumes: those of the scene's section `tracker`, or the
     true ones.
 
-    1. Camera and settings.
-    2. Under a dome: LED map and lever, from the survey or from a map's file, and a tracker of LEDs.
-    3. Under stars: catalog with apparent directions, and a tracker of stars.
-
     Parameters
     ----------
     scene
@@ -154,31 +152,46 @@ def build_tracker(
     InputError
         For a dome or a catalog that the tracker cannot use.
     """
-    # 1. Camera and settings.
+    if isinstance(scene.light, DomeConfig):
+        return build_dome_tracker(scene, scene.light, mount, sources, programs)
+    return build_sky_tracker(scene, programs)
+
+
+def build_dome_tracker(
+    scene: Scene,
+    dome: DomeConfig,
+    mount: Mount,
+    sources: Sources,
+    programs: Mapping[str, str],
+) -> DomeTracker | CodedTracker | ExternalTracker:
+    """The tracker of LEDs, with LED map and lever from the survey or from a map's file. Raises InputError."""
+    settings = assumed_settings(scene)
+    camera = assumed_camera(scene)
+    leds = assumed_dome(scene, dome, sources)
+    lever = assumed_lever(scene, mount)
+    if scene.tracker.map:
+        camera, leds, lever = surveyed_dome(scene, scene.tracker.map, leds, lever)
+    leds = with_brightness(scene, dome, leds, lever)
+    if scene.tracker.name != OWN:
+        return ExternalTracker.start(
+            scene, camera, settings, external_tracker.led_map(leds, lever), programs
+        )
+    try:
+        if scene.tracker.decoder is None:
+            return DomeTracker(camera, leds, lever, settings)
+        code = assumed_code(dome, sources, leds)
+        decoder = DecoderSettings(**scene.tracker.decoder.model_dump())
+        return CodedTracker(camera, leds, lever, settings, code, decoder)
+    except ImageError as error:
+        raise InputError("light", f"the star tracker cannot use this dome: {error}") from None
+
+
+def build_sky_tracker(
+    scene: Scene, programs: Mapping[str, str]
+) -> StarTracker | ExternalTracker:
+    """The tracker of stars, with their apparent directions from its catalog. Raises InputError."""
     camera = assumed_camera(scene)
     settings = assumed_settings(scene)
-    # 2. Dome.
-    if isinstance(scene.light, DomeConfig):
-        leds = assumed_dome(scene, scene.light, sources)
-        lever = assumed_lever(scene, mount)
-        if scene.tracker.map:
-            camera, leds, lever = surveyed_dome(scene, scene.tracker.map, leds, lever)
-        leds = with_brightness(scene, scene.light, leds, lever)
-        if scene.tracker.name != OWN:
-            return ExternalTracker.start(
-                scene, camera, settings, external_tracker.led_map(leds, lever), programs
-            )
-        try:
-            if scene.tracker.decoder is None:
-                return DomeTracker(camera, leds, lever, settings)
-            code = assumed_code(scene.light, sources, leds)
-            decoder = DecoderSettings(**scene.tracker.decoder.model_dump())
-            return CodedTracker(camera, leds, lever, settings, code, decoder)
-        except ImageError as error:
-            raise InputError(
-                "light", f"the star tracker cannot use this dome: {error}"
-            ) from None
-    # 3. Stars.
     stars = catalog.brighter_than(
         onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag
     )
@@ -231,7 +244,9 @@ def solve_frame(
         return Report(Attitude(str(error)), Centroids.empty())
 
 
-def solve_centroids(estimator: Estimator, centroids: Centroids, exposure_s: float) -> Attitude:
+def solve_centroids(
+    estimator: Estimator, centroids: Centroids, exposure_s: float
+) -> Attitude:
     """The tracker's attitude from centroids; a dome tracker needs the exposure time for the lights' brightness."""
     if isinstance(estimator, DomeTracker):
         return estimator.solve_centroids(centroids, exposure_s=exposure_s)
@@ -289,6 +304,8 @@ def observe_frame(settings: Settings, control: Control, frame: Frame) -> Observa
             FramePriors(None, settings.saturation),
         )
     except ImageError:  # a coarse converter may give a frame of one value: no blobs
-        return observe(frame.image_dn, np.empty((0, 4), np.int64), settings.saturation, control)
+        return observe(
+            frame.image_dn, np.empty((0, 4), np.int64), settings.saturation, control
+        )
     box_px = blobs.box_px[blobs.flag & settings.reject == 0]
     return observe(frame.image_dn, box_px, settings.saturation, control)

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import Attitude, RateEstimate
+from estimator.filter.error_models import GyroModel, JumpModel, TrackerModel
 from estimator.filter.mekf import AttitudeFilter
-from estimator.filter.states import GyroModel, JumpModel, TrackerModel
 from skysim.camera.render import Window
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD, DEG_H_RAD_S, EARTH_RATE_RAD_S, HOUR_S, PPM
@@ -55,7 +55,9 @@ def rate_of_frame(
     if not during.any() or samples.saturated[during].any():
         return None
     rate = samples.angle_rad[during].mean(axis=0) / samples.step_s
-    sigma = sigma_rad_s(config, float(np.linalg.norm(rate)), int(during.sum()) * samples.step_s)
+    sigma = sigma_rad_s(
+        config, float(np.linalg.norm(rate)), int(during.sum()) * samples.step_s
+    )
     return RateEstimate(mount.cam_from_body.apply(rate), sigma**2 * np.eye(3))
 
 
@@ -132,7 +134,9 @@ class Navigation:
         self.navigator = imu.Navigator(
             assumed.as_quat(scalar_first=True), self.earth_compensated_rad_s
         )
-        self.filter = build_filter(scene.filter, assumed, len(mounts)) if scene.filter else None
+        self.filter = (
+            build_filter(scene.filter, assumed, len(mounts)) if scene.filter else None
+        )
         self.time_tag_sigma_s = scene.filter.time_tag_sigma_s if scene.filter else 0.0
         self.kept_s = kept_s
         self.measured = list[imu.Increments]()
@@ -268,7 +272,9 @@ class Navigation:
         return self.filter.rate_rad_s
 
 
-def zeroed_attitude(lab_from_body: Rotation, error_deg: tuple[float, float, float]) -> Rotation:
+def zeroed_attitude(
+    lab_from_body: Rotation, error_deg: tuple[float, float, float]
+) -> Rotation:
     """The attitude to which the navigator is zeroed: the true one minus the error in roll, pitch, yaw."""
     yaw, pitch, roll = lab_from_body.as_euler("ZYX", degrees=True)
     angles_deg = [yaw - error_deg[2], pitch - error_deg[1], roll - error_deg[0]]

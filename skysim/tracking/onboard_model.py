@@ -142,7 +142,9 @@ def surveyed_dome(
             f"{size_px} px",
         )
     order = np.argsort(leds.id)
-    row = order[np.minimum(np.searchsorted(leds.id, dome_map.id, sorter=order), len(order) - 1)]
+    row = order[
+        np.minimum(np.searchsorted(leds.id, dome_map.id, sorter=order), len(order) - 1)
+    ]
     unknown = dome_map.id[leds.id[row] != dome_map.id]
     if len(unknown):
         raise InputError(
@@ -267,7 +269,9 @@ class OrbitStarTracker(StarTracker):
 
 def assumed_orbit(scene: Scene) -> CameraOrbit | None:
     """The orbit whose velocity the tracker knows; None on the ground, or without `tracker.orbit_velocity`."""
-    return build_orbit(scene.orbit, scene.start_time) if scene.tracker.orbit_velocity else None
+    return (
+        build_orbit(scene.orbit, scene.start_time) if scene.tracker.orbit_velocity else None
+    )
 
 
 def assumed_observer(scene: Scene, orbit: CameraOrbit | None) -> catalog.Observer:

@@ -57,7 +57,8 @@ class Tetra3rs:
         self.database: Any = tetra3rs.SolverDatabase.generate_from_gaia(
             max_fov_deg=self.camera.fov_deg * FIELD_MARGIN,
             star_max_magnitude=setup.options.get("limit_mag"),
-            epoch_proper_motion_year=moment.year + moment.timetuple().tm_yday / JULIAN_YEAR_DAY,
+            epoch_proper_motion_year=moment.year
+            + moment.timetuple().tm_yday / JULIAN_YEAR_DAY,
         )
 
     def solve(self, picture: Picture) -> Answer:
@@ -76,7 +77,9 @@ class Tetra3rs:
             camera_model=self.camera,
             observer_velocity_km_s=self.velocity_km_s,
         )
-        centered_px = np.array([(centroid.x, centroid.y) for centroid in extraction.centroids])
+        centered_px = np.array(
+            [(centroid.x, centroid.y) for centroid in extraction.centroids]
+        )
         xy_px = centered_px.reshape(-1, 2) + self.image_center_px
         if not solution:
             return Answer(str(solution.status).replace("_", " "), centroids_px=xy_px)

@@ -251,7 +251,9 @@ def check_answer(answer: Any) -> Answer:
     )
     if seconds is not None and seconds < 0:
         raise ValueError(f"seconds {seconds:g}; allowed: 0 or more")
-    return Answer(status, quaternion, covariance, check_centroids(answer.centroids_px), seconds)
+    return Answer(
+        status, quaternion, covariance, check_centroids(answer.centroids_px), seconds
+    )
 
 
 def normalize_quaternion(quaternion: Floats) -> Floats:
@@ -314,7 +316,9 @@ def program_commands(options: Sequence[str] | None) -> dict[str, str]:
         name, equals, command = option.partition("=")
         if not equals or not NAME.fullmatch(name) or not command.strip():
             raise InputError(
-                "programs", option, "NAME=COMMAND, NAME of lower-case letters, digits, _ and -"
+                "programs",
+                option,
+                "NAME=COMMAND, NAME of lower-case letters, digits, _ and -",
             )
         taken = {known for kind in kinds for known in (*kind.own, *kind.entry_points())}
         if name in taken or name in programs:
@@ -462,5 +466,10 @@ class TrackerProgram(Program):
         dtype = "<u2" if picture.image_dn.dtype == np.uint16 else "<f8"
         pixels = np.ascontiguousarray(picture.image_dn, dtype=dtype).tobytes()
         height, width = picture.image_dn.shape
-        header |= {"width_px": width, "height_px": height, "dtype": dtype, "bytes": len(pixels)}
+        header |= {
+            "width_px": width,
+            "height_px": height,
+            "dtype": dtype,
+            "bytes": len(pixels),
+        }
         return [(json.dumps(header) + "\n").encode(), pixels]

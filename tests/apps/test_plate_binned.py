@@ -48,7 +48,9 @@ def test_a_defocused_image_is_solved_binned_and_reported_as_such(
     outcome = plate_solver.solve_picture(images.ViewedImage(blurred), solver, None)
     found = plate_solver.outcome_fields(outcome, None)
     assert found["status"] == "solved"
-    assert math.degrees((outcome.report.attitude.cam_from_ref * truth.inv()).magnitude()) < 0.1
+    assert (
+        math.degrees((outcome.report.attitude.cam_from_ref * truth.inv()).magnitude()) < 0.1
+    )
     assert found["fov_deg"] == pytest.approx(SHOT.fov_deg, rel=0.01)
     assert found["hint"] == "its lights are large: they were found in the picture binned 4x4"
 
@@ -73,10 +75,14 @@ def test_centroids_of_a_binned_image_are_in_its_full_resolution_pixels() -> None
 def test_sharp_pictures_and_small_ones_are_not_binned(blurred: NDArray) -> None:
     rng = np.random.default_rng(4)
     light = np.zeros((1000, 1300))
-    light[rng.integers(0, 1000, 60), rng.integers(0, 1300, 60)] = rng.uniform(1000, 30_000, 60)
+    light[rng.integers(0, 1000, 60), rng.integers(0, 1300, 60)] = rng.uniform(
+        1000, 30_000, 60
+    )
     sharp = 300 + 20 * rng.standard_normal(light.shape) + cv2.GaussianBlur(light, (0, 0), 1.2)
     assert list(retries.large_lights(sharp.astype(np.uint16), Settings())) == []
-    assert [factor for factor, _ in retries.large_lights(blurred[:850, :850], Settings())] == [
+    assert [
+        factor for factor, _ in retries.large_lights(blurred[:850, :850], Settings())
+    ] == [
         4,
         2,
     ]
@@ -90,7 +96,9 @@ def test_a_binned_image_needs_more_evidence(
     """Required chance probability: a thousand times less than for the full image, so none is added."""
     tries = []
 
-    def never(pixels: NDArray, solver: plate_solver.Solver, *_: object) -> tuple[Report, None]:
+    def never(
+        pixels: NDArray, solver: plate_solver.Solver, *_: object
+    ) -> tuple[Report, None]:
         tries.append(solver.hypotheses)
         return Report(Attitude("no"), Centroids.empty()), None
 

@@ -67,7 +67,10 @@ def disk(radius_px: int) -> NDArray:
 def trail(length_px: int) -> NDArray:
     """The trail of a star, at a slope of one half."""
     return cv2.line(
-        np.zeros((length_px, length_px), np.float32), (0, 0), (length_px - 1, length_px // 2), 1
+        np.zeros((length_px, length_px), np.float32),
+        (0, 0),
+        (length_px - 1, length_px // 2),
+        1,
     )
 
 

@@ -90,7 +90,9 @@ def with_exif(
     return path
 
 
-make_solver = functools.lru_cache(maxsize=8)(plate_solver.make_solver)  # it keeps its trackers
+make_solver = functools.lru_cache(maxsize=8)(
+    plate_solver.make_solver
+)  # it keeps its trackers
 
 
 def answer(
@@ -192,9 +194,13 @@ def test_trackers_are_cached_by_their_uncertainty(gray: NDArray) -> None:
     # Of the same picture: they share their trackers' cache.
     by_exif = solver.replace(default_solver, fov_uncertainty=0.1)
     first, second, again = (
-        next(one.trackers(640, 480, None)) for one in (default_solver, by_exif, default_solver)
+        next(one.trackers(640, 480, None))
+        for one in (default_solver, by_exif, default_solver)
     )
-    assert (first.focal_uncertainty, second.focal_uncertainty) == (solver.FOV_UNCERTAINTY, 0.1)
+    assert (first.focal_uncertainty, second.focal_uncertainty) == (
+        solver.FOV_UNCERTAINTY,
+        0.1,
+    )
     assert first is again
 
 
@@ -213,7 +219,9 @@ def test_a_wrong_exif_focal_length_is_abandoned(
     check_right(answer(with_exif(tmp_path / "x.jpg", gray, 1, 50), None), sky[2])
     for absurd in (1, 65_000):
         unknown = plate_solver.make_solver(None, None)
-        (only,) = plate_picture.hypotheses(images.ViewedImage(gray, focal_35mm=absurd), unknown)
+        (only,) = plate_picture.hypotheses(
+            images.ViewedImage(gray, focal_35mm=absurd), unknown
+        )
         assert (only.solver.fov_deg, only.solver.hypotheses) == (None, 1)
 
 
@@ -280,9 +288,9 @@ def test_a_fits_image_has_the_same_attitude_in_either_row_order(
 def test_a_mirrored_fits_picture_of_known_order_is_refused(
     sky: tuple[Scene, Frame, Truth], tmp_path: Path
 ) -> None:
-    fits.PrimaryHDU(sky[1].image_dn[:, ::-1], fits.Header([("ROWORDER", "TOP-DOWN")])).writeto(
-        tmp_path / "x.fits"
-    )
+    fits.PrimaryHDU(
+        sky[1].image_dn[:, ::-1], fits.Header([("ROWORDER", "TOP-DOWN")])
+    ).writeto(tmp_path / "x.fits")
     found = answer(tmp_path / "x.fits")
     assert found["ra_deg"] is None
     assert "perhaps mirrored: it solves when flipped left to right" in found["hint"]
@@ -307,7 +315,14 @@ def test_our_frames_state_their_row_order_and_are_read_unchanged(
 def test_a_folder_stands_for_the_list_of_its_images(tmp_path: Path) -> None:
     inner = tmp_path / "folder.jpg"
     inner.mkdir()
-    for name in ("b.JPG", "a.fits.gz", "c.annotated.png", ".hidden.png", "notes.txt", "d.tiff"):
+    for name in (
+        "b.JPG",
+        "a.fits.gz",
+        "c.annotated.png",
+        ".hidden.png",
+        "notes.txt",
+        "d.tiff",
+    ):
         (inner / name).write_bytes(b"")
     other = tmp_path / "x.png"
     listed = plate_solver.pictures_in([other, inner])
@@ -341,7 +356,7 @@ def test_annotated_images_have_the_images_names() -> None:
 
 
 def test_stars_have_their_catalog_s_designation() -> None:
-    assert [solver.star_name(n) for n in (71683, 1_048_915, 2_345_678)] == [
+    assert [plate_picture.star_name(n) for n in (71683, 1_048_915, 2_345_678)] == [
         "HIP 71683",
         "HD 48915",
         "Gaia 345678",

@@ -106,7 +106,9 @@ def test_faint_trails_are_detected_along_a_streak_found_in_binned_pixels(number:
     vectors = catalog.at_epoch(stars, 2020)
     image, truth = photographs.draw(shot, stars, vectors, rng)
     seen = truth.apply(vectors)
-    xy_px = shot.camera.pixels(seen[(seen[:, 2] > 0.9) & (stars.v_mag < shot.limit_mag + 0.5)])
+    xy_px = shot.camera.pixels(
+        seen[(seen[:, 2] > 0.9) & (stars.v_mag < shot.limit_mag + 0.5)]
+    )
 
     def right(found: Centroids) -> int:
         off = np.linalg.norm(xy_px[:, None] - found.xy_px, axis=2)
@@ -154,7 +156,8 @@ def test_halves_cover_the_image_and_are_not_tried_with_few_lights() -> None:
     efforts, upper = parts[retries.HALF.format("upper")]
     assert (efforts, len(upper)) == (retries.MORE_EFFORTS, 30)
     assert (
-        len(parts[retries.HALF.format("left")][1]) + len(parts[retries.HALF.format("right")][1])
+        len(parts[retries.HALF.format("left")][1])
+        + len(parts[retries.HALF.format("right")][1])
         == 39
     )
 

@@ -47,7 +47,9 @@ def test_every_field_from_two_to_a_hundred_degrees_has_a_tracker(
 
 
 def test_a_given_field_is_the_only_one_tried() -> None:
-    ((camera, uncertainty),) = plate_solver.make_solver(12.0, None).candidate_cameras(640, 480)
+    ((camera, uncertainty),) = plate_solver.make_solver(12.0, None).candidate_cameras(
+        640, 480
+    )
     assert np.degrees(camera.fov_rad) == pytest.approx(12.0, abs=1e-9)
     assert 0.05 < uncertainty < 0.06
     ((known, none),) = plate_solver.make_solver(

@@ -111,7 +111,8 @@ def compare(area: str, cases: dict[str, Case]) -> bool:
     now = measured(area, cases)
     before = recorded(area, cases)
     lines = [
-        f"  {line}; numbers may differ for that" for line in differences(read(area)["machine"])
+        f"  {line}; numbers may differ for that"
+        for line in differences(read(area)["machine"])
     ]
     lines += [f"  gone     {key}: {before[key]}" for key in before if key not in now]
     lines += [f"  new      {key}: {now[key]}" for key in now if key not in before]
@@ -138,7 +139,9 @@ def main() -> int:
         help=f"{', '.join(AREAS)}, or AREA/CASE with * and ?",
     )
     parser.add_argument(
-        "--record", action="store_true", help="write the digests instead of comparing with them"
+        "--record",
+        action="store_true",
+        help="write the digests instead of comparing with them",
     )
     parser.add_argument(
         "--all", action="store_true", help=f"also the cases {LONG}..., which take minutes"

@@ -138,7 +138,16 @@ def run_study(name: str, verb: str, keys: dict[str, Any], folder: Path) -> Entri
     """The table of a study, and the rows of each of its points without times."""
     overrides = [word for key, value in keys.items() for word in ("--set", f"{key}={value}")]
     ran = succeed(
-        folder, "study", verb, name, "--engine", "serial", "--json", "--out", "out", *overrides
+        folder,
+        "study",
+        verb,
+        name,
+        "--engine",
+        "serial",
+        "--json",
+        "--out",
+        "out",
+        *overrides,
     )
     report = json.loads(ran.out)
     yield from prefixed("table", digest.values(report.pop("points")))
@@ -159,7 +168,9 @@ def run_session(lines: list[str], folder: Path) -> Entries:
         ran = run(folder, *shlex.split(line))
         yield f"{line}: exit code", str(ran.code)
         if "--json" in line:
-            yield from prefixed(f"{line}:", iter(digest.structure(json.loads(ran.out)).items()))
+            yield from prefixed(
+                f"{line}:", iter(digest.structure(json.loads(ran.out)).items())
+            )
         else:
             yield f"{line}: text", digest.sha(ran.out)
 
@@ -231,7 +242,8 @@ AREAS: dict[str, Callable[[], dict[str, Case]]] = {
         for name, lines in CASES["contracts"]["sessions"].items()
     },
     "streams": lambda: {
-        scene: partial(run_stream, scene) for scene in ("shefex2", "afit_simsat", "simsat_bump")
+        scene: partial(run_stream, scene)
+        for scene in ("shefex2", "afit_simsat", "simsat_bump")
     },
     "surveys": lambda: {
         name: partial(run_survey, words) for name, words in CASES["surveys"].items()

@@ -21,7 +21,9 @@ CHANGING = re.compile(r"(\w*_)?(time_ms\w*|stages_ms|seconds|late_ms\w*|unix_s|c
 
 def sha(data: bytes | str) -> str:
     """The beginning of the SHA-256 of bytes, or of a text in UTF-8."""
-    return hashlib.sha256(data.encode() if isinstance(data, str) else data).hexdigest()[:DIGITS]
+    return hashlib.sha256(data.encode() if isinstance(data, str) else data).hexdigest()[
+        :DIGITS
+    ]
 
 
 def array(values: np.ndarray) -> str:

@@ -24,7 +24,9 @@ def machine() -> dict[str, str]:
     """Instruction sets that numpy found, and the versions of Python and of the libraries."""
     simd = np.show_config(mode="dicts")["SIMD Extensions"]  # type: ignore[call-overload]
     return {
-        "processor": " ".join([platform.machine(), *simd["baseline"], *simd.get("found", [])]),
+        "processor": " ".join(
+            [platform.machine(), *simd["baseline"], *simd.get("found", [])]
+        ),
         "python": platform.python_version(),
         **{name: version(name) for name in LIBRARIES},
     }

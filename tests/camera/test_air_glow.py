@@ -10,7 +10,7 @@ from skysim.camera.glow.air_glow import airglow_nl, diffuse_air_mass, seen_place
 from skysim.camera.glow.background import NANOLAMBERT_V0, glow_map
 from skysim.core.types import Floats
 from skysim.scene.loader import load
-from skysim.scene.sections.light import SkyGlowConfig
+from skysim.scene.sections.surroundings import SkyGlowConfig
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.lights.atmosphere import AirEffects, AirGlow

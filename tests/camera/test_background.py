@@ -24,7 +24,7 @@ from skysim.camera.glow.background import (
     viewing_geometry,
 )
 from skysim.camera.optics import Optics
-from skysim.scene.sections import light
+from skysim.scene.sections import surroundings
 from skysim.scene.sections.camera import CameraConfig
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 
@@ -36,7 +36,12 @@ CAMERA = {
     "focal_length": "8 mm",
     "f_number": 1.4,
     "transmission": 0.8,
-    "detector": {"quantum_efficiency": 0.5, "full_well_e": 40000, "gain_e_dn": 10, "bits": 12},
+    "detector": {
+        "quantum_efficiency": 0.5,
+        "full_well_e": 40000,
+        "gain_e_dn": 10,
+        "bits": 12,
+    },
 }
 BENT = {"distortion": (-0.25, 0.08, 0.002, -0.001, 0.0), "principal_point_px": (380.0, 310.0)}
 POINTING = Rotation.from_euler("xyz", [0.4, -1.1, 2.0])
@@ -55,8 +60,8 @@ def optics(**camera: object) -> Optics:
     return Optics.from_camera(CameraConfig.model_validate(CAMERA | camera))
 
 
-def glow(**part: object) -> light.Glow:
-    made: light.Glow = TypeAdapter(light.Glow).validate_python(
+def glow(**part: object) -> surroundings.Glow:
+    made: surroundings.Glow = TypeAdapter(surroundings.Glow).validate_python(
         part, by_alias=True, by_name=True
     )
     return made
@@ -69,7 +74,7 @@ def lab_place(right_deg: float) -> tuple[float, float]:
     return float(np.degrees(np.arctan2(y, x)) % 360), float(np.degrees(np.arcsin(z)))
 
 
-def whole_map(config: light.Glow, lens: Optics) -> np.ndarray:
+def whole_map(config: surroundings.Glow, lens: Optics) -> np.ndarray:
     """Background computed directly at every third pixel, for comparison."""
     camera = lens.camera
     x, y = np.meshgrid(np.arange(0, camera.width_px, 3), np.arange(0, camera.height_px, 3))
@@ -80,14 +85,14 @@ def whole_map(config: light.Glow, lens: Optics) -> np.ndarray:
     return BACKGROUNDS[config.kind](config, view).reshape(x.shape)
 
 
-def drawn(config: light.Glow, lens: Optics, exposure_s: float = 1.0) -> np.ndarray:
+def drawn(config: surroundings.Glow, lens: Optics, exposure_s: float = 1.0) -> np.ndarray:
     image = np.full((lens.camera.height_px, lens.camera.width_px), np.nan, np.float32)
     fill(image, glow_map((config,), lens, POINTING, BAND), exposure_s)
     return image
 
 
 def test_every_background_kind_of_the_schema_is_implemented() -> None:
-    union = typing.get_args(typing.get_args(light.Glow)[0])
+    union = typing.get_args(typing.get_args(surroundings.Glow)[0])
     assert {typing.get_args(one.model_fields["kind"].annotation)[0] for one in union} == set(
         BACKGROUNDS
     )
@@ -160,7 +165,9 @@ def test_vignetting_dims_the_sky_and_not_a_light_leak() -> None:
     ratio = drawn(glow(**SKY), dim)[300] / drawn(glow(**SKY), clear)[300]
     # The cusp on the axis is rounded off: half a node of 30 px, 0.6 degrees, costs 1.8 % there and less elsewhere.
     assert ratio[400] == pytest.approx(1, abs=0.03)
-    assert ratio[0] == pytest.approx(np.interp(edge_deg, (0, 10, 30), (1, 0.7, 0.1)), rel=1e-3)
+    assert ratio[0] == pytest.approx(
+        np.interp(edge_deg, (0, 10, 30), (1, 0.7, 0.1)), rel=1e-3
+    )
     leak = drawn(glow(kind="uniform", e_s=7.0), dim, 0.5)
     np.testing.assert_array_equal(leak, np.full((601, 801), 3.5, np.float32))
 
@@ -196,7 +203,9 @@ def test_nanolamberts_convert_to_magnitudes() -> None:
 
 def test_the_half_moon_is_2_6_magnitudes_below_the_full_moon() -> None:
     """By hand: 0.026 x 90 + 4e-9 x 90^4 = 2.602."""
-    full, half = (float(moonlight_nl(60.0, phase, 0.172, 45.0, 30.0)) for phase in (0.0, 90.0))
+    full, half = (
+        float(moonlight_nl(60.0, phase, 0.172, 45.0, 30.0)) for phase in (0.0, 90.0)
+    )
     assert 2.5 * np.log10(full / half) == pytest.approx(2.602, abs=5e-4)
 
 
@@ -287,7 +296,9 @@ def test_frames_drawn_between_nodes_are_within_a_thousandth(
 @pytest.mark.compiles
 def test_the_cusp_of_two_stops_is_rounded_off_within_a_node_of_the_axis() -> None:
     lens = optics(vignetting={"kind": "two_stops", "cutoff_deg": 50.0})
-    error = np.abs(drawn(glow(**SLOPED), lens)[::3, ::3] / whole_map(glow(**SLOPED), lens) - 1)
+    error = np.abs(
+        drawn(glow(**SLOPED), lens)[::3, ::3] / whole_map(glow(**SLOPED), lens) - 1
+    )
     assert error.max() < 0.02
     y, x = np.indices(error.shape)
     assert error[np.hypot(3 * x - 400, 3 * y - 300) > 200].max() < 1e-3
@@ -306,9 +317,9 @@ def test_the_fill_between_nodes_is_bilinear(
     fill(image, coarse, 0.25)
     axes = [np.linspace(0, size - 1, count) for size, count in zip(shape, nodes, strict=True)]
     places = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
-    wanted = 0.25 * RegularGridInterpolator(axes, coarse, bounds_error=False, fill_value=None)(
-        places
-    )
+    wanted = 0.25 * RegularGridInterpolator(
+        axes, coarse, bounds_error=False, fill_value=None
+    )(places)
     np.testing.assert_allclose(image, wanted, rtol=1e-6 if kind is np.float32 else 1e-12)
 
 

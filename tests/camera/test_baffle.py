@@ -131,7 +131,9 @@ def test_the_stray_light_of_a_near_earth_is_that_of_its_ground(
     through = 10 ** np.interp(
         np.degrees(np.arccos(toward @ boresight / d_m)), STEEP.angle_deg, np.log10(STEEP.pst)
     )
-    radiance = 0.3 * IRRADIANCE / np.pi * np.maximum(normal @ sun_m / np.linalg.norm(sun_m), 0)
+    radiance = (
+        0.3 * IRRADIANCE / np.pi * np.maximum(normal @ sun_m / np.linalg.norm(sun_m), 0)
+    )
     expected = np.sum(radiance * emission * area_m2 / d_m**2 * through)
     light = stray_around_e_s_m2(
         STEEP, *earth_around(DARK_EARTH, place_m, sun_m, BAND), boresight

@@ -71,7 +71,9 @@ def test_a_single_source_fills_as_many_pixels_as_it_has_wells(wells: int) -> Non
     image = frame(column)
     bloom(image, WELL)
     half = wells // 2
-    np.testing.assert_array_equal(np.flatnonzero(image[:, 1]), np.arange(50 - half, 51 + half))
+    np.testing.assert_array_equal(
+        np.flatnonzero(image[:, 1]), np.arange(50 - half, 51 + half)
+    )
     np.testing.assert_allclose(image[50 - half : 51 + half, 1], WELL, rtol=1e-6)
     np.testing.assert_array_equal(image[:, 1], image[::-1, 1])
     assert not image[:, [0, 2]].any()

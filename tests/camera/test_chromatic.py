@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.discs import points_of
 from skysim.camera.optics import Optics
-from skysim.camera.render import Poses, Window, project, render
+from skysim.camera.projection import Poses, project
+from skysim.camera.render import Window, render
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount, Sources, Trajectory
 from skysim.scene import loader
@@ -51,7 +52,12 @@ CAMERA = {
     "f_number": 4,
     "psf": {"kind": "gaussian", "sigma_px": 0.7},
     "chromatic": CHROMATIC,
-    "detector": {"quantum_efficiency": "cmos", "full_well_e": 4e4, "gain_e_dn": 10, "bits": 12},
+    "detector": {
+        "quantum_efficiency": "cmos",
+        "full_well_e": 4e4,
+        "gain_e_dn": 10,
+        "bits": 12,
+    },
 }
 
 
@@ -228,7 +234,8 @@ def test_every_light_of_a_scene_has_its_color(scene: str, keys: dict[str, str]) 
     assert (spread > 0.01) == (scene == "shefex2" or "light.led.color_scatter" in keys)
     toward = Rotation.align_vectors([[0, 0, 1]], sources.place[:1, :3])[0]
     pose = Poses(
-        (Rotation.from_euler("x", 2, degrees=True) * toward).as_matrix()[None], np.zeros((1, 3))
+        (Rotation.from_euler("x", 2, degrees=True) * toward).as_matrix()[None],
+        np.zeros((1, 3)),
     )
     first = sources.take(np.arange(1))
     gray = Sources(*(getattr(first, name) for name in Sources.__slots__[:-1]))

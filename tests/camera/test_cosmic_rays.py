@@ -37,7 +37,9 @@ def test_the_count_is_flux_times_area_times_time() -> None:
     counts = []
     for _ in range(400):
         tracks = draw_tracks(protons(), SHAPE, 0.1, PIXEL_M, rng)
-        inside = (np.abs(tracks["x_px"] - 149.5) < 150) & (np.abs(tracks["y_px"] - 99.5) < 100)
+        inside = (np.abs(tracks["x_px"] - 149.5) < 150) & (
+            np.abs(tracks["y_px"] - 99.5) < 100
+        )
         counts.append(inside.sum())
     wanted = 1e4 * 0.06 * 0.1  # 60
     assert np.mean(counts) == pytest.approx(wanted, abs=4 * np.sqrt(wanted / 400))
@@ -72,7 +74,9 @@ def test_the_mean_path_through_a_plate_is_twice_its_depth() -> None:
 def test_a_track_s_image_has_the_length_of_depth_times_tangent() -> None:
     tracks = draw_tracks(protons(), SHAPE, 1.0, PIXEL_M, np.random.default_rng(3))
     along = np.hypot(tracks["end_x_px"] - tracks["x_px"], tracks["end_y_px"] - tracks["y_px"])
-    np.testing.assert_allclose(np.hypot(along * PIXEL_M, 10e-6), tracks["length_m"], rtol=1e-12)
+    np.testing.assert_allclose(
+        np.hypot(along * PIXEL_M, 10e-6), tracks["length_m"], rtol=1e-12
+    )
     # 45 degrees, 10 um, 10 um.
     assert np.median(along) == pytest.approx(1.0, abs=4 * 1.0 / np.sqrt(len(tracks)))
 
@@ -191,4 +195,6 @@ def test_too_many_tracks_for_memory_are_refused() -> None:
     with pytest.raises(
         InputError, match=r"camera\.detector\.particles: .* tracks .*; allowed: 1,000,000"
     ):
-        add_particles(image, 1e6, PIXEL_M, (protons(per_cm2_s=1e6),), np.random.default_rng(1))
+        add_particles(
+            image, 1e6, PIXEL_M, (protons(per_cm2_s=1e6),), np.random.default_rng(1)
+        )

@@ -46,7 +46,9 @@ def expose(
     ).astype(float)
 
 
-def frame(mean_e: float, seed: int = 1, exposure_s: float = 0.05, **changes: Any) -> np.ndarray:
+def frame(
+    mean_e: float, seed: int = 1, exposure_s: float = 0.05, **changes: Any
+) -> np.ndarray:
     return expose(np.full(SHAPE, mean_e), detector_with(**changes), seed, exposure_s)
 
 
@@ -154,7 +156,9 @@ def test_prnu_scales_light_and_not_dark_current() -> None:
     spread = lit - dark
     error = np.sqrt((2e4 + 2 * 5e3) / 30)
     assert spread.std() == pytest.approx(np.hypot(0.02 * 2e4, error), rel=4 / np.sqrt(2 * N))
-    assert spread.mean() == pytest.approx(2e4, abs=4 * np.hypot(0.02 * 2e4, error) / np.sqrt(N))
+    assert spread.mean() == pytest.approx(
+        2e4, abs=4 * np.hypot(0.02 * 2e4, error) / np.sqrt(N)
+    )
     assert np.corrcoef(spread.ravel(), made.sensitivity.ravel())[0, 1] > 0.98
     assert dark.std() == pytest.approx(np.sqrt(5e3 / 30), rel=4 / np.sqrt(2 * N))
 
@@ -162,7 +166,8 @@ def test_prnu_scales_light_and_not_dark_current() -> None:
 def test_dark_current_doubles_with_its_temperature() -> None:
     warm = {"dark_e_s": 200.0, "dark_temperature_c": 20, "dark_doubling_c": 7}
     mean = [
-        frame(0, temperature_c=t, exposure_s=2.0, **warm).mean() - 1000 for t in (6, 13, 20, 27)
+        frame(0, temperature_c=t, exposure_s=2.0, **warm).mean() - 1000
+        for t in (6, 13, 20, 27)
     ]
     np.testing.assert_allclose(mean, [100, 200, 400, 800], rtol=0, atol=4 * np.sqrt(800 / N))
     assert frame(0, exposure_s=2.0, **warm).mean() - 1000 == pytest.approx(
@@ -179,9 +184,9 @@ def test_dark_current_is_lognormal_with_its_own_mean_and_spread() -> None:
 
 def test_hot_pixels_have_their_declared_number_and_strength() -> None:
     dark = (
-        detector_with((1000, 1000), dark_e_s=5, hot_pixels=0.01, hot_e_s=3000).dark_e_s.astype(
-            float
-        )
+        detector_with(
+            (1000, 1000), dark_e_s=5, hot_pixels=0.01, hot_e_s=3000
+        ).dark_e_s.astype(float)
         - 5
     )
     hot = dark[dark > 0]
@@ -249,7 +254,9 @@ def test_the_converter_ends_at_zero_and_at_all_ones(bits: int, top: int) -> None
     assert dark.min() == 0
     assert dark.dtype == float
     np.testing.assert_array_equal(expose(np.full((16, 16), 1e8), made), top)
-    raw = detector.expose(np.zeros((16, 16), np.float32), 0.05, made, np.random.default_rng(0))
+    raw = detector.expose(
+        np.zeros((16, 16), np.float32), 0.05, made, np.random.default_rng(0)
+    )
     assert raw.dtype == np.uint16
 
 
@@ -282,7 +289,8 @@ def spot(electrons: float) -> np.ndarray:
 
 def test_an_overflowing_well_spills_along_its_column_without_loss() -> None:
     made = (
-        expose(spot(2e5), detector_with((64, 32), full_well_e=20000, blooming="column")) - 1000
+        expose(spot(2e5), detector_with((64, 32), full_well_e=20000, blooming="column"))
+        - 1000
     )
     assert made[:, 10].max() == 20000
     assert (made[:, 10] == 20000).sum() in (9, 10, 11)
@@ -494,7 +502,9 @@ def test_signal_to_noise_has_each_noise_of_a_pixel() -> None:
 
 
 @pytest.mark.parametrize(("peak_e", "full"), [(39000.0, False), (41000.0, True)])
-def test_a_source_is_saturated_where_its_brightest_pixel_is(peak_e: float, full: bool) -> None:
+def test_a_source_is_saturated_where_its_brightest_pixel_is(
+    peak_e: float, full: bool
+) -> None:
     made = detector_with((64, 32), full_well_e=40000.0, gain_e_dn=10.0, offset_dn=64.0)
     sources = detector.add_snr_and_saturation(
         seen(peak_e, 1.0, peak_e), spot(peak_e).astype(np.float32), 0.05, made

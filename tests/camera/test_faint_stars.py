@@ -17,7 +17,7 @@ from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene import loader
-from skysim.scene.sections.light import FaintStarsGlowConfig, SkyGlowConfig
+from skysim.scene.sections.surroundings import FaintStarsGlowConfig, SkyGlowConfig
 from skysim.sources import catalog, star_archives
 from skysim.sources.photometry import Band
 from skysim.sources.stars import cam_from_icrs
@@ -122,4 +122,6 @@ def test_a_dome_has_no_faint_stars() -> None:
     with pytest.raises(
         InputError, match=r"background: faint_stars requires light of kind stars, not dome"
     ):
-        loader.load("afit_simsat", {"background": "[{kind: faint_stars, fainter_than_mag: 8}]"})
+        loader.load(
+            "afit_simsat", {"background": "[{kind: faint_stars, fainter_than_mag: 8}]"}
+        )

@@ -87,7 +87,9 @@ def test_sharpness_of_a_grid_equals_that_of_its_table(tmp_path: Any) -> None:
 def test_a_measured_image_is_a_grid(tmp_path: Any) -> None:
     y, x = np.mgrid[-6:7, -6:7]
     np.savetxt(tmp_path / "psf.csv", np.exp(-(x**2) / 2 - y**2 / 8), delimiter=",")
-    lens = camera(focus="infinity", psf={"kind": "measured", "file": str(tmp_path / "psf.csv")})
+    lens = camera(
+        focus="infinity", psf={"kind": "measured", "file": str(tmp_path / "psf.csv")}
+    )
     assert shapes(lens, [0.0], [False], [1.0]).kind.tolist() == [GRID]
 
 

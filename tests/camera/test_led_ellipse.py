@@ -100,7 +100,9 @@ def rays(camera: CameraConfig, source: Sources, exponent: float) -> tuple[Floats
     )
     distance = np.linalg.norm(points, axis=0)
     light = share * (-normal @ points / distance) ** exponent * points[2] / distance**3
-    return camera.focal_px * points[:2] / points[2] + np.array(camera.center_px)[:, None], light
+    return camera.focal_px * points[:2] / points[2] + np.array(camera.center_px)[
+        :, None
+    ], light
 
 
 def traced(
@@ -166,7 +168,9 @@ def test_an_inclined_led_s_image_matches_ray_tracing(
     assert np.abs(image[where] - true).max() < (1e-3 if drawn_round else 5e-4) * true.max()
     assert image.sum() == pytest.approx(true.sum(), rel=2e-4)
     xy, light = rays(lens.camera, source, exponent)
-    np.testing.assert_allclose(seen.flux_xy_px[0], xy @ light / light.sum(), rtol=0, atol=5e-4)
+    np.testing.assert_allclose(
+        seen.flux_xy_px[0], xy @ light / light.sum(), rtol=0, atol=5e-4
+    )
     np.testing.assert_allclose(seen.xy_px[0], xy_px, rtol=0, atol=1e-9)
 
 
@@ -183,7 +187,9 @@ def test_images_of_small_disks_and_other_blurs_match_ray_tracing(
     where, true = traced(lens.camera, source, 2.0, sigma_px)
     assert np.abs(image[where] - true).max() < 5e-4 * true.max()
     xy, light = rays(lens.camera, source, 2.0)
-    np.testing.assert_allclose(seen.flux_xy_px[0], xy @ light / light.sum(), rtol=0, atol=1e-4)
+    np.testing.assert_allclose(
+        seen.flux_xy_px[0], xy @ light / light.sum(), rtol=0, atol=1e-4
+    )
 
 
 LENSES = {
@@ -259,7 +265,11 @@ def test_a_moving_ellipse_is_the_mean_of_still_ones() -> None:
 @pytest.mark.slow
 @settings(max_examples=40, derandomize=True, deadline=None)
 @given(
-    st.floats(0, 30), st.floats(0, 75), st.floats(0, 360), st.floats(0, 360), st.floats(0.5, 4)
+    st.floats(0, 30),
+    st.floats(0, 75),
+    st.floats(0, 360),
+    st.floats(0, 360),
+    st.floats(0.5, 4),
 )
 def test_rim_and_mean_light_match_the_projected_disk(
     field_deg: float,
@@ -274,7 +284,9 @@ def test_rim_and_mean_light_match_the_projected_disk(
     lens = lens_of()
     out_px = lens.camera.focal_px * np.tan(np.radians(field_deg))
     angle = np.radians(azimuth_deg)
-    xy_px = np.array(lens.camera.center_px) + out_px * np.array([np.cos(angle), np.sin(angle)])
+    xy_px = np.array(lens.camera.center_px) + out_px * np.array(
+        [np.cos(angle), np.sin(angle)]
+    )
     source = led(lens, (xy_px[0], xy_px[1]), incidence_deg, around_deg)
     emitter = Emitter(lobe=CosineLobeConfig(kind="cosine", exponent=exponent))
     images = disk_images(lens, emitter, source.place[:, :3], source.normal, source.radius_m)

@@ -36,7 +36,9 @@ def chi_square(numbers: np.ndarray, probability: np.ndarray) -> float:
     common = wanted >= 10
     found = np.append(found[common], found[~common].sum())
     wanted = np.append(wanted[common], max(wanted[~common].sum(), 1e-9))
-    return float(stats.chi2.sf(((found - wanted) ** 2 / wanted).sum(), max(len(found) - 1, 1)))
+    return float(
+        stats.chi2.sf(((found - wanted) ** 2 / wanted).sum(), max(len(found) - 1, 1))
+    )
 
 
 # On both sides of the change of method at 16, in the middle and at the very edge of a guide's step.
@@ -52,7 +54,9 @@ def test_counts_are_poisson(mean: float) -> None:
 def test_normal_numbers_are_normal() -> None:
     """Equal shares in a thousand bins, and ten in the tails that only the slow branches reach."""
     edges = stats.norm.ppf(np.linspace(0, 1, 1001))
-    edges = np.sort(np.append(edges, [*np.linspace(-4.5, -3.2, 5), *np.linspace(3.2, 4.5, 5)]))
+    edges = np.sort(
+        np.append(edges, [*np.linspace(-4.5, -3.2, 5), *np.linspace(3.2, 4.5, 5)])
+    )
     bins = np.digitize(drawn_normals().ravel(), edges) - 1
     assert chi_square(bins, np.diff(stats.norm.cdf(edges))) > 1e-4
 
@@ -110,7 +114,9 @@ def test_rows_of_any_width_are_normally_distributed(width: int) -> None:
     assert np.abs(normals.mean(axis=0)).max() < 4.5 * sigma
     assert np.abs(normals.var(axis=0) - 1).max() < 4.5 * np.sqrt(2) * sigma
     assert (np.abs(counts.mean(axis=0) - means) < 4.5 * np.sqrt(means) * sigma).all()
-    assert (np.abs(counts.var(axis=0) / means - 1) < 4.5 * np.sqrt(2 + 1 / means) * sigma).all()
+    assert (
+        np.abs(counts.var(axis=0) / means - 1) < 4.5 * np.sqrt(2 + 1 / means) * sigma
+    ).all()
 
 
 def test_noise_of_neighbors_and_rows_is_independent() -> None:

@@ -21,7 +21,12 @@ CAMERA = {
     "focal_length": "25 mm",
     "f_number": 1.4,
     "transmission": 0.85,
-    "detector": {"quantum_efficiency": 0.4, "full_well_e": 40000, "gain_e_dn": 10, "bits": 12},
+    "detector": {
+        "quantum_efficiency": 0.4,
+        "full_well_e": 40000,
+        "gain_e_dn": 10,
+        "bits": 12,
+    },
 }
 
 
@@ -187,7 +192,9 @@ def test_a_field_that_ends_before_the_corner_ends_at_the_fold() -> None:
 )
 def test_the_field_is_never_too_small(distortion: list[float]) -> None:
     """Every imaged direction is within the field."""
-    lens = optics(focal_length="8 mm", principal_point_px=[500.0, 100.0], distortion=distortion)
+    lens = optics(
+        focal_length="8 mm", principal_point_px=[500.0, 100.0], distortion=distortion
+    )
     vectors = rays(5000, 50, 3)
     xy = lens.project(vectors)
     on_chip = np.all((xy >= -0.5) & (xy <= [658.5, 492.5]), axis=1)
@@ -253,7 +260,9 @@ def traced(field_rad: float, cutoff_rad: float) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize("cutoff_deg", [8.0, 30.0, 75.0])
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
-def test_two_stops_pass_the_rays_that_fit_through_both(share: float, cutoff_deg: float) -> None:
+def test_two_stops_pass_the_rays_that_fit_through_both(
+    share: float, cutoff_deg: float
+) -> None:
     field = np.arctan(share * np.tan(np.radians(cutoff_deg)))
     lens = optics(vignetting={"kind": "two_stops", "cutoff_deg": cutoff_deg})
     throughput = lens.throughput(np.cos(field)) / np.cos(field)
@@ -294,12 +303,23 @@ def test_a_star_s_electrons_are_scaled_by_vignetting() -> None:
     one = np.ones(2)
     zero = np.zeros(2)
     stars = Sources(
-        id, place, np.zeros((2, 3)), zero, 1e8 * one, one, zero, one, 0 * id, np.full(2, np.nan)
+        id,
+        place,
+        np.zeros((2, 3)),
+        zero,
+        1e8 * one,
+        one,
+        zero,
+        one,
+        0 * id,
+        np.full(2, np.nan),
     )
     still = Trajectory(np.array([0.0, 1.0]), Rotation.identity(2), np.zeros((2, 3)))
     image = np.zeros((493, 659))
     seen = render(
         image, stars, lens, still, Mount(np.zeros(3), Rotation.identity()), Window(0.0, 0.5)
     )
-    wanted = np.cos(angle) * [1, traced(angle[1], np.radians(40))] * lens.collecting_m2 * 0.5e8
+    wanted = (
+        np.cos(angle) * [1, traced(angle[1], np.radians(40))] * lens.collecting_m2 * 0.5e8
+    )
     np.testing.assert_allclose(seen.electrons, wanted, rtol=1e-3, atol=0)

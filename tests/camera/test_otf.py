@@ -255,7 +255,9 @@ def covered_disk(radius: float, size: int, fine: int) -> Floats:
 @pytest.mark.slow
 @pytest.mark.parametrize("radii", [(4.3, 2.6), (3.0, 0.0), (6.0, 1.37)])
 @pytest.mark.parametrize("sigma_px", [0.25, 0.7])
-def test_images_of_disks_match_brute_force(radii: tuple[float, float], sigma_px: float) -> None:
+def test_images_of_disks_match_brute_force(
+    radii: tuple[float, float], sigma_px: float
+) -> None:
     """Emitter x defocus x Gaussian x pixel, summed on a grid of 1/21 px, within 5e-4 of the peak."""
     # odd: the middle cell is in the middle of the middle pixel
     size = 25
@@ -289,7 +291,9 @@ def test_blurs_add_in_quadrature() -> None:
 def test_nearly_equal_sizes_share_a_kernel() -> None:
     lens = camera()
     psf = GaussianPsfConfig(sigma_px=0.7)
-    assert build_kernel(psf, lens, 0.1, 5.001, 2.0) is build_kernel(psf, lens, 0.1, 5.004, 2.0)
+    assert build_kernel(psf, lens, 0.1, 5.001, 2.0) is build_kernel(
+        psf, lens, 0.1, 5.004, 2.0
+    )
     assert build_kernel(psf, lens, 0.1, 5.001, 2.0) is not build_kernel(
         psf, lens, 0.1, 5.02, 2.0
     )
@@ -336,7 +340,9 @@ def test_a_measured_gaussian_is_that_gaussian(
     wanted = build_kernel(GaussianPsfConfig(sigma_px=sigma_px), camera())
     for x, y in PLACES + 10:
         peak = draw(wanted, x, y, 21)
-        np.testing.assert_allclose(draw(image, x, y, 21), peak, rtol=0, atol=5e-4 * peak.max())
+        np.testing.assert_allclose(
+            draw(image, x, y, 21), peak, rtol=0, atol=5e-4 * peak.max()
+        )
     # As few sub-pixel positions, in powers of two, as are more than seven times the highest frequency.
     assert (
         7 * bandwidth(psf, camera(), 0.0, 1e-3)
@@ -348,7 +354,13 @@ def test_a_measured_gaussian_is_that_gaussian(
 def test_a_star_measured_in_whole_pixels_reproduces_its_image(tmp_path: Path) -> None:
     """Oversampling 1: the image itself where it was measured, centered on its center of gravity."""
     table = np.array(
-        [[0, 1, 1, 0, 0], [1, 6, 9, 2, 0], [1, 9, 20, 8, 1], [0, 3, 7, 4, 1], [0, 0, 1, 1, 0.0]]
+        [
+            [0, 1, 1, 0, 0],
+            [1, 6, 9, 2, 0],
+            [1, 9, 20, 8, 1],
+            [0, 3, 7, 4, 1],
+            [0, 0, 1, 1, 0.0],
+        ]
     )
     table /= table.sum()
     x = table.sum(axis=0) @ np.arange(5)
@@ -371,7 +383,10 @@ def test_a_measured_image_keeps_its_handedness_and_its_center(tmp_path: Path) ->
         np.testing.assert_allclose(
             [(patch @ index).sum(), (index @ patch).sum()], [x, y], rtol=0, atol=2e-3
         )
-        third = (((index - x) ** 3) @ patch.sum(axis=0), ((index - y) ** 3) @ patch.sum(axis=1))
+        third = (
+            ((index - x) ** 3) @ patch.sum(axis=0),
+            ((index - y) ** 3) @ patch.sum(axis=1),
+        )
         assert third[0] > third[1] > 0.5
 
 
@@ -397,7 +412,9 @@ def test_interpolation_of_cells_uses_keys_s_cubic() -> None:
     """Its transform, integrated from the cubic pieces; 1 at rest, 0 at whole cycles a cell."""
     t = np.linspace(-2, 2, 40_001)
     s = np.abs(t)
-    pieces = np.where(s < 1, 1.5 * s**3 - 2.5 * s**2 + 1, -0.5 * s**3 + 2.5 * s**2 - 4 * s + 2)
+    pieces = np.where(
+        s < 1, 1.5 * s**3 - 2.5 * s**2 + 1, -0.5 * s**3 + 2.5 * s**2 - 4 * s + 2
+    )
     u = np.array([0.0, 0.1, 0.5, 0.9, 1.3, 2.4])
     wanted = np.array([np.trapezoid(pieces * np.cos(2 * np.pi * at * t), t) for at in u])
     np.testing.assert_allclose(cell_response(u) * np.sinc(u), wanted, rtol=0, atol=1e-7)

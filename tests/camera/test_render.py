@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import erf
 from scipy.stats import ncx2
 
+from skysim.camera import projection
 from skysim.camera import render as rendering
 from skysim.camera.detector import Detector, expose
 from skysim.camera.optics import Optics
@@ -307,7 +308,9 @@ def test_the_smear_of_shefex_matches_the_reference() -> None:
     # Reference H2: 4.41 px at 2 deg/s in 50 ms, 8.8 px at 4 deg/s.
     lens = lens_of(pixel="9.9 um")
     for rate_deg_s, length_px in ((2, 4.41), (4, 8.81)):
-        _, seen = shot(light(), turning([0, np.radians(rate_deg_s), 0]), lens, exposure_s=0.05)
+        _, seen = shot(
+            light(), turning([0, np.radians(rate_deg_s), 0]), lens, exposure_s=0.05
+        )
         assert seen.streak_px[0] == pytest.approx(length_px, abs=0.01)
 
 
@@ -477,7 +480,8 @@ def test_an_led_off_the_axis_is_dimmed_by_the_fourth_power_of_the_cosine() -> No
 def test_duty_scales_the_light_of_whole_periods(duty: float) -> None:
     full, dim = (
         shot(
-            led_at(0, 0, 1.0, period_s=[1e-3], on_s=[d * 1e-3], start_s=[3e-4]), exposure_s=0.01
+            led_at(0, 0, 1.0, period_s=[1e-3], on_s=[d * 1e-3], start_s=[3e-4]),
+            exposure_s=0.01,
         )[0].sum()
         for d in (1.0, duty)
     )
@@ -517,7 +521,9 @@ def test_parallax_matches_a_hand_calculation(tilt_deg: float) -> None:
 
 def test_stars_show_no_parallax() -> None:
     far = Mount(np.array([0.3, -0.2, 0.381]), Rotation.identity())
-    np.testing.assert_array_equal(shot(star_at(20, 20))[0], shot(star_at(20, 20), mount=far)[0])
+    np.testing.assert_array_equal(
+        shot(star_at(20, 20))[0], shot(star_at(20, 20), mount=far)[0]
+    )
 
 
 def test_a_moving_led_draws_a_dashed_streak() -> None:
@@ -555,7 +561,9 @@ def test_a_rolling_shutter_shears_what_moves() -> None:
     speed_px_s = 200.0
     row_time_s = 2e-3
     image, seen = draw(
-        star_at(31.5, 23.5), Window(0.45, 1e-3, row_time_s), turning([0, speed_px_s / 2500, 0])
+        star_at(31.5, 23.5),
+        Window(0.45, 1e-3, row_time_s),
+        turning([0, speed_px_s / 2500, 0]),
     )
     rows = np.arange(21, 27)
     middle = (image[rows] @ np.arange(64)) / image[rows].sum(axis=1)
@@ -641,13 +649,13 @@ def test_a_star_that_crosses_the_field_between_two_poses_is_kept() -> None:
     stars.place[:, :3] = rays
     angles = np.linspace(-0.8, 0.8, 9)
 
-    def poses(angles_rad: Floats) -> rendering.Poses:
+    def poses(angles_rad: Floats) -> projection.Poses:
         turns = Rotation.from_rotvec(np.outer(angles_rad, [0, 1, 0]))
-        return rendering.Poses(turns.as_matrix(), np.zeros((len(angles_rad), 3)))
+        return projection.Poses(turns.as_matrix(), np.zeros((len(angles_rad), 3)))
 
-    fine = rendering.project(stars, LENS, poses(np.linspace(-0.8, 0.8, 201)))[0]
+    fine = projection.project(stars, LENS, poses(np.linspace(-0.8, 0.8, 201)))[0]
     on_chip = np.flatnonzero(((fine > -0.5) & (fine < [63.5, 47.5])).all(axis=2).any(axis=0))
-    kept = rendering.in_view(stars, LENS, poses(angles))
+    kept = projection.in_view(stars, LENS, poses(angles))
     assert len(on_chip) >= 10
     assert set(on_chip) <= set(kept)
     assert len(kept) < 600
@@ -667,17 +675,17 @@ def test_a_field_of_a_deep_catalog_costs_only_the_stars_near_it(
         np.zeros(25_000),
     )
     turns = Rotation.from_rotvec(np.outer(angles, [0, 1, 0])).as_matrix()
-    poses = rendering.Poses(turns, np.zeros((len(angles), 3)))
+    poses = projection.Poses(turns, np.zeros((len(angles), 3)))
     tested = []
-    in_cone = rendering._in_cone
+    in_cone = projection._in_cone
     monkeypatch.setattr(
-        rendering,
+        projection,
         "_in_cone",
         lambda place, *more: tested.append(len(place)) or in_cone(place, *more),
     )
-    rows = rendering.in_view(stars, LENS, poses)
-    monkeypatch.setattr(rendering, "MIN_BAND_STARS", 10**9)
-    assert rows.tolist() == rendering.in_view(stars, LENS, poses).tolist()
+    rows = projection.in_view(stars, LENS, poses)
+    monkeypatch.setattr(projection, "MIN_BAND_STARS", 10**9)
+    assert rows.tolist() == projection.in_view(stars, LENS, poses).tolist()
     assert tested[1] == 25_000
     assert len(rows) <= tested[0] < (0.05 * 25_000 if len(angles) < 3 else 25_001)
 
@@ -698,12 +706,13 @@ def test_a_cubic_path_is_followed_exactly_from_its_first_sample_to_its_last() ->
 
     def path(t: Any) -> Any:
         return np.stack(
-            [30 + 4 * t - 2 * t**2 + t**3, 20 - 3 * t + t**2 - 0.5 * t**3, 100 + t**3], axis=-1
+            [30 + 4 * t - 2 * t**2 + t**3, 20 - 3 * t + t**2 - 0.5 * t**3, 100 + t**3],
+            axis=-1,
         )
 
     t_s = np.linspace(0.0, 4.0, 9)
     samples = path(t_s)[:, None]
-    tracks = rendering.Tracks(
+    tracks = projection.Tracks(
         0.0, 0.5, samples[:, :, :2].copy(), samples[:, :, 2].copy(), np.ones((1, 3))
     )
     times = np.linspace(0.0, 4.0, 33)
@@ -842,7 +851,9 @@ def test_centroids_follow_the_cramer_rao_bound(
     for x, y in rng.uniform(7, 8, (30, 2)):
         image, _ = shot(star_at(x, y, electrons, lens), lens=lens)
         frames = (
-            np.array([expose(image.astype(np.float32), 1.0, detector, rng) for _ in range(20)])
+            np.array(
+                [expose(image.astype(np.float32), 1.0, detector, rng) for _ in range(20)]
+            )
             - 500.0
         )
         errors.append(
@@ -879,7 +890,9 @@ def test_electrons_are_proportional_to_time_and_pupil_area() -> None:
     np.testing.assert_allclose(bright, 3 * shot(light())[0], rtol=1e-12, atol=0)
 
 
-def test_rendering_in_batches_equals_rendering_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rendering_in_batches_equals_rendering_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Patches of many sources are processed in batches, which does not change the result."""
     rng = np.random.default_rng(2)
     many = [star_at(*xy, 1e3) for xy in rng.uniform((5, 5), (58, 42), (40, 2))]

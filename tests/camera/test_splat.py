@@ -38,7 +38,11 @@ def gaussian(sigma_px: float) -> Psf:
 
 
 def draw(
-    image: Kernel, x: float, y: float, rows: tuple[int, int] = (0, SIZE), electrons: float = 1.0
+    image: Kernel,
+    x: float,
+    y: float,
+    rows: tuple[int, int] = (0, SIZE),
+    electrons: float = 1.0,
 ) -> Floats:
     patch = np.zeros((SIZE, SIZE))
     add_kernel(patch, *rows, float(x), float(y), electrons, image)
@@ -124,12 +128,17 @@ def test_mirrored_places_give_mirrored_images(image: Kernel) -> None:
 @pytest.mark.parametrize(
     "place", [(-3.3, 20.2), (20.2, -3.3), (62.7, 61.4), (0.0, 0.0), (-1e6, 5.0), (5.0, 1e6)]
 )
-def test_light_beyond_the_patch_is_left_out(image: Kernel, place: tuple[float, float]) -> None:
+def test_light_beyond_the_patch_is_left_out(
+    image: Kernel, place: tuple[float, float]
+) -> None:
     x, y = place
     wide = np.zeros((SIZE + 80, SIZE + 80))
     add_kernel(wide, 0, len(wide), x + 40, y + 40, 1.0, image)
     np.testing.assert_allclose(
-        draw(image, x, y), wide[40:-40, 40:-40], rtol=0, atol=1e-6 * KERNELS["grid"].grid.max()
+        draw(image, x, y),
+        wide[40:-40, 40:-40],
+        rtol=0,
+        atol=1e-6 * KERNELS["grid"].grid.max(),
     )
 
 
@@ -166,7 +175,9 @@ def test_tables_give_the_error_function_s_image(make: object, sigma_px: float) -
     image: Kernel = make(gaussian(sigma_px), CAMERA, 0, 0, 0)  # type: ignore[operator]
     for x, y in PLACES:
         wanted = exact_gaussian(x, y, sigma_px)
-        np.testing.assert_allclose(draw(image, x, y), wanted, rtol=0, atol=1e-4 * wanted.max())
+        np.testing.assert_allclose(
+            draw(image, x, y), wanted, rtol=0, atol=1e-4 * wanted.max()
+        )
 
 
 @pytest.mark.parametrize(

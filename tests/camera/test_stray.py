@@ -30,7 +30,12 @@ CAMERA = {
     "focal_length": "4 mm",
     "f_number": 2,
     "transmission": 0.8,
-    "detector": {"quantum_efficiency": 0.5, "full_well_e": 40000, "gain_e_dn": 10, "bits": 12},
+    "detector": {
+        "quantum_efficiency": 0.5,
+        "full_well_e": 40000,
+        "gain_e_dn": 10,
+        "bits": 12,
+    },
 }
 
 
@@ -157,7 +162,9 @@ def test_glare_leaves_uniform_light_uniform() -> None:
 
 
 @pytest.mark.parametrize(
-    "config", [GLARE, GlareConfig(share=0.02, exponent=2.4, core_px=9.0)], ids=["steep", "flat"]
+    "config",
+    [GLARE, GlareConfig(share=0.02, exponent=2.4, core_px=9.0)],
+    ids=["steep", "flat"],
 )
 def test_the_glare_of_a_point_matches_its_profile(config: GlareConfig) -> None:
     """The share left in the image, and the law of the power around it, with the mirrored field beside the chip."""

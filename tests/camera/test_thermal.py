@@ -122,7 +122,9 @@ def test_boresight_drifts_by_its_coefficient_in_the_truth() -> None:
             turned, np.array([300.0, -200.0, 100.0]) * drift_k, atol=1e-6
         )
         stars = camera.sources.take(np.isin(camera.sources.id, truth.sources.id))
-        rows = np.searchsorted(truth.sources.id, stars.id, sorter=np.argsort(truth.sources.id))
+        rows = np.searchsorted(
+            truth.sources.id, stars.id, sorter=np.argsort(truth.sources.id)
+        )
         xy_px = camera.optics.project(truth.cam_from_lab.apply(stars.place[:, :3]))
         found = truth.sources.xy_px[np.argsort(truth.sources.id)[rows]]
         np.testing.assert_allclose(found, xy_px, atol=1e-6)

@@ -35,7 +35,10 @@ ORACLES = {
     "STANDARD_GRAVITY_M_S2": (astro.g0.si.value, 0),
     "ZERO_CELSIUS_K": (scipy.constants.zero_Celsius, 0),
     "STANDARD_PRESSURE_HPA": (astro.atm.to_value("hPa"), 0),
-    "STANDARD_TEMPERATURE_K": ((15 * u.deg_C).to_value("K", equivalencies=u.temperature()), 0),
+    "STANDARD_TEMPERATURE_K": (
+        (15 * u.deg_C).to_value("K", equivalencies=u.temperature()),
+        0,
+    ),
     "ARCSEC_RAD": (erfa.DAS2R, 0),
     "MAS_RAD": (erfa.DMAS2R, 1e-15),
     "ARCSEC_DEG": (u.arcsec.to("deg"), 1e-15),
@@ -51,7 +54,10 @@ ORACLES = {
     "DEG_H_RAD_S": ((u.deg / u.hour).to("rad/s"), 1e-15),
     "EARTH_RADIUS_M": (erfa.eform(1)[0], 0),
     "EARTH_FLATTENING": (erfa.eform(1)[1], 0),
-    "EARTH_MU_M3_S2": (astro.GM_earth.si.value, 2e-7),  # the nominal 3.986004e14 of IAU 2015 B3
+    "EARTH_MU_M3_S2": (
+        astro.GM_earth.si.value,
+        2e-7,
+    ),  # the nominal 3.986004e14 of IAU 2015 B3
     "EARTH_J2": (1.0826e-3, ROUNDED),
     "EARTH_RATE_RAD_S": (2 * np.pi * 1.00273781191135448 / erfa.DAYSEC, 3e-8),  # IERS
     "AU_M": (astro.au.si.value, 0),
@@ -155,7 +161,11 @@ def defined_again(path: Path, known: dict[str, float]) -> Iterator[str]:
     characteristic = [value for value in known.values() if len(digits(value)) >= 4]
     characteristic += NOTORIOUS
     for node in ast.walk(tree):
-        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id in known:
+        if (
+            isinstance(node, ast.Name)
+            and isinstance(node.ctx, ast.Store)
+            and node.id in known
+        ):
             yield f"{path}, line {node.lineno}: {node.id}"
         value = number_of(node)
         if value and any(same(value, constant) for constant in characteristic):

@@ -34,7 +34,9 @@ COMMAND_LINE = re.compile(r"(?<![\w-])--[a-z]|skysim \w+ ")
 
 @pytest.mark.parametrize("error", [lambda text: InputError("", text), ImageError])
 @pytest.mark.parametrize("quoted", ["\x1e", "a\nb", "\x1b[2J", "\u2028", "\ud800"])
-def test_message_is_one_printable_line(error: Callable[[str], Exception], quoted: str) -> None:
+def test_message_is_one_printable_line(
+    error: Callable[[str], Exception], quoted: str
+) -> None:
     message = str(error(f"file.tle, line 2: the checksum is {quoted}; it should be 9"))
     assert message.isprintable()
     assert message.startswith("file.tle, line 2: ")

@@ -127,7 +127,9 @@ def test_a_scene_s_time_with_a_zone_is_written_as_utc(sky: Shot, start: str) -> 
     """DATE-OBS takes no zone, and an attitude message would have been two hours off."""
     loaded, frame, _ = sky
     zoned = loader.load("shefex2", {"start_time": start})
-    assert recording.utc_text(zoned, frame.t_mid_s) == recording.utc_text(loaded, frame.t_mid_s)
+    assert recording.utc_text(zoned, frame.t_mid_s) == recording.utc_text(
+        loaded, frame.t_mid_s
+    )
     local = datetime.datetime.fromisoformat(start)
     assert run_export.epoch(local) == "2012-06-22T21:00:00.000000"
 
@@ -237,13 +239,17 @@ def test_astropy_puts_the_true_stars_on_their_true_pixels(
     )
     x, y = WCS(fits.getheader(tmp_path / "f.fits")).all_world2pix(ra, dec, 0)
     assert len(x) > 20
-    np.testing.assert_allclose(np.column_stack([x, y]), truth.sources.xy_px, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        np.column_stack([x, y]), truth.sources.xy_px, rtol=0, atol=1e-6
+    )
 
 
 def test_under_the_dome_there_is_no_wcs(tmp_path: Path, dome: Shot) -> None:
     recording.write_fits(tmp_path / "f.fits", dome[1], dome[2], dome[0])
     assert not [
-        key for key in fits.getheader(tmp_path / "f.fits") if key.startswith(("CTYPE", "CRVAL"))
+        key
+        for key in fits.getheader(tmp_path / "f.fits")
+        if key.startswith(("CTYPE", "CRVAL"))
     ]
 
 

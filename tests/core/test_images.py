@@ -18,9 +18,9 @@ PIXELS = np.random.default_rng(1).integers(0, 500, (60, 80)).astype(np.int16)
 
 def compressed(kind: str = "HCOMPRESS_1") -> bytes:
     file = io.BytesIO()
-    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(PIXELS, compression_type=kind)]).writeto(
-        file
-    )
+    fits.HDUList(
+        [fits.PrimaryHDU(), fits.CompImageHDU(PIXELS, compression_type=kind)]
+    ).writeto(file)
     return file.getvalue()
 
 
@@ -73,7 +73,9 @@ def test_a_wrong_size_of_a_compressed_image_is_refused_in_one_line(
 )
 def test_a_guarded_script_has_limits(tmp_path: Path, code: str, outcome: str) -> None:
     (tmp_path / "script.py").write_text(code)
-    assert guarded.run_guarded(tmp_path / "script.py", cpu_s=1, memory_bytes=1 << 29) == outcome
+    assert (
+        guarded.run_guarded(tmp_path / "script.py", cpu_s=1, memory_bytes=1 << 29) == outcome
+    )
 
 
 @pytest.mark.parametrize("number", [0, 1])
@@ -82,13 +84,13 @@ def test_more_axes_than_the_standard_has_are_refused_at_once(
 ) -> None:
     """astropy makes a list of as many entries as the header says."""
     path = tmp_path / "axes.fits"
-    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(np.zeros((32, 32), np.int16))]).writeto(
-        path
-    )
+    fits.HDUList(
+        [fits.PrimaryHDU(), fits.CompImageHDU(np.zeros((32, 32), np.int16))]
+    ).writeto(path)
     data = path.read_bytes()
-    start = [hit.start() for hit in re.finditer(b"NAXIS   = ", data) if hit.start() % 80 == 0][
-        number
-    ]
+    start = [
+        hit.start() for hit in re.finditer(b"NAXIS   = ", data) if hit.start() % 80 == 0
+    ][number]
     path.write_bytes(data[: start + 10] + b"2147483647".rjust(20) + data[start + 30 :])
     with pytest.raises(
         InputError, match=r"axes\.fits: NAXIS 2147483647; allowed: up to 999 axes$"

@@ -100,7 +100,9 @@ def test_upright_undoes_the_orientation_tag(orientation: int) -> None:
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
 def test_the_focal_length_of_35_mm_film_is_read(tmp_path: Path, suffix: str) -> None:
-    assert images.read_picture(with_exif(tmp_path / f"x{suffix}", GRAY, 1, 26)).focal_35mm == 26
+    assert (
+        images.read_picture(with_exif(tmp_path / f"x{suffix}", GRAY, 1, 26)).focal_35mm == 26
+    )
     assert images.read_picture(with_exif(tmp_path / f"y{suffix}", GRAY, 6)).focal_35mm is None
     # 0: unknown.
     assert (
@@ -229,7 +231,9 @@ def test_a_file_of_tiles_is_read_with_its_header(tmp_path: Path, packed: bool) -
 
 
 @pytest.mark.parametrize("kind", ["i2", "u2", "i4", "f4", "f8", "u1"])
-def test_color_cubes_of_both_axis_orders_give_the_same_image(tmp_path: Path, kind: str) -> None:
+def test_color_cubes_of_both_axis_orders_give_the_same_image(
+    tmp_path: Path, kind: str
+) -> None:
     """Red first; ITU-R BT.601: .299 R + .587 G + .114 B."""
     rgb = np.random.default_rng(1).integers(0, 250, (6, 9, 3)).astype(kind)
     expected = rgb @ [0.299, 0.587, 0.114]
@@ -249,7 +253,9 @@ def test_a_cube_of_one_plane_is_an_image_and_one_of_many_is_refused(
     path = fits_file(tmp_path / "one.fits", FRAME[None, None], ROWORDER="TOP-DOWN")
     np.testing.assert_array_equal(images.read_picture(path).pixels, FRAME)
     for shape in ((12, 6, 9), (2, 6, 9), (3, 2, 6, 9), (5,)):
-        path = fits_file(tmp_path / f"{len(shape)}_{shape[0]}.fits", np.zeros(shape, np.int16))
+        path = fits_file(
+            tmp_path / f"{len(shape)}_{shape[0]}.fits", np.zeros(shape, np.int16)
+        )
         message = re.escape(
             f"a FITS image of shape {shape}; allowed: (H, W), color (3, H, W) and (H, W, 3)"
         )
@@ -274,7 +280,9 @@ def test_a_gzipped_file_is_unpacked_up_to_a_limit(
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.999])
-def test_a_truncated_gzipped_file_is_refused_in_one_line(tmp_path: Path, share: float) -> None:
+def test_a_truncated_gzipped_file_is_refused_in_one_line(
+    tmp_path: Path, share: float
+) -> None:
     data = gzip.compress(
         fits_file(
             tmp_path / "x.fits", RNG.integers(0, 60_000, (60, 90), np.uint16)

@@ -20,7 +20,9 @@ def test_rotation_vectors_round_trip_through_quaternions(turn: list[float]) -> N
     made = quaternion.from_rotvec(np.array(turn, float))
     same = Rotation.from_rotvec(turn)
     assert (Rotation.from_quat(made, scalar_first=True).inv() * same).magnitude() < 1e-15
-    np.testing.assert_allclose(quaternion.to_rotvec(made), same.as_rotvec(), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        quaternion.to_rotvec(made), same.as_rotvec(), rtol=0, atol=1e-14
+    )
     np.testing.assert_allclose(
         quaternion.to_rotvec(-made), same.as_rotvec(), rtol=0, atol=1e-14
     )

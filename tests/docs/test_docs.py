@@ -54,7 +54,9 @@ def test_the_page_s_tables_can_be_printed(words: list[str]) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("words", TABLES, ids=" ".join)
-def test_a_tenth_of_the_page_s_trials_prints_the_same_number_of_rows(words: list[str]) -> None:
+def test_a_tenth_of_the_page_s_trials_prints_the_same_number_of_rows(
+    words: list[str],
+) -> None:
     """Numbers are the business of the modules' own tests."""
     trials = int(words[words.index(COUNT) + 1]) // 10
     assert len(printed_with(words, trials)) == len(printed_with(words, 2))
@@ -87,7 +89,9 @@ def test_the_page_s_survey_prints_what_the_page_shows(tmp_path: Path) -> None:
         done.stdout,
         re.M,
     )
-    rows = dict(re.findall(r"^\| (new attitudes|cross|roll).*\| ([\d.]+)[^|]*\|$", DOME, re.M))
+    rows = dict(
+        re.findall(r"^\| (new attitudes|cross|roll).*\| ([\d.]+)[^|]*\|$", DOME, re.M)
+    )
     shown = [float(rows[name]) for name in ("new attitudes", "cross", "roll")]
     assert [float(one) for one in after] == pytest.approx(shown, rel=0.1)
 
@@ -110,7 +114,9 @@ def test_the_page_s_skysim_commands_parse(words: list[str]) -> None:
 def test_the_page_s_surveys_are_run_by_tests() -> None:
     for words in commands():
         if words[0] == "pytest":
-            assert words[words.index("-k") + 1] in (ROOT / words[3]).read_text(encoding="utf-8")
+            assert words[words.index("-k") + 1] in (ROOT / words[3]).read_text(
+                encoding="utf-8"
+            )
 
 
 # The pages of the studies.

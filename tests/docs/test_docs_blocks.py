@@ -82,7 +82,9 @@ def all_pages() -> list[Path]:
 
 def walked() -> list[Any]:
     """Pages with blocks to run and without a test of their own."""
-    pages = [path for path in all_pages() if path.relative_to(ROOT).as_posix() not in ELSEWHERE]
+    pages = [
+        path for path in all_pages() if path.relative_to(ROOT).as_posix() not in ELSEWHERE
+    ]
     running = [
         path
         for path in pages
@@ -153,7 +155,9 @@ def ran(line: str) -> str:
     """Text printed by a command. `make` runs this test itself, so only its targets are checked."""
     program, *words = shlex.split(line, comments=True)
     if program == "make":
-        done = subprocess.run(["make", "-n", *words], cwd=ROOT, capture_output=True, text=True)
+        done = subprocess.run(
+            ["make", "-n", *words], cwd=ROOT, capture_output=True, text=True
+        )
         assert done.returncode == 0, done.stderr
         return ""
     assert program == "skysim", f"{line}: another program's command belongs in a `text` block"

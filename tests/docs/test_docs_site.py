@@ -82,7 +82,9 @@ def test_a_section_has_the_options_that_help_shows(name: str) -> None:
 def test_a_key_s_row_states_its_type_and_default() -> None:
     exposure = keys.table(ExposureConfig)
     survey = keys.table(SurveyErrorsConfig)
-    assert '| `time` | a time such as "40 ms" or "1000 us", ≥ 1e-06 s | required |' in exposure
+    assert (
+        '| `time` | a time such as "40 ms" or "1000 us", ≥ 1e-06 s | required |' in exposure
+    )
     assert "| `rate_hz` | number, > 0 | required |" in exposure
     assert (
         '| `led_sigma` | a length such as "35 mm" or "48 in" or LengthToleranceConfig | `0 m` |'
@@ -204,7 +206,8 @@ def test_every_make_target_of_ci_exists(name: str) -> None:
     assert os.access(script, os.X_OK)
     text = script.read_text(encoding="utf-8")
     targets, parts = (
-        re.findall(rf"^{head}make ([a-z-]+)", text, re.MULTILINE) for head in ("", r"part \w+ ")
+        re.findall(rf"^{head}make ([a-z-]+)", text, re.MULTILINE)
+        for head in ("", r"part \w+ ")
     )
     assert len(targets) + len(parts) >= 4
     assert {*targets, *parts} <= set(

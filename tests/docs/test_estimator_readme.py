@@ -29,7 +29,9 @@ def picture(cam_from_icrs: Rotation) -> np.ndarray:
     light = np.zeros((800, 1000))
     rows, columns = np.mgrid[:800, :1000]
     for (x, y), mag in zip(xy[inside], stars.v_mag[inside], strict=True):
-        light += 4000 * 10 ** (-0.4 * mag) * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 2)
+        light += (
+            4000 * 10 ** (-0.4 * mag) * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 2)
+        )
     return np.clip(
         light + np.random.default_rng(1).normal(10, 1.5, light.shape), 0, 255
     ).astype(np.uint8)

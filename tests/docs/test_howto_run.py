@@ -22,7 +22,12 @@ def folder(tmp_path_factory) -> Path:
 def test_the_commands_write_the_page_s_files(folder):
     ran = {path.name for path in (folder / "out" / "short").iterdir()}
     frames = {f"frame_000{n}.{suffix}" for n in (0, 1) for suffix in ("fits", "png", "ecsv")}
-    assert ran == frames | {"solutions.ecsv", "telemetry.ecsv", "annotated.png", "report.html"}
+    assert ran == frames | {
+        "solutions.ecsv",
+        "telemetry.ecsv",
+        "annotated.png",
+        "report.html",
+    }
     # `render` came after `run` and removed what the latter said of other frames.
     rendered = {path.name for path in (folder / "out" / "shefex2").iterdir()}
     assert rendered == {

@@ -64,7 +64,8 @@ def test_every_name_in_the_table_of_changes_is_in_its_file():
     assert len(rows) >= 8
     for names, places in rows:
         paths = [
-            (ROOT / ARCHITECTURE).parent / path for path in re.findall(r"\]\(([^)]+)\)", places)
+            (ROOT / ARCHITECTURE).parent / path
+            for path in re.findall(r"\]\(([^)]+)\)", places)
         ]
         text = "".join(path.read_text(encoding="utf-8") for path in paths if path.is_file())
         assert [name for name in re.findall(r"`(\w+)`", names) if name not in text] == []

@@ -132,7 +132,9 @@ def test_findings_stay_short() -> None:
 
 
 def test_every_picture_is_shown() -> None:
-    shown = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs").rglob("*.md"))
+    shown = "".join(
+        path.read_text(encoding="utf-8") for path in (ROOT / "docs").rglob("*.md")
+    )
     named = set(re.findall(r"[\w-]+\.png", shown))
     assert [
         path.name

@@ -34,7 +34,9 @@ def pyramid(skew_rad: float, n: int = 4) -> tuple[np.ndarray, np.ndarray]:
     return gimbal.T, around.apply([0.0, 1.0, 0.0]).T
 
 
-def pyramid_set(steering: str = "singularity_robust", rate_limit_rad_s: float = 1.0) -> CmgSet:
+def pyramid_set(
+    steering: str = "singularity_robust", rate_limit_rad_s: float = 1.0
+) -> CmgSet:
     """Four CMGs of one N m s each at 100 rad/s."""
     return CmgSet(*pyramid(SKEW), np.full(4, 0.01), rate_limit_rad_s, None, steering)
 
@@ -62,7 +64,13 @@ class Body:
     @classmethod
     def start(cls, gimbal, axle, inertia, angle, speed, rate) -> Body:
         body = cls(
-            gimbal, axle, inertia, np.array(angle, float), np.zeros(len(inertia)), STILL, STILL
+            gimbal,
+            axle,
+            inertia,
+            np.array(angle, float),
+            np.zeros(len(inertia)),
+            STILL,
+            STILL,
         )
         axles = body.axles(body.angle)
         body.spin = inertia * (np.asarray(speed, float) + rate @ axles)
@@ -123,10 +131,14 @@ def test_wheels_turn_the_body_and_take_its_momentum(n):
     """From rest rate = BUS^-1 T t, and the total momentum stays zero."""
     set_ = wheels(n)
     torque = np.array([0.05, -0.08, 0.03])
-    body = Body.start(set_.axes, set_.axes, set_.inertia_kg_m2, np.zeros(n), np.zeros(n), STILL)
+    body = Body.start(
+        set_.axes, set_.axes, set_.inertia_kg_m2, np.zeros(n), np.zeros(n), STILL
+    )
     for _ in range(100):
         body = body.move(0.01, motor=set_.drive(torque, body.speed, 0.01))
-    np.testing.assert_allclose(body.rate, np.linalg.solve(BUS, torque * 1.0), rtol=1e-9, atol=0)
+    np.testing.assert_allclose(
+        body.rate, np.linalg.solve(BUS, torque * 1.0), rtol=1e-9, atol=0
+    )
     everything = BUS + set_.axes * set_.inertia_kg_m2 @ set_.axes.T
     np.testing.assert_allclose(
         set_.momentum(body.speed), -everything @ body.rate, rtol=1e-9, atol=0
@@ -198,7 +210,8 @@ def test_a_torque_outside_the_plane_of_level_wheels_is_dropped(angles_deg):
 def fans(limit_n: float = 0.5) -> FanSet:
     """A pair of fans about each axis, one meter apart, whose forces cancel."""
     places = (
-        0.5 * np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0]]).T
+        0.5
+        * np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0]]).T
     )
     pushes = np.array(
         [[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float
@@ -257,7 +270,9 @@ def test_the_jacobian_is_the_momentums_derivative():
 
 def test_manipulability_is_one_at_best_and_nothing_at_a_singularity():
     square = CmgSet(np.eye(3), np.roll(np.eye(3), 1, axis=0), np.full(3, 0.01), 1.0)
-    assert square.manipulability(np.zeros(3), np.full(3, 100.0)) == pytest.approx(1, rel=1e-12)
+    assert square.manipulability(np.zeros(3), np.full(3, 100.0)) == pytest.approx(
+        1, rel=1e-12
+    )
     assert square.manipulability(np.zeros(3), np.zeros(3)) == 0
     set_ = pyramid_set()
     assert set_.manipulability(ANGLES, 7 * SPEEDS) == pytest.approx(
@@ -296,7 +311,8 @@ def test_away_from_singularities_both_steering_laws_agree():
     """lambda is 0.01 exp(-10 det A A^T), 5e-8 at rest with det = 32/27: the rates differ by no more."""
     torque = np.array([0.1, -0.05, 0.2])
     plain, robust = (
-        pyramid_set(name).drive(torque, STILL, np.zeros(4), SPEED, 3.0)[0] for name in STEERING
+        pyramid_set(name).drive(torque, STILL, np.zeros(4), SPEED, 3.0)[0]
+        for name in STEERING
     )
     lambda_ = 0.01 * math.exp(-10 * 32 / 27)
     assert 0 < np.abs(plain - robust).max() < 3 * lambda_ * np.abs(plain).max()

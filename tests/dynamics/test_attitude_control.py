@@ -59,7 +59,9 @@ def closed(
         w = y[9:12]
         law.error_sum_rad_s = y[12:].copy()
         torque = (
-            law.torque_nm(t_s, quaternion.from_rotation(Rotation.from_matrix(R)), w, stored_nms)
+            law.torque_nm(
+                t_s, quaternion.from_rotation(Rotation.from_matrix(R)), w, stored_nms
+            )
             + disturbance_nm
         )
         moves = inverse @ (torque - np.cross(w, law.inertia_kg_m2 @ w + stored_nms))
@@ -84,7 +86,9 @@ def test_the_error_decays_with_the_placed_poles() -> None:
     """
     axis = np.array([2.0, -1.0, 2.0]) / 3
     t_s = np.linspace(0.2, 6.0, 30)
-    there, rate = closed(holding(TENSOR, **PLACED), Rotation.from_rotvec(axis), 0.3 * axis, t_s)
+    there, rate = closed(
+        holding(TENSOR, **PLACED), Rotation.from_rotvec(axis), 0.3 * axis, t_s
+    )
     companion = np.array([[0, 1, 0], [0, 0, 1], -POLES[:0:-1]])
     expected = np.array([expm(companion * t) @ [0.0, 1.0, 0.3] for t in t_s])[:, 1:]
     np.testing.assert_allclose(
@@ -98,7 +102,9 @@ def test_the_poles_are_the_roots_of_the_characteristic_polynomial() -> None:
     pid = holding(**PLACED)
     pd = holding(**PLACED, law="pd")
     np.testing.assert_allclose([1, pid.kd, pid.kp, pid.ki], POLES, rtol=1e-15, atol=0)
-    np.testing.assert_allclose([1, pd.kd, pd.kp, pd.ki], [1, 2.8, 4.0, 0.0], rtol=1e-15, atol=0)
+    np.testing.assert_allclose(
+        [1, pd.kd, pd.kp, pd.ki], [1, 2.8, 4.0, 0.0], rtol=1e-15, atol=0
+    )
 
 
 def test_the_attitude_error_takes_the_shorter_way() -> None:
@@ -222,7 +228,9 @@ def test_a_large_error_commands_at_most_a_rate_that_can_be_braked(
     )
     here = quaternion.from_rotation(Rotation.from_rotvec([0, 0, 1.0]))
     torque = law.torque_nm(0.0, here, NONE, NONE)
-    np.testing.assert_allclose(torque, [0, 0, -9.0 * law.kd * expected], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(
+        torque, [0, 0, -9.0 * law.kd * expected], rtol=1e-12, atol=1e-15
+    )
     coasting = law.torque_nm(0.0, here, np.array([0, 0, -expected]), NONE)
     np.testing.assert_allclose(coasting, NONE, rtol=0, atol=1e-12)
     law.integrate(torque, torque, 0.01)

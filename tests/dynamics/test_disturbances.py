@@ -35,7 +35,9 @@ def flown(duration_s: float, **changes: str) -> Flight:
     until = {
         "exposure": f"{{time: 10 ms, rate_hz: 1, frames: 1, first: {duration_s - 0.012} s}}"
     }
-    given = BALANCED | until | {key.replace("__", "."): value for key, value in changes.items()}
+    given = (
+        BALANCED | until | {key.replace("__", "."): value for key, value in changes.items()}
+    )
     return simulate_motion(loader.load("afit_simsat", given))
 
 

@@ -48,7 +48,9 @@ BUMP = {"kind": "bump", "rate_deg_s": [30, -60, 10], "duration": "50 ms"}
 
 def turn_to(roll: float, pitch: float, yaw: float, **limits: float) -> dict[str, object]:
     return (
-        {"kind": "slew", "roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw} | LIMITS | limits
+        {"kind": "slew", "roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw}
+        | LIMITS
+        | limits
     )
 
 
@@ -127,7 +129,11 @@ def test_euler_angles_are_yaw_then_pitch_then_roll() -> None:
         [0, 1, 0],
         [-math.sin(pitch), 0, math.cos(pitch)],
     ]
-    about_z = [[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]]
+    about_z = [
+        [math.cos(yaw), -math.sin(yaw), 0],
+        [math.sin(yaw), math.cos(yaw), 0],
+        [0, 0, 1],
+    ]
     angles = dict(
         zip(("roll_deg", "pitch_deg", "yaw_deg"), np.degrees([roll, pitch, yaw]), strict=True)
     )
@@ -236,7 +242,9 @@ CHANGES = [
 
 @pytest.mark.compiles
 @pytest.mark.parametrize(("begin", "end", "lasts_s"), CHANGES)
-def test_spin_up_is_the_integral_of_its_rate(begin: tuple, end: tuple, lasts_s: float) -> None:
+def test_spin_up_is_the_integral_of_its_rate(
+    begin: tuple, end: tuple, lasts_s: float
+) -> None:
     """Against scipy's eighth-order integration of q' = q w / 2 with w by hand, to 1e-9 rad."""
     ref = reference(
         {"kind": "rate", "rate_deg_s": begin, "duration": "1 s"},
@@ -266,7 +274,9 @@ def test_spin_up_is_the_integral_of_its_rate(begin: tuple, end: tuple, lasts_s: 
 
 def test_a_spin_up_from_or_to_rest_turns_by_half_of_rate_times_time() -> None:
     """The mean of the smoothstep is 1/2; the axis stands still, so this is exact."""
-    up, down = (SPIN | {"rate_deg_s": w, "duration": "10 s"} for w in ([6, 0, -12], [0, 0, 0]))
+    up, down = (
+        SPIN | {"rate_deg_s": w, "duration": "10 s"} for w in ([6, 0, -12], [0, 0, 0])
+    )
     ref = reference(HOLD, up, down)
     for t, turned_s in ((12.0, 5.0), (22.0, 10.0), (99.0, 10.0)):
         wanted = euler(*START.values()) * Rotation.from_rotvec(
@@ -359,7 +369,9 @@ def test_there_is_a_law_for_every_kind_of_element() -> None:
 
 
 @pytest.mark.parametrize(("first", "second"), list(itertools.product(EVERY, repeat=2)))
-def test_attitude_is_continuous_between_all_elements_but_steps(first: str, second: str) -> None:
+def test_attitude_is_continuous_between_all_elements_but_steps(
+    first: str, second: str
+) -> None:
     later = [el for el in EVERY[second] if el["kind"] != "step"] or [HOLD]
     ref = reference(*EVERY[first], *later, HOLD)
     joints = ref.start_s[1:]
@@ -409,7 +421,9 @@ def test_a_vehicle_that_was_spun_up_keeps_spinning(kind: str) -> None:
 
 def test_a_hold_after_a_rate_stops_at_once() -> None:
     ref = reference(RATE, HOLD)
-    np.testing.assert_allclose(ref.state_at(4.0 - 1e-9)[1], np.radians([3, -5, 20]), rtol=1e-14)
+    np.testing.assert_allclose(
+        ref.state_at(4.0 - 1e-9)[1], np.radians([3, -5, 20]), rtol=1e-14
+    )
     stopped = euler(*START.values()) * Rotation.from_rotvec(np.radians([12, -20, 80]))
     for t in (4.0, 5.0, 6.0, 60.0):
         np.testing.assert_array_equal(ref.state_at(t)[1], np.zeros(3))
@@ -466,7 +480,8 @@ def test_the_reference_is_fast_enough_for_every_control_tick() -> None:
         ref = reference(*EVERY[name])
         t = ref.start_s[-2] + 0.3 * (ref.duration_s - ref.start_s[-2])
         assert (
-            min(timeit.repeat(lambda ref=ref, t=t: ref.state_at(t), number=20, repeat=200)) / 20
+            min(timeit.repeat(lambda ref=ref, t=t: ref.state_at(t), number=20, repeat=200))
+            / 20
             < 12e-6
         )
 
@@ -502,7 +517,9 @@ def test_bumps_knock_at_their_times_and_a_caught_one_leaves_no_impulse() -> None
         np.testing.assert_allclose(np.degrees(knock.rate_rad_s), [30, -60, 10], rtol=1e-14)
     left = sum(k.fraction(5.0, 9.0) * k.rate_rad_s for k in (second, third))
     np.testing.assert_allclose(left, np.zeros(3), rtol=0, atol=1e-15)
-    assert plan(motion).start_s[4] == pytest.approx(5.18, abs=1e-12)  # caught_after + duration
+    assert plan(motion).start_s[4] == pytest.approx(
+        5.18, abs=1e-12
+    )  # caught_after + duration
     assert impulses(motion_config(HOLD, SPIN), reference(HOLD, SPIN)) == ()
 
 

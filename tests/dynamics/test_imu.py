@@ -86,7 +86,9 @@ def unit(gyro: dict[str, Any] | None = None, seed: int = 200, draws: int = 1) ->
     return Imu.from_config(part(gyro, seed=seed), np.random.default_rng(draws))
 
 
-def samples(angle: Floats, velocity: Floats | None = None, step_s: float = STEP) -> Increments:
+def samples(
+    angle: Floats, velocity: Floats | None = None, step_s: float = STEP
+) -> Increments:
     count = len(angle)
     rest = np.zeros((count, 3)) if velocity is None else velocity
     fine = np.zeros(count, bool)
@@ -140,7 +142,8 @@ class Cone:
         flat = np.sin(self.half)
         along = np.cos(self.half) - 1
         return np.stack(
-            [flat * np.cos(self.w * t), flat * np.sin(self.w * t), along * self.w * t], axis=-1
+            [flat * np.cos(self.w * t), flat * np.sin(self.w * t), along * self.w * t],
+            axis=-1,
         )
 
     def acceleration(self, t: Any) -> Floats:
@@ -390,7 +393,9 @@ def test_an_accelerometer_on_a_lever_measures_the_centripetal_force() -> None:
     got = ideal_increments(
         knots, wxyz(attitude), spin, np.array([0.5]), STEP, (0.2, 0.0, 0.7), G
     )
-    np.testing.assert_allclose(got.velocity_m_s[0] / STEP, [-0.219325, 0, G], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        got.velocity_m_s[0] / STEP, [-0.219325, 0, G], rtol=0, atol=1e-6
+    )
 
 
 def test_an_accelerometer_on_a_lever_measures_the_angular_acceleration() -> None:
@@ -524,7 +529,9 @@ def test_scale_and_misalignment_change_a_known_rotation_as_declared() -> None:
     total = one.measure(steady(turn, 4000)).angle_rad.sum(axis=0)
     matrix = one.gyro.matrix
     np.testing.assert_allclose(total, 2 * np.pi * matrix[:, 1], rtol=1e-12)
-    np.testing.assert_allclose(total[1] - 2 * np.pi, 2 * np.pi * (matrix[1, 1] - 1), rtol=1e-6)
+    np.testing.assert_allclose(
+        total[1] - 2 * np.pi, 2 * np.pi * (matrix[1, 1] - 1), rtol=1e-6
+    )
     assert 0 < abs(matrix[1, 1] - 1) < 4 * 500e-6
     assert (np.abs(matrix[[0, 2], 1]) < 4 * 100 * ARCSEC).all()
     backwards = unit({"scale_ppm": 500, "misalignment_arcsec": 100}).measure(
@@ -544,7 +551,12 @@ def test_the_measured_rate_at_rest_is_the_bias() -> None:
 
 def test_accelerometer_errors_are_independent_of_gyro_errors() -> None:
     """At rest on the table: bias of a whole minute's mean is turn-on + wandering; gyros stay exact."""
-    settings = {"turn_on_bias_ug": 300, "bias_ug": 50, "bias_time": "1e15 s", "scale_ppm": 300}
+    settings = {
+        "turn_on_bias_ug": 300,
+        "bias_ug": 50,
+        "bias_time": "1e15 s",
+        "scale_ppm": 300,
+    }
     one = Imu.from_config(part(None, settings), np.random.default_rng(3))
     ideal = still(Rotation.identity(), 60.0, STEP, np.zeros(3))
     got = one.measure(ideal)
@@ -805,7 +817,9 @@ def test_coning_makes_the_navigator_drift_as_theory_predicts() -> None:
 )
 def test_euler_angles_match_scipy(euler: tuple[float, float, float]) -> None:
     start = Rotation.from_euler("ZYX", euler[::-1], degrees=True)
-    np.testing.assert_allclose(euler_deg(Navigator(3 * wxyz(start))), euler, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(
+        euler_deg(Navigator(3 * wxyz(start))), euler, rtol=0, atol=1e-10
+    )
 
 
 def test_an_initial_attitude_error_is_constant_in_the_lab() -> None:

@@ -23,7 +23,9 @@ ARCSEC = np.radians(1 / 3600)
 RMS = (5.0, 2.0, 0.5)
 
 
-def line(frequency_hz: float = 40.0, rms: tuple[float, float, float] = RMS) -> JitterLineConfig:
+def line(
+    frequency_hz: float = 40.0, rms: tuple[float, float, float] = RMS
+) -> JitterLineConfig:
     return JitterLineConfig.model_validate(
         {"kind": "line", "frequency_hz": frequency_hz, "rms_arcsec": rms}
     )
@@ -31,7 +33,13 @@ def line(frequency_hz: float = 40.0, rms: tuple[float, float, float] = RMS) -> J
 
 def band(from_hz: float, to_hz: float, slope: float = 0.0) -> JitterBandConfig:
     return JitterBandConfig.model_validate(
-        {"kind": "band", "from_hz": from_hz, "to_hz": to_hz, "rms_arcsec": RMS, "slope": slope}
+        {
+            "kind": "band",
+            "from_hz": from_hz,
+            "to_hz": to_hz,
+            "rms_arcsec": RMS,
+            "slope": slope,
+        }
     )
 
 
@@ -125,7 +133,9 @@ def test_periodogram_of_a_band_rises_with_its_slope(slope: float) -> None:
     octave = np.exp2((slope + 1) * np.arange(4))
     scatter = np.std(shares, axis=0) / np.sqrt(len(shares))
     # Within 4 sigma, and 1 % that the window carries over an octave's edge.
-    assert np.all(np.abs(np.mean(shares, axis=0) - octave / octave.sum()) < 4 * scatter + 0.01)
+    assert np.all(
+        np.abs(np.mean(shares, axis=0) - octave / octave.sum()) < 4 * scatter + 0.01
+    )
 
 
 def test_many_sines_are_normally_distributed() -> None:
@@ -144,7 +154,9 @@ def test_between_the_samples_the_history_follows_the_sum() -> None:
     rng = np.random.default_rng(8)
     sines = concatenate([SPECTRA[part.kind](part, rng) for part in parts])
     t = np.random.default_rng(9).uniform(0, 2, 5000)
-    wanted = evaluate_sines(t, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0] / ARCSEC
+    wanted = (
+        evaluate_sines(t, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0] / ARCSEC
+    )
     error = np.abs(shaken_by(calm, shaken, t) - wanted)
     assert (error.max(axis=0) < 1e-3 * np.abs(wanted).max(axis=0)).all()
     highest_hz = sines.omega_rad_s.max() / (2 * np.pi)
@@ -163,9 +175,13 @@ def test_the_samples_of_the_history_without_jitter_are_kept() -> None:
 def test_rates_are_the_derivative_of_the_attitude() -> None:
     """A strong vibration (1 degree) on a body that turns at 20 deg/s: central differences, error h^2 w^3 phi / 6."""
     calm = turning(0.5, rate=(0.2, -0.1, 0.25))
-    shaken = shake(calm, (line(10.0, rms=(3600.0, 2000.0, 1000.0)),), np.random.default_rng(11))
+    shaken = shake(
+        calm, (line(10.0, rms=(3600.0, 2000.0, 1000.0)),), np.random.default_rng(11)
+    )
     at = shaken.t_s[1:-1]
-    sines = SPECTRA["line"](line(10.0, rms=(3600.0, 2000.0, 1000.0)), np.random.default_rng(11))
+    sines = SPECTRA["line"](
+        line(10.0, rms=(3600.0, 2000.0, 1000.0)), np.random.default_rng(11)
+    )
 
     def attitude(t_s: np.ndarray) -> Rotation:
         phi = evaluate_sines(t_s, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0]
@@ -204,7 +220,9 @@ def test_without_its_cross_term_the_rate_is_wrong() -> None:
 @pytest.mark.parametrize("angle", [1e-6, 3e-5, 0.99e-4, 1.01e-4, 1e-3])
 def test_the_rate_across_a_small_rotation_has_the_sine_term(angle: float) -> None:
     """Across phi the rate's own part is sin a / a of it; the terms add up to it within rounding, below 1e-4 rad too."""
-    across = rotvec_body_rate(np.array([[angle, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]]))[0, 1]
+    across = rotvec_body_rate(np.array([[angle, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]]))[
+        0, 1
+    ]
     assert 1 - across == pytest.approx(angle**2 / 6 - angle**4 / 120, rel=0, abs=3e-16)
 
 
@@ -397,7 +415,8 @@ def test_too_many_samples_of_a_vibration_are_refused_with_its_time() -> None:
     )
     flight = turning(3.0, samples=3001)
     with pytest.raises(
-        InputError, match=r"^motion\.maneuver jitter at 1 s: 1.*e\+06 Hz over 1 s needs 16,0.*$"
+        InputError,
+        match=r"^motion\.maneuver jitter at 1 s: 1.*e\+06 Hz over 1 s needs 16,0.*$",
     ):
         vibration.add_to(flight)
     with pytest.raises(InputError, match=r"; allowed: 5,000,000, 16 a period$"):

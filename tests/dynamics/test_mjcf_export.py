@@ -158,14 +158,19 @@ def test_an_exported_vehicle_contains_its_mesh_files(tmp_path: Path) -> None:
         <camera name="star_camera" quat="0 1 0 0"/></body></worldbody></mujoco>"""
     )
     scene, vehicle, sources = dome_lab(
-        {"vehicle.model": str(tmp_path / "v.xml"), "vehicle.center_of_mass": "[0 m, 0 m, 0 m]"}
+        {
+            "vehicle.model": str(tmp_path / "v.xml"),
+            "vehicle.center_of_mass": "[0 m, 0 m, 0 m]",
+        }
     )
     text = mjcf_export.mjcf(vehicle, scene, sources, LEVEL)
     assert "tetra.obj" not in text
     own = mujoco.MjData(vehicle.model)
     mujoco.mj_forward(vehicle.model, own)
     here = vertices_m(*loaded(text), "hull")
-    np.testing.assert_allclose(here, vertices_m(vehicle.model, own, "hull"), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        here, vertices_m(vehicle.model, own, "hull"), rtol=0, atol=1e-6
+    )
 
 
 @pytest.mark.slow
@@ -175,7 +180,10 @@ def test_a_vehicle_that_has_its_own_camera_lab_is_refused(tmp_path: Path) -> Non
         <camera name="star_camera" quat="0 1 0 0"/></body></worldbody></mujoco>"""
     )
     scene, vehicle, sources = dome_lab(
-        {"vehicle.model": str(tmp_path / "v.xml"), "vehicle.center_of_mass": "[0 m, 0 m, 0 m]"}
+        {
+            "vehicle.model": str(tmp_path / "v.xml"),
+            "vehicle.center_of_mass": "[0 m, 0 m, 0 m]",
+        }
     )
     with pytest.raises(InputError, match="lab") as refused:
         mjcf_export.mjcf(vehicle, scene, sources, LEVEL)
@@ -205,7 +213,9 @@ def test_exported_dome_and_leds_have_the_scene_s_positions() -> None:
 def test_a_flat_panel_is_a_disk_at_its_height_that_covers_its_leds() -> None:
     flat = {"light.surface": "{kind: flat, apex: 1.2 m}", "light.layout.cap_deg": "20"}
     scene, vehicle, sources = dome_lab(flat)
-    shell = vertices_m(*loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL)), "stage_dome_")
+    shell = vertices_m(
+        *loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL)), "stage_dome_"
+    )
     np.testing.assert_allclose(shell[:, 2], 1.2, rtol=0, atol=1e-6)
     assert np.hypot(*shell[:, :2].T).max() > np.hypot(*sources.place[:, :2].T).max()
 
@@ -299,7 +309,9 @@ def test_the_viewer_starts_where_the_lab_s_camera_looks() -> None:
         ring = np.cos(elevation)
         forward = [ring * np.cos(azimuth), ring * np.sin(azimuth), np.sin(elevation)]
         camera = data.camera("lab")
-        np.testing.assert_allclose(forward, -camera.xmat.reshape(3, 3)[:, 2], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(
+            forward, -camera.xmat.reshape(3, 3)[:, 2], rtol=0, atol=1e-6
+        )
         sight = model.stat.center - camera.xpos
         np.testing.assert_allclose(sight / np.linalg.norm(sight), forward, rtol=0, atol=1e-6)
 
@@ -311,7 +323,9 @@ def test_the_edges_of_the_camera_s_field_are_thin_capsules_along_it() -> None:
     tip_m = multibody.camera_mount(vehicle).camera_body_m
     corner_m = vertices_m(model, data, "stage_field")
     corner_m = corner_m[np.linalg.norm(corner_m - tip_m, axis=1) > 0.1]
-    ends = [(data.geom(f"stage_ray_{k}"), model.geom(f"stage_ray_{k}").size) for k in range(4)]
+    ends = [
+        (data.geom(f"stage_ray_{k}"), model.geom(f"stage_ray_{k}").size) for k in range(4)
+    ]
     for ray, (radius, half_m, _) in ends:
         middle = ray.xpos
         along = ray.xmat.reshape(3, 3)[:, 2]
@@ -470,7 +484,9 @@ def test_a_film_of_ten_seconds_fits_into_a_page(drawn: Drawn, tmp_path: Path) ->
         cv2.resize(one.astype(np.uint8), scene_picture.FILM_PX, interpolation=cv2.INTER_AREA)
         for one in drawn[4]
     ]
-    scene_picture.write_film((lit[k % 2] for k in range(100)), tmp_path / "film.gif", fps=10.0)
+    scene_picture.write_film(
+        (lit[k % 2] for k in range(100)), tmp_path / "film.gif", fps=10.0
+    )
     assert (tmp_path / "film.gif").stat().st_size < 2.5e6
 
 
@@ -478,7 +494,8 @@ def test_a_film_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="nowhere"):
         scene_picture.write_film(RED_TO_GREEN, tmp_path / "nowhere" / "film.gif", fps=10.0)
     with pytest.raises(
-        InputError, match=r"film\.avi: unknown animation format '\.avi'; allowed: \.gif, \.webp"
+        InputError,
+        match=r"film\.avi: unknown animation format '\.avi'; allowed: \.gif, \.webp",
     ):
         scene_picture.write_film(RED_TO_GREEN, tmp_path / "film.avi", fps=10.0)
     assert not list(tmp_path.iterdir())

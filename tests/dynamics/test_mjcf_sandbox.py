@@ -217,9 +217,7 @@ def nested(count: int) -> str:
 
 
 def flexcomp(count: str) -> str:
-    flex = (
-        f'<flexcomp name="f" dim="2" count="{count}" spacing=".1 .1 .1" radius=".01" mass="1"/>'
-    )
+    flex = f'<flexcomp name="f" dim="2" count="{count}" spacing=".1 .1 .1" radius=".01" mass="1"/>'
     return f'<body name="f">{flex}</body>'
 
 
@@ -263,7 +261,9 @@ def test_a_model_that_would_crash_or_never_end_is_refused(
 def test_numbers_that_are_not_finite_or_excessive_are_refused(
     tmp_path: Path, value: str
 ) -> None:
-    (tmp_path / "v.xml").write_text(whole("").replace('size=".1"', f'size=".1" pos="{value}"'))
+    (tmp_path / "v.xml").write_text(
+        whole("").replace('size=".1"', f'size=".1" pos="{value}"')
+    )
     with pytest.raises(
         InputError, match=r"v\.xml: geom pos='.*'; allowed: finite numbers up to 1e\+12$"
     ):

@@ -115,7 +115,8 @@ def test_mass_less_than_what_the_bus_carries_is_refused() -> None:
     with pytest.raises(InputError, match=r"vehicle.inertia: .* impossible for a rigid body"):
         multibody.build(vehicle_config(inertia=["0.5 kg m2"] * 3))
     with pytest.raises(
-        InputError, match=r"vehicle.camera: with the camera 5 m .* impossible for a rigid body"
+        InputError,
+        match=r"vehicle.camera: with the camera 5 m .* impossible for a rigid body",
     ):
         multibody.build(vehicle_config(camera=["0 m", "3 m", "4 m"]))
 
@@ -402,7 +403,9 @@ def built(
     folder: Path, bodies: str, more: str = "", **changes: object
 ) -> multibody.VehicleModel:
     file = folder / "mine.xml"
-    file.write_text(f"<mujoco>{more}<worldbody>{bodies}</worldbody></mujoco>", encoding="utf-8")
+    file.write_text(
+        f"<mujoco>{more}<worldbody>{bodies}</worldbody></mujoco>", encoding="utf-8"
+    )
     return multibody.build(VehicleConfig.model_validate({"model": str(file)} | changes))
 
 
@@ -502,7 +505,10 @@ def test_other_actuators_of_the_file_stay_and_get_no_control(tmp_path: Path) -> 
             {"wheels": {"start_rpm": [100, 200]}},
             r"vehicle\.wheels\.start_rpm: 2 values; allowed: 3",
         ),
-        ({"cmgs": {"start_deg": [1, 2, 3]}}, r"vehicle\.cmgs\.start_deg: 3 values; allowed: 4"),
+        (
+            {"cmgs": {"start_deg": [1, 2, 3]}},
+            r"vehicle\.cmgs\.start_deg: 3 values; allowed: 4",
+        ),
     ],
 )
 def test_start_values_must_be_one_for_each(changes: dict[str, object], message: str) -> None:
@@ -564,7 +570,9 @@ def test_an_untrusted_vehicle_reads_no_file_outside_of_its_folder(
 
 def test_a_vehicle_of_several_files_is_assembled(tmp_path: Path) -> None:
     (tmp_path / "deep").mkdir()
-    (tmp_path / "deep" / "bus.xml").write_text(f"<mujoco><worldbody>{BUS}</worldbody></mujoco>")
+    (tmp_path / "deep" / "bus.xml").write_text(
+        f"<mujoco><worldbody>{BUS}</worldbody></mujoco>"
+    )
     assert built(tmp_path, "", '<include file="deep/bus.xml"/>').spec.body("bus") is not None
 
 
@@ -645,7 +653,9 @@ def test_the_scene_s_declared_values_replace_the_file_s(
 @pytest.mark.slow
 def test_a_reference_to_a_locked_joint_is_refused_with_the_reason(tmp_path: Path) -> None:
     sensor = '<sensor><jointvel joint="wheel_x"/></sensor></mujoco>'
-    with pytest.raises(InputError, match=r"vehicle\.wheels is off, which locks joint wheel_x"):
+    with pytest.raises(
+        InputError, match=r"vehicle\.wheels is off, which locks joint wheel_x"
+    ):
         changed_model(tmp_path, "</mujoco>", sensor)
     assert len(changed_model(tmp_path, "</mujoco>", sensor, wheels={}).wheels) == 3
 

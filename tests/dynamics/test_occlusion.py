@@ -321,7 +321,9 @@ def test_a_panel_hides_its_leds_from_above_as_far_as_it_reaches() -> None:
     assert behind_wall(
         panel, np.array([0.1, 0.2, 1.5]), np.array([[0.3, 0.2, 1.0], [-0.9, 0.4, 1.0]])
     ).all()
-    assert not behind_wall(panel, np.array([0.1, 0.2, 0.5]), np.array([[0.3, 0.2, 1.0]])).any()
+    assert not behind_wall(
+        panel, np.array([0.1, 0.2, 0.5]), np.array([[0.3, 0.2, 1.0]])
+    ).any()
 
 
 @pytest.mark.slow

@@ -74,7 +74,9 @@ def speeds(flight: multibody.Simulation) -> Floats:
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_wheel_motor_turns_the_body_the_other_way_up_to_its_limit(axis: int) -> None:
     """Ask for 5 N m of a motor that has 0.2: the body goes with -0.2 t / (I - I_wheel), the total is nothing."""
-    vehicle = multibody.build(vehicle_config(mount="free", wheels={"torque_limit": "0.2 N m"}))
+    vehicle = multibody.build(
+        vehicle_config(mount="free", wheels={"torque_limit": "0.2 N m"})
+    )
     flight = flown(vehicle, STILL, held(vehicle, vehicle.wheels.motor[axis], 5.0, 2.0))
     body = -0.2 * 2.0 / (INERTIA[axis] - WHEEL_KG_M2)
     np.testing.assert_allclose(
@@ -118,7 +120,9 @@ def test_friction_brings_a_wheel_to_rest_and_the_body_takes_its_momentum() -> No
     np.testing.assert_allclose(flight.rate_body_rad_s, body, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize(("torque_nm", "expected"), [(0.019, 0.0), (0.03, 0.01 / WHEEL_KG_M2)])
+@pytest.mark.parametrize(
+    ("torque_nm", "expected"), [(0.019, 0.0), (0.03, 0.01 / WHEEL_KG_M2)]
+)
 def test_wheel_sticks_until_its_motor_beats_coulombs_friction(
     torque_nm: float, expected: float
 ) -> None:
@@ -301,7 +305,9 @@ def test_fans_thrust_follows_with_a_lag_and_stops_at_its_limit() -> None:
     A pair at 0.46 m is commanded 5 N each for a second; its limit is 0.3 N.
     """
     vehicle = multibody.build(
-        vehicle_config(mount="free", fans={"time_constant": "200 ms", "thrust_limit": "0.3 N"})
+        vehicle_config(
+            mount="free", fans={"time_constant": "200 ms", "thrust_limit": "0.3 N"}
+        )
     )
     control = still(vehicle, 3.0)
     control[:1000, vehicle.fans.motor[:2]] = 5.0

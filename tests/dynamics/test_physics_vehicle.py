@@ -349,7 +349,9 @@ def apart_from_a_finer_run_rad(
     vehicle.model.opt.timestep /= 10
     fine = flown(vehicle, begin, rate, np.repeat(control, 10, axis=0)).trajectory()
     inside = np.arange(len(fine.t_s))[np.arange(len(fine.t_s)) % 10 > 0]
-    return (fine.lab_from_body[inside].inv() * coarse.attitude_at(fine.t_s[inside])).magnitude()
+    return (
+        fine.lab_from_body[inside].inv() * coarse.attitude_at(fine.t_s[inside])
+    ).magnitude()
 
 
 def test_the_pose_within_an_exposure_is_exact_for_a_tumbling_vehicle() -> None:

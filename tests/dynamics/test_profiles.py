@@ -167,7 +167,9 @@ def csv(path: Path, columns: dict[str, object]) -> Path:
     return path
 
 
-def quaternion_columns(name: str, rotation: Rotation, order: str = "wxyz") -> dict[str, object]:
+def quaternion_columns(
+    name: str, rotation: Rotation, order: str = "wxyz"
+) -> dict[str, object]:
     xyzw = rotation.as_quat()
     return {"t_s": TIMES} | {f"{name}{end}": xyzw[:, "xyzw".index(end)] for end in order}
 
@@ -184,7 +186,10 @@ TABLES = {
     "any order": (quaternion_columns("lab_from_body_q", MOTION, "zwyx"), None),
     "inverse": (quaternion_columns("body_from_lab_q", MOTION.inv()), None),
     "frames given": (quaternion_columns("q_", MOTION, "xyzw"), "lab_from_body"),
-    "frames given, inverse": (quaternion_columns("q_", MOTION.inv(), "wxyz"), "body_from_lab"),
+    "frames given, inverse": (
+        quaternion_columns("q_", MOTION.inv(), "wxyz"),
+        "body_from_lab",
+    ),
     "angles": (angles_columns(), None),
 }
 
@@ -269,7 +274,10 @@ FAULTY_TABLES = [
         r"columns t_s, roll_deg, pitch_deg are not one time and one attitude",
     ),
     (GOOD.replace("t_s,", "utc,t_s,"), r"columns utc, t_s, .* are not one time"),
-    ("t_s,q_x,q_y,q_z,q_w\n", r"line 1: q_x, q_y, q_z, q_w do not say which rotation they are"),
+    (
+        "t_s,q_x,q_y,q_z,q_w\n",
+        r"line 1: q_x, q_y, q_z, q_w do not say which rotation they are",
+    ),
     ("t_s,q1,q2,q3,q4\n", r"line 1: unknown column 'q1'"),
     ("# nothing\n\n", r"empty; allowed: a line of column names"),
     (GOOD.replace("1,1,0,0", "1,1,0"), r"line 3: 3 values; allowed: 4"),
@@ -436,7 +444,11 @@ def test_a_written_profile_is_read_unchanged(frames: tuple[str, str], tmp_path: 
 @pytest.mark.parametrize("reference_first", [True, False])
 @pytest.mark.parametrize(
     ("kind", "more"),
-    [("QUATERNION", ""), ("QUATERNION/RATE", " 1 2 3"), ("QUATERNION/DERIVATIVE", " 0 0 0 0")],
+    [
+        ("QUATERNION", ""),
+        ("QUATERNION/RATE", " 1 2 3"),
+        ("QUATERNION/DERIVATIVE", " 0 0 0 0"),
+    ],
 )
 def test_order_direction_and_frames_of_version_1(
     order: str, direction: str, reference_first: bool, kind: str, more: str, tmp_path: Path
@@ -524,7 +536,9 @@ def test_epochs_of_every_time_system_are_turned_into_utc(
 ) -> None:
     """At noon of 31 December 2016, before the leap second: TAI - UTC = 36 s, TT - TAI = 32.184 s, TAI - GPS = 19 s."""
     read = read_text(aem(segment(MOTION, TIMES + ahead_s, TIME_SYSTEM=system)), tmp_path)
-    np.testing.assert_allclose(read.t_s, TIMES, rtol=0, atol=2e-3 if system == "TDB" else 1e-6)
+    np.testing.assert_allclose(
+        read.t_s, TIMES, rtol=0, atol=2e-3 if system == "TDB" else 1e-6
+    )
 
 
 def test_epochs_may_use_the_day_of_the_year(tmp_path: Path) -> None:
@@ -599,7 +613,8 @@ def test_segments_are_joined(tmp_path: Path) -> None:
         ),
         (
             aem(
-                segment(MOTION, TIMES), segment(MOTION, TIMES + 6, REF_FRAME_B="STARTRACKER_1")
+                segment(MOTION, TIMES),
+                segment(MOTION, TIMES + 6, REF_FRAME_B="STARTRACKER_1"),
             ),
             "a segment of icrs_from_cam after one of icrs_from_body",
         ),
@@ -635,7 +650,16 @@ def stk(
         for t, row in zip(TIMES.tolist(), rows.tolist(), strict=True)
     ]
     return "\n".join(
-        ["stk.v.11.0", "# by us", "BEGIN Attitude", *lines, section, *data, "END Attitude", ""]
+        [
+            "stk.v.11.0",
+            "# by us",
+            "BEGIN Attitude",
+            *lines,
+            section,
+            *data,
+            "END Attitude",
+            "",
+        ]
     )
 
 
@@ -737,7 +761,9 @@ def test_an_error_in_an_stk_file_is_reported_with_its_line(
 def test_a_file_that_names_its_frames_takes_no_other_rotation(tmp_path: Path) -> None:
     path = tmp_path / "p.a"
     path.write_text(stk(MOTION))
-    with pytest.raises(InputError, match="the file names its frames; allowed: no key rotation"):
+    with pytest.raises(
+        InputError, match="the file names its frames; allowed: no key rotation"
+    ):
         read_profile(path, START, "lab_from_body")
 
 

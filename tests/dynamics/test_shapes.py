@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.dynamics.multibody.mjcf_export import laboratory
+from skysim.dynamics.multibody.scene_shapes import laboratory
 
 # The tetrahedron is neither centered nor turned as its principal axes are.
 POINTS = np.array([[0.1, 0.2, 0], [0.6, 0.2, 0.1], [0.1, 0.5, 0], [0.2, 0.2, 0.7]])
@@ -34,7 +34,9 @@ def test_shapes_have_the_kinds_and_sizes_of_the_file() -> None:
     np.testing.assert_allclose(cylinder.rgba, [1, 0, 0, 1])
     assert cylinder.name == "bar"
     assert not floor.on_vehicle
-    assert all(shape.on_vehicle for shape in (box, sphere, cylinder, capsule, ellipsoid, mesh))
+    assert all(
+        shape.on_vehicle for shape in (box, sphere, cylinder, capsule, ellipsoid, mesh)
+    )
 
 
 def test_shapes_are_where_the_file_puts_them() -> None:

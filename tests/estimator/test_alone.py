@@ -99,7 +99,9 @@ def test_the_estimator_wheel_solves_in_a_bare_environment(tmp_path: Path) -> Non
     subprocess.run([python, *quiet, "install", wheel], check=True)
     catalog = "import pathlib, estimator; ROOT = pathlib.Path(estimator.__file__).parent\n"
     catalog += "CATALOG = ROOT / 'data/catalogs/hipparcos_hp6.5.ecsv'"
-    clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    clean = {
+        name: value for name, value in os.environ.items() if not name.startswith("PYTHON")
+    }
 
     def printed() -> str:
         done = subprocess.run(

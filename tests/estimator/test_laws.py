@@ -34,6 +34,9 @@ def test_the_laws_hold_for_hundreds_of_examples(checked: bool, tmp_path: Path) -
     bounds = {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)} if checked else {}
     call = [sys.executable, "-m", "pytest", "-x", *map(str, FILES)]
     done = subprocess.run(
-        call, env=os.environ | bounds | {"LAW_EXAMPLES": "300"}, capture_output=True, text=True
+        call,
+        env=os.environ | bounds | {"LAW_EXAMPLES": "300"},
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stdout[-3000:]

@@ -20,7 +20,7 @@ from estimator import (
 )
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.solvers import SOLVERS, covariance
-from estimator.calibration import dome_survey, home_position, star_field
+from estimator.calibration import dome_survey, home_position, star_field, zero_point
 from estimator.calibration.star_field import StarFrame
 from estimator.catalog import catalog
 from estimator.core.types import FramePriors
@@ -83,7 +83,11 @@ CAMERAS: list[Case] = [
     ("focal < 0", lambda: lens(-5.0), r"focal_px is -5\.0; allowed"),
     ("focal NaN", lambda: lens(NAN), "focal_px is nan; allowed"),
     ("zoom 0", lambda: CAMERA.zoomed(0), r"focal_px is 0\.0; allowed"),
-    ("sigma < 0", lambda: lens(focal_sigma=-0.1), r"focal_sigma is -0\.1; allowed: 0 to 0\.5"),
+    (
+        "sigma < 0",
+        lambda: lens(focal_sigma=-0.1),
+        r"focal_sigma is -0\.1; allowed: 0 to 0\.5",
+    ),
     (
         "distortion",
         lambda: lens(distortion=(0.1, 0.2)),
@@ -191,7 +195,11 @@ SKIES: list[Case] = [
     ),
 ]
 IMAGES: list[Case] = [
-    ("none", lambda: TRACKER.solve(None), "the image is a NoneType .*cv2.imread answers None"),
+    (
+        "none",
+        lambda: TRACKER.solve(None),
+        "the image is a NoneType .*cv2.imread answers None",
+    ),
     (
         "list",
         lambda: TRACKER.solve(IMAGE.tolist()),
@@ -361,15 +369,19 @@ OTHERS: list[Case] = [
     ),
     (
         "zero",
-        lambda: star_field.magnitude_zero(SIGMA, SIGMA[:3], UNITS),
+        lambda: zero_point.magnitude_zero(SIGMA, SIGMA[:3], UNITS),
         r"v_mag has shape \(3,\)",
     ),
     (
         "zero NaN",
-        lambda: star_field.magnitude_zero(SIGMA * NAN, SIGMA, UNITS),
+        lambda: zero_point.magnitude_zero(SIGMA * NAN, SIGMA, UNITS),
         "instrumental_mag has a NaN",
     ),
-    ("no zero", lambda: star_field.magnitude_zero(SIGMA[:0], SIGMA[:0], UNITS[:0]), "no stars"),
+    (
+        "no zero",
+        lambda: zero_point.magnitude_zero(SIGMA[:0], SIGMA[:0], UNITS[:0]),
+        "no stars",
+    ),
     ("control", lambda: exposure_control.Control("a"), "mean_dn is 'a'"),
     ("counts", lambda: exposure_control.Control(9.0, min_stars=-3), "min_stars is -3"),
     (
@@ -406,7 +418,9 @@ OTHERS: list[Case] = [
         for name, call, message in cases
     ],
 )
-def test_invalid_input_is_refused_in_one_line(call: Callable[[], object], message: str) -> None:
+def test_invalid_input_is_refused_in_one_line(
+    call: Callable[[], object], message: str
+) -> None:
     with pytest.raises(ValueError, match=message) as refused:
         call()
     assert len(str(refused.value).splitlines()) == 1

@@ -108,7 +108,9 @@ def test_maneuver_stays_within_what_wheels_and_stop_allow(name: str) -> None:
     states = [reference.state_at(t) for t in np.arange(0, reference.duration_s, 0.05)]
     rates, accelerations = (np.array([state[n] for state in states]) for n in (1, 2))
     capacity = vehicle.wheels.inertia_kg_m2.min() * wheels.speed_limit_rpm * 2 * np.pi / 60
-    assert inertia * np.linalg.norm(accelerations, axis=1).max() < 0.6 * wheels.torque_limit_nm
+    assert (
+        inertia * np.linalg.norm(accelerations, axis=1).max() < 0.6 * wheels.torque_limit_nm
+    )
     assert inertia * np.linalg.norm(rates, axis=1).max() < 0.6 * capacity
     attitudes = Rotation.from_quat([state[0] for state in states], scalar_first=True)
     # The sine fades in and out.

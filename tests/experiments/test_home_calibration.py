@@ -109,7 +109,9 @@ def test_an_imu_error_at_one_of_two_stops_spreads_positions_by_half_of_it(
     found = home.calibrated(known, list(home.sightings(known, frames)))
     moved_m = np.abs(np.diff(found.lab_m[[0, -1], :, 0], axis=0)).max()
     assert moved_m == pytest.approx(np.radians(error_deg) * HEIGHT_M, rel=0.1)
-    assert found.catalog.epsilon_pos_m == pytest.approx(moved_m / 2 * np.sqrt(8 / 7), rel=0.02)
+    assert found.catalog.epsilon_pos_m == pytest.approx(
+        moved_m / 2 * np.sqrt(8 / 7), rel=0.02
+    )
 
 
 def test_too_few_frames_are_refused(known: Assumed) -> None:

@@ -78,7 +78,8 @@ def shipped_files(name: str) -> list[Path]:
 def seeds(name: str) -> list[bytes]:
     """All seeds of a target: corpus and shipped files."""
     return [
-        path.read_bytes() for path in (*sorted((CORPUS / name).iterdir()), *shipped_files(name))
+        path.read_bytes()
+        for path in (*sorted((CORPUS / name).iterdir()), *shipped_files(name))
     ]
 
 
@@ -145,7 +146,9 @@ def fuzz_by_mutation(name: str, seconds: float, seed: int = 1) -> int:
     tries = 0
     while time.monotonic() < end_s:
         # First every seed unchanged, then mutations of random seeds.
-        data = corpus[tries] if tries < len(corpus) else mutate(rng.choice(corpus), corpus, rng)
+        data = (
+            corpus[tries] if tries < len(corpus) else mutate(rng.choice(corpus), corpus, rng)
+        )
         tries += 1
         try:
             run_timed(TARGETS[name], data)

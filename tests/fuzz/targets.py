@@ -131,7 +131,9 @@ def tables(data: bytes) -> None:
     rejects(lambda: survey_images.read_attitudes(path), InputError)
     rejects(lambda: read_settings(path), InputError)
     rejects(lambda: listed.read_csv(path), InputError)
-    rejects(lambda: point_cloud.fit(point_cloud.read(str(path), "m"), 2, str(path)), InputError)
+    rejects(
+        lambda: point_cloud.fit(point_cloud.read(str(path), "m"), 2, str(path)), InputError
+    )
     for largest in (1.0, math.inf):  # a response, the spectrum of an LED
         # bypass the cache, whose key is the path
         rejects(
@@ -153,7 +155,13 @@ def stores(data: bytes) -> None:
 
     def read() -> None:
         with store.open_store(path) as trials:
-            trials.points(), trials.columns(), trials.counts(), trials.failures(), trials.runs()
+            (
+                trials.points(),
+                trials.columns(),
+                trials.counts(),
+                trials.failures(),
+                trials.runs(),
+            )
             trials.trial_range(), trials.overrides()
 
     def resume() -> None:
@@ -166,7 +174,9 @@ def stores(data: bytes) -> None:
                 trials.scenes(),
             )
 
-    for journal in path.parent.glob(f"{path.name}-*"):  # SQLite's journal of the previous file
+    for journal in path.parent.glob(
+        f"{path.name}-*"
+    ):  # SQLite's journal of the previous file
         journal.unlink()
     rejects(read, InputError)
     rejects(resume, InputError)

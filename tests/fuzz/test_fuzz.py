@@ -32,7 +32,9 @@ from tests.fuzz.targets import TARGETS, rejects
 from tests.helpers.hostile_files import promise
 
 AS_IT_IS = settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=40,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 
 
@@ -114,7 +116,8 @@ def test_any_file_is_read_or_refused_in_one_line(name: str, examples: int) -> No
     [
         (
             "\n".join(
-                f"a{n}: &a{n} [{', '.join([f'*a{n - 1}' if n else 'x'] * 9)}]" for n in range(9)
+                f"a{n}: &a{n} [{', '.join([f'*a{n - 1}' if n else 'x'] * 9)}]"
+                for n in range(9)
             ),
             "values",
         ),
@@ -144,7 +147,9 @@ def test_yaml_keeps_aliases_and_merges(tmp_path: Path) -> None:
 
 def test_a_yaml_file_of_megabytes_is_refused_unread(tmp_path: Path) -> None:
     (tmp_path / "x.yaml").write_bytes(b"#" * (yaml_reader.MAX_BYTES + 1))
-    with pytest.raises(InputError, match=f"{yaml_reader.MAX_BYTES + 1} bytes; allowed: up to"):
+    with pytest.raises(
+        InputError, match=f"{yaml_reader.MAX_BYTES + 1} bytes; allowed: up to"
+    ):
         yaml_reader.read_yaml(tmp_path / "x.yaml")
 
 
@@ -306,7 +311,9 @@ def test_no_marker_hides_a_jpeg_s_size(tmp_path: Path, between: bytes) -> None:
     path.write_bytes(
         (small[:2] + between + great).ljust(skipped, b"\0") + small[at:] + bytes(9)
     )
-    with pytest.raises(InputError, match=r"17000x17000 pixels by its header|cannot be decoded"):
+    with pytest.raises(
+        InputError, match=r"17000x17000 pixels by its header|cannot be decoded"
+    ):
         images.read_image(path)
 
 

@@ -92,7 +92,7 @@ OUT_OF_REACH = {
     "skysim.core.plugins.serve": OURS,
     "skysim.dynamics.controllers.ControllerInput.of_tree": OURS,
     "skysim.dynamics.controllers.ControllerSetup.of_tree": OURS,
-    "skysim.dynamics.multibody.mjcf_export.laboratory": "reads the MJCF text that we export",
+    "skysim.dynamics.multibody.scene_shapes.laboratory": "reads the MJCF text that we export",
     "skysim.dynamics.profiles.load_profiles": "hands a scene's files on to `read_profile`",
     "skysim.results.run_report.run_report": "takes a picture of ours into a page",
     "skysim.experiments.study.execution.setups.code_version": SOURCES,

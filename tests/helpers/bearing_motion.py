@@ -7,7 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.calibration.mass_dynamics import BearingRecord, LabConstants, Prior, inertia_six
+from estimator.calibration.mass_dynamics import (
+    BearingRecord,
+    LabConstants,
+    Prior,
+    inertia_six,
+)
 from estimator.core.checks import Floats
 
 GRAVITY_M_S2 = 9.80665

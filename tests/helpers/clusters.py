@@ -71,7 +71,9 @@ def cluster_of(
     commands += [[*plan_, "--local-directory", str(folder)]] * count
     with (folder / "log").open("wb") as log:
         processes = [
-            subprocess.Popen(one, env=ENVIRONMENT | (environment or {}), stdout=log, stderr=log)
+            subprocess.Popen(
+                one, env=ENVIRONMENT | (environment or {}), stdout=log, stderr=log
+            )
             for one in commands
         ]
         try:

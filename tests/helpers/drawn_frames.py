@@ -43,7 +43,9 @@ class CameraSetup:
 
 
 EC655 = Camera.from_fov(659, 493, float(np.radians(14.87)))
-SQUARE = Camera.from_fov(1024, 1024, float(np.radians(13.5)))  # holds 22 stars brighter than 6
+SQUARE = Camera.from_fov(
+    1024, 1024, float(np.radians(13.5))
+)  # holds 22 stars brighter than 6
 LIEBE_E = 6008 * 10 ** (0.4 * 4)  # EC655, f/1.4, 50 ms: a star of magnitude 4 gives 6008 e
 SETUPS = (
     CameraSetup("EC655, 50 ms", EC655, LIEBE_E, 7.0, 60, 15, 16, 4095),
@@ -100,7 +102,9 @@ def paint(light: NDArray, xy: NDArray, flux: NDArray, streak: NDArray, psf_px: f
             y = xy[n, 1] + along * streak[n, 1]
             for row in range(max(round(y) - reach, 0), min(round(y) + reach + 1, height)):
                 down = np.exp(-((row - y) ** 2) / 2 / psf_px**2)
-                for column in range(max(round(x) - reach, 0), min(round(x) + reach + 1, width)):
+                for column in range(
+                    max(round(x) - reach, 0), min(round(x) + reach + 1, width)
+                ):
                     across = np.exp(-((column - x) ** 2) / 2 / psf_px**2)
                     light[row, column] += (
                         flux[n] / steps * down * across / (2 * np.pi * psf_px**2)
@@ -146,5 +150,9 @@ def disturb(light: NDArray, setup: CameraSetup, rng: np.random.Generator) -> Non
     paint(light, trail, np.array([3e5]), rng.uniform(200, 600, (1, 2)), setup.psf_px)
     mag = rng.uniform(2.0, 6.0, len(false))
     paint(
-        light, false, setup.zero_e * 10 ** (-0.4 * mag), np.zeros((len(false), 2)), setup.psf_px
+        light,
+        false,
+        setup.zero_e * 10 ** (-0.4 * mag),
+        np.zeros((len(false), 2)),
+        setup.psf_px,
     )

@@ -79,7 +79,12 @@ def astigmatic(galsim: Any) -> Any:
     There is no coma, because it displaces every star equally and so cannot be separated from the attitude.
     """
     return galsim.OpticalPSF(
-        lam_over_diam=1.2, obscuration=0.3, defocus=0.15, astig1=0.08, astig2=-0.05, spher=0.05
+        lam_over_diam=1.2,
+        obscuration=0.3,
+        defocus=0.15,
+        astig1=0.08,
+        astig2=-0.05,
+        spher=0.05,
     )
 
 
@@ -138,7 +143,9 @@ def render_frames(
         image = galsim.ImageD(setup.width_px, setup.height_px, scale=1)
         plate = plate_at(galsim, setup, rng, image.true_center)
         middle = unit_vectors(
-            *np.degrees(plate.xyToradec(image.true_center.x, image.true_center.y, units="rad"))
+            *np.degrees(
+                plate.xyToradec(image.true_center.x, image.true_center.y, units="rad")
+            )
         )
         near = directions @ middle > np.cos(setup.camera.diagonal_rad)
         draw(galsim, image, setup, plate, directions[near], g_mag[near])
@@ -172,7 +179,12 @@ def plate_at(galsim: Any, setup: CameraSetup, rng: np.random.Generator, middle: 
 
 
 def draw(
-    galsim: Any, image: Any, setup: CameraSetup, plate: Any, directions: NDArray, g_mag: NDArray
+    galsim: Any,
+    image: Any,
+    setup: CameraSetup,
+    plate: Any,
+    directions: NDArray,
+    g_mag: NDArray,
 ) -> None:
     """Draw every star within MARGIN_PX of the frame."""
     x, y, z = directions.T
@@ -215,7 +227,9 @@ def plate_solver_way(setup: CameraSetup) -> Ours:
     fov_deg = float(np.degrees(setup.camera.fov_rad)) * (1 + setup.fov_error)
     solver = plate_solver.make_solver(fov_deg, None)
     return lambda image, path: (
-        plate_solver.solve_array(image, solver, images.read_picture(path).date_utc)[0].attitude
+        plate_solver.solve_array(image, solver, images.read_picture(path).date_utc)[
+            0
+        ].attitude
     )
 
 
@@ -295,4 +309,6 @@ def agreement(
         float(np.sqrt(variance[2])),
         len(answer.match.observed),
     )
-    return result, normalized_error_squared(answer.cam_from_ref, truth, answer.covariance_rad2)
+    return result, normalized_error_squared(
+        answer.cam_from_ref, truth, answer.covariance_rad2
+    )

@@ -32,7 +32,9 @@ TRANSFORMS = {"projective": Transform(5, 4), "affine": Transform(4, 3)}
 def determinant(rays: Floats, i: int, j: int, k: int) -> Floats:
     """(...,) determinant of rays i, j and k of (..., L, 3)."""
     return np.asarray(
-        np.einsum("...a,...a->...", rays[..., i, :], np.cross(rays[..., j, :], rays[..., k, :]))
+        np.einsum(
+            "...a,...a->...", rays[..., i, :], np.cross(rays[..., j, :], rays[..., k, :])
+        )
     )
 
 
@@ -44,7 +46,9 @@ def invariants(rays: Floats, name: str) -> Floats:
 
     with np.errstate(divide="ignore", invalid="ignore"):
         if name == "affine":
-            return np.stack([det(1, 2, 4) / det(1, 2, 3), det(1, 3, 4) / det(1, 2, 3)], axis=-1)
+            return np.stack(
+                [det(1, 2, 4) / det(1, 2, 3), det(1, 3, 4) / det(1, 2, 3)], axis=-1
+            )
         first = det(4, 3, 1) * det(5, 2, 1) / (det(4, 2, 1) * det(5, 3, 1))
         return np.stack(
             [first, det(4, 2, 1) * det(5, 3, 2) / (det(4, 3, 2) * det(5, 2, 1))], axis=-1

@@ -12,7 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import Attitude
-from estimator.filter.mekf import AttitudeFilter, GyroModel
+from estimator.filter.error_models import GyroModel
+from estimator.filter.mekf import AttitudeFilter
 from skysim.results.metrics import normalized_error_squared
 from skysim.scene.loader import load_scene
 from skysim.simulation.exposure import render_at_rest

@@ -146,7 +146,9 @@ def repeated(rng: Rng) -> HostileInput:
     """A few lights repeated on a lattice, as from LED panels or reflections in windows."""
     across, down = rng.uniform(30, 200, 2)
     cell = rng.uniform(0, [across, down], (rng.integers(1, 8), 2))
-    steps = np.stack(np.meshgrid(np.arange(-1, 25), np.arange(-1, 20)), axis=-1).reshape(-1, 2)
+    steps = np.stack(np.meshgrid(np.arange(-1, 25), np.arange(-1, 20)), axis=-1).reshape(
+        -1, 2
+    )
     turn = rng.uniform(0, np.pi / 2)
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     xy = (steps[:, None] * [across, down] + cell).reshape(-1, 2) @ (
@@ -354,7 +356,9 @@ class Judge:
     """Cached solvers, and a folder for the files."""
 
     folder: Path
-    solvers: dict[str, dict[tuple[int, ...], plate_solver.Solver]] = field(default_factory=dict)
+    solvers: dict[str, dict[tuple[int, ...], plate_solver.Solver]] = field(
+        default_factory=dict
+    )
 
     def solver(self, prior: str, shape: tuple[int, ...]) -> plate_solver.Solver:
         """A cached solver for each usual size, because its trackers take seconds to build, and one for other sizes.
@@ -457,7 +461,9 @@ def judged(count: int, seed: int, quiet: bool = True) -> dict[str, FamilyResult]
             result.right += answer.get("ra_deg") is not None
             result.worst_s = max(result.worst_s, seconds)
             if case.picture is not None:
-                result.most_frames = max(result.most_frames, memory_bytes / case.picture.nbytes)
+                result.most_frames = max(
+                    result.most_frames, memory_bytes / case.picture.nbytes
+                )
     return results
 
 

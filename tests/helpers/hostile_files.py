@@ -39,7 +39,9 @@ def promise(suffix: str, width: int, height: int) -> bytes:
         head = struct.pack("<IiiHHIIiiII", 40, width, height, 1, 24, 0, 0, 0, 0, 0, 0)
         return b"BM" + struct.pack("<IHHI", 54 + 999, 0, 0, 54) + head
     if suffix == ".jpg":
-        start = struct.pack(">HBHHBBBB", 11, 8, height & 0xFFFF, width & 0xFFFF, 1, 1, 0x11, 0)
+        start = struct.pack(
+            ">HBHHBBBB", 11, 8, height & 0xFFFF, width & 0xFFFF, 1, 1, 0x11, 0
+        )
         return b"\xff\xd8\xff\xc0" + start
     if suffix == ".fits":
         cards = [

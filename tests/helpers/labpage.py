@@ -293,7 +293,9 @@ def exported(page: Any, kind: str, folder: Path) -> Path:
 def brightness(page: Any) -> float:
     """Mean brightness of the canvas, 0 to 255."""
     screenshot = page.locator(".lab-frame canvas").screenshot()
-    return float(cv2.imdecode(np.frombuffer(screenshot, np.uint8), cv2.IMREAD_GRAYSCALE).mean())
+    return float(
+        cv2.imdecode(np.frombuffer(screenshot, np.uint8), cv2.IMREAD_GRAYSCALE).mean()
+    )
 
 
 def screen(page: Any, x: float, y: float) -> tuple[float, float]:

@@ -57,7 +57,12 @@ GEOMETRIES = {
     "measured ellipsoid": Geometry(_dome((0, 0, 48 - 28.60), (38.88, 38.88, 28.60)), *AFIT),
     "flat at 48 in": Geometry(_dome((0, 0, 0), (np.inf, np.inf, 48)), *AFIT),
     "NPS flat at 1 m": Geometry(
-        _dome((0, 0, 0), (np.inf, np.inf, 1 / INCH_M)), NPS_CAMERA, 0.30, 1.0, (0, 5, 10, 15), 9
+        _dome((0, 0, 0), (np.inf, np.inf, 1 / INCH_M)),
+        NPS_CAMERA,
+        0.30,
+        1.0,
+        (0, 5, 10, 15),
+        9,
     ),
 }
 
@@ -89,7 +94,9 @@ def trial(
     )
     rays_lab = (lever.cam_from_body * truth).inv().apply(camera.rays(pixels))
     place = on_surface(rays_lab, truth.inv().apply(lever.camera_body_m), geometry.surface)
-    leds = LedMap(np.arange(geometry.lights), place, np.zeros(3), np.full(3, geometry.radius_m))
+    leds = LedMap(
+        np.arange(geometry.lights), place, np.zeros(3), np.full(3, geometry.radius_m)
+    )
     axis = rng.standard_normal(3)
     start = Rotation.from_rotvec(START_OFF_RAD * axis / np.linalg.norm(axis)) * truth
     seen = project(truth, place, lever, camera) + noise_px * rng.standard_normal(
@@ -98,7 +105,9 @@ def trial(
     return Trial(truth, start, leds, seen)
 
 
-def solved(method: str, geometry: Geometry, one: Trial) -> tuple[Rotation, NDArray[np.float64]]:
+def solved(
+    method: str, geometry: Geometry, one: Trial
+) -> tuple[Rotation, NDArray[np.float64]]:
     """body_from_lab and its covariance from one method."""
     rays = geometry.camera.rays(one.pixels)
     sigma_rad = fitted_sigma_rad(

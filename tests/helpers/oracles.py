@@ -60,11 +60,11 @@ SCENES = {
 }
 # Order of astrometry.net's distortion polynomials: 1 is a lens without distortion.
 TWEAK_ORDER = {"shefex2": 1, "shefex2, wide": 3}
-SIDE = 9  # lattice points along each side of the frame at which world coordinates are compared
-CLASSES = 12  # number of brightness classes, each with its own centroid variance
-MISTAKEN = (
-    4.0  # ratio to the usual variance above which a frame is taken to have a misidentified star
+SIDE = (
+    9  # lattice points along each side of the frame at which world coordinates are compared
 )
+CLASSES = 12  # number of brightness classes, each with its own centroid variance
+MISTAKEN = 4.0  # ratio to the usual variance above which a frame is taken to have a misidentified star
 TIMES = 3.0  # tolerance as a multiple of the predicted error
 DEEPEST_G = 7.5  # limiting magnitude of tetra3rs's stars; the frames have stars to V = 6.5
 STAR_PX = 1.0  # maximum distance of a centroid from its catalog star
@@ -211,7 +211,9 @@ def sighting(frame: Frame, truth: Truth, header: fits.Header, found: Found) -> S
 def agreements(seen: Sequence[Sighting], camera: Camera) -> list[Pair]:
     """The two errors of each frame with their standard deviations, predicted from the scatter of the oracle's stars."""
     held = []
-    for one, sigma_px in zip(seen, star_sigmas_px([each.found for each in seen]), strict=True):
+    for one, sigma_px in zip(
+        seen, star_sigmas_px([each.found for each in seen]), strict=True
+    ):
         by_stars = attitude_spread(one.rays, sigma_px / camera.focal_px)
         by_plate = plate_spread(one.found, sigma_px, camera) if one.found.order else by_stars
         held.append(
@@ -266,7 +268,9 @@ def attitude_spread(rays: NDArray, sigma_rad: NDArray) -> tuple[float, float]:
     projectors = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     inverse = np.linalg.inv(projectors.sum(axis=0))
     covariance = inverse @ np.tensordot(sigma_rad**2, projectors, axes=1) @ inverse
-    return float(np.sqrt(covariance[0, 0] + covariance[1, 1])), float(np.sqrt(covariance[2, 2]))
+    return float(np.sqrt(covariance[0, 0] + covariance[1, 1])), float(
+        np.sqrt(covariance[2, 2])
+    )
 
 
 def plate_spread(found: Found, sigma_px: NDArray, camera: Camera) -> tuple[float, float]:
@@ -306,7 +310,14 @@ def astrometry_net(name: str) -> Solve | None:
     width_deg = float(np.degrees(onboard_model.calibration(camera).fov_rad))
     size_px = (camera.width_px, camera.height_px)
     order = TWEAK_ORDER[name]
-    options = ["--overwrite", "--no-plots", "--no-verify", "--crpix-center", "--cpulimit", "30"]
+    options = [
+        "--overwrite",
+        "--no-plots",
+        "--no-verify",
+        "--crpix-center",
+        "--cpulimit",
+        "30",
+    ]
     options += ["--scale-units", "degwidth", "--scale-low", f"{0.95 * width_deg}"]
     options += ["--scale-high", f"{1.05 * width_deg}", "--tweak-order", str(order)]
     # Skip its Python steps, which need more packages.
@@ -382,13 +393,17 @@ def its_stars(
     the worst eighth of the stars and with them three tenths of the variance.
     """
     radius_deg = 0.7 * tracker.camera.fov_deg
-    listed = tracker.database.cone_search(answer.crval_ra_deg, answer.crval_dec_deg, radius_deg)
+    listed = tracker.database.cone_search(
+        answer.crval_ra_deg, answer.crval_dec_deg, radius_deg
+    )
     places = np.array(
         [(star.ra_deg, star.dec_deg) for star in listed if star.magnitude < DEEPEST_G]
     )
     moved = unit_vectors(*places.T) + np.array(tracker.velocity_km_s) / SPEED_OF_LIGHT_KM_S
     moved /= np.linalg.norm(moved, axis=1, keepdims=True)
-    there_px = np.nan_to_num(np.column_stack(answer.world_to_pixel(*radec_deg(moved))), nan=1e6)
+    there_px = np.nan_to_num(
+        np.column_stack(answer.world_to_pixel(*radec_deg(moved))), nan=1e6
+    )
     seen = np.array([(one.x, one.y, one.brightness) for one in centroids])
     apart_px, star = cKDTree(there_px).query(seen[:, :2])
     near = apart_px < STAR_PX

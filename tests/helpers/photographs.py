@@ -68,7 +68,9 @@ def draw(
     ahead = seen[:, 2] > math.cos(1.05 * math.atan(math.tan(camera.diagonal_rad / 2)))
     xy_px = camera.pixels(seen[ahead])
     mag = stars.v_mag[ahead]
-    inside = np.all((xy_px > -40) & (xy_px < [shot.width_px + 40, shot.height_px + 40]), axis=1)
+    inside = np.all(
+        (xy_px > -40) & (xy_px < [shot.width_px + 40, shot.height_px + 40]), axis=1
+    )
     xy_px = xy_px[inside]
     mag = mag[inside]
     if shot.starless:
@@ -128,7 +130,9 @@ def add_star(
         edge = 1 / (1 + np.exp((np.hypot(u, v) - radius_px) / (0.6 * sigma_px)))
         patch += flux / (math.pi * radius_px**2) * edge
     elif length < 0.5:
-        patch += flux / (2 * math.pi * sigma_px**2) * np.exp(-(u**2 + v**2) / (2 * sigma_px**2))
+        patch += (
+            flux / (2 * math.pi * sigma_px**2) * np.exp(-(u**2 + v**2) / (2 * sigma_px**2))
+        )
     else:
         along = (u * trail[0] + v * trail[1]) / length
         across = (v * trail[0] - u * trail[1]) / length

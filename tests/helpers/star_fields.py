@@ -46,7 +46,14 @@ def detections_of(tangent, mag, sigma=SIGMA, zoom=0.0) -> star_evidence.Detectio
     sigmas = np.full(len(tangent), sigma)
     weight = np.stack([sigmas**-2, sigmas**-2, 0 * sigmas], axis=1)
     return star_evidence.Detections(
-        np.ascontiguousarray(tangent), sigmas, weight, np.array(mag), 0.25, FIELD, zoom, np.nan
+        np.ascontiguousarray(tangent),
+        sigmas,
+        weight,
+        np.array(mag),
+        0.25,
+        FIELD,
+        zoom,
+        np.nan,
     )
 
 

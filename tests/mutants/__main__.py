@@ -144,7 +144,9 @@ def imports(file: str) -> frozenset[str]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
     files = (
-        name.replace(".", "/") + ending for name in names for ending in (".py", "/__init__.py")
+        name.replace(".", "/") + ending
+        for name in names
+        for ending in (".py", "/__init__.py")
     )
     return frozenset(file for file in files if file.count("/") > 1 and (TREE / file).exists())
 
@@ -232,7 +234,9 @@ def record(files: list[str]) -> dict[str, Any]:
     forked(lambda: session(changed, Recorder(TREE, part)), 7200)
     new = json.loads(part.read_text())
     kept = {
-        name: test for name, test in old["tests"].items() if name.split("::")[0] not in changed
+        name: test
+        for name, test in old["tests"].items()
+        if name.split("::")[0] not in changed
     }
     if new["failed"]:
         print("left out, for they fail without a mutant:", *new["failed"], sep="\n  ")
@@ -292,7 +296,9 @@ def first_line(function: ast.FunctionDef) -> int:
 
 
 def functions_in(file: str, source: str) -> list[Key]:
-    nodes = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef))
+    nodes = (
+        node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef)
+    )
     return [(file, first_line(node), node.name) for node in nodes]
 
 
@@ -339,7 +345,11 @@ def try_module(names: list[str], tests: Tests) -> str:
     signal.setitimer(signal.ITIMER_PROF, 200)
     said = session(["-x", *dict.fromkeys(name.split("::")[0] for name in names)], Chosen())
     return (
-        outcomes[0] if outcomes else "survived" if said == "exit code 0" else f"{BROKEN} {said}"
+        outcomes[0]
+        if outcomes
+        else "survived"
+        if said == "exit code 0"
+        else f"{BROKEN} {said}"
     )
 
 

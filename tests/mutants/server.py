@@ -121,7 +121,9 @@ class Program:
     def users(self, key: Key) -> set[CPUDispatcher]:
         """Compiled functions whose machine code contains this function's: itself and all that call it."""
         found: set[CPUDispatcher] = set()
-        more = {one for one in self.compiled if key_of(one.py_func.__code__, self.tree) == key}
+        more = {
+            one for one in self.compiled if key_of(one.py_func.__code__, self.tree) == key
+        }
         while more:
             found |= more
             more = {user for one in more for user in self.callers[one]} - found
@@ -130,7 +132,9 @@ class Program:
     def calls_of(self, key: Key) -> set[Key | None]:
         """Compiled functions that a function names: a call of them enters no Python function."""
         found = {
-            one for function in self.functions.get(key, ()) for one in compiled_names(function)
+            one
+            for function in self.functions.get(key, ())
+            for one in compiled_names(function)
         }
         return {key_of(one.py_func.__code__, self.tree) for one in found}
 
@@ -140,7 +144,9 @@ def compiled_names(function: FunctionType) -> Iterator[CPUDispatcher]:
     names = {name for code in nested(function.__code__) for name in code.co_names}
     values = [function.__globals__.get(name) for name in names]
     # Not an empty one.
-    values += [cell.cell_contents for cell in function.__closure__ or () if cell != CellType()]
+    values += [
+        cell.cell_contents for cell in function.__closure__ or () if cell != CellType()
+    ]
     for value in values:
         if isinstance(value, ModuleType):
             members = [vars(value).get(name) for name in names]
@@ -222,7 +228,9 @@ def run_items(
     change()
     session.config.pluginmanager.register(Listener())
     for item, after in zip(items, [*items[1:], None], strict=True):
-        signal.setitimer(signal.ITIMER_PROF, limit_s(recorded["tests"][item.nodeid]["time_s"]))
+        signal.setitimer(
+            signal.ITIMER_PROF, limit_s(recorded["tests"][item.nodeid]["time_s"])
+        )
         item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
         if failed:
             return failed[0]

@@ -36,7 +36,8 @@ def test_our_aem_is_valid_and_has_the_intended_metadata(
     meant = Rotation.random(count, rng=np.random.default_rng(count))
     path = tmp_path / "truth.aem"
     files.write_text(
-        path, run_export.message("afit_simsat", ["LED dome, 3″ off"], frames, utc(count), meant)
+        path,
+        run_export.message("afit_simsat", ["LED dome, 3″ off"], frames, utc(count), meant),
     )
     read = ndm.Aem.from_file(str(path), format="kvn")
     assert read.validate(strict=False) is None
@@ -59,7 +60,9 @@ def test_our_aem_is_valid_and_has_the_intended_metadata(
             run_export.epoch(epochs[0]),
             run_export.epoch(epochs[-1]),
         )
-        off = (Rotation.from_quat(segment.data.attitude_states_numpy) * meant.inv()).magnitude()
+        off = (
+            Rotation.from_quat(segment.data.attitude_states_numpy) * meant.inv()
+        ).magnitude()
         assert off.max() < 1e-14
 
 

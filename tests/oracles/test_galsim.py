@@ -133,7 +133,9 @@ def test_every_kind_of_lens_images_a_disk_as_galsim(name: str, radius_px: float)
     psf, camera, parts = LENSES[name]
     emitter = [galsim.TopHat(radius_px, gsparams=ACCURATE)] if radius_px else []
     error = worst(
-        build_kernel(psf, camera, 0, radius_px), [*parts, *emitter], seed=round(10 * radius_px)
+        build_kernel(psf, camera, 0, radius_px),
+        [*parts, *emitter],
+        seed=round(10 * radius_px),
     )
     assert error < TOLERANCE.get((name, radius_px), 5e-4)
 
@@ -155,7 +157,9 @@ def test_restored_wings_equal_the_missing_light() -> None:
 
 
 @pytest.mark.parametrize("radius_px", [0.0, 4.3])
-def test_a_measured_asymmetric_lens_images_as_galsim(tmp_path: Path, radius_px: float) -> None:
+def test_a_measured_asymmetric_lens_images_as_galsim(
+    tmp_path: Path, radius_px: float
+) -> None:
     """GalSim draws the cells of a lopsided lens; our image of them against its image of the lens itself."""
     core = galsim.Gaussian(sigma=0.8, gsparams=ACCURATE).shear(g1=0.2, g2=0.1)
     lens = core + 0.3 * galsim.Gaussian(sigma=1.1, gsparams=ACCURATE).shift(1.5, 0.8)

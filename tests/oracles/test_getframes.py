@@ -17,7 +17,9 @@ SHAPE = (80, 100)
 FRAMES = 60
 
 
-def both(mean_e: float, exposure_s: float = 0.5, **part: Any) -> tuple[np.ndarray, np.ndarray]:
+def both(
+    mean_e: float, exposure_s: float = 0.5, **part: Any
+) -> tuple[np.ndarray, np.ndarray]:
     """(FRAMES, H, W) pixel values of skysim and of getframes."""
     ours = {
         "quantum_efficiency": 1.0,
@@ -80,7 +82,9 @@ def test_fixed_pattern_noise_agrees_with_getframes() -> None:
         frames.mean(axis=0).std()
         for frames in both(10_000.0, prnu=0.02, dsnu=0.3, dark_e_s=2000.0)
     ]
-    assert spread[0] == pytest.approx(spread[1], rel=5 * np.sqrt(2 / (2 * SHAPE[0] * SHAPE[1])))
+    assert spread[0] == pytest.approx(
+        spread[1], rel=5 * np.sqrt(2 / (2 * SHAPE[0] * SHAPE[1]))
+    )
 
 
 def test_saturation_agrees_with_getframes() -> None:

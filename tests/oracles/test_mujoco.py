@@ -148,7 +148,9 @@ def test_mujoco_draws_the_ball_where_our_optics_project_it(pose: str, tmp_path: 
     lab_from_mjcam = Rotation.from_quat(quaternion_wxyz, scalar_first=True)
     lab_from_cam = lab_from_mjcam * CAM_FROM_MJCAM.inv()
     balls_m = np.array(place_m) + lab_from_cam.apply(TOWARD_CAM_M)
-    found = middles(drawn(world_xml(quaternion_wxyz, place_m), balls_m, tmp_path / "balls.npy"))
+    found = middles(
+        drawn(world_xml(quaternion_wxyz, place_m), balls_m, tmp_path / "balls.npy")
+    )
     wanted = Optics.from_camera(CAMERA).project(
         lab_from_cam.inv().apply(balls_m - np.array(place_m))
     )

@@ -68,7 +68,9 @@ COMMANDS = re.findall(r"^skysim (.*--tracker tetra3rs.*)$", PAGE, re.MULTILINE)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_the_page_s_commands_run_without_wrong_attitudes(command: str, tmp_path: Path) -> None:
+def test_the_page_s_commands_run_without_wrong_attitudes(
+    command: str, tmp_path: Path
+) -> None:
     """Every frame is listed or counted, and none is wrong."""
     words = [
         sys.executable,

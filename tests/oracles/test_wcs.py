@@ -41,13 +41,17 @@ def both_ways(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(N, 2) pixels by our optics, and by astropy from the header."""
     cam_from_icrs = star_sources.cam_from_icrs(*pointing)
-    ours = Optics.from_camera(CAMERA).project(cam_from_icrs.apply(stars.cartesian.xyz.value.T))
+    ours = Optics.from_camera(CAMERA).project(
+        cam_from_icrs.apply(stars.cartesian.xyz.value.T)
+    )
     header = WCS(Header(wcs.header(CAMERA, cam_from_icrs)))
     return ours, np.column_stack(header.world_to_pixel(stars))
 
 
 @pytest.mark.parametrize("pointing", POINTINGS)
-def test_stars_are_where_astropy_s_wcs_puts_them(pointing: tuple[float, float, float]) -> None:
+def test_stars_are_where_astropy_s_wcs_puts_them(
+    pointing: tuple[float, float, float],
+) -> None:
     """Stars up to ten degrees off in all directions, laid out by astropy itself."""
     rng = np.random.default_rng(2)
     center = SkyCoord(*pointing[:2], unit="deg")
@@ -61,7 +65,9 @@ def test_stars_are_where_astropy_s_wcs_puts_them(pointing: tuple[float, float, f
 
 def test_north_is_up_and_east_is_left_without_roll() -> None:
     center = SkyCoord(83.0, -5.0, unit="deg")
-    north, east = (center.directional_offset_by(angle * u.deg, 1 * u.deg) for angle in (0, 90))
+    north, east = (
+        center.directional_offset_by(angle * u.deg, 1 * u.deg) for angle in (0, 90)
+    )
     step = np.tan(np.radians(1.0)) * CAMERA.focal_px
     for star, offset in ((north, (0, -step)), (east, (-step, 0))):
         ours, theirs = both_ways((83.0, -5.0, 0.0), star.reshape(1))

@@ -56,7 +56,9 @@ def test_invisible_sources_are_not_marked_and_a_legend_names_the_colors() -> Non
     ):
         picture = plots.annotate_truth(image, replace(sources, snr=snr))
         ticks = colored(picture, plots.TRUTH_BGR)
-        near = [(np.hypot(*(ticks - place).T) < 60).any() for place in ((300, 400), (700, 800))]
+        near = [
+            (np.hypot(*(ticks - place).T) < 60).any() for place in ((300, 400), (700, 800))
+        ]
         assert near == shown
         assert (ticks[:, 1] >= 1200).any()  # the legend, below the frame
         assert len(picture) == 1200 + plots.LEGEND_PX

@@ -215,7 +215,8 @@ def test_a_message_follows_the_standard_s_notation() -> None:
         "ünïcode", ["″" * 400], (run_export.LAB, run_export.BODY), utc, spin
     )
     assert all(
-        line.isascii() and line.isprintable() and len(line) <= 254 for line in text.splitlines()
+        line.isascii() and line.isprintable() and len(line) <= 254
+        for line in text.splitlines()
     )
     rows = np.array(
         [line.split()[1:] for line in text.splitlines() if line.startswith("2012-")],
@@ -364,7 +365,9 @@ def misfits(lens: CameraConfig) -> tuple[float, float]:
         [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]
     )
     back = Optics.from_camera(lens).project(cam_from_icrs.apply(directions))
-    straight = header.wcs_world2pix(np.degrees([ra, dec]).T, 0)  # of a lens without distortion
+    straight = header.wcs_world2pix(
+        np.degrees([ra, dec]).T, 0
+    )  # of a lens without distortion
     inverse = header.sip_foc2pix(straight + 1 - header.wcs.crpix, 1) - 1
     return float(np.linalg.norm(back - pixels, axis=1).max()), float(
         np.linalg.norm(inverse - back, axis=1).max()
@@ -401,7 +404,8 @@ def test_a_lens_beyond_sip_is_noted_in_header_and_warning() -> None:
     assert backwards < 1e-6
     assert f"{error_px:.2g} px" in wcs.accuracy_warning(lens)
     wide = loader.load(
-        "shefex2", {"camera.focal_length": "4.5 mm", "camera.distortion": "[-0.4, 0, 0, 0, 0]"}
+        "shefex2",
+        {"camera.focal_length": "4.5 mm", "camera.distortion": "[-0.4, 0, 0, 0, 0]"},
     )
     assert any(
         line.startswith("camera.distortion: ") for line in check(build_lab(wide)).findings
@@ -423,7 +427,11 @@ def test_a_distorted_frame_s_header_maps_stars_to_their_pixels(stars: Flown) -> 
     assert len(true) > 50
     np.testing.assert_allclose(pixels, true, rtol=0, atol=2 * wcs.TARGET_ERROR_PX)
     bare = WCS(
-        {key: value for key, value in header.items() if key[:2] not in ("A_", "B_", "AP", "BP")}
+        {
+            key: value
+            for key, value in header.items()
+            if key[:2] not in ("A_", "B_", "AP", "BP")
+        }
     )
     assert (
         np.abs(

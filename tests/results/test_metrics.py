@@ -53,7 +53,9 @@ def test_cross_is_the_angle_between_the_boresights(x: float, y: float, z: float)
 
 @settings(max_examples=50, derandomize=True)
 @given(st.tuples(small, small, small))
-def test_error_does_not_depend_on_the_reference_frame(turn: tuple[float, float, float]) -> None:
+def test_error_does_not_depend_on_the_reference_frame(
+    turn: tuple[float, float, float],
+) -> None:
     other = Rotation.from_rotvec([1.0, 0.2, -0.7])
     here = metrics.cross_and_roll_rad(turned(*turn), TRUTH)
     there = metrics.cross_and_roll_rad(turned(*turn) * other, TRUTH * other)

@@ -29,7 +29,9 @@ def digest(path: Path) -> str:
 def digests(folder: Path) -> dict[str, str]:
     """Hashes of all files except reports, which contain their command."""
     files = [
-        path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix != ".html"
+        path
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.suffix != ".html"
     ]
     return {str(path.relative_to(folder)): digest(path) for path in files}
 

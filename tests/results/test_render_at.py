@@ -47,7 +47,9 @@ def test_the_truth_is_the_given_pose_at_mid_exposure(lab: Lab, attitude: Rotatio
     order = np.argsort(truth.sources.id)
     rows = np.searchsorted(truth.sources.id, sources.id, sorter=order)
     expected_px = lab.camera.optics.project(truth.cam_from_lab.apply(sources.place[:, :3]))
-    np.testing.assert_allclose(truth.sources.xy_px[order][rows], expected_px, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        truth.sources.xy_px[order][rows], expected_px, rtol=0, atol=1e-9
+    )
     center_px = np.array(lab.scene.camera.center_px)
     middle = np.hypot(*(truth.sources.xy_px - center_px).T) < 120
     across = np.linalg.norm(truth.rate_cam_rad_s[:2])
@@ -63,8 +65,12 @@ def test_a_frame_at_rest_equals_that_of_the_scene_at_rest() -> None:
     scene = skysim.load_scene("shefex2", FULL_SKY)
     for index in range(2):
         frame, truth = skysim.render(scene, index)
-        outside, same = skysim.render_at(scene, truth.lab_from_body, t_s=truth.t_s, index=index)
-        np.testing.assert_allclose(same.sources.electrons, truth.sources.electrons, rtol=1e-12)
+        outside, same = skysim.render_at(
+            scene, truth.lab_from_body, t_s=truth.t_s, index=index
+        )
+        np.testing.assert_allclose(
+            same.sources.electrons, truth.sources.electrons, rtol=1e-12
+        )
         assert np.mean(outside.image_dn != frame.image_dn) < 1e-4
 
 

@@ -50,7 +50,9 @@ def everywhere(text: str) -> Report:
     ]
     inner = Section(text, [table, Figure(PICTURE, text), Code(text)])
     return Report(
-        text, [*blocks, Section(text, [inner]), Section(text, [Text(text)], folded=True)], text
+        text,
+        [*blocks, Section(text, [inner]), Section(text, [Text(text)], folded=True)],
+        text,
     )
 
 
@@ -128,7 +130,9 @@ def test_backticks_are_code_in_html_and_letters_elsewhere(
         "tracker.map",
         "a<b",
     ]
-    assert "".join(text for tag, text in page.texts if tag == "p").endswith("or a lone ` mark")
+    assert "".join(text for tag, text in page.texts if tag == "p").endswith(
+        "or a lone ` mark"
+    )
     assert "`tracker.map`" in one.markdown()
     one.print()
     assert "`tracker.map`" in capsys.readouterr().out
@@ -233,7 +237,8 @@ def test_a_long_table_is_cut_on_the_terminal_with_a_note(
 
 
 @pytest.mark.parametrize(
-    ("width", "count"), [(80, 6), (73, 6), (72, 5), (60, 5), (59, 4), (42, 4), (41, 3), (10, 3)]
+    ("width", "count"),
+    [(80, 6), (73, 6), (72, 5), (60, 5), (59, 4), (42, 4), (41, 3), (10, 3)],
 )
 def test_a_narrow_terminal_leaves_out_optional_columns_alone(
     width: int, count: int, monkeypatch: pytest.MonkeyPatch

@@ -72,7 +72,9 @@ def test_intervals_have_their_stated_coverage():
 
 
 @pytest.mark.parametrize(("hits", "total"), [(0, 10_000), (0, 100), (3, 40), (40, 40)])
-def test_exact_bounds_have_the_binomial_tail_of_their_confidence(hits: int, total: int) -> None:
+def test_exact_bounds_have_the_binomial_tail_of_their_confidence(
+    hits: int, total: int
+) -> None:
     """Clopper and Pearson: at the upper bound, hits or fewer have the probability 5 %; at the lower one, or more."""
     low, high = metrics.exact_bounds(hits, total)
     if hits < total:
@@ -111,7 +113,9 @@ def test_a_quantile_has_an_interval_from_the_number_of_values_by_wilks(
 @pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 400), st.sampled_from([0.05, 0.5, 0.9, 0.95, 0.99]))
-def test_no_pair_of_ranks_with_the_confidence_is_closer(count: int, probability: float) -> None:
+def test_no_pair_of_ranks_with_the_confidence_is_closer(
+    count: int, probability: float
+) -> None:
     """By enumeration of all pairs, with the binomial's own sum."""
     mass = stats.binom.pmf(np.arange(count + 1), count, probability)
     pairs = [
@@ -128,7 +132,9 @@ def test_no_pair_of_ranks_with_the_confidence_is_closer(count: int, probability:
         closest = min(s - r for r, s in pairs)
         below = np.cumsum(mass)
         uneven = {
-            (r, s): abs(below[r - 1] - (1 - below[s - 1])) for r, s in pairs if s - r == closest
+            (r, s): abs(below[r - 1] - (1 - below[s - 1]))
+            for r, s in pairs
+            if s - r == closest
         }
         assert uneven[low + 1, high + 1] == pytest.approx(min(uneven.values()), abs=1e-9)
 

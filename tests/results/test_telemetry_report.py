@@ -18,7 +18,9 @@ DEG = np.pi / 180
 
 
 def turned(axis: str, degrees: np.ndarray | float) -> Rotation:
-    return Rotation.from_euler(axis, np.broadcast_to(degrees, len(T_S))[:, None], degrees=True)
+    return Rotation.from_euler(
+        axis, np.broadcast_to(degrees, len(T_S))[:, None], degrees=True
+    )
 
 
 def bare() -> Telemetry:

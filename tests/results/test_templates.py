@@ -78,12 +78,18 @@ def test_the_printed_leds_are_where_the_scene_has_them(lab: Lab) -> None:
             assert after is not None
             number = int(str(after.text))
             seen.add(number)
-            left, y = np.array([float(str(element.get(key))) for key in ("cx", "cy")]) - apex_mm
+            left, y = (
+                np.array([float(str(element.get(key))) for key in ("cx", "cy")]) - apex_mm
+            )
             # From inside, with the apex up, azimuths grow to the left.
             across = -left / 1e3 / RADIUS_M
             along = y / 1e3 / RADIUS_M
             own = np.array(
-                [np.cos(across) * np.sin(along), np.sin(across), np.cos(across) * np.cos(along)]
+                [
+                    np.cos(across) * np.sin(along),
+                    np.sin(across),
+                    np.cos(across) * np.cos(along),
+                ]
             )
             meridian_rad = 2 * np.pi * (gores - 1) / 18
             cosine = np.cos(meridian_rad)
@@ -113,7 +119,8 @@ def test_the_cutting_pattern_matches_the_printed_one(lab: Lab, tmp_path: Path) -
         for c in drawn.query("CIRCLE[layer=='LEDS']")
     ]
     printed = [
-        [float(str(c.get(key))) for key in ("cx", "cy", "r")] for c in root.iter(SVG + "circle")
+        [float(str(c.get(key))) for key in ("cx", "cy", "r")]
+        for c in root.iter(SVG + "circle")
     ]
     assert len(printed) == 150
     assert np.array(circles) == pytest.approx(np.array(printed), abs=1e-3)

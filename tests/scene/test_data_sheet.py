@@ -10,7 +10,14 @@ import yaml
 
 from skysim.core.errors import InputError
 from skysim.scene import loader
-from skysim.scene.camera_sheet import PLACEHOLDERS, QUESTIONS, REQUIRED, fill, outstanding, text
+from skysim.scene.camera_sheet import (
+    PLACEHOLDERS,
+    QUESTIONS,
+    REQUIRED,
+    fill,
+    outstanding,
+    text,
+)
 
 STATED = {
     "pixels": "1936 x 1216",
@@ -53,7 +60,11 @@ def test_a_full_data_sheet_is_used_without_assumptions(tmp_path: Path) -> None:
     assert (chip.quantum_efficiency.curve, chip.quantum_efficiency.peak) == ("cmos", 0.7)
     assert (chip.bits, chip.offset_dn, chip.full_well_e, chip.gain_e_dn) == (10, 16, 32513, 8)
     assert (chip.read_noise_e, chip.dark_e_s, chip.prnu) == (6.9, 2, 0.008)
-    not_asked = {"psf.kind", "detector.quantum_efficiency.curve", "detector.dark_temperature_c"}
+    not_asked = {
+        "psf.kind",
+        "detector.quantum_efficiency.curve",
+        "detector.dark_temperature_c",
+    }
     assert {line.key for line in fill(STATED).lines if line.comment != "[S1]"} == not_asked
 
 
@@ -104,7 +115,9 @@ def test_without_a_lens_the_file_is_a_camera_body_and_states_it(tmp_path: Path) 
 
 def test_a_lens_without_an_f_number_leaves_it_to_the_scene() -> None:
     (missing,) = [
-        one for one in fill(PLACEHOLDERS | {"focal_length": "16 mm"}).missing if not one.assumed
+        one
+        for one in fill(PLACEHOLDERS | {"focal_length": "16 mm"}).missing
+        if not one.assumed
     ]
     assert missing[::2] == ("f_number", "a scene must give camera.f_number")
 
@@ -130,7 +143,10 @@ def test_a_lens_without_an_f_number_leaves_it_to_the_scene() -> None:
             {"quantum_efficiency": "65"},
             "answers.quantum_efficiency: '65'; allowed: less than or equal to 1",
         ),
-        ({"full_well": "1e999"}, "answers.full_well: '1e999'; allowed: a number such as 10700"),
+        (
+            {"full_well": "1e999"},
+            "answers.full_well: '1e999'; allowed: a number such as 10700",
+        ),
         ({"full_well": "0"}, "answers.full_well: '0'; allowed: greater than or equal to 1"),
         (
             {"black_level": "5000"},

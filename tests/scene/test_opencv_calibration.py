@@ -49,7 +49,9 @@ numbers = st.floats(-1e3, 1e3, allow_subnormal=False)
 
 
 @settings(
-    max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=50,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(
     st.builds(
@@ -223,7 +225,10 @@ def test_a_scene_s_camera_has_opencv_s_calibration(lens: Path, focus: str) -> No
             "calibration: lens.yml, focal_length: null, preset: lu205c",
             "for frames of 659x493; the preset's are 1600x1200",
         ),
-        ("calibration: lens.yml, focal_length: null, pixel: 5", "camera.pixel: 5 has no unit"),
+        (
+            "calibration: lens.yml, focal_length: null, pixel: 5",
+            "camera.pixel: 5 has no unit",
+        ),
     ],
 )
 def test_a_contradiction_is_reported_with_its_line(

@@ -94,7 +94,9 @@ def test_a_preset_file_is_named_as_the_origin_of_its_keys(folder: Path) -> None:
 
 # A profile gives the rate at which a motion starts.
 
-PROFILE = "{start: profile, control: prescribed, maneuver: [{kind: profile, file: sky.csv}]%s}"
+PROFILE = (
+    "{start: profile, control: prescribed, maneuver: [{kind: profile, file: sky.csv}]%s}"
+)
 
 
 def on_profile(folder: Path, more: str = "") -> Path:
@@ -110,7 +112,9 @@ def test_a_rate_of_the_base_is_dropped_where_a_profile_gives_it(folder: Path) ->
     assert loader.load("shefex2").motion.rate_deg_s == (0.3, 0.4, 0.0)
     scene = loader.load(on_profile(folder))
     assert (scene.motion.start, scene.motion.rate_deg_s) == ("profile", (0.0, 0.0, 0.0))
-    shown = {".".join(entry.path): entry for entry in provenance.effective(on_profile(folder))}
+    shown = {
+        ".".join(entry.path): entry for entry in provenance.effective(on_profile(folder))
+    }
     assert shown["motion.rate_deg_s"].origin.what == "default"
     with pytest.raises(
         InputError, match=r"rate_deg_s: has no effect with start: profile.*scene\.yaml"

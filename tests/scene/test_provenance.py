@@ -65,7 +65,11 @@ def test_each_value_has_its_origin() -> None:
         ("camera.detector.read_noise_e", 10, "preset lu205c.yaml", preset, "read_noise_e"),
     ):
         entry = found[key]
-        assert (entry.value, entry.origin.what, Path(entry.origin.file)) == (value, what, path)
+        assert (entry.value, entry.origin.what, Path(entry.origin.file)) == (
+            value,
+            what,
+            path,
+        )
         assert entry.origin.line == line_in(path, words)
     assert found["vehicle.imu.rate_hz"].origin == Origin("default")
     assert (

@@ -23,7 +23,7 @@ from skysim.dynamics.guidance import LEGS
 from skysim.dynamics.jitter import SPECTRA
 from skysim.dynamics.multibody.cmgs import STEERING
 from skysim.scene import loader, scene
-from skysim.scene.sections import camera, leds, light, motion, vehicle
+from skysim.scene.sections import camera, leds, light, motion, surroundings, vehicle
 from skysim.scene.sections.layouts import Layout
 from skysim.scene.sections.leds import Lobe
 from skysim.scene.sections.tracker import FilterConfig
@@ -50,13 +50,17 @@ def complaint(path: Path, overrides: dict[str, str] | None = None) -> str:
     return message
 
 
-def complaint_and_place(tmp_path: Path, whole: Path, right: str, wrong: str) -> tuple[str, str]:
+def complaint_and_place(
+    tmp_path: Path, whole: Path, right: str, wrong: str
+) -> tuple[str, str]:
     """The complaint about a scene with one fault in it, and `(file, line N)` of the fault."""
     text = whole.read_text()
     assert text.count(right) == 1
     path = tmp_path / "bad.yaml"
     path.write_text(text.replace(right, wrong))
-    return complaint(path), f"({path}, line {line_number(text, right.splitlines()[0].strip())})"
+    return complaint(
+        path
+    ), f"({path}, line {line_number(text, right.splitlines()[0].strip())})"
 
 
 # Units
@@ -219,7 +223,9 @@ def test_a_key_has_a_unit_in_its_name_unless_its_value_has_one(
     bare = name.removesuffix(
         suffix if is_quantity(field.annotation, field.metadata) else ""
     ).rstrip("_")  # class_
-    own = {"schema_version": "schema", "name": scene.NAME_ALIAS} if part is scene.Scene else {}
+    own = (
+        {"schema_version": "schema", "name": scene.NAME_ALIAS} if part is scene.Scene else {}
+    )
     assert field.alias == own.get(name, bare)
 
 
@@ -256,7 +262,9 @@ def test_a_scene_s_camera_is_read_without_the_rest(tmp_path: Path) -> None:
     alone = tmp_path / "camera.yaml"
     alone.write_text(text[text.index("camera:") : text.index("exposure:")])
     assert (
-        loader.load_camera(alone) == loader.load_camera(SHEFEX) == loader.load("shefex2").camera
+        loader.load_camera(alone)
+        == loader.load_camera(SHEFEX)
+        == loader.load("shefex2").camera
     )
 
 
@@ -539,7 +547,8 @@ def test_an_unknown_kind_is_answered_with_the_known_ones(
 ) -> None:
     message, place = complaint_and_place(tmp_path, AFIT, right, wrong)
     assert re.fullmatch(
-        rf"{re.escape(key)}: unknown \w+ '\w+'; allowed: {allowed} {re.escape(place)}", message
+        rf"{re.escape(key)}: unknown \w+ '\w+'; allowed: {allowed} {re.escape(place)}",
+        message,
     )
 
 
@@ -548,7 +557,11 @@ def test_an_unknown_kind_is_answered_with_the_known_ones(
     ("key", "value", "says"),
     [
         ("camera.psf", "{kind: moffat}", "camera.psf.fwhm_px: missing"),
-        ("camera.psf", "{kind: disk, radius_px: 0}", "camera.psf.radius_px: 0 is not allowed"),
+        (
+            "camera.psf",
+            "{kind: disk, radius_px: 0}",
+            "camera.psf.radius_px: 0 is not allowed",
+        ),
         ("camera.psf", "{sigma_px: 0.5, fwhm_px: 2}", "camera.psf: kind is missing"),
         (
             "camera.psf",
@@ -726,7 +739,9 @@ UNLOAD = "{start: 2 N m s, stop: 1 N m s}"
         ),
     ],
 )
-def test_contradicting_keys_are_refused_in_one_line(changes: dict[str, str], says: str) -> None:
+def test_contradicting_keys_are_refused_in_one_line(
+    changes: dict[str, str], says: str
+) -> None:
     assert complaint(AFIT, changes) == f"{says} (overrides)"
 
 
@@ -756,7 +771,9 @@ def test_contradicting_keys_are_refused_in_one_line(changes: dict[str, str], say
         ),
     ],
 )
-def test_keys_of_a_room_are_refused_for_a_free_vehicle(key: str, value: str, says: str) -> None:
+def test_keys_of_a_room_are_refused_for_a_free_vehicle(
+    key: str, value: str, says: str
+) -> None:
     free = {"vehicle.mount": "free", "vehicle.center_of_mass": "[0 m, 0 m, 0 m]"}
     assert says in complaint(AFIT, free | {key: value})
     assert (
@@ -1010,7 +1027,9 @@ def test_an_override_precedes_scene_and_base(tmp_path: Path) -> None:
         ("../mine/mine.yaml", "base: ../mine/mine.yaml leads back to this scene"),
     ],
 )
-def test_an_unusable_base_is_refused_in_one_line(tmp_path: Path, base: str, says: str) -> None:
+def test_an_unusable_base_is_refused_in_one_line(
+    tmp_path: Path, base: str, says: str
+) -> None:
     path = written(tmp_path / "mine", "mine.yaml", f"schema: 1\ntitle: Mine\nbase: {base}\n")
     message = complaint(path)
     assert message.startswith(says)
@@ -1033,7 +1052,9 @@ def test_an_error_is_reported_with_the_file_that_contains_it(tmp_path: Path) -> 
         "schema: 1\nbase: afit_simsat\nexposure:\n  frames: 0\n  rate_hz: 2\n",
     )
     mine = written(
-        tmp_path, "mine.yaml", "schema: 1\nbase: lower.yaml\nseed: 3\nexposure:\n  rate_hz: 1\n"
+        tmp_path,
+        "mine.yaml",
+        "schema: 1\nbase: lower.yaml\nseed: 3\nexposure:\n  rate_hz: 1\n",
     )
     says = "exposure.frames: 0 is not allowed; allowed: greater than or equal to 1"
     assert complaint(mine) == f"{says} ({lower}, line 4)"
@@ -1127,7 +1148,10 @@ def test_a_focus_nearer_than_twice_the_focal_length_is_refused(
             "far",
             "camera.focus: 'far' is not a length; allowed: a length such as \"33 in\", or infinity",
         ),
-        ("33", 'camera.focus: 33 has no unit; allowed: a length such as "33 in", or infinity'),
+        (
+            "33",
+            'camera.focus: 33 has no unit; allowed: a length such as "33 in", or infinity',
+        ),
     ],
 )
 def test_a_focus_that_is_not_a_distance_is_refused(focus: str, says: str) -> None:
@@ -1149,7 +1173,8 @@ def test_an_exposure_longer_than_its_period_is_refused(tmp_path: Path) -> None:
     message, place = complaint_and_place(tmp_path, AFIT, 'time: "10 ms"', 'time: "10 s"')
     late = "plus trigger_jitter 0.0001 s"
     assert (
-        message == f"exposure.time: 10.0 s {late} is longer than the frame period 0.5 s {place}"
+        message
+        == f"exposure.time: 10.0 s {late} is longer than the frame period 0.5 s {place}"
     )
 
 
@@ -1215,13 +1240,15 @@ def test_every_algorithm_that_the_schema_names_exists() -> None:
     assert set(light.SurfaceConfig.model_fields["kind"].annotation.__args__) == set(SURFACES)
     assert kinds(Layout) == set(LAYOUTS)
     assert kinds(leds.Drive) == set(DRIVES)
-    assert set(vehicle.CmgsConfig.model_fields["steering"].annotation.__args__) == set(STEERING)
-    assert kinds(camera.Psf) == set(PSFS)
-    assert kinds(get_args(camera.CameraConfig.model_fields["vignetting"].annotation)[0]) == set(
-        VIGNETTING
+    assert set(vehicle.CmgsConfig.model_fields["steering"].annotation.__args__) == set(
+        STEERING
     )
+    assert kinds(camera.Psf) == set(PSFS)
+    assert kinds(
+        get_args(camera.CameraConfig.model_fields["vignetting"].annotation)[0]
+    ) == set(VIGNETTING)
     assert kinds(Lobe) == set(LOBES)
-    assert kinds(light.Glow) == set(BACKGROUNDS)
+    assert kinds(surroundings.Glow) == set(BACKGROUNDS)
     assert kinds(motion.JitterPart) == set(SPECTRA)
     assert kinds(motion.Maneuver) == set(LEGS)
 

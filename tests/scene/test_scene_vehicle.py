@@ -67,7 +67,12 @@ def test_vehicle_quantities_become_si() -> None:
 def test_a_controller_s_name_abbreviates_its_section() -> None:
     law = loaded(motion__control="pd").motion.control
     assert law is not None
-    assert (law.law, law.actuators, law.feedback, law.rate_hz) == ("pd", "ideal", "truth", 100)
+    assert (law.law, law.actuators, law.feedback, law.rate_hz) == (
+        "pd",
+        "ideal",
+        "truth",
+        100,
+    )
     assert loaded(motion__control="none", motion__maneuver="[]").motion.control is None
 
 
@@ -127,7 +132,10 @@ WRONG = [
     ),
     ({"vehicle.wheels": "{coulomb: 2 mN}"}, "'2 mN' is not a torque"),
     ({"vehicle.drag": "{viscous: 0.1}"}, "0.1 has no unit"),
-    ({"vehicle.cmgs": "{steering: moore_penrose}"}, "'pseudo_inverse' or 'singularity_robust'"),
+    (
+        {"vehicle.cmgs": "{steering: moore_penrose}"},
+        "'pseudo_inverse' or 'singularity_robust'",
+    ),
     ({"vehicle.wheels": "{speed_limit: 3000}"}, "did you mean speed_limit_rpm?"),
     (
         {"vehicle.disturbances": "{air_current: {rms: [0 N m, 0 N m, -1 N m]}}"},
@@ -218,7 +226,8 @@ def test_a_base_beside_the_scene_resolves_its_own_files(tmp_path: Path) -> None:
 def test_an_unusable_base_is_reported_with_its_line(tmp_path: Path) -> None:
     path = written(tmp_path, "mine", title="mine", base="nothing")
     with pytest.raises(
-        InputError, match=r"^base: nothing: no such scene; allowed: .* \(.*mine.yaml, line 3\)$"
+        InputError,
+        match=r"^base: nothing: no such scene; allowed: .* \(.*mine.yaml, line 3\)$",
     ):
         loader.load(path)
 
@@ -236,7 +245,8 @@ def test_an_error_names_the_file_that_contains_it(tmp_path: Path) -> None:
         tmp_path, "above", base="below.yaml", vehicle={"wheels": {"coulomb": "1 m"}}
     )
     with pytest.raises(
-        InputError, match=r"vehicle.wheels.coulomb: '1 m' is not a torque.*above.yaml, line 5\)"
+        InputError,
+        match=r"vehicle.wheels.coulomb: '1 m' is not a torque.*above.yaml, line 5\)",
     ):
         loader.load(above)
     above = written(tmp_path, "above", base="below.yaml", vehicle={"wheels": {}})

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.scene import loader, unused
+from skysim.scene import loader, unused, unused_rules
 from skysim.simulation.flight import simulate_motion
 from skysim.simulation.lab import build_tracker
 from skysim.tracking.factory import solve_frame
@@ -108,7 +108,9 @@ CASES = [
         "7",
         {"light.led.code": "{kind: cyclic, bit_time: 20 ms}"},
     ),
-    Case(SKY, {"tracker.name": "tetra3rs"}, "tracker.solver", "quest", {"tracker.name": "own"}),
+    Case(
+        SKY, {"tracker.name": "tetra3rs"}, "tracker.solver", "quest", {"tracker.name": "own"}
+    ),
     Case(
         "simsat_bump",
         {"tracker.name": "tetra3rs"},
@@ -203,7 +205,11 @@ CASES = [
         {"camera.detector.hot_pixels": "1"},
     ),
     Case(
-        SKY, {}, "camera.detector.dark_doubling_c", "5", {"camera.detector.temperature_c": "30"}
+        SKY,
+        {},
+        "camera.detector.dark_doubling_c",
+        "5",
+        {"camera.detector.temperature_c": "30"},
     ),
     Case(
         SKY,
@@ -216,7 +222,14 @@ CASES = [
         SKY,
         {
             f"camera.detector.{key}": "0"
-            for key in ("prnu", "dsnu", "hot_pixels", "column_offset_e", "hot_e_s", "dark_e_s")
+            for key in (
+                "prnu",
+                "dsnu",
+                "hot_pixels",
+                "column_offset_e",
+                "hot_e_s",
+                "dark_e_s",
+            )
         },
         "camera.detector.hardware_seed",
         "9",
@@ -230,10 +243,18 @@ CASES = [
         {"camera.detector.noise": "true"},
     ),
     Case(
-        DOME, {}, "camera.detector.anti_blooming", "0.5", {"camera.detector.blooming": "column"}
+        DOME,
+        {},
+        "camera.detector.anti_blooming",
+        "0.5",
+        {"camera.detector.blooming": "column"},
     ),
-    Case(DOME, {}, "site.latitude_deg", "10", {"vehicle.disturbances.earth_rotation": "true"}),
-    Case(DOME, {}, "site.x_azimuth_deg", "10", {"vehicle.disturbances.earth_rotation": "true"}),
+    Case(
+        DOME, {}, "site.latitude_deg", "10", {"vehicle.disturbances.earth_rotation": "true"}
+    ),
+    Case(
+        DOME, {}, "site.x_azimuth_deg", "10", {"vehicle.disturbances.earth_rotation": "true"}
+    ),
     Case(SKY, MOON, "site.latitude_deg", "-50", {**MOON, "site.longitude_deg": "20"}),
     Case(SKY, {}, "site.longitude_deg", "20", MOON),
     Case(SKY, MOON, "site.height", "9 km", {**MOON, "site.longitude_deg": "20"}),
@@ -298,24 +319,28 @@ def test_every_rule_has_a_case() -> None:
     covered = {
         rule.reason
         for case in CASES
-        for rule in unused.RULES
+        for rule in unused_rules.RULES
         if unused.section_of(case.key, rule)
     }
     # Set with its section.
-    covered |= {rule.reason for rule in unused.RULES if "vehicle.cmgs.steering" in rule.keys}
-    missing = [rule.keys for rule in unused.RULES if rule.reason not in covered]
+    covered |= {
+        rule.reason for rule in unused_rules.RULES if "vehicle.cmgs.steering" in rule.keys
+    }
+    missing = [rule.keys for rule in unused_rules.RULES if rule.reason not in covered]
     assert missing == []
 
 
 def test_every_key_of_a_rule_is_a_key_of_the_schema() -> None:
     """A misspelled key would never be refused."""
     schema = (Path(__file__).parents[2] / "data/schema/scene.json").read_text()
-    for rule in unused.RULES:
+    for rule in unused_rules.RULES:
         for key in rule.keys:
             assert f'"{key.rpartition(".")[2]}": {{' in schema, key
 
 
-def outcome(scene: str, settings: dict[str, str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def outcome(
+    scene: str, settings: dict[str, str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One frame after a short motion, its solution, and the attitude and bias at the end."""
     flight = simulate_motion(loader.load(scene, settings, refuses_unused=False))
     frame, _ = flight.render(0)
@@ -432,7 +457,8 @@ def test_with_a_map_the_survey_has_no_effect(tmp_path: Path) -> None:
     (tmp_path / "leds.ecsv").write_text("")
     own = written(tmp_path, "base: afit_simsat_ideal\ntracker: {map: leds.ecsv}\n")
     with pytest.raises(
-        InputError, match=r"light.surface.error: has no effect: tracker.map replaces the survey"
+        InputError,
+        match=r"light.surface.error: has no effect: tracker.map replaces the survey",
     ):
         loader.load(own, {"light.surface.error": "1 mm"})
     assert loader.load(own, {"light.surface.error": "1 mm", "tracker.solver": "thesis"})

@@ -46,7 +46,9 @@ def faults(kind: str, tree: Any) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", SHIPPED)
-def test_the_published_schema_is_the_newest_and_takes_every_file_that_ships(kind: str) -> None:
+def test_the_published_schema_is_the_newest_and_takes_every_file_that_ships(
+    kind: str,
+) -> None:
     published = json.loads((DATA / "schema" / f"{kind}.json").read_text())
     assert published == json_schema.json_schema(kind), (
         f"skysim validate --schema {kind} > data/schema/{kind}.json"
@@ -105,7 +107,11 @@ def test_a_scene_or_study_without_a_version_gets_the_line_to_add(tmp_path: Path)
     path.write_text("base: shefex2\n")
     above.write_text("schema: 1\nbase: mine.yaml\n")
     says = f"schema: missing; add the line schema: 1 ({path})"
-    for read in (lambda: load(path), lambda: load(above), lambda: load(path, {"schema": "1"})):
+    for read in (
+        lambda: load(path),
+        lambda: load(above),
+        lambda: load(path, {"schema": "1"}),
+    ):
         with pytest.raises(InputError, match=f"^{re.escape(says)}$"):
             read()
     path.write_text("title: T\nscene: shefex2\n")
@@ -113,7 +119,9 @@ def test_a_scene_or_study_without_a_version_gets_the_line_to_add(tmp_path: Path)
         study_file.load(path)
     for kind in SHIPPED:
         assert faults(kind, {"title": "T"}) == ["'schema' is a required property"]
-    path.write_text("camera: {preset: ec655, focal_length: 16 mm, f_number: 1.4}\n")  # no scene
+    path.write_text(
+        "camera: {preset: ec655, focal_length: 16 mm, f_number: 1.4}\n"
+    )  # no scene
     assert load_camera(path).f_number == 1.4
 
 

@@ -77,7 +77,9 @@ def test_the_air_raises_and_dims_stars_in_the_frame() -> None:
     wanted = 57.6 * cot - 0.066 * cot**3  # arcsec, sea level, 15 C, 0.7 um
     np.testing.assert_allclose(raised_arcsec[near_center], wanted[near_center], rtol=0.02)
     lost_mag = -2.5 * np.log10(through.electrons[ours] / without.electrons[bare])
-    inside = (np.abs(without.xy_px[bare] - lab.scene.camera.center_px) < [280, 200]).all(axis=1)
+    inside = (np.abs(without.xy_px[bare] - lab.scene.camera.center_px) < [280, 200]).all(
+        axis=1
+    )
     h_deg = np.degrees(altitude)
     masses = 1 / (np.sin(altitude) + 0.50572 * (h_deg + 6.07995) ** -1.6364)
     np.testing.assert_allclose(lost_mag[inside], 0.172 * masses[inside], rtol=0.02)
@@ -117,9 +119,9 @@ def test_scintillation_is_independent_by_frame_and_star() -> None:
     camera = lab.scene.camera
     exposure_s = lab.scene.exposure.time_s
     mass = np.array([1 / np.sin(np.radians(60))])
-    variance = air.variance(mass, camera.pupil_m, exposure_s, lab.scene.site.height_m, 660e-9)[
-        0
-    ]
+    variance = air.variance(
+        mass, camera.pupil_m, exposure_s, lab.scene.site.height_m, 660e-9
+    )[0]
     assert ratio.mean() == pytest.approx(1, abs=4 * np.sqrt(variance / len(ratio)))
     assert ratio.var() == pytest.approx(variance, rel=0.25)
 

@@ -35,7 +35,9 @@ IMU_ALONE = {
 
 
 def changed(name: str = "simsat_bump", **changes: str) -> Scene:
-    return loader.load(name, {key.replace("__", "."): value for key, value in changes.items()})
+    return loader.load(
+        name, {key.replace("__", "."): value for key, value in changes.items()}
+    )
 
 
 def shots_of(scene: Scene) -> list[Shot]:
@@ -156,7 +158,8 @@ def test_over_an_hour_the_filter_s_covariance_includes_the_laboratory_s_errors()
     telemetry = simulate_motion(scene).telemetry()
     assert telemetry.sigma_bias_rad_s is not None
     bias_error = (
-        np.abs(telemetry.assumed_bias_rad_s - telemetry.bias_rad_s) / telemetry.sigma_bias_rad_s
+        np.abs(telemetry.assumed_bias_rad_s - telemetry.bias_rad_s)
+        / telemetry.sigma_bias_rad_s
     )
     turning = telemetry.t_s > 10
     assert in_sigma(telemetry)[turning].max() < 4

@@ -13,7 +13,9 @@ from skysim.tracking import factory
 # Too few or too regular LEDs for an attitude.
 SYMMETRIC = {"afit_test1", "afit_test2", "afit_test3"}
 CODED = {"coded_spiral"}  # a frame alone does not name its LEDs
-NAMES = {path.stem.removesuffix("_ideal") for path in SCENES.glob("*.yaml")} - SYMMETRIC - CODED
+NAMES = (
+    {path.stem.removesuffix("_ideal") for path in SCENES.glob("*.yaml")} - SYMMETRIC - CODED
+)
 
 
 @pytest.mark.slow

@@ -103,7 +103,8 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: mypd\nVersion: 1.0\n")
     names = "".join(
-        f"{name} = mypd:{name.replace('mine', 'pd')}\n" for name in ("mine", "weak", "crashing")
+        f"{name} = mypd:{name.replace('mine', 'pd')}\n"
+        for name in ("mine", "weak", "crashing")
     )
     (about / "entry_points.txt").write_text(f"[skysim.controllers]\n{names}")
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -257,7 +258,10 @@ def test_controller_setup_and_input_round_trip_through_json() -> None:
         ([0, 0], r"torque_nm has shape \(2,\); allowed: \(3,\)"),
         ("much", "torque_nm is not an array of numbers"),
         (None, "torque_nm has shape|torque_nm is not"),
-        ([0, 0, 601], "torque_nm is 601 N m; allowed: up to 1000 times the actuators' 0.6 N m"),
+        (
+            [0, 0, 601],
+            "torque_nm is 601 N m; allowed: up to 1000 times the actuators' 0.6 N m",
+        ),
     ],
 )
 def test_an_invalid_torque_ends_the_run_in_one_line(torque: Any, message: str) -> None:
@@ -407,7 +411,8 @@ def test_a_program_with_an_existing_name_is_refused(name: str, installed: Path) 
 
 
 @pytest.mark.parametrize(
-    "reply", [5, None, [], {"tick": 7}, {"torque_nm": [0, 0, 0]}, {"tick": 0, "torque_nm": {}}]
+    "reply",
+    [5, None, [], {"tick": 7}, {"torque_nm": [0, 0, 0]}, {"tick": 0, "torque_nm": {}}],
 )
 def test_a_reply_of_another_form_is_refused_in_one_line(reply: object) -> None:
     with pytest.raises(ValueError, match=r"tick 0|torque_nm") as raised:

@@ -100,7 +100,9 @@ def test_weights_favor_the_accurate_lights(stars: Lab) -> None:
     places = np.array([[tangent, 0, 1], [-tangent, 0, 1], [0, tangent, 1], [0, -tangent, 1]])
     sigma_px = np.array([0.1, 0.1, 0.4, 0.4])
     gain = gains(ring(places, places, stars), sigma_px)
-    variance = np.diag(covariance(gain, Independent(sigma_px[:, None, None] ** 2 * np.eye(2))))
+    variance = np.diag(
+        covariance(gain, Independent(sigma_px[:, None, None] ** 2 * np.eye(2)))
+    )
     assert np.sqrt(variance[:2]) == pytest.approx(
         np.full(2, 1 / focal_px / np.sqrt(np.sum(1 / sigma_px**2))), rel=1e-3
     )
@@ -118,7 +120,8 @@ def test_a_survey_s_errors_are_angles_at_the_bearing(leds: Lab) -> None:
     gain = gains(circle, np.ones(LEDS))
     places = np.diag(
         covariance(
-            gain, Independent(sigma_m**2 * circle.gradient @ np.swapaxes(circle.gradient, 1, 2))
+            gain,
+            Independent(sigma_m**2 * circle.gradient @ np.swapaxes(circle.gradient, 1, 2)),
         )
     )
     assert np.sqrt(places[:2]) == pytest.approx(
@@ -188,7 +191,9 @@ def test_a_fitted_focal_length_has_no_error_in_the_attitude() -> None:
         mismatch = expected_error.mismatch(
             samples.used[0], samples.attitudes.lab_from_body[0] * cam_from_body.inv(), context
         )
-        assert (mismatch is None) == ((identifier, focal_length) == ("non_dimensional", 33.25))
+        assert (mismatch is None) == (
+            (identifier, focal_length) == ("non_dimensional", 33.25)
+        )
     assert found["non_dimensional", 33.25][0] < 1e-9 * found["led_pairs", 33.25][0]
     assert found["non_dimensional", 33.25][1] < found["led_pairs", 33.25][1]
 
@@ -319,9 +324,9 @@ def test_a_neighbor_moves_a_fitted_star(stars: Lab) -> None:
             np.array([apart_px]), np.array([star_e]), np.array([faint_e]), camera
         )[0]
         assert found == pytest.approx(fit.x[1], rel=0.12)
-    near = beliefs.response_px(np.array([1e-3]), np.array([1000.0]), np.array([500.0]), camera)[
-        0
-    ]
+    near = beliefs.response_px(
+        np.array([1e-3]), np.array([1000.0]), np.array([500.0]), camera
+    )[0]
     assert near == pytest.approx(1e-3 / 3, rel=0.02)
 
 
@@ -411,7 +416,9 @@ def random_attitude(lab: Lab, frames: CheckedAttitudes, rng: np.random.Generator
 def expected_at(
     context: Context, lab_from_body: Rotation, rate_rad_s: Floats
 ) -> tuple[float, float]:
-    at = CheckedAttitudes(Rotation.concatenate([lab_from_body]), rate_rad_s[None], np.zeros(1))
+    at = CheckedAttitudes(
+        Rotation.concatenate([lab_from_body]), rate_rad_s[None], np.zeros(1)
+    )
     return tuple(
         value * ARCSEC_RAD for value in sampling.sampled(at, context).error.rms_arcsec()
     )  # type: ignore[return-value]

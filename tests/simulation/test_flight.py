@@ -116,7 +116,10 @@ def test_a_shot_equals_the_frame_rendered_alone(
     shots = list(flight.shots(solves=solves))
     assert [shot.frame.index for shot in shots] == [0, 1, 2]
     for shot in shots:
-        for frame, truth in (flight.render(shot.frame.index), render(scene, shot.frame.index)):
+        for frame, truth in (
+            flight.render(shot.frame.index),
+            render(scene, shot.frame.index),
+        ):
             np.testing.assert_array_equal(frame.image_dn, shot.frame.image_dn)
             assert (frame.t_mid_s, frame.exposure_s) == (
                 shot.frame.t_mid_s,
@@ -321,7 +324,10 @@ def test_a_torque_accelerates_the_vehicle_by_eulers_equation() -> None:
         momentum.step(PUSH_NM)
     state = momentum.state
     np.testing.assert_allclose(
-        state.lab_from_body.apply(inertia @ state.rate_body_rad_s), given, rtol=2e-3, atol=1e-6
+        state.lab_from_body.apply(inertia @ state.rate_body_rad_s),
+        given,
+        rtol=2e-3,
+        atol=1e-6,
     )
 
 
@@ -411,7 +417,9 @@ def test_the_state_is_the_trajectory_s_present_one() -> None:
     assert (state.lab_from_body * motion.lab_from_body[-1].inv()).magnitude() < 1e-15
     np.testing.assert_array_equal(state.rate_body_rad_s, motion.rate_body_rad_s[-1])
     flight.step()
-    assert state.t_s == pytest.approx(0.2, abs=1e-12)  # a state is not changed by what follows
+    assert state.t_s == pytest.approx(
+        0.2, abs=1e-12
+    )  # a state is not changed by what follows
     assert (flight.state.lab_from_body * state.lab_from_body.inv()).magnitude() > 0
 
 
@@ -585,7 +593,9 @@ def test_observations_do_not_change_the_flight() -> None:
 def test_an_observation_gets_the_gyro_s_rate_of_its_own_exposure() -> None:
     imu = "{gyro: {arw_deg_sqrt_h: 0, bias_deg_h: 0, turn_on_bias_deg_h: 0, scale_ppm: 0, quantum_arcsec: 0}}"
     flight = open_flight(
-        scene_of("shefex2", 1, vehicle__imu=imu, tracker__gyro="true", exposure__first="0.5 s")
+        scene_of(
+            "shefex2", 1, vehicle__imu=imu, tracker__gyro="true", exposure__first="0.5 s"
+        )
     )
     shot = observed_at(flight, 0.3)
     assert isinstance(shot.rate, RateEstimate)

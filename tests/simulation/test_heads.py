@@ -53,7 +53,9 @@ def test_a_head_is_another_chip_with_other_noise() -> None:
     other, _ = render_at_rest(head, lab.start)
     bright = truth.sources.peak_e > 2000
     x, y = np.rint(truth.sources.xy_px[bright]).astype(int).T
-    inside = (x >= 0) & (y >= 0) & (x < frame.image_dn.shape[1]) & (y < frame.image_dn.shape[0])
+    inside = (
+        (x >= 0) & (y >= 0) & (x < frame.image_dn.shape[1]) & (y < frame.image_dn.shape[0])
+    )
     brightest = (
         frame.image_dn[y[inside], x[inside]].astype(float),
         other.image_dn[y[inside], x[inside]].astype(float),
@@ -126,7 +128,9 @@ def test_an_option_without_effect_is_refused_in_a_head_too(tmp_path: Path) -> No
     path.write_text(
         f"schema: 1\nbase: shefex2\nheads: [{head.replace('solver: rotation_only', 'brightness_sigma: 0.1')}]\n"
     )
-    with pytest.raises(InputError, match=r"heads\.0\.tracker\.brightness_sigma: has no effect"):
+    with pytest.raises(
+        InputError, match=r"heads\.0\.tracker\.brightness_sigma: has no effect"
+    ):
         load_scene(path)
 
 

@@ -172,7 +172,9 @@ def test_a_curtain_hides_earlier_lights_and_the_forecast_names_it() -> None:
     )
     x_m = dict(
         zip(
-            lab.camera.sources.id.tolist(), lab.camera.sources.place[:, 0].tolist(), strict=True
+            lab.camera.sources.id.tolist(),
+            lab.camera.sources.place[:, 0].tolist(),
+            strict=True,
         )
     ) | {LAMP_ID: 0.03}
     seen = [id for id in open_truth.sources.id.tolist() if x_m[id] <= 0.02]
@@ -192,7 +194,11 @@ def test_a_lighthouse_is_a_section_of_the_scene() -> None:
     scene = loader.load("afit_simsat", LEVEL | {"lights": f"[{LAMP}]"})
     (config,) = scene.lights
     assert isinstance(config, LighthouseConfig)
-    assert (config.place_m, config.intensity_cd, config.lit_s) == ((0.0, 0.0, 1.0), 0.002, 1.0)
+    assert (config.place_m, config.intensity_cd, config.lit_s) == (
+        (0.0, 0.0, 1.0),
+        0.002,
+        1.0,
+    )
     written = scene.model_dump(mode="json", by_alias=True)["lights"][0]
     assert (written["kind"], written["place"], written["lit"]) == (
         "lighthouse",

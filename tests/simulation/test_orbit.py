@@ -18,7 +18,9 @@ from skysim.sources.satellites import ID_BASE
 from skysim.tracking.factory import solve_frame
 
 HALF_S = 2838.0  # half a revolution at 500 km: the velocity is reversed
-ORBIT = "{kind: circular, altitude: 500 km, inclination_deg: 90, raan_deg: 0, argument_deg: 0}"
+ORBIT = (
+    "{kind: circular, altitude: 500 km, inclination_deg: 90, raan_deg: 0, argument_deg: 0}"
+)
 
 
 def in_orbit(**keys: str) -> Lab:
@@ -49,7 +51,9 @@ def test_stars_have_the_aberration_of_each_frame_s_velocity() -> None:
         exact = stars.apparent(known, time, velocity_m_s)[chosen]
         xy_px = star_camera.optics.project(truth.cam_from_lab.apply(exact))
         off_arcsec = (
-            np.linalg.norm(xy_px - truth.sources.xy_px, axis=1) / scene.camera.focal_px * 206265
+            np.linalg.norm(xy_px - truth.sources.xy_px, axis=1)
+            / scene.camera.focal_px
+            * 206265
         )
         # Parallax, proper motion and deflection of half a revolution are below 0.001".
         assert off_arcsec.max() < 0.005
@@ -57,7 +61,9 @@ def test_stars_have_the_aberration_of_each_frame_s_velocity() -> None:
             truth.cam_from_lab.apply(stars.apparent(known, time)[chosen])
         )
         moved = (
-            np.linalg.norm(still - truth.sources.xy_px, axis=1) / scene.camera.focal_px * 206265
+            np.linalg.norm(still - truth.sources.xy_px, axis=1)
+            / scene.camera.focal_px
+            * 206265
         )
         assert moved.mean() == pytest.approx(7617 / 299_792_458 * 206265, rel=0.05)
 

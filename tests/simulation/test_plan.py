@@ -127,7 +127,9 @@ def test_without_a_controller_the_bearing_may_tilt_to_its_stop() -> None:
 def test_a_tilt_beyond_the_stop_is_refused_as_by_a_run(
     changes: dict[str, str], message: str
 ) -> None:
-    with pytest.raises(InputError, match=f"{message}.*allowed: up to vehicle.tilt_stop_deg 30"):
+    with pytest.raises(
+        InputError, match=f"{message}.*allowed: up to vehicle.tilt_stop_deg 30"
+    ):
         check(lab_of("afit_simsat", **changes))
 
 
@@ -152,7 +154,9 @@ def test_the_check_counts_the_lights_that_the_tracker_uses(name: str) -> None:
     report = solve_frame(build_tracker(lab.camera), frame)
     assert report.attitude.match is not None
     found = fact(check(lab), "lights in the field").values["frames"]
-    assert found["mean"] == pytest.approx(len(report.attitude.match.observed), rel=0.1, abs=1.5)
+    assert found["mean"] == pytest.approx(
+        len(report.attitude.match.observed), rel=0.1, abs=1.5
+    )
     assert found["least"] <= found["mean"] <= found["on_chip"]
 
 
@@ -278,7 +282,9 @@ def test_the_tracker_s_knowledge_is_stated() -> None:
         "tracker__assumed_distortion": "[0.1, 0, 0, 0, 0]",
         "tracker__assumed_camera_body": "[0 mm, 0 mm, 385 mm]",
     }
-    lines = " ".join(fact(check(lab_of("afit_simsat_ideal", **changes)), "tracker knows").lines)
+    lines = " ".join(
+        fact(check(lab_of("afit_simsat_ideal", **changes)), "tracker knows").lines
+    )
     for words in (
         "LEDs to 0.3 mm",
         "rotated by 36″",
@@ -369,7 +375,12 @@ def test_a_solver_s_own_error_is_listed_as_a_cause() -> None:
             "light.layout.spacing",
             "fewer than 4 lights",
         ),
-        ("shefex2", {"tracker__limit_mag": "1.5"}, "tracker.limit_mag", "fewer than 4 lights"),
+        (
+            "shefex2",
+            {"tracker__limit_mag": "1.5"},
+            "tracker.limit_mag",
+            "fewer than 4 lights",
+        ),
         (
             "afit_simsat",
             {"tracker__min_area_px": "900"},
@@ -406,7 +417,12 @@ def test_a_solver_s_own_error_is_listed_as_a_cause() -> None:
             "camera.vignetting.cutoff_deg",
             "the lens is dark beyond 4 deg",
         ),
-        ("shefex2", {"light__limit_mag": "4"}, "light.limit_mag", "of the directions in reach"),
+        (
+            "shefex2",
+            {"light__limit_mag": "4"},
+            "light.limit_mag",
+            "of the directions in reach",
+        ),
         ("shefex2", {"light__limit_mag": "5.9"}, "light.limit_mag", "the sky ends at V 5.9"),
         (
             "shefex2",
@@ -586,7 +602,8 @@ def test_using_the_brightest_hundred_of_many_lights_is_not_warned_of() -> None:
     )
     result = check(dense)
     assert (
-        "; the tracker uses the 100 brightest)" in fact(result, "lights in the field").lines[0]
+        "; the tracker uses the 100 brightest)"
+        in fact(result, "lights in the field").lines[0]
     )
     assert not [line for line in result.findings if "detects" in line]
 
@@ -625,7 +642,9 @@ def test_a_wrong_focal_length_is_warned_of_where_the_tracker_refuses(
 @pytest.mark.parametrize(
     "layout",
     [
-        pytest.param("{kind: poisson_disk, count: 1400, cap_deg: 42}", marks=pytest.mark.slow),
+        pytest.param(
+            "{kind: poisson_disk, count: 1400, cap_deg: 42}", marks=pytest.mark.slow
+        ),
         pytest.param("{kind: fibonacci, count: 1400, cap_deg: 42}", marks=pytest.mark.slow),
         pytest.param(GEODESIC, marks=pytest.mark.slow),
     ],
@@ -647,7 +666,9 @@ def test_similar_fields_are_those_that_the_tracker_refuses_as_ambiguous(layout: 
         frame, _ = render_at_rest(lab.in_run(n).camera, lab_from_body)
         statuses.append(solve_frame(tracker, frame).attitude.status)
     ambiguous = np.mean([status.startswith("ambiguous") for status in statuses])
-    assert fact(check(lab), "fields alike").values["share"] == pytest.approx(ambiguous, abs=0.2)
+    assert fact(check(lab), "fields alike").values["share"] == pytest.approx(
+        ambiguous, abs=0.2
+    )
 
 
 def test_fields_of_coded_leds_are_not_called_similar() -> None:
@@ -700,7 +721,9 @@ def test_the_star_at_signal_to_noise_five_matches_the_truth_table() -> None:
     lab = lab_of("shefex2", exposure__frames="1")
     limit = fact(check(lab), "faintest star").values["snr_5_v_mag"]
     magnitude = dict(
-        zip(lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True)
+        zip(
+            lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True
+        )
     )
     _, truth = Flight(lab).simulate_motion().render(0)
     v_mag = np.array([magnitude[hip] for hip in truth.sources.id.tolist()])
@@ -717,7 +740,9 @@ def test_the_centroid_floor_proposed_by_the_check_makes_claims_correct() -> None
         sky_warnings.claimed(
             *samples_of(
                 lab_of(
-                    "shefex2", camera__detector__prnu="0.1", tracker__centroid_sigma_px=str(px)
+                    "shefex2",
+                    camera__detector__prnu="0.1",
+                    tracker__centroid_sigma_px=str(px),
                 )
             )
         )

@@ -173,7 +173,8 @@ def test_a_known_distortion_causes_no_error() -> None:
     flight = simulate_motion(loader.load("shefex2", QUIET_SKY | lens))
     frame, truth = flight.render(0)
     assert (
-        error_deg(build_tracker(flight.lab.camera).solve(frame.image_dn).attitude, truth) < 1e-6
+        error_deg(build_tracker(flight.lab.camera).solve(frame.image_dn).attitude, truth)
+        < 1e-6
     )
 
 
@@ -315,7 +316,8 @@ def test_jitter_moves_the_camera_by_its_declared_rms() -> None:
     )
     t_s = np.linspace(0, 1, 2000, endpoint=False)  # twenty whole periods
     turned = (
-        np.degrees((still.attitude_at(t_s).inv() * shaken.attitude_at(t_s)).as_rotvec()) * 3600
+        np.degrees((still.attitude_at(t_s).inv() * shaken.attitude_at(t_s)).as_rotvec())
+        * 3600
     )
     np.testing.assert_allclose(
         np.sqrt(np.mean(turned**2, axis=0)), [100, 0, 0], rtol=1e-3, atol=1e-3
@@ -355,7 +357,9 @@ def test_noise_differs_from_frame_to_frame_and_seed_to_seed() -> None:
 
 
 def test_the_run_s_seed_does_not_change_the_hardware() -> None:
-    domes = [build_lab(changed("afit_simsat", seed=seed)).camera.sources for seed in ("1", "2")]
+    domes = [
+        build_lab(changed("afit_simsat", seed=seed)).camera.sources for seed in ("1", "2")
+    ]
     np.testing.assert_array_equal(domes[0].place, domes[1].place)
     np.testing.assert_array_equal(domes[0].strength, domes[1].strength)
 
@@ -431,7 +435,9 @@ def test_a_calibrated_tracker_uses_the_focused_image_distance() -> None:
     """Reference §1.2: 35 mm at 33 in is 36.53 mm, whose 1,600 pixels of 4 um see 10.01 deg."""
     believed = onboard_model.assumed_camera(loader.load("afit_simsat"))
     assert believed.focal_px * 4e-3 == pytest.approx(36.53, abs=5e-3)
-    assert np.degrees(2 * np.arctan(800 / believed.focal_px)) == pytest.approx(10.01, abs=5e-3)
+    assert np.degrees(2 * np.arctan(800 / believed.focal_px)) == pytest.approx(
+        10.01, abs=5e-3
+    )
 
 
 def test_the_shutter_s_smear_adds_to_saturation_and_noise() -> None:
@@ -582,7 +588,8 @@ def test_the_moon_moves_among_the_stars_during_a_run() -> None:
     flight = simulate_motion(loader.load("shefex2", settings))
     place = [flight.render(index)[1].bodies[0] for index in (0, 1)]
     moved_arcsec = (
-        np.hypot(place[1].ra_deg - place[0].ra_deg, place[1].dec_deg - place[0].dec_deg) * 3600
+        np.hypot(place[1].ra_deg - place[0].ra_deg, place[1].dec_deg - place[0].dec_deg)
+        * 3600
     )
     assert 25 < moved_arcsec < 40
 

@@ -35,13 +35,17 @@ def test_streaks_are_as_long_and_as_bright_as_their_satellites() -> None:
     """Length: rate times exposure, by the scale at the streak. Light: that of a star of the magnitude and color."""
     random = "{per_field: 60, seed: 3, rate_deg_s: [0.5, 3], v_mag: [2, 2]}"
     lab = lab_of(
-        light__satellites__random=random, camera__detector__noise="false", light__limit_mag="0"
+        light__satellites__random=random,
+        camera__detector__noise="false",
+        light__limit_mag="0",
     )
     _, truth = render_at_rest(lab.camera, lab.start, 0)
     rows = truth.sources
     light = {satellite.id: satellite for satellite in truth.satellites}
     camera = lab.scene.camera
-    inside = (np.abs(rows.xy_px - np.array(camera.center_px)) < 100).all(axis=1) & streaks(rows)
+    inside = (np.abs(rows.xy_px - np.array(camera.center_px)) < 100).all(axis=1) & streaks(
+        rows
+    )
     assert np.count_nonzero(inside) >= 2
     for n in np.flatnonzero(inside):
         expected_px = (
@@ -74,7 +78,9 @@ def test_a_satellite_has_its_row_and_its_details_in_the_header(tmp_path: Path) -
 def test_a_file_requires_a_place_on_the_ground_or_in_orbit(tmp_path: Path) -> None:
     path = tmp_path / "one.tle"
     path.write_text("x", encoding="utf-8")
-    with pytest.raises(InputError, match=r"light.satellites.file: requires the section orbit"):
+    with pytest.raises(
+        InputError, match=r"light.satellites.file: requires the section orbit"
+    ):
         loader.load("shefex2", {"light.satellites.file": str(path)})
 
 
@@ -83,7 +89,11 @@ def test_a_file_requires_a_place_on_the_ground_or_in_orbit(tmp_path: Path) -> No
 def test_a_long_streak_is_rejected_as_one_object(v_mag: float) -> None:
     """Also at 4.5, where its light is near the threshold and the streak breaks into pieces, up to nine a streak."""
     random = f"{{per_field: 3, seed: 5, v_mag: [{v_mag}, {v_mag}], rate_deg_s: [15, 20]}}"
-    keys = {"exposure__time": "999 ms", "exposure__rate_hz": "1", "tracker__brightest": "1000"}
+    keys = {
+        "exposure__time": "999 ms",
+        "exposure__rate_hz": "1",
+        "tracker__brightest": "1000",
+    }
     false = []
     streaked = 0
     for settings in ({}, {"light__satellites__random": random}):
@@ -95,7 +105,9 @@ def test_a_long_streak_is_rejected_as_one_object(v_mag: float) -> None:
             report = solve_frame(tracker, frame)
             assert report.attitude.status == "solved"
             stars = truth.sources.flux_xy_px[~streaks(truth.sources)]
-            counts.append(np.count_nonzero(cKDTree(stars).query(report.centroids.xy_px)[0] > 3))
+            counts.append(
+                np.count_nonzero(cKDTree(stars).query(report.centroids.xy_px)[0] > 3)
+            )
             streaked += np.count_nonzero(streaks(truth.sources))
         false.append(sum(counts))
     assert streaked > 10

@@ -87,7 +87,9 @@ def test_a_prescribed_motion_equals_its_reference() -> None:
     assert np.degrees(path.lab_from_body.magnitude()).max() > 0.3
     np.testing.assert_array_equal(flight.telemetry().torque_nm, 0)
     pushed = moved(changes={"motion.control": "pid"})
-    assert angle(pushed.trajectory().lab_from_body, reference.attitudes(path.t_s)).max() > 1e-6
+    assert (
+        angle(pushed.trajectory().lab_from_body, reference.attitudes(path.t_s)).max() > 1e-6
+    )
 
 
 def test_a_prescribed_motion_is_measured_by_the_gyros() -> None:
@@ -116,7 +118,11 @@ def test_a_prescribed_motion_is_measured_by_the_gyros() -> None:
             "motion.maneuver: step is not possible with control:",
         ),
         (
-            {"motion.maneuver": [{"kind": "bump", "rate_deg_s": [1, 0, 0], "duration": "1 s"}]},
+            {
+                "motion.maneuver": [
+                    {"kind": "bump", "rate_deg_s": [1, 0, 0], "duration": "1 s"}
+                ]
+            },
             "bump is not possible",
         ),
         (
@@ -152,7 +158,8 @@ def test_a_table_is_followed_exactly_without_a_controller_and_closely_with_one()
     )
     assert exact.lab.scene.motion.is_prescribed
     assert (
-        angle(exact.trajectory().attitude_at(TIMES[:20]), attitudes(columns)[:20]).max() < 1e-12
+        angle(exact.trajectory().attitude_at(TIMES[:20]), attitudes(columns)[:20]).max()
+        < 1e-12
     )
     flown = moved("afit_simsat", {"motion.control": "pid"}, profile=columns)
     off_deg = np.degrees(
@@ -231,7 +238,9 @@ def test_a_profile_that_the_vehicle_cannot_follow_is_refused(
     scene: str, changes: dict[str, Any], size_deg: float, message: str
 ) -> None:
     """The torque of Euler's equation, the gyros' range and the tilt stop. A fifth of the angles is followed."""
-    ways = {"exposure": {"time": "10 ms", "rate_hz": 1, "frames": 1, "first": "4 s"}} | changes
+    ways = {
+        "exposure": {"time": "10 ms", "rate_hz": 1, "frames": 1, "first": "4 s"}
+    } | changes
     with pytest.raises(InputError, match=message) as raised:
         moved(scene, ways, profile=swing(TIMES, size_deg))
     assert str(raised.value).startswith("motion.maneuver")
@@ -371,7 +380,11 @@ def test_a_function_of_an_image_is_a_tracker(sky: Run) -> None:
     truth = sky[0].truth.cam_from_lab
     images = []
     error = Rotation.from_rotvec([1e-4, 0, 0])
-    for form in (error * truth, (error * truth).as_quat(), (error * truth).as_quat().tolist()):
+    for form in (
+        error * truth,
+        (error * truth).as_quat(),
+        (error * truth).as_quat().tolist(),
+    ):
         images.clear()
 
         def mine(image: np.ndarray, form: Any = form) -> Any:
@@ -383,7 +396,8 @@ def test_a_function_of_an_image_is_a_tracker(sky: Run) -> None:
         assert [frame.row.status for frame in run_] == ["solved", "solved"]
         assert run_[1].error_arcsec == pytest.approx(1e-4 * 206264.8, rel=1e-6)
         assert [
-            np.array_equal(image, frame.image) for image, frame in zip(images, sky, strict=True)
+            np.array_equal(image, frame.image)
+            for image, frame in zip(images, sky, strict=True)
         ] == [True, True]
 
 

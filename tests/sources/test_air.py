@@ -66,7 +66,11 @@ def test_refraction_matches_astropy(
     directions = stars.apparent(
         stars_of, time, observe_from(time, site_of(place)).from_earth.velocity_m_s
     )
-    keys = {"pressure_hpa": pressure_hpa, "temperature_c": temperature_c, "humidity": humidity}
+    keys = {
+        "pressure_hpa": pressure_hpa,
+        "temperature_c": temperature_c,
+        "humidity": humidity,
+    }
     sky = air_at(place, **keys, wavelength=f"{nm} nm").at(time)
     azimuth, altitude = horizontal(sky.axes, directions)
     seen_azimuth, seen_altitude = horizontal(
@@ -75,7 +79,9 @@ def test_refraction_matches_astropy(
     location = EarthLocation.from_geodetic(place[1] * u.deg, place[0] * u.deg, place[2] * u.m)
     at = AltAz(location=location, obstime=Time(time))
     air = {"pressure": pressure_hpa * u.hPa, "temperature": temperature_c * u.deg_C}
-    through_air = at.replicate_without_data(**air, relative_humidity=humidity, obswl=nm * u.nm)
+    through_air = at.replicate_without_data(
+        **air, relative_humidity=humidity, obswl=nm * u.nm
+    )
     with iers.conf.set_temp("auto_download", False):
         icrs = SkyCoord(stars_of.ra_rad * u.rad, stars_of.dec_rad * u.rad)
         without = icrs.transform_to(at)
@@ -156,7 +162,9 @@ def kasten_young(altitude_rad: Floats) -> Floats:
 
 def test_air_masses_match_kasten_and_young() -> None:
     altitude = np.radians(np.linspace(3, 90, 200))
-    np.testing.assert_allclose(starlight.air_mass(altitude), kasten_young(altitude), rtol=0.012)
+    np.testing.assert_allclose(
+        starlight.air_mass(altitude), kasten_young(altitude), rtol=0.012
+    )
     # Pickering's own value.
     assert starlight.air_mass(np.array([0.0]))[0] == pytest.approx(38.75, abs=0.01)
     assert starlight.air_mass(np.array([-0.1]))[0] == starlight.air_mass(np.array([0.0]))[0]

@@ -47,12 +47,16 @@ def test_the_free_share_of_an_inertial_boresight_matches_trigonometry(
     pointing = Pointing("inertial", np.array([np.sin(tilt), 0.0, np.cos(tilt)]))
     found = sample(sphere, START, revolution_s(sphere), pointing, POLE, 0.1)
     free = found.outside(ExclusionConfig(earth_deg=earth_deg, stars=0))["Earth"].mean()
-    limit = np.cos(np.arcsin(EARTH_RADIUS_M / (EARTH_RADIUS_M + 700e3)) + np.radians(earth_deg))
+    limit = np.cos(
+        np.arcsin(EARTH_RADIUS_M / (EARTH_RADIUS_M + 700e3)) + np.radians(earth_deg)
+    )
     expected = 1 - np.arccos(np.clip(limit / np.sin(tilt), -1, 1)) / np.pi
     assert free == pytest.approx(expected, abs=1e-3)
 
 
-def test_a_boresight_off_the_zenith_keeps_its_angle_to_the_limb(sphere: CircularOrbit) -> None:
+def test_a_boresight_off_the_zenith_keeps_its_angle_to_the_limb(
+    sphere: CircularOrbit,
+) -> None:
     found = sample(
         sphere,
         START,
@@ -67,7 +71,9 @@ def test_a_boresight_off_the_zenith_keeps_its_angle_to_the_limb(sphere: Circular
 
 def test_the_sun_excludes_a_cone_over_the_year(sphere: CircularOrbit) -> None:
     """An orbit about the equator, zenith pointing, at the equinox: the Sun is within 90 degrees for half an orbit."""
-    found = sample(sphere, START, revolution_s(sphere), Pointing("zenith", POLE[0]), POLE, 0.1)
+    found = sample(
+        sphere, START, revolution_s(sphere), Pointing("zenith", POLE[0]), POLE, 0.1
+    )
     assert found.outside(ExclusionConfig(sun_deg=90, stars=0))["Sun"].mean() == pytest.approx(
         0.5, abs=1e-3
     )
@@ -101,5 +107,7 @@ def test_positions_between_nodes_match_the_ephemeris(name: str) -> None:
     ephemeris = load_ephemeris()
     for t_s in (1234.0, 54321.0):
         jd = tt_jd(START) + t_s / 86400
-        exact = 1e3 * (ephemeris.barycentric_km(name, jd) - ephemeris.position_km("earth", jd))
+        exact = 1e3 * (
+            ephemeris.barycentric_km(name, jd) - ephemeris.position_km("earth", jd)
+        )
         assert np.linalg.norm(spline(t_s) - exact) < 5e-8 * np.linalg.norm(exact)

@@ -124,7 +124,8 @@ def test_stars_missing_in_hipparcos_2_are_supplied(
     dec = stars.dec_rad[n] + stars.pm_dec_rad_yr[n] * years
     ra = stars.ra_rad[n] + stars.pm_ra_rad_yr[n] * years / np.cos(dec)
     off = (
-        np.degrees([(ra - np.radians(ra_deg)) * np.cos(dec), dec - np.radians(dec_deg)]) * 3600
+        np.degrees([(ra - np.radians(ra_deg)) * np.cos(dec), dec - np.radians(dec_deg)])
+        * 3600
     )
     assert np.abs(off).max() < 2.0
     assert stars.v_mag[n] == pytest.approx(
@@ -240,7 +241,8 @@ def test_a_missing_catalog_is_named() -> None:
 
 
 @pytest.mark.parametrize(
-    "value", ["last year", "null", "[1991.25]", "2016-01-01", "{a: 1}", ".nan", "1e300", "true"]
+    "value",
+    ["last year", "null", "[1991.25]", "2016-01-01", "{a: 1}", ".nan", "1e300", "true"],
 )
 def test_an_epoch_that_is_not_a_year_is_refused(tmp_path: Path, value: str) -> None:
     path = tmp_path / "stars.ecsv"

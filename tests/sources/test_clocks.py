@@ -101,9 +101,9 @@ def test_a_filtered_led_has_the_mean_of_its_filter_s_voltage(filter_s: float) ->
                 - (u - voltage[-2]) * filter_s * -np.expm1(-step_s / filter_s)
             )
         for begin_s, end_s in exposures:
-            expected = (np.interp(end_s, t_s, integral) - np.interp(begin_s, t_s, integral)) / (
-                end_s - begin_s
-            )
+            expected = (
+                np.interp(end_s, t_s, integral) - np.interp(begin_s, t_s, integral)
+            ) / (end_s - begin_s)
             share = filtered_share(leds, np.full(6, filter_s), begin_s, end_s)[n]
             assert share == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
@@ -125,9 +125,7 @@ def test_filtered_leds_do_not_flicker() -> None:
     """A tenth of full light, exposed for one and a half pulses: frames differ by a third, filtered by a hundredth."""
     scatter = []
     for low_pass in ("", ", filter: {time_constant: 20 ms, error: {tolerance: 0.1}}"):
-        layout = (
-            "{kind: poisson_disk, spacing: 60 mm, cap_deg: 20, levels: [0.1], hardware_seed: 5}"
-        )
+        layout = "{kind: poisson_disk, spacing: 60 mm, cap_deg: 20, levels: [0.1], hardware_seed: 5}"
         drive = {
             "light.led.drive": f"{{kind: pwm{low_pass}}}",
             "light.layout": layout,
@@ -177,7 +175,11 @@ def test_flicker_differs_from_frame_to_frame_and_from_run_to_run() -> None:
 
 @pytest.mark.slow
 def test_exposure_starts_and_time_tags_have_the_declared_errors() -> None:
-    keys = {"trigger_jitter": "400 us", "time_tag_offset": "1 ms", "time_tag_jitter": "200 us"}
+    keys = {
+        "trigger_jitter": "400 us",
+        "time_tag_offset": "1 ms",
+        "time_tag_jitter": "200 us",
+    }
     scene = loader.load(
         "afit_simsat", {f"exposure.{key}": value for key, value in keys.items()}
     )

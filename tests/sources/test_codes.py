@@ -30,7 +30,9 @@ def codes(clock: Clocks | None, dropout: float = 0.0, depth: float = 0.6) -> Led
 def test_a_frame_shows_the_bit_of_its_number(frame: int) -> None:
     shown = codes(None)
     bit = shown.words[:, frame % shown.words.shape[1]]
-    np.testing.assert_array_equal(shown.mean_level(1.0, 0.004, frame), np.where(bit, 1.0, 0.4))
+    np.testing.assert_array_equal(
+        shown.mean_level(1.0, 0.004, frame), np.where(bit, 1.0, 0.4)
+    )
 
 
 @pytest.mark.parametrize(
@@ -71,7 +73,10 @@ def test_a_bit_of_several_levels_fails_to_any_other_level() -> None:
     shown = LedCodes(words, code, None, 3)
     light = light_levels(code, np.arange(4))
     steps = [
-        (np.abs(shown.level(n)[:, None] - light).argmin(axis=1) - words[:, n % words.shape[1]])
+        (
+            np.abs(shown.level(n)[:, None] - light).argmin(axis=1)
+            - words[:, n % words.shape[1]]
+        )
         % 4
         for n in range(100)
     ]
@@ -114,7 +119,10 @@ def test_a_rendered_led_has_the_light_of_its_bits() -> None:
     assert len(set((expected[0] / expected[1]).tolist())) > 1
     np.testing.assert_array_equal(truths[0].id, truths[1].id)
     np.testing.assert_allclose(
-        truths[0].electrons / truths[1].electrons, expected[0] / expected[1], rtol=1e-6, atol=0
+        truths[0].electrons / truths[1].electrons,
+        expected[0] / expected[1],
+        rtol=1e-6,
+        atol=0,
     )
 
 

@@ -206,7 +206,9 @@ def test_the_camera_sees_the_real_sky_on_the_panel_to_half_a_pixel() -> None:
     normal = drawn.normal[0]
     along = ((np.array([0.05, -0.02, 1.4]) - camera_m) @ normal) / (direction @ normal)
     where = own_m(camera_m + along[:, None] * direction)[:, :2]
-    on_panel = np.all(np.abs(where) <= np.array([1680, 1050]) * 0.129e-3, axis=1) & (along > 0)
+    on_panel = np.all(np.abs(where) <= np.array([1680, 1050]) * 0.129e-3, axis=1) & (
+        along > 0
+    )
     on_panel &= direction[:, 2] > np.cos(np.radians(60))
     brightest = np.flatnonzero(on_panel)[np.argsort(stars.v_mag[on_panel])[:25]]
     assert set(drawn.id) == set(stars.hip[brightest])
@@ -245,7 +247,9 @@ def test_pixels_of_a_row_light_up_together_and_rows_one_after_another() -> None:
 @pytest.mark.parametrize(
     ("frames", "part"), [(0, 0.5), (1, 0.4), (2, 0.6), (7, 0.35), (20, 0.65)]
 )
-def test_a_panel_s_flicker_matches_the_reference(duty: float, frames: int, part: float) -> None:
+def test_a_panel_s_flicker_matches_the_reference(
+    duty: float, frames: int, part: float
+) -> None:
     """Reference 1.3: sqrt(f (1 - f) - w / 3) / (n + f) for pulses of a share w <= f <= 1 - w, over all beginnings."""
     got = light_s(refreshed(duty), (frames + part) / 60)
     law = np.sqrt(part * (1 - part) - duty / 3) / (frames + part)
@@ -255,7 +259,9 @@ def test_a_panel_s_flicker_matches_the_reference(duty: float, frames: int, part:
 
 def test_a_panel_does_not_flicker_in_whole_frames_nor_when_always_lit() -> None:
     assert np.ptp(light_s(refreshed(0.3), 3 / 60)) < 1e-12
-    np.testing.assert_allclose(light_s(refreshed(1.0), 2.4 / 60), 2.4 / 60, rtol=1e-12, atol=0)
+    np.testing.assert_allclose(
+        light_s(refreshed(1.0), 2.4 / 60), 2.4 / 60, rtol=1e-12, atol=0
+    )
 
 
 def still_frame(lab: Lab) -> tuple[Frame, Truth]:
@@ -267,7 +273,9 @@ def light_s(drawn: Sources, exposure_s: float) -> np.ndarray:
     """A pixel's light in exposures with start times uniform over a frame."""
     begins = (np.arange(4000) + 0.5) / 4000 / 60
     pulses = drawn.period_s[5], drawn.start_s[5], drawn.on_s[5]
-    return np.array([lit_moments_s(begin, begin + exposure_s, *pulses)[0] for begin in begins])
+    return np.array(
+        [lit_moments_s(begin, begin + exposure_s, *pulses)[0] for begin in begins]
+    )
 
 
 def test_rows_that_are_not_lit_within_the_exposure_are_dark() -> None:
@@ -279,7 +287,9 @@ def test_rows_that_are_not_lit_within_the_exposure_are_dark() -> None:
     }
     dark_lab = build_lab(loader.load("nps_tas2", changes))
     dark = dark_lab.camera
-    steady = build_lab(loader.load("nps_tas2", changes | {"light.led.drive": "{kind: direct}"}))
+    steady = build_lab(
+        loader.load("nps_tas2", changes | {"light.led.drive": "{kind: direct}"})
+    )
     window = exposure_window(dark.scene, 0)
     assert isinstance(dark.known, LedDome)
     clocks = dark.known.timing(dark.run_seed).clocks
@@ -365,7 +375,9 @@ def test_a_camera_on_a_lever_sees_only_the_collimation_s_parallax(
     central = build_lab(loader.load("collimated_display", {"motion.start.roll_deg": "6"}))
     _, moved = still_frame(lab)
     _, still = still_frame(central)
-    both, ours, theirs = np.intersect1d(moved.sources.id, still.sources.id, return_indices=True)
+    both, ours, theirs = np.intersect1d(
+        moved.sources.id, still.sources.id, return_indices=True
+    )
     camera_m = moved.lab_from_body.apply(lab.camera.mount.camera_body_m)
     sources = central.camera.sources
     direction = sources.place[[np.flatnonzero(sources.id == n)[0] for n in both], :3]
@@ -409,7 +421,8 @@ def test_a_black_panel_has_the_light_of_all_pixels_over_the_contrast() -> None:
     """
     x, y = np.meshgrid((np.arange(20) - 9.5) * 0.01, (np.arange(15) - 7) * 0.01)
     places = [
-        [f"{0.15 + a} m", f"{b} m", "1.4 m"] for a, b in zip(x.ravel(), y.ravel(), strict=True)
+        [f"{0.15 + a} m", f"{b} m", "1.4 m"]
+        for a, b in zip(x.ravel(), y.ravel(), strict=True)
     ]
     points = {"kind": "listed", "cap_deg": 30, "positions": places}
     layout = {"kind": "lcd", "pixels": [20, 15], "pitch": "1 cm", "points": points}
@@ -507,7 +520,10 @@ def test_the_glow_is_on_the_frame_only_with_a_finite_contrast() -> None:
             {"light.layout.points.kind": "patch_boards"},
             "points.kind: unknown kind 'patch_boards'; allowed:",
         ),
-        ({"light.layout.points.cap_deg": "0"}, "light.layout.points.cap_deg: 0 is not allowed"),
+        (
+            {"light.layout.points.cap_deg": "0"},
+            "light.layout.points.cap_deg: 0 is not allowed",
+        ),
         (
             {"light.surface.width": "0.4 m"},
             "light.layout.pixels: need 0.4334 m by 0.2709 m; allowed: the surface",
@@ -588,5 +604,7 @@ def test_the_surface_ends_with_its_pixels_which_must_fit(width_m: float, fits: b
             display.panel_surface(config, plane).half_m, [0.1, 0.075], rtol=1e-15
         )
         return
-    with pytest.raises(InputError, match=r"light.layout.pixels: need 0.2 m by 0.15 m; allowed"):
+    with pytest.raises(
+        InputError, match=r"light.layout.pixels: need 0.2 m by 0.15 m; allowed"
+    ):
         display.panel_surface(config, plane)

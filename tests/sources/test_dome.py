@@ -116,7 +116,9 @@ def test_the_apex_has_its_declared_height(part: dict) -> None:
     offset = light.SurfaceConfig.model_validate(part).offset_m
     above = np.array([offset[0], offset[1], 0.0])
     top = made.meet(above, np.array([[0.0, 0.0, 1.0]]))[0]
-    np.testing.assert_allclose(top, [*offset[:2], 48 * INCH_M + offset[2]], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        top, [*offset[:2], 48 * INCH_M + offset[2]], rtol=0, atol=1e-14
+    )
 
 
 @pytest.mark.parametrize("part", [MEASURED, SPHERE])
@@ -198,10 +200,14 @@ def test_boards_are_flat_tangent_and_touch_the_surface_at_their_middle(afit: Sou
 def test_outer_leds_of_a_board_are_off_the_surface_by_the_sagitta(afit: Sources) -> None:
     """A tangent plate of half-diagonal h under a dome of curvature radius R stands off by h^2 / 2R."""
     made = surface(MEASURED)
-    gap = np.linalg.norm(made.meet(np.zeros(3), afit.place[:, :3]) - afit.place[:, :3], axis=1)
+    gap = np.linalg.norm(
+        made.meet(np.zeros(3), afit.place[:, :3]) - afit.place[:, :3], axis=1
+    )
     tightest = made.semi_axes_m[2] ** 2 / made.semi_axes_m[0]  # no ellipsoid's radius is less
     assert gap.max() < 2 * 0.008**2 / (2 * tightest)
-    assert gap.max() > 2 * 0.008**2 / (2 * made.semi_axes_m[0] ** 2 / made.semi_axes_m[2]) * 0.9
+    assert (
+        gap.max() > 2 * 0.008**2 / (2 * made.semi_axes_m[0] ** 2 / made.semi_axes_m[2]) * 0.9
+    )
 
 
 def patterns(leds: Sources) -> list[frozenset[int]]:
@@ -336,7 +342,9 @@ def test_strength_is_in_the_chip_s_own_electrons() -> None:
     }
     red = dome.sources(DomeConfig.model_validate(light), Band.from_efficiency(0.5)).strength
     # By hand: 16 mcd of V(640 nm) = .175 in photons of 3.1038e-19 J, half of them electrons.
-    np.testing.assert_allclose(red, 0.016 / (683 * 0.175) / 3.1038e-19 * 0.5, rtol=1e-4, atol=0)
+    np.testing.assert_allclose(
+        red, 0.016 / (683 * 0.175) / 3.1038e-19 * 0.5, rtol=1e-4, atol=0
+    )
 
 
 def test_pulses_have_the_levels_of_the_scene_and_random_phases(afit: Sources) -> None:
@@ -344,7 +352,9 @@ def test_pulses_have_the_levels_of_the_scene_and_random_phases(afit: Sources) ->
     np.testing.assert_array_equal(afit.period_s, 1e-3)
     assert 0 <= afit.start_s.min() < afit.start_s.max() < 1e-3
     # The mean of n uniform phases, to four of its sigmas.
-    assert afit.start_s.mean() == pytest.approx(0.5e-3, abs=4 * 1e-3 / np.sqrt(12 * len(afit)))
+    assert afit.start_s.mean() == pytest.approx(
+        0.5e-3, abs=4 * 1e-3 / np.sqrt(12 * len(afit))
+    )
 
 
 @pytest.mark.parametrize("part", [SPHERE, {"kind": "flat", "apex": "48 in"}])

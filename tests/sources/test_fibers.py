@@ -26,7 +26,11 @@ LED = {"intensity": "13 ucd", "disk_diameter": "0.3 mm", "drive": {"kind": "dire
 
 
 def config(variation: float = 0.0, on: dict[str, Any] = SPHERE, **aiming: Any) -> DomeConfig:
-    layout: dict[str, Any] = {"kind": "fibers", "points": POINTS, "radius_variation": variation}
+    layout: dict[str, Any] = {
+        "kind": "fibers",
+        "points": POINTS,
+        "radius_variation": variation,
+    }
     if aiming:
         layout["aiming"] = {"laser": [f"{one} m" for one in LASER_M]} | aiming
     return DomeConfig.model_validate(
@@ -102,8 +106,12 @@ def test_the_drill_s_error_is_within_the_surface() -> None:
     design = places()
     moved = places(pointing_sigma_arcsec=1e-9, drill_sigma="0.1 mm") - design
     assert np.abs(np.sum(moved * unit(design), axis=1)).max() < 1e-12
-    assert np.sum(moved**2, axis=1).mean() == pytest.approx(2e-8, rel=4 / np.sqrt(len(design)))
-    bounded = places(pointing_sigma_arcsec=1e-9, drill_sigma={"tolerance": "±0.1 mm"}) - design
+    assert np.sum(moved**2, axis=1).mean() == pytest.approx(
+        2e-8, rel=4 / np.sqrt(len(design))
+    )
+    bounded = (
+        places(pointing_sigma_arcsec=1e-9, drill_sigma={"tolerance": "±0.1 mm"}) - design
+    )
     assert np.linalg.norm(bounded, axis=1).max() < 0.1e-3 * np.sqrt(2) * (1 + 1e-9)
 
 

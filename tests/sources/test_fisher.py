@@ -70,7 +70,10 @@ def test_an_led_s_information_matches_the_derivatives_of_its_tangents() -> None:
     for point in b:
         FISHER.led_information(point, CAMERA_M, out)
         slopes = np.array(
-            [(tangents(1e-6 * e, point) - tangents(-1e-6 * e, point)) / 2e-6 for e in np.eye(3)]
+            [
+                (tangents(1e-6 * e, point) - tangents(-1e-6 * e, point)) / 2e-6
+                for e in np.eye(3)
+            ]
         )
         wanted = slopes @ slopes.T
         np.testing.assert_allclose(out[:3], np.diag(wanted), rtol=1e-8)

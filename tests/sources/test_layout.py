@@ -188,7 +188,9 @@ def test_the_afit_field_sees_eight_of_a_thousand(
     seen = []
     for _ in range(1000):
         tilt = np.arccos(1 - rng.random() * (1 - np.cos(np.radians(25))))
-        lab_from_body = Rotation.from_euler("ZYZ", [rng.uniform(0, 7), tilt, rng.uniform(0, 7)])
+        lab_from_body = Rotation.from_euler(
+            "ZYZ", [rng.uniform(0, 7), tilt, rng.uniform(0, 7)]
+        )
         xy = project(lab_from_body.inv(), leds.place[:, :3], lever, camera)
         seen.append(np.sum(np.all((xy > -0.5) & (xy < [1599.5, 1199.5]), axis=1)))
     share = np.mean(seen) / len(leds)
@@ -203,7 +205,9 @@ def test_the_afit_field_sees_eight_of_a_thousand(
     "layout", [*SPREADS, BOARDS, SKY | {"count": 40}], ids=lambda part: part["kind"]
 )
 def test_the_hardware_seed_determines_the_dome(layout: dict) -> None:
-    first, again, other = (lit(layout | {"hardware_seed": s}, scatter=0.08) for s in (5, 5, 6))
+    first, again, other = (
+        lit(layout | {"hardware_seed": s}, scatter=0.08) for s in (5, 5, 6)
+    )
     for name in set(Sources.__slots__) - {"motion", "chromatic"}:
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
     assert not np.isin(other.strength, first.strength).any()
@@ -268,7 +272,9 @@ def test_listed_boards_have_their_positions_leds_and_levels() -> None:
     np.testing.assert_allclose(unit(leds.place[[0, 3], :3]), ray, rtol=0, atol=1e-15)
     apart_m = np.linalg.norm(leds.place[[1, 2], :3] - leds.place[0, :3], axis=1)
     np.testing.assert_allclose(apart_m, 0.008 * np.sqrt(2), rtol=0, atol=1e-15)
-    np.testing.assert_allclose(leds.normal[:3], np.tile(leds.normal[0], (3, 1)), rtol=0, atol=0)
+    np.testing.assert_allclose(
+        leds.normal[:3], np.tile(leds.normal[0], (3, 1)), rtol=0, atol=0
+    )
 
 
 def test_a_listed_board_turns_about_its_normal() -> None:
@@ -339,7 +345,9 @@ def test_glue_tilts_boards_evenly_up_to_its_limit_and_keeps_them_flat() -> None:
     sideways = np.linalg.norm((middle.normal - cosine[:, None] * straight).mean(axis=0))
     assert sideways < 4 * np.sin(np.radians(5)) / np.sqrt(n)
     corner = leds.place[np.argsort(leds.id)].reshape(n, 9, 4)[:, :, :3]
-    off = np.einsum("bhj,bj->bh", corner - corner[:, 4:5], middle.normal[np.argsort(middle.id)])
+    off = np.einsum(
+        "bhj,bj->bh", corner - corner[:, 4:5], middle.normal[np.argsort(middle.id)]
+    )
     np.testing.assert_allclose(off, 0, rtol=0, atol=1e-14)
     np.testing.assert_allclose(
         np.linalg.norm(corner[:, 8] - corner[:, 0], axis=1),
@@ -401,7 +409,9 @@ def test_light_at_the_nominal_position_follows_pogson_s_law(drive: str) -> None:
 
 
 def test_no_star_is_shown_brighter_than_the_limit() -> None:
-    leds = lit(SKY | {"limit_mag": 4.5, "camera": ["0 m", "0 m", "0 m"], "brightest_mag": 2.0})
+    leds = lit(
+        SKY | {"limit_mag": 4.5, "camera": ["0 m", "0 m", "0 m"], "brightest_mag": 2.0}
+    )
     assert np.sum(leds.magnitude < 2) >= 5  # Orion
     expected = 10 ** (-0.4 * (np.maximum(leds.magnitude, 2.0) - 2.0))
     np.testing.assert_allclose(leds.on_s / leds.period_s, expected, rtol=1e-12, atol=0)
@@ -437,7 +447,8 @@ def test_a_millimeter_off_the_nominal_position_causes_the_apl_dome_s_error() -> 
 
 def test_listed_directions_are_put_on_the_surface_and_positions_kept() -> None:
     leds = lit(
-        {"kind": "listed", "directions_deg": [[0, 0], [90, 30]], "levels": [1.0, 0.3]}, MEASURED
+        {"kind": "listed", "directions_deg": [[0, 0], [90, 30]], "levels": [1.0, 0.3]},
+        MEASURED,
     )
     np.testing.assert_allclose(
         unit(leds.place[:, :3]), [[0, 0, 1], [0, 0.5, np.sqrt(0.75)]], rtol=0, atol=1e-15
@@ -493,7 +504,9 @@ def test_a_file_of_leds_equals_a_list_in_the_scene(tmp_path: Path) -> None:
     ],
     ids=["poisson_disk", "circles", "spiral", "boards", "sky"],
 )
-def test_the_exported_list_of_leds_is_read_back(tmp_path: Path, layout: dict[str, Any]) -> None:
+def test_the_exported_list_of_leds_is_read_back(
+    tmp_path: Path, layout: dict[str, Any]
+) -> None:
     path = tmp_path / "leds.csv"
     direct = {"drive": {"kind": "direct"}, "scatter": 0.0}
     config = {
@@ -553,7 +566,11 @@ def test_a_survey_s_file_is_a_list_of_leds(tmp_path: Path) -> None:
         "focal_sigma_px": 0.0,
         "center_px": zero,
     }
-    lens |= {"center_sigma_px": zero, "distortion": (0.0,) * 5, "distortion_sigma": (0.0,) * 5}
+    lens |= {
+        "center_sigma_px": zero,
+        "distortion": (0.0,) * 5,
+        "distortion_sigma": (0.0,) * 5,
+    }
     found = np.array([7, 3, 11, 4, 9])
     surveyed = DomeMap(found, place_m, np.full(5, 1e-4), np.zeros(3), 1e-4, **lens)
     write_dome_map(tmp_path / "leds.ecsv", surveyed)
@@ -656,7 +673,10 @@ def test_a_bad_file_of_leds_is_refused_in_one_line(
             "{kind: patch_boards, cap_deg: 30, pitch: 8 mm, boards: [{azimuth_deg: 0, tilt_deg: 31, leds: [1]}]}",
             "light.layout.boards.0: 31 deg from the zenith",
         ),
-        ("{kind: listed, cap_deg: 30}", "listed takes one of positions, directions_deg, file"),
+        (
+            "{kind: listed, cap_deg: 30}",
+            "listed takes one of positions, directions_deg, file",
+        ),
         (
             "{kind: listed, cap_deg: 30, directions_deg: [[0, 1]], levels: [1, 1]}",
             "1 LEDs, but 2 levels or magnitudes",
@@ -781,7 +801,9 @@ def test_sequential_leds_are_lit_one_after_another_for_their_share() -> None:
 def test_a_cycle_is_as_long_as_its_controller_has_leds(
     controller: str | int, sharing: int
 ) -> None:
-    boards = [{"azimuth_deg": a, "tilt_deg": 20, "leds": list(range(9))} for a in (0, 120, 240)]
+    boards = [
+        {"azimuth_deg": a, "tilt_deg": 20, "leds": list(range(9))} for a in (0, 120, 240)
+    ]
     layout = sequential(9) | {"boards": boards}
     leds = lit(layout, drive={"kind": "sequential", "slot": "2 ms", "controller": controller})
     last = 27 % sharing or sharing
@@ -843,7 +865,9 @@ def test_a_short_pulse_s_flicker_matches_the_reference(
     # count f to 1 / 4,000.
     share = level / 6
     error = (share / 3 + 1 / 4000) / (2 * part * (1 - part))
-    assert relative_sd(leds, 2, (cycles + part) * 6e-3) == pytest.approx(law, rel=error + 1e-3)
+    assert relative_sd(leds, 2, (cycles + part) * 6e-3) == pytest.approx(
+        law, rel=error + 1e-3
+    )
 
 
 @pytest.mark.parametrize(("count", "published"), [(5, 0.063), (2, 0.017), (9, 0.117)])

@@ -45,7 +45,9 @@ def irradiance(
     emitter: Emitter = LAMBERT,
 ) -> float:
     return float(
-        irradiance_e_s_m2(5e12 * ONE, emitter, cos_out * ONE, cos_in * ONE, distance_m * ONE)[0]
+        irradiance_e_s_m2(5e12 * ONE, emitter, cos_out * ONE, cos_in * ONE, distance_m * ONE)[
+            0
+        ]
     )
 
 
@@ -79,7 +81,9 @@ def test_reference_cosine_falloff_of_the_led_at_5_10_and_30_degrees() -> None:
     share = [
         irradiance(cos_out=float(np.cos(np.radians(angle)))) / 5e12 for angle in (5, 10, 30)
     ]
-    np.testing.assert_allclose(share, [0.9962, 0.9848, 0.866], rtol=0, atol=5e-5)  # as printed
+    np.testing.assert_allclose(
+        share, [0.9962, 0.9848, 0.866], rtol=0, atol=5e-5
+    )  # as printed
 
 
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 2.5, 20.0])

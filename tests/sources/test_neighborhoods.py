@@ -31,7 +31,9 @@ def test_no_two_neighborhoods_are_equal_under_rotation() -> None:
     assert set(level.tolist()) == {0, 1, 2}
     words = [(int(level[n]), surroundings(place, level, n, 6)) for n in range(150)]
     for n, (own, turns) in enumerate(words):
-        assert not any(own == other and turns[0] in others for other, others in words[n + 1 :])
+        assert not any(
+            own == other and turns[0] in others for other, others in words[n + 1 :]
+        )
 
 
 @pytest.mark.parametrize(

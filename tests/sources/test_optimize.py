@@ -10,14 +10,14 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
-from estimator.attitude.nearfield import rotation_only
+from estimator.attitude.rotation_fit import rotation_only
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Sources
 from skysim.scene import loader
 from skysim.scene.sections import layouts
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources import catalog, dome
-from skysim.sources.dome.layouts import fisher, optimize, spreads
+from skysim.sources.dome.layouts import fisher, optimize, placing, spreads
 from skysim.sources.dome.layouts.ambiguity import field_ambiguity
 from skysim.sources.photometry import Band, star_flux_e_s_m2
 
@@ -172,7 +172,9 @@ def test_an_optimized_layout_keeps_cap_surface_and_spacing(best: Sources) -> Non
 
 
 @pytest.mark.long
-def test_an_optimized_layout_depends_on_its_seed_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_optimized_layout_depends_on_its_seed_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     quick = replace(optimize.OPTIONS, score_attitudes=2000, fresh_attitudes=1000)
     monkeypatch.setattr(optimize, "OPTIONS", quick)
     few = WANTED | {"count": 20, "tilt_deg": 2, "rounds": 5}
@@ -236,7 +238,11 @@ def test_leds_that_are_off_by_more_than_the_tolerance_do_not_coincide() -> None:
     turned[4] += [0.0, 2e-3, 0.0]
     for coincidence_m, coincide in ((1e-4, 5), (3e-3, 6)):
         found = field_ambiguity(
-            np.concatenate([pattern, turned]), 0.3, np.radians(60), np.radians(6), coincidence_m
+            np.concatenate([pattern, turned]),
+            0.3,
+            np.radians(60),
+            np.radians(6),
+            coincidence_m,
         )
         assert found.fraction[0] == pytest.approx(coincide / 6, abs=1e-12)
 
@@ -323,9 +329,10 @@ def test_a_contracted_layout_covers_a_fraction_of_each_led_s_solid_angle() -> No
         spread("fibonacci", count, 30.0).place[:, :3] for count in (40_000, 50)
     )
     for fraction in (1.0, 0.5):
-        placed = optimize.contract(layout_m, sites_m, fraction)
+        placed = placing.contract(layout_m, sites_m, fraction)
         wanted, found = (
-            place / np.linalg.norm(place, axis=1, keepdims=True) for place in (layout_m, placed)
+            place / np.linalg.norm(place, axis=1, keepdims=True)
+            for place in (layout_m, placed)
         )
         np.testing.assert_allclose(
             1 - found[:, 2], fraction * (1 - wanted[:, 2]), rtol=0, atol=3e-3
@@ -337,8 +344,8 @@ def test_a_contracted_layout_covers_a_fraction_of_each_led_s_solid_angle() -> No
 
 def test_the_spacing_is_the_least_distance_of_two_leds() -> None:
     place_m = np.array([[0.0, 0, 1], [0.03, 0, 1], [0.03, 0.02, 1]])
-    assert optimize.spacing_ok(place_m, 0.0199)
-    assert not optimize.spacing_ok(place_m, 0.0201)
+    assert placing.spacing_ok(place_m, 0.0199)
+    assert not placing.spacing_ok(place_m, 0.0201)
 
 
 def test_field_and_lever_default_to_the_scene_s() -> None:

@@ -149,7 +149,9 @@ def test_an_interline_chip_collects_the_reference_s_rate() -> None:
     ("curve", "a0", "k3", "m"),
     [("interline", 0.01, -0.08, -0.28), ("thick_ccd", 0.19, -0.21, -0.55)],
 )
-def test_red_stars_look_brighter_to_silicon(curve: str, a0: float, k3: float, m: float) -> None:
+def test_red_stars_look_brighter_to_silicon(
+    curve: str, a0: float, k3: float, m: float
+) -> None:
     """Reference §2, instrumental offset against G2.
 
     The reference names neither its curves nor the temperatures; with ours the numbers come within .03 mag (A0),
@@ -260,7 +262,9 @@ def test_a_whole_catalog_is_converted_in_little_time() -> None:
 def test_sky_radiance_is_that_of_one_star_per_square_arcsecond() -> None:
     # 4 pi sr are 5.3464e11 square arcseconds.
     whole_sky = 4 * np.pi * sky_radiance_e_s_m2_sr(21.5, ALL)
-    assert whole_sky == pytest.approx(5.34638e11 * star_flux_e_s_m2(21.5, *SUN, ALL), rel=1e-5)
+    assert whole_sky == pytest.approx(
+        5.34638e11 * star_flux_e_s_m2(21.5, *SUN, ALL), rel=1e-5
+    )
 
 
 def test_one_watt_of_555_nm_is_683_lumens() -> None:
@@ -291,7 +295,10 @@ def test_an_led_gives_the_lens_the_reference_s_light() -> None:
     so that with a flat QE the two differ by less than half a per cent.
     """
     electrons_ms = (
-        led_strength_e_s_sr(0.6, "white", Band.from_efficiency(0.30)) * pupil_sr() * 0.85 * 1e-3
+        led_strength_e_s_sr(0.6, "white", Band.from_efficiency(0.30))
+        * pupil_sr()
+        * 0.85
+        * 1e-3
     )
     assert electrons_ms == pytest.approx(3.1e7, rel=0.02)
     green = 0.6 / 300 / 3.57918e-19 * pupil_sr() * 0.85 * 0.30 * 1e-3
@@ -304,7 +311,9 @@ def test_white_light_has_the_reference_s_color_and_efficacy() -> None:
     lm_w = 683 * np.sum(power * np.interp(nm, eye_nm, eye)) / np.sum(power)
     assert lm_w == pytest.approx(300, rel=0.03)  # reference §2, from memory there
     # A phosphor LED: a narrow peak in the blue, a broad one near 550 nm, a valley near 480 nm between them.
-    blue, valley, yellow = (np.interp(wavelength, nm, power) for wavelength in (452, 490, 550))
+    blue, valley, yellow = (
+        np.interp(wavelength, nm, power) for wavelength in (452, 490, 550)
+    )
     assert blue > yellow > 1.5 * valley > 0
 
 
@@ -412,9 +421,13 @@ def test_a_wrong_name_is_answered_with_the_right_ones() -> None:
 def test_a_user_s_curve_is_read_again_when_its_file_changes(tmp_path: Path) -> None:
     path = tmp_path / "mine.csv"
     path.write_text("# measured\nwavelength_nm,qe\n500,0.2\n600,0.4\n")
-    assert Band.from_efficiency(str(path)).response_at(550e-9) == pytest.approx(0.3, rel=1e-12)
+    assert Band.from_efficiency(str(path)).response_at(550e-9) == pytest.approx(
+        0.3, rel=1e-12
+    )
     path.write_text("wavelength_nm,qe\n500,0.5\n600,0.5\n700,0.5\n")
-    assert Band.from_efficiency(str(path)).response_at(550e-9) == pytest.approx(0.5, rel=1e-12)
+    assert Band.from_efficiency(str(path)).response_at(550e-9) == pytest.approx(
+        0.5, rel=1e-12
+    )
 
 
 @pytest.mark.parametrize(
@@ -545,7 +558,8 @@ def test_a_lens_that_blocks_all_light_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "message"), [("gone.csv", "no file 'gone.csv'; allowed: "), ("1.5", "less than")]
+    ("value", "message"),
+    [("gone.csv", "no file 'gone.csv'; allowed: "), ("1.5", "less than")],
 )
 def test_a_transmission_is_a_number_or_a_file(value: str, message: str) -> None:
     with pytest.raises(InputError, match=f"^camera.transmission: .*{message}"):
@@ -556,7 +570,9 @@ def test_a_measured_spectrum_matches_its_colored_or_white_led(tmp_path: Path) ->
     """A table of a Gaussian is a colored LED, in any unit of power; that of the white LED is the white LED."""
     band = Band.from_efficiency("cmos")
     path = tmp_path / "led.csv"
-    rows = [f"{nm},{7.3 * math.exp(-0.5 * ((nm - 520) / 15) ** 2)!r}" for nm in range(430, 611)]
+    rows = [
+        f"{nm},{7.3 * math.exp(-0.5 * ((nm - 520) / 15) ** 2)!r}" for nm in range(430, 611)
+    ]
     path.write_text("\n".join(["wavelength_nm,power", *rows]))
     gaussian = 520e-9, band, 15e-9 * math.sqrt(8 * math.log(2))
     assert led_strength_e_s_sr(0.3, str(path), band) == pytest.approx(
@@ -571,7 +587,9 @@ def test_a_measured_spectrum_matches_its_colored_or_white_led(tmp_path: Path) ->
 def test_a_spectrum_with_unbounded_power_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "bad.csv"
     path.write_text("wavelength_nm,power\n400,1\n500,inf\n")
-    with pytest.raises(InputError, match=r"not a response curve; allowed: .* within 0 and inf"):
+    with pytest.raises(
+        InputError, match=r"not a response curve; allowed: .* within 0 and inf"
+    ):
         led_strength_e_s_sr(0.3, str(path), ALL)
 
 
@@ -601,7 +619,9 @@ def test_an_invisible_spectrum_has_no_candelas(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_spectrum_is_white_a_file_or_a_wavelength(keys: dict[str, str], message: str) -> None:
+def test_a_spectrum_is_white_a_file_or_a_wavelength(
+    keys: dict[str, str], message: str
+) -> None:
     with pytest.raises(InputError, match=re.escape(message)):
         loader.load("afit_simsat", {f"light.led.{key}": value for key, value in keys.items()})
 
@@ -662,6 +682,8 @@ def test_colors_of_leds_scatter_as_declared() -> None:
     for n in range(0, 2000, 400):
         one = led_strength_e_s_sr(10e-3, 630e-9 + 2e-9 * normal[n], band, 18e-9)
         assert factors[n] == pytest.approx(float(one) / nominal, rel=1e-5)
-    steps = [float(led_strength_e_s_sr(10e-3, 630e-9 + d, band, 18e-9)) for d in (-1e-9, 1e-9)]
+    steps = [
+        float(led_strength_e_s_sr(10e-3, 630e-9 + d, band, 18e-9)) for d in (-1e-9, 1e-9)
+    ]
     slope = math.log(steps[1] / steps[0]) / 2  # a nanometer
     assert np.log(factors).std() == pytest.approx(abs(2 * slope), rel=0.08)

@@ -26,7 +26,8 @@ def test_a_site_is_free_if_only_the_moving_led_is_near() -> None:
     for without in (0, 7):
         others = np.delete(near, without, axis=1).any(axis=1)
         room = [
-            OPTIMIZE.has_room(site, without, chosen, sites_m, spacing_m) for site in range(300)
+            OPTIMIZE.has_room(site, without, chosen, sites_m, spacing_m)
+            for site in range(300)
         ]
         np.testing.assert_array_equal(room, ~others)
         found += sum(room)

@@ -20,7 +20,11 @@ from skysim.sources.dome.led import full_strength_e_s_sr
 from skysim.sources.photometry import Band
 
 BAND = Band.from_efficiency(0.5)
-OVAL = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38.88 in", "38.88 in", "28.60 in"]}
+OVAL = {
+    "kind": "ellipsoid",
+    "apex": "48 in",
+    "semi_axes": ["38.88 in", "38.88 in", "28.60 in"],
+}
 PLACE_M = np.array([0.6, 0.1, 0.2])
 AIM_M = np.array([0.1, 0.0, 1.15])
 LED = {"intensity": "0.2 mcd", "disk_diameter": "1 um", "drive": {"kind": "direct"}}
@@ -233,7 +237,10 @@ def test_black_has_the_light_of_all_pixels_over_the_contrast() -> None:
 @pytest.mark.parametrize(
     ("more", "says"),
     [
-        ({"position": ["2 m", "0 m", "0 m"]}, "light.layout.position: .* outside of the dome"),
+        (
+            {"position": ["2 m", "0 m", "0 m"]},
+            "light.layout.position: .* outside of the dome",
+        ),
         ({"focal_length": "40 mm"}, "stars are outside of the projector's picture"),
         ({"aim": ["1 m", "0.1 m", "0.2 m"]}, "straight along x"),
         ({"distortion": -0.9}, "folds the picture's corners back"),

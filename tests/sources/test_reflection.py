@@ -42,7 +42,9 @@ def leds(place_m: Floats, normal: Floats, on: float = 1.0) -> Sources:
 
 def sphere(rim_deg: float = 180.0) -> Surface:
     rim = Rim(np.array([0.0, 0.0, -HEIGHT_M]), half_rad=math.radians(rim_deg))
-    return Ellipsoid(np.array([0.0, 0.0, HEIGHT_M]), semi_axes_m=np.full(3, RADIUS_M), rim=rim)
+    return Ellipsoid(
+        np.array([0.0, 0.0, HEIGHT_M]), semi_axes_m=np.full(3, RADIUS_M), rim=rim
+    )
 
 
 def on_wall(wall: Surface, count: int) -> tuple[Floats, Floats]:
@@ -63,7 +65,9 @@ def test_an_integrating_sphere_has_its_textbook_irradiance(share: float) -> None
     points, normals = on_wall(wall, 7)
     diffuse = glow(wall, leds(*on_wall(wall, 40), on=0.25), diffuse=share)
     expected = 0.25 * 40 * math.pi / (4 * math.pi * RADIUS_M**2) / (1 - share)
-    np.testing.assert_allclose(diffuse.irradiance_e_s_m2(points, normals), expected, rtol=1e-4)
+    np.testing.assert_allclose(
+        diffuse.irradiance_e_s_m2(points, normals), expected, rtol=1e-4
+    )
 
 
 @pytest.mark.parametrize("rim_deg", [50.0, 90.0, 120.0])
@@ -82,7 +86,9 @@ def test_diffuse_light_in_a_spherical_cap_matches_theory(rim_deg: float) -> None
     diffuse = glow(wall, leds(*placed), diffuse=share)
     points, normals = on_wall(wall, 9)
     expected = len(placed[0]) * math.pi / (4 * math.pi * RADIUS_M**2) / (1 - share * fraction)
-    np.testing.assert_allclose(diffuse.irradiance_e_s_m2(points, normals), expected, rtol=1e-3)
+    np.testing.assert_allclose(
+        diffuse.irradiance_e_s_m2(points, normals), expected, rtol=1e-3
+    )
 
 
 def test_light_is_conserved_in_an_ellipsoid() -> None:
@@ -120,7 +126,8 @@ def test_diffuse_light_of_a_floor_under_one_led_matches_a_hand_calculation() -> 
     radius = np.linspace(0, 3, 60_001)
     on_floor = 2.5**2 / (radius**2 + 2.5**2) ** 2
     back = np.trapezoid(
-        0.5 * on_floor * 2.5**2 / (radius**2 + 2.5**2) ** 2 / np.pi * 2 * np.pi * radius, radius
+        0.5 * on_floor * 2.5**2 / (radius**2 + 2.5**2) ** 2 / np.pi * 2 * np.pi * radius,
+        radius,
     )
     at_led = diffuse.irradiance_e_s_m2(
         np.array([[1e-9, 0.0, 1.5]]), np.array([[0.0, 0.0, -1.0]])
@@ -215,7 +222,9 @@ def miss(name: str, toward: Floats, led_m: Floats) -> Floats:
     hit, along = bounce(name, CAMERA_M, toward)
     to_led = led_m - hit
     ahead = np.sum(to_led * along, axis=1)
-    return np.where(ahead > 0, np.linalg.norm(to_led - ahead[:, None] * along, axis=1), np.inf)
+    return np.where(
+        ahead > 0, np.linalg.norm(to_led - ahead[:, None] * along, axis=1), np.inf
+    )
 
 
 def brute_force(name: str, led_m: Floats) -> Floats:
@@ -269,7 +278,11 @@ def test_reflected_images_are_as_bright_as_traced_rays(name: str) -> None:
     wall, led_m = QUADRICS[name]
     normal = np.array([0.2, 0.1, 1.0]) / np.linalg.norm([0.2, 0.1, 1.0])
     images = mirrored(
-        ReflectionConfig(specular=0.04), wall, leds(led_m[None], normal[None]), CAMERA_M, grid()
+        ReflectionConfig(specular=0.04),
+        wall,
+        leds(led_m[None], normal[None]),
+        CAMERA_M,
+        grid(),
     )
     rng = np.random.default_rng(8)
     for n in range(len(images)):

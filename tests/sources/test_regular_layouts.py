@@ -141,7 +141,9 @@ def test_a_geodesic_layout_rotates_about_the_zenith() -> None:
     np.testing.assert_allclose(
         turned, plain @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]), rtol=0, atol=1e-14
     )
-    assert angles(plain[1:6])[1] == pytest.approx(np.radians([-144, -72, 0, 72, 144]), abs=1e-9)
+    assert angles(plain[1:6])[1] == pytest.approx(
+        np.radians([-144, -72, 0, 72, 144]), abs=1e-9
+    )
 
 
 @pytest.mark.parametrize("kind", ["geodesic", "string"])
@@ -227,11 +229,15 @@ def test_circles_on_a_sphere_have_their_spacing_and_circumference() -> None:
     np.testing.assert_allclose(
         1.2 * rings, 0.03 + 0.06 * np.arange(len(rings)), rtol=0, atol=1e-6
     )
-    np.testing.assert_array_equal(counts, (2 * np.pi * 1.2 * np.sin(rings) / 0.01).astype(int))
+    np.testing.assert_array_equal(
+        counts, (2 * np.pi * 1.2 * np.sin(rings) / 0.01).astype(int)
+    )
 
 
 @pytest.mark.parametrize("on", SURFACES.values(), ids=SURFACES)
-def test_strips_follow_meridians_with_leds_a_pitch_apart_to_the_rim(on: dict[str, Any]) -> None:
+def test_strips_follow_meridians_with_leds_a_pitch_apart_to_the_rim(
+    on: dict[str, Any],
+) -> None:
     place_m = lit(
         {"kind": "string", "winding": "meridian", "pitch": "33 mm", "spacing": "10 cm"}, on
     ).place[:, :3]
@@ -254,7 +260,9 @@ def test_strips_are_between_half_a_spacing_and_a_spacing_apart() -> None:
     """Under a sphere about the bearing, below where the first four begin."""
     layout = {"kind": "string", "winding": "meridian", "pitch": "5 mm", "spacing": "8 cm"}
     tilt, azimuth = angles(lit(layout).place[:, :3])
-    assert len(np.unique(np.round(azimuth, 6))) == 64  # 2 pi 1.2 m sin 40 deg over 8 cm is 60.6
+    assert (
+        len(np.unique(np.round(azimuth, 6))) == 64
+    )  # 2 pi 1.2 m sin 40 deg over 8 cm is 60.6
     for ring in np.radians([3.0, 8.0, 15.0, 25.0, 39.5]):
         beside = np.unique(np.round(azimuth[np.abs(tilt - ring) < 0.0025 / 1.2], 6))
         apart_m = 2 * np.pi * 1.2 * np.sin(ring) / len(beside)
@@ -279,7 +287,9 @@ def test_tape_led_positions_have_pitch_and_glue_errors() -> None:
         if b - a > 20
     ]
     assert len(whole) > 200
-    stretch = [(np.diff(angles(made[one])[0]) / np.diff(tilt[one])).mean() - 1 for one in whole]
+    stretch = [
+        (np.diff(angles(made[one])[0]) / np.diff(tilt[one])).mean() - 1 for one in whole
+    ]
     assert np.std(stretch) == pytest.approx(0.01, rel=0.15)
     same = np.concatenate([sideways_mm[one][:-5] for one in whole])
     later = np.concatenate([sideways_mm[one][5:] for one in whole])
@@ -350,7 +360,8 @@ def test_controllers_along_a_tape_light_their_leds_in_turn() -> None:
     """A controller for every 50 LEDs of the tape: each has its slot in the order along the tape."""
     drive = {"kind": "sequential", "controller": 50, "slot": "1 ms"}
     leds = lit(
-        {"kind": "string", "winding": "spiral", "pitch": "4 cm", "spacing": "8 cm"}, drive=drive
+        {"kind": "string", "winding": "spiral", "pitch": "4 cm", "spacing": "8 cm"},
+        drive=drive,
     )
     whole = len(leds) // 50
     assert whole >= 4

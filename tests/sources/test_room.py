@@ -44,7 +44,9 @@ def check(room: dict[str, Any], on: dict[str, Any] = CAP, cap_deg: float = 40) -
 
 def part_m(segments: int, on: dict[str, Any] = CAP, **room: Any) -> np.ndarray:
     """Sides of the largest part, ascending, in the box that is thinnest."""
-    config = RoomConfig.model_validate(room | {"door": ["1 mm", "1 km"], "segments": segments})
+    config = RoomConfig.model_validate(
+        room | {"door": ["1 mm", "1 km"], "segments": segments}
+    )
     made = surface.build_surface(light.SurfaceConfig.model_validate(on))
     return rooms.largest_part_m(config, LETTER_BOX, made, 40.0, segments)[0]
 
@@ -105,7 +107,9 @@ def test_a_gore_is_as_wide_as_its_chord_at_the_rim(segments: int) -> None:
 
 def test_a_panel_has_its_declared_thickness_width_and_height() -> None:
     panel = {"kind": "flat", "apex": "1.2 m", "width": "2.4 m", "height": "1.3 m"}
-    np.testing.assert_allclose(part_m(1, panel, thickness="6 cm"), [0.06, 1.3, 2.4], rtol=1e-9)
+    np.testing.assert_allclose(
+        part_m(1, panel, thickness="6 cm"), [0.06, 1.3, 2.4], rtol=1e-9
+    )
 
 
 def test_a_sphere_without_a_rim_ends_where_its_leds_end() -> None:
@@ -125,7 +129,9 @@ def test_a_dome_down_to_below_the_bearing_has_all_of_its_shell() -> None:
 @pytest.mark.slow
 def test_the_check_states_how_a_dome_fits_its_room() -> None:
     """A cap of R = 1.5 m from 0.9 m up, on a bearing 1 m above the floor, in quarters through a door."""
-    room = "{height: 2.9 m, bearing_height: 1 m, width: 4 m, door: [0.9 m, 2.1 m], segments: 4}"
+    room = (
+        "{height: 2.9 m, bearing_height: 1 m, width: 4 m, door: [0.9 m, 2.1 m], segments: 4}"
+    )
     surface_text = "{kind: sphere, apex: 1.5 m, radius: 1.5 m, rim_height: 0.9 m}"
     layout = "{kind: fibonacci, count: 300, cap_deg: 40}"
     changes = {"light.surface": surface_text, "light.layout": layout, "light.room": room}

@@ -87,14 +87,16 @@ def tle(
 @pytest.fixture
 def low_orbits(tmp_path: Path) -> orbit_elements.MeanElements:
     rng = np.random.default_rng(4)
-    orbits = (tle(n, *rng.uniform((0, 0, 0, 13), (100, 360, 360, 15.5))) for n in range(1, 41))
+    orbits = (
+        tle(n, *rng.uniform((0, 0, 0, 13), (100, 360, 360, 15.5))) for n in range(1, 41)
+    )
     return orbit_elements.read_elements(written(tmp_path, "".join(orbits)))
 
 
 def test_sgp4_gives_the_published_states(tmp_path: Path) -> None:
-    record = orbit_elements.read_elements(written(tmp_path, f"VANGUARD 1\n{VANGUARD}")).records[
-        0
-    ]
+    record = orbit_elements.read_elements(
+        written(tmp_path, f"VANGUARD 1\n{VANGUARD}")
+    ).records[0]
     for minutes, state in PUBLISHED.items():
         error, place, velocity = record.sgp4_tsince(minutes)
         assert error == 0
@@ -155,7 +157,9 @@ def test_omm_and_tle_give_the_same_states(kind: str, tmp_path: Path) -> None:
         ),
     ],
 )
-def test_bad_elements_are_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:
+def test_bad_elements_are_refused_in_one_line(
+    text: str, message: str, tmp_path: Path
+) -> None:
     with pytest.raises(InputError) as refused:
         orbit_elements.read_elements(written(tmp_path, text))
     assert message in str(refused.value)
@@ -226,7 +230,9 @@ def test_satellites_behind_the_earth_s_ellipsoid_are_hidden() -> None:
     assert camera_orbit.hidden_by_earth(ground, horizon).tolist() == [False, True]
 
 
-def test_a_path_matches_positions_at_its_times(low_orbits: orbit_elements.MeanElements) -> None:
+def test_a_path_matches_positions_at_its_times(
+    low_orbits: orbit_elements.MeanElements,
+) -> None:
     """Place and motion at mid-exposure give the apparent place at another time of a long exposure."""
 
     def observer_at(after_s: float) -> GcrsState:
@@ -272,7 +278,9 @@ def test_random_satellites_have_their_density_rates_and_magnitudes() -> None:
         per_field=30.0, rate_deg_s=(0.1, 2.0), v_mag=(3.0, 5.0), seed=8
     )
     view = ExposureView(np.array([0.6, 0.0, 0.8]), 0.1, 0.0, 1.0)
-    drawn = [list(satellites.random_satellites(config, view, 1, index)) for index in range(60)]
+    drawn = [
+        list(satellites.random_satellites(config, view, 1, index)) for index in range(60)
+    ]
     lights = [light for frame in drawn for light in frame]
     inside = sum(light.place @ view.boresight > np.cos(view.field_rad) for light in lights)
     assert inside / 60 == pytest.approx(30, abs=4 * np.sqrt(30 / 60))
@@ -282,7 +290,9 @@ def test_random_satellites_have_their_density_rates_and_magnitudes() -> None:
     assert rates.max() <= np.log(2.0) + 1e-9
     magnitudes = np.array([light.truth.v_mag for light in lights])
     assert magnitudes.mean() == pytest.approx(4, abs=0.05)
-    headings = np.array([light.motion[0] / np.linalg.norm(light.motion[0]) for light in lights])
+    headings = np.array(
+        [light.motion[0] / np.linalg.norm(light.motion[0]) for light in lights]
+    )
     assert np.abs(headings.mean(axis=0)).max() < 0.05
     other_run = list(satellites.random_satellites(config, view, 2, 3))
     assert [light.truth for light in other_run] != [light.truth for light in drawn[3]]

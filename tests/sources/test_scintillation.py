@@ -13,8 +13,12 @@ RED_M = 650e-9
 ZENITH = np.ones(1)
 
 
-def one(air_mass: float, aperture_m: float, exposure_s: float, height_m: float = 0.0) -> float:
-    return float(air.variance(np.array([air_mass]), aperture_m, exposure_s, height_m, RED_M)[0])
+def one(
+    air_mass: float, aperture_m: float, exposure_s: float, height_m: float = 0.0
+) -> float:
+    return float(
+        air.variance(np.array([air_mass]), aperture_m, exposure_s, height_m, RED_M)[0]
+    )
 
 
 def profile() -> tuple[Floats, Floats, Floats]:
@@ -75,7 +79,9 @@ def test_intermediate_apertures_match_the_integral_over_all_frequencies(
     pupil = (2 * special.j1(np.pi * aperture_m * f) / (np.pi * aperture_m * f)) ** 2
     for layer in range(100):
         mean_h = np.sum(h[layer] * strength[layer]) / np.sum(strength[layer])
-        moved = np.sinc(np.outer(f, np.cos(around)) * wind_m_s[layer].mean() * exposure_s) ** 2
+        moved = (
+            np.sinc(np.outer(f, np.cos(around)) * wind_m_s[layer].mean() * exposure_s) ** 2
+        )
         diffracted = np.sin(np.pi * RED_M * mean_h * air_mass * f**2) ** 2
         density = (
             1.534

@@ -67,16 +67,17 @@ def test_the_moon_s_distance_and_phase_match_skyfield() -> None:
     toward_sun = of_date_axes @ moon.toward_sun
     east = np.cross([0.0, 0.0, 1.0], direction)
     north = np.cross(direction, east)
-    assert np.degrees(np.arctan2(toward_sun @ east, toward_sun @ north)) % 360 == pytest.approx(
-        285.044, abs=0.01
-    )
+    assert np.degrees(
+        np.arctan2(toward_sun @ east, toward_sun @ north)
+    ) % 360 == pytest.approx(285.044, abs=0.01)
 
 
 def test_the_earth_s_velocity_matches_erfa() -> None:
     """Positions of the ephemeris, differenced over a day, against ERFA's own theory; and the Sun against its place."""
     for jd in np.linspace(2441400.5, 2487400.5, 15):
         one, other = (
-            ephemeris.load_ephemeris().position_km("earth", jd + half) for half in (0.05, -0.05)
+            ephemeris.load_ephemeris().position_km("earth", jd + half)
+            for half in (0.05, -0.05)
         )
         heliocentric, barycentric = erfa.epv00(jd, 0.0)
         km_s = (one - other) / (0.1 * 86400)
@@ -202,7 +203,9 @@ def test_open_rings_make_saturn_brighter() -> None:
         body_discs.magnitude("saturn", lit("saturn", 1.0, 1.0, 0.0, b), J2000_JD)
         for b in (0.0, 26.7)
     ]
-    assert unit == pytest.approx([-8.914, -8.914 - 2.203 * np.sin(np.radians(26.7))], abs=1e-6)
+    assert unit == pytest.approx(
+        [-8.914, -8.914 - 2.203 * np.sin(np.radians(26.7))], abs=1e-6
+    )
     at = lit("saturn", 1.0, 1.0, 0.0, 5.0)
     from_below = ephemeris.lit_place(-at.direction, at.from_sun_km, -at.to_body_km)
     assert body_discs.saturn(0.0, from_below, J2000_JD) == pytest.approx(-8.914)

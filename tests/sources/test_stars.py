@@ -73,7 +73,9 @@ def test_apparent_places_match_skycoord(stars: Catalog, date: datetime.datetime)
 
 def test_annual_aberration_is_an_ellipse_of_20_5_arcsec() -> None:
     # The constant of aberration is 20.4955"; perihelion and the Sun's own motion add or take 0.35" and 0.01".
-    pole = star(ra_rad=np.radians(270.0), dec_rad=np.radians(66.56))  # the pole of the ecliptic
+    pole = star(
+        ra_rad=np.radians(270.0), dec_rad=np.radians(66.56)
+    )  # the pole of the ecliptic
     days = [datetime.datetime(2021, 1, 1) + datetime.timedelta(days=5 * n) for n in range(73)]
     straight = np.array(
         [np.cos(np.radians(66.56)) * np.array([0, -1, 0]) + [0, 0, np.sin(np.radians(66.56))]]
@@ -102,7 +104,9 @@ def test_aberration_shifts_a_star_toward_the_direction_of_motion() -> None:
 def test_alpha_centauri_s_parallax_is_three_quarters_of_an_arcsecond() -> None:
     # The nearest star's parallax: its place with and without one differs by 0.75" at most in a year.
     place = {"ra_rad": np.radians(219.9), "dec_rad": np.radians(-60.83)}
-    days = [datetime.datetime(2020, 1, 1) + datetime.timedelta(days=10 * n) for n in range(37)]
+    days = [
+        datetime.datetime(2020, 1, 1) + datetime.timedelta(days=10 * n) for n in range(37)
+    ]
     shift = [
         separation_rad(
             star_sources.apparent(star(**place, parallax_rad=0.75 * ARCSEC_RAD), day),
@@ -144,7 +148,9 @@ def test_the_sun_deflects_stars_outward() -> None:
 def test_pixels_at_the_vernal_equinox_match_a_hand_calculation() -> None:
     # Looking along X with north (Z) up, east (Y) is left: x = -Y, y = -Z, z = X.
     matrix = star_sources.cam_from_icrs(0.0, 0.0, 0.0).as_matrix()
-    np.testing.assert_allclose(matrix, [[0, -1, 0], [0, 0, -1], [1, 0, 0]], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        matrix, [[0, -1, 0], [0, 0, -1], [1, 0, 0]], rtol=0, atol=1e-15
+    )
 
 
 def test_pixels_of_a_rolled_camera_match_a_hand_calculation() -> None:
@@ -188,7 +194,9 @@ def test_roll_is_the_position_angle_of_up(roll_deg: float) -> None:
 
 def test_sources_are_lit_points_at_infinity_in_lab_axes(stars: Catalog) -> None:
     lab_from_icrs = Rotation.from_euler("zyx", [0.3, -1.1, 2.0])
-    seen = star_sources.sources(stars, DATES[1], 2.0, lab_from_icrs, Band.from_efficiency(0.5))
+    seen = star_sources.sources(
+        stars, DATES[1], 2.0, lab_from_icrs, Band.from_efficiency(0.5)
+    )
     kept = stars.take(stars.v_mag <= 2.0)
     assert len(seen) == len(kept) > 40
     np.testing.assert_array_equal(seen.id, kept.hip)
@@ -216,7 +224,9 @@ def test_sources_are_as_bright_as_their_magnitude_and_color(stars: Catalog) -> N
         for hip, strength, v_mag in zip(seen.id, seen.strength, seen.magnitude, strict=True)
     }
     assert relative[71683] == pytest.approx(1, abs=0.03)  # alpha Centauri A, G2
-    assert relative[32349] < 0.9  # Sirius: white, so fewer photons in the red beside the same V
+    assert (
+        relative[32349] < 0.9
+    )  # Sirius: white, so fewer photons in the red beside the same V
     assert relative[27989] > 1.5  # Betelgeuse
 
 

@@ -29,7 +29,13 @@ PROLATE = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["44 in", "44 in",
 TRIAXIAL = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38 in", "45 in", "31 in"]}
 FLAT = {"kind": "flat", "apex": "48 in"}
 VAULT = {"kind": "cylinder", "axis": "x", "apex": "48 in", "radius": "52 in"}
-DRUM = {"kind": "cylinder", "axis": "z", "apex": "30 in", "radius": "48 in", "length": "50 in"}
+DRUM = {
+    "kind": "cylinder",
+    "axis": "z",
+    "apex": "30 in",
+    "radius": "48 in",
+    "length": "50 in",
+}
 WALL = {
     "thickness_apex": "0.2036 in",
     "thickness_base": "0.25 in",
@@ -62,7 +68,9 @@ def rays_up(count: int, seed: int, most_deg: float = 35.0) -> np.ndarray:
     azimuth = rng.uniform(0, 2 * np.pi, count)
     length = rng.uniform(0.3, 3, count)
     out = np.sqrt(1 - up**2)
-    return np.column_stack([out * np.cos(azimuth), out * np.sin(azimuth), up]) * length[:, None]
+    return (
+        np.column_stack([out * np.cos(azimuth), out * np.sin(azimuth), up]) * length[:, None]
+    )
 
 
 def rays_for(name: str, count: int, seed: int) -> np.ndarray:
@@ -127,7 +135,9 @@ def off_equation(name: str, points_m: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize("origin_in", [(0, 0, 0), (2, -1, 15)])
-def test_points_lie_on_their_rays_and_satisfy_the_equation(name: str, origin_in: tuple) -> None:
+def test_points_lie_on_their_rays_and_satisfy_the_equation(
+    name: str, origin_in: tuple
+) -> None:
     origin = INCH_M * np.array(origin_in, float)
     rays = rays_for(name, 300, 1)
     met = made(KINDS[name]).meet(origin, rays)
@@ -185,7 +195,9 @@ def test_rays_that_never_leave_the_surface_are_nan(name: str, cloud: dict) -> No
     """From far outside, past it and away from it; and along a cylinder's axis."""
     shape = made(cloud if name == "cloud" else KINDS[name])
     aside = np.array([0.0, 0.0, 1.0]) if name == "vault" else np.array([0.0, 1.0, 0.0])
-    assert np.isnan(shape.meet(10 * aside, np.array([[1.0, 0.0, 0.0], aside, 0 * aside]))).all()
+    assert np.isnan(
+        shape.meet(10 * aside, np.array([[1.0, 0.0, 0.0], aside, 0 * aside]))
+    ).all()
     if name in ("vault", "drum"):
         axis = np.eye(3)[[0 if name == "vault" else 2]]
         assert np.isnan(shape.meet(np.zeros(3), np.vstack([axis, -axis]))).all()
@@ -517,7 +529,10 @@ def test_a_scene_flies_under_a_surveyed_dome(cloud: dict) -> None:
 
 
 DRAWN: dict[str, dict[str, Any]] = {name: KINDS[name] | MOVED for name in KINDS}
-DRAWN |= {"rimmed": MEASURED | {"rim_height": "36.66 in"}, "narrow": MEASURED | {"rim_deg": 20}}
+DRAWN |= {
+    "rimmed": MEASURED | {"rim_height": "36.66 in"},
+    "narrow": MEASURED | {"rim_deg": 20},
+}
 DRAWN |= {
     "panel": FLAT | MOVED | {"width": "30 in", "height": "20 in"},
     "short vault": VAULT | {"length": "1 m"},

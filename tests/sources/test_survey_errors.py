@@ -102,7 +102,9 @@ def test_a_raised_sphere_is_a_larger_sphere_with_its_leds_on_it() -> None:
     directions = np.random.default_rng(1).normal(size=(50, 3)) * [0.3, 0.3, 0.0] + [0, 0, 1]
     place_m = inside.meet(np.zeros(3), directions)
     assumed_m = survey_errors.assumed_leds_m(inside, place_m, SurveyErrorsConfig(seed=9))
-    center_m, semi_axes_m = survey_errors.assumed_ellipsoid(inside, SurveyErrorsConfig(seed=9))
+    center_m, semi_axes_m = survey_errors.assumed_ellipsoid(
+        inside, SurveyErrorsConfig(seed=9)
+    )
     raised_m = survey_errors.surface_offset_m(inside, 9)
     assert 1e-4 < abs(raised_m) < 1e-2
     np.testing.assert_allclose(semi_axes_m, 1 + raised_m, rtol=0, atol=1e-15)
@@ -121,7 +123,9 @@ def test_leds_are_on_a_raised_ellipsoid_within_kantorovich_s_bound() -> None:
     """The LEDs' own believed height is all of the draw, the ellipsoid's at least 2 sqrt(a b) / (a + b) of it."""
     eyes, lab = believing(light__surface__error="2 mm", tracker__survey="{seed: 4}")
     assert lab.scene.light.kind == "dome"
-    raised_m = survey_errors.surface_offset_m(surface.build_surface(lab.scene.light.surface), 4)
+    raised_m = survey_errors.surface_offset_m(
+        surface.build_surface(lab.scene.light.surface), 4
+    )
     leds = eyes.leds
     directions = (lab.camera.sources.place[:, :3] - leds.center_m) / leds.semi_axes_m**2
     normals = directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -200,7 +204,9 @@ def test_a_pupil_position_error_rotates_the_attitude_by_shift_over_led_distance(
     Across the boresight, to 5 %: LEDs 4 deg aside, about as many as the field is wide, are not at p.
     """
     survey = f"{{lever_sigma: 2 mm, seed: {seed}}}"
-    eyes, lab = believing(tracker__survey=survey, motion__start="{roll_deg: 7}", **BARE_CAMERA)
+    eyes, lab = believing(
+        tracker__survey=survey, motion__start="{roll_deg: 7}", **BARE_CAMERA
+    )
     frame, truth = render_at_rest(lab.camera, lab.start)
     answer = factory.solve_frame(eyes, frame).attitude
     assert answer.status == "solved"
@@ -210,7 +216,9 @@ def test_a_pupil_position_error_rotates_the_attitude_by_shift_over_led_distance(
     middle = to_body.apply(
         lab.camera.sources.place[np.isin(lab.camera.sources.id, truth.sources.id), :3]
     ).mean(axis=0)
-    expected = lab.camera.mount.cam_from_body.apply(np.cross(middle, shift) / (middle @ middle))
+    expected = lab.camera.mount.cam_from_body.apply(
+        np.cross(middle, shift) / (middle @ middle)
+    )
     found = (answer.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec()
     assert np.linalg.norm(expected[:2]) > 1e-3
     np.testing.assert_allclose(

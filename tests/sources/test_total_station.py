@@ -66,7 +66,9 @@ def draws(config: TotalStationConfig, own: bool, setup: bool) -> np.ndarray:
 
 def test_a_total_station_without_errors_gives_the_truth() -> None:
     """Polar coordinates and back, to the rounding of a meter."""
-    found = survey_errors.surveyed_m(station(), PLACES_M, np.zeros(PLACES_M.shape), np.zeros(8))
+    found = survey_errors.surveyed_m(
+        station(), PLACES_M, np.zeros(PLACES_M.shape), np.zeros(8)
+    )
     np.testing.assert_allclose(found, PLACES_M, rtol=0, atol=1e-15)
 
 
@@ -319,7 +321,9 @@ def test_a_station_at_an_led_is_refused() -> None:
     with pytest.raises(
         InputError, match=r"^tracker.survey.instrument.position: an LED is there"
     ):
-        survey_errors.station_covariance_m2(station(position=["0 m", "0 m", "1.2 m"]), PLACES_M)
+        survey_errors.station_covariance_m2(
+            station(position=["0 m", "0 m", "1.2 m"]), PLACES_M
+        )
 
 
 def test_the_focal_length_error_over_seeds_matches_its_survey_sigma() -> None:

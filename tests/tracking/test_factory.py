@@ -75,7 +75,9 @@ def test_a_perfect_navigator_follows_a_turning_vehicle() -> None:
 
 def test_a_moving_axis_costs_the_navigator_the_coning_within_its_samples() -> None:
     """An increment is no rotation vector, but short of one by w x dw/dt T^3 / 12 in every T: 0.02 arcsec here."""
-    flight = flown(5.0, vehicle__imu=f"{{{PERFECT}, rate_hz: 100}}", motion__rate_deg_s=TUMBLE)
+    flight = flown(
+        5.0, vehicle__imu=f"{{{PERFECT}, rate_hz: 100}}", motion__rate_deg_s=TUMBLE
+    )
     telemetry = telemetry_of(flight)
     step_s = 1 / 100
     rate = telemetry.rate_body_rad_s
@@ -256,7 +258,9 @@ def test_without_a_filter_the_estimate_is_the_navigator_s() -> None:
     vehicle = multibody.build(loaded.vehicle)
     mount = multibody.camera_mount(vehicle)
     start = Rotation.from_rotvec([0.1, 0.2, 0.3])
-    navigation = Navigation(loaded, [mount], start, np.zeros(3), 9.8, np.random.default_rng(1))
+    navigation = Navigation(
+        loaded, [mount], start, np.zeros(3), 9.8, np.random.default_rng(1)
+    )
     np.testing.assert_array_equal(
         navigation.attitude_wxyz("filter"), navigation.attitude_wxyz("imu")
     )

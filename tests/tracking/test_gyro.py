@@ -51,7 +51,9 @@ def test_the_rate_of_a_frame_does_not_depend_on_the_buffer_of_samples() -> None:
     assert len(shots) == len(forgetful) == 4
     for shot, other in zip(shots, forgetful, strict=True):
         window = exposure_window(scene, shot.frame.index)
-        after = rate_of_frame(samples, window, scene.camera.height_px, scene.vehicle.imu, mount)
+        after = rate_of_frame(
+            samples, window, scene.camera.height_px, scene.vehicle.imu, mount
+        )
         rates = [shot.rate, other.rate, after]
         np.testing.assert_allclose(
             np.ptp([rate.rate_rad_s for rate in rates], axis=0), 0, rtol=0, atol=1e-9
@@ -66,7 +68,8 @@ def test_the_rate_has_a_correct_covariance_and_is_absent_if_saturated() -> None:
     nees = []
     for unit in range(40):
         scene = load(
-            "shefex2", FLIGHT | {"vehicle.imu": f"{{hardware_seed: {unit}}}", "seed": str(unit)}
+            "shefex2",
+            FLIGHT | {"vehicle.imu": f"{{hardware_seed: {unit}}}", "seed": str(unit)},
         )
         flight = simulate_motion(scene)
         config = scene.vehicle.imu

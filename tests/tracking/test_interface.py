@@ -35,7 +35,14 @@ from skysim.simulation.flight import Flight, open_flight
 from skysim.simulation.lab import build_lab
 from skysim.sources import stars
 from skysim.tracking import tracker_interface
-from skysim.tracking.tracker_interface import Answer, Leds, Picture, Setup, Stars, check_answer
+from skysim.tracking.tracker_interface import (
+    Answer,
+    Leds,
+    Picture,
+    Setup,
+    Stars,
+    check_answer,
+)
 
 PAGE = (ROOT / "docs/howto/external_tracker.md").read_text(encoding="utf-8")
 SETUP = Setup(
@@ -137,7 +144,9 @@ def test_the_frame_s_folder_is_removed_with_the_program(kind: str) -> None:
     runs = program(READY + text, kind=kind)
     path = Path(runs.solve(PICTURE).status)
     assert path.name == f"frame_0007.{kind}"
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if kind == "png" else fits.getdata(path)
+    image = (
+        cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if kind == "png" else fits.getdata(path)
+    )
     np.testing.assert_array_equal(image, PICTURE.image_dn)
     assert [entry.name for entry in path.parent.iterdir()] == [path.name]
     assert b"CRVAL" not in path.read_bytes()
@@ -201,7 +210,9 @@ def test_a_program_that_damages_its_folder_is_reported_and_restarted(
     text = f"import shutil\nfor line in g:\n    h = json.loads(line); {harm}; {answer}"
     runs = program(READY + text, kind=kind)
     assert runs.solve(PICTURE).status == "x"
-    with pytest.raises(ProgramError, match=f"the program's folder takes no frame: ({reason})$"):
+    with pytest.raises(
+        ProgramError, match=f"the program's folder takes no frame: ({reason})$"
+    ):
         runs.solve(PICTURE)
     assert runs.solve(PICTURE).status == "x"
     runs.close()
@@ -378,9 +389,12 @@ def test_the_list_of_trackers_states_requirements(monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_scene_names_a_tracker_and_never_a_command() -> None:
-    scene = loader.load("shefex2", {"tracker.name": "mine", "tracker.options": "{command: rm}"})
+    scene = loader.load(
+        "shefex2", {"tracker.name": "mine", "tracker.options": "{command: rm}"}
+    )
     with pytest.raises(
-        InputError, match=r"tracker\.name: unknown tracker 'mine'; .*a program as mine=COMMAND"
+        InputError,
+        match=r"tracker\.name: unknown tracker 'mine'; .*a program as mine=COMMAND",
     ):
         build_lab(scene)
     for key in ("tracker.command", "tracker.program"):
@@ -463,13 +477,17 @@ def said(folder: Path, words: list[str]) -> str:
         "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
     }
     command = [sys.executable, "-m", "skysim", *words]
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0, f"{words}: {done.stderr}"
     return done.stdout
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("words", [w for w in commands() if "tetra3rs" not in w], ids=" ".join)
+@pytest.mark.parametrize(
+    "words", [w for w in commands() if "tetra3rs" not in w], ids=" ".join
+)
 def test_the_page_s_commands_run_without_wrong_attitudes(
     folder: Path, words: list[str]
 ) -> None:
@@ -501,7 +519,13 @@ print("PNG Read status: no error has occurred")
 shutil.copy(str(image[0, 0]), options["--print-attitude"])
 """
 # RA, Dec, roll in degrees; LOST's own example of a solved picture is the first.
-POINTED = [(225.102, 28.9928, 81.3329), (0, 0, 0), (10, -70, 200), (359, 89, 300), (83, 2, 20)]
+POINTED = [
+    (225.102, 28.9928, 81.3329),
+    (0, 0, 0),
+    (10, -70, 200),
+    (359, 89, 300),
+    (83, 2, 20),
+]
 
 
 def multiplied(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -558,7 +582,9 @@ def test_the_page_s_adapter_reads_lost_s_axes_and_quaternion(tmp_path: Path) -> 
         for n in range(len(POINTED) + 1)
     ]
     runs.close()
-    assert [answer.status for answer in answers] == ["solved"] * len(POINTED) + ["no attitude"]
+    assert [answer.status for answer in answers] == ["solved"] * len(POINTED) + [
+        "no attitude"
+    ]
     for pointed, answer in zip(POINTED, answers, strict=False):
         turn = Rotation.from_quat(answer.cam_from_ref_xyzw)
         assert (turn * stars.cam_from_icrs(*pointed).inv()).magnitude() < 5e-6  # six digits

@@ -111,7 +111,11 @@ class FialhoOptions(NamedTuple):
 
 
 def search_options(
-    tolerance_rad: float, settings: Options, min_fraction: float, optimized: bool, retries: bool
+    tolerance_rad: float,
+    settings: Options,
+    min_fraction: float,
+    optimized: bool,
+    retries: bool,
 ) -> FialhoOptions:
     """Search parameters of one version.
 
@@ -383,7 +387,9 @@ def _candidate(index: PairIndex, star: int, magnitude: float, options: FialhoOpt
     if abs(index.magnitude[star] - magnitude) > options.gate_mag:
         return False
     x, y, z = index.vectors[star]
-    return (x - options.x) ** 2 + (y - options.y) ** 2 + (z - options.z) ** 2 <= options.chord2
+    return (x - options.x) ** 2 + (y - options.y) ** 2 + (
+        z - options.z
+    ) ** 2 <= options.chord2
 
 
 @jit

@@ -145,7 +145,9 @@ def _triangle(
     ij = angle(rays[i], rays[j])
     ik = angle(rays[i], rays[k])
     jk = angle(rays[j], rays[k])
-    t_ij, t_ik, t_jk = sqrt(2.0) * options.tolerance + options.stretch * np.array([ij, ik, jk])
+    t_ij, t_ik, t_jk = sqrt(2.0) * options.tolerance + options.stretch * np.array(
+        [ij, ik, jk]
+    )
     # Short sides carry little information, and the index holds no longer pairs.
     if min(ij, ik, jk) < 4 * t_ij or max(ij, ik, jk) > index.max_angle_rad:
         return no_match()
@@ -194,7 +196,9 @@ def _triangle(
                     continue
                 # 4. and 5. Find a fourth star, and test the whole field.
                 tried[1] += 1
-                scaled = _scale_tangents(rays, tangent_scale) if options.focal_unknown else rays
+                scaled = (
+                    _scale_tangents(rays, tangent_scale) if options.focal_unknown else rays
+                )
                 match = _pyramid(
                     scaled,
                     index,
@@ -284,7 +288,8 @@ def _match_with_penalty(
         return match
     # Catalog stars that the attitude puts into the field and that are not matched.
     missing = max(
-        _count_in_field(index, stars[0], match.R_cam_from_ref, options) - len(match.observed), 0
+        _count_in_field(index, stars[0], match.R_cam_from_ref, options) - len(match.observed),
+        0,
     )
     chance = match.log10_chance + options.missed_dex * missing
     return DirectMatch(match.observed, match.star, match.R_cam_from_ref, chance)

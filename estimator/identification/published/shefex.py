@@ -279,7 +279,11 @@ def _match_others(
     count = 3
     # 4. Identify by angles; each catalog star is used once.
     for n in range(len(rays)):
-        s = _partner(rays, index, corners, stars, n, gates[n], tried) if gates[n, 9] > 0 else -1
+        s = (
+            _partner(rays, index, corners, stars, n, gates[n], tried)
+            if gates[n, 9] > 0
+            else -1
+        )
         if s >= 0 and not (star[:count] == s).any():
             observed[count] = n
             star[count] = s

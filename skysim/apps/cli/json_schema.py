@@ -17,7 +17,9 @@ from skysim.scene.scene import NAME_ALIAS, Scene
 from skysim.scene.sections.camera import CameraConfig
 
 KINDS: Mapping[str, type[BaseModel]] = {"scene": Scene, "study": Study}
-EXTRA_KEYS: Mapping[str, dict[str, Any]] = {  # keys that the loader resolves before validation
+EXTRA_KEYS: Mapping[
+    str, dict[str, Any]
+] = {  # keys that the loader resolves before validation
     Scene.__name__: {
         "base": {
             "type": "string",
@@ -60,7 +62,7 @@ def relaxed(node: Any, name: str = "") -> Any:
     Parameters
     ----------
     name
-        Of the definition that `node` is, for which EXTRA_KEYS may add keys
+        Name of the definition, to which EXTRA_KEYS may add keys
     """
     if isinstance(node, list):
         return [relaxed(item) for item in node]

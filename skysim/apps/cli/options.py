@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 # Loaded scenes: name and command-line overrides, for the locations in error messages.
 Loaded = tuple[str, dict[str, str]]
 LOADED: list[Loaded] = []
-TYPED: dict[
-    str, str
-] = {}  # keys of the scene that options of their own have set, with the option
+TYPED: dict[str, str] = {}  # the option by key of the scene, of keys that an option has set
 
 
 def complete_scene(incomplete: str) -> list[str]:
@@ -44,9 +42,9 @@ def complete_yaml(folder: Path, incomplete: str) -> list[str]:
     from skysim.core.paths import shipped_files
 
     names = list(shipped_files(folder))
-    found = Path(incomplete if incomplete.endswith("/") else os.path.dirname(incomplete)).glob(
-        "*"
-    )
+    found = Path(
+        incomplete if incomplete.endswith("/") else os.path.dirname(incomplete)
+    ).glob("*")
     files = [
         f"{path}/" if path.is_dir() else str(path)
         for path in found
@@ -80,7 +78,9 @@ Detector = Annotated[str | None, typer.Option(help="Detection algorithm, e.g. lo
 Centroider = Annotated[
     str | None, typer.Option(help="Centroiding algorithm, e.g. gaussian_fit.")
 ]
-Identifier = Annotated[str | None, typer.Option(help="Identification algorithm, e.g. pyramid.")]
+Identifier = Annotated[
+    str | None, typer.Option(help="Identification algorithm, e.g. pyramid.")
+]
 SolverName = Annotated[
     str | None, typer.Option("--solver", help="Attitude algorithm, e.g. quest.")
 ]
@@ -93,7 +93,9 @@ Programs = Annotated[
         help="External tracker or controller: a program; repeatable.",
     ),
 ]
-OpenReport = Annotated[bool, typer.Option("--open", help="Open the report when it is written.")]
+OpenReport = Annotated[
+    bool, typer.Option("--open", help="Open the report when it is written.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 
@@ -191,7 +193,7 @@ def selected_stages(**stages: str | None) -> dict[str, str]:
 
 
 def datetime_from_iso(text: str | None) -> datetime.datetime | None:
-    """The value of --time. Raises InputError."""
+    """The date of --time. Raises InputError."""
     if text is None:
         return None
     try:
@@ -200,10 +202,10 @@ def datetime_from_iso(text: str | None) -> datetime.datetime | None:
         raise InputError(f"--time {text}", "", "ISO 8601, e.g. 2012-06-22T21:00:00") from None
 
 
-# What errors name by key, as a user of the command line typed it: options, and `--set`.
+# Errors with the option that a user typed in place of the key.
 
 
-OPTIONS = {  # by the key of a function's parameter
+OPTIONS = {  # option by key of a function's parameter
     "overrides": "--set",
     "programs": "--program",
     "trackers": "--tracker",
@@ -244,7 +246,7 @@ OPTIONS = {  # by the key of a function's parameter
 
 
 def as_typed(error: InputError, loaded: Loaded | None = None) -> InputError:
-    """The error with the option at fault in place of its key, and the place of a key that was checked after loading.
+    """The error with the option at fault in place of its key, and with file and line of a key of the scene.
 
     Parameters
     ----------
@@ -278,6 +280,6 @@ def option_of(key: str) -> str:
 
 
 def with_location(finding: str, loaded: Loaded | None = None) -> str:
-    """A finding, `key: text`, with file and line of the key in a loaded scene, by default the last one."""
+    """A finding, `key: text`, with file and line of the key in a loaded scene; by default, in the last one."""
     key, _, text = finding.partition(": ")
     return str(as_typed(InputError(key, text), loaded)) if text else finding

@@ -32,7 +32,7 @@ ANIMATION_FRAMES = 60
 
 def progress(items: Iterable[T], total: int, what: str, quiet: bool = False) -> Iterator[T]:
     """Yield the items, with a progress bar on stderr that disappears at the end."""
-    if quiet or not sys.stderr.isatty():  # without the time that it takes to import the bar
+    if quiet or not sys.stderr.isatty():  # saves the import of the bar
         yield from items
         return
     with bar() as shown:
@@ -40,7 +40,7 @@ def progress(items: Iterable[T], total: int, what: str, quiet: bool = False) -> 
 
 
 def bar(*columns: ProgressColumn, quiet: bool = False) -> Bar:
-    """A transient progress bar on stderr: description, then columns. Disabled if stderr is no terminal."""
+    """A transient progress bar on stderr: description, then columns. Disabled if stderr is not a terminal."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -78,7 +78,7 @@ def trial_progress(
 ) -> Iterator[Callable[[Progress], None]]:
     """Show a progress bar for trials on stderr: done, rate, time left, failures. Yields its update function.
 
-    If stderr is no terminal, print a line after every tenth of the trials instead.
+    If stderr is not a terminal, print a line after every tenth of the trials instead.
     """
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
@@ -103,7 +103,7 @@ def trial_progress(
 
 
 def print_check(facts: Sequence[Fact], findings: Sequence[str]) -> None:
-    """Print the facts of a plan, names at the left, and its warnings."""
+    """Print the facts of a check, with names at the left, and its warnings."""
     warnings = [Items(findings, tone="warning")] if findings else [Text("no warnings")]
     print_blocks([Facts([(fact.name, fact.lines) for fact in facts]), *warnings])
 
@@ -160,7 +160,7 @@ def print_solutions(solutions: list[dict[str, Any]], out: Path) -> None:
 
 
 def print_remarks(solution: dict[str, Any]) -> None:
-    """Print what `skysim solve` saw, tried and concludes, for a refused image; or what it assumed."""
+    """Print what `skysim solve` saw, tried and concluded for a refused image, or assumed for a solved one."""
     if not solution["hint"]:
         return
     print(f"\n{printable(solution['file'])}: {printable(solution['status'])}")
@@ -203,7 +203,9 @@ def print_catalog(catalog: dict[str, Any], json: bool) -> None:
     print(
         f"{catalog['path']}: {catalog['stars']} stars ({sources}), epoch J{catalog['meta']['epoch_jyear']}"
     )
-    print("  ".join(f"V<{limit}: {count}" for limit, count in catalog["brighter_than"].items()))
+    print(
+        "  ".join(f"V<{limit}: {count}" for limit, count in catalog["brighter_than"].items())
+    )
     for key, value in catalog["meta"].items():
         print(f"  {key}: {printable(value)}")
 
@@ -246,15 +248,16 @@ def write_3d_views(lab: Lab, log: Telemetry, folder: Path) -> list[Path]:
         shown = progress(
             scene_picture.film(mjcf, states), len(states), "rendering the animation"
         )
-        scene_picture.write_film(shown, animation_path, len(states) / float(log.t_s[-1] + 1e-9))
+        scene_picture.write_film(
+            shown, animation_path, len(states) / float(log.t_s[-1] + 1e-9)
+        )
     except scene_picture.NoPicture as error:
         print_error(str(error))
         return []
     return [image_path, animation_path]
 
 
-# Terminal output of `skysim study` but for its report: progress and provenance, worst and replayed
-# trials.
+# Terminal output of `skysim study`, except its report: progress and provenance, worst and replayed trials.
 
 
 REPLAYED = (
@@ -305,9 +308,9 @@ def print_worst(
     Parameters
     ----------
     levels
-        Of each trial's point
+        Levels of each trial's point
     instead
-        The command to give if no trial counts for the response
+        The command that is printed if no trial counts for the response
     """
     if not found:
         print(f"no trial counts for {response}; rank them by an error: {instead}")

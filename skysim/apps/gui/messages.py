@@ -15,7 +15,7 @@ from skysim.results import plots
 
 Triple = tuple[float, float, float]
 NAN = float("nan")
-# Of the display; the last are set in the browser.
+# Limits of the display; the last ones are set in the browser.
 LIMITS = ("automatic", "zscale", "min to max", "manual")
 
 
@@ -25,11 +25,12 @@ class Display(NamedTuple):
     Attributes
     ----------
     screen_px
-        Width and height of its screen that a whole frame fills; (0, 0): all pixels are needed
+        Width and height of the screen area that a whole frame fills; (0, 0) if all pixels are
+        needed
     limits
-        Black and white, by one of LIMITS or in DN
+        Black and white level: one of LIMITS, or values in DN
     curve
-        Between them, one of `stretch.CURVES`
+        Curve between them, a key of `plots.CURVES`
     near_px
         Column and row of the upper left pixel in the loupe, if it shows any
     """
@@ -52,11 +53,11 @@ class Pixels:
     data
         The encoded pixels
     fields
-        What the browser draws beside them: limits, histogram, the loupe's pixels
+        Further data for the browser: limits, histogram, the loupe's pixels
     display
-        That they are made for
+        Display for which the pixels are made
     number
-        Of the image in its worker
+        Number of the image in its worker
     """
 
     data: bytes
@@ -86,7 +87,7 @@ class LightColumns(Sequence[LightRow]):
     Attributes
     ----------
     id, electrons, magnitude
-        (N,) see `LightRow`
+        (N,) as in `LightRow`
     xy_px
         (N, 2) pixels
     """
@@ -105,7 +106,9 @@ class LightColumns(Sequence[LightRow]):
     def __getitem__(self, n: slice) -> LightColumns: ...
     def __getitem__(self, n: int | slice) -> LightRow | LightColumns:
         if isinstance(n, slice):
-            return LightColumns(self.id[n], self.xy_px[n], self.electrons[n], self.magnitude[n])
+            return LightColumns(
+                self.id[n], self.xy_px[n], self.electrons[n], self.magnitude[n]
+            )
         x, y = self.xy_px[n].tolist()
         return LightRow(
             int(self.id[n]), x, y, float(self.electrons[n]), float(self.magnitude[n])
@@ -136,11 +139,11 @@ class TrackerResult:
     status
         "solved", or the reason why not
     angles_deg
-        In the order of the scene's angle names
+        Angles in the order of the scene's angle names
     sigma_arcsec
         Estimated standard errors, cross-boresight and roll
     windows_px
-        (x, y) at which the tracker's map predicts lights
+        Pixels (x, y) at which the tracker's map predicts lights
     """
 
     status: str
@@ -164,8 +167,11 @@ class TrackerResult:
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """Where a camera's pixels point, in camera axes: tangents x / z and y / z at n x n points, row by row from the
-    frame's upper left corner to its lower right one. The browser interpolates between them."""
+    """Directions of a camera's pixels in camera axes, between which the browser interpolates.
+
+    They are the tangents x / z and y / z at n x n points, row by row from the frame's upper left to its lower right
+    corner.
+    """
 
     n: int
     x: tuple[float, ...]
@@ -174,13 +180,13 @@ class Lens:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Attitude of a frame's camera: reference_from_cam by rows, the reference being ICRS or the lab.
+    """Attitude of a frame's camera: reference_from_cam by rows; the reference is ICRS or the lab.
 
     Attributes
     ----------
     place_m, depth_m
-        Under a dome the camera's place, lab frame, and for each point of the lens's tables the
-        depth along the boresight at which its ray meets the surface; None if it does not
+        Under a dome, the camera's place in the lab frame, and for each point of the lens's tables
+        the depth along the boresight at which its ray meets the surface (None if it does not)
     """
 
     rotation: tuple[float, ...]
@@ -195,13 +201,13 @@ class FrameView:
     Attributes
     ----------
     pose
-        Where its pixels point, with the scene's lens
+        Attitude of its camera, for the scene's lens
     saturation_dn
-        From which a pixel is saturated
+        Value from which a pixel is saturated
     body_wxyz
         lab_from_body
     t_s
-        Time in the motion that is played, else 0
+        Time in the motion that is played; 0 otherwise
     filter_arcsec
         Error of the filter during the motion
     innovation_arcsec
@@ -239,9 +245,9 @@ class SceneInfo:
     Attributes
     ----------
     names
-        Of its three angles
+        Names of the three angles
     prefix
-        Of its lights' numbers (HIP or LED)
+        Prefix of the lights' numbers (HIP or LED)
     field_deg
         Horizontal field of view
     pixel_arcsec
@@ -249,11 +255,11 @@ class SceneInfo:
     stages
         The tracker's algorithm by stage
     duration_s
-        Of its motion
+        Duration of the motion
     noise
-        Whether the camera has noise, else a frame is the expected value
+        Whether the camera has noise; without it a frame is the expected value
     surveyed
-        Whether a survey of its dome has begun
+        Whether a survey of the dome has begun
     """
 
     scene: str
@@ -272,7 +278,7 @@ class SceneInfo:
 
 
 class LookFrom(NamedTuple):
-    """A place to look from and what to look at, m, in the lab frame, or in body axes if it is on the vehicle.
+    """A place to look from and a target, m, in the lab frame, or in body axes if the place is on the vehicle.
 
     Attributes
     ----------
@@ -294,7 +300,7 @@ class LabGeometry:
     Attributes
     ----------
     shapes
-        Those of the MJCF file that `skysim scenes export` writes, without the lights
+        Shapes of the MJCF file that `skysim scenes export` writes, without the lights
     ids, lights_m, radius_m, lit
         (N,) the lights, (N, 3) their positions, (N,) drawn radii, (N,) whether they shine;
         stars are on a sphere
@@ -324,13 +330,13 @@ class FlightRow(NamedTuple):
     Attributes
     ----------
     t_s
-        Begin of its exposure
+        Beginning of its exposure
     cross, roll
-        The tracker's error and standard error, arcsec
+        Error and standard error of the tracker, arcsec
     lights, identified
-        In the field, and identified
+        Numbers of lights in the field, and of identified ones
     filter_arcsec, innovation_arcsec
-        See `FrameView`
+        As in `FrameView`
     """
 
     t_s: float
@@ -351,13 +357,13 @@ class FlightStep:
     Attributes
     ----------
     t_s, duration_s
-        How far it is, and how long it lasts
+        Time that has been computed, and duration of the flight
     rows
-        Of the frames since the last step
+        Rows of the frames since the last step
     log
-        Of the motion so far, where there are new frames
+        Curves of the motion so far, if there are new frames
     residuals
-        Of the lights identified in these frames: time, number, and residual in pixels
+        Residuals of the lights identified in these frames: time, number, residual in pixels
     """
 
     is_done: bool
@@ -369,14 +375,14 @@ class FlightStep:
 
 
 class AmbiguityMap(NamedTuple):
-    """The most similar other field of the field about each LED.
+    """For the field about each LED, the most similar other field.
 
     Attributes
     ----------
     ids, others
         (N,) LEDs at the centers of the fields
     fraction
-        (N,) of the LEDs that coincide, at least `least`
+        (N,) fraction of the LEDs that coincide, at least `least`
     coincidence_mm
         Two LEDs coincide if they are nearer than this
     """
@@ -394,14 +400,14 @@ class SurveyPlan(NamedTuple):
     Attributes
     ----------
     angles_deg
-        Roll, pitch and yaw of each
+        Roll, pitch and yaw of each attitude
     shown
-        LEDs that each shows
+        Number of LEDs that each shows
     leds
-        On the dome
+        Number of LEDs on the dome
     steps
-        Predicted after a number of frames: LEDs measured, and their rms error, mm; None if not
-        determined
+        Number of frames; number of LEDs measured and their rms error, mm, predicted after these
+        (None if not determined)
     """
 
     angles_deg: tuple[tuple[float, ...], ...]
@@ -411,28 +417,28 @@ class SurveyPlan(NamedTuple):
 
 
 class SurveyFound(NamedTuple):
-    """What the frames of a survey have measured, and the attitudes to hold next.
+    """Results of the frames of a survey, and the attitudes to hold next.
 
     Attributes
     ----------
     frames, connected
-        So far, and those that share enough LEDs with others
+        Numbers of frames so far, and of those that share enough LEDs with others
     missed
-        Attitudes of the last flight without a frame at which the vehicle rested
+        Number of attitudes of the last flight without a frame at which the vehicle rested
     measured, seen_once, unseen
-        LEDs, of those in connected frames
+        Numbers of LEDs, by the connected frames
     renamed
-        Measured ones with another's number
+        Number of measured LEDs with another one's number
     sigma_mm
-        Estimated rms error of the measured LEDs about each axis
+        Estimated rms error of the measured LEDs along each axis
     before_mm, error_mm
-        The true one before the survey and now. None, with the reason in `refusal`, if the
-        frames do not determine them
+        True rms error before the survey and now. None, with the reason in `refusal`, if the
+        frames do not determine the LEDs
     faults
-        Of the dome, a line each
+        Faults of the dome, a line each
     ids, known
-        (N,) the LEDs, and by how much the survey has reduced the uncertainty of each, 0 to 1;
-        `known` is empty after a refusal
+        (N,) LEDs, and the reduction of each one's uncertainty by the survey, 0 to 1; `known` is
+        empty after a refusal
     """
 
     frames: int

@@ -39,20 +39,19 @@ from skysim.apps.gui.worker.study_process import StudyProcess, is_shown
 from skysim.core.constants import DAY_S
 from skysim.scene.loader import find
 
-# Garbage collection of the server, while no page gets a frame.
+# Garbage collection of the server, at times when no page gets a frame.
 
 
-# New objects until a collection, and collections until one of older objects.
+# Number of new objects before a collection, and numbers of collections before one of older objects.
 THRESHOLDS = (2_000, 10, 1_000)
-QUIET_S = 1.0  # after a page was closed, and without a new frame on any page, before closed pages are collected
-PATIENCE_S = 60.0  # after which they are collected although frames follow one another
+QUIET_S = 1.0  # time without a closed page and without a new frame before closed pages are collected
+PATIENCE_S = 60.0  # time after which they are collected even while pages get frames
 
 
 def freeze() -> None:
-    """Take what was imported out of the garbage collector's sight, and let it look at new objects alone.
+    """Exclude imported objects from garbage collection, and limit automatic collections to new objects.
 
-    A collection of all pages takes half a second with 20 of them, in which no key is answered. Only `ClosedPages`
-    makes one.
+    A full collection takes half a second with 20 pages, during which no key is served. Only `ClosedPages` starts one.
     """
     gc.collect()
     gc.freeze()
@@ -60,7 +59,7 @@ def freeze() -> None:
 
 
 def release_memory() -> None:
-    """Collect closed pages, and return their memory to the system; glibc's allocator would keep it."""
+    """Collect closed pages and return their memory to the system, which glibc's allocator would keep."""
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim:
@@ -68,7 +67,7 @@ def release_memory() -> None:
 
 
 class ClosedPages:
-    """Collects closed pages, many at once if many were closed, while no page gets a frame, or PATIENCE_S later."""
+    """Collects closed pages together when no page gets a frame, at the latest after PATIENCE_S."""
 
     def __init__(self) -> None:
         self.waiting: asyncio.Task[None] | None = None
@@ -83,12 +82,12 @@ class ClosedPages:
         await asyncio.sleep(QUIET_S)
         while (now_s := time.monotonic()) < end_s and now_s - last_frame_s() < QUIET_S:
             await asyncio.sleep(QUIET_S)
-        self.waiting = None  # a page that is closed from now on needs another collection
+        self.waiting = None  # pages closed from now on need another collection
         await asyncio.to_thread(release_memory)
 
 
 def last_frame_s() -> float:
-    """When a page got a frame last, by `time.monotonic`; minus infinity before the first."""
+    """Time at which a page last got a frame, by `time.monotonic`; minus infinity before the first."""
     return max((frames.added_s for frames in FRAMES.values()), default=-float("inf"))
 
 
@@ -115,16 +114,16 @@ USER = "skysim_user"  # cookie with the number of a browser
 USER_BYTES = 8
 YEAR_S = 365 * int(DAY_S)
 QUEUED = "This page opens when another one has been closed."
-CONNECT_TIMEOUT_S = 50.0  # for a browser to load the page
-RECONNECT_S = 6.0  # for a lost browser to reconnect, before its work ends
-PING_INTERVAL_S = 5.0  # of the connection
-PING_TIMEOUT_S = 30.0  # a busy machine answers late
+CONNECT_TIMEOUT_S = 50.0  # time for a browser to load the page
+RECONNECT_S = 6.0  # time for a lost browser to reconnect before its work is ended
+PING_INTERVAL_S = 5.0  # interval of pings on the connection
+PING_TIMEOUT_S = 30.0  # long, because a busy machine answers late
 
 
 async def frame(request: Request) -> Response:
     """A frame of a tab, see `ServedFrame`; 404 if it is no longer among the newest.
 
-    Query: see `display_of`, and `whole`: whether all pixels are needed
+    The query is that of `display_of`, and `whole`: whether all pixels are needed.
     """
     frames = FRAMES.get(request.path_params["tab"])
     served = frames and frames.newest.get(request.path_params["number"])
@@ -140,7 +139,7 @@ async def frame(request: Request) -> Response:
 
 
 async def stream(request: Request) -> Response:
-    """The next frames of a tab, see `TabFrames.stream`; 404 if there is no such tab. Query: see `display_of`"""
+    """The next frames of a tab (`TabFrames.stream`); 404 if there is no such tab. The query is that of `display_of`."""
     frames = FRAMES.get(request.path_params["tab"])
     display = display_of(request.query_params)
     if not frames or not display:
@@ -150,7 +149,7 @@ async def stream(request: Request) -> Response:
     )
 
 
-# Frames pass by the application's own layers, each of which takes a tenth of the time that a frame may take.
+# Frames bypass the application's own layers, each of which takes a tenth of the time that a frame may take.
 FRAME_ROUTES = Router(
     [Route("/frame/{tab}/{number:int}", frame), Route("/frame/{tab}/next", stream)]
 )
@@ -159,8 +158,8 @@ FRAME_ROUTES = Router(
 class KeptFiles:
     """ASGI layer that keeps the page's code and styles after their first response.
 
-    A page loads some 40 of these files at once. NiceGUI's layers take 3 ms for each, in which the keys of other pages
-    wait.
+    A page loads about 40 of these files at once. NiceGUI's layers take 3 ms for each, during which the keys of other
+    pages wait.
     """
 
     def __init__(self, app: Any) -> None:
@@ -204,18 +203,18 @@ def is_plain_file(scope: Any) -> bool:
 
 
 class Guard:
-    """ASGI middleware that refuses unknown host names, requests of other sites or without token, and large requests.
+    """ASGI middleware that refuses unknown hosts, requests of other sites or without token, and large requests.
 
     Attributes
     ----------
     hosts
-        Allowed Host headers ("*": any). This stops DNS rebinding: another site's name that
-        resolves to this server comes with its own Host header.
+        Allowed Host headers ("*": any). This stops DNS rebinding: the name of another site that
+        resolves to this server comes with its own Host header
     token
-        Required; `/?token=...` stores it in a cookie
+        Required access token; `/?token=...` stores it in a cookie
     port
-        Of the server. Browsers send a host's cookies to all its ports, so the cookie's name has
-        the port
+        Port of the server. Browsers send a host's cookies to all its ports, so the name of the
+        cookie contains the port
     """
 
     def __init__(self, app: Any, hosts: tuple[str, ...], token: str, port: int) -> None:
@@ -248,19 +247,22 @@ class Guard:
             return PlainTextResponse("request of another site refused", 403)
         if int(headers.get("content-length") or 0) > LIMIT_BYTES + 2**16:
             return PlainTextResponse("request too large; allowed: 64 MB", 413)
-        # The address does not keep it.
+        # The token is removed from the address.
         if token_matches(request.query_params.get("token", ""), self.token):
             response = RedirectResponse("/", 303)
             response.set_cookie(
                 self.cookie, self.token, path="/", httponly=True, samesite="strict"
             )
             user = user_of(request.cookies) or secrets.token_hex(USER_BYTES)
-            response.set_cookie(USER, user, YEAR_S, path="/", httponly=True, samesite="strict")
+            response.set_cookie(
+                USER, user, YEAR_S, path="/", httponly=True, samesite="strict"
+            )
             return response
         if token_matches(request.cookies.get(self.cookie, ""), self.token):
             return None
         return PlainTextResponse(
-            "token missing or wrong; open the address that the server printed: /?token=...", 401
+            "token missing or wrong; open the address that the server printed: /?token=...",
+            401,
         )
 
 
@@ -304,13 +306,13 @@ def limited(receive: Any) -> Any:
 
 
 def user_of(cookies: Mapping[str, str]) -> str:
-    """The number of a browser, which its cookie keeps; empty if it has none."""
+    """The number of a browser from its cookie; empty if it has none."""
     user = cookies.get(USER, "")
     return user if re.fullmatch(rf"[0-9a-f]{{{2 * USER_BYTES}}}", user) else ""
 
 
 def report_path(out: Path, name: str, user: str = "") -> Path | None:
-    """The report of a study in the folder; None if there is none of that name, or it is another user's."""
+    """Path of the report of a study in the folder; None if there is none, or it belongs to another user."""
     try:
         path = (out / name / "report.html").resolve()
         is_here = path.parent.parent == out.resolve() and is_shown(path.parent.name, user)
@@ -320,7 +322,7 @@ def report_path(out: Path, name: str, user: str = "") -> Path | None:
 
 
 def be_patient() -> None:
-    """Let a connection live although its browser answers late; NiceGUI takes both times from the reconnect time."""
+    """Keep connections whose browsers answer late; NiceGUI derives both times from the reconnect time."""
     core.sio.eio.ping_interval = PING_INTERVAL_S
     core.sio.eio.ping_timeout = PING_TIMEOUT_S
 
@@ -332,7 +334,7 @@ def stop_studies() -> None:
 
 
 async def close(tab: Tab, closed_pages: ClosedPages) -> None:
-    """Release all that a tab held."""
+    """Release the resources of a tab."""
     await tab.close()
     closed_pages.collect_soon()
 
@@ -356,7 +358,7 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers:
             path, media_type="text/html", headers={"content-security-policy": REPORT_POLICY}
         )
 
-    # NiceGUI allows three seconds for building a page, which many that are built at once exceed.
+    # NiceGUI allows three seconds for building a page; many pages that are built at once need longer.
     @ui.page("/", title="skysim gui", dark=True, response_timeout=CONNECT_TIMEOUT_S)
     async def index(request: Request) -> None:
         tab = Tab(scene, folder, out, cameras, user_of(request.cookies))
@@ -391,12 +393,12 @@ def serve(
     Parameters
     ----------
     token
-        Required of browsers, also of this machine, where other users and other sites' pages
-        are; a random one if empty
+        Token that browsers must send, also those of this machine, which has other users and
+        pages of other sites; a random one if empty
     cameras
         Live cameras that the page may watch, see `skysim.core.images`
     workers
-        Greatest number of worker processes; further pages wait for one
+        Maximum number of worker processes; further pages wait for one
     """
     hosts = LOOPBACK if host in LOOPBACK else ("*",)
     token = token or secrets.token_urlsafe(16)
@@ -416,7 +418,7 @@ def serve(
         reconnect_timeout=RECONNECT_S,
         uvicorn_logging_level="critical",
         storage_secret=None,
-        # To this machine nothing is compressed; to others by the quickest level.
+        # Responses to this machine are not compressed; others are, at the fastest level.
         gzip_middleware_factory=None
         if host in LOOPBACK
         else partial(GZipMiddleware, compresslevel=1),

@@ -1,7 +1,7 @@
-"""Preloaded by the fork server of the GUI: the worker from which those of the tabs are forked.
+"""The worker from which the workers of the tabs are forked; the fork server of the GUI preloads this module.
 
-It imports and loads the compiled code and sets up the scene that pages open first. That takes seconds; a fork of it is
-ready in milliseconds and shares its memory.
+It imports the code, loads compiled functions and sets up the scene that pages open first. This takes seconds; a fork is
+ready in milliseconds and shares the memory.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 THREADS = min(
     os.cpu_count() or 1, 2
-)  # of a frame's rendering, so that a key's frame comes sooner
-# Set before the libraries are imported. OpenMP's threads do not survive a fork, numba's own do; OpenCV refuses larger
-# images.
+)  # threads that render a frame, so that a key is answered sooner
+# These are set before the libraries are imported. OpenMP's threads do not survive a fork, numba's own do. OpenCV
+# refuses larger images.
 ENVIRONMENT = {
     "NUMBA_NUM_THREADS": str(THREADS),
     "NUMBA_THREADING_LAYER": "workqueue",
@@ -31,7 +31,7 @@ ENVIRONMENT = {
 
 
 def make_worker() -> Worker:
-    """A worker that has set up the scene and solved a frame; without a scene if it cannot be."""
+    """A worker that has set up the scene and solved a frame; without a scene if it cannot be set up."""
     os.environ.update(ENVIRONMENT)
     import cv2
 

@@ -1,7 +1,7 @@
 """Plate solver of `skysim solve`, `skysim.solve` and the browser's photo panel.
 
-From a file to the picture as it is viewed (`picture.py`), to a solution without a prior attitude (`solver.py`),
-or to the likely cause of a refusal (`diagnosis.py`).
+A file is loaded as a picture in the orientation of viewing (`picture.py`) and solved without a prior attitude
+(`solver.py`). After a refusal other centroids are tried (`retries.py`), and the likely cause is found (`diagnosis.py`).
 """
 
 from skysim.apps.plate_solver.picture import (

@@ -1,7 +1,7 @@
-"""The likely cause of a refusal, and what to do about it.
+"""The likely cause of a refusal, with a remedy.
 
-Causes are tried from the certain to the vague. Some are tried by solving: the mirrored sky, and other fields of view.
-Such a solution names the cause, and is never the answer.
+Causes are tested from the most certain to the vaguest. Two are tested by solving: a mirrored sky, and another field of
+view. Such a solution only shows the cause; it is never the answer.
 """
 
 from __future__ import annotations
@@ -21,31 +21,36 @@ from estimator.detection.classify import streaks_px
 from estimator.detection.detect import DETECTORS
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.trackers.pipeline import Clock
-from skysim.apps.plate_solver.solver import FIELD_SEARCH, Solver, best_attitude, solve_centroids
+from skysim.apps.plate_solver.solver import (
+    FIELD_SEARCH,
+    Solver,
+    best_attitude,
+    solve_centroids,
+)
 
-# expected in a field: hardly solvable below, safe above
+# Expected numbers of stars in a field: hardly solvable below the first, safe above the second.
 MIN_CATALOG_STARS = 6.0
 ENOUGH_CATALOG_STARS = 15.0
 # Stars of the Gaia catalogs of `skysim catalog build`: 45,709 to V 8, 130,337 to V 9, 357,037 to V 10, their limit.
 GAIA_STARS = 45_709
 GAIA_DEX_PER_MAG = 0.45
 GAIA_LIMITS_MAG = (8, 9, 10)
-OVEREXPOSED_SHARE = 0.3  # of pixels at the greatest value
-# of the brightest blobs, so many and this share have one shape
+OVEREXPOSED_SHARE = 0.3  # least fraction of pixels at the greatest value
+# Number of brightest blobs whose shapes are compared; least number and fraction of them that have one shape.
 SHAPED_BLOBS = 6
 MIN_BLOBS = 3
 SAME_SHARE = 0.5
-# least diameter of defocused stars (of sharp ones 4 to 10 px), and its relative spread
+# Least diameter of defocused stars (sharp ones have 4 to 10 px), and its greatest relative spread.
 BLUR_PX = 14.0
 SAME_SIZE = 0.3
-FILLED = 0.6  # least share of its box that a defocused star fills; a disk fills 0.79
-# least length of a trail, and least ratio of its square to the area; of a disk it is 2.5
+FILLED = 0.6  # least fraction of its box that a defocused star fills; a disk fills 0.79
+# Least length of a trail, and least ratio of its square to the area, which is 2.5 for a disk.
 TRAIL_PX = 20.0
 THIN = 6.0
 SAME_ANGLE_RAD = 0.1  # greatest difference between the directions of parallel trails
 TRAILS = "trails of {:.0f} px: a shorter exposure, a steadier camera, or a mount that tracks"
 FEW_LIGHTS = 10
-EFFORTS = 3  # searches of the mirrored picture: its diagnosis should not take as long as all searches before
+EFFORTS = 3  # number of searches of the mirrored picture, so that diagnosis is faster than the searches before it
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,7 @@ class Refusal:
     Attributes
     ----------
     row_order_known
-        False if both row orders were tried, and with them the mirrored sky
+        Whether the row order is known; if not, both orders, and so the mirrored sky, were tried
     """
 
     image: NDArray
@@ -71,12 +76,12 @@ class Refusal:
 
     @property
     def can_be_tried(self) -> bool:
-        """Whether there are lights enough for a solution."""
+        """Whether there are enough lights for a solution."""
         return len(self.centroids) >= MIN_EVIDENCE_MATCHES
 
     @functools.cached_property
     def blobs(self) -> Blobs:
-        """What the detector found, with what cannot be a star."""
+        """The blobs that the detector found, including those that cannot be stars."""
         settings = self.solvers[0].settings
         detect = DETECTORS[settings.detector]
         priors = FramePriors(None, settings.saturation)
@@ -95,7 +100,7 @@ def likely_cause(refusal: Refusal) -> str:
 
 
 def shallow_catalog(refusal: Refusal) -> str:
-    """There are lights enough, but few stars of the catalog in the widest field that was tried, by its mean density."""
+    """There are enough lights, but by the catalog's mean density few stars in the widest field that was tried."""
     solver = max(refusal.solvers, key=lambda one: one.tried_fov_deg(*refusal.size_px)[1])
     narrow_deg, wide_deg = solver.tried_fov_deg(*refusal.size_px)
     share = sphere_share(refusal.size_px, (narrow_deg + wide_deg) / 2)
@@ -109,14 +114,14 @@ def shallow_catalog(refusal: Refusal) -> str:
 
 
 def sphere_share(size_px: tuple[int, int], fov_deg: float) -> float:
-    """Share of the sphere of an image with this horizontal field: the solid angle of a pyramid over 4 pi."""
+    """Fraction of the sphere in an image with this horizontal field: the solid angle of a pyramid over 4 pi."""
     camera = Camera.from_fov(*size_px, math.radians(fov_deg))
     a, b = (side / 2 / camera.focal_px for side in size_px)
     return math.asin(a * b / math.sqrt((1 + a * a) * (1 + b * b))) / math.pi
 
 
 def deeper_catalog(solver: Solver, share: float) -> str:
-    """The remedy for a field that is this share of the sphere: the shallowest Gaia catalog with enough stars."""
+    """The remedy for a field that is this fraction of the sphere: the shallowest Gaia catalog with enough stars."""
     first = GAIA_LIMITS_MAG[0]
     last = GAIA_LIMITS_MAG[-1]
     for limit in GAIA_LIMITS_MAG:
@@ -131,7 +136,7 @@ def deeper_catalog(solver: Solver, share: float) -> str:
 
 
 def mirrored(refusal: Refusal) -> str:
-    """It solves with its columns reversed; the centroids' are reversed here, not the image's."""
+    """The picture is solved with its columns reversed; the centroids are reversed, not the image."""
     if not (refusal.can_be_tried and refusal.row_order_known):
         return ""
     flipped = reversed_columns(refusal.centroids, refusal.size_px[0])
@@ -154,8 +159,10 @@ def reversed_columns(centroids: Centroids, width_px: int) -> Centroids:
 
 
 def other_field(refusal: Refusal) -> str:
-    """It solves with another field of view than those that were tried; with little effort only."""
-    if not refusal.can_be_tried or not all(solver.field_is_known for solver in refusal.solvers):
+    """The picture is solved, with little effort, with another field of view than those that were tried."""
+    if not refusal.can_be_tried or not all(
+        solver.field_is_known for solver in refusal.solvers
+    ):
         return ""
     unknown = replace(refusal.solvers[0], fov_deg=None, camera=None)
     cameras = unknown.candidate_cameras(*refusal.size_px)
@@ -177,7 +184,7 @@ def overexposed(refusal: Refusal) -> str:
 
 
 def trailed(refusal: Refusal) -> str:
-    """The brightest blobs are parallel lines: the detector's streak, or most of a few are long for their area."""
+    """The brightest blobs are parallel lines: by the detector's streak, or as most of them are long for their area."""
     blobs = refusal.blobs
     if blobs.streak_px is not None:
         trails_px = streaks_px(blobs, refusal.image.shape, blobs.streak_px)
@@ -193,7 +200,7 @@ def trailed(refusal: Refusal) -> str:
 
 
 def out_of_focus(refusal: Refusal) -> str:
-    """The brightest blobs are large, filled, and of one size, whatever their brightness."""
+    """The brightest blobs are large, filled, and of one size at any brightness."""
     sides_px, area_px = brightest_shapes(refusal.blobs)
     diameter_px = np.sqrt(4 / np.pi * area_px)
     large = (diameter_px >= BLUR_PX) & (area_px >= FILLED * sides_px.prod(axis=1))
@@ -211,12 +218,12 @@ def brightest_shapes(blobs: Blobs) -> tuple[NDArray, NDArray]:
 
 
 def is_most(chosen: NDArray) -> bool:
-    """Whether these are most of the brightest blobs, and not too few."""
+    """Whether the chosen blobs are most of the brightest ones, and not too few."""
     return bool(np.count_nonzero(chosen) >= MIN_BLOBS and chosen.mean() >= SAME_SHARE)
 
 
 def few_lights(refusal: Refusal) -> str:
-    """There is little to identify."""
+    """There are few lights to identify."""
     count = len(refusal.centroids)
     if count >= FEW_LIGHTS:
         return ""
@@ -224,9 +231,9 @@ def few_lights(refusal: Refusal) -> str:
 
 
 def unknown_cause(refusal: Refusal) -> str:
-    """No cause was found: what is left."""
+    """No cause was found: advice on what may help."""
     solver = refusal.solvers[0]
-    # `other_field` tried it.
+    # `other_field` has tried another field.
     unknown = replace(solver, fov_deg=None, camera=None)
     narrow_deg = min(
         one.tried_fov_deg(*refusal.size_px)[0] for one in (unknown, *refusal.solvers)

@@ -1,4 +1,4 @@
-"""From a picture's file to its solution: load it as it is viewed, solve its hypotheses, diagnose a refusal."""
+"""Load a picture in the orientation of viewing, solve the hypotheses about it, and diagnose a refusal."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ from skysim.apps.plate_solver.solver import (
     FOV_LIMITS_DEG,
     PlateSolution,
     Solver,
-    annotated_image,
     kept_solver,
     make_solver,
     solution_fields,
@@ -34,16 +33,16 @@ from skysim.core import files, images
 from skysim.core.errors import InputError, printable
 
 ANNOTATED = ".annotated.png"
-# The focal length of the 35 mm camera (36 x 24 mm) with the same diagonal field: CIPA DCG-001, to which Exif's
-# FocalLengthIn35mmFilm (CIPA DC-008) is written; whole millimeters. Some makers convert the longer side instead, which
-# differs by 4 % for sensors of 4:3; the rest is rounding, distortion and a small crop.
+# Exif's FocalLengthIn35mmFilm (CIPA DC-008), in whole millimeters, is the focal length of a camera of 36 x 24 mm with
+# the same diagonal field (CIPA DCG-001). Some makers convert the longer side instead, which differs by 4 % for sensors
+# of 4:3; the rest of the uncertainty is rounding, distortion and a small crop.
 DIAGONAL_35MM = math.hypot(36, 24)
 FOCAL_35MM_UNCERTAINTY = 0.10
 TOP_DOWN = "no ROWORDER in the header: its first row is the highest here, not the lowest as the standard recommends"
 
 
 class Reading(NamedTuple):
-    """One reading of a picture: the pixels as they would be viewed, the solver for its field, and what it assumes."""
+    """One reading of a picture: its pixels as they would be viewed, the solver for its field, and its assumption."""
 
     pixels: NDArray
     solver: Solver
@@ -51,7 +50,7 @@ class Reading(NamedTuple):
 
 
 class SolvedReading(NamedTuple):
-    """The hypothesis that was solved, or else the first one, with its report and tracker; all hypotheses."""
+    """The hypothesis that was solved, or else the first one, with its report and tracker; and all hypotheses."""
 
     hypothesis: Reading
     report: Report
@@ -72,8 +71,8 @@ def solve(
     Parameters
     ----------
     fov_deg
-        Horizontal field of view to 5 %; if neither it nor `camera` is given, the field that
-        EXIF tells, and 2 to 100 degrees
+        Horizontal field of view to 5 %; if neither it nor `camera` is given, the field by EXIF
+        and fields of 2 to 100 degrees are tried
     camera
         A scene, a camera file or an OpenCV calibration in place of fov_deg
     time_utc
@@ -119,7 +118,9 @@ def pictures_in(paths: Iterable[Path]) -> list[Path]:
             if child.name[0] != "." and not child.name.endswith(ANNOTATED)
         ]
         if not names:
-            raise InputError(path, "a folder without images", ", ".join(images.IMAGE_SUFFIXES))
+            raise InputError(
+                path, "a folder without images", ", ".join(images.IMAGE_SUFFIXES)
+            )
         found += names
     return found
 
@@ -127,7 +128,7 @@ def pictures_in(paths: Iterable[Path]) -> list[Path]:
 def annotated_paths(folder: Path, paths: list[Path]) -> list[Path]:
     """Paths of the annotated images: named as the pictures, with another suffix.
 
-    If two pictures differ in suffix only, the suffix stays in the name; if they have one name, a number is appended.
+    If two pictures differ only in suffix, the suffix stays in the name; if they have the same name, a number is added.
     """
     stems = [stem_of(path) for path in paths]
     names = [
@@ -151,7 +152,7 @@ def solve_file(path: Path, solver: Solver, annotated: Path | None) -> dict[str, 
     """Solve one file and return the fields of `skysim solve --json`. Writes the annotated PNG if `annotated` is given.
 
     An unreadable image does not raise, so that the files after it are still solved: its error line becomes `status`,
-    and `bad_input` is true (for the exit code). `warning` says why the header's date was ignored, if it was.
+    and `bad_input` is true (for the exit code). `warning` is the reason if the header's date was ignored.
     """
     try:
         return read_and_solve(path, solver, annotated)
@@ -165,7 +166,7 @@ def blank_result(path: Path) -> dict[str, Any]:
 
 
 def read_and_solve(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
-    """`solve_file`, which raises InputError for an unreadable image."""
+    """As `solve_file`, but raise InputError for an unreadable image."""
     result = blank_result(path)
     begin = time.perf_counter()
     try:
@@ -215,7 +216,8 @@ def check_image(path: Path, image: NDArray, solver: Solver) -> None:
     bits = camera.detector.bits if camera.detector else 0
     if image.dtype == np.uint8 and bits > 8:
         raise InputError(
-            path, f"an 8-bit image; this camera's have {bits} bits, in 16-bit FITS, PNG or TIFF"
+            path,
+            f"an 8-bit image; this camera's have {bits} bits, in 16-bit FITS, PNG or TIFF",
         )
     height_px, width_px = image.shape[:2]
     model = camera.model
@@ -231,9 +233,10 @@ def solve_picture(
 ) -> SolvedReading:
     """Solve the hypotheses about a monochrome picture in turn, up to the first that is solved."""
     tried = hypotheses(picture, solver)
-    # those of a reading serve all fields of view
     outcomes = []
-    centroids = dict[int, Centroids]()
+    centroids = dict[
+        int, Centroids
+    ]()  # by the pixels of a reading; they serve all fields of view
     for hypothesis in tried:
         reading = id(hypothesis.pixels)
         solved = solve_array(
@@ -252,7 +255,7 @@ def solve_again(
     """The first hypothesis that is solved by other centroids of its picture (`retries`), if any."""
     camera = refused[0].hypothesis.solver.camera
     if camera and camera.detector:
-        return None  # a frame of a camera that is known, with its own saturation
+        return None  # the camera is known with its saturation: its frames need no retries
     for pixels in {
         id(one.hypothesis.pixels): one.hypothesis.pixels for one in refused
     }.values():
@@ -277,9 +280,9 @@ def solve_again(
 
 
 def hypotheses(picture: images.ViewedImage, solver: Solver) -> list[Reading]:
-    """What a picture may show, the likeliest first: its field by EXIF, or an unknown one; both row orders, if unknown.
+    """Hypotheses about a picture, likeliest first: field by EXIF or unknown; both row orders, if the order is unknown.
 
-    A field or a camera of the user's takes precedence over EXIF.
+    A field or a camera given by the user takes precedence over EXIF.
     """
     height_px, width_px = picture.pixels.shape
     solvers = [solver]
@@ -304,7 +307,7 @@ def hypotheses(picture: images.ViewedImage, solver: Solver) -> list[Reading]:
 def outcome_fields(
     outcome: SolvedReading, date_utc: datetime.datetime | None
 ) -> dict[str, Any]:
-    """The fields of PlateSolution: what was seen and tried, the solution, or the likely cause of a refusal."""
+    """The fields of PlateSolution: image statistics, tried fields, and solution or likely cause of the refusal."""
     report = outcome.report
     (pixels, solver, assumption) = outcome.hypothesis
     height_px, width_px = pixels.shape
@@ -322,5 +325,27 @@ def outcome_fields(
     from skysim.apps.plate_solver import diagnosis
 
     rows_known = len({id(one.pixels) for one in outcome.tried}) == 1
-    refusal = diagnosis.Refusal(pixels, report.centroids, tuple(solvers), date_utc, rows_known)
+    refusal = diagnosis.Refusal(
+        pixels, report.centroids, tuple(solvers), date_utc, rows_known
+    )
     return seen | {"hint": diagnosis.likely_cause(refusal)}
+
+
+def annotated_image(
+    image: NDArray, report: Report, tracker: StarTracker
+) -> NDArray[np.uint8]:
+    """The image annotated with detections, matched stars and their numbers."""
+    from skysim.results.plots import annotate
+
+    match = report.attitude.match
+    detected_px = report.centroids.xy_px
+    if match is None:
+        return annotate(image, detected_px, np.empty((0, 2)))
+    names = [star_name(int(tracker.stars.id[star])) for star in match.star]
+    return annotate(image, detected_px, detected_px[match.observed], names)
+
+
+def star_name(number: int) -> str:
+    """Name of a star by its number in a catalog of skysim (see `skysim.sources.catalog.Catalog`)."""
+    millions, rest = divmod(number, 1_000_000)
+    return f"{('HIP', 'HD', 'Gaia')[min(millions, 2)]} {rest}"

@@ -1,10 +1,10 @@
-"""Other centroids of a picture that was refused: of its halves, without its clouds, of trails, with its pixels binned.
+"""Other centroids of a refused picture: of its halves, without its clouds, of trails, and of binned pixels.
 
-Trees, roofs and street lamps are at one side of a picture, and there may be more of their lights than stars: one half
-may show the sky alone. Clouds and twilight change the sky within a tile of the detector's background, which takes that
-for noise; a top-hat filter removes all that is larger than stars. Noise breaks faint star trails into pieces; the
-streak that binned pixels show joins them. All retries together, twenty at most, add no more than two hundredths to the
-accepted chance of a false match, as each has EXTRA_TRIES times the bar; they use the quick searches.
+Trees, roofs and street lamps are at one side of a picture and may have more lights than there are stars; one half may
+show only sky. Clouds and twilight vary within a tile of the detector's background, which takes this variation for
+noise; a top-hat filter removes everything larger than stars. Noise breaks faint star trails into pieces; the streak
+found in binned pixels joins them. Each retry counts as EXTRA_TRIES tries, so all retries together, twenty at most, add
+no more than two hundredths to the accepted chance of a false match. They use the quick searches.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 # Centroids of a picture whose stars are large: out of focus, or blurred by motion.
 
 
-FACTORS = (8, 4, 2)  # sides of the squares: the most reduced picture is the fastest
-MIN_SIDE_PX = 200  # of a binned picture
-# of so many lights of the binned picture the median area; a sharp star has 10
+FACTORS = (8, 4, 2)  # sides of the binned squares; the most reduced picture is the fastest
+MIN_SIDE_PX = 200  # least side of a binned picture
+# Least median area of so many lights of the binned picture; a sharp star has 10 pixels.
 BRIGHTEST = 12
 MIN_AREA_PX = 30
-MAX_SIGMA_PX = 20.0  # that `Centroids.check_values` allows
+MAX_SIGMA_PX = 20.0  # greatest error that `Centroids.check_values` allows
 
 
 def large_lights(image: NDArray, settings: Settings) -> Iterator[tuple[int, Centroids]]:
@@ -58,12 +58,12 @@ def large_lights(image: NDArray, settings: Settings) -> Iterator[tuple[int, Cent
                     detect_and_centroid(small, camera, settings, Clock()), factor, settings
                 ),
             )
-        except ImageError:  # nothing is left, or there are thousands of lights
+        except ImageError:  # there are no lights, or thousands
             continue
 
 
 def bin_pixels(image: NDArray, factor: int) -> NDArray[np.uint16]:
-    """The means of squares of pixels, spread over 16 bits; what is left over at the right and below is cut off."""
+    """The means of squares of pixels, scaled to 16 bits; incomplete squares at the right and below are cut off."""
     height, width = (side // factor for side in image.shape)
     light = image[: height * factor, : width * factor].astype(np.float32)
     small = cv2.resize(light, (width, height), interpolation=cv2.INTER_AREA)
@@ -73,7 +73,7 @@ def bin_pixels(image: NDArray, factor: int) -> NDArray[np.uint16]:
 
 
 def enlarged(centroids: Centroids, factor: int, settings: Settings) -> Centroids:
-    """Centroids of a binned picture in pixels of the picture itself; the floor of their errors is in binned pixels."""
+    """Centroids of a binned picture in pixels of the original; the floor of their errors is in binned pixels."""
     floor_px2 = settings.centroid_sigma_px**2 * np.eye(2)
     out = replace(
         centroids,
@@ -92,21 +92,23 @@ def camera_of(pixels: NDArray) -> Camera:
 
 
 EXTRA_TRIES = 1000
-MIN_LIGHTS = 10  # in a half: fewer were searched in all combinations with the others
-# searches of a half; of the upper one, the likeliest, and of other centroids
+MIN_LIGHTS = (
+    10  # least lights of a half; fewer were searched in all combinations with the others
+)
+# Number of searches of a half; of the upper half, the likeliest, and of other centroids.
 EFFORTS = 1
 MORE_EFFORTS = 2
 UNEVEN = (
     2.0  # least ratio of the 90 % to the 10 % quantile of the noise of the background's tiles
 )
-TOPHAT_PX = 15  # wider than a sharp star
-# sides of the squares; shorter trails are seen as one
+TOPHAT_PX = 15  # width of the filter, more than that of a sharp star
+# Sides of the binned squares. Trails shorter than MIN_TRAIL_PX are found without binning.
 TRAIL_FACTORS = (3, 2, 4)
 MIN_TRAIL_PX = 10.0
-# Streak of sharp stars: what is left of the edges of trees is parallel, as streaks are.
+# Streak for sharp stars, because remains of the edges of trees are parallel, as streaks are.
 ROUND = (0.0, 0.0)
 FLAT_SIGMA_PX = (
-    0.25  # of their centroids: JPEG has removed a part of what is faint beside clouds
+    0.25  # least error of their centroids: JPEG has removed faint light beside clouds
 )
 FLAT = "its stars were found without its clouds"
 HALF = "its stars were found in its {} half alone"
@@ -115,7 +117,7 @@ BINNED = "its lights are large: they were found in the picture binned {0}x{0}"
 
 
 class Retry(NamedTuple):
-    """What is tried, the number of searches, the centroids; `upper_half` as in `solver.Solver`."""
+    """A note on what is tried, the number of searches, the centroids; `upper_half` as in `solver.Solver`."""
 
     note: str
     efforts: int
@@ -137,7 +139,7 @@ def retries(pixels: NDArray, centroids: Centroids, settings: Settings) -> Iterat
 
 
 def halves(pixels: NDArray, centroids: Centroids, note: str) -> Iterator[Retry]:
-    """The halves of a picture, as `retries`; `note` is put before what is tried."""
+    """The halves of a picture as retries; `note` is put before their own notes."""
     middle = (np.array(pixels.shape[::-1]) - 1) / 2
     right, low = (centroids.xy_px > middle).T
     for side, inside in (("upper", ~low), ("lower", low), ("left", ~right), ("right", right)):
@@ -152,9 +154,9 @@ def halves(pixels: NDArray, centroids: Centroids, note: str) -> Iterator[Retry]:
 def trails(pixels: NDArray, settings: Settings) -> Iterator[Centroids]:
     """The centroids of star trails, detected along the streak that the picture's binned blobs share.
 
-    Noise breaks a long faint trail into pieces, of which most blobs are then, so that their common streak is too short.
-    The mean of n^2 pixels has n times the signal-to-noise ratio, and the trail is one piece there. With its streak the
-    detector adds up the light along each trail in the pixels themselves.
+    Noise breaks a long faint trail into pieces. Most blobs then are pieces, and their common streak is too short. The
+    mean of n^2 pixels has n times the signal-to-noise ratio, so the trail is one piece there. With its streak the
+    detector adds up the light along each trail in the original pixels.
     """
     camera = camera_of(pixels)
     for factor in TRAIL_FACTORS:
@@ -170,12 +172,14 @@ def trails(pixels: NDArray, settings: Settings) -> Iterator[Centroids]:
 
 
 def without_clouds(pixels: NDArray, settings: Settings) -> Centroids:
-    """The centroids of a picture without what is wider than stars; none if its noise is even."""
+    """The centroids of a picture from which all that is wider than stars is removed; none if its noise is uniform."""
     noise = estimate_background(to_native(pixels)).noise
     if np.quantile(noise, 0.9) < UNEVEN * np.quantile(noise, 0.1):
         return Centroids.empty()
     light = cv2.GaussianBlur(bin_pixels(pixels, 1), (0, 0), 0.5)
-    flat = cv2.morphologyEx(light, cv2.MORPH_TOPHAT, np.ones((TOPHAT_PX, TOPHAT_PX), np.uint8))
+    flat = cv2.morphologyEx(
+        light, cv2.MORPH_TOPHAT, np.ones((TOPHAT_PX, TOPHAT_PX), np.uint8)
+    )
     try:
         # The edges of trees leave as many lights as there are stars.
         more = replace(settings, max_blobs=2 * settings.max_blobs)

@@ -36,7 +36,8 @@ from estimator.core.types import Attitude, Centroids, ra_dec_roll_rad
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_centroid
 from estimator.trackers.refinement import NO_MATCH
-from estimator.trackers.star_tracker import QUAD_SEARCHES, StarTracker
+from estimator.trackers.search_models import QUAD_SEARCHES
+from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import CATALOGS
 from skysim.core.time import check_year
@@ -61,8 +62,8 @@ class FieldSearch:
     """Options of the search over unknown horizontal fields of view.
 
     A range is as wide as the codes of quads allow: a focal length wrong by the fraction u changes the code of stars at
-    the angle a from the boresight by up to 2 u sin^2 a (`quads._code_gate`). In narrow fields that is nothing, and the
-    lengths of an index's quads, in units of the field's height, limit the range.
+    the angle a from the boresight by up to 2 u sin^2 a (`star_quads._code_gate`). In narrow fields this is negligible,
+    and the lengths of an index's quads, in units of the field's height, limit the range.
 
     Attributes
     ----------
@@ -73,9 +74,9 @@ class FieldSearch:
     max_uncertainty
         Greatest relative half-width of a range of focal lengths
     max_warp
-        Greatest u sin^2 a, a of the corner
+        Greatest u sin^2 a, with the angle a of the corner
     overlap
-        Of neighboring ranges, as a fraction of the focal length
+        Overlap of neighboring ranges, as a fraction of the focal length
     stars
         Mean number of catalog stars in the narrowest field of a tracker
     least_stars
@@ -83,9 +84,9 @@ class FieldSearch:
     decisive_log10_chance
         A solution below this ends the search without trying other fields of view
     margin_dex
-        By which a solution must beat those with another attitude
+        Difference by which a solution must beat those with another attitude
     same_attitude_rad
-        Solutions that differ by less than this are the same
+        Angle below which two solutions are the same
     """
 
     widest_deg: float = 100.0
@@ -108,8 +109,8 @@ class FieldSearch:
         )
         diagonal2 = (
             1 + (height_px / width_px) ** 2
-        )  # of half the image, in units of half its width
-        while tangent > narrowest:  # of the half field at the lower end of a range
+        )  # square of the half diagonal, in units of half the width
+        while tangent > narrowest:  # tangent of the half field at the lower end of a range
             corner2 = diagonal2 * tangent**2
             uncertainty = min(self.max_uncertainty, self.max_warp * (1 + corner2) / corner2)
             # A focal length f covers f (1 - u) to f (1 + u).
@@ -130,11 +131,11 @@ class KnownCamera(NamedTuple):
     Attributes
     ----------
     model
-        Where its pixels point
+        Model of its pixels' directions
     uncertainty
-        Relative, of its focal length
+        Relative uncertainty of its focal length
     detector
-        Its detector; None if a calibration alone is known
+        Its detector; None if only a calibration is known
     """
 
     model: Camera
@@ -144,22 +145,24 @@ class KnownCamera(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Solver:
-    """Settings of the plate solver: a field of view known to 5 %, or a camera known exactly or by calibration; with
-    neither, `search` says which fields are tried.
+    """Settings of the plate solver.
+
+    Either a field of view is known to 5 %, or a camera exactly or by calibration; with neither, `search` defines the
+    fields that are tried.
 
     Attributes
     ----------
     time_utc
-        When the images were taken; None takes the date of each FITS header. Without any date
-        the epoch is 2020, and stellar aberration (20") is left out because its direction
-        depends on the season.
+        Time at which the images were taken; None takes the date of each FITS header. Without any
+        date the epoch is 2020, and stellar aberration (20") is left out because its direction
+        depends on the season
     fov_uncertainty
-        Relative, of the focal length that follows from fov_deg
+        Relative uncertainty of the focal length that follows from fov_deg
     hypotheses
         Number of alternative readings of one picture that are solved in turn
     upper_half
-        Whether the centroids are of the upper half alone: the trackers' field then is that
-        half, with quads of its height, and no star counts as missing in the lower half
+        Whether the centroids are only of the upper half: the trackers' field then is that half,
+        with quads of its height, and no star counts as missing in the lower half
     tracker_cache
         The trackers for the last image size and date, by camera and uncertainty
     """
@@ -275,7 +278,7 @@ def make_solver(
     stages
         Names of algorithms by stage (`check_stages`); the tracker's defaults for the others
     catalog
-        Name or file of a star catalog; the shipped one to V 6.5 if left out
+        Name or file of a star catalog; the shipped one, CATALOG, if left out
     """
     low, high = FOV_LIMITS_DEG
     if fov_deg is not None and camera_file is not None:
@@ -302,9 +305,9 @@ def kept_solver(
     time_utc: datetime.datetime | None = None,
     stages: tuple[tuple[str, str], ...] = (),
 ) -> Solver:
-    """The solver of `make_solver` with the shipped catalog, kept with its trackers for the next picture.
+    """The solver of `make_solver` with the shipped catalog, cached with its trackers for the next picture.
 
-    To index the fields of view from 2 to 100 degrees takes longer than to solve a picture.
+    Indexing the fields of view from 2 to 100 degrees takes longer than solving a picture.
 
     Parameters
     ----------
@@ -333,7 +336,7 @@ def read_camera(path: Path) -> tuple[KnownCamera, Settings]:
     camera
         The camera of the images
     settings
-        Those of a tracker for it: the defaults, with the detector's gain and saturation if it is known
+        Settings of its tracker: the defaults, with the detector's gain and saturation if known
 
     Raises
     ------
@@ -371,7 +374,9 @@ def read_catalog(name: str | None) -> star_catalog.StarCatalog:
         ) from None
 
 
-def validated_date(date_utc: datetime.datetime | None) -> tuple[datetime.datetime | None, str]:
+def validated_date(
+    date_utc: datetime.datetime | None,
+) -> tuple[datetime.datetime | None, str]:
     """Return (date in UTC, ""), or (None, reason) for a date outside the supported range; (None, "") without a date."""
     try:
         return (check_year(date_utc) if date_utc else None), ""
@@ -391,22 +396,22 @@ def solve_array(
     Parameters
     ----------
     date_utc
-        None if unknown
+        Date of the image; None if unknown
     centroids
-        Of this image, if they are known
+        Centroids of this image, if they are known
     efforts
-        See `solve_centroids`
+        As in `solve_centroids`
     """
     height_px, width_px = image.shape
     first = next(solver.trackers(width_px, height_px, date_utc))
     clock = Clock()
-    if centroids is None:  # of the camera only the size is used
+    if centroids is None:  # only the size of the camera is used
         centroids = detect_and_centroid(image, first.camera, solver.settings, clock)
     attitude, tracker = solve_centroids(
         centroids, solver, (width_px, height_px), date_utc, clock, efforts
     )
     if attitude.camera:
-        # The picture's, of a half.
+        # Of a half, the camera of the whole picture.
         attitude = replace(attitude, camera=replace(attitude.camera, height_px=height_px))
     return Report(attitude, centroids, clock.seconds), tracker
 
@@ -470,7 +475,7 @@ def best_attitude(
     if not solutions:
         return attitude, tracker
     best, best_tracker = min(solutions, key=lambda solution: log10_chance(solution[0]))
-    # The same attitude from neighboring trackers, whose ranges overlap, is no rival.
+    # The same attitude from neighboring trackers, whose ranges overlap, is not a rival.
     rivals = [log10_chance(other) for other, _ in solutions if not same_attitude(other, best)]
     threshold = ACCEPT_LOG10_CHANCE - math.log10(tries)  # Bonferroni correction
     significant = log10_chance(best) <= min(
@@ -514,7 +519,7 @@ def same_attitude(first: Attitude, second: Attitude) -> bool:
     )
 
 
-# The solution of a plate: its fields for Python and JSON, and the annotated image.
+# The solution of a plate: its fields for Python and JSON.
 
 
 @dataclass(frozen=True, slots=True)
@@ -542,8 +547,7 @@ class PlateSolution:
     catalog_limit_mag
         V magnitude of the faintest stars of the catalog
     hint
-        Of a refusal, the likely cause and what to do; of a solution, an assumption about the
-        file
+        Likely cause of a refusal and a remedy, or an assumption about a solved file
     """
 
     status: str = ""
@@ -568,7 +572,9 @@ def solution_fields(report: Report) -> dict[str, Any]:
     assert attitude.match is not None
     camera = attitude.camera
     assert camera is not None
-    ra, dec, roll = np.degrees(ra_dec_roll_rad(center_from_cam(camera) * attitude.cam_from_ref))
+    ra, dec, roll = np.degrees(
+        ra_dec_roll_rad(center_from_cam(camera) * attitude.cam_from_ref)
+    )
     return {
         "ra_deg": float(ra),
         "dec_deg": float(dec),
@@ -590,21 +596,3 @@ def center_from_cam(camera: Camera) -> Rotation:
     x = np.cross(below - z, z)
     x /= np.linalg.norm(x)
     return Rotation.from_matrix(np.array([x, np.cross(z, x), z]))
-
-
-def annotated_image(image: NDArray, report: Report, tracker: StarTracker) -> NDArray[np.uint8]:
-    """The image annotated with detections, matched stars and their numbers."""
-    from skysim.results.plots import annotate
-
-    match = report.attitude.match
-    detected_px = report.centroids.xy_px
-    if match is None:
-        return annotate(image, detected_px, np.empty((0, 2)))
-    names = [star_name(int(tracker.stars.id[star])) for star in match.star]
-    return annotate(image, detected_px, detected_px[match.observed], names)
-
-
-def star_name(number: int) -> str:
-    """Name of a star by its number in a catalog of skysim (see `skysim.sources.catalog.Catalog`)."""
-    millions, rest = divmod(number, 1_000_000)
-    return f"{('HIP', 'HD', 'Gaia')[min(millions, 2)]} {rest}"

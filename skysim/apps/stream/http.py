@@ -21,9 +21,9 @@ from skysim.core.errors import InputError
 from skysim.results.plots import jpeg, to_8bit
 
 BOUNDARY = "frame"
-SOCKET_TIMEOUT_S = 10.0  # for a client that stops reading
-FINISH_TIMEOUT_S = 5.0  # for clients to take the last frame at the end
-KEPT_DISCONNECTED = 20  # disconnected clients with their own counters
+SOCKET_TIMEOUT_S = 10.0  # timeout of a client that stops reading
+FINISH_TIMEOUT_S = 5.0  # time for clients to take the last frame
+KEPT_DISCONNECTED = 20  # maximum number of disconnected clients with their own counters
 INDEX = b"""<!doctype html><meta charset="utf-8"><title>skysim stream</title>
 <body style="margin:0;background:#0d1015;color:#8b95a5;font:13px system-ui"><img src="/stream.mjpg" style="width:100%">
 <p style="padding:0 12px">/stream.mjpg, /stream.raw, /frame.png, /frame.raw, /truth.json, /status.json</p>"""
@@ -43,11 +43,11 @@ class FrameHub:
     Attributes
     ----------
     sender_status
-        Returns the sender's counters
+        Function that returns the sender's counters
     clients
-        Connected clients, and the last KEPT_DISCONNECTED that have disconnected
+        Connected clients, and the last KEPT_DISCONNECTED disconnected ones
     earlier
-        Number of clients that disconnected before those, and the sums of their counters
+        Number of clients that disconnected before, and the sums of their counters
     """
 
     def __init__(self, sender_status: Callable[[], dict[str, Any]]) -> None:
@@ -109,7 +109,7 @@ class FrameHub:
 
 
 class Handler(BaseHTTPRequestHandler):
-    """Request handler of one client. A slow client skips frames; `dropped` in the header says how many so far."""
+    """Request handler of one client. A slow client skips frames; `dropped` in the header counts them."""
 
     hub: FrameHub
     timeout = SOCKET_TIMEOUT_S

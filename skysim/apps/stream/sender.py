@@ -68,9 +68,9 @@ class SenderStats:
     Attributes
     ----------
     rendered, dropped
-        Numbers of frames
+        Numbers of rendered and of dropped frames
     late_ms
-        Delay from the end of the exposure to the frame being ready, of the newest DELAY_WINDOW
+        Delays from the end of the exposure until the frame is ready, for the newest DELAY_WINDOW
         frames
     """
 
@@ -121,7 +121,7 @@ def send(
     Parameters
     ----------
     publish
-        Also called with each packet
+        Function that is also called with each packet
     """
     scene = flight.lab.scene
     may_drop = scene.filter is None
@@ -132,7 +132,7 @@ def send(
         window = exposure_window(scene, frame.index, frame.exposure_s)
         end_s = window.close_s(
             scene.camera.height_px
-        )  # with a rolling shutter, of the last row
+        )  # with a rolling shutter, the end of the last row's exposure
         if pace.zero_s is None:
             pace.start(end_s)  # so that the first frame has no delay
         pace.wait(end_s)
@@ -147,4 +147,6 @@ def send(
         stats.record(1e3 * (now_s - due_s), dropped)
         if sinks and not publish and all(sink.fault for sink in sinks):
             return
-    stats.dropped = scene.exposure.frames - stats.rendered  # and those after the last rendered
+    stats.dropped = (
+        scene.exposure.frames - stats.rendered
+    )  # including those after the last rendered one

@@ -1,5 +1,8 @@
-"""Sinks of a stream: a folder or a pipe. Each writes in its own thread behind a short queue and never delays the
-simulation: packets that do not fit into the queue are dropped and counted."""
+"""Sinks of a stream: a folder or a pipe.
+
+Each writes in its own thread behind a short queue and never delays the simulation: packets that do not fit into the
+queue are dropped and counted.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ from skysim.simulation.flight import Shot
 # Wire format of a frame: a header as one line of JSON, then the raw pixels.
 
 
-# limits for the reader
+# Limits for the reader.
 MAX_HEADER_BYTES = 1 << 16
 MAX_PIXELS = 1 << 28
 
@@ -37,12 +40,12 @@ class Packet(NamedTuple):
     Attributes
     ----------
     header
-        What a tracker may use. index, t_s (mid-exposure since the scene's start), exposure_s,
+        Data that a tracker may use: index, t_s (mid-exposure since the scene's start), exposure_s,
         width, height, dtype (numpy's, little-endian), bytes (of the pixels), due_unix_s and
         made_unix_s (wall-clock times at which the exposure ended and the frame was ready),
         dropped (frames dropped before this one)
     pixels
-        (H, W)
+        (H, W) pixels
     truth
         cam_from_ref_xyzw (scalar last; ref: ICRS or the lab), rate_cam_rad_s, and ids, x_px,
         y_px of the lights on the detector
@@ -59,7 +62,9 @@ class Packet(NamedTuple):
 
     def plus_dropped(self, missed: int) -> Packet:
         """The same packet for a receiver that missed further frames: its header's `dropped` is that much larger."""
-        return self._replace(header=self.header | {"dropped": self.header["dropped"] + missed})
+        return self._replace(
+            header=self.header | {"dropped": self.header["dropped"] + missed}
+        )
 
     def pack(self) -> bytes:
         """Serialize: the header line, then the pixels row by row from the top."""
@@ -93,7 +98,9 @@ def build_packet(shot: Shot, due_unix_s: float, made_unix_s: float, dropped: int
         "dropped": dropped,
     }
     truth_values = {
-        "cam_from_ref_xyzw": np.roll(quaternion.from_rotation(truth.cam_from_lab), -1).tolist(),
+        "cam_from_ref_xyzw": np.roll(
+            quaternion.from_rotation(truth.cam_from_lab), -1
+        ).tolist(),
         "rate_cam_rad_s": truth.rate_cam_rad_s.tolist(),
         "ids": truth.sources.id.tolist(),
         "x_px": truth.sources.xy_px[:, 0].round(4).tolist(),
@@ -128,26 +135,28 @@ def unpack(stream: BinaryIO) -> tuple[dict[str, Any], NDArray[Any]] | None:
 
 
 QUEUE_LENGTH = 2  # length of a sink's queue, packets
-CLOSE_TIMEOUT_S = 5.0  # for a sink to write its queued packets at the end
+CLOSE_TIMEOUT_S = 5.0  # time for a sink to write its queued packets at the end
 READER_GONE = "the reader has closed the pipe"
 
 
 class Sink:
-    """A thread that passes packets to `write`, the oldest first.
+    """A thread that passes packets to `write`, oldest first.
 
     Attributes
     ----------
     sent, dropped
-        Packets so far
+        Numbers of packets so far
     fault
-        The error that stopped it, or ""
+        Error that stopped it, or ""
     """
 
     def __init__(self, name: str, write: Callable[[Packet], None]) -> None:
         self.name = name
         self.write = write
         self.sent = self.dropped = 0
-        self.busy = False  # writing a packet that is counted neither as sent nor as dropped yet
+        self.busy = (
+            False  # writing a packet that is counted neither as sent nor as dropped yet
+        )
         self.fault = ""
         self.packets: queue.Queue[Packet | None] = queue.Queue(QUEUE_LENGTH)
         self.thread = threading.Thread(target=self.run, name=f"sink {name}", daemon=True)
@@ -164,9 +173,7 @@ class Sink:
             except OSError as error:
                 file = f"{error.filename}: " if error.filename else ""
                 self.fault = file + (error.strerror or str(error))
-            except (
-                Exception
-            ) as error:  # a dead thread without `fault` would block a patient offer() for ever
+            except Exception as error:  # a dead thread without `fault` would block a patient offer() for ever
                 self.fault = printable(f"{type(error).__name__}: {error}")
             if self.fault:
                 self.dropped += 1
@@ -232,9 +239,9 @@ def encode_png(packet: Packet) -> bytes:
 
 
 def pipe_writer(path: str) -> Callable[[Packet], None]:
-    """Return a function that writes packets, as `packet.unpack` reads them, to standard output (-) or a named pipe.
+    """Return a function that writes packets, as `unpack` reads them, to standard output (-) or a named pipe.
 
-    The pipe is opened at the first packet, which blocks until a reader opens it. Raises InputError if it is no pipe.
+    The pipe is opened at the first packet, which blocks until a reader opens it. Raises InputError if it is not a pipe.
     """
     if path != "-" and not Path(path).is_fifo():
         raise InputError(f"--pipe {path}", "not a named pipe", "- or a pipe made by mkfifo")

@@ -55,7 +55,9 @@ def air_glow(config: AirGlowConfig, sky: Sky, view: ViewingGeometry) -> Floats:
 def seen_place(name: str, sky: Sky) -> Place:
     """The place of a body over the site, raised by refraction."""
     at = place(name, observe_from(sky.time, sky.air.site))
-    return at._replace(direction=sky.air.refraction.apparent(at.direction[None], sky.zenith)[0])
+    return at._replace(
+        direction=sky.air.refraction.apparent(at.direction[None], sky.zenith)[0]
+    )
 
 
 def diffuse_air_mass(zenith_rad: Floats | float) -> Floats:
@@ -67,7 +69,9 @@ def diffuse_air_mass(zenith_rad: Floats | float) -> Floats:
     return np.asarray((1 - 0.96 * np.sin(zenith_rad) ** 2) ** -0.5)
 
 
-def airglow_nl(zenith_mag_arcsec2: float, zenith_rad: Floats, extinction_mag: float) -> Floats:
+def airglow_nl(
+    zenith_mag_arcsec2: float, zenith_rad: Floats, extinction_mag: float
+) -> Floats:
     """Brightness of the moonless sky in nanolamberts: brighter toward the horizon, then extinct (KS91 eq. 2).
 
     B(Z) = B(0) X 10^(-0.4 k (X - 1)). All of the sky's light, with zodiacal light and starlight, is taken as airglow.

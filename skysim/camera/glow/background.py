@@ -26,7 +26,7 @@ from skysim.camera.optics import Optics, radial, tangential
 from skysim.core.jit import jit
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.light import (
+from skysim.scene.sections.surroundings import (
     FaintStarsGlowConfig,
     Glow,
     MoonGlowConfig,
@@ -71,9 +71,8 @@ def faint_starlight_s10(galactic_latitude_deg: Floats, fainter_than_mag: float) 
     peak = slope / (2 * CURVATURE)
     # The part of the integral beyond the limit.
     beyond = erfc(np.sqrt(CURVATURE) * (fainter_than_mag - 10 - peak))
-    return np.asarray(
-        np.exp(ln_light + CURVATURE * peak**2) * np.sqrt(np.pi / (4 * CURVATURE)) * beyond
-    )
+    whole = np.exp(ln_light + CURVATURE * peak**2) * np.sqrt(np.pi / (4 * CURVATURE))
+    return np.asarray(whole * beyond)
 
 
 def galactic_latitude_deg(direction_icrs: Floats) -> Floats:
@@ -123,11 +122,8 @@ class ViewingGeometry:
         angle w falls as cos^3: its distance grows as 1 / cos, squared, and it is inclined. With the vignetting V this
         is the cos^4 law of illumination. Distortion changes w, which is pixel_sr.
         """
-        return (
-            self.optics.collecting_m2
-            * self.optics.throughput(np.cos(self.field_rad))
-            * self.pixel_sr
-        )
+        throughput = self.optics.throughput(np.cos(self.field_rad))
+        return self.optics.collecting_m2 * throughput * self.pixel_sr
 
 
 def uniform_glow(config: UniformGlowConfig, view: ViewingGeometry) -> Floats:
@@ -150,9 +146,8 @@ def moon_glow(config: MoonGlowConfig, view: ViewingGeometry) -> Floats:
 
     The authors give the model an accuracy of 8 to 23 %, which is more than the air mass changes over a camera's field.
     """
-    to_moon_deg = angular_separation_deg(
-        view.toward_lab, direction(config.ra_deg, config.dec_deg)
-    )
+    moon = direction(config.ra_deg, config.dec_deg)
+    to_moon_deg = angular_separation_deg(view.toward_lab, moon)
     nanolamberts = moonlight_nl(
         to_moon_deg,
         config.phase_angle_deg,
@@ -191,9 +186,8 @@ def moonlight_through_nl(
     with the separation rho, the phase angle a and the extinction k in degrees and magnitudes, and the air masses X of
     the Moon and of the field (Krisciunas & Schaefer 1991, PASP 103, 1033: eqs 3, 15, 20).
     """
-    illuminance = 10 ** (
-        -0.4 * (3.84 + 0.026 * abs(phase_angle_deg) + 4e-9 * phase_angle_deg**4)
-    )
+    magnitude = 3.84 + 0.026 * abs(phase_angle_deg) + 4e-9 * phase_angle_deg**4
+    illuminance = 10 ** (-0.4 * magnitude)
     transmitted = 10 ** (-0.4 * extinction_mag * moon_masses)
     scattered = 1 - 10 ** (-0.4 * extinction_mag * field_masses)
     return np.asarray(scattering(separation_deg) * illuminance * transmitted * scattered)
@@ -233,18 +227,19 @@ def transmittance(
     angle_deg: float | Floats, table_deg: Sequence[float], pst: Sequence[float]
 ) -> Floats:
     """Interpolate the logarithm of a table of transmittances linearly; constant beyond its ends. Shape of angle_deg."""
-    return np.asarray(np.exp(np.interp(angle_deg, table_deg, np.log(np.maximum(pst, MIN_PST)))))
+    return np.asarray(
+        np.exp(np.interp(angle_deg, table_deg, np.log(np.maximum(pst, MIN_PST))))
+    )
 
 
 def faint_star_glow(config: FaintStarsGlowConfig, view: ViewingGeometry) -> Floats:
     """Light of the stars fainter than those that are drawn, by galactic latitude; the lab's axes are the ICRS."""
     s10 = faint_starlight_s10(galactic_latitude_deg(view.toward_lab), config.fainter_than_mag)
-    return (
-        float(sky_radiance_e_s_m2_sr(S10_MAG_ARCSEC2, view.band)) * s10 * view.etendue_m2_sr()
-    )
+    of_one = float(sky_radiance_e_s_m2_sr(S10_MAG_ARCSEC2, view.band))
+    return of_one * s10 * view.etendue_m2_sr()
 
 
-# Radiance models by kind. To add one, add a class to scene/sections/light.py and a function here.
+# Radiance models by kind. To add one, add a class to scene/sections/surroundings.py and a function here.
 BACKGROUNDS: dict[str, Callable[[Any, ViewingGeometry], Floats]] = {
     "uniform": uniform_glow,
     "sky": sky_glow,
@@ -258,7 +253,9 @@ def direction(ra_deg: float, dec_deg: float) -> Floats:
     """(3,) unit vector of a right ascension and declination."""
     ra = math.radians(ra_deg)
     dec = math.radians(dec_deg)
-    return np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
+    return np.array(
+        [math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)]
+    )
 
 
 def angular_separation_deg(vectors: Floats, vector: Floats) -> Floats:
@@ -279,7 +276,7 @@ def glow_map(
     # 1. Geometry of the nodes.
     if all(glow.kind in ("uniform", "stray") for glow in glows):
         shape = (1, 1)
-        (toward, pixel_sr) = pixel_directions(np.array([optics.camera.center_px]), optics)
+        toward, pixel_sr = pixel_directions(np.array([optics.camera.center_px]), optics)
     else:
         toward, pixel_sr, shape = node_directions(optics)
     view = viewing_geometry(toward, pixel_sr, optics, cam_from_lab, band)
@@ -300,15 +297,17 @@ def node_directions(optics: Optics) -> tuple[Floats, Floats, tuple[int, int]]:
 def nodes_px(camera: CameraConfig) -> tuple[Floats, tuple[int, int]]:
     """(h * w, 2) pixel positions of the nodes, row by row, and (h, w)."""
     spacing = min(MAX_NODE_SPACING_PX, max(MAX_NODE_SPACING_RAD * camera.focal_px, 1.0))
-    w, h = (math.ceil((size - 1) / spacing) + 1 for size in (camera.width_px, camera.height_px))
+    w, h = (
+        math.ceil((size - 1) / spacing) + 1 for size in (camera.width_px, camera.height_px)
+    )
     return even_grid_px(camera, w, h), (h, w)
 
 
 def even_grid_px(camera: CameraConfig, columns: int, rows: int) -> Floats:
     """(rows * columns, 2) pixel positions, evenly spread from corner to corner, row by row."""
-    x, y = np.meshgrid(
-        np.linspace(0, camera.width_px - 1, columns), np.linspace(0, camera.height_px - 1, rows)
-    )
+    across = np.linspace(0, camera.width_px - 1, columns)
+    down = np.linspace(0, camera.height_px - 1, rows)
+    x, y = np.meshgrid(across, down)
     return np.column_stack([x.ravel(), y.ravel()])
 
 

@@ -11,7 +11,12 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.glow.background import even_grid_px, fill, pixel_directions, viewing_geometry
+from skysim.camera.glow.background import (
+    even_grid_px,
+    fill,
+    pixel_directions,
+    viewing_geometry,
+)
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats
 from skysim.scene.sections import layouts, leds, light

@@ -82,7 +82,8 @@ def earth_light(
     # The angle between boresight and nadir, and the angular radius of Earth and airglow.
     boresight = cam_from_lab.inv().apply([0.0, 0.0, 1.0])
     distance_m = float(np.linalg.norm(observer_m))
-    from_nadir_rad = math.acos(max(min(float(-boresight @ observer_m) / distance_m, 1.0), -1.0))
+    cosine = float(-boresight @ observer_m) / distance_m
+    from_nadir_rad = math.acos(max(min(cosine, 1.0), -1.0))
     reach_rad = math.asin(min(LAYER[1] * EARTH_RADIUS_M / distance_m, 1.0))
     if from_nadir_rad > reach_rad + optics.field_rad:
         return None
@@ -96,7 +97,9 @@ def earth_light(
 def fine_directions(optics: Optics) -> tuple[Floats, Floats, tuple[int, int]]:
     """Viewing directions and solid angles of pixels at nodes NODE_PX apart, and the nodes' (h, w)."""
     camera = optics.camera
-    w, h = (math.ceil((size - 1) / NODE_PX) + 1 for size in (camera.width_px, camera.height_px))
+    w, h = (
+        math.ceil((size - 1) / NODE_PX) + 1 for size in (camera.width_px, camera.height_px)
+    )
     return *pixel_directions(even_grid_px(camera, w, h), optics), (h, w)
 
 
@@ -133,7 +136,8 @@ def stray_of_bodies_e_s_m2(
     directions = np.array([body.place.direction for body in bodies]).reshape(-1, 3)
     through = pst(baffle, directions, boresight)
     return {
-        body.title: body.flux_e_s_m2 * float(t) for body, t in zip(bodies, through, strict=True)
+        body.title: body.flux_e_s_m2 * float(t)
+        for body, t in zip(bodies, through, strict=True)
     }
 
 
@@ -159,7 +163,9 @@ def earth_around(
     ]
     in_cone, weights_sr = cone_rule(*edges)
     directions = in_cone @ axes_about(-observer_m / distance_m)
-    return directions, weights_sr * earth_radiance(config, observer_m, directions, sun_m, band)
+    return directions, weights_sr * earth_radiance(
+        config, observer_m, directions, sun_m, band
+    )
 
 
 def stray_around_e_s_m2(

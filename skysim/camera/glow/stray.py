@@ -48,10 +48,9 @@ def ghost_optics(optics: Optics, ghost: GhostConfig) -> ScaledOptics:
     camera = optics.camera.model_copy(update={"psf": blur})
     reach = (1 + ghost.radius_px / camera.corner_px) / abs(ghost.magnification)
     field_rad = math.atan(math.tan(optics.field_rad) * reach)
+    collecting_m2 = optics.collecting_m2 * ghost.share
     scale = -ghost.magnification * getattr(optics, "scale", 1.0)
-    return ScaledOptics(
-        camera, optics.collecting_m2 * ghost.share, optics.fold_r, field_rad, scale=scale
-    )
+    return ScaledOptics(camera, collecting_m2, optics.fold_r, field_rad, scale=scale)
 
 
 def as_ghosts(lights: SourceTruth, number: int) -> SourceTruth:
@@ -86,19 +85,21 @@ def add_glare(light_e: NDArray[Any], config: GlareConfig) -> None:
     height, width = (size // block for size in light_e.shape)
     coarse = light_e.reshape(height, block, width, block).mean(axis=(1, 3), dtype=float)
     # 2. Product with the transform of g.
-    spectrum = fft.dctn(coarse, type=2, norm="ortho") * transfer(config, (height, width), block)
+    spectrum = fft.dctn(coarse, type=2, norm="ortho") * transfer(
+        config, (height, width), block
+    )
     scattered = fft.idctn(spectrum, type=2, norm="ortho").astype(light_e.dtype)
     # 3. Back to pixels; `share` of the light is scattered.
+    fine = ndimage.zoom(scattered, block, order=1, mode="reflect", grid_mode=True)
     light_e *= 1 - config.share
-    light_e += config.share * ndimage.zoom(
-        scattered, block, order=1, mode="reflect", grid_mode=True
-    )
+    light_e += config.share * fine
 
 
 def block_px(shape: tuple[int, ...], core_px: float) -> int:
     """Side in pixels of the square blocks in which glare is computed: a divisor of both of the frame's sides."""
     common = math.gcd(*shape)
-    return max(n for n in range(1, max(int(core_px / BLOCKS), 1) + 1) if common % n == 0)
+    largest = max(int(core_px / BLOCKS), 1)
+    return max(n for n in range(1, largest + 1) if common % n == 0)
 
 
 @lru_cache(maxsize=4)
@@ -112,18 +113,17 @@ def transfer(config: GlareConfig, shape: tuple[int, int], block: int) -> Floats:
     scaled = config.core_px * np.hypot(rows[:, None], columns)
     # K_v is infinite at 0, where the limit of the product is 1.
     scaled[0, 0] = 1.0
-    values = 2 ** (1 - order) / special.gamma(order) * scaled**order * special.kv(order, scaled)
+    values = (
+        2 ** (1 - order) / special.gamma(order) * scaled**order * special.kv(order, scaled)
+    )
     values[0, 0] = 1.0
     return np.asarray(values)
 
 
 def without_glare(sources: SourceTruth, config: GlareConfig) -> SourceTruth:
     """The truth of images that lost the scattered fraction of their light."""
-    return replace(
-        sources,
-        electrons=(1 - config.share) * sources.electrons,
-        peak_e=(1 - config.share) * sources.peak_e,
-    )
+    kept = 1 - config.share
+    return replace(sources, electrons=kept * sources.electrons, peak_e=kept * sources.peak_e)
 
 
 # The light that a dome reflects: the glow of wall and floor, and images of LEDs in the wall.
@@ -170,7 +170,8 @@ def wall_glow(
         depth_m = camera_m[2] + dome.config.floor.depth_m
         floor_m = camera_m + meeting(few, depth_m)
         up = np.tile([0.0, 0.0, 1.0], (len(floor_m), 1))
-        axis_m = np.linalg.norm((camera_m + meeting(view.toward_lab, depth_m))[:, :2], axis=1)
+        met_m = camera_m + meeting(view.toward_lab, depth_m)
+        axis_m = np.linalg.norm(met_m[:, :2], axis=1)
         on_floor = ~seen & (axis_m < dome.config.floor.radius_m)
         floor_light = spread(dome.diffuse, floor_m, up, shape)
         radiance += on_floor * dome.config.floor.share * floor_light

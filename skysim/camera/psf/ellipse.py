@@ -88,27 +88,26 @@ def ellipse_box(psf: Psf, camera: CameraConfig, half: int) -> EllipseBox:
     """The tables of a box of 2 half + 1 pixels, with a margin for wings: step 1 of the module."""
     lens = PsfModel(psf, camera, 0.0, ())
     size = 2 * (half + ceil(lens.wing_margin_px())) + 1
-    level, per_wave = ACCURACY[bool(half <= POINT_LIKE * reach_px(psf, camera, 0.0, 0.0))]
+    point_like = bool(half <= POINT_LIKE * reach_px(psf, camera, 0.0, 0.0))
+    level, per_wave = ACCURACY[point_like]
     passed = passband(psf, camera, 0.0, level)
     # As many waves as the lens passes, and as many samples as they need.
     waves = min(ceil(passed * size) + 1, MAX_WAVES)
-    samples = max(2, min(ceil(per_wave * passband(psf, camera, 0.0, 1e-3)), 3072 // size))
+    needed = ceil(per_wave * passband(psf, camera, 0.0, 1e-3))
+    samples = max(2, min(needed, 3072 // size))
     f = np.arange(waves) / size
     # fy > 0 represents -fy too; fx = 0 is in both halves.
     weight = np.outer(np.where(f > 0, 1.0, 0.5), np.where(f > 0, 2.0, 1.0)) / size**2
     weight *= np.outer(np.sinc(f), np.sinc(f))
     # Lens and pixel at (fx, fy) and at (-fx, fy).
-    spectra = [
-        weight * lens.otf(fx, f[None, :], softening_sigma_px(passed, f[-1]))
-        for fx in (f[:, None], -f[:, None])
-    ]
+    softening_px = softening_sigma_px(passed, f[-1])
+    spectra = [weight * lens.otf(fx[:, None], f[None, :], softening_px) for fx in (f, -f)]
     # The waves at x = t + p / S.
     x = (np.arange(half + 1) + np.arange(samples)[:, None] / samples).ravel()
     phase = 2 * np.pi * np.outer(f, x)
     parts = [f, *map(np.real, spectra), *map(np.imag, spectra), np.cos(phase), np.sin(phase)]
-    return EllipseBox(
-        waves, samples, np.concatenate([part.ravel() for part in parts]).astype(np.float32)
-    )
+    table = np.concatenate([part.ravel() for part in parts])
+    return EllipseBox(waves, samples, table.astype(np.float32))
 
 
 @lru_cache(maxsize=1)
@@ -238,7 +237,9 @@ def product(a: Singles, b: Singles) -> Singles:
             w2 = a[k + 2, r]
             w3 = a[k + 3, r]
             for i in range(row.size):
-                row[i] += w0 * b[k, i] + w1 * b[k + 1, i] + w2 * b[k + 2, i] + w3 * b[k + 3, i]
+                row[i] += (
+                    w0 * b[k, i] + w1 * b[k + 1, i] + w2 * b[k + 2, i] + w3 * b[k + 3, i]
+                )
         for k in range(whole, len(a)):
             w = a[k, r]
             for i in range(row.size):
@@ -316,7 +317,9 @@ def unfold(parts: Singles, samples: int, half: int, disk: EllipseDisk) -> Single
                         row[middle - 1 - i] += odd0[left + i] - up * odd1[left + i]
                 # 1 + slope (position) of the disk's light; ringing below zero is cut.
                 light = np.float32(
-                    1 + disk.slope_x * (p / samples - middle) + disk.slope_y * (j + q / samples)
+                    1
+                    + disk.slope_x * (p / samples - middle)
+                    + disk.slope_y * (j + q / samples)
                 )
                 for i in range(size):
                     row[i] = max(row[i] * (light + slope * np.float32(i)), none)
@@ -402,8 +405,7 @@ def add_ellipse(
     bottom = min(center_y + half + 1, row1, height)
     if right <= left or bottom <= top:
         return
-    # Place of the first pixel among the samples, and the weights of the four samples on either
-    # axis.
+    # Place of the first pixel among the samples, and the weights of the four samples on either axis.
     at_x = (center_x - x) * samples
     at_y = (center_y - y) * samples
     first_x = floor(at_x)

@@ -71,22 +71,18 @@ class Kernel:
         """Distance in x or in y beyond which a pixel's center gets no light."""
         if len(self.grid):
             return self.grid.shape[2] / 2
-        return (
-            (len(self.radial) - 2) / PER_PX
-            if len(self.radial)
-            else REACH_SIGMA * self.sigma_px + 0.5
-        )
+        if len(self.radial):
+            return (len(self.radial) - 2) / PER_PX
+        return REACH_SIGMA * self.sigma_px + 0.5
 
     @property
     def peak(self) -> float:
         """Fraction of the light in the brightest pixel of a centered image."""
         if len(self.grid):
             return float(self.grid.max())
-        return float(
-            self.radial[0, 0]
-            if len(self.radial)
-            else special.erf(np.sqrt(0.125) / self.sigma_px) ** 2
-        )
+        if len(self.radial):
+            return float(self.radial[0, 0])
+        return float(special.erf(np.sqrt(0.125) / self.sigma_px) ** 2)
 
 
 def build_kernel(
@@ -150,7 +146,8 @@ class PsfModel:
         """The product of the factors' transfer functions, without the pixel's, times that of an extra Gaussian."""
         product = PSFS[self.psf.kind](self.psf, self.camera, fx, fy)
         sigma_px = float(np.hypot(self.sigma_px, extra_sigma_px))
-        product = product * blur(sigma_px, fx, fy) if sigma_px else product
+        if sigma_px:
+            product = product * blur(sigma_px, fx, fy)
         for radius in self.radii_px:
             product = product * uniform_disk(radius, fx, fy)
         return product
@@ -164,11 +161,9 @@ class PsfModel:
 
     def wing_margin_px(self) -> float:
         """Distance beyond the image to which wings must be followed so that aliasing is below 1e-4 of the peak."""
-        return (
-            2 * EXTENT[self.psf.kind](self.psf, self.camera)[0]
-            if self.psf.kind in WINGED
-            else 0.0
-        )
+        if self.psf.kind not in WINGED:
+            return 0.0
+        return 2 * EXTENT[self.psf.kind](self.psf, self.camera)[0]
 
 
 @lru_cache(maxsize=1024)
@@ -190,11 +185,9 @@ def softening_sigma_px(bandwidth: float, highest: float) -> float:
 
     exp(-2 pi^2 sigma^2 f^2) = OTF_FLOOR.
     """
-    return (
-        0.0
-        if bandwidth <= highest
-        else float(np.sqrt(-np.log(OTF_FLOOR) / 2) / (np.pi * highest))
-    )
+    if bandwidth <= highest:
+        return 0.0
+    return float(np.sqrt(-np.log(OTF_FLOOR) / 2) / (np.pi * highest))
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,8 +221,7 @@ def fourier_bessel_series(
     r = np.arange(round(reach_px * per_px) + 1) / per_px
     zeros = np.array([special.jn_zeros(n, int(2 * highest * box_px)) for n in HARMONICS])
     f = zeros / (2 * np.pi * box_px)
-    # The pixel's harmonics P_n: its transfer function sinc(fx) sinc(fy) on circles, projected on
-    # cos n theta.
+    # The pixel's harmonics P_n: its transfer function sinc(fx) sinc(fy) on circles, projected on cos n theta.
     angle = np.arange(256) * 2 * np.pi / 256
     square = np.sinc(f[..., None] * np.cos(angle)) * np.sinc(f[..., None] * np.sin(angle))
     weight = np.empty_like(f)
@@ -239,9 +231,8 @@ def fourier_bessel_series(
         harmonic = (square[k] * np.cos(n * angle)).mean(axis=1) * (2 if n else 1)
         weight[k] = harmonic / (np.pi * (box_px * special.jv(n + 1, zeros[k])) ** 2)
         # A spline of this step is within 2e-8 of J_n and ten times as fast.
-        matrix[k] = scipy.interpolate.CubicSpline(x, special.jv(n, x))(
-            np.outer(r, 2 * np.pi * f[k])
-        )
+        spline = scipy.interpolate.CubicSpline(x, special.jv(n, x))
+        matrix[k] = spline(np.outer(r, 2 * np.pi * f[k]))
     return FourierBesselSeries(f, weight, matrix)
 
 
@@ -269,16 +260,13 @@ def round_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel | None:
     coarse = 4 if highest <= 4 else 1
     terms = fourier_bessel_series(box_px, table_px, highest, PER_PX // coarse)
     # 2. Sum the series.
-    spectrum = (
-        model.otf(terms.f, np.zeros(1), softening_sigma_px(highest_passed, highest))
-        * terms.weight
-    )
+    softening_px = softening_sigma_px(highest_passed, highest)
+    spectrum = model.otf(terms.f, np.zeros(1), softening_px) * terms.weight
     rows = int(reach * PER_PX / coarse) + 2
     count = int(reach * PER_PX) + 1
     products = zip(terms.matrix[:, :rows], spectrum.astype(np.float32), strict=True)
-    harmonics = interpolate_cubic(
-        np.array([matrix @ spectrum_n for matrix, spectrum_n in products], dtype=float), coarse
-    )[:, :count]
+    sums = np.array([matrix @ spectrum_n for matrix, spectrum_n in products], dtype=float)
+    harmonics = interpolate_cubic(sums, coarse)[:, :count]
     # 3.
     if np.abs(harmonics[2]).max() > min(MAX_T8[0] * harmonics[0].max(), MAX_T8[1]):
         return None
@@ -360,11 +348,8 @@ def grid_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel:
     # 2. The spectrum, the pixel's included, and its inverse transform.
     fx = fft.rfftfreq(samples * box, 1 / samples)[None, :]
     fy = fft.fftfreq(samples * box, 1 / samples)[:, None]
-    otf = (
-        model.otf(fx, fy, softening_sigma_px(highest_passed, 0.4 * samples))
-        * np.sinc(fx)
-        * np.sinc(fy)
-    )
+    softening_px = softening_sigma_px(highest_passed, 0.4 * samples)
+    otf = model.otf(fx, fy, softening_px) * np.sinc(fx) * np.sinc(fy)
     image = fft.irfft2(otf, s=(samples * box,) * 2)
     pixel = np.arange(size) - half
     position = np.arange(-1, samples + 2)
@@ -372,9 +357,8 @@ def grid_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel:
     index = (pixel * samples + samples // 2 - position[:, None]) % (samples * box)
     # Negative ringing is cut.
     tables = np.maximum(image[index[:, None, :, None], index[None, :, None, :]], 0)
-    return Kernel(
-        0.0, NO_RADIAL, (tables / tables.sum(axis=(2, 3), keepdims=True)).astype(np.float32)
-    )
+    normalized = tables / tables.sum(axis=(2, 3), keepdims=True)
+    return Kernel(0.0, NO_RADIAL, normalized.astype(np.float32))
 
 
 # Geometric images of the emitting disks of LEDs: ellipses in perspective, with light that varies across them.

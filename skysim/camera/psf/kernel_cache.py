@@ -136,86 +136,157 @@ def source_kernels(
         (N,) cosines of the angles from the boresight
     disks
         Geometric images of the disks, NaN for stars; None draws all disks round
-    blur_px
-        Standard deviation of a Gaussian blur of all sources
-    chromatic
-        (N, 4) as in `Sources`
+    blur_px, chromatic
+        Standard deviation of a Gaussian blur of all sources; (N, 4) as in `Sources`
 
     Raises
     ------
     InputError
         For a source too far out of focus.
     """
-    # 1. Gaussian blurs add in squares.
+    # 1.
+    sizes = source_sizes(
+        camera, xy_px, radius_m, is_led, distance_m, cos_field, blur_px, chromatic
+    )
+    axes_px = np.column_stack([sizes.emitter_px] * 2)
+    if disks is not None:
+        axes_px = disks.semi_axes_px()
+    check_radii(sizes, axes_px)
+    keys = np.rint(np.column_stack(sizes) / QUANTUM_PX).astype(np.int64)
+    # 2. Ellipses.
+    disk = ellipses(keys, camera, disks, axes_px, sizes)
+    # 3. Gaussians need no shared table, so all have the key of sharp points.
+    gaussian = camera.psf.kind == "gaussian"
+    if gaussian:
+        keys[(keys[:, 1:] == 0).all(axis=1), 0] = 0
+    kernels = look_up(camera, keys, disk)
+    # 4. Widening.
+    if gaussian and (blur_px or camera.psf.corner_sigma_px or chromatic is not None):
+        kernels = widened(kernels, sizes.sigma_px)
+    return kernels
+
+
+class SourceSizes(NamedTuple):
+    """Sizes of N images, px: (N,) each.
+
+    Attributes
+    ----------
+    sigma_px
+        Standard deviations of the Gaussian blurs beside the lens's
+    emitter_px, defocus_px
+        Radii of the emitters' disks and of the defocus disks; 0 for sources far outside the frame
+    """
+
+    sigma_px: Floats
+    emitter_px: Floats
+    defocus_px: Floats
+
+
+def source_sizes(
+    camera: CameraConfig,
+    xy_px: Floats,
+    radius_m: Floats,
+    is_led: NDArray[np.bool_],
+    distance_m: Floats,
+    cos_field: Floats,
+    blur_px: float,
+    chromatic: Floats | None,
+) -> SourceSizes:
+    """The sizes of N sources' images, with the arguments of `source_kernels`."""
+    # Gaussian blurs add in squares.
     position = np.where(np.isnan(xy_px), camera.center_px, xy_px)
-    extra = field_sigma_px(camera.psf, camera, position)
+    sigma = field_sigma_px(camera.psf, camera, position)
     if blur_px:
-        extra = np.hypot(extra, blur_px)
+        sigma = np.hypot(sigma, blur_px)
     shift_m: Floats | float = 0.0
     if chromatic is not None:
-        extra = np.hypot(extra, chromatic_sigma_px(camera, chromatic, position))
+        sigma = np.hypot(sigma, chromatic_sigma_px(camera, chromatic, position))
         shift_m = chromatic[:, 0]
     emitter = np.where(is_led, radius_m / distance_m, 0.0) * camera.focal_px
     # Defocus depends on the distance along the boresight.
     axial_m = np.where(is_led, distance_m * np.maximum(cos_field, 1e-6), np.inf)
-    blur = blur_radius_px(camera, axial_m, shift_m)
+    defocus = blur_radius_px(camera, axial_m, shift_m)
     size = np.array([camera.width_px, camera.height_px])
     outside_px = np.maximum(np.maximum(-position, position - size), 0).max(axis=1)
     # Sources far outside the frame have no image.
     near = outside_px < MAX_RADIUS_PX
-    emitter = np.where(near, emitter, 0.0)
-    blur = np.where(near, blur, 0.0)
-    axes_px = np.column_stack([emitter, emitter]) if disks is None else disks.semi_axes_px()
+    return SourceSizes(sigma, np.where(near, emitter, 0.0), np.where(near, defocus, 0.0))
+
+
+def check_radii(sizes: SourceSizes, axes_px: Floats) -> None:
+    """Raise InputError for an image, of a disk with semi-axes axes_px (N, 2), larger than MAX_RADIUS_PX."""
+    emitter = sizes.emitter_px
     widest = np.where(emitter > 0, np.fmax(emitter, axes_px[:, 0]), 0)
-    largest = (widest + blur).max(initial=0.0)
+    largest = (widest + sizes.defocus_px).max(initial=0.0)
     if largest > MAX_RADIUS_PX:
         raise InputError(
             "camera.focus",
-            f"a source's image, {blur.max():.0f} px out of focus, has a radius of {largest:.0f} px",
+            f"a source's image, {sizes.defocus_px.max():.0f} px out of focus, has a radius of {largest:.0f} px",
             f"up to {MAX_RADIUS_PX:.0f} px",
         )
-    steps = np.rint(np.column_stack([extra, emitter, blur]) / QUANTUM_PX).astype(np.int64)
-    disk = np.zeros((len(steps), len(ellipse.EllipseDisk._fields)))
-    if disks is not None:
-        # 2. A Gaussian of this variance has the peak of a point's image: sum of lens, blur and defocus disk.
-        lens_px2 = 1 / (2 * np.pi * build_kernel(camera.psf, camera).peak)
-        variance_px2 = lens_px2 + extra**2 + blur**2 / 4
-        error = round_error(disks, axes_px, emitter, variance_px2)
-        chosen = np.flatnonzero((emitter > 0) & (error > MAX_ROUND_ERROR))
-        sizes = (part[chosen] for part in (axes_px, blur, extra, variance_px2))
-        disk[chosen], steps[chosen] = ellipse_disks(
-            camera.psf, camera, disks.take(chosen), *sizes
-        )
-    # 3. Gaussians need no shared table, so all have the key of sharp points.
-    gaussian = camera.psf.kind == "gaussian"
-    if gaussian:
-        steps[(steps[:, 1:] == 0).all(axis=1), 0] = 0
+
+
+def ellipses(
+    keys: NDArray[np.int64],
+    camera: CameraConfig,
+    disks: DiskImages | None,
+    axes_px: Floats,
+    sizes: SourceSizes,
+) -> Floats:
+    """(N, 15) fields of `ellipse.EllipseDisk` of the disks that a circle does not represent, zeros for others.
+
+    Their rows of `keys` become the keys of their boxes.
+    """
+    disk = np.zeros((len(keys), len(ellipse.EllipseDisk._fields)))
+    if disks is None:
+        return disk
+    sigma, emitter, defocus = sizes
+    # A Gaussian of this variance has the peak of a point's image: sum of lens, blur and defocus disk.
+    lens_px2 = 1 / (2 * np.pi * build_kernel(camera.psf, camera).peak)
+    variance_px2 = lens_px2 + sigma**2 + defocus**2 / 4
+    error = round_error(disks, axes_px, emitter, variance_px2)
+    chosen = np.flatnonzero((emitter > 0) & (error > MAX_ROUND_ERROR))
+    own = (part[chosen] for part in (axes_px, defocus, sigma, variance_px2))
+    disk[chosen], keys[chosen] = ellipse_disks(camera.psf, camera, disks.take(chosen), *own)
+    return disk
+
+
+def look_up(camera: CameraConfig, keys: NDArray[np.int64], disk: Floats) -> Kernels:
+    """The kernels of N keys (N, 3) in the camera's cache, with the ellipses `disk`; makes those that are missing."""
     cache = kernel_cache(camera)
-    codes = steps @ PACKING
+    codes = keys @ PACKING
     # Stars in focus share one key, which saves the sort.
-    all_in_focus = codes.size > 0 and not codes.any()
-    first, inverse = (
-        ([0], np.zeros(len(codes), int)) if all_in_focus else np.unique(codes, True, True)[1:]
-    )
-    keys = [tuple(key) for key in steps[first].tolist()]
-    add_kernels(cache, camera, keys)
-    rows = np.array([cache.rows[key] for key in keys], dtype=np.int64)[inverse]
+    first = np.zeros(1, int)
+    inverse = np.zeros(len(codes), int)
+    if codes.any() or not codes.size:
+        _, first, inverse = np.unique(codes, return_index=True, return_inverse=True)
+    used = [tuple(key) for key in keys[first].tolist()]
+    add_kernels(cache, camera, used)
+    rows = np.array([cache.rows[key] for key in used], dtype=np.int64)[inverse]
     # Contiguous: columns of a table would be another array type, for which the renderer is compiled once more.
-    kind, sigma, reach, sharp = np.ascontiguousarray(
-        np.array(cache.kernels).reshape(-1, 4)[rows].T
-    )
+    properties = np.array(cache.kernels).reshape(-1, 4)[rows]
+    kind, sigma, reach, sharp = np.ascontiguousarray(properties.T)
     spans = np.array(cache.spans, dtype=np.int64).reshape(-1, 4)[rows]
-    # 4. Standard deviation and sharpness grow in proportion, the reach with them.
-    if gaussian and (blur_px or camera.psf.corner_sigma_px or chromatic is not None):
-        point = kind == GAUSS
-        widening = np.hypot(sigma, extra) / np.where(point, sigma, 1)
-        sigma = np.where(point, sigma * widening, sigma)
-        sharp = np.where(point, sharp * widening, sharp)
-        reach = np.where(point, reach * np.maximum(widening, 1), reach)
     # The Bessel table takes a while to build.
     bessel = ellipse.jinc_table() if disk.any() else np.empty(0, np.float32)
     return Kernels(
         kind.astype(np.int64), sigma, reach, sharp, spans, cache.tables[0], disk, bessel
+    )
+
+
+def widened(kernels: Kernels, extra_px: Floats) -> Kernels:
+    """The kernels with their Gaussians blurred by further Gaussians of these standard deviations (N,).
+
+    Standard deviation and sharpness grow in proportion, the reach with them.
+    """
+    point = kernels.kind == GAUSS
+    widening = np.hypot(kernels.sigma_px, extra_px) / np.where(point, kernels.sigma_px, 1)
+    return kernels._replace(
+        sigma_px=np.where(point, kernels.sigma_px * widening, kernels.sigma_px),
+        reach_px=np.where(
+            point, kernels.reach_px * np.maximum(widening, 1), kernels.reach_px
+        ),
+        sharp_px=np.where(point, kernels.sharp_px * widening, kernels.sharp_px),
     )
 
 
@@ -300,7 +371,9 @@ def ellipse_disks(
     return disk, np.column_stack([BOX_KEY * one, half_px, 0 * one]).astype(np.int64)
 
 
-def add_kernels(cache: KernelCache, camera: CameraConfig, keys: list[tuple[int, ...]]) -> None:
+def add_kernels(
+    cache: KernelCache, camera: CameraConfig, keys: list[tuple[int, ...]]
+) -> None:
     """Make the kernels that the cache does not hold yet; empty the cache first if it is over CACHE_BYTES.
 
     Raises
@@ -342,7 +415,9 @@ def make_kernel(
     kernel = build_kernel(camera.psf, camera, *(n * QUANTUM_PX for n in key))
     kind = GRID if len(kernel.grid) else ROUND if len(kernel.radial) else GAUSS
     table = kernel.grid if kind == GRID else kernel.radial
-    sizes = {GAUSS: (0, 0), ROUND: kernel.radial.shape[:2], GRID: kernel.grid.shape[1:3]}[kind]
+    sizes = {GAUSS: (0, 0), ROUND: kernel.radial.shape[:2], GRID: kernel.grid.shape[1:3]}[
+        kind
+    ]
     return (kind, kernel.sigma_px, kernel.reach_px, sharpness_px(kernel)), sizes, table
 
 

@@ -207,7 +207,7 @@ def read_cells(file: str) -> Floats:
             "a square of 3 to 1024 numbers a side",
         )
     total = cells.sum()
-    if not (np.isfinite(total) and total > 0):
+    if not 0 < total < np.inf:
         raise InputError(
             "camera.psf.file",
             f"{path}: its numbers add up to {total:g}",
@@ -245,7 +245,8 @@ def moffat_reach_px(psf: MoffatPsfConfig, camera: CameraConfig) -> float:
     alpha = moffat_alpha_px(psf)
     # A sharp profile's peak pixel has at most all of the light.
     level = WING_LEVEL / max(1.0, (psf.beta - 1) / (np.pi * alpha**2))
-    return float(min(alpha * np.sqrt(level ** (-1 / psf.beta) - 1), max(64.0, 4 * alpha)))
+    radius = alpha * np.sqrt(level ** (-1 / psf.beta) - 1)
+    return float(min(radius, max(64.0, 4 * alpha)))
 
 
 def airy_reach_px(psf: AiryPsfConfig, camera: CameraConfig) -> float:
@@ -254,7 +255,8 @@ def airy_reach_px(psf: AiryPsfConfig, camera: CameraConfig) -> float:
     At most 64 px or eight lambda N. The light beyond, 2 / (pi z), is 2.5 % at most.
     """
     unit = airy_unit_px(psf, camera)
-    z = (4 / np.pi / WING_LEVEL * max(1.0, np.pi / 4 / unit**2)) ** (1 / 3)
+    sharp = max(1.0, np.pi / 4 / unit**2)
+    z = (4 / np.pi / WING_LEVEL * sharp) ** (1 / 3)
     return float(min(z * unit / np.pi, max(64.0, 8 * unit)))
 
 

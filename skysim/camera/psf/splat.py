@@ -24,6 +24,19 @@ LANES = 32  # buffers are multiples of this (four registers of eight), so that S
 
 
 @jit
+def reached(
+    patch: Floats, row0: int, row1: int, x: float, y: float, reach: float
+) -> tuple[int, int, int, int]:
+    """First column, last + 1, first row, last + 1 of the pixels within an image's reach, the patch and the rows."""
+    height, width = patch.shape
+    left = max(ceil(x - reach), 0)
+    right = min(floor(x + reach) + 1, width)
+    top = max(ceil(y - reach), row0, 0)
+    bottom = min(floor(y + reach) + 1, row1, height)
+    return left, right, top, bottom
+
+
+@jit
 def add_gaussian(
     patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, sigma_px: float
 ) -> None:
@@ -31,13 +44,8 @@ def add_gaussian(
 
     Phi(a, b) = (erf(b / (sigma sqrt 2)) - erf(a / (sigma sqrt 2))) / 2 between a pixel's edges, along x and along y.
     """
-    height, width = patch.shape
     reach = REACH_SIGMA * sigma_px + 0.5
-    # The pixels within the image's reach, the patch and the rows.
-    left = max(ceil(x - reach), 0)
-    right = min(floor(x + reach) + 1, width)
-    top = max(ceil(y - reach), row0, 0)
-    bottom = min(floor(y + reach) + 1, row1, height)
+    left, right, top, bottom = reached(patch, row0, row1, x, y, reach)
     if right <= left or bottom <= top:
         return
     scale = 1 / (sigma_px * sqrt(2.0))
@@ -69,8 +77,7 @@ def add_round(
 
         r^4 cos 4 theta = (u + v)^2 - 8 u v,    r^8 cos 8 theta = 2 (r^4 cos 4 theta)^2 - r^8,
 
-    without division or trigonometry. Square roots and polynomials run as SIMD over LANES pixels; only the table
-    look-up runs pixel by pixel.
+    without division or trigonometry. Only the table look-up runs pixel by pixel, all else as SIMD over LANES pixels.
 
     Parameters
     ----------
@@ -79,12 +86,8 @@ def add_round(
         parabola: linear interpolation would lose 1e-4 of a sharp image's light); then value and step of T4 / r^4 and
         of T8 / r^8, where needed
     """
-    height, width = patch.shape
     reach = (radial.shape[0] - 2) / PER_PX
-    left = max(ceil(x - reach), 0)
-    right = min(floor(x + reach) + 1, width)
-    top = max(ceil(y - reach), row0, 0)
-    bottom = min(floor(y + reach) + 1, row1, height)
+    left, right, top, bottom = reached(patch, row0, row1, x, y, reach)
     if right <= left or bottom <= top:
         return
     # Buffers for one row of pixels, a multiple of LANES long.

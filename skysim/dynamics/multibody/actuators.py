@@ -44,7 +44,8 @@ def kinds_on(vehicle: VehicleConfig) -> list[ActuatorKind]:
 def build_actuators(vehicle: VehicleConfig, model: Any) -> dict[str, Actuators]:
     """All actuators that are switched on, by their key in `vehicle`."""
     return {
-        kind.key: kind.control(model, getattr(vehicle, kind.key)) for kind in kinds_on(vehicle)
+        kind.key: kind.control(model, getattr(vehicle, kind.key))
+        for kind in kinds_on(vehicle)
     }
 
 
@@ -133,7 +134,9 @@ def locked_joint_hint(spec: Any, locked: dict[str, str]) -> str:
     named = {sensor.objname for sensor in spec.sensors} | {
         actuator.target for actuator in spec.actuators
     }
-    named |= {name for equality in spec.equalities for name in (equality.name1, equality.name2)}
+    named |= {
+        name for equality in spec.equalities for name in (equality.name1, equality.name2)
+    }
     names = [name for name in locked if name in named]
     return f"; {locked[names[0]]} is off, which locks joint {names[0]}" if names else ""
 
@@ -168,5 +171,6 @@ def check_bare(joint: Any, path: Path) -> None:
     for name, value in attributes.items():
         if np.any(value):
             raise InputError(
-                path, f"joint {joint.name}: {name} is set by the scene; remove it from the file"
+                path,
+                f"joint {joint.name}: {name} is set by the scene; remove it from the file",
             )

@@ -328,7 +328,9 @@ class CmgActuator:
         return rates_from_torque, self.model.gimbal_rate_limit_rad_s
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
-        return self.model.momentum(angles_rad[self.gimbals.qpos], speeds_rad_s[self.rotors.dof])
+        return self.model.momentum(
+            angles_rad[self.gimbals.qpos], speeds_rad_s[self.rotors.dof]
+        )
 
 
 def check_rotor_pairs(spec: Any, path: Path) -> None:
@@ -377,7 +379,9 @@ def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
 def start_cmgs(model: Any, data: Any, config: CmgsConfig) -> None:
     """Set the gimbal angles and rotor speeds at the start."""
     gimbals = Hinges.from_model(model, GIMBAL)
-    angles = np.radians(member_values(config.start_deg, len(gimbals), "vehicle.cmgs.start_deg"))
+    angles = np.radians(
+        member_values(config.start_deg, len(gimbals), "vehicle.cmgs.start_deg")
+    )
     data.qpos[gimbals.qpos] = angles
     driven = gimbals.motor >= 0
     # A servo whose set-point differs from the angle would jerk the gimbal.

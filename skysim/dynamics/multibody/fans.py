@@ -90,7 +90,9 @@ class FanSet:
     force_axes: Floats
     positions_m: Floats
     thrust_limit_n: float
-    torque_per_thrust_m: Floats = field(init=False, repr=False)  # (3, n) lever arms, N m per N
+    torque_per_thrust_m: Floats = field(
+        init=False, repr=False
+    )  # (3, n) lever arms, N m per N
     thrust_from_torque: Floats = field(init=False, repr=False)  # (n, 3)
 
     def __post_init__(self) -> None:

@@ -89,7 +89,9 @@ def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Ma
     carried = tree_mass(model, without_bus=True)
     center = np.array(vehicle.center_of_mass_m)
     inertia = (
-        total.inertia_kg_m2 if vehicle.inertia_kg_m2 is None else np.diag(vehicle.inertia_kg_m2)
+        total.inertia_kg_m2
+        if vehicle.inertia_kg_m2 is None
+        else np.diag(vehicle.inertia_kg_m2)
     )
     declared = MassProperties(vehicle.mass_kg or total.mass_kg, center, inertia)
     # 2. Mass and center of the bus.
@@ -124,7 +126,9 @@ def is_lever_too_long(bus_inertia_kg_m2: Floats, model: Any, camera_m: Floats) -
     carrier = model.cam_bodyid[model.camera(CAMERA).id]
     if carrier == model.body("bus").id:
         return False
-    without_lever = bus_inertia_kg_m2 + parallel_axis(model.body_subtreemass[carrier], camera_m)
+    without_lever = bus_inertia_kg_m2 + parallel_axis(
+        model.body_subtreemass[carrier], camera_m
+    )
     return not is_possible(np.linalg.eigvalsh(bus_inertia_kg_m2)) and is_possible(
         np.linalg.eigvalsh(without_lever)
     )
@@ -167,7 +171,11 @@ def is_possible(moments: NDArray[Any]) -> bool:
 
 
 def set_inertial(
-    body: Any, mass_kg: float, center_m: Floats, inertia_kg_m2: Floats, subject: tuple[str, str]
+    body: Any,
+    mass_kg: float,
+    center_m: Floats,
+    inertia_kg_m2: Floats,
+    subject: tuple[str, str],
 ) -> None:
     """Set the mass properties of a body of a spec. Raises InputError for an impossible inertia.
 

@@ -163,7 +163,9 @@ def check_candidate(reference: FileReference, candidate: Path, folder: Path) -> 
     if os.path.exists(candidate) and not (
         os.path.isfile(candidate) or os.path.isdir(candidate)
     ):
-        raise InputError("", f"{reference.source} is not a regular file", f"files in {folder}")
+        raise InputError(
+            "", f"{reference.source} is not a regular file", f"files in {folder}"
+        )
 
 
 def file_identity(path: Path) -> tuple[str, Path, Path]:

@@ -1,8 +1,8 @@
-"""Export the laboratory as one MJCF file, for MuJoCo's viewer and for `picture`.
+"""Export the laboratory as one MJCF file (`mjcf`), for MuJoCo's viewer, `picture` and `laboratory`.
 
-`mjcf` writes the file; `laboratory` reads the shapes of one for other drawing programs. The elements that `mjcf` adds
-to the vehicle are for display only: no mass, no contacts, no constraints. Groups of MuJoCo's viewer: 0 vehicle, floor
-and pedestal; 1 dome and LEDs or stars; 2 the star camera's field of view; 4, hidden, the tilt stop.
+The elements that are added to the vehicle are for display only: no mass, no contacts, no constraints. Groups of
+MuJoCo's viewer: 0 vehicle, floor and pedestal; 1 dome and LEDs or stars; 2 the star camera's field of view; 4, hidden,
+the tilt stop.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -54,7 +54,9 @@ LIT_RGB = np.array([1.0, 0.93, 0.78])
 FIELD_RGB = np.array([0.25, 0.75, 1.0])
 
 
-def mjcf(vehicle: VehicleModel, scene: Scene, sources: Sources, lab_from_body: Rotation) -> str:
+def mjcf(
+    vehicle: VehicleModel, scene: Scene, sources: Sources, lab_from_body: Rotation
+) -> str:
     """The laboratory as the text of one MJCF file, which MuJoCo's own viewer can open and simulate.
 
     1. Copy the vehicle's spec, hide the tilt stop, and copy mesh files into it.
@@ -89,19 +91,16 @@ def mjcf(vehicle: VehicleModel, scene: Scene, sources: Sources, lab_from_body: R
             f"camera name {LAB_CAMERA!r} is reserved for the view of the laboratory; rename it",
         )
     on_earth = vehicle.config.mount == "air_bearing"
-    inside = (
-        surface.build_surface(scene.light.surface)
-        if isinstance(scene.light, DomeConfig)
-        else SKY
-    )
+    dome = scene.light if isinstance(scene.light, DomeConfig) else None
+    inside = surface.build_surface(dome.surface) if dome else SKY
     hide_tilt_stop(spec)
     inline_meshes(spec, vehicle.model)
     # 2. Surroundings.
     add_backdrop(spec, on_earth)
     if on_earth:
         add_room(spec)
-    if isinstance(scene.light, DomeConfig):
-        rings_m = shell_m(inside, np.radians(scene.light.layout.cap_deg))
+    if dome:
+        rings_m = shell_m(inside, np.radians(dome.layout.cap_deg))
         add_dome(spec, rings_m)
         look_at(spec, *dome_view(rings_m))
     else:
@@ -156,7 +155,9 @@ def add_backdrop(spec: Any, on_earth: bool) -> None:
     """Add a dim room or black space as background, and a lamp."""
     # Colors of the gradient from zenith to nadir.
     top, bottom = (
-        ([0.16, 0.19, 0.24], [0.03, 0.035, 0.05]) if on_earth else ([0.0, 0.0, 0.01], [0.0] * 3)
+        ([0.16, 0.19, 0.24], [0.03, 0.035, 0.05])
+        if on_earth
+        else ([0.0, 0.0, 0.01], [0.0] * 3)
     )
     spec.add_texture(
         name="stage_backdrop",
@@ -289,7 +290,9 @@ def visible_shell_m(inside: Surface, around: Floats) -> Floats:
         return inside.meet(np.zeros(3), rays.reshape(-1, 3)).reshape(rays.shape)
 
     # The first and the last of 400 polar angles in each direction at which a ray meets the surface.
-    polar = np.broadcast_to(np.linspace(1e-3, np.radians(80), 400)[:, None], (400, len(around)))
+    polar = np.broadcast_to(
+        np.linspace(1e-3, np.radians(80), 400)[:, None], (400, len(around))
+    )
     height_m = np.nan_to_num(points_at(polar)[..., 2], nan=-np.inf)
     on_surface = height_m > 0.35 * height_m.max()
     first = on_surface.argmax(axis=0)
@@ -372,7 +375,9 @@ def add_lights(spec: Any, sources: Sources) -> None:
     shown = np.argsort(-mean, kind="stable")[: MAX_STARS if stars else len(mean)]
     fraction = mean[shown] / mean.max(initial=1e-300)
     position_m = sources.place[shown, :3] * (SKY_RADIUS_M if stars else 1.0)
-    radius_m = 0.006 + 0.04 * np.sqrt(fraction) if stars else np.full(len(shown), LED_RADIUS_M)
+    radius_m = (
+        0.006 + 0.04 * np.sqrt(fraction) if stars else np.full(len(shown), LED_RADIUS_M)
+    )
     # One mesh for each step of brightness; all stars have the brightest.
     level = np.full(len(shown), LEVELS) if stars else np.ceil(fraction * LEVELS).astype(int)
     for step in np.unique(level):
@@ -380,7 +385,14 @@ def add_lights(spec: Any, sources: Sources) -> None:
         rgba = [*(LIT_RGB * (DIM + (1 - DIM) * step / LEVELS)), 1.0]
         name = f"stage_{'stars' if stars else 'leds'}_{step}"
         add_mesh(
-            spec, spec.worldbody, name, vertices, faces, rgba, GROUP_LIGHTS, material=glow.name
+            spec,
+            spec.worldbody,
+            name,
+            vertices,
+            faces,
+            rgba,
+            GROUP_LIGHTS,
+            material=glow.name,
         )
 
 
@@ -468,13 +480,17 @@ def dome_view(rings_m: Floats) -> tuple[Floats, Floats, Floats, float]:
     )
 
 
-def sky_view(vehicle: VehicleModel, boresight: Floats) -> tuple[Floats, Floats, Floats, float]:
+def sky_view(
+    vehicle: VehicleModel, boresight: Floats
+) -> tuple[Floats, Floats, Floats, float]:
     """As `dome_view`, from beside and behind the vehicle, with the boresight along the picture's diagonal."""
     size = float(vehicle.model.stat.extent) / 2 + SKY_RADIUS_M / 2
     # A direction across the boresight, from the axis that is least along it.
     beside = np.cross(boresight, np.eye(3)[np.argmin(np.abs(boresight))])
     back = beside / np.linalg.norm(beside) - 0.5 * boresight
-    up = Rotation.from_rotvec(np.radians(-40.0) * back / np.linalg.norm(back)).apply(boresight)
+    up = Rotation.from_rotvec(np.radians(-40.0) * back / np.linalg.norm(back)).apply(
+        boresight
+    )
     return size * (2.0 * back + 0.5 * boresight), 0.5 * size * boresight, up, 1.2 * size
 
 
@@ -490,9 +506,14 @@ def look_at(spec: Any, eye_m: Floats, middle_m: Floats, up: Floats, size_m: floa
     # MuJoCo's cameras look along -z, y is up.
     back = (eye_m - middle_m) / np.linalg.norm(eye_m - middle_m)
     right = np.cross(up, back) / np.linalg.norm(np.cross(up, back))
-    lab_from_view = Rotation.from_matrix(np.column_stack([right, np.cross(back, right), back]))
+    lab_from_view = Rotation.from_matrix(
+        np.column_stack([right, np.cross(back, right), back])
+    )
     spec.worldbody.add_camera(
-        name=LAB_CAMERA, pos=eye_m, quat=lab_from_view.as_quat(scalar_first=True), fovy=FOVY_DEG
+        name=LAB_CAMERA,
+        pos=eye_m,
+        quat=lab_from_view.as_quat(scalar_first=True),
+        fovy=FOVY_DEG,
     )
     # The viewer's free camera starts at the same view.
     spec.stat.center = middle_m
@@ -534,123 +555,3 @@ def shorten_colors(text: str) -> str:
         lambda m: f'{m[1]}="{" ".join(f"{float(x):.4g}" for x in m[2].split())}"',
         text,
     )
-
-
-# The geometry of an MJCF file as plain shapes, for drawing programs other than MuJoCo's.
-
-KINDS = {
-    mujoco.mjtGeom.mjGEOM_PLANE: "plane",
-    mujoco.mjtGeom.mjGEOM_BOX: "box",
-    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
-    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
-    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
-    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
-    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
-}
-LIGHTS = ("stage_leds", "stage_stars")  # prefixes of the names of the lights' geoms
-
-
-class Shape(NamedTuple):
-    """A shape in the lab, or on the vehicle in body axes with every joint at zero.
-
-    Attributes
-    ----------
-    name
-        Name of the geom; empty if it has none
-    kind
-        One of the values of KINDS
-    size_m
-        Size as defined by MuJoCo: half edges, radius and half length along z, or semi-axes
-    position_m
-        (3,) position of its center
-    parent_from_shape_wxyz
-        (4,) rotation from the shape's axes to those of lab or body
-    rgba
-        (4,) color
-    on_vehicle
-        Whether it rotates with the vehicle
-    vertices_m, faces
-        (N, 3) vertices and (M, 3) faces of a mesh, in the shape's axes; empty for other kinds
-    """
-
-    name: str
-    kind: str
-    size_m: tuple[float, ...]
-    position_m: tuple[float, ...]
-    parent_from_shape_wxyz: tuple[float, ...]
-    rgba: tuple[float, ...]
-    on_vehicle: bool
-    vertices_m: Floats
-    faces: NDArray[np.int32]
-
-
-class Laboratory(NamedTuple):
-    """All visible shapes of a laboratory except its lights, and the view of the camera `lab`.
-
-    Attributes
-    ----------
-    shapes
-        Shapes of vehicle, dome and room
-    eye_m, target_m
-        (3,) positions in the lab of the camera and of the point at which it looks
-    """
-
-    shapes: tuple[Shape, ...]
-    eye_m: Floats
-    target_m: Floats
-
-
-def laboratory(mjcf: str) -> Laboratory:
-    """The laboratory of an MJCF text from `mjcf`."""
-    with mujoco_warnings():
-        model = mujoco.MjModel.from_xml_string(mjcf)
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-    shown = [n for n in range(model.ngeom) if is_shown(model, n)]
-    shapes = tuple(shape(model, data, n) for n in shown)
-    return Laboratory(shapes, model.camera(LAB_CAMERA).pos.copy(), model.stat.center.copy())
-
-
-def is_shown(model: mujoco.MjModel, n: int) -> bool:
-    """Whether the geom with index n is visible and is no light."""
-    kind = mujoco.mjtGeom(model.geom_type[n])
-    name = model.geom(n).name
-    return kind in KINDS and model.geom_group[n] != GROUP_HIDDEN and not name.startswith(LIGHTS)
-
-
-def shape(model: mujoco.MjModel, data: mujoco.MjData, n: int) -> Shape:
-    """The geom with index n as a shape, in the pose of data."""
-    wxyz = np.empty(4)
-    mujoco.mju_mat2Quat(wxyz, data.geom_xmat[n])
-    vertices_m, faces = mesh(model, n)
-    return Shape(
-        model.geom(n).name,
-        KINDS[mujoco.mjtGeom(model.geom_type[n])],
-        tuple(model.geom_size[n].tolist()),
-        tuple(data.geom_xpos[n].tolist()),
-        tuple(wxyz.tolist()),
-        tuple(color(model, n).tolist()),
-        bool(model.geom_bodyid[n] != 0),
-        vertices_m,
-        faces,
-    )
-
-
-def color(model: mujoco.MjModel, n: int) -> Floats:
-    """(4,) color of a geom: its own, or that of its material if it has none."""
-    material = model.geom_matid[n]
-    # MuJoCo's default color marks a geom without one.
-    unset = (model.geom_rgba[n] == (0.5, 0.5, 0.5, 1.0)).all()
-    return np.asarray(
-        model.mat_rgba[material] if material >= 0 and unset else model.geom_rgba[n], float
-    )
-
-
-def mesh(model: mujoco.MjModel, n: int) -> tuple[Floats, NDArray[np.int32]]:
-    """Vertices (N, 3) and faces (M, 3) of the mesh of a geom; empty for other kinds."""
-    if model.geom_type[n] != mujoco.mjtGeom.mjGEOM_MESH:
-        return np.empty((0, 3)), np.empty((0, 3), np.int32)
-    k = model.geom_dataid[n]
-    vertices = slice(model.mesh_vertadr[k], model.mesh_vertadr[k] + model.mesh_vertnum[k])
-    faces = slice(model.mesh_faceadr[k], model.mesh_faceadr[k] + model.mesh_facenum[k])
-    return model.mesh_vert[vertices].astype(float), model.mesh_face[faces].copy()

@@ -222,7 +222,9 @@ def place_camera(spec: Any, vehicle: VehicleConfig) -> None:
 
 def turn_camera(spec: Any, rotation_deg: tuple[float, float, float]) -> None:
     """Turn the camera by a rotation vector in its own axes (+x right, +y down, +z boresight)."""
-    parent_from_file = Rotation.from_quat(spec.compile().camera(CAMERA).quat, scalar_first=True)
+    parent_from_file = Rotation.from_quat(
+        spec.compile().camera(CAMERA).quat, scalar_first=True
+    )
     file_from_turned = Rotation.from_rotvec(rotation_deg, degrees=True)
     mjcam_from_turned = CAM_FROM_MJCAM.inv() * file_from_turned * CAM_FROM_MJCAM
     camera = spec.camera(CAMERA)

@@ -103,7 +103,9 @@ def camera_housing(
     return np.asarray(is_housing)
 
 
-def occluded(obstacles: Obstacles, lab_from_body: Rotation, place: Floats) -> NDArray[np.bool_]:
+def occluded(
+    obstacles: Obstacles, lab_from_body: Rotation, place: Floats
+) -> NDArray[np.bool_]:
     """(N,) whether a part of the vehicle or the lab is between the pupil and each LED or star.
 
     Parameters

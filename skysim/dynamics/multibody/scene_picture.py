@@ -128,7 +128,9 @@ def failure_reason(code: int, errors: IO[bytes]) -> str:
     if code < 0:
         return f"the renderer was ended by {signal.Signals(-code).name}"
     return (
-        one_line(RuntimeError(lines[-1])) if lines else f"the renderer exited with code {code}"
+        one_line(RuntimeError(lines[-1]))
+        if lines
+        else f"the renderer exited with code {code}"
     )
 
 

@@ -140,4 +140,6 @@ def start_wheels(model: Any, data: Any, config: WheelsConfig) -> None:
     )
 
 
-WHEELS = ActuatorKind("wheels", add_wheels, WheelActuator, joints=(WHEEL,), start=start_wheels)
+WHEELS = ActuatorKind(
+    "wheels", add_wheels, WheelActuator, joints=(WHEEL,), start=start_wheels
+)

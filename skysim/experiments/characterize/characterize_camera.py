@@ -1,4 +1,4 @@
-"""From folders of frames to a camera: read, check, estimate, write."""
+"""Make a camera preset from folders of frames: read and check them, estimate its values, write preset and report."""
 
 from __future__ import annotations
 
@@ -41,11 +41,14 @@ from skysim.scene import loader
 from skysim.scene.camera_sheet import PLACEHOLDER_LENS, SheetLine, yaml_lines
 from skysim.scene.sections.camera import CameraConfig, GaussianPsfConfig
 
-# The report of a characterized camera: its values, and figures of what they were fitted to.
+# The report of a characterized camera: its values, and figures of the data with the fits.
 
 
 def characterize_report(
-    statistics: dict[str, Any], config: CameraConfig, found: MeasuredSensor, night: Night | None
+    statistics: dict[str, Any],
+    config: CameraConfig,
+    found: MeasuredSensor,
+    night: Night | None,
 ) -> Report:
     """The report of a characterized camera from the numbers of `characterize.json`."""
     figures = [
@@ -109,7 +112,7 @@ def facts(statistics: dict[str, Any]) -> Facts:
 
 
 def value_table(statistics: dict[str, Any]) -> Table:
-    """The values with their intervals, and those of the camera's file."""
+    """The measured values with their intervals, beside the values of the camera's file."""
     columns = [text_column("what"), Column("measured", format=".5g"), Column("95 %")]
     columns += [Column("file", format=".5g"), text_column("unit")]
     values = statistics["values"] + (
@@ -123,7 +126,7 @@ def value_table(statistics: dict[str, Any]) -> Table:
     return Table(columns, rows)
 
 
-SIZE_IN = (10, 4)  # of a figure
+SIZE_IN = (10, 4)  # width and height of a figure
 TRANSFER_TEXT = (
     "Photon transfer: temporal variance against the mean signal, of darks and flats. Line: the fit; open: beyond it."
     " Right: the signal over that of a linear sensor with the same lamp, less 1; line: the fitted amplifier."
@@ -190,12 +193,14 @@ def plain_labels(*axis: Any) -> None:
 
 
 def draw_dark(axes: Any, dark: DarkCurrent) -> None:
-    """Density of the pixels' rates, hot ones too, measured and expected."""
+    """Density of the dark rates of all pixels, hot ones included: measured and expected."""
     width = np.diff(dark.edges)
     measured = dark.counts[1:-1] / width
     expected = dark.expected[1:-1] / width
     axes.stairs(measured, dark.edges, color=INK[0], fill=True, alpha=0.4, label="measured")
-    axes.plot((dark.edges[1:] + dark.edges[:-1]) / 2, expected, color=INK[1], label="expected")
+    axes.plot(
+        (dark.edges[1:] + dark.edges[:-1]) / 2, expected, color=INK[1], label="expected"
+    )
     axes.set_xscale("symlog", linthresh=dark.mean.value)
     axes.set(yscale="log", xlabel="dark current [DN/s]", ylabel="pixels per DN/s")
     axes.legend()
@@ -224,8 +229,7 @@ def draw_size(axes: Any, config: CameraConfig, night: Night) -> None:
     )
 
 
-# A camera preset with the measured values in place of those of the camera that the frames were
-# taken with.
+# A camera preset: the file of the camera that took the frames, with its values replaced by the measured ones.
 
 
 DIGITS = 6
@@ -270,7 +274,7 @@ def measured(sensor: MeasuredSensor) -> dict[str, tuple[Any, str]]:
 
 
 def measured_lens(config: CameraConfig, night: Night) -> dict[str, tuple[Any, str]]:
-    """Value and comment by key, of the lens."""
+    """Value and comment by key of the lens."""
     size = night.size
     found: dict[str, tuple[Any, str]] = {
         "psf.kind": ("gaussian", "[M]"),
@@ -304,14 +308,14 @@ def comment(one: Estimate) -> str:
 
 
 def rounded(value: float) -> float:
-    """With DIGITS significant digits."""
+    """The value to DIGITS significant digits."""
     return float(f"{value:.{DIGITS}g}")
 
 
 def lines(
     camera: Mapping[str, Any], found: Mapping[str, tuple[Any, str]]
 ) -> Iterator[SheetLine]:
-    """The lines of the section with the values that were found in place of the camera's own, sections last."""
+    """The lines of the section, with measured values in place of the camera's own; subsections come last."""
     tree = copy.deepcopy(dict(camera))
     if "psf.kind" in found:
         tree["psf"] = {}  # keys of another kind
@@ -324,7 +328,7 @@ def lines(
 def section_lines(
     section: Mapping[str, Any], prefix: str, sources: Mapping[str, str]
 ) -> Iterator[SheetLine]:
-    """The lines of a section and, after its values, of the sections in it."""
+    """The lines of a section: its values, then its subsections."""
     for key, value in section.items():
         if not isinstance(value, dict):
             yield SheetLine(
@@ -336,7 +340,7 @@ def section_lines(
 
 
 def write(path: Path, contents: str) -> None:
-    """Write the file and read it as a scene would. Raises InputError if it is no camera."""
+    """Write the file and read it as a scene would. Raises InputError if it is not a valid camera."""
     files.make_folder(path.parent)
     files.write_text(path, contents)
     loader.load_camera(path, PLACEHOLDER_LENS)
@@ -370,7 +374,7 @@ def read_camera(name: str) -> tuple[CameraConfig, dict[str, Any]]:
 def measure_sensor(
     camera: CameraConfig, darks_folder: Path, flats_folder: Path
 ) -> MeasuredSensor:
-    """The sensor from folders of darks and flats. Raises InputError for frames that do not tell."""
+    """The sensor from folders of darks and flats. Raises InputError for frames that cannot be used."""
     shape = (camera.height_px, camera.width_px)
     bits = camera.detector.bits
     darks = read_stack(darks_folder, shape, bits)
@@ -385,7 +389,7 @@ def measure_sensor(
 def measure_night(
     config: CameraConfig, raw: dict[str, Any], folder: Path, found: MeasuredSensor
 ) -> Night:
-    """The lens from a folder of night frames. Raises InputError for a camera without a lens, and as `lens` does."""
+    """The lens from a folder of night frames. Raises InputError for a camera without a lens, or unusable frames."""
     if "focal_length" not in raw:
         raise InputError(
             "characterize.night",
@@ -403,7 +407,7 @@ def write_results(
     night: Night | None,
     name: str,
 ) -> tuple[dict[str, Any], Report]:
-    """Write preset and report; returns the statistics, which `characterize.json` holds too, and the report."""
+    """Write preset, report and `characterize.json`; return the statistics in it, and the report."""
     path = folder / "camera.yaml"
     write(path, preset_text(raw, config, found, night, name))
     statistics = {
@@ -427,7 +431,7 @@ def write_results(
 
 
 def night_statistics(config: CameraConfig, night: Night) -> dict[str, Any]:
-    """Rows of the lens, and the frames and stars from which they are."""
+    """Rows of the lens, and the numbers of frames and stars that were used."""
     psf = config.psf if isinstance(config.psf, GaussianPsfConfig) else None
     rows = [
         row("sigma_px", night.size.sigma_px, psf and psf.sigma_px),

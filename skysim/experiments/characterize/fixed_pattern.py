@@ -1,15 +1,15 @@
 """Dark current, its scatter over the pixels, and hot pixels, from the rate of every pixel.
 
-A pixel's dark current is lognormal over the chip, with the mean m and the relative standard deviation DSNU; hot pixels,
-the fraction h, have an exponential of mean H beside it. A rate measured from darks of several exposures has Gaussian
-noise of a variance v + w u at the rate u: of reading, and of counting. So the probability that it is below d is
+A pixel's dark current is lognormal over the chip, with the mean m and the relative standard deviation DSNU. Hot pixels,
+the fraction h, have an additional exponential rate of mean H. A rate u measured from darks of several exposures has
+Gaussian noise of the variance v + w u, from reading and counting. So the probability that it is below d is
 
     P(d) = (1 - h) E[Phi(z)] + h E[Phi(z) - exp(s^2 / 2 H^2 - (d - u) / H) Phi(z - s / H)],  z = (d - u) / s,
 
 with s^2 = v + w u and the expectation over the lognormal u: the second term is an exponentially modified Gaussian. The
 counts of pixels in bins are multinomial; Fisher's scoring maximizes their likelihood and gives the covariance, which
-has the scatter of a chip's pixels in it (Rao 1973, Linear Statistical Inference, 5g). Frames have too few hot
-pixels for H if they have fewer than LEAST_HOT: h is then their count, with the interval of Clopper & Pearson (1934).
+includes the scatter of a chip's pixels (Rao 1973, Linear Statistical Inference, 5g). With fewer than LEAST_HOT hot
+pixels H is not fitted, and h is their fraction, with the interval of Clopper & Pearson (1934).
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from skysim.experiments.characterize.photon_transfer import (
     Transfer,
 )
 
-LEAST_HOT = 10  # hot pixels for a fit of their scatter
-# quantiles; the tail is the upper hundredth
+LEAST_HOT = 10  # least number of hot pixels for a fit of their mean
+# Bins of the rates below the quantile 1 - TAIL, and above it.
 CORE_BINS = 160
 TAIL_BINS = 60
 TAIL = 0.01
-# of the lognormal's normal variable
+# Nodes of the expectation over the lognormal, and its limit in standard deviations of the normal variable.
 NODES = 301
 SPAN = 6.0
-# scoring steps, and a step in standard deviations
-STEPS = 60
-CONVERGED = 1e-3
-DIFFERENCE = 1e-4
-# sigmas; standard error of a variance from medians over that from squares
-RESOLVED = 5.0
-MEDIAN_COST = 1.65
-HOT_SIGMAS = 8.0  # above the core's width: where hot pixels begin, for the start of the fit
+STEPS = 60  # most scoring steps
+CONVERGED = 1e-3  # length of the last step, in standard deviations
+DIFFERENCE = 1e-4  # step of the numerical derivatives
+RESOLVED = 5.0  # standard errors by which a scatter must exceed the noise
+MEDIAN_COST = 1.65  # standard error of a variance from medians over that from squares
+HOT_SIGMAS = (
+    8.0  # core widths above the median beyond which pixels are hot, at the start of the fit
+)
 
 
 class RateNoise(NamedTuple):
@@ -58,12 +58,12 @@ class RateNoise(NamedTuple):
 
 
 class DarkCurrent(NamedTuple):
-    """Mean and DSNU over the pixels, fraction of hot pixels, and their mean excess if they are enough. Rates in DN/s.
+    """Mean and DSNU over the pixels, fraction of hot pixels, and their mean excess if it was fitted. Rates in DN/s.
 
     Attributes
     ----------
     edges, counts, expected
-        Histogram of the rates, and what the law expects
+        Histogram of the rates, and the numbers that the law expects
     """
 
     mean: Estimate
@@ -98,12 +98,14 @@ def fit(rates: Floats, noise: RateNoise, greatest: float) -> DarkCurrent:
     """
     start, hot = start_values(rates, noise)
     enough = hot >= LEAST_HOT
-    kept = rates if enough else np.sort(rates)[: rates.size - hot]
+    kept = rates
+    if not enough:
+        kept = np.sort(rates)[: rates.size - hot]
+        start = start[:2]
     edges = bin_edges(kept, greatest)
-    counts = np.bincount(np.searchsorted(edges, kept), minlength=len(edges) + 1).astype(
-        np.float64
-    )
-    theta, covariance = maximize(start if enough else start[:2], edges, counts, noise)
+    bins = np.searchsorted(edges, kept)
+    counts = np.bincount(bins, minlength=len(edges) + 1).astype(np.float64)
+    theta, covariance = maximize(start, edges, counts, noise)
     sigma = np.sqrt(np.diag(covariance))
     values = [
         Estimate.lognormal(math.exp(one), math.exp(one) * error)
@@ -112,12 +114,11 @@ def fit(rates: Floats, noise: RateNoise, greatest: float) -> DarkCurrent:
     if enough:
         fraction = Estimate.logistic(theta[2], sigma[2])
     else:
-        low, high = stats.beta.ppf(
-            [0.025, 0.975], [max(hot, 1e-9), hot + 1], [rates.size - hot + 1, rates.size - hot]
-        )
-        fraction = Estimate(
-            hot / rates.size, math.sqrt(max(hot, 1)) / rates.size, float(low), float(high)
-        )
+        # Clopper & Pearson's interval.
+        low = stats.beta.ppf(0.025, max(hot, 1e-9), rates.size - hot + 1)
+        high = stats.beta.ppf(0.975, hot + 1, rates.size - hot)
+        error = math.sqrt(max(hot, 1)) / rates.size
+        fraction = Estimate(hot / rates.size, error, float(low), float(high))
     expected = counts.sum() * probabilities(theta, edges, noise)
     return DarkCurrent(
         values[0], values[1], fraction, values[3] if enough else None, edges, counts, expected
@@ -158,12 +159,10 @@ def probabilities(theta: Floats, edges: Floats, noise: RateNoise) -> Floats:
     if len(theta) == 4:
         share = special.expit(theta[2])
         excess = math.exp(theta[3])
-        tail = np.exp(
-            s**2 / (2 * excess**2)
-            - (edges[:, None] - u) / excess
-            + special.log_ndtr(normal - s / excess)
-        )
-        below -= share * tail
+        # The factors alone would overflow.
+        log_tail = s**2 / (2 * excess**2) - (edges[:, None] - u) / excess
+        log_tail += special.log_ndtr(normal - s / excess)
+        below -= share * np.exp(log_tail)
     cumulative = np.concatenate([[0.0], below @ weight, [1.0]])
     return np.maximum(np.diff(cumulative), 1e-15)
 
@@ -180,10 +179,9 @@ def maximize(
         for n in range(len(theta)):
             moved = np.zeros(len(theta))
             moved[n] = DIFFERENCE
-            slope[n] = (
-                probabilities(theta + moved, edges, noise)
-                - probabilities(theta - moved, edges, noise)
-            ) / (2 * DIFFERENCE)
+            above = probabilities(theta + moved, edges, noise)
+            below = probabilities(theta - moved, edges, noise)
+            slope[n] = (above - below) / (2 * DIFFERENCE)
         information = total * (slope / p) @ slope.T
         score = slope @ (counts / p)
         step = np.linalg.solve(information, score)
@@ -211,18 +209,17 @@ def start_values(rates: Floats, noise: RateNoise) -> tuple[Floats, int]:
     hot = rates[rates > limit]
     excess = max(float(hot.mean()) - limit, spread) if hot.size else spread
     share = max(hot.size, 1) / rates.size * math.exp(min((limit - core) / excess, 3.0))
-    return np.array(
-        [math.log(core), math.log(dsnu), special.logit(min(share, 0.5)), math.log(excess)]
-    ), hot.size
+    logit = special.logit(min(share, 0.5))
+    return np.array([math.log(core), math.log(dsnu), logit, math.log(excess)]), hot.size
 
 
-# Fixed pattern: of the black level by columns, and of the sensitivity (PRNU).
+# Fixed pattern of the black level by columns, and of the sensitivity (PRNU).
 
 
-ORDER = 4  # of the polynomial that is the light's distribution
+ORDER = 4  # total order of the polynomial that models the light over the chip
 SAMPLE = 8  # rows and columns of a block, for the fit of the polynomial
 
-# (H, W) at exposure 0 in DN, (H, W) rate in DN/s, (L,) weights of the rate.
+# (H, W) signal at exposure 0 in DN, (H, W) rate in DN/s, (L,) weights of the levels in the rate.
 Planes = tuple[Floats, Floats, Floats]
 
 
@@ -235,12 +232,8 @@ def dark_planes(darks: Sequence[Level], transfer: Transfer, half: str) -> Planes
         first_dn or second_dn
     """
     times = np.array([one.exposure_s for one in darks])
-    weight = np.array(
-        [
-            one.count / one.moments(np.ones(one.first_dn.shape, bool)).variance_dn2
-            for one in darks
-        ]
-    )
+    every = np.ones(darks[0].first_dn.shape, bool)
+    weight = np.array([one.count / one.moments(every).variance_dn2 for one in darks])
     weight /= weight.sum()
     middle = weight @ times
     spread = weight @ (times - middle) ** 2
@@ -257,10 +250,8 @@ def dark_planes(darks: Sequence[Level], transfer: Transfer, half: str) -> Planes
 
 def column_offset(first: Floats, second: Floats, usable: Mask, gain_e_dn: float) -> Estimate:
     """Standard deviation of the columns' black levels, in electrons, from the two dark frames at exposure 0."""
-    means = [
-        np.where(usable, one, 0.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
-        for one in (first, second)
-    ]
+    count = np.maximum(usable.sum(axis=0), 1)
+    means = [np.where(usable, one, 0.0).sum(axis=0) / count for one in (first, second)]
     a, b = (one - one.mean() for one in means)
     columns = len(a)
     product = a * b * columns / (columns - 1)
@@ -286,12 +277,11 @@ def prnu(
     dark_ratio
         Dark current at the flats' temperature over that of the darks
     """
-    rates = [
-        light_rate(flats, transfer, half, planes, dark_ratio)
-        for half, planes in (("first_dn", first), ("second_dn", second))
-    ]
-    trend = smooth((rates[0] + rates[1]) / 2, usable)
-    a, b = (one[usable] / trend[usable] - 1 for one in rates)
+    first_rate = light_rate(flats, transfer, "first_dn", first, dark_ratio)
+    second_rate = light_rate(flats, transfer, "second_dn", second, dark_ratio)
+    trend = smooth((first_rate + second_rate) / 2, usable)[usable]
+    a = first_rate[usable] / trend - 1
+    b = second_rate[usable] / trend - 1
     product = (a - a.mean()) * (b - b.mean())
     return Estimate.root(float(product.mean()), float(product.std() / np.sqrt(product.size)))
 
@@ -319,11 +309,8 @@ def smooth(image: Floats, usable: Mask) -> Floats:
     weight = usable[:rows, :columns].astype(np.float64)
 
     def blocks(plane: Floats) -> Floats:
-        return (
-            plane.reshape(rows // SAMPLE, SAMPLE, columns // SAMPLE, SAMPLE)
-            .sum(axis=(1, 3))
-            .ravel()
-        )
+        split = plane.reshape(rows // SAMPLE, SAMPLE, columns // SAMPLE, SAMPLE)
+        return split.sum(axis=(1, 3)).ravel()
 
     count = blocks(weight)
     y, x = np.mgrid[0:rows:SAMPLE, 0:columns:SAMPLE] + (SAMPLE - 1) / 2

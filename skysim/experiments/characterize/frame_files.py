@@ -27,7 +27,12 @@ from skysim.core.files import atomic_file, make_folder
 from skysim.core.random_streams import random_stream
 from skysim.core.text import read_named_rows
 from skysim.core.types import Floats
-from skysim.experiments.characterize.photon_transfer import FIT_RANGE, Level, LevelBuilder, Mask
+from skysim.experiments.characterize.photon_transfer import (
+    FIT_RANGE,
+    Level,
+    LevelBuilder,
+    Mask,
+)
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig
 
 TABLE = "frames.csv"
@@ -48,7 +53,7 @@ class Setting(NamedTuple):
 
 @dataclass
 class Stack:
-    """Levels of a folder's frames, and the median of each frame."""
+    """The levels of a folder's frames, and the median of each frame."""
 
     folder: Path
     levels: list[Level] = field(default_factory=list)
@@ -57,7 +62,7 @@ class Stack:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """The images of a folder and its subfolders, by name; of several formats of one name FITS. Raises InputError."""
+    """The images of a folder and its subfolders by name; FITS if one name has several formats. Raises InputError."""
     if not folder.is_dir():
         raise InputError(folder, "no such folder", "a folder of images")
     best: dict[Path, Path] = {}
@@ -79,7 +84,9 @@ def read_frames(folder: Path) -> Iterator[tuple[Path, Setting, NDArray[np.uint16
     for path in image_files(folder):
         parent = path.parent
         if parent not in tables:
-            tables[parent] = read_settings(parent / TABLE) if (parent / TABLE).exists() else {}
+            tables[parent] = (
+                read_settings(parent / TABLE) if (parent / TABLE).exists() else {}
+            )
         picture = images.read_picture(path)
         yield (
             path,
@@ -182,13 +189,15 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
         builders.setdefault(setting, LevelBuilder()).add(numbers)
         stack.medians.setdefault(setting, []).append((float(np.median(numbers)), path))
     check_settings(stack, builders)
-    for setting in sorted(builders, key=lambda one: (one.exposure_s, one.temperature_c or 0.0)):
+    for setting in sorted(
+        builders, key=lambda one: (one.exposure_s, one.temperature_c or 0.0)
+    ):
         stack.levels.append(builders[setting].level(*setting))
     return stack
 
 
 def padding_bits(frame: NDArray[np.uint16], bits: int) -> int:
-    """By how many bits the numbers are shifted to the left, if they are beyond the camera's range; otherwise 0."""
+    """Number of bits by which the numbers are shifted to the left; 0 if they are within the camera's range."""
     if frame.max() < 2**bits:
         return 0
     union = int(np.bitwise_or.reduce(frame, axis=None))
@@ -197,11 +206,13 @@ def padding_bits(frame: NDArray[np.uint16], bits: int) -> int:
 
 
 def check_settings(stack: Stack, builders: dict[Setting, LevelBuilder]) -> None:
-    """Raise InputError for a single frame of an exposure, and if the temperature of some frames only is known."""
+    """Raise InputError if an exposure has a single frame, or if only some frames have a temperature."""
     for setting, builder in builders.items():
         if builder.frames < 2:
             path = stack.medians[setting][0][1]
-            raise InputError(path, f"the only frame of {describe(setting)}", "2 or more, alike")
+            raise InputError(
+                path, f"the only frame of {describe(setting)}", "2 or more, alike"
+            )
     unknown = [setting for setting in builders if setting.temperature_c is None]
     if unknown and len(unknown) < len(builders):
         path = stack.medians[unknown[0]][0][1]
@@ -216,15 +227,13 @@ def describe(setting: Setting) -> str:
     return f"{setting.exposure_s:g} s{at}"
 
 
-# Darks and flats as a camera of a scene would take them, written as files: to try the command, and
-# to test it.
+# Simulated darks and flats of a scene's camera, written as files to try and to test the command.
 
 
-# frames of a dark's exposure, and of a flat's
-DARKS = 16
-PAIR = 2
-DARK_PARTS = (0.01, 0.3, 1.0)  # exposures of the darks, of the longest
-# dark current of the longest dark: squared read noises, electrons
+DARKS = 16  # frames at each exposure of the darks
+PAIR = 2  # frames at each exposure of the flats
+DARK_PARTS = (0.01, 0.3, 1.0)  # exposures of the darks over the longest one
+# Dark current in the longest dark: in squared read noises, and at least so many electrons.
 DARK_NOISES = 8.0
 LEAST_DARK_E = 200.0
 WARMER_C = 10.0
@@ -233,7 +242,7 @@ FLAT_PARTS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.66, 0.8, 0.9, 1.3, 1.5
 
 
 class PlannedFrame(NamedTuple):
-    """Frames to take: their kind, exposure, temperature, light in electrons a second, and number of frames."""
+    """Frames to take: kind, exposure, temperature, light in electrons per second, and number of frames."""
 
     kind: str
     exposure_s: float
@@ -244,7 +253,9 @@ class PlannedFrame(NamedTuple):
 
 def shots(config: DetectorConfig) -> Iterator[PlannedFrame]:
     """Darks at three exposures and two temperatures, flats in pairs from 2 to 150 % of the full well."""
-    own_c = config.dark_temperature_c if config.temperature_c is None else config.temperature_c
+    own_c = (
+        config.dark_temperature_c if config.temperature_c is None else config.temperature_c
+    )
     own_e_s = config.dark_e_s * 2.0**config.doublings
     wanted_e = min(
         max(DARK_NOISES * config.read_noise_e**2, LEAST_DARK_E), capacity_e(config) / 16
@@ -269,7 +280,7 @@ def capacity_e(config: DetectorConfig) -> float:
 def frames_of(
     camera: CameraConfig, shot: PlannedFrame, seed: int
 ) -> Iterator[NDArray[np.uint16]]:
-    """The frames of a shot by the simulated detector, uniform light."""
+    """The frames of a shot by the simulated detector in uniform light."""
     at_it = camera.detector.model_copy(update={"temperature_c": shot.temperature_c})
     made = Detector.from_camera(camera.model_copy(update={"detector": at_it}))
     key = (
@@ -293,7 +304,9 @@ def write_frames(camera: CameraConfig, folder: Path, seed: int) -> Iterator[Path
 
     for shot in shots(camera.detector):
         parent = make_folder(folder / shot.kind)
-        name = f"{shot.kind[:-1]}_{shot.exposure_s:g}s_{shot.temperature_c:g}C".replace("/", "")
+        name = f"{shot.kind[:-1]}_{shot.exposure_s:g}s_{shot.temperature_c:g}C".replace(
+            "/", ""
+        )
         for n, frame in enumerate(frames_of(camera, shot, seed)):
             header = fits.Header()
             header["EXPTIME"] = (shot.exposure_s, "exposure [s]")
@@ -309,25 +322,25 @@ def frame_count(config: DetectorConfig) -> int:
     return sum(shot.frames for shot in shots(config))
 
 
-# Frames that cannot be what they are taken for: darks with light, flats that are not flat, too few
-# of either.
+# Checks that frames are usable: darks without light, flats that are flat, and enough of both.
 
 
-LEAST_LEVELS = (
-    4  # of flats that are not saturated: three rates and a curvature, with one to test them
-)
+LEAST_LEVELS = 4  # least levels of flats below saturation: for three rates and a curvature, and one to test them
 MEDIAN_SIGMAS = 0.5  # greatest difference of a dark's median from the others, in standard deviations of a pixel
-MAX_ZEROS = 1e-3  # of a dark's pixels
-BLOCK = 32  # pixels: side of the blocks whose medians show structure
-MAX_DARK_RANGE = 2.0  # of the blocks' medians, in standard deviations of a pixel
-MAX_FLAT_RANGE = 0.3  # of the light over the frame, relative to its mean
-BRIGHT = 0.2  # signal over the brightest, from which on a flat must be flat
-MAX_PAIR_CHANGE = 0.03  # of the light from frame to frame, relative
-# of a bright pixel, of a spot, and spots beyond those by chance
-SPOT_SIGMAS = 12.0
-SPOT_PIXELS = 4
-MAX_SPOTS = 3
-POLYPLETS = 110  # figures of four squares that touch by sides or corners, fixed (OEIS A006770)
+MAX_ZEROS = 1e-3  # greatest fraction of a dark's pixels that are 0
+BLOCK = 32  # side in pixels of the blocks whose medians show structure
+MAX_DARK_RANGE = (
+    2.0  # greatest range of the blocks' medians in a dark, in standard deviations of a pixel
+)
+MAX_FLAT_RANGE = 0.3  # greatest range of the light over a flat, relative to its mean
+BRIGHT = 0.2  # signal, relative to the brightest flat, above which a flat must be flat
+MAX_PAIR_CHANGE = 0.03  # greatest relative change of the light from frame to frame
+SPOT_SIGMAS = 12.0  # standard deviations above which a pixel is bright
+SPOT_PIXELS = 4  # least number of touching bright pixels of a spot
+MAX_SPOTS = 3  # greatest number of spots beyond those expected by chance
+POLYPLETS = (
+    110  # figures of four squares that touch by sides or corners, fixed (OEIS A006770)
+)
 
 
 class BrightSpots(NamedTuple):
@@ -338,7 +351,7 @@ class BrightSpots(NamedTuple):
 
 
 def check_darks(darks: Stack) -> None:
-    """Raise InputError unless these are darks of two exposures or more: equal medians, no structure, no stars."""
+    """Raise InputError unless these are darks of two exposures or more, with equal medians, no structure, no stars."""
     for setting, medians in darks.medians.items():
         level = level_of(darks, setting)
         noise_dn = math.sqrt(float(np.median(level.variance_dn2)) + 1)
@@ -370,7 +383,7 @@ def level_of(stack: Stack, setting: Setting) -> Level:
 
 
 def check_dark(darks: Stack, level: Level) -> None:
-    """Raise InputError for a level of darks that is cut off at 0, equal frame by frame, or has structure or stars."""
+    """Raise InputError for a level of darks that is cut off at 0, has identical frames, or has structure or stars."""
     folder = darks.folder
     which = f"the darks of {describe(Setting(level.exposure_s, level.temperature_c))}"
     mean = level.mean_dn
@@ -395,7 +408,7 @@ def check_dark(darks: Stack, level: Level) -> None:
             f"{which} are not dark: {extent:.3g} DN brighter at the {place.brightest} than at the {place.darkest}",
             f"{MAX_DARK_RANGE * noise_dn:.2g} DN: cap the lens, cover the window",
         )
-    # Hot pixels are single, but for those that touch by chance; images of stars cover several pixels. A track of a
+    # Hot pixels are single, except those that touch by chance; images of stars cover several pixels. A track of a
     # particle is in one half of the frames.
     both = np.minimum(level.first_dn, level.second_dn)
     bright = both > np.median(mean) + SPOT_SIGMAS * max(
@@ -472,7 +485,7 @@ def spread(image: Floats) -> float:
 
 
 def block_medians(image: Floats) -> Floats:
-    """Medians of square blocks, BLOCK pixels wide or smaller, so that there are nine at least."""
+    """Medians of square blocks, at most BLOCK pixels wide, and small enough that there are at least nine."""
     side = max(min(BLOCK, *(size // 3 for size in image.shape)), 1)
     rows, columns = (size // side for size in image.shape)
     blocks = image[: rows * side, : columns * side].reshape(rows, side, columns, side)
@@ -480,7 +493,7 @@ def block_medians(image: Floats) -> Floats:
 
 
 def extremes(medians: Floats) -> BrightSpots:
-    """Words for the places of the greatest and of the least block."""
+    """The places of the greatest and of the least block, in words."""
 
     def word(index: int) -> str:
         row, column = np.unravel_index(index, medians.shape)

@@ -38,17 +38,15 @@ from skysim.tracking.onboard_model import calibration, onboard_catalog
 # Size of star images over the field, from Gaussian fits of single stars.
 
 
-HALF_PX = 7  # half of a star's window
+HALF_PX = 7  # a star's window is 2 HALF_PX + 1 pixels wide
 X, Y, FLUX, SKY, LN_SX, LN_SY = range(6)
-# of the fit; a step in standard deviations
-STEPS = 30
-CONVERGED = 1e-3
+STEPS = 30  # most steps of the fit
+CONVERGED = 1e-3  # length of the last step, in standard deviations
 START_SIGMA_PX = 1.0
-MAX_STEP = 0.5  # pixels, and of the logarithms
-OUTLIER_SIGMAS = 4.0  # of a chi-square, and of a size
-# of leaving out outliers, and the change of the errors at their end
-ROUNDS = 12
-SETTLED = 1e-4
+MAX_STEP = 0.5  # greatest step: pixels of a position, or of the logarithm of a size
+OUTLIER_SIGMAS = 4.0  # greatest deviation of a chi-square, and of a size
+ROUNDS = 12  # most rounds of leaving out outliers
+SETTLED = 1e-4  # relative change of the errors that ends the rounds
 LEAST_VARIANCE_PX2 = 1e-3
 
 
@@ -58,9 +56,9 @@ class StarImages(NamedTuple):
     Attributes
     ----------
     xy_px
-        (N, 2)
+        (N, 2) positions
     flux_dn
-        (N,)
+        (N,) fluxes
     variance_px2, variance_sigma_px2
         (N,) mean of s_x^2 and s_y^2, and its error
     stretch_px2
@@ -81,7 +79,7 @@ class StarImages(NamedTuple):
 
 
 class ImageSize(NamedTuple):
-    """sigma_px and corner_sigma_px of the key psf; the stars used, and how many were left out."""
+    """sigma_px and corner_sigma_px of the key psf; the stars that were used, and the number of those left out."""
 
     sigma_px: Estimate
     corner_sigma_px: Estimate
@@ -128,7 +126,7 @@ def model(p: Floats) -> tuple[Floats, Floats]:
 def fit_images(
     image_dn: Floats, xy_px: Floats, gain_dn_e: float, read_dn2: float
 ) -> StarImages:
-    """Fit the stars at these pixels of a frame without black level, its signal linear; gain in DN per electron."""
+    """Fit the stars at these pixels of a linear frame without black level; the gain is in DN per electron."""
     pixels, corner = windows(image_dn, xy_px)
     sky = np.median(pixels, axis=1)
     flux = np.maximum((pixels - sky[:, None]).sum(axis=1), 1.0)
@@ -166,12 +164,12 @@ def fit_images(
 def summary(
     p: Floats, corner: Floats, residual: Floats, normal: Floats, chi2: Floats
 ) -> StarImages:
-    """What is used of the fits."""
+    """The star images from the parameters of the fits."""
     covariance = np.linalg.inv(normal)
     sx2 = np.exp(2 * p[:, LN_SX])
     sy2 = np.exp(2 * p[:, LN_SY])
     slope = np.zeros((len(p), 6))
-    # of (s_x^2 + s_y^2) / 2
+    # Slope of (s_x^2 + s_y^2) / 2.
     slope[:, LN_SX] = sx2
     slope[:, LN_SY] = sy2
     error = np.sqrt(np.einsum("ni,nij,nj->n", slope, covariance, slope))
@@ -181,7 +179,9 @@ def summary(
     v = (span - p[:, Y, None]) / sy2[:, None]
     gx = integrals(p[:, X], p[:, LN_SX])[0]
     gy = integrals(p[:, Y], p[:, LN_SY])[0]
-    tilt = p[:, FLUX, None] * ((v * gy)[:, :, None] * (u * gx)[:, None, :]).reshape(len(p), -1)
+    tilt = p[:, FLUX, None] * ((v * gy)[:, :, None] * (u * gx)[:, None, :]).reshape(
+        len(p), -1
+    )
     covariance_px2 = np.sum(tilt * residual, axis=1) / np.maximum(
         np.sum(tilt**2, axis=1), 1e-300
     )
@@ -195,14 +195,15 @@ def summary(
 def image_size(
     stars: StarImages, center_px: tuple[float, float], corner_px: float
 ) -> ImageSize | None:
-    """The law of the size over the field; None for fewer than three stars that are Gaussians."""
+    """The law of the size over the field; None if fewer than three stars fit a Gaussian."""
     freedom = (2 * HALF_PX + 1) ** 2 - 6
     sound = np.isfinite(stars.variance_sigma_px2) & (
         stars.chi2 < 1 + OUTLIER_SIGMAS * np.sqrt(2 / freedom) + 0.2
     )
     rho2 = np.sum((stars.xy_px - np.array(center_px)) ** 2, axis=1) / corner_px**2
     design = np.column_stack([np.ones(len(rho2)), rho2])
-    # A star's relative error, times the law's size: its own error would give images that came out small more weight.
+    # The error is a star's relative error times the law's size: with its own size, images that were measured too small
+    # would have too much weight.
     kept = sound
     relative = stars.variance_sigma_px2 / stars.variance_px2
     expected = stars.variance_px2
@@ -238,16 +239,15 @@ def image_size(
 
 CATALOG = "gaia_v8.0"
 DEFAULT_EPOCH_YR = 2020.0
-STARS_A_FIELD = 300.0  # of the catalog, on average
-FOCAL_UNCERTAINTY = 0.05  # of the focal length in the camera's file
-# of a star whose image is measured; its peak over saturation
-LEAST_SNR = 40.0
-MAX_PEAK = 0.8
+STARS_A_FIELD = 300.0  # mean number of catalog stars in a field
+FOCAL_UNCERTAINTY = 0.05  # relative, of the focal length in the camera's file
+LEAST_SNR = 40.0  # least signal-to-noise ratio of a star whose image is measured
+MAX_PEAK = 0.8  # greatest peak of such a star, relative to saturation
 LEAST_STARS = 20
 LEAST_FRAMES = 3
 LEAST_TRAILED = 3
 MEDIAN_COST = 1.25  # standard error of a median over that of a mean
-MAX_STRETCH = 0.25  # of the images, over their variance
+MAX_STRETCH = 0.25  # greatest stretch of the images, relative to their variance
 LENS = ("focal_px", "center_x_px", "center_y_px", "k1", "k2", "p1", "p2", "k3")
 
 
@@ -273,8 +273,10 @@ class NightFrame(NamedTuple):
 def measure_night(
     config: CameraConfig, folder: Path, transfer: Transfer, saturation_dn: float
 ) -> Night:
-    """The lens from frames of the sky. Raises InputError for frames that do not tell."""
-    frames = [read_frame(path, config, transfer, saturation_dn) for path in image_files(folder)]
+    """The lens from frames of the sky. Raises InputError for frames that cannot be used."""
+    frames = [
+        read_frame(path, config, transfer, saturation_dn) for path in image_files(folder)
+    ]
     still = [without_trail(one.stars) for one in frames]
     stars = StarImages(*(np.concatenate(part) for part in zip(*still, strict=True)))
     if len(stars.chi2) < LEAST_STARS:
@@ -289,7 +291,9 @@ def measure_night(
     center_px = lens.camera.center_px if lens else config.center_px
     size = image_size(stars, center_px, config.corner_px)
     if size is None:
-        raise InputError(folder, "no star's image is a Gaussian", "stars in focus, not trailed")
+        raise InputError(
+            folder, "no star's image is a Gaussian", "stars in focus, not trailed"
+        )
     if size.left_out > 0.5 * len(stars.chi2):
         remarks.append(
             f"psf: {size.left_out} of {len(stars.chi2)} star images are no Gaussians, and were left out"
@@ -301,7 +305,7 @@ def measure_night(
 def read_frame(
     path: Path, config: CameraConfig, transfer: Transfer, saturation_dn: float
 ) -> NightFrame:
-    """Detect and fit the stars of a frame. Raises InputError for one of another camera."""
+    """Detect and fit the stars of a frame. Raises InputError for a frame of another camera."""
     picture = images.read_picture(path)
     numbers = raw_numbers(path, picture.pixels)
     if numbers.shape != (config.height_px, config.width_px):
@@ -320,7 +324,9 @@ def read_frame(
     chosen = measurable(numbers, centroids, transfer, saturation_dn)
     gain = float(transfer.values[GAIN])
     read = float(transfer.values[READ])
-    return NightFrame(path, centroids, fit_images(signal, chosen, gain, read), picture.date_utc)
+    return NightFrame(
+        path, centroids, fit_images(signal, chosen, gain, read), picture.date_utc
+    )
 
 
 def settings_of(transfer: Transfer, saturation_dn: float) -> Settings:
@@ -335,7 +341,7 @@ def settings_of(transfer: Transfer, saturation_dn: float) -> Settings:
 def measurable(
     numbers: NDArray[Any], centroids: Centroids, transfer: Transfer, saturation_dn: float
 ) -> Floats:
-    """(N, 2) pixels of stars that are bright, not saturated, away from the border and from other stars."""
+    """(N, 2) pixels of stars that are bright, not saturated, and away from the border and from other stars."""
     xy = centroids.xy_px
     if not len(xy):
         return np.zeros((0, 2))
@@ -368,7 +374,7 @@ def trail_px2(stars: StarImages) -> tuple[float, float]:
 
 
 def without_trail(stars: StarImages) -> StarImages:
-    """The images without what a common trail adds to their mean variance: half of the stretch, less its own error."""
+    """The images without the effect of a common trail on their mean variance: half of the stretch, less its error."""
     count = max(len(stars.chi2), 1)
     noise2 = (
         float(np.sum(np.var(stars.stretch_px2, axis=0))) * MEDIAN_COST**2 / count
@@ -401,7 +407,7 @@ def check_trails(frames: list[NightFrame]) -> None:
 def find_lens(
     config: CameraConfig, frames: list[NightFrame], transfer: Transfer, saturation_dn: float
 ) -> tuple[Calibration | None, list[str]]:
-    """The lens by stars that are identified, from the focal length in the camera's file; or why it is unknown."""
+    """The lens from identified stars, starting at the focal length in the camera's file; or why it is unknown."""
     if len(frames) < LEAST_FRAMES:
         lacking = LEAST_FRAMES - len(frames)
         return None, [

@@ -2,16 +2,16 @@
 
 Light of a steady lamp and dark current give a pixel, in the time t, N = (R + D) t electrons on average, with the
 variance N. With the conversion K (DN per electron) its mean signal is x = K N; an amplifier whose gain falls with the
-signal makes x (1 - c x) of it. A level's mean and its temporal variance over the pixels are then
+signal changes it to x (1 - c x). A level's mean and its temporal variance over the pixels are then
 
     mean = o + x - c x^2,    variance = (1 - 2 c x)^2 (K x + r^2) + 1/12,
 
 with the black level o, the read noise r in DN, and 1/12 DN^2 of the converter's rounding (Janesick 2007, Photon
-Transfer, ch. 5; EMVA 1288, release 4.0 Linear, has the law without c). Darks, R = 0, and flats follow one law and
-are fitted at once by weighted least squares, with a rate D for each temperature. What is left of the differences
-between two frames' means beyond their noise is the lamp's flicker; it is part of a mean's error.
+Transfer, ch. 5; EMVA 1288, release 4.0 Linear, has the law without c). Darks (R = 0) and flats follow one law and
+are fitted at once by weighted least squares, with a rate D for each temperature. Differences between the means of two
+frames that their noise does not explain are the lamp's flicker, which is part of the error of a mean.
 
-Only levels up to FIT_RANGE of the saturation are fitted, as EMVA 1288 has it for the photon transfer curve. In a
+Only levels up to FIT_RANGE of the saturation are fitted, as EMVA 1288 does for the photon transfer curve. In a
 saturated level the variance collapses: it grows up to the turnover and falls to the read noise beyond it.
 """
 
@@ -33,7 +33,7 @@ from skysim.core.types import Floats
 
 
 SIGMAS_95 = 1.959964  # half of a normal 95 % interval in standard deviations
-STEP = 1e-4  # of a slope's difference, in standard deviations
+STEP = 1e-4  # step of the numerical derivatives, in standard deviations
 
 
 class Estimate(NamedTuple):
@@ -66,7 +66,7 @@ class Estimate(NamedTuple):
 
     @classmethod
     def root(cls, variance: float, sigma: float) -> Estimate:
-        """The square root of a variance, with the standard error of that; an interval from 0 if it is not above 0."""
+        """The square root of a variance with its standard error; the interval begins at 0 if the variance does."""
         value = math.sqrt(max(variance, 0.0))
         low, high = (
             math.sqrt(max(variance + sign * SIGMAS_95 * sigma, 0.0)) for sign in (-1, 1)
@@ -77,7 +77,7 @@ class Estimate(NamedTuple):
 def propagate(
     function: Callable[[Floats], float], at: Floats, covariance: Floats
 ) -> tuple[float, float]:
-    """Value and standard error of a function of parameters, by central differences of a fraction of their errors."""
+    """Value and standard error of a function of parameters, by central differences."""
     step = STEP * np.sqrt(np.diag(covariance))
     slope = np.zeros(len(at))
     for n in np.flatnonzero(step > 0):
@@ -87,14 +87,12 @@ def propagate(
     return float(function(at)), math.sqrt(max(float(slope @ covariance @ slope), 0.0))
 
 
-# Frames of one exposure, reduced to two mean frames and to the mean and temporal variance of their
-# pixels.
+# Frames of one exposure, reduced to two mean frames and the temporal variance of every pixel.
 
 
 Mask = NDArray[np.bool_]
-# interquartile ranges, and pixels from which these are taken
-TRIM = 5.0
-SAMPLES = 100_000
+TRIM = 5.0  # interquartile ranges from the median within which pixels are averaged
+SAMPLES = 100_000  # number of pixels from which the quartiles are computed
 
 
 class Moments(NamedTuple):
@@ -113,9 +111,9 @@ class Level:
     Attributes
     ----------
     count
-        Frames, an even number
+        Number of frames, even
     greatest_dn, least_dn
-        Of all pixels
+        Greatest and least number of all pixels
     first_dn, second_dn
         (H, W) means of the first and of the second frames of the pairs
     variance_dn2
@@ -140,8 +138,10 @@ class Level:
         return (self.first_dn.astype(np.float64) + self.second_dn) / 2
 
     def moments(self, used: Mask) -> Moments:
-        """Mean and variance over the used pixels. Standard errors are empirical, from the scatter of the pixels'
-        variances, since hot pixels have more noise."""
+        """Mean and variance over the used pixels.
+
+        Standard errors are empirical, from the scatter of the pixels' variances, since hot pixels have more noise.
+        """
         variance = self.variance_dn2[used].astype(np.float64)
         mean = (
             self.first_dn[used].mean(dtype=np.float64)
@@ -185,7 +185,7 @@ class LevelBuilder:
         self.first = None
 
     def level(self, exposure_s: float, temperature_c: float | None) -> Level:
-        """The level of the pairs so far, of which there must be one; an odd last frame is left out."""
+        """The level of the pairs so far, at least one; an odd last frame is left out."""
         pairs = self.frames // 2
         first, second, squares = (
             total / np.float32(divisor)
@@ -200,7 +200,7 @@ class LevelBuilder:
 
 
 def trimmed_mean(difference: NDArray[np.float32]) -> float:
-    """Mean of the pixels within TRIM interquartile ranges of the median: without those that a particle hit."""
+    """Mean of the pixels within TRIM interquartile ranges of the median, which excludes those that a particle hit."""
     low, middle, high = np.quantile(
         difference.ravel()[:: max(difference.size // SAMPLES, 1)], (0.25, 0.5, 0.75)
     )
@@ -209,7 +209,7 @@ def trimmed_mean(difference: NDArray[np.float32]) -> float:
 
 
 def level(exposure_s: float, temperature_c: float | None, frames: Iterable[NDArray]) -> Level:
-    """The level of some frames, two at least."""
+    """The level of two frames or more."""
     builder = LevelBuilder()
     for frame in frames:
         builder.add(frame)
@@ -218,20 +218,20 @@ def level(exposure_s: float, temperature_c: float | None, frames: Iterable[NDArr
 
 ROUNDING_DN2 = 1 / 12  # variance of a rounding error, uniform over one number
 FIT_RANGE = 0.7
-SIGNIFICANT = 2.0  # standard errors from which on a flicker is one
-COLLAPSED = 0.5  # a level beyond the turnover whose variance is below this fraction of the greatest is saturated
+SIGNIFICANT = 2.0  # standard errors above which a flicker is significant
+COLLAPSED = 0.5  # a level beyond the turnover is saturated if its variance is below this fraction of the greatest
 GAIN, CURVATURE, READ, BLACK, LIGHT, FIRST_DARK = range(6)  # places of the parameters
 
 
 class TransferPoint(NamedTuple):
-    """A level as the fit sees it.
+    """A level as input of the fit.
 
     Attributes
     ----------
     lit
         1 for a flat, 0 for a dark
     dark
-        Index of its temperature
+        Index of the temperature of its dark current
     """
 
     exposure_s: float
@@ -249,13 +249,13 @@ class Transfer(NamedTuple):
         K in DN/e-, c in 1/DN, r^2 in DN^2, o in DN, K R in DN/s, and K D in DN/s for each
         temperature
     covariance
-        Of these
+        Covariance of the values
     flicker
         Relative standard deviation of the light from frame to frame
     misfit
-        chi-square over its degrees of freedom
+        Chi-square over its degrees of freedom
     points
-        Those fitted
+        The levels that were fitted
     """
 
     values: Floats
@@ -266,11 +266,13 @@ class Transfer(NamedTuple):
 
     @property
     def gain_e_dn(self) -> Estimate:
-        return Estimate.normal(*propagate(lambda p: 1 / p[GAIN], self.values, self.covariance))
+        return Estimate.normal(
+            *propagate(lambda p: 1 / p[GAIN], self.values, self.covariance)
+        )
 
     @property
     def read_noise_e(self) -> Estimate:
-        """Of the sensor alone, without rounding."""
+        """Read noise of the sensor alone, without rounding."""
         variance, sigma = propagate(
             lambda p: p[READ] / p[GAIN] ** 2, self.values, self.covariance
         )
@@ -315,7 +317,7 @@ def fit(points: Sequence[TransferPoint], flicker: float) -> Transfer:
     mean, mean_sigma, variance, variance_sigma = np.array([one.moments for one in kept]).T
     black = min(mean)
     lit = np.array([one.lit for one in kept])
-    # Of a pair at least.
+    # Flicker of the mean of a pair, the fewest frames of a level.
     mean_sigma = np.hypot(mean_sigma, lit * flicker * (mean - black) / np.sqrt(2))
     start = start_values(kept)
 
@@ -339,7 +341,7 @@ def fit(points: Sequence[TransferPoint], flicker: float) -> Transfer:
 
 
 def start_values(points: Sequence[TransferPoint]) -> Floats:
-    """Slope of the variance against the mean over all levels, and rates from the longest exposures."""
+    """Start values: slope of the variance against the mean over all levels, and rates from the longest exposures."""
     mean, variance = (
         np.array([getattr(one.moments, name) for one in points])
         for name in ("mean_dn", "variance_dn2")
@@ -364,13 +366,13 @@ def start_values(points: Sequence[TransferPoint]) -> Floats:
 
 
 def unsaturated(points: Sequence[TransferPoint], black_dn: float) -> list[bool]:
-    """Which flats are up to FIT_RANGE of the greatest signal."""
+    """Whether the signal of each flat is at most FIT_RANGE of the greatest."""
     top = max(one.moments.mean_dn for one in points) - black_dn
     return [one.moments.mean_dn - black_dn <= FIT_RANGE * top for one in points]
 
 
 def saturated(points: Sequence[TransferPoint]) -> list[bool]:
-    """Which flats are beyond the turnover of the variance, with a variance that has collapsed."""
+    """Whether each flat is beyond the turnover of the variance, with a variance that has collapsed."""
     variance = np.array([one.moments.variance_dn2 for one in points])
     brighter = (
         np.array([one.exposure_s for one in points])
@@ -385,11 +387,11 @@ def lamp_flicker(
     black_dn: float,
     pixels: int,
 ) -> float:
-    """Relative flicker from frame to frame: of the means' differences in pairs, what their noise does not explain.
+    """Relative flicker from frame to frame, from differences between the means of a pair that noise does not explain.
 
     The frames of a pair are independent, so the mean square difference is 2 (flicker signal)^2 + 2 variance / pixels.
-    What is not above its own error, by SIGNIFICANT sigmas, is taken for 0: a flicker would else be found in half of all
-    steady lamps.
+    A flicker that is not above its own error by SIGNIFICANT sigmas is set to 0: otherwise half of all steady lamps
+    would have one.
     """
     signal = np.array([one.moments.mean_dn for one in points]) - black_dn
     noise = 2 * np.array([one.moments.variance_dn2 for one in points]) / pixels

@@ -27,23 +27,25 @@ from skysim.experiments.characterize.photon_transfer import (
     propagate,
 )
 
-HOT_SIGMAS = 20.0  # above the median dark: pixels left out of the photon transfer
-HIT_SIGMAS = 8.0  # by which the halves of a pixel's frames differ, where a particle hit it
+HOT_SIGMAS = (
+    20.0  # above the median dark, beyond which pixels are left out of the photon transfer
+)
+HIT_SIGMAS = 8.0  # difference between the halves of a pixel's frames beyond which a particle has hit it
 
 
 class MeasuredSensor(NamedTuple):
-    """What the frames tell.
+    """The parameters of a sensor from its frames.
 
     Attributes
     ----------
     estimates
         By key of `camera.detector`, in its units
     remarks
-        What they do not tell, one line each
+        What remains unknown, one line each
     dark
         Distribution of the dark current, None if it is below the noise
     flats
-        All levels, those too that are beyond the fit
+        All levels, including those that were not fitted
     saturation_dn
         Digital number of a saturated pixel, or of the brightest flat
     """
@@ -59,7 +61,7 @@ class MeasuredSensor(NamedTuple):
 
 
 class Findings(NamedTuple):
-    """The photon transfer, and what was found by it so far: estimates by key, and remarks on what is unknown."""
+    """The photon transfer, and the results so far: estimates by key, and remarks on what is unknown."""
 
     transfer: Transfer
     estimates: dict[str, Estimate]
@@ -67,13 +69,14 @@ class Findings(NamedTuple):
 
 
 def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSensor:
-    """Every parameter from levels of darks and flats, which `checks` has found to be usable.
+    """Every parameter from levels of darks and flats that have passed the checks of `frame_files`.
 
     The dark current is stated at the darks' temperature that is nearest to that of the flats.
     """
     usable = usable_pixels(darks)
     temperatures = sorted(
-        {one.temperature_c for one in darks}, key=lambda one: -math.inf if one is None else one
+        {one.temperature_c for one in darks},
+        key=lambda one: -math.inf if one is None else one,
     )
     own = nearest_index(temperatures, flats[0].temperature_c)
     dark_points = [
@@ -82,7 +85,9 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
         )
         for one in darks
     ]
-    flat_points = [TransferPoint(one.exposure_s, 1, own, one.moments(usable)) for one in flats]
+    flat_points = [
+        TransferPoint(one.exposure_s, 1, own, one.moments(usable)) for one in flats
+    ]
     black_dn = min(point.moments.mean_dn for point in dark_points)
     below = photon_transfer.unsaturated(flat_points, black_dn)
     fitted = [one for one, is_below in zip(flats, below, strict=True) if is_below]
@@ -110,7 +115,7 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
         first[0], second[0], usable, 1 / transfer.values[GAIN]
     )
     estimates["column_offset_e"] = columns
-    # The columns' levels are those of this chip: the mean of as many others differs by their scatter.
+    # The columns are a sample: the mean of as many columns of another chip differs by their scatter.
     scatter_dn = columns.value * transfer.values[GAIN] / math.sqrt(usable.shape[1])
     black = transfer.offset_dn
     estimates["offset_dn"] = Estimate.normal(black.value, math.hypot(black.sigma, scatter_dn))
@@ -135,8 +140,10 @@ def rate_ratio(transfer: Transfer, own: int, chosen: int) -> float:
 
 
 def usable_pixels(darks: Sequence[Level]) -> Mask:
-    """Pixels that no particle has hit and that are not hot in any dark: no further above the median than HOT_SIGMAS
-    robust standard deviations."""
+    """Pixels that no particle has hit, and that are not hot in any dark.
+
+    Hot pixels are more than HOT_SIGMAS robust standard deviations above the median.
+    """
     usable = np.ones(darks[0].first_dn.shape, bool)
     for one in darks:
         mean = one.mean_dn
@@ -149,9 +156,9 @@ def usable_pixels(darks: Sequence[Level]) -> Mask:
 
 
 def steady_pixels(one: Level, variance_dn2: float | Floats) -> Mask:
-    """Pixels whose two halves of the frames agree within HIT_SIGMAS: no track of a particle is in one of them.
+    """Pixels whose means over the two halves of the frames agree within HIT_SIGMAS: no particle has hit them.
 
-    Each half is the mean of count / 2 frames, so that their difference has four times the variance over count.
+    Each half is the mean of count / 2 frames, so their difference has the variance 4 variance_dn2 / count.
     """
     return np.abs(one.first_dn - one.second_dn) <= HIT_SIGMAS * np.sqrt(
         4 * np.maximum(variance_dn2, 0.2) / one.count
@@ -159,16 +166,18 @@ def steady_pixels(one: Level, variance_dn2: float | Floats) -> Mask:
 
 
 def nearest_index(temperatures: Sequence[float | None], temperature_c: float | None) -> int:
-    """Index of the darks' temperature that is nearest; 0 if it is unknown."""
+    """Index of the darks' temperature that is nearest to a temperature; 0 if one of them is unknown."""
     if temperature_c is None or temperatures[0] is None:
         return 0
-    return int(np.argmin([abs(one - temperature_c) for one in temperatures if one is not None]))
+    return int(
+        np.argmin([abs(one - temperature_c) for one in temperatures if one is not None])
+    )
 
 
 def best_temperature(
     temperatures: Sequence[float | None], darks: Sequence[Level], transfer: Transfer
 ) -> int:
-    """The temperature whose darks of two exposures or more have the most dark current."""
+    """Index of the temperature whose darks differ most in their charge from dark current."""
 
     def signal(index: int) -> float:
         times = [one.exposure_s for one in darks if one.temperature_c == temperatures[index]]
@@ -178,8 +187,11 @@ def best_temperature(
 
 
 def full_well(found: Findings, flats: Sequence[TransferPoint]) -> None:
-    """Full well and nonlinearity: electrons where the signal stays though the exposure grows, and what is missing
-    there; c x of the fit."""
+    """Add full well and nonlinearity to the findings.
+
+    Full well is the charge at which the signal no longer grows with the exposure. Nonlinearity is the relative loss of
+    signal there, c x of the fit.
+    """
     transfer = found.transfer
     is_full = photon_transfer.saturated(flats)
     full = [one for one, chosen in zip(flats, is_full, strict=True) if chosen]
@@ -216,14 +228,14 @@ def dark_parameters(
     own: int,
     ratio: float,
 ) -> DarkCurrent | None:
-    """Dark current, DSNU and hot pixels from the rates of the pixels at the temperature of these darks.
+    """Add dark current, DSNU and hot pixels to the findings, from the rates of the pixels in darks of one temperature.
 
     Parameters
     ----------
     own
-        Index of the temperature for which they are stated
+        Index of the temperature for which the dark current is stated
     ratio
-        Dark current at it over that of these darks
+        Dark current at that temperature over the dark current of these darks
     """
     transfer = found.transfer
     weights = first[2]
@@ -268,7 +280,7 @@ def unresolved(
     noise: RateNoise,
     longest_s: float,
 ) -> None:
-    """Mean dark current alone, where its scatter over the pixels is below the noise; with the exposure to take."""
+    """Add the mean dark current alone, if its scatter over the pixels is below the noise; remark what it needs."""
     transfer = found.transfer
     value, sigma = propagate(
         lambda p: p[FIRST_DARK + own] / p[GAIN], transfer.values, transfer.covariance
@@ -293,9 +305,9 @@ def unresolved(
 
 
 def doubling(found: Findings, temperatures: Sequence[float | None]) -> None:
-    """Temperature that doubles the dark current: ln 2 over the slope of ln D, a weighted line through all temperatures.
+    """Add the temperature step that doubles the dark current: ln 2 over the slope of ln D, by a weighted line.
 
-    The same pixels are compared, so that their scatter does not count.
+    The same pixels are compared at all temperatures, so their scatter does not matter.
     """
     known = [one for one in temperatures if one is not None]
     if len(known) < 2:

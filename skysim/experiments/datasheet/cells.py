@@ -1,6 +1,6 @@
 """The experiments of a datasheet as one study: each cell sets keys of the scene and of the trial, in the same fields.
 
-A field is a replicate: a random attitude, the same in all cells whose `attitude_seed` is the same. A cell draws units,
+A field is a replicate: a random attitude, the same in all cells with the same `attitude_seed`. A cell chooses unit,
 thermal state, attitude and noise by number, so that terms can be separated and causes compared on the same frames.
 """
 
@@ -26,42 +26,53 @@ from skysim.core.yaml_reader import parse_yaml
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.factors import Point, Settings
 from skysim.experiments.study.plan import Plan, Study, TrialSpec, make_plan
-from skysim.experiments.study.study_file import has_survey_errors
+from skysim.experiments.study.study_file import dome_seeds
 from skysim.experiments.study.unused_options import tracks
 from skysim.scene.scene import BODIES_YEARS, Scene
-from skysim.scene.sections.layouts import OnPoints
-from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
+from skysim.scene.sections.light import CollimatedDisplayConfig, StarsConfig
 
-# From one attitude of a field to the next: other phases in the pixels, the same stars.
+# Step from one attitude of a field to the next: the same stars at other phases in the pixels.
 SCAN_PX = 3.37
-FIXED_PATTERN = ("prnu", "dsnu", "hot_pixels", "column_offset_e")  # keys of the detector
-STREAKS_PX = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # of the rates
+FIXED_PATTERN = ("prnu", "dsnu", "hot_pixels", "column_offset_e")  # keys of `camera.detector`
+STREAKS_PX = (
+    0.5,
+    1.0,
+    2.0,
+    4.0,
+    8.0,
+    16.0,
+    32.0,
+)  # lengths of the streaks, which give the rates
 SEQUENCE = (0, 1, 2, 4, 8, 16)  # frames of a sequence at a constant rate
-SEQUENCE_RATES = 4  # beside rest, the slowest ones
-FAINTER = (-1.0, -0.5, 0.5)  # magnitudes by which the limit of the tracker's catalog is varied
-# error and number of the centroids beside which false ones are drawn
+SEQUENCE_RATES = 4  # number of the slowest rates that have sequences, as rest has
+FAINTER = (
+    -1.0,
+    -0.5,
+    0.5,
+)  # magnitudes by which the limit of the tracker's catalog is varied
+# Error and number of the true centroids in trials with false ones.
 FALSE_STARS_PX = 0.05
 TRUE_STARS = 20
-BENDS_PX = (1.0, 4.0, 16.0, 64.0)  # acceleration times the exposure time's square
-TRACKED = 2  # frames that are followed before one in tracking mode: the second has a rate
-TRACKED_STREAKS_PX = (2.0, 8.0, 16.0, 32.0)  # of the rates in tracking mode
+BENDS_PX = (1.0, 4.0, 16.0, 64.0)  # acceleration times the square of the exposure time
+TRACKED = 2  # frames before one in tracking mode: the second one gives a rate
+TRACKED_STREAKS_PX = (2.0, 8.0, 16.0, 32.0)  # lengths of the streaks in tracking mode
 # Acceleration times the square of the time between frames, in tracking mode.
 MISSED_PX = (3.0, 6.0, 12.0, 24.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """Numbers of fields, of units, of thermal states, of attitudes and frames in a field, and of other cells.
+    """Numbers of fields, units, thermal states, attitudes in a field, frames at an attitude, and other cells.
 
     Attributes
     ----------
     draws
-        Frames in each field with attitudes and noise of their own, in which units and thermal
-        states take turns
+        Independent frames in each field: each with another attitude and noise, and with the next
+        unit and thermal state
     sky
         Frames in new fields, of other units
     pairs
-        Frames with and without a cause to compare
+        Pairs of frames with and without a cause
     """
 
     fields: int
@@ -94,7 +105,7 @@ class DatasheetCell(NamedTuple):
 
 
 class Draw(NamedTuple):
-    """Numbers of the unit, thermal state and attitude in the field; the noise is another one in every cell."""
+    """Numbers of the unit, the thermal state and the attitude in the field. Every cell has other noise."""
 
     unit: int = 0
     state: int = 0
@@ -120,31 +131,25 @@ def check_scene(scene: Scene) -> None:
 
 
 def unit_seeds(scene: Scene) -> list[str]:
-    """Keys of the seeds that make another unit: chip, survey, LEDs."""
+    """Keys of the seeds that differ from unit to unit: chip, survey, LEDs."""
     chip = scene.camera.detector
     has_pattern = any(getattr(chip, key) for key in FIXED_PATTERN)
     seeds = ["camera.detector.hardware_seed"] if has_pattern else []
-    seeds += (
-        ["tracker.survey.seed"] if has_survey_errors(scene) and not scene.tracker.map else []
-    )
-    layout = scene.light.layout if isinstance(scene.light, DomeConfig) else None
-    points, prefix = (
-        (layout.points, ".points") if isinstance(layout, OnPoints) else (layout, "")
-    )
-    seeds += [f"light.layout{prefix}.hardware_seed"] if hasattr(points, "hardware_seed") else []
-    return seeds
+    return seeds + dome_seeds(scene)
 
 
 def states_c(scene: Scene, count: int) -> list[float]:
-    """Temperatures of `count` thermal states: the scene's own history at equal steps; none without the section.
+    """Temperatures of `count` thermal states, at equal steps of the scene's history; none without the section.
 
-    The history is a period of a sine, a table from its first to its last time, or a day.
+    The history is one period of a sine, a table from its first to its last time, or a day.
     """
     config = scene.thermal
     if config is None:
         return []
     history = config.temperature
-    hours = np.linspace(0, getattr(history, "period_s", DAY_S) / HOUR_S, count, endpoint=False)
+    hours = np.linspace(
+        0, getattr(history, "period_s", DAY_S) / HOUR_S, count, endpoint=False
+    )
     if history.kind == "table":
         hours = np.linspace(history.hours[0], history.hours[-1], count)
     if history.kind == "steady":
@@ -185,9 +190,9 @@ class Designer:
         return chosen | {"trial.noise_seed": self.noise, "trial.turn_deg": turn_deg}
 
     def in_turn(self, number: int) -> Draw:
-        """A draw with an attitude of its own, of the units and the thermal states of the terms in turn.
+        """The draw of a number: another attitude each, with the units and thermal states of the terms in turn.
 
-        A bias that scatters among units would be another one among others, which few units cannot average out.
+        The units must be those of the terms: the mean bias of a few other units would be another.
         """
         return Draw(number % self.units, number // self.units % self.states, 10 + number)
 
@@ -195,7 +200,9 @@ class Designer:
         """All cells, in the order in which they are run."""
         yield from self.terms()
         combinations = self.units * self.states
-        yield from self.draws("total", math.ceil(self.size.draws / combinations) * combinations)
+        yield from self.draws(
+            "total", math.ceil(self.size.draws / combinations) * combinations
+        )
         for number in range(self.size.sky):
             settings = self.settings(Draw(100 + number, number))
             settings["trial.attitude_seed"] = 1 + number
@@ -220,7 +227,7 @@ class Designer:
     def draws(
         self, experiment: str, count: int, change: Settings | None = None, **levels: str
     ) -> Iterator[DatasheetCell]:
-        """Frames of other attitudes; with a change the same as without it, noise included, for a comparison."""
+        """Frames of other attitudes. With a change they are otherwise equal to those without it, noise included."""
         for number in range(count):
             settings = self.settings(self.in_turn(number)) | {
                 "trial.noise_seed": 10_000 + number
@@ -236,7 +243,7 @@ class Designer:
         return [float(f"{streak * per_px:.2g}") for streak in streaks_px]
 
     def rates(self) -> Iterator[DatasheetCell]:
-        """At each rate two frames of each attitude that differ in their noise alone."""
+        """At each rate two frames of each attitude that differ only in their noise."""
         for rate in self.rates_deg_s(STREAKS_PX):
             for frame in range(2):
                 settings = self.settings(Draw()) | {"trial.rate_deg_s": rate}
@@ -251,9 +258,11 @@ class Designer:
                 yield DatasheetCell("sequence", {"rate_deg_s": rate, "step": step}, settings)
 
     def accelerations(self) -> Iterator[DatasheetCell]:
-        """Two frames of each attitude at accelerations with no rate at mid-exposure."""
+        """Two frames of each attitude at accelerations, with a rate of zero at mid-exposure."""
         for bend in BENDS_PX:
-            acceleration = float(f"{bend * self.pixel_deg / self.scene.exposure.time_s**2:.2g}")
+            acceleration = float(
+                f"{bend * self.pixel_deg / self.scene.exposure.time_s**2:.2g}"
+            )
             change = {"trial.acceleration_deg_s2": acceleration}
             for frame in range(2):
                 levels = {"acceleration_deg_s2": acceleration, "frame": frame}
@@ -262,13 +271,15 @@ class Designer:
     def tracked(self) -> Iterator[DatasheetCell]:
         """Two frames of each attitude in tracking mode, at constant rates and at accelerations; none without the mode.
 
-        The prediction extrapolates the mean rate between the last two frames, so under an acceleration a it misses the
-        next one, t later, by a t^2.
+        The prediction extrapolates the mean rate between the last two frames, so an acceleration a displaces the next
+        one, t later, by a t^2 from it.
         """
         if not tracks(self.scene):
             return
         between_s = 1 / self.scene.exposure.rate_hz
-        bends = [float(f"{missed * self.pixel_deg / between_s**2:.2g}") for missed in MISSED_PX]
+        bends = [
+            float(f"{missed * self.pixel_deg / between_s**2:.2g}") for missed in MISSED_PX
+        ]
         motions = [("rate_deg_s", rate) for rate in self.rates_deg_s(TRACKED_STREAKS_PX)]
         motions += [("acceleration_deg_s2", bend) for bend in bends]
         for key, value in motions:
@@ -288,10 +299,12 @@ class Designer:
             limit = self.scene.tracker.limit_mag + step
             for frame in range(2):
                 settings = self.settings(Draw()) | {"tracker.limit_mag": limit}
-                yield DatasheetCell("magnitude", {"limit_mag": limit, "frame": frame}, settings)
+                yield DatasheetCell(
+                    "magnitude", {"limit_mag": limit, "frame": frame}, settings
+                )
 
     def causes(self) -> dict[str, Settings]:
-        """What would lower the error, as changes of the scene; those that it has no use for are left out."""
+        """Changes of the scene that would lower the error; those without effect on it are left out."""
         camera = self.scene.camera
         chip = self.scene.camera.detector
         survey = self.scene.tracker.survey
@@ -368,8 +381,7 @@ class Designer:
         return math.degrees(math.atan(side_px / 2 / self.scene.camera.focal_px))
 
 
-# Run the experiments of a datasheet: write them as a study, run its missing trials, and read them
-# as arrays.
+# Run the experiments of a datasheet: write them as a study, run its missing trials, and read their results as arrays.
 
 
 STUDY = "datasheet.yaml"
@@ -383,13 +395,13 @@ class MeasuredFrames:
     Attributes
     ----------
     columns
-        Of the trials, (cells, fields) each
+        Results of the trials, (cells, fields) each
     scene_name
-        As it was given
+        Name or file of the scene, as it was given
     overrides
-        Of the command line
+        Overrides of the command line
     spec
-        What a trial needs to be run again
+        Specification by which a trial can be run again
     """
 
     scene: Scene
@@ -418,7 +430,7 @@ class MeasuredFrames:
         )
 
     def column(self, name: str, rows: list[int]) -> NDArray[Any]:
-        """(cells, fields) of some cells."""
+        """(cells, fields) values of a column in some cells."""
         return self.columns[name][rows]
 
     def right(self, rows: list[int]) -> NDArray[np.bool_]:
@@ -430,7 +442,7 @@ class MeasuredFrames:
         return self.columns["wrong"][rows] > 0
 
     def errors(self, rows: list[int]) -> Floats:
-        """(3, cells, fields) errors about the camera's axes, arcseconds; NaN for refused and false ones."""
+        """(3, cells, fields) errors about the camera's axes, arcseconds; NaN for refused and false attitudes."""
         errors = np.stack([self.columns[name][rows] for name in AXES])
         return np.where(self.right(rows), errors, np.nan)
 
@@ -453,12 +465,18 @@ def study_tree(
         "trial": {"kind": "frames", **attitudes(scene)},
         "factors": {"cell": {"levels": {cell.name: cell.settings for cell in cells}}},
         "replicates": size.fields,
-        "responses": ["identified", "wrong", "refused", "cross_arcsec_rms", "roll_arcsec_rms"],
+        "responses": [
+            "identified",
+            "wrong",
+            "refused",
+            "cross_arcsec_rms",
+            "roll_arcsec_rms",
+        ],
     }
 
 
 def attitudes(scene: Scene) -> dict[str, Any]:
-    """Keys of the trial that bound the attitudes: under a dome the tilt of the vehicle's stop."""
+    """Keys of the trial that bound the attitudes: under a dome, the tilt limit of the vehicle."""
     if scene.light.kind != "dome":
         return {}
     greatest = scene.vehicle.tilt_stop_deg if scene.vehicle.mount == "air_bearing" else 30.0
@@ -478,13 +496,19 @@ def measure(
 ) -> MeasuredFrames:
     """Run the missing trials of a scene's datasheet in a folder, and return all of them.
 
-    watch(trials) : returns the function that is called after every batch
-    Raises InputError for a scene without attitudes of single frames, and for a cell whose trials fail.
-
     Parameters
     ----------
-    quick, fields
-        Smaller experiments, and another number of fields
+    quick
+        Smaller experiments
+    fields
+        Number of fields; None for the usual one
+    watch
+        Called with the number of trials; returns the function that is called after every batch
+
+    Raises
+    ------
+    InputError
+        For a scene without attitudes of single frames, and for a cell whose trials fail.
     """
     check_scene(scene)
     size = QUICK if quick else FULL
@@ -501,7 +525,14 @@ def measure(
             runner.prepare_store(plan, kept, resume=kept.counts()["done"] > 0)
             runner.run(plan, kept, engine, watch(plan.trials) if watch else None)
             return MeasuredFrames(
-                scene, scene_name, overrides, size, designer, cells, read(plan, kept), plan.spec
+                scene,
+                scene_name,
+                overrides,
+                size,
+                designer,
+                cells,
+                read(plan, kept),
+                plan.spec,
             )
     finally:
         engine.close()

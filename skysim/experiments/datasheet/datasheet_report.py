@@ -1,4 +1,4 @@
-"""The report of a datasheet: its sections with their figures, which are written as files too."""
+"""The report of a datasheet: its sections with their figures, which are also written as files."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from skysim.results.report_blocks import (
 
 
 class DatasheetFigure(NamedTuple):
-    """A figure: its function, size in inches and caption."""
+    """A figure: its drawing function, size in inches, and caption."""
 
     draw: Callable[[Any, Statement], None]
     size_in: tuple[float, float]
@@ -66,7 +66,7 @@ def draw_terms(fig: Any, statement: Statement) -> None:
 
 
 def draw_causes(fig: Any, statement: Statement) -> None:
-    """What each change leaves of the mean square."""
+    """Ratio of the mean square after each change to that before it."""
     axes = fig.subplots()
     for n, group in enumerate(GROUPS):
         for k, one in enumerate(statement.causes):
@@ -113,7 +113,7 @@ def draw_sky(fig: Any, statement: Statement) -> None:
 
 
 def draw_by(fig: Any, rows: list[dict[str, Any]], key: str, label: str) -> None:
-    """Noise-equivalent angle, error and share of right attitudes against a quantity."""
+    """Noise-equivalent angle, error and fraction of right attitudes against a quantity."""
     errors, share = fig.subplots(1, 2)
     x = [row[key] for row in rows]
     for n, group in enumerate(GROUPS):
@@ -121,7 +121,11 @@ def draw_by(fig: Any, rows: list[dict[str, Any]], key: str, label: str) -> None:
             x, [row[f"nea_{group}"] for row in rows], "o-", color=INK[n], label=f"NEA {group}"
         )
         errors.plot(
-            x, [row[f"rms_{group}"] for row in rows], "s--", color=INK[n], label=f"rms {group}"
+            x,
+            [row[f"rms_{group}"] for row in rows],
+            "s--",
+            color=INK[n],
+            label=f"rms {group}",
         )
     errors.set_yscale("log")
     errors.yaxis.set_major_formatter("{x:g}")
@@ -137,12 +141,12 @@ def draw_by(fig: Any, rows: list[dict[str, Any]], key: str, label: str) -> None:
 
 
 def draw_rates(fig: Any, statement: Statement) -> None:
-    """By rate."""
+    """Noise and error by rate."""
     draw_by(fig, statement.rates, "rate_deg_s", "rate [°/s]")
 
 
 def draw_magnitudes(fig: Any, statement: Statement) -> None:
-    """By the catalog's limit."""
+    """Noise and error by the catalog's limit."""
     draw_by(fig, statement.magnitudes, "limit_mag", "faintest star of the catalog [V]")
 
 
@@ -177,7 +181,7 @@ STANDARD = (
     "Terms in the sense of ECSS-E-ST-60-20C (star sensors: terminology and performance specification). The numbers"
     " are of the simulated scene; compliance with the standard is not claimed."
 )
-PRINTED = 3  # sections on a terminal: the terms, their causes and the probabilities
+PRINTED = 3  # number of sections on a terminal: the terms, their causes and the probabilities
 
 
 def command(sheet: MeasuredFrames, quick: bool) -> str:
@@ -186,7 +190,14 @@ def command(sheet: MeasuredFrames, quick: bool) -> str:
     for key, value in sheet.overrides.items():
         options += ["--seed", value] if key == "seed" else ["--set", f"{key}={value}"]
     return shlex.join(
-        ["skysim", "datasheet", sheet.scene_name, *options, "--fields", str(sheet.size.fields)]
+        [
+            "skysim",
+            "datasheet",
+            sheet.scene_name,
+            *options,
+            "--fields",
+            str(sheet.size.fields),
+        ]
     )
 
 
@@ -238,7 +249,7 @@ def figure_png(name: str, statement: Statement) -> bytes:
 
 
 def write_all(folder: Path, statement: Statement, report: Report) -> dict[str, Path]:
-    """Write JSON, figures and the page to a folder; return the paths of JSON and page by kind."""
+    """Write JSON, figures and page to a folder; return the paths of JSON and page by kind."""
     make_folder(folder)
     for name, figure in figure_files(report.blocks):
         write_bytes(folder / name, figure.image)

@@ -4,11 +4,11 @@ The errors about the camera's axes x, y (across the boresight) and z (about it) 
 
     e_k = bias + s_k (field f_k + pixel p_k + noise(rate) n_k + along(rate) m_k u),      s_k^2 of mean 1,
 
-n and m white, u the axis of the rate across the boresight (a streak's centroid errs more along the streak, and so the
-attitude about the axis of the motion), f and p Gauss-Markov processes of the angle that the boresight has turned, with
-a correlation angle each, and s the scale of the field: a lognormal process of that angle, since a field with few stars
-errs more. At rest f, p and s are constant. bias is the mean and the draw of the unit. All are independent; the scale is
-common to the axes.
+with white noise n and m, and the axis u of the rate across the boresight (a streak's centroid errs more along the
+streak, and so the attitude errs more about the axis of the motion). f and p are Gauss-Markov processes of the angle
+that the boresight has turned, each with a correlation angle. s is the scale of the field: a lognormal process of that
+angle, since a field with few stars errs more. At rest f, p and s are constant. bias is the mean plus the draw of the
+unit. All are independent; the scale is common to the axes.
 
     model = ErrorModel.read("tracker_error.json")
     errors_arcsec = model.draw(rate_deg_s, step_s, np.random.default_rng(1))     # (N, 3)
@@ -31,9 +31,9 @@ class State(NamedTuple):
     Attributes
     ----------
     field, pixel
-        (3,)
+        (3,) standard normal
     scale
-        A number
+        Standard normal
     bias
         (3,) arcseconds
     axis_rad
@@ -53,19 +53,20 @@ class ErrorModel:
     Attributes
     ----------
     constants
-        Mean, unit, field, pixel (x, y, roll: arcseconds, 1 sigma), scale (x, y, roll: standard
-        deviation of the logarithm of the variance), field_deg, pixel_deg, scale_deg
-        (correlation angles), rates_deg_s, noise (for each rate x, y, roll in arcseconds) and
-        along (for each rate what is added about its axis, arcseconds); both are linear between
+        mean, unit, field, pixel (of x, y, roll: arcseconds, 1 sigma); scale (of x, y, roll:
+        standard deviation of the logarithm of the variance); field_deg, pixel_deg, scale_deg
+        (correlation angles); rates_deg_s, noise (for each rate: of x, y, roll in arcseconds)
+        and along (for each rate: what is added about its axis, arcseconds), both linear between
         the rates and constant beyond the last
     """
 
     def __init__(self, constants: dict[str, Any]) -> None:
         self.constants = constants
-        self.mean, self.unit, self.field, self.pixel, self.scale = (
-            np.array(constants[name], dtype=float)
-            for name in ("mean", "unit", "field", "pixel", "scale")
-        )
+        self.mean = np.array(constants["mean"], dtype=float)
+        self.unit = np.array(constants["unit"], dtype=float)
+        self.field = np.array(constants["field"], dtype=float)
+        self.pixel = np.array(constants["pixel"], dtype=float)
+        self.scale = np.array(constants["scale"], dtype=float)
         self.rates_deg_s = np.array(constants["rates_deg_s"], dtype=float)
         self.noise = np.array(constants["noise"], dtype=float)
         self.along = np.array(constants["along"], dtype=float)
@@ -82,7 +83,7 @@ class ErrorModel:
         Parameters
         ----------
         unit
-            Whether its bias is drawn, or the mean of all units
+            Whether its bias is drawn; otherwise it is the mean of all units
         """
         bias = self.mean + (self.unit * rng.standard_normal(3) if unit else 0.0)
         axis_rad = float(rng.uniform(0, 2 * math.pi))
@@ -128,20 +129,22 @@ class ErrorModel:
         rate_deg_s
             (N,) rate of the boresight; from one time to the next it turns by rate times step
         state
-            At the first time; that of a new unit in a random field if left out
+            State at the first time; that of a new unit in a random field if left out
         axis_rad
-            Angle of the rate's axis from the camera's x toward y, or (N,); that of the state if
-            left out
+            Angle of the rate's axis from the camera's x toward y, or (N,) angles; that of the
+            state if left out
         """
         rate = np.abs(np.asarray(rate_deg_s, dtype=float))
         first = self.start(rng) if state is None else state
+        if axis_rad is None:
+            axis_rad = first.axis_rad
         turned = rate * step_s
         field, pixel, scale = (
             correlated(turned / self.constants[f"{name}_deg"], getattr(first, name), rng)
             for name in ("field", "pixel", "scale")
         )
         slow = self.field * field + self.pixel * pixel
-        noise = self.drawn_noise(rate, first.axis_rad if axis_rad is None else axis_rad, rng)
+        noise = self.drawn_noise(rate, axis_rad, rng)
         return first.bias + self.scales(scale) * (slow + noise)
 
     def step(
@@ -153,18 +156,17 @@ class ErrorModel:
         for name in ("field", "pixel", "scale"):
             left = math.exp(-turned / self.constants[f"{name}_deg"])
             old = getattr(state, name)
-            new.append(
-                left * old + math.sqrt(1 - left * left) * rng.standard_normal(np.shape(old))
-            )
+            fresh = rng.standard_normal(np.shape(old))
+            new.append(left * old + math.sqrt(1 - left * left) * fresh)
         later = state._replace(field=new[0], pixel=new[1], scale=float(new[2]))
         noise = self.drawn_noise(np.array([abs(rate_deg_s)]), state.axis_rad, rng)[0]
         slow = self.field * later.field + self.pixel * later.pixel
-        return later, later.bias + self.scales(np.array([later.scale]))[0] * (slow + noise)
+        return later, later.bias + self.scales(later.scale) * (slow + noise)
 
     def correlation(self, angle_deg: float, rate_deg_s: float) -> Any:
         """(3,) correlation of two errors of one unit at a rate, between which the boresight turns by an angle.
 
-        The mean over all axes of the rate, about which x and y have half of what is added along each.
+        It is the mean over all axes of the rate: x and y each have half of the variance that is added about the axis.
 
         E[s_k s_l] = exp(-v^2 (1 - r) / 4) for lognormal scales whose normal numbers have the correlation r.
         """
@@ -179,7 +181,7 @@ class ErrorModel:
         return np.exp(-(self.scale**2) * (1 - scale) / 4) * shared / total
 
     def scales(self, normal: Any) -> Any:
-        """(N, 3) scales of standard normal numbers: s^2 = exp(v q - v^2 / 2) has the mean 1."""
+        """(N, 3) scales of standard normal numbers, (3,) of one: s^2 = exp(v q - v^2 / 2) has the mean 1."""
         return np.exp(0.5 * (np.multiply.outer(normal, self.scale) - self.scale**2 / 2))
 
 

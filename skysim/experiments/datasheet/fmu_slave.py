@@ -11,12 +11,12 @@ from tracker_error import ErrorModel  # type: ignore[import-not-found]
 
 
 class TrackerError(Fmi3Slave):
-    """Input: the rate of the boresight. Outputs: the errors about the camera's axes, drawn anew at every step.
+    """Unit with the boresight's rate as input, and the errors about the camera's axes, drawn at every step, as outputs.
 
     Attributes
     ----------
     seed
-        Of the random numbers; read at the first step
+        Seed of the random numbers; read at the first step
     """
 
     author = "skysim"
@@ -36,7 +36,9 @@ class TrackerError(Fmi3Slave):
         }
         self.register_variable(Float64("time", **independent))
         self.register_variable(
-            Int32("seed", causality=Fmi3Causality.parameter, variability=Fmi3Variability.fixed)
+            Int32(
+                "seed", causality=Fmi3Causality.parameter, variability=Fmi3Variability.fixed
+            )
         )
         self.register_variable(Float64("rate_deg_s", causality=Fmi3Causality.input))
         for name in ("x_arcsec", "y_arcsec", "roll_arcsec"):

@@ -1,10 +1,11 @@
-"""Fit the constants of a measurement model to the frames of a datasheet."""
+"""Fit the constants of the error model (`error_model`) to the frames of a datasheet, test the fit, and write it."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
 from importlib.util import find_spec
+from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,23 +27,19 @@ from skysim.experiments.datasheet.variance_components import (
 )
 from skysim.experiments.study.execution import setups, trials
 
-GRID = 60  # correlation angles that are tried
-LEAST_NOISE = (
-    0.05  # of the mean square at a rate: noise below it cannot be separated from the slow terms
-)
+GRID = 60  # number of correlation angles that are tried
+LEAST_NOISE = 0.05  # of the mean square at a rate: noise below it cannot be separated from the slow terms
 
 
 def constants(sheet: MeasuredFrames) -> dict[str, Any]:
-    """The constants of `errors.ErrorModel` for the scene of a datasheet."""
+    """The constants of `error_model.ErrorModel` for the scene of a datasheet."""
     errors, _ = term_errors(sheet)
     found = [components(one) for one in errors]
-    field, pixel = (
-        np.sqrt(np.maximum([getattr(one, name) for one in found], 0))
-        for name in ("field", "pixel")
-    )
+    field = np.sqrt(np.maximum([one.field for one in found], 0))
+    pixel = np.sqrt(np.maximum([one.pixel for one in found], 0))
     bias = [bias_terms(one) for one in errors]
-    across, about = (log_scale(*field_variances(sheet, axes)) for axes in GROUPS.values())
     mean = [one[0] for one in bias]
+    across, about = (log_scale(*field_variances(sheet, axes)) for axes in GROUPS.values())
     by_rate = errors_by_rate(sheet)
     squares = np.array([mean_known(one**2, (1, 2)) for one in by_rate.values()])
     along = np.array(
@@ -87,7 +84,7 @@ def log_scale(first: Floats, second: Floats) -> float:
 
 
 def field_variances(sheet: MeasuredFrames, axes: slice) -> tuple[Floats, Floats]:
-    """Two estimates of the noise variance in each field: of the terms' frames, and of the sequence at rest."""
+    """Two estimates of the noise variance in each field: from the terms' frames, and from the sequence at rest."""
     errors, solved = term_errors(sheet)
     terms = np.var(errors[axes], axis=-1, ddof=1).mean(axis=(0, 2, 3, 4))
     rest = sequences(sheet, 0.0)[1][axes][:, :, solved]
@@ -102,11 +99,13 @@ def sequences(sheet: MeasuredFrames, rate_deg_s: float) -> tuple[list[int], Floa
 
 
 def errors_by_rate(sheet: MeasuredFrames) -> dict[float, Floats]:
-    """(3, frames, fields) errors by rate, from rest on: of the sequences, and of the faster pairs of frames."""
+    """(3, frames, fields) errors by rate, rest first: of the sequences, and of the pairs of frames at faster rates."""
     sequenced = sheet.levels("sequence", "rate_deg_s")
     faster = [rate for rate in sheet.levels("rate", "rate_deg_s") if rate > max(sequenced)]
     found = {rate: sequences(sheet, rate)[1] for rate in sequenced}
-    return found | {rate: sheet.errors(sheet.rows("rate", rate_deg_s=rate)) for rate in faster}
+    return found | {
+        rate: sheet.errors(sheet.rows("rate", rate_deg_s=rate)) for rate in faster
+    }
 
 
 def along_square(
@@ -114,11 +113,14 @@ def along_square(
 ) -> float:
     """Mean square of the errors about the rate's axis beyond that about the other axis across the boresight.
 
+    It is 0 at rest, and where the difference is negative.
+
     Parameters
     ----------
+    mean
+        (3,) mean error, which is subtracted
     errors
-        (3, frames, fields), whose means are taken off;  0 at rest, and where the difference is
-        negative
+        (3, frames, fields)
     """
     if not rate_deg_s:
         return 0.0
@@ -131,21 +133,23 @@ def along_square(
 
 def axes_rad(sheet: MeasuredFrames, rate_deg_s: float) -> Floats:
     """(fields,) angle of the axis of a rate from the camera's x toward y, as the trials at this rate draw it again."""
-    rows = sheet.rows("sequence", rate_deg_s=rate_deg_s) or sheet.rows(
-        "rate", rate_deg_s=rate_deg_s
-    )
+    rows = sheet.rows("sequence", rate_deg_s=rate_deg_s)
+    if not rows:
+        rows = sheet.rows("rate", rate_deg_s=rate_deg_s)
     setup = setups.prepared_setup(sheet.spec, sheet.cells[rows[0]].settings)
-    seeds = sheet.column("seed", rows[:1])[0].tolist()
-    axes = np.array(
-        [trials.attitude_and_axis(setup, trials.streams(setup, seed)[0])[1] for seed in seeds]
-    )
-    return np.arctan2(axes[:, 1], axes[:, 0])
+    axes = []
+    for seed in sheet.column("seed", rows[:1])[0].tolist():
+        rng = trials.streams(setup, seed)[0]
+        axes.append(trials.attitude_and_axis(setup, rng)[1])
+    x, y, _ = np.transpose(axes)
+    return np.arctan2(y, x)
 
 
 def lagged(sheet: MeasuredFrames, mean: list[float]) -> tuple[Floats, Floats, Floats]:
     """Angles in degrees between frames of the sequences, the products of their errors, and the mean square at the rate.
 
-    (M,) each, the mean over the fields and the axes across the boresight, without the mean error; arcsec^2
+    (M,) each. Products and squares are means over the fields and the axes across the boresight, in arcsec^2, after the
+    mean error is subtracted.
     """
     angles = []
     products = []
@@ -154,12 +158,11 @@ def lagged(sheet: MeasuredFrames, mean: list[float]) -> tuple[Floats, Floats, Fl
         steps, errors = sequences(sheet, rate)
         errors = errors[:2] - np.array(mean)[:2, None, None]
         square = mean_known(errors**2)
-        for first in range(len(steps)):
-            for second in range(first + 1, len(steps)):
-                apart = steps[second] - steps[first]
-                angles.append(rate * apart / sheet.scene.exposure.rate_hz)
-                products.append(mean_known(errors[:, first] * errors[:, second]))
-                squares.append(square)
+        for first, second in combinations(range(len(steps)), 2):
+            apart = steps[second] - steps[first]
+            angles.append(rate * apart / sheet.scene.exposure.rate_hz)
+            products.append(mean_known(errors[:, first] * errors[:, second]))
+            squares.append(square)
     return np.array(angles), np.array(products), np.array(squares)
 
 
@@ -168,8 +171,9 @@ def field_angle_deg(
 ) -> float:
     """The correlation angle of the field term: that with the least squares of the lagged products.
 
-    They are fitted by a exp(-angle / field_deg) + b exp(-angle / pixel_deg) with a : b as the terms at rest, each in
-    units of the mean square at its rate, to which its error is proportional; between a pixel and four fields.
+    The model is a exp(-angle / field_deg) + b exp(-angle / pixel_deg), with a : b as the terms at rest. Each product is
+    divided by the mean square at its rate, to which its error is proportional. The angle is between a pixel and four
+    fields.
     """
     angles, products, squares = lagged(sheet, mean)
     pixel_deg = sheet.designer.pixel_deg
@@ -179,23 +183,21 @@ def field_angle_deg(
     if not total:
         return float(trials_deg[-1])
     found = products / squares
+    by_pixel = (total - weight) * np.exp(-angles / pixel_deg)
     left = []
     for angle in trials_deg:
-        shape = (
-            (weight * np.exp(-angles / angle) + (total - weight) * np.exp(-angles / pixel_deg))
-            / total
-            / squares
-        )
-        left.append(float(np.sum((found - shape * (shape @ found) / (shape @ shape)) ** 2)))
+        by_field = weight * np.exp(-angles / angle)
+        shape = (by_field + by_pixel) / total / squares
+        fitted = shape * (shape @ found) / (shape @ shape)
+        left.append(float(np.sum((found - fitted) ** 2)))
     return float(trials_deg[int(np.argmin(left))])
 
 
-# Compare a measurement model with frames that it was not fitted to: distribution by rate, and
-# correlation.
+# Compare the model with frames that it was not fitted to: distribution by rate, and correlation.
 
 
-DRAWN = 200_000  # errors of the model for its distribution
-APART_STEP_S = 1e9  # between draws, which then are of other fields
+DRAWN = 200_000  # number of errors drawn from the model for its distribution
+APART_STEP_S = 1e9  # step between draws, so long that each is in another field
 
 
 class Agreement(NamedTuple):
@@ -206,11 +208,11 @@ class Agreement(NamedTuple):
     fitted
         The fields of the fit, even or odd
     frames
-        One of each other field
+        Number of frames that are compared, one of each other field
     p_values
-        (3,) of x, y, roll, of the Kolmogorov-Smirnov tests
-    correlation
-        Mean over the axes and over all pairs of frames of a sequence, and that of the model
+        (3,) of the Kolmogorov-Smirnov tests of x, y and roll
+    correlation, expected_correlation
+        Mean over the axes and over all pairs of frames of a sequence: measured, and of the model
     """
 
     fitted: str
@@ -222,14 +224,14 @@ class Agreement(NamedTuple):
 
 
 def some_fields(sheet: MeasuredFrames, fields: slice) -> MeasuredFrames:
-    """The sheet of some of its fields."""
+    """The part of a sheet with some of its fields."""
     columns = {name: values[:, fields] for name, values in sheet.columns.items()}
     count = len(range(sheet.size.fields)[fields])
     return replace(sheet, columns=columns, size=replace(sheet.size, fields=count))
 
 
 def agreements(sheet: MeasuredFrames) -> list[Agreement]:
-    """The agreement of each half of the fields with the other, at the rates of the sequences, from rest on."""
+    """The agreement of each half of the fields with the other, at the rates of the sequences, rest first."""
     even = some_fields(sheet, slice(0, None, 2))
     odd = some_fields(sheet, slice(1, None, 2))
     rates = sheet.levels("sequence", "rate_deg_s")
@@ -243,7 +245,9 @@ def agreements(sheet: MeasuredFrames) -> list[Agreement]:
 def of_one_unit(sheet: MeasuredFrames) -> ErrorModel:
     """The model of a sheet for the first of its units."""
     unit_mean = term_errors(sheet)[0][:, :, 0].mean(axis=(1, 2, 3, 4))
-    return ErrorModel(constants(sheet) | {"mean": unit_mean.tolist(), "unit": [0.0, 0.0, 0.0]})
+    return ErrorModel(
+        constants(sheet) | {"mean": unit_mean.tolist(), "unit": [0.0, 0.0, 0.0]}
+    )
 
 
 def agreement(
@@ -254,19 +258,18 @@ def agreement(
     first = errors[:, 0][:, np.isfinite(errors[:, 0]).all(axis=0)]
     drawn = turning(model, rate_deg_s) if rate_deg_s else at_rest(model)
     p_values = [
-        float(stats.ks_2samp(*pair).pvalue) for pair in zip(first, drawn.T, strict=True)
+        float(stats.ks_2samp(measured, modeled).pvalue)
+        for measured, modeled in zip(first, drawn.T, strict=True)
     ]
     centered = errors - model.mean[:, None, None]
+    squares = mean_known(centered**2, (1, 2))
     found = []
     expected = []
-    for one in range(len(steps)):
-        for two in range(one + 1, len(steps)):
-            angle_deg = rate_deg_s * (steps[two] - steps[one]) / sheet.scene.exposure.rate_hz
-            found.append(
-                mean_known(centered[:, one] * centered[:, two], 1)
-                / mean_known(centered**2, (1, 2))
-            )
-            expected.append(model.correlation(angle_deg, rate_deg_s))
+    for one, two in combinations(range(len(steps)), 2):
+        products = mean_known(centered[:, one] * centered[:, two], 1)
+        found.append(products / squares)
+        angle_deg = rate_deg_s * (steps[two] - steps[one]) / sheet.scene.exposure.rate_hz
+        expected.append(model.correlation(angle_deg, rate_deg_s))
     return Agreement(
         fitted,
         rate_deg_s,
@@ -291,8 +294,7 @@ def at_rest(model: ErrorModel) -> Floats:
     return turning(ErrorModel(model.constants | rest), 1.0)
 
 
-# Write a measurement model: a Python module that needs NumPy alone, its constants as JSON, a co-
-# simulation unit.
+# Write the model: a Python module that needs NumPy alone, its constants as JSON, a co-simulation unit.
 
 
 MODULE = "tracker_error.py"

@@ -22,16 +22,16 @@ from skysim.results import metrics
 from skysim.results.metrics import Summary
 from skysim.tracking import factory
 
-CLAIMS = (0.95, 0.99, 0.997)  # probabilities of a right attitude
-LEVELS = (0.683, 0.954, 0.997)  # of the quantiles
+CLAIMS = (0.95, 0.99, 0.997)  # probabilities of a right attitude that a datasheet may claim
+LEVELS = (0.683, 0.954, 0.997)  # probabilities of the quantiles
 LIMITS = (0.95, 0.9)  # probabilities of a right attitude that bound a rate or an acceleration
-TIMED = 50  # frames whose solution is timed
+TIMED = 50  # number of frames whose solution is timed
 
 
 class Counts(NamedTuple):
-    """Numbers of independent frames: all, with a right attitude, refused, and with a false one.
+    """Numbers of independent frames: all, with a right attitude, refused, and with a false attitude.
 
-    Of fields with several frames: all fields, with right attitudes alone, with a refused one, and with a false one.
+    Fields with several frames count once: as right if all frames are right, as false if one is, else as refused.
     """
 
     frames: int
@@ -40,7 +40,7 @@ class Counts(NamedTuple):
     false: int
 
     def share(self, kind: str) -> Summary:
-        """The share of one kind with its exact one-sided bounds, each at 95 % (Clopper & Pearson 1934)."""
+        """The fraction of one kind with its exact one-sided bounds, each at 95 % (Clopper & Pearson 1934)."""
         hits = getattr(self, kind)
         return Summary(
             hits / self.frames, *metrics.exact_bounds(hits, self.frames), self.frames
@@ -53,20 +53,24 @@ def counts(sheet: MeasuredFrames, rows: list[int]) -> Counts:
 
 
 def counts_of_fields(sheet: MeasuredFrames, rows: list[int]) -> Counts:
-    """The outcomes of fields with a frame in each of some cells, which succeed and fail together."""
+    """The outcomes of fields with a frame in each of some cells; the frames of a field count as one."""
     return tally(sheet.right(rows).all(axis=0), sheet.false(rows).any(axis=0))
 
 
 def tally(right: Any, false: Any) -> Counts:
     """Counts from boolean arrays of right and of false attitudes; all others are refused."""
-    return Counts(right.size, int(right.sum()), int((~right & ~false).sum()), int(false.sum()))
+    return Counts(
+        right.size, int(right.sum()), int((~right & ~false).sum()), int(false.sum())
+    )
 
 
-def runs_needed(share: float, failures: int = 0, confidence: float = metrics.CONFIDENCE) -> int:
-    """Fewest runs with so many failures that show a probability of success of `share` at this confidence.
+def runs_needed(
+    share: float, failures: int = 0, confidence: float = metrics.CONFIDENCE
+) -> int:
+    """Least number of runs that show a probability of success of `share` at this confidence, with so many failures.
 
-    Without a failure n = ln(1 - c) / ln(share), rounded up; with failures the n whose exact upper bound of the
-    probability of a failure is 1 - share.
+    Without a failure it is ln(1 - c) / ln(share), rounded up; with failures, the number for which the exact upper bound
+    of the probability of a failure is 1 - share.
     """
     low = metrics.trials_for_bound(1 - share, confidence)
     if not failures:
@@ -85,7 +89,7 @@ def runs_needed(share: float, failures: int = 0, confidence: float = metrics.CON
 
 
 def claims(found: Counts) -> list[dict[str, Any]]:
-    """Which probabilities of a right attitude the frames show, and how many more they need if none of those fails."""
+    """Which of CLAIMS the frames show, and how many more frames each needs if none of them fails."""
     failures = found.frames - found.right
     return [
         {
@@ -117,8 +121,8 @@ def quantiles(sheet: MeasuredFrames) -> list[dict[str, Any]]:
 def consistency(sheet: MeasuredFrames) -> dict[str, Any]:
     """How well the tracker's covariance P and the assumption of equal axes fit the errors e of independent frames.
 
-    The normalized error squared e^T P^-1 e has the chi-square distribution of three degrees of freedom where P is
-    right: its mean is 3, and a share of LEVELS lies within the quantile of that probability.
+    If P is right, the normalized error squared e^T P^-1 e has the chi-square distribution with three degrees of
+    freedom: its mean is 3, and the fractions LEVELS are within the quantiles of these probabilities.
     """
     rows = sheet.rows("sky")
     right = sheet.right(rows)
@@ -159,7 +163,7 @@ def rms_by_group(sheet: MeasuredFrames, rows: list[int]) -> dict[str, float]:
 
 
 def by_rate(sheet: MeasuredFrames) -> list[dict[str, Any]]:
-    """Noise-equivalent angle, error and outcomes by rate; that at rest is of the terms' first attitude."""
+    """Noise-equivalent angle, error and outcomes by rate; at rest from the terms' first attitude."""
     rest = sheet.rows("terms", unit=0, state=0, attitude=0)
     rates = sheet.levels("rate", "rate_deg_s")
     found = [{"rate_deg_s": 0.0, "streak_px": 0.0, **pair_row(sheet, rest)}]
@@ -171,7 +175,7 @@ def by_rate(sheet: MeasuredFrames) -> list[dict[str, Any]]:
 
 
 def by_level(sheet: MeasuredFrames, experiment: str, key: str) -> list[dict[str, Any]]:
-    """The same by the levels of a key, in rising order; empty for a scene without the experiment."""
+    """Noise-equivalent angle, error and outcomes by the levels of a key, ascending; empty without the experiment."""
     return [
         {key: level, **pair_row(sheet, sheet.rows(experiment, **{key: level}))}
         for level in sorted(sheet.levels(experiment, key))
@@ -179,16 +183,18 @@ def by_level(sheet: MeasuredFrames, experiment: str, key: str) -> list[dict[str,
 
 
 def by_acceleration(sheet: MeasuredFrames) -> list[dict[str, Any]]:
-    """Error and outcomes by acceleration, beside the error that the streaks' asymmetry predicts.
+    """Error and outcomes by acceleration, beside the error that the asymmetry of the streaks predicts.
 
-    From no rate at mid-exposure all lights move by a t^2 / 2, to one side. Their mean is a T^2 / 24 away from where
-    they are at mid-exposure, so the attitude errs by this angle about the axis of the motion.
+    The rate is zero at mid-exposure, so all lights move by a t^2 / 2 to one side. Their mean is a T^2 / 24 away from
+    their place at mid-exposure, so the attitude errs by this angle about the axis of the motion.
     """
     found = []
     for acceleration in sheet.levels("acceleration", "acceleration_deg_s2"):
         rows = sheet.rows("acceleration", acceleration_deg_s2=acceleration)
         lag_arcsec = 3600 * acceleration * sheet.scene.exposure.time_s**2 / 24
-        at_rest = rms(sheet, sheet.rows("terms", unit=0, state=0, attitude=0), GROUPS["across"])
+        at_rest = rms(
+            sheet, sheet.rows("terms", unit=0, state=0, attitude=0), GROUPS["across"]
+        )
         predicted = math.sqrt(at_rest**2 + lag_arcsec**2 / 2)  # about one of two axes
         row = {"acceleration_deg_s2": acceleration, "counts": counts_of_fields(sheet, rows)}
         found.append(row | {"predicted_across": predicted} | rms_by_group(sheet, rows))
@@ -196,18 +202,18 @@ def by_acceleration(sheet: MeasuredFrames) -> list[dict[str, Any]]:
 
 
 class Limit(NamedTuple):
-    """Between which levels the probability of a right attitude falls below `share`, each shown at 95 % confidence.
+    """The two levels between which the probability of a right attitude falls below `share`, each at 95 % confidence.
 
     Attributes
     ----------
     share
         The highest of LIMITS that the frames of a level can show
     above
-        The highest level up to which all are shown to be above it, NaN if none is
+        Greatest level up to which all probabilities are shown to be above `share`; NaN if none is
     below
-        The lowest from which all are shown to be below it, infinite if none is
+        Least level from which all are shown to be below `share`; infinite if none is
     fields
-        Fewest fields at a level
+        Least number of fields at a level
     """
 
     share: float
@@ -217,7 +223,7 @@ class Limit(NamedTuple):
 
 
 def bracket(rows: list[dict[str, Any]], key: str) -> Limit:
-    """The limit in a rate or an acceleration, from rows in rising order of it."""
+    """The limit in a rate or an acceleration, from rows in ascending order of it."""
     fewest = min(row["counts"].frames for row in rows)
     share = next((one for one in LIMITS if runs_needed(one) <= fewest), LIMITS[-1])
     above = math.nan
@@ -236,7 +242,7 @@ def bracket(rows: list[dict[str, Any]], key: str) -> Limit:
 def solution_times_s(sheet: MeasuredFrames) -> Floats:
     """(TIMED,) seconds that the tracker took for frames lost in space, from pixels to attitude, on this machine.
 
-    All are solved twice and the second time counts: the first one compiles or loads what the solutions need.
+    All are solved twice, and the second time counts: the first one compiles and loads what the solutions need.
     """
     setup = setups.prepared_setup(sheet.spec, sheet.cells[sheet.rows("sky")[0]].settings)
     seeds = (setups.seed_of(sheet.spec, 0, replicate) for replicate in range(TIMED))

@@ -27,7 +27,7 @@ TEMPORAL = "temporal: over frames of one attitude that differ in their noise"
 
 
 class StatementSection(NamedTuple):
-    """A section of the statement: what the numbers are, their table, and names of figures (see `figures`)."""
+    """A section of the statement: text on its numbers, their table, and names of figures (`datasheet_report`)."""
 
     title: str
     texts: Sequence[str]
@@ -37,7 +37,7 @@ class StatementSection(NamedTuple):
 
 
 class Statement(NamedTuple):
-    """All numbers of a datasheet, and the sheet they are from."""
+    """All numbers of a datasheet, and the measured frames that they are from."""
 
     sheet: MeasuredFrames
     terms: dict[str, variance_components.TermTable]
@@ -58,7 +58,7 @@ class Statement(NamedTuple):
 
 
 def state(sheet: MeasuredFrames) -> Statement:
-    """The statement of a measured sheet, with times of this machine. Raises InputError where too few are solved."""
+    """The statement of a measured sheet, with times on this machine. Raises InputError if too few frames are solved."""
     _, solved = variance_components.term_errors(sheet)
     found = performance.counts(sheet, sheet.rows("sky"))
     return Statement(
@@ -128,7 +128,9 @@ def limits(statement: Statement) -> dict[str, Any]:
         {
             mode: {
                 key: performance.bracket(rows, key)
-                for key, rows in zip(("rate_deg_s", "acceleration_deg_s2"), tables, strict=True)
+                for key, rows in zip(
+                    ("rate_deg_s", "acceleration_deg_s2"), tables, strict=True
+                )
             }
             for mode, tables in measured.items()
             if tables[0]
@@ -140,7 +142,7 @@ def limits(statement: Statement) -> dict[str, Any]:
 
 
 def size(square: Bounded) -> str:
-    """A root mean square with its interval; where the square is not known to be above 0, what it is below."""
+    """A root mean square with its interval; only its upper bound if the square is not shown to be above 0."""
     if square.high <= 0:
         return "not seen"
     if square.low <= 0:
@@ -154,7 +156,7 @@ def bounded(value: Bounded | Summary, digits: int = 3) -> str:
 
 
 def percent(share: Summary) -> str:
-    """A share in percent with its exact bounds."""
+    """A fraction in percent with its exact bounds."""
     return f"{100 * share.value:.4g} ({100 * share.low:.4g} to {100 * share.high:.4g})"
 
 
@@ -225,7 +227,7 @@ def term_section(statement: Statement) -> StatementSection:
 
 
 def unit_text(units: int) -> str:
-    """What the intervals over the fields leave out: that units are few (chi-square of a variance)."""
+    """The uncertainty from few units, which intervals over the fields leave out (chi-square of a variance)."""
     from scipy.special import chdtri
 
     freedom = units - 1
@@ -238,7 +240,7 @@ def unit_text(units: int) -> str:
 
 
 def lowering_section(statement: Statement) -> StatementSection:
-    """Which term dominates, and what is left of the mean square after each change of the scene."""
+    """The dominant term, and the ratio of the mean square after each change of the scene to that before it."""
     texts = [
         f"{name.capitalize()} the boresight {NAMES[table.dominant]} dominates:"
         f" {100 * table.squares[table.dominant].value / table.squares['total'].value:.0f} % of the variance."
@@ -268,10 +270,12 @@ def lowering_section(statement: Statement) -> StatementSection:
 
 
 def probability_section(statement: Statement) -> StatementSection:
-    """Probabilities of right, refused and false attitudes, and what may be claimed."""
+    """Probabilities of right, refused and false attitudes, and the claims that the frames support."""
     counts = statement.counts
     where = (
-        "the whole sky" if statement.sheet.designer.under_stars else "the tilts of the vehicle"
+        "the whole sky"
+        if statement.sheet.designer.under_stars
+        else "the tilts of the vehicle"
     )
     shares = ", ".join(
         f"{kind} {percent(counts.share(kind))} %" for kind in ("right", "refused", "false")
@@ -313,7 +317,9 @@ def probability_section(statement: Statement) -> StatementSection:
         "runs needed without failure",
         "more runs, if none fails",
     ]
-    return StatementSection("Right, refused and false attitudes", texts, headers, rows, ["sky"])
+    return StatementSection(
+        "Right, refused and false attitudes", texts, headers, rows, ["sky"]
+    )
 
 
 def quantile_section(statement: Statement) -> StatementSection:
@@ -339,7 +345,7 @@ def quantile_section(statement: Statement) -> StatementSection:
 
 
 def consistency_text(found: dict[str, Any]) -> str:
-    """What the covariances of the attitudes are worth, and whether x and y err alike."""
+    """How well the covariances of the attitudes fit their errors, and whether x and y have equal errors."""
     shares = ", ".join(
         f"{percent(one['share'])} % of {100 * one['level']:g} %" for one in found["within"]
     )
@@ -350,7 +356,7 @@ def consistency_text(found: dict[str, Any]) -> str:
 
 
 def quantile_text(found: Summary) -> str:
-    """A quantile with its interval, or how many more frames it needs for one."""
+    """A quantile with its interval, or the number of further frames that it needs to have one."""
     if math.isnan(found.low):
         return f"not established: {found.needs} more frames needed"
     return f"{found.value:.3g} ({found.low:.3g} to {found.high:.3g})"
@@ -383,7 +389,9 @@ def bracket_text(what: str, limit: Limit, unit: str) -> str:
     """A sentence on a limit, for fields that are right in both of their frames."""
     if limit.fields < runs_needed(limit.share):
         return f"Limit of {what}: not established: {limit.fields} attitudes, {runs_needed(limit.share)} needed."
-    above = "at no level tested" if math.isnan(limit.above) else f"up to {limit.above:g} {unit}"
+    above = (
+        "at no level tested" if math.isnan(limit.above) else f"up to {limit.above:g} {unit}"
+    )
     below = "at none tested" if math.isinf(limit.below) else f"from {limit.below:g} {unit} on"
     share = f"{100 * limit.share:g} %"
     return f"Limit of {what}: {share} of right attitudes are shown {above}; fewer than {share} are shown {below}."
@@ -413,9 +421,10 @@ def rate_section(statement: Statement) -> StatementSection:
 
 
 def precision_text(sheet: MeasuredFrames) -> str:
-    """How well rms and NEA of F fields are known: 1 / sqrt(2 F) about two axes, 1 / sqrt(F) about one.
+    """Relative error of rms and NEA of F fields: 1 / sqrt(2 F) about two axes, 1 / sqrt(F) about one.
 
-    For two Gaussian values a field and axis, with a scatter of the fields' variances that doubles the error's square.
+    This is for two Gaussian values per field and axis, if the scatter of the fields' variances doubles the square of
+    the error.
     """
     across, about = (100 / math.sqrt(axes * sheet.size.fields) for axes in (2, 1))
     return f"NEA and rms are known to about {across:.0f} % across and {about:.0f} % about the boresight (1 σ)."

@@ -63,14 +63,16 @@ def subsets(present: list[int]) -> Iterator[Subset]:
 def effects(means: Floats, present: list[int]) -> dict[Subset, float]:
     """Variance of each crossed effect plus what is left in the means of nested ones, by subset of the factors.
 
-    means) have E[MS_A] = sum over B containing A of var_B times the number of cells that share one level of B; they
-    are solved from the largest subset down. var_() is the square of the mean.
+    The mean squares of the orthogonal decomposition (inclusion and exclusion of marginal means) have
+    E[MS_A] = sum over B containing A of var_B times the number of cells that share one level of B; they are solved from
+    the largest subset down. var_() is the square of the mean.
 
     Parameters
     ----------
     means
-        (fields, units, states). Mean squares of the orthogonal decomposition (inclusion and
-        exclusion of marginal
+        (fields, units, states)
+    present
+        Factors with more than one level
     """
     found: dict[Subset, float] = {}
     counts = np.array(means.shape)
@@ -79,7 +81,7 @@ def effects(means: Floats, present: list[int]) -> dict[Subset, float]:
         for part in subsets(list(subset)):
             others = tuple(axis for axis in range(means.ndim) if axis not in part)
             sign = (-1) ** (len(subset) - len(part))
-            effect = effect + sign * means.mean(axis=others, keepdims=True)
+            effect += sign * means.mean(axis=others, keepdims=True)
         freedom = np.prod([counts[axis] - 1 for axis in subset])
         square = float(np.sum(np.broadcast_to(effect, means.shape) ** 2) / freedom)
         larger = [one for one in found if set(subset) < set(one)]
@@ -115,11 +117,14 @@ def components(errors: Floats) -> Components:
     found = effects(means, present)
     # What attitudes and noise leave in a mean is in the smallest of the crossed effects.
     found[tuple(present)] -= between / attitudes
-    by_state = sum(value for subset, value in found.items() if STATE in subset)
-    by_field = sum(
-        value for subset, value in found.items() if FIELD in subset and STATE not in subset
-    )
-    bias = sum(value for subset, value in found.items() if not {FIELD, STATE} & set(subset))
+    bias = by_state = by_field = 0.0
+    for subset, value in found.items():
+        if STATE in subset:
+            by_state += value
+        elif FIELD in subset:
+            by_field += value
+        else:
+            bias += value
     return Components(bias, by_state, by_field, between - temporal / frames, temporal)
 
 
@@ -133,17 +138,17 @@ def with_intervals(errors: Floats) -> dict[str, Bounded]:
 
     Fields are the independent draws; units and states are those that were measured.
     """
-    names = (*Components._fields, "total")
     drawn = [of_axes(errors[:, rows]) for rows in resamples(errors.shape[1])]
     values = of_axes(errors)
-    return {
-        name: bounded(getattr(values, name), np.array([getattr(one, name) for one in drawn]))
-        for name in names
-    }
+    found = {}
+    for name in (*Components._fields, "total"):
+        samples = np.array([getattr(one, name) for one in drawn])
+        found[name] = bounded(getattr(values, name), samples)
+    return found
 
 
 def resamples(count: int) -> Iterator[NDArray[np.int64]]:
-    """Rows of the bootstrap's samples of so many fields."""
+    """Rows of each sample of the bootstrap over `count` fields."""
     rng = random_stream(1)
     return (rng.integers(count, size=count) for _ in range(RESAMPLES))
 
@@ -162,7 +167,7 @@ def mean_known(values: Floats, axis: int | tuple[int, ...] | None = None) -> Any
 
 
 def sum_over_total(errors: Floats, at_once: Floats) -> Bounded:
-    """The sum of the terms over the mean square that independent frames of the same fields have.
+    """Ratio of the sum of the terms to the mean square error of independent frames of the same fields.
 
     Parameters
     ----------
@@ -175,10 +180,10 @@ def sum_over_total(errors: Floats, at_once: Floats) -> Bounded:
     known = np.isfinite(squares)
     errors = errors[:, known]
     squares = squares[known]
-    drawn = [
-        of_axes(errors[:, rows]).total / squares[rows].mean()
-        for rows in resamples(len(squares))
-    ]
+    drawn = []
+    for rows in resamples(len(squares)):
+        total = of_axes(errors[:, rows]).total
+        drawn.append(total / squares[rows].mean())
     return bounded(of_axes(errors).total / float(squares.mean()), np.array(drawn))
 
 
@@ -199,12 +204,11 @@ def mean_square_ratio(numerator: Floats, denominator: Floats) -> Bounded:
     return bounded(top.mean() / bottom.mean(), np.array(drawn))
 
 
-# The terms of a datasheet: sizes, sum against the total, what would lower them, and what
-# disturbances do.
+# The terms of a datasheet: their sizes, their sum against the total, and the effect of each cause.
 
 
 GROUPS = {"across": slice(0, 2), "about": slice(2, 3)}  # axes across and about the boresight
-MIN_FIELDS = 10  # in which all frames of the terms are solved
+MIN_FIELDS = 10  # minimum number of fields in which all frames of the terms are solved
 
 TERMS = {
     "bias": "mean over fields, attitudes and time, and its scatter among units",
@@ -264,12 +268,11 @@ def term_tables(sheet: MeasuredFrames) -> dict[str, TermTable]:
     """The terms across and about the boresight."""
     errors, solved = term_errors(sheet)
     at_once = np.moveaxis(sheet.errors(sheet.rows("total")), 1, 2)[:, solved]
-    return {
-        name: TermTable(
-            with_intervals(errors[axes]), sum_over_total(errors[axes], at_once[axes])
-        )
-        for name, axes in GROUPS.items()
-    }
+    tables = {}
+    for name, axes in GROUPS.items():
+        ratio = sum_over_total(errors[axes], at_once[axes])
+        tables[name] = TermTable(with_intervals(errors[axes]), ratio)
+    return tables
 
 
 def mean_errors(sheet: MeasuredFrames) -> list[Bounded]:
@@ -291,17 +294,19 @@ def squares_by_field(sheet: MeasuredFrames, rows: list[int], axes: slice) -> Flo
 
 
 def causes(sheet: MeasuredFrames) -> list[dict[str, Any]]:
-    """Each change of the scene with the mean square that is left of the total's, across and about the boresight."""
+    """Each change of the scene with the ratio of the mean square after it to that of the unchanged scene.
+
+    Across and about the boresight.
+    """
     found = []
     for name in sheet.levels("cause", "cause"):
         rows = sheet.rows("cause", cause=name)
-        before = [
-            row for row in sheet.rows("total") if sheet.cells[row].levels["draw"] < len(rows)
-        ]
+        draws = sheet.rows("total")
+        before = [draw for draw in draws if sheet.cells[draw].levels["draw"] < len(rows)]
         row: dict[str, Any] = {"cause": name}
         for group, axes in GROUPS.items():
-            after, squares = (squares_by_field(sheet, cells, axes) for cells in (rows, before))
-            row[group] = mean_square_ratio(after, squares)
+            squares = squares_by_field(sheet, rows, axes)
+            row[group] = mean_square_ratio(squares, squares_by_field(sheet, before, axes))
         found.append(row)
     return sorted(found, key=lambda one: one["across"].value + one["about"].value)
 

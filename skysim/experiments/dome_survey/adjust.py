@@ -1,10 +1,10 @@
-"""Identification of a survey's LEDs and adjustment of everything, in rounds.
+"""Identification of a survey's LEDs and adjustment of all unknowns, in rounds.
 
-The IMU gives the attitude of each frame to about half a degree. At first the detections are matched to LEDs with it.
-Its error shifts all lights of a frame together by more than the LED spacing, so the most likely common shift is found
-first (`matching`). Then `estimator.calibration.dome_survey.survey` adjusts LED positions, lever arm, lens and attitudes
-together by least squares, and the LEDs get the names that their places and their light have together. All is repeated
-with the improved values. LEDs that turn out to be far from their place in the list start the last rounds where they
+The IMU gives the attitude of each frame to about half a degree. In the first round the detections are matched to LEDs
+by it. Its error shifts all lights of a frame together by more than the LED spacing, so the most likely common shift is
+found first (`survey_frames.common_shift_px`). Then `estimator.calibration.dome_survey.survey` adjusts LED positions,
+lever arm, lens and attitudes together by least squares, and places and light together give the LEDs their names. All is
+repeated with the improved values. LEDs that are found far from their place in the list start the last rounds where they
 were found. The result is a `DomeMap`, the file that `tracker.map` reads.
 """
 
@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.attitude.dome_map import LedMap
-from estimator.calibration import dome_survey, survey_faults
+from estimator.calibration import dome_survey, survey_faults, survey_subset
 from estimator.calibration.bundle_adjustment import Assumed
-from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, Unconnected
+from estimator.calibration.dome_survey import DomeFrame, DomeSurvey
+from estimator.calibration.survey_subset import Unconnected
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey.survey_findings import (
@@ -43,24 +44,27 @@ from skysim.experiments.dome_survey.survey_prior import (
 )
 from skysim.tracking.dome_map_file import DomeMap
 
-MIN_SHARED_LEDS = 3  # that a frame must share with others: two determine its attitude
-MAX_UNCONNECTED = 0.5  # share of the frames that may be left out at a time
+MIN_SHARED_LEDS = (
+    3  # least number of LEDs that a frame shares with others: two determine its attitude
+)
+MAX_UNCONNECTED = 0.5  # greatest fraction of the frames that is left out at a time
 
 ROUNDS = (
     3  # rounds of identification and adjustment; from the second on with the adjusted values
 )
 MOVED_ROUNDS = 2  # further rounds if LEDs are far from their places in the list
 
-# Share of a frame's lights that are matched, and of these that fit the adjustment: far less by chance.
+# Least fraction of a frame's lights that are matched, and of these that fit the adjustment; far fewer do by chance.
 MIN_MATCHED = 0.5
-# The same at first, as a share of the frames' median: a field shifted by one LED matches some 0.6 of its lights, a
-# right one all. Later measured LEDs tell such fields apart, and frames count that show displaced LEDs.
+# Least fraction that are matched in the first round, relative to the median of the frames: a field shifted by one LED
+# matches about 0.6 of its lights, a right one all. Later rounds tell such fields apart by the LEDs measured, and must
+# not refuse frames with displaced LEDs.
 MIN_OF_MEDIAN = 0.8
-# Standard deviations by which a parameter may move from the assumed one, and the least of these, as a share of that
-# of the assumed one.
+# Standard deviations by which a parameter may move from the assumed one, and their least value relative to the standard
+# deviation of the assumed one.
 PLAUSIBLE = 6.0
 LEAST_SHARE = 0.1
-MAX_DISPLACEMENT_M = 0.1  # of an LED from its place in the list
+MAX_DISPLACEMENT_M = 0.1  # greatest distance of an LED from its place in the list
 
 
 def run_survey(
@@ -72,15 +76,19 @@ def run_survey(
 ) -> SurveyRun:
     """Survey LEDs, lever arm, lens and attitudes from all frames, starting from `prior` with errors of `uncertainty`.
 
-    watch(rounds done, rounds) is called after each round of identification and adjustment
-    Raises InputError if the frames do not determine the unknowns, or the result contradicts the prior.
-
     Parameters
     ----------
     fit_distortion
         Fit k1, k2, p1, p2 as well. A narrow field hardly determines them, and they correlate
         with the focal length: on the AFIT dome its sigma grows from 10 to 80 px, while the
         attitude does not change
+    watch
+        Called with the rounds done and the number of rounds after each round
+
+    Raises
+    ------
+    InputError
+        If the frames do not determine the unknowns, or the result contradicts the prior.
     """
 
     def adjusted(
@@ -94,7 +102,9 @@ def run_survey(
         rows = [rows[k] for k in selected]
         matches = [matches[k] for k in selected]
         start.update(zip(rows, survey.body_from_lab, strict=True))
-        return with_names(SurveyRun(survey, frames, rows, matches, listed, prior, uncertainty))
+        return with_names(
+            SurveyRun(survey, frames, rows, matches, listed, prior, uncertainty)
+        )
 
     listed = prior.leds
     before = assumed(prior, uncertainty)
@@ -121,9 +131,9 @@ def check_plausible(run: SurveyRun, before: Assumed) -> None:
 
     If frames are misidentified, the adjustment can fit them with a model that is far from the real one, such as half
     the focal length with the camera close to the dome, and with small residuals and standard deviations. The assumed
-    value is one of the adjustment's measurements, so what the frames add to it has the variance P0 - P, P0 before and P
-    after (the innovation of a linear estimate). A value moves by more than PLAUSIBLE standard deviations only by such
-    an error. For frames that add next to nothing the variance is at least LEAST_SHARE^2 P0.
+    value is one of the adjustment's measurements, so its correction has the variance P0 - P, with P0 before and P after
+    (the innovation of a linear estimate). Only such an error moves a value by more than PLAUSIBLE standard deviations.
+    The variance is taken to be at least LEAST_SHARE^2 P0, for frames that add next to nothing.
     """
     found = run.survey
     accuracy = run.accuracy
@@ -166,7 +176,8 @@ def identified_by_imu(
     """Rows of the frames that the IMU's attitudes identify, and their correspondences. Raises InputError for none."""
     matches = [match_by_imu(frame, prior, uncertainty) for frame in frames]
     shares = [
-        matched_share(frame, match, prior) for frame, match in zip(frames, matches, strict=True)
+        matched_share(frame, match, prior)
+        for frame, match in zip(frames, matches, strict=True)
     ]
     least = max(MIN_MATCHED, MIN_OF_MEDIAN * float(np.median(shares)))
     rows = np.flatnonzero(np.array(shares) >= least).tolist()
@@ -179,8 +190,10 @@ def identified_by_imu(
     return rows, [matches[row] for row in rows]
 
 
-def matched_share(frame: SurveyFrame, match: Correspondences, model: CalibrationPrior) -> float:
-    """Share of the lights of a frame that are matched, or of the LEDs in it if they are fewer; 0 if too few connect."""
+def matched_share(
+    frame: SurveyFrame, match: Correspondences, model: CalibrationPrior
+) -> float:
+    """Fraction of a frame's lights that are matched, or of its LEDs if they are fewer; 0 if too few connect it."""
     if len(match.led) < MIN_SHARED_LEDS:
         return 0.0
     visible = int(np.count_nonzero(model.camera.contains(model.pixels(frame.body_from_lab))))
@@ -188,15 +201,15 @@ def matched_share(frame: SurveyFrame, match: Correspondences, model: Calibration
 
 
 def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], CalibrationPrior]:
-    """Rows of the frames that are identified, their lights matched anew with the adjusted model, and that model.
+    """Rows of the frames that are identified, their matches by the adjusted model, and that model.
 
-    A frame that is not tied, or has too few matches with its adjusted attitude, was misidentified as a whole: it is
-    matched with the IMU's attitude again, now that lever and lens are known better.
+    A frame that was left out, or has too few matches with its adjusted attitude, was misidentified as a whole: it is
+    matched again with the IMU's attitude, since lever and lens now are known better.
     """
     survey = run.survey
     prior = run.prior
     model = replace(prior, camera=survey.camera, leds=survey.leds, lever=survey.lever)
-    # The attitudes are adjusted now, so only the map's and the residual error remain in the predictions.
+    # The attitudes are adjusted, so only the errors of the map and of the residuals remain in the predictions.
     map_px = led_sigma_m(survey, run.uncertainty) * model.px_per_m
     sigma_px = np.hypot(map_px, max(survey.rms_px, prior.floor_px))
     tied = {
@@ -219,9 +232,9 @@ def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], Calibra
 
 
 def with_names(run: SurveyRun) -> SurveyRun:
-    """The run with the names that place and light give its LEDs together (`survey_faults.names`).
+    """The run with LED names by place and light together (`estimator.calibration.survey_faults.names`).
 
-    An LED that is not measured keeps its name, or gets one that is free if another LED has it now.
+    An LED that is not measured keeps its name, or gets a free one if another LED has taken it.
     """
     survey = run.survey
     listed_m = run.listed.position_m
@@ -251,7 +264,7 @@ def with_names(run: SurveyRun) -> SurveyRun:
 
 
 def displaced_leds(run: SurveyRun) -> dict[int, Floats]:
-    """Rows and places of the LEDs that are far from those in the list: measured ones, and stray lights with a name."""
+    """Rows and places of LEDs found far from their places in the list: measured LEDs, and stray lights with a name."""
     survey = run.survey
     rows, _ = survey_faults.displaced(
         run.listed.position_m, survey.leds.position_m, survey.led_covariance_m2
@@ -266,7 +279,7 @@ def displaced_leds(run: SurveyRun) -> dict[int, Floats]:
 
 
 def with_places(run: SurveyRun, places: dict[int, Floats]) -> SurveyRun:
-    """The run with these LEDs at other places, before the survey and after it."""
+    """The run with these LEDs at other places, both before and after the survey."""
 
     def moved(leds: LedMap) -> LedMap:
         position_m = leds.position_m.copy()
@@ -292,14 +305,14 @@ def adjust_connected(
 ) -> tuple[list[int], DomeSurvey]:
     """Adjust the largest group of connected frames. Returns its rows and the survey.
 
-    A frame may be connected only by misidentified lights. The adjustment rejects these and refuses the frame, or keeps
-    the few that fit by chance with a wrong attitude. Both are left out. Raises InputError if the frames that remain do
-    not determine the unknowns.
+    A frame may be connected only by misidentified lights. The adjustment rejects these and refuses the frame, or it
+    keeps the few lights that fit a wrong attitude by chance. Such frames are left out. Raises InputError if the
+    frames that remain do not determine the unknowns.
     """
     selected = largest_connected_group(led_visibility(pairs, prior), MIN_SHARED_LEDS)
     while True:
         try:
-            # A robust loss, and what was assumed before the survey as measurements.
+            # The loss is robust, and the values assumed before the survey are measurements.
             survey = dome_survey.survey(
                 [dome_frame(*pairs[k]) for k in selected],
                 prior.leds,
@@ -335,11 +348,13 @@ def led_visibility(
     """
     visible = identified([match for _, match in pairs], len(prior.leds.id))
     arm_m = prior.lever.camera_body_m
-    camera_m = np.array([frame.body_from_lab.inv().apply(arm_m) for frame, _ in pairs]).reshape(
-        -1, 3
+    camera_m = np.array(
+        [frame.body_from_lab.inv().apply(arm_m) for frame, _ in pairs]
+    ).reshape(-1, 3)
+    angle_rad = survey_subset.ray_angles(
+        prior.leds.position_m, camera_m, *np.nonzero(visible)
     )
-    angle_rad = dome_survey.ray_angles(prior.leds.position_m, camera_m, *np.nonzero(visible))
-    return visible & (angle_rad > dome_survey.CONNECTING_RAD)
+    return visible & (angle_rad > survey_subset.CONNECTING_RAD)
 
 
 def largest_connected_group(visible: NDArray[np.bool_], min_shared: int) -> list[int]:
@@ -403,5 +418,8 @@ def dome_frame(frame: SurveyFrame, match: Correspondences) -> DomeFrame:
     """Input frame of the adjustment: matched detections with their LEDs, and the start attitude."""
     lights = frame.lights
     return DomeFrame(
-        match.led, lights.xy_px[match.light], lights.sigma_px[match.light], frame.body_from_lab
+        match.led,
+        lights.xy_px[match.light],
+        lights.sigma_px[match.light],
+        frame.body_from_lab,
     )

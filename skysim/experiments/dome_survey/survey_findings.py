@@ -1,4 +1,4 @@
-"""What a survey has found: which LEDs are measured and how well, the attitudes to hold next, and faults of the dome."""
+"""Findings of a survey: the LEDs measured and their errors, the attitudes to hold next, and faults of the dome."""
 
 from __future__ import annotations
 
@@ -33,12 +33,13 @@ from skysim.experiments.dome_survey.survey_prior import (
 from skysim.results.telemetry_report import euler_deg
 from skysim.scene.scene import Scene
 
-# A survey of a dome as its last round has it: frames, correspondences, what they show of each LED,
-# stray lights.
+# A survey after its last round: frames, correspondences, light of each LED, stray lights.
 
 
-STRAY_SIGMA_PX = 0.3  # of a ray to a stray light, for the errors of the attitude and of blends
-STRAY_REACH_M = 0.005  # on the dome, within which stray lights of two frames may be one
+STRAY_SIGMA_PX = 0.3  # error of a ray to a stray light, from the attitude and from blends
+STRAY_REACH_M = (
+    0.005  # greatest distance on the dome between stray lights of two frames that may be one
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +51,12 @@ class SurveyRun:
     taken
         All frames, with the IMU's attitudes
     rows
-        Those of `taken` that are in the survey
+        Rows of `taken` that are in the survey
     listed
         The LEDs before the survey
     prior
-        The model before the last round; its LEDs are the listed ones, those moved at the places
-        found
+        The model before the last round; its LEDs are the listed ones, with displaced LEDs at
+        the places found
     """
 
     survey: DomeSurvey
@@ -91,12 +92,12 @@ class SurveyRun:
 
     @property
     def seen(self) -> Mask:
-        """(F, N) LEDs identified in each frame."""
+        """(F, N) mask of the LEDs identified in each frame."""
         return identified(self.inliers, len(self.listed.id))
 
     @property
     def noise_px(self) -> float:
-        """Standard deviation of a centroid's coordinates, as the residuals have it; of the mean information."""
+        """Standard deviation of a centroid's coordinates by the residuals, for the mean information."""
         pairs = zip(self.frames, self.inliers, strict=True)
         sigma_px = np.concatenate(
             [frame.lights.sigma_px[match.light] for frame, match in pairs]
@@ -116,7 +117,7 @@ class SurveyRun:
 
     @property
     def uncertainty_after(self) -> SurveyUncertainty:
-        """The uncertainty of the IMU and of LEDs that are not measured, and that of the lever and the lens found."""
+        """The uncertainty of the IMU and of unmeasured LEDs as before, and of lever and lens as found."""
         accuracy = self.accuracy
         before = self.uncertainty
         lever_m = math.sqrt(np.mean(accuracy.lever_sigma_m**2))
@@ -125,7 +126,7 @@ class SurveyRun:
 
 
 def identified(matches: Sequence[Correspondences], leds: int) -> Mask:
-    """(F, N) LEDs that the correspondences of each frame have."""
+    """(F, N) mask of the LEDs in the correspondences of each frame."""
     out = np.zeros((len(matches), leds), dtype=bool)
     for row, match in zip(out, matches, strict=True):
         row[match.led] = True
@@ -133,13 +134,13 @@ def identified(matches: Sequence[Correspondences], leds: int) -> Mask:
 
 
 def led_sigma_m(survey: DomeSurvey, uncertainty: SurveyUncertainty) -> Floats:
-    """(N,) standard deviation of each LED's position, RMS of three axes; that before the survey if not surveyed."""
+    """(N,) standard deviation of each LED's position, RMS of three axes; as before the survey if not surveyed."""
     variance_m2 = np.einsum("nii->n", survey.led_covariance_m2) / 3
     return np.sqrt(np.where(survey.surveyed, variance_m2, uncertainty.led_sigma_m**2))
 
 
 def stray_lights(run: SurveyRun) -> list[StrayLight]:
-    """Lights at rest in the lab that are no known LED."""
+    """Lights at rest in the lab that are not a known LED."""
     frame = [np.zeros(0, np.int64)]
     xy_px = [np.zeros((0, 2))]
     for k, match in enumerate(run.inliers):
@@ -153,7 +154,7 @@ def stray_lights(run: SurveyRun) -> list[StrayLight]:
 
 
 def residuals_px(run: SurveyRun) -> tuple[Floats, Floats]:
-    """(M, 2) pixels of all correspondences without outliers, and their residuals: found minus predicted."""
+    """(M, 2) pixels of all correspondences except outliers, and their residuals, detected minus predicted."""
     survey = run.survey
     found = [np.zeros((0, 2))]
     residual = [np.zeros((0, 2))]
@@ -169,7 +170,7 @@ def residuals_px(run: SurveyRun) -> tuple[Floats, Floats]:
 
 
 def light_table(run: SurveyRun) -> LightTable:
-    """What the frames show of each LED, and what each must show."""
+    """The light of each LED in the frames, measured and expected."""
     index = np.array([frame.index for frame in run.frames])
     return LightTable(
         light_at_unit_distance(run),
@@ -179,7 +180,7 @@ def light_table(run: SurveyRun) -> LightTable:
 
 
 def margins(run: SurveyRun) -> tuple[Floats, float]:
-    """Margin of the chip for each LED, and distance between LEDs, by the errors of the places as well."""
+    """Margin of the chip for each LED, and least distance between LEDs, including the errors of their places."""
     sizes = image_sizes(run.prior)
     place_px = run.accuracy.led_sigma_m * run.prior.px_per_m
     return sizes.margin_px + GATE_SIGMAS * place_px, sizes.apart_px
@@ -204,11 +205,11 @@ class Coverage(NamedTuple):
     Attributes
     ----------
     model
-        By which further attitudes are chosen
+        Model by which further attitudes are chosen
     held, seen
-        body_from_lab of F frames, and (F, N) LEDs in them
+        body_from_lab of F frames, and (F, N) mask of the LEDs in them
     accuracy
-        That of the survey, or predicted before it; None if the frames are too few
+        Accuracy of the survey, or predicted before it; None if the frames are too few
     """
 
     model: SurveyModel
@@ -239,7 +240,7 @@ def coverage_before(
     uncertainty: SurveyUncertainty,
     noise_px: float,
 ) -> Coverage:
-    """The coverage of frames before their survey: LEDs named by the IMU's attitudes, and the accuracy predicted."""
+    """The coverage of frames before their survey: LEDs named by the IMU's attitudes, and predicted accuracy."""
     matches = [match_by_imu(frame, prior, uncertainty) for frame in frames]
     held = Rotation.concatenate([frame.body_from_lab for frame in frames])
     model = survey_model(prior, uncertainty, noise_px)
@@ -248,7 +249,7 @@ def coverage_before(
 
 
 class NextStops(NamedTuple):
-    """Attitudes to hold next, and what the survey with them will reach (None if that does not determine it)."""
+    """Attitudes to hold next, and the predicted accuracy with them; None if they do not determine the unknowns."""
 
     lab_from_body: Rotation
     accuracy: SurveyAccuracy | None
@@ -267,7 +268,9 @@ def next_stops(
     return NextStops(further, predicted(model, attitudes, seen))
 
 
-def predicted(model: SurveyModel, body_from_lab: Rotation, seen: Mask) -> SurveyAccuracy | None:
+def predicted(
+    model: SurveyModel, body_from_lab: Rotation, seen: Mask
+) -> SurveyAccuracy | None:
     """The accuracy predicted; None if the frames do not determine the unknowns."""
     try:
         return survey_plan.predict(model, body_from_lab, seen)
@@ -285,19 +288,19 @@ class DomeFaults:
     Attributes
     ----------
     dark
-        LEDs that no frame shows though it must
+        LEDs that no frame shows although it should
     displaced
         LED and its distance from the list's place, m
     list_sigma_m
-        Error of the other places about each axis
+        Error of the other places along each axis
     exchanged
-        LED at whose place another one shines, that other one, and others that would do as well
+        LED with another one at its place, that other one, and other LEDs that fit as well
     found_m
         Places, m, at which displaced LEDs and lights of exchanged ones were found
     unlisted
-        Places, m, of lights at rest that are no LED of the list
+        Places, m, of lights at rest that are not an LED of the list
     exchange_share
-        Share of the pairs of LEDs whose exchange would be found; 0 if all are alike, None if
+        Fraction of the pairs of LEDs whose exchange would be found; 0 if all are alike, None if
         none are compared: too few are in enough frames, or the time of their code is unknown
     """
 
@@ -324,7 +327,7 @@ def find_faults(run: SurveyRun) -> DomeFaults:
         leds.position_m, survey.leds.position_m, survey.led_covariance_m2
     )
     off_m = np.linalg.norm(survey.leds.position_m - leds.position_m, axis=1)
-    # The time of a code that runs freely is unknown, and with it what each LED shows.
+    # The time of a code that runs freely is unknown, so the expected light of each LED is unknown.
     code = run.prior.code
     is_free = code is not None and code.bit_time_s is not None
     exchanges, share = ([], None) if is_free else survey_faults.exchanged(table)
@@ -396,7 +399,7 @@ def coverage_statistics(so_far: Coverage) -> dict[str, Any]:
 
 
 def accuracy_statistics(accuracy: SurveyAccuracy | None) -> dict[str, float | int | None]:
-    """Measured LEDs, their rms error in mm, that of the lever, and of the focal length in px; None if undetermined."""
+    """Number of measured LEDs, rms errors of LEDs and lever in mm, and of focal length in px; None if undetermined."""
     if accuracy is None:
         return {"measured": 0, "led_mm": None, "lever_mm": None, "focal_px": None}
     return {

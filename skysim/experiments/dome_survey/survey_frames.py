@@ -31,7 +31,7 @@ from skysim.tracking import factory, onboard_model
 # Attitudes at which the vehicle is held for a survey: by a plan, or random.
 
 
-CANDIDATES = 1000  # random attitudes among which a plan chooses
+CANDIDATES = 1000  # number of random attitudes among which a plan chooses
 # Distinct from those in core/random_streams.py.
 STREAM_KEYS = {"attitudes": 101, "imu": 102, "checks": 103, "candidates": 104, "noise": 105}
 
@@ -42,8 +42,12 @@ def stop_attitudes(scene: Scene, stream_name: str, count: int, tilt_deg: float) 
     Parameters
     ----------
     stream_name
-        Random stream, a key of STREAM_KEYS. Raises InputError if the tilt exceeds the vehicle's
-        tilt stop.
+        Random stream, a key of STREAM_KEYS
+
+    Raises
+    ------
+    InputError
+        If the tilt exceeds the vehicle's tilt stop.
     """
     stop_deg = scene.vehicle.tilt_stop_deg if scene.vehicle.mount == "air_bearing" else 90.0
     if not 0 < tilt_deg <= stop_deg:
@@ -70,12 +74,12 @@ def planned_stops(
     held: Rotation | None = None,
     seen: Mask | None = None,
 ) -> Rotation:
-    """lab_from_body at up to `count` stops that reduce the errors most, in their order (`survey_plan.choose`).
+    """lab_from_body at up to `count` stops that reduce the errors most, best first (`survey_plan.choose`).
 
     Parameters
     ----------
     margin_px
-        Of the chip, where an image would be incomplete
+        Margin of the chip in which an image would be incomplete
     held, seen
         body_from_lab of frames taken before, and the LEDs identified in them
 
@@ -108,7 +112,7 @@ def from_rows(rows: Sequence[Mapping[str, float]]) -> Rotation:
     )
 
 
-NOISE_FRAMES = 4  # by which the noise of a centroid is determined
+NOISE_FRAMES = 4  # number of frames from which the noise of a centroid is determined
 MIN_LIGHTS = 10
 LEAST_NOISE_PX = 1e-4
 SAME_LIGHT_PX = 2.0  # greatest distance of a centroid from the true image
@@ -121,7 +125,7 @@ class SurveyFrame:
     Attributes
     ----------
     index
-        Number of the frame, from 0, which tells what coded LEDs show
+        Number of the frame, from 0, which determines the light of coded LEDs
     """
 
     lights: Centroids
@@ -132,13 +136,17 @@ class SurveyFrame:
 def render_stops(
     lab: Lab, lab_from_body: Rotation, first: int = 0
 ) -> Iterator[tuple[Frame, Truth]]:
-    """Render a frame at each attitude with the vehicle at rest. `first` is the index of the first frame, which also
-    selects its noise."""
+    """Render a frame at each attitude with the vehicle at rest.
+
+    `first` is the index of the first frame; the index of a frame also selects its noise.
+    """
     for n, attitude in enumerate(lab_from_body):
         yield render_at_rest(lab.camera, attitude, first + n)
 
 
-def take_frames(lab: Lab, lab_from_body: Rotation) -> Iterator[tuple[Frame, Truth, Centroids]]:
+def take_frames(
+    lab: Lab, lab_from_body: Rotation
+) -> Iterator[tuple[Frame, Truth, Centroids]]:
     """Each frame at these stops, with its truth and its detections."""
     settings = factory.assumed_settings(lab.scene)
     camera = onboard_model.assumed_camera(lab.scene)
@@ -152,7 +160,7 @@ def centroid_noise_px(lab: Lab, tilt_deg: float) -> float:
     Raises
     ------
     InputError
-        If they show too few lights.
+        If the frames show too few lights.
     """
     errors = []
     for _, truth, lights in take_frames(
@@ -188,11 +196,11 @@ def detect_lights(settings: Settings, camera: Camera, image_dn: NDArray[Any]) ->
         return Centroids.empty()
 
 
-# Identification of the LEDs in the frames of a dome survey.
+# Identification of the LEDs in the frames.
 
 
 Ints = NDArray[np.int64]
-GATE_SIGMAS = 3.5  # sigmas of a two-dimensional error; Gaussian noise exceeds it once in 450
+GATE_SIGMAS = 3.5  # gate of a two-dimensional error; Gaussian noise exceeds it once in 450
 ANCHOR_LIGHTS = (
     10  # number of central lights that are paired with every LED to find the common shift
 )
@@ -210,15 +218,15 @@ def prediction_sigmas_px(
 ) -> tuple[float, Floats]:
     """Standard deviations per coordinate in pixels: of the common shift of a frame, and (N,) of each LED individually.
 
-    The attitude error across the boresight and the lever arm error shift all lights alike. An attitude error moves the
-    camera too: it turns the direction of an LED at the distance R from the center of rotation, d from the camera, by
-    R / d of itself. The LED position error, and the roll and focal length errors (largest, and evaluated, at the image
-    corner), act on each light differently.
+    The attitude error across the boresight and the lever arm error shift all lights alike. An attitude error also moves
+    the camera: it turns the direction of an LED at the distance R from the center of rotation and d from the camera by
+    R / d times the error. The LED position error, and the errors of roll and focal length (evaluated at the image
+    corner, where they are largest), shift each light differently.
 
     Parameters
     ----------
     map_px
-        (N,) standard deviation of each LED's place; that of `uncertainty` if None
+        (N,) standard deviation of each LED's place; from `uncertainty` if None
     """
     camera = prior.camera
     corner_px = np.hypot(camera.width_px, camera.height_px) / 2
@@ -280,7 +288,7 @@ def common_shift_px(
     candidates = (detected_px[inner, None] - predicted_px).reshape(-1, 2)
     limit_px = GATE_SIGMAS * np.hypot(common_px, individual_px.max())
     candidates = candidates[np.linalg.norm(candidates, axis=1) < limit_px]
-    candidates = np.vstack([np.zeros((1, 2)), candidates])  # no shift is a candidate too
+    candidates = np.vstack([np.zeros((1, 2)), candidates])  # no shift is also a candidate
     distance_px, nearest = cKDTree(predicted_px).query(detected_px - candidates[:, None])
     sigma_px = individual_px[nearest]
     cost = np.minimum(

@@ -1,8 +1,8 @@
 """Frames of a survey from images on disk.
 
-A folder has one image for each attitude, in the order of their names, and may have `attitudes.csv` with the IMU's
-attitudes: columns file, roll_deg, pitch_deg, yaw_deg (`motion` of a scene has the same angles). Images that it does not
-name are identified by the tracker with the list of LEDs, or with the survey of the other images.
+A folder has one image for each attitude, in the order of their names. It may have `attitudes.csv` with the IMU's
+attitudes: columns file, roll_deg, pitch_deg, yaw_deg (the angles of `motion` in a scene). Images that are not in this
+file are identified by the tracker with the list of LEDs, or with the survey of the other images.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ATTITUDES = "attitudes.csv"
 FRAME = "frame_{:04d}.fits"
 COLUMNS = ("file", "roll_deg", "pitch_deg", "yaw_deg")
 MIN_IMAGES = 3
-# Of several images of one name the first is read.
+# Of several images with the same name, the first format of this list is read.
 FORMATS = (".fits", ".fit", ".fits.gz", ".tif", ".tiff", ".png")
 
 
@@ -59,7 +59,7 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def best_images(folder: Path) -> list[Path]:
-    """The images of a folder by name, of those of one stem the first of FORMATS. Raises InputError for no folder."""
+    """The images of a folder by name; of one stem, that of the first of FORMATS. Raises InputError for no folder."""
     if not folder.is_dir():
         raise InputError(folder, "no such folder", "a folder of images")
     best: dict[str, Path] = {}
@@ -73,7 +73,7 @@ def best_images(folder: Path) -> list[Path]:
 
 
 def rank(suffix: str) -> int:
-    """Place of an image format in the order in which images of one name are preferred."""
+    """Rank of an image format among images of one name."""
     return FORMATS.index(suffix) if suffix in FORMATS else len(FORMATS)
 
 
@@ -92,7 +92,7 @@ def read_images(folder: Path, camera: Camera, settings: Settings) -> Iterator[Su
 
 
 def lights_of(path: Path, camera: Camera, settings: Settings) -> Centroids:
-    """The detections of an image. Raises InputError for one that cannot be used."""
+    """The detections of an image. Raises InputError if it cannot be used."""
     return detect_lights(settings, camera, pixels_of(path, camera))
 
 
@@ -146,7 +146,7 @@ def frames_with_attitude(
     uncertainty: SurveyUncertainty,
     settings: Settings,
 ) -> list[SurveyFrame]:
-    """The images whose attitude is known or is found by the tracker, lost in space, with this model."""
+    """The images whose attitude is known, or is found by the tracker with this model, lost in space."""
     tracker: DomeTracker | None = None
     out = []
     for index, picture in enumerate(pictures):
@@ -164,7 +164,7 @@ def frames_with_attitude(
 def lost_in_space(
     model: CalibrationPrior, uncertainty: SurveyUncertainty, settings: Settings
 ) -> DomeTracker:
-    """A tracker that knows how uncertain the model is. Raises InputError for LEDs that it cannot use."""
+    """A tracker with the uncertainty of the model. Raises InputError for LEDs that it cannot use."""
     camera = replace(model.camera, focal_sigma=abs(uncertainty.focal_error))
     leds: LedMap = replace(
         model.leds, sigma_m=uncertainty.led_sigma_m, covariance_m2=None, common_m=None
@@ -181,13 +181,13 @@ def lost_in_space(
 # A folder of images that is followed while they are taken.
 
 
-POLL_S = 0.5  # between two looks at the folder
+POLL_S = 0.5  # time between two looks at the folder
 
 Stamp = tuple[int, int]  # size in bytes, time of the last change in ns
 
 
 class News(NamedTuple):
-    """What a look found: names of the files that were read, and an error for each that cannot be used."""
+    """Result of a look at the folder: names of files that were read, and an error for each that cannot be used."""
 
     read: list[str]
     complaints: list[InputError]
@@ -195,7 +195,7 @@ class News(NamedTuple):
 
 @dataclass
 class WatchedFolder:
-    """The images of a folder so far; `pictures` has their names, detections and attitudes, by name."""
+    """The images of a folder so far; `pictures` has their names, detections and attitudes, ordered by name."""
 
     folder: Path
     camera: Camera
@@ -224,11 +224,13 @@ class WatchedFolder:
             time.sleep(poll_s)
 
     def look(self) -> News:
-        """Read the files that are complete and new. Raises InputError if there is no such folder."""
+        """Read the new files that are complete. Raises InputError if there is no such folder."""
         news = News([], [])
         paths = best_images(self.folder)
         names = {path.name for path in paths}
-        self._lights = {name: lights for name, lights in self._lights.items() if name in names}
+        self._lights = {
+            name: lights for name, lights in self._lights.items() if name in names
+        }
         for path in [*paths, self.folder / ATTITUDES]:
             stamp = stamp_of(path)
             before = self._seen.get(path.name)

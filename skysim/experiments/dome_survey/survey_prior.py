@@ -1,4 +1,4 @@
-"""What is assumed before a survey of the dome, and how uncertain it is."""
+"""The model that is assumed before a survey of the dome, and its uncertainty."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from skysim.sources.dome.layouts import led_list, registry
 from skysim.tracking import onboard_model
 
 Ints = NDArray[np.int64]
-BLUR_PX = 3.0  # of an image's edge
+BLUR_PX = 3.0  # width of an image's blurred edge
 
 # Options: unit, quantity, example, minimum and maximum. The LED error must be > 0, because it weights the map.
 UNCERTAINTY_RANGES = {
@@ -41,7 +41,7 @@ UNCERTAINTY_RANGES = {
 
 @dataclass(frozen=True, slots=True)
 class SurveyUncertainty:
-    """Uncertainty before the survey: standard deviations per axis, and a focal length error.
+    """Uncertainty before the survey: standard deviations along or about each axis, and of the focal length.
 
     Attributes
     ----------
@@ -72,13 +72,13 @@ class CalibrationPrior:
     Attributes
     ----------
     floor_px
-        Least standard deviation of a prediction's residuals, by which lights are matched
+        Least standard deviation of the residuals of predictions, for the matching of lights
     disk_m
         Diameter of an LED's luminous disk
     levels
         (N,) relative nominal brightness of the LEDs
     code
-        What each LED shows in a frame; None if all are steady
+        Code of the LEDs; None if all are steady
     """
 
     camera: Camera
@@ -90,7 +90,7 @@ class CalibrationPrior:
     code: LedCode | None = None
 
     def expected_light(self, index: Ints) -> Floats:
-        """(F, N) relative light that each LED gives in frames of these numbers, 0 if its code has it off."""
+        """(F, N) relative light of each LED in frames of these numbers; 0 if its code switches it off."""
         if self.code is None or self.code.bit_time_s is not None:
             return np.tile(self.levels, (len(index), 1))
         return self.levels * self.code.levels[:, index % self.code.bits].T
@@ -108,7 +108,7 @@ class CalibrationPrior:
         )
 
     def pixels(self, body_from_lab: Rotation) -> Floats:
-        """(N, 2) pixel positions of the LEDs; a value far outside the image for LEDs behind the camera."""
+        """(N, 2) pixel positions of the LEDs; far outside the image for LEDs behind the camera."""
         in_body = body_from_lab.apply(self.leds.position_m) - self.lever.camera_body_m
         xy_px = self.camera.pixels(self.lever.cam_from_body.apply(in_body))
         return np.nan_to_num(xy_px, nan=-1e9)
@@ -133,7 +133,7 @@ def calibration_prior(lab: Lab) -> CalibrationPrior:
 
 
 def listed_prior(lab: Lab, camera: Camera) -> CalibrationPrior:
-    """The model of a dome as its list has it, without the errors of the scene's simulation, and this camera."""
+    """The model of a dome by its list, without the simulated errors of the scene, with this camera."""
     light = require_dome(lab.scene)
     inside = surface.build_surface(light.surface)
     design = design_of(lab)
@@ -143,7 +143,7 @@ def listed_prior(lab: Lab, camera: Camera) -> CalibrationPrior:
 
 
 def prior_of(lab: Lab, camera: Camera, leds: LedMap) -> CalibrationPrior:
-    """The prior with these LEDs, their nominal brightness and code, and the lever that the tracker assumes."""
+    """The prior with these LEDs, their nominal brightness and code, and the tracker's assumed lever."""
     scene = lab.scene
     design = design_of(lab)
     order = np.argsort(design.id)
@@ -151,11 +151,15 @@ def prior_of(lab: Lab, camera: Camera, leds: LedMap) -> CalibrationPrior:
     lever = onboard_model.assumed_lever(scene, lab.camera.mount)
     light = require_dome(scene)
     code = (
-        onboard_model.assumed_code(light, lab.camera.sources, leds) if light.led.code else None
+        onboard_model.assumed_code(light, lab.camera.sources, leds)
+        if light.led.code
+        else None
     )
     floor_px = scene.tracker.centroid_sigma_px
     disk_m = light.led.disk_diameter_m
-    return CalibrationPrior(camera, leds, lever, floor_px, disk_m, levels / levels.max(), code)
+    return CalibrationPrior(
+        camera, leds, lever, floor_px, disk_m, levels / levels.max(), code
+    )
 
 
 def design_of(lab: Lab) -> Sources:
@@ -174,7 +178,7 @@ def require_dome(scene: Scene) -> DomeConfig:
 def survey_model(
     known: CalibrationPrior | DomeSurvey, uncertainty: SurveyUncertainty, noise_px: float
 ) -> SurveyModel:
-    """The model by which the estimator plans and predicts, from what is known before a survey or by it."""
+    """The estimator's model for plans and predictions, with the knowledge before or after a survey."""
     sigmas = (
         uncertainty.led_sigma_m,
         uncertainty.lever_sigma_m,
@@ -214,7 +218,7 @@ def with_survey_errors(scene: Scene, uncertainty: SurveyUncertainty) -> Scene:
 
 
 def as_listed(scene: Scene) -> Scene:
-    """The scene whose tracker assumes the LEDs of the list and the vehicle's lever, without errors of a simulation."""
+    """The scene whose tracker assumes the LEDs of the list and the vehicle's lever, without simulated errors."""
     tracker = scene.tracker.model_copy(update={"survey": SurveyErrorsConfig(), "map": None})
     return scene.model_copy(update={"tracker": tracker})
 

@@ -1,4 +1,4 @@
-"""The survey from beginning to end: its plan and predicted errors, its simulation, and both side by side."""
+"""The procedure of a survey: its plan with predicted errors, its simulation, and their comparison."""
 
 from __future__ import annotations
 
@@ -61,9 +61,9 @@ class HeldAttitudes(NamedTuple):
     Attributes
     ----------
     shown
-        (F, N) LEDs that each shows
+        (F, N) mask of the LEDs that each shows
     margin_px
-        From the edge, where an image would be incomplete
+        Margin of the chip in which an image would be incomplete
     """
 
     lab_from_body: Rotation
@@ -89,7 +89,7 @@ def plan_survey(
     tilt_deg: float,
     kind: str = PLANNED,
 ) -> tuple[Lab, CalibrationPrior, HeldAttitudes]:
-    """The lab with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
+    """The lab whose onboard model has errors as before a survey, that model, and a plan."""
     lab = build_lab(with_survey_errors(scene, uncertainty))
     before = calibration_prior(lab)
     return lab, before, make_plan(lab, before, uncertainty, count, tilt_deg, kind)
@@ -116,7 +116,7 @@ def make_plan(
 
 
 def write_plan(path: Path, plan: HeldAttitudes) -> None:
-    """Write the attitudes as CSV, with the names of the images to take, so that it serves as their attitudes too."""
+    """Write the attitudes as CSV with the names of the images to take, as `attitudes.csv` has them."""
     names = [FRAME.format(n) for n in range(len(plan.shown))]
     write_attitudes(path, names, plan.lab_from_body, plan.shown.sum(axis=1))
 
@@ -127,7 +127,7 @@ def simulated_frames(
     lab_from_body: Rotation,
     folder: Path | None = None,
 ) -> Iterator[SurveyFrame]:
-    """The frames of a simulated survey. A folder gets each as FITS, and the IMU's attitudes, for `images`."""
+    """The frames of a simulated survey, which are also written to a folder as FITS with the IMU's attitudes."""
     measured = imu_attitudes(lab.scene, lab_from_body, uncertainty.imu_sigma_rad)
     if folder is not None:
         names = [FRAME.format(n) for n in range(len(lab_from_body))]
@@ -149,7 +149,7 @@ def survey_images(
     fit_distortion: bool = False,
     watch: Callable[[float, float], None] | None = None,
 ) -> SurveyRun:
-    """Survey from images, of which `frames` have an attitude; the others are identified with the LEDs surveyed so far.
+    """Survey from images. `frames` are those with an attitude; the others are identified with the LEDs so far.
 
     Raises
     ------
@@ -165,7 +165,9 @@ def survey_images(
     run = run_survey(frames, prior, uncertainty, fit_distortion, watch)
     while len(frames) < len(pictures):
         found = run.survey
-        model = replace(prior, camera=found.camera, leds=found.surveyed_leds, lever=found.lever)
+        model = replace(
+            prior, camera=found.camera, leds=found.surveyed_leds, lever=found.lever
+        )
         known = {frame.index: frame.body_from_lab.inv() for frame in frames}
         named = [
             picture._replace(lab_from_body=known.get(n)) for n, picture in enumerate(pictures)
@@ -183,12 +185,14 @@ def survey_images(
     return run
 
 
-# --- the prediction against simulated surveys ---------------------------------------------------------------
+# Comparison of the prediction with simulated surveys.
 
 
 class SimulatedErrors(NamedTuple):
-    """Errors of one simulated survey: mean squares of LED coordinates (m2) and of the lever's (m2), of the focal length
-    (px2); LEDs measured, and faults reported although the dome has none."""
+    """Errors of one simulated survey: mean squares of coordinates of LEDs and lever (m2) and of the focal length (px2).
+
+    Also the number of measured LEDs, and of faults reported although the dome has none.
+    """
 
     led_m2: float
     lever_m2: float
@@ -202,7 +206,7 @@ def repeat_survey(
 ) -> Iterator[SimulatedErrors | InputError]:
     """The errors of simulated surveys at the attitudes of a plan, each with its own noise, IMU errors and list.
 
-    Of a survey that does not determine the dome, why.
+    For a survey that does not determine the dome, the InputError that says why.
     """
     for n in range(repeats):
         again = in_survey(lab, n)
@@ -215,7 +219,7 @@ def repeat_survey(
 
 
 def in_survey(lab: Lab, n: int) -> Lab:
-    """The lab in another survey: other noise, and other errors of the list, the lever and the IMU."""
+    """The lab of another survey: with other noise, and other errors of list, lever and IMU."""
     scene = lab.scene
     again = lab.in_run(scene.seed + n)
     return replace(
@@ -238,12 +242,16 @@ def survey_errors(run: SurveyRun, prior: CalibrationPrior, lab: Lab) -> Simulate
 
 
 def comparison(plan: HeldAttitudes, errors: list[SimulatedErrors]) -> list[dict[str, Any]]:
-    """Rows of the errors predicted, those simulated (rms over all surveys), their ratio and its standard error."""
+    """Rows with predicted errors, simulated errors (rms over all surveys), and their ratio with its standard error."""
     accuracy = accuracy_statistics(plan.first(len(plan.lab_from_body)))
     rows = (
         ("LED place mm", accuracy["led_mm"], 1e6 * np.array([one.led_m2 for one in errors])),
         ("lever mm", accuracy["lever_mm"], 1e6 * np.array([one.lever_m2 for one in errors])),
-        ("focal length px", accuracy["focal_px"], np.array([one.focal_px2 for one in errors])),
+        (
+            "focal length px",
+            accuracy["focal_px"],
+            np.array([one.focal_px2 for one in errors]),
+        ),
     )
     return [compared(*row) for row in rows]
 

@@ -1,4 +1,4 @@
-"""The report of a survey: the dome from above, what was found and how well, faults, and what to do next."""
+"""The report of a survey: the dome from above, results with errors, faults, and the attitudes to hold next."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.lab import Lab
 from skysim.tracking import factory
 
-CELLS = 8  # across the chip, over which residuals are averaged
+CELLS = 8  # number of cells across the chip in which residuals are averaged
 BINS = 60
-TAIL = 0.005  # share of the residuals beyond each end of the histogram
+TAIL = 0.005  # fraction of the residuals beyond each end of the histogram
 REACHED = {"led_mm": "LED place, mm", "lever_mm": "lever, mm", "focal_px": "focal length, px"}
 FIT = (
     "{status}: {outliers} outliers, {rms_px:.2g} px rms residual; 1σ of an LED's place: median"
@@ -85,7 +85,7 @@ def survey_report(statistics: dict[str, Any], run: SurveyRun, command: str) -> R
 
 
 def verdict(statistics: Mapping[str, Any], led_mm: float) -> Verdict:
-    """How many LEDs were measured, how well, and the number of faults."""
+    """Number of measured LEDs, their error, and number of faults."""
     faults = len(fault_rows(statistics["faults"]))
     text = "{surveyed} of {leds} LEDs measured in {tied} of {frames} frames".format(
         **statistics
@@ -95,7 +95,7 @@ def verdict(statistics: Mapping[str, Any], led_mm: float) -> Verdict:
 
 
 def value_table(statistics: dict[str, Any]) -> Table:
-    """Lens and lever before and after the survey, and in truth if it was simulated."""
+    """Lens and lever before and after the survey, with the truth if it was simulated."""
     truth = statistics.get("truth")
     rows = []
     for row in statistics["values"]:
@@ -139,7 +139,7 @@ def truth_blocks(statistics: dict[str, Any]) -> list[Block]:
 
 
 def accuracy_table(statistics: dict[str, Any], reached: Mapping[str, Any]) -> Table:
-    """Errors by the plan, by this survey's covariance, in truth, and with the next attitudes."""
+    """Errors: predicted by the plan, by the covariance, true, and predicted with the next attitudes."""
     predicted = statistics.get("predicted")
     after = statistics.get("led_mm_after")
     columns = {"by the plan": predicted} if predicted else {}
@@ -153,7 +153,7 @@ def accuracy_table(statistics: dict[str, Any], reached: Mapping[str, Any]) -> Ta
 
 
 def coverage_blocks(statistics: dict[str, Any]) -> list[Block]:
-    """Which LEDs are measured, the attitudes to hold next, and what those will reach."""
+    """The measured LEDs, the attitudes to hold next, and the accuracy predicted with them."""
     counts = statistics["coverage"]
     reaches = statistics["next_reaches"]
     stops = statistics["next"]
@@ -180,14 +180,14 @@ def stop_table(stops: list[dict[str, Any]]) -> Table:
 
 
 def fault_blocks(faults: dict[str, Any]) -> list[Block]:
-    """The faults as a table; their numbers, the error of the list's other places, and which exchanges can be found."""
+    """The faults as a table, with their number, the error of the other places, and the exchanges that can be found."""
     columns = [Column("LED"), text_column("fault"), text_column("details")]
     *_, counts = fault_lines(faults)
     return [Table(columns, fault_rows(faults)), Text(counts)]
 
 
 def fault_rows(faults: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """LED, fault and details, one row a fault."""
+    """LED, fault and details, one row per fault."""
     found = {led: f"at {coordinates(place_m)}" for led, place_m in faults["found_m"].items()}
     rows = [(str(led), "dark", "no frame shows it") for led in faults["dark"]]
     for led, off_m in faults["displaced"].items():
@@ -216,14 +216,17 @@ def residual_figure(run: SurveyRun) -> bytes:
         left, right = fig.subplots(1, 2)
         draw_histogram(left, residual_px.ravel(), run.noise_px)
         draw_means(
-            right, xy_px, residual_px, (run.survey.camera.width_px, run.survey.camera.height_px)
+            right,
+            xy_px,
+            residual_px,
+            (run.survey.camera.width_px, run.survey.camera.height_px),
         )
 
     return png(draw, (10, 4))
 
 
 def draw_histogram(axes: Any, residual_px: Floats, noise_px: float) -> None:
-    """Residual coordinates as a density, with the Gaussian of the noise: wider, as a fit takes up part of the noise."""
+    """Density of the residual coordinates, with the Gaussian of the noise: wider, as the fit absorbs some noise."""
     end_px = float(np.quantile(np.abs(residual_px), 1 - TAIL))
     x_px = np.linspace(-end_px, end_px, 200)
     inside = residual_px[np.abs(residual_px) <= end_px]
@@ -240,7 +243,9 @@ def draw_histogram(axes: Any, residual_px: Floats, noise_px: float) -> None:
     axes.legend()
 
 
-def draw_means(axes: Any, xy_px: Floats, residual_px: Floats, size_px: tuple[int, int]) -> None:
+def draw_means(
+    axes: Any, xy_px: Floats, residual_px: Floats, size_px: tuple[int, int]
+) -> None:
     """Mean residuals in cells of the chip: a pattern is a distortion that the lens model lacks."""
     width_px = size_px[0] / CELLS
     cell = (xy_px // width_px).astype(np.int64)
@@ -268,8 +273,7 @@ def draw_means(axes: Any, xy_px: Floats, residual_px: Floats, size_px: tuple[int
     axes.set_title("mean residuals over the chip", loc="left")
 
 
-# Report of a dome survey: statistics, pictures of the dome, and the comparison of a simulated one
-# with the truth.
+# Statistics, pictures of the dome, and the comparison of a simulated survey with the truth.
 
 
 LENS = ("focal length px", "center x px", "center y px", "k1", "k2", "p1", "p2")
@@ -434,7 +438,9 @@ def draw_coverage(
         for name, (numbers, marker, color) in marks.items():
             rows = rows_of(numbers, leds.id)
             colors = (
-                {"color": color} if marker == "x" else {"facecolor": "none", "edgecolor": color}
+                {"color": color}
+                if marker == "x"
+                else {"facecolor": "none", "edgecolor": color}
             )
             if len(rows):
                 axes.scatter(x_m[rows], y_m[rows], 70, marker=marker, label=name, **colors)
@@ -443,7 +449,9 @@ def draw_coverage(
                 axes.annotate(str(leds.id[row]), (x_m[row], y_m[row]), (6, 6), **text)
     if further is not None:
         lever = so_far.model.lever
-        toward = further.apply(lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])).reshape(-1, 3)
+        toward = further.apply(lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])).reshape(
+            -1, 3
+        )
         for n, (u, attitude) in enumerate(zip(toward, further, strict=True)):
             at = on_surface(u[None], attitude.apply(lever.camera_body_m), leds)[0]
             axes.annotate(str(n + 1), at[:2], color="tab:blue", ha="center", weight="bold")
@@ -472,7 +480,7 @@ def draw_errors(axes: Any, title: str, place_m: Floats, error_m: Floats) -> None
 
 
 def list_shifts(run: SurveyRun) -> LedErrors:
-    """The measured LEDs as found, and the list's errors against that."""
+    """The measured LEDs as found, with the errors of the list relative to them."""
     row = np.flatnonzero(run.survey.surveyed)
     found_m = run.survey.leds.position_m[row]
     none = np.zeros(len(row), dtype=bool)

@@ -116,7 +116,9 @@ class Comparison(NamedTuple):
         ours = cause.ours if cause and self.verdict == "explained" else self.result.ours
         if low > -math.inf and high < math.inf:
             return (
-                "interval wider than the tolerance" if ours.high - ours.low > high - low else ""
+                "interval wider than the tolerance"
+                if ours.high - ours.low > high - low
+                else ""
             )
         bound = low if low > -math.inf else high
         return "the bound is within the interval" if ours.low < bound < ours.high else ""
@@ -200,7 +202,9 @@ def intervals_overlap(row: PublishedRow, ours: Summary) -> bool:
 
 def format_with_source(row: PublishedRow) -> str:
     """Format the published number with its source; `derived` if the paper does not print it."""
-    source = "; ".join(part for part in ("derived" if row.derived else "", row.source) if part)
+    source = "; ".join(
+        part for part in ("derived" if row.derived else "", row.source) if part
+    )
     return f"{format_published(row)} ({source})" if source else format_published(row)
 
 
@@ -309,4 +313,6 @@ def bootstrap_of_means(columns: Floats, statistic: Callable[[Floats], Any]) -> S
     value = float(statistic(filled.sum(axis=0) / finite.sum(axis=0)))
     tail = 50 * (1 - CONFIDENCE)
     low, high = np.nanpercentile(resampled, [tail, 100 - tail])
-    return widen_interval(Summary(value, min(float(low), value), max(float(high), value), rows))
+    return widen_interval(
+        Summary(value, min(float(low), value), max(float(high), value), rows)
+    )

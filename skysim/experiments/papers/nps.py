@@ -79,7 +79,9 @@ class PanelSolution(NamedTuple):
     def error_deg(self) -> float:
         """Error of the attitude; the true one is level. NaN without a solution."""
         return (
-            float(np.degrees(self.body_from_lab.magnitude())) if self.body_from_lab else np.nan
+            float(np.degrees(self.body_from_lab.magnitude()))
+            if self.body_from_lab
+            else np.nan
         )
 
 
@@ -254,7 +256,9 @@ def draw(fig: Any, series_by_camera: dict[str, SolutionSeries]) -> None:
         mean_error_deg = []
         for error in errors:
             counts.append(np.mean([one.matched for one in series.solutions[error]]))
-            errors_deg = [one.error_deg for one in series.solutions[error] if one.body_from_lab]
+            errors_deg = [
+                one.error_deg for one in series.solutions[error] if one.body_from_lab
+            ]
             mean_error_deg.append(np.mean(errors_deg) if errors_deg else np.nan)
         style = {"color": INK[(0, 2)[n]], "marker": MARKS[n], "label": f"ours, {name}"}
         above.plot(errors, counts, **style)

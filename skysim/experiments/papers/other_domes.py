@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.render import Poses, in_view, project
+from skysim.camera.projection import Poses, in_view, project
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
@@ -98,7 +98,9 @@ def largest_discrepancies_arcsec(
             perfect_m[visible[on_detector]] - lab_from_body.apply(assumed_pupil_m)
         )
         expected_rays = assumed_m / np.linalg.norm(assumed_m, axis=1, keepdims=True)
-        sine = np.linalg.norm(np.cross(camera.rays(xy_px[on_detector]), expected_rays), axis=1)
+        sine = np.linalg.norm(
+            np.cross(camera.rays(xy_px[on_detector]), expected_rays), axis=1
+        )
         if len(sine):
             largest.append(np.arcsin(sine.max()) / ARCSEC_RAD)
     return np.array(largest)
@@ -343,7 +345,9 @@ def draw_oled(fig: Any, errors_by_lights: dict[int, AttitudeErrors]) -> None:
         )
         coefficient = np.exp(np.mean(np.log(value * np.sqrt(lights))))
         axes.plot(lights, coefficient / np.sqrt(lights), color=INK[n], lw=0.8)
-        axes.axhline(rows[key].at_most, color=INK[n], ls="--", label=f"published bound, {name}")
+        axes.axhline(
+            rows[key].at_most, color=INK[n], ls="--", label=f"published bound, {name}"
+        )
     axes.set(
         xscale="log", yscale="log", xlabel="lights in the field", ylabel="error, rms (arcsec)"
     )

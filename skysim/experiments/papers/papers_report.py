@@ -49,12 +49,16 @@ def papers_report(
     """The report of some experiments; the other arguments are those of the command that repeats it."""
     papers = dict.fromkeys(one.published.paper for one in reproductions)
     by_paper = [
-        Section(paper, [section(one) for one in reproductions if one.published.paper == paper])
+        Section(
+            paper, [section(one) for one in reproductions if one.published.paper == paper]
+        )
         for paper in papers
     ]
     blocks = [
         verdict(reproductions),
-        Text(INTRODUCTION.format(seed=seed, quick=", quick: wider intervals" if quick else "")),
+        Text(
+            INTRODUCTION.format(seed=seed, quick=", quick: wider intervals" if quick else "")
+        ),
         Items(MEANINGS),
         Section("Experiments", [contents(reproductions)]),
         *by_paper,
@@ -100,7 +104,9 @@ def section(reproduction: Reproduction) -> Section:
         ("Fitted", "; ".join(published.fitted)),
     ]
     first, *others = reproduction.commands
-    more = f"\n# and {len(others)} more, to {others[-1].split('--seed=')[-1]}" if others else ""
+    more = (
+        f"\n# and {len(others)} more, to {others[-1].split('--seed=')[-1]}" if others else ""
+    )
     blocks = [
         Text(f"{published.title}. {published.source}."),
         Code(f"{first}{more}", "sh"),

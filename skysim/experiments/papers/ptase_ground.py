@@ -64,7 +64,9 @@ NIGHT = {
 FITTED_DECENTERING = (
     0.0018  # sqrt(p1^2 + p2^2), uncalibrated: about 0.4 px at the detector's corner
 )
-FITTED_JITTER = "[{kind: line, frequency_hz: 1, rms_arcsec: [22, 22, 22]}]"  # a vibrating floor
+FITTED_JITTER = (
+    "[{kind: line, frequency_hz: 1, rms_arcsec: [22, 22, 22]}]"  # a vibrating floor
+)
 
 
 def itrs_from_icrs(local: datetime.datetime) -> Rotation:
@@ -208,7 +210,9 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
     return ExperimentResult(results, drawings(calibrated, uncalibrated))
 
 
-def scatter_results(calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]) -> Results:
+def scatter_results(
+    calibrated: FrameSolutions, uncalibrated: list[FrameSolutions]
+) -> Results:
     """Standard deviation of each angle, and mean error. The interval with the cause is over lenses, because the frames
     of one lens share its distortion."""
     name = "optics decentered and not calibrated, and vibration, fitted"
@@ -265,7 +269,11 @@ def drawings(
 def draw_rate(fig: Any, calibrated: FrameSolutions) -> None:
     axes = fig.subplots()
     axes.plot(
-        calibrated.minutes, calibrated.estimated_deg[:, 0], MARKS[0], color=INK[0], label="ours"
+        calibrated.minutes,
+        calibrated.estimated_deg[:, 0],
+        MARKS[0],
+        color=INK[0],
+        label="ours",
     )
     axes.plot(
         calibrated.minutes[:4], TABLE_2[:, 0], "*", ms=11, color=INK[1], label="published"
@@ -273,7 +281,9 @@ def draw_rate(fig: Any, calibrated: FrameSolutions) -> None:
     time_range = np.array([0, calibrated.minutes.max()])
     published_rate = experiments()["ptase-table-2"].rows["rate"].published or 0.0
     sidereal_deg = calibrated.estimated_deg[0, 0] + published_rate * time_range
-    axes.plot(time_range, sidereal_deg, color=INK[6], lw=0.8, label=f"{published_rate} deg/min")
+    axes.plot(
+        time_range, sidereal_deg, color=INK[6], lw=0.8, label=f"{published_rate} deg/min"
+    )
     axes.set(xlabel="minutes after 19:55:22", ylabel="right ascension (deg)")
     axes.legend()
 
@@ -291,11 +301,17 @@ def draw_errors(
     ):
         for solutions in (*uncalibrated, calibrated):
             style = (
-                (MARKS[0], INK[0], 4.5) if solutions is calibrated else (MARKS[1], INK[2], 2.5)
+                (MARKS[0], INK[0], 4.5)
+                if solutions is calibrated
+                else (MARKS[1], INK[2], 2.5)
             )
             solved = solutions.minutes[np.isfinite(solutions.error_rad)]
             axes.plot(
-                solved, solutions.errors_arcsec[:, axis], style[0], color=style[1], ms=style[2]
+                solved,
+                solutions.errors_arcsec[:, axis],
+                style[0],
+                color=style[1],
+                ms=style[2],
             )
         axes.plot(minutes, published[:, axis], "*", ms=10, color=INK[1])
         axes.set(ylabel=f"{name} (arcsec)")

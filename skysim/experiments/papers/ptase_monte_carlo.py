@@ -287,7 +287,9 @@ def draw_histogram(fig: Any, right: RunErrors) -> None:
     """Histogram of the Frobenius norm, with our mean and the published one."""
     axes = fig.subplots()
     bins = np.arange(0, 25.5, 0.5)
-    axes.hist(np.minimum(right.attitude, bins[-1]), bins, color=INK[0], alpha=0.5, label="ours")
+    axes.hist(
+        np.minimum(right.attitude, bins[-1]), bins, color=INK[0], alpha=0.5, label="ours"
+    )
     axes.axvline(
         right.attitude.mean(), color=INK[0], label=f"ours, mean {right.attitude.mean():.2f}"
     )

@@ -61,7 +61,9 @@ def check_ids(ids: list[str]) -> list[str]:
         return list(experiments())
     for id in ids:
         if id not in EXPERIMENTS:
-            raise InputError("", f"unknown experiment '{id}'", f"all, {', '.join(EXPERIMENTS)}")
+            raise InputError(
+                "", f"unknown experiment '{id}'", f"all, {', '.join(EXPERIMENTS)}"
+            )
     return list(dict.fromkeys(ids))
 
 

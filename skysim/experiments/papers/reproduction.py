@@ -168,7 +168,9 @@ def run_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Nu
         overrides = {key: str(seed) for key in ("seed", *experiment.hardware)}
         sets = [f"--set={key}={seed}" for key in experiment.hardware]
         commands.append(
-            shlex.join(["skysim", experiment.command, experiment.file, f"--seed={seed}", *sets])
+            shlex.join(
+                ["skysim", experiment.command, experiment.file, f"--seed={seed}", *sets]
+            )
         )
         results.append(RESULTS[experiment.command](experiment.file, overrides))
         options.watch(n + 1, runs)
@@ -186,7 +188,10 @@ def run_result(file: str, overrides: dict[str, str]) -> dict[str, Any]:
     with open_flight(loader.load(file, overrides)) as flight:
         rows = [scoring.score(shot).row for shot in flight.shots()]
         motion = telemetry_report.summary(flight.telemetry())
-    return run_report.summary(rows) | {"flight": motion, "rows": [asdict(row) for row in rows]}
+    return run_report.summary(rows) | {
+        "flight": motion,
+        "rows": [asdict(row) for row in rows],
+    }
 
 
 def calibrate_result(file: str, overrides: dict[str, str]) -> dict[str, Any]:

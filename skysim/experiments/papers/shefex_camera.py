@@ -27,12 +27,16 @@ from skysim.experiments.papers.compare import (
     bootstrap_interval,
     bootstrap_of_means,
 )
-from skysim.experiments.papers.shefex_nights import FULL_MOON, exposure_override, render_frames
+from skysim.experiments.papers.shefex_nights import (
+    FULL_MOON,
+    exposure_override,
+    render_frames,
+)
 from skysim.experiments.papers.shefex_setup import MAX_CENTROIDS, PUBLISHED
 from skysim.results.metrics import Summary, exact, quantile
 from skysim.results.plots import INK, MARKS
 from skysim.scene.loader import load
-from skysim.scene.sections.light import UniformGlowConfig
+from skysim.scene.sections.surroundings import UniformGlowConfig
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.lab import StarCamera, build_lab
 from skysim.simulation.lights.starlight import BackgroundLight
@@ -133,7 +137,9 @@ COARSE_DN = 9.5
 GLARE_E_S = 4e5
 PLANET_MAG = -4.0
 EDGE_PX = 20
-DARK_FRAMES = 24  # steps of 2 ms from 10 ms: reaches the limit and stays there for some frames
+DARK_FRAMES = (
+    24  # steps of 2 ms from 10 ms: reaches the limit and stays there for some frames
+)
 STEADY_FRAMES = 4
 EIGHT_BITS = {
     "camera.detector.gain_e_dn": "157",
@@ -150,7 +156,11 @@ CAMERAS: dict[str, dict[str, str]] = {
 PLANET = {"planets": 1}
 PLANETS = {"planets": 4}
 GLARE = {"glare_e_s": GLARE_E_S}
-DISTURBANCES: dict[str, dict[str, Any]] = {"planet": PLANET, "planets": PLANETS, "glare": GLARE}
+DISTURBANCES: dict[str, dict[str, Any]] = {
+    "planet": PLANET,
+    "planets": PLANETS,
+    "glare": GLARE,
+}
 
 
 class ExposureLoop:

@@ -207,7 +207,9 @@ def figs_7_to_10(options: ExperimentOptions) -> ExperimentResult:
             "Fig. 7: angles compared by an identification, against cosError.",
             partial(draw_time, curves),
         ),
-        FigureDrawing("Fig. 8: success rate against cosError.", partial(draw_success, curves)),
+        FigureDrawing(
+            "Fig. 8: success rate against cosError.", partial(draw_success, curves)
+        ),
         FigureDrawing(
             "Fig. 9: wrong recognitions against the spikes among the stars.",
             partial(draw_wrong, curves),
@@ -223,7 +225,8 @@ def figs_7_to_10(options: ExperimentOptions) -> ExperimentResult:
 def time_results(curves: Curves) -> Results:
     """Fig. 7: the ends of the curves relative to their minimum, and how far the minimum moves with centroid error."""
     low = [
-        bootstrap_of_means(work.T, lambda m: m[..., 0] / m.min(axis=-1)) for work in curves.work
+        bootstrap_of_means(work.T, lambda m: m[..., 0] / m.min(axis=-1))
+        for work in curves.work
     ]
     high = [
         bootstrap_of_means(work.T, lambda m: m[..., -1] / m.min(axis=-1))
@@ -281,7 +284,8 @@ def attitude_results(curves: Curves) -> Results:
     yaw_squared = yaw**2
     yaw_and_cross = np.column_stack([yaw_at_limit**2, cross[:, LIMIT_INDEX] ** 2 / 2])
     one_sigma, two_sigma = (
-        bootstrap_of_means(yaw_squared, partial(error_at_limit, times)) for times in (1.0, 2.0)
+        bootstrap_of_means(yaw_squared, partial(error_at_limit, times))
+        for times in (1.0, 2.0)
     )
     return {
         "yaw_mean": bootstrap_of_mean(np.abs(yaw_at_limit)),
@@ -393,7 +397,11 @@ def draw_success(curves: Curves, fig: Any) -> None:
             f"ours, fourth star, {centroid_px} px",
         )
     plot_curve(
-        axes, COS_ERRORS, fractions(curves.right_significant), 4, "ours, beyond chance, 0.2 px"
+        axes,
+        COS_ERRORS,
+        fractions(curves.right_significant),
+        4,
+        "ours, beyond chance, 0.2 px",
     )
     set_up_cos_error_axis(axes)
     axes.set(ylabel="success rate", ylim=(0, 1.02))

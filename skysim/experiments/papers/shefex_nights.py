@@ -89,7 +89,11 @@ def field_deg(camera: Camera) -> tuple[float, float, float]:
     right = camera.width_px - 0.5
     bottom = camera.height_px - 0.5
     x, y = camera.center_px
-    edges = [[(-0.5, y), (right, y)], [(x, -0.5), (x, bottom)], [(-0.5, -0.5), (right, bottom)]]
+    edges = [
+        [(-0.5, y), (right, y)],
+        [(x, -0.5), (x, bottom)],
+        [(-0.5, -0.5), (right, bottom)],
+    ]
     rays = [camera.rays(np.array(pair)) for pair in edges]
     return tuple(float(np.degrees(np.arccos(a @ b))) for a, b in rays)  # type: ignore[return-value]
 
@@ -367,7 +371,8 @@ def frame_results(results: dict[str, NightResults]) -> Results:
     )
     combined, combined_low_threshold = (
         bootstrap_interval(
-            np.mean([getattr(result, name) for result in by_exposure.values()], axis=0), np.mean
+            np.mean([getattr(result, name) for result in by_exposure.values()], axis=0),
+            np.mean,
         )
         for name in ("right", "right_low_threshold")
     )
@@ -410,7 +415,9 @@ def draw_rates(results: dict[str, NightResults], fig: Any) -> None:
                 proportion(result.ours.sum(), len(result.ours)) for result in by_rate.values()
             ]
             plot_curve(axes, list(by_rate), ours, 2, f"{label}, our default chain")
-    axes.axvspan(0, 2, color=PUBLISHED, alpha=0.25, lw=0, label="published: mostly identified")
+    axes.axvspan(
+        0, 2, color=PUBLISHED, alpha=0.25, lw=0, label="published: mostly identified"
+    )
     axes.axvspan(4, 8, color=PUBLISHED, alpha=0.1, lw=0, label="published: rarely identified")
     axes.set(
         xlabel="turning rate (deg/s)",

@@ -236,7 +236,9 @@ def catalog_statistics(options: ExperimentOptions) -> ExperimentResult:
         ),
     }
     drawings = (
-        FigureDrawing("Fig. 4: the asymmetric catalog.", partial(draw, asymmetric), (7.4, 4.2)),
+        FigureDrawing(
+            "Fig. 4: the asymmetric catalog.", partial(draw, asymmetric), (7.4, 4.2)
+        ),
         FigureDrawing("Fig. 5: the uniform catalog.", partial(draw, uniform), (7.4, 4.2)),
         FigureDrawing(
             "Stars in the field of 14.9 x 11.2 deg at random attitudes.",
@@ -306,6 +308,8 @@ def draw_counts(counts: Floats, fig: Any) -> None:
         axes.step(
             edges[:-1] + 0.5, fraction, where="mid", color=INK[n * 2], label=f"ours, {name}"
         )
-    axes.axvline(MIN_STARS - 0.5, color=PUBLISHED, ls="--", label="published: four are needed")
+    axes.axvline(
+        MIN_STARS - 0.5, color=PUBLISHED, ls="--", label="published: four are needed"
+    )
     axes.set(xlabel="stars in the field", ylabel="share of the fields")
     axes.legend()

@@ -1,7 +1,7 @@
 """The answers of a study in words: range of each response, thresholds, and how often the tracker answers wrongly.
 
-Misidentification (a light matched with a wrong star or LED) is kept apart from honest roll noise (the right lights, and
-an error that the covariance allows). An event that was never seen has an upper bound instead of an interval.
+Misidentification (a light matched with a wrong star or LED) is separate from roll noise (the right lights, and an error
+that the covariance allows). An event that was never seen has an upper bound instead of an interval.
 """
 
 from __future__ import annotations
@@ -27,15 +27,17 @@ from skysim.experiments.study.table import (
 from skysim.results import metrics
 from skysim.results.metrics import Summary
 
-# What a study's numbers allow to claim, in words: whether the tracker's claimed errors are true,
-# and rare events.
+# Claims that a study's numbers support, in words: whether the tracker's claimed errors are true, and rare events.
 
 
-TRUE_NEES = (2.5, 3.5)  # mean NEES of claimed errors that are true to a tenth
+TRUE_NEES = (
+    2.5,
+    3.5,
+)  # range of the mean NEES (3 if true) in which claimed errors are true to a tenth
 
 
 def claimed_errors(lines: Sequence[PointRow], place: Place) -> list[str]:
-    """Whether the claimed errors are true at all points, by the intervals of the mean NEES; none without any NEES."""
+    """Sentences on whether the claimed errors are true at all points, by the intervals of the mean NEES."""
     found = [(known(line.responses.get("nees", metrics.NO_VALUE)), line) for line in lines]
     found = [(one, line) for one, line in found if np.isfinite(one.low)]
     if not found:
@@ -68,14 +70,14 @@ def claimed_errors(lines: Sequence[PointRow], place: Place) -> list[str]:
 
 
 def known(nees: Summary) -> Summary:
-    """A mean NEES, also of a single solution if no true covariance has it (probability 1e-8)."""
+    """A mean NEES; that of a single solution counts if a true covariance hardly has it (probability 1e-8)."""
     if np.isnan(nees.low) and nees.value > metrics.OVERCONFIDENT_NEES:
         return nees._replace(low=nees.value, high=nees.value)
     return nees
 
 
 def effect_of_wrong_matches(lines: Sequence[PointRow], place: Place) -> list[str]:
-    """How many matches are wrong, and whether the attitude errs more than claimed because of them; none if none are."""
+    """Sentences on wrong matches, and on whether they make the attitude err more than claimed; none without them."""
     known = [line.responses.get("mismatched", metrics.NO_VALUE) for line in lines]
     shares = [one for one in known if one.value > 0]
     if not shares:
@@ -101,7 +103,7 @@ def everywhere(points: int) -> str:
 
 
 def runs_needed(lines: Sequence[PointRow], events: Sequence[str]) -> list[str]:
-    """How many trials the next smaller claim about an event that was never seen needs; none if all were seen.
+    """Sentences on how many trials a smaller claim about events that were never seen needs; none if all were seen.
 
     The next smaller claim is the next power of ten below the bound of the point with the fewest trials.
     """
@@ -126,7 +128,7 @@ EVENTS = {
     "wrong": "Wrong attitudes (an error beyond 10′ that the covariance does not allow, or beyond 1°)",
 }
 SHARES = (*EVENTS, "ambiguous", "misled", "refused")
-# Responses that the answers need besides those of the study.
+# Responses that the answers need in addition to those of the study.
 RESPONSES = (*SHARES, "mismatched", "nees")
 
 
@@ -136,12 +138,12 @@ def headline(
     may_be_ambiguous: bool,
     worst: str = "skysim study worst STUDY",
 ) -> list[str]:
-    """Thresholds, refusals, ambiguity and wrong answers, one sentence or two each; none if all trials failed.
+    """Thresholds, refusals, ambiguity and wrong answers, in one or two sentences each; none if all trials failed.
 
     Parameters
     ----------
     lines
-        Of all points, with the responses of the study and RESPONSES
+        All points, with the responses of the study and RESPONSES
     may_be_ambiguous
         Whether the tracker can refuse a frame as ambiguous
     worst
@@ -164,14 +166,14 @@ def headline(
 
 
 def answered(lines: Sequence[PointRow]) -> list[PointRow]:
-    """The points of which a trial has an answer."""
+    """The points with a trial that has an answer."""
     return [
         line for line in lines if line.trials and np.isfinite(line.responses["wrong"].value)
     ]
 
 
 def verdict(study: Study, lines: Sequence[PointRow]) -> str:
-    """What the study answers, in three or four short sentences; "" if no trial has an answer.
+    """The answer of the study in three or four short sentences; "" if no trial has an answer.
 
     1. Its thresholds. 2. How many frames are refused. 3. How many attitudes are wrong.
     """
@@ -199,7 +201,7 @@ def verdict(study: Study, lines: Sequence[PointRow]) -> str:
 def worst_share(
     name: str, never: str, text: str, lines: Sequence[PointRow], place: Place
 ) -> str:
-    """ "No attitude is wrong (in 12,000).", or the share at the point where it is largest."""
+    """A sentence such as "No attitude is wrong (in 12,000).", or the fraction at the point where it is largest."""
     worst = max(lines, key=lambda line: np.nan_to_num(line.responses[name].value))
     share = worst.responses[name]
     if not share.value > 0:
@@ -210,18 +212,22 @@ def worst_share(
 
 
 def ranges(study: Study, lines: Sequence[PointRow]) -> list[str]:
-    """Smallest and largest value of each response over the points, but of those that the headline is about."""
+    """Smallest and largest value over the points of each response that the headline is not about."""
     done = [line for line in lines if line.trials]
     if not done:
         return []
     place = placer(study, done)
-    return [response_range(name, done, place) for name in study.responses if name not in SHARES]
+    return [
+        response_range(name, done, place) for name in study.responses if name not in SHARES
+    ]
 
 
 def placer(study: Study, lines: Sequence[PointRow]) -> Place:
     """The function that names a point by the levels that vary: "leds = 900, rate = 8 deg/s"."""
     varied = [
-        name for name in study.factors if len(distinct(line.levels[name] for line in lines)) > 1
+        name
+        for name in study.factors
+        if len(distinct(line.levels[name] for line in lines)) > 1
     ]
     units = {name: unit_of(axis(study, lines, name)) for name in varied}
 
@@ -234,7 +240,7 @@ def placer(study: Study, lines: Sequence[PointRow]) -> Place:
 
 
 def valued(name: str, lines: Sequence[PointRow]) -> list[PointRow]:
-    """The points with a value of a response; those of few values only without others."""
+    """The points with a value of a response; those with few values only if there are no others."""
     found = [line for line in lines if np.isfinite(line.responses[name].value)]
     return [line for line in found if not has_few_values(line, name)] or found
 
@@ -256,12 +262,14 @@ def response_range(name: str, lines: Sequence[PointRow], place: Place) -> str:
     least, most = extremes(name, points)
     low, high = (format_summary(line.responses[name]) for line in (least, most))
     if least.responses[name].value == most.responses[name].value:
-        return f"{name}: {low}" + (f" at all {len(points)} points." if len(points) > 1 else ".")
+        return f"{name}: {low}" + (
+            f" at all {len(points)} points." if len(points) > 1 else "."
+        )
     return f"{name}: {low} at {place(least)}, to {high} at {place(most)}."
 
 
 def range_rows(study: Study, lines: Sequence[PointRow]) -> list[list[str]]:
-    """Of each response its name, least value, the point that has it, largest value, and the point that has that."""
+    """A row per response: name, least value and its point, largest value and its point."""
     done = [line for line in lines if line.trials]
     place = placer(study, done)
     rows = []
@@ -273,7 +281,9 @@ def range_rows(study: Study, lines: Sequence[PointRow]) -> list[list[str]]:
     return rows
 
 
-def event(text: str, shares: Sequence[Summary], lines: Sequence[PointRow], place: Place) -> str:
+def event(
+    text: str, shares: Sequence[Summary], lines: Sequence[PointRow], place: Place
+) -> str:
     """How often an event happens: the point where it is most frequent, and an upper bound where it was never seen."""
     pairs = zip(shares, lines, strict=True)
     known = [(share, line) for share, line in pairs if np.isfinite(share.value)]
@@ -285,13 +295,15 @@ def event(text: str, shares: Sequence[Summary], lines: Sequence[PointRow], place
     most, line = max(known, key=lambda pair: pair[0].value)
     where = ""
     if len(known) > 1:
-        where = f" at {len(known) - len(never)} of {len(known)} points, most at {place(line)}:"
+        where = (
+            f" at {len(known) - len(never)} of {len(known)} points, most at {place(line)}:"
+        )
     found = f"{text}:{where} {percent(most.value)} of the frames ({interval(most)})"
     return f"{found}; {none_of(never)} at the other points." if never else f"{found}."
 
 
 def ambiguity(study: Study, lines: Sequence[PointRow], place: Place) -> str:
-    """Whether the lights of some attitude fit another one as well: refused as ambiguous, or misled."""
+    """A sentence on attitudes whose lights fit another attitude as well: refused as ambiguous, or misled."""
     shares = []
     for line in lines:
         refused = line.responses["ambiguous"]
@@ -305,8 +317,10 @@ def ambiguity(study: Study, lines: Sequence[PointRow], place: Place) -> str:
     return f"Is it ambiguous anywhere{unit}? {'No' if never else 'Yes'}. {text}"
 
 
-def solved_everywhere(study: Study, lines: Sequence[PointRow], place: Place, worst: str) -> str:
-    """Whether every attitude is solved, and how often and where the tracker refuses one for any reason."""
+def solved_everywhere(
+    study: Study, lines: Sequence[PointRow], place: Place, worst: str
+) -> str:
+    """A sentence on whether every attitude is solved, and how often and where the tracker refuses one."""
     shares = [line.responses["refused"] for line in lines]
     text = event("Refused (no attitude is returned)", shares, lines, place)
     what = "attitude" if study.trial.kind == "centroids" else "frame"
@@ -316,7 +330,7 @@ def solved_everywhere(study: Study, lines: Sequence[PointRow], place: Place, wor
 
 
 def one_unit(fixed: Sequence[str]) -> list[str]:
-    """That the intervals are of one unit of hardware, and how to cover others; nothing without a seed drawn once."""
+    """A sentence that the intervals are of one unit of hardware, and how to cover others; "" without a fixed seed."""
     if not fixed:
         return []
     units = " and ".join(
@@ -330,7 +344,7 @@ def one_unit(fixed: Sequence[str]) -> list[str]:
 
 
 def none_of(shares: Sequence[Summary]) -> str:
-    """That an event was never seen, and the exact upper bound of its frequency (Clopper & Pearson 1934)."""
+    """A sentence that an event was never seen, with the exact upper bound of its frequency (Clopper & Pearson 1934)."""
     fewest = min(share.trials for share in shares)
     each = " a point" if len(shares) > 1 else ""
     bound = metrics.exact_bounds(0, fewest)[1] if fewest else 1.0
@@ -338,10 +352,10 @@ def none_of(shares: Sequence[Summary]) -> str:
 
 
 def interval(share: Summary) -> str:
-    """The interval of a share in percent."""
+    """The interval of a fraction in percent."""
     return f"{100 * share.low:.3g} to {percent(share.high)}"
 
 
 def percent(share: float) -> str:
-    """A share in percent, to three digits."""
+    """A fraction in percent, to three digits."""
     return f"{100 * share:.3g} %"

@@ -40,7 +40,7 @@ class StudyResult(NamedTuple):
             return Table(dict(table.trial_columns(kept)))
 
     def report(self) -> Report:
-        """Its report for people: answers, figures and tables."""
+        """The study's report: answers, figures and tables."""
         with store.open_store(self.path) as kept:
             return study_report(self.plan, kept)
 
@@ -67,7 +67,7 @@ def run_study(
     overrides
         Keys of the study and their values, such as {"replicates": 20}
     out
-        Folder of the store, by default out/NAME. A store of the same study is continued
+        Folder of the store, by default out/NAME; a store of the same study is continued
     workers
         Number of processes, by default the number of cores; 1 runs the trials in this process
     """
@@ -78,7 +78,9 @@ def run_study(
     path = folder / store.STORE
     try:
         with store.writing(path) as kept:
-            runner.prepare_store(plan, kept, resume=kept.counts()["done"] > 0, overrides=texts)
+            runner.prepare_store(
+                plan, kept, resume=kept.counts()["done"] > 0, overrides=texts
+            )
             progress = runner.run(plan, kept, engine)
     finally:
         engine.close()

@@ -138,7 +138,7 @@ class Range(KeyedFactor):
 
 class Distribution(KeyedFactor):
     """A random key: normal (mean, sigma), lognormal (median, sigma of the logarithm), triangular (low, mode, high),
-    truncated_normal (mean and sigma before it is truncated to low and high), integers (low to high, both included).
+    truncated_normal (mean and sigma before truncation to low and high), integers (low to high, both included).
     For uniform and log-uniform use `from` and `to`.
 
     All numbers have the same unit, except the sigma of a lognormal, which has none.
@@ -172,7 +172,9 @@ class Distribution(KeyedFactor):
         ]
         units = {
             unit
-            for _, unit in (quantities[:1] if self.distribution == "lognormal" else quantities)
+            for _, unit in (
+                quantities[:1] if self.distribution == "lognormal" else quantities
+            )
         }
         if len(units) > 1:
             raise InputError(
@@ -240,8 +242,7 @@ Factor = Annotated[
 ]
 
 
-# Experimental designs: full factorial, one factor at a time, and samples of the unit cube of the
-# factors.
+# Experimental designs: full factorial, one factor at a time, and samples of the factors' unit cube.
 
 
 class Point(NamedTuple):
@@ -329,8 +330,10 @@ def points_at(factors: Factors, coordinates: Floats) -> Iterator[Point]:
 
 
 def sample(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
-    """A Latin hypercube, in which each factor's range is divided into as many strips as points, with one point in each;
-    or a Sobol sequence, scrambled by the seed."""
+    """A Latin hypercube or a Sobol sequence, scrambled by the seed.
+
+    In a Latin hypercube each factor's range is divided into as many strips as points, with one point in each.
+    """
     qmc = scipy.stats.qmc
     sampler = (qmc.LatinHypercube if design.kind == "lhs" else qmc.Sobol)(
         len(factors), rng=seed
@@ -339,7 +342,7 @@ def sample(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
 
 
 def saltelli(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
-    """A, B, then for each factor A with that column taken from B. `table.sample_outputs` relies on this order.
+    """A, B, then for each factor A with its column replaced by B's. `table.sample_outputs` relies on this order.
 
     A and B are the two halves of the columns of one scrambled Sobol sequence of dimension 2 D.
     """

@@ -52,7 +52,7 @@ BodyName = Literal[
 
 
 def check_rising(ends: tuple[float, float]) -> tuple[float, float]:
-    """Check that an interval's ends are in their order."""
+    """Check that the ends of an interval are in order."""
     if ends[0] > ends[1]:
         raise InputError("", f"{ends[0]:g} to {ends[1]:g}", "the smaller first")
     return ends
@@ -329,7 +329,7 @@ class Threshold(ConfigModel):
 
     @property
     def axes(self) -> dict[str, str | None]:
-        """The factors that it is about, by key."""
+        """The factors of the threshold, by key."""
         return {"along": self.along, "by": self.by}
 
 
@@ -431,7 +431,7 @@ class Study(ConfigModel):
         return self.optimize
 
     def trial_count(self, points: int) -> int:
-        """Number of trials at so many points or, of a search that runs to its end, of all candidates."""
+        """Number of trials of a design with so many points, or of a complete search."""
         return (self.optimize.candidates if self.optimize else points) * self.replicates
 
 
@@ -479,7 +479,7 @@ class Plan:
     Attributes
     ----------
     prices
-        Of `optimize.cost.parts`
+        Prices of `optimize.cost.parts`
     """
 
     path: Path
@@ -565,7 +565,9 @@ def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:
     values = spec.base | settings
     name = str(values.pop("scene", spec.scene))
     local = Path(spec.folder) / name
-    path = local if local.suffix in {".yaml", ".yml"} and is_file(local) else loader.find(name)
+    path = (
+        local if local.suffix in {".yaml", ".yml"} and is_file(local) else loader.find(name)
+    )
     overrides = {
         key: one_line(value) for key, value in values.items() if not key.startswith(TRIAL)
     }

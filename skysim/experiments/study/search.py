@@ -1,4 +1,4 @@
-"""Design optimization: a sampler proposes candidate points one after another, each evaluated by all its replicates.
+"""Design optimization: a sampler proposes one candidate point after another; each is evaluated by all its replicates.
 
 The sampler is optuna's tree-structured Parzen estimator with constraints. It is seeded by the study and learns only
 from rows in the store, so a resumed search proposes the same candidates again, finds their rows and continues after
@@ -99,7 +99,7 @@ def si(value: Value) -> float:
 
 
 def cost(plan: Plan, point: Point) -> tuple[float, str]:
-    """Cost of a point, and why it has none (NaN): base, `per` and `levels` of the factors, and the parts' total."""
+    """Cost of a point: base, `per` and `levels` of the factors, and the parts' total; if it is NaN, also the reason."""
     config = plan.study.search.cost
     total = factors_cost(config, point.levels)
     if plan.prices is None:
@@ -134,11 +134,11 @@ class Candidate(NamedTuple):
     figures
         Statistic of each response that is an objective or a constraint
     feasible
-        All constraints hold for the values (intervals are ignored), and no value is missing
+        Whether all constraints hold for the values (intervals are ignored), and none is missing
     refused
-        Its scene is invalid
+        Whether its scene is invalid
     why
-        The violated constraints, or the error message of the scene; empty if feasible
+        Violated constraints, or error message of the scene; empty if feasible
     """
 
     number: int
@@ -184,7 +184,9 @@ def check(study: Study) -> None:
         check_response(objective.response, f"optimize.objectives.{n}.response")
     first, *others = (one.response for one in config.objectives)
     if first in others:
-        raise InputError("optimize.objectives", f"{first} occurs twice", "different responses")
+        raise InputError(
+            "optimize.objectives", f"{first} occurs twice", "different responses"
+        )
     for n, limit in enumerate(config.constraints):
         check_response(limit.response, f"optimize.constraints.{n}.response")
         if limit.at_least is None and limit.at_most is None:
@@ -279,7 +281,7 @@ def front(config: Search, candidates: Sequence[Candidate]) -> list[Candidate]:
 
 
 def front_cells(study: Study, result: SearchResult) -> tuple[list[str], list[list[str]]]:
-    """Column heads and cell texts of the front: candidate, levels, objectives and what the constraints bound."""
+    """Column heads and cell texts of the front: candidate, levels, objectives and constrained responses."""
     named = [one.response for one in study.search.objectives]
     shown = named + [name for name in study.search.responses if name not in (*named, COST)]
     rows = []
@@ -292,7 +294,7 @@ def front_cells(study: Study, result: SearchResult) -> tuple[list[str], list[lis
 
 
 def front_columns(result: SearchResult) -> dict[str, Any]:
-    """The candidates of the front, and of all candidates the cost; None for one without."""
+    """The candidates of the front, and the cost of every candidate; None if it has none."""
     costs = [None if math.isnan(one.cost) else one.cost for one in result.candidates]
     return {"front": [one.number for one in result.front], "costs": costs}
 
@@ -374,7 +376,7 @@ def create_sampler(study: Study) -> Any:
 def propose(
     sampler: Any, study: Study, evaluated: dict[str, Candidate]
 ) -> tuple[Any, Point | None]:
-    """The sampler's next proposal that was not evaluated yet: optuna trial and point; (None, None) if there is none.
+    """The sampler's next proposal that has not been evaluated: optuna trial and point; (None, None) if there is none.
 
     A repeated proposal gets the known result, so that the sampler moves on.
     """
@@ -387,7 +389,9 @@ def propose(
                 chosen[name] = factor.value_at(proposal.suggest_float(name, 0.0, 1.0))
             else:
                 options = factor.options()
-                chosen[name] = options[proposal.suggest_categorical(name, range(len(options)))]
+                chosen[name] = options[
+                    proposal.suggest_categorical(name, range(len(options)))
+                ]
         point = make_point(chosen)
         if key_of(point) not in evaluated:
             return proposal, point

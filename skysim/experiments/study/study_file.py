@@ -39,6 +39,7 @@ from skysim.experiments.study.plan import (
     resolve_point,
 )
 from skysim.results import metrics
+from skysim.scene import unused
 from skysim.scene.scene import BODIES_YEARS, Scene
 from skysim.scene.sections.layouts import OnPoints
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
@@ -72,12 +73,12 @@ def load(
     ----------
     programs
         Commands of external trackers and controllers by name; None if the study will not be
-        run, and its trackers and controllers need not be installed
+        run, so that they need not be installed
 
     Raises
     ------
     InputError
-        With one line: the key, the fault, what is allowed, the file and line.
+        With one line: the key, the fault, allowed values, file and line.
     """
     path = find(str(name))
     tree, text = read_yaml(path)
@@ -101,9 +102,9 @@ def plan_of(
     Parameters
     ----------
     path
-        Of the text, for messages
+        Path of the text, for messages
     base
-        A file beside which scenes are, `path` if left out
+        File to whose folder scene paths are relative; `path` if left out
 
     Raises
     ------
@@ -150,7 +151,9 @@ def check(plan: Plan, to_run: bool) -> None:
     for name in study.factors:
         if name in COLUMNS or name in study.responses:
             raise InputError(
-                f"factors.{name}", "the name is that of a column of the trials", "another name"
+                f"factors.{name}",
+                "the name is that of a column of the trials",
+                "another name",
             )
     check_hardware(study)
     points = []
@@ -207,7 +210,7 @@ def named_sections(study: Study) -> Iterator[tuple[str, Figure | Threshold]]:
 
 
 def check_hardware(study: Study) -> None:
-    """Raise InputError where draws of the hardware are levels of a factor, or keys that the factors set too."""
+    """Raise InputError if a key of `hardware` is of the trial or is also set by a factor, or a factor sets a seed."""
     for n, key in enumerate(study.hardware):
         if key.startswith(TRIAL):
             raise InputError(
@@ -232,14 +235,16 @@ def check_hardware(study: Study) -> None:
 
 
 def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
-    """Raise InputError where the trial does not fit the scene of a level."""
-    if isinstance(scene.light, CollimatedDisplayConfig) and not isinstance(trial, FlightTrial):
+    """Raise InputError if the trial does not fit the scene of a level."""
+    if isinstance(scene.light, CollimatedDisplayConfig) and not isinstance(
+        trial, FlightTrial
+    ):
         raise InputError("trial.kind", f"{trial.kind} with a collimated display", "flight")
     if scene.tracker.decoder and isinstance(trial, FrameTrial):
         raise InputError(
             "trial.kind", "frames with tracker.decoder, which needs many", "centroids, flight"
         )
-    if SURVEY_SEED in plan.spec.hardware and not has_survey_errors(scene):
+    if SURVEY_SEED in plan.spec.hardware and unused.reason(SURVEY_SEED, scene):
         raise InputError(
             "hardware",
             "tracker.survey.seed has no effect without errors of the survey",
@@ -253,7 +258,9 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
     if near and not BODIES_YEARS[0] <= scene.start_time.year <= BODIES_YEARS[1]:
         first, last = BODIES_YEARS
         raise InputError(
-            "trial.near", f"start_time {scene.start_time} is outside {first} to {last}", "none"
+            "trial.near",
+            f"start_time {scene.start_time} is outside {first} to {last}",
+            "none",
         )
     if to_run:
         tracker = scene.tracker.name
@@ -268,38 +275,27 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
             )
 
 
-def has_survey_errors(scene: Scene) -> bool:
-    """Whether the survey of a scene has errors that `tracker.survey.seed` draws."""
-    survey = scene.tracker.survey
-    dome = scene.light if isinstance(scene.light, DomeConfig) else None
-    error_m = dome.surface.error_m if dome else 0.0
-    return any(
-        (
-            survey.led_sigma_m,
-            survey.lever_sigma_m,
-            survey.focal_length_sigma_m,
-            survey.instrument,
-            error_m,
-        )
-    )
+def dome_seeds(scene: Scene) -> list[str]:
+    """Keys of the seeds of the survey and of the LEDs that have an effect in a scene."""
+    seeds = [] if unused.reason(SURVEY_SEED, scene) else [SURVEY_SEED]
+    key = "light.layout"
+    layout = scene.light.layout if isinstance(scene.light, DomeConfig) else None
+    if isinstance(layout, OnPoints):
+        key = "light.layout.points"
+        layout = layout.points
+    return seeds + [f"{key}.hardware_seed"] * hasattr(layout, "hardware_seed")
 
 
 def fixed_seeds(study: Study, scene: Scene) -> list[str]:
     """Seeds of the survey and of the LEDs that a scene draws once, and the study neither draws anew nor varies."""
-    layout = scene.light.layout if isinstance(scene.light, DomeConfig) else None
-    points, prefix = (
-        (layout.points, ".points") if isinstance(layout, OnPoints) else (layout, "")
-    )
-    seeds = [SURVEY_SEED] if has_survey_errors(scene) else []
-    seeds += [f"light.layout{prefix}.hardware_seed"] if hasattr(points, "hardware_seed") else []
     varied = {*study.hardware, *study.set}.union(
         *(factor.value_at(0.5)[1] for factor in study.factors.values())
     )
-    return [seed for seed in seeds if seed not in varied]
+    return [seed for seed in dome_seeds(scene) if seed not in varied]
 
 
 def at_factor(study: Study, name: str, level: Value, error: InputError) -> InputError:
-    """A level's error with the factor that sets the key at fault, and its value; one of `hardware` unchanged."""
+    """An error of a level, with the factor that sets the key at fault and its value; one of `hardware` is unchanged."""
     if error.key == "hardware":
         return error
     owners = [
@@ -320,7 +316,9 @@ def check_measured(study: Study, kinds: set[str], scenes: Sequence[Scene]) -> No
         measured = MEASURED_BY.get(metrics.split_name(name)[0], kinds)
         if not kinds & set(measured):
             raise InputError(
-                key, f"{name} in trials of kind {', '.join(kinds)}", f"of {', '.join(measured)}"
+                key,
+                f"{name} in trials of kind {', '.join(kinds)}",
+                f"of {', '.join(measured)}",
             )
         if name == "ambiguous" and not any(map(may_report_ambiguity, scenes)):
             raise InputError(
@@ -351,14 +349,16 @@ def check_random_start(scene: Scene, start: AttitudeRange) -> None:
         )
         raise InputError("trial.start", f"random with {where}", "scene")
     dome = isinstance(scene.light, DomeConfig)
-    for unused in ("dec_deg", "near") if dome else ("tilt_deg",):
-        if unused in start.model_fields_set:
+    for key in ("dec_deg", "near") if dome else ("tilt_deg",):
+        if key in start.model_fields_set:
             raise InputError(
-                f"trial.start.{unused}",
+                f"trial.start.{key}",
                 f"has no effect with light of kind {scene.light.kind}",
                 "none",
             )
-    greatest_deg = max(start.tilt_deg) if isinstance(start.tilt_deg, tuple) else start.tilt_deg
+    greatest_deg = (
+        max(start.tilt_deg) if isinstance(start.tilt_deg, tuple) else start.tilt_deg
+    )
     vehicle = scene.vehicle
     if dome and vehicle.mount == "air_bearing" and greatest_deg > vehicle.tilt_stop_deg:
         raise InputError(

@@ -16,21 +16,25 @@ from skysim.core.errors import InputError, unknown_name
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.study.execution.store import Store
-from skysim.experiments.study.factors import Distribution, Levels, Range, Value, split_quantity
+from skysim.experiments.study.factors import (
+    Distribution,
+    Levels,
+    Range,
+    Value,
+    split_quantity,
+)
 from skysim.experiments.study.plan import Figure, Plan, Study, Threshold
 from skysim.results import metrics
 from skysim.results.files.row_parts import Rows
 from skysim.results.metrics import CONFIDENCE, NO_VALUE, Summary
 
 LONG_QUANTITY = re.compile(r"(-?\d*\.\d{4,}(?:e[-+]?\d+)?)(\s\S.*)$")
-
-
 ROUNDING = 1e-9  # a smaller response is the rounding error of 0
-MIN_VALUES = 5  # fewer values of more trials are few
+MIN_VALUES = 5  # a response with fewer values, from more trials, has few
 
 
 class PointRow(NamedTuple):
-    """One point: its number, factor levels, the responses computed from its trials, and the number of these."""
+    """One point: its number, factor levels, the responses computed from its trials, and the number of its trials."""
 
     point: int
     levels: dict[str, Any]
@@ -55,7 +59,7 @@ def table(store: Store, responses: Sequence[str]) -> list[PointRow]:
 def has_few_values(row: PointRow, response: str) -> bool:
     """Whether few of a point's trials have a value of a response: less than half of them, or less than MIN_VALUES.
 
-    The error of a solution, for example, is that of the solved trials alone, which are the easy ones where few are.
+    The error of a solution, for example, is known for solved trials alone; if few are solved, they are the easy ones.
     """
     values = row.responses[response].trials
     return 0 < values < max(row.trials / 2, min(MIN_VALUES, row.trials))
@@ -73,14 +77,11 @@ def cells(rows: Sequence[PointRow]) -> tuple[list[str], list[list[str]]]:
     """Column heads and cell texts of a table, such as `0.97 (0.95..0.98)`."""
     if not rows:
         return [], []
-    texts = [
-        [
-            str(one.point),
-            *map(format_level, one.levels.values()),
-            *(format_response(one, name) for name in one.responses),
-        ]
-        for one in rows
-    ]
+    texts = []
+    for one in rows:
+        levels = [format_level(level) for level in one.levels.values()]
+        responses = [format_response(one, name) for name in one.responses]
+        texts.append([str(one.point), *levels, *responses])
     return ["point", *rows[0].levels, *rows[0].responses], texts
 
 
@@ -88,14 +89,16 @@ def format_level(value: Any) -> str:
     """Text of a factor's level, numbers rounded to four digits."""
     if isinstance(value, float):
         return f"{value:.4g}"
-    match = LONG_QUANTITY.match(value) if isinstance(value, str) else None
+    if isinstance(value, list):
+        return ", ".join(map(str, value))
+    match = LONG_QUANTITY.match(str(value))
     if match:  # a sampled quantity with a unit
         return f"{float(match[1]):.4g}{match[2]}"
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    return str(value)
 
 
 def format_summary(summary: Summary) -> str:
-    """Text of a statistic with its interval, or how many values more it needs to have one."""
+    """Text of a statistic with its interval, or with the number of further values that it needs to have one."""
     if np.isnan(summary.value):
         return "-"
     value, low, high = (0.0 if abs(one) < ROUNDING else one for one in summary[:3])
@@ -132,15 +135,14 @@ def trial_columns(store: Store) -> Rows:
 def level_columns(store: Store) -> dict[str, NDArray[Any]]:
     """(P,) levels of each factor by point: numbers, or texts."""
     points = store.points()
-    return {
-        name: to_array([one.levels[name] for one in points])
-        for name in (points[0].levels if points else ())
-    }
+    names = points[0].levels if points else {}
+    return {name: to_array([one.levels[name] for one in points]) for name in names}
 
 
 def to_array(levels: Sequence[Any]) -> NDArray[Any]:
-    """Levels of a factor as an array; those that numpy has no type for as texts."""
-    array = np.array([format_level(one) if isinstance(one, list) else one for one in levels])
+    """Levels of a factor as an array; as texts if numpy has no type for them."""
+    plain = [format_level(one) if isinstance(one, list) else one for one in levels]
+    array = np.array(plain)
     if array.dtype != object:
         return array
     return np.array([one if one is None else str(one) for one in levels], object)
@@ -221,14 +223,15 @@ def sample_outputs(
     width = len(plan.study.factors)
     each = plan.study.replicates
     columns = store.columns()
-    # Trial number = point * replicates + replicate, and points are in the order A, B, AB_1 .. AB_D.
     values = np.full((len(axes), plan.trials), np.nan)
     values[:, columns["trial"]] = [columns[name] for name in axes]
-    grid = values.reshape(len(axes), -1, each).transpose(0, 2, 1).reshape(len(axes) * each, -1)
-    complete = np.isfinite(grid).all(axis=1)
-    blocks = grid[complete].reshape(
-        int(complete.sum()), width + 2, len(plan.points) // (width + 2)
-    )
+    # Trial number = point * replicates + replicate.
+    by_point = values.reshape(len(axes), len(plan.points), each)
+    outputs = by_point.transpose(0, 2, 1).reshape(len(axes) * each, -1)
+    complete = outputs[np.isfinite(outputs).all(axis=1)]
+    # Points are in the order A, B, AB_1 .. AB_D.
+    rows = len(plan.points) // (width + 2)
+    blocks = complete.reshape(len(complete), width + 2, rows)
     return blocks[:, 0], blocks[:, 1], blocks[:, 2:].transpose(1, 0, 2)
 
 
@@ -246,10 +249,10 @@ def generalized(a: Floats, b: Floats, ab: Floats) -> NDArray[np.float64]:
     return np.stack([weight[varying] @ index[varying] / weight.sum() for index in both])
 
 
-# Factors of a study as axes, and which of its points a figure or a threshold is about.
+# Factors of a study as axes, and the points of a figure or a threshold.
 
 
-SAMPLED_DESIGNS = ("lhs", "sobol", "saltelli")  # sampled designs: no two points share a level
+SAMPLED_DESIGNS = ("lhs", "sobol", "saltelli")  # designs in which no two points share a level
 GROUPS = 4  # number of groups into which a sampled factor `by` is divided
 LOG_FACTOR_RATIO = 10  # minimum ratio of last to first level for a logarithmic factor axis
 UNITS = {
@@ -313,8 +316,10 @@ def distinct(levels: Iterable[Value]) -> list[Value]:
 
 def label(name: str, unit: str = "") -> str:
     """Readable name with its unit in brackets: `cross_arcsec_p95` becomes "cross p95 [arcsec]"."""
-    figure, _, statistic = name.rpartition("_")
-    stem, tail = (figure, f" {statistic}") if statistic in metrics.STATISTICS else (name, "")
+    stem, _, statistic = name.rpartition("_")
+    tail = f" {statistic}"
+    if statistic not in metrics.STATISTICS:
+        stem, tail = name, ""
     ending = next((ending for ending in UNITS if stem.endswith(ending)), "")
     unit = unit or UNITS.get(ending, "")
     text = stem.removesuffix(ending).replace("_", " ") + tail
@@ -341,11 +346,11 @@ def axis(study: Study, lines: Sequence[PointRow], name: str) -> Axis:
             log = suits_log_scale(np.sort(numbers))
         return Axis(label(name, own_unit or unit), levels, True, log)
     order = [one for one, _ in factor.options()]
-    levels.sort(
-        key=lambda one: next(
-            (n for n, other in enumerate(order) if same(one, other)), len(order)
-        )
-    )
+
+    def place(level: Value) -> int:
+        return next((n for n, one in enumerate(order) if same(level, one)), len(order))
+
+    levels.sort(key=place)
     has_text = any(isinstance(one, str | bool) for one in levels)
     return Axis(label(name, "" if has_text else unit), levels, False, False)
 
@@ -386,11 +391,10 @@ def suits_log_scale(numbers: Floats) -> bool:
 
 
 def fixed_levels(shown: Shown, study: Study, lines: Sequence[PointRow]) -> dict[str, Value]:
-    """The levels at which a figure or threshold keeps factors fixed: those of its `where`, and the first level of
-    other factors that it does not show.
+    """The levels at which a figure or threshold keeps factors fixed.
 
-    Sampled points share no levels, so only `where` applies to them. Raises InputError if `where` names an unknown
-    factor or level.
+    They are those of its `where`, and the first level of the other factors that it does not show. Sampled points share
+    no levels, so only `where` applies to them. Raises InputError if `where` names an unknown factor or level.
     """
     check_levels(shown.where, study, lines)
     if is_sampled(study):
@@ -404,11 +408,13 @@ def fixed_levels(shown: Shown, study: Study, lines: Sequence[PointRow]) -> dict[
 
 
 def shown_points(lines: Sequence[PointRow], shown: Shown, study: Study) -> list[PointRow]:
-    """The table lines (points) that a figure or threshold is about."""
+    """The table lines (points) of a figure or threshold."""
     return points_at(lines, study, fixed_levels(shown, study, lines))
 
 
-def check_levels(levels: Mapping[str, Value], study: Study, lines: Sequence[PointRow]) -> None:
+def check_levels(
+    levels: Mapping[str, Value], study: Study, lines: Sequence[PointRow]
+) -> None:
     """Raise InputError for an unknown factor, or a level at which there is no point."""
     for name, level in levels.items():
         if name not in study.factors:
@@ -434,7 +440,7 @@ def points_at(
 def group_points(
     all_lines: Sequence[PointRow], shown: Shown, study: Study
 ) -> dict[str, list[PointRow]]:
-    """The table lines that a figure or threshold is about, by the level of its `by`; under "" if it has none."""
+    """The table lines of a figure or threshold by the level of its `by`; under "" if it has none."""
     lines = shown_points(all_lines, shown, study)
     name = shown.axes.get("by")
     if name is None:
@@ -445,9 +451,11 @@ def group_points(
         ordered = sorted(lines, key=lambda line: group_axis.coordinate(line.levels[name]))
         bounds = [round(n * len(ordered) / GROUPS) for n in range(GROUPS + 1)]
         groups = {}
-        for part in (ordered[a:b] for a, b in itertools.pairwise(bounds) if b > a):
-            low, high = (group_axis.coordinate(part[n].levels[name]) for n in (0, -1))
-            groups[f"{low:.3g} to {high:.3g}"] = part
+        for begin, end in itertools.pairwise(bounds):
+            if begin < end:
+                low = group_axis.coordinate(ordered[begin].levels[name])
+                high = group_axis.coordinate(ordered[end - 1].levels[name])
+                groups[f"{low:.3g} to {high:.3g}"] = ordered[begin:end]
         return groups
     return {
         group_axis.tick_label(one): [line for line in lines if same(line.levels[name], one)]

@@ -1,9 +1,8 @@
 """Thresholds of a study: where along a factor a proportion crosses a limit, with an interval.
 
-The proportion is assumed to rise or to fall along the factor, and nothing else about its curve. The estimate is the
-place where its isotonic fit crosses the limit, linear between the levels. The interval has levels as its ends: it goes
-from the last level of which it is certain that it is on one side of the limit to the first that is certainly on the
-other, so more levels between the two make it shorter.
+The only assumption on the proportion is that it rises or falls along the factor. The estimate is the place where its
+isotonic fit, linear between the levels, crosses the limit. The interval goes from the last level that is certainly on
+one side of the limit to the first level that is certainly on the other, so more levels between the two shorten it.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ from skysim.experiments.study.table import Axis, PointRow
 from skysim.results import metrics
 
 TAIL = (1 - metrics.CONFIDENCE) / 2
-MOST_TRIALS = 1_000_000  # more trials than that are no advice
-MISFIT_PROBABILITY = 1e-3  # of a monotonic curve that differs from its isotonic fit by more than the accepted deviance
+MOST_TRIALS = 1_000_000  # greatest number of trials that is advised
+MISFIT_PROBABILITY = 1e-3  # probability that a monotonic curve deviates from its isotonic fit by more than is accepted
 
 
 class Crossing(NamedTuple):
@@ -41,11 +40,11 @@ class Crossing(NamedTuple):
     rising
         Whether the proportion rises along the factor
     between
-        The two levels between which it crosses, where trials are so few that the estimate is no
-        more than that (`too_few`); None otherwise
+        The two levels between which it crosses, if there are too few trials for a better
+        estimate (`too_few`); None otherwise
     needs
-        Of each open end that more trials would close, a level, and about how many trials it
-        takes in all
+        For each open end that more trials would close: a level, and the approximate total of
+        trials that it needs
     """
 
     value: float
@@ -114,19 +113,21 @@ def crossing(
 
 
 def too_few(trials: Floats, limit: float) -> bool:
-    """Whether one trial is more than what separates the limit from 0 or 1: a proportion then has no value near it."""
+    """Whether one trial is more than the distance of the limit from 0 or 1: no proportion then is near the limit."""
     return bool(trials.min() < 1 / min(limit, 1 - limit))
 
 
 def trials_needed(share: float, limit: float, above: bool) -> int:
-    """About how many trials make a level of this proportion certainly above (or below) the limit; 0 if none would.
+    """Approximate number of trials that show a level to be above (or below) the limit; 0 if none would.
 
-    The fewest n whose exact bound for n share hits is beyond the limit, a guess as good as the share is known.
+    It is the least n whose exact bound for n share hits is beyond the limit; it is as uncertain as the share.
     """
     side, sign = (0, 1.0) if above else (1, -1.0)
 
     def certain(count: int) -> bool:
-        return sign * (metrics.exact_bounds(share * count, count, 1 - TAIL)[side] - limit) >= 0
+        return (
+            sign * (metrics.exact_bounds(share * count, count, 1 - TAIL)[side] - limit) >= 0
+        )
 
     if not certain(MOST_TRIALS):
         return 0
@@ -174,7 +175,7 @@ def certain_levels(
 
 
 def check(threshold: Threshold, where: str, study: Study, rows: Sequence[PointRow]) -> None:
-    """Raise InputError for a threshold of no proportion, or along a factor without numeric levels."""
+    """Raise InputError if the response is not a proportion, or the factor has no numeric levels."""
     name = threshold.response
     if not metrics.is_proportion(name):
         raise InputError(
@@ -240,7 +241,8 @@ def sentences(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> 
         else ""
     )
     return [
-        (f"{threshold.by} = {label}{unit}: " if label else "") + describe(one, threshold, axis)
+        (f"{threshold.by} = {label}{unit}: " if label else "")
+        + describe(one, threshold, axis)
         for label, one in crossings(threshold, study, lines).items()
     ]
 
@@ -269,7 +271,7 @@ def describe(found: Crossing | None, threshold: Threshold, axis: Axis) -> str:
 
 
 def interval_text(found: Crossing, name: str, unit: str) -> str:
-    """The interval of a crossing in words, and how many trials it takes in all where an end is open."""
+    """The interval of a crossing in words, with the total of trials that an open end needs."""
     counts = " and ".join(
         f"about {trials:,} trials at {name} = {level:.4g}{unit}"
         for level, trials in found.needs

@@ -1,8 +1,8 @@
 """Refuse options of a study that have no effect: keys of `set`, `trial` and factors.
 
 A key is refused if it has no effect at any level of any factor, each factor varied alone. The rules are those of scenes
-(`scene.unused`) and, for the kinds of trial, those below. `exposure.rate_hz` is always tolerated, because it bounds the
-exposure time.
+(`scene.unused_rules`) and, for the kinds of trial, those below. `exposure.rate_hz` is always tolerated, because it
+bounds the exposure time.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from skysim.experiments.study.plan import (
     Trial,
     TrialSection,
 )
-from skysim.scene import unused
+from skysim.scene import unused, unused_rules
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import RollingShutterConfig
 from skysim.scene.sections.layouts import CelestialConfig, OnPoints
 from skysim.scene.sections.light import DomeConfig, StarsConfig
-from skysim.scene.unused import Rule
+from skysim.scene.unused_rules import Rule
 from skysim.tracking import factory
 
 # Detectors and centroiders that use the streak measured by a gyro.
@@ -50,7 +50,9 @@ DYNAMICS = (
 def on_ground(scene: Scene, trial: Trial) -> bool:
     """Whether the view of a trial depends on the site."""
     near = getattr(trial, "near", None)
-    return unused.seen_from_ground(scene) or (near is not None and near.body == "zenith")
+    return unused_rules.seen_from_ground(scene) or (
+        near is not None and near.body == "zenith"
+    )
 
 
 DETECTOR = tuple(
@@ -87,14 +89,14 @@ def ignores_streak(scene: Scene, trial: Trial) -> bool:
     """Whether neither the detector nor the centroider of skysim's tracker uses a measured streak."""
     chosen = factory.assumed_settings(scene)
     used = {chosen.detector, chosen.centroider} & set(STREAK_ALGORITHMS)
-    return isinstance(trial, FrameTrial) and not unused.external(scene) and not used
+    return isinstance(trial, FrameTrial) and not unused_rules.external(scene) and not used
 
 
 def tracks(scene: Scene) -> bool:
     """Whether the scene's tracker has a tracking mode."""
     return (
         isinstance(scene.light, StarsConfig)
-        and not unused.external(scene)
+        and not unused_rules.external(scene)
         and not isinstance(scene.camera.shutter, RollingShutterConfig)
     )
 
@@ -143,7 +145,10 @@ RULES = (
         "trial.near.off_deg",
     ),
     Rule(
-        ("seed",), lambda scene, trial: True, "every trial has its own seed", "the study's seed"
+        ("seed",),
+        lambda scene, trial: True,
+        "every trial has its own seed",
+        "the study's seed",
     ),
     Rule(
         DYNAMICS,
@@ -153,13 +158,17 @@ RULES = (
     ),
     Rule(
         ("site",),
-        lambda scene, trial: not isinstance(trial, FlightTrial) and not on_ground(scene, trial),
+        lambda scene, trial: (
+            not isinstance(trial, FlightTrial) and not on_ground(scene, trial)
+        ),
         "a trial of one attitude does not simulate the motion, and its sky is that of space",
         "trial.kind: flight, light.air, light.bodies with a site.longitude_deg, or trial.near.body: zenith",
     ),
     Rule(
         ("exposure.frames",),
-        lambda scene, trial: not isinstance(trial, FlightTrial) and scene.exposure.frames != 1,
+        lambda scene, trial: (
+            not isinstance(trial, FlightTrial) and scene.exposure.frames != 1
+        ),
         "a trial is one frame",
         "1, or trial.kind: flight",
     ),
@@ -174,7 +183,7 @@ RULES = (
         lambda scene, trial: (
             isinstance(trial, FrameTrial)
             and not trial.tracked
-            and (not isinstance(scene.light, DomeConfig) or unused.steady(scene))
+            and (not isinstance(scene.light, DomeConfig) or unused_rules.steady(scene))
         ),
         "the light of a trial's frame is steady",
         "trial.kind: flight",
@@ -210,7 +219,9 @@ RULES = (
             "light.led.pwm_period",
             "light.led.clock",
         ),
-        lambda scene, trial: isinstance(trial, CentroidTrial) and scene.tracker.decoder is None,
+        lambda scene, trial: (
+            isinstance(trial, CentroidTrial) and scene.tracker.decoder is None
+        ),
         "a trial of kind centroids has no image: trial.noise_px is the centroids' error",
         "trial.kind: frames, or tracker.decoder, which reads the lights' brightness",
     ),
@@ -274,7 +285,10 @@ def check(plan: Plan, points: Iterable[CheckedPoint], resolve: Resolve) -> None:
         Function from the settings of all factors to the scene and the trial
     """
     # 1. Faults by factor and level ("" for `set` and `trial`), and key; None for a key with an effect.
-    written = [*plan.spec.base, *(f"{TRIAL}{key}" for key in plan.spec.trial if key != "kind")]
+    written = [
+        *plan.spec.base,
+        *(f"{TRIAL}{key}" for key in plan.spec.trial if key != "kind"),
+    ]
     faults: dict[tuple[str, str, str], Fault | None] = {}
     for point in points:
         keys = [("", "", key) for key in written if key not in point.settings]
@@ -313,7 +327,7 @@ def find(key: str, plan: Plan, point: CheckedPoint) -> Fault | None:
         )
     else:
         keys = list(unused.set_keys({key: (plan.spec.base | point.settings)[key]}))
-        found = unused.find(unused.RULES, keys, scene) or unused.find(
+        found = unused.find(unused_rules.RULES, keys, scene) or unused.find(
             RULES, keys, scene, scene, trial
         )
     return Fault(*found, point) if found else None

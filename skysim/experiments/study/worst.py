@@ -26,10 +26,10 @@ DIRECTION = (
     "boresight_dec_deg",
     "stars",
 )
-FIRST = 1000  # worst trials that are sorted at first
-APART_DEG = 5.0  # least angle between the directions of two of them; nearer ones are one place
+FIRST = 1000  # number of worst trials that are sorted first
+APART_DEG = 5.0  # least angle between the directions of two listed trials
 NEAR = math.cos(math.radians(APART_DEG))
-# Column by which a trial counts for a proportion; for `identified` those that do not.
+# How often a trial counts for a proportion; for `identified`, how often it does not.
 FLAGS: dict[str, Callable[[Columns], NDArray[Any]]] = {
     "identified": lambda c: c["frames"] - c["solved"] + c["wrong"],
     "refused": lambda c: c["frames"] - c["solved"],
@@ -47,15 +47,15 @@ class WorstTrial(NamedTuple):
     status
         "misidentified" where it is solved with wrong lights
     tilt_deg, azimuth_deg
-        Of the body's z axis under a dome
+        Direction of the body's z axis under a dome
     ra_deg, dec_deg
-        Of the boresight under the stars
+        Direction of the boresight under the stars
     yaw_deg, pitch_deg, roll_deg
-        The body's 3-2-1 angles under a dome, as of `motion.start`;  NaN under the stars
+        3-2-1 angles of the body under a dome, as in `motion.start`; NaN under the stars
     lights
-        In the field
+        Number of lights in the field
     cross_arcsec, roll_arcsec
-        Its errors, NaN without a solution
+        Errors; NaN without a solution
     """
 
     trial: int
@@ -74,14 +74,14 @@ class WorstTrial(NamedTuple):
 
     @property
     def direction(self) -> str:
-        """Its direction in words."""
+        """The direction in words."""
         if math.isfinite(self.tilt_deg):
             return f"tilt {self.tilt_deg:.1f}°, azimuth {self.azimuth_deg:.0f}°"
         return f"RA {self.ra_deg:.1f}°, Dec {self.dec_deg:+.1f}°"
 
     @property
     def start(self) -> str:
-        """The setting that starts a scene at the attitude; empty under the stars, where the direction does."""
+        """The setting that starts a scene at the attitude; empty under the stars, where the direction is enough."""
         if math.isnan(self.yaw_deg):
             return ""
         angles = ", ".join(
@@ -100,10 +100,10 @@ class WorstTrial(NamedTuple):
 
 
 def worst_trials(columns: Columns, response: str, count: int = COUNT) -> list[WorstTrial]:
-    """The worst trials by a response or a quantity, worst first, of directions at least APART_DEG apart.
+    """The worst trials by a response or a quantity, worst first, with directions at least APART_DEG apart.
 
-    For a proportion they are trials that count for it (for `identified`, that do not), those without a solution before
-    those with one, then by error and by the number of lights; none if there is no such trial.
+    For a proportion they are trials that count for it (for `identified`, that do not): trials without a solution first,
+    then by error and by the number of lights. None if there is no such trial.
     """
     if not columns:
         return []
@@ -123,8 +123,10 @@ def worst_trials(columns: Columns, response: str, count: int = COUNT) -> list[Wo
     return chosen
 
 
-def worst_first(keys: Sequence[Floats], rows: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    """Rows in the order of their keys, some at a time: about FIRST, then ten times as many, since few are needed."""
+def worst_first(
+    keys: Sequence[Floats], rows: NDArray[np.int64]
+) -> Iterator[NDArray[np.int64]]:
+    """Rows in the order of their keys, in blocks: about FIRST, then ten times as many, since few are needed."""
     most = FIRST
     while len(rows) and keys:
         first = keys[0][rows]
@@ -139,7 +141,7 @@ def worst_first(keys: Sequence[Floats], rows: NDArray[np.int64]) -> Iterator[NDA
 
 
 def worst_trial(columns: Columns) -> WorstTrial:
-    """The only one of some trials."""
+    """The trial in columns of a single trial."""
     return WorstTrial(
         int(columns["trial"][0]),
         int(columns["point"][0]),
@@ -180,7 +182,7 @@ def unit_directions(columns: Columns) -> Floats:
 
 
 def ranking(columns: Columns, response: str) -> tuple[list[Floats], NDArray[np.bool_]]:
-    """Sort keys, (N,) each, the first the most important and smaller the worse; and (N,) whether a trial qualifies."""
+    """(N,) sort keys, the most important first, smaller is worse; and (N,) whether a trial qualifies."""
     angle = metrics.QUANTITIES["angle_arcsec"](columns)
     unsolved_first = np.where(np.isnan(angle), -np.inf, -angle)
     fewest_first = np.nan_to_num(columns["stars"], nan=0.0)

@@ -130,8 +130,12 @@ class Recording:
             return None
         columns = [f"true_{name}" for name in LAB_ANGLES]
         self._require("telemetry", telemetry, ("t_s", *columns))
-        angles = np.column_stack([np.asarray(telemetry[name], dtype=float) for name in columns])
-        return np.asarray(telemetry["t_s"], dtype=float), attitudes(angles, is_celestial=False)
+        angles = np.column_stack(
+            [np.asarray(telemetry[name], dtype=float) for name in columns]
+        )
+        return np.asarray(telemetry["t_s"], dtype=float), attitudes(
+            angles, is_celestial=False
+        )
 
 
 def attitudes(angles_deg: Floats, is_celestial: bool) -> Rotation:
@@ -306,7 +310,9 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
         "cam_from_lab_xyzw": truth.cam_from_lab.as_quat().tolist(),
         "rate_cam_rad_s": truth.rate_cam_rad_s.tolist(),
         "hidden": truth.hidden.tolist(),
-        "lab": "ICRS axes" if isinstance(scene.light, StarsConfig) else "bearing center, z up",
+        "lab": "ICRS axes"
+        if isinstance(scene.light, StarsConfig)
+        else "bearing center, z up",
     }
     if truth.bodies:
         table.meta["bodies"] = [dataclasses.asdict(body) for body in truth.bodies]

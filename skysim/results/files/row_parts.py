@@ -20,9 +20,7 @@ from skysim.core.errors import InputError
 from skysim.core.files import atomic_file
 
 EXTRA = "needs optional packages: pip install 'skysim[export]'"
-KEPT_BYTES = (
-    250_000_000  # columns that are kept for the next one who asks, the oldest are dropped first
-)
+KEPT_BYTES = 250_000_000  # columns that are kept for the next one who asks, the oldest are dropped first
 
 Array = NDArray[Any]
 Source = Callable[[str], Array]  # the column of some rows by its name
@@ -173,7 +171,9 @@ class Part:
     def trials(self, replicates: int) -> Array:
         """(N,) numbers of its trials, where a point has so many. Raises InputError for a part that is not as listed."""
         if self._trials[0] != replicates:
-            point, replicate = (read_column(self.path, name) for name in ("point", "replicate"))
+            point, replicate = (
+                read_column(self.path, name) for name in ("point", "replicate")
+            )
             if not len(point) == len(replicate) == self.rows > 0:
                 raise InputError(
                     self.path,
@@ -193,7 +193,8 @@ class Part:
         """The columns of the trials in some ranges of numbers; None if there are none."""
         near = np.array(ranges)
         near = near[
-            (near[:, 0] < (self.last + 1) * replicates) & (near[:, 1] > self.first * replicates)
+            (near[:, 0] < (self.last + 1) * replicates)
+            & (near[:, 1] > self.first * replicates)
         ]
         if not len(near):
             return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
@@ -49,14 +50,14 @@ def message(
 
     The standard's quaternion "from A to B" rotates the basis vectors of A into those of B (annex F2). That is the
     quaternion of a_from_b, whose matrix has the axes of B in coordinates of A as columns; coordinates transform by
-    X_B = a_from_b^-1 X_A. Scalar last. Raises InputError if there is no epoch or the epochs do not ascend.
+    X_B = a_from_b^-1 X_A. Scalar last. Raises InputError as `check_epochs`.
 
     Parameters
     ----------
     name
         Object name
     notes
-        comments
+        Comments
     frames
         (A, B), keys of MEANING
     utc
@@ -64,13 +65,7 @@ def message(
     a_from_b
         K rotations
     """
-    if not utc:
-        raise InputError(name, "no attitude to write")
-    late = [n for n in range(1, len(utc)) if utc[n] <= utc[n - 1]]
-    if late:
-        raise InputError(
-            name, f"epoch {epoch(utc[late[0]])} is not after {epoch(utc[late[0] - 1])}"
-        )
+    check_epochs(name, utc)
     head = {
         "CCSDS_AEM_VERS": "2.0",
         "CREATION_DATE": epoch(datetime.datetime.now(datetime.UTC)),
@@ -102,6 +97,15 @@ def message(
         "DATA_STOP",
     ]
     return "".join(f"{ascii_line(line)}\n" for line in lines)
+
+
+def check_epochs(name: str, utc: Sequence[datetime.datetime]) -> None:
+    """Raise InputError if there is no epoch, or the epochs do not ascend."""
+    if not utc:
+        raise InputError(name, "no attitude to write")
+    for before, after in itertools.pairwise(utc):
+        if after <= before:
+            raise InputError(name, f"epoch {epoch(after)} is not after {epoch(before)}")
 
 
 def continuous_quaternions(xyzw: Floats) -> Floats:
@@ -185,7 +189,9 @@ def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
         return path
 
     a_from_b = Rotation.concatenate([rotation for *_, rotation in true])
-    written = [write("truth", "True attitude at mid-exposure", list(epochs.values()), a_from_b)]
+    written = [
+        write("truth", "True attitude at mid-exposure", list(epochs.values()), a_from_b)
+    ]
     solved = run.solved()
     if solved is not None:
         unknown = [frame for frame in solved[0].tolist() if frame not in epochs]
@@ -449,7 +455,9 @@ def to_video(run: Recording, out: Path, bar: Bar) -> list[Path]:
                 )
             for stem in bar(run.stems, len(run.stems), "video"):
                 image = check_same_format(run.image(stem), first, stem)
-                gray = plots.to_8bit(image, "square root", levels_dn=(float(low), float(high)))
+                gray = plots.to_8bit(
+                    image, "square root", levels_dn=(float(low), float(high))
+                )
                 with silent_stderr():
                     film.write(np.ascontiguousarray(gray[:height, :width]))
         finally:

@@ -137,7 +137,9 @@ def dxf_groups(shape: Shape, height_mm: float) -> Iterator[tuple[int, object]]:
     if isinstance(shape, Circle):
         yield 40, float(shape.radius_mm)
     else:
-        words = "".join(one if one.isascii() else f"\\U+{ord(one):04X}" for one in shape.words)
+        words = "".join(
+            one if one.isascii() else f"\\U+{ord(one):04X}" for one in shape.words
+        )
         yield from ((40, float(shape.size_mm)), (1, words))
 
 
@@ -185,7 +187,9 @@ def template(lab: Lab, ending: str) -> str:
     surface = build_surface(light.surface)
     leds = design_leds(light, surface, lab.camera.band)
     # Boards stand out.
-    cap_deg = max(float(getattr(light.layout, "cap_deg", 0.0)), max_tilt_deg(leds.place[:, :3]))
+    cap_deg = max(
+        float(getattr(light.layout, "cap_deg", 0.0)), max_tilt_deg(leds.place[:, :3])
+    )
     dome = Dome(
         lab.scene.name,
         surface,

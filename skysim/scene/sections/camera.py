@@ -144,7 +144,9 @@ class ChromaticConfig(ConfigModel):
         tuple[Annotated[Length, Field(ge=200e-9, le=2e-6)], ...], Field(min_length=2)
     ]
     focus_m: (
-        Annotated[tuple[Annotated[Length, Field(ge=-1e-3, le=1e-3)], ...], Field(min_length=2)]
+        Annotated[
+            tuple[Annotated[Length, Field(ge=-1e-3, le=1e-3)], ...], Field(min_length=2)
+        ]
         | None
     ) = None
     corner_px: (

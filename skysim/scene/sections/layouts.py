@@ -16,7 +16,9 @@ from skysim.core.units import ConfigModel, Length, Number
 HOLES = 9  # holes of a patch board, 3x3
 Level = Annotated[Number, Field(gt=0, le=1)]
 Levels = Annotated[tuple[Level, ...], Field(min_length=1)]
-Magnitudes = Annotated[tuple[Annotated[Number, Field(ge=-30, le=30)], ...], Field(min_length=1)]
+Magnitudes = Annotated[
+    tuple[Annotated[Number, Field(ge=-30, le=30)], ...], Field(min_length=1)
+]
 Cap = Annotated[Number, Field(gt=0, le=90)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
 Seed = Annotated[int, Field(ge=0)]
@@ -55,7 +57,9 @@ class BoardConfig(ConfigModel):
         if len(set(self.leds)) < len(self.leds):
             raise InputError("leds", f"{list(self.leds)} has a duplicate hole")
         if self.levels is not None and len(self.levels) != len(self.leds):
-            raise InputError("", f"leds has {len(self.leds)} holes, levels {len(self.levels)}")
+            raise InputError(
+                "", f"leds has {len(self.leds)} holes, levels {len(self.levels)}"
+            )
         return self
 
 
@@ -99,7 +103,9 @@ class PatchBoardsConfig(ConfigModel):
     def check_lit(cls, value: tuple[int, int]) -> tuple[int, int]:
         if not 1 <= value[0] <= value[1] <= HOLES:
             raise InputError(
-                "", f"{value} is not a range of LEDs on a 3x3 board", "1 <= least <= most <= 9"
+                "",
+                f"{value} is not a range of LEDs on a 3x3 board",
+                "1 <= least <= most <= 9",
             )
         return value
 
@@ -337,9 +343,9 @@ class ListedConfig(DimmedConfig):
     positions_m: (
         Annotated[tuple[tuple[Length, Length, Length], ...], Field(min_length=1)] | None
     ) = None
-    directions_deg: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] | None = (
-        None
-    )
+    directions_deg: (
+        Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] | None
+    ) = None
     file: str | None = None
 
     @model_validator(mode="after")
@@ -539,7 +545,9 @@ class ProjectorConfig(PixelsConfig):
     def check_lens(self) -> ProjectorConfig:
         sight = [end - start for start, end in zip(self.position_m, self.aim_m, strict=True)]
         if not any(sight[1:]):
-            raise InputError("aim", "straight along x from the position", "any other direction")
+            raise InputError(
+                "aim", "straight along x from the position", "any other direction"
+            )
         corner = math.hypot(*self.pixels) * self.pitch_m / 2 / self.focal_length_m
         # t (1 + k t^2) has its maximum 2 t / 3 at t^2 = -1 / (3 k).
         if self.distortion < 0 and 2 / 3 / math.sqrt(-3 * self.distortion) <= corner:

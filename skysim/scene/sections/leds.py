@@ -5,7 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Discriminator,
+    Field,
+    Tag,
+    field_validator,
+    model_validator,
+)
 
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
@@ -234,7 +241,9 @@ class AgingConfig(ConfigModel):
     @classmethod
     def check_scatter(cls, value: float) -> float:
         if isinstance(value, Tolerance) and value.half_width >= 1:
-            raise InputError("", f"a tolerance of {value.half_width:g} makes light", "below 1")
+            raise InputError(
+                "", f"a tolerance of {value.half_width:g} makes light", "below 1"
+            )
         return value
 
 
@@ -347,7 +356,9 @@ class LedConfig(ConfigModel):
 
     @model_validator(mode="after")
     def check_color(self) -> LedConfig:
-        if isinstance(self.spectrum, str) and (self.fwhm_m is not None or self.color_scatter_m):
+        if isinstance(self.spectrum, str) and (
+            self.fwhm_m is not None or self.color_scatter_m
+        ):
             key = "color_scatter" if self.fwhm_m is None else "fwhm"
             raise InputError(
                 key, f"{self.spectrum} is a whole spectrum", "a wavelength as spectrum"

@@ -1,6 +1,6 @@
-"""Schema of the scene sections `light`, `background` and `lights`.
+"""Schema of the scene sections `light` and `lights`.
 
-The light is a dome with its LEDs, stars, or a star simulator; the background is glow. The section `lights` has further
+The light is a dome with its LEDs, stars, or a star simulator. The section `lights` has further
 lights, of kinds that modules or installed packages add. Such a kind is a class derived from `LightConfig` with a
 literal `kind`, which `simulation.lights.registry.register` adds with its function. A package offers it by an entry
 point of the group `skysim.lights` with the name of the kind, which names the module that registers it.
@@ -23,18 +23,15 @@ from pydantic import (
     model_validator,
 )
 
-from skysim.core.constants import SUN_V_MAG
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.plugins import PluginKind
 from skysim.core.tolerance import LengthError
 from skysim.core.units import (
-    Ascending,
     ConfigModel,
     Fraction,
     Length,
     Number,
     SemiAxis,
-    check_table,
 )
 from skysim.scene.sections.layouts import Layout, PixelsConfig
 from skysim.scene.sections.leds import LedConfig
@@ -94,7 +91,9 @@ class RimmedConfig(SurfaceConfig):
             self, "apex_m", math.inf
         ):
             raise InputError(
-                "rim_height", f"{self.rim_height_m:g} m is not below the apex", "less than apex"
+                "rim_height",
+                f"{self.rim_height_m:g} m is not below the apex",
+                "less than apex",
             )
         return self
 
@@ -169,7 +168,9 @@ class CylinderSurfaceConfig(SurfaceConfig):
             raise InputError("", "a cylinder about z requires length, from apex down")
         if self.rim_height_m is not None and self.rim_height_m >= self.apex_m:
             raise InputError(
-                "rim_height", f"{self.rim_height_m:g} m is not below the apex", "less than apex"
+                "rim_height",
+                f"{self.rim_height_m:g} m is not below the apex",
+                "less than apex",
             )
         return self
 
@@ -259,7 +260,9 @@ class RoomConfig(ConfigModel):
     bearing_height_m: Annotated[Length, Field(ge=0)] | None = None
     width_m: Annotated[Length, Field(gt=0)] | None = None
     length_m: Annotated[Length, Field(gt=0)] | None = None
-    door_m: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] | None = None
+    door_m: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] | None = (
+        None
+    )
     segments: Annotated[int, Field(ge=1, le=100)] = 1
     thickness_m: Annotated[Length, Field(ge=0)] = 0.0
 
@@ -387,7 +390,8 @@ class DomeConfig(ConfigModel):
             )
         if not display and drive == "refresh":
             raise InputError(
-                "led.drive", f"refresh requires a layout of kind lcd or projector, not {layout}"
+                "led.drive",
+                f"refresh requires a layout of kind lcd or projector, not {layout}",
             )
         return self
 
@@ -475,92 +479,6 @@ class CollimatedDisplayConfig(PixelsConfig):
     roll_deg: Number = 0.0
     brightest_mag: Annotated[Number, Field(ge=-30, le=30)]
     conjugate_m: Annotated[Length, Field(ge=10)] | None = None
-
-
-class UniformGlowConfig(ConfigModel):
-    """Uniform glow: e_s electrons per second in every pixel (a light leak, a lit room)."""
-
-    kind: Literal["uniform"]
-    e_s: Annotated[Number, Field(ge=0, le=1e12)]
-
-
-class SkyGlowConfig(ConfigModel):
-    """Surface brightness of the night sky at the boresight, with a relative gradient along the axes of the image."""
-
-    kind: Literal["sky"]
-    mag_arcsec2: Annotated[Number, Field(ge=0, le=30)]
-    gradient_per_deg: tuple[Number, Number] = (0.0, 0.0)
-
-
-class MoonGlowConfig(ConfigModel):
-    """Moonlight scattered by the atmosphere (Krisciunas & Schaefer 1991), with the Moon at ra_deg, dec_deg.
-
-    Attributes
-    ----------
-    phase_angle_deg
-        Phase angle: 0 at full moon, 90 at the quarters
-    extinction_mag
-        Extinction of the atmosphere at the zenith, in V
-    moon_zenith_deg, field_zenith_deg
-        Zenith distances of the Moon and of the boresight
-    """
-
-    kind: Literal["moon"]
-    ra_deg: Annotated[Number, Field(ge=0, lt=360)]
-    dec_deg: Annotated[Number, Field(ge=-90, le=90)]
-    phase_angle_deg: Annotated[Number, Field(ge=0, le=180)]
-    extinction_mag: Annotated[Number, Field(ge=0, le=2)] = 0.172
-    moon_zenith_deg: Annotated[Number, Field(ge=0, lt=90)]
-    field_zenith_deg: Annotated[Number, Field(ge=0, lt=90)]
-
-
-class StrayLightConfig(ConfigModel):
-    """Stray light of a bright body outside the field, by the point source transmittance of baffle and lens.
-
-    Attributes
-    ----------
-    ra_deg, dec_deg
-        Direction of the body in the lab's axes (under the stars those of the ICRS)
-    v_mag
-        V magnitude of the body; the Sun's -26.74 if left out
-    angle_deg, pst
-        Irradiance on the detector over irradiance before the lens, by the angle from the boresight
-    """
-
-    kind: Literal["stray"]
-    ra_deg: Annotated[Number, Field(ge=0, lt=360)]
-    dec_deg: Annotated[Number, Field(ge=-90, le=90)]
-    v_mag: Number = SUN_V_MAG
-    angle_deg: Ascending
-    pst: Annotated[tuple[Fraction, ...], Field(min_length=2)]
-
-    @model_validator(mode="after")
-    def check_columns(self) -> StrayLightConfig:
-        check_table(self.angle_deg, self.pst, "pst")
-        return self
-
-
-class FaintStarsGlowConfig(ConfigModel):
-    """Light of all stars fainter than a V magnitude, by galactic latitude, for skies of kind stars.
-
-    Attributes
-    ----------
-    fainter_than_mag
-        Faintest magnitude of the catalog, or its limit_mag
-    """
-
-    kind: Literal["faint_stars"]
-    fainter_than_mag: Annotated[Number, Field(ge=6, le=15)]
-
-
-Glow = Annotated[
-    UniformGlowConfig
-    | SkyGlowConfig
-    | MoonGlowConfig
-    | StrayLightConfig
-    | FaintStarsGlowConfig,
-    Field(discriminator="kind"),
-]
 
 
 Light = DomeConfig | StarsConfig | CollimatedDisplayConfig

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Discriminator,
+    Field,
+    Tag,
+    model_validator,
+)
 
 from skysim.core.errors import InputError
 from skysim.core.units import ConfigModel, Momentum, NotNegative, Number, Positive, Spin, Time
@@ -40,7 +47,9 @@ def start_tag(value: Any) -> str:
     if isinstance(value, str):
         return "profile"
     keys = value if isinstance(value, dict) else ()
-    sky = isinstance(value, PointingConfig) or any(key in keys for key in ("ra_deg", "dec_deg"))
+    sky = isinstance(value, PointingConfig) or any(
+        key in keys for key in ("ra_deg", "dec_deg")
+    )
     return "PointingConfig" if sky else "AttitudeConfig"
 
 
@@ -352,7 +361,9 @@ class MotionConfig(ConfigModel):
     rate_deg_s: RatesDegS = (0.0, 0.0, 0.0)
     control: Annotated[
         ControlConfig | None,
-        BeforeValidator(expand_control, json_schema_input_type=ControlConfig | LawName | None),
+        BeforeValidator(
+            expand_control, json_schema_input_type=ControlConfig | LawName | None
+        ),
     ] = None
     maneuver: tuple[Maneuver, ...] = ()
     jitter: tuple[JitterPart, ...] = ()

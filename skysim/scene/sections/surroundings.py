@@ -1,4 +1,4 @@
-"""Schema of the surroundings of camera and laboratory: `light.air`, `thermal`, `orbit`, and satellites."""
+"""Schema of the surroundings of camera and laboratory: `light.air`, `thermal`, `orbit`, satellites, `background`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from skysim.core.constants import FWHM_PER_SIGMA
+from skysim.core.constants import FWHM_PER_SIGMA, SUN_V_MAG
 from skysim.core.errors import InputError
 from skysim.core.units import (
     Ascending,
@@ -351,4 +351,93 @@ class OemOrbitConfig(OrbitConfig):
 
 Orbit = Annotated[
     CircularOrbitConfig | TleOrbitConfig | OemOrbitConfig, Field(discriminator="kind")
+]
+
+
+# The scene section `background`: glow.
+
+
+class UniformGlowConfig(ConfigModel):
+    """Uniform glow: e_s electrons per second in every pixel (a light leak, a lit room)."""
+
+    kind: Literal["uniform"]
+    e_s: Annotated[Number, Field(ge=0, le=1e12)]
+
+
+class SkyGlowConfig(ConfigModel):
+    """Surface brightness of the night sky at the boresight, with a relative gradient along the axes of the image."""
+
+    kind: Literal["sky"]
+    mag_arcsec2: Annotated[Number, Field(ge=0, le=30)]
+    gradient_per_deg: tuple[Number, Number] = (0.0, 0.0)
+
+
+class MoonGlowConfig(ConfigModel):
+    """Moonlight scattered by the atmosphere (Krisciunas & Schaefer 1991), with the Moon at ra_deg, dec_deg.
+
+    Attributes
+    ----------
+    phase_angle_deg
+        Phase angle: 0 at full moon, 90 at the quarters
+    extinction_mag
+        Extinction of the atmosphere at the zenith, in V
+    moon_zenith_deg, field_zenith_deg
+        Zenith distances of the Moon and of the boresight
+    """
+
+    kind: Literal["moon"]
+    ra_deg: Annotated[Number, Field(ge=0, lt=360)]
+    dec_deg: Annotated[Number, Field(ge=-90, le=90)]
+    phase_angle_deg: Annotated[Number, Field(ge=0, le=180)]
+    extinction_mag: Annotated[Number, Field(ge=0, le=2)] = 0.172
+    moon_zenith_deg: Annotated[Number, Field(ge=0, lt=90)]
+    field_zenith_deg: Annotated[Number, Field(ge=0, lt=90)]
+
+
+class StrayLightConfig(ConfigModel):
+    """Stray light of a bright body outside the field, by the point source transmittance of baffle and lens.
+
+    Attributes
+    ----------
+    ra_deg, dec_deg
+        Direction of the body in the lab's axes (under the stars those of the ICRS)
+    v_mag
+        V magnitude of the body; the Sun's -26.74 if left out
+    angle_deg, pst
+        Irradiance on the detector over irradiance before the lens, by the angle from the boresight
+    """
+
+    kind: Literal["stray"]
+    ra_deg: Annotated[Number, Field(ge=0, lt=360)]
+    dec_deg: Annotated[Number, Field(ge=-90, le=90)]
+    v_mag: Number = SUN_V_MAG
+    angle_deg: Ascending
+    pst: Annotated[tuple[Fraction, ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def check_columns(self) -> StrayLightConfig:
+        check_table(self.angle_deg, self.pst, "pst")
+        return self
+
+
+class FaintStarsGlowConfig(ConfigModel):
+    """Light of all stars fainter than a V magnitude, by galactic latitude, for skies of kind stars.
+
+    Attributes
+    ----------
+    fainter_than_mag
+        Faintest magnitude of the catalog, or its limit_mag
+    """
+
+    kind: Literal["faint_stars"]
+    fainter_than_mag: Annotated[Number, Field(ge=6, le=15)]
+
+
+Glow = Annotated[
+    UniformGlowConfig
+    | SkyGlowConfig
+    | MoonGlowConfig
+    | StrayLightConfig
+    | FaintStarsGlowConfig,
+    Field(discriminator="kind"),
 ]

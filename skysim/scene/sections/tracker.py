@@ -318,5 +318,7 @@ class FilterConfig(ConfigModel):
     @model_validator(mode="after")
     def check_drift(self) -> FilterConfig:
         if self.mounting_drift_arcsec_sqrt_h and not self.mounting_arcsec:
-            raise InputError("mounting_drift_arcsec_sqrt_h", "requires mounting_arcsec above 0")
+            raise InputError(
+                "mounting_drift_arcsec_sqrt_h", "requires mounting_arcsec above 0"
+            )
         return self

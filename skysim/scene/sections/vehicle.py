@@ -304,7 +304,9 @@ class VehicleConfig(ConfigModel):
             raise InputError("imu.earth_rate", "a free vehicle is not on the Earth", "none")
         if self.mount == "free" and self.trim:
             raise InputError(
-                "trim", "a free vehicle rotates about its center of mass", "mount: air_bearing"
+                "trim",
+                "a free vehicle rotates about its center of mass",
+                "mount: air_bearing",
             )
         return self
 

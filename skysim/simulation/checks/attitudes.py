@@ -182,5 +182,7 @@ def describe(attitudes: CheckedAttitudes, n: int, scene: Scene, mount: Mount) ->
         # Adding 0 turns -0 into 0.
         yaw, pitch, roll = np.round(lab_from_body.as_euler("ZYX", degrees=True), 1) + 0.0
         tilt_deg = float(multibody.tilt_deg(lab_from_body))
-        where = f"roll {roll:.1f}° pitch {pitch:.1f}° yaw {yaw:.1f}°, a tilt of {tilt_deg:.1f}°"
+        where = (
+            f"roll {roll:.1f}° pitch {pitch:.1f}° yaw {yaw:.1f}°, a tilt of {tilt_deg:.1f}°"
+        )
     return where if math.isnan(t_s) else f"{where} (t = {t_s:.1f} s)"

@@ -141,7 +141,9 @@ def known_lights(lab: Lab, camera: CameraModel) -> tuple[Sources, Floats, float,
     sources = lab.camera.sources
     if isinstance(scene.light, DomeConfig):
         if scene.tracker.map:
-            known = np.isin(sources.id, dome_map_file.read_dome_map(Path(scene.tracker.map)).id)
+            known = np.isin(
+                sources.id, dome_map_file.read_dome_map(Path(scene.tracker.map)).id
+            )
             sources = sources.take(known)
         return sources, np.zeros((len(sources), 3)), math.inf, math.nan
     stars = believed_stars(lab)
@@ -277,14 +279,18 @@ def describe(beliefs: Beliefs, scene: Scene) -> list[str]:
             f" J{beliefs.epoch_jyear:.2f} moved to {scene.start_time:%Y-%m-%d}{differ}"
         )
     source = (
-        f"tracker.map {Path(scene.tracker.map).name}" if scene.tracker.map else "tracker.survey"
+        f"tracker.map {Path(scene.tracker.map).name}"
+        if scene.tracker.map
+        else "tracker.survey"
     )
     sigmas = {
         "LEDs": beliefs.led_sigma_m,
         "the lever": beliefs.lever_sigma_m,
         "the surface": beliefs.surface_sigma_m,
     }
-    known = [f"{what} to {1e3 * sigma_m:.3g} mm" for what, sigma_m in sigmas.items() if sigma_m]
+    known = [
+        f"{what} to {1e3 * sigma_m:.3g} mm" for what, sigma_m in sigmas.items() if sigma_m
+    ]
     if known:
         lines.append(f"{', '.join(known)} about each axis ({source})")
     if instrument := scene.tracker.survey.instrument:

@@ -171,9 +171,7 @@ def why_not_compared(context: Context, samples: CheckedSamples) -> str:
         return "tracker.decoder: coded LEDs are named by their codes, so that no field is ambiguous; allowed: none"
     mean = float(samples.reach.counts().mean())
     if mean < MIN_LEDS:
-        return (
-            f"light.layout: {mean:.2g} LEDs in a field on average; allowed: {MIN_LEDS} or more"
-        )
+        return f"light.layout: {mean:.2g} LEDs in a field on average; allowed: {MIN_LEDS} or more"
     return ""
 
 

@@ -121,7 +121,9 @@ def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Common
     shifts_m = survey_errors.station_displacements_m(
         instrument, context.beliefs.lights.place[view.row, :3]
     )
-    parts = [displacement(view, shift_m, lab_from_cam).displacement_px for shift_m in shifts_m]
+    parts = [
+        displacement(view, shift_m, lab_from_cam).displacement_px for shift_m in shifts_m
+    ]
     return Common(np.concatenate(parts, axis=2)) if parts else None
 
 
@@ -199,16 +201,17 @@ def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Com
     return Common((velocity_px_s * delay_s[:, None])[:, :, None])
 
 
-def angular_acceleration(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+def angular_acceleration(
+    view: View, lab_from_cam: Rotation, context: Context
+) -> Common | None:
     """Mean displacement of the images in the exposure from those at mid-exposure, E_i = -J_i a T^2 / 24."""
     return Common(view.bend_px[:, :, None]) if view.bend_px.any() else None
 
 
 def displacement(view: View, shift_lab: Floats, lab_from_cam: Rotation) -> Common:
     """The displacement of the images by shifts (n, 3) of the lights in lab axes, E_i = G_i R shift_i."""
-    return Common(
-        np.einsum("nij,nj->ni", view.gradient, lab_from_cam.inv().apply(shift_lab))[:, :, None]
-    )
+    shift_cam = lab_from_cam.inv().apply(shift_lab)
+    return Common(np.einsum("nij,nj->ni", view.gradient, shift_cam)[:, :, None])
 
 
 CAUSES: dict[str, Callable[[View, Rotation, Context], Independent | Common | None]] = {
@@ -253,9 +256,9 @@ def gains(view: View, sigma_px: Floats, fitted: Floats | None = None) -> Floats:
     LinAlgError
         If the lights do not determine the rotation.
     """
-    jacobian = (
-        view.jacobian if fitted is None else np.concatenate([view.jacobian, fitted], axis=2)
-    )
+    jacobian = view.jacobian
+    if fitted is not None:
+        jacobian = np.concatenate([jacobian, fitted], axis=2)
     weighted = jacobian / sigma_px[:, None, None] ** 2
     # Scale the columns, because a rotation in rad and a shift in meters have different sizes.
     size = np.sqrt(np.einsum("nij,nij->j", jacobian, jacobian))
@@ -317,11 +320,10 @@ def finds_focal_length(context: Context) -> bool:
     scene = context.lab.scene
     if fits_focal_length(context):
         return abs(context.beliefs.focal_error) < FOCAL_UNCERTAINTY
-    under_stars = (
-        isinstance(scene.light, StarsConfig)
-        and (scene.tracker.identifier or "default") == "default"
-    )
-    return under_stars and abs(context.beliefs.focal_error) < WRONG_FOCAL
+    if not isinstance(scene.light, StarsConfig):
+        return False
+    by_default = scene.tracker.identifier in (None, "default")
+    return by_default and abs(context.beliefs.focal_error) < WRONG_FOCAL
 
 
 def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch | None:
@@ -335,15 +337,11 @@ def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch |
     if len(view) < MIN_EVIDENCE_MATCHES:
         return None
     # 1. Displacements.
-    causes = {
-        name: CAUSES[name](view, lab_from_cam, context)
-        for name in (*UNKNOWN_TO_TRACKER, *OUTSIDE_OF_GATE)
-    }
-    shifts = {
-        name: errors.displacement_px
-        for name, errors in causes.items()
-        if isinstance(errors, Common)
-    }
+    shifts = {}
+    for name in (*UNKNOWN_TO_TRACKER, *OUTSIDE_OF_GATE):
+        errors = CAUSES[name](view, lab_from_cam, context)
+        if isinstance(errors, Common):
+            shifts[name] = errors.displacement_px
     if context.beliefs.focal_sigma or finds_focal_length(context):
         shifts.pop("focal length", None)  # the tracker corrects it
     if not shifts:
@@ -353,20 +351,18 @@ def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch |
         gain = gains(view, sigma_px)
     except np.linalg.LinAlgError:
         return None
-    # 2. Residuals of the best rotation.
-    left = {
-        name: shift - view.jacobian @ np.einsum("nij,njk->ik", gain, shift)
-        for name, shift in shifts.items()
-    }
-    rms = {
-        name: float(np.sqrt((shift**2).sum(axis=(1, 2)).mean())) for name, shift in left.items()
-    }
-    # 3. Sum of all causes.
-    known = sum(
-        (shift for name, shift in left.items() if name in UNKNOWN_TO_TRACKER),
-        np.zeros((len(view), 2, 1)),
-    )
-    drawn = [shift for name, shift in left.items() if name in OUTSIDE_OF_GATE]
+    known = np.zeros((len(view), 2, 1))
+    drawn = []
+    rms = {}
+    for name, shift in shifts.items():
+        # 2. Residuals of the best rotation.
+        left = shift - view.jacobian @ np.einsum("nij,njk->ik", gain, shift)
+        rms[name] = float(np.sqrt((left**2).sum(axis=(1, 2)).mean()))
+        # 3. Known errors; those that are drawn once are joined below.
+        if name in UNKNOWN_TO_TRACKER:
+            known = known + left
+        else:
+            drawn.append(left)
     residual_px = np.linalg.norm(np.concatenate([known, *drawn], axis=2), axis=(1, 2))
     return Mismatch(residual_px, GATE_SIGMA * sigma_px, rms)
 

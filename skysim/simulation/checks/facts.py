@@ -222,7 +222,9 @@ class CapMargin(NamedTuple):
     @property
     def text(self) -> str:
         """The reach of the field and the margins in words."""
-        edge, corner = (self.cap_deg - needed for needed in (self.needed_deg, self.corner_deg))
+        edge, corner = (
+            self.cap_deg - needed for needed in (self.needed_deg, self.corner_deg)
+        )
         return (
             f"the field's edge reaches {self.needed_deg:.1f}°, its corner {self.corner_deg:.1f}°: margin {edge:+.1f}°"
             f" and {corner:+.1f}°"
@@ -309,7 +311,10 @@ def cap(context: Context, samples: CheckedSamples) -> Fact | None:
         stop = cap_margin(context, samples, vehicle.tilt_stop_deg)
         assert stop is not None
         lines.append(f"at the tilt stop, {stop.tilt_deg:g}°, {stop.text}")
-        values |= {"stop_deg": stop.tilt_deg, "stop_margin_deg": stop.cap_deg - stop.needed_deg}
+        values |= {
+            "stop_deg": stop.tilt_deg,
+            "stop_margin_deg": stop.cap_deg - stop.needed_deg,
+        }
     return Fact("LED cap", lines, values)
 
 
@@ -326,7 +331,9 @@ def room(context: Context, samples: CheckedSamples) -> Fact | None:
         f"{size:.2f} m" if size is not None else "any"
         for size in (limits.width_m, limits.length_m)
     ]
-    text = f"{x_m:.2f} x {y_m:.2f} x {z_m:.2f} m along x, y, z (room: {floor[0]} x {floor[1]})"
+    text = (
+        f"{x_m:.2f} x {y_m:.2f} x {z_m:.2f} m along x, y, z (room: {floor[0]} x {floor[1]})"
+    )
     if limits.bearing_height_m is not None:
         ceiling = f" of {limits.height_m:.2f} m" if limits.height_m is not None else ""
         text = f"top {values['top_m']:.2f} m{ceiling}, rim {values['rim_m']:.2f} m above the floor; {text}"
@@ -404,7 +411,11 @@ def expected_error(context: Context, samples: CheckedSamples) -> Fact:
             else "no solution"
         )
         lines.append(f"{what}: {errors}{worst}{few}")
-        values[key] = {"cross_arcsec": cross, "roll_arcsec": roll, "without_solution": failing}
+        values[key] = {
+            "cross_arcsec": cross,
+            "roll_arcsec": roll,
+            "without_solution": failing,
+        }
         values[key] |= {
             f"{angle}_causes_arcsec": causes(sampled, angle) for angle in ("cross", "roll")
         }

@@ -52,7 +52,9 @@ MIN_DETECTED = 0.5  # fraction of the lights on the detector that the tracker sh
 # Fraction of the directions in reach, or of the whole sky, that may have fewer than MIN_LIGHTS.
 MAX_FEW = 0.02
 MAX_FEW_SKY = 0.5
-HIGH_THRESHOLD = 20.0  # threshold in sigma above which it is the reason for missing detections
+HIGH_THRESHOLD = (
+    20.0  # threshold in sigma above which it is the reason for missing detections
+)
 MAX_BACKGROUND = 0.5  # fraction of full scale
 MAX_BEYOND = 0.25  # fraction of images beyond the tracker's matching radius up to which frames are identified
 # A path that is longer than both gives a warning; the second is in widths of the image.
@@ -117,7 +119,9 @@ def bright_background(context: Context, samples: CheckedSamples) -> str:
     full_e = full_scale_e(scene.camera.detector)
     if camera.background_e < MAX_BACKGROUND * full_e:
         return ""
-    shorter_ms = 1e3 * scene.exposure.time_s * MAX_BACKGROUND / 2 * full_e / camera.background_e
+    shorter_ms = (
+        1e3 * scene.exposure.time_s * MAX_BACKGROUND / 2 * full_e / camera.background_e
+    )
     most = max(camera.glow_e, key=lambda name: camera.glow_e[name], default=BACKGROUND)
     cause = "" if most == BACKGROUND else f", most of it from {most}"
     return (
@@ -151,7 +155,9 @@ def few_lights(context: Context, samples: CheckedSamples) -> str:
     mount = context.lab.camera.mount
     needed = least_lights(scene)
     # 1. More lights where there are some would not help.
-    if any(find(context, samples) for find in (cap_too_small, dark_corners, bright_background)):
+    if any(
+        find(context, samples) for find in (cap_too_small, dark_corners, bright_background)
+    ):
         return ""
     if scene.tracker.brightest is not None and scene.tracker.brightest < needed:
         return f"tracker.brightest: the tracker uses {scene.tracker.brightest} lights; change it to {needed} or more"
@@ -301,7 +307,9 @@ def not_where_expected(context: Context, samples: CheckedSamples) -> str:
     cam_from_body = context.lab.camera.mount.cam_from_body
     found = [
         one
-        for view, lab_from_body in zip(frames.used, frames.attitudes.lab_from_body, strict=True)
+        for view, lab_from_body in zip(
+            frames.used, frames.attitudes.lab_from_body, strict=True
+        )
         if (one := mismatch(view, lab_from_body * cam_from_body.inv(), context)) is not None
     ]
     if not found:
@@ -371,7 +379,11 @@ def cap_too_small(context: Context, samples: CheckedSamples) -> str:
     """Warn if the field reaches beyond the LEDs at the greatest tilt."""
     found = cap_margin(context, samples)
     light = context.lab.scene.light
-    if found is None or not isinstance(light, DomeConfig) or found.needed_deg <= found.cap_deg:
+    if (
+        found is None
+        or not isinstance(light, DomeConfig)
+        or found.needed_deg <= found.cap_deg
+    ):
         return ""
     # No key changes the positions of listed LEDs.
     if getattr(light.layout, "points", light.layout).kind == "listed":
@@ -495,7 +507,9 @@ def drift_rad(view: View, lab_from_body: Rotation, t_s: float, context: Context)
     return np.asarray(np.einsum("nij,nj->i", gains(view, sigma_px), drifted_px - surveyed_px))
 
 
-def image_px(lights: Sources, mount: Mount, optics: Optics, lab_from_body: Rotation) -> Floats:
+def image_px(
+    lights: Sources, mount: Mount, optics: Optics, lab_from_body: Rotation
+) -> Floats:
     """(n, 2) image positions of lights at an attitude."""
     camera_m = lab_from_body.apply(mount.camera_body_m)
     offset_m = lights.place[:, :3] - lights.place[:, 3:] * camera_m

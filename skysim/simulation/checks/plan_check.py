@@ -90,7 +90,10 @@ def check(
         rates = np.tile(rate_body_rad_s, (len(frames.t_s), 1))
         frames = frames._replace(rate_body_rad_s=rates, acceleration_body_rad_s2=None)
     check_reference(
-        guidance.plan(scene.motion, lab.start, lab.profiles), scene, lab.vehicle, lab.duration_s
+        guidance.plan(scene.motion, lab.start, lab.profiles),
+        scene,
+        lab.vehicle,
+        lab.duration_s,
     )
     # 2. Views.
     samples = samples_of(context, frames, tilt_deg)
@@ -100,13 +103,7 @@ def check(
         for build in (*FACTS, sky_warnings.faintest_star, sky_warnings.fact)
     ]
     facts = [fact for fact in built if fact is not None]
-    found = [
-        find(context, samples)
-        for find in (*FINDINGS, *SKY_FINDINGS, dome_warnings.mirror_images)
-    ]
-    findings = [line for line in found if line]
-    for finder in (sky_warnings.bodies_near, sky_warnings.stray_light, sky_warnings.exclusion):
-        findings += finder(context, samples)
+    findings = warnings_of(context, samples)
     alike = dome_warnings.of(context, samples)
     if alike is not None and isinstance(scene.light, DomeConfig):
         facts.insert(2, dome_warnings.fact(alike))
@@ -121,6 +118,22 @@ def check(
     for n, head in enumerate(checked):
         findings += head_findings(n, head.findings, findings)
     return Check(facts, findings)
+
+
+def warnings_of(context: Context, samples: CheckedSamples) -> list[str]:
+    """The warnings of the views."""
+    found = [
+        find(context, samples)
+        for find in (*FINDINGS, *SKY_FINDINGS, dome_warnings.mirror_images)
+    ]
+    findings = [line for line in found if line]
+    for finder in (
+        sky_warnings.bodies_near,
+        sky_warnings.stray_light,
+        sky_warnings.exclusion,
+    ):
+        findings += finder(context, samples)
+    return findings
 
 
 def ambiguity_map(lab: Lab) -> tuple[Ambiguity, float]:
@@ -200,7 +213,8 @@ def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
     errors = [errors_arcsec(own) for own in facts]
     names = [head.name for head in lab.scene.heads]
     lines = [
-        f"{name}: {errors_text(*error)}" for name, error in zip(names, errors[1:], strict=True)
+        f"{name}: {errors_text(*error)}"
+        for name, error in zip(names, errors[1:], strict=True)
     ]
     combined = together_arcsec(lab, errors)
     lines.append(
@@ -230,5 +244,7 @@ def head_findings(n: int, own: Sequence[str], main: Sequence[str]) -> list[str]:
         line.replace("motion.start:", "rotation_deg:", 1) for line in own if line not in main
     ]
     return [
-        f"heads.{n}.{line}" for line in lines if line.startswith(OWN_KEYS) and line not in main
+        f"heads.{n}.{line}"
+        for line in lines
+        if line.startswith(OWN_KEYS) and line not in main
     ]

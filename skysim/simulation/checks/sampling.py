@@ -90,7 +90,9 @@ def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
     seen = []
     hidden = []
     others = []
-    for exposure, beam, acceleration in zip(exposures, beams, at.accelerations(), strict=True):
+    for exposure, beam, acceleration in zip(
+        exposures, beams, at.accelerations(), strict=True
+    ):
         found, names = known_lights(beam, exposure, context, acceleration)
         known.append(found)
         seen.append(found.take(found.behind == VISIBLE))

@@ -20,7 +20,12 @@ from skysim.simulation.checks.detection import (
     full_scale_e,
     threshold_e,
 )
-from skysim.simulation.checks.expected_error import Independent, covariance, gains, star_places
+from skysim.simulation.checks.expected_error import (
+    Independent,
+    covariance,
+    gains,
+    star_places,
+)
 from skysim.simulation.checks.facts import Fact, short
 from skysim.simulation.checks.findings import few_lights
 from skysim.simulation.checks.sampling import CheckedSamples, Sampled
@@ -50,7 +55,9 @@ def refraction(context: Context, samples: CheckedSamples) -> str:
     atmosphere = find_light(lab.camera.lights, AirEffects)
     if atmosphere is None or lab.scene.tracker.refraction:
         return ""
-    boresight = (at.lab_from_body * lab.camera.mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
+    boresight = (at.lab_from_body * lab.camera.mount.cam_from_body.inv()).apply(
+        [0.0, 0.0, 1.0]
+    )
     zenith = np.array(
         [atmosphere.air.at(exposure.time).zenith for exposure in samples.frames.exposures]
     )
@@ -160,7 +167,9 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
     """
     found = []
     cam_from_body = context.lab.camera.mount.cam_from_body
-    for view, lab_from_body in zip(sampled.used, sampled.attitudes.lab_from_body, strict=True):
+    for view, lab_from_body in zip(
+        sampled.used, sampled.attitudes.lab_from_body, strict=True
+    ):
         own = centroid_variance(view, context, prnu=0.0)
         sigma_px = np.sqrt(np.trace(own, axis1=1, axis2=2) / 2 + floor_px**2)
         try:
@@ -173,7 +182,9 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
         places = star_places(view, lab_from_body * cam_from_body.inv(), context)
         errors = covariance(gain, Independent(centroid_variance(view, context)))
         errors = errors if places is None else errors + covariance(gain, places)
-        information = np.einsum("nij,nik,n->jk", view.jacobian, view.jacobian, 1 / sigma_px**2)
+        information = np.einsum(
+            "nij,nik,n->jk", view.jacobian, view.jacobian, 1 / sigma_px**2
+        )
         found.append(float(np.trace(information @ errors)))
     return float(np.median(found)) if found else math.nan
 
@@ -234,7 +245,9 @@ def stray_light(context: Context, samples: CheckedSamples) -> Iterator[str]:
     at = samples.frames.attitudes
     if lab.scene.camera.baffle is None:
         return
-    by_frame = [stray_e_s(lab.camera.lights, exposure) for exposure in samples.frames.exposures]
+    by_frame = [
+        stray_e_s(lab.camera.lights, exposure) for exposure in samples.frames.exposures
+    ]
     stray_e = context.camera.exposure_s * np.array([sum(one.values()) for one in by_frame])
     n = int(stray_e.argmax())
     own_e2 = context.camera.noise_e**2 - context.camera.stray_e
@@ -259,7 +272,9 @@ def exclusion(context: Context, samples: CheckedSamples) -> Iterator[str]:
     limits = lab.scene.orbit.exclusion if lab.scene.orbit else None
     if limits is None:
         return
-    boresight = (at.lab_from_body * lab.camera.mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
+    boresight = (at.lab_from_body * lab.camera.mount.cam_from_body.inv()).apply(
+        [0.0, 0.0, 1.0]
+    )
     angles_deg = np.array(
         [
             beside_deg(context, t, axis)
@@ -382,9 +397,9 @@ def detection_limit_mag(context: Context, samples: CheckedSamples) -> float:
         context.settings.min_area_px / (2 * math.pi * blur2_px2)
     )
     none = np.zeros(1)
-    share = peak_share(np.array([blur2_px2]), none, none, np.array([least_streak_px(samples)]))[
-        0
-    ]
+    share = peak_share(
+        np.array([blur2_px2]), none, none, np.array([least_streak_px(samples)])
+    )[0]
     reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
     return 2.5 * math.log10(
         reference_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s * share / peak_e

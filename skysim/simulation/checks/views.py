@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from scipy import special
 
 from skysim.camera.optics import Optics
+from skysim.camera.projection import Poses, in_view, project, rates_e_s
 from skysim.camera.psf.kernel import build_kernel
 from skysim.camera.psf.otf import blur_radius_px, chromatic_sigma_px, field_sigma_px
-from skysim.camera.render import in_view, project, rates_e_s
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Sources
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lab import Lab
 from skysim.simulation.lights.lens import STRAY_LIGHT
@@ -152,7 +152,9 @@ class CameraModel(NamedTuple):
         dark_e_s = detector.dark_e_s * 2.0**detector.doublings
         background_e = sum(glow_e.values()) + dark_e_s * exposure_s
         # Variances of the fixed pattern and of the read-out; a converter's step q has the variance q^2 / 12.
-        pattern_e2 = (detector.dsnu * dark_e_s * exposure_s) ** 2 + detector.column_offset_e**2
+        pattern_e2 = (
+            detector.dsnu * dark_e_s * exposure_s
+        ) ** 2 + detector.column_offset_e**2
         read_e2 = (
             detector.read_noise_e**2
             + detector.reset_noise_e**2
@@ -194,20 +196,11 @@ def view(
 
     1. Select the points on the detector.
     2. Electrons, from rate and on-time.
-    3. Vectors to the lights, and the derivatives of the images.
-    4. Paths. At the time t from mid-exposure the lights are rotated by -(rate t + acceleration t^2 / 2), with the
-       vehicle's rate and acceleration in body axes. The mean over the exposure T is -acceleration T^2 / 24. Moving
-       lights add their own motion.
-    5. Sizes of lens image, LED disk and defocus disk.
+    3. Vectors to the lights, derivatives of the images, paths.
+    4. Sizes of lens image, LED disk and defocus disk.
 
     Parameters
     ----------
-    lit
-        Light with points
-    exposure
-        Exposure
-    camera
-        Camera
     occluders
         Occluders of the points; their numbers are in `behind`
     acceleration_body_rad_s2
@@ -217,44 +210,22 @@ def view(
     assert lit.points is not None
     mount = exposure.mount
     optics = exposure.optics
-    exposure_s = camera.exposure_s
-    near = in_view(lit.points, optics, exposure.pose, reach=0.0)
-    xy_px, distance_m, cos_out, cos_in = (
-        one[0] for one in project(lit.points.take(near), optics, exposure.pose)
-    )
-    size = np.array([optics.camera.width_px, optics.camera.height_px])
-    on_chip = ((xy_px > -0.5) & (xy_px < size - 0.5)).all(axis=1)
-    row = near[on_chip]
+    row, (xy_px, distance_m, cos_out, cos_in) = on_detector(lit.points, optics, exposure.pose)
     chosen = lit.points.take(row)
-    is_led = lit.points.place[row, 3] > 0
-    xy_px, distance_m, cos_out, cos_in = (
-        one[on_chip] for one in (xy_px, distance_m, cos_out, cos_in)
-    )
     # 2. Electrons.
     rate_e_s = rates_e_s(chosen, optics, lit.emitter, distance_m, cos_out, cos_in)
-    electrons = rate_e_s * np.minimum(chosen.on_s / chosen.period_s, 1.0) * exposure_s
-    # 3. Derivatives.
+    electrons = rate_e_s * np.minimum(chosen.on_s / chosen.period_s, 1.0) * camera.exposure_s
+    # 3. Vectors, derivatives, paths.
     arm_m = exposure.cam_from_lab.apply(chosen.place[:, :3])
     offset_m = arm_m - chosen.place[:, 3:] * mount.cam_from_body.apply(mount.camera_body_m)
     gradient = image_gradient(optics, offset_m)
-    jacobian = np.cross(arm_m[:, None, :], gradient)
-    # 4. Paths.
-    rate_cam = mount.cam_from_body.apply(exposure.trajectory.rate_at(exposure.t_s))
-    acceleration_cam = mount.cam_from_body.apply(acceleration_body_rad_s2)
-    streak_px = -exposure_s * np.einsum("nij,j->ni", jacobian, rate_cam)
-    bend_px = -(exposure_s**2 / 24) * np.einsum("nij,j->ni", jacobian, acceleration_cam)
-    if chosen.motion is not None:
-        motion_cam = exposure.cam_from_lab.apply(chosen.motion[:, 0])
-        streak_px = streak_px + exposure_s * np.einsum("nij,nj->ni", gradient, motion_cam)
-    # 5. Sizes.
-    depth_m = np.where(is_led, offset_m[:, 2], np.inf)
-    disk_px = np.where(is_led, optics.camera.focal_px * chosen.radius_m / distance_m, 0.0)
-    lens2_px2 = camera.lens_px**2 + field_sigma_px(optics.camera.psf, optics.camera, xy_px) ** 2
-    shift_m: Floats | float = 0.0
-    if chosen.chromatic is not None:
-        shift_m = chosen.chromatic[:, 0]
-        lens2_px2 = lens2_px2 + chromatic_sigma_px(optics.camera, chosen.chromatic, xy_px) ** 2
-    defocus_px = blur_radius_px(optics.camera, depth_m, shift_m)
+    streak_px, bend_px = paths_px(
+        exposure, camera.exposure_s, chosen.motion, arm_m, gradient, acceleration_body_rad_s2
+    )
+    # 4. Sizes.
+    depth_m = np.where(chosen.place[:, 3] > 0, offset_m[:, 2], np.inf)
+    disk_px = optics.camera.focal_px * chosen.radius_m / distance_m  # a star has no radius
+    lens2_px2, defocus_px = lens_blur(camera, chosen, xy_px, depth_m)
     share = peak_share(lens2_px2, disk_px, defocus_px, np.linalg.norm(streak_px, axis=1))
     sigma_px = np.sqrt(lens2_px2 + (disk_px**2 + defocus_px**2) / 4)
     return View(
@@ -275,6 +246,57 @@ def view(
     )
 
 
+def on_detector(
+    points: Sources, optics: Optics, pose: Poses
+) -> tuple[NDArray[np.int64], list[Floats]]:
+    """Rows of the points whose images are on the detector, and what `project` returns for these at the one pose."""
+    near = in_view(points, optics, pose, reach=0.0)
+    projected = [one[0] for one in project(points.take(near), optics, pose)]
+    xy_px = projected[0]
+    size = np.array([optics.camera.width_px, optics.camera.height_px])
+    on_chip = ((xy_px > -0.5) & (xy_px < size - 0.5)).all(axis=1)
+    return near[on_chip], [one[on_chip] for one in projected]
+
+
+def paths_px(
+    exposure: Exposure,
+    exposure_s: float,
+    motion: Floats | None,
+    arm_m: Floats,
+    gradient: Floats,
+    acceleration_body_rad_s2: Floats,
+) -> tuple[Floats, Floats]:
+    """(n, 2) paths during the exposure, and (n, 2) means of the paths minus their middles, as in `View`.
+
+    At the time t from mid-exposure the lights are rotated by -(rate t + acceleration t^2 / 2), with the vehicle's
+    rate and acceleration in body axes. The mean over the exposure T is -acceleration T^2 / 24. Moving lights add
+    their own `motion`.
+    """
+    jacobian = np.cross(arm_m[:, None, :], gradient)
+    cam_from_body = exposure.mount.cam_from_body
+    rate_cam = cam_from_body.apply(exposure.trajectory.rate_at(exposure.t_s))
+    acceleration_cam = cam_from_body.apply(acceleration_body_rad_s2)
+    streak_px = -exposure_s * np.einsum("nij,j->ni", jacobian, rate_cam)
+    bend_px = -(exposure_s**2 / 24) * np.einsum("nij,j->ni", jacobian, acceleration_cam)
+    if motion is not None:
+        motion_cam = exposure.cam_from_lab.apply(motion[:, 0])
+        streak_px = streak_px + exposure_s * np.einsum("nij,nj->ni", gradient, motion_cam)
+    return streak_px, bend_px
+
+
+def lens_blur(
+    model: CameraModel, points: Sources, xy_px: Floats, depth_m: Floats
+) -> tuple[Floats, Floats]:
+    """(n,) variances of the lens's images at xy_px, in px^2, and (n,) radii of the defocus disks in px."""
+    camera = model.optics.camera
+    lens2_px2 = model.lens_px**2 + field_sigma_px(camera.psf, camera, xy_px) ** 2
+    shift_m: Floats | float = 0.0
+    if points.chromatic is not None:
+        shift_m = points.chromatic[:, 0]
+        lens2_px2 = lens2_px2 + chromatic_sigma_px(camera, points.chromatic, xy_px) ** 2
+    return lens2_px2, blur_radius_px(camera, depth_m, shift_m)
+
+
 def hiding(occluders: Sequence[Occluder], place: Floats) -> NDArray[np.int64]:
     """(N,) number of the last occluder that hides each of N places; VISIBLE for none."""
     found = np.full(len(place), VISIBLE)
@@ -287,7 +309,9 @@ def image_gradient(optics: Optics, offset_m: Floats) -> Floats:
     """(n, 2, 3) derivatives of the image positions by the offsets in camera axes, from central differences."""
     step_m = STEP * np.linalg.norm(offset_m, axis=1)[:, None, None] * np.eye(3)
     ahead, behind = (optics.project(offset_m[:, None, :] + sign * step_m) for sign in (1, -1))
-    return np.asarray(np.swapaxes(ahead - behind, 1, 2) / (2 * step_m.max(axis=2)[:, None, :]))
+    return np.asarray(
+        np.swapaxes(ahead - behind, 1, 2) / (2 * step_m.max(axis=2)[:, None, :])
+    )
 
 
 def peak_share(

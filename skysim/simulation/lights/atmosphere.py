@@ -12,7 +12,7 @@ from typing import ClassVar
 
 from skysim.camera.glow.air_glow import air_glow
 from skysim.camera.glow.background import node_directions, viewing_geometry
-from skysim.camera.render import in_view
+from skysim.camera.projection import in_view
 from skysim.core.random_streams import SCINTILLATION, random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.light import StarsConfig
@@ -90,7 +90,9 @@ def seen_points(sky: Sky, points: Sources, exposure: Exposure) -> Sources:
     if not sky.air.config.scintillation or exposure.seeds is None:
         return seen
     rng = random_stream(exposure.seeds.camera, SCINTILLATION, exposure.index)
-    return sky.twinkling(seen, exposure.optics.camera.pupil_m, exposure.window.exposure_s, rng)
+    return sky.twinkling(
+        seen, exposure.optics.camera.pupil_m, exposure.window.exposure_s, rng
+    )
 
 
 def build(plan: LightPlan) -> Iterator[Light]:

@@ -94,7 +94,9 @@ class LedDome(KnownLight):
             while len(self._timing) >= MAX_RUNS:
                 self._timing.pop(next(iter(self._timing)))
             clocks = build_clocks(self.config, self.sources, seed)
-            self._timing[seed] = LedTiming(clocks, build_codes(self.config, self.sources, seed))
+            self._timing[seed] = LedTiming(
+                clocks, build_codes(self.config, self.sources, seed)
+            )
         return self._timing[seed]
 
 
@@ -106,7 +108,11 @@ class CollimatedDisplay(KnownLight):
 
     def during(self, exposure: Exposure) -> Lit:
         return Lit(
-            "stars", True, self.sources, self.emitter, edged=black_pixels(self.config, exposure)
+            "stars",
+            True,
+            self.sources,
+            self.emitter,
+            edged=black_pixels(self.config, exposure),
         )
 
 

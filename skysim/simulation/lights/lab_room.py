@@ -54,7 +54,11 @@ class WallGlow(Light):
     def glow(self, exposure: Exposure) -> Floats:
         """(h, w) electrons s^-1 px^-1 at the nodes of the background."""
         full = wall_glow(
-            self.dome, exposure.optics, exposure.cam_from_lab, exposure.camera_m, exposure.band
+            self.dome,
+            exposure.optics,
+            exposure.cam_from_lab,
+            exposure.camera_m,
+            exposure.band,
         )
         return warm_up_factor(self.warm_up, exposure.t_s) * full
 

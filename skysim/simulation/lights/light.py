@@ -25,7 +25,8 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.discs import FEW, Exposed, centers_of
 from skysim.camera.optics import Optics
-from skysim.camera.render import OcclusionTest, Poses, Window, poses
+from skysim.camera.projection import Poses, poses
+from skysim.camera.render import OcclusionTest, Window
 from skysim.core.types import Floats, Mount, SatelliteTruth, Sources, Trajectory
 from skysim.dynamics.multibody.model import VehicleModel
 from skysim.scene.scene import Scene

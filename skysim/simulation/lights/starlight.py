@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.glow.background import glow_map
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, StarSources
-from skysim.scene.sections.light import Glow, StarsConfig
+from skysim.scene.sections.light import StarsConfig
+from skysim.scene.sections.surroundings import Glow
 from skysim.simulation.lights.light import Exposure, KnownLight, Light, LightPlan, Lit
 from skysim.sources import stars
 from skysim.sources.dome.led import Emitter
@@ -63,7 +64,9 @@ def stars_of(config: StarsConfig, plan: LightPlan) -> KnownLight:
     if config.variability_seed is not None:
         if not catalog.scatter_mag.any():
             raise InputError(
-                "light.variability_seed", f"{config.catalog} has no variable stars", "gaia_v8.0"
+                "light.variability_seed",
+                f"{config.catalog} has no variable stars",
+                "gaia_v8.0",
             )
         catalog = stars.varied(catalog, config.variability_seed)
     # Anything that depends on the place of the camera makes its velocity matter for the aberration, too.

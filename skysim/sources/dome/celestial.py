@@ -143,7 +143,9 @@ def merge_stars(stars: ProjectedStars, target: NDArray[np.int64]) -> ProjectedSt
     )
 
 
-def merge_close_stars(stars: ProjectedStars, count: int, separation_m: float) -> ProjectedStars:
+def merge_close_stars(
+    stars: ProjectedStars, count: int, separation_m: float
+) -> ProjectedStars:
     """The first `count` stars as LEDs, no two nearer to each other than separation_m.
 
     A merged LED is between the places of its stars and may be too near a third star, so merging repeats until no two
@@ -189,7 +191,10 @@ def select_brightest(
 
 
 def led_levels(
-    config: layouts.CelestialConfig, stars: ProjectedStars, normal: Floats, led: leds.LedConfig
+    config: layouts.CelestialConfig,
+    stars: ProjectedStars,
+    normal: Floats,
+    led: leds.LedConfig,
 ) -> Floats:
     """(N,) levels for which the irradiance at the camera's nominal place follows Pogson's law, 10^(-0.4 m).
 

@@ -51,6 +51,8 @@ MAX_DATA_BITS = 20  # 2^20 words are listed at most
 @lru_cache(maxsize=8)  # every trial of a study asks for the same codebook
 def codebook(config: Code, count: int) -> Words:
     """(count, frames) levels of a scene's code, 0 the lowest; read-only.
+
+    Raises
     ------
     InputError
         If the kind has fewer words.
@@ -101,8 +103,9 @@ def symbols_of(words: Words, bits: int) -> Words:
 
     From reflected to plain binary digits each digit is the exclusive or of all digits before it.
     """
-    padded = np.pad(words, ((0, 0), (0, -words.shape[1] % bits))).reshape(len(words), -1, bits)
-    digits = np.bitwise_xor.accumulate(padded, axis=2)
+    missing = -words.shape[1] % bits
+    padded = np.pad(words, ((0, 0), (0, missing)))
+    digits = np.bitwise_xor.accumulate(padded.reshape(len(words), -1, bits), axis=2)
     return (digits @ (1 << np.arange(bits)[::-1])).astype(np.uint8)
 
 
@@ -122,8 +125,7 @@ def de_bruijn(count: int, levels: int) -> Words:
     word = [0]
     sequence = [0]
     while word:
-        # Next Lyndon word: repeat to the length k, drop the highest symbols at the end, raise the
-        # last (Duval).
+        # Next Lyndon word: repeat to the length k, drop the highest symbols at the end, raise the last (Duval).
         word = (word * k)[:k]
         while word and word[-1] == levels - 1:
             word.pop()

@@ -133,7 +133,9 @@ def filtered_share(pulses: Sources, filter_s: Floats, begin_s: float, end_s: flo
 
     lit0_s, voltage0 = lit_s_and_voltage(begin_s)
     lit1_s, voltage1 = lit_s_and_voltage(end_s)
-    return np.asarray((lit1_s - lit0_s - filter_s * (voltage1 - voltage0)) / (end_s - begin_s))
+    return np.asarray(
+        (lit1_s - lit0_s - filter_s * (voltage1 - voltage0)) / (end_s - begin_s)
+    )
 
 
 def build_clocks(light: Light, sources: Sources, seed: int) -> Clocks | None:
@@ -178,7 +180,9 @@ class LedCodes:
     clock: Clocks | None
     seed: int
 
-    def shown(self, sources: Sources, open_s: float, exposure_s: float, frame: int) -> Sources:
+    def shown(
+        self, sources: Sources, open_s: float, exposure_s: float, frame: int
+    ) -> Sources:
         """The dome's LEDs with their mean light in the exposure of a frame."""
         level = self.mean_level(open_s, exposure_s, frame)
         return replace(sources, strength=sources.strength * level)

@@ -57,7 +57,9 @@ class PixelBlocks(NamedTuple):
     level: Floats
 
 
-def draw_blocks(config: layouts.PixelsConfig, position_m: Floats, level: Floats) -> PixelBlocks:
+def draw_blocks(
+    config: layouts.PixelsConfig, position_m: Floats, level: Floats
+) -> PixelBlocks:
     """Draw stars as blocks of pixels: places rounded to the nearest block that fits, levels to the nearest gray.
 
     Rounding to a pitch p is an error uniform over p, p / sqrt(12) rms along each axis. A returned level of 0 is a
@@ -248,7 +250,9 @@ def block_sources(
 
 def lab_from_icrs(config: light.CollimatedDisplayConfig) -> Rotation:
     """Rotation from ICRS to lab axes: the collimator's axis is lab +z, roll is the position angle of lab -y."""
-    return star_sources.cam_from_icrs(config.axis_ra_deg, config.axis_dec_deg, config.roll_deg)
+    return star_sources.cam_from_icrs(
+        config.axis_ra_deg, config.axis_dec_deg, config.roll_deg
+    )
 
 
 def display_sources(
@@ -480,7 +484,9 @@ def projector_sources(
     place_m = surface.meet(position_m, ray)
     if np.isnan(place_m).any():
         raise InputError(
-            "light.layout.points", "a star's pixel is below the dome's rim", "a smaller cap_deg"
+            "light.layout.points",
+            "a star's pixel is below the dome's rim",
+            "a smaller cap_deg",
         )
     normal = surface.inward(place_m)
     lens_disk_m = spot_radius_m(config, surface, drawn_m, place_m, normal)

@@ -83,7 +83,9 @@ def diffuse_light(
     patches = wall_patches(wall, config.diffuse)
     if config.floor:
         floor = floor_patches(config.floor)
-        patches = Patches(*(np.concatenate(pair) for pair in zip(patches, floor, strict=True)))
+        patches = Patches(
+            *(np.concatenate(pair) for pair in zip(patches, floor, strict=True))
+        )
     # 2. Direct light.
     emitters = led_emitters(leds, lobe)
     direct = irradiance(patches.place_m, patches.normal, emitters)
@@ -132,11 +134,18 @@ def floor_patches(config: FloorConfig) -> Patches:
     radius_m = config.radius_m * np.sqrt((np.arange(PATCHES) + 0.5) / PATCHES)
     azimuth = np.arange(PATCHES) * GOLDEN_ANGLE_RAD
     place_m = np.column_stack(
-        [radius_m * np.cos(azimuth), radius_m * np.sin(azimuth), 0 * radius_m - config.depth_m]
+        [
+            radius_m * np.cos(azimuth),
+            radius_m * np.sin(azimuth),
+            0 * radius_m - config.depth_m,
+        ]
     )
     area_m2 = np.full(PATCHES, np.pi * config.radius_m**2 / PATCHES)
     return Patches(
-        place_m, np.tile([0.0, 0.0, 1.0], (PATCHES, 1)), area_m2, np.full(PATCHES, config.share)
+        place_m,
+        np.tile([0.0, 0.0, 1.0], (PATCHES, 1)),
+        area_m2,
+        np.full(PATCHES, config.share),
     )
 
 
@@ -200,7 +209,9 @@ def _irradiance(
             emission = (
                 x * emitter_normal[n, 0] + y * emitter_normal[n, 1] + z * emitter_normal[n, 2]
             ) / distance
-            incidence = -(x * normals[m, 0] + y * normals[m, 1] + z * normals[m, 2]) / distance
+            incidence = (
+                -(x * normals[m, 0] + y * normals[m, 1] + z * normals[m, 2]) / distance
+            )
             if emission > 0 and incidence > 0:
                 # The lobe between its samples.
                 at = min(emission, 1.0) * last

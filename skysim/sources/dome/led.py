@@ -64,7 +64,10 @@ def table_lobe(config: LobeTableConfig, cos_emission: Floats) -> Floats:
 
 
 # Arguments: its section of the scene, cosine of the angle from the LED's normal. Intensity is 1 on the normal.
-LOBES: dict[str, Callable[[Any, Floats], Floats]] = {"cosine": cosine_lobe, "table": table_lobe}
+LOBES: dict[str, Callable[[Any, Floats], Floats]] = {
+    "cosine": cosine_lobe,
+    "table": table_lobe,
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,9 +39,7 @@ from skysim.sources.satellites import MIRRORED
 
 STEP_RAD = 1e-5  # of the difference quotients: error 1e-10
 STEPS = 12  # of Newton's method
-REACH = (
-    12.0  # largest angle from an LED to a ray of the grid to start from, in the grid's spacing
-)
+REACH = 12.0  # largest angle from an LED to a ray of the grid to start from, in the grid's spacing
 TOUCHING = 1e-4  # an image nearer to the LED itself, in units of the camera's distance, is no reflection
 SAME_RAD = 1e-7  # two solutions for an LED nearer to each other are one image
 CLOSE = 1e-9  # largest offset of a solution from the ray, in units of the LED's distance
@@ -101,13 +99,11 @@ def mirrored(
     normal = wall.inward(images.wall_m) if len(images.led) else np.zeros((0, 3))
     # 4. The virtual LED's normal is the LED's, mirrored at the wall.
     across = np.sum(sources.normal * normal, axis=1, keepdims=True)
-    place = np.column_stack(
-        [camera_m + images.toward * images.distance_m[:, None], np.ones(len(sources))]
-    )
+    virtual_m = camera_m + images.toward * images.distance_m[:, None]
     return replace(
         sources,
         id=sources.id + MIRRORED * numbered(images.led),
-        place=place,
+        place=np.column_stack([virtual_m, np.ones(len(sources))]),
         normal=sources.normal - 2 * across * normal,
         strength=sources.strength * reflectance(config, images.cosine),
     )
@@ -145,16 +141,15 @@ def find_images(wall: Surface, led_m: Floats, camera_m: Floats, grid: Floats) ->
             step = -np.einsum("kij,kj->ki", inverse(jacobian), offset)
         toward = toward + np.einsum("ki,kij->kj", np.clip(step, -0.1, 0.1), axes)
         toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    # 3. What a solution must satisfy: F = 0, an LED off the wall and ahead of the reflected ray, in
-    # the field.
+    # 3. What a solution must satisfy: F = 0, an LED off the wall and ahead of the reflected ray, in the field.
     offset, jacobian, _ = linearized(wall, led_m[led], camera_m, toward)
     rays = reflect(wall, camera_m, toward)
     to_led = led_m[led] - rays.wall_m
     far_m = np.linalg.norm(to_led, axis=1)
     path_m = np.linalg.norm(rays.wall_m - camera_m, axis=1)
     solved = (np.linalg.norm(offset, axis=1) < CLOSE * far_m) & (far_m > TOUCHING * path_m)
-    on_wall = np.isfinite(wall.meet(camera_m, toward)[:, 0])
-    solved &= on_wall & (np.sum(to_led * rays.along, axis=1) > 0)
+    solved &= np.isfinite(wall.meet(camera_m, toward)[:, 0])
+    solved &= np.sum(to_led * rays.along, axis=1) > 0
     solved &= cosines_to_grid(toward, grid) > 0
     # d = sqrt(|det dF / du|).
     distance_m = np.sqrt(np.abs(np.linalg.det(np.nan_to_num(jacobian))))
@@ -188,7 +183,8 @@ def nearest_rays(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """LEDs (K,) and rays (K,), as flat indices of the grid, at which an LED's angle from the reflected ray is least."""
     rays = reflect(wall, camera_m, grid.reshape(-1, 3))
-    spacing_rad = float(np.arccos(np.clip(np.sum(grid[1:] * grid[:-1], axis=2), -1, 1)).max())
+    cosine = np.sum(grid[1:] * grid[:-1], axis=2)
+    spacing_rad = float(np.arccos(np.clip(cosine, -1, 1)).max())
     limit = np.cos(min(REACH * spacing_rad, np.pi))
     shape = (*grid.shape[:2], 3)
     found = _minima(

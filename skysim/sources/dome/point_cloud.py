@@ -111,7 +111,13 @@ def fit_ellipsoid(points_m: Floats) -> FittedEllipsoid:
         return np.asarray((norm - 1) * norm / np.linalg.norm(w / axes, axis=1))
 
     solution = scipy.optimize.least_squares(
-        residual_m, np.zeros(6), method="lm", xtol=1e-13, ftol=1e-13, gtol=1e-13, max_nfev=4000
+        residual_m,
+        np.zeros(6),
+        method="lm",
+        xtol=1e-13,
+        ftol=1e-13,
+        gtol=1e-13,
+        max_nfev=4000,
     )
     center_m = sphere.center_m + sphere.radius_m * solution.x[:3]
     rms_m = float(np.sqrt(np.mean(solution.fun**2)))
@@ -154,7 +160,9 @@ def zernike(degree: int, disk: Floats) -> tuple[Floats, Floats]:
             # For m = 0 there is no imaginary part.
             for component in (np.real, np.imag)[: 1 + (m > 0)]:
                 values.append(component(value))
-                slopes.append(np.stack([component(derivative) for derivative in slope], axis=1))
+                slopes.append(
+                    np.stack([component(derivative) for derivative in slope], axis=1)
+                )
     return np.stack(values, axis=1), np.stack(slopes, axis=1)
 
 
@@ -269,6 +277,16 @@ def read(file: str, unit: str) -> Floats:
     return points * UNIT_M[unit]
 
 
+def covered_rad(unit: Floats) -> tuple[float, float]:
+    """Angles from +z up to which directions (N, 3) cover all azimuths, and of the farthest direction."""
+    angle = np.arctan2(np.hypot(unit[:, 0], unit[:, 1]), unit[:, 2])
+    azimuth = np.arctan2(unit[:, 1], unit[:, 0])
+    sector = np.floor((azimuth / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
+    # Of the farthest point in each sector of azimuth, the least.
+    farthest = [float(angle[sector == n].max(initial=0.0)) for n in range(SECTORS)]
+    return min(farthest), float(angle.max())
+
+
 def fit(points_m: Floats, degree: int, file: str) -> SurfaceFit:
     """Smooth surface fitted to points of a dome whose axis is about +z: linear least squares in the radius.
 
@@ -308,12 +326,7 @@ def fit(points_m: Floats, degree: int, file: str) -> SurfaceFit:
     relative_m = points_m - sphere.center_m
     radius_m = np.linalg.norm(relative_m, axis=1)
     unit = relative_m / radius_m[:, None]
-    angle = np.arctan2(np.hypot(unit[:, 0], unit[:, 1]), unit[:, 2])
-    azimuth = np.arctan2(unit[:, 1], unit[:, 0])
-    sector = np.floor((azimuth / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
-    # Covered angle: of the farthest point in each sector of azimuth, the least.
-    cover_rad = min(float(angle[sector == n].max(initial=0.0)) for n in range(SECTORS))
-    half_rad = float(angle.max())
+    cover_rad, half_rad = covered_rad(unit)
     # 3.
     design, _ = zernike(degree, to_disk(unit, half_rad)[0])
     coefficient, _, _, singular = np.linalg.lstsq(design, radius_m)

@@ -49,7 +49,9 @@ def check_room(room: RoomConfig, surface: Surface, cap_deg: float) -> None:
                 f"{-low_m[2]:.3f} m or more, or a higher rim",
             )
     # Widths between the walls.
-    for axis, (key, limit_m) in enumerate((("width", room.width_m), ("length", room.length_m))):
+    for axis, (key, limit_m) in enumerate(
+        (("width", room.width_m), ("length", room.length_m))
+    ):
         if limit_m is not None and high_m[axis] - low_m[axis] > limit_m:
             raise InputError(
                 f"light.room.{key}",
@@ -154,7 +156,9 @@ def best_box(
     return sides_m[best], float(ratio[best])
 
 
-def shell_m(room: RoomConfig, surface: Surface, cap_deg: float, azimuth_rad: Floats) -> Floats:
+def shell_m(
+    room: RoomConfig, surface: Surface, cap_deg: float, azimuth_rad: Floats
+) -> Floats:
     """(N, 3) points of the shell on meridians of these azimuths about the bearing, inside and outside.
 
     1. Sample each meridian at equal steps of the angle from the zenith.
@@ -188,7 +192,9 @@ def shell_m(room: RoomConfig, surface: Surface, cap_deg: float, azimuth_rad: Flo
         inner = inner[inside]
         outer = outer[inside]
         column = column[inside]
-        edges.append(find_edges(surface, tilt_rad[inner], tilt_rad[outer], azimuth_rad[column]))
+        edges.append(
+            find_edges(surface, tilt_rad[inner], tilt_rad[outer], azimuth_rad[column])
+        )
     points_m = np.concatenate([met[np.isfinite(met[:, 0])], *edges])
     if not len(points_m):
         raise InputError(

@@ -115,12 +115,16 @@ class Surface(ABC):
     def exit_m(self, origin_m: Floats, rays: Floats) -> Floats:
         """(N,) distances of rays in the lab's axes to the surface, or to its continuation beyond the rim."""
         R_lab_from_own = self.lab_from_own.as_matrix()
-        return self.distance((origin_m - self.center_m) @ R_lab_from_own, rays @ R_lab_from_own)
+        return self.distance(
+            (origin_m - self.center_m) @ R_lab_from_own, rays @ R_lab_from_own
+        )
 
     def inward(self, points_m: Floats) -> Floats:
         """(N, 3) unit normals toward the inside, at points of the surface: minus the level's gradient."""
         R_lab_from_own = self.lab_from_own.as_matrix()
-        gradient = self.gradient((points_m - self.center_m) @ R_lab_from_own) @ R_lab_from_own.T
+        gradient = (
+            self.gradient((points_m - self.center_m) @ R_lab_from_own) @ R_lab_from_own.T
+        )
         return np.asarray(-gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
 
     def inside(self, point_m: Floats) -> bool:
@@ -410,7 +414,9 @@ class Radial(Surface):
             step = distance - level / np.where(slope > 0, slope, np.nan)
             newton = (step > low) & (step < high) & (np.abs(level) <= before / 2)
             before = np.abs(level)
-            distance = np.where(unconverged, np.where(newton, step, (low + high) / 2), distance)
+            distance = np.where(
+                unconverged, np.where(newton, step, (low + high) / 2), distance
+            )
         raise ArithmeticError(
             f"no convergence on the surface for {unconverged.sum()} rays in {MAX_STEPS} steps"
         )
@@ -533,7 +539,9 @@ def build_surface(config: light.SurfaceConfig) -> Surface:
     """
     surface = SURFACES[config.kind](config)
     if not surface.inside(np.zeros(3)):
-        check = "file, unit, offset" if config.kind == "surveyed" else "apex, sizes and offset"
+        check = (
+            "file, unit, offset" if config.kind == "surveyed" else "apex, sizes and offset"
+        )
         place = "not below the panel" if isinstance(surface, Plane) else "outside of the dome"
         raise InputError("light.surface", f"the bearing's center is {place}; check {check}")
     if not len(surface.samples_m()):
@@ -577,5 +585,7 @@ def cap_area_m2(surface: Surface, cap_deg: float) -> float:
     rays = rays[met]
     # dA / dW, and the weights dW.
     element_m2 = np.sum(place_m**2, axis=1) / -np.sum(rays * surface.inward(place_m), axis=1)
-    solid = np.repeat(weight, AREA_SECTORS)[met] * (1 - least) / 2 * (2 * np.pi / AREA_SECTORS)
+    solid = (
+        np.repeat(weight, AREA_SECTORS)[met] * (1 - least) / 2 * (2 * np.pi / AREA_SECTORS)
+    )
     return float(element_m2 @ solid)

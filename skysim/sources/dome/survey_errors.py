@@ -240,7 +240,9 @@ def led_covariance_m2(place_m: Floats, config: SurveyErrorsConfig) -> Floats | N
     """(N, 3, 3) covariances of the LEDs' own errors; None if they are those of led_sigma alone."""
     if config.instrument is None:
         return None
-    return station_covariance_m2(config.instrument, place_m) + config.led_sigma_m**2 * np.eye(3)
+    return station_covariance_m2(config.instrument, place_m) + config.led_sigma_m**2 * np.eye(
+        3
+    )
 
 
 def across_sigma_m(place_m: Floats, covariance_m2: Floats) -> Floats:

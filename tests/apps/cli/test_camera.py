@@ -49,11 +49,15 @@ def test_a_preset_is_shown_with_a_lens_and_without(camera: Command) -> None:
         line(camera("imx264"), "field of view")
         == "no lens: add --set camera.focal_length='16 mm'"
     )
-    shown = json.loads(camera("--json", "imx264", "--set", "camera.focal_length=16 mm").stdout)
+    shown = json.loads(
+        camera("--json", "imx264", "--set", "camera.focal_length=16 mm").stdout
+    )
     assert shown["field_deg"][0] == pytest.approx(
         2 * math.degrees(math.atan(2448 * 3.45e-6 / 2 / 0.016)), rel=1e-12
     )
-    assert shown["arcsec_px"] == pytest.approx(math.degrees(3.45e-6 / 0.016) * 3600, rel=1e-12)
+    assert shown["arcsec_px"] == pytest.approx(
+        math.degrees(3.45e-6 / 0.016) * 3600, rel=1e-12
+    )
 
 
 def test_a_calibration_is_written_and_shown(camera: Command, tmp_path: Path) -> None:

@@ -62,9 +62,12 @@ def test_an_example_calls_its_command_with_options_that_it_has(name: str, line: 
     path, command, left = command_of(words)
     assert program == "skysim"
     assert path == name or (
-        f"{path} ".startswith(f"{name} ".lstrip()) and hasattr(commands(ROOT)[name], "commands")
+        f"{path} ".startswith(f"{name} ".lstrip())
+        and hasattr(commands(ROOT)[name], "commands")
     )
-    command.make_context(path, list(left))  # raises for an unknown option or a missing argument
+    command.make_context(
+        path, list(left)
+    )  # raises for an unknown option or a missing argument
     assert len(line) <= 78
 
 

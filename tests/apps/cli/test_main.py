@@ -114,7 +114,9 @@ def test_help_lists_the_commands(skysim: Skysim) -> None:
 @pytest.mark.slow
 def test_scenes_are_listed_with_their_titles(skysim: Skysim) -> None:
     listed = json.loads(skysim("scenes", "--json").out)
-    assert {entry["name"] for entry in listed} == {path.stem for path in SCENES.glob("*.yaml")}
+    assert {entry["name"] for entry in listed} == {
+        path.stem for path in SCENES.glob("*.yaml")
+    }
     for entry in listed:
         assert loader.load(entry["file"]).title == entry["title"]
     assert "AFIT SimSat" in skysim("scenes").out
@@ -148,7 +150,9 @@ def test_without_opengl_the_run_continues_and_reports_the_missing_picture(
     skysim: Skysim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
-    done = skysim("run", "shefex2", "--frames", "1", "--scene-3d", "--json", "--out", tmp_path)
+    done = skysim(
+        "run", "shefex2", "--frames", "1", "--scene-3d", "--json", "--out", tmp_path
+    )
     assert done.code == 0
     assert done.err.count("\n") == 1
     assert done.err.startswith("skysim: no picture of the lab: ")
@@ -311,7 +315,9 @@ def test_solve_takes_a_folder_and_states_why_an_image_is_refused(
 
 
 @pytest.mark.slow
-def test_solve_accepts_catalogs_by_name(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
+def test_solve_accepts_catalogs_by_name(
+    skysim: Skysim, rendered: Path, tmp_path: Path
+) -> None:
     path = rendered / "frame_0000.png"
     ran = skysim(
         "solve", path, "--fov", "14.8", "--catalog", "gaia_v8.0", "--json", "--out", tmp_path
@@ -352,7 +358,9 @@ def test_the_same_seed_writes_the_same_bytes(
         assert (tmp_path / name).read_bytes() == (rendered / name).read_bytes()
 
 
-def test_a_shorter_run_leaves_no_frames_of_a_longer_one(skysim: Skysim, tmp_path: Path) -> None:
+def test_a_shorter_run_leaves_no_frames_of_a_longer_one(
+    skysim: Skysim, tmp_path: Path
+) -> None:
     (tmp_path / "frame_0039.fits").write_bytes(b"old")
     skysim("render", "shefex2", "--frames", "1", "--out", tmp_path)
     assert not (tmp_path / "frame_0039.fits").exists()
@@ -408,7 +416,8 @@ def test_the_stages_of_a_run_are_those_named(skysim: Skysim, tmp_path: Path) -> 
         "--solver",
     ]
     (triad,), (quest,) = (
-        json.loads(skysim(*words, *named, solver).out)["rows"] for solver in ("triad", "quest")
+        json.loads(skysim(*words, *named, solver).out)["rows"]
+        for solver in ("triad", "quest")
     )
     assert (triad["status"], quest["status"]) == ("solved", "solved")
     assert triad["matched"] == quest["matched"]
@@ -550,7 +559,9 @@ def test_an_error_in_a_scene_file_is_reported_with_its_line(
     )
 
 
-def test_a_file_that_is_not_yaml_is_refused_in_one_line(skysim: Skysim, tmp_path: Path) -> None:
+def test_a_file_that_is_not_yaml_is_refused_in_one_line(
+    skysim: Skysim, tmp_path: Path
+) -> None:
     (tmp_path / "mine.yaml").write_text("a: [1, 2\nb: {")
     assert "not YAML" in skysim("render", tmp_path / "mine.yaml").one_line()
 
@@ -719,7 +730,10 @@ def test_an_image_of_noise_is_refused(skysim: Skysim, tmp_path: Path) -> None:
             ["--identifier", "magic"],
             "--identifier: unknown identifier 'magic'; allowed: default, ",
         ),
-        (["--solver", "magic"], "--solver: unknown solver 'magic'; allowed: default, quest, "),
+        (
+            ["--solver", "magic"],
+            "--solver: unknown solver 'magic'; allowed: default, quest, ",
+        ),
     ],
 )
 def test_a_wrong_option_of_solve_is_refused_in_one_line(

@@ -48,7 +48,10 @@ STUDY = {
             "study run study.yaml --engine serial --workers 2",
             "--workers 2: has no effect with --engine serial",
         ),
-        ("stream shefex2 --folder out --host ::1", "--host ::1: has no effect without --http"),
+        (
+            "stream shefex2 --folder out --host ::1",
+            "--host ::1: has no effect without --http",
+        ),
         ("reproduce afit-table-1 --open", "--open: has no effect without --report"),
     ],
 )

@@ -71,7 +71,9 @@ def test_no_key_of_the_table_is_a_key_of_a_scene_or_a_study() -> None:
 
 
 def test_every_parameter_at_fault_below_the_apps_is_in_the_table() -> None:
-    found = {key for key in raised_keys() if "." in key and key.partition(".")[0] in PARAMETERS}
+    found = {
+        key for key in raised_keys() if "." in key and key.partition(".")[0] in PARAMETERS
+    }
     assert len(found) > 10
     # With a name filled in, as `dataset.{name}`, the begin alone is known.
     assert {key for key in found if key not in OPTIONS and key[-1] != "."} <= {

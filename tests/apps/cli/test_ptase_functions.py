@@ -166,7 +166,9 @@ def moved(folder: Path) -> bool:
 
 
 def rolled(folder: Path) -> bool:
-    return bool(np.abs(drawn_at(folder, "motion.start.roll_deg=35") - [83, 2, 35]).max() < 1e-3)
+    return bool(
+        np.abs(drawn_at(folder, "motion.start.roll_deg=35") - [83, 2, 35]).max() < 1e-3
+    )
 
 
 def coordinates(folder: Path) -> bool:
@@ -200,7 +202,14 @@ def studied(folder: Path, *words: str) -> Any:
     path = folder / "monte_carlo.yaml"
     files.write_text(path, STUDY)
     report = asked(
-        "study", "run", str(path), "--engine", "serial", "--out", str(folder / "study"), *words
+        "study",
+        "run",
+        str(path),
+        "--engine",
+        "serial",
+        "--out",
+        str(folder / "study"),
+        *words,
     )
     return report["points"]
 

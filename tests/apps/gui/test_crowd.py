@@ -68,7 +68,9 @@ def test_tabs_get_workers_in_order_and_a_closed_tab_frees_its_worker(
         assert [number for number, _ in served] == [0, 1]
         await asyncio.sleep(0.02)
         assert status_texts[2] == "2 of 2 workers in use."
-        assert status_texts[TABS - 1] == f"2 of 2 workers in use; {TABS - 3} before this page."
+        assert (
+            status_texts[TABS - 1] == f"2 of 2 workers in use; {TABS - 3} before this page."
+        )
         gone.add(2)  # it is closed while it waits
         await tabs[2]
         assert served[-1] == (2, None)
@@ -106,7 +108,9 @@ def test_twenty_tabs_share_two_workers(browser: Any, tmp_path: Path) -> None:
                 changed(first, frame)  # keys of others go on
             for page in waiting:
                 page.set_default_timeout(QUICK_MS)
-                page.get_by_text("This page opens when another one has been closed.").wait_for()
+                page.get_by_text(
+                    "This page opens when another one has been closed."
+                ).wait_for()
             assert come(lambda: sorted(map(place, waiting)) == list(range(TABS - WORKERS)))
             pictured(waiting[-1], "test_twenty_tabs_share_two_workers")
             for page in waiting:  # an animation would take the processor from those who work

@@ -177,7 +177,9 @@ def test_shades_follow_the_curve_between_the_limits(curve: str) -> None:
     image = np.repeat(np.arange(0, 500, dtype=np.uint16)[None], 2, axis=0).repeat(2, axis=1)
     found = shades(image, 500, (100.0, 400.0), np.inf, curve)[0]
     fraction = np.clip((np.arange(500) - 100) / 300, 0, 1)
-    np.testing.assert_array_equal(found, np.rint((SHADES - 1) * plots.CURVES[curve](fraction)))
+    np.testing.assert_array_equal(
+        found, np.rint((SHADES - 1) * plots.CURVES[curve](fraction))
+    )
 
 
 def test_a_single_saturated_pixel_is_seen_in_the_reduced_frame() -> None:
@@ -222,7 +224,10 @@ def test_zscale_matches_astropy_and_other_limits_match_pictures(seed: int) -> No
     )
     assert limits_of(levels, "automatic") == plots.display_levels(image)
     assert limits_of(levels, "min to max") == (image.min(), image.max())
-    assert limits_of(levels._replace(offset=-50.0, step=0.5), (100.0, 120.0)) == (300.0, 340.0)
+    assert limits_of(levels._replace(offset=-50.0, step=0.5), (100.0, 120.0)) == (
+        300.0,
+        340.0,
+    )
 
 
 def test_the_histogram_s_axis_is_linear_in_the_sky_and_holds_all_pixels() -> None:
@@ -248,7 +253,9 @@ def test_the_loupe_s_pixels_come_unchanged_with_a_reduced_frame() -> None:
     assert near["levels"] == image[40:51, 155:].tolist()  # as far as the frame reaches
 
 
-def test_frames_are_served_only_to_logged_in_browsers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_are_served_only_to_logged_in_browsers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     async def nothing(*_: object) -> None:
         raise AssertionError("not a frame")
 
@@ -271,7 +278,9 @@ def test_frames_are_served_only_to_logged_in_browsers(monkeypatch: pytest.Monkey
         "4?screen=40,40&limits=automatic&near=5,6",
         "4?screen=40,40&whole=1",
     ]
-    whole, fewer, rest = asyncio.run(answers([f"/frame/tab/{path}" for path in paths], "right"))
+    whole, fewer, rest = asyncio.run(
+        answers([f"/frame/tab/{path}" for path in paths], "right")
+    )
     for answer in (whole, rest):
         np.testing.assert_array_equal(decoded(answer.content)[1], image)
     assert whole.headers["cache-control"] == "no-store"
@@ -481,7 +490,9 @@ def test_a_key_shows_a_reduced_frame_at_once_and_all_pixels_at_rest(
     x, y = (int(word) for word in text.split(",")[0].split()[2:4])
     values = [float(word) for word in text.partition(": ")[2].split()]
     np.testing.assert_array_equal(values, frame[y : y + 7, x : x + 11].ravel())
-    square.keyboard.press("ArrowLeft")  # the loupe follows at once, before all pixels are there
+    square.keyboard.press(
+        "ArrowLeft"
+    )  # the loupe follows at once, before all pixels are there
     assert come(
         lambda: square.locator(".lab-loupe").get_attribute("aria-label") not in (text, "")
     )

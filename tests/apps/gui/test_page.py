@@ -68,7 +68,9 @@ def test_the_page_shows_a_solved_frame_with_names_and_key_help(page: Any) -> Non
     assert re.match(r"solved; \d+ of \d+ lights identified", status(page, "solved"))
     page.get_by_role("img", name="Mintaka").wait_for()  # of Orion's belt
     shown = page.locator(".lab-keys").first.inner_text()
-    assert all(name in shown for name in ("F1", "F5", "F6", "F7", "F8", "F10", "E R", "1", "2"))
+    assert all(
+        name in shown for name in ("F1", "F5", "F6", "F7", "F8", "F10", "E R", "1", "2")
+    )
 
 
 def test_at_either_window_size_nothing_is_cut_off_or_scrolls(page: Any) -> None:
@@ -196,7 +198,8 @@ def test_hovering_shows_a_star_s_data_and_a_click_enlarges_it(
 def limits(page: Any) -> list[float]:
     """The display's black and white levels, DN."""
     return [
-        float(level) for level in page.locator(".lab-plot").get_attribute("data-limits").split()
+        float(level)
+        for level in page.locator(".lab-plot").get_attribute("data-limits").split()
     ]
 
 
@@ -245,7 +248,9 @@ def test_the_wheel_zooms_about_the_cursor_a_drag_pans_and_fit_shows_the_whole_fr
     page.mouse.down()
     page.mouse.move(at[0] + 40, at[1] - 25)
     page.mouse.up()
-    np.testing.assert_allclose(screen(page, *spot), (at[0] + 40, at[1] - 25), rtol=0, atol=0.01)
+    np.testing.assert_allclose(
+        screen(page, *spot), (at[0] + 40, at[1] - 25), rtol=0, atol=0.01
+    )
     page.get_by_role("button", name="fit", exact=True).click()
     assert canvas.get_attribute("data-placement") == whole
 
@@ -332,7 +337,9 @@ NAMES = """async ([names, size]) => { const { drawNames } = await import("skysim
 def test_names_are_beside_their_stars_within_the_frame_and_cover_no_other(page: Any) -> None:
     size = (659, 493)
     random = np.random.default_rng(4)
-    places = np.vstack([random.uniform(0, size, (20, 2)), [[size[0] - 1, 5], [3, size[1] - 2]]])
+    places = np.vstack(
+        [random.uniform(0, size, (20, 2)), [[size[0] - 1, 5], [3, size[1] - 2]]]
+    )
     names = [(*place, f"HIP {n}") for n, place in enumerate(places.tolist())]
     boxes = np.array(page.evaluate(NAMES, [names, list(size)]))
     assert 15 <= len(boxes) <= len(names)

@@ -238,7 +238,8 @@ def test_an_edit_removes_earlier_edits_that_it_makes_useless() -> None:
 
 def test_keys_without_effect_are_reported() -> None:
     stars, dome = (
-        {one.key: one for one in forms.fields(name, {})} for name in ("shefex2", "afit_simsat")
+        {one.key: one for one in forms.fields(name, {})}
+        for name in ("shefex2", "afit_simsat")
     )
     assert "LEDs" in dome["tracker.limit_mag"].no_effect
     assert not stars["tracker.limit_mag"].no_effect
@@ -259,7 +260,8 @@ def test_the_feedback_can_be_changed_for_both_forms_of_the_control_section() -> 
         values = forms.loop_overrides(name, {}, "truth")
         assert loader.load(name, values).motion.control.feedback == "truth"
         assert (
-            loader.load(name, values).motion.control.law == loader.load(name).motion.control.law
+            loader.load(name, values).motion.control.law
+            == loader.load(name).motion.control.law
         )
         assert loader.load(name, forms.loop_overrides(name, {}, "")).motion.control is None
 
@@ -344,7 +346,9 @@ def test_the_cursor_finds_lights_and_detections_independent_of_marks() -> None:
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_integers_reach_the_browser_unchanged(dtype: type) -> None:
-    image = np.random.default_rng(3).integers(0, np.iinfo(dtype).max + 1, (7, 9)).astype(dtype)
+    image = (
+        np.random.default_rng(3).integers(0, np.iinfo(dtype).max + 1, (7, 9)).astype(dtype)
+    )
     data = pixels.levels_of(image).data()
     assert np.frombuffer(data, float, 2).tolist() == [0.0, 1.0]
     np.testing.assert_array_equal(np.frombuffer(data, dtype, offset=16).reshape(7, 9), image)
@@ -494,7 +498,9 @@ def test_static_files_of_the_page_are_cached(
 
     async def inner(scope: dict, _receive: object, send) -> None:
         calls.append(scope)
-        await send({"type": "http.response.start", "status": status, "headers": [(b"a", b"b")]})
+        await send(
+            {"type": "http.response.start", "status": status, "headers": [(b"a", b"b")]}
+        )
         await send({"type": "http.response.body", "body": b"one", "more_body": True})
         await send({"type": "http.response.body", "body": b"two", "more_body": False})
 
@@ -535,7 +541,12 @@ def test_a_compressed_file_is_not_sent_to_a_browser_that_asks_for_a_plain_one() 
         starts.append(message)
 
     for encoding in (b"gzip", b"identity", b"gzip"):
-        scope = {"type": "http", "method": "GET", "path": f"{FILES}/a.js", "query_string": b""}
+        scope = {
+            "type": "http",
+            "method": "GET",
+            "path": f"{FILES}/a.js",
+            "query_string": b"",
+        }
         asyncio.run(kept(scope | {"headers": [(b"accept-encoding", encoding)]}, None, send))
     assert [dict(one["headers"])[b"accept-encoding"] for one in starts[::2]] == [
         b"gzip",
@@ -674,7 +685,9 @@ def test_a_worker_is_forked_with_its_scene_set_up_and_a_closed_one_leaves_nothin
         first = Session()
         try:
             _, start = await first.run("open", scene, {}, True)
-            assert (await first.run("move", 1.0, 0.0, 5.0, True)).angles_deg != start.angles_deg
+            assert (
+                await first.run("move", 1.0, 0.0, 5.0, True)
+            ).angles_deg != start.angles_deg
             second = Session()
             try:
                 assert (await second.run("open", scene, {}, True))[
@@ -704,7 +717,9 @@ def test_kept_frames_of_a_flight_equal_rerendered_ones(
         worker.begin_flight()
         while not worker.advance_flight(1.0).is_done:
             pass
-        assert [frame.place is None for frame in worker.flight.frames] == [kept_bytes == 0] * 2
+        assert [frame.place is None for frame in worker.flight.frames] == [
+            kept_bytes == 0
+        ] * 2
         worker.flight_frame(0)
         pixels_of.append(worker.flight_frame(1).pixels.data)
         exported.append(fits.getdata(BytesIO(worker.export()["frame.fits"])))
@@ -729,7 +744,9 @@ def test_a_session_answers_refuses_bad_input_and_ends_with_its_tab() -> None:
             there = await session.run("point", (10.0, 45.0, 0.0), False)
             np.testing.assert_allclose(there.angles_deg[:2], (10.0, 45.0), rtol=0, atol=1e-9)
             files = await session.run("export")
-            assert set(image_export.FILE_BY_ITEM.values()) - {"", "solution.json"} == set(files)
+            assert set(image_export.FILE_BY_ITEM.values()) - {"", "solution.json"} == set(
+                files
+            )
             with pytest.raises(InputError, match=r"x\.exe: allowed"):
                 await session.run("solve_file", "x.exe", b"MZ", None)
             with pytest.raises(InputError, match="no camera found"):
@@ -813,7 +830,9 @@ def test_a_photograph_is_solved_by_the_chosen_stages(monkeypatch: pytest.MonkeyP
 @pytest.mark.long
 def test_monte_carlo_runs_a_study_and_shows_the_store_s_results(tmp_path: Path) -> None:
     trial = {"kind": "centroids", "noise_px": 0.2}
-    text = study_process.monte_carlo("shefex2", {"camera.focal_length": "24 mm"}, trial, 40, 7)
+    text = study_process.monte_carlo(
+        "shefex2", {"camera.focal_length": "24 mm"}, trial, 40, 7
+    )
     path = tmp_path / "monte_carlo.yaml"
     path.write_text(text)
     values = study_loader.load(path)

@@ -111,7 +111,9 @@ def test_a_survey_does_not_tilt_the_vehicle_beyond_its_stop_between_attitudes() 
     flown = loader.load("afit_simsat", survey_flight("afit_simsat", overrides, TILTED))
     reference = guidance.plan(flown.motion)
     t_s = np.arange(0, reference.duration_s, 0.2)
-    up = [quaternion.to_rotation(reference.state_at(t)[0]).apply([0.0, 0.0, 1.0]) for t in t_s]
+    up = [
+        quaternion.to_rotation(reference.state_at(t)[0]).apply([0.0, 0.0, 1.0]) for t in t_s
+    ]
     assert np.min(np.array(up)[:, 2]) > np.cos(np.radians(25))
 
 
@@ -169,8 +171,12 @@ def test_a_survey_continues_with_the_frames_flown() -> None:
         rows, holds = survey.frames_at_rest(worker.flight.flight, views)
         assert holds == len(rows) == 8
         wxyz = np.array([views[row].body_wxyz for row in rows])
-        wanted = survey_frames.from_angles(np.array(plan.angles_deg)).as_quat(scalar_first=True)
-        np.testing.assert_allclose(np.abs(np.sum(wxyz * wanted, axis=1)), 1, rtol=0, atol=1e-9)
+        wanted = survey_frames.from_angles(np.array(plan.angles_deg)).as_quat(
+            scalar_first=True
+        )
+        np.testing.assert_allclose(
+            np.abs(np.sum(wxyz * wanted, axis=1)), 1, rtol=0, atol=1e-9
+        )
         found = worker.adjust_survey(8)
         assert (found.frames, found.refusal) == (count, "")
         assert found.measured > measured

@@ -45,7 +45,9 @@ def test_the_pull_force_is_linear_up_to_a_limit() -> None:
         stiffness
     )
     along = Grip(tuple(held), tuple(turned.apply(3 * held)))
-    np.testing.assert_allclose(pull_torque_nm(along, turned, np.diag(INERTIA)), 0.0, atol=1e-9)
+    np.testing.assert_allclose(
+        pull_torque_nm(along, turned, np.diag(INERTIA)), 0.0, atol=1e-9
+    )
     np.testing.assert_array_equal(pull_torque_nm(None, turned, np.diag(INERTIA)), np.zeros(3))
 
 

@@ -79,7 +79,9 @@ def test_a_study_beyond_the_number_allowed_is_refused(
     StudyProcess.check_count()  # none of them runs
     monkeypatch.setattr(StudyProcess, "begun", running)
     monkeypatch.setattr(StudyProcess, "running", property(lambda _: True))
-    with pytest.raises(InputError, match=f"{MAX_STUDIES} of {MAX_STUDIES} studies are running"):
+    with pytest.raises(
+        InputError, match=f"{MAX_STUDIES} of {MAX_STUDIES} studies are running"
+    ):
         StudyProcess.check_count()
 
 
@@ -106,7 +108,9 @@ STATES = ("good", "warn", "bad")
 
 def distance(colors: Iterable[str], eye: str) -> float:
     """The least distance between two of some colors, in Oklab (Ottosson 2020), of which 0.02 is just noticeable."""
-    srgb = np.array([[int(color[n : n + 2], 16) / 255 for n in (1, 3, 5)] for color in colors])
+    srgb = np.array(
+        [[int(color[n : n + 2], 16) / 255 for n in (1, 3, 5)] for color in colors]
+    )
     linear = (
         np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
         @ np.array(EYES[eye]).T

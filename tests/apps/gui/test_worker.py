@@ -89,7 +89,9 @@ def test_a_dome_flight_is_played_positioned_and_its_loop_opened(page: Any) -> No
         panel(page, "Run")
         feedback.filter(has_text=loop).wait_for()
     chosen(page, "Feedback", "closed by the filter")
-    page.get_by_role("status").filter(has_text="filter requires the section filter").wait_for()
+    page.get_by_role("status").filter(
+        has_text="filter requires the section filter"
+    ).wait_for()
 
 
 def test_monte_carlo_stops_resumes_and_replays_a_failed_trial(
@@ -163,7 +165,8 @@ def test_a_shared_page_requires_its_token_and_rejects_other_origins(
     with Server(tmp_path, host="0.0.0.0") as others:
         for one in (server, others):
             assert [
-                one.status(path) for path in ("", "?token=wrong", "?token=%C3%A9", "frame/x/1")
+                one.status(path)
+                for path in ("", "?token=wrong", "?token=%C3%A9", "frame/x/1")
             ] == [401] * 4
             assert one.status("report/%00", Cookie=f"skysim_gui_{one.port}={TOKEN}") == 404
         with opened(browser, others.login, NARROW) as page:

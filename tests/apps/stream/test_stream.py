@@ -47,14 +47,18 @@ def frames() -> list[np.ndarray]:
 
 def streamed_flight(*, endless: bool = False) -> Flight:
     """A flight as `skysim stream` opens it."""
-    return open_flight(loader.load("shefex2", OVERRIDES), endless=endless, keeps_history=False)
+    return open_flight(
+        loader.load("shefex2", OVERRIDES), endless=endless, keeps_history=False
+    )
 
 
 def packet(index: int, dropped: int = 0, pixels: Any = None) -> Packet:
     pixels = np.arange(12, dtype="<u2").reshape(3, 4) if pixels is None else pixels
     shape = {"width": pixels.shape[1], "height": pixels.shape[0], "dtype": pixels.dtype.str}
     return Packet(
-        {"index": index, "dropped": dropped, "t_s": 0.5, "due_unix_s": 1.0, **shape}, pixels, {}
+        {"index": index, "dropped": dropped, "t_s": 0.5, "due_unix_s": 1.0, **shape},
+        pixels,
+        {},
     )
 
 
@@ -200,7 +204,16 @@ def test_a_folder_receives_every_frame_with_its_truth(
     tmp_path: Path, frames: list[np.ndarray]
 ) -> None:
     sets = [word for key, value in OVERRIDES.items() for word in ("--set", f"{key}={value}")]
-    command = ["stream", "shefex2", "--folder", str(tmp_path), "--speed", "0", "--json", *sets]
+    command = [
+        "stream",
+        "shefex2",
+        "--folder",
+        str(tmp_path),
+        "--speed",
+        "0",
+        "--json",
+        *sets,
+    ]
     done = CliRunner().invoke(main.app, command)
     assert json.loads(done.stdout)["sinks"]["folder"] == {
         "sent": FRAMES,
@@ -287,7 +300,9 @@ def test_a_client_that_disconnects_during_a_response_is_ignored(
     hub: tuple[http.FrameHub, str], capfd: pytest.CaptureFixture[str]
 ) -> None:
     hub[0].publish(packet(1, pixels=np.zeros((3000, 3000), "<u2")))
-    with socket.create_connection(("127.0.0.1", int(hub[1].rpartition(":")[2])), 10) as client:
+    with socket.create_connection(
+        ("127.0.0.1", int(hub[1].rpartition(":")[2])), 10
+    ) as client:
         # Reset by closing.
         client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         client.sendall(b"GET /frame.raw HTTP/1.0\r\n\r\n")

@@ -10,7 +10,7 @@ from hypothesis import given
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude import nearfield, rate, rolling
+from estimator.attitude import rate, rolling, rotation_fit
 from estimator.attitude.rate import STARS, Sight
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
@@ -89,13 +89,19 @@ def test_correction_moves_rolling_shutter_lights_to_global_shutter_positions(
         # An error of a centroid moves its place at the middle row by the gain.
         error_px = rng.normal(0, 1e-4, found.xy_px.shape)
         off = rate.at_middle_row(
-            CAMERA, replace(found, xy_px=found.xy_px + error_px), exact(seen.rate_rad_s), sight
+            CAMERA,
+            replace(found, xy_px=found.xy_px + error_px),
+            exact(seen.rate_rad_s),
+            sight,
         )
         gain = rate.error_gain(
             CAMERA, rate.tangent_motion(CAMERA.rays(found.xy_px), sight) @ seen.rate_rad_s
         )
         assert_allclose(
-            off.xy_px - still.xy_px, np.einsum("nij,nj->ni", gain, error_px), rtol=0, atol=2e-6
+            off.xy_px - still.xy_px,
+            np.einsum("nij,nj->ni", gain, error_px),
+            rtol=0,
+            atol=2e-6,
         )
         assert still.covariance_px2 is not None
         expected = gain @ rate.covariance_of(found) @ np.swapaxes(gain, 1, 2)
@@ -154,7 +160,9 @@ def test_exact_streaks_give_the_rate_in_one_of_two_signs(rng: np.random.Generato
                 (one.rate_rad_s - seen.rate_rad_s, one.covariance_rad2_s2) for one in again
             ]
             assert (
-                min(error @ np.linalg.solve(covariance, error) for error, covariance in errors)
+                min(
+                    error @ np.linalg.solve(covariance, error) for error, covariance in errors
+                )
                 < 1.8
             )
     assert rate.from_streaks(CAMERA, found.take(np.arange(2)), EXPOSURE_S) == []
@@ -235,7 +243,7 @@ def test_an_error_of_the_rate_rotates_the_attitude(rng: np.random.Generator) -> 
     found = seen.centroids()
     wrong = rate.at_middle_row(CAMERA, found, exact(seen.rate_rad_s + error))
     place = seen.cam_from_ref.apply(seen.place_ref)
-    jacobian = nearfield.tangent_jacobian(place, place).reshape(-1, 2, 3)
+    jacobian = rotation_fit.tangent_jacobian(place, place).reshape(-1, 2, 3)
     residual = GLOBAL.tangents(wrong.xy_px) - GLOBAL.tangents(seen.still_px)
     turned, *_ = np.linalg.lstsq(jacobian.reshape(-1, 3), residual.ravel(), rcond=None)
     covariance = rolling.rate_covariance_rad2(CAMERA, found, jacobian, np.outer(error, error))
@@ -257,7 +265,7 @@ def test_a_rolling_shutter_attitude_has_its_claimed_covariance() -> None:
             CAMERA, found, places, np.zeros(3), (seen.cam_from_ref, seen.rate_rad_s), ANYTHING
         )
         place = seen.cam_from_ref.apply(places)
-        jacobian = nearfield.tangent_jacobian(place, place)
+        jacobian = rotation_fit.tangent_jacobian(place, place)
         noise = (
             np.linalg.inv(jacobian.T @ jacobian) * (found.sigma_px[0] / CAMERA.focal_px) ** 2
         )
@@ -305,9 +313,9 @@ def test_disks_of_a_rolling_shutter_determine_the_rate(rng: np.random.Generator)
     )
     rates = rate.from_moments(CAMERA, disks, EXPOSURE_S, DOME)
     assert len(rates) == 2
-    assert min(np.linalg.norm(one.rate_rad_s - seen.rate_rad_s) for one in rates) < np.radians(
-        0.05
-    )
+    assert min(
+        np.linalg.norm(one.rate_rad_s - seen.rate_rad_s) for one in rates
+    ) < np.radians(0.05)
     assert_covariance(rates[0].covariance_rad2_s2)
     assert rate.from_moments(GLOBAL, disks, EXPOSURE_S, DOME) == []
     points = replace(disks, moments_px2=moments_of(seen, 0.1) * 0.01)
@@ -320,7 +328,9 @@ def test_moments_of_an_ellipse_match_those_of_its_pixels(rng: np.random.Generato
     xx, yy = rng.uniform(12, 30, 2)
     xy = rng.uniform(-0.5, 0.5) * np.sqrt(xx * yy)
     offset = np.stack(np.meshgrid(np.arange(60) - 29.5, np.arange(60) - 29.5), axis=-1)
-    distance2 = np.einsum("yxi,ij,yxj->yx", offset, np.linalg.inv([[xx, xy], [xy, yy]]), offset)
+    distance2 = np.einsum(
+        "yxi,ij,yxj->yx", offset, np.linalg.inv([[xx, xy], [xy, yy]]), offset
+    )
     # Of a uniform ellipse; its moments are a quarter of the squared half axes.
     inside = distance2 < 4
     image = np.where(inside, 5000.0, 0.0) + rng.normal(100, 1, (60, 60))
@@ -358,4 +368,6 @@ def test_centroids_keep_their_streaks() -> None:
     assert found.streak_px is not None
     assert part.streak_covariance_px2 is not None
     assert_allclose(part.streak_px, found.streak_px[[4, 2]], rtol=0, atol=0)
-    assert_allclose(part.streak_covariance_px2[:, 0, 0], STREAK_SIGMA_PX**2, rtol=1e-12, atol=0)
+    assert_allclose(
+        part.streak_covariance_px2[:, 0, 0], STREAK_SIGMA_PX**2, rtol=1e-12, atol=0
+    )

@@ -9,7 +9,7 @@ from hypothesis import given
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude import nearfield, systematic
+from estimator.attitude import rotation_fit, systematic
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
@@ -23,9 +23,9 @@ COUNT = 6
 
 def places(rng: np.random.Generator, count: int = COUNT) -> tuple[Floats, Floats]:
     """(K, 3) LEDs from the bearing and from the pupil, m, in camera axes and in the camera's field."""
-    rays = np.column_stack([rng.uniform(-0.2, 0.2, (count, 2)), np.ones(count)]) * rng.uniform(
-        0.8, 1.5, (count, 1)
-    )
+    rays = np.column_stack(
+        [rng.uniform(-0.2, 0.2, (count, 2)), np.ones(count)]
+    ) * rng.uniform(0.8, 1.5, (count, 1))
     return rays + np.array([*rng.normal(0, 0.02, 2), 0.3]), rays
 
 
@@ -43,7 +43,7 @@ def covariances(rng: np.random.Generator, size: int, count: int = COUNT) -> Floa
     return root @ np.moveaxis(root, 1, 2)
 
 
-@law(nearfield.tangent_gradients, nearfield.tangent_jacobian, systematic.geometry)
+@law(rotation_fit.tangent_gradients, rotation_fit.tangent_jacobian, systematic.geometry)
 @given(rng=SEEDS)
 def test_changes_of_tangents_match_their_derivatives(rng: np.random.Generator) -> None:
     bearing, pupil = places(rng)
@@ -51,12 +51,12 @@ def test_changes_of_tangents_match_their_derivatives(rng: np.random.Generator) -
     turned_rad = rng.normal(0, 1e-6, 3)
     view = systematic.geometry(bearing, pupil)
     assert_allclose(view.tangent, tangents(pupil), rtol=0, atol=1e-15)
-    gradient = nearfield.tangent_gradients(pupil)
+    gradient = rotation_fit.tangent_gradients(pupil)
     moved = tangents(pupil + step_m) - view.tangent
     assert_allclose(np.einsum("kij,kj->ki", gradient, step_m), moved, rtol=0, atol=1e-11)
     # Along the ray nothing changes.
     assert_allclose(np.einsum("kij,kj->ki", gradient, pupil), 0, rtol=0, atol=1e-14)
-    jacobian = nearfield.tangent_jacobian(bearing, pupil)
+    jacobian = rotation_fit.tangent_jacobian(bearing, pupil)
     rotated = (
         tangents(pupil + Rotation.from_rotvec(turned_rad).apply(bearing) - bearing)
         - view.tangent
@@ -78,7 +78,9 @@ def test_a_rotation_is_found_and_leaves_no_residual(rng: np.random.Generator) ->
     covariance = systematic.from_common(view, sigma, change[None])
     assert_allclose(covariance, np.outer(turned_rad, turned_rad), rtol=0, atol=1e-18)
     other = rng.normal(0, 1e-5, (2, COUNT, 2))
-    products = systematic.residual_products(view, sigma, np.concatenate([change[None], other]))
+    products = systematic.residual_products(
+        view, sigma, np.concatenate([change[None], other])
+    )
     assert_allclose(
         products[0], 0, rtol=0, atol=1e-10 * np.abs(change / sigma[:, None]).sum() ** 2
     )
@@ -191,7 +193,9 @@ def test_isotropic_led_errors_on_a_sphere_are_angles_from_the_camera(
     """An error along the line from the bearing moves no direction. The least distance is the radius less the lever."""
     along = units(rng, COUNT)
     sigma_m = rng.uniform(1e-4, 1e-3)
-    leds = LedMap(np.arange(COUNT), 1.2 * along, np.zeros(3), np.full(3, 1.2), sigma_m=sigma_m)
+    leds = LedMap(
+        np.arange(COUNT), 1.2 * along, np.zeros(3), np.full(3, 1.2), sigma_m=sigma_m
+    )
     arm = Lever(np.array([0, 0, rng.uniform(0, 0.4)]), turn(rng))
     expected = np.full(COUNT, sigma_m / (1.2 - arm.camera_body_m[2]))
     assert_allclose(dome_tracker.led_sigma_rad(leds, arm), expected, rtol=1e-12, atol=0)

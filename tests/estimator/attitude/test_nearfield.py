@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude import dome_map, nearfield
+from estimator.attitude import dome_map, nearfield, rotation_fit
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
@@ -38,7 +38,9 @@ def leds_in_view(
 
 
 def true_rays(body_from_lab: Rotation, leds: LedMap, lever: Lever) -> np.ndarray:
-    rays = lever.cam_from_body.apply(body_from_lab.apply(leds.position_m) - lever.camera_body_m)
+    rays = lever.cam_from_body.apply(
+        body_from_lab.apply(leds.position_m) - lever.camera_body_m
+    )
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
@@ -139,7 +141,9 @@ def test_a_sphere_is_an_ellipsoid_of_equal_axes() -> None:
 
 def test_infinite_semi_axes_are_a_ceiling() -> None:
     rays = np.array([[0.6, 0, 0.8], [0, 0, 1]])
-    flat = LedMap(np.arange(0), np.zeros((0, 3)), np.zeros(3), np.array([np.inf, np.inf, 1.2]))
+    flat = LedMap(
+        np.arange(0), np.zeros((0, 3)), np.zeros(3), np.array([np.inf, np.inf, 1.2])
+    )
     met = dome_map.on_surface(rays, np.array([0.1, 0, 0.4]), flat)
     # 0.8 m up along (.6, .8) is 0.6 m across, by hand.
     np.testing.assert_allclose(met, [[0.7, 0, 1.2], [0.1, 0, 1.2]], rtol=0, atol=1e-15)
@@ -165,7 +169,7 @@ def test_the_jacobian_is_the_derivative_of_the_projection(lever: Lever) -> None:
 
     slopes = [(tangents(step * e) - tangents(-step * e)) / (2 * step) for e in np.eye(3)]
     b = cam_from_body.apply(truth.apply(leds.position_m))
-    jacobian = nearfield.tangent_jacobian(b, b - cam_from_body.apply(lever.camera_body_m))
+    jacobian = rotation_fit.tangent_jacobian(b, b - cam_from_body.apply(lever.camera_body_m))
     # 1e-9: rounding of 1e-16 over a step of 1e-6, and the step's square.
     np.testing.assert_allclose(jacobian, np.transpose(slopes), rtol=0, atol=1e-9)
 
@@ -181,7 +185,7 @@ def test_the_exact_solve_is_exact_from_five_degrees_off(
     for _ in range(30):
         truth = tilted(rng, np.radians(30))
         leds = leds_in_view(rng, truth, lever, count, surface)
-        found, _ = nearfield.rotation_only(
+        found, _ = rotation_fit.rotation_only(
             true_rays(truth, leds, lever),
             np.full(count, 1e-5),
             leds.position_m,
@@ -207,7 +211,7 @@ def monte_carlo(
         pixels = dome_map.project(truth, leds.position_m, lever, CAMERA) + rng.normal(
             0, 0.1, (count, 2)
         )
-        found, spread = nearfield.rotation_only(
+        found, spread = rotation_fit.rotation_only(
             CAMERA.rays(pixels),
             np.full(count, 0.1 / CAMERA.focal_px),
             leds.position_m,
@@ -296,7 +300,12 @@ def test_rays_on_a_sphere_instead_of_an_ellipsoid_err_by_the_surface_difference(
         real = leds_in_view(rng, truth, LEVER, 5, MEASURED)
         leds = LedMap(real.id, real.position_m, *SPHERE)
         found, _ = nearfield.ray_on_surface(
-            true_rays(truth, real, LEVER), np.full(5, 1e-5), real.position_m, leds, LEVER, truth
+            true_rays(truth, real, LEVER),
+            np.full(5, 1e-5),
+            real.position_m,
+            leds,
+            LEVER,
+            truth,
         )
         errors.append(angle_rad(found, truth))
     rms_deg = np.degrees(np.sqrt(np.mean(np.square(errors))))
@@ -311,7 +320,7 @@ def test_one_light_seen_repeatedly_leaves_one_rotation_undetermined(
     leds = LedMap(np.arange(count), np.tile([0.1, 0.05, 1.19], (count, 1)), *SPHERE)
     truth = Rotation.from_rotvec([0.1, 0.05, 0.3])
     with pytest.raises(ValueError, match=f"{count} rays do not determine a rotation"):
-        nearfield.rotation_only(
+        rotation_fit.rotation_only(
             true_rays(truth, leds, lever),
             np.full(count, 1e-5),
             leds.position_m,
@@ -327,7 +336,7 @@ def test_lights_that_contradict_the_rays_are_refused() -> None:
     places = RADIUS_M * np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0.1]])
     leds = LedMap(np.arange(4), places, *SPHERE)
     with pytest.raises(ValueError, match="rotation_only: not converged"):
-        nearfield.rotation_only(
+        rotation_fit.rotation_only(
             CAMERA.rays(rng.uniform(0, [1599, 1199], (4, 2))),
             np.full(4, 1e-5),
             places,

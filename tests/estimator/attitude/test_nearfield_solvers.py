@@ -186,7 +186,9 @@ def test_an_unknown_position_raises_the_cross_error_a_thousandfold() -> None:
     for method in ("pnp", "rotation_only"):
         rng = np.random.default_rng(78)
         one = bench.GEOMETRIES["measured ellipsoid"]
-        claimed = [bench.solved(method, one, bench.trial(one, 15, rng))[1] for _ in range(100)]
+        claimed = [
+            bench.solved(method, one, bench.trial(one, 15, rng))[1] for _ in range(100)
+        ]
         sigma_deg[method] = np.degrees(
             np.median([np.sqrt(np.trace(c[:2, :2]) / 2) for c in claimed])
         )
@@ -197,7 +199,9 @@ def test_an_unknown_position_raises_the_cross_error_a_thousandfold() -> None:
 
 def test_the_six_dof_covariance_matches_small_noise() -> None:
     # A hundredth of the noise claimed, so that the turned-over fit stays out of reach: first order is put to the test.
-    errors, claimed = noise_alone("pnp", "measured ellipsoid", 15, 120, seed=79, noise_px=1e-3)
+    errors, claimed = noise_alone(
+        "pnp", "measured ellipsoid", 15, 120, seed=79, noise_px=1e-3
+    )
     assert nees(errors, claimed * 1e-4).mean() == pytest.approx(3, abs=3 * np.sqrt(6 / 120))
 
 
@@ -254,7 +258,9 @@ def test_unsupported_input_of_a_method_is_refused() -> None:
         nearfield.pnp(rays[:3], sigma[:3], place[:3], clean.leds, one.lever, clean.truth)
     same = np.tile(place[0], (5, 1))
     with pytest.raises(ValueError, match=r"position|parallel"):
-        nearfield.pnp(np.tile(rays[0], (5, 1)), sigma, same, clean.leds, one.lever, clean.truth)
+        nearfield.pnp(
+            np.tile(rays[0], (5, 1)), sigma, same, clean.leds, one.lever, clean.truth
+        )
     wide = np.array([[0.8, 0, 0.6], [0, 0.1, 1], [0.1, 0, 1], [0, 0, 1], [0.1, 0.1, 1]])
     with pytest.raises(ValueError, match=r"eq\. 44 has no root: a ray is 45 deg off"):
         nearfield.thesis(wide, sigma, place, clean.leds, one.lever, clean.truth)

@@ -133,9 +133,9 @@ def test_half_turns_about_any_axis_are_solved(
             ref = in_field(rng, count) if count == 8 else unit(rng.normal(size=(count, 3)))
             cross = np.linalg.norm(np.cross(ref[0], ref[1]))
             # Rounding over the angle between the directions.
-            assert error_rad(solve(truth.apply(ref), ref, np.ones(count)), truth) < 1e-14 / min(
-                cross, 0.1
-            )
+            assert error_rad(
+                solve(truth.apply(ref), ref, np.ones(count)), truth
+            ) < 1e-14 / min(cross, 0.1)
 
 
 QUARTER_TURNS = list(Rotation.create_group("O"))
@@ -199,8 +199,18 @@ def test_stars_that_coincide_in_camera_or_catalog_are_refused(solve: Solver) -> 
         (np.eye(3), np.eye(3), np.array([1.0, np.nan, 1.0]), "sigma_rad is not usable"),
         (np.eye(3), np.eye(3), np.array([1.0, -1.0, 1.0]), "sigma_rad is not usable"),
         (np.diag([1.0, np.nan, 1.0]), np.eye(3), np.ones(3), "a direction is NaN"),
-        (np.diag([1.0, 1.02, 1.0]), np.eye(3), np.ones(3), "a direction is not of unit length"),
-        (np.eye(3), np.diag([1.0, 1.0, 0.98]), np.ones(3), "a direction is not of unit length"),
+        (
+            np.diag([1.0, 1.02, 1.0]),
+            np.eye(3),
+            np.ones(3),
+            "a direction is not of unit length",
+        ),
+        (
+            np.eye(3),
+            np.diag([1.0, 1.0, 0.98]),
+            np.ones(3),
+            "a direction is not of unit length",
+        ),
         (np.eye(3), np.eye(3)[:2], np.ones(3), r"shapes .* allowed: \(N, 3\)"),
         (np.eye(3), np.eye(3), np.ones(2), r"shapes .* allowed: \(N, 3\)"),
         (np.ones(3), np.ones(3), np.ones(3), r"shapes .* allowed: \(N, 3\)"),
@@ -217,7 +227,9 @@ def test_bad_directions_are_refused_in_one_line(
 # ---- One optimum, many ways ----
 
 
-def same_data(case: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def same_data(
+    case: str, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Noisy directions in camera axes and their catalog's, and sigmas that differ by a factor of three."""
     count = {"two stars": 2, "two close stars": 2, "a few stars": 5}.get(case, 15)
     seen = in_field(rng, count)
@@ -300,7 +312,9 @@ def test_each_bare_method_solves_davenport_s_equation_itself(
         q = Rotation.from_matrix(RAW[name](B)).as_quat()
         assert np.abs(davenport_matrix(B) @ q - values[3] * q).max() < 1e-13
         assert 1 - abs(q @ vectors[:, 3]) < (1e-13 / gap) ** 2 + 1e-15
-        assert kernel.largest_eigenvalue(B) == pytest.approx(values[3], abs=1e-14 / min(gap, 1))
+        assert kernel.largest_eigenvalue(B) == pytest.approx(
+            values[3], abs=1e-14 / min(gap, 1)
+        )
 
 
 @pytest.mark.parametrize("axis", AXES)
@@ -350,7 +364,8 @@ def test_bare_quest_loses_precision_in_a_narrow_field_and_polishing_restores_it(
         cam, ref, sigma = same_data("two close stars", rng)
         B = np.einsum("n,ni,nj->ij", sigma**-2 / np.sum(sigma**-2), cam, ref)
         worst = max(
-            worst, error_rad(Rotation.from_matrix(kernel.raw_quest(B)), quest(cam, ref, sigma))
+            worst,
+            error_rad(Rotation.from_matrix(kernel.raw_quest(B)), quest(cam, ref, sigma)),
         )
     assert worst > 1e-10  # what the methods are to agree to
 
@@ -426,7 +441,9 @@ def test_quaternions_and_matrices_match_scipy(axis: str, angle_rad: float) -> No
     found = quaternion_xyzw(rotation.as_matrix())
     # Either sign is the same turn.
     assert (
-        min(np.abs(found - rotation.as_quat()).max(), np.abs(found + rotation.as_quat()).max())
+        min(
+            np.abs(found - rotation.as_quat()).max(), np.abs(found + rotation.as_quat()).max()
+        )
         < 1e-15
     )
     assert (

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude import systematic
 from estimator.attitude.dome_map import LedMap, Lever
-from estimator.attitude.nearfield import rotation_only
+from estimator.attitude.rotation_fit import rotation_only
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Centroids
@@ -176,7 +176,10 @@ def test_the_dome_tracker_claims_the_errors_of_its_map(kind: str) -> None:
             common_m=np.array([np.tile(s, (len(position_m), 1)) for s in np.diag(shift)]),
         )
         camera = Camera(
-            1600, 1200, CAMERA.focal_px * (1 + focal * rng.standard_normal()), CAMERA.center_px
+            1600,
+            1200,
+            CAMERA.focal_px * (1 + focal * rng.standard_normal()),
+            CAMERA.center_px,
         )
         camera = Camera(
             *(camera.width_px, camera.height_px, camera.focal_px, camera.center_px),

@@ -8,13 +8,14 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude import dome_map, nearfield
+from estimator.attitude import dome_map, rotation_fit
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration import dome_survey
 from estimator.calibration.bundle_adjustment import Assumed
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, survey
 from estimator.calibration.gauge import align_attitudes
+from estimator.calibration.survey_subset import connected_subset
 from estimator.core.camera import Camera
 
 INCH = 0.0254
@@ -156,7 +157,9 @@ def test_the_derivatives_match_finite_differences_of_the_residuals(block: str) -
     size = 3 * 3 + 3 + 8
     first = {"by_led": 0, "by_rotation": 0, "by_shared": 9}[block]
     for m in [0, len(seen.led) // 2, len(seen.led) - 1]:
-        rows = {"by_led": seen.led, "by_rotation": seen.frame, "by_shared": 0 * seen.led}[block]
+        rows = {"by_led": seen.led, "by_rotation": seen.frame, "by_shared": 0 * seen.led}[
+            block
+        ]
         one = seen.take([m])
         for n in range(exact.shape[2]):
             led = np.zeros(lights)
@@ -305,7 +308,10 @@ def test_the_covariance_matches_the_scatter_of_surveys(
         lens = [found.camera.focal_px, *found.camera.center_px]
         both = [
             ([found.lever.camera_body_m - true_lever], [found.lever_covariance_m2]),
-            ([np.subtract(lens, [SMALL.focal_px, *SMALL.center_px])], [found.lens_covariance]),
+            (
+                [np.subtract(lens, [SMALL.focal_px, *SMALL.center_px])],
+                [found.lens_covariance],
+            ),
             ((found.leds.position_m - true_place)[kept], found.led_covariance_m2[kept]),
             (
                 (found.body_from_lab * true_turned.inv()).as_rotvec(),
@@ -484,7 +490,8 @@ def test_malformed_frames_are_refused_by_number() -> None:
     with pytest.raises(ValueError, match=r"^survey: no frames"):
         survey([], *asked)
     with pytest.raises(
-        ValueError, match=r"^survey: \d+ usable coordinates for \d+ unknowns; take more frames"
+        ValueError,
+        match=r"^survey: \d+ usable coordinates for \d+ unknowns; take more frames",
     ):
         survey(frames[:3], *asked)
 
@@ -521,7 +528,7 @@ def afit_errors_deg(
         xy = frame.xy_px[known]
         sigma = np.full(len(led), 0.1 / found.camera.focal_px)
         solved.append(
-            nearfield.rotation_only(
+            rotation_fit.rotation_only(
                 found.camera.rays(xy),
                 sigma,
                 found.leds.position_m[led],
@@ -556,7 +563,7 @@ def test_the_afit_dome_is_surveyed_from_its_own_frames(begin: str) -> None:
         frames = [
             replace(
                 f,
-                body_from_lab=nearfield.rotation_only(
+                body_from_lab=rotation_fit.rotation_only(
                     camera.rays(f.xy_px),
                     f.sigma_px / camera.focal_px,
                     start.position_m[f.led],
@@ -607,7 +614,7 @@ def test_the_three_weak_moves_are_conformal_maps() -> None:
     frames = filmed(rng, turned, place, AFIT_LEVER, AFIT, 0.1, imu_deg=0.0)
     seen = dome_survey._collect(frames, 700)
     whole = dome_survey._start_bundle(frames, leds_of(place), AFIT_LEVER, AFIT, 3)
-    part = dome_survey.connected_subset(whole, seen, np.ones(len(seen.led), dtype=bool))
+    part = connected_subset(whole, seen, np.ones(len(seen.led), dtype=bool))
     terms = ba.normal_equations(part.bundle, part.sightings, np.ones(len(part.index)))
     reduced = ba.eliminate_lights(terms, ba.gauge_freedoms(part.bundle)[1], 0.0)
     spread = ba.cho_solve(reduced.factor, np.diag(reduced.scale)) * reduced.scale[:, None]
@@ -616,14 +623,19 @@ def test_the_three_weak_moves_are_conformal_maps() -> None:
     in_lab = block_diag(*R_body_from_lab.transpose(0, 2, 1))
     # Turns of the lab and of the body, the same in every frame, are no errors.
     common = np.hstack(
-        [np.tile(np.eye(3), (count // 3, 1)), R_body_from_lab.transpose(0, 2, 1).reshape(-1, 3)]
+        [
+            np.tile(np.eye(3), (count // 3, 1)),
+            R_body_from_lab.transpose(0, 2, 1).reshape(-1, 3),
+        ]
     )
     axes, _ = np.linalg.qr(common)
     without = np.eye(count) - axes @ axes.T
     moves = np.linalg.eigh(without @ in_lab @ spread[:count, :count] @ in_lab.T @ without)[1][
         :, ::-1
     ]
-    boresight = np.einsum("kji,j->ki", R_body_from_lab, AFIT_LEVER.cam_from_body.as_matrix()[2])
+    boresight = np.einsum(
+        "kji,j->ki", R_body_from_lab, AFIT_LEVER.cam_from_body.as_matrix()[2]
+    )
     boosts, _ = np.linalg.qr(
         without @ np.stack([np.cross(boresight, n).ravel() for n in np.eye(3)], axis=1)
     )

@@ -119,7 +119,9 @@ def test_with_the_corrected_sine_a_tenth_of_the_error_is_left() -> None:
     near = np.arctan2((R_M - M_M) * np.sin(half), M_M + (R_M - M_M) * np.cos(half))
     expected = 2 * (near - true) / ARCSEC
     found = pair_error_arcsec(2 * half, sine=True)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)  # the arc cosine's rounding
+    np.testing.assert_allclose(
+        found, expected, rtol=0, atol=1e-6
+    )  # the arc cosine's rounding
     assert -5 < found < -4
 
 
@@ -213,7 +215,9 @@ def test_different_stops_show_the_geometric_error_without_noise() -> None:
     ray = unit(np.array([[R_M * np.sin(tilt), 0, R_M * np.cos(tilt) - M_M]]))
     true = on_sphere(ray, LEVER.camera_body_m, R_M)
     for sine, found in spread.items():
-        off = nearfield.thesis_points(ray, SPHERE, LEVER, sine)[0] + LEVER.camera_body_m - true
+        off = (
+            nearfield.thesis_points(ray, SPHERE, LEVER, sine)[0] + LEVER.camera_body_m - true
+        )
         assert 0 < found < np.linalg.norm(off)
     assert spread[True] < spread[False]
 
@@ -317,7 +321,9 @@ def test_a_camera_mounted_askew_gives_the_same_positions() -> None:
     askew = Lever(np.array([0.004, -0.003, M_M]), Rotation.from_euler("z", 0.7))
     rng = np.random.default_rng(67)
     level = Rotation.identity()
-    seen = [sighting(rng, dome(), level, level, 0, noise_px=0.0, lever=askew) for _ in range(2)]
+    seen = [
+        sighting(rng, dome(), level, level, 0, noise_px=0.0, lever=askew) for _ in range(2)
+    ]
     found = calibrate(seen, CAMERA, SPHERE, askew)
     off = found.position_m - dome().position_m
     # Eq. 44's own error: 17 mm from the boresight the sphere is .12 mm lower, .12 mm of range shifts by 17 / 838.

@@ -71,7 +71,9 @@ def test_a_change_of_states_is_recovered(rng: np.random.Generator) -> None:
     EquationsOfMotion.integrate,
 )
 @given(rng=SEEDS)
-def test_momentum_in_the_lab_changes_by_external_torques_only(rng: np.random.Generator) -> None:
+def test_momentum_in_the_lab_changes_by_external_torques_only(
+    rng: np.random.Generator,
+) -> None:
     """Without gravity's moment, drag and torques H stays, whatever the wheels do; rate and slope agree."""
     free = SMALL.truth.copy()
     free[6:14] = 0
@@ -86,7 +88,9 @@ def test_momentum_in_the_lab_changes_by_external_torques_only(rng: np.random.Gen
     turned = motion.integrate(begin, begin + short, states, 2.0).minus(states)[:3] / short
     np.testing.assert_allclose(turned, rate, rtol=0, atol=1e-4)
     spin = motion.slope(begin, states).quaternion
-    np.testing.assert_allclose(np.sum(spin * states.quaternion, axis=0), 0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        np.sum(spin * states.quaternion, axis=0), 0, rtol=0, atol=1e-12
+    )
 
 
 @law(mass_dynamics.difference_steps, mass_dynamics.transition, mass_dynamics.torque_noise)
@@ -157,7 +161,9 @@ def test_elimination_equals_the_whole_normal_matrix(rng: np.random.Generator) ->
     np.testing.assert_array_equal(band[0], diagonal[:, range(STATE), range(STATE)].ravel())
 
 
-@law(mass_properties.considered, BearingRecord.noise_rad2, BearingRecord.with_noise, slow=True)
+@law(
+    mass_properties.considered, BearingRecord.noise_rad2, BearingRecord.with_noise, slow=True
+)
 @given(rng=SEEDS, at=some.integers(2, 24))
 def test_consider_covariance_is_the_effect_of_attitude_errors(
     rng: np.random.Generator, at: int
@@ -171,7 +177,9 @@ def test_consider_covariance_is_the_effect_of_attitude_errors(
     systematic = np.zeros((len(RECORD.t_s), 3, 3))
     systematic[at] = np.outer(error, error)
     shared = replace(
-        RECORD, covariance_rad2=RECORD.covariance_rad2 + systematic, systematic_rad2=systematic
+        RECORD,
+        covariance_rad2=RECORD.covariance_rad2 + systematic,
+        systematic_rad2=systematic,
     )
     np.testing.assert_allclose(shared.noise_rad2, RECORD.covariance_rad2, rtol=1e-12)
     np.testing.assert_allclose(

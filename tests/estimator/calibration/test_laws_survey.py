@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.calibration import bundle_adjustment as ba
-from estimator.calibration import dome_survey, star_field
+from estimator.calibration import bundle_covariance, dome_survey, star_field
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, survey
 from estimator.calibration.gauge import Gauge, Subset, align_attitudes
@@ -73,7 +73,9 @@ def dome(rng: np.random.Generator, noise_px: float = 0.0) -> tuple[Bundle, Sight
 
 def nudged(rng: np.random.Generator, true: Bundle, by: float) -> Bundle:
     """The parameters with small random errors."""
-    return true.apply_step(rng.normal(0, by, 3 * LIGHTS), rng.normal(0, by, 3 * FRAMES + 3 + 3))
+    return true.apply_step(
+        rng.normal(0, by, 3 * LIGHTS), rng.normal(0, by, 3 * FRAMES + 3 + 3)
+    )
 
 
 def whole_matrix(terms: ba.NormalEquations) -> Floats:
@@ -116,6 +118,7 @@ def test_the_jacobian_rows_match_finite_differences_of_the_residuals(
     ba.eliminate_lights,
     ba.step,
     ba.gauge_freedoms,
+    ba.free_gauge,
     ba.cauchy,
     ba.robust_scale,
     Bundle.cost,
@@ -131,6 +134,8 @@ def test_eliminating_the_lights_solves_the_whole_system(
     (led_free, rest_free) = ba.gauge_freedoms(bundle)
     whole = whole_matrix(terms)
     assert_covariance(whole)
+    np.testing.assert_array_equal(ba.free_gauge(bundle), rest_free)
+    assert ba.free_gauge(replace(bundle, map_sigma_m=1e-3)).shape == (len(rest_free), 0)
     still = whole @ np.concatenate([led_free, rest_free])  # they change no pixel
     np.testing.assert_allclose(still, 0, rtol=0, atol=1e-9 * np.abs(whole).max())
     led, rest = ba.step(terms, ba.eliminate_lights(terms, rest_free[:, :0], damping))
@@ -207,7 +212,7 @@ def test_redundancy_is_the_share_of_residuals_that_the_unknowns_do_not_absorb(
     )
     terms = ba.normal_equations(known, seen, every)
     part = Subset(known, seen, np.arange(LIGHTS), np.arange(FRAMES), np.arange(rows))
-    covariances = ba.covariance(terms, known)
+    covariances = bundle_covariance.covariance(terms, known)
     spare = 2 * rows - np.trace(np.linalg.solve(whole_matrix(terms), pixels))
     assert dome_survey.redundancy(part, covariances) == pytest.approx(spare, abs=1e-3)
     assert (
@@ -218,7 +223,7 @@ def test_redundancy_is_the_share_of_residuals_that_the_unknowns_do_not_absorb(
     assert dome_survey.redundancy(alone, covariances) == 2 * rows - (len(pixels) - 4)
 
 
-@law(ba.adjust, ba.fit_attitudes, ba.covariance_in_gauge)
+@law(ba.adjust, ba.fit_attitudes, bundle_covariance.covariance_in_gauge)
 @given(rng=SEEDS, by=some.floats(0, 3e-3))
 def test_an_adjustment_converges_to_the_observed_pixels(
     rng: np.random.Generator, by: float
@@ -233,7 +238,7 @@ def test_an_adjustment_converges_to_the_observed_pixels(
     gauge = Gauge(None, None, true.position_m, true.R_body_from_lab)
     part = Subset(found, seen, np.arange(LIGHTS), np.arange(FRAMES), np.arange(len(seen.led)))
     terms = ba.normal_equations(found, seen, np.ones(len(seen.led)))
-    by_led, by_rotation, shared = ba.covariance_in_gauge(
+    by_led, by_rotation, shared = bundle_covariance.covariance_in_gauge(
         terms, found, *gauge.constraints(found, part)
     )
     for matrix in (*by_led, *by_rotation, shared):
@@ -378,7 +383,15 @@ def test_the_misfit_is_over_what_the_pixels_determine(
     place_m = found.leds.position_m
     at_m = found.lever.camera_body_m
     bundle = Bundle(
-        place_m, attitudes, at_m, true.R_cam_from_body, lens, 3, leds.position_m, 0.002, assumed
+        place_m,
+        attitudes,
+        at_m,
+        true.R_cam_from_body,
+        lens,
+        3,
+        leds.position_m,
+        0.002,
+        assumed,
     )
     every = ba.linearize(bundle, seen)
     jacobian = np.zeros((len(seen.led), 2, 3 * LIGHTS + 3 * FRAMES + 6))
@@ -443,7 +456,9 @@ def filmed(rng: np.random.Generator, count: int) -> tuple[list[StarFrame], Rotat
 @given(rng=SEEDS, longer=some.floats(-0.03, 0.03))
 def test_star_fields_determine_the_lens(rng: np.random.Generator, longer: float) -> None:
     frames, truths = filmed(rng, 8)
-    sheet = replace(CAMERA.zoomed(1 + longer), center_px=(319.5, 239.5), distortion=(0.0,) * 5)
+    sheet = replace(
+        CAMERA.zoomed(1 + longer), center_px=(319.5, 239.5), distortion=(0.0,) * 5
+    )
     result = star_field.calibrate(frames, sheet)
     assert result.report.status == "converged"
     assert_covariance(result.covariance)

@@ -11,9 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as some
 from scipy.spatial.transform import Rotation
 
-from estimator.calibration import bundle_adjustment as ba
-from estimator.calibration import dome_survey, survey_faults, survey_plan
-from estimator.calibration.dome_survey import connected_subset
+from estimator.calibration import (
+    bundle_covariance,
+    survey_faults,
+    survey_plan,
+    survey_subset,
+)
 from estimator.calibration.gauge import Gauge
 from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
 from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
@@ -27,8 +30,8 @@ from tests.helpers.surveyed_dome import attitudes, model, pixels
         survey_plan.predict,
         SurveyAccuracy.led_rms_m,
         SurveyModel.visible,
-        ba.covariance,
-        connected_subset,
+        bundle_covariance.covariance,
+        survey_subset.connected_subset,
     ),
     slow=True,
 )
@@ -41,7 +44,9 @@ def test_predicted_errors_grow_with_noise_and_list_errors_and_shrink_with_frames
     seen = assumed.visible(held)
     first = answered(lambda: survey_plan.predict(assumed, held[:25], seen[:25]))
     larger = replace(
-        assumed, sigma_px=factor * assumed.sigma_px, leds_sigma_m=factor * assumed.leds_sigma_m
+        assumed,
+        sigma_px=factor * assumed.sigma_px,
+        leds_sigma_m=factor * assumed.leds_sigma_m,
     )
     scaled = answered(lambda: survey_plan.predict(larger, held[:25], seen[:25]))
     every = answered(lambda: survey_plan.predict(assumed, held, seen))
@@ -70,11 +75,12 @@ def test_a_longer_plan_extends_a_shorter_one(rng: np.random.Generator, count: in
         assert reachable[row] >= min(survey_plan.LEAST_CROSSING, reachable.max())
         covered = covered | shown[row]
     assert (
-        answered(lambda: survey_plan.choose(assumed, candidates, shown[:, :-1], count)) is None
+        answered(lambda: survey_plan.choose(assumed, candidates, shown[:, :-1], count))
+        is None
     )
 
 
-@law(dome_survey.ray_angles)
+@law(survey_subset.ray_angles)
 @given(rng=SEEDS, half_rad=some.floats(1e-3, 0.5))
 def test_rays_from_a_circle_cross_at_its_half_angle(
     rng: np.random.Generator, half_rad: float
@@ -91,7 +97,7 @@ def test_rays_from_a_circle_cross_at_its_half_angle(
     lights_m = np.array([at_m, at_m + 1, at_m - 1])
     frame = np.array([0, 1, 2, 3, 4, 2])
     led = np.array([0, 0, 0, 0, 0, 1])
-    angle_rad = dome_survey.ray_angles(lights_m, camera_m, frame, led)
+    angle_rad = survey_subset.ray_angles(lights_m, camera_m, frame, led)
     assert np.sin(half_rad) == pytest.approx(angle_rad[0], rel=1e-6)
     np.testing.assert_allclose(angle_rad[1:], 0, atol=1e-7)
 
@@ -257,7 +263,9 @@ def test_no_other_light_gets_the_name_of_a_dark_led(rng: np.random.Generator) ->
 
 @law(survey_faults.exchanged)
 @given(rng=SEEDS, gain=some.floats(0.1, 10))
-def test_exchanged_lights_are_found_at_any_gain(rng: np.random.Generator, gain: float) -> None:
+def test_exchanged_lights_are_found_at_any_gain(
+    rng: np.random.Generator, gain: float
+) -> None:
     levels = np.exp(np.linspace(0, -3, 12))[rng.permutation(12)]
     shown = np.ones((10, 12), dtype=bool)
     light = gain * levels * np.exp(0.03 * rng.normal(0, 1, (10, 12)))

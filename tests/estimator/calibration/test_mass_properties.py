@@ -208,10 +208,13 @@ def test_a_motion_of_known_trim_adds_the_scale() -> None:
 
 def test_too_few_attitudes_and_missing_wheel_speeds_are_refused() -> None:
     whole = record(SMALL, np.random.default_rng(0), 10.0)
-    with pytest.raises(ImageError, match=r"^mass properties: 3 attitudes; allowed: 4 or more$"):
+    with pytest.raises(
+        ImageError, match=r"^mass properties: 3 attitudes; allowed: 4 or more$"
+    ):
         replace(whole, t_s=whole.t_s[:3])
     with pytest.raises(
-        ImageError, match=r"wheel speeds from 0 to 5 s; allowed: over all attitudes, 0 to 10 s$"
+        ImageError,
+        match=r"wheel speeds from 0 to 5 s; allowed: over all attitudes, 0 to 10 s$",
     ):
         replace(whole, wheel_t_s=whole.wheel_t_s[:51])
     with pytest.raises(ImageError, match=r"^mass properties: times do not ascend$"):

@@ -16,9 +16,9 @@ from estimator.calibration.star_field import (
     StarFrame,
     calibrate,
     disagreement_px,
-    magnitude_zero,
     self_calibrate,
 )
+from estimator.calibration.zero_point import magnitude_zero
 from estimator.catalog import catalog
 from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera
@@ -247,9 +247,15 @@ def test_bad_frames_are_refused_in_one_line() -> None:
     spoiled = [
         ([], "no frames"),
         ([good, replace(good, sigma_px=np.ones(3))], "frame 1 has shapes"),
-        ([replace(good, sigma_px=np.zeros(20))], "frame 0 has a pixel .* sigma_px not above 0"),
+        (
+            [replace(good, sigma_px=np.zeros(20))],
+            "frame 0 has a pixel .* sigma_px not above 0",
+        ),
         ([replace(good, xy_px=good.xy_px * np.nan)], "frame 0 has a pixel .* not finite"),
-        (lacking[:1], "8 coordinates in frames of 3 stars or more, for 3 unknowns of attitude"),
+        (
+            lacking[:1],
+            "8 coordinates in frames of 3 stars or more, for 3 unknowns of attitude",
+        ),
         (
             drawn(np.random.default_rng(96), stars=2).frames,
             "0 coordinates in frames of 3 stars",
@@ -264,7 +270,9 @@ def test_bad_frames_are_refused_in_one_line() -> None:
 # ---- The measure ----
 
 
-def test_a_wrong_focal_length_disagrees_by_its_share_of_the_distance_from_the_center() -> None:
+def test_a_wrong_focal_length_disagrees_by_its_share_of_the_distance_from_the_center() -> (
+    None
+):
     # Rms distance from the middle of a rectangle: sqrt((w^2 + h^2) / 12).
     camera = Camera(800, 600, 3000.0, (399.5, 299.5))
     expected = 1e-3 * np.sqrt((800**2 + 600**2) / 12)

@@ -14,14 +14,13 @@ from estimator.attitude.dome_map import Lever
 from estimator.calibration import survey_faults, survey_plan
 from estimator.calibration.bundle_adjustment import Assumed
 from estimator.calibration.dome_survey import (
-    CONNECTING_RAD,
     DomeFrame,
     DomeSurvey,
-    ray_angles,
     survey,
 )
 from estimator.calibration.survey_faults import LightTable
 from estimator.calibration.survey_plan import SurveyModel
+from estimator.calibration.survey_subset import CONNECTING_RAD, ray_angles
 from estimator.core.camera import Camera
 from tests.helpers.surveyed_dome import LIST_SIGMA_M, NOISE_PX, attitudes, leds, model, pixels
 
@@ -183,7 +182,8 @@ def test_a_plan_continues_from_the_frames_at_hand() -> None:
     candidates = attitudes(np.random.default_rng(4), 300)
     shown = true.visible(candidates)
     west = candidates[
-        candidates.inv().apply(true.lever.cam_from_body.inv().apply([0, 0, 1.0]))[:, 0] < -0.15
+        candidates.inv().apply(true.lever.cam_from_body.inv().apply([0, 0, 1.0]))[:, 0]
+        < -0.15
     ]
     seen = true.visible(west)
     further = survey_plan.choose(true, candidates, shown, 10, west, seen)
@@ -270,7 +270,9 @@ def test_a_dome_without_a_fault_gives_few_alarms() -> None:
         found = listed + np.sqrt(1.01) * rng.normal(0, 1, (300, 3))
         alarms[0] += len(survey_faults.displaced(listed, found, covariance)[0]) > 0
         shown = rng.random((12, 300)) < 0.3
-        alarms[1] += len(survey_faults.dark(shown, shown & (rng.random((12, 300)) < 0.97))) > 0
+        alarms[1] += (
+            len(survey_faults.dark(shown, shown & (rng.random((12, 300)) < 0.97))) > 0
+        )
     assert (alarms <= 4).all()
 
 
@@ -281,7 +283,9 @@ def test_leds_in_the_right_order_are_not_reported_as_exchanged() -> None:
     alarms = 0
     for _ in range(300):
         levels = np.array([1.0, 0.7, 0.5, 0.35])[rng.integers(0, 4, 100)]
-        light = levels * np.exp(0.08 * rng.normal(size=100) + 0.02 * rng.normal(size=(8, 100)))
+        light = levels * np.exp(
+            0.08 * rng.normal(size=100) + 0.02 * rng.normal(size=(8, 100))
+        )
         alarms += len(
             survey_faults.exchanged(
                 LightTable(light, np.ones((8, 100), bool), np.tile(levels, (8, 1)))

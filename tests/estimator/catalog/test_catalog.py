@@ -223,7 +223,9 @@ def test_merging_keeps_all_the_light_brightest_first(stars: StarCatalog) -> None
 
 
 def test_brighter_keeps_the_limit_itself() -> None:
-    stars = made_up((1, 0, 0, 0, 0, 0, 4.0), (2, 9, 0, 0, 0, 0, 5.0), (3, 20, 0, 0, 0, 0, 5.01))
+    stars = made_up(
+        (1, 0, 0, 0, 0, 0, 4.0), (2, 9, 0, 0, 0, 0, 5.0), (3, 20, 0, 0, 0, 0, 5.01)
+    )
     assert catalog.brighter_than(stars, 5.0).id.tolist() == [1, 2]
 
 
@@ -307,7 +309,9 @@ def test_stars_move_from_the_epoch_of_their_file(tmp_path: Path) -> None:
     stars = catalog.read(path)
     assert stars.epoch_yr == 2016.0
     for kept in (stars, stars.take(np.array([0])), catalog.merge_doubles(stars, 1e-4)):
-        assert catalog.at_epoch(kept, 2012.0)[0, 2] / ARCSEC_RAD == pytest.approx(-4, abs=1e-6)
+        assert catalog.at_epoch(kept, 2012.0)[0, 2] / ARCSEC_RAD == pytest.approx(
+            -4, abs=1e-6
+        )
 
 
 @pytest.mark.parametrize("name", [".", "no_such_file.ecsv"])

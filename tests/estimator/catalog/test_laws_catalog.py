@@ -55,13 +55,17 @@ def test_stars_move_across_the_sky_and_no_farther_than_they_can(
     away = np.linalg.norm(seen + there.position_au, axis=1)
     assert (
         moved
-        < 1.01e-4 + stars.parallax_rad + 2 * catalog.SUN_DEFLECTION_RAD / np.maximum(away, 1e-9)
+        < 1.01e-4
+        + stars.parallax_rad
+        + 2 * catalog.SUN_DEFLECTION_RAD / np.maximum(away, 1e-9)
     ).all()
 
 
 @law(catalog.on_earth)
 @given(some.datetimes(datetime.datetime(1900, 1, 1), datetime.datetime(2100, 1, 1)))
-def test_the_earth_is_one_au_from_the_sun_and_moves_at_30_km_s(utc: datetime.datetime) -> None:
+def test_the_earth_is_one_au_from_the_sun_and_moves_at_30_km_s(
+    utc: datetime.datetime,
+) -> None:
     there = catalog.on_earth(utc)
     assert 0.97 < np.linalg.norm(there.position_au) < 1.03
     assert 29e3 < np.linalg.norm(there.velocity_m_s) < 30.6e3
@@ -150,7 +154,9 @@ def test_merged_stars_keep_their_light(rng: np.random.Generator, near_rad: float
     rng=SEEDS,
 )
 def test_any_table_is_a_catalog_or_is_refused(
-    tmp_path_factory: pytest.TempPathFactory, rows: list[list[object]], rng: np.random.Generator
+    tmp_path_factory: pytest.TempPathFactory,
+    rows: list[list[object]],
+    rng: np.random.Generator,
 ) -> None:
     path = tmp_path_factory.mktemp("catalog") / "x.ecsv"
     head = "# epoch_jyear: 2016.0\n" + ",".join(catalog.COLUMNS)
@@ -184,9 +190,9 @@ def test_a_prepared_catalog_counts_every_star(
     assert count.sum() == len(prepared)
     assert edges[0] <= prepared.magnitude[0] + 1e-6
     assert prepared.magnitude[-1] < edges[-1] + step_mag
-    assert len(published_catalogs.log(prepared, step_mag).splitlines()) == 6 + len(count) + len(
-        prepared
-    )
+    assert len(published_catalogs.log(prepared, step_mag).splitlines()) == 6 + len(
+        count
+    ) + len(prepared)
 
 
 # Indexes

@@ -71,7 +71,9 @@ def test_the_zenith_matches_erfa(
     utc: datetime.datetime, latitude: float, longitude: float, t_s: float
 ) -> None:
     """By precession and nutation of IAU 2006/2000A and the Earth rotation angle, of UTC for UT1 in both."""
-    days = (utc - datetime.datetime(2000, 1, 1, 12)) / datetime.timedelta(days=1) + t_s / 86400
+    days = (utc - datetime.datetime(2000, 1, 1, 12)) / datetime.timedelta(
+        days=1
+    ) + t_s / 86400
     theta = erfa.era00(erfa.DJ00, days) + np.radians(longitude)
     lat = np.radians(latitude)
     up = np.array([np.cos(lat) * np.cos(theta), np.cos(lat) * np.sin(theta), np.sin(lat)])
@@ -97,5 +99,6 @@ def test_the_zenith_matches_erfa(
 def test_bad_air_is_refused(change: dict, name: str) -> None:
     with pytest.raises(ImageError, match=name):
         SiteAir(
-            **{"latitude_deg": 50.0, "longitude_deg": 8.0, "epoch": "2012-06-24T23:00"} | change
+            **{"latitude_deg": 50.0, "longitude_deg": 8.0, "epoch": "2012-06-24T23:00"}
+            | change
         )

@@ -83,7 +83,9 @@ def test_nothing_within_the_gate_is_missed(crowd: Floats, width_arcsec: float) -
     gate = 29 * ARCSEC_RAD
     slack = 1e-12
     keys = {}
-    for theta in np.concatenate([rng.uniform(0, np.radians(12.5), 60), rng.choice(angle, 20)]):
+    for theta in np.concatenate(
+        [rng.uniform(0, np.radians(12.5), 60), rng.choice(angle, 20)]
+    ):
         window = candidates(known, theta - gate, theta + gate)
         if window not in keys:
             keys[window] = names(known.pair[slice(*window)])
@@ -120,7 +122,9 @@ def test_buckets_of_a_quarter_gate_look_at_an_eighth_too_many(
     for theta in thetas:
         begin, end = candidates(published, theta - gate, theta + gate)
         looked += end - begin
-        expected += np.searchsorted(angle, theta + gate) - np.searchsorted(angle, theta - gate)
+        expected += np.searchsorted(angle, theta + gate) - np.searchsorted(
+            angle, theta - gate
+        )
     # Of N wanted an eighth is Poisson, and less is repeated as the gates overlap: five deviations of that eighth.
     pairs_once = len(published.pair)
     assert abs(looked / expected - 1.125) < 5 * np.sqrt(0.125 / pairs_once)
@@ -137,7 +141,9 @@ def test_pairs_are_limited_by_magnitude_and_angle(crowd: Floats) -> None:
 
 
 def test_settings_that_leave_no_catalog_are_refused(crowd: Floats) -> None:
-    with pytest.raises(PLAIN.ImageError, match=r"no pair of stars from 20\.000 to 30\.000 deg"):
+    with pytest.raises(
+        PLAIN.ImageError, match=r"no pair of stars from 20\.000 to 30\.000 deg"
+    ):
         build_pair_catalog(crowd, np.zeros(500), range_rad=(np.radians(20), np.radians(30)))
     with pytest.raises(PLAIN.ImageError, match="bucket width 0 rad; allowed: more than 0"):
         build_pair_catalog(crowd, np.zeros(500), 0)

@@ -62,9 +62,13 @@ def test_every_star_has_all_its_neighbors_sorted_by_angle(sky: pair_index.PairIn
         )
 
 
-def test_bisection_finds_the_first_neighbor_beyond_an_angle(sky: pair_index.PairIndex) -> None:
+def test_bisection_finds_the_first_neighbor_beyond_an_angle(
+    sky: pair_index.PairIndex,
+) -> None:
     rng = np.random.default_rng(31)
-    for star, low in zip(rng.integers(0, 600, 300), rng.uniform(-0.01, 0.33, 300), strict=True):
+    for star, low in zip(
+        rng.integers(0, 600, 300), rng.uniform(-0.01, 0.33, 300), strict=True
+    ):
         mine = sky.separation_rad[sky.first[star] : sky.first[star + 1]]
         assert pair_index.first_neighbor(sky, star, low) - sky.first[star] == np.searchsorted(
             mine, low

@@ -41,7 +41,9 @@ def test_the_counts_are_the_published_ones(limit: float, published: int) -> None
 def test_the_file_s_order_stays_until_the_catalog_is_processed() -> None:
     raw = read_cat(FILE, 5.0)
     numbers = [
-        int(line.split(",")[0]) for line in FILE.read_text().splitlines() if line[:1].isdigit()
+        int(line.split(",")[0])
+        for line in FILE.read_text().splitlines()
+        if line[:1].isdigit()
     ]
     place = {hip: n for n, hip in enumerate(numbers)}
     assert np.all(np.diff([place[hip] for hip in raw.id]) > 0)
@@ -59,7 +61,9 @@ def test_the_mission_s_epoch_matches_erfa_s_space_motion() -> None:
     pm_ra, pm_dec = np.array([pm_ra / np.cos(dec), pm_dec]) * 1e-3 * ARCSEC_RAD
     epochs = erfa.DJ00, -8.75 * 365.25, erfa.DJ00, 10 * 365.25
     ra, dec, *_ = erfa.pmsafe(ra, dec, pm_ra, pm_dec, 0.01, 0.0, *epochs)
-    oracle = np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    oracle = np.column_stack(
+        [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]
+    )
     # 0.2 mas: erfa moves a star evenly in space, 0.01" of parallax away; alpha Centauri's 69" is its angle's tangent.
     assert np.linalg.norm(oracle - raw.vectors, axis=1).max() < 2e-4 * ARCSEC_RAD
     assert np.linalg.norm(raw.vectors - still.vectors, axis=1).max() > 60 * ARCSEC_RAD
@@ -119,7 +123,9 @@ def test_the_histogram_counts_every_star_in_its_bin() -> None:
     assert count.tolist() == [1, 0, 0, 2, 1, 0, 1]
     magnitude = read_cat(FILE, 6.0).magnitude
     edges, count = histogram(magnitude, 0.25)
-    np.testing.assert_array_equal(count, np.histogram(magnitude, [*edges, edges[-1] + 0.25])[0])
+    np.testing.assert_array_equal(
+        count, np.histogram(magnitude, [*edges, edges[-1] + 0.25])[0]
+    )
 
 
 def test_the_log_has_the_histogram_the_memory_and_every_star() -> None:
@@ -130,7 +136,13 @@ def test_the_log_has_the_histogram_the_memory_and_every_star() -> None:
     assert lines[0] == "3 entries from 4 stars at J2000.00; 1 of them of 2 stars"
     assert lines[1].startswith(f"{3 * BYTES_PER_ENTRY} bytes")
     assert lines[-3].split() == ["3", "90.000000", "+0.000000", "-1.000", "1"]
-    assert lines[-2].split() == ["1", "0.027778", "+0.000000", "4.897", "2"]  # 100", 5 - .1035
+    assert lines[-2].split() == [
+        "1",
+        "0.027778",
+        "+0.000000",
+        "4.897",
+        "2",
+    ]  # 100", 5 - .1035
     counts = [int(line.split()[3]) for line in lines if ".." in line]
     assert sum(counts) == 3
 

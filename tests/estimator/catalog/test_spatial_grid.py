@@ -45,6 +45,7 @@ def test_a_short_list_keeps_the_count() -> None:
     vectors = patch(np.random.default_rng(3), 50)
     out = np.full(10, -1)
     assert (
-        sky_index.within(sky_index.build_grid(vectors), vectors, 0.0, 0.0, 1.0, 0.5, out) == 50
+        sky_index.within(sky_index.build_grid(vectors), vectors, 0.0, 0.0, 1.0, 0.5, out)
+        == 50
     )
     assert len(set(out)) == 10

@@ -111,7 +111,9 @@ def test_the_fit_recovers_a_noise_free_gaussian(sigma: float) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(CENTROIDERS))
-def test_a_centroid_follows_its_star_by_whole_pixels_and_across_the_diagonal(name: str) -> None:
+def test_a_centroid_follows_its_star_by_whole_pixels_and_across_the_diagonal(
+    name: str,
+) -> None:
     image = np.full((80, 96), 50.0)
     image += gaussian((80, 96), 40.3, 30.8, 1e4)
     seen = CENTROIDERS[name](image, detect.local(image, min_area_px=1)).xy_px
@@ -243,7 +245,9 @@ def test_the_windowed_centroid_s_error_is_an_eighth_above_the_minimum(sigma: flo
         image, np.array([[30.0, 30.0]]), box, np.zeros((1, 1)), noise, 1e12
     )[0]
     np.testing.assert_allclose(row[:2], [30.3, 29.8], rtol=0, atol=1e-3)
-    assert row[2] == pytest.approx(9 / 8 * np.sqrt(8 * np.pi) * sigma**2 * 3.0 / 1e4, rel=0.01)
+    assert row[2] == pytest.approx(
+        9 / 8 * np.sqrt(8 * np.pi) * sigma**2 * 3.0 / 1e4, rel=0.01
+    )
 
 
 def test_a_star_at_an_edge_is_placed_as_its_mirror_image_at_the_other() -> None:
@@ -293,7 +297,9 @@ def test_stars_side_by_side_do_not_pull_each_other(name: str, apart_px: float) -
     for _ in range(150):
         x, y = rng.uniform(29, 30, 2)
         turn = rng.uniform(0, 2 * np.pi)
-        places = np.array([[x, y], [x + apart_px * np.cos(turn), y + apart_px * np.sin(turn)]])
+        places = np.array(
+            [[x, y], [x + apart_px * np.cos(turn), y + apart_px * np.sin(turn)]]
+        )
         light = gaussian((64, 64), *places[0], 2e4) + gaussian((64, 64), *places[1], 4e3)
         image = rng.poisson(light) + rng.normal(100, 5, light.shape)
         blobs = detect.local(image)
@@ -336,7 +342,9 @@ def test_a_frame_without_blobs_gives_no_centroids(name: str) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("radius", "bright_e"), [(5.0, 400.0), (10.4, 400.0), (10.4, 4000.0)])
+@pytest.mark.parametrize(
+    ("radius", "bright_e"), [(5.0, 400.0), (10.4, 400.0), (10.4, 4000.0)]
+)
 def test_the_disk_fit_is_unbiased_and_beats_center_of_gravity_under_noise(
     radius: float, bright_e: float
 ) -> None:

@@ -62,6 +62,11 @@ IMAGE = np.random.default_rng(1).normal(100, 3, (30, 40))
 def test_a_centroider_refuses_invalid_blobs(
     name: str, change: dict[str, Any], message: str
 ) -> None:
-    good = {"image": IMAGE, "blobs": blobs([2, 2, 9, 9]), "gain_e_dn": 1.0, "priors": NO_PRIORS}
+    good = {
+        "image": IMAGE,
+        "blobs": blobs([2, 2, 9, 9]),
+        "gain_e_dn": 1.0,
+        "priors": NO_PRIORS,
+    }
     with pytest.raises(ImageError, match=message):
         CENTROIDERS[name](**good | change)

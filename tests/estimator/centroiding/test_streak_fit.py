@@ -32,7 +32,9 @@ def smeared(
 
     def share(count: int, at: np.ndarray) -> np.ndarray:
         return (
-            np.diff(erf((np.arange(count + 1) - 0.5 - at[:, None]) / (sigma * 2**0.5)), axis=1)
+            np.diff(
+                erf((np.arange(count + 1) - 0.5 - at[:, None]) / (sigma * 2**0.5)), axis=1
+            )
             / 2
         )
 
@@ -41,10 +43,16 @@ def smeared(
 
 
 def field(
-    rng: np.random.Generator, dx: float, dy: float, fluxes_e: np.ndarray, noise_e: float = 10.0
+    rng: np.random.Generator,
+    dx: float,
+    dy: float,
+    fluxes_e: np.ndarray,
+    noise_e: float = 10.0,
 ):
     """A 512x512 frame of up to 36 streaks on a lattice, and their middles."""
-    lattice = np.array([(x, y) for y in range(56, 480, 80) for x in range(56, 480, 80)], float)
+    lattice = np.array(
+        [(x, y) for y in range(56, 480, 80) for x in range(56, 480, 80)], float
+    )
     xy = lattice[: len(fluxes_e)] + rng.uniform(-8, 8, (len(fluxes_e), 2))
     light = np.full((512, 512), 50.0)
     for (x, y), flux in zip(xy, fluxes_e, strict=True):
@@ -136,7 +144,9 @@ def test_in_pure_noise_the_line_filter_keeps_only_bright_runs_of_five_pixels() -
     background = frame_background.estimate_background(image)
     blobs = detect.detect_streaks(image, background, 2.0, 1000, FramePriors(streak_px))
     taps = detect.line_taps(streak_px)
-    above = 2.0 * detect.noise_factor(taps) / frame_background.FILTERED_NOISE * background.noise
+    above = (
+        2.0 * detect.noise_factor(taps) / frame_background.FILTERED_NOISE * background.noise
+    )
     mask = np.zeros(image.shape, bool)
     for y, x0, x1 in runs_above(image, background.level + above, taps):
         mask[y, x0 : x1 + 1] = True
@@ -303,9 +313,9 @@ def test_a_star_s_own_vector_excludes_the_priors(seed: int) -> None:
     pull[place] = prior[place, place] * prior_mean
     p = np.linalg.solve(normal, np.linalg.solve(covariance, data_mean) + pull)
     out = np.full(5, np.nan)
-    streak_fit._own_vector(
-        np.linalg.cholesky(normal), p, *prior_mean, 1.0, 0.01, np.empty(7), out
-    )
+    start = np.zeros(7)
+    start[place] = prior_mean
+    streak_fit._own_vector(np.linalg.cholesky(normal), p, start, 1.0, 0.01, out)
     length, angle = data_mean[place]
     c = np.cos(angle)
     s = np.sin(angle)
@@ -343,7 +353,9 @@ def test_false_streaks_of_white_noise_are_rare() -> None:
 
 
 @pytest.mark.slow
-def test_streaks_below_the_single_detection_limit_are_found_by_their_common_direction() -> None:
+def test_streaks_below_the_single_detection_limit_are_found_by_their_common_direction() -> (
+    None
+):
     """Five streaks of unknown direction; the filter for round stars finds two of them at most."""
     rng = np.random.default_rng(31)
     middles = rng.uniform(40, 360, (5, 2))
@@ -385,7 +397,9 @@ def test_the_fit_s_model_is_the_integral_of_a_moving_gaussian() -> None:
         rows = np.ones((8, x.size))
         weight = np.empty(x.size)
         plain._rows(np.vstack([x, y, np.zeros(x.size)]), 3.0, 2.0, at, rows, weight)
-        np.testing.assert_allclose(weight, 1 / (9 + (-rows[7] - at[plain.SKY]) / 2), rtol=1e-9)
+        np.testing.assert_allclose(
+            weight, 1 / (9 + (-rows[7] - at[plain.SKY]) / 2), rtol=1e-9
+        )
         return -rows[7], rows  # the pixels are zero: the residual is minus the model
 
     light, rows = model(p)
@@ -475,9 +489,9 @@ def test_a_streak_s_length_direction_and_width_are_weighed_with_the_frame_s() ->
             x - p[0],
             y - p[1],
         ]
-        along = np.diff(erf(np.array([u - p[3] / 2, u + p[3] / 2]) / (p[5] * 2**0.5)), axis=0)[
-            0
-        ] / (2 * p[3])
+        along = np.diff(
+            erf(np.array([u - p[3] / 2, u + p[3] / 2]) / (p[5] * 2**0.5)), axis=0
+        )[0] / (2 * p[3])
         return p[6] + p[2] * along * np.exp(-((v / p[5]) ** 2) / 2) / (
             p[5] * np.sqrt(2 * np.pi)
         )

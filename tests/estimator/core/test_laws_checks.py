@@ -73,10 +73,16 @@ def is_plain(array: NDArray, dtype: Any) -> bool:
 
 
 @law(
-    checks.native, checks.floats, detect.to_native, detect.in_row_order, detect.check_pixel_type
+    checks.native,
+    checks.floats,
+    detect.to_native,
+    detect.in_row_order,
+    detect.check_pixel_type,
 )
 @given(array=MATRICES)
-def test_an_array_of_any_type_or_layout_gives_the_plain_array_s_result(array: NDArray) -> None:
+def test_an_array_of_any_type_or_layout_gives_the_plain_array_s_result(
+    array: NDArray,
+) -> None:
     for one in disguises(array):
         plain = checks.floats("x", one, (None, array.shape[1]))
         assert is_plain(plain, np.float64)
@@ -88,7 +94,9 @@ def test_an_array_of_any_type_or_layout_gives_the_plain_array_s_result(array: ND
         np.testing.assert_array_equal(looped, array.astype(looped.dtype))
     plain = np.ascontiguousarray(array, dtype=float)
     assert checks.floats("x", plain, (None, None)) is plain
-    assert answered(lambda: detect.check_pixel_type(array.astype(complex)), ImageError) is None
+    assert (
+        answered(lambda: detect.check_pixel_type(array.astype(complex)), ImageError) is None
+    )
     with pytest.raises(ImageError, match="a list; allowed: a numpy array"):
         detect.check_pixel_type(array.tolist())
 

@@ -30,7 +30,10 @@ def test_the_loss_is_a_square_at_first_and_then_grows_as_the_residual(size: floa
 
 @law(fit_soft_l1)
 @given(
-    rng=SEEDS, count=some.integers(16, 60), gross=some.integers(0, 2), units=some.floats(-3, 3)
+    rng=SEEDS,
+    count=some.integers(16, 60),
+    gross=some.integers(0, 2),
+    units=some.floats(-3, 3),
 )
 def test_the_robust_fit_finds_scipy_s_minimum(
     rng: np.random.Generator, count: int, gross: int, units: float

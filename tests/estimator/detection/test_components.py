@@ -27,7 +27,9 @@ def star(shape: tuple[int, int], x: float, y: float, flux: float, sigma: float) 
 def field(seed: int, sigma: float = 0.8) -> np.ndarray:
     """A 200x240 frame of 20 stars of different light, none touching another."""
     rng = np.random.default_rng(seed)
-    lattice = np.array([(x, y) for y in range(25, 190, 40) for x in range(30, 230, 45)], float)
+    lattice = np.array(
+        [(x, y) for y in range(25, 190, 40) for x in range(30, 230, 45)], float
+    )
     light = np.full((200, 240), 100.0)
     for k, (x, y) in enumerate(rng.permutation(lattice)[:20] + rng.uniform(-8, 8, (20, 2))):
         light += star(light.shape, x, y, 3000 * 1.2**k, sigma)

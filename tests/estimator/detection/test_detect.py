@@ -155,7 +155,10 @@ def test_the_peak_of_an_image_below_zero_is_below_zero() -> None:
 def test_a_ramp_of_the_sky_is_not_detected(slope: tuple[float, float]) -> None:
     y, x = np.mgrid[:512, :640]
     image = (
-        20_000 + slope[0] * x + slope[1] * y + np.random.default_rng(8).normal(0, 5, (512, 640))
+        20_000
+        + slope[0] * x
+        + slope[1] * y
+        + np.random.default_rng(8).normal(0, 5, (512, 640))
     )
     assert len(detect.local(image)) == 0
 

@@ -369,7 +369,10 @@ def test_a_streak_s_center_is_between_its_ends(
     pipeline.inflate_uncertainty,
 )
 @given(
-    rng=SEEDS, count=some.integers(0, 60), base=some.integers(1, 30), floor_px=some.floats(0, 2)
+    rng=SEEDS,
+    count=some.integers(0, 60),
+    base=some.integers(1, 30),
+    floor_px=some.floats(0, 2),
 )
 def test_lights_are_selected_and_weighted_by_the_settings(
     rng: np.random.Generator, count: int, base: int, floor_px: float
@@ -388,7 +391,9 @@ def test_lights_are_selected_and_weighted_by_the_settings(
     frame, _ = starry(rng)
     blobs = DETECTORS["local"](frame, 5.0, 3, 9, FramePriors())
     seen = CENTROIDERS["cog"](frame, blobs, 1.0, FramePriors())
-    assert (pipeline.inflate_uncertainty(seen, blobs, settings).sigma_px >= seen.sigma_px).all()
+    assert (
+        pipeline.inflate_uncertainty(seen, blobs, settings).sigma_px >= seen.sigma_px
+    ).all()
     off_border = (blobs.box_px > 0) & (blobs.box_px < np.tile([WIDTH - 1, HEIGHT - 1], 2))
     np.testing.assert_array_equal(
         pipeline.away_from_border(blobs.box_px, CAMERA), off_border.all(axis=1)
@@ -463,7 +468,9 @@ def test_projected_rays_return_to_their_pixels(
     rays = lens.rays(xy)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1, rtol=0, atol=1e-12)
     np.testing.assert_allclose(lens.pixels(rays), xy, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(lens.tangents(xy), rays[:, :2] / rays[:, 2:], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        lens.tangents(xy), rays[:, :2] / rays[:, 2:], rtol=0, atol=1e-12
+    )
     assert np.isnan(lens.pixels(-rays)).all()
     assert lens.contains(xy).all()
     assert (lens.contains(xy, 3.0) <= lens.contains(xy, 1.0)).all()
@@ -595,5 +602,7 @@ def test_a_blemish_adds_the_same_variance_in_every_direction(
     lights = Centroids(np.array([[11.0, 11.0]]), np.array([0.02]), np.array([99.0]), ellipse)
     settings = Settings(bad_px=np.array([bad_px, [40, 40]]))
     found = pipeline.inflate_uncertainty(lights, blob, settings)
-    np.testing.assert_allclose(found.covariance_px2, ellipse + variance * np.eye(2), rtol=1e-12)
+    np.testing.assert_allclose(
+        found.covariance_px2, ellipse + variance * np.eye(2), rtol=1e-12
+    )
     assert found.sigma_px[0] == pytest.approx(np.hypot(0.02, np.sqrt(variance)), rel=1e-12)

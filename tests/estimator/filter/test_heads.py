@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from estimator.filter.mekf import USED, AttitudeFilter, GyroModel, TrackerModel
+from estimator.filter.error_models import GyroModel, TrackerModel
+from estimator.filter.mekf import USED, AttitudeFilter
 from tests.helpers.tumble import tumble_angle_rad, tumble_body_from_ref
 
 ARCSEC_RAD = np.pi / 180 / 3600

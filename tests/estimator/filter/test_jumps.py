@@ -10,16 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from estimator.filter.consistency import CONFIRMATIONS, ENOUGH, Jump, log_odds, shock_rad
-from estimator.filter.mekf import (
-    DISPUTED,
-    OUTSIDE_GATE,
-    RESET,
-    USED,
-    AttitudeFilter,
-    GyroModel,
-    JumpModel,
-    Update,
-)
+from estimator.filter.error_models import GyroModel, JumpModel
+from estimator.filter.mekf import DISPUTED, OUTSIDE_GATE, RESET, USED, AttitudeFilter, Update
 
 ARCSEC_RAD = np.pi / 180 / 3600
 ARW_RAD_SQRT_S = np.radians(0.07) / 60
@@ -35,7 +27,11 @@ class Vehicle:
     """A vehicle at rest with a noisy gyro at 100 Hz and a solution each second."""
 
     def __init__(
-        self, seed: int, gyro: GyroModel = GYRO, start: Rotation = HOME, sigma_rad: float = 1e-3
+        self,
+        seed: int,
+        gyro: GyroModel = GYRO,
+        start: Rotation = HOME,
+        sigma_rad: float = 1e-3,
     ) -> None:
         self.rng = np.random.default_rng(seed)
         self.second = 0
@@ -174,7 +170,9 @@ def test_after_a_knock_the_filter_is_back_within_three_solutions(
     updates = [vehicle.update(after, turn, flagged), *vehicle.updates(after, 3)]
     assert updates[2].status in (USED, RESET)
     assert updates[3].status == USED
-    assert vehicle.error_rad(after) < 5 * np.linalg.norm(vehicle.mekf.state.sigma_attitude_rad)
+    assert vehicle.error_rad(after) < 5 * np.linalg.norm(
+        vehicle.mekf.state.sigma_attitude_rad
+    )
 
 
 def test_a_measured_knock_does_not_admit_a_wrong_solution() -> None:
@@ -254,12 +252,16 @@ def test_a_shock_is_the_largest_change_of_rate_above_noise() -> None:
     samples[:, 1:4] = ARW_RAD_SQRT_S * np.sqrt(step_s)[:, None] * rng.normal(size=(100, 3))
     assert shock_rad(2.0, samples, ARW_RAD_SQRT_S) == 0.0
     samples[60:, 2] += 0.5 * step_s[60:]
-    assert shock_rad(2.0, samples, ARW_RAD_SQRT_S) == pytest.approx(0.5 * step_s[60], rel=0.01)
+    assert shock_rad(2.0, samples, ARW_RAD_SQRT_S) == pytest.approx(
+        0.5 * step_s[60], rel=0.01
+    )
     assert shock_rad(2.0, samples[:60], ARW_RAD_SQRT_S) == 0.0
     assert shock_rad(2.0, samples[:0], ARW_RAD_SQRT_S) == 0.0
 
 
-@pytest.mark.parametrize("name", ["missed_per_s", "wrong_share", "wrong_repeat", "wrong_start"])
+@pytest.mark.parametrize(
+    "name", ["missed_per_s", "wrong_share", "wrong_repeat", "wrong_start"]
+)
 @pytest.mark.parametrize("value", [0.0, 1.0, -1.0, np.nan])
 def test_a_bad_probability_is_refused_in_one_line(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=rf"jumps: {name} is .*; allowed: above 0, below 1$"):

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import FilterState
-from estimator.filter.mekf import USED, AttitudeFilter, GyroModel
+from estimator.filter.error_models import GyroModel
+from estimator.filter.mekf import USED, AttitudeFilter
 from estimator.filter.states import inverse_response
 from estimator.trackers import exposure_control
 from estimator.trackers.exposure_control import Control, NextExposure, Observation
@@ -120,7 +121,9 @@ def test_an_accepted_solution_shrinks_the_covariance(
     update = mekf.update(0.2, measured, sigma_rad**2 * np.eye(3))
     after = mekf.state
     assert_sound(after)
-    np.testing.assert_allclose(np.linalg.norm(update.residual_rad), off_rad, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        np.linalg.norm(update.residual_rad), off_rad, rtol=0, atol=1e-9
+    )
     shrunk = np.trace(after.covariance[3:, 3:]) <= np.trace(before.covariance[3:, 3:]) * (
         1 + 1e-9
     )
@@ -176,6 +179,8 @@ def test_an_observation_requires_boxes_inside_the_frame(
     observation = answered(lambda: exposure_control.observe(image, boxes, full, Control(1e3)))
     inside = (boxes[:, :2] >= 0).all() and (boxes[:, 2:] < [30, 20]).all()
     assert (observation is not None) == inside
-    everything = exposure_control.observe(image, np.array([[0, 0, 29, 19]]), full, Control(1e3))
+    everything = exposure_control.observe(
+        image, np.array([[0, 0, 29, 19]]), full, Control(1e3)
+    )
     np.testing.assert_allclose(everything.mean_dn, image.mean(), rtol=1e-12, atol=0)
     assert everything.overexposed == (np.count_nonzero(image >= full) > 1)

@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.types import FilterState
 from estimator.filter import consistency, correct, states
+from estimator.filter.error_models import GyroModel, JumpModel, TrackerModel
 from estimator.filter.mekf import AttitudeFilter
-from estimator.filter.states import STATES, GyroModel, JumpModel, TrackerModel
+from estimator.filter.states import STATES
 from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
@@ -95,7 +96,9 @@ def test_standard_deviations_are_kept_or_refused(value: float | NDArray) -> None
 
 
 @law(consistency.checked_samples)
-@given(rng=SEEDS, angle=arrays("f8", (5, 3), elements=some.floats(-1, 1)), lost=arrays(bool, 5))
+@given(
+    rng=SEEDS, angle=arrays("f8", (5, 3), elements=some.floats(-1, 1)), lost=arrays(bool, 5)
+)
 def test_checked_samples_keep_measured_angles_and_mark_lost_and_limited_ones(
     rng: np.random.Generator, angle: NDArray, lost: NDArray
 ) -> None:
@@ -147,7 +150,9 @@ def test_the_states_fill_the_covariance_without_gap_or_overlap(
         gyro, replace(TRACKER, mounting_rad="mounting" in used), considered
     )
     assert set(layout.slices) == {"attitude", "bias", "systematic"} | used
-    rows = np.concatenate([np.arange(part.start, part.stop) for part in layout.slices.values()])
+    rows = np.concatenate(
+        [np.arange(part.start, part.stop) for part in layout.slices.values()]
+    )
     np.testing.assert_array_equal(rows, np.arange(layout.size))
     assert set(layout.reported) == set(layout.slices) - {"systematic"}
     assert max(part.stop for part in layout.reported.values()) == layout.size - 3
@@ -158,7 +163,9 @@ def test_the_states_fill_the_covariance_without_gap_or_overlap(
         assert (np.diag(started.covariance)[part] == sigmas[name] ** 2).all()
     inside = layout.columns[layout.columns >= 0]
     assert (
-        len(set(inside)) == len(inside) == 3 * ("scale" in used) + 6 * ("misalignment" in used)
+        len(set(inside))
+        == len(inside)
+        == 3 * ("scale" in used) + 6 * ("misalignment" in used)
     )
 
 
@@ -263,7 +270,10 @@ def test_the_residual_is_linear_in_the_error_states(
         prior._replace(values=prior.values + change), solution, layout
     ).residual_rad
     np.testing.assert_allclose(
-        found.residual_rad - less, found.H @ change, rtol=0, atol=3e-3 * np.linalg.norm(change)
+        found.residual_rad - less,
+        found.H @ change,
+        rtol=0,
+        atol=3e-3 * np.linalg.norm(change),
     )
     apart = found.distance2
     assert apart >= 0
@@ -289,7 +299,9 @@ def test_a_correction_shrinks_estimated_states_and_keeps_considered_ones(
         after.covariance[inside], prior.covariance[inside], rtol=1e-9, atol=1e-15
     )
     assert_covariance(after.covariance)
-    np.testing.assert_allclose(np.linalg.norm(after.ref_from_body_wxyz), 1, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        np.linalg.norm(after.ref_from_body_wxyz), 1, rtol=0, atol=1e-12
+    )
     assert (np.diag(after.covariance)[3:] <= np.diag(prior.covariance)[3:] * (1 + 1e-9)).all()
     assert (after.support, after.lost_rad, after.used_s) == (6, 0.0, prior.t_s)
     assert correct.correct(prior._replace(lost_rad=0.1), found, layout).support == 1

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
 from estimator.core.types import FilterState
+from estimator.filter.error_models import GyroModel
 from estimator.filter.mekf import (
     HISTORY_S,
     OUTSIDE_GATE,
@@ -17,7 +18,6 @@ from estimator.filter.mekf import (
     TOO_OLD,
     USED,
     AttitudeFilter,
-    GyroModel,
     Update,
 )
 from estimator.filter.states import transition
@@ -70,7 +70,9 @@ def test_the_rate_is_the_last_call_s_less_the_bias() -> None:
     assert mekf.update(1.2, turned, TRACKER_RAD2).status == USED
     # The solution says that the vehicle turned less than the gyro says: the bias is positive.
     assert mekf.bias_rad_s[0] > 1e-4
-    assert mekf.rate_rad_s == pytest.approx(np.array([0.2, 0, 0]) - mekf.bias_rad_s, abs=1e-12)
+    assert mekf.rate_rad_s == pytest.approx(
+        np.array([0.2, 0, 0]) - mekf.bias_rad_s, abs=1e-12
+    )
 
 
 # ---- The covariance ----
@@ -88,7 +90,9 @@ def test_an_error_common_to_all_solutions_remains_in_the_covariance() -> None:
         for k in range(15):
             mekf.propagate([k + 1.0], np.zeros((1, 3)), [False])
             noisy = measured(shifted, common_rad2 / 9, rng)
-            assert mekf.update(k + 1.0, noisy, common_rad2 * 10 / 9, common_rad2).status == USED
+            assert (
+                mekf.update(k + 1.0, noisy, common_rad2 * 10 / 9, common_rad2).status == USED
+            )
         error = error_rad(mekf.state, HOME)
         nees.append(error @ np.linalg.solve(mekf.state.covariance[:3, :3], error))
     assert np.mean(nees) == pytest.approx(
@@ -299,12 +303,15 @@ def test_200_runs_are_within_their_bands_at_many_rates_with_frames_lost_and_out_
         at = 0
         while at < len(t_s) - 1:
             rows = slice(at, min(at + int(rng.integers(1, 41)), len(t_s) - 1))
-            mekf.propagate(t_s[1:][rows], world.angle_rad[rows], np.zeros(rows.stop - at, bool))
+            mekf.propagate(
+                t_s[1:][rows], world.angle_rad[rows], np.zeros(rows.stop - at, bool)
+            )
             at = rows.stop
             while waiting and arrives_s[waiting[0]] <= t_s[at]:
                 k = waiting.pop(0)
                 nis.append(
-                    mekf.update(seen_s[k], measured(seen[k], spread, rng), spread).distance ** 2
+                    mekf.update(seen_s[k], measured(seen[k], spread, rng), spread).distance
+                    ** 2
                 )
         state = mekf.state
         error = np.concatenate(
@@ -425,7 +432,9 @@ def test_memory_does_not_grow_and_reaches_half_of_its_span_at_least() -> None:
         if k % 3:
             assert mekf.update(k + 0.95, HOME, TRACKER_RAD2).status == USED
         kept_s = 60 if k < 10 else HISTORY_S / 2
-        assert mekf.update(max(k + 1.0 - kept_s, 0.0) + 0.01, HOME, TRACKER_RAD2).status == USED
+        assert (
+            mekf.update(max(k + 1.0 - kept_s, 0.0) + 0.01, HOME, TRACKER_RAD2).status == USED
+        )
     assert mekf.update(45.0, HOME, TRACKER_RAD2).status == TOO_OLD
     assert sum(len(segment.samples) for segment in mekf._segments) < 10 * (
         HISTORY_S + 3
@@ -434,7 +443,9 @@ def test_memory_does_not_grow_and_reaches_half_of_its_span_at_least() -> None:
 
 
 @pytest.mark.parametrize("order", [(1, 0, 2, 3), (3, 2, 1, 0), (2, 3, 0, 1)])
-def test_solutions_in_any_order_end_where_the_right_order_ends(order: tuple[int, ...]) -> None:
+def test_solutions_in_any_order_end_where_the_right_order_ends(
+    order: tuple[int, ...],
+) -> None:
     gyro = GyroModel(1e-4, 3e-4, 20.0)
     rng = np.random.default_rng(68)
     t_s = np.arange(401) / 400
@@ -533,7 +544,12 @@ def test_without_the_saturation_flag_the_blow_corrupts_the_bias() -> None:
     # With the gate it is lost for two frames and found at the third.
     gated = AttitudeFilter(QUIET, 0.0, HOME, 1e-3, 10 * DEG_H_RAD_S)
     rng = np.random.default_rng(67)
-    assert blow.fly(gated, 0, 24, False, rng)[20:] == [OUTSIDE_GATE, OUTSIDE_GATE, RESET, USED]
+    assert blow.fly(gated, 0, 24, False, rng)[20:] == [
+        OUTSIDE_GATE,
+        OUTSIDE_GATE,
+        RESET,
+        USED,
+    ]
     state = gated.state
     assert (np.abs(state.bias_rad_s - blow.bias_rad_s) < 4 * state.sigma_bias_rad_s).all()
 
@@ -698,7 +714,9 @@ def refused_then(
         mekf.propagate(
             t_s, np.tile([rate_rad_s * gap_s / 100, 0.0, 0.0], (100, 1)), np.zeros(100, bool)
         )
-        attitude = Rotation.from_rotvec([-rate_rad_s * t_s[-1], 0.0, 0.0]) * wild(0.0, 0.5, 0.0)
+        attitude = Rotation.from_rotvec([-rate_rad_s * t_s[-1], 0.0, 0.0]) * wild(
+            0.0, 0.5, 0.0
+        )
         status = mekf.update(t_s[-1], turn * attitude, spread).status
     return status
 

@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import FilterState
-from estimator.filter.mekf import USED, AttitudeFilter, GyroModel, TrackerModel
+from estimator.filter.error_models import GyroModel, TrackerModel
+from estimator.filter.mekf import USED, AttitudeFilter
 from tests.helpers.tumble import tumble_angle_rad, tumble_body_from_ref
 
 ARCSEC_RAD = np.pi / 180 / 3600
@@ -94,7 +95,15 @@ def squared(
         # Without a gate: a wrong model is to be seen in the errors.
         gyro, tracker = assumed
         mekf = AttitudeFilter(
-            gyro, 0.0, start, SIGMA_RAD, SIGMA_BIAS, 0.0, np.inf, tracker, considered=considered
+            gyro,
+            0.0,
+            start,
+            SIGMA_RAD,
+            SIGMA_BIAS,
+            0.0,
+            np.inf,
+            tracker,
+            considered=considered,
         )
         state = flown(flight, mekf)
         turned = (state.body_from_ref * truth[-1].inv()).as_rotvec()
@@ -118,7 +127,9 @@ MODELS = {
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("considers", [False, True])
 def test_each_state_s_errors_match_its_covariance(name: str, considers: bool) -> None:
-    attitude, every, states = squared(MODELS[name], MODELS[name], (name,) if considers else ())
+    attitude, every, states = squared(
+        MODELS[name], MODELS[name], (name,) if considers else ()
+    )
     assert 2.5 < attitude < 3.5
     assert abs(every - states) < 4 * np.sqrt(2 * states / RUNS)
 
@@ -226,7 +237,9 @@ def turning_about(
     step[:, axis] = 0.3 / RATE_HZ
     for k in range(seconds):
         mekf.propagate(
-            k + np.arange(1, RATE_HZ + 1) / RATE_HZ, step * (1 + 8e-4), np.zeros(RATE_HZ, bool)
+            k + np.arange(1, RATE_HZ + 1) / RATE_HZ,
+            step * (1 + 8e-4),
+            np.zeros(RATE_HZ, bool),
         )
         turned = np.zeros(3)
         turned[axis] = -0.3 * (k + 1)
@@ -257,11 +270,14 @@ def test_at_rest_no_scale_or_misalignment_is_observable() -> None:
     for k in range(20):
         mekf.propagate([k + 1.0], np.zeros((1, 3)), [False])
         assert (
-            mekf.update(k + 1.0, Rotation.from_rotvec([1e-5, 0, 0]), NOISE_RAD2).status == USED
+            mekf.update(k + 1.0, Rotation.from_rotvec([1e-5, 0, 0]), NOISE_RAD2).status
+            == USED
         )
     for name in ("scale", "misalignment"):
         assert mekf.state.sigma(name) == pytest.approx(1e-3, rel=1e-9)
-        assert np.abs(mekf.state.others[name]).max() < 1e-12  # the filter turns by an arcsecond
+        assert (
+            np.abs(mekf.state.others[name]).max() < 1e-12
+        )  # the filter turns by an arcsecond
 
 
 def test_a_considered_state_keeps_its_value_and_its_variance() -> None:
@@ -296,7 +312,9 @@ def test_the_rate_is_corrected_by_the_gyro_s_matrix() -> None:
 
 def test_bad_options_are_refused_in_one_line() -> None:
     def built(**options: object) -> AttitudeFilter:
-        return AttitudeFilter(GYRO, 0.0, Rotation.identity(), SIGMA_RAD, SIGMA_BIAS, **options)  # type: ignore[arg-type]
+        return AttitudeFilter(
+            GYRO, 0.0, Rotation.identity(), SIGMA_RAD, SIGMA_BIAS, **options
+        )  # type: ignore[arg-type]
 
     with pytest.raises(
         ValueError,
@@ -305,7 +323,9 @@ def test_bad_options_are_refused_in_one_line() -> None:
         built(considered=("scale", "gain"))
     with pytest.raises(ValueError, match=r"gyro: scale is -1; allowed: finite, 0 or more"):
         replace(GYRO, scale=-1)
-    with pytest.raises(ValueError, match=r"gyro: limit_rad_s is 0; allowed: above 0, also inf"):
+    with pytest.raises(
+        ValueError, match=r"gyro: limit_rad_s is 0; allowed: above 0, also inf"
+    ):
         replace(GYRO, limit_rad_s=0)
     with pytest.raises(
         ValueError, match=r"tracker: systematic_rad is inf; allowed: finite, 0 or more"

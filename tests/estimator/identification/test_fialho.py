@@ -49,7 +49,9 @@ def field(
     truth = attitude or Rotation.random(rng=rng)
     x, y, z = truth.apply(sky.vectors).T
     row = np.flatnonzero((z > 0) & (abs(x) < HALF_TAN * z) & (abs(y) < HALF_TAN * z))
-    seen = catalog.unit(truth.apply(sky.vectors[row]) + rng.normal(0, SIGMA_RAD, (len(row), 3)))
+    seen = catalog.unit(
+        truth.apply(sky.vectors[row]) + rng.normal(0, SIGMA_RAD, (len(row), 3))
+    )
     light = sky.magnitude[row] + rng.normal(0, EPSILON_MAG, len(row))
     order = np.argsort(light)
     return seen[order], light[order], row[order], truth
@@ -226,7 +228,9 @@ def test_a_hint_lets_only_stars_near_the_boresight_be_candidates(
         assert fialho_1(seen, sky, 5 * SIGMA_RAD, **known, **wrong) is not None
 
 
-def test_the_fourth_version_measures_the_camera_s_magnitudes(sky: pair_index.PairIndex) -> None:
+def test_the_fourth_version_measures_the_camera_s_magnitudes(
+    sky: pair_index.PairIndex,
+) -> None:
     # Twice its error bars: of n stars the mean is known to sigma / sqrt(n), the variance to sigma^2 sqrt(2 / (n - 1)).
     rng = np.random.default_rng(109)
     offset = 0.3
@@ -289,6 +293,7 @@ def test_stars_too_close_for_a_triangle_are_passed_over_or_refused(
 def test_an_invalid_magnitude_error_is_refused(sky: pair_index.PairIndex) -> None:
     seen, light, _, _ = field(np.random.default_rng(112), sky)
     with pytest.raises(
-        ImageError, match=r"fialho: tolerance 0\.1 rad, magnitude error 0; allowed: more than 0"
+        ImageError,
+        match=r"fialho: tolerance 0\.1 rad, magnitude error 0; allowed: more than 0",
     ):
         fialho_2(seen, sky, 0.1, magnitude=light, epsilon_mag=0)

@@ -18,7 +18,9 @@ def image(x: Floats, matrix: Floats) -> Floats:
 
 
 @pytest.mark.parametrize(("name", "matrix"), [("projective", HOMOGRAPHY), ("affine", AFFINE)])
-def test_a_family_s_transforms_do_not_change_its_invariants(name: str, matrix: Floats) -> None:
+def test_a_family_s_transforms_do_not_change_its_invariants(
+    name: str, matrix: Floats
+) -> None:
     """And the lights that fix a transform predict the image of every other one."""
     family = group_invariants.TRANSFORMS[name]
     x = np.concatenate(

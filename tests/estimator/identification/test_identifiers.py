@@ -20,7 +20,11 @@ ARCSEC_RAD = np.pi / 648_000
 SIGMA_RAD = 10 * ARCSEC_RAD
 EPSILON_MAG = 0.25
 HALF_TAN = np.tan(np.radians(8))  # a field of 16 x 16 degrees
-SLOW = {"shefex", "master_star", "saa"}  # ten seconds and more for the 40 fields, or to compile
+SLOW = {
+    "shefex",
+    "master_star",
+    "saa",
+}  # ten seconds and more for the 40 fields, or to compile
 
 
 def named(*names: str) -> list:
@@ -31,7 +35,9 @@ def named(*names: str) -> list:
 
 
 PAPERS = named("fialho_1", "fialho_2", "fialho_3", "fialho_4", "shefex", "master_star", "saa")
-GIVES_UP = 1_000_000  # angles compared: on the real sky each finds within some hundred thousand
+GIVES_UP = (
+    1_000_000  # angles compared: on the real sky each finds within some hundred thousand
+)
 
 
 @pytest.fixture(scope="module")
@@ -196,7 +202,9 @@ def test_unusable_input_of_an_identifier_is_refused(
 
 
 @pytest.mark.parametrize("name", named("fialho_4", "master_star", "saa"))
-def test_magnitudes_of_another_count_are_refused(sky: pair_index.PairIndex, name: str) -> None:
+def test_magnitudes_of_another_count_are_refused(
+    sky: pair_index.PairIndex, name: str
+) -> None:
     one = fields(sky, 1, 97)[0]
     with pytest.raises(ImageError, match=r"magnitudes \(3,\) of \d+ observed stars"):
         IDENTIFIERS[name](one.seen, sky, 1e-4, magnitude=np.zeros(3))

@@ -129,7 +129,9 @@ def field(sphere: led_naming.Sphere, body_from_lab: Rotation) -> tuple[Floats, F
 
 @law(led_naming.identify)
 @given(rng=SEEDS, known=some.floats(0, 40), lied=some.integers(0, 1))
-def test_names_are_right_or_refused(rng: np.random.Generator, known: float, lied: int) -> None:
+def test_names_are_right_or_refused(
+    rng: np.random.Generator, known: float, lied: int
+) -> None:
     """Codes that identify each LED by `known`, in some cases one of them wrongly: no attitude is wrong."""
     sphere = dome(100)
     truth = turn(rng, 0.3)
@@ -192,7 +194,9 @@ def test_two_lights_are_named_if_every_other_pair_is_1e5_times_less_likely(
 ) -> None:
     """Of eight LEDs on a circle all neighbors are as far apart; ln(10^5) is 11.5."""
     azimuth = np.arange(8) * np.pi / 4
-    ring = np.column_stack([0.1 * np.cos(azimuth), 0.1 * np.sin(azimuth), np.full(8, 0.99499)])
+    ring = np.column_stack(
+        [0.1 * np.cos(azimuth), 0.1 * np.sin(azimuth), np.full(8, 0.99499)]
+    )
     sphere = led_naming.Sphere(1.2 * ring, np.full(8, 1.2), ring, LEVER.camera_body_m)
     _, xy_px = field(sphere, Rotation.identity())
     misfit = np.full((2, 8), 100.0)

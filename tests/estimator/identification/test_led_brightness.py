@@ -14,8 +14,8 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
-from estimator.identification import led_search
-from estimator.identification.led_evidence import STRAY, STRAY_DENSITY
+from estimator.identification import led_detections
+from estimator.identification.led_detections import STRAY, STRAY_DENSITY
 from estimator.identification.led_index import build_dome_index
 from estimator.trackers.dome_tracker import DomeTracker
 from tests.helpers.interpreted import interpreted
@@ -48,11 +48,11 @@ def grid(levels: Floats | None, pitch_m: float = 0.03, side: int = 21) -> LedMap
 
 def test_the_evidence_of_a_brightness_is_a_bayes_factor() -> None:
     """Its ratio integrates to one over brightnesses of any LED, and its terms are a normal's and a stray light's."""
-    evidence = interpreted("estimator.identification.led_evidence")
+    evidence = interpreted("estimator.identification.led_detections")
     dome = build_dome_index(grid(LEVELS), LEVER, CAMERA)
     log_flux = np.linspace(np.log(FLUX_S) - 5, np.log(FLUX_S) + 5, 4001)
     rays = np.tile([0.0, 0.0, 1.0], (len(log_flux), 1))
-    detections = led_search.build_detections(
+    detections = led_detections.build_detections(
         rays, np.full(len(rays), 1e-5), dome, flux_s=np.exp(log_flux)
     )
     as_any = np.mean(
@@ -73,10 +73,10 @@ def test_the_evidence_of_a_brightness_is_a_bayes_factor() -> None:
 
 @pytest.mark.parametrize("known", ["map", "exposure", "neither"])
 def test_without_brightness_the_evidence_depends_on_positions_alone(known: str) -> None:
-    evidence = interpreted("estimator.identification.led_evidence")
+    evidence = interpreted("estimator.identification.led_detections")
     dome = build_dome_index(grid(LEVELS if known == "map" else None), LEVER, CAMERA)
     flux_s = np.full(3, FLUX_S) if known == "exposure" else None
-    detections = led_search.build_detections(
+    detections = led_detections.build_detections(
         CAMERA.rays(np.eye(3, 2) * 100), np.full(3, 1e-5), dome, flux_s=flux_s
     )
     assert evidence.light_dex(detections, dome, 1, 2) == 0.0
@@ -124,6 +124,8 @@ def test_brightness_distinguishes_the_fields_of_a_grid() -> None:
         ({"flux_sigma": 0.0}, "leds: flux_sigma"),
     ],
 )
-def test_a_map_with_unusable_fluxes_is_refused(change: dict[str, object], reason: str) -> None:
+def test_a_map_with_unusable_fluxes_is_refused(
+    change: dict[str, object], reason: str
+) -> None:
     with pytest.raises(ImageError, match=reason):
         DomeTracker(CAMERA, replace(grid(LEVELS), **change), LEVER)

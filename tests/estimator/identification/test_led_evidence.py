@@ -10,8 +10,8 @@ from scipy.special import betaln
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
-from estimator.identification import led_evidence, led_search
-from estimator.identification.led_evidence import LedDetections
+from estimator.identification import led_detections, led_evidence
+from estimator.identification.led_detections import LedDetections
 from estimator.identification.led_index import DomeIndex, build_dome_index
 from tests.helpers.interpreted import interpreted
 
@@ -45,7 +45,7 @@ def test_matches_on_one_board_count_little(
     dome = build_dome_index(leds, LEVER, CAMERA)
     sigma = 0.2 / CAMERA.focal_px
     rays = CAMERA.rays(project(Rotation.identity(), place_m, LEVER, CAMERA))
-    detections = led_search.build_detections(rays, np.full(6, sigma), dome)._replace(
+    detections = led_detections.build_detections(rays, np.full(6, sigma), dome)._replace(
         sigma=np.full(6, sigma)
     )
     boarded = dome._replace(pairs=dome.pairs._replace(group=np.array(boards)))
@@ -77,7 +77,7 @@ def wide_field(level_from_lab: Rotation) -> tuple[DomeIndex, LedDetections, Floa
     R_cam_from_lab = (ASIDE.cam_from_body * level_from_lab).as_matrix()
     return (
         dome,
-        led_search.build_detections(rays, sigma, dome)._replace(sigma=sigma),
+        led_detections.build_detections(rays, sigma, dome)._replace(sigma=sigma),
         R_cam_from_lab,
     )
 
@@ -112,7 +112,8 @@ def test_the_information_matches_the_projection_s_derivatives(uncertainty: float
 
     def tangents(change: Floats) -> Floats:
         q = (
-            dome.position_m @ (Rotation.from_rotvec(change[:3]).as_matrix() @ R_cam_from_lab).T
+            dome.position_m
+            @ (Rotation.from_rotvec(change[:3]).as_matrix() @ R_cam_from_lab).T
             - dome.pupil_m
         )
         return 1.07 * np.exp(change[3]) * (q[:, :2] / q[:, 2:]).ravel()
@@ -138,7 +139,9 @@ def test_two_iterations_of_attitude_and_focal_length_reach_the_truth() -> None:
     off = Rotation.from_rotvec(np.radians([0.2, -0.1, 0.2])).as_matrix() @ R_cam_from_lab
     hypothesis = led_evidence.evaluate(zoomed, dome, off, 0, 0, 3, 1.07)
     assert len(hypothesis.star) == 6
-    assert Rotation.from_matrix(hypothesis.R_cam_from_lab @ R_cam_from_lab.T).magnitude() < 1e-5
+    assert (
+        Rotation.from_matrix(hypothesis.R_cam_from_lab @ R_cam_from_lab.T).magnitude() < 1e-5
+    )
     beyond = zoomed._replace(focal_uncertainty=0.05)  # to 6 % at most
     assert led_evidence.evaluate(beyond, dome, off.copy(), 0, 0, 3, 1.07).dex == -np.inf
 
@@ -154,14 +157,21 @@ def test_leds_are_matched_within_the_error_of_their_pair_s_direction(
     each is 0.5 s from the middle, 5.7 sigma from its place, where the gate is 3.5 sqrt(1 + 1 / 2 + 1 / 2) sigma.
     """
     place_m = np.array(
-        [[0.015, 0], [-0.015, 0], [0.04, 0.03], [-0.03, 0.045], [-0.045, -0.03], [0.03, -0.04]]
+        [
+            [0.015, 0],
+            [-0.015, 0],
+            [0.04, 0.03],
+            [-0.03, 0.045],
+            [-0.045, -0.03],
+            [0.03, -0.04],
+        ]
     )
     place_m = np.column_stack([place_m, np.full(6, 1.2192)])
     leds = LedMap(np.arange(6), place_m, np.zeros(3), np.array([np.inf, np.inf, 1.2192]))
     dome = build_dome_index(leds, LEVER, CAMERA)
     sigma = 0.2 / CAMERA.focal_px
     rays = CAMERA.rays(project(Rotation.identity(), place_m, LEVER, CAMERA))
-    detections = led_search.build_detections(rays, np.full(6, sigma), dome)._replace(
+    detections = led_detections.build_detections(rays, np.full(6, sigma), dome)._replace(
         sigma=np.full(6, sigma)
     )
     apart = 0.03 / (1.2192 - 0.381)
@@ -186,7 +196,7 @@ def test_dead_leds_cost_the_beta_function_of_the_counts(dead: list[int]) -> None
         dome = build_dome_index(LedMap(rows, place_m[rows], *surface), LEVER, CAMERA)
         dome = dome._replace(prior_volume=1.0)
         sigma = np.full(len(kept), 0.2 / CAMERA.focal_px)
-        detections = led_search.build_detections(rays, sigma, dome)._replace(sigma=sigma)
+        detections = led_detections.build_detections(rays, sigma, dome)._replace(sigma=sigma)
         center = int(np.flatnonzero(rows == 3)[0])
         hypothesis = plain.evaluate(detections, dome, np.eye(3), center, 0, len(kept) - 1)
         assert sorted(hypothesis.observed) == list(range(len(kept)))

@@ -15,7 +15,7 @@ from estimator.attitude.dome_map import LedMap, Lever, on_sphere, on_surface, pr
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Centroids, StarMatch
-from estimator.identification import led_search
+from estimator.identification import led_detections, led_search
 from estimator.identification.led_index import DomeIndex, build_dome_index
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Settings
@@ -23,7 +23,9 @@ from tests.helpers.interpreted import interpreted
 
 # AFIT's SimSat focused on its LEDs at 33 in; the camera is a little askew.
 CAMERA = Camera(1600, 1200, 8698.0, (799.5, 599.5))
-LEVER = Lever(np.array([0.004, -0.003, 0.381]), Rotation.from_euler("xyz", [0.01, -0.02, 0.3]))
+LEVER = Lever(
+    np.array([0.004, -0.003, 0.381]), Rotation.from_euler("xyz", [0.01, -0.02, 0.3])
+)
 # Measured: 38.88 and 28.60 in.
 OVAL = (np.array([0.0, 0.003, 0.492]), np.array([0.9876, 0.9876, 0.7264]))
 FLAT = np.zeros(3), np.array([np.inf, np.inf, 1.2192])  # a panel at 48 in
@@ -57,7 +59,12 @@ def surveyed(leds: LedMap, seed: int) -> LedMap:
     """The tracker's map: every LED is displaced by ERROR_M along each axis."""
     error_m = ERROR_M * np.random.default_rng(seed).standard_normal(leds.position_m.shape)
     return LedMap(
-        leds.id, leds.position_m + error_m, leds.center_m, leds.semi_axes_m, leds.board, ERROR_M
+        leds.id,
+        leds.position_m + error_m,
+        leds.center_m,
+        leds.semi_axes_m,
+        leds.board,
+        ERROR_M,
     )
 
 
@@ -146,7 +153,9 @@ def test_random_lights_give_no_attitude():
     dex = []
     for _ in range(200):
         rays = CAMERA.rays(rng.uniform(0, [1599, 1199], (8, 2)))
-        fallen = led_search.build_detections(rays, np.full(8, NOISE_PX / CAMERA.focal_px), dome)
+        fallen = led_detections.build_detections(
+            rays, np.full(8, NOISE_PX / CAMERA.focal_px), dome
+        )
         best, _ = led_search._search(fallen, dome, 10**7)
         dex.append(best.dex)
     # At most .1 of them, and three deviations of a binomial count.
@@ -279,7 +288,9 @@ def test_two_leds_whose_images_touch_are_left_out_of_the_attitude():
             Centroids(pixels, np.full(len(pixels), 0.05), np.ones(len(pixels)))
         )
         assert answer.solved
-        error = (answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()).as_rotvec()
+        error = (
+            answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()
+        ).as_rotvec()
         pulls.append(error @ np.linalg.inv(answer.covariance_rad2) @ error)
     # Chi-square of three or less, a centroid's error having a floor above the noise; deviation sqrt(6 / 30).
     assert np.mean(pulls) < 3 + 3 * np.sqrt(6 / 30)
@@ -301,7 +312,9 @@ def test_the_covariance_includes_the_lever_s_error():
             Centroids(pixels, np.full(len(pixels), NOISE_PX), np.ones(len(pixels)))
         )
         assert answer.solved
-        error = (answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()).as_rotvec()
+        error = (
+            answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()
+        ).as_rotvec()
         nees.append(error[:2] @ np.linalg.inv(answer.covariance_rad2[:2, :2]) @ error[:2])
     # Chi-square of two: mean 2, deviation sqrt(4 / 60).
     assert np.mean(nees) == pytest.approx(2, abs=3 * np.sqrt(4 / 60))
@@ -336,7 +349,7 @@ def test_an_led_near_a_direction_is_found_as_by_brute_force() -> None:
         direction = np.array([x, y, np.sqrt(max(1 - x * x - y * y, 0.0))])
         gate = dome.grid.cell * rng.uniform(0.1, 3)
         near = np.linalg.norm(dome.grid.direction - direction, axis=1).min() < gate
-        assert PLAIN._has_led_near(dome.grid, tuple(direction), gate) == near
+        assert PLAIN.has_led_near(dome.grid, tuple(direction), gate) == near
         found += near
     assert 100 < found < 400
 
@@ -361,7 +374,7 @@ def test_a_pair_s_gates_are_the_error_of_where_it_puts_a_detection() -> None:
     b = 2
     places = np.array([[0.05, 0.02], [0.0, 0.03], [-0.04, 0.01], [0.07, -0.05]])
     rays = np.column_stack([places, np.ones(4)])
-    detections = led_search.build_detections(
+    detections = led_detections.build_detections(
         rays / np.linalg.norm(rays, axis=1, keepdims=True), np.full(4, sigma), dome
     )
     seen = places[:, 0] + 1j * places[:, 1]
@@ -406,7 +419,7 @@ def test_the_quick_check_stops_once_the_outcome_is_decided(
         else whole
     )
     rays = camera.rays(project(Rotation.identity(), position_m, lever, camera))
-    detections = led_search.build_detections(rays, np.full(5, 1e-5), dome)
+    detections = led_detections.build_detections(rays, np.full(5, 1e-5), dome)
     gates = np.full(5, 1e-4)
     R_grid_from_cam = dome.grid.R_grid_from_lab
     median_m = dome.median_radius_m
@@ -416,14 +429,16 @@ def test_the_quick_check_stops_once_the_outcome_is_decided(
         )
         == found
     )
-    zoomed = led_search.build_detections(
+    zoomed = led_detections.build_detections(
         camera.zoomed(1 / 1.08).rays(camera.pixels(rays)),
         np.full(5, 1e-5),
         dome,
         focal_uncertainty=0.1,
     )
     assert (
-        PLAIN._quick_check(zoomed, dome, R_grid_from_cam, 1.08, median_m, 0, 1, gates, required)
+        PLAIN._quick_check(
+            zoomed, dome, R_grid_from_cam, 1.08, median_m, 0, 1, gates, required
+        )
         == found
     )
     if found > 2:
@@ -445,7 +460,7 @@ def test_a_pair_gives_the_focal_length_at_which_it_matches_two_leds(ratio: float
         for one in ((rays[0], dome, 1.1), (rays[1], dome, 1.3))
     ]
     pixels = CAMERA.pixels(rays)
-    seen = led_search.build_detections(
+    seen = led_detections.build_detections(
         CAMERA.zoomed(1 / ratio).rays(pixels), np.full(2, 1e-5), dome, focal_uncertainty=0.12
     )
     chord = float(np.linalg.norm(ends[0] - ends[1]))
@@ -474,7 +489,7 @@ def test_the_prior_of_a_pair_s_attitude_is_its_share_of_all_attitudes() -> None:
     dome = build_dome_index(spread(60, OVAL, seed=1), LEVER, CAMERA)
     rays = np.array([[0.05, 0.02, 1.0], [-0.04, 0.01, 1.0]])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    detections = led_search.build_detections(rays, np.array([1e-5, 2e-5]), dome)
+    detections = led_detections.build_detections(rays, np.array([1e-5, 2e-5]), dome)
     across = detections.sigma.min() / np.sqrt(2)
     apart = np.hypot(0.09, 0.01)
     covariance = np.diag([across, across, np.sqrt(2) * detections.sigma.min() / apart]) ** 2
@@ -483,7 +498,9 @@ def test_the_prior_of_a_pair_s_attitude_is_its_share_of_all_attitudes() -> None:
     # A length errs relatively as a direction does; a uniform prior of the focal length over +-12 %.
     focal = np.log10(np.sqrt(2 * np.pi) * np.sqrt(covariance[2, 2]) / 0.24)
     uncertain = detections._replace(focal_uncertainty=0.12)
-    assert PLAIN._attitude_dex(uncertain, dome, 0, 1) == pytest.approx(wanted + focal, abs=1e-9)
+    assert PLAIN._attitude_dex(uncertain, dome, 0, 1) == pytest.approx(
+        wanted + focal, abs=1e-9
+    )
 
 
 # ---- a focal length that is known to a tenth
@@ -565,7 +582,9 @@ def test_a_calibrated_tracker_finds_nothing_at_a_focal_length_ten_percent_off() 
         tracker = DomeTracker(CAMERA.zoomed(1.1), leds, LEVER, settings)
         seen = [lights(truth, pose(rng, 25), rng)[0] for _ in range(10)]
         answers = [
-            tracker.solve_centroids(Centroids(one, np.full(len(one), 1e-3), np.ones(len(one))))
+            tracker.solve_centroids(
+                Centroids(one, np.full(len(one), 1e-3), np.ones(len(one)))
+            )
             for one in seen
         ]
         solved.append(sum(answer.solved for answer in answers))
@@ -581,7 +600,7 @@ def test_random_lights_give_no_attitude_at_any_focal_length() -> None:
     dex = []
     for _ in range(200):
         rays = CAMERA.rays(rng.uniform(0, [1599, 1199], (8, 2)))
-        fallen = led_search.build_detections(
+        fallen = led_detections.build_detections(
             rays, np.full(8, NOISE_PX / CAMERA.focal_px), dome, focal_uncertainty=0.12
         )
         best, _ = led_search._search(fallen, dome, 10**7)

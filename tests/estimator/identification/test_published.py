@@ -17,7 +17,8 @@ from estimator.catalog import pair_index
 from estimator.catalog.catalog import unit
 from estimator.core.checks import Floats
 from estimator.identification.published import pyramid
-from estimator.identification.published.saa import UNMATCHED_COST, Gates, Primary, SearchInput
+from estimator.identification.published.primary_pair import Gates, Primary, SearchInput
+from estimator.identification.published.saa import UNMATCHED_COST
 from estimator.identification.published.shefex import FOURTH_STAR, ShefexOptions
 from estimator.identification.registry import IDENTIFIERS
 from estimator.identification.solver_options import Options
@@ -117,7 +118,9 @@ def test_each_catalog_star_of_the_field_that_is_not_seen_costs_its_penalty(name:
         rows = inside[:-missing]
         known = {"magnitude": magnitude[rows], "epsilon_mag": 0.1, "field_tan": EDGES}
         free, charged = (
-            PLAIN[name](rays[rows], index, TOLERANCE_RAD, missed_dex=dex, **known).log10_chance
+            PLAIN[name](
+                rays[rows], index, TOLERANCE_RAD, missed_dex=dex, **known
+            ).log10_chance
             for dex in (0.0, 0.07)
         )
         assert charged - free == pytest.approx(0.07 * missing, abs=1e-12)
@@ -276,7 +279,9 @@ def test_a_pyramid_s_chance_counts_the_hypotheses_tried() -> None:
     np.testing.assert_array_equal(match.star, rows[match.observed])
     assert tried[1] >= 41
     once = DIRECT.match_field(rays, index, np.arange(3), rows[:3], TOLERANCE_RAD, 0.0, 1)
-    assert match.log10_chance - once.log10_chance == pytest.approx(np.log10(tried[1]), abs=1e-9)
+    assert match.log10_chance - once.log10_chance == pytest.approx(
+        np.log10(tried[1]), abs=1e-9
+    )
 
 
 # ---- the areas of gates
@@ -332,7 +337,8 @@ def test_shefex_counts_the_other_stars_in_the_gates_by_the_binomial_law() -> Non
     match = SHEFEX.search(rays, index, options, tried)
     np.testing.assert_array_equal(match.star, rows[match.observed])
     neighbors = np.sum(
-        np.linalg.norm(index.vectors - index.vectors[match.star[0]], axis=1) < 2 * np.sin(0.12)
+        np.linalg.norm(index.vectors - index.vectors[match.star[0]], axis=1)
+        < 2 * np.sin(0.12)
     )
     density = neighbors / (2 * np.pi * (1 - np.cos(MAX_ANGLE_RAD)))
     area_sr = SHEFEX._angle_gates(rays, match.observed[:3], options)[:, 9].sum()
@@ -394,14 +400,17 @@ def test_four_stars_are_the_least_of_shefex_s_match() -> None:
     np.testing.assert_array_equal(match.star, rows[:4])
     strays = np.vstack([rays[:3], unit(np.array([[0.012, 0.034, 1.0]]))])
     assert (
-        len(SHEFEX.search(strays, index, options._replace(base=4), np.zeros(3, np.int64)).star)
+        len(
+            SHEFEX.search(strays, index, options._replace(base=4), np.zeros(3, np.int64)).star
+        )
         == 0
     )
     # Within wide gates of the angles, but 30 tolerances from its place.
     moved = unit(rays[:4] + np.outer([0, 0, 0, 1], [3e-4, 0, 0]))
     wide = options._replace(cos_error=1e-4, tolerance_rad=1e-5)
     assert (
-        len(SHEFEX.search(moved, index, wide._replace(base=4), np.zeros(3, np.int64)).star) == 0
+        len(SHEFEX.search(moved, index, wide._replace(base=4), np.zeros(3, np.int64)).star)
+        == 0
     )
 
 
@@ -412,7 +421,13 @@ POSITION_RAD = 1e-2
 STRETCH = 1e-4
 FIVE = unit(
     np.array(
-        [[0.1, 0.02, 1], [-0.06, 0.08, 1], [-0.03, -0.09, 1], [0.02, 0.03, 1], [0.15, -0.12, 1]]
+        [
+            [0.1, 0.02, 1],
+            [-0.06, 0.08, 1],
+            [-0.03, -0.09, 1],
+            [0.02, 0.03, 1],
+            [0.15, -0.12, 1],
+        ]
     )
 )
 
@@ -481,7 +496,9 @@ def test_saa_s_chance_counts_the_stars_within_its_reach() -> None:
     near = np.arccos(np.clip(catalog @ primary.midpoint, -1, 1)) < primary.reach_rad
     rows = np.setdiff1d(np.flatnonzero(in_field & near), [0, 2])
     assert 0 < len(rows) < np.count_nonzero(near) - 2
-    similar = np.sum(np.abs(magnitude[rows] - seen_mag[primary.others][:, None]) <= 1.2, axis=1)
+    similar = np.sum(
+        np.abs(magnitude[rows] - seen_mag[primary.others][:, None]) <= 1.2, axis=1
+    )
     share = primary.area_sr / (2 * np.pi * (1 - np.cos(primary.reach_rad)))
     # Star 3 of the field is seen and has no partner.
     p, missing = SAA._chance_statistics(
@@ -583,7 +600,8 @@ def test_saa_s_best_counts_as_the_binomial_tail_of_the_stars_beside_its_pair() -
     best = rows.astype(np.int32)
     best[-1] = -1
     pool.add(
-        SAA.build_primary(stars, 0, 1), (best[None], np.array([3.0]), np.array([len(rows) - 3]))
+        SAA.build_primary(stars, 0, 1),
+        (best[None], np.array([3.0]), np.array([len(rows) - 3])),
     )
     tail = stats.binom.logsf(len(rows) - 4, len(rows) - 2, pool.p) / np.log(10)
     assert pool.log10_chance == pytest.approx(tail + 0.5 * pool.missing, abs=1e-9)
@@ -648,7 +666,9 @@ def test_fialho_s_match_has_more_than_its_share_of_the_observed_stars(
     """All stars match among twice as many lights."""
     rays, _, rows, index, _ = field(1)
     strays = unit(rays + np.array([0.004, 0.003, 0]))  # 50 tolerances beside each star
-    options = FIALHO.search_options(TOLERANCE_RAD, Options(epsilon_mag=0.1), share, True, False)
+    options = FIALHO.search_options(
+        TOLERANCE_RAD, Options(epsilon_mag=0.1), share, True, False
+    )
     match = FIALHO._direct_match(
         np.vstack([rays, strays]), index, np.arange(3), rows[:3], options, 1
     )

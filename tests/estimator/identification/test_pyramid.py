@@ -168,7 +168,9 @@ def test_another_sky_is_refused(bright_sky: pair_index.PairIndex) -> None:
     other = rng.normal(size=bright_sky.vectors.shape)
     other /= np.linalg.norm(other, axis=1, keepdims=True)
     assert (
-        sum(solved(Field(rng, other, 0.0, 0.0).xy, bright_sky) is not None for _ in range(300))
+        sum(
+            solved(Field(rng, other, 0.0, 0.0).xy, bright_sky) is not None for _ in range(300)
+        )
         == 0
     )
 
@@ -195,7 +197,9 @@ def test_four_stars_of_a_field_are_not_beyond_chance_but_eight_are(
     assert sum(match is not None for _, match in eights) > 0.95 * len(fields)
 
 
-def test_a_match_is_the_same_in_any_order_of_the_false_stars(sky: pair_index.PairIndex) -> None:
+def test_a_match_is_the_same_in_any_order_of_the_false_stars(
+    sky: pair_index.PairIndex,
+) -> None:
     # The brightest three blobs are false (hot pixels): the search goes round them.
     rng = np.random.default_rng(69)
     for _ in range(20):

@@ -148,7 +148,9 @@ def test_random_lights_and_a_mirrored_sky_are_refused() -> None:
     for _ in range(200):
         tangent = rng.uniform(FIELD[[0, 2]], FIELD[[1, 3]], (rng.integers(4, 40), 2))
         assert not len(
-            identify(detections_of(tangent, rng.choice(SKY.mag, len(tangent)), zoom=0.05)).star
+            identify(
+                detections_of(tangent, rng.choice(SKY.mag, len(tangent)), zoom=0.05)
+            ).star
         )
         tangent, mag, _ = observe(Rotation.random(rng=rng), rng)
         assert not len(identify(detections_of(tangent * [-1, 1], mag, zoom=0.05)).star)

@@ -85,15 +85,21 @@ def test_missing_stars_cost_the_beta_function_of_the_counts(missing: int) -> Non
     kept = np.setdiff1d(np.arange(len(TANGENT)), gone)
     fewer = sky_index.build_without_pairs(SKY.vectors[kept], SKY.mag[kept])
     gates = np.full(4, 0.01)
-    here = star_evidence.evaluate(seen(tangent), fewer, TRUTH.as_matrix(), 1.0, gates, -np.inf)
+    here = star_evidence.evaluate(
+        seen(tangent), fewer, TRUTH.as_matrix(), 1.0, gates, -np.inf
+    )
     none = np.setdiff1d(np.arange(len(TANGENT)), [3, 4, 5])
     bare = sky_index.build_without_pairs(SKY.vectors[none], SKY.mag[none])
-    whole = star_evidence.evaluate(seen(tangent), bare, TRUTH.as_matrix(), 1.0, gates, -np.inf)
+    whole = star_evidence.evaluate(
+        seen(tangent), bare, TRUTH.as_matrix(), 1.0, gates, -np.inf
+    )
     toll = (betaln(5, missing + 1) - betaln(5, 1)) / np.log(10)
     assert here.dex - whole.dex == pytest.approx(toll, abs=1e-9)
 
 
-@pytest.mark.parametrize(("limit_mag", "missing"), [(4.4, 0), (5.4, 1), (6.4, 2), (np.nan, 0)])
+@pytest.mark.parametrize(
+    ("limit_mag", "missing"), [(4.4, 0), (5.4, 1), (6.4, 2), (np.nan, 0)]
+)
 def test_stars_to_the_limiting_magnitude_are_missed(limit_mag: float, missing: int) -> None:
     """Stars 0 to 3, of magnitudes 1 to 4, are seen; stars 4 and 5 are not."""
     lights = seen(TANGENT[:4])
@@ -167,11 +173,9 @@ def test_the_magnitudes_density_is_the_smoothed_catalog_s() -> None:
     for value in (3.0, 4.0, 5.0, 5.5):
         wanted = np.mean(norm.pdf(value, mag, sky_index.MAG_SMOOTHING))
         # Of bins of MAG_STEP.
-        assert star_evidence.magnitude_density(sky, value) == pytest.approx(wanted, rel=0.1)
-    assert star_evidence.magnitude_density(sky, -9.0) == star_evidence.magnitude_density(
-        sky, mag[0]
-    )
-    assert star_evidence.magnitude_density(sky, 30.0) == star_evidence.magnitude_density(
+        assert sky_index.magnitude_density(sky, value) == pytest.approx(wanted, rel=0.1)
+    assert sky_index.magnitude_density(sky, -9.0) == sky_index.magnitude_density(sky, mag[0])
+    assert sky_index.magnitude_density(sky, 30.0) == sky_index.magnitude_density(
         sky, mag[-1] + 2
     )
 
@@ -186,9 +190,10 @@ def test_a_magnitude_s_likelihoods_of_one_star_add_up_to_one(star: int) -> None:
     share = 0.8
     detections = seen(np.zeros((len(mag), 2)))._replace(mag=mag)
     ratio = [
-        star_evidence._magnitude_ratio(detections, sky, n, star, share) for n in range(len(mag))
+        star_evidence._magnitude_ratio(detections, sky, n, star, share)
+        for n in range(len(mag))
     ]
-    density = [star_evidence.magnitude_density(sky, value) / share for value in mag]
+    density = [sky_index.magnitude_density(sky, value) / share for value in mag]
     # Of 5 stars in 100, variable ones and the like, the magnitude is any of those seen.
     assert np.dot(ratio, density) * 1e-3 == pytest.approx(
         0.95 + 0.05 * np.sum(density) * 1e-3, rel=2e-3

@@ -16,7 +16,7 @@ from estimator.trackers.exposure_control import (
 )
 from skysim.camera.detector import saturation_dn
 from skysim.scene import loader
-from skysim.scene.sections.light import UniformGlowConfig
+from skysim.scene.sections.surroundings import UniformGlowConfig
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.lights.starlight import BackgroundLight

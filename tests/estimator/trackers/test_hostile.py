@@ -113,7 +113,9 @@ def test_any_directions_give_a_rotation_or_one_error_line(
 
 @BRIEF
 @given(xy_px=PIXELS, k1=some.floats(-1e3, 1e3))
-def test_any_pixels_and_lens_give_directions_of_their_shape(xy_px: NDArray, k1: float) -> None:
+def test_any_pixels_and_lens_give_directions_of_their_shape(
+    xy_px: NDArray, k1: float
+) -> None:
     lens = Camera(40, 30, 80.0, (20.0, 15.0), (k1, 0.0, 0.0, 0.0, 0.0))
     rays = lens.rays(xy_px)
     assert rays.shape == (len(xy_px), 3)

@@ -56,7 +56,9 @@ def test_lights_are_named_correctly_by_their_codes_or_not_at_all(
     solved = 0
     for frame in range(24):
         body_from_lab = Rotation.from_rotvec(axis * rate_rad_s * 0.02 * frame) * start
-        px = np.nan_to_num(project(body_from_lab, eye.leds.position_m, LEVER, CAMERA), nan=-1e9)
+        px = np.nan_to_num(
+            project(body_from_lab, eye.leds.position_m, LEVER, CAMERA), nan=-1e9
+        )
         star = np.flatnonzero(CAMERA.contains(px, 3))
         bit = (WORDS[star, frame] > 0) != (rng.random(len(star)) < failing)
         light = (

@@ -47,7 +47,9 @@ def test_a_bright_double_star_does_not_bias_the_attitude(tracker: StarTracker) -
         sigma_px[0] = BRIGHT_PX
         noisy_px = xy_px[star] + sigma_px[:, None] * rng.standard_normal((len(star), 2))
         azimuth = rng.uniform(0, 2 * np.pi)
-        noisy_px[0] += OFF_RAD * CAMERA.focal_px * np.array([np.cos(azimuth), np.sin(azimuth)])
+        noisy_px[0] += (
+            OFF_RAD * CAMERA.focal_px * np.array([np.cos(azimuth), np.sin(azimuth)])
+        )
         answer = tracker.solve_centroids(
             Centroids(noisy_px, sigma_px, 10 ** (-0.4 * stars.v_mag[star]))
         )
@@ -121,9 +123,9 @@ def test_a_star_loses_information_only_by_what_companions_explain(
     """In arcseconds: between that of its centroid and that of a star with the greatest error."""
     own = np.eye(2)[None] / (sigma * ARCSEC_RAD) ** 2
     residual = np.array([[off, 0.0]]) * ARCSEC_RAD
-    mean = misfit.mean_information(own, residual, (spread * ARCSEC_RAD) ** 2 * np.eye(2)[None])[
-        0
-    ]
+    mean = misfit.mean_information(
+        own, residual, (spread * ARCSEC_RAD) ** 2 * np.eye(2)[None]
+    )[0]
     least = 1 / (sigma**2 + (ERROR_RAD.max() / ARCSEC_RAD) ** 2)
     share = np.diag(mean) * (sigma * ARCSEC_RAD) ** 2
     assert (share <= 1 + 1e-9).all()
@@ -147,7 +149,9 @@ def test_shares_of_companions_match_the_catalogs() -> None:
     for vector in seen:
         near = np.flatnonzero(stars @ vector > np.cos(40 * ARCSEC_RAD))
         center = flux[near] @ stars[near]
-        off_arcsec.append(np.linalg.norm(center / np.linalg.norm(center) - vector) / ARCSEC_RAD)
+        off_arcsec.append(
+            np.linalg.norm(center / np.linalg.norm(center) - vector) / ARCSEC_RAD
+        )
     for limit in (0.5, 1.5):
         found = float(np.mean(np.array(off_arcsec) > limit))
         expected = SHARE @ np.exp(

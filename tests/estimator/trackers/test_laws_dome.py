@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude import dome_map, nearfield
+from estimator.attitude import dome_map, nearfield, rotation_fit
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.nearfield import SOLVERS
 from estimator.calibration import home_position
@@ -23,7 +23,7 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
-from estimator.identification import led_index, led_search
+from estimator.identification import led_detections, led_index, led_search
 from estimator.trackers import dome_tracker
 from estimator.trackers.dome_tracker import DomeTracker
 from tests.helpers.laws import (
@@ -40,7 +40,9 @@ from tests.helpers.laws import (
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 CAMERA = Camera(640, 480, 900.0, (319.5, 239.5))
 SPHERE = LedMap(np.arange(0), np.empty((0, 3)), np.zeros(3), np.full(3, 1.2))
-OVAL = LedMap(np.arange(0), np.empty((0, 3)), np.array([0, 0, 0.4]), np.array([1.0, 1.0, 0.8]))
+OVAL = LedMap(
+    np.arange(0), np.empty((0, 3)), np.array([0, 0, 0.4]), np.array([1.0, 1.0, 0.8])
+)
 RAYS = arrays("f8", (5, 3), elements=ANY)
 
 
@@ -116,7 +118,13 @@ def test_rays_intersect_the_surface_ahead_of_the_camera(
 # Solves
 
 
-@law(nearfield.rotation_only, nearfield.tappe, nearfield.ray_on_surface, nearfield.pnp)
+@law(
+    rotation_fit.rotation_only,
+    rotation_fit.in_body_axes,
+    nearfield.tappe,
+    nearfield.ray_on_surface,
+    nearfield.pnp,
+)
 @given(
     rng=SEEDS,
     count=some.integers(6, 20),
@@ -135,9 +143,13 @@ def test_exact_solves_find_the_truth(
     )
     assert (found * truth.inv()).magnitude() < 1e-6
     assert_covariance(covariance)
+    # Back to camera axes
+    R = arm.cam_from_body.as_matrix()
+    back = R @ rotation_fit.in_body_axes(covariance, arm) @ R.T
+    np.testing.assert_allclose(back, covariance, rtol=0, atol=1e-9 * np.abs(covariance).max())
 
 
-@law(nearfield.fit_focal_ratio)
+@law(rotation_fit.fit_focal_ratio)
 @given(
     rng=SEEDS,
     count=some.integers(4, 20),
@@ -153,7 +165,9 @@ def test_a_focal_length_is_fitted_with_the_attitude(
     leds, rays = seen_through(rng, OVAL, arm, truth, count)
     seen = CAMERA.zoomed(1 / ratio).rays(CAMERA.pixels(rays))
     start = turn(rng, 0.035) * truth
-    found = nearfield.fit_focal_ratio(seen, np.full(count, sigma), leds.position_m, arm, start)
+    found = rotation_fit.fit_focal_ratio(
+        seen, np.full(count, sigma), leds.position_m, arm, start
+    )
     assert found == pytest.approx(ratio, abs=1e-9)
 
 
@@ -222,7 +236,7 @@ def eye() -> DomeTracker:
 @law(
     DomeTracker.solve_centroids,
     led_search.identify,
-    led_search.build_detections,
+    led_detections.build_detections,
     dome_tracker.led_pairs,
 )
 @given(rng=SEEDS, false=some.integers(0, 4))
@@ -235,7 +249,10 @@ def test_lights_are_named_correctly_or_not_at_all(
     )
     star = np.flatnonzero(CAMERA.contains(px, 3))
     xy = np.concatenate(
-        [px[star] + rng.normal(0, 0.1, (len(star), 2)), rng.uniform(0, [639, 479], (false, 2))]
+        [
+            px[star] + rng.normal(0, 0.1, (len(star), 2)),
+            rng.uniform(0, [639, 479], (false, 2)),
+        ]
     )
     star = np.concatenate([star, np.full(false, -1)])
     solution = eye.solve_centroids(
@@ -250,7 +267,7 @@ def test_lights_are_named_correctly_or_not_at_all(
     rays = CAMERA.rays(xy)
     sigma = np.full(len(xy), 1e-4)
     dome = led_index.build_dome_index(eye.leds, eye.lever, CAMERA)
-    lights = led_search.build_detections(rays, sigma, dome)
+    lights = led_detections.build_detections(rays, sigma, dome)
     np.testing.assert_allclose(np.linalg.norm(lights.direction, axis=1), 1, rtol=0, atol=1e-9)
     for match in (led_search.identify(rays, sigma, dome), eye.identify(rays, sigma, None)):
         named = [] if isinstance(match, str) else match.observed.tolist()
@@ -291,7 +308,10 @@ def test_leds_are_named_correctly_at_any_focal_length_or_not_at_all(
     )
     star = np.flatnonzero(CAMERA.contains(px, 3))
     xy = np.concatenate(
-        [px[star] + rng.normal(0, 0.1, (len(star), 2)), rng.uniform(0, [639, 479], (false, 2))]
+        [
+            px[star] + rng.normal(0, 0.1, (len(star), 2)),
+            rng.uniform(0, [639, 479], (false, 2)),
+        ]
     )
     star = np.concatenate([star, np.full(false, -1)])
     camera = CAMERA.zoomed(1 / ratio)
@@ -370,7 +390,9 @@ def test_the_mean_of_many_frames_has_the_claimed_systematic_error(
     arm = Lever(np.array([0.01, 0.0, 0.3]), Rotation.identity())
     body_from_lab = Rotation.from_rotvec([0.1, -0.1, 0.5])
     dome = even(300)
-    px = np.nan_to_num(dome_map.project(body_from_lab, dome.position_m, arm, CAMERA), nan=-1e9)
+    px = np.nan_to_num(
+        dome_map.project(body_from_lab, dome.position_m, arm, CAMERA), nan=-1e9
+    )
     px = px[CAMERA.contains(px, 3)]
     settings = replace(dome_tracker.SETTINGS, centroid_sigma_px=1e-6)
     for survey in range(60):
@@ -379,12 +401,17 @@ def test_the_mean_of_many_frames_has_the_claimed_systematic_error(
         camera_m = arm.camera_body_m + rng.normal(0, lever_mm / 1e3, 3)
         leds = replace(dome, position_m=position_m, sigma_m=led_mm / 1e3)
         tracker = DomeTracker(
-            CAMERA, leds, replace(arm, camera_body_m=camera_m, sigma_m=lever_mm / 1e3), settings
+            CAMERA,
+            leds,
+            replace(arm, camera_body_m=camera_m, sigma_m=lever_mm / 1e3),
+            settings,
         )
         noise = np.full(len(px), noise_px)
         flux = np.linspace(2, 1, len(px))
         draws_px = px + rng.normal(0, noise_px, (frames, *px.shape))
-        found = [tracker.solve_centroids(Centroids(one_px, noise, flux)) for one_px in draws_px]
+        found = [
+            tracker.solve_centroids(Centroids(one_px, noise, flux)) for one_px in draws_px
+        ]
         assert all(one.solved for one in found)
         errors = np.array(
             [(one.cam_from_ref * body_from_lab.inv()).as_rotvec() for one in found]
@@ -419,7 +446,9 @@ def test_a_spread_scales_with_its_data_and_ignores_shifts(
     other = deviation(scale * value + shift, group, stop)
     np.testing.assert_allclose(other, scale * one, rtol=1e-6, atol=0)
     by_numpy = [np.std(value[group == g], ddof=1) for g in range(5)]
-    assert deviation is home_position.averaged or np.allclose(one, by_numpy, rtol=1e-9, atol=0)
+    assert deviation is home_position.averaged or np.allclose(
+        one, by_numpy, rtol=1e-9, atol=0
+    )
     light = home_position.instrument_brightness(np.abs(value), 1.0 + group)
     np.testing.assert_allclose(
         home_position.instrument_brightness(np.abs(value), scale * (1.0 + group)),

@@ -118,7 +118,7 @@ def test_wider_errors_in_closed_form_match_the_full_evaluation(
     quick, quick_factor = misfit.widened(
         matched, hypothesis.R_cam_from_ref, detections, tracker.sky
     )
-    monkeypatch.setattr(star_evidence, "count_near", lambda *_: 1)
+    monkeypatch.setattr(misfit, "count_near", lambda *_: 1)
     slow, slow_factor = misfit.widened.py_func(
         matched, hypothesis.R_cam_from_ref, detections, tracker.sky
     )

@@ -145,7 +145,9 @@ def test_row_times_alone_determine_a_slow_rate_with_its_sign(tracker: StarTracke
         assert_allclose(attitude.rate.rate_rad_s, seen.rate_rad_s, rtol=0, atol=1e-5)
 
 
-def test_the_gyro_gives_the_sign_of_a_global_shutter_frame_s_rate(tracker: StarTracker) -> None:
+def test_the_gyro_gives_the_sign_of_a_global_shutter_frame_s_rate(
+    tracker: StarTracker,
+) -> None:
     still = StarTracker(
         replace(WIDE, row_time_s=0.0), tracker.stars, tracker.stars.vectors, SETTINGS
     )

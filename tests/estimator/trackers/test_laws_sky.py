@@ -14,14 +14,13 @@ from scipy import stats
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from estimator.calibration.star_field import magnitude_zero
+from estimator.calibration.zero_point import magnitude_zero
 from estimator.catalog import catalog, pair_index
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.identification.direct_match import to_star_match
-from estimator.identification.published import saa as saa_search
-from estimator.identification.published import shefex
+from estimator.identification.published import primary_pair, shefex
 from estimator.identification.published.fialho import fialho_1, fialho_2, fialho_3, fialho_4
 from estimator.identification.published.fialho import search_options as fialho_options
 from estimator.identification.published.master_star import master_star
@@ -182,8 +181,8 @@ def test_a_pool_without_assumptions_gives_no_answer(rng: np.random.Generator) ->
     world = World(rng, 60)
     known = world.index
     unknown = np.full(len(world.seen), np.nan)
-    gates = saa_search.Gates(1e-4, 1e-4, np.inf, 0.0)
-    seen = saa_search.SearchInput(
+    gates = primary_pair.Gates(1e-4, 1e-4, np.inf, 0.0)
+    seen = primary_pair.SearchInput(
         world.seen, unknown, known.vectors, known.magnitude, known.cells, gates
     )
     pool = AssumptionPool(seen, (-1.0, 1.0, -1.0, 1.0), 0.0)
@@ -197,7 +196,9 @@ def test_a_pool_without_assumptions_gives_no_answer(rng: np.random.Generator) ->
     errors=some.lists(some.floats(0, 1e-3), min_size=2, max_size=2),
     factor=some.floats(0, 9),
 )
-def test_the_gate_grows_with_the_error(fov: float, errors: list[float], factor: float) -> None:
+def test_the_gate_grows_with_the_error(
+    fov: float, errors: list[float], factor: float
+) -> None:
     small, large = (shefex.cos_error(fov, error, factor) for error in sorted(errors))
     assert (
         0 <= small <= large <= factor * max(errors) * 1.000001 + 1e-15
@@ -282,7 +283,14 @@ def test_stars_beside_detections_reveal_a_wrong_camera(
     matched = np.flatnonzero(~moved if aside else moved | ~moved)
     nothing = np.zeros((3, 3))
     solution = Solution(
-        matched, rows[matched], truth.as_quat(), nothing, 1.0, 0.1 / CAMERA.focal_px, 1.0, 20.0
+        matched,
+        rows[matched],
+        truth.as_quat(),
+        nothing,
+        1.0,
+        0.1 / CAMERA.focal_px,
+        1.0,
+        20.0,
     )
     near, by_chance = matcher.near_misses(solution, centroids)
     assert near >= moved.sum() * aside
@@ -417,13 +425,17 @@ def test_mutual_neighbors_are_each_other_s_nearest(
     }
     least = [(a, int(np.argmin(between[a]))) for a in range(len(seen)) if len(there)]
     assert mutual == {
-        (a, b) for a, b in least if np.argmin(between[:, b]) == a and between[a, b] < radius_px
+        (a, b)
+        for a, b in least
+        if np.argmin(between[:, b]) == a and between[a, b] < radius_px
     }
 
 
 @law(refinement.log10_chance)
 @given(
-    blobs=some.integers(4, 100), predicted=some.integers(1, 100), radius_px=some.floats(0.5, 5)
+    blobs=some.integers(4, 100),
+    predicted=some.integers(1, 100),
+    radius_px=some.floats(0.5, 5),
 )
 def test_more_matches_are_less_likely_by_chance(
     blobs: int, predicted: int, radius_px: float

@@ -421,7 +421,9 @@ def test_the_dome_tracker_refuses_too_few_and_unknown_lights() -> None:
 
 
 @pytest.mark.slow
-def test_a_star_tracker_does_not_solve_a_dome_at_finite_distance(tracker: StarTracker) -> None:
+def test_a_star_tracker_does_not_solve_a_dome_at_finite_distance(
+    tracker: StarTracker,
+) -> None:
     leds = dome("sphere")
     rng = np.random.default_rng(98)
     fields = [under_the_dome(rng, leds, LEVERS["axial"], 0.1)[1] * 0.41 for _ in range(2)]

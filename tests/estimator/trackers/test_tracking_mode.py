@@ -53,7 +53,9 @@ def light_of_stars(tracker: StarTracker, cam_from_ref: Rotation, light: float):
     return image
 
 
-def photograph(tracker: StarTracker, cam_from_ref: Rotation, seed: int = 0, light: float = 3e5):
+def photograph(
+    tracker: StarTracker, cam_from_ref: Rotation, seed: int = 0, light: float = 3e5
+):
     """Stars over a sky of 20 electrons, photon and read noise; 16 bits."""
     image = 20 + light_of_stars(tracker, cam_from_ref, light)
     rng = np.random.default_rng(seed)

@@ -75,7 +75,8 @@ def lab(folder: Path, seed: int = 1, suffix: str = ".png", shift: int = 0) -> No
         for n in range(2):
             image = frame(rng, exposure_s * WELL / 0.08, exposure_s)
             write(
-                folder / f"flats/flat_{1e6 * exposure_s:.0f}us_20C_{n}{suffix}", image << shift
+                folder / f"flats/flat_{1e6 * exposure_s:.0f}us_20C_{n}{suffix}",
+                image << shift,
             )
 
 
@@ -127,7 +128,9 @@ def test_numbers_in_the_upper_bits_are_shifted_back(tmp_path: Path, good: Path) 
 
 def test_parameters_of_an_independent_camera_are_recovered(good: Path) -> None:
     config, raw = characterize_camera.read_camera(str(good / "camera.yaml"))
-    found = characterize_camera.measure_sensor(config, good / "darks", good / "flats").estimates
+    found = characterize_camera.measure_sensor(
+        config, good / "darks", good / "flats"
+    ).estimates
     for key, truth in (
         ("gain_e_dn", GAIN),
         ("read_noise_e", READ),
@@ -176,7 +179,8 @@ def stars(folder: Path) -> None:
     rng = np.random.default_rng(5)
     (y, x) = np.mgrid[0:SIDE, 0:SIDE]
     light_e = sum(
-        1000 * np.exp(-((x - a) ** 2 + (y - b) ** 2) / 2) for a, b in rng.uniform(5, 58, (6, 2))
+        1000 * np.exp(-((x - a) ** 2 + (y - b) ** 2) / 2)
+        for a, b in rng.uniform(5, 58, (6, 2))
     )
     for n in range(4):
         write(folder / f"darks/dark_100s_20C_{n}.png", frame(rng, light_e, 100.0))
@@ -279,7 +283,10 @@ BAD: list[tuple[Callable[[Path], None], str]] = [
         lamp,
         "the flats of 0.05 s at 20 °C differ by 9.5 % from frame to frame; allowed: 3 %: a steady lamp",
     ),
-    (small, "flat_50000us_20C_1.png: 64 x 32 pixels; allowed: 64 x 64, as the camera has them"),
+    (
+        small,
+        "flat_50000us_20C_1.png: 64 x 32 pixels; allowed: 64 x 64, as the camera has them",
+    ),
     (
         unnamed,
         "flat.png: no exposure time; allowed: EXPTIME in a FITS header, a row of frames.csv beside it",
@@ -297,7 +304,10 @@ BAD: list[tuple[Callable[[Path], None], str]] = [
         average,
         "flat_50000us_20C_9.fits: numbers that are not whole, as of an average; allowed: raw frames",
     ),
-    (beyond, "flat_50000us_20C_9.png: 4097 DN; allowed: up to 4095, the 12 bits of the camera"),
+    (
+        beyond,
+        "flat_50000us_20C_9.png: 4097 DN; allowed: up to 4095, the 12 bits of the camera",
+    ),
 ]
 
 
@@ -307,7 +317,9 @@ def test_uninformative_frames_are_refused_in_one_line(
 ) -> None:
     lab(tmp_path)
     spoil(tmp_path)
-    (tmp_path / "camera.yaml").write_text(yaml.safe_dump({"camera": CAMERA}), encoding="utf-8")
+    (tmp_path / "camera.yaml").write_text(
+        yaml.safe_dump({"camera": CAMERA}), encoding="utf-8"
+    )
     config, _ = characterize_camera.read_camera(str(tmp_path / "camera.yaml"))
     with pytest.raises(InputError) as refused:
         characterize_camera.measure_sensor(config, tmp_path / "darks", tmp_path / "flats")

@@ -43,22 +43,29 @@ def drawn(
     rng: np.random.Generator, sigma: float, corner: float, trail_px: float = 0.0
 ) -> tuple[Floats, Floats]:
     """A frame without black level of some 250 stars on a grid, and their places; trails are along the rows."""
-    places = np.stack(np.meshgrid(*(np.arange(22.0, SIDE_PX - 22, 42),) * 2), axis=-1).reshape(
-        -1, 2
-    )
+    places = np.stack(
+        np.meshgrid(*(np.arange(22.0, SIDE_PX - 22, 42),) * 2), axis=-1
+    ).reshape(-1, 2)
     places += rng.uniform(-0.5, 0.5, places.shape)
     light = np.full((SIDE_PX, SIDE_PX), 20.0)
     for x, y in places:
-        own = np.hypot(sigma, corner * np.hypot(x - CENTER_PX[0], y - CENTER_PX[1]) / CORNER_PX)
+        own = np.hypot(
+            sigma, corner * np.hypot(x - CENTER_PX[0], y - CENTER_PX[1]) / CORNER_PX
+        )
         columns, rows = (np.arange(int(at) - 12, int(at) + 14) for at in (x, y))
         along = np.mean(
-            [gaussian(columns, x + trail_px * t, own) for t in (np.arange(9) + 0.5) / 9 - 0.5],
+            [
+                gaussian(columns, x + trail_px * t, own)
+                for t in (np.arange(9) + 0.5) / 9 - 0.5
+            ],
             axis=0,
         )
         light[rows[:, None], columns] += (
             5000 * 10 ** rng.uniform(-0.4, 0.4) * np.outer(gaussian(rows, y, own), along)
         )
-    return np.rint(GAIN_DN_E * rng.poisson(light) + rng.normal(0, READ_DN, light.shape)), places
+    return np.rint(
+        GAIN_DN_E * rng.poisson(light) + rng.normal(0, READ_DN, light.shape)
+    ), places
 
 
 def fitted(rng: np.random.Generator, *law: float) -> tuple[StarImages, Floats]:
@@ -231,7 +238,8 @@ def test_lens_and_star_images_are_recovered_and_reproduce_the_frames(
     found = night_sky.lens_estimates(config, night.lens)
     assert found["focal_length_mm"].value == pytest.approx(16.0, rel=1e-3)
     assert (
-        disagreement_px(night.lens.camera, calibration(CameraConfig.model_validate(TRUE))) < 0.1
+        disagreement_px(night.lens.camera, calibration(CameraConfig.model_validate(TRUE)))
+        < 0.1
     )
     psf = {"kind": "gaussian", "sigma_px": night.size.sigma_px.value}
     psf["corner_sigma_px"] = night.size.corner_sigma_px.value

@@ -162,7 +162,10 @@ def test_linear_signal_is_the_inverse_of_the_amplifier() -> None:
     x = np.linspace(0, 4000, 9)
     for curvature in (0.0, 1e-5, -1e-5):
         np.testing.assert_allclose(
-            photon_transfer.linear_dn(x - curvature * x**2, curvature), x, rtol=1e-12, atol=1e-9
+            photon_transfer.linear_dn(x - curvature * x**2, curvature),
+            x,
+            rtol=1e-12,
+            atol=1e-9,
         )
 
 
@@ -255,7 +258,9 @@ def test_uneven_illumination_is_not_counted_as_prnu() -> None:
     y, x = np.mgrid[0:96, 0:128]
     image = 500 * (1 + 0.1 * (x - 64) / 64 - 0.06 * ((y - 48) / 48) ** 2)
     trend = fixed_pattern.smooth(image, np.ones(image.shape, bool))
-    np.testing.assert_allclose(trend, image, rtol=3e-4)  # means of a block are not its center's
+    np.testing.assert_allclose(
+        trend, image, rtol=3e-4
+    )  # means of a block are not its center's
 
 
 def test_error_propagation_matches_that_of_a_product() -> None:

@@ -85,7 +85,8 @@ def test_streak_vectors_match_the_rotating_camera() -> None:
     middle = camera.rays(np.column_stack([rows["x_px"], rows["y_px"]]))
     # Directions at rest turn against the camera: v(t) = exp(-w t) v.
     begin, end = (
-        camera.pixels(Rotation.from_rotvec(-rate * t).apply(middle)) for t in (-half_s, half_s)
+        camera.pixels(Rotation.from_rotvec(-rate * t).apply(middle))
+        for t in (-half_s, half_s)
     )
     found = np.column_stack([rows["streak_x_px"], rows["streak_y_px"]])
     np.testing.assert_allclose(found, end - begin, atol=2e-3)
@@ -123,7 +124,9 @@ def test_the_box_of_a_still_star_is_a_square_about_it() -> None:
         strict=True,
     ):
         assert box == pytest.approx([10.5 - 2.1, 20.5 - 2.1, 4.2, 4.2])
-        assert sorted(outline) == pytest.approx([8.4, 8.4, 12.6, 12.6, 18.4, 18.4, 22.6, 22.6])
+        assert sorted(outline) == pytest.approx(
+            [8.4, 8.4, 12.6, 12.6, 18.4, 18.4, 22.6, 22.6]
+        )
 
 
 MOON: dict[str, object] = {

@@ -20,7 +20,9 @@ def variations(folder: Path, text: str = VARY) -> Path:
     return path
 
 
-def test_the_trial_is_drawn_in_every_frame_and_the_scene_in_every_shard(tmp_path: Path) -> None:
+def test_the_trial_is_drawn_in_every_frame_and_the_scene_in_every_shard(
+    tmp_path: Path,
+) -> None:
     made = small(variations(tmp_path), 400, frames_per_shard=10)
     levels = [made.draw(frame // 10, frame) for frame in range(400)]
     rates = [one["rate"] for one, _ in levels]
@@ -95,7 +97,10 @@ def test_every_setting_that_changes_the_frames_changes_the_digest(tmp_path: Path
             VARY.replace("{dec_deg", "{kind: centroids, dec_deg"),
             "trial.kind: a dataset has frames; allowed: frames",
         ),
-        (VARY.replace("{dec_deg: [-60, 60]}", "{tilt_deg: 5}"), "trial.tilt_deg: .*no effect"),
+        (
+            VARY.replace("{dec_deg: [-60, 60]}", "{tilt_deg: 5}"),
+            "trial.tilt_deg: .*no effect",
+        ),
         (
             VARY.replace("{dec_deg", "{tracked: 3, dec_deg"),
             "trial.tracked: no effect on single frames; allowed: studies",

@@ -43,7 +43,9 @@ def whole(vary: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def index(folder: Path) -> list[dict[str, Any]]:
-    tables = [pyarrow.read_table(path) for path in sorted((folder / "index").glob("*.parquet"))]
+    tables = [
+        pyarrow.read_table(path) for path in sorted((folder / "index").glob("*.parquet"))
+    ]
     return [row for table in tables for row in table.to_pylist()]
 
 
@@ -98,7 +100,9 @@ def test_every_format_has_the_same_frames(whole: Path) -> None:
 
 def test_the_table_of_sources_has_the_sources_of_the_frames(whole: Path) -> None:
     made = samples(whole)
-    found = [pyarrow.read_table(path) for path in sorted((whole / "sources").glob("*.parquet"))]
+    found = [
+        pyarrow.read_table(path) for path in sorted((whole / "sources").glob("*.parquet"))
+    ]
     ids = [
         pair
         for table in found
@@ -167,7 +171,9 @@ def test_boxes_hold_the_light_of_their_sources(whole: Path) -> None:
 
 def test_numbers_with_two_decimals_are_written_as_by_json() -> None:
     rng = np.random.default_rng(3)
-    numbers = np.round(rng.standard_normal((500, 4)) * 10.0 ** rng.integers(-3, 6, (500, 4)), 2)
+    numbers = np.round(
+        rng.standard_normal((500, 4)) * 10.0 ** rng.integers(-3, 6, (500, 4)), 2
+    )
     numbers[0] = [0.0, -0.0, 100.0, -0.05]
     assert [f"[{row}]" for row in dataset_shards.hundredths(numbers)] == [
         json.dumps(row) for row in numbers.tolist()

@@ -96,7 +96,11 @@ def test_thermal_states_match_the_scene():
     [
         ("collimated_display", {}, "light.kind: collimated_display"),
         ("coded_spiral", {}, "tracker.decoder: gives no attitude for one frame"),
-        ("shefex2", {"tracker.exposure_control": "{mean_dn: 500}"}, "tracker.exposure_control"),
+        (
+            "shefex2",
+            {"tracker.exposure_control": "{mean_dn: 500}"},
+            "tracker.exposure_control",
+        ),
     ],
 )
 def test_a_scene_without_attitudes_of_single_frames_is_refused(scene, overrides, message):

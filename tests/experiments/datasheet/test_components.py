@@ -40,7 +40,8 @@ def test_injected_terms_are_recovered_to_five_percent():
         "fuspt": 3.0,
     }
     found = np.mean(
-        [components(generated(rng, (60, 6, 4, 2, 2), 1.5, **sizes)) for _ in range(900)], axis=0
+        [components(generated(rng, (60, 6, 4, 2, 2), 1.5, **sizes)) for _ in range(900)],
+        axis=0,
     )
     expected = Components(
         1.5**2 + 0.5**2, 0.8**2 + 0.6**2 + 0.3**2, 2.0**2 + 1.0**2, 0.7**2, 3.0**2

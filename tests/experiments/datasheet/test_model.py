@@ -140,7 +140,9 @@ def test_correlations_match_those_of_simulated_draws(model, turned_deg):
     axis_rad = rng.uniform(0, 2 * np.pi, count)
     noise = np.stack([model.drawn_noise(rates, axis_rad, rng) for _ in range(2)])
     slow = model.field * normal["field"] + model.pixel * normal["pixel"]
-    errors = np.stack([model.scales(scale[:, 0]) for scale in normal["scale"]]) * (slow + noise)
+    errors = np.stack([model.scales(scale[:, 0]) for scale in normal["scale"]]) * (
+        slow + noise
+    )
     found = np.mean(errors[0] * errors[1], axis=0) / np.mean(errors**2, axis=(0, 1))
     assert found == pytest.approx(model.correlation(turned_deg, rate_deg_s), abs=0.02)
 
@@ -247,7 +249,9 @@ def drawn_sheet(model: ErrorModel, fields: int) -> MeasuredFrames:
     return MeasuredFrames(scene, "shefex2", {}, size, designer, cells, columns, None)
 
 
-def turned(model: ErrorModel, state: State, step_deg: float, rng: np.random.Generator) -> State:
+def turned(
+    model: ErrorModel, state: State, step_deg: float, rng: np.random.Generator
+) -> State:
     """The state after a rotation."""
     new = []
     for name in ("field", "pixel", "scale"):
@@ -268,7 +272,9 @@ def test_a_model_agrees_with_new_fields_of_its_own_errors_and_not_with_others(
     rates = {"rates_deg_s": [0.0, 0.28, 0.57, 1.1, 2.3], "along": [0.0, 0.5, 1.0, 2.0, 4.0]}
     truth = ErrorModel(CONSTANTS | rates | {"noise": [[1.0, 1.0, 10.0]] * 5})
     sheet = drawn_sheet(truth, 300)
-    monkeypatch.setattr(model_fit, "axes_rad", lambda sheet, rate: sheet.columns["axis_rad"][0])
+    monkeypatch.setattr(
+        model_fit, "axes_rad", lambda sheet, rate: sheet.columns["axis_rad"][0]
+    )
     found = model_fit.agreements(sheet)
     assert [one.fitted for one in found] == ["even"] * 5 + ["odd"] * 5
     assert np.mean([p > 0.05 for one in found for p in one.p_values]) >= 0.7

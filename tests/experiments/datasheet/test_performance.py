@@ -111,7 +111,9 @@ def sky_sheet(errors_over_sigma: tuple[float, float, float]) -> datasheet_run.Me
     columns["nees"][0, :5] = np.nan
     cells = [DatasheetCell("sky", {"draw": number}, {}) for number in range(10)]
     unused: Any = None
-    return datasheet_run.MeasuredFrames(unused, "", {}, unused, unused, cells, columns, unused)
+    return datasheet_run.MeasuredFrames(
+        unused, "", {}, unused, unused, cells, columns, unused
+    )
 
 
 def test_a_correct_covariance_is_confirmed():

@@ -62,7 +62,9 @@ def untimed(statement: Statement) -> str:
     return json.dumps(numbers(statement._replace(times_s=[])))
 
 
-def test_a_stopped_datasheet_resumes_with_the_same_result(small: None, tmp_path: Path) -> None:
+def test_a_stopped_datasheet_resumes_with_the_same_result(
+    small: None, tmp_path: Path
+) -> None:
     whole = state(measured(tmp_path / "whole"))
     assert len(whole.times_s) == 3
     assert min(whole.times_s) > 0
@@ -131,7 +133,9 @@ def test_an_injected_bias_and_thermal_drift_are_recovered() -> None:
         effects = slope * (temperatures_c - 20)
         found = components(by_axis[axis])
         expected = float(np.var(effects, ddof=1))
-        assert found.thermal == pytest.approx(expected, rel=0.05, abs=1.0 if axis < 2 else 20.0)
+        assert found.thermal == pytest.approx(
+            expected, rel=0.05, abs=1.0 if axis < 2 else 20.0
+        )
         # The mean's square, less what the three states' scatter gives to it.
         unbiased = float(np.mean(effects) ** 2 - expected / 3)
         assert found.bias == pytest.approx(unbiased, rel=0.05, abs=2.0 if axis < 2 else 20.0)

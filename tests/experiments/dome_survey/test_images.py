@@ -369,7 +369,10 @@ def test_images_that_cannot_be_surveyed_are_refused_in_one_line(
         (["--camera", "x.yaml"], "--camera: has no effect without --images"),
         (["--plan", "--checks", "3"], "--checks: has no effect with --plan"),
         (["--repeat", "3", "--frames-to", "x"], "--frames-to: has no effect with --repeat"),
-        (["--watch"], "--watch: has no effect without --images; allowed: with --images FOLDER"),
+        (
+            ["--watch"],
+            "--watch: has no effect without --images; allowed: with --images FOLDER",
+        ),
         (
             ["--images", ".", "--camera", "x.yaml", "--watch", "--checks", "3"],
             "--checks: has no effect with --watch",
@@ -414,7 +417,9 @@ def test_written_attitudes_are_read_unchanged(tmp_path: Path) -> None:
         (HEAD + "a.fits,1,2,3\na.fits,1,2,3\n", "'a.fits' occurs twice; allowed: once"),
     ],
 )
-def test_faulty_attitudes_are_refused_in_one_line(tmp_path: Path, text: str, says: str) -> None:
+def test_faulty_attitudes_are_refused_in_one_line(
+    tmp_path: Path, text: str, says: str
+) -> None:
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(InputError) as refused:
         survey_images.read_attitudes(tmp_path / "a.csv")

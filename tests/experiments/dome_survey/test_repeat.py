@@ -76,7 +76,9 @@ def test_a_survey_that_contradicts_its_assumptions_is_refused(
     )
     run = SimpleNamespace(survey=found, accuracy=accuracy)
     if refused:
-        with pytest.raises(InputError, match=f"survey: {parameter} .* contradicts the assumed"):
+        with pytest.raises(
+            InputError, match=f"survey: {parameter} .* contradicts the assumed"
+        ):
             adjust.check_plausible(run, survey_prior.assumed(before, assumed))  # type: ignore[arg-type]
     else:
         adjust.check_plausible(run, survey_prior.assumed(before, assumed))  # type: ignore[arg-type]

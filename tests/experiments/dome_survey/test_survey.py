@@ -23,7 +23,12 @@ from estimator.core.types import Centroids
 from estimator.trackers.dome_tracker import DomeTracker
 from skysim.apps.cli import main
 from skysim.core.errors import InputError
-from skysim.experiments.dome_survey import adjust, survey_frames, survey_prior, survey_procedure
+from skysim.experiments.dome_survey import (
+    adjust,
+    survey_frames,
+    survey_prior,
+    survey_procedure,
+)
 from skysim.experiments.dome_survey.survey_frames import SurveyFrame
 from skysim.scene import loader
 from skysim.simulation.lab import Lab, build_lab, build_tracker
@@ -108,7 +113,9 @@ def lab(folder: Path) -> Lab:
 
 
 @pytest.mark.long
-def test_a_survey_reduces_the_tracker_s_error_substantially(statistics: dict[str, Any]) -> None:
+def test_a_survey_reduces_the_tracker_s_error_substantially(
+    statistics: dict[str, Any],
+) -> None:
     """1000″ before. After: what one frame's lights are off, 0.2 mm at 0.8 m over the root of some twenty, and the
     turn of the lab, which the map of 2 mm before holds to 2 mm / (0.3 m sqrt(240)) = 90″.
     """
@@ -167,7 +174,9 @@ def test_led_errors_match_their_sigmas(statistics: dict[str, Any], folder: Path)
 
 
 @pytest.mark.slow
-def test_a_scene_beside_the_map_file_uses_it(statistics: dict[str, Any], folder: Path) -> None:
+def test_a_scene_beside_the_map_file_uses_it(
+    statistics: dict[str, Any], folder: Path
+) -> None:
     """Places, sigma, lever and lens as measured; LEDs not surveyed are left out; frames of the scene are solved."""
     (folder / "mapped.yaml").write_text(
         "schema: 1\nbase: small.yaml\ntracker: {map: leds.ecsv}\n"
@@ -265,7 +274,10 @@ def test_an_imu_error_shifts_a_frame_as_predicted(lab: Lab) -> None:
         np.linalg.norm(prior.pixels(Rotation.identity()) - prior.camera.center_px, axis=1)
     )[:5]
     shifted_px = np.array(
-        [prior.pixels(error)[center].mean(axis=0) for error in Rotation.from_rotvec(errors_rad)]
+        [
+            prior.pixels(error)[center].mean(axis=0)
+            for error in Rotation.from_rotvec(errors_rad)
+        ]
     )
     assert shifted_px.std(axis=0) == pytest.approx(predicted_px, rel=0.05)
     assert predicted_px > 1.4 * sigmas.imu_sigma_rad * prior.camera.focal_px
@@ -315,7 +327,9 @@ def test_leds_of_unknown_position_do_not_bias_the_shift() -> None:
     for _ in range(40):
         across, down = np.meshgrid(75.0 * np.arange(25), 75.0 * np.arange(25))
         predicted = (
-            np.column_stack([across.ravel(), down.ravel()]) + rng.normal(0, 22, (625, 2)) - 550
+            np.column_stack([across.ravel(), down.ravel()])
+            + rng.normal(0, 22, (625, 2))
+            - 550
         )
         sigma_px = np.where(predicted[:, 0] < 250, 7.0, 25.0)
         shift = rng.normal(0, 90, 2)
@@ -353,7 +367,9 @@ def test_a_board_that_is_displaced_is_found_whole(seed: int) -> None:
             np.full(len(xy_px), NOISE_PX),
             np.ones(len(xy_px)),
         )
-        by_imu = Rotation.from_rotvec(UNCERTAINTY.imu_sigma_rad * rng.normal(size=3)) * attitude
+        by_imu = (
+            Rotation.from_rotvec(UNCERTAINTY.imu_sigma_rad * rng.normal(size=3)) * attitude
+        )
         frames.append(SurveyFrame(lights, by_imu, index))
     run = adjust.run_survey(frames, prior, UNCERTAINTY)
     survey = run.survey
@@ -390,7 +406,14 @@ def test_pairs_have_the_least_total_cost() -> None:
 
 def test_frames_without_common_leds_are_left_out() -> None:
     """Three share three lights in a chain; two share three of their own; one shows two of the chain's."""
-    shown = [[0, 1, 2, 3], [1, 2, 3, 4, 5, 6], [4, 5, 6, 7], [10, 11, 12], [10, 11, 12], [0, 1]]
+    shown = [
+        [0, 1, 2, 3],
+        [1, 2, 3, 4, 5, 6],
+        [4, 5, 6, 7],
+        [10, 11, 12],
+        [10, 11, 12],
+        [0, 1],
+    ]
     table = np.zeros((len(shown), 13), dtype=bool)
     for row, leds in zip(table, shown, strict=True):
         row[leds] = True
@@ -432,7 +455,12 @@ def test_a_written_map_is_read_unchanged(
     ],
 )
 def test_a_faulty_map_is_refused_in_one_line(
-    statistics: dict[str, Any], folder: Path, tmp_path: Path, right: str, wrong: str, says: str
+    statistics: dict[str, Any],
+    folder: Path,
+    tmp_path: Path,
+    right: str,
+    wrong: str,
+    says: str,
 ) -> None:
     text = (folder / "leds.ecsv").read_text()
     assert right in text
@@ -522,7 +550,10 @@ def test_a_missing_or_ambiguous_map_is_refused_in_one_line(
             ["afit_simsat", "--imu-sigma", "20 deg"],
             "--imu-sigma: 20 deg; allowed: 0 to 0.1 rad",
         ),
-        (["afit_simsat", "--led-sigma", "0 mm"], "--led-sigma: 0 mm; allowed: 1e-06 to 0.1 m"),
+        (
+            ["afit_simsat", "--led-sigma", "0 mm"],
+            "--led-sigma: 0 mm; allowed: 1e-06 to 0.1 m",
+        ),
         (["afit_simsat", "--focal-error", "50%"], "--focal-error: 50%; allowed: -0.1 to 0.1"),
         (["afit_simsat", "--frames", "2", "--attitudes", "random"], "survey: "),
     ],

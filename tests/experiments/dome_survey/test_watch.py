@@ -59,7 +59,9 @@ def test_every_image_is_read_once_and_each_bad_one_is_one_line(
     read = [name for one in news for name in one.read if name != ATTITUDES]
     complaints = [error for one in news for error in one.complaints]
     assert sorted(read) == [f"{n:02d}.png" for n in range(12)]
-    assert [sorted(Path(error.key).name for error in complaints)] == [["bad.png", "small.png"]]
+    assert [sorted(Path(error.key).name for error in complaints)] == [
+        ["bad.png", "small.png"]
+    ]
     assert not any("\n" in str(error) for error in complaints)
     for _ in range(2):  # the attitudes of the last image may be written after it
         folder.look()

@@ -68,7 +68,9 @@ def test_a_cause_explains_only_a_disagreement_that_it_removes() -> None:
     off = exact(12.0)
     near = exact(10.1)
     assert compare.verdict(TEN, RowResult(off, cause=Cause("tilt", near))) == "explained"
-    assert compare.verdict(TEN, RowResult(off, cause=Cause("tilt", exact(11.0)))) == "disagrees"
+    assert (
+        compare.verdict(TEN, RowResult(off, cause=Cause("tilt", exact(11.0)))) == "disagrees"
+    )
     assert compare.verdict(TEN, RowResult(near, cause=Cause("tilt", off))) == "agrees"
 
 
@@ -83,7 +85,9 @@ def test_a_cause_explains_only_a_disagreement_that_it_removes() -> None:
         (PublishedRow(quantity="x", at_least=0.9, at_most=0.97), 0.99, False),
     ],
 )
-def test_a_bound_is_compared_on_its_side(row: PublishedRow, ours: float, agrees: bool) -> None:
+def test_a_bound_is_compared_on_its_side(
+    row: PublishedRow, ours: float, agrees: bool
+) -> None:
     assert (compare.verdict(row, RowResult(exact(ours))) == "agrees") == agrees
 
 

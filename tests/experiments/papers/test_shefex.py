@@ -71,7 +71,9 @@ def test_three_stars_are_no_success() -> None:
 
 
 def test_the_triangles_of_fifteen_are_the_binomial_coefficient() -> None:
-    assert shefex_identification.count_triangles(np.random.default_rng(2)) == 15 * 14 * 13 // 6
+    assert (
+        shefex_identification.count_triangles(np.random.default_rng(2)) == 15 * 14 * 13 // 6
+    )
 
 
 def test_equation_5_fails_as_printed_and_holds_when_corrected() -> None:
@@ -81,7 +83,9 @@ def test_equation_5_fails_as_printed_and_holds_when_corrected() -> None:
 def test_the_crossing_of_a_line_and_a_limit_is_interpolated() -> None:
     """0.2 deg a pixel passes 0.1 deg at half a pixel; one that stays below ends at the last."""
     yaw_deg = 0.2 * shefex_identification.ERRORS_PX
-    assert shefex_identification.error_at_limit(1.0, yaw_deg**2) == pytest.approx(0.5, abs=0.01)
+    assert shefex_identification.error_at_limit(1.0, yaw_deg**2) == pytest.approx(
+        0.5, abs=0.01
+    )
     assert shefex_identification.error_at_limit(2.0, yaw_deg**2) == pytest.approx(
         0.25, abs=0.01
     )

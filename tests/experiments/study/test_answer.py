@@ -90,7 +90,9 @@ def test_refusals_are_named_where_they_are_most_frequent() -> None:
     lines = [line(0, 500, 200, refused=4), line(1, 900, 400)]
     interval = metrics.proportion(4, 200)
     texts = answer.headline(study(), lines, True, "skysim study worst leds.yaml")
-    assert said(texts, "Is it ambiguous anywhere?").startswith("Is it ambiguous anywhere? No.")
+    assert said(texts, "Is it ambiguous anywhere?").startswith(
+        "Is it ambiguous anywhere? No."
+    )
     assert said(texts, "Is every attitude solved?") == (
         "Is every attitude solved? No. Refused (no attitude is returned): at 1 of 2 points, most at leds = 500: 2 % of"
         f" the frames ({100 * interval.low:.3g} to {100 * interval.high:.3g} %); none in 400 (less than 0.75 % at 95 %"
@@ -133,7 +135,9 @@ def test_wrong_matches_are_counted_and_their_effect_on_the_attitude() -> None:
         "There 25 of 18,000 matches are wrong; the attitude is unaffected: all errors are as claimed."
         in texts
     )
-    assert said(texts, "Is it ambiguous anywhere?").startswith("Is it ambiguous anywhere? No.")
+    assert said(texts, "Is it ambiguous anywhere?").startswith(
+        "Is it ambiguous anywhere? No."
+    )
     one.responses["misled"] = metrics.proportion(10, 200)
     (text,) = [
         text
@@ -251,7 +255,9 @@ def test_the_scene_is_in_a_table(tmp_path: Path) -> None:
     assert rows["camera"].endswith("f/8, field 10° × 7.52°, 22.6″ a pixel")
     assert rows["trial"] == "kind: centroids, noise_px: 0.2"
     assert rows["varied: leds"] == "500, 900 (light.layout.count)"
-    assert rows["trials"] == "2 at each of 2 points, the same attitudes at every point; seed 1"
+    assert (
+        rows["trials"] == "2 at each of 2 points, the same attitudes at every point; seed 1"
+    )
     assert rows["drawn in every trial"] == "light.layout.hardware_seed"
 
 
@@ -307,7 +313,9 @@ def test_a_dome_is_checked_up_to_the_tilt_of_the_trials(tmp_path: Path) -> None:
 
     def warned(tilt_deg: int) -> list[str]:
         trial = {"kind": "centroids", "tilt_deg": [0, tilt_deg]}
-        summary = overview.overview(loaded(tmp_path, set=layout, trial=trial, factors=factors))
+        summary = overview.overview(
+            loaded(tmp_path, set=layout, trial=trial, factors=factors)
+        )
         return [one for one in summary.findings if "LEDs end at 27 deg" in one]
 
     assert not warned(10)

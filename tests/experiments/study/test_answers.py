@@ -207,7 +207,9 @@ def test_exports_have_the_values_of_the_store(tmp_path):
     study_plan, kept = done(tmp_path, STUDY)
     with kept as rows:
         for suffix in ("csv", "parquet", "zarr"):
-            study_export.export(rows, study_plan.study.responses, tmp_path / f"trials.{suffix}")
+            study_export.export(
+                rows, study_plan.study.responses, tmp_path / f"trials.{suffix}"
+            )
         columns = rows.columns()
         lines = table.table(rows, study_plan.study.responses)
         with pytest.raises(
@@ -223,7 +225,9 @@ def test_exports_have_the_values_of_the_store(tmp_path):
     frame = pandas.read_parquet(tmp_path / "trials.parquet")
     assert frame["strays"].tolist() == [0] * 8 + [5] * 8
     assert frame["status"].tolist() == [row["status"] for row in written]
-    assert pyarrow.read_schema(tmp_path / "trials.parquet").metadata[b"title"] == b"a question"
+    assert (
+        pyarrow.read_schema(tmp_path / "trials.parquet").metadata[b"title"] == b"a question"
+    )
     cube = xarray.open_zarr(tmp_path / "trials.zarr", consolidated=False)
     assert dict(cube.sizes) == {"strays": 2, "focal": 2}
     assert (

@@ -47,7 +47,9 @@ def serial_contents(plan_: plan.Plan, tmp_path_factory: pytest.TempPathFactory) 
 
 
 @contextmanager
-def processes(*commands: list[str], **options: Any) -> Iterator[list[subprocess.Popen[bytes]]]:
+def processes(
+    *commands: list[str], **options: Any
+) -> Iterator[list[subprocess.Popen[bytes]]]:
     """Commands that run in the background, without this environment's thread limits."""
     environment = {
         key: value for key, value in ENVIRONMENT.items() if key not in workers.ONE_THREAD
@@ -156,7 +158,9 @@ def test_the_commands_of_the_pods_run_a_study(
     ]
     with processes(*here, cwd=tmp_path):
         done(
-            plan_, tmp_path / "pods.sqlite", on_dask(Cluster(f"tcp://127.0.0.1:{port}", []), 2)
+            plan_,
+            tmp_path / "pods.sqlite",
+            on_dask(Cluster(f"tcp://127.0.0.1:{port}", []), 2),
         )
     assert contents(tmp_path / "pods.sqlite") == serial_contents
 
@@ -171,7 +175,9 @@ def test_a_hanging_worker_is_abandoned(
         engine = on_dask(cluster, 2)
         hung = cluster.workers[:1]
 
-        def hang(progress: runner.Progress, hung: list[subprocess.Popen[bytes]] = hung) -> None:
+        def hang(
+            progress: runner.Progress, hung: list[subprocess.Popen[bytes]] = hung
+        ) -> None:
             if progress.now >= 5 and hung:
                 hung.pop().send_signal(signal.SIGSTOP)
 
@@ -207,7 +213,8 @@ def test_a_worker_that_is_lost_before_a_run_does_not_end_it() -> None:
         engine.check_workers(Replies({"first": lost}), "tcp://here:1")
     with pytest.raises(InputError, match="worker second cannot run trials: no file"):
         engine.check_workers(
-            Replies({"first": version, "second": FileNotFoundError("no file")}), "tcp://here:1"
+            Replies({"first": version, "second": FileNotFoundError("no file")}),
+            "tcp://here:1",
         )
     with pytest.raises(InputError, match=f"worker second has skysim 0; allowed: {version}"):
         engine.check_workers(Replies({"first": lost, "second": "0"}), "tcp://here:1")

@@ -50,7 +50,8 @@ def test_a_study_is_run_reported_exported_and_replayed(typed, tmp_path):
     code, out, _ = typed("study", "report", "question.yaml", "--json")
     assert json.loads(out)["points"]["strays"] == [0, 5]
     assert (
-        "skysim study run question.yaml" in (tmp_path / "out/question/report.html").read_text()
+        "skysim study run question.yaml"
+        in (tmp_path / "out/question/report.html").read_text()
     )
     assert typed("study", "export", "question.yaml", "all.csv")[0] == 0
     assert len((tmp_path / "all.csv").read_text().splitlines()) == 61
@@ -90,10 +91,14 @@ def test_overrides_are_kept_on_resume(typed):
 @pytest.mark.slow
 def test_a_study_named_by_its_folder_can_be_grown(typed, tmp_path):
     assert (
-        typed("study", "run", "question.yaml", "--engine", "serial", "--set", "replicates=2")[0]
+        typed("study", "run", "question.yaml", "--engine", "serial", "--set", "replicates=2")[
+            0
+        ]
         == 0
     )
-    refused = typed("study", "resume", "question.yaml", "--engine", "serial", "--set", "seed=2")
+    refused = typed(
+        "study", "resume", "question.yaml", "--engine", "serial", "--set", "seed=2"
+    )
     assert refused[0] == 2
     assert "another study" in refused[2]
     grow = ("study", "resume", "out/question", "--engine", "serial", "--set", "replicates=4")
@@ -130,7 +135,9 @@ def test_the_worst_trials_are_listed_with_their_replay_command(typed):
     )
     words = ("study", "worst", "question.yaml", "--where", "strays=5", "--count", "2")
     _, out, _ = typed(*words, "--response", "cross_arcsec_p95")
-    line = r"^1\. RA [\d.]+°, Dec [+-][\d.]+°, \d+ lights: cross .*″, roll .*″ \(strays = 5\)$"
+    line = (
+        r"^1\. RA [\d.]+°, Dec [+-][\d.]+°, \d+ lights: cross .*″, roll .*″ \(strays = 5\)$"
+    )
     assert re.search(line, out, re.MULTILINE)
     assert (
         "no trial counts for misidentified" in typed(*words, "--response", "misidentified")[1]

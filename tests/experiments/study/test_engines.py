@@ -25,7 +25,15 @@ from skysim.core.paths import ROOT
 from skysim.experiments.study import plan
 from skysim.experiments.study.execution import engines, runner, setups, store, trials
 from skysim.experiments.study.execution.engines import Engine
-from tests.helpers.clusters import ENVIRONMENT, STUDY, Cluster, cluster_of, dask, on_dask, study
+from tests.helpers.clusters import (
+    ENVIRONMENT,
+    STUDY,
+    Cluster,
+    cluster_of,
+    dask,
+    on_dask,
+    study,
+)
 from tests.helpers.study_stores import contents, done
 
 # What `python -c` runs in a process of its own: a study on a pool, begun or gone on with, that tells how far it is.
@@ -59,7 +67,9 @@ def serial_contents(plan_: plan.Plan) -> str:
 
 
 @pytest.mark.slow
-def test_a_refused_trial_keeps_its_seed_and_reason_and_the_rest_is_done(tmp_path: Path) -> None:
+def test_a_refused_trial_keeps_its_seed_and_reason_and_the_rest_is_done(
+    tmp_path: Path,
+) -> None:
     """One level's scene file vanishes after the study was checked: its trials fail, in a pool as in one process."""
     lost = tmp_path / "lost.yaml"
     lost.write_text((ROOT / "scenes" / "shefex2.yaml").read_text())
@@ -119,7 +129,9 @@ def stubs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 def deaths(plan_: plan.Plan) -> list[int]:
     """The trials that kill a process running `deadly`."""
     bad = [
-        n for n in range(plan_.trials) if setups.seed_of(plan_.spec, *divmod(n, 150)) % 200 == 5
+        n
+        for n in range(plan_.trials)
+        if setups.seed_of(plan_.spec, *divmod(n, 150)) % 200 == 5
     ]
     assert 1 <= len(bad) <= 3
     return bad
@@ -235,13 +247,17 @@ class Run:
 
     def end(self, by: signal.Signals) -> int:
         """Send a signal (to the group for SIGINT); return the status once the process and its children have ended."""
-        os.killpg(self.process.pid, by) if by == signal.SIGINT else self.process.send_signal(by)
+        os.killpg(self.process.pid, by) if by == signal.SIGINT else self.process.send_signal(
+            by
+        )
         status = self.process.wait(20)
         assert self.family, "it had no workers"
         _, orphans = psutil.wait_procs(self.family, timeout=5)
         # A container without an init keeps the dead of a dead parent.
         assert not [
-            one for one in orphans if one.is_running() and one.status() != psutil.STATUS_ZOMBIE
+            one
+            for one in orphans
+            if one.is_running() and one.status() != psutil.STATUS_ZOMBIE
         ]
         return status
 
@@ -368,7 +384,8 @@ def test_other_code_on_the_cluster_is_refused(cluster: Cluster) -> None:
     on_dask(cluster, 2).client.run(change_code, "0123456789abcdef")
     try:
         with pytest.raises(
-            InputError, match=rf"has skysim 0123456789abcdef; allowed: {setups.code_version()}"
+            InputError,
+            match=rf"has skysim 0123456789abcdef; allowed: {setups.code_version()}",
         ):
             dask(cluster.address)
     finally:
@@ -407,7 +424,8 @@ def test_dask_gives_the_same_rows_after_losing_a_worker(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "scheduler", ["", "nonsense", "tcp://127.0.0.1", "tcp://127.0.0.1:99999", "foo://1.2.3.4:5"]
+    "scheduler",
+    ["", "nonsense", "tcp://127.0.0.1", "tcp://127.0.0.1:99999", "foo://1.2.3.4:5"],
 )
 def test_an_invalid_address_is_refused_in_one_line(scheduler: str) -> None:
     pytest.importorskip("distributed")

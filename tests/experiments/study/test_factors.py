@@ -97,7 +97,10 @@ def test_a_drawn_factor_has_its_declared_distribution(factor, law):
             {"key": "x", "distribution": "normal", "mean": "1 m", "sigma": "1 mm"},
             "different units",
         ),
-        ({"key": "x", "distribution": "normal", "mean": 1, "sigma": 0}, "sigma is 0; allowed"),
+        (
+            {"key": "x", "distribution": "normal", "mean": 1, "sigma": 0},
+            "sigma is 0; allowed",
+        ),
         (
             {"key": "x", "distribution": "triangular", "low": 0, "mode": 5, "high": 4},
             "not in ascending order",
@@ -195,7 +198,10 @@ def test_sobols_points_cover_a_square_more_evenly_than_chance():
 def test_saltellis_blocks_are_a_b_and_a_with_a_column_of_b():
     factors = {name: READ({"key": name, "from": 0.0, "to": 1.0}) for name in "xyz"}
     found = np.array(
-        [list(p.levels.values()) for p in points(Design(kind="saltelli", points=8), factors, 5)]
+        [
+            list(p.levels.values())
+            for p in points(Design(kind="saltelli", points=8), factors, 5)
+        ]
     )
     a, b, *mixed = found.reshape(5, 8, 3)
     assert not np.isin(a, b).any()

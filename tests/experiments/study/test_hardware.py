@@ -79,7 +79,9 @@ def test_leds_and_survey_are_drawn_independently(tmp_path: Path) -> None:
     errors_m = []
     for n in range(4):
         setup = setups.prepared_setup(spec, spec.trial_settings({}, n))
-        errors_m.append(setup.estimator.leds.position_m - setup.lab.camera.sources.place[:, :3])
+        errors_m.append(
+            setup.estimator.leds.position_m - setup.lab.camera.sources.place[:, :3]
+        )
     assert np.std(errors_m) == pytest.approx(0.2e-3, rel=0.05)
     assert np.corrcoef(np.reshape(errors_m, (4, -1))) == pytest.approx(np.eye(4), abs=0.2)
 
@@ -99,7 +101,9 @@ def test_leds_and_survey_are_drawn_independently(tmp_path: Path) -> None:
         ),
         (
             {
-                "factors": {"draw": {"key": "light.layout.hardware_seed", "values": [1, 2, 3]}},
+                "factors": {
+                    "draw": {"key": "light.layout.hardware_seed", "values": [1, 2, 3]}
+                },
                 "hardware": [],
             },
             r"factors.draw: light.layout.hardware_seed numbers draws of the hardware; allowed: hardware: \[light",

@@ -50,13 +50,22 @@ def columns(
         "point": np.zeros(count, int),
         "seed": np.arange(count),
     }
-    table |= {"frames": np.ones(count), "solved": np.ones(count), "stars": np.full(count, 9.0)}
-    table |= {name: np.ones(count) for name in ("x_arcsec", "y_arcsec", "roll_arcsec", "nees")}
+    table |= {
+        "frames": np.ones(count),
+        "solved": np.ones(count),
+        "stars": np.full(count, 9.0),
+    }
+    table |= {
+        name: np.ones(count) for name in ("x_arcsec", "y_arcsec", "roll_arcsec", "nees")
+    }
     table["status"] = np.full(count, "solved", dtype=object)
     around = RNG.uniform(0, 360, count)
     if sky:
         sine = RNG.uniform(math.sin(math.radians(low)), math.sin(math.radians(high)), count)
-        table |= {"boresight_ra_deg": around, "boresight_dec_deg": np.degrees(np.arcsin(sine))}
+        table |= {
+            "boresight_ra_deg": around,
+            "boresight_dec_deg": np.degrees(np.arcsin(sine)),
+        }
     else:
         cosine = RNG.uniform(math.cos(math.radians(high)), math.cos(math.radians(low)), count)
         table |= {"body_azimuth_deg": around, "body_tilt_deg": np.degrees(np.arccos(cosine))}
@@ -332,7 +341,10 @@ def test_the_worst_trials_of_a_proportion_are_its_failures() -> None:
         assert [one.trial for one in worst.worst_trials(table, response)] == [60, 150, 3]
     assert worst.worst_trials(table, "ambiguous")[0].event == "ambiguous: so"
     assert worst.worst_trials(table, "misidentified") == []
-    assert [one.trial for one in worst.worst_trials(table, "stars_least", count=2)] == [60, 150]
+    assert [one.trial for one in worst.worst_trials(table, "stars_least", count=2)] == [
+        60,
+        150,
+    ]
     assert [one.trial for one in worst.worst_trials(table, "coverage_4", count=1)] == [60]
 
 

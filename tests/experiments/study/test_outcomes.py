@@ -184,7 +184,9 @@ def test_a_streak_is_as_long_as_the_rate_times_the_exposure() -> None:
 
 
 @pytest.mark.slow
-def test_frames_of_a_closed_loop_have_the_streaks_of_their_lights_in_the_true_motion() -> None:
+def test_frames_of_a_closed_loop_have_the_streaks_of_their_lights_in_the_true_motion() -> (
+    None
+):
     """The LEDs of each frame, projected from where the camera is as its exposure opens and closes."""
     base = {"exposure.frames": 3, "vehicle.imu": {}, "filter": {"start_deg": 0.1}}
     setup = setups.prepared_setup(replace(DOME, base=base, trial={"kind": "flight"}), {})

@@ -91,7 +91,11 @@ def begun(path: Path, each: int = EACH) -> Any:
         def __enter__(self) -> store.Store:
             self.kept = opened.__enter__()
             self.kept.begin(
-                POINT, replicates=str(each), title="strays", code="code", study="title: strays"
+                POINT,
+                replicates=str(each),
+                title="strays",
+                code="code",
+                study="title: strays",
             )
             return self.kept
 
@@ -120,7 +124,8 @@ def whole(path: Path) -> dict[str, list[Any]]:
     with store.open_store(path) as kept:
         columns = kept.columns()
         return {
-            name: [store.to_sql(value) for value in columns[name].tolist()] for name in columns
+            name: [store.to_sql(value) for value in columns[name].tolist()]
+            for name in columns
         }
 
 
@@ -171,7 +176,9 @@ def test_rows_of_store_and_parts_are_one_table(both: tuple[Path, Path]) -> None:
     with store.open_store(one) as kept, store.open_store(other) as parted:
         assert parted.counts() == kept.counts() == {"done": 120, "failed": 4, "wrong": 3}
         assert (
-            parted.done(130).tolist() == kept.done(130).tolist() == [True] * 120 + [False] * 10
+            parted.done(130).tolist()
+            == kept.done(130).tolist()
+            == [True] * 120 + [False] * 10
         )
         assert parted.failures() == kept.failures()
         assert parted.scenes() == kept.scenes()
@@ -211,7 +218,9 @@ def test_exports_with_and_without_parts_have_the_same_bytes(
     assert len(one) > 4000
 
 
-def test_an_export_reads_the_trials_in_batches(both: tuple[Path, Path], tmp_path: Path) -> None:
+def test_an_export_reads_the_trials_in_batches(
+    both: tuple[Path, Path], tmp_path: Path
+) -> None:
     pyarrow = pytest.importorskip("pyarrow.parquet")
     with store.open_store(both[1]) as kept, pytest.MonkeyPatch.context() as patch:
         patch.delattr(store.Store, "columns")

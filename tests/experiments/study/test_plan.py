@@ -89,7 +89,10 @@ def test_an_override_changes_the_study(tmp_path):
             r"factors.focal: '0 mm': camera.focal_length: '0 mm' is not allowed",
         ),
         (("noise_px: 0.1", "noise_px: -1"), r"trial.*noise_px.*line 6\)"),
-        (("kind: centroids", "kind: guesses"), r"trial.kind: unknown kind 'guesses'; allowed:"),
+        (
+            ("kind: centroids", "kind: guesses"),
+            r"trial.kind: unknown kind 'guesses'; allowed:",
+        ),
         (
             ("  strays:", "  stars:"),
             r"factors.stars: the name is that of a column of the trials; allowed: another name.*line 8\)",

@@ -71,7 +71,15 @@ class Law:
         code = code_version()
         try:
             return Row(
-                trial, segment.point, k, seed, "s", code, self.law(segment.settings), None, 0.0
+                trial,
+                segment.point,
+                k,
+                seed,
+                "s",
+                code,
+                self.law(segment.settings),
+                None,
+                0.0,
             )
         except InputError as error:
             return Row(trial, segment.point, k, seed, REFUSED, code, FAILED, str(error), 0.0)
@@ -161,7 +169,9 @@ def test_the_front_holds_the_nondominated_candidates(tmp_path: Path) -> None:
         candidates=40,
     )
     found = searched(
-        loaded(tmp_path, keys), tmp_path / "s.db", Law(lambda s: angle(1 / s["trial.noise_px"]))
+        loaded(tmp_path, keys),
+        tmp_path / "s.db",
+        Law(lambda s: angle(1 / s["trial.noise_px"])),
     )
     on = {one.number for one in found.front}
     assert len(on) >= 5
@@ -294,7 +304,9 @@ def killed_and_resumed(
 
 @pytest.mark.long
 @pytest.mark.parametrize("every", [2, 9])
-def test_a_search_killed_and_resumed_leaves_the_same_store(tmp_path: Path, every: int) -> None:
+def test_a_search_killed_and_resumed_leaves_the_same_store(
+    tmp_path: Path, every: int
+) -> None:
     """Two objectives, a constraint, levels and a refusal: the sampler's whole input is restored from the store."""
 
     def law(settings: Settings) -> Outcome:
@@ -386,7 +398,9 @@ def test_cost_is_per_si_unit(tmp_path: Path) -> None:
             },
         }
     )
-    price = search.factors_cost(wanted.cost, {"size": "48 in", "leds": 300, "dome": "precise"})
+    price = search.factors_cost(
+        wanted.cost, {"size": "48 in", "leds": 300, "dome": "precise"}
+    )
     assert price == pytest.approx(1 + 2 * 1.2192 + 3 + 5, rel=1e-12)
 
 
@@ -418,7 +432,9 @@ def test_cost_is_the_total_of_the_parts(tmp_path: Path) -> None:
     total = parts_list(scene, read_prices(find_prices("assumed"))).total
     found, why = search.cost(made, Point({"leds": 200, "survey": "1 mm"}, settings))
     assert (found, why) == (pytest.approx(7 + total, abs=1e-9), "")
-    refused, why = search.cost(made, Point({}, settings | {"tracker.survey.led_sigma": "1 um"}))
+    refused, why = search.cost(
+        made, Point({}, settings | {"tracker.survey.led_sigma": "1 um"})
+    )
     assert math.isnan(refused)
     assert "no survey reaches 0.001 mm" in why
 

@@ -167,7 +167,9 @@ def test_another_study_or_other_code_is_refused(
     }.items():
         assert done(other(study_plan, **{key: value}), path, resume=True).now == 0
     monkeypatch.setattr(runner, "code_version", lambda: "0123456789abcdef")
-    with pytest.raises(InputError, match=r"trials are of skysim .*; allowed: 0123456789abcdef"):
+    with pytest.raises(
+        InputError, match=r"trials are of skysim .*; allowed: 0123456789abcdef"
+    ):
         done(study_plan, path, resume=True)
     with pytest.raises(InputError, match="no trials to resume"):
         done(study_plan, tmp_path / "new.sqlite", resume=True)
@@ -221,7 +223,8 @@ COLUMNS_READ = {  # all but the keys, for which SQLite itself refuses anything b
 
 @pytest.mark.parametrize("value", ["x'ff00'", "x'3132'"])  # the second are digits
 @pytest.mark.parametrize(
-    ("table", "column"), [(table, one) for table in COLUMNS_READ for one in COLUMNS_READ[table]]
+    ("table", "column"),
+    [(table, one) for table in COLUMNS_READ for one in COLUMNS_READ[table]],
 )
 def test_a_value_of_a_wrong_type_is_refused_in_one_line(
     table: str, column: str, value: str, tmp_path: Path

@@ -46,7 +46,10 @@ def study(**keys: Any) -> Study:
         "seed": 11,
         "replicates": 20,
     }
-    base |= {"trial": {"kind": "centroids"}, "responses": ["identified", "cross_arcsec_median"]}
+    base |= {
+        "trial": {"kind": "centroids"},
+        "responses": ["identified", "cross_arcsec_median"],
+    }
     return Study.model_validate(base | {"factors": {"tilt": TILT}} | keys)
 
 
@@ -74,7 +77,9 @@ def filled(
         point, replicate = divmod(trial, asked.replicates)
         error = f"Traceback\nValueError: <b>{trial}</b>" if trial < failed else None
         result = Outcome("failed") if error else outcome(point, replicate)
-        rows.append(Row(trial, point, replicate, trial, "scene", "cafe", result, error, 0.001))
+        rows.append(
+            Row(trial, point, replicate, trial, "scene", "cafe", result, error, 0.001)
+        )
     with store.writing(path) as kept:
         kept.begin(
             kept.points(),
@@ -241,7 +246,9 @@ def test_a_killed_run_is_reported(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("bare")
-def test_names_sort_in_the_studys_order_and_quantities_by_their_number(tmp_path: Path) -> None:
+def test_names_sort_in_the_studys_order_and_quantities_by_their_number(
+    tmp_path: Path,
+) -> None:
     asked = study(factors={"dome": DOME, "radius": RADIUS})
     _, html = written(filled(tmp_path / "s.sqlite", asked), asked)
     by_dome, by_radius = ({row[n]: float(key[n]) for row, key in table} for n, table in (
@@ -325,9 +332,9 @@ def test_indices_and_a_search_have_figures(tmp_path: Path) -> None:
         search.Candidate(n, {"tilt": n}, (1.0, cost), statistics, cost, True, False, "")
         for n, cost in enumerate((7.0, 2.5))
     ]
-    html = written(path, asked, result=search.SearchResult(candidates, candidates[1:], False))[
-        1
-    ]
+    html = written(
+        path, asked, result=search.SearchResult(candidates, candidates[1:], False)
+    )[1]
     assert len(html.images) == 2 + 1
     assert html.marked[1:] == [False, True, False]
     assert [row[-1] for row in html.tables[POINTS]] == ["cost", "7", "2.5", "–"]
@@ -475,7 +482,11 @@ def test_shares_are_drawn_from_zero_to_one() -> None:
         ("cividis", 0, 1)
     }
     other = color_scale(np.array([3.0, 9.0]), heat.model_copy(update={"value": "nees_mean"}))
-    assert (other["cmap"] != "cividis", other["norm"].vmin, other["norm"].vmax) == (True, 3, 9)
+    assert (other["cmap"] != "cividis", other["norm"].vmin, other["norm"].vmax) == (
+        True,
+        3,
+        9,
+    )
 
 
 def test_a_curve_of_nees_has_a_line_at_three() -> None:
@@ -495,7 +506,9 @@ def test_a_curve_of_nees_has_a_line_at_three() -> None:
         curve, study(), lines
     )
     assert (
-        layout.expected_value("nees_p95") is layout.expected_value("cross_arcsec_mean") is None
+        layout.expected_value("nees_p95")
+        is layout.expected_value("cross_arcsec_mean")
+        is None
     )
 
 
@@ -585,14 +598,19 @@ def test_default_figures_follow_from_the_factors() -> None:
         ]
 
     assert chosen() == [("curve", "tilt", "wrong", None)]
-    assert chosen(factors={"dome": DOME, "tilt": TILT}) == [("curve", "tilt", "wrong", "dome")]
+    assert chosen(factors={"dome": DOME, "tilt": TILT}) == [
+        ("curve", "tilt", "wrong", "dome")
+    ]
     assert chosen(factors={"tilt": TILT, "n": many}) == [("heat", "tilt", "n", "wrong")]
     assert chosen(factors={"tilt": TILT, "dome": DOME, "n": many}) == [
         ("curve", "tilt", "wrong", "dome")
     ]
     assert chosen(factors={"tilt": {"key": "x", "values": [5]}}) == []
     drawn = {"factors": {"n": many, "dome": DOME}, "design": {"kind": "lhs", "points": 9}}
-    assert chosen(**drawn) == [("curve", "n", "wrong", None), ("curve", "dome", "wrong", None)]
+    assert chosen(**drawn) == [
+        ("curve", "n", "wrong", None),
+        ("curve", "dome", "wrong", None),
+    ]
 
 
 def test_drawn_factors_divide_points_into_equal_bands() -> None:

@@ -98,7 +98,9 @@ def test_noise_on_a_monotonic_curve_is_not_called_misfit() -> None:
 
 
 @pytest.mark.parametrize(("middle", "width"), [(6.0, 0.6), (7.0, 1.2), (9.0, 0.2)])
-def test_the_interval_covers_the_truth_as_often_as_stated(middle: float, width: float) -> None:
+def test_the_interval_covers_the_truth_as_often_as_stated(
+    middle: float, width: float
+) -> None:
     """Logistic curves cross 0.95 at middle - width ln 19. Of 600 draws each, at least 95 % to four standard errors."""
     rng = np.random.default_rng(7)
     truth = middle - width * math.log(19)
@@ -180,7 +182,9 @@ def test_a_level_of_the_sentence_has_its_unit() -> None:
 def test_a_threshold_needs_trials_at_two_levels() -> None:
     """A point without trials is left out; two levels are the least."""
     study = Study.model_validate(STUDY)
-    line = PointRow(0, {"rate": 0, "chain": "slow"}, {"identified": metrics.proportion(9, 10)})
+    line = PointRow(
+        0, {"rate": 0, "chain": "slow"}, {"identified": metrics.proportion(9, 10)}
+    )
     other = line._replace(
         levels={"rate": 1, "chain": "slow"}, responses={"identified": metrics.NO_VALUE}
     )
@@ -196,7 +200,10 @@ def test_a_threshold_needs_trials_at_two_levels() -> None:
             {"response": "nees"},
             r"thresholds.0.response: nees is no proportion; allowed: identified.*\(.*line 2\d\)",
         ),
-        ({"along": "chain", "by": None}, "thresholds.0.along: chain has no two numeric levels"),
+        (
+            {"along": "chain", "by": None},
+            "thresholds.0.along: chain has no two numeric levels",
+        ),
         (
             {"along": "speed"},
             "thresholds.0.along: unknown factor 'speed'; allowed: rate, chain",

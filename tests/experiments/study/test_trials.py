@@ -342,7 +342,9 @@ def test_a_flights_filter_is_scored_at_every_tick():
     log = trials.trial_flight(ready, 5).simulate_motion().telemetry()
     error = (log.lab_from_ref * log.lab_from_body.inv()).magnitude()
     assert 0 < came.pointing_arcsec < came.pointing_worst_arcsec
-    assert came.pointing_worst_arcsec == pytest.approx(np.degrees(error.max()) * 3600, rel=1e-9)
+    assert came.pointing_worst_arcsec == pytest.approx(
+        np.degrees(error.max()) * 3600, rel=1e-9
+    )
 
 
 @pytest.mark.slow

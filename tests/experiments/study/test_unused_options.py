@@ -253,7 +253,9 @@ def test_a_refused_option_changes_no_outcome(
     assert outcomes[0] == outcomes[1]
     assert outcomes[0].status == "solved"
     for key in change:
-        assert any(unused_options.unused.section_of(key, rule) for rule in unused_options.RULES)
+        assert any(
+            unused_options.unused.section_of(key, rule) for rule in unused_options.RULES
+        )
 
 
 def test_overrides_without_effect_on_a_trial() -> None:
@@ -264,6 +266,10 @@ def test_overrides_without_effect_on_a_trial() -> None:
         "tracker": "{threshold_sigma: 9, identifier: pyramid}",
     }
     scene = load("shefex2", overrides)
-    unused = unused_options.unused_overrides(overrides, scene, CentroidTrial(kind="centroids"))
+    unused = unused_options.unused_overrides(
+        overrides, scene, CentroidTrial(kind="centroids")
+    )
     assert unused == {"camera.detector"}
-    assert unused_options.unused_overrides(overrides, scene, FrameTrial(kind="frames")) == set()
+    assert (
+        unused_options.unused_overrides(overrides, scene, FrameTrial(kind="frames")) == set()
+    )

@@ -52,24 +52,17 @@ def availability(
 ) -> None:
     """Fraction of an orbit or a year in which the tracker is outside its exclusion angles and sees enough stars."""
     config = load(scene, None, None, overrides)
-    if config.orbit is None or config.orbit.exclusion is None:
+    exclusion = config.orbit.exclusion if config.orbit else None
+    if exclusion is None:
         raise InputError(
             "orbit.exclusion",
             "the scene has none",
             "a scene with a section orbit with exclusion",
         )
-    for value, allowed, name in ((law, LAWS, "law"), (span, tuple(SPANS_S), "span")):
-        if value not in allowed:
-            raise InputError(f"--{name} {value}", "", ", ".join(allowed))
-    if law == "inertial" and (off_deg or around_deg):
-        raise InputError(
-            "--off-deg, --around-deg", "have no effect with --law inertial", "--law zenith"
-        )
+    check_options(law, span, bool(off_deg or around_deg))
+    pointing = pointing_of(config, law, off_deg, around_deg)
     with progress_callback("availability", quiet=json) as watch:
-        found = computed(
-            config, pointing_of(config, law, off_deg, around_deg), SPANS_S[span], samples, watch
-        )
-    exclusion = config.orbit.exclusion
+        found = computed(config, pointing, SPANS_S[span], samples, watch)
     fractions = fractions_of(found, exclusion)
     if picture is not None:
         write_picture(picture, found, exclusion)
@@ -77,22 +70,37 @@ def availability(
         print_json(
             {"span": span, "law": law, "samples": len(found.t_s), "fractions": fractions}
         )
-        return
-    limits = {
-        "Sun": exclusion.sun_deg,
-        "Earth": exclusion.earth_deg,
-        "Moon": exclusion.moon_deg,
+    else:
+        title = f"{config.name}: {span} of {found.t_s[-1] / HOUR_S:.4g} h"
+        print_table(fraction_table(fractions, exclusion), title)
+
+
+def check_options(law: str, span: str, is_turned: bool) -> None:
+    """Raise InputError for an unknown law or span, or for an angle from the zenith that has no effect."""
+    for value, allowed, name in ((law, LAWS, "law"), (span, tuple(SPANS_S), "span")):
+        if value not in allowed:
+            raise InputError(f"--{name} {value}", "", ", ".join(allowed))
+    if law == "inertial" and is_turned:
+        raise InputError(
+            "--off-deg, --around-deg", "have no effect with --law inertial", "--law zenith"
+        )
+
+
+def fraction_table(fractions: dict[str, float], exclusion: ExclusionConfig) -> Table:
+    """The conditions with the fraction of time at which each holds."""
+    conditions = {
+        "Sun": f"more than {exclusion.sun_deg:g}° away",
+        "Earth": f"more than {exclusion.earth_deg:g}° away",
+        "Moon": f"more than {exclusion.moon_deg:g}° away",
+        "stars": f"at least {exclusion.stars}",
+        "all": "available",
     }
     rows = [
-        [name, f"more than {limit:g}° away", f"{100 * fractions[name]:.2f} %"]
-        for name, limit in limits.items()
+        [name, condition, f"{100 * fractions[name]:.2f} %"]
+        for name, condition in conditions.items()
     ]
-    rows.append(["stars", f"at least {exclusion.stars}", f"{100 * fractions['stars']:.2f} %"])
-    rows.append(["all", "available", f"{100 * fractions['all']:.2f} %"])
     columns = [Column("", kind="text"), Column("condition"), Column("fraction of time")]
-    print_table(
-        Table(columns, rows), f"{config.name}: {span} of {found.t_s[-1] / HOUR_S:.4g} h"
-    )
+    return Table(columns, rows)
 
 
 def pointing_of(scene: Scene, law: str, off_deg: float, around_deg: float) -> Pointing:
@@ -105,7 +113,9 @@ def pointing_of(scene: Scene, law: str, off_deg: float, around_deg: float) -> Po
 
     start = scene.motion.start
     if law == "zenith":
-        return Pointing("zenith", np.zeros(3), math.radians(off_deg), math.radians(around_deg))
+        return Pointing(
+            "zenith", np.zeros(3), math.radians(off_deg), math.radians(around_deg)
+        )
     if not isinstance(start, PointingConfig):
         raise InputError("--law inertial", "requires motion.start with ra_deg and dec_deg")
     return Pointing("inertial", direction(start.ra_deg, start.dec_deg))
@@ -114,7 +124,7 @@ def pointing_of(scene: Scene, law: str, off_deg: float, around_deg: float) -> Po
 def computed(
     scene: Scene, pointing: Pointing, span_s: float | None, samples: int, watch: Any
 ) -> SkySamples:
-    """The angles over the span, or over one revolution."""
+    """The angles over the span; without one, over one revolution."""
     import numpy as np
 
     from skysim.core.constants import EARTH_MU_M3_S2
@@ -151,7 +161,7 @@ def computed(
 
 
 def fractions_of(found: SkySamples, exclusion: ExclusionConfig) -> dict[str, float]:
-    """The fraction of the times at which each condition holds, and at which all do."""
+    """The fraction of the times at which each condition holds, and at which all hold."""
     outside = found.outside(exclusion)
     each = {name: float(holds.mean()) for name, holds in outside.items()}
     return {**each, "all": float(available(found, exclusion).mean())}

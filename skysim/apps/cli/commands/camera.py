@@ -43,8 +43,8 @@ class CameraGroup(TyperGroup):
         return super().parse_args(ctx, args)
 
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
-        """Subcommands, and what `show` takes."""
-        # The class of typer's own parser or of click.
+        """Subcommands, and arguments of `show`."""
+        # The class is that of typer's own parser or of click.
         item = type(super().shell_complete(ctx, "")[0])
         names = [] if incomplete.startswith("-") else complete_camera(incomplete)
         return [*super().shell_complete(ctx, incomplete), *map(item, names)]
@@ -106,7 +106,9 @@ def camera_show(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(help="Also write the calibration to this file, in OpenCV's YAML format."),
+        typer.Option(
+            help="Also write the calibration to this file, in OpenCV's YAML format."
+        ),
     ] = None,
     set_: Overrides = None,
     json: Json = False,
@@ -146,15 +148,19 @@ def camera_show(
     print(f"field of view    {lens.field_text()}")
     print(f"focal length     {lens.focal_px:.6g} px")
     print(f"principal point  {x:.6g}, {y:.6g} px (the center of the first pixel is 0, 0)")
-    print("distortion       " + ", ".join(f"{name} {value:g}" for name, value in coefficients))
+    print(
+        "distortion       " + ", ".join(f"{name} {value:g}" for name, value in coefficients)
+    )
     if out:
-        print(f"{out}: for OpenCV, skysim solve --camera and the scene key camera.calibration")
+        print(
+            f"{out}: for OpenCV, skysim solve --camera and the scene key camera.calibration"
+        )
 
 
 def read_camera(
     name: str, overrides: list[str] | None
 ) -> tuple[OpencvCalibration | None, dict[str, int]]:
-    """The calibration, None without a lens, and the chip's size: of a scene, a camera, a preset or an OpenCV file."""
+    """Calibration (None without a lens) and chip size of a scene, a camera file, a preset or an OpenCV file."""
     from skysim.core.yaml_reader import parse_overrides
     from skysim.scene import loader, opencv_calibration
 
@@ -180,7 +186,9 @@ def read_camera(
         camera = loader.load(path, values).camera
     else:
         camera = loader.load_camera(path, PLACEHOLDER_LENS if alone else None, values)
-    has_lens = not alone or "camera.focal_length" in values or "focal_length" in tree["camera"]
+    has_lens = (
+        not alone or "camera.focal_length" in values or "focal_length" in tree["camera"]
+    )
     return camera.calibration() if has_lens else None, {
         "width_px": camera.width_px,
         "height_px": camera.height_px,
@@ -188,7 +196,7 @@ def read_camera(
 
 
 def sheet_option(name: str) -> Any:
-    """The option of a question of the data sheet."""
+    """The option for a question of the data sheet."""
     question = QUESTIONS[name]
     return typer.Option(
         OPTIONS[f"answers.{name}"], metavar="TEXT", help=f"{question.ask}: {question.where}."
@@ -237,7 +245,9 @@ def camera_new(
         raise InputError(
             f"--out {out}", "exists" if out.exists() else "no .yaml file", "a new .yaml file"
         )
-    answers = {key: context.params[key] for key in QUESTIONS if context.params[key] is not None}
+    answers = {
+        key: context.params[key] for key in QUESTIONS if context.params[key] is not None
+    }
     if not answers:
         answers = ask_all()
     filled = camera_sheet.fill(answers)
@@ -250,7 +260,7 @@ def camera_new(
 
 
 def ask_all() -> dict[str, str]:
-    """Ask for each number of the data sheet; a wrong answer is asked again, an empty one is not stated."""
+    """Ask for each number of the data sheet. A wrong answer is asked again; an empty one leaves the number out."""
     from skysim.scene import camera_sheet
 
     print(
@@ -260,7 +270,7 @@ def ask_all() -> dict[str, str]:
     for name, question in QUESTIONS.items():
         required = name in camera_sheet.PLACEHOLDERS
         if not required and name not in camera_sheet.outstanding(answers):
-            continue  # of a lens or a shutter that this camera does not have
+            continue  # a question on a lens or a shutter that this camera does not have
         assumed = (
             "" if required else camera_sheet.outstanding(answers)[name].assumed or "left out"
         )
@@ -285,7 +295,7 @@ def ask_all() -> dict[str, str]:
 
 
 def print_new(path: Path, filled: Sheet) -> None:
-    """Print what a new camera file assumes, and how to use it."""
+    """Print the assumptions of a new camera file, and how to use it."""
     lens, body = read_camera(str(path), None)
     print(
         "{path}: {width_px} x {height_px} px".format(path=path, **body)

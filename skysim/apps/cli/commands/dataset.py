@@ -18,28 +18,32 @@ from skysim.apps.cli.commands.study import (
 from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed
 from skysim.apps.cli.terminal import print_error, print_json, trial_progress
 
+OutputUrl = Annotated[
+    str,
+    typer.Option(metavar="URL", help="Output folder, or a URL such as s3://bucket/folder."),
+]
+Variations = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Variations: YAML with the study's keys set, trial, factors, hardware.",
+    ),
+]
+Formats = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--to",
+        help="Format: webdataset, zarr, coco; repeatable. Default: webdataset and coco.",
+    ),
+]
+
 
 def dataset(
     scene: SceneArg,
     frames: Annotated[int, typer.Option(help="Number of frames.")],
-    out: Annotated[
-        str,
-        typer.Option(metavar="URL", help="Output folder, or a URL such as s3://bucket/folder."),
-    ],
-    vary: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Variations: YAML with the study's keys set, trial, factors, hardware.",
-        ),
-    ] = None,
-    to: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--to",
-            help="Format: webdataset, zarr, coco; repeatable. Default: webdataset and coco.",
-        ),
-    ] = None,
+    out: OutputUrl,
+    vary: Variations = None,
+    to: Formats = None,
     shard_frames: Annotated[int, typer.Option(help="Frames of a shard.")] = 64,
     seed: Seed = None,
     set_: Overrides = None,
@@ -57,7 +61,7 @@ def dataset(
     from skysim.experiments import dataset_run
     from skysim.experiments.dataset_shards import Storage
 
-    Storage(out)  # refuses a wrong URL before the scene is read
+    Storage(out)  # raises for a wrong URL before the scene is read
     formats = tuple(to or ("webdataset", "coco"))
     made = dataset_run.load(
         scene,
@@ -73,14 +77,9 @@ def dataset(
         trial_progress(f"dataset of {scene}", frames, "frames") as update,
     ):
         progress = dataset_run.run(made, out, chosen, update)
-    result = {
-        "out": out,
-        "frames": progress.done,
-        "shards": made.shards,
-        "failed": progress.failed,
-    }
     if json:
-        print_json(result | {"rate_hz": progress.rate})
+        result = {"out": out, "frames": progress.done, "shards": made.shards}
+        print_json(result | {"failed": progress.failed, "rate_hz": progress.rate})
     else:
         print(f"{progress.done} of {frames} frames in {made.shards} shards: {out}")
     if progress.failed:

@@ -19,43 +19,48 @@ if TYPE_CHECKING:
     from skysim.experiments.datasheet.model_fit import Agreement
 
 
+Quick = Annotated[
+    bool, typer.Option("--quick", help="Smaller experiments; the intervals are wider.")
+]
+FieldCount = Annotated[
+    int | None,
+    typer.Option(
+        min=2,
+        help="Number of fields (attitudes) of each experiment; more narrow the intervals.",
+    ),
+]
+Processes = Annotated[
+    int | None, typer.Option(min=1, help="Number of processes; default: number of cores.")
+]
+Folder = Annotated[
+    Path | None, typer.Option(help="Output folder; default: out/NAME_datasheet.")
+]
+ModelFolder = Annotated[
+    Path | None,
+    typer.Option(
+        help="Also write a fast model of the errors to a folder: a module for NumPy, its constants in JSON."
+    ),
+]
+AsFmu = Annotated[
+    bool,
+    typer.Option(
+        "--fmu",
+        help="With --model: also as a co-simulation unit of FMI 3 (needs pythonfmu3).",
+    ),
+]
+
+
 def datasheet(
     scene: SceneArg,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Smaller experiments; the intervals are wider.")
-    ] = False,
-    fields: Annotated[
-        int | None,
-        typer.Option(
-            min=2,
-            help="Number of fields (attitudes) of each experiment; more narrow the intervals.",
-        ),
-    ] = None,
+    quick: Quick = False,
+    fields: FieldCount = None,
     seed: Seed = None,
     set_: Overrides = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Number of processes; default: number of cores.")
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Output folder; default: out/NAME_datasheet.")
-    ] = None,
-    markdown: Annotated[
-        Path | None,
-        typer.Option(help="Also write a Markdown page."),
-    ] = None,
-    model: Annotated[
-        Path | None,
-        typer.Option(
-            help="Also write a fast model of the errors to a folder: a module for NumPy, its constants in JSON."
-        ),
-    ] = None,
-    fmu: Annotated[
-        bool,
-        typer.Option(
-            "--fmu",
-            help="With --model: also as a co-simulation unit of FMI 3 (needs pythonfmu3).",
-        ),
-    ] = False,
+    workers: Processes = None,
+    out: Folder = None,
+    markdown: Annotated[Path | None, typer.Option(help="Also write a Markdown page.")] = None,
+    model: ModelFolder = None,
+    fmu: AsFmu = False,
     open_: OpenReport = False,
     json: Json = False,
 ) -> None:

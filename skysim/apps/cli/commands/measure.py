@@ -1,4 +1,4 @@
-"""Commands that measure hardware: `skysim balance`, the vehicle; `characterize`, the camera; `calibrate`, the LEDs."""
+"""Commands that measure hardware: `skysim balance`, `characterize` for the camera, `calibrate` for its LEDs."""
 
 from __future__ import annotations
 
@@ -30,57 +30,71 @@ class Excitation(StrEnum):
     SWING = "swing"
 
 
+ExcitedBy = Annotated[
+    Excitation,
+    typer.Option(help="Tilt by the wheels at three yaw angles, or let go and swing freely."),
+]
+EstimateOnly = Annotated[
+    bool, typer.Option("--estimate-only", help="Estimate from one flight; move nothing.")
+]
+Tilt = Annotated[
+    float, typer.Option(min=0.1, max=60, help="Tilt of the excitation, degrees.")
+]
+Torque = Annotated[
+    str, typer.Option(help="Residual gravity torque at which the vehicle is balanced.")
+]
+Flights = Annotated[
+    int | None, typer.Option(min=1, max=50, help="Flights at most; default: 6.")
+]
+InertiaBar = Annotated[
+    float,
+    typer.Option(
+        min=0.01, help="Standard deviation that moments of inertia must reach, percent."
+    ),
+]
+OffsetBar = Annotated[
+    str | None,
+    typer.Option(
+        help="Standard deviation that the offset must reach; default: half of the torque over weight."
+    ),
+]
+InFlight = Annotated[
+    bool,
+    typer.Option("--in-flight", help="Also run the filter in flight over the last flight."),
+]
+# The errors of the onboard model before the first flight.
+InertiaSigma = Annotated[
+    str, typer.Option(help="Standard error of the assumed inertia, a share.")
+]
+OffsetSigma = Annotated[
+    str, typer.Option(help="Standard error of the assumed balance, along each axis.")
+]
+WheelSigma = Annotated[
+    str, typer.Option(help="Standard error of a wheel's assumed inertia, a share.")
+]
+MountSigma = Annotated[
+    str, typer.Option(help="Standard error of the tracker's axes in the body.")
+]
+TachoSigma = Annotated[
+    float, typer.Option(help="Standard error of a reading of a wheel's speed, rpm.")
+]
+
+
 def balance(
     scene: SceneArg,
-    excite: Annotated[
-        Excitation,
-        typer.Option(
-            help="Tilt by the wheels at three yaw angles, or let go and swing freely."
-        ),
-    ] = Excitation.WHEELS,
-    estimate_only: Annotated[
-        bool, typer.Option("--estimate-only", help="Estimate from one flight; move nothing.")
-    ] = False,
-    tilt: Annotated[
-        float, typer.Option(min=0.1, max=60, help="Tilt of the excitation, degrees.")
-    ] = 8.0,
-    torque: Annotated[
-        str, typer.Option(help="Residual gravity torque at which the vehicle is balanced.")
-    ] = "5e-5 N m",
-    flights: Annotated[
-        int | None, typer.Option(min=1, max=50, help="Flights at most; default: 6.")
-    ] = None,
-    inertia_bar: Annotated[
-        float,
-        typer.Option(
-            min=0.01, help="Standard deviation that moments of inertia must reach, percent."
-        ),
-    ] = 1.0,
-    offset_bar: Annotated[
-        str | None,
-        typer.Option(
-            help="Standard deviation that the offset must reach; default: half of the torque over weight."
-        ),
-    ] = None,
-    in_flight: Annotated[
-        bool,
-        typer.Option("--in-flight", help="Also run the filter in flight over the last flight."),
-    ] = False,
-    inertia_sigma: Annotated[
-        str, typer.Option(help="Standard error of the assumed inertia, a share.")
-    ] = "10%",
-    offset_sigma: Annotated[
-        str, typer.Option(help="Standard error of the assumed balance, along each axis.")
-    ] = "500 um",
-    wheel_sigma: Annotated[
-        str, typer.Option(help="Standard error of a wheel's assumed inertia, a share.")
-    ] = "0.1%",
-    mount_sigma: Annotated[
-        str, typer.Option(help="Standard error of the tracker's axes in the body.")
-    ] = "0.03 deg",
-    tacho_sigma: Annotated[
-        float, typer.Option(help="Standard error of a reading of a wheel's speed, rpm.")
-    ] = 1.0,
+    excite: ExcitedBy = Excitation.WHEELS,
+    estimate_only: EstimateOnly = False,
+    tilt: Tilt = 8.0,
+    torque: Torque = "5e-5 N m",
+    flights: Flights = None,
+    inertia_bar: InertiaBar = 1.0,
+    offset_bar: OffsetBar = None,
+    in_flight: InFlight = False,
+    inertia_sigma: InertiaSigma = "10%",
+    offset_sigma: OffsetSigma = "500 um",
+    wheel_sigma: WheelSigma = "0.1%",
+    mount_sigma: MountSigma = "0.03 deg",
+    tacho_sigma: TachoSigma = 1.0,
     seed: Seed = None,
     out: Out = None,
     set_: Overrides = None,
@@ -109,7 +123,9 @@ def balance(
         statistics["in_flight"] = balance_report.filter_rows(flown[-1], assumed)
     folder = output_folder(out, loaded.name)
     command = shlex.join(["skysim", *sys.argv[1:]])
-    print_report(statistics, balance_report.write_all(folder, statistics, flown, command), json)
+    print_report(
+        statistics, balance_report.write_all(folder, statistics, flown, command), json
+    )
     balance_flight.check_observed(
         flown[-1].estimate,
         assumed.prior,
@@ -144,7 +160,7 @@ def print_report(statistics: dict[str, Any], report: Report, json: bool) -> None
 
 
 def print_flight(row: dict[str, Any]) -> None:
-    """Print one flight: offset with its standard deviation, torque, where the trim masses go."""
+    """Print one flight: offset with its standard deviation, torque, next places of the trim masses."""
     from skysim.experiments.balance_report import offset_text
 
     places = "/".join(f"{one:.3f}" for one in row["next_trim_mm"])
@@ -211,14 +227,17 @@ def characterize(
         Path | None, typer.Option(help="Folder of darks, of two exposures or more.")
     ] = None,
     flats: Annotated[
-        Path | None, typer.Option(help="Folder of flats: pairs at exposures up to saturation.")
+        Path | None,
+        typer.Option(help="Folder of flats: pairs at exposures up to saturation."),
     ] = None,
     night: Annotated[
         Path | None, typer.Option(help="Folder of frames of the night sky, stars at rest.")
     ] = None,
     frames_to: Annotated[
         Path | None,
-        typer.Option(help="Measure nothing: write the darks and flats of --camera, simulated."),
+        typer.Option(
+            help="Measure nothing: write the darks and flats of --camera, simulated."
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the frames of --frames-to.")] = 1,
     out: Out = None,
@@ -233,7 +252,9 @@ def characterize(
     config, raw = characterize_camera.read_camera(camera)
     if frames_to is not None:
         given = {"darks": darks, "flats": flats, "night": night, "out": out}
-        if conflict := next((name for name, value in given.items() if value is not None), None):
+        if conflict := next(
+            (name for name, value in given.items() if value is not None), None
+        ):
             raise InputError(
                 f"--{conflict}", "has no effect with --frames-to", "one of the two"
             )

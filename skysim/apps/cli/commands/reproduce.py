@@ -23,7 +23,8 @@ def reproduce(
     ] = False,
     seed: Annotated[int, typer.Option(help="Seed of all random streams.")] = 1,
     report: Annotated[
-        bool, typer.Option("--report", help="Also write an HTML page with the papers' figures.")
+        bool,
+        typer.Option("--report", help="Also write an HTML page with the papers' figures."),
     ] = False,
     out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("out/reproduce"),
     markdown: Annotated[
@@ -64,7 +65,9 @@ def reproduce(
     if open_:
         typer.launch(str(page))
     if json:
-        print_json([line.as_dict() for result in reproductions for line in result.comparisons])
+        print_json(
+            [line.as_dict() for result in reproductions for line in result.comparisons]
+        )
         return
     print_blocks([verdict(reproductions)])
     for path in paths:

@@ -108,7 +108,10 @@ def scenes_parts(
     if json:
         print_json({"parts": [line._asdict() for line in found.lines], "total": found.total})
         return
-    rows = [*map(parts.cells, found.lines), ["total", "", "", "", "", f"{found.total:.2f}", ""]]
+    rows = [
+        *map(parts.cells, found.lines),
+        ["total", "", "", "", "", f"{found.total:.2f}", ""],
+    ]
     columns = [
         Column(head, kind="text" if head in ("part", "what") else "number")
         for head in parts.COLUMNS

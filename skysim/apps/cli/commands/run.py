@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -35,6 +35,9 @@ from skysim.apps.cli.options import (
 
 if TYPE_CHECKING:
     from skysim.core.types import FrameRow
+    from skysim.results.report import Report
+    from skysim.scene.scene import Scene
+    from skysim.simulation.checks import Check
 
 
 def run(
@@ -60,10 +63,8 @@ def run(
     json: Json = False,
 ) -> None:
     """Simulate a scene: motion, frames, attitude solutions and their scores."""
-    from skysim.results.report_blocks import Facts
     from skysim.results.run import FlightRecorder
     from skysim.simulation.checks import check
-    from skysim.simulation.checks.facts import TRACKER_KNOWS
     from skysim.simulation.compilation import on_two_processes
     from skysim.simulation.flight import open_flight
 
@@ -83,25 +84,45 @@ def run(
         for finding in plan.findings:
             terminal.print_error(with_location(finding))
         recorder = FlightRecorder(output_folder(out, loaded.name), flight)
-        with on_two_processes(*LOADED[-1]), terminal.progress_callback(loaded.title) as update:
+        with (
+            on_two_processes(*LOADED[-1]),
+            terminal.progress_callback(loaded.title) as update,
+        ):
             rows = recorder.record(flight.shots(progress=update))
         command = shlex.join(["skysim", *sys.argv[1:]])
-        finished = recorder.finish(command, plan, terminal.write_3d_views if scene_3d else None)
-    (statistics, report), *others = finished
-    heads = dict(zip([head.name for head in loaded.heads], others, strict=True))
-    if json:
-        result = {"scene": loaded.name, **statistics, "rows": [asdict(row) for row in rows]}
-        head_results = {name: head for name, (head, _) in heads.items()}
-        terminal.print_json(result | {"heads": head_results} if heads else result)
-    else:
-        known = [(fact.name, fact.lines) for fact in plan.facts if fact.name == TRACKER_KNOWS]
-        terminal.print_blocks([Facts(known)])
-        report.print()
-        print(f"report: {statistics['report']}")
-        for name, (head, head_report) in heads.items():
-            terminal.print_wrapped(f"{name}: {head_report.verdict}; report: {head['report']}")
+        finished = recorder.finish(
+            command, plan, terminal.write_3d_views if scene_3d else None
+        )
+    statistics = print_results(loaded, finished, rows, plan, json)
     if open_:
         typer.launch(statistics["report"])
+
+
+def print_results(
+    scene: Scene,
+    finished: list[tuple[dict[str, Any], Report]],
+    rows: list[FrameRow],
+    plan: Check,
+    json: bool,
+) -> dict[str, Any]:
+    """Print the results of the main camera and of the further heads; return the main camera's statistics."""
+    from skysim.results.report_blocks import Facts
+    from skysim.simulation.checks.facts import TRACKER_KNOWS
+
+    (statistics, report), *others = finished
+    heads = dict(zip([head.name for head in scene.heads], others, strict=True))
+    if json:
+        result = {"scene": scene.name, **statistics, "rows": [asdict(row) for row in rows]}
+        head_results = {name: head for name, (head, _) in heads.items()}
+        terminal.print_json(result | {"heads": head_results} if heads else result)
+        return statistics
+    known = [(fact.name, fact.lines) for fact in plan.facts if fact.name == TRACKER_KNOWS]
+    terminal.print_blocks([Facts(known)])
+    report.print()
+    print(f"report: {statistics['report']}")
+    for name, (head, head_report) in heads.items():
+        terminal.print_wrapped(f"{name}: {head_report.verdict}; report: {head['report']}")
+    return statistics
 
 
 def render(

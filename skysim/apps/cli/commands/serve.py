@@ -26,7 +26,9 @@ def stream(
     scene: SceneArg,
     folder: Annotated[
         Path | None,
-        typer.Option(help="Write frames to a folder: a 16-bit PNG and a JSON file per frame."),
+        typer.Option(
+            help="Write frames to a folder: a 16-bit PNG and a JSON file per frame."
+        ),
     ] = None,
     http: Annotated[
         int | None,
@@ -59,7 +61,7 @@ def stream(
     json: Json = False,
 ) -> None:
     """Stream a scene's frames in real time, for hardware or a processor in the loop."""
-    from skysim.apps.stream.sinks import READER_GONE, Sink, folder_writer, pipe_writer
+    from skysim.apps.stream.sinks import READER_GONE
     from skysim.core import files
     from skysim.simulation.flight import open_flight
 
@@ -71,18 +73,28 @@ def stream(
         )
     if endless and frames is not None:
         raise InputError("--endless", "has no effect with --frames", "one of the two")
-    flight = open_flight(load(scene, frames, seed, set_), endless=endless, keeps_history=False)
-    sinks = []
-    if folder is not None:
-        sinks.append(Sink("folder", folder_writer(folder)))
-    if pipe is not None:
-        sinks.append(Sink("pipe", pipe_writer(pipe)))
+    flight = open_flight(
+        load(scene, frames, seed, set_), endless=endless, keeps_history=False
+    )
+    sinks = open_sinks(folder, pipe)
     statistics = send_all(flight, sinks, speed, http, host)
     output = sys.stderr if pipe == "-" else sys.stdout
     print(files.to_json(statistics) if json else summary(statistics), file=output)
     for sink in sinks:
         if sink.fault not in ("", READER_GONE):
             raise InputError(f"--{sink.name}", sink.fault)
+
+
+def open_sinks(folder: Path | None, pipe: str | None) -> list[Sink]:
+    """Sinks for the folder and for the pipe, if they are given."""
+    from skysim.apps.stream.sinks import Sink, folder_writer, pipe_writer
+
+    sinks = []
+    if folder is not None:
+        sinks.append(Sink("folder", folder_writer(folder)))
+    if pipe is not None:
+        sinks.append(Sink("pipe", pipe_writer(pipe)))
+    return sinks
 
 
 def send_all(
@@ -163,9 +175,9 @@ def gui(
             help="Access token that browsers must send; default: a random one, in the printed link."
         ),
     ] = "",
-    folder: Annotated[Path, typer.Option(help="Folder in which new scenes are saved.")] = Path(
-        "."
-    ),
+    folder: Annotated[
+        Path, typer.Option(help="Folder in which new scenes are saved.")
+    ] = Path("."),
     out: Annotated[Path, typer.Option(help="Folder of studies and their reports.")] = Path(
         "out"
     ),

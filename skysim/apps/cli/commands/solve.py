@@ -26,7 +26,9 @@ if TYPE_CHECKING:
 def solve(
     images: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="IMAGES", help="FITS, PNG, TIFF, JPEG, BMP files, or folders."),
+        typer.Argument(
+            metavar="IMAGES", help="FITS, PNG, TIFF, JPEG, BMP files, or folders."
+        ),
     ] = None,
     fov: Annotated[
         float | None,
@@ -74,20 +76,28 @@ def solve(
     import skysim.core.jit  # noqa: F401  # says so if numba has to compile
     from skysim.apps import plate_solver
     from skysim.core import files
-    from skysim.core.images import grab_frame
 
     stages = selected_stages(
         detector=detector, centroider=centroider, identifier=identifier, solver=solver
     )
     settings = plate_solver.make_solver(fov, camera, datetime_from_iso(time), stages, catalog)
     files.make_folder(out)
-    paths = plate_solver.pictures_in(images or ())
+    solve_all(pictures(images or [], live, out), settings, out, json)
+
+
+def pictures(images: list[Path], live: str | None, out: Path) -> list[Path]:
+    """The files to solve, with a frame of the live camera, which is written to `out`. Raises InputError without any."""
+    from skysim.apps import plate_solver
+    from skysim.core import files
+    from skysim.core.images import grab_frame
+
+    paths = plate_solver.pictures_in(images)
     if live is not None:
         paths.append(out / "live.png")
         files.write_image(paths[-1], grab_frame(live))
     if not paths:
         raise InputError("", "no images", "files, folders, or --live CAMERA")
-    solve_all(paths, settings, out, json)
+    return paths
 
 
 def solve_all(paths: list[Path], solver: Solver, out: Path, json: bool) -> None:

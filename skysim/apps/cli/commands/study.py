@@ -57,7 +57,9 @@ Workers = Annotated[
 EngineName = Annotated[
     str, typer.Option("--engine", help="How trials are run: pool, serial or dask.")
 ]
-Scheduler = Annotated[str, typer.Option(help="Address of the Dask scheduler, tcp://HOST:PORT.")]
+Scheduler = Annotated[
+    str, typer.Option(help="Address of the Dask scheduler, tcp://HOST:PORT.")
+]
 
 
 @app.callback()
@@ -111,7 +113,9 @@ def resume(
     workers: Workers = None,
     engine: EngineName = "pool",
     scheduler: Scheduler = "",
-    failed: Annotated[bool, typer.Option("--failed", help="Repeat failed trials too.")] = False,
+    failed: Annotated[
+        bool, typer.Option("--failed", help="Repeat failed trials too.")
+    ] = False,
     set_: Overrides = None,
     program: Programs = None,
     open_: OpenReport = False,
@@ -145,7 +149,9 @@ def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
     plan, _ = load_stored_plan(study, out)
     with open_store(study, out) as stored:
         progress = study_status(plan, stored)
-        failures = [{"trial": trial, "error": error} for trial, error in stored.failures()[:10]]
+        failures = [
+            {"trial": trial, "error": error} for trial, error in stored.failures()[:10]
+        ]
     if json:
         print_json(progress | {"failures": failures})
         return
@@ -209,7 +215,9 @@ def replay(
     study, out = located(study, out)
     plan, _ = load_stored_plan(study, out, program or [])
     with open_store(study, out) as stored:
-        repeated = runner.replay(plan, stored, trial, folder_of(study, out) / f"trial_{trial}")
+        repeated = runner.replay(
+            plan, stored, trial, folder_of(study, out) / f"trial_{trial}"
+        )
     row = repeated.row
     result: dict[str, Any] = {
         "trial": trial,
@@ -283,7 +291,7 @@ def chosen_levels(words: list[str]) -> dict[str, Any]:
     }
 
 
-# Registered last, so that it is the last in `skysim study --help`.
+# Registered last to be the last in `skysim study --help`.
 SEARCH_HELP = (
     "Search a study's factors for the best point, or the Pareto front of two objectives."
     " `resume` continues it."
@@ -307,9 +315,9 @@ def run_and_report(
     Parameters
     ----------
     resumed
-        The store may hold trials already
+        Whether the store may already hold trials
     repeat_failed
-        Repeat the failed trials too
+        Whether failed trials are repeated
     """
     from skysim.experiments.study import search
     from skysim.experiments.study.execution import runner, store
@@ -317,7 +325,11 @@ def run_and_report(
     path = folder_of(study, out) / store.STORE
     total = plan.study.trial_count(len(plan.points))
     resume_command = command(study, out, "resume")
-    with store.writing(path) as stored, interruptible(resume_command, stored), closing(engine):
+    with (
+        store.writing(path) as stored,
+        interruptible(resume_command, stored),
+        closing(engine),
+    ):
         runner.prepare_store(plan, stored, resumed, overrides)
         if repeat_failed:
             stored.delete_failed()
@@ -345,7 +357,9 @@ def interruptible(resume_command: str, stored: Store) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        print_error(f"{stored.counts()['done']} trials are stored; continue: {resume_command}")
+        print_error(
+            f"{stored.counts()['done']} trials are stored; continue: {resume_command}"
+        )
         raise
 
 
@@ -379,7 +393,7 @@ def write_report(plan: Plan, study: str, out: Path | None, json: bool, open_: bo
 
 
 def located(study: str, out: Path | None) -> tuple[str, Path | None]:
-    """The study's file and its output folder, where `study` may be the folder with its store. Raises InputError."""
+    """The study's file and its output folder; `study` may also be the folder of its store. Raises InputError."""
     from skysim.experiments.study.execution import store
 
     if out is not None or not (Path(study) / store.STORE).is_file():
@@ -388,7 +402,9 @@ def located(study: str, out: Path | None) -> tuple[str, Path | None]:
         file = stored.meta("file")
     if not Path(file).is_file():
         raise InputError(
-            study, f"no such file as its study, {file or 'not stored'}", f"STUDY --out {study}"
+            study,
+            f"no such file as its study, {file or 'not stored'}",
+            f"STUDY --out {study}",
         )
     return file, Path(study)
 
@@ -407,7 +423,7 @@ def load_stored_plan(
     program
         External trackers of the command line; None if no trial will be run
     set_
-        More overrides
+        Further overrides
     grows
         Whether the study may have more replicates than its store
 

@@ -34,7 +34,8 @@ FrameCount = Annotated[
 PlanOnly = Annotated[
     bool,
     typer.Option(
-        "--plan", help="Print the attitudes to hold and the predicted errors; simulate nothing."
+        "--plan",
+        help="Print the attitudes to hold and the predicted errors; simulate nothing.",
     ),
 ]
 Images = Annotated[
@@ -130,13 +131,7 @@ def survey(
     from skysim.apps.cli.commands import survey_modes
     from skysim.experiments.dome_survey.survey_prior import survey_uncertainty
 
-    given = {
-        "frames": frames,
-        "attitudes": attitudes,
-        "next": next_,
-        "frames-to": frames_to,
-        "checks": checks,
-    }
+    given = dict(zip(LIMITED, (frames, attitudes, next_, frames_to, checks), strict=True))
     chosen = {name for name, value in given.items() if value is not None}
     check_mode(plan, images, camera, watch, repeat, chosen)
     loaded = load(scene, None, seed, set_)
@@ -163,7 +158,8 @@ def survey(
         print_json(statistics)
 
 
-# What each mode of the command does not use.
+# Options that have no effect in some modes, and those without effect by mode.
+LIMITED = ("frames", "attitudes", "next", "frames-to", "checks")
 UNUSED = {
     "images": ("frames", "attitudes", "frames-to", "checks"),
     "watch": ("attitudes", "frames-to", "checks"),

@@ -1,4 +1,4 @@
-"""What `skysim survey` does in each of its modes: plan, repeat, simulate, or survey from images."""
+"""The modes of `skysim survey`: plan, repeat, simulate, and survey from images."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from skysim.tracking import dome_map_file, factory
 
 @dataclass(frozen=True)
 class Request:
-    """What the command line asks for."""
+    """The options of the command line."""
 
     scene: Scene
     uncertainty: SurveyUncertainty
@@ -50,15 +50,19 @@ class Request:
 
 
 def planned(request: Request) -> tuple[Lab, CalibrationPrior, survey_procedure.HeldAttitudes]:
-    """The lab with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
+    """The lab whose onboard model has errors as before a survey, that model, and a plan."""
 
     return survey_procedure.plan_survey(
-        request.scene, request.uncertainty, request.frames, request.tilt_deg, request.attitudes
+        request.scene,
+        request.uncertainty,
+        request.frames,
+        request.tilt_deg,
+        request.attitudes,
     )
 
 
 def plan_only(request: Request) -> dict[str, Any]:
-    """Return the attitudes of a plan and the errors predicted; print them."""
+    """Return the attitudes of a plan and the predicted errors; print them."""
 
     _, _, plan = planned(request)
     path = files.make_folder(request.folder) / "plan.csv"
@@ -69,7 +73,8 @@ def plan_only(request: Request) -> dict[str, Any]:
         "leds": plan.shown.shape[1],
         "noise_px": plan.model.sigma_px,
         "predicted": [
-            {"frames": n, **survey_findings.accuracy_statistics(one)} for n, one in plan.steps()
+            {"frames": n, **survey_findings.accuracy_statistics(one)}
+            for n, one in plan.steps()
         ],
         "plan": str(path),
     }
@@ -79,7 +84,7 @@ def plan_only(request: Request) -> dict[str, Any]:
 
 
 def repeated(request: Request, repeat: int) -> dict[str, Any]:
-    """Return the errors predicted and those of simulated surveys, side by side; print them."""
+    """Return the predicted errors beside those of simulated surveys; print them."""
 
     lab, _, plan = planned(request)
     surveys = survey_procedure.repeat_survey(lab, request.uncertainty, plan, repeat)
@@ -138,7 +143,7 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str
 def from_images(
     request: Request, images: Path, camera_file: Path, watch: bool
 ) -> dict[str, Any]:
-    """A survey from the images of a folder, with the LEDs of the scene as the list before it."""
+    """A survey from the images of a folder; the LEDs of the scene are the list before the survey."""
 
     known, read = read_camera(camera_file)
     camera = known.model
@@ -155,7 +160,10 @@ def from_images(
             progress(survey_images.read_images(images, camera, stages), total, "reading")
         )
     found = survey_images.frames_with_attitude(pictures, before, request.uncertainty, stages)
-    with progress_callback("adjusting") as update, coverage_shown(request, found, before, None):
+    with (
+        progress_callback("adjusting") as update,
+        coverage_shown(request, found, before, None),
+    ):
         run = survey_procedure.survey_images(
             pictures, found, before, request.uncertainty, stages, request.distortion, update
         )
@@ -167,7 +175,7 @@ def from_images(
 def followed(
     request: Request, images: Path, before: CalibrationPrior, stages: Settings
 ) -> list[survey_images.SurveyImage]:
-    """The images of a folder while they are taken, until there are enough or Ctrl-C; prints the coverage so far."""
+    """The images of a folder, read while they are taken, until there are enough or Ctrl-C; print the coverage."""
 
     watched = survey_images.WatchedFolder(images, before.camera, stages)
     with suppress(KeyboardInterrupt):
@@ -185,7 +193,7 @@ def print_so_far(
     before: CalibrationPrior,
     stages: Settings,
 ) -> None:
-    """Print how many images there are, which LEDs they measure, and the attitudes to hold next."""
+    """Print the number of images, the LEDs that they measure, and the attitudes to hold next."""
 
     found = survey_images.frames_with_attitude(pictures, before, request.uncertainty, stages)
     print(f"{len(pictures)} of {request.frames} images, {len(found)} with an attitude")
@@ -195,9 +203,12 @@ def print_so_far(
 
 @contextmanager
 def coverage_shown(
-    request: Request, frames: list[SurveyFrame], prior: CalibrationPrior, noise_px: float | None
+    request: Request,
+    frames: list[SurveyFrame],
+    prior: CalibrationPrior,
+    noise_px: float | None,
 ) -> Iterator[None]:
-    """Print which LEDs the frames show, and the attitudes to hold next, if they are too few for a survey."""
+    """If the frames are too few for a survey, print the LEDs that they show and the attitudes to hold next."""
 
     try:
         yield
@@ -208,9 +219,12 @@ def coverage_shown(
 
 
 def print_coverage(
-    request: Request, frames: list[SurveyFrame], prior: CalibrationPrior, noise_px: float | None
+    request: Request,
+    frames: list[SurveyFrame],
+    prior: CalibrationPrior,
+    noise_px: float | None,
 ) -> None:
-    """Print which LEDs the frames show, and the attitudes to hold next."""
+    """Print the LEDs that the frames show, and the attitudes to hold next."""
     so_far = survey_findings.coverage_before(
         frames, prior, request.uncertainty, noise_px or prior.floor_px
     )
@@ -218,7 +232,7 @@ def print_coverage(
 
 
 def with_next(request: Request, so_far: Coverage, prior: CalibrationPrior) -> dict[str, Any]:
-    """Statistics of a coverage with the attitudes to hold next, and what they will reach."""
+    """Statistics of a coverage, with the attitudes to hold next and the accuracy predicted with them."""
 
     margin_px = survey_prior.image_sizes(prior).margin_px
     further = survey_findings.next_stops(
@@ -235,7 +249,7 @@ def with_next(request: Request, so_far: Coverage, prior: CalibrationPrior) -> di
 def write_results(
     request: Request, run: SurveyRun, before: CalibrationPrior, lab: Lab | None
 ) -> dict[str, Any]:
-    """Write map and picture of a survey, and return its statistics; a simulated one is drawn with its errors."""
+    """Write map and picture of a survey and return its statistics; the picture of a simulated one shows its errors."""
 
     folder = files.make_folder(request.folder)
     path = folder / "leds.ecsv"
@@ -266,11 +280,13 @@ def write_results(
 def write_report(
     request: Request, run: SurveyRun, statistics: dict[str, Any]
 ) -> dict[str, Any]:
-    """Write a survey's statistics as JSON, and its report, which is printed too; return them with the report's path."""
+    """Write a survey's statistics as JSON, write and print its report; return the statistics with the report's path."""
 
     path = request.folder / "report.html"
     statistics |= {"report": str(path)}
-    report = survey_report.survey_report(statistics, run, shlex.join(["skysim", *sys.argv[1:]]))
+    report = survey_report.survey_report(
+        statistics, run, shlex.join(["skysim", *sys.argv[1:]])
+    )
     report.save(path)
     files.write_text(request.folder / "survey.json", files.to_json(statistics))
     if not request.quiet:
@@ -282,7 +298,7 @@ def write_report(
 # Terminal output of `--plan` and `--repeat`: the attitudes to hold, predicted and simulated errors.
 
 
-SHOWN_STOPS = 12  # attitudes of a plan that are printed; the file has all
+SHOWN_STOPS = 12  # number of attitudes of a plan that are printed; the file has all
 
 
 def print_plan(plan: dict[str, Any]) -> None:

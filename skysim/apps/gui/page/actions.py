@@ -1,4 +1,4 @@
-"""Actions of the user: by keys, and by a palette of all of them, which is filtered while the user types (Ctrl-K)."""
+"""Actions of the user, by keys or by a palette (Ctrl-K) that lists all actions and filters them by typed text."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skysim.apps.gui.worker import geometry
 
 Action = Callable[[], Awaitable[None] | None]
 
-# Ctrl-K also from a field; the browser's own action is suppressed.
+# Ctrl-K also acts in a field; the browser's own action is suppressed.
 OPEN_JS = """
 document.addEventListener("keydown", event => {
   if (!(event.ctrlKey || event.metaKey) || event.key.toLowerCase() !== "k") return;
@@ -28,7 +28,7 @@ document.addEventListener("keydown", event => {
 
 
 class Command(NamedTuple):
-    """An entry: its name, the label of its key if it has one, and what it does."""
+    """An entry: its name, the label of its key if it has one, and its action."""
 
     name: str
     key: str
@@ -36,7 +36,7 @@ class Command(NamedTuple):
 
 
 async def perform(action: Action) -> None:
-    """Do an action, to its end if it takes a while."""
+    """Do an action, and wait for its end if it is asynchronous."""
     done = action()
     if done is not None:
         await done
@@ -51,14 +51,14 @@ def matching(commands: list[Command], text: str) -> list[Command]:
 
 
 class Palette:
-    """The dialog. Arrows choose, Enter or a click does.
+    """The dialog. Arrow keys choose an entry; Enter or a click performs it.
 
     Attributes
     ----------
     found
-        Commands that match
+        Commands that match the typed text
     chosen
-        Index of the one that Enter does
+        Index of the command that Enter performs
     """
 
     def __init__(self, commands: Callable[[], list[Command]]) -> None:
@@ -90,7 +90,7 @@ class Palette:
         self.choose(0)
 
     def choose(self, index: int) -> None:
-        """Mark an entry as the one that Enter does, and draw the list."""
+        """Mark the entry that Enter performs, and draw the list."""
         self.chosen = min(max(index, 0), max(len(self.found) - 1, 0))
         self.list.clear()
         with self.list:
@@ -118,18 +118,18 @@ class Palette:
 
 
 class Actions:
-    """What keys and commands do on a page.
+    """Actions of the keys and commands on a page.
 
     Attributes
     ----------
     step
         Shows the next or the previous frame of the flight (1 or -1)
     performers
-        By the action of a key, of those that are also commands
+        Functions by the action of a key, for keys that are also commands
     others
         Commands that are not in `keys.KEYS`
     steps
-        (3,) right, up, roll: movements requested by keys that no frame shows yet
+        (3,) right, up, roll: movements requested by keys, which no frame shows yet
     moving
         Whether such a frame is being rendered
     """
@@ -161,7 +161,7 @@ class Actions:
         ] + [*self.others]
 
     async def key(self, event: KeyEventArguments) -> None:
-        """Do what a pressed key is for, unless a dialog is open."""
+        """Perform the action of a pressed key, unless a dialog is open."""
         name = event.key.name.lower() if len(event.key.name) == 1 else event.key.name
         action = keys.ACTION_BY_KEY.get(name)
         if (
@@ -176,7 +176,9 @@ class Actions:
         if action == "move":
             right, up, roll_sign = keys.MOVES[name]
             step = geometry.COARSE if event.modifiers.shift else geometry.FINE
-            roll = geometry.ROLL_COARSE_DEG if event.modifiers.shift else geometry.ROLL_FINE_DEG
+            roll = (
+                geometry.ROLL_COARSE_DEG if event.modifiers.shift else geometry.ROLL_FINE_DEG
+            )
             await self.move(right * step, up * step, roll_sign * roll)
         elif action == "step":
             await self.step(1 if name == "." else -1)
@@ -201,7 +203,7 @@ class Actions:
             self.moving = False
 
     async def perform(self, action: str) -> None:
-        """Do what a key is for, without an older message."""
+        """Clear an older message and perform the action of a key."""
         self.page.show_message("")
         if action == "close":
             self.help.close()

@@ -1,4 +1,4 @@
-"""The head of the page: its scene, what it shows, its messages, noise, identification, and export."""
+"""The head of the page: its scene, the banner, messages, noise, identification, and export."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from skysim.core.paths import SCENES, shipped_files
 
 
 class Head:
-    """The elements of the head, and what they do.
+    """The elements of the head and their actions.
 
     Attributes
     ----------
     folder
-        Where scenes are saved
+        Folder in which scenes are saved
     message_text
-        The message
+        Text of the message
     """
 
     def __init__(self, page: PageContext, contents: Contents, folder: Path) -> None:
@@ -33,15 +33,22 @@ class Head:
         with ui.element("div").classes("lab-head"):
             ui.label("skysim gui").classes("lab-name")
             self.picker = widgets.select(
-                self.scenes(), "borderless", value=page.state.scene, on_change=self.scene_picked
+                self.scenes(),
+                "borderless",
+                value=page.state.scene,
+                on_change=self.scene_picked,
             )
             self.picker.props('aria-label="Scene"').classes("w-44").mark("scene")
             self.banner = LiveText(contents, "live").classes("lab-banner").mark("banner")
             self.live_button = widgets.button("Live", self.go_live, "live")
             self.live_button.set_visibility(False)
             self.title = ui.label().classes("lab-title quiet ellipsis")
-            self.message = ui.label().classes("lab-said").props('role="status"').mark("message")
-            self.busy = ui.icon("hourglass_empty", size="16px").classes("lab-busy").mark("busy")
+            self.message = (
+                ui.label().classes("lab-said").props('role="status"').mark("message")
+            )
+            self.busy = (
+                ui.icon("hourglass_empty", size="16px").classes("lab-busy").mark("busy")
+            )
             self.latency = LiveText(contents).classes("lab-rate mono quiet").mark("rate")
             self.latency.props('title="latency: from the request for a frame to its arrival"')
             self.noise = ui.switch("noise", value=True, on_change=self.switch_noise).props(
@@ -54,7 +61,7 @@ class Head:
                     item.props("dense").style("white-space: nowrap")
 
     def scenes(self) -> dict[str, str]:
-        """Scenes to choose from and their labels: shipped ones, those saved in the folder, and the current one."""
+        """Scenes to choose from, with labels: shipped ones, those saved in the folder, and the current one."""
         current = self.page.state.scene
         own = [path for path in sorted(self.folder.glob("*.yaml")) if forms.is_scene(path)]
         return (
@@ -64,17 +71,17 @@ class Head:
         )
 
     def update_scenes(self) -> None:
-        """Offer a scene that was saved meanwhile."""
+        """Add scenes that have been saved to the list."""
         self.picker.set_options(self.scenes())
 
     async def scene_picked(self) -> None:
         if self.picker.value != self.page.state.scene:
             await self.page.open(str(self.picker.value))
 
-    # What it shows.
+    # Contents.
 
     def set_scene(self, info: SceneInfo) -> None:
-        """Show the name, the title and the noise of the scene that is open now."""
+        """Show the name, the title and the noise of a newly opened scene."""
         self.picker.set_value(self.page.state.scene)
         self.title.props["title"] = info.title  # tooltip with the full title
         self.title.set_text(info.title)
@@ -91,7 +98,7 @@ class Head:
         self.message.set_text(text)
         self.message.classes(remove="good warn quiet", add=color)
 
-    # What its elements do.
+    # Actions.
 
     async def go_live(self) -> None:
         """Return to the live scene at the newest attitude."""
@@ -102,7 +109,7 @@ class Head:
         self.noise.set_value(not self.noise.value)
 
     async def switch_noise(self) -> None:
-        """Render with the camera's noise, or each pixel's expected value; the attitude is kept."""
+        """Render with the camera's noise, or the expected value of each pixel; the attitude is kept."""
         info = self.page.scene_info
         if info and info.noise != self.noise.value:
             await self.page.apply_overrides(
@@ -138,11 +145,12 @@ class Head:
             self.page.show_message(f"{item}: {reason}")
 
 
-# How a user arranges the page: the sizes of its panes and its theme, remembered by the browser.
+# The arrangement of the page: sizes of its panes and theme, which the browser remembers.
 
 
-# The splitters work in the browser alone. Each sets the size of a pane in pixels, as a variable of CSS; without it the
-# page has its own. Below CLOSED the pane of the 3-D view is closed. An arrow key on a splitter is not the camera's.
+# The splitters work only in the browser. Each sets the size of a pane in pixels as a CSS variable; without it the pane
+# has its default size. Below CLOSED the pane of the 3-D view is closed. Arrow keys on a splitter do not move the
+# camera.
 SPLITTER_JS = """
 window.skysimSplitter = (() => {
   const STEP = 24, CLOSED = 60, root = document.documentElement;
@@ -207,7 +215,7 @@ class Arrangement:
     Attributes
     ----------
     charts
-        That are drawn again in another theme
+        Charts that are drawn again when the theme changes
     """
 
     def __init__(self, charts: list[ui.echart]) -> None:
@@ -217,12 +225,12 @@ class Arrangement:
 
     @staticmethod
     def splitter(kind: str, orientation: str, label: str) -> None:
-        """A line that is dragged or moved by arrow keys; a double click or Enter gives the pane its first size.
+        """A line that is dragged or moved by arrow keys; a double click or Enter restores the pane's default size.
 
         Parameters
         ----------
         kind
-            Side (the column of panels) or space (the 3-D view)
+            `side` (the column of panels) or `space` (the 3-D view)
         """
         line = (
             ui.element("div")
@@ -233,7 +241,7 @@ class Arrangement:
         line.props(f'title="{label}: drag, or arrow keys; double-click: as at first"')
 
     async def restore(self) -> None:
-        """Take the theme that the browser remembers."""
+        """Apply the theme that the browser remembers."""
         if (
             await ui.run_javascript('localStorage.getItem("skysim.theme")', timeout=10)
             == "light"
@@ -241,7 +249,7 @@ class Arrangement:
             self.set_dark(False)
 
     def reset(self) -> None:
-        """Give all panes their first sizes."""
+        """Restore the default sizes of all panes."""
         ui.run_javascript("skysimSplitter.reset()")
 
     def toggle(self) -> None:
@@ -251,7 +259,7 @@ class Arrangement:
         )
 
     def set_dark(self, dark: bool) -> None:
-        """Change the theme; charts take their colors from it when they are drawn."""
+        """Change the theme and draw the charts again, which take their colors from it."""
         self.dark.set_value(dark)
         for chart in self.charts:
             chart.update()

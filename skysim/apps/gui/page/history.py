@@ -1,7 +1,7 @@
 """The page's view in the browser: in the address, in its history and in its storage.
 
-The browser's history is the list of undone and redone views: Ctrl-Z goes back, Ctrl-Shift-Z forward. So a reload, the
-back button and a shared link read a view from the address in the same way as undo does.
+The browser's history serves for undo and redo: Ctrl-Z goes back, Ctrl-Shift-Z forward. So a reload, the back button, a
+shared link and undo all read a view from the address in the same way.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ from nicegui import ui
 from skysim.apps.gui.views.context import Shown
 from skysim.apps.gui.views.state import PageView
 
-SETTLED = 3  # times of the timer without a change after which the next one is a new step
-WRITE_S = 0.4  # browsers refuse more than about 200 entries in 30 s
+SETTLED = (
+    3  # number of timer calls without a change after which the next change is a new step
+)
+WRITE_S = 0.4  # interval of the timer; browsers refuse more than about 200 entries in 30 s
 JS = """
 window.skysimHistory = {
   index: () => (history.state && history.state.skysim) || 0,
@@ -53,19 +55,19 @@ class History:
     Attributes
     ----------
     home
-        The server's scene; a stored view is that of a server for the same one
+        The server's scene; a stored view is used only by a server of the same scene
     show_query
-        Shows the view of an address
+        Function that shows the view of an address
     is_settling
-        Whether the page does not show its view yet
+        Function that returns whether the page does not yet show its view
     written
-        The view in the address
+        View in the address
     pending
-        The newest query that is asked for while another is being shown
+        Newest query that was requested while another one is being shown
     moving
-        Whether the last change was of attitude or time alone
+        Whether the last change was only of attitude or time
     unchanged
-        Times of the timer since then
+        Number of timer calls since the last change
     """
 
     def __init__(
@@ -89,14 +91,16 @@ class History:
         ui.timer(WRITE_S, self.write)
 
     async def read(self) -> str:
-        """The query of the page's address, or else of the stored view."""
+        """The query of the page's address; if it has none, that of the stored view."""
         return str(
-            await ui.run_javascript(f"skysimHistory.read({json.dumps(self.home)})", timeout=10)
+            await ui.run_javascript(
+                f"skysimHistory.read({json.dumps(self.home)})", timeout=10
+            )
             or ""
         )
 
     def write(self) -> None:
-        """Timer: write a changed view; a movement that goes on replaces the address, other changes add a step."""
+        """Timer: write a changed view. A continued movement replaces the address; other changes add a step."""
         view = self.page.state
         if view is self.written or self.showing or self.is_settling():
             self.unchanged += 1
@@ -118,12 +122,12 @@ class History:
         ui.run_javascript("skysimHistory.redo()")
 
     def adopt(self) -> None:
-        """The address names the page's view already."""
+        """Take the page's view as the one that is already in the address."""
         self.written = self.page.state
         self.moving = False
 
     async def asked(self, event: Any) -> None:
-        """The browser has gone to another address of this page: show its view; of several, the newest."""
+        """Show the view after the browser has gone to another address of this page; of several, the newest."""
         self.pending = str(event.args)
         if self.showing:
             return

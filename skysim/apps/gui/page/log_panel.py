@@ -1,4 +1,4 @@
-"""Log panel: what has happened in this session, and a table of the identifications, as CSV."""
+"""Log panel: the events of this session, and a table of the identifications as CSV."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ COLUMNS = (
 
 
 class LogPanel:
-    """The log, the newest line first.
+    """The log, newest line first.
 
     Attributes
     ----------
     rows
-        Identifications, with the cells of COLUMNS
+        Identifications as values of COLUMNS
     """
 
     def __init__(self, page: Shown) -> None:
@@ -74,7 +74,7 @@ class LogPanel:
 
 
 def line(view: FrameView, info: SceneInfo) -> str:
-    """An identification in a line."""
+    """An identification as a line of text."""
     noise = "with" if info.noise else "without"
     result = view.result
     if result is None or result.angles_deg is None:

@@ -47,13 +47,13 @@ class MonteCarloPanel:
     out
         Folder of the studies
     user, tab
-        The browser and its tab, which are in the names of their folders
+        The browser and its tab, which are part of the names of the studies' folders
     process
-        The study
+        Process of the study
     run_number
-        Of the tab's last Monte Carlo study
+        Number of the tab's last Monte Carlo study
     failed
-        Trials that the page lists, see `StudyResults`
+        Trials that the page lists, as in `StudyResults`
     stopped
         Whether the study was stopped and can be continued
     starting
@@ -77,7 +77,9 @@ class MonteCarloPanel:
             self.study_select.mark("study").on_value_change(self.study_chosen)
             self.button = widgets.button("Start", self.start_or_stop, "monte-carlo")
         with ui.element("div").classes("lab-trial") as self.fields:
-            self.count = widgets.number("runs, F8", value=200, min=1, max=100_000, precision=0)
+            self.count = widgets.number(
+                "runs, F8", value=200, min=1, max=100_000, precision=0
+            )
             self.count.mark("runs")
             self.kind = widgets.select(TRIAL_KINDS, value="centroids", label="of")
             self.noise = widgets.number("noise, px", value=0.1, min=0, max=10, step=0.05)
@@ -89,7 +91,9 @@ class MonteCarloPanel:
         with widgets.row(3) as self.model:
             self.with_noise = widgets.checkbox("with noise", value=True).mark("with-noise")
             self.noise_text = widgets.quiet().mark("noise-text")
-        self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
+        self.bar = ui.linear_progress(0, show_value=False, size="3px").props(
+            "instant-feedback"
+        )
         self.note = widgets.quiet("No study has been run yet: press 2.").style(
             "margin-top: 6px"
         )
@@ -116,7 +120,7 @@ class MonteCarloPanel:
         self.show_noise()
 
     def show_noise(self) -> None:
-        """Say what the centroids' noise is as an angle, in the middle of the frame."""
+        """Show the centroids' noise as an angle in the middle of the frame."""
         info = self.page.scene_info
         angle = f"{float(self.noise.value or 0) * info.pixel_arcsec:.3g}″" if info else ""
         self.noise_text.set_text(f"noise of a centroid: {angle} an axis")
@@ -167,7 +171,7 @@ class MonteCarloPanel:
                 self.show_end("" if self.stopped else fault)
 
     async def start_process(self) -> bool:
-        """Start the process of the chosen study; return whether it could be."""
+        """Start the process of the chosen study; return whether it has started."""
         self.page.show_message("")
         found = await self.page.run_here(self.load_study)
         if found is None:
@@ -193,7 +197,7 @@ class MonteCarloPanel:
             )
         self.page.set_state(study=self.process.folder.name)
         await self.process.start(path)
-        if not self.page.is_open:  # closed meanwhile, when there was no process to end
+        if not self.page.is_open:  # the page was closed before there was a process to end
             self.process.stop(signal.SIGTERM)
         return True
 
@@ -207,7 +211,7 @@ class MonteCarloPanel:
         return path, study
 
     def study_file(self) -> Path:
-        """Path of the study file: the chosen one, or a new Monte Carlo study; a stopped one if it is unchanged.
+        """Path of the study file: the chosen one, a stopped study with unchanged settings, or a new Monte Carlo study.
 
         Raises
         ------
@@ -249,7 +253,7 @@ class MonteCarloPanel:
         overrides = dict(self.page.state.overrides)
         try:
             section = TrialSection.model_validate({"trial": trial})
-        except ValidationError:  # the study's loader says in one line what is wrong
+        except ValidationError:  # the study's loader reports it in one line
             return overrides
         unused = unused_options.unused_overrides(
             overrides, load(scene, overrides), section.trial
@@ -306,7 +310,7 @@ class MonteCarloPanel:
         self.false_lights.set_value(trial.get("false_lights", self.false_lights.value))
 
     def show_count(self, done: int) -> None:
-        """Say how many trials are done, and how to go on."""
+        """Show the number of finished trials, and how to continue."""
         rest = "" if done >= self.process.total else "; stopped, Start continues"
         self.note.set_text(f"{done} of {self.process.total} trials{rest}")
 
@@ -320,7 +324,9 @@ class MonteCarloPanel:
 
     def show(self, results: StudyResults) -> None:
         self.bar.set_value(results.done / max(self.process.total, 1))
-        self.chart.options["xAxis"]["data"] = [format_number(center) for center in results.bins]
+        self.chart.options["xAxis"]["data"] = [
+            format_number(center) for center in results.bins
+        ]
         self.chart.options["series"][0]["data"] = list(results.counts)
         self.chart.options["title"]["text"] = "" if results.counts else "no trial solved"
         self.chart.update()

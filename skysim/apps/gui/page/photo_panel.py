@@ -1,4 +1,4 @@
-"""Image panel: solves an uploaded image or frames of a live camera; shows the solution or the reason for none."""
+"""Image panel: solves an uploaded image or frames of a live camera; shows the solution or the reason for a refusal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LIMIT_BYTES = 64 * 2**20
 
 
 def weak_handler(method: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """A handler that does not keep its panel alive: FastAPI keeps the route of an upload area in a cache for ever."""
+    """A handler that does not keep its panel alive, because FastAPI never drops the route of an upload area."""
     reference = weakref.WeakMethod(method)
 
     def handler(event: Any) -> Any:
@@ -32,11 +32,11 @@ class PhotoPanel:
     Attributes
     ----------
     cameras
-        That it may watch
+        Live cameras that may be watched
     live
-        Whether it watches one
+        Whether one is being watched
     logged
-        The status that was logged last
+        Status that was logged last
     """
 
     def __init__(self, page: PageContext, cameras: Sequence[str]) -> None:
@@ -88,7 +88,12 @@ class PhotoPanel:
         self.page.stop_playback()
         self.show_text(f"solving {name} …", "quiet")
         photo = await self.page.run_task(
-            "solve_file", name, data, self.fov.value, self.stages, activity=f"solving {name} …"
+            "solve_file",
+            name,
+            data,
+            self.fov.value,
+            self.stages,
+            activity=f"solving {name} …",
         )
         self.show(name, photo)
 
@@ -110,7 +115,7 @@ class PhotoPanel:
         if self.live:
             self.stop()
             return
-        # The value comes from the browser, which may send any: only what the command line named is opened.
+        # A browser may send any value: only cameras that the command line named are opened.
         if self.source.value not in self.cameras:
             self.page.show_message("live camera: allowed: one of those in the list")
             return

@@ -28,15 +28,13 @@ from skysim.scene.sections.motion import PRESCRIBED
 if TYPE_CHECKING:
     from skysim.simulation.checks.plan_check import Check
 
-# Of a survey that is flown: few frames while the vehicle slews, and a whole exposure in each hold.
+# Frame rate and holds of a survey flight: few frames while the vehicle slews, and a whole exposure in each hold.
 SURVEY_RATE_HZ = 0.5
 HOLD_PERIODS = 2.0
-TILT_MARGIN_DEG = 0.5  # to the vehicle's stop
-TILT_STEPS = 61  # points of a slew at which its tilt is looked at
-FRAMES = 20  # of a survey, at first
-ALIKE = (
-    0.9  # of the LEDs that coincide: a tracker without a prior refuses the field as ambiguous
-)
+TILT_MARGIN_DEG = 0.5  # least distance of the tilt from the vehicle's stop
+TILT_STEPS = 61  # number of points of a slew at which its tilt is computed
+FRAMES = 20  # initial number of frames of a survey
+ALIKE = 0.9  # fraction of coinciding LEDs from which a tracker without a prior refuses a field as ambiguous
 UNCHECKED = "Check computes what this scene will show and how accurate its tracker will be. Nothing is rendered."
 UNMAPPED = "Map compares the fields of the dome with one another: a field that looks like another one is ambiguous."
 COLORED = "In the 3-D view the LEDs are the brighter the better they are measured."
@@ -47,21 +45,21 @@ UNPLANNED = (
 
 
 class PlanPanel:
-    """Panel with three parts, each computed at a button's press and cleared when the scene changes.
+    """Panel with three parts, each computed on request and cleared when the scene changes.
 
     Attributes
     ----------
     scene_3d
-        In which it colors LEDs
+        3-D view, in which LEDs are colored
     run_panel
-        Which flies the survey
+        Panel that flies the survey
     taken
-        Frames of the survey, once they are adjusted
+        Number of frames of the survey that have been adjusted
     colored
-        Its LEDs and how well it knows each
+        LEDs of the survey, and how well each is known
     legends
-        What the colors of the LEDs in the 3-D view mean, by what has colored them; the last one
-        is shown
+        Meaning of the LED colors in the 3-D view, by the part that has colored them; the last
+        one is shown
     """
 
     def __init__(self, page: PageContext, scene_3d: Scene3D, run_panel: RunPanel) -> None:
@@ -104,7 +102,7 @@ class PlanPanel:
         return widgets.button(label, action).props(f'title="{title}"').classes("flex-none")
 
     def set_scene(self) -> None:
-        """Say what each part does, because nothing is known of a new scene; its survey goes on if there is one."""
+        """Show what each part does, as there are no results for a new scene; a survey of the scene is continued."""
         self.legends.pop("map", None)
         for column, text in ((self.facts, UNCHECKED), (self.fields, UNMAPPED)):
             column.clear()
@@ -117,13 +115,13 @@ class PlanPanel:
             self.color("survey", *self.colored)
 
     def color(self, by: str, ids: NDArray[np.int64], values: Floats) -> None:
-        """Color LEDs of the 3-D view, and show what that means."""
+        """Color LEDs of the 3-D view, and show the meaning of the colors."""
         self.scene_3d.color_lights(ids, values)
         for name, legend in self.legends.items():
             legend.set_visibility(name == by)
 
     def clear_survey(self) -> None:
-        """Forget the survey, and say what it does."""
+        """Discard the survey, and show what a survey does."""
         self.plan = self.colored = None
         self.taken = 0
         self.legends.pop("survey", None)
@@ -134,14 +132,14 @@ class PlanPanel:
             widgets.quiet(UNPLANNED)
 
     def enable(self) -> None:
-        """Let the buttons of a planned survey act."""
+        """Enable the buttons of a planned survey."""
         self.begin.set_enabled(True)
         for button in (self.fly, self.adjust_button):
             button.set_enabled(self.plan is not None)
 
     @contextmanager
     def working(self) -> Iterator[None]:
-        """Within this context no second step of the survey begins."""
+        """Context in which no second step of the survey can begin."""
         for button in (self.begin, self.fly, self.adjust_button):
             button.set_enabled(False)
         try:
@@ -153,7 +151,9 @@ class PlanPanel:
     # The check.
 
     async def check(self) -> None:
-        found: Check | None = await self.page.run_task("check", activity="checking the scene …")
+        found: Check | None = await self.page.run_task(
+            "check", activity="checking the scene …"
+        )
         if found is None:
             return
         self.facts.clear()
@@ -206,10 +206,12 @@ class PlanPanel:
                 self.show_survey([prediction_text(found)], found)
 
     async def adjust(self) -> None:
-        """Adjust the dome to the frames flown, and show what they measure and the attitudes to hold next."""
+        """Adjust the dome to the frames flown; show the results and the attitudes to hold next."""
         with self.working():
             found: SurveyFound | None = await self.page.run_task(
-                "adjust_survey", int(self.frames.value or 0), activity="adjusting the survey …"
+                "adjust_survey",
+                int(self.frames.value or 0),
+                activity="adjusting the survey …",
             )
             if found is None:
                 return
@@ -224,7 +226,7 @@ class PlanPanel:
                 self.color("survey", *self.colored)
 
     def show_survey(self, lines: Sequence[str], plan: SurveyPlan) -> None:
-        """Show what a survey has found and its next attitudes, which can then be flown."""
+        """Show the findings of a survey and its next attitudes, which can then be flown."""
         self.plan = plan
         self.stops.clear()
         with self.stops:
@@ -270,7 +272,7 @@ class PlanPanel:
 
 
 async def confirmed(question: str, action: str) -> bool:
-    """Ask before something is lost.
+    """Ask the user to confirm an action that loses something.
 
     Parameters
     ----------
@@ -289,7 +291,7 @@ async def confirmed(question: str, action: str) -> bool:
 
 
 def ambiguity_text(found: AmbiguityMap) -> str:
-    """How many fields look like another one, and which the most alike are."""
+    """The number of fields that look like another one, and the most similar pair."""
     count = int(np.sum(found.fraction >= ALIKE))
     most = int(np.argmax(found.fraction))
     return (
@@ -301,7 +303,7 @@ def ambiguity_text(found: AmbiguityMap) -> str:
 
 
 def prediction_text(plan: SurveyPlan) -> str:
-    """What a survey is predicted to reach with the attitudes of its plan."""
+    """The predicted accuracy of a survey with the attitudes of its plan."""
     steps = [
         f"after {frames} frames {measured} LEDs to {mm:.2g} mm rms"
         for frames, measured, mm in plan.steps
@@ -311,7 +313,7 @@ def prediction_text(plan: SurveyPlan) -> str:
 
 
 def survey_lines(found: SurveyFound) -> list[str]:
-    """What the frames of a survey have measured, and the faults of the dome."""
+    """The results of a survey's frames, and the faults of the dome."""
     missed = []
     if found.missed:
         missed = [f"{found.missed} attitudes have no frame: the vehicle did not rest there."]
@@ -337,9 +339,9 @@ def survey_flight(
 ) -> dict[str, str]:
     """Overrides with which the vehicle slews to each attitude and holds it, with frames over the whole time.
 
-    An exposure is no longer than the frame period, so one lies wholly in a hold of two periods. Between two tilted
-    attitudes the vehicle may tilt more than at either: where that is too much, it is leveled in between. Raises
-    InputError.
+    An exposure is no longer than the frame period, so a hold of two periods contains a whole exposure. Between two
+    tilted attitudes the vehicle may tilt more than at either; if this exceeds the limit, it is leveled in between.
+    Raises InputError.
     """
     before = forms.validated_scene(scene, overrides)
     rate_hz = min(SURVEY_RATE_HZ, before.exposure.rate_hz)

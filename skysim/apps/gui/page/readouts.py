@@ -1,4 +1,4 @@
-"""What the tracker made of the frame: the card of its attitude, and the table of its lights."""
+"""The tracker's results on the frame: the card of its attitude, and the table of its lights."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from skysim.apps.gui.views.overlay import MAX_TRUTH_MARKS, NEAR_PX
 from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.worker.photo import Photo
 
-ANGLES_JS = "() => emit([...document.querySelectorAll('.lab-angle')].map(field => field.value))"
+ANGLES_JS = (
+    "() => emit([...document.querySelectorAll('.lab-angle')].map(field => field.value))"
+)
 
 
 class AttitudeCard:
@@ -26,7 +28,7 @@ class AttitudeCard:
     Attributes
     ----------
     contents
-        Of the tab's live fields
+        Contents of the tab's live fields
     shows_photo
         Whether the card shows an image that is not of the current scene
     """
@@ -42,10 +44,14 @@ class AttitudeCard:
                 widgets.quiet("true (F5)")
                 self.inputs = [self.angle_input(n) for n in range(3)]
                 widgets.quiet("tracker")
-                self.estimates = [LiveText(contents, "–").classes("mono num") for _ in range(3)]
+                self.estimates = [
+                    LiveText(contents, "–").classes("mono num") for _ in range(3)
+                ]
                 widgets.quiet("error")
                 self.errors = [LiveText(contents, "–").classes("mono num") for _ in range(3)]
-            self.status = LiveText(contents).classes("mono ellipsis lab-status").mark("status")
+            self.status = (
+                LiveText(contents).classes("mono ellipsis lab-status").mark("status")
+            )
             self.stages = ui.label(" ").classes("quiet ellipsis").mark("stages")
 
     def angle_input(self, n: int) -> LiveInput:
@@ -57,7 +63,7 @@ class AttitudeCard:
         )
 
     def set_scene(self, scene_info: SceneInfo) -> None:
-        """Take over a new scene: angle names and algorithms."""
+        """Show angle names and algorithms of a new scene."""
         self.set_headers(scene_info.names)
         self.stages.set_text("stages (F6, F7): " + " · ".join(scene_info.stages.values()))
         self.stages.props["title"] = ", ".join(
@@ -152,7 +158,7 @@ def status_line(result: TrackerResult | None) -> tuple[str, str]:
     return "good", f"solved; {counts}"
 
 
-# Lights panel: a table of the true lights of the frame and of what the tracker made of each.
+# Lights panel: a table of the true lights of the frame with their detections and matches.
 
 
 HEADS = ("light", "V", "e⁻", "x, px", "y, px", "error, px", "taken for")
@@ -178,27 +184,31 @@ class LightsPanel:
         self.table = LightsTable().mark("lights")
 
     def update(self) -> None:
-        """Send the table of the sensor's frame if it is another one; every UPDATE_S while the panel is open."""
+        """Send the table if the sensor shows another frame; called every UPDATE_S while the panel is open."""
         sensor = self.sensor
         if self.sent == sensor.sent_number:
             return
         self.sent = sensor.sent_number
         detections = sensor.result.detections if sensor.result else ()
         self.table.run_method(
-            "show", HEADS, list(rows(sensor.lights[:MAX_TRUTH_MARKS], detections, sensor.name))
+            "show",
+            HEADS,
+            list(rows(sensor.lights[:MAX_TRUTH_MARKS], detections, sensor.name)),
         )
 
 
 def rows(
-    lights: Collection[LightRow], detections: Collection[Detection], name: Callable[[int], str]
+    lights: Collection[LightRow],
+    detections: Collection[Detection],
+    name: Callable[[int], str],
 ) -> Iterator[dict[str, Any]]:
-    """Rows of the table: every true light with its detection, the brightest first, then detections of no light.
+    """Rows of the table: true lights with their detections, brightest first, then detections of no light.
 
     Returns
     -------
     state
-        Good if the light was identified, warn if a detection is false or taken for another
-        light, else quiet
+        `good` if the light was identified, `warn` if a detection is false or matched with another
+        light, else `quiet`
     """
     found = list(detections)
     found_px = np.array([(one.x, one.y) for one in found]).reshape(-1, 2)

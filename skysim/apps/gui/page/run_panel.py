@@ -1,4 +1,4 @@
-"""Run panel: computes the scene's flight in the worker, and plays its frames: scrub, step, any speed."""
+"""Run panel: computes the scene's flight in the worker, and plays, scrubs and steps through its frames."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from skysim.apps.gui.views.sensor import SensorView
 
 SPEEDS = {"real time": 1.0, "½": 0.5, "¼": 0.25, "1/10": 0.1, "2×": 2.0, "5×": 5.0}
 CONTROL_KEYS = ("motion.control", "motion.maneuver")
-BUDGET_S = 0.04  # of a piece of the flight; a key waits for one at most
-LOOK_S = 0.05  # between two looks whether the flight still plays
-DRAW_S = 0.7  # between two drawings of the strips while frames come
+BUDGET_S = 0.04  # time to compute a piece of the flight; a key waits for at most one
+LOOK_S = 0.05  # interval of checks whether the flight still plays
+DRAW_S = 0.7  # interval of drawing the strips while frames are computed
 
 
 class RunPanel:
@@ -33,31 +33,31 @@ class RunPanel:
     Attributes
     ----------
     sensor
-        Which shows its frames
+        Sensor view, which shows the frames
     contents
-        Of the tab's live fields
+        Contents of the tab's live fields
     feedback
-        Of the scene's controller; None without a controller
+        Feedback of the scene's controller; None without a controller
     rows, log
-        Of the computed frames and of the motion
+        Rows of the computed frames, and curves of the motion
     residuals
-        Of the identified lights, see `FlightStep`
+        Residuals of the identified lights, as in `FlightStep`
     computing, stopping
-        Whether the flight is being computed, and whether it shall end
+        Whether the flight is being computed, and whether the computation has been told to stop
     playing, showing
         Whether it plays, and whether `play_on` shows its frames
     slot
-        Of the panel in the page
+        Slot of the panel in the page
     wanted_s
         Time to be shown once the flight is computed; None: play it from its start
     when_shown
-        Called then
+        Function that is called when this time is shown
     sought
-        Place of the slider while its frame is not shown yet
+        Position of the slider while its frame is not shown yet
     index
-        Of the frame on the page
+        Index of the frame on the page
     started_s, from_s
-        Time of the last start of playback, and in the flight there
+        Time of the last start of playback, and the time in the flight at this start
     closed_scene, closed_overrides
         Last scene with a closed loop and its overrides, with which an opened loop is closed
         again
@@ -95,12 +95,18 @@ class RunPanel:
                 "skip_previous", "Previous frame", partial(self.step, -1)
             )
             self.play = self.player_button("play_arrow", "Play", self.toggle)
-            self.forward = self.player_button("skip_next", "Next frame", partial(self.step, 1))
+            self.forward = self.player_button(
+                "skip_next", "Next frame", partial(self.step, 1)
+            )
             self.speed = widgets.select(list(SPEEDS), "borderless", value="real time")
-            self.speed.props('aria-label="Speed"').classes("w-24").on_value_change(self.resync)
+            self.speed.props('aria-label="Speed"').classes("w-24").on_value_change(
+                self.resync
+            )
             self.loop = widgets.select({}, "borderless", on_change=self.close_loop)
             self.loop.props('aria-label="Feedback"').mark("feedback")
-        self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
+        self.bar = ui.linear_progress(0, show_value=False, size="3px").props(
+            "instant-feedback"
+        )
         with widgets.row(3):
             self.seek = LiveInput(self.contents, "range").props(
                 'min=0 step=1 aria-label="Frame of the flight"'
@@ -116,11 +122,13 @@ class RunPanel:
         self.enable()
 
     def player_button(self, icon: str, label: str, action: Any) -> ui.button:
-        button = ui.button(icon=icon, on_click=action).props(f'dense flat aria-label="{label}"')
+        button = ui.button(icon=icon, on_click=action).props(
+            f'dense flat aria-label="{label}"'
+        )
         return button.mark(label.lower())
 
     def enable(self) -> None:
-        """Let the controls work that have frames to work on, and say what to do without."""
+        """Enable the controls if there are frames; without frames, show what to do."""
         for item in (self.back, self.play, self.forward, self.csv_button):
             item.set_enabled(bool(self.rows) and not self.computing)
         self.seek.props(f"max={max(len(self.rows) - 1, 1)}")
@@ -136,7 +144,7 @@ class RunPanel:
         )
 
     def set_scene(self, feedback: str | None) -> None:
-        """Take over a new scene, which has no flight yet.
+        """Set up the panel for a new scene, which has no flight yet.
 
         Parameters
         ----------
@@ -227,7 +235,7 @@ class RunPanel:
             self.start()
 
     async def compute(self) -> bool:
-        """Compute piece by piece, so that keys and other requests get their turn; return whether it was all."""
+        """Compute piece by piece, so that keys and other requests get their turn; return whether all was computed."""
         step = await self.page.ask("begin_flight")
         while step is not None and not step.is_done and not self.stopping:
             self.take(step)
@@ -238,7 +246,7 @@ class RunPanel:
         return step is not None and step.is_done
 
     def take(self, step: FlightStep) -> None:
-        """Take over what is new of the flight."""
+        """Add new rows, residuals and curves of the flight."""
         self.rows += step.rows
         self.residuals += step.residuals
         self.times_s += [row.t_s for row in step.rows]
@@ -254,7 +262,9 @@ class RunPanel:
         """Draw the strips with the frames so far."""
         self.drawn_s = time.monotonic()
         ends = [*self.log.t_s[-1:], *self.times_s[-1:]]
-        lights = () if self.computing else self.residuals  # which are many, and sent once
+        lights = (
+            () if self.computing else self.residuals
+        )  # residuals are many, so they are sent once
         self.strips.draw(
             strips(self.rows, self.log, lights), max(ends, default=1.0), self.sensor.name
         )
@@ -262,7 +272,7 @@ class RunPanel:
             self.summary.set_text(rms_line(self.rows))
 
     async def restore(self, t_s: float, when_shown: Callable[[], None]) -> None:
-        """Show a moment of the flight again; compute the flight first if it is not kept.
+        """Show a moment of the flight again; compute the flight first if it was not kept.
 
         Parameters
         ----------
@@ -285,7 +295,7 @@ class RunPanel:
         self.playing = True
         self.started_s = time.monotonic()
         self.play.props("icon=pause")
-        with self.slot:  # not in that of a palette's row, which ends with the palette
+        with self.slot:  # not in the slot of a palette's row, which ends with the palette
             ui.timer(0, self.play_on, once=True)
 
     def toggle(self) -> None:
@@ -293,7 +303,9 @@ class RunPanel:
         if self.playing:
             self.pause()
         elif self.rows and not self.computing:
-            self.from_s = 0.0 if self.index >= len(self.rows) - 1 else self.times_s[self.index]
+            self.from_s = (
+                0.0 if self.index >= len(self.rows) - 1 else self.times_s[self.index]
+            )
             self.start()
 
     def pause(self) -> None:
@@ -309,7 +321,7 @@ class RunPanel:
         return self.from_s + elapsed
 
     def resync(self) -> None:
-        """Continue from the current time at another speed."""
+        """Continue from the current time at a new speed."""
         self.from_s = self.now_s
         self.started_s = time.monotonic()
         self.factor = SPEEDS[str(self.speed.value)]
@@ -321,7 +333,7 @@ class RunPanel:
             await self.show_index(min(max(self.index + frames, 0), len(self.rows) - 1))
 
     async def clicked(self, event: Any) -> None:
-        """A strip was clicked at a time."""
+        """Show the moment at which a strip was clicked."""
         await self.show_moment(float(event.args))
 
     async def show_moment(self, t_s: float) -> None:
@@ -333,7 +345,7 @@ class RunPanel:
             )
 
     async def slid(self, event: Any) -> None:
-        """The slider is dragged: show the frame at its place, of several the newest."""
+        """Show the frame at the place of the dragged slider; of several, the newest."""
         is_showing = self.sought is not None
         self.sought = int(event.args)
         while not is_showing and self.sought is not None:
@@ -346,7 +358,7 @@ class RunPanel:
                 self.sought = None
 
     async def play_on(self) -> None:
-        """While the flight plays, show the frame whose turn it is; pause at the last."""
+        """While the flight plays, show the frame that is due; pause at the last one."""
         if self.showing:  # it was paused and started again meanwhile
             return
         self.showing = True

@@ -1,4 +1,4 @@
-"""Scene and Tracker panels: the keys of the scene as forms, all of them, and those of image processing and tracker."""
+"""Scene panel, a form of all keys of the scene; Tracker panel, a form of those of image processing and tracker."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ NAMES = {  # by group and key
         "tracker.decoder.frames": "decoder's frames",
     },
 }
-FOCUS_S = 0.2  # until a part that opens is drawn
+FOCUS_S = 0.2  # time until a part that opens is drawn
 MODEL = "Sensor model: the Monte Carlo simulation of centroids takes stars of the catalog with random errors."
 
 
@@ -48,17 +48,17 @@ class KeyForm:
     Attributes
     ----------
     label
-        Of a field, from its key
+        Function that returns the label of a field from its key
     opens
-        The group that is open at first
+        Group that is open at first
     scene, fields
-        The scene whose fields are shown, and these by key
+        Scene whose fields are shown, and its fields by key
     last_typed
-        By key the last typed value, accepted or refused
+        Last typed value by key, accepted or refused
     rows, labels, inputs
-        By key its elements
+        Elements by key
     expansions
-        By group
+        Expandable parts by group
     """
 
     def __init__(
@@ -95,7 +95,13 @@ class KeyForm:
         open_now = {name for name, expansion in self.expansions.items() if expansion.value}
         open_now = open_now if self.expansions else {self.opens}
         self.parts.clear()
-        for elements in (self.expansions, self.last_typed, self.rows, self.labels, self.inputs):
+        for elements in (
+            self.expansions,
+            self.last_typed,
+            self.rows,
+            self.labels,
+            self.inputs,
+        ):
             elements.clear()
         with self.parts:
             for name, fields in groups.items():
@@ -153,7 +159,7 @@ class KeyForm:
             self.show_error(field.key, "")
 
     async def edit(self, key: str, *_: object) -> None:
-        """Apply a typed value, or show at the field why it is refused."""
+        """Apply a typed value, or show the reason of its refusal at the field."""
         value = str(self.inputs[key].value)
         current = self.fields[key].shown
         if value == self.last_typed.get(key, current):
@@ -173,11 +179,13 @@ class KeyForm:
         changed = {one: text for one, text in after.items() if before.get(one) != text}
         await self.page.apply_overrides(changed, before.keys() - after.keys())
         now = self.page.state.overrides
-        if any(now.get(one) != text for one, text in after.items()):  # it could not be set up
+        if any(
+            now.get(one) != text for one, text in after.items()
+        ):  # the scene could not be set up
             self.show_error(key, self.page.message_text)
 
     def show_error(self, key: str, message: str) -> None:
-        """Show an error message at a field, if it is still there; an empty one removes it."""
+        """Show an error message at a field if the field still exists; an empty message removes it."""
         entry = self.inputs.get(key)
         if entry is None:
             return
@@ -189,14 +197,14 @@ class KeyForm:
 
 
 class ScenePanel:
-    """The form, one part per section of the scene, a field that finds keys, and a button that saves a new scene file.
+    """The form with one part per section of the scene, a search field for keys, and a button to save a new scene file.
 
     Attributes
     ----------
     folder
-        Of the saved scenes
+        Folder of the saved scenes
     saved
-        Called when one is there
+        Function that is called when a scene has been saved
     shown
         Scene and overrides in the form
     """
@@ -272,19 +280,19 @@ class ScenePanel:
 
     async def revert(self) -> None:
         """Reopen the scene without overrides."""
-        self.form.scene = ""  # forces a rebuild, which removes refused values too
+        self.form.scene = ""  # forces a rebuild, which also removes refused values
         await self.page.open(self.page.state.scene)
 
 
 class TrackerPanel:
-    """What F6 and F7 of PTASE set up: image processing with the sensor's noise, and identification.
+    """The settings of F6 and F7 in PTASE: image processing with the sensor's noise, and identification.
 
-    A form of two parts, without keys that have no effect, and the noise of the Monte Carlo simulation's lights.
+    It has a form of two parts, without keys that have no effect, and the noise of the lights in Monte Carlo studies.
 
     Attributes
     ----------
     study
-        The panel of that simulation
+        Panel of the Monte Carlo studies
     shown
         Scene and overrides in the form
     """
@@ -297,7 +305,9 @@ class TrackerPanel:
         self.form = KeyForm(page, lambda field: names[field.key], opens=SENSOR)
         widgets.quiet(MODEL).style("margin: 10px 0 4px")
         with widgets.row():
-            self.arcsec = widgets.number("noise, ″ an axis", min=0, step=1).mark("noise-arcsec")
+            self.arcsec = widgets.number("noise, ″ an axis", min=0, step=1).mark(
+                "noise-arcsec"
+            )
             self.arcsec.on("blur", self.typed).on("keydown.enter", self.typed)
             magnitude = widgets.number("noise, magnitudes", min=0, max=5, step=0.05)
             magnitude.classes("w-36 flex-none").bind_value(study.magnitude)
@@ -308,12 +318,15 @@ class TrackerPanel:
         """Show the fields of the current scene."""
         offered = {field.key: field for field in fields if not field.no_effect}
         self.form.show(
-            {group: [offered[key] for key in NAMES[group] if key in offered] for group in NAMES}
+            {
+                group: [offered[key] for key in NAMES[group] if key in offered]
+                for group in NAMES
+            }
         )
         self.show_noise()
 
     def show_noise(self) -> None:
-        """Show the noise of a centroid, which is in pixels, as an angle in the middle of the frame."""
+        """Show the noise of a centroid as an angle in the middle of the frame."""
         info = self.page.scene_info
         if info:
             self.arcsec.set_value(
@@ -321,7 +334,7 @@ class TrackerPanel:
             )
 
     def typed(self) -> None:
-        """Take over a typed angle."""
+        """Set the noise from a typed angle."""
         info = self.page.scene_info
         noise = self.study.noise
         shown = float(f"{float(noise.value or 0) * info.pixel_arcsec:.4g}") if info else 0.0
@@ -329,7 +342,7 @@ class TrackerPanel:
             noise.set_value(float(f"{float(self.arcsec.value or 0) / info.pixel_arcsec:.4g}"))
 
     def open(self, action: str) -> None:
-        """Show the part of an action, sensor or identifier, with the keyboard on its first field."""
+        """Show the part of an action (sensor or identifier) and focus its first field."""
         group = SENSOR if action == "sensor" else IDENTIFIER
         if group in self.form.expansions:
             self.form.expansions[group].open()

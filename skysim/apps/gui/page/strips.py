@@ -15,12 +15,12 @@ from skysim.apps.gui.views.style import CURVE_COLORS, TOOLTIP, chart_color
 
 BAND_COLOR = "#8b95a5"
 STRIP_PX = 118  # height of a strip
-HEAD_PX = 22  # of its title and legend
-AXIS_PX = 24  # of the time axis
+HEAD_PX = 22  # height of its title and legend
+AXIS_PX = 24  # height of the time axis
 INNER_PX = STRIP_PX - HEAD_PX - 8  # height of a strip between its axes
-MAX_DOTS = 20_000  # of lights; of more, some frames are left out
+MAX_DOTS = 20_000  # maximum number of dots; if there are more, some frames are left out
 Points = list[list[float]]
-LEFT_PX = 52  # from a strip to the left edge of the chart
+LEFT_PX = 52  # distance of a strip from the left edge of the chart
 RIGHT_PX = 12
 ZOOM = {
     "type": "inside",
@@ -30,7 +30,7 @@ ZOOM = {
     "moveOnMouseWheel": False,
     "filterMode": "none",
 }
-# A click on a strip, and the line of the shown moment over all strips. The line is an element of its own, because the
+# A click on a strip, and the line of the shown moment over all strips. The line is a separate element, because the
 # chart would draw all curves again for it.
 CHART_JS = """() => {
   const chart = getElement(%d).chart;
@@ -84,7 +84,7 @@ class Strip:
     Attributes
     ----------
     dots
-        Of lights, drawn by strips.js: time, value, and the light's number
+        Dots of lights, drawn by strips.js: time, value, number of the light
     """
 
     title: str
@@ -106,12 +106,12 @@ def strips(
     log: MotionLog,
     residuals: Sequence[tuple[float, int, float]] = (),
 ) -> list[Strip]:
-    """Return the strips of a flight that have something to show.
+    """Return the strips for which a flight has data.
 
     Parameters
     ----------
     residuals
-        Of the identified lights, see `FlightStep`
+        Residuals of the identified lights, as in `FlightStep`
     """
 
     def of_frames(value: Callable[[FlightRow], float]) -> Points:
@@ -145,7 +145,9 @@ def strips(
             "attitude error, ″",
             (
                 *map(of_motion, ("pointing", "IMU alone", "filter")),
-                StripCurve("innovation", of_frames(lambda row: row.innovation_arcsec), "dots"),
+                StripCurve(
+                    "innovation", of_frames(lambda row: row.innovation_arcsec), "dots"
+                ),
             ),
             logarithmic=True,
         ),
@@ -164,15 +166,17 @@ def strips(
 
 
 def point(t_s: float, value: float) -> list[float]:
-    """A point of a curve, with the digits that are drawn."""
+    """A point of a curve, rounded to the digits that are drawn."""
     return [round(t_s, 4), float(f"{value:.5g}")]
 
 
 def thinned(residuals: Sequence[tuple[float, int, float]]) -> Points:
-    """The residuals as dots, of every frame or, if they are many, of every so many-th one."""
+    """The residuals as dots: of all frames or, if they are more than MAX_DOTS, of frames at equal steps."""
     times_s = sorted({t_s for t_s, _, _ in residuals})
     kept = set(times_s[:: max(math.ceil(len(residuals) / MAX_DOTS), 1)])
-    return [[round(t_s, 4), float(f"{px:.3g}"), id] for t_s, id, px in residuals if t_s in kept]
+    return [
+        [round(t_s, 4), float(f"{px:.3g}"), id] for t_s, id, px in residuals if t_s in kept
+    ]
 
 
 class StripChart:
@@ -181,9 +185,9 @@ class StripChart:
     Attributes
     ----------
     contents
-        Of the tab's live fields
+        Contents of the tab's live fields
     strips
-        That are drawn
+        Strips that are drawn
     """
 
     def __init__(self, contents: Contents) -> None:
@@ -202,7 +206,7 @@ class StripChart:
         Parameters
         ----------
         name
-            Returns the name of a light
+            Function that returns the name of a light
         """
         if any(strip.dots for strip in (*self.strips, *drawn)):
             self.dots.run_method("show", dot_fields(drawn, name))
@@ -214,13 +218,13 @@ class StripChart:
         self.chart.update()
 
     def set_moment(self, t_s: float) -> None:
-        """Move the line of the shown moment, when the next frame is drawn."""
+        """Move the line of the shown moment when the next frame is drawn."""
         if self.strips:
             self.contents.set(self.chart.id, {"moment": f"{t_s:.4f}"})
 
 
 def dot_fields(drawn: list[Strip], name: Callable[[int], str]) -> dict[str, Any]:
-    """What strips.js draws: dots, names of their lights, and the place of their strip."""
+    """Data for strips.js: dots, names of their lights, and the place of their strip."""
     n = next((n for n, strip in enumerate(drawn) if strip.dots), 0)
     dots = drawn[n].dots if drawn else []
     names = {int(id): name(int(id)) for _, _, id in dots}
@@ -293,7 +297,7 @@ def round_up(value: float) -> float:
 
 
 def decades(values: list[float]) -> dict[str, float]:
-    """Axis limits: whole decades that contain the values, the uppermost four at most."""
+    """Axis limits: whole decades that contain the values, at most the uppermost four."""
     positive = [value for value in values if value > 0] or [1.0]
     low = math.floor(math.log10(min(positive)))
     high = math.ceil(math.log10(max(positive)))
@@ -328,8 +332,8 @@ def rms_line(rows: Sequence[FlightRow]) -> str:
         return f"{len(rows)} frames, none solved" if rows else ""
     cross, roll = (
         math.hypot(*errors) / math.sqrt(len(solved))
-        for errors in zip(*((row.cross_arcsec, row.roll_arcsec) for row in solved), strict=True)
+        for errors in zip(
+            *((row.cross_arcsec, row.roll_arcsec) for row in solved), strict=True
+        )
     )
-    return (
-        f"{len(solved)} of {len(rows)} frames solved; rms: cross {cross:.3g}″, roll {roll:.3g}″"
-    )
+    return f"{len(solved)} of {len(rows)} frames solved; rms: cross {cross:.3g}″, roll {roll:.3g}″"

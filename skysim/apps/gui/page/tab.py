@@ -37,7 +37,7 @@ from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.scene.loader import load
 
-PAUSE_S = 0.005  # between the parts of a page that is built, in which the keys of other pages are answered
+PAUSE_S = 0.005  # pause between building parts of a page, in which the keys of other pages are served
 PANELS = ("Run", "Lights", "Scene", "Tracker", "Plan", "Monte Carlo", "Image", "Log")
 
 
@@ -47,23 +47,23 @@ class Tab:
     Attributes
     ----------
     session
-        Its worker, set when it has got one
+        Its worker, once it has one
     new_session
-        Gives another worker, None if there are too many
+        Function that returns another worker, None if there are too many
     folder
-        Where scenes are saved
+        Folder in which scenes are saved
     out
-        Where studies are
+        Folder of the studies
     cameras
-        Live ones that it may watch
+        Live cameras that it may watch
     user
-        Its browser, see `server.user_of`
+        Its browser, by `server.user_of`
     state, scene_info, view, is_open
-        See `Shown`
+        As in `Shown`
     contents
-        Of the fields that change with every frame
+        Contents of the fields that change with every frame
     editing, filling
-        Held while the scene is changed, or a form of its keys is filled
+        Locks that are held while the scene is changed, or a form of its keys is filled
     """
 
     session: Session
@@ -87,7 +87,7 @@ class Tab:
         self.filling = asyncio.Lock()
 
     async def close(self) -> None:
-        """Release the tab's resources after its browser has gone: frames, study and worker."""
+        """Release frames, study and worker of the tab after its browser has gone."""
         self.is_open = False
         FRAMES.pop(self.id, None)
         self.study_panel.close()
@@ -95,7 +95,7 @@ class Tab:
             await asyncio.to_thread(self.session.close)
 
     def use(self, session: Session) -> None:
-        """Take a worker."""
+        """Use a worker."""
         self.session = session
         self.sensor.source = session
 
@@ -149,7 +149,7 @@ class Tab:
         self.actions = Actions(
             self, self.sensor, self.run_panel.step, self.performers(), self.commands()
         )
-        # A timer waits for the browser, whereupon NiceGUI sends the page as it is: so timers come after all pauses.
+        # A timer waits for the browser, and NiceGUI then sends the unfinished page. So timers come after all pauses.
         ui.timer(readouts.UPDATE_S, self.update_lights)
         ui.timer(monte_carlo_panel.POLL_S, self.study_panel.poll)
 
@@ -197,7 +197,7 @@ class Tab:
     # Actions of keys and of the command palette.
 
     def performers(self) -> dict[str, Action]:
-        """What the keys are for, by the names of their actions."""
+        """Functions of the keys by the names of their actions."""
         return {
             "identify": self.identify,
             "noise": self.head.toggle_noise,
@@ -212,9 +212,11 @@ class Tab:
         }
 
     def commands(self) -> list[Command]:
-        """Further commands: those of the flight, of the history and of the arrangement, panels, and exports."""
+        """Further commands: flight, history, arrangement, panels and exports."""
         return [
-            Command("show the next frame of the flight", ".", partial(self.run_panel.step, 1)),
+            Command(
+                "show the next frame of the flight", ".", partial(self.run_panel.step, 1)
+            ),
             Command(
                 "show the previous frame of the flight", ",", partial(self.run_panel.step, -1)
             ),
@@ -223,11 +225,18 @@ class Tab:
             Command(
                 "compute the flight of the scene, or stop that", "", self.run_panel.simulate
             ),
-            Command("change between the dark and the light theme", "", self.arrangement.toggle),
             Command(
-                "give frame, 3-D view and panels their first sizes", "", self.arrangement.reset
+                "change between the dark and the light theme", "", self.arrangement.toggle
             ),
-            *(Command(f"panel: {name}", "", partial(self.show_panel, name)) for name in PANELS),
+            Command(
+                "give frame, 3-D view and panels their first sizes",
+                "",
+                self.arrangement.reset,
+            ),
+            *(
+                Command(f"panel: {name}", "", partial(self.show_panel, name))
+                for name in PANELS
+            ),
             *(
                 Command(f"export: {name}", "", partial(self.head.export, name))
                 for name in image_export.FILE_BY_ITEM
@@ -235,7 +244,7 @@ class Tab:
         ]
 
     async def identify(self) -> None:
-        """Render a new frame of the live scene, solve it, and log what the tracker found."""
+        """Render a new frame of the live scene, solve it, and log the result."""
         self.stop_playback()
         await self.show_live("render", True)
         if self.view and self.view.result and self.scene_info:
@@ -250,15 +259,17 @@ class Tab:
         self.study_panel.focus()
 
     async def set_up_tracker(self, action: str) -> None:
-        """Open the tracker's form at sensor or identifier."""
+        """Open the tracker's form at its part for an action (sensor or identifier)."""
         self.show_panel("Tracker")
         await self.fill_form()
         self.tracker_panel.open(action)
 
     # The view of the page's address.
 
-    async def start(self, session: Session, new_session: Callable[[], Session | None]) -> None:
-        """Show the first view: that of the page's address or of the browser's storage, else the server's scene."""
+    async def start(
+        self, session: Session, new_session: Callable[[], Session | None]
+    ) -> None:
+        """Show the first view: that of the page's address, or of the browser's storage, or the server's scene."""
         self.use(session)
         self.new_session = new_session
         await self.arrangement.restore()
@@ -268,7 +279,7 @@ class Tab:
             self.show_message(refusal)
 
     async def show_query(self, query: str) -> None:
-        """Show the view of an address; refuse one that is not of this server."""
+        """Show the view of an address; refuse an address that this server does not have."""
         try:
             wanted = PageView.from_query(query, self.head.scenes())
             if wanted:
@@ -280,7 +291,7 @@ class Tab:
             await self.restore(wanted)
 
     async def restore(self, wanted: PageView) -> None:
-        """Show a view again: open its scene if it is another, point there, then fly or replay."""
+        """Restore a view: open its scene if it is another one, point the camera, then fly or replay."""
         now = self.state
         is_shown = self.view is not None and (now.scene, now.overrides) == (
             wanted.scene,
@@ -340,7 +351,7 @@ class Tab:
         self.set_scene(self.scene_info, control.feedback if control else None)
         self.show_live_view(view)
         self.scene_panel.shown = self.tracker_panel.shown = (
-            None  # the file may be another one under the same name
+            None  # the file of this name may have changed
         )
         await self.fill_form()
         self.log(f"opened {name}" + (f" with {', '.join(overrides)}" if overrides else ""))
@@ -365,7 +376,7 @@ class Tab:
     async def apply_overrides(
         self, overrides: Mapping[str, str], dropped: Collection[str] = ()
     ) -> None:
-        """Reopen the scene with further overrides and without some; edits made meanwhile follow one after the other."""
+        """Reopen the scene with further overrides and without some; concurrent edits are done one after another."""
         async with self.editing:
             kept = {
                 key: text for key, text in self.state.overrides.items() if key not in dropped
@@ -373,7 +384,7 @@ class Tab:
             await self.open(self.state.scene, {**kept, **overrides})
 
     async def fill_form(self) -> None:
-        """Show the keys of the current scene in the panel of them that is open; it takes a while, so not in others."""
+        """Show the keys of the current scene in the panel of keys that is open; not in others, as it takes a while."""
         panels: dict[str, ScenePanel | TrackerPanel] = {
             "Scene": self.scene_panel,
             "Tracker": self.tracker_panel,
@@ -392,7 +403,7 @@ class Tab:
         """The open scene and its overrides."""
         return self.state.scene, self.state.overrides
 
-    # What is shown.
+    # Contents of the page.
 
     @property
     def solving(self) -> bool:
@@ -405,12 +416,12 @@ class Tab:
         return self.head.message_text
 
     def set_state(self, **changes: Any) -> None:
-        """Change what the page shows, as the banner says."""
+        """Change fields of the page's view, and the banner."""
         self.state = replace(self.state, **changes)
         self.head.set_state(self.state)
 
     def show_frame(self, view: FrameView, **state: Any) -> None:
-        """Show a frame of the scene: live, or of its flight.
+        """Show a frame of the scene, live or of its flight.
 
         Parameters
         ----------
@@ -427,12 +438,12 @@ class Tab:
         self.show_frame(view, kind="live", angles_deg=view.angles_deg)
 
     def show_photo(self, photo: Photo, /, **state: Any) -> None:
-        """Show an image that is not of the scene as it is now: a photograph, or a trial again.
+        """Show an image that is not of the current scene: a photograph, or a replayed trial.
 
         Parameters
         ----------
         state
-            See `show_frame`
+            Changes of the fields of `PageView`
         """
         self.set_state(**state)
         self.attitude.show_photo(photo)
@@ -443,7 +454,7 @@ class Tab:
         self.tabs.set_value(name)
 
     def stop_playback(self) -> None:
-        """Stop playback, a pushed vehicle and the live camera, because the sensor view is needed for something else."""
+        """Stop playback, a pushed vehicle and the live camera before the sensor view shows something else."""
         self.run_panel.pause()
         self.scene_3d.push.stop()
         self.photo.stop()
@@ -460,10 +471,10 @@ class Tab:
         """Add a line to the log."""
         self.log_panel.add(text)
 
-    # What the worker is asked for.
+    # Tasks of the worker.
 
     async def ask(self, task: str, *arguments: Any) -> Any:
-        """Result of a task of the worker; None after an error, which is shown in one line, or if the tab has closed."""
+        """Result of a task of the worker; None after an error, which is shown, or if the tab has been closed."""
         try:
             result = await self.session.run(task, *arguments)
         except InputError as error:
@@ -490,7 +501,7 @@ class Tab:
             return None
 
     async def run_task(self, task: str, *arguments: Any, activity: str = "") -> Any:
-        """Do as `ask`, with the mark of a busy page.
+        """Run a task as `ask` does, while the page is marked as busy.
 
         Parameters
         ----------
@@ -508,7 +519,7 @@ class Tab:
                     self.show_message("")
 
     async def show_live(self, task: str, *arguments: Any) -> FrameView | None:
-        """Show the frame of the live scene that a task renders; None if that failed or the tab has closed."""
+        """Show the frame of the live scene that a task renders, and return it; None after an error or a closed tab."""
         begin = time.perf_counter()
         view = await self.ask(task, *arguments)
         if view is not None:

@@ -1,4 +1,4 @@
-"""What a part of the page may ask of the page. The page implements it, and no part imports the page."""
+"""The interface of the page for its parts. The page implements it; no part imports the page."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from skysim.apps.gui.worker.photo import Photo
 
 
 class Shown(Protocol):
-    """What the page shows.
+    """The contents of the page.
 
     Attributes
     ----------
     state
-        As an address holds it
+        View of the page as in its address
     scene_info
-        Of the open scene, None before the first is open
+        Facts about the open scene; None before one is open
     view
-        Newest frame of the scene, None before the first
+        Newest frame of the scene; None before the first
     message_text
         Message in the head
     solving
@@ -44,7 +44,7 @@ class Shown(Protocol):
 
 
 class Asked(Protocol):
-    """What the page asks of its worker for a part. An error is shown in the head, and the answer is None or False."""
+    """Requests to the worker. An error is shown in the head, and the result is None or False."""
 
     async def ask(self, task: str, *arguments: Any) -> Any:
         """Return the result of a task."""
@@ -53,7 +53,7 @@ class Asked(Protocol):
         """Return the result of a function that runs in a thread of the server."""
 
     async def run_task(self, task: str, *arguments: Any, activity: str = "") -> Any:
-        """Do as `ask`, with the mark of a busy page.
+        """Run a task as `ask` does, while the page is marked as busy.
 
         Parameters
         ----------
@@ -100,7 +100,7 @@ class Notified(Protocol):
         """
 
     def show_photo(self, image: Photo, /, **state: Any) -> None:
-        """Show an image that is not of the scene as it is now: a photograph, or a trial again.
+        """Show an image that is not of the current scene: a photograph, or a replayed trial.
 
         Parameters
         ----------
@@ -109,11 +109,11 @@ class Notified(Protocol):
         """
 
     def stop_playback(self) -> None:
-        """Stop playback, a pushed vehicle and the live camera, because something else is to be shown."""
+        """Stop playback, a pushed vehicle and the live camera before something else is shown."""
 
     def show_panel(self, name: str) -> None:
         """Open a panel by its name."""
 
 
 class PageContext(Shown, Asked, Notified, Protocol):
-    """The page for its parts: what it shows, what it asks of its worker, and how it is notified."""
+    """The page for its parts: its contents, requests to its worker, and notifications."""

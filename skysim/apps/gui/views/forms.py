@@ -23,7 +23,7 @@ from skysim.scene.scene import NAME_ALIAS, Scene
 from skysim.scene.sections.motion import expand_control
 from skysim.tracking import factory as tracker_settings
 
-# Units of bare numbers by suffix of a key.
+# Units of numbers without unit, by suffix of the key.
 DISPLAY_UNITS = {
     "deg": "deg",
     "arcsec": "arcsec",
@@ -54,8 +54,8 @@ SECTIONS = (
     "tracker",
 )
 NO_SECTION = "none"  # the kind of a section that is left out
-# Values of the keys that a kind of section requires, when it is chosen. A kind without them, as of a file, is not
-# offered; nor is another kind of light, which requires another start of the motion.
+# Values for the keys that a kind of section requires, when it is chosen. A kind without such values, for example one
+# that names a file, is not offered; nor is another kind of light, which requires another start of the motion.
 FIRST_VALUES: dict[str, Any] = {
     "row_time": "10 us",
     "fwhm_px": 2,
@@ -91,19 +91,19 @@ class FormField(NamedTuple):
     Attributes
     ----------
     key
-        dotted
+        Dotted key
     text
-        Its value as YAML, from the file, or else the default
+        Value as YAML, from the file or by default
     unit
-        Of a bare number
+        Unit of a number without unit
     allowed_values
-        Those of an enumeration
+        Values of an enumeration
     is_set
         Whether a file or an override sets it
     meaning
-        What `null` stands for, if that is one of the allowed values
+        Meaning of `null`, if that is one of the allowed values
     no_effect
-        Why the key does nothing in this scene; empty if it does something
+        Reason why the key has no effect in this scene; empty if it has one
     """
 
     key: str
@@ -150,12 +150,12 @@ def fields(name: str, overrides: Mapping[str, str]) -> list[FormField]:
 def section_fields(
     model: BaseModel, tree: Any, prefix: str, kinds: tuple[str, ...] = ()
 ) -> Iterator[FormField]:
-    """Yield the fields of a section. A list of sections is one field, as is one given by a word (`control: pid`).
+    """Yield the fields of a section. A list of sections, or a section given by a word (`control: pid`), is one field.
 
     Parameters
     ----------
     kinds
-        That the section could have instead of its own
+        Kinds that the section could have instead of its own
     """
     for name, info in type(model).model_fields.items():
         file_key = info.alias or SI_SUFFIX.sub("", name)
@@ -173,7 +173,9 @@ def section_fields(
             yield FormField(key, value, "", tuple(dict.fromkeys((*kinds, value))), is_set)
         else:
             subtree = short_path(subtree)
-            text = yaml_line(subtree) if is_set else yaml_line(file_value(value, si_unit(name)))
+            text = (
+                yaml_line(subtree) if is_set else yaml_line(file_value(value, si_unit(name)))
+            )
             yield FormField(
                 key, text, display_unit(file_key), allowed_values(annotation), is_set
             )
@@ -189,7 +191,7 @@ def short_path(value: Any) -> Any:
 
 
 def display_unit(file_key: str) -> str:
-    """The unit of a bare number, from the suffix of its key."""
+    """The unit of a number without unit, from the suffix of its key."""
     match = UNIT_SUFFIX.search(file_key)
     return DISPLAY_UNITS[match[1]] if match else ""
 
@@ -215,7 +217,9 @@ def models(annotation: Any) -> dict[str, type[BaseModel]]:
         return dict.fromkeys(allowed_values(kind.annotation), annotation) if kind else {}
     found: dict[str, type[BaseModel]] = {}
     for part in (
-        get_args(annotation) if get_origin(annotation) in (Union, UnionType, Annotated) else ()
+        get_args(annotation)
+        if get_origin(annotation) in (Union, UnionType, Annotated)
+        else ()
     ):
         found |= models(part)
     return found
@@ -223,7 +227,7 @@ def models(annotation: Any) -> dict[str, type[BaseModel]]:
 
 @cache
 def offered_kinds(annotation: Any) -> tuple[str, ...]:
-    """The kinds that a section may be given by a choice, with NO_SECTION if it may be left out; () if there is none."""
+    """The kinds to choose from for a section, with NO_SECTION if it may be left out; () if there is no choice."""
     found = tuple(
         kind
         for kind, model in models(annotation).items()
@@ -235,7 +239,7 @@ def offered_kinds(annotation: Any) -> tuple[str, ...]:
 def first_section(
     model: type[BaseModel], kind: str, kept: Mapping[str, Any] | None = None
 ) -> dict[str, Any] | None:
-    """A section of a kind with the keys that it requires and others that are kept; None if their values are unknown."""
+    """A section of a kind with its required keys and with keys that are kept; None if required values are unknown."""
     required = [
         info.alias or name for name, info in model.model_fields.items() if info.is_required()
     ]
@@ -251,10 +255,12 @@ def first_section(
     return section
 
 
-def with_value(name: str, overrides: Mapping[str, str], key: str, text: str) -> dict[str, str]:
-    """Overrides after a key has got a value, without those that lose their effect thereby. Raises InputError.
+def with_value(
+    name: str, overrides: Mapping[str, str], key: str, text: str
+) -> dict[str, str]:
+    """Overrides with a new value of a key, without those that lose their effect by it. Raises InputError.
 
-    The kind of a section replaces the section.
+    A new kind of a section replaces the section.
     """
     section = key.removesuffix(".kind")
     changed = (
@@ -275,7 +281,7 @@ def with_value(name: str, overrides: Mapping[str, str], key: str, text: str) -> 
 def with_kind(
     name: str, overrides: Mapping[str, str], section: str, kind: str
 ) -> dict[str, str]:
-    """Overrides by which a section gets another kind: that of the file, or with the keys that this kind requires.
+    """Overrides that change a section's kind: to that of the file, or to another with the keys that it requires.
 
     Keys that both kinds have keep their values.
     """
@@ -305,7 +311,7 @@ def with_kind(
 
 
 def same_field(model: type[BaseModel], name: str, annotation: Any) -> bool:
-    """Whether a model has a field of a name with the same type, and no section."""
+    """Whether a model has a field with this name and type that is not a section."""
     field = model.model_fields.get(name)
     return field is not None and field.annotation == annotation and not models(annotation)
 
@@ -344,7 +350,7 @@ def yaml_line(value: Any) -> str:
 
 
 def absolute_path(scene: str) -> str:
-    """Absolute path of a scene's file, by which a file in any folder can name it."""
+    """Absolute path of a scene's file, so that a file in any folder can refer to it."""
     return str(find(scene).resolve())
 
 
@@ -360,7 +366,7 @@ def validated_scene(name: str, overrides: Mapping[str, str]) -> Scene:
 
 
 def is_scene(path: Path) -> bool:
-    """Return True if a YAML file looks like a scene: no study, with a camera or a base scene."""
+    """Return True if a YAML file looks like a scene: not a study, and with a camera or a base scene."""
     try:
         tree, _ = read_yaml(path)
     except InputError:
@@ -376,8 +382,10 @@ FEEDBACKS = {
 }
 
 
-def field_override(name: str, overrides: Mapping[str, str], field_deg: float) -> dict[str, str]:
-    """Override by which a scene's horizontal field of view becomes another: f = width / (2 tan(field / 2)).
+def field_override(
+    name: str, overrides: Mapping[str, str], field_deg: float
+) -> dict[str, str]:
+    """Override for another horizontal field of view of a scene: f = width / (2 tan(field / 2)).
 
     Raises
     ------
@@ -407,7 +415,9 @@ def loop_overrides(name: str, overrides: Mapping[str, str], feedback: str) -> di
     return {"motion.control": yaml_line(control | {"feedback": feedback})}
 
 
-def save(folder: Path, name: str, base: str, overrides: Mapping[str, str], title: str) -> Path:
+def save(
+    folder: Path, name: str, base: str, overrides: Mapping[str, str], title: str
+) -> Path:
     """Save a new scene file that consists of a base and overrides. Raises InputError, also if the file exists."""
     from skysim.apps.gui.worker.image_export import base_reference, scene_yaml
     from skysim.core import files

@@ -1,4 +1,4 @@
-"""Keyboard map and its help; the keys of PTASE where it had one (Fialho & Saotome 2005, section 3.1)."""
+"""Keyboard map and its help, with the keys of PTASE where it has them (Fialho & Saotome 2005, section 3.1)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from nicegui import ui
 class Key(NamedTuple):
     """Keys as the browser names them, their action, and their label and description on the screen and in the help.
 
-    A key without a description is in the help alone.
+    A key without a description is only in the help.
     """
 
     keys: tuple[str, ...]
@@ -20,7 +20,7 @@ class Key(NamedTuple):
     help: str
 
 
-MOVES = {  # right, up, roll clockwise, in steps of a key press
+MOVES = {  # right, up, roll clockwise; unit: one step of a key press
     "ArrowLeft": (-1, 0, 0),
     "ArrowRight": (1, 0, 0),
     "ArrowUp": (0, 1, 0),
@@ -43,7 +43,9 @@ KEYS = (
         "roll",
         "roll the camera by a degree: E counterclockwise, R clockwise",
     ),
-    Key(("Shift",), "⇧", "coarse", "coarse", "with an arrow, E or R: steps ten times as large"),
+    Key(
+        ("Shift",), "⇧", "coarse", "coarse", "with an arrow, E or R: steps ten times as large"
+    ),
     Key(("1",), "1", "identify", "identify", "render a new frame and solve it"),
     Key(("n",), "N", "noise", "noise", "render without the camera's noise, or with it again"),
     Key(
@@ -54,7 +56,11 @@ KEYS = (
         "start a Monte Carlo study; F8 sets its number of trials",
     ),
     Key(
-        ("F5",), "F5", "attitude", "attitude", "type an attitude; Enter points the camera there"
+        ("F5",),
+        "F5",
+        "attitude",
+        "attitude",
+        "type an attitude; Enter points the camera there",
     ),
     Key(("F6",), "F6", "sensor", "sensor", "set up image processing and the sensor's noise"),
     Key(
@@ -107,7 +113,7 @@ def focus(field: ui.element) -> None:
 
 
 def help_dialog() -> ui.dialog:
-    """A dialog that says what the page is for, and lists its keys."""
+    """A dialog on the purpose of the page and its keys."""
     with (
         ui.dialog() as dialog,
         ui.card().style("max-width: 600px; padding: 20px 24px; gap: 12px"),

@@ -1,8 +1,8 @@
 """Texts and fields that change with every frame.
 
-NiceGUI's page renders all of its elements again when one of them is updated, which takes a browser as long as a frame.
-So these contents travel with the frame's pixels, and the browser sets them when it draws the frame; without a new frame
-a message brings them.
+When one element of NiceGUI's page is updated, the browser renders all of them, which takes as long as a frame. So these
+contents are sent with the frame's pixels, and the browser sets them when it draws the frame. Without a new frame they
+are sent in a message.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Contents:
     Attributes
     ----------
     send
-        Called with all contents when some have changed without a frame
+        Function that is called with all contents if some have changed without a frame
     """
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ class Contents:
         self.waits = False
 
     def set(self, number: int, content: dict[str, str]) -> None:
-        """Change the content of a field: its text and state, or its value; of the strips the moment that is shown."""
+        """Change the content of a field: text and state, or value, or the shown moment of the strips."""
         if self.all.get(number) == content:
             return
         self.all[number] = content
@@ -53,7 +53,7 @@ class Contents:
 
 
 class LiveField(ui.element, component="js/live_field.js", esm={"skysim-views": "js"}):  # type: ignore[call-arg]
-    """An element whose content travels with the frames."""
+    """An element whose content is sent with the frames."""
 
     def __init__(self, contents: Contents, tag: str, type: str = "") -> None:
         super().__init__()
@@ -84,10 +84,10 @@ class LiveInput(LiveField):
         self.contents.set(self.id, {"value": str(value)})
 
 
-# Texts of the page: errors in its words, numbers, and tables as CSV files.
+# Texts of the page: errors, numbers, and tables as CSV files.
 
 
-LABELS = {  # of the fields, by the parameter's key; a key of a scene is the label of its field
+LABELS = {  # labels of fields by parameter; the label of a scene's key is the key
     "solve.fov_deg": "the field of view",
     "solve.time_utc": "the date",
     "solve.catalog": "the star catalog",
@@ -100,7 +100,7 @@ LABELS = {  # of the fields, by the parameter's key; a key of a scene is the lab
 
 
 def for_page(error: InputError) -> str:
-    """An error with the label of the field at fault; without a place if the value was typed in the page."""
+    """An error with the label of the field at fault; without file and line if the value was typed in the page."""
     where = None if error.where == OVERRIDES else error.where
     return str(
         InputError(LABELS.get(error.key, error.key), error.problem, error.allowed, where)
@@ -108,7 +108,7 @@ def for_page(error: InputError) -> str:
 
 
 def format_number(value: float) -> str:
-    """Format with three significant digits, from 100 up as an integer."""
+    """Format with three significant digits; from 100 up, as an integer."""
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 

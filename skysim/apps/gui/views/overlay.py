@@ -1,4 +1,4 @@
-"""Overlay of a frame: which marks it has, and where, in the frame's pixels. Each kind can be switched off."""
+"""Overlay of a frame: its marks and their places in the frame's pixels. Each kind can be switched off."""
 
 from __future__ import annotations
 
@@ -32,16 +32,14 @@ COLORS = {
 }
 KINDS = tuple(COLORS)
 KIND_BY_MARK = {kind: kind for kind in KINDS} | {"faint": "truth"}
-MAX_LABELS = 40  # most names; the brightest lights get them
-MAX_TRUTH_MARKS = 400  # most marks of true lights
-UNSOLVED_TICKS = (
-    60  # of the brightest true lights of a frame without detections; fainter ones are dots
-)
+MAX_LABELS = 40  # maximum number of names; the brightest lights have them
+MAX_TRUTH_MARKS = 400  # maximum number of marks of true lights
+UNSOLVED_TICKS = 60  # number of brightest true lights with marks in a frame without detections; fainter ones are dots
 # Proper names of bright stars by Hipparcos number.
 NAMES: dict[Any, str] = read_yaml(DATA / "star_names.yaml")[0]
 NEAR_PX = 4.0  # a detection within this distance of a true light is not false
 
-Points = list[list[float]]  # to a tenth of a pixel, for a short message
+Points = list[list[float]]  # rounded to a tenth of a pixel, for a short message
 
 
 def marks(
@@ -50,7 +48,7 @@ def marks(
     shown: Collection[str],
     name: Callable[[int], str],
 ) -> dict[str, Any]:
-    """Return what frame.js draws.
+    """Return the marks for frame.js.
 
     Returns
     -------
@@ -100,9 +98,9 @@ def marks(
 def bright_count(
     lights: LightColumns, identified: Collection[int], near: NDArray[np.bool_]
 ) -> int:
-    """How many lights, the brightest first, are as bright as the faintest identified one, or else detected one.
+    """Number of lights that are at least as bright as the faintest identified one, or else the faintest detected one.
 
-    In a field of hundreds of faint stars some detection of noise is beside one of them.
+    Detected ones alone are no measure: in a field of hundreds of faint stars, noise is detected beside some of them.
 
     Parameters
     ----------
@@ -122,17 +120,17 @@ def rounded(xy_px: Floats) -> Points:
     return np.round(xy_px, 1).tolist()
 
 
-# A frame as the browser gets it: its pixels, then marks and texts that are drawn with them.
+# A frame for the browser: its pixels, and the marks and texts that are drawn with them.
 
 
 MAX_SCREEN_PX = 10**5
 KEPT_FRAMES = 5
-FRAMES: dict[str, TabFrames] = {}  # by tab
-IDLE_S = 2.0  # without a frame, after which a stream ends: a browser has six connections for all of its tabs
+FRAMES: dict[str, TabFrames] = {}  # frames by tab
+IDLE_S = 2.0  # time without a frame after which a stream ends: a browser has six connections for all tabs
 
 
 class Source(Protocol):
-    """The session of the tab: the worker has all pixels of its newest images."""
+    """The session of a tab, whose worker has all pixels of its newest images."""
 
     display: Display | None
 
@@ -147,7 +145,7 @@ class ServedFrame:
     Attributes
     ----------
     fields
-        What frame.js needs beside the pixels: pointing, marks, contents of live fields
+        Further data for frame.js: pointing, marks, contents of live fields
     """
 
     pixels: Pixels
@@ -155,17 +153,17 @@ class ServedFrame:
     source: Source
 
     async def response(self, display: Display, whole: bool) -> bytes | None:
-        """Header, pixels, fields as JSON, and the length of these as an unsigned integer of 32 bits. So a frame comes
-        with its marks, and little goes over the websocket, whose messages are compiled as code.
+        """Header, pixels, fields as JSON, and the length of the fields as an unsigned integer of 32 bits.
 
-        None if pixels are missing, and the worker has newer images.
+        So a frame comes with its marks, and little is sent over the websocket, whose messages are compiled as code.
+        The result is None if pixels are missing and the worker only has newer images.
 
         Parameters
         ----------
         display
-            For which the worker makes the next frames
+            Display for which the worker makes the next frames
         whole
-            Whether all pixels of this one are needed
+            Whether all pixels of this frame are needed
         """
         self.source.display = display
         pixels = self.pixels
@@ -183,24 +181,24 @@ class ServedFrame:
 
 @dataclass
 class TabFrames:
-    """The newest frames of a tab, and the stream over which its browser gets them while they follow one another.
+    """The newest frames of a tab, and the stream that sends them to its browser while they follow one another.
 
     A stream is one response for many frames: a request for each would take a fifth of the time that a frame may take.
 
     Attributes
     ----------
     announce
-        Sends the number of a frame to the browser, which then requests it
+        Function that sends the number of a frame to the browser, which then requests the frame
     newest
-        By number
+        Newest frames by number
     waiting
-        Numbers of those to be sent over the stream; None: no stream is open
+        Numbers of the frames to be sent over the stream; None if no stream is open
     drawn
         Number of the last frame that the browser has drawn
     alone
-        Of the last one that did not go over the stream, which later ones must not overtake
+        Number of the last frame outside the stream, which later ones must not overtake
     added_s
-        When the newest one was added, by `time.monotonic`
+        Time at which the newest frame was added, by `time.monotonic`
     """
 
     announce: Callable[[int], Any]
@@ -216,7 +214,7 @@ class TabFrames:
         Parameters
         ----------
         alone
-            Whether the frame must not go over the stream, because messages belong to it
+            Whether the frame is sent outside the stream, because messages belong to it
         """
         self.newest[number] = frame
         self.added_s = time.monotonic()
@@ -248,13 +246,13 @@ class TabFrames:
         finally:
             if self.waiting is waiting:
                 self.waiting = None
-                # The connection was lost before the browser got it.
+                # The connection was lost before the browser got the frame.
                 if self.drawn < max(self.newest, default=0):
                     self.announce(max(self.newest))
 
 
 def display_of(query: Mapping[str, str]) -> Display | None:
-    """The display that a browser asks for; None if the query has a value that is not allowed.
+    """The display of a browser's query; None if the query has a value that is not allowed.
 
     Returns
     -------

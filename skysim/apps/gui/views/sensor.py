@@ -44,8 +44,10 @@ from skysim.core.types import Floats
 from skysim.results import plots
 from skysim.sources.bodies import NAMES as BODIES
 
-FIRST_START = "The first frame on a machine takes up to a minute, because the code is compiled."
-LABELS = NAMES | BODIES  # by number
+FIRST_START = (
+    "The first frame on a machine takes up to a minute, because the code is compiled."
+)
+LABELS = NAMES | BODIES  # names of lights by number
 STRETCHES = list(plots.CURVES)
 COLOR_MAPS = {
     "gray": None,
@@ -55,8 +57,8 @@ COLOR_MAPS = {
     "inferno": cv2.COLORMAP_INFERNO,
     "hot": cv2.COLORMAP_HOT,
 }
-AHEAD = 2  # frames that the browser fetches while it draws another one
-DRAW_TIMEOUT_S = 1.0  # for the browser to report a drawn frame
+AHEAD = 2  # number of frames that the browser fetches while it draws another one
+DRAW_TIMEOUT_S = 1.0  # time for the browser to report a drawn frame
 
 
 class Canvas(ui.element, component="js/frame.js", esm={"skysim-views": "js"}):  # type: ignore[call-arg]
@@ -69,15 +71,15 @@ class SensorView:
     Attributes
     ----------
     id, contents
-        Of the tab, and its live fields
+        Id of the tab, and contents of its live fields
     source
-        Of pixels, set when the tab has got a worker
+        Source of pixels, once the tab has a worker
     hover_px
         Place of the light under the mouse, or None
     sent_number
-        Of the last frame sent to the browser
+        Number of the last frame sent to the browser
     frames
-        The newest ones
+        The newest frames
     """
 
     source: Source
@@ -92,7 +94,7 @@ class SensorView:
         self.prefix = "HIP"
         self.lens: Lens | None = None
         self.pose: Pose | None = None
-        self.statistics = ""  # numbers of the frame, shown while the mouse is on no light
+        self.statistics = ""  # numbers of the frame, shown while no light is under the mouse
         self.hover_px: tuple[float, float] | None = None
         self.sent_number = 0
         self.frames = TabFrames(self.announce)
@@ -105,7 +107,7 @@ class SensorView:
                 self.canvas.add_slot("wait"),
                 ui.element("div").classes("lab-wait") as self.wait,
             ):
-                # No spinner: each takes a sixth of a core from the worker that it waits for, without a graphics card.
+                # No spinner: without a graphics card each takes a sixth of a core from the worker that it waits for.
                 self.waited = ui.element("div").classes("lab-waited mono")
                 self.wait_label = ui.label().mark("wait")
         contents.send = lambda changed: self.canvas.run_method("setContents", changed)
@@ -120,7 +122,7 @@ class SensorView:
         self.show_waiting(f"Setting up {Path(scene).name} …", FIRST_START)
 
     def show_waiting(self, *lines: str, in_vain: bool = False) -> None:
-        """Show what the first frame waits for, and for how long the page has waited; or why there is none (in_vain)."""
+        """Show what the first frame waits for and since when; with `in_vain`, why there is none."""
         self.wait_label.set_text("\n".join(lines))
         self.waited.set_visibility(not in_vain)
 
@@ -171,7 +173,7 @@ class SensorView:
         Parameters
         ----------
         alone
-            See `TabFrames.add`
+            As in `TabFrames.add`
         """
         if not self.sent_number:
             self.wait.set_visibility(False)
@@ -185,7 +187,7 @@ class SensorView:
         self.canvas.run_method("show", {"src": self.address(number)})
 
     def drawn(self, event: Any) -> None:
-        """The browser reports a drawn frame, and how it draws the next ones."""
+        """Handle the browser's report of a drawn frame, and of its display for the next ones."""
         self.frames.drawn = int(event.args["src"].rpartition("/")[2])
         self.frame_drawn.set()
         display = display_of(dict(parse_qsl(str(event.args["display"]))))
@@ -216,7 +218,7 @@ class SensorView:
         self.take(photo, photo.lens)
 
     def take(self, view: FrameView | Photo, lens: Lens | None) -> None:
-        """Take over lights, solution and pointing of a new image, and display it."""
+        """Store lights, solution and pointing of a new image, and display it."""
         self.lights = view.lights
         self.result = view.result
         self.size_px = view.size_px
@@ -237,7 +239,7 @@ class SensorView:
         return f"/frame/{self.id}/{number}"
 
     def fields(self) -> dict[str, Any]:
-        """What frame.js needs beside the pixels: pointing and marks."""
+        """Further data for frame.js: pointing and marks."""
         view = {
             "pose": pose_fields(self.pose) if self.pose else None,
             "label": self.description(),
@@ -245,14 +247,17 @@ class SensorView:
         return view | overlay.marks(self.lights, self.result, self.shown, self.name)
 
     def update_marks(self) -> None:
-        """Send other marks of the newest frame; not as properties, which would be sent again whole with each change
-        of any of them."""
-        self.canvas.run_method("show", {"src": self.address(self.sent_number)} | self.fields())
+        """Send the marks of the newest frame again, as a message: NiceGUI sends all properties if one changes."""
+        self.canvas.run_method(
+            "show", {"src": self.address(self.sent_number)} | self.fields()
+        )
 
     def description(self) -> str:
         """Text alternative of the view for screen readers."""
         detections = self.result.detections if self.result else ()
-        identified = [self.name(detection.id) for detection in detections if detection.id >= 0]
+        identified = [
+            self.name(detection.id) for detection in detections if detection.id >= 0
+        ]
         return f"Sensor view: {len(self.lights)} true lights; identified: {', '.join(identified) or 'none'}"
 
     def name(self, id: int) -> str:
@@ -261,19 +266,19 @@ class SensorView:
         return LABELS.get(id, f"HIP {id}" if id < 1_000_000 else f"star {id}")
 
     def hover_changed(self, event: Any) -> None:
-        """The mouse is on another light, or on none."""
+        """Handle a move of the mouse to another light, or to none."""
         self.hover_px = (event.args["x"], event.args["y"]) if event.args["inside"] else None
         self.update_text()
 
     def light_chosen(self, event: Any) -> None:
-        """A click: what is known of the light there stays on the page until the mouse is on another one."""
+        """Handle a click: the data of the light stay on the page until the mouse is on another one."""
         self.hover_px = (
             (event.args["x"], event.args["y"]) if event.args["id"] is not None else None
         )
         self.update_text()
 
     def nearest(self, x: float, y: float) -> tuple[Detection | None, LightRow | None]:
-        """The nearest detection and the nearest true light within a few marks' width, or None."""
+        """The nearest detection and the nearest true light within a few widths of a mark, or None."""
         radius_px = max(8.0, self.size_px[0] / 60)
 
         def nearest(places_px: Floats) -> int | None:
@@ -288,7 +293,7 @@ class SensorView:
         ], None if light is None else self.lights[light]
 
     def light_text(self, detection: Detection | None, light: LightRow | None) -> str:
-        """Text on a light: where it truly is, the detection and its error."""
+        """Text on a light: its true place, its detection and the error."""
         lines = []
         if light:
             brightness = "" if math.isnan(light.magnitude) else f"V {light.magnitude:.2f}  "
@@ -318,7 +323,9 @@ class SensorView:
 def pose_fields(pose: Pose) -> dict[str, Any]:
     """A pose for frame.js."""
     fields: dict[str, Any] = {"rotation": pose.rotation}
-    return fields | ({"place_m": pose.place_m, "depth_m": pose.depth_m} if pose.depth_m else {})
+    return fields | (
+        {"place_m": pose.place_m, "depth_m": pose.depth_m} if pose.depth_m else {}
+    )
 
 
 @functools.cache
@@ -341,7 +348,7 @@ def statistics_text(
     view: FrameView | None = None,
     scene_info: SceneInfo | None = None,
 ) -> str:
-    """A frame's numbers in two columns; fewer for an image that is not of the scene (view is None)."""
+    """A frame's numbers in two columns; fewer if the image is not of the scene (view is None)."""
     field = ("field", f"{scene_info.field_deg:.4g}°") if scene_info else ("", "")
     rows = [("frame", f"{size_px[0]} × {size_px[1]} px", *field)]
     if view:

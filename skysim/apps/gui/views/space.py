@@ -1,6 +1,6 @@
 """3-D view of the laboratory (three.js): the shapes of its MJCF file, the lights and the vehicle's attitude.
 
-A drag pulls at a point of the vehicle, and frames show its motion.
+A drag pulls at a point of the vehicle; frames show the motion.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ VIEWS = {
     "top": "from above",
 }
 UPDATE_S = 0.1
-AXIS = 0.35  # length of the axes over the distance from which the laboratory is seen
+AXIS = 0.35  # length of the axes, relative to the viewing distance of the laboratory
 MOST_AXIS_M = 1.2
-DIGITS = 5  # of meters
-COAST_S = 60.0  # after a drag, until the vehicle is held
+DIGITS = 5  # decimals of lengths in meters
+COAST_S = 60.0  # time after a drag until the vehicle is stopped
 
 
 class Space(ui.element, component="js/space.js", esm={"skysim-views": "js"}):  # type: ignore[call-arg]
@@ -41,12 +41,12 @@ class Space(ui.element, component="js/space.js", esm={"skysim-views": "js"}):  #
 
 
 class Scene3D:
-    """The view and its buttons; `set_scene` builds it, `show` sets the attitude, which is sent a little later.
+    """The view and its buttons. `set_scene` builds it; `show` sets the attitude, which is sent a little later.
 
     Attributes
     ----------
     newest_view
-        That is not sent yet
+        Newest frame, which is not sent yet
     waits
         Whether `send_newest` will be called
     """
@@ -59,7 +59,9 @@ class Scene3D:
         self.canvas = Space().classes("w-full h-full").mark("space")
         with ui.element("div").classes("lab-looks"):
             for name, text in VIEWS.items():
-                button = ui.button(name, color=None, on_click=lambda name=name: self.look(name))
+                button = ui.button(
+                    name, color=None, on_click=lambda name=name: self.look(name)
+                )
                 button.props("dense outline size=xs")
                 button.props(f'title="look {text}"').mark(f"look-{name}")
         hint = ui.label(
@@ -69,7 +71,7 @@ class Scene3D:
         self.push = PushControl(page, sensor, self.canvas, self.update)
 
     def look(self, name: str) -> None:
-        """Look from a preset, also to undo how the user has turned the view."""
+        """Look from a preset place, also to reset a view that the user has turned."""
         self.canvas.run_method("look", name)
 
     def set_scene(self, scene_info: SceneInfo) -> None:
@@ -97,7 +99,7 @@ class Scene3D:
         self.canvas.run_method("color", list(zip(ids.tolist(), colors, strict=True)))
 
     def show(self, view: FrameView) -> None:
-        """Send the newest attitude soon, so that of many frames in a short time only the last is sent."""
+        """Send the attitude after a delay, so that of many frames in a short time only the last one is sent."""
         self.newest_view = view
         if not self.waits:
             self.waits = True
@@ -108,7 +110,7 @@ class Scene3D:
         self.update()
 
     def update(self) -> None:
-        """Send the vehicle's attitude, and the lights that are on the frame and that are identified."""
+        """Send the vehicle's attitude, and the lights that are in the frame or identified."""
         view = self.newest_view
         self.newest_view = None
         if view is None or not self.page.is_open:
@@ -125,15 +127,15 @@ class PushControl:
     Attributes
     ----------
     moved
-        Called after each frame of the motion
+        Function that is called after each frame of the motion
     grip
-        The newest one; None while the vehicle is not held
+        Newest grip; None while the vehicle is not held
     held_s
-        When there was one last
+        Time of the last grip
     before
         Attitude before the push, deg
     motion
-        Of which frames are being computed; None if there is none
+        Token of the motion whose frames are being computed; None if there is none
     """
 
     def __init__(
@@ -163,7 +165,7 @@ class PushControl:
         self.bar.set_visibility(False)
 
     async def gripped(self, event: Any) -> None:
-        """The user drags the vehicle."""
+        """Handle a drag of the vehicle."""
         grip = Grip(tuple(event.args["held"]), tuple(event.args["wanted"]))
         view = self.page.view
         if self.motion is None and view:
@@ -182,7 +184,7 @@ class PushControl:
         self.grip = None
 
     async def run(self) -> None:
-        """Show frames of the motion, as many as there is time for, until it is stopped."""
+        """Show frames of the motion as fast as possible until it is stopped."""
         page = self.page
         motion = self.motion = object()
         now_s = time.monotonic()
@@ -201,7 +203,7 @@ class PushControl:
             self.stop()
 
     def stop(self) -> None:
-        """Hold the vehicle where it is, because something else is shown."""
+        """Stop the vehicle where it is, because something else is shown."""
         self.motion = self.grip = self.before = None
         self.bar.set_visibility(False)
 

@@ -1,6 +1,6 @@
 """The state of a page: what it shows, as one value that an address can hold.
 
-Reload, back, a shared link, undo and redo all read a `View` from the page's address and show it again.
+Reload, back, a shared link, undo and redo all read a `PageView` from the page's address and show it again.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 
 @dataclass(frozen=True, slots=True)
 class PageView:
-    """What a page shows.
+    """The view of a page.
 
     Attributes
     ----------
     scene, overrides
         The scene and the keys that differ from its file
     kind
-        Live scene at rest, a moment of its flight, a study's trial again, or an image from
-        elsewhere
+        Live scene at rest, a moment of its flight, a replayed trial of a study, or an image that
+        is not of the scene
     angles_deg
         Attitude of the live scene; None: the scene's own start
     t_s
-        Begin of the shown frame of a flight
+        Beginning of the shown frame of a flight
     study, trial
         Folder of the study in the Monte Carlo panel, and the trial that is replayed
     photo
-        Name of the image from elsewhere
+        Name of the image that is not of the scene
     """
 
     scene: str
@@ -49,7 +49,7 @@ class PageView:
     photo: str = ""
 
     def query(self) -> str:
-        """The view as the query of an address, without what has its default."""
+        """The view as the query of an address, without default values."""
         pairs = [
             ("scene", self.scene),
             *(("set", f"{key}={value}") for key, value in self.overrides.items()),
@@ -76,8 +76,12 @@ class PageView:
         Parameters
         ----------
         scenes
-            Those that the page offers. An address from elsewhere opens no other file. Raises
-            InputError.
+            Scenes that the page offers; an address can open no other file
+
+        Raises
+        ------
+        InputError
+            For an address with other scenes or invalid values.
         """
         pairs = parse_qsl(query.removeprefix("?"))
         one: dict[str, Any] = dict(pairs)
@@ -85,7 +89,8 @@ class PageView:
             return None
         if one["scene"] not in scenes:
             raise InputError(
-                "link", f"scene {one['scene']!r} is not offered here; choose one from the list"
+                "link",
+                f"scene {one['scene']!r} is not offered here; choose one from the list",
             )
         kind = one.get("view", "live")
         if kind not in KINDS:
@@ -98,7 +103,9 @@ class PageView:
             trial = int(one.get("trial", -1))
         except ValueError:
             raise InputError("link", "at, t, trial", "numbers") from None
-        if not all(map(math.isfinite, (*(angles or ()), t_s))) or (angles and len(angles) != 3):
+        if not all(map(math.isfinite, (*(angles or ()), t_s))) or (
+            angles and len(angles) != 3
+        ):
             raise InputError("link", "at", "three angles in degrees; t: seconds")
         overrides = dict(value.partition("=")[::2] for key, value in pairs if key == "set")
         study = one.get("study", "")
@@ -111,7 +118,7 @@ class PageView:
 
     @property
     def coarse(self) -> tuple[Any, ...]:
-        """What changes in steps that a user undoes one by one."""
+        """The values whose changes a user undoes one by one."""
         return self.scene, dict(self.overrides), self.kind, self.study, self.trial, self.photo
 
     @property

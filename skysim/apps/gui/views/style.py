@@ -7,7 +7,7 @@ import numpy as np
 
 from skysim.core.types import Floats
 
-# Color-blind people can distinguish the colors of states, marks and curves too: tests/apps/gui/test_shell.py.
+# Color-blind people can also distinguish the colors of states, marks and curves: tests/apps/gui/test_shell.py.
 DARK = {
     "ground": "#0d1015",
     "panel": "#141922",
@@ -30,12 +30,12 @@ LIGHT = {
     "warn": "#b05400",
     "bad": "#8a1040",
 }
-COLORS = {name: f"var(--lab-{name})" for name in DARK}  # in CSS: of the theme
-CURVE_COLORS = ["#3aa6f2", "#e0a82a", "#0d7b84", "#d02f28"]  # of both
+COLORS = {name: f"var(--lab-{name})" for name in DARK}  # CSS values, which follow the theme
+CURVE_COLORS = ["#3aa6f2", "#e0a82a", "#0d7b84", "#d02f28"]  # for both themes
 
 
 def chart_color(name: str) -> str:
-    """JavaScript of a theme's color, for ECharts; the name of an option that has it begins with a colon."""
+    """JavaScript of a theme's color for ECharts; the name of its option must begin with a colon."""
     return f'getComputedStyle(document.body).getPropertyValue("--lab-{name}").trim()'
 
 
@@ -54,9 +54,9 @@ TOOLTIP = {
 
 
 def color_scale(values: Floats) -> Floats:
-    """(N, 3) sRGB, 0 to 1, of values from 0 to 1: the map cividis, which is the same to color-blind eyes.
+    """(N, 3) sRGB, 0 to 1, of values from 0 to 1: the map cividis, which looks the same to color-blind people.
 
-    Its darkest third is left out, because it would not be seen on the dark ground.
+    Its darkest third is left out, because it cannot be seen on the dark background.
     """
     levels = np.rint(85 + 170 * np.clip(values, 0, 1)).astype(np.uint8)
     return np.asarray(

@@ -1,4 +1,4 @@
-"""Small elements that the panels share: rows, buttons, texts, lists, numbers, all in the look of the page."""
+"""Small elements in the style of the page that the panels share: rows, buttons, texts, lists, numbers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skysim.apps.gui.views import keys
 
 
 def row(gap: int = 2) -> ui.row:
-    """A row as wide as its panel, which is not wrapped.
+    """A row as wide as its panel, without wrapping.
 
     Parameters
     ----------
@@ -34,9 +34,9 @@ def button(
     Parameters
     ----------
     action
-        Called, and awaited if need be, when it is pressed
+        Function that is called (and awaited, if it is asynchronous) when the button is pressed
     mark
-        Name by which tests find it
+        Name by which tests find the button
     look
         Quasar's style: outline or flat
     """
@@ -44,7 +44,7 @@ def button(
 
 
 def select(options: Any, look: str = "outlined", **settings: Any) -> ui.select:
-    """A list to choose from, which gives the keyboard back to the page after a choice.
+    """A list to choose from, which returns the keyboard focus to the page after a choice.
 
     Parameters
     ----------

@@ -28,20 +28,20 @@ from skysim.tracking.onboard_model import calibration
 
 MAX_STARS = 600
 MAX_LEDS = 4000
-WIDE_DEG = 100.0  # of the view from the bearing
+WIDE_DEG = 100.0  # field of the view from the bearing
 
 
 def lab_geometry(lab: Lab) -> LabGeometry:
-    """Geometry of a lab: that of its MJCF file, its lights, and the places to look from."""
+    """Geometry of a lab: the shapes of its MJCF file, its lights, and the places to look from."""
     model = multibody.laboratory(lab.export_mjcf())
     return LabGeometry(model.shapes, *lights(lab.camera.sources), views(lab, model))
 
 
 def lights(sources: Sources) -> tuple[NDArray[np.int64], Floats, Floats, NDArray[np.bool_]]:
-    """Ids, (N, 3) positions, (N,) drawn radii in m of the brightest lights, the brightest first, and which are lit.
+    """Ids, (N, 3) positions and (N,) drawn radii in m of the brightest lights, brightest first, and which are lit.
 
-    An LED's radius grows with the time-averaged power to the power of 0.3, so that faint ones remain visible; a star's
-    with its square root, as in the MJCF file.
+    The radius of an LED grows with the time-averaged power to the power of 0.3, so that faint ones remain visible; that
+    of a star grows with the square root of its light, as in the MJCF file.
     """
     power = sources.strength * np.minimum(sources.on_s / sources.period_s, 1.0)
     stars = bool((sources.place[:, 3] == 0).any())
@@ -78,19 +78,20 @@ def views(lab: Lab, model: multibody.Laboratory) -> dict[str, LookFrom]:
 def look_from(
     eye_m: Floats, target_m: Floats, up: Floats, fov_deg: float, on_vehicle: bool = False
 ) -> LookFrom:
-    eye, target, upwards = ((float(x), float(y), float(z)) for x, y, z in (eye_m, target_m, up))
+    eye, target, upwards = (
+        (float(x), float(y), float(z)) for x, y, z in (eye_m, target_m, up)
+    )
     return LookFrom(eye, target, upwards, fov_deg, on_vehicle)
 
 
-# Where a frame's pixels point, for the browser.
+# Directions of a frame's pixels, for the browser.
 
 
-NODES = 13  # along each side of a frame, of the tables between which the browser interpolates
+NODES = 13  # points along each side of a frame, between which the browser interpolates
 
 
 def lens_of(camera: Camera) -> Lens:
-    """Tables of the tangents x / z and y / z of a camera's pixels, from the frame's upper left to its lower right
-    corner."""
+    """Tables of the tangents x / z and y / z of a camera's pixels, from the upper left to the lower right corner."""
     x = np.linspace(-0.5, camera.width_px - 0.5, NODES)
     y = np.linspace(-0.5, camera.height_px - 0.5, NODES)
     tangents = camera.tangents(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
@@ -113,7 +114,7 @@ def scene_pose(lab: Lab, lens: Lens, truth: Truth) -> Pose:
     length = np.linalg.norm(rays_cam, axis=1)
     dome = surface.build_surface(lab.scene.light.surface)
     points_m = dome.meet(place_m, lab_from_cam.apply(rays_cam / length[:, None]))
-    # Along the boresight; NaN where a ray meets nothing.
+    # Depths along the boresight; NaN where a ray meets nothing.
     depth_m = np.linalg.norm(points_m - place_m, axis=1) / length
     return Pose(rotation, tuple(place_m.tolist()), tuple(rounded(depth_m)))
 
@@ -130,11 +131,10 @@ def solved_pose(attitude: Attitude) -> Pose | None:
     return Pose(tuple(attitude.cam_from_ref.inv().as_matrix().ravel().tolist()))
 
 
-# Camera pointing: from typed angles, or by rotations about the camera's own axes, which have no
-# singularity.
+# Camera pointing: from typed angles, or by rotations about the camera's own axes, which have no singularity.
 
 
-# step of an arrow key without and with shift, in fields of view
+# Step of an arrow key without and with shift, in fields of view.
 FINE = 0.02
 COARSE = 0.2
 ROLL_FINE_DEG = 1.0
@@ -148,7 +148,9 @@ RANGES = {  # degrees
 }
 
 
-def from_angles(scene: Scene, mount: Mount, angles_deg: tuple[float, float, float]) -> Rotation:
+def from_angles(
+    scene: Scene, mount: Mount, angles_deg: tuple[float, float, float]
+) -> Rotation:
     """lab_from_body from RA, Dec, roll of the camera under stars, else from roll, pitch, yaw of the vehicle; degrees.
 
     Raises
@@ -202,34 +204,35 @@ def within_stop(scene: Scene, lab_from_body: Rotation) -> Rotation:
     return lab_from_body
 
 
-# Pushing the vehicle: a user pulls at a point of it, and its multibody dynamics are integrated in
-# real time.
+# Pushing the vehicle: a user pulls at a point of it, and its dynamics are integrated in real time.
 
 
-PULL_RAD_S = 1.5  # a held vehicle without gravity would swing at this angular frequency about where it is pulled to
-PERIOD_S = 0.01  # for which a torque is held in body axes
-MAX_ADVANCE_S = 0.25  # in one call; on a slow machine the motion is slower than real time
+PULL_RAD_S = 1.5  # angular frequency at which a held vehicle without gravity swings about the wanted point
+PERIOD_S = 0.01  # time for which a torque is constant in body axes
+MAX_ADVANCE_S = (
+    0.25  # maximum step of one call; on a slow machine the motion is slower than real time
+)
 
 
 class Grip(NamedTuple):
-    """Where the vehicle is held, in body axes, and where that point is pulled to, in the lab frame; m."""
+    """The held point of the vehicle in body axes, and the wanted place of this point in the lab frame; m."""
 
     held_body_m: tuple[float, float, float]
     wanted_m: tuple[float, float, float]
 
 
 class Push:
-    """The motion of a lab's vehicle from rest at an attitude, as long as the user lets it go on.
+    """The motion of a lab's vehicle from rest at an attitude, under the pull of a user.
 
     Attributes
     ----------
     simulation
-        With gravity, drag, cable, tilt stop and the rotors' momentum; without disturbances and
-        controller
+        Dynamics with gravity, drag, cable, tilt stop and the rotors' momentum, without
+        disturbances and controller
     lab_from_body
         The present attitude
     torque_nm
-        (3,) of the grip in the last period, body axes
+        (3,) torque of the grip in the last period, body axes
     """
 
     def __init__(self, lab: Lab, lab_from_body: Rotation) -> None:
@@ -244,7 +247,7 @@ class Push:
 
     @property
     def exposure_s(self) -> float:
-        """How much of the motion a frame sees."""
+        """Duration of the motion that a frame shows."""
         window = exposure_window(self.lab.scene, 0)
         return window.close_s(self.lab.scene.camera.height_px) - window.open_s + 2 * MARGIN_S
 
@@ -254,8 +257,12 @@ class Push:
         period = round(PERIOD_S / simulation.step_s)
         steps = round(min(elapsed_s, MAX_ADVANCE_S) / simulation.step_s)
         for begin in range(0, steps, period):
-            lab_from_body = Rotation.from_quat(simulation.lab_from_body_wxyz, scalar_first=True)
-            self.torque_nm = pull_torque_nm(grip, lab_from_body, self.lab.vehicle.inertia_kg_m2)
+            lab_from_body = Rotation.from_quat(
+                simulation.lab_from_body_wxyz, scalar_first=True
+            )
+            self.torque_nm = pull_torque_nm(
+                grip, lab_from_body, self.lab.vehicle.inertia_kg_m2
+            )
             control = np.zeros((min(period, steps - begin), simulation.model.nu))
             control[:, simulation.vehicle.torques] = self.torque_nm
             simulation.advance(control)
@@ -264,7 +271,7 @@ class Push:
         )
 
     def seen(self) -> Trajectory:
-        """A motion of which frame 0 sees what happened until now; before it the vehicle was at rest."""
+        """A trajectory whose frame 0 ends now; before the motion the vehicle is at rest."""
         window = exposure_window(self.lab.scene, 0)
         end_s = window.close_s(self.lab.scene.camera.height_px) + MARGIN_S
         begin = self.simulation.step - math.ceil(self.exposure_s / self.simulation.step_s)
@@ -280,12 +287,14 @@ class Push:
         return Trajectory(t_s, attitudes, rates)
 
 
-def pull_torque_nm(grip: Grip | None, lab_from_body: Rotation, inertia_kg_m2: Floats) -> Floats:
-    """(3,) torque about the bearing, in body axes, of a force towards the wanted point.
+def pull_torque_nm(
+    grip: Grip | None, lab_from_body: Rotation, inertia_kg_m2: Floats
+) -> Floats:
+    """(3,) torque about the bearing, in body axes, of a force toward the wanted point.
 
-    With the held point r and the way d from it to the wanted one, T = J w^2 (r x d) / max(r^2, |r x d|): that of a
-    force in proportion to d, scaled so that vehicles of every size follow alike, and not above J w^2. J is the mean
-    moment of inertia, w is PULL_RAD_S. The force itself is the bearing's to bear.
+    With the held point r and the vector d from it to the wanted one, T = J w^2 (r x d) / max(r^2, |r x d|). This is the
+    torque of a force proportional to d, scaled so that vehicles of every size follow alike, and at most J w^2. J is the
+    mean moment of inertia, w is PULL_RAD_S. The bearing takes the force itself.
     """
     if grip is None:
         return np.zeros(3)

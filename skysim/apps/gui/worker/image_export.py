@@ -38,14 +38,17 @@ FILE_BY_ITEM = {  # file by menu entry
 }
 
 
-def frame_files(workbench: Workbench, base: str, overrides: dict[str, str]) -> dict[str, bytes]:
+def frame_files(
+    workbench: Workbench, base: str, overrides: dict[str, str]
+) -> dict[str, bytes]:
     """All files by name. Raises InputError if no frame has been rendered."""
     if workbench.frame is None or workbench.truth is None:
         raise InputError("", "no frame has been rendered yet")
     with tempfile.TemporaryDirectory() as folder:
         recording.write_frame(Path(folder), workbench.frame, workbench.truth, workbench.scene)
         contents = {
-            f"frame{path.suffix}": path.read_bytes() for path in sorted(Path(folder).iterdir())
+            f"frame{path.suffix}": path.read_bytes()
+            for path in sorted(Path(folder).iterdir())
         }
     annotated = scoring.annotated(workbench.frame, workbench.truth, workbench.report)
     contents["figure.png"] = bytes(cv2.imencode(".png", annotated)[1])

@@ -51,15 +51,15 @@ class Photo:
     Attributes
     ----------
     pixels, saturation_dn, pose
-        See `FrameView`
+        As in `FrameView`
     lens
-        Of the pose; both are None if the image was not solved
+        Lens for the pose; both are None if the image was not solved
     names, true_deg
-        Of its three angles, and their true values if known
+        Names of the three angles, and their true values if known
     lights, prefix
         True lights of a study's trial, and the catalog of the lights' numbers (HIP or LED)
     hint
-        Of a refused file the likely cause, of a solved one what was assumed
+        Likely cause of a refusal, or assumption about a solved file
     """
 
     size_px: tuple[int, int]
@@ -77,8 +77,8 @@ class Photo:
     hint: str = ""
 
 
-PhotoPixels = tuple[Photo, NDArray]  # with the image's pixels
-# Ends of the names of image files, as a browser's file dialog takes them: ".gz" for ".fits.gz".
+PhotoPixels = tuple[Photo, NDArray]  # a photo and the image's pixels
+# Suffixes of image files as a browser's file dialog takes them: ".gz" for ".fits.gz".
 SUFFIXES = tuple(
     dict.fromkeys("." + suffix.rpartition(".")[2] for suffix in images.IMAGE_SUFFIXES)
 )
@@ -90,7 +90,7 @@ Stages = tuple[tuple[str, str], ...]  # chosen algorithms: pairs of stage and na
 def photo_from_file(
     name: str, data: bytes, fov_deg: float | None, stages: Stages = ()
 ) -> PhotoPixels:
-    """Solve an uploaded file, as it is viewed. Raises InputError if it is no readable image."""
+    """Solve an uploaded file, as it is viewed. Raises InputError if it is not a readable image."""
     suffix = images.image_suffix(name)
     if not suffix:
         raise InputError(Path(name).name, "", ", ".join(images.IMAGE_SUFFIXES))
@@ -119,7 +119,9 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     frame, truth, report = next(runner.replayed_frames(setup, row.seed))
     result = tracker_result(setup.lab, setup.estimator, frame, truth, report)
     if row.error:
-        result = TrackerResult(row.error.strip().splitlines()[-1], result.detections, result.ms)
+        result = TrackerResult(
+            row.error.strip().splitlines()[-1], result.detections, result.ms
+        )
     scene = setup.lab.scene
     (height, width) = frame.image_dn.shape
     photo = Photo(
@@ -139,7 +141,7 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
 
 
 def solve_frame(image: NDArray, fov_deg: float | None, stages: Stages = ()) -> PhotoPixels:
-    """Solve a frame of a live camera; the result's status says why if there is no solution."""
+    """Solve a frame of a live camera; without a solution, the status of the result is the reason."""
     check_size(image)
     return solved_photo(
         image,
@@ -150,7 +152,7 @@ def solve_frame(image: NDArray, fov_deg: float | None, stages: Stages = ()) -> P
 
 
 def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoPixels:
-    """What the page shows of an image that a tracker has solved or refused."""
+    """The photo for the page of an image that a tracker has solved or refused."""
     attitude = report.attitude
     detections = detection_views(
         report, matches_by_row(tracker, attitude, report.centroids.xy_px)

@@ -1,8 +1,8 @@
-"""A frame's pixels for the browser: all of them as numbers, or the shades of as many as its screen has.
+"""A frame's pixels for the browser: all of them as numbers, or as many shades as its screen has pixels.
 
-While frames follow one another the browser gets shades: sending and coloring a million numbers takes it longer than a
-frame lasts. Limits and histogram are those of the whole frame, so the picture does not change when it comes to rest and
-all pixels arrive.
+While frames follow one another the browser gets shades: it takes longer than a frame to receive and color a million
+numbers. Limits and histogram are those of the whole frame, so the picture does not change when the motion ends and all
+pixels arrive.
 """
 
 from __future__ import annotations
@@ -23,14 +23,16 @@ from skysim.results import plots
 
 LEVELS = 2**16 - 1
 HEADER_BYTES = 16
-# the shade of saturated pixels, and the number of the others
+# Shade of saturated pixels, and number of the other shades.
 SATURATED = 255
 SHADES = 255
-WORTHWHILE = 0.95  # of the columns, above which all pixels are sent
-BINS = 80  # of the histogram
-AXIS_MARGIN = 0.3  # on either side of it, in units of its axis
-ZSCALE_SAMPLES = 1000  # pixels, as in IRAF
-LOUPE_PX = 11  # most rows and columns in the loupe
+WORTHWHILE = (
+    0.95  # fraction of the frame's columns on the screen above which all pixels are sent
+)
+BINS = 80  # number of bins of the histogram
+AXIS_MARGIN = 0.3  # margin on either side of the histogram, in units of its axis
+ZSCALE_SAMPLES = 1000  # number of sampled pixels, as in IRAF
+LOUPE_PX = 11  # maximum number of rows and columns in the loupe
 
 
 class PixelLevels(NamedTuple):
@@ -39,7 +41,7 @@ class PixelLevels(NamedTuple):
     Attributes
     ----------
     integers
-        (H, W), of 8 or 16 bits
+        (H, W) unsigned integers of 8 or 16 bits
     """
 
     integers: NDArray
@@ -52,8 +54,10 @@ class PixelLevels(NamedTuple):
 
 
 def levels_of(image: NDArray) -> PixelLevels:
-    """The levels of an image: exact for integers of 8 and 16 bits; other numbers are rounded to 65,535 steps between
-    the least and the greatest value."""
+    """The levels of an image.
+
+    Integers of 8 and 16 bits are exact; other numbers are rounded to 65,535 steps between the least and the greatest.
+    """
     if image.dtype in (np.uint8, np.uint16):
         return PixelLevels(image)
     low = float(image.min())
@@ -84,15 +88,16 @@ def levels_from(data: bytes, size_px: tuple[int, int]) -> PixelLevels:
 def pixels_for(
     display: Display, levels: PixelLevels, saturation_dn: float, number: int = 0
 ) -> Pixels:
-    """What the browser gets of an image: offset and step of its levels, then these, or shades if its screen has fewer
-    columns than the image.
+    """The pixels of an image for the browser.
+
+    They are its levels with their offset and step, or shades if the screen has fewer columns than the image.
 
     Parameters
     ----------
     saturation_dn
-        From which a pixel is saturated
+        Value from which a pixel is saturated
     number
-        Of the image in its worker
+        Number of the image in its worker
     """
     integers = levels.integers
     (height, width) = levels.integers.shape
@@ -100,7 +105,9 @@ def pixels_for(
     saturation = (saturation_dn - levels.offset) / levels.step
     columns = columns_for(display, width, height)
     shaded = 0 < columns < WORTHWHILE * width
-    drawn = shades(integers, columns, limits, saturation, display.curve) if shaded else integers
+    drawn = (
+        shades(integers, columns, limits, saturation, display.curve) if shaded else integers
+    )
     fields: dict[str, Any] = {
         "size": (width, height),
         "grid": drawn.shape[::-1],
@@ -127,7 +134,11 @@ def columns_for(display: Display, width: int, height: int) -> int:
 
 
 def shades(
-    integers: NDArray, columns: int, limits: tuple[float, float], saturation: float, curve: str
+    integers: NDArray,
+    columns: int,
+    limits: tuple[float, float],
+    saturation: float,
+    curve: str,
 ) -> NDArray[np.uint8]:
     """The image in fewer columns: the mean over each area, from 0 (black) to SHADES - 1 (white).
 
@@ -136,7 +147,9 @@ def shades(
     height, width = integers.shape
     rows = max(round(height * columns / width), 1)
     low, high = limits
-    fraction = np.clip((np.arange(int(integers.max()) + 1) - low) / max(high - low, 1e-9), 0, 1)
+    fraction = np.clip(
+        (np.arange(int(integers.max()) + 1) - low) / max(high - low, 1e-9), 0, 1
+    )
     table = np.rint((SHADES - 1) * plots.CURVES[curve](fraction)).astype(np.uint8)
     shaded = np.empty((rows, columns), np.uint8)
     _shade(integers, table, shaded)
@@ -145,15 +158,15 @@ def shades(
     return shaded
 
 
-# Lengths are counted in units that divide both pixels and areas: a pixel is as high as there are rows of areas, and an
-# area as there are rows of pixels, so that no rounding assigns a pixel to an area that it does not overlap.
+# Heights are in units of which a pixel has as many as there are rows of areas, and an area as many as there are rows of
+# pixels. So all are integers, and no rounding assigns a pixel to an area that it does not overlap.
 
 
 @jit(parallel=True)
 def _shade(integers: Any, table: Any, shaded: Any) -> None:
     """Write the shade of the mean over each area.
 
-    Indices are unsigned, which saves numba's check for negative ones in the loops that take the time.
+    Indices are unsigned, which saves numba's check for negative ones in the inner loops.
     """
     height, width = integers.shape
     rows, columns = shaded.shape
@@ -218,7 +231,9 @@ def limits_of(levels: PixelLevels, limits: str | tuple[float, float]) -> tuple[f
         low, high = ((dn - levels.offset) / levels.step for dn in limits)
         return low, high
     if limits == "zscale":
-        samples = integers.ravel()[:: max(1, integers.size // ZSCALE_SAMPLES)][:ZSCALE_SAMPLES]
+        samples = integers.ravel()[:: max(1, integers.size // ZSCALE_SAMPLES)][
+            :ZSCALE_SAMPLES
+        ]
         low, high = ZScaleInterval().get_limits(samples)
         return float(low), float(high)
     if limits == "min to max":
@@ -227,15 +242,17 @@ def limits_of(levels: PixelLevels, limits: str | tuple[float, float]) -> tuple[f
 
 
 def histogram(integers: NDArray) -> dict[str, Any]:
-    """Counts of a sample of the pixels, in BINS of an axis that is an inverse hyperbolic sine about the sky, in units
-    of its scatter: linear there, logarithmic for stars.
+    """Counts of a sample of the pixels in BINS bins.
+
+    The axis is an inverse hyperbolic sine about the sky, in units of the sky's scatter: linear there, logarithmic for
+    stars.
 
     Returns
     -------
     sky, scatter
-        Of the axis
+        Median and scatter of the sky, which define the axis
     range
-        Least and greatest value of all pixels, over which it reaches
+        Least and greatest value of all pixels, the range of the axis
     """
     sample = integers[:: 2 * plots.SAMPLE_STRIDE, :: plots.SAMPLE_STRIDE].astype(float)
     low = float(integers.min())

@@ -12,7 +12,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Report
-from skysim.apps.gui.messages import FlightRow, FlightStep, FrameView, MotionLog, TrackerResult
+from skysim.apps.gui.messages import (
+    FlightRow,
+    FlightStep,
+    FrameView,
+    MotionLog,
+    TrackerResult,
+)
 from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker.workbench import Workbench, tracker_result
 from skysim.core import quaternion
@@ -22,10 +28,10 @@ from skysim.results import telemetry_report
 from skysim.simulation.flight import Flight, Shot
 from skysim.simulation.timing import exposure_window
 
-NO_RESULT = TrackerResult("", (), 0.0)  # of a frame that was not solved
-MAX_POINTS = 500  # of a curve on the page, roughly
+NO_RESULT = TrackerResult("", (), 0.0)  # result for a frame that was not solved
+MAX_POINTS = 500  # approximate maximum number of points of a curve on the page
 FLOOR = 1e-3  # arcsec; lower limit of values on a logarithmic axis
-# Of frames in the file, beyond which they are rendered again when they are shown.
+# Maximum size of the frames in the file; further frames are rendered again when they are shown.
 KEPT_BYTES = 2**28
 
 
@@ -36,8 +42,8 @@ class KeptFrame:
     Attributes
     ----------
     place
-        Of these in the file, and their number of bytes; None: they are rendered again, bit for
-        bit
+        Place of the pixels in the file, and their number of bytes; None if they are rendered
+        again, which gives the same bits
     """
 
     view: FrameView
@@ -46,14 +52,14 @@ class KeptFrame:
 
 
 class Playback:
-    """A flight of a workbench's scene. Frames are those of `skysim run`.
+    """A flight of a workbench's scene. Its frames are those of `skysim run`.
 
     Its computation is a series of short steps, so that the worker does other tasks between them.
 
     Attributes
     ----------
     file
-        Pixels of the first frames, so that playing them costs no rendering
+        Pixels of the first frames, which need not be rendered again for playback
     shown
         Number of the shown frame
     reported
@@ -73,7 +79,7 @@ class Playback:
         )
 
     def advance(self, budget_s: float) -> FlightStep:
-        """Compute for about a time, and report what is new."""
+        """Compute for about budget_s, and report the progress."""
         end_s = time.perf_counter() + budget_s
         is_done = False
         while not is_done and time.perf_counter() < end_s:
@@ -101,10 +107,12 @@ class Playback:
         )
 
     def add(self, shot: Shot) -> None:
-        """Keep a shot, and its pixels as far as the file has room."""
+        """Keep a shot, and its pixels if the file has room."""
         bench = self.bench
         assert shot.report is not None
-        solved = tracker_result(bench.lab, bench.estimator, shot.frame, shot.truth, shot.report)
+        solved = tracker_result(
+            bench.lab, bench.estimator, shot.frame, shot.truth, shot.report
+        )
         view = bench.frame_view(shot.frame, shot.truth, solved, sum(shot.seconds.values()))
         t_s = exposure_window(bench.scene, shot.frame.index, shot.frame.exposure_s).open_s
         self.frames.append(
@@ -121,7 +129,7 @@ class Playback:
         return begin, len(data)
 
     def show(self, index: int) -> tuple[FrameView, pixels.PixelLevels]:
-        """The view of a kept frame and its pixels; the scene is seen from there from now on."""
+        """The view of a kept frame and its pixels; its attitude becomes that of the workbench."""
         kept = self.frames[index]
         bench = self.bench
         self.shown = index
@@ -135,7 +143,7 @@ class Playback:
         return kept.view, pixels.levels_from(self.file.read(kept.place[1]), kept.view.size_px)
 
     def render(self) -> None:
-        """Render the shown frame with its truth, unless another frame of the scene has been rendered since."""
+        """Render the shown frame with its truth, unless a later frame of the scene has been rendered."""
         if self.shown is None or self.bench.frame is not None:
             return
         kept = self.frames[self.shown]

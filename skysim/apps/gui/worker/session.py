@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # the template sets the environment of numba before it is imp
 TEMPLATE = "skysim.apps.gui.template"  # module of the worker from which the others are forked
 SCENE = "SKYSIM_GUI_SCENE"  # environment variable: the scene that the template of the workers sets up
 STOPPED = "the worker of this page has stopped"
-QUEUE_S = 0.2  # between two looks for a free worker
+QUEUE_S = 0.2  # interval of looking for a free worker
 
 
 class WorkerLost(Exception):
@@ -51,7 +51,7 @@ def serve(pipe: Connection) -> None:
             pipe.send(("error", InputError("", error)))
         except MemoryError:
             pipe.send(("error", InputError("", "not enough memory")))
-        except Exception as error:  # a bug in one task must not end the tab
+        except Exception as error:  # a bug in one task must not end the worker
             pipe.send(("error", InputError("", f"{type(error).__name__}: {error}")))
 
 
@@ -61,9 +61,9 @@ class Session:
     Attributes
     ----------
     display
-        Of the browser, for which the worker makes frames; None: not known yet
+        Display of the browser, for which the worker makes frames; None if it is not known yet
     alive
-        All that are not closed
+        All sessions that are not closed
     """
 
     display: Display | None = None
@@ -111,7 +111,7 @@ class Session:
         if self.process.pid:
             self.process.terminate()
             self.process.join(2.0)
-        self.pipe.close()  # a worker that starts meanwhile ends thereby
+        self.pipe.close()  # this also ends a worker that is just starting
         self.thread.shutdown(wait=False, cancel_futures=True)
 
 
@@ -121,9 +121,9 @@ class Workers:
     Attributes
     ----------
     limit
-        Of workers at once
+        Maximum number of workers
     queue
-        Of the tabs that wait for one, the first first
+        Tabs that wait for a worker, first come first
     """
 
     def __init__(self, limit: int) -> None:
@@ -144,18 +144,18 @@ class Workers:
         forkserver.ensure_running()
 
     def take(self) -> Session | None:
-        """A new worker; None if there are as many as the limit already."""
+        """A new worker; None if the limit is reached."""
         return Session() if len(Session.alive) < self.limit else None
 
     async def wait(
         self, wanted: Callable[[], bool], tell: Callable[[str], None]
     ) -> Session | None:
-        """Do as `take`, once it is this tab's turn; return None if no worker is wanted any more.
+        """A new worker when it is this tab's turn; None if the tab no longer wants one.
 
         Parameters
         ----------
         tell
-            Called with what the tab waits for, in words
+            Function that is called with a text on what the tab waits for
         """
         ticket = object()
         self.queue.append(ticket)

@@ -31,8 +31,8 @@ RESPONSES = {  # label on the page by response
     "time_ms_median": "ms per trial",
 }
 BINS = 28
-PAGE_STUDY = "monte_carlo_"  # of the folders of Monte Carlo studies, followed by their user
-MAX_STUDIES = 4  # at once, of all pages
+PAGE_STUDY = "monte_carlo_"  # prefix of the folders of Monte Carlo studies; the user follows
+MAX_STUDIES = 4  # maximum number of studies of all pages at once
 MAX_FAILED = 20  # maximum number of failed trials in the results
 
 
@@ -82,7 +82,7 @@ class StudyProcess:
     Attributes
     ----------
     begun
-        Processes of all tabs; those that have ended are taken out before another begins
+        Processes of all tabs; ended ones are removed before another one begins
     """
 
     begun: ClassVar[set[StudyProcess]] = set()
@@ -152,7 +152,9 @@ class StudyProcess:
         error_arcsec = metrics.QUANTITIES["angle_arcsec"](columns)
         bins, heights = histogram(error_arcsec[np.isfinite(error_arcsec)])
         failed = (*raised, *unsolved(columns))[:MAX_FAILED]
-        return StudyResults(counts["done"], counts["wrong"], statistics, bins, heights, failed)
+        return StudyResults(
+            counts["done"], counts["wrong"], statistics, bins, heights, failed
+        )
 
 
 def unsolved(columns: Mapping[str, Any]) -> list[tuple[int, str]]:
@@ -162,7 +164,10 @@ def unsolved(columns: Mapping[str, Any]) -> list[tuple[int, str]]:
     unsolved_trials = zip(
         columns["trial"][refused].tolist(), columns["status"][refused].tolist(), strict=True
     )
-    return [*((trial, "wrong") for trial in columns["trial"][wrong].tolist()), *unsolved_trials]
+    return [
+        *((trial, "wrong") for trial in columns["trial"][wrong].tolist()),
+        *unsolved_trials,
+    ]
 
 
 def histogram(error_arcsec: Any) -> tuple[tuple[float, ...], tuple[int, ...]]:
@@ -177,7 +182,7 @@ def histogram(error_arcsec: Any) -> tuple[tuple[float, ...], tuple[int, ...]]:
 
 
 def run_and_report(study: Path, folder: Path) -> None:
-    """Run a study's missing trials and write its report: the body of the process, which SIGTERM ends as Ctrl-C does."""
+    """Body of the process: run a study's missing trials and write its report. SIGTERM ends it as Ctrl-C does."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         run_study(study, out=folder, workers=1).report().save(folder / "report.html")
@@ -188,14 +193,16 @@ def run_and_report(study: Path, folder: Path) -> None:
 
 
 def is_shown(name: str, user: str) -> bool:
-    """Whether a user may see a study: all but the Monte Carlo studies that another user has started in the page."""
+    """Whether a user may see a study: any except the Monte Carlo studies of other users of the page."""
     return not name.startswith(PAGE_STUDY) or name.startswith(f"{PAGE_STUDY}{user}_")
 
 
 def finished(folder: Path, user: str) -> list[Path]:
-    """Folders of the studies that have a report and are shown to a user, the newest first."""
+    """Folders of the studies that have a report and are shown to a user, newest first."""
     folders = [
-        path.parent for path in folder.glob("*/report.html") if (path.parent / STORE).is_file()
+        path.parent
+        for path in folder.glob("*/report.html")
+        if (path.parent / STORE).is_file()
     ]
     folders = [path for path in folders if is_shown(path.name, user)]
     return sorted(folders, key=lambda path: -(path / "report.html").stat().st_mtime)

@@ -1,4 +1,4 @@
-"""A survey of the dome in the page: attitudes to hold, the frames flown at them, and what these measure."""
+"""A survey of the dome in the page: attitudes to hold, frames flown at them, and results."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ from skysim.tracking import factory as tracker_settings
 
 SURVEY_TILT_DEG = 25.0  # greatest tilt of a survey, if the vehicle's stop allows it
 MAX_STOPS = 200
-REST_PX = 1.0  # motion of the image at rest, during an exposure
-UNCERTAINTY = survey_prior.survey_uncertainty()  # that `skysim survey` assumes
+REST_PX = 1.0  # maximum motion of the image during an exposure for a vehicle at rest
+UNCERTAINTY = survey_prior.survey_uncertainty()  # as `skysim survey` assumes by default
 
 
 @dataclass
@@ -49,13 +49,13 @@ class Survey:
     Attributes
     ----------
     lab, before
-        With the errors of the onboard model before the survey, and this model
+        Lab with the errors of the onboard model before the survey, and this model
     noise_px
         Standard deviation of a centroid's coordinates, by which attitudes are chosen
     taken
-        The frames that were flown
+        Frames that were flown
     run
-        The newest adjustment that succeeded
+        Last adjustment that succeeded
     """
 
     scene: Scene
@@ -66,7 +66,7 @@ class Survey:
     run: SurveyRun | None = None
 
     def is_of(self, scene: Scene) -> bool:
-        """Whether a scene is the surveyed one, but for its sections `motion` and `exposure`."""
+        """Whether a scene is the surveyed one, apart from its sections `motion` and `exposure`."""
         return (
             self.scene.model_copy(update={"motion": scene.motion, "exposure": scene.exposure})
             == scene
@@ -83,7 +83,7 @@ class Survey:
         Raises
         ------
         InputError
-            If the flight has no further frames; the survey is then as before.
+            If the flight has no further frames; the survey then remains unchanged.
         """
         allow(count)
         new, missed = self.new_frames(flight, views)
@@ -129,12 +129,12 @@ class Survey:
     def new_frames(
         self, flight: Flight, views: Sequence[FrameView]
     ) -> tuple[list[TakenFrame], int]:
-        """The frames of a flight at which the vehicle rests, one of each hold, and the number of holds without one.
+        """The frames of a flight at which the vehicle rests, one per hold, and the number of holds without one.
 
         Raises
         ------
         InputError
-            If there are none, or the survey has them already.
+            If there are none, or the survey already has them.
         """
         rows, holds = frames_at_rest(flight, views)
         if not rows:
@@ -194,7 +194,7 @@ class Survey:
 
 @dataclass(frozen=True, slots=True)
 class TakenFrame:
-    """A frame of a survey: the scene that was flown, its number there, the true attitude, and its detections."""
+    """A frame of a survey: the scene that was flown, its number in it, the true attitude, and its detections."""
 
     flown: Scene
     row: int
@@ -227,7 +227,7 @@ def tilt_deg(scene: Scene) -> float:
 def survey_plan(
     lab_from_body: Rotation, shown: Mask, steps: tuple[tuple[int, int, float | None], ...]
 ) -> SurveyPlan:
-    """Return a plan as the page has it.
+    """Return a plan in the form of the page.
 
     Parameters
     ----------
@@ -239,13 +239,13 @@ def survey_plan(
 
 
 def plan_step(count: int, accuracy: SurveyAccuracy | None) -> tuple[int, int, float | None]:
-    """Number of frames, and what is predicted after them: LEDs measured, and their rms error in mm."""
+    """Number of frames; predicted after them, the number of LEDs measured and their rms error in mm."""
     statistics = survey_findings.accuracy_statistics(accuracy)
     return count, int(statistics["measured"] or 0), statistics["led_mm"]
 
 
 def known_share(run: SurveyRun | None) -> Floats:
-    """(N,) by how much a survey has reduced the uncertainty of each LED: 0, not measured, to 1; (0,) without one."""
+    """(N,) reduction of each LED's uncertainty by a survey, from 0 (not measured) to 1; (0,) without a survey."""
     if run is None:
         return np.zeros(0)
     share = 1 - run.accuracy.led_sigma_m / UNCERTAINTY.led_sigma_m
@@ -253,10 +253,10 @@ def known_share(run: SurveyRun | None) -> Floats:
 
 
 def frames_at_rest(flight: Flight, views: Sequence[FrameView]) -> tuple[list[int], int]:
-    """Rows of a flight's frames at which the vehicle rests, of each hold the last one, and the number of holds.
+    """Rows of the last frame in each hold of a flight at which the vehicle rests, and the number of holds.
 
-    It rests if its image moves by less than REST_PX during the exposure, as its true rate says: a controller may not
-    reach the attitude, or not hold it.
+    It rests if the image moves by less than REST_PX during the exposure, by the true rate: a controller may not reach
+    the attitude, or may not hold it.
     """
     scene = flight.lab.scene
     motion = scene.motion

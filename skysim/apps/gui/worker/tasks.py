@@ -39,29 +39,29 @@ from skysim.core.errors import InputError
 from skysim.simulation import checks
 from skysim.simulation.checks.plan_check import Check
 
-KEPT_IMAGES = 3  # the page may still show one before the newest
+KEPT_IMAGES = 3  # number of newest images that are kept: the page may show an earlier one
 
 
 @dataclass
 class Worker:
-    """State between tasks: the workbench, its flight, and the other image if the page shows one.
+    """State between tasks: the workbench, its flight, and another image if the page shows one.
 
     Attributes
     ----------
     display
-        Of the browser, for which frames are made, as far as it is known
+        Display of the browser, for which frames are made, if it is known
     shown
-        The newest images for the page by number, and from where each is saturated
+        Newest images for the page by number, each with its saturation value
     number
-        Of the last one
+        Number of the last image
     pushed
-        The motion of the pushed vehicle, as long as the workbench has its attitude
+        Motion of the pushed vehicle, as long as the workbench has its attitude
     surveyed
-        The survey of the scene's dome, if one was planned
+        Survey of the scene's dome, if one was planned
     other, image
-        An image that is not of the scene, and its (H, W) pixels
+        Image that is not of the scene, and its (H, W) pixels
     camera
-        An open live camera
+        Open live camera
     """
 
     current: Workbench | None = None
@@ -85,7 +85,7 @@ class Worker:
         return self.current
 
     def show_frame(self, view: FrameView, levels: pixels.PixelLevels) -> FrameView:
-        """Return the view with its pixels, and forget the other image, because the page now shows the scene."""
+        """Return the view with its pixels, and drop the other image, because the page now shows the scene."""
         self.other = self.image = None
         return replace(view, pixels=self.show(levels, view.saturation_dn))
 
@@ -93,7 +93,8 @@ class Worker:
         """Keep an image that is not of the scene, and return its view."""
         self.other, self.image = photo_pixels
         return replace(
-            self.other, pixels=self.show(pixels.levels_of(self.image), self.other.saturation_dn)
+            self.other,
+            pixels=self.show(pixels.levels_of(self.image), self.other.saturation_dn),
         )
 
     def show(self, levels: pixels.PixelLevels, saturation_dn: float) -> Pixels:
@@ -101,7 +102,9 @@ class Worker:
         self.number += 1
         self.shown[self.number] = levels, saturation_dn
         self.shown.pop(self.number - KEPT_IMAGES, None)
-        return pixels.pixels_for(self.display or ALL_PIXELS, levels, saturation_dn, self.number)
+        return pixels.pixels_for(
+            self.display or ALL_PIXELS, levels, saturation_dn, self.number
+        )
 
     @property
     def survey_of_scene(self) -> survey_flight.Survey:
@@ -120,7 +123,7 @@ class Worker:
     # Tasks.
 
     def warm_up(self, scene: str) -> None:
-        """Set up a scene, which a page will probably open, and solve a frame, so that code is imported and compiled."""
+        """Set up a scene that a page will probably open and solve a frame, so that code is imported and compiled."""
         self.current = Workbench.open(scene, {})
         view = self.current.render_at_rest(solve=True)
         pixels.pixels_for(Display((8, 8)), self.levels, view.saturation_dn)
@@ -181,7 +184,7 @@ class Worker:
     def push(self, grip: Grip | None, elapsed_s: float, solve: bool) -> PushedView:
         """Integrate the motion of the pushed vehicle for a time, and render the frame whose exposure ends then.
 
-        The motion begins at rest, also if the camera was moved in another way meanwhile. Raises InputError.
+        The motion begins at rest, also after the camera was moved in another way. Raises InputError.
         """
         bench = self.workbench
         if self.pushed is None or self.pushed.lab_from_body is not bench.lab_from_body:
@@ -224,7 +227,7 @@ class Worker:
         return self.flight.advance(0.0)
 
     def advance_flight(self, budget_s: float) -> FlightStep:
-        """Compute the flight for about a time. Raises InputError if none has begun."""
+        """Compute the flight for about budget_s. Raises InputError if none has begun."""
         if self.flight is None:
             raise InputError("", "no flight has begun")
         return self.flight.advance(budget_s)
@@ -245,7 +248,9 @@ class Worker:
             return image_export.photo_files(self.other, self.image)
         if self.flight:
             self.flight.render()
-        return image_export.frame_files(self.workbench, self.scene, dict(self.overrides or {}))
+        return image_export.frame_files(
+            self.workbench, self.scene, dict(self.overrides or {})
+        )
 
     def solve_file(
         self, name: str, data: bytes, fov_deg: float | None, stages: photo.Stages = ()

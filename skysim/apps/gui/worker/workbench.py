@@ -50,13 +50,13 @@ class Workbench:
     Attributes
     ----------
     lens
-        Where its camera's pixels point
+        Directions of the camera's pixels
     geometry
-        Of the laboratory
+        Geometry of the laboratory
     rendered_count
         Number of frames rendered; it changes the seed, so that each frame has independent noise
     magnitude
-        V magnitude by a light's number
+        V magnitude by number of the light
     """
 
     scene: Scene
@@ -75,8 +75,9 @@ class Workbench:
     def open(
         cls, name: str, overrides: Mapping[str, str], before: Workbench | None = None
     ) -> Workbench:
-        """Set up a scene, or keep `before` if it is the same. If only the tracker differs from `before`, its lab is
-        kept; if tracker or camera, its attitude.
+        """Set up a scene, or keep `before` if it is the same.
+
+        If only the tracker differs from `before`, its lab is kept; if only tracker and camera differ, its attitude.
 
         Raises
         ------
@@ -99,7 +100,12 @@ class Workbench:
         lab_from_body = before.lab_from_body if before and same else lab.start
         views = geometry.scene_lens(lab), geometry.lab_geometry(lab)
         return cls(
-            scene, lab, warm_tracker(lab), lab_from_body, *views, magnitude=magnitude_by_id(lab)
+            scene,
+            lab,
+            warm_tracker(lab),
+            lab_from_body,
+            *views,
+            magnitude=magnitude_by_id(lab),
         )
 
     @property
@@ -136,7 +142,7 @@ class Workbench:
         )
 
     def next_run(self) -> Lab:
-        """The lab in a run with its own noise."""
+        """The lab of the next run, with independent noise."""
         self.rendered_count += 1
         return self.lab.in_run(self.scene.seed + self.rendered_count)
 
@@ -175,14 +181,14 @@ class Workbench:
 
 
 def warm_tracker(lab: Lab) -> factory.Estimator:
-    """The scene's tracker, compiled, so that its first frame's time is that of solving it."""
+    """The scene's tracker, compiled, so that the time of its first frame does not include the compilation."""
     tracker = build_tracker(lab.camera)
     warm_up(lab.camera, lab.start, tracker)
     return tracker
 
 
 def id_prefix(lab: Lab) -> str:
-    """Catalog of the lights' numbers: LED if no light has a magnitude, else HIP."""
+    """Prefix of the lights' numbers: LED if no light has a magnitude, else HIP."""
     return "LED" if np.isnan(lab.camera.sources.magnitude).all() else "HIP"
 
 
@@ -208,7 +214,9 @@ def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> LightColumns:
 def magnitude_by_id(lab: Lab) -> dict[int, float]:
     """V magnitude by a light's number; NaN for an LED."""
     return dict(
-        zip(lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True)
+        zip(
+            lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True
+        )
     )
 
 

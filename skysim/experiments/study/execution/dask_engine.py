@@ -110,7 +110,7 @@ def thread_count(client: Client) -> int:
 def collect_rows(
     client: Client, name: str, job: Job, chunks: Chunks, in_flight: dict[Future, Submission]
 ) -> Iterator[list[Any]]:
-    """Yield rows as chunks complete, those of the same time together. `in_flight` maps futures to their chunks.
+    """Yield rows as chunks complete; chunks that complete together are joined. `in_flight` maps futures to chunks.
 
     Dask gives up a task (KilledWorker) after several of its workers died, whether the task was the cause or was only
     queued there. The trials of such a chunk are therefore retried one at a time with nothing else in flight, and a
@@ -129,9 +129,11 @@ def collect_rows(
             retries.popleft if alone else chunks.next,
             (1 if alone else capacity) - len(in_flight),
         )
-        # One message submits all, and results arrive in the background: a round trip for each would be the limit.
+        # One message submits all, and results arrive in the background: a round trip for each would limit the speed.
         futures = (
-            client.map(run_encoded, [name] * len(new), list(map(encode_chunk, new)), pure=False)
+            client.map(
+                run_encoded, [name] * len(new), list(map(encode_chunk, new)), pure=False
+            )
             if new
             else []
         )
@@ -160,7 +162,7 @@ def collect_rows(
 
 
 def take(source: Callable[[], Chunk], count: int) -> list[Chunk]:
-    """Chunks of a source, as many or until it has no more."""
+    """The next `count` chunks of a source, or fewer at its end."""
     taken: list[Chunk] = []
     while len(taken) < count and (chunk := source()):
         taken.append(chunk)
@@ -225,7 +227,7 @@ class Dask:
     Attributes
     ----------
     scheduler
-        Its address, such as tcp://10.0.0.1:8786
+        Address of the scheduler, such as tcp://10.0.0.1:8786
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """Detections of a trial without a frame: the lights in view with noise, and a sequence of them under coded light.
 
-Under coded light (`tracker.decoder`) a trial is as many frames of one attitude as the code has bits, or fewer if the
-tracker solves one before: that frame is the trial's, or else the last one. A light's brightness in a frame is that of
-its code and of its drive's pulses in the exposure, with photon noise and FLUX_NOISE.
+Under coded light (`tracker.decoder`) a trial has as many frames of one attitude as the code has bits, or fewer: it ends
+with the first frame that the tracker solves. Its result is that of its last frame. A light's brightness in a frame
+follows from its code and from its drive's pulses in the exposure, with photon noise and FLUX_NOISE.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import Centroids
 from estimator.trackers.coded_tracker import CodedTracker
 from estimator.trackers.pipeline import Report
-from skysim.camera.render import OcclusionTest, Poses, Window, in_view, project_each, rates_e_s
+from skysim.camera.projection import Poses, in_view, project_each, rates_e_s
+from skysim.camera.render import OcclusionTest, Window
 from skysim.core.types import Floats, Trajectory
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene
@@ -31,7 +32,7 @@ from skysim.simulation.timing import MARGIN_S, exposure_window
 from skysim.sources.dome.led import lit_moments_s
 
 LEAST_SIGMA_PX = 1e-3
-# Relative, of a light in a frame; above that of rendered ones (benchmarks/codes_attitudes.py).
+# Relative noise of a light's brightness in a frame; more than in rendered frames (benchmarks/codes_attitudes.py).
 FLUX_NOISE = 0.02
 
 
@@ -41,9 +42,9 @@ class VisibleSources(NamedTuple):
     Attributes
     ----------
     rows
-        (N,) in `lab.camera.sources`
+        (N,) rows of the sources in `lab.camera.sources`
     xy_px
-        (N, 2)
+        (N, 2) pixel positions
     electrons
         (N,) photo-electrons of an exposure
     """
@@ -61,52 +62,49 @@ def visible_sources(lab: Lab, lab_from_body: Rotation) -> tuple[Floats, Floats]:
 
 def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[VisibleSources]:
     """The view at each of B attitudes, all at the scene's start. The sources near all fields are projected at once."""
-    R_cam_from_body = lab.camera.mount.cam_from_body.as_matrix()
-    camera_body_m = lab.camera.mount.camera_body_m
+    camera = lab.camera
+    optics = camera.optics
+    R_cam_from_body = camera.mount.cam_from_body.as_matrix()
     R_lab_from_body = lab_from_body.as_matrix()
     poses = Poses(
         np.array([R_cam_from_body @ each.T for each in R_lab_from_body]),
-        np.array([each @ camera_body_m for each in R_lab_from_body]),
+        np.array([each @ camera.mount.camera_body_m for each in R_lab_from_body]),
     )
-    each_pose = (
-        Poses(*(part[n : n + 1] for part in poses)) for n in range(len(R_lab_from_body))
-    )
-    rows = [
-        in_view(lab.camera.sources, lab.camera.optics, pose, reach=0.0) for pose in each_pose
-    ]
+    rows = []
+    for n in range(len(R_lab_from_body)):
+        pose = Poses(*(part[n : n + 1] for part in poses))
+        rows.append(in_view(camera.sources, optics, pose, reach=0.0))
     ends = np.cumsum([0, *map(len, rows)])
-    near = lab.camera.sources.take(np.concatenate(rows))
-    atmosphere = find_light(lab.camera.lights, AirEffects)
+    near = camera.sources.take(np.concatenate(rows))
+    atmosphere = find_light(camera.lights, AirEffects)
     if atmosphere:
         near = atmosphere.air.at(lab.scene.start_time).points_seen(near)
-    xy_px, distance_m, cos_out, cos_in = project_each(near, lab.camera.optics, poses, ends)
-    rate_e_s = rates_e_s(
-        near, lab.camera.optics, lab.camera.known.emitter, distance_m, cos_out, cos_in
-    )
-    electrons = (
-        rate_e_s * np.minimum(near.on_s / near.period_s, 1.0) * lab.scene.exposure.time_s
-    )
+    xy_px, distance_m, cos_out, cos_in = project_each(near, optics, poses, ends)
+    rate_e_s = rates_e_s(near, optics, camera.known.emitter, distance_m, cos_out, cos_in)
+    duty = np.minimum(near.on_s / near.period_s, 1.0)
+    electrons = rate_e_s * duty * lab.scene.exposure.time_s
     x, y = xy_px.T
-    width_px, height_px = lab.camera.canvas.shape[::-1]
+    width_px, height_px = camera.canvas.shape[::-1]
     visible = (x > -0.5) & (y > -0.5) & (x < width_px - 0.5) & (y < height_px - 0.5)
-    start = exposure_of(
-        lab.camera, Trajectory.at_rest(lab.start, MARGIN_S), 0, Window(0.0, 0.0), None
-    )
+    at_rest = Trajectory.at_rest(lab.start, MARGIN_S)
+    start = exposure_of(camera, at_rest, 0, Window(0.0, 0.0), None)
     views = []
     for n, (begin, end) in enumerate(itertools.pairwise(ends.tolist())):
         chosen = begin + np.flatnonzero(visible[begin:end])
-        if occludes := occlusion(lab.camera, replace(start, lab_from_body=lab_from_body[n])):
+        occludes = occlusion(camera, replace(start, lab_from_body=lab_from_body[n]))
+        if occludes:
             chosen = chosen[~occludes(near.place[chosen])]
-        views.append(VisibleSources(rows[n][chosen - begin], xy_px[chosen], electrons[chosen]))
+        views.append(
+            VisibleSources(rows[n][chosen - begin], xy_px[chosen], electrons[chosen])
+        )
     return views
 
 
 def occlusion(camera: StarCamera, exposure: Exposure) -> OcclusionTest | None:
     """The test for places that something hides from a camera in an exposure; None if nothing can."""
     obstacles = [light for light in camera.lights if isinstance(light, Obstacle)]
-    return any_of(
-        [occluder for light in obstacles if (occluder := light.during(exposure).hides)]
-    )
+    tests = [light.during(exposure).hides for light in obstacles]
+    return any_of([hides for hides in tests if hides])
 
 
 def simulate_detections(
@@ -118,8 +116,8 @@ def simulate_detections(
 ) -> Centroids:
     """Simulated detections, brightest first: some true sources missed, all with noise, false detections added.
 
-    Each claims its true error, or LEAST_SIGMA_PX without noise: a tracker takes no detection without an error.
-    The flux of a false detection is that of a random true source, including those that `visible_sources` leaves out.
+    The stated error of each is the true one, or LEAST_SIGMA_PX without noise: a tracker takes no detection without an
+    error. The flux of a false detection is that of a random true source, detected or missed.
     """
     # Draw noise for all sources, also the missing ones, so that the stream does not depend on which are missing.
     sigma_px = max(trial.noise_px, LEAST_SIGMA_PX)
@@ -134,9 +132,10 @@ def simulate_detections(
     if not false:
         return Centroids(xy_px[detected], np.full(len(detected), sigma_px), flux[detected])
     false_px = rng.random((false, 2)) * [scene.camera.width_px, scene.camera.height_px] - 0.5
-    false_flux = (
-        flux[rng.integers(len(flux), size=false)] if len(flux) else rng.random(false) + 1.0
-    )
+    if len(flux):
+        false_flux = flux[rng.integers(len(flux), size=false)]
+    else:
+        false_flux = rng.random(false) + 1.0
     all_flux = np.concatenate([flux[detected], false_flux])
     order = np.argsort(-all_flux, kind="stable")
     all_px = np.concatenate([xy_px[detected], false_px])
@@ -153,17 +152,16 @@ def solve_coded(
     """(N, 2) true pixel positions, and the report of the first frame with an attitude, or of the code's last one."""
     lab = lab.in_run(int(rng.integers(2**62)))
     ((rows, xy_px, electrons),) = visible_rows(lab, Rotation.concatenate([lab_from_body]))
-    electrons = electrons * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(rows)))
-    # The error of a brightness is that of the LED.
+    electrons = electrons * 10 ** (
+        0.4 * trial.magnitude_sigma * rng.standard_normal(len(rows))
+    )
+    # The error of the magnitude is the LED's, equal in all frames, so `simulate_detections` adds none.
     per_frame = trial.model_copy(update={"magnitude_sigma": 0.0})
-    tracker.last_s = None  # begins anew
+    tracker.last_s = None  # forget the frames of an earlier trial
     first = int(rng.integers(tracker.code.bits))
     for frame in range(first, first + tracker.code.bits):
-        light_e = (
-            electrons
-            * brightness(lab, rows, frame)
-            * (1 + FLUX_NOISE * rng.standard_normal(len(rows)))
-        )
+        noise = 1 + FLUX_NOISE * rng.standard_normal(len(rows))
+        light_e = electrons * brightness(lab, rows, frame) * noise
         light_e += np.sqrt(np.maximum(light_e, 0)) * rng.standard_normal(len(rows))
         lit = light_e > 0
         detections = simulate_detections(per_frame, xy_px[lit], light_e[lit], lab.scene, rng)
@@ -178,7 +176,7 @@ def solve_coded(
 
 
 def brightness(lab: Lab, rows: NDArray[np.int64], frame: int) -> Floats:
-    """(K,) light of LEDs in the exposure of a frame over their mean light: what code, pulses and filters leave."""
+    """(K,) light of LEDs in the exposure of a frame over their mean light: the effect of codes, pulses and filters."""
     window = exposure_window(lab.scene, frame)
     steady = lab.camera.sources.take(rows)
     begin_s = window.open_s

@@ -31,10 +31,10 @@ TimedRows = tuple[list[Any], float]  # rows of a chunk, and the seconds it took
 
 
 class Job(Protocol):
-    """What the items of a chunk are: a frozen value that is sent to the workers."""
+    """Work on the items of a chunk: a frozen value that is sent to the workers."""
 
     def run(self, chunk: Chunk) -> list[Any]:
-        """The rows of a chunk, one an item."""
+        """The rows of a chunk, one per item."""
 
     def failed(self, segment: Segment, error: str) -> Any:
         """The row of an item, alone in its segment, that repeatedly killed its worker."""
@@ -103,7 +103,9 @@ class Pool:
                 done = True
             except BrokenProcessPool:
                 # Count a death only for a trial that was alone in flight; otherwise the culprit is unknown.
-                lost = [single for chunk in in_flight.values() for single in split_chunk(chunk)]
+                lost = [
+                    single for chunk in in_flight.values() for single in split_chunk(chunk)
+                ]
                 deaths.update(single[0].first for single in lost if len(lost) == 1)
                 for single in lost:
                     if deaths[single[0].first] == MAX_ATTEMPTS:

@@ -47,9 +47,9 @@ class Outcome:
         e^T P^-1 e with three degrees of freedom and the tracker's covariance P; mean for a
         flight
     stars
-        True sources on the detector, minimum for a flight
+        Number of true sources on the detector; minimum for a flight
     detected, matched
-        Numbers of detections and of lights matched with a star or LED, means for a flight
+        Numbers of detections and of lights matched with a star or LED; means for a flight
     availability
         Fraction of a flight's ticks with a filter error below ten arcminutes; without a filter,
         fraction of its frames solved correctly
@@ -68,12 +68,12 @@ class Outcome:
         its lights
     roll_noise
         Number of frames solved with the right lights and a roll error beyond ten arcminutes
-        that the covariance allows; NaN likewise
+        that the covariance allows; NaN if the tracker does not name its lights
     misled
         Number of misidentified frames whose error the covariance does not allow: the wrong
-        lights moved the attitude beyond what the tracker claims; NaN likewise
+        lights moved the attitude beyond what the tracker claims; NaN as above
     wrong_matches
-        Number of lights that are matched with a wrong star or LED; NaN likewise
+        Number of lights that are matched with a wrong star or LED; NaN as above
     centroid_px
         RMS error of the centroids about each axis, of those within SAME_LIGHT_PX of a true
         image
@@ -83,9 +83,10 @@ class Outcome:
     lab_from_body_w, _x, _y, _z
         True attitude at mid-exposure; of the worst frame for a flight (`worst_frame`)
     body_tilt_deg, body_azimuth_deg
-        Under a dome, of the body's z axis: from vertical, and from the lab's x toward y
+        Under a dome, angle of the body's z axis from vertical, and its azimuth from the lab's x
+        toward y
     boresight_ra_deg, boresight_dec_deg
-        Under the stars, of the camera
+        Under the stars, direction of the camera
     """
 
     status: str
@@ -123,7 +124,7 @@ class Outcome:
 
 
 FIELDS = tuple(field.name for field in fields(Outcome))
-# Unknown of an external tracker.
+# Values that are unknown for an external tracker.
 IDENTITY = ("misidentified", "roll_noise", "misled", "wrong_matches")
 FAILED = Outcome("failed")
 DIRECTION = FIELDS[-8:]  # attitude and direction
@@ -137,7 +138,7 @@ class TrueLights(NamedTuple):
     xy_px
         (N, 2) image at mid-exposure
     flux_xy_px
-        (N, 2) flux-weighted mean of the image over the exposure, where a perfect centroid is
+        (N, 2) flux-weighted mean of the image over the exposure: the perfect centroid
     streak_px
         (N,) length of its path over the exposure; None if there is no exposure
     """
@@ -151,7 +152,9 @@ class TrueLights(NamedTuple):
 def true_lights(truth: Truth) -> TrueLights:
     """The lights of a rendered frame."""
     sources = truth.sources
-    return TrueLights(truth.lab_from_body, sources.xy_px, sources.flux_xy_px, sources.streak_px)
+    return TrueLights(
+        truth.lab_from_body, sources.xy_px, sources.flux_xy_px, sources.streak_px
+    )
 
 
 def score(
@@ -223,13 +226,15 @@ def claimed_image_px(
 ) -> Floats:
     """(K, 2) true images at mid-exposure of the stars or LEDs with which the tracker matched its lights.
 
-    They are projected with the true attitude and the true optics; LEDs from their true places. Stars are projected
-    from the tracker's catalog, which is independent of the simulated sky and may have merged a double.
+    They are projected with the true attitude and the true optics. LEDs are at their true places. Stars have the
+    directions of the tracker's catalog, which is independent of the simulated sky and may have merged a double.
     """
     if isinstance(estimator, DomeTracker):
         order = np.argsort(lab.camera.sources.id)
         rows = order[
-            np.searchsorted(lab.camera.sources.id, estimator.leds.id[match.star], sorter=order)
+            np.searchsorted(
+                lab.camera.sources.id, estimator.leds.id[match.star], sorter=order
+            )
         ]
         camera_m = quaternion.apply(lab_from_body, lab.camera.mount.camera_body_m)
         offset_lab = lab.camera.sources.place[rows, :3] - camera_m
@@ -242,10 +247,10 @@ def claimed_image_px(
 def count_wrong_matches(
     observed_px: Floats, claimed_px: Floats, lights: TrueLights, reach_px: float
 ) -> int:
-    """How many of K lights are matched with a star or LED whose true image is farther than reach_px from them.
+    """Number of K lights that are matched with a star or LED whose true image is farther than reach_px from them.
 
-    The image of a pulsed LED, or under a rolling shutter, is displaced over the exposure: that of the light nearest to
-    the claimed image is added.
+    The mean image of a pulsed LED, or under a rolling shutter, is displaced from that at mid-exposure. The displacement
+    of the light nearest to the claimed image is added to it.
 
     Parameters
     ----------
@@ -258,7 +263,7 @@ def count_wrong_matches(
         return len(observed_px)
     nearest, _ = nearest_light(claimed_px, lights.xy_px)
     expected_px = claimed_px + lights.flux_xy_px[nearest] - lights.xy_px[nearest]
-    # NaN is wrong.
+    # NaN counts as wrong.
     return int(np.sum(~(np.linalg.norm(observed_px - expected_px, axis=1) <= reach_px)))
 
 
@@ -363,8 +368,10 @@ def summarize_flight(log: Telemetry, outcomes: list[Outcome], settle_s: float) -
 
 
 def worst_frame(outcomes: list[Outcome]) -> Outcome:
-    """The worst frame of a flight: a misidentified or wrong one, else the first without a solution, else the largest
-    error; FAILED if there is no frame."""
+    """The worst frame of a flight; FAILED if there is no frame.
+
+    It is a misidentified or wrong one, else the first without a solution, else the one with the largest error.
+    """
 
     def badness(one: Outcome) -> tuple[bool, bool, float]:
         error = math.hypot(one.x_arcsec, one.y_arcsec, one.roll_arcsec)

@@ -44,7 +44,8 @@ from skysim.tracking import factory
 CHUNK_S = (
     0.25  # run time of a chunk: long relative to its overhead, short in case a worker dies
 )
-MANY = 16  # workers; more have longer chunks, and complete MANY / CHUNK_S a second: a Dask scheduler handles hundreds
+# Beyond so many workers chunks are longer, so that MANY / CHUNK_S end per second: a Dask scheduler handles hundreds.
+MANY = 16
 MAX_CHUNK = 5000  # maximum number of trials in a chunk
 
 
@@ -55,11 +56,11 @@ class Progress:
     Attributes
     ----------
     trials
-        total
-    done
-        In the store, of which failed and wrong
+        Total number of trials
+    done, failed, wrong
+        Numbers of trials in the store: all, failed ones, and those with a wrong attitude
     now
-        Done by this run since `began`
+        Number of trials done by this run since `began`
     """
 
     trials: int
@@ -86,7 +87,7 @@ Watch = Callable[[Progress], Any]
 
 
 class ChunkQueue:
-    """Divides the missing trials of some points into chunks of about so many seconds.
+    """Divides the missing trials of some points into chunks with a run time of about `chunk_s`.
 
     Chunks larger than a point are extended to complete points, so that a point's setup is built on one worker only.
 
@@ -95,7 +96,7 @@ class ChunkQueue:
     missing
         (M,) trial numbers, ascending
     spec
-        Of the trials, if their hardware is drawn
+        Specification of the trials, if their hardware is drawn
     """
 
     def __init__(
@@ -152,7 +153,7 @@ class ChunkQueue:
 
 
 def chunk_seconds(workers: int) -> float:
-    """Run time of a chunk, in proportion to the workers if they are many, so that coordination is not the limit."""
+    """Run time of a chunk, proportional to the number of workers beyond MANY, so that coordination is not the limit."""
     return CHUNK_S * max(1.0, workers / MANY)
 
 
@@ -161,7 +162,7 @@ def prepare_store(
 ) -> None:
     """Initialize a store for a plan, or check that it belongs to the plan.
 
-    The store may be of the same study with fewer replicates: its trials are kept, and numbered anew.
+    The store may be of the same study with fewer replicates: its trials are kept and renumbered.
 
     Parameters
     ----------
@@ -217,10 +218,12 @@ def prepare_store(
 
 
 def stored_replicates(plan: Plan, store: Store) -> int:
-    """Replicates of the store's trials if its study is the plan's, with as many of them or fewer; else 0."""
+    """Number of replicates in the store if its study is the plan's, with as many replicates or fewer; else 0."""
     if plan.digest == store.meta("digest"):
         return plan.study.replicates
-    if plan.study.optimize is not None:  # a search has chosen its candidates by all replicates
+    if (
+        plan.study.optimize is not None
+    ):  # a search has chosen its candidates by all replicates
         return 0
     with store.corruption_as_input_error():
         fewer = int(store.meta("replicates") or 0)
@@ -292,7 +295,10 @@ def run_points(
             rows.close()
         if progress.now:
             store.record_run(
-                engine.name, engine.workers, progress.now, time.perf_counter() - progress.began
+                engine.name,
+                engine.workers,
+                progress.now,
+                time.perf_counter() - progress.began,
             )
     return progress
 
@@ -330,7 +336,9 @@ def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
     points = store.points()
     each = plan.study.replicates
     if not 0 <= trial < len(points) * each:
-        raise InputError(f"trial {trial}", "not in the study", f"0 to {len(points) * each - 1}")
+        raise InputError(
+            f"trial {trial}", "not in the study", f"0 to {len(points) * each - 1}"
+        )
     point, replicate = divmod(trial, each)
     settings = plan.spec.trial_settings(points[point].settings, replicate)
     return Segment(point, settings, trial, range(replicate, replicate + 1))
@@ -340,7 +348,7 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
     """Repeat a trial with its seed, and write each of its frames with an annotated image.
 
     Only the first MAX_FRAMES frames of a flight are written. An exception of the trial is in its row; frames rendered
-    before it are written too.
+    before it are also written.
     """
     segment = segment_of(plan, store, trial)
     row = trials.run_trial(plan.spec, segment, trial, segment.replicates[0])

@@ -57,8 +57,8 @@ def prepared_setup(spec: TrialSpec, settings: Settings, key: str = "") -> TrialS
     Parameters
     ----------
     key
-        Its `setup_key`, if it is known: a trial of centroids takes fifteen times as long as the
-        key
+        `setup_key` of the point, if it is known. To compute it takes a fifteenth of a centroid
+        trial
     """
     key = key or setup_key(spec, settings)
     cached = CACHE.setups

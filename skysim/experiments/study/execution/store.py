@@ -3,12 +3,12 @@
 Tables `trials` and `points` depend only on the study; engine, time and speed are in `timings` and `runs`. Every batch
 of rows is one transaction of a write-ahead log, so a killed run leaves only complete batches.
 
-Beyond MOST_ROWS rows in all, every PART_ROWS of them move to a Parquet file in a folder beside it, `study.parts`, those
-of the lowest trial numbers first; SQLite keeps the list of the files and the failed trials, which may be run again. A
-part is written and synced under a temporary name and renamed; then one transaction lists it and deletes its rows. A run
-that is killed before leaves a file that is not listed, which the next run removes. Parts are never changed: they hold
-point and replicate, from which the trial's number follows, since that changes when a study grows. All methods of
-`Store` take the rows of both for one table.
+If there are more than MOST_ROWS rows, they move, PART_ROWS at a time, to Parquet files in the folder `study.parts`
+beside the SQLite file, lowest trial numbers first. SQLite keeps the list of the files, and the failed trials, which may
+be run again. A part is written and synced under a temporary name and renamed; then one transaction lists it and deletes
+its rows. A run that is killed before that leaves a file that is not listed, which the next run removes. Parts are never
+changed. They hold point and replicate, from which the trial's number follows, since the number changes when a study
+grows. All methods of `Store` treat the rows of both as one table.
 """
 
 from __future__ import annotations
@@ -36,16 +36,26 @@ from skysim.results.files.row_parts import Part, Rows, Source
 
 STORE = "study.sqlite"  # file name in a study's results folder
 FORMAT = 4  # raised when the columns of `trials` change
-FORMAT_OF_PARTS = 5  # of a store with parts, which an earlier skysim would not see
-MOST_ROWS = 1_000_000  # of a store without parts; beyond, rows move to them
-PART_ROWS = 250_000  # of a part: some 50 MB in memory
+FORMAT_OF_PARTS = 5  # format of a store with parts, which an earlier skysim would not see
+MOST_ROWS = 1_000_000  # maximum number of rows in SQLite; beyond, rows move to parts
+PART_ROWS = 250_000  # rows of a part, about 50 MB in memory
 EVERY = (0, 2**62)  # range of all trials
-BLOCK_TRIALS = 100_000  # numbers of trials of a block of `Store.blocks`
+BLOCK_TRIALS = 100_000  # trial numbers of a block of `Store.blocks`
 TEXT_FIELDS = {"status"}
 INTEGER_FIELDS = {"frames", "solved", "wrong", "ambiguous"}
 
-# Of `Store.columns`.
-COLUMNS = ("trial", "point", "replicate", "seed", "scene", "code", *FIELDS, "error", "time_ms")
+# Names of `Store.columns`.
+COLUMNS = (
+    "trial",
+    "point",
+    "replicate",
+    "seed",
+    "scene",
+    "code",
+    *FIELDS,
+    "error",
+    "time_ms",
+)
 
 SQL_TYPES = dict.fromkeys(TEXT_FIELDS, "TEXT") | dict.fromkeys(INTEGER_FIELDS, "INTEGER")
 OUTCOME_COLUMNS = ", ".join(f"{name} {SQL_TYPES.get(name, 'REAL')}" for name in FIELDS)
@@ -67,7 +77,9 @@ CREATE TABLE IF NOT EXISTS parts (
   last INTEGER NOT NULL);
 """
 
-values_of = attrgetter(*FIELDS)  # of an outcome; `astuple` takes twenty times longer
+values_of = attrgetter(
+    *FIELDS
+)  # the values of an outcome; `astuple` takes twenty times longer
 INSERT = f"INSERT OR REPLACE INTO trials VALUES ({', '.join('?' * (7 + len(FIELDS)))})"
 
 
@@ -81,8 +93,10 @@ class Store:
         self.path = path
         self.db = connection
         self.parts_folder = path.with_suffix(".parts")
-        self._room = 0  # rows that SQLite takes until rows move; 0 before they are counted
-        self._parts: dict[int, Part] = {}  # by number
+        self._room = (
+            0  # further rows that SQLite takes before rows move; 0 before they are counted
+        )
+        self._parts: dict[int, Part] = {}  # open parts by number
         self._near = NONE_NEAR  # points that were read together with the last one
 
     def meta(self, key: str) -> str:
@@ -108,8 +122,8 @@ class Store:
         Parameters
         ----------
         grown
-            Replicates of the stored trials and of the study, if it has more: trials are
-            numbered point * replicates + replicate, and get their new numbers
+            Replicates of the stored trials and of the study, if the study has more. Trials are
+            renumbered as point * replicates + replicate
         """
         with self.db:
             if grown:
@@ -122,7 +136,7 @@ class Store:
     def _renumber(self, replicates: int, more: int) -> None:
         number = f"trial / {replicates} * {more} + trial % {replicates}"
         for table in ("trials", "timings"):
-            # By way of negative numbers, since a new number may be the old one of another row.
+            # Negative numbers first, since a new number may be the old one of another row.
             self.db.execute(f"UPDATE {table} SET trial = -1 - ({number})")
             self.db.execute(f"UPDATE {table} SET trial = -1 - trial")
 
@@ -134,7 +148,9 @@ class Store:
         )
         with self.snapshot():
             found = [
-                row for order in ("ASC", "DESC") for row in self.db.execute(query.format(order))
+                row
+                for order in ("ASC", "DESC")
+                for row in self.db.execute(query.format(order))
             ]
             for part in self.parts():
                 part.trials(self._replicates())  # is as listed
@@ -158,7 +174,11 @@ class Store:
 
     def _insert_points(self, points: Iterable[Point], first: int = 0) -> None:
         rows = (
-            (n, json.dumps(point.levels, default=str), json.dumps(point.settings, default=str))
+            (
+                n,
+                json.dumps(point.levels, default=str),
+                json.dumps(point.settings, default=str),
+            )
             for n, point in enumerate(points, first)
         )
         self.db.executemany("INSERT OR REPLACE INTO points VALUES (?, ?, ?)", rows)
@@ -182,9 +202,9 @@ class Store:
             self.move_rows()
 
     def move_rows(self) -> None:
-        """Move rows without an error to parts, as many as fill one, if there are too many for SQLite.
+        """Move rows without an error to parts, a full part at a time, if there are too many for SQLite.
 
-        None move without pyarrow, or before the study is known.
+        No rows move without pyarrow, or before the study is known.
         """
         in_parts = sum(part.rows for part in self.parts())
         count = self.db.execute("SELECT COUNT(*) FROM trials").fetchone()[0]
@@ -199,8 +219,10 @@ class Store:
             self._room = PART_ROWS - count if count < PART_ROWS else PART_ROWS
 
     def _move_part(self) -> int:
-        """Move the rows of the lowest trial numbers, and return how many; 0 if there are too few without an error."""
-        where = "trial IN (SELECT trial FROM trials WHERE error IS NULL ORDER BY trial LIMIT ?)"
+        """Move the rows with the lowest trial numbers and return their number; 0 if too few are without an error."""
+        where = (
+            "trial IN (SELECT trial FROM trials WHERE error IS NULL ORDER BY trial LIMIT ?)"
+        )
         columns = self._kept_columns(where, (PART_ROWS,))
         trial = columns.pop("trial")
         if len(trial) < PART_ROWS:
@@ -228,7 +250,7 @@ class Store:
         return self.parts_folder / f"{number:06d}.parquet"
 
     def remove_unlisted_parts(self) -> None:
-        """Remove files of a run that was killed before it listed them."""
+        """Remove part files of a run that was killed before it listed them."""
         listed = {part.path for part in self.parts()}
         for path in self.parts_folder.glob("*"):
             if path not in listed:
@@ -239,7 +261,9 @@ class Store:
         # A store of an earlier skysim has no such table.
         if self.meta("format") != str(FORMAT_OF_PARTS):
             return []
-        rows = self.db.execute("SELECT part, rows, wrong, first, last FROM parts ORDER BY part")
+        rows = self.db.execute(
+            "SELECT part, rows, wrong, first, last FROM parts ORDER BY part"
+        )
         known = (self.checked(row, int, int, int, int, int) for row in rows)
         return [
             self._parts.setdefault(number, Part(self.part_path(number), *others))
@@ -248,7 +272,7 @@ class Store:
 
     @contextmanager
     def snapshot(self) -> Iterator[None]:
-        """Within this context all queries see the rows of one instant, however a run goes on meanwhile."""
+        """Within this context all queries see the rows of one instant, even while a run adds others."""
         if self.db.in_transaction:
             yield
             return
@@ -266,7 +290,9 @@ class Store:
 
     def runs(self) -> list[dict[str, Any]]:
         """Every run that was not killed: engine, workers, trials, seconds."""
-        rows = self.db.execute("SELECT engine, workers, trials, seconds FROM runs ORDER BY run")
+        rows = self.db.execute(
+            "SELECT engine, workers, trials, seconds FROM runs ORDER BY run"
+        )
         known = (self.checked(row, str, int, int, float) for row in rows)
         return [
             dict(zip(("engine", "workers", "trials", "seconds"), row, strict=True))
@@ -291,7 +317,9 @@ class Store:
         query = "SELECT COUNT(*), COALESCE(SUM(error IS NOT NULL), 0), COALESCE(SUM(wrong), 0) FROM trials"
         with self.snapshot():
             # SQLite's sum is an integer only if all values are.
-            done, failed, wrong = self.checked(self.db.execute(query).fetchone(), int, int, int)
+            done, failed, wrong = self.checked(
+                self.db.execute(query).fetchone(), int, int, int
+            )
             parts = self.parts()
         done = done + sum(part.rows for part in parts)
         wrong = wrong + sum(part.wrong for part in parts)
@@ -326,7 +354,7 @@ class Store:
         Parameters
         ----------
         failed
-            Whether failed trials are among them
+            Whether failed trials are included
         """
         return self._rows([EVERY], "1" if failed else "error IS NULL")
 
@@ -334,11 +362,12 @@ class Store:
         """The columns of the trials of some points."""
         if len(points) > 1 or not (parts := self.parts()):
             return self._rows(ranges_of(points, self._replicates()))
-        # To read one point of a part takes as long as to read all of them.
+        # Reading one point of a part takes as long as reading all of its points.
         (point,), (near, rows) = points, self._near
         if point not in near:
             last = min(
-                (part.last for part in parts if part.first <= point <= part.last), default=point
+                (part.last for part in parts if part.first <= point <= part.last),
+                default=point,
             )
             near = range(point, last + 1)
             rows = self._rows(ranges_of(range(point, last + 1), self._replicates()))
@@ -349,7 +378,7 @@ class Store:
         return row_parts.subset(rows, slice(first, end))
 
     def blocks(self) -> Iterator[Rows]:
-        """The columns of all trials, so many trial numbers after another; one block at least."""
+        """The columns of all trials in blocks of BLOCK_TRIALS trial numbers; at least one block."""
         for first in range(0, 1 + max(self._ends(), default=0), BLOCK_TRIALS):
             yield self._rows([(first, first + BLOCK_TRIALS)])
 
@@ -367,7 +396,7 @@ class Store:
         Parameters
         ----------
         where
-            What else holds of those in SQLite
+            SQL condition for the rows in SQLite
         """
         sources = list[Source]()
         numbers = list[NDArray[np.int64]]()
@@ -386,7 +415,7 @@ class Store:
         return Rows(COLUMNS, sources, list(map(len, numbers)), order)
 
     def _replicates(self) -> int:
-        """Trials of a point."""
+        """Number of trials of a point."""
         with self.corruption_as_input_error():
             replicates = int(self.meta("replicates"))
             if not 1 <= replicates < 2**31:
@@ -405,7 +434,9 @@ class Store:
                     COLUMNS, batches, zip(*rows, strict=True), strict=True
                 ):
                     arrays.append(to_array(name, column, texts))
-            self.checked([text for text in texts if not isinstance(text, str | None)][:1], str)
+            self.checked(
+                [text for text in texts if not isinstance(text, str | None)][:1], str
+            )
             return {
                 name: np.concatenate(arrays)
                 for name, arrays in zip(COLUMNS, batches, strict=True)
@@ -454,7 +485,7 @@ def to_array(name: str, column: Sequence[Any], texts: dict[Any, Any]) -> NDArray
     Parameters
     ----------
     texts
-        Texts so far, each of which is kept once
+        Texts so far; equal texts share one object
 
     Raises
     ------
@@ -505,8 +536,10 @@ def check_format(store: Store) -> None:
 
 @contextmanager
 def sqlite_errors_as_input_error(path: Path, what: str = "") -> Iterator[None]:
-    """Raise InputError instead of the errors of SQLite for a damaged file: not a database, invalid text, or a declared
-    size that exceeds memory."""
+    """Raise InputError instead of the errors of SQLite for a damaged file.
+
+    It may be no database, or have invalid text or a declared size that exceeds memory.
+    """
     try:
         yield
     except (sqlite3.DatabaseError, UnicodeDecodeError, MemoryError) as error:

@@ -66,10 +66,12 @@ from skysim.sources.air import topocentric_axes
 from skysim.sources.ephemeris import observe_from, place
 from skysim.tracking import factory
 
-GYRO_RAD_S = 1e-5  # standard deviation that a frame trial's gyro claims, 2 arcseconds a second
+GYRO_RAD_S = (
+    1e-5  # standard deviation that a frame trial's gyro claims: 2 arcseconds per second
+)
 KNOTS = 9  # samples of a frame trial's trajectory in each exposure
-BLOCK = 64  # centroid trials that run together
-REFUSED = "refused"  # in place of the hash of a scene that cannot be built
+BLOCK = 64  # number of centroid trials that run together
+REFUSED = "refused"  # stands for the hash of a scene that cannot be built
 
 
 class Row(NamedTuple):
@@ -78,10 +80,10 @@ class Row(NamedTuple):
     Attributes
     ----------
     scene
-        Its hash; REFUSED, with why in `error`, for a scene that is invalid; empty if its worker
-        died
+        Hash of the scene; REFUSED for an invalid scene, with the reason in `error`; empty if
+        the trial's worker died
     error
-        An InputError's line, or the traceback of another exception
+        Line of an InputError, or traceback of another exception
     """
 
     trial: int
@@ -140,24 +142,24 @@ def run_segments(spec: TrialSpec, segments: tuple[Segment, ...]) -> list[Row]:
 
 
 def run_segment(spec: TrialSpec, segment: Segment) -> list[Row]:
-    """Run the trials of a segment, in order, as many at a time as their kind allows."""
+    """Run the trials of a segment in order, together in blocks if their kind allows."""
     key = setup_key(spec, segment.settings)
     size = block_size(spec, segment, key)
     return [row for block in divided(segment, size) for row in run_block(spec, block, key)]
 
 
 def block_size(spec: TrialSpec, segment: Segment, key: str) -> int:
-    """How many trials of a segment run together. Detections must reach an external tracker once, in order."""
+    """Number of trials of a segment that run together. Detections must reach an external tracker once, in order."""
     try:
         setup = prepared_setup(spec, segment.settings, key)
-    except Exception:  # in the rows
+    except Exception:  # the trials raise it again and store it in their rows
         return 1
     own = isinstance(setup.estimator, StarTracker | DomeTracker)
     return BLOCK if own and setup.trial.kind == "centroids" else 1
 
 
 def divided(segment: Segment, size: int) -> Iterator[Segment]:
-    """The segment in parts of so many trials."""
+    """The segment in parts of `size` trials."""
     for n in range(0, len(segment.replicates), size):
         yield segment._replace(
             first=segment.first + n, replicates=segment.replicates[n : n + size]
@@ -167,7 +169,7 @@ def divided(segment: Segment, size: int) -> Iterator[Segment]:
 def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
     """Run the trials of a segment together.
 
-    If one of them raises an exception, each runs by itself, and the row of that one stores it.
+    If one of them raises an exception, each is run alone, and the row of the faulty one stores the exception.
 
     Parameters
     ----------
@@ -192,7 +194,7 @@ def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
             scene = scene or REFUSED
             error = str(raised)
         else:
-            # Independent of the installation path.
+            # The stored text must not depend on the installation path.
             error = traceback.format_exc().replace(f"{ROOT}/", "")
     seconds = (time.perf_counter() - start_s) / len(seeds)
     return [
@@ -219,9 +221,9 @@ def run_trial(spec: TrialSpec, segment: Segment, trial: int, replicate: int) -> 
 
 
 def run_centroid_trials(setup: TrialSetup, seeds: Sequence[int]) -> list[Outcome]:
-    """Centroid trials: random attitude, noisy true detections and false ones; identified and solved.
+    """Centroid trials: at a random attitude, noisy true detections and false ones are identified and solved.
 
-    Every step is made for all of the trials before the next one, so that its code is in the processor's cache.
+    Each step is done for all trials before the next step, so that its code is in the processor's cache.
     """
     solved = solved_centroids(setup, seeds)
     return [score(setup.lab, setup.estimator, report, lights) for lights, report in solved]
@@ -230,7 +232,7 @@ def run_centroid_trials(setup: TrialSetup, seeds: Sequence[int]) -> list[Outcome
 def solved_centroids(
     setup: TrialSetup, seeds: Sequence[int]
 ) -> list[tuple[TrueLights, Report]]:
-    """The lights of centroid trials, and the report on the detections; of coded light on those of the last frame."""
+    """The lights of centroid trials, and the report on the detections (under coded light, of the last frame)."""
     lab = setup.lab
     trial = setup.trial
     estimator = setup.estimator
@@ -265,7 +267,7 @@ def solved_centroids(
 
 
 def streams(setup: TrialSetup, seed: int) -> tuple[np.random.Generator, np.random.Generator]:
-    """Random generators of a trial's attitude and of its noise; `noise_seed` changes the noise only."""
+    """Random generators of a trial's attitude and of its noise; `noise_seed` changes only the noise."""
     trial = setup.trial
     assert isinstance(trial, CentroidTrial | FrameTrial)
     attitude = (0, trial.attitude_seed) if trial.attitude_seed else (0,)
@@ -314,13 +316,16 @@ def flight_outcomes(
     """Mid-exposure time and outcome of every frame of the main camera."""
     for shot in flight.shots(cameras=[0]):
         assert shot.report is not None
-        yield shot.truth.t_s, score(flight.lab, estimator, shot.report, true_lights(shot.truth))
+        yield (
+            shot.truth.t_s,
+            score(flight.lab, estimator, shot.report, true_lights(shot.truth)),
+        )
 
 
 def one_by_one(
     run: Callable[[TrialSetup, int], Outcome],
 ) -> Callable[[TrialSetup, Sequence[int]], list[Outcome]]:
-    """Trials of which each is run by itself."""
+    """Outcomes of trials that are run one by one."""
     return lambda setup, seeds: [run(setup, seed) for seed in seeds]
 
 
@@ -340,7 +345,7 @@ def random_attitude(setup: TrialSetup, rng: np.random.Generator) -> Rotation:
 
 
 def random_attitudes(setup: TrialSetup, rngs: Sequence[np.random.Generator]) -> Rotation:
-    """Random lab_from_body, N of them, each drawn by a generator of its own.
+    """N random lab_from_body, each drawn by its own generator.
 
     Under a dome: tilt uniform in solid angle within `tilt_deg`, tilt direction and yaw uniform. Otherwise: boresight
     uniform over the sphere within `dec_deg` or between two angles from a body, roll uniform.
@@ -409,7 +414,7 @@ def render_trial_frame(
     Parameters
     ----------
     added
-        Gets the masks of smear and particles
+        Receives the masks of smear and particles
     """
     moving = moving_camera(setup, seed)
     return *moving.render(tracked_frames(setup), added), moving.streak_px
@@ -434,7 +439,7 @@ class MovingCamera(NamedTuple):
 
 
 def tracked_frames(setup: TrialSetup) -> int:
-    """How many frames of a frame trial are followed before its own; this is also the index of its own."""
+    """Number of frames that are followed before the frame of a frame trial; also the index of that frame."""
     assert isinstance(setup.trial, FrameTrial)
     return setup.trial.tracked
 
@@ -472,10 +477,10 @@ def attitude_and_axis(setup: TrialSetup, rng: np.random.Generator) -> tuple[Rota
 
 
 def tracked_report(setup: TrialSetup, moving: MovingCamera, frame: Frame) -> Report:
-    """The report on a frame trial's last frame by a tracker in its tracking mode, which has solved those before.
+    """The report on a frame trial's last frame by a tracker in its tracking mode, which has solved the frames before.
 
-    Without an attitude if the prediction failed and the frame had to be solved lost in space. A gyro's prediction is
-    the true rotation since the frame before.
+    It has no attitude if the prediction failed and the frame had to be solved lost in space. A gyro's prediction is the
+    true rotation since the frame before.
     """
     assert isinstance(setup.estimator, StarTracker)
     tracker = TrackingMode(setup.estimator)
@@ -517,7 +522,7 @@ def gyro_rate(setup: TrialSetup, truth: Truth) -> RateEstimate | None:
 
 
 def rate_axis(axis: str | AxisConfig, azimuth_rad: float, mount: Mount) -> Floats:
-    """(3,) unit axis of rotation in camera axes; azimuth_rad is that of one perpendicular to the boresight."""
+    """(3,) unit axis of rotation in camera axes; azimuth_rad is used if it is perpendicular to the boresight."""
     if not isinstance(axis, AxisConfig):
         boresight = np.array([0.0, 0.0, 1.0])
         return (
@@ -539,11 +544,15 @@ def constant_rate(scene: Scene, middle: Rotation, rate_body: Floats) -> Trajecto
 
 
 def constant_acceleration(
-    scene: Scene, middle: Rotation, rate_body: Floats, acceleration_body: Floats, frame: int = 0
+    scene: Scene,
+    middle: Rotation,
+    rate_body: Floats,
+    acceleration_body: Floats,
+    frame: int = 0,
 ) -> Trajectory:
-    """A trajectory through the exposures up to that of a frame, in the middle of which it has this attitude and rate.
+    """A trajectory through the exposures up to a frame's; in the middle of that one it has this attitude and rate.
 
-    The acceleration is along the rate or there is no rate: the rotation vector is rate t + acceleration t^2 / 2.
+    The acceleration is along the rate, or the rate is zero: the rotation vector is rate t + acceleration t^2 / 2.
     """
     windows = [exposure_window(scene, index) for index in range(frame + 1)]
     rows = scene.camera.height_px

@@ -9,7 +9,12 @@ from contextlib import AbstractContextManager, contextmanager
 from multiprocessing import forkserver
 from multiprocessing.context import ForkServerContext
 
-ONE_THREAD = ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+ONE_THREAD = (
+    "NUMBA_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+)
 
 
 def start_fork_server() -> ForkServerContext:

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 
 SHARE_COLORS = "cividis"  # color map of all proportions
-COLORS = "YlOrRd"  # of other responses, dark where they are bad: reversed where more is better
-# A cell without value.
+COLORS = "YlOrRd"  # color map of other responses, dark is bad: reversed if more is better
+# Style of a cell without value.
 HATCHED: Any = {
     "facecolor": "#eeeeee",
     "edgecolor": "#b8b8b8",
@@ -68,8 +68,10 @@ def color_norm(values: Floats, log: bool) -> Any:
     from matplotlib.colors import LogNorm, Normalize
 
     finite = values[np.isfinite(values) & ((values > 0) | (not log))]
-    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.5, 1.0)
-    high = high if high > low else low + (abs(low) or 1.0)
+    low = float(finite.min()) if len(finite) else 0.5
+    high = float(finite.max()) if len(finite) else 1.0
+    if high <= low:
+        high = low + (abs(low) or 1.0)
     return LogNorm(low, high, clip=True) if log else Normalize(low, high)
 
 
@@ -81,9 +83,13 @@ def ticks(low: float, high: float) -> tuple[Any, Any]:
     """
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
-    where: Any = MaxNLocator(5)
-    if high > 8 * low:
-        where = LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,))
+    where: Any
+    if high <= 8 * low:
+        where = MaxNLocator(5)
+    elif high < 1000 * low:
+        where = LogLocator(subs=(1, 2, 5))
+    else:
+        where = LogLocator(subs=(1,))
     return where, FuncFormatter(lambda value, _: f"{value:.6g}")
 
 
@@ -99,7 +105,7 @@ def halo() -> Any:
     return withStroke(linewidth=2.2, foreground="white")
 
 
-MAX_TICKS = 16  # maximum number of levels with a tick each
+MAX_TICKS = 16  # maximum number of levels that have a tick each
 MAX_WRAPPED_LABELS = (
     8  # maximum number of tick labels that are wrapped; with more, long ones are rotated
 )
@@ -141,15 +147,16 @@ def draw_curve(fig: Any, lines: Sequence[PointRow], figure: Curve, study: Study)
         axes.axhline(expected, color="#777777", linestyle=":", linewidth=1.2)
     group_axis = axis(study, lines, figure.by) if figure.by is not None else None
     inks = colors(len(shown), group_axis)
-    widest_pt = 3.0 if x_axis.numeric else 6.0
+    # Bars of several series are side by side.
+    widest_pt, room_pt = (3.0, 20.0) if x_axis.numeric else (6.0, 60.0)
+    step_pt = min(widest_pt, room_pt / max(len(shown), 1))
+    middle = (len(shown) - 1) / 2
     for n, (one, ink) in enumerate(zip(shown, inks, strict=True)):
         mark = MARKS[n % len(MARKS)]
         if sampled:
             draw_points(axes, one, ink, mark, x_axis.numeric, dots)
         else:
-            # Bars are side by side.
-            wide_pt = min(widest_pt, (20 if x_axis.numeric else 60) / len(shown))
-            draw_line(axes, one, ink, mark, x_axis, (n - (len(shown) - 1) / 2) * wide_pt)
+            draw_line(axes, one, ink, mark, x_axis, (n - middle) * step_pt)
     draw_thresholds(axes, figure, study, lines, group_axis)
     if not any(np.isfinite(one.value).any() for one in shown):
         axes.text(
@@ -211,7 +218,7 @@ def draw_line(
         axes.fill_between(one.x, low, high, color=ink, alpha=0.15, linewidth=0)
     else:
         draw_bars(axes, one.x, one, ink, offset)
-    # A line joins no point of few values, which is that of the easy trials alone.
+    # A line leaves out points of few values, which are from the easy trials alone.
     style = {"color": ink, "transform": offset}
     joined = np.where(one.few, np.nan, one.value)
     line = "-" if x_axis.numeric else ":"
@@ -223,7 +230,7 @@ def draw_line(
 
 
 def draw_few(axes: Any, one: Series, mark: str, **style: Any) -> None:
-    """Draw the points of few values: hollow, with their number."""
+    """Draw the points of few values: hollow, with the number of values."""
     axes.plot(one.x[one.few], one.value[one.few], mark, markerfacecolor="white", **style)
     text = {"fontsize": 6.5, "color": style["color"], "path_effects": [halo()]}
     text |= {"xytext": (4, 4), "textcoords": "offset points", "xycoords": style["transform"]}
@@ -231,7 +238,9 @@ def draw_few(axes: Any, one: Series, mark: str, **style: Any) -> None:
         axes.annotate(f"n={one.values[n]}", (one.x[n], one.value[n]), **text)
 
 
-def draw_points(axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots: bool) -> None:
+def draw_points(
+    axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots: bool
+) -> None:
     """Draw sampled points: with error bars, or, if they are many, with their running median.
 
     On an axis of named levels the median at each level replaces the running median.
@@ -239,7 +248,9 @@ def draw_points(axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots
     style = {"marker": mark, "color": ink, "linestyle": "none"}
     if not dots:
         draw_bars(axes, one.x, one, ink, axes.transData)
-        axes.plot(one.x, np.where(one.few, np.nan, one.value), label=one.label or None, **style)
+        axes.plot(
+            one.x, np.where(one.few, np.nan, one.value), label=one.label or None, **style
+        )
         draw_few(axes, one, mark, color=ink, transform=axes.transData)
         return
     size = min(max(4.5 * (MAX_POINTS_WITH_BARS / len(one.x)) ** 0.3, 1.8), 4.5)
@@ -247,7 +258,12 @@ def draw_points(axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots
     if numeric:
         axes.plot(*running_median(one), color=ink, linewidth=2.2, label=one.label or None)
     else:
-        medians = {"marker": "_", "markersize": 26, "markeredgewidth": 2.2, "linestyle": "none"}
+        medians = {
+            "marker": "_",
+            "markersize": 26,
+            "markeredgewidth": 2.2,
+            "linestyle": "none",
+        }
         axes.plot(*level_medians(one), color=ink, label=one.label or None, **medians)
 
 
@@ -270,13 +286,10 @@ def drawn_interval(axes: Any, one: Series | Panel) -> tuple[Floats, Floats]:
 def running_median(one: Series) -> tuple[Floats, Floats]:
     """Medians of x and of value in twelve groups of equal size, along a series ascending in x."""
     good = np.isfinite(one.value)
-    parts = zip(
-        np.array_split(one.x[good], 12), np.array_split(one.value[good], 12), strict=True
-    )
-    medians = np.array([(np.median(x), np.median(y)) for x, y in parts if len(x)]).reshape(
-        -1, 2
-    )
-    return medians[:, 0], medians[:, 1]
+    groups = [rows for rows in np.array_split(np.flatnonzero(good), 12) if len(rows)]
+    x = [np.median(one.x[rows]) for rows in groups]
+    values = [np.median(one.value[rows]) for rows in groups]
+    return np.array(x), np.array(values)
 
 
 def level_medians(one: Series) -> tuple[Floats, Floats]:
@@ -288,7 +301,7 @@ def level_medians(one: Series) -> tuple[Floats, Floats]:
 
 
 def colors(count: int, group_axis: Axis | None) -> list[Any]:
-    """Colors of so many lines: from a color scale if their axis is numeric, else from the palette."""
+    """Colors of `count` lines: from a color scale if their axis is numeric, else from the palette."""
     from matplotlib import colormaps
 
     if count > 2 and group_axis is not None and group_axis.numeric:
@@ -312,12 +325,11 @@ def set_up_x_axis(axes: Any, x_axis: Axis) -> None:
     if x_axis.numeric and (len(places) > MAX_TICKS or close):
         return
     names = [wrapped(x_axis.tick_label(one), len(places)) for one in x_axis.levels]
-    rotated = (
-        len(places) > MAX_WRAPPED_LABELS and max(map(len, names)) * len(names) > LABEL_WIDTH
-    )
-    axes.set_xticks(
-        places, names, rotation=25 if rotated else 0, ha="right" if rotated else "center"
-    )
+    width = max(map(len, names)) * len(names)
+    if len(places) > MAX_WRAPPED_LABELS and width > LABEL_WIDTH:
+        axes.set_xticks(places, names, rotation=25, ha="right")
+    else:
+        axes.set_xticks(places, names, rotation=0, ha="center")
     if x_axis.log:
         axes.tick_params(axis="x", which="minor", length=0)
 
@@ -362,12 +374,7 @@ def draw_heat(fig: Any, cells: Grid, figure: Heat) -> None:
         dotted: Any = {"fill": False, "edgecolor": "white", "hatch": "...", "linewidth": 0}
         axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, **dotted))
     if max(rows, columns) <= MAX_CELLS_WITH_TEXT:
-        for (row, column), value in np.ndenumerate(cells.value):
-            if np.isfinite(value):
-                ink = "#111111" if is_light(image.to_rgba([value])[0]) else "white"
-                text = f"{value:.0f}" if 1000 <= abs(value) < 1e5 else f"{value:.3g}"
-                text += f"\nn={cells.values[row, column]}" if cells.few[row, column] else ""
-                axes.text(column, row, text, ha="center", va="center", color=ink, fontsize=8)
+        write_values(axes, cells, image)
     for which, one, most in (("x", cells.x, MAX_TICKS * 2 // 3), ("y", cells.y, MAX_TICKS)):
         count = len(one.levels)
         step = math.ceil(count / most) if count > MAX_CELLS_WITH_TEXT else 1
@@ -377,6 +384,17 @@ def draw_heat(fig: Any, cells: Grid, figure: Heat) -> None:
         getattr(axes, f"set_{which}label")(one.label)
     axes.grid(False)
     add_color_bar(fig, image, figure)
+
+
+def write_values(axes: Any, cells: Grid, image: Any) -> None:
+    """Write the value in each cell, with the number of values where they are few."""
+    for row, column in np.argwhere(np.isfinite(cells.value)):
+        value = cells.value[row, column]
+        ink = "#111111" if is_light(image.to_rgba([value])[0]) else "white"
+        text = f"{value:.0f}" if 1000 <= abs(value) < 1e5 else f"{value:.3g}"
+        if cells.few[row, column]:
+            text += f"\nn={cells.values[row, column]}"
+        axes.text(column, row, text, ha="center", va="center", color=ink, fontsize=8)
 
 
 def draw_scatter(fig: Any, lines: Sequence[PointRow], figure: Heat, study: Study) -> None:
@@ -430,7 +448,9 @@ def draw_indices(fig: Any, selected: Sequence[Index], response: str) -> None:
         [end for one in selected for end in (*one.first[:3], *one.total[:3], 0.0)]
     )
     bounds = bounds[np.isfinite(bounds)]
-    axes.set_xlim(min(bounds.min() * 1.05, 0.0), max(min(bounds.max() * 1.05, 2.0), 0.1))
+    left = min(1.05 * bounds.min(), 0.0)
+    right = np.clip(1.05 * bounds.max(), 0.1, 2.0)
+    axes.set_xlim(left, right)
     axes.set_yticks(rows, [one.factor for one in selected])
     axes.set_ylim(len(selected) - 0.4, -0.6)
     axes.grid(False, axis="y")
@@ -441,7 +461,9 @@ def draw_indices(fig: Any, selected: Sequence[Index], response: str) -> None:
 # Optimizations.
 
 
-def search_png(panels: dict[str, Panel], points: Sequence[int], front: Sequence[int]) -> bytes:
+def search_png(
+    panels: dict[str, Panel], points: Sequence[int], front: Sequence[int]
+) -> bytes:
     """Responses of an optimization against candidate number, stacked panels; Pareto points marked, bounds dashed."""
 
     def draw(fig: Any) -> None:
@@ -449,9 +471,8 @@ def search_png(panels: dict[str, Panel], points: Sequence[int], front: Sequence[
         marked = np.isin(points, front)
         stack = np.ravel(fig.subplots(len(panels), 1, sharex=True))
         for axes, (name, one) in zip(stack, panels.items(), strict=True):
-            set_up_y_axis(
-                axes, name, [one._replace(value=np.append(one.value, one.bounds))], False
-            )
+            with_bounds = one._replace(value=np.append(one.value, one.bounds))
+            set_up_y_axis(axes, name, [with_bounds], False)
             axes.set_ylabel(one.label.replace(", ", "\n"))
             draw_bars(axes, x, one, GRAY, axes.transData)
             axes.plot(x, one.value, "o", color=GRAY, markersize=3.5)
@@ -480,8 +501,8 @@ def pareto_png(
 
     def draw(fig: Any) -> None:
         axes = fig.subplots()
-        marked = np.flatnonzero(np.isin(points, front))
         axes.plot(one.value, other.value, "o", color=GRAY, label="candidate")
+        marked = np.flatnonzero(np.isin(points, front))
         marked = marked[np.argsort(one.value[marked], kind="stable")]
         x = one.value[marked]
         y = other.value[marked]
@@ -497,10 +518,9 @@ def pareto_png(
         axes.plot(x, y, "D--", color=ORANGE, label="front")
         style = {"fontsize": 8, "color": ORANGE, "path_effects": [halo()]}
         style |= {"xytext": (5, 5), "textcoords": "offset points"}
-        for n, *at in (
-            zip(marked.tolist(), x, y, strict=True) if len(x) <= MAX_LABELED_POINTS else ()
-        ):
-            axes.annotate(str(points[n]), at, **style)
+        if len(x) <= MAX_LABELED_POINTS:
+            for n, *at in zip(marked.tolist(), x, y, strict=True):
+                axes.annotate(str(points[n]), at, **style)
         axes.set_xlabel(one.label)
         axes.set_ylabel(other.label)
         fig.legend(loc="outside right upper")

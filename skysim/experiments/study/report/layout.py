@@ -44,9 +44,7 @@ MOST_FIGURES = 24  # maximum number of automatic figures
 LOG_RESPONSE_RATIO = (
     30  # minimum ratio of largest to smallest response for an automatic logarithmic axis
 )
-FAR_RATIO = (
-    30  # interval bounds below the smallest value / FAR_RATIO do not extend a logarithmic axis
-)
+FAR_RATIO = 30  # interval bounds below the smallest value / FAR_RATIO do not extend a logarithmic axis
 
 
 class Series(NamedTuple):
@@ -131,7 +129,9 @@ def figures(study: Study, lines: Sequence[PointRow]) -> list[Figure]:
         by = next((name for name in varied if name != x), None)
         pairs = [(x, by, y) for y in study.responses]
     # If there are too many figures, show fewer responses, each with all of its figures.
-    most = max(MOST_FIGURES * len(study.responses) // len(pairs), 1)  # responses to show
+    most = max(
+        MOST_FIGURES * len(study.responses) // len(pairs), 1
+    )  # number of responses to show
     return [
         automatic_figure(x, by, y, axes, lines)
         for x, by, y in pairs
@@ -193,8 +193,8 @@ def limits(
 ) -> tuple[float, float]:
     """Axis limits that include all values and all finite interval bounds, with padding.
 
-    A proportion has all of 0 to 1, so that figures of a study compare by eye. On a logarithmic axis nonpositive
-    numbers, and bounds far below the smallest value (FAR_RATIO), are left out.
+    A proportion has the limits 0 and 1, so that the figures of a study can be compared by eye. On a logarithmic axis
+    nonpositive numbers, and bounds far below the smallest value (FAR_RATIO), are left out.
     """
     if share and not log:
         return -0.03, 1.03
@@ -277,9 +277,7 @@ def caption(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
         mark = "Hollow, without a line"
         text += curve_note(figure, study, lines, summaries) + "."
         if thresholds_of(figure, study, lines):
-            text += (
-                " Dashed: a limit; ticks and bars: where it is crossed, with intervals of 95 %."
-            )
+            text += " Dashed: a limit; ticks and bars: where it is crossed, with intervals of 95 %."
         if (expected := expected_value(value)) is not None:
             text += f" Dotted: {expected:g}, where the claimed errors are true."
     else:
@@ -292,7 +290,7 @@ def caption(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
 
 
 def caption_title(figure: Figure) -> str:
-    """What a figure shows against what."""
+    """The title of a figure: its quantity and its factors."""
     if isinstance(figure, Curve):
         return f"{figure.y} against {figure.x}" + (f" by {figure.by}" if figure.by else "")
     if isinstance(figure, Heat):
@@ -303,7 +301,9 @@ def caption_title(figure: Figure) -> str:
 def fixed_text(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
     """The levels of varied factors that a figure keeps fixed, as ", at leds = 900"; empty if there are none."""
     varied = {
-        name for name in study.factors if len(distinct(line.levels[name] for line in lines)) > 1
+        name
+        for name in study.factors
+        if len(distinct(line.levels[name] for line in lines)) > 1
     }
     fixed = fixed_levels(figure, study, lines).items()
     at = ", ".join(f"{name} = {format_level(one)}" for name, one in fixed if name in varied)
@@ -313,7 +313,7 @@ def fixed_text(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
 def curve_note(
     figure: Curve, study: Study, lines: Sequence[PointRow], summaries: Sequence[Summary]
 ) -> str:
-    """What the lines and bars of a curve are."""
+    """The meaning of the lines and bars of a curve."""
     x_axis = axis(study, lines, figure.x)
     if draws_medians(study, x_axis, len(summaries)):
         return f"; lines: {'running medians' if x_axis.numeric else 'medians'} of the points"

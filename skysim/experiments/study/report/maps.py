@@ -30,19 +30,21 @@ from skysim.results.metrics import Columns
 from skysim.results.plots import png
 
 CELL_TRIALS = 25  # mean number of trials in a cell
-MAX_CELLS = 240  # of a panel
-MIN_VALUES = 5  # a cell with fewer is hatched
-SPARE = 1.6  # mean number of trials in a cell over the least that a quantile takes
-MAX_NUMBERED = 70  # cells of a panel up to which each has its number of trials written in it
+MAX_CELLS = 240  # maximum number of cells of a panel
+MIN_VALUES = 5  # a cell with fewer values is hatched
+SPARE = 1.6  # mean number of trials in a cell over the least number that a quantile takes
+MAX_NUMBERED = (
+    70  # maximum number of cells of a panel with their numbers of trials written in them
+)
 SKY_RANGE_DEG = (-90.0, 90.0)
-MARK = "#111111"  # of the worst trials
+MARK = "#111111"  # color of the marks of the worst trials
 EDGE_POINTS = 24  # points along each edge of a cell
 RING_LABEL_DEG = 67.5  # azimuth of the labels of the rings
 LABEL: Any = {"ha": "center", "va": "center", "fontsize": 7, "color": "#444444"}
 
 
 class MapCell(NamedTuple):
-    """A cell: its range from the center (tilt, or declination) and around it (azimuth, or RA), in degrees.
+    """A cell: its range of tilt or declination, and of azimuth or right ascension, in degrees.
 
     Attributes
     ----------
@@ -106,14 +108,15 @@ def direction_map(label: str, columns: Columns, response: str) -> DirectionMap:
         return DirectionMap(label, sky, [], [])
     radial_deg = columns["boresight_dec_deg" if sky else "body_tilt_deg"]
     around_deg = columns["boresight_ra_deg" if sky else "body_azimuth_deg"]
-    summarize = metrics.response(response)
-    cells = []
     least = least_values(response)
     count = int(known.sum() * min(CELL_TRIALS / (SPARE * least), 1.0))
-    ranges = list(partition(*radial_range(radial_deg[known], sky), count, sky))
+    low_deg, high_deg = radial_range(radial_deg[known], sky)
+    ranges = list(partition(low_deg, high_deg, count, sky))
     number = cell_numbers(ranges, radial_deg, around_deg)
     order = np.argsort(number, kind="stable")
     ends = np.searchsorted(number[order], np.arange(len(ranges) + 1))
+    summarize = metrics.response(response)
+    cells = []
     for one, (first, end) in zip(ranges, itertools.pairwise(ends.tolist()), strict=True):
         summary = summarize(subset(columns, order[first:end]))
         value = summary.value if summary.trials >= least else math.nan
@@ -122,24 +125,28 @@ def direction_map(label: str, columns: Columns, response: str) -> DirectionMap:
 
 
 def least_values(response: str) -> int:
-    """Least values of a cell that is drawn: MIN_VALUES, and for the quantile p as many as have one above it.
+    """Least number of values of a cell that is drawn: MIN_VALUES, and for the quantile p at least 1 / (1 - p).
 
-    One of 1 / (1 - p) values exceeds it; of fewer the quantile is about their largest.
+    Of so many values one exceeds the quantile; of fewer, the quantile is about the largest.
     """
     percent = re.search(r"_p(\d+)$", response)
-    return max(MIN_VALUES, math.ceil(100 / (100 - int(percent[1])))) if percent else MIN_VALUES
+    if not percent:
+        return MIN_VALUES
+    return max(MIN_VALUES, math.ceil(100 / (100 - int(percent[1]))))
 
 
 def radial_range(radial_deg: Floats, sky: bool) -> tuple[float, float]:
-    """Range of tilts or declinations to draw: that of the trials in whole degrees; to the poles if near them."""
-    low = math.floor(float(radial_deg.min()))
-    high = math.floor(float(radial_deg.max())) + 1
+    """Range of tilts or declinations to draw: that of the trials in whole degrees, extended to near poles."""
+    low = float(np.floor(radial_deg.min()))
+    high = float(np.floor(radial_deg.max())) + 1
     if not sky:
-        return (0.0 if low <= 1 else float(low)), float(high)
+        return (0.0 if low <= 1 else low), high
     bottom, top = SKY_RANGE_DEG
-    return (bottom if low < bottom + 5 else float(low)), (
-        top if high > top - 5 else float(high)
-    )
+    if low < bottom + 5:
+        low = bottom
+    if high > top - 5:
+        high = top
+    return low, high
 
 
 def partition(
@@ -165,7 +172,9 @@ def partition(
 
 
 def cell_numbers(
-    ranges: Sequence[tuple[float, float, float, float]], radial_deg: Floats, around_deg: Floats
+    ranges: Sequence[tuple[float, float, float, float]],
+    radial_deg: Floats,
+    around_deg: Floats,
 ) -> NDArray[np.int16]:
     """(N,) number of the cell that each trial is in, by the ranges of `partition`; -1 for none."""
     number = np.full(len(radial_deg), -1, np.int16)
@@ -201,7 +210,10 @@ def draw_maps(fig: Any, panels: Sequence[DirectionMap], figure: Map) -> None:
         axes.set_aspect("equal")
         axes.set_axis_off()
         draw_cells(axes, panel, colors)
-        (draw_sky_labels if panel.sky else draw_dome_labels)(axes, panel)
+        if panel.sky:
+            draw_sky_labels(axes)
+        else:
+            draw_dome_labels(axes, panel)
         mark_worst(axes, panel)
         axes.set_title(f"{figure.by} = {panel.label}" if panel.label else "", fontsize=9)
     add_color_bar(fig, colors, figure, ax=list(stack), shrink=0.8)
@@ -233,7 +245,7 @@ def place(radial_deg: Floats | float, around_deg: Floats | float, sky: bool) -> 
 
 
 def draw_cells(axes: Any, panel: DirectionMap, colors: Any) -> None:
-    """Draw each cell in the color of its value, or hatched if it has too few; with their numbers if cells are few."""
+    """Draw each cell in the color of its value, or hatched if it has too few; write their numbers if cells are few."""
     from matplotlib.collections import PolyCollection
 
     shown = [cell for cell in panel.cells if cell.shown]
@@ -242,7 +254,9 @@ def draw_cells(axes: Any, panel: DirectionMap, colors: Any) -> None:
     axes.add_collection(PolyCollection([outline(cell, panel.sky) for cell in shown], **edges))
     empty = [outline(cell, panel.sky) for cell in panel.cells if not cell.shown]
     axes.add_collection(PolyCollection(empty, **HATCHED))
-    for cell in panel.cells if len(panel.cells) <= MAX_NUMBERED else ():
+    if len(panel.cells) > MAX_NUMBERED:
+        return
+    for cell in panel.cells:
         dark = cell.shown and not is_light(colors.to_rgba(cell.value))
         style = LABEL | {"fontsize": 6.5, "color": "#eeeeee" if dark else "#333333"}
         radial_deg = (cell.low_deg + cell.high_deg) / 2
@@ -271,22 +285,26 @@ def draw_dome_labels(axes: Any, panel: DirectionMap) -> None:
         axes.text(*place(1.09 * edges[-1], azimuth_deg, False), text, **LABEL)
     for edge in edges:
         axes.text(
-            *place(edge, RING_LABEL_DEG, False), f"{edge:.3g}°", path_effects=[halo()], **LABEL
+            *place(edge, RING_LABEL_DEG, False),
+            f"{edge:.3g}°",
+            path_effects=[halo()],
+            **LABEL,
         )
 
 
-def draw_sky_labels(axes: Any, panel: DirectionMap) -> None:
+def draw_sky_labels(axes: Any) -> None:
     """Draw the sky's border, and label right ascensions along the equator and declinations at the left."""
     dec_deg = np.linspace(-90, 90, 91)
     for edge in (180.0, 540.0):
         axes.plot(*place(dec_deg, edge, True).T, color="#888888", linewidth=1)
     axes.set(xlim=(-3.2, 2.9), ylim=(-1.5, 1.5))
     for ra_deg in (240, 300, 360, 420, 480):
-        axes.text(*place(0.0, ra_deg, True), f"{ra_deg % 360}°", path_effects=[halo()], **LABEL)
-    for dec in (-60.0, -30.0, 0.0, 30.0, 60.0):
         axes.text(
-            *place(dec, 540.0, True) - [0.22, 0.0], f"{dec:+.0f}°" if dec else "0°", **LABEL
+            *place(0.0, ra_deg, True), f"{ra_deg % 360}°", path_effects=[halo()], **LABEL
         )
+    for dec in (-60.0, -30.0, 0.0, 30.0, 60.0):
+        x, y = place(dec, 540.0, True)
+        axes.text(x - 0.22, y, f"{dec:+.0f}°" if dec else "0°", **LABEL)
 
 
 def mark_worst(axes: Any, panel: DirectionMap) -> None:
@@ -307,7 +325,7 @@ def mark_worst(axes: Any, panel: DirectionMap) -> None:
 def caption(
     panels: Sequence[DirectionMap], figure: Map, study: Study, lines: Sequence[PointRow]
 ) -> str:
-    """Caption of a map: its response, the fixed levels, what its directions are, and the numbers in its cells."""
+    """Caption of a map: its response, the fixed levels, the meaning of directions, and the numbers in the cells."""
     text = caption_title(figure) + fixed_text(figure, study, lines)
     cells = [cell for panel in panels for cell in panel.cells]
     if not cells:

@@ -1,4 +1,4 @@
-"""The first part of a study's report: its scene as a table, and what the checks of the scene find."""
+"""The first part of a study's report: its scene as a table, and the findings of the scene's checks."""
 
 from __future__ import annotations
 
@@ -26,19 +26,21 @@ from skysim.simulation.lab import Lab, UserParts, build_lab
 
 NUMBER = re.compile(r"\d[\d.]*")
 RATE = "trial.rate_deg_s"
-MAX_CHECKED = 8  # scenes that are checked: building one takes up to a second
+MAX_CHECKED = (
+    8  # maximum number of scenes that are checked: building one takes up to a second
+)
 
 
 class Overview(NamedTuple):
-    """What a report begins with.
+    """The first part of a report.
 
     Attributes
     ----------
     rows
         Names and texts of the scene table, for the first level of every factor
     findings
-        Of the checks, each with the levels at which it was found; at the rates of the study's
-        trials
+        Findings of the checks at the rates of the trials, each with the levels at which it was
+        found
     may_be_ambiguous
         Whether the tracker can refuse a frame as ambiguous
     fixed
@@ -52,7 +54,7 @@ class Overview(NamedTuple):
 
 
 def overview(plan: Plan) -> Overview:
-    """The overview of a study; scenes that cannot be built are left out, as their trials tell why."""
+    """The overview of a study. Scenes that cannot be built are left out: the rows of their trials have the reason."""
     rows: list[tuple[str, str]] = []
     found: dict[str, list[tuple[str, str]]] = {}
     leds: dict[str, int] = {}
@@ -63,7 +65,9 @@ def overview(plan: Plan) -> Overview:
         if checked == MAX_CHECKED:
             break
         try:
-            scene, trial = resolve_point(plan.spec, plan.spec.trial_settings(point.settings, 0))
+            scene, trial = resolve_point(
+                plan.spec, plan.spec.trial_settings(point.settings, 0)
+            )
             lab = build_lab(scene, UserParts(plan.spec.programs))
             found_here = checks.check(
                 lab, greatest_tilt_deg(scene, trial), trial_rate_rad_s(trial, lab)
@@ -96,18 +100,18 @@ def greatest_tilt_deg(scene: Scene, trial: Trial) -> float | None:
 
 
 def with_leds(levels: str, leds: Mapping[str, int]) -> str:
-    """The name of a checked point, with its number of LEDs where a study's points differ in it.
+    """The name of a checked point, with its number of LEDs if the points of the study differ in it.
 
     Parameters
     ----------
     leds
-        Of each checked point under a dome
+        Number of LEDs of each checked point under a dome
     """
     return f"{levels}, {leds[levels]} LEDs" if len(set(leds.values())) > 1 else levels
 
 
 def finding_text(at: list[tuple[str, str]], checked: int) -> str:
-    """One finding, which differs in its numbers at some levels: the first one, and the levels at which it was found."""
+    """Text of a finding that has other numbers at other levels: the first one, and the levels at which it was found."""
     others = [levels for _, levels in at[1:]]
     (line, first) = at[0]
     if len(at) == checked and len({text for text, _ in at}) == 1:
@@ -118,26 +122,32 @@ def finding_text(at: list[tuple[str, str]], checked: int) -> str:
 
 
 def trial_rate_rad_s(trial: Trial, lab: Lab) -> Floats | None:
-    """(3,) rate of a trial of a single attitude in body axes; None for a flight, whose scene has its rates."""
+    """(3,) rate of a trial of a single attitude in body axes; None for a flight, whose rates are in its scene."""
     if isinstance(trial, FlightTrial):
         return None
     if not isinstance(trial, FrameTrial):
         return np.zeros(3)
-    # A random axis is taken between the camera's x and y: rows of a rolling shutter are both sheared and stretched.
+    # For a random axis, one between the camera's x and y is taken: a rolling shutter then both shears and stretches.
     axis_cam = rate_axis(trial.rate_axis, math.pi / 4, lab.camera.mount)
-    return lab.camera.mount.cam_from_body.inv().apply(math.radians(trial.rate_deg_s) * axis_cam)
+    return lab.camera.mount.cam_from_body.inv().apply(
+        math.radians(trial.rate_deg_s) * axis_cam
+    )
 
 
 def checked_points(plan: Plan) -> Iterator[tuple[str, Point]]:
-    """The point of all first levels, then the greatest rate of trials, then each other level of one factor that changes
-    the scene, with its name.
+    """The points whose scenes are checked, with their names.
+
+    They are the point of all first levels, the greatest rate of the trials, and each other level of a factor that
+    changes the scene.
     """
     factors = plan.study.factors
     first = {name: options(factor)[0] for name, factor in factors.items()}
     yield "first levels", make_point(first)
     for name, factor in factors.items():
         rates = [
-            option for option in options(factor) if isinstance(option[1].get(RATE), int | float)
+            option
+            for option in options(factor)
+            if isinstance(option[1].get(RATE), int | float)
         ]
         fastest = max(rates, key=lambda option: float(str(option[1][RATE])), default=None)
         if fastest is not None and fastest != first[name]:
@@ -152,7 +162,7 @@ def checked_points(plan: Plan) -> Iterator[tuple[str, Point]]:
 
 
 def options(factor: Factor) -> list[tuple[object, dict[str, object]]]:
-    """The levels of a factor; of a range its ends, of a distribution its median."""
+    """The levels of a factor, the ends of a range, or the median of a distribution."""
     if isinstance(factor, Range):
         return [factor.value_at(0.0), factor.value_at(1.0)]
     return (
@@ -164,7 +174,7 @@ def options(factor: Factor) -> list[tuple[object, dict[str, object]]]:
 
 
 def scene_rows(plan: Plan, lab: Lab, facts: Sequence[Fact]) -> list[tuple[str, str]]:
-    """The scene of a lab, with what the check's facts say of its tracker; how the study varies and repeats it."""
+    """Rows on the scene of a lab, its tracker by the facts of the checks, and how the study varies and repeats it."""
     study = plan.study
     scene = lab.scene
     changed = "; ".join(f"{key}: {format_setting(value)}" for key, value in study.set.items())
@@ -226,7 +236,9 @@ def tracker_text(scene: Scene) -> str:
 
 def factor_text(factor: Factor) -> str:
     """The levels of a factor, or its range or distribution."""
-    keys = ", ".join(dict.fromkeys(key for _, settings in options(factor) for key in settings))
+    keys = ", ".join(
+        dict.fromkeys(key for _, settings in options(factor) for key in settings)
+    )
     if isinstance(factor, Range):
         return f"{factor.from_} to {factor.to} ({keys})"
     if isinstance(factor, Distribution):

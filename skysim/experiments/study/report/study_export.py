@@ -19,9 +19,9 @@ from skysim.results.files.row_parts import EXTRA, encoding, to_arrow
 
 
 def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
-    """Write one line per trial, missing values empty; numbers in Python's shortest form, which reads back exactly.
+    """Write one line per trial, with missing values empty and numbers in Python's shortest exact form.
 
-    Columns without any value are left out: of a study of frames, for example, those of flights.
+    Columns without any value are left out, for example those of flights in a study of frames.
     """
     levels = level_columns(store)
     names = names_with_values(store)
@@ -37,7 +37,7 @@ def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
 
 
 def names_with_values(store: Store) -> list[str]:
-    """Names of the columns of `trial_columns` that are not empty; all of a store without trials."""
+    """Names of the columns of `trial_columns` that are not empty; all names if there are no trials."""
     every = [*COLUMNS, *level_columns(store)]
     empty = set(COLUMNS)
     some = False
@@ -109,7 +109,9 @@ def dataset(store: Store, responses: tuple[str, ...], path: Path) -> Any:
         if frame[name].map(type).isin([list, dict]).any():
             frame[name] = frame[name].map(str)
     sizes = [frame[name].nunique() for name in factors]
-    full = factors and int(np.prod(sizes)) == len(frame) and not frame.duplicated(factors).any()
+    full = (
+        factors and int(np.prod(sizes)) == len(frame) and not frame.duplicated(factors).any()
+    )
     meta = {key: store.meta(key) for key in ("title", "code", "study")}
     indexed = frame.set_index(factors if full else ["point"])
     return xarray.Dataset.from_dataframe(indexed).assign_attrs(meta)

@@ -1,4 +1,4 @@
-"""The report of a study, finished or not: its answers, figures and tables, made from its plan and its store."""
+"""The report of a finished or unfinished study: answers, figures and tables, made from its plan and its store."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ POINTS = "Points"  # titles of sections
 STUDY_FILE = "The study file"
 LISTED = 10  # maximum number of failures listed
 ROWS = 5000  # maximum number of rows in the table of points
-OPEN_ROWS = 20  # rows above which that table is folded
+OPEN_ROWS = 20  # number of rows above which that table is folded
 SOBOL = (
     "Sobol indices of {}: the share of its variance that would go were a factor known, and that would stay were all"
     " others known; intervals of 95 %."
@@ -63,24 +63,24 @@ SOBOL = (
 
 
 class Analysis(NamedTuple):
-    """What is known of a study's trials.
+    """The analysis of a study's trials.
 
     Attributes
     ----------
     lines
-        Of all points, with the responses of `responses` and those of the answers
+        All points, with the responses of `responses` and those of the answers
     about
-        Scene table and findings of its checks
+        Scene table and findings of the scene's checks
     verdict
         The answer in a few sentences
     headline
         All answers in words
     ranges
-        Of each response, in words
+        Range of each response, in words
     indices
-        Sobol indices, of design saltelli
+        Sobol indices, for the design saltelli
     result
-        Candidates and front, of a search
+        Candidates and front, for a search
     """
 
     lines: Sequence[PointRow]
@@ -97,7 +97,9 @@ class Analysis(NamedTuple):
         return [*self.headline, *self.ranges]
 
 
-def study_report(plan: Plan, store: Store, study: str = "", out: Path | None = None) -> Report:
+def study_report(
+    plan: Plan, store: Store, study: str = "", out: Path | None = None
+) -> Report:
     """The report of a study; `study` and `out` are those of `commands`.
 
     Raises
@@ -112,12 +114,13 @@ def study_report(plan: Plan, store: Store, study: str = "", out: Path | None = N
 def commands(
     plan: Plan, store: Store, study: str = "", out: Path | None = None
 ) -> Callable[[str], str]:
-    """The function from a verb to the shell command that applies it to a study, with its overrides if it runs it.
+    """The function from a verb to the shell command that applies it to a study, with overrides if the verb runs it.
 
     Parameters
     ----------
     study, out
-        What the command names; by default the study's name or path, and the store's folder
+        Study and folder in the command; by default the study's name or path, and the store's
+        folder
     """
     if not study:
         study = plan.name if plan.path.parent == STUDIES else str(plan.path)
@@ -125,7 +128,9 @@ def commands(
     return partial(shell_command, study, out, store.overrides())
 
 
-def shell_command(study: str, out: Path | None, overrides: Mapping[str, str], verb: str) -> str:
+def shell_command(
+    study: str, out: Path | None, overrides: Mapping[str, str], verb: str
+) -> str:
     """The shell command that applies `verb` to a study."""
     words = ["skysim", "study", verb, study]
     if out:
@@ -179,7 +184,9 @@ def compose(
     """
     lines = select_responses(found.lines, responses(study))
     front = [one.number for one in found.result.front] if found.result else []
-    costs = {one.number: one.cost for one in found.result.candidates} if found.result else None
+    costs = (
+        {one.number: one.cost for one in found.result.candidates} if found.result else None
+    )
     drawn = [
         *search_figures(lines, study, front, costs, also),
         *sobol_figures(found.indices),
@@ -212,14 +219,16 @@ def compose(
 
 
 def folded(title: str, blocks: Sequence[Block], on_terminal: bool = False) -> Section:
-    """A section that a reader opens; on the page alone unless it is said."""
+    """A folded section of the page; it is printed on a terminal only with `on_terminal`."""
     return Section(title, blocks, folded=True, on_terminal=on_terminal)
 
 
 def scene_sections(about: Overview, code: str) -> list[Section]:
     """The findings of the scene's checks, and the scene as a table with the version of the code."""
     findings = (
-        Items(about.findings, tone="warning") if about.findings else Text("Nothing to warn of.")
+        Items(about.findings, tone="warning")
+        if about.findings
+        else Text("Nothing to warn of.")
     )
     facts = [*((name, [text]) for name, text in about.rows), ("code version", [code])]
     return [
@@ -228,17 +237,17 @@ def scene_sections(about: Overview, code: str) -> list[Section]:
     ]
 
 
-# What it says.
+# Texts.
 
 
 def question(text: str) -> str:
-    """The comment that a study file begins with."""
+    """The comment at the beginning of a study file."""
     lines = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
     return " ".join(line.removeprefix("#").strip() for line in lines)
 
 
 def progress(study: Study, store: Store) -> Text:
-    """How many trials are done, failed, and ended in a wrong attitude; its tone says whether all are done."""
+    """Numbers of trials that are done, that failed, and that gave a wrong attitude; the tone says if all are done."""
     counts = store.counts()
     trials = study.trial_count(len(store.points()))
     finished = 0 < trials <= counts["done"]
@@ -259,7 +268,9 @@ def failures(store: Store, replay: str) -> Items:
         lines.append(f"`{replay} {listed[0][0]}` does one again and keeps its frames.")
     trials = "1 trial failed and counts" if count == 1 else f"{count} trials failed and count"
     first = ", the first of them" if count > len(listed) else ""
-    return Items(lines, f"{trials} in no figure but `failed`{first}:", "bad", on_terminal=False)
+    return Items(
+        lines, f"{trials} in no figure but `failed`{first}:", "bad", on_terminal=False
+    )
 
 
 # Tables.
@@ -271,7 +282,7 @@ def points_section(
     front: Sequence[int],
     costs: Mapping[int, float] | None,
 ) -> Section:
-    """The table of all points. Named levels sort in the order of the study file; those of a front are marked."""
+    """The table of all points. Named levels sort in the order of the study file; points of a front are marked."""
     heads, texts = cells(lines)
     axes = {name: axis(study, lines, name) for name in (lines[0].levels if lines else ())}
     kinds: list[Kind] = [
@@ -282,7 +293,10 @@ def points_section(
     columns = [Column(head, kind=kind) for head, kind in zip(heads, kinds, strict=False)]
     rows: list[list[Any]] = []
     for line, row_texts in zip(lines[:ROWS], texts[:ROWS], strict=True):
-        keys = [line.point, *(axes[name].coordinate(one) for name, one in line.levels.items())]
+        keys = [
+            line.point,
+            *(axes[name].coordinate(one) for name, one in line.levels.items()),
+        ]
         keys += [one.value for one in line.responses.values()]
         tone: Tone = "marked" if line.point in front else ""
         row = [Cell(text, key=key) for text, key in zip(row_texts, keys, strict=True)]
@@ -294,15 +308,19 @@ def points_section(
     if front:
         note += " Tinted: the front."
     if len(lines) > ROWS:
-        note += f" And {len(lines) - ROWS} points more: `skysim study export` writes them all."
+        note += (
+            f" And {len(lines) - ROWS} points more: `skysim study export` writes them all."
+        )
     shown = Table(columns, rows, from_the_last(len(axes) + 1, len(columns)))
     return Section(POINTS, [shown, Text(note)], folded=len(lines) > OPEN_ROWS)
 
 
 def range_table(study: Study, lines: Sequence[PointRow]) -> Table:
-    """The least and the largest value of each response, and where they are."""
+    """The least and the largest value of each response, with their points."""
     heads = ("response", "least", "at", "largest", "at")
-    return Table([Column(head, kind="text") for head in heads], answer.range_rows(study, lines))
+    return Table(
+        [Column(head, kind="text") for head in heads], answer.range_rows(study, lines)
+    )
 
 
 def index_table(indices: Sequence[Index]) -> Table:
@@ -321,7 +339,7 @@ def index_table(indices: Sequence[Index]) -> Table:
 
 
 def with_key(summary: Any) -> Cell:
-    """A statistic with its interval, which sorts by its value."""
+    """A cell with a statistic and its interval, which sorts by value."""
     return Cell(format_summary(summary), key=summary.value)
 
 
@@ -338,12 +356,12 @@ def front_table(study: Study, result: SearchResult | None) -> list[Block]:
 
 
 def from_the_last(kept: int, count: int) -> list[tuple[int]]:
-    """The columns that a narrow terminal leaves out: the last first, none of the first `kept`."""
+    """The columns that a narrow terminal leaves out: the last one first, but not the first `kept`."""
     return [(column,) for column in range(count - 1, kept - 1, -1)]
 
 
 def runs_section(store: Store) -> Section:
-    """The runs that filled the store."""
+    """The runs that have filled the store."""
     columns = [text_column("engine"), Column("workers"), Column("trials")]
     columns += [Column("time", "s", ".1f"), Column("trials/s", format=".1f")]
     runs = store.runs()
@@ -362,7 +380,7 @@ def runs_section(store: Store) -> Section:
 def study_figures(
     lines: Sequence[PointRow], study: Study, columns_of: ColumnsOf, replay: str
 ) -> list[Block]:
-    """The study's figures: maps with their worst trials, others with their numbers.
+    """The study's figures: maps with tables of their worst trials, other figures with tables of their numbers.
 
     Parameters
     ----------
@@ -375,7 +393,9 @@ def study_figures(
     for one in layout.figures(study, lines):
         if isinstance(one, Map):
             panels = maps.direction_maps(lines, one, study, columns_of)
-            picture = Figure(maps.map_png(panels, one), maps.caption(panels, one, study, lines))
+            picture = Figure(
+                maps.map_png(panels, one), maps.caption(panels, one, study, lines)
+            )
             blocks += [picture, worst_table(panels, replay)]
             continue
         blocks.append(
@@ -409,7 +429,7 @@ def worst_table(panels: Sequence[DirectionMap], replay: str) -> Table:
 
 
 def pivot_table(figure: Curve | Heat, lines: Sequence[PointRow], study: Study) -> Table:
-    """A figure's numbers: its x across, the other factor down."""
+    """A figure's numbers: a column per level of x, a row per level of the other factor."""
     across = axis(study, lines, figure.x)
     other = figure.by if isinstance(figure, Curve) else figure.y
     chosen = shown_points(lines, figure, study)
@@ -462,6 +482,7 @@ def search_figures(
         one, other = (panels[name] for name in named)
         text = f"{named[1]} against {named[0]}: the Pareto front of {len(front)} among {len(lines)} candidates."
         shown.insert(
-            0, Figure(figures.pareto_png(one, other, points, front, also), text, name="pareto")
+            0,
+            Figure(figures.pareto_png(one, other, points, front, also), text, name="pareto"),
         )
     return shown

@@ -258,7 +258,9 @@ def unique_levels(
     """
     count = len(position_m)
     if count <= nearest:
-        raise InputError("light.layout.unique_neighbors", f"{nearest} of {count} LEDs", "fewer")
+        raise InputError(
+            "light.layout.unique_neighbors", f"{nearest} of {count} LEDs", "fewer"
+        )
     around = neighbors(position_m, nearest)
     level = rng.integers(0, levels, count)
     alike = alike_leds(level, around, levels)
@@ -291,7 +293,9 @@ def neighbors(position_m: Floats, nearest: int) -> Ints:
         direction, np.where(np.abs(direction[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
     )
     y = np.cross(direction, x)
-    azimuth = np.arctan2(np.einsum("nki,ni->nk", offset, y), np.einsum("nki,ni->nk", offset, x))
+    azimuth = np.arctan2(
+        np.einsum("nki,ni->nk", offset, y), np.einsum("nki,ni->nk", offset, x)
+    )
     return np.take_along_axis(near, np.argsort(azimuth, axis=1), axis=1)
 
 

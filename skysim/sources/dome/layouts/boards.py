@@ -76,7 +76,9 @@ def patch_boards(
     glue = random_stream(config.hardware_seed, GLUE_STREAM)
     if config.glue_tilt_deg:
         boards = tilt_boards(boards, np.radians(config.glue_tilt_deg), glue)
-    displacement_m = scaled_errors(config.glue_scatter_m, glue.standard_normal((2, len(board))))
+    displacement_m = scaled_errors(
+        config.glue_scatter_m, glue.standard_normal((2, len(board)))
+    )
     # 3.
     place = (
         boards.center_m[board]
@@ -84,7 +86,9 @@ def patch_boards(
         + ((hole // 3 - 1) * config.pitch_m + displacement_m[1])[:, None] * boards.v[board]
     )
     number = (board * HOLES + hole).astype(np.int64)
-    placed = PlacedLeds(number, place, boards.normal[board], level, np.full(len(board), np.nan))
+    placed = PlacedLeds(
+        number, place, boards.normal[board], level, np.full(len(board), np.nan)
+    )
     return led_sources(placed, led, band, rng)
 
 

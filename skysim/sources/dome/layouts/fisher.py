@@ -60,7 +60,9 @@ class Visibility(NamedTuple):
 
 
 @jit
-def in_field(R: Floats, point_m: Floats, camera_m: Floats, tan_half: Floats, b: Floats) -> bool:
+def in_field(
+    R: Floats, point_m: Floats, camera_m: Floats, tan_half: Floats, b: Floats
+) -> bool:
     """Whether the attitude R_body_from_lab has a point in its field of view; writes the point in body axes to b.
 
     The height is computed first: most points fail there, or in x.

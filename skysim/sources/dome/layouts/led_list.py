@@ -38,7 +38,7 @@ def led_list(config: DomeConfig, band: Band, name: str) -> tuple[str, int]:
     full = full_strength_e_s_sr(ideal_led(config.led), band)
     level = leds.strength / max(full, float(leds.strength.max()))
     azimuth_deg = np.degrees(np.arctan2(place_m[:, 1], place_m[:, 0])) % 360
-    tilt_deg = np.degrees(np.arctan2(np.hypot(*place_m[:, :2].T), place_m[:, 2]))
+    tilt_deg = tilts_deg(place_m)
     columns = {"id": [f"{number}" for number in leds.id]}
     for n, axis in enumerate("xyz"):
         columns[f"{axis}_m"] = [f"{value:.12f}" for value in place_m[:, n]]
@@ -54,7 +54,8 @@ def led_list(config: DomeConfig, band: Band, name: str) -> tuple[str, int]:
     columns["level"] = [f"{value:.9g}" for value in level]
     rows = [",".join(row) for row in zip(*columns.values(), strict=True)]
     header = HEADER.format(name=name, tape=TAPE if "tape" in columns else "")
-    return header + "\n".join([",".join(columns), *rows, ""]), math.ceil(max_tilt_deg(place_m))
+    lines = [",".join(columns), *rows, ""]
+    return header + "\n".join(lines), math.ceil(tilt_deg.max())
 
 
 def design_leds(config: DomeConfig, surface: Surface, band: Band) -> Sources:
@@ -65,6 +66,11 @@ def design_leds(config: DomeConfig, surface: Surface, band: Band) -> Sources:
     return LAYOUTS[layout.kind](layout, surface, ideal_led(config.led), band)
 
 
+def tilts_deg(place_m: Floats) -> Floats:
+    """(N,) angles of places (N, 3) from the zenith, seen from the bearing."""
+    return np.degrees(np.arctan2(np.hypot(*place_m[:, :2].T), place_m[:, 2]))
+
+
 def max_tilt_deg(place_m: Floats) -> float:
-    """Greatest angle of places (N, 3) from the zenith, seen from the bearing."""
-    return float(np.degrees(np.arctan2(np.hypot(*place_m[:, :2].T), place_m[:, 2])).max())
+    """The greatest of the angles of `tilts_deg`."""
+    return float(tilts_deg(place_m).max())

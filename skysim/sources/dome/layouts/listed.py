@@ -27,7 +27,12 @@ from skysim.sources.photometry import Band
 MAX_SURFACE_OFFSET_M = 0.05  # of a listed LED; a larger one is an error in a unit or an axis
 COLUMNS = (("x_m", "y_m", "z_m"), ("azimuth_deg", "tilt_deg"))
 BRIGHTNESS = ("level", "magnitude")
-FURTHER = ("id", "tape", "tape_m", "sigma_m")  # `id` numbers the LEDs, the others are not used
+FURTHER = (
+    "id",
+    "tape",
+    "tape_m",
+    "sigma_m",
+)  # `id` numbers the LEDs, the others are not used
 
 
 class LedFile(NamedTuple):
@@ -70,7 +75,9 @@ def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -
     )
     check_cap(key, directions, config.cap_deg)
     place_m = (
-        coordinates if coordinates.shape[1] == 3 else project_from_bearing(surface, directions)
+        coordinates
+        if coordinates.shape[1] == 3
+        else project_from_bearing(surface, directions)
     )
     check_on_surface(key, surface, place_m)
     # Without levels every LED is at full brightness.
@@ -113,7 +120,9 @@ def read_csv(path: Path) -> LedFile:
             f"{path} cannot be read: {getattr(error, 'strerror', None) or error}",
         ) from None
     lines = [
-        (n, line) for n, line in enumerate(text, 1) if line.strip() and not line.startswith("#")
+        (n, line)
+        for n, line in enumerate(text, 1)
+        if line.strip() and not line.startswith("#")
     ]
     names = split_row(lines[0][1]) if lines else []
     chosen = next((columns for columns in COLUMNS if set(columns) <= set(names)), None)

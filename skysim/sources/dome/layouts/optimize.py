@@ -11,9 +11,7 @@ the move is kept if it lowers the sum and respects the least spacing (`try_moves
 contains the worst one, the hardest attitudes of a fresh random sample join the set between generations
 (`hardest_attitudes`).
 
-The search starts from even layouts: Fibonacci spirals and a Poisson-disk sample of the sites, the best of them also
-contracted toward the zenith. A final stage moves LEDs whose fields of view are too similar to another field
-(`reduce_ambiguity`). Layouts are compared by the mean variance of the worst 1 % of independent attitudes
+Layouts are compared by the mean variance of the worst 1 % of independent attitudes
 (`PlacementScore`). By this measure the result is never worse than the even layouts; at a single attitude it can be.
 `optimize_places` has the steps in order.
 """
@@ -45,6 +43,7 @@ from skysim.sources.dome.layouts.fisher import (
     variances,
     visible_from,
 )
+from skysim.sources.dome.layouts.placing import contract, spacing_ok, spread
 from skysim.sources.dome.surface import Surface
 
 Ints = NDArray[np.int64]
@@ -186,7 +185,9 @@ class PlacementScore(NamedTuple):
         tail = self.tail_variance(place_m)
         ambiguity = layout_ambiguity(self.config, place_m)
         hardest = hardest_attitudes(self.config, self.options, place_m, 1.0, rng)
-        fewest = total_information(place_m, hardest, *camera_geometry(self.config))[:, 6].min()
+        fewest = total_information(place_m, hardest, *camera_geometry(self.config))[
+            :, 6
+        ].min()
         ambiguous = float(np.mean(ambiguity.fraction > self.options.max_overlap))
         return tail > 1, bool(fewest < 2), tail * (1 + ambiguous)
 
@@ -202,10 +203,9 @@ def optimize_places(
 
     1. The best even layout by `PlacementScore.tail_variance` sets the reference. It is also contracted toward the
        zenith.
-    2. From the best of these `descend` lowers sum_a c_a^HARDNESS, c_a = MISSING_LED_FACTOR^missing
-       tr((sum_i J_i'J_i)^-1), over attitudes a to the tilt. The Jacobian J_i of LED i is with respect to a rotation
-       about the bearing. Steps are small, because evenness once lost is not regained, but they suffice to make one
-       field differ from others.
+    2. From the best of these `descend` lowers the sum over attitudes a to the tilt; the Jacobian J_i of LED i is with
+       respect to a rotation about the bearing. Steps are small, because evenness once lost is not regained, but they
+       suffice to make one field differ from others.
     3. The best by `PlacementScore.score` of all layouts reached is kept, so no even layout is better in the worst
        attitudes.
     4. `reduce_ambiguity` changes ambiguous fields; its result is kept if `score` prefers it.
@@ -225,17 +225,7 @@ def optimize_places(
     """
     # 1. Even layouts that keep the spacing.
     few_sites_m = sites_m[: options.even_sites_per_led * config.count]
-    even = [start_m for start_m in starts_m if spacing_ok(start_m, config.spacing_m)]
-    chosen = spread(few_sites_m, config.spacing_m, config.count, options.bisections)
-    if len(chosen) == config.count:
-        even.append(sites_m[chosen])
-    if not even:
-        raise InputError(
-            "light.layout.spacing",
-            f"{len(chosen)} of {config.count} LEDs fit {config.spacing_m:.3g} m apart where the field reaches at a"
-            f" tilt of {config.tilt_deg:g} deg",
-            "fewer LEDs, less spacing, or a greater cap_deg",
-        )
+    even = even_layouts(config, few_sites_m, starts_m, options.bisections)
     visible = visible_fraction(config, few_sites_m, rng)
     scorer = PlacementScore(
         config, options, sample_attitudes(config, options.score_attitudes, rng)
@@ -251,13 +241,8 @@ def optimize_places(
         return min(layouts_m, key=lambda layout_m: scorer.score(layout_m, rng))
 
     best_m = best([even_m, start_m])
-    # 2. Settings by the mean number of LEDs in a field.
-    steps = options.dense_steps
-    field_fraction = options.dense_field
-    if visible * config.count < options.sparse_below:
-        steps = options.sparse_steps
-        field_fraction = options.sparse_field
-    search = LocalSearch(config, options, sites_m, cKDTree(sites_m), steps, field_fraction)
+    # 2.
+    search = LocalSearch.of(config, options, sites_m, visible * config.count)
     views = options.views_per_site / max(visible, 1e-9)
     count = np.clip(views, options.min_attitudes, options.max_attitudes)
     # 3. and 4.
@@ -265,25 +250,31 @@ def optimize_places(
     return best([reduce_ambiguity(scorer, best_m, sites_m, rng), best_m])
 
 
-def spacing_ok(place_m: Floats, spacing_m: float) -> bool:
-    """Whether no two LEDs are nearer to each other than the spacing."""
-    return bool(cKDTree(place_m).query(place_m, k=2)[0][:, 1].min() >= spacing_m)
+def even_layouts(
+    config: layouts.OptimizedConfig,
+    sites_m: Floats,
+    starts_m: Sequence[Floats],
+    bisections: int,
+) -> list[Floats]:
+    """The starts that keep the spacing, and a Poisson-disk sample of the sites if there is room for it.
 
-
-def contract(place_m: Floats, sites_m: Floats, fraction: float) -> Floats:
-    """(N, 3) sites nearest to a layout that is contracted to this fraction of its solid angle about the zenith.
-
-    Few attitudes see the rim, so its LEDs help more where more fields overlap. With z = cos(zenith angle) the
-    contraction is 1 - z' = fraction (1 - z), which scales every solid angle alike.
+    Raises
+    ------
+    InputError
+        If there is none.
     """
-    # Contract the directions, then take the nearest sites.
-    direction = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
-    z = 1 - fraction * (1 - direction[:, 2])
-    # sin(zenith angle) after the contraction, over that before it.
-    narrower = np.sqrt((1 - z**2) / np.maximum(1 - direction[:, 2] ** 2, 1e-12))
-    xy = direction[:, :2] * narrower[:, None]
-    site_direction = sites_m / np.linalg.norm(sites_m, axis=1, keepdims=True)
-    return sites_m[cKDTree(site_direction).query(np.column_stack([xy, z]))[1]]
+    even = [start_m for start_m in starts_m if spacing_ok(start_m, config.spacing_m)]
+    chosen = spread(sites_m, config.spacing_m, config.count, bisections)
+    if len(chosen) == config.count:
+        even.append(sites_m[chosen])
+    if not even:
+        raise InputError(
+            "light.layout.spacing",
+            f"{len(chosen)} of {config.count} LEDs fit {config.spacing_m:.3g} m apart where the field reaches at a"
+            f" tilt of {config.tilt_deg:g} deg",
+            "fewer LEDs, less spacing, or a greater cap_deg",
+        )
+    return even
 
 
 class LocalSearch(NamedTuple):
@@ -305,6 +296,22 @@ class LocalSearch(NamedTuple):
     tree: cKDTree
     steps: tuple[float, float]
     field_fraction: float
+
+    @classmethod
+    def of(
+        cls,
+        config: layouts.OptimizedConfig,
+        options: PlacementOptions,
+        sites_m: Floats,
+        field_leds: float,
+    ) -> LocalSearch:
+        """The search with the settings for a mean number of LEDs in a field."""
+        steps = options.dense_steps
+        field_fraction = options.dense_field
+        if field_leds < options.sparse_below:
+            steps = options.sparse_steps
+            field_fraction = options.sparse_field
+        return cls(config, options, sites_m, cKDTree(sites_m), steps, field_fraction)
 
     def propose(self, place_m: Floats, rng: np.random.Generator) -> Floats:
         """(N, 3) one site for each LED, a random step away; the length is log-uniform between the limits in `steps`."""
@@ -407,7 +414,9 @@ def hardest_attitudes(
     cost = sample_cost[worst]
     # 2. Size of the rotations across the boresight and about it.
     half = tan_half(config)
-    step_rad = options.perturbation_size * half.min() * np.array([1, 1, 1 / math.hypot(*half)])
+    step_rad = (
+        options.perturbation_size * half.min() * np.array([1, 1, 1 / math.hypot(*half)])
+    )
     for _ in range(options.perturbations):
         perturbation = Rotation.from_rotvec(step_rad * rng.standard_normal((len(hardest), 3)))
         perturbed = perturbation.as_matrix() @ hardest
@@ -469,7 +478,9 @@ def field_reach_rad(config: layouts.OptimizedConfig, surface: Surface) -> float:
 
 
 @jit
-def has_room(site: int, without: int, chosen: Ints, sites_m: Floats, spacing_m: float) -> bool:
+def has_room(
+    site: int, without: int, chosen: Ints, sites_m: Floats, spacing_m: float
+) -> bool:
     """Whether a site keeps the spacing to every LED except LED number `without`."""
     for n in range(len(chosen)):
         distance2 = 0.0
@@ -512,40 +523,6 @@ def try_moves(
             add_led(old, 1, visibility, total)
             update_costs(old, visibility, total, attitude_cost, min_leds)
             update_costs(new, visibility, total, attitude_cost, min_leds)
-
-
-def spread(sites_m: Floats, spacing_m: float, count: int, bisections: int) -> Ints:
-    """Indices of `count` sites at the widest spacing at which `thin` finds that many, by bisection.
-
-    Fewer than `count` if there is no room for them even at spacing_m.
-    """
-    chosen = thin(sites_m, spacing_m, count)
-    low_m = spacing_m
-    high_m = float(np.ptp(sites_m, axis=0).max())
-    for _ in range(bisections):
-        middle_m = (low_m + high_m) / 2
-        wider = thin(sites_m, middle_m, count)
-        if len(wider) < count:
-            high_m = middle_m
-        else:
-            low_m = middle_m
-            chosen = wider
-    return chosen
-
-
-def thin(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
-    """Indices of sites taken in order, each if none taken before is within the spacing, up to `count`.
-
-    For sites in random order this is random sequential adsorption.
-    """
-    tree = cKDTree(sites_m)
-    free = np.ones(len(sites_m), dtype=bool)
-    taken: list[int] = []
-    for site in range(len(sites_m)):
-        if free[site] and (count is None or len(taken) < count):
-            taken.append(site)
-            free[tree.query_ball_point(sites_m[site], spacing_m)] = False
-    return np.array(taken, dtype=np.int64)
 
 
 # Ambiguity between fields of view.
@@ -591,7 +568,9 @@ def reduce_ambiguity(
             break
         # 1.
         center_m = place_m[ambiguity.led[rng.choice(ambiguous)]]
-        central = cKDTree(place_m).query(center_m, k=min(options.central_leds, config.count))[1]
+        central = cKDTree(place_m).query(center_m, k=min(options.central_leds, config.count))[
+            1
+        ]
         moved = rng.choice(central)
         nearby = tree.query(place_m[moved], k=min(options.nearby_sites, len(sites_m)))[1]
         trial_m = place_m.copy()

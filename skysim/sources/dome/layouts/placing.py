@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.errors import InputError
@@ -122,7 +123,9 @@ def lit_sources(
     rng = random_stream(config.hardware_seed)
     lit = max(round(config.lit_fraction * len(place_m)), 1)
     number = np.sort(rng.permutation(len(place_m))[:lit])
-    return replace(dimmed_sources(config, surface, place_m[number], led, band, rng), id=number)
+    return replace(
+        dimmed_sources(config, surface, place_m[number], led, band, rng), id=number
+    )
 
 
 def cap(count: int, half_angle_rad: float) -> Floats:
@@ -174,3 +177,58 @@ def project_from_bearing(surface: Surface, directions: Floats) -> Floats:
             "a smaller cap_deg, a larger surface or rim, or kind listed",
         )
     return place_m
+
+
+def spread(sites_m: Floats, spacing_m: float, count: int, bisections: int) -> Ints:
+    """Indices of `count` sites at the widest spacing at which `thin` finds that many, by bisection.
+
+    Fewer than `count` if there is no room for them even at spacing_m.
+    """
+    chosen = thin(sites_m, spacing_m, count)
+    low_m = spacing_m
+    high_m = float(np.ptp(sites_m, axis=0).max())
+    for _ in range(bisections):
+        middle_m = (low_m + high_m) / 2
+        wider = thin(sites_m, middle_m, count)
+        if len(wider) < count:
+            high_m = middle_m
+        else:
+            low_m = middle_m
+            chosen = wider
+    return chosen
+
+
+def thin(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
+    """Indices of sites taken in order, each if none taken before is within the spacing, up to `count`.
+
+    For sites in random order this is random sequential adsorption.
+    """
+    tree = cKDTree(sites_m)
+    free = np.ones(len(sites_m), dtype=bool)
+    taken: list[int] = []
+    for site in range(len(sites_m)):
+        if free[site] and (count is None or len(taken) < count):
+            taken.append(site)
+            free[tree.query_ball_point(sites_m[site], spacing_m)] = False
+    return np.array(taken, dtype=np.int64)
+
+
+def spacing_ok(place_m: Floats, spacing_m: float) -> bool:
+    """Whether no two LEDs are nearer to each other than the spacing."""
+    return bool(cKDTree(place_m).query(place_m, k=2)[0][:, 1].min() >= spacing_m)
+
+
+def contract(place_m: Floats, sites_m: Floats, fraction: float) -> Floats:
+    """(N, 3) sites nearest to a layout that is contracted to this fraction of its solid angle about the zenith.
+
+    Few attitudes see the rim, so its LEDs help more where more fields overlap. With z = cos(zenith angle) the
+    contraction is 1 - z' = fraction (1 - z), which scales every solid angle alike.
+    """
+    # Contract the directions, then take the nearest sites.
+    direction = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
+    z = 1 - fraction * (1 - direction[:, 2])
+    # sin(zenith angle) after the contraction, over that before it.
+    narrower = np.sqrt((1 - z**2) / np.maximum(1 - direction[:, 2] ** 2, 1e-12))
+    xy = direction[:, :2] * narrower[:, None]
+    site_direction = sites_m / np.linalg.norm(sites_m, axis=1, keepdims=True)
+    return sites_m[cKDTree(site_direction).query(np.column_stack([xy, z]))[1]]

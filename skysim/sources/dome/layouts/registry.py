@@ -41,7 +41,9 @@ from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band
 
 
-def celestial(config: CelestialConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+def celestial(
+    config: CelestialConfig, surface: Surface, led: LedConfig, band: Band
+) -> Sources:
     """The real sky (JHU/APL's idea): an LED where the camera at its nominal place sees each of the brightest stars.
 
     LED numbers are Hipparcos numbers. Places are those of `celestial.project_stars`, levels those of
@@ -68,7 +70,9 @@ def lcd(config: LcdConfig, surface: Surface, led: LedConfig, band: Band) -> Sour
     return display.panel_sources(config, panel, led, band, stars)
 
 
-def projector(config: ProjectorConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+def projector(
+    config: ProjectorConfig, surface: Surface, led: LedConfig, band: Band
+) -> Sources:
     """Another layout's LEDs drawn on the nearest pixels of a projector: `display.projector_sources`."""
     stars = LAYOUTS[config.points.kind](config.points, surface, display.ideal_led(led), band)
     return projector_sources(config, surface, led, band, stars)

@@ -26,6 +26,8 @@ from skysim.sources.dome.layouts.placing import (
     lit_sources,
     project_from_bearing,
     scattered_cap,
+    spread,
+    thin,
 )
 from skysim.sources.dome.surface import Surface, directions
 from skysim.sources.photometry import Band
@@ -39,7 +41,9 @@ UNDIMMED = {"levels": None, "magnitudes": None, "unique_neighbors": None}
 BISECTIONS = 14  # bisection steps from the dome's width: to some tenths of a millimeter
 
 
-def fibonacci(config: FibonacciConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+def fibonacci(
+    config: FibonacciConfig, surface: Surface, led: LedConfig, band: Band
+) -> Sources:
     """LEDs on a Fibonacci spiral: equal solid angles about the bearing contain equal numbers, to within a few."""
     rng = random_stream(config.hardware_seed)
     place_m = project_from_bearing(surface, cap(config.count, np.radians(config.cap_deg)))
@@ -79,8 +83,10 @@ def poisson_disk(
     # A count: the widest spacing by bisection.
     if config.spacing_m is None:
         count = config.count or 1
-        darts_m = project_from_bearing(surface, scattered_cap(DARTS_PER_LED * count, half, rng))
-        place_m = darts_m[optimize.spread(darts_m, 0.0, count, BISECTIONS)]
+        darts_m = project_from_bearing(
+            surface, scattered_cap(DARTS_PER_LED * count, half, rng)
+        )
+        place_m = darts_m[spread(darts_m, 0.0, count, BISECTIONS)]
         return dimmed_sources(config, surface, place_m, led, band, rng)
     directions = cap(1000, half)
     points = project_from_bearing(surface, directions)
@@ -100,11 +106,13 @@ def poisson_disk(
             f"{min_spacing_m:.3g} m or more",
         )
     darts_m = project_from_bearing(surface, scattered_cap(max(int(dart_count), 1), half, rng))
-    place_m = darts_m[optimize.thin(darts_m, config.spacing_m)]
+    place_m = darts_m[thin(darts_m, config.spacing_m)]
     return dimmed_sources(config, surface, place_m, led, band, rng)
 
 
-def optimized(config: OptimizedConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+def optimized(
+    config: OptimizedConfig, surface: Surface, led: LedConfig, band: Band
+) -> Sources:
     """LEDs at the places that make the camera's worst attitudes most accurate: `optimize.optimize_places`.
 
     No LED is placed where no attitude's field reaches. In the mean of the worst attitudes the layout is not worse

@@ -186,7 +186,9 @@ def circles(config: StringConfig, surface: Surface, meridian: Meridian) -> list[
     tapes = []
     for tilt_rad in np.interp(arcs_m, meridian.arc_m, meridian.tilt_rad):
         ring_m = float(np.interp(tilt_rad, meridian.tilt_rad, meridian.ring_m))
-        steps = max(STEPS_PER_TURN, int(STEPS_PER_PITCH * 2 * np.pi * ring_m / config.pitch_m))
+        steps = max(
+            STEPS_PER_TURN, int(STEPS_PER_PITCH * 2 * np.pi * ring_m / config.pitch_m)
+        )
         around_rad = np.linspace(0, 2 * np.pi, steps + 1)
         tapes.append(lay(surface, np.full(steps + 1, tilt_rad), around_rad, closed=True))
     return tapes
@@ -207,9 +209,8 @@ def spiral(config: StringConfig, surface: Surface, meridian: Meridian) -> list[T
     )
     steps = np.append(0, np.cumsum((per_rad[1:] + per_rad[:-1]) / 2 * np.diff(azimuth_rad)))
     fine_rad = np.interp(np.arange(int(steps[-1]) + 1), steps, azimuth_rad)
-    tilt_rad = np.interp(
-        fine_rad, azimuth_rad, np.interp(arc_m, meridian.arc_m, meridian.tilt_rad)
-    )
+    tilt_rad = np.interp(arc_m, meridian.arc_m, meridian.tilt_rad)
+    tilt_rad = np.interp(fine_rad, azimuth_rad, tilt_rad)
     return [lay(surface, tilt_rad, fine_rad)]
 
 
@@ -223,9 +224,8 @@ def strips(config: StringConfig, surface: Surface, meridian: Meridian) -> list[T
     while 2 * np.pi * widest_m[-1] > count * config.spacing_m:
         count *= 2
     check_length(count * float(meridian.arc_m[-1]), count, config)
-    steps = max(
-        STEPS_PER_TURN, int(STEPS_PER_PITCH * float(meridian.arc_m[-1]) / config.pitch_m)
-    )
+    leds = float(meridian.arc_m[-1]) / config.pitch_m
+    steps = max(STEPS_PER_TURN, int(STEPS_PER_PITCH * leds))
     tapes = []
     for number in range(count):
         # Number of strips in the coarsest set that contains this one; it begins where these are half a spacing apart.
@@ -240,7 +240,9 @@ def strips(config: StringConfig, surface: Surface, meridian: Meridian) -> list[T
 WINDINGS = {"latitude": circles, "spiral": spiral, "meridian": strips}
 
 
-def lay(surface: Surface, tilt_rad: Floats, azimuth_rad: Floats, closed: bool = False) -> Tape:
+def lay(
+    surface: Surface, tilt_rad: Floats, azimuth_rad: Floats, closed: bool = False
+) -> Tape:
     """A tape along (K,) directions from the bearing, with its length."""
     return Tape(tilt_rad, azimuth_rad, tape_length_m(surface, tilt_rad, azimuth_rad), closed)
 
@@ -311,22 +313,29 @@ def marked_m(
     laser_m = np.array(config.laser_m)
     if not surface.inside(laser_m):
         raise InputError(
-            "light.layout.aiming.laser", f"{config.laser_m} m is outside of the dome", "inside"
+            "light.layout.aiming.laser",
+            f"{config.laser_m} m is outside of the dome",
+            "inside",
         )
     # 1.
     sight_m = place_m - laser_m
     line = sight_m / np.linalg.norm(sight_m, axis=1, keepdims=True)
-    common = scaled_errors(config.orientation_sigma_arcsec, rng.standard_normal(3)) * ARCSEC_RAD
-    pointing = scaled_errors(config.pointing_sigma_arcsec, rng.standard_normal((len(line), 2)))
-    line = Rotation.from_rotvec(common).apply(
-        line + along_two_axes(line, pointing * ARCSEC_RAD)
+    common = (
+        scaled_errors(config.orientation_sigma_arcsec, rng.standard_normal(3)) * ARCSEC_RAD
     )
+    pointing = scaled_errors(
+        config.pointing_sigma_arcsec, rng.standard_normal((len(line), 2))
+    )
+    line = line + along_two_axes(line, pointing * ARCSEC_RAD)
+    line = Rotation.from_rotvec(common).apply(line)
     line /= np.linalg.norm(line, axis=1, keepdims=True)
     # 2.
     mark_m = surface.meet(laser_m, line)
     if np.isnan(mark_m).any():
         raise InputError(
-            "light.layout.aiming", "the laser's line passes below the rim", "a smaller cap_deg"
+            "light.layout.aiming",
+            "the laser's line passes below the rim",
+            "a smaller cap_deg",
         )
     normal = surface.inward(mark_m)
     mark_m += (-outward_m / np.sum(normal * line, axis=1))[:, None] * line

@@ -1,0 +1,183 @@
+"""Quick check of an attitude that a pair of detections determines: have the other detections a star nearby?
+
+`trial` prepares the check for a pair. It computes the gates, from the errors of the detections and of the pair's
+attitude, and the number of matches without which the evidence cannot suffice. `quick_check` then looks up one detection
+after another, at each attitude of the pair.
+"""
+
+from __future__ import annotations
+
+from math import log10, pi, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.catalog.sky_index import nearest
+from estimator.core import vectors
+from estimator.core.checks import Floats
+from estimator.core.jit import jit
+from estimator.identification.chance import (
+    GATE_SIGMA,
+    least,
+    middle,
+    required_matches,
+    separation,
+    squared_separation,
+)
+from estimator.identification.star_detections import Detections, field_area, ray
+from estimator.identification.star_evidence import prior_volume_dex
+
+
+@jit
+def trial(
+    detections: Detections, a: int, b: int, start: int, min_dex: float
+) -> tuple[Floats, NDArray[np.int64], int]:
+    """What the quick check of an attitude by two detections needs.
+
+    Parameters
+    ----------
+    a, b
+        Rows of the two detections
+    start
+        The other detections are looked up from this row on
+    min_dex
+        Least evidence of interest, log10
+
+    Returns
+    -------
+    gates
+        (N,) matching radius of each detection, tangents
+    order
+        (N - 2,) rows of the other detections
+    required
+        Number of matches, the pair included, without which the evidence cannot reach `min_dex`
+    """
+    gates = pair_gates(detections, a, b)
+    order = other_detections(len(detections.sigma), a, b, start)
+    pair_dex = attitude_dex(detections, a, b)
+    required = required_matches(detections.sigma, field_area(detections), pair_dex, min_dex)
+    return gates, order, required
+
+
+@jit
+def pair_gates(detections: Detections, a: int, b: int) -> Floats:
+    """Matching radius of each detection at the attitude of a pair: its own error and that of the attitude.
+
+        gate_n = GATE_SIGMA sqrt(s_n^2 + (sa^2 + sb^2) / 4 + (sa^2 + sb^2) d_n^2 / D^2)
+
+    The second term is the variance of the pair's midpoint. The third is that of its direction, and of its relative
+    length (for an uncertain focal length), which grows with the squared distance d_n from the midpoint; D is the
+    separation.
+
+    Returns
+    -------
+    Floats
+        (N,) tangents
+    """
+    tangent = detections.tangent
+    x, y = middle(tangent, a, b)
+    pair_variance = detections.sigma[a] ** 2 + detections.sigma[b] ** 2
+    direction_variance = pair_variance / squared_separation(tangent, a, b)
+    out = np.empty(len(detections.sigma))
+    for n in range(len(out)):
+        distance2 = (tangent[n, 0] - x) ** 2 + (tangent[n, 1] - y) ** 2
+        # The detection's variance, that of the midpoint, and that of the direction at this distance.
+        out[n] = GATE_SIGMA * sqrt(
+            detections.sigma[n] ** 2 + pair_variance / 4 + direction_variance * distance2
+        )
+    return out
+
+
+@jit
+def attitude_dex(detections: Detections, a: int, b: int) -> float:
+    """Contribution of a pair's attitude alone to the evidence, for `required_matches`.
+
+        log10( (2 pi)^(3/2) (s / sqrt(2))^2 (sqrt(2) s / D) / V )
+
+    The pair determines the two axes across the boresight to s / sqrt(2), and the roll to sqrt(2) s / D, D the
+    separation. s is the least sigma of all detections, taken as isotropic, which gives a lower bound of the
+    uncertainty. V is the prior volume. An uncertain focal length adds sqrt(2 pi) sqrt(2) s / D.
+    """
+    sigma = least(detections.sigma)
+    direction_sigma = sqrt(2.0) * sigma / separation(detections.tangent, a, b)
+    dex = (
+        1.5 * log10(2 * pi)
+        + log10(sigma**2 / 2 * direction_sigma)
+        - prior_volume_dex(detections)
+    )
+    # An uncertain focal length is as well known as the roll.
+    if detections.focal_uncertainty > 0:
+        dex += log10(sqrt(2 * pi) * direction_sigma)
+    return dex
+
+
+@jit
+def other_detections(total: int, a: int, b: int, start: int) -> NDArray[np.int64]:
+    """Rows of all N detections but a and b, from row `start` on and around: (N - 2,)."""
+    out = np.empty(total, np.int64)
+    count = 0
+    for step in range(total):
+        # Wrap around at the end.
+        n = (start + step) % total
+        if n not in (a, b):
+            out[count] = n
+            count += 1
+    return out[:count]
+
+
+@jit
+def quick_check(
+    tangent: Floats,
+    vectors_ref: Floats,
+    cell_first: NDArray,
+    cell_star: NDArray,
+    side: int,
+    R_ref_from_cam: Floats,
+    focal_ratio: float,
+    gates: Floats,
+    order: NDArray,
+    required: int,
+    max_misses: int,
+) -> tuple[int, bool]:
+    """Look up detections at an attitude, until it is clear whether enough of them have a star nearby.
+
+    Parameters
+    ----------
+    tangent
+        (N, 2) detections, tangents
+    vectors_ref, cell_first, cell_star, side
+        Fields of the sky index (see `nearest`)
+    R_ref_from_cam
+        (3, 3) candidate attitude
+    focal_ratio
+        Ratio of the true to the assumed focal length
+    gates
+        (N,) matching radius of each detection
+    order
+        (N - 2,) rows of the detections other than the pair, in the order of the look-ups
+    required
+        Number of matches wanted, with the pair's two
+    max_misses
+        Number of look-ups without any match after which the candidate is dropped
+
+    Returns
+    -------
+    lookups
+        Number of detections looked up
+    fits
+        Whether `required` is reached
+    """
+    count = 2
+    remaining = len(order)
+    for step in range(remaining):
+        # Out of reach, or too many misses at the start.
+        if count + remaining - step < required or (step >= max_misses and count == 2):
+            return step, False
+        # The star nearest to the detection's direction in the catalog's frame.
+        n = order[step]
+        x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, n, focal_ratio))
+        star, _ = nearest(vectors_ref, cell_first, cell_star, side, x, y, z, gates[n])
+        count += star >= 0
+        if count >= required:
+            return step + 1, True
+    return remaining, False

@@ -1,0 +1,55 @@
+"""Searches of the star tracker: error models and efforts, tried in turn until one gives an attitude."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from estimator.identification.star_search import WRONG_FOCAL
+
+MIN_ERROR_PX = (
+    0.005  # least centroid error of a star, for a calibrated lens and the catalog's positions
+)
+
+
+class SearchModel(NamedTuple):
+    """Error model and effort of one search.
+
+    Attributes
+    ----------
+    min_error_px
+        Least centroid error
+    relative_error
+        Additional error, as a fraction of the distance from the principal point
+    max_checks
+        Largest number of star look-ups; 400,000 take about 0.02 s
+    by_quads
+        Whether quads are searched in place of pairs
+    focal_uncertainty
+        Relative uncertainty of the focal length, if it is larger than that of the tracker
+    """
+
+    min_error_px: float
+    relative_error: float
+    max_checks: int
+    by_quads: bool = False
+    focal_uncertainty: float = 0.0
+
+
+WRONG_FOCAL_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 200_000, True, WRONG_FOCAL)
+CALIBRATED_SEARCHES = (
+    SearchModel(MIN_ERROR_PX, 0.0, 25_000),
+    WRONG_FOCAL_SEARCH,
+    SearchModel(MIN_ERROR_PX, 0.0, 400_000),
+)
+UNCALIBRATED_SEARCHES = (
+    SearchModel(MIN_ERROR_PX, 0.0, 10_000, True),
+    SearchModel(MIN_ERROR_PX, 0.0, 100_000, True),
+    SearchModel(0.5, 0.0, 100_000, True),
+    SearchModel(1.0, 0.005, 100_000, True),
+    SearchModel(2.0, 0.01, 100_000, True),
+    SearchModel(0.5, 0.0, 100_000),
+    SearchModel(1.0, 0.005, 200_000),
+    SearchModel(2.0, 0.01, 100_000),
+)
+# Searches for an unknown field of view.
+QUAD_SEARCHES = tuple(model for model in UNCALIBRATED_SEARCHES if model.by_quads)
