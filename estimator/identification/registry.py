@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from estimator.catalog.pair_index import PairIndex
 from estimator.core.camera import Camera
@@ -19,6 +18,7 @@ from estimator.identification.published.master_star import master_star
 from estimator.identification.published.pyramid import pyramid
 from estimator.identification.published.saa import saa
 from estimator.identification.published.shefex import shefex
+from estimator.identification.published.triangles import planar_triangle, spherical_triangle
 
 Identifier = Callable[..., StarMatch | None]
 
@@ -29,6 +29,8 @@ IDENTIFIERS: dict[str, Identifier] = {
     "saa": saa,
     "shefex": shefex,
     "master_star": master_star,
+    "planar_triangle": planar_triangle,
+    "spherical_triangle": spherical_triangle,
     **VERSIONS,
 }
 
@@ -47,8 +49,9 @@ def candidates(
     focal_uncertainty: float,
     sigma_px: float,
     base_stars: int,
-) -> Iterator[tuple[Camera, Rotation]]:
-    """Candidate cameras and attitudes from the brightest centroids, by a published method.
+    acceptance: str = "evidence",
+) -> Iterator[tuple[Camera, StarMatch]]:
+    """Candidate cameras and matches from the brightest centroids, by a published method.
 
     If the focal length is uncertain, its interval is searched in steps of STEP from the middle outward: first with
     little effort at every step, then with more.
@@ -63,13 +66,13 @@ def candidates(
         Greatest relative error of the camera's focal length; 0 if it is calibrated
     sigma_px
         Least centroid error, pixels
-    base_stars
+    base_stars, acceptance
         See `solver_options.Options`
 
     Yields
     ------
-    tuple[Camera, Rotation]
-        The camera with the focal length of the step, and cam_from_ref
+    tuple[Camera, StarMatch]
+        The camera with the focal length of the step, and the match
     """
     identify = IDENTIFIERS[identifier]
     # Steps on either side of the assumed focal length, the nearest first.
@@ -89,6 +92,7 @@ def candidates(
                 max_triangles=triangles,
                 max_checks=most_checks,
                 base_stars=base_stars,
+                acceptance=acceptance,
             )
             if match:
-                yield zoomed, match.cam_from_ref
+                yield zoomed, match

@@ -31,6 +31,7 @@ from estimator.core.types import Attitude, Blobs, Centroids, FramePriors, RateEs
 from estimator.detection import classify
 from estimator.detection.classify import NO_STAR, Flag
 from estimator.detection.detect import DETECTORS, in_row_order, replace_bad_pixels, to_native
+from estimator.identification.solver_options import ACCEPTANCES
 
 SATURATED = "the frame is saturated"
 # Extra centroid error of a saturated blob, whose plateau has edges at whole pixels. Monte Carlo: 0.01 to 0.07 px, more
@@ -100,8 +101,9 @@ class Settings:
         Magnitude of a source of flux 1; None if unknown: magnitudes are then not used
     magnitude_sigma
         Standard deviation of a star's magnitude, including the effect of its color
-    missed_dex
-        Penalty of a missed star: see `identification.solver_options`
+    missed_dex, acceptance
+        Penalty of a missed star, and the rule by which a published identifier accepts a match: see
+        `identification.solver_options`
     reject
         Flags of `detection.classify.Flag` that exclude a blob
     bad_px
@@ -131,6 +133,7 @@ class Settings:
     zero_point_mag: float | None = None
     magnitude_sigma: float = 0.25
     missed_dex: float = 0.5
+    acceptance: str = "evidence"
     reject: int = int(NO_STAR)
     bad_px: Ints | None = field(default=None, compare=False)
 
@@ -153,6 +156,7 @@ class Settings:
             object.__setattr__(
                 self, name, value
             )  # a plain float or int, which compiled code knows
+        checks.known("settings: acceptance", self.acceptance, ACCEPTANCES)
         if self.zero_point_mag is not None:
             zero = checks.number(
                 "settings: zero_point_mag",

@@ -32,6 +32,7 @@ from estimator.core.least_squares import variance_factor
 from estimator.core.types import NO_SPREAD, Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification import star_quads, star_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
+from estimator.identification.refusals import advice
 from estimator.identification.star_detections import (
     Detections,
     FlatCentroids,
@@ -128,8 +129,9 @@ class StarTracker:
         self.stars = catalog.merge_doubles(
             apparent_stars, settings.merge_px / camera.focal_px
         )
-        field_sr = camera.width_px * camera.height_px / camera.focal_px**2
-        limit_mag = catalog.limit_for_density(self.stars, field_sr, settings.field_stars)
+        limit_mag = catalog.limit_for_density(
+            self.stars, self._field_sr, settings.field_stars
+        )
         index_stars = self.stars.take(self.stars.v_mag <= limit_mag)
         # Longest pair: the diagonal of the widest field that the camera may have
         longest_rad = 1.02 * camera.zoomed(1 - focal_uncertainty).diagonal_rad
@@ -168,6 +170,11 @@ class StarTracker:
     def quads(self) -> quad_index.QuadIndex:
         """Quads of the stars that form pairs, built on first use."""
         return quad_index.build(self.sky, self._height_rad)
+
+    @property
+    def _field_sr(self) -> float:
+        """Solid angle of the field of view."""
+        return self.camera.width_px * self.camera.height_px / self.camera.focal_px**2
 
     @property
     def _height_rad(self) -> float:
@@ -369,17 +376,25 @@ class StarTracker:
         if self.index is None:
             searches = self.searches if effort is None else self.searches[effort : effort + 1]
             return self._identify_by_evidence(centroids, searches, clock)
-        for camera, cam_from_ref in self._candidates(centroids):
+        for camera, match in self._candidates(centroids):
             clock.lap("identify")
-            attitude = self.field_matcher.refine(centroids, camera, cam_from_ref)
+            if self.settings.acceptance == "thesis":
+                # The paper's rule has accepted this match: it is not tested with the whole field.
+                attitude = self.solve_matches(centroids, match.observed, match.star)
+            else:
+                attitude = self.field_matcher.refine(centroids, camera, match.cam_from_ref)
             clock.lap("solve")
             if attitude.solved:
                 return attitude
         clock.lap("identify")
-        return Attitude(NO_MATCH)
+        settings = self.settings
+        lights = len(brightest(centroids, settings))
+        in_field = len(self.index.vectors) * self._field_sr / (4 * np.pi)
+        why = advice(settings.identifier, lights, settings.acceptance, in_field)
+        return Attitude(f"{NO_MATCH}: {why}")
 
-    def _candidates(self, centroids: Centroids) -> Iterator[tuple[Camera, Rotation]]:
-        """Return candidate cameras and attitudes by the published identifier that the settings name."""
+    def _candidates(self, centroids: Centroids) -> Iterator[tuple[Camera, StarMatch]]:
+        """Return candidate cameras and matches by the published identifier that the settings name."""
         from estimator.identification.registry import candidates  # several compiled modules
 
         settings = self.settings
@@ -391,6 +406,7 @@ class StarTracker:
             self.focal_uncertainty,
             settings.centroid_sigma_px,
             settings.base_stars,
+            settings.acceptance,
         )
 
     def solve_matches(self, centroids: Centroids, observed: Ints, star: Ints) -> Attitude:

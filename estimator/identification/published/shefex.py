@@ -8,7 +8,8 @@ gate is wide for stars close together: for 5.5e-5 it is 0.090 deg at 2 deg, and 
 3. Reject those of the other handedness (not in the paper).
 4. Identify every other star by its three angles to the base, a fourth star first (`_match_others`, `_partner`).
 5. Keep those that are near their predicted place at the attitude found (not in the paper).
-6. Accept a match with fewer than 1e-5 chance matches expected over all triangles. The paper accepts any fourth star.
+6. Accept a match with fewer than 1e-5 chance matches expected over all triangles. The paper accepts any fourth star,
+   and so does the acceptance `thesis`.
 """
 
 from __future__ import annotations
@@ -132,11 +133,13 @@ def shefex(
     tolerance_rad += settings.stretch * index.max_angle_rad
     error = cos_error(index.max_angle_rad, tolerance_rad)
     base = min(settings.base_stars, len(vectors_cam))
+    accept = FOURTH_STAR if settings.by_paper else ACCEPT_LOG10_CHANCE
     parameters = ShefexOptions(
-        error, tolerance_rad, settings.max_triangles, settings.max_checks, base
+        error, tolerance_rad, settings.max_triangles, settings.max_checks, base, accept
     )
     tried = np.zeros(3, np.int64)
-    return to_star_match(search(np.ascontiguousarray(vectors_cam), index, parameters, tried))
+    match = search(np.ascontiguousarray(vectors_cam), index, parameters, tried)
+    return to_star_match(match, settings.by_paper)
 
 
 @jit

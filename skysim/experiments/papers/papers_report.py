@@ -76,8 +76,8 @@ def verdict(reproductions: Sequence[Reproduction]) -> Verdict:
     rows = sum(len(one.comparisons) for one in reproductions)
     others = sum(one.count("disagrees") for one in reproductions) - disagree
     text = (
-        f"Of {agree + undecided + disagree} predictions {agree} agree with the published number, {disagree} disagree and"
-        f" {undecided} are undecided; of the {rows - agree - undecided - disagree} other rows {others} disagree."
+        f"Of {agree + undecided + disagree} predictions {agree} agree with the published number, {disagree} disagree"
+        f" and {undecided} are undecided; of the {rows - agree - undecided - disagree} other rows {others} disagree."
     )
     return Verdict(text, "bad" if disagree else "good")
 

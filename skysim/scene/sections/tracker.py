@@ -150,6 +150,10 @@ class TrackerConfig(ConfigModel):
         Algorithms. If left out, `local`, `cog`, `led_pairs` and `rotation_only` under a dome, `default` under the
         stars. With the dome's identifier `non_dimensional` the assumed focal length may be wrong by up to 12 %, and the
         tracker fits it with the attitude
+    acceptance
+        Rule by which a published identifier accepts a match: `evidence`, if it is significant against chance, or
+        `thesis`, by the rule of its own paper, which does not test it (SAA: the hypothesis of least cost; SHEFEX-2: a
+        fourth star; Fialho: the fraction of matched stars; NPS: the most angles)
     catalog
         Star catalog of the tracker, not that of the simulator: a name in data/catalogs, or a file of
         `skysim catalog build`
@@ -185,6 +189,7 @@ class TrackerConfig(ConfigModel):
     detector: str | None = None
     centroider: str | None = None
     identifier: str | None = None
+    acceptance: Literal["evidence", "thesis"] = "evidence"
     solver: str | None = None
     threshold_sigma: Annotated[Number, Field(gt=0)] = 5.0
     min_area_px: Annotated[int, Field(ge=1)] = 3
