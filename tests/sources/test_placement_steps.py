@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from tests.helpers.interpreted import interpreted
 
-OPTIMIZE, AMBIGUITY = (
-    interpreted(f"skysim.sources.dome.layouts.{name}") for name in ("optimize", "ambiguity")
+OPTIMIZE, AMBIGUITY, PLACING = (
+    interpreted(f"skysim.sources.dome.layouts.{name}")
+    for name in ("optimize", "ambiguity", "placing")
 )
 
 
@@ -39,7 +40,7 @@ def test_sites_are_taken_in_order_if_none_before_is_within_the_spacing(
     count: int | None,
 ) -> None:
     sites_m = np.random.default_rng(2).uniform(0, 1, (200, 3))
-    taken = OPTIMIZE.thin(sites_m, 0.3, count)
+    taken = PLACING.thin(sites_m, 0.3, count)
     whole: list[int] = []
     for site in range(200):
         if not whole or cdist(sites_m[[site]], sites_m[whole]).min() > 0.3:
@@ -51,12 +52,12 @@ def test_sites_are_taken_in_order_if_none_before_is_within_the_spacing(
 def test_sites_are_spread_as_widely_as_there_are_that_many() -> None:
     """Beyond the least distance of two of them thinning finds fewer; where there is no room, as many as there are."""
     sites_m = np.random.default_rng(3).uniform(0, 1, (200, 3))
-    chosen = OPTIMIZE.spread(sites_m, 0.05, 20, 40)
+    chosen = PLACING.spread(sites_m, 0.05, 20, 40)
     assert len(chosen) == 20
     widest_m = pdist(sites_m[chosen]).min()
     assert widest_m > 0.2
-    assert len(OPTIMIZE.thin(sites_m, widest_m * (1 + 1e-9), 20)) < 20
-    assert len(OPTIMIZE.spread(sites_m, 0.3, 190, 40)) == len(OPTIMIZE.thin(sites_m, 0.3))
+    assert len(PLACING.thin(sites_m, widest_m * (1 + 1e-9), 20)) < 20
+    assert len(PLACING.spread(sites_m, 0.3, 190, 40)) == len(PLACING.thin(sites_m, 0.3))
 
 
 def test_attitudes_with_less_than_two_leds_in_the_inner_field_are_counted() -> None:
@@ -110,7 +111,7 @@ def test_leds_are_moved_to_reduce_an_ambiguity_where_their_spacing_allows_it(
 ) -> None:
     """A stand-in for the overlap that falls with an LED's height, so that every move up is wanted."""
     sites_m = np.random.default_rng(6).uniform(0, 1, (400, 3))
-    place_m = sites_m[OPTIMIZE.thin(sites_m, 0.2, 20)]
+    place_m = sites_m[PLACING.thin(sites_m, 0.2, 20)]
     config = SimpleNamespace(count=20, spacing_m=0.2)
     options = OPTIMIZE.PlacementOptions(ambiguity_trials=300)
     scorer = SimpleNamespace(
