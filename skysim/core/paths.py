@@ -17,6 +17,7 @@ SHIPPED = ROOT if (ROOT / "pyproject.toml").is_file() else ROOT / "skysim"
 DATA = SHIPPED / "data"
 SCENES = SHIPPED / "scenes"
 STUDIES = SCENES / "studies"
+PAPER_STUDIES = SCENES / "papers" / "studies"
 CATALOGS = DATA / "catalogs"
 
 

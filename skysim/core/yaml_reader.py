@@ -119,18 +119,19 @@ def existing_file(value: str) -> str:
     return value
 
 
-def find_file(name: str, folder: Path, what: str) -> Path:
-    """The path of a .yaml file given by its path, or by its name in a folder. Raises InputError."""
+def find_file(name: str, what: str, *folders: Path) -> Path:
+    """The path of a .yaml file given by its path, or by its name in one of some folders. Raises InputError."""
     path = Path(name)
-    shipped = folder / f"{name}.yaml"
     if path.suffix in {".yaml", ".yml"} and is_file(path):
         return path
-    if not path.suffix and is_file(shipped):
-        return shipped
+    for folder in folders:
+        shipped = folder / f"{name}.yaml"
+        if not path.suffix and is_file(shipped):
+            return shipped
     near = Path(f"{name}.yaml")
     if is_file(near):
         raise InputError(excerpt(name), f"no such {what}; did you mean {excerpt(near)}?")
-    names = sorted(file.stem for file in folder.glob("*.yaml"))
+    names = [file.stem for folder in folders for file in sorted(folder.glob("*.yaml"))]
     raise InputError(
         excerpt(name), f"no such {what}", f"a .yaml file or one of {', '.join(names)}"
     )

@@ -229,7 +229,7 @@ class CameraFileConfig(ConfigModel):
 
 def find(name: str) -> Path:
     """The path of a scene given by path or by its name in scenes/. Raises InputError."""
-    return yaml_reader.find_file(name, SCENES, "scene")
+    return yaml_reader.find_file(name, "scene", SCENES)
 
 
 def load(

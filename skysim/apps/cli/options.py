@@ -30,18 +30,18 @@ def complete_scene(incomplete: str) -> list[str]:
     """Names of shipped scenes, and YAML files and folders, that begin with what was typed."""
     from skysim.core.paths import SCENES
 
-    return complete_yaml(SCENES, incomplete)
+    return complete_yaml(incomplete, SCENES)
 
 
 def complete_study(incomplete: str) -> list[str]:
     """Names of shipped studies, and YAML files and folders, that begin with what was typed."""
-    from skysim.core.paths import STUDIES
+    from skysim.core.paths import PAPER_STUDIES, STUDIES
 
-    return complete_yaml(STUDIES, incomplete)
+    return complete_yaml(incomplete, STUDIES, PAPER_STUDIES)
 
 
-def complete_yaml(folder: Path, incomplete: str) -> list[str]:
-    names = [path.stem for path in folder.glob("*.yaml")]
+def complete_yaml(incomplete: str, *folders: Path) -> list[str]:
+    names = [path.stem for folder in folders for path in folder.glob("*.yaml")]
     found = Path(incomplete if incomplete.endswith("/") else os.path.dirname(incomplete)).glob(
         "*"
     )

@@ -208,12 +208,13 @@ def print_catalog(catalog: dict[str, Any], json: bool) -> None:
         print(f"  {key}: {printable(value)}")
 
 
-def print_titles(folder: Path, json: bool) -> None:
-    """Print names and titles of the YAML files in a folder."""
+def print_titles(json: bool, *folders: Path) -> None:
+    """Print names and titles of the YAML files in some folders."""
     from skysim.core.paths import title_of
 
     listed = [
         {"name": path.stem, "title": title_of(path), "file": str(path)}
+        for folder in folders
         for path in sorted(folder.glob("*.yaml"))
     ]
     print_list(listed, json, lambda entry: f"{entry['name']:20s} {printable(entry['title'])}")

@@ -23,7 +23,7 @@ from pydantic import (
 
 from skysim.core import yaml_reader
 from skysim.core.errors import InputError
-from skysim.core.paths import STUDIES
+from skysim.core.paths import PAPER_STUDIES, STUDIES
 from skysim.core.units import ConfigModel, Fraction, NotNegative, Number, Time, Triple
 from skysim.core.yaml_reader import explain, is_file, set_key
 from skysim.experiments.study.factors import Design, Factor, Point, Settings, Value, points
@@ -526,8 +526,8 @@ def digest(value: Any) -> str:
 
 
 def find(name: str) -> Path:
-    """Path of a study that is given by path or by its name in scenes/studies/."""
-    return yaml_reader.find_file(name, STUDIES, "study")
+    """Path of a study that is given by path, or by its name in scenes/studies/ or scenes/papers/studies/."""
+    return yaml_reader.find_file(name, "study", STUDIES, PAPER_STUDIES)
 
 
 def make_plan(

@@ -46,7 +46,7 @@ StudyArg = Annotated[
     str,
     typer.Argument(
         metavar="STUDY",
-        help="Study file (.yaml), or name of a study in scenes/studies/; once it has run, its output folder too.",
+        help="Study file (.yaml), or name of a shipped study; once it has run, its output folder too.",
         autocompletion=complete_study,
     ),
 ]
@@ -65,9 +65,9 @@ def studies(context: typer.Context, json: Json = False) -> None:
     """List the studies that come with skysim."""
     if context.invoked_subcommand:
         return
-    from skysim.core.paths import STUDIES
+    from skysim.core.paths import PAPER_STUDIES, STUDIES
 
-    print_titles(STUDIES, json)
+    print_titles(json, STUDIES, PAPER_STUDIES)
 
 
 @app.command(

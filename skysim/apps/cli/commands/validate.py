@@ -175,12 +175,12 @@ def names_in_file(path: Path) -> set[str | None]:
 
 def find_shipped(path: Path) -> Path:
     """Path of the shipped scene, study or camera of this name. Raises InputError with the names of the scenes."""
-    from skysim.core.paths import DATA, SCENES, STUDIES
+    from skysim.core.paths import DATA, PAPER_STUDIES, SCENES, STUDIES
     from skysim.core.yaml_reader import find_file
 
-    names = (folder / f"{path}.yaml" for folder in (STUDIES, DATA / "cameras"))
+    names = (folder / f"{path}.yaml" for folder in (STUDIES, PAPER_STUDIES, DATA / "cameras"))
     return next((file for file in names if file.is_file()), None) or find_file(
-        str(path), SCENES, "scene"
+        str(path), "scene", SCENES
     )
 
 

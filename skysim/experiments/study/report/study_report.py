@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from skysim.core.paths import STUDIES
+from skysim.core.paths import PAPER_STUDIES, STUDIES
 from skysim.core.types import Floats
 from skysim.experiments.study import answer, search
 from skysim.experiments.study.execution.store import Store
@@ -120,7 +120,8 @@ def commands(
         What the command names; by default the study's name or path, and the store's folder
     """
     if not study:
-        study = plan.name if plan.path.parent == STUDIES else str(plan.path)
+        shipped = plan.path.parent in (STUDIES, PAPER_STUDIES)
+        study = plan.name if shipped else str(plan.path)
         out = store.path.parent
     return partial(shell_command, study, out, store.overrides())
 
