@@ -83,6 +83,7 @@ def run_report(
     moved = [Figure(motion_figure, MOTION_CAPTION)] if motion_figure else []
     warned = f"The check of the plan warns: {len(findings)}, see below." if findings else ""
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in stages_ms.items())
+    times = Text(f"Median ms a frame: {stages}")
     blocks = [
         verdict(rows),
         Text(warned, "bad", on_terminal=False),
@@ -92,19 +93,16 @@ def run_report(
         Section("Motion", [*moved, Items(motion_lines(motion))]),
         Section("Scene", [Facts(facts)], on_terminal=False),
         Section("Check of the plan", [Items(findings, tone="warning")], on_terminal=False),
-        Section(
-            "Frames",
-            [
-                frame_table(angles, rows),
-                Text(f"Median ms a frame: {stages}"),
-                Text(magnitude_text(rows)),
-            ],
-        ),
+        Section("Frames", [frame_table(angles, rows), times, Text(magnitude_text(rows))]),
     ]
     return Report(title, blocks, command)
 
 
 FRAME_CAPTION = "Blue ticks: truth. Red squares: detected. Green circles: identified."
+MAGNITUDES = (
+    "Magnitudes of {magnitude_stars} stars, measured (-2.5 log10 DN/s) minus catalog: mean"
+    " {magnitude_error_mag_mean:+.3f}, standard deviation {magnitude_error_mag_sigma:.3f}"
+)
 ERROR_CAPTION = (
     "Errors, lights and rate against time. Red lines mark frames that were not solved."
 )
@@ -155,14 +153,8 @@ def magnitude_errors(rows: Sequence[FrameRow]) -> dict[str, Any]:
 
 def magnitude_text(rows: Sequence[FrameRow]) -> str:
     """The magnitude errors in words; empty without any."""
-    return (
-        "Magnitudes of {magnitude_stars} stars, measured (-2.5 log10 DN/s) minus catalog: mean"
-        " {magnitude_error_mag_mean:+.3f}, standard deviation {magnitude_error_mag_sigma:.3f}".format(
-            **errors
-        )
-        if (errors := magnitude_errors(rows))
-        else ""
-    )
+    errors = magnitude_errors(rows)
+    return MAGNITUDES.format(**errors) if errors else ""
 
 
 def verdict(rows: Sequence[FrameRow]) -> Verdict:

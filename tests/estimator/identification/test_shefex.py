@@ -74,7 +74,7 @@ def test_a_given_cos_error_searches_as_eq_3_does_from_its_tolerance() -> None:
     assert tolerance == pytest.approx(0.495 * PIXEL_RAD, rel=0.01)
     assert cos_error(fov, tolerance) == pytest.approx(5.5e-5, rel=1e-9)
     rng = np.random.default_rng(8)
-    stars = catalog.unit(rng.normal(size=(400, 3)))
+    stars = catalog.unit(rng.normal(size=(2000, 3)))
     index = pair_index.build(stars, fov)
     seen = stars[np.arccos(np.clip(stars @ stars[0], -1, 1)) < fov / 2]
     error = cos_error(index.max_angle_rad, tolerance)
