@@ -19,6 +19,7 @@ from estimator.identification.published.master_star import master_star
 from estimator.identification.published.pyramid import pyramid
 from estimator.identification.published.saa import saa
 from estimator.identification.published.shefex import shefex
+from estimator.identification.published.triangles import planar_triangle, spherical_triangle
 
 Identifier = Callable[..., StarMatch | None]
 
@@ -29,6 +30,8 @@ IDENTIFIERS: dict[str, Identifier] = {
     "saa": saa,
     "shefex": shefex,
     "master_star": master_star,
+    "planar_triangle": planar_triangle,
+    "spherical_triangle": spherical_triangle,
     **VERSIONS,
 }
 

@@ -38,6 +38,7 @@ from estimator.identification import led_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.led_index import build_dome_index, corner_rays, inner_field
 from estimator.identification.led_search import NO_MATCH
+from estimator.identification.refusals import advice
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
 from estimator.trackers import warm_up
 from estimator.trackers.pipeline import (
@@ -118,8 +119,9 @@ def star_identifier(
             base_stars=settings.base_stars,
             missed_dex=settings.missed_dex,
             field_tan=tuple(field_tan),
+            acceptance=settings.acceptance,
         )
-        return match or NO_MATCH
+        return match or f"{NO_MATCH}: {advice(name, len(rays_cam), settings.acceptance)}"
 
     return identify
 
@@ -129,8 +131,10 @@ def star_identifier(
 IDENTIFIERS: dict[str, Callable[[Camera, LedMap, Lever, Settings], Identify]] = {
     "led_pairs": led_pairs,
     "non_dimensional": non_dimensional,
-    "pyramid": partial(star_identifier, "pyramid"),
-    "saa": partial(star_identifier, "saa"),
+    **{
+        name: partial(star_identifier, name)
+        for name in ("pyramid", "saa", "master_star", "planar_triangle", "spherical_triangle")
+    },
 }
 
 

@@ -35,6 +35,7 @@ from estimator.identification import star_quads, star_search
 from estimator.identification.chance import (
     MIN_EVIDENCE_MATCHES,
 )
+from estimator.identification.refusals import advice
 from estimator.identification.star_detections import (
     Detections,
     FlatCentroids,
@@ -168,8 +169,7 @@ class StarTracker:
         # Stars that a frame can show, and the brighter ones among them that form patterns
         apparent_stars = replace(stars, vectors=vectors)
         self.stars = catalog.merge_doubles(apparent_stars, settings.merge_px / camera.focal_px)
-        field_sr = camera.width_px * camera.height_px / camera.focal_px**2
-        limit_mag = catalog.limit_for_density(self.stars, field_sr, settings.field_stars)
+        limit_mag = catalog.limit_for_density(self.stars, self._field_sr, settings.field_stars)
         index_stars = self.stars.take(self.stars.v_mag <= limit_mag)
         # Longest pair: the diagonal of the widest field that the camera may have
         longest_rad = 1.02 * camera.zoomed(1 - focal_uncertainty).diagonal_rad
@@ -201,6 +201,11 @@ class StarTracker:
     def quads(self) -> quad_index.QuadIndex:
         """Quads of the stars that form pairs, built on first use."""
         return quad_index.build(self.sky, self._height_rad)
+
+    @property
+    def _field_sr(self) -> float:
+        """Solid angle of the field of view."""
+        return self.camera.width_px * self.camera.height_px / self.camera.focal_px**2
 
     @property
     def _height_rad(self) -> float:
@@ -418,7 +423,12 @@ class StarTracker:
             if attitude.solved:
                 return attitude
         clock.lap("identify")
-        return Attitude(NO_MATCH)
+        assert self.index is not None
+        settings = self.settings
+        lights = len(brightest(centroids, settings))
+        in_field = len(self.index.vectors) * self._field_sr / (4 * np.pi)
+        why = advice(settings.identifier, lights, settings.acceptance, in_field)
+        return Attitude(f"{NO_MATCH}: {why}")
 
     def _candidates(
         self, centroids: Centroids, compared: Ints

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,14 @@ from skysim.results.report_blocks import (
     text_column,
 )
 
+# Settings that help where the tracker's own refusal names none.
+HELP = {
+    "too few stars detected": "lower tracker.threshold_sigma or tracker.min_area_px, or expose longer (exposure.time)",
+    "no identification beyond chance": "raise tracker.centroid_sigma_px if the camera or the map is less accurate than"
+    " assumed, or leave out false lights with tracker.brightest",
+    "ambiguous: another attitude fits the lights as well": "tell the lights apart by tracker.brightness_sigma with"
+    " several levels in light.layout, or make the layout irregular",
+}
 MOTION = {  # sentences of the motion's statistics, by the statistic that a scene must have
     "pointing_deg_worst": "pointing: worst {pointing_deg_worst:.3g}°, at the end {pointing_deg_end:.2g}°; "
     "maximum commanded torque {torque_nm_worst:.3g} N m",
@@ -83,7 +92,7 @@ def run_report(
     moved = [Figure(motion_figure, MOTION_CAPTION)] if motion_figure else []
     warned = f"The check of the plan warns: {len(findings)}, see below." if findings else ""
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in stages_ms.items())
-    times = Text(f"Median ms a frame: {stages}")
+    last = [Text(f"Median ms a frame: {stages}"), Text(magnitude_text(rows))]
     blocks = [
         verdict(rows),
         Text(warned, "bad", on_terminal=False),
@@ -93,7 +102,7 @@ def run_report(
         Section("Motion", [*moved, Items(motion_lines(motion))]),
         Section("Scene", [Facts(facts)], on_terminal=False),
         Section("Check of the plan", [Items(findings, tone="warning")], on_terminal=False),
-        Section("Frames", [frame_table(angles, rows), times, Text(magnitude_text(rows))]),
+        Section("Frames", [frame_table(angles, rows), Items(refusals(rows)), *last]),
     ]
     return Report(title, blocks, command)
 
@@ -169,6 +178,12 @@ def verdict(rows: Sequence[FrameRow]) -> Verdict:
         )
     text += f"; image to attitude in {run['time_ms_median']:.1f} ms (median)"
     return Verdict(text, "bad" if run["wrong"] or not run["solved"] else tone)
+
+
+def refusals(rows: Sequence[FrameRow]) -> list[str]:
+    """Each reason why frames were not solved, their number, and the settings that would help."""
+    counts = Counter(row.status for row in rows if row.status in HELP)
+    return [f"{count} frames: {status}; {HELP[status]}" for status, count in counts.items()]
 
 
 def motion_lines(motion: Mapping[str, float]) -> list[str]:

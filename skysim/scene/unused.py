@@ -37,6 +37,7 @@ from skysim.scene.sections.surroundings import NEGLIGIBLE_PX
 
 SURFACE_SOLVERS = ("thesis", "ray_on_surface")  # solvers that use the surveyed surface
 FIXED_DETECTORS = ("thesis",)  # detectors with their own thresholds
+OWN_RULES = ("saa", "shefex", "master_star", "fialho")  # identifiers with their paper's rule
 OWN = "own"  # skysim's tracker
 
 
@@ -232,6 +233,7 @@ RULES = (
         (
             "tracker.centroider",
             "tracker.identifier",
+            "tracker.acceptance",
             "tracker.solver",
             "tracker.centroid_sigma_px",
         ),
@@ -246,7 +248,7 @@ RULES = (
         "tracker.name: own",
     ),
     Rule(
-        ("tracker.identifier", "tracker.brightness_sigma"),
+        ("tracker.identifier", "tracker.acceptance", "tracker.brightness_sigma"),
         lambda scene: scene.tracker.decoder is not None,
         "the LEDs are identified by their codes",
         "no tracker.decoder",
@@ -268,6 +270,12 @@ RULES = (
         lambda scene: scene.tracker.identifier != "shefex",
         "this identifier has no tolerance of cosines",
         "tracker.identifier: shefex",
+    ),
+    Rule(
+        ("tracker.acceptance",),
+        lambda scene: not str(scene.tracker.identifier).startswith(OWN_RULES),
+        "this identifier has no rule of its paper beside the test against chance",
+        "tracker.identifier: saa, shefex, master_star or fialho_1 to fialho_4",
     ),
     Rule(
         ("tracker.brightness_sigma",),

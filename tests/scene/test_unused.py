@@ -100,6 +100,7 @@ CASES = [
         "0.2",
         {"tracker.identifier": "led_pairs"},
     ),
+    Case(SKY, {}, "tracker.acceptance", "thesis", {"tracker.identifier": "fialho_3"}),
     Case(DOME, {"light.layout": MANY}, "tracker.brightness_sigma", "0.2", TWO_LEVELS),
     Case(
         CODED,

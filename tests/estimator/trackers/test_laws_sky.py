@@ -160,8 +160,8 @@ def test_the_true_camera_and_attitude_are_a_candidate(
     )
     right = (
         abs(lens.focal_px / CAMERA.focal_px - 1) < 1e-9
-        and (cam_from_ref * world.truth.inv()).magnitude() < 1e-3
-        for lens, cam_from_ref in found
+        and (match.cam_from_ref * world.truth.inv()).magnitude() < 1e-3
+        for lens, match in found
     )
     assert any(right)
 
