@@ -28,7 +28,7 @@ from estimator.identification.published.master_star import master_star
 from estimator.identification.published.pyramid import pyramid
 from estimator.identification.published.saa import AssumptionPool, saa
 from estimator.identification.registry import IDENTIFIERS, STEP, candidates
-from estimator.identification.solver_options import Options
+from estimator.identification.solver_options import ACCEPTANCES, Options
 from estimator.identification.star_evidence import Solution
 from estimator.trackers import refinement
 from estimator.trackers.pipeline import Settings
@@ -166,7 +166,7 @@ def test_the_true_camera_and_attitude_are_a_candidate(
     assert any(right)
 
 
-@law(Options.magnitudes, Options.require_known_focal)
+@law(Options.magnitudes, Options.require_known_focal, Options.by_paper)
 @given(mag=NUMBERS, count=some.integers(0, 6))
 @example(mag=np.array(3.0), count=1)
 def test_magnitudes_are_one_per_star_or_unknown(mag: NDArray, count: int) -> None:
@@ -174,6 +174,7 @@ def test_magnitudes_are_one_per_star_or_unknown(mag: NDArray, count: int) -> Non
     assert (magnitudes is not None) == (mag.shape == (count,))
     assert np.isnan(Options().magnitudes(count)).tolist() == [True] * count
     Options().require_known_focal("any")
+    assert [Options(acceptance=one).by_paper for one in ACCEPTANCES] == [False, True]
 
 
 @law(AssumptionPool.log10_chance, AssumptionPool.best_match)
