@@ -7,6 +7,7 @@ the match or None. The tracker verifies a match with the whole field (`trackers.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
@@ -48,8 +49,8 @@ def candidates(
     index: PairIndex | None,
     focal_uncertainty: float,
     sigma_px: float,
-    base_stars: int,
     acceptance: str = "evidence",
+    **options: Any,
 ) -> Iterator[tuple[Camera, StarMatch]]:
     """Candidate cameras and matches from the brightest centroids, by a published method.
 
@@ -66,7 +67,7 @@ def candidates(
         Greatest relative error of the camera's focal length; 0 if it is calibrated
     sigma_px
         Least centroid error, pixels
-    base_stars, acceptance
+    acceptance, options
         See `solver_options.Options`
 
     Yields
@@ -79,7 +80,9 @@ def candidates(
     steps = int(np.ceil(focal_uncertainty / STEP - 0.5))
     stretch = STRETCH if focal_uncertainty else CALIBRATED
     zooms = sorted((n * STEP for n in range(-steps, steps + 1)), key=abs)
-    for triangles, most_checks in EFFORTS:
+    # A paper's rule is that of one search.
+    efforts = EFFORTS if acceptance == "evidence" else EFFORTS[-1:]
+    for triangles, most_checks in efforts:
         for zoom in zooms:
             zoomed = camera.zoomed(1 + zoom)
             # The tolerance is four standard deviations, but at least a pixel, for errors of the calibration.
@@ -91,8 +94,8 @@ def candidates(
                 focal_unknown=steps > 0,
                 max_triangles=triangles,
                 max_checks=most_checks,
-                base_stars=base_stars,
                 acceptance=acceptance,
+                **options,
             )
             if match:
                 yield zoomed, match

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, Ints
 from estimator.core.errors import ImageError
 
 ACCEPTANCES = ("evidence", "thesis")
@@ -50,6 +50,10 @@ class Options:
     acceptance
         One of ACCEPTANCES: `evidence` accepts a match that is significant against chance, `thesis` one that the
         method's own paper would accept. Its log10_chance is then NaN, as it has not been tested
+    cos_error
+        Greatest difference of the cosines of two angles that agree, for methods that use it; None: from the tolerance
+    compared
+        (1,) count of the angles compared, to which a method that counts them adds its own; None: not counted
     """
 
     stretch: float = 0.0
@@ -65,6 +69,8 @@ class Options:
     boresight_ref: Floats | None = None
     within_rad: float = np.pi
     acceptance: str = "evidence"
+    cos_error: float | None = None
+    compared: Ints | None = None
 
     @property
     def by_paper(self) -> bool:

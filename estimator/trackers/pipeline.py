@@ -71,6 +71,11 @@ ALLOWED = {
     "missed_dex": NOT_NEGATIVE,
     "reject": Allowed(0, int(max(Flag)) * 2 - 1, "bits of detection.classify.Flag", True),
 }
+# Settings that may also be None.
+OPTIONAL = {
+    "zero_point_mag": Allowed(-100, 100, "-100 to 100, or None"),
+    "cos_error": Allowed(1e-12, 0.1, "1e-12 to 0.1, or None"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +109,8 @@ class Settings:
     missed_dex, acceptance
         Penalty of a missed star, and the rule by which a published identifier accepts a match: see
         `identification.solver_options`
+    cos_error
+        Tolerance of the cosine of an angle, for the identifier `shefex`; None: from the centroids' errors
     reject
         Flags of `detection.classify.Flag` that exclude a blob
     bad_px
@@ -134,6 +141,7 @@ class Settings:
     magnitude_sigma: float = 0.25
     missed_dex: float = 0.5
     acceptance: str = "evidence"
+    cos_error: float | None = None
     reject: int = int(NO_STAR)
     bad_px: Ints | None = field(default=None, compare=False)
 
@@ -143,8 +151,10 @@ class Settings:
         return object.__new__(cls)
 
     def __post_init__(self) -> None:
-        for name, allowed in ALLOWED.items():
+        for name, allowed in (ALLOWED | OPTIONAL).items():
             value = getattr(self, name)
+            if value is None and name in OPTIONAL:
+                continue
             value = checks.number(
                 f"settings: {name}",
                 value,
@@ -157,15 +167,6 @@ class Settings:
                 self, name, value
             )  # a plain float or int, which compiled code knows
         checks.known("settings: acceptance", self.acceptance, ACCEPTANCES)
-        if self.zero_point_mag is not None:
-            zero = checks.number(
-                "settings: zero_point_mag",
-                self.zero_point_mag,
-                -100,
-                100,
-                "-100 to 100, or None",
-            )
-            object.__setattr__(self, "zero_point_mag", zero)
         if self.bad_px is not None:
             bad = np.asarray(self.bad_px)
             if (

@@ -376,7 +376,15 @@ class StarTracker:
         if self.index is None:
             searches = self.searches if effort is None else self.searches[effort : effort + 1]
             return self._identify_by_evidence(centroids, searches, clock)
-        for camera, match in self._candidates(centroids):
+        compared = np.zeros(1, np.int64)
+        attitude = self._identify_by_paper(centroids, clock, compared)
+        return replace(attitude, angles_compared=int(compared[0]) or None)
+
+    def _identify_by_paper(
+        self, centroids: Centroids, clock: Clock, compared: Ints
+    ) -> Attitude:
+        """Solve by a published identifier; `compared` counts the angles that it compares."""
+        for camera, match in self._candidates(centroids, compared):
             clock.lap("identify")
             if self.settings.acceptance == "thesis":
                 # The paper's rule has accepted this match: it is not tested with the whole field.
@@ -387,13 +395,16 @@ class StarTracker:
             if attitude.solved:
                 return attitude
         clock.lap("identify")
+        assert self.index is not None
         settings = self.settings
         lights = len(brightest(centroids, settings))
         in_field = len(self.index.vectors) * self._field_sr / (4 * np.pi)
         why = advice(settings.identifier, lights, settings.acceptance, in_field)
         return Attitude(f"{NO_MATCH}: {why}")
 
-    def _candidates(self, centroids: Centroids) -> Iterator[tuple[Camera, StarMatch]]:
+    def _candidates(
+        self, centroids: Centroids, compared: Ints
+    ) -> Iterator[tuple[Camera, StarMatch]]:
         """Return candidate cameras and matches by the published identifier that the settings name."""
         from estimator.identification.registry import candidates  # several compiled modules
 
@@ -405,8 +416,10 @@ class StarTracker:
             self.index,
             self.focal_uncertainty,
             settings.centroid_sigma_px,
-            settings.base_stars,
             settings.acceptance,
+            base_stars=settings.base_stars,
+            cos_error=settings.cos_error,
+            compared=compared,
         )
 
     def solve_matches(self, centroids: Centroids, observed: Ints, star: Ints) -> Attitude:
@@ -446,7 +459,7 @@ class StarTracker:
         covariance_rad2, common_rad2 = with_focal_error(
             covariance_rad2, self.camera, xy_px, seen_cam, sigma_rad
         )
-        match = StarMatch(observed, star, cam_from_ref, float("nan"))
+        match = StarMatch(observed, star, cam_from_ref, float("nan"), self.stars.v_mag[star])
         rms_px = float(np.sqrt(np.mean(residual**2)))
         return Attitude(
             "solved", cam_from_ref, covariance_rad2, match, rms_px, self.camera, common_rad2
@@ -617,7 +630,10 @@ class StarTracker:
             covariance_rad2, common_rad2 = with_focal_error(
                 covariance_rad2, camera, xy_px, seen_cam, sigma_rad
             )
-        match = StarMatch(solution.observed, solution.star, cam_from_ref, -solution.dex)
+        v_mag = self.stars.v_mag[solution.star]
+        match = StarMatch(
+            solution.observed, solution.star, cam_from_ref, -solution.dex, v_mag
+        )
         rms_px = solution.rms * self.camera.focal_px
         return Attitude(
             "solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2

@@ -256,6 +256,12 @@ RULES = (
         "tracker.identifier: led_pairs or non_dimensional",
     ),
     Rule(
+        ("tracker.cos_error",),
+        lambda scene: scene.tracker.identifier != "shefex",
+        "this identifier has no tolerance of cosines",
+        "tracker.identifier: shefex",
+    ),
+    Rule(
         ("tracker.acceptance",),
         lambda scene: not str(scene.tracker.identifier).startswith(OWN_RULES),
         "this identifier has no rule of its paper beside the test against chance",

@@ -96,6 +96,7 @@ def assumed_settings(scene: Scene) -> Settings:
         saturation=saturation_dn(scene.camera.detector),
         centroid_sigma_px=config.centroid_sigma_px,
         acceptance=config.acceptance,
+        cos_error=config.cos_error,
         **chosen,
     )
 

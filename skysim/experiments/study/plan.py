@@ -526,7 +526,7 @@ def digest(value: Any) -> str:
 
 
 def find(name: str) -> Path:
-    """Path of a study that is given by path or by its name in scenes/studies/."""
+    """Path of a study that is given by path, or by its name in scenes/studies/ or scenes/papers/studies/."""
     return yaml_reader.find_file(name, STUDIES, "study")
 
 
