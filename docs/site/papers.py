@@ -39,8 +39,8 @@ MOST_ROWS = 20
 PAGE_TEXT = """# Do we reproduce the papers?
 
 Of {predictions} predictions {agrees} agree with the published number, {disagrees} disagree and {undecided} are
-undecided. Of the {others} other rows {others_disagree} disagree: they are bounds, inputs, repetitions, numbers to which the
-experiment was fitted, and numbers that the paper does not print.
+undecided. Of the {others} other rows {others_disagree} disagree: they are bounds, inputs, repetitions, numbers to which
+the experiment was fitted, and numbers that the paper does not print.
 
 {table}
 
