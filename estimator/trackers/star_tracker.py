@@ -399,17 +399,31 @@ class StarTracker:
         if self.index is None:
             searches = self.searches if effort is None else self.searches[effort : effort + 1]
             return self._identify_by_evidence(centroids, searches, clock)
-        for camera, cam_from_ref in self._candidates(centroids):
+        compared = np.zeros(1, np.int64)
+        attitude = self._identify_by_paper(centroids, clock, compared)
+        return replace(attitude, angles_compared=int(compared[0]) or None)
+
+    def _identify_by_paper(
+        self, centroids: Centroids, clock: Clock, compared: Ints
+    ) -> Attitude:
+        """Solve by a published identifier; `compared` counts the angles that it compares."""
+        for camera, match in self._candidates(centroids, compared):
             clock.lap("identify")
-            attitude = self.field_matcher.refine(centroids, camera, cam_from_ref)
+            if self.settings.acceptance == "thesis":
+                # The paper's rule has accepted this match: it is not tested with the whole field.
+                attitude = self.solve_matches(centroids, match.observed, match.star)
+            else:
+                attitude = self.field_matcher.refine(centroids, camera, match.cam_from_ref)
             clock.lap("solve")
             if attitude.solved:
                 return attitude
         clock.lap("identify")
         return Attitude(NO_MATCH)
 
-    def _candidates(self, centroids: Centroids) -> Iterator[tuple[Camera, Rotation]]:
-        """Return candidate cameras and attitudes by the published identifier that the settings name."""
+    def _candidates(
+        self, centroids: Centroids, compared: Ints
+    ) -> Iterator[tuple[Camera, StarMatch]]:
+        """Return candidate cameras and matches by the published identifier that the settings name."""
         from estimator.identification.registry import candidates  # several compiled modules
 
         settings = self.settings
@@ -420,7 +434,10 @@ class StarTracker:
             self.index,
             self.focal_uncertainty,
             settings.centroid_sigma_px,
-            settings.base_stars,
+            settings.acceptance,
+            base_stars=settings.base_stars,
+            cos_error=settings.cos_error,
+            compared=compared,
         )
 
     def solve_matches(self, centroids: Centroids, observed: Ints, star: Ints) -> Attitude:
@@ -460,7 +477,7 @@ class StarTracker:
         covariance_rad2, common_rad2 = with_focal_error(
             covariance_rad2, self.camera, xy_px, seen_cam, sigma_rad
         )
-        match = StarMatch(observed, star, cam_from_ref, float("nan"))
+        match = StarMatch(observed, star, cam_from_ref, float("nan"), self.stars.v_mag[star])
         rms_px = float(np.sqrt(np.mean(residual**2)))
         return Attitude(
             "solved", cam_from_ref, covariance_rad2, match, rms_px, self.camera, common_rad2
@@ -626,7 +643,8 @@ class StarTracker:
             covariance_rad2, common_rad2 = with_focal_error(
                 covariance_rad2, camera, xy_px, seen_cam, sigma_rad
             )
-        match = StarMatch(solution.observed, solution.star, cam_from_ref, -solution.dex)
+        v_mag = self.stars.v_mag[solution.star]
+        match = StarMatch(solution.observed, solution.star, cam_from_ref, -solution.dex, v_mag)
         rms_px = solution.rms * self.camera.focal_px
         return Attitude(
             "solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2

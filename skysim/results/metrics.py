@@ -368,6 +368,7 @@ QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
             "drift_arcsec",
             "pointing_arcsec",
             "pointing_worst_arcsec",
+            "angles_compared",
             "time_ms",
         )
     },

@@ -264,6 +264,12 @@ RULES = (
         "tracker.identifier: led_pairs or non_dimensional",
     ),
     Rule(
+        ("tracker.cos_error",),
+        lambda scene: scene.tracker.identifier != "shefex",
+        "this identifier has no tolerance of cosines",
+        "tracker.identifier: shefex",
+    ),
+    Rule(
         ("tracker.brightness_sigma",),
         equally_bright,
         "all LEDs are equally bright",

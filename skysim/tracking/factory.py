@@ -93,6 +93,8 @@ def assumed_settings(scene: Scene) -> Settings:
         gain_e_dn=scene.camera.detector.gain_e_dn,
         saturation=saturation_dn(scene.camera.detector),
         centroid_sigma_px=config.centroid_sigma_px,
+        acceptance=config.acceptance,
+        cos_error=config.cos_error,
         **chosen,
     )
 

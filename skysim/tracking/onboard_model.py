@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
-from estimator.catalog import catalog
+from estimator.catalog import cat_file, catalog
 from estimator.catalog.refraction import SiteAir
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
@@ -210,10 +210,13 @@ def onboard_catalog(key: str, name: str) -> catalog.StarCatalog:
     key
         Key of the scene, or option, that names the catalog, for the error message
     name
-        Name in data/catalogs/, or a file
+        Name in data/catalogs/, or a file, .ecsv or .cat
     """
+    path = require_catalog(key, name)
     try:
-        return catalog.read(require_catalog(key, name))
+        if path.suffix.lower() == ".cat":
+            return cat_file.read_stars(path)
+        return catalog.read(path)
     except ImageError as error:
         raise InputError(key, error) from None
 

@@ -220,8 +220,8 @@ def fialho_4(
         match.star,
         match.cam_from_ref,
         match.log10_chance,
-        float(offset_mag.mean()),
-        float(np.var(offset_mag, ddof=1)),
+        offset_mag=float(offset_mag.mean()),
+        variance_mag2=float(np.var(offset_mag, ddof=1)),
     )
 
 

@@ -328,6 +328,11 @@ def check_measured(study: Study, kinds: set[str], scenes: Sequence[Scene]) -> No
                 "no tracker of this study reports ambiguity",
                 "under a dome, with the default identifier",
             )
+        counts = any(scene.tracker.identifier == "shefex" for scene in scenes)
+        if name.startswith("angles_compared") and not counts:
+            raise InputError(
+                key, "no identifier of this study counts angles", "tracker.identifier: shefex"
+            )
 
 
 def may_report_ambiguity(scene: Scene) -> bool:

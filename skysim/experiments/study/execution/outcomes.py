@@ -80,6 +80,9 @@ class Outcome:
     streak_px
         Length of the images of the lights, median of a frame and mean for a flight; NaN for
         centroid trials
+    angles_compared
+        Number of angles that the identifier compared, mean for a flight; NaN if it does not count
+        them
     lab_from_body_w, _x, _y, _z
         True attitude at mid-exposure; of the worst frame for a flight (`worst_frame`)
     body_tilt_deg, body_azimuth_deg
@@ -112,6 +115,7 @@ class Outcome:
     wrong_matches: float = math.nan
     centroid_px: float = math.nan
     streak_px: float = math.nan
+    angles_compared: float = math.nan
     lab_from_body_w: float = math.nan
     lab_from_body_x: float = math.nan
     lab_from_body_y: float = math.nan
@@ -179,6 +183,7 @@ def score(
         **dict.fromkeys(IDENTITY, 0.0 if own_tracker else math.nan),
         "centroid_px": centroid_error_px(centroids_px, lights.flux_xy_px, reach_px),
         "streak_px": streak_px,
+        "angles_compared": solution.angles_compared or math.nan,
         **directions(lab, lab_from_body, cam_from_lab),
     }
     if solution.cam_from_ref is None:
@@ -358,6 +363,7 @@ def summarize_flight(log: Telemetry, outcomes: list[Outcome], settle_s: float) -
         },
         centroid_px=rms(finite([one.centroid_px for one in outcomes])),
         streak_px=mean(finite([one.streak_px for one in outcomes])),
+        angles_compared=mean(finite([one.angles_compared for one in outcomes])),
         **{name: getattr(worst, name) for name in DIRECTION},
     )
 

@@ -35,8 +35,8 @@ from skysim.results.files import row_parts
 from skysim.results.files.row_parts import Part, Rows, Source
 
 STORE = "study.sqlite"  # file name in a study's results folder
-FORMAT = 4  # raised when the columns of `trials` change
-FORMAT_OF_PARTS = 5  # of a store with parts, which an earlier skysim would not see
+FORMAT = 6  # raised when the columns of `trials` change
+FORMAT_OF_PARTS = 7  # of a store with parts, which an earlier skysim would not see
 MOST_ROWS = 1_000_000  # of a store without parts; beyond, rows move to them
 PART_ROWS = 250_000  # of a part: some 50 MB in memory
 EVERY = (0, 2**62)  # range of all trials
@@ -493,10 +493,10 @@ def open_store(path: Path) -> Iterator[Store]:
 def check_format(store: Store) -> None:
     """Raise InputError for a store of another format."""
     stored = store.meta("format")
-    if stored == "1":
+    if stored in ("1", "4", "5"):
         raise InputError(
             store.path,
-            "written by an earlier skysim, without the attitudes of the trials",
+            "written by an earlier skysim, without all columns of the trials",
             "run the study again, to another store",
         )
     if stored not in (str(FORMAT), str(FORMAT_OF_PARTS)):
