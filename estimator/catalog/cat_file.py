@@ -50,11 +50,11 @@ def encode(stars: OnBoard) -> bytes:
     entries["magnitude"] = np.rint(UNITS_MAG * stars.magnitude)
     entries["id"] = stars.id
     entries["components"] = stars.components
-    entries["checksum"] = -word_sums(entries) % 2**16
+    entries["checksum"] = -_word_sums(entries) % 2**16
     return header.tobytes() + entries.tobytes()
 
 
-def word_sums(entries: np.ndarray) -> np.ndarray:
+def _word_sums(entries: np.ndarray) -> np.ndarray:
     """(N,) sums of the 16-bit words of each entry."""
     return entries.view("<u2").reshape(-1, BYTES_PER_ENTRY // 2).sum(axis=1, dtype=np.int64)
 
@@ -78,7 +78,7 @@ def read(path: str | Path) -> OnBoard:
     if len(data) != HEADER.itemsize + BYTES_PER_ENTRY * count:
         raise _not_cat(path, f"{len(data)} bytes for {count} entries")
     entries = np.frombuffer(data, ENTRY, count, HEADER.itemsize)
-    damaged = np.flatnonzero(word_sums(entries) % 2**16)
+    damaged = np.flatnonzero(_word_sums(entries) % 2**16)
     if len(damaged):
         raise _not_cat(path, f"wrong checksum of entry {damaged[0]}")
     ra = entries["ra"] / UNITS_RAD

@@ -83,6 +83,7 @@ def run_report(
     moved = [Figure(motion_figure, MOTION_CAPTION)] if motion_figure else []
     warned = f"The check of the plan warns: {len(findings)}, see below." if findings else ""
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in stages_ms.items())
+    times = Text(f"Median ms a frame: {stages}")
     blocks = [
         verdict(rows),
         Text(warned, "bad", on_terminal=False),
@@ -92,12 +93,16 @@ def run_report(
         Section("Motion", [*moved, Items(motion_lines(motion))]),
         Section("Scene", [Facts(facts)], on_terminal=False),
         Section("Check of the plan", [Items(findings, tone="warning")], on_terminal=False),
-        Section("Frames", [frame_table(angles, rows), Text(f"Median ms a frame: {stages}")]),
+        Section("Frames", [frame_table(angles, rows), times, Text(magnitude_text(rows))]),
     ]
     return Report(title, blocks, command)
 
 
 FRAME_CAPTION = "Blue ticks: truth. Red squares: detected. Green circles: identified."
+MAGNITUDES = (
+    "Magnitudes of {magnitude_stars} stars, measured (-2.5 log10 DN/s) minus catalog: mean"
+    " {magnitude_error_mag_mean:+.3f}, standard deviation {magnitude_error_mag_sigma:.3f}"
+)
 ERROR_CAPTION = (
     "Errors, lights and rate against time. Red lines mark frames that were not solved."
 )
@@ -107,7 +112,8 @@ MOTION_CAPTION = "Attitude, estimates and actuators against time."
 def summary(rows: Sequence[FrameRow]) -> dict[str, Any]:
     """Frame counts, median and worst errors in arcseconds, and median solve time of a run.
 
-    Errors are over solved frames, wrong ones included; NaN if no frame was solved.
+    Errors are over solved frames, wrong ones included; NaN if no frame was solved. Where stars were identified, also
+    `magnitude_errors`.
     """
     solved = [row for row in rows if row.status == "solved"]
     cross = np.array([row.cross_arcsec for row in solved] or [np.nan])
@@ -121,7 +127,34 @@ def summary(rows: Sequence[FrameRow]) -> dict[str, Any]:
         "roll_arcsec_median": float(np.median(roll)),
         "roll_arcsec_worst": float(np.max(roll)),
         "time_ms_median": float(np.median([row.time_ms for row in rows])),
+        **magnitude_errors(rows),
     }
+
+
+def magnitude_errors(rows: Sequence[FrameRow]) -> dict[str, Any]:
+    """Mean and standard deviation of measured minus catalog magnitude over the stars of all frames; empty without any.
+
+    The sum of squares about the common mean is that within the frames and that of the frames' means.
+    """
+    found = [row for row in rows if not np.isnan(row.magnitude_error_mag)]
+    if not found:
+        return {}
+    stars = np.array([row.matched for row in found])
+    means = np.array([row.magnitude_error_mag for row in found])
+    sigmas = np.array([row.magnitude_sigma_mag for row in found])
+    mean = np.average(means, weights=stars)
+    squares = np.sum((stars - 1) * sigmas**2 + stars * (means - mean) ** 2)
+    return {
+        "magnitude_error_mag_mean": float(mean),
+        "magnitude_error_mag_sigma": float(np.sqrt(squares / (stars.sum() - 1))),
+        "magnitude_stars": int(stars.sum()),
+    }
+
+
+def magnitude_text(rows: Sequence[FrameRow]) -> str:
+    """The magnitude errors in words; empty without any."""
+    errors = magnitude_errors(rows)
+    return MAGNITUDES.format(**errors) if errors else ""
 
 
 def verdict(rows: Sequence[FrameRow]) -> Verdict:

@@ -191,7 +191,7 @@ def test_a_pool_without_assumptions_gives_no_answer(rng: np.random.Generator) ->
     assert pool.best_match() is None
 
 
-@law(shefex.cos_error)
+@law(shefex.cos_error, shefex.direction_tolerance_rad)
 @given(
     fov=some.floats(0.01, 1.5),
     errors=some.lists(some.floats(0, 1e-3), min_size=2, max_size=2),
@@ -202,6 +202,9 @@ def test_the_gate_grows_with_the_error(fov: float, errors: list[float], factor: 
     assert (
         0 <= small <= large <= factor * max(errors) * 1.000001 + 1e-15
     )  # cosines of 16 digits
+    # The inverse of c = 1, to the digits of a cosine.
+    error = shefex.direction_tolerance_rad(fov, shefex.cos_error(fov, min(errors[0], fov / 2)))
+    assert error == pytest.approx(min(errors[0], fov / 2), rel=1e-6, abs=1e-13 / np.sin(fov))
 
 
 @law(magnitude_zero)

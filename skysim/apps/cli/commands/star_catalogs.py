@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -19,6 +20,9 @@ app = typer.Typer(
 )
 Source = Annotated[
     str, typer.Argument(metavar="NAME", help="Name or file of a catalog, .ecsv.")
+]
+Limit = Annotated[
+    float | None, typer.Option(metavar="V", help="A visual magnitude; see above.")
 ]
 CatFile = Annotated[Path, typer.Option("--out", help="Output file, .cat.")]
 
@@ -80,55 +84,40 @@ def catalog_select(
     source: Source,
     rule: Annotated[
         Literal["uniform", "asymmetric", "chosen"],
-        typer.Option(help="Rule of SHEFEX-2: evenly spread; a limit of each hemisphere; both."),
+        typer.Option(help="Evenly spread; a limit for each hemisphere; both."),
     ],
     out: Annotated[Path, typer.Option("--out", help="Output file, .ecsv.")],
     count: Annotated[int | None, typer.Option(min=1, help="Number of stars; 2023.")] = None,
-    bright: Annotated[
-        float | None,
-        typer.Option(metavar="V", help="Keep all stars to here; chosen: 4.5, uniform: none."),
-    ] = None,
-    faintest: Annotated[
-        float | None, typer.Option(metavar="V", help="Limit of uniform; 5.75.")
-    ] = None,
-    north: Annotated[
-        float | None, typer.Option(metavar="V", help="Limit of the northern sky; 5.2.")
-    ] = None,
-    south: Annotated[
-        float | None, typer.Option(metavar="V", help="Limit of the southern sky; 5.4.")
-    ] = None,
+    bright: Limit = None,
+    faintest: Limit = None,
+    north: Limit = None,
+    south: Limit = None,
     json: Json = False,
 ) -> None:
-    """Select the stars of a tracker's catalog as for SHEFEX-2 (Samaan & Theil 2011, 3.3); the defaults are theirs."""
-    import inspect
+    """Select the stars of a tracker's catalog by the rules of SHEFEX-2 (Samaan & Theil 2011, 3.3), with its defaults.
 
+    All stars to `--bright` stay (4.5; of uniform none). The others end at `--faintest` (uniform: 5.75), or at
+    `--north` (5.2) and `--south` (5.4) of the equator.
+    """
     from estimator.catalog.published_catalogs import CATALOGS
     from skysim.core import files
     from skysim.sources import catalog
     from skysim.tracking.onboard_model import onboard_catalog
 
-    options = {
-        "count": count,
-        "bright_mag": bright,
-        "faintest_mag": faintest,
-        "north_mag": north,
-        "south_mag": south,
-    }
+    limits = {"bright": bright, "faintest": faintest, "north": north, "south": south}
+    options = {f"{name}_mag": limit for name, limit in limits.items()} | {"count": count}
     given = {name: value for name, value in options.items() if value is not None}
     known = list(inspect.signature(CATALOGS[rule]).parameters)[1:]
-    for name in given:
-        if name not in known:
-            allowed = ", ".join(f"--{one.removesuffix('_mag')}" for one in known)
-            raise InputError(
-                f"--{name.removesuffix('_mag')}", f"has no effect with --rule {rule}", allowed
-            )
+    if useless := [name for name in given if name not in known]:
+        key, *allowed = (f"--{name.removesuffix('_mag')}" for name in (useless[0], *known))
+        raise InputError(key, f"has no effect with --rule {rule}", ", ".join(allowed))
     if out.suffix != ".ecsv":
         raise InputError("--out", out, "a file .ecsv")
     path = catalog.require_catalog("NAME", source)
     selected = CATALOGS[rule](onboard_catalog("NAME", source), **given)
     files.make_folder(out.parent)
-    settings = "".join(f", {name} {value:g}" for name, value in given.items())
-    catalog.write_selection(path, out, selected.id, f"{rule} of {path.stem}{settings}")
+    words = [f"{rule} of {path.stem}", *(f"{name} {value:g}" for name, value in given.items())]
+    catalog.write_selection(path, out, selected.id, ", ".join(words))
     print_catalog(catalog.info(out), json)
 
 
@@ -192,20 +181,14 @@ def write_cat(stars: OnBoard, path: Path, json: bool) -> None:
 
 def print_cat(stars: OnBoard, path: Path, json: bool) -> None:
     """Print the contents of a .cat file."""
-    count = int(stars.components.sum())
-    faintest = float(stars.magnitude.max())
+    facts = {
+        "path": str(path),
+        "entries": len(stars),
+        "stars": int(stars.components.sum()),
+        "epoch_jyear": stars.epoch_yr,
+        "faintest_mag": round(float(stars.magnitude.max()), 3),
+    }
     if json:
-        print_json(
-            {
-                "path": str(path),
-                "entries": len(stars),
-                "stars": count,
-                "epoch_jyear": stars.epoch_yr,
-                "faintest_mag": faintest,
-            }
-        )
-        return
-    print(
-        f"{path}: {len(stars)} entries of {count} stars to magnitude {faintest:.2f},"
-        f" epoch J{stars.epoch_yr:.2f}"
-    )
+        print_json(facts)
+    else:
+        print(*(f"{name}: {value}" for name, value in facts.items()), sep=", ")
