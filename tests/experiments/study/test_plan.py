@@ -3,6 +3,7 @@
 import pytest
 
 from skysim.core.errors import InputError
+from skysim.core.paths import shipped_files
 from skysim.experiments.study import plan, study_file
 
 STUDY = """schema: 1
@@ -153,7 +154,7 @@ def test_an_unknown_study_is_refused():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "path",
-    sorted([*plan.STUDIES.glob("*.yaml"), *plan.PAPER_STUDIES.glob("*.yaml")]),
+    shipped_files(plan.STUDIES).values(),
     ids=lambda path: path.stem,
 )
 def test_every_shipped_study_loads(path):
