@@ -377,7 +377,9 @@ QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
             "pointing_arcsec",
             "pointing_worst_arcsec",
             "angles_compared",
+            "exposure_ms",
             "time_ms",
+            "detect_ms",
         )
     },
 }

@@ -11,10 +11,6 @@ from skysim.experiments.papers import (
     other_domes,
     ptase_ground,
     ptase_monte_carlo,
-    shefex_camera,
-    shefex_identification,
-    shefex_nights,
-    shefex_setup,
 )
 from skysim.experiments.papers.afit import (
     afit_surface,
@@ -47,11 +43,6 @@ EXPERIMENTS: dict[str, ExperimentFunction] = {
     "oled": other_domes.noise_and_absolute_error,
     "ptase-table-1": ptase_monte_carlo.table_1,
     "ptase-table-2": ptase_ground.table_2,
-    "shefex-fig-2": shefex_camera.exposure_control,
-    "shefex-fig-3": shefex_camera.scan_times,
-    "shefex-figs-4-5": shefex_setup.catalog_statistics,
-    "shefex-figs-7-10": shefex_identification.figs_7_to_10,
-    "shefex-nights": shefex_nights.night_results,
 }
 
 

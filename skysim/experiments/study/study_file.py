@@ -54,11 +54,12 @@ FLIGHT_QUANTITIES = (
     "drift_arcsec",
     "pointing_arcsec",
     "pointing_worst_arcsec",
+    "exposure_ms",
 )
 # Kinds of trial that measure a quantity; quantities that are not listed are measured by all.
 MEASURED_BY: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(FLIGHT_QUANTITIES, ("flight",)),
-    "streak_px": ("frames", "flight"),
+    **dict.fromkeys(("streak_px", "detect_ms"), ("frames", "flight")),
 }
 
 

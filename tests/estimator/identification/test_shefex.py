@@ -28,7 +28,7 @@ PIXEL_RAD = np.radians(0.02)
 
 @pytest.mark.parametrize(("centroid_px", "factor"), [(0.1, 4.95), (0.2, 2.47), (0.3, 1.65)])
 def test_eq_3_gives_the_published_cos_error(centroid_px: float, factor: float) -> None:
-    # Reference H5: 5.5e-5 with these constants; their third digit is half a per cent.
+    # Section 3.4.1: "a value between 0.00005 and 0.00006"; the constants' third digit is half a per cent.
     error = cos_error(np.radians(18.57), centroid_px * PIXEL_RAD, factor)
     assert error == pytest.approx(5.5e-5, rel=0.01)
 
@@ -36,7 +36,7 @@ def test_eq_3_gives_the_published_cos_error(centroid_px: float, factor: float) -
 @pytest.mark.parametrize(
     ("angle_deg", "tolerance_deg"), [(2, 0.090), (5, 0.036), (10, 0.018), (18.57, 0.010)]
 )
-def test_cos_error_equals_reference_h5_s_angle_tolerance(
+def test_cos_error_is_a_wide_gate_at_small_angles_and_a_narrow_one_at_large_ones(
     angle_deg: float, tolerance_deg: float
 ) -> None:
     low, high = np.degrees(angle_interval(np.radians(angle_deg), 5.5e-5))

@@ -44,18 +44,9 @@ BLOCK_TRIALS = 100_000  # trial numbers of a block of `Store.blocks`
 TEXT_FIELDS = {"status"}
 INTEGER_FIELDS = {"frames", "solved", "wrong", "ambiguous"}
 
+TIMES = ("time_ms", "detect_ms")
 # Names of `Store.columns`.
-COLUMNS = (
-    "trial",
-    "point",
-    "replicate",
-    "seed",
-    "scene",
-    "code",
-    *FIELDS,
-    "error",
-    "time_ms",
-)
+COLUMNS = ("trial", "point", "replicate", "seed", "scene", "code", *FIELDS, "error", *TIMES)
 
 SQL_TYPES = dict.fromkeys(TEXT_FIELDS, "TEXT") | dict.fromkeys(INTEGER_FIELDS, "INTEGER")
 OUTCOME_COLUMNS = ", ".join(f"{name} {SQL_TYPES.get(name, 'REAL')}" for name in FIELDS)
@@ -68,7 +59,7 @@ CREATE TABLE IF NOT EXISTS trials (
   scene TEXT NOT NULL, code TEXT NOT NULL,
   {OUTCOME_COLUMNS},
   error TEXT);
-CREATE TABLE IF NOT EXISTS timings (trial INTEGER PRIMARY KEY, time_ms REAL NOT NULL);
+CREATE TABLE IF NOT EXISTS timings (trial INTEGER PRIMARY KEY, time_ms REAL NOT NULL, detect_ms REAL);
 CREATE TABLE IF NOT EXISTS runs (
   run INTEGER PRIMARY KEY, began REAL NOT NULL, engine TEXT NOT NULL, workers INTEGER NOT NULL,
   trials INTEGER NOT NULL, seconds REAL NOT NULL);
@@ -194,8 +185,10 @@ class Store:
         values = [(*row[:6], *map(to_sql, values_of(row.outcome)), row.error) for row in rows]
         with self.db:
             self.db.executemany(INSERT, values)
-            times = [(row.trial, 1e3 * row.seconds) for row in rows]
-            self.db.executemany("INSERT OR REPLACE INTO timings VALUES (?, ?)", times)
+            times = [
+                (row.trial, 1e3 * row.seconds, to_sql(row.outcome.detect_ms)) for row in rows
+            ]
+            self.db.executemany("INSERT OR REPLACE INTO timings VALUES (?, ?, ?)", times)
         self._near = NONE_NEAR
         self._room -= len(rows)
         if self._room < 0:
@@ -341,7 +334,7 @@ class Store:
         rows = self._rows([(number, number + 1)])
         if not len(rows["trial"]):
             raise InputError(f"trial {number}", f"not in {self.path}", self.trial_range())
-        return {name: to_sql(rows[name].tolist()[0]) for name in rows if name != "time_ms"}
+        return {name: to_sql(rows[name].tolist()[0]) for name in rows if name not in TIMES}
 
     def trial_range(self) -> str:
         """Range of the trial numbers in the store, as text for messages."""
@@ -349,7 +342,7 @@ class Store:
         return f"{min(ends)} to {max(ends)}" if ends else "none yet"
 
     def columns(self, failed: bool = True) -> Rows:
-        """Every column of `trials`, and `timings.time_ms`, as arrays in trial order; NaN for missing values.
+        """Every column of `trials`, and those of `timings`, as arrays in trial order; NaN for missing values.
 
         Parameters
         ----------
