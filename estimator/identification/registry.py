@@ -7,6 +7,7 @@ the match or None. The tracker verifies a match with the whole field (`trackers.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -46,7 +47,7 @@ def candidates(
     index: PairIndex | None,
     focal_uncertainty: float,
     sigma_px: float,
-    base_stars: int,
+    **options: Any,
 ) -> Iterator[tuple[Camera, Rotation]]:
     """Candidate cameras and attitudes from the brightest centroids, by a published method.
 
@@ -63,7 +64,7 @@ def candidates(
         Greatest relative error of the camera's focal length; 0 if it is calibrated
     sigma_px
         Least centroid error, pixels
-    base_stars
+    options
         See `solver_options.Options`
 
     Yields
@@ -88,7 +89,7 @@ def candidates(
                 focal_unknown=steps > 0,
                 max_triangles=triangles,
                 max_checks=most_checks,
-                base_stars=base_stars,
+                **options,
             )
             if match:
                 yield zoomed, match.cam_from_ref

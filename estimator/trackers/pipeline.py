@@ -102,6 +102,8 @@ class Settings:
         Standard deviation of a star's magnitude, including the effect of its color
     missed_dex
         Penalty of a missed star: see `identification.solver_options`
+    assumed_deg
+        Roll, pitch and yaw (3-2-1) of the vehicle by another sensor, for star identifiers under LEDs; None if unknown
     reject
         Flags of `detection.classify.Flag` that exclude a blob
     bad_px
@@ -131,6 +133,7 @@ class Settings:
     zero_point_mag: float | None = None
     magnitude_sigma: float = 0.25
     missed_dex: float = 0.5
+    assumed_deg: tuple[float, float, float] | None = None
     reject: int = int(NO_STAR)
     bad_px: Ints | None = field(default=None, compare=False)
 

@@ -7,10 +7,6 @@ from collections.abc import Callable
 
 from skysim.core.errors import InputError
 from skysim.experiments.papers import (
-    nps,
-    other_domes,
-    ptase_ground,
-    ptase_monte_carlo,
     shefex_camera,
     shefex_identification,
     shefex_nights,
@@ -42,11 +38,6 @@ EXPERIMENTS: dict[str, ExperimentFunction] = {
     "afit-table-6-9": test3.tables_6_to_9,
     "afit-table-10-15": test3_attitude.tables_10_to_15,
     "afit-bump": test3_attitude.bump,
-    "nps": nps.initial_error_trials,
-    "apl": other_domes.discrepancies_and_counts,
-    "oled": other_domes.noise_and_absolute_error,
-    "ptase-table-1": ptase_monte_carlo.table_1,
-    "ptase-table-2": ptase_ground.table_2,
     "shefex-fig-2": shefex_camera.exposure_control,
     "shefex-fig-3": shefex_camera.scan_times,
     "shefex-figs-4-5": shefex_setup.catalog_statistics,
