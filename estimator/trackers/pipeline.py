@@ -111,6 +111,10 @@ class Settings:
         `identification.solver_options`
     cos_error
         Tolerance of the cosine of an angle, for the identifier `shefex`; None: from the centroids' errors
+    missed_dex
+        Penalty of a missed star: see `identification.solver_options`
+    assumed_deg
+        Roll, pitch and yaw (3-2-1) of the vehicle by another sensor, for star identifiers under LEDs; None if unknown
     reject
         Flags of `detection.classify.Flag` that exclude a blob
     bad_px
@@ -142,6 +146,7 @@ class Settings:
     missed_dex: float = 0.5
     acceptance: str = "evidence"
     cos_error: float | None = None
+    assumed_deg: tuple[float, float, float] | None = None
     reject: int = int(NO_STAR)
     bad_px: Ints | None = field(default=None, compare=False)
 

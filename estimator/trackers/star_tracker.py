@@ -15,6 +15,7 @@ import datetime
 import functools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -145,7 +146,12 @@ class StarTracker:
             self.pairs = len(self.sky.pair)
         else:
             self.sky = sky_index.build_without_pairs(self.stars.vectors, self.stars.v_mag)
-            self.index = pair_index.build(index_stars.vectors, longest_rad)
+            known = settings.zero_point_mag is not None
+            self.index = pair_index.build(
+                index_stars.vectors,
+                longest_rad,
+                magnitude=index_stars.v_mag if known else None,
+            )
             self.pairs = len(self.index.pair)
         self.field_matcher = FieldMatcher(
             camera, self.stars, self.sky, settings, focal_uncertainty, self.pairs
@@ -409,17 +415,22 @@ class StarTracker:
         from estimator.identification.registry import candidates  # several compiled modules
 
         settings = self.settings
+        bright = brightest(centroids, settings)
+        options: dict[str, Any] = {"base_stars": settings.base_stars}
+        if settings.zero_point_mag is not None:
+            options["magnitude"] = settings.zero_point_mag - 2.5 * np.log10(bright.flux)
+            options["epsilon_mag"] = settings.magnitude_sigma
         return candidates(
             settings.identifier,
-            brightest(centroids, settings),
+            bright,
             self.camera,
             self.index,
             self.focal_uncertainty,
             settings.centroid_sigma_px,
             settings.acceptance,
-            base_stars=settings.base_stars,
             cos_error=settings.cos_error,
             compared=compared,
+            **options,
         )
 
     def solve_matches(self, centroids: Centroids, observed: Ints, star: Ints) -> Attitude:

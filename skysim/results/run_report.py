@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -122,7 +123,7 @@ def summary(rows: Sequence[FrameRow]) -> dict[str, Any]:
     """Frame counts, median and worst errors in arcseconds, and median solve time of a run.
 
     Errors are over solved frames, wrong ones included; NaN if no frame was solved. Where stars were identified, also
-    `magnitude_errors`.
+    `magnitude_errors`; for `scatter_arcsec` see there.
     """
     solved = [row for row in rows if row.status == "solved"]
     cross = np.array([row.cross_arcsec for row in solved] or [np.nan])
@@ -135,6 +136,7 @@ def summary(rows: Sequence[FrameRow]) -> dict[str, Any]:
         "cross_arcsec_worst": float(np.max(cross)),
         "roll_arcsec_median": float(np.median(roll)),
         "roll_arcsec_worst": float(np.max(roll)),
+        "scatter_arcsec": scatter_arcsec(solved),
         "time_ms_median": float(np.median([row.time_ms for row in rows])),
         **magnitude_errors(rows),
     }
@@ -158,6 +160,23 @@ def magnitude_errors(rows: Sequence[FrameRow]) -> dict[str, Any]:
         "magnitude_error_mag_sigma": float(np.sqrt(squares / (stars.sum() - 1))),
         "magnitude_stars": int(stars.sum()),
     }
+
+
+def scatter_arcsec(solved: Sequence[FrameRow]) -> list[float]:
+    """Standard deviations of the three estimated angles about straight lines in time, fitted by least squares.
+
+    A laboratory without a truth measures it at rest or at a constant rate. NaN for fewer than three frames.
+    """
+    if len(solved) < 3:
+        return [math.nan] * 3
+    t_s = [row.t_s for row in solved]
+    angles_deg = np.array([row.estimate_deg for row in solved])
+    # 360 degrees are none.
+    angles_deg = np.unwrap(angles_deg, period=360, axis=0)
+    design = np.column_stack([np.ones(len(t_s)), t_s])
+    fit = np.linalg.lstsq(design, angles_deg, rcond=None)[0]
+    squares = np.sum((angles_deg - design @ fit) ** 2, axis=0)
+    return (3600 * np.sqrt(squares / (len(t_s) - 2))).tolist()
 
 
 def magnitude_text(rows: Sequence[FrameRow]) -> str:

@@ -274,6 +274,28 @@ RULES = (
         "two levels of brightness in light.layout",
     ),
     Rule(
+        ("tracker.assumed_attitude_deg",),
+        lambda scene: (
+            not under_dome(scene)
+            or external(scene)
+            or scene.tracker.identifier in (None, "led_pairs", "non_dimensional")
+        ),
+        "this identifier needs no attitude",
+        "a dome with tracker.identifier: pyramid, saa or master_star",
+    ),
+    Rule(
+        ("tracker.magnitude_sigma",),
+        lambda scene: scene.light.kind != "stars" or external(scene),
+        "only skysim's own tracker of stars uses it",
+        "light.kind: stars",
+    ),
+    Rule(
+        ("tracker.magnitude_sigma",),
+        lambda scene: scene.tracker.identifier in ("pyramid", "shefex"),
+        "this identifier does not use magnitudes",
+        "tracker.identifier: default, saa, master_star or fialho_1 to fialho_4",
+    ),
+    Rule(
         ("tracker.gyro",),
         external,
         "an external tracker gets no rate",

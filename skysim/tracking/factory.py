@@ -52,6 +52,7 @@ from skysim.tracking.onboard_model import (
     onboard_catalog,
     surveyed_dome,
     with_brightness,
+    zero_point_mag,
 )
 from skysim.tracking.tracker_interface import OWN
 
@@ -97,6 +98,9 @@ def assumed_settings(scene: Scene) -> Settings:
         centroid_sigma_px=config.centroid_sigma_px,
         acceptance=config.acceptance,
         cos_error=config.cos_error,
+        assumed_deg=config.assumed_attitude_deg,
+        zero_point_mag=zero_point_mag(scene),
+        magnitude_sigma=config.magnitude_sigma or default.magnitude_sigma,
         **chosen,
     )
 

@@ -34,7 +34,7 @@ ELSEWHERE = {  # pages whose blocks have a test of their own, which knows what i
     "docs/howto/export.md": "docs/test_formats.py",
     "docs/howto/external_tracker.md": "tracking/test_interface.py",
     "docs/howto/light.md": "simulation/test_lights.py",
-    "docs/findings/papers.md": "experiments/papers/test_papers.py",
+    "docs/findings/papers.md": "experiments/papers/test_reproduction.py",
     "docs/findings/studies.md": "docs/test_docs.py",
     "estimator/README.md": "docs/test_estimator_readme.py",
 }

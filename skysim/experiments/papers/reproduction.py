@@ -2,7 +2,8 @@
 
 Each experiment of data/published names a scene or a study, and each row a response: a path into the JSON of the command
 that runs it, as in `leds.0.mean` or `stops.4.difference_deg.2`. A study's response has the levels of the point in
-brackets: `identified[rate=2, chain=default]`. Two terms may be subtracted or divided: `a - b`, `a / b`.
+brackets: `identified[rate=2, chain=default]`. Two terms may be subtracted or divided: `a - b`, `a / b`; a term may be a
+number.
 
 The verdict tests the difference d between our number and the published one. With our standard error s (of the mean over
 runs, or of the study's response), the scatter p of the published number and an allowed difference t,
@@ -17,6 +18,7 @@ where the bound is within 1.96 s of our number.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 import shlex
@@ -159,7 +161,7 @@ Number = Callable[[str, str], Ours]  # of a path and the text in its brackets
 
 
 def run_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Number]:
-    """Run a scene with several seeds; a number is the mean of its values."""
+    """Run a scene with several seeds; a number is the mean of its values, of the runs in which it has one."""
     runs = experiment.quick_runs if options.quick else experiment.runs
     commands = []
     results = []
@@ -177,8 +179,12 @@ def run_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Nu
 
     def number(path: str, levels: str) -> Ours:
         values = np.array([at_path(result, path) for result in results], float)
-        deviation = float(values.std(ddof=1)) if runs > 1 else 0.0
-        return Ours(float(values.mean()), deviation / math.sqrt(runs), deviation, runs)
+        values = values[np.isfinite(values)]
+        count = len(values)
+        if not count:
+            return Ours(math.nan, runs=0)
+        deviation = float(values.std(ddof=1)) if count > 1 else 0.0
+        return Ours(float(values.mean()), deviation / math.sqrt(count), deviation, count)
 
     return commands, number
 
@@ -249,6 +255,8 @@ def point_at(rows: Sequence[PointRow], levels: str) -> PointRow:
 def at_path(result: Any, path: str) -> float:
     """The number at a dotted path of mappings and lists; a list that the path ends in is averaged by magnitude."""
     for part in path.split("."):
+        if result is None:  # of a frame without a solution
+            return math.nan
         result = result[int(part)] if isinstance(result, list | tuple) else result[part]
     return float(result)
 
@@ -263,15 +271,17 @@ def evaluate(response: str, number: Number) -> Ours:
                 a.value - b.value,
                 math.hypot(a.error, b.error),
                 math.hypot(a.deviation, b.deviation),
-                a.runs,
+                max(a.runs, b.runs),
             )
         ratio = a.value / b.value
         relative = math.hypot(a.error / a.value, b.error / b.value) if a.value else 0.0
         spread = math.hypot(a.deviation / a.value, b.deviation / b.value) if a.value else 0.0
-        return Ours(ratio, abs(ratio) * relative, abs(ratio) * spread, a.runs)
+        return Ours(ratio, abs(ratio) * relative, abs(ratio) * spread, max(a.runs, b.runs))
     term = TERM.fullmatch(response)
     if not term:
         raise ValueError("no response")
+    with contextlib.suppress(ValueError):
+        return Ours(float(term[1]))
     return number(term[1], term[2] or "")
 
 

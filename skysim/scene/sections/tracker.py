@@ -182,6 +182,12 @@ class TrackerConfig(ConfigModel):
     brightness_sigma
         Standard deviation of the logarithm of the LEDs' brightness over that of the data sheet (scatter, aging, angle,
         flicker), for identification by brightness and position; by position alone if left out
+    assumed_attitude_deg
+        Roll, pitch and yaw (3-2-1) of the vehicle by another sensor, from which the dome's identifiers pyramid, saa and
+        master_star compute the distances of the lights, as for a panel that is not a sphere; a sphere if left out
+    magnitude_sigma
+        Standard deviation of a star's measured magnitude over the catalog's V (noise, colors), for identification by
+        magnitude and place; by place alone if left out. The zero point is that of a star of the Sun's color
     map
         File that `skysim survey` wrote: measured LEDs, lever, focal length and distortion
     """
@@ -212,6 +218,8 @@ class TrackerConfig(ConfigModel):
     exposure_control: ExposureControlConfig | None = None
     decoder: DecoderConfig | None = None
     brightness_sigma: Annotated[Number, Field(ge=0.02, le=2)] | None = None
+    assumed_attitude_deg: tuple[Spin, Spin, Spin] | None = None
+    magnitude_sigma: Annotated[Number, Field(ge=0.01, le=5)] | None = None
     map: Annotated[str, AfterValidator(existing_file)] | None = None
 
     @model_validator(mode="after")
