@@ -28,7 +28,13 @@ BOOTSTRAP = (
     " of the others is normal"
 )
 EXTREMUM = "none: it is that of these trials"
-INTERVALS = {"mean": BOOTSTRAP, "rms": BOOTSTRAP, "worst": EXTREMUM, "least": EXTREMUM}
+INTERVALS = {
+    "mean": BOOTSTRAP,
+    "rms": BOOTSTRAP,
+    "sd": "percentile bootstrap, from two values on",
+    "worst": EXTREMUM,
+    "least": EXTREMUM,
+}
 QUANTILES = {"median": 0.5, "p90": 0.9, "p95": 0.95, "p99": 0.99}
 
 

@@ -5,7 +5,7 @@ convert visual magnitudes to instrumental magnitudes through an empirical formul
 B-V and V-I color indexes", and corrects proper motion "from the Hipparcos mean epoch (J1991.25) to the mean mission
 epoch"; it keeps the file's order. PROC_CAT "merges optically double or multiple systems into a single
 photometrically equivalent star and rearranges the stars in order of increasing magnitude", and logs a histogram and
-every star. The fixed-point layout of their files is unpublished and is not imitated.
+every star. `cat_file` has files with the fields of theirs, whose layout is unpublished.
 
 SHEFEX-2 (Samaan & Theil 2011, section 3.3). The asymmetric catalog has no star fainter than 5.4 and about 180 between
 5.2 and 5.4, "the difference in stars between the hemispheres". The uniform one has about 450 stars from 5.25 to 5.75.
@@ -195,6 +195,7 @@ def log(stars: OnBoard, step_mag: float = 0.5) -> str:
 NORTH_MAG = 5.2
 SOUTH_MAG = 5.4
 BRIGHT_MAG = 4.5
+FAINTEST_MAG = 5.75  # of the uniform catalog
 COUNT = 2023
 
 
@@ -256,13 +257,29 @@ def uniform(stars: StarCatalog, count: int, bright_mag: float = -np.inf) -> Star
     return thin(stars, low, bright_mag)
 
 
-def chosen(stars: StarCatalog) -> StarCatalog:
+def uniform_to_limit(
+    stars: StarCatalog,
+    count: int = COUNT,
+    faintest_mag: float = FAINTEST_MAG,
+    bright_mag: float = -np.inf,
+) -> StarCatalog:
+    """Select the uniform catalog: `uniform` from the stars to a limit."""
+    return uniform(stars.take(stars.v_mag <= faintest_mag), count, bright_mag)
+
+
+def chosen(
+    stars: StarCatalog,
+    count: int = COUNT,
+    bright_mag: float = BRIGHT_MAG,
+    north_mag: float = NORTH_MAG,
+    south_mag: float = SOUTH_MAG,
+) -> StarCatalog:
     """Select the flown catalog: 2,023 stars, all of the asymmetric one to 4.5 and the rest evenly distributed."""
-    return uniform(asymmetric(stars), COUNT, BRIGHT_MAG)
+    return uniform(asymmetric(stars, north_mag, south_mag), count, bright_mag)
 
 
-CATALOGS: dict[str, Callable[[StarCatalog], StarCatalog]] = {
+CATALOGS: dict[str, Callable[..., StarCatalog]] = {
     "asymmetric": asymmetric,
-    "uniform": lambda stars: uniform(stars.take(stars.v_mag <= 5.75), COUNT),
+    "uniform": uniform_to_limit,
     "chosen": chosen,
 }

@@ -309,12 +309,15 @@ class StarMatch:
         Attitude with which the matches were verified
     log10_chance
         Logarithm of the expected number of equally good chance matches over the whole search
+    v_mag
+        (K,) catalog magnitudes of the stars; None of LEDs
     """
 
     observed: Ints
     star: Ints
     cam_from_ref: Rotation
     log10_chance: float
+    v_mag: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -340,6 +343,8 @@ class Attitude:
         (3, 3) part of covariance_rad2 that is common to successive frames; None if there is none
     rate
         Rate of the camera at the attitude's time; None where neither streaks nor rows determine it
+    angles_compared
+        Number of angles that the identifier has compared, of those that count them; None of others
     """
 
     status: str
@@ -350,6 +355,7 @@ class Attitude:
     camera: Camera | None = None
     systematic_rad2: Floats | None = None
     rate: RateEstimate | None = None
+    angles_compared: int | None = None
 
     @property
     def solved(self) -> bool:

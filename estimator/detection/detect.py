@@ -202,7 +202,7 @@ def thesis(
     Raises
     ------
     ImageError
-        For an image that cannot be used, and for floats of unknown scale.
+        For an image that cannot be used, for floats of unknown scale, and for a dark frame above the threshold.
     """
     check_pixel_type(image)
     pixel = image.dtype
@@ -216,11 +216,15 @@ def thesis(
             )
         full_scale = float(np.iinfo(pixel).max)
     flat = flat_background(estimate_background(image), image.shape)
+    threshold = THESIS_INTENSITY * full_scale
+    if flat.level[0, 0] >= threshold:
+        raise ImageError(
+            f"the black level of {flat.level[0, 0]:.0f} is above the threshold of 4 % of {full_scale:.0f}, that is"
+            f" {threshold:.0f}: lower the camera's offset or the background, or set another detector"
+        )
     # The thesis thresholds raw pixels. We threshold the filtered image, whose contour around a plateau of 50 pixels is
     # within a pixel of the raw one.
-    return detect_blobs(
-        image, flat, THESIS_INTENSITY * full_scale - flat.level, THESIS_AREA_PX, max_blobs
-    )
+    return detect_blobs(image, flat, threshold - flat.level, THESIS_AREA_PX, max_blobs)
 
 
 def sequential(

@@ -46,13 +46,15 @@ class DirectMatch(NamedTuple):
     log10_chance: float
 
 
-def to_star_match(match: DirectMatch) -> StarMatch | None:
-    """The match as a StarMatch, or None if it is not significant (ACCEPT_LOG10_CHANCE, MIN_MATCHES)."""
-    if len(match.observed) < MIN_MATCHES or match.log10_chance > ACCEPT_LOG10_CHANCE:
+def to_star_match(match: DirectMatch, by_paper: bool = False) -> StarMatch | None:
+    """The match as a StarMatch, or None if it is not significant (ACCEPT_LOG10_CHANCE, MIN_MATCHES).
+
+    A match accepted by its paper's rule is not tested: its log10_chance is NaN.
+    """
+    chance = float("nan") if by_paper else match.log10_chance
+    if len(match.observed) < MIN_MATCHES or chance > ACCEPT_LOG10_CHANCE:
         return None
-    return StarMatch(
-        match.observed, match.star, rotation(match.R_cam_from_ref), match.log10_chance
-    )
+    return StarMatch(match.observed, match.star, rotation(match.R_cam_from_ref), chance)
 
 
 @jit

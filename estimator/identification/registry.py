@@ -7,9 +7,9 @@ the match or None. The tracker verifies a match with the whole field (`trackers.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from estimator.catalog.pair_index import PairIndex
 from estimator.core.camera import Camera
@@ -19,6 +19,7 @@ from estimator.identification.published.master_star import master_star
 from estimator.identification.published.pyramid import pyramid
 from estimator.identification.published.saa import saa
 from estimator.identification.published.shefex import shefex
+from estimator.identification.published.triangles import planar_triangle, spherical_triangle
 
 Identifier = Callable[..., StarMatch | None]
 
@@ -29,6 +30,8 @@ IDENTIFIERS: dict[str, Identifier] = {
     "saa": saa,
     "shefex": shefex,
     "master_star": master_star,
+    "planar_triangle": planar_triangle,
+    "spherical_triangle": spherical_triangle,
     **VERSIONS,
 }
 
@@ -46,9 +49,10 @@ def candidates(
     index: PairIndex | None,
     focal_uncertainty: float,
     sigma_px: float,
-    base_stars: int,
-) -> Iterator[tuple[Camera, Rotation]]:
-    """Candidate cameras and attitudes from the brightest centroids, by a published method.
+    acceptance: str = "evidence",
+    **options: Any,
+) -> Iterator[tuple[Camera, StarMatch]]:
+    """Candidate cameras and matches from the brightest centroids, by a published method.
 
     If the focal length is uncertain, its interval is searched in steps of STEP from the middle outward: first with
     little effort at every step, then with more.
@@ -63,20 +67,22 @@ def candidates(
         Greatest relative error of the camera's focal length; 0 if it is calibrated
     sigma_px
         Least centroid error, pixels
-    base_stars
+    acceptance, options
         See `solver_options.Options`
 
     Yields
     ------
-    tuple[Camera, Rotation]
-        The camera with the focal length of the step, and cam_from_ref
+    tuple[Camera, StarMatch]
+        The camera with the focal length of the step, and the match
     """
     identify = IDENTIFIERS[identifier]
     # Steps on either side of the assumed focal length, the nearest first.
     steps = int(np.ceil(focal_uncertainty / STEP - 0.5))
     stretch = STRETCH if focal_uncertainty else CALIBRATED
     zooms = sorted((n * STEP for n in range(-steps, steps + 1)), key=abs)
-    for triangles, most_checks in EFFORTS:
+    # A paper's rule is that of one search.
+    efforts = EFFORTS if acceptance == "evidence" else EFFORTS[-1:]
+    for triangles, most_checks in efforts:
         for zoom in zooms:
             zoomed = camera.zoomed(1 + zoom)
             # The tolerance is four standard deviations, but at least a pixel, for errors of the calibration.
@@ -88,7 +94,8 @@ def candidates(
                 focal_unknown=steps > 0,
                 max_triangles=triangles,
                 max_checks=most_checks,
-                base_stars=base_stars,
+                acceptance=acceptance,
+                **options,
             )
             if match:
-                yield zoomed, match.cam_from_ref
+                yield zoomed, match

@@ -10,8 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, Ints
 from estimator.core.errors import ImageError
+
+ACCEPTANCES = ("evidence", "thesis")
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +47,13 @@ class Options:
         (3,) unit vector, prior direction of the optical axis in the catalog's frame
     within_rad
         Greatest error of that direction
+    acceptance
+        One of ACCEPTANCES: `evidence` accepts a match that is significant against chance, `thesis` one that the
+        method's own paper would accept. Its log10_chance is then NaN, as it has not been tested
+    cos_error
+        Greatest difference of the cosines of two angles that agree, for methods that use it; None: from the tolerance
+    compared
+        (1,) count of the angles compared, to which a method that counts them adds its own; None: not counted
     """
 
     stretch: float = 0.0
@@ -59,6 +68,14 @@ class Options:
     epsilon_sep_rad: float | None = None
     boresight_ref: Floats | None = None
     within_rad: float = np.pi
+    acceptance: str = "evidence"
+    cos_error: float | None = None
+    compared: Ints | None = None
+
+    @property
+    def by_paper(self) -> bool:
+        """Whether the paper's own rule accepts a match, without a test against chance."""
+        return self.acceptance == "thesis"
 
     @staticmethod
     def require_tolerance(name: str, tolerance_rad: float) -> None:

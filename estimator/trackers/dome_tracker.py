@@ -26,6 +26,7 @@ from estimator.attitude.dome_map import (
     check_lever,
     check_map,
     on_sphere,
+    on_surface,
     project,
 )
 from estimator.attitude.nearfield import SOLVERS, fitted_sigma_rad
@@ -39,6 +40,7 @@ from estimator.identification import led_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.led_index import build_dome_index, corner_rays, inner_field
 from estimator.identification.led_search import NO_MATCH
+from estimator.identification.refusals import advice
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
 from estimator.trackers import warm_up
 from estimator.trackers.pipeline import (
@@ -99,7 +101,8 @@ def star_identifier(
     """Return a star identifier that works on directions from the bearing, where the rays meet one sphere.
 
     The sphere has the median radius of the LEDs. On a dome that is not a sphere this changes the angles; the tolerance
-    therefore has a stretch, from the spread of the radii and the lever.
+    therefore has a stretch, from the spread of the radii and the lever. With an assumed attitude the rays meet the
+    dome's surface as seen from there (`assumed_directions`), and the stretch is that of the calibration alone.
     """
     radius = np.linalg.norm(leds.position_m, axis=1)
     median_radius_m = float(np.median(radius))
@@ -108,25 +111,47 @@ def star_identifier(
     field_tan, _ = inner_field(points)
     reach_rad = np.arccos(np.clip((points @ points.T).min(), -1, 1))
     pairs = pair_index.build(leds.position_m / radius[:, None], reach_rad * 1.05, leds.board)
-    stretch = (
-        2 * float(np.std(radius)) / (median_radius_m - float(np.linalg.norm(pupil_m))) + 5e-4
-    )
+    stretch = 5e-4
+    if settings.assumed_deg is None:
+        spread_m = 2 * float(np.std(radius))
+        stretch += spread_m / (median_radius_m - float(np.linalg.norm(pupil_m)))
 
     def identify(
         rays_cam: Floats, sigma_rad: Floats, flux_s: Floats | None
     ) -> StarMatch | str:
+        if settings.assumed_deg is None:
+            directions = on_sphere(rays_cam, pupil_m, median_radius_m) / median_radius_m
+        else:
+            directions = assumed_directions(rays_cam, leds, lever, settings.assumed_deg)
         match = STAR_IDENTIFIERS[name](
-            on_sphere(rays_cam, pupil_m, median_radius_m) / median_radius_m,
+            directions,
             pairs,
             max(1.0, 4 * settings.centroid_sigma_px) / camera.focal_px,
             stretch=stretch,
             base_stars=settings.base_stars,
             missed_dex=settings.missed_dex,
             field_tan=tuple(field_tan),
+            acceptance=settings.acceptance,
         )
-        return match or NO_MATCH
+        return match or f"{NO_MATCH}: {advice(name, len(rays_cam), settings.acceptance)}"
 
     return identify
+
+
+def assumed_directions(
+    rays_cam: Floats, leds: LedMap, lever: Lever, assumed_deg: tuple[float, float, float]
+) -> Floats:
+    """Return (N, 3) unit vectors from the bearing to lights, in camera axes, with distances from an assumed attitude.
+
+    R_0 + alpha_i b_i = A beta_i r_i (Tappe 2009, by Padro 2012, eq. 33): the distance alpha_i from the camera at R_0 to
+    light i along its ray b_i depends on the attitude A, and follows from the surface at an assumed A.
+    """
+    lab_from_body = Rotation.from_euler("ZYX", assumed_deg[::-1], degrees=True)
+    lab_from_cam = lab_from_body * lever.cam_from_body.inv()
+    origin_m = lab_from_body.apply(lever.camera_body_m)
+    points_m = on_surface(lab_from_cam.apply(rays_cam), origin_m, leds)
+    points_m /= np.linalg.norm(points_m, axis=1, keepdims=True)
+    return lab_from_cam.inv().apply(points_m)
 
 
 # Each entry maps (camera, leds, lever, settings) to a function that identifies (N, 3) rays with (N,) errors and, if the
@@ -134,8 +159,10 @@ def star_identifier(
 IDENTIFIERS: dict[str, Callable[[Camera, LedMap, Lever, Settings], Identify]] = {
     "led_pairs": led_pairs,
     "non_dimensional": non_dimensional,
-    "pyramid": partial(star_identifier, "pyramid"),
-    "saa": partial(star_identifier, "saa"),
+    **{
+        name: partial(star_identifier, name)
+        for name in ("pyramid", "saa", "master_star", "planar_triangle", "spherical_triangle")
+    },
 }
 
 

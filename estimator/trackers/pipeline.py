@@ -31,6 +31,7 @@ from estimator.core.types import Attitude, Blobs, Centroids, FramePriors, RateEs
 from estimator.detection import classify
 from estimator.detection.classify import NO_STAR, Flag
 from estimator.detection.detect import DETECTORS, in_row_order, replace_bad_pixels, to_native
+from estimator.identification.solver_options import ACCEPTANCES
 
 SATURATED = "the frame is saturated"
 # Extra centroid error of a saturated blob, whose plateau has edges at whole pixels. Monte Carlo: 0.01 to 0.07 px, more
@@ -70,6 +71,11 @@ ALLOWED = {
     "missed_dex": NOT_NEGATIVE,
     "reject": Allowed(0, int(max(Flag)) * 2 - 1, "bits of detection.classify.Flag", True),
 }
+# Settings that may also be None.
+OPTIONAL = {
+    "zero_point_mag": Allowed(-100, 100, "-100 to 100, or None"),
+    "cos_error": Allowed(1e-12, 0.1, "1e-12 to 0.1, or None"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,8 +106,15 @@ class Settings:
         Magnitude of a source of flux 1; None if unknown: magnitudes are then not used
     magnitude_sigma
         Standard deviation of a star's magnitude, including the effect of its color
+    missed_dex, acceptance
+        Penalty of a missed star, and the rule by which a published identifier accepts a match: see
+        `identification.solver_options`
+    cos_error
+        Tolerance of the cosine of an angle, for the identifier `shefex`; None: from the centroids' errors
     missed_dex
         Penalty of a missed star: see `identification.solver_options`
+    assumed_deg
+        Roll, pitch and yaw (3-2-1) of the vehicle by another sensor, for star identifiers under LEDs; None if unknown
     reject
         Flags of `detection.classify.Flag` that exclude a blob
     bad_px
@@ -131,6 +144,9 @@ class Settings:
     zero_point_mag: float | None = None
     magnitude_sigma: float = 0.25
     missed_dex: float = 0.5
+    acceptance: str = "evidence"
+    cos_error: float | None = None
+    assumed_deg: tuple[float, float, float] | None = None
     reject: int = int(NO_STAR)
     bad_px: Ints | None = field(default=None, compare=False)
 
@@ -140,8 +156,10 @@ class Settings:
         return object.__new__(cls)
 
     def __post_init__(self) -> None:
-        for name, allowed in ALLOWED.items():
+        for name, allowed in (ALLOWED | OPTIONAL).items():
             value = getattr(self, name)
+            if value is None and name in OPTIONAL:
+                continue
             value = checks.number(
                 f"settings: {name}",
                 value,
@@ -153,15 +171,7 @@ class Settings:
             object.__setattr__(
                 self, name, value
             )  # a plain float or int, which compiled code knows
-        if self.zero_point_mag is not None:
-            zero = checks.number(
-                "settings: zero_point_mag",
-                self.zero_point_mag,
-                -100,
-                100,
-                "-100 to 100, or None",
-            )
-            object.__setattr__(self, "zero_point_mag", zero)
+        checks.known("settings: acceptance", self.acceptance, ACCEPTANCES)
         if self.bad_px is not None:
             bad = np.asarray(self.bad_px)
             if (

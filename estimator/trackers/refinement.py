@@ -140,7 +140,7 @@ class FieldMatcher:
         covariance_rad2, common_rad2 = with_focal_error(
             covariance_rad2, camera, xy, seen_cam, sigma_rad
         )
-        match = StarMatch(observed, star, cam_from_ref, chance)
+        match = StarMatch(observed, star, cam_from_ref, chance, self.stars.v_mag[star])
         return Attitude(
             "solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2
         )

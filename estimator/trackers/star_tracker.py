@@ -15,6 +15,7 @@ import datetime
 import functools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -32,6 +33,7 @@ from estimator.core.least_squares import variance_factor
 from estimator.core.types import NO_SPREAD, Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification import star_quads, star_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
+from estimator.identification.refusals import advice
 from estimator.identification.star_detections import (
     Detections,
     FlatCentroids,
@@ -128,8 +130,9 @@ class StarTracker:
         self.stars = catalog.merge_doubles(
             apparent_stars, settings.merge_px / camera.focal_px
         )
-        field_sr = camera.width_px * camera.height_px / camera.focal_px**2
-        limit_mag = catalog.limit_for_density(self.stars, field_sr, settings.field_stars)
+        limit_mag = catalog.limit_for_density(
+            self.stars, self._field_sr, settings.field_stars
+        )
         index_stars = self.stars.take(self.stars.v_mag <= limit_mag)
         # Longest pair: the diagonal of the widest field that the camera may have
         longest_rad = 1.02 * camera.zoomed(1 - focal_uncertainty).diagonal_rad
@@ -143,7 +146,12 @@ class StarTracker:
             self.pairs = len(self.sky.pair)
         else:
             self.sky = sky_index.build_without_pairs(self.stars.vectors, self.stars.v_mag)
-            self.index = pair_index.build(index_stars.vectors, longest_rad)
+            known = settings.zero_point_mag is not None
+            self.index = pair_index.build(
+                index_stars.vectors,
+                longest_rad,
+                magnitude=index_stars.v_mag if known else None,
+            )
             self.pairs = len(self.index.pair)
         self.field_matcher = FieldMatcher(
             camera, self.stars, self.sky, settings, focal_uncertainty, self.pairs
@@ -168,6 +176,11 @@ class StarTracker:
     def quads(self) -> quad_index.QuadIndex:
         """Quads of the stars that form pairs, built on first use."""
         return quad_index.build(self.sky, self._height_rad)
+
+    @property
+    def _field_sr(self) -> float:
+        """Solid angle of the field of view."""
+        return self.camera.width_px * self.camera.height_px / self.camera.focal_px**2
 
     @property
     def _height_rad(self) -> float:
@@ -369,28 +382,55 @@ class StarTracker:
         if self.index is None:
             searches = self.searches if effort is None else self.searches[effort : effort + 1]
             return self._identify_by_evidence(centroids, searches, clock)
-        for camera, cam_from_ref in self._candidates(centroids):
+        compared = np.zeros(1, np.int64)
+        attitude = self._identify_by_paper(centroids, clock, compared)
+        return replace(attitude, angles_compared=int(compared[0]) or None)
+
+    def _identify_by_paper(
+        self, centroids: Centroids, clock: Clock, compared: Ints
+    ) -> Attitude:
+        """Solve by a published identifier; `compared` counts the angles that it compares."""
+        for camera, match in self._candidates(centroids, compared):
             clock.lap("identify")
-            attitude = self.field_matcher.refine(centroids, camera, cam_from_ref)
+            if self.settings.acceptance == "thesis":
+                # The paper's rule has accepted this match: it is not tested with the whole field.
+                attitude = self.solve_matches(centroids, match.observed, match.star)
+            else:
+                attitude = self.field_matcher.refine(centroids, camera, match.cam_from_ref)
             clock.lap("solve")
             if attitude.solved:
                 return attitude
         clock.lap("identify")
-        return Attitude(NO_MATCH)
+        assert self.index is not None
+        settings = self.settings
+        lights = len(brightest(centroids, settings))
+        in_field = len(self.index.vectors) * self._field_sr / (4 * np.pi)
+        why = advice(settings.identifier, lights, settings.acceptance, in_field)
+        return Attitude(f"{NO_MATCH}: {why}")
 
-    def _candidates(self, centroids: Centroids) -> Iterator[tuple[Camera, Rotation]]:
-        """Return candidate cameras and attitudes by the published identifier that the settings name."""
+    def _candidates(
+        self, centroids: Centroids, compared: Ints
+    ) -> Iterator[tuple[Camera, StarMatch]]:
+        """Return candidate cameras and matches by the published identifier that the settings name."""
         from estimator.identification.registry import candidates  # several compiled modules
 
         settings = self.settings
+        bright = brightest(centroids, settings)
+        options: dict[str, Any] = {"base_stars": settings.base_stars}
+        if settings.zero_point_mag is not None:
+            options["magnitude"] = settings.zero_point_mag - 2.5 * np.log10(bright.flux)
+            options["epsilon_mag"] = settings.magnitude_sigma
         return candidates(
             settings.identifier,
-            brightest(centroids, settings),
+            bright,
             self.camera,
             self.index,
             self.focal_uncertainty,
             settings.centroid_sigma_px,
-            settings.base_stars,
+            settings.acceptance,
+            cos_error=settings.cos_error,
+            compared=compared,
+            **options,
         )
 
     def solve_matches(self, centroids: Centroids, observed: Ints, star: Ints) -> Attitude:
@@ -430,7 +470,7 @@ class StarTracker:
         covariance_rad2, common_rad2 = with_focal_error(
             covariance_rad2, self.camera, xy_px, seen_cam, sigma_rad
         )
-        match = StarMatch(observed, star, cam_from_ref, float("nan"))
+        match = StarMatch(observed, star, cam_from_ref, float("nan"), self.stars.v_mag[star])
         rms_px = float(np.sqrt(np.mean(residual**2)))
         return Attitude(
             "solved", cam_from_ref, covariance_rad2, match, rms_px, self.camera, common_rad2
@@ -601,7 +641,10 @@ class StarTracker:
             covariance_rad2, common_rad2 = with_focal_error(
                 covariance_rad2, camera, xy_px, seen_cam, sigma_rad
             )
-        match = StarMatch(solution.observed, solution.star, cam_from_ref, -solution.dex)
+        v_mag = self.stars.v_mag[solution.star]
+        match = StarMatch(
+            solution.observed, solution.star, cam_from_ref, -solution.dex, v_mag
+        )
         rms_px = solution.rms * self.camera.focal_px
         return Attitude(
             "solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2

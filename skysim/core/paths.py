@@ -17,7 +17,16 @@ SHIPPED = ROOT if (ROOT / "pyproject.toml").is_file() else ROOT / "skysim"
 DATA = SHIPPED / "data"
 SCENES = SHIPPED / "scenes"
 STUDIES = SCENES / "studies"
+PAPERS = SCENES / "papers"  # scenes and studies of the papers' experiments
 CATALOGS = DATA / "catalogs"
+
+
+def shipped_files(folder: Path) -> dict[str, Path]:
+    """YAML files of a folder by name; those of scenes and of studies include the papers'."""
+    papers = {SCENES: PAPERS, STUDIES: PAPERS / "studies"}
+    folders = [folder, papers[folder]] if folder in papers else [folder]
+    files = {path.stem: path for one in folders for path in one.glob("*.yaml")}
+    return dict(sorted(files.items()))
 
 
 def title_of(path: Path) -> str:

@@ -489,6 +489,8 @@ class FrameRow:
         tracker does not know the sign
     rate_sigma_deg_s
         Standard deviation that the tracker claims for the rate
+    magnitude_error_mag, magnitude_sigma_mag
+        Mean and standard deviation of measured minus catalog magnitude of its stars; NaN of LEDs
     """
 
     frame: int
@@ -511,3 +513,5 @@ class FrameRow:
     exposure_s: float = float("nan")
     rate_error_deg_s: float = float("nan")
     rate_sigma_deg_s: float = float("nan")
+    magnitude_error_mag: float = float("nan")
+    magnitude_sigma_mag: float = float("nan")

@@ -25,6 +25,7 @@ from pydantic_core import ErrorDetails
 
 from skysim.core import __version__
 from skysim.core.errors import OVERRIDES, InputError, Where, printable, unknown_name
+from skysim.core.paths import shipped_files
 
 Files = list[tuple[Path, str]]  # paths and texts
 # Version of scene and study files. An incompatible change increases it and adds a conversion of old files here.
@@ -124,17 +125,16 @@ def existing_file(value: str) -> str:
 def find_file(name: str, folder: Path, what: str) -> Path:
     """The path of a .yaml file given by its path, or by its name in a folder. Raises InputError."""
     path = Path(name)
-    shipped = folder / f"{name}.yaml"
+    shipped = shipped_files(folder)
     if path.suffix in {".yaml", ".yml"} and is_file(path):
         return path
-    if not path.suffix and is_file(shipped):
-        return shipped
+    if name in shipped:
+        return shipped[name]
     near = Path(f"{name}.yaml")
     if is_file(near):
         raise InputError(excerpt(name), f"no such {what}; did you mean {excerpt(near)}?")
-    names = sorted(file.stem for file in folder.glob("*.yaml"))
     raise InputError(
-        excerpt(name), f"no such {what}", f"a .yaml file or one of {', '.join(names)}"
+        excerpt(name), f"no such {what}", f"a .yaml file or one of {', '.join(shipped)}"
     )
 
 

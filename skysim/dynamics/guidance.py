@@ -38,7 +38,9 @@ from skysim.dynamics.reference_curves import (
     steady,
     still,
 )
+from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import (
+    SIDEREAL,
     AttitudeConfig,
     BumpConfig,
     ChirpConfig,
@@ -52,6 +54,7 @@ from skysim.scene.sections.motion import (
     SpinUpConfig,
     StepConfig,
 )
+from skysim.sources.ephemeris import earth_rate_rad_s
 
 State = tuple[Floats, Floats, Floats]  # lab_from_ref_wxyz, rate_rad_s, acceleration_rad_s2
 
@@ -84,12 +87,19 @@ def start_attitude(motion: MotionConfig, profiles: Sequence[AttitudeSpline] = ()
 
 
 def start_rate_rad_s(motion: MotionConfig, profiles: Sequence[AttitudeSpline] = ()) -> Floats:
-    """(3,) rate at the start, in body axes, rad/s."""
-    return (
-        profile_start(motion, profiles)[1]
-        if motion.start == "profile"
-        else np.radians(motion.rate_deg_s)
-    )
+    """(3,) rate at the start, in body axes, rad/s; 0 of `sidereal`, which has no controller to follow it."""
+    if motion.start == "profile":
+        return profile_start(motion, profiles)[1]
+    return np.zeros(3) if motion.rate_deg_s == SIDEREAL else np.radians(motion.rate_deg_s)
+
+
+def body_rate_rad_s(
+    scene: Scene, lab_from_body: Rotation, profiles: Sequence[AttitudeSpline] = ()
+) -> Floats:
+    """(3,) rate of a vehicle at this attitude at the start, in body axes; `sidereal` is that of the Earth."""
+    if scene.motion.rate_deg_s == SIDEREAL:
+        return lab_from_body.inv().apply(earth_rate_rad_s(scene.start_time))
+    return start_rate_rad_s(scene.motion, profiles)
 
 
 def profile_start(motion: MotionConfig, profiles: Sequence[AttitudeSpline]) -> State:

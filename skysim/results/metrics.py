@@ -337,6 +337,11 @@ def rms(values: Floats, axis: int = -1) -> Any:
     return np.sqrt(np.mean(np.square(values), axis=axis))
 
 
+def sample_std(values: Floats, axis: int = -1) -> Any:
+    """Standard deviation of a sample, with n - 1."""
+    return np.std(values, axis=axis, ddof=min(1, values.shape[axis] - 1))
+
+
 # Responses: statistics over trials. Each trial is a row; the columns are arrays, NaN where it has no such value.
 
 Columns = Mapping[str, NDArray[Any]]
@@ -347,6 +352,7 @@ Response = Callable[[Columns], Summary]
 STATISTICS: dict[str, Callable[[Floats], Summary]] = {
     "mean": mean_of,
     "rms": rms_of,
+    "sd": lambda values: resampled(values, sample_std),
     "median": lambda values: quantile(values, 0.5),
     "p90": lambda values: quantile(values, 0.9),
     "p95": lambda values: quantile(values, 0.95),
@@ -376,7 +382,10 @@ QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
             "drift_arcsec",
             "pointing_arcsec",
             "pointing_worst_arcsec",
+            "angles_compared",
+            "exposure_ms",
             "time_ms",
+            "detect_ms",
         )
     },
 }

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,14 @@ from skysim.results.report_blocks import (
     text_column,
 )
 
+# Settings that help where the tracker's own refusal names none.
+HELP = {
+    "too few stars detected": "lower tracker.threshold_sigma or tracker.min_area_px, or expose longer (exposure.time)",
+    "no identification beyond chance": "raise tracker.centroid_sigma_px if the camera or the map is less accurate than"
+    " assumed, or leave out false lights with tracker.brightest",
+    "ambiguous: another attitude fits the lights as well": "tell the lights apart by tracker.brightness_sigma with"
+    " several levels in light.layout, or make the layout irregular",
+}
 MOTION = {  # sentences of the motion's statistics, by the statistic that a scene must have
     "pointing_deg_worst": "pointing: worst {pointing_deg_worst:.3g}°, at the end {pointing_deg_end:.2g}°; "
     "maximum commanded torque {torque_nm_worst:.3g} N m",
@@ -83,6 +93,7 @@ def run_report(
     moved = [Figure(motion_figure, MOTION_CAPTION)] if motion_figure else []
     warned = f"The check of the plan warns: {len(findings)}, see below." if findings else ""
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in stages_ms.items())
+    last = [Text(f"Median ms a frame: {stages}"), Text(magnitude_text(rows))]
     blocks = [
         verdict(rows),
         Text(warned, "bad", on_terminal=False),
@@ -92,12 +103,16 @@ def run_report(
         Section("Motion", [*moved, Items(motion_lines(motion))]),
         Section("Scene", [Facts(facts)], on_terminal=False),
         Section("Check of the plan", [Items(findings, tone="warning")], on_terminal=False),
-        Section("Frames", [frame_table(angles, rows), Text(f"Median ms a frame: {stages}")]),
+        Section("Frames", [frame_table(angles, rows), Items(refusals(rows)), *last]),
     ]
     return Report(title, blocks, command)
 
 
 FRAME_CAPTION = "Blue ticks: truth. Red squares: detected. Green circles: identified."
+MAGNITUDES = (
+    "Magnitudes of {magnitude_stars} stars, measured (-2.5 log10 DN/s) minus catalog: mean"
+    " {magnitude_error_mag_mean:+.3f}, standard deviation {magnitude_error_mag_sigma:.3f}"
+)
 ERROR_CAPTION = (
     "Errors, lights and rate against time. Red lines mark frames that were not solved."
 )
@@ -107,7 +122,8 @@ MOTION_CAPTION = "Attitude, estimates and actuators against time."
 def summary(rows: Sequence[FrameRow]) -> dict[str, Any]:
     """Frame counts, median and worst errors in arcseconds, and median solve time of a run.
 
-    Errors are over solved frames, wrong ones included; NaN if no frame was solved.
+    Errors are over solved frames, wrong ones included; NaN if no frame was solved. Where stars were identified, also
+    `magnitude_errors`; for `scatter_arcsec` see there.
     """
     solved = [row for row in rows if row.status == "solved"]
     cross = np.array([row.cross_arcsec for row in solved] or [np.nan])
@@ -120,8 +136,53 @@ def summary(rows: Sequence[FrameRow]) -> dict[str, Any]:
         "cross_arcsec_worst": float(np.max(cross)),
         "roll_arcsec_median": float(np.median(roll)),
         "roll_arcsec_worst": float(np.max(roll)),
+        "scatter_arcsec": scatter_arcsec(solved),
         "time_ms_median": float(np.median([row.time_ms for row in rows])),
+        **magnitude_errors(rows),
     }
+
+
+def magnitude_errors(rows: Sequence[FrameRow]) -> dict[str, Any]:
+    """Mean and standard deviation of measured minus catalog magnitude over the stars of all frames; empty without any.
+
+    The sum of squares about the common mean is that within the frames and that of the frames' means.
+    """
+    found = [row for row in rows if not np.isnan(row.magnitude_error_mag)]
+    if not found:
+        return {}
+    stars = np.array([row.matched for row in found])
+    means = np.array([row.magnitude_error_mag for row in found])
+    sigmas = np.array([row.magnitude_sigma_mag for row in found])
+    mean = np.average(means, weights=stars)
+    squares = np.sum((stars - 1) * sigmas**2 + stars * (means - mean) ** 2)
+    return {
+        "magnitude_error_mag_mean": float(mean),
+        "magnitude_error_mag_sigma": float(np.sqrt(squares / (stars.sum() - 1))),
+        "magnitude_stars": int(stars.sum()),
+    }
+
+
+def scatter_arcsec(solved: Sequence[FrameRow]) -> list[float]:
+    """Standard deviations of the three estimated angles about straight lines in time, fitted by least squares.
+
+    A laboratory without a truth measures it at rest or at a constant rate. NaN for fewer than three frames.
+    """
+    if len(solved) < 3:
+        return [math.nan] * 3
+    t_s = [row.t_s for row in solved]
+    angles_deg = np.array([row.estimate_deg for row in solved])
+    # 360 degrees are none.
+    angles_deg = np.unwrap(angles_deg, period=360, axis=0)
+    design = np.column_stack([np.ones(len(t_s)), t_s])
+    fit = np.linalg.lstsq(design, angles_deg, rcond=None)[0]
+    squares = np.sum((angles_deg - design @ fit) ** 2, axis=0)
+    return (3600 * np.sqrt(squares / (len(t_s) - 2))).tolist()
+
+
+def magnitude_text(rows: Sequence[FrameRow]) -> str:
+    """The magnitude errors in words; empty without any."""
+    errors = magnitude_errors(rows)
+    return MAGNITUDES.format(**errors) if errors else ""
 
 
 def verdict(rows: Sequence[FrameRow]) -> Verdict:
@@ -136,6 +197,12 @@ def verdict(rows: Sequence[FrameRow]) -> Verdict:
         )
     text += f"; image to attitude in {run['time_ms_median']:.1f} ms (median)"
     return Verdict(text, "bad" if run["wrong"] or not run["solved"] else tone)
+
+
+def refusals(rows: Sequence[FrameRow]) -> list[str]:
+    """Each reason why frames were not solved, their number, and the settings that would help."""
+    counts = Counter(row.status for row in rows if row.status in HELP)
+    return [f"{count} frames: {status}; {HELP[status]}" for status, count in counts.items()]
 
 
 def motion_lines(motion: Mapping[str, float]) -> list[str]:

@@ -77,6 +77,7 @@ def row(
         roll_sigma = math.sqrt(variance[2])
         chance = attitude.match.log10_chance if attitude.match else chance
     rate_error, rate_sigma = rate_errors_deg_s(attitude.rate, truth)
+    magnitude_error, magnitude_sigma = magnitude_errors_mag(report, frame.exposure_s)
     return FrameRow(
         frame=frame.index,
         t_s=truth.t_s,
@@ -98,7 +99,24 @@ def row(
         exposure_s=frame.exposure_s,
         rate_error_deg_s=rate_error,
         rate_sigma_deg_s=rate_sigma,
+        magnitude_error_mag=magnitude_error,
+        magnitude_sigma_mag=magnitude_sigma,
     )
+
+
+def magnitude_errors_mag(report: Report, exposure_s: float) -> tuple[float, float]:
+    """Mean and standard deviation of measured minus catalog magnitude of a frame's identified stars; NaN without any.
+
+    A star's measured magnitude is -2.5 log10 of its light in DN per second of exposure, so that the mean is the offset
+    of the instrument's magnitudes. PTASE's identifier "returns the mean and variance for the identified stars magnitude
+    errors", for the calibration of offset and tolerance (Fialho & Saotome 2005, section 3.5).
+    """
+    match = report.attitude.match
+    if match is None or match.v_mag is None:
+        return math.nan, math.nan
+    flux_dn_s = report.centroids.flux[match.observed] / exposure_s
+    errors = -2.5 * np.log10(flux_dn_s) - match.v_mag
+    return float(errors.mean()), float(errors.std(ddof=1))
 
 
 def rate_errors_deg_s(rate: RateEstimate | None, truth: Truth) -> tuple[float, float]:

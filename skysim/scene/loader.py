@@ -25,7 +25,7 @@ from pydantic import ValidationError
 
 from skysim.core import yaml_reader
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.paths import DATA, SCENES
+from skysim.core.paths import DATA, SCENES, shipped_files
 from skysim.core.units import ConfigModel, quantity
 from skysim.core.yaml_reader import (
     Files,
@@ -312,7 +312,7 @@ def load_scene(name: str | Path, overrides: Mapping[str, Any] | None = None) -> 
 
 def list_scenes() -> list[str]:
     """Names of the scenes that are shipped with skysim."""
-    return sorted(path.stem for path in SCENES.glob("*.yaml"))
+    return list(shipped_files(SCENES))
 
 
 def located(error: InputError, name: str, overrides: Mapping[str, str]) -> InputError:

@@ -23,7 +23,7 @@ from skysim.core.yaml_reader import fault_of
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, FurtherLight, Light, StarsConfig
-from skysim.scene.sections.motion import MotionConfig, PointingConfig
+from skysim.scene.sections.motion import SIDEREAL, MotionConfig, PointingConfig
 from skysim.scene.sections.surroundings import Coefficient, Glow, Orbit, ThermalConfig
 from skysim.scene.sections.tracker import FilterConfig, SurveyErrorsConfig, TrackerConfig
 from skysim.scene.sections.vehicle import SiteConfig, VehicleConfig
@@ -169,6 +169,10 @@ class Scene(ConfigModel):
             keys = "ra_deg, dec_deg, roll_deg" if sky else "roll_deg, pitch_deg, yaw_deg"
             raise InputError(
                 "motion.start", f"light of kind {self.light.kind} requires {keys}"
+            )
+        if not sky and self.motion.rate_deg_s == SIDEREAL:
+            raise InputError(
+                "motion.rate_deg_s", "sidereal requires light of kind stars", "[0, 0, 0]"
             )
         if not sky and any(glow.kind == "faint_stars" for glow in self.background):
             raise InputError(

@@ -27,6 +27,7 @@ from skysim.scene.sections.surroundings import NEGLIGIBLE_PX
 
 SURFACE_SOLVERS = ("thesis", "ray_on_surface")  # solvers that use the surveyed surface
 FIXED_DETECTORS = ("thesis",)  # detectors with their own thresholds
+OWN_RULES = ("saa", "shefex", "master_star", "fialho")  # identifiers with their paper's rule
 OWN = "own"  # skysim's tracker
 
 
@@ -222,6 +223,7 @@ RULES = (
         (
             "tracker.centroider",
             "tracker.identifier",
+            "tracker.acceptance",
             "tracker.solver",
             "tracker.centroid_sigma_px",
         ),
@@ -236,7 +238,7 @@ RULES = (
         "tracker.name: own",
     ),
     Rule(
-        ("tracker.identifier", "tracker.brightness_sigma"),
+        ("tracker.identifier", "tracker.acceptance", "tracker.brightness_sigma"),
         lambda scene: scene.tracker.decoder is not None,
         "the LEDs are identified by their codes",
         "no tracker.decoder",
@@ -254,10 +256,44 @@ RULES = (
         "tracker.identifier: led_pairs or non_dimensional",
     ),
     Rule(
+        ("tracker.cos_error",),
+        lambda scene: scene.tracker.identifier != "shefex",
+        "this identifier has no tolerance of cosines",
+        "tracker.identifier: shefex",
+    ),
+    Rule(
+        ("tracker.acceptance",),
+        lambda scene: not str(scene.tracker.identifier).startswith(OWN_RULES),
+        "this identifier has no rule of its paper beside the test against chance",
+        "tracker.identifier: saa, shefex, master_star or fialho_1 to fialho_4",
+    ),
+    Rule(
         ("tracker.brightness_sigma",),
         equally_bright,
         "all LEDs are equally bright",
         "two levels of brightness in light.layout",
+    ),
+    Rule(
+        ("tracker.assumed_attitude_deg",),
+        lambda scene: (
+            not under_dome(scene)
+            or external(scene)
+            or scene.tracker.identifier in (None, "led_pairs", "non_dimensional")
+        ),
+        "this identifier needs no attitude",
+        "a dome with tracker.identifier: pyramid, saa or master_star",
+    ),
+    Rule(
+        ("tracker.magnitude_sigma",),
+        lambda scene: scene.light.kind != "stars" or external(scene),
+        "only skysim's own tracker of stars uses it",
+        "light.kind: stars",
+    ),
+    Rule(
+        ("tracker.magnitude_sigma",),
+        lambda scene: scene.tracker.identifier in ("pyramid", "shefex"),
+        "this identifier does not use magnitudes",
+        "tracker.identifier: default, saa, master_star or fialho_1 to fialho_4",
     ),
     Rule(
         ("tracker.gyro",),

@@ -461,7 +461,7 @@ def build_simulation(
         return multibody.PrescribedMotion(
             lab.vehicle, lambda t_s: reference.state_at(t_s)[:2], duration_s, kept_s
         )
-    rate = guidance.start_rate_rad_s(motion, lab.profiles)
+    rate = guidance.body_rate_rad_s(lab.scene, lab.start, lab.profiles)
     return multibody.Simulation(lab.vehicle, lab.start, rate, duration_s, kept_s)
 
 

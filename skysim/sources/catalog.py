@@ -127,19 +127,11 @@ def write(
         | {"datatype": "int64" if c.format == "d" else "float64"}
         for c in columns
     ] + [{"name": name, "datatype": "string"} for name in text_columns]
-    head = {"delimiter": ",", "datatype": datatype}
-    # The header is YAML in comments, its entries in the order of `head`.
-    comment = yaml.safe_dump(head, sort_keys=False, default_flow_style=None)
-    comment += yaml.safe_dump(
-        {"meta": meta | {"rows": len(rows)}}, sort_keys=False, width=105
-    )
     with (
         files.atomic_file(path) as temporary,
         open(temporary, "w", encoding="utf-8", newline="") as out,
     ):
-        out.writelines(
-            f"# {line}\n" for line in ["%ECSV 1.0", "---", *comment.splitlines(), SCHEMA]
-        )
+        out.write(header_text(datatype, meta | {"rows": len(rows)}))
         table = csv.writer(out, lineterminator="\n")
         table.writerow([*(c.name for c in columns), *text_columns])
         for row in rows:
@@ -147,6 +139,38 @@ def write(
                 [format(row[c.name], c.format) for c in columns]
                 + [row[t] for t in text_columns]
             )
+
+
+def header_text(datatype: list[dict[str, Any]], meta: dict[str, Any]) -> str:
+    """The header of an ECSV file: YAML in comments."""
+    head = {"delimiter": ",", "datatype": datatype}
+    comment = yaml.safe_dump(head, sort_keys=False, default_flow_style=None)
+    comment += yaml.safe_dump({"meta": meta}, sort_keys=False, width=105)
+    lines = ["%ECSV 1.0", "---", *comment.splitlines(), SCHEMA]
+    return "".join(f"# {line}\n" for line in lines)
+
+
+def write_selection(source: Path, path: Path, hip: NDArray[np.int64], rule: str) -> None:
+    """Write the stars of a catalog file that have these numbers, their lines unchanged.
+
+    Parameters
+    ----------
+    rule
+        How they were selected, for the header's `selection`
+    """
+    meta, lines = read_meta_and_lines(source)
+    comments = [
+        line[2:] for line in source.read_text("utf-8").splitlines() if line[:1] == "#"
+    ]
+    datatype = parse_yaml("\n".join(comments[1:]))[1]["datatype"]
+    column = lines[0].split(",").index("hip")
+    selected = set(hip.tolist())
+    kept = [line for line in lines[1:] if int(line.split(",")[column]) in selected]
+    # A selection of a selection has both rules.
+    rules = [meta["selection"], rule] if "selection" in meta else [rule]
+    meta |= {"selection": "; then ".join(rules), "rows": len(kept)}
+    text = "".join(f"{line}\n" for line in [lines[0], *kept])
+    files.write_text(path, header_text(datatype, meta) + text)
 
 
 def package_file(package: str) -> str:
@@ -162,9 +186,13 @@ def package_file(package: str) -> str:
 
 
 def catalog_path(name_or_path: str | Path) -> Path:
-    """The path of a catalog given as a path (that ends in .ecsv) or by its name in data/catalogs/."""
+    """The path of a catalog given as a path (that ends in .ecsv or .cat) or by its name in data/catalogs/."""
     path = Path(name_or_path)
-    return path if path.suffix == ".ecsv" else CATALOGS / f"{name_or_path}.ecsv"
+    return (
+        path
+        if path.suffix.lower() in (".ecsv", ".cat")
+        else CATALOGS / f"{name_or_path}.ecsv"
+    )
 
 
 def read(name_or_path: str | Path) -> Catalog:

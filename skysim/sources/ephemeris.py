@@ -14,7 +14,7 @@ import erfa
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.core.constants import AU_KM, DAY_S, SPEED_OF_LIGHT_KM_S
+from skysim.core.constants import AU_KM, DAY_S, EARTH_RATE_RAD_S, SPEED_OF_LIGHT_KM_S
 from skysim.core.paths import DATA
 from skysim.core.time import tt_jd, ut1_jd
 from skysim.core.types import Floats
@@ -151,6 +151,12 @@ def site_in_gcrs(time: datetime.datetime, tt: float, site: SiteConfig) -> GcrsSt
     state = erfa.pvtob(longitude_rad, latitude_rad, site.height_m, 0.0, 0.0, 0.0, theta_rad)
     gcrs_from_cirs = erfa.c2i06a(tt, 0.0).T
     return GcrsState(gcrs_from_cirs @ state["p"], gcrs_from_cirs @ state["v"])
+
+
+def earth_rate_rad_s(time: datetime.datetime) -> Floats:
+    """(3,) rate of the Earth, ICRS axes: about the pole of the date (IAU 2006/2000A; no polar motion)."""
+    pole = erfa.c2i06a(tt_jd(time), 0.0)[2]
+    return np.asarray(EARTH_RATE_RAD_S * pole)
 
 
 # Apparent places of the Sun, the Moon and the planets, with distances and the geometry of their light.

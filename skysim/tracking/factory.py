@@ -52,6 +52,7 @@ from skysim.tracking.onboard_model import (
     onboard_catalog,
     surveyed_dome,
     with_brightness,
+    zero_point_mag,
 )
 from skysim.tracking.tracker_interface import OWN
 
@@ -95,6 +96,11 @@ def assumed_settings(scene: Scene) -> Settings:
         gain_e_dn=scene.camera.detector.gain_e_dn,
         saturation=saturation_dn(scene.camera.detector),
         centroid_sigma_px=config.centroid_sigma_px,
+        acceptance=config.acceptance,
+        cos_error=config.cos_error,
+        assumed_deg=config.assumed_attitude_deg,
+        zero_point_mag=zero_point_mag(scene),
+        magnitude_sigma=config.magnitude_sigma or default.magnitude_sigma,
         **chosen,
     )
 

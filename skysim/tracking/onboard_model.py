@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
-from estimator.catalog import catalog
+from estimator.catalog import cat_file, catalog
 from estimator.catalog.refraction import SiteAir
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
@@ -35,7 +35,7 @@ from skysim.sources.dome import surface, survey_errors
 from skysim.sources.dome.codebooks import codebook, light_levels
 from skysim.sources.dome.layouts import led_list, registry
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
-from skysim.sources.photometry import Band
+from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 from skysim.tracking import dome_map_file
 
 
@@ -80,6 +80,19 @@ def with_brightness(scene: Scene, light: DomeConfig, leds: LedMap, lever: Lever)
     collecting_m2 = Optics.from_camera(scene.camera).collecting_m2
     flux_s = light_e_s_m2 * collecting_m2 / scene.camera.detector.gain_e_dn
     return replace(leds, flux_s=flux_s, flux_sigma=scene.tracker.brightness_sigma)
+
+
+def zero_point_mag(scene: Scene) -> float | None:
+    """The magnitude of a star of the Sun's color with a flux of one DN in an exposure; None if magnitudes are not used.
+
+    2.5 log10 of the DN of a star of V = 0: its electrons s^-1 m^-2, times the collecting area and the exposure time,
+    over the gain.
+    """
+    if scene.tracker.magnitude_sigma is None:
+        return None
+    light_e = star_flux_e_s_m2(0.0, *SUN, Band.from_camera(scene.camera))
+    light_e = light_e * Optics.from_camera(scene.camera).collecting_m2 * scene.exposure.time_s
+    return float(2.5 * np.log10(light_e / scene.camera.detector.gain_e_dn))
 
 
 def assumed_code(light: DomeConfig, sources: Sources, leds: LedMap) -> LedCode:
@@ -212,10 +225,13 @@ def onboard_catalog(key: str, name: str) -> catalog.StarCatalog:
     key
         Key of the scene, or option, that names the catalog, for the error message
     name
-        Name in data/catalogs/, or a file
+        Name in data/catalogs/, or a file, .ecsv or .cat
     """
+    path = require_catalog(key, name)
     try:
-        return catalog.read(require_catalog(key, name))
+        if path.suffix.lower() == ".cat":
+            return cat_file.read_stars(path)
+        return catalog.read(path)
     except ImageError as error:
         raise InputError(key, error) from None
 

@@ -34,7 +34,7 @@ ELSEWHERE = {  # pages whose blocks have a test of their own, which knows what i
     "docs/howto/export.md": "docs/test_formats.py",
     "docs/howto/external_tracker.md": "tracking/test_interface.py",
     "docs/howto/light.md": "simulation/test_lights.py",
-    "docs/findings/papers.md": "experiments/papers/test_papers.py",
+    "docs/findings/papers.md": "experiments/papers/test_reproduction.py",
     "docs/findings/studies.md": "docs/test_docs.py",
     "estimator/README.md": "docs/test_estimator_readme.py",
 }
@@ -48,6 +48,7 @@ LONG = {
     "howto/dome.md",
     "howto/photo.md",
     "howto/profile.md",
+    "howto/thesis_tests.md",
     "howto/tracker.md",
     "explanation/error_budget.md",
     "howto/stream.md",

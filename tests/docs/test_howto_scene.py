@@ -124,6 +124,15 @@ def test_the_page_s_controller_damps_the_motion(folder):
     assert np.abs(rate).max() < 0.2
 
 
+@pytest.mark.long
+def test_the_catalog_commands_leave_catalogs_a_log_and_a_study(folder):
+    pages.run_commands(PAGE, folder)
+    names = ("chosen.ecsv", "raw.cat", "m6.cat", "m6.log", "shefex_fig_7/report.html")
+    assert all((folder / "out" / name).is_file() for name in names)
+    page = (folder / "out" / "shefex2" / "report.html").read_text(encoding="utf-8")
+    assert "measured (-2.5 log10 DN/s) minus catalog" in page
+
+
 def test_the_error_message_is_what_a_user_sees(tmp_path, monkeypatch):
     (block,) = pages.blocks(PAGE, "text")
     bad = (ROOT / "scenes/afit_simsat.yaml").read_text(encoding="utf-8")

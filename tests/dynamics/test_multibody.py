@@ -684,3 +684,20 @@ def test_an_unstable_flight_is_an_error_even_if_it_settles() -> None:
     flight.advance(good)
     with pytest.raises(InputError, match=r"MuJoCo warned before 0\.020 s"):
         flight.advance(bad)
+
+
+def test_a_camera_rolled_on_its_mount_turns_its_axes_and_keeps_its_place() -> None:
+    """A rotation vector in the file's camera axes: +90 deg of roll brings the image's x axis where its y axis was."""
+    plain = multibody.camera_mount(multibody.build(vehicle_config()))
+    rolled = multibody.camera_mount(
+        multibody.build(vehicle_config(camera_rotation_deg=[0, 0, 90]))
+    )
+    tilted = multibody.camera_mount(
+        multibody.build(vehicle_config(camera_rotation_deg=[30, 0, 0]))
+    )
+    plain_from_rolled = plain.cam_from_body * rolled.cam_from_body.inv()
+    assert plain_from_rolled.apply([1, 0, 0]) == pytest.approx([0, 1, 0], abs=1e-12)
+    assert plain_from_rolled.apply([0, 0, 1]) == pytest.approx([0, 0, 1], abs=1e-12)
+    plain_from_tilted = plain.cam_from_body * tilted.cam_from_body.inv()
+    assert plain_from_tilted.as_rotvec(degrees=True) == pytest.approx([30, 0, 0])
+    assert rolled.camera_body_m == pytest.approx(plain.camera_body_m)

@@ -100,7 +100,19 @@ CASES = [
         "0.2",
         {"tracker.identifier": "led_pairs"},
     ),
+    Case(SKY, {}, "tracker.acceptance", "thesis", {"tracker.identifier": "fialho_3"}),
     Case(DOME, {"light.layout": MANY}, "tracker.brightness_sigma", "0.2", TWO_LEVELS),
+    Case(DOME, {}, "tracker.magnitude_sigma", "0.2", {}),
+    Case(
+        SKY,
+        {"tracker.identifier": "shefex"},
+        "tracker.magnitude_sigma",
+        "0.2",
+        {"tracker.identifier": "fialho_4"},
+    ),
+    Case(
+        DOME, {}, "tracker.assumed_attitude_deg", "[0, 0, 1]", {"tracker.identifier": "saa"}
+    ),
     Case(
         CODED,
         DENSE | DIRECT,

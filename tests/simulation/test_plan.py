@@ -854,3 +854,18 @@ def test_a_profile_that_is_too_fast_is_refused_before_the_run(tmp_path: Path) ->
     ):
         check(lab_of("simsat_slew", **changes))
     check(lab_of("simsat_slew", motion__control="prescribed", filter="null", **changes))
+
+
+@pytest.mark.parametrize(
+    ("detector", "level", "warned"), [("thesis", 42, 1), ("thesis", 40, 0), ("local", 42, 0)]
+)
+def test_a_black_level_above_the_thesis_s_threshold_is_warned_of(
+    detector: str, level: int, warned: int
+) -> None:
+    """4 % of some 1017 DN are 40.7."""
+    lab = lab_of(
+        "afit_test3", tracker__detector=detector, camera__detector__offset_dn=str(level)
+    )
+    lines = [one for one in check(lab).findings if "above the threshold of 4 %" in one]
+    assert len(lines) == warned
+    assert all(line.startswith("camera.detector.offset_dn: ") for line in lines)

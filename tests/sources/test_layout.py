@@ -775,6 +775,16 @@ def sequential(count: int, **more: Any) -> dict[str, Any]:
     return {"kind": "patch_boards", "cap_deg": 40, "pitch": "8 mm", "boards": [board]}
 
 
+def test_slots_without_an_led_stay_dark() -> None:
+    """Two LEDs in a cycle of nine slots of 1 ms: each is lit for a ninth of the time (thesis, eq. 37)."""
+    drive = {"kind": "sequential", "slot": "1 ms", "slots": 9}
+    leds = lit(sequential(2), drive=drive)
+    assert leds.period_s == pytest.approx(9e-3)
+    assert leds.on_s / leds.period_s == pytest.approx(1 / 9)
+    with pytest.raises(InputError, match=r"slots: 2; allowed: 5 LEDs"):
+        lit(sequential(5), drive=drive | {"slots": 2})
+
+
 def test_sequential_leds_are_lit_one_after_another_for_their_share() -> None:
     """Eq. 37: D = t_on / sum T; never two at once, and the whole cycle is lit where every level is one."""
     leds = lit(sequential(5), drive={"kind": "sequential", "slot": "1 ms"})

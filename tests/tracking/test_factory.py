@@ -482,3 +482,12 @@ def test_defective_pixels_are_no_stars_so_the_exposure_grows() -> None:
         image = np.rint(100 + light + rng.normal(0, 2, light.shape)).astype(np.uint16)
         meter.update(Frame(0, image, 0.0, 0.04, 4080.0))
         assert meter.exposure_s == pytest.approx(expected_s, abs=1e-12)
+
+
+def test_an_empty_frame_of_a_coarse_converter_lengthens_the_exposure() -> None:
+    """Every pixel equals the offset: no star, and nothing too bright."""
+    meter = ExposureController(
+        loader.load("shefex2", {"tracker.exposure_control": "{mean_dn: 9}"})
+    )
+    meter.update(Frame(0, np.full((493, 659), 4, np.uint16), 0.0, 0.04, 255.0))
+    assert meter.exposure_s == pytest.approx(0.042, abs=1e-12)

@@ -22,8 +22,9 @@ The paper names four improvements since alg_ide_mf1_1 of 2003 and says what mf1_
 
 The paper does not say what "optimized" means. Here the first list is a range of the catalog, which is sorted by
 magnitude, and the other lists are the neighbors of its stars at the observed angles. Two tests are added in all
-versions: the match must be significant against chance, and the triangles must have the same handedness. As in the
-paper, the first triplet that passes is the solution. For a repetitive catalog, such as a lattice of LEDs, use `saa`.
+versions: the match must be significant against chance (not with the acceptance `thesis`), and the triangles must have
+the same handedness. As in the paper, the first triplet that passes is the solution. For a repetitive catalog, such as a
+lattice of LEDs, use `saa`.
 """
 
 from __future__ import annotations
@@ -94,6 +95,8 @@ class FialhoOptions(NamedTuple):
         Whether the lists are assembled from neighbors
     x, y, z, chord2
         Prior boresight, a unit vector in the catalog's frame, and the greatest squared chord of a candidate from it
+    accept
+        log10 of the chance at which a match is accepted; infinite for the paper's rule, the fraction alone
     """
 
     tolerance_rad: float
@@ -108,6 +111,7 @@ class FialhoOptions(NamedTuple):
     y: float
     z: float
     chord2: float
+    accept: float = ACCEPT_LOG10_CHANCE
 
 
 def search_options(
@@ -158,6 +162,7 @@ def search_options(
         float(y),
         float(z),
         float(chord2),
+        np.inf if settings.by_paper else ACCEPT_LOG10_CHANCE,
     )
 
 
@@ -224,8 +229,8 @@ def fialho_4(
         match.star,
         match.cam_from_ref,
         match.log10_chance,
-        float(offset_mag.mean()),
-        float(np.var(offset_mag, ddof=1)),
+        offset_mag=float(offset_mag.mean()),
+        variance_mag2=float(np.var(offset_mag, ddof=1)),
     )
 
 
@@ -253,7 +258,8 @@ def _identify(
     if count < MIN_MATCHES:
         return None
     rays = np.ascontiguousarray(vectors_cam)
-    return to_star_match(search(rays, settings.magnitudes(count), index, parameters))
+    match = search(rays, settings.magnitudes(count), index, parameters)
+    return to_star_match(match, settings.by_paper)
 
 
 @jit
@@ -270,7 +276,7 @@ def search(
     Returns
     -------
     DirectMatch
-        A solution only if its log10_chance is at most ACCEPT_LOG10_CHANCE
+        Empty if no match is accepted
     """
     tried = np.zeros(2, np.int64)  # triplets, angles compared
     min_side_rad = MIN_SIDE_FRACTION * index.max_angle_rad
@@ -281,7 +287,7 @@ def search(
         return no_match()
     # 2. to 4. Test its triplets.
     match = triplets(rays, magnitudes, index, corners, options, tried)
-    if match.log10_chance <= ACCEPT_LOG10_CHANCE:
+    if len(match.observed):
         return match
     # 5. Other triangles: (i, i + dj, i + dj + dk), i running fastest, so that one false star costs little.
     count = 1
@@ -297,7 +303,7 @@ def search(
                 ) < min_side_rad:
                     continue
                 match = triplets(rays, magnitudes, index, next_corners, options, tried)
-                if match.log10_chance <= ACCEPT_LOG10_CHANCE:
+                if len(match.observed):
                     return match
                 count += 1
     return no_match()
@@ -374,7 +380,7 @@ def _direct_match(
     # The paper's threshold on the number of matches, and the added one on their significance.
     if (
         len(match.observed) <= options.min_fraction * len(rays)
-        or match.log10_chance > ACCEPT_LOG10_CHANCE
+        or match.log10_chance > options.accept
     ):
         return no_match()
     return match
@@ -445,7 +451,7 @@ def _test_neighbors(
                 match = _direct_match(
                     rays, index, corners, np.array([a, b, c]), options, tried[0]
                 )
-                if match.log10_chance <= ACCEPT_LOG10_CHANCE:
+                if len(match.observed):
                     return match
     return no_match()
 
@@ -501,6 +507,6 @@ def _test_lists(
                 match = _direct_match(
                     rays, index, corners, np.array([a, b, c]), options, tried[0]
                 )
-                if match.log10_chance <= ACCEPT_LOG10_CHANCE:
+                if len(match.observed):
                     return match
     return no_match()

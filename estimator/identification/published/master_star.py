@@ -10,7 +10,8 @@ Steps 3 and 4 are therefore added:
 2. Count how many of the master's angles each candidate has (`_count_angles`).
 3. Test the candidates with as many as the best one, or one less: the angle to a second star determines an attitude,
    at which the whole field is matched (`_best_match`).
-4. Accept the best match if it is significant, and no contradicting match is nearly as good, as on a lattice.
+4. Accept the best match if it is significant, and no contradicting match is nearly as good, as on a lattice. The
+   acceptance `thesis` takes it without this test.
 """
 
 from __future__ import annotations
@@ -49,6 +50,8 @@ class MasterStarOptions(NamedTuple):
         Number of brightest stars to try as master
     checks
         Greatest number of angles compared
+    by_paper
+        Whether the best match is accepted without step 4
     """
 
     tolerance_rad: float
@@ -56,6 +59,7 @@ class MasterStarOptions(NamedTuple):
     gate_mag: float
     masters: int
     checks: int
+    by_paper: bool = False
 
 
 def master_star(
@@ -103,9 +107,11 @@ def master_star(
         3 * settings.epsilon_mag,
         min(masters, count),
         settings.max_checks,
+        settings.by_paper,
     )
     rays = np.ascontiguousarray(vectors_cam)
-    return to_star_match(search(rays, settings.magnitudes(count), index, parameters))
+    match = search(rays, settings.magnitudes(count), index, parameters)
+    return to_star_match(match, settings.by_paper)
 
 
 @jit
@@ -144,6 +150,8 @@ def search(
             best = _best_match(rays, index, master, candidate, options, tried, best, rival)
             if tried[1] >= options.checks:
                 break
+        if options.by_paper and len(best.observed):
+            return best
         if best.log10_chance <= ACCEPT_LOG10_CHANCE:
             # 4. A repetitive pattern has another match as good: the best must be 1e5 times less likely by chance.
             return best if rival[0] > best.log10_chance - ACCEPT_LOG10_CHANCE else no_match()
@@ -151,7 +159,7 @@ def search(
 
 
 @jit
-def _contradict(first: DirectMatch, second: DirectMatch) -> bool:
+def contradict(first: DirectMatch, second: DirectMatch) -> bool:
     """Whether two matches identify an observed star differently."""
     for n in range(len(first.observed)):
         for m in range(len(second.observed)):
@@ -227,7 +235,7 @@ def _best_match(
                 rays, index, pair, stars, options.tolerance_rad, options.stretch, tried[0]
             )
             # The worse of two matches that contradict each other is a rival.
-            if len(match.observed) and _contradict(best, match):
+            if len(match.observed) and contradict(best, match):
                 rival[0] = min(rival[0], max(best.log10_chance, match.log10_chance))
             if match.log10_chance < best.log10_chance:
                 best = match

@@ -15,7 +15,8 @@ of an observed pair are a certain catalog pair, in a certain order. The steps ar
 
 The thesis stops at the first assumption that passes. Here the assumption of least cost is accepted, if it is
 significant, and 1e5 times as likely as any contradicting assumption of this and of RIVAL_PAIRS more pairs
-(`AssumptionPool`).
+(`AssumptionPool`). The acceptance `thesis` takes the assumption of least cost of the first primary pair that has one
+with MIN_MATCHES stars, without these tests.
 """
 
 from __future__ import annotations
@@ -287,7 +288,7 @@ def saa(
     )
     pool = AssumptionPool(stars, settings.field_tan, settings.missed_dex)
     _test_pairs(pool, index, settings)
-    return pool.best_match()
+    return pool.best_match(settings.by_paper)
 
 
 class AssumptionPool:
@@ -347,6 +348,11 @@ class AssumptionPool:
             add_contradictions(*assumed, self.star, self._contradictions)
 
     @property
+    def is_complete(self) -> bool:
+        """Whether the best assumption identifies MIN_MATCHES stars."""
+        return int((self.star >= 0).sum()) >= MIN_MATCHES
+
+    @property
     def log10_chance(self) -> float:
         """log10 of the expected number of chance matches as good as the best one; 0 with too few matches.
 
@@ -356,22 +362,30 @@ class AssumptionPool:
         # The pair defines the attitude: the other stars are trials.
         trials = len(self.star) - 2
         hits = int((self.star >= 0).sum()) - 2
-        if hits + 2 < MIN_MATCHES:
+        if not self.is_complete:
             return 0.0
         count, matches, _ = self._contradictions
         match_rate = matches / count / trials if count else 0.0
         tail = log10_tail(trials, hits, max(self.p, match_rate))
         return tail + self.missed_dex * self.missing + float(np.log10(self.count))
 
-    def best_match(self) -> StarMatch | None:
-        """The best assumption, or None if it is not significant or a contradicting one is nearly as likely."""
+    def best_match(self, by_paper: bool = False) -> StarMatch | None:
+        """The best assumption, or None if it is not significant or a contradicting one is nearly as likely.
+
+        By the paper's rule it needs only MIN_MATCHES stars, and its log10_chance is NaN.
+        """
+        if by_paper:
+            return self._solution(float("nan")) if self.is_complete else None
         chance = self.log10_chance
         # A cost is -2 ln(likelihood): 1e5 times as likely is a cost smaller by 2 ln 1e5.
         margin = -2 * np.log(10) * ACCEPT_LOG10_CHANCE
         count, _, rival_cost = self._contradictions
         if chance > ACCEPT_LOG10_CHANCE or (count and rival_cost < self.cost + margin):
             return None
-        # The attitude of all matches.
+        return self._solution(chance)
+
+    def _solution(self, chance: float) -> StarMatch:
+        """The best assumption with the attitude of all its matches."""
         observed = np.flatnonzero(self.star >= 0)
         star = self.star[observed].astype(np.int64)
         cam_from_ref = quest(
@@ -403,6 +417,8 @@ def _test_pairs(
         # 4. to 7. Their assumptions.
         primary = build_primary(stars, a, b)
         pool.add(primary, match_assumptions(stars, primary, index.pair[begin:end]))
+        if settings.by_paper and pool.is_complete:
+            break
         # Once the best is significant, only RIVAL_PAIRS more pairs are tried.
         if remaining >= RIVAL_PAIRS and pool.log10_chance <= ACCEPT_LOG10_CHANCE:
             remaining = RIVAL_PAIRS

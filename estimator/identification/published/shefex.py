@@ -8,7 +8,8 @@ gate is wide for stars close together: for 5.5e-5 it is 0.090 deg at 2 deg, and 
 3. Reject those of the other handedness (not in the paper).
 4. Identify every other star by its three angles to the base, a fourth star first (`_match_others`, `_partner`).
 5. Keep those that are near their predicted place at the attitude found (not in the paper).
-6. Accept a match with fewer than 1e-5 chance matches expected over all triangles. The paper accepts any fourth star.
+6. Accept a match with fewer than 1e-5 chance matches expected over all triangles. The paper accepts any fourth star,
+   and so does the acceptance `thesis`.
 """
 
 from __future__ import annotations
@@ -78,6 +79,11 @@ def cos_error(fov_rad: float, centroid_error_rad: float, factor: float = 1.0) ->
     return factor * abs(float(np.cos(fov_rad) - np.cos(fov_rad - centroid_error_rad)))
 
 
+def direction_tolerance_rad(fov_rad: float, cosine_error: float) -> float:
+    """The error of a direction to which a cosError corresponds: the inverse of eq. 3 with c = 1."""
+    return float(fov_rad - np.arccos(min(np.cos(fov_rad) + cosine_error, 1.0)))
+
+
 @jit
 def angle_interval(angle_rad: float, cos_error: float) -> tuple[float, float]:
     """Interval of angles whose cosines differ by at most cosError from that of an angle: eqs 4 and 5 with correct
@@ -100,7 +106,7 @@ def shefex(
 ) -> StarMatch | None:
     """Identify stars by SHEFEX-2's pyramids, brightest first (see the module's steps).
 
-    cosError is that of eq. 3 for the tolerance and the greatest angle of the index.
+    Unless `cos_error` is given, cosError is that of eq. 3 for the tolerance and the greatest angle of the index.
 
     Parameters
     ----------
@@ -128,15 +134,24 @@ def shefex(
     settings.require_tolerance("shefex", tolerance_rad)
     if len(vectors_cam) < MIN_MATCHES:
         return None
-    # cosError is one number for all angles: the stretch counts at the greatest angle.
-    tolerance_rad += settings.stretch * index.max_angle_rad
-    error = cos_error(index.max_angle_rad, tolerance_rad)
+    if settings.cos_error is None:
+        # cosError is one number for all angles: the stretch counts at the greatest angle.
+        tolerance_rad += settings.stretch * index.max_angle_rad
+        error = cos_error(index.max_angle_rad, tolerance_rad)
+    else:
+        error = settings.cos_error
+        tolerance_rad = direction_tolerance_rad(index.max_angle_rad, error)
     base = min(settings.base_stars, len(vectors_cam))
+    accept = FOURTH_STAR if settings.by_paper else ACCEPT_LOG10_CHANCE
     parameters = ShefexOptions(
-        error, tolerance_rad, settings.max_triangles, settings.max_checks, base
+        error, tolerance_rad, settings.max_triangles, settings.max_checks, base, accept
     )
     tried = np.zeros(3, np.int64)
-    return to_star_match(search(np.ascontiguousarray(vectors_cam), index, parameters, tried))
+    match = search(np.ascontiguousarray(vectors_cam), index, parameters, tried)
+    if settings.compared is not None:
+        # Three angles of each observed triangle, and those of its candidates.
+        settings.compared[0] += tried[1] + 3 * tried[2]
+    return to_star_match(match, settings.by_paper)
 
 
 @jit

@@ -14,12 +14,13 @@ from skysim.apps.cli.commands.availability import availability
 from skysim.apps.cli.commands.camera import app as cameras
 from skysim.apps.cli.commands.dataset import dataset
 from skysim.apps.cli.commands.datasheet import datasheet
-from skysim.apps.cli.commands.measure import balance, characterize
+from skysim.apps.cli.commands.measure import balance, calibrate, characterize
 from skysim.apps.cli.commands.reproduce import reproduce
-from skysim.apps.cli.commands.resources import catalog_app, export, scenes_app
+from skysim.apps.cli.commands.resources import export, scenes_app
 from skysim.apps.cli.commands.run import compare, render, run, trackers
 from skysim.apps.cli.commands.serve import gui, stream
 from skysim.apps.cli.commands.solve import solve
+from skysim.apps.cli.commands.star_catalogs import app as catalogs
 from skysim.apps.cli.commands.study import app as studies
 from skysim.apps.cli.commands.survey import survey
 from skysim.apps.cli.commands.validate import check, validate
@@ -42,6 +43,7 @@ COMMANDS = (
     datasheet,
     dataset,
     characterize,
+    calibrate,
     balance,
     reproduce,
     gui,
@@ -53,7 +55,7 @@ for command in COMMANDS:
     app.command()(command)
 app.add_typer(scenes_app, name="scenes")
 app.add_typer(cameras, name="camera")
-app.add_typer(catalog_app, name="catalog")
+app.add_typer(catalogs, name="catalog")
 app.add_typer(studies, name="study")
 add_examples(app)
 

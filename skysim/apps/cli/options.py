@@ -39,7 +39,9 @@ def complete_study(incomplete: str) -> list[str]:
 
 
 def complete_yaml(folder: Path, incomplete: str) -> list[str]:
-    names = [path.stem for path in folder.glob("*.yaml")]
+    from skysim.core.paths import shipped_files
+
+    names = list(shipped_files(folder))
     found = Path(
         incomplete if incomplete.endswith("/") else os.path.dirname(incomplete)
     ).glob("*")

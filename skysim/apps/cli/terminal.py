@@ -212,11 +212,11 @@ def print_catalog(catalog: dict[str, Any], json: bool) -> None:
 
 def print_titles(folder: Path, json: bool) -> None:
     """Print names and titles of the YAML files in a folder."""
-    from skysim.core.paths import title_of
+    from skysim.core.paths import shipped_files, title_of
 
     listed = [
         {"name": path.stem, "title": title_of(path), "file": str(path)}
-        for path in sorted(folder.glob("*.yaml"))
+        for path in shipped_files(folder).values()
     ]
     print_list(listed, json, lambda entry: f"{entry['name']:20s} {printable(entry['title'])}")
 

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.types import Floats, Mount, Sources
+from skysim.dynamics import guidance
 from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.mjcf import compile_spec, mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel, camera_mount
@@ -528,7 +529,8 @@ def add_start_keyframe(
     spec: Any, vehicle: VehicleModel, scene: Scene, lab_from_body: Rotation
 ) -> None:
     """Add the keyframe `start`: attitude and rate, wheel and rotor speeds, gimbal angles and servo set-points."""
-    simulation = Simulation(vehicle, lab_from_body, np.radians(scene.motion.rate_deg_s), 0.0)
+    rate_rad_s = guidance.body_rate_rad_s(scene, lab_from_body)
+    simulation = Simulation(vehicle, lab_from_body, rate_rad_s, 0.0)
     data = simulation.data
     spec.add_key(name="start", qpos=data.qpos, qvel=data.qvel, act=data.act, ctrl=data.ctrl)
 

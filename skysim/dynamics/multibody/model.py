@@ -201,10 +201,12 @@ def put_at_origin(spec: Any, path: Path) -> Any:
 
 
 def place_camera(spec: Any, vehicle: VehicleConfig) -> None:
-    """Move the camera's pupil to the position that the scene gives.
+    """Move the camera's pupil to the position that the scene gives, and turn the camera on its mount.
 
-    The body that carries the camera moves, or the camera itself if it is on bus.
+    The body that carries the camera moves, or the camera itself if it is on bus. Only the camera turns.
     """
+    if any(vehicle.camera_rotation_deg):
+        turn_camera(spec, vehicle.camera_rotation_deg)
     if vehicle.camera_m is None:
         return
     model = spec.compile()
@@ -216,6 +218,18 @@ def place_camera(spec: Any, vehicle: VehicleConfig) -> None:
     mujoco.mj_camlight(model, data)
     offset_m = np.array(vehicle.camera_m) - data.camera(CAMERA).xpos
     carrier.pos = carrier.pos + R_lab_from_parent.T @ offset_m
+
+
+def turn_camera(spec: Any, rotation_deg: tuple[float, float, float]) -> None:
+    """Turn the camera by a rotation vector in its own axes (+x right, +y down, +z boresight)."""
+    parent_from_file = Rotation.from_quat(
+        spec.compile().camera(CAMERA).quat, scalar_first=True
+    )
+    file_from_turned = Rotation.from_rotvec(rotation_deg, degrees=True)
+    mjcam_from_turned = CAM_FROM_MJCAM.inv() * file_from_turned * CAM_FROM_MJCAM
+    camera = spec.camera(CAMERA)
+    camera.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    camera.quat = (parent_from_file * mjcam_from_turned).as_quat(scalar_first=True)
 
 
 def add_bearing(spec: Any, bus: Any, vehicle: VehicleConfig) -> None:

@@ -1,10 +1,10 @@
-"""Published data: numbers with their source, the tolerance of the reproduction, and the papers' errors."""
+"""Published data: experiments as files that the user runs, their numbers with sources, and the papers' errors."""
 
 from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
@@ -17,35 +17,49 @@ from skysim.core.yaml_reader import explain, read_yaml
 
 FOLDER = DATA / "published"
 
+# What an agreement of a row says: a prediction may fail; the others are true by construction, or not printed.
+RowClass = Literal["prediction", "bound", "derived", "fitted", "repeated", "input"]
+
 
 class PublishedRow(ConfigModel):
-    """One published number.
+    """One published number, and the response of our experiment that is compared with it.
 
     Attributes
     ----------
     quantity
         Its description, with the unit in parentheses
+    row_class
+        `prediction`: nothing of it is used; `bound`: only a bound is published; `derived`: not
+        printed, but computed from printed numbers; `fitted`: a parameter was fitted to it;
+        `repeated`: it follows from another row; `input`: the experiment is given it
     published
         The number; at_least and at_most, one or both, replace it if the paper states only a
         bound
+    scatter
+        Standard deviation of the published number
+    draw
+        Whether the number is a single draw, of which ours has the standard deviation between
+        runs
     tolerance
-        Allowed difference of ours, in the same unit
+        Difference that is allowed without scatter, such as half of the last digit
+    response
+        Path into the result of the experiment's command, see `reproduction`
     source
         The table, figure or page, if it differs from its experiment's
-    derived
-        Not printed, but follows from printed numbers by arithmetic or by generally accepted
-        theory
     note
         Remark for the reader, such as a misprint or the reason for the tolerance
     """
 
     quantity: str
+    row_class: Annotated[RowClass, Field(alias="class")] = "prediction"
     published: Number | None = None
     at_least: Number | None = None
     at_most: Number | None = None
+    scatter: NotNegative = 0.0
+    draw: bool = False
     tolerance: NotNegative = 0.0
+    response: str
     source: str = ""
-    derived: bool = False
     note: str = ""
 
     @model_validator(mode="after")
@@ -55,38 +69,38 @@ class PublishedRow(ConfigModel):
             raise InputError("", "give either published, or at_least or at_most or both")
         return self
 
-    @property
-    def band(self) -> tuple[float, float]:
-        """(low, high): values with which ours agrees; an open end is infinite."""
-        if self.published is not None:
-            return self.published - self.tolerance, self.published + self.tolerance
-        low = float("-inf") if self.at_least is None else self.at_least - self.tolerance
-        return low, float("inf") if self.at_most is None else self.at_most + self.tolerance
-
 
 class Experiment(ConfigModel):
-    """Published data of one experiment.
+    """An experiment of a paper: the command that repeats it, and its published numbers.
 
     Attributes
     ----------
     source
         Table, figure or section
+    command, file
+        `run` or `calibrate` with a scene, or `study` with a study
+    runs, quick_runs
+        Number of runs with other seeds; of replicates for a study
+    hardware
+        Keys of the seeds of hardware that differ from run to run
     wrong
         Errors of the paper, with the corrected values
     assumed
         Our assumptions where the paper gives no value
     fitted
         Parameters chosen so that a number is reproduced; all such parameters are listed here
-    data
-        Published tables that are inputs of the experiment, row by row
     """
 
     title: str
     source: str
+    command: Literal["run", "calibrate", "study"]
+    file: str
+    runs: Annotated[int, Field(ge=1)] = 1
+    quick_runs: Annotated[int, Field(ge=1)] = 1
+    hardware: tuple[str, ...] = ()
     wrong: str = ""
     assumed: tuple[str, ...] = ()
     fitted: tuple[str, ...] = ()
-    data: dict[str, tuple[tuple[Number, ...], ...]] = Field(default_factory=dict)
     rows: Annotated[dict[str, PublishedRow], Field(min_length=1)]
     paper: str = ""
 

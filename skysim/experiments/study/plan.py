@@ -145,6 +145,9 @@ class CentroidTrial(RandomAttitude):
     ----------
     noise_px
         Standard deviation of a centroid, each axis
+    noise_arcsec
+        Standard deviation of a centroid's direction along each axis, in place of noise_px if it is given: equal in the
+        whole field, as in simulations without an image
     magnitude_sigma
         Of its brightness, magnitudes
     lights
@@ -159,6 +162,7 @@ class CentroidTrial(RandomAttitude):
 
     kind: Literal["centroids"]
     noise_px: NotNegative = 0.1
+    noise_arcsec: NotNegative | None = None
     magnitude_sigma: NotNegative = 0.25
     lights: Annotated[int, Field(ge=1)] | None = None
     missing: Fraction = 0.0
@@ -526,7 +530,7 @@ def digest(value: Any) -> str:
 
 
 def find(name: str) -> Path:
-    """Path of a study that is given by path or by its name in scenes/studies/."""
+    """Path of a study that is given by path, or by its name in scenes/studies/ or scenes/papers/studies/."""
     return yaml_reader.find_file(name, STUDIES, "study")
 
 

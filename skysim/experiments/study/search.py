@@ -22,7 +22,7 @@ from skysim.experiments.study.execution.engines import Engine
 from skysim.experiments.study.execution.outcomes import FAILED
 from skysim.experiments.study.execution.runner import Progress, Watch, run_points
 from skysim.experiments.study.execution.setups import code_version, seed_of
-from skysim.experiments.study.execution.store import Store
+from skysim.experiments.study.execution.store import TIMES, Store
 from skysim.experiments.study.execution.trials import REFUSED, Row
 from skysim.experiments.study.factors import (
     Distribution,
@@ -210,14 +210,14 @@ def check(study: Study) -> None:
 
 
 def check_response(response: str, where: str) -> None:
-    """Raise InputError for an unknown response and for one that is not reproducible (time_ms)."""
+    """Raise InputError for an unknown response and for one that is not reproducible (times)."""
     if response == COST:
         return
     try:
         metrics.response(response, where)
     except InputError as error:
         raise InputError(where, error.problem, f"{error.allowed}, or {COST}") from None
-    if response.startswith("time_ms"):
+    if response.startswith(TIMES):
         allowed = "responses that a resumed search reproduces"
         raise InputError(where, f"{response} is not reproducible", allowed)
 

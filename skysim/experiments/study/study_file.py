@@ -54,11 +54,12 @@ FLIGHT_QUANTITIES = (
     "drift_arcsec",
     "pointing_arcsec",
     "pointing_worst_arcsec",
+    "exposure_ms",
 )
 # Kinds of trial that measure a quantity; quantities that are not listed are measured by all.
 MEASURED_BY: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(FLIGHT_QUANTITIES, ("flight",)),
-    "streak_px": ("frames", "flight"),
+    **dict.fromkeys(("streak_px", "detect_ms"), ("frames", "flight")),
 }
 
 
@@ -325,6 +326,11 @@ def check_measured(study: Study, kinds: set[str], scenes: Sequence[Scene]) -> No
                 key,
                 "no tracker of this study reports ambiguity",
                 "under a dome, with the default identifier",
+            )
+        counts = any(scene.tracker.identifier == "shefex" for scene in scenes)
+        if name.startswith("angles_compared") and not counts:
+            raise InputError(
+                key, "no identifier of this study counts angles", "tracker.identifier: shefex"
             )
 
 

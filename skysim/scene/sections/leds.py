@@ -100,11 +100,15 @@ class SequentialConfig(ConfigModel):
     controller
         `board`: one controller for each patch board; `dome`: one for all; or the number of LEDs that share one, in the
         order of their numbers
+    slots
+        Number of slots in a cycle, of which those without an LED stay dark; as many as the controller has LEDs if left
+        out
     """
 
     kind: Literal["sequential"]
     slot_s: Annotated[Time, Field(gt=0)] = 1e-3
     controller: Literal["board", "dome"] | Annotated[int, Field(ge=1)] = "board"
+    slots: Annotated[int, Field(ge=1)] | None = None
 
 
 class RefreshConfig(ConfigModel):

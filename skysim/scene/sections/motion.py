@@ -21,6 +21,11 @@ from skysim.scene.sections.vehicle import ActuatorsName
 Duration = Annotated[Time, Field(gt=0)]
 Acceleration = Positive
 RatesDegS = tuple[Spin, Spin, Spin]
+SIDEREAL = "sidereal"  # the rate of a vehicle that stands on the Earth, under the stars
+StartRate = Annotated[
+    Annotated[RatesDegS, Tag("rates")] | Annotated[Literal["sidereal"], Tag("name")],
+    Discriminator(lambda value: "name" if isinstance(value, str) else "rates"),
+]
 LawName = Annotated[str, Field(pattern=r"^\w[\w.-]*$", max_length=100)]
 BUILT_IN_LAWS = ("pid", "pd")  # of dynamics/attitude_control.py
 PRESCRIBED = "prescribed"  # no controller: the vehicle moves exactly along the maneuver
@@ -348,7 +353,8 @@ class MotionConfig(ConfigModel):
     start
         Attitude, or pointing under the stars; `profile`: attitude and rate of the first maneuver, which is a profile
     rate_deg_s
-        Rate at the start about body x, y, z
+        Rate at the start about body x, y, z; `sidereal` under the stars: that of the Earth about its pole at
+        start_time, as of a camera on a tripod
     control
         Controller; none if left out
     maneuver
@@ -358,7 +364,7 @@ class MotionConfig(ConfigModel):
     """
 
     start: Start = AttitudeConfig()
-    rate_deg_s: RatesDegS = (0.0, 0.0, 0.0)
+    rate_deg_s: StartRate = (0.0, 0.0, 0.0)
     control: Annotated[
         ControlConfig | None,
         BeforeValidator(
@@ -375,6 +381,10 @@ class MotionConfig(ConfigModel):
 
     @model_validator(mode="after")
     def check_controller(self) -> MotionConfig:
+        if self.rate_deg_s == SIDEREAL and self.control is not None:
+            raise InputError(
+                "rate_deg_s", "sidereal conflicts with a controller", "no control"
+            )
         driven = any(leg.kind not in ("bump", "hold", "jitter") for leg in self.maneuver)
         if driven and self.control is None:
             raise InputError(

@@ -150,9 +150,16 @@ class TrackerConfig(ConfigModel):
         Algorithms. If left out, `local`, `cog`, `led_pairs` and `rotation_only` under a dome, `default` under the
         stars. With the dome's identifier `non_dimensional` the assumed focal length may be wrong by up to 12 %, and the
         tracker fits it with the attitude
+    acceptance
+        Rule by which a published identifier accepts a match: `evidence`, if it is significant against chance, or
+        `thesis`, by the rule of its own paper, which does not test it (SAA: the hypothesis of least cost; SHEFEX-2: a
+        fourth star; Fialho: the fraction of matched stars; NPS: the most angles)
+    cos_error
+        Tolerance of the cosine of an angle between two stars, for the identifier `shefex` (Samaan & Theil 2011, eq. 3:
+        c |cos FOV - cos(FOV - centroid error)|; they chose 5.5e-5). If left out, from centroid_sigma_px
     catalog
-        Star catalog of the tracker, not that of the simulator: a name in data/catalogs, or a file of
-        `skysim catalog build`
+        Star catalog of the tracker, not that of the simulator: a name in data/catalogs, or a file of `skysim catalog
+        build`, `select`, `readcat` or `proc-cat`
     assumed_distortion
         Assumed coefficients k1, k2, p1, p2, k3 of the lens; the true ones if left out
     assumed_row_time
@@ -175,6 +182,12 @@ class TrackerConfig(ConfigModel):
     brightness_sigma
         Standard deviation of the logarithm of the LEDs' brightness over that of the data sheet (scatter, aging, angle,
         flicker), for identification by brightness and position; by position alone if left out
+    assumed_attitude_deg
+        Roll, pitch and yaw (3-2-1) of the vehicle by another sensor, from which the dome's identifiers pyramid, saa and
+        master_star compute the distances of the lights, as for a panel that is not a sphere; a sphere if left out
+    magnitude_sigma
+        Standard deviation of a star's measured magnitude over the catalog's V (noise, colors), for identification by
+        magnitude and place; by place alone if left out. The zero point is that of a star of the Sun's color
     map
         File that `skysim survey` wrote: measured LEDs, lever, focal length and distortion
     """
@@ -185,6 +198,8 @@ class TrackerConfig(ConfigModel):
     detector: str | None = None
     centroider: str | None = None
     identifier: str | None = None
+    acceptance: Literal["evidence", "thesis"] = "evidence"
+    cos_error: Annotated[Number, Field(ge=1e-12, le=0.1)] | None = None
     solver: str | None = None
     threshold_sigma: Annotated[Number, Field(gt=0)] = 5.0
     min_area_px: Annotated[int, Field(ge=1)] = 3
@@ -203,6 +218,8 @@ class TrackerConfig(ConfigModel):
     exposure_control: ExposureControlConfig | None = None
     decoder: DecoderConfig | None = None
     brightness_sigma: Annotated[Number, Field(ge=0.02, le=2)] | None = None
+    assumed_attitude_deg: tuple[Spin, Spin, Spin] | None = None
+    magnitude_sigma: Annotated[Number, Field(ge=0.01, le=5)] | None = None
     map: Annotated[str, AfterValidator(existing_file)] | None = None
 
     @model_validator(mode="after")

@@ -21,6 +21,7 @@ from skysim.core.units import (
     Number,
     Positive,
     QuadraticDrag,
+    Spin,
     Stiffness,
     Time,
     Torque,
@@ -256,6 +257,9 @@ class VehicleConfig(ConfigModel):
         Mass properties with all trim masses at zero; mass and inertia are those of the file if left out
     camera
         Entrance pupil on the body, with which the housing moves; that of the file if left out
+    camera_rotation_deg
+        Rotation vector from the axes of the file's camera to those of the scene's, in the axes of the file's camera
+        (+x right, +y down, +z boresight): [0, 0, 55] rolls it about its boresight
     torque_limit
         Limit of each ideal torque about body x, y, z
     wheels, fans, cmgs
@@ -270,6 +274,7 @@ class VehicleConfig(ConfigModel):
     inertia_kg_m2: tuple[Inertia, Inertia, Inertia] | None = None
     center_of_mass_m: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
     camera_m: tuple[Length, Length, Length] | None = None
+    camera_rotation_deg: tuple[Spin, Spin, Spin] = (0.0, 0.0, 0.0)
     tilt_stop_deg: Annotated[Number, Field(gt=0, lt=90)] = 30.0
     torque_limit_nm: TorqueLimit = 1.0
     wheels: WheelsConfig | None = None

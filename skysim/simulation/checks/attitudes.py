@@ -104,7 +104,7 @@ def attitudes_at(lab: Lab, t_s: Floats) -> CheckedAttitudes:
     """The commanded attitudes at (N,) times; without a controller those of the constant initial rate."""
     scene = lab.scene
     if scene.motion.control is None:
-        rate = np.radians(scene.motion.rate_deg_s)
+        rate = guidance.body_rate_rad_s(scene, lab.start)
         lab_from_body = lab.start * Rotation.from_rotvec(np.outer(t_s, rate))
         return CheckedAttitudes(lab_from_body, np.tile(rate, (len(t_s), 1)), t_s)
     reference = guidance.plan(scene.motion, lab.start, lab.profiles)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from estimator.detection.detect import THESIS_INTENSITY
 from estimator.trackers.pipeline import SATURATED_SIGMA_PX, Settings
 from skysim.camera.detector import saturation_dn
 from skysim.core.types import Floats
@@ -30,7 +31,6 @@ BINOMIAL_VARIANCE_PX2 = (
     0.5  # variance that the detectors' filter [1 2 1] / 4 adds to an image, along each axis
 )
 FILTERED_NOISE = 0.375  # factor of that filter on the noise of a pixel
-THESIS_THRESHOLD = 0.04  # threshold of the detector `thesis` as a fraction of full scale
 COG_MARGIN_PX = (
     4.5  # margin of the window about the pixels above the threshold, half a pixel included
 )
@@ -102,8 +102,12 @@ def threshold_e(context: Context) -> float:
     settings = context.settings
     camera = context.camera
     if settings.detector == "thesis":
-        full_e = full_scale_e(context.lab.scene.camera.detector)
-        return max(THESIS_THRESHOLD * full_e - camera.background_e, 1.0)
+        detector = context.lab.scene.camera.detector
+        threshold_dn = THESIS_INTENSITY * saturation_dn(detector)
+        return max(
+            (threshold_dn - detector.offset_dn) * detector.gain_e_dn - camera.background_e,
+            1.0,
+        )
     return settings.threshold_sigma * FILTERED_NOISE * camera.noise_e
 
 

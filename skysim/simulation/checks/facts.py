@@ -29,6 +29,9 @@ SIDES = 12  # number of azimuths of the greatest tilt, and of rays around the fi
 MIN_SHARE = 0.005  # least share of the variance of a cause that is printed
 ARCSEC = "″"
 TRACKER_KNOWS = "tracker knows"
+UNTESTED = (
+    "matches accepted by the thesis's rule, not tested against chance (tracker.acceptance)"
+)
 
 
 def short(value: float, digits: int = 3) -> str:
@@ -384,7 +387,10 @@ def tracker_beliefs(context: Context, samples: CheckedSamples) -> Fact:
         "distortion": list(believed.camera.distortion),
         "catalog_epoch_jyear": believed.epoch_jyear,
     }
-    return Fact(TRACKER_KNOWS, beliefs.describe(believed, context.lab.scene), values)
+    lines = beliefs.describe(believed, context.lab.scene)
+    if context.settings.acceptance == "thesis":
+        lines = [*lines, UNTESTED]
+    return Fact(TRACKER_KNOWS, lines, values)
 
 
 def expected_error(context: Context, samples: CheckedSamples) -> Fact:

@@ -12,7 +12,9 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from estimator.detection.detect import THESIS_INTENSITY
 from skysim.camera import thermal_motion
+from skysim.camera.detector import saturation_dn
 from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Mount, Sources
@@ -130,6 +132,20 @@ def bright_background(context: Context, samples: CheckedSamples) -> str:
     )
 
 
+def black_level(context: Context, samples: CheckedSamples) -> str:
+    """Warn if a pixel without light is above the fixed threshold of the detector `thesis`."""
+    detector = context.lab.scene.camera.detector
+    level_dn = detector.offset_dn + context.camera.background_e / detector.gain_e_dn
+    threshold_dn = THESIS_INTENSITY * saturation_dn(detector)
+    if context.settings.detector != "thesis" or level_dn < threshold_dn:
+        return ""
+    return (
+        f"camera.detector.offset_dn: the black level of {short(level_dn, 3)} DN is above the threshold of 4 % of the"
+        f" detector thesis, {short(threshold_dn, 3)} DN, so that it finds no light; change it to"
+        f" {short(threshold_dn / 4, 2)}, or tracker.detector to local"
+    )
+
+
 def dark_corners(context: Context, samples: CheckedSamples) -> str:
     """Warn if the lens passes no light to a part of the detector."""
     camera = context.camera.optics.camera
@@ -155,9 +171,8 @@ def few_lights(context: Context, samples: CheckedSamples) -> str:
     mount = context.lab.camera.mount
     needed = least_lights(scene)
     # 1. More lights where there are some would not help.
-    if any(
-        find(context, samples) for find in (cap_too_small, dark_corners, bright_background)
-    ):
+    explained = (cap_too_small, dark_corners, bright_background, black_level)
+    if any(find(context, samples) for find in explained):
         return ""
     if scene.tracker.brightest is not None and scene.tracker.brightest < needed:
         return f"tracker.brightest: the tracker uses {scene.tracker.brightest} lights; change it to {needed} or more"
@@ -252,7 +267,7 @@ def undetected(context: Context, samples: CheckedSamples) -> str:
     # The tracker takes at most max_blobs of a frame.
     seen = sum(min(len(view), settings.max_blobs) for view in samples.frames.seen)
     used = sum(map(len, samples.frames.used))
-    explained = (bright_background, dark_corners, long_smear)
+    explained = (bright_background, black_level, dark_corners, long_smear)
     if (
         not seen
         or used >= MIN_DETECTED * seen
@@ -518,6 +533,7 @@ def image_px(
 
 FINDINGS: tuple[Callable[[Context, CheckedSamples], str], ...] = (
     bright_background,
+    black_level,
     saturation,
     dark_corners,
     hidden_lights,

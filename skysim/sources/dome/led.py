@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.tolerance import Tolerance, scaled_errors
 from skysim.core.types import Floats
@@ -252,7 +253,8 @@ def sequential(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> 
     """Software PWM of a controller that lights its LEDs one after another: D_i = t_on,i / sum T (thesis, eq. 37).
 
     Each LED of a controller has a slot T and is lit for the fraction `level` of it; the controller's cycle is the sum
-    of its slots. The controllers' phases are random. The microcontroller's own delays are neglected, as in the thesis.
+    of its slots, also of those without an LED. The controllers' phases are random. The microcontroller's own delays are
+    neglected, as in the thesis. Raises InputError for a controller with more LEDs than slots.
     """
     drive = led.drive
     count = len(inputs.level)
@@ -269,8 +271,14 @@ def sequential(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> 
     order = np.argsort(controller, kind="stable")
     slot = np.empty(count)  # number of the LED's slot on its controller: 0, 1, ...
     slot[order] = np.arange(count) - np.repeat(np.cumsum(led_count) - led_count, led_count)
-    # A cycle is as many slots as the controller has LEDs.
-    cycle_s = led_count * np.float64(drive.slot_s)
+    if drive.slots and led_count.max() > drive.slots:
+        raise InputError(
+            "light.led.drive.slots",
+            f"{drive.slots}",
+            f"{led_count.max()} LEDs of a controller or more",
+        )
+    slots = np.full(len(led_count), drive.slots) if drive.slots else led_count
+    cycle_s = slots * np.float64(drive.slot_s)
     start_s = rng.uniform(0, cycle_s)[controller] + slot * drive.slot_s
     return PulseTrains(
         cycle_s[controller], start_s, inputs.level * drive.slot_s, np.ones(count), controller

@@ -12,7 +12,14 @@ from hypothesis import strategies as some
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from estimator.catalog import catalog, pair_index, published_catalogs, quad_index, sky_index
+from estimator.catalog import (
+    cat_file,
+    catalog,
+    pair_index,
+    published_catalogs,
+    quad_index,
+    sky_index,
+)
 from estimator.catalog.catalog import StarCatalog
 from estimator.catalog.sky_index import SkyIndex
 from estimator.core.camera import Camera
@@ -110,6 +117,39 @@ def test_spread_stars_are_apart_and_none_is_left_out_needlessly(
     few = answered(lambda: published_catalogs.uniform(stars, count), ImageError)
     assert (few is not None) == (1 <= count <= 60)
     assert few is None or (set(few.id) <= set(stars.id) and abs(len(few) - count) <= 2)
+
+
+@law(published_catalogs.uniform_to_limit)
+@given(rng=SEEDS, limit=some.floats(-2, 7), count=some.integers(1, 60))
+def test_a_uniform_catalog_to_a_limit_has_no_fainter_star(
+    rng: np.random.Generator, limit: float, count: int
+) -> None:
+    stars = drawn(rng)
+    few = answered(
+        lambda: published_catalogs.uniform_to_limit(stars, count, limit), ImageError
+    )
+    assert (few is not None) == (count <= np.sum(stars.v_mag <= limit))
+    assert few is None or (few.v_mag <= limit).all()
+
+
+@law(cat_file.encode, cat_file.read, cat_file.read_stars)
+@given(rng=SEEDS, damaged=some.integers(0, 39), by=some.integers(1, 255))
+def test_a_cat_file_keeps_any_sky_and_no_damaged_byte_passes_as_a_star(
+    tmp_path_factory: pytest.TempPathFactory, rng: np.random.Generator, damaged: int, by: int
+) -> None:
+    stars = drawn(rng)
+    ones = np.ones(len(stars), int)
+    sky = published_catalogs.OnBoard(stars.id, stars.vectors, stars.v_mag, ones, 2010.0)
+    path = tmp_path_factory.mktemp("cat") / "x.cat"
+    data = bytearray(cat_file.encode(sky))
+    path.write_bytes(data)
+    # A unit is 2^-32 of a turn.
+    same = cat_file.read(path)
+    np.testing.assert_allclose(same.vectors, sky.vectors, rtol=0, atol=2e-9)
+    assert cat_file.read_stars(path).v_mag.tolist() == sorted(same.magnitude)
+    data[20 + damaged] ^= by
+    path.write_bytes(data)
+    assert answered(lambda: cat_file.read(path), ImageError) is None
 
 
 @law(published_catalogs.chosen, slow=True)

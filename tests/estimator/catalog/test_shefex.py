@@ -32,7 +32,8 @@ def chord(angle_rad: float) -> float:
 
 
 def test_the_chosen_catalog_has_the_published_stars_and_pairs(stars: StarCatalog) -> None:
-    # Reference H3: 2,023 stars, 54,804 pairs within 18.57 deg, +-15 %.
+    # Section 3.3: "2023 stars which can be combined to 54804 reasonable star pair combinations"; +-15 %, since
+    # the thinning is unpublished.
     flown = chosen(stars)
     assert len(flown) == pytest.approx(2023, abs=1)
     pairs = len(pair_index.build(flown.vectors, np.radians(18.57)).pair)
@@ -45,7 +46,7 @@ def test_the_chosen_catalog_has_the_published_stars_and_pairs(stars: StarCatalog
 
 
 def test_a_uniform_sky_of_as_many_stars_has_the_expected_pairs(stars: StarCatalog) -> None:
-    # Reference H3: N (N - 1) / 2 (1 - cos theta) / 2 = 53,243; thinning leaves less clumping than the flown one has.
+    # N (N - 1) / 2 (1 - cos theta) / 2 = 53,243; thinning leaves less clumping than the flown one has.
     even = CATALOGS["uniform"](stars)
     expected = len(even) * (len(even) - 1) / 4 * (1 - np.cos(np.radians(18.57)))
     assert len(even) == pytest.approx(COUNT, abs=1)

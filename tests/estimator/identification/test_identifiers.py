@@ -34,7 +34,11 @@ def named(*names: str) -> list:
     ]
 
 
-PAPERS = named("fialho_1", "fialho_2", "fialho_3", "fialho_4", "shefex", "master_star", "saa")
+TRIANGLES = named("planar_triangle", "spherical_triangle")
+PAPERS = (
+    named("fialho_1", "fialho_2", "fialho_3", "fialho_4", "shefex", "master_star", "saa")
+    + TRIANGLES
+)
 GIVES_UP = (
     1_000_000  # angles compared: on the real sky each finds within some hundred thousand
 )

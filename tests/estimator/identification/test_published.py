@@ -98,7 +98,13 @@ def test_a_tolerance_must_be_positive(name: str, tolerance_rad: float) -> None:
         PLAIN[name](rays, index, tolerance_rad, magnitude=magnitude, epsilon_mag=0.1)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name.endswith("triangle") else ())
+        for name in NAMES
+    ],
+)
 def test_no_method_takes_a_mirror_image(name: str) -> None:
     rays, magnitude, _, index, _ = field(0)
     match = PLAIN[name](

@@ -11,7 +11,9 @@ from estimator.identification.published.shefex import (
     ShefexOptions,
     angle_interval,
     cos_error,
+    direction_tolerance_rad,
     search,
+    shefex,
 )
 
 pytestmark = pytest.mark.slow  # much is compiled
@@ -26,7 +28,7 @@ PIXEL_RAD = np.radians(0.02)
 
 @pytest.mark.parametrize(("centroid_px", "factor"), [(0.1, 4.95), (0.2, 2.47), (0.3, 1.65)])
 def test_eq_3_gives_the_published_cos_error(centroid_px: float, factor: float) -> None:
-    # Reference H5: 5.5e-5 with these constants; their third digit is half a per cent.
+    # Section 3.4.1: "a value between 0.00005 and 0.00006"; the constants' third digit is half a per cent.
     error = cos_error(np.radians(18.57), centroid_px * PIXEL_RAD, factor)
     assert error == pytest.approx(5.5e-5, rel=0.01)
 
@@ -34,7 +36,7 @@ def test_eq_3_gives_the_published_cos_error(centroid_px: float, factor: float) -
 @pytest.mark.parametrize(
     ("angle_deg", "tolerance_deg"), [(2, 0.090), (5, 0.036), (10, 0.018), (18.57, 0.010)]
 )
-def test_cos_error_equals_reference_h5_s_angle_tolerance(
+def test_cos_error_is_a_wide_gate_at_small_angles_and_a_narrow_one_at_large_ones(
     angle_deg: float, tolerance_deg: float
 ) -> None:
     low, high = np.degrees(angle_interval(np.radians(angle_deg), 5.5e-5))
@@ -63,6 +65,34 @@ def test_no_triangle_is_begun_once_the_effort_is_used_up(
     tried = np.zeros(3, np.int64)
     search(seen, index, ShefexOptions(1e-9, 1e-7, triangles, checks, base=6), tried)
     assert tried[2] == begun
+
+
+def test_a_given_cos_error_searches_as_eq_3_does_from_its_tolerance() -> None:
+    """The inverse of eq. 3 leads from the paper's 5.5e-5 to 0.495 px, c = 4.95 at 0.1 px, and back."""
+    fov = np.radians(18.57)
+    tolerance = direction_tolerance_rad(fov, 5.5e-5)
+    assert tolerance == pytest.approx(0.495 * PIXEL_RAD, rel=0.01)
+    assert cos_error(fov, tolerance) == pytest.approx(5.5e-5, rel=1e-9)
+    rng = np.random.default_rng(8)
+    stars = catalog.unit(rng.normal(size=(2000, 3)))
+    index = pair_index.build(stars, fov)
+    seen = stars[np.arccos(np.clip(stars @ stars[0], -1, 1)) < fov / 2]
+    error = cos_error(index.max_angle_rad, tolerance)
+    counts = np.zeros((2, 1), np.int64)
+    by_eq_3 = shefex(seen, index, tolerance, compared=counts[0])
+    given = shefex(seen, index, 1e-3, cos_error=error, compared=counts[1])
+    assert by_eq_3 is not None
+    assert given is not None
+    np.testing.assert_array_equal(given.star, by_eq_3.star)
+    assert counts[0, 0] == counts[1, 0] > 3
+
+
+def test_the_angles_of_twenty_triangles_without_a_catalog_pair_are_sixty() -> None:
+    seen = catalog.unit(screen(np.random.default_rng(5))[:6])
+    compared = np.zeros(1, np.int64)
+    index = pair_index.build(SCREEN_CORNERS, 0.5)
+    assert shefex(seen, index, 1e-7, cos_error=1e-9, compared=compared) is None
+    assert compared[0] == 3 * 20
 
 
 # ---- the master star: nine stars on a screen of .30 x .22 m a meter away (reference section 5) -----------------------

@@ -27,7 +27,7 @@ from estimator.identification.published.master_star import master_star
 from estimator.identification.published.pyramid import pyramid
 from estimator.identification.published.saa import AssumptionPool, saa
 from estimator.identification.registry import IDENTIFIERS, STEP, candidates
-from estimator.identification.solver_options import Options
+from estimator.identification.solver_options import ACCEPTANCES, Options
 from estimator.identification.star_evidence import Solution
 from estimator.trackers import refinement
 from estimator.trackers.pipeline import Settings
@@ -159,13 +159,13 @@ def test_the_true_camera_and_attitude_are_a_candidate(
     )
     right = (
         abs(lens.focal_px / CAMERA.focal_px - 1) < 1e-9
-        and (cam_from_ref * world.truth.inv()).magnitude() < 1e-3
-        for lens, cam_from_ref in found
+        and (match.cam_from_ref * world.truth.inv()).magnitude() < 1e-3
+        for lens, match in found
     )
     assert any(right)
 
 
-@law(Options.magnitudes, Options.require_known_focal)
+@law(Options.magnitudes, Options.require_known_focal, Options.by_paper)
 @given(mag=NUMBERS, count=some.integers(0, 6))
 @example(mag=np.array(3.0), count=1)
 def test_magnitudes_are_one_per_star_or_unknown(mag: NDArray, count: int) -> None:
@@ -173,6 +173,7 @@ def test_magnitudes_are_one_per_star_or_unknown(mag: NDArray, count: int) -> Non
     assert (magnitudes is not None) == (mag.shape == (count,))
     assert np.isnan(Options().magnitudes(count)).tolist() == [True] * count
     Options().require_known_focal("any")
+    assert [Options(acceptance=one).by_paper for one in ACCEPTANCES] == [False, True]
 
 
 @law(AssumptionPool.log10_chance, AssumptionPool.best_match)
@@ -190,7 +191,7 @@ def test_a_pool_without_assumptions_gives_no_answer(rng: np.random.Generator) ->
     assert pool.best_match() is None
 
 
-@law(shefex.cos_error)
+@law(shefex.cos_error, shefex.direction_tolerance_rad)
 @given(
     fov=some.floats(0.01, 1.5),
     errors=some.lists(some.floats(0, 1e-3), min_size=2, max_size=2),
@@ -203,6 +204,11 @@ def test_the_gate_grows_with_the_error(
     assert (
         0 <= small <= large <= factor * max(errors) * 1.000001 + 1e-15
     )  # cosines of 16 digits
+    # The inverse of c = 1, to the digits of a cosine.
+    error = shefex.direction_tolerance_rad(
+        fov, shefex.cos_error(fov, min(errors[0], fov / 2))
+    )
+    assert error == pytest.approx(min(errors[0], fov / 2), rel=1e-6, abs=1e-13 / np.sin(fov))
 
 
 @law(magnitude_zero)

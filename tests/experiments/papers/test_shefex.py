@@ -1,182 +1,186 @@
-"""Tools of SHEFEX-2's experiments against geometry, counting and theory."""
+"""SHEFEX-2's formulas and geometry against the renderer, and its experiments, shortened (Samaan & Theil 2011)."""
 
 from __future__ import annotations
+
+import math
+from functools import cache
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
-from estimator.identification.published.shefex import FOURTH_STAR
-from skysim.core.types import Frame
-from skysim.experiments.papers import (
-    shefex_camera,
-    shefex_identification,
-    shefex_nights,
-    shefex_setup,
-)
-from skysim.experiments.papers.compare import ExperimentOptions, bootstrap_of_means
-from skysim.experiments.papers.shefex_setup import StarField, pairs, random_fields, shefex_lab
+from estimator.catalog import catalog, pair_index
+from estimator.core.checks import Floats
+from estimator.identification.published.shefex import ShefexOptions, search
+from skysim.camera.render import Window, render
+from skysim.core.paths import CATALOGS
+from skysim.core.types import Trajectory
+from skysim.experiments.papers import published, reproduction
+from skysim.experiments.papers.reproduction import Options
 from skysim.scene.loader import load
+from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking import onboard_model
-from skysim.tracking.factory import ExposureController
 
-pytestmark = pytest.mark.long  # compiles the paper's algorithms for ten seconds
+EXPOSURE_S = 0.05
+COS_ERROR = 5.5e-5
+FIELD_RAD = np.radians(18.57)
 
 
-def test_the_bootstrap_of_means_matches_theory_and_skips_missing_values() -> None:
-    """A mean's 95 % interval is +-1.96 sigma / sqrt(N); NaN values are skipped."""
-    values = np.random.default_rng(1).normal(3.0, 2.0, 4000)
-    found = bootstrap_of_means(values[:, None], lambda m: m[..., 0])
-    half = 1.96 * values.std() / np.sqrt(len(values))
-    assert found.value == pytest.approx(values.mean(), rel=1e-12)
-    # The ends of 999 resamples are good to a tenth of the half.
-    assert found.high - found.value == pytest.approx(half, rel=0.15)
-    assert found.value - found.low == pytest.approx(half, rel=0.15)
-    holed = np.where(np.arange(4000) % 2, values, np.nan)
-    assert bootstrap_of_means(holed[:, None], lambda m: m[..., 0]).value == pytest.approx(
-        values[1::2].mean(), rel=1e-12
+@cache
+def lab(**overrides: str) -> Lab:
+    keys = {name.replace("__", "."): value for name, value in overrides.items()}
+    return build_lab(load("shefex2", {"light.catalog": "hipparcos_hp6.5"} | keys))
+
+
+def star_image(shown: Lab, exposure_s: float = EXPOSURE_S, rate_deg_s: float = 0.0) -> Floats:
+    """(H, W) noise-free electrons of the brightest star, at the image's center and moving along its row."""
+    camera = shown.camera
+    brightest = camera.sources.take(np.array([np.argmax(camera.sources.strength)]))
+    cam_from_lab = Rotation.align_vectors([[0.0, 0.0, 1.0]], brightest.place[:, :3])[0]
+    body_from_cam = camera.mount.cam_from_body.inv()
+    rate_body = body_from_cam.apply([0.0, np.radians(rate_deg_s), 0.0])
+    t_s = np.linspace(-0.01, exposure_s + 0.01, 9)
+    turned = Rotation.from_rotvec(np.outer(t_s - exposure_s / 2, rate_body))
+    lab_from_body = (body_from_cam * cam_from_lab).inv() * turned
+    motion = Trajectory(t_s, lab_from_body, np.tile(rate_body, (len(t_s), 1)))
+    image = np.zeros(camera.canvas.shape)
+    render(image, brightest, camera.optics, motion, camera.mount, Window(0.0, exposure_s))
+    return image
+
+
+def variance_px2(image: Floats) -> Floats:
+    """(2,) variances of an image about its centroid along x and y."""
+    y, x = np.indices(image.shape)
+    total = image.sum()
+    means = [(image * axis).sum() / total for axis in (x, y)]
+    return np.array(
+        [
+            (image * (axis - mean) ** 2).sum() / total
+            for axis, mean in zip((x, y), means, strict=True)
+        ]
     )
 
 
-def test_a_field_s_stars_are_the_catalog_s_where_the_attitude_puts_them() -> None:
-    camera = onboard_model.calibration(shefex_lab().scene.camera)
-    for field in random_fields(5, 3):
-        shown = camera.pixels(field.cam_from_ref.apply(pairs().vectors))
-        shown = shown[camera.contains(np.nan_to_num(shown, nan=-1e9))]
-        assert len(shown) == len(field.xy_px)
-        apart = np.linalg.norm(field.xy_px[:, None] - shown[None], axis=2).min(axis=1)
-        # Aberration and proper motion by two codes: thousandths of a pixel.
-        assert apart.max() < 0.01
+# Section 2.1 and table 1: 659 x 493 pixels of 9.9 um behind 25 mm.
 
 
-@pytest.mark.long
-def test_without_noise_a_field_is_named_and_its_attitude_found() -> None:
-    field = next(one for one in random_fields(20, 4) if len(one.xy_px) >= 6)
-    result = shefex_identification.identify(
-        field, 1e-6, 1e-5, 0, FOURTH_STAR, np.random.default_rng(1)
-    )
-    assert (result.right, result.wrong) == (1.0, 0.0)
-    assert np.abs(result.error_deg).max() < 1e-3
+def test_the_fields_are_the_printed_ones_and_the_diagonal_is_not() -> None:
+    """Section 2.1: "14.87 deg x 11.15 deg, which results in a diagonal FOV of 18.57 deg"; it is 18.51 deg."""
+    camera = onboard_model.calibration(load("shefex2", {}).camera)
+    x, y = camera.center_px
+    ends = [[(-0.5, y), (658.5, y)], [(x, -0.5), (x, 492.5)], [(-0.5, -0.5), (658.5, 492.5)]]
+    rays = [camera.rays(np.array(pair)) for pair in ends]
+    horizontal, vertical, diagonal = (float(np.degrees(np.arccos(a @ b))) for a, b in rays)
+    assert horizontal == pytest.approx(14.87, abs=0.005)
+    assert vertical == pytest.approx(11.15, abs=0.005)
+    half = np.hypot(659, 493) / 2 * 9.9e-6 / 25e-3
+    assert diagonal == pytest.approx(np.degrees(2 * np.arctan(half)), rel=1e-9)
+    assert diagonal == pytest.approx(18.51, abs=0.005)
+    assert math.hypot(horizontal, vertical) == pytest.approx(18.58, abs=0.01)
 
 
-def test_three_stars_are_no_success() -> None:
-    field = StarField(
-        np.array([[100.0, 100.0], [300.0, 80.0], [200.0, 400.0]]), Rotation.identity()
-    )
-    result = shefex_identification.identify(
-        field, 0.1, 1e-4, 0, FOURTH_STAR, np.random.default_rng(1)
-    )
-    assert (result.right, result.wrong) == (0.0, 0.0)
+# Section 3.1: smear and light.
 
 
-def test_the_triangles_of_fifteen_are_the_binomial_coefficient() -> None:
-    assert (
-        shefex_identification.count_triangles(np.random.default_rng(2)) == 15 * 14 * 13 // 6
-    )
-
-
-def test_equation_5_fails_as_printed_and_holds_when_corrected() -> None:
-    assert shefex_identification.eq5_failures(np.random.default_rng(3), 500) == (500, 0)
-
-
-def test_the_crossing_of_a_line_and_a_limit_is_interpolated() -> None:
-    """0.2 deg a pixel passes 0.1 deg at half a pixel; one that stays below ends at the last."""
-    yaw_deg = 0.2 * shefex_identification.ERRORS_PX
-    assert shefex_identification.error_at_limit(1.0, yaw_deg**2) == pytest.approx(
-        0.5, abs=0.01
-    )
-    assert shefex_identification.error_at_limit(2.0, yaw_deg**2) == pytest.approx(
-        0.25, abs=0.01
-    )
-    assert (
-        shefex_identification.error_at_limit(1.0, 1e-4 * yaw_deg**2)
-        == shefex_identification.ERRORS_PX[-1]
-    )
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("rate_deg_s", [2.0, 4.0])
 def test_smear_is_rate_times_time_and_the_peak_falls_as_that_of_a_line(
     rate_deg_s: float,
 ) -> None:
-    """A line of L pixels over one centered star's pixel: (1 / L) of erf(1 / (2 sqrt 2 sigma)), ends far away."""
-    length_px = np.radians(rate_deg_s) * 0.05 * shefex_lab().scene.camera.focal_px
-    assert shefex_nights.smear_px(rate_deg_s) == pytest.approx(length_px, rel=2e-3)
-    alone = erf(0.5 / (0.7 * np.sqrt(2)))
-    loss_mag = 2.5 * np.log10(alone * length_px)
-    # The pixel's own ends are rounded by the blur: a few thousandths.
-    assert shefex_nights.peak_loss(rate_deg_s, 1, 1).ours.value == pytest.approx(
-        loss_mag, abs=0.02
-    )
+    """A line of L pixels adds L^2 / 12 to the variance and has the share erf(1 / (2 sqrt 2 sigma)) / L in its pixel.
+
+    At 2 deg/s L is 4.4 px ("a maximum image smear of 4.5 pixel"), and the brightest pixel loses 0.91 mag.
+    """
+    moving = star_image(lab(), rate_deg_s=rate_deg_s)
+    at_rest = star_image(lab())
+    length_px = math.radians(rate_deg_s) * EXPOSURE_S * 25e-3 / 9.9e-6
+    added = variance_px2(moving)[0] - variance_px2(at_rest)[0]
+    assert math.sqrt(12 * added) == pytest.approx(length_px, rel=2e-3)
+    alone = erf(0.5 / (0.7 * math.sqrt(2)))
+    # The line's own ends are rounded by the blur: a few thousandths.
+    loss_mag = 2.5 * math.log10(at_rest.max() / moving.max())
+    assert loss_mag == pytest.approx(2.5 * math.log10(alone * length_px), abs=0.02)
+    if rate_deg_s == 2:
+        assert length_px == pytest.approx(4.5, abs=0.1)
+        assert loss_mag == pytest.approx(0.91, abs=0.02)
 
 
+@pytest.mark.slow
+def test_the_light_of_50_ms_under_the_air_is_that_of_35_ms_in_space() -> None:
+    """Section 3.1: the atmosphere absorbs about 30 %, so 50 ms on ground are "equivalent to about 35 ms in space"."""
+    on_ground = star_image(lab(camera__transmission="0.595"), 0.05).sum()
+    assert on_ground == pytest.approx(star_image(lab(), 0.035).sum(), rel=1e-6)
+
+
+# Section 4: the focusing range of 0.1 mm.
+
+
+@pytest.mark.slow
 def test_the_blur_disk_is_the_defocus_over_the_f_number() -> None:
-    assert shefex_nights.blur_px() == pytest.approx(1e-4 / 1.4 / 9.9e-6, rel=0.01)
-
-
-def test_the_chip_s_fields_follow_from_its_half_sizes() -> None:
-    half = np.array([659, 493, np.hypot(659, 493)]) / 2 * 9.9e-6 / 25e-3
-    field_deg = shefex_nights.field_deg(onboard_model.calibration(shefex_lab().scene.camera))
-    np.testing.assert_allclose(field_deg, np.degrees(2 * np.arctan(half)), rtol=1e-9)
-
-
-def test_a_poisson_sky_has_the_expected_unevenness_and_an_even_sky_less() -> None:
-    rng = np.random.default_rng(5)
-    poisson = rng.poisson(8, (20_000, 2))
-    even = np.full(20_000, 8.0) + rng.integers(-1, 2, 20_000)
-    for counts, expected in (
-        (poisson, 1.0),
-        (np.column_stack([poisson[:, 0], even]), (2 / 3) / 8),
-    ):
-        columns = np.hstack([counts, counts**2.0])
-        assert shefex_setup.relative_dispersion(columns.mean(axis=0)) == pytest.approx(
-            expected, rel=0.05
-        )
-
-
-def test_both_scans_have_the_same_objects() -> None:
-    rng = np.random.default_rng(6)
-    image = rng.normal(100, 3, (200, 300))
-    for x, y in rng.uniform(20, 180, (10, 2)):
-        image[int(y) : int(y) + 3, int(x) : int(x) + 3] += 200
-    count, share = shefex_camera.count_common(np.rint(image).astype(np.uint16), 100)
-    assert count >= 8
-    assert share == 1.0
-
-
-def test_an_empty_frame_of_a_coarse_converter_lengthens_the_exposure() -> None:
-    """Every pixel equals the offset: no star, and nothing too bright."""
-    controller = ExposureController(
-        load("shefex2", {"tracker.exposure_control": "{mean_dn: 9}"})
+    """0.1 mm / 1.4 = 71 um: 7.2 px. A uniform disk of diameter D adds D^2 / 16 to the variance along an axis."""
+    added = variance_px2(star_image(lab(camera__focus="6.275 m"))) - variance_px2(
+        star_image(lab())
     )
-    controller.update(Frame(0, np.full((493, 659), 4, np.uint16), 0.0, 0.04, 255.0))
-    assert controller.exposure_s == pytest.approx(0.042, abs=1e-12)
+    assert 4 * math.sqrt(added.mean()) == pytest.approx(1e-4 / 1.4 / 9.9e-6, rel=0.01)
 
 
-def test_a_planet_s_light_follows_pogson_s_law() -> None:
-    loop = shefex_camera.ExposureLoop({}, shefex_camera.random_attitudes(1, 1)[0], 40)
-    before = loop.lab.camera.sources
-    after = shefex_camera.with_planets(loop.lab.camera, loop.rest, 3)
-    changed = after.strength != before.strength
-    assert changed.sum() == 3
-    gained_mag = 2.5 * np.log10(after.strength[changed] / before.strength[changed])
-    np.testing.assert_allclose(
-        gained_mag, before.magnitude[changed] - shefex_camera.PLANET_MAG, rtol=1e-9
-    )
+# Section 3.4: equations 1 and 5.
 
 
-@pytest.mark.long
-def test_the_same_seed_gives_the_same_numbers() -> None:
-    first, again = (
-        shefex_camera.exposure_control(ExperimentOptions(quick=True, seed=2)).results
-        for _ in range(2)
-    )
-    assert first == again
+@cache
+def pairs() -> pair_index.PairIndex:
+    chosen = catalog.read(CATALOGS / "shefex_chosen.ecsv")
+    return pair_index.build(chosen.vectors, FIELD_RAD)
 
 
-def test_a_lab_under_the_air_gathers_thirty_per_cent_less() -> None:
-    """The light of 35 ms without air equals that of 50 ms under the air."""
-    on_ground = shefex_nights.star_image(shefex_nights.ground_lab(), 0.05).sum()
-    assert on_ground == pytest.approx(
-        shefex_nights.star_image(shefex_lab(), 0.035).sum(), rel=1e-6
+@pytest.mark.slow
+def test_the_triangles_of_fifteen_are_the_binomial_coefficient() -> None:
+    """Eq. 1: 15! / (3! 12!) = 455, all of which a search tries on lights that are no stars."""
+    camera = onboard_model.calibration(lab().scene.camera)
+    lights_px = np.random.default_rng(2).random((15, 2)) * [659, 493] - 0.5
+    counters = np.zeros(3, np.int64)
+    options = ShefexOptions(COS_ERROR, 1e-3, 10**9, 10**9, 15, -np.inf)
+    search(camera.rays(lights_px), pairs(), options, counters)
+    assert counters[2] == 455
+
+
+def test_equation_5_fails_as_printed_and_holds_when_corrected() -> None:
+    """Printed is ceil((cos a - cosError) / m + q / m) for the upper index; + cosError and - q / m is right.
+
+    Of 500 measured pairs, within cosError of true ones, all printed indices are outside of the k-vector, and no true
+    pair is outside of the corrected range.
+    """
+    rng = np.random.default_rng(3)
+    cosines = np.sort(np.cos(pairs().angle_rad))
+    kvector, slope, offset = pair_index.k_vector(cosines)
+    true_pair = rng.integers(0, len(cosines), 500)
+    measured = cosines[true_pair] + COS_ERROR * rng.uniform(-1, 1, 500)
+    last = len(kvector) - 1
+    printed = np.ceil((measured - COS_ERROR) / slope + offset / slope)
+    assert np.all((printed < 0) | (printed > last))
+    low = np.floor((measured - COS_ERROR - offset) / slope)
+    high = np.ceil((measured + COS_ERROR - offset) / slope)
+    begin = np.where(low < 0, 0, kvector[np.clip(low, 0, last).astype(int)])
+    end = kvector[np.clip(high, 0, last).astype(int)]
+    assert np.all((begin <= true_pair) & (true_pair < end))
+
+
+# The experiments.
+
+EXPERIMENTS = published.read(published.FOLDER / "shefex.yaml").experiments
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("id", EXPERIMENTS)
+def test_a_shortened_experiment_has_a_number_for_every_row(
+    id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reproduction, "experiments", lambda: EXPERIMENTS)
+    result = reproduction.reproduce(id, Options(quick=True))
+    assert len(result.comparisons) == len(EXPERIMENTS[id].rows)
+    assert all(math.isfinite(one.ours.value) for one in result.comparisons)
+    assert result.commands == (
+        f"skysim study run {EXPERIMENTS[id].file}"
+        f" --set=replicates={EXPERIMENTS[id].quick_runs} --set=seed=1",
     )

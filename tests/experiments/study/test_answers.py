@@ -14,6 +14,7 @@ from skysim.core.paths import SCENES
 from skysim.experiments.study import study_file, table
 from skysim.experiments.study.execution import engines, runner, store
 from skysim.experiments.study.execution.outcomes import FIELDS
+from skysim.experiments.study.execution.store import TIMES
 from skysim.experiments.study.report import study_export
 from skysim.results import metrics
 
@@ -34,7 +35,7 @@ responses: [identified, cross_arcsec_p95]
 def columns(**given):
     """Columns of trials; columns that are not given are NaN."""
     count = len(next(iter(given.values())))
-    empty = {name: np.full(count, np.nan) for name in (*FIELDS, "time_ms")}
+    empty = {name: np.full(count, np.nan) for name in (*FIELDS, *TIMES)}
     return empty | {name: np.asarray(values, dtype=float) for name, values in given.items()}
 
 

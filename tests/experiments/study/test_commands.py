@@ -159,7 +159,7 @@ def test_a_store_of_an_earlier_skysim_is_refused_in_one_line(typed, tmp_path):
     path = tmp_path / "out/question/study.sqlite"
     db = sqlite3.connect(path)
     db.execute("CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL)")
-    db.execute("INSERT INTO meta VALUES ('format', '1')")
+    db.execute("INSERT INTO meta VALUES ('format', '4')")
     db.commit()
     db.close()
     for words in (
@@ -172,7 +172,7 @@ def test_a_store_of_an_earlier_skysim_is_refused_in_one_line(typed, tmp_path):
         code, _, err = typed("study", words[0], "question.yaml", *words[1:])
         assert code == 2
         assert err == (
-            "skysim: out/question/study.sqlite: written by an earlier skysim, without the attitudes of the trials;"
+            "skysim: out/question/study.sqlite: written by an earlier skysim, without all columns of the trials;"
             " allowed: run the study again, to another store\n"
         )
 

@@ -3,6 +3,7 @@
 import pytest
 
 from skysim.core.errors import InputError
+from skysim.core.paths import shipped_files
 from skysim.experiments.study import plan, study_file
 
 STUDY = """schema: 1
@@ -155,13 +156,40 @@ def test_an_unknown_study_is_refused():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "path", sorted(plan.STUDIES.glob("*.yaml")), ids=lambda path: path.stem
+    "path",
+    list(shipped_files(plan.STUDIES).values()),
+    ids=lambda path: path.stem,
 )
 def test_every_shipped_study_loads(path):
     """Every level of every factor makes a scene; `load` has tried them all."""
     study_plan = study_file.load(path)
     assert study_plan.study.title
     assert study_plan.trials or study_plan.study.optimize
+
+
+COSINES = """schema: 1
+title: how many angles?
+scene: shefex2
+seed: 1
+set: {set}
+trial: {{kind: centroids}}
+factors: {{px: {{key: trial.noise_px, values: [0.1, 0.2]}}}}
+responses: [angles_compared_mean]
+"""
+
+
+def test_compared_angles_are_of_the_identifier_that_counts_them(tmp_path):
+    counts = COSINES.format(set="{tracker.identifier: shefex, tracker.cos_error: 5.5e-5}")
+    assert study_file.load(written(tmp_path, counts)).trials == 2
+    with pytest.raises(
+        InputError, match=r"no identifier .* counts angles; allowed: tracker.id"
+    ):
+        study_file.load(written(tmp_path, COSINES.format(set="{tracker.identifier: saa}")))
+    unused = counts.replace("identifier: shefex", "identifier: pyramid")
+    with pytest.raises(
+        InputError, match=r"cos_error: has no effect.*no tolerance of cosines"
+    ):
+        study_file.load(written(tmp_path, unused.replace("angles_compared_mean", "wrong")))
 
 
 FLIGHT = """schema: 1

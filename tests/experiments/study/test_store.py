@@ -215,8 +215,8 @@ def test_a_file_that_is_not_a_store_is_refused(tmp_path: Path) -> None:
 COLUMNS_READ = {  # all but the keys, for which SQLite itself refuses anything but integers
     "meta": ["value"],
     "points": ["levels", "settings"],
-    "trials": [name for name in store.COLUMNS if name not in ("trial", "time_ms")],
-    "timings": ["time_ms"],
+    "trials": [name for name in store.COLUMNS if name not in ("trial", *store.TIMES)],
+    "timings": list(store.TIMES),
     "runs": ["engine", "workers", "trials", "seconds"],
 }
 

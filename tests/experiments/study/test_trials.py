@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.paths import SCENES
 from skysim.experiments.study import plan
-from skysim.experiments.study.execution import detections, setups, trials
+from skysim.experiments.study.execution import detections, setups, store, trials
 from skysim.experiments.study.plan import CentroidTrial, FrameTrial, TrialSpec
 from skysim.simulation.exposure import render_at_rest
 from skysim.sources.ephemeris import observe_from, place
@@ -532,3 +532,38 @@ def test_a_tracked_frame_has_the_motion_of_its_time():
     moving = trials.moving_camera(setup, 5)
     step = trials.rotation_between(moving, truth.t_s - 0.1, truth.t_s)
     assert np.degrees(step.magnitude()) == pytest.approx(0.2, rel=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("frames", "exposure_ms"), [(1, 44), (3, 48), (6, 50)])
+def test_a_flight_in_the_dark_ends_with_the_exposure_that_its_control_has_reached(
+    frames: int, exposure_ms: float
+) -> None:
+    """Steps of 2 ms from 44 ms, to 50 ms at most (Samaan & Theil 2011, section 3.1)."""
+    settings = {
+        "tracker.exposure_control": {"mean_dn": 150},
+        "camera.transmission": 1e-6,
+        "exposure.time": "44 ms",
+        "exposure.frames": frames,
+    }
+    flights = replace(SKY, base=settings, trial={"kind": "flight"})
+    came = trials.run_flight_trial(setups.prepared_setup(flights, {}), 5)
+    assert came.exposure_ms == pytest.approx(exposure_ms, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_the_time_of_a_detection_is_stored_beside_the_trial_and_is_not_compared(tmp_path):
+    rows = {}
+    for name in ("sequential", "maximum"):
+        settings = {"tracker.detector": name}
+        spec = replace(SKY, trial={"kind": "frames"})
+        rows[name] = trials.run_segments(spec, (trials.Segment(0, settings, 0, range(4)),))
+    # Every object costs the maximum search another pass over the image.
+    sequential, maximum = ([row.outcome.detect_ms for row in each] for each in rows.values())
+    assert np.median(maximum) > 3 * np.median(sequential) > 0
+    outcome = rows["maximum"][0].outcome
+    assert outcome == replace(outcome, detect_ms=-1.0)
+    with store.writing(tmp_path / "study.sqlite") as kept:
+        kept.add(rows["maximum"])
+        assert kept.columns()["detect_ms"].tolist() == maximum
+        assert not {"detect_ms", "time_ms"} & set(kept.trial(0))

@@ -1,4 +1,4 @@
-"""Commands that measure hardware: `skysim balance` for the vehicle, `skysim characterize` for the camera."""
+"""Commands that measure hardware: `skysim balance`, `characterize` for the camera, `calibrate` for its LEDs."""
 
 from __future__ import annotations
 
@@ -173,6 +173,43 @@ def print_flight(row: dict[str, Any]) -> None:
         f" center of mass at {offset_text(row)} um;"
         f" gravity torque {row['torque_nm']:.2g} N m, at most {row['torque_bound_nm']:.2g} N m{moved}"
     )
+
+
+def calibrate(
+    scene: SceneArg,
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of images with attitudes.csv of the IMU, in place of a flight."
+        ),
+    ] = None,
+    clicks: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="LED spacings that set the scale in the first frame; 0 keeps the focal length.",
+        ),
+    ] = 4,
+    seed: Seed = None,
+    out: Out = None,
+    set_: Overrides = None,
+    json: Json = False,
+) -> None:
+    """Measure LEDs from the vehicle's stops as the AFIT thesis does: magnitudes, angles, epsilons, on-board catalog."""
+    from skysim.experiments import home_calibration
+
+    loaded = load(scene, None, seed, set_)
+    with progress_callback(loaded.title, quiet=json) as watch:
+        known, frames = (
+            home_calibration.measure_folder(images, loaded)
+            if images
+            else home_calibration.measure_scene(loaded, watch)
+        )
+    seen = list(home_calibration.sightings(known, frames))
+    found = home_calibration.calibrated(known, seen, clicks)
+    command = shlex.join(["skysim", *sys.argv[1:]])
+    folder = output_folder(out, f"{loaded.name}_calibration")
+    print_report(*home_calibration.write_results(folder, known, found, command), json)
 
 
 # Command `skysim characterize`: a camera preset from darks, flats and night frames.

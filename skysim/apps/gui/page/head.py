@@ -12,7 +12,7 @@ from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.live import Contents, LiveText
 from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker import image_export
-from skysim.core.paths import SCENES
+from skysim.core.paths import SCENES, shipped_files
 
 
 class Head:
@@ -65,7 +65,7 @@ class Head:
         current = self.page.state.scene
         own = [path for path in sorted(self.folder.glob("*.yaml")) if forms.is_scene(path)]
         return (
-            {path.stem: path.stem for path in sorted(SCENES.glob("*.yaml"))}
+            {name: name for name in shipped_files(SCENES)}
             | {str(path): path.name for path in own}
             | {current: Path(current).name}
         )

@@ -28,7 +28,7 @@ from skysim.apps.gui.worker.study_process import (
 )
 from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.paths import STUDIES, title_of
+from skysim.core.paths import STUDIES, shipped_files, title_of
 from skysim.experiments.study import study_file as loader
 from skysim.experiments.study import unused_options
 from skysim.experiments.study.execution.store import STORE
@@ -111,8 +111,7 @@ class MonteCarloPanel:
     def set_scene(self) -> None:
         options = {"": f"Monte Carlo of {Path(self.page.state.scene).stem}"}
         options |= {
-            path.stem: f"{path.stem}: {title_of(path)}"
-            for path in sorted(STUDIES.glob("*.yaml"))
+            name: f"{name}: {title_of(path)}" for name, path in shipped_files(STUDIES).items()
         }
         self.study_select.set_options(options, value=self.study_select.value or "")
         info = self.page.scene_info
@@ -392,7 +391,8 @@ class MonteCarloPanel:
 def stored_study(folder: Path) -> Plan | None:
     """The plan of a study with a store in the folder; None if there is none."""
     try:
-        file = next(iter(sorted(folder.glob("*.yaml"))), STUDIES / f"{folder.name}.yaml")
+        own = sorted(folder.glob("*.yaml"))
+        file = own[0] if own else shipped_files(STUDIES).get(folder.name, folder)
         return loader.load(file) if (folder / STORE).is_file() else None
     except (InputError, ValueError, OSError):  # a name with a null byte, or too long
         return None

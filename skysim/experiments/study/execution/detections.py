@@ -20,6 +20,7 @@ from estimator.trackers.coded_tracker import CodedTracker
 from estimator.trackers.pipeline import Report
 from skysim.camera.projection import Poses, in_view, project_each, rates_e_s
 from skysim.camera.render import OcclusionTest, Window
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Trajectory
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene
@@ -120,11 +121,17 @@ def simulate_detections(
     error. The flux of a false detection is that of a random true source, detected or missed.
     """
     # Draw noise for all sources, also the missing ones, so that the stream does not depend on which are missing.
-    sigma_px = max(trial.noise_px, LEAST_SIGMA_PX)
+    sigma_px = trial.noise_px
+    if trial.noise_arcsec is not None:
+        sigma_px = trial.noise_arcsec * ARCSEC_RAD * scene.camera.focal_px
+    sigma_px = max(sigma_px, LEAST_SIGMA_PX)
     detected = np.flatnonzero(rng.random(len(xy_px)) >= trial.missing)
     flux = electrons / scene.camera.detector.gain_e_dn
     flux = flux * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(xy_px)))
-    xy_px = xy_px + trial.noise_px * rng.standard_normal(xy_px.shape)
+    if trial.noise_arcsec is None:
+        xy_px = xy_px + trial.noise_px * rng.standard_normal(xy_px.shape)
+    else:
+        xy_px = with_direction_noise(xy_px, trial.noise_arcsec * ARCSEC_RAD, scene, rng)
     detected = detected[np.argsort(-flux[detected], kind="stable")][: trial.lights]
     false = trial.false_lights + round(
         len(detected) * trial.false_share / (1 - trial.false_share)
@@ -140,6 +147,20 @@ def simulate_detections(
     order = np.argsort(-all_flux, kind="stable")
     all_px = np.concatenate([xy_px[detected], false_px])
     return Centroids(all_px[order], np.full(len(order), sigma_px), all_flux[order])
+
+
+def with_direction_noise(
+    xy_px: Floats, sigma_rad: float, scene: Scene, rng: np.random.Generator
+) -> Floats:
+    """(N, 2) images of directions with normal errors of every component of the unit vector.
+
+    The error of the tangents, times the focal length, is added: it is that of an undistorted lens.
+    """
+    focal_px = scene.camera.focal_px
+    rays = np.column_stack([(xy_px - scene.camera.center_px) / focal_px, np.ones(len(xy_px))])
+    lengths = np.linalg.norm(rays, axis=1, keepdims=True)
+    moved = rays + sigma_rad * lengths * rng.standard_normal(rays.shape)
+    return xy_px + focal_px * (moved[:, :2] / moved[:, 2:] - rays[:, :2])
 
 
 def solve_coded(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -80,6 +80,13 @@ class Outcome:
     streak_px
         Length of the images of the lights, median of a frame and mean for a flight; NaN for
         centroid trials
+    angles_compared
+        Number of angles that the identifier compared, mean for a flight; NaN if it does not count
+        them
+    exposure_ms
+        Exposure time of a flight's last frame; NaN for other trials
+    detect_ms
+        Computing time of the detection, mean for a flight; not the same in every run
     lab_from_body_w, _x, _y, _z
         True attitude at mid-exposure; of the worst frame for a flight (`worst_frame`)
     body_tilt_deg, body_azimuth_deg
@@ -113,6 +120,8 @@ class Outcome:
     wrong_matches: float = math.nan
     centroid_px: float = math.nan
     streak_px: float = math.nan
+    angles_compared: float = math.nan
+    exposure_ms: float = math.nan
     lab_from_body_w: float = math.nan
     lab_from_body_x: float = math.nan
     lab_from_body_y: float = math.nan
@@ -121,9 +130,10 @@ class Outcome:
     body_azimuth_deg: float = math.nan
     boresight_ra_deg: float = math.nan
     boresight_dec_deg: float = math.nan
+    detect_ms: float = field(default=math.nan, compare=False)
 
 
-FIELDS = tuple(field.name for field in fields(Outcome))
+FIELDS = tuple(one.name for one in fields(Outcome) if one.compare)
 # Values that are unknown for an external tracker.
 IDENTITY = ("misidentified", "roll_noise", "misled", "wrong_matches")
 FAILED = Outcome("failed")
@@ -182,6 +192,8 @@ def score(
         **dict.fromkeys(IDENTITY, 0.0 if own_tracker else math.nan),
         "centroid_px": centroid_error_px(centroids_px, lights.flux_xy_px, reach_px),
         "streak_px": streak_px,
+        "angles_compared": solution.angles_compared or math.nan,
+        "detect_ms": 1e3 * report.seconds.get("detect", math.nan),
         **directions(lab, lab_from_body, cam_from_lab),
     }
     if solution.cam_from_ref is None:
@@ -363,6 +375,9 @@ def summarize_flight(log: Telemetry, outcomes: list[Outcome], settle_s: float) -
         },
         centroid_px=rms(finite([one.centroid_px for one in outcomes])),
         streak_px=mean(finite([one.streak_px for one in outcomes])),
+        angles_compared=mean(finite([one.angles_compared for one in outcomes])),
+        exposure_ms=outcomes[-1].exposure_ms if outcomes else math.nan,
+        detect_ms=mean(finite([one.detect_ms for one in outcomes])),
         **{name: getattr(worst, name) for name in DIRECTION},
     )
 

@@ -20,6 +20,7 @@ from skysim.core.files import make_folder, write_image
 from skysim.core.types import Frame, Truth
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.engines import Chunk, Engine, Pool, Serial
+from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.execution.setups import (
     TrialSetup,
     code_version,
@@ -353,7 +354,7 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
     segment = segment_of(plan, store, trial)
     row = trials.run_trial(plan.spec, segment, trial, segment.replicates[0])
     stored = store.trial(trial) if store.done(trial + 1)[trial] else {}
-    now = {name: to_sql(getattr(row.outcome, name)) for name in row.outcome.__slots__}
+    now = {name: to_sql(getattr(row.outcome, name)) for name in FIELDS}
     changed = [name for name, value in now.items() if stored and stored[name] != value]
     files = []
     pictures = []

@@ -35,8 +35,8 @@ from skysim.results.files import row_parts
 from skysim.results.files.row_parts import Part, Rows, Source
 
 STORE = "study.sqlite"  # file name in a study's results folder
-FORMAT = 4  # raised when the columns of `trials` change
-FORMAT_OF_PARTS = 5  # format of a store with parts, which an earlier skysim would not see
+FORMAT = 6  # raised when the columns of `trials` change
+FORMAT_OF_PARTS = 7  # format of a store with parts, which an earlier skysim would not see
 MOST_ROWS = 1_000_000  # maximum number of rows in SQLite; beyond, rows move to parts
 PART_ROWS = 250_000  # rows of a part, about 50 MB in memory
 EVERY = (0, 2**62)  # range of all trials
@@ -44,18 +44,9 @@ BLOCK_TRIALS = 100_000  # trial numbers of a block of `Store.blocks`
 TEXT_FIELDS = {"status"}
 INTEGER_FIELDS = {"frames", "solved", "wrong", "ambiguous"}
 
+TIMES = ("time_ms", "detect_ms")
 # Names of `Store.columns`.
-COLUMNS = (
-    "trial",
-    "point",
-    "replicate",
-    "seed",
-    "scene",
-    "code",
-    *FIELDS,
-    "error",
-    "time_ms",
-)
+COLUMNS = ("trial", "point", "replicate", "seed", "scene", "code", *FIELDS, "error", *TIMES)
 
 SQL_TYPES = dict.fromkeys(TEXT_FIELDS, "TEXT") | dict.fromkeys(INTEGER_FIELDS, "INTEGER")
 OUTCOME_COLUMNS = ", ".join(f"{name} {SQL_TYPES.get(name, 'REAL')}" for name in FIELDS)
@@ -68,7 +59,7 @@ CREATE TABLE IF NOT EXISTS trials (
   scene TEXT NOT NULL, code TEXT NOT NULL,
   {OUTCOME_COLUMNS},
   error TEXT);
-CREATE TABLE IF NOT EXISTS timings (trial INTEGER PRIMARY KEY, time_ms REAL NOT NULL);
+CREATE TABLE IF NOT EXISTS timings (trial INTEGER PRIMARY KEY, time_ms REAL NOT NULL, detect_ms REAL);
 CREATE TABLE IF NOT EXISTS runs (
   run INTEGER PRIMARY KEY, began REAL NOT NULL, engine TEXT NOT NULL, workers INTEGER NOT NULL,
   trials INTEGER NOT NULL, seconds REAL NOT NULL);
@@ -194,8 +185,10 @@ class Store:
         values = [(*row[:6], *map(to_sql, values_of(row.outcome)), row.error) for row in rows]
         with self.db:
             self.db.executemany(INSERT, values)
-            times = [(row.trial, 1e3 * row.seconds) for row in rows]
-            self.db.executemany("INSERT OR REPLACE INTO timings VALUES (?, ?)", times)
+            times = [
+                (row.trial, 1e3 * row.seconds, to_sql(row.outcome.detect_ms)) for row in rows
+            ]
+            self.db.executemany("INSERT OR REPLACE INTO timings VALUES (?, ?, ?)", times)
         self._near = NONE_NEAR
         self._room -= len(rows)
         if self._room < 0:
@@ -341,7 +334,7 @@ class Store:
         rows = self._rows([(number, number + 1)])
         if not len(rows["trial"]):
             raise InputError(f"trial {number}", f"not in {self.path}", self.trial_range())
-        return {name: to_sql(rows[name].tolist()[0]) for name in rows if name != "time_ms"}
+        return {name: to_sql(rows[name].tolist()[0]) for name in rows if name not in TIMES}
 
     def trial_range(self) -> str:
         """Range of the trial numbers in the store, as text for messages."""
@@ -349,7 +342,7 @@ class Store:
         return f"{min(ends)} to {max(ends)}" if ends else "none yet"
 
     def columns(self, failed: bool = True) -> Rows:
-        """Every column of `trials`, and `timings.time_ms`, as arrays in trial order; NaN for missing values.
+        """Every column of `trials`, and those of `timings`, as arrays in trial order; NaN for missing values.
 
         Parameters
         ----------
@@ -524,10 +517,10 @@ def open_store(path: Path) -> Iterator[Store]:
 def check_format(store: Store) -> None:
     """Raise InputError for a store of another format."""
     stored = store.meta("format")
-    if stored == "1":
+    if stored in ("1", "4", "5"):
         raise InputError(
             store.path,
-            "written by an earlier skysim, without the attitudes of the trials",
+            "written by an earlier skysim, without all columns of the trials",
             "run the study again, to another store",
         )
     if stored not in (str(FORMAT), str(FORMAT_OF_PARTS)):

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from skysim.core.paths import STUDIES
+from skysim.core.paths import STUDIES, shipped_files
 from skysim.core.types import Floats
 from skysim.experiments.study import answer, search
 from skysim.experiments.study.execution.store import Store
@@ -123,7 +123,8 @@ def commands(
         folder
     """
     if not study:
-        study = plan.name if plan.path.parent == STUDIES else str(plan.path)
+        shipped = plan.path in shipped_files(STUDIES).values()
+        study = plan.name if shipped else str(plan.path)
         out = store.path.parent
     return partial(shell_command, study, out, store.overrides())
 

@@ -1,0 +1,44 @@
+"""What to change if an identifier refuses a field: each refusal names the setting that would help."""
+
+from __future__ import annotations
+
+from math import inf
+
+from estimator.identification.chance import MIN_MATCHES
+
+# Identifiers whose papers accept a match by a rule of their own (see `solver_options.Options.acceptance`).
+OWN_RULE = ("saa", "shefex", "master_star", "fialho_1", "fialho_2", "fialho_3", "fialho_4")
+CROWDED = 1.5  # lights per catalog star in a field from which the lights are too many
+
+
+def advice(identifier: str, lights: int, acceptance: str, in_field: float = inf) -> str:
+    """The setting that would help a published identifier that has refused a field.
+
+    The text depends on the frame only by its case, so that equal refusals are counted together.
+
+    Parameters
+    ----------
+    identifier
+        Name of the method
+    lights
+        Number of lights that it was given
+    acceptance
+        See `solver_options.Options`
+    in_field
+        Mean number of its catalog's stars in a field; infinite if unknown
+    """
+    if lights < MIN_MATCHES:
+        return (
+            f"{identifier} needs {MIN_MATCHES} lights; lower threshold_sigma or min_area_px"
+        )
+    if lights > CROWDED * in_field:
+        wanted = max(round(in_field), MIN_MATCHES)
+        return (
+            f"more lights than the {wanted} stars that the catalog of {identifier} has in a field; set brightest to"
+            f" {wanted}, or limit_mag to a fainter one"
+        )
+    if identifier == "fialho_1":
+        return "its lists of the whole catalog are too long; set identifier to fialho_2"
+    if acceptance == "evidence" and identifier in OWN_RULE:
+        return "set acceptance to thesis for the paper's rule, without this test, or raise centroid_sigma_px"
+    return "raise centroid_sigma_px, or set another identifier"

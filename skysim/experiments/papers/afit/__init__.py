@@ -1,1 +1,0 @@
-"""Experiments of the AFIT thesis (Padro 2012)."""

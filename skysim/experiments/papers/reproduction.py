@@ -1,0 +1,311 @@
+"""Repeat a published experiment by the command that a user would type, and compare its numbers with the paper's.
+
+Each experiment of data/published names a scene or a study, and each row a response: a path into the JSON of the command
+that runs it, as in `leds.0.mean` or `stops.4.difference_deg.2`. A study's response has the levels of the point in
+brackets: `identified[rate=2, chain=default]`. Two terms may be subtracted or divided: `a - b`, `a / b`; a term may be a
+number.
+
+The verdict tests the difference d between our number and the published one. With our standard error s (of the mean over
+runs, or of the study's response), the scatter p of the published number and an allowed difference t,
+
+    agrees:     |d| <= t + 1.96 sqrt(s^2 + p^2)
+    undecided:  it agrees, but our own part 1.96 s alone is larger than t + 1.96 p: more runs are needed
+    disagrees:  else.
+
+For a bound d is how far our number is beyond it, 0 on the allowed side, with t and s as above; a verdict is undecided
+where the bound is within 1.96 s of our number.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+import shlex
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from skysim.core.errors import InputError
+from skysim.experiments import home_calibration
+from skysim.experiments.papers.published import Experiment, PublishedRow, experiments
+from skysim.experiments.study import study_file
+from skysim.experiments.study import table as study_table
+from skysim.experiments.study.api import run_study
+from skysim.experiments.study.execution.store import open_store
+from skysim.experiments.study.table import PointRow
+from skysim.results import run_report, scoring, telemetry_report
+from skysim.results.metrics import SIGMAS
+from skysim.scene import loader
+from skysim.simulation.flight import open_flight
+
+Verdict = Literal["agrees", "undecided", "disagrees"]
+VERDICTS: tuple[Verdict, ...] = ("agrees", "undecided", "disagrees")
+TERM = re.compile(r"\s*([\w.-]+?)\s*(?:\[(.*?)\])?\s*")
+BOTH = re.compile(r"^(.*?\S)\s+([-/])\s+(\S.*)$")
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """Options of `skysim reproduce`.
+
+    Attributes
+    ----------
+    quick
+        Fewer runs, wider intervals
+    seed
+        Of the first run; the others follow
+    watch
+        Progress callback, called with (completed, total)
+    """
+
+    quick: bool = False
+    seed: int = 1
+    watch: Callable[[float, float], None] = lambda completed, total: None
+
+
+class Ours(NamedTuple):
+    """Our number: its mean over n runs, the standard error of this mean, and the deviation between runs."""
+
+    value: float
+    error: float = 0.0
+    deviation: float = 0.0
+    runs: int = 1
+
+
+class Comparison(NamedTuple):
+    """One row of the table: published number, ours and the verdict."""
+
+    id: str
+    row: PublishedRow
+    ours: Ours
+    verdict: Verdict
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON. A bound is published as [least, most], an open end as null."""
+        row = self.row
+        bounds = [row.at_least, row.at_most]
+        return {
+            "id": self.id,
+            "quantity": row.quantity,
+            "class": row.row_class,
+            "published": bounds if row.published is None else row.published,
+            "scatter": row.scatter,
+            "tolerance": row.tolerance,
+            "ours": self.ours.value,
+            "error": self.ours.error,
+            "runs": self.ours.runs,
+            "verdict": self.verdict,
+            "note": row.note,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Reproduction:
+    """A repeated experiment: the published data, the commands, the comparison of each row, and the time in seconds."""
+
+    id: str
+    published: Experiment
+    commands: tuple[str, ...]
+    comparisons: tuple[Comparison, ...]
+    seconds: float = field(compare=False)
+
+    def count(self, verdict: Verdict, predictions: bool = False) -> int:
+        """Number of rows with a verdict, of all or of the predictions alone."""
+        return sum(
+            one.verdict == verdict and (not predictions or one.row.row_class == "prediction")
+            for one in self.comparisons
+        )
+
+
+def check_ids(ids: Sequence[str]) -> list[str]:
+    """The requested ids without repeats; `all` for every experiment. Raises InputError for an unknown id."""
+    if list(ids) == ["all"]:
+        return list(experiments())
+    for id in ids:
+        if id not in experiments():
+            raise InputError(
+                "", f"unknown experiment '{id}'", f"all, {', '.join(experiments())}"
+            )
+    return list(dict.fromkeys(ids))
+
+
+def reproduce(id: str, options: Options) -> Reproduction:
+    """Repeat one experiment and compare it with the published numbers. Raises InputError."""
+    begin = time.perf_counter()
+    experiment = experiments()[id]
+    if experiment.command == "study":
+        commands, number = study_numbers(experiment, options)
+    else:
+        commands, number = run_numbers(experiment, options)
+    comparisons = []
+    for key, row in experiment.rows.items():
+        try:
+            ours = evaluate(row.response, number)
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            raise InputError(f"{id}.{key}.response", f"{row.response}: {error!r}") from None
+        comparisons.append(Comparison(id, row, ours, verdict(row, ours)))
+    seconds = time.perf_counter() - begin
+    return Reproduction(id, experiment, tuple(commands), tuple(comparisons), seconds)
+
+
+# Our numbers.
+
+
+Number = Callable[[str, str], Ours]  # of a path and the text in its brackets
+
+
+def run_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Number]:
+    """Run a scene with several seeds; a number is the mean of its values, of the runs in which it has one."""
+    runs = experiment.quick_runs if options.quick else experiment.runs
+    commands = []
+    results = []
+    for n in range(runs):
+        seed = options.seed + n
+        overrides = {key: str(seed) for key in ("seed", *experiment.hardware)}
+        sets = [f"--set={key}={seed}" for key in experiment.hardware]
+        commands.append(
+            shlex.join(
+                ["skysim", experiment.command, experiment.file, f"--seed={seed}", *sets]
+            )
+        )
+        results.append(RESULTS[experiment.command](experiment.file, overrides))
+        options.watch(n + 1, runs)
+
+    def number(path: str, levels: str) -> Ours:
+        values = np.array([at_path(result, path) for result in results], float)
+        values = values[np.isfinite(values)]
+        count = len(values)
+        if not count:
+            return Ours(math.nan, runs=0)
+        deviation = float(values.std(ddof=1)) if count > 1 else 0.0
+        return Ours(float(values.mean()), deviation / math.sqrt(count), deviation, count)
+
+    return commands, number
+
+
+def run_result(file: str, overrides: dict[str, str]) -> dict[str, Any]:
+    """What `skysim run --json` prints of a flight, without the files."""
+    with open_flight(loader.load(file, overrides)) as flight:
+        rows = [scoring.score(shot).row for shot in flight.shots()]
+        motion = telemetry_report.summary(flight.telemetry())
+    return run_report.summary(rows) | {
+        "flight": motion,
+        "rows": [asdict(row) for row in rows],
+    }
+
+
+def calibrate_result(file: str, overrides: dict[str, str]) -> dict[str, Any]:
+    """What `skysim calibrate --json` prints."""
+    known, frames = home_calibration.measure_scene(loader.load(file, overrides))
+    seen = list(home_calibration.sightings(known, frames))
+    return home_calibration.statistics(home_calibration.calibrated(known, seen))
+
+
+RESULTS: dict[str, Callable[[str, dict[str, str]], dict[str, Any]]] = {
+    "run": run_result,
+    "calibrate": calibrate_result,
+}
+
+
+def study_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Number]:
+    """Run a study; a number is a response at one of its points."""
+    replicates = experiment.quick_runs if options.quick else experiment.runs
+    overrides = {"replicates": replicates, "seed": options.seed}
+    sets = [f"--set={key}={value}" for key, value in overrides.items()]
+    command = shlex.join(["skysim", "study", "run", experiment.file, *sets])
+    study = study_file.load(experiment.file, {}).study
+    with tempfile.TemporaryDirectory() as folder:
+        result = run_study(experiment.file, overrides, out=Path(folder))
+        with open_store(result.path) as store:
+            rows = study_table.table(store, study.responses)
+
+    def number(path: str, levels: str) -> Ours:
+        summary = point_at(rows, levels).responses[path]
+        half = (summary.high - summary.low) / 2
+        error = 0.0 if math.isnan(half) else half / SIGMAS
+        return Ours(summary.value, error, error * math.sqrt(summary.trials), summary.trials)
+
+    return [command], number
+
+
+def point_at(rows: Sequence[PointRow], levels: str) -> PointRow:
+    """The only point with the levels of a text such as `rate=2, chain=default`. Raises ValueError."""
+    wanted = dict(
+        re.split(r"\s*=\s*", part, maxsplit=1) for part in levels.split(",") if part.strip()
+    )
+    found = [
+        row
+        for row in rows
+        if all(
+            study_table.format_level(row.levels[name.strip()]) == level.strip()
+            for name, level in wanted.items()
+        )
+    ]
+    if len(found) != 1:
+        raise ValueError(f"{len(found)} points with {levels or 'any levels'}")
+    return found[0]
+
+
+def at_path(result: Any, path: str) -> float:
+    """The number at a dotted path of mappings and lists; a list that the path ends in is averaged by magnitude."""
+    for part in path.split("."):
+        if result is None:  # of a frame without a solution
+            return math.nan
+        result = result[int(part)] if isinstance(result, list | tuple) else result[part]
+    return float(result)
+
+
+def evaluate(response: str, number: Number) -> Ours:
+    """The value of a response: one term, or two with - or / between them; independent errors add in quadrature."""
+    if both := BOTH.match(response):
+        a = evaluate(both[1], number)
+        b = evaluate(both[3], number)
+        if both[2] == "-":
+            return Ours(
+                a.value - b.value,
+                math.hypot(a.error, b.error),
+                math.hypot(a.deviation, b.deviation),
+                max(a.runs, b.runs),
+            )
+        ratio = a.value / b.value
+        relative = math.hypot(a.error / a.value, b.error / b.value) if a.value else 0.0
+        spread = math.hypot(a.deviation / a.value, b.deviation / b.value) if a.value else 0.0
+        return Ours(ratio, abs(ratio) * relative, abs(ratio) * spread, max(a.runs, b.runs))
+    term = TERM.fullmatch(response)
+    if not term:
+        raise ValueError("no response")
+    with contextlib.suppress(ValueError):
+        return Ours(float(term[1]))
+    return number(term[1], term[2] or "")
+
+
+# Verdicts.
+
+
+def verdict(row: PublishedRow, ours: Ours) -> Verdict:
+    """The verdict of the module's docstring."""
+    own = SIGMAS * ours.error
+    if math.isnan(ours.value):
+        return "disagrees"
+    if row.published is None:
+        low = -math.inf if row.at_least is None else row.at_least - row.tolerance
+        high = math.inf if row.at_most is None else row.at_most + row.tolerance
+        if min(abs(ours.value - low), abs(ours.value - high)) < own:
+            return "undecided"
+        return "agrees" if low <= ours.value <= high else "disagrees"
+    theirs = row.tolerance + SIGMAS * scatter(row, ours)
+    limit = row.tolerance + SIGMAS * math.hypot(ours.error, scatter(row, ours))
+    if abs(ours.value - row.published) > limit + 1e-12 * abs(row.published):
+        return "disagrees"
+    return "undecided" if own > theirs > 0 else "agrees"
+
+
+def scatter(row: PublishedRow, ours: Ours) -> float:
+    """Standard deviation of the published number: as stated, and that of one of our runs if it is a single draw."""
+    return math.hypot(row.scatter, ours.deviation if row.draw else 0.0)
