@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import project
 from skysim.camera.glow.display_glow import black_glow
-from skysim.core.paths import SCENES
+from skysim.core.paths import SCENES, shipped_files
 from skysim.dynamics import multibody
 from skysim.experiments.study.execution.setups import TrialSetup
 from skysim.experiments.study.execution.trials import run_frame_trial
@@ -28,7 +28,7 @@ from skysim.simulation.lab import build_lab, build_tracker
 from skysim.simulation.timing import exposure_window
 from skysim.tracking import onboard_model
 
-ALL_NAMES = sorted(path.stem for path in SCENES.glob("*.yaml"))
+ALL_NAMES = list(shipped_files(SCENES))
 IDEAL = [name for name in ALL_NAMES if name.endswith("_ideal")]
 NAMES = [name for name in ALL_NAMES if name not in IDEAL]
 # What a published experiment shows instead of five sources and an attitude.

@@ -171,7 +171,11 @@ class Settings:
             object.__setattr__(
                 self, name, value
             )  # a plain float or int, which compiled code knows
+        checks.of_type("settings: acceptance", self.acceptance, str)
         checks.known("settings: acceptance", self.acceptance, ACCEPTANCES)
+        if self.assumed_deg is not None:
+            angles = checks.floats("settings: assumed_deg", self.assumed_deg, (3,))
+            object.__setattr__(self, "assumed_deg", tuple(angles.tolist()))
         if self.bad_px is not None:
             bad = np.asarray(self.bad_px)
             if (

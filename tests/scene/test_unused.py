@@ -101,6 +101,7 @@ CASES = [
         {"tracker.identifier": "led_pairs"},
     ),
     Case(SKY, {}, "tracker.acceptance", "thesis", {"tracker.identifier": "fialho_3"}),
+    Case(SKY, {}, "tracker.cos_error", "5.5e-5", {"tracker.identifier": "shefex"}),
     Case(DOME, {"light.layout": MANY}, "tracker.brightness_sigma", "0.2", TWO_LEVELS),
     Case(DOME, {}, "tracker.magnitude_sigma", "0.2", {}),
     Case(

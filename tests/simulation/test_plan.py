@@ -864,7 +864,7 @@ def test_a_black_level_above_the_thesis_s_threshold_is_warned_of(
 ) -> None:
     """4 % of some 1017 DN are 40.7."""
     lab = lab_of(
-        "afit_test3", tracker__detector=detector, camera__detector__offset_dn=str(level)
+        "afit_simsat", tracker__detector=detector, camera__detector__offset_dn=str(level)
     )
     lines = [one for one in check(lab).findings if "above the threshold of 4 %" in one]
     assert len(lines) == warned

@@ -13,7 +13,7 @@ from skysim.apps.cli.options import complete_scene, complete_study
 @pytest.mark.parametrize(
     ("typed", "completed"),
     [
-        ("skysim run ptase", ["ptase_2003"]),
+        ("skysim run ptase_2", ["ptase_2003"]),
         ("skysim study run led_c", ["led_count"]),
         ("skysim camera imx2", ["imx250", "imx264"]),
         ("skysim camera show imx2", ["imx250", "imx264"]),
@@ -42,7 +42,7 @@ def test_files_and_folders_complete_beside_names(
     for name in ("shed/lab.yaml", "shefex_mine.yaml", "notes.txt"):
         (tmp_path / name).touch()
     monkeypatch.chdir(tmp_path)
-    assert complete_scene("she") == ["shed/", "shefex2", "shefex_mine.yaml"]
+    assert complete_scene("she") == ["shed/", "shefex2", "shefex_mine.yaml", "shefex_night"]
     assert complete_scene("shed/") == ["shed/lab.yaml"]
     assert complete_scene("no") == []
     assert complete_study("led_c") == ["led_count"]
