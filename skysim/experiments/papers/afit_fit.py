@@ -33,7 +33,7 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.papers.published import published_values
 
-PHASES = 1500
+PHASES = 600
 SLOT_MS = 1.0
 THRESHOLD_GRAY = 0.04 * 255
 OVERSAMPLING = 4
@@ -123,7 +123,7 @@ def blob_moments(full: float, noise: float, radius_px: float, blur_px: float) ->
     shape = gaussian_filter(disk, blur_px * OVERSAMPLING)[
         ::OVERSAMPLING, ::OVERSAMPLING
     ].ravel()
-    level = np.concatenate([[0.0], np.geomspace(8, 1500, 150)])
+    level = np.concatenate([[0.0], np.geomspace(8, 1500, 80)])
     gray = np.minimum(level[:, None] * shape, full)
     above = (gray - THRESHOLD_GRAY) / noise
     lit = gray > 1.0  # others are noise beside the light

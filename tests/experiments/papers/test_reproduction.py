@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 
@@ -12,10 +13,12 @@ from typer.testing import CliRunner
 
 from skysim.apps.cli.main import app
 from skysim.core.errors import InputError
-from skysim.core.paths import SCENES, STUDIES, shipped_files
+from skysim.core.paths import ROOT, SCENES, STUDIES, shipped_files
 from skysim.experiments.papers import papers_report, reproduction
 from skysim.experiments.papers.published import PublishedRow, experiments
 from skysim.experiments.papers.reproduction import Options, Ours, Verdict
+
+FINDINGS = ROOT / "docs" / "findings"
 
 
 def row(**fields: object) -> PublishedRow:
@@ -121,3 +124,19 @@ def test_report_and_json_have_the_same_verdicts() -> None:
     assert found.commands[0] in text
     for one in found.comparisons:
         assert papers_report.format_ours(one.ours) in text
+
+
+def test_the_page_counts_the_verdicts_of_its_table() -> None:
+    """docs/findings/papers.md is written from the rows of docs/findings/papers.csv."""
+    with (FINDINGS / "papers.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    predictions = [line["verdict"] for line in rows if line["class"] == "prediction"]
+    text = (FINDINGS / "papers.md").read_text(encoding="utf-8")
+    assert f"Of {len(predictions)} predictions {predictions.count('agrees')} agree" in text
+    assert f"{predictions.count('disagrees')} disagree" in text
+    listed = [
+        (id, one.quantity)
+        for id, paper in experiments().items()
+        for one in paper.rows.values()
+    ]
+    assert [(line["id"], line["quantity"]) for line in rows] == listed
