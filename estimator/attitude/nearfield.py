@@ -87,7 +87,7 @@ def _with_covariance(
         sum(k [(a.d) I - a d^T]) w = sum(k a x (I - d d^T) dp / |p|),    dp = by_ray du + u (by_rotation . w).
 
     1. Compute the gradient's derivative G_i by a shift dp_i of each point: the columns of k a x (I - d d^T) / |p|.
-    2. Compute the Hessian H: the bracket on the left, less the part of dp that depends on w.
+    2. Compute the Hessian H: the bracket on the left minus the part of dp that depends on w.
     3. Map ray noise of sigma across the ray to the rotation: w_i = H^-1 G_i by_ray (I - u u^T) sigma_i.
     4. Sum over the independent rays: P = sum(w_i w_i^T).
 

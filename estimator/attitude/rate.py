@@ -300,8 +300,8 @@ def from_moments(
     2. Compute each root's error from that of the moments: the derivative of the first equation is k^2 / 6 z + 2 i a.
     3. Fit a rate to each of the two roots of the median moments, as in `_fit_disks`.
 
-    Of the two roots z only one is about zero for a camera at rest: they are not opposite to each other as the two rates
-    of a streak are, and only one fits the places of the lights.
+    The two rates of a streak are opposite; the two roots z are not. For a camera at rest only one root is about zero,
+    and only one fits the places of the lights.
     """
     if centroids.moments_px2 is None or len(centroids) < MIN_LIGHTS or not camera.row_time_s:
         return []

@@ -244,7 +244,10 @@ def linearize(bundle: Bundle, sightings: Sightings) -> Linearization:
 
 
 def _in_camera(bundle: Bundle, sightings: Sightings) -> tuple[Floats, Floats]:
-    """Return b, (M, 3) lights from the bearing center in body axes, and q, (M, 3) from the pupil in camera axes."""
+    """Return the vectors to the observed LEDs: b from the bearing center in body axes, q from the pupil in camera axes.
+
+    Both are (M, 3), one row for each sighting.
+    """
     rotation = bundle.R_body_from_lab[sightings.frame]
     b = np.einsum("mij,mj->mi", rotation, bundle.position_m[sightings.led])
     return b, (b - bundle.camera_body_m) @ bundle.R_cam_from_body.T
@@ -478,7 +481,7 @@ def cauchy(squared: Floats, width: float) -> tuple[float, Floats]:
 
 
 def robust_scale(bundle: Bundle, sightings: Sightings) -> float:
-    """Return the robust scale of the residuals in sigmas, at least 1: their median length over that of unit noise."""
+    """Return the robust scale of the residuals, at least 1: ratio of their median length in sigmas to unit noise's."""
     length = np.linalg.norm(residuals(bundle, sightings), axis=1)
     return max(1.0, float(np.median(length) / MEDIAN_RADIUS))
 

@@ -194,7 +194,7 @@ def survey(
         1999, Parameter Estimation and Hypothesis Testing in Linear Models, section 3.6). The weights of pixels and map
         are then right even if the noise is known only up to a factor
     assumed
-        Lever and focal length with standard deviations, used as measurements beside the map. Few frames hardly
+        Lever and focal length with standard deviations, used as measurements like the map. Few frames hardly
         determine them: a wrong lens could then fit misidentified lights
 
     Raises
@@ -319,14 +319,14 @@ def _misfit(subset: Subset, covariances: Covariances) -> float:
 
 
 def redundancy(subset: Subset, covariances: Covariances) -> float:
-    """Return the number of pixel coordinates less the number of unknowns that they determine.
+    """Return the number of pixel coordinates minus the number of unknowns that they determine.
 
     With the map as a measurement, the pixels determine U - tr(C) / sigma_map^2 of the U unknowns, C the covariance of
-    the lights, and the map determines the rest. Without it the pixels determine U less the four gauge freedoms. An
+    the lights, and the map determines the rest. Without it the pixels determine U minus the four gauge freedoms. An
     assumed lever and focal length are counted in the same way as the map.
     """
     bundle = subset.bundle
-    # Lights, rotations, lever, and lens, less the gauge freedoms
+    # Lights, rotations, lever and lens, minus the gauge freedoms
     unknowns = 3.0 * (len(subset.led) + len(subset.frame) + 1) + bundle.free_lens - 4
     if np.isfinite(bundle.map_sigma_m):
         by_prior = float(np.einsum("nii->", covariances.by_led)) / bundle.map_sigma_m**2

@@ -9,8 +9,8 @@ respect to inertial space, and a random torque d about lab axes:
     dd/dt = -d / tau + noise
 
 J0 is the assumed inertia, so that d represents the random acceleration J0^-1 R^T d. If d were the torque itself, a fit
-of J and of the motion at once would prefer small inertias, since with them small random torques explain a motion: it
-maximizes the joint probability of J and d, where that of J alone is sought (Box & Tiao, Bayesian Inference in
+of J and of the motion at once would prefer small inertias, since with them small random torques explain a motion:
+such a fit maximizes the joint probability of J and d, not the probability of J alone (Box & Tiao, Bayesian Inference in
 Statistical Analysis, 1973, section 1.5).
 
 J is the inertia with the wheels locked, A the wheel axes, h the wheels' assumed momenta and e their relative errors,

@@ -421,7 +421,7 @@ def names(
 def _log_likelihood(table: LightTable) -> Floats:
     """Return the (N, N) log likelihood that the light at the place of LED i (rows) is that of LED j (columns).
 
-    With x_f the logarithm of the measured light less that of the expected one in frame f, it is
+    With x_f the logarithm of the ratio of measured to expected light in frame f, it is
 
         -[(mean x / s_between)^2 + sum (x_f - mean x)^2 / s_within^2] / 2 + n ln CHANCE.
 

@@ -173,7 +173,7 @@ def k_vector(angle_rad: Floats) -> tuple[NDArray[np.int64], float, float]:
     kvector
         (P + 2,) counts
     slope, offset
-        Of the line, rad
+        Slope and offset of the line, rad
     """
     count = len(angle_rad)
     margin = max(1e-12, 1e-12 * angle_rad[-1])

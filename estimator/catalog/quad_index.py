@@ -35,7 +35,7 @@ LONGEST = 0.75
 SHORTEST = 0.15
 NEIGHBORS = 60  # greatest number of stars near one star that are combined with it
 SIDE = 20  # cells along each of the four axes
-# Bounds of the coordinates along B to A and across: C and D are nearer to A and to B than these are to each other.
+# Bounds of the coordinates along B to A and across: C and D are nearer to A and to B than A is to B.
 ALONG = 0.5
 ACROSS = 0.87
 
@@ -166,7 +166,7 @@ def _quads(
             vectors.pair_frame(star_a, star_b, frame)
             candidates = neighbor[start[a] : min(start[a + 1], start[a] + NEIGHBORS)]
             count = _stars_between(xyz, candidates, a, b, frame, near, place)
-            # Pairs C, D of these.
+            # Pairs C, D of these stars.
             for k in range(count):
                 for m in range(k):
                     if (
@@ -198,9 +198,9 @@ def _stars_between(
     near: NDArray,
     place: Floats,
 ) -> int:
-    """Number of the candidates nearer to A and to B than these are to each other.
+    """Return the number of candidates whose distances from A and from B are both less than the distance A B.
 
-    Their rows and their coordinates in the frame of A and B are written to `near` and `place`.
+    Writes the rows of these stars to `near`, and their coordinates in the frame of A and B to `place`.
     """
     star_a = vectors.row(xyz, a)
     star_b = vectors.row(xyz, b)

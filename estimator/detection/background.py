@@ -33,7 +33,7 @@ CLIP_SIGMA = 3.0
 # Variance of a unit Gaussian truncated at 3 sigma: 1 - 6 phi(3) / (2 Phi(3) - 1).
 CLIPPED_VARIANCE = 0.9733
 FLOAT_STEPS = 65535  # quantization steps assumed over the range of an image of floats
-# Standard deviation of white noise after the binomial filter, over that before: (1 + 4 + 1) / 16.
+# Ratio of the standard deviations of white noise after and before the binomial filter: (1 + 4 + 1) / 16.
 FILTERED_NOISE = 0.375
 
 
@@ -48,7 +48,7 @@ def estimate_background(image: NDArray, tile_px: int = TILE_PX) -> Background:
     """
     tile_px = min(tile_px, *image.shape)
     sum_type = accumulator_type(image.dtype)
-    # float32 holds 16 pixels of two bytes to the last digit.
+    # float32 represents 16 times a 16-bit pixel exactly.
     sample_type = np.float64 if sum_type == np.float64 else np.float32
     samples: NDArray = np.empty(INITIAL_SAMPLES, sample_type)
     level, noise = _tiles(image, tile_px, np.empty(image.shape[1], sum_type), samples)

@@ -180,8 +180,8 @@ class AttitudeFilter:
         Standard deviation that is added in quadrature to every solution's noise, for errors that
         its stars share but other solutions do not
     gate_sigma
-        A solution is refused if its distance is less probable than so many sigma of a scalar
-        Gaussian
+        A solution is refused if its distance is less probable than this number of sigmas of a
+        scalar Gaussian
     tracker
         Errors that solutions share
     jumps

@@ -293,8 +293,8 @@ class Layout(NamedTuple):
     """Order of the error states: attitude (3), bias (3), then those in use, then the slow error (3) of each head.
 
     The slow error is normalized: its standard deviation is 1, and each solution has the matrix that maps it to an
-    angle. Heads are the star cameras on the body. The states of head n above 0 have its number in their name:
-    "mounting_1" is relative to the mounting of the first head.
+    angle. Heads are the star cameras on the body, numbered from 0. The states of further heads have the head's number
+    in their name: "mounting_1" is the mounting of head 1 relative to that of head 0.
 
     Attributes
     ----------

@@ -266,7 +266,7 @@ def excess_noise(least: Floats, measured: Floats | Ints) -> float:
 
 
 def expected_misfit(measured: Floats | Ints) -> Floats:
-    """(T,) greatest misfit of the true word to so many measurements that is not suspicious.
+    """(T,) greatest misfit of the true word that is not suspicious, for each number of measurements.
 
     Half a chi-square has the mean n / 2 and the variance n / 2. Three standard deviations are allowed, and gross
     errors: one, or one in six measurements.

@@ -105,8 +105,8 @@ def evaluate(
         Its evidence is -inf if fewer than MIN_EVIDENCE_MATCHES LEDs match, or if the focal length is out of its range
     """
     # 1. Match.
-    # Error of the pair's attitude, in units of a detection's variance: 1/2 from its midpoint (beside the detection's
-    # own 1), and 2 / separation^2 per squared distance from the midpoint from its direction; a focal length from the
+    # Error of the pair's attitude, in units of a detection's variance: 1/2 from the midpoint (added to the detection's
+    # own 1), and 2 / separation^2 from the direction, per squared distance from the midpoint; a focal length from the
     # pair adds the same along that distance.
     midpoint = middle(detections.tangent, a, b)
     direction_variance = 2 / separation(detections.tangent, a, b) ** 2

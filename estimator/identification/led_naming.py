@@ -34,7 +34,7 @@ STRANGER = (
     14.0  # misfit of a light that fits no LED: a reflection, or a track that changed its LED
 )
 TRUSTED = 5.0  # greatest excess misfit of the names, times the square root of their number
-MAX_HYPOTHESES = 150  # with so many or more, the lights are undecided
+MAX_HYPOTHESES = 150  # with this number or more, the lights are undecided
 UNDECIDED = "codes: more than one attitude fits the lights"
 CONTRADICTED = "codes: the names of the lights contradict their places"
 
@@ -235,7 +235,7 @@ def _attitudes(
 
 
 def _frames(u: Floats, v: Floats) -> Floats:
-    """(M, 3, 3) axes, in rows, of pairs of unit vectors: their bisector, the third axis, and their normal."""
+    """(M, 3, 3) axes of pairs of unit vectors, in rows: the bisector b, n x b, and the normal n to both vectors."""
     middle = u + v
     normal = np.cross(u, v)
     middle = middle / np.linalg.norm(middle, axis=1, keepdims=True)

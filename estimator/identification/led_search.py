@@ -127,7 +127,7 @@ def _search(
     best
         The best hypothesis
     rival_dex
-        Evidence of the best hypothesis with another attitude, log10
+        Evidence of the strongest rival, which is the best hypothesis with a different attitude; log10
     """
     none = np.empty(0, np.int64)
     best = LedHypothesis(none, none, np.eye(3), -np.inf)

@@ -105,7 +105,7 @@ def attitude_dex(detections: Detections, a: int, b: int) -> float:
         + log10(sigma**2 / 2 * direction_sigma)
         - prior_volume_dex(detections)
     )
-    # An uncertain focal length is as well known as the roll.
+    # The pair determines an uncertain focal length with the same relative error as the roll.
     if detections.focal_uncertainty > 0:
         dex += log10(sqrt(2 * pi) * direction_sigma)
     return dex

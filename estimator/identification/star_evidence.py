@@ -251,7 +251,7 @@ def _match(
 
 @jit
 def focal_gain_dex(detections: Detections, sky: SkyIndex, hypothesis: Hypothesis) -> float:
-    """log10 of the Bayes factor of a free focal length over that of a hypothesis, with the same matches.
+    """log10 of the Bayes factor of a free focal length to the hypothesis's own focal length, with the same matches.
 
         fall / 2 / ln 10  +  log10( sqrt(2 pi) sigma / (2 u) )
 

@@ -84,9 +84,9 @@ def lost_in_space(
 ) -> Solution:
     """Identify the detections and solve the attitude: the whole search (see the module's steps).
 
-    A few bright stars among many faint false lights are found with the FEW brightest detections, stars among brighter
-    false lights with the `max_detections` brightest. Each of the two searches must reach twice the evidence, so that
-    together they accept a chance match as rarely as one would.
+    One search uses the FEW brightest detections: it finds a few bright stars among many faint false lights. Another
+    uses the `max_detections` brightest: it finds stars among brighter false lights. Each must reach twice the evidence,
+    so that both together accept a chance match as rarely as a single search would.
 
     Parameters
     ----------

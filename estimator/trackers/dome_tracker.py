@@ -170,7 +170,7 @@ def led_sigma_rad(leds: LedMap, lever: Lever) -> Floats:
     """Return the (L,) standard deviation of the direction to each LED from the camera, from the error of its position.
 
     Equal errors of all LEDs are divided by the least distance of any LED from the camera. Otherwise the rms across the
-    line from the bearing is divided by the LED's own distance less the lever.
+    line from the bearing is divided by the LED's own distance minus the lever.
     """
     radius_m = np.linalg.norm(leds.position_m, axis=1)
     lever_m = float(np.linalg.norm(lever.camera_body_m))

@@ -411,7 +411,7 @@ CHANGED = 0.9  # share of a star's information below which the field is fitted a
 
 
 def are_small(sigma_rad: Floats) -> bool:
-    """Return whether the errors of any companion are smaller than those of all centroids, so that none can show."""
+    """Return whether companions are undetectable: their greatest error is below the error of every centroid."""
     return bool(sigma_rad.min(initial=np.inf) > ERROR_RAD.max())
 
 
@@ -471,10 +471,10 @@ def with_companions(
 def prediction_by_others(
     residual: Floats, jacobian: Floats, information: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the (K, 2) residuals of stars from the attitude of all others, and the (K, 2, 2) covariances of these.
+    """Predict each star from all others: return its (K, 2) residuals, and the predictions' (K, 2, 2) covariances.
 
-    With the information N of the attitude and J^T W J of one star, the attitude without that star moves by
-    -(N - J^T W J)^-1 J^T W r, and predicts it with the covariance J (N - J^T W J)^-1 J^T.
+    N is the information of the attitude from all stars, J^T W J that of one star. Without this star the attitude moves
+    by -(N - J^T W J)^-1 J^T W r, and the star's predicted position has the covariance J (N - J^T W J)^-1 J^T.
 
     Parameters
     ----------

@@ -208,7 +208,7 @@ class FieldMatcher:
         return near <= 1 + 2 * by_chance
 
     def misfits(self, solution: Solution, centroids: Centroids) -> bool:
-        """Return whether about as many stars are beside detections, beyond their errors, as match them.
+        """Return whether stars that just miss a detection are about as many as stars that match one.
 
         The camera model is then wrong (a rotating camera with a rolling shutter, a strong distortion). The stars that
         match are those of a part of the field, and their attitude is that of this part.

@@ -175,7 +175,7 @@ def delayed_fractions(transfers: int, cti: float) -> Floats:
 
 @jit(parallel=True)
 def _delay_rows(electrons: NDArray[Any], fraction: Floats) -> None:
-    """Apply the parallel loss in place: row y gathers the late charge of the rows below it in number."""
+    """Apply the parallel loss in place: row y receives delayed charge of the rows with lower numbers."""
     height, width = electrons.shape
     for block in numba.prange((width + BLOCK - 1) // BLOCK):
         first = block * BLOCK

@@ -213,7 +213,7 @@ def count(row: Any, state: Any, guide: Any, memory: Scratch) -> Any:
                     float64(row[x]), (float64(int64(words[x] >> uint16(6))) + more) / BUCKETS
                 )
             )
-    # 4. Counts back to the row; the loop without large means has no branch.
+    # 4. Write the counts to the row. Without large means, use a loop without a branch.
     if large == 0:
         for x in range(width):
             row[x] = float32(found[x])

@@ -60,7 +60,7 @@ class Tiff:
 
     @property
     def order(self) -> str:
-        """Byte order as a format character of struct."""
+        """Byte order as a format character of the module struct."""
         return "<" if self.data.startswith(b"II") else ">"
 
     @property
@@ -69,7 +69,7 @@ class Tiff:
         return self.number("H", 2) == 43
 
     def number(self, kind: str, at: int) -> int:
-        """The integer at an offset, of this type of struct."""
+        """The integer at an offset; `kind` is its format character in the module struct."""
         return int(struct.unpack_from(self.order + kind, self.data, at)[0])
 
     def entries(self, at: int | None = None) -> Iterator[TiffEntry]:

@@ -238,7 +238,7 @@ def channels_last(path: Path, pixels: NDArray) -> NDArray:
 def header_values(
     *headers: Any,
 ) -> tuple[bool | None, datetime.datetime | None, float | None, float | None]:
-    """FitsImage's fields beside the pixels, by the first header that has them: the image's, then the file's."""
+    """FitsImage's fields other than the pixels, by the first header that has them: the image's, then the file's."""
     found: dict[str, str] = {}
     for header in reversed(headers):
         for key in ("ROWORDER", "DATE-OBS", *EXPOSURE_KEYS, *TEMPERATURE_KEYS):
@@ -286,7 +286,7 @@ class ViewedImage:
         False for a FITS file without ROWORDER, whose last row is then taken for the highest, as
         the standard recommends
     exposure_s, temperature_c
-        Of a FITS header; None if unknown
+        Exposure time and temperature in a FITS header; None if unknown
     """
 
     pixels: NDArray

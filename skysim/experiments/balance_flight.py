@@ -368,7 +368,7 @@ def excited_by_swing(scene: Scene, tilt_deg: float, number: int) -> Scene:
 
 
 def with_frames(scene: Scene, duration_s: float) -> Scene:
-    """The scene with frames at its rate over this time."""
+    """The scene with as many frames, two at least, as its frame rate gives in a duration."""
     frames = max(int((duration_s - scene.exposure.first_s) * scene.exposure.rate_hz), 2)
     return with_config(scene, "exposure", frames=frames)
 

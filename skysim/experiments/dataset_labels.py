@@ -116,7 +116,7 @@ class Labeller(NamedTuple):
 
 
 def labeller(scene: Scene) -> Labeller:
-    """The labeller of a scene, made once for its frames: it takes as long as a tenth of them."""
+    """The labeller of a scene. Build it once for all frames: building takes a tenth of the time of a frame."""
     config = scene.camera.detector
     threshold_e = max(math.hypot(config.read_noise_e, config.reset_noise_e), 1.0)
     return Labeller(assumed_camera(scene), assumed_settings(scene), threshold_e)
@@ -160,9 +160,10 @@ def least_value(frame: Frame) -> float:
 
 
 def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Floats]:
-    """(N,) labels of the sources, brightest first, and the (M, 2) detections of none of them.
+    """(N,) labels of the sources, brightest first, and the (M, 2) detections that belong to no source.
 
-    A detection belongs to the brightest source whose distance is at most SAME_LIGHT_PX and half of its streak.
+    A detection belongs to the brightest free source whose distance is at most SAME_LIGHT_PX plus half the length of
+    its streak.
     """
     order = np.argsort(-truth.electrons, kind="stable")
     rows = np.zeros(len(order), SOURCE)

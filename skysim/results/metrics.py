@@ -296,8 +296,8 @@ def quantile_ranks(count: int, probability: float) -> tuple[int, int] | None:
 
         P(X_(r) <= q <= X_(s)) >= B(s - 1) - B(r - 1),    ranks from 1, B the distribution function of Bin(n, p).
 
-    Of all pairs of sufficient confidence this is the one with the fewest values between them, and of these the one
-    whose two tails differ least.
+    Among the pairs of sufficient confidence the result has the fewest values between its ranks; among equal ones, its
+    two tails differ least.
     """
     middle = count * probability
     spread = math.sqrt(count * probability * (1 - probability))
@@ -391,7 +391,7 @@ QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
 }
 
 
-# Quantities; of others less is better.
+# Quantities of which more is better; of all others, less.
 MORE_IS_BETTER = ("stars", "detected", "matched", "availability")
 # Quantities that are responses by themselves, with the statistic that this name stands for.
 DEFAULT_STATISTICS = {"nees": "mean", "centroid_px": "rms", "streak_px": "median"}

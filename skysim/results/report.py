@@ -60,9 +60,9 @@ def paragraphs(block: Block, level: int, names: Iterator[str]) -> Iterator[str]:
     Parameters
     ----------
     level
-        Of a section's heading
+        Level of a section's heading
     names
-        Of the figures from this one on
+        File names of this figure and those after it
     """
     match block:
         case Section(title=title, folded=folded):
@@ -275,7 +275,7 @@ def console() -> Any:
 
 
 def terminal_width() -> int:
-    """Characters in a line: of the terminal, or WIDE if the output goes to a file."""
+    """Characters in a line of the terminal; at least WIDE if the output goes to a file."""
     from rich.console import Console
 
     shown = Console()

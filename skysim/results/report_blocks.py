@@ -38,7 +38,7 @@ class Column(NamedTuple):
     Attributes
     ----------
     format
-        Of its numbers, such as ".3f"
+        Format of its numbers, such as ".3f"
     kind
         Numbers are aligned to the right; an aside is a longer text, on a terminal a line below
         the table
@@ -172,7 +172,7 @@ class Section(Block):
     Attributes
     ----------
     id
-        Of the heading, for links
+        Id of the heading, for links
     folded
         Closed until a reader opens it
     """

@@ -41,7 +41,7 @@ class Recorder:
     Attributes
     ----------
     seconds
-        Of all frames, by stage
+        Computing times of all frames, by stage
     shown
         The last solved frame, or the first if none was solved
     """

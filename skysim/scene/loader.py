@@ -100,7 +100,7 @@ def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def with_heads(tree: dict[str, Any]) -> dict[str, Any]:
-    """The raw scene with complete heads: the keys of each head over those of the main camera. Raises InputError."""
+    """The raw scene with complete heads: each section takes missing keys from the main camera. Raises InputError."""
     heads = tree.get("heads")
     if not isinstance(heads, list):
         return tree
@@ -179,7 +179,7 @@ def over_base(
     own: dict[str, Any],
     camera_of: Callable[[Any], dict[str, Any]] = lambda name: preset(str(name)),
 ) -> dict[str, Any]:
-    """The keys of a scene over those of its base.
+    """The keys of a scene merged over the keys of its base.
 
     A camera preset in `own` also removes the keys of the base that it defines. `motion.start: profile` removes the
     rate of the base, which the profile defines.
@@ -369,7 +369,7 @@ def read_layers(path: Path, derived: tuple[Path, ...] = ()) -> list[Layer]:
 
 
 def merged(layers: list[Layer]) -> dict[str, Any]:
-    """A copy of the keys of a scene, merged over those of its base scenes."""
+    """A copy of the keys of a scene, merged over the keys of its base scenes."""
     tree = functools.reduce(over_base, (layer.tree for layer in reversed(layers)))
     return copy.deepcopy(tree)
 

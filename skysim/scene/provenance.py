@@ -116,7 +116,7 @@ def preset_camera(preset: Located) -> dict[str, Any]:
 
 
 def with_preset(camera: dict[str, Any]) -> dict[str, Any]:
-    """The keys of a camera over those of its preset, and the keys of a calibration over both."""
+    """The keys of a camera merged over the keys of its preset, and the keys of a calibration merged over both."""
     own = {
         key: value for key, value in camera.items() if key not in ("preset", "calibration")
     }

@@ -154,7 +154,7 @@ def factors(variances: Floats, rng: np.random.Generator) -> Floats:
 
 
 def air_mass(altitude_rad: Floats) -> Floats:
-    """Air masses along the line of sight over that at the zenith: X = 1 / sin(h + 244 / (165 + 47 h^1.1)).
+    """Air masses along the line of sight, relative to the zenith: X = 1 / sin(h + 244 / (165 + 47 h^1.1)).
 
     h is the apparent altitude in degrees. X is 38.75 on the horizon, and the same below it.
     Source: Pickering (2002), DIO 12, 20.

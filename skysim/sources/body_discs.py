@@ -59,7 +59,7 @@ class DiscSurface(NamedTuple):
     phase_rad
         Phase angle
     earthshine
-        Light of the disc as lit from the observer's side, over that of the sunlit disc
+        Ratio of the light of the disc lit from the observer's side to that of the sunlit disc
     """
 
     law: int
@@ -388,11 +388,11 @@ def moon_magnitude(distance_km: float, sun_au: float, phase_deg: float) -> float
 
 
 def earthshine_fraction(moon: Place) -> float:
-    """Light of the earthlit Moon over that of the sunlit Moon.
+    """Ratio of the light of the earthlit Moon to that of the sunlit Moon.
 
-    Seen from the Moon, the Earth's phase angle is 180 degrees less the Moon's. It shines on the Moon from the
-    observer's direction, so the earthlit Moon is a full Moon (phase angle 0), fainter by the magnitude of the Earth
-    less that of the Sun, both as seen from the Moon.
+    The phase angles of the Earth, seen from the Moon, and of the Moon add up to 180 degrees. The Earth shines on the
+    Moon from the observer's direction, so the earthlit Moon is a full Moon (phase angle 0). It is fainter than the
+    sunlit full Moon by the difference in magnitude of Earth and Sun, both seen from the Moon.
     """
     sun_au = moon.sun_distance_km / AU_KM
     moon_au = moon.distance_km / AU_KM
@@ -417,7 +417,10 @@ def mercury(phase_deg: float, _place: Place, _tt_jd: float) -> float:
 
 
 def venus(phase_deg: float, _place: Place, _tt_jd: float) -> float:
-    """Two polynomials: near inferior conjunction the clouds scatter sunlight forward."""
+    """V magnitude of Venus at 1 au from Sun and observer.
+
+    Two polynomials: near inferior conjunction the clouds scatter sunlight forward.
+    """
     far = (-4.384, -1.044e-3, 3.687e-4, -2.814e-6, 8.938e-9)
     return polynomial(
         phase_deg, far if phase_deg < 163.7 else (236.05828, -2.81914, 8.39034e-3)
@@ -436,7 +439,9 @@ def jupiter(phase_deg: float, _place: Place, _tt_jd: float) -> float:
 
 
 def saturn(phase_deg: float, place: Place, _tt_jd: float) -> float:
-    """Globe and rings: -8.914 - 1.825 sin b + 0.026 a - 0.378 sin b exp(-2.25 a).
+    """V magnitude of Saturn's globe and rings at 1 au from Sun and observer.
+
+        -8.914 - 1.825 sin b + 0.026 a - 0.378 sin b exp(-2.25 a)
 
     b is the geometric mean of the latitudes of Sun and observer, 0 if the rings are seen from their unlit side.
     """
@@ -448,7 +453,10 @@ def saturn(phase_deg: float, place: Place, _tt_jd: float) -> float:
 
 
 def uranus(phase_deg: float, place: Place, _tt_jd: float) -> float:
-    """Fainter toward the equator, by the mean of the planetographic latitudes of Sun and observer."""
+    """V magnitude of Uranus at 1 au from Sun and observer.
+
+    The poles are brighter: the magnitude depends on the mean planetographic latitude of Sun and observer.
+    """
     latitudes_deg = np.degrees(
         np.arctan(np.tan(latitudes_rad("uranus", place)) / (1 - URANUS_FLATTENING) ** 2)
     )
@@ -457,7 +465,7 @@ def uranus(phase_deg: float, place: Place, _tt_jd: float) -> float:
 
 
 def neptune(phase_deg: float, _place: Place, tt_jd: float) -> float:
-    """Neptune brightened from 1980 to 2000."""
+    """V magnitude of Neptune at 1 au from Sun and observer. Neptune brightened from 1980 to 2000."""
     year = 2000 + (tt_jd - J2000_JD) / JULIAN_YEAR_DAY
     at_full = min(max(-6.89 - 0.0054 * (year - 1980), -7.0), -6.89)
     return at_full + (

@@ -228,7 +228,7 @@ class Viewpoint:
         return observe_at(self.time_at(t_s), self.state_at(t_s))
 
 
-# The Earth as an ellipsoid: what it hides, and how much of the Sun it leaves to a satellite. The ellipsoid (WGS 84) is
+# The Earth as an ellipsoid: what it hides, and how much of the Sun a satellite sees. The ellipsoid (WGS 84) is
 # a unit sphere in coordinates in which z is stretched, and lines stay lines. Its axis is taken for the GCRS's z (a
 # tenth of a degree off in 2020, which displaces the limb by up to 40 m). The air is left out.
 
@@ -265,11 +265,11 @@ def hidden_by_earth(
 
 
 def sunlit_fraction(place_m: Floats, sun_m: Floats) -> Floats:
-    """(...,) fraction of the Sun's disc that the Earth leaves to places (..., 3): 1 in the light, 0 in the umbra.
+    """(...,) fraction of the Sun's disc that the Earth does not hide at places (..., 3): 1 in sunlight, 0 in the umbra.
 
     The limb crosses the Sun's disc as a straight line, at h solar radii from its center toward the Earth:
-    f = 1/2 + (h sqrt(1 - h^2) + arcsin h) / pi, for |h| < 1. The Sun's elevation above the limb is that on the
-    stretched sphere (within 0.4 % of it). Refraction and the limb's curvature across the Sun (0.7 % of the light in a
+    f = 1/2 + (h sqrt(1 - h^2) + arcsin h) / pi, for |h| < 1. The Sun's elevation above the limb is computed on the
+    stretched sphere (to 0.4 %). Refraction and the limb's curvature across the Sun (0.7 % of the light in a
     low orbit) are left out. Source: Montenbruck & Gill 2000, Satellite Orbits, section 3.4.2.
     """
     to_sun = sun_m - place_m

@@ -23,7 +23,7 @@ from skysim.core.constants import JULIAN_YEAR_DAY
 from skysim.core.time import in_utc
 from skysim.tracking.tracker_interface import SOLVED, Answer, Picture, Setup
 
-FIELD_MARGIN = 1.1  # field of the pattern database over that of the camera
+FIELD_MARGIN = 1.1  # field of the pattern database, relative to that of the camera
 OPTIONS = ("fast", "sigma", "brightest", "limit_mag")
 
 

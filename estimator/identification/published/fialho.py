@@ -211,7 +211,7 @@ def fialho_4(
     options
         Keywords of `Options`. `magnitude`, if the index has magnitudes too, shortens the lists. `boresight_ref` and
         `within_rad` are the prior boresight: candidates are within that angle of it, which must therefore include half
-        the field's diagonal beside the error of the prior
+        the field's diagonal and the error of the prior
 
     Returns
     -------

@@ -86,7 +86,7 @@ def match_assumptions(
     cost
         (K,) costs in squared standard deviations
     matches
-        (K,) numbers of matches beside the pair
+        (K,) numbers of matches in addition to the pair
     """
     a, b = primary.rows
     separation_rad = angle(stars.vectors_cam[a], stars.vectors_cam[b])

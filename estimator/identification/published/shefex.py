@@ -340,8 +340,8 @@ def _partner(
 ) -> int:
     """The catalog star whose three angles to the base fit those of observed star n, or -1.
 
-    Of several, the one of the least sum of cosine differences. With a slim base three angles do not distinguish a place
-    from its mirror image, so that the side of the base line is tested too.
+    If several fit, the one with the least sum of cosine differences. With a slim base three angles do not distinguish a
+    place from its mirror image, so that the side of the base line is tested too.
 
     Parameters
     ----------

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 # Loaded scenes: name and command-line overrides, for the locations in error messages.
 Loaded = tuple[str, dict[str, str]]
 LOADED: list[Loaded] = []
-TYPED: dict[str, str] = {}  # the option by key of the scene, of keys that an option has set
+TYPED: dict[str, str] = {}  # scene keys that an option has set, and the option
 
 
 def complete_scene(incomplete: str) -> list[str]:
@@ -205,7 +205,7 @@ def datetime_from_iso(text: str | None) -> datetime.datetime | None:
 # Errors with the option that a user typed in place of the key.
 
 
-OPTIONS = {  # option by key of a function's parameter
+OPTIONS = {  # the option of each function parameter, by the parameter's key in messages
     "overrides": "--set",
     "programs": "--program",
     "trackers": "--tracker",

@@ -190,7 +190,10 @@ def read_and_solve(path: Path, solver: Solver, annotated: Path | None) -> dict[s
 
 
 def load_picture(path: Path, solver: Solver) -> images.ViewedImage:
-    """The picture as it is viewed, in monochrome. Raises InputError or ImageError if it cannot be solved."""
+    """Read a picture in monochrome, in the orientation in which it is viewed.
+
+    Raises InputError or ImageError if the file cannot be read or does not suit the solver.
+    """
     picture = images.read_picture(path)
     check_image(path, picture.pixels, solver)
     pixels = images.monochrome(picture.pixels)
@@ -236,7 +239,7 @@ def solve_picture(
     outcomes = []
     centroids = dict[
         int, Centroids
-    ]()  # by the pixels of a reading; they serve all fields of view
+    ]()  # by id of the pixels, shared by all fields of view tried on them
     for hypothesis in tried:
         reading = id(hypothesis.pixels)
         solved = solve_array(

@@ -32,7 +32,7 @@ from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 
 FACTORS = (8, 4, 2)  # sides of the binned squares; the most reduced picture is the fastest
 MIN_SIDE_PX = 200  # least side of a binned picture
-# Least median area of so many lights of the binned picture; a sharp star has 10 pixels.
+# Number of the brightest lights of the binned picture, and their least median area; a sharp star has 10 pixels.
 BRIGHTEST = 12
 MIN_AREA_PX = 30
 MAX_SIGMA_PX = 20.0  # greatest error that `Centroids.check_values` allows
@@ -95,7 +95,7 @@ EXTRA_TRIES = 1000
 MIN_LIGHTS = (
     10  # least lights of a half; fewer were searched in all combinations with the others
 )
-# Number of searches of a half; of the upper half, the likeliest, and of other centroids.
+# Number of searches of a half, and of the upper half (the likeliest) and of other centroids.
 EFFORTS = 1
 MORE_EFFORTS = 2
 UNEVEN = (
@@ -126,7 +126,7 @@ class Retry(NamedTuple):
 
 
 def retries(pixels: NDArray, centroids: Centroids, settings: Settings) -> Iterator[Retry]:
-    """The retries of a picture, with the centroids in its pixels."""
+    """Yield the retries of a picture; `centroids` are those of the refused attempt, in the unchanged picture."""
     yield from halves(pixels, centroids, "")
     flat = without_clouds(pixels, settings)
     if len(flat):
@@ -181,7 +181,7 @@ def without_clouds(pixels: NDArray, settings: Settings) -> Centroids:
         light, cv2.MORPH_TOPHAT, np.ones((TOPHAT_PX, TOPHAT_PX), np.uint8)
     )
     try:
-        # The edges of trees leave as many lights as there are stars.
+        # The edges of trees add about as many lights as there are stars.
         more = replace(settings, max_blobs=2 * settings.max_blobs)
         found = detect_and_centroid(flat, camera_of(pixels), more, Clock(), ROUND)
         return replace(found, sigma_px=np.hypot(found.sigma_px, FLAT_SIGMA_PX))

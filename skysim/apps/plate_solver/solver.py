@@ -524,12 +524,12 @@ def same_attitude(first: Attitude, second: Attitude) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class PlateSolution:
-    """Pointing of a picture as it is viewed; the angles are None unless `status` is solved.
+    """Pointing of a picture in the orientation in which it is viewed; the angles are None unless `status` is solved.
 
     Attributes
     ----------
     ra_deg, dec_deg
-        Of the image center, ICRS
+        Right ascension and declination of the image center, ICRS
     roll_deg
         Position angle of the image's up, north through east
     fov_deg

@@ -206,7 +206,7 @@ def scattering(separation_deg: float | Floats) -> Floats:
 
 
 def air_mass(zenith_deg: float) -> float:
-    """Air mass along the line of sight over that at the zenith: (1 - 0.96 sin^2 Z)^-1/2 (KS91 eq. 3)."""
+    """Air mass along the line of sight, relative to the zenith: (1 - 0.96 sin^2 Z)^-1/2 (KS91 eq. 3)."""
     return float((1 - 0.96 * math.sin(math.radians(zenith_deg)) ** 2) ** -0.5)
 
 

@@ -26,7 +26,7 @@ from skysim.sources.camera_orbit import TO_SPHERE
 from skysim.sources.dome.surface import perpendicular
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
 
-NODE_PX = 4.0  # spacing of the nodes: the limb is blurred over so many pixels
+NODE_PX = 4.0  # spacing of the nodes: the limb is blurred over this number of pixels
 AIR_M = 8e3  # scale height of the air
 # Bottom and top of the airglow, in radii of the Earth.
 LAYER = (1 + 85e3 / EARTH_RADIUS_M, 1 + 95e3 / EARTH_RADIUS_M)

@@ -35,14 +35,14 @@ CUT_SIGMA = (
     4.0  # a box ends here beyond the disk: 3e-5 of the peak of a resolved disk are beyond
 )
 MAX_WAVES = 512  # along an axis of a box; a larger image is softened
-# Images up to so many times as wide as a point's, and wider ones, whose waves are weaker: level of the lens's transfer
-# function below which waves are left out, and samples a pixel over the frequency that the lens passes by 1e-3. The
-# image is then within 2e-4 of the peak.
+# Images at most POINT_LIKE times as wide as a point's, and wider ones, whose waves are weaker: level of the lens's
+# transfer function below which waves are left out, and samples a pixel over the frequency that the lens passes by 1e-3.
+# The image is then within 2e-4 of the peak.
 POINT_LIKE = 1.7
 ACCURACY = {True: (2e-5, 8), False: (2e-4, 4)}
 PAD = 1  # empty pixels about a table, for the four points of the cubic
 ENTRIES = 64  # of the Bessel table, per unit of its argument
-# (from this half width, boxes in steps of so many pixels)
+# least half width, and step of the half widths of wider boxes, in pixels
 COARSE_HALF_PX = ((100, 16), (24, 4), (0, 1))
 
 
@@ -68,7 +68,7 @@ class EllipseBox(NamedTuple):
 def reach_px(psf: Psf, camera: CameraConfig, radius_px: Any, sigma_px: Any) -> Any:
     """Reach in pixels, pixels' corners included, of the images of disks of these largest radii.
 
-    `sigma_px` is that of a Gaussian blur beside the lens's own.
+    `sigma_px` is that of a Gaussian blur in addition to the lens's own.
     """
     # Lens, fading wings, disk, blur, and the pixel's half diagonal.
     radius, sigma = EXTENT[psf.kind](psf, camera)
@@ -147,7 +147,7 @@ class EllipseDisk(NamedTuple):
     blur
         Radius of the defocus disk
     sigma
-        Standard deviation of a Gaussian blur beside the lens's
+        Standard deviation of a Gaussian blur in addition to the lens's
     fade
         Reach of wings, where they are faded to zero; 0 for a lens without wings
     odd

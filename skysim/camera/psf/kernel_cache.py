@@ -172,7 +172,7 @@ class SourceSizes(NamedTuple):
     Attributes
     ----------
     sigma_px
-        Standard deviations of the Gaussian blurs beside the lens's
+        Standard deviations of the Gaussian blurs in addition to the lens's
     emitter_px, defocus_px
         Radii of the emitters' disks and of the defocus disks; 0 for sources far outside the frame
     """
@@ -333,7 +333,7 @@ def ellipse_disks(
     axes_px
         (M, 2) semi-axes of the disks' images, the larger one first
     blur_px, sigma_px
-        (M,) radii of the defocus disks, and sigmas of the Gaussian blurs beside the lens's
+        (M,) radii of the defocus disks, and sigmas of the Gaussian blurs in addition to the lens's
     variance_px2
         (M,) s^2 of the blur behind which the disks are seen
     """

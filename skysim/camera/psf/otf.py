@@ -166,9 +166,9 @@ def measured(psf: MeasuredPsfConfig, camera: CameraConfig, fx: Floats, fy: Float
 
 
 def cell_positions_px(psf: MeasuredPsfConfig) -> tuple[Floats, Floats]:
-    """x of a measured table's columns and y of its rows in pixels, from its center of gravity."""
+    """x of the columns and y of the rows of a measured table, in pixels from its center of gravity."""
     cells = read_cells(psf.file)
-    # A table's cells are even steps; its center of gravity is the origin.
+    # Cells are equally spaced. The origin is the center of gravity.
     position_px = np.arange(len(cells)) / psf.oversampling
     center_x = cells.sum(axis=0) @ position_px
     center_y = cells.sum(axis=1) @ position_px
@@ -217,7 +217,7 @@ def read_cells(file: str) -> Floats:
 
 
 def cell_response(u: Floats) -> Floats:
-    """Transfer function of Keys' interpolation over that of a cell; u in cycles a cell. 0 at whole u except 0.
+    """Transfer function of Keys' interpolation divided by that of a cell; u in cycles a cell. 0 at whole u except 0.
 
     Keys' kernel (a = -1/2) has the transform (3 s1^2 - 3 s2^2 - s2 + s4) / (pi u)^2 with sk = sinc(k u).
     """

@@ -44,7 +44,7 @@ SKY = Ellipsoid(np.zeros(3), np.full(3, SKY_RADIUS_M))
 MAX_STARS = 300
 LED_RADIUS_M = 5e-3  # larger than the true disk, which would be less than a pixel
 LEVELS = 12  # steps of brightness
-DIM = 0.15  # brightness of the darkest LED over that of the brightest
+DIM = 0.15  # brightness of the darkest LED, relative to the brightest
 RIM_M = 0.03
 # Number of vertices of the dome's mesh around its axis and down from its top.
 SECTORS = 72
@@ -273,8 +273,8 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
 def visible_shell_m(inside: Surface, around: Floats) -> Floats:
     """(RINGS, SECTORS, 3) points at which rays from the bearing meet a surface, from its upper edge to its rim.
 
-    Edge and rim are found to a fifth of a degree, between 0 and 80 deg from the zenith and above a third of the
-    surface's height.
+    Rays are tested in steps of a fifth of a degree, from 0 to 80 deg from the zenith. Points lower than about a third
+    of the surface's height are ignored.
 
     Parameters
     ----------

@@ -44,7 +44,7 @@ STEPS = 60  # most scoring steps
 CONVERGED = 1e-3  # length of the last step, in standard deviations
 DIFFERENCE = 1e-4  # step of the numerical derivatives
 RESOLVED = 5.0  # standard errors by which a scatter must exceed the noise
-MEDIAN_COST = 1.65  # standard error of a variance from medians over that from squares
+MEDIAN_COST = 1.65  # ratio of the standard errors of a variance from medians and from squares
 HOT_SIGMAS = (
     8.0  # core widths above the median beyond which pixels are hot, at the start of the fit
 )
@@ -275,7 +275,7 @@ def prnu(
     Parameters
     ----------
     dark_ratio
-        Dark current at the flats' temperature over that of the darks
+        Ratio of the dark currents at the temperatures of the flats and of the darks
     """
     first_rate = light_rate(flats, transfer, "first_dn", first, dark_ratio)
     second_rate = light_rate(flats, transfer, "second_dn", second, dark_ratio)

@@ -233,7 +233,7 @@ def describe(setting: Setting) -> str:
 DARKS = 16  # frames at each exposure of the darks
 PAIR = 2  # frames at each exposure of the flats
 DARK_PARTS = (0.01, 0.3, 1.0)  # exposures of the darks over the longest one
-# Dark current in the longest dark: in squared read noises, and at least so many electrons.
+# Least dark current in the longest dark: in squared read noises, and in electrons.
 DARK_NOISES = 8.0
 LEAST_DARK_E = 200.0
 WARMER_C = 10.0

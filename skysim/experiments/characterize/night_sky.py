@@ -246,7 +246,7 @@ MAX_PEAK = 0.8  # greatest peak of such a star, relative to saturation
 LEAST_STARS = 20
 LEAST_FRAMES = 3
 LEAST_TRAILED = 3
-MEDIAN_COST = 1.25  # standard error of a median over that of a mean
+MEDIAN_COST = 1.25  # ratio of the standard errors of a median and of a mean
 MAX_STRETCH = 0.25  # greatest stretch of the images, relative to their variance
 LENS = ("focal_px", "center_x_px", "center_y_px", "k1", "k2", "p1", "p2", "k3")
 
@@ -374,7 +374,7 @@ def trail_px2(stars: StarImages) -> tuple[float, float]:
 
 
 def without_trail(stars: StarImages) -> StarImages:
-    """The images without the effect of a common trail on their mean variance: half of the stretch, less its error."""
+    """The images without the effect of a common trail on their mean variance: half of the stretch minus its error."""
     count = max(len(stars.chi2), 1)
     noise2 = (
         float(np.sum(np.var(stars.stretch_px2, axis=0))) * MEDIAN_COST**2 / count

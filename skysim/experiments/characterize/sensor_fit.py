@@ -134,7 +134,7 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
 
 
 def rate_ratio(transfer: Transfer, own: int, chosen: int) -> float:
-    """Dark current at one temperature over that at another, of the same pixels."""
+    """Ratio of the dark currents of the same pixels at two temperatures, `own` to `chosen`."""
     rates = transfer.values[FIRST_DARK:]
     return 1.0 if own == chosen else float(max(rates[own], 0.0) / max(rates[chosen], 1e-12))
 
@@ -177,7 +177,7 @@ def nearest_index(temperatures: Sequence[float | None], temperature_c: float | N
 def best_temperature(
     temperatures: Sequence[float | None], darks: Sequence[Level], transfer: Transfer
 ) -> int:
-    """Index of the temperature whose darks differ most in their charge from dark current."""
+    """Index of the temperature at which the dark charge grows most from the shortest to the longest dark frame."""
 
     def signal(index: int) -> float:
         times = [one.exposure_s for one in darks if one.temperature_c == temperatures[index]]

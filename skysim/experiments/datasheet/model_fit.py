@@ -169,11 +169,11 @@ def lagged(sheet: MeasuredFrames, mean: list[float]) -> tuple[Floats, Floats, Fl
 def field_angle_deg(
     sheet: MeasuredFrames, field: Floats, pixel: Floats, mean: list[float]
 ) -> float:
-    """The correlation angle of the field term: that with the least squares of the lagged products.
+    """The correlation angle of the field term, from a least-squares fit to the lagged products.
 
-    The model is a exp(-angle / field_deg) + b exp(-angle / pixel_deg), with a : b as the terms at rest. Each product is
-    divided by the mean square at its rate, to which its error is proportional. The angle is between a pixel and four
-    fields.
+    The model is a exp(-angle / field_deg) + b exp(-angle / pixel_deg); the ratio a / b is that of the terms at rest.
+    Each product is divided by the mean square at its rate, to which its error is proportional. Angles from one pixel to
+    four fields are tried.
     """
     angles, products, squares = lagged(sheet, mean)
     pixel_deg = sheet.designer.pixel_deg

@@ -67,7 +67,7 @@ def tally(right: Any, false: Any) -> Counts:
 def runs_needed(
     share: float, failures: int = 0, confidence: float = metrics.CONFIDENCE
 ) -> int:
-    """Least number of runs that show a probability of success of `share` at this confidence, with so many failures.
+    """Least number of runs, `failures` of them failed, that show a probability of success of `share` at a confidence.
 
     Without a failure it is ln(1 - c) / ln(share), rounded up; with failures, the number for which the exact upper bound
     of the probability of a failure is 1 - share.

@@ -226,7 +226,10 @@ def residual_figure(run: SurveyRun) -> bytes:
 
 
 def draw_histogram(axes: Any, residual_px: Floats, noise_px: float) -> None:
-    """Density of the residual coordinates, with the Gaussian of the noise: wider, as the fit absorbs some noise."""
+    """Draw the density of the residual coordinates, and the Gaussian of the noise.
+
+    The Gaussian is wider, because the fit absorbs a part of the noise.
+    """
     end_px = float(np.quantile(np.abs(residual_px), 1 - TAIL))
     x_px = np.linspace(-end_px, end_px, 200)
     inside = residual_px[np.abs(residual_px) <= end_px]

@@ -59,7 +59,7 @@ class Options:
     quick
         Fewer runs, wider intervals
     seed
-        Of the first run; the others follow
+        Seed of the first run; further runs use the next integers
     watch
         Progress callback, called with (completed, total)
     """

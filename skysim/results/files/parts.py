@@ -69,9 +69,9 @@ class Price(NamedTuple):
     Attributes
     ----------
     price
-        Of a unit
+        Price of a unit
     fixed
-        once
+        Price that is paid once, for any number of units
     serves
         How many LEDs or channels one part serves
     sigma_m
@@ -99,7 +99,7 @@ class Prices(NamedTuple):
         return self.parts[part]
 
     def survey(self, sigma_m: float, leds: int) -> str:
-        """The cheapest survey of so many LEDs that reaches an error. Raises InputError if none does."""
+        """The cheapest survey of `leds` LEDs that reaches an error. Raises InputError if none does."""
         able = {
             name: one.fixed + leds * one.price
             for name, one in self.parts.items()

@@ -1,4 +1,4 @@
-"""Columns of trials that may be too many for memory: each is read when it is asked for, also from Parquet files.
+"""Columns of trials that may be too many for memory: each is read when it is used, also from Parquet files.
 
 A part is a Parquet file of some hundred thousand trials, written once and never changed. Missing values are null there,
 NaN or None in arrays. Trials are in the order of point and replicate, from which their numbers follow.
@@ -20,25 +20,25 @@ from skysim.core.errors import InputError
 from skysim.core.files import atomic_file
 
 EXTRA = "needs optional packages: pip install 'skysim[export]'"
-KEPT_BYTES = 250_000_000  # columns that are kept for the next one who asks, the oldest are dropped first
+KEPT_BYTES = 250_000_000  # size of the columns kept in memory for further use; the oldest are dropped first
 
 Array = NDArray[Any]
 Source = Callable[[str], Array]  # the column of some rows by its name
 
 
 class Rows(Mapping[str, Array]):
-    """Columns of some rows by name; a column is read when it is asked for.
+    """Columns of some rows by name; a column is read when it is first used.
 
     Attributes
     ----------
     names
-        Of the columns, in order
+        Names of the columns, in order
     sources
-        Of the rows, one after another
+        Functions that return a column of a part of the rows; the parts follow one another
     counts
-        Of the rows of each
+        Number of rows of each source
     order
-        (N,) places of the rows in those of the sources; None for their own order
+        (N,) index of each row in the joined rows of the sources; None to keep the order of the sources
     """
 
     def __init__(
@@ -138,8 +138,10 @@ def write_part(path: Path, columns: Mapping[str, Array]) -> None:
 
 
 def encoding(schema: Any) -> dict[str, Any]:
-    """How columns are written: of a float the bytes of the exponent compress, those of the fraction do not, so bytes of
-    one place are put together, which takes less space and time than a dictionary of numbers that are all different.
+    """Options of the Parquet writer: split bytes for floats, dictionaries for all other columns.
+
+    A float's exponent compresses well, its fraction hardly. Grouping all first bytes, all second bytes and so on takes
+    less space and time than a dictionary of numbers that are all different.
     """
     floats = [field.name for field in schema if str(field.type) == "double"]
     others = [field.name for field in schema if field.name not in floats]

@@ -166,9 +166,9 @@ class Dome(NamedTuple):
     Attributes
     ----------
     name
-        Of the scene
+        Name of the scene
     led_radius_m
-        Of an LED's disk
+        Radius of an LED's disk
     """
 
     name: str

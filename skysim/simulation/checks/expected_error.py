@@ -19,7 +19,7 @@ axes and R the rotation from lab to camera axes:
     LED survey     : S_i = sigma^2 G_i G_i'                  lever survey : E_i = -sigma G_i
     surface survey : E_i = sigma G_i R n_i, n_i the normal   focal length : E_i = relative error (x_i - center)
     survey rotation r : E_i = G_i R (r x P_i)                distortion, star places : difference of the image positions
-    rolling shutter : E_i = velocity times the row's delay from the middle row, less the delay that the tracker assumes
+    rolling shutter : E_i = velocity times the row's delay from the middle row, minus the delay that the tracker assumes
     angular acceleration a : E_i = -J_i a T^2 / 24 against the attitude at mid-exposure: the images are rotated by
         rate t + a t^2 / 2 at the time t from it, and the mean of t^2 / 2 over an exposure T is T^2 / 24
 

@@ -62,7 +62,7 @@ MAX_BEYOND = 0.25  # fraction of images beyond the tracker's matching radius up 
 # A path that is longer than both gives a warning; the second is in widths of the image.
 MAX_SMEAR_PX = 4.0
 MAX_SMEAR_WIDTHS = 2.0
-MAX_DEFOCUS = 0.5  # width of the defocus disk over that of the image in focus
+MAX_DEFOCUS = 0.5  # width of the defocus disk, relative to the image in focus
 MIN_DEFOCUS_PX = 1.0
 # Error of the time tags over the filter's value, and the rotation in that time, up to which there is no warning.
 MAX_TAG_RATIO = 1.3
@@ -160,11 +160,12 @@ def dark_corners(context: Context, samples: CheckedSamples) -> str:
 
 
 def few_lights(context: Context, samples: CheckedSamples) -> str:
-    """Warn if the tracker has too few lights at the frames or in reach.
+    """Warn if the tracker has too few lights, in the frames or in the directions in reach.
 
-    1. Leave it to the warning that explains it: a cap that is too small, dark corners, or a bright background.
-    2. Find too few lights, hidden ones counted, since `hidden_lights` explains them.
-    3. Leave it to `undetected` if the lights are on the detector.
+    1. Return no warning if another one explains the problem: a cap that is too small, dark corners, a bright background
+       or the black level.
+    2. Count the lights, hidden ones included (`hidden_lights` warns of those); stop if there are enough.
+    3. Return no warning if enough lights are on the detector (`undetected` warns of those).
     4. Recommend more LEDs, or fainter stars.
     """
     scene = context.lab.scene
@@ -176,7 +177,7 @@ def few_lights(context: Context, samples: CheckedSamples) -> str:
         return ""
     if scene.tracker.brightest is not None and scene.tracker.brightest < needed:
         return f"tracker.brightest: the tracker uses {scene.tracker.brightest} lights; change it to {needed} or more"
-    # 2. At the frames none may have too few, in reach some directions.
+    # 2. No frame may have too few; of the directions in reach, some may.
     in_reach = MAX_FEW_SKY if scene.vehicle.mount == "free" else MAX_FEW
     for sampled, allowed in ((samples.frames, 0.0), (samples.reach, in_reach)):
         counts = sampled.counts()

@@ -69,7 +69,7 @@ def stars_of(config: StarsConfig, plan: LightPlan) -> KnownLight:
                 "gaia_v8.0",
             )
         catalog = stars.varied(catalog, config.variability_seed)
-    # Anything that depends on the place of the camera makes its velocity matter for the aberration, too.
+    # If other parts of the scene depend on the camera's place, the aberration by its velocity is included as well.
     velocity_m_s: Floats | tuple[float, ...] = stars.AT_REST
     if config.bodies or config.satellites or config.air or viewpoint.orbit:
         velocity_m_s = viewpoint.state_at(0.0).velocity_m_s

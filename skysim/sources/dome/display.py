@@ -201,7 +201,7 @@ class LitBlocks(NamedTuple):
     radius_m
         Radius of the disk that represents a block
     gain
-        Light of a block's pixel over that of the white pixel `led`
+        Light of a block's pixel, relative to the white pixel `led`
     """
 
     place_m: Floats
@@ -497,7 +497,7 @@ def projector_sources(
 
 
 def white_wall_per_m2(config: ProjectorConfig, place_m: Floats, normal: Floats) -> Floats:
-    """(N,) light of white pixels per area of the wall at places (N, 3), over that of one pixel on the axis, in 1/m^2.
+    """(N,) light of white pixels per area of the wall at places (N, 3), relative to one pixel on the axis, in 1/m^2.
 
     cos^n(theta) over the area w D^2 / cos(i) that a pixel lights; 0 outside of the picture, and for NaN.
     """

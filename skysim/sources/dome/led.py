@@ -35,7 +35,7 @@ from skysim.sources.photometry import (
     radiant_strength_e_s_sr,
 )
 
-LIFE_SHARE = 0.7  # fraction of its light that an LED has left at the end of its life, L70
+LIFE_SHARE = 0.7  # fraction of initial light that an LED emits at the end of its life, L70
 COLORS = 129  # number of wavelengths at which the strength of a colored LED is computed
 Falloff = Callable[[Floats], Floats]
 
@@ -137,7 +137,7 @@ def full_strength_e_s_sr(led: LedConfig, band: Band) -> float:
 
 
 def color_factors(led: LedConfig, band: Band, normal: Floats) -> Floats:
-    """Strengths of LEDs with scattered peak wavelengths over that of the nominal one, at the same intensity.
+    """Strengths of LEDs with scattered peak wavelengths, relative to the nominal one at the same intensity.
 
     `normal` (N,) are standard normal numbers. The strengths are interpolated between COLORS wavelengths.
     """
@@ -180,7 +180,7 @@ def strength_factors(scatter: float, normal: Floats) -> Floats:
 
 
 def aging_factors(aging: AgingConfig | None, normal: Floats) -> Floats:
-    """Fraction of light that LEDs have left after their hours of operation: exp(-a t) (IES TM-21, eq. 1).
+    """Fraction of their initial light that LEDs emit after their hours of operation: exp(-a t) (IES TM-21, eq. 1).
 
     a = ln(1 / 0.7) / L70, times the scatter of the rates from standard normal numbers; the projection's constant B is
     1.
@@ -193,7 +193,7 @@ def aging_factors(aging: AgingConfig | None, normal: Floats) -> Floats:
 
 
 def warm_up_factor(warm_up: WarmUpConfig | None, t_s: float) -> float:
-    """Light of all LEDs t_s after they were switched on, over that of the cold ones: s + (1 - s) exp(-t / tau)."""
+    """Light of all LEDs t_s after they were switched on, relative to cold LEDs: s + (1 - s) exp(-t / tau)."""
     if warm_up is None:
         return 1.0
     return warm_up.steady + (1 - warm_up.steady) * exp(-t_s / warm_up.time_s)

@@ -231,7 +231,7 @@ class SurfaceFit:
     radius
         Radius over direction about that center
     residual_m
-        (N,) points' radii less the surface's
+        (N,) radii of the points minus the radii of the surface
     sphere
         The best sphere, with its own rms
     """

@@ -504,7 +504,8 @@ def surveyed(config: light.SurveyedSurfaceConfig) -> Surface:
             f"rms_limit {config.rms_limit_m:g} m, a higher degree, another unit",
         )
     pose = pose_and_rim(config, 0.0)
-    # The surface's frame has its origin at the best sphere's center; the scene's tilt and rim refer to the points'.
+    # The origin of the surface's frame is the center of the best sphere; the scene gives tilt and rim in the frame of
+    # the points.
     pose["center_m"] = config.offset_m + pose["lab_from_own"].apply(fit.center_m)
     pose["rim"] = Rim(
         -fit.center_m, pose["rim"].lowest_m - fit.center_m[2], pose["rim"].half_rad

@@ -127,7 +127,7 @@ class History:
         self.moving = False
 
     async def asked(self, event: Any) -> None:
-        """Show the view after the browser has gone to another address of this page; of several, the newest."""
+        """Show the view after the browser has gone to another address of this page; if to several, the newest one."""
         self.pending = str(event.args)
         if self.showing:
             return

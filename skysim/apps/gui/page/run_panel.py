@@ -345,7 +345,7 @@ class RunPanel:
             )
 
     async def slid(self, event: Any) -> None:
-        """Show the frame at the place of the dragged slider; of several, the newest."""
+        """Show the frame at the position of the dragged slider; skip all but the newest position."""
         is_showing = self.sought is not None
         self.sought = int(event.args)
         while not is_showing and self.sought is not None:

@@ -412,7 +412,7 @@ class Tab:
 
     @property
     def message_text(self) -> str:
-        """The message in the head."""
+        """The message in the page header."""
         return self.head.message_text
 
     def set_state(self, **changes: Any) -> None:
@@ -460,7 +460,7 @@ class Tab:
         self.photo.stop()
 
     def show_message(self, text: str, color: str = "warn") -> None:
-        """Show a message in the head until the next action; warnings are also logged."""
+        """Show a message in the page header until the next action; warnings are also logged."""
         if text == self.message_text:
             return
         self.head.set_message(text, color)

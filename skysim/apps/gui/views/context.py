@@ -16,13 +16,13 @@ class Shown(Protocol):
     Attributes
     ----------
     state
-        View of the page as in its address
+        View of the page, which its address contains
     scene_info
         Facts about the open scene; None before one is open
     view
         Newest frame of the scene; None before the first
     message_text
-        Message in the head
+        Message in the page header
     solving
         Whether every frame is solved
     is_open
@@ -44,7 +44,7 @@ class Shown(Protocol):
 
 
 class Asked(Protocol):
-    """Requests to the worker. An error is shown in the head, and the result is None or False."""
+    """Requests to the worker. An error is shown in the page header, and the result is None or False."""
 
     async def ask(self, task: str, *arguments: Any) -> Any:
         """Return the result of a task."""
@@ -82,7 +82,7 @@ class Notified(Protocol):
     """How a part notifies the page."""
 
     def show_message(self, text: str, color: str = "warn") -> None:
-        """Show a message in the head until the next action."""
+        """Show a message in the page header until the next action."""
 
     def log(self, text: str) -> None:
         """Add a line to the log."""

@@ -227,7 +227,7 @@ class TabFrames:
 
     async def stream(self, display: Display) -> AsyncIterator[bytes]:
         """Frames as they come, until there is none for a while: length and number as unsigned integers of 32 bits, then
-        the frame's response. Of several streams the newest gets the frames.
+        the frame's response. If there are several streams, only the newest gets the frames.
         """
         waiting = self.waiting = asyncio.Queue[int]()
         try:
@@ -284,7 +284,10 @@ def pair(text: str) -> tuple[int, int]:
 
 
 def limits_from(text: str) -> str | tuple[float, float] | None:
-    """Limits by name, or two increasing values; None if they are neither. Raises ValueError."""
+    """Parse the limits of the display: a name in LIMITS, or two numbers separated by a comma.
+
+    Returns None if the numbers are not finite or do not increase. Raises ValueError for any other text.
+    """
     if text in LIMITS:
         return text
     low, high = (float(word) for word in text.split(","))

@@ -90,7 +90,7 @@ Stages = tuple[tuple[str, str], ...]  # chosen algorithms: pairs of stage and na
 def photo_from_file(
     name: str, data: bytes, fov_deg: float | None, stages: Stages = ()
 ) -> PhotoPixels:
-    """Solve an uploaded file, as it is viewed. Raises InputError if it is not a readable image."""
+    """Solve an uploaded file in its viewing orientation. Raises InputError if it is not a readable image."""
     suffix = images.image_suffix(name)
     if not suffix:
         raise InputError(Path(name).name, "", ", ".join(images.IMAGE_SUFFIXES))

@@ -158,8 +158,8 @@ def shades(
     return shaded
 
 
-# Heights are in units of which a pixel has as many as there are rows of areas, and an area as many as there are rows of
-# pixels. So all are integers, and no rounding assigns a pixel to an area that it does not overlap.
+# Heights are integers: the height of a pixel is the number of rows of areas, the height of an area is the number of
+# rows of pixels. So no rounding assigns a pixel to an area that it does not overlap.
 
 
 @jit(parallel=True)

@@ -253,10 +253,10 @@ def known_share(run: SurveyRun | None) -> Floats:
 
 
 def frames_at_rest(flight: Flight, views: Sequence[FrameView]) -> tuple[list[int], int]:
-    """Rows of the last frame in each hold of a flight at which the vehicle rests, and the number of holds.
+    """Return the row of the last frame at rest in each hold of a flight, and the number of holds.
 
-    It rests if the image moves by less than REST_PX during the exposure, by the true rate: a controller may not reach
-    the attitude, or may not hold it.
+    A frame is at rest if the image moves by less than REST_PX during its exposure. The true rate decides, since a
+    controller may not reach the attitude or may not hold it. A hold without a frame at rest has no row.
     """
     scene = flight.lab.scene
     motion = scene.motion

@@ -88,7 +88,7 @@ class Outcome:
     detect_ms
         Computing time of the detection, mean for a flight; not the same in every run
     lab_from_body_w, _x, _y, _z
-        True attitude at mid-exposure; of the worst frame for a flight (`worst_frame`)
+        True attitude at mid-exposure; for a flight, that of its worst frame (`worst_frame`)
     body_tilt_deg, body_azimuth_deg
         Under a dome, angle of the body's z axis from vertical, and its azimuth from the lab's x
         toward y

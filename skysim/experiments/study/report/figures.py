@@ -218,7 +218,7 @@ def draw_line(
         axes.fill_between(one.x, low, high, color=ink, alpha=0.15, linewidth=0)
     else:
         draw_bars(axes, one.x, one, ink, offset)
-    # A line leaves out points of few values, which are from the easy trials alone.
+    # The line skips points with few values, because these come from the easy trials only.
     style = {"color": ink, "transform": offset}
     joined = np.where(one.few, np.nan, one.value)
     line = "-" if x_axis.numeric else ":"
@@ -230,7 +230,7 @@ def draw_line(
 
 
 def draw_few(axes: Any, one: Series, mark: str, **style: Any) -> None:
-    """Draw the points of few values: hollow, with the number of values."""
+    """Draw points that have few values as hollow marks, each with its number of values."""
     axes.plot(one.x[one.few], one.value[one.few], mark, markerfacecolor="white", **style)
     text = {"fontsize": 6.5, "color": style["color"], "path_effects": [halo()]}
     text |= {"xytext": (4, 4), "textcoords": "offset points", "xycoords": style["transform"]}

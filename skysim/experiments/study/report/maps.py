@@ -127,7 +127,7 @@ def direction_map(label: str, columns: Columns, response: str) -> DirectionMap:
 def least_values(response: str) -> int:
     """Least number of values of a cell that is drawn: MIN_VALUES, and for the quantile p at least 1 / (1 - p).
 
-    Of so many values one exceeds the quantile; of fewer, the quantile is about the largest.
+    Among 1 / (1 - p) values one exceeds the quantile. With fewer values the quantile is about the largest one.
     """
     percent = re.search(r"_p(\d+)$", response)
     if not percent:

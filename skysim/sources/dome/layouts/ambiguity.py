@@ -158,7 +158,7 @@ def most_similar(fields: Fields, least: float) -> tuple[Floats, Ints]:
 
 @jit
 def max_coincident(fields: Fields, i: int, j: int, threshold: float, farther: bool) -> int:
-    """The most neighbors of i that coincide with neighbors of j at any rotation, if more than `threshold`; else less.
+    """The most neighbors of i that coincide with neighbors of j at any rotation; a lower bound if at most `threshold`.
 
     Parameters
     ----------

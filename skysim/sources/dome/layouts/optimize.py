@@ -380,7 +380,10 @@ def descend(
 def visible_fraction(
     config: layouts.OptimizedConfig, sites_m: Floats, rng: np.random.Generator
 ) -> float:
-    """Mean fraction of the sites that an attitude sees; times the number of LEDs it is the mean number in a field."""
+    """Mean fraction of the sites in the field of view, over random attitudes.
+
+    Multiplied by the number of LEDs, it is the mean number of LEDs in a field.
+    """
     total = total_information(
         sites_m, sample_attitudes(config, 200, rng), *camera_geometry(config)
     )

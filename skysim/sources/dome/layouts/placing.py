@@ -227,7 +227,7 @@ def contract(place_m: Floats, sites_m: Floats, fraction: float) -> Floats:
     # Contract the directions, then take the nearest sites.
     direction = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
     z = 1 - fraction * (1 - direction[:, 2])
-    # sin(zenith angle) after the contraction, over that before it.
+    # Ratio of sin(zenith angle) after the contraction to that before it.
     narrower = np.sqrt((1 - z**2) / np.maximum(1 - direction[:, 2] ** 2, 1e-12))
     xy = direction[:, :2] * narrower[:, None]
     site_direction = sites_m / np.linalg.norm(sites_m, axis=1, keepdims=True)
