@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -85,7 +84,7 @@ def test_simsat_is_measured_to_a_percent_and_a_micrometer(
     """In-plane offset, without trim masses; NEES of the nine as their covariance says."""
     monkeypatch.setattr(balance_flight, "measured_attitudes", noisy_truth)
     scene = scene_of("simsat_slew")
-    plan = replace(BALANCE, moves=False)
+    plan = BALANCE._replace(moves=False)
     (one,) = balance_procedure.balance(scene, plan, UNCERTAINTY)
     rows = balance_report.statistics(scene.name, plan, [one])
     for row in rows["estimates"][:3]:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from estimator.catalog import catalog, published_catalogs
+from estimator.catalog import cat_file, catalog, published_catalogs
 from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import validate
 from skysim.apps.stream import sinks
@@ -106,6 +106,7 @@ def catalogs(data: bytes) -> None:
     rejects(lambda: star_catalog.read(path), InputError)
     rejects(lambda: catalog.read(path), ImageError)
     rejects(lambda: published_catalogs.read_cat(path, 5.0, 2010.0, COLOR), ImageError)
+    rejects(lambda: cat_file.read_stars(write_file(data, "stars.cat")), ImageError)
     rejects(lambda: validate.describe_file(path), InputError)
 
 

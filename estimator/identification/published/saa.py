@@ -54,6 +54,9 @@ UNMATCHED_COST = 16.0
 # missed by all ten with probability 1e-3.
 RIVAL_PAIRS = 10
 MAX_ASSUMPTIONS = 100_000  # 16 MB of matches at 40 observed stars
+# By the paper's rule a contradicting assumption must be this much less likely, and this share of the lights named.
+TENFOLD = 10.0
+MOST_LIGHTS = 2 / 3
 
 
 @jit
@@ -372,14 +375,18 @@ class AssumptionPool:
     def best_match(self, by_paper: bool = False) -> StarMatch | None:
         """The best assumption, or None if it is not significant or a contradicting one is nearly as likely.
 
-        By the paper's rule it needs only MIN_MATCHES stars, and its log10_chance is NaN.
+        By the paper's rule it needs only MIN_MATCHES stars, and its log10_chance is NaN. An assumption that a
+        contradicting one equals, as on a lattice of equal lights, or that leaves many lights without a star is refused
+        by this rule, too.
         """
+        count, _, rival_cost = self._contradictions
         if by_paper:
-            return self._solution(float("nan")) if self.is_complete else None
+            is_alone = not count or rival_cost > self.cost + 2 * np.log(TENFOLD)
+            is_named = self.is_complete and np.mean(self.star >= 0) >= MOST_LIGHTS
+            return self._solution(float("nan")) if is_named and is_alone else None
         chance = self.log10_chance
         # A cost is -2 ln(likelihood): 1e5 times as likely is a cost smaller by 2 ln 1e5.
         margin = -2 * np.log(10) * ACCEPT_LOG10_CHANCE
-        count, _, rival_cost = self._contradictions
         if chance > ACCEPT_LOG10_CHANCE or (count and rival_cost < self.cost + margin):
             return None
         return self._solution(chance)

@@ -19,7 +19,7 @@ from skysim.apps.cli import main
 from skysim.apps.cli.options import load
 from skysim.core import images
 from skysim.core.errors import InputError
-from skysim.core.paths import SCENES
+from skysim.core.paths import SCENES, shipped_files
 from skysim.scene import loader
 
 SHEFEX = SCENES / "shefex2.yaml"
@@ -114,9 +114,7 @@ def test_help_lists_the_commands(skysim: Skysim) -> None:
 @pytest.mark.slow
 def test_scenes_are_listed_with_their_titles(skysim: Skysim) -> None:
     listed = json.loads(skysim("scenes", "--json").out)
-    assert {entry["name"] for entry in listed} == {
-        path.stem for path in SCENES.glob("*.yaml")
-    }
+    assert [entry["name"] for entry in listed] == list(shipped_files(SCENES))
     for entry in listed:
         assert loader.load(entry["file"]).title == entry["title"]
     assert "AFIT SimSat" in skysim("scenes").out
@@ -448,7 +446,7 @@ def test_exposure_times_are_recorded_frame_by_frame(skysim: Skysim, tmp_path: Pa
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["nosuch"], "nosuch: no such scene; allowed: a .yaml file or one of afit_simsat, "),
+        (["nosuch"], "nosuch: no such scene; allowed: a .yaml file or one of afit_bump, "),
         (
             ["shefex2", "--set", "camera.focal_lenght=25 mm"],
             "unknown key; did you mean focal_length?; allowed: ",
@@ -716,7 +714,7 @@ def test_an_image_of_noise_is_refused(skysim: Skysim, tmp_path: Path) -> None:
         (["--camera", "nosuch.yaml"], "nosuch.yaml: cannot be read: No such file"),
         (
             ["--camera", "nosuch"],
-            "nosuch: no such scene; allowed: a .yaml file or one of afit_simsat, ",
+            "nosuch: no such scene; allowed: a .yaml file or one of afit_bump, ",
         ),
         (["--camera", SHEFEX, "--time", "yesterday"], "--time yesterday: allowed: ISO 8601"),
         (
