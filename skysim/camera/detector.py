@@ -160,6 +160,9 @@ def expose(
     ----------
     light_e
         (H, W) float32 mean photo-electrons of a perfect pixel, including the shutter's `smear`; overwritten
+    rng
+        The frame's generator. Counting, read noise and particles draw from it in turn, so a new kind of noise draws
+        from `rng.spawn(1)[0]`, which leaves their numbers as they are
     added
         Receives the mask of the particles' pixels
     """
