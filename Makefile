@@ -86,7 +86,7 @@ studies: $(READY)
 
 papers: $(READY)
 	mkdir -p out
-	$(BIN)/skysim reproduce all --report --json > out/papers.json
+	$(BIN)/skysim reproduce all --quick --json > out/papers.json
 	$(BIN)/python docs/site/papers.py out/papers.json
 
 # The findings pages whose code has changed since they were made, and the commands that make them again.

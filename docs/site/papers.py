@@ -1,6 +1,7 @@
 """Write docs/findings/papers.md: how the papers' numbers come out, with the predictions that disagree and why.
 
-`skysim reproduce all --json > out/papers.json; python docs/site/papers.py out/papers.json`, which `make papers` does.
+`skysim reproduce all --quick --json > out/papers.json; python docs/site/papers.py out/papers.json`, which `make papers`
+does.
 All rows are kept beside the page as papers.csv, which the tests compare with today's code; the full page with
 assumptions and fitted parameters is what `skysim reproduce all --report` writes.
 """
@@ -34,7 +35,7 @@ FIELDS = (
     "error",
     "verdict",
 )
-COMMAND = "skysim reproduce all"
+COMMAND = "skysim reproduce all --quick"  # the whole, without --quick, takes half an hour
 MOST_ROWS = 20
 PAGE_TEXT = """# Do we reproduce the papers?
 

@@ -125,14 +125,16 @@ def direction_map(label: str, columns: Columns, response: str) -> DirectionMap:
 
 
 def least_values(response: str) -> int:
-    """Least number of values of a cell that is drawn: MIN_VALUES, and for the quantile p at least 1 / (1 - p).
+    """Least number of values of a cell that is drawn: MIN_VALUES, and for a quantile p as many as its tail holds one.
 
-    Among 1 / (1 - p) values one exceeds the quantile. With fewer values the quantile is about the largest one.
+    Of 1 / (1 - p) values one exceeds the quantile p, of 1 / p one is below it. With fewer values the quantile is about
+    the largest or the smallest one.
     """
     percent = re.search(r"_p(\d+)$", response)
     if not percent:
         return MIN_VALUES
-    return max(MIN_VALUES, math.ceil(100 / (100 - int(percent[1]))))
+    tail = min(int(percent[1]), 100 - int(percent[1]))
+    return max(MIN_VALUES, math.ceil(100 / tail))
 
 
 def radial_range(radial_deg: Floats, sky: bool) -> tuple[float, float]:
