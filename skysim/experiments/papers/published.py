@@ -14,6 +14,7 @@ from skysim.core.paths import DATA
 from skysim.core.types import Floats
 from skysim.core.units import ConfigModel, NotNegative, Number
 from skysim.core.yaml_reader import explain, read_yaml
+from skysim.experiments import home_calibration
 
 FOLDER = DATA / "published"
 
@@ -81,6 +82,8 @@ class Experiment(ConfigModel):
         `run` or `calibrate` with a scene, or `study` with a study
     runs, quick_runs
         Number of runs with other seeds; of replicates for a study
+    clicks
+        Of `skysim calibrate`: LED spacings that set the scale in the first frame
     hardware
         Keys of the seeds of hardware that differ from run to run
     wrong
@@ -97,6 +100,7 @@ class Experiment(ConfigModel):
     file: str
     runs: Annotated[int, Field(ge=1)] = 1
     quick_runs: Annotated[int, Field(ge=1)] = 1
+    clicks: Annotated[int, Field(ge=0)] = home_calibration.CLICKS
     hardware: tuple[str, ...] = ()
     wrong: str = ""
     assumed: tuple[str, ...] = ()

@@ -42,6 +42,7 @@ from skysim.experiments.study.table import PointRow
 from skysim.results import run_report, scoring, telemetry_report
 from skysim.results.metrics import SIGMAS
 from skysim.scene import loader
+from skysim.scene.scene import Scene
 from skysim.simulation.flight import open_flight
 
 Verdict = Literal["agrees", "undecided", "disagrees"]
@@ -169,12 +170,19 @@ def run_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Nu
         seed = options.seed + n
         overrides = {key: str(seed) for key in ("seed", *experiment.hardware)}
         sets = [f"--set={key}={seed}" for key in experiment.hardware]
+        if experiment.clicks != home_calibration.CLICKS:
+            sets.append(f"--clicks={experiment.clicks}")
         commands.append(
             shlex.join(
                 ["skysim", experiment.command, experiment.file, f"--seed={seed}", *sets]
             )
         )
-        results.append(RESULTS[experiment.command](experiment.file, overrides))
+        scene = loader.load(experiment.file, overrides)
+        results.append(
+            calibrate_result(scene, experiment.clicks)
+            if experiment.command == "calibrate"
+            else run_result(scene)
+        )
         options.watch(n + 1, runs)
 
     def number(path: str, levels: str) -> Ours:
@@ -189,9 +197,9 @@ def run_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Nu
     return commands, number
 
 
-def run_result(file: str, overrides: dict[str, str]) -> dict[str, Any]:
+def run_result(scene: Scene) -> dict[str, Any]:
     """What `skysim run --json` prints of a flight, without the files."""
-    with open_flight(loader.load(file, overrides)) as flight:
+    with open_flight(scene) as flight:
         rows = [scoring.score(shot).row for shot in flight.shots()]
         motion = telemetry_report.summary(flight.telemetry())
     return run_report.summary(rows) | {
@@ -200,17 +208,11 @@ def run_result(file: str, overrides: dict[str, str]) -> dict[str, Any]:
     }
 
 
-def calibrate_result(file: str, overrides: dict[str, str]) -> dict[str, Any]:
+def calibrate_result(scene: Scene, clicks: int) -> dict[str, Any]:
     """What `skysim calibrate --json` prints."""
-    known, frames = home_calibration.measure_scene(loader.load(file, overrides))
+    known, frames = home_calibration.measure_scene(scene)
     seen = list(home_calibration.sightings(known, frames))
-    return home_calibration.statistics(home_calibration.calibrated(known, seen))
-
-
-RESULTS: dict[str, Callable[[str, dict[str, str]], dict[str, Any]]] = {
-    "run": run_result,
-    "calibrate": calibrate_result,
-}
+    return home_calibration.statistics(home_calibration.calibrated(known, seen, clicks))
 
 
 def study_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Number]:
