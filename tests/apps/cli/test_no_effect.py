@@ -52,7 +52,7 @@ STUDY = {
             "stream shefex2 --folder out --host ::1",
             "--host ::1: has no effect without --http",
         ),
-        ("reproduce afit-table-1 --open", "--open: has no effect without --report"),
+        ("reproduce shefex-figs-4-5 --open", "--open: has no effect without --report"),
     ],
 )
 def test_an_option_without_effect_is_refused(
