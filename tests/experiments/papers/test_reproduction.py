@@ -104,14 +104,26 @@ def test_an_unknown_id_is_answered_with_the_allowed_ones() -> None:
         reproduction.check_ids(["afit-table-99"])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("id", list(experiments()))
-def test_every_row_of_a_quick_experiment_has_a_number(id: str) -> None:
-    """The command is printed, and each response is found in what it prints."""
+# Hundreds of frames, which `make test-long` and the papers' page have.
+LONG = {"afit-table-2", "afit-table-3-5", "afit-table-6-9", "afit-table-10-15"}
+# NPS matched six stars of nine on average, and its attitudes failed at 6 degrees without exception.
+MOST_OFF = 2
+
+
+@pytest.mark.parametrize(
+    "id",
+    [
+        pytest.param(id, marks=pytest.mark.long if id in LONG else pytest.mark.slow)
+        for id in experiments()
+    ],
+)
+def test_a_quick_experiment_has_a_number_for_every_row(id: str) -> None:
+    """The command is printed, and each response is found in what it prints; few rows disagree."""
     found = reproduction.reproduce(id, Options(quick=True))
     assert found.commands[0].startswith("skysim ")
     assert experiments()[id].file in found.commands[0]
     assert all(math.isfinite(one.ours.value) for one in found.comparisons)
+    assert id in LONG or found.count("disagrees") <= MOST_OFF
 
 
 @pytest.mark.slow

@@ -16,8 +16,7 @@ from estimator.identification.published.shefex import ShefexOptions, search
 from skysim.camera.render import Window, render
 from skysim.core.paths import CATALOGS
 from skysim.core.types import Trajectory
-from skysim.experiments.papers import published, reproduction
-from skysim.experiments.papers.reproduction import Options
+from skysim.experiments.papers import published
 from skysim.scene.loader import load
 from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking import onboard_model
@@ -169,18 +168,3 @@ def test_equation_5_fails_as_printed_and_holds_when_corrected() -> None:
 # The experiments.
 
 EXPERIMENTS = published.read(published.FOLDER / "shefex.yaml").experiments
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("id", EXPERIMENTS)
-def test_a_shortened_experiment_has_a_number_for_every_row(
-    id: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(reproduction, "experiments", lambda: EXPERIMENTS)
-    result = reproduction.reproduce(id, Options(quick=True))
-    assert len(result.comparisons) == len(EXPERIMENTS[id].rows)
-    assert all(math.isfinite(one.ours.value) for one in result.comparisons)
-    assert result.commands == (
-        f"skysim study run {EXPERIMENTS[id].file}"
-        f" --set=replicates={EXPERIMENTS[id].quick_runs} --set=seed=1",
-    )
