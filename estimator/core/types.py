@@ -15,6 +15,8 @@ from estimator.core.checks import Floats, Ints
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
+THESIS_INTENSITY = 0.04  # Padro 2012, section 3.7
+
 
 @dataclass(frozen=True, slots=True)
 class FramePriors:
@@ -30,6 +32,8 @@ class FramePriors:
     turn_rad
         Rotation of the stars about the frame's center during the exposure, with the sign of
         streak_px; as in Blobs
+    intensity_threshold
+        Threshold of the detector `thesis`, as a share of full scale
 
     Raises
     ------
@@ -40,6 +44,7 @@ class FramePriors:
     streak_px: tuple[float, float] | None = None
     saturation: float = float("inf")
     turn_rad: float = 0.0
+    intensity_threshold: float = THESIS_INTENSITY
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "streak_px", checks.pixel_step("streak_px", self.streak_px))
@@ -49,6 +54,10 @@ class FramePriors:
         object.__setattr__(self, "saturation", least)
         turn_rad = checks.number("turn_rad", self.turn_rad, -1e300, 1e300, "a finite number")
         object.__setattr__(self, "turn_rad", turn_rad)
+        share = checks.number(
+            "intensity_threshold", self.intensity_threshold, 1e-300, 1.0, "above 0, up to 1"
+        )
+        object.__setattr__(self, "intensity_threshold", share)
 
 
 NO_PRIORS = FramePriors()

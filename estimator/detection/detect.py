@@ -61,7 +61,6 @@ MAX_STREAK_PX = (
 MAX_TURN_PX = 4.0
 # Least area of a streak: noise averaged along a line is correlated, so that several pixels exceed the threshold.
 MIN_STREAK_AREA_PX = 5
-THESIS_INTENSITY = 0.04
 THESIS_AREA_PX = 50
 
 Detector = Callable[..., Blobs]  # (image, threshold_sigma, min_area_px, max_blobs, priors)
@@ -194,10 +193,11 @@ def thesis(
     max_blobs: int = 200,
     priors: FramePriors = NO_PRIORS,
 ) -> Blobs:
-    """Detect blobs of at least 50 pixels above 4 % of full scale (Padro 2012, sections 3.4.1.3 and 3.5).
+    """Detect blobs of at least 50 pixels above a share of full scale (Padro 2012, sections 3.4.1.3 and 3.7).
 
-    Full scale is the saturation in the priors, otherwise the maximum of the integer type. `threshold_sigma` and
-    `min_area_px` are ignored: the thesis has two fixed thresholds.
+    The share is the priors' intensity_threshold: 4 % in the thesis's tests, 2 to 25 % in its preliminary ones. Full
+    scale is the saturation in the priors, otherwise the maximum of the integer type. `threshold_sigma` and
+    `min_area_px` are ignored.
 
     Raises
     ------
@@ -216,11 +216,12 @@ def thesis(
             )
         full_scale = float(np.iinfo(pixel).max)
     flat = flat_background(estimate_background(image), image.shape)
-    threshold = THESIS_INTENSITY * full_scale
+    threshold = priors.intensity_threshold * full_scale
     if flat.level[0, 0] >= threshold:
         raise ImageError(
-            f"the black level of {flat.level[0, 0]:.0f} is above the threshold of 4 % of {full_scale:.0f}, that is"
-            f" {threshold:.0f}: lower the camera's offset or the background, or set another detector"
+            f"the black level of {flat.level[0, 0]:.0f} is above the threshold of"
+            f" {100 * priors.intensity_threshold:g} % of {full_scale:.0f}, that is {threshold:.0f}: lower the camera's"
+            " offset or the background, or set another detector"
         )
     # The thesis thresholds raw pixels. We threshold the filtered image, whose contour around a plateau of 50 pixels is
     # within a pixel of the raw one.

@@ -27,7 +27,14 @@ from estimator.core import checks
 from estimator.core.camera import Camera, check_frame
 from estimator.core.checks import Floats, Ints
 from estimator.core.errors import ImageError
-from estimator.core.types import Attitude, Blobs, Centroids, FramePriors, RateEstimate
+from estimator.core.types import (
+    THESIS_INTENSITY,
+    Attitude,
+    Blobs,
+    Centroids,
+    FramePriors,
+    RateEstimate,
+)
 from estimator.detection import classify
 from estimator.detection.classify import NO_STAR, Flag
 from estimator.detection.detect import DETECTORS, in_row_order, replace_bad_pixels, to_native
@@ -60,6 +67,7 @@ ALLOWED = {
     "threshold_sigma": POSITIVE,
     "min_area_px": COUNT,
     "max_blobs": COUNT,
+    "intensity_threshold": Allowed(TINY, 1.0, "above 0, up to 1"),
     "gain_e_dn": Allowed(TINY, math.inf, "above 0; inf without photon noise"),
     "saturation": Allowed(TINY, math.inf, "above 0; inf if unknown"),
     "centroid_sigma_px": NOT_NEGATIVE,
@@ -88,6 +96,8 @@ class Settings:
         Names of the algorithms
     threshold_sigma, min_area_px, max_blobs
         Parameters of the detector (`detection.detect`)
+    intensity_threshold
+        Threshold of the detector `thesis`, as a share of full scale
     gain_e_dn
         Gain in electrons per unit of the image
     saturation
@@ -134,6 +144,7 @@ class Settings:
     threshold_sigma: float = 5.0
     min_area_px: int = 3
     max_blobs: int = 100
+    intensity_threshold: float = THESIS_INTENSITY
     gain_e_dn: float = 1.0
     saturation: float = float("inf")
     centroid_sigma_px: float = 0.1
@@ -259,7 +270,9 @@ def detect_and_centroid(
     if settings.bad_px is not None:
         image = replace_bad_pixels(image, settings.bad_px)
     # 2. Blobs
-    priors = FramePriors(streak_px, settings.saturation, turn_rad)
+    priors = FramePriors(
+        streak_px, settings.saturation, turn_rad, settings.intensity_threshold
+    )
     blobs = DETECTORS[settings.detector](
         image, settings.threshold_sigma, settings.min_area_px, settings.max_blobs, priors
     )

@@ -60,7 +60,6 @@ DISTINCT_ARCSEC = (
     100.0  # angles with a larger gap are distinct: a bucket of the thesis's pair catalog
 )
 QUEST_LEDS = 2
-INTENSITY = 0.04  # threshold, a share of full scale
 AREA_PX = 50
 
 
@@ -130,16 +129,16 @@ class HeldFrame(NamedTuple):
     magnitude: Floats
 
 
-def measure(image_dn: NDArray[Any], full_scale_dn: float) -> tuple[Floats, Floats]:
+def measure(image_dn: NDArray[Any], threshold_dn: float) -> tuple[Floats, Floats]:
     """(N, 2) centroids and (N,) magnitudes of the lights of an image (Padro 2012, sections 3.4.1.3 and 3.6.2.1).
 
     As the thesis does with MATLAB's `bwlabel` and `regionprops`, by their counterparts in scikit-image: regions of at
-    least 50 connected pixels above 4 % of full scale, without a filter, so that noise makes holes in a dim light. The
+    least 50 connected pixels above the threshold, without a filter, so that noise makes holes in a dim light. The
     centroid is that of the region's pixels, all with the same weight.
     """
     from skimage.measure import label, regionprops_table
 
-    region = label(image_dn > INTENSITY * full_scale_dn, connectivity=2)
+    region = label(image_dn > threshold_dn, connectivity=2)
     area_px = np.bincount(region.ravel())
     area_px[0] = 0
     kept = area_px >= AREA_PX
@@ -152,15 +151,20 @@ def measure(image_dn: NDArray[Any], full_scale_dn: float) -> tuple[Floats, Float
     return xy_px, instrument_brightness(found["intensity_mean"], found["area"])
 
 
+def intensity_threshold_dn(scene: Scene) -> float:
+    """The scene's intensity threshold, a share of the converter's range: 4 % in the thesis (section 3.7)."""
+    return scene.tracker.intensity_threshold * (2.0**scene.camera.detector.bits - 1)
+
+
 def measure_scene(
     scene: Scene, progress: Progress | None = None
 ) -> tuple[Assumed, list[HeldFrame]]:
     """Fly a scene and measure its frames. The IMU's attitude is the true one if the vehicle has none."""
     with open_flight(scene) as flight:
         known = assumed(flight.lab)
-        full_scale_dn = 2.0**scene.camera.detector.bits - 1
+        threshold_dn = intensity_threshold_dn(scene)
         measured = [
-            (shot.truth.t_s, *measure(shot.frame.image_dn, full_scale_dn))
+            (shot.truth.t_s, *measure(shot.frame.image_dn, threshold_dn))
             for shot in flight.shots(solves=False, progress=progress)
             if shot.camera is flight.lab.camera
         ]
@@ -173,12 +177,12 @@ def measure_scene(
 def measure_folder(folder: Path, scene: Scene) -> tuple[Assumed, list[HeldFrame]]:
     """Measure the images of a folder with the IMU's attitudes in its `attitudes.csv`. Raises InputError."""
     known = assumed(build_lab(scene))
-    full_scale_dn = 2.0**scene.camera.detector.bits - 1
+    threshold_dn = intensity_threshold_dn(scene)
     attitudes = survey_images.read_attitudes(folder / survey_images.ATTITUDES)
     frames = []
     for name, lab_from_body in attitudes.items():
         pixels = survey_images.pixels_of(folder / name, known.camera)
-        frames.append(HeldFrame(lab_from_body, *measure(pixels, full_scale_dn)))
+        frames.append(HeldFrame(lab_from_body, *measure(pixels, threshold_dn)))
     return known, frames
 
 

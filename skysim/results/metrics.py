@@ -375,6 +375,8 @@ QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
             "detected",
             "matched",
             "centroid_px",
+            "lights_detected",
+            "false_detections",
             "streak_px",
             "availability",
             "filter_arcsec",
@@ -392,7 +394,7 @@ QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
 
 
 # Quantities of which more is better; of all others, less.
-MORE_IS_BETTER = ("stars", "detected", "matched", "availability")
+MORE_IS_BETTER = ("stars", "detected", "lights_detected", "matched", "availability")
 # Quantities that are responses by themselves, with the statistic that this name stands for.
 DEFAULT_STATISTICS = {"nees": "mean", "centroid_px": "rms", "streak_px": "median"}
 

@@ -70,6 +70,8 @@ def equally_bright(scene: Scene) -> bool:
     if not isinstance(scene.light, DomeConfig):
         return False
     layout = scene.light.layout
+    if scene.light.led.types:
+        return False
     points = layout.points if isinstance(layout, OnPoints) else layout
     if isinstance(points, PatchBoardsConfig):
         levels = {level for board in points.boards or () for level in board.levels or (1.0,)}
@@ -306,6 +308,7 @@ RULES = (
             "tracker.detector",
             "tracker.threshold_sigma",
             "tracker.min_area_px",
+            "tracker.intensity_threshold",
             "tracker.brightest",
         ),
         lambda scene: external(scene) and scene.tracker.exposure_control is None,
@@ -315,8 +318,14 @@ RULES = (
     Rule(
         ("tracker.threshold_sigma", "tracker.min_area_px"),
         lambda scene: scene.tracker.detector in FIXED_DETECTORS,
-        "the detector thesis has two fixed thresholds",
-        "another tracker.detector, e.g. threshold",
+        "the detector thesis has its own thresholds",
+        "tracker.intensity_threshold, or another tracker.detector, e.g. threshold",
+    ),
+    Rule(
+        ("tracker.intensity_threshold",),
+        lambda scene: scene.tracker.detector not in FIXED_DETECTORS,
+        "it is a threshold of the detector thesis",
+        "tracker.detector: thesis, or tracker.threshold_sigma",
     ),
     Rule(
         (

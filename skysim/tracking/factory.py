@@ -93,6 +93,7 @@ def assumed_settings(scene: Scene) -> Settings:
         ),
         threshold_sigma=config.threshold_sigma,
         min_area_px=config.min_area_px,
+        intensity_threshold=config.intensity_threshold,
         gain_e_dn=scene.camera.detector.gain_e_dn,
         saturation=saturation_dn(scene.camera.detector),
         centroid_sigma_px=config.centroid_sigma_px,
@@ -307,7 +308,7 @@ def observe_frame(settings: Settings, control: Control, frame: Frame) -> Observa
             settings.threshold_sigma,
             settings.min_area_px,
             settings.max_blobs,
-            FramePriors(None, settings.saturation),
+            FramePriors(None, settings.saturation, 0.0, settings.intensity_threshold),
         )
     except ImageError:  # a coarse converter may give a frame of one value: no blobs
         return observe(

@@ -147,6 +147,13 @@ CASES = [
     ),
     Case(
         DOME,
+        {"tracker.detector": "threshold"},
+        "tracker.intensity_threshold",
+        "0.1",
+        {"tracker.detector": "thesis"},
+    ),
+    Case(
+        DOME,
         {"tracker.survey": "{led_sigma: 0 m, lever_sigma: 0 m}"},
         "tracker.survey.seed",
         "5",

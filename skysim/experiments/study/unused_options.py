@@ -197,6 +197,7 @@ RULES = (
             "tracker.detector",
             "tracker.centroider",
             "tracker.threshold_sigma",
+            "tracker.intensity_threshold",
             "tracker.min_area_px",
             "light.reflection",
             "camera.ghosts",

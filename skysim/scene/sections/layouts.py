@@ -19,6 +19,7 @@ Levels = Annotated[tuple[Level, ...], Field(min_length=1)]
 Magnitudes = Annotated[
     tuple[Annotated[Number, Field(ge=-30, le=30)], ...], Field(min_length=1)
 ]
+TypeNames = Annotated[tuple[str, ...], Field(min_length=1)]
 Cap = Annotated[Number, Field(gt=0, le=90)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
 Seed = Annotated[int, Field(ge=0)]
@@ -42,8 +43,8 @@ class BoardConfig(ConfigModel):
         Rotation of its columns about its normal
     leds
         Holes with an LED, 0 to 8, row by row
-    levels
-        Brightness of each LED; full brightness if left out
+    levels, types
+        Brightness of each LED, and its type, a name in `led.types`; full brightness and `led` if left out
     """
 
     azimuth_deg: Number
@@ -51,15 +52,15 @@ class BoardConfig(ConfigModel):
     rotation_deg: Number = 0.0
     leds: Annotated[tuple[Annotated[int, Field(ge=0, lt=HOLES)], ...], Field(min_length=1)]
     levels: Levels | None = None
+    types: TypeNames | None = None
 
     @model_validator(mode="after")
     def check_leds(self) -> BoardConfig:
         if len(set(self.leds)) < len(self.leds):
             raise InputError("leds", f"{list(self.leds)} has a duplicate hole")
-        if self.levels is not None and len(self.levels) != len(self.leds):
-            raise InputError(
-                "", f"leds has {len(self.leds)} holes, levels {len(self.levels)}"
-            )
+        for name, values in (("levels", self.levels), ("types", self.types)):
+            if values is not None and len(values) != len(self.leds):
+                raise InputError("", f"leds has {len(self.leds)} holes, {name} {len(values)}")
         return self
 
 
@@ -337,6 +338,8 @@ class ListedConfig(DimmedConfig):
     file
         File with columns x_m, y_m, z_m or azimuth_deg, tilt_deg; optionally level or magnitude, and id, the numbers of
         the LEDs. `skysim scenes export --out leds.csv` and `skysim survey` write such files
+    types
+        Type of each LED, a name in `led.types`; `led` if left out
     """
 
     kind: Literal["listed"]
@@ -347,6 +350,7 @@ class ListedConfig(DimmedConfig):
         Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] | None
     ) = None
     file: str | None = None
+    types: TypeNames | None = None
 
     @model_validator(mode="after")
     def check_positions(self) -> ListedConfig:
@@ -362,6 +366,10 @@ class ListedConfig(DimmedConfig):
             raise InputError("unique_neighbors", "a list has its own levels", "none")
         if dimmed and self.file is not None:
             raise InputError("", "levels and magnitudes of a file belong in its columns")
+        if self.types and (self.file is not None or len(self.types) != len(lists[0])):
+            raise InputError(
+                "types", f"{len(self.types)}", "one for each listed LED, no file"
+            )
         if dimmed and dimmed != len(lists[0]):
             raise InputError("", f"{len(lists[0])} LEDs, but {dimmed} levels or magnitudes")
         return self

@@ -301,15 +301,13 @@ LedSpectrum = Annotated[
 ]
 
 
-class LedConfig(ConfigModel):
-    """The LED type of the dome, which all LEDs share.
+class LedLightConfig(ConfigModel):
+    """Brightness and color of an LED.
 
     Attributes
     ----------
     intensity, radiant_intensity
         Intensity along its normal in candela, or in watts per steradian
-    disk_diameter
-        Diameter of the emitting disk
     spectrum
         `white` (data/led/white.csv), a CSV file of wavelength_nm and relative power, or the peak wavelength of a
         colored LED
@@ -318,6 +316,46 @@ class LedConfig(ConfigModel):
     color_scatter
         Standard deviation of the peak wavelength from LED to LED at the same intensity, or its tolerance (a bin); drawn
         by the layout's hardware_seed
+    """
+
+    intensity_cd: Annotated[Intensity, Field(gt=0)] | None = None
+    radiant_intensity_w_sr: Annotated[RadiantIntensity, Field(gt=0)] | None = None
+    spectrum: LedSpectrum = "white"
+    fwhm_m: Annotated[Length, Field(ge=3e-9, le=200e-9)] | None = None
+    color_scatter_m: Annotated[LengthError, Field(le=30e-9)] = 0.0
+
+    @model_validator(mode="after")
+    def check_intensity(self) -> Self:
+        if (self.intensity_cd is None) == (self.radiant_intensity_w_sr is None):
+            raise InputError("", "an LED takes either intensity or radiant_intensity")
+        return self
+
+    @model_validator(mode="after")
+    def check_color(self) -> Self:
+        if isinstance(self.spectrum, str) and (
+            self.fwhm_m is not None or self.color_scatter_m
+        ):
+            key = "color_scatter" if self.fwhm_m is None else "fwhm"
+            raise InputError(
+                key, f"{self.spectrum} is a whole spectrum", "a wavelength as spectrum"
+            )
+        return self
+
+
+class LedTypeConfig(LedLightConfig):
+    """A further type of LEDs, by its brightness and color; the other keys are those of `led`."""
+
+
+class LedConfig(LedLightConfig):
+    """The LEDs of the dome, and the type of those to which the layout gives none of `types`.
+
+    Attributes
+    ----------
+    disk_diameter
+        Diameter of the emitting disk
+    types
+        Further types by name, for `types` of a layout; all share the keys below. A series resistor scales the current,
+        so LEDs of one type with several resistors have levels, by the drive `direct`
     scatter
         Standard deviation of the logarithm of the intensity from LED to LED, or the tolerance of the intensity as a
         fraction (a bin of ±10 %: {tolerance: 0.1})
@@ -332,14 +370,10 @@ class LedConfig(ConfigModel):
         left out
     """
 
-    intensity_cd: Annotated[Intensity, Field(gt=0)] | None = None
-    radiant_intensity_w_sr: Annotated[RadiantIntensity, Field(gt=0)] | None = None
     disk_diameter_m: Annotated[Length, Field(gt=0, le=0.1)]
     falloff: Literal["inverse_square"] = "inverse_square"
     lobe: Lobe = CosineLobeConfig()
-    spectrum: LedSpectrum = "white"
-    fwhm_m: Annotated[Length, Field(ge=3e-9, le=200e-9)] | None = None
-    color_scatter_m: Annotated[LengthError, Field(le=30e-9)] = 0.0
+    types: dict[str, LedTypeConfig] = Field(default_factory=dict)
     scatter: Annotated[NumberError, Field(lt=0.5)] = 0.0
     aging: AgingConfig | None = None
     warm_up: WarmUpConfig | None = None
@@ -348,22 +382,9 @@ class LedConfig(ConfigModel):
     code: Code | None = None
     pwm_period_s: Annotated[Time, Field(gt=0)] = 1e-3
 
-    @model_validator(mode="after")
-    def check_intensity(self) -> LedConfig:
-        if (self.intensity_cd is None) == (self.radiant_intensity_w_sr is None):
-            raise InputError("", "an LED takes either intensity or radiant_intensity")
-        return self
-
-    @model_validator(mode="after")
-    def check_color(self) -> LedConfig:
-        if isinstance(self.spectrum, str) and (
-            self.fwhm_m is not None or self.color_scatter_m
-        ):
-            key = "color_scatter" if self.fwhm_m is None else "fwhm"
-            raise InputError(
-                key, f"{self.spectrum} is a whole spectrum", "a wavelength as spectrum"
-            )
-        return self
+    def of_type(self, name: str) -> LedConfig:
+        """The LED with brightness and color of one of its types; itself for an empty name."""
+        return self.model_copy(update=dict(self.types[name])) if name else self
 
     @model_validator(mode="after")
     def check_code(self) -> LedConfig:

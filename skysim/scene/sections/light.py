@@ -107,12 +107,15 @@ class WallConfig(ConfigModel):
         Angle of thickness_base, beyond which the thickness is constant
     radius_of
         Face that is a sphere: the outside, or the middle of the wall
+    density_kg_m3
+        Density, from which `skysim check` computes the mass; 1190 for acrylic
     """
 
     thickness_apex_m: Annotated[Length, Field(gt=0)]
     thickness_base_m: Annotated[Length, Field(gt=0)]
     base_deg: Annotated[Number, Field(gt=0, le=90)]
     radius_of: Literal["outside", "mid_wall"] = "outside"
+    density_kg_m3: Annotated[Number, Field(gt=0)] | None = None
 
 
 class SphereSurfaceConfig(RimmedConfig):
@@ -371,6 +374,24 @@ class DomeConfig(ConfigModel):
                 "led.drive.controller",
                 f"{self.layout.kind} has no boards",
                 "dome, or a number of LEDs",
+            )
+        return self
+
+    @model_validator(mode="after")
+    def check_types(self) -> DomeConfig:
+        layout = self.layout
+        used = {
+            name
+            for part in (layout, *getattr(layout, "boards", ()))
+            for name in getattr(part, "types", None) or ()
+        }
+        for name in sorted(used - {*self.led.types}):
+            raise InputError("layout.types", *unknown_name("LED type", name, self.led.types))
+        if set(self.led.types) - used or getattr(
+            getattr(layout, "points", None), "types", None
+        ):
+            raise InputError(
+                "led.types", "not all are used", "names in a list's or board's types"
             )
         return self
 

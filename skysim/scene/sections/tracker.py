@@ -157,6 +157,8 @@ class TrackerConfig(ConfigModel):
     cos_error
         Tolerance of the cosine of an angle between two stars, for the identifier `shefex` (Samaan & Theil 2011, eq. 3:
         c |cos FOV - cos(FOV - centroid error)|; they chose 5.5e-5). If left out, from centroid_sigma_px
+    intensity_threshold
+        Threshold of the detector `thesis` and of `skysim calibrate`, as a share of full scale (Padro 2012: 0.04)
     catalog
         Star catalog of the tracker, not that of the simulator: a name in data/catalogs, or a file of `skysim catalog
         build`, `select`, `readcat` or `proc-cat`
@@ -203,6 +205,7 @@ class TrackerConfig(ConfigModel):
     solver: str | None = None
     threshold_sigma: Annotated[Number, Field(gt=0)] = 5.0
     min_area_px: Annotated[int, Field(ge=1)] = 3
+    intensity_threshold: Annotated[Number, Field(gt=0, lt=1)] = 0.04
     catalog: str = "hipparcos_hp6.5"
     limit_mag: Number = 6.0
     centroid_sigma_px: Annotated[Number, Field(gt=0)] = 0.2

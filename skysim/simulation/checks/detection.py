@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from estimator.detection.detect import THESIS_INTENSITY
 from estimator.trackers.pipeline import SATURATED_SIGMA_PX, Settings
 from skysim.camera.detector import saturation_dn
 from skysim.core.types import Floats
@@ -103,7 +102,7 @@ def threshold_e(context: Context) -> float:
     camera = context.camera
     if settings.detector == "thesis":
         detector = context.lab.scene.camera.detector
-        threshold_dn = THESIS_INTENSITY * saturation_dn(detector)
+        threshold_dn = settings.intensity_threshold * saturation_dn(detector)
         return max(
             (threshold_dn - detector.offset_dn) * detector.gain_e_dn - camera.background_e,
             1.0,

@@ -23,6 +23,8 @@ from skysim.simulation.checks.expected_error import mean_root
 from skysim.simulation.checks.sampling import CheckedSamples, Sampled
 from skysim.sources.dome.layouts.led_list import max_tilt_deg
 from skysim.sources.dome.room import fit
+from skysim.sources.dome.surface import Radial
+from skysim.sources.dome.wall import wall_size
 
 GAUSSIAN_WIDTH = 4.0  # width of an image over its rms radius: D4sigma (ISO 11146), the diameter of a uniform disk
 SIDES = 12  # number of azimuths of the greatest tilt, and of rays around the field
@@ -350,6 +352,22 @@ def room(context: Context, samples: CheckedSamples) -> Fact | None:
     return Fact("room", [text], values)
 
 
+def wall(context: Context, samples: CheckedSamples) -> Fact | None:
+    """Area, volume and mass of a formed wall without its flange; None without `surface.wall`."""
+    light = context.lab.scene.light
+    config = getattr(getattr(light, "surface", None), "wall", None)
+    if config is None or not isinstance(light, DomeConfig):
+        return None
+    assert isinstance(context.surface, Radial)
+    size = wall_size(context.surface, light.layout.cap_deg)
+    text = f"inside {size.area_m2:.3f} m², volume {1e3 * size.volume_m3:.2f} L"
+    values = size._asdict()
+    if config.density_kg_m3 is not None:
+        values["mass_kg"] = config.density_kg_m3 * size.volume_m3
+        text += f", mass {values['mass_kg']:.2f} kg"
+    return Fact("dome's wall", [text + ", without ribs and flange"], values)
+
+
 def depth_of_focus(context: Context, samples: CheckedSamples) -> Fact:
     """Distances u at which the defocus disk is one pixel wide: 1 / u = 1 / focus ± pixel / (pupil image_distance)."""
     camera = context.camera.optics.camera
@@ -479,6 +497,7 @@ FACTS: tuple[Callable[[Context, CheckedSamples], Fact | None], ...] = (
     smear,
     cap,
     room,
+    wall,
     depth_of_focus,
     tracker_beliefs,
     expected_error,

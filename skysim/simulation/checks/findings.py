@@ -12,7 +12,6 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.detection.detect import THESIS_INTENSITY
 from skysim.camera import thermal_motion
 from skysim.camera.detector import saturation_dn
 from skysim.camera.optics import Optics
@@ -136,13 +135,14 @@ def black_level(context: Context, samples: CheckedSamples) -> str:
     """Warn if a pixel without light is above the fixed threshold of the detector `thesis`."""
     detector = context.lab.scene.camera.detector
     level_dn = detector.offset_dn + context.camera.background_e / detector.gain_e_dn
-    threshold_dn = THESIS_INTENSITY * saturation_dn(detector)
+    share = context.settings.intensity_threshold
+    threshold_dn = share * saturation_dn(detector)
     if context.settings.detector != "thesis" or level_dn < threshold_dn:
         return ""
     return (
-        f"camera.detector.offset_dn: the black level of {short(level_dn, 3)} DN is above the threshold of 4 % of the"
-        f" detector thesis, {short(threshold_dn, 3)} DN, so that it finds no light; change it to"
-        f" {short(threshold_dn / 4, 2)}, or tracker.detector to local"
+        f"camera.detector.offset_dn: the black level of {short(level_dn, 3)} DN is above the threshold of"
+        f" {100 * share:g} % of the detector thesis, {short(threshold_dn, 3)} DN, so that it finds no light; change"
+        f" it to {short(threshold_dn / 4, 2)}, or tracker.detector to local"
     )
 
 

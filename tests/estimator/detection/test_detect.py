@@ -7,11 +7,13 @@ import pytest
 from scipy import ndimage, stats
 from scipy.special import erf
 
+from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Background, FramePriors
 from estimator.detection import background as frame_background
 from estimator.detection import detect
 from estimator.detection.classify import NO_STAR
+from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 
 BINOMIAL = np.outer([1, 2, 1], [1, 2, 1]) / 16
 
@@ -203,6 +205,31 @@ def test_the_thesis_s_full_scale_is_that_of_the_pixel_type() -> None:
     image = np.random.default_rng(15).normal(5, 1, (120, 160))
     image[40:50, 40:50] += 60
     assert [len(detect.thesis(image.astype(dtype))) for dtype in ("u1", "u2")] == [1, 0]
+
+
+@pytest.mark.parametrize(
+    ("threshold", "expected"), [(0.02, 4), (0.04, 3), (0.1, 2), (0.25, 1), (0.5, 0)]
+)
+def test_the_thesis_s_threshold_is_a_share_of_full_scale(
+    threshold: float, expected: int
+) -> None:
+    """Padro 2012, page 73: lights of 3, 6, 15 and 35 % of 255 by thresholds of 2, 4, 10, 25 and 50 %."""
+    image = np.zeros((120, 160), np.uint8)
+    image[::2, ::2] = 1  # a frame of one value is empty
+    for n, share in enumerate((0.03, 0.06, 0.15, 0.35)):
+        image[40:52, 20 + 35 * n : 32 + 35 * n] = round(255 * share)
+    blobs = detect.thesis(image, priors=FramePriors(intensity_threshold=threshold))
+    assert len(blobs) == expected
+    camera = Camera.from_fov(160, 120, 0.2)
+    settings = Settings(detector="thesis", intensity_threshold=threshold)
+    assert len(detect_and_centroid(image, camera, settings, Clock())) == expected
+
+
+@pytest.mark.parametrize("threshold", [0.0, 1.1, float("nan"), "4 %"])
+def test_a_threshold_beyond_full_scale_is_refused(threshold: float) -> None:
+    for make in (FramePriors, Settings):
+        with pytest.raises(ImageError, match=r"intensity_threshold.*above 0, up to 1"):
+            make(intensity_threshold=threshold)
 
 
 def test_a_boolean_mask_is_a_valid_image() -> None:

@@ -170,6 +170,26 @@ def test_false_lights_have_no_centroid_error() -> None:
     assert math.isnan(outcomes.centroid_error_px(np.empty((0, 2)), true_px, 3.0))
 
 
+def test_a_detection_is_of_a_light_or_of_none() -> None:
+    """Of three lights one has two detections and one has none; a detection is far from all of them."""
+    lights_px = np.array([[10.0, 10.0], [50.0, 50.0], [90.0, 90.0]])
+    centroids_px = np.array([[10.0, 12.9], [8.0, 10.0], [53.1, 50.0], [90.0, 89.0]])
+    assert outcomes.near(lights_px, centroids_px, 3.0) == 2
+    assert outcomes.near(centroids_px, lights_px, 3.0) == 3
+    assert outcomes.near(centroids_px, np.empty((0, 2)), 3.0) == 0
+    assert outcomes.near(np.empty((0, 2)), lights_px, 3.0) == 0
+
+
+def test_all_detections_without_noise_are_of_lights_and_false_ones_are_counted() -> None:
+    for false in (0, 4):
+        trial = {"trial.noise_px": 0.01, "trial.false_lights": false}
+        rows = trials.run_segments(SKY, (trials.Segment(0, trial, 0, range(5)),))
+        for one in (row.outcome for row in rows):
+            assert one.lights_detected == one.stars
+            # A false one may fall on a light.
+            assert one.detected - one.stars - 1 <= one.false_detections <= false
+
+
 @pytest.mark.slow
 def test_a_streak_is_as_long_as_the_rate_times_the_exposure() -> None:
     spec = replace(SKY, trial={"kind": "frames", "rate_deg_s": 4.0})

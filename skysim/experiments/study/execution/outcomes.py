@@ -77,6 +77,9 @@ class Outcome:
     centroid_px
         RMS error of the centroids about each axis, of those within SAME_LIGHT_PX of a true
         image
+    lights_detected, false_detections
+        Number of true images with a centroid within SAME_LIGHT_PX, and of centroids without such an
+        image; means for a flight
     streak_px
         Length of the images of the lights, median of a frame and mean for a flight; NaN for
         centroid trials
@@ -119,6 +122,8 @@ class Outcome:
     misled: float = math.nan
     wrong_matches: float = math.nan
     centroid_px: float = math.nan
+    lights_detected: float = math.nan
+    false_detections: float = math.nan
     streak_px: float = math.nan
     angles_compared: float = math.nan
     exposure_ms: float = math.nan
@@ -191,6 +196,9 @@ def score(
         "ambiguous": int(solution.status.startswith(AMBIGUOUS)),
         **dict.fromkeys(IDENTITY, 0.0 if own_tracker else math.nan),
         "centroid_px": centroid_error_px(centroids_px, lights.flux_xy_px, reach_px),
+        "lights_detected": near(lights.flux_xy_px, centroids_px, reach_px),
+        "false_detections": len(centroids_px)
+        - near(centroids_px, lights.flux_xy_px, reach_px),
         "streak_px": streak_px,
         "angles_compared": solution.angles_compared or math.nan,
         "detect_ms": 1e3 * report.seconds.get("detect", math.nan),
@@ -288,6 +296,13 @@ def centroid_error_px(centroids_px: Floats, true_px: Floats, reach_px: float) ->
     return rms(distance_px) / math.sqrt(2)
 
 
+def near(xy_px: Floats, others_px: Floats, reach_px: float) -> int:
+    """Number of positions with another one within reach_px."""
+    if not len(xy_px) or not len(others_px):
+        return 0
+    return int(np.sum(nearest_light(xy_px, others_px)[1] <= reach_px))
+
+
 @jit
 def nearest_light(xy_px: Floats, lights_px: Floats) -> tuple[NDArray[np.int64], Floats]:
     """(K,) row of the light nearest to each position, and its distance."""
@@ -374,6 +389,8 @@ def summarize_flight(log: Telemetry, outcomes: list[Outcome], settle_s: float) -
             for name in IDENTITY
         },
         centroid_px=rms(finite([one.centroid_px for one in outcomes])),
+        lights_detected=mean([one.lights_detected for one in outcomes]),
+        false_detections=mean([one.false_detections for one in outcomes]),
         streak_px=mean(finite([one.streak_px for one in outcomes])),
         angles_compared=mean(finite([one.angles_compared for one in outcomes])),
         exposure_ms=outcomes[-1].exposure_ms if outcomes else math.nan,

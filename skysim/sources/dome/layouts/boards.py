@@ -86,8 +86,9 @@ def patch_boards(
         + ((hole // 3 - 1) * config.pitch_m + displacement_m[1])[:, None] * boards.v[board]
     )
     number = (board * HOLES + hole).astype(np.int64)
+    types = [name for each in config.boards for name in each.types or [""] * len(each.leds)]
     placed = PlacedLeds(
-        number, place, boards.normal[board], level, np.full(len(board), np.nan)
+        number, place, boards.normal[board], level, np.full(len(board), np.nan), types
     )
     return led_sources(placed, led, band, rng)
 

@@ -82,7 +82,7 @@ def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -
     check_on_surface(key, surface, place_m)
     # Without levels every LED is at full brightness.
     level = level if level is not None and len(level) else np.ones(len(place_m))
-    placed = on_surface(surface, place_m, level)
+    placed = replace(on_surface(surface, place_m, level), types=config.types or ())
     placed = placed if number is None else replace(placed, id=number)
     return led_sources(placed, led, band, random_stream(config.hardware_seed))
 

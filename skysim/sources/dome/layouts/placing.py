@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -47,6 +48,8 @@ class PlacedLeds:
         (N,) fractions of full brightness, 0 < level <= 1
     magnitude
         (N,) magnitudes of the stars that the LEDs represent; NaN for LEDs that represent none
+    types
+        (N,) names in `led.types`, empty for `led` itself; none for LEDs of one type
     """
 
     id: Ints
@@ -54,6 +57,7 @@ class PlacedLeds:
     normal: Floats
     level: Floats
     magnitude: Floats
+    types: Sequence[str] = ()
 
 
 def led_sources(
@@ -65,16 +69,26 @@ def led_sources(
     """
     # Order of the random numbers: strengths, phases of the drive, colors, aging.
     count = len(placed.id)
-    scatter = strength_factors(led.scatter, rng.standard_normal(count))
-    strength = full_strength_e_s_sr(led, band) * scatter
+    names = np.array(placed.types or [""] * count)
+    types = [(led.of_type(name), names == name) for name in sorted({*names.tolist()})]
+    strength = np.empty(count)
+    for one, rows in types:
+        strength[rows] = full_strength_e_s_sr(one, band)
+    strength *= strength_factors(led.scatter, rng.standard_normal(count))
     pulses = DRIVES[led.drive.kind](led, DriveInput(placed.level, placed.id // HOLES), rng)
     color = np.zeros(count)
     # Drawn last, so that all other numbers are the same without it.
-    if led.color_scatter_m:
+    if any(one.color_scatter_m for one, _ in types):
         color = rng.standard_normal(count)
-        strength = strength * color_factors(led, band, color)
+    for one, rows in types:
+        if one.color_scatter_m:
+            strength[rows] *= color_factors(one, band, color[rows])
     if led.aging:
         strength = strength * aging_factors(led.aging, rng.standard_normal(count))
+    chromatic = np.empty((count, 4))
+    if band.chromatic is not None:
+        for one, rows in types:
+            chromatic[rows] = chromatic_of(one, band, color[rows])
     return Sources(
         id=placed.id,
         place=np.column_stack([placed.place_m, np.ones(count)]),
@@ -86,7 +100,7 @@ def led_sources(
         on_s=pulses.on_s,
         clock=pulses.clock,
         magnitude=placed.magnitude,
-        chromatic=chromatic_of(led, band, color),
+        chromatic=chromatic if band.chromatic is not None else None,
     )
 
 
