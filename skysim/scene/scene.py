@@ -335,6 +335,20 @@ class Scene(ConfigModel):
         return self
 
     @model_validator(mode="after")
+    def check_gimbals(self) -> Scene:
+        """Check that a two-axis mount follows profiles alone, in a laboratory."""
+        motion = self.motion
+        other = {leg.kind for leg in motion.maneuver} - {"profile", "hold", "jitter"}
+        follows = motion.is_prescribed and motion.start == "profile" and not other
+        if self.vehicle.gimbals and (not follows or isinstance(self.light, StarsConfig)):
+            raise InputError(
+                "vehicle.mount",
+                "two_axis follows profiles in a laboratory, without dynamics",
+                "motion.control: prescribed, start: profile, maneuvers profile, hold, jitter, and no light: stars",
+            )
+        return self
+
+    @model_validator(mode="after")
     def check_rates(self) -> Scene:
         """Check that a control period is a whole number of milliseconds and of IMU samples, and resolves every sine."""
         rate_hz = self.control_rate_hz
