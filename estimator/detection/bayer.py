@@ -67,11 +67,10 @@ def _demosaic(
         for x in range(width):
             left = abs(x - 1)
             right = x + 1 if x + 1 < width else x - 1
-            beside = 0.5 * (float(row[left]) + float(row[right]))
-            above = 0.5 * (float(up[x]) + float(down[x]))
+            beside = 0.5 * (row[left] + row[right])
+            above = 0.5 * (up[x] + down[x])
             if ((x - red_x) % 2 == 0) == red_row:
-                corners = float(up[left]) + float(up[right]) + float(down[left])
-                corners = 0.25 * (corners + float(down[right]))
+                corners = 0.25 * (up[left] + up[right] + down[left] + down[right])
                 value = own * row[x] + WG * 0.5 * (beside + above) + other * corners
             else:
                 value = WG * row[x] + own * beside + other * above

@@ -40,7 +40,7 @@ def on_gimbals(samples: Samples, config: GimbalsConfig) -> Samples:
     R = samples.a_from_b.as_matrix()
     azimuth = np.arctan2(-R[:, 0, 1], R[:, 1, 1])
     angle_rad = np.unwrap(np.stack([azimuth, np.arctan2(-R[:, 2, 0], R[:, 2, 2])]))
-    third_rad = (attitudes(angle_rad).inv() * samples.a_from_b).magnitude()
+    third_rad = (Rotation.from_euler("ZY", angle_rad.T).inv() * samples.a_from_b).magnitude()
     if third_rad.max() > THIRD_AXIS_RAD:
         n = int(third_rad.argmax())
         raise samples.error(
@@ -52,7 +52,7 @@ def on_gimbals(samples: Samples, config: GimbalsConfig) -> Samples:
     first_rad = np.radians(config.azimuth_deg[0])
     angle_rad[0] += 2 * np.pi * np.ceil((first_rad - angle_rad[0, 0]) / (2 * np.pi) - 1e-9)
     # 2. Limits.
-    check_limits(samples, np.degrees(angle_rad), config)
+    check_limits(samples, np.degrees(angle_rad).round(9), config)
     # 3. Resolution and play.
     if config.resolution_arcsec:
         step_rad = config.resolution_arcsec * ARCSEC_RAD
@@ -63,33 +63,27 @@ def on_gimbals(samples: Samples, config: GimbalsConfig) -> Samples:
         angle_rad[:, n] = np.clip(
             angle_rad[:, n - 1], commanded - half_rad, commanded + half_rad
         )
-    return replace(samples, a_from_b=attitudes(angle_rad))
-
-
-def attitudes(angle_rad: Floats) -> Rotation:
-    """lab_from_body at (2, N) azimuths and elevations."""
-    return Rotation.from_euler("ZY", angle_rad.T)
+    return replace(samples, a_from_b=Rotation.from_euler("ZY", angle_rad.T))
 
 
 def check_limits(samples: Samples, angle_deg: Floats, config: GimbalsConfig) -> None:
     """Raise InputError for (2, N) angles beyond the limits, and for rates beyond theirs."""
-    rate_deg_s = np.abs(np.diff(angle_deg)) / np.diff(samples.t_s)
-    ranges = config.azimuth_deg, config.elevation_deg
-    for name, angle, rate, (low, high) in zip(
-        AXES, angle_deg, rate_deg_s, ranges, strict=True
-    ):
-        beyond = np.flatnonzero((angle < low - 1e-6) | (angle > high + 1e-6))
-        if len(beyond):
-            n = int(beyond[0])
-            raise samples.error(
-                n,
-                f"{name} {angle[n]:.6g} deg",
-                f"{low:g} to {high:g}, vehicle.gimbals.{name}_deg",
-            )
-        n = int(rate.argmax())
-        if rate[n] > config.rate_limit_deg_s * (1 + 1e-6):
-            raise samples.error(
-                n + 1,
-                f"{name} at {rate[n]:.4g} deg/s, at elevation {angle_deg[1, n]:.3g} deg; 0 is gimbal lock",
-                f"up to vehicle.gimbals.rate_limit_deg_s {config.rate_limit_deg_s:g}",
-            )
+    low_high_deg = np.array([config.azimuth_deg, config.elevation_deg])
+    beyond = np.argwhere(angle_deg != np.clip(angle_deg, *low_high_deg.T[:, :, None]))
+    if len(beyond):
+        axis, n = beyond[0].tolist()
+        low, high = low_high_deg[axis]
+        raise samples.error(
+            n,
+            f"{AXES[axis]} {angle_deg[axis, n]:.6g} deg",
+            f"{low:g} to {high:g}, vehicle.gimbals.{AXES[axis]}_deg",
+        )
+    rate_deg_s = (np.abs(np.diff(angle_deg)) / np.diff(samples.t_s)).round(9)
+    axis, n = divmod(int(rate_deg_s.argmax()), len(samples.t_s) - 1)
+    if rate_deg_s[axis, n] > config.rate_limit_deg_s:
+        raise samples.error(
+            n + 1,
+            f"{AXES[axis]} at {rate_deg_s[axis, n]:.4g} deg/s, at elevation {angle_deg[1, n]:.3g} deg;"
+            " 0 is gimbal lock",
+            f"up to vehicle.gimbals.rate_limit_deg_s {config.rate_limit_deg_s:g}",
+        )

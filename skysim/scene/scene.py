@@ -336,14 +336,19 @@ class Scene(ConfigModel):
 
     @model_validator(mode="after")
     def check_gimbals(self) -> Scene:
-        """Check that a two-axis mount follows profiles alone, in a laboratory."""
+        """Check that a two-axis mount has gimbals, and follows profiles alone, in a laboratory."""
         motion = self.motion
-        other = {leg.kind for leg in motion.maneuver} - {"profile", "hold", "jitter"}
-        follows = motion.is_prescribed and motion.start == "profile" and not other
-        if self.vehicle.gimbals and (not follows or isinstance(self.light, StarsConfig)):
+        two_axis = self.vehicle.mount == "two_axis"
+        follows = (
+            motion.is_prescribed
+            and motion.start == "profile"
+            and {leg.kind for leg in motion.maneuver} <= {"profile", "hold", "jitter"}
+            and not isinstance(self.light, StarsConfig)
+        )
+        if two_axis != bool(self.vehicle.gimbals) or (two_axis and not follows):
             raise InputError(
-                "vehicle.mount",
-                "two_axis follows profiles in a laboratory, without dynamics",
+                "vehicle.gimbals",
+                "mount two_axis has them and follows profiles in a laboratory, without dynamics",
                 "motion.control: prescribed, start: profile, maneuvers profile, hold, jitter, and no light: stars",
             )
         return self

@@ -409,12 +409,8 @@ def color_channels(plan: LightPlan) -> tuple[ColorChannel, ...]:
         return ()
     channels = []
     for color, curve in colors:
-        own = {"bayer": None, "quantum_efficiency": curve}
-        detector = camera.detector.model_copy(update=own)
-        one_color = camera.model_copy(update={"detector": detector})
-        band = Band.from_camera(one_color)
-        scene = plan.scene.model_copy(update={"camera": one_color})
-        lights = build_lights(replace(plan, scene=scene, band=band, known=None))
+        band = Band.from_camera(camera, curve)
+        lights = build_lights(replace(plan, band=band, known=None))
         letters = enumerate(camera.detector.bayer or "")
         first_px = tuple(divmod(n, 2) for n, one in letters if one == color[0].upper())
         channels.append(ColorChannel(first_px, band, lights))

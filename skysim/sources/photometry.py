@@ -75,12 +75,13 @@ class Band:
     chromatic: ChromaticConfig | None = None
 
     @classmethod
-    def from_camera(cls, camera: CameraConfig) -> Band:
+    def from_camera(cls, camera: CameraConfig, curve: str = "") -> Band:
         """The response of a camera: its chip's quantum efficiency times its lens's transmission curve; cached.
 
-        A transmission that is one number is part of `Optics.collecting_m2`. Raises as `from_efficiency`.
+        `curve` is the quantum efficiency of one of its colors; if empty, that of the chip. A transmission that is one
+        number is part of `Optics.collecting_m2`. Raises as `from_efficiency`.
         """
-        band = cls.from_efficiency(camera.detector.quantum_efficiency)
+        band = cls.from_efficiency(curve or camera.detector.quantum_efficiency)
         if isinstance(camera.transmission, str):
             # The time of change is part of the cache's key.
             path = Path(camera.transmission)
@@ -160,10 +161,7 @@ def _scaled(band: Band, peak: float) -> Band:
 def _luma(*colors: Band) -> Band:
     """The band of the gray image of a red, a green and a blue band."""
     grid_m = np.unique(np.concatenate([color.wavelength_m for color in colors]))
-    response = sum(
-        weight * color.response_at(grid_m) for weight, color in zip(LUMA, colors, strict=True)
-    )
-    return Band(grid_m, np.asarray(response))
+    return Band(grid_m, np.dot(LUMA, [color.response_at(grid_m) for color in colors]))
 
 
 @lru_cache(maxsize=64)

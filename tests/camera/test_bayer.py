@@ -29,6 +29,7 @@ STILL = {
     "exposure": "{time: 200 ms, rate_hz: 1, frames: 1}",
     "motion.rate_deg_s": "[0, 0, 0]",
     "camera.psf.sigma_px": str(SHARP_PX),
+    "light.limit_mag": "6",
 }
 # Lonely stars of the frame with their B-V and V-I: a K giant and a B9 star.
 RED_STAR = (27750, 1.382, 1.31)
@@ -81,7 +82,7 @@ def test_three_equal_filters_are_a_monochrome_camera_bit_for_bit() -> None:
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_a_sunlit_flat_field_has_the_ratios_of_the_three_responses(pattern: str) -> None:
     """A sky as bright as V 5 a square arcsecond, of the light of a G2 star, 5,770 K in the table."""
-    sky = {"background": "[{kind: sky, mag_arcsec2: 5}]", "light.limit_mag": "0"}
+    sky = {"background": "[{kind: sky, mag_arcsec2: 5}]"} | {"light.limit_mag": "0"}
     own = {"bayer": pattern, "quantum_efficiency": COLORS, "noise": "false", "prnu": "0"}
     lab = build_lab(
         loader.load(

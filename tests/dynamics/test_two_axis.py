@@ -136,9 +136,9 @@ def test_beside_the_zenith_the_azimuth_needs_the_rate_over_the_sine_of_the_eleva
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"motion.control": "pid"}, "vehicle.mount: two_axis follows profiles"),
-        ({"vehicle.gimbals": "null"}, "gimbals.*belongs to mount two_axis"),
-        ({"vehicle.mount": "free"}, "gimbals.*belongs to mount two_axis"),
+        ({"motion.control": "pid"}, "vehicle.gimbals: mount two_axis.*prescribed"),
+        ({"vehicle.gimbals": "null"}, "vehicle.gimbals: mount two_axis has them"),
+        ({"vehicle.mount": "free"}, "vehicle.gimbals: mount two_axis has them"),
     ],
 )
 def test_a_mount_needs_gimbals_and_a_profile(changes: dict[str, str], told: str) -> None:

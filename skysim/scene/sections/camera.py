@@ -295,6 +295,9 @@ def existing_curve(value: str) -> str:
     return value
 
 
+Curve = Annotated[str, AfterValidator(existing_curve)]
+
+
 class EfficiencyConfig(ConfigModel):
     """A curve of quantum efficiency, scaled to the peak that a data sheet states.
 
@@ -306,32 +309,28 @@ class EfficiencyConfig(ConfigModel):
         Electrons per photon at the highest point of the curve
     """
 
-    curve: Annotated[str, AfterValidator(existing_curve)]
+    curve: Curve
     peak: Annotated[Number, Field(gt=0, le=1)]
 
 
 class ColorEfficiencyConfig(ConfigModel):
     """The quantum efficiency behind each filter of a Bayer mosaic: the name of a curve in data/qe, or a file."""
 
-    red: Annotated[str, AfterValidator(existing_curve)]
-    green: Annotated[str, AfterValidator(existing_curve)]
-    blue: Annotated[str, AfterValidator(existing_curve)]
+    red: Curve
+    green: Curve
+    blue: Curve
 
 
 def efficiency_tag(value: Any) -> str:
     """Tag of the kind of quantum efficiency; an error then names the keys of the section only if there is one."""
-    if isinstance(value, ColorEfficiencyConfig) or (
-        isinstance(value, dict) and "red" in value
-    ):
-        return "ColorEfficiencyConfig"
-    if isinstance(value, dict | EfficiencyConfig):
-        return "EfficiencyConfig"
+    if isinstance(value, dict | ConfigModel):
+        return "ColorEfficiencyConfig" if "red" in dict(value) else "EfficiencyConfig"
     return "name" if isinstance(value, str) else "number"
 
 
 Efficiency = Annotated[
     Annotated[Annotated[float, Field(gt=0, le=1)], Tag("number")]
-    | Annotated[Annotated[str, AfterValidator(existing_curve)], Tag("name")]
+    | Annotated[Curve, Tag("name")]
     | Annotated[EfficiencyConfig, Tag("EfficiencyConfig")]
     | Annotated[ColorEfficiencyConfig, Tag("ColorEfficiencyConfig")],
     Discriminator(efficiency_tag),

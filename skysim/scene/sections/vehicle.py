@@ -322,12 +322,6 @@ class VehicleConfig(ConfigModel):
         return value
 
     @model_validator(mode="after")
-    def check_gimbals(self) -> VehicleConfig:
-        if (self.mount == "two_axis") != (self.gimbals is not None):
-            raise InputError("gimbals", "belongs to mount two_axis", "both, or neither")
-        return self
-
-    @model_validator(mode="after")
     def check_free_mount(self) -> VehicleConfig:
         if self.mount == "free" and self.disturbances != DisturbancesConfig():
             raise InputError("disturbances", "a free vehicle has none", "mount: air_bearing")
