@@ -82,7 +82,7 @@ def test_three_equal_filters_are_a_monochrome_camera_bit_for_bit() -> None:
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_a_sunlit_flat_field_has_the_ratios_of_the_three_responses(pattern: str) -> None:
     """A sky as bright as V 5 a square arcsecond, of the light of a G2 star, 5,770 K in the table."""
-    sky = {"background": "[{kind: sky, mag_arcsec2: 5}]"} | {"light.limit_mag": "0"}
+    sky = {"background": "[{kind: sky, mag_arcsec2: 5}]", "light.limit_mag": "0"}
     own = {"bayer": pattern, "quantum_efficiency": COLORS, "noise": "false", "prnu": "0"}
     lab = build_lab(
         loader.load(
