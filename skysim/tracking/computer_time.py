@@ -23,7 +23,7 @@ CPUINFO = Path("/proc/cpuinfo")
 
 @functools.cache
 def fastest_mhz() -> float:
-    """The fastest clock of this machine's processors. Raises InputError where Linux does not tell it."""
+    """The fastest clock of this machine's processors. Raises InputError where Linux does not state it."""
     text = CPUINFO.read_text(encoding="utf-8") if CPUINFO.is_file() else ""
     clocks = re.findall(r"cpu MHz\s*: ([\d.]+)", text)
     if not clocks:

@@ -138,7 +138,7 @@ class DecoderConfig(ConfigModel):
 
 
 class ComputerConfig(ConfigModel):
-    """Another computer, on which the tracker's times are told as well.
+    """Another computer, for which the times of the tracker are computed.
 
     Attributes
     ----------
@@ -207,7 +207,7 @@ class TrackerConfig(ConfigModel):
         Standard deviation of a star's measured magnitude over the catalog's V (noise, colors), for identification by
         magnitude and place; by place alone if left out. The zero point is that of a star of the Sun's color
     computer
-        Computer whose times a run tells and a study has as `computer_ms`
+        Computer whose times a run reports and a study has as `computer_ms`
     map
         File that `skysim survey` wrote: measured LEDs, lever, focal length and distortion
     """
