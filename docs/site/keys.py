@@ -82,6 +82,10 @@ TEXTS = {
     "light.led.spectrum": "`white`, a CSV file, or a wavelength from 300 nm to 1100 nm",
     "camera.detector.quantum_efficiency": f"a number to 1, or {stems(CURVE_FOLDER, 'csv')}, or a CSV file",
     "camera.detector.quantum_efficiency.curve": f"{stems(CURVE_FOLDER, 'csv')}, or a CSV file",
+    **dict.fromkeys(
+        (f"camera.detector.quantum_efficiency.{color}" for color in ("red", "green", "blue")),
+        f"{stems(CURVE_FOLDER, 'csv')}, or a CSV file",
+    ),
     "heads.name": "a word in small letters, other than `main`",
     "vehicle.model": "an MJCF file",
     "motion.control.law": "`pid`, `pd`, or a controller of an entry point or of `--program`",

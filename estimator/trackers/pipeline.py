@@ -4,7 +4,7 @@ A frame passes through four stages, each a function named in `Settings`: detect 
 positions with errors), identify (positions to stars or LEDs) and solve (matches to an attitude). This module has the
 first two (`detect_and_centroid`):
 
-1. Check the frame: its shape, saturation, and bad pixels.
+1. Check the frame: its shape, saturation, and bad pixels. A color camera's frame becomes a gray one.
 2. Detect blobs, and drop those that cannot be stars (hot pixels, tracks, the Moon, texture) or touch the border.
 3. Centroid them, with larger errors for saturated blobs and bad pixels.
 4. Drop centroids that are too inaccurate to distinguish stars.
@@ -36,6 +36,7 @@ from estimator.core.types import (
     RateEstimate,
 )
 from estimator.detection import classify
+from estimator.detection.bayer import PATTERNS, gray_from_bayer
 from estimator.detection.classify import NO_STAR, Flag
 from estimator.detection.detect import DETECTORS, in_row_order, replace_bad_pixels, to_native
 from estimator.identification.solver_options import ACCEPTANCES
@@ -129,6 +130,8 @@ class Settings:
         Flags of `detection.classify.Flag` that exclude a blob
     bad_px
         (K, 2) x and y of the sensor's bad pixels; None without a map
+    bayer
+        Filters of a color camera, a key of `detection.bayer.PATTERNS`; None for a monochrome one
 
     Raises
     ------
@@ -160,6 +163,7 @@ class Settings:
     assumed_deg: tuple[float, float, float] | None = None
     reject: int = int(NO_STAR)
     bad_px: Ints | None = field(default=None, compare=False)
+    bayer: str | None = None
 
     def __new__(cls, *args: Any, **named: Any) -> Settings:
         for name in named:
@@ -187,6 +191,10 @@ class Settings:
         if self.assumed_deg is not None:
             angles = checks.floats("settings: assumed_deg", self.assumed_deg, (3,))
             object.__setattr__(self, "assumed_deg", tuple(angles.tolist()))
+        if self.bayer is not None:
+            checks.known("settings: bayer", self.bayer, PATTERNS)
+            if self.bad_px is not None:
+                raise ImageError("settings: bad_px with bayer; allowed: one of the two")
         if self.bad_px is not None:
             bad = np.asarray(self.bad_px)
             if (
@@ -269,6 +277,7 @@ def detect_and_centroid(
             )
     if settings.bad_px is not None:
         image = replace_bad_pixels(image, settings.bad_px)
+    image = monochrome(image, settings)
     # 2. Blobs
     priors = FramePriors(
         streak_px, settings.saturation, turn_rad, settings.intensity_threshold
@@ -294,6 +303,13 @@ def detect_and_centroid(
     )
     valid &= (centroids.flux > 0) & (centroids.flux < np.inf)
     return centroids if valid.all() else centroids.take(valid)
+
+
+def monochrome(image: NDArray, settings: Settings) -> NDArray:
+    """Return the gray image of a color camera's frame; the frame of a monochrome camera as it is."""
+    if settings.bayer is None:
+        return image
+    return gray_from_bayer(image, settings.bayer, settings.saturation)
 
 
 def inflate_uncertainty(centroids: Centroids, blobs: Blobs, settings: Settings) -> Centroids:

@@ -34,6 +34,7 @@ from estimator.trackers.pipeline import (
     Report,
     detect_and_centroid,
     inflate_uncertainty,
+    monochrome,
 )
 from estimator.trackers.rolling_shutter import with_streak_rate
 from estimator.trackers.star_tracker import StarTracker
@@ -356,6 +357,7 @@ class TrackingMode:
                 < self.reach_px
             )
             return centroids.take(near.any(axis=1)), False
+        image = monochrome(image, settings)
         blobs = in_windows(image, window_centers_px, self.reach_px, WINDOW_SIGMA, priors)
         blobs = blobs.take(blobs.flag & settings.reject == 0)
         clock.lap("detect")

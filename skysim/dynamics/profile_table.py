@@ -5,7 +5,8 @@ The names of the columns define their content, so nothing is guessed:
 time     : `t_s`, or `utc` (ISO 8601)
 attitude : a quaternion `A_from_B_qw`, `_qx`, `_qy`, `_qz` of one of the rotations in QUATERNIONS, or the components
            `q_w`, `q_x`, `q_y`, `q_z` where the scene's maneuver names the rotation; in a laboratory `roll_deg`,
-           `pitch_deg`, `yaw_deg`, 3-2-1 angles of the body; under the stars `ra_deg`, `dec_deg`, `roll_deg` of the
+           `pitch_deg`, `yaw_deg`, 3-2-1 angles of the body, or `azimuth_deg`, `elevation_deg` of a two-axis mount,
+           Rz(azimuth) Ry(elevation); under the stars `ra_deg`, `dec_deg`, `roll_deg` of the
            camera
 """
 
@@ -36,14 +37,16 @@ QUATERNIONS = (
 )
 BARE = ("q_x", "q_y", "q_z", "q_w")
 BODY_ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
+GIMBAL_ANGLES = ("azimuth_deg", "elevation_deg")
 CAMERA_ANGLES = ("ra_deg", "dec_deg", "roll_deg")
 TIMES = ("t_s", "utc")
-UNITS = {"t_s": "s", **dict.fromkeys(BODY_ANGLES + CAMERA_ANGLES, "deg")}
+UNITS = {"t_s": "s", **dict.fromkeys(BODY_ANGLES + GIMBAL_ANGLES + CAMERA_ANGLES, "deg")}
 COLUMNS = (
     "t_s or utc, with A_from_B_qx, _qy, _qz, _qw (A_from_B: "
     + ", ".join(QUATERNIONS)
     + "), or q_x, q_y, q_z, q_w and"
-    " the maneuver's key rotation, or roll_deg, pitch_deg, yaw_deg, or ra_deg, dec_deg, roll_deg"
+    " the maneuver's key rotation, or roll_deg, pitch_deg, yaw_deg, or azimuth_deg,"
+    " elevation_deg, or ra_deg, dec_deg, roll_deg"
 )
 
 
@@ -176,7 +179,7 @@ def check_names(where: Where, names: Sequence[str], rotation: str | None) -> Non
         raise InputError(where.file, f"two columns {excerpt(repeated[0])}", "one", where)
     # The sets of columns that make an attitude.
     attitudes = [tuple(f"{name}_q{end}" for end in "xyzw") for name in QUATERNIONS]
-    attitudes += [BARE, BODY_ANGLES, CAMERA_ANGLES]
+    attitudes += [BARE, BODY_ANGLES, GIMBAL_ANGLES, CAMERA_ANGLES]
     known = {*TIMES, *(name for columns in attitudes for name in columns)}
     unknown = [name for name in names if name not in known]
     if unknown:
@@ -224,6 +227,9 @@ def to_samples(
     # 3-2-1 angles of the body in the lab.
     if "yaw_deg" in columns:
         body = Rotation.from_euler("ZYX", stack(columns, BODY_ANGLES[::-1]), degrees=True)
+        return Samples(source, unit, ends, t_s, "lab", "body", body, absolute)
+    if "azimuth_deg" in columns:
+        body = Rotation.from_euler("ZY", stack(columns, GIMBAL_ANGLES), degrees=True)
         return Samples(source, unit, ends, t_s, "lab", "body", body, absolute)
     # Right ascension, declination and roll of the camera.
     if "ra_deg" in columns:

@@ -3,7 +3,8 @@
 1. `read_profile` reads the samples of a file or table (profile_aem.py, profile_stk.py, profile_table.py).
 2. `to_body` converts them to lab_from_body.
 3. `profile_samples.check_samples` checks their number, times and steps.
-4. `reference_curves.fit_spline` interpolates them.
+4. `two_axis.on_gimbals` turns them to those that a two-axis mount takes.
+5. `reference_curves.fit_spline` interpolates them.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from skysim.core.types import Mount
 from skysim.dynamics import profile_aem, profile_stk, profile_table
 from skysim.dynamics.profile_samples import Samples, check_samples
 from skysim.dynamics.reference_curves import AttitudeSpline, fit_spline
+from skysim.dynamics.two_axis import on_gimbals
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.motion import ProfileConfig
@@ -53,7 +55,10 @@ def load_profiles(
             source = given if given is not None and not profiles else Path(element.file)
             try:
                 samples = read_profile(source, in_utc(scene.start_time), element.rotation)
-                profiles.append(fit_spline(check_samples(to_body(samples, scene, mount))))
+                samples = check_samples(to_body(samples, scene, mount))
+                if scene.vehicle.gimbals:
+                    samples = on_gimbals(samples, scene.vehicle.gimbals)
+                profiles.append(fit_spline(samples))
             except InputError as error:
                 raise error.within(f"motion.maneuver.{n}") from None
     return tuple(profiles)

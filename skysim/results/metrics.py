@@ -388,6 +388,7 @@ QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
             "exposure_ms",
             "time_ms",
             "detect_ms",
+            "computer_ms",
         )
     },
 }

@@ -22,6 +22,7 @@ from skysim.scene.scene import Scene
 from skysim.simulation.checks import Check, check
 from skysim.simulation.flight import Flight, Shot
 from skysim.simulation.lab import Lab, StarCamera
+from skysim.tracking.computer_time import computer_text, on_computer
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -111,6 +112,7 @@ class Recorder:
         stages_ms = {
             stage: 1e3 * float(np.median(seconds)) for stage, seconds in self.seconds.items()
         }
+        computer = scene.tracker.computer
         flight = (
             telemetry_report.figure(log)
             if len(self.rows) > 1 or log.t_s[-1] > SHORT_S
@@ -126,6 +128,7 @@ class Recorder:
             names,
             self.rows,
             stages_ms=stages_ms,
+            computer=computer_text(computer, stages_ms) if computer else "",
             annotated=annotated,
             motion=motion,
             motion_figure=flight,
@@ -136,6 +139,7 @@ class Recorder:
         report.save(page)
         statistics = run_report.summary(self.rows) | {
             "stages_ms": stages_ms,
+            **({"computer_ms": on_computer(computer, stages_ms)} if computer else {}),
             "report": str(page),
             "flight": motion,
             "pictures": [str(path) for path in pictures],

@@ -57,6 +57,7 @@ def run_report(
     rows: Sequence[FrameRow],
     *,
     stages_ms: Mapping[str, float],
+    computer: str = "",
     annotated: NDArray[np.uint8],
     motion: Mapping[str, float],
     motion_figure: bytes,
@@ -74,6 +75,8 @@ def run_report(
         Names of the three angles of a row
     stages_ms
         Median time by stage
+    computer
+        Sentence on the times on another computer
     annotated
         The last solved frame with its markers, BGR
     motion
@@ -93,7 +96,7 @@ def run_report(
     moved = [Figure(motion_figure, MOTION_CAPTION)] if motion_figure else []
     warned = f"The check of the plan warns: {len(findings)}, see below." if findings else ""
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in stages_ms.items())
-    last = [Text(f"Median ms a frame: {stages}"), Text(magnitude_text(rows))]
+    last = [Text(f"Median ms a frame: {stages}"), Text(computer), Text(magnitude_text(rows))]
     blocks = [
         verdict(rows),
         Text(warned, "bad", on_terminal=False),

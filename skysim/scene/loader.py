@@ -404,7 +404,10 @@ FILE_KEYS = (
     ("camera", "calibration"),
     ("camera", "transmission"),
     ("camera", "detector", "quantum_efficiency"),
-    ("camera", "detector", "quantum_efficiency", "curve"),
+    *(
+        ("camera", "detector", "quantum_efficiency", key)
+        for key in ("curve", "red", "green", "blue")
+    ),
     ("light", "catalog"),
     ("light", "satellites", "file"),
     ("light", "led", "spectrum"),

@@ -335,6 +335,25 @@ class Scene(ConfigModel):
         return self
 
     @model_validator(mode="after")
+    def check_gimbals(self) -> Scene:
+        """Check that a two-axis mount has gimbals, and follows profiles alone, in a laboratory."""
+        motion = self.motion
+        two_axis = self.vehicle.mount == "two_axis"
+        follows = (
+            motion.is_prescribed
+            and motion.start == "profile"
+            and {leg.kind for leg in motion.maneuver} <= {"profile", "hold", "jitter"}
+            and not isinstance(self.light, StarsConfig)
+        )
+        if two_axis != bool(self.vehicle.gimbals) or (two_axis and not follows):
+            raise InputError(
+                "vehicle.gimbals",
+                "mount two_axis has them and follows profiles in a laboratory, without dynamics",
+                "motion.control: prescribed, start: profile, maneuvers profile, hold, jitter, and no light: stars",
+            )
+        return self
+
+    @model_validator(mode="after")
     def check_rates(self) -> Scene:
         """Check that a control period is a whole number of milliseconds and of IMU samples, and resolves every sine."""
         rate_hz = self.control_rate_hz

@@ -3,6 +3,7 @@
 1. Collect the light that reaches the lens in the exposure (lights/light.py).
 2. Draw extended light (camera/glow).
 3. Draw points and discs along each path through the lens (camera/render.py, camera/discs), then the lens's glare.
+   A color camera draws 2. and 3. once for the pixels of each color.
 4. Add the charge smear of the shutter (camera/detector).
 5. Convert the light to digital numbers: noise, charge, analog-to-digital conversion (camera/detector).
 6. Collect the truth of the frame.
@@ -11,7 +12,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -33,7 +35,7 @@ from skysim.camera.projection import in_view, project
 from skysim.camera.render import Window, render
 from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Floats, Frame, SourceTruth, Trajectory, Truth
-from skysim.simulation.lab import StarCamera
+from skysim.simulation.lab import ColorChannel, StarCamera
 from skysim.simulation.lights.light import Beam, Exposure, Lit, Seeds, any_of, beam_of
 from skysim.simulation.timing import (
     MARGIN_S,
@@ -82,9 +84,12 @@ def render_frame(
     beam = beam_of(camera.lights, exposure)
     # 2. Extended light. The canvas is reused for every frame: the glow overwrites it, the rest is added to it.
     light_e = camera.canvas
-    draw_glow(light_e, beam, window.exposure_s)
-    # 3. Points, discs, glare.
-    sources = draw_lights(light_e, beam, exposure)
+    if camera.channels:
+        sources = draw_colors(light_e, camera.channels, exposure)
+    else:
+        draw_glow(light_e, beam, window.exposure_s)
+        # 3. Points, discs, glare.
+        sources = draw_lights(light_e, beam, exposure)
     # 4. Smear.
     smear(light_e, window.exposure_s, detector.shutter, added)
     # Saturation and SNR need the light of the whole frame, which `expose` then overwrites.
@@ -220,6 +225,34 @@ def draw_lights(image: NDArray[Any], beam: Beam, exposure: Exposure) -> SourceTr
         stray.add_glare(image, config)
         sources = stray.without_glare(sources, config)
     return sources
+
+
+def draw_colors(
+    image: NDArray[Any], channels: Sequence[ColorChannel], exposure: Exposure
+) -> SourceTruth:
+    """Set the (H, W) image of a color camera to all light: each pixel has that of the channel of its filter.
+
+    Returns the truth of the images. Electrons are the mean over an image's positions in the mosaic, since its light is
+    drawn for the whole image in each color; other values are those of its brightest color.
+    """
+    one_color = np.empty_like(image)
+    truths = []
+    for channel in channels:
+        own = replace(exposure, band=channel.band)
+        beam = beam_of(channel.lights, own)
+        draw_glow(one_color, beam, exposure.window.exposure_s)
+        drawn = draw_lights(one_color, beam, own)
+        truths.append(replace(drawn, electrons=drawn.electrons * len(channel.first_px) / 4))
+        for y, x in channel.first_px:
+            image[y::2, x::2] = one_color[y::2, x::2]
+    every = concatenated(truths)
+    # In descending order of brightness, so that the first row of an id is its brightest color.
+    order = np.argsort(-every.peak_e, kind="stable")
+    _, first, source = np.unique(every.id[order], return_index=True, return_inverse=True)
+    kept = order[first]
+    columns = {one.name: getattr(every, one.name)[kept] for one in fields(every)}
+    columns["electrons"] = np.bincount(source, every.electrons[order])
+    return SourceTruth(**columns)
 
 
 def truth_of(beam: Beam, exposure: Exposure, sources: SourceTruth) -> Truth:

@@ -13,7 +13,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ from skysim.dynamics.multibody import mjcf_export
 from skysim.dynamics.profiles import load_profiles
 from skysim.dynamics.reference_curves import AttitudeSpline
 from skysim.scene.scene import Scene
+from skysim.scene.sections.camera import ColorEfficiencyConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.scene.sections.motion import (
     PRESCRIBED,
@@ -177,6 +178,22 @@ def name_of(part: Any) -> str:
 MAIN = "main"  # name of the camera of the scene's section `camera`
 
 
+class ColorChannel(NamedTuple):
+    """The pixels of one color of a Bayer mosaic, and the lights as they see them.
+
+    Attributes
+    ----------
+    first_px
+        Rows and columns (y, x) of its pixels in the mosaic's first 2 x 2 pixels
+    band, lights
+        As in `StarCamera`
+    """
+
+    first_px: tuple[tuple[int, int], ...]
+    band: Band
+    lights: tuple[Light, ...]
+
+
 @dataclass(frozen=True, slots=True)
 class StarCamera:
     """A camera of the lab: its hardware and the light that reaches it, without time, motion or results.
@@ -190,12 +207,14 @@ class StarCamera:
     mount
         Assumed position and attitude on the body
     optics, detector, band
-        Hardware of the camera
+        Hardware of the camera; the band of a color camera is that of its gray image
     canvas
         (H, W) array in which the light of every frame is drawn: float32, or float64 without noise, since such a
         frame is the expectation itself
     lights
         Lights in this camera's band, from the farthest to the lens, see `simulation.lights`
+    channels
+        Red, green and blue pixels of a color camera, whose light is drawn instead; none if it is monochrome
     orbit
         Orbit about the Earth; None for a camera on the ground
     run_seed
@@ -212,6 +231,7 @@ class StarCamera:
     band: Band
     canvas: NDArray[Any]
     lights: tuple[Light, ...]
+    channels: tuple[ColorChannel, ...]
     orbit: CameraOrbit | None
     run_seed: int
     mount_error: Rotation | None = None
@@ -283,7 +303,9 @@ class Lab:
         return replace(self, cameras=(replace(self.camera, **changes), *self.cameras[1:]))
 
     def with_light(self, light: Light) -> Lab:
-        """The lab with one light of the main camera replaced: that of the same class."""
+        """The lab with one light of the main camera replaced: that of the same class. Raises InputError."""
+        if self.camera.channels:
+            raise InputError("camera.detector.bayer", "no light can be replaced", "none")
         return self.with_camera(
             lights=tuple(
                 light if type(one) is type(light) else one for one in self.camera.lights
@@ -363,6 +385,7 @@ def build_camera(
     band = Band.from_camera(scene.camera)
     orbit = build_orbit(scene.orbit, scene.start_time)
     viewpoint = Viewpoint(scene.start_time, scene.site, orbit)
+    plan = LightPlan(scene, band, vehicle, viewpoint, shown)
     return StarCamera(
         name=MAIN,
         scene=scene,
@@ -371,10 +394,27 @@ def build_camera(
         detector=Detector.from_camera(scene.camera),
         band=band,
         canvas=build_canvas(scene),
-        lights=build_lights(LightPlan(scene, band, vehicle, viewpoint, shown)),
+        lights=build_lights(plan),
+        channels=color_channels(plan),
         orbit=orbit,
         run_seed=scene.seed,
     )
+
+
+def color_channels(plan: LightPlan) -> tuple[ColorChannel, ...]:
+    """The red, green and blue pixels of a color camera, from the plan of its lights; none if it is monochrome."""
+    camera = plan.scene.camera
+    colors = camera.detector.quantum_efficiency
+    if not isinstance(colors, ColorEfficiencyConfig):
+        return ()
+    channels = []
+    for color, curve in colors:
+        band = Band.from_camera(camera, curve)
+        lights = build_lights(replace(plan, band=band, known=None))
+        letters = enumerate(camera.detector.bayer or "")
+        first_px = tuple(divmod(n, 2) for n, one in letters if one == color[0].upper())
+        channels.append(ColorChannel(first_px, band, lights))
+    return tuple(channels)
 
 
 def build_canvas(scene: Scene) -> NDArray[Any]:
@@ -418,9 +458,9 @@ def build_head(
         check_hardware(scene, programs, True)
         band = Band.from_camera(scene.camera) if head.camera else main.band
         known = None if head.camera else main.known
-        lights = build_lights(
-            LightPlan(scene, band, vehicle, main.viewpoint, shown, known, mount)
-        )
+        plan = LightPlan(scene, band, vehicle, main.viewpoint, shown, known, mount)
+        lights = build_lights(plan)
+        channels = color_channels(plan)
     except InputError as error:
         raise error.under(f"heads.{n}") from None
     return replace(
@@ -433,6 +473,7 @@ def build_head(
         band=band,
         canvas=build_canvas(scene),
         lights=lights,
+        channels=channels,
         mount_error=Rotation.from_rotvec(np.array(head.mount_error_arcsec) * ARCSEC_RAD),
     )
 

@@ -33,6 +33,7 @@ from skysim.core.types import Floats
 from skysim.scene.sections.camera import (
     CameraConfig,
     ChromaticConfig,
+    ColorEfficiencyConfig,
     EfficiencyConfig,
     curve_file,
 )
@@ -45,6 +46,7 @@ V0_W_M3 = 3.63e-2  # irradiance of a star of V = 0: 3.63e-9 erg s^-1 cm^-2 A^-1 
 # Bandpass of the silicon camera for a quantum efficiency that is one number (reference §2).
 FLAT_M = (400e-9, 1000e-9)
 
+LUMA = (0.2989, 0.5870, 0.1140)  # weights of red, green, blue in gray (ITU-R BT.601)
 STEP_M = 1e-9  # of the integrals
 LONGEST_NM = 10_000.0  # of a curve; the integral of a longer one would take too many steps
 SUN = (
@@ -73,12 +75,13 @@ class Band:
     chromatic: ChromaticConfig | None = None
 
     @classmethod
-    def from_camera(cls, camera: CameraConfig) -> Band:
+    def from_camera(cls, camera: CameraConfig, curve: str = "") -> Band:
         """The response of a camera: its chip's quantum efficiency times its lens's transmission curve; cached.
 
-        A transmission that is one number is part of `Optics.collecting_m2`. Raises as `from_efficiency`.
+        `curve` is the quantum efficiency of one of its colors; if empty, that of the chip. A transmission that is one
+        number is part of `Optics.collecting_m2`. Raises as `from_efficiency`.
         """
-        band = cls.from_efficiency(camera.detector.quantum_efficiency)
+        band = cls.from_efficiency(curve or camera.detector.quantum_efficiency)
         if isinstance(camera.transmission, str):
             # The time of change is part of the cache's key.
             path = Path(camera.transmission)
@@ -86,10 +89,13 @@ class Band:
         return _through(band, camera.chromatic) if camera.chromatic else band
 
     @classmethod
-    def from_efficiency(cls, quantum_efficiency: float | str | EfficiencyConfig) -> Band:
+    def from_efficiency(
+        cls, quantum_efficiency: float | str | EfficiencyConfig | ColorEfficiencyConfig
+    ) -> Band:
         """The band of one number (flat over 400-1000 nm) or of a named curve; cached, so the same object every time.
 
-        A curve with a peak is scaled to it.
+        A curve with a peak is scaled to it. That of three colors is the band of the gray image that a tracker makes of
+        them, 0.2989 R + 0.5870 G + 0.1140 B (ITU-R BT.601, as MATLAB's rgb2gray).
 
         Raises
         ------
@@ -103,6 +109,8 @@ class Band:
             return _scaled(
                 cls.from_efficiency(quantum_efficiency.curve), quantum_efficiency.peak
             )
+        if isinstance(quantum_efficiency, ColorEfficiencyConfig):
+            return _luma(*(cls.from_efficiency(curve) for _, curve in quantum_efficiency))
         return _flat(float(quantum_efficiency))
 
     def response_at(self, wavelength_m: Floats | float) -> Floats:
@@ -147,6 +155,13 @@ def _flat(quantum_efficiency: float) -> Band:
 def _scaled(band: Band, peak: float) -> Band:
     """A response scaled to another peak."""
     return Band(band.wavelength_m, band.response * (peak / band.response.max()))
+
+
+@lru_cache(maxsize=64)
+def _luma(*colors: Band) -> Band:
+    """The band of the gray image of a red, a green and a blue band."""
+    grid_m = np.unique(np.concatenate([color.wavelength_m for color in colors]))
+    return Band(grid_m, np.dot(LUMA, [color.response_at(grid_m) for color in colors]))
 
 
 @lru_cache(maxsize=64)

@@ -30,7 +30,7 @@ from estimator.trackers.exposure_control import (
     observe,
     step,
 )
-from estimator.trackers.pipeline import Report, Settings
+from estimator.trackers.pipeline import Report, Settings, monochrome
 from estimator.trackers.star_tracker import StarTracker
 from skysim.camera.detector import saturation_dn
 from skysim.core.errors import InputError, unknown_name
@@ -99,6 +99,7 @@ def assumed_settings(scene: Scene) -> Settings:
         centroid_sigma_px=config.centroid_sigma_px,
         acceptance=config.acceptance,
         cos_error=config.cos_error,
+        bayer=scene.camera.detector.bayer,
         assumed_deg=config.assumed_attitude_deg,
         zero_point_mag=zero_point_mag(scene),
         magnitude_sigma=config.magnitude_sigma or default.magnitude_sigma,
@@ -302,17 +303,16 @@ def observe_frame(settings: Settings, control: Control, frame: Frame) -> Observa
     Blobs that are not stars (defects, tracks, the Moon) are left out. A pixel near the camera's saturation value counts
     as saturated.
     """
+    image_dn = monochrome(frame.image_dn, settings)
     try:
         blobs = DETECTORS[settings.detector](
-            frame.image_dn,
+            image_dn,
             settings.threshold_sigma,
             settings.min_area_px,
             settings.max_blobs,
             FramePriors(None, settings.saturation, 0.0, settings.intensity_threshold),
         )
     except ImageError:  # a coarse converter may give a frame of one value: no blobs
-        return observe(
-            frame.image_dn, np.empty((0, 4), np.int64), settings.saturation, control
-        )
+        return observe(image_dn, np.empty((0, 4), np.int64), settings.saturation, control)
     box_px = blobs.box_px[blobs.flag & settings.reject == 0]
-    return observe(frame.image_dn, box_px, settings.saturation, control)
+    return observe(image_dn, box_px, settings.saturation, control)

@@ -411,10 +411,11 @@ def test_efficiency_curves_are_plausible_and_state_their_source(curve: str) -> N
 
 def test_a_wrong_name_is_answered_with_the_right_ones() -> None:
     with pytest.raises(
-        ValueError, match=r"^unknown curve 'emccd'; allowed: cmos, interline, thick_ccd$"
+        ValueError,
+        match=r"^unknown curve 'emccd'; allowed: bayer_blue, bayer_green, bayer_red, cmos, interline, thick_ccd$",
     ):
         Band.from_efficiency("emccd")
-    with pytest.raises(ValueError, match=r"^unknown curve 'gone\.csv'; allowed: cmos"):
+    with pytest.raises(ValueError, match=r"^unknown curve 'gone\.csv'; allowed: bayer_blue"):
         curve_file("gone.csv")
 
 

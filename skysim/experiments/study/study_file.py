@@ -59,7 +59,7 @@ FLIGHT_QUANTITIES = (
 # Kinds of trial that measure a quantity; quantities that are not listed are measured by all.
 MEASURED_BY: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(FLIGHT_QUANTITIES, ("flight",)),
-    **dict.fromkeys(("streak_px", "detect_ms"), ("frames", "flight")),
+    **dict.fromkeys(("streak_px", "detect_ms", "computer_ms"), ("frames", "flight")),
 }
 
 

@@ -289,6 +289,15 @@ class ParticlesConfig(ConfigModel):
     diffusion_px: Annotated[Number, Field(ge=0, le=5)] = 0.3
 
 
+def existing_curve(value: str) -> str:
+    """The name of a curve. Raises InputError if there is no such curve."""
+    curve_file(value)
+    return value
+
+
+Curve = Annotated[str, AfterValidator(existing_curve)]
+
+
 class EfficiencyConfig(ConfigModel):
     """A curve of quantum efficiency, scaled to the peak that a data sheet states.
 
@@ -300,27 +309,30 @@ class EfficiencyConfig(ConfigModel):
         Electrons per photon at the highest point of the curve
     """
 
-    curve: str
+    curve: Curve
     peak: Annotated[Number, Field(gt=0, le=1)]
 
-    @field_validator("curve")
-    @classmethod
-    def check_curve(cls, value: str) -> str:
-        curve_file(value)
-        return value
+
+class ColorEfficiencyConfig(ConfigModel):
+    """The quantum efficiency behind each filter of a Bayer mosaic: the name of a curve in data/qe, or a file."""
+
+    red: Curve
+    green: Curve
+    blue: Curve
 
 
 def efficiency_tag(value: Any) -> str:
     """Tag of the kind of quantum efficiency; an error then names the keys of the section only if there is one."""
-    if isinstance(value, dict | EfficiencyConfig):
-        return "EfficiencyConfig"
+    if isinstance(value, dict | ConfigModel):
+        return "ColorEfficiencyConfig" if "red" in dict(value) else "EfficiencyConfig"
     return "name" if isinstance(value, str) else "number"
 
 
 Efficiency = Annotated[
     Annotated[Annotated[float, Field(gt=0, le=1)], Tag("number")]
-    | Annotated[str, Tag("name")]
-    | Annotated[EfficiencyConfig, Tag("EfficiencyConfig")],
+    | Annotated[Curve, Tag("name")]
+    | Annotated[EfficiencyConfig, Tag("EfficiencyConfig")]
+    | Annotated[ColorEfficiencyConfig, Tag("ColorEfficiencyConfig")],
     Discriminator(efficiency_tag),
 ]
 
@@ -355,7 +367,9 @@ class DetectorConfig(ConfigModel):
     ----------
     quantum_efficiency
         One number for 400-1000 nm, the name of a curve in data/qe (or a file), or a curve with its peak:
-        {curve: cmos, peak: 0.6}
+        {curve: cmos, peak: 0.6}; with `bayer` three curves: {red: bayer_red, green: bayer_green, blue: bayer_blue}
+    bayer
+        Filters of the first pixels of the first two rows of a color camera; monochrome if left out
     hardware_seed
         Seed of the fixed pattern: PRNU, DSNU, hot pixels, column offsets
     prnu
@@ -388,6 +402,7 @@ class DetectorConfig(ConfigModel):
     """
 
     quantum_efficiency: Efficiency
+    bayer: Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None = None
     hardware_seed: Annotated[int, Field(ge=0)] = 0
     prnu: Annotated[Number, Field(ge=0, le=0.2)] = 0.0
     dark_e_s: Electrons = 0.0
@@ -412,14 +427,15 @@ class DetectorConfig(ConfigModel):
     bits: Annotated[int, Field(ge=1, le=16)]
     noise: bool = True
 
-    @field_validator("quantum_efficiency")
-    @classmethod
-    def check_efficiency(
-        cls, value: float | str | EfficiencyConfig
-    ) -> float | str | EfficiencyConfig:
-        if isinstance(value, str):
-            curve_file(value)
-        return value
+    @model_validator(mode="after")
+    def check_bayer(self) -> DetectorConfig:
+        if isinstance(self.quantum_efficiency, ColorEfficiencyConfig) != bool(self.bayer):
+            raise InputError(
+                "quantum_efficiency",
+                f"{'one' if self.bayer else 'three curves'} with bayer: {self.bayer or 'none'}",
+                "{red: bayer_red, green: bayer_green, blue: bayer_blue} with bayer: RGGB",
+            )
+        return self
 
     @model_validator(mode="after")
     def check_temperature(self) -> DetectorConfig:

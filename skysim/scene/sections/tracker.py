@@ -137,6 +137,24 @@ class DecoderConfig(ConfigModel):
     frames: Annotated[int, Field(ge=3, le=10_000)] | None = None
 
 
+class ComputerConfig(ConfigModel):
+    """Another computer, for which the times of the tracker are computed.
+
+    Attributes
+    ----------
+    clock_mhz
+        Its clock
+    cycles_factor
+        Its cycles for the same work over those of this machine
+    host_clock_mhz
+        Clock of this machine; that of /proc/cpuinfo if left out
+    """
+
+    clock_mhz: Positive
+    cycles_factor: Positive = 1.0
+    host_clock_mhz: Positive | None = None
+
+
 class TrackerConfig(ConfigModel):
     """Settings of the star tracker and its assumed values of the hardware; an assumed value of `null` is the true one.
 
@@ -190,6 +208,8 @@ class TrackerConfig(ConfigModel):
     magnitude_sigma
         Standard deviation of a star's measured magnitude over the catalog's V (noise, colors), for identification by
         magnitude and place; by place alone if left out. The zero point is that of a star of the Sun's color
+    computer
+        Computer whose times a run reports and a study has as `computer_ms`
     map
         File that `skysim survey` wrote: measured LEDs, lever, focal length and distortion
     """
@@ -223,6 +243,7 @@ class TrackerConfig(ConfigModel):
     brightness_sigma: Annotated[Number, Field(ge=0.02, le=2)] | None = None
     assumed_attitude_deg: tuple[Spin, Spin, Spin] | None = None
     magnitude_sigma: Annotated[Number, Field(ge=0.01, le=5)] | None = None
+    computer: ComputerConfig | None = None
     map: Annotated[str, AfterValidator(existing_file)] | None = None
 
     @model_validator(mode="after")

@@ -244,6 +244,28 @@ class ImuConfig(ConfigModel):
     hardware_seed: Annotated[int, Field(ge=0)] = 200
 
 
+class GimbalsConfig(ConfigModel):
+    """The axes of a two-axis mount: lab_from_body = Rz(azimuth) Ry(elevation), so that elevation 0 is the zenith.
+
+    Attributes
+    ----------
+    azimuth_deg, elevation_deg
+        Least and greatest angle
+    rate_limit_deg_s
+        Greatest rate of each axis
+    resolution_arcsec
+        Step of both angles
+    backlash_arcsec
+        Play of the gears, through which an axis does not follow after each reversal
+    """
+
+    azimuth_deg: tuple[Number, Number] = (-180.0, 180.0)
+    elevation_deg: tuple[Number, Number] = (-90.0, 90.0)
+    rate_limit_deg_s: Positive = 30.0
+    resolution_arcsec: NotNegative = 0.0
+    backlash_arcsec: NotNegative = 0.0
+
+
 class VehicleConfig(ConfigModel):
     """The moving body: an MJCF file, and values of the scene that replace those of the file.
 
@@ -252,7 +274,7 @@ class VehicleConfig(ConfigModel):
     model
         Name of the MJCF file
     mount
-        `air_bearing`: gravity and a tilt stop; `free`: neither
+        `air_bearing`: gravity and a tilt stop; `free`: neither; `two_axis`: follows a profile with `gimbals`
     mass, inertia, center_of_mass
         Mass properties with all trim masses at zero; mass and inertia are those of the file if left out
     camera
@@ -266,10 +288,12 @@ class VehicleConfig(ConfigModel):
         Actuators that are switched on; joints of the others are locked
     trim
         Trim masses
+    gimbals
+        Axes of mount two_axis
     """
 
     model: str
-    mount: Literal["air_bearing", "free"] = "air_bearing"
+    mount: Literal["air_bearing", "free", "two_axis"] = "air_bearing"
     mass_kg: Annotated[Mass, Field(gt=0)] | None = None
     inertia_kg_m2: tuple[Inertia, Inertia, Inertia] | None = None
     center_of_mass_m: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
@@ -284,6 +308,7 @@ class VehicleConfig(ConfigModel):
     drag: DragConfig = DragConfig()
     disturbances: DisturbancesConfig = DisturbancesConfig()
     imu: ImuConfig | None = None
+    gimbals: GimbalsConfig | None = None
 
     @field_validator("inertia_kg_m2")
     @classmethod

@@ -29,7 +29,7 @@ from estimator.core.types import (
     FramePriors,
     ra_dec_roll_rad,
 )
-from estimator.detection import background, classify, components, detect, windows
+from estimator.detection import background, bayer, classify, components, detect, windows
 from estimator.detection.classify import Flag
 from estimator.detection.detect import DETECTORS
 from estimator.identification.star_detections import FlatCentroids, Sensor, detections_of
@@ -212,6 +212,25 @@ def test_a_line_filter_keeps_less_noise_and_has_no_direction(
     assert (np.abs(taps) <= np.abs(streak_px) / 2 + 0.5).all()
     kept = detect.noise_factor(taps)
     assert 0.375 / np.sqrt(len(taps)) - 1e-12 <= kept <= 0.375 + 1e-12
+
+
+@law(bayer.gray_from_bayer, pipeline.monochrome)
+@given(SEEDS, some.sampled_from(bayer.PATTERNS), some.booleans())
+def test_a_gray_image_is_within_its_colors_and_transposes_with_them(
+    rng: np.random.Generator, pattern: str, whole: bool
+) -> None:
+    frame, _ = starry(rng)
+    frame = frame if whole else frame + 0.25
+    gray = pipeline.monochrome(frame, Settings(bayer=pattern))
+    assert 0.9999 * frame.min() - 0.5 <= gray.min() <= gray.max() <= frame.max()
+    transposed = bayer.gray_from_bayer(
+        np.ascontiguousarray(frame.T), pattern[0] + pattern[2] + pattern[1] + pattern[3]
+    )
+    # The order of additions may round a half the other way.
+    assert np.abs(transposed.T.astype(float) - gray).max() <= (1.0 if whole else 1e-9)
+    assert pipeline.monochrome(frame, Settings()) is frame
+    with pytest.raises(ImageError, match="RGGB"):
+        bayer.gray_from_bayer(frame, pattern[::-1] + "G")
 
 
 @law(detect.replace_bad_pixels)

@@ -23,6 +23,7 @@ from skysim.results.telemetry_report import attitude_error_deg
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lab import Lab
 from skysim.tracking import factory
+from skysim.tracking.computer_time import total
 
 # A centroid is a light's own if it is within this distance of its true image, and half of its streak. Errors of
 # centroids are below it even where two images touch; neighboring stars or LEDs are usually farther apart.
@@ -88,8 +89,9 @@ class Outcome:
         them
     exposure_ms
         Exposure time of a flight's last frame; NaN for other trials
-    detect_ms
-        Computing time of the detection, mean for a flight; not the same in every run
+    detect_ms, computer_ms
+        Computing time of the detection, and of the tracker on the scene's `tracker.computer`, mean for a flight; not
+        the same in every run
     lab_from_body_w, _x, _y, _z
         True attitude at mid-exposure; for a flight, that of its worst frame (`worst_frame`)
     body_tilt_deg, body_azimuth_deg
@@ -136,6 +138,7 @@ class Outcome:
     boresight_ra_deg: float = math.nan
     boresight_dec_deg: float = math.nan
     detect_ms: float = field(default=math.nan, compare=False)
+    computer_ms: float = field(default=math.nan, compare=False)
 
 
 FIELDS = tuple(one.name for one in fields(Outcome) if one.compare)
@@ -202,6 +205,7 @@ def score(
         "streak_px": streak_px,
         "angles_compared": solution.angles_compared or math.nan,
         "detect_ms": 1e3 * report.seconds.get("detect", math.nan),
+        "computer_ms": 1e3 * total(lab.scene.tracker.computer, report.seconds),
         **directions(lab, lab_from_body, cam_from_lab),
     }
     if solution.cam_from_ref is None:
@@ -395,6 +399,7 @@ def summarize_flight(log: Telemetry, outcomes: list[Outcome], settle_s: float) -
         angles_compared=mean(finite([one.angles_compared for one in outcomes])),
         exposure_ms=outcomes[-1].exposure_ms if outcomes else math.nan,
         detect_ms=mean(finite([one.detect_ms for one in outcomes])),
+        computer_ms=mean(finite([one.computer_ms for one in outcomes])),
         **{name: getattr(worst, name) for name in DIRECTION},
     )
 

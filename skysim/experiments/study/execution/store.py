@@ -35,8 +35,8 @@ from skysim.results.files import row_parts
 from skysim.results.files.row_parts import Part, Rows, Source
 
 STORE = "study.sqlite"  # file name in a study's results folder
-FORMAT = 6  # raised when the columns of `trials` change
-FORMAT_OF_PARTS = 7  # format of a store with parts, which an earlier skysim would not see
+FORMAT = 8  # raised when the columns of `trials` or `timings` change
+FORMAT_OF_PARTS = 9  # format of a store with parts, which an earlier skysim would not see
 MOST_ROWS = 1_000_000  # maximum number of rows in SQLite; beyond, rows move to parts
 PART_ROWS = 250_000  # rows of a part, about 50 MB in memory
 EVERY = (0, 2**62)  # range of all trials
@@ -44,7 +44,7 @@ BLOCK_TRIALS = 100_000  # trial numbers of a block of `Store.blocks`
 TEXT_FIELDS = {"status"}
 INTEGER_FIELDS = {"frames", "solved", "wrong", "ambiguous"}
 
-TIMES = ("time_ms", "detect_ms")
+TIMES = ("time_ms", "detect_ms", "computer_ms")
 # Names of `Store.columns`.
 COLUMNS = ("trial", "point", "replicate", "seed", "scene", "code", *FIELDS, "error", *TIMES)
 
@@ -59,7 +59,7 @@ CREATE TABLE IF NOT EXISTS trials (
   scene TEXT NOT NULL, code TEXT NOT NULL,
   {OUTCOME_COLUMNS},
   error TEXT);
-CREATE TABLE IF NOT EXISTS timings (trial INTEGER PRIMARY KEY, time_ms REAL NOT NULL, detect_ms REAL);
+CREATE TABLE IF NOT EXISTS timings (trial INTEGER PRIMARY KEY, time_ms REAL NOT NULL, detect_ms REAL, computer_ms REAL);
 CREATE TABLE IF NOT EXISTS runs (
   run INTEGER PRIMARY KEY, began REAL NOT NULL, engine TEXT NOT NULL, workers INTEGER NOT NULL,
   trials INTEGER NOT NULL, seconds REAL NOT NULL);
@@ -71,6 +71,7 @@ CREATE TABLE IF NOT EXISTS parts (
 values_of = attrgetter(
     *FIELDS
 )  # the values of an outcome; `astuple` takes twenty times longer
+times_of = attrgetter(*TIMES[1:])
 INSERT = f"INSERT OR REPLACE INTO trials VALUES ({', '.join('?' * (7 + len(FIELDS)))})"
 
 
@@ -186,9 +187,10 @@ class Store:
         with self.db:
             self.db.executemany(INSERT, values)
             times = [
-                (row.trial, 1e3 * row.seconds, to_sql(row.outcome.detect_ms)) for row in rows
+                (row.trial, 1e3 * row.seconds, *map(to_sql, times_of(row.outcome)))
+                for row in rows
             ]
-            self.db.executemany("INSERT OR REPLACE INTO timings VALUES (?, ?, ?)", times)
+            self.db.executemany("INSERT OR REPLACE INTO timings VALUES (?, ?, ?, ?)", times)
         self._near = NONE_NEAR
         self._room -= len(rows)
         if self._room < 0:
