@@ -394,13 +394,17 @@ def statistics(found: Calibration) -> dict[str, Any]:
 
 
 def differences(difference_deg: Floats) -> dict[str, list[float]]:
-    """Table 15: least, largest and mean absolute difference of each angle over the stops, and its deviation (n - 1)."""
+    """Table 15: least, largest and mean absolute difference of each angle over the stops, and its deviation (n - 1).
+
+    A single stop has no deviation, NaN.
+    """
     absolute = np.abs(difference_deg)
+    sd = absolute.std(axis=0, ddof=1) if len(absolute) > 1 else np.full(3, np.nan)
     return {
         "least": absolute.min(axis=0).tolist(),
         "largest": absolute.max(axis=0).tolist(),
         "mean": absolute.mean(axis=0).tolist(),
-        "sd": absolute.std(axis=0, ddof=1).tolist(),
+        "sd": sd.tolist(),
     }
 
 

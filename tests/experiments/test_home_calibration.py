@@ -117,3 +117,9 @@ def test_an_imu_error_at_one_of_two_stops_spreads_positions_by_half_of_it(
 def test_too_few_frames_are_refused(known: Assumed) -> None:
     with pytest.raises(InputError, match="2 or more"):
         home.calibrated(known, [seen_from(known, tilted(0, 0))])
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_single_stop_has_no_deviation_between_stops(known: Assumed) -> None:
+    found = home.calibrated(known, [seen_from(known, Rotation.identity())] * 3)
+    assert np.isnan(home.statistics(found)["difference_deg"]["sd"]).all()
