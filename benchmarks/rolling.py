@@ -26,7 +26,7 @@ from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Truth
-from skysim.experiments.study.execution.trials import constant_rate
+from skysim.experiments.study.execution.trials import constant_acceleration
 from skysim.results import metrics
 from skysim.scene.loader import load
 from skysim.simulation.exposure import render_frame
@@ -155,9 +155,8 @@ def frame_of(
         [1, 1, ROLL_SHARE] if work.tilt_deg is None else [1, 1, 1]
     )
     rate_cam = np.radians(rate_deg_s) * axis / np.linalg.norm(axis)
-    trajectory = constant_rate(
-        camera.scene, middle, camera.mount.cam_from_body.inv().apply(rate_cam)
-    )
+    rate_body = camera.mount.cam_from_body.inv().apply(rate_cam)
+    trajectory = constant_acceleration(camera.scene, middle, rate_body, np.zeros(3))
     frame, truth = render_frame(camera, trajectory, 0)
     tracker = camera.scene.tracker
     surveyed = tracker.model_copy(

@@ -106,6 +106,34 @@ def instrument_brightness(mean_dn: Floats, area_px: Floats) -> Floats:
     return mean_dn * area_px / np.median(area_px)
 
 
+def body_positions(
+    xy_px: Floats, camera: Camera, surface: LedMap, lever: Lever, sine: bool = False
+) -> Floats:
+    """Return the (N, 3) positions of lights in body axes, m: eqs 43-44, then from the camera to the bearing.
+
+    Parameters
+    ----------
+    sine
+        See `calibrate`
+
+    Raises
+    ------
+    ValueError
+        If eq. 44 has no root.
+    """
+    point_cam, _ = thesis_points(camera.rays(xy_px), surface, lever, sine)
+    return lever.cam_from_body.inv().apply(point_cam) + lever.camera_body_m
+
+
+def separation_rad(first: Floats, second: Floats) -> Floats:
+    """Return the (...,) angles between (..., 3) unit vectors (eq. 45).
+
+    The angle is computed from half the chord, 2 asin(|u - v| / 2), which is accurate for small angles, unlike the arc
+    cosine of eq. 45.
+    """
+    return 2 * np.arcsin(np.linalg.norm(first - second, axis=-1) / 2)
+
+
 def pooled(value: Floats, group: Ints, stop: Ints) -> Floats:
     """Return the (G,) sample standard deviation (n - 1) of each group's values over all frames; NaN for a single value.
 
@@ -249,9 +277,7 @@ def _lab_positions(
     body_m = []
     lab_m = []
     for sighting in sightings:
-        # Eqs 43-44, then from the camera to the bearing, then to the lab
-        point_cam, _ = thesis_points(camera.rays(sighting.xy_px), surface, lever, sine)
-        point_body = lever.cam_from_body.inv().apply(point_cam) + lever.camera_body_m
+        point_body = body_positions(sighting.xy_px, camera, surface, lever, sine)
         body_m.append(point_body)
         lab_m.append(sighting.body_from_lab.inv().apply(point_body))
     lights = [len(sighting.led) for sighting in sightings]
@@ -282,11 +308,7 @@ def _check(index: int, sighting: Sighting) -> None:
 
 
 def _separations(samples: _Samples) -> tuple[Floats, Ints, Ints]:
-    """Return the angle about the bearing of every pair in every frame (eq. 45), its pair's number, its frame's stop.
-
-    The angle, in rad, is computed from half the chord, 2 asin(|u - v| / 2), which is accurate for small angles, unlike
-    the arc cosine of eq. 45.
-    """
+    """Return the angle about the bearing of every pair in every frame (eq. 45), its pair's number, its frame's stop."""
     # All pairs of each frame
     direction = unit(samples.body_m)
     first = []
@@ -303,7 +325,7 @@ def _separations(samples: _Samples) -> tuple[Floats, Ints, Ints]:
         raise ImageError(
             "no frame has two lights; allowed: two or more in a frame, for their separation"
         )
-    angle = 2 * np.arcsin(np.linalg.norm(direction[a] - direction[b], axis=1) / 2)
+    angle = separation_rad(direction[a], direction[b])
     # One number for each pair of lights, in whichever order they occur
     low, high = np.sort([samples.led[a], samples.led[b]], axis=0)
     _, pair = np.unique(low * (samples.led.max() + 1) + high, return_inverse=True)

@@ -125,9 +125,9 @@ def existing_file(value: str) -> str:
 def find_file(name: str, folder: Path, what: str) -> Path:
     """The path of a .yaml file given by its path, or by its name in a folder. Raises InputError."""
     path = Path(name)
-    shipped = shipped_files(folder)
     if path.suffix in {".yaml", ".yml"} and is_file(path):
         return path
+    shipped = shipped_files(folder)
     if name in shipped:
         return shipped[name]
     near = Path(f"{name}.yaml")

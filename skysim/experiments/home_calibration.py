@@ -31,10 +31,17 @@ from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.attitude.nearfield import thesis_points
 from estimator.attitude.solvers import quest
 from estimator.calibration import home_position
-from estimator.calibration.home_position import HomeCatalog, Sighting, instrument_brightness
+from estimator.calibration.home_position import (
+    HomeCatalog,
+    Sighting,
+    body_positions,
+    instrument_brightness,
+    separation_rad,
+)
 from estimator.catalog.catalog import unit
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
+from estimator.detection.detect import THESIS_AREA_PX
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder
@@ -60,7 +67,6 @@ DISTINCT_ARCSEC = (
     100.0  # angles with a larger gap are distinct: a bucket of the thesis's pair catalog
 )
 QUEST_LEDS = 2
-AREA_PX = 50
 
 
 class Assumed(NamedTuple):
@@ -141,7 +147,7 @@ def measure(image_dn: NDArray[Any], threshold_dn: float) -> tuple[Floats, Floats
     region = label(image_dn > threshold_dn, connectivity=2)
     area_px = np.bincount(region.ravel())
     area_px[0] = 0
-    kept = area_px >= AREA_PX
+    kept = area_px >= THESIS_AREA_PX
     if not kept.any():
         return np.empty((0, 2)), np.empty(0)
     number = np.where(kept, np.cumsum(kept), 0)[region]
@@ -243,7 +249,9 @@ def name_lights(known: Assumed, frame: HeldFrame) -> tuple[NDArray[Any], NDArray
 # The thesis's steps.
 
 
-def calibrated(known: Assumed, seen: Sequence[Sighting], clicks: int = CLICKS) -> Calibration:
+def calibrated(
+    known: Assumed, frames: Sequence[HeldFrame], clicks: int = CLICKS
+) -> Calibration:
     """The numbered steps of the module.
 
     Parameters
@@ -256,13 +264,15 @@ def calibrated(known: Assumed, seen: Sequence[Sighting], clicks: int = CLICKS) -
     InputError
         If the frames show no LEDs in common, or too few frames.
     """
-    common = complete(seen)
+    common = complete(list(sightings(known, frames)))
     camera = scaled(known, common[0], clicks) if clicks else known.camera
     try:
         catalog = home_position.calibrate(common, camera, known.leds, known.lever)
     except ImageError as error:
         raise InputError("frames", str(error)) from None
-    body_m = np.array([positions_m(known, camera, one) for one in common])
+    body_m = np.array(
+        [body_positions(one.xy_px, camera, known.leds, known.lever) for one in common]
+    )
     lab_m = np.array(
         [
             one.body_from_lab.inv().apply(led_m)
@@ -329,18 +339,11 @@ def scaled(known: Assumed, first: Sighting, clicks: int) -> Camera:
     return replace(known.camera, focal_px=float(distance_m / transform.scale))
 
 
-def positions_m(known: Assumed, camera: Camera, sighting: Sighting) -> Floats:
-    """(N, 3) positions in body axes by eqs 43-44."""
-    points_m, _ = thesis_points(camera.rays(sighting.xy_px), known.leds, known.lever)
-    return known.lever.cam_from_body.inv().apply(points_m) + known.lever.camera_body_m
-
-
 def pair_angles_rad(body_m: Floats) -> Floats:
-    """Eq. 45: (..., N (N - 1) / 2) angles of (..., N, 3) points about the bearing, by 2 arcsin(chord / 2)."""
+    """(..., N (N - 1) / 2) angles of (..., N, 3) points about the bearing."""
     directions = body_m / np.linalg.norm(body_m, axis=-1, keepdims=True)
     a, b = np.triu_indices(directions.shape[-2], 1)
-    chord = np.linalg.norm(directions[..., a, :] - directions[..., b, :], axis=-1)
-    return 2 * np.arcsin(chord / 2)
+    return separation_rad(directions[..., a, :], directions[..., b, :])
 
 
 def quest_attitude(body_m: Floats, lab_m: Floats) -> Rotation:
@@ -396,13 +399,17 @@ def statistics(found: Calibration) -> dict[str, Any]:
 
 
 def differences(difference_deg: Floats) -> dict[str, list[float]]:
-    """Table 15: least, largest and mean absolute difference of each angle over the stops, and its deviation (n - 1)."""
+    """Table 15: least, largest and mean absolute difference of each angle over the stops, and its deviation (n - 1).
+
+    A single stop has no deviation, NaN.
+    """
     absolute = np.abs(difference_deg)
+    sd = absolute.std(axis=0, ddof=1) if len(absolute) > 1 else np.full(3, np.nan)
     return {
         "least": absolute.min(axis=0).tolist(),
         "largest": absolute.max(axis=0).tolist(),
         "mean": absolute.mean(axis=0).tolist(),
-        "sd": absolute.std(axis=0, ddof=1).tolist(),
+        "sd": sd.tolist(),
     }
 
 
@@ -419,9 +426,10 @@ def spread(values: Floats, sets: Sequence[NDArray[np.bool_]]) -> dict[str, Any]:
     }
 
 
-def calibration_report(title: str, command: str, found: Calibration) -> Report:
-    """The report: histograms as in the thesis's appendix A, the tables, and the epsilons."""
-    numbers = statistics(found)
+def calibration_report(
+    title: str, command: str, found: Calibration, numbers: dict[str, Any]
+) -> Report:
+    """The report of `statistics`: histograms as in the thesis's appendix A, the tables, and the epsilons."""
     epsilon = numbers["epsilon"]
     text = (
         f"{len(numbers['leds'])} LEDs in {numbers['frames']} frames at {len(numbers['stops'])} stops; deviations"
@@ -472,8 +480,8 @@ def write_results(
     folder: Path, known: Assumed, found: Calibration, command: str
 ) -> tuple[dict[str, Any], Report]:
     """Write the report, and the catalog as a map for `tracker.map`; return what `--json` prints, and the report."""
-    made = calibration_report(f"Calibration of {known.scene.name}", command, found)
     numbers = statistics(found)
+    made = calibration_report(f"Calibration of {known.scene.name}", command, found, numbers)
     page = make_folder(folder) / "report.html"
     made.save(page)
     catalog = folder / "leds.ecsv"

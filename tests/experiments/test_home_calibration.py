@@ -92,7 +92,7 @@ def test_attitude_and_angles_of_noise_free_stops_are_true(known: Assumed) -> Non
     """Near the boresight eqs 43-44 are exact to second order: 0.02 deg and an arcsecond at 2 deg of tilt."""
     attitudes = [Rotation.identity()] * 3 + [tilted(1.5, 2.0)] * 3
     frames = [seen_from(known, one) for one in attitudes]
-    found = home.calibrated(known, list(home.sightings(known, frames)))
+    found = home.calibrated(known, frames)
     numbers = home.statistics(found)
     assert numbers["distinct"] == 3
     assert [one["pairs"] for one in numbers["angles"]] == [4, 4, 2]
@@ -108,7 +108,7 @@ def test_an_imu_error_at_one_of_two_stops_spreads_positions_by_half_of_it(
     error_deg = 0.2
     frames = [seen_from(known, Rotation.identity())] * 4
     frames += [seen_from(known, tilted(0, 1.0), imu=tilted(0, 1.0 + error_deg))] * 4
-    found = home.calibrated(known, list(home.sightings(known, frames)))
+    found = home.calibrated(known, frames)
     moved_m = np.abs(np.diff(found.lab_m[[0, -1], :, 0], axis=0)).max()
     assert moved_m == pytest.approx(np.radians(error_deg) * HEIGHT_M, rel=0.1)
     assert found.catalog.epsilon_pos_m == pytest.approx(
@@ -118,4 +118,10 @@ def test_an_imu_error_at_one_of_two_stops_spreads_positions_by_half_of_it(
 
 def test_too_few_frames_are_refused(known: Assumed) -> None:
     with pytest.raises(InputError, match="2 or more"):
-        home.calibrated(known, list(home.sightings(known, [seen_from(known, tilted(0, 0))])))
+        home.calibrated(known, [seen_from(known, tilted(0, 0))])
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_single_stop_has_no_deviation_between_stops(known: Assumed) -> None:
+    found = home.calibrated(known, [seen_from(known, Rotation.identity())] * 3)
+    assert np.isnan(home.statistics(found)["difference_deg"]["sd"]).all()

@@ -22,6 +22,7 @@ it may cut. The magnitude is the summed gray level over the median area of the l
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -70,6 +71,7 @@ def rows(id: str, name: str, keys: Sequence[object]) -> Floats:
     return published_values(id, *(f"{name}_{key}" for key in keys))
 
 
+@cache
 def boards() -> list[Board]:
     """The three tests, from data/published."""
     short = np.nan
@@ -101,6 +103,12 @@ def boards() -> list[Board]:
             rows("afit-table-6-9", "magnitude_sd", five),
         ),
     ]
+
+
+@cache
+def noise_draws() -> Floats:
+    """(3, 9, 2, PHASES) standard normal draws for the lights of the tests, the same at every step of the fit."""
+    return random_stream(3).standard_normal((3, 9, 2, PHASES))
 
 
 class BlobMoments(NamedTuple):
@@ -192,10 +200,9 @@ def residuals(values: Floats) -> list[Floats]:
         Laboratory, then the logarithms of the LEDs of all tests
     """
     laboratory, leds = np.split(values, [len(NAMES)])
-    noise = random_stream(3).standard_normal((3, 9, 2, PHASES))
     found = []
     first = 0
-    for board, draws in zip(boards(), noise, strict=True):
+    for board, draws in zip(boards(), noise_draws(), strict=True):
         count = len(board.slot)
         led = np.exp(leds[first : first + count])
         first += count

@@ -14,7 +14,6 @@ from skysim.core.paths import DATA
 from skysim.core.types import Floats
 from skysim.core.units import ConfigModel, NotNegative, Number
 from skysim.core.yaml_reader import explain, read_yaml
-from skysim.experiments import home_calibration
 
 FOLDER = DATA / "published"
 
@@ -83,7 +82,7 @@ class Experiment(ConfigModel):
     runs, quick_runs
         Number of runs with other seeds; of replicates for a study
     clicks
-        Of `skysim calibrate`: LED spacings that set the scale in the first frame
+        Option of `skysim calibrate`; its default if left out
     hardware
         Keys of the seeds of hardware that differ from run to run
     wrong
@@ -100,7 +99,7 @@ class Experiment(ConfigModel):
     file: str
     runs: Annotated[int, Field(ge=1)] = 1
     quick_runs: Annotated[int, Field(ge=1)] = 1
-    clicks: Annotated[int, Field(ge=0)] = home_calibration.CLICKS
+    clicks: Annotated[int, Field(ge=0)] | None = None
     hardware: tuple[str, ...] = ()
     wrong: str = ""
     assumed: tuple[str, ...] = ()

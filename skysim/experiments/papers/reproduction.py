@@ -34,7 +34,6 @@ import numpy as np
 from skysim.core.errors import InputError
 from skysim.experiments import home_calibration
 from skysim.experiments.papers.published import Experiment, PublishedRow, experiments
-from skysim.experiments.study import study_file
 from skysim.experiments.study import table as study_table
 from skysim.experiments.study.api import run_study
 from skysim.experiments.study.execution.store import open_store
@@ -170,7 +169,7 @@ def run_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Nu
         seed = options.seed + n
         overrides = {key: str(seed) for key in ("seed", *experiment.hardware)}
         sets = [f"--set={key}={seed}" for key in experiment.hardware]
-        if experiment.clicks != home_calibration.CLICKS:
+        if experiment.clicks is not None:
             sets.append(f"--clicks={experiment.clicks}")
         commands.append(
             shlex.join(
@@ -179,7 +178,7 @@ def run_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Nu
         )
         scene = loader.load(experiment.file, overrides)
         results.append(
-            calibrate_result(scene, experiment.clicks)
+            calibrate_result(scene, experiment)
             if experiment.command == "calibrate"
             else run_result(scene)
         )
@@ -208,11 +207,11 @@ def run_result(scene: Scene) -> dict[str, Any]:
     }
 
 
-def calibrate_result(scene: Scene, clicks: int) -> dict[str, Any]:
+def calibrate_result(scene: Scene, experiment: Experiment) -> dict[str, Any]:
     """What `skysim calibrate --json` prints."""
+    clicks = home_calibration.CLICKS if experiment.clicks is None else experiment.clicks
     known, frames = home_calibration.measure_scene(scene)
-    seen = list(home_calibration.sightings(known, frames))
-    return home_calibration.statistics(home_calibration.calibrated(known, seen, clicks))
+    return home_calibration.statistics(home_calibration.calibrated(known, frames, clicks))
 
 
 def study_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Number]:
@@ -221,11 +220,10 @@ def study_numbers(experiment: Experiment, options: Options) -> tuple[list[str], 
     overrides = {"replicates": replicates, "seed": options.seed}
     sets = [f"--set={key}={value}" for key, value in overrides.items()]
     command = shlex.join(["skysim", "study", "run", experiment.file, *sets])
-    study = study_file.load(experiment.file, {}).study
     with tempfile.TemporaryDirectory() as folder:
         result = run_study(experiment.file, overrides, out=Path(folder))
         with open_store(result.path) as store:
-            rows = study_table.table(store, study.responses)
+            rows = study_table.table(store, result.plan.study.responses)
 
     def number(path: str, levels: str) -> Ours:
         summary = point_at(rows, levels).responses[path]
@@ -255,7 +253,7 @@ def point_at(rows: Sequence[PointRow], levels: str) -> PointRow:
 
 
 def at_path(result: Any, path: str) -> float:
-    """The number at a dotted path of mappings and lists; a list that the path ends in is averaged by magnitude."""
+    """The number at a dotted path of mappings and lists; NaN below a value that is missing."""
     for part in path.split("."):
         if result is None:  # of a frame without a solution
             return math.nan

@@ -19,6 +19,7 @@ from estimator.attitude.nearfield import SOLVERS
 from estimator.calibration import home_position
 from estimator.calibration.home_position import HomeCatalog, Sighting
 from estimator.catalog import pair_index
+from estimator.catalog.catalog import unit
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
@@ -455,6 +456,26 @@ def test_a_spread_scales_with_its_data_and_ignores_shifts(
         light,
         rtol=1e-9,
     )
+
+
+@law(home_position.body_positions, home_position.separation_rad)
+@given(rng=SEEDS, sine=some.booleans())
+def test_positions_of_lights_are_those_of_equations_43_to_45(
+    rng: np.random.Generator, sine: bool
+) -> None:
+    """A camera level at height M below a sphere of radius R: across (R - M) tan a, or sin a, and (R - M) in all."""
+    surface = LedMap(np.arange(1), np.array([[0.0, 0.0, 1.2]]), np.zeros(3), np.full(3, 1.2))
+    arm = Lever(np.array([0.0, 0.0, 0.3]), Rotation.identity())
+    xy_px = rng.uniform(100, 400, (5, 2))
+    tangent = (xy_px - CAMERA.center_px) / CAMERA.focal_px
+    if sine:
+        tangent /= np.sqrt(1 + np.sum(tangent**2, axis=1, keepdims=True))
+    found = home_position.body_positions(xy_px, CAMERA, surface, arm, sine) - [0, 0, 0.3]
+    np.testing.assert_allclose(found[:, :2], 0.9 * tangent, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 0.9, rtol=1e-12, atol=0)
+    first, second = unit(rng.standard_normal((2, 3)))
+    angle = home_position.separation_rad(first, second)
+    assert np.cos(angle) == pytest.approx(first @ second, abs=1e-12)
 
 
 @law(home_position.calibrate, home_position.led_map, HomeCatalog.epsilon_pos_rad)

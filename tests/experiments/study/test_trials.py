@@ -156,7 +156,9 @@ def test_lights_of_a_trial_match_the_renderer_s_positions_and_brightness(spec):
     lab = ready.lab
     lab_from_body = trials.random_attitude(ready, np.random.default_rng(5))
     _, truth = render_at_rest(lab.camera, lab_from_body)
-    xy_px, electrons = detections.visible_sources(lab, lab_from_body)
+    (view,) = detections.visible_rows(lab, Rotation.concatenate([lab_from_body]))
+    xy_px = view.xy_px
+    electrons = view.electrons
     size_px = np.array(lab.camera.canvas.shape[::-1])
     inner = np.flatnonzero(
         ((truth.sources.xy_px > 40) & (truth.sources.xy_px < size_px - 41)).all(axis=1)

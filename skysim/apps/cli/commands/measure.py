@@ -205,8 +205,7 @@ def calibrate(
             if images
             else home_calibration.measure_scene(loaded, watch)
         )
-    seen = list(home_calibration.sightings(known, frames))
-    found = home_calibration.calibrated(known, seen, clicks)
+    found = home_calibration.calibrated(known, frames, clicks)
     command = shlex.join(["skysim", *sys.argv[1:]])
     folder = output_folder(out, f"{loaded.name}_calibration")
     print_report(*home_calibration.write_results(folder, known, found, command), json)

@@ -20,7 +20,7 @@ from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core import files as file_io
 from skysim.core.errors import InputError
-from skysim.core.paths import SCENES, shipped_files
+from skysim.core.paths import PAPERS, SCENES
 from skysim.core.yaml_reader import VERSION, set_key
 from skysim.results import scoring
 from skysim.results.files import recording
@@ -86,7 +86,7 @@ def solution_record(result: TrackerResult) -> dict[str, Any]:
 def base_reference(scene: str, folder: Path | None = None) -> str:
     """The value of `base` by which a file in `folder` refers to a scene: a shipped scene's name, else a path."""
     path = find(scene).resolve()
-    if path in {shipped.resolve() for shipped in shipped_files(SCENES).values()}:
+    if path.parent in (SCENES.resolve(), PAPERS.resolve()):
         return path.stem
     return path.name if path.parent == folder else str(path)
 

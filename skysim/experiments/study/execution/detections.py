@@ -55,12 +55,6 @@ class VisibleSources(NamedTuple):
     electrons: Floats
 
 
-def visible_sources(lab: Lab, lab_from_body: Rotation) -> tuple[Floats, Floats]:
-    """(N, 2) pixel positions and (N,) photo-electrons of the visible sources at one attitude."""
-    (view,) = visible_rows(lab, Rotation.concatenate([lab_from_body]))
-    return view.xy_px, view.electrons
-
-
 def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[VisibleSources]:
     """The view at each of B attitudes, all at the scene's start. The sources near all fields are projected at once."""
     camera = lab.camera

@@ -536,11 +536,6 @@ def rate_axis(axis: str | AxisConfig, azimuth_rad: float, mount: Mount) -> Float
     return vector / np.linalg.norm(vector)
 
 
-def constant_rate(scene: Scene, middle: Rotation, rate_body: Floats) -> Trajectory:
-    """A trajectory around the first frame's exposure: lab_from_body `middle` at mid-exposure, and a constant rate."""
-    return constant_acceleration(scene, middle, rate_body, np.zeros(3))
-
-
 def constant_acceleration(
     scene: Scene,
     middle: Rotation,
