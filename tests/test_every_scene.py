@@ -36,7 +36,8 @@ NAMES = [name for name in ALL_NAMES if name not in IDEAL]
 PAIR = "afit_test2"
 GRID = "afit_test1"
 CODED = "coded_spiral"  # few LEDs, which are named after some frames
-SHOWN = {PAIR: 2, GRID: 9, CODED: 4}  # LEDs in its first frame
+BOARDS = ("afit_board", "afit_board_sanded", "afit_fig_46", GRID)
+SHOWN = {PAIR: 2, CODED: 4, **dict.fromkeys(BOARDS, 9)}  # LEDs in its first frame
 # On its way from one pair to the next it sees none; Position 4 of Test 3 is beyond this field's short side.
 NOT_ALL_ALONG = {PAIR, CODED, "afit_test3"}
 MODELS = sorted(path.name for path in (SCENES / "vehicles").glob("*.xml"))

@@ -74,6 +74,8 @@ TEXTS = {
     "light.catalog": CATALOG,
     "light.layout.catalog": CATALOG,
     "light.layout.file": "a CSV file",
+    "light.layout.types": "names of `light.led.types`, one for each listed LED",
+    "light.layout.boards.types": "names of `light.led.types`, one for each LED of the board",
     "light.surface.file": "a file of points",
     "light.satellites.file": "a TLE file, or an OMM file as CSV, XML or JSON",
     "orbit.file": "a TLE or OMM file, or with `kind: oem` a CCSDS OEM file",

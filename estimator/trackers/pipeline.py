@@ -192,6 +192,7 @@ class Settings:
             angles = checks.floats("settings: assumed_deg", self.assumed_deg, (3,))
             object.__setattr__(self, "assumed_deg", tuple(angles.tolist()))
         if self.bayer is not None:
+            checks.of_type("settings: bayer", self.bayer, str)
             checks.known("settings: bayer", self.bayer, PATTERNS)
             if self.bad_px is not None:
                 raise ImageError("settings: bad_px with bayer; allowed: one of the two")

@@ -857,12 +857,12 @@ def test_a_profile_that_is_too_fast_is_refused_before_the_run(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("detector", "level", "warned"), [("thesis", 9, 1), ("thesis", 7, 0), ("local", 9, 0)]
+    ("detector", "level", "warned"), [("thesis", 42, 1), ("thesis", 40, 0), ("local", 42, 0)]
 )
 def test_a_black_level_above_the_thesis_s_threshold_is_warned_of(
     detector: str, level: int, warned: int
 ) -> None:
-    """4 % of some 191 DN, where the full well saturates, are 7.6."""
+    """4 % of some 1017 DN are 40.7."""
     lab = lab_of(
         "afit_simsat", tracker__detector=detector, camera__detector__offset_dn=str(level)
     )

@@ -374,7 +374,7 @@ def test_settings_are_known_and_usable(word: str, value: Any) -> None:
         ):
             Settings(**{word: value})
     for name, kind in itertools.product(
-        names - set(stages) - {"bad_px", "zero_point_mag", "assumed_deg"}, [value]
+        names - set(stages) - {"bad_px", "zero_point_mag", "assumed_deg", "bayer"}, [value]
     ):
         made = answered(lambda name=name, kind=kind: Settings(**{name: kind}), ImageError)  # type: ignore[misc]
         assert made is None or type(getattr(made, name)) is type(getattr(Settings(), name))

@@ -193,7 +193,7 @@ def test_a_store_of_an_earlier_skysim_is_refused_in_one_line(typed, tmp_path):
             "--set: replicates; allowed: path.to.key=value",
         ),
         (("run", "question.yaml", "--set", "replicates=0"), "replicates: 0 is not allowed"),
-        (("run", "nothing"), "nothing: no such study; allowed: a .yaml file or one of dome_"),
+        (("run", "nothing"), "nothing: no such study; allowed: a .yaml file or one of "),
         (("run", "question"), "question: no such study; did you mean question.yaml?"),
         (
             ("list",),

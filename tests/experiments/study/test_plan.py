@@ -149,7 +149,7 @@ def test_a_scene_beside_the_study_is_found_from_anywhere(tmp_path):
 
 def test_an_unknown_study_is_refused():
     with pytest.raises(
-        InputError, match=r"which: no such study; allowed: a .yaml file or one of dome_"
+        InputError, match=r"which: no such study; allowed: a .yaml file or one of .*dome_"
     ):
         study_file.load("which")
 
