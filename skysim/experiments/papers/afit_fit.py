@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
-from scipy.optimize import least_squares
+from scipy.optimize import brentq, least_squares
 from scipy.special import ndtr
 
 from skysim.core.random_streams import random_stream
@@ -54,6 +54,7 @@ OTHERS_MS = (
     100.0,
 )  # a frame of 60 Hz, and those that Table 2 alone allows
 CHI2_95 = 3.84
+FARTHEST_MS = 1.0  # of an end of the interval from the best exposure
 
 
 class Board(NamedTuple):
@@ -256,20 +257,18 @@ def start_values(exposure_ms: float) -> Floats:
     return np.concatenate([laboratory, 0.8 * np.log(ranks / ranks.mean()), np.zeros(7)])
 
 
-def exposure_interval(best: Fit, step_ms: float = 0.05) -> tuple[float, float]:
-    """Exposures between which chi-square, minimized over all other values, is less than 3.84 above the best."""
-    ends = []
-    for sign in (-1, 1):
-        values = best.values
-        while True:
-            values = values.copy()
-            values[0] += sign * step_ms
-            other = fit(values, fixed=0)
-            if sum(other.chi2) > sum(best.chi2) + CHI2_95:
-                break
-            values = other.values
-        ends.append(float(values[0] - sign * step_ms))
-    return ends[0], ends[1]
+def exposure_interval(best: Fit) -> tuple[float, float]:
+    """Exposures at which chi-square, minimized over all other values, is 3.84 above the best, to 5 us."""
+
+    def excess(exposure_ms: float) -> float:
+        values = best.values.copy()
+        values[0] = exposure_ms
+        return sum(fit(values, fixed=0).chi2) - sum(best.chi2) - CHI2_95
+
+    middle_ms = float(best.values[0])
+    ends = (middle_ms - FARTHEST_MS, middle_ms + FARTHEST_MS)
+    low_ms, high_ms = (brentq(excess, middle_ms, end_ms, xtol=0.005) for end_ms in ends)
+    return low_ms, high_ms
 
 
 def describe(best: Fit, interval_ms: tuple[float, float]) -> list[str]:
