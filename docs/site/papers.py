@@ -36,7 +36,6 @@ FIELDS = (
     "verdict",
 )
 COMMAND = "skysim reproduce all --quick"  # the whole, without --quick, takes half an hour
-MOST_ROWS = 20
 PAGE_TEXT = """# Do we reproduce the papers?
 
 Of {predictions} predictions {agrees} agree with the published number, {disagrees} disagree and {undecided} are
@@ -104,7 +103,7 @@ def page(rows: list[Row], laboratory: str, stamp: str) -> str:
     wrong = [row for row in predictions if row["verdict"] == "disagrees"]
     lines = [
         [row["id"], row["quantity"], row["published"], f"{row['ours']:.4g}", row["note"]]
-        for row in wrong[:MOST_ROWS]
+        for row in wrong
     ]
     return PAGE_TEXT.format(
         predictions=len(predictions),

@@ -419,9 +419,11 @@ def spread(values: Floats, sets: Sequence[NDArray[np.bool_]]) -> dict[str, Any]:
         "mean": float(values.mean()),
         "sd": float(values.std(ddof=1)),
         "stops": [
-            {"mean": float(values[one].mean()), "sd": float(values[one].std(ddof=1))}
+            {
+                "mean": float(values[one].mean()),
+                "sd": float(values[one].std(ddof=1)) if one.sum() > 1 else np.nan,
+            }
             for one in sets
-            if one.sum() > 1
         ],
     }
 
@@ -432,9 +434,9 @@ def calibration_report(
     """The report of `statistics`: histograms as in the thesis's appendix A, the tables, and the epsilons."""
     epsilon = numbers["epsilon"]
     text = (
-        f"{len(numbers['leds'])} LEDs in {numbers['frames']} frames at {len(numbers['stops'])} stops; deviations"
-        f" at most {epsilon['magnitude']:.3g} of the magnitude, {epsilon['position_mm']:.3g} mm of the position,"
-        f" {epsilon['separation_arcsec']:.3g}″ of an angle"
+        f"{len(numbers['leds'])} LEDs in {numbers['frames']} frames at {len(numbers['stops'])} stops; epsilons, the"
+        f" largest deviations: {epsilon['magnitude']:.3g} of the magnitude, {epsilon['position_mm']:.3g} mm of the"
+        f" position, {epsilon['separation_arcsec']:.3g}″ of an angle"
     )
     figures = [
         Figure(
@@ -450,14 +452,16 @@ def calibration_report(
             "LEDs in the lab by the IMU, a color for each stop.",
         ),
     ]
-    leds = Table(
-        [Column("LED"), Column("magnitude", "", ".2f"), Column("deviation", "", ".2f")],
-        [[one["led"], one["mean"], one["sd"]] for one in numbers["leds"]],
+    magnitude = Column("magnitude", "", ".2f")
+    angle = Column("angle", "″", ".1f")
+    by_led = spread_table(
+        [one["led"] for one in numbers["leds"]], "LED", magnitude, numbers["leds"]
     )
-    pairs = Table(
-        [Column("pair"), Column("angle", "″", ".1f"), Column("deviation", "″", ".2f")],
-        [[n, one["mean"], one["sd"]] for n, one in enumerate(numbers["pairs"], 1)],
-    )
+    ranks = range(1, len(numbers["ranks"]) + 1)
+    by_rank = spread_table(ranks, "rank in the image", magnitude, numbers["ranks"])
+    pairs = spread_table(range(1, len(numbers["pairs"]) + 1), "pair", angle, numbers["pairs"])
+    counts = [one["pairs"] for one in numbers["angles"]]
+    distinct = spread_table(counts, "pairs of one angle", angle, numbers["angles"])
     angles = [
         f"{name} {kind}" for kind in ("IMU", "camera") for name in ("roll", "pitch", "yaw")
     ]
@@ -468,12 +472,30 @@ def calibration_report(
             for n, one in enumerate(numbers["stops"], 1)
         ],
     )
+    names = [Column(name, "°", ".4f") for name in ("roll", "pitch", "yaw")]
+    difference = Table(
+        [Column("camera minus IMU, absolute", kind="text"), *names],
+        [[name, *values] for name, values in numbers["difference_deg"].items()],
+    )
     sections = [
-        Section("LEDs", [leds]),
-        Section("Pairs", [pairs]),
-        Section("Attitudes", [stops]),
+        Section("LEDs", [by_led, by_rank]),
+        Section("Angles of pairs", [distinct, pairs]),
+        Section("Attitudes", [stops, difference]),
     ]
     return Report(title, [Verdict(text), *figures, *sections], command)
+
+
+def spread_table(
+    keys: Iterable[int], name: str, value: Column, rows: list[dict[str, Any]]
+) -> Table:
+    """Mean and deviation of the rows of `statistics`, over all frames, and the mean at each stop."""
+    stops = max((len(one["stops"]) for one in rows), default=0)
+    columns = [Column(name), value, value._replace(title="deviation", format=".2f")]
+    columns += [value._replace(title=f"stop {n + 1}") for n in range(stops)]
+    cells = [
+        [one["mean"], one["sd"], *(stop["mean"] for stop in one["stops"])] for one in rows
+    ]
+    return Table(columns, [[key, *line] for key, line in zip(keys, cells, strict=True)])
 
 
 def write_results(
@@ -514,8 +536,8 @@ def catalog_map(known: Assumed, found: Calibration) -> DomeMap:
 
 
 def by_stop(found: Calibration, values: Floats) -> Iterable[tuple[int, Floats]]:
-    """The values of each stop's frames."""
-    return ((n, values[found.stop == n]) for n in np.unique(found.stop))
+    """The values of each stop's frames; stops count from 0 as in the tables."""
+    return enumerate(values[found.stop == n] for n in np.unique(found.stop))
 
 
 def draw_magnitudes(found: Calibration, fig: Any) -> None:
