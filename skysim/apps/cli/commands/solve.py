@@ -134,6 +134,8 @@ def solve(
     )
     files.make_folder(out)
     paths = pictures(images or [], live, out)
+    if sequence:  # a frame that is there as FITS and as PNG is one
+        paths = list({path.with_suffix(""): path for path in reversed(paths)}.values())[::-1]
     chosen = plate_solver.Outputs(annotate, table, wcs)
     if any(chosen) and len(paths) != 1:
         raise InputError("", f"{len(paths)} images", "one with --annotate, --table or --wcs")
