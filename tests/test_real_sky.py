@@ -41,7 +41,7 @@ def answer(row, fov_error: float) -> dict:
     """Result of `skysim solve` for a photograph if the given field of view has this relative error."""
     fov_deg = float(row["fov_deg_horizontal"] or 10.0) * (1 + fov_error)
     return plate_solver.solve_file(
-        FOLDER / row["file"], plate_solver.make_solver(fov_deg, None), None
+        FOLDER / row["file"], plate_solver.make_solver(fov_deg, None)
     )
 
 
@@ -88,21 +88,21 @@ def test_a_picture_without_stars_is_refused(row):
 @needs_photographs
 @by_file(TO_SOLVE[4:5])
 def test_a_photograph_is_solved_with_its_field_unknown(row, blind):
-    check_right(plate_solver.solve_file(FOLDER / row["file"], blind, None), row)
+    check_right(plate_solver.solve_file(FOLDER / row["file"], blind), row)
 
 
 @pytest.mark.long
 @needs_photographs
 @by_file(TO_SOLVE)
 def test_every_photograph_is_solved_with_its_field_unknown(row, blind):
-    check_right(plate_solver.solve_file(FOLDER / row["file"], blind, None), row)
+    check_right(plate_solver.solve_file(FOLDER / row["file"], blind), row)
 
 
 @pytest.mark.long
 @needs_photographs
 @by_file(NOT_TO_SOLVE + ANY)
 def test_no_photograph_is_answered_wrongly_with_its_field_unknown(row, blind):
-    found = plate_solver.solve_file(FOLDER / row["file"], blind, None)
+    found = plate_solver.solve_file(FOLDER / row["file"], blind)
     right = (
         bool(row["ra_deg"])
         and found["status"] == "solved"

@@ -69,7 +69,8 @@ class Optics:
         area_m2 = np.pi / 4 * camera.pupil_m**2
         collecting_m2 = float(area_m2 * camera.gray_transmission)
         fold = fold_r(camera.distortion)
-        return cls(camera, collecting_m2, fold, field_rad(camera, fold))
+        corner_r = camera.corner_px / camera.focal_px
+        return cls(camera, collecting_m2, fold, field_rad(corner_r, camera.distortion, fold))
 
     def project(self, vectors_cam: Floats) -> Floats:
         """Project (..., 3) vectors in camera axes to (..., 2) pixels; NaN behind the camera and beyond the fold.
@@ -141,12 +142,11 @@ def tangential(distortion: tuple[float, ...], x: Floats, y: Floats) -> tuple[Flo
     return 2 * p1 * x * y + p2 * (r2 + 2 * x**2), p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
 
 
-def field_rad(camera: CameraConfig, fold_r: float) -> float:
-    """Field angle of the chip's farthest corner, with the radial distortion inverted by interpolation."""
-    corner_r = camera.corner_px / camera.focal_px
+def field_rad(corner_r: float, distortion: tuple[float, ...], fold_r: float) -> float:
+    """Field angle of the chip's farthest corner, a tangent, with the radial distortion inverted by interpolation."""
     # The radius grows up to the fold, so a table inverts it.
     r = np.linspace(0, min(fold_r, 20 * corner_r), 4001)
-    return float(np.arctan(np.interp(corner_r, r * radial(camera.distortion, r**2), r)))
+    return float(np.arctan(np.interp(corner_r, r * radial(distortion, r**2), r)))
 
 
 def fold_r(distortion: tuple[float, ...]) -> float:

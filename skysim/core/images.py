@@ -282,6 +282,8 @@ class ViewedImage:
         DATE-OBS of a FITS file; None if unknown
     focal_35mm
         Focal length of the 35 mm camera with the same diagonal field, mm; None if unknown
+    flipped
+        Whether the file's first row is the lowest one here
     row_order_known
         False for a FITS file without ROWORDER, whose last row is then taken for the highest, as
         the standard recommends
@@ -295,6 +297,7 @@ class ViewedImage:
     row_order_known: bool = True
     exposure_s: float | None = None
     temperature_c: float | None = None
+    flipped: bool = False
 
 
 def read_picture(path: Path) -> ViewedImage:
@@ -316,6 +319,7 @@ def read_picture(path: Path) -> ViewedImage:
         row_order_known=image.top_down is not None,
         exposure_s=image.exposure_s,
         temperature_c=image.temperature_c,
+        flipped=not image.top_down,
     )
 
 
@@ -413,6 +417,16 @@ class LiveCamera:
     def close(self) -> None:
         """Release the camera."""
         self.capture.release()
+
+
+def video_numbers(path: Path) -> tuple[float, int]:
+    """Frame rate in Hz and number of frames of a video, by its container. Raises InputError if it cannot be read."""
+    with contextlib.closing(LiveCamera(str(path))) as video:
+        rate_hz = video.capture.get(cv2.CAP_PROP_FPS)
+        count = int(video.capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    if not (rate_hz > 0 and count > 0):
+        raise InputError(path, "not a video that can be read", "AVI, MP4, MOV, MKV")
+    return rate_hz, count
 
 
 def grab_frame(source: str) -> NDArray:

@@ -347,7 +347,7 @@ def test_a_refusal_is_printed_with_detections_and_attempts(
     image = mirror(photograph())
     cv2.imwrite(str(tmp_path / "x.png"), image)
     found = plate_solver.solve_file(
-        tmp_path / "x.png", plate_solver.make_solver(FOV_DEG, None), None
+        tmp_path / "x.png", plate_solver.make_solver(FOV_DEG, None)
     )
     terminal.print_solutions([found], tmp_path)
     printed = capsys.readouterr().out.splitlines()

@@ -98,7 +98,9 @@ make_solver = functools.lru_cache(maxsize=8)(
 def answer(
     path: Path, fov_deg: float | None = FOV_DEG, annotated: Path | None = None
 ) -> dict[str, Any]:
-    return plate_solver.solve_file(path, make_solver(fov_deg, None), annotated)
+    return plate_solver.solve_file(
+        path, make_solver(fov_deg, None), plate_solver.Outputs(annotated)
+    )
 
 
 def check_right(found: dict[str, Any], truth: Truth, fov_deg: float = FOV_DEG) -> None:
@@ -405,14 +407,22 @@ def test_json_output_keeps_its_keys_and_adds_details(gray: NDArray, tmp_path: Pa
         "dec_deg",
         "roll_deg",
         "fov_deg",
+        "cam_from_icrs_xyzw",
+        "covariance_rad2",
+        "focal_px",
+        "center_px",
+        "distortion",
+        "log10_chance",
         "matches",
         "rms_arcsec",
+        "stars",
         "lights",
         "brightest_dn",
         "background_dn",
         "tried_fov_deg",
         "catalog_limit_mag",
         "hint",
+        "date_utc",
         "time_ms",
         "warning",
         "bad_input",

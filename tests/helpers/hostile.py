@@ -410,7 +410,7 @@ def timed(path: Path, solver: plate_solver.Solver) -> tuple[dict, float, float]:
     before = memory("VmRSS", reset=True)
     begin = time.process_time()
     try:
-        answer = plate_solver.solve_file(path, solver, None)
+        answer = plate_solver.solve_file(path, solver)
     except Exception as error:  # any exception is a defect
         answer = {"status": f"raised {error!r}", "raised": True}
     seconds = time.process_time() - begin

@@ -265,12 +265,12 @@ def test_a_frame_is_solved_by_its_camera_s_calibration(lens: Path) -> None:
     )
     files.write_text(lens, off)
     how = plate_solver.make_solver(None, lens)
-    answer = plate_solver.solve_file(lens.parent / "frame_0000.fits", how, None)
+    answer = plate_solver.solve_file(lens.parent / "frame_0000.fits", how)
     assert answer["status"] == "solved"
     true = scene_pointing(truth, calibration)
     assert [answer["ra_deg"], answer["dec_deg"]] == pytest.approx(true, abs=3 / 3600)
     files.write_image(lens.parent / "other.png", np.zeros((480, 640), np.uint16))
-    refused = plate_solver.solve_file(lens.parent / "other.png", how, None)
+    refused = plate_solver.solve_file(lens.parent / "other.png", how)
     assert refused["status"].endswith("other.png: 640x480 pixels; this camera's are 659x493")
 
 

@@ -5,6 +5,7 @@ A file is loaded as a picture in the orientation of viewing (`picture.py`) and s
 """
 
 from skysim.apps.plate_solver.picture import (
+    Outputs,
     annotated_paths,
     load_picture,
     outcome_fields,
@@ -13,23 +14,30 @@ from skysim.apps.plate_solver.picture import (
     solve_file,
     solve_picture,
 )
+from skysim.apps.plate_solver.plate_solution import (
+    PlateSolution,
+    add_rates,
+    sequence_summary,
+    solution_fields,
+    wcs_header,
+)
 from skysim.apps.plate_solver.solver import (
     FIELD_SEARCH,
-    PlateSolution,
     Solver,
     best_attitude,
     kept_solver,
     make_solver,
     read_camera,
-    solution_fields,
     solve_array,
     validated_date,
 )
 
 __all__ = [
     "FIELD_SEARCH",
+    "Outputs",
     "PlateSolution",
     "Solver",
+    "add_rates",
     "annotated_paths",
     "best_attitude",
     "kept_solver",
@@ -38,10 +46,12 @@ __all__ = [
     "outcome_fields",
     "pictures_in",
     "read_camera",
+    "sequence_summary",
     "solution_fields",
     "solve",
     "solve_array",
     "solve_file",
     "solve_picture",
     "validated_date",
+    "wcs_header",
 ]

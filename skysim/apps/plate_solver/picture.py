@@ -16,23 +16,31 @@ from numpy.typing import NDArray
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
 from estimator.detection.detect import check_size
-from estimator.trackers.pipeline import Report
+from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.plate_solver import retries
+from skysim.apps.plate_solver.plate_solution import (
+    PlateSolution,
+    attitude_fields,
+    solution_fields,
+    star_name,
+    wcs_header,
+)
 from skysim.apps.plate_solver.solver import (
     FOV_LIMITS_DEG,
-    PlateSolution,
     Solver,
     kept_solver,
     make_solver,
-    solution_fields,
     solve_array,
+    solve_centroids,
     validated_date,
 )
 from skysim.core import files, images
 from skysim.core.errors import InputError, printable
 
 ANNOTATED = ".annotated.png"
+LIST_SUFFIXES = (".csv", ".ecsv")
+LIST_SIGMA_PX = 0.1
 # Exif's FocalLengthIn35mmFilm (CIPA DC-008), in whole millimeters, is the focal length of a camera of 36 x 24 mm with
 # the same diagonal field (CIPA DCG-001). Some makers convert the longer side instead, which differs by 4 % for sensors
 # of 4:3; the rest of the uncertainty is rounding, distortion and a small crop.
@@ -42,11 +50,26 @@ TOP_DOWN = "no ROWORDER in the header: its first row is the highest here, not th
 
 
 class Reading(NamedTuple):
-    """One reading of a picture: its pixels as they would be viewed, the solver for its field, and its assumption."""
+    """One reading of a picture: its pixels as they would be viewed, the solver for its field, and its assumption.
+
+    `flipped`: whether the file's first row is the lowest of these pixels.
+    """
 
     pixels: NDArray
     solver: Solver
     assumption: str = ""
+    flipped: bool = False
+
+
+class Outputs(NamedTuple):
+    """Files to write of a picture, each None for none: with its stars marked; of a solved one its stars and header."""
+
+    annotated: Path | None = None
+    table: Path | None = None
+    wcs: Path | None = None
+
+
+NO_OUTPUTS = Outputs()
 
 
 class SolvedReading(NamedTuple):
@@ -65,6 +88,8 @@ def solve(
     camera: str | Path | None = None,
     time_utc: datetime.datetime | None = None,
     catalog: str | Path | None = None,
+    size_px: tuple[int, int] | None = None,
+    near_deg: tuple[float, float, float] | None = None,
 ) -> PlateSolution:
     """Solve the attitude of an image file of the sky, lost in space. Public as `skysim.solve`.
 
@@ -79,22 +104,28 @@ def solve(
         When the image was taken; the FITS header's date if left out
     catalog
         Name or file of a deeper star catalog, for fields of a few degrees
+    size_px
+        Width and height of the picture, for a list of lights (CSV or ECSV with x_px, y_px, flux)
+    near_deg
+        Right ascension, declination and radius: only answers within this circle are searched
 
     Raises
     ------
     InputError
         With one line for an image that cannot be read.
     """
-    if camera or catalog:
+    if camera or catalog or near_deg or size_px:
         solver = make_solver(
             fov_deg,
             Path(camera) if camera else None,
             time_utc,
             catalog=str(catalog) if catalog else None,
+            size_px=size_px,
+            near_deg=near_deg,
         )
     else:
         solver = kept_solver(fov_deg, time_utc)
-    result = read_and_solve(Path(path), solver, None)
+    result = read_and_solve(Path(path), solver, Outputs())
     return PlateSolution(**{name.name: result[name.name] for name in fields(PlateSolution)})
 
 
@@ -148,53 +179,138 @@ def stem_of(path: Path) -> str:
     return path.name[: -len(suffix)] if suffix else path.stem
 
 
-def solve_file(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
-    """Solve one file and return the fields of `skysim solve --json`. Writes the annotated PNG if `annotated` is given.
+def solve_file(
+    path: Path,
+    solver: Solver,
+    outputs: Outputs = NO_OUTPUTS,
+    picture: images.ViewedImage | None = None,
+) -> dict[str, Any]:
+    """Solve one file, return the fields of `skysim solve --json`, and write the files of `outputs`.
 
     An unreadable image does not raise, so that the files after it are still solved: its error line becomes `status`,
-    and `bad_input` is true (for the exit code). `warning` is the reason if the header's date was ignored.
+    and `bad_input` is true (for the exit code). `warning` is the reason if the header's date was ignored. A `picture`
+    that was read already, as of a video, is solved in place of the file.
     """
     try:
-        return read_and_solve(path, solver, annotated)
+        return read_and_solve(path, solver, outputs, picture)
     except InputError as error:
         return blank_result(path) | {"status": str(error), "bad_input": True}
 
 
 def blank_result(path: Path) -> dict[str, Any]:
     """The fields of a file that is not solved."""
-    return {"file": str(path), **asdict(PlateSolution()), "time_ms": None, "warning": ""}
+    run = {"date_utc": None, "time_ms": None, "warning": ""}
+    return {"file": str(path), **asdict(PlateSolution()), **run}
 
 
-def read_and_solve(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
+def read_and_solve(
+    path: Path,
+    solver: Solver,
+    outputs: Outputs = NO_OUTPUTS,
+    picture: images.ViewedImage | None = None,
+) -> dict[str, Any]:
     """As `solve_file`, but raise InputError for an unreadable image."""
     result = blank_result(path)
     begin = time.perf_counter()
+    date_utc = None
     try:
-        picture = load_picture(path, solver)
-        date_utc, warning = validated_date(picture.date_utc)
-        if warning and not solver.time_utc:
-            result["warning"] = f"{path}: DATE-OBS {warning}: ignored"
-        outcome = solve_picture(picture, solver, date_utc)
+        if path.suffix.lower() in LIST_SUFFIXES:
+            outcome = solve_list(path, solver)
+        else:
+            picture = load_picture(path, solver, picture)
+            date_utc, warning = validated_date(picture.date_utc)
+            if warning and not solver.time_utc:
+                result["warning"] = f"{path}: DATE-OBS {warning}: ignored"
+            outcome = solve_picture(picture, solver, date_utc)
     except InputError as error:
         raise error if error.key == printable(path) else error.within(path) from None
     except ImageError as error:
         raise InputError(path, error) from None
     result["time_ms"] = 1e3 * (time.perf_counter() - begin)
     result |= {"bad_input": False} | outcome_fields(outcome, date_utc)
-    if annotated:
-        files.write_image(
-            annotated,
-            annotated_image(outcome.hypothesis.pixels, outcome.report, outcome.tracker),
-        )
+    taken_utc = solver.time_utc or date_utc
+    result["date_utc"] = taken_utc.isoformat() if taken_utc else None
+    write_outputs(outputs, outcome, result)
     return result
 
 
-def load_picture(path: Path, solver: Solver) -> images.ViewedImage:
+def write_outputs(outputs: Outputs, outcome: SolvedReading, result: dict[str, Any]) -> None:
+    """Write the files of a picture; stars and header only if it is solved."""
+    reading = outcome.hypothesis
+    if outputs.annotated:
+        image = annotated_image(reading.pixels, outcome.report, outcome.tracker)
+        files.write_image(outputs.annotated, image)
+    if not outcome.report.attitude.solved:
+        return
+    if outputs.table:
+        from astropy.table import Table
+
+        files.write_table(outputs.table, Table(list(result["stars"])))
+    if outputs.wcs:
+        from astropy.io import fits
+
+        header = wcs_header(outcome.report.attitude, reading.flipped)
+        with files.atomic_file(outputs.wcs) as temporary:
+            fits.PrimaryHDU(header=header).writeto(temporary, overwrite=True)
+
+
+def solve_list(path: Path, solver: Solver) -> SolvedReading:
+    """Solve a list of lights: columns x_px, y_px and optionally flux, without it the brightest first.
+
+    Raises
+    ------
+    InputError
+        Without the picture's size, which a camera or `solver.size_px` gives, or for other columns.
+    """
+    camera = solver.camera
+    size_px = (camera.model.width_px, camera.model.height_px) if camera else solver.size_px
+    if size_px is None:
+        raise InputError(
+            path,
+            "a list of lights of a picture of unknown size",
+            "--size 1024x768, or --camera",
+        )
+    centroids = read_lights(path)
+    begin = Clock()
+    attitude, tracker = solve_centroids(centroids, solver, size_px, None, begin)
+    report = Report(attitude, centroids, begin.seconds)
+    reading = Reading(np.zeros(size_px[::-1], np.uint8), solver)
+    return SolvedReading(reading, report, tracker, [reading])
+
+
+def read_lights(path: Path) -> Centroids:
+    """The lights of a CSV or ECSV file, brightest first; errors of 0.1 px are assumed."""
+    from astropy.table import Table
+
+    form = "ascii.ecsv" if path.suffix.lower() == ".ecsv" else "ascii.csv"
+    try:
+        table = Table.read(path, format=form)
+        values = [
+            np.asarray(table[name], float)
+            for name in ("x_px", "y_px", "flux")[: 2 + ("flux" in table.colnames)]
+        ]
+    except Exception as error:
+        # astropy's parsers raise many types of exception.
+        what = f"cannot be read: {' '.join(str(error).split())[:120]}"
+        raise InputError(
+            path, what, "columns x_px, y_px and flux or none, all numbers"
+        ) from None
+    if not all(np.isfinite(column).all() for column in values):
+        raise InputError(path, "an empty or infinite number", "finite numbers")
+    flux = values[2] if len(values) == 3 else np.arange(len(table), 0.0, -1.0)
+    order = np.argsort(-flux, kind="stable")
+    xy_px = np.column_stack(values[:2])[order]
+    return Centroids(xy_px, np.full(len(table), LIST_SIGMA_PX), flux[order])
+
+
+def load_picture(
+    path: Path, solver: Solver, picture: images.ViewedImage | None = None
+) -> images.ViewedImage:
     """Read a picture in monochrome, in the orientation in which it is viewed.
 
     Raises InputError or ImageError if the file cannot be read or does not suit the solver.
     """
-    picture = images.read_picture(path)
+    picture = picture or images.read_picture(path)
     check_image(path, picture.pixels, solver)
     pixels = images.monochrome(picture.pixels)
     check_size(pixels)
@@ -289,7 +405,7 @@ def hypotheses(picture: images.ViewedImage, solver: Solver) -> list[Reading]:
     """
     height_px, width_px = picture.pixels.shape
     solvers = [solver]
-    readings = [(picture.pixels, "")]
+    readings = [(picture.pixels, "", picture.flipped)]
     if picture.focal_35mm and not solver.field_is_known:
         focal_px = picture.focal_35mm / DIAGONAL_35MM * math.hypot(width_px, height_px)
         fov_deg = math.degrees(2 * math.atan((width_px - 1) / 2 / focal_px))
@@ -298,12 +414,13 @@ def hypotheses(picture: images.ViewedImage, solver: Solver) -> list[Reading]:
                 0, replace(solver, fov_deg=fov_deg, fov_uncertainty=FOCAL_35MM_UNCERTAINTY)
             )
     if not picture.row_order_known:
-        readings.append((np.ascontiguousarray(picture.pixels[::-1]), TOP_DOWN))
+        turned = np.ascontiguousarray(picture.pixels[::-1])
+        readings.append((turned, TOP_DOWN, not picture.flipped))
     count = len(solvers) * len(readings)
     return [
-        Reading(pixels, replace(one, hypotheses=count), text)
+        Reading(pixels, replace(one, hypotheses=count), text, flipped)
         for one in solvers
-        for pixels, text in readings
+        for pixels, text, flipped in readings
     ]
 
 
@@ -312,7 +429,7 @@ def outcome_fields(
 ) -> dict[str, Any]:
     """The fields of PlateSolution: image statistics, tried fields, and solution or likely cause of the refusal."""
     report = outcome.report
-    (pixels, solver, assumption) = outcome.hypothesis
+    (pixels, solver, assumption, _) = outcome.hypothesis
     height_px, width_px = pixels.shape
     solvers = {one.solver.fov_deg: one.solver for one in outcome.tried}.values()
     seen = {
@@ -324,7 +441,10 @@ def outcome_fields(
         "catalog_limit_mag": round(float(solver.stars.v_mag[-1]), 1),
     }
     if report.attitude.solved:
-        return seen | solution_fields(report) | {"hint": assumption}
+        solved = solution_fields(report) | attitude_fields(
+            report, outcome.tracker, solver.stars
+        )
+        return seen | solved | {"hint": assumption}
     from skysim.apps.plate_solver import diagnosis
 
     rows_known = len({id(one.pixels) for one in outcome.tried}) == 1
@@ -346,9 +466,3 @@ def annotated_image(
         return annotate(image, detected_px, np.empty((0, 2)))
     names = [star_name(int(tracker.stars.id[star])) for star in match.star]
     return annotate(image, detected_px, detected_px[match.observed], names)
-
-
-def star_name(number: int) -> str:
-    """Name of a star by its number in a catalog of skysim (see `skysim.sources.catalog.Catalog`)."""
-    millions, rest = divmod(number, 1_000_000)
-    return f"{('HIP', 'HD', 'Gaia')[min(millions, 2)]} {rest}"

@@ -26,13 +26,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from estimator.catalog import catalog as star_catalog
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
-from estimator.core.types import Attitude, Centroids, ra_dec_roll_rad
+from estimator.core.types import Attitude, Centroids
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_centroid
 from estimator.trackers.refinement import NO_MATCH
@@ -163,6 +162,10 @@ class Solver:
     upper_half
         Whether the centroids are only of the upper half: the trackers' field then is that half,
         with quads of its height, and no star counts as missing in the lower half
+    size_px
+        Width and height of pictures of which only lists of lights are known
+    near_deg
+        Right ascension, declination and radius of a circle in which the image center is; None: the whole sky
     tracker_cache
         The trackers for the last image size and date, by camera and uncertainty
     """
@@ -176,6 +179,8 @@ class Solver:
     search: FieldSearch = FIELD_SEARCH
     hypotheses: int = 1
     upper_half: bool = False
+    size_px: tuple[int, int] | None = None
+    near_deg: tuple[float, float, float] | None = None
     tracker_cache: dict[Any, dict[Any, StarTracker]] = field(
         default_factory=dict, compare=False, repr=False
     )
@@ -246,6 +251,15 @@ class Solver:
             return star_catalog.at_epoch(self.stars, DEFAULT_EPOCH.year)
         return star_catalog.apparent(self.stars, star_catalog.on_earth(date_utc))
 
+    def within_reach(self, camera: Camera, vectors: Floats) -> NDArray[np.bool_]:
+        """(N,) which directions a picture can show whose center is in the circle of `near_deg`."""
+        if self.near_deg is None:
+            return np.ones(len(vectors), bool)
+        ra, dec, radius = np.radians(self.near_deg)
+        center = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+        reach = min(radius + camera.diagonal_rad / 2, np.pi)
+        return np.asarray(vectors @ center >= np.cos(reach))
+
     def tracker(self, camera: Camera, vectors: Floats, uncertainty: float) -> StarTracker:
         """A tracker with the brightest stars of the catalog, as many as its narrowest field needs."""
         narrowest = camera.zoomed(1 + uncertainty)
@@ -253,6 +267,7 @@ class Solver:
         bright = self.stars.v_mag <= star_catalog.limit_for_density(
             self.stars, field_sr, self.search.stars
         )
+        bright &= self.within_reach(camera.zoomed(1 - uncertainty), vectors)
         searches = () if self.field_is_known else QUAD_SEARCHES
         return StarTracker(
             camera,
@@ -270,6 +285,8 @@ def make_solver(
     time_utc: datetime.datetime | None = None,
     stages: Mapping[str, str] | None = None,
     catalog: str | None = None,
+    size_px: tuple[int, int] | None = None,
+    near_deg: tuple[float, float, float] | None = None,
 ) -> Solver:
     """Build a Solver from user input. Raises InputError with one line.
 
@@ -279,7 +296,15 @@ def make_solver(
         Names of algorithms by stage (`check_stages`); the tracker's defaults for the others
     catalog
         Name or file of a star catalog; the shipped one, CATALOG, if left out
+    size_px, near_deg
+        As in `Solver`
     """
+    if near_deg is not None and not (abs(near_deg[1]) <= 90 and 0 < near_deg[2] <= 180):
+        raise InputError(
+            "solve.near_deg",
+            near_deg,
+            "a declination of -90 to 90 and a radius of 0 to 180 degrees",
+        )
     low, high = FOV_LIMITS_DEG
     if fov_deg is not None and camera_file is not None:
         raise InputError("solve.fov_deg", "conflicts with a camera", "one of the two")
@@ -296,7 +321,10 @@ def make_solver(
     if stages:
         check_stages(stages)
         settings = replace(settings, **stages)  # type: ignore[arg-type]
-    return Solver(fov_deg, camera, read_catalog(catalog), settings, time_utc)
+    stars = read_catalog(catalog)
+    return Solver(
+        fov_deg, camera, stars, settings, time_utc, size_px=size_px, near_deg=near_deg
+    )
 
 
 @functools.lru_cache(maxsize=1)
@@ -517,82 +545,3 @@ def same_attitude(first: Attitude, second: Attitude) -> bool:
         (first.cam_from_ref * second.cam_from_ref.inv()).magnitude()
         < FIELD_SEARCH.same_attitude_rad
     )
-
-
-# The solution of a plate: its fields for Python and JSON.
-
-
-@dataclass(frozen=True, slots=True)
-class PlateSolution:
-    """Pointing of a picture in the orientation in which it is viewed; the angles are None unless `status` is solved.
-
-    Attributes
-    ----------
-    ra_deg, dec_deg
-        Right ascension and declination of the image center, ICRS
-    roll_deg
-        Position angle of the image's up, north through east
-    fov_deg
-        Fitted horizontal field of view
-    matches
-        Number of identified stars
-    rms_arcsec
-        Rms of their residuals
-    lights
-        Number of detections that may be stars
-    brightest_dn, background_dn
-        Maximum and median of the pixels
-    tried_fov_deg
-        Narrowest and widest horizontal field of each range that was tried, the likeliest first
-    catalog_limit_mag
-        V magnitude of the faintest stars of the catalog
-    hint
-        Likely cause of a refusal and a remedy, or an assumption about a solved file
-    """
-
-    status: str = ""
-    ra_deg: float | None = None
-    dec_deg: float | None = None
-    roll_deg: float | None = None
-    fov_deg: float | None = None
-    matches: int = 0
-    rms_arcsec: float | None = None
-    lights: int = 0
-    brightest_dn: float | None = None
-    background_dn: float | None = None
-    tried_fov_deg: tuple[tuple[float, float], ...] = ()
-    catalog_limit_mag: float | None = None
-    hint: str = ""
-
-
-def solution_fields(report: Report) -> dict[str, Any]:
-    """Fields of a solved image for the JSON output; the angles are those of the image center."""
-    attitude = report.attitude
-    assert attitude.cam_from_ref is not None
-    assert attitude.match is not None
-    camera = attitude.camera
-    assert camera is not None
-    ra, dec, roll = np.degrees(
-        ra_dec_roll_rad(center_from_cam(camera) * attitude.cam_from_ref)
-    )
-    return {
-        "ra_deg": float(ra),
-        "dec_deg": float(dec),
-        "roll_deg": float(roll),
-        "fov_deg": float(np.degrees(camera.fov_rad)),
-        "matches": len(attitude.match.observed),
-        "rms_arcsec": float(np.degrees(attitude.rms_px / camera.focal_px) * 3600),
-    }
-
-
-def center_from_cam(camera: Camera) -> Rotation:
-    """Rotation from the camera frame into a frame with z along the ray of the image center and y along image down.
-
-    The principal point need not be the image center, so the camera's own boresight is not used. The down direction
-    comes from the ray of the pixel one row below, made orthogonal to z.
-    """
-    center = np.array([(camera.width_px - 1) / 2, (camera.height_px - 1) / 2])
-    z, below = camera.rays(np.array([center, [center[0], center[1] + 1]]))
-    x = np.cross(below - z, z)
-    x /= np.linalg.norm(x)
-    return Rotation.from_matrix(np.array([x, np.cross(z, x), z]))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,14 +22,18 @@ from skysim.apps.cli.terminal import print_error, print_json, print_solutions, p
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
-    from skysim.apps.plate_solver import Solver
+    from skysim.apps.plate_solver import Outputs, Solver
+    from skysim.core.images import ViewedImage
+
+VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4")
 
 
 def solve(
     images: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="IMAGES", help="FITS, PNG, TIFF, JPEG, BMP files, or folders."
+            metavar="IMAGES",
+            help="FITS, PNG, TIFF, JPEG, BMP files, folders, or lists of lights (CSV or ECSV: x_px, y_px, flux).",
         ),
     ] = None,
     fov: Annotated[
@@ -64,6 +70,43 @@ def solve(
     centroider: Centroider = None,
     identifier: Identifier = None,
     solver: SolverName = None,
+    near: Annotated[
+        str | None,
+        typer.Option(
+            metavar="RA,DEC,DEG",
+            help="Circle of the sky in which the image center is sought, in degrees.",
+        ),
+    ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WxH", help="Size of the picture of a list of lights, in pixels."
+        ),
+    ] = None,
+    wcs: Annotated[
+        Path | None,
+        typer.Option(help="Also write the FITS header (TAN-SIP) of one image here."),
+    ] = None,
+    table: Annotated[
+        Path | None,
+        typer.Option(help="Also write the matched stars of one image here, as ECSV."),
+    ] = None,
+    annotate: Annotated[
+        Path | None,
+        typer.Option(help="File of the annotated image of one image, in place of OUT's."),
+    ] = None,
+    sequence: Annotated[
+        bool,
+        typer.Option(
+            help="The images are one camera's in the order of time: also print rates and gaps."
+        ),
+    ] = False,
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            help="Frame rate of a sequence, Hz; default: the dates of the FITS headers."
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the annotated images.")] = Path(
         "out/solve"
     ),
@@ -80,9 +123,51 @@ def solve(
     stages = selected_stages(
         detector=detector, centroider=centroider, identifier=identifier, solver=solver
     )
-    settings = plate_solver.make_solver(fov, camera, datetime_from_iso(time), stages, catalog)
+    settings = plate_solver.make_solver(
+        fov,
+        camera,
+        datetime_from_iso(time),
+        stages,
+        catalog,
+        size_px=numbers("size", size, "x", 2, int),
+        near_deg=numbers("near", near, ",", 3, float),
+    )
     files.make_folder(out)
-    solve_all(pictures(images or [], live, out), settings, out, json)
+    paths = pictures(images or [], live, out)
+    if sequence:  # a frame that is there as FITS and as PNG is one
+        paths = list({path.with_suffix(""): path for path in reversed(paths)}.values())[::-1]
+    chosen = plate_solver.Outputs(annotate, table, wcs)
+    if any(chosen) and len(paths) != 1:
+        raise InputError("", f"{len(paths)} images", "one with --annotate, --table or --wcs")
+    results, warnings, errors = solve_all(paths, settings, chosen, out, json)
+    if sequence:
+        plate_solver.add_rates(results, rate or video_rate(paths[0]))
+    files.write_text(out / "solutions.json", files.to_json(results))
+    if json:
+        print_json(results)
+    else:
+        print_solutions(results, out)
+        if sequence:
+            print(plate_solver.sequence_summary(results))
+    for message in warnings + errors:
+        print_error(message)
+    if errors:
+        raise typer.Exit(2)
+
+
+def numbers(name: str, text: str | None, separator: str, count: int, kind: Any) -> Any:
+    """The numbers of an option, None if it is left out. Raises InputError for another count or no numbers."""
+    if text is None:
+        return None
+    try:
+        values = tuple(kind(part) for part in text.split(separator))
+    except ValueError:
+        values = ()
+    if len(values) != count:
+        raise InputError(
+            f"--{name}", text, f"{count} numbers with {separator!r} between them"
+        )
+    return values
 
 
 def pictures(images: list[Path], live: str | None, out: Path) -> list[Path]:
@@ -100,30 +185,61 @@ def pictures(images: list[Path], live: str | None, out: Path) -> list[Path]:
     return paths
 
 
-def solve_all(paths: list[Path], solver: Solver, out: Path, json: bool) -> None:
-    """Solve the images and print the solutions. Raises typer.Exit if one could not be read."""
+def solve_all(
+    paths: list[Path], solver: Solver, chosen: Outputs, out: Path, quiet: bool
+) -> tuple[list[dict[str, Any]], list[str], list[str]]:
+    """Solve the images. Returns their results, warnings, and the errors of those that could not be read."""
     from skysim.apps import plate_solver
-    from skysim.core import files
 
-    quiet = json or len(paths) == 1
-    annotated = plate_solver.annotated_paths(out, paths)
     results = []
     errors = []
     warnings = []
-    for n, path in enumerate(progress(paths, len(paths), "solving", quiet)):
-        result = plate_solver.solve_file(path, solver, annotated[n])
+    annotated = plate_solver.annotated_paths(out, paths)
+    count = sum(video_length(path) for path in paths)
+    frames = (
+        (name, picture, annotated[n])
+        for n, path in enumerate(paths)
+        for name, picture in frames_of(path)
+    )
+    for name, picture, marked in progress(frames, count, "solving", quiet or count == 1):
+        # The frames of a video are not drawn: they are thousands.
+        outputs = chosen if picture or chosen.annotated else chosen._replace(annotated=marked)
+        result = plate_solver.solve_file(name, solver, outputs, picture)
         warning = result.pop("warning")
         if warning:
             warnings.append(warning)
         if result.pop("bad_input"):
             errors.append(result["status"])
         results.append(result)
-    files.write_text(out / "solutions.json", files.to_json(results))
-    if json:
-        print_json(results)
-    else:
-        print_solutions(results, out)
-    for message in warnings + errors:
-        print_error(message)
-    if errors:
-        raise typer.Exit(2)
+    return results, warnings, errors
+
+
+def frames_of(path: Path) -> Iterator[tuple[Path, ViewedImage | None]]:
+    """Names and pictures of a video's frames; of another file its name, and None."""
+    from skysim.core.images import LiveCamera, ViewedImage
+
+    if not is_video(path):
+        yield path, None
+        return
+    with closing(LiveCamera(str(path))) as video:
+        for n in range(video_length(path)):
+            yield path.with_name(f"{path.name}#{n}"), ViewedImage(video.frame())
+
+
+def is_video(path: Path) -> bool:
+    """Whether a file's suffix is that of a video."""
+    return path.suffix.lower() in VIDEO_SUFFIXES
+
+
+def video_length(path: Path) -> int:
+    """Number of frames of a video; 1 of another file."""
+    from skysim.core.images import video_numbers
+
+    return video_numbers(path)[1] if is_video(path) else 1
+
+
+def video_rate(path: Path) -> float | None:
+    """Frame rate of a video, Hz; None of another file."""
+    from skysim.core.images import video_numbers
+
+    return video_numbers(path)[0] if is_video(path) else None
