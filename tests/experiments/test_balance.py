@@ -36,10 +36,9 @@ def noisy_truth(
     every = round(0.5 / log.period_s)
     turned = Rotation.from_rotvec(SIGMA_RAD * rng.standard_normal((len(log.t_s[::every]), 3)))
     attitudes = log.lab_from_body[::every] * turned
-    noise = SIGMA_RAD**2 * np.eye(3)
-    shared = np.zeros((3, 3))
+    parts = np.array([SIGMA_RAD**2 * np.eye(3), np.zeros((3, 3)), np.zeros((3, 3))])
     return [
-        (float(t), one, noise, shared)
+        (float(t), one, parts, np.ones(1))
         for t, one in zip(log.t_s[::every], attitudes, strict=True)
     ]
 
