@@ -389,8 +389,10 @@ def fly(
     Frames are left out from the first one near the tilt stop on, because the torque of a contact is unknown.
     """
     with open_flight(scene) as flight:
-        rows = measured_attitudes(flight, watch)
+        measured = measured_attitudes(flight, watch)
         log = flight.telemetry()
+    # A time tag may be before the first wheel speed.
+    rows = [row for row in measured if row[0] >= log.t_s[0]]
     vehicle = flight.lab.vehicle
     tilts_deg = np.array([multibody.tilt_deg(attitude) for _, attitude, *_ in rows])
     contact = np.flatnonzero(tilts_deg > scene.vehicle.tilt_stop_deg - STOP_MARGIN_DEG)

@@ -76,6 +76,19 @@ def test_table_is_balanced_below_the_published_torque(
     )
 
 
+@pytest.mark.long
+def test_the_errors_of_a_table_in_frames_match_their_covariance() -> None:
+    """Draws of vehicle, noise and survey, one frame a second: the sum of 30 NEES of nine values is chi-square."""
+    plan = BalancePlan("wheels", 8.0, 5e-5, 1, False)
+    total = 0.0
+    for seed in range(30):
+        changes = {"exposure.rate_hz": "1", "tracker.survey.seed": str(seed)}
+        scene = loader.load("cubesat_table", changes | {"seed": str(seed)})
+        (one,) = balance_procedure.balance(scene, plan, UNCERTAINTY)
+        total += balance_report.statistics(scene.name, plan, [one])["nees"]
+    assert chi2.ppf(1e-4, 270) < total < chi2.ppf(1 - 1e-4, 270)
+
+
 @pytest.mark.slow
 def test_simsat_is_measured_to_a_percent_and_a_micrometer(
     monkeypatch: pytest.MonkeyPatch,
