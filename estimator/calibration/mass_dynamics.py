@@ -72,6 +72,11 @@ class BearingRecord:
         configuration whose mass properties are sought
     systematic_rad2
         (N, 3, 3) part of covariance_rad2 that attitudes near one another share; None without one
+    constant_rad2
+        (N, 3, 3) part of systematic_rad2 that is one rotation in body axes at all attitudes; None without one
+    lights
+        (N, M) 1 for each light of a map that an attitude is from, else 0: two attitudes share the errors of their
+        common lights. None to let the shared errors fall with the rotation between them
     """
 
     t_s: Floats
@@ -82,6 +87,8 @@ class BearingRecord:
     added_inertia_kg_m2: Floats = field(default_factory=lambda: np.zeros((3, 3)))
     added_moment_kg_m: Floats = field(default_factory=lambda: np.zeros(3))
     systematic_rad2: Floats | None = None
+    constant_rad2: Floats | None = None
+    lights: Floats | None = None
 
     def __post_init__(self) -> None:
         if len(self.t_s) < MIN_ATTITUDES:
@@ -102,6 +109,13 @@ class BearingRecord:
         if self.systematic_rad2 is None:
             return self.covariance_rad2
         return self.covariance_rad2 - self.systematic_rad2
+
+    @property
+    def varying_rad2(self) -> Floats:
+        """(N, 3, 3) part of covariance_rad2 that changes with the attitude, by which attitudes are weighted."""
+        if self.constant_rad2 is None:
+            return self.covariance_rad2
+        return self.covariance_rad2 - self.constant_rad2
 
     def with_noise(self, factor: float) -> BearingRecord:
         """Return the record with the independent part of its covariance scaled by a factor."""

@@ -15,8 +15,9 @@ Kalman smoother (Bell, SIAM J. Optimization 4, 1994, 626; Bock's multiple shooti
 3. Solve for the parameters; their covariance is the inverse of the sum.
 4. Substitute back for the states.
 
-Errors that attitudes share, of a map of LEDs or a lens, are not fitted, but considered (Schmidt 1966): the weights are
-those of the noise alone, and the shared errors add to the covariance of the parameters (`considered`).
+Errors that attitudes share, of a map of LEDs or a lens, are not fitted, but considered (Schmidt 1966): the weights take
+those that vary with the attitude as independent, and their correlation, with the errors that all attitudes share, adds
+to the covariance of the parameters (`considered`).
 
 In flight `filter_mass` estimates the same parameters by an extended Kalman filter.
 """
@@ -25,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import LinAlgError, solveh_banded
@@ -151,18 +152,21 @@ def estimate_with_noise(
 def considered(
     records: Sequence[BearingRecord], parts: Sequence[Reduced], covariance: Floats
 ) -> Floats:
-    """Return the (P, P) covariance of the parameters from errors that attitudes share.
+    """Return the (P, P) change of the parameters' covariance by errors that attitudes share.
 
     1. An attitude's error e_n changes the parameters by K_n e_n, K_n = C (B - X_n)^T W_n: C is their covariance from
-       the noise, W_n the weight, B the derivative of a measured attitude by the parameters (those of the bias), and X_n
-       that of the fitted one.
-    2. The errors have the covariance S_n = L_n L_n^T, and a correlation r = exp(-rotation / angle) that falls with the
-       rotation between two attitudes: the process of `filter.error_models.TrackerModel`, without its time.
-    3. They add sum_mn K_m L_m r_mn L_n^T K_n^T.
+       independent errors, W_n the weight, B the derivative of a measured attitude by the parameters (those of the
+       bias), and X_n that of the fitted one.
+    2. The constant errors have the covariance S_n = L_n L_n^T and the correlation r = 1 of two attitudes. For the
+       varying ones r is the share of their common lights, c / sqrt(n m) of the n and m of the attitudes, if these are
+       known. Else it is exp(-rotation / angle), the process of `filter.error_models.TrackerModel`, without its time.
+    3. They add sum_mn K_m L_m r_mn L_n^T K_n^T, where C already has the terms m = n of the varying errors.
     """
     size = len(covariance)
-    effects = []
+    varying = []
+    constant = []
     attitudes = []
+    lights = []
     by_bias = np.zeros((3, size))
     by_bias[:, BIAS] = np.eye(3)
     for record, part in zip(records, parts, strict=True):
@@ -173,22 +177,39 @@ def considered(
         gain = (
             covariance
             @ (by_bias - fitted).transpose(0, 2, 1)
-            @ np.linalg.inv(record.noise_rad2)
+            @ np.linalg.inv(record.varying_rad2)
         )
-        # 2. K_n L_n, with the symmetric root L_n
-        values, axes = np.linalg.eigh(record.systematic_rad2)
-        scaled_axes = axes * np.sqrt(np.maximum(values, 0))[:, None]
-        effects.append(gain @ scaled_axes @ axes.transpose(0, 2, 1))
+        # 2. K_n L_n
+        varying.append(gain @ symmetric_root(record.varying_rad2 - record.noise_rad2))
+        constant.append(gain @ symmetric_root(record.covariance_rad2 - record.varying_rad2))
         attitudes.append(record.lab_from_body)
-    if not effects:
+        if record.lights is not None:
+            lights.append(record.lights)
+    if not varying:
         return np.zeros((size, size))
     # 3. Sum over all pairs of attitudes, of all records
-    effect = np.concatenate(effects)
-    quaternion = Rotation.concatenate(attitudes).as_quat()
-    cosine = np.abs(quaternion @ quaternion.T)  # of half the angle
-    angle_rad = 2 * np.arccos(np.minimum(cosine, 1))
-    shared = np.exp(-angle_rad / TrackerModel().systematic_angle_rad)
-    return np.asarray(np.einsum("mpk,mn,nqk->pq", effect, shared, effect, optimize=True))
+    effect = np.concatenate(varying)
+    if len(lights) == len(varying):
+        used = np.concatenate(lights)
+        used = used / np.linalg.norm(used, axis=1, keepdims=True)
+        shared = used @ used.T
+    else:
+        quaternion = Rotation.concatenate(attitudes).as_quat()
+        cosine = np.abs(quaternion @ quaternion.T)  # of half the angle
+        angle_rad = 2 * np.arccos(np.minimum(cosine, 1))
+        shared = np.exp(-angle_rad / TrackerModel().systematic_angle_rad)
+    np.fill_diagonal(shared, 0.0)
+    total = np.concatenate(constant).sum(axis=0)
+    added = np.einsum("mpk,mn,nqk->pq", effect, shared, effect, optimize=True)
+    return np.asarray(added + total @ total.T)
+
+
+def symmetric_root(matrix: Floats) -> Floats:
+    """Return the (N, 3, 3) symmetric roots of positive semi-definite matrices."""
+    values, axes = np.linalg.eigh(matrix)
+    return np.asarray(
+        axes * np.sqrt(np.maximum(values, 0))[:, None] @ axes.transpose(0, 2, 1)
+    )
 
 
 def first_states(record: BearingRecord, lab: LabConstants, values: Floats) -> States:
@@ -297,7 +318,7 @@ def add_measured(
     """
     diagonal, border, corner = to
     # The residual depends on the attitude and on the bias with the same derivative, -I.
-    weight = np.linalg.inv(record.noise_rad2)
+    weight = np.linalg.inv(record.varying_rad2)
     torque_weight = lab.torque_rms_nm**-2.0
     off = measured_minus(record.lab_from_body, states.rotation, values[BIAS])
     pull = np.einsum("nij,nj->ni", weight, off)
@@ -374,14 +395,13 @@ def filter_mass(
 
 def cut(record: BearingRecord, which: slice) -> BearingRecord:
     """Return the record with some of its attitudes."""
+    names = ("covariance_rad2", "systematic_rad2", "constant_rad2", "lights")
+    parts: dict[str, Any] = {
+        name: None if (part := getattr(record, name)) is None else part[which]
+        for name in names
+    }
     return replace(
-        record,
-        t_s=record.t_s[which],
-        lab_from_body=record.lab_from_body[which],
-        covariance_rad2=record.covariance_rad2[which],
-        systematic_rad2=None
-        if record.systematic_rad2 is None
-        else record.systematic_rad2[which],
+        record, t_s=record.t_s[which], lab_from_body=record.lab_from_body[which], **parts
     )
 
 

@@ -354,6 +354,9 @@ class Attitude:
         Rate of the camera at the attitude's time; None where neither streaks nor rows determine it
     angles_compared
         Number of angles that the identifier has compared, of those that count them; None of others
+    constant_rad2
+        (3, 3) part of systematic_rad2 that is one rotation of the camera in all frames, such as that by the error of
+        its place; None if there is none
     """
 
     status: str
@@ -365,6 +368,7 @@ class Attitude:
     systematic_rad2: Floats | None = None
     rate: RateEstimate | None = None
     angles_compared: int | None = None
+    constant_rad2: Floats | None = None
 
     @property
     def solved(self) -> bool:

@@ -449,6 +449,7 @@ class DomeTracker:
             float(np.sqrt(np.mean(residual**2))),
             self.camera,
             shared + lever_covariance,
+            constant_rad2=lever_covariance,
         )
 
     def _sigma_rad(

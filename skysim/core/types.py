@@ -119,6 +119,19 @@ class Trajectory:
         )
         return lab_from_body if np.ndim(t_s) else lab_from_body[0]
 
+    def means(self, t_s: Floats) -> tuple[Rotation, Floats]:
+        """Means of lab_from_body and of the rate in body axes over an interval, from an odd number of even times (K,).
+
+        The mean attitude is the rotation R with the least integral of |R - lab_from_body(t)|^2, by Simpson's rule
+        (Markley et al. 2007, J. Guid. Control Dyn. 30, 1193). It also solves Wahba's problem for mean directions.
+        """
+        weights = np.full(len(t_s), 2.0)
+        weights[1::2] = 4.0
+        weights[[0, -1]] = 1.0
+        attitudes = self.attitude_at(t_s)
+        turned = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec().sum(axis=0)
+        return attitudes.mean(weights), turned / (t_s[-1] - t_s[0])
+
     def rate_at(self, t_s: float) -> Floats:
         """(3,) angular velocity in body axes, interpolated linearly."""
         return np.array([np.interp(t_s, self.t_s, rate) for rate in self.rate_body_rad_s.T])
@@ -408,6 +421,10 @@ class SatelliteTruth:
     sunlit: float
 
 
+# Attitudes of a `Truth` that are written to files.
+ATTITUDES = ("lab_from_body", "cam_from_lab", "mean_lab_from_body", "mean_cam_from_lab")
+
+
 @dataclass(frozen=True, slots=True)
 class Truth:
     """The true state behind a frame.
@@ -420,8 +437,13 @@ class Truth:
         Attitude at mid-exposure
     cam_from_lab
         Attitude of the camera at mid-exposure
+    mean_lab_from_body
+        Mean attitude over the exposure of the middle row, which the frame shows and solutions are compared with. An
+        angular acceleration a turns it by a T^2 / 24 from that at mid-exposure
     rate_cam_rad_s
         (3,) angular velocity in camera axes
+    mean_rate_cam_rad_s
+        (3,) mean of the angular velocity over that exposure
     sources
         Sources on the frame
     hidden
@@ -435,11 +457,18 @@ class Truth:
     t_s: float
     lab_from_body: Rotation
     cam_from_lab: Rotation
+    mean_lab_from_body: Rotation
     rate_cam_rad_s: Floats
+    mean_rate_cam_rad_s: Floats
     sources: SourceTruth
     hidden: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     bodies: tuple[BodyTruth, ...] = ()
     satellites: tuple[SatelliteTruth, ...] = ()
+
+    @property
+    def mean_cam_from_lab(self) -> Rotation:
+        """Mean attitude of the camera."""
+        return self.cam_from_lab * self.lab_from_body * self.mean_lab_from_body.inv()
 
 
 @dataclass(frozen=True, slots=True)

@@ -389,8 +389,10 @@ def fly(
     Frames are left out from the first one near the tilt stop on, because the torque of a contact is unknown.
     """
     with open_flight(scene) as flight:
-        rows = measured_attitudes(flight, watch)
+        measured = measured_attitudes(flight, watch)
         log = flight.telemetry()
+    # A time tag may be before the first wheel speed.
+    rows = [row for row in measured if row[0] >= log.t_s[0]]
     vehicle = flight.lab.vehicle
     tilts_deg = np.array([multibody.tilt_deg(attitude) for _, attitude, *_ in rows])
     contact = np.flatnonzero(tilts_deg > scene.vehicle.tilt_stop_deg - STOP_MARGIN_DEG)
@@ -404,7 +406,8 @@ def fly(
         raise InputError(
             "balance", f"{len(kept)} attitudes {cause}", f"{LEAST_ATTITUDES} or more"
         )
-    t_s, attitudes, covariances, shared = zip(*kept, strict=True)
+    t_s, attitudes, parts, lights = zip(*kept, strict=True)
+    covariance, systematic, constant = np.stack(parts, axis=1)
     speeds = log.wheel_rad_s + uncertainty.tacho_sigma_rad_s * random_stream(
         scene.seed, BALANCE, 1
     ).standard_normal(log.wheel_rad_s.shape)
@@ -412,12 +415,14 @@ def fly(
     record = BearingRecord(
         np.array(t_s),
         lab_from_body,
-        np.array(covariances)
+        covariance
         + timing_covariance(np.array(t_s), lab_from_body, scene.exposure.time_tag_jitter_s),
         log.t_s,
         speeds * assumptions.wheel_inertia_kg_m2,
         *vehicle.trims.added(vehicle.trims.position_m),
-        np.array(shared),
+        systematic,
+        constant,
+        np.array(lights),
     )
     return BalanceFlight(
         record, vehicle, scene.exposure.frames, len(rows), len(rows) - len(kept)
@@ -427,7 +432,10 @@ def fly(
 def measured_attitudes(
     flight: Flight, watch: ProgressCallback | None
 ) -> list[tuple[float, Rotation, Floats, Floats]]:
-    """Of each solved frame: time, attitude, (3, 3) covariance in body axes, and the part of it that frames share."""
+    """Of each solved frame: time, attitude, covariances in body axes, and which LEDs it has used, 1 or 0.
+
+    The covariances (3, 3, 3) are the whole one, the part that frames share, and the part of this that is constant.
+    """
     camera = flight.lab.camera
     body_from_cam = camera.mount.cam_from_body.inv()
     R_body_from_cam = body_from_cam.as_matrix()
@@ -436,23 +444,20 @@ def measured_attitudes(
         assert shot.report is not None
         attitude = shot.report.attitude
         if attitude.cam_from_ref is not None and attitude.covariance_rad2 is not None:
-            systematic = (
-                np.zeros((3, 3))
-                if attitude.systematic_rad2 is None
-                else attitude.systematic_rad2
-            )
-            covariance, shared = (
-                R_body_from_cam @ one @ R_body_from_cam.T
-                for one in (attitude.covariance_rad2, systematic)
-            )
-            rows.append(
-                (
-                    shot.frame.t_mid_s,
-                    (body_from_cam * attitude.cam_from_ref).inv(),
-                    covariance,
-                    shared,
+            parts = [
+                np.zeros((3, 3)) if one is None else R_body_from_cam @ one @ R_body_from_cam.T
+                for one in (
+                    attitude.covariance_rad2,
+                    attitude.systematic_rad2,
+                    attitude.constant_rad2,
                 )
-            )
+            ]
+            used = np.zeros(len(camera.sources))
+            # An external tracker may not say which LEDs it has used.
+            known = slice(None) if attitude.match is None else attitude.match.star
+            used[known] = 1.0
+            lab_from_body = (body_from_cam * attitude.cam_from_ref).inv()
+            rows.append((shot.frame.t_mid_s, lab_from_body, np.array(parts), used))
     return rows
 
 

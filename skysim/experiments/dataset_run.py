@@ -211,7 +211,7 @@ def study_plan(
 
 
 MANIFEST = "dataset.json"
-FORMAT = 1
+FORMAT = 2
 INDEX = "index"
 SOURCES = "sources"
 SHARDS = "shards"

@@ -19,7 +19,7 @@ from estimator.core.types import ra_dec_roll_rad
 from skysim.core.errors import InputError
 from skysim.core.files import atomic_file, make_folder
 from skysim.core.jit import jit
-from skysim.core.types import Floats
+from skysim.core.types import ATTITUDES, Floats
 from skysim.experiments.dataset_labels import MASKS, Extents, LabelledFrame
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
@@ -197,7 +197,7 @@ def frame_labels(one: LabelledFrame, scene: Scene, numbers: dict[str, Any]) -> d
     frame = one.frame
     labels = {**numbers, "height": frame.image_dn.shape[0], "width": frame.image_dn.shape[1]}
     labels |= {"exposure_s": frame.exposure_s, "saturation_dn": frame.saturation_dn}
-    for name in ("lab_from_body", "cam_from_lab"):
+    for name in ATTITUDES:
         rotation: Rotation = getattr(truth, name)
         labels |= {
             f"{name}_q{end}": float(q)
@@ -208,7 +208,7 @@ def frame_labels(one: LabelledFrame, scene: Scene, numbers: dict[str, Any]) -> d
         for end, rate in zip("xyz", truth.rate_cam_rad_s, strict=True)
     }
     if isinstance(scene.light, StarsConfig):
-        angles = np.degrees(ra_dec_roll_rad(truth.cam_from_lab))
+        angles = np.degrees(ra_dec_roll_rad(truth.mean_cam_from_lab))
         labels |= dict(
             zip(("ra_deg", "dec_deg", "roll_deg"), map(float, angles), strict=True)
         )

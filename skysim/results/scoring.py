@@ -46,6 +46,19 @@ def angles_deg(
     return float(roll), float(pitch), float(yaw)
 
 
+def scored_attitude(camera: StarCamera, truth: Truth) -> Rotation:
+    """The cam_from_lab that solutions are compared with: the mean over the exposure, by the mount of the calibration.
+
+    A mount that has moved since makes an error of the vehicle's attitude.
+    """
+    return camera.mount.cam_from_body * truth.mean_lab_from_body.inv()
+
+
+def true_angles_deg(camera: StarCamera, truth: Truth) -> tuple[float, float, float]:
+    """`angles_deg` of the truth that solutions are compared with."""
+    return angles_deg(scored_attitude(camera, truth), camera.scene, camera.mount)
+
+
 def row(
     camera: StarCamera, frame: Frame, truth: Truth, report: Report, update_status: str = ""
 ) -> FrameRow:
@@ -56,8 +69,7 @@ def row(
     scene = camera.scene
     mount = camera.mount
     attitude = report.attitude
-    # With the mount of the calibration: one that has moved since makes an error of the vehicle's attitude.
-    cam_from_lab = mount.cam_from_body * truth.lab_from_body.inv()
+    cam_from_lab = scored_attitude(camera, truth)
     cross = roll = cross_sigma = roll_sigma = chance = float("nan")
     estimate = None
     wrong = False
@@ -81,9 +93,9 @@ def row(
     return FrameRow(
         frame=frame.index,
         t_s=truth.t_s,
-        rate_deg_s=float(np.degrees(np.linalg.norm(truth.rate_cam_rad_s))),
+        rate_deg_s=float(np.degrees(np.linalg.norm(truth.mean_rate_cam_rad_s))),
         status=attitude.status,
-        truth_deg=angles_deg(cam_from_lab, scene, mount),
+        truth_deg=true_angles_deg(camera, truth),
         estimate_deg=estimate,
         cross_arcsec=cross / ARCSEC_RAD,
         roll_arcsec=roll / ARCSEC_RAD,
@@ -128,7 +140,7 @@ def rate_errors_deg_s(rate: RateEstimate | None, truth: Truth) -> tuple[float, f
         return float("nan"), float("nan")
     signs = (1,) if rate.sign_known else (1, -1)
     error = min(
-        np.linalg.norm(sign * rate.rate_rad_s - truth.rate_cam_rad_s) for sign in signs
+        np.linalg.norm(sign * rate.rate_rad_s - truth.mean_rate_cam_rad_s) for sign in signs
     )
     return float(np.degrees(error)), float(
         np.degrees(np.sqrt(np.trace(rate.covariance_rad2_s2)))
@@ -213,10 +225,7 @@ class Score:
     @property
     def error_arcsec(self) -> float:
         """Rotation angle between the solution and the truth, arcseconds; NaN without a solution."""
-        estimate = self.attitude.cam_from_ref
-        if estimate is None:
-            return float("nan")
-        return float((estimate * self.truth.cam_from_lab.inv()).magnitude() / ARCSEC_RAD)
+        return math.hypot(self.row.cross_arcsec, self.row.roll_arcsec)
 
     def annotated(self) -> NDArray[np.uint8]:
         """(H, W, 3) stretched frame in BGR: truth in blue, detections in red, identified sources in green."""

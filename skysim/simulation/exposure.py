@@ -31,7 +31,7 @@ from skysim.camera.detector import (
 )
 from skysim.camera.discs import concatenated, render_bodies
 from skysim.camera.glow import background, stray
-from skysim.camera.projection import in_view, project
+from skysim.camera.projection import in_view, project, sample_times
 from skysim.camera.render import Window, render
 from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Floats, Frame, SourceTruth, Trajectory, Truth
@@ -257,11 +257,19 @@ def draw_colors(
 
 def truth_of(beam: Beam, exposure: Exposure, sources: SourceTruth) -> Truth:
     """The truth of an exposure, from the truth of its images."""
+    trajectory = exposure.trajectory
+    half_s = exposure.window.exposure_s / 2
+    # The renderer's own samples, those of the middle row.
+    t_s = sample_times(exposure.t_s - half_s, exposure.t_s + half_s, trajectory)
+    mean_lab_from_body, mean_rate_rad_s = trajectory.means(t_s)
+    cam_from_body = exposure.mount.cam_from_body
     return Truth(
         exposure.t_s,
         exposure.lab_from_body,
         exposure.cam_from_lab,
-        exposure.mount.cam_from_body.apply(exposure.trajectory.rate_at(exposure.t_s)),
+        mean_lab_from_body,
+        cam_from_body.apply(trajectory.rate_at(exposure.t_s)),
+        cam_from_body.apply(mean_rate_rad_s),
         sources,
         hidden_ids(beam, exposure),
         tuple(disc.truth() for disc in beam.discs if disc.id in sources.id),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -68,8 +69,16 @@ def frame_end_s(scene: Scene, index: int, exposure_s: float | None = None) -> fl
 
 
 def duration_s(scene: Scene) -> float:
-    """Duration of a motion until the longest exposure of the last frame ends."""
-    return frame_end_s(scene, scene.exposure.frames - 1, longest_exposure_s(scene))
+    """Duration of a motion until the longest exposure of the last frame ends, and a period begins after its middle.
+
+    Telemetry has a row at the beginning of each control period, so it covers mid-exposure and time tag of all frames.
+    """
+    last = scene.exposure.frames - 1
+    exposure_s = longest_exposure_s(scene)
+    middle_s = exposure_window(scene, last, exposure_s).middle_s(scene.camera.height_px)
+    latest_s = middle_s + max(time_tag_error_s(scene, last), 0.0)
+    covered_s = math.ceil(latest_s * scene.control_rate_hz) / scene.control_rate_hz
+    return max(frame_end_s(scene, last, exposure_s), covered_s + MARGIN_S)
 
 
 def history_s(scene: Scene) -> float:

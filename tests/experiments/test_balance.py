@@ -36,10 +36,9 @@ def noisy_truth(
     every = round(0.5 / log.period_s)
     turned = Rotation.from_rotvec(SIGMA_RAD * rng.standard_normal((len(log.t_s[::every]), 3)))
     attitudes = log.lab_from_body[::every] * turned
-    noise = SIGMA_RAD**2 * np.eye(3)
-    shared = np.zeros((3, 3))
+    parts = np.array([SIGMA_RAD**2 * np.eye(3), np.zeros((3, 3)), np.zeros((3, 3))])
     return [
-        (float(t), one, noise, shared)
+        (float(t), one, parts, np.ones(1))
         for t, one in zip(log.t_s[::every], attitudes, strict=True)
     ]
 
@@ -75,6 +74,19 @@ def test_table_is_balanced_below_the_published_torque(
     assert json.loads((tmp_path / "balance.json").read_text())["report"] == str(
         tmp_path / "report.html"
     )
+
+
+@pytest.mark.long
+def test_the_errors_of_a_table_in_frames_match_their_covariance() -> None:
+    """Draws of vehicle, noise and survey, one frame a second: the sum of 30 NEES of nine values is chi-square."""
+    plan = BalancePlan("wheels", 8.0, 5e-5, 1, False)
+    total = 0.0
+    for seed in range(30):
+        changes = {"exposure.rate_hz": "1", "tracker.survey.seed": str(seed)}
+        scene = loader.load("cubesat_table", changes | {"seed": str(seed)})
+        (one,) = balance_procedure.balance(scene, plan, UNCERTAINTY)
+        total += balance_report.statistics(scene.name, plan, [one])["nees"]
+    assert chi2.ppf(1e-4, 270) < total < chi2.ppf(1 - 1e-4, 270)
 
 
 @pytest.mark.slow

@@ -184,7 +184,7 @@ def test_in_the_laboratory_the_message_puts_every_led_on_its_pixel(
         from_camera_m = leds_m @ matrix_b_from_a(q).T - camera.mount.camera_body_m
         pixels = camera.optics.project(camera.mount.cam_from_body.apply(from_camera_m))
         np.testing.assert_allclose(
-            pixels, np.column_stack([seen["x_px"], seen["y_px"]]), rtol=0, atol=1e-5
+            pixels, np.column_stack([seen["x_px"], seen["y_px"]]), rtol=0, atol=5e-4
         )
     assert not (tmp_path / "solutions.aem").exists()  # no frame was solved
 
@@ -263,7 +263,7 @@ def test_parquet_has_the_columns_and_units_of_the_ecsv(stars: Flown, tmp_path: P
     assert lights.schema.metadata[b"skysim.seed"] == b"2"
     truth = pyarrow.parquet.read_table(tmp_path / "truth.parquet")
     same = Table.read(tmp_path / "truth.ecsv")
-    for name in ("t_mid_s", "cam_from_lab_qw", "rate_cam_x_rad_s"):
+    for name in ("t_mid_s", "mean_cam_from_lab_qw", "cam_from_lab_qw", "rate_cam_x_rad_s"):
         np.testing.assert_array_equal(truth[name].to_numpy(), same[name])
     assert same["cam_from_lab_qw"][1] == each[1].meta["cam_from_lab_xyzw"][3]
 

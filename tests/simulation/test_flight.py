@@ -634,3 +634,21 @@ def test_a_control_loop_of_twenty_lines_brings_the_vehicle_to_its_target() -> No
         ticks += 1
     assert np.degrees((target.inv() * flight.state.lab_from_body).magnitude()) < 0.05
     assert np.degrees(np.linalg.norm(flight.state.rate_body_rad_s)) < 0.05
+
+
+@pytest.mark.parametrize("rate_hz", [20, 50])
+@pytest.mark.parametrize("offset", ["0 s", "-0.1 s", "33 ms"])
+def test_telemetry_covers_every_frame(rate_hz: int, offset: str) -> None:
+    """Telemetry is as slow as the controller; it has a row at or after each mid-exposure and time tag."""
+    exposure = "time: 4 ms, rate_hz: 10, frames: 3, first: 0.105 s"
+    scene = loader.load(
+        "simsat_slew",
+        {
+            "exposure": f"{{{exposure}, time_tag_offset: {offset}}}",
+            "motion.control.rate_hz": str(rate_hz),
+        },
+    )
+    last_s = simulate_motion(scene).telemetry().t_s[-1]
+    middle_s = 0.305 + 0.002
+    assert last_s >= middle_s
+    assert last_s >= middle_s + scene.exposure.time_tag_offset_s

@@ -15,6 +15,7 @@ from skysim.simulation.checks import check
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.flight import open_flight, simulate_motion
 from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.motion import mounting_rad
 from tests.helpers.head_pairs import gain, measured_pairs
 
 SIDE = {"name": "side", "position": ["0.2 m", "0 m", "0 m"], "rotation_deg": [0, 90, 0]}
@@ -214,3 +215,15 @@ def test_the_filter_finds_how_far_the_mounts_have_turned() -> None:
     )[:2]
     assert np.linalg.norm(side.true_rad[-1]) > 20 * ARCSEC_RAD
     assert np.linalg.norm(boresight) < 3 * ARCSEC_RAD
+
+
+def test_the_mounts_may_drift_as_far_as_the_scene_moves_them() -> None:
+    """A random walk of d per root hour has the standard deviation d sqrt(t); a ramp within it lags by less than it."""
+    lab = build_lab(load_scene("two_heads"))
+    config = lab.scene.filter
+    assert config is not None
+    ends_s = np.array([0.0, lab.duration_s])
+    main, side = (np.diff(mounting_rad(camera, ends_s), axis=0) for camera in lab.cameras)
+    walk_arcsec = config.mounting_drift_arcsec_sqrt_h * np.sqrt(lab.duration_s / 3600)
+    for moved in (main, side - main):
+        assert np.abs(moved).max() / ARCSEC_RAD < 1.05 * walk_arcsec

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.core import files, quaternion
+from skysim.core import files
 from skysim.core.errors import InputError, printable
 from skysim.simulation.flight import Shot
 
@@ -98,9 +98,8 @@ def build_packet(shot: Shot, due_unix_s: float, made_unix_s: float, dropped: int
         "dropped": dropped,
     }
     truth_values = {
-        "cam_from_ref_xyzw": np.roll(
-            quaternion.from_rotation(truth.cam_from_lab), -1
-        ).tolist(),
+        "cam_from_ref_xyzw": truth.cam_from_lab.as_quat().tolist(),
+        "mean_cam_from_ref_xyzw": truth.mean_cam_from_lab.as_quat().tolist(),
         "rate_cam_rad_s": truth.rate_cam_rad_s.tolist(),
         "ids": truth.sources.id.tolist(),
         "x_px": truth.sources.xy_px[:, 0].round(4).tolist(),

@@ -183,21 +183,12 @@ def by_level(sheet: MeasuredFrames, experiment: str, key: str) -> list[dict[str,
 
 
 def by_acceleration(sheet: MeasuredFrames) -> list[dict[str, Any]]:
-    """Error and outcomes by acceleration, beside the error that the asymmetry of the streaks predicts.
-
-    The rate is zero at mid-exposure, so all lights move by a t^2 / 2 to one side. Their mean is a T^2 / 24 away from
-    their place at mid-exposure, so the attitude errs by this angle about the axis of the motion.
-    """
+    """Error and outcomes by acceleration."""
     found = []
     for acceleration in sheet.levels("acceleration", "acceleration_deg_s2"):
         rows = sheet.rows("acceleration", acceleration_deg_s2=acceleration)
-        lag_arcsec = 3600 * acceleration * sheet.scene.exposure.time_s**2 / 24
-        at_rest = rms(
-            sheet, sheet.rows("terms", unit=0, state=0, attitude=0), GROUPS["across"]
-        )
-        predicted = math.sqrt(at_rest**2 + lag_arcsec**2 / 2)  # about one of two axes
         row = {"acceleration_deg_s2": acceleration, "counts": counts_of_fields(sheet, rows)}
-        found.append(row | {"predicted_across": predicted} | rms_by_group(sheet, rows))
+        found.append(row | rms_by_group(sheet, rows))
     return found
 
 

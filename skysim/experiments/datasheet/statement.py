@@ -434,8 +434,8 @@ def acceleration_section(statement: Statement) -> StatementSection:
     """Error and acquisition by acceleration."""
     texts = [
         "Two frames of each attitude, with no rate at mid-exposure and a constant acceleration across the boresight"
-        f" ({ENSEMBLE}). All lights move to one side, so their mean is a T² / 24 from where they are at mid-exposure:"
-        " predicted, with the error at rest.",
+        f" ({ENSEMBLE}). Errors are relative to the mean attitude over the exposure, which is a T² / 24 from that at"
+        " mid-exposure.",
         bracket_text(
             "acquisition in acceleration",
             performance.bracket(statement.accelerations, "acceleration_deg_s2"),
@@ -446,7 +446,6 @@ def acceleration_section(statement: Statement) -> StatementSection:
         [
             f"{row['acceleration_deg_s2']:g}",
             arcsec(row["rms_across"]),
-            arcsec(row["predicted_across"]),
             arcsec(row["rms_about"]),
             *outcome_cells(row),
         ]
@@ -455,7 +454,6 @@ def acceleration_section(statement: Statement) -> StatementSection:
     headers = [
         "acceleration °/s²",
         "rms across ″",
-        "predicted ″",
         "rms about ″",
         *FIELD_HEADERS,
     ]

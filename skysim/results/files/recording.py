@@ -21,7 +21,7 @@ from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.core.files import atomic_file, write_png16, write_table
 from skysim.core.images import read_fits
-from skysim.core.types import Floats, Frame, Truth
+from skysim.core.types import ATTITUDES, Floats, Frame, Truth
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.sources import stars
@@ -42,6 +42,8 @@ class FrameTruth:
     exposure_s: float
     lab_from_body_xyzw: Floats
     cam_from_lab_xyzw: Floats
+    mean_lab_from_body_xyzw: Floats
+    mean_cam_from_lab_xyzw: Floats
     rate_cam_rad_s: Floats
     sources: Any
 
@@ -173,12 +175,13 @@ def read_truth(path: Path) -> FrameTruth:
     """
     sources = files.read_table(path)
     counts = {"frame": 1, "t_mid_s": 1, "exposure_s": 1}
-    counts |= {"lab_from_body_xyzw": 4, "cam_from_lab_xyzw": 4, "rate_cam_rad_s": 3}
+    quaternions = [f"{name}_xyzw" for name in ATTITUDES]
+    counts |= {**dict.fromkeys(quaternions, 4), "rate_cam_rad_s": 3}
     numbers = {
         key: np.array(files.header_numbers(path, sources.meta, key, count))
         for key, count in counts.items()
     }
-    for key in ("lab_from_body_xyzw", "cam_from_lab_xyzw"):
+    for key in quaternions:
         if abs(np.linalg.norm(numbers[key]) - 1) > UNIT_NORM:
             raise InputError(
                 path, f"{key} in the header is {sources.meta[key]}", "a unit quaternion"
@@ -262,9 +265,9 @@ def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
     header["ROWORDER"] = ("TOP-DOWN", "the first row is the highest")
     header["SATURATE"] = (frame.saturation_dn, "saturation [DN]")
     if isinstance(scene.light, StarsConfig):
-        header.update(wcs.header(scene.camera, truth.cam_from_lab))
+        header.update(wcs.header(scene.camera, truth.mean_cam_from_lab))
         header["COMMENT"] = (
-            "WCS: of the true attitude at mid-exposure; apparent directions in ICRS axes"
+            "WCS: of the true mean attitude in the exposure; apparent directions in ICRS axes"
         )
     else:
         header["COMMENT"] = "no WCS: the lights are in the laboratory"
@@ -306,8 +309,7 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
             scene, truth.t_s
         ),  # the true time; that of the FITS header is the camera's time tag
         "exposure_s": frame.exposure_s,
-        "lab_from_body_xyzw": truth.lab_from_body.as_quat().tolist(),
-        "cam_from_lab_xyzw": truth.cam_from_lab.as_quat().tolist(),
+        **{f"{name}_xyzw": getattr(truth, name).as_quat().tolist() for name in ATTITUDES},
         "rate_cam_rad_s": truth.rate_cam_rad_s.tolist(),
         "hidden": truth.hidden.tolist(),
         "lab": "ICRS axes"

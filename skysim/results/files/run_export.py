@@ -19,7 +19,7 @@ from skysim.core import files, images
 from skysim.core.encoded import silent_stderr
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.time import in_utc
-from skysim.core.types import Floats
+from skysim.core.types import ATTITUDES, Floats
 from skysim.dynamics.profile_samples import BODY, CAMERA, ICRF, LAB
 from skysim.results import plots
 from skysim.results.files.recording import ZARR, FrameTruth, Recording
@@ -162,9 +162,9 @@ UNITS = {
 def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
     """Write truth.aem, solutions.aem if frames were solved, and motion.aem of a simulated motion. Returns the paths.
 
-    At mid-exposure, attitudes are those of the camera in the ICRF under the stars, and of the body in the laboratory
-    under a dome. The motion is that of the body at every tick of the vehicle's computer. Raises InputError if a
-    solution has no truth.
+    Attitudes are means over the exposure, with the time of mid-exposure: those of the camera in the ICRF under the
+    stars, and of the body in the laboratory under a dome. The motion is that of the body at every tick of the vehicle's
+    computer. Raises InputError if a solution has no truth.
     """
     stars = run.is_celestial
     frames = (ICRF, CAMERA) if stars else (LAB, BODY)
@@ -190,7 +190,7 @@ def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
 
     a_from_b = Rotation.concatenate([rotation for *_, rotation in true])
     written = [
-        write("truth", "True attitude at mid-exposure", list(epochs.values()), a_from_b)
+        write("truth", "True mean attitude in the exposure", list(epochs.values()), a_from_b)
     ]
     solved = run.solved()
     if solved is not None:
@@ -205,7 +205,7 @@ def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
         written.append(
             write(
                 "solutions",
-                "Attitude found by the star tracker, at mid-exposure",
+                "Attitude found by the star tracker",
                 utc,
                 solved[1],
             )
@@ -221,10 +221,10 @@ def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
 
 
 def attitude(truth: FrameTruth, stars: bool) -> Rotation:
-    """lab_from_cam under the stars, lab_from_body in a laboratory; the same convention as `Recording.solved`."""
+    """Mean lab_from_cam under the stars, lab_from_body in a laboratory; the same convention as `Recording.solved`."""
     if stars:
-        return Rotation.from_quat(truth.cam_from_lab_xyzw).inv()
-    return Rotation.from_quat(truth.lab_from_body_xyzw)
+        return Rotation.from_quat(truth.mean_cam_from_lab_xyzw).inv()
+    return Rotation.from_quat(truth.mean_lab_from_body_xyzw)
 
 
 def truths(run: Recording, bar: Bar) -> Iterator[FrameTruth]:
@@ -245,7 +245,7 @@ def truth_row(truth: FrameTruth) -> dict[str, Any]:
         "mid_utc": truth.mid_utc.isoformat(timespec="microseconds"),
     }
     row |= {"t_mid_s": truth.t_mid_s, "exposure_s": truth.exposure_s}
-    for name in ("lab_from_body", "cam_from_lab"):
+    for name in ATTITUDES:
         quaternion = getattr(truth, f"{name}_xyzw")
         row |= {
             f"{name}_q{end}": float(component)
@@ -405,8 +405,7 @@ def frame_arrays(frame_truths: list[FrameTruth]) -> Iterator[tuple[str, Any, str
         ("t_mid_s", ""),
         ("exposure_s", ""),
         ("rate_cam_rad_s", "xyz"),
-        ("lab_from_body_xyzw", "xyzw"),
-        ("cam_from_lab_xyzw", "xyzw"),
+        *((f"{name}_xyzw", "xyzw") for name in ATTITUDES),
     ):
         yield (
             name,

@@ -37,19 +37,11 @@ class CheckedAttitudes(NamedTuple):
         (N, 3) rates in body axes; zeros if only the direction matters
     t_s
         (N,) times of the frames; NaN for an attitude that is not of a frame
-    acceleration_body_rad_s2
-        (N, 3) angular accelerations in body axes; None for zeros
     """
 
     lab_from_body: Rotation
     rate_body_rad_s: Floats
     t_s: Floats
-    acceleration_body_rad_s2: Floats | None = None
-
-    def accelerations(self) -> Floats:
-        """(N, 3) angular accelerations in body axes, rad/s^2."""
-        given = self.acceleration_body_rad_s2
-        return np.zeros_like(self.rate_body_rad_s) if given is None else given
 
 
 def of_frames(lab: Lab) -> CheckedAttitudes:
@@ -74,12 +66,7 @@ def of_frames(lab: Lab) -> CheckedAttitudes:
     if scene.vehicle.mount == "air_bearing":
         check_stop(scene, t_s[rows], np.degrees(tilt_rad))
         rows = rows[tilt_rad <= math.radians(scene.vehicle.tilt_stop_deg)]
-    return CheckedAttitudes(
-        every.lab_from_body[rows],
-        every.rate_body_rad_s[rows],
-        t_s[rows],
-        every.accelerations()[rows],
-    )
+    return CheckedAttitudes(every.lab_from_body[rows], every.rate_body_rad_s[rows], t_s[rows])
 
 
 def check_stop(scene: Scene, t_s: Floats, tilt_deg: Floats) -> None:
@@ -109,9 +96,9 @@ def attitudes_at(lab: Lab, t_s: Floats) -> CheckedAttitudes:
         return CheckedAttitudes(lab_from_body, np.tile(rate, (len(t_s), 1)), t_s)
     reference = guidance.plan(scene.motion, lab.start, lab.profiles)
     states = [reference.state_at(float(t)) for t in t_s]
-    wxyz, rates, accelerations = (np.array(column) for column in zip(*states, strict=True))
+    wxyz, rates, _ = (np.array(column) for column in zip(*states, strict=True))
     lab_from_body = Rotation.from_quat(wxyz, scalar_first=True)
-    return CheckedAttitudes(lab_from_body, rates, t_s, accelerations)
+    return CheckedAttitudes(lab_from_body, rates, t_s)
 
 
 def tilts_rad(attitudes: CheckedAttitudes) -> Floats:

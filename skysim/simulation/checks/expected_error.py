@@ -20,8 +20,6 @@ axes and R the rotation from lab to camera axes:
     surface survey : E_i = sigma G_i R n_i, n_i the normal   focal length : E_i = relative error (x_i - center)
     survey rotation r : E_i = G_i R (r x P_i)                distortion, star places : difference of the image positions
     rolling shutter : E_i = velocity times the row's delay from the middle row, minus the delay that the tracker assumes
-    angular acceleration a : E_i = -J_i a T^2 / 24 against the attitude at mid-exposure: the images are rotated by
-        rate t + a t^2 / 2 at the time t from it, and the mean of t^2 / 2 over an exposure T is T^2 / 24
 
 The approximation of a solver (thesis, infinity, ...) has the error of its solution for exact rays. `pnp` also fits the
 camera's position, so its J_i has three more columns. Errors of star places are those of the catalog and of neighbors
@@ -201,13 +199,6 @@ def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Com
     return Common((velocity_px_s * delay_s[:, None])[:, :, None])
 
 
-def angular_acceleration(
-    view: View, lab_from_cam: Rotation, context: Context
-) -> Common | None:
-    """Mean displacement of the images in the exposure from those at mid-exposure, E_i = -J_i a T^2 / 24."""
-    return Common(view.bend_px[:, :, None]) if view.bend_px.any() else None
-
-
 def displacement(view: View, shift_lab: Floats, lab_from_cam: Rotation) -> Common:
     """The displacement of the images by shifts (n, 3) of the lights in lab axes, E_i = G_i R shift_i."""
     shift_cam = lab_from_cam.inv().apply(shift_lab)
@@ -225,7 +216,6 @@ CAUSES: dict[str, Callable[[View, Rotation, Context], Independent | Common | Non
     "distortion": distortion,
     "star places": star_places,
     "rolling shutter": rolling_shutter,
-    "angular acceleration": angular_acceleration,
 }
 UNKNOWN_TO_TRACKER = ("focal length", "distortion", "assumed lever", "rolling shutter")
 # A survey draws these once. The tracker's covariance contains them, its matching radius does not.

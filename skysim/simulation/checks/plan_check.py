@@ -88,7 +88,7 @@ def check(
     frames = attitudes.of_frames(lab)
     if rate_body_rad_s is not None:
         rates = np.tile(rate_body_rad_s, (len(frames.t_s), 1))
-        frames = frames._replace(rate_body_rad_s=rates, acceleration_body_rad_s2=None)
+        frames = frames._replace(rate_body_rad_s=rates)
     check_reference(
         guidance.plan(scene.motion, lab.start, lab.profiles),
         scene,

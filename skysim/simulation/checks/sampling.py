@@ -90,10 +90,8 @@ def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
     seen = []
     hidden = []
     others = []
-    for exposure, beam, acceleration in zip(
-        exposures, beams, at.accelerations(), strict=True
-    ):
-        found, names = known_lights(beam, exposure, context, acceleration)
+    for exposure, beam in zip(exposures, beams, strict=True):
+        found, names = known_lights(beam, exposure, context)
         known.append(found)
         seen.append(found.take(found.behind == VISIBLE))
         hidden.append(
@@ -106,9 +104,7 @@ def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
     return Sampled(at, exposures, beams, known, seen, used, hidden, others, error)
 
 
-def known_lights(
-    beam: Beam, exposure: Exposure, context: Context, acceleration_body_rad_s2: Floats
-) -> tuple[View, list[str]]:
+def known_lights(beam: Beam, exposure: Exposure, context: Context) -> tuple[View, list[str]]:
     """The lights on the detector that the tracker knows, hidden ones included, and the names of their occluders.
 
     `row` of the view is the row in the tracker's beliefs.
@@ -116,7 +112,7 @@ def known_lights(
     lit = next(lit for lit in beam.lits if lit.known)
     assert lit.points is not None
     occluders = beam.before(lit)
-    found = view(lit, exposure, context.camera, occluders, acceleration_body_rad_s2)
+    found = view(lit, exposure, context.camera, occluders)
     row = context.rows_of(lit.points.id[found.row])
     return View(row, *found[1:]).take(row >= 0), [occluder.name for occluder in occluders]
 

@@ -30,7 +30,6 @@ from skysim.simulation.lights.lens import STRAY_LIGHT
 from skysim.simulation.lights.light import Beam, Exposure, Lit, Occluder, beam_of
 
 STEP = 1e-6  # relative displacement of a light, for the numerical derivative of its image
-NO_ACCELERATION = np.zeros(3)
 VISIBLE = -1  # number in place of an occluder's for a light that is not hidden
 
 
@@ -61,8 +60,6 @@ class View(NamedTuple):
         (n, 2) paths during the exposure
     peak_e
         (n,) mean electrons in the brightest pixel, background included
-    bend_px
-        (n, 2) means of the paths minus their middles, by the angular acceleration
     behind
         (n,) numbers of the occluders that hide the lights; VISIBLE for none
     """
@@ -79,7 +76,6 @@ class View(NamedTuple):
     sigma_px: Floats
     streak_px: Floats
     peak_e: Floats
-    bend_px: Floats
     behind: NDArray[np.int64]
 
     def __len__(self) -> int:
@@ -190,7 +186,6 @@ def view(
     exposure: Exposure,
     camera: CameraModel,
     occluders: Sequence[Occluder] = (),
-    acceleration_body_rad_s2: Floats = NO_ACCELERATION,
 ) -> View:
     """The points of a light on the detector in an exposure, hidden ones included.
 
@@ -203,8 +198,6 @@ def view(
     ----------
     occluders
         Occluders of the points; their numbers are in `behind`
-    acceleration_body_rad_s2
-        (3,) angular acceleration in body axes
     """
     # 1. Points on the detector.
     assert lit.points is not None
@@ -219,9 +212,7 @@ def view(
     arm_m = exposure.cam_from_lab.apply(chosen.place[:, :3])
     offset_m = arm_m - chosen.place[:, 3:] * mount.cam_from_body.apply(mount.camera_body_m)
     gradient = image_gradient(optics, offset_m)
-    streak_px, bend_px = paths_px(
-        exposure, camera.exposure_s, chosen.motion, arm_m, gradient, acceleration_body_rad_s2
-    )
+    streak_px = paths_px(exposure, camera.exposure_s, chosen.motion, arm_m, gradient)
     # 4. Sizes.
     depth_m = np.where(chosen.place[:, 3] > 0, offset_m[:, 2], np.inf)
     disk_px = optics.camera.focal_px * chosen.radius_m / distance_m  # a star has no radius
@@ -241,7 +232,6 @@ def view(
         sigma_px,
         streak_px,
         electrons * share + camera.background_e,
-        bend_px,
         hiding(occluders, chosen.place),
     )
 
@@ -264,24 +254,16 @@ def paths_px(
     motion: Floats | None,
     arm_m: Floats,
     gradient: Floats,
-    acceleration_body_rad_s2: Floats,
-) -> tuple[Floats, Floats]:
-    """(n, 2) paths during the exposure, and (n, 2) means of the paths minus their middles, as in `View`.
-
-    At the time t from mid-exposure the lights are rotated by -(rate t + acceleration t^2 / 2), with the vehicle's
-    rate and acceleration in body axes. The mean over the exposure T is -acceleration T^2 / 24. Moving lights add
-    their own `motion`.
-    """
+) -> Floats:
+    """(n, 2) paths during the exposure, by minus the rate of the vehicle; moving lights add their `motion`."""
     jacobian = np.cross(arm_m[:, None, :], gradient)
     cam_from_body = exposure.mount.cam_from_body
     rate_cam = cam_from_body.apply(exposure.trajectory.rate_at(exposure.t_s))
-    acceleration_cam = cam_from_body.apply(acceleration_body_rad_s2)
     streak_px = -exposure_s * np.einsum("nij,j->ni", jacobian, rate_cam)
-    bend_px = -(exposure_s**2 / 24) * np.einsum("nij,j->ni", jacobian, acceleration_cam)
     if motion is not None:
         motion_cam = exposure.cam_from_lab.apply(motion[:, 0])
         streak_px = streak_px + exposure_s * np.einsum("nij,nj->ni", gradient, motion_cam)
-    return streak_px, bend_px
+    return streak_px
 
 
 def lens_blur(

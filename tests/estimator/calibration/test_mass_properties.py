@@ -263,3 +263,41 @@ def test_errors_common_to_all_attitudes_are_in_the_covariance() -> None:
         blind += nees(estimate_with_noise([unshared], vehicle.lab, assumed), vehicle)
     assert chi2.ppf(1e-4, 108) < honest < chi2.ppf(1 - 1e-4, 108)
     assert blind > chi2.ppf(1 - 1e-4, 108)
+
+
+@pytest.mark.slow
+def test_errors_of_common_lights_and_of_the_place_are_counted_once() -> None:
+    """Each attitude has the mean error of the lights around its z axis and one error that never changes.
+
+    Of 12 draws the sum of 9 NEES each is as claimed. If these errors are taken as one process that falls with the
+    rotation, on top of the noise that explains the residuals, the covariance claims too much.
+    """
+    rng = np.random.default_rng(23)
+    honest = 0.0
+    wide = 0.0
+    for _ in range(12):
+        assumed, vehicle = prior(SMALL, rng)
+        one = record(vehicle, rng)
+        sigma_rad = 20 * vehicle.attitude_sigma_rad
+        direction = rng.standard_normal((6000, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        z = one.lab_from_body.apply([0.0, 0.0, 1.0])
+        lights = (z @ direction.T > np.cos(0.1)).astype(float)
+        count = lights.sum(axis=1)
+        errors = lights @ rng.normal(0, sigma_rad, direction.shape) / count[:, None]
+        errors += rng.normal(0, sigma_rad, 3)
+        own = (sigma_rad**2 / count)[:, None, None] * np.eye(3)
+        constant = np.tile(sigma_rad**2 * np.eye(3), (len(errors), 1, 1))
+        one = replace(
+            one,
+            lab_from_body=one.lab_from_body * Rotation.from_rotvec(errors),
+            covariance_rad2=one.covariance_rad2 + own + constant,
+            systematic_rad2=own + constant,
+            constant_rad2=constant,
+            lights=lights,
+        )
+        honest += nees(estimate_with_noise([one], vehicle.lab, assumed), vehicle)
+        unsplit = replace(one, constant_rad2=None, lights=None)
+        wide += nees(estimate_with_noise([unsplit], vehicle.lab, assumed), vehicle)
+    assert chi2.ppf(1e-4, 108) < honest < chi2.ppf(1 - 1e-4, 108)
+    assert wide < chi2.ppf(1e-4, 108)

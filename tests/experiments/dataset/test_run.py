@@ -368,7 +368,7 @@ def changed(key: str, value: Any) -> Callable[[Path], object]:
             changed("code", "0123"),
             r"made by skysim 0\.\d+\.\d+, code 0123; allowed: [0-9a-f]{16}, the version here",
         ),
-        (changed("format", 7), "a dataset of format 7; allowed: 1"),
+        (changed("format", 7), "a dataset of format 7; allowed: 2"),
         (
             lambda folder: (folder / dataset_run.MANIFEST).write_text("[" * 10_000),
             "is not that of a dataset",

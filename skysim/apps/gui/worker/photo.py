@@ -130,7 +130,7 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
         {},
         plots.frame_statistics(frame.image_dn, frame.saturation_dn),
         names=scoring.angle_names(scene),
-        true_deg=scoring.angles_deg(truth.cam_from_lab, scene, setup.lab.camera.mount),
+        true_deg=scoring.true_angles_deg(setup.lab.camera, truth),
         lights=true_lights(truth, magnitude_by_id(setup.lab)),
         prefix=id_prefix(setup.lab),
         saturation_dn=frame.saturation_dn,

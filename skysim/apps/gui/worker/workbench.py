@@ -170,7 +170,7 @@ class Workbench:
             geometry.scene_pose(self.lab, self.lens, truth),
             frame.saturation_dn,
             (width, height),
-            scoring.angles_deg(truth.cam_from_lab, self.scene, self.lab.camera.mount),
+            scoring.true_angles_deg(self.lab.camera, truth),
             tuple(quaternion.from_rotation(truth.lab_from_body).tolist()),
             frame.exposure_s,
             plots.frame_statistics(frame.image_dn, frame.saturation_dn),

@@ -82,8 +82,8 @@ class Outcome:
         Number of true images with a centroid within SAME_LIGHT_PX, and of centroids without such an
         image; means for a flight
     streak_px
-        Length of the images of the lights, median of a frame and mean for a flight; NaN for
-        centroid trials
+        Path length of the lights over the exposure, back and forth if they vibrate: median of a frame and mean for a
+        flight; NaN for centroid trials
     angles_compared
         Number of angles that the identifier compared, mean for a flight; NaN if it does not count
         them
@@ -149,7 +149,7 @@ DIRECTION = FIELDS[-8:]  # attitude and direction
 
 
 class TrueLights(NamedTuple):
-    """True state of a frame: attitude at mid-exposure, and N lights on the detector.
+    """True state of a frame: attitude at mid-exposure and its mean over the exposure, and N lights on the detector.
 
     Attributes
     ----------
@@ -162,6 +162,7 @@ class TrueLights(NamedTuple):
     """
 
     lab_from_body: Rotation
+    mean_lab_from_body: Rotation
     xy_px: Floats
     flux_xy_px: Floats
     streak_px: Floats | None
@@ -171,7 +172,11 @@ def true_lights(truth: Truth) -> TrueLights:
     """The lights of a rendered frame."""
     sources = truth.sources
     return TrueLights(
-        truth.lab_from_body, sources.xy_px, sources.flux_xy_px, sources.streak_px
+        truth.lab_from_body,
+        truth.mean_lab_from_body,
+        sources.xy_px,
+        sources.flux_xy_px,
+        sources.streak_px,
     )
 
 
@@ -210,7 +215,10 @@ def score(
     }
     if solution.cam_from_ref is None:
         return Outcome(solution.status, 1, **common)
-    error, nees = error_and_nees(solution, cam_from_lab)
+    mean_lab_from_body = quaternion.from_rotation(lights.mean_lab_from_body)
+    error, nees = error_and_nees(
+        solution, quaternion.multiply(cam_from_body, quaternion.inverse(mean_lab_from_body))
+    )
     wrong = metrics.is_wrong(math.hypot(*error), math.inf if math.isnan(nees) else nees)
     if solution.match is not None and own_tracker:
         claimed_px = claimed_image_px(

@@ -261,7 +261,8 @@ def solved_centroids(
             for each in detections
         ]
     lights = [
-        TrueLights(*each, each[1], None) for each in zip(lab_from_body, seen_px, strict=True)
+        TrueLights(attitude, attitude, xy_px, xy_px, None)
+        for attitude, xy_px in zip(lab_from_body, seen_px, strict=True)
     ]
     return list(zip(lights, reports, strict=True))
 
