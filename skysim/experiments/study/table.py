@@ -26,7 +26,7 @@ from skysim.experiments.study.factors import (
 from skysim.experiments.study.plan import Figure, Plan, Study, Threshold
 from skysim.results import metrics
 from skysim.results.files.row_parts import Rows
-from skysim.results.metrics import CONFIDENCE, NO_VALUE, Summary
+from skysim.results.metrics import NO_VALUE, Summary
 
 LONG_QUANTITY = re.compile(r"(-?\d*\.\d{4,}(?:e[-+]?\d+)?)(\s\S.*)$")
 ROUNDING = 1e-9  # a smaller response is the rounding error of 0
@@ -197,7 +197,7 @@ def response_indices(plan: Plan, store: Store, response: str) -> list[Index]:
     # Resample rows of A, B and AB together, so that each resample is a valid Saltelli sample.
     selections = rng.integers(count, size=(RESAMPLES, count))
     resampled = [generalized(a[:, rows], b[:, rows], ab[:, :, rows]) for rows in selections]
-    low, high = np.quantile(resampled, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], axis=0)
+    low, high = np.quantile(resampled, metrics.TAILS, axis=0)
     first, total = (
         [Summary(value, least, most, count) for value, least, most in index]
         for index in np.stack([estimate, low, high], axis=-1).tolist()
