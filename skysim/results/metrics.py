@@ -87,10 +87,16 @@ TAILS = (
 # Half of the interval of a normal variable, in sigmas.
 SIGMAS = float(scipy.special.ndtri((1 + CONFIDENCE) / 2))
 MOST_TRIALS = 10**9  # greatest number of trials that `trials_needed` considers
+FEWEST = 30  # values of which a verdict is given; with fewer its interval may be too narrow
 RESAMPLES = 999
 MANY_VALUES = 2000  # beyond, the bootstrap is `bootstrap_of_many`
 EXTREMES = 50  # values that it draws one by one, at most
 RANK_SIGMAS = 12  # ranks farther from their mean have a probability below 1e-30
+
+
+def joint_sigmas(count: int) -> float:
+    """SIGMAS for intervals at CONFIDENCE of so many statistics together (Bonferroni 1936)."""
+    return float(scipy.special.ndtri(1 - TAILS[0] / count))
 
 
 class Summary(NamedTuple):

@@ -33,7 +33,6 @@ from skysim.results.metrics import Summary
 
 # Range of the mean NEES (3 if true) in which claimed errors are true to a tenth.
 TRUE_NEES = (2.5, 3.5)
-FEWEST = 30  # trials at a point; fewer do not show how much its attitudes differ, so that intervals are too narrow
 POWER = 0.8  # probability with which a stated factor is noticed
 
 
@@ -50,7 +49,7 @@ def claimed_errors(lines: Sequence[PointRow], place: Place) -> list[str]:
     if not found:
         most = max(one.trials for one, _ in known)
         return [
-            f"{question} Too few to say: {most} trials{everywhere(len(known))}, {FEWEST} are needed."
+            f"{question} Too few to say: {most} trials{everywhere(len(known))}, {metrics.FEWEST} are needed."
         ]
     together = f", 95 % for all {len(known)} points together" if len(known) > 1 else ""
     false = [(one, line) for one, line in found if one.low > high or one.high < low]
@@ -86,34 +85,29 @@ def claimed_errors(lines: Sequence[PointRow], place: Place) -> list[str]:
     ]
 
 
-def sigmas(points: int) -> float:
-    """Half of a normal interval at CONFIDENCE for all of some points together, in sigmas (Bonferroni 1936)."""
-    return float(scipy.special.ndtri(1 - metrics.TAILS[0] / points))
-
-
 def jointly(nees: Summary, points: int) -> Summary:
-    """A mean NEES with an interval at CONFIDENCE for all of some points together; fewer than FEWEST trials have none.
+    """A mean NEES with an interval at CONFIDENCE for all of some points together; none for few trials.
 
     The ends of an interval of chi-square have normal inverse cube roots (Wilson & Hilferty 1931), which are extended. A
     mean of few trials counts as it is if a true covariance hardly has it (probability OVERCONFIDENCE_PROBABILITY).
     """
     count = nees.trials
-    if count < FEWEST:
+    if count < metrics.FEWEST:
         chance = scipy.special.chdtrc(3 * count, count * nees.value)
         end = nees.value if chance < metrics.OVERCONFIDENCE_PROBABILITY else math.nan
         return nees._replace(low=end, high=end)
     low, high = nees.low ** (-1 / 3), nees.high ** (-1 / 3)
     middle = (low + high) / 2
-    half = sigmas(points) / metrics.SIGMAS * (low - high) / 2
+    half = metrics.joint_sigmas(points) / metrics.SIGMAS * (low - high) / 2
     return nees._replace(low=(middle + half) ** -3, high=max(middle - half, 1e-9) ** -3)
 
 
 def noticed(nees: Summary, points: int) -> float:
     """The factor by which errors are claimed too small that would be noticed with POWER, by the interval of `jointly`.
 
-    The lower end must exceed TRUE_NEES; POWER takes so many sigmas more, of which value / low has `sigmas`.
+    The lower end must exceed TRUE_NEES; POWER takes so many sigmas more, of which value / low has `joint_sigmas`.
     """
-    ratio = 1 + scipy.special.ndtri(POWER) / sigmas(points)
+    ratio = 1 + scipy.special.ndtri(POWER) / metrics.joint_sigmas(points)
     return math.sqrt(TRUE_NEES[1] / 3 * (nees.value / nees.low) ** ratio)
 
 
