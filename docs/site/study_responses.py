@@ -29,7 +29,7 @@ BOOTSTRAP = (
 )
 EXTREMUM = "none: it is that of these trials"
 INTERVALS = {
-    "mean": BOOTSTRAP,
+    "mean": f"{BOOTSTRAP}; of the NEES chi-square, wider where trials vary more",
     "rms": BOOTSTRAP,
     "sd": "percentile bootstrap, from two values on",
     "worst": EXTREMUM,

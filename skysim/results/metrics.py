@@ -120,11 +120,6 @@ class Summary(NamedTuple):
 NO_VALUE = Summary(math.nan, math.nan, math.nan, 0)
 
 
-def exact(value: float) -> Summary:
-    """Summary of a deterministic value: an interval of zero width."""
-    return Summary(float(value), float(value), float(value), 1)
-
-
 def proportion(hits: Any, total: Any) -> Summary:
     """The proportion hits / total with Wilson's interval (Wilson 1927).
 

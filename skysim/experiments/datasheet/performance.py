@@ -109,7 +109,7 @@ def consistency(sheet: MeasuredFrames) -> dict[str, Any]:
         within.append({"level": level, "share": metrics.proportion(hits, nees.size)})
     x, y, _ = sheet.errors(rows)[:, right] ** 2
     return {
-        "nees": metrics.resampled(nees, np.mean),
+        "nees": metrics.mean_nees({"nees": nees, "solved": np.ones(nees.size)}),
         "within": within,
         "y_over_x": mean_square_ratio(y, x),
     }
