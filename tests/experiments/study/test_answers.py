@@ -185,6 +185,7 @@ responses: [cross_arcsec_p95, identified]
 """
 
 
+@pytest.mark.slow
 def test_sampled_points_are_evaluated_together(tmp_path):
     """64 points of a trial: a p95 of all has an interval, and the error depends on the noise alone."""
     study_plan, kept = done(tmp_path, SAMPLED)
