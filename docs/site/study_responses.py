@@ -29,13 +29,12 @@ BOOTSTRAP = (
 )
 EXTREMUM = "none: it is that of these trials"
 INTERVALS = {
-    "mean": BOOTSTRAP,
+    "mean": f"{BOOTSTRAP}; of the NEES chi-square, wider where trials vary more",
     "rms": BOOTSTRAP,
     "sd": "percentile bootstrap, from two values on",
     "worst": EXTREMUM,
     "least": EXTREMUM,
 }
-QUANTILES = {"median": 0.5, "p90": 0.9, "p95": 0.95, "p99": 0.99}
 
 
 def meaning(name: str, found: dict[str, str]) -> str:
@@ -83,7 +82,7 @@ def statistics() -> str:
     """Table of the statistics with their intervals, and the statistic of a quantity without an ending."""
     intervals = INTERVALS | {
         name: f"two order statistics, whatever the distribution; from {metrics.values_for_quantile(share)} values on"
-        for name, share in QUANTILES.items()
+        for name, share in metrics.QUANTILES.items()
     }
     rows = [f"| `_{name}` | {intervals[name]} |" for name in metrics.STATISTICS]
     short = [

@@ -3,12 +3,13 @@
 A statistic is named by a string (`response`), for example `cross_arcsec_p95` or `coverage_5`. Each is computed from
 the columns of a table of trials and returned with a 95% confidence interval: Wilson's interval for proportions, the
 percentile bootstrap for means and RMS (of many values a faster one, `bootstrap_of_many`), and order statistics for
-quantiles. Clopper and Pearson's exact bounds are used
+quantiles. That of a mean NEES is of a chi-square variable. Clopper and Pearson's exact bounds are used
 where a claim must hold: that an event never occurs (or always), or that a proportion is on one side of a limit.
 """
 
 from __future__ import annotations
 
+import bisect
 import math
 import re
 from collections.abc import Callable, Mapping
@@ -19,6 +20,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
@@ -31,7 +33,7 @@ WRONG_AS_CLAIMED_RAD = np.radians(
 OVERCONFIDENCE_PROBABILITY = (
     1e-8  # with which a correct covariance allows an error counted as overconfident
 )
-OVERCONFIDENT_NEES = float(scipy.special.chdtri(3, OVERCONFIDENCE_PROBABILITY))
+OVERCONFIDENT_NEES = float(chdtri(3, OVERCONFIDENCE_PROBABILITY))
 
 
 def cross_and_roll_rad(
@@ -84,10 +86,17 @@ TAILS = (
 )  # probabilities below the ends of an interval
 # Half of the interval of a normal variable, in sigmas.
 SIGMAS = float(scipy.special.ndtri((1 + CONFIDENCE) / 2))
+MOST_TRIALS = 10**9  # greatest number of trials that `trials_needed` considers
+FEWEST = 30  # values of which a verdict is given; with fewer its interval may be too narrow
 RESAMPLES = 999
 MANY_VALUES = 2000  # beyond, the bootstrap is `bootstrap_of_many`
 EXTREMES = 50  # values that it draws one by one, at most
 RANK_SIGMAS = 12  # ranks farther from their mean have a probability below 1e-30
+
+
+def joint_sigmas(count: int) -> float:
+    """SIGMAS for intervals at CONFIDENCE of so many statistics together (Bonferroni 1936)."""
+    return float(scipy.special.ndtri(1 - TAILS[0] / count))
 
 
 class Summary(NamedTuple):
@@ -109,11 +118,6 @@ class Summary(NamedTuple):
 
 
 NO_VALUE = Summary(math.nan, math.nan, math.nan, 0)
-
-
-def exact(value: float) -> Summary:
-    """Summary of a deterministic value: an interval of zero width."""
-    return Summary(float(value), float(value), float(value), 1)
 
 
 def proportion(hits: Any, total: Any) -> Summary:
@@ -150,9 +154,18 @@ def exact_bounds(
     return low, high
 
 
-def trials_for_bound(share: float, confidence: float = CONFIDENCE) -> int:
-    """Fewest trials without an event whose exact upper bound is at most this share: n = ln(1 - c) / ln(1 - p)."""
-    return math.ceil(math.log(1 - confidence) / math.log1p(-share))
+def trials_needed(limit: float, events: float = 0, share: float = 0.0) -> int:
+    """Fewest trials n, with events + share n events, whose exact upper bound of their proportion is at most `limit`.
+
+    Without an event it is n = ln(1 - CONFIDENCE) / ln(1 - limit), rounded up. 0 if MOST_TRIALS are too few.
+    """
+
+    def certain(count: int) -> bool:
+        return exact_bounds(events + share * count, count)[1] <= limit
+
+    if not certain(MOST_TRIALS):
+        return 0
+    return bisect.bisect_left(range(MOST_TRIALS), True, lo=1, key=certain)
 
 
 def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
@@ -348,15 +361,16 @@ Columns = Mapping[str, NDArray[Any]]
 DEFAULT_COVERAGE = 5  # "5 stars everywhere" (Padro 2012)
 Response = Callable[[Columns], Summary]
 
+QUANTILES = {"median": 0.5, "p90": 0.9, "p95": 0.95, "p99": 0.99}
 # The ending of a response name such as `cross_arcsec_p95`.
 STATISTICS: dict[str, Callable[[Floats], Summary]] = {
     "mean": mean_of,
     "rms": rms_of,
     "sd": lambda values: resampled(values, sample_std),
-    "median": lambda values: quantile(values, 0.5),
-    "p90": lambda values: quantile(values, 0.9),
-    "p95": lambda values: quantile(values, 0.95),
-    "p99": lambda values: quantile(values, 0.99),
+    **{
+        name: lambda values, share=share: quantile(values, share)  # type: ignore[misc]
+        for name, share in QUANTILES.items()
+    },
     "worst": lambda values: extremum(values, np.max),
     "least": lambda values: extremum(values, np.min),
 }
@@ -398,6 +412,25 @@ QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
 MORE_IS_BETTER = ("stars", "detected", "lights_detected", "matched", "availability")
 # Quantities that are responses by themselves, with the statistic that this name stands for.
 DEFAULT_STATISTICS = {"nees": "mean", "centroid_px": "rms", "streak_px": "median"}
+
+
+def mean_nees(c: Columns) -> Summary:
+    """The mean NEES with an interval that covers it for few trials too: f mean / E is chi-square with f degrees.
+
+    A true covariance has f = 3 for each solution. Where attitudes differ, or the solutions of a flight are correlated,
+    the n trials vary more: f = 2 n mean^2 / s^2 (Satterthwaite 1946), if it is less.
+    """
+    known = np.isfinite(c["nees"])
+    values = c["nees"][known]
+    count = len(values)
+    if count < 2:
+        return without_resampling(values, float(values[0])) if count else NO_VALUE
+    mean = float(np.mean(values))
+    freedom = 3 * float(np.sum(c["solved"][known]))
+    if spread := float(np.var(values, ddof=1)):
+        freedom = min(freedom, 2 * count * mean**2 / spread)
+    low, high = (mean * freedom / chdtri(freedom, TAILS)).tolist()
+    return Summary(mean, low, high, count)
 
 
 def overconfident(c: Columns) -> Summary:
@@ -498,6 +531,8 @@ def response(name: str, where: str = "response") -> Response:
             np.sum(c["stars"][c["frames"] > 0] >= least), np.sum(c["frames"] > 0)
         )
     quantity, statistic = split_name(name)
+    if (quantity, statistic) == ("nees", "mean"):
+        return mean_nees
     if quantity not in QUANTITIES or statistic not in STATISTICS:
         raise InputError(
             where,

@@ -47,7 +47,7 @@ def test_none_and_all_have_the_stated_exact_bound(count: int) -> None:
 @pytest.mark.parametrize(("share", "count"), [(0.001, 2995), (0.01, 299), (0.05, 59)])
 def test_a_claim_needs_as_many_trials_as_its_bound(share: float, count: int) -> None:
     """n = ln 0.05 / ln(1 - p), rounded up; one fewer is not enough."""
-    assert metrics.trials_for_bound(share) == count
+    assert metrics.trials_needed(share) == count
     assert metrics.exact_bounds(0, count)[1] <= share < metrics.exact_bounds(0, count - 1)[1]
 
 

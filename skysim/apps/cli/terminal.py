@@ -303,7 +303,7 @@ def print_worst(
     repeat: str,
     instead: str,
 ) -> None:
-    """Print the worst attitudes by a response, the settings that start there, and the commands that repeat them.
+    """Print the worst attitudes by a quantity or a share, settings that start there, and commands that repeat them.
 
     Parameters
     ----------
@@ -317,7 +317,8 @@ def print_worst(
     for rank, (one, level) in enumerate(zip(found, levels, strict=True), 1):
         at = ", ".join(f"{name} = {value}" for name, value in level.items())
         print(
-            f"{rank}. {one.direction}, {one.lights:.0f} lights: {printable(one.event)} ({printable(at)})"
+            f"{rank}. {response} {one.value:.4g}: {one.direction}, {one.lights:.0f} lights: {printable(one.event)}"
+            f" ({printable(at)})"
         )
         if one.start:
             print(f"   {one.start}")
@@ -334,5 +335,6 @@ def print_replay(replay: dict[str, Any]) -> None:
         )
     if replay["error"]:
         print(replay["error"])
-    for path in replay["pictures"][:10]:
+    tables = [path for path in replay["files"] if not path.endswith(".fits")]
+    for path in [*replay["pictures"][:10], *tables]:
         print(path)

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special, stats
+from scipy import special
 
 from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.types import Floats
@@ -31,6 +31,7 @@ from skysim.experiments.characterize.photon_transfer import (
     Mask,
     Transfer,
 )
+from skysim.results import metrics
 
 LEAST_HOT = 10  # least number of hot pixels for a fit of their mean
 # Bins of the rates below the quantile 1 - TAIL, and above it.
@@ -115,10 +116,9 @@ def fit(rates: Floats, noise: RateNoise, greatest: float) -> DarkCurrent:
         fraction = Estimate.logistic(theta[2], sigma[2])
     else:
         # Clopper & Pearson's interval.
-        low = stats.beta.ppf(0.025, max(hot, 1e-9), rates.size - hot + 1)
-        high = stats.beta.ppf(0.975, hot + 1, rates.size - hot)
+        low, high = metrics.exact_bounds(hot, rates.size, metrics.TAILS[1])
         error = math.sqrt(max(hot, 1)) / rates.size
-        fraction = Estimate(hot / rates.size, error, float(low), float(high))
+        fraction = Estimate(hot / rates.size, error, low, high)
     expected = counts.sum() * probabilities(theta, edges, noise)
     return DarkCurrent(
         values[0], values[1], fraction, values[3] if enough else None, edges, counts, expected

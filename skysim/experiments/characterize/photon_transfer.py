@@ -28,11 +28,11 @@ from scipy import special
 from scipy.optimize import least_squares
 
 from skysim.core.types import Floats
+from skysim.results.metrics import SIGMAS
 
 # A measured number with its interval.
 
 
-SIGMAS_95 = 1.959964  # half of a normal 95 % interval in standard deviations
 STEP = 1e-4  # step of the numerical derivatives, in standard deviations
 
 
@@ -47,20 +47,20 @@ class Estimate(NamedTuple):
     @classmethod
     def normal(cls, value: float, sigma: float) -> Estimate:
         """A normal estimate: value ± 1.96 sigma."""
-        half = SIGMAS_95 * sigma
+        half = SIGMAS * sigma
         return cls(float(value), float(sigma), float(value - half), float(value + half))
 
     @classmethod
     def lognormal(cls, value: float, sigma: float) -> Estimate:
         """An estimate of a positive number whose logarithm is normal, such as a standard deviation."""
-        factor = math.exp(min(SIGMAS_95 * sigma / value, 50.0)) if value > 0 else 1.0
+        factor = math.exp(min(SIGMAS * sigma / value, 50.0)) if value > 0 else 1.0
         return cls(float(value), float(sigma), float(value / factor), float(value * factor))
 
     @classmethod
     def logistic(cls, logit: float, sigma: float) -> Estimate:
         """An estimate of a fraction whose logit is normal."""
         low, value, high = (
-            float(special.expit(logit + sign * SIGMAS_95 * sigma)) for sign in (-1, 0, 1)
+            float(special.expit(logit + sign * SIGMAS * sigma)) for sign in (-1, 0, 1)
         )
         return cls(value, value * (1 - value) * float(sigma), low, high)
 
@@ -69,9 +69,9 @@ class Estimate(NamedTuple):
         """The square root of a variance with its standard error; the interval begins at 0 if the variance does."""
         value = math.sqrt(max(variance, 0.0))
         low, high = (
-            math.sqrt(max(variance + sign * SIGMAS_95 * sigma, 0.0)) for sign in (-1, 1)
+            math.sqrt(max(variance + sign * SIGMAS * sigma, 0.0)) for sign in (-1, 1)
         )
-        return cls(value, sigma / (2 * value) if value else high / SIGMAS_95, low, high)
+        return cls(value, sigma / (2 * value) if value else high / SIGMAS, low, high)
 
 
 def propagate(

@@ -64,30 +64,6 @@ def tally(right: Any, false: Any) -> Counts:
     )
 
 
-def runs_needed(
-    share: float, failures: int = 0, confidence: float = metrics.CONFIDENCE
-) -> int:
-    """Least number of runs, `failures` of them failed, that show a probability of success of `share` at a confidence.
-
-    Without a failure it is ln(1 - c) / ln(share), rounded up; with failures, the number for which the exact upper bound
-    of the probability of a failure is 1 - share.
-    """
-    low = metrics.trials_for_bound(1 - share, confidence)
-    if not failures:
-        return low
-    high = low
-    while metrics.exact_bounds(failures, high, confidence)[1] > 1 - share:
-        low = high
-        high = 2 * high
-    while high - low > 1:
-        middle = (low + high) // 2
-        if metrics.exact_bounds(failures, middle, confidence)[1] > 1 - share:
-            low = middle
-        else:
-            high = middle
-    return high
-
-
 def claims(found: Counts) -> list[dict[str, Any]]:
     """Which of CLAIMS the frames show, and how many more frames each needs if none of them fails."""
     failures = found.frames - found.right
@@ -97,8 +73,8 @@ def claims(found: Counts) -> list[dict[str, Any]]:
             "shown": found.share("right").low >= share,
             "runs": found.frames,
             "failures": failures,
-            "without_failure": runs_needed(share),
-            "more": max(runs_needed(share, failures) - found.frames, 0),
+            "without_failure": metrics.trials_needed(1 - share),
+            "more": max(metrics.trials_needed(1 - share, failures) - found.frames, 0),
         }
         for share in CLAIMS
     ]
@@ -133,7 +109,7 @@ def consistency(sheet: MeasuredFrames) -> dict[str, Any]:
         within.append({"level": level, "share": metrics.proportion(hits, nees.size)})
     x, y, _ = sheet.errors(rows)[:, right] ** 2
     return {
-        "nees": metrics.resampled(nees, np.mean),
+        "nees": metrics.mean_nees({"nees": nees, "solved": np.ones(nees.size)}),
         "within": within,
         "y_over_x": mean_square_ratio(y, x),
     }
@@ -216,7 +192,9 @@ class Limit(NamedTuple):
 def bracket(rows: list[dict[str, Any]], key: str) -> Limit:
     """The limit in a rate or an acceleration, from rows in ascending order of it."""
     fewest = min(row["counts"].frames for row in rows)
-    share = next((one for one in LIMITS if runs_needed(one) <= fewest), LIMITS[-1])
+    share = next(
+        (one for one in LIMITS if metrics.trials_needed(1 - one) <= fewest), LIMITS[-1]
+    )
     above = math.nan
     below = math.inf
     for row in rows:

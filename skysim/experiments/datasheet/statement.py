@@ -10,8 +10,9 @@ import numpy as np
 
 from skysim.experiments.datasheet import performance, variance_components
 from skysim.experiments.datasheet.cells import TRACKED, MeasuredFrames
-from skysim.experiments.datasheet.performance import Counts, Limit, runs_needed
+from skysim.experiments.datasheet.performance import Counts, Limit
 from skysim.experiments.datasheet.variance_components import Bounded, Components
+from skysim.results import metrics
 from skysim.results.metrics import Summary
 
 NAMES = {
@@ -231,7 +232,7 @@ def unit_text(units: int) -> str:
     from scipy.special import chdtri
 
     freedom = units - 1
-    low, high = (math.sqrt(freedom / chdtri(freedom, tail)) for tail in (0.025, 0.975))
+    low, high = (math.sqrt(freedom / chdtri(freedom, tail)) for tail in metrics.TAILS)
     return (
         f"These intervals are over the fields, for the {units} units that were measured, which both sides of the"
         f" comparison have. Where the bias scatters among units, {units} of them bound its size for all units to a"
@@ -387,8 +388,9 @@ FIELD_HEADERS = ["both right %", "one refused", "one false"]
 
 def bracket_text(what: str, limit: Limit, unit: str) -> str:
     """A sentence on a limit, for fields that are right in both of their frames."""
-    if limit.fields < runs_needed(limit.share):
-        return f"Limit of {what}: not established: {limit.fields} attitudes, {runs_needed(limit.share)} needed."
+    needed = metrics.trials_needed(1 - limit.share)
+    if limit.fields < needed:
+        return f"Limit of {what}: not established: {limit.fields} attitudes, {needed} needed."
     above = (
         "at no level tested" if math.isnan(limit.above) else f"up to {limit.above:g} {unit}"
     )

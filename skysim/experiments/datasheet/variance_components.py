@@ -24,11 +24,11 @@ from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.datasheet.cells import MeasuredFrames
+from skysim.results.metrics import TAILS
 
 FIELD, UNIT, STATE = range(3)
 Subset = tuple[int, ...]
 RESAMPLES = 400
-CONFIDENCE = 0.95
 
 
 class Components(NamedTuple):
@@ -47,7 +47,7 @@ class Components(NamedTuple):
 
 
 class Bounded(NamedTuple):
-    """A value with its interval at CONFIDENCE."""
+    """A value with its interval at `metrics.CONFIDENCE`."""
 
     value: float
     low: float
@@ -155,7 +155,7 @@ def resamples(count: int) -> Iterator[NDArray[np.int64]]:
 
 def bounded(value: float, drawn: Floats) -> Bounded:
     """A value with the percentile interval of its bootstrap samples."""
-    low, high = np.percentile(drawn, [50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE)])
+    low, high = np.quantile(drawn, TAILS)
     return Bounded(float(value), float(low), float(high))
 
 
@@ -283,7 +283,7 @@ def mean_errors(sheet: MeasuredFrames) -> list[Bounded]:
     means = errors.reshape(*errors.shape[:2], -1).mean(axis=2)
     fields = means.shape[1]
     mean = means.mean(axis=1)
-    half = stdtrit(fields - 1, 0.975) * means.std(axis=1, ddof=1) / math.sqrt(fields)
+    half = stdtrit(fields - 1, TAILS[1]) * means.std(axis=1, ddof=1) / math.sqrt(fields)
     ends = np.column_stack([mean, mean - half, mean + half])
     return [Bounded(*one) for one in ends.tolist()]
 

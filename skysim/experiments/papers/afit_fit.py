@@ -33,6 +33,7 @@ from scipy.special import ndtr
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.papers.published import published_values
+from skysim.results.metrics import SIGMAS
 
 PHASES = 600
 SLOT_MS = 1.0
@@ -273,7 +274,7 @@ def exposure_interval(best: Fit) -> tuple[float, float]:
 
 def describe(best: Fit, interval_ms: tuple[float, float]) -> list[str]:
     """Lines that say the parameters with 95 % intervals and chi-square by table."""
-    half = 1.96 * np.sqrt(np.diag(best.covariance))
+    half = SIGMAS * np.sqrt(np.diag(best.covariance))
     lines = [
         f"exposure: {best.values[0]:.2f} ms ({interval_ms[0]:.2f}..{interval_ms[1]:.2f})"
     ]

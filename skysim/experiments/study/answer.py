@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+import scipy
 
 from skysim.experiments.study import thresholds
 from skysim.experiments.study.factors import Value
@@ -30,50 +31,84 @@ from skysim.results.metrics import Summary
 # Claims that a study's numbers support, in words: whether the tracker's claimed errors are true, and rare events.
 
 
-TRUE_NEES = (
-    2.5,
-    3.5,
-)  # range of the mean NEES (3 if true) in which claimed errors are true to a tenth
+# Range of the mean NEES (3 if true) in which claimed errors are true to a tenth.
+TRUE_NEES = (2.5, 3.5)
+POWER = 0.8  # probability with which a stated factor is noticed
 
 
 def claimed_errors(lines: Sequence[PointRow], place: Place) -> list[str]:
     """Sentences on whether the claimed errors are true at all points, by the intervals of the mean NEES."""
-    found = [(known(line.responses.get("nees", metrics.NO_VALUE)), line) for line in lines]
-    found = [(one, line) for one, line in found if np.isfinite(one.low)]
-    if not found:
+    known = [(line.responses.get("nees", metrics.NO_VALUE), line) for line in lines]
+    known = [(one, line) for one, line in known if one.trials]
+    if not known:
         return []
+    found = [(jointly(one, len(known)), line) for one, line in known]
+    found = [(one, line) for one, line in found if np.isfinite(one.low)]
     low, high = TRUE_NEES
     question = "Are the claimed errors true?"
+    if not found:
+        most = max(one.trials for one, _ in known)
+        return [
+            f"{question} Too few to say: {most} trials{everywhere(len(known))}, {metrics.FEWEST} are needed."
+        ]
+    together = f", 95 % for all {len(known)} points together" if len(known) > 1 else ""
     false = [(one, line) for one, line in found if one.low > high or one.high < low]
     if not false:
+        few = len(known) - len(found)
+        at = (
+            f" at {len(found)} of {len(known)} points, too few to say at the others"
+            if few
+            else everywhere(len(found))
+        )
         if all(one.low >= low and one.high <= high for one, _ in found):
-            return [f"{question} Yes: NEES is {low:g} to {high:g}{everywhere(len(found))}."]
+            return [f"{question} Yes: NEES is {low:g} to {high:g}{at}{together}."]
         widest, line = max(found, key=lambda pair: pair[0].high - pair[0].low)
-        at = f" at {place(line)}" if len(found) > 1 else ""
+        named = f" at {place(line)}{together}" if len(known) > 1 else ""
         between = f"{widest.low:.3g} to {widest.high:.3g}"
+        factor = noticed(widest, len(known))
         return [
-            f"{question} Nothing says otherwise, but NEES is known to {between} only{at}; more trials decide it."
+            f"{question} Nothing says otherwise{at if few else ''}, but NEES is known to {between} only{named}."
+            f" Errors too small by a factor of {factor:.2g} would be noticed with a probability of {100 * POWER:g} %."
         ]
     worst, line = max(false, key=lambda pair: abs(math.log(max(pair[0].value, 1e-9) / 3)))
     factor = math.sqrt(worst.value / 3)
     size = "small" if factor >= 1 else "large"
     factor = max(factor, 1 / factor)
-    at = f" at {place(line)}" if len(found) > 1 else ""
-    count = f", at {len(false)} of {len(found)} points" if len(found) > 1 else ""
+    at = f" at {place(line)}" if len(known) > 1 else ""
+    count = f", at {len(false)} of {len(known)} points" if len(known) > 1 else ""
     wrong = line.responses.get("wrong", metrics.NO_VALUE).value
     cause = ", wrong attitudes included" if wrong > 0 else ""
-    interval = f"{worst.low:.3g} to {worst.high:.3g}"
+    interval = f"{worst.low:.3g} to {worst.high:.3g}{together}"
     return [
         f"{question} No: too {size} by a factor of {factor:.2g}{at} (NEES {worst.value:.3g}, {interval}{cause}; 3 if"
         f" true){count}."
     ]
 
 
-def known(nees: Summary) -> Summary:
-    """A mean NEES; that of a single solution counts if a true covariance hardly has it (probability 1e-8)."""
-    if np.isnan(nees.low) and nees.value > metrics.OVERCONFIDENT_NEES:
-        return nees._replace(low=nees.value, high=nees.value)
-    return nees
+def jointly(nees: Summary, points: int) -> Summary:
+    """A mean NEES with an interval at CONFIDENCE for all of some points together; none for few trials.
+
+    The ends of an interval of chi-square have normal inverse cube roots (Wilson & Hilferty 1931), which are extended. A
+    mean of few trials counts as it is if a true covariance hardly has it (probability OVERCONFIDENCE_PROBABILITY).
+    """
+    count = nees.trials
+    if count < metrics.FEWEST:
+        chance = scipy.special.chdtrc(3 * count, count * nees.value)
+        end = nees.value if chance < metrics.OVERCONFIDENCE_PROBABILITY else math.nan
+        return nees._replace(low=end, high=end)
+    low, high = nees.low ** (-1 / 3), nees.high ** (-1 / 3)
+    middle = (low + high) / 2
+    half = metrics.joint_sigmas(points) / metrics.SIGMAS * (low - high) / 2
+    return nees._replace(low=(middle + half) ** -3, high=max(middle - half, 1e-9) ** -3)
+
+
+def noticed(nees: Summary, points: int) -> float:
+    """The factor by which errors are claimed too small that would be noticed with POWER, by the interval of `jointly`.
+
+    The lower end must exceed TRUE_NEES; POWER takes so many sigmas more, of which value / low has `joint_sigmas`.
+    """
+    ratio = 1 + scipy.special.ndtri(POWER) / metrics.joint_sigmas(points)
+    return math.sqrt(TRUE_NEES[1] / 3 * (nees.value / nees.low) ** ratio)
 
 
 def effect_of_wrong_matches(lines: Sequence[PointRow], place: Place) -> list[str]:
@@ -114,7 +149,7 @@ def runs_needed(lines: Sequence[PointRow], events: Sequence[str]) -> list[str]:
     fewest = min(never)
     bound = metrics.exact_bounds(0, fewest)[1]
     claim = 10.0 ** (math.ceil(math.log10(bound) - 1e-9) - 1)
-    needed = metrics.trials_for_bound(claim)
+    needed = metrics.trials_needed(claim)
     each = " at each point" if len(lines) > 1 else ""
     return [
         f"None in {fewest:,} is less than {100 * bound:.2g} % at {100 * metrics.CONFIDENCE:g} % confidence; a claim of"

@@ -400,7 +400,7 @@ class Study(ConfigModel):
         points
     paired
         Use the same random attitudes and noise at every point for each replicate (common random
-        numbers)
+        numbers); by default in all designs but lhs and sobol, whose trials are evaluated together
     hardware
         Keys of seeds, such as `light.layout.hardware_seed` and `tracker.survey.seed`, that are
         drawn anew in every replicate: results then hold for all LED domes or surveys of the
@@ -427,6 +427,19 @@ class Study(ConfigModel):
     figures: tuple[Figure, ...] = ()
     thresholds: tuple[Threshold, ...] = ()
     optimize: Search | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def default_pairing(cls, tree: Any) -> Any:
+        """The same noise at all points, unless they are random points."""
+        design = (
+            tree.get("design")
+            if isinstance(tree, dict) and not tree.get("optimize")
+            else None
+        )
+        if isinstance(design, dict) and design.get("kind") in ("lhs", "sobol"):
+            return {"paired": False} | tree
+        return tree
 
     @property
     def search(self) -> Search:

@@ -25,8 +25,8 @@ from skysim.experiments.study.factors import (
 )
 from skysim.experiments.study.plan import Figure, Plan, Study, Threshold
 from skysim.results import metrics
-from skysim.results.files.row_parts import Rows
-from skysim.results.metrics import CONFIDENCE, NO_VALUE, Summary
+from skysim.results.files.row_parts import Rows, subset
+from skysim.results.metrics import NO_VALUE, Columns, Summary
 
 LONG_QUANTITY = re.compile(r"(-?\d*\.\d{4,}(?:e[-+]?\d+)?)(\s\S.*)$")
 ROUNDING = 1e-9  # a smaller response is the rounding error of 0
@@ -54,6 +54,62 @@ def table(store: Store, responses: Sequence[str]) -> list[PointRow]:
         responses_ = {name: response(columns) for name, response in functions.items()}
         rows.append(PointRow(number, point.levels, responses_, len(columns["trial"])))
     return rows
+
+
+def pooled(plan: Plan, store: Store) -> Columns:
+    """The columns of one trial at each point of an lhs or sobol design with few replicates; else empty.
+
+    A point alone has too few trials for a statistic, and the points are draws from the factors. Trials of a point share
+    its levels, so one of them counts, and paired trials share their noise.
+    """
+    study = plan.study
+    each = study.replicates
+    if (
+        study.paired
+        or study.optimize
+        or each >= MIN_VALUES
+        or study.design.kind not in ("lhs", "sobol")
+    ):
+        return {}
+    columns = store.point_columns(*range(len(plan.points)))
+    return subset(columns, columns["trial"] % each == columns["point"] % each)
+
+
+def pooled_row(plan: Plan, columns: Columns, responses: Sequence[str]) -> PointRow:
+    """The row of pooled trials, as a point; its levels stand for all."""
+    found = {name: metrics.response(name)(columns) for name in responses}
+    return PointRow(0, plan.points[0].levels, found, len(columns["trial"]))
+
+
+def quantities(responses: Sequence[str]) -> list[str]:
+    """The quantities of the responses, without proportions."""
+    split = (metrics.split_name(name)[0] for name in responses)
+    return [name for name in dict.fromkeys(split) if name in metrics.QUANTITIES]
+
+
+def rank_correlations(plan: Plan, columns: Columns) -> list[tuple[str, str, Summary]]:
+    """Spearman's correlation of each quantity with each numeric factor over pooled trials, the strongest first.
+
+    The interval is tanh(atanh r +- z sqrt((1 + r^2 / 2) / (n - 3))) (Bonett & Wright 2000), for all correlations
+    together; none of fewer than FEWEST trials, or of equal values.
+    """
+    lines = [PointRow(n, one.levels, {}) for n, one in enumerate(plan.points)]
+    axes = {name: axis(plan.study, lines, name) for name in plan.study.factors}
+    numeric = [name for name, one in axes.items() if one.numeric]
+    pairs = list(itertools.product(quantities(plan.study.responses), numeric))
+    found = []
+    for quantity, name in pairs:
+        y = metrics.QUANTITIES[quantity](columns)
+        known = np.isfinite(y)
+        count = int(known.sum())
+        if count < metrics.FEWEST or np.ptp(y[known]) == 0:
+            continue
+        x = [axes[name].coordinate(lines[n].levels[name]) for n in columns["point"][known]]
+        r = float(scipy.stats.spearmanr(x, y[known]).statistic)
+        half = metrics.joint_sigmas(len(pairs)) * math.sqrt((1 + r**2 / 2) / (count - 3))
+        low, high = np.tanh(np.arctanh(np.clip(r, -1, 1)) + np.array([-half, half])).tolist()
+        found.append((quantity, name, Summary(r, low, high, count)))
+    return sorted(found, key=lambda one: -abs(one[2].value))
 
 
 def has_few_values(row: PointRow, response: str) -> bool:
@@ -197,7 +253,7 @@ def response_indices(plan: Plan, store: Store, response: str) -> list[Index]:
     # Resample rows of A, B and AB together, so that each resample is a valid Saltelli sample.
     selections = rng.integers(count, size=(RESAMPLES, count))
     resampled = [generalized(a[:, rows], b[:, rows], ab[:, :, rows]) for rows in selections]
-    low, high = np.quantile(resampled, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], axis=0)
+    low, high = np.quantile(resampled, metrics.TAILS, axis=0)
     first, total = (
         [Summary(value, least, most, count) for value, least, most in index]
         for index in np.stack([estimate, low, high], axis=-1).tolist()
@@ -246,7 +302,9 @@ def generalized(a: Floats, b: Floats, ab: Floats) -> NDArray[np.float64]:
         return np.zeros((2, len(ab)))
     varying = weight > 0
     both = (estimate.first_order, estimate.total_order)
-    return np.stack([weight[varying] @ index[varying] / weight.sum() for index in both])
+    # SciPy drops the axis of a single output.
+    indices = [index.reshape(len(a), -1) for index in both]
+    return np.stack([weight[varying] @ index[varying] / weight.sum() for index in indices])
 
 
 # Factors of a study as axes, and the points of a figure or a threshold.

@@ -7,7 +7,6 @@ one side of the limit to the first level that is certainly on the other, so more
 
 from __future__ import annotations
 
-import bisect
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -22,7 +21,6 @@ from skysim.experiments.study.plan import Curve, Study, Threshold
 from skysim.experiments.study.table import Axis, PointRow
 from skysim.results import metrics
 
-TAIL = (1 - metrics.CONFIDENCE) / 2
 MOST_TRIALS = 1_000_000  # greatest number of trials that is advised
 MISFIT_PROBABILITY = 1e-3  # probability that a monotonic curve deviates from its isotonic fit by more than is accepted
 
@@ -36,7 +34,7 @@ class Crossing(NamedTuple):
         The estimate; -inf or inf if it is beyond the levels, NaN if the proportion neither
         rises nor falls
     low, high
-        Interval at CONFIDENCE; -inf or inf where no level is certain
+        Its ends, each at CONFIDENCE; -inf or inf where no level is certain
     rising
         Whether the proportion rises along the factor
     between
@@ -67,7 +65,7 @@ def crossing(
     are found by fixed-sequence tests (Maurer, Hothorn & Lehmacher 1995): from the side where the proportion is above
     the limit, level after level as long as its exact lower bound (Clopper & Pearson 1934) is; from the other side
     likewise with upper bounds. A wrong end requires a wrong test at the first level beyond the true crossing, so each
-    end is wrong with a probability of at most 2.5 %, for any monotonic curve.
+    end is wrong with a probability of at most 5 %, for any monotonic curve, as is every claim (`metrics.exact_bounds`).
 
     Parameters
     ----------
@@ -107,7 +105,9 @@ def crossing(
     open_ends = [end for end, level in ((0, above), (-1, beneath)) if level is None]
     needs = []
     for end in open_ends:
-        if count := trials_needed(float(fit[end]), limit, above=end == 0):
+        share = float(fit[end])
+        certain = (1 - limit, 0, 1 - share) if end == 0 else (limit, 0, share)
+        if 0 < (count := metrics.trials_needed(*certain)) <= MOST_TRIALS:
             needs.append((float(x[order][end]), count))
     return Crossing(value, min(ends), max(ends), rising, between, tuple(needs))
 
@@ -115,23 +115,6 @@ def crossing(
 def too_few(trials: Floats, limit: float) -> bool:
     """Whether one trial is more than the distance of the limit from 0 or 1: no proportion then is near the limit."""
     return bool(trials.min() < 1 / min(limit, 1 - limit))
-
-
-def trials_needed(share: float, limit: float, above: bool) -> int:
-    """Approximate number of trials that show a level to be above (or below) the limit; 0 if none would.
-
-    It is the least n whose exact bound for n share hits is beyond the limit; it is as uncertain as the share.
-    """
-    side, sign = (0, 1.0) if above else (1, -1.0)
-
-    def certain(count: int) -> bool:
-        return (
-            sign * (metrics.exact_bounds(share * count, count, 1 - TAIL)[side] - limit) >= 0
-        )
-
-    if not certain(MOST_TRIALS):
-        return 0
-    return bisect.bisect_left(range(MOST_TRIALS), True, lo=1, key=certain)
 
 
 def isotonic(proportion: Floats, weight: Floats, rising: bool) -> Floats:
@@ -161,11 +144,11 @@ def certain_levels(
     )
     above = beneath = None
     for place, count, total in counts:
-        if metrics.exact_bounds(count, total, 1 - TAIL)[0] < limit:
+        if metrics.exact_bounds(count, total)[0] < limit:
             break
         above = place
     for place, count, total in reversed(counts):
-        if metrics.exact_bounds(count, total, 1 - TAIL)[1] >= limit:
+        if metrics.exact_bounds(count, total)[1] >= limit:
             break
         beneath = place
     return above, beneath
@@ -248,7 +231,7 @@ def sentences(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> 
 
 
 def describe(found: Crossing | None, threshold: Threshold, axis: Axis) -> str:
-    """A crossing in words, such as "identified falls below 95 % at rate = 6.2 deg/s (95 %: 4 to 8)"."""
+    """A crossing in words, such as "identified falls below 95 % at rate = 6.2 deg/s (95 %: below 8)"."""
     response = threshold.response
     limit = f"{100 * threshold.limit:g} %"
     name = threshold.along
@@ -284,7 +267,9 @@ def interval_text(found: Crossing, name: str, unit: str) -> str:
     elif math.isinf(found.high):
         span = f"above {found.low:.4g}{needs}"
     else:
-        span = f"{found.low:.4g} to {found.high:.4g}"
+        return (
+            f"each end at {100 * metrics.CONFIDENCE:g} %: {found.low:.4g} to {found.high:.4g}"
+        )
     return f"{100 * metrics.CONFIDENCE:g} %: {span}"
 
 

@@ -44,14 +44,17 @@ class WorstTrial(NamedTuple):
 
     Attributes
     ----------
+    value
+        What ranks it: its value of the quantity, or how often it counts
     status
         "misidentified" where it is solved with wrong lights
     tilt_deg, azimuth_deg
-        Direction of the body's z axis under a dome
+        Direction of the body's z axis under a dome; of a flight, in its worst frame
     ra_deg, dec_deg
         Direction of the boresight under the stars
     yaw_deg, pitch_deg, roll_deg
-        3-2-1 angles of the body under a dome, as in `motion.start`; NaN under the stars
+        3-2-1 angles of the body under a dome, as in `motion.start`; NaN under the stars, and of a
+        flight, which starts elsewhere
     lights
         Number of lights in the field
     cross_arcsec, roll_arcsec
@@ -60,6 +63,7 @@ class WorstTrial(NamedTuple):
 
     trial: int
     point: int
+    value: float
     status: str
     cross_arcsec: float
     roll_arcsec: float
@@ -99,24 +103,30 @@ class WorstTrial(NamedTuple):
         return f"{status}cross {self.cross_arcsec:.3g}″, roll {self.roll_arcsec:.4g}″"
 
 
-def worst_trials(columns: Columns, response: str, count: int = COUNT) -> list[WorstTrial]:
-    """The worst trials by a response or a quantity, worst first, with directions at least APART_DEG apart.
+def worst_trials(
+    columns: Columns, response: str, count: int = COUNT, flights: bool = False
+) -> list[WorstTrial]:
+    """The worst trials by a response or a quantity, worst first, unless `flights` with directions APART_DEG apart.
 
     For a proportion they are trials that count for it (for `identified`, that do not): trials without a solution first,
     then by error and by the number of lights. None if there is no such trial.
     """
     if not columns:
         return []
-    keys, counted = ranking(columns, response)
+    keys, values = ranking(columns, response)
+    counted = np.isfinite(values)
+    near = math.inf if flights else NEAR
     axis = np.empty((0, 3))
     chosen = list[WorstTrial]()
     for rows in worst_first(keys, np.flatnonzero(counted)):
         directions = unit_directions(subset(columns, rows))
-        left = np.all(directions @ axis.T <= NEAR, axis=1)
+        left = np.all(~(directions @ axis.T > near), axis=1)
         while len(chosen) < count and left.any():
             nearest = int(np.argmax(left))
-            chosen.append(worst_trial(row_of(columns, int(rows[nearest]))))
-            left &= directions @ directions[nearest] <= NEAR
+            row = int(rows[nearest])
+            chosen.append(worst_trial(row_of(columns, row), float(values[row]), flights))
+            left[nearest] = False
+            left &= ~(directions @ directions[nearest] > near)
             axis = np.concatenate([axis, directions[nearest : nearest + 1]])
         if len(chosen) == count:
             break
@@ -140,18 +150,19 @@ def worst_first(
         yield rows
 
 
-def worst_trial(columns: Columns) -> WorstTrial:
+def worst_trial(columns: Columns, value: float, flight: bool) -> WorstTrial:
     """The trial in columns of a single trial."""
     return WorstTrial(
         int(columns["trial"][0]),
         int(columns["point"][0]),
+        value,
         "misidentified" if columns["misidentified"][0] > 0 else str(columns["status"][0]),
         *(
             float(metrics.QUANTITIES[name](columns)[0])
             for name in ("cross_arcsec", "roll_arcsec")
         ),
         *(float(columns[name][0]) for name in DIRECTION),
-        *body_angles_deg(columns, 0),
+        *([] if flight else body_angles_deg(columns, 0)),
     )
 
 
@@ -181,22 +192,28 @@ def unit_directions(columns: Columns) -> Floats:
     )
 
 
-def ranking(columns: Columns, response: str) -> tuple[list[Floats], NDArray[np.bool_]]:
-    """(N,) sort keys, the most important first, smaller is worse; and (N,) whether a trial qualifies."""
+def ranked(response: str) -> str:
+    """What ranks the trials by a response: its quantity, or the proportion itself."""
+    quantity = response if response in metrics.QUANTITIES else metrics.split_name(response)[0]
+    return quantity if quantity in metrics.QUANTITIES else response
+
+
+def ranking(columns: Columns, response: str) -> tuple[list[Floats], Floats]:
+    """(N,) sort keys, the most important first, smaller is worse; and (N,) values, NaN if a trial does not qualify."""
     angle = metrics.QUANTITIES["angle_arcsec"](columns)
     unsolved_first = np.where(np.isnan(angle), -np.inf, -angle)
     fewest_first = np.nan_to_num(columns["stars"], nan=0.0)
-    quantity = response if response in metrics.QUANTITIES else metrics.split_name(response)[0]
+    quantity = ranked(response)
     if metrics.COVERAGE.match(response):
-        return [fewest_first], columns["frames"] > 0
+        return [fewest_first], np.where(columns["frames"] > 0, columns["stars"], np.nan)
     if quantity in metrics.QUANTITIES:
         values = metrics.QUANTITIES[quantity](columns)
         key = values if quantity in metrics.MORE_IS_BETTER else -values
-        return [key, fewest_first], np.isfinite(values)
+        return [key, fewest_first], values
     flagged = np.nan_to_num(
         np.asarray(FLAGS.get(response, lambda c: c[response])(columns), dtype=float)
     )
-    return [-flagged, unsolved_first, fewest_first], flagged > 0
+    return [-flagged, unsolved_first, fewest_first], np.where(flagged > 0, flagged, np.nan)
 
 
 def worst_of_levels(
@@ -205,4 +222,5 @@ def worst_of_levels(
     """The worst trials of the points at some levels. Raises InputError for an unknown factor or level."""
     rows = [PointRow(n, point.levels, {}) for n, point in enumerate(store.points())]
     chosen = points_at(rows, study, levels)
-    return worst_trials(store.point_columns(*(row.point for row in chosen)), response, count)
+    columns = store.point_columns(*(row.point for row in chosen))
+    return worst_trials(columns, response, count, study.trial.kind == "flight")

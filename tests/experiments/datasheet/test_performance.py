@@ -18,23 +18,23 @@ from skysim.experiments.datasheet.performance import (
     bracket,
     claims,
     noise_equivalent_angle,
-    runs_needed,
 )
+from skysim.results.metrics import trials_needed
 
 
 def test_the_number_of_runs_without_failure_follows_the_formula():
     """ln 0.05 / ln 0.997 = 997.1: 997 runs show 99.7 % at 94.999 %, and 998 at 95 %."""
     assert math.log(0.05) / math.log(0.997) == pytest.approx(997.07, abs=0.01)
-    assert runs_needed(0.997) == 998
+    assert trials_needed(1 - 0.997) == 998
     assert 1 - 0.997**998 >= 0.95 > 1 - 0.997**997
     assert abs(0.95 - (1 - 0.997**997)) < 2e-5
-    assert runs_needed(0.95) == 59
+    assert trials_needed(1 - 0.95) == 59
 
 
 @pytest.mark.parametrize("failures", [1, 2, 7])
 def test_runs_with_failures_are_the_fewest_whose_bound_holds(failures):
     """P(at most so many failures) is the binomial's, below 5 % at the number and not at one fewer."""
-    runs = runs_needed(0.99, failures)
+    runs = trials_needed(0.01, failures)
     below = [scipy.stats.binom.cdf(failures, n, 0.01) for n in (runs, runs - 1)]
     assert below[0] <= 0.05 < below[1]
 

@@ -6,8 +6,11 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
+from numpy.typing import NDArray
+from scipy import stats
 
 from skysim.experiments.study import answer, study_file
 from skysim.experiments.study.execution import store
@@ -186,23 +189,37 @@ def test_the_next_claim_says_how_many_trials_it_needs() -> None:
 @pytest.mark.parametrize(
     ("nees", "expected"),
     [
-        ([(3.0, 2.8, 3.2), (3.1, 2.9, 3.3)], "Yes: NEES is 2.5 to 3.5 at all 2 points."),
+        (
+            [(3.0, 2.8, 3.2), (3.1, 2.9, 3.3)],
+            "Yes: NEES is 2.5 to 3.5 at all 2 points, 95 % for all 2 points together.",
+        ),
         (
             [(3.0, 2.8, 3.2), (5.07, 4.6, 5.6)],
-            "No: too small by a factor of 1.3 at leds = 900 (NEES 5.07, 4.6 to 5.6; 3 if true), at 1 of 2 points.",
+            "No: too small by a factor of 1.3 at leds = 900 (NEES 5.07, 4.54 to 5.68, 95 % for all 2 points together"
+            "; 3 if true), at 1 of 2 points.",
         ),
         (
             [(0.75, 0.7, 0.8), (3.0, 2.8, 3.2)],
-            "No: too large by a factor of 2 at leds = 500 (NEES 0.75, 0.7 to 0.8; 3 if true), at 1 of 2 points.",
+            "No: too large by a factor of 2 at leds = 500 (NEES 0.75, 0.693 to 0.808, 95 % for all 2 points together"
+            "; 3 if true), at 1 of 2 points.",
         ),
         (
             [(3.0, 2.8, 3.2), (1e4, math.nan, math.nan)],
-            "No: too small by a factor of 58 at leds = 900 (NEES 1e+04, 1e+04 to 1e+04; 3 if true), at 1 of 2 points.",
+            "No: too small by a factor of 58 at leds = 900 (NEES 1e+04, 1e+04 to 1e+04, 95 % for all 2 points together"
+            "; 3 if true), at 1 of 2 points.",
         ),
-        ([(3.0, 2.8, 3.2), (9.0, math.nan, math.nan)], "Yes: NEES is 2.5 to 3.5."),
+        (
+            [(3.0, 2.8, 3.2), (9.0, math.nan, math.nan)],
+            "Yes: NEES is 2.5 to 3.5 at 1 of 2 points, too few to say at the others, 95 % for all 2 points together.",
+        ),
+        (
+            [(9.0, math.nan, math.nan), (9.0, math.nan, math.nan)],
+            "Too few to say: 1 trials at all 2 points, 30 are needed.",
+        ),
         (
             [(3.0, 2.8, 3.2), (4.0, 2.0, 6.0)],
-            "Nothing says otherwise, but NEES is known to 2 to 6 only at leds = 900; more trials decide it.",
+            "Nothing says otherwise, but NEES is known to 1.87 to 6.61 only at leds = 900, 95 % for all"
+            " 2 points together. Errors too small by a factor of 1.8 would be noticed with a probability of 80 %.",
         ),
     ],
 )
@@ -212,13 +229,64 @@ def test_understated_errors_are_reported(
     """The factor is sqrt(NEES / 3): 1.3 at 5.07, and 2 too large at 0.75."""
     lines = [line(n, leds, 500) for n, leds in enumerate((500, 900))]
     for one, values in zip(lines, nees, strict=True):
-        one.responses["nees"] = Summary(*values, 500)
+        one.responses["nees"] = Summary(*values, 1 if math.isnan(values[1]) else 500)
     texts = answer.headline(study(), lines, False)
     assert (
         said(texts, "Are the claimed errors true?")
         == f"Are the claimed errors true? {expected}"
     )
     assert len(answer.ranges(study(responses=["nees"]), lines)) == 1
+
+
+def verdicts(nees: NDArray[np.float64]) -> list[str]:
+    """The sentence on claimed errors of each of S studies, from the NEES of T trials at P points, (S, P, T)."""
+    texts = []
+    for one in nees:
+        lines = []
+        for n, values in enumerate(one):
+            nees_of = metrics.response("nees")(
+                {"nees": values, "solved": np.ones(len(values))}
+            )
+            lines.append(PointRow(n, {"leds": n}, {"nees": nees_of}, len(values)))
+        texts += answer.claimed_errors(lines, lambda line: f"leds = {line.levels['leds']}")
+    return texts
+
+
+@pytest.mark.parametrize(("points", "trials"), [(1, 30), (20, 30), (20, 4), (5, 300)])
+def test_true_claims_are_called_false_in_at_most_one_study_of_twenty(
+    points: int, trials: int
+) -> None:
+    """Chi-square of three degrees times 3.5 / 3, the limit of TRUE_NEES; 100 studies, to four standard errors."""
+    rng = np.random.default_rng(12)
+    found = verdicts(3.5 / 3 * rng.chisquare(3, (100, points, trials)))
+    assert np.mean([" No: " in one for one in found]) <= 0.05 + 4 * math.sqrt(0.0475 / 100)
+    assert (trials < 30) == all("Too few to say" in one for one in found)
+
+
+def test_attitudes_that_differ_widen_the_interval() -> None:
+    """Claims that are wrong by a factor of their own at each attitude, true on average: at most 10 of 100 say no."""
+    rng = np.random.default_rng(13)
+    shape = (100, 20, 60)
+    found = verdicts(rng.chisquare(3, shape) * rng.gamma(4, 1 / 4, shape))
+    assert np.mean([" No: " in one for one in found]) <= 0.1
+
+
+@pytest.mark.parametrize("points", [1, 20])
+def test_a_wrong_claim_is_noticed_with_the_stated_power(points: int) -> None:
+    """One point of errors that are too small by the factor that 40 true trials a point state, in 400 studies."""
+    rng = np.random.default_rng(14)
+    true = Summary(
+        3.0, 3 * 120 / stats.chi2.isf(0.025, 120), 3 * 120 / stats.chi2.isf(0.975, 120), 40
+    )
+    factor = answer.noticed(answer.jointly(true, points), points)
+    values = rng.chisquare(3, (400, 40)) * factor**2
+    low = [
+        answer.jointly(
+            metrics.response("nees")({"nees": one, "solved": np.ones(40)}), points
+        ).low
+        for one in values
+    ]
+    assert np.mean(np.array(low) > 3.5) == pytest.approx(0.8, abs=4 * math.sqrt(0.16 / 400))
 
 
 def test_before_the_first_trial_there_is_no_answer() -> None:

@@ -11,11 +11,11 @@ from scipy.stats import qmc
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.experiments.study import study_file, table
+from skysim.experiments.study import study_file, table, worst
 from skysim.experiments.study.execution import engines, runner, store
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.execution.store import TIMES
-from skysim.experiments.study.report import study_export
+from skysim.experiments.study.report import study_export, study_report
 from skysim.results import metrics
 
 STUDY = """schema: 1
@@ -160,6 +160,71 @@ def test_the_error_budget_attributes_errors_to_their_factors(tmp_path):
     assert found["cross_arcsec", "lever_x"].rms_arcsec == pytest.approx(drawn, rel=0.6)
 
 
+def test_one_output_has_the_indices_of_many_equal_ones():
+    """Saltelli with one replicate and one axis: SciPy drops the axis of a single output."""
+    rng = np.random.default_rng(5)
+    a, b = rng.normal(size=(2, 1, 16))
+    ab = rng.normal(size=(3, 1, 16))
+    one = table.generalized(a, b, ab)
+    many = table.generalized(*(np.repeat(x, 2, axis=-2) for x in (a, b, ab)))
+    assert one.shape == (2, 3)
+    assert one == pytest.approx(many, rel=1e-12)
+
+
+SAMPLED = """schema: 1
+title: a sampled question
+scene: shefex2
+seed: 1
+set: {light.limit_mag: 6.0}
+trial: {kind: centroids, lights: 15}
+factors:
+  noise: {key: trial.noise_px, from: 0.05, to: 0.5}
+  missing: {key: trial.missing, from: 0.0, to: 0.001}
+design: {kind: lhs, points: 64}
+responses: [cross_arcsec_p95, identified]
+"""
+
+
+@pytest.mark.slow
+def test_sampled_points_are_evaluated_together(tmp_path):
+    """64 points of a trial: a p95 of all has an interval, and the error depends on the noise alone."""
+    study_plan, kept = done(tmp_path, SAMPLED)
+    assert not study_plan.study.paired
+    with kept as rows:
+        columns = table.pooled(study_plan, rows)
+        assert len({float(one) for one in columns["boresight_ra_deg"]}) == 64
+        text = study_report.study_report(study_plan, rows).html()
+    error = table.pooled_row(study_plan, columns, ["cross_arcsec_p95"]).responses
+    assert error["cross_arcsec_p95"] == metrics.response("cross_arcsec_p95")(columns)
+    assert error["cross_arcsec_p95"].needs == 0
+    found = {factor: one for _, factor, one in table.rank_correlations(study_plan, columns)}
+    assert found["noise"].low > 0 > found["missing"].low
+    assert found["missing"].high > 0
+    x = [one.levels["noise"] for one in study_plan.points]
+    y = metrics.QUANTITIES["cross_arcsec"](columns)
+    assert found["noise"].value == pytest.approx(stats.spearmanr(x, y).statistic)
+    assert "more values" not in text
+    assert "All points together" in text
+
+
+def test_independent_factors_are_said_to_matter_in_at_most_one_study_of_twenty(tmp_path):
+    """Bonett & Wright's intervals of six correlations together, of 100 samples of 30 of independent numbers."""
+    path = tmp_path / "question.yaml"
+    path.write_text(
+        SAMPLED.replace("[cross_arcsec_p95", "[nees, stars_mean, cross_arcsec_p95")
+    )
+    study_plan = study_file.load(path)
+    rng = np.random.default_rng(3)
+    names = ("nees", "stars", "x_arcsec", "y_arcsec")
+    said = 0
+    for _ in range(100):
+        trials = {name: rng.normal(size=30) for name in names} | {"point": np.arange(30)}
+        found = table.rank_correlations(study_plan, trials)
+        assert len(found) == 6
+        said += any(one.low > 0 or one.high < 0 for *_, one in found)
+    assert said <= 5 + 4 * math.sqrt(4.75)
+
+
 def test_a_budget_without_trials_is_nan_and_no_error(tmp_path):
     path = tmp_path / "question.yaml"
     path.write_text(ERRORS)
@@ -180,6 +245,33 @@ def done(folder, text):
         runner.prepare_store(study_plan, kept, resume=False)
         runner.run(study_plan, kept, engines.Serial())
     return study_plan, store.open_store(folder / "study.sqlite")
+
+
+FLIGHTS = """schema: 1
+title: flights
+scene: afit_simsat
+seed: 1
+set: {exposure.frames: 1}
+trial: {kind: flight}
+factors:
+  noise: {key: camera.detector.read_noise_e, values: [5, 10]}
+responses: [cross_arcsec_mean]
+"""
+
+
+@pytest.mark.slow
+def test_the_worst_flights_are_ranked_by_their_value_and_replayed_with_telemetry(tmp_path):
+    """Two flights of one direction are two; the attitude of a frame is not where a flight starts."""
+    study_plan, kept = done(tmp_path, FLIGHTS)
+    with kept as rows:
+        found = worst.worst_of_levels(study_plan.study, rows, "cross_arcsec_mean", {})
+        cross = metrics.QUANTITIES["cross_arcsec"](rows.columns())
+        again = runner.replay(study_plan, rows, 1, tmp_path / "trial_1")
+    assert [one.value for one in found] == sorted(cross.tolist(), reverse=True)
+    assert [one.start for one in found] == ["", ""]
+    assert not again.changed
+    names = {path.name for path in again.files}
+    assert names == {"frame_0000.fits", "report.html", "solutions.ecsv", "telemetry.ecsv"}
 
 
 def loaded_with_a_fault(path):

@@ -390,6 +390,40 @@ def test_chunks_hold_every_missing_trial_once_and_in_order(data: st.DataObject) 
     assert not todo.next()
 
 
+def test_under_a_budget_of_time_no_point_waits_for_another() -> None:
+    """Four points of 300 trials of 10 ms, whenever it ends: counts differ by one, later by a fifth; all run at last."""
+    points = [Point({"n": n}, {}) for n in range(4)]
+    todo = runner.ChunkQueue(points, 300, np.arange(1200), limited=True)
+    ran = set[int]()
+    while chunk := todo.next():
+        for segment in chunk:
+            ran |= {segment.first + n for n in range(len(segment.replicates))}
+            assert segment.point == segment.first // 300
+            assert segment.replicates[0] == segment.first % 300
+        todo.report_time(chunk, 0.01 * sum(len(one.replicates) for one in chunk))
+        counts = np.bincount([trial // 300 for trial in ran], minlength=4)
+        assert counts.max() <= max(counts.min() + 1, 2**0.25 * (counts.min() + 1))
+    assert ran == set(range(1200))
+
+
+def test_a_study_with_a_budget_of_time_fills_its_points_together(
+    study_plan: plan.Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "CHUNK_S", 0.0)  # one trial a chunk
+    limited = other(study_plan, budget="{time: 1 h}")
+
+    def stop(progress: runner.Progress) -> None:
+        if progress.now == 7:
+            raise KeyboardInterrupt
+
+    path = tmp_path / "budget.sqlite"
+    with pytest.raises(KeyboardInterrupt):
+        done(limited, path, watch=stop)
+    with store.open_store(path) as kept:
+        came = kept.columns()["point"].tolist()
+    assert np.bincount(came).tolist() == [3, 2, 2]
+
+
 def test_chunks_are_sized_by_time() -> None:
     """Trials of 10 ms: chunks double until they take CHUNK_S, and shrink as trials take longer."""
     point = [Point({}, {})]

@@ -12,6 +12,7 @@ import yaml
 from scipy import stats
 
 from skysim.core.errors import InputError
+from skysim.experiments.datasheet import performance
 from skysim.experiments.study import study_file, thresholds
 from skysim.experiments.study.plan import Study, Threshold
 from skysim.experiments.study.table import PointRow
@@ -73,11 +74,11 @@ def test_a_threshold_beyond_the_levels_has_no_number() -> None:
 
 
 def test_uncertain_levels_leave_the_interval_open_and_name_the_trials_needed() -> None:
-    """All of 60: the exact lower bound is 0.025^(1/60) = 0.940; 72 trials would be enough."""
-    found = counted([60, 60, 60, 60, 39, 12, 5, 2], trials=60)
-    assert metrics.exact_bounds(60, 60, 0.975)[0] == pytest.approx(0.025 ** (1 / 60))
-    assert (found.low, found.high, found.needs) == (-math.inf, 4, ((0, 72),))
-    assert counted([72, 72, 72, 72, 40, 12, 5, 2], trials=72).low == 3
+    """All of 50: the exact lower bound is 0.05^(1/50) = 0.942; 59 trials would be enough."""
+    found = counted([50, 50, 50, 50, 32, 10, 5, 2], trials=50)
+    assert metrics.exact_bounds(50, 50)[0] == pytest.approx(0.05 ** (1 / 50))
+    assert (found.low, found.high, found.needs) == (-math.inf, 4, ((0, 59),))
+    assert counted([59, 59, 59, 59, 32, 12, 5, 2], trials=59).low == 3
 
 
 def test_a_curve_that_falls_and_rises_has_no_threshold() -> None:
@@ -98,20 +99,18 @@ def test_noise_on_a_monotonic_curve_is_not_called_misfit() -> None:
 
 
 @pytest.mark.parametrize(("middle", "width"), [(6.0, 0.6), (7.0, 1.2), (9.0, 0.2)])
-def test_the_interval_covers_the_truth_as_often_as_stated(
-    middle: float, width: float
-) -> None:
+def test_each_end_is_right_as_often_as_stated(middle: float, width: float) -> None:
     """Logistic curves cross 0.95 at middle - width ln 19. Of 600 draws each, at least 95 % to four standard errors."""
     rng = np.random.default_rng(7)
     truth = middle - width * math.log(19)
     draws = rng.binomial(100, logistic(LEVELS, middle, width), size=(600, 8)).astype(float)
     found = [crossing(LEVELS, hits, np.full(8, 100.0), 0.95) for hits in draws]
-    inside = np.mean([one.low <= truth <= one.high for one in found])
-    assert inside >= 0.95 - 4 * math.sqrt(0.95 * 0.05 / 600)
+    for right in ([one.low <= truth for one in found], [truth <= one.high for one in found]):
+        assert np.mean(right) >= 0.95 - 4 * math.sqrt(0.95 * 0.05 / 600)
 
 
-def test_the_interval_keeps_its_coverage_for_a_level_just_below_the_limit() -> None:
-    """The hardest case, a level at 0.949: it is called certainly above in at most 2.5 % of 2,000 draws."""
+def test_an_end_keeps_its_confidence_for_a_level_just_below_the_limit() -> None:
+    """The hardest case, a level at 0.949: it is called certainly above in at most 5 % of 2,000 draws."""
     rng = np.random.default_rng(8)
     truth = np.array([1.0, 1.0, 0.949, 0.5, 0.1, 0, 0, 0])
     draws = rng.binomial(300, truth, size=(2000, 8)).astype(float)
@@ -119,7 +118,7 @@ def test_the_interval_keeps_its_coverage_for_a_level_just_below_the_limit() -> N
         thresholds.certain_levels(LEVELS, hits, np.full(8, 300.0), 0.95)[0] for hits in draws
     ]
     wrong = np.mean([level is not None and level >= 2 for level in above])
-    assert 0 < wrong <= 0.025 + 4 * math.sqrt(0.025 * 0.975 / 2000)
+    assert 0 < wrong <= 0.05 + 4 * math.sqrt(0.05 * 0.95 / 2000)
 
 
 def test_the_estimate_approaches_the_truth() -> None:
@@ -159,11 +158,11 @@ def test_a_study_states_the_rate_at_which_95_percent_are_identified() -> None:
     curves = {"slow": [1, 1, 1, 0.9, 0.5, 0.1, 0, 0], "fast": [1.0] * 8}
     said = thresholds.sentences(study.thresholds[0], study, lines_of(study, curves, 400))
     assert said == [
-        "chain = slow: identified falls below 95 % at rate = 2.5 deg/s (95 %: 2 to 3).",
+        "chain = slow: identified falls below 95 % at rate = 2.5 deg/s (each end at 95 %: 2 to 3).",
         "chain = fast: identified is at least 95 % at all levels of rate, 0 to 10 deg/s (95 %: above 10).",
     ]
-    few = thresholds.sentences(study.thresholds[0], study, lines_of(study, curves, 60))
-    assert few[0].endswith("(95 %: below 4; needs about 72 trials at rate = 0 deg/s).")
+    few = thresholds.sentences(study.thresholds[0], study, lines_of(study, curves, 50))
+    assert few[0].endswith("(95 %: below 4; needs about 59 trials at rate = 0 deg/s).")
 
 
 def test_a_level_of_the_sentence_has_its_unit() -> None:
@@ -224,26 +223,30 @@ def test_an_impossible_threshold_is_refused(
 
 @pytest.mark.parametrize(
     ("share", "limit", "needed"),
-    [(1.0, 0.9, 36), (1.0, 0.95, 72), (1.0, 0.99, 368), (0.0, 0.95, 2), (0.98, 0.95, 0)],
+    [(1.0, 0.9, 29), (1.0, 0.95, 59), (1.0, 0.99, 299), (0.98, 0.95, 0)],
 )
-def test_a_limit_needs_as_many_trials_as_its_exact_bound(
+def test_an_end_needs_as_many_trials_as_the_same_claim_of_a_datasheet(
     share: float, limit: float, needed: int
 ) -> None:
-    """ceil(ln 0.025 / ln limit): 36 at 90 %, 72 at 95 %, 368 at 99 %; of 98 % the fewest n by the binomial tail."""
-    found = thresholds.trials_needed(share, limit, above=share > limit)
+    """ceil(ln 0.05 / ln limit): 29 at 90 %, 59 at 95 %, 299 at 99 %; of 98 % the fewest n by the binomial tail."""
+    found = metrics.trials_needed(1 - limit, share=1 - share)
     if needed:
-        assert found == needed
+        (claim,) = [
+            one
+            for one in performance.claims(performance.Counts(400, 400, 0, 0))
+            if one["share"] == limit
+        ] or [{"without_failure": needed}]
+        assert found == claim["without_failure"] == needed
     else:  # integer hits n share bracket it: 50 more than enough, 50 fewer not
         for count, enough in ((found + 50 - found % 50, True), (found - found % 50, False)):
             hits = round(share * count)
-            assert (stats.binom.sf(hits - 1, count, limit) <= 0.025) == enough
-    assert thresholds.trials_needed(0.95, 0.95, above=True) == 0
-    assert thresholds.trials_needed(share, limit, above=share <= limit) == 0
+            assert (stats.binom.sf(hits - 1, count, limit) <= 0.05) == enough
+    assert metrics.trials_needed(0.05, share=0.05) == 0
 
 
 def test_no_number_of_trials_closes_an_interval_at_a_level_on_the_wrong_side() -> None:
     """All levels are above, so no number of trials is requested at the last one."""
-    assert counted([60] * 8, trials=60).needs == ((0, 72),)
+    assert counted([50] * 8, trials=50).needs == ((0, 59),)
     assert counted([400] * 8).needs == ()
     both = counted([78, 77, 77, 77, 77, 76, 75, 75], trials=80)
     assert [level for level, _ in both.needs] == [0, 10]

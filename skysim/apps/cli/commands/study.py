@@ -278,7 +278,8 @@ def worst(
         print_json([row | {"command": f"{repeat} {row['trial']}"} for row in rows])
     else:
         instead = f"{command(study, out, 'worst')} --response roll_arcsec"
-        print_worst(name, found, [points[one.point].levels for one in found], repeat, instead)
+        levels = [points[one.point].levels for one in found]
+        print_worst(analysis.ranked(name), found, levels, repeat, instead)
 
 
 def chosen_levels(words: list[str]) -> dict[str, Any]:

@@ -116,7 +116,7 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
         segment = runner.segment_of(plan, stored, trial)
     row = run_trial(plan.spec, segment, trial, segment.replicates[0])
     setup = prepared_setup(plan.spec, segment.settings)
-    frame, truth, report = next(runner.replayed_frames(setup, row.seed))
+    frame, truth, report = runner.replayed_frame(setup, row.seed)
     result = tracker_result(setup.lab, setup.estimator, frame, truth, report)
     if row.error:
         result = TrackerResult(

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import shlex
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,8 +39,11 @@ from skysim.experiments.study.plan import (
     TrialSpec,
     resolve_point,
 )
+from skysim.results import scoring
 from skysim.results.files import recording
 from skysim.results.plots import annotate, visible
+from skysim.results.run import Recorder
+from skysim.simulation.checks import check
 from skysim.tracking import factory
 
 CHUNK_S = (
@@ -88,14 +92,16 @@ Watch = Callable[[Progress], Any]
 
 
 class ChunkQueue:
-    """Divides the missing trials of some points into chunks with a run time of about `chunk_s`.
+    """Divides the missing trials of some points into chunks with a run time of about `seconds`.
 
     Chunks larger than a point are extended to complete points, so that a point's setup is built on one worker only.
 
     Attributes
     ----------
     missing
-        (M,) trial numbers, ascending
+        (M,) trial numbers in the order in which they run
+    ends
+        Where in them segments end: trial numbers are not consecutive, the point or the hardware is another
     spec
         Specification of the trials, if their hardware is drawn
     """
@@ -108,33 +114,41 @@ class ChunkQueue:
         first: int = 0,
         spec: TrialSpec | None = None,
         seconds: float = CHUNK_S,
+        limited: bool = False,
     ) -> None:
+        """Order the trials by point, or if time is `limited` by replicate, so that no point stays empty.
+
+        Then all points run one replicate before the next one. Beyond the sixth, rounds are a fifth of the replicates
+        before them, because trials of a point that run together are faster.
+        """
         self.points = points
         self.replicates = replicates
+        if limited:
+            rounds = np.floor(4 * np.log2(1 + missing % replicates))
+            missing = missing[np.lexsort((missing, rounds))]
         self.missing = missing
         self.first = first
         self.spec = spec
         self.seconds = seconds
         self.position = 0
         self.size = 1
+        apart = (np.diff(missing) != 1) | (missing[1:] % replicates == 0)
+        self.ends = np.append(
+            np.flatnonzero(apart | bool(spec and spec.hardware)) + 1, len(missing)
+        )
 
     def next(self) -> Chunk:
         """The next chunk; empty if nothing is left."""
-        end = min(self.position + self.size, len(self.missing))
-        if self.size >= self.replicates and end < len(self.missing):
-            last = self.missing[end - 1] // self.replicates
-            end = int(np.searchsorted(self.missing, (last + 1) * self.replicates))
-        chosen = self.missing[self.position : end]
+        start = self.position
+        end = min(start + self.size, len(self.missing))
+        if self.size >= self.replicates:
+            end = int(self.ends[np.searchsorted(self.ends, end)])
         self.position = end
-        # A segment ends where the trial numbers are not consecutive, the next point begins, or the hardware is another.
-        ends = (
-            (np.diff(chosen) != 1)
-            | (chosen[1:] % self.replicates == 0)
-            | bool(self.spec and self.spec.hardware)
-        )
-        breaks = np.flatnonzero(ends) + 1
+        within = slice(*np.searchsorted(self.ends, (start + 1, end)))
         return tuple(
-            self._segment(trials) for trials in np.split(chosen, breaks) if len(trials)
+            self._segment(trials)
+            for trials in np.split(self.missing[start:end], self.ends[within] - start)
+            if len(trials)
         )
 
     def _segment(self, trials: NDArray[np.int64]) -> Segment:
@@ -273,7 +287,13 @@ def run_points(
     progress = Progress(len(numbers), len(numbers) - len(missing), failed_before)
     budget = plan.study.budget
     queue = ChunkQueue(
-        points, replicates, missing, first, plan.spec, chunk_seconds(engine.workers)
+        points,
+        replicates,
+        missing,
+        first,
+        plan.spec,
+        chunk_seconds(engine.workers),
+        budget.time_s is not None,
     )
     rows = engine.run(TrialJob(plan.spec), queue) if len(missing) else iter(())
     try:
@@ -320,11 +340,11 @@ ENGINES: dict[str, Callable[[int | None, str], Engine]] = {
 # Repeat one trial of a study and write its frames for inspection.
 
 
-MAX_FRAMES = 100  # maximum number of frames written for a flight
+MAX_FRAMES = 100  # maximum number of frames annotated for a flight
 
 
 class Replay(NamedTuple):
-    """A repeated trial: its row, names of stored quantities that differ now, frame files, annotated images."""
+    """A repeated trial: its row, names of stored quantities that differ now, files, annotated images."""
 
     row: Row
     changed: list[str]
@@ -346,40 +366,63 @@ def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
 
 
 def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
-    """Repeat a trial with its seed, and write each of its frames with an annotated image.
+    """Repeat a trial with its seed, and write its frame, or the files of `skysim run` for a flight, annotated.
 
-    Only the first MAX_FRAMES frames of a flight are written. An exception of the trial is in its row; frames rendered
-    before it are also written.
+    Only the first MAX_FRAMES frames of a flight are annotated. An exception of the trial is in its row; frames
+    rendered before it are also written.
     """
     segment = segment_of(plan, store, trial)
     row = trials.run_trial(plan.spec, segment, trial, segment.replicates[0])
     stored = store.trial(trial) if store.done(trial + 1)[trial] else {}
     now = {name: to_sql(getattr(row.outcome, name)) for name in FIELDS}
     changed = [name for name, value in now.items() if stored and stored[name] != value]
-    files = []
-    pictures = []
     if row.scene not in ("", REFUSED):  # an invalid scene has no lab
         setup = prepared_setup(plan.spec, segment.settings)
         recording.remove_results(make_folder(folder))
         try:
-            for frame, truth, report in islice(replayed_frames(setup, row.seed), MAX_FRAMES):
+            if isinstance(setup.trial, FlightTrial):
+                command = shlex.join(
+                    ["skysim", "study", "replay", str(plan.path), str(trial)]
+                )
+                replay_flight(setup, row.seed, folder, command)
+            else:
+                frame, truth, report = replayed_frame(setup, row.seed)
                 recording.write_frame(folder, frame, truth, setup.lab.scene)
-                files.append(folder / f"frame_{frame.index:04d}.fits")
-                pictures.append(folder / f"frame_{frame.index:04d}.annotated.png")
-                match = report.attitude.match
-                xy_px = report.centroids.xy_px
-                matched_px = xy_px[match.observed] if match else np.empty((0, 2))
-                truth_px = truth.sources.xy_px[visible(truth.sources)]
-                picture = annotate(frame.image_dn, xy_px, matched_px, truth_px=truth_px)
-                write_image(pictures[-1], picture)
+                write_annotated(folder, frame, truth, report)
         except Exception:
             if row.error is None:
                 raise
-    return Replay(row, changed, files, pictures)
+    files = [*sorted(folder.glob("frame_*.fits")), *sorted(folder.glob("[rst]*.*"))]
+    return Replay(row, changed, files, sorted(folder.glob("frame_*.annotated.png")))
 
 
-def replayed_frames(setup: TrialSetup, seed: int) -> Iterator[tuple[Frame, Truth, Report]]:
-    """Frames of a trial with truth and report.
+def write_annotated(folder: Path, frame: Frame, truth: Truth, report: Report) -> None:
+    """Write a frame with the lights that the tracker found, those that it matched, and the true ones."""
+    match = report.attitude.match
+    xy_px = report.centroids.xy_px
+    matched_px = xy_px[match.observed] if match else np.empty((0, 2))
+    truth_px = truth.sources.xy_px[visible(truth.sources)]
+    picture = annotate(frame.image_dn, xy_px, matched_px, truth_px=truth_px)
+    write_image(folder / f"frame_{frame.index:04d}.annotated.png", picture)
+
+
+def replay_flight(setup: TrialSetup, seed: int, folder: Path, command: str) -> None:
+    """Fly a trial again and write its frames, solutions, telemetry and report, and the annotated images."""
+    with trials.trial_flight(setup, seed) as flight:
+        recorder = Recorder(folder, flight.lab.camera)
+        for shot in flight.shots(cameras=[0]):
+            assert shot.report is not None
+            recorder.add(scoring.score(shot))
+            if shot.frame.index < MAX_FRAMES:
+                write_annotated(folder, shot.frame, shot.truth, shot.report)
+        if recorder.rows:
+            recorder.finish(
+                command, flight.telemetry(), flight.imu_samples(), check(flight.lab)
+            )
+
+
+def replayed_frame(setup: TrialSetup, seed: int) -> tuple[Frame, Truth, Report]:
+    """The frame of a trial, of a flight the first one, with truth and report.
 
     A centroid trial has no frame, so one is rendered at its attitude and shown with the trial's own centroids.
     """
@@ -390,27 +433,20 @@ def replayed_frames(setup: TrialSetup, seed: int) -> Iterator[tuple[Frame, Truth
             **{name: getattr(trial, name) for name in ("tilt_deg", "dec_deg", "near")},
         )
         frame, truth, _ = trials.render_trial_frame(setup._replace(trial=frame_trial), seed)
-        yield (
+        return (
             frame,
             truth,
             solve_or_failed(lambda: trials.solved_centroids(setup, [seed])[0][1]),
         )
-    elif isinstance(trial, FlightTrial):
+    if isinstance(trial, FlightTrial):
         with trials.trial_flight(setup, seed) as flight:
-            for shot in flight.shots(cameras=[0]):
-                assert shot.report is not None
-                yield shot.frame, shot.truth, shot.report
-    else:
-        frame, truth, streak_px = trials.render_trial_frame(setup, seed)
-        yield (
-            frame,
-            truth,
-            solve_or_failed(
-                lambda: factory.solve_frame(
-                    setup.estimator, frame, streak_px, trials.gyro_rate(setup, truth)
-                )
-            ),
-        )
+            shot = next(flight.shots(cameras=[0]))
+            assert shot.report is not None
+            return shot.frame, shot.truth, shot.report
+    frame, truth, streak_px = trials.render_trial_frame(setup, seed)
+    rate = trials.gyro_rate(setup, truth)
+    solve = partial(factory.solve_frame, setup.estimator, frame, streak_px, rate)
+    return frame, truth, solve_or_failed(solve)
 
 
 def solve_or_failed(solve: Callable[[], Report]) -> Report:

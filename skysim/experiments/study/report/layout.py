@@ -277,7 +277,7 @@ def caption(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
         mark = "Hollow, without a line"
         text += curve_note(figure, study, lines, summaries) + "."
         if thresholds_of(figure, study, lines):
-            text += " Dashed: a limit; ticks and bars: where it is crossed, with intervals of 95 %."
+            text += " Dashed: a limit; ticks and bars: where it is crossed, each end at 95 %."
         if (expected := expected_value(value)) is not None:
             text += f" Dotted: {expected:g}, where the claimed errors are true."
     else:

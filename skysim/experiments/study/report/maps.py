@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -130,11 +129,8 @@ def least_values(response: str) -> int:
     Of 1 / (1 - p) values one exceeds the quantile p, of 1 / p one is below it. With fewer values the quantile is about
     the largest or the smallest one.
     """
-    percent = re.search(r"_p(\d+)$", response)
-    if not percent:
-        return MIN_VALUES
-    tail = min(int(percent[1]), 100 - int(percent[1]))
-    return max(MIN_VALUES, math.ceil(100 / tail))
+    share = metrics.QUANTILES.get(metrics.split_name(response)[1], 0.5)
+    return max(MIN_VALUES, math.ceil(round(1 / min(share, 1 - share), 9)))
 
 
 def radial_range(radial_deg: Floats, sky: bool) -> tuple[float, float]:

@@ -27,12 +27,18 @@ from skysim.experiments.study.table import (
     format_summary,
     indices,
     is_sampled,
+    pooled,
+    pooled_row,
+    quantities,
+    rank_correlations,
     same,
     select_responses,
     shown_points,
     table,
 )
-from skysim.experiments.study.worst import ColumnsOf
+from skysim.experiments.study.worst import ColumnsOf, ranked, worst_trials
+from skysim.results import metrics
+from skysim.results.metrics import Columns
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
     Block,
@@ -52,6 +58,7 @@ from skysim.results.report_blocks import (
 )
 
 POINTS = "Points"  # titles of sections
+POOLED = "All points together"
 STUDY_FILE = "The study file"
 LISTED = 10  # maximum number of failures listed
 ROWS = 5000  # maximum number of rows in the table of points
@@ -81,6 +88,8 @@ class Analysis(NamedTuple):
         Sobol indices, for the design saltelli
     result
         Candidates and front, for a search
+    pooled
+        In place of the table of points: all points of a sampled design together
     """
 
     lines: Sequence[PointRow]
@@ -90,6 +99,7 @@ class Analysis(NamedTuple):
     ranges: Sequence[str] = ()
     indices: Sequence[Index] = ()
     result: SearchResult | None = None
+    pooled: Sequence[Block] = ()
 
     @property
     def answers(self) -> list[str]:
@@ -145,18 +155,22 @@ def analyze(plan: Plan, store: Store, command: Callable[[str], str]) -> Analysis
     """The analysis of the trials in a store; `command` is the function of `commands`."""
     study = plan.study
     about = overview(plan)
-    lines = table(store, list(dict.fromkeys([*responses(study), *answer.RESPONSES])))
-    headline = answer.headline(study, lines, about.may_be_ambiguous, command("worst"))
+    names = list(dict.fromkeys([*responses(study), *answer.RESPONSES]))
+    lines = table(store, names)
+    columns = pooled(plan, store)
+    answered = [pooled_row(plan, columns, names)] if columns else lines
+    headline = answer.headline(study, answered, about.may_be_ambiguous, command("worst"))
     headline += answer.one_unit(about.fixed) if headline else []
     sobol = study.design.kind == "saltelli" and not study.optimize
     return Analysis(
         lines,
         about,
-        answer.verdict(study, lines),
+        answer.verdict(study, answered),
         headline,
-        answer.ranges(study, lines),
+        answer.ranges(study, answered),
         indices(plan, store) if sobol else [],
         search.collect_result(plan, store) if study.optimize else None,
+        pooled_blocks(plan, columns, command("replay")) if columns else (),
     )
 
 
@@ -208,10 +222,14 @@ def compose(
         *drawn[:1],
         folded("All answers", [Items(found.headline)], on_terminal=True),
         folded("Further figures", further),
-        folded("Ranges of the responses", [range_table(study, found.lines)]),
+        folded("Ranges of the responses", [range_table(study, found.lines)])
+        if not found.pooled
+        else Text(""),
         Section("Sobol indices", [index_table(found.indices)]),
         Section("Front", front_table(study, found.result)),
-        points_section(lines, study, front, costs),
+        Section(POOLED, found.pooled)
+        if found.pooled
+        else points_section(lines, study, front, costs),
         *scene_sections(found.about, store.meta("code")),
         runs_section(store),
         folded(STUDY_FILE, [Code(store.meta("study"), "yaml")]),
@@ -314,6 +332,37 @@ def points_section(
         )
     shown = Table(columns, rows, from_the_last(len(axes) + 1, len(columns)))
     return Section(POINTS, [shown, Text(note)], folded=len(lines) > OPEN_ROWS)
+
+
+def pooled_blocks(plan: Plan, columns: Columns, replay: str) -> list[Block]:
+    """A sampled design as a whole: each response with its spread, its dependence on the factors, the worst trials."""
+    responses = list(plan.study.responses)
+    for quantity in quantities(responses):
+        tail = ["least"] if quantity in metrics.MORE_IS_BETTER else ["p95", "worst"]
+        responses += [f"{quantity}_{statistic}" for statistic in ("median", *tail)]
+    row = pooled_row(plan, columns, responses)
+    spread = [[name, with_key(one)] for name, one in row.responses.items()]
+    found = rank_correlations(plan, columns)
+    response = responses[0]
+    worst = [
+        [one.value, one.event, one.point, f"`{replay} {one.trial}`"]
+        for one in worst_trials(columns, response, flights=True)
+    ]
+    heads = [text_column("what happened"), Column("point"), text_column("repeat it")]
+    return [
+        Text(f"{row.trials} trials, one at each point; in brackets intervals of 95 %."),
+        Table([text_column("response"), Column("of all points")], spread),
+        Text(
+            "Dependence on the factors: an interval that excludes 0 shows one, 95 % for all together."
+            if found
+            else f"Dependence on the factors: too few to say, {metrics.FEWEST} trials are needed."
+        ),
+        Table(
+            [text_column("quantity"), text_column("factor"), Column("rank correlation")],
+            [[quantity, factor, with_key(one)] for quantity, factor, one in found],
+        ),
+        Table([Column(f"worst {ranked(response)}", format=".4g"), *heads], worst),
+    ]
 
 
 def range_table(study: Study, lines: Sequence[PointRow]) -> Table:
