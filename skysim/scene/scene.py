@@ -138,6 +138,8 @@ class Scene(ConfigModel):
     filter: FilterConfig | None = None
     heads: Annotated[tuple[HeadConfig, ...], Field(max_length=MAX_HEADS)] = ()
     name: Annotated[str, Field(exclude=True, alias=NAME_ALIAS)] = ""
+    # Keys of the vehicle that the loader took from a base with another vehicle.model.
+    _inherited: tuple[str, ...] = ()
 
     @model_validator(mode="after")
     def check_light_source(self) -> Scene:
@@ -409,6 +411,11 @@ class Scene(ConfigModel):
                 section = ".".join(map(str, ("heads", n, *first["loc"])))
                 raise fault_of(first, Scene).under(section) from None
         return self
+
+    @property
+    def inherited(self) -> tuple[str, ...]:
+        """Keys about the vehicle's body that are from a base scene with another `vehicle.model`."""
+        return self._inherited
 
     def of_head(self, n: int) -> Scene:
         """The scene with head n as its only camera, whose noise and timing have their own seed."""
