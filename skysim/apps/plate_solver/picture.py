@@ -38,7 +38,6 @@ ANNOTATED = ".annotated.png"
 # of 4:3; the rest of the uncertainty is rounding, distortion and a small crop.
 DIAGONAL_35MM = math.hypot(36, 24)
 FOCAL_35MM_UNCERTAINTY = 0.10
-TOP_DOWN = "no ROWORDER in the header: its first row is the highest here, not the lowest as the standard recommends"
 
 
 class Reading(NamedTuple):
@@ -298,7 +297,7 @@ def hypotheses(picture: images.ViewedImage, solver: Solver) -> list[Reading]:
                 0, replace(solver, fov_deg=fov_deg, fov_uncertainty=FOCAL_35MM_UNCERTAINTY)
             )
     if not picture.row_order_known:
-        readings.append((np.ascontiguousarray(picture.pixels[::-1]), TOP_DOWN))
+        readings.append((np.ascontiguousarray(picture.pixels[::-1]), images.ASSUMED_TOP_DOWN))
     count = len(solvers) * len(readings)
     return [
         Reading(pixels, replace(one, hypotheses=count), text)
