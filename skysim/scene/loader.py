@@ -480,12 +480,16 @@ def resolve_files(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def resolve_overrides(path: Path, overrides: Mapping[str, str]) -> dict[str, str]:
-    """The overrides with file names made absolute: of files where the command runs, else in the scene's folder."""
+    """The overrides with the names of files in the scene's folder made absolute, unless the command runs beside them.
+
+    A relative `vehicle.model` would be in scenes/, so this name is made absolute in both cases.
+    """
     resolved = dict(overrides)
     for key, name in file_names(with_overrides({}, overrides)):
-        for folder in (path.resolve().parent, Path.cwd()):
-            if is_file(folder / name):
-                resolved[key] = json.dumps(str(folder / name))
+        here = is_file(Path(name))
+        found = (Path.cwd() if here else path.resolve().parent) / name
+        if is_file(found) and (key == "vehicle.model" or not here):
+            resolved[key] = json.dumps(str(found))
     return resolved
 
 
