@@ -473,10 +473,11 @@ FILE_KEYS += tuple(("heads", "*", *keys) for keys in FILE_KEYS if keys[0] in HEA
 
 def resolve_files(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
     """The raw scene with file names made absolute if the file is in the folder of the scene."""
-    folder = path.resolve().parent
-    for keys in FILE_KEYS:
-        tree = resolve_file(folder, tree, *keys)
-    return tree
+    resolved = copy.deepcopy(tree)
+    for key, name in file_names(tree):
+        if is_file(found := path.resolve().parent / name):
+            set_key(resolved, key, json.dumps(str(found), ensure_ascii=False))
+    return resolved
 
 
 def resolve_overrides(path: Path, overrides: Mapping[str, str]) -> dict[str, str]:
@@ -489,21 +490,8 @@ def resolve_overrides(path: Path, overrides: Mapping[str, str]) -> dict[str, str
         here = is_file(Path(name))
         found = (Path.cwd() if here else path.resolve().parent) / name
         if is_file(found) and (key == "vehicle.model" or not here):
-            resolved[key] = json.dumps(str(found))
+            resolved[key] = json.dumps(str(found), ensure_ascii=False)
     return resolved
-
-
-def resolve_file(folder: Path, tree: Any, *keys: str) -> Any:
-    """The tree with the file name under these nested keys made absolute if the file is in the folder."""
-    if not keys:
-        return (
-            str(folder / tree) if isinstance(tree, str) and is_file(folder / tree) else tree
-        )
-    if keys[0] == "*" and isinstance(tree, list):
-        return [resolve_file(folder, item, *keys[1:]) for item in tree]
-    if isinstance(tree, dict) and keys[0] in tree:
-        return tree | {keys[0]: resolve_file(folder, tree[keys[0]], *keys[1:])}
-    return tree
 
 
 def file_names(tree: Any) -> Iterator[tuple[str, str]]:

@@ -298,7 +298,7 @@ def fixed_seeds(study: Study, scene: Scene) -> list[str]:
 def at_factor(study: Study, name: str, level: Value, error: InputError) -> InputError:
     """An error of a level, with the factor that sets the key at fault and its value; one of `hardware` is unchanged.
 
-    If no factor sets the key, a section of it or a key in it, the error keeps its key and states the level.
+    So is an error of a key that no factor sets, nor a section of it or a key in it.
     """
     if error.key == "hardware":
         return error
@@ -311,8 +311,7 @@ def at_factor(study: Study, name: str, level: Value, error: InputError) -> Input
         )
     ]
     if not owners:
-        problem = f"{error.problem} (at factors.{name} {level!r})"
-        return InputError(error.key, problem, error.allowed, error.where)
+        return error
     owner = name if name in owners else owners[0]
     value = level if owner == name else study.factors[owner].value_at(0.5)[0]
     return error.within(f"{value!r}").within(f"factors.{owner}")
