@@ -14,6 +14,7 @@ import pytest
 import skysim
 from skysim.core.paths import DATA
 from skysim.core.yaml_reader import PATTERNS, override_texts
+from skysim.experiments.study import study_file
 
 
 @pytest.mark.parametrize(
@@ -59,3 +60,20 @@ def test_every_pattern_of_the_schema_has_words(schema: str) -> None:
     quantities = ("a-zA-Z", r"[.]?\d")
     plain = {json.loads(one) for one in found}
     assert {one for one in plain if not any(q in one for q in quantities)} <= set(PATTERNS)
+
+
+def test_an_error_of_a_key_that_no_factor_sets_is_not_blamed_on_one(tmp_path: Path) -> None:
+    """An unknown law was reported under factors.com_z, a key of the vehicle."""
+    path = tmp_path / "study.yaml"
+    path.write_text(
+        "schema: 1\ntitle: t\nscene: simsat_slew\nseed: 4\ntrial: {kind: flight}\nreplicates: 2\n"
+        "set: {motion.control: lqrr}\nresponses: [identified]\n"
+        'factors: {com_z: {key: vehicle.center_of_mass.2, values: ["-50 um", "-90 um"]}}\n'
+    )
+    with pytest.raises(skysim.InputError, match=r"^motion.control.law: unknown law 'lqrr'"):
+        study_file.load(path, programs={})
+    path.write_text(path.read_text().replace('"-90 um"', "90").replace("lqrr", "pid"))
+    with pytest.raises(
+        skysim.InputError, match=r"^factors.com_z: 90: vehicle.center_of_mass"
+    ):
+        study_file.load(path, programs={})
