@@ -382,7 +382,8 @@ def test_a_second_of_random_control_of_every_actuator_gives_no_mujoco_warning(
         "gimbal_": {"cmgs": {"rotor_torque_limit": "0.1 N m"}},
         "fan_": {"fans": {}},
     }
-    given = {"model": f"vehicles/{model}", "mount": mount}
+    balanced = {"center_of_mass": ["0 m", "0 m", "0 m"]}
+    given = {"model": f"vehicles/{model}", "mount": mount} | balanced
     for prefix, part in parts.items():
         given |= part if any(name.startswith(prefix) for name in named) else {}
     flight = at_random(

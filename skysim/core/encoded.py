@@ -7,13 +7,13 @@ open TIFF files of 64-bit floats and uses the last of a repeated tag where libti
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import struct
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
@@ -41,6 +41,12 @@ ORIENTATION_TAG = 274
 EXIF_TAG = 34665
 FOCAL_35MM_TAG = 41989
 MAX_ENTRIES = 1 << 16
+MAX_DIRECTORIES = 100
+# A reduced version of another image, in the bits of SUBFILE_TAG; white is 0, by PHOTOMETRIC_TAG.
+SUBFILE_TAG = 254
+REDUCED = 1
+PHOTOMETRIC_TAG = 262
+WHITE_IS_ZERO = 0
 
 
 class TiffEntry(NamedTuple):
@@ -72,11 +78,22 @@ class Tiff:
         """The integer at an offset; `kind` is its format character in the module struct."""
         return int(struct.unpack_from(self.order + kind, self.data, at)[0])
 
+    def directories(self) -> Iterator[int]:
+        """Yield the offsets of the first MAX_DIRECTORIES directories, one for each image."""
+        offset, size, head = ("Q", 20, 8) if self.is_big else ("I", 12, 2)
+        place = 8 if self.is_big else 4
+        for _ in range(MAX_DIRECTORIES):
+            at = self.number(offset, place)
+            if not at:
+                return
+            yield at
+            place = at + head + size * self.number("Q" if self.is_big else "H", at)
+
     def entries(self, at: int | None = None) -> Iterator[TiffEntry]:
         """Yield the entries of the directory at an offset, or of the first directory."""
         big = self.is_big
         if at is None:
-            at = self.number("Q" if big else "I", 8 if big else 4)
+            at = next(self.directories(), 0)
         count = self.number("Q" if big else "H", at)
         # Bytes of an entry, of the count before the first one, and offset of the value field in an entry.
         size, head, value = (20, 8, 12) if big else (12, 2, 8)
@@ -180,7 +197,7 @@ def check_bytes(path: Path) -> None:
         raise InputError(path, f"{size} bytes", f"up to {MAX_BYTES}")
 
 
-@contextmanager
+@contextlib.contextmanager
 def silent_opencv() -> Iterator[None]:
     """Suppress OpenCV's own messages, for example about a missing camera."""
     level = cv2.utils.logging.getLogLevel()
@@ -191,7 +208,7 @@ def silent_opencv() -> Iterator[None]:
         cv2.utils.logging.setLogLevel(level)
 
 
-@contextmanager
+@contextlib.contextmanager
 def silent_stderr() -> Iterator[None]:
     """Suppress output of C libraries: libpng and OpenCV write messages directly to file descriptor 2."""
     sys.stderr.flush()
@@ -221,7 +238,7 @@ def decode_image(path: Path, data: bytes) -> NDArray:
     OpenCV applies the orientation of a TIFF file, but not that of PNG and JPEG.
     """
     check_encoded_size(path, data)
-    check_planes(path, data)
+    check_tiff(path, data)
     try:
         with silent_stderr():
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -285,7 +302,7 @@ def pillow_size(data: bytes) -> Sizes:
         yield image.size, 1 if image.mode in ("1", "L") else 4
 
 
-@contextmanager
+@contextlib.contextmanager
 def opened_by_pillow(data: bytes) -> Iterator[Any]:
     """A JPEG or BMP file as an image of Pillow, which reads only the header; its warnings are suppressed."""
     from PIL import BmpImagePlugin, JpegImagePlugin
@@ -316,9 +333,29 @@ FORMATS: dict[bytes, Callable[[bytes], Sizes]] = {
 }
 
 
-def check_planes(path: Path, data: bytes) -> None:
-    """Raise InputError for a TIFF file of separate color planes, which OpenCV misreads unless they have 8 bits."""
-    size = image_size(data) if data.startswith(MAGICS) else None
+def check_tiff(path: Path, data: bytes) -> None:
+    """Raise InputError for a TIFF file that OpenCV misreads, or of which it reads one image of several.
+
+    It misreads separate color planes unless they have 8 bits, and inverts white zeros in some formats only. Reduced
+    versions of an image are no images of their own.
+    """
+    if not data.startswith(MAGICS):
+        return
+    tiff = Tiff(data)
+    pages = 0
+    with contextlib.suppress(struct.error):  # the file ends before its last directory
+        for at in tiff.directories():
+            tags = {entry.tag: tiff.value(entry) for entry in tiff.entries(at)}
+            if tags.get(PHOTOMETRIC_TAG) == WHITE_IS_ZERO:
+                raise InputError(
+                    path,
+                    "a TIFF file in which 0 is white (PhotometricInterpretation 0)",
+                    "1, 0 is black",
+                )
+            pages += not (tags.get(SUBFILE_TAG) or 0) & REDUCED
+    if pages > 1:
+        raise InputError(path, f"a TIFF file of {pages} images", "a file for each")
+    size = image_size(data)
     if size and size[2] > 1 and size[3] > 8 and size[4]:
         raise InputError(
             path,

@@ -57,6 +57,8 @@ EXPOSURE_KEYS = ("EXPTIME", "EXPOSURE")  # seconds
 TEMPERATURE_KEYS = ("CCD-TEMP", "DET-TEMP")
 # Values of ROWORDER, which is a convention of imaging programs.
 TOP_DOWN = {"TOP-DOWN": True, "BOTTOM-UP": False}
+TOP_DOWN_CARD = ("ROWORDER", "TOP-DOWN", "the first row is the highest")
+ASSUMED_TOP_DOWN = "no ROWORDER in the header: its first row is the highest here, not the lowest as by the standard"
 
 
 class FitsImage(NamedTuple):
@@ -80,11 +82,6 @@ class FitsImage(NamedTuple):
     date_utc: datetime.datetime | None
     exposure_s: float | None
     temperature_c: float | None
-
-
-def read_fits(path: Path) -> NDArray:
-    """The pixels of the first image, rows as stored. Raises InputError with one line."""
-    return read_fits_image(path).pixels
 
 
 def read_fits_image(path: Path) -> FitsImage:
@@ -301,7 +298,14 @@ class ViewedImage:
 
 
 def read_picture(path: Path) -> ViewedImage:
-    """The image as a person sees it. Raises InputError as `read_image` does."""
+    """The image of a FITS, PNG, TIFF, JPEG or BMP file as a person sees it.
+
+    Raises
+    ------
+    InputError
+        With one line for a file that is missing, truncated, not an image, or has too many
+        pixels.
+    """
     check_name(path)
     if not is_fits(path):
         data = path.read_bytes()
@@ -324,19 +328,17 @@ def read_picture(path: Path) -> ViewedImage:
 
 
 def read_image(path: Path) -> NDArray:
-    """The pixels of a FITS, PNG, TIFF, JPEG or BMP file as stored: (H, W) or (H, W, channels), blue first.
-
-    Raises
-    ------
-    InputError
-        With one line for a file that is missing, truncated, not an image, or has too many
-        pixels.
-    """
-    check_name(path)
-    return check_numbers(
-        path,
-        read_fits(path) if is_fits(path) else encoded.decode_image(path, path.read_bytes()),
-    )
+    """The pixels of `read_picture`, for callers that cannot try both row orders: a FITS file must have ROWORDER."""
+    picture = read_picture(path)
+    if not picture.row_order_known and not np.array_equal(
+        picture.pixels, picture.pixels[::-1]
+    ):
+        raise InputError(
+            path,
+            "no ROWORDER in the header",
+            f"{' or '.join(TOP_DOWN)}, or a PNG or TIFF file",
+        )
+    return picture.pixels
 
 
 def image_suffix(name: str) -> str:

@@ -11,6 +11,7 @@ duplicate keys are rejected (`reject_duplicate_keys`). `explain` makes the error
 from __future__ import annotations
 
 import copy
+import datetime
 import difflib
 import functools
 import json
@@ -158,11 +159,26 @@ def parse_overrides(
 
 
 def override_texts(overrides: Mapping[str, Any] | None) -> dict[str, str]:
-    """The values of overrides as YAML texts, like those of `--set`: strings unchanged, other values as JSON."""
-    return {
-        key: value if isinstance(value, str) else json.dumps(value)
-        for key, value in (overrides or {}).items()
-    }
+    """The values of overrides as YAML texts, like those of `--set`: strings unchanged, other values as JSON.
+
+    Numbers and arrays of numpy are those of Python. Raises InputError for values of other types.
+    """
+    if not isinstance(overrides, Mapping | None):
+        raise InputError("overrides", excerpt(repr(overrides)), "values by dotted key")
+    texts = {}
+    for key, value in (overrides or {}).items():
+
+        def as_plain(value: Any, key: object = key) -> Any:
+            if isinstance(value, Path | datetime.date):
+                return str(value)
+            if hasattr(value, "tolist"):
+                return value.tolist()
+            raise InputError(key, excerpt(repr(value)), "text, numbers, lists and mappings")
+
+        if not isinstance(key, str):
+            raise InputError("overrides", excerpt(repr(key)), "dotted keys")
+        texts[key] = value if isinstance(value, str) else json.dumps(value, default=as_plain)
+    return texts
 
 
 def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
@@ -278,7 +294,7 @@ EXPECTED = {
     "less_than": "less than {lt}",
     "less_than_equal": "less than or equal to {le}",
     "literal_error": "{expected}",
-    "string_pattern_mismatch": "text that matches the pattern '{pattern}'",
+    "string_pattern_mismatch": "{pattern}",
     "string_too_short": "at least {min_length} characters",
     "string_too_long": "at most {max_length} characters",
     "too_short": "at least {min_length} values",
@@ -300,6 +316,15 @@ EXPECTED = {
     "datetime_from_date_parsing": "a valid datetime",
     "dict_type": "a mapping of keys to values",
     "string_type": "text",
+}
+
+
+# The patterns of names and keys in words.
+PATTERNS = {
+    r"^\w[\w.-]*$": "letters, digits, _, . and -, the first no . or -",
+    r"^[a-z]\w*$": "letters, digits and _, the first a small letter",
+    r"^[a-z_]+(\.\w+)*$": "a dotted key, such as exposure.time",
+    r"^[a-z_]+(\.\w+)*[._]seed$": "a dotted key of a seed",
 }
 
 
@@ -362,6 +387,8 @@ def fault_of(error: ErrorDetails, model: type[BaseModel]) -> InputError:
     if kind not in EXPECTED:
         return InputError("", f"{value} is not allowed: {error['msg']}")
     limits = {name: plain_number(limit) for name, limit in context.items()}
+    if kind == "string_pattern_mismatch":
+        limits["pattern"] = PATTERNS[limits["pattern"]]
     return InputError("", f"{value} is not allowed", EXPECTED[kind].format(**limits))
 
 
@@ -370,15 +397,15 @@ def plain_number(value: Any) -> Any:
     return f"{Decimal(repr(value)).normalize():f}" if isinstance(value, float) else value
 
 
-def where_of(keys: list[str], files: Files, overrides: Mapping[str, str]) -> Where:
+def where_of(keys: list[str], files: Files, overrides: Mapping[str, str]) -> Where | None:
     """The place that sets a key: OVERRIDES, or the line in the file that has most components of the key."""
     dotted = ".".join(keys)
     if any(k == dotted or dotted.startswith(k + ".") for k in overrides):
         return OVERRIDES
     matches = [(*line_of(text, keys), path) for path, text in files]
-    # `max` takes the first file of those with equal depth.
-    _, line, path = max(matches, key=lambda match: match[0])
-    return Where(path, line)
+    # `max` takes the first file of those with equal depth; in Python there may be no file.
+    _, line, path = max(matches, key=lambda match: match[0], default=(0, None, None))
+    return Where(path, line) if path else None
 
 
 def yaml_keys(loc: tuple[int | str, ...], tree: Any, missing: bool) -> list[int | str]:

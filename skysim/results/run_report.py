@@ -193,7 +193,7 @@ def verdict(rows: Sequence[FrameRow]) -> Verdict:
     run = summary(rows)
     tone: Tone = "good" if run["solved"] == run["frames"] else "warning"
     text = f"{run['solved']} of {run['frames']} frames solved, {run['wrong']} wrong"
-    if run["solved"]:
+    if np.isfinite(run["cross_arcsec_median"]):
         text += (
             f"; cross-boresight median {run['cross_arcsec_median']:.3g}″ worst {run['cross_arcsec_worst']:.3g}″,"
             f" roll median {run['roll_arcsec_median']:.3g}″ worst {run['roll_arcsec_worst']:.3g}″"

@@ -12,7 +12,7 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.results.run import Run, run_of
 from skysim.results.scoring import Score, score
-from skysim.scene.scene import Scene
+from skysim.scene.scene import Scene, check_scene
 from skysim.simulation import timing
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.flight import Progress, open_flight
@@ -70,6 +70,7 @@ def render(scene: Scene, index: int = 0) -> tuple[Frame, Truth]:
     Earlier frames are not rendered, except with a `filter` section or exposure control, where a frame depends on
     them. Raises InputError for an index outside the scene's frames.
     """
+    check_scene(scene)
     frames = scene.exposure.frames
     if not 0 <= index < frames:
         raise InputError(
@@ -114,7 +115,7 @@ def render_at(
     InputError
         For a negative number, and for a camera that the lab does not have.
     """
-    lab = build_lab(scene) if isinstance(scene, Scene) else scene
+    lab = build_lab(scene) if not isinstance(scene, Lab) else scene
     if index < 0:
         raise InputError("index", f"{index} is negative", "0 or more")
     if not 0 <= camera < len(lab.cameras):

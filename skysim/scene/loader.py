@@ -4,7 +4,7 @@
 
 1. Read the scene's file and its `base` scenes as layers (`read_layers`).
 2. Merge them, each over its base, then the overrides of `--set` (`merged`, `with_overrides`). A layer that names a
-   camera preset also drops the keys that this preset defines from the layers below (`over_base`).
+   camera preset or a vehicle's model also drops the keys that this file defines from the layers below (`over_base`).
 3. Merge the camera section over its preset, and the values of a calibration file over both (`apply_preset`).
 4. Validate the tree by pydantic.
 5. Refuse options that have no effect (unused.py).
@@ -17,7 +17,8 @@ from __future__ import annotations
 import contextlib
 import copy
 import functools
-from collections.abc import Callable, Iterator, Mapping
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -181,8 +182,8 @@ def over_base(
 ) -> dict[str, Any]:
     """The keys of a scene merged over the keys of its base.
 
-    A camera preset in `own` also removes the keys of the base that it defines. `motion.start: profile` removes the
-    rate of the base, which the profile defines.
+    A camera preset in `own` also removes the keys of the base that it defines, another `vehicle.model` the mass
+    properties of the base's model. `motion.start: profile` removes the rate of the base, which the profile defines.
 
     Parameters
     ----------
@@ -198,19 +199,64 @@ def over_base(
     if named is not None and isinstance(below, dict):
         with contextlib.suppress(InputError):
             base = base | {"camera": undefined_keys(below, camera_of(named))}
-    motion = own.get("motion")
-    moving = base.get("motion")
-    if isinstance(motion, dict) and isinstance(moving, dict):
-        # In `provenance` a value is an object that also has its origin.
-        start = motion.get("start")
-        if getattr(start, "value", start) == "profile":
-            kept = {key: value for key, value in moving.items() if key != "rate_deg_s"}
-            base = base | {"motion": kept}
+    if plain_at(own, "motion", "start") == "profile":
+        base = without_keys(base, "motion", ("rate_deg_s",))
+    if has_other_model(own, base):
+        base = without_keys(base, "vehicle", MASS_KEYS)
     return merge(base, own)
 
 
 # Keys that remove others of the base, see `over_base`.
-REPLACING = ("camera.preset", "motion.start")
+REPLACING = ("camera.preset", "motion.start", "vehicle.model")
+MASS_KEYS = ("mass", "inertia", "center_of_mass")
+# Further keys about the vehicle's body, which those of a base may not suit.
+BODY_KEYS = (
+    "camera",
+    "camera_rotation_deg",
+    "torque_limit",
+    "wheels",
+    "fans",
+    "cmgs",
+    "trim",
+    "drag",
+)
+
+
+def plain_at(tree: dict[str, Any], section: str, key: str) -> Any:
+    """The value of a section's key, None without one. In `provenance` a value is an object with its origin."""
+    found = tree[section].get(key) if isinstance(tree.get(section), dict) else None
+    return getattr(found, "value", found)
+
+
+def without_keys(tree: dict[str, Any], section: str, keys: Sequence[str]) -> dict[str, Any]:
+    """The tree without these keys of a section."""
+    inner = tree.get(section)
+    if not isinstance(inner, dict):
+        return tree
+    return tree | {section: {key: inner[key] for key in inner if key not in keys}}
+
+
+def has_other_model(own: dict[str, Any], base: dict[str, Any]) -> bool:
+    """Whether a scene names another model of the vehicle than its base does."""
+    names = [plain_at(tree, "vehicle", "model") for tree in (own, base)]
+    return None not in names and len({SCENES / str(name) for name in names}) == 2
+
+
+def inherited_keys(trees: Sequence[dict[str, Any]]) -> tuple[str, ...]:
+    """The BODY_KEYS that a vehicle has from below its model, from a base with another one.
+
+    The trees are those of the layers, the overrides' first.
+    """
+    for n, tree in enumerate(trees):
+        below = trees[n + 1 :]
+        if any(has_other_model(tree, base) for base in below):
+            return tuple(
+                key
+                for key in BODY_KEYS
+                if all(plain_at(one, "vehicle", key) is None for one in trees[: n + 1])
+                and any(plain_at(one, "vehicle", key) is not None for one in below)
+            )
+    return ()
 
 
 def undefined_keys(section: dict[str, Any], defined: dict[str, Any]) -> dict[str, Any]:
@@ -264,7 +310,7 @@ def load(
         With one line: the key, the problem, the allowed values, the file and the line.
     """
     path = find(str(name))
-    overrides = overrides or {}
+    overrides = resolve_overrides(path, overrides or {})
     # 1. Files.
     layers = read_layers(path)
     # 2. to 4. Merging and validation.
@@ -283,9 +329,12 @@ def validate(layers: list[Layer], overrides: Mapping[str, str]) -> Scene:
     files = locations(layers)
     try:
         raw = apply_preset(tree, files, overrides)
-        return Scene.model_validate(raw | {NAME_ALIAS: layers[0].path.stem})
+        scene = Scene.model_validate(raw | {NAME_ALIAS: layers[0].path.stem})
     except ValidationError as error:
         raise explain(error, Scene, tree, files, overrides) from None
+    trees = (with_overrides({}, overrides), *(layer.tree for layer in layers))
+    scene._inherited = inherited_keys(trees)
+    return scene
 
 
 def with_overrides(tree: dict[str, Any], overrides: Mapping[str, str]) -> dict[str, Any]:
@@ -424,23 +473,25 @@ FILE_KEYS += tuple(("heads", "*", *keys) for keys in FILE_KEYS if keys[0] in HEA
 
 def resolve_files(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
     """The raw scene with file names made absolute if the file is in the folder of the scene."""
-    folder = path.resolve().parent
-    for keys in FILE_KEYS:
-        tree = resolve_file(folder, tree, *keys)
-    return tree
+    resolved = copy.deepcopy(tree)
+    for key, name in file_names(tree):
+        if is_file(found := path.resolve().parent / name):
+            set_key(resolved, key, json.dumps(str(found), ensure_ascii=False))
+    return resolved
 
 
-def resolve_file(folder: Path, tree: Any, *keys: str) -> Any:
-    """The tree with the file name under these nested keys made absolute if the file is in the folder."""
-    if not keys:
-        return (
-            str(folder / tree) if isinstance(tree, str) and is_file(folder / tree) else tree
-        )
-    if keys[0] == "*" and isinstance(tree, list):
-        return [resolve_file(folder, item, *keys[1:]) for item in tree]
-    if isinstance(tree, dict) and keys[0] in tree:
-        return tree | {keys[0]: resolve_file(folder, tree[keys[0]], *keys[1:])}
-    return tree
+def resolve_overrides(path: Path, overrides: Mapping[str, str]) -> dict[str, str]:
+    """The overrides with the names of files in the scene's folder made absolute, unless the command runs beside them.
+
+    A relative `vehicle.model` would be in scenes/, so this name is made absolute in both cases.
+    """
+    resolved = dict(overrides)
+    for key, name in file_names(with_overrides({}, overrides)):
+        here = is_file(Path(name))
+        found = (Path.cwd() if here else path.resolve().parent) / name
+        if is_file(found) and (key == "vehicle.model" or not here):
+            resolved[key] = json.dumps(str(found), ensure_ascii=False)
+    return resolved
 
 
 def file_names(tree: Any) -> Iterator[tuple[str, str]]:
@@ -453,8 +504,10 @@ def file_names(tree: Any) -> Iterator[tuple[str, str]]:
         if not keys:
             if isinstance(node, str):
                 yield ".".join(path), node
-        elif keys[0] == "*" and isinstance(node, list | tuple):
-            for n, item in enumerate(node):
+        elif keys[0] == "*" and isinstance(node, list | tuple | dict):
+            # Overrides of items are keys of a mapping: heads.0.camera.psf.file.
+            items = node.items() if isinstance(node, dict) else enumerate(node)
+            for n, item in items:
                 yield from below(item, keys[1:], (*path, str(n)))
         elif isinstance(node, dict) and keys[0] in node:
             yield from below(node[keys[0]], keys[1:], (*path, keys[0]))

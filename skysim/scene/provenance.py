@@ -73,9 +73,10 @@ class Located:
 def effective(name: str | Path, overrides: Mapping[str, str] | None = None) -> list[Entry]:
     """All keys of a scene in the order of the schema. Raises InputError as `loader.load`."""
     # 1. Tree with origins.
-    overrides = overrides or {}
+    path = loader.find(str(name))
+    overrides = loader.resolve_overrides(path, overrides or {})
     scene = loader.load(name, overrides)
-    tree = located_tree(loader.read_layers(loader.find(str(name))), overrides)
+    tree = located_tree(loader.read_layers(path), overrides)
     # 2. Fields of the scene. 3. Reasons.
     found = []
     for entry in entries(scene, tree):

@@ -9,9 +9,10 @@ from __future__ import annotations
 import datetime
 import html
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic._internal._model_construction import ModelMetaclass
 
 from skysim.core.constants import DAY_S
 from skysim.core.errors import InputError
@@ -19,7 +20,7 @@ from skysim.core.random_streams import HEAD_SEED, derived_seed
 from skysim.core.time import check_year
 from skysim.core.tolerance import TimeError
 from skysim.core.units import ConfigModel, Length, Number, Spin, Time
-from skysim.core.yaml_reader import fault_of
+from skysim.core.yaml_reader import excerpt, explain, fault_of
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, FurtherLight, Light, StarsConfig
@@ -117,7 +118,17 @@ MAX_HEADS = 8
 HEAD_SECTIONS = ("camera", "tracker", "exposure")
 
 
-class Scene(ConfigModel):
+class SceneKind(ModelMetaclass):
+    """The class of `Scene`: a scene from Python's keywords is refused in one line, like one from a file."""
+
+    def __call__(cls, /, **keys: Any) -> Any:
+        try:
+            return super().__call__(**keys)
+        except ValidationError as error:
+            raise explain(error, Scene, keys, [], {}) from None
+
+
+class Scene(ConfigModel, metaclass=SceneKind):
     """A complete simulation: the laboratory, the vehicle and its motion, the light, the camera and the tracker."""
 
     schema_version: Annotated[Literal[1], Field(alias="schema")]
@@ -138,6 +149,8 @@ class Scene(ConfigModel):
     filter: FilterConfig | None = None
     heads: Annotated[tuple[HeadConfig, ...], Field(max_length=MAX_HEADS)] = ()
     name: Annotated[str, Field(exclude=True, alias=NAME_ALIAS)] = ""
+    # Keys of the vehicle that the loader took from a base with another vehicle.model.
+    _inherited: tuple[str, ...] = ()
 
     @model_validator(mode="after")
     def check_light_source(self) -> Scene:
@@ -410,6 +423,11 @@ class Scene(ConfigModel):
                 raise fault_of(first, Scene).under(section) from None
         return self
 
+    @property
+    def inherited(self) -> tuple[str, ...]:
+        """Keys about the vehicle's body that are from a base scene with another `vehicle.model`."""
+        return self._inherited
+
     def of_head(self, n: int) -> Scene:
         """The scene with head n as its only camera, whose noise and timing have their own seed."""
         head = self.heads[n]
@@ -481,3 +499,9 @@ class Scene(ConfigModel):
     def control_rate_hz(self) -> float:
         """Rate of the control periods, with or without a controller."""
         return self.motion.control.rate_hz if self.motion.control else 100.0
+
+
+def check_scene(scene: object) -> None:
+    """Raise InputError for what is no scene, such as the name of one."""
+    if not isinstance(scene, Scene):
+        raise InputError("scene", excerpt(repr(scene)), "a Scene, as from skysim.load_scene")

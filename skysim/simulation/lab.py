@@ -33,7 +33,7 @@ from skysim.dynamics.controllers import ControllerSource, Factory
 from skysim.dynamics.multibody import mjcf_export
 from skysim.dynamics.profiles import load_profiles
 from skysim.dynamics.reference_curves import AttitudeSpline
-from skysim.scene.scene import Scene
+from skysim.scene.scene import Scene, check_scene
 from skysim.scene.sections.camera import ColorEfficiencyConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.scene.sections.motion import (
@@ -103,6 +103,7 @@ def with_parts(
     InputError
         For a part of a wrong type.
     """
+    check_scene(scene)
     motion = scene.motion
     law = None
     estimator = None
@@ -360,6 +361,7 @@ def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:
         any long work.
     """
     # 1. Names and files.
+    check_scene(scene)
     check_hardware(scene, parts.programs, parts.tracker is None)
     if scene.motion.control:
         parts.controllers.check_name(scene.motion.control.law)

@@ -38,6 +38,7 @@ from skysim.sources.ephemeris import (
 from skysim.sources.orbit_elements import (
     MeanElements,
     OrbitEphemeris,
+    check_epochs,
     gcrs_states,
     read_elements,
     read_oem,
@@ -171,7 +172,9 @@ def tle(config: TleOrbitConfig, start: datetime.datetime) -> TleOrbit:
             f"{config.number}: {len(rows)} satellites of {config.file}",
             f"one of {listed}",
         )
-    return TleOrbit(elements.take(rows), start)
+    chosen = elements.take(rows)
+    check_epochs(config.file, chosen, start)
+    return TleOrbit(chosen, start)
 
 
 def oem(config: OemOrbitConfig, start: datetime.datetime) -> OemOrbit:

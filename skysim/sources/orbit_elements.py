@@ -38,6 +38,7 @@ from skysim.core.time import J2000_JD, SCALES, tt_jd, ut1_jd, utc_days
 from skysim.core.types import Floats
 
 MAX_SATELLITES = 100_000  # in a file
+MAX_AGE_DAYS = 365  # of the elements that are nearest in time
 REQUIRED = (
     "NORAD_CAT_ID",
     "EPOCH",
@@ -75,6 +76,18 @@ class MeanElements(NamedTuple):
         """The elements of the chosen satellites."""
         rows = list(which)
         return MeanElements(*(tuple(column[n] for n in rows) for column in self))  # type: ignore[arg-type]
+
+
+def check_epochs(path: str, elements: MeanElements, time: datetime.datetime) -> None:
+    """Raise InputError if all elements are of an epoch too far from a time for places by SGP4."""
+    epoch_days = [one.jdsatepoch - J2000_JD + one.jdsatepochF for one in elements.records]
+    nearest = min((utc_days(time) - one for one in epoch_days), key=abs)
+    if abs(nearest) > MAX_AGE_DAYS:
+        raise InputError(
+            path,
+            f"elements of {abs(nearest):.0f} days {'before' if nearest > 0 else 'after'} start_time {time:%Y-%m-%d}",
+            f"{MAX_AGE_DAYS} days: the error grows by 1 to 3 km a day",
+        )
 
 
 def read_elements(path: str) -> MeanElements:

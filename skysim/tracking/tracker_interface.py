@@ -355,11 +355,12 @@ def write_fits(path: Path, picture: Picture) -> None:
     """Write the frame as FITS with times in the header, but without the truth that the frames of a run contain."""
     from astropy.io import fits
 
-    from skysim.core import files
+    from skysim.core import files, images
 
     header = fits.Header(
         {"EXPTIME": picture.exposure_s, "TMID": picture.t_s, "FRAME": picture.frame}
     )
+    header.append(images.TOP_DOWN_CARD)
     with files.atomic_file(path) as temporary:
         fits.PrimaryHDU(picture.image_dn, header).writeto(temporary, overwrite=True)
 

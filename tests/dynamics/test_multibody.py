@@ -32,6 +32,7 @@ SIMSAT = {
     "model": "vehicles/simsat.xml",
     "mass": "80 kg",
     "inertia": ["6 kg m2", "6.5 kg m2", "9 kg m2"],
+    "center_of_mass": ["0 m", "0 m", "0 m"],
 }
 
 
@@ -96,14 +97,35 @@ def test_balance_masses_do_not_move_the_camera() -> None:
     )
 
 
-def test_an_undeclared_mass_is_taken_from_the_file() -> None:
-    """The sum of the geoms in simsat.xml, read as text."""
+def test_undeclared_mass_properties_are_those_of_the_file() -> None:
+    """The sum of the geoms in simsat.xml, read as text, and their center by MuJoCo alone."""
     text = (SCENES / "vehicles" / "simsat.xml").read_text(encoding="utf-8")
     spec = mujoco.MjSpec.from_string(text)
     listed = sum(geom.mass for geom in spec.geoms)
     own = multibody.build(VehicleConfig.model_validate({"model": "vehicles/simsat.xml"}))
     assert own.mass.mass_kg == pytest.approx(listed, rel=1e-12)
-    np.testing.assert_allclose(own.mass.center_m, np.zeros(3), rtol=0, atol=1e-12)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    center_m = data.subtree_com[model.body("bus").id]
+    assert np.linalg.norm(center_m) > 0.01
+    np.testing.assert_allclose(own.mass.center_m, center_m, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("given", [{}, {"center_of_mass": None}])
+def test_a_vehicle_swings_about_the_center_of_mass_of_its_file(
+    tmp_path: Path, given: dict[str, None]
+) -> None:
+    """A compound pendulum, 2 mm below the bearing: theta = theta_0 cos(w t), w^2 = m g l / (I + m l^2)."""
+    inertial = '<inertial pos="0 0 -0.002" mass="12" diaginertia="0.4 0.5 0.6"/>'
+    own = built(tmp_path, f'<body name="bus">{inertial}{CAMERA}</body>', "", **given)
+    begin = Rotation.from_euler("x", 1.0, degrees=True)
+    flight = multibody.simulate(own, begin, STILL, 2.0)
+    w_rad_s = math.sqrt(12 * 9.80665 * 0.002 / (0.4 + 12 * 0.002**2))
+    expected_deg = np.cos(w_rad_s * 2.0)
+    assert abs(expected_deg) < 0.5
+    turned_deg = np.degrees(flight.attitude_at(2.0).as_rotvec()[0])
+    assert turned_deg == pytest.approx(expected_deg, abs=1e-3)
 
 
 def test_mass_less_than_what_the_bus_carries_is_refused() -> None:

@@ -26,6 +26,7 @@ SIMSAT = {
     "model": "vehicles/simsat.xml",
     "mass": "80 kg",
     "inertia": ["6 kg m2", "6.5 kg m2", "9 kg m2"],
+    "center_of_mass": ["0 m", "0 m", "0 m"],
 }
 SPINNING: dict[str, object] = {
     "mount": "free",

@@ -129,3 +129,21 @@ def test_an_orbit_needs_the_sky() -> None:
         InputError, match=r"orbit: light of kind dome is in a laboratory; allowed: stars"
     ):
         loader.load("afit_simsat", {"orbit": ORBIT})
+
+
+@pytest.mark.parametrize("key", ["orbit", "light.satellites"])
+def test_elements_of_another_year_are_refused(key: str, tmp_path: Path) -> None:
+    """The epoch is 2006-02-17: SGP4 would be 1 to 3 km a day off (the verification of Vallado et al. 2006)."""
+    path = tmp_path / "x.tle"
+    path.write_text(
+        "1 06251U 62025E   06176.82412014  .00008885  00000-0  12808-3 0  3985\n"
+        "2 06251  58.0579  54.0425 0030035 139.1568 221.1854 15.56387291  6774\n"
+    )
+    section = {"orbit": "{kind: tle, file: %s}", "light.satellites": "{file: %s}"}[key] % path
+    space = {key: section, "orbit": "{kind: circular, altitude: 500 km, inclination_deg: 60}"}
+    space[key] = section
+    build_lab(loader.load("shefex2", space | {"start_time": "2007-06-20T00:00:00"}))
+    with pytest.raises(
+        InputError, match=r"x.tle: elements of 6\d\d\d days before start_time 2024"
+    ):
+        build_lab(loader.load("shefex2", space | {"start_time": "2024-06-20T00:00:00"}))

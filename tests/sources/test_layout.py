@@ -591,7 +591,7 @@ def test_a_survey_s_file_is_a_list_of_leds(tmp_path: Path) -> None:
         ("x_m,y_m,z_m,id\n0,0,1.2,1e300\n", "id 1e+300; allowed: whole numbers from 0"),
         (
             "x_m,y_m\n1,2\n",
-            "not a list of LEDs; allowed: columns x_m, y_m, z_m or azimuth_deg, tilt_deg",
+            "not a list of LEDs; allowed: columns x_m, y_m, z_m or azimuth_deg, tilt_deg, or x_mm",
         ),
         ("azimuth_deg,tilt_deg\n", "not a list of LEDs"),
         ("", "not a list of LEDs"),
@@ -911,3 +911,34 @@ def test_the_measured_order_and_ratio_of_levels_matches_table_7() -> None:
         [TABLE_7[on_us] / ours[n] for n, on_us in enumerate(TABLE_7) if 200 <= on_us <= 500]
     )
     np.testing.assert_allclose(slopes / slopes.mean(), 1, rtol=0, atol=0.05)
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("mm", 1e-3), ("cm", 0.01), ("in", INCH_M)])
+def test_the_header_of_a_list_states_the_unit(
+    unit: str, scale: float, tmp_path: Path
+) -> None:
+    place_m = lit({"kind": "listed", "directions_deg": [[0, 0], [90, 30]]}, MEASURED).place
+    path = tmp_path / "leds.csv"
+    rows = "\n".join(",".join(map(repr, row)) for row in (place_m[:, :3] / scale).tolist())
+    path.write_text(f"x_{unit},y_{unit},z_{unit}\n{rows}\n")
+    read = lit({"kind": "listed", "file": str(path)}, MEASURED).place
+    np.testing.assert_allclose(read, place_m, rtol=0, atol=1e-12)
+    path.write_text(f"x_m,y_m,z_m\n{rows}\n")
+    with pytest.raises(InputError, match=r"m from the surface; allowed: 0.05 m; .* x_mm"):
+        lit({"kind": "listed", "file": str(path)}, MEASURED)
+
+
+@pytest.mark.parametrize("names", ["azimuth_deg,tilt_deg", "azimuth_deg,tilt_deg,id"])
+def test_an_led_that_is_listed_twice_is_refused(names: str, tmp_path: Path) -> None:
+    """Without a column id a repeated row was a light more; at the zenith any azimuth is the same place."""
+    path = tmp_path / "leds.csv"
+    rows = [
+        f"{azimuth},{tilt},{n}"
+        for n, (azimuth, tilt) in enumerate([(0, 0), (90, 30), (7, 0)])
+    ]
+    columns = names.count(",") + 1
+    path.write_text("\n".join([names, *(",".join(row.split(",")[:columns]) for row in rows)]))
+    with pytest.raises(
+        InputError, match=r"leds.csv.2: at the place of 0; allowed: each LED once"
+    ):
+        lit({"kind": "listed", "file": str(path)}, MEASURED)

@@ -46,7 +46,6 @@ LIST_SIGMA_PX = 0.1
 # of 4:3; the rest of the uncertainty is rounding, distortion and a small crop.
 DIAGONAL_35MM = math.hypot(36, 24)
 FOCAL_35MM_UNCERTAINTY = 0.10
-TOP_DOWN = "no ROWORDER in the header: its first row is the highest here, not the lowest as the standard recommends"
 
 
 class Reading(NamedTuple):
@@ -415,7 +414,7 @@ def hypotheses(picture: images.ViewedImage, solver: Solver) -> list[Reading]:
             )
     if not picture.row_order_known:
         turned = np.ascontiguousarray(picture.pixels[::-1])
-        readings.append((turned, TOP_DOWN, not picture.flipped))
+        readings.append((turned, images.ASSUMED_TOP_DOWN, not picture.flipped))
     count = len(solvers) * len(readings)
     return [
         Reading(pixels, replace(one, hypotheses=count), text, flipped)

@@ -76,8 +76,8 @@ def parallel_axis(mass_kg: float, position_m: Floats) -> Floats:
 def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> MassProperties:
     """Set the mass properties of body bus so that the vehicle has the declared ones, which are returned.
 
-    1. The declared properties: mass and inertia of the scene, or of the file if the scene leaves them out, and the
-       scene's center of mass. The inertia is about the bearing's center, with principal axes along the body's.
+    1. The declared properties: those of the scene, or of the file where the scene leaves one out. The scene's inertia
+       is about the bearing's center, with principal axes along the body's.
     2. The bus has the declared mass and first moment minus those of what it carries.
     3. Its inertia about its own center is the declared one minus that of what it carries, minus Steiner's term.
 
@@ -87,12 +87,12 @@ def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Ma
     # 1. Declared properties.
     total = tree_mass(model)
     carried = tree_mass(model, without_bus=True)
-    center = np.array(vehicle.center_of_mass_m)
-    inertia = (
-        total.inertia_kg_m2
-        if vehicle.inertia_kg_m2 is None
-        else np.diag(vehicle.inertia_kg_m2)
-    )
+    center = total.center_m
+    inertia = total.inertia_kg_m2
+    if vehicle.center_of_mass_m is not None:
+        center = np.array(vehicle.center_of_mass_m)
+    if vehicle.inertia_kg_m2 is not None:
+        inertia = np.diag(vehicle.inertia_kg_m2)
     declared = MassProperties(vehicle.mass_kg or total.mass_kg, center, inertia)
     # 2. Mass and center of the bus.
     mass = declared.mass_kg - carried.mass_kg

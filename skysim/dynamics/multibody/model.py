@@ -53,6 +53,7 @@ from skysim.dynamics.multibody.wheels import WHEEL
 from skysim.scene.sections.vehicle import VehicleConfig
 
 STEP_S = 1e-3
+CENTERED_M = 1e-9  # offset of a file's center of mass by rounding
 IMU = "imu"
 REQUIRED = f"body bus and camera {CAMERA}"
 
@@ -134,12 +135,6 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Tr
     its center of mass, which must be the body's origin. The steps are those of the module's docstring. Raises
     InputError.
     """
-    if vehicle.mount == "free" and any(vehicle.center_of_mass_m):
-        raise InputError(
-            "vehicle.center_of_mass",
-            "a free vehicle rotates about it, so it must be the body's origin",
-            "0",
-        )
     # 1. Body bus. The compiler must not fuse bodies until the bearing is added.
     spec = load(path)
     spec.compiler.fusestatic = False
@@ -156,6 +151,12 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Tr
         ) from None
     # 4. Mass properties.
     mass = declare_mass(bus, bare, vehicle, path)
+    if vehicle.mount == "free" and np.abs(mass.center_m).max() > CENTERED_M:
+        raise InputError(
+            "vehicle.center_of_mass",
+            "a free vehicle rotates about it, so it must be the body's origin",
+            f"[0 m, 0 m, 0 m]; it is {np.round(mass.center_m, 6).tolist()} m",
+        )
     # 5. Bearing.
     try:
         add_bearing(spec, bus, vehicle)

@@ -308,7 +308,7 @@ def write_frames(camera: CameraConfig, folder: Path, seed: int) -> Iterator[Path
             "/", ""
         )
         for n, frame in enumerate(frames_of(camera, shot, seed)):
-            header = fits.Header()
+            header = fits.Header([images.TOP_DOWN_CARD])
             header["EXPTIME"] = (shot.exposure_s, "exposure [s]")
             header["CCD-TEMP"] = (shot.temperature_c, "temperature of the chip [C]")
             path = parent / f"{name}_{n:03d}.fits"

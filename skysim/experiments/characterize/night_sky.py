@@ -268,17 +268,16 @@ class NightFrame(NamedTuple):
     centroids: Centroids
     stars: StarImages
     date_utc: datetime.datetime | None
+    row_order_known: bool = True
 
 
 def measure_night(
     config: CameraConfig, folder: Path, transfer: Transfer, saturation_dn: float
 ) -> Night:
     """The lens from frames of the sky. Raises InputError for frames that cannot be used."""
-    frames = [
-        read_frame(path, config, transfer, saturation_dn) for path in image_files(folder)
-    ]
-    still = [without_trail(one.stars) for one in frames]
-    stars = StarImages(*(np.concatenate(part) for part in zip(*still, strict=True)))
+    paths = image_files(folder)
+    frames = [read_frame(path, config, transfer, saturation_dn) for path in paths]
+    stars = all_stars(frames)
     if len(stars.chi2) < LEAST_STARS:
         raise InputError(
             folder,
@@ -288,6 +287,12 @@ def measure_night(
         )
     check_trails(frames)
     lens, remarks = find_lens(config, frames, transfer, saturation_dn)
+    if lens is None and not all(one.row_order_known for one in frames):
+        frames = [read_frame(path, config, transfer, saturation_dn, True) for path in paths]
+        lens, found = find_lens(config, frames, transfer, saturation_dn)
+        if lens:
+            stars = all_stars(frames)
+            remarks = [f"rows: {images.ASSUMED_TOP_DOWN}", *found]
     center_px = lens.camera.center_px if lens else config.center_px
     size = image_size(stars, center_px, config.corner_px)
     if size is None:
@@ -302,12 +307,27 @@ def measure_night(
     return Night(size, lens, len(frames), identified, remarks)
 
 
+def all_stars(frames: list[NightFrame]) -> StarImages:
+    """The star images of all frames, without the effect of trails."""
+    still = [without_trail(one.stars) for one in frames]
+    return StarImages(*(np.concatenate(part) for part in zip(*still, strict=True)))
+
+
 def read_frame(
-    path: Path, config: CameraConfig, transfer: Transfer, saturation_dn: float
+    path: Path,
+    config: CameraConfig,
+    transfer: Transfer,
+    saturation_dn: float,
+    as_stored: bool = False,
 ) -> NightFrame:
-    """Detect and fit the stars of a frame. Raises InputError for a frame of another camera."""
+    """Detect and fit the stars of a frame. Raises InputError for a frame of another camera.
+
+    as_stored takes the first row of a file without a row order for the highest.
+    """
     picture = images.read_picture(path)
     numbers = raw_numbers(path, picture.pixels)
+    if as_stored and not picture.row_order_known:
+        numbers = np.ascontiguousarray(numbers[::-1])
     if numbers.shape != (config.height_px, config.width_px):
         size = f"{numbers.shape[1]} x {numbers.shape[0]} pixels"
         raise InputError(
@@ -325,7 +345,11 @@ def read_frame(
     gain = float(transfer.values[GAIN])
     read = float(transfer.values[READ])
     return NightFrame(
-        path, centroids, fit_images(signal, chosen, gain, read), picture.date_utc
+        path,
+        centroids,
+        fit_images(signal, chosen, gain, read),
+        picture.date_utc,
+        picture.row_order_known,
     )
 
 

@@ -98,7 +98,7 @@ def lights_of(path: Path, camera: Camera, settings: Settings) -> Centroids:
 
 def pixels_of(path: Path, camera: Camera) -> NDArray:
     """The pixels of an image of the camera, the highest row first. Raises InputError for another size."""
-    pixels = images.monochrome(images.read_picture(path).pixels)
+    pixels = images.monochrome(images.read_image(path))
     if pixels.shape != (camera.height_px, camera.width_px):
         raise InputError(
             path,

@@ -296,15 +296,23 @@ def fixed_seeds(study: Study, scene: Scene) -> list[str]:
 
 
 def at_factor(study: Study, name: str, level: Value, error: InputError) -> InputError:
-    """An error of a level, with the factor that sets the key at fault and its value; one of `hardware` is unchanged."""
+    """An error of a level, with the factor that sets the key at fault and its value; one of `hardware` is unchanged.
+
+    So is an error of a key that no factor sets, nor a section of it or a key in it.
+    """
     if error.key == "hardware":
         return error
     owners = [
         other
         for other, factor in study.factors.items()
-        if error.key in dict(factor.value_at(0.5)[1])
+        if any(
+            f"{key}.".startswith(f"{error.key}.") or f"{error.key}.".startswith(f"{key}.")
+            for key in dict(factor.value_at(0.5)[1])
+        )
     ]
-    owner = name if name in owners or not owners else owners[0]
+    if not owners:
+        return error
+    owner = name if name in owners else owners[0]
     value = level if owner == name else study.factors[owner].value_at(0.5)[0]
     return error.within(f"{value!r}").within(f"factors.{owner}")
 

@@ -20,7 +20,7 @@ from skysim.camera import wcs
 from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.core.files import atomic_file, write_png16, write_table
-from skysim.core.images import read_fits
+from skysim.core.images import TOP_DOWN_CARD, read_image
 from skysim.core.types import ATTITUDES, Floats, Frame, Truth
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
@@ -79,7 +79,7 @@ class Recording:
 
     def image(self, stem: Path) -> NDArray[Any]:
         """A frame's digital numbers: (H, W) uint16, or float64 from a noise-free camera. Raises InputError."""
-        image = read_fits(stem.with_suffix(".fits"))
+        image = read_image(stem.with_suffix(".fits"))
         if image.ndim != 2 or not image.size:
             raise InputError(
                 f"{stem}.fits", f"an image of shape {image.shape}", "(height, width)"
@@ -262,7 +262,7 @@ def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
     header["SCENE"] = (scene.name, "scene")
     header["SEED"] = (scene.seed, "seed of every random stream")
     header["FRAME"] = (frame.index, "index of the frame")
-    header["ROWORDER"] = ("TOP-DOWN", "the first row is the highest")
+    header.append(TOP_DOWN_CARD)
     header["SATURATE"] = (frame.saturation_dn, "saturation [DN]")
     if isinstance(scene.light, StarsConfig):
         header.update(wcs.header(scene.camera, truth.mean_cam_from_lab))

@@ -336,8 +336,8 @@ class ListedConfig(DimmedConfig):
     directions_deg
         Azimuth from +x toward +y, and tilt from the zenith
     file
-        File with columns x_m, y_m, z_m or azimuth_deg, tilt_deg; optionally level or magnitude, and id, the numbers of
-        the LEDs. `skysim scenes export --out leds.csv` and `skysim survey` write such files
+        File with columns x_m, y_m, z_m (or x_mm, x_cm, x_in) or azimuth_deg, tilt_deg; optionally level or magnitude,
+        and id, the numbers of the LEDs. `skysim scenes export --out leds.csv` and `skysim survey` write such files
     types
         Type of each LED, a name in `led.types`; `led` if left out
     """

@@ -276,7 +276,7 @@ class VehicleConfig(ConfigModel):
     mount
         `air_bearing`: gravity and a tilt stop; `free`: neither; `two_axis`: follows a profile with `gimbals`
     mass, inertia, center_of_mass
-        Mass properties with all trim masses at zero; mass and inertia are those of the file if left out
+        Mass properties with all trim masses at zero; those of the file if left out
     camera
         Entrance pupil on the body, with which the housing moves; that of the file if left out
     camera_rotation_deg
@@ -296,7 +296,7 @@ class VehicleConfig(ConfigModel):
     mount: Literal["air_bearing", "free", "two_axis"] = "air_bearing"
     mass_kg: Annotated[Mass, Field(gt=0)] | None = None
     inertia_kg_m2: tuple[Inertia, Inertia, Inertia] | None = None
-    center_of_mass_m: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
+    center_of_mass_m: tuple[Length, Length, Length] | None = None
     camera_m: tuple[Length, Length, Length] | None = None
     camera_rotation_deg: tuple[Spin, Spin, Spin] = (0.0, 0.0, 0.0)
     tilt_stop_deg: Annotated[Number, Field(gt=0, lt=90)] = 30.0

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -368,6 +369,26 @@ def wall(context: Context, samples: CheckedSamples) -> Fact | None:
     return Fact("dome's wall", [text + ", without ribs and flange"], values)
 
 
+def mass_properties(context: Context, samples: CheckedSamples) -> Fact:
+    """Mass, inertia about the bearing's center and center of mass, each with its origin: the scene or the model."""
+    vehicle = context.lab.vehicle
+    config = vehicle.config
+    mass = vehicle.mass
+    numbers = (
+        ("mass_kg", mass.mass_kg, "{} kg", 1.0),
+        ("inertia_kg_m2", mass.inertia_kg_m2.diagonal(), "inertia {} kg m²", 1.0),
+        ("center_of_mass_m", mass.center_m, "center of mass {} mm", 1e3),
+    )
+    texts = []
+    values: dict[str, Any] = {}
+    for key, number, text, scale in numbers:
+        origin = Path(config.model).name if getattr(config, key) is None else "scene"
+        shown = ", ".join(short(scale * one, 4) for one in np.atleast_1d(number))
+        texts.append(f"{text.format(shown)} ({origin})")
+        values |= {key: np.asarray(number).tolist(), f"{key}_of": origin}
+    return Fact("vehicle", [", ".join(texts)], values)
+
+
 def depth_of_focus(context: Context, samples: CheckedSamples) -> Fact:
     """Distances u at which the defocus disk is one pixel wide: 1 / u = 1 / focus ± pixel / (pupil image_distance)."""
     camera = context.camera.optics.camera
@@ -498,6 +519,7 @@ FACTS: tuple[Callable[[Context, CheckedSamples], Fact | None], ...] = (
     cap,
     room,
     wall,
+    mass_properties,
     depth_of_focus,
     tracker_beliefs,
     expected_error,

@@ -481,6 +481,14 @@ def unknown_tag_error(context: Context, samples: CheckedSamples) -> str:
     )
 
 
+def inherited_vehicle(context: Context, samples: CheckedSamples) -> str:
+    """Warn if keys about the vehicle's body are those of a base scene with another vehicle."""
+    inherited = ", ".join(context.lab.scene.inherited)
+    if not inherited:
+        return ""
+    return f"vehicle.model: not that of the base, whose {inherited} the vehicle keeps; give its own"
+
+
 def thermal_drift(context: Context, samples: CheckedSamples) -> str:
     """Warn if thermal drift of dome, mount and lens causes larger errors than expected otherwise."""
     thermal_config = context.lab.scene.thermal
@@ -546,4 +554,5 @@ FINDINGS: tuple[Callable[[Context, CheckedSamples], str], ...] = (
     not_where_expected,
     unknown_tag_error,
     thermal_drift,
+    inherited_vehicle,
 )

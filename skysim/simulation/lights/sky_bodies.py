@@ -25,7 +25,7 @@ from skysim.simulation.lights.light import (
 from skysim.sources.bodies import bodies_from
 from skysim.sources.camera_orbit import hidden_by_earth, sun_m
 from skysim.sources.ephemeris import GcrsState
-from skysim.sources.orbit_elements import MeanElements, read_elements
+from skysim.sources.orbit_elements import MeanElements, check_epochs, read_elements
 from skysim.sources.satellites import (
     MovingLight,
     as_sources,
@@ -129,8 +129,11 @@ def build_satellites(plan: LightPlan) -> Iterator[Light]:
     """The satellites of `light.satellites`; none without it. Raises InputError for an unreadable file."""
     light = plan.scene.light
     if isinstance(light, StarsConfig) and light.satellites:
-        file = light.satellites.file
-        yield Satellites(light.satellites, read_elements(file) if file else None)
+        elements = None
+        if file := light.satellites.file:
+            elements = read_elements(file)
+            check_epochs(file, elements, plan.scene.start_time)
+        yield Satellites(light.satellites, elements)
 
 
 # Sun, Moon and planets.

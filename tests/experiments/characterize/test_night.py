@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from astropy.io import fits
 from numpy.typing import NDArray
 from scipy import special
 from scipy.spatial.transform import Rotation
@@ -265,6 +266,25 @@ def test_lens_and_star_images_are_recovered_and_reproduce_the_frames(
     )
     assert histogram_p(first, same) > 0.01
     assert histogram_p(first, other) < 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("top_down", [True, False])
+def test_frames_without_a_row_order_are_identified_in_both(
+    top_down: bool, tmp_path: Path
+) -> None:
+    """As `skysim solve` does; astropy writes row 0 first, the standard takes it for the lowest."""
+    folder = files.make_folder(tmp_path / "night")
+    for n, (frame, _) in enumerate(rendered(tmp_path, TRUE, 1)):
+        rows = frame.image_dn if top_down else frame.image_dn[::-1]
+        fits.PrimaryHDU(rows).writeto(folder / f"{n}.fits")
+    config = CameraConfig.model_validate(SHEET)
+    night = night_sky.measure_night(config, folder, transfer(), SATURATION_DN)
+    assert night.identified == FRAMES
+    assert ("rows: no ROWORDER" in " ".join(night.remarks)) == top_down
+    assert night.lens is not None
+    true = calibration(CameraConfig.model_validate(TRUE))
+    assert disagreement_px(night.lens.camera, true) < 0.1
 
 
 def star_pixels(truth: Truth) -> NDArray[np.bool_]:

@@ -20,6 +20,7 @@ from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core import files as file_io
 from skysim.core.errors import InputError
+from skysim.core.images import TOP_DOWN_CARD
 from skysim.core.paths import PAPERS, SCENES
 from skysim.core.yaml_reader import VERSION, set_key
 from skysim.results import scoring
@@ -64,7 +65,7 @@ def photo_files(photo: Photo, image: NDArray) -> dict[str, bytes]:
     identified = np.array([spot.id >= 0 for spot in photo.result.detections], bool)
     record = solution_record(photo.result) | {"solution": photo.solution, "hint": photo.hint}
     buffer = BytesIO()
-    fits.PrimaryHDU(image).writeto(buffer)
+    fits.PrimaryHDU(image, fits.Header([TOP_DOWN_CARD])).writeto(buffer)
     return {
         "frame.fits": buffer.getvalue(),
         "frame.png": bytes(cv2.imencode(".png", image)[1]),

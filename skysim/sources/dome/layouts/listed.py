@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from skysim.core.errors import InputError, Where
 from skysim.core.random_streams import random_stream
@@ -21,11 +22,14 @@ from skysim.sources.dome.layouts.placing import (
     on_surface,
     project_from_bearing,
 )
+from skysim.sources.dome.point_cloud import UNIT_M
 from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band
 
 MAX_SURFACE_OFFSET_M = 0.05  # of a listed LED; a larger one is an error in a unit or an axis
-COLUMNS = (("x_m", "y_m", "z_m"), ("azimuth_deg", "tilt_deg"))
+SAME_PLACE = 1e-4  # distance of two LEDs of a file that are one, in m or rad
+PLACES = {tuple(f"{axis}_{unit}" for axis in "xyz"): scale for unit, scale in UNIT_M.items()}
+ANGLES = ("azimuth_deg", "tilt_deg")
 BRIGHTNESS = ("level", "magnitude")
 FURTHER = (
     "id",
@@ -67,6 +71,7 @@ def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -
     if config.file:
         key = config.file
         coordinates, level, number = read_csv(Path(config.file))
+        check_each_once(key, coordinates)
     else:
         coordinates = np.array(config.positions_m or config.directions_deg)
     # Places are used as they are; directions are projected from the bearing.
@@ -97,15 +102,26 @@ def check_on_surface(key: str, surface: Surface, place_m: Floats) -> None:
         raise InputError(
             f"{key}.{far[0]}",
             f"{offset_m[far[0]]:.3g} m from the surface",
-            f"{MAX_SURFACE_OFFSET_M:g} m",
+            f"{MAX_SURFACE_OFFSET_M:g} m; columns x_mm, y_mm, z_mm of a file are in millimeters",
         )
+
+
+def check_each_once(key: str, coordinates: Floats) -> None:
+    """Raise InputError for two rows of a file with one place (N, 3), or direction (N, 2)."""
+    if coordinates.shape[1] == 2:
+        coordinates = directions_from_angles(coordinates)
+    pairs = cKDTree(coordinates).query_pairs(SAME_PLACE)
+    if pairs:
+        first, second = min(pairs)
+        raise InputError(f"{key}.{second}", f"at the place of {first}", "each LED once")
 
 
 def read_csv(path: Path) -> LedFile:
     """Read a file of LEDs: columns x_m, y_m, z_m or azimuth_deg, tilt_deg; and level or magnitude, or neither.
 
-    Comments begin with #; the first other line has the names, in any order, separated by commas or, as in an ECSV of
-    `skysim survey`, by blanks. If there are places and directions, the places are used.
+    Places may be in other units: x_mm, x_cm, x_in. Comments begin with #; the first other line has the names, in any
+    order, separated by commas or, as in an ECSV of `skysim survey`, by blanks. If there are places and directions, the
+    places are used.
 
     Raises
     ------
@@ -125,16 +141,17 @@ def read_csv(path: Path) -> LedFile:
         if line.strip() and not line.startswith("#")
     ]
     names = split_row(lines[0][1]) if lines else []
-    chosen = next((columns for columns in COLUMNS if set(columns) <= set(names)), None)
+    allowed = {**PLACES, ANGLES: 1.0}
+    chosen = next((columns for columns in allowed if {*columns} <= {*names}), None)
     brightness = [name for name in names if name in BRIGHTNESS]
-    known = {*BRIGHTNESS, *FURTHER, *COLUMNS[0], *COLUMNS[1]}
+    known = {*BRIGHTNESS, *FURTHER, *ANGLES, *(chosen or ())}
     # Every column must be known and there once; one kind of place, and one of brightness at most.
     repeated = len(brightness) > 1 or len({*names}) < len(names)
     if chosen is None or repeated or {*names} - known or len(lines) < 2:
         raise InputError(
             path,
             "not a list of LEDs",
-            f"columns {' or '.join(map(', '.join, COLUMNS))}; optionally {' or '.join(BRIGHTNESS)},"
+            f"columns x_m, y_m, z_m or {', '.join(ANGLES)}, or x_mm and so on; optionally {' or '.join(BRIGHTNESS)},"
             f" {', '.join(FURTHER)}; one LED per line",
         )
     # Each row is checked with its number in the file.
@@ -144,7 +161,7 @@ def read_csv(path: Path) -> LedFile:
     if "magnitude" in column:
         level = np.array(relative_levels(column["magnitude"].tolist()))
     return LedFile(
-        np.column_stack([column[name] for name in chosen]),
+        allowed[chosen] * np.column_stack([column[name] for name in chosen]),
         level,
         led_numbers(path, column.get("id")),
     )
