@@ -13,6 +13,8 @@ from skysim.core.types import Floats
 from skysim.experiments.datasheet.cells import MeasuredFrames
 from skysim.experiments.datasheet.variance_components import (
     GROUPS,
+    Bounded,
+    bounded,
     mean_known,
     mean_square_ratio,
     rms,
@@ -133,7 +135,7 @@ def consistency(sheet: MeasuredFrames) -> dict[str, Any]:
         within.append({"level": level, "share": metrics.proportion(hits, nees.size)})
     x, y, _ = sheet.errors(rows)[:, right] ** 2
     return {
-        "nees": metrics.resampled(nees, np.mean),
+        "nees": mean_nees(sheet, rows),
         "within": within,
         "y_over_x": mean_square_ratio(y, x),
     }
@@ -154,7 +156,15 @@ def pair_row(sheet: MeasuredFrames, rows: list[int]) -> dict[str, Any]:
             for name, axes in GROUPS.items()
         },
         **rms_by_group(sheet, rows),
+        "nees": mean_nees(sheet, rows),
     }
+
+
+def mean_nees(sheet: MeasuredFrames, rows: list[int]) -> Bounded:
+    """The mean normalized error squared of right attitudes: 3 if their covariances are right."""
+    nees = np.where(sheet.right(rows), sheet.column("nees", rows), np.nan)
+    by_field = mean_known(nees, 0)
+    return bounded(by_field[np.isfinite(by_field)])
 
 
 def rms_by_group(sheet: MeasuredFrames, rows: list[int]) -> dict[str, float]:
@@ -197,7 +207,11 @@ def by_acceleration(sheet: MeasuredFrames) -> list[dict[str, Any]]:
         )
         predicted = math.sqrt(at_rest**2 + lag_arcsec**2 / 2)  # about one of two axes
         row = {"acceleration_deg_s2": acceleration, "counts": counts_of_fields(sheet, rows)}
-        found.append(row | {"predicted_across": predicted} | rms_by_group(sheet, rows))
+        found.append(
+            row
+            | {"predicted_across": predicted, "nees": mean_nees(sheet, rows)}
+            | rms_by_group(sheet, rows)
+        )
     return found
 
 
