@@ -136,8 +136,9 @@ def check_scene(scene: Scene) -> None:
 def require_fields(fields: int, solved: int, least: int, problem: str) -> None:
     """Raise InputError if fewer than `least` of the fields are solved, with a number of fields that is enough."""
     if solved < least:
-        share = max(solved, 1) / fields
-        enough = least if solved == fields else math.ceil(1.5 * least / share)
+        enough = (
+            least if solved == fields else math.ceil(1.5 * least * fields / max(solved, 1))
+        )
         raise InputError(
             "datasheet.fields", f"{fields}: {problem}, {least} needed", f"{enough} or more"
         )
@@ -532,8 +533,9 @@ def measure(
     """
     check_scene(scene)
     size = QUICK if quick else FULL
-    size = replace(size, fields=fields or size.fields)
-    require_fields(size.fields, size.fields, least, "too few fields")
+    size = replace(size, fields=size.fields if fields is None else fields)
+    purpose = "to fit and test a model" if least > MIN_FIELDS else "for the error terms"
+    require_fields(size.fields, size.fields, least, f"too few {purpose}")
     designer = Designer(scene, size)
     cells = list(designer.cells())
     tree = study_tree(scene_name, scene, overrides, size, cells)

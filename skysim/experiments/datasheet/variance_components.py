@@ -1,7 +1,7 @@
 """Variance components of an attitude error: which part of its mean square belongs to which cause.
 
 The error about one axis is measured in a crossed and nested design: fields x units x thermal states, in each of these
-combinations some attitudes a few pixels apart, at each of these some frames with new noise. Fields, units, attitudes
+combinations the same attitudes a few pixels apart, at each some frames with new noise. Fields, units, attitudes
 and noise are drawn, and their effects are random (Searle, Casella & McCulloch 1992, Variance Components, chapter 4).
 The thermal states are the whole history at equal steps, a fixed factor: its variance is the mean square over them.
 All terms are estimated without bias, and their sum is the mean square of the design's errors. A term may come out
@@ -57,18 +57,18 @@ def contributions(errors: Floats) -> Components:
         distortion, map of the LEDs, geometry of the stars); pixel: changes over a few pixels (centroiding, fixed
         pattern); temporal: changes from frame to frame
     """
-    *_, states, attitudes, frames = errors.shape
+    *_, attitudes, frames = errors.shape
     temporal = np.var(errors, axis=-1, ddof=1).mean(axis=(-1, -2, -3))
     cells = errors.mean(axis=-1)
     between = np.var(cells, axis=-1, ddof=1).mean(axis=(-1, -2))
-    # Attitudes and noise leave this variance in the mean of a state.
-    left = between / attitudes
+    # The same attitudes are used in all states: this part of their variance is common to the states.
+    common = np.var(cells.mean(axis=-2), axis=-1, ddof=1).mean(axis=-1)
     by_state = cells.mean(axis=-1)
     # The states are all that there are, so their mean square is divided by their number.
-    thermal = np.var(by_state, axis=-1).mean(axis=-1) - left * (1 - 1 / states)
+    thermal = np.var(by_state, axis=-1).mean(axis=-1) - (between - common) / attitudes
     means = by_state.mean(axis=-1)
     bias = common_square(means).mean(axis=-1)
-    field = np.mean(means**2, axis=-1) - left / states - bias
+    field = np.mean(means**2, axis=-1) - common / attitudes - bias
     return Components(bias, thermal, field, between - temporal / frames, temporal)
 
 

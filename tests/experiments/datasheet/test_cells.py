@@ -116,7 +116,7 @@ def test_thermal_states_match_the_scene():
         (
             9,
             MIN_FIELDS,
-            "datasheet.fields: 9: too few fields, 10 needed; allowed: 10 or more",
+            "datasheet.fields: 9: too few for the error terms, 10 needed; allowed: 10 or more",
         ),
         (16, MODEL_FIELDS, "datasheet.fields: 16: .* allowed: 20 or more"),
     ],

@@ -40,7 +40,16 @@ def generated(rng, shape, bias=0.0, **sigma):
 def test_injected_terms_are_recovered_to_five_percent():
     """Over many experiments, whose mean is the expectation: of the thermal states those that are there."""
     rng = np.random.default_rng(1)
-    sizes = {"u": 0.5, "f": 2.0, "fu": 1.0, "fs": 0.6, "us": 0.3, "fusp": 0.7, "fuspt": 3.0}
+    sizes = {
+        "u": 0.5,
+        "f": 2.0,
+        "fu": 1.0,
+        "fs": 0.6,
+        "us": 0.3,
+        "fp": 1.1,
+        "fusp": 0.7,
+        "fuspt": 3.0,
+    }
     states = np.array([1.0, -1.0, 0.5, -0.5])[:, None, None]
     found = np.mean(
         [
@@ -52,7 +61,11 @@ def test_injected_terms_are_recovered_to_five_percent():
     # Of effects that are drawn for each of four states a quarter is common to the four.
     thermal = np.mean(states**2) + (0.6**2 + 0.3**2) * 3 / 4
     expected = Components(
-        1.5**2 + 0.5**2 + 0.3**2 / 4, thermal, 2.0**2 + 1.0**2 + 0.6**2 / 4, 0.7**2, 3.0**2
+        1.5**2 + 0.5**2 + 0.3**2 / 4,
+        thermal,
+        2.0**2 + 1.0**2 + 0.6**2 / 4,
+        1.1**2 + 0.7**2,
+        3.0**2,
     )
     assert found == pytest.approx(np.array(expected), rel=0.05)
 
@@ -64,6 +77,13 @@ def test_thermal_states_are_all_that_there_are(effects):
     found = components(np.broadcast_to(np.array(effects)[:, None, None], shape))
     assert found.thermal == pytest.approx(np.var(effects), abs=1e-9)
     assert found.bias == pytest.approx(np.mean(effects) ** 2, abs=1e-9)
+
+
+def test_what_the_states_share_is_not_taken_from_them():
+    """The attitudes of a field are the same in all states, so their effects do not differ among the states."""
+    found = components(generated(np.random.default_rng(10), (200, 2, 3, 2, 2), fp=5.0))
+    assert found.pixel == pytest.approx(25, rel=0.3)
+    assert found.thermal == pytest.approx(0, abs=1e-9)
 
 
 def test_the_sum_of_the_terms_is_the_mean_square_of_every_field():
