@@ -446,9 +446,10 @@ def rate_section(statement: Statement) -> StatementSection:
     texts = [
         "Two frames of each attitude that differ in their noise, at a constant rate across the boresight, each lost in"
         f" space. NEA: temporal noise of one axis, 1 σ ({TEMPORAL}). rms: all errors of one axis ({ONE_UNIT})."
-        f" NEES: normalized error squared, 3 where the tracker's own covariance is right. Shares are of attitudes that"
-        f" are right in both frames. {precision_text(statement.sheet)} Each row holds at its rate, and nothing is known"
-        f" beyond {statement.rates[-1]['rate_deg_s']:g} °/s.",
+        " NEES: normalized error squared of this unit; over all units 3 where the tracker's own covariance is right."
+        " Shares are of attitudes that are right in both frames."
+        f" {precision_text(statement.sheet)} Each row holds at its rate, and nothing is known beyond"
+        f" {statement.rates[-1]['rate_deg_s']:g} °/s.",
         bracket_text(
             "acquisition in rate", performance.bracket(statement.rates, "rate_deg_s"), "°/s"
         ),
